@@ -1,0 +1,106 @@
+"""anny (Apache-2.0 code, CC0 data) as a Rig: one watertight part, no eyes, no tongue."""
+
+import functools
+
+import anny
+import torch
+from anny.models.model_data import TopologyConfig
+from torch import Tensor
+
+from hnerf.body.rig import Rig
+
+PHENOTYPES = ("gender", "age", "muscle", "weight", "height", "proportions")
+
+# anny's local changes that fit limbs, trunk and head to a person whom no phenotype describes; sides move together.
+LOCAL_CHANGES = tuple(
+    "measure-upperarm-length measure-lowerarm-length measure-upperleg-height measure-lowerleg-height "
+    "measure-napetowaist-dist measure-shoulder-dist measure-neck-height measure-upperarm-circ l-lowerarm-fat+r-lowerarm-fat "
+    "measure-thigh-circ measure-calf-circ measure-waist-circ measure-hips-circ torso-scale-horiz torso-scale-depth "
+    "hip-scale-horiz hip-scale-depth head-scale-vert head-scale-depth head-scale-horiz l-foot-scale+r-foot-scale "
+    "l-hand-scale+r-hand-scale".split()
+)
+BETA_NAMES = PHENOTYPES + LOCAL_CHANGES
+ADULT = (0.5, 0.72, 0.5, 0.5, 0.5, 0.5) + (0.0,) * len(LOCAL_CHANGES)  # age 0.5 is a teenager of 1.63 m
+BETA_LOW = (0.0,) * len(PHENOTYPES) + (-1.0,) * len(LOCAL_CHANGES)
+BETA_HIGH = (1.0,) * len(BETA_NAMES)
+
+# Limbs, spine, neck and head turn; fingers, toes, eyes and the twist halves of a limb follow their parents.
+FREE_JOINTS = (
+    "root spine05 spine03 spine01 neck01 head clavicle.L clavicle.R upperarm01.L upperarm01.R lowerarm01.L lowerarm01.R "
+    "wrist.L wrist.R upperleg01.L upperleg01.R lowerleg01.L lowerleg01.R foot.L foot.R"
+).split()
+
+# BODY_25 in OpenPose's order, by the names of anny's keypoint regressor; pairs are averaged.
+BODY_25 = (
+    "nose left_shoulder+right_shoulder right_shoulder right_elbow right_wrist left_shoulder left_elbow left_wrist "
+    "left_hip+right_hip right_hip right_knee right_ankle left_hip left_knee left_ankle right_eye left_eye right_ear "
+    "left_ear left_big_toe left_small_toe left_heel right_big_toe right_small_toe right_heel"
+).split()
+
+
+@functools.cache
+def _model() -> anny.Anny:
+    """The body model; the first construction on a machine takes about a minute and is cached on disk by anny."""
+    labels = [f"{part}-incr" for name in LOCAL_CHANGES for part in name.split("+")]
+    model = anny.Anny(topology=TopologyConfig(base_mesh="makehuman", eyes=False, tongue=False), local_changes=labels)
+    assert tuple(model.phenotype_labels) == PHENOTYPES
+    return model
+
+
+def anny_rig(beta: Tensor | None = None) -> Rig:
+    """The rig linearised at shape values (28,), in the order of BETA_NAMES: phenotypes in [0, 1], then local changes in
+    [-1, 1] (held to these ranges); an average adult by default. float32."""
+    model = _model()
+    beta = torch.tensor(ADULT) if beta is None else beta
+    beta = beta.detach().to(torch.float64).clamp(torch.tensor(BETA_LOW), torch.tensor(BETA_HIGH))
+    unchanged = torch.zeros(1, len(model.local_change_labels), dtype=torch.float64)
+    none = torch.zeros(1, 0, dtype=torch.float64)
+    changes = _local_change_rows(model)
+
+    def coefficients(values: Tensor) -> Tensor:
+        phenotypes, local = values.split([len(PHENOTYPES), len(LOCAL_CHANGES)])
+        return model._get_phenotype_blendshape_coefficients(phenotypes[None], unchanged, none)[0] + changes @ local
+
+    weights = coefficients(beta)
+    jacobian = torch.autograd.functional.jacobian(coefficients, beta)  # (rows, 28)
+    joint_names = tuple(model.bone_labels)
+    return Rig(
+        vertices_m=model.template_vertices + torch.einsum("a,avd->vd", weights, model.blendshapes),
+        faces=model.faces.long(),
+        uvs=model.texture_coordinates,
+        face_uvs=model.face_texture_coordinate_indices,
+        joints_m=model.template_bone_heads + torch.einsum("a,ajd->jd", weights, model.bone_heads_blendshapes),
+        joint_names=joint_names,
+        parents=torch.tensor(model.bone_parents),
+        beta=beta,
+        beta_names=BETA_NAMES,
+        shape_basis=torch.einsum("ab,avd->bvd", jacobian, model.blendshapes),
+        joint_basis=torch.einsum("ab,ajd->bjd", jacobian, model.bone_heads_blendshapes),
+        skin_joints=model.vertex_bone_indices.long(),
+        skin_weights=model.vertex_bone_weights / model.vertex_bone_weights.sum(1, keepdim=True),
+        free=torch.tensor([name in FREE_JOINTS and name != "root" for name in joint_names]),
+        keypoint_weights=_keypoint_weights(model),
+    ).to(dtype=torch.float32)
+
+
+def _local_change_rows(model: anny.Anny) -> Tensor:
+    """(rows, 22): blend shape coefficients per local change. anny has a shape for more and another for less of each (the
+    last rows, in turns); half their difference is linear in the value, with no kink at zero."""
+    first = len(model.blendshapes) - 2 * len(model.local_change_labels)
+    rows = torch.zeros(len(model.blendshapes), len(LOCAL_CHANGES), dtype=torch.float64)
+    for column, name in enumerate(LOCAL_CHANGES):
+        for part in name.split("+"):
+            more = first + 2 * model.local_change_labels.index(f"{part}-incr")
+            rows[more, column], rows[more + 1, column] = 0.5, -0.5
+    return rows
+
+
+def _keypoint_weights(model: anny.Anny) -> Tensor:
+    """BODY_25 regression weights (25, V). Eyes lose their removed eyeball vertices, so rows are normalised again."""
+    path = anny.paths.get_anny_root_dir() / "data" / "keypoints" / "coco.pth"
+    stored = torch.load(path, weights_only=True)
+    rows = []
+    for name in BODY_25:
+        row = sum(stored[part][model.base_mesh_vertex_indices].double() for part in name.split("+"))
+        rows.append(row / row.sum())
+    return torch.stack(rows)

@@ -1,0 +1,167 @@
+"""World points seen from the canonical body: (d, s) of the paper, and y = s + L^-1 (x - p).
+
+p is the closest point on the posed body, s the same point on the rest body, and L the blended linear part of the skinning
+there, so y equals s + d n(s) where the skin moves rigidly, and stays continuous across edges where n(s) does not.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from hnerf.body.descriptor import BodyMeshes, ClosestPoints
+from hnerf.body.rig import (
+    Rig,
+    joint_transforms,
+    pose_vertices,
+    rotation_from_axis_angle,
+    skinning_transforms,
+    vertex_transforms,
+)
+
+
+@dataclass(frozen=True)
+class Descriptor:
+    """d (N,) metres, negative inside; s (N, 3) on the rest body; y (N, 3) canonical position; normal (N, 3) of the rest
+    body at s, turned into the world; near (N,) bool: within reach (the rest is meaningless where it is False)."""
+
+    d: Tensor
+    s: Tensor
+    y: Tensor
+    normal: Tensor
+    near: Tensor
+
+
+class PoseCorrection(nn.Module):
+    """Small changes of pose and shape, learned while the body meshes stand still (Delta theta_t, Delta beta of the paper).
+
+    Free joints and the root of each frame turn by small world-axes twists (n, free + 1, 3), the root also moves (n, 3), and
+    the shape changes for all frames (B,). A twist moves a point by its joint's share of the point's skin weights: the
+    linearisation of skinning for one bone, blended between bones. `PosedBodies.absorb` turns it into theta, T and beta.
+    """
+
+    def __init__(self, frames: int, free_joints: int, shapes: int):
+        super().__init__()
+        self.turn = nn.Parameter(torch.zeros(frames, free_joints + 1, 3))
+        self.move_m = nn.Parameter(torch.zeros(frames, 3))
+        self.shape = nn.Parameter(torch.zeros(shapes))
+        for name, parameter in list(self.named_parameters()):
+            self.register_buffer(f"absorbed_{name}", torch.zeros_like(parameter.data))
+
+    def totals(self) -> tuple[Tensor, Tensor, Tensor]:
+        """(turn, move_m, shape) since the fit, what was absorbed included."""
+        return (
+            self.turn + self.absorbed_turn,
+            self.move_m + self.absorbed_move_m,
+            self.shape + self.absorbed_shape,
+        )
+
+
+class PosedBodies:
+    """The body in several poses: closest points, descriptors and their sensitivity to pose and shape."""
+
+    def __init__(self, rig: Rig, theta: Tensor, root: Tensor, canonical_m: Tensor):
+        """theta (n, J, 3), root (n, 4, 4); canonical_m (V, 3): the rest body that s and y refer to, whatever the shape."""
+        self.rig = rig
+        self._canonical_m = canonical_m
+        self._free = torch.nonzero(rig.free)[:, 0]
+        self._subtree_weights = _subtree_weights(rig, self._free)
+        self._pose(theta, root)
+
+    def _pose(self, theta: Tensor, root: Tensor) -> None:
+        self.theta, self.root = theta.detach(), root.detach()
+        rig = self.rig
+        blended = vertex_transforms(rig, skinning_transforms(rig, rig.joints_m, self.theta, self.root))
+        self._linear = blended[..., :3]
+        self._inverse = torch.linalg.inv(self._linear)
+        self.vertices_m = pose_vertices(rig, self.theta, self.root)
+        self._joints = joint_transforms(rig, rig.joints_m, self.theta, self.root)
+        if hasattr(self, "_meshes"):
+            self._meshes.move(self.vertices_m)
+        else:
+            self._meshes = BodyMeshes(self.vertices_m, rig.faces)
+
+    def correction(self) -> PoseCorrection:
+        """A correction of zero for these frames."""
+        return PoseCorrection(len(self.theta), len(self._free), len(self.rig.beta)).to(self.rig.vertices_m.device)
+
+    def describe(
+        self, points_m: Tensor, frame: Tensor, reach_m: float, correction: PoseCorrection | None = None
+    ) -> Descriptor:
+        """Descriptors of world points (N, 3) in the bodies of rows `frame` (N,); gradients flow to points and correction."""
+        found = self._meshes.closest_points(points_m, frame, reach_m)
+        corners = self.rig.faces[found.face.clamp(min=0)]  # (N, 3)
+        flat = frame.long()[:, None] * len(self.rig.vertices_m) + corners
+        weights = found.barycentric[..., None]
+        p = (self.vertices_m.flatten(0, 1)[flat] * weights).sum(1)
+        s = (self._canonical_m[corners] * weights).sum(1)
+        inverse = (self._inverse.flatten(0, 1).flatten(1)[flat] * weights).sum(1).unflatten(-1, (3, 3))
+        offset = points_m.detach() - p
+        distance = offset.norm(dim=-1)
+        normal = found.sign[:, None] * offset / distance.clamp(min=1e-9)[:, None]
+        moved = points_m - points_m.detach()  # zero, but carries the gradient
+        if correction is not None:
+            moved = moved - self._displacement(points_m.detach(), frame, corners, found, correction)
+        tangential = moved - normal * (normal * moved).sum(-1, keepdim=True)
+        y = s + (inverse @ (offset + moved)[..., None])[..., 0]
+        s = s + (inverse @ tangential[..., None])[..., 0]
+        d = found.sign * distance + (normal * moved).sum(-1)
+        return Descriptor(d, s, y, normal, found.face >= 0)
+
+    def _displacement(
+        self, points_m: Tensor, frame: Tensor, corners: Tensor, found: ClosestPoints, correction: PoseCorrection
+    ) -> Tensor:
+        """How far the correction carries the body at each point, (N, 3)."""
+        nearest = corners.gather(1, found.barycentric.argmax(1, keepdim=True))[:, 0]
+        frame = frame.long()
+        share = self._subtree_weights[nearest]  # (N, free + 1)
+        pivots = torch.cat([self._joints[:, self._free, :3, 3], self._joints[:, :1, :3, 3]], 1)  # (n, free + 1, 3)
+        twists = torch.cat([correction.turn, -torch.linalg.cross(correction.turn, pivots)], -1)  # (n, free + 1, 6)
+        blended = (share[:, None] @ twists[frame])[:, 0]
+        moved = torch.linalg.cross(blended[:, :3], points_m) + blended[:, 3:] + correction.move_m[frame]
+        bulge = torch.einsum("b,nbd->nd", correction.shape, self.rig.shape_basis[:, nearest].transpose(0, 1))
+        linear = self._linear.flatten(0, 1)[frame * len(self.rig.vertices_m) + nearest]
+        return moved + (linear @ bulge[..., None])[..., 0]
+
+    @torch.no_grad()
+    def absorb(self, correction: PoseCorrection) -> None:
+        """Move the bodies by the correction, exactly through the kinematic chain, and set it to zero."""
+        rig, free = self.rig, self._free
+        rotations = rotation_from_axis_angle(self.theta)
+        above = self._joints[:, rig.parents[free].clamp(min=0), :3, :3]
+        turned = above.transpose(-1, -2) @ rotation_from_axis_angle(correction.turn[:, :-1]) @ above @ rotations[:, free]
+        theta, root = self.theta.clone(), self.root.clone()
+        theta[:, free] = axis_angle_from_rotation(turned)
+        turn, pivot = rotation_from_axis_angle(correction.turn[:, -1]), self._joints[:, 0, :3, 3]
+        root[:, :3, :3] = turn @ root[:, :3, :3]
+        root[:, :3, 3] = (turn @ (root[:, :3, 3] - pivot)[..., None])[..., 0] + pivot + correction.move_m
+        self.rig = rig.reshaped(rig.beta + correction.shape)
+        self._pose(theta, root)
+        for name, parameter in correction.named_parameters():
+            correction.get_buffer(f"absorbed_{name}").add_(parameter)
+            parameter.zero_()
+
+
+def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
+    """(..., 3, 3) to (..., 3) axis-angle in radians; exact below a half turn (logarithm of a rotation)."""
+    skew = torch.stack(
+        [
+            rotation[..., 2, 1] - rotation[..., 1, 2],
+            rotation[..., 0, 2] - rotation[..., 2, 0],
+            rotation[..., 1, 0] - rotation[..., 0, 1],
+        ],
+        -1,
+    )
+    sine = skew.norm(dim=-1) / 2
+    cosine = (rotation.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    scale = torch.where(sine > 1e-7, torch.atan2(sine, cosine) / (2 * sine.clamp(min=1e-12)), 0.5)
+    return skew * scale[..., None]
+
+
+def _subtree_weights(rig: Rig, free: Tensor) -> Tensor:
+    """(V, free + 1): the skin weight that each free joint carries with all below it; the last column is the root's, 1."""
+    dense = torch.zeros(len(rig.skin_weights), len(rig.joints_m), device=rig.skin_weights.device)
+    dense.scatter_add_(1, rig.skin_joints, rig.skin_weights)
+    for joint in range(len(rig.joints_m) - 1, 0, -1):
+        dense[:, rig.parents[joint]] += dense[:, joint]
+    return torch.cat([dense[:, free], torch.ones(len(dense), 1, device=dense.device)], 1)

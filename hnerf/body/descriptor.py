@@ -1,0 +1,156 @@
+"""The body prior H: (x, theta, T, beta) -> (d, s), computed from posed body meshes.
+
+Two forms find the closest point: `BodyMeshes.closest_points` (warp's bounding-volume hierarchy; CPU and CUDA) and
+`closest_points_reference` (every triangle, plain torch), which tests compare it to. Both sign by the solid angle: the
+fast form asks for the winding number only where the surface's normal leaves doubt.
+"""
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import Tensor
+
+wp.config.log_level = wp.LOG_ERROR
+wp.init()
+
+SURE_COSINE = 0.35  # of the angle between offset and normal; below it the winding number decides the sign
+
+
+@dataclass(frozen=True)
+class ClosestPoints:
+    """face (N,) long, -1 where nothing is within reach; barycentric (N, 3) of the closest point; sign (N,): -1 inside."""
+
+    face: Tensor
+    barycentric: Tensor
+    sign: Tensor
+
+
+@wp.kernel
+def _closest_kernel(
+    meshes: wp.array(dtype=wp.uint64),
+    mesh_index: wp.array(dtype=wp.int32),
+    points: wp.array(dtype=wp.vec3),
+    normals: wp.array2d(dtype=wp.vec3),
+    reach_m: float,
+    sure_cosine: float,
+    face: wp.array(dtype=wp.int32),
+    barycentric: wp.array(dtype=wp.vec3),
+    sign: wp.array(dtype=float),
+):
+    i = wp.tid()
+    m = mesh_index[i]
+    query = wp.mesh_query_point_no_sign(meshes[m], points[i], reach_m)
+    face[i] = -1
+    sign[i] = 1.0
+    if query.result:
+        face[i] = query.face
+        w = 1.0 - query.u - query.v
+        barycentric[i] = wp.vec3(query.u, query.v, w)
+        mesh = wp.mesh_get(meshes[m])
+        a = mesh.indices[3 * query.face]
+        b = mesh.indices[3 * query.face + 1]
+        c = mesh.indices[3 * query.face + 2]
+        normal = query.u * normals[m, a] + query.v * normals[m, b] + w * normals[m, c]
+        offset = points[i] - wp.mesh_eval_position(meshes[m], query.face, query.u, query.v)
+        along = wp.dot(offset, normal)
+        if wp.abs(along) > sure_cosine * wp.length(offset) * wp.length(normal):
+            sign[i] = wp.sign(along)
+        else:
+            sign[i] = wp.mesh_query_point_sign_winding_number(meshes[m], points[i], reach_m).sign
+
+
+class BodyMeshes:
+    """Posed copies of one body, one a frame, ready for closest-point queries."""
+
+    def __init__(self, vertices_m: Tensor, faces: Tensor):
+        """vertices_m (n, V, 3), faces (F, 3)."""
+        self._device = wp.device_from_torch(vertices_m.device)
+        self._faces = faces
+        self._indices = wp.from_torch(faces.to(torch.int32).flatten().contiguous())
+        self.move(vertices_m)
+
+    def move(self, vertices_m: Tensor) -> None:
+        """Replace the vertices (n, V, 3) of every copy."""
+        vertices_m = vertices_m.detach().float().contiguous()
+        self._meshes = [
+            wp.Mesh(points=wp.from_torch(v, dtype=wp.vec3), indices=self._indices, support_winding_number=True)
+            for v in vertices_m
+        ]
+        self._ids = wp.array([m.id for m in self._meshes], dtype=wp.uint64, device=self._device)
+        self._normals = vertex_normals(vertices_m, self._faces)
+
+    def closest_points(self, points_m: Tensor, mesh_index: Tensor, reach_m: float) -> ClosestPoints:
+        """Closest surface point of mesh `mesh_index` (N,) to each of `points_m` (N, 3), if within `reach_m`."""
+        n, device = len(points_m), points_m.device
+        face = torch.empty(n, dtype=torch.int32, device=device)
+        barycentric = torch.zeros(n, 3, device=device)
+        sign = torch.empty(n, device=device)
+        wp.launch(
+            _closest_kernel,
+            n,
+            inputs=[
+                self._ids,
+                wp.from_torch(mesh_index.to(torch.int32).contiguous()),
+                wp.from_torch(points_m.detach().float().contiguous(), dtype=wp.vec3),
+                wp.from_torch(self._normals, dtype=wp.vec3),
+                reach_m,
+                SURE_COSINE,
+            ],
+            outputs=[wp.from_torch(face), wp.from_torch(barycentric, dtype=wp.vec3), wp.from_torch(sign)],
+            device=self._device,
+        )
+        return ClosestPoints(face.long(), barycentric, sign)
+
+
+def closest_points_reference(points_m: Tensor, vertices_m: Tensor, faces: Tensor, reach_m: float) -> ClosestPoints:
+    """The same for one mesh (V, 3), by trying every triangle (Ericson, Real-Time Collision Detection, 5.1.5) and summing
+    solid angles (van Oosterom and Strackee 1983) for the sign. Memory grows with points x faces."""
+    a, b, c = vertices_m[faces][None].unbind(2)  # (1, F, 3) each
+    barycentric = _triangle_barycentric(points_m[:, None], a, b, c)  # (N, F, 3)
+    closest = (barycentric[..., None] * torch.stack([a, b, c], 2)).sum(-2)
+    distance, face = (points_m[:, None] - closest).norm(dim=-1).min(1)
+    angle = solid_angle(points_m[:, None], a, b, c).sum(1)
+    sign = torch.where(angle > 2 * torch.pi, -1.0, 1.0).to(points_m)
+    rows = torch.arange(len(points_m), device=points_m.device)
+    found = distance <= reach_m
+    return ClosestPoints(torch.where(found, face, -1), barycentric[rows, face], torch.where(found, sign, 1.0))
+
+
+def solid_angle(x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """Signed solid angle of triangles (..., 3) seen from x (..., 3): 4 pi in total inside a closed outward surface."""
+    a, b, c = a - x, b - x, c - x
+    la, lb, lc = a.norm(dim=-1), b.norm(dim=-1), c.norm(dim=-1)
+    numerator = (a * torch.linalg.cross(b, c)).sum(-1)
+    denominator = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
+    return 2 * torch.atan2(numerator, denominator)
+
+
+def _triangle_barycentric(x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """Barycentric coordinates of the point of each triangle closest to x, (..., 3)."""
+
+    def edge(p: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+        t = (((x - p) * (q - p)).sum(-1) / ((q - p) ** 2).sum(-1).clamp(min=1e-20)).clamp(0, 1)
+        return t, ((p + t[..., None] * (q - p) - x) ** 2).sum(-1)
+
+    normal = torch.linalg.cross(b - a, c - a)
+    area_squared = (normal**2).sum(-1).clamp(min=1e-30)
+    u = (torch.linalg.cross(c - b, x - b) * normal).sum(-1) / area_squared
+    v = (torch.linalg.cross(a - c, x - c) * normal).sum(-1) / area_squared
+    inside = torch.stack(torch.broadcast_tensors(u, v, 1 - u - v), -1)
+    (ab, ab_squared), (bc, bc_squared), (ca, ca_squared) = edge(a, b), edge(b, c), edge(c, a)
+    zero = torch.zeros_like(ab)
+    edges = torch.stack(
+        [torch.stack([1 - ab, ab, zero], -1), torch.stack([zero, 1 - bc, bc], -1), torch.stack([ca, zero, 1 - ca], -1)], -2
+    )
+    nearest = torch.stack([ab_squared, bc_squared, ca_squared], -1).argmin(-1)[..., None, None].expand(*zero.shape, 1, 3)
+    return torch.where((inside >= 0).all(-1, keepdim=True), inside, edges.gather(-2, nearest)[..., 0, :])
+
+
+def vertex_normals(vertices_m: Tensor, faces: Tensor) -> Tensor:
+    """Area-weighted unit normals of meshes (..., V, 3)."""
+    a, b, c = (vertices_m[..., faces[:, k], :] for k in range(3))
+    normals = torch.zeros_like(vertices_m)
+    for k in range(3):
+        normals.index_add_(-2, faces[:, k], torch.linalg.cross(b - a, c - a))
+    return torch.nn.functional.normalize(normals, dim=-1)

@@ -1,0 +1,53 @@
+"""The fitted body of a capture: one shape, a pose a frame."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hnerf.body.rig import Rig, joint_transforms, pose_vertices
+
+
+@dataclass(frozen=True)
+class BodyFit:
+    """rig: linearised at the fitted shape (its `beta`). frames: (n,). theta (n, J, 3) radians, zero at locked joints and
+    at the root joint; root (n, 4, 4) world from body, metres."""
+
+    rig: Rig
+    frames: tuple[int, ...]
+    theta: Tensor
+    root: Tensor
+
+    def index(self, frame: int) -> int:
+        """Row of a capture's frame."""
+        return self.frames.index(frame)
+
+    def vertices_m(self) -> Tensor:
+        """(n, V, 3) posed vertices in the world."""
+        return pose_vertices(self.rig, self.theta, self.root)
+
+    def save(self, folder: Path) -> None:
+        """Write `body.npz` (the contract of docs/design.md) and `rig.npz`."""
+        joints = joint_transforms(self.rig, self.rig.joints_m, self.theta, self.root)[..., :3, 3]
+        np.savez(
+            folder / "body.npz",
+            theta=self.theta.numpy(),
+            T=self.root.numpy(),
+            beta=self.rig.beta.numpy(),
+            frames=np.array(self.frames),
+            vertices=self.vertices_m().numpy().astype(np.float32),
+            faces=self.rig.faces.numpy(),
+            joints=joints.numpy(),
+            joint_names=np.array(self.rig.joint_names),
+        )
+        self.rig.save(folder / "rig.npz")
+
+    @staticmethod
+    def load(folder: Path) -> "BodyFit":
+        """Read what `save` wrote."""
+        with np.load(folder / "body.npz", allow_pickle=False) as stored:
+            frames = tuple(int(f) for f in stored["frames"])
+            theta, root = torch.from_numpy(stored["theta"]), torch.from_numpy(stored["T"])
+        return BodyFit(Rig.load(folder / "rig.npz"), frames, theta, root)

@@ -1,0 +1,134 @@
+"""The body as plain tensors: linear blend skinning of one linearised shape space.
+
+All that fitting, training and export need of a body model. anny, SMPL and SMPL-X become a Rig once; after that no
+body-model package is used. The body frame is the model's own: metres, anny's Z up, facing -Y.
+
+Rotations are axis-angle, about a joint's rest position, in axes parallel to the body frame in the rest pose (as in SMPL,
+Loper et al. 2015), so every rest orientation is the identity.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Rest body at shape `beta`, and how it moves.
+
+    vertices_m (V, 3), faces (F, 3) long, uvs (U, 2), face_uvs (F, 3) long, joints_m (J, 3), parents (J,) long with -1 at
+    the root and parents before children, shape_basis (B, V, 3) and joint_basis (B, J, 3): metres per unit of beta around
+    `beta` (B,). skin_joints (V, K) long, skin_weights (V, K) summing to 1. free (J,) bool: joints that may turn.
+    keypoint_weights (25, V): BODY_25 keypoints from the vertices.
+    """
+
+    vertices_m: Tensor
+    faces: Tensor
+    uvs: Tensor
+    face_uvs: Tensor
+    joints_m: Tensor
+    joint_names: tuple[str, ...]
+    parents: Tensor
+    beta: Tensor
+    beta_names: tuple[str, ...]
+    shape_basis: Tensor
+    joint_basis: Tensor
+    skin_joints: Tensor
+    skin_weights: Tensor
+    free: Tensor
+    keypoint_weights: Tensor
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "Rig":
+        """The same rig on another device; `dtype` changes the floating tensors only."""
+        changed = {}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor):
+                changed[field.name] = value.to(device=device, dtype=dtype if value.is_floating_point() else None)
+        return dataclasses.replace(self, **changed)
+
+    def shaped(self, beta: Tensor) -> tuple[Tensor, Tensor]:
+        """Rest vertices (V, 3) and joints (J, 3) at another shape (B,), to first order around `self.beta`."""
+        delta = beta - self.beta
+        vertices_m = self.vertices_m + torch.einsum("b,bvd->vd", delta, self.shape_basis)
+        return vertices_m, self.joints_m + torch.einsum("b,bjd->jd", delta, self.joint_basis)
+
+    def reshaped(self, beta: Tensor) -> "Rig":
+        """The rig moved to another shape (B,), along the same basis."""
+        vertices_m, joints_m = self.shaped(beta)
+        return dataclasses.replace(self, vertices_m=vertices_m, joints_m=joints_m, beta=beta)
+
+    def save(self, path: Path) -> None:
+        """Write an .npz without pickles."""
+        np.savez(path, **{f.name: np.asarray(getattr(self, f.name)) for f in dataclasses.fields(self)})
+
+    @staticmethod
+    def load(path: Path) -> "Rig":
+        """Read what `save` wrote."""
+        with np.load(path, allow_pickle=False) as stored:
+            values = {
+                f.name: tuple(map(str, stored[f.name]))
+                if f.name in ("joint_names", "beta_names")
+                else torch.from_numpy(stored[f.name])
+                for f in dataclasses.fields(Rig)
+            }
+        return Rig(**values)
+
+
+def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
+    """(..., 3) axis-angle in radians to (..., 3, 3); Rodrigues' formula, with finite gradients at zero."""
+    angle_squared = (axis_angle * axis_angle).sum(-1)[..., None, None]
+    small = angle_squared < 1e-8
+    safe = torch.where(small, torch.ones_like(angle_squared), angle_squared)
+    angle = safe.sqrt()
+    sinc = torch.where(small, 1 - angle_squared / 6, angle.sin() / angle)
+    half = torch.where(small, 0.5 - angle_squared / 24, (1 - angle.cos()) / safe)
+    x, y, z = axis_angle.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    return torch.eye(3, dtype=cross.dtype, device=cross.device) + sinc * cross + half * (cross @ cross)
+
+
+def joint_transforms(rig: Rig, joints_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+    """World transform of every joint, (..., J, 4, 4).
+
+    joints_m (J, 3) rest joints; theta (..., J, 3) radians; root (..., 4, 4) world from body (T in docs/method.md).
+    """
+    rotations = rotation_from_axis_angle(theta)
+    parents = rig.parents.tolist()
+    offsets = joints_m - torch.where(rig.parents[:, None] >= 0, joints_m[rig.parents.clamp(min=0)], 0.0)
+    world: list[Tensor] = []
+    for j, parent in enumerate(parents):
+        above = root if parent < 0 else world[parent]
+        rotation = above[..., :3, :3] @ rotations[..., j, :, :]
+        translation = above[..., :3, 3:] + above[..., :3, :3] @ offsets[j, :, None]
+        top = torch.cat([rotation, translation], -1)
+        bottom = torch.tensor([0, 0, 0, 1], dtype=top.dtype, device=top.device).expand(*top.shape[:-2], 1, 4)
+        world.append(torch.cat([top, bottom], -2))
+    return torch.stack(world, -3)
+
+
+def skinning_transforms(rig: Rig, joints_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+    """World from rest pose for a point rigidly on each joint, (..., J, 4, 4): G_j [I | -joint_j]."""
+    world = joint_transforms(rig, joints_m, theta, root)
+    moved = world[..., :3, 3] - (world[..., :3, :3] @ joints_m[..., None])[..., 0]
+    return torch.cat([torch.cat([world[..., :3, :3], moved[..., None]], -1), world[..., 3:, :]], -2)
+
+
+def pose_vertices(rig: Rig, theta: Tensor, root: Tensor, beta: Tensor | None = None) -> Tensor:
+    """Posed vertices in the world, (..., V, 3) metres. theta (..., J, 3), root (..., 4, 4), beta (B,) or the rig's own."""
+    vertices_m, joints_m = (rig.vertices_m, rig.joints_m) if beta is None else rig.shaped(beta)
+    transforms = vertex_transforms(rig, skinning_transforms(rig, joints_m, theta, root))
+    return (transforms[..., :3, :3] @ vertices_m[..., None])[..., 0] + transforms[..., :3, 3]
+
+
+def vertex_transforms(rig: Rig, transforms: Tensor) -> Tensor:
+    """Blend joint transforms (..., J, 4, 4) to vertices: (..., V, 3, 4), world from rest pose."""
+    top = transforms[..., :3, :].flatten(-2)  # (..., J, 12)
+    dense = torch.zeros(len(rig.skin_weights), len(rig.joints_m), dtype=top.dtype, device=top.device)
+    dense.scatter_add_(1, rig.skin_joints, rig.skin_weights)
+    return (dense @ top).unflatten(-1, (3, 4))

@@ -1,0 +1,59 @@
+"""The fast machinery of F and DH: feature grids over the canonical shell and small networks (docs/method.md)."""
+
+import torch
+from torch import Tensor, nn
+
+from hnerf.field.encoding import FeatureGrids, positional_encoding
+
+
+class CanonicalField(nn.Module):
+    """DH: (y, d, theta) -> dd and F: (y, d, theta, n) -> c over the canonical volume.
+
+    The density of F is the SDF's own opacity (the geometry loss of the paper with lambda at its limit), so F is a colour
+    here. n is the body's normal in the world: it carries the root transform T's effect on shading.
+    """
+
+    def __init__(
+        self,
+        lower_m: Tensor,
+        upper_m: Tensor,
+        geometry_cells: tuple[int, ...],
+        colour_cells: tuple[int, ...],
+        channels: int,
+        width: int,
+        pose_width: int,
+        pose_inputs: int,
+        reach_m: float,
+    ):
+        super().__init__()
+        self.reach_m = reach_m
+        self.geometry_grids = FeatureGrids(lower_m, upper_m, geometry_cells, channels)
+        self.colour_grids = FeatureGrids(lower_m, upper_m, colour_cells, channels)
+        self.pose_code = nn.Linear(pose_inputs, pose_width, bias=False) if pose_width else None
+        self.geometry = nn.Sequential(
+            nn.Linear(self.geometry_grids.width + 1 + pose_width, width), nn.SiLU(), nn.Linear(width, 1)
+        )
+        nn.init.zeros_(self.geometry[-1].weight)
+        nn.init.zeros_(self.geometry[-1].bias)
+        self.radiance = nn.Sequential(
+            nn.Linear(self.colour_grids.width + 1 + 9 + pose_width, width),
+            nn.SiLU(),
+            nn.Linear(width, width),
+            nn.SiLU(),
+            nn.Linear(width, 3),
+        )
+
+    def _inputs(self, features: Tensor, d: Tensor, pose: Tensor) -> list[Tensor]:
+        code = [] if self.pose_code is None else [self.pose_code(pose)]
+        return [features, d[:, None] / self.reach_m, *code]
+
+    def residual(self, y_m: Tensor, d_m: Tensor, pose: Tensor) -> Tensor:
+        """dd (N,) metres at y (N, 3), d (N,), pose (N, P); zero at the start of training."""
+        features = self.geometry_grids(y_m)
+        return self.reach_m * self.geometry(torch.cat(self._inputs(features, d_m, pose), -1))[:, 0]
+
+    def colour(self, y_m: Tensor, d_m: Tensor, normal: Tensor, pose: Tensor) -> Tensor:
+        """c (N, 3) in [0, 1]."""
+        features = self.colour_grids(y_m)
+        inputs = self._inputs(features, d_m, pose)
+        return torch.sigmoid(self.radiance(torch.cat([*inputs, positional_encoding(normal, 1)], -1)))

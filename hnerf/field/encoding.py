@@ -1,0 +1,38 @@
+"""Encodings of a position: sines and cosines (Mildenhall et al. 2020) and dense grids of learned features."""
+
+import torch
+from torch import Tensor, nn
+
+
+def positional_encoding(x: Tensor, octaves: int) -> Tensor:
+    """(..., D) to (..., D + 2 D octaves): x, then sin and cos of 2^k pi x for k = 0 .. octaves - 1."""
+    angles = x[..., None, :] * (torch.pi * 2.0 ** torch.arange(octaves, device=x.device, dtype=x.dtype))[:, None]
+    return torch.cat([x, angles.sin().flatten(-2), angles.cos().flatten(-2)], -1)
+
+
+class FeatureGrids(nn.Module):
+    """Dense grids of several resolutions over a box, trilinearly interpolated and concatenated.
+
+    cells: cells of each level along the box's longest side; channels: features a level.
+    """
+
+    def __init__(self, lower_m: Tensor, upper_m: Tensor, cells: tuple[int, ...], channels: int):
+        super().__init__()
+        self.register_buffer("lower_m", lower_m.clone())
+        self.register_buffer("upper_m", upper_m.clone())
+        size = upper_m - lower_m
+        self.levels = nn.ParameterList()
+        for n in cells:
+            x, y, z = (int(s) + 1 for s in (size / size.max() * n).round())
+            self.levels.append(nn.Parameter(torch.empty(1, channels, z, y, x).uniform_(-0.1, 0.1)))
+        self.width = channels * len(cells)
+
+    def forward(self, y_m: Tensor) -> Tensor:
+        """(N, 3) canonical metres to (N, width); positions outside the box take the border's features."""
+        unit = 2 * (y_m - self.lower_m) / (self.upper_m - self.lower_m) - 1
+        at = unit[None, None, None]
+        found = [
+            nn.functional.grid_sample(level, at, align_corners=True, padding_mode="border")[0, :, 0, 0]
+            for level in self.levels
+        ]
+        return torch.cat(found, 0).T

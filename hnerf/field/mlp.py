@@ -1,0 +1,59 @@
+"""The networks of the paper: F, eight layers of 256, and DH, six of 128; Swish, a skip connection to the middle."""
+
+import torch
+from torch import Tensor, nn
+
+from hnerf.field.encoding import positional_encoding
+
+
+class SkipMLP(nn.Module):
+    """`layers` linear layers of `width` with Swish; the input is fed again into the middle one."""
+
+    def __init__(self, inputs: int, width: int, layers: int):
+        super().__init__()
+        self.middle = layers // 2
+        sizes = [inputs] + [width] * (layers - 1)
+        sizes[self.middle] += inputs
+        self.layers = nn.ModuleList(nn.Linear(size, width) for size in sizes)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, inputs) to (N, width)."""
+        h = x
+        for k, layer in enumerate(self.layers):
+            h = nn.functional.silu(layer(torch.cat([h, x], -1) if k == self.middle else h))
+        return h
+
+
+class RadianceMLP(nn.Module):
+    """F: (PE8(s, d), theta, T, v) -> (sigma, c). Density sees theta alone; colour also T and v."""
+
+    OCTAVES = 8
+
+    def __init__(self, point_inputs: int, pose_inputs: int, root_inputs: int):
+        super().__init__()
+        self.trunk = SkipMLP(point_inputs * (1 + 2 * self.OCTAVES) + pose_inputs, 256, 8)
+        self.density = nn.Linear(256, 1)
+        self.colour = nn.Sequential(nn.Linear(256 + root_inputs + 3, 128), nn.SiLU(), nn.Linear(128, 3))
+
+    def forward(self, point: Tensor, pose: Tensor, root: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
+        """point (N, D) in scene units, pose (N, P), root (N, Q), view (N, 3): density (N,) per scene unit, colour (N, 3)."""
+        features = self.trunk(torch.cat([positional_encoding(point, self.OCTAVES), pose], -1))
+        density = nn.functional.softplus(self.density(features)[:, 0])
+        return density, torch.sigmoid(self.colour(torch.cat([features, root, view], -1)))
+
+
+class ResidualMLP(nn.Module):
+    """DH: (PE1(s, d), theta) -> dd. The last layer starts at zero, so training starts from the body."""
+
+    OCTAVES = 1
+
+    def __init__(self, point_inputs: int, pose_inputs: int):
+        super().__init__()
+        self.trunk = SkipMLP(point_inputs * (1 + 2 * self.OCTAVES) + pose_inputs, 128, 6)
+        self.residual = nn.Linear(128, 1)
+        nn.init.zeros_(self.residual.weight)
+        nn.init.zeros_(self.residual.bias)
+
+    def forward(self, point: Tensor, pose: Tensor) -> Tensor:
+        """point (N, D), pose (N, P): dd (N,) in scene units."""
+        return self.residual(self.trunk(torch.cat([positional_encoding(point, self.OCTAVES), pose], -1)))[:, 0]

@@ -1,0 +1,25 @@
+"""A training in progress on disk: written beside and renamed, read without unpickling anything but tensors."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+
+NAME = "checkpoint.pt"
+
+
+def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
+    """Replace the checkpoint in `folder` atomically. state: tensors, numbers, strings and containers of them."""
+    beside = folder / f"{NAME}.{os.getpid()}.tmp"
+    with beside.open("wb") as file:
+        torch.save(state, file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(beside, folder / NAME)
+
+
+def load_checkpoint(folder: Path, device: torch.device) -> dict[str, Any] | None:
+    """The last checkpoint, or None where there is none."""
+    path = folder / NAME
+    return torch.load(path, map_location=device, weights_only=True) if path.exists() else None

@@ -1,0 +1,77 @@
+"""What the fields are conditioned on beside the point, and the random numbers of one step."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
+
+import torch
+from torch import Tensor
+
+from hnerf.body.rig import Rig
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Batch = TypeVar("Batch", bound="DataclassInstance")
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """By body row: pose (n, 3 free) the free joints' angles; root (n, 12) the rows of T, translation in scene units."""
+
+    pose: Tensor
+    root: Tensor
+
+    @staticmethod
+    def of(rig: Rig, theta: Tensor, root: Tensor, scene_m: float) -> "Conditions":
+        """theta (n, J, 3), root (n, 4, 4); scene_m: metres in a scene unit."""
+        scaled = torch.cat([root[:, :3, :3], root[:, :3, 3:] / scene_m], -1)
+        return Conditions(pose_inputs(rig, theta), scaled.flatten(1))
+
+    def noisy(self, sigma: float, generator: torch.Generator) -> "Conditions":
+        """With Gaussian noise on theta and T, so that networks do not learn poses by heart (paper, section 4)."""
+        pose, root = (sigma * torch.randn(c.shape, generator=generator).to(c) for c in (self.pose, self.root))
+        return Conditions(self.pose + pose, self.root + root)
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Random numbers of a batch: jitter (R, K) of samples in their strata, finer (R, K) for hierarchical sampling, beyond
+    (R, 3) the colour behind the rays, probe (R,) which sample's gradient is regularised, view (R, 3) noise on directions.
+    None where a rendering needs none."""
+
+    jitter: Tensor
+    beyond: Tensor
+    finer: Tensor | None = None
+    probe: Tensor | None = None
+    view: Tensor | None = None
+
+    @staticmethod
+    def random(rays: int, samples: int, view_sigma: float, generator: torch.Generator, device: torch.device) -> "Draws":
+        """For one training step."""
+        jitter, finer = (torch.rand(rays, samples, generator=generator).to(device) for _ in range(2))
+        beyond = torch.rand(rays, 3, generator=generator).to(device)
+        probe = torch.rand(rays, generator=generator).to(device)
+        view = view_sigma * torch.randn(rays, 3, generator=generator).to(device)
+        return Draws(jitter, beyond, finer, probe, view)
+
+    def over(self, beyond: Tensor) -> "Draws":
+        """The same numbers, with another colour behind the rays."""
+        return dataclasses.replace(self, beyond=beyond)
+
+    @staticmethod
+    def still(rays: int, samples: int, device: torch.device) -> "Draws":
+        """For a rendering: every sample in the middle of its stratum, black beyond."""
+        middle = torch.full((rays, samples), 0.5, device=device)
+        return Draws(middle, torch.zeros(rays, 3, device=device), middle)
+
+
+def pose_inputs(rig: Rig, theta: Tensor) -> Tensor:
+    """What networks see of poses (n, J, 3): the free joints' angles in radians, (n, 3 free)."""
+    return theta[:, rig.free].flatten(1)
+
+
+def own_share(batch: Batch, rank: int, world_size: int) -> Batch:
+    """This rank's rays of a joint batch: a dataclass whose tensors all have the rays first."""
+    own = {f.name: getattr(batch, f.name) for f in dataclasses.fields(batch)}
+    return dataclasses.replace(batch, **{k: v if v is None else v[rank::world_size] for k, v in own.items()})

@@ -1,0 +1,104 @@
+"""The nine losses of H-NeRF (docs/method.md). Sums over rays are means over rays here, so that a batch's size does not
+change the balance; sums over a ray's samples stay sums. The weights in the presets are the paper's in this form.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy, relu
+
+from hnerf.body.canonical import PoseCorrection
+from hnerf.render.compositing import composite, weights_from_alpha
+
+EPSILON = 1e-6  # keeps logarithms finite
+
+
+@dataclass(frozen=True)
+class RaySamples:
+    """What a model says of a batch of rays. (R, K) each: alpha of the radiance field, alpha_dot of the SDF, in_box b,
+    d of the body, residual dd, spatial_gradient |grad d_hat| (or a subset of samples, any shape); colour (R, K, 3);
+    density (R, K) or None where the SDF itself is the density; beyond (R, 3): the colour behind the samples."""
+
+    alpha: Tensor
+    alpha_dot: Tensor
+    in_box: Tensor
+    colour: Tensor
+    density: Tensor | None
+    d: Tensor
+    residual: Tensor
+    gradient_norm: Tensor
+    beyond: Tensor
+
+    @property
+    def d_hat(self) -> Tensor:
+        """Signed distance to the clothed person."""
+        return self.d + self.residual
+
+
+@dataclass(frozen=True)
+class Target:
+    """colour (R, 3) observed; person M (R,) float; weight (R,): 0 leaves a ray out of the colour losses."""
+
+    colour: Tensor
+    person: Tensor
+    weight: Tensor
+
+
+def pixel(alpha: Tensor, samples: RaySamples) -> Tensor:
+    """Composited colour (R, 3) for one choice of opacity, over what lies beyond."""
+    weights = weights_from_alpha(alpha)
+    return composite(weights, samples.colour) + (1 - weights.sum(1, keepdim=True)) * samples.beyond
+
+
+def reconstruction(samples: RaySamples, target: Target) -> Tensor:
+    """rec: |C_gt - C|_1."""
+    return (target.weight * (target.colour - pixel(samples.alpha, samples)).abs().sum(1)).mean()
+
+
+def mask(samples: RaySamples, target: Target) -> Tensor:
+    """mask: |M (C_gt - C~)|_1, C~ composited with b alpha."""
+    error = (target.colour - pixel(samples.in_box * samples.alpha, samples)).abs().sum(1)
+    return (target.weight * target.person * error).mean()
+
+
+def blend(samples: RaySamples, target: Target, eta: float) -> Tensor:
+    """blend: |M (C_gt - C^)|_1 + eta |(1 - M)(C_gt - C^)|_1, C^ composited with b alpha_dot + (1 - b) alpha."""
+    alpha = samples.in_box * samples.alpha_dot + (1 - samples.in_box) * samples.alpha
+    error = (target.colour - pixel(alpha, samples)).abs().sum(1)
+    return (target.weight * (target.person + eta * (1 - target.person)) * error).mean()
+
+
+def geometry(samples: RaySamples, threshold: float, steepness: float) -> Tensor:
+    """geom: sum_i b_i BCE(sigmoid(lambda (sigma_i - sigma_h)), alpha_dot_i); 0 where the SDF is the density."""
+    if samples.density is None:
+        return samples.d.new_zeros(())
+    opaque = torch.sigmoid(steepness * (samples.density - threshold)).clamp(EPSILON, 1 - EPSILON)
+    bce = binary_cross_entropy(opaque, samples.alpha_dot, reduction="none")
+    return (samples.in_box * bce).sum(1).mean()
+
+
+def segmentation(distance: Tensor, target: Target, sharpness: float) -> Tensor:
+    """seg, fit: BCE(M, sigmoid(-gamma min_i d_i)) for distances (R, K): d_hat for seg, the body's own d for fit."""
+    covered = torch.sigmoid(-sharpness * distance.amin(1)).clamp(EPSILON, 1 - EPSILON)
+    return binary_cross_entropy(covered, target.person)
+
+
+def eikonal(samples: RaySamples) -> Tensor:
+    """eik: sum_i b_i (|grad_x d_hat| - 1)^2, given the norms inside the box."""
+    return ((samples.gradient_norm - 1) ** 2).sum() / len(samples.d)
+
+
+def residual(samples: RaySamples) -> Tensor:
+    """reg: |relu(dd)|_1: clothing lies outside the skin, where d_hat < d."""
+    return relu(samples.residual).sum(1).mean()
+
+
+def increment(correction: PoseCorrection) -> Tensor:
+    """inc: |dbeta|_2 + mean_t |dtheta_t|_2."""
+    turn, move_m, shape = correction.totals()
+    return _norm(shape) + _norm(torch.cat([turn.flatten(1), move_m], 1)).mean()
+
+
+def _norm(x: Tensor) -> Tensor:
+    return (x.square().sum(-1) + EPSILON**2).sqrt()

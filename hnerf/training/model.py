@@ -1,0 +1,104 @@
+"""A trained subject: built for training, saved, and loaded again as an Avatar."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from hnerf.body.canonical import PosedBodies
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.camera import Camera
+from hnerf.config import TrainingSettings
+from hnerf.render.avatar import Rendering
+from hnerf.render.compositing import composite, weights_from_alpha
+from hnerf.training.conditions import Conditions, Draws
+from hnerf.training.fast import FastField
+from hnerf.training.paper import PaperField
+
+RAYS_AT_ONCE = 16384
+POINTS_AT_ONCE = 262144
+
+
+def build_field(settings: TrainingSettings, body: BodyFit, static: bool) -> FastField | PaperField:
+    """An untrained field around the fitted body; static: the capture has one training frame."""
+    if settings.machinery == "fast":
+        return FastField(body.rig, settings.fast)
+    return PaperField(body.rig, body.root, settings.paper, static)
+
+
+@dataclass(frozen=True)
+class TrainedAvatar:
+    """A field and the fine-tuned body: the Avatar of hnerf/render/avatar.py."""
+
+    field: FastField | PaperField
+    body: BodyFit
+    scene_m: float
+
+    @torch.no_grad()
+    def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
+        """Colour, coverage and depth of the person alone, from b alpha (docs/method.md, evaluation)."""
+        bodies, conditions = self._pose(theta, root)
+        region = self.field.region(bodies)
+        device = bodies.vertices_m.device
+        pixels = pixels_around(camera, bodies.vertices_m[0].cpu().numpy())
+        origins, directions = camera.rays(pixels.astype(np.float64))
+        flat = torch.zeros(camera.height_px * camera.width_px, 5, device=device)
+        index = torch.from_numpy(pixels[:, 1] * camera.width_px + pixels[:, 0]).to(device)
+        for start in range(0, len(pixels), RAYS_AT_ONCE):
+            part = slice(start, start + RAYS_AT_ONCE)
+            o, d = (torch.from_numpy(np.ascontiguousarray(a[part])).float().to(device) for a in (origins, directions))
+            row = torch.zeros(len(o), dtype=torch.long, device=device)
+            still = Draws.still(len(o), self.field.samples, device)
+            samples, depths = self.field.sample(bodies, region, o, d, row, conditions, still)
+            weights = weights_from_alpha(samples.in_box * samples.alpha)
+            alpha = weights.sum(1, keepdim=True)
+            depth = (weights * depths).sum(1, keepdim=True) / alpha.clamp(min=1e-6)
+            flat[index[part]] = torch.cat([composite(weights, samples.colour), alpha, depth * (alpha > 0)], 1)
+        image = flat.view(camera.height_px, camera.width_px, 5)
+        return Rendering(image[..., :3].clamp(0, 1), image[..., 3], image[..., 4])
+
+    @torch.no_grad()
+    def signed_distance(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+        """d_hat at world points (N, 3), (N,) metres."""
+        bodies, conditions = self._pose(theta, root)
+        parts = points_m.split(POINTS_AT_ONCE)
+        return torch.cat([self.field.signed_distance(bodies, part, conditions) for part in parts])
+
+    @torch.no_grad()
+    def colour(self, points_m: Tensor, directions: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+        """Radiance at world points (N, 3) along unit directions (N, 3), (N, 3)."""
+        bodies, conditions = self._pose(theta, root)
+        parts = zip(points_m.split(POINTS_AT_ONCE), directions.split(POINTS_AT_ONCE), strict=True)
+        return torch.cat([self.field.colour(bodies, x, v, conditions) for x, v in parts])
+
+    def _pose(self, theta: Tensor, root: Tensor) -> tuple[PosedBodies, Conditions]:
+        rig = self.body.rig
+        bodies = PosedBodies(rig, theta[None], root[None], self.field.canonical_m)
+        return bodies, Conditions.of(rig, theta[None], root[None], self.scene_m)
+
+
+def pixels_around(camera: Camera, vertices_m: np.ndarray, margin: float = 0.15) -> np.ndarray:
+    """Pixels (N, 2) in the rectangle of the projected body, widened by a share of its size; all if it reaches behind."""
+    xy, depth_m = camera.project(vertices_m)
+    size = np.array([camera.width_px, camera.height_px])
+    lower, upper = np.zeros(2), size - 1.0
+    if (depth_m > 0).all():
+        widen = margin * (xy.max(0) - xy.min(0)).max()
+        lower, upper = np.maximum(xy.min(0) - widen, 0), np.minimum(xy.max(0) + widen, size - 1)
+    x, y = (np.arange(int(np.floor(a)), int(np.ceil(b)) + 1) for a, b in zip(lower, upper, strict=True))
+    return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+
+
+def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvatar:
+    """The subject that training left in `folder`."""
+    stored = json.loads((folder / "settings.json").read_text())
+    settings = TrainingSettings.model_validate(stored["training"])
+    body = BodyFit.load(folder)
+    body = BodyFit(body.rig.to(device), body.frames, body.theta.to(device), body.root.to(device))
+    field = build_field(settings, body, stored["static"]).to(device)
+    field.load_state_dict(load_file(folder / "model.safetensors", device=str(device)))
+    return TrainedAvatar(field.eval(), body, settings.paper.scene_m)

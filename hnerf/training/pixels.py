@@ -1,0 +1,121 @@
+"""Every training pixel that the person can reach, on the device, ready to be drawn as rays."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+from hnerf.segmentation.segment import Masks
+
+EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel may mix person and surroundings
+
+
+@dataclass(frozen=True)
+class Rays:
+    """A batch: origins_m, directions (R, 3); frame (R,) row of the body fit; colour (R, 3) in [0, 1]; person (R,) bool;
+    edge (R,) bool: near the mask's outline; plate (R, 3) the clean plate's colour, or None."""
+
+    origins_m: Tensor
+    directions: Tensor
+    frame: Tensor
+    colour: Tensor
+    person: Tensor
+    edge: Tensor
+    plate: Tensor | None
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Pixels of all images, ordered by frame. starts (n + 1,): each frame's range. camera (P,), xy_px (P, 2) int16;
+    colour, plate (P, 3) uint8; person, edge (P,) bool; inverse_K, R (C, 3, 3); centres_m (C, 3)."""
+
+    starts: Tensor
+    camera: Tensor
+    xy_px: Tensor
+    colour: Tensor
+    plate: Tensor | None
+    person: Tensor
+    edge: Tensor
+    rays_from_px: Tensor
+    centres_m: Tensor
+
+    def draw(self, frames: Tensor, rays_per_frame: int, generator: torch.Generator) -> Rays:
+        """`rays_per_frame` pixels of each of the frames (rows), drawn with replacement."""
+        first, after = self.starts[frames], self.starts[frames + 1]
+        unit = torch.rand(len(frames), rays_per_frame, generator=generator, dtype=torch.float64).to(first.device)
+        pick = (first[:, None] + (unit * (after - first)[:, None]).long()).flatten()
+        camera = self.camera[pick].long()
+        origins_m, directions = self.rays(camera, self.xy_px[pick])
+        return Rays(
+            origins_m,
+            directions,
+            frames.repeat_interleave(rays_per_frame),
+            self.colour[pick] / 255,
+            self.person[pick],
+            self.edge[pick],
+            None if self.plate is None else self.plate[pick] / 255,
+        )
+
+    def rays(self, camera: Tensor, xy_px: Tensor) -> tuple[Tensor, Tensor]:
+        """Origins and unit directions (R, 3) of pixels (R, 2) of cameras (R,)."""
+        homogeneous = torch.cat([xy_px.float(), torch.ones_like(xy_px[:, :1], dtype=torch.float32)], 1)
+        directions = (self.rays_from_px[camera] @ homogeneous[..., None])[..., 0]
+        return self.centres_m[camera], torch.nn.functional.normalize(directions, dim=-1)
+
+
+def gather_pixels(
+    capture: Capture, masks: Masks, body: BodyFit, frames: tuple[int, ...], outer_m: float, device: torch.device
+) -> Pixels:
+    """Pixels of the training cameras in `frames` within `outer_m` of the fitted body, or on the mask."""
+    names = capture.train_cameras
+    cameras = [capture.cameras[name] for name in names]
+    plates = [capture.background(name) for name in names]
+    vertices_m = body.vertices_m().numpy()
+    columns: dict[str, list[np.ndarray]] = {k: [] for k in ("camera", "xy_px", "colour", "plate", "person", "edge")}
+    starts = [0]
+    for frame in frames:
+        count = 0
+        for c, (camera, plate) in enumerate(zip(cameras, plates, strict=True)):
+            mask = masks.get(camera.name, frame)
+            wanted = _reach(camera, vertices_m[body.index(frame)], outer_m) | mask
+            y, x = np.nonzero(wanted)
+            columns["camera"].append(np.full(len(x), c, np.uint8))
+            columns["xy_px"].append(np.stack([x, y], 1).astype(np.int16))
+            columns["colour"].append(capture.image(camera.name, frame)[y, x])
+            columns["person"].append(mask[y, x])
+            columns["edge"].append(_edge(mask)[y, x])
+            if plate is not None:
+                columns["plate"].append(plate[y, x])
+            count += len(x)
+        starts.append(starts[-1] + count)
+    with_plates = all(plate is not None for plate in plates)
+    stacked = {k: torch.from_numpy(np.concatenate(v)).to(device) for k, v in columns.items() if k != "plate"}
+    inverse = np.stack([c.R.T @ np.linalg.inv(c.K) for c in cameras])
+    return Pixels(
+        starts=torch.tensor(starts, device=device),
+        plate=torch.from_numpy(np.concatenate(columns["plate"])).to(device) if with_plates else None,
+        rays_from_px=torch.from_numpy(inverse).float().to(device),
+        centres_m=torch.from_numpy(np.stack([c.centre_m for c in cameras])).float().to(device),
+        **stacked,
+    )
+
+
+def _reach(camera: Camera, vertices_m: np.ndarray, outer_m: float) -> np.ndarray:
+    """Pixels whose rays pass within about `outer_m` of the body: its vertices, each a disc of that radius."""
+    xy, depth_m = camera.project(vertices_m)
+    picture = np.zeros((camera.height_px, camera.width_px), np.uint8)
+    xy = np.round(xy[depth_m > 0]).astype(int)
+    seen = (xy >= 0).all(1) & (xy < [camera.width_px, camera.height_px]).all(1)
+    picture[xy[seen, 1], xy[seen, 0]] = 1
+    radius = int(np.ceil(outer_m * camera.K[0, 0] / np.median(depth_m)))
+    return cv2.dilate(picture, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)) > 0
+
+
+def _edge(mask: np.ndarray) -> np.ndarray:
+    kernel = np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_GRADIENT, kernel) > 0

@@ -1,0 +1,33 @@
+"""The processes that train one subject together: rank, world size and device."""
+
+import os
+from dataclasses import dataclass
+
+import torch
+import torch.distributed as dist
+
+
+@dataclass(frozen=True)
+class Processes:
+    """This process among its fellows, as torchrun started them; alone without torchrun."""
+
+    rank: int
+    world_size: int
+    device: torch.device
+
+    @staticmethod
+    def join() -> "Processes":
+        """Join the group that torchrun's environment describes: NCCL with one GPU a rank, else gloo on the CPU."""
+        rank, world_size = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+        cuda = torch.cuda.is_available()
+        device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0))) if cuda else torch.device("cpu")
+        if cuda:
+            torch.cuda.set_device(device)
+        if world_size > 1 and not dist.is_initialized():
+            dist.init_process_group("nccl" if cuda else "gloo")
+        return Processes(rank, world_size, device)
+
+    @property
+    def leads(self) -> bool:
+        """Whether this process writes files and logs."""
+        return self.rank == 0

@@ -1,0 +1,47 @@
+"""One rank of a training, as torchrun starts it.
+
+usage: python -m hnerf.training.run CAPTURE CALIBRATION MASKS FIT SETTINGS_JSON OUT
+"""
+
+import argparse
+import logging
+import sys
+from pathlib import Path
+
+import torch.distributed as dist
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.calibration.check import load_cameras
+from hnerf.capture.capture import Capture
+from hnerf.config import TrainingSettings
+from hnerf.errors import CaptureError
+from hnerf.segmentation.segment import Masks
+from hnerf.training.processes import Processes
+from hnerf.training.trainer import train
+
+
+def main() -> int:
+    """Exit status 0, or 2 with one line on standard error for bad input."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    for name in ("capture", "calibration", "masks", "fit"):
+        parser.add_argument(name, type=Path)
+    parser.add_argument("settings")
+    parser.add_argument("out", type=Path)
+    a = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
+    processes = Processes.join()
+    try:
+        capture = load_cameras(a.calibration, Capture.load(a.capture))
+        settings = TrainingSettings.model_validate_json(a.settings)
+        train(capture, Masks.load(a.masks), BodyFit.load(a.fit), settings, a.out, processes)
+    except CaptureError as error:
+        print(error, file=sys.stderr)
+        return 2
+    finally:
+        if dist.is_initialized():
+            dist.destroy_process_group()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""One optimisation step: from a joint batch of rays to the gradients of its losses."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from hnerf.body.canonical import PoseCorrection, PosedBodies
+from hnerf.config import TrainingSettings
+from hnerf.training import losses
+from hnerf.training.conditions import Conditions, Draws
+from hnerf.training.fast import FastField
+from hnerf.training.paper import PaperField
+from hnerf.training.pixels import Rays
+
+
+class TrainingError(RuntimeError):
+    """Training cannot go on; the message names the likely cause."""
+
+
+@dataclass
+class Stage:
+    """What stands still within a step: the posed bodies and where their rays are sampled."""
+
+    bodies: PosedBodies
+    region: object
+
+
+class Objective(nn.Module):
+    """Field and pose correction with their losses; the forward pass is what DistributedDataParallel wraps."""
+
+    def __init__(self, field: FastField | PaperField, correction: PoseCorrection, settings: TrainingSettings):
+        super().__init__()
+        self.field, self.correction, self.settings = field, correction, settings
+
+    def forward(self, stage: Stage, rays: Rays, conditions: Conditions, draws: Draws) -> dict[str, Tensor]:
+        """The weighted losses by name; their sum is minimised."""
+        own_background = isinstance(self.field, PaperField)
+        target, draws = aim(rays, draws, own_background)
+        samples, _ = self.field.sample(
+            stage.bodies, stage.region, rays.origins_m, rays.directions, rays.frame, conditions, draws, self.correction
+        )
+        s = self.settings.losses
+        sharpness = self.settings.paper.sharpness if own_background else s.sharpness_per_m
+        terms = {
+            "reconstruction": lambda: losses.reconstruction(samples, target),
+            "mask": lambda: losses.mask(samples, target),
+            "blend": lambda: losses.blend(samples, target, s.eta),
+            "geometry": lambda: losses.geometry(samples, s.density_threshold, s.density_steepness),
+            "segmentation": lambda: losses.segmentation(samples.d_hat, target, sharpness),
+            "eikonal": lambda: losses.eikonal(samples),
+            "residual": lambda: losses.residual(samples),
+            "fit": lambda: losses.segmentation(samples.d, target, sharpness),
+            "increment": lambda: losses.increment(self.correction),
+        }
+        return {name: getattr(s, name) * term() for name, term in terms.items() if getattr(s, name)}
+
+
+def aim(rays: Rays, draws: Draws, own_background: bool) -> tuple[losses.Target, Draws]:
+    """What rays should look like, and what lies beyond their samples.
+
+    A field with a background of its own aims at the photograph. One without is composited over the clean plate, so that
+    pixels on the outline, which mix person and plate, count too; where there is no plate, over random colours, with the
+    outline left out.
+    """
+    person = rays.person.float()
+    everywhere = torch.ones_like(person)
+    if own_background:
+        return losses.Target(rays.colour, person, everywhere), draws
+    if rays.plate is not None:
+        colour = torch.where((rays.person | rays.edge)[:, None], rays.colour, rays.plate)
+        return losses.Target(colour, person, everywhere), draws.over(rays.plate)
+    colour = torch.where(rays.person[:, None], rays.colour, draws.beyond)
+    return losses.Target(colour, person, (~rays.edge).float()), draws
+
+
+def not_finite(terms: dict[str, Tensor], gradients: list[Tensor], step: int) -> str | None:
+    """None where all is finite, else which losses or gradients are not."""
+    bad = [name for name, value in terms.items() if not torch.isfinite(value)]
+    if bad:
+        return f"step {step}: {', '.join(bad)} not finite"
+    if not all(torch.isfinite(g).all() for g in gradients):
+        return f"step {step}: a gradient is not finite"
+    return None

@@ -1,0 +1,260 @@
+"""Training: the field with the poses of the training frames, then the poses of novel frames against the finished field."""
+
+
+import json
+import logging
+import resource
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
+
+from hnerf.body.canonical import PosedBodies
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.capture import Capture
+from hnerf.config import TrainingSettings
+from hnerf.segmentation.segment import Masks
+from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
+from hnerf.training.conditions import Conditions, Draws, own_share
+from hnerf.training.losses import pixel
+from hnerf.training.model import build_field
+from hnerf.training.pixels import Pixels, gather_pixels
+from hnerf.training.processes import Processes
+from hnerf.training.step import Objective, Stage, TrainingError, not_finite
+
+logger = logging.getLogger("hnerf.training")
+
+WARM_UP_STEPS = 20
+SKIPS_ALLOWED = 2  # in a row; one more non-finite step stops the run
+HELD_OUT_RAYS = 2048
+LEAST_COVERAGE = 0.2  # of the person's pixels; below it the surface has collapsed
+LOG_STEPS = 25
+REACH_M = 0.1  # around the body, within which a pixel can be the person's
+
+
+class Trainer:
+    """All state of one training; `run` goes from wherever the checkpoint left it to the end."""
+
+    def __init__(
+        self, capture: Capture, masks: Masks, body: BodyFit, settings: TrainingSettings, out: Path, processes: Processes
+    ):
+        self.settings, self.out, self.processes = settings, out, processes
+        device = processes.device
+        torch.manual_seed(settings.seed)
+        self.generator = torch.Generator().manual_seed(settings.seed)
+        self.static = len(capture.train_frames) == 1
+        self.body = BodyFit(body.rig.to(device), body.frames, body.theta.to(device), body.root.to(device))
+        self.field = build_field(settings, self.body, self.static).to(device)
+        bodies = PosedBodies(self.body.rig, self.body.theta, self.body.root, self.field.canonical_m)
+        self.objective = Objective(self.field, bodies.correction(), settings)
+        self.optimizer = torch.optim.Adam(self._parameter_groups(), betas=(0.9, 0.99), eps=1e-12)
+        self.first_rates = [group["lr"] for group in self.optimizer.param_groups]
+        logger.info("gathering pixels")
+        self.pixels: Pixels = gather_pixels(capture, masks, body, body.frames, REACH_M, device)
+        rows = {frame: row for row, frame in enumerate(body.frames)}
+        self.train_rows = torch.tensor([rows[f] for f in capture.train_frames], device=device)
+        held_out = [rows[f] for f in capture.novel_pose_frames if f not in capture.train_frames]
+        self.novel_rows = torch.tensor(held_out, dtype=torch.long, device=device)
+        self.step, self.skipped, self.seconds = 0, 0, 0.0
+        self.history: list[dict[str, Any]] = []
+        self._stand(bodies)
+        self._resume()
+
+    @property
+    def steps(self) -> int:
+        """Of both phases."""
+        return self.settings.steps + (self.settings.novel_pose_steps if self._novel_poses_learn else 0)
+
+    @property
+    def _novel_poses_learn(self) -> bool:
+        return len(self.novel_rows) > 0 and self.settings.pose_learning_rate > 0
+
+    def _parameter_groups(self) -> list[dict[str, Any]]:
+        rate = self.settings.pose_learning_rate
+        return [*self.field.parameter_groups(), {"params": list(self.objective.correction.parameters()), "lr": rate}]
+
+    def _stand(self, bodies: PosedBodies) -> None:
+        """Take the bodies as they stand now for the coming steps."""
+        self.stage = Stage(bodies, self.field.region(bodies))
+        self.conditions = Conditions.of(bodies.rig, bodies.theta, bodies.root, self.settings.paper.scene_m)
+
+    def run(self) -> dict[str, Any]:
+        """Train to the end, write the subject's files and return the report."""
+        module: torch.nn.Module = self.objective
+        if self.processes.world_size > 1:
+            devices = [self.processes.device] if self.processes.device.type == "cuda" else None
+            module = DistributedDataParallel(self.objective, device_ids=devices, find_unused_parameters=True)
+        started, last_log = time.monotonic() - self.seconds, time.monotonic()
+        while self.step < self.steps:
+            if self.step == self.settings.steps:
+                self._freeze_field()
+            terms = self._optimise(module)
+            self.step += 1
+            self.seconds = time.monotonic() - started
+            if self.step % self.settings.absorb_steps == 0 or self.step in (self.settings.steps, self.steps):
+                self.stage.bodies.absorb(self.objective.correction)
+                self._stand(self.stage.bodies)
+            if self.step % LOG_STEPS == 0 or self.step in (1, self.settings.steps, self.steps):
+                self._record(terms)
+                if time.monotonic() - last_log > 5 and self.processes.leads:
+                    last_log = time.monotonic()
+                    logger.info("step %d of %d, %.0f s: %s", self.step, self.steps, self.seconds, self.history[-1])
+            if self.step % self.settings.checkpoint_steps == 0 and self.processes.leads:
+                save_checkpoint(self.out, self._state())
+        self._require_surface()
+        return self._finish() if self.processes.leads else {}
+
+    def _freeze_field(self) -> None:
+        """Novel poses are fitted to the finished field, so that it never sees their pixels."""
+        for parameter in [*self.field.parameters(), self.objective.correction.shape]:
+            parameter.requires_grad_(False)
+
+    def _optimise(self, module: torch.nn.Module) -> dict[str, Tensor]:
+        s, p = self.settings, self.processes
+        rows = self.train_rows if self.step < s.steps else self.novel_rows
+        pick = torch.randperm(len(rows), generator=self.generator)[: s.frames_per_step].to(rows.device)
+        rays = self.pixels.draw(rows[pick], s.rays_per_frame, self.generator)
+        draws = Draws.random(len(rays.frame), self.field.samples, s.noise, self.generator, p.device)
+        conditions = self.conditions.noisy(s.noise, self.generator)
+        self._set_rates()
+        self.optimizer.zero_grad(set_to_none=True)
+        share = own_share(rays, p.rank, p.world_size), conditions, own_share(draws, p.rank, p.world_size)
+        terms = module(self.stage, *share)
+        torch.stack(list(terms.values())).sum().backward()
+        gradients = [q.grad for q in self.objective.parameters() if q.grad is not None]
+        fault = not_finite(terms, gradients, self.step)
+        if fault is None:
+            self.optimizer.step()
+            self.skipped = 0
+        else:
+            self.skipped += 1
+            logger.warning("%s: step skipped", fault)
+            if self.skipped > SKIPS_ALLOWED:
+                raise TrainingError(f"{fault}, {self.skipped} times in a row; lower the learning rates or check the fit")
+        return terms
+
+    def _set_rates(self) -> None:
+        s = self.settings
+        phase_step, phase_steps = (self.step, s.steps) if self.step < s.steps else (self.step - s.steps, s.novel_pose_steps)
+        factor = s.final_learning_rate ** (phase_step / phase_steps) * min(1.0, (phase_step + 1) / WARM_UP_STEPS)
+        for group, rate in zip(self.optimizer.param_groups, self.first_rates, strict=True):
+            group["lr"] = rate * factor
+
+    def _record(self, terms: dict[str, Tensor]) -> None:
+        row: dict[str, Any] = {"step": self.step, "seconds": round(self.seconds, 2)}
+        row["losses"] = {name: value.item() for name, value in terms.items()}
+        if len(self.novel_rows) and self.step <= self.settings.steps:
+            row["held_out"] = {"psnr": self._held_out_psnr()}
+        self.history.append(row)
+
+    @torch.no_grad()
+    def _held_out_psnr(self) -> float:
+        """PSNR on person pixels of novel-pose frames in training cameras, which the field is not trained on."""
+        generator = torch.Generator().manual_seed(self.settings.seed)
+        pixel_colour, rays, _ = self._look(self.novel_rows, generator)
+        error = (pixel_colour - rays.colour)[rays.person & ~rays.edge]
+        return float(-10 * torch.log10((error**2).mean()))
+
+    @torch.no_grad()
+    def _look(self, rows: Tensor, generator: torch.Generator) -> tuple[Tensor, Any, Tensor]:
+        """Rays at some frames as the model renders them: colour (R, 3), the rays, coverage (R,)."""
+        rays = self.pixels.draw(rows, HELD_OUT_RAYS // len(rows) + 1, generator)
+        draws = Draws.still(len(rays.frame), self.field.samples, self.processes.device)
+        samples, _ = self.field.sample(
+            self.stage.bodies, self.stage.region, rays.origins_m, rays.directions, rays.frame, self.conditions, draws
+        )
+        inside = samples.in_box * samples.alpha
+        return pixel(inside, samples), rays, 1 - (1 - inside).prod(1)
+
+    def _require_surface(self) -> None:
+        _, rays, coverage = self._look(self.train_rows, torch.Generator().manual_seed(self.settings.seed))
+        person, around = coverage[rays.person].mean(), coverage[~rays.person & ~rays.edge].mean()
+        if person < LEAST_COVERAGE:
+            raise TrainingError(f"the surface is empty (covers {person:.0%} of the person): check masks and body fit")
+        if around > 1 - LEAST_COVERAGE:
+            raise TrainingError(f"the surface fills the box (covers {around:.0%} of the surroundings): check the masks")
+
+    def _state(self) -> dict[str, Any]:
+        bodies = self.stage.bodies
+        return {
+            "step": self.step,
+            "skipped": self.skipped,
+            "seconds": self.seconds,
+            "objective": self.objective.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+            "theta": bodies.theta,
+            "root": bodies.root,
+            "beta": bodies.rig.beta,
+            "history": json.dumps(self.history),
+        }
+
+    def _resume(self) -> None:
+        state = load_checkpoint(self.out, self.processes.device)
+        if state is None:
+            return
+        self.step, self.skipped, self.seconds = state["step"], state["skipped"], state["seconds"]
+        self.objective.load_state_dict(state["objective"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["generator"].cpu())
+        self.history = json.loads(state["history"])
+        rig = self.body.rig.reshaped(state["beta"])
+        self._stand(PosedBodies(rig, state["theta"], state["root"], self.field.canonical_m))
+        if self.step > self.settings.steps:
+            self._freeze_field()
+        logger.info("resumed at step %d", self.step)
+
+    def _finish(self) -> dict[str, Any]:
+        bodies, out = self.stage.bodies, self.out
+        body = BodyFit(bodies.rig.to("cpu"), self.body.frames, bodies.theta.cpu(), bodies.root.cpu())
+        body.save(out)
+        tensors = {name: t.detach().cpu().contiguous() for name, t in self.field.state_dict().items()}
+        save_file(tensors, out / "model.safetensors")
+        settings = {"static": self.static, "training": self.settings.model_dump()}
+        (out / "settings.json").write_text(json.dumps(settings, indent=1))
+        (out / "history.jsonl").write_text("".join(json.dumps(row) + "\n" for row in self.history))
+        turn, move_m, _ = self.objective.correction.totals()
+        report = {
+            "device": _device_name(self.processes.device),
+            "processes": self.processes.world_size,
+            "seconds": self.seconds,
+            "steps": self.step,
+            "peak_memory_gib": _peak_memory_gib(self.processes.device),
+            "parameters": sum(p.numel() for p in self.field.parameters()),
+            "model_mib": (out / "model.safetensors").stat().st_size / 2**20,
+            "mean_turn_deg": float(np.rad2deg(turn.norm(dim=-1).mean().item())),
+            "mean_move_mm": float(1e3 * move_m.norm(dim=-1).mean()),
+        }
+        (out / "report.json").write_text(json.dumps(report, indent=1))
+        (out / NAME).unlink(missing_ok=True)
+        return report
+
+
+def train(
+    capture: Capture,
+    masks: Masks,
+    body: BodyFit,
+    settings: TrainingSettings,
+    out: Path,
+    processes: Processes | None = None,
+) -> dict[str, Any]:
+    """Train the subject into `out`, from its checkpoint where there is one; the report as a dict.
+
+    Raises TrainingError where the surface collapses or the losses stay non-finite.
+    """
+    return Trainer(capture, masks, body, settings, out, processes or Processes.join()).run()
+
+
+def _device_name(device: torch.device) -> str:
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"CPU, {torch.get_num_threads()} threads"
+
+
+def _peak_memory_gib(device: torch.device) -> float:
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 2**30
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20

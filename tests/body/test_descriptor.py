@@ -1,0 +1,132 @@
+"""The descriptor (d, s): hand-worked on a box, fast form against reference, gradients against finite differences."""
+
+import pytest
+import torch
+
+from hnerf.body.canonical import PosedBodies, axis_angle_from_rotation
+from hnerf.body.descriptor import BodyMeshes, closest_points_reference, solid_angle
+from hnerf.body.rig import Rig, rotation_from_axis_angle
+from tests.body.boxes import box_faces, box_rig, box_vertices
+
+
+def test_box_by_hand():
+    """From (2, 0.5, 0.5) the unit box is 1 m away, nearest at (1, 0.5, 0.5); its centre lies 0.5 m inside."""
+    vertices, faces = box_vertices(), box_faces()
+    points = torch.tensor([[2.0, 0.5, 0.5], [0.5, 0.5, 0.4]])
+    found = BodyMeshes(vertices[None], faces).closest_points(points, torch.zeros(2, dtype=torch.int32), 5.0)
+    closest = (vertices[faces[found.face]] * found.barycentric[..., None]).sum(1)
+    torch.testing.assert_close(closest[0], torch.tensor([1.0, 0.5, 0.5]))
+    torch.testing.assert_close(closest[1], torch.tensor([0.5, 0.5, 0.0]))
+    assert found.sign.tolist() == [1.0, -1.0]
+
+
+def test_out_of_reach_is_said():
+    found = BodyMeshes(box_vertices()[None], box_faces()).closest_points(
+        torch.tensor([[2.0, 0.5, 0.5]]), torch.zeros(1, dtype=torch.int32), 0.9
+    )
+    assert found.face.tolist() == [-1]
+
+
+def test_solid_angle_of_a_closed_surface():
+    """4 pi from inside, 0 from outside."""
+    a, b, c = box_vertices().double()[box_faces()][None].unbind(2)
+    inside, outside = torch.tensor([[[0.3, 0.6, 0.2]]]).double(), torch.tensor([[[1.3, 0.6, 0.2]]]).double()
+    assert solid_angle(inside, a, b, c).sum().item() == pytest.approx(4 * torch.pi)
+    assert solid_angle(outside, a, b, c).sum().item() == pytest.approx(0, abs=1e-12)
+
+
+def test_fast_form_agrees_with_the_reference():
+    """On a posed body, points all around: the same distances, and the same sign at every point."""
+    rig = box_rig(bend_segments=6)
+    theta = torch.zeros(1, 2, 3)
+    theta[0, 1] = torch.tensor([0.0, 0.7, 0.0])
+    bodies = PosedBodies(rig, theta, torch.eye(4)[None], rig.vertices_m)
+    vertices = bodies.vertices_m[0]
+    points = vertices.amin(0) - 0.2 + torch.rand(800, 3, generator=torch.Generator().manual_seed(0)) * (
+        vertices.amax(0) - vertices.amin(0) + 0.4
+    )
+    fast = BodyMeshes(vertices[None], rig.faces).closest_points(points, torch.zeros(800, dtype=torch.int32), 9.0)
+    slow = closest_points_reference(points, vertices, rig.faces, 9.0)
+
+    def distance(found):
+        return ((vertices[rig.faces[found.face]] * found.barycentric[..., None]).sum(1) - points).norm(dim=1)
+
+    torch.testing.assert_close(distance(fast), distance(slow), atol=1e-6, rtol=0)
+    assert torch.equal(fast.sign, slow.sign)
+
+
+def test_canonical_position_undoes_the_pose():
+    """A rigidly turned and moved body: y is the point carried back, d is unchanged."""
+    rig = box_rig()
+    root = torch.eye(4)
+    root[:3, :3] = rotation_from_axis_angle(torch.tensor([0.3, -0.5, 0.8]))
+    root[:3, 3] = torch.tensor([1.0, 2.0, -0.5])
+    rest_points = torch.tensor([[0.5, 0.5, 1.2], [1.1, 0.4, 0.3], [0.5, 0.5, 0.1]])
+    world = rest_points @ root[:3, :3].T + root[:3, 3]
+    described = PosedBodies(rig, torch.zeros(1, 2, 3), root[None], rig.vertices_m).describe(
+        world, torch.zeros(3, dtype=torch.int32), 5.0
+    )
+    torch.testing.assert_close(described.y, rest_points, atol=1e-5, rtol=0)
+    torch.testing.assert_close(described.d, torch.tensor([0.2, 0.1, -0.1]), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("name, index", [("move_m", (0, 2)), ("turn", (0, 1, 0)), ("turn", (0, 0, 1))])
+def test_gradient_to_the_pose(name: str, index: tuple[int, ...]):
+    """dd and dy of the learned correction agree with moving the body for real (absorb) and asking again."""
+    step = 1e-3
+    rig = box_rig(bend_segments=6)
+    theta = torch.zeros(1, 2, 3)
+    points = torch.tensor([[0.5, 0.4, 2.15], [1.15, 0.5, 1.8], [0.4, -0.1, 1.9]])
+    row = torch.zeros(3, dtype=torch.int32)
+
+    def described_after(amount: float):
+        bodies = PosedBodies(rig, theta, torch.eye(4)[None], rig.vertices_m)
+        correction = bodies.correction()
+        with torch.no_grad():
+            getattr(correction, name)[index] = amount
+        bodies.absorb(correction)
+        return bodies.describe(points, row, 5.0)
+
+    bodies = PosedBodies(rig, theta, torch.eye(4)[None], rig.vertices_m)
+    correction = bodies.correction()
+    now = bodies.describe(points, row, 5.0, correction)
+    ahead, behind = described_after(step), described_after(-step)
+    for k in range(3):
+        gradient = torch.autograd.grad(now.d[k], getattr(correction, name), retain_graph=True)[0][index]
+        assert gradient.item() == pytest.approx(((ahead.d - behind.d)[k] / (2 * step)).item(), abs=2e-2)
+        for axis in range(3):
+            gradient = torch.autograd.grad(now.y[k, axis], getattr(correction, name), retain_graph=True)[0][index]
+            assert gradient.item() == pytest.approx(((ahead.y - behind.y)[k, axis] / (2 * step)).item(), abs=2e-2)
+
+
+def test_gradient_to_the_shape():
+    """A shape that lifts the top by 1 m a unit: the distance above it shrinks at rate 1."""
+    rig = box_rig()
+    bodies = PosedBodies(rig, torch.zeros(1, 2, 3), torch.eye(4)[None], rig.vertices_m)
+    correction = bodies.correction()
+    described = bodies.describe(torch.tensor([[0.5, 0.5, 1.3]]), torch.zeros(1, dtype=torch.int32), 5.0, correction)
+    gradient = torch.autograd.grad(described.d.sum(), correction.shape)[0]
+    assert gradient.tolist() == pytest.approx([-1.0])
+
+
+def test_absorbing_keeps_the_total():
+    rig = box_rig()
+    bodies = PosedBodies(rig, torch.zeros(1, 2, 3), torch.eye(4)[None], rig.vertices_m)
+    correction = bodies.correction()
+    with torch.no_grad():
+        correction.move_m[0, 0] = 0.25
+    bodies.absorb(correction)
+    assert correction.move_m.abs().max().item() == 0
+    assert correction.totals()[1].tolist() == [[0.25, 0.0, 0.0]]
+    torch.testing.assert_close(bodies.vertices_m[0], rig.vertices_m + torch.tensor([0.25, 0.0, 0.0]))
+
+
+def test_logarithm_inverts_the_exponential():
+    angles = torch.tensor([[0.0, 0.0, 0.0], [1e-5, 0.0, 0.0], [0.5, -1.0, 0.3], [0.0, 3.0, 0.0]]).double()
+    torch.testing.assert_close(axis_angle_from_rotation(rotation_from_axis_angle(angles)), angles)
+
+
+def test_the_rig_of_the_tests_is_closed():
+    rig: Rig = box_rig(bend_segments=6)
+    a, b, c = rig.vertices_m[rig.faces].double()[None].unbind(2)
+    assert solid_angle(torch.tensor([[[0.5, 0.5, 0.5]]]).double(), a, b, c).sum().item() == pytest.approx(4 * torch.pi)

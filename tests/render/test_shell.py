@@ -1,0 +1,53 @@
+import pytest
+import torch
+
+from hnerf.render.shell import EMPTY, SHELL, SOLID, ShellGrid, box_interval
+
+
+def sphere(radius_m: float) -> torch.Tensor:
+    """Dense points on a sphere about the origin, (1, N, 3)."""
+    points = torch.randn(40000, 3, generator=torch.Generator().manual_seed(0))
+    return radius_m * torch.nn.functional.normalize(points, dim=-1)[None]
+
+
+def test_box_interval_by_hand():
+    """Along x into [1, 2]: from 1 to 2; a ray that misses has no length."""
+    origins = torch.tensor([[0.0, 0.5, 0.5], [0.0, 5.0, 0.5]])
+    directions = torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3)
+    lower, upper = torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3), torch.tensor([[2.0, 1.0, 1.0]]).expand(2, 3)
+    near, far = box_interval(origins, directions, lower, upper)
+    assert (near[0].item(), far[0].item()) == (1.0, 2.0)
+    assert near[1] == far[1]
+
+
+def test_states_around_a_sphere():
+    grid = ShellGrid.around(sphere(0.3), outer_m=0.05, inner_m=0.04, cell_m=0.02)
+    points = torch.tensor([[[0.0, 0, 0], [0.27, 0, 0], [0.33, 0, 0], [0.42, 0, 0], [5.0, 0, 0]]])
+    assert grid.look_up(points, torch.zeros(1, dtype=torch.long))[0].tolist() == [SOLID, SHELL, SHELL, EMPTY, EMPTY]
+
+
+def test_samples_lie_in_the_shell_before_the_solid():
+    """Through the middle of a sphere of 0.3 m from 1 m away: entered 5 cm before the surface, left at the solid core."""
+    grid = ShellGrid.around(sphere(0.3), outer_m=0.05, inner_m=0.04, cell_m=0.01)
+    depths, met = grid.sample_rays(
+        torch.tensor([[-1.0, 0.0, 0.0], [-1.0, 0.6, 0.0]]),
+        torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
+        torch.zeros(2, dtype=torch.long),
+        torch.full((2, 16), 0.5),
+    )
+    assert met.tolist() == [True, False]
+    assert (depths[0].diff() > 0).all()
+    assert depths[0, 0].item() == pytest.approx(0.65, abs=0.03)
+    assert depths[0, -1].item() == pytest.approx(0.74, abs=0.03)
+
+
+def test_a_gap_between_two_shells_is_not_sampled():
+    """Beside the solid core a ray crosses the shell twice; nothing is sampled outside it."""
+    grid = ShellGrid.around(torch.cat([sphere(0.1) - 0.3, sphere(0.1) + 0.3], 1), 0.03, 0.2, 0.01)
+    depths, _ = grid.sample_rays(
+        torch.full((1, 3), -1.0), torch.full((1, 3), 3**-0.5), torch.zeros(1, dtype=torch.long), torch.rand(1, 64)
+    )
+    position = (-1 + depths[0] * 3**-0.5)[:, None].expand(-1, 3)
+    distance = torch.minimum((position - 0.3).norm(dim=1), (position + 0.3).norm(dim=1))
+    assert (distance < 0.1 + 0.03 + 0.03).all()
+    assert (position[:, 0] < 0).any() and (position[:, 0] > 0).any()

@@ -1,0 +1,79 @@
+"""A recording small enough to train on in seconds: a bending red column before a grey plate, four cameras, 32 pixels."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+from hnerf.config import TrainingSettings
+from hnerf.render.silhouette import silhouette
+from tests.body.boxes import box_rig
+
+SIZE_PX = 32
+FRAMES = (0, 1, 2)
+
+TINY = TrainingSettings.model_validate(
+    {
+        "fast": {"samples": 8, "geometry_cells": [4], "colour_cells": [4], "width": 8, "outer_m": 0.2, "inner_m": 0.1, "shell_cell_m": 0.05},
+        "paper": {"samples": 4},
+        "losses": {"mask": 0, "blend": 0, "geometry": 0, "fit": 0, "increment": 0},
+        "steps": 12,
+        "novel_pose_steps": 4,
+        "frames_per_step": 2,
+        "rays_per_frame": 64,
+        "absorb_steps": 5,
+        "checkpoint_steps": 6,
+    }
+)
+
+
+class KnownMasks:
+    """Masks held in memory, by camera and frame."""
+
+    def __init__(self, masks: dict[tuple[str, int], np.ndarray]):
+        self.masks = masks
+
+    def get(self, camera: str, frame: int) -> np.ndarray:
+        """(H, W) bool."""
+        return self.masks[camera, frame]
+
+
+def look_at(name: str, centre_m: np.ndarray, target_m: np.ndarray) -> Camera:
+    """A camera at `centre_m` that sees `target_m` in the middle, z up."""
+    forward = (target_m - centre_m) / np.linalg.norm(target_m - centre_m)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    R = np.stack([right, np.cross(forward, right), forward])
+    K = np.array([[1.2 * SIZE_PX, 0, (SIZE_PX - 1) / 2], [0, 1.2 * SIZE_PX, (SIZE_PX - 1) / 2], [0, 0, 1]])
+    return Camera(name, K, R, -R @ centre_m, SIZE_PX, SIZE_PX)
+
+
+def record(folder: Path) -> tuple[Capture, KnownMasks, BodyFit]:
+    """Write the recording to `folder`; frame 2 is a novel pose."""
+    rig = box_rig(bend_segments=6, splits=4)
+    theta = torch.zeros(len(FRAMES), 2, 3)
+    theta[:, 1, 1] = torch.tensor([0.0, 0.2, 0.4])
+    body = BodyFit(rig, FRAMES, theta, torch.eye(4).repeat(len(FRAMES), 1, 1))
+    middle = np.array([0.5, 0.5, 1.0])
+    directions = [(4, 0), (0, 4), (-4, 0), (0, -4)]
+    cameras = {f"{k}": look_at(f"{k}", middle + [x, y, 0.5], middle) for k, (x, y) in enumerate(directions)}
+    masks = {}
+    plate = np.full((SIZE_PX, SIZE_PX, 3), 128, np.uint8)
+    for name, camera in cameras.items():
+        for row, frame in enumerate(FRAMES):
+            mask = silhouette(camera, body.vertices_m()[row].numpy(), rig.faces.numpy())
+            masks[name, frame] = mask
+            _write(folder / "images" / name / f"{frame:06d}.png", np.where(mask[..., None], [200, 50, 50], plate))
+        _write(folder / "background" / f"{name}.png", plate)
+    sizes = {name: (SIZE_PX, SIZE_PX) for name in cameras}
+    capture = Capture("column", folder, cameras, tuple(cameras), (), FRAMES[:2], FRAMES[2:], 10.0, "z", sizes, sizes)
+    return capture, KnownMasks(masks), body
+
+
+def _write(path: Path, rgb: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), rgb[..., ::-1].astype(np.uint8))

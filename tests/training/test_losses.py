@@ -1,0 +1,121 @@
+"""Each of the nine losses on two rays with two samples, by hand."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hnerf.body.canonical import PoseCorrection
+from hnerf.training import losses
+from hnerf.training.losses import RaySamples, Target
+
+RED, GREEN, BLACK = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]
+
+# Ray 0 on the person: red at half opacity, then green, opaque by the SDF. Ray 1 beside: transparent, black beyond.
+SAMPLES = RaySamples(
+    alpha=torch.tensor([[0.5, 0.5], [0.0, 0.2]]),
+    alpha_dot=torch.tensor([[0.0, 1.0], [0.0, 0.0]]),
+    in_box=torch.tensor([[1.0, 1.0], [1.0, 0.0]]),
+    colour=torch.tensor([[RED, GREEN], [RED, GREEN]]),
+    density=torch.tensor([[60.0, 50.0], [0.0, 0.0]]),
+    d=torch.tensor([[0.05, 0.01], [0.10, 0.20]]),
+    residual=torch.tensor([[-0.02, -0.03], [0.04, -0.05]]),
+    gradient_norm=torch.tensor([1.5, 0.8]),
+    beyond=torch.tensor([BLACK, BLACK]),
+)
+TARGET = Target(colour=torch.tensor([RED, BLACK]), person=torch.tensor([1.0, 0.0]), weight=torch.ones(2))
+
+
+def test_reconstruction():
+    """C = (0.5, 0.25, 0) and (0, 0.2, 0): errors 0.75 and 0.2."""
+    assert losses.reconstruction(SAMPLES, TARGET).item() == pytest.approx((0.75 + 0.2) / 2)
+
+
+def test_reconstruction_leaves_out_weightless_rays():
+    unweighted = replace(TARGET, weight=torch.tensor([0.0, 1.0]))
+    assert losses.reconstruction(SAMPLES, unweighted).item() == pytest.approx(0.1)
+
+
+def test_mask():
+    """Only the person's ray counts."""
+    assert losses.mask(SAMPLES, TARGET).item() == pytest.approx(0.75 / 2)
+
+
+def test_mask_ignores_what_is_outside_the_box():
+    """Without its second sample the ray is (0.5, 0, 0): error 0.5."""
+    outside = replace(SAMPLES, in_box=torch.tensor([[1.0, 0.0], [1.0, 0.0]]))
+    assert losses.mask(outside, TARGET).item() == pytest.approx(0.5 / 2)
+
+
+def test_blend():
+    """C^ of ray 0 is green: error 2; of ray 1 (outside the box alpha stands) (0, 0.2, 0): 0.2 eta."""
+    assert losses.blend(SAMPLES, TARGET, eta=0.25).item() == pytest.approx((2 + 0.25 * 0.2) / 2)
+
+
+def test_geometry():
+    """sigmoid(0.1 (60 - 50)) = 0.731 against 0; sigmoid(0) = 0.5 against 1; sigmoid(-5) against 0; outside ignored."""
+    expected = -math.log(1 - 1 / (1 + math.exp(-1))) - math.log(0.5) - math.log(1 - 1 / (1 + math.exp(5)))
+    assert losses.geometry(SAMPLES, 50.0, 0.1).item() == pytest.approx(expected / 2, rel=1e-5)
+
+
+def test_geometry_vanishes_where_the_sdf_is_the_density():
+    assert losses.geometry(replace(SAMPLES, density=None), 50.0, 0.1).item() == 0
+
+
+def test_segmentation():
+    """min d_hat: -0.02 on the person, 0.14 beside; gamma 80: -log sigmoid(1.6) - log(1 - sigmoid(-11.2))."""
+    expected = -math.log(1 / (1 + math.exp(-1.6))) - math.log(1 - 1 / (1 + math.exp(11.2)))
+    assert losses.segmentation(SAMPLES.d_hat, TARGET, 80.0).item() == pytest.approx(expected / 2, rel=1e-3)
+
+
+def test_fit_takes_the_body_alone():
+    """min d = 0.01 on the person: outside, -log sigmoid(-0.8)."""
+    expected = -math.log(1 / (1 + math.exp(0.8))) - math.log(1 - 1 / (1 + math.exp(8)))
+    assert losses.segmentation(SAMPLES.d, TARGET, 80.0).item() == pytest.approx(expected / 2, rel=1e-4)
+
+
+def test_eikonal():
+    assert losses.eikonal(SAMPLES).item() == pytest.approx((0.25 + 0.04) / 2)
+
+
+def test_residual_punishes_only_what_goes_inside_the_skin():
+    """The only positive residual is 0.04."""
+    assert losses.residual(SAMPLES).item() == pytest.approx(0.04 / 2)
+
+
+def test_increment():
+    """|dbeta| = 5; frames: |(3, 4)| = 5 and 0: mean 2.5."""
+    correction = PoseCorrection(frames=2, free_joints=0, shapes=2)
+    with torch.no_grad():
+        correction.shape.copy_(torch.tensor([3.0, 4.0]))
+        correction.turn[0, 0, 0], correction.absorbed_move_m[0, 1] = 3.0, 4.0
+    assert losses.increment(correction).item() == pytest.approx(7.5)
+
+
+@pytest.mark.parametrize("name", ["reconstruction", "mask", "eikonal", "residual"])
+def test_gradients_in_double(name: str):
+    def loss(alpha, residual, norms):
+        samples = replace(double, alpha=alpha, residual=residual, gradient_norm=norms)
+        return getattr(losses, name)(samples, target) if name in ("reconstruction", "mask") else getattr(losses, name)(samples)
+
+    double = replace(SAMPLES, **{k: v.double() for k, v in vars(SAMPLES).items()})
+    target = replace(TARGET, **{k: v.double() for k, v in vars(TARGET).items()})
+    inputs = [x.clone().requires_grad_() for x in (double.alpha + 0.05, double.residual, double.gradient_norm)]
+    assert torch.autograd.gradcheck(loss, inputs)
+
+
+def test_gradients_of_coupled_losses_in_double():
+    double = replace(SAMPLES, **{k: v.double() for k, v in vars(SAMPLES).items()})
+    target = replace(TARGET, **{k: v.double() for k, v in vars(TARGET).items()})
+
+    def coupled(alpha_dot, density, residual):
+        samples = replace(double, alpha_dot=alpha_dot, density=density, residual=residual)
+        return (
+            losses.blend(samples, target, 0.25)
+            + losses.geometry(samples, 50.0, 0.1)
+            + losses.segmentation(samples.d_hat, target, 80.0)
+        )
+
+    alpha_dot = (0.05 + 0.9 * double.alpha_dot).requires_grad_()
+    assert torch.autograd.gradcheck(coupled, (alpha_dot, double.density.requires_grad_(), double.residual.requires_grad_()))

@@ -1,0 +1,163 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from hnerf.config import TrainingSettings
+from hnerf.training import trainer as trainer_module
+from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
+from hnerf.training.model import load_avatar
+from hnerf.training.processes import Processes
+from hnerf.training.step import TrainingError
+from hnerf.training.trainer import Trainer, train
+from tests.training.scene import TINY, record
+
+ALONE = Processes(0, 1, torch.device("cpu"))
+
+
+def with_changes(**changes: object) -> TrainingSettings:
+    return TrainingSettings.model_validate(TINY.model_dump() | changes)
+
+
+@pytest.fixture(autouse=True)
+def any_surface(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A dozen steps leave no surface worth judging; tests of the judgement set their own bar."""
+    monkeypatch.setattr(trainer_module, "LEAST_COVERAGE", 0.0)
+
+
+@pytest.mark.parametrize("machinery", ["fast", "paper"])
+def test_interrupted_training_ends_as_if_it_was_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, machinery: str):
+    """Stopped after ten steps, resumed from the checkpoint at six: the same weights, poses and losses, bit by bit."""
+    recording = record(tmp_path / "capture")
+    settings = with_changes(machinery=machinery)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    whole.mkdir(), parts.mkdir()
+    train(*recording, settings, whole, ALONE)
+
+    class Killed(Exception):
+        pass
+
+    optimise = Trainer._optimise
+
+    def stop_at_ten(self, module):
+        if self.step == 10:
+            raise Killed
+        return optimise(self, module)
+
+    monkeypatch.setattr(Trainer, "_optimise", stop_at_ten)
+    with pytest.raises(Killed):
+        train(*recording, settings, parts, ALONE)
+    assert not (parts / "model.safetensors").exists()
+    monkeypatch.setattr(Trainer, "_optimise", optimise)
+    train(*recording, settings, parts, ALONE)
+
+    one, two = (load_file(folder / "model.safetensors") for folder in (whole, parts))
+    assert all(torch.equal(one[name], two[name]) for name in one)
+    bodies = [load_avatar(folder).body for folder in (whole, parts)]
+    assert torch.equal(bodies[0].theta, bodies[1].theta)
+    losses = [[json.loads(row)["losses"] for row in (f / "history.jsonl").read_text().splitlines()] for f in (whole, parts)]
+    assert losses[0] == losses[1]
+    assert not (parts / NAME).exists()
+
+
+def test_overfits_the_column(tmp_path: Path):
+    """A few seconds are enough for a render of a training view within 40 dB, in the right place."""
+    capture, masks, body = record(tmp_path / "capture")
+    fast = TINY.fast.model_dump() | {"samples": 16, "network_learning_rate": 0.02, "grid_learning_rate": 0.05}
+    out = tmp_path / "out"
+    out.mkdir()
+    train(capture, masks, body, with_changes(fast=fast, steps=120, rays_per_frame=256), out, ALONE)
+    avatar = load_avatar(out)
+    drawn = avatar.render(capture.cameras["0"], avatar.body.theta[0], avatar.body.root[0])
+    mask = torch.from_numpy(masks.get("0", 0))
+    wanted = torch.from_numpy(capture.image("0", 0)) / 255 * mask[..., None]
+    assert -10 * torch.log10(((drawn.rgb - wanted) ** 2).mean()) > 40
+    assert drawn.depth_m[mask].mean().item() == pytest.approx(3.6, abs=0.4)
+
+
+def test_novel_pixels_never_reach_the_field(tmp_path: Path):
+    """Without the second phase the field is the same to the bit: it learns from training frames alone."""
+    recording = record(tmp_path / "capture")
+    models = []
+    for steps in (0, 4):
+        out = tmp_path / f"{steps}"
+        out.mkdir()
+        train(*recording, with_changes(novel_pose_steps=steps), out, ALONE)
+        models.append(load_file(out / "model.safetensors"))
+    assert all(torch.equal(models[0][name], models[1][name]) for name in models[0])
+
+
+def test_not_a_number_stops_the_run_with_its_cause(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    capture, masks, body = record(tmp_path / "capture")
+    trainer = Trainer(capture, masks, body, TINY, tmp_path, ALONE)
+    before = {name: p.clone() for name, p in trainer.field.named_parameters()}
+    poisoned = trainer.objective.forward
+
+    def poison(*arguments):
+        return {name: value * float("nan") for name, value in poisoned(*arguments).items()}
+
+    monkeypatch.setattr(trainer.objective, "forward", poison)
+    with pytest.raises(TrainingError, match="reconstruction.*not finite.*3 times in a row"):
+        trainer.run()
+    assert all(torch.equal(before[name], p) for name, p in trainer.field.named_parameters())
+
+
+def test_an_empty_surface_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(trainer_module, "LEAST_COVERAGE", 1.1)
+    with pytest.raises(TrainingError, match="surface is empty"):
+        train(*record(tmp_path / "capture"), TINY, tmp_path, ALONE)
+
+
+def test_checkpoint_is_replaced_whole(tmp_path: Path):
+    save_checkpoint(tmp_path, {"step": 1, "x": torch.ones(2)})
+    save_checkpoint(tmp_path, {"step": 2, "x": torch.zeros(2)})
+    assert [p.name for p in tmp_path.iterdir()] == [NAME]
+    state = load_checkpoint(tmp_path, torch.device("cpu"))
+    assert state is not None and state["step"] == 2
+
+
+RANK = """
+import sys, torch
+from pathlib import Path
+from hnerf.training import trainer
+from hnerf.training.processes import Processes
+from tests.training.scene import TINY, record
+torch.set_num_threads(1)
+root = Path(sys.argv[1])
+p = Processes.join()
+t = trainer.Trainer(*record(root / f"capture{p.rank}"), TINY, root, p)
+module = t.objective
+if p.world_size > 1:
+    module = torch.nn.parallel.DistributedDataParallel(module, find_unused_parameters=True)
+t.optimizer.step = lambda: None
+t._optimise(module)
+if p.leads:
+    torch.save({n: q.grad for n, q in t.objective.named_parameters() if q.grad is not None}, root / "gradients.pt")
+"""
+
+
+def test_two_ranks_have_the_gradients_of_one(tmp_path: Path):
+    """Two gloo processes with half the rays each: the averaged gradients are those of one process with all rays."""
+    gradients = []
+    for ranks in (1, 2):
+        root = tmp_path / f"{ranks}"
+        root.mkdir()
+        script = root / "rank.py"
+        script.write_text(RANK)
+        launcher = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
+        subprocess.run([sys.executable, *launcher, str(script), str(root)], check=True, env=_environment())
+        gradients.append(torch.load(root / "gradients.pt", weights_only=True))
+    assert gradients[0].keys() == gradients[1].keys()
+    assert any(g.abs().max() > 0 for name, g in gradients[0].items() if "correction" in name)
+    for name, gradient in gradients[0].items():
+        torch.testing.assert_close(gradients[1][name], gradient, atol=1e-6, rtol=1e-4, msg=lambda m, n=name: f"{n}: {m}")
+
+
+def _environment() -> dict[str, str]:
+    import os
+
+    return os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent.parent), "OMP_NUM_THREADS": "1"}
