@@ -1,0 +1,114 @@
+"""What was recorded: the normalised capture that every later stage reads.
+
+A normalised capture is a folder with `capture.json`, `images/<camera>/<frame:06d>.<ext>` (undistorted), and where the
+recording has them `background/<camera>.<ext>` (clean plates), `masks/<camera>/<frame:06d>.png` and `keypoints.npz`.
+"""
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hnerf.capture.camera import Camera
+from hnerf.errors import CaptureError
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Cameras, frames, splits and where the pixels lie. Test cameras are for scoring only.
+
+    `calibrated_sizes_px`: per camera the (width, height) that the calibration was made at, before any normalisation;
+    `recorded_sizes_px`: the (width, height) of the files as recorded. `up`: "z" or "y", the world's vertical axis.
+    """
+
+    name: str
+    root: Path
+    cameras: dict[str, Camera]
+    train_cameras: tuple[str, ...]
+    test_cameras: tuple[str, ...]
+    train_frames: tuple[int, ...]
+    novel_pose_frames: tuple[int, ...]
+    fps: float
+    up: str
+    calibrated_sizes_px: dict[str, tuple[int, int]]
+    recorded_sizes_px: dict[str, tuple[int, int]]
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """Every frame that a pose is wanted for."""
+        return tuple(sorted(set(self.train_frames) | set(self.novel_pose_frames)))
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        """(H, W, 3) uint8 RGB."""
+        return read_rgb(_only(self.root / "images" / camera, f"{frame:06d}"))
+
+    def background(self, camera: str) -> np.ndarray | None:
+        """Clean plate, (H, W, 3) uint8 RGB, or None where the recording has none."""
+        found = list((self.root / "background").glob(f"{camera}.*"))
+        return read_rgb(found[0]) if found else None
+
+    def given_mask(self, camera: str, frame: int) -> np.ndarray | None:
+        """(H, W) bool, True on the person, or None where the recording has none."""
+        path = self.root / "masks" / camera / f"{frame:06d}.png"
+        if not path.exists():
+            return None
+        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if mask is None:
+            raise CaptureError(f"{path}: not a readable image; write it again or delete it")
+        return mask > 127
+
+    def keypoints(self, camera: str) -> np.ndarray | None:
+        """(frames, people, 25, 3) BODY_25 x_px, y_px, confidence in the order of `frames`; all 0 where absent."""
+        path = self.root / "keypoints.npz"
+        if not path.exists():
+            return None
+        with np.load(path, allow_pickle=False) as stored:
+            return stored.get(camera)
+
+    def with_cameras(self, cameras: dict[str, Camera]) -> "Capture":
+        """The same recording seen through other (refined) cameras."""
+        return dataclasses.replace(self, cameras=cameras)
+
+    def save(self) -> None:
+        """Write `capture.json` into `root`."""
+        plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in ("root", "cameras")}
+        plain["cameras"] = {
+            c.name: {"K": c.K.tolist(), "R": c.R.tolist(), "t_m": c.t_m.tolist(), "size_px": [c.width_px, c.height_px]}
+            for c in self.cameras.values()
+        }
+        plain["units"] = "m"
+        (self.root / "capture.json").write_text(json.dumps(plain, indent=1))
+
+    @staticmethod
+    def load(root: Path) -> "Capture":
+        """Read a normalised capture folder."""
+        plain: dict[str, Any] = json.loads((root / "capture.json").read_text())
+        del plain["units"]
+        cameras = {
+            name: Camera(name, np.array(c["K"]), np.array(c["R"]), np.array(c["t_m"]), *c["size_px"])
+            for name, c in plain.pop("cameras").items()
+        }
+        tuples = ("train_cameras", "test_cameras", "train_frames", "novel_pose_frames")
+        sizes = ("calibrated_sizes_px", "recorded_sizes_px")
+        plain |= {k: tuple(plain[k]) for k in tuples}
+        plain |= {k: {name: tuple(size) for name, size in plain[k].items()} for k in sizes}
+        return Capture(root=root, cameras=cameras, **plain)
+
+
+def read_rgb(path: Path) -> np.ndarray:
+    """(H, W, 3) uint8 RGB from an image file; CaptureError if it cannot be read."""
+    bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if bgr is None:
+        raise CaptureError(f"{path}: not a readable image; export it again as JPEG or PNG")
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+
+def _only(folder: Path, stem: str) -> Path:
+    found = sorted(folder.glob(f"{stem}.*"))
+    if not found:
+        raise CaptureError(f"{folder}/{stem}.*: image missing; every camera needs every frame")
+    return found[0]

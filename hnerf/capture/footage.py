@@ -1,0 +1,86 @@
+"""The pictures of one camera as recorded: a folder of images, or a video."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from hnerf.capture.guarded import check_image_size, read_image
+from hnerf.errors import CaptureError
+
+
+class Picture(NamedTuple):
+    """One frame: RGB (H, W, 3) uint8, and the image file that holds exactly it, if there is one."""
+
+    frame: int
+    rgb: np.ndarray
+    file: Path | None
+
+
+@dataclass(frozen=True)
+class ImageFolder:
+    """Image files by frame number."""
+
+    path: Path
+    files: dict[int, Path]
+    fps: float | None = None
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """Frame numbers, ascending."""
+        return tuple(sorted(self.files))
+
+    def read(self, wanted: Iterable[int]) -> Iterator[Picture]:
+        """The wanted frames in ascending order; CaptureError if one cannot be read."""
+        for frame in sorted(wanted):
+            yield Picture(frame, read_image(self.files[frame]), self.files[frame])
+
+
+@dataclass(frozen=True)
+class Video:
+    """A video file whose every frame could be decoded, numbered from 0."""
+
+    path: Path
+    frames: tuple[int, ...]
+    fps: float | None
+
+    @staticmethod
+    def open(path: Path) -> "Video":
+        """Count the frames by decoding: a header proves nothing (a codec may be missing, a file cut short)."""
+        stream = _open_stream(path)
+        check_image_size(path, stream.get(cv2.CAP_PROP_FRAME_WIDTH), stream.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        declared, count = int(stream.get(cv2.CAP_PROP_FRAME_COUNT)), 0
+        while stream.grab():
+            count += 1
+        if count == 0 or count != declared:
+            raise CaptureError(
+                f"{path}: {declared} frames declared, {count} could be read; export it again whole, as H.264"
+            )
+        return Video(path, tuple(range(count)), stream.get(cv2.CAP_PROP_FPS) or None)
+
+    def read(self, wanted: Iterable[int]) -> Iterator[Picture]:
+        """The wanted frames in ascending order; CaptureError if one cannot be read."""
+        stream, position = _open_stream(self.path), 0
+        for frame in sorted(wanted):
+            while position < frame and stream.grab():
+                position += 1
+            ok, bgr = stream.read()
+            if not ok:
+                raise CaptureError(f"{self.path}: frame {frame} cannot be read; export the video again as H.264")
+            position += 1
+            yield Picture(frame, cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), None)
+
+
+Footage = ImageFolder | Video
+
+
+def _open_stream(path: Path) -> cv2.VideoCapture:
+    if not path.is_file():
+        raise CaptureError(f"{path}: video missing; every calibrated camera needs one")
+    stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    if not stream.isOpened():
+        raise CaptureError(f"{path}: not a readable video; export it again as H.264")
+    return stream

@@ -1,0 +1,128 @@
+"""The EasyMocap layout: intri.yml and extri.yml, images/ or videos/, openpose/, masks/ or mask/, background/."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import yaml
+
+from hnerf.capture.footage import Footage, ImageFolder, Video
+from hnerf.capture.guarded import IMAGE_SUFFIXES, files_in, images_named, inside, numbered, read_text
+from hnerf.capture.lens import Lens, checked_lens
+from hnerf.errors import CaptureError
+
+MAX_CALIBRATION_BYTES = 1_000_000
+
+
+@dataclass(frozen=True)
+class EasyMocap:
+    """A folder as EasyMocap's own tools read it (its `read_camera`): world to camera, OpenCV axes."""
+
+    folder: Path
+    novel_pose_share: ClassVar[float] = 0.0
+
+    @staticmethod
+    def recognises(folder: Path) -> bool:
+        """Whether the folder looks like this layout."""
+        return any((folder / name).exists() for name in ("intri.yml", "extri.yml", "images"))
+
+    def lenses(self) -> dict[str, Lens]:
+        """Every camera that intri.yml names."""
+        intri = _CalibrationFile(inside(self.folder, "intri.yml"))
+        extri = _CalibrationFile(inside(self.folder, "extri.yml"))
+        lenses = (_lens(name, intri, extri) for name in intri.names())
+        return {lens.name: lens for lens in lenses}
+
+    def footage(self, camera: str) -> Footage:
+        """images/<camera>/, else videos/<camera>.mp4."""
+        files = [p for p in files_in(self.folder, "images", camera) if p.suffix.lower() in IMAGE_SUFFIXES]
+        if files:
+            return ImageFolder(self.folder / "images" / camera, numbered(files, "images"))
+        video = inside(self.folder, "videos", f"{camera}.mp4")
+        if not video.exists():
+            raise CaptureError(
+                f"{self.folder / 'images' / camera}: no JPEG or PNG images, and no {video}; "
+                "add them or take the camera out of the calibration"
+            )
+        return Video.open(video)
+
+    def keypoint_files(self, camera: str) -> dict[int, Path]:
+        """openpose/<camera>/<frame>_keypoints.json."""
+        return numbered([p for p in files_in(self.folder, "openpose", camera) if p.suffix == ".json"], "keypoints")
+
+    def mask_files(self, camera: str) -> dict[int, Path]:
+        """masks/<camera>/<frame>.png, or mask/."""
+        for name in ("masks", "mask"):
+            files = [p for p in files_in(self.folder, name, camera) if p.suffix.lower() in IMAGE_SUFFIXES]
+            if files:
+                return numbered(files, "masks")
+        return {}
+
+    def plate_file(self, camera: str) -> Path | None:
+        """background/<camera>.jpg or .png."""
+        found = images_named(self.folder, camera, "background")
+        return found[0] if found else None
+
+    def to_body_25(self, keypoints: np.ndarray) -> np.ndarray:
+        """OpenPose's BODY_25 already."""
+        return keypoints
+
+
+class _CalibrationFile:
+    """An OpenCV FileStorage in YAML. Read by PyYAML, to strings only: on deep nesting OpenCV's own parser overflows the
+    stack, and it allocates whatever matrix a file declares."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        text = re.sub(r"\A%YAML:\S*", "", read_text(path, MAX_CALIBRATION_BYTES))  # OpenCV's header is not YAML's
+        try:
+            self.tree = yaml.load(text, Loader=yaml.BaseLoader)
+        except (yaml.YAMLError, RecursionError, ValueError):
+            self.tree = None
+        if not isinstance(self.tree, dict):
+            raise CaptureError(f"{path}: not an OpenCV YAML file; export it again with EasyMocap")
+
+    def names(self) -> list[object]:
+        names = self.tree.get("names")
+        if not isinstance(names, list) or not names:
+            raise CaptureError(f"{self.path}: lists no cameras under 'names'; export it again with EasyMocap")
+        return names
+
+    def number(self, key: str) -> float | None:
+        try:
+            return float(self.tree[key]) if key in self.tree else None
+        except (TypeError, ValueError):
+            raise CaptureError(f"{self.path}: {key} is no number; calibrate again") from None
+
+    def matrix(self, *keys: str) -> np.ndarray | None:
+        """The first of these keys that is there, as float64."""
+        found = [key for key in keys if key in self.tree]
+        if not found:
+            return None
+        try:
+            node = self.tree[found[0]]
+            return np.array([float(value) for value in node["data"]]).reshape(int(node["rows"]), int(node["cols"]))
+        except (KeyError, TypeError, ValueError):
+            raise CaptureError(f"{self.path}: {found[0]} is no matrix of finite numbers; calibrate again") from None
+
+    def required(self, *keys: str) -> np.ndarray:
+        found = self.matrix(*keys)
+        if found is None:
+            raise CaptureError(f"{self.path}: {' or '.join(keys)} is missing; calibrate that camera, or take it out")
+        return found
+
+
+def _lens(name: object, intri: _CalibrationFile, extri: _CalibrationFile) -> Lens:
+    distortion = intri.matrix(f"dist_{name}", f"D_{name}")
+    width_px, height_px = intri.number(f"W_{name}"), intri.number(f"H_{name}")
+    return checked_lens(
+        sources=(intri.path, extri.path),
+        name=name,
+        K=intri.required(f"K_{name}"),
+        distortion=np.zeros(4) if distortion is None else distortion,
+        R=extri.required(f"R_{name}", f"Rot_{name}"),
+        t_m=extri.required(f"T_{name}"),
+        size_px=(width_px, height_px) if width_px is not None and height_px is not None else None,
+    )

@@ -1,0 +1,61 @@
+"""A camera as calibrated, with its lens distortion: what stands in a calibration file."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hnerf.capture.guarded import check_camera_name, check_image_size
+from hnerf.errors import CaptureError
+
+MIN_FOCAL_PX = 1.0
+
+
+@dataclass(frozen=True)
+class Lens:
+    """K (3, 3) pixels; distortion (4,) or (5,): OpenCV's k1 k2 p1 p2 [k3]; R (3, 3), t_m (3,) world to camera.
+
+    `size_px` is the (width, height) that was calibrated, None where the file does not say.
+    """
+
+    name: str
+    K: np.ndarray
+    distortion: np.ndarray
+    R: np.ndarray
+    t_m: np.ndarray
+    size_px: tuple[int, int] | None
+
+
+def checked_lens(
+    sources: tuple[Path, Path],
+    name: object,
+    K: np.ndarray,
+    distortion: np.ndarray,
+    R: np.ndarray,
+    t_m: np.ndarray,
+    size_px: tuple[float, float] | None,
+) -> Lens:
+    """A Lens from numbers of any shape; CaptureError naming file and camera if they make no camera.
+
+    sources: the files of the intrinsics and of the extrinsics. R: a matrix or a rotation vector (Rodrigues).
+    """
+    intrinsics, extrinsics = sources
+    camera = check_camera_name(name, intrinsics)
+    for source, label, value, sizes in (
+        (intrinsics, "K", K, (9,)),
+        (intrinsics, "distortion", distortion, (4, 5)),
+        (extrinsics, "R", R, (3, 9)),
+        (extrinsics, "T", t_m, (3,)),
+    ):
+        if value.size not in sizes:
+            raise CaptureError(f"{source}: camera {camera}: {label} has {value.size} numbers; calibrate again")
+        if not np.isfinite(value).all():
+            raise CaptureError(f"{source}: camera {camera}: {label} holds a NaN or infinity; calibrate again")
+    K, R = K.reshape(3, 3), cv2.Rodrigues(R.ravel())[0] if R.size == 3 else R.reshape(3, 3)
+    if K[0, 0] < MIN_FOCAL_PX or K[1, 1] < MIN_FOCAL_PX or K[1, 0] != 0 or K[2].tolist() != [0, 0, 1]:
+        raise CaptureError(f"{intrinsics}: camera {camera}: K is not a matrix of intrinsics in pixels; calibrate again")
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        raise CaptureError(f"{extrinsics}: camera {camera}: R is not a rotation; calibrate again")
+    size = check_image_size(intrinsics, *size_px) if size_px else None
+    return Lens(camera, K, distortion.ravel(), R, t_m.ravel(), size)

@@ -1,0 +1,105 @@
+"""From one camera's recorded pixels to those of a linear camera of bounded size."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hnerf.capture.camera import Camera
+from hnerf.capture.guarded import read_image
+from hnerf.capture.lens import Lens
+from hnerf.errors import CaptureError
+
+JPEG_OPTIONS = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+
+
+@dataclass(frozen=True)
+class Normaliser:
+    """`camera` is the linear one, at the size that is written. `maps`: cv2.remap's tables, None without distortion.
+
+    The linear camera keeps the calibrated K; what undistortion has no pixel for repeats the nearest edge pixel.
+    """
+
+    lens: Lens
+    camera: Camera
+    recorded_size_px: tuple[int, int]
+    maps: tuple[np.ndarray, np.ndarray] | None
+
+    @staticmethod
+    def create(lens: Lens, recorded_size_px: tuple[int, int], max_side_px: int) -> "Normaliser":
+        """For images of (width, height) pixels, shrunk until the longest side is at most `max_side_px`."""
+        width_px, height_px = recorded_size_px
+        camera = Camera(lens.name, lens.K, lens.R, lens.t_m, width_px, height_px)
+        scale = max_side_px / max(recorded_size_px)
+        if scale < 1:
+            camera = camera.resized(max(1, round(scale * width_px)), max(1, round(scale * height_px)))
+        maps = None
+        if np.any(lens.distortion):
+            maps = cv2.initUndistortRectifyMap(lens.K, lens.distortion, None, lens.K, recorded_size_px, cv2.CV_16SC2)
+        return Normaliser(lens, camera, recorded_size_px, maps)
+
+    @property
+    def changes_pixels(self) -> bool:
+        """Whether there is anything to undistort or to shrink."""
+        return self.maps is not None or self.size_px != self.recorded_size_px
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height) of what is written."""
+        return self.camera.width_px, self.camera.height_px
+
+    def pixels(self, recorded: np.ndarray) -> np.ndarray:
+        """(H, W) or (H, W, 3) uint8 as recorded, undistorted and shrunk."""
+        if self.maps is not None:
+            recorded = cv2.remap(recorded, *self.maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        if self.size_px != self.recorded_size_px:
+            recorded = cv2.resize(recorded, self.size_px, interpolation=cv2.INTER_AREA)
+        return recorded
+
+    def keypoints(self, recorded: np.ndarray) -> np.ndarray:
+        """(..., 25, 3) x_px, y_px, confidence as recorded to the linear camera; points of no confidence become zero."""
+        xy = recorded[..., :2].reshape(-1, 1, 2)
+        if self.maps is not None:
+            xy = cv2.undistortPoints(xy, self.lens.K, self.lens.distortion, P=self.lens.K)
+        scale = np.array(self.size_px) / self.recorded_size_px
+        xy = xy.reshape(*recorded.shape[:-1], 2) * scale + (scale - 1) / 2  # pixel centres at integers
+        return np.concatenate([xy, recorded[..., 2:]], -1) * (recorded[..., 2:] > 0)
+
+    def write_image(self, rgb: np.ndarray, source: Path, verbatim: Path | None, target: Path) -> None:
+        """Write to `target` plus a suffix: the file itself where it already holds exactly these pixels.
+
+        Else JPEG of quality 95 without chroma subsampling: its error is far below that of the resampling, and at a
+        fifth of a PNG's size.
+        """
+        self._check_size(rgb, source)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if verbatim and not self.changes_pixels:
+            shutil.copyfile(verbatim, target.with_name(target.name + verbatim.suffix.lower()))
+        else:
+            _write(target.with_name(f"{target.name}.jpg"), self.pixels(rgb)[..., ::-1], JPEG_OPTIONS)
+
+    def write_plate(self, source: Path, target: Path) -> None:
+        """A clean plate, like any image."""
+        self.write_image(read_image(source), source, source, target)
+
+    def write_mask(self, source: Path, target: Path) -> None:
+        """A mask (anything but black is the person) as 0/255 PNG."""
+        recorded = read_image(source).max(-1)
+        self._check_size(recorded, source)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _write(target, np.where(self.pixels(np.where(recorded > 0, 255, 0).astype(np.uint8)) > 127, 255, 0), [])
+
+    def _check_size(self, pixels: np.ndarray, source: Path) -> None:
+        height_px, width_px = pixels.shape[:2]
+        if (width_px, height_px) != self.recorded_size_px:
+            raise CaptureError(
+                f"{source}: is {width_px} x {height_px} px, but camera {self.lens.name} records "
+                f"{self.recorded_size_px[0]} x {self.recorded_size_px[1]}; give all its pictures one size"
+            )
+
+
+def _write(path: Path, pixels: np.ndarray, options: list[int]) -> None:
+    if not cv2.imwrite(str(path), np.ascontiguousarray(pixels, dtype=np.uint8), options):
+        raise OSError(f"{path}: cannot be written")

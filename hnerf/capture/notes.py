@@ -1,0 +1,98 @@
+"""`capture.toml`: what a layout does not say itself, and which cameras and frames are for what."""
+
+import math
+import re
+from collections.abc import Collection
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from hnerf.capture.guarded import inside, read_toml
+from hnerf.errors import CaptureError
+
+FrameNumber = Annotated[int, Field(ge=0, le=999_999)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class CameraSplit(_Table):
+    """Test cameras are for scoring only."""
+
+    train: list[str] = Field(min_length=1)
+    test: list[str] = []
+
+
+class FrameSplit(_Table):
+    """Novel-pose frames are fitted but not trained on."""
+
+    train: list[FrameNumber] = Field(min_length=1)
+    novel_pose: list[FrameNumber] = []
+
+
+class Notes(_Table):
+    """`capture.toml`. Descriptive keys (subject, licence, ...) are anyone's own; those below have a meaning."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
+
+    name: str | None = None
+    fps: float | None = Field(default=None, gt=0, le=10_000)
+    up: Literal["y", "z"] = "z"
+    units: Literal["m", "mm"] = "m"
+    cameras: CameraSplit | None = None
+    frames: FrameSplit | None = None
+
+
+def read_notes(folder: Path) -> Notes:
+    """The folder's `capture.toml`, or the defaults without one; CaptureError on a bad key or value."""
+    path = inside(folder, "capture.toml")
+    try:
+        return Notes.model_validate(read_toml(path)) if path.exists() else Notes()
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise CaptureError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}; correct it") from None
+
+
+def capture_name(folder: Path, notes: Notes) -> str:
+    """What the subject is called; it becomes a folder name, so CaptureError if it cannot be one."""
+    name = folder.resolve().name if notes.name is None else notes.name
+    if not re.fullmatch(r"\w[\w .()-]{0,127}", name):
+        raise CaptureError(f"{folder / 'capture.toml'}: name {name!r}: use letters, digits, '_', '-', '.' and spaces")
+    return name
+
+
+def chosen_cameras(folder: Path, notes: Notes, calibrated: list[str]) -> CameraSplit:
+    """The cameras that `capture.toml` names, else all for training; CaptureError on one unknown or named twice."""
+    if notes.cameras is None:
+        return CameraSplit(train=calibrated)
+    _check(folder, "camera", notes.cameras.train + notes.cameras.test, calibrated, "the calibration")
+    return notes.cameras
+
+
+def chosen_frames(
+    folder: Path, notes: Notes, recorded: tuple[int, ...], novel_pose_share: float, max_frames: int
+) -> FrameSplit:
+    """The frames that `capture.toml` names, else the first of the recorded ones for training and a last share for novel
+    poses, evenly strided so that at most `max_frames` are for training.
+
+    Neighbouring frames of a long recording are nearly the same picture, while fitting and training pay for each.
+    CaptureError on a frame that is not recorded or is named twice.
+    """
+    if notes.frames is None:
+        novel = recorded[len(recorded) - int(novel_pose_share * len(recorded)) :]
+        train = recorded[: len(recorded) - len(novel)]
+        stride = math.ceil(len(train) / max_frames)
+        return FrameSplit(train=list(train[::stride]), novel_pose=list(novel[::stride]))
+    _check(folder, "frame", notes.frames.train + notes.frames.novel_pose, recorded, "the recording")
+    return notes.frames
+
+
+def _check(folder: Path, what: str, named: list, known: Collection, where: str) -> None:
+    path, known_set = folder / "capture.toml", set(known)
+    for item in named:
+        if item not in known_set:
+            raise CaptureError(f"{path}: {what} {item} is not in {where}; correct [{what}s]")
+    if len(set(named)) < len(named):
+        raise CaptureError(f"{path}: a {what} is named twice; correct [{what}s]")

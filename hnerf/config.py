@@ -1,0 +1,177 @@
+"""Every setting, typed, frozen, with units in the names. Unknown keys are refused.
+
+A preset is a YAML file under `configs/`; `load_settings("fast", ["training.seconds=60"])` reads one and overrides it.
+"""
+
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from hnerf.errors import CaptureError
+
+CONFIGS = Path(__file__).parent.parent / "configs"
+
+
+class Section(BaseModel):
+    """One stage's settings: frozen, no unknown keys, no values outside their type."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class CaptureSettings(Section):
+    max_side_px: int = Field(default=1024, ge=16)  # longer images are shrunk at the door
+    max_frames: int = Field(default=60, ge=1)  # training frames where no capture.toml chooses; evenly strided
+
+
+class PerformerSettings(Section):
+    """The synthetic capture that `hnerf synth` writes; no stage of a run reads it."""
+
+    seed: int = Field(default=0, ge=0)
+    size_px: int = Field(default=256, ge=16, le=4096)
+    train_frames: int = Field(default=20, ge=1)
+    novel_pose_frames: int = Field(default=6, ge=0)
+    fps: float = Field(default=10.0, gt=0)
+
+
+class CalibrationSettings(Section):
+    max_residual_px: float = Field(default=5.0, gt=0)  # median a camera may show before its pose is refined
+    min_improvement: float = Field(default=0.05, ge=0, lt=1)  # share by which held-out frames must gain to accept it
+
+
+class SegmentationSettings(Section):
+    shadow_chroma: float = Field(default=0.055, gt=0)  # a shadow changes log colour ratios by no more than this
+    darkest_shadow: float = Field(default=0.27, gt=0, lt=1)  # brightness left in the deepest shadow
+    reach: float = Field(default=0.13, gt=0)  # how far clothes and hair reach from limbs, in heights of the person
+
+
+class FitSettings(Section):
+    keypoint_m: float = 0.02  # standard deviation of a keypoint seen with full confidence
+    keypoint_outlier_m: float = 0.15  # where a keypoint's pull fades
+    offset_m: float = 0.02
+    phenotype_spread: float = 0.25
+    local_change_spread: float = 0.3
+    inside_m: float = 0.008
+    outside_m: float = 0.02
+    clothing_m: float = 0.08
+    spacing_m: float = 0.03
+    contour_steps: int = 10
+    acceleration_mps2: float = 15.0
+
+
+class FastFieldSettings(Section):
+    """The fast machinery: shell, grids and small networks."""
+
+    outer_m: float = Field(default=0.07, gt=0)  # the shell's thickness outside the body
+    inner_m: float = Field(default=0.03, gt=0)  # and inside
+    shell_cell_m: float = Field(default=0.02, gt=0)
+    samples: int = Field(default=24, ge=2)
+    geometry_cells: tuple[int, ...] = (16, 32, 64)  # on the box's longest side, a level each
+    colour_cells: tuple[int, ...] = (24, 64, 112, 192)
+    channels: int = Field(default=4, ge=1)
+    width: int = Field(default=64, ge=1)
+    pose_width: int = Field(default=8, ge=1)
+    initial_sharpness_per_m: float = Field(default=100.0, gt=0)
+    gradient_step_m: float = Field(default=0.005, gt=0)
+    grid_learning_rate: float = Field(default=1e-2, gt=0)
+    network_learning_rate: float = Field(default=2e-3, gt=0)
+
+
+class PaperFieldSettings(Section):
+    """The paper's machinery; distances inside it are in scene units."""
+
+    scene_m: float = Field(default=2.5, gt=0)  # half the scene's edge, the unit of sigma_h and gamma
+    box_margin_m: float = Field(default=0.1, gt=0)
+    samples: int = Field(default=256, ge=2)  # coarse, and as many fine
+    sharpness: float = Field(default=200.0, gt=0)  # gamma
+    learning_rate: float = Field(default=1e-3, gt=0)
+
+
+class LossSettings(Section):
+    """Weights of the nine losses in the form of hnerf/training/losses.py, and their constants."""
+
+    reconstruction: float = Field(default=1.0, ge=0)
+    mask: float = Field(default=1.0, ge=0)
+    blend: float = Field(default=0.1, ge=0)
+    geometry: float = Field(default=0.02, ge=0)
+    segmentation: float = Field(default=0.02, ge=0)
+    eikonal: float = Field(default=1e-6, ge=0)
+    residual: float = Field(default=5e-4, ge=0)
+    fit: float = Field(default=1.0, ge=0)
+    increment: float = Field(default=0.02, ge=0)
+    eta: float = Field(default=1.0, ge=0)  # of the surroundings in blend; 0.25 where floor or furniture is near
+    density_threshold: float = Field(default=50.0, gt=0)  # sigma_h, per scene unit
+    density_steepness: float = Field(default=0.1, gt=0)  # lambda: sigmoid leaves 0.007 for no density, 0.993 for 2 sigma_h
+    sharpness_per_m: float = Field(default=80.0, gt=0)  # gamma = 200 per 2.5 m
+
+
+class TrainingSettings(Section):
+    machinery: Literal["fast", "paper"] = "fast"
+    fast: FastFieldSettings = FastFieldSettings()
+    paper: PaperFieldSettings = PaperFieldSettings()
+    losses: LossSettings = LossSettings()
+    steps: int = Field(default=400, ge=1)
+    novel_pose_steps: int = Field(default=100, ge=0)  # poses of novel frames, against the finished field
+    frames_per_step: int = Field(default=8, ge=1)
+    rays_per_frame: int = Field(default=384, ge=1)
+    pose_learning_rate: float = Field(default=5e-4, ge=0)  # 0 keeps the fitted poses and shape
+    absorb_steps: int = Field(default=100, ge=1)  # between exact updates of the posed bodies
+    final_learning_rate: float = Field(default=0.1, gt=0, le=1)  # share of the first that is left at the end
+    noise: float = Field(default=0.1, ge=0)  # on theta, T and v
+    checkpoint_steps: int = Field(default=100, ge=1)
+    processes: int = Field(default=0, ge=0)  # 0: one a GPU, or one
+    seed: int = Field(default=0, ge=0)
+
+
+class EvaluationSettings(Section):
+    max_meshes: int = Field(default=4, ge=1)  # a split
+    report_rows: int = Field(default=3, ge=1)  # frames shown of each split
+
+
+class AssetSettings(Section):
+    grid_cells: int = 256  # of marching cubes, on the longest side
+    margin_m: float = 0.2  # how far hair and clothes may stand off the body
+    faces: int = 20_000
+    texture_px: int = 1024
+    texture_poses: int = 3  # of the capture; each texel takes the median colour
+
+
+class Settings(Section):
+    """One section a stage; a stage's cache key depends on its own section only."""
+
+    capture: CaptureSettings = CaptureSettings()
+    calibration: CalibrationSettings = CalibrationSettings()
+    segmentation: SegmentationSettings = SegmentationSettings()
+    fit: FitSettings = FitSettings()
+    training: TrainingSettings = TrainingSettings()
+    evaluation: EvaluationSettings = EvaluationSettings()
+    asset: AssetSettings = AssetSettings()
+
+
+def load_settings(preset: str, overrides: list[str] | None = None) -> Settings:
+    """Settings from a preset's name or a YAML file's path, with overrides like "training.steps=100".
+
+    Raises CaptureError with one line if the preset is unknown, or a key or value is not allowed.
+    """
+    path = CONFIGS / f"{preset}.yaml" if (CONFIGS / f"{preset}.yaml").exists() else Path(preset)
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in CONFIGS.glob("*.yaml")))
+        raise CaptureError(f"{preset}: no such preset or file; presets are {known}")
+    tree: dict[str, Any] = yaml.safe_load(path.read_text()) or {}
+    for override in overrides or []:
+        key, equals, value = override.partition("=")
+        if not equals:
+            raise CaptureError(f"--set {override}: write it as section.name=value")
+        *sections, leaf = key.split(".")
+        node = tree
+        for section in sections:
+            node = node.setdefault(section, {})
+            if not isinstance(node, dict):
+                raise CaptureError(f"--set {override}: {section} is not a section")
+        node[leaf] = yaml.safe_load(value)
+    try:
+        return Settings.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise CaptureError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None

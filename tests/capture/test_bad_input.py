@@ -1,0 +1,201 @@
+"""Broken recordings are refused with one line that names the file, before anything is made of them."""
+
+import json
+import os
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.capture.ingest import ingest
+from hnerf.config import CaptureSettings
+from hnerf.errors import CaptureError
+from tests.capture import recordings as rec
+
+
+class Bomb:
+    """A pickle that leaves a trace if anyone loads it."""
+
+    def __reduce__(self) -> tuple:
+        return os.system, ("touch pickle-was-loaded",)
+
+
+def _edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def _nan_keypoint(folder: Path) -> None:
+    points = np.full((25, 3), 0.5).tolist()
+    points[3][0] = float("nan")
+    rec.write_keypoints(folder / "openpose/01/000001_keypoints.json", [points])
+
+
+def _link(folder: Path, name: str) -> None:
+    target = folder.parent / "elsewhere"
+    (folder / name).rename(target)
+    (folder / name).symlink_to(target)
+
+
+def _huge_png(folder: Path) -> None:
+    """A PNG whose header claims 60000 x 60000 pixels."""
+    path = folder / "images/02/000003.png"
+    data = bytearray(path.read_bytes())
+    data[16:24] = (60000).to_bytes(4, "big") * 2
+    path.write_bytes(data)
+
+
+def _toml(text: str) -> Callable[[Path], object]:
+    return lambda folder: (folder / "capture.toml").write_text(text)
+
+
+EASYMOCAP = {
+    "extri missing": (lambda f: (f / "extri.yml").unlink(), "extri.yml"),
+    "intri is a pickle": (lambda f: (f / "intri.yml").write_bytes(pickle.dumps(Bomb())), "intri.yml"),
+    "intri is an ASCII pickle": (lambda f: (f / "intri.yml").write_bytes(pickle.dumps(Bomb(), 0)), "intri.yml"),
+    "intri is nested deeply": (lambda f: (f / "intri.yml").write_text("%YAML:1.0\n---\na: " + "[" * 5000), "intri.yml"),
+    "NaN in K": (lambda f: _edit(f / "intri.yml", "20.", ".Nan"), "intri.yml: K_01"),
+    "NaN in T": (lambda f: _edit(f / "extri.yml", "data: [ 0., 1., 3. ]", "data: [ .Nan, 1., 3. ]"), "extri.yml: T_01"),
+    "plain nan in K": (lambda f: _edit(f / "intri.yml", "20.", "nan"), "intri.yml: camera 01: K"),
+    "K of zero focal length": (lambda f: _edit(f / "intri.yml", "20.", "0."), "intri.yml"),
+    "camera not in extri": (lambda f: _edit(f / "extri.yml", "T_02", "T_03"), "extri.yml: T_02"),
+    "matrix of a billion rows": (lambda f: _edit(f / "intri.yml", "rows: 3", "rows: 1000000000"), "intri.yml: K_01"),
+    "matrix shorter than declared": (lambda f: _edit(f / "intri.yml", "cols: 3", "cols: 5"), "intri.yml: K_01"),
+    "intri of a gigabyte": (lambda f: os.truncate(f / "intri.yml", 10**9), "intri.yml"),
+    "camera name leaves the folder": (lambda f: _edit(f / "intri.yml", '"01"', '"../01"'), "intri.yml"),
+    "camera without a folder": (lambda f: (f / "images/02").rename(f / "images/03"), "images/02"),
+    "camera without images": (lambda f: [p.unlink() for p in (f / "images/02").iterdir()], "images/02"),
+    "unequal frame counts": (lambda f: (f / "images/02/000004.png").unlink(), "images/02: 4 frames"),
+    "frame without a number": (lambda f: (f / "images/01/000001.png").rename(f / "images/01/a.png"), "images/01/a.png"),
+    "unreadable image": (lambda f: (f / "images/01/000001.png").write_bytes(b"nothing"), "images/01/000001.png"),
+    "image cut short": (lambda f: os.truncate(f / "images/01/000001.png", 700), "images/01/000001.png"),
+    "image of enormous size": (_huge_png, "images/02/000003.png"),
+    "image of another size": (
+        lambda f: rec.write_png(f / "images/01/000002.png", np.zeros((8, 8, 3), np.uint8)),
+        "images/01/000002.png: is 8 x 8 px",
+    ),
+    "calibrated at another size": (
+        lambda f: _edit(f / "intri.yml", "W_02: 24", "W_02: 32"),
+        "24 x 16 px, but camera 02",
+    ),
+    "plate of another size": (
+        lambda f: rec.write_png(f / "background/01.png", np.zeros((8, 8, 3), np.uint8)),
+        "background/01.png",
+    ),
+    "mask missing": (
+        lambda f: rec.write_png(f / "masks/01/000002.png", np.zeros((16, 24, 3), np.uint8)),
+        "masks/01: 1 masks for 5 frames",
+    ),
+    "empty keypoint file": (
+        lambda f: (f / "openpose/01/000001_keypoints.json").write_text(""),
+        "000001_keypoints.json: is empty",
+    ),
+    "keypoint file missing": (lambda f: (f / "openpose/01/000001_keypoints.json").unlink(), "openpose/01: 4 keypoints"),
+    "keypoints are a pickle": (
+        lambda f: (f / "openpose/01/000001_keypoints.json").write_bytes(pickle.dumps(Bomb())),
+        "000001_keypoints.json",
+    ),
+    "keypoints are an archive": (
+        lambda f: np.savez(open(f / "openpose/01/000001_keypoints.json", "wb"), a=1),  # noqa: SIM115
+        "000001_keypoints.json",
+    ),
+    "keypoints of another model": (
+        lambda f: rec.write_keypoints(f / "openpose/01/000001_keypoints.json", [np.zeros((18, 3))]),
+        "000001_keypoints.json",
+    ),
+    "keypoints nested deeply": (
+        lambda f: (f / "openpose/01/000001_keypoints.json").write_text("[" * 100_000),
+        "000001_keypoints.json",
+    ),
+    "NaN keypoint": (_nan_keypoint, "000001_keypoints.json"),
+    "a thousand people": (
+        lambda f: (f / "openpose/01/000001_keypoints.json").write_text(json.dumps({"people": [{}] * 1000})),
+        "1000 people",
+    ),
+    "linked image folder": (lambda f: _link(f, "images/01"), "images/01: is a symbolic link"),
+    "linked image": (lambda f: _link(f, "images/01/000001.png"), "000001.png: is a symbolic link"),
+    "linked calibration": (lambda f: _link(f, "intri.yml"), "intri.yml: is a symbolic link"),
+    "toml is not TOML": (_toml("name = "), "capture.toml"),
+    "toml with an unknown key": (_toml('[cameras]\ntrain = ["01"]\nvalidation = ["02"]\n'), "cameras.validation"),
+    "toml with unknown units": (_toml('units = "inch"\n'), "units"),
+    "toml with an unknown camera": (_toml('[cameras]\ntrain = ["01", "07"]\n'), "camera 07"),
+    "toml with a camera twice": (_toml('[cameras]\ntrain = ["01"]\ntest = ["01"]\n'), "named twice"),
+    "toml with an unknown frame": (_toml("[frames]\ntrain = [0, 5]\n"), "frame 5"),
+    "toml without training frames": (_toml("[frames]\ntrain = []\n"), "frames.train"),
+    "toml name leaves the store": (_toml('name = "../../other"\n'), "name '../../other'"),
+}
+
+POSE2SIM = {
+    "no calibration file": (lambda f: (f / "calibration/Calib.toml").unlink(), "calibration: 0 files"),
+    "calibration is a pickle": (
+        lambda f: (f / "calibration/Calib.toml").write_bytes(pickle.dumps(Bomb())),
+        "Calib.toml",
+    ),
+    "NaN": (lambda f: _edit(f / "calibration/Calib.toml", "50.0", "nan"), "Calib.toml: camera cam01: K"),
+    "key missing": (
+        lambda f: _edit(f / "calibration/Calib.toml", "rotation", "rot"),
+        "Calib.toml: camera cam01: 'rotation'",
+    ),
+    "camera is no table": (
+        lambda f: _edit(f / "calibration/Calib.toml", "[cam01]", "cam03 = 1\n[cam01]"),
+        "camera cam03",
+    ),
+    "fisheye": (lambda f: _edit(f / "calibration/Calib.toml", "fisheye = false", "fisheye = true"), "fisheye"),
+    "video missing": (lambda f: (f / "videos/cam02.mp4").unlink(), "videos/cam02.mp4"),
+    "video is none": (lambda f: (f / "videos/cam02.mp4").write_bytes(b"0" * 100), "videos/cam02.mp4"),
+    "video cut short": (lambda f: _cut_video(f / "videos/cam02.mp4"), "videos/cam02.mp4"),
+    "unequal frame counts": (lambda f: rec.write_video(f / "videos/cam02.mp4", 9), "videos/cam02.mp4: 9 frames"),
+    "video of another size": (
+        lambda f: rec.write_video(f / "videos/cam02.mp4", 10, (48, 64)),
+        "videos/cam02.mp4: is 48 x 64",
+    ),
+    "keypoint file missing": (
+        lambda f: (f / "pose/cam01_json/cam01_000003.json").unlink(),
+        "pose/cam01_json: 9 keypoints",
+    ),
+}
+
+
+def _cut_video(path: Path) -> None:
+    """The header still promises ten frames; the data of the later ones is gone."""
+    data = path.read_bytes()
+    start = data.index(b"mdat") + 4
+    length = int.from_bytes(data[start - 8 : start - 4], "big") - 8
+    path.write_bytes(data[: start + length // 2] + bytes(length - length // 2) + data[start + length :])
+
+
+def _refused(folder: Path, tmp_path: Path, names: str) -> None:
+    with pytest.raises(CaptureError) as refusal:
+        ingest(folder, CaptureSettings(), tmp_path / "out")
+    message = str(refusal.value)
+    assert names in message and "\n" not in message and len(message) < 400
+    assert not (tmp_path / "out" / "capture.json").exists()
+
+
+@pytest.mark.parametrize("case", EASYMOCAP)
+def test_broken_easymocap_folder_is_refused(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = rec.write_easymocap(tmp_path / "person")
+    damage, names = EASYMOCAP[case]
+    damage(folder)
+    _refused(folder, tmp_path, names)
+    assert not (tmp_path / "pickle-was-loaded").exists()
+
+
+@pytest.mark.parametrize("case", POSE2SIM)
+def test_broken_pose2sim_folder_is_refused(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = rec.write_pose2sim(tmp_path / "walker")
+    damage, names = POSE2SIM[case]
+    damage(folder)
+    _refused(folder, tmp_path, names)
+    assert not (tmp_path / "pickle-was-loaded").exists()
+
+
+def test_folder_that_is_no_capture_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    _refused(tmp_path / "empty", tmp_path, "neither EasyMocap")
+    _refused(tmp_path / "absent", tmp_path, "no such folder")

@@ -1,0 +1,160 @@
+"""What comes through the door: pixels, cameras and keypoints of a small recording, worked out by hand."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hnerf.capture.capture import Capture
+from hnerf.capture.ingest import ingest
+from hnerf.config import CaptureSettings
+from tests.capture import recordings as rec
+from tests.shared_data import shared_capture
+
+SETTINGS = CaptureSettings()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return rec.write_easymocap(tmp_path / "person")
+
+
+def test_without_capture_toml_everything_is_for_training(folder: Path, tmp_path: Path) -> None:
+    capture = ingest(folder, SETTINGS, tmp_path / "out")
+    assert (capture.name, capture.fps, capture.up) == ("person", 30.0, "z")
+    assert capture.train_cameras == ("01", "02") and capture.test_cameras == ()
+    assert capture.train_frames == (0, 1, 2, 3, 4) and capture.novel_pose_frames == ()
+
+
+def test_unchanged_images_are_copied_byte_for_byte(folder: Path, tmp_path: Path) -> None:
+    ingest(folder, SETTINGS, tmp_path / "out")
+    for camera in rec.CAMERAS:
+        for frame in rec.FRAMES:
+            name = Path("images", camera, f"{frame:06d}.png")
+            assert (tmp_path / "out" / name).read_bytes() == (folder / name).read_bytes()
+
+
+def test_saved_capture_loads_equal(folder: Path, tmp_path: Path) -> None:
+    written, loaded = ingest(folder, SETTINGS, tmp_path / "out"), Capture.load(tmp_path / "out")
+    for camera in rec.CAMERAS:
+        a, b = written.cameras[camera], loaded.cameras[camera]
+        assert (a.name, a.width_px, a.height_px) == (b.name, b.width_px, b.height_px)
+        assert np.array_equal(a.projection, b.projection)
+    plain = ("name", "train_cameras", "train_frames", "recorded_sizes_px", "calibrated_sizes_px")
+    assert all(getattr(written, field) == getattr(loaded, field) for field in plain)
+
+
+def test_cameras_are_where_the_calibration_puts_them(folder: Path, tmp_path: Path) -> None:
+    cameras = ingest(folder, SETTINGS, tmp_path / "out").cameras
+    assert cameras["01"].centre_m == pytest.approx([-3, 0, 1], abs=1e-9)
+    assert cameras["02"].centre_m == pytest.approx([0, -3, 1], abs=1e-9)
+    # A point 3 m ahead of camera 02, 0.3 m to its right and 0.15 m below: 20 px * 0.3 / 3 = 2 px, and 1 px.
+    pixel, depth_m = cameras["02"].project(np.array([0.3, 0.0, 0.85]))
+    assert pixel == pytest.approx([13.5, 8.5]) and depth_m == pytest.approx(3.0)
+
+
+def test_millimetres_become_metres(folder: Path, tmp_path: Path) -> None:
+    rec.write_calibration(folder, t_scale=1000.0)
+    (folder / "capture.toml").write_text('units = "mm"\n')
+    assert ingest(folder, SETTINGS, tmp_path / "out").cameras["01"].centre_m == pytest.approx([-3, 0, 1])
+
+
+def test_capture_toml_names_and_splits(folder: Path, tmp_path: Path) -> None:
+    (folder / "capture.toml").write_text(
+        'name = "Ann B."\nfps = 12.5\nup = "y"\nlicence = "CC0"\n[cameras]\ntrain = ["02"]\ntest = ["01"]\n'
+        "[frames]\ntrain = [1, 3]\nnovel_pose = [4]\n"
+    )
+    capture = ingest(folder, SETTINGS, tmp_path / "out")
+    assert (capture.name, capture.fps, capture.up) == ("Ann B.", 12.5, "y")
+    assert (capture.train_cameras, capture.test_cameras) == (("02",), ("01",))
+    assert (capture.train_frames, capture.novel_pose_frames, capture.frames) == ((1, 3), (4,), (1, 3, 4))
+    assert sorted(p.name for p in (tmp_path / "out" / "images" / "01").iterdir()) == [
+        "000001.png",
+        "000003.png",
+        "000004.png",
+    ]
+
+
+def test_long_recordings_are_strided_evenly(folder: Path, tmp_path: Path) -> None:
+    assert ingest(folder, CaptureSettings(max_frames=3), tmp_path / "out").train_frames == (0, 2, 4)
+
+
+def test_keypoints_hold_all_people_in_frame_order(folder: Path, tmp_path: Path) -> None:
+    keypoints = ingest(folder, SETTINGS, tmp_path / "out").keypoints("02")
+    assert keypoints is not None and keypoints.shape == (5, 2, 25, 3)
+    assert keypoints[:, 0, 7].tolist() == [[3.0 + frame, 5.0, 0.5] for frame in rec.FRAMES]
+    assert keypoints[2, 1, 7].tolist() == [6.0, 5.0, 0.5]
+    assert not keypoints[[0, 1, 3, 4], 1].any()
+
+
+def test_shrinking_takes_camera_keypoints_and_masks_along(folder: Path, tmp_path: Path) -> None:
+    mask = np.zeros((rec.HEIGHT, rec.WIDTH), np.uint8)
+    mask[:8, :12] = 1  # not 255: anything but black is the person
+    for camera in rec.CAMERAS:
+        for frame in rec.FRAMES:
+            rec.write_png(folder / "masks" / camera / f"{frame:06d}.png", np.repeat(mask[..., None], 3, -1))
+    capture = ingest(folder, CaptureSettings(max_side_px=16), tmp_path / "out")  # 24 x 16 -> 16 x 11
+    camera, keypoints, shrunk = capture.cameras["01"], capture.keypoints("01"), capture.given_mask("01", 0)
+    assert (camera.width_px, camera.height_px) == (16, 11) and capture.image("01", 0).shape == (11, 16, 3)
+    assert capture.recorded_sizes_px["01"] == (24, 16)
+    sx, sy = 16 / 24, 11 / 16
+    assert camera.K[0].tolist() == pytest.approx([20 * sx, 0, (11.5 + 0.5) * sx - 0.5])
+    assert keypoints is not None and keypoints[0, 0, 0] == pytest.approx([(3.5 * sx) - 0.5, (5.5 * sy) - 0.5, 0.5])
+    assert shrunk is not None and shrunk[:5, :8].all() and not shrunk[6:].any() and not shrunk[:, 8:].any()
+
+
+def test_distorted_recording_comes_out_linear(folder: Path, tmp_path: Path) -> None:
+    """k1 = -0.5: what the lens shows at radius r (1 - 0.5 r^2) belongs at radius r."""
+    rec.write_calibration(folder, distortion=(-0.5, 0, 0, 0))
+    # At r = 0.4 the lens shows 0.4 (1 - 0.5 * 0.16) = 0.368: 20 px * 0.368 = 7.36 px right of 11.5.
+    points = np.tile([11.5 + 7.36, 7.5, 0.9], (25, 1))
+    for frame in rec.FRAMES:
+        rec.write_keypoints(folder / "openpose" / "01" / f"{frame:06d}_keypoints.json", [points])
+    ramp = np.repeat(np.arange(rec.WIDTH, dtype=np.uint8)[None, :, None] * 10, rec.HEIGHT, 0).repeat(3, -1)
+    for frame in rec.FRAMES:
+        rec.write_png(folder / "images" / "01" / f"{frame:06d}.png", ramp)
+    capture = ingest(folder, SETTINGS, tmp_path / "out")
+    keypoints = capture.keypoints("01")
+    assert keypoints is not None and keypoints[0, 0, 0] == pytest.approx([11.5 + 8.0, 7.5, 0.9], abs=1e-3)
+    # Pixel (19, 7): x = 7.5 / 20, r^2 = 0.375^2 + 0.025^2; shown at 11.5 + 7.5 (1 - 0.5 r^2), on a ramp of 10 a pixel.
+    expected = 10 * (11.5 + 7.5 * (1 - 0.5 * (0.375**2 + 0.025**2)))
+    assert capture.image("01", 0)[7, 19] == pytest.approx([expected] * 3, abs=2.5)  # remap's 1/32 px, and JPEG
+    assert np.array_equal(capture.cameras["01"].K, np.array(rec.K))
+
+
+def test_clean_plates_come_along(folder: Path, tmp_path: Path) -> None:
+    rec.write_png(folder / "background" / "01.png", rec.picture("01", 99))
+    capture = ingest(folder, SETTINGS, tmp_path / "out")
+    plate = capture.background("01")
+    assert plate is not None and np.array_equal(plate, rec.picture("01", 99))
+    assert capture.background("02") is None
+
+
+def test_padding_within_two_percent_is_let_through_and_reported(folder: Path, tmp_path: Path) -> None:
+    text = (folder / "intri.yml").read_text()
+    (folder / "intri.yml").write_text(text.replace("W_01: 24", "W_01: 2400").replace("H_01: 16", "H_01: 1600"))
+    for frame in rec.FRAMES:
+        rec.write_png(folder / "images" / "01" / f"{frame:06d}.png", np.zeros((1600, 2352, 3), np.uint8))
+    capture = ingest(folder, CaptureSettings(max_side_px=1176), tmp_path / "out")
+    assert capture.calibrated_sizes_px["01"] == (2400, 1600) and capture.recorded_sizes_px["01"] == (2352, 1600)
+    assert (capture.cameras["01"].width_px, capture.cameras["01"].height_px) == (1176, 800)
+    assert capture.cameras["01"].K[0, 0] == pytest.approx(10.0)  # the calibrated 20, halved with the image
+
+
+def test_videos_are_read_by_frame(tmp_path: Path) -> None:
+    folder = rec.write_pose2sim(tmp_path / "walker")
+    capture = ingest(folder, CaptureSettings(max_frames=3), tmp_path / "out")
+    # The last fifth of ten frames is for novel poses; eight are strided by three.
+    assert capture.train_frames == (0, 3, 6) and capture.novel_pose_frames == (8,)
+    assert capture.fps == pytest.approx(25.0)
+    for frame in (0, 3, 6, 8):
+        assert capture.image("cam02", frame).mean() == pytest.approx(20 + 20 * frame, abs=3)
+
+
+def test_shared_captures_come_through(tmp_path: Path) -> None:
+    folder = shared_capture("valid-wave")
+    capture = ingest(folder, SETTINGS, tmp_path / "out")
+    assert (len(capture.train_frames), len(capture.novel_pose_frames)) == (24, 12)
+    image = cv2.imread(str(folder / "images" / "05" / "000035.jpg"))[..., ::-1]
+    assert np.array_equal(capture.image("05", 35), image)
