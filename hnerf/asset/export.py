@@ -1,0 +1,99 @@
+"""From a trained avatar to files that any 3-D program opens."""
+
+import dataclasses
+import json
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+
+from hnerf.asset.glb import write_glb
+from hnerf.asset.rig_transfer import dressed_rig
+from hnerf.asset.simplify import simplified
+from hnerf.asset.staging import stage_avatar
+from hnerf.asset.surface import extract_surface
+from hnerf.asset.texture import bake, unwrap
+from hnerf.asset.usd import write_cache, write_skinned
+from hnerf.asset.validation import validate_package
+from hnerf.body.fit_result import BodyFit
+from hnerf.body.rig import Rig
+from hnerf.capture.capture import Capture
+from hnerf.config import AssetSettings
+from hnerf.render.avatar import Avatar
+
+log = logging.getLogger("hnerf.asset")
+
+
+def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out: Path) -> dict[str, Any]:
+    """Write `avatar.usdz`, `avatar_cache.usdz`, `avatar.glb` and `report.json` into `out`; returns the report.
+
+    Raises CaptureError if the field has no surface, InvalidAsset if a package does not pass validation.
+    """
+    seconds: dict[str, float] = {}
+    with _timed("surface", seconds):
+        dense = canonical_surface(avatar, settings)
+    with _timed("mesh", seconds):
+        surface = simplified(dense, settings.faces)
+        layout = unwrap(surface.vertices, surface.faces, settings.texture_px)
+        rig = dressed_rig(avatar.body.rig.to("cpu"), surface, layout)
+    with _timed("texture", seconds):
+        spread = np.linspace(0, len(capture.train_frames) - 1, min(settings.texture_poses, len(capture.train_frames)))
+        posed = _dressed_body(avatar.body, rig, tuple(capture.train_frames[round(i)] for i in spread))
+        texture = bake(avatar, posed, layout, settings.texture_px)
+    with _timed("files", seconds):
+        staged = stage_avatar(_dressed_body(avatar.body, rig, capture.frames), texture, capture.up)
+        cameras = list(capture.cameras.values())
+        write_skinned(out / "avatar.usdz", staged, cameras, capture.fps)
+        write_cache(out / "avatar_cache.usdz", staged, cameras, capture.fps)
+        write_glb(out / "avatar.glb", staged, capture.fps)
+    with _timed("validation", seconds):
+        validation = {name: validate_package(out / name) for name in ("avatar.usdz", "avatar_cache.usdz")}
+    report = {
+        "surface": {"faces": len(dense.faces), "watertight": dense.is_watertight, "volume_l": 1e3 * dense.volume},
+        "mesh": {
+            "vertices": len(surface.vertices),
+            "faces": len(surface.faces),
+            "watertight": surface.is_watertight,
+            "height_m": float(np.ptp(staged.rest_points_m[:, 1])),
+        },
+        "texture_px": settings.texture_px,
+        "joints": len(rig.joint_names),
+        "frames": len(capture.frames),
+        "cameras": len(cameras),
+        "bytes": {path.name: path.stat().st_size for path in sorted(out.glob("avatar*"))},
+        "seconds": seconds,
+        "validation": validation,
+    }
+    (out / "report.json").write_text(json.dumps(report, indent=1))
+    return report
+
+
+def canonical_surface(avatar: Avatar, settings: AssetSettings) -> trimesh.Trimesh:
+    """The clothed surface in the rest pose of the fitted shape, in the body frame."""
+    rig = avatar.body.rig
+    device = rig.vertices_m.device
+    theta, root = torch.zeros(len(rig.joints_m), 3, device=device), torch.eye(4, device=device)
+    lower_m = rig.vertices_m.min(0).values - settings.margin_m
+    upper_m = rig.vertices_m.max(0).values + settings.margin_m
+    return extract_surface(
+        lambda points_m: avatar.signed_distance(points_m, theta, root), lower_m, upper_m, settings.grid_cells
+    )
+
+
+def _dressed_body(body: BodyFit, rig: Rig, frames: tuple[int, ...]) -> BodyFit:
+    rows = [body.index(frame) for frame in frames]
+    return dataclasses.replace(body, rig=rig, frames=frames, theta=body.theta[rows].cpu(), root=body.root[rows].cpu())
+
+
+@contextmanager
+def _timed(step: str, seconds: dict[str, float]) -> Iterator[None]:
+    log.info("asset: %s", step)
+    start_s = time.perf_counter()
+    yield
+    seconds[step] = round(time.perf_counter() - start_s, 3)

@@ -1,0 +1,63 @@
+"""The body's rig on another surface: the clothed person moves with the body beneath."""
+
+import dataclasses
+
+import torch
+import trimesh
+from torch import Tensor
+
+from hnerf.asset.texture import UvLayout
+from hnerf.body.descriptor import BodyMeshes
+from hnerf.body.rig import Rig
+
+MAX_INFLUENCES = 8
+SMOOTHING_PASSES = 4
+REACH_M = 10.0  # nothing of a person is further from the body than this
+
+
+def dressed_rig(rig: Rig, surface: trimesh.Trimesh, layout: UvLayout) -> Rig:
+    """The same joints under a surface in the rest pose. Shape is frozen (no basis left), and it has no keypoints."""
+    vertices_m = torch.from_numpy(surface.vertices).float()
+    faces = torch.from_numpy(surface.faces).long()
+    skin_joints, skin_weights = transfer_skin(rig, vertices_m, faces)
+    return dataclasses.replace(
+        rig,
+        vertices_m=vertices_m,
+        faces=faces,
+        uvs=torch.from_numpy(layout.uvs),
+        face_uvs=torch.from_numpy(layout.face_uvs),
+        beta=rig.beta[:0],
+        beta_names=(),
+        shape_basis=torch.zeros(0, len(vertices_m), 3),
+        joint_basis=torch.zeros(0, len(rig.joints_m), 3),
+        skin_joints=skin_joints,
+        skin_weights=skin_weights,
+        keypoint_weights=torch.zeros(0, len(vertices_m)),
+    )
+
+
+def transfer_skin(rig: Rig, vertices_m: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """Joints (V, 8) and weights (V, 8) for a surface (V, 3), (F, 3) around the rest body, largest weight first.
+
+    Each vertex takes the weights at the closest point of the body, barycentric in its triangle; a few Laplacian passes
+    then soften the jumps where the closest point leaps from one limb to another.
+    """
+    body, only = BodyMeshes(rig.vertices_m[None], rig.faces), torch.zeros(len(vertices_m), dtype=torch.int32)
+    found = body.closest_points(vertices_m, only, REACH_M)
+    dense = torch.zeros(len(rig.vertices_m), len(rig.joints_m))
+    dense.scatter_add_(1, rig.skin_joints, rig.skin_weights)
+    weights = (dense[rig.faces[found.face]] * found.barycentric[..., None]).sum(1)
+    start, end = _edges(faces)
+    neighbours = torch.bincount(start, minlength=len(weights))[:, None]
+    for _ in range(SMOOTHING_PASSES):
+        average = torch.zeros_like(weights).index_add_(0, start, weights[end]) / neighbours
+        weights = (weights + average) / 2
+    top, joints = weights.topk(min(MAX_INFLUENCES, weights.shape[1]), dim=1)
+    return torch.where(top > 0, joints, 0), top / top.sum(1, keepdim=True)
+
+
+def _edges(faces: Tensor) -> tuple[Tensor, Tensor]:
+    """Start and end vertex of every edge, in both directions."""
+    edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    start, end = torch.cat([edges, edges.flip(1)]).unique(dim=0).unbind(1)
+    return start, end

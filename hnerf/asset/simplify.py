@@ -1,0 +1,25 @@
+"""A marching-cubes surface as a clean mesh of a chosen size."""
+
+import pymeshlab
+import trimesh
+
+
+def simplified(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
+    """The surface repaired and decimated to at most `faces` triangles (quadrics, Garland and Heckbert 1997)."""
+    meshes = pymeshlab.MeshSet()
+    meshes.add_mesh(pymeshlab.Mesh(surface.vertices, surface.faces))
+    _repair(meshes)
+    if meshes.current_mesh().face_number() > faces:
+        meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=faces, preservetopology=True, preservenormal=True)
+        _repair(meshes)
+    meshes.meshing_remove_unreferenced_vertices()
+    mesh = meshes.current_mesh()
+    return trimesh.Trimesh(mesh.vertex_matrix(), mesh.face_matrix(), process=False)
+
+
+def _repair(meshes: pymeshlab.MeshSet) -> None:
+    meshes.meshing_remove_null_faces()
+    meshes.meshing_remove_duplicate_faces()
+    meshes.meshing_repair_non_manifold_edges()
+    meshes.meshing_repair_non_manifold_vertices()
+    meshes.meshing_close_holes(newfaceselected=False)  # later filters would only look at a selection

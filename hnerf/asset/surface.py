@@ -1,0 +1,83 @@
+"""The zero surface of a signed distance field as a closed triangle mesh."""
+
+import itertools
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+import trimesh
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
+from torch import Tensor
+
+from hnerf.errors import CaptureError
+
+SLOPE_BOUND = 2.0  # |gradient| that skipping empty space allows for; a true distance has 1
+COARSEST_STRIDE = 9  # nodes; refined by threes, so that a coarse node is the centre of the block it stands for
+CHUNK_POINTS = 1 << 17
+
+
+def extract_surface(
+    signed_distance: Callable[[Tensor], Tensor], lower_m: Tensor, upper_m: Tensor, cells: int
+) -> trimesh.Trimesh:
+    """Largest closed component of the zero surface inside a box, by marching cubes; faces turn outwards.
+
+    signed_distance: points (N, 3) in metres, on the device of `lower_m`, to metres (N,), negative inside.
+    lower_m, upper_m (3,): the box; cells: how many on its longest side, cubic.
+    Raises CaptureError if the field has no surface in the box, or one that the box cuts.
+    """
+    step_m = float((upper_m - lower_m).max()) / cells
+    nodes = [math.ceil(float(side_m) / step_m - 1e-4) + 1 for side_m in upper_m - lower_m]
+    values = _sample_near_surface(signed_distance, lower_m, step_m, nodes).cpu().numpy()
+    if not np.isfinite(values).all():
+        raise CaptureError("signed distance field: not finite; training diverged, lower its learning rate")
+    if not values.min() < 0 < values.max():
+        found = "everything is inside" if values.max() <= 0 else "everything is outside"
+        raise CaptureError(f"signed distance field: no surface in its box ({found}); train longer or check masks")
+    vertices, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")  # in steps from `lower_m`
+    vertices, faces = _largest_component(vertices, faces)
+    if vertices.min() <= 0 or (vertices >= np.array(nodes) - 1).any():
+        raise CaptureError("signed distance field: the surface fills its box; train longer or check masks and body fit")
+    return trimesh.Trimesh(vertices * step_m + lower_m.cpu().numpy(), faces, process=False)
+
+
+@torch.no_grad()
+def _sample_near_surface(
+    signed_distance: Callable[[Tensor], Tensor], lower_m: Tensor, step_m: float, nodes: list[int]
+) -> Tensor:
+    """Distances on a grid of `nodes`, exact near the surface; elsewhere the distance at the middle of the block around.
+
+    A block whose middle is further from the surface than its corners, times SLOPE_BOUND, cannot meet the surface.
+    """
+    stride = COARSEST_STRIDE
+    shape = [math.ceil(n / stride) for n in nodes]
+    device = lower_m.device
+    index = torch.cartesian_prod(*(torch.arange(n, device=device) for n in shape))
+    children = torch.tensor(list(itertools.product(range(3), repeat=3)), device=device)
+    values = torch.empty(shape, device=device)
+    while True:
+        points_m = lower_m + (index * stride + stride // 2) * step_m
+        distances_m = torch.cat([signed_distance(chunk).float() for chunk in points_m.split(CHUNK_POINTS)])
+        values[index.unbind(1)] = distances_m
+        if stride == 1:
+            return values[: nodes[0], : nodes[1], : nodes[2]]
+        reach_m = SLOPE_BOUND * (math.sqrt(3) / 2 * stride + 1) * step_m
+        index = (index[distances_m.abs() <= reach_m, None] * 3 + children).flatten(0, 1)
+        for axis in range(3):
+            values = values.repeat_interleave(3, axis)
+        stride //= 3
+
+
+def _largest_component(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The connected part with the largest area: vertices (V, 3), faces (F, 3)."""
+    start, end = faces.ravel(), np.roll(faces, 1, axis=1).ravel()
+    count = len(vertices)
+    edges = coo_matrix((np.ones(len(start), bool), (start, end)), (count, count))
+    _, label = connected_components(edges, directed=False)
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    kept = label == np.bincount(label[faces[:, 0]], area).argmax()
+    renumbered = np.cumsum(kept) - 1
+    return vertices[kept], renumbered[faces[kept[faces[:, 0]]]]

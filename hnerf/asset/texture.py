@@ -1,0 +1,114 @@
+"""Texture coordinates, and the radiance field's colours baked into an image."""
+
+import ctypes
+import logging
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+import xatlas
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from hnerf.body.descriptor import vertex_normals
+from hnerf.body.fit_result import BodyFit
+from hnerf.body.rig import Rig, pose_vertices
+from hnerf.render.avatar import Avatar
+
+CHUNK_POINTS = 1 << 16
+CHART_PADDING_PX = 4
+MAX_STEP_M = 0.03  # skinning is not further off; a longer distance is another limb's
+SUBPIXEL_BITS = 8
+
+log = logging.getLogger("hnerf.asset")
+
+
+@dataclass(frozen=True)
+class UvLayout:
+    """uvs (U, 2) float32 in [0, 1], v up; face_uvs (F, 3) long: rows of uvs for the corners of each face."""
+
+    uvs: np.ndarray
+    face_uvs: np.ndarray
+
+
+@dataclass(frozen=True)
+class Texels:
+    """Covered texels: row, column (N,) from the image's top left, face (N,), barycentric (N, 3)."""
+
+    row: Tensor
+    column: Tensor
+    face: Tensor
+    barycentric: Tensor
+
+
+def unwrap(vertices_m: np.ndarray, faces: np.ndarray, texture_px: int) -> UvLayout:
+    """Charts of a mesh (V, 3), (F, 3) packed into one square with room for dilation between them (xatlas)."""
+    atlas = xatlas.Atlas()
+    # Never freed: xatlas' destructor wakes its threads without holding their lock, misses one now and then, and hangs.
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(atlas))
+    atlas.add_mesh(vertices_m.astype(np.float32), faces.astype(np.uint32))
+    packing = xatlas.PackOptions()
+    packing.resolution, packing.padding, packing.bilinear = texture_px, CHART_PADDING_PX, True
+    atlas.generate(pack_options=packing)
+    vertex_of_uv, face_uvs, uvs = atlas[0]
+    if not np.array_equal(vertex_of_uv[face_uvs], faces):
+        raise RuntimeError("xatlas changed the order of faces; its texture coordinates cannot be matched to the mesh")
+    return UvLayout(uvs * (1, -1) + (0, 1), face_uvs.astype(np.int64))
+
+
+def rasterise(layout: UvLayout, texture_px: int) -> Texels:
+    """The texels that a layout's faces touch; of texels on a border of two faces, the later face has it."""
+    corners_px = (layout.uvs * (1, -1) + (0, 1))[layout.face_uvs] * texture_px - 0.5  # centres at integers
+    face_image = np.full((texture_px, texture_px), -1, np.int32)
+    for index, triangle in enumerate(np.round(corners_px * (1 << SUBPIXEL_BITS)).astype(np.int32)):
+        cv2.fillConvexPoly(face_image, triangle, index, shift=SUBPIXEL_BITS)
+    row, column = np.nonzero(face_image >= 0)
+    face = face_image[row, column]
+    a, b, c = corners_px[face].swapaxes(0, 1)
+    p = np.stack([column, row], 1)
+    weights = np.stack([_cross(b - p, c - p), _cross(c - p, a - p), _cross(a - p, b - p)], 1)
+    area = weights.sum(1, keepdims=True)
+    inside = np.clip(weights / np.where(area == 0, 1, area), 0, None) + 1e-9  # a touched texel's centre may lie outside
+    barycentric = torch.from_numpy(inside / inside.sum(1, keepdims=True)).float()
+    return Texels(torch.from_numpy(row), torch.from_numpy(column), torch.from_numpy(face).long(), barycentric)
+
+
+@torch.no_grad()
+def bake(avatar: Avatar, dressed: BodyFit, layout: UvLayout, texture_px: int) -> np.ndarray:
+    """Square RGB image, uint8: each texel's radiance along the inward normal, the median over the poses of `dressed`.
+
+    Poses of the capture keep the field's conditioning where it was trained; the median drops a pose in which that spot
+    touches another limb. Texels off the charts repeat the nearest chart's border.
+    """
+    texels = rasterise(layout, texture_px)
+    seen = []
+    for frame, theta, root in zip(dressed.frames, dressed.theta, dressed.root, strict=True):
+        log.info("texture: %d texels in the pose of frame %d", len(texels.face), frame)
+        seen.append(_colours_in_pose(avatar, dressed.rig, texels, theta, root).numpy())
+    image = np.zeros((texture_px, texture_px, 3), np.uint8)
+    covered = np.zeros((texture_px, texture_px), bool)
+    row, column = texels.row.numpy(), texels.column.numpy()
+    image[row, column] = np.round(np.median(np.stack(seen), axis=0).clip(0, 1) * 255)
+    covered[row, column] = True
+    nearest = distance_transform_edt(~covered, return_distances=False, return_indices=True)
+    return image[nearest[0], nearest[1]]
+
+
+def _colours_in_pose(avatar: Avatar, rig: Rig, texels: Texels, theta: Tensor, root: Tensor) -> Tensor:
+    """Radiance at each texel of the surface posed by theta (J, 3) and root (4, 4), (N, 3) on the CPU."""
+    device = avatar.body.rig.vertices_m.device
+    vertices_m, faces = pose_vertices(rig, theta, root).to(device), rig.faces.to(device)
+    theta, root = theta.to(device), root.to(device)
+    normals = vertex_normals(vertices_m, faces)
+    # Skinning is only near the field's own surface in this pose: one step of Newton's method along the normal.
+    height_m = avatar.signed_distance(vertices_m, theta, root).clamp(-MAX_STEP_M, MAX_STEP_M)
+    corners, weights = faces[texels.face.to(device)], texels.barycentric.to(device)[..., None]
+    points_m = ((vertices_m - height_m[:, None] * normals)[corners] * weights).sum(1)
+    inward = -torch.nn.functional.normalize((normals[corners] * weights).sum(1), dim=1)
+    chunks = zip(points_m.split(CHUNK_POINTS), inward.split(CHUNK_POINTS), strict=True)
+    return torch.cat([avatar.colour(p, v, theta, root).cpu() for p, v in chunks])
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

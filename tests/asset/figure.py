@@ -1,0 +1,74 @@
+"""A two-bone column 1.6 m tall as a body, small enough to work out by hand."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.body.rig import Rig
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+
+FRAMES = (3, 4, 5, 8)  # with a gap
+
+
+def column_rig() -> Rig:
+    """Radius 15 cm, z from 0 to 1.6 m; joints at z = 0 and z = 0.8; the upper's weight rises from z = 0.7 to 0.9."""
+    column = upright_column(0.15, 0.0, 1.6)
+    vertices_m = torch.from_numpy(column.vertices).float()
+    upper = upper_weight(vertices_m[:, 2])
+    return Rig(
+        vertices_m=vertices_m,
+        faces=torch.from_numpy(column.faces).long(),
+        uvs=torch.zeros(1, 2),
+        face_uvs=torch.zeros(len(column.faces), 3, dtype=torch.long),
+        joints_m=torch.tensor([[0.0, 0, 0], [0, 0, 0.8]]),
+        joint_names=("root", "upper.L"),
+        parents=torch.tensor([-1, 0]),
+        beta=torch.zeros(1),
+        beta_names=("height",),
+        shape_basis=torch.zeros(1, len(vertices_m), 3),
+        joint_basis=torch.zeros(1, 2, 3),
+        skin_joints=torch.tensor([[0, 1]]).repeat(len(vertices_m), 1),
+        skin_weights=torch.stack([1 - upper, upper], 1),
+        free=torch.tensor([False, True]),
+        keypoint_weights=torch.zeros(25, len(vertices_m)),
+    )
+
+
+def upright_column(radius_m: float, bottom_m: float, top_m: float) -> trimesh.Trimesh:
+    """A closed column around the z axis, in sixteen storeys of 24 sides."""
+    rings = [[radius_m, z] for z in np.linspace(bottom_m, top_m, 17)]
+    return trimesh.creation.revolve([[0, bottom_m], *rings, [0, top_m]], sections=24)
+
+
+def upper_weight(z_m: torch.Tensor) -> torch.Tensor:
+    """The upper bone's skin weight at a height."""
+    return ((z_m - 0.7) / 0.2).clamp(0, 1)
+
+
+def bending_body() -> BodyFit:
+    """The column bends at its joint about x and turns about z while it moves along x."""
+    theta, root = torch.zeros(len(FRAMES), 2, 3), torch.eye(4).repeat(len(FRAMES), 1, 1)
+    for row, frame in enumerate(FRAMES):
+        theta[row, 1, 0] = 0.1 * frame
+        c, s = math.cos(0.8 * frame), math.sin(0.8 * frame)
+        root[row, :2, :2] = torch.tensor([[c, -s], [s, c]])
+        root[row, :3, 3] = torch.tensor([0.1 * frame, 2.0, 0.5])
+    return BodyFit(column_rig(), FRAMES, theta, root)
+
+
+def side_camera() -> Camera:
+    """3 m from the origin along -y of the world, looking along +y; the image's right is +x."""
+    R = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    K = np.array([[500.0, 0, 300], [0, 400, 200], [0, 0, 1]])
+    return Camera("01", K, R, -R @ np.array([0, -3.0, 1.0]), 640, 480)
+
+
+def capture() -> Capture:
+    """One camera, three training frames and one novel pose; no pixels."""
+    cameras = {"01": side_camera()}
+    return Capture("column", Path(), cameras, ("01",), (), FRAMES[:3], FRAMES[3:], 10.0, "z", {}, {})

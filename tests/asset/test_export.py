@@ -1,0 +1,28 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from hnerf.asset.export import canonical_surface, export_asset
+from hnerf.config import AssetSettings
+from tests.asset.figure import bending_body, capture
+from tests.asset.stand_in import CLOTHING_M, StandInAvatar
+
+SMALL = AssetSettings(grid_cells=96, faces=2000, texture_px=128)
+
+
+def test_surface_is_the_grown_body() -> None:
+    surface = canonical_surface(StandInAvatar(bending_body()), SMALL)
+    lower_m, upper_m = surface.bounds
+    assert lower_m == pytest.approx([-0.15 - CLOTHING_M, -0.15 - CLOTHING_M, -CLOTHING_M], abs=0.002)
+    assert upper_m == pytest.approx([0.15 + CLOTHING_M, 0.15 + CLOTHING_M, 1.6 + CLOTHING_M], abs=0.002)
+
+
+def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path) -> None:
+    report = export_asset(capture(), StandInAvatar(bending_body()), SMALL, tmp_path)
+    assert json.loads((tmp_path / "report.json").read_text()) == report
+    assert set(report["bytes"]) == {"avatar.usdz", "avatar_cache.usdz", "avatar.glb"}
+    assert report["mesh"]["watertight"] and report["mesh"]["faces"] <= 2000
+    assert report["mesh"]["height_m"] == pytest.approx(1.62, abs=0.005)
+    assert (report["frames"], report["joints"], report["cameras"]) == (4, 2, 1)
+    assert report["validation"]["avatar.usdz"]["warnings"] == []

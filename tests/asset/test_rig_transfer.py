@@ -1,0 +1,36 @@
+import dataclasses
+
+import torch
+import trimesh
+
+from hnerf.asset.rig_transfer import transfer_skin
+from tests.asset.figure import column_rig, upper_weight
+
+
+def test_weights_follow_the_closest_point_of_the_body() -> None:
+    rig = column_rig()
+    sleeve = trimesh.creation.cylinder(0.18, segment=[[0, 0, 0.1], [0, 0, 1.5]], sections=48).subdivide_to_size(0.04)
+    vertices_m, faces = torch.from_numpy(sleeve.vertices).float(), torch.from_numpy(sleeve.faces).long()
+    joints, weights = transfer_skin(rig, vertices_m, faces)
+    upper = torch.where(joints == 1, weights, 0.0).sum(1)
+    torch.testing.assert_close(weights.sum(1), torch.ones(len(weights)))
+    z_m = vertices_m[:, 2]
+    assert (upper - upper_weight(z_m)).abs().max() < 0.1  # smoothing rounds the ramp's two corners
+    far = (z_m - 0.8).abs() > 0.3
+    torch.testing.assert_close(upper[far], (z_m[far] > 0.8).float())
+    assert (upper[(z_m - 0.8).abs() < 1e-3] - 0.5).abs().max() < 0.03
+
+
+def test_at_most_eight_influences_largest_first() -> None:
+    rig = column_rig()
+    vertices = len(rig.vertices_m)
+    parts = torch.arange(1.0, 11.0)  # ten joints with weights 1/55 .. 10/55 everywhere
+    ten = dataclasses.replace(
+        rig,
+        joints_m=torch.zeros(10, 3),
+        skin_joints=torch.arange(10).repeat(vertices, 1),
+        skin_weights=(parts / parts.sum()).repeat(vertices, 1),
+    )
+    joints, weights = transfer_skin(ten, rig.vertices_m, rig.faces)
+    assert joints[0].tolist() == [9, 8, 7, 6, 5, 4, 3, 2]
+    torch.testing.assert_close(weights[0], torch.arange(10.0, 2.0, -1) / 52)  # 10 + 9 + ... + 3 = 52
