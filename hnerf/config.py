@@ -74,8 +74,8 @@ class FastFieldSettings(Section):
     pose_width: int = Field(default=8, ge=1)
     initial_sharpness_per_m: float = Field(default=100.0, gt=0)
     gradient_step_m: float = Field(default=0.005, gt=0)
-    grid_learning_rate: float = Field(default=1e-2, gt=0)
-    network_learning_rate: float = Field(default=2e-3, gt=0)
+    grid_learning_rate: float = Field(default=5e-2, gt=0)
+    network_learning_rate: float = Field(default=1e-2, gt=0)
 
 
 class PaperFieldSettings(Section):

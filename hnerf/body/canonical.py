@@ -117,7 +117,9 @@ class PosedBodies:
         share = self._subtree_weights[nearest]  # (N, free + 1)
         pivots = torch.cat([self._joints[:, self._free, :3, 3], self._joints[:, :1, :3, 3]], 1)  # (n, free + 1, 3)
         twists = torch.cat([correction.turn, -torch.linalg.cross(correction.turn, pivots)], -1)  # (n, free + 1, 6)
-        blended = (share[:, None] @ twists[frame])[:, 0]
+        present, own = torch.unique(frame, return_inverse=True)
+        everywhere = (share @ twists[present].transpose(0, 1).flatten(1)).unflatten(1, (len(present), 6))
+        blended = everywhere.gather(1, own[:, None, None].expand(-1, 1, 6))[:, 0]  # one product beats a gather a point
         moved = torch.linalg.cross(blended[:, :3], points_m) + blended[:, 3:] + correction.move_m[frame]
         bulge = torch.einsum("b,nbd->nd", correction.shape, self.rig.shape_basis[:, nearest].transpose(0, 1))
         linear = self._linear.flatten(0, 1)[frame * len(self.rig.vertices_m) + nearest]
