@@ -41,23 +41,27 @@ class CalibrationSettings(Section):
 
 
 class SegmentationSettings(Section):
-    shadow_chroma: float = Field(default=0.055, gt=0)  # a shadow changes log colour ratios by no more than this
+    shadow_chroma: float = Field(default=0.06, gt=0)  # a shadow changes log colour ratios by no more than this
     darkest_shadow: float = Field(default=0.27, gt=0, lt=1)  # brightness left in the deepest shadow
     reach: float = Field(default=0.13, gt=0)  # how far clothes and hair reach from limbs, in heights of the person
 
 
 class FitSettings(Section):
-    keypoint_m: float = 0.02  # standard deviation of a keypoint seen with full confidence
-    keypoint_outlier_m: float = 0.15  # where a keypoint's pull fades
-    offset_m: float = 0.02
-    phenotype_spread: float = 0.25
-    local_change_spread: float = 0.3
-    inside_m: float = 0.008
-    outside_m: float = 0.02
-    clothing_m: float = 0.08
-    spacing_m: float = 0.03
-    contour_steps: int = 10
-    acceleration_mps2: float = 15.0
+    """Standard deviations, unless said otherwise. Shape values are anny's: phenotypes in [0, 1], local changes in [-1, 1]."""
+
+    keypoint_m: float = Field(default=0.02, gt=0)  # of a keypoint seen with full confidence
+    keypoint_outlier_m: float = Field(default=0.15, gt=0)  # distance at which a keypoint's pull fades
+    offset_m: float = Field(default=0.02, gt=0)  # between the detector's idea of a keypoint and the body model's
+    stature_m: float = Field(default=1.72, gt=0)  # mean height of people
+    stature_spread_m: float = Field(default=0.08, gt=0)
+    phenotype_spread: float = Field(default=0.25, gt=0)
+    local_change_spread: float = Field(default=0.3, gt=0)
+    acceleration_mps2: float = Field(default=15.0, gt=0)  # of the trunk; hands and feet three to four times as much
+    inside_m: float = Field(default=0.008, gt=0)  # of a mask's edge inside the body
+    outside_m: float = Field(default=0.02, gt=0)  # of a mask's edge outside the body
+    clothing_m: float = Field(default=0.08, gt=0)  # distance at which cloth and hair no longer pull the body outwards
+    spacing_m: float = Field(default=0.03, gt=0)  # between the points of an outline
+    contour_steps: int = Field(default=10, ge=1)
 
 
 class FastFieldSettings(Section):

@@ -1,7 +1,8 @@
 """World points seen from the canonical body: (d, s) of the paper, and y = s + L^-1 (x - p).
 
-p is the closest point on the posed body, s the same point on the rest body, and L the blended linear part of the skinning
-there, so y equals s + d n(s) where the skin moves rigidly, and stays continuous across edges where n(s) does not.
+p is the closest point on the posed body, s the same point on the rest body, and L the blended linear part of the
+skinning there, so y equals s + d n(s) where the skin moves rigidly, and stays continuous across edges where n(s) does
+not.
 """
 
 from dataclasses import dataclass
@@ -33,12 +34,18 @@ class Descriptor:
 
 
 class PoseCorrection(nn.Module):
-    """Small changes of pose and shape, learned while the body meshes stand still (Delta theta_t, Delta beta of the paper).
+    """Small changes of pose and shape, learned while the body meshes stand still (Delta theta_t, Delta beta of the
+    paper).
 
-    Free joints and the root of each frame turn by small world-axes twists (n, free + 1, 3), the root also moves (n, 3), and
-    the shape changes for all frames (B,). A twist moves a point by its joint's share of the point's skin weights: the
-    linearisation of skinning for one bone, blended between bones. `PosedBodies.absorb` turns it into theta, T and beta.
+    Free joints and the root of each frame turn by small world-axes twists (n, free + 1, 3), the root also moves (n,
+    3), and the shape changes for all frames (B,). A twist moves a point by its joint's share of the point's skin
+    weights: the linearisation of skinning for one bone, blended between bones. `PosedBodies.absorb` turns it into
+    theta, T and beta.
     """
+
+    absorbed_turn: Tensor
+    absorbed_move_m: Tensor
+    absorbed_shape: Tensor
 
     def __init__(self, frames: int, free_joints: int, shapes: int):
         super().__init__()
@@ -61,12 +68,14 @@ class PosedBodies:
     """The body in several poses: closest points, descriptors and their sensitivity to pose and shape."""
 
     def __init__(self, rig: Rig, theta: Tensor, root: Tensor, canonical_m: Tensor):
-        """theta (n, J, 3), root (n, 4, 4); canonical_m (V, 3): the rest body that s and y refer to, whatever the shape."""
+        """theta (n, J, 3), root (n, 4, 4); canonical_m (V, 3): the rest body that s and y refer to, whatever the
+        shape."""
         self.rig = rig
         self._canonical_m = canonical_m
         self._free = torch.nonzero(rig.free)[:, 0]
         self._subtree_weights = _subtree_weights(rig, self._free)
         self._pose(theta, root)
+        self._meshes = BodyMeshes(self.vertices_m, rig.faces)
 
     def _pose(self, theta: Tensor, root: Tensor) -> None:
         self.theta, self.root = theta.detach(), root.detach()
@@ -76,10 +85,6 @@ class PosedBodies:
         self._inverse = torch.linalg.inv(self._linear)
         self.vertices_m = pose_vertices(rig, self.theta, self.root)
         self._joints = joint_transforms(rig, rig.joints_m, self.theta, self.root)
-        if hasattr(self, "_meshes"):
-            self._meshes.move(self.vertices_m)
-        else:
-            self._meshes = BodyMeshes(self.vertices_m, rig.faces)
 
     def correction(self) -> PoseCorrection:
         """A correction of zero for these frames."""
@@ -88,7 +93,8 @@ class PosedBodies:
     def describe(
         self, points_m: Tensor, frame: Tensor, reach_m: float, correction: PoseCorrection | None = None
     ) -> Descriptor:
-        """Descriptors of world points (N, 3) in the bodies of rows `frame` (N,); gradients flow to points and correction."""
+        """Descriptors of world points (N, 3) in the bodies of rows `frame` (N,); gradients flow to points and
+        correction."""
         found = self._meshes.closest_points(points_m, frame, reach_m)
         corners = self.rig.faces[found.face.clamp(min=0)]  # (N, 3)
         flat = frame.long()[:, None] * len(self.rig.vertices_m) + corners
@@ -131,7 +137,9 @@ class PosedBodies:
         rig, free = self.rig, self._free
         rotations = rotation_from_axis_angle(self.theta)
         above = self._joints[:, rig.parents[free].clamp(min=0), :3, :3]
-        turned = above.transpose(-1, -2) @ rotation_from_axis_angle(correction.turn[:, :-1]) @ above @ rotations[:, free]
+        turned = (
+            above.transpose(-1, -2) @ rotation_from_axis_angle(correction.turn[:, :-1]) @ above @ rotations[:, free]
+        )
         theta, root = self.theta.clone(), self.root.clone()
         theta[:, free] = axis_angle_from_rotation(turned)
         turn, pivot = rotation_from_axis_angle(correction.turn[:, -1]), self._joints[:, 0, :3, 3]
@@ -139,6 +147,7 @@ class PosedBodies:
         root[:, :3, 3] = (turn @ (root[:, :3, 3] - pivot)[..., None])[..., 0] + pivot + correction.move_m
         self.rig = rig.reshaped(rig.beta + correction.shape)
         self._pose(theta, root)
+        self._meshes.move(self.vertices_m)
         for name, parameter in correction.named_parameters():
             correction.get_buffer(f"absorbed_{name}").add_(parameter)
             parameter.zero_()
@@ -161,7 +170,8 @@ def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def _subtree_weights(rig: Rig, free: Tensor) -> Tensor:
-    """(V, free + 1): the skin weight that each free joint carries with all below it; the last column is the root's, 1."""
+    """(V, free + 1): the skin weight that each free joint carries with all below it; the last column is the root's,
+    1."""
     dense = torch.zeros(len(rig.skin_weights), len(rig.joints_m), device=rig.skin_weights.device)
     dense.scatter_add_(1, rig.skin_joints, rig.skin_weights)
     for joint in range(len(rig.joints_m) - 1, 0, -1):

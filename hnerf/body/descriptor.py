@@ -19,7 +19,8 @@ SURE_COSINE = 0.35  # of the angle between offset and normal; below it the windi
 
 @dataclass(frozen=True)
 class ClosestPoints:
-    """face (N,) long, -1 where nothing is within reach; barycentric (N, 3) of the closest point; sign (N,): -1 inside."""
+    """face (N,) long, -1 where nothing is within reach; barycentric (N, 3) of the closest point; sign (N,): -1
+    inside."""
 
     face: Tensor
     barycentric: Tensor
@@ -37,7 +38,7 @@ def _closest_kernel(
     face: wp.array(dtype=wp.int32),
     barycentric: wp.array(dtype=wp.vec3),
     sign: wp.array(dtype=float),
-):
+) -> None:
     i = wp.tid()
     m = mesh_index[i]
     query = wp.mesh_query_point_no_sign(meshes[m], points[i], reach_m)
@@ -104,8 +105,8 @@ class BodyMeshes:
 
 
 def closest_points_reference(points_m: Tensor, vertices_m: Tensor, faces: Tensor, reach_m: float) -> ClosestPoints:
-    """The same for one mesh (V, 3), by trying every triangle (Ericson, Real-Time Collision Detection, 5.1.5) and summing
-    solid angles (van Oosterom and Strackee 1983) for the sign. Memory grows with points x faces."""
+    """The same for one mesh (V, 3), by trying every triangle (Ericson, Real-Time Collision Detection, 5.1.5) and
+    summing solid angles (van Oosterom and Strackee 1983) for the sign. Memory grows with points x faces."""
     a, b, c = vertices_m[faces][None].unbind(2)  # (1, F, 3) each
     barycentric = _triangle_barycentric(points_m[:, None], a, b, c)  # (N, F, 3)
     closest = (barycentric[..., None] * torch.stack([a, b, c], 2)).sum(-2)
@@ -141,9 +142,12 @@ def _triangle_barycentric(x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     (ab, ab_squared), (bc, bc_squared), (ca, ca_squared) = edge(a, b), edge(b, c), edge(c, a)
     zero = torch.zeros_like(ab)
     edges = torch.stack(
-        [torch.stack([1 - ab, ab, zero], -1), torch.stack([zero, 1 - bc, bc], -1), torch.stack([ca, zero, 1 - ca], -1)], -2
+        [torch.stack([1 - ab, ab, zero], -1), torch.stack([zero, 1 - bc, bc], -1), torch.stack([ca, zero, 1 - ca], -1)],
+        -2,
     )
-    nearest = torch.stack([ab_squared, bc_squared, ca_squared], -1).argmin(-1)[..., None, None].expand(*zero.shape, 1, 3)
+    nearest = (
+        torch.stack([ab_squared, bc_squared, ca_squared], -1).argmin(-1)[..., None, None].expand(*zero.shape, 1, 3)
+    )
     return torch.where((inside >= 0).all(-1, keepdim=True), inside, edges.gather(-2, nearest)[..., 0, :])
 
 

@@ -12,8 +12,8 @@ from hnerf.body.rig import Rig, joint_transforms, pose_vertices
 
 @dataclass(frozen=True)
 class BodyFit:
-    """rig: linearised at the fitted shape (its `beta`). frames: (n,). theta (n, J, 3) radians, zero at locked joints and
-    at the root joint; root (n, 4, 4) world from body, metres."""
+    """rig: linearised at the fitted shape (its `beta`). frames: (n,). theta (n, J, 3) radians, zero at locked joints
+    and at the root joint; root (n, 4, 4) world from body, metres."""
 
     rig: Rig
     frames: tuple[int, ...]

@@ -3,13 +3,14 @@
 All that fitting, training and export need of a body model. anny, SMPL and SMPL-X become a Rig once; after that no
 body-model package is used. The body frame is the model's own: metres, anny's Z up, facing -Y.
 
-Rotations are axis-angle, about a joint's rest position, in axes parallel to the body frame in the rest pose (as in SMPL,
-Loper et al. 2015), so every rest orientation is the identity.
+Rotations are axis-angle, about a joint's rest position, in axes parallel to the body frame in the rest pose (as in
+SMPL, Loper et al. 2015), so every rest orientation is the identity.
 """
 
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,9 +21,9 @@ from torch import Tensor
 class Rig:
     """Rest body at shape `beta`, and how it moves.
 
-    vertices_m (V, 3), faces (F, 3) long, uvs (U, 2), face_uvs (F, 3) long, joints_m (J, 3), parents (J,) long with -1 at
-    the root and parents before children, shape_basis (B, V, 3) and joint_basis (B, J, 3): metres per unit of beta around
-    `beta` (B,). skin_joints (V, K) long, skin_weights (V, K) summing to 1. free (J,) bool: joints that may turn.
+    vertices_m (V, 3), faces (F, 3) long, uvs (U, 2), face_uvs (F, 3) long, joints_m (J, 3), parents (J,) long with -1
+    at the root and parents before children, shape_basis (B, V, 3) and joint_basis (B, J, 3): metres per unit of beta
+    around `beta` (B,). skin_joints (V, K) long, skin_weights (V, K) summing to 1. free (J,) bool: joints that may turn.
     keypoint_weights (25, V): BODY_25 keypoints from the vertices.
     """
 
@@ -44,7 +45,7 @@ class Rig:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "Rig":
         """The same rig on another device; `dtype` changes the floating tensors only."""
-        changed = {}
+        changed: dict[str, Any] = {}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(value, Tensor):
@@ -64,13 +65,14 @@ class Rig:
 
     def save(self, path: Path) -> None:
         """Write an .npz without pickles."""
-        np.savez(path, **{f.name: np.asarray(getattr(self, f.name)) for f in dataclasses.fields(self)})
+        arrays: dict[str, Any] = {f.name: np.asarray(getattr(self, f.name)) for f in dataclasses.fields(self)}
+        np.savez(path, **arrays)
 
     @staticmethod
     def load(path: Path) -> "Rig":
         """Read what `save` wrote."""
         with np.load(path, allow_pickle=False) as stored:
-            values = {
+            values: dict[str, Any] = {
                 f.name: tuple(map(str, stored[f.name]))
                 if f.name in ("joint_names", "beta_names")
                 else torch.from_numpy(stored[f.name])
@@ -120,7 +122,8 @@ def skinning_transforms(rig: Rig, joints_m: Tensor, theta: Tensor, root: Tensor)
 
 
 def pose_vertices(rig: Rig, theta: Tensor, root: Tensor, beta: Tensor | None = None) -> Tensor:
-    """Posed vertices in the world, (..., V, 3) metres. theta (..., J, 3), root (..., 4, 4), beta (B,) or the rig's own."""
+    """Posed vertices in the world, (..., V, 3) metres. theta (..., J, 3), root (..., 4, 4), beta (B,) or the rig's
+    own."""
     vertices_m, joints_m = (rig.vertices_m, rig.joints_m) if beta is None else rig.shaped(beta)
     transforms = vertex_transforms(rig, skinning_transforms(rig, joints_m, theta, root))
     return (transforms[..., :3, :3] @ vertices_m[..., None])[..., 0] + transforms[..., :3, 3]

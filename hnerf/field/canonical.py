@@ -9,8 +9,8 @@ from hnerf.field.encoding import FeatureGrids, positional_encoding
 class CanonicalField(nn.Module):
     """DH: (y, d, theta) -> dd and F: (y, d, theta, n) -> c over the canonical volume.
 
-    The density of F is the SDF's own opacity (the geometry loss of the paper with lambda at its limit), so F is a colour
-    here. n is the body's normal in the world: it carries the root transform T's effect on shading.
+    The density of F is the SDF's own opacity (the geometry loss of the paper with lambda at its limit), so F is a
+    colour here. n is the body's normal in the world: it carries the root transform T's effect on shading.
     """
 
     def __init__(
@@ -29,12 +29,11 @@ class CanonicalField(nn.Module):
         self.reach_m = reach_m
         self.geometry_grids = FeatureGrids(lower_m, upper_m, geometry_cells, channels)
         self.colour_grids = FeatureGrids(lower_m, upper_m, colour_cells, channels)
-        self.pose_code = nn.Linear(pose_inputs, pose_width, bias=False) if pose_width else None
-        self.geometry = nn.Sequential(
-            nn.Linear(self.geometry_grids.width + 1 + pose_width, width), nn.SiLU(), nn.Linear(width, 1)
-        )
-        nn.init.zeros_(self.geometry[-1].weight)
-        nn.init.zeros_(self.geometry[-1].bias)
+        self.pose_code = nn.Linear(pose_inputs, pose_width, bias=False)
+        last = nn.Linear(width, 1)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.geometry = nn.Sequential(nn.Linear(self.geometry_grids.width + 1 + pose_width, width), nn.SiLU(), last)
         self.radiance = nn.Sequential(
             nn.Linear(self.colour_grids.width + 1 + 9 + pose_width, width),
             nn.SiLU(),
@@ -44,8 +43,7 @@ class CanonicalField(nn.Module):
         )
 
     def _inputs(self, features: Tensor, d: Tensor, pose: Tensor) -> list[Tensor]:
-        code = [] if self.pose_code is None else [self.pose_code(pose)]
-        return [features, d[:, None] / self.reach_m, *code]
+        return [features, d[:, None] / self.reach_m, self.pose_code(pose)]
 
     def residual(self, y_m: Tensor, d_m: Tensor, pose: Tensor) -> Tensor:
         """dd (N,) metres at y (N, 3), d (N,), pose (N, P); zero at the start of training."""

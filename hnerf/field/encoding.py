@@ -16,6 +16,9 @@ class FeatureGrids(nn.Module):
     cells: cells of each level along the box's longest side; channels: features a level.
     """
 
+    lower_m: Tensor
+    upper_m: Tensor
+
     def __init__(self, lower_m: Tensor, upper_m: Tensor, cells: tuple[int, ...], channels: int):
         super().__init__()
         self.register_buffer("lower_m", lower_m.clone())

@@ -36,7 +36,8 @@ class RadianceMLP(nn.Module):
         self.colour = nn.Sequential(nn.Linear(256 + root_inputs + 3, 128), nn.SiLU(), nn.Linear(128, 3))
 
     def forward(self, point: Tensor, pose: Tensor, root: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
-        """point (N, D) in scene units, pose (N, P), root (N, Q), view (N, 3): density (N,) per scene unit, colour (N, 3)."""
+        """point (N, D) in scene units, pose (N, P), root (N, Q), view (N, 3): density (N,) per scene unit, colour (N,
+        3)."""
         features = self.trunk(torch.cat([positional_encoding(point, self.OCTAVES), pose], -1))
         density = nn.functional.softplus(self.density(features)[:, 0])
         return density, torch.sigmoid(self.colour(torch.cat([features, root, view], -1)))

@@ -11,7 +11,8 @@ from hnerf.capture.camera import Camera
 
 @dataclass(frozen=True)
 class Rendering:
-    """One image over black. rgb (H, W, 3) in [0, 1] premultiplied by alpha (H, W); depth_m (H, W), 0 where alpha is 0."""
+    """One image over black. rgb (H, W, 3) in [0, 1] premultiplied by alpha (H, W); depth_m (H, W), 0 where alpha is
+    0."""
 
     rgb: Tensor
     alpha: Tensor

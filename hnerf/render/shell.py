@@ -1,4 +1,5 @@
-"""Where the person can be: one voxel grid a frame that says empty, shell or solid. Rays are sampled in the shell alone."""
+"""Where the person can be: one voxel grid a frame that says empty, shell or solid. Rays are sampled in the shell
+alone."""
 
 from dataclasses import dataclass
 
@@ -12,7 +13,8 @@ EMPTY, SHELL, SOLID = 0, 1, 2
 
 @dataclass(frozen=True)
 class ShellGrid:
-    """cells (n, X, Y, Z) uint8 of EMPTY, SHELL, SOLID; lower_m (n, 3) corner of each frame's grid; cell_m: edge length."""
+    """cells (n, X, Y, Z) uint8 of EMPTY, SHELL, SOLID; lower_m (n, 3) corner of each frame's grid; cell_m: edge
+    length."""
 
     cells: Tensor
     lower_m: Tensor
@@ -53,8 +55,8 @@ class ShellGrid:
     def sample_rays(
         self, origins_m: Tensor, directions: Tensor, frame: Tensor, jitter: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Depths (R, K) in metres, sorted, spread evenly over the shell up to the first solid cell; and (R,) bool: whether
-        the ray meets the shell at all. jitter (R, K) in [0, 1): where each sample lies in its stratum."""
+        """Depths (R, K) in metres, sorted, spread evenly over the shell up to the first solid cell; and (R,) bool:
+        whether the ray meets the shell at all. jitter (R, K) in [0, 1): where each sample lies in its stratum."""
         size_m = self.cell_m * torch.tensor(self.cells.shape[1:], device=origins_m.device)
         near, far = box_interval(origins_m, directions, self.lower_m[frame], self.lower_m[frame] + size_m)
         bins = max(self.cells.shape[1:])

@@ -11,7 +11,7 @@ NEAR_M = 1e-3  # triangles that come nearer to the camera's plane are not drawn
 
 @wp.func
 def _edge(a: wp.vec2d, b: wp.vec2d, p: wp.vec2d) -> wp.float64:
-    return (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0])
+    return (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0])  # type: ignore[index]
 
 
 @wp.kernel
@@ -20,7 +20,7 @@ def _cover(
     corners_px: wp.array(dtype=wp.vec2d),
     in_front: wp.array(dtype=wp.bool),
     image: wp.array2d(dtype=wp.uint8),
-):
+) -> None:
     f = wp.tid()
     i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
     if in_front[i] and in_front[j] and in_front[k]:

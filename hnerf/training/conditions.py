@@ -36,9 +36,9 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Draws:
-    """Random numbers of a batch: jitter (R, K) of samples in their strata, finer (R, K) for hierarchical sampling, beyond
-    (R, 3) the colour behind the rays, probe (R,) which sample's gradient is regularised, view (R, 3) noise on directions.
-    None where a rendering needs none."""
+    """Random numbers of a batch: jitter (R, K) of samples in their strata, finer (R, K) for hierarchical sampling,
+    beyond (R, 3) the colour behind the rays, probe (R,) which sample's gradient is regularised, view (R, 3) noise on
+    directions. None where a rendering needs none."""
 
     jitter: Tensor
     beyond: Tensor

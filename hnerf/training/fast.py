@@ -19,6 +19,8 @@ FAR_M = 10.0  # farther than any point that is asked about
 class FastField(nn.Module):
     """Networks, sharpness and the canonical body; no pose of its own."""
 
+    canonical_m: Tensor
+
     def __init__(self, rig: Rig, settings: FastFieldSettings):
         super().__init__()
         self.settings = settings
@@ -126,5 +128,3 @@ class FastField(nn.Module):
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         described = bodies.describe(points_m, row, FAR_M)
         return self.field.colour(described.y, described.d, described.normal, conditions.pose[row])
-
-

@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -42,7 +43,7 @@ class TrainedAvatar:
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
         """Colour, coverage and depth of the person alone, from b alpha (docs/method.md, evaluation)."""
         bodies, conditions = self._pose(theta, root)
-        region = self.field.region(bodies)
+        region: Any = self.field.region(bodies)
         device = bodies.vertices_m.device
         pixels = pixels_around(camera, bodies.vertices_m[0].cpu().numpy())
         origins, directions = camera.rays(pixels.astype(np.float64))
@@ -82,7 +83,8 @@ class TrainedAvatar:
 
 
 def pixels_around(camera: Camera, vertices_m: np.ndarray, margin: float = 0.15) -> np.ndarray:
-    """Pixels (N, 2) in the rectangle of the projected body, widened by a share of its size; all if it reaches behind."""
+    """Pixels (N, 2) in the rectangle of the projected body, widened by a share of its size; all if it reaches
+    behind."""
     xy, depth_m = camera.project(vertices_m)
     size = np.array([camera.width_px, camera.height_px])
     lower, upper = np.zeros(2), size - 1.0

@@ -1,7 +1,8 @@
 """H-NeRF as published: F and DH of the paper, whole rays, background included.
 
 Distances are in scene units (metres / scene_m) inside the networks and losses, metres outside. One network F serves the
-coarse and the fine samples; the fine ones are drawn from the coarse weights without a gradient, and the losses see both.
+coarse and the fine samples; the fine ones are drawn from the coarse weights without a gradient, and the losses see
+both.
 """
 
 from dataclasses import dataclass
@@ -34,6 +35,9 @@ class Boxes:
 
 class PaperField(nn.Module):
     """F and DH; dynamic: on (s, d) and theta; static (one frame): on x itself, unconditioned."""
+
+    canonical_m: Tensor
+    centre_m: Tensor
 
     def __init__(self, rig: Rig, root: Tensor, settings: PaperFieldSettings, static: bool):
         """root (n, 4, 4): the training poses, which the scene is centred on."""
@@ -79,9 +83,7 @@ class PaperField(nn.Module):
             assert draws.finer is not None
             finer = resample(coarse, near, far, weights_from_alpha(rough.alpha), draws.finer)
             depths = torch.cat([coarse, finer], 1).sort(1).values
-        out = self._evaluate(
-            bodies, region, origins_m, directions, view, frame, conditions, depths, draws, correction
-        )
+        out = self._evaluate(bodies, region, origins_m, directions, view, frame, conditions, depths, draws, correction)
         return out, depths
 
     def _evaluate(
@@ -109,7 +111,9 @@ class PaperField(nn.Module):
         d_in = described.d / self.settings.scene_m
         norms = d_in.new_zeros(0)
         if train:
-            gradient = torch.autograd.grad((d_in + residual_in).sum() * self.settings.scene_m, queried, create_graph=True)
+            gradient = torch.autograd.grad(
+                (d_in + residual_in).sum() * self.settings.scene_m, queried, create_graph=True
+            )
             norms = gradient[0].norm(dim=-1)
         d = points.new_full((len(points),), OUTSIDE_DISTANCE).index_copy(0, pick, d_in)
         residual = torch.zeros_like(d).index_copy(0, pick, residual_in)
@@ -161,9 +165,9 @@ class PaperField(nn.Module):
         """c (N, 3) at points around the first body seen along directions (N, 3)."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         described = bodies.describe(points_m, row, FAR_M)
-        return self._radiance(points_m, described, torch.arange(len(row), device=row.device), row, directions, conditions)[1]
-
-
+        return self._radiance(
+            points_m, described, torch.arange(len(row), device=row.device), row, directions, conditions
+        )[1]
 
 
 def resample(middles: Tensor, near: Tensor, far: Tensor, weights: Tensor, uniform: Tensor) -> Tensor:

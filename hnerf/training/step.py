@@ -1,6 +1,7 @@
 """One optimisation step: from a joint batch of rays to the gradients of its losses."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -23,7 +24,7 @@ class Stage:
     """What stands still within a step: the posed bodies and where their rays are sampled."""
 
     bodies: PosedBodies
-    region: object
+    region: Any
 
 
 class Objective(nn.Module):

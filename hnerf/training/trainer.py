@@ -1,5 +1,5 @@
-"""Training: the field with the poses of the training frames, then the poses of novel frames against the finished field."""
-
+"""Training: the field with the poses of the training frames, then the poses of novel frames against the finished
+field."""
 
 import json
 import logging
@@ -135,12 +135,16 @@ class Trainer:
             self.skipped += 1
             logger.warning("%s: step skipped", fault)
             if self.skipped > SKIPS_ALLOWED:
-                raise TrainingError(f"{fault}, {self.skipped} times in a row; lower the learning rates or check the fit")
+                raise TrainingError(
+                    f"{fault}, {self.skipped} times in a row; lower the learning rates or check the fit"
+                )
         return terms
 
     def _set_rates(self) -> None:
         s = self.settings
-        phase_step, phase_steps = (self.step, s.steps) if self.step < s.steps else (self.step - s.steps, s.novel_pose_steps)
+        phase_step, phase_steps = (
+            (self.step, s.steps) if self.step < s.steps else (self.step - s.steps, s.novel_pose_steps)
+        )
         factor = s.final_learning_rate ** (phase_step / phase_steps) * min(1.0, (phase_step + 1) / WARM_UP_STEPS)
         for group, rate in zip(self.optimizer.param_groups, self.first_rates, strict=True):
             group["lr"] = rate * factor
@@ -228,7 +232,7 @@ class Trainer:
             "parameters": sum(p.numel() for p in self.field.parameters()),
             "model_mib": (out / "model.safetensors").stat().st_size / 2**20,
             "mean_turn_deg": float(np.rad2deg(turn.norm(dim=-1).mean().item())),
-            "mean_move_mm": float(1e3 * move_m.norm(dim=-1).mean()),
+            "mean_move_mm": float(1e3 * move_m.norm(dim=-1).mean().item()),
         }
         (out / "report.json").write_text(json.dumps(report, indent=1))
         (out / NAME).unlink(missing_ok=True)

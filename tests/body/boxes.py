@@ -26,8 +26,8 @@ def box_faces(levels: int = 1) -> Tensor:
 
 
 def box_rig(bend_segments: int = 0, splits: int = 0) -> Rig:
-    """The unit box on one bone, or with `bend_segments` a column of 2 m that bends at 1 m, smoothly from 0.67 to 1.33 m.
-    Each of `splits` halves every edge."""
+    """The unit box on one bone, or with `bend_segments` a column of 2 m that bends at 1 m, smoothly from 0.67 to 1.33
+    m. Each of `splits` halves every edge."""
     levels, height_m = max(bend_segments, 1), 2.0 if bend_segments else 1.0
     vertices, faces = box_vertices(height_m, levels), box_faces(levels)
     for _ in range(splits):

@@ -42,8 +42,10 @@ def test_fast_form_agrees_with_the_reference():
     theta[0, 1] = torch.tensor([0.0, 0.7, 0.0])
     bodies = PosedBodies(rig, theta, torch.eye(4)[None], rig.vertices_m)
     vertices = bodies.vertices_m[0]
-    points = vertices.amin(0) - 0.2 + torch.rand(800, 3, generator=torch.Generator().manual_seed(0)) * (
-        vertices.amax(0) - vertices.amin(0) + 0.4
+    points = (
+        vertices.amin(0)
+        - 0.2
+        + torch.rand(800, 3, generator=torch.Generator().manual_seed(0)) * (vertices.amax(0) - vertices.amin(0) + 0.4)
     )
     fast = BodyMeshes(vertices[None], rig.faces).closest_points(points, torch.zeros(800, dtype=torch.int32), 9.0)
     slow = closest_points_reference(points, vertices, rig.faces, 9.0)

@@ -7,7 +7,16 @@ def test_sizes_of_the_paper():
     """F: eight layers of 256, the fifth sees the input again; DH: six of 128."""
     radiance = RadianceMLP(4, 57, 12)
     inputs = 4 * 17 + 57
-    assert [layer.in_features for layer in radiance.trunk.layers] == [inputs, 256, 256, 256, 256 + inputs, 256, 256, 256]
+    assert [layer.in_features for layer in radiance.trunk.layers] == [
+        inputs,
+        256,
+        256,
+        256,
+        256 + inputs,
+        256,
+        256,
+        256,
+    ]
     residual = ResidualMLP(4, 57)
     assert [layer.out_features for layer in residual.trunk.layers] == [128] * 6
 

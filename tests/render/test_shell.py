@@ -27,7 +27,8 @@ def test_states_around_a_sphere():
 
 
 def test_samples_lie_in_the_shell_before_the_solid():
-    """Through the middle of a sphere of 0.3 m from 1 m away: entered 5 cm before the surface, left at the solid core."""
+    """Through the middle of a sphere of 0.3 m from 1 m away: entered 5 cm before the surface, left at the solid
+    core."""
     grid = ShellGrid.around(sphere(0.3), outer_m=0.05, inner_m=0.04, cell_m=0.01)
     depths, met = grid.sample_rays(
         torch.tensor([[-1.0, 0.0, 0.0], [-1.0, 0.6, 0.0]]),

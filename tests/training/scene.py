@@ -1,4 +1,5 @@
-"""A recording small enough to train on in seconds: a bending red column before a grey plate, four cameras, 32 pixels."""
+"""A recording small enough to train on in seconds: a bending red column before a grey plate, four cameras, 32
+pixels."""
 
 from pathlib import Path
 
@@ -18,7 +19,15 @@ FRAMES = (0, 1, 2)
 
 TINY = TrainingSettings.model_validate(
     {
-        "fast": {"samples": 8, "geometry_cells": [4], "colour_cells": [4], "width": 8, "outer_m": 0.2, "inner_m": 0.1, "shell_cell_m": 0.05},
+        "fast": {
+            "samples": 8,
+            "geometry_cells": [4],
+            "colour_cells": [4],
+            "width": 8,
+            "outer_m": 0.2,
+            "inner_m": 0.1,
+            "shell_cell_m": 0.05,
+        },
         "paper": {"samples": 4},
         "losses": {"mask": 0, "blend": 0, "geometry": 0, "fit": 0, "increment": 0},
         "steps": 12,
@@ -60,7 +69,7 @@ def record(folder: Path) -> tuple[Capture, KnownMasks, BodyFit]:
     body = BodyFit(rig, FRAMES, theta, torch.eye(4).repeat(len(FRAMES), 1, 1))
     middle = np.array([0.5, 0.5, 1.0])
     directions = [(4, 0), (0, 4), (-4, 0), (0, -4)]
-    cameras = {f"{k}": look_at(f"{k}", middle + [x, y, 0.5], middle) for k, (x, y) in enumerate(directions)}
+    cameras = {f"{k}": look_at(f"{k}", middle + np.array([x, y, 0.5]), middle) for k, (x, y) in enumerate(directions)}
     masks = {}
     plate = np.full((SIZE_PX, SIZE_PX, 3), 128, np.uint8)
     for name, camera in cameras.items():
@@ -69,7 +78,7 @@ def record(folder: Path) -> tuple[Capture, KnownMasks, BodyFit]:
             masks[name, frame] = mask
             _write(folder / "images" / name / f"{frame:06d}.png", np.where(mask[..., None], [200, 50, 50], plate))
         _write(folder / "background" / f"{name}.png", plate)
-    sizes = {name: (SIZE_PX, SIZE_PX) for name in cameras}
+    sizes = dict.fromkeys(cameras, (SIZE_PX, SIZE_PX))
     capture = Capture("column", folder, cameras, tuple(cameras), (), FRAMES[:2], FRAMES[2:], 10.0, "z", sizes, sizes)
     return capture, KnownMasks(masks), body
 

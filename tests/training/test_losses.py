@@ -97,7 +97,11 @@ def test_increment():
 def test_gradients_in_double(name: str):
     def loss(alpha, residual, norms):
         samples = replace(double, alpha=alpha, residual=residual, gradient_norm=norms)
-        return getattr(losses, name)(samples, target) if name in ("reconstruction", "mask") else getattr(losses, name)(samples)
+        return (
+            getattr(losses, name)(samples, target)
+            if name in ("reconstruction", "mask")
+            else getattr(losses, name)(samples)
+        )
 
     double = replace(SAMPLES, **{k: v.double() for k, v in vars(SAMPLES).items()})
     target = replace(TARGET, **{k: v.double() for k, v in vars(TARGET).items()})
@@ -118,4 +122,6 @@ def test_gradients_of_coupled_losses_in_double():
         )
 
     alpha_dot = (0.05 + 0.9 * double.alpha_dot).requires_grad_()
-    assert torch.autograd.gradcheck(coupled, (alpha_dot, double.density.requires_grad_(), double.residual.requires_grad_()))
+    assert torch.autograd.gradcheck(
+        coupled, (alpha_dot, double.density.requires_grad_(), double.residual.requires_grad_())
+    )

@@ -59,7 +59,9 @@ def test_interrupted_training_ends_as_if_it_was_not(tmp_path: Path, monkeypatch:
     assert all(torch.equal(one[name], two[name]) for name in one)
     bodies = [load_avatar(folder).body for folder in (whole, parts)]
     assert torch.equal(bodies[0].theta, bodies[1].theta)
-    losses = [[json.loads(row)["losses"] for row in (f / "history.jsonl").read_text().splitlines()] for f in (whole, parts)]
+    losses = [
+        [json.loads(row)["losses"] for row in (f / "history.jsonl").read_text().splitlines()] for f in (whole, parts)
+    ]
     assert losses[0] == losses[1]
     assert not (parts / NAME).exists()
 
@@ -101,7 +103,7 @@ def test_not_a_number_stops_the_run_with_its_cause(tmp_path: Path, monkeypatch: 
         return {name: value * float("nan") for name, value in poisoned(*arguments).items()}
 
     monkeypatch.setattr(trainer.objective, "forward", poison)
-    with pytest.raises(TrainingError, match="reconstruction.*not finite.*3 times in a row"):
+    with pytest.raises(TrainingError, match=r"reconstruction.*not finite.*3 times in a row"):
         trainer.run()
     assert all(torch.equal(before[name], p) for name, p in trainer.field.named_parameters())
 
@@ -154,7 +156,9 @@ def test_two_ranks_have_the_gradients_of_one(tmp_path: Path):
     assert gradients[0].keys() == gradients[1].keys()
     assert any(g.abs().max() > 0 for name, g in gradients[0].items() if "correction" in name)
     for name, gradient in gradients[0].items():
-        torch.testing.assert_close(gradients[1][name], gradient, atol=1e-6, rtol=1e-4, msg=lambda m, n=name: f"{n}: {m}")
+        torch.testing.assert_close(
+            gradients[1][name], gradient, atol=1e-6, rtol=1e-4, msg=lambda m, n=name: f"{n}: {m}"
+        )
 
 
 def _environment() -> dict[str, str]:

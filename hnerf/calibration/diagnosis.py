@@ -1,0 +1,135 @@
+"""What keypoints say about a calibration: residuals, the camera that does not fit, the mistake that explains it all."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from hnerf.calibration.triangulation import person_heights_px, reprojection_px, triangulate
+from hnerf.capture.camera import Camera
+
+TRIM = 0.8  # share of the residuals that count; the rest are detector errors
+BODY_HEIGHT_M = (0.5, 2.3)
+USUAL_HEIGHT_M = 1.7
+UNITS_M = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "metres declared as millimetres": 1e3}
+GROSS_SHARE = 0.05  # of the person's height in the image: beyond this a calibration is wrong, not stale
+MISFIT_SHARE = 0.8  # the camera without which the trimmed cost falls under this share does not fit the others
+MISFIT_SHARE_OF_THREE = 0.6  # two cameras left agree more easily
+
+# BODY_25: ankle-knee, knee-hip, hips-neck and neck-nose make 0.87 of an adult's stature (Winter 2009, figure 4.1).
+LIMB_CHAIN = (((11, 10), (14, 13)), ((10, 9), (13, 12)), ((8, 1),), ((1, 0),))
+CHAIN_SHARE_OF_STATURE = 0.87
+
+MISTAKES: dict[str, Callable[[Camera], Camera]] = {  # what was done, and what undoes it
+    "the extrinsics are camera to world (inverted)": lambda c: dataclasses.replace(c, R=c.R.T, t_m=-c.R.T @ c.t_m),
+    "R is transposed": lambda c: dataclasses.replace(c, R=c.R.T),
+    "T is the camera's centre": lambda c: dataclasses.replace(c, t_m=-c.R @ c.t_m),
+    "the camera axes are OpenGL's (y up, z backward)": lambda c: dataclasses.replace(
+        c, R=np.diag([1, -1, -1]) @ c.R, t_m=np.diag([1, -1, -1]) @ c.t_m
+    ),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Measure:
+    """How well cameras agree on the subject. Per camera by name: median_px, p95_px (robust triangulation), and
+    cost_without_px (the others' trimmed cost; empty with fewer than three cameras). points_m (frames, 25, 3)."""
+
+    median_px: dict[str, float]
+    p95_px: dict[str, float]
+    cost_px: float
+    cost_without_px: dict[str, float]
+    body_height_m: float
+    points_m: np.ndarray
+
+    @property
+    def worst(self) -> str | None:
+        """The camera whose removal lowers the trimmed cost most; None with two cameras."""
+        return min(self.cost_without_px, key=self.cost_without_px.__getitem__, default=None)
+
+    @property
+    def misfit(self) -> str | None:
+        """The worst camera, if the others agree far better without it."""
+        share = MISFIT_SHARE_OF_THREE if len(self.cost_without_px) == 3 else MISFIT_SHARE
+        worst = self.worst
+        return worst if worst and self.cost_without_px[worst] < share * self.cost_px else None
+
+
+def measure(cameras: Sequence[Camera], keypoints: np.ndarray) -> Measure:
+    """Residuals of keypoints (C, frames, 25, 3) under these cameras; two cameras at least."""
+    flat = keypoints.reshape(len(cameras), -1, 3)
+    points_m, residuals_px, _ = triangulate(np.stack([camera.projection for camera in cameras]), flat)
+    points_m = points_m.reshape(*keypoints.shape[1:3], 3)
+    off_px = max(float(np.hypot(camera.width_px, camera.height_px)) for camera in cameras)  # where nothing is in front
+    found = {camera.name: row[np.isfinite(row)] for camera, row in zip(cameras, residuals_px, strict=True)}
+    return Measure(
+        median_px={name: float(np.median(row)) if len(row) else off_px for name, row in found.items()},
+        p95_px={name: float(np.percentile(row, 95)) if len(row) else off_px for name, row in found.items()},
+        cost_px=trimmed_cost_px(cameras, flat),
+        cost_without_px=cost_without_each_px(cameras, flat) if len(cameras) > 2 else {},
+        body_height_m=body_height_m(points_m),
+        points_m=points_m,
+    )
+
+
+def trimmed_cost_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> float:
+    """Mean of the lowest four fifths of the distances of keypoints (C, K, 3) to points solved from all their views.
+
+    No view is left out, so no camera can hide. Behind a camera that sees it, a point costs that image's diagonal.
+    """
+    projections = np.stack([camera.projection for camera in cameras])
+    seen = keypoints[..., 2] > 0
+    points_m, _, _ = triangulate(projections, keypoints, inlier_px=np.inf)
+    diagonal_px = np.array([[np.hypot(c.width_px, c.height_px)] for c in cameras])
+    residuals = np.fmin(reprojection_px(projections, points_m, keypoints), diagonal_px)
+    ordered = np.sort(residuals[seen & (seen.sum(0) >= 2)])
+    return float(ordered[: max(1, int(TRIM * len(ordered)))].mean()) if len(ordered) else np.inf
+
+
+def cost_without_each_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> dict[str, float]:
+    """Trimmed cost of the other cameras when one is left out, by that one's name; needs three cameras.
+
+    A point in n views leaves 2n - 3 degrees of freedom in 2n residuals: the costs are scaled to what all would show.
+    """
+    count = len(cameras)
+    scale = np.sqrt((2 * count - 3) / (2 * count)) / np.sqrt((2 * count - 5) / (2 * count - 2))
+    costs = {}
+    for i, camera in enumerate(cameras):
+        others = [c for c in range(count) if c != i]
+        costs[camera.name] = float(scale * trimmed_cost_px([cameras[c] for c in others], keypoints[others]))
+    return costs
+
+
+def body_height_m(points_m: np.ndarray) -> float:
+    """Stature from triangulated BODY_25 keypoints (frames, 25, 3): medians of limb lengths, whatever the pose. NaN if a
+    limb is never seen."""
+    chain = 0.0
+    for bones in LIMB_CHAIN:
+        lengths = np.concatenate([np.linalg.norm(points_m[:, a] - points_m[:, b], axis=-1) for a, b in bones])
+        chain += float(np.median(lengths[np.isfinite(lengths)])) if np.isfinite(lengths).any() else np.nan
+    return chain / CHAIN_SHARE_OF_STATURE
+
+
+def unit_of(height: float) -> str | None:
+    """The unit in which a body of this height, out of range in metres, would be a person; None if there is none."""
+    heights_m = {unit: height * metres for unit, metres in UNITS_M.items()}
+    possible = [unit for unit, metres in heights_m.items() if BODY_HEIGHT_M[0] <= metres <= BODY_HEIGHT_M[1]]
+    return min(possible, key=lambda unit: abs(np.log(heights_m[unit] / USUAL_HEIGHT_M)), default=None)
+
+
+def gross_limit_px(keypoints: np.ndarray) -> float:
+    """The trimmed cost beyond which a calibration is wrong rather than stale. keypoints (C, frames, 25, 3)."""
+    heights = person_heights_px(keypoints.reshape(-1, 25, 3))
+    return GROSS_SHARE * float(np.median(heights[heights > 0]))
+
+
+def explain(cameras: Sequence[Camera], keypoints: np.ndarray, of: str | None = None) -> str | None:
+    """The mistakes of convention that, undone in camera `of` or in all, make the calibration fit keypoints
+    (C, frames, 25, 3), joined by "or" where the views cannot tell them apart; None if none does."""
+    flat, limit_px = keypoints.reshape(len(cameras), -1, 3), gross_limit_px(keypoints)
+    explaining = []
+    for cause, undo in MISTAKES.items():
+        repaired = [undo(camera) if of in (None, camera.name) else camera for camera in cameras]
+        if trimmed_cost_px(repaired, flat) <= limit_px:
+            explaining.append(cause)
+    return " or ".join(explaining) or None

@@ -1,0 +1,80 @@
+"""The calibration as a picture: cameras and person from above and from the side, and residuals."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from hnerf.calibration.diagnosis import Measure
+from hnerf.capture.camera import Camera
+
+LIMBS = [(0, 1), (1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7), (1, 8), (8, 9), (9, 10), (10, 11), (8, 12), (12, 13),
+         (13, 14), (14, 19), (14, 21), (11, 22), (11, 24)]  # fmt: skip
+SHOWN_FRAMES = 5
+FRUSTUM_SHARE = 0.15  # of the distance to the person
+COLOURS = {"ok": "tab:green", "refined": "tab:blue", "suspect": "tab:orange", "rejected": "tab:red", "unjudged": "0.6"}
+
+
+def draw_cameras(
+    path: Path,
+    cameras: Sequence[Camera],
+    status: dict[str, str],
+    up: str,
+    before: Measure | None,
+    after: Measure | None,
+) -> None:
+    """Write the picture as PNG. `status` by camera; `before`, `after`: what `measure` found, None with one camera."""
+    figure = Figure(figsize=(16, 5.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    above, side, bars = figure.subplots(1, 3)
+    vertical = {"y": 1, "z": 2}[up]
+    first, second = (axis for axis in range(3) if axis != vertical)
+    points_m = np.zeros((0, 25, 3)) if after is None else after.points_m
+    for axes, across, along, title in (
+        (above, first, second, "from above"),
+        (side, first, vertical, "from the side"),
+    ):
+        _draw_scene(axes, cameras, status, points_m[..., [across, along]], (across, along))
+        axes.set(title=title, xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[along]} (m)")
+        axes.set_aspect("equal", adjustable="datalim")
+    if before is not None and after is not None:
+        _draw_bars(bars, before, after, status)
+    else:
+        bars.text(0.5, 0.5, "one camera: no residuals", ha="center")
+        bars.set_axis_off()
+    figure.savefig(path, dpi=90)
+
+
+def _draw_scene(
+    axes: Axes, cameras: Sequence[Camera], status: dict[str, str], person: np.ndarray, shown: tuple[int, int]
+) -> None:
+    """Frusta and the person's limbs (frames, 25, 2) in one plane of the world."""
+    for pose in person[:: max(1, len(person) // SHOWN_FRAMES)]:
+        for a, b in LIMBS:
+            axes.plot(*pose[[a, b]].T, color="0.3", linewidth=0.8)
+    for camera in cameras:
+        colour = COLOURS[status[camera.name]]
+        centre = camera.centre_m
+        width, height = camera.width_px - 1, camera.height_px - 1
+        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
+        reach_m = FRUSTUM_SHARE * float(np.linalg.norm(camera.t_m))
+        ends = centre + reach_m * camera.rays(corners)[1]
+        for i in range(4):
+            axes.plot(*np.stack([centre, ends[i], ends[i - 1]])[:, shown].T, color=colour, linewidth=1)
+        axes.annotate(camera.name, (centre[shown[0]], centre[shown[1]]), color=colour)
+
+
+def _draw_bars(axes: Axes, before: Measure, after: Measure, status: dict[str, str]) -> None:
+    names = list(before.median_px)
+    at = np.arange(len(names))
+    axes.bar(at - 0.2, [before.median_px[n] for n in names], 0.4, color="0.8", label="as given, median")
+    colours = [COLOURS[status[n]] for n in names]
+    axes.bar(at + 0.2, [after.median_px[n] for n in names], 0.4, color=colours, label="as used, median")
+    p95_px = [after.p95_px[n] for n in names]
+    axes.scatter(at + 0.2, p95_px, color="black", marker="_", label="as used, 95th percentile")
+    axes.set_xticks(at, [f"{n}\n{status[n]}" for n in names])
+    axes.set(title="reprojection of keypoints", ylabel="px")
+    axes.legend()

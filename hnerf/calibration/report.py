@@ -1,0 +1,117 @@
+"""What was found out about the cameras: in numbers, in words, as a picture, and as the cameras to use."""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hnerf.calibration.diagnosis import Measure
+from hnerf.calibration.picture import draw_cameras
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+from hnerf.errors import CaptureError
+
+SEVERITY = ("ok", "refined", "suspect", "rejected")
+
+
+@dataclass(frozen=True)
+class CameraVerdict:
+    """status: one of SEVERITY; residuals in pixels, None with one camera only; reasons in words."""
+
+    status: str
+    median_px: float | None
+    p95_px: float | None
+    median_before_px: float | None
+    p95_before_px: float | None
+    frame_offset: int
+    reasons: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class CalibrationReport:
+    """cameras: as used from here on, test cameras too; verdicts: of the training cameras. before, after: None with one
+    training camera. notes: what concerns the whole rig, and the checks that could not be made."""
+
+    cameras: dict[str, Camera]
+    verdicts: dict[str, CameraVerdict]
+    before: Measure | None
+    after: Measure | None
+    held_out_px: dict[str, float]
+    notes: tuple[str, ...]
+    up: str
+
+    @property
+    def verdict(self) -> str:
+        """The gravest status among the training cameras."""
+        return max((v.status for v in self.verdicts.values()), key=SEVERITY.index)
+
+    def save(self, out: Path) -> None:
+        """Write `intri.yml`, `extri.yml` (EasyMocap, without rejected cameras), `report.json` and `cameras.png`."""
+        out.mkdir(parents=True, exist_ok=True)
+        rejected = {name for name, v in self.verdicts.items() if v.status == "rejected"}
+        _write_easymocap(out, [camera for name, camera in self.cameras.items() if name not in rejected])
+        (out / "report.json").write_text(json.dumps(self._plain(), indent=1))
+        status = {name: self.verdicts[name].status if name in self.verdicts else "unjudged" for name in self.cameras}
+        draw_cameras(out / "cameras.png", list(self.cameras.values()), status, self.up, self.before, self.after)
+
+    def _plain(self) -> dict[str, Any]:
+        return {
+            "verdict": self.verdict,
+            "cameras": {name: dataclasses.asdict(v) for name, v in self.verdicts.items()},
+            "unjudged_cameras": [name for name in self.cameras if name not in self.verdicts],
+            "body_height_m": self.after and self.after.body_height_m,
+            "trimmed_cost_px": {
+                "before": self.before and self.before.cost_px,
+                "after": self.after and self.after.cost_px,
+            },
+            "trimmed_cost_without_px": {
+                "before": self.before and self.before.cost_without_px,
+                "after": self.after and self.after.cost_without_px,
+            },
+            "held_out_cost_px": self.held_out_px,
+            "notes": self.notes,
+        }
+
+
+def load_cameras(out: Path, capture: Capture) -> Capture:
+    """The capture seen through the cameras that `save` wrote; rejected training cameras are gone."""
+    intri, extri = (cv2.FileStorage(str(out / name), cv2.FILE_STORAGE_READ) for name in ("intri.yml", "extri.yml"))
+    if not (intri.isOpened() and extri.isOpened()):
+        raise CaptureError(f"{out}: intri.yml or extri.yml cannot be read; run the calibration stage again")
+    names = intri.getNode("names")
+    kept = [names.at(i).string() for i in range(names.size())]
+    cameras = {
+        name: dataclasses.replace(
+            capture.cameras[name],
+            K=intri.getNode(f"K_{name}").mat(),
+            R=extri.getNode(f"Rot_{name}").mat(),
+            t_m=extri.getNode(f"T_{name}").mat().ravel(),
+        )
+        for name in kept
+    }
+    train_cameras = tuple(name for name in capture.train_cameras if name in cameras)
+    return dataclasses.replace(capture.with_cameras(cameras), train_cameras=train_cameras)
+
+
+def _write_easymocap(out: Path, cameras: Sequence[Camera]) -> None:
+    intri, extri = (cv2.FileStorage(str(out / name), cv2.FILE_STORAGE_WRITE) for name in ("intri.yml", "extri.yml"))
+    for storage in (intri, extri):
+        storage.startWriteStruct("names", cv2.FILE_NODE_SEQ)
+        for camera in cameras:
+            storage.write("", camera.name)
+        storage.endWriteStruct()
+    for camera in cameras:
+        intri.write(f"K_{camera.name}", camera.K)
+        intri.write(f"dist_{camera.name}", np.zeros((1, 5)))
+        intri.write(f"W_{camera.name}", camera.width_px)
+        intri.write(f"H_{camera.name}", camera.height_px)
+        extri.write(f"R_{camera.name}", cv2.Rodrigues(camera.R)[0])
+        extri.write(f"Rot_{camera.name}", camera.R)
+        extri.write(f"T_{camera.name}", camera.t_m.reshape(3, 1))
+    intri.release()
+    extri.release()

@@ -1,0 +1,213 @@
+"""From detected keypoints to points in space: robust triangulation, and which detected person is the subject."""
+
+from itertools import combinations
+
+import numpy as np
+
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+from hnerf.errors import CaptureError
+
+CHUNK = 1 << 14  # points triangulated at once, which bounds memory
+MIN_INLIER_PX = 3.0
+AGREEMENT_REACH = 0.15  # of a person's height in the image: where a detection stops supporting a hypothesis
+UNEXPLAINED = 0.1  # weight of a detection that the other cameras do not support: a camera may be badly calibrated
+CANDIDATES = 8  # combinations of people kept a frame
+JUMP_COST = 0.5  # of one camera's best score, for moving by the person's own height between frames
+
+
+def triangulate(
+    projections: np.ndarray, keypoints: np.ndarray, inlier_px: float | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points in space from their images, with outlier views left out.
+
+    projections (C, 3, 4); keypoints (C, K, 3) x_px, y_px, confidence (0: unseen). The pair of views whose linear
+    solution lies nearest to all views (confidence-weighted L1) decides which views are inliers; these are solved
+    together by the iteratively re-weighted linear method (Hartley and Sturm 1997). `inlier_px` defaults to 4 times the
+    median distance of the views that took no part in a pair's solution: it grows with noise and calibration error.
+
+    Returns points_m (K, 3), NaN with fewer than two inlier views; residuals_px (C, K), NaN where unseen or without a
+    point; inliers (C, K) bool.
+    """
+    confidence = _confidence(keypoints)
+    best = [_best_pair(projections, keypoints[:, i : i + CHUNK], confidence[:, i : i + CHUNK])
+            for i in range(0, keypoints.shape[1], CHUNK)]  # fmt: skip
+    pair_points = np.concatenate([points for points, _ in best]) if best else np.zeros((0, 3))
+    in_pair = np.concatenate([members for _, members in best], 1) if best else confidence > 0
+    distances = reprojection_px(projections, pair_points, keypoints)
+    if inlier_px is None:
+        witnesses = distances[(confidence > 0) & ~in_pair & np.isfinite(distances)]
+        inlier_px = max(MIN_INLIER_PX, 4 * float(np.median(witnesses))) if witnesses.size else np.inf
+    inliers = (confidence > 0) & (distances < inlier_px)
+    points_m = _solve(projections, keypoints, confidence * inliers)
+    residuals_px = reprojection_px(projections, points_m, keypoints)
+    inliers &= np.isfinite(residuals_px)
+    points_m[inliers.sum(0) < 2] = np.nan
+    residuals_px[:, inliers.sum(0) < 2] = np.nan
+    residuals_px[confidence == 0] = np.nan
+    return points_m, residuals_px, inliers & np.isfinite(residuals_px)
+
+
+def _confidence(keypoints: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(keypoints).all(-1), keypoints[..., 2], 0.0)
+
+
+def _best_pair(projections: np.ndarray, keypoints: np.ndarray, confidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Per point the two-view solution nearest to all views: (K, 3), and the members of the pair (C, K) bool."""
+    cameras, count = confidence.shape
+    best_cost = np.full(count, np.inf)
+    points_m = np.full((count, 3), np.nan)
+    members = np.zeros((cameras, count), bool)
+    for pair in combinations(range(cameras), 2):
+        in_pair = np.zeros((cameras, 1), bool)
+        in_pair[list(pair)] = True
+        candidate_m = _solve(projections, keypoints, confidence * in_pair)
+        far = reprojection_px(projections, candidate_m, keypoints)
+        cost = np.where(confidence > 0, confidence * np.nan_to_num(far, nan=1e6), 0).sum(0)
+        better = (confidence[list(pair)] > 0).all(0) & (cost < best_cost)
+        best_cost[better], points_m[better], members[:, better] = cost[better], candidate_m[better], in_pair
+    return points_m, members
+
+
+def _solve(projections: np.ndarray, keypoints: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Weighted linear triangulation (K, 3), re-weighted once by depth to minimise pixels; NaN under two views."""
+    rows = projections[:, None, 2:] * np.nan_to_num(keypoints)[..., :2, None] - projections[:, None, :2]  # (C, K, 2, 4)
+    focal = np.linalg.norm(projections[:, :2, :3], axis=-1).mean(1)
+    scale = np.where(weights > 0, np.sqrt(weights), 0)
+    enough = (weights > 0).sum(0) >= 2
+    points = np.zeros((keypoints.shape[1], 4))
+    for _ in range(2):
+        normal = np.einsum("ckia,ckib,ck->kab", rows, rows, (scale / focal[:, None]) ** 2, optimize=True)
+        points[enough] = np.linalg.eigh(normal[enough])[1][..., 0]
+        depth = np.abs(np.einsum("ca,ka->ck", projections[:, 2], points)) / np.linalg.norm(points, axis=1).clip(1e-12)
+        scale = np.sqrt(weights.clip(0)) / depth.clip(1e-9)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(enough[:, None], points[:, :3] / points[:, 3:], np.nan)
+
+
+def reprojection_px(projections: np.ndarray, points_m: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
+    """Distance of points (K, 3) to keypoints (C, K, 3) in the image, (C, K); NaN behind a camera."""
+    x = np.einsum("cij,kj->cki", projections, np.concatenate([points_m, np.ones_like(points_m[:, :1])], 1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.linalg.norm(x[..., :2] / x[..., 2:] - keypoints[..., :2], axis=-1)
+        return np.where(x[..., 2] > 0, distance, np.nan)
+
+
+def subject_keypoints(capture: Capture) -> dict[str, np.ndarray]:
+    """The subject's keypoints in every training camera, (frames, 25, 3) in the order of `capture.frames`.
+
+    Where several people are detected, the subject is whom most cameras agree on (two-view triangulation predicts where
+    each camera must see the person), weighted by size, confidence and nearness to the image's centre, and followed
+    through time (Viterbi). Confidence is 0 where the person is not detected. Test cameras are never read.
+    Raises CaptureError where no frame shows a person in two cameras (in one, if there is only one).
+    """
+    names = capture.train_cameras
+    detections = {name: capture.keypoints(name) for name in names}
+    for name, found in detections.items():
+        if found is None:
+            raise CaptureError(f"{capture.name}: camera {name}: no keypoints; run a keypoint detector on its images")
+    people = [np.nan_to_num(found).astype(np.float64) for found in detections.values() if found is not None]
+    seen = np.array([(p[..., 2] > 0).any((1, 2)) for p in people])  # (cameras, frames)
+    if not (seen.sum(0) >= min(2, len(names))).any():
+        raise CaptureError(f"{capture.name}: no person found in any frame by enough cameras; check the keypoint files")
+    if all(p.shape[1] == 1 for p in people):
+        return {name: p[:, 0] for name, p in zip(names, people, strict=True)}
+    cameras = [capture.cameras[name] for name in names]
+    choice = _follow([_frame_candidates(cameras, [p[i] for p in people]) for i in range(len(capture.frames))], people)
+    chosen = {}
+    for c, name in enumerate(names):
+        chosen[name] = people[c][np.arange(len(choice)), choice[:, c]] * (choice[:, c] >= 0)[:, None, None]
+    return chosen
+
+
+def _frame_candidates(cameras: list[Camera], people: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The best combinations of people in one frame: indices (n, C), -1 for nobody, and their scores (n,).
+
+    people: per camera (P, 25, 3). The score is the mean over cameras of prominence times agreement.
+    """
+    prominence = [_prominence(camera, found) for camera, found in zip(cameras, people, strict=True)]
+    agreements = _agreements(cameras, people) if len(cameras) > 1 else [np.eye(len(people[0]))]
+    picks = np.full((len(agreements[0]), len(cameras)), -1)
+    scores = np.zeros(len(picks))
+    for c, agreement in enumerate(agreements):
+        if len(picks) == 0 or not prominence[c].any():
+            continue
+        value = (UNEXPLAINED + agreement) * prominence[c]
+        picks[:, c] = value.argmax(1)
+        scores += value.max(1) / len(cameras)
+    picks, first = np.unique(picks, axis=0, return_index=True)
+    order = np.argsort(-scores[first])[:CANDIDATES]
+    if len(order) == 0:
+        return np.full((1, len(cameras)), -1), np.zeros(1)
+    return picks[order], scores[first][order]
+
+
+def _agreements(cameras: list[Camera], people: list[np.ndarray]) -> list[np.ndarray]:
+    """How well each hypothesis (a person in one camera being a person in another) explains each person: per camera
+    (n, P), from 0 to 1."""
+    projections = np.stack([camera.projection for camera in cameras])
+    shown = [np.flatnonzero(found[..., 2].any(1)) for found in people]
+    pairs = [(a, i, b, j) for a, b in combinations(range(len(cameras)), 2) for i in shown[a] for j in shown[b]]
+    views = np.zeros((len(cameras), len(pairs), 25, 3))
+    for n, (a, i, b, j) in enumerate(pairs):
+        views[a, n], views[b, n] = people[a][i], people[b][j]
+    flat = views.reshape(len(cameras), -1, 3)
+    points_m = _solve(projections, flat, _confidence(flat)).reshape(-1, 25, 3)
+    return [_support(camera, points_m, found) for camera, found in zip(cameras, people, strict=True)]
+
+
+def _support(camera: Camera, points_m: np.ndarray, people: np.ndarray) -> np.ndarray:
+    """(n, P): confidence-weighted share of the keypoints of people (P, 25, 3) that points (n, 25, 3) project onto."""
+    uv, depth_m = camera.project(points_m)
+    height_px = person_heights_px(people).clip(1)
+    distance = np.linalg.norm(uv[:, None] - people[None, ..., :2], axis=-1) / height_px[:, None]
+    hit = np.where((depth_m[:, None] > 0) & np.isfinite(distance), 1 - distance / AGREEMENT_REACH, 0).clip(0)
+    weight = people[..., 2]
+    return (hit * weight).sum(-1) / weight.sum(-1).clip(1e-9)
+
+
+def person_heights_px(people: np.ndarray) -> np.ndarray:
+    """Largest side of each person's keypoint box, (P,)."""
+    visible = people[..., 2:] > 0
+    low = np.where(visible, people[..., :2], np.inf).min(-2)
+    high = np.where(visible, people[..., :2], -np.inf).max(-2)
+    return (high - low).max(-1).clip(0)
+
+
+def _prominence(camera: Camera, people: np.ndarray) -> np.ndarray:
+    """Size x confidence x centrality of each person, (P,), from 0 to 1."""
+    size_px = np.array([camera.width_px, camera.height_px])
+    weight = people[..., 2:]
+    centre = (people[..., :2] * weight).sum(-2) / weight.sum(-2).clip(1e-9)
+    off_centre = np.linalg.norm((centre - size_px / 2) / size_px, axis=-1)
+    height = (person_heights_px(people) / camera.height_px).clip(0, 1)
+    return height * people[..., 2].mean(-1).clip(0, 1) * np.exp(-2 * off_centre**2)
+
+
+def _follow(candidates: list[tuple[np.ndarray, np.ndarray]], people: list[np.ndarray]) -> np.ndarray:
+    """The most probable sequence of combinations, (frames, C): Viterbi with a cost for jumping in the image."""
+    total, back = candidates[0][1], []
+    for i in range(1, len(candidates)):
+        (before, _), (now, score) = candidates[i - 1], candidates[i]
+        jump = _jump([p[i - 1] for p in people], before, [p[i] for p in people], now)
+        best_before = total[:, None] - JUMP_COST * jump
+        back.append(best_before.argmax(0))
+        total = best_before.max(0) + score
+    path = [int(total.argmax())]
+    for step in reversed(back):
+        path.append(int(step[path[-1]]))
+    return np.stack([picks[k] for (picks, _), k in zip(candidates, reversed(path), strict=True)])
+
+
+def _jump(
+    before: list[np.ndarray], picks_before: np.ndarray, now: list[np.ndarray], picks_now: np.ndarray
+) -> np.ndarray:
+    """Mean over cameras of the movement in person heights, at most 1 a camera: (n before, n now)."""
+    jumps = np.zeros((len(picks_before), len(picks_now)))
+    for c in range(len(before)):
+        a, b = before[c][picks_before[:, c]][:, None], now[c][picks_now[:, c]][None]
+        there = (picks_before[:, c] >= 0)[:, None] & (picks_now[:, c] >= 0)
+        both = np.minimum(a[..., 2], b[..., 2]) * there[..., None]
+        distance = np.linalg.norm(a[..., :2] - b[..., :2], axis=-1) / person_heights_px(b).clip(1)[..., None]
+        jumps += ((distance.clip(0, 1) * both).sum(-1) / both.sum(-1).clip(1e-9)) / len(before)
+    return jumps

@@ -1,0 +1,49 @@
+"""The person's masks of a capture, held as PNG so that many fit in memory."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hnerf.errors import CaptureError
+
+
+@dataclass(frozen=True)
+class Masks:
+    """encoded: by (camera, frame), PNG bytes of 0/255; report: plain values, backend and notes."""
+
+    encoded: dict[tuple[str, int], bytes]
+    report: dict[str, Any]
+
+    def get(self, camera: str, frame: int) -> np.ndarray:
+        """(H, W) bool, True on the person."""
+        png = np.frombuffer(self.encoded[camera, frame], np.uint8)
+        mask = cv2.imdecode(png, cv2.IMREAD_GRAYSCALE)
+        if mask is None:
+            raise CaptureError(
+                f"masks/{camera}/{frame:06d}.png: not a readable image; run the segmentation stage again"
+            )
+        return mask > 127
+
+    def save(self, out: Path) -> None:
+        """Write `masks/<camera>/<frame:06d>.png` and `report.json`."""
+        for (camera, frame), png in self.encoded.items():
+            path = out / "masks" / camera / f"{frame:06d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(png)
+        (out / "report.json").write_text(json.dumps(self.report, indent=1))
+
+    @staticmethod
+    def load(out: Path) -> "Masks":
+        """Read what `save` wrote."""
+        files = sorted((out / "masks").glob("*/*.png"))
+        encoded = {(path.parent.name, int(path.stem)): path.read_bytes() for path in files}
+        return Masks(encoded, json.loads((out / "report.json").read_text()))
+
+
+def encode(mask: np.ndarray) -> bytes:
+    """(H, W) bool to PNG bytes of 0/255."""
+    return cv2.imencode(".png", np.where(mask, 255, 0).astype(np.uint8))[1].tobytes()

@@ -1,0 +1,156 @@
+"""Where in an image the subject can be, from keypoints or from a fitted body."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.calibration.triangulation import person_heights_px, subject_keypoints, triangulate
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+from hnerf.config import SegmentationSettings
+from hnerf.render.silhouette import silhouette
+
+LIMBS = ((1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7), (8, 9), (9, 10), (10, 11), (8, 12), (12, 13), (13, 14),
+         (1, 8), (0, 1))  # fmt: skip
+FEET = ((11, 24), (11, 22), (14, 21), (14, 19))
+TRUNK = (2, 5, 12, 9)
+CORE_SHARE = 0.02  # of the person's height: half the width of a limb that is surely body
+MARGIN_PX = 12  # of background around the person
+NEAR_SHARE = 0.03  # of the person's height: how wrong a body fitted to keypoints alone may lie
+HEAD_SHARE = 0.45  # of the distance from neck to nose: radius of the head about a point a little above the nose
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of the person in one image before looking at it; height_px of the person.
+
+    (H, W) bool, each within the next: `core`, surely the person; `body`, as fitted; `near`, what a body fitted a little
+    wrong may cover; `reach`, where clothes and hair must end.
+    """
+
+    core: np.ndarray
+    body: np.ndarray
+    near: np.ndarray
+    reach: np.ndarray
+    height_px: float
+
+    @staticmethod
+    def around(body: np.ndarray, core: np.ndarray, height_px: float, reach: float) -> "Prior":
+        """Grown from a body (H, W) bool; reach in heights of the person."""
+        away_px = cv2.distanceTransform(np.where(body, 0, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+        return Prior(core, body, away_px <= NEAR_SHARE * height_px, away_px <= reach * height_px, height_px)
+
+    def cropped(self, window: tuple[slice, slice]) -> "Prior":
+        """The same within a window of the image."""
+        return Prior(self.core[window], self.body[window], self.near[window], self.reach[window], self.height_px)
+
+
+def keypoint_priors(capture: Capture, settings: SegmentationSettings) -> dict[str, list[Prior]]:
+    """Stick figures in every training camera, in the order of `capture.frames`."""
+    return {
+        name: [Prior.around(stick.body, stick.core, stick.height_px, settings.reach) for stick in sticks]
+        for name, sticks in _sticks(capture).items()
+    }
+
+
+def body_priors(capture: Capture, body: BodyFit, settings: SegmentationSettings) -> dict[str, list[Prior]]:
+    """The fitted body together with the stick figure, which a poor fit may have left, in every training camera."""
+    vertices_m, faces = body.vertices_m().numpy(), body.rig.faces.numpy()
+    priors: dict[str, list[Prior]] = {}
+    for name, sticks in _sticks(capture).items():
+        priors[name] = []
+        for frame, stick in zip(capture.frames, sticks, strict=True):
+            covered = silhouette(capture.cameras[name], vertices_m[body.index(frame)], faces)
+            core = cv2.erode(covered.astype(np.uint8), disc(CORE_SHARE * stick.height_px)).astype(bool)
+            priors[name].append(Prior.around(covered | stick.body, core, stick.height_px, settings.reach / 2))
+    return priors
+
+
+def window_around(region: np.ndarray) -> tuple[slice, slice]:
+    """Rows and columns of the True pixels of (H, W) with a margin of background; empty if there are none."""
+    rows, columns = np.flatnonzero(region.any(1)), np.flatnonzero(region.any(0))
+    if len(rows) == 0:
+        return slice(0), slice(0)
+    return (
+        slice(max(0, rows[0] - MARGIN_PX), rows[-1] + 1 + MARGIN_PX),
+        slice(max(0, columns[0] - MARGIN_PX), columns[-1] + 1 + MARGIN_PX),
+    )
+
+
+def disc(radius_px: float) -> np.ndarray:
+    """Structuring element of this radius, at least 1 px."""
+    side = 2 * max(1, round(radius_px)) + 1
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+
+
+def _consistent_keypoints(capture: Capture) -> dict[str, np.ndarray]:
+    """(frames, 25, 2) pixels a camera; NaN for a keypoint that is never seen.
+
+    Triangulated and projected where several cameras see the person, so that a detector's outliers are gone; gaps in
+    time are interpolated.
+    """
+    found = subject_keypoints(capture)
+    cameras = [capture.cameras[name] for name in capture.train_cameras]
+    if len(cameras) == 1:
+        keypoints = found[cameras[0].name]
+        return {cameras[0].name: _interpolated(np.where(keypoints[..., 2:] > 0, keypoints[..., :2], np.nan))}
+    flat = np.stack([found[camera.name].reshape(-1, 3) for camera in cameras])
+    points_m, _, _ = triangulate(np.stack([camera.projection for camera in cameras]), flat)
+    poses_m = _interpolated(points_m.reshape(-1, 25, 3))
+    return {camera.name: camera.project(poses_m)[0] for camera in cameras}
+
+
+def _interpolated(tracks: np.ndarray) -> np.ndarray:
+    """(frames, 25, D) with NaN gaps filled linearly in time."""
+    filled = tracks.copy()
+    at = np.arange(len(tracks))
+    for track in filled.reshape(len(tracks), -1).T:
+        known = np.isfinite(track)
+        if known.any():
+            track[~known] = np.interp(at[~known], at[known], track[known])
+    return filled
+
+
+@dataclass(frozen=True)
+class _Stick:
+    """A drawn stick figure, (H, W) bool: body, and core without the feet, where shadows touch the person."""
+
+    core: np.ndarray
+    body: np.ndarray
+    height_px: float
+
+
+def _sticks(capture: Capture) -> dict[str, list[_Stick]]:
+    """Per training camera the stick figures of `capture.frames`."""
+    sticks = {}
+    for name, poses_px in _consistent_keypoints(capture).items():
+        seen = np.isfinite(poses_px).all(-1, keepdims=True)
+        heights_px = person_heights_px(np.concatenate([np.nan_to_num(poses_px), seen], -1)).tolist()
+        camera = capture.cameras[name]
+        sticks[name] = [_stick(camera, pose_px, h) for pose_px, h in zip(poses_px, heights_px, strict=True)]
+    return sticks
+
+
+def _stick(camera: Camera, pose_px: np.ndarray, height_px: float) -> _Stick:
+    """Limbs as thick lines, trunk as a polygon, head as a disc. pose_px (25, 2)."""
+    seen = np.isfinite(pose_px).all(-1)
+    image = np.zeros((camera.height_px, camera.width_px), np.uint8)
+    width_px = max(1, round(2 * CORE_SHARE * height_px))
+    # Cut off far outside the image: drawing takes 32-bit integers.
+    at = np.nan_to_num(pose_px).clip(-4 * max(image.shape), 5 * max(image.shape)).round().astype(np.int32)
+
+    def draw(limbs: tuple[tuple[int, int], ...]) -> np.ndarray:
+        for a, b in limbs:
+            if seen[a] and seen[b]:
+                cv2.line(image, at[a].tolist(), at[b].tolist(), 1, width_px)
+        return image.astype(bool)
+
+    if seen[list(TRUNK)].all():
+        cv2.fillConvexPoly(image, cv2.convexHull(at[list(TRUNK)]), 1)
+    if seen[0] and seen[1]:
+        up = at[0] - at[1]
+        radius_px = round(HEAD_SHARE * float(np.linalg.norm(up)) + CORE_SHARE * height_px)
+        cv2.circle(image, (at[0] + 0.15 * up).round().astype(int).tolist(), radius_px, 1, cv2.FILLED)
+    return _Stick(draw(LIMBS), draw(FEET), height_px)

@@ -1,0 +1,82 @@
+"""A ring of cameras around a walking stick figure: everything about it is known."""
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+
+SIZE_PX = 1000
+FRAMES = 12
+
+# BODY_25 of a standing person facing +x, metres; ankle-knee .43, knee-hip .43, hips-neck .50, neck-nose .20 = 1.56.
+STANDING_M = np.array([
+    [.05, 0, 1.64], [0, 0, 1.446], [0, -.2, 1.44], [0, -.25, 1.15], [.05, -.27, .9], [0, .2, 1.44], [0, .25, 1.15],
+    [.05, .27, .9], [0, 0, .946], [0, -.1, .94], [0, -.1, .51], [0, -.1, .08], [0, .1, .94], [0, .1, .51], [0, .1, .08],
+    [.06, -.03, 1.67], [.06, .03, 1.67], [0, -.07, 1.65], [0, .07, 1.65],
+    [.17, .1, .02], [.15, .14, .02], [-.05, .1, .02], [.17, -.1, .02], [.15, -.14, .02], [-.05, -.1, .02],
+])  # fmt: skip
+
+
+def look_at(name: str, centre_m: np.ndarray, target_m: np.ndarray) -> Camera:
+    """A camera of 1000 x 1000 px and focal length 1000 px, upright."""
+    forward = target_m - centre_m
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    R = np.stack([right, np.cross(forward, right), forward])
+    middle = (SIZE_PX - 1) / 2
+    K = np.array([[1000.0, 0, middle], [0, 1000, middle], [0, 0, 1]])
+    return Camera(name, K, R, -R @ centre_m, SIZE_PX, SIZE_PX)
+
+
+def ring(count: int) -> list[Camera]:
+    """Cameras 3.5 m around the origin at 1.2 to 1.8 m, unevenly spaced, looking at the middle of the body."""
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False) + 0.3 * np.sin(np.arange(count))
+    heights = 1.2 + 0.6 * (np.arange(count) % 2)
+    return [
+        look_at(f"c{i}", np.array([3.5 * np.cos(a), 3.5 * np.sin(a), h]), np.array([0, 0, 0.9]))
+        for i, (a, h) in enumerate(zip(angles, heights, strict=True))
+    ]
+
+
+def walk_m(frames: int = FRAMES) -> np.ndarray:
+    """(frames, 25, 3): the figure on a small circle, turning, with arms that swing."""
+    poses = []
+    for angle in np.linspace(0, 2 * np.pi, frames, endpoint=False):
+        pose = STANDING_M.copy()
+        pose[[3, 4, 6, 7], 0] += 0.2 * np.sin(2 * angle) * np.array([1, 1, -1, -1])
+        turn = cv2.Rodrigues(np.array([0, 0, angle]))[0]
+        poses.append(pose @ turn.T + [0.4 * np.cos(angle), 0.4 * np.sin(angle), 0])
+    return np.stack(poses)
+
+
+def detections(cameras: list[Camera], noise_px: float, seed: int = 0) -> dict[str, np.ndarray]:
+    """Per camera (frames, 1, 25, 3) keypoints of the walk with Gaussian noise and confidence 0.8."""
+    rng = np.random.default_rng(seed)
+    seen = {}
+    for camera in cameras:
+        uv = camera.project(walk_m())[0]
+        noisy = uv + rng.normal(size=uv.shape) * noise_px
+        seen[camera.name] = np.concatenate([noisy, np.full_like(uv[..., :1], 0.8)], -1)[:, None]
+    return seen
+
+
+def write_capture(root: Path, cameras: list[Camera], seen: dict[str, np.ndarray], up: str = "z") -> Capture:
+    """A capture with keypoints and no images, as the given cameras would have it."""
+    root.mkdir(parents=True, exist_ok=True)
+    np.savez(root / "keypoints.npz", **seen)  # type: ignore[arg-type]
+    sizes = {camera.name: (SIZE_PX, SIZE_PX) for camera in cameras}
+    frames = tuple(range(len(next(iter(seen.values())))))
+    names = tuple(camera.name for camera in cameras)
+    by_name = {camera.name: camera for camera in cameras}
+    return Capture("ring", root, by_name, names, (), frames, (), 30.0, up, sizes, sizes)
+
+
+def turned(camera: Camera, degrees: float, axis: int = 1) -> Camera:
+    """The camera turned about its own centre and one of its own axes."""
+    rotation = cv2.Rodrigues(np.deg2rad(degrees) * np.eye(3)[axis])[0]
+    return dataclasses.replace(camera, R=rotation @ camera.R, t_m=rotation @ camera.t_m)

@@ -1,0 +1,182 @@
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hnerf.calibration.check import check_calibration, load_cameras
+from hnerf.calibration.diagnosis import MISTAKES, body_height_m, cost_without_each_px, unit_of
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+from hnerf.capture.ingest import ingest
+from hnerf.config import CalibrationSettings, CaptureSettings
+from hnerf.errors import CaptureError
+from tests.calibration.synthetic import STANDING_M, detections, ring, turned, walk_m, write_capture
+from tests.shared_data import shared_capture
+
+SETTINGS = CalibrationSettings()
+Mistake = Callable[[Camera], Camera]
+
+
+def recorded_with(
+    root: Path, mistake: Mistake, only: int | None = None, count: int = 4, noise_px: float = 2
+) -> Capture:
+    """A ring that saw the walk, with a mistake in the calibration of one camera or of all."""
+    cameras = ring(count)
+    wrong = [mistake(camera) if only in (None, i) else camera for i, camera in enumerate(cameras)]
+    return write_capture(root, wrong, detections(cameras, noise_px))
+
+
+def true_error_px(camera: Camera, truth: Camera) -> float:
+    """Median distance between both projections of the walk."""
+    return float(np.median(np.linalg.norm(camera.project(walk_m())[0] - truth.project(walk_m())[0], axis=-1)))
+
+
+def test_body_height_by_hand() -> None:
+    # The figure's limb chain is .43 + .43 + .50 + |(.05, .194)| = 1.560 m; over 0.87 that is 1.79 m.
+    assert body_height_m(STANDING_M[None]) == pytest.approx((0.43 + 0.43 + 0.5 + np.hypot(0.05, 0.194)) / 0.87)
+
+
+def test_units_by_hand() -> None:
+    assert unit_of(1790) == "millimetres"
+    assert unit_of(179) == "centimetres"
+    assert unit_of(70.5) == "inches"
+    assert unit_of(5) is None
+
+
+def test_a_good_calibration_is_left_alone(tmp_path: Path) -> None:
+    capture = recorded_with(tmp_path / "in", lambda c: c)
+    report = check_calibration(capture, SETTINGS)
+    assert report.verdict == "ok"
+    assert report.after is not None
+    assert report.after.body_height_m == pytest.approx(1.79, abs=0.02)
+    report.save(tmp_path / "out")
+    for name, camera in load_cameras(tmp_path / "out", capture).cameras.items():
+        for field in ("K", "R", "t_m"):
+            np.testing.assert_array_equal(getattr(camera, field), getattr(capture.cameras[name], field))
+
+
+def test_leave_one_out_names_the_turned_camera() -> None:
+    cameras = ring(4)
+    keypoints = np.stack([seen.reshape(-1, 3) for seen in detections(cameras, noise_px=2).values()])
+    for i in range(4):
+        off = [turned(camera, 1.0) if j == i else camera for j, camera in enumerate(cameras)]
+        costs = cost_without_each_px(off, keypoints)
+        assert min(costs, key=costs.__getitem__) == f"c{i}"
+
+
+def test_one_turned_camera_is_named_and_refined(tmp_path: Path) -> None:
+    # One degree at 1000 px focal length is 17 px.
+    capture = recorded_with(tmp_path / "in", lambda c: turned(c, 1.0), only=2)
+    assert true_error_px(capture.cameras["c2"], ring(4)[2]) == pytest.approx(17.5, abs=1)
+    report = check_calibration(capture, SETTINGS)
+    assert {name: v.status for name, v in report.verdicts.items()} == {
+        "c0": "ok", "c1": "ok", "c2": "refined", "c3": "ok"
+    }  # fmt: skip
+    assert any("the worst fit" in reason for reason in report.verdicts["c2"].reasons)
+    assert true_error_px(report.cameras["c2"], ring(4)[2]) < 1
+    report.save(tmp_path / "out")
+    used = load_cameras(tmp_path / "out", capture).cameras
+    np.testing.assert_allclose(used["c2"].R, report.cameras["c2"].R, atol=1e-12)
+    stored = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert stored["verdict"] == "refined"
+    assert stored["cameras"]["c2"]["median_px"] < 4 < stored["cameras"]["c2"]["median_before_px"]
+    assert cv2.imread(str(tmp_path / "out" / "cameras.png")).shape[2] == 3
+
+
+def test_far_off_camera_comes_back(tmp_path: Path) -> None:
+    report = check_calibration(recorded_with(tmp_path, lambda c: turned(c, 10.0), only=1), SETTINGS)
+    assert true_error_px(report.cameras["c1"], ring(4)[1]) < 1
+
+
+def test_when_all_are_stale_the_world_stays(tmp_path: Path) -> None:
+    signs = iter([1, -1, 1, -1])
+    capture = recorded_with(tmp_path, lambda c: turned(c, 0.8 * next(signs), axis=0), noise_px=1)
+    report = check_calibration(capture, SETTINGS)
+    assert {v.status for v in report.verdicts.values()} == {"refined"}
+    assert report.after is not None
+    assert max(report.after.median_px.values()) < 2
+    # Nobody can tell where the whole rig moved; as the errors cancel, points must be where they were within 2 cm.
+    points_m = report.after.points_m
+    assert np.median(np.linalg.norm(points_m - walk_m(), axis=-1)) < 0.02
+
+
+@pytest.mark.parametrize("cause", list(MISTAKES))
+def test_each_wrong_convention_is_named(tmp_path: Path, cause: str) -> None:
+    make: dict[str, Mistake] = dict(MISTAKES)  # all but one undo themselves
+    make["T is the camera's centre"] = lambda c: dataclasses.replace(c, t_m=c.centre_m)
+    with pytest.raises(CaptureError) as caught:
+        check_calibration(recorded_with(tmp_path, make[cause]), SETTINGS)
+    assert cause in str(caught.value)
+    assert " or " not in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_wrong_convention_in_one_camera_is_named(tmp_path: Path) -> None:
+    report = check_calibration(recorded_with(tmp_path, MISTAKES["R is transposed"], only=3), SETTINGS)
+    assert "likely cause: R is transposed" in report.verdicts["c3"].reasons
+
+
+def test_millimetres_are_named(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match=r"1793 m tall.*millimetres"):
+        check_calibration(
+            recorded_with(tmp_path, lambda c: dataclasses.replace(c, t_m=1000 * c.t_m), noise_px=0), SETTINGS
+        )
+
+
+def test_swapped_files_fit_no_convention(tmp_path: Path) -> None:
+    cameras = ring(4)
+    shuffled = [
+        dataclasses.replace(cameras[1], name="c0"), dataclasses.replace(cameras[0], name="c1"), *cameras[2:]
+    ]  # fmt: skip
+    with pytest.raises(CaptureError, match="no known mistake explains it"):
+        check_calibration(write_capture(tmp_path, shuffled, detections(cameras, 1)), SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "words"),
+    [
+        (lambda c: dataclasses.replace(c, t_m=np.array([np.nan, 0, 0])), "camera c0: NaN"),
+        (lambda c: dataclasses.replace(c, R=1.1 * c.R), "camera c0: R is not a rotation"),
+        (lambda c: dataclasses.replace(c, R=np.diag([-1, 1, 1]) @ c.R), "camera c0: R mirrors"),
+        (lambda c: dataclasses.replace(ring(4)[1], name=c.name), "c0 and c1 stand at one place"),
+    ],
+)
+def test_impossible_numbers_name_the_camera(tmp_path: Path, mistake: Mistake, words: str) -> None:
+    with pytest.raises(CaptureError, match=words):
+        check_calibration(recorded_with(tmp_path, mistake, only=0), SETTINGS)
+
+
+def test_a_camera_that_never_shows_the_person_is_named(tmp_path: Path) -> None:
+    cameras = ring(4)
+    seen = detections(cameras, noise_px=1)
+    seen["c2"] = 0 * seen["c2"]
+    with pytest.raises(CaptureError, match="camera c2 never shows the person"):
+        check_calibration(write_capture(tmp_path, cameras, seen), SETTINGS)
+
+
+def test_a_size_mismatch_is_named(tmp_path: Path) -> None:
+    capture = recorded_with(tmp_path, lambda c: c)
+    capture = dataclasses.replace(capture, calibrated_sizes_px=capture.calibrated_sizes_px | {"c1": (1008, 1000)})
+    report = check_calibration(capture, SETTINGS)
+    assert report.verdicts["c1"].reasons == ("calibrated at 1008x1000, recorded at 1000x1000",)
+    assert report.verdicts["c1"].status == "ok"
+
+
+def test_one_camera_says_what_is_not_checked(tmp_path: Path) -> None:
+    capture = recorded_with(tmp_path / "in", lambda c: c, count=1)
+    report = check_calibration(capture, SETTINGS)
+    assert report.verdict == "ok"
+    assert any("not checked with one camera" in note for note in report.notes)
+    report.save(tmp_path / "out")
+    assert load_cameras(tmp_path / "out", capture).train_cameras == ("c0",)
+
+
+def test_a_rendered_capture_is_left_alone(tmp_path: Path) -> None:
+    capture = ingest(shared_capture("valid-wave"), CaptureSettings(), tmp_path)
+    report = check_calibration(capture, SETTINGS)
+    assert report.verdict == "ok"
+    assert all(report.cameras[name] is camera for name, camera in capture.cameras.items())

@@ -1,0 +1,106 @@
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.calibration.triangulation import subject_keypoints, triangulate
+from hnerf.capture.camera import Camera
+from hnerf.errors import CaptureError
+from tests.calibration.synthetic import detections, ring, walk_m, write_capture
+
+
+def test_two_cameras_by_hand() -> None:
+    # Focal length 100, principal point (50, 50); b stands 1 m to the right of a. The point (0.5, 0.2, 2) lies at
+    # (50 + 100 * .25, 50 + 100 * .1) = (75, 60) in a, and at (50 - 100 * .25, 60) = (25, 60) in b.
+    K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
+    a = Camera("a", K, np.eye(3), np.zeros(3), 100, 100)
+    b = Camera("b", K, np.eye(3), np.array([-1.0, 0, 0]), 100, 100)
+    keypoints = np.array([[[75, 60, 0.9]], [[25, 60, 0.9]]])
+    points_m, residuals_px, inliers = triangulate(np.stack([a.projection, b.projection]), keypoints)
+    np.testing.assert_allclose(points_m, [[0.5, 0.2, 2]], atol=1e-9)
+    np.testing.assert_allclose(residuals_px, 0, atol=1e-7)
+    assert inliers.all()
+
+
+def test_residual_by_hand() -> None:
+    # Rows that disagree by 2 px cannot meet in 3-D: with equal confidence each view misses by 1 px, vertically.
+    K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
+    projections = np.stack([K @ np.hstack([np.eye(3), [[-x], [0], [0]]]) for x in (0.0, 1.0)])
+    keypoints = np.array([[[75, 59, 0.9]], [[25, 61, 0.9]]])
+    points_m, residuals_px, _ = triangulate(projections, keypoints)
+    np.testing.assert_allclose(residuals_px, 1, atol=1e-3)
+    np.testing.assert_allclose(points_m[0], [0.5, 0.2, 2], atol=1e-3)
+
+
+def test_an_outlier_view_is_left_out_and_its_residual_told() -> None:
+    cameras = ring(4)
+    keypoints = np.stack([seen.reshape(-1, 3) for seen in detections(cameras, noise_px=0).values()])
+    keypoints[2, 0, :2] += [30, 40]
+    points_m, residuals_px, inliers = triangulate(np.stack([c.projection for c in cameras]), keypoints)
+    np.testing.assert_allclose(points_m[0], walk_m()[0, 0], atol=1e-6)
+    np.testing.assert_allclose(residuals_px[:, 0], [0, 0, 50, 0], atol=1e-3)
+    assert inliers[:, 0].tolist() == [True, True, False, True]
+
+
+def test_unseen_points_are_nan() -> None:
+    cameras = ring(3)
+    keypoints = np.stack([np.append(c.project(np.zeros((2, 3)))[0], [[0.8], [0.8]], 1) for c in cameras])
+    keypoints[1:, 0, 2] = 0  # the first point in one view only
+    keypoints[0, 1, 2] = 0  # the second in two
+    points_m, residuals_px, _ = triangulate(np.stack([c.projection for c in cameras]), keypoints)
+    assert np.isnan(points_m[0]).all()
+    assert np.isnan(residuals_px[:, 0]).all()
+    np.testing.assert_allclose(points_m[1], 0, atol=1e-6)
+    assert np.isnan(residuals_px[0, 1])
+
+
+def test_noise_averages_out() -> None:
+    # 2 px at 3.5 m and 1000 px focal length is 7 mm across a ray; four views bring the error under 10 mm.
+    cameras = ring(4)
+    keypoints = np.stack([seen.reshape(-1, 3) for seen in detections(cameras, noise_px=2).values()])
+    points_m, _, _ = triangulate(np.stack([c.projection for c in cameras]), keypoints)
+    assert np.median(np.linalg.norm(points_m - walk_m().reshape(-1, 3), axis=1)) < 0.010
+
+
+def two_people(cameras: list[Camera]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """The subject in every camera; a bystander 1.5 m behind, larger confidence, in two; order swapped now and then."""
+    subject = detections(cameras, noise_px=1)
+    both = {}
+    for i, camera in enumerate(cameras):
+        uv = camera.project(walk_m()[0] + [1.5, 0.5, 0])[0]
+        bystander = np.broadcast_to(np.concatenate([uv, np.full((25, 1), 0.95 * (i < 2))], 1), (12, 1, 25, 3))
+        pair = np.concatenate([subject[camera.name], bystander], 1)
+        pair[i::3] = pair[i::3, ::-1]
+        both[camera.name] = pair
+    return subject, both
+
+
+def test_the_subject_is_whom_all_cameras_see(tmp_path: Path) -> None:
+    cameras = ring(4)
+    subject, both = two_people(cameras)
+    chosen = subject_keypoints(write_capture(tmp_path, cameras, both))
+    for camera in cameras:
+        np.testing.assert_array_equal(chosen[camera.name], subject[camera.name][:, 0])
+
+
+def test_one_camera_takes_the_largest_and_most_central(tmp_path: Path) -> None:
+    camera = ring(4)[0]
+    subject = detections([camera], noise_px=1)["c0"]
+    small = subject * [0.4, 0.4, 1]  # towards the upper left corner, at the same confidence
+    chosen = subject_keypoints(write_capture(tmp_path, [camera], {"c0": np.concatenate([small, subject], 1)}))
+    np.testing.assert_array_equal(chosen["c0"], subject[:, 0])
+
+
+def test_test_cameras_are_never_read(tmp_path: Path) -> None:
+    cameras = ring(4)
+    capture = write_capture(tmp_path, cameras, {c: k for c, k in detections(cameras, 1).items() if c != "c3"})
+    capture = dataclasses.replace(capture, train_cameras=("c0", "c1", "c2"), test_cameras=("c3",))
+    assert set(subject_keypoints(capture)) == {"c0", "c1", "c2"}
+
+
+def test_nobody_is_an_error(tmp_path: Path) -> None:
+    cameras = ring(3)
+    seen = {name: k * [1, 1, name == "c0"] for name, k in detections(cameras, 1).items()}
+    with pytest.raises(CaptureError, match="no person"):
+        subject_keypoints(write_capture(tmp_path, cameras, seen))

@@ -1,0 +1,73 @@
+"""A synthetic person in one or more views of a textured room, with a soft shadow: the mask is known."""
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hnerf.capture.capture import Capture
+from tests.calibration.synthetic import STANDING_M, look_at, write_capture
+
+SIZE_PX = 400
+FRAMES = 8
+PERSON_RGB = (60, 80, 150)
+LIMBS = ((1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7), (8, 9), (9, 10), (10, 11), (8, 12), (12, 13), (13, 14),
+         (14, 19), (11, 22))  # fmt: skip
+
+
+def write_scene(root: Path, cameras: int = 1, plate: bool = True, moves_m: float = 0.5) -> tuple[Capture, dict]:
+    """A capture of a stick person walking across, and the true masks by (camera, frame)."""
+    rng = np.random.default_rng(0)
+    middle = np.array([0, 0, 0.9])
+    places = [np.array([3.5 * np.cos(a), 3.5 * np.sin(a), 1.0]) for a in 1.2 * np.arange(cameras)]
+    views = [look_at(f"c{i}", place, middle).resized(SIZE_PX, SIZE_PX) for i, place in enumerate(places)]
+    seen, truth = {}, {}
+    for camera in views:
+        room = cv2.resize(rng.integers(90, 200, (40, 40, 3)).astype(np.uint8), (SIZE_PX, SIZE_PX))
+        poses_px = []
+        for frame in range(FRAMES):
+            sideways = moves_m * (frame - FRAMES / 2) / FRAMES
+            pose_m = STANDING_M + sideways * np.array([-1.0, 1, 0])
+            pose_px = camera.project(pose_m)[0]
+            truth[camera.name, frame] = person(pose_px)
+            shadow = np.roll(cv2.GaussianBlur(truth[camera.name, frame].astype(np.float32), (0, 0), 9), 45, axis=1)
+            image = room * (1 - 0.5 * shadow[..., None])
+            image[truth[camera.name, frame]] = PERSON_RGB
+            noisy = (image + rng.normal(size=image.shape) * 2).clip(0, 255).astype(np.uint8)
+            _write(root / "images" / camera.name / f"{frame:06d}.png", noisy)
+            poses_px.append(np.concatenate([pose_px, np.full((25, 1), 0.8)], 1))
+        seen[camera.name] = np.stack(poses_px)[:, None]
+        if plate:
+            _write(root / "background" / f"{camera.name}.png", room)
+    return write_capture(root, views, seen), truth
+
+
+def person(pose_px: np.ndarray) -> np.ndarray:
+    """Thick limbs, trunk and head, (H, W) bool."""
+    image = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
+    at = pose_px.round().astype(np.int32)
+    for a, b in LIMBS:
+        cv2.line(image, at[a].tolist(), at[b].tolist(), 1, 13)
+    cv2.fillConvexPoly(image, cv2.convexHull(at[[2, 5, 9, 12]]), 1)
+    cv2.circle(image, at[0].tolist(), 12, 1, cv2.FILLED)
+    cv2.line(image, at[0].tolist(), at[1].tolist(), 1, 9)
+    return image.astype(bool)
+
+
+def write_masks(capture: Capture, masks: dict) -> None:
+    """Given masks beside the images."""
+    for (camera, frame), mask in masks.items():
+        _write(capture.root / "masks" / camera / f"{frame:06d}.png", np.where(mask, 255, 0).astype(np.uint8))
+
+
+def only_frames(capture: Capture, count: int) -> Capture:
+    """The first frames, with their keypoints."""
+    with np.load(capture.root / "keypoints.npz") as stored:
+        np.savez(capture.root / "keypoints.npz", **{name: stored[name][:count] for name in stored.files})
+    return dataclasses.replace(capture, train_frames=tuple(range(count)), novel_pose_frames=())
+
+
+def _write(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image)

@@ -1,0 +1,139 @@
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from hnerf.capture.ingest import ingest
+from hnerf.config import CaptureSettings, SegmentationSettings
+from hnerf.errors import CaptureError
+from hnerf.segmentation.cut import components_within
+from hnerf.segmentation.difference import difference, masked_median, noise_level
+from hnerf.segmentation.prior import Prior
+from hnerf.segmentation.segment import Masks, segment
+from tests.segmentation.scene import only_frames, write_masks, write_scene
+from tests.shared_data import shared_capture
+
+SETTINGS = SegmentationSettings()
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    return float((a & b).sum() / (a | b).sum())
+
+
+def test_a_shadow_is_not_the_person_by_hand() -> None:
+    # Left: the plate at 60 % brightness in all channels (a shadow); right: another colour of like brightness.
+    plate = np.full((40, 80, 3), (150, 120, 90), np.uint8)
+    image = plate.copy()
+    image[10:30, 10:30] = (90, 72, 54)
+    image[10:30, 50:70] = (54, 72, 90)
+    found = difference(image, plate, noise_level(image, plate), SETTINGS)
+    assert found.changed[12:28, 12:28].all()
+    assert found.shadow[12:28, 12:28].all()
+    assert found.changed[12:28, 52:68].all()
+    assert not found.shadow[12:28, 52:68].any()
+    assert not found.changed[:8].any()
+
+
+def test_masked_median_by_hand() -> None:
+    # The pixel's values over five frames; hidden by the person (200) in three: the median of 10 and 30 is their upper.
+    values, hidden = [10, 200, 200, 30, 200], [False, True, True, False, True]
+    images = [np.full((1, 2, 3), value, np.uint8) for value in values]
+    priors = []
+    for is_hidden in hidden:
+        near = np.array([[is_hidden, True]])  # the second pixel is never free
+        priors.append(Prior(near, near, near, near, 1.0))
+    plate, known = masked_median(images, priors)
+    assert plate[0, 0].tolist() == [30, 30, 30]
+    assert known.tolist() == [[True, False]]
+
+
+def test_components_of_another_person_go() -> None:
+    mask = np.zeros((10, 20), bool)
+    mask[2:8, 2:6] = True  # 24 px, wholly within reach
+    mask[2:8, 12:18] = True  # 36 px, 6 of them within reach
+    reach = np.zeros_like(mask)
+    reach[:, :13] = True
+    kept = components_within(mask, reach)
+    assert kept.sum() == 24
+    assert kept[2:8, 2:6].all()
+
+
+def test_clean_plate_with_a_soft_shadow(tmp_path: Path) -> None:
+    capture, truth = write_scene(tmp_path / "in")
+    masks = segment(capture, None, SETTINGS)
+    assert min(iou(masks.get(*view), mask) for view, mask in truth.items()) >= 0.97
+    assert masks.report["cameras"]["c0"]["backend"] == "clean plate"
+    (tmp_path / "out").mkdir()
+    masks.save(tmp_path / "out")
+    written = cv2.imread(str(tmp_path / "out" / "masks" / "c0" / "000003.png"), cv2.IMREAD_UNCHANGED)
+    assert sorted(np.unique(written)) == [0, 255]
+    loaded = Masks.load(tmp_path / "out")
+    assert loaded.report == json.loads((tmp_path / "out" / "report.json").read_text())
+    np.testing.assert_array_equal(loaded.get("c0", 3), masks.get("c0", 3))
+
+
+def test_given_masks_come_first_and_lose_other_people(tmp_path: Path) -> None:
+    capture, truth = write_scene(tmp_path)
+    given = {view: mask.copy() for view, mask in truth.items()}
+    for mask in given.values():
+        mask[150:250, 5:25] = True  # someone at the edge
+    write_masks(capture, given)
+    masks = segment(capture, None, SETTINGS)
+    assert masks.report["cameras"]["c0"]["backend"] == "given"
+    for view, mask in truth.items():
+        np.testing.assert_array_equal(masks.get(*view), mask)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "word"), [(np.zeros_like, "no person in the mask"), (np.logical_not, "the mask is inverted")]
+)
+def test_bad_given_masks_name_the_image(tmp_path: Path, spoil, word: str) -> None:  # type: ignore[no-untyped-def]
+    capture, truth = write_scene(tmp_path)
+    truth["c0", 5] = spoil(truth["c0", 5])
+    write_masks(capture, truth)
+    with pytest.raises(CaptureError, match=f"camera c0, frame 5.*{word}"):
+        segment(capture, None, SETTINGS)
+
+
+def test_a_missing_given_mask_names_the_file(tmp_path: Path) -> None:
+    capture, truth = write_scene(tmp_path)
+    del truth["c0", 2]
+    write_masks(capture, truth)
+    with pytest.raises(CaptureError, match=r"masks/c0/000002\.png"):
+        segment(capture, None, SETTINGS)
+
+
+def test_a_plate_that_shows_the_person_is_an_error(tmp_path: Path) -> None:
+    capture, _ = write_scene(tmp_path, moves_m=0)
+    (tmp_path / "background" / "c0.png").write_bytes((tmp_path / "images" / "c0" / "000000.png").read_bytes())
+    with pytest.raises(CaptureError, match="no person in the mask"):
+        segment(only_frames(capture, 1), None, SETTINGS)
+
+
+def test_neither_masks_nor_plate_asks_for_a_body(tmp_path: Path) -> None:
+    capture, _ = write_scene(tmp_path, plate=False)
+    with pytest.raises(CaptureError, match="fit a body first"):
+        segment(capture, None, SETTINGS)
+
+
+def test_without_a_plate_the_background_is_found_around_the_body(tmp_path: Path) -> None:
+    capture, truth = write_scene(tmp_path, cameras=2, plate=False, moves_m=2.0)
+    nowhere_m = torch.tensor([[[0.0, 0, -9], [0.01, 0, -9], [0, 0.01, -9]]]).expand(len(capture.frames), 3, 3)
+    lost = SimpleNamespace(  # a fit that went astray: the keypoints have to do
+        vertices_m=lambda: nowhere_m, rig=SimpleNamespace(faces=torch.tensor([[0, 1, 2]])), index=capture.frames.index
+    )
+    masks = segment(capture, lost, SETTINGS)  # type: ignore[arg-type]
+    assert np.mean([iou(masks.get(*view), mask) for view, mask in truth.items()]) >= 0.95
+
+
+def test_rendered_capture_against_ground_truth(tmp_path: Path) -> None:
+    folder = shared_capture("valid-wave")
+    capture = only_frames(ingest(folder, CaptureSettings(), tmp_path), 4)
+    masks = segment(capture, None, SETTINGS)
+    for camera, frame in masks.encoded:
+        truth = cv2.imread(str(folder / "ground_truth" / "masks" / camera / f"{frame:06d}.png"), cv2.IMREAD_GRAYSCALE)
+        assert iou(masks.get(camera, frame), truth > 127) > 0.95
