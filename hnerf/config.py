@@ -47,7 +47,8 @@ class SegmentationSettings(Section):
 
 
 class FitSettings(Section):
-    """Standard deviations, unless said otherwise. Shape values are anny's: phenotypes in [0, 1], local changes in [-1, 1]."""
+    """Standard deviations, unless said otherwise. Shape values are anny's: phenotypes in [0, 1], local changes in
+    [-1, 1]."""
 
     keypoint_m: float = Field(default=0.02, gt=0)  # of a keypoint seen with full confidence
     keypoint_outlier_m: float = Field(default=0.15, gt=0)  # distance at which a keypoint's pull fades
@@ -56,7 +57,7 @@ class FitSettings(Section):
     stature_spread_m: float = Field(default=0.08, gt=0)
     phenotype_spread: float = Field(default=0.25, gt=0)
     local_change_spread: float = Field(default=0.3, gt=0)
-    acceleration_mps2: float = Field(default=15.0, gt=0)  # of the trunk; hands and feet three to four times as much
+    acceleration_mps2: float = Field(default=10.0, gt=0)  # of the trunk; hands and feet three to four times as much
     inside_m: float = Field(default=0.008, gt=0)  # of a mask's edge inside the body
     outside_m: float = Field(default=0.02, gt=0)  # of a mask's edge outside the body
     clothing_m: float = Field(default=0.08, gt=0)  # distance at which cloth and hair no longer pull the body outwards
@@ -106,7 +107,7 @@ class LossSettings(Section):
     increment: float = Field(default=0.02, ge=0)
     eta: float = Field(default=1.0, ge=0)  # of the surroundings in blend; 0.25 where floor or furniture is near
     density_threshold: float = Field(default=50.0, gt=0)  # sigma_h, per scene unit
-    density_steepness: float = Field(default=0.1, gt=0)  # lambda: sigmoid leaves 0.007 for no density, 0.993 for 2 sigma_h
+    density_steepness: float = Field(default=0.1, gt=0)  # lambda; docs/method.md says why
     sharpness_per_m: float = Field(default=80.0, gt=0)  # gamma = 200 per 2.5 m
 
 

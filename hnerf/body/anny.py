@@ -1,5 +1,6 @@
 """anny (Apache-2.0 code, CC0 data) as a Rig: one watertight part, no eyes, no tongue."""
 
+import dataclasses
 import functools
 
 import anny
@@ -12,12 +13,29 @@ from hnerf.body.rig import Rig
 PHENOTYPES = ("gender", "age", "muscle", "weight", "height", "proportions")
 
 # anny's local changes that fit limbs, trunk and head to a person whom no phenotype describes; sides move together.
-LOCAL_CHANGES = tuple(
-    "measure-upperarm-length measure-lowerarm-length measure-upperleg-height measure-lowerleg-height "
-    "measure-napetowaist-dist measure-shoulder-dist measure-neck-height measure-upperarm-circ l-lowerarm-fat+r-lowerarm-fat "
-    "measure-thigh-circ measure-calf-circ measure-waist-circ measure-hips-circ torso-scale-horiz torso-scale-depth "
-    "hip-scale-horiz hip-scale-depth head-scale-vert head-scale-depth head-scale-horiz l-foot-scale+r-foot-scale "
-    "l-hand-scale+r-hand-scale".split()
+LOCAL_CHANGES = (
+    "measure-upperarm-length",
+    "measure-lowerarm-length",
+    "measure-upperleg-height",
+    "measure-lowerleg-height",
+    "measure-napetowaist-dist",
+    "measure-shoulder-dist",
+    "measure-neck-height",
+    "measure-upperarm-circ",
+    "l-lowerarm-fat+r-lowerarm-fat",
+    "measure-thigh-circ",
+    "measure-calf-circ",
+    "measure-waist-circ",
+    "measure-hips-circ",
+    "torso-scale-horiz",
+    "torso-scale-depth",
+    "hip-scale-horiz",
+    "hip-scale-depth",
+    "head-scale-vert",
+    "head-scale-depth",
+    "head-scale-horiz",
+    "l-foot-scale+r-foot-scale",
+    "l-hand-scale+r-hand-scale",
 )
 BETA_NAMES = PHENOTYPES + LOCAL_CHANGES
 ADULT = (0.5, 0.72, 0.5, 0.5, 0.5, 0.5) + (0.0,) * len(LOCAL_CHANGES)  # age 0.5 is a teenager of 1.63 m
@@ -26,16 +44,18 @@ BETA_HIGH = (1.0,) * len(BETA_NAMES)
 
 # Limbs, spine, neck and head turn; fingers, toes, eyes and the twist halves of a limb follow their parents.
 FREE_JOINTS = (
-    "root spine05 spine03 spine01 neck01 head clavicle.L clavicle.R upperarm01.L upperarm01.R lowerarm01.L lowerarm01.R "
-    "wrist.L wrist.R upperleg01.L upperleg01.R lowerleg01.L lowerleg01.R foot.L foot.R"
-).split()
+    "root", "spine05", "spine03", "spine01", "neck01", "head", "clavicle.L", "clavicle.R", "upperarm01.L",
+    "upperarm01.R", "lowerarm01.L", "lowerarm01.R", "wrist.L", "wrist.R", "upperleg01.L", "upperleg01.R",
+    "lowerleg01.L", "lowerleg01.R", "foot.L", "foot.R",
+)  # fmt: skip
 
 # BODY_25 in OpenPose's order, by the names of anny's keypoint regressor; pairs are averaged.
 BODY_25 = (
-    "nose left_shoulder+right_shoulder right_shoulder right_elbow right_wrist left_shoulder left_elbow left_wrist "
-    "left_hip+right_hip right_hip right_knee right_ankle left_hip left_knee left_ankle right_eye left_eye right_ear "
-    "left_ear left_big_toe left_small_toe left_heel right_big_toe right_small_toe right_heel"
-).split()
+    "nose", "left_shoulder+right_shoulder", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder",
+    "left_elbow", "left_wrist", "left_hip+right_hip", "right_hip", "right_knee", "right_ankle", "left_hip",
+    "left_knee", "left_ankle", "right_eye", "left_eye", "right_ear", "left_ear", "left_big_toe", "left_small_toe",
+    "left_heel", "right_big_toe", "right_small_toe", "right_heel",
+)  # fmt: skip
 
 
 @functools.cache
@@ -50,32 +70,42 @@ def _model() -> anny.Anny:
 def anny_rig(beta: Tensor | None = None) -> Rig:
     """The rig linearised at shape values (28,), in the order of BETA_NAMES: phenotypes in [0, 1], then local changes in
     [-1, 1] (held to these ranges); an average adult by default. float32."""
-    model = _model()
     beta = torch.tensor(ADULT) if beta is None else beta
     beta = beta.detach().to(torch.float64).clamp(torch.tensor(BETA_LOW), torch.tensor(BETA_HIGH))
-    unchanged = torch.zeros(1, len(model.local_change_labels), dtype=torch.float64)
-    none = torch.zeros(1, 0, dtype=torch.float64)
-    changes = _local_change_rows(model)
+    average = _average()
+    weights = _coefficients(beta)
+    jacobian = torch.autograd.functional.jacobian(
+        _coefficients, beta, strategy="forward-mode", vectorize=True
+    )  # (rows, 28)
+    moved = torch.cat([weights[:, None], jacobian], 1).T.float() @ _shapes()
+    vertices, joints = moved.unflatten(-1, (-1, 3)).split([len(average.vertices_m), len(average.joints_m)], 1)
+    return dataclasses.replace(
+        average,
+        vertices_m=average.vertices_m + vertices[0],
+        joints_m=average.joints_m + joints[0],
+        beta=beta.float(),
+        shape_basis=vertices[1:].contiguous(),
+        joint_basis=joints[1:].contiguous(),
+    )
 
-    def coefficients(values: Tensor) -> Tensor:
-        phenotypes, local = values.split([len(PHENOTYPES), len(LOCAL_CHANGES)])
-        return model._get_phenotype_blendshape_coefficients(phenotypes[None], unchanged, none)[0] + changes @ local
 
-    weights = coefficients(beta)
-    jacobian = torch.autograd.functional.jacobian(coefficients, beta)  # (rows, 28)
+@functools.cache
+def _average() -> Rig:
+    """Everything that shape leaves alone, with anny's template for a body. float32."""
+    model = _model()
     joint_names = tuple(model.bone_labels)
     return Rig(
-        vertices_m=model.template_vertices + torch.einsum("a,avd->vd", weights, model.blendshapes),
+        vertices_m=model.template_vertices,
         faces=model.faces.long(),
         uvs=model.texture_coordinates,
         face_uvs=model.face_texture_coordinate_indices,
-        joints_m=model.template_bone_heads + torch.einsum("a,ajd->jd", weights, model.bone_heads_blendshapes),
+        joints_m=model.template_bone_heads,
         joint_names=joint_names,
         parents=torch.tensor(model.bone_parents),
-        beta=beta,
+        beta=torch.zeros(len(BETA_NAMES)),
         beta_names=BETA_NAMES,
-        shape_basis=torch.einsum("ab,avd->bvd", jacobian, model.blendshapes),
-        joint_basis=torch.einsum("ab,ajd->bjd", jacobian, model.bone_heads_blendshapes),
+        shape_basis=torch.zeros(len(BETA_NAMES), *model.template_vertices.shape),
+        joint_basis=torch.zeros(len(BETA_NAMES), *model.template_bone_heads.shape),
         skin_joints=model.vertex_bone_indices.long(),
         skin_weights=model.vertex_bone_weights / model.vertex_bone_weights.sum(1, keepdim=True),
         free=torch.tensor([name in FREE_JOINTS and name != "root" for name in joint_names]),
@@ -83,16 +113,25 @@ def anny_rig(beta: Tensor | None = None) -> Rig:
     ).to(dtype=torch.float32)
 
 
-def _local_change_rows(model: anny.Anny) -> Tensor:
-    """(rows, 22): blend shape coefficients per local change. anny has a shape for more and another for less of each (the
-    last rows, in turns); half their difference is linear in the value, with no kink at zero."""
-    first = len(model.blendshapes) - 2 * len(model.local_change_labels)
-    rows = torch.zeros(len(model.blendshapes), len(LOCAL_CHANGES), dtype=torch.float64)
-    for column, name in enumerate(LOCAL_CHANGES):
-        for part in name.split("+"):
-            more = first + 2 * model.local_change_labels.index(f"{part}-incr")
-            rows[more, column], rows[more + 1, column] = 0.5, -0.5
-    return rows
+@functools.cache
+def _shapes() -> Tensor:
+    """Displacements of vertices and joints, (rows, 3 (V + J)) metres: phenotype blend shapes, then local changes.
+
+    Of each change anny has a shape for more and another for less; half their difference is linear, without a kink."""
+    labels = _model().local_change_labels
+    shapes = torch.cat([_model().blendshapes, _model().bone_heads_blendshapes], 1).flatten(1)
+    phenotypes, local = shapes[: -2 * len(labels)], shapes[-2 * len(labels) :]
+    change = dict(zip(labels, (local[0::2] - local[1::2]) / 2, strict=True))
+    changes = [torch.stack([change[f"{part}-incr"] for part in name.split("+")]).sum(0) for name in LOCAL_CHANGES]
+    return torch.cat([phenotypes, torch.stack(changes)]).float()
+
+
+def _coefficients(beta: Tensor) -> Tensor:
+    """Coefficients (rows,) of `_shapes` at shape values (28,); piecewise multilinear in the phenotypes."""
+    phenotypes, local = beta.split([len(PHENOTYPES), len(LOCAL_CHANGES)])
+    unchanged = beta.new_zeros(1, len(_model().local_change_labels))
+    rows = _model()._get_phenotype_blendshape_coefficients(phenotypes[None], unchanged, beta.new_zeros(1, 0))[0]
+    return torch.cat([rows[: -2 * unchanged.shape[1]], local])
 
 
 def _keypoint_weights(model: anny.Anny) -> Tensor:

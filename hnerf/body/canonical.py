@@ -91,11 +91,16 @@ class PosedBodies:
         return PoseCorrection(len(self.theta), len(self._free), len(self.rig.beta)).to(self.rig.vertices_m.device)
 
     def describe(
-        self, points_m: Tensor, frame: Tensor, reach_m: float, correction: PoseCorrection | None = None
+        self,
+        points_m: Tensor,
+        frame: Tensor,
+        reach_m: float,
+        correction: PoseCorrection | None = None,
+        exact_sign: bool = False,
     ) -> Descriptor:
         """Descriptors of world points (N, 3) in the bodies of rows `frame` (N,); gradients flow to points and
         correction."""
-        found = self._meshes.closest_points(points_m, frame, reach_m)
+        found = self._meshes.closest_points(points_m, frame, reach_m, exact_sign)
         corners = self.rig.faces[found.face.clamp(min=0)]  # (N, 3)
         flat = frame.long()[:, None] * len(self.rig.vertices_m) + corners
         weights = found.barycentric[..., None]

@@ -11,7 +11,7 @@ NAME = "checkpoint.pt"
 
 def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
     """Replace the checkpoint in `folder` atomically. state: tensors, numbers, strings and containers of them."""
-    beside = folder / f"{NAME}.{os.getpid()}.tmp"
+    beside = folder / f"{NAME}.tmp"  # what an interrupted write leaves, the next one overwrites
     with beside.open("wb") as file:
         torch.save(state, file)
         file.flush()

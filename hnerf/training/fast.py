@@ -79,7 +79,7 @@ class FastField(nn.Module):
         near = described.near & met.repeat_interleave(depths.shape[1])
         d = torch.where(near, described.d, self.reach_m)
         pose = conditions.pose[row]
-        residual = torch.where(near, self.field.residual(described.y, described.d, pose), 0.0)
+        residual = torch.where(near, self._residual(described, pose), 0.0)
         d, residual = d.view_as(depths), residual.view_as(depths)
         alpha = alpha_from_sdf(d + residual, self.log_sharpness.exp())
         colour = self._colour(described, pose, weights_from_alpha(alpha.detach()).flatten() > NEGLIGIBLE)
@@ -90,6 +90,12 @@ class FastField(nn.Module):
             alpha, alpha, torch.ones_like(d), colour.view(*depths.shape, 3), None, d, residual, norms, draws.beyond
         )
         return samples, depths
+
+    def _residual(self, described: Descriptor, pose: Tensor) -> Tensor:
+        """dd (N,) in the shell; 0 beyond it and deeper inside, where no ray asks and the body's d is enough."""
+        s = self.settings
+        trained = described.near & (described.d < self.reach_m) & (described.d > -s.inner_m - 2 * s.shell_cell_m)
+        return torch.where(trained, self.field.residual(described.y, described.d, pose), 0.0)
 
     def _colour(self, described: Descriptor, pose: Tensor, visible: Tensor) -> Tensor:
         """Colours (N, 3) of the samples that count, zero elsewhere."""
@@ -119,9 +125,8 @@ class FastField(nn.Module):
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """d_hat (N,) at points (N, 3) around the first body; beyond reach the body's own distance stands alone."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
-        described = bodies.describe(points_m, row, FAR_M)
-        residual = self.field.residual(described.y, described.d, conditions.pose[row])
-        return described.d + torch.where(described.d.abs() < self.reach_m, residual, 0.0)
+        described = bodies.describe(points_m, row, FAR_M, exact_sign=True)
+        return described.d + self._residual(described, conditions.pose[row])
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """c (N, 3) at points around the first body; this field does not depend on the viewing direction."""

@@ -1,5 +1,6 @@
 """A trained subject: built for training, saved, and loaded again as an Avatar."""
 
+import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from hnerf.render.compositing import composite, weights_from_alpha
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.fast import FastField
 from hnerf.training.paper import PaperField
+from hnerf.training.pixels import within_reach
 
 RAYS_AT_ONCE = 16384
 POINTS_AT_ONCE = 262144
@@ -45,11 +47,11 @@ class TrainedAvatar:
         bodies, conditions = self._pose(theta, root)
         region: Any = self.field.region(bodies)
         device = bodies.vertices_m.device
-        pixels = pixels_around(camera, bodies.vertices_m[0].cpu().numpy())
-        origins, directions = camera.rays(pixels.astype(np.float64))
+        y, x = np.nonzero(within_reach(camera, bodies.vertices_m[0].cpu().numpy()))
+        origins, directions = camera.rays(np.stack([x, y], 1).astype(np.float64))
         flat = torch.zeros(camera.height_px * camera.width_px, 5, device=device)
-        index = torch.from_numpy(pixels[:, 1] * camera.width_px + pixels[:, 0]).to(device)
-        for start in range(0, len(pixels), RAYS_AT_ONCE):
+        index = torch.from_numpy(y * camera.width_px + x).to(device)
+        for start in range(0, len(x), RAYS_AT_ONCE):
             part = slice(start, start + RAYS_AT_ONCE)
             o, d = (torch.from_numpy(np.ascontiguousarray(a[part])).float().to(device) for a in (origins, directions))
             row = torch.zeros(len(o), dtype=torch.long, device=device)
@@ -82,25 +84,14 @@ class TrainedAvatar:
         return bodies, Conditions.of(rig, theta[None], root[None], self.scene_m)
 
 
-def pixels_around(camera: Camera, vertices_m: np.ndarray, margin: float = 0.15) -> np.ndarray:
-    """Pixels (N, 2) in the rectangle of the projected body, widened by a share of its size; all if it reaches
-    behind."""
-    xy, depth_m = camera.project(vertices_m)
-    size = np.array([camera.width_px, camera.height_px])
-    lower, upper = np.zeros(2), size - 1.0
-    if (depth_m > 0).all():
-        widen = margin * (xy.max(0) - xy.min(0)).max()
-        lower, upper = np.maximum(xy.min(0) - widen, 0), np.minimum(xy.max(0) + widen, size - 1)
-    x, y = (np.arange(int(np.floor(a)), int(np.ceil(b)) + 1) for a, b in zip(lower, upper, strict=True))
-    return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-
-
 def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvatar:
     """The subject that training left in `folder`."""
     stored = json.loads((folder / "settings.json").read_text())
     settings = TrainingSettings.model_validate(stored["training"])
     body = BodyFit.load(folder)
     body = BodyFit(body.rig.to(device), body.frames, body.theta.to(device), body.root.to(device))
-    field = build_field(settings, body, stored["static"]).to(device)
-    field.load_state_dict(load_file(folder / "model.safetensors", device=str(device)))
+    tensors = load_file(folder / "model.safetensors", device=str(device))
+    before_tuning = dataclasses.replace(body, rig=dataclasses.replace(body.rig, vertices_m=tensors["canonical_m"]))
+    field = build_field(settings, before_tuning, stored["static"]).to(device)
+    field.load_state_dict(tensors)
     return TrainedAvatar(field.eval(), body, settings.paper.scene_m)

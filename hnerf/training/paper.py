@@ -158,7 +158,7 @@ class PaperField(nn.Module):
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """d_hat (N,) metres at points (N, 3) around the first body."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
-        described = bodies.describe(points_m, row, FAR_M)
+        described = bodies.describe(points_m, row, FAR_M, exact_sign=True)
         return described.d + self.settings.scene_m * self._residual(points_m, described, row, conditions)
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:

@@ -34,7 +34,6 @@ SKIPS_ALLOWED = 2  # in a row; one more non-finite step stops the run
 HELD_OUT_RAYS = 2048
 LEAST_COVERAGE = 0.2  # of the person's pixels; below it the surface has collapsed
 LOG_STEPS = 25
-REACH_M = 0.1  # around the body, within which a pixel can be the person's
 
 
 class Trainer:
@@ -55,7 +54,7 @@ class Trainer:
         self.optimizer = torch.optim.Adam(self._parameter_groups(), betas=(0.9, 0.99), eps=1e-12)
         self.first_rates = [group["lr"] for group in self.optimizer.param_groups]
         logger.info("gathering pixels")
-        self.pixels: Pixels = gather_pixels(capture, masks, body, body.frames, REACH_M, device)
+        self.pixels: Pixels = gather_pixels(capture, masks, body, body.frames, device)
         rows = {frame: row for row, frame in enumerate(body.frames)}
         self.train_rows = torch.tensor([rows[f] for f in capture.train_frames], device=device)
         held_out = [rows[f] for f in capture.novel_pose_frames if f not in capture.train_frames]
@@ -235,7 +234,8 @@ class Trainer:
             "mean_move_mm": float(1e3 * move_m.norm(dim=-1).mean().item()),
         }
         (out / "report.json").write_text(json.dumps(report, indent=1))
-        (out / NAME).unlink(missing_ok=True)
+        for left in out.glob(f"{NAME}*"):
+            left.unlink()
         return report
 
 

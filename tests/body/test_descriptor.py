@@ -35,7 +35,8 @@ def test_solid_angle_of_a_closed_surface():
     assert solid_angle(outside, a, b, c).sum().item() == pytest.approx(0, abs=1e-12)
 
 
-def test_fast_form_agrees_with_the_reference():
+@pytest.mark.parametrize("exact", [False, True])
+def test_fast_form_agrees_with_the_reference(exact: bool):
     """On a posed body, points all around: the same distances, and the same sign at every point."""
     rig = box_rig(bend_segments=6)
     theta = torch.zeros(1, 2, 3)
@@ -47,7 +48,7 @@ def test_fast_form_agrees_with_the_reference():
         - 0.2
         + torch.rand(800, 3, generator=torch.Generator().manual_seed(0)) * (vertices.amax(0) - vertices.amin(0) + 0.4)
     )
-    fast = BodyMeshes(vertices[None], rig.faces).closest_points(points, torch.zeros(800, dtype=torch.int32), 9.0)
+    fast = BodyMeshes(vertices[None], rig.faces).closest_points(points, torch.zeros(800, dtype=torch.int32), 9.0, exact)
     slow = closest_points_reference(points, vertices, rig.faces, 9.0)
 
     def distance(found):
@@ -55,6 +56,17 @@ def test_fast_form_agrees_with_the_reference():
 
     torch.testing.assert_close(distance(fast), distance(slow), atol=1e-6, rtol=0)
     assert torch.equal(fast.sign, slow.sign)
+
+
+def test_exact_sign_inside_a_body_that_intersects_itself():
+    """Two unit boxes that overlap from x = 0.6 to 1: at x = 0.55 the nearest surface is the second box's buried wall,
+    and the point outside that wall, but inside the first box."""
+    vertices = torch.cat([box_vertices(), box_vertices() + torch.tensor([0.6, 0.0, 0.0])])
+    faces = torch.cat([box_faces(), box_faces() + 8])
+    point, row = torch.tensor([[0.55, 0.5, 0.5]]), torch.zeros(1, dtype=torch.int32)
+    meshes = BodyMeshes(vertices[None], faces)
+    assert meshes.closest_points(point, row, 5.0, exact_sign=True).sign.tolist() == [-1.0]
+    assert closest_points_reference(point, vertices, faces, 5.0).sign.tolist() == [-1.0]
 
 
 def test_canonical_position_undoes_the_pose():

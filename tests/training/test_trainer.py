@@ -81,6 +81,18 @@ def test_overfits_the_column(tmp_path: Path):
     assert drawn.depth_m[mask].mean().item() == pytest.approx(3.6, abs=0.4)
 
 
+def test_loads_after_the_shape_has_changed(tmp_path: Path):
+    """The grids' extent is that of the body before its shape was tuned, whatever the tuned shape is."""
+    capture, masks, body = record(tmp_path / "capture")
+    trainer = Trainer(capture, masks, body, TINY, tmp_path, ALONE)
+    with torch.no_grad():
+        trainer.objective.correction.shape += 0.5  # half a metre taller
+    trainer.run()
+    avatar = load_avatar(tmp_path)
+    assert avatar.body.rig.vertices_m[:, 2].max().item() == pytest.approx(2.5, abs=0.02)
+    assert all(torch.equal(p, q) for p, q in zip(avatar.field.parameters(), trainer.field.parameters(), strict=True))
+
+
 def test_novel_pixels_never_reach_the_field(tmp_path: Path):
     """Without the second phase the field is the same to the bit: it learns from training frames alone."""
     recording = record(tmp_path / "capture")

@@ -1,0 +1,25 @@
+# make install | test | demo.  pip's own environment variables choose another index, for example for CUDA wheels.
+export DO_NOT_TRACK := 1
+
+PYTHON ?= python3
+BIN := .venv/bin
+INSTALLED := .venv/.installed
+
+.PHONY: install test demo
+
+install: $(INSTALLED)
+
+# torch first and by its exact version: a resolver left to itself may fetch several builds of it.
+$(INSTALLED): pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --constraint constraints.txt torch
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+test: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/pytest
+
+demo: $(INSTALLED)
+	$(BIN)/hnerf demo

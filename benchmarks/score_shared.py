@@ -1,0 +1,170 @@
+"""Run the pipeline on the shared captures and score what it leaves behind with the independent program beside them.
+
+usage: python benchmarks/score_shared.py [CAPTURE ...] [--preset NAME] [--store DIR] [--set a.b=c] [--name RESULT]
+
+Needs `../shared` beside this checkout (`data/`, `accept/score_run.py`) and the package installed. Writes
+`benchmarks/results/RESULT.json` and `.md`, by default `shared-NAME`. Stages that the store has already are not run
+again: seconds of the whole run mean something for an empty store only.
+"""
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import torch
+
+ROOT = Path(__file__).resolve().parent.parent
+SHARED = ROOT.parent / "shared"
+SCORE_RUN = SHARED / "accept" / "score_run.py"
+CAPTURES = ("valid-walk", "valid-wave", "valid-turn-mono", "pose2sim-balance")
+IMAGE_COLUMNS = {"psnr": ("PSNR", "{:.2f}"), "ssim": ("SSIM", "{:.3f}"), "mask_iou": ("mask IoU", "{:.3f}")}
+GEOMETRY_COLUMNS = {
+    "chamfer_l2_e3": ("Chamfer x1e-3 m²", "{:.3f}"),
+    "chamfer_mm": ("mean mm", "{:.1f}"),
+    "normal_consistency": ("NC", "{:.3f}"),
+    "iou": ("IoU", "{:.3f}"),
+}
+
+
+def main() -> int:
+    """1 if any capture failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", nargs="*", default=list(CAPTURES), metavar="CAPTURE")
+    parser.add_argument("--preset", default="fast")
+    parser.add_argument("--store", type=Path, default=ROOT / "store")
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="a.b=c")
+    parser.add_argument("--name", help="of the files of results (default: shared-PRESET)")
+    options = parser.parse_args()
+    result: dict[str, Any] = {
+        "machine": machine(),
+        "commit": commit(),
+        "date": datetime.now(UTC).date().isoformat(),
+        "preset": options.preset,
+        "overrides": options.overrides,
+        "captures": {},
+    }
+    out = ROOT / "benchmarks" / "results" / (options.name or f"shared-{options.preset}")
+    out.parent.mkdir(exist_ok=True)
+    for name in options.captures:
+        result["captures"][name] = measure(SHARED / "data" / name, options.preset, options.store, options.overrides)
+        out.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
+        out.with_suffix(".md").write_text(as_markdown(result))
+    print(out.with_suffix(".md").read_text())
+    return int(any("error" in figures for figures in result["captures"].values()))
+
+
+def measure(capture: Path, preset: str, store: Path, overrides: list[str]) -> dict[str, Any]:
+    """Run the pipeline on one capture and score it; {"error": its last line} where it fails."""
+    command = [str(Path(sys.executable).with_name("hnerf")), "run", str(capture), "--preset", preset]
+    command += ["--store", str(store), *(f"--set={override}" for override in overrides)]
+    started = time.perf_counter()
+    lines: list[str] = []
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as run:
+        assert run.stdout is not None
+        for line in run.stdout:
+            print(line, end="", flush=True)
+            lines.append(line.strip())
+    if run.returncode:
+        return {"error": next((line for line in reversed(lines) if line), f"exit status {run.returncode}")}
+    report = next(line.removeprefix("report:").strip() for line in lines if line.startswith("report:"))
+    subject = Path(report).parent.parent
+    figures: dict[str, Any] = {"run_seconds": time.perf_counter() - started}
+    figures["training"] = json.loads((subject / "training" / "report.json").read_text())
+    figures["own_metrics"] = json.loads((subject / "evaluation" / "metrics.json").read_text())
+    return figures | {"score": score(subject, capture)}
+
+
+def score(subject: Path, capture: Path) -> dict[str, Any] | None:
+    """What the independent program finds; None where the capture has no ground truth."""
+    if not (capture / "ground_truth").is_dir():
+        return None
+    command = [sys.executable, str(SCORE_RUN), str(subject), str(capture)]
+    scored: dict[str, Any] = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
+    return scored
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on."""
+    cpuinfo = Path("/proc/cpuinfo")
+    names = [line.partition(":")[2].strip() for line in _lines(cpuinfo) if line.startswith("model name")]
+    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
+    cpu = names[0] if names else platform.processor()
+    return {
+        "cpu": cpu,
+        "cores": os.cpu_count(),
+        "gpu": gpu,
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def _lines(path: Path) -> list[str]:
+    return path.read_text().splitlines() if path.exists() else []
+
+
+def commit() -> str:
+    """The checkout's commit, marked where files differ from it."""
+    command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=12"]
+    described = subprocess.run(command, capture_output=True, text=True)
+    return described.stdout.strip() or "not committed"
+
+
+def as_markdown(result: dict[str, Any]) -> str:
+    """One table a split, after the machine and before the protocol."""
+    m = result["machine"]
+    changes = f" with {', '.join(result['overrides'])}" if result["overrides"] else ""
+    lines = [
+        f"# Shared captures, preset `{result['preset']}`{changes}",
+        "",
+        f"{m['cpu']}, {m['cores']} cores, {m['gpu'] or 'no GPU'}, torch {m['torch']}, Python {m['python']}; "
+        f"commit {result['commit']}; {result['date']}. Scored by the independent program.",
+    ]
+    for split, title in (("novel_view", "Training poses, test cameras"), ("novel_pose", "New poses")):
+        lines += ["", f"## {title}", "", *_split_table(result["captures"], split)]
+    lines += ["", "## Cost and body fit", "", *_cost_table(result["captures"])]
+    protocols = {c["own_metrics"]["protocol"] for c in result["captures"].values() if "own_metrics" in c}
+    note = "The independent program samples 30 000 points a surface and counts volumes on an 80^3 grid."
+    return "\n".join([*lines, "", "## Protocol", "", *protocols, "", note, ""])
+
+
+def _split_table(captures: dict[str, Any], split: str) -> list[str]:
+    columns = IMAGE_COLUMNS | GEOMETRY_COLUMNS
+    rows = [["capture", "images", *(title for title, _ in columns.values())]]
+    for name, figures in captures.items():
+        if not figures.get("score"):
+            rows.append([name, figures.get("error", "no ground truth"), *[""] * len(columns)])
+            continue
+        found = figures["score"][split]
+        values = [found[key] for key in IMAGE_COLUMNS] + [
+            (found["geometry"] or {}).get(key) for key in GEOMETRY_COLUMNS
+        ]
+        shown = ["" if v is None else form.format(v) for v, (_, form) in zip(values, columns.values(), strict=True)]
+        rows.append([name, str(found["n"]), *shown])
+    return _table(rows)
+
+
+def _cost_table(captures: dict[str, Any]) -> list[str]:
+    rows = [["capture", "limb joints, mm", "training, s", "one image, s", "whole run, s"]]
+    for name, figures in captures.items():
+        if "error" not in figures:
+            fit = (figures["score"] or {}).get("fit")
+            joints = "" if fit is None else f"{fit['limb_joint_error_mm']:.1f}"
+            image = f"{figures['own_metrics']['seconds_per_image']:.2f}"
+            rows.append([name, joints, f"{figures['training']['seconds']:.0f}", image, f"{figures['run_seconds']:.0f}"])
+    return _table(rows)
+
+
+def _table(rows: list[list[str]]) -> list[str]:
+    body = ["| " + " | ".join(row) + " |" for row in rows]
+    return [body[0], "|" + "---|" * len(rows[0]), *body[1:]]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,118 @@
+"""The command line: the flows' work from a shell, without a server."""
+
+import argparse
+import json
+import logging
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from flows.train_subject import train_subject
+from hnerf.capture.performer import PerformerSettings, write_performer
+from hnerf.config import load_settings
+from hnerf.errors import CaptureError
+from tasks.calibration import calibrate
+from tasks.capture import ingest
+from tasks.source import read_capture
+from tasks.store import Store
+
+DEMO = Path("demo")
+BAD_INPUT = 2
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command; 2 and one line on stderr for input that cannot be used."""
+    options = _parser().parse_args(argv)
+    try:
+        with _progress():
+            options.command(options)
+    except CaptureError as error:
+        print(f"hnerf: {error}", file=sys.stderr)
+        return BAD_INPUT
+    return 0
+
+
+@contextmanager
+def _progress() -> Iterator[None]:
+    """The library's log on stdout, instead of Prefect's console handler, which writes to stderr."""
+    logger, handler = logging.getLogger("hnerf"), logging.StreamHandler(sys.stdout)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
+    logger.addHandler(handler)
+    logger.propagate = False
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = True
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="hnerf", description="From a folder of calibrated video to an avatar.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    run = commands.add_parser("run", help="train one person and export the avatar")
+    run.add_argument("capture", type=Path, help="the recording's folder")
+    run.add_argument("--preset", default="fast", help="a name under configs/ or a YAML file (default: fast)")
+    run.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
+    run.add_argument("--set", dest="overrides", action="append", default=[], metavar="a.b=c", help="override a setting")
+    run.set_defaults(command=lambda o: _run(o.capture, o.preset, o.store, o.overrides))
+
+    check = commands.add_parser("check", help="read a recording and check its cameras, nothing more")
+    check.add_argument("capture", type=Path, help="the recording's folder")
+    check.add_argument("--preset", default="fast", help="a name under configs/ or a YAML file (default: fast)")
+    check.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
+    check.set_defaults(command=lambda o: _check(o.capture, o.preset, o.store))
+
+    synth = commands.add_parser("synth", help="write a synthetic capture with ground truth")
+    synth.add_argument("out", type=Path, help="the folder to write")
+    synth.set_defaults(command=lambda o: _synth(o.out))
+
+    demo = commands.add_parser("demo", help=f"synth and run in ./{DEMO}, in minutes")
+    demo.set_defaults(command=lambda o: _demo())
+    return parser
+
+
+def _run(capture: Path, preset: str, store: Path, overrides: list[str]) -> None:
+    folder = train_subject.fn(capture, preset, store, overrides)
+    print(f"report: {folder / 'evaluation' / 'report.html'}")
+    print(f"asset:  {folder / 'asset' / 'avatar.usdz'}")
+
+
+def _check(capture: Path, preset: str, store: Path) -> None:
+    settings = load_settings(preset)
+    shelf = Store(store.resolve())
+    source, _ = read_capture(capture)
+    recording = ingest(shelf, source, settings.capture)
+    calibration = calibrate(shelf, recording, settings.calibration)
+    print("\n".join(_table(json.loads((calibration.root / "report.json").read_text()))))
+    print(f"picture: {calibration.root / 'cameras.png'}")
+
+
+def _table(report: dict[str, Any]) -> list[str]:
+    """A calibration report as lines for people."""
+    lines = [f"{'camera':<12} {'status':<9} {'median px':>9} {'95 % px':>9}  remarks"]
+    for name, camera in report["cameras"].items():
+        median, p95 = ("-" if px is None else f"{px:.2f}" for px in (camera["median_px"], camera["p95_px"]))
+        remarks = "; ".join(camera["reasons"])
+        lines.append(f"{name:<12} {camera['status']:<9} {median:>9} {p95:>9}  {remarks}".rstrip())
+    return [*lines, *report["notes"], f"verdict: {report['verdict']}"]
+
+
+def _synth(out: Path) -> None:
+    if out.exists():
+        raise CaptureError(f"{out}: exists; give the name of a new folder")
+    partial = out.with_name(f"{out.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    write_performer(partial, PerformerSettings())
+    os.replace(partial, out)
+
+
+def _demo() -> None:
+    capture = DEMO / "performer"
+    if not capture.exists():
+        _synth(capture)
+    _run(capture, "demo", DEMO / "store", [])

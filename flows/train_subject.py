@@ -1,0 +1,57 @@
+"""From a capture folder to an avatar."""
+
+from pathlib import Path
+
+from prefect import flow
+from prefect.artifacts import create_markdown_artifact
+from prefect.context import FlowRunContext
+
+from hnerf.capture.capture import Capture
+from hnerf.config import load_settings
+from tasks.asset import export
+from tasks.calibration import calibrate
+from tasks.capture import ingest
+from tasks.evaluation import evaluate
+from tasks.fit import fit
+from tasks.segmentation import needs_body, segment
+from tasks.source import read_capture
+from tasks.store import Artifact, Store
+from tasks.training import train
+
+
+@flow(name="train-subject", flow_run_name="{capture}")
+def train_subject(
+    capture: Path, preset: str = "fast", store: Path = Path("store"), overrides: list[str] | None = None
+) -> Path:
+    """Train one person and export the avatar; returns the folder that links to each stage's result.
+
+    capture: the recording's folder; preset: a name under configs/ or a YAML file; store: where artifacts are kept;
+    overrides: settings like "training.steps=100".
+    """
+    settings = load_settings(preset, overrides)
+    shelf = Store(store.resolve())
+    source, truth = read_capture(capture)
+
+    recording = ingest(shelf, source, settings.capture)
+    subject = Capture.load(recording.root).name
+    shelf.show(subject, recording)
+    calibration = shelf.show(subject, calibrate(shelf, recording, settings.calibration))
+    rough = fit(shelf, recording, calibration, None, settings.fit) if needs_body(recording) else None
+    masks = shelf.show(subject, segment(shelf, recording, calibration, rough, settings.segmentation))
+    body = shelf.show(subject, fit(shelf, recording, calibration, masks, settings.fit))
+    model = shelf.show(subject, train(shelf, recording, calibration, masks, body, settings.training))
+    report = evaluate(shelf, truth, recording, calibration, masks, body, model, settings.evaluation)
+    shelf.show(subject, report)
+    asset = shelf.show(subject, export(shelf, recording, calibration, model, settings.asset))
+    _announce(subject, report, asset)
+    return shelf.subject_folder(subject)
+
+
+def _announce(subject: str, report: Artifact, asset: Artifact) -> None:
+    """Figures and places on the flow run's page, where there is one."""
+    if not FlowRunContext.get():
+        return
+    lines = [f"# {subject}", "", "| figure | value |", "|---|---|"]
+    lines += [f"| {name} | {value:.4g} |" for name, value in report.metrics.items()]
+    lines += ["", f"Report: `{report.root / 'report.html'}`", f"Asset: `{asset.root / 'avatar.usdz'}`"]
+    create_markdown_artifact("\n".join(lines), key="result", description=f"What came of {subject}")

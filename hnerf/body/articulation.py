@@ -1,0 +1,172 @@
+"""Points carried by the joints that turn, with their analytic Jacobian.
+
+Locked joints follow their nearest free ancestor rigidly, so a rig of a hundred joints reduces to about twenty that
+move. A point's world position is linear in their transforms and in the shape: x = sum_m R_m (a_m - w_m q_m) + w_m p_m
+with rest joint q_m, posed joint p_m, and a_m the point's rest position times its weight w_m on joint m.
+
+Unknowns of a frame, in this order: the root joint's displacement (3) in metres, a rotation about it (3) in world axes,
+then the change of axis-angle (3) of every other moving joint.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from hnerf.body.rig import Rig, joint_transforms, rotation_from_axis_angle
+
+
+@dataclass(frozen=True)
+class Pose:
+    """What a fit looks for. rig: linearised at the shape, its `beta` (B,); theta (n, J, 3) radians, zero at locked
+    joints and the root; root (n, 4, 4) world from body, metres; offsets_m (25, 3): where the detector sees a keypoint
+    on the resting body, less where the body model has it."""
+
+    rig: Rig
+    theta: Tensor
+    root: Tensor
+    offsets_m: Tensor
+
+
+@dataclass(frozen=True)
+class Points:
+    """P points on the resting body: weights (P, M); rest_m (P, M, 3) and basis_m (P, M, 3, B) already times the
+    weight."""
+
+    weights: Tensor
+    rest_m: Tensor
+    basis_m: Tensor
+
+
+@dataclass(frozen=True)
+class PosedJoints:
+    """Moving joints in the world: rotations (n, M, 3, 3), positions_m (n, M, 3), axes (n, M, 3, 3) whose columns are
+    the world rotation vectors of the joint's three unknowns, shape_m (n, M, 3, B) displacement per unit of beta."""
+
+    rotations: Tensor
+    positions_m: Tensor
+    axes: Tensor
+    shape_m: Tensor
+
+
+class Articulation:
+    """The moving joints of a rig: the root (index 0), then the free joints, parents first."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        moves = rig.free.clone()
+        moves[0] = True
+        self.joints = moves.nonzero()[:, 0]
+        carrier = torch.zeros(len(moves), dtype=torch.long)  # index of the moving joint that carries each joint
+        slot = moves.cumsum(0) - 1
+        for j, parent in enumerate(rig.parents.tolist()):
+            carrier[j] = slot[j] if moves[j] else carrier[parent]
+        self.parents = carrier[rig.parents[self.joints].clamp(min=0)]
+        count = len(self.joints)
+        self.below = torch.eye(count, dtype=rig.vertices_m.dtype)  # below[j, m] = 1 if turning j moves m
+        for m in range(1, count):
+            self.below[:, m] += self.below[:, self.parents[m]]
+        self.vertex_weights = torch.zeros(len(rig.vertices_m), count, dtype=rig.vertices_m.dtype)
+        self.vertex_weights.scatter_add_(1, carrier[rig.skin_joints], rig.skin_weights)
+        self.rest_m, self.rest_basis_m = rig.joints_m[self.joints], rig.joint_basis[:, self.joints].permute(1, 2, 0)
+        self.unknowns = 3 + 3 * count
+
+    def keypoints(self) -> Points:
+        """The 25 BODY_25 keypoints."""
+        rows, count = self.rig.keypoint_weights, len(self.joints)
+        used = (rows != 0).any(0)
+        split = (rows[:, None, used] * self.vertex_weights[used].T).flatten(0, 1)  # (25 M, V used), most rows empty
+        carried = (split != 0).any(1)
+        columns = torch.cat([self.rig.vertices_m[None], self.rig.shape_basis])[:, used].transpose(0, 1).flatten(1)
+        sums = torch.zeros(len(split), columns.shape[1], dtype=rows.dtype)
+        sums[carried] = split[carried] @ columns
+        sums = sums.unflatten(0, (-1, count)).unflatten(-1, (-1, 3)).transpose(-1, -2)  # (25, M, 3, 1 + B)
+        return Points(split.sum(1).unflatten(0, (-1, count)), sums[..., 0], sums[..., 1:])
+
+    def pose(self, pose: Pose) -> PosedJoints:
+        """Place the moving joints."""
+        world = joint_transforms(self.rig, self.rig.joints_m, pose.theta, pose.root)[:, self.joints]
+        rotations, positions = world[..., :3, :3], world[..., :3, 3]
+        above = rotations[:, self.parents]
+        axes = above @ left_jacobian(pose.theta[:, self.joints])
+        axes[:, 0] = torch.eye(3, dtype=axes.dtype)
+        shape = [rotations[:, 0] @ self.rest_basis_m[0]]
+        for m in range(1, len(self.joints)):
+            parent = int(self.parents[m])
+            shape.append(shape[parent] + above[:, m] @ (self.rest_basis_m[m] - self.rest_basis_m[parent]))
+        return PosedJoints(rotations, positions, axes, torch.stack(shape, 1))
+
+    def surface(self, joints: PosedJoints, frame: int) -> Tensor:
+        """Every vertex in one frame, (V, 3) world."""
+        rotations = joints.rotations[frame]
+        moved = joints.positions_m[frame] - (rotations @ self.rest_m[..., None])[..., 0]
+        blended = self.vertex_weights @ torch.cat([rotations.flatten(1), moved], 1)
+        return (blended[:, :9].unflatten(1, (3, 3)) @ self.rig.vertices_m[..., None])[..., 0] + blended[:, 9:]
+
+    def jacobian(self, points: Points, joints: PosedJoints) -> tuple[Tensor, Tensor, Tensor]:
+        """Positions (n, P, 3), and their derivatives by the frame's unknowns (n, P, 3, U) and by beta (n, P, 3, B)."""
+        carried = self._carried(points, joints)
+        moved = torch.einsum("jm,npmd->npjd", self.below, carried)
+        lever = moved - torch.einsum("jm,pm->pj", self.below, points.weights)[..., None] * joints.positions_m[:, None]
+        axes = joints.axes.transpose(-1, -2)[:, None]  # (n, 1, M, 3 unknowns, 3)
+        turn = torch.linalg.cross(axes, lever[..., None, :].expand(*lever.shape[:-1], 3, 3))
+        position = carried.sum(2)
+        shift = torch.eye(3, dtype=turn.dtype).expand(*position.shape, 3)
+        frame = torch.cat([shift, turn.flatten(2, 3).transpose(-1, -2)], -1)
+        rest_basis = points.basis_m - points.weights[..., None, None] * self.rest_basis_m
+        shape = torch.einsum("nmcd,pmdb->npcb", joints.rotations, rest_basis)
+        shape += torch.einsum("pm,nmcb->npcb", points.weights, joints.shape_m)
+        return position, frame, shape
+
+    def along(self, ids: Tensor, directions: Tensor, joints: PosedJoints, frame: int) -> tuple[Tensor, Tensor]:
+        """Derivatives of some vertices' positions, ids (P,), along directions (P, 3): by a frame's unknowns (P, U),
+        and by beta (P, B). The same as `jacobian`, contracted early."""
+        weights, rest = self.vertex_weights[ids], self.rig.vertices_m[ids, None] - self.rest_m
+        rotations, positions = joints.rotations[frame], joints.positions_m[frame]
+        carried = weights[..., None] * (torch.einsum("mcd,pmd->pmc", rotations, rest) + positions)
+        lever = torch.einsum("jm,pmd->pjd", self.below, carried) - (weights @ self.below.T)[..., None] * positions
+        torque = torch.linalg.cross(lever, directions[:, None].expand_as(lever))
+        turn = torch.einsum("pmc,mcu->pmu", torque, joints.axes[frame]).flatten(1)
+        pulled = weights[..., None] * torch.einsum("pc,mcd->pmd", directions, rotations)
+        shape = torch.einsum("pd,bpd->pb", pulled.sum(1), self.rig.shape_basis[:, ids])
+        shape -= pulled.flatten(1) @ self.rest_basis_m.flatten(0, 1)
+        shape += (weights[..., None] * directions[:, None]).flatten(1) @ joints.shape_m[frame].flatten(0, 1)
+        return torch.cat([directions, turn], 1), shape
+
+    def _carried(self, points: Points, joints: PosedJoints) -> Tensor:
+        """Each joint's share of each point, (n, P, M, 3)."""
+        rest = points.rest_m - points.weights[..., None] * self.rest_m
+        turned = torch.einsum("nmcd,pmd->npmc", joints.rotations, rest)
+        return turned + points.weights[..., None] * joints.positions_m[:, None]
+
+    def moved(self, pose: Pose, step: Tensor) -> Pose:
+        """The pose after a step (n, U) of the frames' unknowns."""
+        theta = pose.theta.clone()
+        theta[:, self.joints[1:]] += step[:, 6:].unflatten(-1, (-1, 3))
+        rotation = rotation_from_axis_angle(step[:, 3:6]) @ pose.root[:, :3, :3]
+        root = pose.root.clone()
+        root[:, :3, 3] += step[:, :3] + (pose.root[:, :3, :3] - rotation) @ self.rest_m[0]
+        root[:, :3, :3] = rotation
+        return replace(pose, theta=theta, root=root)
+
+
+def with_offsets(points: Points, offsets_m: Tensor) -> Points:
+    """Keypoints moved on the resting body by offsets_m (P, 3)."""
+    return replace(points, rest_m=points.rest_m + points.weights[..., None] * offsets_m[:, None])
+
+
+def left_jacobian(axis_angle: Tensor) -> Tensor:
+    """(..., 3) to (..., 3, 3): J with R(v + dv) = R(J dv) R(v) to first order.
+
+    J = I + (1 - cos a)/a^2 [v] + (a - sin a)/a^3 [v]^2 (Barfoot 2017, eq. 7.37).
+    """
+    squared = (axis_angle * axis_angle).sum(-1)[..., None, None]
+    small = squared < 1e-8
+    safe = torch.where(small, torch.ones_like(squared), squared)
+    angle = safe.sqrt()
+    first = torch.where(small, 0.5 - squared / 24, (1 - angle.cos()) / safe)
+    second = torch.where(small, 1 / 6 - squared / 120, (angle - angle.sin()) / (safe * angle))
+    x, y, z = axis_angle.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    return torch.eye(3, dtype=cross.dtype) + first * cross + second * (cross @ cross)

@@ -1,0 +1,213 @@
+"""The body's outline against the mask's, camera by camera.
+
+Two kinds of match, both point to line (Chen and Medioni 1992, in the image): every point of the mask's contour pulls
+the nearest rim vertex of the projected body, and every rim vertex outside the mask is pushed back in. A body belongs
+inside its clothes, so the second is strict and the first is loose and robust: cloth and hair stand away from the skin.
+"""
+
+import logging
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from scipy.ndimage import map_coordinates
+from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
+from skimage.measure import find_contours
+
+from hnerf.body.articulation import Articulation, Pose, PosedJoints
+from hnerf.body.keypoint_fit import Problem, project
+from hnerf.body.normal_equations import NormalEquations
+from hnerf.capture.camera import Camera
+from hnerf.render.silhouette import silhouette
+
+log = logging.getLogger("hnerf.fit")
+
+MASK_BLUR_PX = 0.7  # takes the stairs off a mask's edge
+FACING = 0.35  # |cosine| between normal and view below which a vertex is on the rim
+RIM_DEPTH_PX = 2.5  # pixels from the border of the body's silhouette
+SAME_WAY = 0.5  # cosine between the outlines' normals above which points may match
+GROUND_M = 0.01  # how near the ground the lowest vertex of a frame is
+NO_GROUND_M = 0.15  # and from which distance there is no reason to believe so
+DAMPING = (
+    1e-4  # enough for well-posed steps; more would hold back depth and scale, which outlines of one camera hardly tell
+)
+
+
+@dataclass(frozen=True)
+class Outline:
+    """A mask's edge: points (N, 2) px, outward normals (N, 2), and its signed distance (H, W) px, negative inside."""
+
+    points_px: np.ndarray
+    normals: np.ndarray
+    distance_px: np.ndarray
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Linear residuals of one frame: residual_m + gradient . (movement of vertex), with weights in 1 / m^2."""
+
+    vertices: np.ndarray
+    gradient: np.ndarray
+    residual_m: np.ndarray
+    weight: np.ndarray
+
+
+@dataclass(frozen=True)
+class ContourWeights:
+    """Standard deviations in metres: see FitSettings."""
+
+    inside_m: float
+    outside_m: float
+    clothing_m: float
+    spacing_m: float
+
+
+def outline(mask: np.ndarray, spacing_px: float) -> Outline:
+    """The edge of a mask (H, W) bool, sampled about every spacing_px."""
+    soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), MASK_BLUR_PX)
+    lines = [_resampled(line, spacing_px) for line in find_contours(soft, 0.5)]  # (row, column)
+    points = np.concatenate(lines) if lines else np.zeros((0, 2))
+    slope = np.stack([map_coordinates(g, points.T, order=1) for g in np.gradient(soft)], -1)
+    normals = -slope / np.linalg.norm(slope, axis=1, keepdims=True).clip(1e-9)
+    inside, outside = (cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, 5) for m in (mask, ~mask))
+    distance = np.where(mask, 0.5 - inside, outside - 0.5)
+    return Outline(points[:, ::-1], normals[:, ::-1], distance.astype(np.float64))
+
+
+def _resampled(line: np.ndarray, spacing_px: float) -> np.ndarray:
+    """Points at even spacing along a polyline (N, 2)."""
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    at = np.arange(0, along[-1], spacing_px)
+    return np.stack([np.interp(at, along, line[:, k]) for k in range(2)], 1)
+
+
+def match(
+    camera: Camera, edge: Outline, scale_m: float, vertices_m: np.ndarray, normals: np.ndarray, faces: np.ndarray,
+    weights: ContourWeights,
+) -> Rows:  # fmt: skip
+    """Rows of one camera and frame. scale_m: metres a pixel spans; vertices_m and normals (V, 3)."""
+    rim = _rim(camera, vertices_m, normals, faces)
+    uv, by_x = (t.numpy() for t in project(camera, torch.from_numpy(vertices_m[rim])))
+    flat = normals[rim] @ camera.R[:2].T
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True).clip(1e-9)
+    pairs = [_cover(edge, uv, flat), _contain(edge, uv, weights.spacing_m / scale_m)]
+    ids, direction, residual_px = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
+    gradient = np.einsum("ri,ric->rc", direction, by_x[ids]) * scale_m
+    residual_m = residual_px * scale_m
+    ids = rim[ids]
+    loose = weights.outside_m**-2 / (1 + (residual_m / weights.clothing_m) ** 2) ** 2  # Geman-McClure
+    return Rows(ids, gradient, residual_m, np.where(residual_m > 0, weights.inside_m**-2, loose))
+
+
+def _rim(camera: Camera, vertices_m: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Vertices (N,) on the body's outline in the image: seen edge-on, and near the border of its silhouette."""
+    view = vertices_m - camera.centre_m
+    edge_on = np.abs((view * normals).sum(1)) < FACING * np.linalg.norm(view, axis=1)
+    rim = np.flatnonzero(edge_on)
+    covered = silhouette(camera, vertices_m, faces).astype(np.uint8)
+    depth_px = cv2.distanceTransform(np.pad(covered, 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    deep = map_coordinates(depth_px, camera.project(vertices_m[rim])[0].T[::-1], order=0, mode="nearest")
+    return rim[deep <= RIM_DEPTH_PX]
+
+
+def _cover(edge: Outline, rim_px: np.ndarray, rim_normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mask contour to nearest rim vertex: its index, the direction (N, 2), the signed distance px (negative: too
+    small)."""
+    if len(rim_px) == 0 or len(edge.points_px) == 0:
+        return np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)
+    nearest = cKDTree(rim_px).query(edge.points_px)[1]
+    signed = ((rim_px[nearest] - edge.points_px) * edge.normals).sum(1)
+    keep = ((rim_normals[nearest] * edge.normals).sum(1) > SAME_WAY) & (signed < 0)
+    return nearest[keep], edge.normals[keep], signed[keep]
+
+
+def _contain(edge: Outline, rim_px: np.ndarray, spacing_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rim vertices outside the mask, thinned to one a cell: index, direction (N, 2), distance px (positive)."""
+    height, width = edge.distance_px.shape
+    seen = np.flatnonzero(((rim_px >= 0) & (rim_px <= (width - 1, height - 1))).all(1))
+    column, row = np.floor(rim_px[seen] / spacing_px).astype(np.int64).T
+    first = seen[np.unique(row * width + column, return_index=True)[1]]
+    at = rim_px[first].T[::-1]
+    distance = map_coordinates(edge.distance_px, at, order=1)
+    ahead, behind = (
+        [
+            map_coordinates(edge.distance_px, at + step, order=1, mode="nearest")
+            for step in sign * np.eye(2)[::-1, :, None]
+        ]
+        for sign in (1, -1)
+    )
+    slope = np.stack(ahead, -1) - np.stack(behind, -1)
+    slope /= np.linalg.norm(slope, axis=1, keepdims=True).clip(1e-9)
+    out = distance > 0
+    return first[out], slope[out], distance[out]
+
+
+def refine(
+    problem: Problem, pose: Pose, edges: list[list[Outline | None]], weights: ContourWeights, up: int, steps: int
+) -> Pose:
+    """Gauss-Newton steps on outlines and keypoints, matched anew before each. edges: by frame and camera, None without
+    a mask; up: the world's vertical axis, used with one camera only."""
+    surface = Surface(pose.rig.faces.numpy(), len(pose.rig.vertices_m))
+    for step in range(steps):
+        articulation = Articulation(pose.rig)
+        joints = articulation.pose(pose)
+        _, equations = problem.assemble(pose, problem.in_images)
+        residuals = []
+        for t, row in enumerate(edges):
+            vertices_m = articulation.surface(joints, t).numpy()
+            normals = surface.normals(vertices_m)
+            found = [
+                match(camera, edge, float(scale_m[t]), vertices_m, normals, surface.faces, weights)
+                for camera, scale_m, edge in zip(problem.seen.cameras, problem.scale_m, row, strict=True)
+                if edge is not None
+            ]
+            if len(row) == 1:
+                found.append(_standing(vertices_m, up))
+            for rows in found:
+                _add_rows(equations, articulation, joints, t, rows)
+                residuals.append(rows.residual_m)
+        pose = problem.moved(pose, equations, DAMPING)
+        error_mm = 1e3 * np.concatenate([np.zeros(0), *residuals])
+        log.info("outlines, step %d of %d: %.1f mm rms", step + 1, steps, np.sqrt((error_mm**2).mean()))
+    return pose
+
+
+def _standing(vertices_m: np.ndarray, up: int) -> Rows:
+    """The lowest vertex stands on the ground at height 0, where calibrations usually put it: with one camera this tells
+    the depth. Geman-McClure lets it go where the body floats or the world's origin lies elsewhere."""
+    lowest = int(vertices_m[:, up].argmin())
+    height_m = vertices_m[lowest, up]
+    weight = GROUND_M**-2 / (1 + (height_m / NO_GROUND_M) ** 2) ** 2
+    return Rows(np.array([lowest]), np.eye(3)[[up]], np.array([height_m]), np.array([weight]))
+
+
+def _add_rows(
+    equations: NormalEquations, articulation: Articulation, joints: PosedJoints, frame: int, rows: Rows
+) -> None:
+    """Add a frame's rows to the normal equations."""
+    ids, directions = torch.from_numpy(rows.vertices), torch.from_numpy(rows.gradient)
+    j, s = (part.numpy() for part in articulation.along(ids, directions, joints, frame))
+    shape = slice(0, s.shape[1])
+    weighted_j, weighted_s = j * rows.weight[:, None], s * rows.weight[:, None]
+    equations.frame[0][frame] += weighted_j.T @ j
+    equations.border[frame, :, shape] += weighted_j.T @ s
+    equations.shared[shape, shape] += weighted_s.T @ s
+    equations.frame_gradient[frame] += weighted_j.T @ rows.residual_m
+    equations.shared_gradient[shape] += weighted_s.T @ rows.residual_m
+
+
+class Surface:
+    """Faces (F, 3) of V vertices, ready for normals."""
+
+    def __init__(self, faces: np.ndarray, vertices: int) -> None:
+        self.faces = faces
+        rows, columns = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
+        self.sums = csr_matrix((np.ones(len(rows)), (rows, columns)), (vertices, len(faces)))
+
+    def normals(self, vertices_m: np.ndarray) -> np.ndarray:
+        """Area-weighted unit normals (V, 3)."""
+        a, b, c = (vertices_m[self.faces[:, k]] for k in range(3))
+        normals = self.sums @ np.cross(b - a, c - a)
+        return normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12)

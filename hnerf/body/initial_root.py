@@ -1,0 +1,42 @@
+"""Where the body stands and faces, before its joints are known."""
+
+import cv2
+import numpy as np
+
+from hnerf.capture.camera import Camera
+
+TORSO = (2, 5, 9, 12)  # shoulders and hips in BODY_25
+HEAD_AND_TORSO = (0, 1, 2, 5, 8, 9, 12, 15, 16, 17, 18)
+
+
+def kabsch(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Rigid transform (4, 4) that takes points source (N, 3) nearest to target (N, 3) (Kabsch 1976)."""
+    centre_s, centre_t = source.mean(0), target.mean(0)
+    u, _, vt = np.linalg.svd((target - centre_t).T @ (source - centre_s))
+    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation, centre_t - rotation @ centre_s
+    return transform
+
+
+def root_from_space(rest_m: np.ndarray, points_m: np.ndarray) -> np.ndarray | None:
+    """World from body (4, 4) by shoulders and hips: rest_m and points_m (25, 3); None where one of the four is NaN."""
+    torso = list(TORSO)
+    return kabsch(rest_m[torso], points_m[torso]) if np.isfinite(points_m[torso]).all() else None
+
+
+def root_from_image(camera: Camera, rest_m: np.ndarray, keypoints: np.ndarray) -> np.ndarray | None:
+    """World from body (4, 4) from one view, by the head and torso of a resting body: rest_m (25, 3), keypoints (25, 3)
+    x_px, y_px, confidence. SQPnP (Terzakis and Lourakis 2020), refined by Levenberg-Marquardt; None with too few
+    keypoints."""
+    seen = [k for k in HEAD_AND_TORSO if keypoints[k, 2] > 0]
+    if len(seen) < 6:
+        return None
+    ok, rvec, tvec = cv2.solvePnP(rest_m[seen], keypoints[seen, :2], camera.K, None, flags=cv2.SOLVEPNP_SQPNP)
+    if not ok:
+        return None
+    rvec, tvec = cv2.solvePnPRefineLM(rest_m[seen], keypoints[seen, :2], camera.K, None, rvec, tvec)
+    camera_from_body, camera_from_world = np.eye(4), np.eye(4)
+    camera_from_body[:3, :3], camera_from_body[:3, 3] = cv2.Rodrigues(rvec)[0], tvec[:, 0]
+    camera_from_world[:3, :3], camera_from_world[:3, 3] = camera.R, camera.t_m
+    return np.linalg.inv(camera_from_world) @ camera_from_body

@@ -1,0 +1,48 @@
+"""The subject's keypoints as a fit needs them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hnerf.calibration.triangulation import subject_keypoints, triangulate
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+
+
+@dataclass(frozen=True)
+class Observations:
+    """pixels (C, n, 25, 2) and confidence (C, n, 25) of the training cameras, float64; space_m (n, 25, 3), NaN where
+    fewer than two of them agree."""
+
+    cameras: tuple[Camera, ...]
+    pixels: Tensor
+    confidence: Tensor
+    space_m: Tensor
+
+
+def observe(capture: Capture) -> Observations:
+    """Keypoints of every frame, from training cameras only. Raises CaptureError where the capture has none."""
+    people = subject_keypoints(capture)
+    cameras = tuple(capture.cameras[name] for name in capture.train_cameras)
+    keypoints = np.stack([people[camera.name] for camera in cameras])
+    count, frames = keypoints.shape[:2]
+    space_m = np.full((frames, 25, 3), np.nan)
+    if count > 1:
+        projections = np.stack([camera.projection for camera in cameras])
+        space_m = triangulate(projections, keypoints.reshape(count, -1, 3))[0].reshape(frames, 25, 3)
+    pixels, confidence = torch.from_numpy(keypoints).split([2, 1], -1)
+    return Observations(cameras, pixels, confidence[..., 0], torch.from_numpy(space_m))
+
+
+def runs(capture: Capture) -> list[tuple[int, ...]]:
+    """Frames that follow each other in time: a gap in the numbers, or another split, starts a new run."""
+    novel = set(capture.novel_pose_frames)
+    found: list[list[int]] = []
+    for frame in capture.frames:
+        if found and frame == found[-1][-1] + 1 and (frame in novel) == (found[-1][-1] in novel):
+            found[-1].append(frame)
+        else:
+            found.append([frame])
+    return [tuple(run) for run in found]

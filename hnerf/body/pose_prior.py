@@ -1,0 +1,138 @@
+"""What a human pose is likely to be: how far each joint turns from rest, and where hinges stop.
+
+A joint's rotation vector is read along three axes of the resting body: flexion, twist about the bone, and sideways.
+"""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hnerf.body.articulation import Articulation, Pose
+from hnerf.body.normal_equations import NormalEquations
+
+# Standard deviations from rest in degrees: flexion, twist, sideways; chosen wide, as what everyday movement spans.
+SPREAD_DEG = {
+    "upperleg01": (45, 20, 25),
+    "lowerleg01": (60, 6, 4),
+    "foot": (20, 10, 12),
+    "spine05": (12, 8, 8),
+    "spine03": (12, 8, 8),
+    "spine01": (12, 8, 8),
+    "clavicle": (10, 5, 10),
+    "upperarm01": (60, 40, 60),
+    "lowerarm01": (60, 30, 5),
+    "wrist": (25, 25, 15),
+    "neck01": (15, 15, 10),
+    "head": (15, 15, 10),
+}
+OTHER_SPREAD_DEG = (30, 30, 30)
+HINGES = ("lowerleg01", "lowerarm01")  # from straight to folded
+FOLDED_DEG = 150.0
+FLEXION_DEG = {"upperarm01": (-170, 45), "upperleg01": (-130, 40)}  # forwards, backwards, from rest
+MEAN_FLEXION_DEG = {"upperarm01": -10.0}  # arms are carried in front of the body
+LIMIT_SIGMA_DEG = 2.0
+
+DIFFERENCE = (1.0, -2.0, 1.0)
+SUDDEN_SIGMAS = 3.0
+
+
+class PosePrior:
+    """Gaussian about the rest pose on every axis of every free joint, and one-sided limits on the hinges."""
+
+    def __init__(self, articulation: Articulation) -> None:
+        self.articulation = articulation
+        rig = articulation.rig
+        names = [rig.joint_names[int(j)].split(".")[0] for j in articulation.joints[1:]]
+        bones = _bone_directions(articulation)
+        self.axes = torch.stack([_axes(bones[int(articulation.parents[m + 1])], bones[m + 1], name in HINGES)
+                                 for m, name in enumerate(names)])  # fmt: skip
+        spread = torch.tensor([SPREAD_DEG.get(name, OTHER_SPREAD_DEG) for name in names], dtype=bones.dtype)
+        self.sigma = torch.deg2rad(spread)
+        bend = torch.stack([_angle(bones[int(articulation.parents[m + 1])], bones[m + 1]) for m in range(len(names))])
+        hinge = torch.tensor([name in HINGES for name in names])
+        span = torch.deg2rad(torch.tensor([FLEXION_DEG.get(name, (-180, 180)) for name in names], dtype=bones.dtype))
+        self.low = torch.where(hinge, -bend, span[:, 0])
+        self.high = torch.where(hinge, math.radians(FOLDED_DEG) - bend, span[:, 1])
+        self.mean = torch.zeros_like(self.sigma)
+        self.mean[:, 0] = torch.deg2rad(torch.tensor([MEAN_FLEXION_DEG.get(name, 0.0) for name in names]))
+
+    def likely(self) -> Tensor:
+        """The likeliest turns of the free joints, (M - 1, 3) axis-angle."""
+        return torch.einsum("mac,ma->mc", self.axes, self.mean)
+
+    def add(self, equations: NormalEquations, pose: Pose) -> float:
+        """Add to the normal equations; returns the cost."""
+        local = torch.einsum("mac,nmc->nma", self.axes, pose.theta[:, self.articulation.joints[1:]])
+        weight = (self.sigma**-2).expand_as(local).clone()
+        off = local - self.mean
+        pull = weight * off
+        excess = local[..., 0] - local[..., 0].clamp(self.low, self.high)
+        limit = math.radians(LIMIT_SIGMA_DEG) ** -2
+        pull[..., 0] += limit * excess
+        weight[..., 0] += limit * (excess != 0)
+        gradient = torch.einsum("mac,nma->nmc", self.axes, pull)
+        blocks = torch.einsum("mac,nma,mad->nmcd", self.axes, weight, self.axes)
+        equations.frame_gradient[:, 6:] += gradient.flatten(1).numpy()
+        for m in range(blocks.shape[1]):
+            at = slice(6 + 3 * m, 9 + 3 * m)
+            equations.frame[0][:, at, at] += blocks[:, m].numpy()
+        return 0.5 * float((off**2 / self.sigma**2).sum() + limit * (excess**2).sum())
+
+
+def _bone_directions(articulation: Articulation) -> Tensor:
+    """Unit direction (M, 3) of each moving joint's bone at rest: to its moving children, or to what it carries."""
+    heads = articulation.rest_m
+    directions = []
+    for m in range(len(heads)):
+        children = [c for c in range(1, len(heads)) if int(articulation.parents[c]) == m]
+        carried = articulation.vertex_weights[:, m] > 0.5
+        end = heads[children].mean(0) if len(children) == 1 else articulation.rig.vertices_m[carried].mean(0)
+        directions.append((end - heads[m]) / (end - heads[m]).norm())
+    return torch.stack(directions)
+
+
+def _axes(above: Tensor, bone: Tensor, hinge: bool) -> Tensor:
+    """Rows: flexion, twist, sideways. A hinge flexes in the plane of its two bones, other joints about left-right."""
+    flexion = torch.linalg.cross(above, bone) if hinge else torch.tensor([1.0, 0, 0], dtype=bone.dtype)
+    flexion = flexion - (flexion @ bone) * bone
+    flexion = flexion / flexion.norm()
+    return torch.stack([flexion, bone, torch.linalg.cross(flexion, bone)])
+
+
+def _angle(a: Tensor, b: Tensor) -> Tensor:
+    return torch.arccos((a @ b).clamp(-1, 1))
+
+
+class Smoothness:
+    """Keypoints accelerate little between neighbouring frames (zero velocity would hold back real movement), except
+    when they do: Geman-McClure lets a sudden movement or a cut go. It is not applied across gaps in the frames."""
+
+    def __init__(self, runs: list[tuple[int, ...]], fps: float, sigma_mps2: np.ndarray) -> None:
+        """runs: frames that follow each other; sigma_mps2 (25,): standard deviations."""
+        starts = np.cumsum([0] + [len(run) for run in runs])
+        triples = [np.arange(a, a + len(run) - 2) for a, run in zip(starts, runs, strict=False)]
+        self.first = np.concatenate(triples)  # of each three frames, (T,)
+        self.sigma_m = sigma_mps2 / fps**2
+
+    def add(self, equations: NormalEquations, keypoints_m: Tensor, jacobian: Tensor) -> float:
+        """keypoints_m (n, 25, 3), jacobian (n, 25, 3, U); returns the cost. The shape's part in an acceleration is
+        nil, so shared unknowns are left alone."""
+        if len(self.first) == 0:
+            return 0.0
+        x, j = keypoints_m.numpy(), jacobian.flatten(1, 2).numpy()
+        at = [self.first + i for i in range(3)]
+        second = x[at[0]] - 2 * x[at[1]] + x[at[2]]  # (T, 25, 3)
+        squared = (second**2).sum(-1) / self.sigma_m**2
+        fade = 1 + squared / SUDDEN_SIGMAS**2
+        weight = np.repeat((self.sigma_m * fade) ** -2, 3, axis=1)  # (T, 75)
+        pull = weight * second.reshape(len(second), -1)
+        before = np.einsum("nuu->nu", equations.frame[0]).copy()
+        for i, a in enumerate(DIFFERENCE):
+            weighted = a * np.swapaxes(j[at[i]], 1, 2) * weight[:, None]  # (T, U, 75)
+            equations.frame_gradient[at[i]] += a * np.einsum("tku,tk->tu", j[at[i]], pull)
+            for k in range(3 - i):
+                equations.frame[k][at[i]] += DIFFERENCE[i + k] * weighted @ j[at[i + k]]
+        equations.coupling_diagonal += np.einsum("nuu->nu", equations.frame[0]) - before
+        return 0.5 * float((squared / fade).sum())

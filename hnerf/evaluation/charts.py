@@ -1,0 +1,91 @@
+"""Charts of training and of the scores frame by frame, as PNG files."""
+
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+COLOURS = ("#1f5fa8", "#e0701a", "#2b8a57", "#b23a48", "#6a4c93", "#8a6d3b", "#11808a", "#9a9a9a", "#d14d9a", "#3d3d3d")
+INK, FAINT = "#25292e", "#d9dde2"
+
+Points = list[tuple[float, float]]
+
+
+def loss_chart(history: list[dict[str, Any]], path: Path) -> bool:
+    """Every loss over training time, on a logarithmic scale; False, and no file, where there is none to draw."""
+    series = _series(history, "losses")
+    positive = {name: [(s, v) for s, v in points if v > 0] for name, points in series.items()}
+    return _chart(path, {k: v for k, v in positive.items() if v}, "seconds of training", "loss", "log")
+
+
+def quality_chart(history: list[dict[str, Any]], path: Path) -> bool:
+    """Held-out figures over training time, one panel each; False, and no file, where there is none to draw."""
+    series = _series(history, "held_out")
+    if not series:
+        return False
+    figure, panels = _figure(len(series))
+    for axes, colour, (name, points) in zip(panels, COLOURS, series.items(), strict=False):
+        _line(axes, points, colour, None)
+        _finish(axes, "seconds of training", f"held-out {name}")
+    _save(figure, path)
+    return True
+
+
+def frame_chart(per_image: list[dict[str, Any]], path: Path) -> bool:
+    """PSNR of every frame, one line a camera; False, and no file, where no image was scored."""
+    series: dict[str, Points] = defaultdict(list)
+    for score in per_image:
+        series[f"camera {score['camera']}"].append((score["frame"], score["psnr"]))
+    return _chart(path, series, "frame", "PSNR, dB", "linear")
+
+
+def _series(history: list[dict[str, Any]], key: str) -> dict[str, Points]:
+    """The figures under a key of every record, by name, over seconds."""
+    series: dict[str, Points] = defaultdict(list)
+    for record in history:
+        for name, value in record.get(key, {}).items():
+            series[name].append((record["seconds"], value))
+    return series
+
+
+def _chart(path: Path, series: dict[str, Points], x_label: str, y_label: str, scale: str) -> bool:
+    if not series:
+        return False
+    figure, (axes,) = _figure(1)
+    for k, (name, points) in enumerate(series.items()):
+        _line(axes, points, COLOURS[k % len(COLOURS)], name)
+    axes.set_yscale(scale)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=9, labelcolor=INK)
+    _finish(axes, x_label, y_label)
+    _save(figure, path)
+    return True
+
+
+def _figure(panels: int) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(9.6, 3.4), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, list(figure.subplots(1, panels, squeeze=False)[0])
+
+
+def _line(axes: Axes, points: Points, colour: str, label: str | None) -> None:
+    x, y = zip(*points, strict=True)
+    axes.plot(x, y, color=colour, linewidth=1.6, marker="o" if len(points) < 40 else None, markersize=3, label=label)
+
+
+def _finish(axes: Axes, x_label: str, y_label: str) -> None:
+    axes.set_xlabel(x_label, color=INK)
+    axes.set_ylabel(y_label, color=INK)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.grid(color=FAINT, linewidth=0.7)
+    axes.tick_params(colors=INK, labelsize=9)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color(FAINT)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    figure.savefig(path, facecolor="white")

@@ -1,0 +1,148 @@
+"""Render, mesh and score a trained avatar by the protocol of docs/method.md, and report what was found."""
+
+import dataclasses
+import json
+import logging
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+import trimesh
+
+from hnerf.asset.surface import extract_surface
+from hnerf.body.rig import pose_vertices
+from hnerf.capture.capture import Capture, read_rgb
+from hnerf.config import EvaluationSettings
+from hnerf.evaluation import geometry, metrics
+from hnerf.evaluation.ground_truth import GroundTruth
+from hnerf.evaluation.inputs import EvaluationInputs
+from hnerf.evaluation.report import write_report
+from hnerf.evaluation.views import SPLITS, TRAINING_VIEW, View, all_views, some_views, split_frames, spread
+from hnerf.render.avatar import Avatar
+
+log = logging.getLogger("hnerf.evaluation")
+
+MESH_CELLS = 256  # on the longest side of the box
+MESH_MARGIN_M = 0.2  # around the naked body: hair, shoes, loose clothes
+LOG_EVERY_S = 10.0
+PROTOCOL = (
+    "Images: PSNR, SSIM (Gaussian window of 11 px, sigma 1.5) of 8-bit images over black, data range 1, inside the box "
+    "of the true mask padded by 20 px; mask IoU of pixels brighter than 8/255. Mean over images. "
+    "novel_view: training frames from test cameras; novel_pose: frames kept from training, from test cameras, or from "
+    "training cameras where there are no test cameras; their poses are fitted from training cameras. "
+    f"Geometry: zero surface of the signed distance by marching cubes, {MESH_CELLS} cells on the longest side; "
+    f"{geometry.SAMPLES} samples a surface before those that cannot be seen from outside are dropped, fixed seed; "
+    "Chamfer: mean of both directions of the mean squared distance from sample to surface, m^2 x 1e3, and of the mean "
+    "distance in mm; normal consistency: mean |cos| at nearest points; IoU by winding number on a "
+    f"{geometry.OCCUPANCY_NODES}^3 grid."
+)
+LPIPS = "not available: the AlexNet weights it needs come with no package, and none are fetched at run time"
+
+
+def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) -> dict[str, Any]:
+    """Write `renders/`, `meshes/`, `metrics.json`, charts and `report.html` into `out`; what metrics.json holds.
+
+    A figure that cannot be had is null, and a reason stands beside it.
+    """
+    started = time.perf_counter()
+    capture = inputs.capture
+    truth = GroundTruth(inputs.capture_folder, capture) if (inputs.capture_folder / "ground_truth").is_dir() else None
+    views = [view for split in SPLITS for view in all_views(capture, split)]
+    shown = some_views(capture, TRAINING_VIEW, settings.report_rows)
+    image_seconds = render(inputs.avatar, capture, views + shown, out)
+    rendered = time.perf_counter()
+    found: dict[str, Any] = {"protocol": PROTOCOL, "lpips": LPIPS, "seconds_per_image": image_seconds}
+    found |= {split: score_split(capture, split, truth, out) for split in SPLITS}
+    true_meshes = {} if truth is None else truth.meshes()
+    for split in SPLITS:
+        frames = mesh_frames(split_frames(capture, split), true_meshes, settings.max_meshes)
+        found[split] |= score_meshes(inputs.avatar, frames, true_meshes, out)
+    found["seconds"] = {"rendering": rendered - started, "scores and meshes": time.perf_counter() - rendered}
+    write_report(inputs, settings, truth, true_meshes, found, out)
+    found["seconds"]["all"] = time.perf_counter() - started
+    (out / "metrics.json").write_text(json.dumps(found, indent=1))
+    log.info("evaluation took %.0f s, %.0f s of them rendering", found["seconds"]["all"], rendered - started)
+    return found
+
+
+def render(avatar: Avatar, capture: Capture, views: list[View], out: Path) -> float:
+    """Write the 8-bit rendering of every view; the median seconds of one image, without writing it."""
+    seconds: list[float] = []
+    next_log = time.perf_counter() + LOG_EVERY_S
+    for view in views:
+        started = time.perf_counter()
+        k = avatar.body.index(view.frame)
+        with torch.no_grad():
+            rgb = avatar.render(capture.cameras[view.camera], avatar.body.theta[k], avatar.body.root[k]).rgb
+            pixels = (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+        seconds.append(time.perf_counter() - started)
+        path = view.path(out)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
+        if time.perf_counter() > next_log:
+            log.info("rendered %d of %d images", len(seconds), len(views))
+            next_log = time.perf_counter() + LOG_EVERY_S
+    return float(np.median(seconds))
+
+
+def score_split(capture: Capture, split: str, truth: GroundTruth | None, out: Path) -> dict[str, Any]:
+    """Mean image figures of a split's renderings, and each image's; null with a reason where there are none."""
+    nothing: dict[str, Any] = {"n": 0, "psnr": None, "ssim": None, "mask_iou": None, "per_image": []}
+    views = all_views(capture, split)
+    if not views:
+        missing = "test cameras" if split == "novel_view" else "novel-pose frames"
+        return nothing | {"reason": f"the capture has no {missing}"}
+    if truth is None or not truth.has_masks:
+        return nothing | {"reason": "the capture has no ground-truth masks"}
+    rows, references = [], set()
+    for view in views:
+        mask = truth.mask(view.camera, view.frame)
+        if not mask.any():
+            continue
+        reference, source = truth.on_black(view.camera, view.frame)
+        score = metrics.score_image(read_rgb(view.path(out)), reference, mask)
+        references.add(source)
+        rows.append({"camera": view.camera, "frame": view.frame} | dataclasses.asdict(score))
+    if not rows:
+        return nothing | {"reason": "no image of this split shows the person"}
+    means = {name: float(np.mean([row[name] for row in rows])) for name in ("psnr", "ssim", "mask_iou")}
+    without = {"without_person": len(views) - len(rows)}
+    return {"n": len(rows)} | means | without | {"reference": " and ".join(sorted(references)), "per_image": rows}
+
+
+def mesh_frames(frames: tuple[int, ...], true_meshes: dict[int, trimesh.Trimesh], count: int) -> list[int]:
+    """The frames to mesh: at most `count`, spread over those with a true surface, or over all where none has one."""
+    return spread([f for f in frames if f in true_meshes] or frames, count)
+
+
+def score_meshes(
+    avatar: Avatar, frames: list[int], true_meshes: dict[int, trimesh.Trimesh], out: Path
+) -> dict[str, Any]:
+    """Write `meshes/<frame>.ply` of the frames; their mean geometry figures, or null with a reason."""
+    (out / "meshes").mkdir(exist_ok=True)
+    scores = []
+    for frame in frames:
+        mesh = posed_surface(avatar, frame)
+        mesh.export(out / "meshes" / f"{frame:06d}.ply")
+        if frame in true_meshes:
+            rng = np.random.default_rng(0)
+            scores.append(dataclasses.asdict(geometry.score_geometry(mesh, true_meshes[frame], rng)))
+        log.info("meshed frame %d: %d faces", frame, len(mesh.faces))
+    if not scores:
+        return {"geometry": None, "geometry_reason": "the capture has no ground-truth surface in these frames"}
+    means = {name: float(np.mean([score[name] for score in scores])) for name in scores[0]}
+    return {"geometry": means | {"n": len(scores), "frames": [f for f in frames if f in true_meshes]}}
+
+
+def posed_surface(avatar: Avatar, frame: int) -> trimesh.Trimesh:
+    """The zero surface of the avatar's signed distance in a frame's pose, in world metres (single precision)."""
+    k = avatar.body.index(frame)
+    theta, root = avatar.body.theta[k], avatar.body.root[k]
+    body_m = pose_vertices(avatar.body.rig, theta, root)
+    lower_m, upper_m = body_m.amin(0) - MESH_MARGIN_M, body_m.amax(0) + MESH_MARGIN_M
+    with torch.no_grad():
+        mesh = extract_surface(lambda x: avatar.signed_distance(x, theta, root), lower_m, upper_m, MESH_CELLS)
+    return trimesh.Trimesh(mesh.vertices.astype(np.float32), mesh.faces, process=False)

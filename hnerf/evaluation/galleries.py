@@ -1,0 +1,101 @@
+"""Rows of pictures for the report: what a camera saw, what was made of it, and how far it is off."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.body.rig import pose_vertices
+from hnerf.evaluation import pictures
+from hnerf.evaluation.ground_truth import GroundTruth
+from hnerf.evaluation.inputs import EvaluationInputs
+from hnerf.evaluation.mesh_queries import Surface
+from hnerf.evaluation.views import TRAINING_VIEW, View
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A captioned picture as a data: address."""
+
+    caption: str
+    uri: str
+
+
+@dataclass(frozen=True)
+class Row:
+    """Pictures of one view or frame."""
+
+    title: str
+    note: str
+    pictures: list[Picture]
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """Rows under one heading."""
+
+    title: str
+    text: str
+    rows: list[Row]
+
+
+def view_row(view: View, rendered: np.ndarray, inputs: EvaluationInputs, truth: GroundTruth | None, note: str) -> Row:
+    """Input, mask, fitted body, rendering, reference and error, cut to the person.
+
+    A scored view is compared to the truth; a training view, or one without a truth, to the photograph under its mask.
+    """
+    image = inputs.capture.image(view.camera, view.frame)
+    mask, reference = _mask_and_reference(view, image, inputs, truth)
+    lit = rendered.max(-1) > 0
+    box = pictures.frame_person(lit if mask is None else lit | mask)
+    camera = pictures.cropped_camera(inputs.capture.cameras[view.camera], box)
+    cut_image, cut_rendered = pictures.crop(image, box), pictures.crop(rendered, box)
+    row = [("Input", cut_image)]
+    if mask is not None:
+        cut_mask = pictures.crop(mask.astype(np.uint8) * 255, box) > 127
+        row.append(("Mask", pictures.show_mask(cut_image, cut_mask)))
+    row.append(
+        ("Fitted body", pictures.overlay_surface(cut_image, Surface(_body_mesh(inputs.fitted, view.frame)), camera))
+    )
+    row.append(("Render", cut_rendered))
+    if reference is not None:
+        caption, cut_reference = reference[0], pictures.crop(reference[1], box)
+        row += [(caption, cut_reference), ("Error", pictures.error_map(cut_rendered, cut_reference))]
+    return Row(f"Frame {view.frame}, camera {view.camera}", note, _captioned(row))
+
+
+def _mask_and_reference(
+    view: View, image: np.ndarray, inputs: EvaluationInputs, truth: GroundTruth | None
+) -> tuple[np.ndarray | None, tuple[str, np.ndarray] | None]:
+    """The mask (H, W) bool and the captioned picture to compare with, or None where there is none."""
+    if view.split != TRAINING_VIEW and truth is not None and truth.has_masks:
+        return truth.mask(view.camera, view.frame), ("Ground truth", truth.on_black(view.camera, view.frame)[0])
+    if view.camera not in inputs.capture.train_cameras:
+        return None, None
+    mask = inputs.masks.get(view.camera, view.frame)
+    return mask, ("Input × mask", image * mask[..., None])
+
+
+def surface_row(frame: int, mesh: trimesh.Trimesh, truth: trimesh.Trimesh | None, root: np.ndarray, note: str) -> Row:
+    """A mesh from the person's front and back; beside it the true one and the distance between them. root (4, 4)."""
+    points_m = mesh.vertices if truth is None else np.concatenate([mesh.vertices, truth.vertices])
+    cameras = {side: pictures.portrait_camera(points_m, root, side) for side in ("front", "back")}
+    surface = Surface(mesh)
+    row = [(f"Surface, {side}", pictures.clay(surface, camera)) for side, camera in cameras.items()]
+    if truth is not None:
+        true_surface = Surface(truth)
+        row += [(f"Ground truth, {side}", pictures.clay(true_surface, camera)) for side, camera in cameras.items()]
+        row += [(f"Distance, {side}", pictures.distance_map(surface, true_surface, c)) for side, c in cameras.items()]
+    return Row(f"Frame {frame}", note, _captioned(row))
+
+
+def _body_mesh(body: BodyFit, frame: int) -> trimesh.Trimesh:
+    """The naked body in the pose of a frame."""
+    k = body.index(frame)
+    vertices_m = pose_vertices(body.rig, body.theta[k], body.root[k])
+    return trimesh.Trimesh(vertices_m.numpy(), body.rig.faces.numpy(), process=False)
+
+
+def _captioned(row: list[tuple[str, np.ndarray]]) -> list[Picture]:
+    return [Picture(caption, pictures.data_uri(picture)) for caption, picture in row]

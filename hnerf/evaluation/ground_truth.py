@@ -1,0 +1,65 @@
+"""What a capture folder knows about the truth: masks, the person on black, and surfaces, under `ground_truth/`."""
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+
+from hnerf.capture.capture import Capture
+from hnerf.capture.guarded import inside, read_image
+from hnerf.errors import CaptureError
+
+ON_BLACK = "ground_truth/on_black"
+MASKED_IMAGE = "image x ground-truth mask"
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """Readers of an original capture folder's `ground_truth/`; images come at the size of the capture's camera."""
+
+    folder: Path
+    capture: Capture
+
+    @property
+    def has_masks(self) -> bool:
+        """Whether images can be scored."""
+        return self._path("masks").is_dir()
+
+    def mask(self, camera: str, frame: int) -> np.ndarray:
+        """(H, W) bool, True on the person."""
+        path = self._path("masks", camera, f"{frame:06d}.png")
+        return self._at_camera_size(read_image(path)[..., 0], camera, cv2.INTER_NEAREST) > 127
+
+    def on_black(self, camera: str, frame: int) -> tuple[np.ndarray, str]:
+        """The person alone over black, (H, W, 3) uint8, and where that comes from.
+
+        `on_black/`, whose edge pixels are weighted by coverage, where it has the view; else the photograph x the mask.
+        """
+        path = self._path("on_black", camera, f"{frame:06d}.jpg")
+        if path.exists():
+            return self._at_camera_size(read_image(path), camera, cv2.INTER_AREA), ON_BLACK
+        return self.capture.image(camera, frame) * self.mask(camera, frame)[..., None], MASKED_IMAGE
+
+    def meshes(self) -> dict[int, trimesh.Trimesh]:
+        """The true surface, in world metres, of every frame that has one."""
+        path = self._path("meshes.npz")
+        if not path.exists():
+            return {}
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                faces, vertices, frames = stored["faces"], stored["vertices"], stored["frames"]
+            if not (faces.min() >= 0 and faces.max() < vertices.shape[1] and np.isfinite(vertices).all()):
+                raise ValueError("a face names no vertex, or a vertex is not finite")
+            return {int(f): trimesh.Trimesh(v, faces, process=False) for f, v in zip(frames, vertices, strict=True)}
+        except (OSError, ValueError, KeyError, IndexError, zipfile.BadZipFile) as error:
+            raise CaptureError(f"{path}: no true surfaces to read ({error}); write it again or delete it") from None
+
+    def _path(self, *parts: str) -> Path:
+        return inside(self.folder, "ground_truth", *parts)
+
+    def _at_camera_size(self, image: np.ndarray, camera: str, interpolation: int) -> np.ndarray:
+        size = (self.capture.cameras[camera].width_px, self.capture.cameras[camera].height_px)
+        return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=interpolation)

@@ -1,0 +1,28 @@
+"""What evaluation is given."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.capture import Capture
+from hnerf.render.avatar import Avatar
+from hnerf.segmentation.masks import Masks
+
+
+@dataclass(frozen=True)
+class EvaluationInputs:
+    """Everything made before evaluation.
+
+    capture_folder: as recorded, for its ground_truth/; capture: with the calibrated cameras; fitted: the body before
+    training (avatar.body holds the fine-tuned one); the folders hold their stages' report.json.
+    """
+
+    capture_folder: Path
+    capture: Capture
+    masks: Masks
+    fitted: BodyFit
+    avatar: Avatar
+    calibration_folder: Path
+    segmentation_folder: Path
+    fit_folder: Path
+    training_folder: Path

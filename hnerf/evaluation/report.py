@@ -1,0 +1,237 @@
+"""The report: one HTML file that needs nothing beside it."""
+
+import base64
+import json
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import trimesh
+
+from hnerf.capture.capture import read_rgb
+from hnerf.config import EvaluationSettings
+from hnerf.evaluation import charts
+from hnerf.evaluation.galleries import Gallery, Picture, surface_row, view_row
+from hnerf.evaluation.ground_truth import MASKED_IMAGE, GroundTruth
+from hnerf.evaluation.inputs import EvaluationInputs
+from hnerf.evaluation.views import SPLITS, TRAINING_VIEW, View, some_views
+
+FIGURES = (  # where in a split's scores, name, unit, format, what it means
+    (
+        "psnr",
+        "PSNR",
+        "dB",
+        "{:.2f}",
+        "Pixel error, logarithmic. Higher is better; 3 dB more is half the squared error.",
+    ),
+    ("ssim", "SSIM", "", "{:.3f}", "Likeness of local structure: edges, folds, pattern. 1 is identical."),
+    ("mask_iou", "Mask IoU", "", "{:.3f}", "Overlap of the rendered and the true outline. 1 is identical."),
+    ("geometry.chamfer_mm", "Surface distance", "mm", "{:.1f}", "Mean distance between the surface and the true one."),
+    ("geometry.chamfer_l2_e3", "Chamfer", "m² × 10⁻³", "{:.3f}", "Mean squared distance; far-off parts weigh more."),
+    (
+        "geometry.normal_consistency",
+        "Normal consistency",
+        "",
+        "{:.3f}",
+        "Agreement of surface directions. 1 is identical.",
+    ),
+    ("geometry.iou", "Volume IoU", "", "{:.3f}", "Overlap of the volumes. 1 is identical."),
+)
+SPLIT_TITLES = {"novel_view": "New views", "novel_pose": "New poses"}
+LONG_LIST = 12
+
+
+def write_report(
+    inputs: EvaluationInputs,
+    settings: EvaluationSettings,
+    truth: GroundTruth | None,
+    true_meshes: dict[int, trimesh.Trimesh],
+    found: dict[str, Any],
+    out: Path,
+) -> None:
+    """Write `report.html` and its charts into `out`, from the renderings and meshes there and the stages' reports."""
+    stages = stage_reports(inputs)
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["readable"] = readable
+    environment.tests["rows"] = is_rows
+    page = environment.get_template("report.html").render(
+        capture=inputs.capture,
+        size_px=image_sizes(inputs),
+        split_titles=SPLIT_TITLES,
+        found=found,
+        summary=summary(found),
+        galleries=galleries(inputs, settings, truth, true_meshes, found, out),
+        training_charts=training_charts(inputs.training_folder / "history.jsonl", out),
+        frame_charts=frame_charts(found, out),
+        rig_picture=png_uri(inputs.calibration_folder / "cameras.png"),
+        stages=stages,
+        costs=costs(stages, found),
+        notes=notes(inputs, found),
+    )
+    (out / "report.html").write_text(page, encoding="utf-8")
+
+
+def stage_reports(inputs: EvaluationInputs) -> dict[str, dict[str, Any]]:
+    """What each earlier stage said about itself; an empty dict where it left no report."""
+    folders = {
+        "Calibration": inputs.calibration_folder,
+        "Segmentation": inputs.segmentation_folder,
+        "Body fit": inputs.fit_folder,
+        "Training": inputs.training_folder,
+    }
+    paths = {name: folder / "report.json" for name, folder in folders.items()}
+    return {name: json.loads(path.read_text()) if path.exists() else {} for name, path in paths.items()}
+
+
+def image_sizes(inputs: EvaluationInputs) -> str:
+    """The distinct image sizes, like "256 × 256"."""
+    sizes = {(camera.width_px, camera.height_px) for camera in inputs.capture.cameras.values()}
+    return ", ".join(f"{width} × {height}" for width, height in sorted(sizes))
+
+
+def summary(found: dict[str, Any]) -> list[dict[str, Any]]:
+    """One row a figure: name, unit, meaning, and the value of each split ("–" where there is none)."""
+    rows = []
+    for key, name, unit, form, meaning in FIGURES:
+        values = [_pick(found[split], key) for split in SPLITS]
+        shown = ["–" if value is None else form.format(value) for value in values]
+        rows.append({"name": name, "unit": unit, "meaning": meaning, "values": shown})
+    return rows
+
+
+def _pick(scores: dict[str, Any], key: str) -> float | None:
+    value: Any = scores
+    for part in key.split("."):
+        value = None if value is None else value[part]
+    return value
+
+
+def galleries(
+    inputs: EvaluationInputs,
+    settings: EvaluationSettings,
+    truth: GroundTruth | None,
+    true_meshes: dict[int, trimesh.Trimesh],
+    found: dict[str, Any],
+    out: Path,
+) -> list[Gallery]:
+    """Training views, then a gallery for each split that has images, then the surfaces."""
+    made = []
+    for split in (TRAINING_VIEW, *SPLITS):
+        views = dict.fromkeys(some_views(inputs.capture, split, settings.report_rows), "")
+        if split in SPLITS and found[split]["per_image"]:
+            worst = min(found[split]["per_image"], key=lambda score: score["psnr"])
+            views[View(split, worst["camera"], worst["frame"])] = f"the worst of this split, {worst['psnr']:.1f} dB"
+        rows = [view_row(view, read_rgb(view.path(out)), inputs, truth, note) for view, note in views.items()]
+        if rows:
+            made.append(Gallery(*_gallery_words(split, inputs), rows))
+    return [*made, surface_gallery(inputs, true_meshes, out)]
+
+
+def _gallery_words(split: str, inputs: EvaluationInputs) -> tuple[str, str]:
+    if split == TRAINING_VIEW:
+        return "Training views", "What training saw: how well the avatar explains its own data. No test."
+    if split == "novel_view":
+        return "New views", "Frames that training saw, from cameras that it never saw."
+    if inputs.capture.test_cameras:
+        return "New poses", "Frames that training never saw, from cameras that it never saw."
+    return "New poses", "Frames that training never saw, from the training cameras: the capture has no test camera."
+
+
+def surface_gallery(inputs: EvaluationInputs, true_meshes: dict[int, trimesh.Trimesh], out: Path) -> Gallery:
+    """The first mesh of the training frames and of the novel-pose frames, front and back."""
+    frames = sorted(int(path.stem) for path in (out / "meshes").glob("*.ply"))
+    capture, body, rows = inputs.capture, inputs.avatar.body, []
+    for members, note in ((capture.train_frames, "training pose"), (capture.novel_pose_frames, "new pose")):
+        for frame in [f for f in frames if f in members][:1]:
+            mesh = trimesh.load_mesh(out / "meshes" / f"{frame:06d}.ply", process=False)
+            root = body.root[body.index(frame)].cpu().numpy()
+            rows.append(surface_row(frame, mesh, true_meshes.get(frame), root, note))
+    return Gallery("Surface", "The zero surface of the signed distance, without colour.", rows)
+
+
+def training_charts(history_path: Path, out: Path) -> list[Picture]:
+    """Losses and held-out quality over training time, as far as the history has them."""
+    history = [json.loads(line) for line in history_path.read_text().splitlines()] if history_path.exists() else []
+    drawn = {
+        "Losses": (out / "losses.png", charts.loss_chart(history, out / "losses.png")),
+        "Held-out quality": (out / "quality.png", charts.quality_chart(history, out / "quality.png")),
+    }
+    return [Picture(title, png_uri(path)) for title, (path, exists) in drawn.items() if exists]
+
+
+def frame_charts(found: dict[str, Any], out: Path) -> list[Picture]:
+    """PSNR frame by frame of every split that was scored."""
+    paths = {split: out / f"psnr_{split}.png" for split in SPLITS}
+    scored = [split for split in SPLITS if charts.frame_chart(found[split]["per_image"], paths[split])]
+    return [Picture(f"{SPLIT_TITLES[split]}, frame by frame", png_uri(paths[split])) for split in scored]
+
+
+def png_uri(path: Path) -> str:
+    """A PNG file as a data: address; empty where there is none."""
+    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode() if path.exists() else ""
+
+
+def costs(stages: dict[str, dict[str, Any]], found: dict[str, Any]) -> list[tuple[str, str]]:
+    """What it took: seconds of each stage that recorded them, memory, size, time of one image."""
+    rows = [(f"{name}, seconds", readable(report["seconds"])) for name, report in stages.items() if "seconds" in report]
+    rows += [(f"Evaluation: {name}, seconds", readable(seconds)) for name, seconds in found["seconds"].items()]
+    rows.append(("One image, seconds (median)", readable(found["seconds_per_image"])))
+    training = stages["Training"]
+    sizes = ("device", "processes", "steps", "peak_memory_gib", "parameters", "model_mib")
+    return rows + [(key.replace("_", " ").capitalize(), readable(training[key])) for key in sizes if key in training]
+
+
+def notes(inputs: EvaluationInputs, found: dict[str, Any]) -> list[str]:
+    """What is missing or must be kept in mind when the figures are read."""
+    lines = [f"LPIPS is {found['lpips']}."]
+    for split in SPLITS:
+        scores, title = found[split], SPLIT_TITLES[split]
+        if "reason" in scores:
+            lines.append(f"{title}: no image figures, since {scores['reason']}.")
+        if "geometry_reason" in scores:
+            lines.append(f"{title}: no surface figures, since {scores['geometry_reason']}.")
+        if MASKED_IMAGE in scores.get("reference", ""):
+            lines.append(f"{title}: compared to photographs under the true mask, whose edge pixels hold background.")
+        if scores.get("without_person"):
+            lines.append(f"{title}: {scores['without_person']} images do not show the person and are not scored.")
+    if not inputs.capture.test_cameras:
+        lines.append("Without a test camera nothing here measures a new viewpoint; training views are shown instead.")
+    return lines
+
+
+def is_rows(value: Any) -> bool:
+    """Whether values are dicts of plain values: rows of a table."""
+    if not isinstance(value, Collection) or isinstance(value, str | Mapping) or not value:
+        return False
+    return all(isinstance(row, dict) and not any(isinstance(cell, dict) for cell in row.values()) for row in value)
+
+
+def readable(value: Any) -> str:
+    """A scalar, or a list of scalars, in few characters."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list | tuple):
+        flat = list(_leaves(value))
+        if len(flat) > LONG_LIST and all(isinstance(v, int | float) for v in flat):
+            return f"{len(flat)} values from {readable(min(flat))} to {readable(max(flat))}"
+        return ", ".join(readable(v) for v in value) or "none"
+    return str(value)
+
+
+def _leaves(value: Any) -> Iterator[Any]:
+    if isinstance(value, list | tuple):
+        for inner in value:
+            yield from _leaves(inner)
+    else:
+        yield value

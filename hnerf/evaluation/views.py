@@ -1,0 +1,58 @@
+"""Which images of a capture are rendered, under which split, and where they lie."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hnerf.capture.capture import Capture
+
+SPLITS = ("novel_view", "novel_pose")
+TRAINING_VIEW = "training_view"  # shown in the report, never scored
+
+
+@dataclass(frozen=True)
+class View:
+    """One image of a split."""
+
+    split: str
+    camera: str
+    frame: int
+
+    def path(self, out: Path) -> Path:
+        """Its rendering below the evaluation folder."""
+        return out / "renders" / self.split / self.camera / f"{self.frame:06d}.png"
+
+
+def split_frames(capture: Capture, split: str) -> tuple[int, ...]:
+    """The frames whose poses a split is about; novel_view and the training views are about the training frames."""
+    return capture.novel_pose_frames if split == "novel_pose" else capture.train_frames
+
+
+def split_cameras(capture: Capture, split: str) -> tuple[str, ...]:
+    """The cameras a split is seen from: test cameras; where there are none, new poses from the training cameras."""
+    if split == TRAINING_VIEW or (split == "novel_pose" and not capture.test_cameras):
+        return capture.train_cameras
+    return capture.test_cameras
+
+
+def all_views(capture: Capture, split: str) -> list[View]:
+    """Every image of a split."""
+    return [View(split, c, f) for c in split_cameras(capture, split) for f in split_frames(capture, split)]
+
+
+def some_views(capture: Capture, split: str, count: int) -> list[View]:
+    """At most `count` images of a split: frames spread over the recording, the cameras in turn."""
+    cameras = split_cameras(capture, split)
+    if not cameras:
+        return []
+    frames = spread(split_frames(capture, split), count)
+    return [View(split, cameras[k % len(cameras)], frame) for k, frame in enumerate(frames)]
+
+
+def spread(frames: Sequence[int], count: int) -> list[int]:
+    """At most `count` of the frames, evenly spread, the first and the last among them."""
+    if len(frames) <= count:
+        return list(frames)
+    return [frames[k] for k in np.linspace(0, len(frames) - 1, count).round().astype(int)]

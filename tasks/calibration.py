@@ -1,0 +1,23 @@
+"""Stage 2: which cameras can be trusted."""
+
+from pathlib import Path
+
+from hnerf.calibration.check import check_calibration, load_cameras
+from hnerf.capture.capture import Capture
+from hnerf.config import CalibrationSettings
+from tasks.stage import stage
+from tasks.store import Artifact
+
+
+@stage("calibration", version="1")
+def calibrate(out: Path, recording: Artifact, settings: CalibrationSettings) -> dict[str, float]:
+    """Check the cameras against what they saw; leave those to be used from here on."""
+    report = check_calibration(Capture.load(recording.root), settings)
+    report.save(out)
+    medians_px = [verdict.median_px for verdict in report.verdicts.values() if verdict.median_px is not None]
+    return {"worst_median_px": max(medians_px)} if medians_px else {}
+
+
+def calibrated(recording: Artifact, calibration: Artifact) -> Capture:
+    """The recording seen through the cameras that the calibration left."""
+    return load_cameras(calibration.root, Capture.load(recording.root))

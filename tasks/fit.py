@@ -1,0 +1,23 @@
+"""Stage 4: the body model, posed."""
+
+import json
+from pathlib import Path
+
+from hnerf.body.fit import fit_body
+from hnerf.config import FitSettings
+from hnerf.segmentation.segment import Masks
+from tasks.calibration import calibrated
+from tasks.stage import stage
+from tasks.store import Artifact
+
+
+@stage("fit", version="1")
+def fit(
+    out: Path, recording: Artifact, calibration: Artifact, segmentation: Artifact | None, settings: FitSettings
+) -> dict[str, float]:
+    """One shape and a pose a frame, from keypoints, and from contours where there are masks."""
+    masks = Masks.load(segmentation.root) if segmentation else None
+    body, report = fit_body(calibrated(recording, calibration), masks, settings)
+    body.save(out)
+    (out / "report.json").write_text(json.dumps(report, indent=1))
+    return {}

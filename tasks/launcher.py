@@ -1,0 +1,100 @@
+"""Run a module in several processes under torchrun, none of which outlives the caller."""
+
+import ctypes
+import logging
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from hnerf.errors import CaptureError
+
+BAD_INPUT = 2  # exit code of a rank that met a CaptureError, whose message is its last line on stderr
+GRACE_S = 40  # torchrun gives its ranks 30 s to end before it kills them
+LAST_LINES = 20
+RANK_LINE = re.compile(r"^\[default\d+\]:")
+FAILURE = re.compile(r"failed \(exitcode: (-?\d+)\) local_rank: (\d+)")
+PR_SET_PDEATHSIG = 1  # linux/prctl.h
+_libc = ctypes.CDLL(None)
+
+
+class LostWorkerError(RuntimeError):
+    """A rank was killed from outside (out of memory, a lost machine): worth another try."""
+
+
+def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
+    """`python -m module arguments` in `processes` processes; their lines go to its logger as they come.
+
+    Raises CaptureError if a rank ends with BAD_INPUT, LostWorkerError if one was killed, RuntimeError with the last
+    lines of the first failing rank otherwise. All ranks end with the caller, however he ends: torchrun hears of his
+    death by signal, and takes its ranks along.
+    """
+    with TemporaryDirectory(prefix="hnerf-ranks-") as logs:
+        command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
+        command += ["--tee=3", f"--log-dir={logs}", "-m", module, *arguments]
+        agent = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            env=_environment(processes),
+            start_new_session=True,
+            preexec_fn=_end_with_parent,
+        )
+        try:
+            failure = _follow(agent, logging.getLogger(module))
+        except BaseException:
+            _stop(agent)
+            raise
+        if agent.returncode:
+            raise _error(module, Path(logs), failure)
+
+
+def _environment(processes: int) -> dict[str, str]:
+    """The cores shared out evenly among the ranks, unless the user has said otherwise."""
+    threads = max(1, len(os.sched_getaffinity(0)) // processes)
+    return {"OMP_NUM_THREADS": str(threads), **os.environ}
+
+
+def _end_with_parent() -> None:
+    _libc.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def _follow(agent: "subprocess.Popen[str]", log: logging.Logger) -> re.Match[str] | None:
+    """Log the ranks' lines until all have ended; torchrun's word on the first failure, if there was one."""
+    failure = None
+    assert agent.stdout is not None
+    for line in agent.stdout:
+        failure = failure or FAILURE.search(line)
+        level = logging.INFO if RANK_LINE.match(line) else logging.DEBUG
+        log.log(level, "%s", RANK_LINE.sub("", line.rstrip()))
+    agent.wait()
+    return failure
+
+
+def _stop(agent: "subprocess.Popen[str]") -> None:
+    """Let torchrun end its ranks; kill it if it does not."""
+    agent.terminate()
+    try:
+        agent.wait(timeout=GRACE_S)
+    except subprocess.TimeoutExpired:
+        os.killpg(agent.pid, signal.SIGKILL)
+        agent.wait()
+
+
+def _error(module: str, logs: Path, failure: re.Match[str] | None) -> Exception:
+    if failure is None:
+        return RuntimeError(f"{module}: torchrun did not start")
+    code, rank = int(failure[1]), failure[2]
+    written = [path.read_text(errors="replace") for path in logs.glob(f"*/attempt_0/{rank}/stderr.log")]
+    lines = "".join(written).strip().splitlines()[-LAST_LINES:]
+    if code == BAD_INPUT and lines:
+        return CaptureError(lines[-1])
+    if code < 0:
+        return LostWorkerError(f"{module}: rank {rank} was killed by {signal.Signals(-code).name}")
+    return RuntimeError("\n".join([f"{module}: rank {rank} ended with exit code {code}", *lines]))

@@ -1,0 +1,57 @@
+"""A capture folder as somebody else wrote it, and the digests of its bytes."""
+
+import hashlib
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from hnerf.errors import CaptureError
+from tasks.store import sha256_of
+
+GROUND_TRUTH = "ground_truth"
+
+
+class Source(BaseModel):
+    """Part of the capture folder `root`. `name` is the folder's own; `digest` the SHA-256 of the part's file names and
+    bytes, wherever the folder lies."""
+
+    root: Path
+    name: str
+    digest: str
+
+
+def read_capture(folder: Path) -> tuple[Source, Source]:
+    """What was recorded, and what is known to be true of it: all files but those of `ground_truth/`, and only those.
+
+    Hidden files do not count. A symbolic link counts as the text it holds: what it points at is either in the folder
+    itself or none of ours. Raises CaptureError if there is no such folder.
+    """
+    folder = folder.resolve()
+    if not folder.is_dir():
+        raise CaptureError(f"{folder}: no such folder; give the capture's folder")
+    truth = folder / GROUND_TRUTH
+    files = capture_files(folder)
+    parts = [f for f in files if not f.is_relative_to(truth)], [f for f in files if f.is_relative_to(truth)]
+    recorded, known = (Source(root=folder, name=folder.name, digest=_digest(folder, part)) for part in parts)
+    return recorded, known
+
+
+def capture_files(folder: Path) -> list[Path]:
+    """The files and symbolic links in a capture folder, sorted; no hidden ones, no devices."""
+    found = []
+    for parent, folders, files in os.walk(folder):
+        links = [name for name in folders if (Path(parent) / name).is_symlink()]
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        paths = [Path(parent) / name for name in files + links if not name.startswith(".")]
+        found += [path for path in paths if path.is_symlink() or path.is_file()]
+    return sorted(found)
+
+
+def _digest(folder: Path, files: Iterable[Path]) -> str:
+    listing = hashlib.sha256()
+    for path in files:
+        content = os.readlink(path) if path.is_symlink() else sha256_of(path)
+        listing.update(f"{content} {path.relative_to(folder)}\n".encode())
+    return listing.hexdigest()

@@ -1,0 +1,56 @@
+"""What every stage's task has in common."""
+
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Concatenate, Generic, ParamSpec
+
+from prefect import Task
+from prefect.context import FlowRunContext
+from prefect.tasks import exponential_backoff
+
+from tasks.policy import Input, StorePolicy, is_transient, stage_key
+from tasks.store import Artifact, Store
+
+P = ParamSpec("P")
+Write = Callable[Concatenate[Path, P], dict[str, float]]
+
+
+class Stage(Generic[P]):
+    """A function `write(out, inputs...)` that fills a folder, made into a cached task.
+
+    Called as `stage(store, inputs...)`: within a flow run it is a Prefect task run; outside it is the same work through
+    the same store, without a server.
+    """
+
+    def __init__(self, write: Write[P], name: str, version: str, resumable: bool):
+        self.write, self.name, self.version, self.resumable = write, name, version, resumable
+        self.task: Task[..., Artifact] = Task(
+            fn=self._run,
+            name=name,
+            description=write.__doc__,
+            version=version,
+            cache_policy=StorePolicy(),
+            persist_result=True,
+            result_serializer="json",
+            cache_result_in_memory=False,
+            retries=3,
+            retry_delay_seconds=exponential_backoff(backoff_factor=10),
+            retry_jitter_factor=0.5,
+            retry_condition_fn=is_transient,
+        )
+
+    def __call__(self, store: Store, *args: P.args, **kwargs: P.kwargs) -> Artifact:
+        _, *parameters = inspect.signature(self.write).parameters.values()
+        inputs = inspect.Signature(parameters).bind(*args, **kwargs).arguments
+        run = self.task if FlowRunContext.get() else self.task.fn
+        return run(store=store, inputs=dict(inputs))
+
+    def _run(self, store: Store, inputs: dict[str, Input]) -> Artifact:
+        key = stage_key(self.name, self.version, inputs)
+        return store.obtain(self.name, key, lambda out: self.write(out, **inputs), self.resumable)  # type: ignore[call-arg, arg-type]
+
+
+def stage(name: str, version: str, resumable: bool = False) -> Callable[[Write[P]], Stage[P]]:
+    """Decorator: artifacts lie under `<store>/<name>/`; raise `version` when the same inputs give another result."""
+    return lambda write: Stage(write, name, version, resumable)

@@ -1,0 +1,171 @@
+"""The artifact store: what a stage made, under the key of what it was made from.
+
+    <store>/<stage>/<key>/          the files, put there by one rename
+    <store>/<stage>/<key>.json      the record: each file's SHA-256 and size, and a few figures
+    <store>/<stage>/<key>.partial/  work in progress
+    <store>/<stage>/<key>.lock      held (flock) while somebody works on the key; the kernel lets go when he dies
+    <store>/subjects/<name>/<stage> -> the latest artifact of a subject
+
+The store alone decides what need not be done again; Prefect's record of a task run is a view of it (tasks/policy.py).
+"""
+
+import fcntl
+import hashlib
+import json
+import logging
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import BaseModel
+
+from hnerf.errors import CaptureError
+
+log = logging.getLogger("hnerf.store")
+
+
+class StoredFile(BaseModel):
+    """What a file must be for the artifact to be whole."""
+
+    sha256: str
+    size_bytes: int
+
+
+class Artifact(BaseModel):
+    """One stage's finished work. `files` by path relative to `root`; `metrics` are the few figures worth a glance."""
+
+    stage: str
+    root: Path
+    files: dict[str, StoredFile]
+    metrics: dict[str, float] = {}
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the files' names and bytes: what later stages' keys depend on."""
+        listing = "".join(f"{file.sha256} {name}\n" for name, file in sorted(self.files.items()))
+        return hashlib.sha256(listing.encode()).hexdigest()
+
+    def damaged_file(self) -> Path | None:
+        """The first recorded file that is missing or has changed, or None."""
+        for name, file in self.files.items():
+            path = self.root / name
+            if not path.is_file() or path.stat().st_size != file.size_bytes or sha256_of(path) != file.sha256:
+                return path
+        return None
+
+
+@dataclass(frozen=True)
+class Store:
+    """A folder of artifacts, shared by any number of processes."""
+
+    root: Path
+
+    def find(self, stage: str, key: str) -> Artifact | None:
+        """The artifact if it is recorded and whole, else None."""
+        record, folder = self._path(stage, key, ".json"), self._path(stage, key)
+        try:
+            artifact = Artifact.model_validate({"root": folder, **json.loads(record.read_bytes())})
+            damaged = artifact.damaged_file()
+        except FileNotFoundError:
+            return None
+        except ValueError:
+            damaged = record
+        if damaged is None:
+            return artifact
+        log.warning("%s is damaged or gone: %s will be computed again", damaged, stage)
+        return None
+
+    def obtain(
+        self, stage: str, key: str, write: Callable[[Path], dict[str, float]], resumable: bool = False
+    ) -> Artifact:
+        """The artifact, found, or else made by `write(folder)`, which returns its figures.
+
+        Of several callers at once one does the work and the others wait for it. The folder of a resumable stage
+        outlives a crash, for the next call to go on in; any other starts empty.
+        """
+        partial = self._path(stage, key, ".partial")
+        with self._locked(stage, key):
+            found = self.find(stage, key)
+            if found:
+                return found
+            if not resumable:
+                shutil.rmtree(partial, ignore_errors=True)
+            partial.mkdir(parents=True, exist_ok=True)
+            try:
+                metrics = write(partial)
+            except BaseException as error:
+                if not resumable or isinstance(error, CaptureError):
+                    shutil.rmtree(partial)
+                raise
+            return self._commit(stage, key, metrics)
+
+    def show(self, subject: str, artifact: Artifact) -> Artifact:
+        """Point `<store>/subjects/<subject>/<stage>` at the artifact; returns it."""
+        if subject in ("", ".", "..") or "/" in subject:
+            raise CaptureError(f"capture.toml: name {subject!r} cannot be a folder's name; choose another")
+        link = self.subject_folder(subject) / artifact.stage
+        link.parent.mkdir(parents=True, exist_ok=True)
+        beside = link.with_name(f".{artifact.stage}.{os.getpid()}")
+        beside.unlink(missing_ok=True)
+        beside.symlink_to(os.path.relpath(artifact.root, link.parent))
+        os.replace(beside, link)
+        return artifact
+
+    def subject_folder(self, subject: str) -> Path:
+        """Where a subject's latest artifacts are linked."""
+        return self.root / "subjects" / subject
+
+    def _path(self, stage: str, key: str, suffix: str = "") -> Path:
+        return self.root / stage / f"{key}{suffix}"
+
+    @contextmanager
+    def _locked(self, stage: str, key: str) -> Iterator[None]:
+        path = self._path(stage, key, ".lock")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                log.info("waiting for another run that is working on %s %s", stage, key)
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            yield
+
+    def _commit(self, stage: str, key: str, metrics: dict[str, float]) -> Artifact:
+        partial, folder, record = (self._path(stage, key, suffix) for suffix in (".partial", "", ".json"))
+        paths = sorted(partial.rglob("*"))
+        sizes_bytes = {path: _flush(path) for path in [partial, *paths]}
+        files = {
+            str(path.relative_to(partial)): StoredFile(sha256=sha256_of(path), size_bytes=sizes_bytes[path])
+            for path in paths
+            if path.is_file()
+        }
+        record.unlink(missing_ok=True)
+        shutil.rmtree(folder, ignore_errors=True)
+        os.replace(partial, folder)
+        _flush(folder.parent)
+        artifact = Artifact(stage=stage, root=folder, files=files, metrics=metrics)
+        beside = self._path(stage, key, ".json.partial")
+        beside.write_text(artifact.model_dump_json(indent=1, exclude={"root"}))
+        _flush(beside)
+        os.replace(beside, record)
+        _flush(folder.parent)
+        return artifact
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file's bytes, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _flush(path: Path) -> int:
+    """fsync a file or folder; returns its size in bytes."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+        return os.fstat(descriptor).st_size
+    finally:
+        os.close(descriptor)

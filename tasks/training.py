@@ -1,0 +1,35 @@
+"""Stage 5: the radiance field and the clothed surface."""
+
+import json
+from pathlib import Path
+
+import torch
+
+from hnerf.config import TrainingSettings
+from hnerf.render.avatar import Avatar
+from hnerf.training.model import load_avatar
+from tasks.launcher import run_ranks
+from tasks.stage import stage
+from tasks.store import Artifact
+
+
+@stage("training", version="1", resumable=True)
+def train(
+    out: Path,
+    recording: Artifact,
+    calibration: Artifact,
+    segmentation: Artifact,
+    body: Artifact,
+    settings: TrainingSettings,
+) -> dict[str, float]:
+    """Train on one GPU a process; goes on from the checkpoint of a run that was interrupted."""
+    inputs = [str(artifact.root) for artifact in (recording, calibration, segmentation, body)]
+    processes = settings.processes or max(1, torch.cuda.device_count())
+    run_ranks("hnerf.training.run", [*inputs, settings.model_dump_json(), str(out)], processes)
+    report = json.loads((out / "report.json").read_text())
+    return {name: report[name] for name in ("steps", "seconds", "peak_memory_gib", "model_mib")}
+
+
+def trained(training: Artifact) -> Avatar:
+    """The trained person, on the GPU where there is one."""
+    return load_avatar(training.root, "cuda" if torch.cuda.is_available() else "cpu")

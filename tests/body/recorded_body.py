@@ -1,0 +1,68 @@
+"""A naked body of known shape and pose, recorded without error: keypoints and masks in a ring of cameras."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from hnerf.body.anny import ADULT, BETA_NAMES, anny_rig
+from hnerf.body.fit_result import BodyFit
+from hnerf.body.rig import rotation_from_axis_angle
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+from hnerf.render.silhouette import silhouette
+
+
+@dataclass(frozen=True)
+class Silhouettes:
+    """Masks of the training cameras; another camera's is never asked for."""
+
+    capture: Capture
+    body: BodyFit
+
+    def get(self, camera: str, frame: int) -> np.ndarray:
+        assert camera in self.capture.train_cameras
+        vertices_m = self.body.vertices_m()[self.body.index(frame)].numpy()
+        return silhouette(self.capture.cameras[camera], vertices_m, self.body.rig.faces.numpy())
+
+
+def ring_camera(name: str, angle: float, size_px: int = 256) -> Camera:
+    """3 m from the origin, 1 m high, looking level at the axis."""
+    forward = -np.array([np.cos(angle), np.sin(angle), 0])
+    R = np.stack([np.cross(forward, [0, 0, 1]), [0, 0, -1], forward])
+    K = np.array([[size_px * 1.1, 0, size_px / 2], [0, size_px * 1.1, size_px / 2], [0, 0, 1]])
+    return Camera(name, K, R, -R @ np.array([*(-3 * forward[:2]), 1.0]), size_px, size_px)
+
+
+def moving_body(frames: tuple[int, ...]) -> BodyFit:
+    """A tall, slim person with long shins who swings arms and legs, feet near z = 0."""
+    beta = torch.tensor(ADULT)
+    for name, value in (("height", 0.55), ("weight", 0.4), ("measure-lowerleg-height", 0.3), ("hip-scale-horiz", -0.3)):
+        beta[BETA_NAMES.index(name)] = value
+    rig = anny_rig(beta)
+    theta = torch.zeros(len(frames), len(rig.joints_m), 3)
+    for i in range(len(frames)):
+        swing = 0.3 * np.sin(i * 0.5)
+        for name, turn in (("upperarm01.L", -0.3 - swing), ("upperarm01.R", -0.3 + swing), ("upperleg01.L", swing)):
+            theta[i, rig.joint_names.index(name), 0] = turn
+        theta[i, rig.joint_names.index("lowerleg01.R"), 0] = 0.4 + swing
+        theta[i, rig.joint_names.index("spine03"), 2] = swing / 2
+    root = torch.eye(4).repeat(len(frames), 1, 1)
+    root[:, :3, :3] = rotation_from_axis_angle(torch.tensor([0.0, 0.05, 0.6]))
+    root[:, 2, 3] = -rig.vertices_m[:, 2].min()
+    root[:, 0, 3] = torch.linspace(0, 0.1, len(frames))
+    return BodyFit(rig, frames, theta, root)
+
+
+def record(root: Path, body: BodyFit, cameras: dict[str, Camera], train: tuple[str, ...]) -> Capture:
+    """Exact keypoints of all cameras; test cameras get nonsense, which nothing may read."""
+    keypoints_m = (body.rig.keypoint_weights @ body.vertices_m()).double().numpy()
+    stored = {}
+    for name, camera in cameras.items():
+        pixels = camera.project(keypoints_m)[0] if name in train else np.full((*keypoints_m.shape[:2], 2), 1e5)
+        stored[name] = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], -1)[:, None]
+    np.savez(root / "keypoints.npz", **stored)  # type: ignore[arg-type]
+    sizes = {name: (camera.width_px, camera.height_px) for name, camera in cameras.items()}
+    test = tuple(name for name in cameras if name not in train)
+    return Capture("body", root, cameras, train, test, body.frames, (), 25.0, "z", sizes, sizes)

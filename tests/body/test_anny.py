@@ -1,0 +1,67 @@
+import torch
+
+from hnerf.body.anny import ADULT, BETA_NAMES, anny_rig
+from hnerf.body.rig import pose_vertices
+
+
+def test_the_average_adult_is_a_watertight_person() -> None:
+    rig = anny_rig()
+    edges = torch.cat([rig.faces[:, [0, 1]], rig.faces[:, [1, 2]], rig.faces[:, [2, 0]]])
+    _, counts = edges.sort(1).values.unique(dim=0, return_counts=True)
+    assert (counts == 2).all()
+    height_m = float(rig.vertices_m[:, 2].max() - rig.vertices_m[:, 2].min())
+    assert 1.6 < height_m < 1.9
+    torch.testing.assert_close(rig.skin_weights.sum(1), torch.ones(len(rig.vertices_m)))
+    torch.testing.assert_close(rig.keypoint_weights.sum(1), torch.ones(25))
+
+
+def test_keypoints_lie_where_a_body_25_detector_sees_them() -> None:
+    """anny faces -Y with Z up, so its left is at +X: nose in front, ankles below knees, left wrist on the left."""
+    rig = anny_rig()
+    nose, right_wrist, left_wrist = ((rig.keypoint_weights @ rig.vertices_m)[k] for k in (0, 4, 7))
+    left_knee, left_ankle, left_heel = ((rig.keypoint_weights @ rig.vertices_m)[k] for k in (13, 14, 21))
+    assert nose[1] < -0.1 and abs(float(nose[0])) < 0.01
+    assert left_wrist[0] > 0.3 and right_wrist[0] < -0.3
+    assert left_heel[2] < left_ankle[2] < left_knee[2] - 0.3
+
+
+def test_the_shape_basis_is_the_derivative_of_the_rig() -> None:
+    """Away from the anchors of anny's piecewise shape space, by central differences of 1e-2."""
+    beta = torch.tensor(ADULT) + 0.1
+    rig = anny_rig(beta)
+    for k in (0, 4, BETA_NAMES.index("measure-upperleg-height"), BETA_NAMES.index("l-foot-scale+r-foot-scale")):
+        step = torch.zeros_like(beta)
+        step[k] = 0.01
+        above, below = anny_rig(beta + step), anny_rig(beta - step)
+        torch.testing.assert_close((above.vertices_m - below.vertices_m) / 0.02, rig.shape_basis[k], atol=2e-3, rtol=0)
+        torch.testing.assert_close((above.joints_m - below.joints_m) / 0.02, rig.joint_basis[k], atol=2e-3, rtol=0)
+
+
+def test_local_changes_are_linear_with_no_kink_at_zero() -> None:
+    step = torch.zeros(len(ADULT))
+    step[BETA_NAMES.index("measure-lowerleg-height")] = 0.5
+    middle = torch.tensor(ADULT)
+    up, at, down = (anny_rig(beta).vertices_m for beta in (middle + step, middle, middle - step))
+    torch.testing.assert_close(up - at, at - down, atol=1e-5, rtol=0)
+    assert float((up - at).abs().max()) > 0.02
+
+
+def test_shape_values_are_held_to_their_range() -> None:
+    assert torch.equal(anny_rig(torch.full((28,), 2.0)).beta, torch.ones(28))
+    assert anny_rig(torch.full((28,), -2.0)).beta.tolist() == [0.0] * 6 + [-1.0] * 22
+
+
+def test_a_bent_elbow_brings_the_hand_to_the_shoulder_without_moving_the_rest() -> None:
+    rig = anny_rig()
+    theta = torch.zeros(104, 3)
+    elbow, wrist = rig.joint_names.index("lowerarm01.L"), rig.joint_names.index("wrist.L")
+    upper = rig.joints_m[elbow] - rig.joints_m[rig.joint_names.index("upperarm01.L")]
+    lower = rig.joints_m[wrist] - rig.joints_m[elbow]
+    axis = torch.linalg.cross(upper, lower)
+    theta[elbow] = 1.5 * axis / axis.norm()
+    moved = (pose_vertices(rig, theta, torch.eye(4)) - rig.vertices_m).norm(dim=1)
+    hand = (rig.skin_joints == wrist).any(1) & (
+        rig.skin_weights.argmax(1) == (rig.skin_joints == wrist).int().argmax(1)
+    )
+    assert float(moved[hand].min()) > 0.2
+    assert float(moved[rig.vertices_m[:, 0] < 0].max()) < 1e-5

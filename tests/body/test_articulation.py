@@ -1,0 +1,101 @@
+import dataclasses
+import math
+
+import torch
+
+from hnerf.body.anny import ADULT, anny_rig
+from hnerf.body.articulation import Articulation, Pose, left_jacobian, with_offsets
+from hnerf.body.rig import Rig, pose_vertices, rotation_from_axis_angle
+from tests.body.two_bone import two_bone_rig
+
+
+def random_pose(rig: Rig, frames: int) -> Pose:
+    generator = torch.Generator().manual_seed(1)
+    theta = 0.4 * torch.randn(frames, len(rig.joints_m), 3, generator=generator, dtype=torch.float64)
+    theta[:, ~rig.free] = 0
+    root = torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1)
+    root[:, :3, :3] = rotation_from_axis_angle(torch.randn(frames, 3, generator=generator, dtype=torch.float64))
+    root[:, :3, 3] = torch.randn(frames, 3, generator=generator, dtype=torch.float64)
+    return Pose(rig, theta, root, 0.01 * torch.randn(25, 3, generator=generator, dtype=torch.float64))
+
+
+def numeric_jacobian(pose: Pose, points: torch.Tensor) -> torch.Tensor:
+    """(n, P, 3, U) of vertices, by central differences through the plain rig."""
+    articulation, columns = Articulation(pose.rig), []
+    for u in range(articulation.unknowns):
+        step = torch.zeros(len(pose.theta), articulation.unknowns, dtype=torch.float64)
+        step[:, u] = 1e-5
+        ends = [articulation.moved(pose, sign * step) for sign in (1, -1)]
+        above, below = (pose_vertices(end.rig, end.theta, end.root)[:, points] for end in ends)
+        columns.append((above - below) / 2e-5)
+    return torch.stack(columns, -1)
+
+
+def test_locked_joints_ride_on_their_ancestor() -> None:
+    articulation = Articulation(two_bone_rig())
+    assert articulation.joints.tolist() == [0, 1] and articulation.unknowns == 9
+    expected = [[1.0, 0], [0.5, 0.5], [0, 1], [0, 1], [0, 1]]
+    assert articulation.vertex_weights.tolist() == expected
+    assert articulation.below.tolist() == [[1, 1], [0, 1]]
+
+
+def test_left_jacobian_turns_a_change_of_the_vector_into_a_rotation() -> None:
+    vector, change = torch.tensor([0.4, -0.9, 1.3], dtype=torch.float64), torch.tensor([2e-6, 1e-6, -3e-6])
+    exact = rotation_from_axis_angle(vector + change)
+    turned = rotation_from_axis_angle(left_jacobian(vector) @ change.double()) @ rotation_from_axis_angle(vector)
+    torch.testing.assert_close(turned, exact, atol=1e-10, rtol=0)
+    torch.testing.assert_close(left_jacobian(torch.zeros(3, dtype=torch.float64)), torch.eye(3, dtype=torch.float64))
+
+
+def test_vertices_and_their_derivatives_agree_with_the_plain_rig() -> None:
+    rig = anny_rig(torch.tensor(ADULT) + 0.05).to(dtype=torch.float64)
+    pose, articulation = random_pose(rig, 2), Articulation(rig)
+    joints = articulation.pose(pose)
+    vertices = pose_vertices(rig, pose.theta, pose.root)
+    by_shape = (pose_vertices(rig, pose.theta, pose.root, rig.beta + 0.1) - vertices) / 0.1  # exact: beta acts linearly
+    ids = torch.arange(0, len(rig.vertices_m), 331)
+    numeric = numeric_jacobian(pose, ids)
+    torch.testing.assert_close(articulation.surface(joints, 1), vertices[1])
+    for axis, direction in enumerate(torch.eye(3, dtype=torch.float64)):
+        rows, shape = articulation.along(ids, direction.expand(len(ids), 3), joints, 1)
+        torch.testing.assert_close(rows, numeric[1, :, axis], atol=1e-6, rtol=0)
+        torch.testing.assert_close(shape.sum(1), by_shape[1, ids, axis], atol=1e-8, rtol=0)
+
+
+def test_keypoints_and_their_derivatives_agree_with_the_plain_rig() -> None:
+    rig = anny_rig(torch.tensor(ADULT) + 0.05).to(dtype=torch.float64)
+    pose, articulation = random_pose(rig, 2), Articulation(rig)
+    vertices = pose_vertices(rig, pose.theta, pose.root)
+    moved = pose_vertices(rig, pose.theta, pose.root, rig.beta + 0.1)
+    keypoints, by_frame, by_shape = articulation.jacobian(articulation.keypoints(), articulation.pose(pose))
+    torch.testing.assert_close(keypoints, rig.keypoint_weights @ vertices)
+    torch.testing.assert_close(by_shape.sum(-1), rig.keypoint_weights @ (moved - vertices) / 0.1, atol=1e-8, rtol=0)
+    wrist = rig.keypoint_weights[4]
+    used = wrist.nonzero()[:, 0]
+    numeric = torch.einsum("v,nvcu->ncu", wrist[used], numeric_jacobian(pose, used))
+    torch.testing.assert_close(by_frame[:, 4], numeric, atol=1e-6, rtol=0)
+
+
+def test_an_offset_turns_with_its_bone() -> None:
+    """v2 hangs on the elbow; bent a quarter turn about y, an offset along z points along x."""
+    rig = two_bone_rig()
+    offsets = torch.zeros(25, 3, dtype=torch.float64)
+    offsets[2, 2] = 0.25
+    theta = torch.zeros(1, 3, 3, dtype=torch.float64)
+    theta[0, 1, 1] = math.pi / 2
+    pose = Pose(rig, theta, torch.eye(4, dtype=torch.float64)[None], offsets)
+    articulation = Articulation(rig)
+    points = with_offsets(articulation.keypoints(), offsets)
+    where = articulation.jacobian(points, articulation.pose(pose))[0][0]
+    torch.testing.assert_close(where[2], torch.tensor([0.75, 0, 1.0], dtype=torch.float64))
+    torch.testing.assert_close(where[7], torch.tensor([0.5, 0, 1.0], dtype=torch.float64))  # the same vertex, no offset
+
+
+def test_the_root_turns_about_its_joint_and_only_moves_as_told() -> None:
+    rig = dataclasses.replace(two_bone_rig(), joints_m=two_bone_rig().joints_m + torch.tensor([0, 0, 1.0]))
+    pose = random_pose(rig, 1)
+    articulation = Articulation(rig)
+    before = articulation.pose(pose).positions_m[0, 0]
+    step = torch.tensor([[0.1, 0.2, 0.3, 0.5, -0.4, 0.6, 0, 0, 0]], dtype=torch.float64)
+    after = articulation.pose(articulation.moved(pose, step)).positions_m[0, 0]
+    torch.testing.assert_close(after - before, step[0, :3])

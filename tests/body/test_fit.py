@@ -1,0 +1,102 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hnerf.body.articulation import Articulation
+from hnerf.body.fit import fit_body
+from hnerf.body.fit_result import BodyFit
+from hnerf.body.keypoint_fit import Likely, Problem, metres_per_pixel
+from hnerf.body.observations import observe, runs
+from hnerf.body.pose_prior import Smoothness
+from hnerf.body.rig import Rig, joint_transforms
+from hnerf.config import FitSettings
+from hnerf.errors import CaptureError
+from tests.body.recorded_body import Silhouettes, moving_body, record, ring_camera
+from tests.body.test_articulation import random_pose
+from tests.body.two_bone import two_bone_rig
+
+RING = {str(k): ring_camera(str(k), 0.3 + k * np.pi / 2) for k in range(4)} | {"test": ring_camera("test", 1.0)}
+
+
+def joint_error_m(a: BodyFit, b: BodyFit) -> torch.Tensor:
+    """(n, free joints) distances."""
+    where = [joint_transforms(body.rig, body.rig.joints_m, body.theta, body.root)[..., :3, 3] for body in (a, b)]
+    return (where[0] - where[1]).norm(dim=-1)[:, a.rig.free]
+
+
+def test_four_cameras_recover_pose_and_shape(tmp_path: Path) -> None:
+    truth = moving_body((0, 1, 2))
+    capture = record(tmp_path, truth, RING, ("0", "1", "2", "3"))
+    fit, report = fit_body(capture, Silhouettes(capture, truth), FitSettings(contour_steps=6))  # type: ignore[arg-type]
+    error_m = joint_error_m(fit, truth)
+    assert error_m.mean() < 0.012 and error_m.max() < 0.04
+    assert (fit.vertices_m() - truth.vertices_m()).norm(dim=-1).mean() < 0.012
+    assert min(report["silhouette_iou"]) > 0.94 and report["poor_frames"] == []
+    assert max(report["keypoint_residual_px"]) < 2
+    assert abs(report["stature_m"] - float(np.ptp(truth.rig.vertices_m[:, 2].numpy()))) < 0.02
+    assert fit.frames == (0, 1, 2) and not fit.theta[:, ~fit.rig.free].any()
+
+
+def test_one_camera_finds_the_depth(tmp_path: Path) -> None:
+    truth = moving_body((0, 1, 2, 3))
+    capture = record(tmp_path, truth, RING, ("0",))
+    fit, _ = fit_body(capture, Silhouettes(capture, truth), FitSettings(contour_steps=6))  # type: ignore[arg-type]
+    assert joint_error_m(fit, truth).mean() < 0.06
+
+
+def test_keypoints_alone_seed_a_segmentation(tmp_path: Path) -> None:
+    truth = moving_body((0, 1))
+    capture = record(tmp_path, truth, RING, ("0", "1", "2", "3"))
+    fit, report = fit_body(capture, None, FitSettings())
+    assert joint_error_m(fit, truth).mean() < 0.03
+    assert report["silhouette_iou"] is None and "outlines" not in report["seconds"]
+
+
+def test_a_person_seen_by_too_few_cameras_is_bad_input(tmp_path: Path) -> None:
+    capture = record(tmp_path, moving_body((0, 1, 2)), RING, ("0", "1"))
+    with np.load(tmp_path / "keypoints.npz") as stored:
+        keypoints = dict(stored)
+    keypoints["1"][1:, ..., 2] = 0
+    np.savez(tmp_path / "keypoints.npz", **keypoints)
+    with pytest.raises(CaptureError, match=r"keypoints.npz: shoulders and hips .* in only 1 of 3 frames"):
+        fit_body(capture, None, FitSettings())
+    (tmp_path / "keypoints.npz").unlink()
+    with pytest.raises(CaptureError, match=r"no keypoints"):
+        fit_body(capture, None, FitSettings())
+
+
+def test_runs_break_at_gaps_and_between_splits(tmp_path: Path) -> None:
+    capture = record(tmp_path, moving_body((0, 1, 2, 5, 6)), RING, ("0",))
+    assert runs(capture) == [(0, 1, 2), (5, 6)]
+
+
+def test_the_normal_equations_hold_the_gradient_of_the_cost(tmp_path: Path) -> None:
+    """Along a random direction through poses, shape and offsets, by central differences."""
+    capture = record(tmp_path, moving_body((0, 1, 2)), RING, ("0", "1"))
+    rig, seen = two_bone_rig(), observe(capture)
+
+    def reshape(beta: torch.Tensor) -> Rig:
+        vertices_m, joints_m = rig.shaped(beta)
+        return replace(rig, beta=beta, vertices_m=vertices_m, joints_m=joints_m)
+
+    pose, one = random_pose(rig, 3), torch.ones(1, dtype=torch.float64)
+    likely = Likely(0.02, 0.5, 0.02, 2.0, 0.1, 0 * one, one, -9 * one, 9 * one)
+    rough = Smoothness([(0, 1, 2)], 25.0, np.full(25, 1e9))
+    problem = Problem(seen, metres_per_pixel(seen.cameras, pose), likely, rough, reshape)
+    generator = torch.Generator().manual_seed(0)
+    frame, shared = (torch.randn(*shape, generator=generator, dtype=torch.float64) for shape in ((3, 9), (76,)))
+    ends = []
+    for step in (1e-6, -1e-6):
+        end = Articulation(rig).moved(pose, step * frame)
+        offsets_m = pose.offsets_m + step * shared[1:].reshape(25, 3)
+        ends.append(replace(end, rig=reshape(rig.beta + step * shared[:1]), offsets_m=offsets_m))
+    for inform in (problem.in_space, problem.in_images):
+        _, equations = problem.assemble(pose, inform)
+        slope = float((equations.frame_gradient * frame.numpy()).sum() + equations.shared_gradient @ shared.numpy())
+        above, below = (problem.assemble(end, inform)[0] for end in ends)
+        np.testing.assert_allclose(
+            slope, (above - below) / 2e-6, rtol=5e-3
+        )  # the prior's axes, which turn with the shape, are held

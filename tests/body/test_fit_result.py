@@ -1,0 +1,27 @@
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from hnerf.body.fit_result import BodyFit
+from tests.body.two_bone import two_bone_rig
+
+
+def test_what_was_saved_is_loaded_and_keeps_the_contract(tmp_path: Path) -> None:
+    rig = two_bone_rig().to(dtype=torch.float32)
+    theta = torch.zeros(2, 3, 3)
+    theta[1, 1, 1] = torch.pi / 2
+    root = torch.eye(4).repeat(2, 1, 1)
+    root[:, 0, 3] = 5
+    BodyFit(rig, (3, 7), theta, root).save(tmp_path)
+    loaded = BodyFit.load(tmp_path)
+    assert loaded.frames == (3, 7) and loaded.index(7) == 1
+    assert torch.equal(loaded.theta, theta) and torch.equal(loaded.root, root)
+    with np.load(tmp_path / "body.npz", allow_pickle=False) as stored:
+        assert set(stored) == {"theta", "T", "beta", "frames", "vertices", "faces", "joints", "joint_names"}
+        np.testing.assert_allclose(
+            stored["joints"][:, 2], [[5, 0, 2], [6, 0, 1]], atol=1e-6
+        )  # the tip, straight and bent
+        np.testing.assert_allclose(stored["vertices"][1, 3], [6.5, 0, 1], atol=1e-6)
+        assert stored["joint_names"].tolist() == ["root", "elbow", "tip"]
+        np.testing.assert_allclose(stored["beta"], [0.3])

@@ -1,0 +1,54 @@
+import cv2
+import numpy as np
+
+from hnerf.body.anny import anny_rig
+from hnerf.body.initial_root import kabsch, root_from_image, root_from_space
+from hnerf.capture.camera import Camera
+
+
+def rest_keypoints() -> np.ndarray:
+    rig = anny_rig()
+    return (rig.keypoint_weights @ rig.vertices_m).double().numpy()
+
+
+def turned(x_m: float, about_z: float) -> np.ndarray:
+    transform = np.eye(4)
+    transform[:3, :3] = cv2.Rodrigues(np.array([0.05, -0.1, about_z]))[0]
+    transform[0, 3] = x_m
+    return transform
+
+
+def test_kabsch_finds_a_quarter_turn() -> None:
+    source = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]])
+    target = source @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]]) + (7, 8, 9)  # x to y, y to -x
+    expected = np.array([[0, -1, 0, 7], [1, 0, 0, 8], [0, 0, 1, 9], [0, 0, 0, 1.0]])
+    np.testing.assert_allclose(kabsch(source, target), expected, atol=1e-12)
+
+
+def test_kabsch_never_mirrors() -> None:
+    source = np.random.default_rng(0).normal(size=(5, 3))
+    assert np.linalg.det(kabsch(source, source * (1, 1, -1))[:3, :3]) > 0
+
+
+def test_shoulders_and_hips_place_the_body_in_space() -> None:
+    rest, root = rest_keypoints(), turned(2.0, 1.3)
+    points = rest @ root[:3, :3].T + root[:3, 3]
+    points[4] = np.nan  # a wrist does not matter
+    found = root_from_space(rest, points)
+    assert found is not None
+    np.testing.assert_allclose(found, root, atol=1e-9)
+    points[9] = np.nan  # a hip does
+    assert root_from_space(rest, points) is None
+
+
+def test_one_image_places_the_body_facing_the_right_way() -> None:
+    rest = rest_keypoints()
+    camera = Camera("a", np.array([[500.0, 0, 255], [0, 500, 255], [0, 0, 1]]),
+                    np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.array([0, 0, 3.0]), 512, 512)  # fmt: skip
+    for angle in (0.0, 1.5, 3.0, 4.5):
+        root = turned(0.3, angle)
+        pixels = camera.project(rest @ root[:3, :3].T + root[:3, 3])[0]
+        found = root_from_image(camera, rest, np.column_stack([pixels, np.ones(25)]))
+        assert found is not None
+        np.testing.assert_allclose(found, root, atol=1e-4)
+    assert root_from_image(camera, rest, np.zeros((25, 3))) is None

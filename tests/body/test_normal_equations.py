@@ -1,0 +1,61 @@
+import numpy as np
+
+from hnerf.body.normal_equations import NormalEquations
+
+
+def random_problem(frames: int, unknowns: int, shared: int) -> tuple[NormalEquations, np.ndarray, np.ndarray]:
+    """The banded form, the dense matrix and the dense gradient of the same random least squares."""
+    generator = np.random.default_rng(0)
+    size = frames * unknowns
+    jacobian = np.zeros((frames * 40, size + shared))
+    for t in range(frames):  # each row touches three neighbouring frames at most
+        low, high = t * unknowns, min(t + 3, frames) * unknowns
+        jacobian[t * 40 : (t + 1) * 40, low:high] = generator.normal(size=(40, high - low))
+    jacobian[:, size:] = generator.normal(size=(len(jacobian), shared))
+    dense, gradient = jacobian.T @ jacobian, jacobian.T @ generator.normal(size=len(jacobian))
+    equations = NormalEquations(frames, unknowns, shared)
+    blocks = dense[:size, :size].reshape(frames, unknowns, frames, unknowns).swapaxes(1, 2)
+    for k in range(3):
+        for t in range(frames - k):
+            equations.frame[k][t] = blocks[t, t + k]
+    equations.border[:] = dense[:size, size:].reshape(frames, unknowns, shared)
+    equations.shared[:] = dense[size:, size:]
+    equations.frame_gradient[:], equations.shared_gradient[:] = gradient[:size].reshape(frames, -1), gradient[size:]
+    return equations, dense, gradient
+
+
+def free(count: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.full(count, -np.inf), np.full(count, np.inf)
+
+
+def test_the_banded_step_is_the_dense_one() -> None:
+    equations, dense, gradient = random_problem(6, 4, 3)
+    frame, shared = equations.step(0.0, *free(3))
+    np.testing.assert_allclose(np.append(frame, shared), -np.linalg.solve(dense, gradient), atol=1e-10)
+
+
+def test_damping_adds_to_the_diagonal_what_does_not_couple_frames() -> None:
+    equations, dense, gradient = random_problem(4, 2, 2)
+    equations.coupling_diagonal[:] = 5.0
+    frame, shared = equations.step(0.5, *free(2))
+    coupling = np.append(np.full(8, 5.0), [0, 0])
+    damped = dense + 0.5 * np.diag(np.diag(dense) - coupling)
+    np.testing.assert_allclose(np.append(frame, shared), -np.linalg.solve(damped, gradient), atol=1e-10)
+
+
+def test_a_single_frame_needs_no_neighbours() -> None:
+    equations, dense, gradient = random_problem(1, 4, 2)
+    frame, shared = equations.step(0.0, *free(2))
+    np.testing.assert_allclose(np.append(frame, shared), -np.linalg.solve(dense, gradient), atol=1e-10)
+
+
+def test_a_shared_unknown_stops_at_its_bound_and_the_others_make_the_best_of_it() -> None:
+    equations, dense, gradient = random_problem(4, 2, 2)
+    wanted = -np.linalg.solve(dense, gradient)[-2]
+    low, high = (np.array([wanted / 2, -np.inf]), np.array([np.inf, np.inf])) if wanted < 0 else (
+        np.array([-np.inf, -np.inf]), np.array([wanted / 2, np.inf]))  # fmt: skip
+    frame, shared = equations.step(0.0, low, high)
+    np.testing.assert_allclose(shared[0], wanted / 2)
+    rest = np.delete(np.arange(10), 8)
+    best = np.linalg.solve(dense[np.ix_(rest, rest)], -gradient[rest] - dense[rest, 8] * wanted / 2)
+    np.testing.assert_allclose(np.append(frame, shared[1]), best, atol=1e-10)

@@ -1,0 +1,119 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from hnerf.body.anny import anny_rig
+from hnerf.body.articulation import Articulation, Pose
+from hnerf.body.normal_equations import NormalEquations
+from hnerf.body.pose_prior import PosePrior, Smoothness
+from tests.body.test_articulation import random_pose
+from tests.body.two_bone import two_bone_rig
+
+
+def resting(articulation: Articulation) -> Pose:
+    joints = len(articulation.rig.joints_m)
+    root = torch.eye(4, dtype=torch.float64)[None]
+    theta = torch.zeros(1, joints, 3, dtype=torch.float64)
+    theta[:, articulation.joints[1:]] = PosePrior(articulation).likely()
+    return Pose(articulation.rig, theta, root, torch.zeros(25, 3, dtype=torch.float64))
+
+
+def cost_of(articulation: Articulation, pose: Pose) -> float:
+    return PosePrior(articulation).add(NormalEquations(len(pose.theta), articulation.unknowns, 0), pose)
+
+
+def test_the_likeliest_pose_costs_nothing() -> None:
+    articulation = Articulation(anny_rig().to(dtype=torch.float64))
+    assert cost_of(articulation, resting(articulation)) < 1e-12
+
+
+def test_one_standard_deviation_of_flexion_costs_one_half() -> None:
+    """A foot's flexion is about left-right, square to the foot, with a spread of 20 degrees."""
+    articulation = Articulation(anny_rig().to(dtype=torch.float64))
+    pose, prior = resting(articulation), PosePrior(articulation)
+    foot = articulation.joints[1:].tolist().index(articulation.rig.joint_names.index("foot.L"))
+    pose.theta[0, articulation.joints[1 + foot]] += math.radians(20) * prior.axes[foot, 0]
+    assert math.isclose(cost_of(articulation, pose), 0.5, rel_tol=1e-9)
+
+
+def test_knees_do_not_bend_backwards_and_arms_do_not_swing_behind() -> None:
+    """Half the free range forwards is cheap; the same backwards meets the limit of 2 degrees' softness."""
+    articulation = Articulation(anny_rig().to(dtype=torch.float64))
+    prior = PosePrior(articulation)
+    names = [articulation.rig.joint_names[int(j)] for j in articulation.joints[1:]]
+    for name, forwards in (("lowerleg01.L", 1), ("lowerarm01.R", 1), ("upperarm01.R", -1)):
+        m = names.index(name)
+        costs = []
+        for sign in (forwards, -forwards):
+            pose = resting(articulation)
+            pose.theta[0, articulation.joints[1 + m]] = sign * math.radians(75) * prior.axes[m, 0]
+            costs.append(cost_of(articulation, pose))
+        assert costs[0] < 2 and costs[1] > 20, name
+
+
+def test_hinges_fold_the_limb() -> None:
+    """Turning an elbow by positive flexion brings the wrist nearer to the shoulder."""
+    articulation = Articulation(anny_rig().to(dtype=torch.float64))
+    rig, prior = articulation.rig, PosePrior(articulation)
+    names = [rig.joint_names[int(j)] for j in articulation.joints[1:]]
+    for hinge, above, below in (
+        ("lowerarm01.L", "upperarm01.L", "wrist.L"),
+        ("lowerleg01.R", "upperleg01.R", "foot.R"),
+    ):
+        ends = [articulation.joints.tolist().index(rig.joint_names.index(name)) for name in (above, below)]
+        lengths = []
+        for angle in (0.0, 1.0):
+            pose = resting(articulation)
+            pose.theta[0, rig.joint_names.index(hinge)] = angle * prior.axes[names.index(hinge), 0]
+            where = articulation.pose(pose).positions_m[0, ends]
+            lengths.append(float((where[0] - where[1]).norm()))
+        assert lengths[1] < lengths[0] - 0.05, hinge
+
+
+def test_the_gradient_is_that_of_the_cost() -> None:
+    rig = anny_rig().to(dtype=torch.float64)
+    articulation, pose = Articulation(rig), random_pose(rig, 2)
+    equations = NormalEquations(2, articulation.unknowns, 0)
+    PosePrior(articulation).add(equations, pose)
+    direction = torch.randn(2, articulation.unknowns, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    ends = [cost_of(articulation, articulation.moved(pose, sign * 1e-6 * direction)) for sign in (1, -1)]
+    np.testing.assert_allclose(
+        (equations.frame_gradient * direction.numpy()).sum(), (ends[0] - ends[1]) / 2e-6, rtol=1e-5
+    )
+
+
+def test_constant_velocity_is_free_and_a_jerk_costs_its_square() -> None:
+    """At 10 frames a second, 5 mm off a straight line is a second difference of -10 mm: 1 m/s^2, one sigma of 1 m/s^2.
+    Geman-McClure with 3 sigma: half of 1 / (1 + 1/9) for each of 25 keypoints."""
+    smoothness = Smoothness([(0, 1, 2)], 10.0, np.ones(25))
+    x = torch.zeros(3, 25, 3, dtype=torch.float64)
+    x[:, :, 0] = torch.tensor([0.0, 0.1, 0.2])[:, None]
+    jacobian = torch.zeros(3, 25, 3, 9, dtype=torch.float64)
+    assert smoothness.add(NormalEquations(3, 9, 0), x, jacobian) < 1e-20
+    x[1, :, 0] += 0.005
+    assert math.isclose(smoothness.add(NormalEquations(3, 9, 0), x, jacobian), 25 * 0.5 * 0.9, rel_tol=1e-6)
+
+
+def test_smoothness_does_not_reach_across_runs_of_frames() -> None:
+    smoothness = Smoothness([(0, 1), (5, 6)], 10.0, np.ones(25))
+    x = torch.randn(4, 25, 3, dtype=torch.float64)
+    assert smoothness.add(NormalEquations(4, 9, 0), x, torch.zeros(4, 25, 3, 9, dtype=torch.float64)) == 0
+
+
+def test_smoothness_adds_the_blocks_of_its_own_jacobian() -> None:
+    """Against the dense J^T W J of the second differences, small enough that the robust weight is one."""
+    rig = two_bone_rig()
+    articulation, pose = Articulation(rig), random_pose(rig, 4)
+    pose = replace(pose, theta=1e-6 * pose.theta, root=torch.eye(4, dtype=torch.float64).repeat(4, 1, 1))
+    x, by_frame, _ = articulation.jacobian(articulation.keypoints(), articulation.pose(pose))
+    equations = NormalEquations(4, 9, 0)
+    Smoothness([(0, 1, 2, 3)], 1.0, np.full(25, 2.0)).add(equations, x, by_frame)
+    second = np.array([[1, -2, 1, 0], [0, 1, -2, 1.0]])
+    j = by_frame.flatten(1, 2).numpy()
+    for k in range(3):
+        for t in range(4 - k):
+            expected = (second.T @ second)[t, t + k] * j[t].T @ j[t + k] / 4
+            np.testing.assert_allclose(equations.frame[k][t], expected, atol=1e-6)
+    np.testing.assert_allclose(equations.coupling_diagonal, np.einsum("nuu->nu", equations.frame[0]))

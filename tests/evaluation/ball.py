@@ -1,0 +1,140 @@
+"""A made-up subject: a ball that a stand-in avatar shows in one colour, before cameras that look at it from around."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.body.rig import Rig
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+from hnerf.evaluation.inputs import EvaluationInputs
+from hnerf.render.avatar import Rendering
+from hnerf.segmentation.masks import Masks, encode
+
+RADIUS_M = 0.1
+SIZE_PX = 64
+FRAMES = (0, 1, 2, 3)  # the last for new poses
+NOVEL = (3,)
+RENDERED, PHOTOGRAPHED = 102, 153  # grey levels, of 255
+
+
+@dataclass(frozen=True)
+class BallAvatar:
+    """The ball in grey; its distance is exact."""
+
+    body: BodyFit
+
+    def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
+        alpha = torch.from_numpy(seen(camera, root[:3, 3].numpy())).float()
+        return Rendering(alpha[..., None].expand(-1, -1, 3) * RENDERED / 255, alpha, alpha)
+
+    def signed_distance(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+        return (points_m - root[:3, 3]).norm(dim=1) - RADIUS_M
+
+    def colour(self, points_m: Tensor, directions: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+        raise NotImplementedError
+
+
+def centre_m(frame: int) -> np.ndarray:
+    """Where the ball is in a frame."""
+    return np.array([0.01 * frame, 0.0, 1.0])
+
+
+def seen(camera: Camera, middle_m: np.ndarray) -> np.ndarray:
+    """(H, W) bool: the pixels whose rays meet the ball."""
+    pixels = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), -1)
+    origins, directions = camera.rays(pixels.astype(np.float64))
+    offset = np.cross(middle_m - origins, directions)
+    return np.linalg.norm(offset, axis=-1) < RADIUS_M
+
+
+def ball_camera(name: str, turn_deg: float) -> Camera:
+    """A camera 0.75 m off, at the ball's height, that looks at (0, 0, 1)."""
+    angle = np.deg2rad(turn_deg)
+    forward = np.array([-np.cos(angle), -np.sin(angle), 0])
+    down = np.array([0, 0, -1.0])
+    R = np.stack([np.cross(down, forward), down, forward])
+    K = np.array([[80.0, 0, 31.5], [0, 80, 31.5], [0, 0, 1]])
+    return Camera(name, K, R, -R @ (np.array([0, 0, 1]) - 0.75 * forward), SIZE_PX, SIZE_PX)
+
+
+def ball_fit() -> BodyFit:
+    """The ball as a body of one joint."""
+    ball = trimesh.creation.icosphere(3, RADIUS_M)
+    count = len(ball.vertices)
+    rig = Rig(
+        vertices_m=torch.tensor(ball.vertices, dtype=torch.float32),
+        faces=torch.tensor(ball.faces, dtype=torch.long),
+        uvs=torch.zeros(1, 2),
+        face_uvs=torch.zeros(len(ball.faces), 3, dtype=torch.long),
+        joints_m=torch.zeros(1, 3),
+        joint_names=("root",),
+        parents=torch.tensor([-1]),
+        beta=torch.zeros(0),
+        beta_names=(),
+        shape_basis=torch.zeros(0, count, 3),
+        joint_basis=torch.zeros(0, 1, 3),
+        skin_joints=torch.zeros(count, 1, dtype=torch.long),
+        skin_weights=torch.ones(count, 1),
+        free=torch.zeros(1, dtype=torch.bool),
+        keypoint_weights=torch.zeros(25, count),
+    )
+    root = torch.eye(4).repeat(len(FRAMES), 1, 1)
+    root[:, :3, 3] = torch.tensor(np.stack([centre_m(f) for f in FRAMES]), dtype=torch.float32)
+    return BodyFit(rig, FRAMES, torch.zeros(len(FRAMES), 1, 3), root)
+
+
+def write_ball_capture(folder: Path, name: str, test_cameras: tuple[str, ...]) -> Capture:
+    """A ball photographed by "a", "b" and the test cameras, before grey, and `capture.toml` as recordings have it."""
+    names = ("a", "b", *test_cameras)
+    cameras = {n: ball_camera(n, 80.0 * k) for k, n in enumerate(names)}
+    sizes = dict.fromkeys(names, (SIZE_PX, SIZE_PX))
+    capture = Capture(name, folder, cameras, ("a", "b"), test_cameras, FRAMES[:-1], NOVEL, 10.0, "z", sizes, sizes)
+    for camera in cameras.values():
+        for frame in FRAMES:
+            image = np.where(seen(camera, centre_m(frame)), PHOTOGRAPHED, 60).astype(np.uint8)
+            _write(folder / "images" / camera.name / f"{frame:06d}.png", image)
+    (folder / "capture.toml").write_text(
+        f"[cameras]\ntrain = ['a', 'b']\ntest = {list(test_cameras)}\n"
+        f"[frames]\ntrain = {list(FRAMES[:-1])}\nnovel_pose = {list(NOVEL)}\n"
+    )
+    return capture
+
+
+def write_ball_truth(capture: Capture, radius_m: float) -> None:
+    """`ground_truth/` with exact masks of every view, and a true surface of another radius for frame 0."""
+    for camera in capture.cameras.values():
+        for frame in FRAMES:
+            mask = seen(camera, centre_m(frame)).astype(np.uint8) * 255
+            _write(capture.root / "ground_truth" / "masks" / camera.name / f"{frame:06d}.png", mask)
+    ball = trimesh.creation.icosphere(5, radius_m)
+    vertices = (ball.vertices + centre_m(0))[None].astype(np.float32)
+    path = capture.root / "ground_truth" / "meshes.npz"
+    np.savez(path, faces=ball.faces, vertices=vertices, frames=np.array([0]))
+
+
+def ball_inputs(capture: Capture, stages: Path) -> EvaluationInputs:
+    """Everything before evaluation; `stages` has a folder of each earlier stage."""
+    fit = ball_fit()
+    folders = {f"{name}_folder": stages / name for name in ("calibration", "segmentation", "fit", "training")}
+    for folder in folders.values():
+        folder.mkdir(parents=True)
+    return EvaluationInputs(
+        capture_folder=capture.root,
+        capture=capture,
+        masks=Masks({(n, f): encode(seen(capture.cameras[n], centre_m(f))) for n in ("a", "b") for f in FRAMES}, {}),
+        fitted=fit,
+        avatar=BallAvatar(fit),
+        **folders,
+    )
+
+
+def _write(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), image)

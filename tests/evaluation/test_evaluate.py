@@ -1,0 +1,197 @@
+"""The whole of evaluation on a made-up subject whose figures are known, and against the independent scoring program."""
+
+import json
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from hnerf.config import EvaluationSettings
+from hnerf.evaluation.evaluate import evaluate, mesh_frames
+from hnerf.evaluation.geometry import score_geometry
+from hnerf.evaluation.metrics import mask_box
+from tests.evaluation.ball import (
+    PHOTOGRAPHED,
+    RADIUS_M,
+    RENDERED,
+    ball_camera,
+    ball_inputs,
+    centre_m,
+    seen,
+    write_ball_capture,
+    write_ball_truth,
+)
+
+SCORE_RUN = Path(__file__).parents[2].parent / "shared" / "accept" / "score_run.py"
+GAP_M = 0.01
+Scored = tuple[Path, dict[str, Any]]
+TEST_CAMERA = ball_camera("c", 160.0)
+HOSTILE = "<script>alert(1)</script>"
+
+
+@pytest.fixture(scope="module")
+def scored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
+    """A subject with ground truth and one test camera: its evaluation lies beside its capture."""
+    base = tmp_path_factory.mktemp("scored")
+    capture = write_ball_capture(base / "capture", "ball", ("c",))
+    write_ball_truth(capture, RADIUS_M + GAP_M)
+    inputs = ball_inputs(capture, base / "stages")
+    history = [{"step": k, "seconds": 2.0 * k, "losses": {"rec": 0.1}, "held_out": {"psnr": 20.0 + k}} for k in (0, 1)]
+    (inputs.training_folder / "history.jsonl").write_text("\n".join(map(json.dumps, history)))
+    (inputs.training_folder / "report.json").write_text(json.dumps({"device": "a processor", "seconds": 12.5}))
+    cameras = {"a": {"status": "ok", "median_px": 0.5}, "b": {"status": "rejected", "median_px": 9.25}}
+    (inputs.calibration_folder / "report.json").write_text(json.dumps({"cameras": cameras, "notes": [HOSTILE]}))
+    out = base / "subject" / "evaluation"
+    out.mkdir(parents=True)
+    return base, evaluate(inputs, EvaluationSettings(max_meshes=1, report_rows=2), out)
+
+
+@pytest.fixture(scope="module")
+def unscored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
+    """A subject without ground truth and without test cameras, whose name is markup."""
+    base = tmp_path_factory.mktemp("unscored")
+    inputs = ball_inputs(write_ball_capture(base / "capture", HOSTILE, ()), base / "stages")
+    out = base / "evaluation"
+    out.mkdir()
+    return out, evaluate(inputs, EvaluationSettings(max_meshes=1, report_rows=1), out)
+
+
+def test_image_figures_by_hand(scored: Scored) -> None:
+    base, found = scored
+    psnr = []
+    for frame in (0, 1, 2):
+        mask = seen(TEST_CAMERA, centre_m(frame))
+        error = mask[mask_box(mask)].mean() * ((PHOTOGRAPHED - RENDERED) / 255) ** 2
+        psnr.append(-10 * np.log10(error))
+    assert found["novel_view"]["psnr"] == pytest.approx(np.mean(psnr), abs=1e-4)
+    assert found["novel_view"]["mask_iou"] == 1.0
+    assert [found[split]["n"] for split in ("novel_view", "novel_pose")] == [3, 1]
+    assert found["novel_view"]["reference"] == "image x ground-truth mask"
+    assert found == json.loads((base / "subject" / "evaluation" / "metrics.json").read_text())
+
+
+def test_geometry_figures_by_hand(scored: Scored) -> None:
+    geometry = scored[1]["novel_view"]["geometry"]
+    assert geometry["chamfer_mm"] == pytest.approx(1e3 * GAP_M, rel=0.01)
+    assert geometry["chamfer_l2_e3"] == pytest.approx(1e3 * GAP_M**2, rel=0.02)
+    assert geometry["iou"] == pytest.approx((RADIUS_M / (RADIUS_M + GAP_M)) ** 3, abs=0.005)
+    assert geometry["normal_consistency"] > 0.999
+    assert geometry["watertight"] == 1 and geometry["n"] == 1 and geometry["frames"] == [0]
+    assert scored[1]["novel_pose"]["geometry"] is None  # no true surface in its frame
+
+
+def test_renderings_and_meshes_lie_where_the_contract_says(scored: Scored) -> None:
+    out = scored[0] / "subject" / "evaluation"
+    written = {str(p.relative_to(out)) for p in out.rglob("*") if p.suffix in (".png", ".ply") and p.parent != out}
+    assert {p for p in written if "training_view" not in p} == {
+        *(f"renders/novel_view/c/{f:06d}.png" for f in (0, 1, 2)),
+        "renders/novel_pose/c/000003.png",
+        "meshes/000000.ply",
+        "meshes/000003.ply",
+    }
+    image = cv2.imread(str(out / "renders/novel_view/c/000001.png"), cv2.IMREAD_UNCHANGED)
+    assert image is not None and image.shape == (64, 64, 3) and image.dtype == np.uint8
+    assert np.array_equal(image[..., 0], seen(TEST_CAMERA, centre_m(1)) * RENDERED)
+
+
+def test_figures_agree_with_the_independent_program(scored: Scored) -> None:
+    if not SCORE_RUN.exists():
+        pytest.skip("the independent scoring program is not beside this checkout")
+    base, found = scored
+    command = [sys.executable, str(SCORE_RUN), str(base / "subject"), str(base / "capture")]
+    theirs = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    for split in ("novel_view", "novel_pose"):
+        for name in ("n", "psnr", "ssim", "mask_iou"):
+            assert found[split][name] == pytest.approx(theirs[split][name], rel=1e-6), (split, name)
+    predicted = trimesh.load_mesh(base / "subject" / "evaluation" / "meshes" / "000000.ply", process=False)
+    stored = np.load(base / "capture" / "ground_truth" / "meshes.npz")
+    truth = trimesh.Trimesh(stored["vertices"][0], stored["faces"], process=False)
+    ours = score_geometry(predicted, truth, np.random.default_rng(0), samples=30000, nodes=80)  # as that program does
+    for name in ("chamfer_l2_e3", "chamfer_mm", "normal_consistency", "iou", "watertight"):
+        assert getattr(ours, name) == pytest.approx(theirs["novel_view"]["geometry"][name], rel=1e-6), name
+
+
+def test_without_truth_figures_are_null_with_a_reason(unscored: Scored) -> None:
+    _, found = unscored
+    assert found["novel_view"]["psnr"] is None and "no test cameras" in found["novel_view"]["reason"]
+    assert found["novel_pose"]["psnr"] is None and "no ground-truth masks" in found["novel_pose"]["reason"]
+    assert found["novel_pose"]["geometry"] is None
+    assert "no ground-truth surface" in found["novel_pose"]["geometry_reason"]
+
+
+def test_without_test_cameras_no_training_image_is_a_new_view(unscored: Scored) -> None:
+    renders = unscored[0] / "renders"
+    assert sorted(p.name for p in renders.iterdir()) == ["novel_pose", "training_view"]
+    assert sorted(p.parent.name for p in (renders / "novel_pose").rglob("*.png")) == ["a", "b"]
+
+
+class _Page(HTMLParser):
+    """Headings, and everything that a browser would load or run."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.headings: list[str] = []
+        self.loaded: list[str] = []
+        self.tags: set[str] = set()
+        self._in_heading = False
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self._in_heading = tag == "h2"
+        self.loaded += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data", "poster")]
+
+    def handle_data(self, data: str) -> None:
+        if self._in_heading:
+            self.headings.append(data)
+            self._in_heading = False
+
+
+def test_report_has_every_section_and_loads_nothing(scored: Scored) -> None:
+    text = (scored[0] / "subject" / "evaluation" / "report.html").read_text()
+    page = _Page(text)
+    galleries = ["Training views", "New views", "New poses", "Surface"]
+    assert page.headings == ["Summary", *galleries, "Training", "Findings", "Cost", "Notes"]
+    assert all(address.startswith(("data:image/", "#")) for address in page.loaded)
+    assert not page.tags & {"script", "link", "iframe", "object"}
+    assert "://" not in text and "@import" not in text and not re.search(r"url\(", text)
+
+
+def test_report_shows_figures_findings_and_charts(scored: Scored) -> None:
+    base, found = scored
+    text = (base / "subject" / "evaluation" / "report.html").read_text()
+    assert f"{found['novel_view']['psnr']:.2f}" in text
+    assert '<span class="status rejected">' in text and "9.25" in text
+    assert "a processor" in text and "12.5" in text
+    assert 'alt="Losses"' in text and 'alt="Held-out quality"' in text
+    assert "LPIPS is not available" in text
+    views, surfaces = ("Input", "Mask", "Fitted body", "Render", "Ground truth", "Error"), ("Surface", "Distance")
+    for caption in (*views, *(f"{s}, {side}" for s in surfaces for side in ("front", "back"))):
+        assert f'alt="{caption}"' in text, caption
+
+
+def test_report_escapes_what_captures_say(scored: Scored, unscored: Scored) -> None:
+    assert "&lt;script&gt;alert(1)" in (unscored[0] / "report.html").read_text()
+    assert "&lt;script&gt;alert(1)" in (scored[0] / "subject" / "evaluation" / "report.html").read_text()
+    assert "script" not in _Page((unscored[0] / "report.html").read_text()).tags
+
+
+def test_report_without_truth_says_so(unscored: Scored) -> None:
+    text = (unscored[0] / "report.html").read_text()
+    assert "the capture has no ground-truth masks" in text and "training views are shown instead" in text
+    assert 'alt="Ground truth"' not in text and 'alt="Input × mask"' in text
+    assert "No history was recorded" in text
+
+
+def test_mesh_frames_are_spread_over_those_with_a_truth() -> None:
+    truths = dict.fromkeys((0, 4, 8, 12, 16, 20), trimesh.Trimesh())
+    assert mesh_frames(tuple(range(24)), truths, 4) == [0, 8, 12, 20]
+    assert mesh_frames(tuple(range(24)), {}, 3) == [0, 12, 23]
+    assert mesh_frames((1, 2), truths, 4) == [1, 2]

@@ -1,0 +1,65 @@
+import numpy as np
+import pytest
+import trimesh
+
+from hnerf.evaluation.geometry import outer_samples, score_geometry, volume_overlap
+from hnerf.evaluation.mesh_queries import Surface
+
+
+def plane(height_m: float = 0.0, tilt_deg: float = 0.0) -> trimesh.Trimesh:
+    """A square of 1 m at a height, turned about the x axis."""
+    corners = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
+    turned = corners @ trimesh.transformations.rotation_matrix(np.deg2rad(tilt_deg), [1, 0, 0])[:3, :3].T
+    return trimesh.Trimesh(turned + np.array([0, 0, height_m]), [[0, 1, 2], [0, 2, 3]], process=False)
+
+
+def cube(x_m: float = 0.0, side_m: float = 1.0) -> trimesh.Trimesh:
+    return trimesh.creation.box([side_m] * 3).apply_translation([x_m, 0, 0])
+
+
+def joined(a: trimesh.Trimesh, b: trimesh.Trimesh) -> trimesh.Trimesh:
+    faces = np.concatenate([a.faces, b.faces + len(a.vertices)])
+    return trimesh.Trimesh(np.concatenate([a.vertices, b.vertices]), faces, process=False)
+
+
+def test_parallel_planes() -> None:
+    score = score_geometry(plane(), plane(0.1), np.random.default_rng(0), samples=2000, nodes=16)
+    assert score.chamfer_mm == pytest.approx(100.0, rel=1e-5)
+    assert score.chamfer_l2_e3 == pytest.approx(10.0, rel=1e-5)  # 0.1^2 x 1e3
+    assert score.normal_consistency == pytest.approx(1.0)
+    assert not score.watertight
+
+
+def test_normal_consistency_of_turned_planes() -> None:
+    score = score_geometry(plane(), plane(tilt_deg=60), np.random.default_rng(0), samples=2000, nodes=16)
+    assert score.normal_consistency == pytest.approx(0.5, abs=1e-6)  # cos 60 degrees, wherever the nearest point is
+
+
+def test_distances_go_to_the_surface_not_to_samples() -> None:
+    score = score_geometry(cube(), cube(), np.random.default_rng(0), samples=500, nodes=16)
+    assert score.chamfer_mm < 1e-3
+    assert score.iou == 1.0
+    assert score.watertight
+
+
+def test_overlap_of_offset_cubes() -> None:
+    surfaces = Surface(cube()), Surface(cube(0.5))
+    # Nodes in the middle of cells of 1/64 m that no side of a cube cuts: counted volumes are exact.
+    lower_m, upper_m = np.array([-0.5, -0.5, -0.5]) + 1 / 128, np.array([1.5, 1.5, 1.5]) - 1 / 128
+    assert volume_overlap(*surfaces, lower_m, upper_m, 128) == pytest.approx(0.5 / 1.5)
+
+
+def test_hidden_layers_are_not_sampled() -> None:
+    both = joined(cube(), cube(side_m=0.8))
+    points_m, normals = outer_samples(Surface(both), 3000, np.random.default_rng(0))
+    assert np.abs(points_m).max(1) == pytest.approx(0.5)  # all on the outer cube
+    assert len(points_m) == pytest.approx(3000 / 1.64, rel=0.05)  # its share of 6 + 6 x 0.64 m^2
+    assert np.abs(normals).max(1) == pytest.approx(1.0)
+
+
+def test_occupancy_is_the_winding_number_at_every_node() -> None:
+    mesh = joined(trimesh.creation.icosphere(2, 0.3), trimesh.creation.torus(0.5, 0.06))
+    surface, lower_m, upper_m = Surface(mesh), mesh.bounds[0] - 0.02, mesh.bounds[1] + 0.02
+    axes = [np.linspace(a, b, 40) for a, b in zip(lower_m, upper_m, strict=True)]
+    nodes_m = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    assert np.array_equal(surface.occupancy(lower_m, upper_m, 40).ravel(), surface.inside(nodes_m))

@@ -1,0 +1,53 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hnerf.errors import CaptureError
+from hnerf.evaluation.ground_truth import GroundTruth
+from tests.evaluation.ball import PHOTOGRAPHED, centre_m, seen, write_ball_capture, write_ball_truth
+
+
+@pytest.fixture
+def truth(tmp_path: Path) -> GroundTruth:
+    capture = write_ball_capture(tmp_path, "ball", ("c",))
+    write_ball_truth(capture, 0.1)
+    return GroundTruth(tmp_path, capture)
+
+
+def test_the_photograph_under_its_mask_stands_in_for_on_black(truth: GroundTruth) -> None:
+    image, source = truth.on_black("c", 1)
+    assert source == "image x ground-truth mask"
+    assert np.array_equal(image[..., 0], seen(truth.capture.cameras["c"], centre_m(1)) * PHOTOGRAPHED)
+
+
+def test_on_black_comes_first_and_at_the_camera_size(truth: GroundTruth) -> None:
+    path = truth.folder / "ground_truth" / "on_black" / "c" / "000001.jpg"
+    path.parent.mkdir(parents=True)
+    cv2.imwrite(str(path), np.full((128, 128, 3), 90, np.uint8))
+    image, source = truth.on_black("c", 1)
+    assert source == "ground_truth/on_black"
+    assert np.array_equal(image, np.full((64, 64, 3), 90))
+
+
+def test_a_missing_mask_is_named(truth: GroundTruth) -> None:
+    path = truth.folder / "ground_truth" / "masks" / "c" / "000001.png"
+    path.unlink()
+    with pytest.raises(CaptureError, match=r"000001\.png"):
+        truth.mask("c", 1)
+
+
+@pytest.mark.parametrize("faces", [[[0, 1, 3]], [[-1, 0, 1]]])
+def test_faces_without_vertices_are_refused(truth: GroundTruth, faces: list[list[int]]) -> None:
+    path = truth.folder / "ground_truth" / "meshes.npz"
+    np.savez(path, faces=np.array(faces), vertices=np.zeros((1, 3, 3)), frames=np.array([0]))
+    with pytest.raises(CaptureError, match=r"meshes\.npz: no true surfaces to read \(a face names no vertex"):
+        truth.meshes()
+
+
+def test_a_pickle_is_refused(truth: GroundTruth) -> None:
+    path = truth.folder / "ground_truth" / "meshes.npz"
+    np.savez(path, faces=np.array([{}], dtype=object), vertices=np.zeros((1, 3, 3)), frames=np.array([0]))
+    with pytest.raises(CaptureError, match=r"meshes\.npz"):
+        truth.meshes()

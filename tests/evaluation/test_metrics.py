@@ -1,0 +1,45 @@
+import numpy as np
+import pytest
+
+from hnerf.evaluation.metrics import mask_box, mask_iou, psnr, score_image, ssim
+
+
+def test_psnr_of_a_constant_error() -> None:
+    a = np.full((8, 8, 3), 0.5)
+    assert psnr(a, a + 0.1) == pytest.approx(20.0)  # -10 log10(0.1^2)
+    assert psnr(a, a) == pytest.approx(100.0)
+
+
+def test_ssim_of_flat_images_is_its_luminance_term() -> None:
+    a, b = np.full((16, 16, 3), 0.5), np.full((16, 16, 3), 0.6)
+    # (2 a b + C1) / (a^2 + b^2 + C1) with C1 = 0.01^2; the contrast term of flat images is 1
+    assert ssim(a, b) == pytest.approx((2 * 0.5 * 0.6 + 1e-4) / (0.5**2 + 0.6**2 + 1e-4), abs=1e-6)
+    assert ssim(a, a) == pytest.approx(1.0)
+
+
+def test_mask_box_is_padded_and_cut_to_the_image() -> None:
+    mask = np.zeros((100, 80), bool)
+    mask[30:41, 5:9] = True
+    rows, columns = mask_box(mask)
+    assert range(100)[rows] == range(10, 61)  # 30 - 20 to 40 + 20
+    assert range(80)[columns] == range(0, 29)  # 5 - 20 is outside; 8 + 20
+    assert mask_box(mask, padding_px=0) == (slice(30, 41), slice(5, 9))
+
+
+def test_mask_iou_counts_pixels_brighter_than_the_level() -> None:
+    rendered = np.zeros((2, 4, 3), np.uint8)
+    rendered[0, :3, 1] = 9
+    rendered[1, :, 0] = 8  # not brighter
+    mask = np.zeros((2, 4), bool)
+    mask[0, 1:] = True
+    assert mask_iou(rendered, mask) == pytest.approx(2 / 4)
+
+
+def test_score_image_looks_into_the_box_only() -> None:
+    reference = np.zeros((100, 100, 3), np.uint8)
+    mask = np.zeros((100, 100), bool)
+    mask[50, 50] = True
+    rendered = reference.copy()
+    rendered[0, 0] = 255  # outside the box of 41 x 41 px
+    rendered[50, 50] = 51  # 0.2
+    assert score_image(rendered, reference, mask).psnr == pytest.approx(-10 * np.log10(0.2**2 / 41**2), abs=1e-4)

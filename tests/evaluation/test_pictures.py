@@ -1,0 +1,53 @@
+import numpy as np
+import pytest
+import trimesh
+
+from hnerf.evaluation import pictures
+from hnerf.evaluation.mesh_queries import Surface
+from tests.evaluation.ball import ball_camera
+
+
+def test_crops_and_their_camera_agree() -> None:
+    camera = ball_camera("a", 30.0)
+    box = (slice(10, 50), slice(20, 50))  # 40 x 30 px become 400 x 300
+    cropped = pictures.cropped_camera(camera, box)
+    assert (cropped.width_px, cropped.height_px) == pictures.PICTURE_PX
+    point_m = np.array([0.02, -0.03, 1.05])
+    (x, y), (u, v) = camera.project(point_m)[0], cropped.project(point_m)[0]
+    assert (u, v) == pytest.approx(((x - 20 + 0.5) * 10 - 0.5, (y - 10 + 0.5) * 10 - 0.5))  # pixel centres at integers
+
+
+def test_a_person_is_framed_in_the_proportions_of_a_picture() -> None:
+    person = np.zeros((200, 300), bool)
+    person[60:121, 100:111] = True
+    # padded by 20 px: rows 40 to 140, columns 80 to 130; 101 rows want 75 columns about the middle
+    assert pictures.frame_person(person) == (slice(40, 141), slice(68, 143))
+    assert pictures.frame_person(np.zeros((40, 30), bool)) == (slice(0, 40), slice(0, 30))
+
+
+def test_error_map_is_dark_without_error_and_brightest_at_the_end_of_its_scale() -> None:
+    reference = np.zeros((1, 3, 3), np.uint8)
+    rendered = np.array([[[0] * 3, [64] * 3, [255] * 3]], np.uint8)
+    none, quarter, full = pictures.error_map(rendered, reference)[0].astype(int)
+    assert none.sum() < 10
+    assert np.array_equal(quarter, full) and full.sum() > 600
+
+
+def test_portraits_look_at_the_front_and_the_back() -> None:
+    front_m, back_m = np.array([0.3, -0.2, 0.0]), np.array([-0.3, 0.2, 1.0])  # facing -Y, Z up
+    points_m = np.stack([front_m, back_m])
+    for side, nearer, further in (("front", front_m, back_m), ("back", back_m, front_m)):
+        camera = pictures.portrait_camera(points_m, np.eye(4), side)
+        (_, low_px), (_, high_px) = (camera.project(p)[0] for p in points_m)
+        assert camera.project(nearer)[1] < camera.project(further)[1]
+        assert 0 < high_px < 40 and 360 < low_px < 400  # the head up, filling 94 % of 400 px
+
+
+def test_distance_map_shows_how_far_the_truth_is() -> None:
+    ball = trimesh.creation.icosphere(3, 0.3)
+    camera = pictures.portrait_camera(ball.vertices, np.eye(4), "front")
+    surface, far = Surface(ball), Surface(trimesh.creation.icosphere(3, 0.3 + pictures.FULL_DISTANCE_M))
+    same, off = (pictures.distance_map(surface, truth, camera)[200, 150].astype(float) for truth in (surface, far))
+    assert same / same[0] == pytest.approx(pictures.DISTANCE_COLOURS[0] / pictures.DISTANCE_COLOURS[0][0], abs=0.02)
+    assert off / off[0] == pytest.approx(pictures.DISTANCE_COLOURS[-1] / pictures.DISTANCE_COLOURS[-1][0], abs=0.05)
+    assert np.array_equal(pictures.clay(surface, camera)[0, 0], [255, 255, 255])

@@ -1,0 +1,48 @@
+from pathlib import Path
+from typing import Any
+
+from hnerf.evaluation.report import is_rows, notes, readable, summary
+from tests.evaluation.ball import ball_inputs, write_ball_capture
+
+
+def test_readable_values() -> None:
+    assert [readable(v) for v in (None, True, 3, 0.123456, "x", [], ["a", 1])] == [
+        "–",
+        "yes",
+        "3",
+        "0.1235",
+        "x",
+        "none",
+        "a, 1",
+    ]
+    assert readable([[0.5, 2.0, 1.0]] * 5) == "15 values from 0.5 to 2"
+
+
+def test_dicts_of_plain_values_are_rows_of_a_table() -> None:
+    assert is_rows([{"a": 1}, {"b": [2]}])
+    assert is_rows({"x": {"a": 1}}.values())
+    assert not is_rows({"x": {"a": {"b": 1}}}.values())
+    others: list[Any] = [[], "text", 1, None, [1], {"a": {}}]
+    assert not any(is_rows(value) for value in others)
+
+
+def test_summary_shows_a_dash_where_there_is_no_figure() -> None:
+    geometry = {"chamfer_mm": 8.04, "chamfer_l2_e3": 0.1234, "normal_consistency": 0.95, "iou": 0.9}
+    view = {"psnr": 30.126, "ssim": 0.9, "mask_iou": 0.95, "geometry": geometry}
+    pose = {"psnr": None, "ssim": None, "mask_iou": None, "geometry": None}
+    values = {row["name"]: row["values"] for row in summary({"novel_view": view, "novel_pose": pose})}
+    assert values["PSNR"] == ["30.13", "–"]
+    assert values["Surface distance"] == ["8.0", "–"]
+    assert values["Chamfer"] == ["0.123", "–"]
+
+
+def test_notes_say_what_was_left_out_and_what_was_compared_to(tmp_path: Path) -> None:
+    inputs = ball_inputs(write_ball_capture(tmp_path / "capture", "ball", ("c",)), tmp_path / "stages")
+    view = {"reference": "image x ground-truth mask", "without_person": 2}
+    found = {"lpips": "not available: no weights", "novel_view": view, "novel_pose": {"reason": "of rain"}}
+    assert notes(inputs, found) == [
+        "LPIPS is not available: no weights.",
+        "New views: compared to photographs under the true mask, whose edge pixels hold background.",
+        "New views: 2 images do not show the person and are not scored.",
+        "New poses: no image figures, since of rain.",
+    ]

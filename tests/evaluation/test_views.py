@@ -1,0 +1,31 @@
+from pathlib import Path
+
+from hnerf.evaluation.views import TRAINING_VIEW, View, all_views, some_views, spread
+from tests.evaluation.ball import write_ball_capture
+
+
+def test_splits_with_test_cameras(tmp_path: Path) -> None:
+    capture = write_ball_capture(tmp_path, "ball", ("c", "d"))
+    assert all_views(capture, "novel_view") == [View("novel_view", c, f) for c in ("c", "d") for f in (0, 1, 2)]
+    assert all_views(capture, "novel_pose") == [View("novel_pose", "c", 3), View("novel_pose", "d", 3)]
+
+
+def test_splits_without_test_cameras(tmp_path: Path) -> None:
+    capture = write_ball_capture(tmp_path, "ball", ())
+    assert all_views(capture, "novel_view") == []
+    assert all_views(capture, "novel_pose") == [View("novel_pose", "a", 3), View("novel_pose", "b", 3)]
+
+
+def test_shown_views_take_the_cameras_in_turn(tmp_path: Path) -> None:
+    capture = write_ball_capture(tmp_path, "ball", ("c",))
+    shown = some_views(capture, TRAINING_VIEW, 3)
+    assert [(v.camera, v.frame) for v in shown] == [("a", 0), ("b", 1), ("a", 2)]
+
+
+def test_spread_keeps_both_ends() -> None:
+    assert spread(range(10), 4) == [0, 3, 6, 9]
+    assert spread((5, 7), 4) == [5, 7]
+
+
+def test_path_of_a_rendering() -> None:
+    assert View("novel_view", "05", 7).path(Path("out")) == Path("out/renders/novel_view/05/000007.png")

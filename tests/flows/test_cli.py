@@ -1,0 +1,62 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from flows import cli
+from flows.cli import main
+from tests.shared_data import shared_capture
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run", "absent"], "absent: no such folder"),
+        (["check", "absent"], "absent: no such folder"),
+        (["run", "absent", "--preset", "best"], "best: no such preset or file; presets are demo, fast, paper"),
+        (["run", "absent", "--set", "training.stepz=1"], "training.stepz"),
+        (["synth", "."], "exists; give the name of a new folder"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("hnerf: ")
+    assert message in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unreadable_capture_leaves_nothing_half_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "ada").mkdir()
+    (tmp_path / "ada" / "notes.txt").write_text("no cameras here")
+    assert main(["run", str(tmp_path / "ada"), "--store", str(tmp_path / "store")]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert [path.suffix for path in (tmp_path / "store").rglob("*") if path.is_file()] == [".lock"]
+
+
+def test_check_prints_every_camera_and_the_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capture = shared_capture("valid-wave")
+    assert main(["check", str(capture), "--store", str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    table = lines[next(i for i, line in enumerate(lines) if line.startswith("camera ")) :]
+    report = json.loads(next(tmp_path.glob("calibration/*/report.json")).read_text())
+    assert [line.split()[0] for line in table[1 : 1 + len(report["cameras"])]] == list(report["cameras"])
+    assert f"verdict: {report['verdict']}" in table
+
+
+def test_synth_writes_whole_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(out: Path, settings: object) -> None:
+        out.mkdir()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "write_performer", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        main(["synth", str(tmp_path / "ada")])
+    assert not (tmp_path / "ada").exists()

@@ -1,0 +1,79 @@
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from flows import ingest_captures as module
+from flows.ingest_captures import ingest_captures
+
+
+@pytest.fixture
+def watched(tmp_path: Path) -> Path:
+    for name in ("ada", "bob"):
+        (tmp_path / "captures" / name / "images").mkdir(parents=True)
+        (tmp_path / "captures" / name / "images" / "0.jpg").write_text(f"pixels of {name}")
+    return tmp_path / "captures"
+
+
+@pytest.fixture
+def runs(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """What was asked of the deployment; no server."""
+    asked: list[dict[str, Any]] = []
+
+    def run_deployment(name: str, parameters: dict[str, Any], **options: Any) -> SimpleNamespace:
+        asked.append({"deployment": name, **parameters})
+        return SimpleNamespace(id=f"run-{len(asked)}")
+
+    monkeypatch.setattr(module, "run_deployment", run_deployment)
+    return asked
+
+
+def look(watched: Path, settle_s: float = 0.0) -> list[str]:
+    return ingest_captures.fn(watched, "demo", watched.parent / "store", settle_s)
+
+
+def test_each_capture_is_started_once(watched: Path, runs: list[dict[str, Any]]) -> None:
+    assert look(watched) == ["ada", "bob"]
+    assert look(watched) == []
+    assert runs[0] == {
+        "deployment": "train-subject/local",
+        "capture": str(watched / "ada"),
+        "preset": "demo",
+        "store": str(watched.parent / "store"),
+    }
+    assert [Path(run["capture"]).name for run in runs] == ["ada", "bob"]
+
+
+def test_a_copy_or_a_new_name_is_the_same_capture(watched: Path, runs: list[dict[str, Any]]) -> None:
+    look(watched)
+    shutil.copytree(watched / "ada", watched / "copy of ada")
+    (watched / "bob").rename(watched / "robert")
+    assert look(watched) == []
+
+
+def test_changed_content_is_a_new_capture(watched: Path, runs: list[dict[str, Any]]) -> None:
+    look(watched)
+    (watched / "ada" / "images" / "0.jpg").write_text("other pixels")
+    assert look(watched) == ["ada"]
+
+
+def test_folders_still_being_written_hidden_and_empty_ones_wait(watched: Path, runs: list[dict[str, Any]]) -> None:
+    shutil.copytree(watched / "ada", watched / ".incoming")
+    (watched / "empty").mkdir()
+    assert look(watched, settle_s=1000.0) == []
+    assert look(watched) == ["ada", "bob"]
+
+
+def test_what_could_not_be_started_is_tried_at_the_next_look(
+    watched: Path, runs: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise ConnectionError("no server")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(module, "run_deployment", refuse)
+        with pytest.raises(ConnectionError):
+            look(watched)
+    assert look(watched) == ["ada", "bob"]

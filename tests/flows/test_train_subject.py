@@ -1,0 +1,63 @@
+"""The order of the flow, with stages that only leave a note of what they were given."""
+
+import inspect
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flows import train_subject as module
+from flows.train_subject import train_subject
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+from tasks.stage import Stage
+from tasks.store import Artifact
+
+STAGES = ("ingest", "calibrate", "segment", "fit", "train", "evaluate", "export")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A capture folder, with every stage of the flow replaced."""
+    for name in STAGES:
+        monkeypatch.setattr(module, name, _noting(getattr(module, name)))
+    monkeypatch.setattr(module, "needs_body", lambda recording: (tmp_path / "ada" / "bare").exists())
+    (tmp_path / "ada").mkdir()
+    return tmp_path / "ada"
+
+
+def _noting(stage: Stage[Any]) -> Stage[Any]:
+    """A stage of the same name and inputs that writes down which artifacts it was given."""
+
+    def write(out: Path, **inputs: Any) -> dict[str, float]:
+        (out / "given.json").write_text(json.dumps([v.stage for v in inputs.values() if isinstance(v, Artifact)]))
+        camera = Camera("1", np.eye(3), np.eye(3), np.zeros(3), 4, 4)
+        Capture("ada", out, {"1": camera}, ("1",), (), (0,), (), 25.0, "z", {"1": (4, 4)}, {"1": (4, 4)}).save()
+        return {}
+
+    write.__signature__ = inspect.signature(stage.write)  # type: ignore[attr-defined]
+    return Stage(write, stage.name, "test", resumable=False)
+
+
+def given(subject: Path, stage: str) -> list[str]:
+    return json.loads((subject / stage / "given.json").read_text())
+
+
+def test_every_stage_is_shown_and_given_what_went_before(folder: Path, tmp_path: Path) -> None:
+    subject = train_subject.fn(folder, "demo", tmp_path / "store", [])
+    assert subject == tmp_path / "store" / "subjects" / "ada"
+    assert given(subject, "segmentation") == ["capture", "calibration"]
+    assert given(subject, "fit") == ["capture", "calibration", "segmentation"]
+    assert given(subject, "training") == ["capture", "calibration", "segmentation", "fit"]
+    assert given(subject, "evaluation") == ["capture", "calibration", "segmentation", "fit", "training"]
+    assert given(subject, "asset") == ["capture", "calibration", "training"]
+
+
+def test_without_masks_or_plates_a_rough_fit_comes_first(folder: Path, tmp_path: Path) -> None:
+    (folder / "bare").touch()
+    subject = train_subject.fn(folder, "demo", tmp_path / "store", [])
+    assert given(subject, "segmentation") == ["capture", "calibration", "fit"]
+    assert given(subject, "fit") == ["capture", "calibration", "segmentation"]
+    assert len(list((tmp_path / "store" / "fit").glob("*/given.json"))) == 2

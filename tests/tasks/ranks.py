@@ -1,0 +1,28 @@
+"""A rank for the launcher's tests: python -m tests.tasks.ranks MODE FOLDER."""
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+
+def main(mode: str, folder: Path) -> None:
+    """Leave a file named after the process's id, then behave as told."""
+    rank = int(os.environ["RANK"])
+    (folder / str(os.getpid())).touch()
+    if rank == 1 and mode == "bad":
+        print("a warning\na.jpg: bad; write it again", file=sys.stderr)
+        sys.exit(2)
+    if rank == 1 and mode == "raise":
+        raise ValueError("boom in rank one")
+    if rank == 1 and mode == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if mode == "ok":
+        print(f"rank {rank} of {os.environ['WORLD_SIZE']}")
+        return
+    time.sleep(100)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]))

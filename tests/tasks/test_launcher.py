@@ -1,0 +1,66 @@
+import logging
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from hnerf.errors import CaptureError
+from tasks.launcher import LostWorkerError, run_ranks
+
+RANKS = "tests.tasks.ranks"
+PATIENCE_S = 60.0
+
+
+def still_running(folder: Path) -> list[int]:
+    """Process ids of the ranks that have begun and not ended."""
+    ids = [int(path.name) for path in folder.iterdir()]
+    return [i for i in ids if Path(f"/proc/{i}/stat").exists() and b") Z" not in Path(f"/proc/{i}/stat").read_bytes()]
+
+
+def wait_until_running(folder: Path, count: int) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while len(still_running(folder)) != count:
+        assert time.monotonic() < deadline, f"{still_running(folder)} are running, not {count}"
+        time.sleep(0.05)
+
+
+def test_lines_of_all_ranks_reach_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO, logger=RANKS):
+        run_ranks(RANKS, ["ok", str(tmp_path)], processes=2)
+    assert sorted(caplog.messages) == ["rank 0 of 2", "rank 1 of 2"]
+
+
+@pytest.mark.parametrize(
+    ("mode", "error", "message"),
+    [
+        ("bad", CaptureError, r"^a\.jpg: bad; write it again$"),
+        ("raise", RuntimeError, r"rank 1 ended with exit code 1(.|\n)*ValueError: boom in rank one$"),
+        ("killed", LostWorkerError, "rank 1 was killed by SIGKILL"),
+    ],
+)
+def test_one_failing_rank_ends_all_with_its_message(
+    tmp_path: Path, mode: str, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error) as caught:
+        run_ranks(RANKS, [mode, str(tmp_path)], processes=2)
+    assert re.search(message, str(caught.value))
+    assert still_running(tmp_path) == []
+
+
+def start_caller(folder: Path) -> "subprocess.Popen[bytes]":
+    code = f"from tasks.launcher import run_ranks; run_ranks({RANKS!r}, ['sleep', {str(folder)!r}], 2)"
+    return subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
+
+
+@pytest.mark.parametrize("fatal", [signal.SIGKILL, signal.SIGINT])
+def test_ranks_end_with_the_caller(tmp_path: Path, fatal: signal.Signals) -> None:
+    caller = start_caller(tmp_path)
+    wait_until_running(tmp_path, 2)
+    os.kill(caller.pid, fatal)
+    caller.wait()
+    wait_until_running(tmp_path, 0)

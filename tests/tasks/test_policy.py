@@ -1,0 +1,85 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prefect.states import Failed
+
+from hnerf.config import CaptureSettings, Section
+from hnerf.errors import CaptureError
+from tasks.launcher import LostWorkerError
+from tasks.policy import is_transient, stage_key
+from tasks.source import Source
+from tasks.store import Artifact, StoredFile
+
+
+def artifact(sha256: str = "a", root: str = "/store/fit/k") -> Artifact:
+    return Artifact(stage="fit", root=Path(root), files={"f": StoredFile(sha256=sha256, size_bytes=1)}, metrics={})
+
+
+def source(digest: str = "d", name: str = "ada", root: str = "/here/ada") -> Source:
+    return Source(root=Path(root), name=name, digest=digest)
+
+
+def key(task: str = "fit", version: str = "1", **changed: Any) -> str:
+    inputs = {"source": source(), "body": artifact(), "settings": CaptureSettings(), "rough": None} | changed
+    return stage_key(task, version, inputs)
+
+
+@pytest.mark.parametrize(
+    "same",
+    [
+        {"source": source(root="/there/ada")},
+        {"body": artifact(root="/other/store/fit/k").model_copy(update={"metrics": {"seconds": 2.0}})},
+        {"settings": CaptureSettings(max_side_px=CaptureSettings().max_side_px)},
+    ],
+)
+def test_key_is_the_same_wherever_the_bytes_lie(same: dict[str, Any]) -> None:
+    assert key(**same) == key()
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"task": "training"},
+        {"version": "2"},
+        {"source": source(digest="e")},
+        {"source": source(name="bob")},
+        {"body": artifact("b")},
+        {"settings": CaptureSettings(max_side_px=64)},
+        {"rough": artifact()},
+    ],
+)
+def test_key_changes_with_name_version_bytes_and_settings(other: dict[str, Any]) -> None:
+    assert key(**other) != key()
+
+
+def test_inputs_are_told_apart_by_their_part() -> None:
+    assert key(body=artifact("a"), rough=artifact("b")) != key(body=artifact("b"), rough=artifact("a"))
+
+
+class Shape(Section):
+    width: int = 3
+
+
+def test_key_in_numbers() -> None:
+    """SHA-256, first 32 digits, of {"inputs": {"settings": {"width": 3}}, "task": "fit", "version": "1"}: a change of
+    this number makes every store in the world compute everything again."""
+    assert stage_key("fit", "1", {"settings": Shape()}) == "b8a992a905319034c4fab500077a8ef6"
+
+
+@pytest.mark.parametrize(
+    ("error", "transient"),
+    [
+        (OSError(5, "Input/output error"), True),
+        (TimeoutError("server"), True),
+        (ConnectionResetError("peer"), True),
+        (LostWorkerError("rank 1 was killed"), True),
+        (FileNotFoundError("a.jpg"), False),
+        (PermissionError("a.jpg"), False),
+        (IsADirectoryError("a.jpg"), False),
+        (CaptureError("a.jpg: bad"), False),
+        (ValueError("bug"), False),
+    ],
+)
+def test_only_transient_faults_are_retried(error: Exception, transient: bool) -> None:
+    assert is_transient(None, None, Failed(data=error)) is transient  # type: ignore[arg-type]

@@ -1,0 +1,74 @@
+import os
+from pathlib import Path
+
+import pytest
+
+from hnerf.errors import CaptureError
+from tasks.source import read_capture
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    root = tmp_path / "ada"
+    (root / "images").mkdir(parents=True)
+    (root / "images" / "0.jpg").write_bytes(b"pixels")
+    (root / "intri.yml").write_text("K")
+    (root / "ground_truth").mkdir()
+    (root / "ground_truth" / "mesh.ply").write_text("exact")
+    return root
+
+
+def digest(folder: Path) -> str:
+    return read_capture(folder)[0].digest
+
+
+def test_digest_is_of_content_not_place_or_time(folder: Path, tmp_path: Path) -> None:
+    before = digest(folder)
+    os.utime(folder / "intri.yml", (0, 0))
+    moved = folder.rename(tmp_path / "elsewhere")
+    assert digest(moved) == before
+    assert read_capture(moved)[0].name == "elsewhere"
+
+
+def test_hidden_files_do_not_count(folder: Path) -> None:
+    before = digest(folder)
+    (folder / ".DS_Store").write_text("x")
+    assert digest(folder) == before
+
+
+def test_recording_and_ground_truth_have_digests_of_their_own(folder: Path) -> None:
+    recorded, truth = read_capture(folder)
+    (folder / "ground_truth" / "mesh.ply").write_text("other")
+    recorded_now, truth_now = read_capture(folder)
+    assert recorded_now == recorded
+    assert truth_now.digest != truth.digest
+    assert truth.root == folder
+
+
+@pytest.mark.parametrize("change", ["bytes", "name", "new", "gone", "link"])
+def test_digest_changes_with_content(folder: Path, change: str) -> None:
+    before = digest(folder)
+    image = folder / "images" / "0.jpg"
+    match change:
+        case "bytes":
+            image.write_bytes(b"pixelz")
+        case "name":
+            image.rename(folder / "images" / "1.jpg")
+        case "new":
+            (folder / "images" / "ground_truth").write_text("a file of that name further down counts")
+        case "gone":
+            image.unlink()
+        case "link":
+            (folder / "images" / "1.jpg").symlink_to("0.jpg")
+    assert digest(folder) != before
+
+
+def test_links_and_devices_are_not_followed(folder: Path) -> None:
+    (folder / "images" / "endless.jpg").symlink_to("/dev/zero")
+    os.mkfifo(folder / "images" / "pipe.jpg")
+    assert digest(folder)
+
+
+def test_missing_folder_is_bad_input(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="no such folder"):
+        read_capture(tmp_path / "absent")

@@ -1,0 +1,117 @@
+import shutil
+from pathlib import Path
+
+import pytest
+from prefect import flow, get_client
+from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterId
+from prefect.context import FlowRunContext
+
+from hnerf.config import CaptureSettings
+from hnerf.errors import CaptureError
+from tasks.source import Source, read_capture
+from tasks.store import Store
+from tests.tasks.fakes import calls, copy, double, flaky
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Source:
+    (tmp_path / "ada").mkdir()
+    (tmp_path / "ada" / "text").write_text("ab")
+    return read_capture(tmp_path / "ada")[0]
+
+
+@flow
+def chain(store: Path, source: Source) -> tuple[str, str]:
+    """Both fakes; the text, and the flow run's id."""
+    doubled = double(Store(store), copy(Store(store), source, CaptureSettings()))
+    context = FlowRunContext.get()
+    return (doubled.root / "text").read_text(), str(context.flow_run.id) if context and context.flow_run else ""
+
+
+def states(flow_run_id: str) -> list[str]:
+    """State names of a flow run's tasks, in order."""
+    chosen = FlowRunFilter(id=FlowRunFilterId(any_=[flow_run_id]))
+    with get_client(sync_client=True) as client:
+        runs = client.read_task_runs(flow_run_filter=chosen)
+    return [run.state_name or "" for run in sorted(runs, key=lambda run: run.start_time or run.expected_start_time)]
+
+
+def test_without_a_server_work_is_done_once(tmp_path: Path, source: Source) -> None:
+    assert chain.fn(tmp_path, source) == ("ABAB", "")
+    assert chain.fn(tmp_path, source) == ("ABAB", "")
+    assert calls(tmp_path) == ["copied", "doubled"]
+
+
+def test_other_settings_do_the_work_again_but_equal_content_stops_there(tmp_path: Path, source: Source) -> None:
+    store = Store(tmp_path)
+    first = double(store, copy(store, source, CaptureSettings()))
+    second = double(store, copy(store, source, CaptureSettings(max_side_px=64)))
+    assert calls(tmp_path) == ["copied", "doubled", "copied"]
+    assert first == second
+
+
+def test_prefect_and_plain_calls_share_the_store(prefect_api: str, tmp_path: Path, source: Source) -> None:
+    chain.fn(tmp_path, source)
+    text, run = chain(tmp_path, source)
+    assert text == "ABAB"
+    assert states(run) == ["Completed", "Completed"]
+    assert calls(tmp_path) == ["copied", "doubled"]
+
+
+def test_second_flow_run_is_cached_until_an_artifact_is_damaged(
+    prefect_api: str, tmp_path: Path, source: Source
+) -> None:
+    chain(tmp_path, source)
+    _, again = chain(tmp_path, source)
+    assert states(again) == ["Cached", "Cached"]
+    (copied,) = (tmp_path / "copied").glob("*/text")
+    copied.write_text("XX")
+    text, repaired = chain(tmp_path, source)
+    assert (text, copied.read_text()) == ("ABAB", "AB")
+    assert states(repaired) == ["Completed", "Cached"]
+    assert calls(tmp_path) == ["copied", "doubled", "copied"]
+
+
+def test_artifact_made_anew_outside_prefect_replaces_its_record(
+    prefect_api: str, tmp_path: Path, source: Source
+) -> None:
+    chain(tmp_path, source)
+    shutil.rmtree(tmp_path / "copied")
+    (source.root / "text").write_text("cd")  # as if the stage were not repeatable: the source record stays as it was
+    copy(Store(tmp_path), source, CaptureSettings())
+    assert chain(tmp_path, source)[0] == "CDCD"
+
+
+def test_stores_do_not_share_prefect_records(prefect_api: str, tmp_path: Path, source: Source) -> None:
+    for store in (tmp_path / "a", tmp_path / "b", tmp_path / "a"):
+        store.mkdir(exist_ok=True)
+        chain(store, source)
+    assert calls(tmp_path / "a") == calls(tmp_path / "b") == ["copied", "doubled"]
+
+
+@flow
+def one_flaky(store: Path, source: Source) -> None:
+    """A stage that fails once."""
+    flaky(Store(store), source)
+
+
+@pytest.mark.parametrize(
+    ("fault", "error", "attempts"), [("io", None, 2), ("bad", CaptureError, 1), ("gone", FileNotFoundError, 1)]
+)
+def test_only_transient_faults_are_tried_again(
+    prefect_api: str,
+    tmp_path: Path,
+    source: Source,
+    monkeypatch: pytest.MonkeyPatch,
+    fault: str,
+    error: type[Exception] | None,
+    attempts: int,
+) -> None:
+    monkeypatch.setattr(flaky.task, "retry_delay_seconds", 0)
+    (source.root / "text").write_text(fault)
+    if error:
+        with pytest.raises(error):
+            one_flaky(tmp_path, read_capture(source.root)[0])
+    else:
+        one_flaky(tmp_path, read_capture(source.root)[0])
+    assert calls(tmp_path) == attempts * ["flaky"]

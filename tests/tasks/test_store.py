@@ -1,0 +1,146 @@
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from hnerf.errors import CaptureError
+from tasks.store import Store
+
+# Not forked: a child would inherit Prefect's threads half-way.
+SPAWN = multiprocessing.get_context("spawn")
+# SHA-256 of b"abc" (FIPS 180-2, example B.1).
+ABC = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def write_abc(out: Path) -> dict[str, float]:
+    (out / "deep").mkdir()
+    (out / "deep" / "letters").write_text("abc")
+    return {"letters": 3.0}
+
+
+def never(out: Path) -> dict[str, float]:
+    raise AssertionError("was to be found in the store")
+
+
+def test_artifact_is_recorded_with_digests_and_found_again(tmp_path: Path) -> None:
+    made = Store(tmp_path).obtain("fit", "k", write_abc)
+    found = Store(tmp_path).obtain("fit", "k", never)
+    assert found == made
+    assert made.root == tmp_path / "fit" / "k"
+    assert {name: (file.sha256, file.size_bytes) for name, file in made.files.items()} == {"deep/letters": (ABC, 3)}
+    assert made.metrics == {"letters": 3.0}
+
+
+def test_digest_is_of_names_and_bytes_only(tmp_path: Path) -> None:
+    first = Store(tmp_path / "a").obtain("fit", "k", write_abc)
+    second = Store(tmp_path / "b").obtain("fit", "other", lambda out: write_abc(out) and {})
+    renamed = first.model_copy(update={"files": {"deep/lettres": first.files["deep/letters"]}})
+    assert first.digest == second.digest
+    assert first.digest != renamed.digest
+
+
+@pytest.mark.parametrize("error", [RuntimeError("crash"), KeyboardInterrupt(), CaptureError("a.jpg: bad")])
+def test_half_written_artifact_is_not_seen(tmp_path: Path, error: BaseException) -> None:
+    def half(out: Path) -> dict[str, float]:
+        write_abc(out)
+        raise error
+
+    with pytest.raises(type(error)):
+        Store(tmp_path).obtain("fit", "k", half)
+    assert Store(tmp_path).find("fit", "k") is None
+    assert [path.name for path in (tmp_path / "fit").iterdir()] == ["k.lock"]
+
+
+def test_resumable_stage_goes_on_where_it_was(tmp_path: Path) -> None:
+    def interrupted(out: Path) -> dict[str, float]:
+        write_abc(out)
+        raise OSError("worker lost")
+
+    with pytest.raises(OSError, match="worker lost"):
+        Store(tmp_path).obtain("training", "k", interrupted, resumable=True)
+    assert (tmp_path / "training" / "k.partial" / "deep" / "letters").exists()
+    artifact = Store(tmp_path).obtain("training", "k", lambda out: {"resumed": (out / "deep").exists()}, resumable=True)
+    assert artifact.metrics == {"resumed": 1.0}
+    assert list(artifact.files) == ["deep/letters"]
+
+
+@pytest.mark.parametrize("victim", ["k/deep/letters", "k.json"])
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_text("abd")])
+def test_damaged_or_deleted_artifact_is_made_again(tmp_path: Path, victim: str, damage) -> None:  # type: ignore[no-untyped-def]
+    made = Store(tmp_path).obtain("fit", "k", write_abc)
+    damage(tmp_path / "fit" / victim)
+    assert Store(tmp_path).find("fit", "k") is None
+    assert Store(tmp_path).obtain("fit", "k", write_abc) == made
+    assert Store(tmp_path).find("fit", "k") == made
+
+
+def test_directory_without_record_is_not_an_artifact(tmp_path: Path) -> None:
+    """What a crash between the rename and the record leaves."""
+    (tmp_path / "fit" / "k").mkdir(parents=True)
+    (tmp_path / "fit" / "k" / "stale").write_text("x")
+    assert list(Store(tmp_path).obtain("fit", "k", write_abc).files) == ["deep/letters"]
+    assert not (tmp_path / "fit" / "k" / "stale").exists()
+
+
+def slow_work(root: Path) -> None:
+    def write(out: Path) -> dict[str, float]:
+        with (root / "calls").open("a") as calls:
+            calls.write(f"{os.getpid()}\n")
+        time.sleep(0.5)
+        return write_abc(out)
+
+    Store(root).obtain("fit", "k", write)
+
+
+def test_two_processes_at_once_do_the_work_once(tmp_path: Path) -> None:
+    both = [SPAWN.Process(target=slow_work, args=(tmp_path,)) for _ in range(2)]
+    for process in both:
+        process.start()
+    for process in both:
+        process.join()
+    assert [process.exitcode for process in both] == [0, 0]
+    assert len((tmp_path / "calls").read_text().splitlines()) == 1
+
+
+def hang(root: Path) -> None:
+    def write(out: Path) -> dict[str, float]:
+        (root / "begun").touch()
+        time.sleep(60)
+        return {}
+
+    Store(root).obtain("fit", "k", write)
+
+
+def test_sigkill_leaves_no_lock_and_no_artifact(tmp_path: Path) -> None:
+    process = SPAWN.Process(target=hang, args=(tmp_path,))
+    process.start()
+    while not (tmp_path / "begun").exists():
+        time.sleep(0.01)
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    assert Store(tmp_path).find("fit", "k") is None
+    began = time.monotonic()
+    Store(tmp_path).obtain("fit", "k", write_abc)
+    assert time.monotonic() - began < 5
+
+
+def test_view_points_at_the_latest(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    for key in ("first", "second"):
+        store.show("ada", store.obtain("fit", key, write_abc))
+    link = tmp_path / "subjects" / "ada" / "fit"
+    assert os.readlink(link) == "../../fit/second"
+    assert (link / "deep" / "letters").read_text() == "abc"
+    assert list(link.parent.iterdir()) == [link]
+
+
+@pytest.mark.parametrize("name", ["", "..", "../../home", "a/b"])
+def test_view_stays_within_the_store(tmp_path: Path, name: str) -> None:
+    store = Store(tmp_path)
+    artifact = store.obtain("fit", "k", write_abc)
+    with pytest.raises(CaptureError, match=r"capture\.toml: name"):
+        store.show(name, artifact)
