@@ -73,11 +73,9 @@ def anny_rig(beta: Tensor | None = None) -> Rig:
     beta = torch.tensor(ADULT) if beta is None else beta
     beta = beta.detach().to(torch.float64).clamp(torch.tensor(BETA_LOW), torch.tensor(BETA_HIGH))
     average = _average()
-    weights = _coefficients(beta)
-    jacobian = torch.autograd.functional.jacobian(
-        _coefficients, beta, strategy="forward-mode", vectorize=True
-    )  # (rows, 28)
-    moved = torch.cat([weights[:, None], jacobian], 1).T.float() @ _shapes()
+    jacobian = torch.autograd.functional.jacobian(_coefficients, beta, vectorize=True, strategy="forward-mode")
+    rows = torch.cat([_coefficients(beta)[None], jacobian.T]).float()  # (1 + 28, rows)
+    moved = rows @ _shapes()
     vertices, joints = moved.unflatten(-1, (-1, 3)).split([len(average.vertices_m), len(average.joints_m)], 1)
     return dataclasses.replace(
         average,

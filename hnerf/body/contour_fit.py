@@ -30,9 +30,7 @@ RIM_DEPTH_PX = 2.5  # pixels from the border of the body's silhouette
 SAME_WAY = 0.5  # cosine between the outlines' normals above which points may match
 GROUND_M = 0.01  # how near the ground the lowest vertex of a frame is
 NO_GROUND_M = 0.15  # and from which distance there is no reason to believe so
-DAMPING = (
-    1e-4  # enough for well-posed steps; more would hold back depth and scale, which outlines of one camera hardly tell
-)
+DAMPING = 1e-4  # more would hold back depth and scale, which the outlines of one camera hardly tell
 
 
 @dataclass(frozen=True)
