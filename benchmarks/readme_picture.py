@@ -1,0 +1,48 @@
+"""Draw the README's picture from a finished subject: photograph, fitted body, rendered avatar, surface.
+
+usage: python benchmarks/readme_picture.py SUBJECT_DIR [--camera NAME] [--frame N] [--out docs/valid-wave.png]
+"""
+
+import argparse
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.capture import Capture
+from hnerf.evaluation.evaluate import posed_surface
+from hnerf.evaluation.mesh_queries import Surface
+from hnerf.evaluation.pictures import clay, crop, cropped_camera, frame_person, overlay_surface
+from hnerf.training.model import load_avatar
+
+
+def main() -> None:
+    """Write the picture."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("subject", type=Path)
+    parser.add_argument("--camera", default="05")
+    parser.add_argument("--frame", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("docs/valid-wave.png"))
+    options = parser.parse_args()
+    capture = Capture.load(options.subject / "capture")
+    fitted, avatar = BodyFit.load(options.subject / "fit"), load_avatar(options.subject / "training")
+    camera, row = capture.cameras[options.camera], avatar.body.index(options.frame)
+    drawn = avatar.render(camera, avatar.body.theta[row], avatar.body.root[row])
+    rendered = (drawn.rgb.numpy() * 255).round().astype(np.uint8)
+    box = frame_person(drawn.alpha.numpy() > 0.5)
+    close = cropped_camera(camera, box)
+    photograph = crop(capture.image(options.camera, options.frame), box)
+    body = trimesh.Trimesh(fitted.vertices_m()[row].numpy(), fitted.rig.faces.numpy(), process=False)
+    panels = [
+        photograph,
+        overlay_surface(photograph, Surface(body), close),
+        crop(rendered, box),
+        clay(Surface(posed_surface(avatar, options.frame)), close),
+    ]
+    cv2.imwrite(str(options.out), cv2.cvtColor(np.hstack(panels), cv2.COLOR_RGB2BGR))
+
+
+if __name__ == "__main__":
+    main()
