@@ -36,20 +36,24 @@ class PerformerSettings(Section):
 
 
 class CalibrationSettings(Section):
-    max_residual_px: float = Field(default=5.0, gt=0)  # median a camera may show before its pose is refined
-    min_improvement: float = Field(default=0.05, ge=0, lt=1)  # share by which held-out frames must gain to accept it
+    max_residual_px: float = Field(default=5.0, gt=0)  # median a camera may show before the whole rig is refined
+    min_improvement: float = Field(default=0.02, ge=0, lt=1)  # share by which held-out frames must gain to accept it
 
 
 class SegmentationSettings(Section):
-    shadow_chroma: float = Field(default=0.06, gt=0)  # a shadow changes log colour ratios by no more than this
-    darkest_shadow: float = Field(default=0.27, gt=0, lt=1)  # brightness left in the deepest shadow
+    shadow_chroma: float = Field(default=0.01, gt=0)  # spread of log colour ratios in a shadow, beyond noise
+    darkest_shadow: float = Field(default=0.3, gt=0, lt=1)  # brightness left in the deepest shadow
     reach: float = Field(default=0.13, gt=0)  # how far clothes and hair reach from limbs, in heights of the person
+    model: Path | None = None  # ONNX file of a learned segmentation, used in place of plates; given masks come first
+    rounds: int = Field(default=3, ge=1)  # of fit and segmentation at most, where neither masks nor plates are given
+    still_px: float = Field(default=0.5, gt=0)  # mean movement of the masks' edges from which rounds end
 
 
 class FitSettings(Section):
     """Standard deviations, unless said otherwise. Shape values are anny's: phenotypes in [0, 1], local changes in
-    [-1, 1]."""
+    [-1, 1]; SMPL's have their own, 1."""
 
+    body_model: Literal["anny"] | Path = "anny"  # or an SMPL, SMPL-H or SMPL-X file (.npz, .pkl) of one's own
     keypoint_m: float = Field(default=0.02, gt=0)  # of a keypoint seen with full confidence
     keypoint_outlier_m: float = Field(default=0.15, gt=0)  # distance at which a keypoint's pull fades
     offset_m: float = Field(default=0.02, gt=0)  # between the detector's idea of a keypoint and the body model's

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from pathlib import Path
 from typing import Any
 
 from prefect.cache_policies import CachePolicy
@@ -13,7 +14,7 @@ from prefect.tasks import Task
 from hnerf.config import Section
 from tasks.launcher import LostWorkerError
 from tasks.source import Source
-from tasks.store import Artifact, Store
+from tasks.store import Artifact, Store, sha256_of
 
 LASTING = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 
@@ -23,7 +24,7 @@ Input = Artifact | Source | Section | None
 def stage_key(task: str, version: str, inputs: dict[str, Input]) -> str:
     """Key of a stage's artifact: digest of the task's name and version, its inputs' content and its own settings."""
     described = {name: _identity(value) for name, value in inputs.items()}
-    text = json.dumps({"task": task, "version": version, "inputs": described}, sort_keys=True)
+    text = json.dumps({"task": task, "version": version, "inputs": described}, sort_keys=True, default=_content)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
@@ -31,10 +32,16 @@ def _identity(value: Input) -> Any:
     if value is None:
         return None
     if isinstance(value, Section):
-        return value.model_dump(mode="json")
+        return value.model_dump()
     if isinstance(value, Source):
         return [value.name, value.digest]
     return value.digest
+
+
+def _content(path: Path) -> str:
+    """A file that a setting names counts by its bytes, wherever it lies; one that is missing is for the stage to
+    refuse."""
+    return sha256_of(path) if path.is_file() else str(path)
 
 
 class StorePolicy(CachePolicy):

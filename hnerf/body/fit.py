@@ -4,22 +4,24 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from scipy.ndimage import median_filter
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from hnerf.body.anny import ADULT, BETA_HIGH, BETA_LOW, LOCAL_CHANGES, PHENOTYPES, anny_rig
 from hnerf.body.articulation import Articulation, Pose
+from hnerf.body.body_model import BodyModel, body_model
 from hnerf.body.contour_fit import ContourWeights, Outline, outline, refine
 from hnerf.body.fit_result import BodyFit
+from hnerf.body.given_start import given_start, seen_on, told_of
 from hnerf.body.initial_root import root_from_image, root_from_space
 from hnerf.body.keypoint_fit import Likely, Problem, levenberg_marquardt, metres_per_pixel, project
 from hnerf.body.observations import Observations, observe, runs
 from hnerf.body.pose_prior import PosePrior, Smoothness
-from hnerf.body.rig import Rig
 from hnerf.capture.capture import Capture
 from hnerf.config import FitSettings
 from hnerf.errors import CaptureError
@@ -32,6 +34,7 @@ log = logging.getLogger("hnerf.fit")
 
 # How much harder each BODY_25 keypoint accelerates than the trunk.
 LIVELINESS = np.array([2, 1, 1, 2, 3, 1, 2, 3, 1, 1, 2, 3, 1, 2, 3, 2, 2, 2, 2, 4, 4, 4, 4, 4, 4])
+NEIGHBOURS = 5  # frames that vote on which way a limb bends in depth
 KEYPOINT_STEPS = 30  # Levenberg-Marquardt steps at most; it stops by itself
 HELD = 0.1  # of its spread: keypoints alone say little of proportions, and at first nothing of a detector's habits
 POOR_IOU, POOR_KEYPOINT_M = 0.75, 0.06  # beyond which a frame is flagged
@@ -46,31 +49,36 @@ def fit_body(capture: Capture, masks: "Masks | None", settings: FitSettings) -> 
     """
     with threadpool_limits(1):  # so small are the tensors that threads cost more than they give
         seconds: dict[str, float] = {}
-        seen = observe(capture)
+        model, given = body_model(settings), capture.given_poses()
+        begin = given_start(given, model) if given else None
+        seen = observe(capture) if capture.has_keypoints or begin is None else seen_on(begin, capture)
         smoothness = Smoothness(runs(capture), capture.fps, settings.acceleration_mps2 * LIVELINESS)
         with _timed(seconds, "start"):
-            pose = start(capture, seen)
+            pose = begin or start(capture, seen, model)
         if len(seen.cameras) > 1:
             with _timed(seconds, "keypoints in space"):
-                problem = _problem(pose, seen, smoothness, settings, offsets=HELD, proportions=HELD)
+                problem = problem_of(model, pose, seen, smoothness, settings, offsets=HELD, proportions=HELD)
                 pose = levenberg_marquardt(problem, pose, problem.in_space, KEYPOINT_STEPS)
         with _timed(seconds, "keypoints in images"):
-            problem = _problem(pose, seen, smoothness, settings, offsets=1, proportions=HELD)
+            problem = problem_of(model, pose, seen, smoothness, settings, offsets=1, proportions=HELD)
             pose = levenberg_marquardt(problem, pose, problem.in_images, KEYPOINT_STEPS)
+            if len(seen.cameras) == 1:
+                pose = unflipped(problem, pose, runs(capture))
         if masks is not None:
             with _timed(seconds, "outlines"):
-                problem = _problem(pose, seen, smoothness, settings, offsets=1, proportions=1)
+                problem = problem_of(model, pose, seen, smoothness, settings, offsets=1, proportions=1)
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
                 weights = ContourWeights(settings.inside_m, settings.outside_m, settings.clothing_m, settings.spacing_m)
                 pose = refine(problem, pose, edges, weights, "xyz".index(capture.up), settings.contour_steps)
         fit = BodyFit(pose.rig.to(dtype=torch.float32), capture.frames, pose.theta.float(), pose.root.float())
-        return fit, _report(capture, masks, seen, pose, fit, seconds)
+        report = _report(capture, masks, seen, pose, fit, seconds)
+        return fit, report | ({"given_poses": told_of(model, capture)} if begin else {})
 
 
-def start(capture: Capture, seen: Observations) -> Pose:
+def start(capture: Capture, seen: Observations, model: BodyModel) -> Pose:
     """The likeliest pose of an average body, placed by shoulders and hips in space, or by head and trunk in the image
     of a single camera; frames where that fails stand as their nearest neighbour does."""
-    rig = _rig()
+    rig = model.rig(None)
     articulation = Articulation(rig)
     rest_m = (rig.keypoint_weights @ rig.vertices_m).numpy()
     if len(seen.cameras) > 1:
@@ -90,34 +98,44 @@ def start(capture: Capture, seen: Observations) -> Pose:
     return Pose(rig, theta, torch.from_numpy(np.stack(nearest)), torch.zeros(25, 3, dtype=torch.float64))
 
 
-def _problem(
-    pose: Pose, seen: Observations, smoothness: Smoothness, settings: FitSettings, offsets: float, proportions: float
-) -> Problem:
-    """`offsets` and `proportions` scale the spread of the keypoint offsets and of the local changes."""
-    local = settings.local_change_spread * proportions
-    spread = [settings.phenotype_spread] * len(PHENOTYPES) + [local] * len(LOCAL_CHANGES)
+def unflipped(problem: Problem, pose: Pose, follow: list[tuple[int, ...]]) -> Pose:
+    """One view shows a bent limb and its mirror image in depth alike; a few frames that fell for the mirror image are
+    outvoted by their neighbours. `follow`: frames in order, by run. The pose as it was where nothing is gained."""
+    parts = np.split(pose.theta.numpy(), np.cumsum([len(run) for run in follow])[:-1])
+    theta = np.concatenate([median_filter(part, (NEIGHBOURS, 1, 1), mode="nearest") for part in parts])
+    again = replace(pose, theta=torch.from_numpy(theta))
+    again = levenberg_marquardt(problem, again, problem.in_images, KEYPOINT_STEPS)
+    before, after = (problem.assemble(p, problem.in_images)[0] for p in (pose, again))
+    return again if after < before else pose
+
+
+def problem_of(
+    model: BodyModel, pose: Pose, seen: Observations, smoothness: Smoothness, settings: FitSettings, offsets: float,
+    proportions: float,
+) -> Problem:  # fmt: skip
+    """`offsets` and `proportions` scale the spread of the keypoint offsets and of the shape's details."""
     likely = Likely(
         settings.keypoint_m,
         settings.keypoint_outlier_m,
         settings.offset_m * offsets,
         settings.stature_m,
         settings.stature_spread_m,
-        *(torch.tensor(values, dtype=torch.float64) for values in (ADULT, spread, BETA_LOW, BETA_HIGH)),
+        model.mean,
+        torch.where(model.details, proportions * model.spread, model.spread),
+        model.low,
+        model.high,
     )
-    return Problem(seen, metres_per_pixel(seen.cameras, pose), likely, smoothness, _rig)
-
-
-def _rig(beta: Tensor | None = None) -> Rig:
-    return anny_rig(beta).to(dtype=torch.float64)
+    return Problem(seen, metres_per_pixel(seen.cameras, pose), likely, smoothness, model.rig)
 
 
 def _outlines(capture: Capture, masks: "Masks", scale_m: Tensor, spacing_m: float) -> list[list[Outline | None]]:
-    """By frame and training camera; None where a mask is empty."""
+    """By frame and training camera; None where a mask was dropped or is empty."""
     edges: list[list[Outline | None]] = []
     for t, frame in enumerate(capture.frames):
-        found = [masks.get(name, frame) for name in capture.train_cameras]
+        found = [masks.get(name, frame) if (name, frame) in masks else None for name in capture.train_cameras]
         spacings_px = spacing_m / scale_m[:, t].numpy()
-        edges.append([outline(m, px) if m.any() else None for m, px in zip(found, spacings_px, strict=True)])
+        pairs = zip(found, spacings_px, strict=True)
+        edges.append([outline(m, px) if m is not None and m.any() else None for m, px in pairs])
     return edges
 
 
@@ -130,7 +148,7 @@ def _report(
     iou = None if masks is None else _silhouette_iou(capture, masks, fit)
     poor = residual_m > POOR_KEYPOINT_M
     if iou is not None:
-        poor |= np.array(iou) < POOR_IOU
+        poor |= np.array([value is None or value < POOR_IOU for value in iou])
     flagged = [frame for frame, bad in zip(fit.frames, poor, strict=True) if bad]
     if flagged:
         log.warning("the fit is poor in %d of %d frames: %s", len(flagged), len(poor), flagged)
@@ -155,16 +173,16 @@ def _keypoint_residuals_px(seen: Observations, fit: BodyFit) -> np.ndarray:
     return distance.transpose(0, 1).flatten(1).nanmedian(1).values.numpy()
 
 
-def _silhouette_iou(capture: Capture, masks: "Masks", fit: BodyFit) -> list[float]:
-    """Mean over training cameras of the naked body's IoU with the masks, by frame."""
+def _silhouette_iou(capture: Capture, masks: "Masks", fit: BodyFit) -> list[float | None]:
+    """Mean over training cameras of the naked body's IoU with the masks, by frame; None where all were dropped."""
     faces = fit.rig.faces.numpy()
-    means = []
+    means: list[float | None] = []
     for frame, vertices_m in zip(fit.frames, fit.vertices_m().numpy(), strict=True):
         values = []
-        for name in capture.train_cameras:
+        for name in (n for n in capture.train_cameras if (n, frame) in masks):
             covered, mask = silhouette(capture.cameras[name], vertices_m, faces), masks.get(name, frame)
             values.append((covered & mask).sum() / max((covered | mask).sum(), 1))
-        means.append(round(float(np.mean(values)), 4))
+        means.append(round(float(np.mean(values)), 4) if values else None)
     return means
 
 

@@ -21,6 +21,9 @@ class Silhouettes:
     capture: Capture
     body: BodyFit
 
+    def __contains__(self, view: tuple[str, int]) -> bool:
+        return view[1] in self.body.frames
+
     def get(self, camera: str, frame: int) -> np.ndarray:
         assert camera in self.capture.train_cameras
         vertices_m = self.body.vertices_m()[self.body.index(frame)].numpy()

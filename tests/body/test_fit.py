@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 import torch
 
-from hnerf.body.articulation import Articulation
-from hnerf.body.fit import fit_body
+from hnerf.body.articulation import Articulation, Pose
+from hnerf.body.body_model import body_model
+from hnerf.body.fit import fit_body, problem_of, unflipped
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.keypoint_fit import Likely, Problem, metres_per_pixel
+from hnerf.body.keypoint_fit import Likely, Problem, levenberg_marquardt, metres_per_pixel
 from hnerf.body.observations import observe, runs
 from hnerf.body.pose_prior import Smoothness
 from hnerf.body.rig import Rig, joint_transforms
@@ -45,6 +46,30 @@ def test_one_camera_finds_the_depth(tmp_path: Path) -> None:
     capture = record(tmp_path, truth, RING, ("0",))
     fit, _ = fit_body(capture, Silhouettes(capture, truth), FitSettings(contour_steps=6))  # type: ignore[arg-type]
     assert joint_error_m(fit, truth).mean() < 0.06
+
+
+def test_neighbours_outvote_an_arm_mirrored_in_depth(tmp_path: Path) -> None:
+    truth, settings = moving_body(tuple(range(7))), FitSettings()
+    capture = record(tmp_path, truth, RING, ("0",))
+    seen = observe(capture)
+    smoothness = Smoothness(runs(capture), capture.fps, np.full(25, 30.0))
+    nothing = torch.zeros(25, 3, dtype=torch.float64)
+    pose = Pose(truth.rig.to(dtype=torch.float64), truth.theta.double(), truth.root.double(), nothing)
+    problem = problem_of(body_model(settings), pose, seen, smoothness, settings, offsets=1, proportions=0.1)
+    pose = levenberg_marquardt(problem, pose, problem.in_images, 30)
+    mirrored_theta = pose.theta.clone()
+    mirrored_theta[3, truth.rig.joint_names.index("upperarm01.L")] += torch.tensor([0.0, 2.0, 0.0])
+    mirrored = levenberg_marquardt(problem, replace(pose, theta=mirrored_theta), problem.in_images, 30)
+    wrist = truth.rig.joint_names.index("wrist.L")
+
+    def off_m(found: Pose) -> float:
+        where = [joint_transforms(p.rig, p.rig.joints_m, p.theta, p.root)[3, wrist, :3, 3] for p in (found, pose)]
+        return float((where[0] - where[1]).norm())
+
+    assert off_m(mirrored) > 0.5  # descent alone stays there
+    mended = unflipped(problem, mirrored, runs(capture))
+    assert off_m(mended) < 0.02
+    assert unflipped(problem, mended, runs(capture)).theta.sub(mended.theta).abs().max() < 0.02
 
 
 def test_keypoints_alone_seed_a_segmentation(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from typing import Any
 import pytest
 from prefect.states import Failed
 
-from hnerf.config import CaptureSettings, Section
+from hnerf.config import CaptureSettings, FitSettings, Section
 from hnerf.errors import CaptureError
 from tasks.launcher import LostWorkerError
 from tasks.policy import is_transient, stage_key
@@ -51,6 +51,13 @@ def test_key_is_the_same_wherever_the_bytes_lie(same: dict[str, Any]) -> None:
 )
 def test_key_changes_with_name_version_bytes_and_settings(other: dict[str, Any]) -> None:
     assert key(**other) != key()
+
+
+def test_a_file_that_a_setting_names_counts_by_its_bytes(tmp_path: Path) -> None:
+    for name, content in (("a.npz", b"one"), ("b.npz", b"one"), ("c.npz", b"two")):
+        (tmp_path / name).write_bytes(content)
+    a, b, c, absent = (key(settings=FitSettings(body_model=tmp_path / f"{name}.npz")) for name in "abcd")
+    assert a == b and len({a, c, absent, key(settings=FitSettings())}) == 4
 
 
 def test_inputs_are_told_apart_by_their_part() -> None:

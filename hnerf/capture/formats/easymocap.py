@@ -1,14 +1,16 @@
 """The EasyMocap layout: intri.yml and extri.yml, images/ or videos/, openpose/, masks/ or mask/, background/."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
+import cv2
 import numpy as np
 import yaml
 
 from hnerf.capture.footage import Footage, ImageFolder, Video
+from hnerf.capture.formats.layout import Layout, Stored
 from hnerf.capture.guarded import IMAGE_SUFFIXES, files_in, images_named, inside, numbered, read_text
 from hnerf.capture.lens import Lens, checked_lens
 from hnerf.errors import CaptureError
@@ -17,11 +19,8 @@ MAX_CALIBRATION_BYTES = 1_000_000
 
 
 @dataclass(frozen=True)
-class EasyMocap:
+class EasyMocap(Layout):
     """A folder as EasyMocap's own tools read it (its `read_camera`): world to camera, OpenCV axes."""
-
-    folder: Path
-    novel_pose_share: ClassVar[float] = 0.0
 
     @staticmethod
     def recognises(folder: Path) -> bool:
@@ -48,16 +47,17 @@ class EasyMocap:
             )
         return Video.open(video)
 
-    def keypoint_files(self, camera: str) -> dict[int, Path]:
+    def keypoint_files(self, camera: str) -> dict[int, Path | Stored]:
         """openpose/<camera>/<frame>_keypoints.json."""
-        return numbered([p for p in files_in(self.folder, "openpose", camera) if p.suffix == ".json"], "keypoints")
+        files = [p for p in files_in(self.folder, "openpose", camera) if p.suffix == ".json"]
+        return dict(numbered(files, "keypoints"))
 
-    def mask_files(self, camera: str) -> dict[int, Path]:
+    def mask_files(self, camera: str) -> dict[int, Path | Stored]:
         """masks/<camera>/<frame>.png, or mask/."""
         for name in ("masks", "mask"):
             files = [p for p in files_in(self.folder, name, camera) if p.suffix.lower() in IMAGE_SUFFIXES]
             if files:
-                return numbered(files, "masks")
+                return dict(numbered(files, "masks"))
         return {}
 
     def plate_file(self, camera: str) -> Path | None:
@@ -65,9 +65,25 @@ class EasyMocap:
         found = images_named(self.folder, camera, "background")
         return found[0] if found else None
 
-    def to_body_25(self, keypoints: np.ndarray) -> np.ndarray:
-        """OpenPose's BODY_25 already."""
-        return keypoints
+
+def write_easymocap(out: Path, lenses: Sequence[Lens]) -> None:
+    """`intri.yml` and `extri.yml`. As text: OpenCV's own writer refuses names like `Camera (1)`."""
+    names = "".join(f'   - "{lens.name}"\n' for lens in lenses)
+    intri = extri = f"%YAML:1.0\n---\nnames:\n{names}"
+    for lens in lenses:
+        intri += _matrix(f"K_{lens.name}", lens.K) + _matrix(f"dist_{lens.name}", lens.distortion[None])
+        if lens.size_px:
+            intri += f"W_{lens.name}: {lens.size_px[0]}\nH_{lens.name}: {lens.size_px[1]}\n"
+        extri += _matrix(f"R_{lens.name}", cv2.Rodrigues(lens.R)[0]) + _matrix(f"Rot_{lens.name}", lens.R)
+        extri += _matrix(f"T_{lens.name}", lens.t_m[:, None])
+    (out / "intri.yml").write_text(intri, encoding="utf-8")
+    (out / "extri.yml").write_text(extri, encoding="utf-8")
+
+
+def _matrix(key: str, values: np.ndarray) -> str:
+    rows, cols = values.shape
+    data = values.astype(np.float64).ravel().tolist()
+    return f"{key}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: {data}\n"
 
 
 class _CalibrationFile:

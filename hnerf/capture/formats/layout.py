@@ -1,57 +1,65 @@
 """What every layout on disk offers to `ingest`."""
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from hnerf.capture.footage import Footage
-from hnerf.capture.guarded import read_json
+from hnerf.capture.given_poses import GivenPoses
 from hnerf.capture.lens import Lens
-from hnerf.errors import CaptureError
-
-MAX_PEOPLE = 64
 
 
-class Layout(Protocol):
-    """One capture folder in one layout. `novel_pose_share`: of the frames, where no `capture.toml` splits them."""
+class Stored(NamedTuple):
+    """One frame of a file that holds a whole recording. path: for messages; read: a mask (H, W) uint8, or keypoints
+    (people, K, 3) as `read_openpose` returns them."""
 
-    novel_pose_share: ClassVar[float]
+    path: Path
+    read: Callable[[], np.ndarray]
 
+
+@dataclass(frozen=True)
+class Layout(ABC):
+    """One capture folder in one layout; what most layouts do not have is left out here.
+
+    `novel_pose_share`: of the frames, where no `capture.toml` splits them.
+    """
+
+    folder: Path
+    novel_pose_share: ClassVar[float] = 0.0
+
+    @staticmethod
+    @abstractmethod
+    def recognises(folder: Path) -> bool:
+        """Whether the folder looks like this layout."""
+
+    @abstractmethod
     def lenses(self) -> dict[str, Lens]:
         """Every calibrated camera, translations in the capture's own unit."""
-        ...
 
+    @abstractmethod
     def footage(self, camera: str) -> Footage:
         """Its pictures; CaptureError if there are none."""
-        ...
 
-    def keypoint_files(self, camera: str) -> dict[int, Path]:
-        """OpenPose JSON files by frame; empty where nothing was detected for this camera."""
-        ...
+    def training_cameras(self) -> list[str]:
+        """Those that the recording's own publication trains on, the rest being for testing; empty: all of them."""
+        return []
 
-    def mask_files(self, camera: str) -> dict[int, Path]:
+    def keypoint_files(self, camera: str) -> dict[int, Path | Stored]:
+        """OpenPose JSON files, or the like, by frame; empty where nothing was detected for this camera."""
+        return {}
+
+    def mask_files(self, camera: str) -> dict[int, Path | Stored]:
         """Given person masks by frame; empty where there are none."""
-        ...
+        return {}
 
     def plate_file(self, camera: str) -> Path | None:
         """Clean plate, or None."""
-        ...
+        return None
 
-    def to_body_25(self, keypoints: np.ndarray) -> np.ndarray:
-        """(..., 25, 3) keypoints in the file's order to BODY_25."""
-        ...
-
-
-def read_openpose(path: Path) -> np.ndarray:
-    """(people, 25, 3) x_px, y_px, confidence in the file's order; CaptureError if it is not such a file."""
-    try:
-        people = read_json(path)["people"]
-        if len(people) > MAX_PEOPLE:
-            raise CaptureError(f"{path}: {len(people)} people; keep at most {MAX_PEOPLE}")
-        points = np.array([person["pose_keypoints_2d"] for person in people], dtype=np.float64).reshape(-1, 75)
-    except (KeyError, TypeError, ValueError):
-        raise CaptureError(f"{path}: not OpenPose keypoints of 25 points a person; detect them again") from None
-    if not np.isfinite(points).all():
-        raise CaptureError(f"{path}: a keypoint is NaN or infinite; detect them again")
-    return points.reshape(-1, 25, 3)
+    def given_poses(self, frames: tuple[int, ...]) -> GivenPoses | None:
+        """Somebody's fit of a body model, for these frames; None where there is none."""
+        return None

@@ -1,0 +1,69 @@
+"""Poses that somebody else fitted, as the start of a fit; and as keypoints, where a recording has none."""
+
+import torch
+from torch import Tensor
+
+from hnerf.body.articulation import Pose
+from hnerf.body.body_model import BodyModel
+from hnerf.body.canonical import axis_angle_from_rotation
+from hnerf.body.keypoint_fit import NEAR_M, project
+from hnerf.body.observations import Observations
+from hnerf.body.rig import Rig, pose_vertices, rotation_from_axis_angle
+from hnerf.body.smpl import BODY_FROM_SMPL, JOINTS, LOCKED
+from hnerf.capture.capture import Capture
+from hnerf.capture.given_poses import GivenPoses
+
+PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)  # of JOINTS
+# Of the mean SMPL body, rounded; anny has no joint there.
+PELVIS_M = (0.0, -0.23, 0.03)  # in SMPL's axes
+PELVIS_ABOVE_HIPS_M = 0.09
+CONFIDENCE = 0.5  # of a keypoint on a given body, next to one that was detected
+
+
+def given_start(given: GivenPoses, model: BodyModel) -> Pose:
+    """The given poses in the turns of the model's own joints: exactly for SMPL, whose shape comes along; by the likes
+    of SMPL's joints, on the average body, for others. Frames without a pose stand as their nearest neighbour does."""
+    known = given.known.nonzero()[0]
+    nearest = torch.tensor([min(known, key=lambda other: abs(int(other) - t)) for t in range(len(given.theta))])
+    rig = model.rig(torch.from_numpy(given.betas) if model.is_smpl else None)
+    turns = rotation_from_axis_angle(torch.from_numpy(given.theta))[nearest]
+    placed = torch.from_numpy(given.root)[nearest]
+    theta = torch.zeros(len(turns), len(rig.joints_m), 3, dtype=torch.float64)
+    for j, name in enumerate(JOINTS):
+        if name in LOCKED:
+            continue
+        own = rig.joint_names.index(name)
+        above, below = (model.rest_turns[rig.joint_names.index(JOINTS[PARENTS[j]])], model.rest_turns[own])
+        turn = BODY_FROM_SMPL @ turns[:, j] @ BODY_FROM_SMPL.T
+        theta[:, own] = axis_angle_from_rotation(above @ turn @ below.T)
+    return Pose(rig, theta, _root(rig, turns[:, 0], placed, model.is_smpl), torch.zeros(25, 3, dtype=torch.float64))
+
+
+def _root(rig: Rig, pelvis_turns: Tensor, placed: Tensor, is_smpl: bool) -> Tensor:
+    """World from body (n, 4, 4): SMPL turns about its pelvis (n, 3, 3) before it is placed (n, 4, 4)."""
+    if is_smpl:
+        pelvis_m = rig.joints_m[0]
+        smpl_pelvis_m = BODY_FROM_SMPL.T @ pelvis_m
+    else:
+        hips = [rig.joint_names.index(f"upperleg01.{side}") for side in "LR"]
+        pelvis_m = rig.joints_m[hips].mean(0) + torch.tensor([0, 0, PELVIS_ABOVE_HIPS_M], dtype=torch.float64)
+        smpl_pelvis_m = torch.tensor(PELVIS_M, dtype=torch.float64)
+    root = torch.eye(4, dtype=torch.float64).repeat(len(placed), 1, 1)
+    root[:, :3, :3] = placed[:, :3, :3] @ pelvis_turns @ BODY_FROM_SMPL.T
+    root[:, :3, 3] = placed[:, :3, :3] @ smpl_pelvis_m + placed[:, :3, 3] - root[:, :3, :3] @ pelvis_m
+    return root
+
+
+def told_of(model: BodyModel, capture: Capture) -> str:
+    """What a report says of given poses."""
+    how = "used as the start" if model.is_smpl else "are SMPL's: used as the start, by the likes of its joints"
+    return how if capture.has_keypoints else f"{how}, and in place of keypoints, of which there are none"
+
+
+def seen_on(pose: Pose, capture: Capture) -> Observations:
+    """The pose's own keypoints, as the training cameras would see them."""
+    cameras = tuple(capture.cameras[name] for name in capture.train_cameras)
+    points_m = pose.rig.keypoint_weights @ pose_vertices(pose.rig, pose.theta, pose.root)  # (n, 25, 3)
+    pixels = torch.stack([project(camera, points_m)[0] for camera in cameras])
+    ahead = torch.stack([torch.from_numpy(camera.project(points_m.numpy())[1]) > NEAR_M for camera in cameras])
+    return Observations(cameras, pixels, CONFIDENCE * ahead.double(), points_m)

@@ -1,0 +1,124 @@
+"""ZJU-MoCap, and Human3.6M as NeuralBody prepares it: annots.npy, mask_cihp/ or mask/, new_params/ or params/."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hnerf.capture.footage import Footage, ImageFolder
+from hnerf.capture.formats.layout import Layout, Stored
+from hnerf.capture.given_poses import JOINTS, GivenPoses
+from hnerf.capture.guarded import inside
+from hnerf.capture.lens import Lens, checked_lens
+from hnerf.capture.pickled import read_pickled_npy
+from hnerf.errors import CaptureError
+
+# NeuralBody's configs train on these of ZJU-MoCap's 21 to 23 cameras, and on all but the last of Human3.6M's 4.
+TRAINING_CAMERAS = {4: (0, 1, 2)} | dict.fromkeys((21, 22, 23), (0, 6, 12, 18))
+METRES_PER_UNIT = 1e-3  # of the cameras' translations
+
+
+@dataclass(frozen=True)
+class ZjuMocap(Layout):
+    """A folder as NeuralBody's own tools read it: world to camera, OpenCV axes, Z up."""
+
+    @staticmethod
+    def recognises(folder: Path) -> bool:
+        """Whether the folder looks like this layout."""
+        return (folder / "annots.npy").exists()
+
+    @property
+    def source(self) -> Path:
+        """The file that lists cameras and images."""
+        return inside(self.folder, "annots.npy")
+
+    @cached_property
+    def images(self) -> dict[str, dict[int, PurePosixPath]]:
+        """By camera, which is an image's own folder, and by frame: the images' paths."""
+        try:
+            rows = [[PurePosixPath(str(path)) for path in row["ims"]] for row in self._annotations["ims"]]
+            names = [path.parent.name for path in rows[0]]
+            frames = [_frame(row[0]) for row in rows]
+            columns = list(zip(*rows, strict=True))
+        except (IndexError, KeyError, TypeError, ValueError):
+            raise CaptureError(f"{self.source}: 'ims' lists no images, as many a frame; prepare it again") from None
+        if len(set(names)) < len(names) or len(set(frames)) < len(frames):
+            raise CaptureError(f"{self.source}: two images of one camera and frame; prepare it again")
+        return {name: dict(zip(frames, paths, strict=True)) for name, paths in zip(names, columns, strict=True)}
+
+    @cached_property
+    def _annotations(self) -> Any:
+        return read_pickled_npy(self.source)
+
+    def lenses(self) -> dict[str, Lens]:
+        """One camera for each of a frame's images."""
+        lenses = {}
+        for i, name in enumerate(self.images):
+            try:
+                cameras = self._annotations["cams"]
+                K, D, R, T = (np.asarray(cameras[key][i], dtype=np.float64) for key in "KDRT")
+            except (IndexError, KeyError, TypeError, ValueError):
+                raise CaptureError(f"{self.source}: camera {name}: K, D, R or T is missing; prepare it again") from None
+            lens = checked_lens((self.source, self.source), name, K, D, R, T * METRES_PER_UNIT, None)
+            lenses[lens.name] = lens
+        return lenses
+
+    def training_cameras(self) -> list[str]:
+        """NeuralBody's."""
+        names = list(self.images)
+        return [names[i] for i in TRAINING_CAMERAS.get(len(names), ())]
+
+    def footage(self, camera: str) -> Footage:
+        """The images that annots.npy lists."""
+        files = {frame: inside(self.folder, *path.parts) for frame, path in self.images[camera].items()}
+        return ImageFolder(next(iter(files.values())).parent, files)
+
+    def mask_files(self, camera: str) -> dict[int, Path | Stored]:
+        """mask_cihp/<image>.png, or mask/: part labels, 0 outside the person."""
+        for name in ("mask_cihp", "mask"):
+            if inside(self.folder, name).is_dir():
+                paths = self.images[camera].items()
+                return {frame: inside(self.folder, name, *path.with_suffix(".png").parts) for frame, path in paths}
+        return {}
+
+    def given_poses(self, frames: tuple[int, ...]) -> GivenPoses | None:
+        """new_params/<frame>.npy, or params/: SMPL's poses (72, of which the first 3 are zero, or 69), Rh, Th, shapes;
+        a vertex is R(Rh) SMPL(poses, shapes) + Th."""
+        folders = [name for name in ("new_params", "params") if inside(self.folder, name).is_dir()]
+        if not folders:
+            return None
+        poses = GivenPoses.unknown(len(frames))
+        betas = []
+        for i, frame in enumerate(frames):
+            path = inside(self.folder, folders[0], f"{frame}.npy")
+            if path.exists():
+                turns, poses.root[i], shape = _parameters(path)
+                poses.theta[i].flat[-len(turns) :] = turns
+                poses.theta[i, 0] = np.nan_to_num(poses.theta[i, 0])  # not among 69
+                betas.append(shape)
+        poses.betas[:] = np.mean(betas, 0) if betas else 0
+        return poses
+
+
+def _frame(path: PurePosixPath) -> int:
+    """000012.jpg is frame 12, and so is CoreView_313_Camera_(1)_0012_2019-08-23_16-08-50.592.jpg."""
+    return int(path.stem if path.stem.isdigit() else path.stem.split("_")[4])
+
+
+def _parameters(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Turns (72,) or (69,), placement (4, 4) in metres, shape (10,)."""
+    try:
+        stored = read_pickled_npy(path)
+        turns, rotation, translation, shape = (
+            np.asarray(stored[key], dtype=np.float64).ravel() for key in ("poses", "Rh", "Th", "shapes")
+        )
+        placed = np.eye(4)
+        placed[:3, :3], placed[:3, 3] = cv2.Rodrigues(rotation)[0], translation
+    except (KeyError, TypeError, ValueError, cv2.error):
+        raise CaptureError(f"{path}: no poses, Rh, Th and shapes of SMPL; remove it or fit again") from None
+    if len(turns) not in (3 * JOINTS, 3 * JOINTS - 3) or len(shape) < 10:
+        raise CaptureError(f"{path}: {len(turns)} turns and {len(shape)} shape values are not SMPL's; remove it")
+    return turns, placed, shape[:10]

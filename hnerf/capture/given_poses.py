@@ -1,0 +1,43 @@
+"""A body's poses as somebody else fitted them: what ZJU-MoCap and PeopleSnapshot come with."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+JOINTS, BETAS = 24, 10  # of SMPL
+
+
+@dataclass(frozen=True)
+class GivenPoses:
+    """SMPL's own parameters, a row for each of a capture's frames, NaN where a frame has none: a vertex in the world is
+    root @ SMPL(theta, betas).
+
+    theta (n, 24, 3) axis-angle in SMPL's axes, the pelvis's turn first; root (n, 4, 4) metres, applied after the model
+    turned about its pelvis; betas (10,).
+    """
+
+    theta: np.ndarray
+    root: np.ndarray
+    betas: np.ndarray
+
+    @staticmethod
+    def unknown(frames: int) -> "GivenPoses":
+        """Rows to fill, NaN, and the mean shape."""
+        return GivenPoses(np.full((frames, JOINTS, 3), np.nan), np.full((frames, 4, 4), np.nan), np.zeros(BETAS))
+
+    @property
+    def known(self) -> np.ndarray:
+        """(n,) bool: frames that have a pose."""
+        return np.isfinite(self.theta).all((1, 2)) & np.isfinite(self.root).all((1, 2))
+
+    def save(self, path: Path) -> None:
+        """Write an .npz without pickles."""
+        np.savez(path, **dataclasses.asdict(self), model=np.array("smpl"))
+
+    @staticmethod
+    def load(path: Path) -> "GivenPoses":
+        """Read what `save` wrote."""
+        with np.load(path, allow_pickle=False) as stored:
+            return GivenPoses(stored["theta"], stored["root"], stored["betas"])

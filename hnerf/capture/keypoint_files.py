@@ -1,0 +1,68 @@
+"""Files that keypoint detectors write: OpenPose's, one a frame; and lists of COCO results, one a camera."""
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hnerf.capture.guarded import read_json
+from hnerf.capture.keypoint_sets import COUNTS, KNOWN
+from hnerf.errors import CaptureError
+
+MAX_PEOPLE = 64
+
+
+def read_openpose(path: Path) -> np.ndarray:
+    """(people, K, 3) x_px, y_px, confidence in the file's order, K a known number of points, or 0 without people.
+
+    CaptureError if it is no such file."""
+    try:
+        people = _few(path, read_json(path)["people"])
+        return _people(path, [person["pose_keypoints_2d"] for person in people])
+    except (KeyError, TypeError):
+        raise CaptureError(f"{path}: no list of people with pose_keypoints_2d; detect them again") from None
+
+
+def read_results(path: Path, frames: Iterable[int]) -> list[np.ndarray]:
+    """As `read_openpose`, for each of the frames: of a list of {image_id, keypoints, score}, as MMPose, RTMPose and
+    AlphaPose write for a whole recording. image_id: the frame's number, or an image name that ends in it. Frames that
+    it leaves out show nobody. CaptureError if it is no such file."""
+    try:
+        people: dict[int, list[Any]] = {}
+        for result in read_json(path):
+            people.setdefault(_frame(result["image_id"]), []).append(result["keypoints"])
+    except (KeyError, TypeError, ValueError):
+        raise CaptureError(f"{path}: no list of image_id and keypoints; write COCO results again") from None
+    return [_people(path, _few(path, people.get(frame, []))) for frame in frames]
+
+
+def _frame(image_id: object) -> int:
+    """12, "12.jpg" and "walk_000012.png" are frame 12; ValueError if it has no number."""
+    found = re.search(r"([0-9]{1,9})(\.\w+)?$", str(image_id))
+    if not found:
+        raise ValueError(image_id)
+    return int(found[1])
+
+
+def _few(path: Path, people: list[Any]) -> list[Any]:
+    if len(people) > MAX_PEOPLE:
+        raise CaptureError(f"{path}: {len(people)} people in an image; keep at most {MAX_PEOPLE}")
+    return people
+
+
+def _people(path: Path, triples: list[Any]) -> np.ndarray:
+    """Flat x, y, confidence lists of one image, checked."""
+    if not triples:
+        return np.zeros((0, 0, 3))
+    try:
+        points = np.array(triples, dtype=np.float64).reshape(len(triples), -1, 3)
+    except (TypeError, ValueError):
+        raise CaptureError(f"{path}: keypoints are not triples of numbers, as many a person; detect again") from None
+    if points.shape[1] not in COUNTS:
+        raise CaptureError(f"{path}: {points.shape[1]} keypoints a person; sets that are read: {KNOWN}")
+    if not np.isfinite(points).all():
+        raise CaptureError(f"{path}: a keypoint is NaN or infinite; detect them again")
+    points[..., 2] = points[..., 2].clip(0, 1)  # some detectors exceed 1, and COCO's own annotations reach 2
+    return points

@@ -1,0 +1,96 @@
+"""The keypoint sets that detectors write, and how each becomes OpenPose's BODY_25, the only one past the door.
+
+BODY_25's neck is the middle of the shoulders and its mid-hip that of the hips, and so they are made here from any set
+that lacks them. A set's own neck (BODY_25B, Halpe) is the base of the skull and is left out.
+"""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from hnerf.errors import CaptureError
+
+KeypointSetName = Literal["coco_17", "coco_18", "body_25", "body_25b", "halpe_26", "coco_wholebody", "halpe_136"]
+
+
+class KeypointSet(NamedTuple):
+    """points: of a person; rows (25): those whose mean is each BODY_25 keypoint, none where the set has no such."""
+
+    points: int
+    rows: tuple[tuple[int, ...], ...]
+
+
+# COCO's 17 (Lin et al. 2014: nose, then left and right eye, ear, shoulder, elbow, wrist, hip, knee, ankle) open all
+# sets but OpenPose's older two. BODY_25's nose to left ear; feet follow: left big toe, small toe, heel, then the right.
+_COCO = (
+    (0,), (5, 6), (6,), (8,), (10,), (5,), (7,), (9,), (11, 12), (12,), (14,), (16,), (11,), (13,), (15,),
+    (2,), (1,), (4,), (3,),
+)  # fmt: skip
+_NO_FEET = ((),) * 6
+_HALPE = (*_COCO, (20,), (22,), (24,), (21,), (23,), (25,))  # Halpe-FullBody: toes and heels in pairs
+
+SETS: dict[KeypointSetName, KeypointSet] = {
+    "coco_17": KeypointSet(17, _COCO + _NO_FEET),
+    # OpenPose's COCO model: nose, neck, arms, legs from the hips down, eyes, ears; the right side first.
+    "coco_18": KeypointSet(18, (*((k,) for k in range(8)), (8, 11), *((k,) for k in range(8, 18)), *_NO_FEET)),
+    "body_25": KeypointSet(25, tuple((k,) for k in range(25))),
+    # OpenPose, src/openpose/pose/poseParameters.cpp: 17 upper neck, 18 head top, then the feet.
+    "body_25b": KeypointSet(25, (*_COCO, *((k,) for k in range(19, 25)))),
+    "halpe_26": KeypointSet(26, _HALPE),
+    "coco_wholebody": KeypointSet(133, (*_COCO, *((k,) for k in range(17, 23)))),  # Jin et al. 2020; face, hands unused
+    "halpe_136": KeypointSet(136, _HALPE),  # Halpe-26, then face and hands
+}
+KNOWN = ", ".join(f"{name} ({known.points})" for name, known in SETS.items())
+COUNTS = {known.points for known in SETS.values()}
+
+
+def to_body_25(detections: dict[str, np.ndarray], named: KeypointSetName | None) -> dict[str, np.ndarray]:
+    """BODY_25 keypoints (frames, people, 25, 3) by camera, of detections (frames, people, K, 3) x_px, y_px, confidence.
+
+    `named` holds for all cameras; without it the number of points tells the set, and for 25, which two sets have, where
+    point 8 lies. K is 0 where nobody was detected. Raises CaptureError where `named` has another number of points.
+    """
+    of_25 = [points.reshape(-1, 25, 3) for points in detections.values() if points.shape[-2] == 25]
+    if of_25 and not named and not is_body_25(np.concatenate(of_25)):
+        named_25: KeypointSetName = "body_25b"
+    else:
+        named_25 = "body_25"
+    by_count = {known.points: known for known in SETS.values()} | {25: SETS[named_25]}
+    found = {}
+    for camera, points in detections.items():
+        count = points.shape[-2]
+        if count == 0:
+            found[camera] = np.zeros((*points.shape[:-2], 25, 3))
+            continue
+        chosen = SETS[named] if named else by_count[count]
+        if chosen.points != count:
+            raise CaptureError(
+                f'capture.toml: keypoints = "{named}" has {chosen.points} points, but camera {camera} has {count}; '
+                "correct it"
+            )
+        found[camera] = _combined(points, chosen)
+    return found
+
+
+def _combined(points: np.ndarray, known: KeypointSet) -> np.ndarray:
+    """(..., K, 3) to (..., 25, 3). A mean of two points has the lower confidence, and is absent if either is."""
+    combined = np.zeros((*points.shape[:-2], 25, 3))
+    for k, rows in enumerate(known.rows):
+        if rows:
+            part = points[..., rows, :]
+            combined[..., k, :2], combined[..., k, 2] = part[..., :2].mean(-2), part[..., 2].min(-1)
+    return combined * (combined[..., 2:] > 0)
+
+
+def is_body_25(keypoints: np.ndarray) -> bool:
+    """Whether (..., 25, 3) detections are in BODY_25's order rather than BODY_25B's; true where nothing tells.
+
+    BODY_25's points 8, 9, 12 are mid-hip, right and left hip, so 8 lies midway; BODY_25B's are right elbow, left wrist,
+    right hip. Judged by the median over all detections, against the distance from point 0 (nose in both) to the hips.
+    """
+    seen = keypoints[(keypoints[..., [0, 8, 9, 12], 2] > 0).all(-1)][..., :2]
+    if len(seen) == 0:
+        return True
+    middle = (seen[:, 9] + seen[:, 12]) / 2
+    offset = np.linalg.norm(seen[:, 8] - middle, axis=-1) / (np.linalg.norm(seen[:, 0] - middle, axis=-1) + 1e-9)
+    return bool(np.median(offset) < 0.1)

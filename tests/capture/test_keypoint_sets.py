@@ -1,0 +1,123 @@
+"""Every keypoint set to BODY_25: point i of a set lies at (i, 100 i) with confidence 0.5 + i / 1000."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.capture.ingest import ingest
+from hnerf.capture.keypoint_files import read_openpose, read_results
+from hnerf.capture.keypoint_sets import SETS, KeypointSetName, is_body_25, to_body_25
+from hnerf.config import CaptureSettings
+from hnerf.errors import CaptureError
+from tests.capture import recordings as rec
+
+
+def points(count: int) -> np.ndarray:
+    i = np.arange(float(count))
+    return np.stack([i, 100 * i, 0.5 + i / 1000], -1)
+
+
+def converted(count: int, named: KeypointSetName | None = None) -> np.ndarray:
+    """(25, 3) of one person in one frame."""
+    return to_body_25({"01": points(count)[None, None]}, named)["01"][0, 0]
+
+
+# x of BODY_25's nose, neck, right arm, left arm, mid-hip, right leg, left leg, eyes and ears (right first).
+COCO_BODY = [0, 5.5, 6, 8, 10, 5, 7, 9, 11.5, 12, 14, 16, 11, 13, 15, 2, 1, 4, 3]
+FEET: dict[KeypointSetName, list[float]] = {  # left big toe, small toe, heel, then the right
+    "coco_17": [0] * 6,
+    "body_25b": [19, 20, 21, 22, 23, 24],
+    "halpe_26": [20, 22, 24, 21, 23, 25],
+    "coco_wholebody": [17, 18, 19, 20, 21, 22],
+    "halpe_136": [20, 22, 24, 21, 23, 25],
+}
+
+
+@pytest.mark.parametrize("name", FEET)
+def test_sets_that_begin_with_coco(name: KeypointSetName) -> None:
+    found = converted(SETS[name].points, name)
+    assert found[:, 0].tolist() == COCO_BODY + FEET[name]
+    assert found[:, 1].tolist() == pytest.approx([100 * x for x in COCO_BODY + FEET[name]])
+    feet = [0.5 + x / 1000 if x else 0 for x in FEET[name]]  # a foot that the set has not has no confidence
+    lower = [0.5 + int(x) / 1000 for x in COCO_BODY]  # a mean has the lower of its two confidences
+    assert found[:, 2].tolist() == pytest.approx(lower + feet)
+
+
+def test_openpose_coco_and_body_25() -> None:
+    assert converted(18)[:, 0].tolist() == [*range(8), 9.5, *range(8, 18)] + [0] * 6
+    assert np.array_equal(converted(25, "body_25"), points(25))
+
+
+@pytest.mark.parametrize("count", [17, 18, 26, 133, 136])
+def test_the_number_of_points_tells_the_set(count: int) -> None:
+    (name,) = (name for name, known in SETS.items() if known.points == count)
+    assert np.array_equal(converted(count), converted(count, name))
+
+
+def test_where_point_8_lies_tells_sets_of_25_apart() -> None:
+    """A person 10 px high: nose at y = 0, hips at 5 and 2 px apart; BODY_25's point 8 lies between them."""
+    body_25 = np.ones((25, 3))
+    body_25[[0, 8, 9, 12], :2] = [[5, 0], [5, 5], [4, 5], [6, 5]]
+    assert is_body_25(body_25) and not is_body_25(points(25))
+    assert is_body_25(np.zeros((25, 3)))  # nobody seen: the commoner of the two
+    seen_by_one = {"01": points(25)[None, None], "02": np.zeros((1, 1, 25, 3))}
+    assert to_body_25(seen_by_one, None)["01"][0, 0, 8].tolist() == pytest.approx([11.5, 1150, 0.511])
+
+
+def test_a_mean_needs_both_points() -> None:
+    one_shoulder = points(17)
+    one_shoulder[6] = 0
+    found = to_body_25({"01": one_shoulder[None, None]}, None)["01"][0, 0]
+    assert found[1].tolist() == [0, 0, 0] and found[5, 0] == 5
+
+
+def test_a_camera_that_sees_nobody_has_no_confidence() -> None:
+    found = to_body_25({"01": points(17)[None, None], "02": np.zeros((1, 1, 0, 3))}, "coco_17")
+    assert found["02"].shape == (1, 1, 25, 3) and not found["02"].any()
+
+
+def test_a_named_set_of_another_size_is_bad_input() -> None:
+    with pytest.raises(CaptureError, match=r'keypoints = "halpe_26" has 26 points, but camera 01 has 17'):
+        converted(17, "halpe_26")
+
+
+def test_an_unknown_number_of_points_names_the_known_sets(tmp_path: Path) -> None:
+    rec.write_keypoints(tmp_path / "a.json", [points(19)])
+    with pytest.raises(CaptureError, match=r"a\.json: 19 keypoints a person; .* coco_17 \(17\), .* halpe_26 \(26\)"):
+        read_openpose(tmp_path / "a.json")
+
+
+def test_lists_of_results_are_read_by_frame(tmp_path: Path) -> None:
+    """As AlphaPose (image names) and MMPose (numbers) write them; scores over 1 count as 1."""
+    sure = points(17)
+    sure[:, 2] = 3
+    results = [
+        {"image_id": "000002.jpg", "category_id": 1, "keypoints": points(17).ravel().tolist(), "score": 2.9},
+        {"image_id": 4, "category_id": 1, "keypoints": points(17).ravel().tolist(), "score": 1.0},
+        {"image_id": 4, "category_id": 1, "keypoints": sure.ravel().tolist(), "score": 0.5},
+    ]
+    (tmp_path / "01.json").write_text(json.dumps(results))
+    two, three, four = read_results(tmp_path / "01.json", (2, 3, 4))
+    assert np.allclose(two, points(17)[None]) and len(three) == 0
+    assert four.shape == (2, 17, 3) and (four[1, :, 2] == 1).all()
+    (tmp_path / "01.json").write_text(json.dumps([{"image_id": "cover", "keypoints": []}]))
+    with pytest.raises(CaptureError, match=r"01\.json: no list of image_id"):
+        read_results(tmp_path / "01.json", (0,))
+
+
+def test_results_beside_the_images_come_through_the_door(tmp_path: Path) -> None:
+    folder = rec.write_easymocap(tmp_path / "person")
+    for path in folder.glob("openpose/*/*.json"):
+        path.unlink()
+    (folder / "keypoints").mkdir()
+    (folder / "capture.toml").write_text('keypoints = "halpe_26"\n')
+    for camera in rec.CAMERAS:
+        triples = (points(26) / [2, 200, 1]).ravel().tolist()
+        text = json.dumps([{"image_id": f, "keypoints": triples, "score": 1} for f in (0, 2)])
+        (folder / "keypoints" / f"{camera}.json").write_text(text)
+    keypoints = ingest(folder, CaptureSettings(), tmp_path / "out").keypoints("02")
+    assert keypoints is not None and keypoints.shape == (5, 1, 25, 3)
+    assert keypoints[2, 0, 24].tolist() == pytest.approx([12.5, 12.5, 0.525])
+    assert not keypoints[[1, 3, 4]].any()

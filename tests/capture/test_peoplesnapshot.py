@@ -1,0 +1,89 @@
+"""A PeopleSnapshot folder of six frames, in the files of the published subjects."""
+
+import pickle
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from hnerf.capture.capture import Capture
+from hnerf.capture.ingest import ingest
+from hnerf.config import CaptureSettings
+from hnerf.errors import CaptureError
+from tests.capture import recordings as rec
+
+
+def write_hdf5(path: Path, **arrays: np.ndarray) -> None:
+    with h5py.File(path, "w") as file:
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array, chunks=True, compression="lzf")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """64 x 48 px; row i of the seven poses holds i, so that frame f has row f + 1; the last was never reconstructed."""
+    folder = tmp_path / "female-1"
+    rec.write_video(folder / "female-1.mp4", 6)
+    camera = {"camera_f": np.array([50.0, 50]), "camera_c": np.array([31.5, 23.5]), "camera_k": np.zeros(5)}
+    camera |= {"camera_t": np.zeros(3), "camera_rt": np.zeros(3), "width": 64, "height": 48}
+    (folder / "camera.pkl").write_bytes(pickle.dumps(camera, 2))
+    masks = np.zeros((6, 48, 64), np.uint8)
+    masks[:, 10:20, 30:40] = 1
+    write_hdf5(folder / "masks.hdf5", masks=masks)
+    keypoints = np.stack([np.arange(18.0), 2 * np.arange(18.0), np.full(18, 0.8)], -1).ravel()
+    write_hdf5(folder / "keypoints.hdf5", keypoints=np.tile(keypoints, (6, 1)))
+    pose, trans = np.tile(np.arange(7.0)[:, None], (1, 72)), np.tile([0.1, 0.2, 2.5], (7, 1))
+    pose[6], trans[6] = 0, 0
+    write_hdf5(folder / "reconstructed_poses.hdf5", pose=pose, trans=trans, betas=np.arange(10.0))
+    return folder
+
+
+@pytest.fixture
+def capture(folder: Path, tmp_path: Path) -> Capture:
+    return ingest(folder, CaptureSettings(), tmp_path / "out")
+
+
+def test_the_world_is_turned_upright(capture: Capture) -> None:
+    """What is 2.5 m ahead of the camera, 0.1 m to its right and 0.2 m below lies at (0.1, 2.5, -0.2)."""
+    camera = capture.cameras["camera"]
+    pixel, depth_m = camera.project(np.array([0.1, 2.5, -0.2]))
+    assert pixel == pytest.approx([31.5 + 50 * 0.1 / 2.5, 23.5 + 50 * 0.2 / 2.5]) and depth_m == pytest.approx(2.5)
+    assert capture.up == "z" and capture.train_frames == (0, 1, 2, 3, 4, 5)
+
+
+def test_masks_and_keypoints(capture: Capture) -> None:
+    mask, keypoints = capture.given_mask("camera", 3), capture.keypoints("camera")
+    assert mask is not None and mask[10:20, 30:40].all() and mask.sum() == 100
+    assert keypoints is not None and keypoints[5, 0, 1].tolist() == [1, 2, 0.8]  # the neck
+    assert keypoints[5, 0, 8] == pytest.approx([9.5, 19, 0.8])  # the middle of hips 8 and 11
+    assert not keypoints[..., 19:, :].any()
+
+
+def test_given_poses_are_aligned_from_the_end(capture: Capture) -> None:
+    given = capture.given_poses()
+    assert given is not None and given.known.tolist() == [True] * 5 + [False]
+    assert given.theta[0].ravel().tolist() == [1.0] * 72 and given.theta[4, 0].tolist() == [5.0] * 3
+    # SMPL's own origin, and its y axis, which in that camera's world points down
+    assert given.root[0] @ [0, 0, 0, 1] == pytest.approx([0.1, 2.5, -0.2, 1])
+    assert given.root[0] @ [0, 1, 0, 0] == pytest.approx([0, 0, -1, 0])
+    assert given.betas.tolist() == list(range(10))
+
+
+def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
+    def refused(names: str) -> None:
+        with pytest.raises(CaptureError, match=names):
+            ingest(folder, CaptureSettings(), tmp_path / "out")
+
+    with h5py.File(folder / "reconstructed_poses.hdf5", "r+") as file:
+        del file["betas"]
+        file["betas"] = h5py.ExternalLink("/etc/hostname", "betas")
+    refused(r"reconstructed_poses\.hdf5: has no array of numbers called betas")
+    write_hdf5(folder / "keypoints.hdf5", keypoints=np.full((6, 54), np.nan))
+    refused(r"keypoints\.hdf5: keypoints is not \(N, 54\) finite numbers")
+    write_hdf5(folder / "masks.hdf5", masks=np.zeros((5, 48, 64), np.uint8))
+    refused(r"masks\.hdf5: 5 masks for 6 frames")
+    (folder / "masks.hdf5").write_bytes(b"nothing")
+    refused(r"masks\.hdf5: not a readable HDF5 file")
+    (folder / "camera.pkl").write_bytes(pickle.dumps({"camera_f": [1]}))
+    refused(r"camera\.pkl: camera_f, _c, .* is missing")

@@ -1,0 +1,101 @@
+"""A ZJU-MoCap folder of two cameras and three frames, as NeuralBody prepares it."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hnerf.capture.ingest import ingest
+from hnerf.config import CaptureSettings
+from hnerf.errors import CaptureError
+from tests.capture import recordings as rec
+
+CAMERAS = ("Camera_B1", "Camera_B2")
+
+
+def write_zju(folder: Path, names: tuple[str, ...] = CAMERAS, frame: str = "{:06d}.jpg") -> Path:
+    """Cameras of recordings.py, translations in mm; in masks the person's left half has label 3; poses of frames 0 and
+    2."""
+    rows = [[f"{name}/" + frame.format(f) for name in names] for f in range(3)]
+    for row in rows:
+        for path in row:
+            rec.write_png(folder / path, np.full((rec.HEIGHT, rec.WIDTH, 3), 90, np.uint8))
+            labels = np.zeros((rec.HEIGHT, rec.WIDTH, 3), np.uint8)
+            labels[:, :12] = 3
+            rec.write_png((folder / "mask_cihp" / path).with_suffix(".png"), labels)
+    turns = [rec.ROTATIONS[name] for name in rec.CAMERAS] * 12
+    cams: dict[str, Any] = {
+        "K": [np.array(rec.K)] * len(names),
+        "D": [np.zeros((5, 1))] * len(names),
+        "R": [np.array(R) for R in turns[: len(names)]],
+        "T": [np.array([[0.0], [1000], [3000]])] * len(names),
+    }
+    annotations: Any = {"cams": cams, "ims": [{"ims": np.array(row)} for row in rows]}
+    np.save(folder / "annots.npy", annotations, allow_pickle=True)
+    return folder
+
+
+def write_parameters(path: Path, poses: np.ndarray) -> None:
+    """Turned a quarter about the vertical, then moved by (1, 2, 3) m."""
+    path.parent.mkdir(exist_ok=True)
+    parameters: Any = {"poses": poses, "Rh": np.array([[0, 0, np.pi / 2]]), "Th": np.array([[1.0, 2, 3]])}
+    np.save(path, parameters | {"shapes": np.arange(10.0)[None]}, allow_pickle=True)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "zju").mkdir()
+    return write_zju(tmp_path / "zju")
+
+
+def test_cameras_images_and_masks(folder: Path, tmp_path: Path) -> None:
+    capture = ingest(folder, CaptureSettings(), tmp_path / "out")
+    assert capture.train_cameras == CAMERAS and capture.train_frames == (0, 1, 2)
+    assert capture.cameras["Camera_B1"].centre_m == pytest.approx([-3, 0, 1], abs=1e-9)
+    mask = capture.given_mask("Camera_B2", 2)
+    assert mask is not None and mask[:, :12].all() and not mask[:, 12:].any()
+    assert capture.image("Camera_B2", 1).shape == (rec.HEIGHT, rec.WIDTH, 3)
+    assert capture.keypoints("Camera_B1") is None and capture.given_poses() is None
+
+
+def test_given_poses(folder: Path, tmp_path: Path) -> None:
+    """new_params go before params; frame 1 has none; 69 turns leave out the pelvis."""
+    turns = np.arange(72.0) * (np.arange(72) >= 3)
+    write_parameters(folder / "new_params" / "0.npy", turns[None])
+    write_parameters(folder / "new_params" / "2.npy", turns[3:])
+    write_parameters(folder / "params" / "1.npy", turns)
+    given = ingest(folder, CaptureSettings(), tmp_path / "out").given_poses()
+    assert given is not None and given.known.tolist() == [True, False, True]
+    for row in (0, 2):
+        assert given.theta[row].ravel().tolist() == turns.tolist()
+        assert given.root[row] == pytest.approx(np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]]))
+    assert given.betas.tolist() == list(range(10))
+
+
+def test_the_published_cameras_are_for_training(tmp_path: Path) -> None:
+    (tmp_path / "zju").mkdir()
+    names = tuple(f"Camera ({k})" for k in range(1, 22))
+    frame = "CoreView_313_Camera_(1)_{:04d}_2019-08-23_16-08-50.592.jpg"
+    capture = ingest(write_zju(tmp_path / "zju", names, frame), CaptureSettings(), tmp_path / "out")
+    assert capture.train_cameras == ("Camera (1)", "Camera (7)", "Camera (13)", "Camera (19)")
+    assert len(capture.test_cameras) == 17 and capture.train_frames == (0, 1, 2)
+
+
+def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
+    def refused(names: str) -> None:
+        with pytest.raises(CaptureError, match=names):
+            ingest(folder, CaptureSettings(), tmp_path / "out")
+
+    write_parameters(folder / "params" / "1.npy", np.zeros(10))
+    refused(r"1\.npy: 10 turns and 10 shape values are not SMPL's")
+    (folder / "params" / "1.npy").rename(folder / "params" / "9.npy")
+    refused(r"its poses are of none of these frames")
+    (folder / "mask_cihp" / "Camera_B2" / "000001.png").unlink()
+    refused(r"mask_cihp/Camera_B2/000001\.png")
+    annotations = np.load(folder / "annots.npy", allow_pickle=True).item()
+    annotations["ims"][0]["ims"][1] = "../secret/000000.jpg"
+    np.save(folder / "annots.npy", annotations, allow_pickle=True)
+    refused("leaves the capture folder")
+    np.save(folder / "annots.npy", {"cams": {}, "ims": []}, allow_pickle=True)  # type: ignore[arg-type]
+    refused(r"annots\.npy: 'ims' lists no images")
