@@ -1,6 +1,7 @@
 """The command line: the flows' work from a shell, without a server."""
 
 import argparse
+import dataclasses
 import json
 import logging
 import os
@@ -12,6 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from flows.train_subject import train_subject
+from hnerf.calibration.boards import calibrate_from_boards
+from hnerf.capture.formats.export import WRITERS, write_cameras
+from hnerf.capture.ingest import recognise
+from hnerf.capture.notes import read_notes
 from hnerf.capture.performer import PerformerSettings, write_performer
 from hnerf.config import load_settings
 from hnerf.errors import CaptureError
@@ -67,6 +72,19 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
     check.set_defaults(command=lambda o: _check(o.capture, o.preset, o.store))
 
+    boards = commands.add_parser("calibrate", help="find the cameras from footage of a calibration board")
+    boards.add_argument("folder", type=Path, help="a folder with calibration/extrinsic/ and charuco.toml")
+    boards.add_argument("--out", type=Path, default=Path("cameras"), help="the folder to write (default: cameras)")
+    boards.add_argument("--format", choices=WRITERS, action="append", default=[], help="write these files, too")
+    boards.add_argument("--ground-frame", type=int, metavar="N", help="when the board lies on the floor, at the origin")
+    boards.set_defaults(command=lambda o: _calibrate(o.folder, o.out, o.format, o.ground_frame))
+
+    cameras = commands.add_parser("cameras", help="write a recording's cameras as other tools read them")
+    cameras.add_argument("folder", type=Path, help="a recording, or a folder that `calibrate` wrote")
+    cameras.add_argument("--format", choices=WRITERS, required=True)
+    cameras.add_argument("--out", type=Path, default=Path("cameras"), help="the folder to write (default: cameras)")
+    cameras.set_defaults(command=lambda o: _cameras(o.folder, o.format, o.out))
+
     synth = commands.add_parser("synth", help="write a synthetic capture with ground truth")
     synth.add_argument("out", type=Path, help="the folder to write")
     synth.set_defaults(command=lambda o: _synth(o.out))
@@ -100,6 +118,23 @@ def _table(report: dict[str, Any]) -> list[str]:
         remarks = "; ".join(camera["reasons"])
         lines.append(f"{name:<12} {camera['status']:<9} {median:>9} {p95:>9}  {remarks}".rstrip())
     return [*lines, *report["notes"], f"verdict: {report['verdict']}"]
+
+
+def _calibrate(folder: Path, out: Path, layouts: list[str], ground_frame: int | None) -> None:
+    found = calibrate_from_boards(folder, ground_frame)
+    found.save(out, layouts)
+    print(f"{'camera':<12} {'pictures':>8} {'RMS px':>7}  intrinsics")
+    report = found.report()
+    for name, camera in report["cameras"].items():
+        print(f"{name:<12} {camera['pictures']:>8} {camera['rms_px']:>7.2f}  {camera['intrinsics']}")
+    print(f"all: {report['rms_px']:.2f} px RMS\ncameras: {out}\npicture: {out / 'boards.png'}")
+
+
+def _cameras(folder: Path, layout: str, out: Path) -> None:
+    lenses = recognise(folder).lenses().values()
+    metres_per_unit = read_notes(folder).metres_per_unit
+    write_cameras(out, [dataclasses.replace(lens, t_m=metres_per_unit * lens.t_m) for lens in lenses], layout)
+    print(f"cameras: {out}")
 
 
 def _synth(out: Path) -> None:

@@ -12,11 +12,15 @@ from hnerf.capture.camera import Camera
 ROUNDS = 3  # triangulate, adjust, and again with the better cameras
 LOSS_SCALE_PX = 2.0  # about a detector's noise
 MIN_OBSERVATIONS = 50  # with fewer, the cameras have drifted apart: there is nothing to adjust to
+FUNCTION_TOLERANCE = 1e-6  # relative change of the cost at which a solve ends
 MAX_FRAMES = 100  # a hundred poses, evenly chosen, hold a camera firmly
 
 
-def adjust(cameras: Sequence[Camera], keypoints: np.ndarray, free: Sequence[str]) -> list[Camera]:
-    """Cameras with the poses of those named in `free` adjusted to keypoints (C, frames, 25, 3); intrinsics stay.
+def adjust(
+    cameras: Sequence[Camera], keypoints: np.ndarray, free: Sequence[str], focal: Sequence[str] = ()
+) -> list[Camera]:
+    """Cameras with the poses of those named in `free`, and the focal lengths of those in `focal`, adjusted to keypoints
+    (C, frames, K, 3). The pixels' aspect stays.
 
     Where two others are fixed, they alone place the points, and every keypoint of a free camera counts, far off
     as it may be. Where all are free, the rig is moved as a whole, and scaled, to the old cameras: the world stays.
@@ -36,7 +40,7 @@ def adjust(cameras: Sequence[Camera], keypoints: np.ndarray, free: Sequence[str]
         if used.sum() < MIN_OBSERVATIONS:
             break
         loss_scale_px = max(LOSS_SCALE_PX, float(np.median(residuals_px[used])))
-        adjusted = _bundle_adjust(adjusted, flat, points_m, used, free, loss_scale_px)
+        adjusted = _bundle_adjust(adjusted, flat, points_m, used, free, focal, loss_scale_px)
     return align(adjusted, cameras) if moving.all() else adjusted
 
 
@@ -46,23 +50,19 @@ def _bundle_adjust(
     points_m: np.ndarray,
     used: np.ndarray,
     free: Sequence[str],
+    focal: Sequence[str],
     loss_scale_px: float,
 ) -> list[Camera]:
     """One solve over the used observations (C, K): every (frame, joint) a point, one image per camera."""
     scene = pycolmap.Reconstruction()
     config = pycolmap.BundleAdjustmentConfig()
     for i, camera in enumerate(cameras, start=1):
-        K = camera.K
-        pinhole = {"model": "PINHOLE", "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
-        scene.add_camera_with_trivial_rig(
-            pycolmap.Camera(camera_id=i, width=camera.width_px, height=camera.height_px, **pinhole)
-        )
-        image = pycolmap.Image(camera.name, np.ascontiguousarray(keypoints[i - 1, :, :2]), i, i)
-        scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(camera.R), camera.t_m))
+        _add_image(scene, i, camera, keypoints[i - 1, :, :2])
         config.add_image(i)
-        config.set_constant_cam_intrinsics(i)
         if camera.name not in free:
             config.set_constant_rig_from_world_pose(i)
+        if camera.name not in focal:
+            config.set_constant_cam_intrinsics(i)
     for k in np.flatnonzero(used.sum(0) >= 2):
         track = [pycolmap.TrackElement(int(c) + 1, int(k)) for c in np.flatnonzero(used[:, k])]
         scene.add_point3D(points_m[k], pycolmap.Track(track))
@@ -71,14 +71,27 @@ def _bundle_adjust(
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = loss_scale_px
+    options.ceres.solver_options.function_tolerance = FUNCTION_TOLERANCE
     pycolmap.create_default_ceres_bundle_adjuster(options, config, scene).solve()
-    poses = [scene.image(i).cam_from_world() for i in range(1, len(cameras) + 1)]
-    return [
-        dataclasses.replace(camera, R=pose.rotation.matrix(), t_m=np.array(pose.translation))
-        if camera.name in free
-        else camera
-        for camera, pose in zip(cameras, poses, strict=True)
-    ]
+    return [_solved(scene, i, camera) if camera.name in free else camera for i, camera in enumerate(cameras, start=1)]
+
+
+def _add_image(scene: pycolmap.Reconstruction, number: int, camera: Camera, keypoints_px: np.ndarray) -> None:
+    """A camera with one focal length: y is scaled by the pixels' aspect fx / fy."""
+    aspect = np.array([1, camera.K[0, 0] / camera.K[1, 1]])
+    fx, cx, cy = camera.K[0, 0], camera.K[0, 2], camera.K[1, 2] * aspect[1]
+    size = {"width": camera.width_px, "height": camera.height_px}
+    scene.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=number, model="SIMPLE_PINHOLE", params=[fx, cx, cy], **size)
+    )
+    image = pycolmap.Image(camera.name, np.ascontiguousarray(keypoints_px * aspect), number, number)
+    scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(camera.R), camera.t_m))
+
+
+def _solved(scene: pycolmap.Reconstruction, number: int, camera: Camera) -> Camera:
+    pose, zoom = scene.image(number).cam_from_world(), scene.camera(number).params[0] / camera.K[0, 0]
+    K = camera.K * np.array([[zoom, zoom, 1], [1, zoom, 1], [1, 1, 1]])
+    return dataclasses.replace(camera, K=K, R=pose.rotation.matrix(), t_m=np.array(pose.translation))
 
 
 def align(cameras: Sequence[Camera], to: Sequence[Camera]) -> list[Camera]:

@@ -6,10 +6,22 @@ from itertools import combinations
 import cv2
 import numpy as np
 
-from hnerf.calibration.diagnosis import BODY_HEIGHT_M, Measure, explain, gross_limit_px, measure, unit_of
+from hnerf.calibration.diagnosis import (
+    BODY_HEIGHT_M,
+    Measure,
+    explain,
+    gross_limit_px,
+    measure,
+    undo_mistake,
+    unit_of,
+)
+from hnerf.calibration.monocular import ground_reasons, intrinsics_reasons
 from hnerf.calibration.refine import refine
 from hnerf.calibration.report import CalibrationReport, CameraVerdict, load_cameras
+from hnerf.calibration.sizes import size_reasons
+from hnerf.calibration.synchronise import Timing, measure_timing, put_in_step
 from hnerf.calibration.triangulation import subject_keypoints
+from hnerf.calibration.witnesses import Witnesses
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
@@ -23,34 +35,64 @@ REJECT_FACTOR = 2.0  # times `max_residual_px`: a camera so far off, that no ref
 
 
 def check_calibration(capture: Capture, settings: CalibrationSettings) -> CalibrationReport:
-    """Judge the training cameras by the subject's keypoints, and refine them where held-out frames prove it right.
+    """Judge the training cameras by the subject's keypoints; undo, synchronise and refine what held-out frames prove.
 
     Raises CaptureError, naming the likely cause, on a calibration that no person can have been seen with.
     """
     _check_numbers(capture)
+    if not capture.has_keypoints and capture.given_poses():
+        return _unchecked(capture)
+    keypoints = _keypoints(capture)
+    given = [capture.cameras[name] for name in capture.train_cameras]
+    if len(given) == 1:
+        return _monocular(capture, keypoints[0])
+    before = measure(given, keypoints)
+    _check_convention(capture, given, keypoints, before)
+    cameras, mistakes = undo_mistake(given, keypoints)
+    _check_height(capture, measure(cameras, keypoints) if mistakes else before)
+    in_step, held_out_px, notes = put_in_step(capture, cameras, keypoints, settings)
+    keypoints = keypoints if in_step is capture else _keypoints(in_step)
+    witnesses = Witnesses.of(in_step, keypoints, settings)
+    refinement = refine(in_step, cameras, keypoints, witnesses.outlines, settings)
+    used = refinement.cameras
+    after = measure(used, keypoints)
+    _check_agreement(capture, after, settings)
+    timing = measure_timing(used, keypoints, in_step.frames)
+    verdicts = {}
+    for old, new in zip(given, used, strict=True):
+        name, offset = old.name, in_step.frame_offsets.get(old.name, 0.0)
+        reasons = size_reasons(capture, name) + intrinsics_reasons(old) + _fit_reasons(name, before, settings)
+        reasons += [f"{mistakes[name]}: undone"] if name in mistakes else []
+        reasons += [_timing_reason(offset, timing[name]), *_change_reasons(old, new), refinement.reasons[name]]
+        status = "refined" if new is not old or offset else "ok"
+        verdicts[name] = _verdict(name, status, before, after, offset, timing[name], reasons, settings)
+    if sum(v.status != "rejected" for v in verdicts.values()) < 2:
+        raise CaptureError(f"{capture.name}: fewer than two cameras agree on the person; calibrate again")
+    every = capture.cameras | {camera.name: camera for camera in used}
+    held_out_px |= refinement.held_out_px
+    notes += refinement.notes
+    return CalibrationReport(
+        every,
+        verdicts,
+        before,
+        after,
+        held_out_px,
+        refinement.outlines_px,
+        tuple(notes),
+        capture.up,
+        witnesses,
+    )
+
+
+def _keypoints(capture: Capture) -> np.ndarray:
+    """The subject's keypoints in the training cameras, (C, frames, 25, 3); CaptureError where a camera has none."""
     found = subject_keypoints(capture)
     for name, seen in found.items():
         if not (seen[..., 2] > 0).any():
             raise CaptureError(
                 f"{capture.name}: camera {name} never shows the person; check its keypoints or leave it out"
             )
-    keypoints = np.stack([found[name] for name in capture.train_cameras])
-    cameras = [capture.cameras[name] for name in capture.train_cameras]
-    if len(cameras) == 1:
-        return _monocular(capture, keypoints[0])
-    before = measure(cameras, keypoints)
-    _check_convention(capture, cameras, keypoints, before)
-    used, held_out_px, notes = refine(capture, cameras, keypoints, before, settings)
-    after = before if used is cameras else measure(used, keypoints)
-    _check_result(capture, after, settings)
-    verdicts = {}
-    for old, new in zip(cameras, used, strict=True):
-        reasons = _size_reasons(capture, old.name) + _fit_reasons(old.name, cameras, keypoints, before, settings)
-        verdicts[old.name] = _verdict(old, new, before, after, reasons, settings)
-    if sum(v.status != "rejected" for v in verdicts.values()) < 2:
-        raise CaptureError(f"{capture.name}: fewer than two cameras agree on the person; calibrate again")
-    every = capture.cameras | {camera.name: camera for camera in used}
-    return CalibrationReport(every, verdicts, before, after, held_out_px, tuple(notes), capture.up)
+    return np.stack([found[name] for name in capture.train_cameras])
 
 
 def _check_numbers(capture: Capture) -> None:
@@ -85,13 +127,8 @@ def _check_convention(capture: Capture, cameras: Sequence[Camera], keypoints: np
             )
 
 
-def _check_result(capture: Capture, found: Measure, settings: CalibrationSettings) -> None:
-    """CaptureError if no set of cameras agrees on the person, or the person would be a giant or a dwarf."""
-    if min(found.cost_px, *found.cost_without_px.values(), np.inf) > REJECT_FACTOR * settings.max_residual_px:
-        raise CaptureError(
-            f"{capture.name}: the cameras do not see one person (keypoints off by {found.cost_px:.0f} px) and no known "
-            "mistake explains it; check which files belong to which camera, or calibrate again"
-        )
+def _check_height(capture: Capture, found: Measure) -> None:
+    """CaptureError if the person would be a giant or a dwarf, naming the unit that makes him one of us."""
     low, high = BODY_HEIGHT_M
     if low <= found.body_height_m <= high or np.isnan(found.body_height_m):
         return
@@ -100,17 +137,18 @@ def _check_result(capture: Capture, found: Measure, settings: CalibrationSetting
     raise CaptureError(f"{capture.name}: the person would be {found.body_height_m:.4g} m tall; {cause}")
 
 
-def _size_reasons(capture: Capture, name: str) -> list[str]:
-    calibrated, recorded = capture.calibrated_sizes_px[name], capture.recorded_sizes_px[name]
-    if calibrated == recorded:
-        return []
-    return [f"calibrated at {calibrated[0]}x{calibrated[1]}, recorded at {recorded[0]}x{recorded[1]}"]
+def _check_agreement(capture: Capture, found: Measure, settings: CalibrationSettings) -> None:
+    """CaptureError if no set of cameras agrees on the person."""
+    if min(found.cost_px, *found.cost_without_px.values(), np.inf) > REJECT_FACTOR * settings.max_residual_px:
+        raise CaptureError(
+            f"{capture.name}: the cameras do not see one person (keypoints off by {found.cost_px:.0f} px) and no known "
+            "mistake explains it; check which files belong to which camera, or calibrate again"
+        )
+    _check_height(capture, found)
 
 
-def _fit_reasons(
-    name: str, cameras: Sequence[Camera], keypoints: np.ndarray, before: Measure, settings: CalibrationSettings
-) -> list[str]:
-    """What is wrong with a camera as given, and why if one mistake explains it."""
+def _fit_reasons(name: str, before: Measure, settings: CalibrationSettings) -> list[str]:
+    """What is wrong with a camera as given."""
     reasons = []
     if before.median_px[name] > settings.max_residual_px:
         reasons.append(
@@ -119,21 +157,40 @@ def _fit_reasons(
     if before.misfit == name:
         falls = f"from {before.cost_px:.1f} to {before.cost_without_px[name]:.1f} px"
         reasons.append(f"as given, the worst fit: without it the trimmed cost falls {falls}")
-        cause = explain(cameras, keypoints, of=name) if before.cost_px > gross_limit_px(keypoints) else None
-        reasons += [f"likely cause: {cause}"] if cause else []
     return reasons
 
 
+def _timing_reason(offset_frames: float, left: Timing) -> str:
+    """What is known about a camera's offset in time: as corrected, and as measured after that."""
+    if offset_frames:
+        return f"out of step by {offset_frames:+.2f} +- {left.error_frames:.2f} frames: corrected"
+    if left.reason:
+        return f"offset in time not observable: {left.reason}"
+    return f"in step: measured offset {left.offset_frames:+.2f} +- {left.error_frames:.2f} frames"
+
+
+def _change_reasons(old: Camera, new: Camera) -> list[str]:
+    """By how much a camera was changed."""
+    if new is old:
+        return []
+    turned_deg = np.rad2deg(np.linalg.norm(cv2.Rodrigues(new.R @ old.R.T)[0]))
+    moved_cm = 100 * np.linalg.norm(new.centre_m - old.centre_m)
+    zoomed = 100 * (new.K[0, 0] / old.K[0, 0] - 1)
+    lens = f", focal length changed by {zoomed:+.1f} %" if new.K[0, 0] != old.K[0, 0] else ""
+    return [f"turned by {turned_deg:.2f} degrees, moved by {moved_cm:.1f} cm{lens}"]
+
+
 def _verdict(
-    old: Camera, new: Camera, before: Measure, after: Measure, reasons: list[str], settings: CalibrationSettings
+    name: str,
+    status: str,
+    before: Measure,
+    after: Measure,
+    offset_frames: float,
+    timing: Timing,
+    reasons: list[str],
+    settings: CalibrationSettings,
 ) -> CameraVerdict:
-    """Status of one training camera; reasons to come first are given."""
-    name, status = old.name, "ok"
-    if new is not old:
-        status = "refined"
-        turned_deg = np.rad2deg(np.linalg.norm(cv2.Rodrigues(new.R @ old.R.T)[0]))
-        moved_cm = 100 * np.linalg.norm(new.centre_m - old.centre_m)
-        reasons = [*reasons, f"refined: turned by {turned_deg:.2f} degrees, moved by {moved_cm:.1f} cm"]
+    """One training camera's; worse than `status` where its residuals are still too large."""
     if after.median_px[name] > settings.max_residual_px:
         status = "suspect"
         reasons = [*reasons, f"as used, median residual is still {after.median_px[name]:.1f} px"]
@@ -146,9 +203,22 @@ def _verdict(
         p95_px=after.p95_px[name],
         median_before_px=before.median_px[name],
         p95_before_px=before.p95_px[name],
-        frame_offset=0,
+        frame_offset=offset_frames,
+        timing=timing,
         reasons=tuple(reasons),
     )
+
+
+def _unchecked(capture: Capture) -> CalibrationReport:
+    """Poses are given, but nothing was detected that could speak for or against the cameras they were fitted with."""
+    notes = ("not checked: the recording has no keypoints; cameras are used as given, with the poses given for them",)
+    verdicts = {
+        name: CameraVerdict(
+            "ok", None, None, None, None, 0.0, Timing.unknown("no keypoints"), tuple(size_reasons(capture, name))
+        )
+        for name in capture.train_cameras
+    }
+    return CalibrationReport(capture.cameras, verdicts, None, None, {}, {}, notes, capture.up, None)
 
 
 def _monocular(capture: Capture, keypoints: np.ndarray) -> CalibrationReport:
@@ -159,5 +229,7 @@ def _monocular(capture: Capture, keypoints: np.ndarray) -> CalibrationReport:
         f"one training camera: the person is seen in {shown} of {len(capture.frames)} frames",
         "not checked with one camera: reprojection, units, body height, direction of extrinsics, leave-one-out",
     )
-    verdict = CameraVerdict("ok", None, None, None, None, 0, tuple(_size_reasons(capture, name)))
-    return CalibrationReport(capture.cameras, {name: verdict}, None, None, {}, notes, capture.up)
+    camera = capture.cameras[name]
+    reasons = size_reasons(capture, name) + intrinsics_reasons(camera) + ground_reasons(camera, keypoints, capture.up)
+    verdict = CameraVerdict("ok", None, None, None, None, 0.0, Timing.unknown("one camera"), tuple(reasons))
+    return CalibrationReport(capture.cameras, {name: verdict}, None, None, {}, {}, notes, capture.up, None)

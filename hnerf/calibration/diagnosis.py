@@ -28,6 +28,10 @@ MISTAKES: dict[str, Callable[[Camera], Camera]] = {  # what was done, and what u
         c, R=np.diag([1, -1, -1]) @ c.R, t_m=np.diag([1, -1, -1]) @ c.t_m
     ),
 }
+MISTAKES_OF_ONE: dict[str, Callable[[Camera], Camera]] = {  # in all cameras they only scale the world
+    f"T is in {unit}": lambda c, metres=metres: dataclasses.replace(c, t_m=metres * c.t_m)  # type: ignore[misc]
+    for unit, metres in UNITS_M.items()
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,17 +77,20 @@ def measure(cameras: Sequence[Camera], keypoints: np.ndarray) -> Measure:
 
 
 def trimmed_cost_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> float:
-    """Mean of the lowest four fifths of the distances of keypoints (C, K, 3) to points solved from all their views.
+    """Mean over cameras of the mean of the lowest four fifths of the distances of its keypoints (C, K, 3) to points
+    solved from all their views.
 
-    No view is left out, so no camera can hide. Behind a camera that sees it, a point costs that image's diagonal.
+    No view is left out of the points, nor a camera trimmed away as a whole: none can hide. Behind a camera that sees
+    it, a point costs that image's diagonal.
     """
     projections = np.stack([camera.projection for camera in cameras])
     seen = keypoints[..., 2] > 0
     points_m, _, _ = triangulate(projections, keypoints, inlier_px=np.inf)
     diagonal_px = np.array([[np.hypot(c.width_px, c.height_px)] for c in cameras])
     residuals = np.fmin(reprojection_px(projections, points_m, keypoints), diagonal_px)
-    ordered = np.sort(residuals[seen & (seen.sum(0) >= 2)])
-    return float(ordered[: max(1, int(TRIM * len(ordered)))].mean()) if len(ordered) else np.inf
+    rows = [np.sort(row[use]) for row, use in zip(residuals, seen & (seen.sum(0) >= 2), strict=True)]
+    costs = [row[: max(1, int(TRIM * len(row)))].mean() for row in rows if len(row)]
+    return float(np.mean(costs)) if costs else np.inf
 
 
 def cost_without_each_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> dict[str, float]:
@@ -123,13 +130,41 @@ def gross_limit_px(keypoints: np.ndarray) -> float:
     return GROSS_SHARE * float(np.median(heights[heights > 0]))
 
 
-def explain(cameras: Sequence[Camera], keypoints: np.ndarray, of: str | None = None) -> str | None:
-    """The mistakes of convention that, undone in camera `of` or in all, make the calibration fit keypoints
-    (C, frames, 25, 3), joined by "or" where the views cannot tell them apart; None if none does."""
+def explain(cameras: Sequence[Camera], keypoints: np.ndarray) -> str | None:
+    """The mistakes of convention that, undone in all cameras, make the calibration fit keypoints (C, frames, 25, 3),
+    joined by "or" where the views cannot tell them apart; None if none does."""
     flat, limit_px = keypoints.reshape(len(cameras), -1, 3), gross_limit_px(keypoints)
-    explaining = []
-    for cause, undo in MISTAKES.items():
-        repaired = [undo(camera) if of in (None, camera.name) else camera for camera in cameras]
-        if trimmed_cost_px(repaired, flat) <= limit_px:
-            explaining.append(cause)
+    explaining = [
+        cause for cause, undo in MISTAKES.items() if trimmed_cost_px([undo(c) for c in cameras], flat) <= limit_px
+    ]
     return " or ".join(explaining) or None
+
+
+def undo_mistake(cameras: list[Camera], keypoints: np.ndarray) -> tuple[list[Camera], dict[str, str]]:
+    """The cameras with one's mistake undone, and that mistake by the camera's name, where this alone makes a grossly
+    wrong camera fit keypoints (C, frames, 25, 3). Two mistakes that come to the same are joined by "or"."""
+    flat, limit_px = keypoints.reshape(len(cameras), -1, 3), gross_limit_px(keypoints)
+    gross = np.flatnonzero(_medians_px(cameras, flat) > limit_px)
+    if len(cameras) < 3 or len(gross) == 0:
+        return cameras, {}
+    undone = {
+        (i, cause): [*cameras[:i], undo(cameras[i]), *cameras[i + 1 :]]
+        for i in gross
+        for cause, undo in (MISTAKES | MISTAKES_OF_ONE).items()
+    }
+    medians_px = {what: _medians_px(repaired, flat) for what, repaired in undone.items()}
+    costs_px = {what: medians.sum() for what, medians in medians_px.items() if medians.max() <= limit_px}
+    if not costs_px:
+        return cameras, {}
+    best = min(costs_px, key=costs_px.__getitem__)
+    causes = [cause for (i, cause), cost in costs_px.items() if i == best[0] and np.isclose(cost, costs_px[best])]
+    return undone[best], {cameras[best[0]].name: " or ".join(causes)}
+
+
+def _medians_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> np.ndarray:
+    """Median residual of each camera (C,) against robustly triangulated keypoints (C, K, 3); infinitely far are points
+    behind it."""
+    points_m, residuals_px, _ = triangulate(np.stack([camera.projection for camera in cameras]), keypoints)
+    judged = (keypoints[..., 2] > 0) & np.isfinite(points_m).all(1)
+    off_px = np.where(np.isfinite(residuals_px), residuals_px, np.inf)
+    return np.array([np.median(row[use]) if use.any() else np.inf for row, use in zip(off_px, judged, strict=True)])

@@ -1,44 +1,130 @@
-"""Refinement of camera poses, taken only where frames that took no part prove it right."""
+"""Refinement of cameras, taken only where frames and joints that took no part prove it right, and outlines agree."""
 
 import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from hnerf.calibration.bundle import adjust
-from hnerf.calibration.diagnosis import Measure, trimmed_cost_px
-from hnerf.calibration.sizes import CHANGES
+from hnerf.calibration.diagnosis import measure, trimmed_cost_px
+from hnerf.calibration.silhouettes import Outlines
+from hnerf.calibration.sizes import CHANGES, unexplained
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
 
+OUTLINE_NOISE, OUTLINE_NOISE_PX = 0.05, 0.05  # a share, and pixels, by which outlines may fit worse by chance
+
 log = logging.getLogger("hnerf.calibration")
 
 
-def refine(
-    capture: Capture, cameras: list[Camera], keypoints: np.ndarray, before: Measure, settings: CalibrationSettings
-) -> tuple[list[Camera], dict[str, float], list[str]]:
-    """Cameras to use, held-out costs of everything that was tried, and notes.
+@dataclass(frozen=True)
+class Refinement:
+    """Cameras to use; costs in px of everything tried, on held-out frames and of outlines; why, per camera and for the
+    rig."""
 
-    Tried where residuals are too large or one camera does not fit the rest; the very `cameras` are returned unless
-    held-out frames gain. `before`: what `measure` found; keypoints (C, frames, 25, 3).
+    cameras: list[Camera]
+    held_out_px: dict[str, float]
+    outlines_px: dict[str, float]
+    reasons: dict[str, str]
+    notes: list[str]
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """Cameras as they could be used, what was done to which of them, and what held-out frames cost with them."""
+
+    cameras: list[Camera]
+    done: dict[str, str]
+    cost_px: float
+
+
+def refine(
+    capture: Capture,
+    cameras: list[Camera],
+    keypoints: np.ndarray,
+    outlines: Outlines | None,
+    settings: CalibrationSettings,
+) -> Refinement:
+    """Adjust the cameras that do not fit the others; the very `cameras` are returned unless held-out frames gain.
+
+    Camera by camera, the others fixed; all at once where that asks for more than one, or leaves residuals too large.
+    keypoints (C, frames, 25, 3).
     """
-    if max(before.median_px.values()) <= settings.max_residual_px and before.misfit is None:
-        return cameras, {}, []
     keep = 1 - settings.min_improvement
+    held_out_px = {"as given": held_out_cost_px(cameras, keypoints, ())}
+    chosen, kept = _one_by_one(cameras, keypoints, keep, held_out_px)
+    too_large = max(measure(chosen.cameras, keypoints).median_px.values()) > settings.max_residual_px
+    if len(chosen.done) > 1 or too_large:
+        together = _all_at_once(cameras, keypoints, held_out_px)
+        chosen = together if together.cost_px < keep * chosen.cost_px else chosen
+    if not chosen.done:
+        notes = ["refinement did not improve held-out frames: the cameras are used as given"] if too_large else []
+        return Refinement(cameras, held_out_px, {}, kept, notes)
+    free = tuple(chosen.done)
+    refined, notes = _resized(capture, chosen.cameras, keypoints, free, keep * chosen.cost_px, held_out_px)
+    if refined is not chosen.cameras:
+        refined = adjust(refined, keypoints, free)
+    outlines_px, refusal = _judge_by_outlines(outlines, cameras, refined)
+    if refusal:
+        return Refinement(cameras, held_out_px, outlines_px, kept, [refusal])
+    return Refinement(refined, held_out_px, outlines_px, kept | chosen.done, notes)
+
+
+def _one_by_one(
+    cameras: list[Camera], keypoints: np.ndarray, keep: float, held_out_px: dict[str, float]
+) -> tuple[_Candidate, dict[str, str]]:
+    """Free the camera that lets held-out frames gain most, then one more, until two are left or none gains enough.
+
+    Adds to `held_out_px` what everything cost; returns with the outcome why the other cameras stay as they are.
+    """
+    kept = {camera.name: "pose kept: it takes two others to judge one camera" for camera in cameras}
+    cost_px, done, zoomed = held_out_px["as given"], dict[str, str](), tuple[str, ...]()
+    for _ in cameras[2:]:
+        tried = {}
+        for name in (camera.name for camera in cameras if camera.name not in done):
+            what = f"pose of {' and '.join([*done, name])} refined"
+            log.info("trying: %s", what)
+            tried[name] = held_out_px[what] = held_out_cost_px(cameras, keypoints, (*done, name), zoomed)
+            kept[name] = f"pose kept: refining it takes held-out frames {_gain(cost_px, tried[name])}"
+        name = min(tried, key=tried.__getitem__)
+        if tried[name] >= keep * cost_px:
+            break
+        what = f"pose of {' and '.join([*done, name])} and focal length of {name} refined"
+        held_out_px[what] = held_out_cost_px(cameras, keypoints, (*done, name), (*zoomed, name))
+        focal = held_out_px[what] < keep * tried[name]
+        gained_px = held_out_px[what] if focal else tried[name]
+        done[name] = f"pose {'and focal length ' * focal}refined: held-out frames go {_gain(cost_px, gained_px)}"
+        cost_px, zoomed = gained_px, (*zoomed, name) if focal else zoomed
+    adjusted = adjust(cameras, keypoints, tuple(done), zoomed) if done else cameras
+    return _Candidate(adjusted, done, cost_px), kept
+
+
+def _all_at_once(cameras: list[Camera], keypoints: np.ndarray, held_out_px: dict[str, float]) -> _Candidate:
+    """All poses free; adds to `held_out_px` what that cost."""
+    log.info("trying: all poses refined")
     everyone = tuple(camera.name for camera in cameras)
-    held_out_px = {"as given": halves_cost_px(cameras, keypoints)}
-    best, free = held_out_px["as given"], None
-    for candidate in ([(before.worst,)] if before.worst else []) + [everyone]:
-        what = "all poses refined" if candidate == everyone else f"pose of {before.worst} refined"
-        log.info("trying: %s", what)
-        held_out_px[what] = held_out_cost_px(cameras, keypoints, candidate)
-        if held_out_px[what] < keep * best:
-            best, free = held_out_px[what], candidate
-    if free is None:
-        return cameras, held_out_px, ["refinement did not improve held-out frames: the cameras are used as given"]
-    start, note = _resized(capture, cameras, keypoints, free, keep * best, held_out_px)
-    return adjust(start, keypoints, free), held_out_px, note
+    cost_px = held_out_px["all poses refined"] = held_out_cost_px(cameras, keypoints, everyone)
+    done = f"refined with all others: held-out frames go {_gain(held_out_px['as given'], cost_px)}"
+    return _Candidate(adjust(cameras, keypoints, everyone), dict.fromkeys(everyone, done), cost_px)
+
+
+def _gain(before_px: float, after_px: float) -> str:
+    return f"from {before_px:.2f} to {after_px:.2f} px"
+
+
+def _judge_by_outlines(
+    outlines: Outlines | None, given: list[Camera], refined: list[Camera]
+) -> tuple[dict[str, float], str]:
+    """What the person's outlines cost before and after, and why that forbids the refinement, else nothing."""
+    if outlines is None:
+        return {}, ""
+    costs_px = {"as given": outlines.cost_px(given), "refined": outlines.cost_px(refined)}
+    if costs_px["refined"] <= costs_px["as given"] + max(OUTLINE_NOISE_PX, OUTLINE_NOISE * costs_px["as given"]):
+        return costs_px, ""
+    worse = _gain(costs_px["as given"], costs_px["refined"])
+    return costs_px, f"refinement refused: keypoints gain by it, but the person's outlines fit worse, {worse}"
 
 
 def _resized(
@@ -49,17 +135,18 @@ def _resized(
     must_beat_px: float,
     held_out_px: dict[str, float],
 ) -> tuple[list[Camera], list[str]]:
-    """Intrinsics that explain a recorded size other than the calibrated one, if held-out frames prove them.
+    """Intrinsics that explain recorded sizes that black bars do not, if held-out frames prove them.
 
     Adds the costs of what was tried to `held_out_px`.
     """
-    sizes = {c.name: (capture.calibrated_sizes_px[c.name], capture.recorded_sizes_px[c.name]) for c in cameras}
-    if all(calibrated == recorded for calibrated, recorded in sizes.values()):
+    doubtful = [c.name for c in cameras if unexplained(capture, c.name)]
+    if not doubtful:
         return cameras, []
+    sizes = {name: (capture.calibrated_sizes_px[name], capture.recorded_sizes_px[name]) for name in doubtful}
     tried = {}
     for what, change in CHANGES.items():
         log.info("trying: pictures were %s", what)
-        tried[what] = [change(c, *sizes[c.name]) if sizes[c.name][0] != sizes[c.name][1] else c for c in cameras]
+        tried[what] = [change(c, *sizes[c.name]) if c.name in sizes else c for c in cameras]
         held_out_px[f"and pictures {what}"] = held_out_cost_px(tried[what], keypoints, free)
     best = min(tried, key=lambda what: held_out_px[f"and pictures {what}"])
     if held_out_px[f"and pictures {best}"] >= must_beat_px:
@@ -67,16 +154,17 @@ def _resized(
     return tried[best], [f"pictures of another size than calibrated were {best}: intrinsics changed to match"]
 
 
-def halves_cost_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> float:
-    """Trimmed cost of the cameras as they are, mean of both halves of the frames of keypoints (C, frames, 25, 3)."""
-    halves = np.array_split(keypoints, 2, axis=1)
-    return float(np.mean([trimmed_cost_px(cameras, half.reshape(len(cameras), -1, 3)) for half in halves]))
+def held_out_cost_px(
+    cameras: Sequence[Camera], keypoints: np.ndarray, free: Sequence[str], focal: Sequence[str] = ()
+) -> float:
+    """Trimmed cost of keypoints (C, frames, 25, 3), each part judged with cameras that were adjusted to another part.
 
-
-def held_out_cost_px(cameras: Sequence[Camera], keypoints: np.ndarray, free: Sequence[str]) -> float:
-    """The same, each half judged with cameras that were adjusted to the other half."""
-    halves = np.array_split(keypoints, 2, axis=1)
+    The parts share neither frames nor joints: what a detector gets wrong about one joint, in frame after frame, does
+    not prove a camera wrong.
+    """
+    first, second = np.array_split(keypoints, 2, axis=1)
     costs = []
-    for fitted, judged in (halves, halves[::-1]):
-        costs.append(trimmed_cost_px(adjust(cameras, fitted, free), judged.reshape(len(cameras), -1, 3)))
+    for fitted, judged in ((first[:, :, ::2], second[:, :, 1::2]), (second[:, :, 1::2], first[:, :, ::2])):
+        adjusted = adjust(cameras, fitted, free, focal) if free else cameras
+        costs.append(trimmed_cost_px(adjusted, judged.reshape(len(cameras), -1, 3)))
     return float(np.mean(costs))

@@ -12,6 +12,9 @@ import numpy as np
 
 from hnerf.calibration.diagnosis import Measure
 from hnerf.calibration.picture import draw_cameras
+from hnerf.calibration.sheet import draw_witnesses
+from hnerf.calibration.synchronise import Timing
+from hnerf.calibration.witnesses import Witnesses
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.errors import CaptureError
@@ -21,29 +24,46 @@ SEVERITY = ("ok", "refined", "suspect", "rejected")
 
 @dataclass(frozen=True)
 class CameraVerdict:
-    """status: one of SEVERITY; residuals in pixels, None with one camera only; reasons in words."""
+    """status: one of SEVERITY; residuals in pixels, None with one camera only; frame_offset: as corrected, the frame of
+    this camera at the others' frame 0; timing: the offset as measured; reasons in words."""
 
     status: str
     median_px: float | None
     p95_px: float | None
     median_before_px: float | None
     p95_before_px: float | None
-    frame_offset: int
+    frame_offset: float
+    timing: Timing
     reasons: tuple[str, ...]
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON has it."""
+        timing = self.timing
+        offset = {
+            "observable": not timing.reason,
+            "frames": None if np.isnan(timing.offset_frames) else timing.offset_frames,
+            "standard_error_frames": None if np.isnan(timing.error_frames) else timing.error_frames,
+            "reason": timing.reason,
+        }
+        return dataclasses.asdict(self) | {"timing": offset}
 
 
 @dataclass(frozen=True)
 class CalibrationReport:
     """cameras: as used from here on, test cameras too; verdicts: of the training cameras. before, after: None with one
-    training camera. notes: what concerns the whole rig, and the checks that could not be made."""
+    training camera. held_out_px, outlines_px: what each correction that was tried cost on held-out frames and by the
+    person's outlines. notes: what concerns the whole rig, and the checks that could not be made. witnesses: None with
+    one training camera."""
 
     cameras: dict[str, Camera]
     verdicts: dict[str, CameraVerdict]
     before: Measure | None
     after: Measure | None
     held_out_px: dict[str, float]
+    outlines_px: dict[str, float]
     notes: tuple[str, ...]
     up: str
+    witnesses: Witnesses | None
 
     @property
     def verdict(self) -> str:
@@ -51,18 +71,22 @@ class CalibrationReport:
         return max((v.status for v in self.verdicts.values()), key=SEVERITY.index)
 
     def save(self, out: Path) -> None:
-        """Write `intri.yml`, `extri.yml` (EasyMocap, without rejected cameras), `report.json` and `cameras.png`."""
+        """Write `intri.yml`, `extri.yml` (EasyMocap, without rejected cameras), `report.json`, `cameras.png`, and where
+        there are witnesses, `witnesses.png`."""
         out.mkdir(parents=True, exist_ok=True)
         rejected = {name for name, v in self.verdicts.items() if v.status == "rejected"}
         _write_easymocap(out, [camera for name, camera in self.cameras.items() if name not in rejected])
         (out / "report.json").write_text(json.dumps(self._plain(), indent=1))
         status = {name: self.verdicts[name].status if name in self.verdicts else "unjudged" for name in self.cameras}
         draw_cameras(out / "cameras.png", list(self.cameras.values()), status, self.up, self.before, self.after)
+        if self.witnesses and self.after:
+            used = [self.cameras[name] for name in self.verdicts]
+            draw_witnesses(out / "witnesses.png", self.witnesses, used, self.after)
 
     def _plain(self) -> dict[str, Any]:
         return {
             "verdict": self.verdict,
-            "cameras": {name: dataclasses.asdict(v) for name, v in self.verdicts.items()},
+            "cameras": {name: v.plain() for name, v in self.verdicts.items()},
             "unjudged_cameras": [name for name in self.cameras if name not in self.verdicts],
             "body_height_m": self.after and self.after.body_height_m,
             "trimmed_cost_px": {
@@ -74,12 +98,25 @@ class CalibrationReport:
                 "after": self.after and self.after.cost_without_px,
             },
             "held_out_cost_px": self.held_out_px,
+            "outlines_cost_px": self.outlines_px,
             "notes": self.notes,
+            "witnesses": self._heard(),
+        }
+
+    def _heard(self) -> dict[str, Any]:
+        """What the witnesses say of the cameras as given and as used; nothing of one camera."""
+        if self.witnesses is None or self.before is None or self.after is None:
+            return {}
+        given = self.witnesses.capture.cameras
+        return {
+            "as_given": self.witnesses.plain([given[name] for name in self.verdicts], self.before),
+            "as_used": self.witnesses.plain([self.cameras[name] for name in self.verdicts], self.after),
+            "board_footage": self.witnesses.boards or "none: the recording has no calibration/ footage of a board",
         }
 
 
 def load_cameras(out: Path, capture: Capture) -> Capture:
-    """The capture seen through the cameras that `save` wrote; rejected training cameras are gone."""
+    """The capture seen through the cameras that `save` wrote, and in step; rejected training cameras are gone."""
     intri, extri = (cv2.FileStorage(str(out / name), cv2.FILE_STORAGE_READ) for name in ("intri.yml", "extri.yml"))
     if not (intri.isOpened() and extri.isOpened()):
         raise CaptureError(f"{out}: intri.yml or extri.yml cannot be read; run the calibration stage again")
@@ -95,7 +132,10 @@ def load_cameras(out: Path, capture: Capture) -> Capture:
         for name in kept
     }
     train_cameras = tuple(name for name in capture.train_cameras if name in cameras)
-    return dataclasses.replace(capture.with_cameras(cameras), train_cameras=train_cameras)
+    found = json.loads((out / "report.json").read_text())["cameras"]
+    offsets = {name: found[name]["frame_offset"] for name in train_cameras if found[name]["frame_offset"]}
+    used = dataclasses.replace(capture.with_cameras(cameras), train_cameras=train_cameras)
+    return used.synchronised(offsets) if offsets else used
 
 
 def _write_easymocap(out: Path, cameras: Sequence[Camera]) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
 
 Change = Callable[[Camera, tuple[int, int], tuple[int, int]], Camera]
 
@@ -39,3 +40,24 @@ CHANGES: dict[str, Change] = {  # none: cropped or padded on the right and at th
     "stretched": _stretched,
     "scaled and padded evenly": _scaled_and_padded,
 }
+
+
+def unexplained(capture: Capture, name: str) -> bool:
+    """Whether a camera recorded another size than it was calibrated at, and no black bars say what was done."""
+    other = capture.calibrated_sizes_px[name] != capture.recorded_sizes_px[name]
+    return other and name not in capture.picture_areas_px
+
+
+def size_reasons(capture: Capture, name: str) -> list[str]:
+    """What is known of a recorded size other than the calibrated one, in words; none where they are the same."""
+    calibrated, recorded = capture.calibrated_sizes_px[name], capture.recorded_sizes_px[name]
+    if calibrated == recorded:
+        return []
+    sizes = f"calibrated at {calibrated[0]}x{calibrated[1]}, recorded at {recorded[0]}x{recorded[1]}"
+    if unexplained(capture, name):
+        return [f"{sizes}: no black bars prove what was done to the picture"]
+    area = capture.picture_areas_px[name]
+    return [
+        f"{sizes}: black bars prove that the picture was scaled by {area.width / calibrated[0]:.4f} and put "
+        f"{area.left:.1f} px from the left and {area.top:.1f} px from the top; intrinsics changed to match"
+    ]

@@ -13,6 +13,7 @@ MIN_INLIER_PX = 3.0
 AGREEMENT_REACH = 0.15  # of a person's height in the image: where a detection stops supporting a hypothesis
 UNEXPLAINED = 0.1  # weight of a detection that the other cameras do not support: a camera may be badly calibrated
 CANDIDATES = 8  # combinations of people kept a frame
+SINGULAR = 1e-12  # of the normal equations' trace: parallel rays meet far away instead of nowhere
 JUMP_COST = 0.5  # of one camera's best score, for moving by the person's own height between frames
 
 
@@ -70,19 +71,23 @@ def _best_pair(projections: np.ndarray, keypoints: np.ndarray, confidence: np.nd
 
 
 def _solve(projections: np.ndarray, keypoints: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Weighted linear triangulation (K, 3), re-weighted once by depth to minimise pixels; NaN under two views."""
+    """Weighted linear triangulation (K, 3), re-weighted once by depth to minimise pixels; NaN under two views.
+
+    Hartley and Sturm 1997, section 5.2, "Iterative-LS": inhomogeneous normal equations, the same wherever the origin.
+    """
     rows = projections[:, None, 2:] * np.nan_to_num(keypoints)[..., :2, None] - projections[:, None, :2]  # (C, K, 2, 4)
     focal = np.linalg.norm(projections[:, :2, :3], axis=-1).mean(1)
+    outer = np.einsum("ckia,ckib->ckab", rows, rows) / focal[:, None, None, None] ** 2
     scale = np.where(weights > 0, np.sqrt(weights), 0)
     enough = (weights > 0).sum(0) >= 2
-    points = np.zeros((keypoints.shape[1], 4))
+    points_m = np.full((keypoints.shape[1], 3), np.nan)
     for _ in range(2):
-        normal = np.einsum("ckia,ckib,ck->kab", rows, rows, (scale / focal[:, None]) ** 2, optimize=True)
-        points[enough] = np.linalg.eigh(normal[enough])[1][..., 0]
-        depth = np.abs(np.einsum("ca,ka->ck", projections[:, 2], points)) / np.linalg.norm(points, axis=1).clip(1e-12)
-        scale = np.sqrt(weights.clip(0)) / depth.clip(1e-9)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(enough[:, None], points[:, :3] / points[:, 3:], np.nan)
+        normal = np.einsum("ckab,ck->kab", outer, scale**2)[enough]
+        damping = SINGULAR * np.trace(normal[:, :3, :3], axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        points_m[enough] = -np.linalg.solve(normal[:, :3, :3] + damping, normal[:, :3, 3:])[..., 0]
+        depth = np.abs(projections[:, 2, :3] @ points_m.T + projections[:, 2, 3:])
+        scale = np.where(enough, np.sqrt(weights.clip(0)) / depth.clip(1e-9), 0)
+    return points_m
 
 
 def reprojection_px(projections: np.ndarray, points_m: np.ndarray, keypoints: np.ndarray) -> np.ndarray:

@@ -1,7 +1,8 @@
 """What was recorded: the normalised capture that every later stage reads.
 
 A normalised capture is a folder with `capture.json`, `images/<camera>/<frame:06d>.<ext>` (undistorted), and where the
-recording has them `background/<camera>.<ext>` (clean plates), `masks/<camera>/<frame:06d>.png` and `keypoints.npz`.
+recording has them `background/<camera>.<ext>` (clean plates), `masks/<camera>/<frame:06d>.png`, `keypoints.npz` and
+`poses.npz`.
 """
 
 import dataclasses
@@ -13,7 +14,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hnerf.capture.bars import Area
 from hnerf.capture.camera import Camera
+from hnerf.capture.given_poses import GivenPoses
+from hnerf.capture.timing import nearest_frame, resample
 from hnerf.errors import CaptureError
 
 
@@ -22,7 +26,10 @@ class Capture:
     """Cameras, frames, splits and where the pixels lie. Test cameras are for scoring only.
 
     `calibrated_sizes_px`: per camera the (width, height) that the calibration was made at, before any normalisation;
-    `recorded_sizes_px`: the (width, height) of the files as recorded. `up`: "z" or "y", the world's vertical axis.
+    `recorded_sizes_px`: the (width, height) of the files as recorded; `picture_areas_px`: where in the recorded picture
+    black bars prove the calibrated one to lie, for which K was changed at the door. `up`: "z" or "y", the world's
+    vertical axis. `frame_offsets`: of cameras out of step (hnerf.capture.timing); `stored_frames`: what the files hold,
+    where frames were dropped since.
     """
 
     name: str
@@ -36,6 +43,9 @@ class Capture:
     up: str
     calibrated_sizes_px: dict[str, tuple[int, int]]
     recorded_sizes_px: dict[str, tuple[int, int]]
+    picture_areas_px: dict[str, Area] = dataclasses.field(default_factory=dict)
+    frame_offsets: dict[str, float] = dataclasses.field(default_factory=dict)
+    stored_frames: tuple[int, ...] = ()
 
     @property
     def frames(self) -> tuple[int, ...]:
@@ -43,8 +53,8 @@ class Capture:
         return tuple(sorted(set(self.train_frames) | set(self.novel_pose_frames)))
 
     def image(self, camera: str, frame: int) -> np.ndarray:
-        """(H, W, 3) uint8 RGB."""
-        return read_rgb(_only(self.root / "images" / camera, f"{frame:06d}"))
+        """(H, W, 3) uint8 RGB, of the recorded frame nearest in time."""
+        return read_rgb(_only(self.root / "images" / camera, f"{self._recorded(camera, frame):06d}"))
 
     def background(self, camera: str) -> np.ndarray | None:
         """Clean plate, (H, W, 3) uint8 RGB, or None where the recording has none."""
@@ -52,8 +62,8 @@ class Capture:
         return read_rgb(found[0]) if found else None
 
     def given_mask(self, camera: str, frame: int) -> np.ndarray | None:
-        """(H, W) bool, True on the person, or None where the recording has none."""
-        path = self.root / "masks" / camera / f"{frame:06d}.png"
+        """(H, W) bool, True on the person, of the recorded frame nearest in time; None where there is none."""
+        path = self.root / "masks" / camera / f"{self._recorded(camera, frame):06d}.png"
         if not path.exists():
             return None
         mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -62,16 +72,51 @@ class Capture:
         return mask > 127
 
     def keypoints(self, camera: str) -> np.ndarray | None:
-        """(frames, people, 25, 3) BODY_25 x_px, y_px, confidence in the order of `frames`; all 0 where absent."""
+        """(frames, people, 25, 3) BODY_25 x_px, y_px, confidence in the order of `frames`; all 0 where absent.
+
+        Between recorded frames where the camera is out of step.
+        """
         path = self.root / "keypoints.npz"
         if not path.exists():
             return None
         with np.load(path, allow_pickle=False) as stored:
-            return stored.get(camera)
+            found = stored.get(camera)
+        if found is None or not self.stored_frames:
+            return found
+        return resample(found, self.stored_frames, np.array(self.frames) + self.frame_offsets.get(camera, 0.0))
+
+    @property
+    def has_keypoints(self) -> bool:
+        """Whether anything was detected in this recording."""
+        return (self.root / "keypoints.npz").exists()
+
+    def given_poses(self) -> GivenPoses | None:
+        """Somebody else's fit of a body model, a row for each of `frames`, or None where the recording has none."""
+        path = self.root / "poses.npz"
+        if not path.exists():
+            return None
+        poses = GivenPoses.load(path)
+        rows = np.searchsorted(self.stored_frames or self.frames, self.frames)
+        return dataclasses.replace(poses, theta=poses.theta[rows], root=poses.root[rows])
 
     def with_cameras(self, cameras: dict[str, Camera]) -> "Capture":
         """The same recording seen through other (refined) cameras."""
         return dataclasses.replace(self, cameras=cameras)
+
+    def synchronised(self, frame_offsets: dict[str, float]) -> "Capture":
+        """The same recording with these cameras' offsets; frames are dropped that one of them did not record."""
+        stored = self.stored_frames or self.frames
+        kept = {f for f in stored if all(nearest_frame(f, o) in stored for o in frame_offsets.values())}
+        return dataclasses.replace(
+            self,
+            train_frames=tuple(f for f in self.train_frames if f in kept),
+            novel_pose_frames=tuple(f for f in self.novel_pose_frames if f in kept),
+            frame_offsets=frame_offsets,
+            stored_frames=stored,
+        )
+
+    def _recorded(self, camera: str, frame: int) -> int:
+        return nearest_frame(frame, self.frame_offsets.get(camera, 0.0))
 
     def save(self) -> None:
         """Write `capture.json` into `root`."""
@@ -95,7 +140,9 @@ class Capture:
         tuples = ("train_cameras", "test_cameras", "train_frames", "novel_pose_frames")
         sizes = ("calibrated_sizes_px", "recorded_sizes_px")
         plain |= {k: tuple(plain[k]) for k in tuples}
+        plain["stored_frames"] = tuple(plain.get("stored_frames", ()))
         plain |= {k: {name: tuple(size) for name, size in plain[k].items()} for k in sizes}
+        plain["picture_areas_px"] = {name: Area(*area) for name, area in plain.get("picture_areas_px", {}).items()}
         return Capture(root=root, cameras=cameras, **plain)
 
 

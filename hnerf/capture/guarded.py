@@ -65,15 +65,21 @@ def numbered(paths: list[Path], what: str) -> dict[int, Path]:
     return by_frame
 
 
-def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """A small UTF-8 text file; CaptureError if it is missing, empty, too large, or not text (a pickle, an archive)."""
+def read_bytes(path: Path, max_bytes: int) -> bytes:
+    """A file's content; CaptureError if it is missing or too large."""
     try:
         size = path.stat().st_size
         if size > max_bytes:
             raise CaptureError(f"{path}: {size} bytes are too many for such a file; export it again")
-        text = path.read_bytes().decode("utf-8")
+        return path.read_bytes()
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read ({error.strerror}); add it to the capture folder") from None
+
+
+def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
+    """A small UTF-8 text file; CaptureError if it is missing, empty, too large, or not text (a pickle, an archive)."""
+    try:
+        text = read_bytes(path, max_bytes).decode("utf-8")
     except UnicodeDecodeError:
         raise CaptureError(f"{path}: is binary where text belongs (a pickle?); export it again as text") from None
     if not text.strip():

@@ -1,16 +1,26 @@
 """The door: a capture folder in any known layout becomes one normalised capture."""
 
+import dataclasses
 import logging
 from pathlib import Path
 
 import numpy as np
 
+from hnerf.capture.bars import Area, fitted, picture_area
+from hnerf.capture.boards import normalised_corners, read_board_footage
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.capture.footage import Footage
+from hnerf.capture.formats.caliscope import Caliscope
+from hnerf.capture.formats.colmap import Colmap
 from hnerf.capture.formats.easymocap import EasyMocap
-from hnerf.capture.formats.layout import Layout, read_openpose
+from hnerf.capture.formats.layout import Layout, Stored
+from hnerf.capture.formats.peoplesnapshot import PeopleSnapshot
 from hnerf.capture.formats.pose2sim import Pose2Sim
+from hnerf.capture.formats.zjumocap import ZjuMocap
+from hnerf.capture.guarded import inside, read_image
+from hnerf.capture.keypoint_files import read_openpose, read_results
+from hnerf.capture.keypoint_sets import to_body_25
 from hnerf.capture.lens import Lens
 from hnerf.capture.normalise import Normaliser
 from hnerf.capture.notes import Notes, capture_name, chosen_cameras, chosen_frames, read_notes
@@ -20,12 +30,21 @@ from hnerf.errors import CaptureError
 DEFAULT_FPS = 30.0
 # Padding and cropping by encoders moves sizes by a few pixels; the calibration stage judges what it did to the cameras.
 SIZE_TOLERANCE = 0.02
+LAYOUTS: tuple[type[Layout], ...] = (
+    ZjuMocap,
+    PeopleSnapshot,
+    Colmap,
+    Caliscope,
+    EasyMocap,
+    Pose2Sim,
+)  # the first that recognises a folder
+BAR_FRAMES = 5  # evenly spread, in which black bars are looked for
 
 log = logging.getLogger("hnerf.capture")
 
 
 def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
-    """Read a capture folder (EasyMocap or Pose2Sim layout) and write it normalised into `out`.
+    """Read a capture folder (any of LAYOUTS) and write it normalised into `out`.
 
     Images are undistorted, and shrunk to `settings.max_side_px`; keypoints and masks with them. CaptureError, one line
     that names the file, on anything missing, unreadable, contradictory or unsafe.
@@ -33,7 +52,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
     layout, notes = recognise(folder), read_notes(folder)
     subject = capture_name(folder, notes)
     lenses = layout.lenses()
-    cameras = chosen_cameras(folder, notes, list(lenses))
+    cameras = chosen_cameras(folder, notes, list(lenses), layout.training_cameras())
     footage = {name: layout.footage(name) for name in cameras.train + cameras.test}
     recorded = _common_frames(footage)
     frames = chosen_frames(folder, notes, recorded, layout.novel_pose_share, settings.max_frames)
@@ -41,17 +60,26 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
 
     out.mkdir(parents=True, exist_ok=True)
     normalisers: dict[str, Normaliser] = {}
-    keypoints: dict[str, np.ndarray] = {}
+    detected: dict[str, np.ndarray] = {}
+    areas: dict[str, Area] = {}
     for name in footage:
         log.info("camera %s: %d frames from %s", name, len(wanted), footage[name].path)
-        normalisers[name] = _write_pixels(layout, lenses[name], footage[name], wanted, settings, out)
-        files = layout.keypoint_files(name)
-        if files:
-            paths = _per_frame(files, wanted, recorded, "keypoints").values()
-            detected = _stack([read_openpose(path) for path in paths])
-            keypoints[name] = normalisers[name].keypoints(layout.to_body_25(detected))
-    if keypoints:
+        lens, area = _lens_as_recorded(lenses[name], footage[name], wanted)
+        areas |= {name: area} if area else {}
+        normalisers[name] = _write_pixels(layout, lens, footage[name], wanted, settings, out)
+        found = _detections(layout, name, wanted, recorded)
+        detected |= {} if found is None else {name: found}
+    if detected:
+        keypoints = {name: normalisers[name].keypoints(k) for name, k in to_body_25(detected, notes.keypoints).items()}
         np.savez_compressed(out / "keypoints.npz", **keypoints)  # type: ignore[arg-type]
+    poses = layout.given_poses(wanted)
+    if poses and not poses.known.any():
+        raise CaptureError(f"{folder}: its poses are of none of these frames; choose others, or take the poses out")
+    if poses:
+        poses.save(out / "poses.npz")
+    boards = read_board_footage(folder, "extrinsic")
+    if boards:
+        normalised_corners(boards, normalisers).save(out)
 
     capture = Capture(
         name=subject,
@@ -65,6 +93,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
         up=notes.up,
         calibrated_sizes_px={name: lenses[name].size_px or n.recorded_size_px for name, n in normalisers.items()},
         recorded_sizes_px={name: n.recorded_size_px for name, n in normalisers.items()},
+        picture_areas_px=areas,
     )
     capture.save()
     return capture
@@ -74,12 +103,13 @@ def recognise(folder: Path) -> Layout:
     """The folder's layout; CaptureError if it is none that is known."""
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder; give the folder of a capture")
-    for layout in (EasyMocap, Pose2Sim):
+    for layout in LAYOUTS:
         if layout.recognises(folder):
             return layout(folder)
     raise CaptureError(
-        f"{folder}: neither EasyMocap (intri.yml, extri.yml, images/) nor Pose2Sim (calibration/, videos/); "
-        "see docs/formats.md"
+        f"{folder}: none of EasyMocap (intri.yml, extri.yml, images/), Pose2Sim (calibration/, videos/), COLMAP "
+        "(sparse/), Caliscope (camera_array.toml), aniposelib (calibration.toml), ZJU-MoCap (annots.npy) and "
+        "PeopleSnapshot (camera.pkl); see docs/formats.md"
     )
 
 
@@ -106,12 +136,14 @@ def _write_pixels(
         source = picture.file or footage.path
         if normaliser is None:
             height_px, width_px = picture.rgb.shape[:2]
-            _check_against_calibration(source, (width_px, height_px), lens)
             normaliser = Normaliser.create(lens, (width_px, height_px), settings.max_side_px)
         stem = f"{picture.frame:06d}"
         normaliser.write_image(picture.rgb, source, picture.file, out / "images" / lens.name / stem)
         if picture.frame in mask_paths:
-            normaliser.write_mask(mask_paths[picture.frame], out / "masks" / lens.name / f"{stem}.png")
+            mask = mask_paths[picture.frame]
+            recorded = mask.read() if isinstance(mask, Stored) else read_image(mask).max(-1)
+            path = mask.path if isinstance(mask, Stored) else mask
+            normaliser.write_mask(recorded, path, out / "masks" / lens.name / f"{stem}.png")
     assert normaliser is not None  # a split has at least one training frame
     plate = layout.plate_file(lens.name)
     if plate:
@@ -119,37 +151,64 @@ def _write_pixels(
     return normaliser
 
 
-def _check_against_calibration(source: Path, recorded: tuple[int, int], lens: Lens) -> None:
-    if lens.size_px is None:
-        return
-    if any(abs(r - c) > SIZE_TOLERANCE * c for r, c in zip(recorded, lens.size_px, strict=True)):
+def _lens_as_recorded(lens: Lens, footage: Footage, frames: tuple[int, ...]) -> tuple[Lens, Area | None]:
+    """The lens for the recorded size, and where in it the calibrated picture lies if black bars prove that.
+
+    Without a proof the lens stays as it is; CaptureError if the sizes are then too far apart.
+    """
+    first = next(footage.read(frames[:1]))
+    recorded_px = (first.rgb.shape[1], first.rgb.shape[0])
+    if lens.size_px in (None, recorded_px):
+        return lens, None
+    chosen = {frames[round(i)] for i in np.linspace(0, len(frames) - 1, BAR_FRAMES)}
+    area = picture_area([p.rgb for p in footage.read(chosen) if p.rgb.shape == first.rgb.shape])
+    matched = fitted(lens, area, recorded_px)
+    if matched:
+        return matched, area
+    if any(abs(r - c) > SIZE_TOLERANCE * c for r, c in zip(recorded_px, lens.size_px, strict=True)):
         raise CaptureError(
-            f"{source}: is {recorded[0]} x {recorded[1]} px, but camera {lens.name} was calibrated at "
-            f"{lens.size_px[0]} x {lens.size_px[1]}; export the footage at that size or calibrate again"
+            f"{first.file or footage.path}: is {recorded_px[0]} x {recorded_px[1]} px, but camera {lens.name} was "
+            f"calibrated at {lens.size_px[0]} x {lens.size_px[1]}; export the footage at that size or calibrate again"
         )
+    return lens, None
 
 
 def _per_frame(
-    files: dict[int, Path], wanted: tuple[int, ...], recorded: tuple[int, ...], what: str
-) -> dict[int, Path]:
+    files: dict[int, Path | Stored], wanted: tuple[int, ...], recorded: tuple[int, ...], what: str
+) -> dict[int, Path | Stored]:
     """The files of the wanted frames, in their order; CaptureError if there is not one for every recorded frame."""
     some = next(iter(files.values()))
+    place = some.path if isinstance(some, Stored) else some.parent
     if len(files) != len(recorded):
-        raise CaptureError(f"{some.parent}: {len(files)} {what} for {len(recorded)} frames; give one file a frame")
+        raise CaptureError(f"{place}: {len(files)} {what} for {len(recorded)} frames; give one a frame")
     for frame in wanted:
         if frame not in files:
-            raise CaptureError(f"{some.parent}: {what} of frame {frame} missing; give one file a frame")
+            raise CaptureError(f"{place}: {what} of frame {frame} missing; give one a frame")
     return {frame: files[frame] for frame in wanted}
 
 
-def _stack(people: list[np.ndarray]) -> np.ndarray:
-    """Ragged (people, 25, 3) per frame to (frames, most people, 25, 3), absent ones zero."""
-    stacked = np.zeros((len(people), max(1, *(len(p) for p in people)), 25, 3))
-    for row, points in zip(stacked, people, strict=True):
+def _detections(layout: Layout, camera: str, wanted: tuple[int, ...], recorded: tuple[int, ...]) -> np.ndarray | None:
+    """(frames, most people, K, 3) as detected, absent people zero: of the layout's files, else of a list of results in
+    keypoints/<camera>.json; None where there is neither."""
+    files, results = layout.keypoint_files(camera), inside(layout.folder, "keypoints", f"{camera}.json")
+    if files:
+        chosen = _per_frame(files, wanted, recorded, "keypoints").values()
+        paths = [file.path if isinstance(file, Stored) else file for file in chosen]
+        people = [file.read() if isinstance(file, Stored) else read_openpose(file) for file in chosen]
+    elif results.is_file():
+        paths, people = [results] * len(wanted), read_results(results, wanted)
+    else:
+        return None
+    count = next((p.shape[1] for p in people if len(p)), 0)
+    stacked = np.zeros((len(people), max(1, *(len(p) for p in people)), count, 3))
+    for path, row, points in zip(paths, stacked, people, strict=True):
+        if len(points) == 0:
+            continue
+        if points.shape[1] != count:
+            raise CaptureError(f"{path}: {points.shape[1]} keypoints a person where others have {count}; detect again")
         row[: len(points)] = points
     return stacked
 
 
 def _in_metres(camera: Camera, notes: Notes) -> Camera:
-    metres_per_unit = {"m": 1.0, "mm": 1e-3}[notes.units]
-    return Camera(camera.name, camera.K, camera.R, camera.t_m * metres_per_unit, camera.width_px, camera.height_px)
+    return dataclasses.replace(camera, t_m=camera.t_m * notes.metres_per_unit)

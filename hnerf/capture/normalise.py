@@ -84,9 +84,8 @@ class Normaliser:
         """A clean plate, like any image."""
         self.write_image(read_image(source), source, source, target)
 
-    def write_mask(self, source: Path, target: Path) -> None:
-        """A mask (anything but black is the person) as 0/255 PNG."""
-        recorded = read_image(source).max(-1)
+    def write_mask(self, recorded: np.ndarray, source: Path, target: Path) -> None:
+        """A mask (H, W) uint8 from file `source` (anything but black is the person) as 0/255 PNG."""
         self._check_size(recorded, source)
         target.parent.mkdir(parents=True, exist_ok=True)
         _write(target, np.where(self.pixels(np.where(recorded > 0, 255, 0).astype(np.uint8)) > 127, 255, 0), [])

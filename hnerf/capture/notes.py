@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hnerf.capture.guarded import inside, read_toml
+from hnerf.capture.keypoint_sets import KeypointSetName
 from hnerf.errors import CaptureError
 
 FrameNumber = Annotated[int, Field(ge=0, le=999_999)]
@@ -40,9 +41,15 @@ class Notes(_Table):
     name: str | None = None
     fps: float | None = Field(default=None, gt=0, le=10_000)
     up: Literal["y", "z"] = "z"
-    units: Literal["m", "mm"] = "m"
+    units: Literal["m", "mm"] | Annotated[float, Field(gt=0, le=1e6)] = "m"
+    keypoints: KeypointSetName | None = None
     cameras: CameraSplit | None = None
     frames: FrameSplit | None = None
+
+    @property
+    def metres_per_unit(self) -> float:
+        """The calibration's unit of length."""
+        return {"m": 1.0, "mm": 1e-3}[self.units] if isinstance(self.units, str) else self.units
 
 
 def read_notes(folder: Path) -> Notes:
@@ -63,10 +70,12 @@ def capture_name(folder: Path, notes: Notes) -> str:
     return name
 
 
-def chosen_cameras(folder: Path, notes: Notes, calibrated: list[str]) -> CameraSplit:
-    """The cameras that `capture.toml` names, else all for training; CaptureError on one unknown or named twice."""
+def chosen_cameras(folder: Path, notes: Notes, calibrated: list[str], published: list[str]) -> CameraSplit:
+    """The cameras that `capture.toml` names, else the published ones for training and the rest for testing, else all
+    for training; CaptureError on one unknown or named twice."""
     if notes.cameras is None:
-        return CameraSplit(train=calibrated)
+        train = published or calibrated
+        return CameraSplit(train=train, test=[name for name in calibrated if name not in train])
     _check(folder, "camera", notes.cameras.train + notes.cameras.test, calibrated, "the calibration")
     return notes.cameras
 

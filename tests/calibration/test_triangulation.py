@@ -30,7 +30,7 @@ def test_residual_by_hand() -> None:
     keypoints = np.array([[[75, 59, 0.9]], [[25, 61, 0.9]]])
     points_m, residuals_px, _ = triangulate(projections, keypoints)
     np.testing.assert_allclose(residuals_px, 1, atol=1e-3)
-    np.testing.assert_allclose(points_m[0], [0.5, 0.2, 2], atol=1e-3)
+    np.testing.assert_allclose(points_m[0], [0.5, 0.2, 2], atol=4e-3)
 
 
 def test_an_outlier_view_is_left_out_and_its_residual_told() -> None:

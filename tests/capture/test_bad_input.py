@@ -197,5 +197,5 @@ def test_broken_pose2sim_folder_is_refused(case: str, tmp_path: Path, monkeypatc
 
 def test_folder_that_is_no_capture_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    _refused(tmp_path / "empty", tmp_path, "neither EasyMocap")
+    _refused(tmp_path / "empty", tmp_path, "none of EasyMocap")
     _refused(tmp_path / "absent", tmp_path, "no such folder")

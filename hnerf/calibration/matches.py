@@ -1,0 +1,89 @@
+"""The third witness: points of the picture itself, background and person, that two cameras see (SIFT)."""
+
+import dataclasses
+import logging
+from collections.abc import Sequence
+from itertools import combinations
+
+import cv2
+import numpy as np
+import pycolmap
+
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+
+INLIER_PX = 3.0  # of the fundamental matrix that verifies matches
+MIN_MATCHES = 15  # and a share: a fundamental matrix fits some wrong matches by chance
+MIN_INLIERS = 0.3
+
+log = logging.getLogger("hnerf.calibration")
+
+
+@dataclasses.dataclass(frozen=True)
+class Matches:
+    """Verified matches by pair of cameras that overlap: (n, 2, 2) pixels, in the first and in the second camera; in
+    images of this frame."""
+
+    by_pair: dict[tuple[str, str], np.ndarray]
+    frame: int
+
+    @staticmethod
+    def of(capture: Capture) -> "Matches":
+        """Of the training cameras at one instant; no pairs where cameras stand too far apart, which is no fault.
+
+        A pair is verified by a fundamental matrix of its own and not by the calibration, which is on trial.
+        """
+        names, frame = capture.train_cameras, capture.frames[len(capture.frames) // 2]
+        log.info("SIFT in %d cameras", len(names))
+        extractor = pycolmap.FeatureExtractor.create(pycolmap.FeatureExtractionOptions(use_gpu=False))
+        matcher = pycolmap.FeatureMatcher.create(pycolmap.FeatureMatchingOptions(use_gpu=False))
+        grey = {name: cv2.cvtColor(capture.image(name, frame), cv2.COLOR_RGB2GRAY) for name in names}
+        features = {name: extractor.extract_from_uint8_array(image) for name, image in grey.items()}
+        verified = {(a, b): _verified(_matched(matcher, features[a], features[b])) for a, b in combinations(names, 2)}
+        return Matches({pair: matched for pair, matched in verified.items() if len(matched)}, frame)
+
+    def residuals_px(self, cameras: Sequence[Camera]) -> dict[tuple[str, str], np.ndarray]:
+        """Sampson distances of each pair's matches under these cameras, (n,) pixels."""
+        named = {camera.name: camera for camera in cameras}
+        return {
+            (a, b): sampson_px(fundamental(named[a], named[b]), matched)
+            for (a, b), matched in self.by_pair.items()
+            if a in named and b in named
+        }
+
+
+def fundamental(a: Camera, b: Camera) -> np.ndarray:
+    """F with x_b^T F x_a = 0 (Hartley and Zisserman 2004, eq. 9.1), (3, 3)."""
+    R = b.R @ a.R.T
+    x, y, z = b.t_m - R @ a.t_m
+    return np.linalg.inv(b.K).T @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R @ np.linalg.inv(a.K)
+
+
+def sampson_px(F: np.ndarray, matched: np.ndarray) -> np.ndarray:
+    """First-order distance of matches (n, 2, 2) to the epipolar constraint, (n,) (ibid., eq. 11.9, its root)."""
+    x = np.concatenate([matched, np.ones_like(matched[..., :1])], -1)
+    in_b, in_a = x[:, 0] @ F.T, x[:, 1] @ F
+    gradient = np.sqrt((in_b[:, :2] ** 2).sum(1) + (in_a[:, :2] ** 2).sum(1))
+    return np.abs((x[:, 1] * in_b).sum(1)) / gradient
+
+
+def _matched(
+    matcher: pycolmap.FeatureMatcher,
+    a: tuple[pycolmap.FeatureKeypoints, pycolmap.FeatureDescriptors],
+    b: tuple[pycolmap.FeatureKeypoints, pycolmap.FeatureDescriptors],
+) -> np.ndarray:
+    """(n, 2, 2) pixels."""
+    rows = matcher.match(*a, *b)
+    in_a = [(a[0][int(i)].x, a[0][int(i)].y) for i, _ in rows]
+    in_b = [(b[0][int(j)].x, b[0][int(j)].y) for _, j in rows]
+    return np.stack([np.reshape(in_a, (-1, 2)), np.reshape(in_b, (-1, 2))], 1) - 0.5  # centres at integers
+
+
+def _verified(matched: np.ndarray) -> np.ndarray:
+    """Those of (n, 2, 2) that a fundamental matrix explains; none if it explains too few."""
+    if len(matched) < MIN_MATCHES:
+        return matched[:0]
+    ransac = pycolmap.RANSACOptions(max_error=INLIER_PX, random_seed=0)
+    found = pycolmap.estimate_fundamental_matrix(matched[:, 0], matched[:, 1], ransac)
+    inliers = found["inlier_mask"] if found else np.zeros(len(matched), bool)
+    return matched[inliers] if inliers.sum() >= MIN_MATCHES and inliers.mean() >= MIN_INLIERS else matched[:0]

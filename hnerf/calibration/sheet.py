@@ -1,0 +1,97 @@
+"""The witnesses as a picture: for each camera what keypoints, outlines and matches look like under the cameras used."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PathCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from hnerf.calibration.diagnosis import Measure
+from hnerf.calibration.picture import LIMBS
+from hnerf.calibration.witnesses import NO_MATCHES, Witnesses
+from hnerf.capture.camera import Camera
+
+SCALE_PX = Normalize(0, 10)  # residuals, from green to red
+COLOURS = "RdYlGn_r"
+DIMMED = 0.55  # light left in the photographs, so that the marks stand out
+MARGIN = 0.12  # of the person's size
+PANEL_INCHES = 4.2
+
+
+def draw_witnesses(path: Path, witnesses: Witnesses, cameras: Sequence[Camera], found: Measure) -> None:
+    """Write the sheet as PNG, a row a camera; `found`: what `measure` says of these cameras."""
+    capture, outlines = witnesses.capture, witnesses.outlines
+    instant = outlines.instants[len(outlines.instants) // 2] if outlines else len(capture.frames) // 2
+    figure = Figure(figsize=(3 * PANEL_INCHES + 1, PANEL_INCHES * len(cameras) + 0.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(len(cameras), 3, squeeze=False)
+    for row, camera, detected in zip(panels, cameras, witnesses.keypoints[:, instant], strict=True):
+        for axes, frame in zip(row, [*[capture.frames[instant]] * 2, witnesses.matches.frame], strict=True):
+            axes.imshow((DIMMED * capture.image(camera.name, frame)).astype(np.uint8))
+            axes.set_axis_off()
+        marks = _draw_keypoints(row[0], camera, detected, found.points_m[instant])
+        _draw_outline(row[1], cameras, camera, witnesses)
+        _draw_matches(row[2], cameras, camera, witnesses)
+        told = f"{camera.name}: keypoints, median {found.median_px[camera.name]:.1f} px"
+        row[0].set_title(f"{told}, 95 % below {found.p95_px[camera.name]:.1f} px", fontsize=10)
+        for axes in row[:2]:
+            _zoom(axes, detected[detected[:, 2] > 0, :2])
+    figure.colorbar(marks, ax=panels, shrink=0.6 / len(cameras), aspect=20, label="px", extend="max")
+    figure.savefig(path, dpi=80)
+
+
+def _draw_keypoints(axes: Axes, camera: Camera, detected: np.ndarray, points_m: np.ndarray) -> PathCollection:
+    """Detections (25, 3) as discs, coloured by how far the person's joints (25, 3), as lines, lie from them."""
+    uv, _ = camera.project(points_m)
+    for a, b in LIMBS:
+        axes.plot(*uv[[a, b]].T, color="white", linewidth=1)
+    seen = detected[:, 2] > 0
+    return _scatter(axes, detected[seen, :2], np.linalg.norm(uv[seen] - detected[seen, :2], axis=-1), 26)
+
+
+def _draw_outline(axes: Axes, cameras: Sequence[Camera], camera: Camera, witnesses: Witnesses) -> None:
+    """Points of the outline, coloured by how far their rays miss the person as the others see it."""
+    axes.set_title(f"{camera.name}: no outline", fontsize=10)
+    outlines = witnesses.outlines
+    if outlines is None or camera.name not in outlines.by_camera:
+        return
+    middle = len(outlines.instants) // 2
+    outline = outlines.by_camera[camera.name][middle]
+    if outline is None:
+        return
+    residuals_px = outlines.residuals_px(cameras)[camera.name]
+    told = f"mean {residuals_px.mean():.2f} px, 95 % below {np.percentile(residuals_px, 95):.1f} px"
+    axes.set_title(f"{camera.name}: outline, {told}", fontsize=10)
+    _scatter(axes, outline.points_px, outlines.at(middle).residuals_px(cameras)[camera.name], 14)
+
+
+def _draw_matches(axes: Axes, cameras: Sequence[Camera], camera: Camera, witnesses: Witnesses) -> None:
+    """Matches with other cameras, coloured by their distance from the epipolar constraint."""
+    told = []
+    for pair, residuals_px in witnesses.matches.residuals_px(cameras).items():
+        if camera.name in pair:
+            side = pair.index(camera.name)
+            _scatter(axes, witnesses.matches.by_pair[pair][:, side], residuals_px, 14)
+            told.append(f"{len(residuals_px)} with {pair[1 - side]}, median {np.median(residuals_px):.1f} px")
+    axes.set_title(f"{camera.name}: " + (f"matches, {'; '.join(told)}" if told else NO_MATCHES), fontsize=10)
+
+
+def _scatter(axes: Axes, points_px: np.ndarray, residuals_px: np.ndarray, size: float) -> PathCollection:
+    x, y = points_px.T
+    marks = axes.scatter(x, y, size, residuals_px, cmap=COLOURS, norm=SCALE_PX)
+    marks.set(edgecolor="black", linewidth=0.3)
+    return marks
+
+
+def _zoom(axes: Axes, points_px: np.ndarray) -> None:
+    """A square window around the person, (n, 2)."""
+    if len(points_px) == 0:
+        return
+    low, high = points_px.min(0), points_px.max(0)
+    half = (0.5 + MARGIN) * float((high - low).max())
+    x, y = (low + high) / 2
+    axes.set(xlim=(x - half, x + half), ylim=(y + half, y - half))

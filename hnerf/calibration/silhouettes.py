@@ -1,0 +1,222 @@
+"""The second witness: do the outlines of the person in all cameras belong to one body?
+
+A pixel on the outline of one mask is where a ray touches the person. Somewhere along that ray must be a point that no
+other camera sees outside its own mask: a point of the visual hull (Laurentini 1994). How far the best point of the ray
+lies outside, in pixels of the camera that denies it, is the residual. It knows nothing of keypoints or their bias.
+"""
+
+import dataclasses
+import logging
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+from skimage.measure import find_contours
+
+from hnerf.calibration.triangulation import subject_keypoints
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+from hnerf.config import CalibrationSettings, SegmentationSettings
+from hnerf.segmentation.cut import cut
+from hnerf.segmentation.difference import difference, masked_median, noise_level
+from hnerf.segmentation.prior import Prior, keypoint_priors, window_around
+
+FRAMES = 8  # evenly spread: neighbours say the same again
+PLATE_FRAMES = 24  # from which the background is made where there is no clean plate
+POINTS = 64  # of the outline in each image
+COARSE, FINE = 64, 17  # samples along a ray, and again between the neighbours of the best
+ROOM = 1.5  # times the person's size: how far along a ray the person is looked for
+TRIM = 0.98  # share of the residuals that count; the rest are faults of the masks
+COVERED = 0.6  # of the person's keypoints: a mask with fewer of them is not the person's
+DENIED_PX = 1e4  # behind a camera that sees the person
+
+log = logging.getLogger("hnerf.calibration")
+
+
+@dataclasses.dataclass(frozen=True)
+class Outline:
+    """One mask: points_px (n, 2) on its outline, distance_px (H, W) to it, negative inside; `centre_px` (2,),
+    `size_px` of its box."""
+
+    points_px: np.ndarray
+    distance_px: np.ndarray
+    centre_px: np.ndarray
+    size_px: float
+
+    @staticmethod
+    def around(mask: np.ndarray) -> "Outline | None":
+        """Of the largest part of a mask (H, W) bool, its holes filled; None if it is empty.
+
+        Where the image's border cuts the person off there is no outline.
+        """
+        parts, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        if not parts:
+            return None
+        whole = cv2.drawContours(np.zeros(mask.shape, np.uint8), [max(parts, key=cv2.contourArea)], 0, 1, cv2.FILLED)
+        inside = cv2.distanceTransform(whole, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        outside = cv2.distanceTransform(1 - whole, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        distance_px = np.where(whole, 0.5 - inside, outside - 0.5).astype(np.float32)
+        edges = find_contours(np.pad(distance_px, 1, constant_values=1e3), 0)
+        points = max(edges, key=len)[:-1, ::-1] - 1
+        last = np.array(mask.shape[::-1]) - 1
+        points = points[((points > 1) & (points < last - 1)).all(1)]
+        rows, columns = np.nonzero(whole)
+        size_px = float(np.hypot(np.ptp(columns), np.ptp(rows)))
+        return Outline(_spread(points, POINTS), distance_px, np.array([columns.mean(), rows.mean()]), size_px)
+
+
+@dataclasses.dataclass(frozen=True)
+class Outlines:
+    """Outlines of the person by camera, one an instant; None where a camera has no mask then.
+
+    instants: their indices in `capture.frames`.
+    """
+
+    by_camera: Mapping[str, Sequence[Outline | None]]
+    instants: tuple[int, ...]
+
+    @staticmethod
+    def of(capture: Capture, settings: CalibrationSettings) -> "Outlines | None":
+        """Of the training cameras at a few instants, from given masks, clean plates, or a median of the images.
+
+        The masks use each camera's own keypoints only, so that a wrong calibration cannot spoil them. None where fewer
+        than two cameras have a usable mask.
+        """
+        found = subject_keypoints(capture)
+        everyone = np.all([(seen[..., 2] > 0).any(1) for seen in found.values()], axis=0)
+        shown = _spread(np.flatnonzero(everyone), FRAMES)
+        log.info("outlines of %d cameras at %d instants", len(found), len(shown))
+        by_camera = {name: _outlines(capture, name, found[name], shown) for name in found}
+        usable = {name: outlines for name, outlines in by_camera.items() if any(outlines)}
+        return Outlines(usable, tuple(shown.tolist())) if len(usable) > 1 else None
+
+    def at(self, position: int) -> "Outlines":
+        """One instant alone, by its position in `instants`."""
+        return Outlines({name: [row[position]] for name, row in self.by_camera.items()}, (self.instants[position],))
+
+    def cost_px(self, cameras: Sequence[Camera]) -> float:
+        """Mean of the lowest 98 % of all residuals under these cameras, two of them at least.
+
+        Most rays pass through the middle of the hull and cannot miss it: with exact masks a true rig costs almost
+        nothing, and one whose camera is a degree off a few tenths of a pixel.
+        """
+        ordered = np.sort(np.concatenate(list(self.residuals_px(cameras).values())))
+        return float(ordered[: max(1, int(TRIM * len(ordered)))].mean()) if len(ordered) else np.inf
+
+    def residuals_px(self, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
+        """Per camera how far the rays of its outline miss the person as the other cameras see it, (n,) pixels >= 0.
+
+        Cameras without outlines take no part; neither do instants at which fewer than two cameras have one.
+        """
+        known = [camera for camera in cameras if camera.name in self.by_camera]
+        residuals: dict[str, list[np.ndarray]] = {camera.name: [] for camera in known}
+        for instant in range(len(self.instants)):
+            at_once = [(camera, self.by_camera[camera.name][instant]) for camera in known]
+            seen = [(camera, outline) for camera, outline in at_once if outline is not None]
+            if len(seen) < 2:
+                continue
+            centre_m, reach_m = _whereabouts(seen)
+            for i, (camera, outline) in enumerate(seen):
+                others = seen[:i] + seen[i + 1 :]
+                residuals[camera.name].append(_missed_by_px(camera, outline, others, centre_m, reach_m))
+        return {name: np.concatenate(rows) if rows else np.zeros(0) for name, rows in residuals.items()}
+
+
+def _whereabouts(seen: Sequence[tuple[Camera, Outline]]) -> tuple[np.ndarray, float]:
+    """The point nearest to the rays through the middles of the masks, (3,), and the person's size about it."""
+    origins, directions = zip(*(camera.rays(outline.centre_px) for camera, outline in seen), strict=True)
+    across = np.stack([np.eye(3) - np.outer(d, d) for d in directions])  # projects onto the plane across the ray
+    towards = np.einsum("cij,cj->i", across, np.stack(origins))
+    centre_m = np.linalg.lstsq(across.sum(0), towards, rcond=None)[0]
+    sizes_m = [
+        outline.size_px / camera.K[1, 1] * float(np.linalg.norm(centre_m - camera.centre_m)) for camera, outline in seen
+    ]
+    return centre_m, ROOM * float(np.median(sizes_m))
+
+
+def _missed_by_px(
+    camera: Camera,
+    outline: Outline,
+    others: Sequence[tuple[Camera, Outline]],
+    centre_m: np.ndarray,
+    reach_m: float,
+) -> np.ndarray:
+    """For each outline point the least distance at which its ray passes the hull of the others, (n,) pixels >= 0.
+
+    The ray is searched within `reach_m` of its point nearest to the centre.
+    """
+    origins, directions = camera.rays(outline.points_px)
+    nearest_m = ((centre_m - origins) * directions).sum(-1, keepdims=True)
+    step_m = 2 * reach_m / (COARSE - 1)
+    along_m = (nearest_m + np.linspace(-reach_m, reach_m, COARSE)).clip(step_m)
+    outside_px = _outside_px(others, origins[:, None] + along_m[..., None] * directions[:, None])
+    best_m = np.take_along_axis(along_m, outside_px.argmin(1)[:, None], 1)
+    closer_m = best_m + np.linspace(-step_m, step_m, FINE)
+    closer_px = _outside_px(others, origins[:, None] + closer_m[..., None] * directions[:, None])
+    return closer_px.min(1).clip(0)
+
+
+def _outside_px(seen: Sequence[tuple[Camera, Outline]], points_m: np.ndarray) -> np.ndarray:
+    """How far points (n, S, 3) lie outside the mask that denies them most, (n, S) pixels, negative in the hull.
+
+    Beyond an image's edge the nearest edge pixel speaks: where the edge cuts the person off, he may go on.
+    """
+    worst = np.full(points_m.shape[:2], -np.inf)
+    for camera, outline in seen:
+        uv, depth_m = camera.project(points_m)
+        at = np.nan_to_num(uv).clip(-DENIED_PX, DENIED_PX).astype(np.float32)
+        x, y = cv2.split(at)
+        far_px = cv2.remap(outline.distance_px, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        worst = np.maximum(worst, np.where(depth_m > 0, far_px, DENIED_PX))
+    return worst
+
+
+def _outlines(capture: Capture, name: str, keypoints: np.ndarray, shown: np.ndarray) -> list[Outline | None]:
+    """One camera's outlines at the frames of these indices; keypoints (frames, 25, 3) of the subject."""
+    outlines = []
+    for i, mask in zip(shown, _masks(capture, name, shown), strict=True):
+        xy = keypoints[i, keypoints[i, :, 2] > 0, :2].round().astype(int)
+        xy = xy[((xy >= 0) & (xy < mask.shape[::-1])).all(1)]
+        covered = mask[xy[:, 1], xy[:, 0]].mean() if len(xy) else 0.0
+        outlines.append(Outline.around(mask) if covered >= COVERED else None)
+    return outlines
+
+
+def _masks(capture: Capture, name: str, shown: np.ndarray) -> list[np.ndarray]:
+    """The person's masks in one camera at the frames of these indices, (H, W) bool."""
+    given = [capture.given_mask(name, capture.frames[i]) for i in shown]
+    if all(mask is not None for mask in given):
+        return [mask for mask in given if mask is not None]
+    settings = SegmentationSettings()
+    priors = keypoint_priors(dataclasses.replace(capture, train_cameras=(name,)), settings)[name]
+    plate, known = _plate(capture, name, priors)
+    shadowed = capture.background(name) is None
+    return [_mask(capture.image(name, capture.frames[i]), plate, known, priors[i], settings, shadowed) for i in shown]
+
+
+def _plate(capture: Capture, name: str, priors: Sequence[Prior]) -> tuple[np.ndarray, np.ndarray]:
+    """The background (H, W, 3) as it was recorded, or its median over time, and (H, W) bool where it is known."""
+    plate = capture.background(name)
+    if plate is not None:
+        return plate, np.ones(plate.shape[:2], bool)
+    chosen = _spread(np.arange(len(priors)), PLATE_FRAMES)
+    return masked_median([capture.image(name, capture.frames[i]) for i in chosen], [priors[i] for i in chosen])
+
+
+def _mask(
+    image: np.ndarray,
+    plate: np.ndarray,
+    known: np.ndarray,
+    prior: Prior,
+    settings: SegmentationSettings,
+    shadowed: bool,
+) -> np.ndarray:
+    mask, window = np.zeros(image.shape[:2], bool), window_around(prior.reach)
+    found = difference(image[window], plate[window], noise_level(image, plate), settings, shadowed)
+    mask[window] = cut(image[window], found, prior.cropped(window), known[window])
+    return mask
+
+
+def _spread(rows: np.ndarray, count: int) -> np.ndarray:
+    """At most this many of the rows, evenly spread."""
+    return rows[np.unique(np.linspace(0, len(rows) - 1, count).round().astype(int))] if len(rows) else rows

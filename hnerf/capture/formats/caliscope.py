@@ -1,0 +1,82 @@
+"""Calibrations in TOML: Caliscope's `camera_array.toml` and aniposelib's `calibration.toml`, world to camera.
+
+Pictures and all else lie as in the EasyMocap layout. Caliscope names the footage of its camera 0 `cam_0`.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hnerf.capture.formats.easymocap import EasyMocap
+from hnerf.capture.formats.pose2sim import lens_from_table
+from hnerf.capture.guarded import inside, read_toml
+from hnerf.capture.lens import Lens
+from hnerf.errors import CaptureError
+
+FILES = ("camera_array.toml", "calibration.toml")
+
+
+class Caliscope(EasyMocap):
+    """A folder with camera_array.toml, or calibration.toml; metres in the former, the board's unit in the latter."""
+
+    @staticmethod
+    def recognises(folder: Path) -> bool:
+        """Whether the folder looks like this layout."""
+        return not (folder / "intri.yml").exists() and any((folder / name).exists() for name in FILES)
+
+    def lenses(self) -> dict[str, Lens]:
+        """Every camera that the file calibrates and does not ignore."""
+        caliscope = inside(self.folder, "camera_array.toml")
+        path = caliscope if caliscope.exists() else inside(self.folder, "calibration.toml")
+        tables = _caliscope_tables(path) if path == caliscope else _aniposelib_tables(path)
+        lenses = [lens_from_table(path, key, table) for key, table in tables.items()]
+        if not lenses:
+            raise CaptureError(f"{path}: calibrates no camera; calibrate again")
+        return {lens.name: lens for lens in lenses}
+
+
+def write_caliscope(out: Path, lenses: Sequence[Lens]) -> None:
+    """`camera_array.toml`; cameras are numbered in their order, unless all are called cam_<number> already."""
+    numbers = [lens.name.removeprefix("cam_") for lens in lenses]
+    if not all(lens.name.startswith("cam_") and n.isdecimal() for lens, n in zip(lenses, numbers, strict=True)):
+        numbers = [str(i) for i in range(len(lenses))]
+    tables = (
+        f"[cameras.{n}]\ncam_id = {n}\nrotation_count = 0\nignore = false\n"
+        f"{_numbers(lens)}rotation = {lens.R.tolist()}\n"
+        for n, lens in zip(numbers, lenses, strict=True)
+    )
+    (out / "camera_array.toml").write_text("\n".join(tables), encoding="utf-8")
+
+
+def write_aniposelib(out: Path, lenses: Sequence[Lens]) -> None:
+    """`calibration.toml`, in metres; Pose2Sim reads it as `Calib.toml`, too."""
+    tables = (
+        f'[cam_{i}]\nname = "{lens.name}"\n{_numbers(lens)}rotation = {cv2.Rodrigues(lens.R)[0].ravel().tolist()}\n'
+        for i, lens in enumerate(lenses)
+    )
+    (out / "calibration.toml").write_text("\n".join([*tables, "[metadata]\nadjusted = false\n"]), encoding="utf-8")
+
+
+def _numbers(lens: Lens) -> str:
+    size = "" if lens.size_px is None else f"size = {list(lens.size_px)}\n"
+    distortions = np.pad(lens.distortion, (0, 5 - len(lens.distortion))).tolist()
+    matrix = f"matrix = {lens.K.tolist()}\ndistortions = {distortions}\n"
+    return f"{size}{matrix}fisheye = false\ntranslation = {lens.t_m.tolist()}\n"
+
+
+def _caliscope_tables(path: Path) -> dict[str, dict[str, Any]]:
+    cameras = read_toml(path).get("cameras")
+    if not isinstance(cameras, dict) or not all(isinstance(table, dict) for table in cameras.values()):
+        raise CaptureError(f"{path}: no tables [cameras.<number>]; calibrate again with Caliscope")
+    return {
+        key: table | {"name": f"cam_{table.get('cam_id', table.get('port', key))}"}
+        for key, table in cameras.items()
+        if not table.get("ignore", False)
+    }
+
+
+def _aniposelib_tables(path: Path) -> dict[str, Any]:
+    return {key: table for key, table in read_toml(path).items() if key != "metadata"}

@@ -1,0 +1,56 @@
+import numpy as np
+import pytest
+
+from hnerf.calibration.matches import Matches, _verified, fundamental, sampson_px
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+from hnerf.capture.ingest import ingest
+from hnerf.config import CaptureSettings
+from tests.calibration.synthetic import look_at, turned
+from tests.shared_data import shared_capture
+
+
+def pair() -> tuple[Camera, Camera]:
+    """Two cameras of 1000 px focal length, 30 degrees apart."""
+    target_m = np.array([0, 0, 1.0])
+    centre_m = 4 * np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0]) + target_m
+    return look_at("a", np.array([4.0, 0, 1]), target_m), look_at("b", centre_m, target_m)
+
+
+def seen(count: int = 200) -> np.ndarray:
+    """(n, 2, 2): points of a cube of 2 m in both cameras."""
+    points_m = np.random.default_rng(0).uniform([-1, -1, 0], [1, 1, 2], (count, 3))
+    return np.stack([camera.project(points_m)[0] for camera in pair()], 1)
+
+
+def test_sampson_by_hand() -> None:
+    # Cameras side by side, F of a pure shift along x: matches must lie on one row. Two rows apart is a gradient of
+    # sqrt(1 + 1) and a residual of 2: a distance of sqrt 2, shared between both images.
+    F = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    assert sampson_px(F, np.array([[[5.0, 7], [9, 7]], [[5, 7], [9, 9]]])) == pytest.approx([0, np.sqrt(2)])
+
+
+def test_true_cameras_agree_and_a_turned_one_shows() -> None:
+    a, b = pair()
+    assert sampson_px(fundamental(a, b), seen()).max() < 1e-8
+    # Pitched by one degree, 17.5 px along y at the middle: half in each image's share is 17.5 / sqrt 2 = 12.3.
+    assert np.median(sampson_px(fundamental(a, turned(b, 1.0, axis=0)), seen())) == pytest.approx(12.3, abs=1)
+
+
+def test_verification_does_not_ask_the_calibration() -> None:
+    wrong = np.random.default_rng(1).uniform(0, 1000, (60, 2, 2))
+    kept = _verified(np.concatenate([seen(), wrong]))
+    assert 200 <= len(kept) < 210
+    assert len(_verified(wrong)) == 0
+    assert len(_verified(seen(10))) == 0
+
+
+@pytest.fixture(scope="module")
+def wave(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return ingest(shared_capture("valid-wave"), CaptureSettings(), tmp_path_factory.mktemp("wave"))
+
+
+def test_views_a_right_angle_apart_share_no_matches(wave: Capture) -> None:
+    found = Matches.of(wave)
+    assert found.by_pair == {}
+    assert found.residuals_px(list(wave.cameras.values())) == {}

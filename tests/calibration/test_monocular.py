@@ -1,0 +1,61 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from hnerf.calibration.monocular import ground_reasons, intrinsics_reasons, stature_on_ground_m
+from hnerf.calibration.triangulation import subject_keypoints
+from hnerf.capture.ingest import ingest
+from hnerf.config import CaptureSettings
+from tests.calibration.synthetic import STANDING_M, detections, ring
+from tests.shared_data import shared_capture
+
+
+def standing() -> np.ndarray:
+    """The walk of the first camera of the ring, without noise."""
+    return detections(ring(1), noise_px=0)["c0"][:, 0]
+
+
+def test_usual_intrinsics_have_no_reasons() -> None:
+    assert intrinsics_reasons(ring(1)[0]) == []  # 1000 px wide at 1000 px focal length: 53 degrees
+
+
+@pytest.mark.parametrize(
+    ("K", "words"),
+    [
+        # 1000 px at 200 px focal length: 2 atan 2.5 = 136 degrees; at 8000 px: 7 degrees.
+        ([[200, 0, 499.5], [0, 200, 499.5], [0, 0, 1]], "field of view 136 degrees"),
+        ([[8000, 0, 499.5], [0, 8000, 499.5], [0, 0, 1]], "field of view 7 degrees"),
+        # The middle of a picture of 1920 x 1080.
+        (
+            [[1000, 0, 959.5], [0, 1000, 539.5], [0, 0, 1]],
+            "principal point at 96 % of the width and 54 % of the height",
+        ),
+        ([[1000, 0, 499.5], [0, 1250, 499.5], [0, 0, 1]], "pixels 1.25 times as wide as high"),
+    ],
+)
+def test_odd_intrinsics_are_named(K: list, words: str) -> None:
+    reasons = intrinsics_reasons(dataclasses.replace(ring(1)[0], K=np.array(K, float)))
+    assert len(reasons) == 1 and words in reasons[0]
+
+
+def test_stature_by_hand() -> None:
+    # The figure's nose is at 1.64 m, its toes at 2 cm; the ray to a toe reaches the ground a little behind it.
+    camera = ring(1)[0]
+    assert stature_on_ground_m(camera, standing(), "z") == pytest.approx(STANDING_M[0, 2] / 0.92, abs=0.08)
+
+
+def test_a_wrong_ground_or_scale_is_flagged() -> None:
+    camera = ring(1)[0]
+    assert "can be true" in ground_reasons(camera, standing(), "z")[0]
+    doubled = dataclasses.replace(camera, t_m=2 * camera.t_m)  # everything twice as far, so twice as tall
+    assert "would be 3.5" in ground_reasons(doubled, standing(), "z")[0]
+    below = dataclasses.replace(camera, t_m=camera.t_m + camera.R @ [0, 0, 2.0])  # the camera two metres down
+    assert "is not the ground" in ground_reasons(below, standing(), "z")[0]
+
+
+def test_the_rendered_performer_stands_on_the_ground(tmp_path_factory: pytest.TempPathFactory) -> None:
+    capture = ingest(shared_capture("valid-turn-mono"), CaptureSettings(), tmp_path_factory.mktemp("mono"))
+    name = capture.train_cameras[0]
+    keypoints = subject_keypoints(capture)[name]
+    assert stature_on_ground_m(capture.cameras[name], keypoints, capture.up) == pytest.approx(1.75, abs=0.2)

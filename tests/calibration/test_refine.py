@@ -1,0 +1,125 @@
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hnerf.calibration.check import check_calibration
+from hnerf.calibration.diagnosis import MISTAKES, MISTAKES_OF_ONE, undo_mistake
+from hnerf.calibration.refine import Refinement, refine
+from hnerf.capture.camera import Camera
+from hnerf.config import CalibrationSettings
+from tests.calibration.synthetic import FRAMES, detections, ring, turned, walk_m, write_capture
+
+SETTINGS = CalibrationSettings()
+
+
+class OutlinesThat:
+    """A stand-in: the same cost for whatever was refined."""
+
+    def __init__(self, given: Sequence[Camera], given_px: float, refined_px: float) -> None:
+        self.given, self.given_px, self.refined_px = given, given_px, refined_px
+
+    def cost_px(self, cameras: Sequence[Camera]) -> float:
+        return self.given_px if cameras is self.given else self.refined_px
+
+
+def keypoints_of(noise_px: float = 1) -> np.ndarray:
+    return np.stack([seen[:, 0] for seen in detections(ring(4), noise_px).values()])
+
+
+def refined(root: Path, cameras: list[Camera], keypoints: np.ndarray, outlines: Any = None) -> Refinement:
+    seen = {camera.name: k[:, None] for camera, k in zip(cameras, keypoints, strict=True)}
+    return refine(write_capture(root, cameras, seen), cameras, keypoints, outlines, SETTINGS)
+
+
+def with_c2(change: Any) -> list[Camera]:
+    return [change(camera) if camera.name == "c2" else camera for camera in ring(4)]
+
+
+@pytest.mark.parametrize(("after_px", "accepted"), [(0.1, True), (0.54, True), (0.6, False)])
+def test_outlines_have_a_veto(tmp_path: Path, after_px: float, accepted: bool) -> None:
+    given = with_c2(lambda c: turned(c, 1.0))
+    found = refined(tmp_path, given, keypoints_of(), OutlinesThat(given, 0.5, after_px))
+    assert [new is not old for new, old in zip(found.cameras, given, strict=True)] == [False, False, accepted, False]
+    assert found.outlines_px == {"as given": 0.5, "refined": after_px}
+    assert any("outlines fit worse, from 0.50 to 0.60 px" in note for note in found.notes) != accepted
+    assert found.reasons["c2"].startswith("pose refined" if accepted else "pose kept")
+
+
+def test_what_a_detector_gets_wrong_of_a_joint_moves_no_camera(tmp_path: Path) -> None:
+    # Each camera's detector puts each joint 4 px off, the same in every frame: held-out frames alone would prove it.
+    bias = 4 * np.random.default_rng(3).normal(size=(4, 1, 25, 2))
+    keypoints = keypoints_of()
+    keypoints[..., :2] += bias
+    given = ring(4)
+    assert refined(tmp_path, given, keypoints).cameras is given
+
+
+def test_a_wrong_focal_length_is_refined_where_the_pose_does_not_suffice(tmp_path: Path) -> None:
+    # The figure walks 0.4 m to and fro before a camera 3.5 m away: a fifth in focal length cannot pass for distance.
+    zoom = np.array([[1.2, 1, 1], [1, 1.2, 1], [1, 1, 1]])
+    found = refined(tmp_path, with_c2(lambda c: dataclasses.replace(c, K=c.K * zoom)), keypoints_of())
+    assert found.reasons["c2"].startswith("pose and focal length refined")
+    assert found.cameras[2].K[0, 0] == pytest.approx(1000, rel=0.02)
+    assert found.cameras[2].K[0, 0] == found.cameras[2].K[1, 1]
+    assert found.cameras[2].K[0, 2] == 499.5
+    error_px = np.linalg.norm(found.cameras[2].project(walk_m())[0] - ring(4)[2].project(walk_m())[0], axis=-1)
+    assert np.median(error_px) < 1
+
+
+def test_two_cameras_wrong_leave_the_others_alone(tmp_path: Path) -> None:
+    given = [turned(c, 1.0, axis=i) if i < 2 else c for i, c in enumerate(ring(4))]
+    found = refined(tmp_path, given, keypoints_of())
+    assert [new is not old for new, old in zip(found.cameras, given, strict=True)] == [True, True, False, False]
+    for new, true in zip(found.cameras, ring(4), strict=True):
+        assert np.median(np.linalg.norm(new.project(walk_m())[0] - true.project(walk_m())[0], axis=-1)) < 1
+
+
+def test_one_of_many_cannot_hide(tmp_path: Path) -> None:
+    # One of eight sees an eighth of all keypoints: less than what is trimmed as detector errors.
+    given = [turned(camera, 0.5) if camera.name == "c5" else camera for camera in ring(8)]
+    keypoints = np.stack([seen[:, 0] for seen in detections(ring(8), 2).values()])
+    found = refined(tmp_path, given, keypoints)
+    assert [camera.name for camera, old in zip(found.cameras, given, strict=True) if camera is not old] == ["c5"]
+
+
+def test_two_cameras_are_never_judged_one_by_one(tmp_path: Path) -> None:
+    given = ring(4)[:2]
+    found = refined(tmp_path, given, keypoints_of()[:2])
+    assert found.cameras is given
+    assert set(found.reasons.values()) == {"pose kept: it takes two others to judge one camera"}
+
+
+@pytest.mark.parametrize("cause", [*MISTAKES, *MISTAKES_OF_ONE])
+def test_one_cameras_mistake_is_undone(cause: str) -> None:
+    make = dict(MISTAKES)
+    make["T is the camera's centre"] = lambda c: dataclasses.replace(c, t_m=c.centre_m)
+    make |= {
+        "T is in millimetres": lambda c: dataclasses.replace(c, t_m=1e3 * c.t_m),
+        "T is in centimetres": lambda c: dataclasses.replace(c, t_m=1e2 * c.t_m),
+        "T is in inches": lambda c: dataclasses.replace(c, t_m=c.t_m / 0.0254),
+        "T is in metres declared as millimetres": lambda c: dataclasses.replace(c, t_m=1e-3 * c.t_m),
+    }
+    cameras, causes = undo_mistake(with_c2(make[cause]), keypoints_of())
+    assert causes == {"c2": cause}
+    np.testing.assert_allclose(cameras[2].projection, ring(4)[2].projection, atol=1e-9)
+
+
+def test_a_camera_far_off_for_no_known_reason_is_left_to_refinement() -> None:
+    given = with_c2(lambda c: turned(c, 20.0))
+    assert undo_mistake(given, keypoints_of()) == (given, {})
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_every_camera_has_its_reasons(tmp_path: Path) -> None:
+    capture = write_capture(tmp_path, with_c2(lambda c: turned(c, 1.0)), detections(ring(4), 1))
+    report = check_calibration(capture, SETTINGS)
+    said = {name: " | ".join(verdict.reasons) for name, verdict in report.verdicts.items()}
+    assert "turned by 1.0" in said["c2"] and "pose refined: held-out frames go from" in said["c2"]
+    assert all("pose kept: refining it takes held-out frames from" in said[name] for name in ("c0", "c1", "c3"))
+    assert all("offset in time" in text or "in step" in text for text in said.values())
+    assert {"as given", "pose of c0 refined", "pose of c2 refined"} <= set(report.held_out_px)
+    assert len(capture.frames) == FRAMES

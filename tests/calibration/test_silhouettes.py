@@ -1,0 +1,116 @@
+"""Outlines of a box whose masks are exact: the convex hulls of its corners."""
+
+import dataclasses
+from itertools import product
+
+import cv2
+import numpy as np
+import pytest
+
+from hnerf.calibration.silhouettes import Outline, Outlines
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+from hnerf.capture.ingest import ingest
+from hnerf.config import CalibrationSettings, CaptureSettings
+from tests.calibration.synthetic import SIZE_PX, look_at, ring, turned
+from tests.shared_data import shared_capture
+
+CORNERS_M = np.array(list(product([-0.2, 0.2], [-0.3, 0.3], [0.1, 1.7])))
+
+
+def mask(camera: Camera, corners_m: np.ndarray = CORNERS_M) -> np.ndarray:
+    """Drawn at an eighth of a pixel, so that pixels are inside where their centres are."""
+    corners_px = (camera.project(corners_m)[0] * 256).round().astype(np.int32)
+    drawn = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
+    cv2.fillConvexPoly(drawn, cv2.convexHull(corners_px), 1, lineType=cv2.LINE_8, shift=8)
+    return drawn.astype(bool)
+
+
+def outlines(cameras: list[Camera], corners_m: np.ndarray = CORNERS_M) -> Outlines:
+    return Outlines({camera.name: [Outline.around(mask(camera, corners_m))] for camera in cameras}, (0,))
+
+
+def test_distance_and_points_by_hand() -> None:
+    square = np.zeros((20, 30), bool)
+    square[5:15, 10:20] = True
+    square[8:10, 12:14] = False  # a hole and a speck are faults of the mask
+    square[0, 0] = True
+    found = Outline.around(square)
+    assert found is not None
+    assert found.distance_px[10, 25] == 5.5 and found.distance_px[10, 15] == -4.5 and found.distance_px[9, 13] < 0
+    # The edge lies half a pixel outside the centres of the first and last pixels inside.
+    assert found.points_px.min(0) == pytest.approx([9.5, 4.5]) and found.points_px.max(0) == pytest.approx([19.5, 14.5])
+    assert found.centre_px == pytest.approx([14.5, 9.5])
+
+
+def test_no_outline_where_the_image_ends() -> None:
+    assert Outline.around(np.zeros((20, 30), bool)) is None
+    cut_off = np.zeros((20, 30), bool)
+    cut_off[10:, 5:15] = True
+    found = Outline.around(cut_off)
+    assert found is not None and found.points_px[:, 1].max() < 18
+
+
+def test_a_true_rig_costs_nothing() -> None:
+    cameras = ring(4)
+    residuals_px = np.concatenate(list(outlines(cameras).residuals_px(cameras).values()))
+    assert residuals_px.max() < 1.5
+    assert outlines(cameras).cost_px(cameras) < 0.05
+
+
+def test_a_camera_pitched_by_a_degree_misses_by_that_much() -> None:
+    # Two cameras at a right angle, level with the box's middle. One degree moves the picture of c0 by 17.5 px: the
+    # rays of its lower or upper edge pass c1's box by that much, those of the other three edges go through it.
+    centres_m = {"c0": [3.5, 0, 0.9], "c1": [0, 3.5, 0.9]}
+    cameras = [look_at(name, np.array(at), np.array([0, 0, 0.9])) for name, at in centres_m.items()]
+    seen = outlines(cameras)
+    off = [turned(cameras[0], 1.0, axis=0), cameras[1]]
+    residuals_px = seen.residuals_px(off)["c0"]
+    assert residuals_px.max() == pytest.approx(17.5, abs=1.5)
+    outline = seen.by_camera["c0"][0]
+    assert outline is not None
+    wrong_way = outline.points_px[residuals_px > 3, 1]
+    assert len(wrong_way) > 2 and np.ptp(wrong_way) < 60
+
+
+def test_rigs_that_are_off_cost_more() -> None:
+    cameras = ring(4)
+    seen = outlines(cameras)
+    for i, axis in product(range(4), (0, 1)):
+        off = [turned(camera, 1.0, axis) if j == i else camera for j, camera in enumerate(cameras)]
+        assert seen.cost_px(off) > 0.5
+
+
+def test_a_camera_without_mask_takes_no_part() -> None:
+    cameras = ring(4)
+    partly = Outlines(dict(outlines(cameras[:3]).by_camera) | {"c3": [None]}, (0,))
+    residuals_px = partly.residuals_px([*cameras[:3], turned(cameras[3], 20)])
+    assert len(residuals_px["c3"]) == 0 and len(residuals_px["c0"]) > 30
+    assert max(row.max() for row in residuals_px.values() if len(row)) < 1.5
+
+
+@pytest.fixture(scope="module")
+def wave(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return ingest(shared_capture("valid-wave"), CaptureSettings(), tmp_path_factory.mktemp("wave"))
+
+
+def test_a_rendered_capture_tells_a_turned_camera(wave: Capture) -> None:
+    seen = Outlines.of(wave, CalibrationSettings())
+    assert seen is not None
+    cameras = [wave.cameras[name] for name in wave.train_cameras]
+    assert seen.cost_px(cameras) < 0.05
+    for i, camera in enumerate(cameras):
+        off = turned(camera, 1.0, axis=i % 2)
+        assert seen.cost_px([off if j == i else other for j, other in enumerate(cameras)]) > 0.1
+
+
+def test_wrong_cameras_do_not_change_the_masks(wave: Capture) -> None:
+    inverted = {
+        name: dataclasses.replace(c, R=c.R.T, t_m=-c.R.T @ c.t_m) for name, c in wave.cameras.items()
+    }  # fmt: skip
+    a, b = (Outlines.of(capture, CalibrationSettings()) for capture in (wave, wave.with_cameras(inverted)))
+    assert a is not None and b is not None
+    for name in wave.train_cameras:
+        for one, other in zip(a.by_camera[name], b.by_camera[name], strict=True):
+            assert one is not None and other is not None
+            np.testing.assert_array_equal(one.distance_px, other.distance_px)

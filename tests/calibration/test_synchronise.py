@@ -1,0 +1,118 @@
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.calibration.check import check_calibration, load_cameras
+from hnerf.calibration.synchronise import measure_timing, synchronise
+from hnerf.capture.capture import Capture
+from hnerf.config import CalibrationSettings
+from hnerf.errors import CaptureError
+from tests.calibration.synthetic import STANDING_M, ring, turned, write_capture
+
+SETTINGS = CalibrationSettings()
+FRAMES = 48
+
+
+def poses_m(instants: np.ndarray) -> np.ndarray:
+    """(n, 25, 3): the figure to and fro, its arms swinging.
+
+    On a round at an even pace an offset in time would be a turn of the world, as if the camera had been moved.
+    """
+    poses = np.repeat(STANDING_M[None], len(instants), axis=0)
+    poses[:, [3, 4, 6, 7], 0] += 0.2 * np.sin(instants / 5)[:, None] * np.array([1, 1, -1, -1])
+    poses[:, :, 0] += 0.5 * np.sin(instants / 7)[:, None]
+    poses[:, :, 1] += 0.3 * np.sin(instants / 4)[:, None]
+    return poses
+
+
+def recorded(offsets: dict[str, float], frames: int = FRAMES, noise_px: float = 2, speed: float = 1) -> np.ndarray:
+    """(4, frames, 25, 3): what the ring saw. A camera recorded the instant of frame f in its frame f + offset: its
+    frame f shows the instant f - offset."""
+    rng, seen = np.random.default_rng(1), []
+    for camera in ring(4):
+        uv = camera.project(poses_m(speed * (np.arange(frames) - offsets.get(camera.name, 0.0))))[0]
+        seen.append(np.concatenate([uv + noise_px * rng.normal(size=uv.shape), np.full_like(uv[..., :1], 0.8)], -1))
+    return np.stack(seen)
+
+
+def capture_of(root: Path, keypoints: np.ndarray, frames: tuple[int, ...] | None = None) -> Capture:
+    seen = {camera.name: k[:, None] for camera, k in zip(ring(4), keypoints, strict=True)}
+    capture = write_capture(root, ring(4), seen)
+    return capture if frames is None else dataclasses.replace(capture, train_frames=frames)
+
+
+@pytest.mark.parametrize(("name", "offset"), [("c0", 3.0), ("c1", -2.3), ("c2", 0.5), ("c3", -0.3)])
+def test_the_camera_out_of_step_is_found(name: str, offset: float) -> None:
+    offsets, held_out_px, notes = synchronise(ring(4), recorded({name: offset}), range(FRAMES), SETTINGS)
+    assert offsets == {name: pytest.approx(offset, abs=0.08)}
+    assert min(held_out_px, key=held_out_px.__getitem__).startswith(f"camera {name} shifted by")
+    assert not notes
+
+
+def test_several_cameras_out_of_step() -> None:
+    offsets, _, _ = synchronise(ring(4), recorded({"c0": 2.0, "c3": -1.4}), range(FRAMES), SETTINGS)
+    assert offsets == {"c0": pytest.approx(2, abs=0.1), "c3": pytest.approx(-1.4, abs=0.1)}
+
+
+def test_cameras_in_step_stay_so() -> None:
+    keypoints = recorded({})
+    assert synchronise(ring(4), keypoints, range(FRAMES), SETTINGS) == ({}, {}, [])
+    for timing in measure_timing(ring(4), keypoints, range(FRAMES)).values():
+        assert not timing.reason
+        assert abs(timing.offset_frames) < 4 * timing.error_frames < 0.25
+
+
+def test_a_turned_camera_is_not_out_of_step() -> None:
+    # A degree is 17 px, about as far as the figure moves in one frame.
+    cameras = [turned(camera, 1.0) if camera.name == "c1" else camera for camera in ring(4)]
+    assert synchronise(cameras, recorded({}), range(FRAMES), SETTINGS)[0] == {}
+
+
+def test_who_hardly_moves_shows_no_offset() -> None:
+    # A hundredth of walking speed: a frame moves him by less than a pixel, and two by less than the noise.
+    keypoints = recorded({"c1": 2.0}, speed=0.01)
+    assert synchronise(ring(4), keypoints, range(FRAMES), SETTINGS)[0] == {}
+    reasons = [timing.reason for timing in measure_timing(ring(4), keypoints, range(FRAMES)).values()]
+    assert all(reasons)
+    assert any("too little motion" in reason for reason in reasons)
+
+
+def test_two_cameras_cannot_tell() -> None:
+    found = measure_timing(ring(4)[:2], recorded({})[:2], range(FRAMES))
+    assert {timing.reason for timing in found.values()} == {"it takes two other cameras to place keypoints"}
+
+
+def test_the_report_corrects_and_says_so(tmp_path: Path, no_pictures: None) -> None:
+    capture = capture_of(tmp_path / "in", recorded({"c2": 2.0}))
+    report = check_calibration(capture, SETTINGS)
+    assert {name: v.status for name, v in report.verdicts.items()} == {
+        "c0": "ok", "c1": "ok", "c2": "refined", "c3": "ok"
+    }  # fmt: skip
+    assert report.verdicts["c2"].frame_offset == pytest.approx(2, abs=0.08)
+    assert any(reason.startswith("out of step by +2.0") for reason in report.verdicts["c2"].reasons)
+    assert "2 frames dropped that not every camera recorded: 46, 47" in report.notes
+    report.save(tmp_path / "out")
+    used = load_cameras(tmp_path / "out", capture)
+    assert used.frames == tuple(range(46))
+    found, given = used.keypoints("c2"), capture.keypoints("c2")
+    assert found is not None and given is not None
+    # Frame 5 of the others is frame 7 of this one, but for a few hundredths.
+    assert np.abs(found[5] - given[7]).max() < 2
+
+
+def test_strided_frames_say_what_to_cut(tmp_path: Path, no_pictures: None) -> None:
+    strided = recorded({"c0": -2.0, "c1": 0.0}, frames=4 * FRAMES)[:, ::4]
+    capture = capture_of(tmp_path, strided, frames=tuple(range(0, 4 * FRAMES, 4)))
+    with pytest.raises(CaptureError) as caught:
+        check_calibration(capture, SETTINGS)
+    assert "camera c0 by -2." in str(caught.value)
+    assert "2 from camera c1, 2 from camera c2, 2 from camera c3" in str(caught.value)
+
+
+def test_recorded_frame_numbers_count() -> None:
+    # Frames 16 to 23 were never ingested: neighbours in the array are not neighbours in time.
+    frames = [frame for frame in range(FRAMES) if not 16 <= frame < 24]
+    offsets, _, _ = synchronise(ring(4), recorded({"c1": 1.0})[:, frames], frames, SETTINGS)
+    assert offsets == {"c1": pytest.approx(1, abs=0.08)}

@@ -1,0 +1,87 @@
+"""Black bars, made with known edges."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hnerf.capture.bars import Area, fitted, picture_area
+from hnerf.capture.capture import Capture
+from hnerf.capture.ingest import ingest
+from hnerf.capture.lens import Lens
+from hnerf.config import CaptureSettings
+from hnerf.errors import CaptureError
+from tests.capture.recordings import WIDTH, picture, write_easymocap, write_png
+
+LENS = Lens(
+    "a", np.array([[200.0, 0, 99.5], [0, 200, 149.5], [0, 0, 1]]), np.zeros(5), np.eye(3), np.zeros(3), (200, 300)
+)
+
+
+def frames(height: int = 300, width: int = 200) -> list[np.ndarray]:
+    """Three of noise around grey 120."""
+    return [np.random.default_rng(seed).integers(60, 180, (height, width, 3), np.uint8) for seed in range(3)]
+
+
+def test_edges_are_found_to_a_fraction_of_a_pixel() -> None:
+    pictures = frames()
+    for rgb in pictures:
+        rgb[:7] = 2
+        rgb[-6:] = 3
+        rgb[:, :4] = 0
+        rgb[-7] = rgb[-7] * 0.6  # the last row is picture over 0.6 of its height
+    found = picture_area(pictures)
+    assert found[:3] == pytest.approx((4, 7, 196), abs=0.1)
+    assert found.top + found.height == pytest.approx(293.6, abs=0.1)
+
+
+def test_no_bars_in_a_whole_or_a_dark_picture() -> None:
+    assert picture_area(frames()) == (0, 0, 200, 300)
+    assert picture_area([rgb // 20 for rgb in frames()]) == (0, 0, 200, 300)
+    fade = np.linspace(0, 1, 40)[:, None, None]  # light that falls off towards the top is no bar
+    pictures = frames()
+    for rgb in pictures:
+        rgb[:40] = rgb[:40] * fade**2
+    assert picture_area(pictures) == (0, 0, 200, 300)
+
+
+def test_a_bar_is_dark_in_most_frames() -> None:
+    pictures = frames()
+    pictures[0][:7] = 0
+    assert picture_area(pictures) == (0, 0, 200, 300)
+
+
+def test_scale_and_offset_by_hand() -> None:
+    # Half size, 5 px from the left and 7 from the top: the calibrated picture's middle (99.5, 149.5) in centres is
+    # (100, 150) from the corner, so (55, 82) from the new corner and (54.5, 81.5) in centres.
+    lens = fitted(LENS, Area(5, 7, 100, 150), (110, 164))
+    assert lens is not None
+    np.testing.assert_allclose(lens.K, np.array([[100, 0, 54.5], [0, 100, 81.5], [0, 0, 1]]))
+
+
+def test_without_bars_or_at_another_aspect_nothing_is_proven() -> None:
+    assert fitted(LENS, Area(0, 0, 100, 150), (100, 150)) is None
+    assert fitted(LENS, Area(5, 0, 100, 152), (110, 152)) is None
+
+
+def test_a_letterboxed_camera_is_matched_at_the_door(tmp_path: Path) -> None:
+    # 24 x 16 calibrated, doubled to 48 x 32 and put 20 px down in 48 x 72: the middle (11.5, 7.5) is at (23.5, 35.5).
+    folder = write_easymocap(tmp_path / "in")
+    for path in sorted((folder / "images" / "01").iterdir()):
+        tall = cv2.resize(picture("01", int(path.stem)) // 2 + 100, (48, 32), interpolation=cv2.INTER_NEAREST)
+        write_png(path, np.pad(tall, ((20, 20), (0, 0), (0, 0))))
+    ingest(folder, CaptureSettings(), tmp_path / "out")
+    capture = Capture.load(tmp_path / "out")
+    assert capture.picture_areas_px["01"] == pytest.approx((0, 20, 48, 32), abs=0.2)
+    expected = np.array([[40, 0, 23.5], [0, 40, 35.5], [0, 0, 1]])
+    np.testing.assert_allclose(capture.cameras["01"].K, expected, atol=0.2)
+    assert capture.recorded_sizes_px["01"] == (48, 72) and capture.calibrated_sizes_px["01"] == (WIDTH, 16)
+
+
+def test_a_size_that_bars_do_not_explain_is_refused(tmp_path: Path) -> None:
+    folder = write_easymocap(tmp_path / "in")
+    for path in sorted((folder / "images" / "01").iterdir()):
+        write_png(path, np.pad(picture("01", int(path.stem)), ((20, 20), (0, 9), (0, 0)), mode="wrap"))
+    with pytest.raises(CaptureError, match=r"000000.png: is 33 x 56 px, but camera 01 was calibrated at 24 x 16"):
+        ingest(folder, CaptureSettings(), tmp_path / "out")

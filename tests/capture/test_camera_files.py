@@ -1,0 +1,174 @@
+"""Cameras in other tools' files: read, written, and read back; numbers worked out by hand."""
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from flows.cli import main
+from hnerf.capture.formats.caliscope import Caliscope
+from hnerf.capture.formats.colmap import Colmap
+from hnerf.capture.formats.easymocap import EasyMocap
+from hnerf.capture.formats.export import write_cameras
+from hnerf.capture.formats.layout import Layout
+from hnerf.capture.formats.pose2sim import Pose2Sim
+from hnerf.capture.ingest import ingest, recognise
+from hnerf.capture.lens import Lens
+from hnerf.config import CaptureSettings
+from hnerf.errors import CaptureError
+from tests.capture import recordings as rec
+
+CAMERAS_TXT = "# Camera list\n1 SIMPLE_RADIAL 640 480 500 320 240 0.1\n2 PINHOLE 24 16 20 21 12 8\n"
+# A quarter turn about x, quaternion w x y z = (cos 45, sin 45, 0, 0): y goes to z, z to -y.
+IMAGES_TXT = (
+    "# Image list\n7 0.7071067811865476 0.7071067811865476 0 0 1 2 3 1 01/000000.jpg\n10.5 20.5 -1 30.5 40.5 -1\n"
+    "9 1 0 0 0 0 0 4 2 02.png\n\n"
+)
+LENSES = [
+    Lens("cam_0", np.array([[500.0, 0, 319.5], [0, 510, 239.5], [0, 0, 1]]), np.array([0.1, -0.2, 0.01, 0.02, 0.3]),
+         np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.array([1.0, 2, 3]), (640, 480)),
+    Lens("cam_3", np.array([[20.0, 0, 11.5], [0, 20, 7.5], [0, 0, 1]]), np.array([0.1, -0.2, 0.01, 0.02]),
+         cv2.Rodrigues(np.array([0.1, 0.2, 0.3]))[0], np.array([0.0, 0, 4]), (24, 16)),
+    Lens("cam_4", np.array([[20.0, 0, 11.5], [0, 20, 7.5], [0, 0, 1]]), np.zeros(4), np.eye(3), np.zeros(3), (24, 16)),
+]  # fmt: skip
+
+
+def write_model(folder: Path, binary: bool = False) -> Path:
+    """The model above in sparse/0."""
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True)
+    (model / "cameras.txt").write_text(CAMERAS_TXT)
+    (model / "images.txt").write_text(IMAGES_TXT)
+    if binary:
+        (model / "points3D.txt").write_text("")
+        pycolmap.Reconstruction(str(model)).write_binary(str(model))
+        for path in model.glob("*.txt"):
+            path.unlink()
+    return folder
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_a_colmap_model_is_read(binary: bool, tmp_path: Path) -> None:
+    lenses = Colmap(write_model(tmp_path, binary)).lenses()
+    assert set(lenses) == {"01", "02"}
+    first = lenses["01"]
+    assert first.K.tolist() == [[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]]  # half a pixel less
+    assert first.distortion.tolist() == [0.1, 0, 0, 0, 0] and first.size_px == (640, 480)
+    assert np.allclose(first.R, [[1, 0, 0], [0, 0, -1], [0, 1, 0]]) and first.t_m.tolist() == [1, 2, 3]
+    assert lenses["02"].K.tolist() == [[20, 0, 11.5], [0, 21, 7.5], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "value"),
+    [
+        ("cameras.bin", 0, struct.pack("<Q", 1 << 60)),  # number of cameras
+        ("images.bin", 0, struct.pack("<Q", 1 << 60)),  # number of images
+        ("cameras.bin", 12, struct.pack("<i", 5)),  # OPENCV_FISHEYE
+        ("cameras.bin", 16, struct.pack("<Q", 1 << 40)),  # width
+        ("images.bin", 8 + 64 + len("01/000000.jpg") + 1, struct.pack("<Q", 1 << 60)),  # number of points
+        ("images.bin", 12, struct.pack("<d", float("nan"))),  # quaternion
+        ("images.bin", 8 + 64, b"../../etc/pwd"),  # name
+    ],
+)
+def test_hostile_colmap_models_are_refused(name: str, at: int, value: bytes, tmp_path: Path) -> None:
+    path = write_model(tmp_path, binary=True) / "sparse" / "0" / name
+    data = bytearray(path.read_bytes())
+    data[at : at + len(value)] = value
+    path.write_bytes(data)
+    with pytest.raises(CaptureError, match=name):
+        Colmap(tmp_path).lenses()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("02.png", "01/000001.jpg", "several images of camera 01"),
+        ("4 2 02.png", "4 5 02.png", "camera 5 is not in"),
+        ("9 1 0 0 0", "9 0 0 0 0", "its quaternion is none"),
+        ("7 0.7", "7 zero", "no model of COLMAP's"),
+    ],
+)
+def test_colmap_models_that_make_no_cameras_are_refused(old: str, new: str, message: str, tmp_path: Path) -> None:
+    path = write_model(tmp_path) / "sparse" / "0" / "images.txt"
+    assert old in IMAGES_TXT
+    path.write_text(IMAGES_TXT.replace(old, new))
+    with pytest.raises(CaptureError, match=message):
+        Colmap(tmp_path).lenses()
+
+
+@pytest.mark.parametrize(
+    ("layout", "reader"),
+    [("colmap", Colmap), ("caliscope", Caliscope), ("aniposelib", Caliscope), ("easymocap", EasyMocap)],
+)
+def test_what_is_written_reads_back(layout: str, reader: type[Layout], tmp_path: Path) -> None:
+    write_cameras(tmp_path, LENSES, layout)
+    assert type(recognise(tmp_path)) is reader
+    read = recognise(tmp_path).lenses()
+    assert list(read) == ["cam_0", "cam_3", "cam_4"]
+    for lens in LENSES:
+        found = read[lens.name]
+        assert np.allclose(found.K, lens.K, atol=1e-12) and found.size_px == lens.size_px
+        assert np.allclose(found.R, lens.R, atol=1e-12) and np.allclose(found.t_m, lens.t_m, atol=1e-12)
+        padded = [np.pad(d, (0, 5 - len(d))) for d in (found.distortion, lens.distortion)]
+        assert np.allclose(*padded, atol=1e-12)
+
+
+def test_colmap_sees_the_same_pixels(tmp_path: Path) -> None:
+    """A point on the axis of K's centre: pixel (319.5, 239.5) here is (320, 240) there."""
+    write_cameras(tmp_path, LENSES, "colmap")
+    model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    assert [model.cameras[i].model.name for i in (1, 2, 3)] == ["FULL_OPENCV", "OPENCV", "PINHOLE"]
+    image = next(image for image in model.images.values() if image.name == "cam_0/000000.jpg")
+    on_axis = LENSES[0].R.T @ (np.array([0, 0, 2.0]) - LENSES[0].t_m)
+    assert image.project_point(on_axis).tolist() == pytest.approx([320, 240])
+    beside = np.array([0.3, 0.2, 2.0])
+    uv = cv2.projectPoints(beside, np.zeros(3), np.zeros(3), LENSES[0].K, LENSES[0].distortion)[0].ravel()
+    assert image.project_point(LENSES[0].R.T @ (beside - LENSES[0].t_m)) == pytest.approx(uv + 0.5)
+
+
+def test_opencv_and_pose2sim_read_what_is_written(tmp_path: Path) -> None:
+    write_cameras(tmp_path, LENSES, "easymocap")
+    extri = cv2.FileStorage(str(tmp_path / "extri.yml"), cv2.FILE_STORAGE_READ)
+    assert np.allclose(extri.getNode("Rot_cam_3").mat(), LENSES[1].R)
+    write_cameras(tmp_path / "calibration", LENSES, "aniposelib")
+    (tmp_path / "calibration" / "calibration.toml").rename(tmp_path / "calibration" / "Calib.toml")
+    assert np.allclose(Pose2Sim(tmp_path).lenses()["cam_3"].R, LENSES[1].R)
+
+
+def test_caliscope_cameras_that_are_ignored_stay_away(tmp_path: Path) -> None:
+    write_cameras(tmp_path, LENSES, "caliscope")
+    text = (tmp_path / "camera_array.toml").read_text().replace("ignore = false", "ignore = true", 1)
+    (tmp_path / "camera_array.toml").write_text(text)
+    assert list(recognise(tmp_path).lenses()) == ["cam_3", "cam_4"]
+    (tmp_path / "camera_array.toml").write_text(text.replace("cam_id = 3", 'cam_id = "../3"'))
+    with pytest.raises(CaptureError, match="camera name"):
+        recognise(tmp_path).lenses()
+    (tmp_path / "camera_array.toml").write_text("cameras = [1]\n")
+    with pytest.raises(CaptureError, match="no tables"):
+        recognise(tmp_path).lenses()
+
+
+def test_a_colmap_capture_is_ingested_with_its_scale(tmp_path: Path) -> None:
+    """A unit of the model is half a metre."""
+    folder = rec.write_easymocap(tmp_path / "ada")
+    for name in ("intri.yml", "extri.yml"):
+        (folder / name).unlink()
+    lenses = [Lens(n, np.array(rec.K), np.zeros(4), np.array(rec.ROTATIONS[n]), np.array(rec.TRANSLATIONS_M[n]) * 2,
+                   (rec.WIDTH, rec.HEIGHT)) for n in rec.CAMERAS]  # fmt: skip
+    write_cameras(folder, lenses, "colmap")
+    (folder / "capture.toml").write_text("units = 0.5\n")
+    capture = ingest(folder, CaptureSettings(), tmp_path / "out")
+    assert capture.cameras["02"].t_m.tolist() == pytest.approx(rec.TRANSLATIONS_M["02"])
+    assert np.allclose(capture.cameras["02"].K, rec.K) and len(capture.frames) == len(rec.FRAMES)
+
+
+def test_the_command_line_converts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_model(tmp_path / "model")
+    (folder / "capture.toml").write_text('units = "mm"\n')
+    assert main(["cameras", str(folder), "--format", "aniposelib", "--out", str(tmp_path / "out")]) == 0
+    assert Caliscope(tmp_path / "out").lenses()["01"].t_m.tolist() == pytest.approx([0.001, 0.002, 0.003])
+    assert main(["calibrate", str(folder), "--out", str(tmp_path / "none")]) == 2
+    assert "no board footage" in capsys.readouterr().err and not (tmp_path / "none").exists()

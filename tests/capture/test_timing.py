@@ -1,0 +1,70 @@
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+from hnerf.capture.timing import nearest_frame, resample
+
+
+def people_at(*x_px: float) -> np.ndarray:
+    """(people, 2, 3): two keypoints 100 px apart, one below the other."""
+    return np.array([[[x, 0, 0.8], [x, 100, 0.8]] for x in x_px])
+
+
+def test_nearest_frame_by_hand() -> None:
+    assert [nearest_frame(10, offset) for offset in (-0.6, -0.4, 0.4, 0.5, 2.7)] == [9, 10, 10, 11, 13]
+
+
+def test_keypoints_between_frames_by_hand() -> None:
+    moving = np.stack([people_at(10 * frame) for frame in range(4)])
+    found = resample(moving, range(4), np.array([1.25, 2.0, 3.4, 3.6, -0.6]))
+    # Between frames linearly; beyond the ends as at the ends for half a frame, then nobody.
+    np.testing.assert_allclose(found[:3, 0, 0], [[12.5, 0, 0.8], [20, 0, 0.8], [30, 0, 0.8]])
+    assert not found[3:].any()
+
+
+def test_keypoints_do_not_cross_a_gap() -> None:
+    frames = (0, 1, 2, 10, 11)
+    moving = np.stack([people_at(10 * frame) for frame in frames])
+    found = resample(moving, frames, np.array([2.3, 6.0, 9.6, 10.5]))
+    assert found[:, 0, 0, 0].tolist() == [20, 0, 100, 105]
+
+
+def test_a_keypoint_of_one_frame_is_taken_from_there() -> None:
+    pair = np.stack([people_at(0), people_at(10)])
+    pair[1, 0, 1] = 0
+    found = resample(pair, (0, 1), np.array([0.25, 0.75]))
+    assert found[0, 0].tolist() == [[2.5, 0, 0.8], [0, 100, 0.8]]
+    assert found[1, 0].tolist() == [[7.5, 0, 0.8], [0, 0, 0]]
+
+
+def test_people_are_followed_whatever_their_order() -> None:
+    swapped = np.stack([people_at(0, 500), people_at(510, 10)])
+    assert resample(swapped, (0, 1), np.array([0.4]))[0, :, 0, 0].tolist() == [4, 504]
+
+
+def test_a_capture_in_step_reads_the_nearest_frame(tmp_path: Path) -> None:
+    camera = Camera("a", np.eye(3), np.eye(3), np.zeros(3), 4, 4)
+    for frame in range(6):
+        for folder, value in (("images", 40 * frame), ("masks", 255 * (frame == 4))):
+            (tmp_path / folder / "a").mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(tmp_path / folder / "a" / f"{frame:06d}.png"), np.full((4, 4), value, np.uint8))
+    np.savez(tmp_path / "keypoints.npz", a=np.stack([people_at(10 * frame) for frame in range(6)]))
+    size = {"a": (4, 4)}
+    capture = Capture("x", tmp_path, {"a": camera}, ("a",), (), (0, 1, 2, 3), (4, 5), 30.0, "z", size, size)
+
+    in_step = capture.synchronised({"a": 1.75})  # instants 0 .. 3 lie nearest to frames 2 .. 5; 4 and 5 are beyond
+    assert (in_step.train_frames, in_step.novel_pose_frames) == ((0, 1, 2, 3), ())
+    assert in_step.image("a", 1).max() == 120
+    assert [in_step.given_mask("a", frame).all() for frame in in_step.frames] == [False, False, True, False]  # type: ignore[union-attr]
+    found = in_step.keypoints("a")
+    assert found is not None
+    np.testing.assert_allclose(found[:, 0, 0, 0], [17.5, 27.5, 37.5, 47.5])
+
+    in_step.save()
+    assert json.loads((tmp_path / "capture.json").read_text())["frame_offsets"] == {"a": 1.75}
+    again = Capture.load(tmp_path)
+    assert (again.frame_offsets, again.stored_frames, again.frames) == ({"a": 1.75}, (0, 1, 2, 3, 4, 5), (0, 1, 2, 3))
