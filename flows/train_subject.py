@@ -7,13 +7,13 @@ from prefect.artifacts import create_markdown_artifact
 from prefect.context import FlowRunContext
 
 from hnerf.capture.capture import Capture
-from hnerf.config import load_settings
+from hnerf.config import Settings, load_settings
 from tasks.asset import export
 from tasks.calibration import calibrate
 from tasks.capture import ingest
 from tasks.evaluation import evaluate
 from tasks.fit import fit
-from tasks.segmentation import needs_body, segment
+from tasks.segmentation import needs_body, segment, settled
 from tasks.source import read_capture
 from tasks.store import Artifact, Store
 from tasks.training import train
@@ -36,8 +36,7 @@ def train_subject(
     subject = Capture.load(recording.root).name
     shelf.show(subject, recording)
     calibration = shelf.show(subject, calibrate(shelf, recording, settings.calibration))
-    rough = fit(shelf, recording, calibration, None, settings.fit) if needs_body(recording) else None
-    masks = shelf.show(subject, segment(shelf, recording, calibration, rough, settings.segmentation))
+    masks = shelf.show(subject, find_masks(shelf, recording, calibration, settings))
     body = shelf.show(subject, fit(shelf, recording, calibration, masks, settings.fit))
     model = shelf.show(subject, train(shelf, recording, calibration, masks, body, settings.training))
     report = evaluate(shelf, truth, recording, calibration, masks, body, model, settings.evaluation)
@@ -45,6 +44,20 @@ def train_subject(
     asset = shelf.show(subject, export(shelf, recording, calibration, model, settings.asset))
     _announce(subject, report, asset)
     return shelf.subject_folder(subject)
+
+
+def find_masks(shelf: Store, recording: Artifact, calibration: Artifact, settings: Settings) -> Artifact:
+    """Segment; where that needs a body, fit one to keypoints first, and go round until the masks stand still."""
+    if not needs_body(recording, settings.segmentation):
+        return segment(shelf, recording, calibration, None, None, settings.segmentation)
+    masks = None
+    for _ in range(settings.segmentation.rounds):
+        body = fit(shelf, recording, calibration, masks, settings.fit)
+        masks = segment(shelf, recording, calibration, body, masks, settings.segmentation)
+        if settled(masks, settings.segmentation):
+            break
+    assert masks is not None  # there is a round at least
+    return masks
 
 
 def _announce(subject: str, report: Artifact, asset: Artifact) -> None:

@@ -16,7 +16,7 @@ from tasks.store import Artifact
 from tasks.training import trained
 
 
-@stage("evaluation", version="1")
+@stage("evaluation", version="2")
 def evaluate(
     out: Path,
     truth: Source,

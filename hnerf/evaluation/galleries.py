@@ -71,7 +71,7 @@ def _mask_and_reference(
     """The mask (H, W) bool and the captioned picture to compare with, or None where there is none."""
     if view.split != TRAINING_VIEW and truth is not None and truth.has_masks:
         return truth.mask(view.camera, view.frame), ("Ground truth", truth.on_black(view.camera, view.frame)[0])
-    if view.camera not in inputs.capture.train_cameras:
+    if (view.camera, view.frame) not in inputs.masks:
         return None, None
     mask = inputs.masks.get(view.camera, view.frame)
     return mask, ("Input × mask", image * mask[..., None])

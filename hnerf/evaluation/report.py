@@ -71,6 +71,7 @@ def write_report(
         training_charts=training_charts(inputs.training_folder / "history.jsonl", out),
         frame_charts=frame_charts(found, out),
         rig_picture=png_uri(inputs.calibration_folder / "cameras.png"),
+        witness_picture=png_uri(inputs.calibration_folder / "witnesses.png"),
         stages=stages,
         costs=costs(stages, found),
         notes=notes(inputs, found),

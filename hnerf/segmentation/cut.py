@@ -1,54 +1,61 @@
-"""From a difference and a prior to a mask: labels, then GrabCut in the band where they are unsure."""
+"""From a difference and a prior to a mask: smoothed odds, GrabCut where they are unsure, then matting at the edge."""
 
 import cv2
 import numpy as np
 
 from hnerf.segmentation.difference import Difference
+from hnerf.segmentation.edge import settle_edge
 from hnerf.segmentation.prior import Prior, disc, window_around
 
-ITERATIONS = 2  # the labels are nearly right: more let the colour models drift
-SHADOW_SHARE = 0.006  # of the person's height: thinner shadows are the person's own dark edges
-BAND_SHARE = 0.005  # of the person's height, on both sides of the outline: what GrabCut decides
+BODY_ODDS, CORE_ODDS = 1.0, 2.0  # logarithms: what the prior adds on the body, and again on its core
+UNKNOWN_ODDS = -2.0  # off the body, where there is nothing to compare with
+MOST_ODDS = 4.0  # of one pixel: models of noise and shadow are not better than that
+SURE_ODDS = 2.0  # beyond which GrabCut has to agree
+SMOOTH_PX, SMOOTH_GREY = 2, 7.0  # the guided filter's window, and the step in the picture that it keeps
+SPECK_SHARE = 0.001  # of the mask's area: smaller parts are noise
+BAND_PX = 4  # around the likely person, where GrabCut may find more of it
 
 
 def cut(image: np.ndarray, found: Difference, prior: Prior, known: np.ndarray) -> np.ndarray:
-    """Mask of the person, (H, W) bool, in an RGB image. `known` (H, W) bool: where the plate behind `found` is one."""
-    likely = _likely_person(found, prior, known)
+    """Mask of the person, (H, W) bool, in an RGB image. `known` (H, W) bool: where the plate behind `found` is one.
+
+    The odds, with those of the prior, are averaged by a guided filter (cost-volume filtering, Rhemann et al. 2011) and
+    label what is sure. GrabCut (Rother et al. 2004) decides the rest on the picture of differences, from which the
+    background's texture has gone.
+    """
+    odds = np.where(known, found.odds.clip(-MOST_ODDS, MOST_ODDS), UNKNOWN_ODDS * ~prior.body)
+    odds = odds + BODY_ODDS * prior.body + CORE_ODDS * prior.core
+    odds = cv2.ximgproc.guidedFilter(found.apart, odds.astype(np.float32), SMOOTH_PX, SMOOTH_GREY**2)
+    likely = components_within((odds > 0) & prior.reach, prior.reach)
     if not likely.any():
         return likely
-    band = disc(max(2, BAND_SHARE * prior.height_px))
-    grown = cv2.dilate(likely.astype(np.uint8), band).astype(bool)
-    shrunk = cv2.erode(likely.astype(np.uint8), band).astype(bool)
-    labels = np.full(likely.shape, cv2.GC_BGD, np.uint8)
-    labels[grown & found.changed & prior.reach | ~known & prior.near] = cv2.GC_PR_BGD
-    labels[likely] = cv2.GC_PR_FGD
-    labels[shrunk & (known | prior.core)] = cv2.GC_FGD
-    labels = _grab_cut(image, labels)
-    mask = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
-    return components_within(mask, prior.reach)
+    labels = np.where(odds > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    around = cv2.dilate(likely.astype(np.uint8), disc(BAND_PX)).astype(bool) | (~known & prior.near)
+    labels[(odds < -SURE_ODDS) | ~around | ~prior.reach] = cv2.GC_BGD
+    labels[cv2.erode((odds > SURE_ODDS).astype(np.uint8), disc(1)).astype(bool) & prior.reach] = cv2.GC_FGD
+    labels = _grab_cut(found.apart, labels)
+    mask = components_within((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD), prior.reach)
+    return settle_edge(_without_specks(mask), image, found.plate)
 
 
-def _likely_person(found: Difference, prior: Prior, known: np.ndarray) -> np.ndarray:
-    """Changed and no shadow, within reach, without specks and pin holes; the body itself where there is no plate."""
-    thin = disc(SHADOW_SHARE * prior.height_px)
-    shadow = cv2.morphologyEx((found.shadow & ~prior.core).astype(np.uint8), cv2.MORPH_OPEN, thin).astype(bool)
-    lit = found.changed & ~shadow
-    likely = np.where(known, lit & prior.reach, prior.body)
-    opened = cv2.morphologyEx(likely.astype(np.uint8), cv2.MORPH_OPEN, disc(1))
-    closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, thin).astype(bool)
-    return opened.astype(bool) | (closed & (lit | ~known))
+def _without_specks(mask: np.ndarray) -> np.ndarray:
+    """A mask without its smallest parts."""
+    _, parts, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    large = stats[:, cv2.CC_STAT_AREA] >= SPECK_SHARE * mask.sum()
+    large[0] = False
+    return large[parts]
 
 
-def _grab_cut(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
+def _grab_cut(picture: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """Labels after GrabCut, which sees a tight window: its model of the background is of what surrounds the person."""
     window = window_around(labels != cv2.GC_BGD)
     inside = np.ascontiguousarray(labels[window])
-    if not np.isin(inside, (cv2.GC_BGD, cv2.GC_PR_BGD)).any():
+    if not np.isin(inside, (cv2.GC_BGD, cv2.GC_PR_BGD)).any() or not np.isin(inside, (cv2.GC_FGD, cv2.GC_PR_FGD)).any():
         return labels
     cv2.setRNGSeed(0)  # its colour models start from k-means
     background, person = np.zeros((1, 65)), np.zeros((1, 65))
-    pixels = np.ascontiguousarray(image[window])
-    cv2.grabCut(pixels, inside, (0, 0, 0, 0), background, person, ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    pixels = np.ascontiguousarray(picture[window])
+    cv2.grabCut(pixels, inside, (0, 0, 0, 0), background, person, 1, cv2.GC_INIT_WITH_MASK)
     result = labels.copy()
     result[window] = inside
     return result

@@ -1,4 +1,4 @@
-"""Image against clean plate: what changed, and which of that is only a shadow."""
+"""Image against background: how much likelier each pixel is the person's than the background's, or its shadow's."""
 
 from dataclasses import dataclass
 
@@ -8,19 +8,27 @@ import numpy as np
 from hnerf.config import SegmentationSettings
 from hnerf.segmentation.prior import Prior
 
-LEAST_DIFFERENCE = 5.0  # grey levels: below it JPEG and rounding
+DARK = 6.0  # grey levels added before the logarithm: below it sensors and JPEG tell little
+RATIO_NOISE = 0.01  # of log ratios, beyond the pixel's own noise: JPEG, rounding of the plate
+SHADOW_TINT = 0.02  # change of log chroma per log brightness: gamma and stray light tint deep shadows a little
+SHADOW_SHARE = 0.1  # of the background near a person, before looking
+EDGE_OF_SHADOW = 0.1  # log brightness over which a shadow beyond the darkest becomes impossible
+PERSON_BRIGHTNESS, PERSON_CHROMA = 0.6, 0.25  # spread of a person's log ratio to what is behind
+NOISE_FACTOR = 0.8  # the robust estimate of noise counts JPEG's blocks twice
 ROUNDING = 0.5  # grey levels
+APART_GAIN, APART_FLOOR = 16.0, 16.0  # of the picture of differences, which cameras' square-root noise makes even
+PAINT_PX = 3  # from which a pixel never seen takes its colour
 HIDDEN = 256  # sorts behind every grey level
-NOISE_FACTOR = 1.5  # standard deviations of a pixel's noise; the mean of nine has a third of it
-CHROMA_PER_DARKENING = 0.04  # gamma and stray light tint deep shadows a little
 
 
 @dataclass(frozen=True)
 class Difference:
-    """changed, shadow (H, W) bool; shadow lies within changed."""
+    """odds: (H, W) float32, logarithm of the odds of person against background, shadows included. apart: (H, W, 3)
+    uint8, the difference as a picture, grey where nothing changed. plate: (H, W, 3) uint8 RGB, as compared to."""
 
-    changed: np.ndarray
-    shadow: np.ndarray
+    odds: np.ndarray
+    apart: np.ndarray
+    plate: np.ndarray
 
 
 def noise_level(image: np.ndarray, plate: np.ndarray) -> float:
@@ -29,31 +37,46 @@ def noise_level(image: np.ndarray, plate: np.ndarray) -> float:
     return 1.4826 * float(np.median(np.abs(apart))) + ROUNDING
 
 
-def difference(image: np.ndarray, plate: np.ndarray, noise: float, settings: SegmentationSettings) -> Difference:
-    """Compare (H, W, 3) uint8 RGB images.
+def difference(
+    image: np.ndarray, plate: np.ndarray, noise: float, settings: SegmentationSettings, shadowed: bool = False
+) -> Difference:
+    """Compare (H, W, 3) uint8 RGB images. `shadowed`: the plate, a median over time, may hold shadows itself.
 
-    A shadow multiplies the plate, and all channels nearly alike: it is where the log ratio's brightness falls, not too
-    far, while its chroma stays (Horprasert et al. 1999, in logarithms).
+    The logarithm of their ratio splits into brightness and chroma. Unchanged background has neither; a shadow takes
+    brightness away and leaves chroma nearly alone (Horprasert et al. 1999, in logarithms); a person may have any.
     """
-    image, plate = image.astype(np.float32), plate.astype(np.float32)
-    apart = image - plate
-    single = np.abs(apart).max(-1)
-    smooth = np.abs(cv2.blur(apart, (3, 3))).max(-1)
-    least = max(LEAST_DIFFERENCE, NOISE_FACTOR * noise)
-    changed = (smooth > least) & (single > 0.6 * least)
-    ratio = cv2.blur(np.log((image + 1) / (plate + 1)), (3, 3))
+    lit, unlit = image.astype(np.float32) + DARK, plate.astype(np.float32) + DARK
+    ratio = np.log(lit / unlit)
     brightness = ratio.mean(-1)
-    chroma = np.linalg.norm(ratio - brightness[..., None], axis=-1)
-    chroma_noise = 2 * noise / (plate.min(-1) + 1)
-    tint = np.maximum(settings.shadow_chroma, chroma_noise) - CHROMA_PER_DARKENING * brightness
-    shadow = (chroma < tint) & (brightness < 0) & (brightness > np.log(settings.darkest_shadow))
-    return Difference(changed, changed & shadow)
+    chroma = ((ratio - brightness[..., None]) ** 2).sum(-1)
+    noise_variance = (NOISE_FACTOR * noise / unlit.min(-1)) ** 2 + RATIO_NOISE**2
+    unchanged = _normal(3 * brightness**2, noise_variance, 1) + _normal(chroma, noise_variance, 2)
+    tint = noise_variance + settings.shadow_chroma**2 + (SHADOW_TINT * np.minimum(brightness, 0)) ** 2
+    darkest = float(np.log(settings.darkest_shadow))
+    shadow = _even(brightness, darkest, -darkest if shadowed else 0.0) + _normal(chroma, tint, 2)
+    background = np.logaddexp(np.log(1 - SHADOW_SHARE) + unchanged, np.log(SHADOW_SHARE) + shadow)
+    person = _normal(3 * brightness**2, 3 * PERSON_BRIGHTNESS**2, 1) + _normal(chroma, PERSON_CHROMA**2, 2)
+    apart = APART_GAIN * (image.astype(np.float32) - plate) / np.sqrt(plate + APART_FLOOR)
+    picture = (128 + apart).clip(0, 255).round().astype(np.uint8)
+    return Difference((person - background).astype(np.float32), picture, plate)
+
+
+def _normal(squared: np.ndarray, variance: np.ndarray | float, dimensions: int) -> np.ndarray:
+    """Logarithm of the normal density at this squared distance."""
+    return -0.5 * squared / variance - 0.5 * dimensions * np.log(2 * np.pi * variance)
+
+
+def _even(brightness: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Logarithm of a density of log brightness that is even from low to high, soft at both ends."""
+    beyond = (np.maximum(low - brightness, 0) + np.maximum(brightness - high, 0)) / EDGE_OF_SHADOW
+    return -0.5 * beyond**2 - np.log(np.sqrt(3) * (high - low))
 
 
 def masked_median(images: list[np.ndarray], priors: list[Prior]) -> tuple[np.ndarray, np.ndarray]:
     """The background of a fixed camera without a clean plate: (H, W, 3) uint8 RGB, and (H, W) bool where it is known.
 
-    The median over time of each pixel in the frames in which the person is not near it.
+    The median over time of each pixel in the frames in which the person is not near it; where there is no such frame,
+    painted in from around (Telea 2004).
     """
     hidden = np.stack([prior.near for prior in priors])
     seen = (~hidden).sum(0)
@@ -62,5 +85,5 @@ def masked_median(images: list[np.ndarray], priors: list[Prior]) -> tuple[np.nda
         values = np.stack([image[row] for image in images]).astype(np.int16)
         values[hidden[:, row]] = HIDDEN
         middle = np.sort(values, axis=0)[seen[row] // 2, np.arange(plate.shape[1])]
-        plate[row] = np.where(seen[row, :, None] > 0, middle, 0)
-    return plate, seen > 0
+        plate[row] = middle.clip(0, 255)
+    return cv2.inpaint(plate, (seen == 0).astype(np.uint8), PAINT_PX, cv2.INPAINT_TELEA), seen > 0

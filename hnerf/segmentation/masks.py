@@ -10,13 +10,24 @@ import numpy as np
 
 from hnerf.errors import CaptureError
 
+# An edge lies anywhere between two pixels' centres: they are 75 % and 25 % covered on average.
+COVERED = np.array([0.25, 0.5, 0.25], np.float32)
+
 
 @dataclass(frozen=True)
 class Masks:
-    """encoded: by (camera, frame), PNG bytes of 0/255; report: plain values, backend and notes."""
+    """encoded: by (camera, frame), PNG bytes of 0/255, without the masks that were dropped; report: plain values."""
 
     encoded: dict[tuple[str, int], bytes]
     report: dict[str, Any]
+
+    def __contains__(self, view: tuple[str, int]) -> bool:
+        """Whether this (camera, frame) has a mask that can be trusted."""
+        return view in self.encoded
+
+    def soft(self, camera: str, frame: int) -> np.ndarray:
+        """(H, W) float32 in [0, 1]: the share of each pixel that the person covers, as far as a mask tells it."""
+        return cv2.sepFilter2D(self.get(camera, frame).astype(np.float32), -1, COVERED, COVERED)
 
     def get(self, camera: str, frame: int) -> np.ndarray:
         """(H, W) bool, True on the person."""
@@ -47,3 +58,16 @@ class Masks:
 def encode(mask: np.ndarray) -> bytes:
     """(H, W) bool to PNG bytes of 0/255."""
     return cv2.imencode(".png", np.where(mask, 255, 0).astype(np.uint8))[1].tobytes()
+
+
+def movement_px(before: Masks, after: Masks) -> float:
+    """Mean over the views that both have of the mean distance from the edge after to the edge before."""
+    moved = [_edge_distance_px(before.get(*view), after.get(*view)) for view in after.encoded if view in before]
+    return float(np.mean(moved)) if moved else float("inf")
+
+
+def _edge_distance_px(before: np.ndarray, after: np.ndarray) -> float:
+    """Mean distance in pixels of the edge of one mask (H, W) bool to that of another."""
+    edges = [m & ~cv2.erode(m.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool) for m in (before, after)]
+    away_px = cv2.distanceTransform((~edges[0]).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return float(away_px[edges[1]].mean())

@@ -16,9 +16,12 @@ LIMBS = ((1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7), (8, 9), (9, 10), (10, 1
          (1, 8), (0, 1))  # fmt: skip
 FEET = ((11, 24), (11, 22), (14, 21), (14, 19))
 TRUNK = (2, 5, 12, 9)
+THICK = ((1, 8), (9, 10), (12, 13))  # trunk seen from the side, and thighs: twice as thick as other limbs
 CORE_SHARE = 0.02  # of the person's height: half the width of a limb that is surely body
 MARGIN_PX = 12  # of background around the person
 NEAR_SHARE = 0.03  # of the person's height: how wrong a body fitted to keypoints alone may lie
+SOLE_SHARE = 0.06  # of the person's height: how far a shoe may go on below the lowest keypoint
+UPRIGHT = 0.7  # cosine between the image's and the world's vertical from which down is down
 HEAD_SHARE = 0.45  # of the distance from neck to nose: radius of the head about a point a little above the nose
 
 
@@ -37,10 +40,16 @@ class Prior:
     height_px: float
 
     @staticmethod
-    def around(body: np.ndarray, core: np.ndarray, height_px: float, reach: float) -> "Prior":
-        """Grown from a body (H, W) bool; reach in heights of the person."""
+    def around(body: np.ndarray, core: np.ndarray, height_px: float, reach: float, upright: bool = False) -> "Prior":
+        """Grown from a body (H, W) bool; reach in heights of the person.
+
+        In an upright image what hangs much below the lowest part of the body is its reflection.
+        """
         away_px = cv2.distanceTransform(np.where(body, 0, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-        return Prior(core, body, away_px <= NEAR_SHARE * height_px, away_px <= reach * height_px, height_px)
+        within = away_px <= reach * height_px
+        if upright and body.any():
+            within[int(np.flatnonzero(body.any(1))[-1] + SOLE_SHARE * height_px) + 1 :] = False
+        return Prior(core, body, within & (away_px <= NEAR_SHARE * height_px), within, height_px)
 
     def cropped(self, window: tuple[slice, slice]) -> "Prior":
         """The same within a window of the image."""
@@ -49,23 +58,29 @@ class Prior:
 
 def keypoint_priors(capture: Capture, settings: SegmentationSettings) -> dict[str, list[Prior]]:
     """Stick figures in every training camera, in the order of `capture.frames`."""
-    return {
-        name: [Prior.around(stick.body, stick.core, stick.height_px, settings.reach) for stick in sticks]
-        for name, sticks in _sticks(capture).items()
-    }
+    priors = {}
+    for name, sticks in _sticks(capture).items():
+        upright = _is_upright(capture, name)
+        priors[name] = [Prior.around(s.body, s.core, s.height_px, settings.reach, upright) for s in sticks]
+    return priors
 
 
 def body_priors(capture: Capture, body: BodyFit, settings: SegmentationSettings) -> dict[str, list[Prior]]:
     """The fitted body together with the stick figure, which a poor fit may have left, in every training camera."""
     vertices_m, faces = body.vertices_m().numpy(), body.rig.faces.numpy()
     priors: dict[str, list[Prior]] = {}
-    for name, sticks in _sticks(capture).items():
-        priors[name] = []
+    for name, sticks in _sticks(capture, body).items():
+        priors[name], upright = [], _is_upright(capture, name)
         for frame, stick in zip(capture.frames, sticks, strict=True):
             covered = silhouette(capture.cameras[name], vertices_m[body.index(frame)], faces)
             core = cv2.erode(covered.astype(np.uint8), disc(CORE_SHARE * stick.height_px)).astype(bool)
-            priors[name].append(Prior.around(covered | stick.body, core, stick.height_px, settings.reach / 2))
+            priors[name].append(Prior.around(covered | stick.body, core, stick.height_px, settings.reach / 2, upright))
     return priors
+
+
+def _is_upright(capture: Capture, camera: str) -> bool:
+    """Whether the image's rows go down as the world does."""
+    return bool(-capture.cameras[camera].R[1, "xyz".index(capture.up)] > UPRIGHT)
 
 
 def window_around(region: np.ndarray) -> tuple[slice, slice]:
@@ -85,12 +100,15 @@ def disc(radius_px: float) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
 
 
-def _consistent_keypoints(capture: Capture) -> dict[str, np.ndarray]:
+def _consistent_keypoints(capture: Capture, body: BodyFit | None) -> dict[str, np.ndarray]:
     """(frames, 25, 2) pixels a camera; NaN for a keypoint that is never seen.
 
     Triangulated and projected where several cameras see the person, so that a detector's outliers are gone; gaps in
-    time are interpolated.
+    time are interpolated. The body's own where the recording has none.
     """
+    if body is not None and not capture.has_keypoints:
+        points_m = (body.rig.keypoint_weights @ body.vertices_m()).numpy()
+        return {name: capture.cameras[name].project(points_m)[0] for name in capture.train_cameras}
     found = subject_keypoints(capture)
     cameras = [capture.cameras[name] for name in capture.train_cameras]
     if len(cameras) == 1:
@@ -122,10 +140,10 @@ class _Stick:
     height_px: float
 
 
-def _sticks(capture: Capture) -> dict[str, list[_Stick]]:
+def _sticks(capture: Capture, body: BodyFit | None = None) -> dict[str, list[_Stick]]:
     """Per training camera the stick figures of `capture.frames`."""
     sticks = {}
-    for name, poses_px in _consistent_keypoints(capture).items():
+    for name, poses_px in _consistent_keypoints(capture, body).items():
         seen = np.isfinite(poses_px).all(-1, keepdims=True)
         heights_px = person_heights_px(np.concatenate([np.nan_to_num(poses_px), seen], -1)).tolist()
         camera = capture.cameras[name]
@@ -141,10 +159,10 @@ def _stick(camera: Camera, pose_px: np.ndarray, height_px: float) -> _Stick:
     # Cut off far outside the image: drawing takes 32-bit integers.
     at = np.nan_to_num(pose_px).clip(-4 * max(image.shape), 5 * max(image.shape)).round().astype(np.int32)
 
-    def draw(limbs: tuple[tuple[int, int], ...]) -> np.ndarray:
+    def draw(limbs: tuple[tuple[int, int], ...], times: int = 1) -> np.ndarray:
         for a, b in limbs:
             if seen[a] and seen[b]:
-                cv2.line(image, at[a].tolist(), at[b].tolist(), 1, width_px)
+                cv2.line(image, at[a].tolist(), at[b].tolist(), 1, times * width_px)
         return image.astype(bool)
 
     if seen[list(TRUNK)].all():
@@ -153,4 +171,5 @@ def _stick(camera: Camera, pose_px: np.ndarray, height_px: float) -> _Stick:
         up = at[0] - at[1]
         radius_px = round(HEAD_SHARE * float(np.linalg.norm(up)) + CORE_SHARE * height_px)
         cv2.circle(image, (at[0] + 0.15 * up).round().astype(int).tolist(), radius_px, 1, cv2.FILLED)
+    draw(THICK, times=2)
     return _Stick(draw(LIMBS), draw(FEET), height_px)

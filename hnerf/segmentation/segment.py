@@ -1,7 +1,7 @@
-"""Masks of the person in every training view: given, from clean plates, or else around a fitted body."""
+"""Masks of the person in every training view: given, learned, from clean plates, or else around a fitted body."""
 
+import dataclasses
 import logging
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -10,16 +10,13 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.config import SegmentationSettings
 from hnerf.errors import CaptureError
-from hnerf.segmentation.cut import components_within, cut
-from hnerf.segmentation.difference import difference, masked_median, noise_level
+from hnerf.segmentation.backends import choose_backend
+from hnerf.segmentation.learned import Network
 from hnerf.segmentation.masks import Masks, encode
-from hnerf.segmentation.prior import Prior, body_priors, keypoint_priors, window_around
+from hnerf.segmentation.prior import Prior, body_priors, keypoint_priors
+from hnerf.segmentation.verdicts import Verdict, judge, jumps
 
 __all__ = ["Masks", "segment"]
-
-LEAST_AREA_SHARE = 0.1  # of the prior's core: less is no person
-JUMP = 1.3  # areas of neighbouring frames that differ by more are reported
-MEDIAN_FRAMES = 60  # evenly chosen, for the background without a plate
 
 log = logging.getLogger("hnerf.segmentation")
 
@@ -27,90 +24,45 @@ log = logging.getLogger("hnerf.segmentation")
 def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettings) -> Masks:
     """Masks for all training cameras and `capture.frames`.
 
-    A camera with given masks keeps them; with a clean plate it is compared to that; else it needs `body`, to find the
-    background from pixels that the body does not reach. Only the subject is kept where there are several people.
-    Raises CaptureError, naming the image, on an empty or an inverted mask.
+    A camera with given masks keeps them; the user's network comes next, then a clean plate; else `body` is needed, to
+    find the background from pixels that it does not reach. Only the subject is kept where there are several people.
+    A mask that cannot be right is left out and named in the report; a camera with no other raises CaptureError.
     """
     priors = keypoint_priors(capture, settings) if body is None else body_priors(capture, body, settings)
+    network = None if settings.model is None else Network(settings.model)
     encoded: dict[tuple[str, int], bytes] = {}
     cameras: dict[str, Any] = {}
     for name in capture.train_cameras:
-        backend = _backend(capture, name, body)
-        log.info("camera %s: %d masks, %s", name, len(capture.frames), backend)
-        areas, notes = [], []
-        for frame, prior, mask in zip(
-            capture.frames, priors[name], _masks(capture, name, backend, priors[name], settings), strict=True
-        ):
-            _check(capture, name, frame, mask, prior)
+        backend = choose_backend(capture, name, priors[name], body is not None, network, settings)
+        log.info("camera %s: %d masks, %s", name, len(capture.frames), backend.name)
+        verdicts = []
+        for frame, prior in zip(capture.frames, priors[name], strict=True):
+            mask = backend.mask(frame, prior)
+            verdicts.append(judge(mask, prior))
             encoded[name, frame] = encode(mask)
-            areas.append(int(mask.sum()))
-            if mask[[0, -1]].any() or mask[:, [0, -1]].any():
-                notes.append(f"frame {frame}: the person is cut off by the image's border")
-        cameras[name] = {
-            "backend": backend,
-            "median_area_px": int(np.median(areas)),
-            "notes": notes + _jumps(capture.frames, areas),
-        }
+        cameras[name] = {"backend": backend.name} | _findings(capture, name, verdicts, priors[name])
+        for row in cameras[name]["dropped"]:
+            del encoded[name, row["frame"]]
     return Masks(encoded, {"cameras": cameras})
 
 
-def _backend(capture: Capture, name: str, body: BodyFit | None) -> str:
-    given = [capture.given_mask(name, frame) is not None for frame in capture.frames]
-    if all(given):
-        return "given"
-    if any(given):
-        frame = capture.frames[given.index(False)]
-        raise CaptureError(f"masks/{name}/{frame:06d}.png: mask missing; give a mask for every frame or for none")
-    if capture.background(name) is not None:
-        return "clean plate"
-    if body is None:
+def _findings(capture: Capture, camera: str, verdicts: list[Verdict], priors: list[Prior]) -> dict[str, Any]:
+    """Plain values: the median area, and the frames dropped or noted, each with its reason."""
+    sudden = jumps(capture.frames, verdicts, [int(prior.body.sum()) for prior in priors])
+    judged = {
+        frame: dataclasses.replace(verdict, fault=verdict.fault or sudden.get(frame))
+        for frame, verdict in zip(capture.frames, verdicts, strict=True)
+    }
+    dropped = [{"frame": frame, "reason": v.fault} for frame, v in judged.items() if v.fault]
+    if len(dropped) == len(judged):
         raise CaptureError(
-            f"{capture.name}: camera {name} has neither masks nor a plate (background/{name}.jpg); fit a body first"
+            f"{capture.name}: camera {camera}: no mask is usable (frame {dropped[0]['frame']}: "
+            f"{dropped[0]['reason']}); check its clean plate, its given masks and its calibration, or leave it out"
         )
-    return "median around the fitted body"
-
-
-def _masks(
-    capture: Capture, name: str, backend: str, priors: list[Prior], settings: SegmentationSettings
-) -> Iterator[np.ndarray]:
-    """(H, W) bool for each of the capture's frames."""
-    if backend == "given":
-        for frame, prior in zip(capture.frames, priors, strict=True):
-            mask = capture.given_mask(name, frame)
-            assert mask is not None  # _backend looked
-            subject = components_within(mask, prior.reach)
-            yield subject if subject.any() else mask
-        return
-    plate = capture.background(name)
-    known = np.ones(capture.image(name, capture.frames[0]).shape[:2], bool)
-    if plate is None:
-        chosen = np.unique(np.linspace(0, len(priors) - 1, MEDIAN_FRAMES).round().astype(int))
-        images = [capture.image(name, capture.frames[i]) for i in chosen]
-        plate, known = masked_median(images, [priors[i] for i in chosen])
-    for frame, prior in zip(capture.frames, priors, strict=True):
-        image, window = capture.image(name, frame), window_around(prior.reach)
-        found = difference(image[window], plate[window], noise_level(image, plate), settings)
-        mask = np.zeros(image.shape[:2], bool)
-        mask[window] = cut(image[window], found, prior.cropped(window), known[window])
-        yield mask
-
-
-def _check(capture: Capture, name: str, frame: int, mask: np.ndarray, prior: Prior) -> None:
-    """CaptureError on a mask that misses the person whom keypoints or body show in this image."""
-    expected = int(prior.core.sum())
-    if expected == 0:
-        return
-    where = f"{capture.name}: camera {name}, frame {frame}"
-    if mask.sum() < LEAST_AREA_SHARE * expected:
-        raise CaptureError(f"{where}: no person in the mask; check the clean plate or the given mask of this image")
-    if mask[prior.core].mean() < 0.5 < mask.mean():
-        raise CaptureError(f"{where}: the mask is inverted (255 must be on the person); invert the masks")
-
-
-def _jumps(frames: tuple[int, ...], areas_px: list[int]) -> list[str]:
-    notes = []
-    for i in range(1, len(areas_px)):
-        low, high = sorted(areas_px[i - 1 : i + 1])
-        if frames[i] == frames[i - 1] + 1 and high > JUMP * low:
-            notes.append(f"frame {frames[i]}: area jumps from {areas_px[i - 1]} to {areas_px[i]} px")
-    return notes
+    for row in dropped:
+        log.warning("camera %s, frame %d: mask dropped: %s", camera, row["frame"], row["reason"])
+    return {
+        "median_area_px": int(np.median([v.area_px for v in judged.values() if not v.fault])),
+        "dropped": dropped,
+        "notes": [{"frame": frame, "note": v.note} for frame, v in judged.items() if v.note and not v.fault],
+    }

@@ -72,7 +72,8 @@ class Pixels:
 def gather_pixels(
     capture: Capture, masks: Masks, body: BodyFit, frames: tuple[int, ...], device: torch.device
 ) -> Pixels:
-    """Pixels of the training cameras in `frames` within reach of the fitted body, or on the mask."""
+    """Pixels of the training cameras in `frames` within reach of the fitted body, or on the mask; none where the mask
+    was dropped."""
     names = capture.train_cameras
     cameras = [capture.cameras[name] for name in names]
     plates = [capture.background(name) for name in names]
@@ -82,6 +83,8 @@ def gather_pixels(
     for frame in frames:
         count = 0
         for c, (camera, plate) in enumerate(zip(cameras, plates, strict=True)):
+            if (camera.name, frame) not in masks:
+                continue
             mask = masks.get(camera.name, frame)
             wanted = within_reach(camera, vertices_m[body.index(frame)]) | mask
             y, x = np.nonzero(wanted)

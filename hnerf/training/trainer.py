@@ -55,9 +55,10 @@ class Trainer:
         self.first_rates = [group["lr"] for group in self.optimizer.param_groups]
         logger.info("gathering pixels")
         self.pixels: Pixels = gather_pixels(capture, masks, body, body.frames, device)
-        rows = {frame: row for row, frame in enumerate(body.frames)}
-        self.train_rows = torch.tensor([rows[f] for f in capture.train_frames], device=device)
-        held_out = [rows[f] for f in capture.novel_pose_frames if f not in capture.train_frames]
+        seen = self.pixels.starts.diff() > 0  # not where a frame's masks were all dropped
+        rows = {frame: row for row, frame in enumerate(body.frames) if seen[row]}
+        self.train_rows = torch.tensor([rows[f] for f in capture.train_frames if f in rows], device=device)
+        held_out = [rows[f] for f in capture.novel_pose_frames if f in rows and f not in capture.train_frames]
         self.novel_rows = torch.tensor(held_out, dtype=torch.long, device=device)
         self.step, self.skipped, self.seconds = 0, 0, 0.0
         self.history: list[dict[str, Any]] = []

@@ -23,7 +23,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A capture folder, with every stage of the flow replaced."""
     for name in STAGES:
         monkeypatch.setattr(module, name, _noting(getattr(module, name)))
-    monkeypatch.setattr(module, "needs_body", lambda recording: (tmp_path / "ada" / "bare").exists())
+    monkeypatch.setattr(module, "needs_body", lambda *_: (tmp_path / "ada" / "bare").exists())
     (tmp_path / "ada").mkdir()
     return tmp_path / "ada"
 
@@ -55,9 +55,32 @@ def test_every_stage_is_shown_and_given_what_went_before(folder: Path, tmp_path:
     assert given(subject, "asset") == ["capture", "calibration", "training"]
 
 
-def test_without_masks_or_plates_a_rough_fit_comes_first(folder: Path, tmp_path: Path) -> None:
+def test_without_masks_or_plates_a_rough_fit_comes_first(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (folder / "bare").touch()
+    monkeypatch.setattr(module, "settled", lambda *_: True)
     subject = train_subject.fn(folder, "demo", tmp_path / "store", [])
     assert given(subject, "segmentation") == ["capture", "calibration", "fit"]
     assert given(subject, "fit") == ["capture", "calibration", "segmentation"]
     assert len(list((tmp_path / "store" / "fit").glob("*/given.json"))) == 2
+
+
+def test_fit_and_segmentation_go_round_until_the_masks_stand_still(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "bare").touch()
+    answers = iter([False, True])
+    monkeypatch.setattr(module, "settled", lambda *_: next(answers))
+    subject = train_subject.fn(folder, "demo", tmp_path / "store", [])
+    assert given(subject, "segmentation") == ["capture", "calibration", "fit", "segmentation"]
+    assert next(answers, None) is None
+    assert len(list((tmp_path / "store" / "segmentation").glob("*/given.json"))) == 2
+
+
+def test_rounds_are_bounded(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "bare").touch()
+    asked = []
+    monkeypatch.setattr(module, "settled", lambda *_: bool(asked.append(1)))
+    train_subject.fn(folder, "demo", tmp_path / "store", ["segmentation.rounds=2"])
+    assert len(asked) == 2

@@ -11,13 +11,18 @@ from tests.calibration.synthetic import STANDING_M, look_at, write_capture
 
 SIZE_PX = 400
 FRAMES = 8
-PERSON_RGB = (60, 80, 150)
+PERSON_RGB, STRANGER_RGB = (60, 80, 150), (150, 60, 60)
 LIMBS = ((1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7), (8, 9), (9, 10), (10, 11), (8, 12), (12, 13), (13, 14),
          (14, 19), (11, 22))  # fmt: skip
 
 
-def write_scene(root: Path, cameras: int = 1, plate: bool = True, moves_m: float = 0.5) -> tuple[Capture, dict]:
-    """A capture of a stick person walking across, and the true masks by (camera, frame)."""
+def write_scene(
+    root: Path, cameras: int = 1, plate: bool = True, moves_m: float = 0.5, stranger_px: int = 0, glossy: bool = False
+) -> tuple[Capture, dict]:
+    """A capture of a stick person walking across, and the true masks by (camera, frame).
+
+    stranger_px: how far to the left another person stands, 0 for nobody; glossy: whether the floor reflects.
+    """
     rng = np.random.default_rng(0)
     middle = np.array([0, 0, 0.9])
     places = [np.array([3.5 * np.cos(a), 3.5 * np.sin(a), 1.0]) for a in 1.2 * np.arange(cameras)]
@@ -33,6 +38,11 @@ def write_scene(root: Path, cameras: int = 1, plate: bool = True, moves_m: float
             truth[camera.name, frame] = person(pose_px)
             shadow = np.roll(cv2.GaussianBlur(truth[camera.name, frame].astype(np.float32), (0, 0), 9), 45, axis=1)
             image = room * (1 - 0.5 * shadow[..., None])
+            if glossy:
+                mirrored = _mirrored(truth[camera.name, frame])
+                image[mirrored] = 0.4 * image[mirrored] + 0.6 * np.array(PERSON_RGB)
+            if stranger_px:
+                image[np.roll(person(camera.project(STANDING_M)[0]), -stranger_px, axis=1)] = STRANGER_RGB
             image[truth[camera.name, frame]] = PERSON_RGB
             noisy = (image + rng.normal(size=image.shape) * 2).clip(0, 255).astype(np.uint8)
             _write(root / "images" / camera.name / f"{frame:06d}.png", noisy)
@@ -53,6 +63,15 @@ def person(pose_px: np.ndarray) -> np.ndarray:
     cv2.circle(image, at[0].tolist(), 12, 1, cv2.FILLED)
     cv2.line(image, at[0].tolist(), at[1].tolist(), 1, 9)
     return image.astype(bool)
+
+
+def _mirrored(mask: np.ndarray) -> np.ndarray:
+    """The mask (H, W) bool upside down below its lowest row."""
+    feet = int(np.flatnonzero(mask.any(1))[-1])
+    below = np.zeros_like(mask)
+    shown = mask[: feet + 1][::-1][: SIZE_PX - feet - 1]
+    below[feet + 1 : feet + 1 + len(shown)] = shown
+    return below
 
 
 def write_masks(capture: Capture, masks: dict) -> None:

@@ -12,6 +12,8 @@ from hnerf.config import CaptureSettings, SegmentationSettings
 from hnerf.errors import CaptureError
 from hnerf.segmentation.cut import components_within
 from hnerf.segmentation.difference import difference, masked_median, noise_level
+from hnerf.segmentation.edge import settle_edge
+from hnerf.segmentation.masks import encode, movement_px
 from hnerf.segmentation.prior import Prior
 from hnerf.segmentation.segment import Masks, segment
 from tests.segmentation.scene import only_frames, write_masks, write_scene
@@ -31,24 +33,56 @@ def test_a_shadow_is_not_the_person_by_hand() -> None:
     image[10:30, 10:30] = (90, 72, 54)
     image[10:30, 50:70] = (54, 72, 90)
     found = difference(image, plate, noise_level(image, plate), SETTINGS)
-    assert found.changed[12:28, 12:28].all()
-    assert found.shadow[12:28, 12:28].all()
-    assert found.changed[12:28, 52:68].all()
-    assert not found.shadow[12:28, 52:68].any()
-    assert not found.changed[:8].any()
+    assert (found.odds[12:28, 12:28] < -1).all()
+    assert (found.odds[12:28, 52:68] > 4).all()
+    assert (found.odds[:8] < -4).all()
+    assert (found.apart[:8] == 128).all()
+
+
+def test_only_a_median_may_hold_shadows_itself() -> None:
+    # The image is 1 / 0.6 as bright as the plate, in all channels.
+    plate = np.full((8, 8, 3), (90, 72, 54), np.uint8)
+    image = np.full((8, 8, 3), (150, 120, 90), np.uint8)
+    assert (difference(image, plate, 1.0, SETTINGS).odds > 4).all()
+    assert (difference(image, plate, 1.0, SETTINGS, shadowed=True).odds < 0).all()
 
 
 def test_masked_median_by_hand() -> None:
     # The pixel's values over five frames; hidden by the person (200) in three: the median of 10 and 30 is their upper.
+    # The second pixel is never free: it is painted in from the first.
     values, hidden = [10, 200, 200, 30, 200], [False, True, True, False, True]
     images = [np.full((1, 2, 3), value, np.uint8) for value in values]
     priors = []
     for is_hidden in hidden:
-        near = np.array([[is_hidden, True]])  # the second pixel is never free
+        near = np.array([[is_hidden, True]])
         priors.append(Prior(near, near, near, near, 1.0))
     plate, known = masked_median(images, priors)
-    assert plate[0, 0].tolist() == [30, 30, 30]
+    assert plate[0].tolist() == [[30, 30, 30], [30, 30, 30]]
     assert known.tolist() == [[True, False]]
+
+
+def test_an_edge_pixel_is_whose_it_shows_more_of() -> None:
+    # A bright person from column 10 on; column 9 mixes: 60 % person in the upper half, 40 % in the lower. The mask to
+    # begin with is a pixel too wide above and too narrow below.
+    plate, image = np.full((40, 20, 3), 50, np.uint8), np.full((40, 20, 3), 50, np.uint8)
+    image[:, 10:] = 200
+    image[:20, 9], image[20:, 9] = 140, 110
+    mask = np.zeros((40, 20), bool)
+    mask[:20, 8:], mask[20:, 10:] = True, True
+    settled = settle_edge(mask, image, plate)
+    assert (settled[2:18].argmax(1) == 9).all()
+    assert (settled[22:38].argmax(1) == 10).all()
+
+
+def test_soft_masks_and_movement_by_hand() -> None:
+    # An edge somewhere between the centres of columns 9 and 10, in the middle on average.
+    def half(first: int) -> np.ndarray:
+        return np.broadcast_to(np.arange(20) >= first, (30, 20))
+
+    masks, moved = (Masks({("a", 0): encode(half(first))}, {}) for first in (10, 13))
+    np.testing.assert_allclose(masks.soft("a", 0)[15, 8:12], [0, 0.25, 0.75, 1])
+    assert movement_px(masks, moved) == pytest.approx(3.0)
+    assert movement_px(masks, Masks({("a", 1): encode(half(3))}, {})) == np.inf  # no view in common
 
 
 def test_components_of_another_person_go() -> None:
@@ -91,12 +125,36 @@ def test_given_masks_come_first_and_lose_other_people(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "word"), [(np.zeros_like, "no person in the mask"), (np.logical_not, "the mask is inverted")]
 )
-def test_bad_given_masks_name_the_image(tmp_path: Path, spoil, word: str) -> None:  # type: ignore[no-untyped-def]
+def test_a_bad_mask_is_dropped_and_named(tmp_path: Path, spoil, word: str) -> None:  # type: ignore[no-untyped-def]
     capture, truth = write_scene(tmp_path)
-    truth["c0", 5] = spoil(truth["c0", 5])
-    write_masks(capture, truth)
-    with pytest.raises(CaptureError, match=f"camera c0, frame 5.*{word}"):
+    write_masks(capture, truth | {("c0", 5): spoil(truth["c0", 5])})
+    masks = segment(capture, None, SETTINGS)
+    assert {frame for _, frame in masks.encoded} == {0, 1, 2, 3, 4, 6, 7}
+    assert ("c0", 5) not in masks and ("c0", 6) in masks
+    [dropped] = masks.report["cameras"]["c0"]["dropped"]
+    assert dropped["frame"] == 5 and word in dropped["reason"]
+
+
+def test_a_camera_without_a_good_mask_is_an_error(tmp_path: Path) -> None:
+    capture, truth = write_scene(tmp_path)
+    write_masks(capture, {view: ~mask for view, mask in truth.items()})
+    with pytest.raises(CaptureError, match=r"camera c0: no mask is usable.*inverted"):
         segment(capture, None, SETTINGS)
+
+
+def test_another_person_beside_the_subject_goes(tmp_path: Path) -> None:
+    capture, truth = write_scene(tmp_path, stranger_px=130)
+    masks = segment(capture, None, SETTINGS)
+    assert min(iou(masks.get(*view), mask) for view, mask in truth.items()) >= 0.97
+
+
+def test_a_reflection_in_the_floor_goes(tmp_path: Path) -> None:
+    capture, truth = write_scene(tmp_path, glossy=True)
+    masks = segment(capture, None, SETTINGS)
+    for view, mask in truth.items():
+        height_px = np.ptp(np.flatnonzero(mask.any(1)))
+        below = masks.get(*view)[np.flatnonzero(mask.any(1))[-1] + round(0.1 * height_px) :]
+        assert not below.any()
 
 
 def test_a_missing_given_mask_names_the_file(tmp_path: Path) -> None:
@@ -108,6 +166,7 @@ def test_a_missing_given_mask_names_the_file(tmp_path: Path) -> None:
 
 
 def test_a_plate_that_shows_the_person_is_an_error(tmp_path: Path) -> None:
+    # The only image is the plate itself.
     capture, _ = write_scene(tmp_path, moves_m=0)
     (tmp_path / "background" / "c0.png").write_bytes((tmp_path / "images" / "c0" / "000000.png").read_bytes())
     with pytest.raises(CaptureError, match="no person in the mask"):

@@ -46,6 +46,10 @@ class KnownMasks:
     def __init__(self, masks: dict[tuple[str, int], np.ndarray]):
         self.masks = masks
 
+    def __contains__(self, view: tuple[str, int]) -> bool:
+        """None was dropped but those that are not here."""
+        return view in self.masks
+
     def get(self, camera: str, frame: int) -> np.ndarray:
         """(H, W) bool."""
         return self.masks[camera, frame]

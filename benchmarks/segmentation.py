@@ -1,0 +1,177 @@
+"""Mask IoU against ground truth and time a frame, on the shared captures, with and without their clean plates.
+
+usage: python benchmarks/segmentation.py [CAPTURE ...] [--sheet FOLDER]
+
+Needs `../shared/data` beside this checkout. Without a plate, fit and segmentation go round as in the flow. Only
+training cameras are segmented and scored. `--sheet` also writes a picture a capture: false pixels red, missing ones
+cyan, worst
+frames first. Writes `benchmarks/results/segmentation.json` and `.md`.
+"""
+
+import argparse
+import itertools
+import logging
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from provenance import SHARED, provenance, sentence, table, write_result
+
+from hnerf.body.fit import fit_body
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.capture import Capture
+from hnerf.capture.ingest import ingest
+from hnerf.config import CaptureSettings, FitSettings, SegmentationSettings
+from hnerf.segmentation.masks import Masks, movement_px
+from hnerf.segmentation.prior import window_around
+from hnerf.segmentation.segment import segment
+
+CAPTURES = ("valid-walk", "valid-turn-mono", "valid-wave")
+WANTED_OF = ("valid-walk", "valid-turn-mono")
+WANTED = {"clean plate": 0.975, "no plate": 0.96}
+SETTINGS = SegmentationSettings()
+SHOWN = 8  # frames on a sheet
+PROTOCOL = (
+    "IoU is the mean over all training views; a dropped mask counts 0. Milliseconds are of the whole segmentation, "
+    "reading of images and priors included, without the body fits between rounds."
+)
+
+
+def main() -> int:
+    """1 if a mean that is wanted is not reached."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", nargs="*", default=list(CAPTURES), metavar="CAPTURE")
+    parser.add_argument("--sheet", type=Path, help="folder for pictures")
+    options = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
+    result: dict[str, Any] = provenance() | {"protocol": PROTOCOL, "captures": {}}
+    for name in options.captures:
+        result["captures"][name] = measure(SHARED / "data" / name, options.sheet)
+    means = {
+        kind: float(np.mean([result["captures"][name][kind]["iou"] for name in WANTED_OF]))
+        for kind in WANTED
+        if set(WANTED_OF) <= set(result["captures"])
+    }
+    result["mean_iou"] = {"over": WANTED_OF, **means}
+    write_result("segmentation", result, as_markdown(result))
+    print(as_markdown(result))
+    return int(any(means[kind] < WANTED[kind] for kind in means))
+
+
+def measure(folder: Path, sheet: Path | None) -> dict[str, Any]:
+    """Figures of one capture, with the plates it has and without them."""
+    with tempfile.TemporaryDirectory() as scratch:
+        capture = ingest(folder, CaptureSettings(), Path(scratch))
+        found = {"clean plate": [_timed_segment(capture, None)]}
+        shutil.rmtree(capture.root / "background")
+        found["no plate"] = _rounds(capture)
+        figures: dict[str, Any] = {
+            "size_px": list(capture.image(capture.train_cameras[0], capture.frames[0]).shape[:2])
+        }
+        for kind, rounds in found.items():
+            masks = rounds[-1][0]
+            figures[kind] = score(folder, capture, masks) | {
+                "ms_per_frame": round(rounds[-1][1], 1),
+                "rounds": [round(float(np.mean(list(ious(folder, capture, m).values()))), 4) for m, _ in rounds],
+                "moved_px": [round(movement_px(a[0], b[0]), 2) for a, b in itertools.pairwise(rounds)],
+            }
+            if sheet:
+                sheet.mkdir(parents=True, exist_ok=True)
+                picture = worst(folder, capture, masks)
+                cv2.imwrite(str(sheet / f"{folder.name}-{kind.replace(' ', '-')}.png"), picture[..., ::-1])
+    return figures
+
+
+def _timed_segment(capture: Capture, body: BodyFit | None) -> tuple[Masks, float]:
+    """Masks, and milliseconds a frame."""
+    began = time.perf_counter()
+    masks = segment(capture, body, SETTINGS)
+    return masks, 1e3 * (time.perf_counter() - began) / (len(capture.train_cameras) * len(capture.frames))
+
+
+def _rounds(capture: Capture) -> list[tuple[Masks, float]]:
+    """Fit and segment in turns until the masks stand still, as the flow does."""
+    rounds: list[tuple[Masks, float]] = []
+    while len(rounds) < SETTINGS.rounds:
+        body, _ = fit_body(capture, rounds[-1][0] if rounds else None, FitSettings())
+        rounds.append(_timed_segment(capture, body))
+        if len(rounds) > 1 and movement_px(rounds[-2][0], rounds[-1][0]) < SETTINGS.still_px:
+            break
+    return rounds
+
+
+def ious(folder: Path, capture: Capture, masks: Masks) -> dict[tuple[str, int], float]:
+    """By training camera and frame."""
+    found = {}
+    for view in ((camera, frame) for camera in capture.train_cameras for frame in capture.frames):
+        true = truth(folder, *view)
+        mask = masks.get(*view) if view in masks else np.zeros_like(true)
+        found[view] = float((mask & true).sum() / (mask | true).sum())
+    return found
+
+
+def score(folder: Path, capture: Capture, masks: Masks) -> dict[str, Any]:
+    """Mean and worst IoU, and what is wrong as shares of the person's area."""
+    by_view = ious(folder, capture, masks)
+    wrong = []
+    for view in masks.encoded:
+        mask, true = masks.get(*view), truth(folder, *view)
+        wrong.append([(mask & ~true).sum() / true.sum(), (true & ~mask).sum() / true.sum()])
+    values = list(by_view.values())
+    return {
+        "iou": round(float(np.mean(values)), 4),
+        "worst_iou": round(min(values), 4),
+        "false_share": round(float(np.mean(wrong, 0)[0]), 4),
+        "missing_share": round(float(np.mean(wrong, 0)[1]), 4),
+        "dropped": len(values) - len(masks.encoded),
+    }
+
+
+def truth(folder: Path, camera: str, frame: int) -> np.ndarray:
+    """(H, W) bool: the ray through the pixel's centre meets the person."""
+    image = cv2.imread(str(folder / "ground_truth" / "masks" / camera / f"{frame:06d}.png"), cv2.IMREAD_GRAYSCALE)
+    assert image is not None, f"{folder}: no true mask of camera {camera}, frame {frame}"
+    return image > 127
+
+
+def worst(folder: Path, capture: Capture, masks: Masks) -> np.ndarray:
+    """The worst frames, cut to the person, side by side, (H, W, 3) uint8 RGB."""
+    by_view = ious(folder, capture, masks)
+    cells = []
+    for view in sorted(masks.encoded, key=lambda view: by_view[view])[:SHOWN]:
+        mask, true = masks.get(*view), truth(folder, *view)
+        picture = (0.6 * capture.image(*view)).astype(np.uint8)
+        picture[mask & ~true], picture[true & ~mask] = (255, 0, 0), (0, 255, 255)
+        cell = picture[window_around(mask | true)]
+        cells.append(cv2.resize(cell, None, fx=500 / len(cell), fy=500 / len(cell), interpolation=cv2.INTER_NEAREST))
+    return np.hstack(cells)
+
+
+def as_markdown(result: dict[str, Any]) -> str:
+    """A row a capture and kind, then the means that are wanted."""
+    rows = [["capture", "", "IoU", "worst", "false", "missing", "dropped", "ms/frame", "IoU by round", "moved, px"]]
+    for name, figures in result["captures"].items():
+        for kind in WANTED:
+            f = figures[kind]
+            rows.append([f"{name} ({figures['size_px'][0]} x {figures['size_px'][1]})", kind, f"{f['iou']:.4f}",
+                         f"{f['worst_iou']:.4f}", f"{f['false_share']:.2%}", f"{f['missing_share']:.2%}",
+                         str(f["dropped"]), f"{f['ms_per_frame']:.0f}", " ".join(f"{v:.4f}" for v in f["rounds"]),
+                         " ".join(f"{v:.2f}" for v in f["moved_px"])])  # fmt: skip
+    means = result["mean_iou"]
+    wanted = [
+        f"Mean over {' and '.join(means['over'])}, {kind}: **{means[kind]:.4f}** (wanted {goal})."
+        for kind, goal in WANTED.items()
+        if kind in means
+    ]
+    return "\n".join(
+        ["# Segmentation", "", sentence(result), "", *table(rows), "", *wanted, "", result["protocol"], ""]
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

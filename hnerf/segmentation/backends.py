@@ -1,0 +1,110 @@
+"""Four ways to a mask, behind one interface: given, learned, against a clean plate, against a median over time."""
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from hnerf.capture.capture import Capture
+from hnerf.config import SegmentationSettings
+from hnerf.errors import CaptureError
+from hnerf.segmentation.cut import components_within, cut
+from hnerf.segmentation.difference import difference, masked_median, noise_level
+from hnerf.segmentation.learned import Network
+from hnerf.segmentation.prior import Prior, window_around
+
+CLEAN_PLATE, MEDIAN = "clean plate", "median around the fitted body"
+MEDIAN_FRAMES = 60  # evenly chosen, for the background without a plate
+
+
+class Backend(Protocol):
+    """Masks of one camera of a capture. `name` is for the report."""
+
+    @property
+    def name(self) -> str: ...
+
+    def mask(self, frame: int, prior: Prior) -> np.ndarray:
+        """(H, W) bool, True on the person whom the prior describes."""
+        ...
+
+
+@dataclass(frozen=True)
+class Given:
+    """Masks that came with the recording; other people in them go."""
+
+    capture: Capture
+    camera: str
+    name: str = "given"
+
+    def mask(self, frame: int, prior: Prior) -> np.ndarray:
+        """The given mask, or what of it is the subject. Raises CaptureError where it is missing."""
+        mask = self.capture.given_mask(self.camera, frame)
+        if mask is None:
+            raise CaptureError(
+                f"masks/{self.camera}/{frame:06d}.png: mask missing; give a mask for every frame or for none"
+            )
+        subject = components_within(mask, prior.reach)
+        return subject if subject.any() else mask
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A network's probability map, as far as it is the subject."""
+
+    capture: Capture
+    camera: str
+    network: Network
+    name: str = "learned model"
+
+    def mask(self, frame: int, prior: Prior) -> np.ndarray:
+        """Where the person is likelier than not, within reach."""
+        likely = self.network.probability(self.capture.image(self.camera, frame)) >= 0.5
+        return components_within(likely & prior.reach, prior.reach)
+
+
+@dataclass(frozen=True)
+class AgainstBackground:
+    """Difference to a plate, (H, W, 3) uint8 RGB, where it is `known`, (H, W) bool; then GrabCut."""
+
+    capture: Capture
+    camera: str
+    plate: np.ndarray = field(repr=False)
+    known: np.ndarray = field(repr=False)
+    settings: SegmentationSettings
+    name: str
+
+    def mask(self, frame: int, prior: Prior) -> np.ndarray:
+        """Cut out of the window within reach."""
+        image, window = self.capture.image(self.camera, frame), window_around(prior.reach)
+        mask = np.zeros(image.shape[:2], bool)
+        if not prior.reach.any():
+            return mask
+        noise, is_median = noise_level(image, self.plate), self.name == MEDIAN
+        found = difference(image[window], self.plate[window], noise, self.settings, shadowed=is_median)
+        mask[window] = cut(image[window], found, prior.cropped(window), self.known[window])
+        return mask
+
+
+def choose_backend(
+    capture: Capture, camera: str, priors: list[Prior], fitted: bool, network: Network | None,
+    settings: SegmentationSettings,
+) -> Backend:  # fmt: skip
+    """Given masks first, then the user's network, then a clean plate, then the background around a `fitted` body.
+
+    priors: in the order of the capture's frames. Raises CaptureError where none is possible.
+    """
+    if any(capture.given_mask(camera, frame) is not None for frame in capture.frames):
+        return Given(capture, camera)
+    if network is not None:
+        return Learned(capture, camera, network)
+    plate = capture.background(camera)
+    if plate is not None:
+        return AgainstBackground(capture, camera, plate, np.ones(plate.shape[:2], bool), settings, CLEAN_PLATE)
+    if not fitted:
+        raise CaptureError(
+            f"{capture.name}: camera {camera} has neither masks nor a plate (background/{camera}.jpg); fit a body first"
+        )
+    chosen = np.unique(np.linspace(0, len(priors) - 1, MEDIAN_FRAMES).round().astype(int))
+    images = [capture.image(camera, capture.frames[i]) for i in chosen]
+    plate, known = masked_median(images, [priors[i] for i in chosen])
+    return AgainstBackground(capture, camera, plate, known, settings, MEDIAN)

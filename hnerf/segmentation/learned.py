@@ -1,0 +1,55 @@
+"""A segmentation network from an ONNX file of the user's own, through ONNX Runtime."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hnerf.errors import CaptureError
+
+TOLERANCE = 1e-3  # a probability may be outside [0, 1] by so much
+
+
+class Network:
+    """A network with one image input and, first among its outputs, a map of the person's probability.
+
+    The input is RGB in [0, 1], float32, (1, 3, H, W) or (1, H, W, 3) as the file says; where the file fixes H and W,
+    images are resized to it. The output may have leading or trailing axes of length 1.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises CaptureError where the file or ONNX Runtime is missing, or where the file is no such network."""
+        if not path.is_file():
+            raise CaptureError(f"segmentation.model: {path}: no such file; name an ONNX file, or leave it out")
+        try:
+            import onnxruntime
+        except ImportError:
+            raise CaptureError(
+                f"segmentation.model: {path}: needs ONNX Runtime; install hnerf-pipeline[learned], or leave it out"
+            ) from None
+        self.path = path
+        try:
+            self.session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+        except Exception as error:  # ONNX Runtime's own exceptions have no common base
+            raise CaptureError(f"{path}: not a network that ONNX Runtime can run: {error}") from None
+        inputs = self.session.get_inputs()
+        shape = inputs[0].shape
+        if len(inputs) != 1 or len(shape) != 4 or 3 not in (shape[1], shape[3]) or inputs[0].type != "tensor(float)":
+            raise CaptureError(f"{path}: needs one float input (1, 3, H, W) or (1, H, W, 3); it has {shape}")
+        self.channels_first = shape[1] == 3
+        height, width = shape[2:] if self.channels_first else shape[1:3]
+        self.size_px = (width, height) if isinstance(width, int) and isinstance(height, int) else None
+
+    def probability(self, image: np.ndarray) -> np.ndarray:
+        """(H, W) float32 in [0, 1] of an image (H, W, 3) uint8 RGB. Raises CaptureError where it is none."""
+        pixels = image if self.size_px is None else cv2.resize(image, self.size_px, interpolation=cv2.INTER_AREA)
+        values = pixels.astype(np.float32)[None] / 255
+        if self.channels_first:
+            values = np.ascontiguousarray(values.transpose(0, 3, 1, 2))
+        found = np.squeeze(self.session.run(None, {self.session.get_inputs()[0].name: values})[0])
+        if found.ndim != 2 or found.min() < -TOLERANCE or found.max() > 1 + TOLERANCE:
+            raise CaptureError(
+                f"{self.path}: its first output must be one map of probabilities; it is {found.shape}, "
+                f"from {found.min():.3g} to {found.max():.3g}"
+            )
+        return cv2.resize(found.astype(np.float32), image.shape[1::-1], interpolation=cv2.INTER_LINEAR)

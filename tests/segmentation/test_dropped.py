@@ -1,0 +1,33 @@
+"""What the stages after segmentation make of a mask that was dropped."""
+
+from pathlib import Path
+
+import torch
+
+from hnerf.body.fit import _outlines, _silhouette_iou
+from hnerf.segmentation.masks import Masks, encode
+from hnerf.training.pixels import gather_pixels
+from tests.training.scene import record
+
+
+def test_fit_and_training_do_without(tmp_path: Path) -> None:
+    capture, known, body = record(tmp_path)
+    whole = {view: encode(mask) for view, mask in known.masks.items()}
+    kept = {view: png for view, png in whole.items() if view != ("1", 0) and view[1] != 1}
+    masks = Masks(kept, {})
+
+    scale_m = torch.full((4, 3), 0.01, dtype=torch.float64)
+    edges = _outlines(capture, masks, scale_m, 0.03)
+    assert [[edge is None for edge in row] for row in edges] == [[False, True, False, False], [True] * 4, [False] * 4]
+
+    iou = _silhouette_iou(capture, masks, body)
+    assert iou == [1.0, None, 1.0]
+
+    pixels, all_pixels = (
+        gather_pixels(capture, m, body, capture.frames, torch.device("cpu")) for m in (masks, Masks(whole, {}))
+    )
+    count, all_count = pixels.starts.diff().tolist(), all_pixels.starts.diff().tolist()
+    assert count[1] == 0 and count[2] == all_count[2]
+    first = slice(0, count[0])
+    assert sorted(set(pixels.camera[first].tolist())) == [0, 2, 3]
+    assert count[0] == int((all_pixels.camera[: all_count[0]] != 1).sum())

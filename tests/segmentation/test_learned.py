@@ -1,0 +1,83 @@
+"""A network made here: the person's probability is a step where blue is 0.3 above red."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from onnx import TensorProto, helper
+
+from hnerf.config import SegmentationSettings
+from hnerf.errors import CaptureError
+from hnerf.segmentation.learned import Network
+from hnerf.segmentation.segment import segment
+from tests.segmentation.scene import PERSON_RGB, write_scene
+
+
+def write_network(path: Path, shape: list, gain: float = 50.0) -> Path:
+    """sigmoid(gain * (blue - red - 0.3)) by a convolution of 1 x 1; channels last where `shape` says so."""
+    first = shape[1] == 3
+    names = ["image", "planes"] if first else ["turned", "planes"]
+    weights = helper.make_tensor("weights", TensorProto.FLOAT, [1, 3, 1, 1], [-gain, 0.0, gain])
+    bias = helper.make_tensor("bias", TensorProto.FLOAT, [1], [-0.3 * gain])
+    nodes = [] if first else [helper.make_node("Transpose", ["image"], ["turned"], perm=[0, 3, 1, 2])]
+    nodes += [
+        helper.make_node("Conv", [names[0], "weights", "bias"], ["planes"]),
+        helper.make_node("Sigmoid", ["planes"], ["person"]),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "blue",
+        [helper.make_tensor_value_info("image", TensorProto.FLOAT, shape)],
+        [helper.make_tensor_value_info("person", TensorProto.FLOAT, None)],
+        [weights, bias],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+@pytest.mark.parametrize("shape", [[1, 3, "H", "W"], [1, "H", "W", 3], [1, 3, 20, 40]])
+def test_probability_by_hand(tmp_path: Path, shape: list) -> None:
+    image = np.zeros((10, 20, 3), np.uint8)
+    image[:, 10:] = (60, 80, 150)  # 50 * (150 - 60) / 255 - 15 = 2.647: a probability of 0.934
+    found = Network(write_network(tmp_path / "n.onnx", shape)).probability(image)
+    assert found.shape == (10, 20) and found.dtype == np.float32
+    np.testing.assert_allclose(found[:, 12:], 0.934, atol=1e-3)
+    np.testing.assert_allclose(found[:, :8], 0, atol=1e-6)
+
+
+def test_the_subject_among_what_the_network_finds(tmp_path: Path) -> None:
+    capture, truth = write_scene(tmp_path, plate=False, stranger_px=130)
+    settings = SegmentationSettings(model=write_network(tmp_path / "n.onnx", [1, 3, "H", "W"]))
+    masks = segment(capture, None, settings)
+    assert masks.report["cameras"]["c0"]["backend"] == "learned model"
+    assert PERSON_RGB[2] - PERSON_RGB[0] > 0.3 * 255
+    for view, mask in truth.items():
+        found = masks.get(*view)
+        assert (found & mask).sum() / (found | mask).sum() > 0.97
+
+
+def test_a_missing_file_and_a_missing_package_say_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(CaptureError, match=r"nowhere\.onnx: no such file"):
+        Network(tmp_path / "nowhere.onnx")
+    path = write_network(tmp_path / "n.onnx", [1, 3, "H", "W"])
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(CaptureError, match=r"install hnerf-pipeline\[learned\]"):
+        Network(path)
+
+
+def test_files_that_are_no_such_network(tmp_path: Path) -> None:
+    (tmp_path / "text.onnx").write_text("not a network")
+    with pytest.raises(CaptureError, match="not a network that ONNX Runtime can run"):
+        Network(tmp_path / "text.onnx")
+    weights = helper.make_tensor("weights", TensorProto.FLOAT, [1], [1.0])
+    node = helper.make_node("Mul", ["image", "weights"], ["person"])
+    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 4])
+    graph = helper.make_graph(
+        [node], "flat", [image], [helper.make_tensor_value_info("person", TensorProto.FLOAT, None)], [weights]
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    (tmp_path / "flat.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(CaptureError, match="needs one float input"):
+        Network(tmp_path / "flat.onnx")

@@ -1,0 +1,42 @@
+import numpy as np
+
+from hnerf.segmentation.prior import Prior
+from hnerf.segmentation.verdicts import Verdict, judge, jumps
+
+BODY = np.zeros((20, 20), bool)
+BODY[4:16, 8:12] = True  # 48 px
+PRIOR = Prior(BODY, BODY, BODY, BODY, 12.0)
+
+
+def test_a_good_mask() -> None:
+    assert judge(BODY, PRIOR) == Verdict(None, None, 48)
+
+
+def test_empty_inverted_and_astray() -> None:
+    speck = np.zeros_like(BODY)
+    speck[8, 8:12] = True  # 4 px, less than a tenth of 48
+    assert "no person" in str(judge(speck, PRIOR).fault)
+    assert "inverted" in str(judge(~BODY, PRIOR).fault)
+    assert "misses the person" in str(judge(np.roll(BODY, 5, axis=1), PRIOR).fault)
+
+
+def test_inverted_without_a_prior() -> None:
+    nothing = np.zeros_like(BODY)
+    assert "inverted" in str(judge(~BODY, Prior(nothing, nothing, nothing, nothing, 0.0)).fault)
+
+
+def test_cut_off_by_the_border_is_noted_only() -> None:
+    mask = BODY.copy()
+    mask[4:, 8:12] = True
+    verdict = judge(mask, PRIOR)
+    assert verdict.fault is None
+    assert verdict.note == "cut off by the image's border (bottom)"
+
+
+def test_jumps_need_both_neighbours_and_prior() -> None:
+    # Frame 2 leaks to twice its area; frame 6 is twice as large because the person is; frame 20 has no neighbours.
+    frames = (0, 1, 2, 3, 4, 5, 6, 7, 8, 20)
+    areas = [100, 100, 200, 100, 100, 100, 200, 100, 100, 300]
+    expected = [50, 50, 50, 50, 50, 50, 100, 50, 50, 50]
+    found = jumps(frames, [Verdict(None, None, area) for area in areas], expected)
+    assert found == {2: "area jumps from 100 to 200 px"}
