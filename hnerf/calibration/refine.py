@@ -1,4 +1,4 @@
-"""Refinement of cameras, taken only where frames and joints that took no part prove it right, and outlines agree."""
+"""Refinement of cameras, taken only where frames and joints that took no part prove it right, and pictures agree."""
 
 import logging
 from collections.abc import Sequence
@@ -8,6 +8,7 @@ import numpy as np
 
 from hnerf.calibration.bundle import adjust
 from hnerf.calibration.diagnosis import measure, trimmed_cost_px
+from hnerf.calibration.matches import Matches
 from hnerf.calibration.silhouettes import Outlines
 from hnerf.calibration.sizes import CHANGES, unexplained
 from hnerf.capture.camera import Camera
@@ -15,6 +16,7 @@ from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
 
 OUTLINE_NOISE, OUTLINE_NOISE_PX = 0.05, 0.05  # a share, and pixels, by which outlines may fit worse by chance
+MATCH_NOISE_PX = 0.5  # by which matches of a pair of cameras may
 
 log = logging.getLogger("hnerf.calibration")
 
@@ -45,20 +47,22 @@ def refine(
     cameras: list[Camera],
     keypoints: np.ndarray,
     outlines: Outlines | None,
+    matches: Matches,
     settings: CalibrationSettings,
 ) -> Refinement:
     """Adjust the cameras that do not fit the others; the very `cameras` are returned unless held-out frames gain.
 
     Camera by camera, the others fixed; all at once where that asks for more than one, or leaves residuals too large.
-    keypoints (C, frames, 25, 3).
+    What matches between two cameras contradict is not taken. keypoints (C, frames, 25, 3).
     """
     keep = 1 - settings.min_improvement
     held_out_px = {"as given": held_out_cost_px(cameras, keypoints, ())}
-    chosen, kept = _one_by_one(cameras, keypoints, keep, held_out_px)
+    chosen, kept = _one_by_one(cameras, keypoints, matches, keep, held_out_px)
     too_large = max(measure(chosen.cameras, keypoints).median_px.values()) > settings.max_residual_px
     if len(chosen.done) > 1 or too_large:
         together = _all_at_once(cameras, keypoints, held_out_px)
-        chosen = together if together.cost_px < keep * chosen.cost_px else chosen
+        better = together.cost_px < keep * chosen.cost_px
+        chosen = together if better and not _contradiction(matches, cameras, together.cameras) else chosen
     if not chosen.done:
         notes = ["refinement did not improve held-out frames: the cameras are used as given"] if too_large else []
         return Refinement(cameras, held_out_px, {}, kept, notes)
@@ -73,7 +77,7 @@ def refine(
 
 
 def _one_by_one(
-    cameras: list[Camera], keypoints: np.ndarray, keep: float, held_out_px: dict[str, float]
+    cameras: list[Camera], keypoints: np.ndarray, matches: Matches, keep: float, held_out_px: dict[str, float]
 ) -> tuple[_Candidate, dict[str, str]]:
     """Free the camera that lets held-out frames gain most, then one more, until two are left or none gains enough.
 
@@ -88,8 +92,11 @@ def _one_by_one(
             log.info("trying: %s", what)
             tried[name] = held_out_px[what] = held_out_cost_px(cameras, keypoints, (*done, name), zoomed)
             kept[name] = f"pose kept: refining it takes held-out frames {_gain(cost_px, tried[name])}"
-        name = min(tried, key=tried.__getitem__)
-        if tried[name] >= keep * cost_px:
+            if against := _contradiction(matches, cameras, adjust(cameras, keypoints, (*done, name), zoomed)):
+                kept[name] += f", but {against}"
+                del tried[name]
+        name = min(tried, key=tried.__getitem__, default="")
+        if not name or tried[name] >= keep * cost_px:
             break
         what = f"pose of {' and '.join([*done, name])} and focal length of {name} refined"
         held_out_px[what] = held_out_cost_px(cameras, keypoints, (*done, name), (*zoomed, name))
@@ -108,6 +115,16 @@ def _all_at_once(cameras: list[Camera], keypoints: np.ndarray, held_out_px: dict
     cost_px = held_out_px["all poses refined"] = held_out_cost_px(cameras, keypoints, everyone)
     done = f"refined with all others: held-out frames go {_gain(held_out_px['as given'], cost_px)}"
     return _Candidate(adjust(cameras, keypoints, everyone), dict.fromkeys(everyone, done), cost_px)
+
+
+def _contradiction(matches: Matches, given: list[Camera], refined: list[Camera]) -> str:
+    """Which pair's matches say that the refinement is wrong; empty where none does."""
+    before_px, after_px = matches.residuals_px(given), matches.residuals_px(refined)
+    for (a, b), px in after_px.items():
+        was_px, is_px = float(np.median(before_px[a, b])), float(np.median(px))
+        if is_px > was_px + MATCH_NOISE_PX:
+            return f"matches of {a} and {b} go {_gain(was_px, is_px)}"
+    return ""
 
 
 def _gain(before_px: float, after_px: float) -> str:

@@ -8,12 +8,14 @@ import pytest
 
 from hnerf.calibration.check import check_calibration
 from hnerf.calibration.diagnosis import MISTAKES, MISTAKES_OF_ONE, undo_mistake
+from hnerf.calibration.matches import Matches
 from hnerf.calibration.refine import Refinement, refine
 from hnerf.capture.camera import Camera
 from hnerf.config import CalibrationSettings
 from tests.calibration.synthetic import FRAMES, detections, ring, turned, walk_m, write_capture
 
 SETTINGS = CalibrationSettings()
+NO_MATCHES = Matches({}, 0)
 
 
 class OutlinesThat:
@@ -30,9 +32,11 @@ def keypoints_of(noise_px: float = 1) -> np.ndarray:
     return np.stack([seen[:, 0] for seen in detections(ring(4), noise_px).values()])
 
 
-def refined(root: Path, cameras: list[Camera], keypoints: np.ndarray, outlines: Any = None) -> Refinement:
+def refined(
+    root: Path, cameras: list[Camera], keypoints: np.ndarray, outlines: Any = None, matches: Matches = NO_MATCHES
+) -> Refinement:
     seen = {camera.name: k[:, None] for camera, k in zip(cameras, keypoints, strict=True)}
-    return refine(write_capture(root, cameras, seen), cameras, keypoints, outlines, SETTINGS)
+    return refine(write_capture(root, cameras, seen), cameras, keypoints, outlines, matches, SETTINGS)
 
 
 def with_c2(change: Any) -> list[Camera]:
@@ -47,6 +51,16 @@ def test_outlines_have_a_veto(tmp_path: Path, after_px: float, accepted: bool) -
     assert found.outlines_px == {"as given": 0.5, "refined": after_px}
     assert any("outlines fit worse, from 0.50 to 0.60 px" in note for note in found.notes) != accepted
     assert found.reasons["c2"].startswith("pose refined" if accepted else "pose kept")
+
+
+@pytest.mark.parametrize("as_given", [True, False])
+def test_matches_between_two_cameras_have_a_say(tmp_path: Path, as_given: bool) -> None:
+    """c2 is turned by a degree. Matches that agree with the turned camera keep it; those of the true one let it go."""
+    given, points_m = with_c2(lambda c: turned(c, 1.0)), walk_m().reshape(-1, 3)[:40]
+    seen = [camera.project(points_m)[0] for camera in (given if as_given else ring(4))[1:3]]
+    found = refined(tmp_path, given, keypoints_of(), matches=Matches({("c1", "c2"): np.stack(seen, 1)}, 0))
+    assert (found.cameras[2] is given[2]) == as_given
+    assert ("but matches of c1 and c2 go from 0.00 to" in found.reasons["c2"]) == as_given
 
 
 def test_what_a_detector_gets_wrong_of_a_joint_moves_no_camera(tmp_path: Path) -> None:
