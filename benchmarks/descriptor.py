@@ -2,7 +2,8 @@
 
 usage: python benchmarks/descriptor.py [--points 100000] [--frames 8]
 
-Points lie within the shell of `fast` around the average body, one resting copy a frame. Writes
+Points lie within the shell of `fast` around the average body, one resting copy a frame, in random order (rays ask in
+order, which caches like better). Writes
 `benchmarks/results/descriptor.json` and `.md`: medians of five runs after one to warm up.
 """
 

@@ -95,6 +95,7 @@ class PaperFieldSettings(Section):
     samples: int = Field(default=256, ge=2)  # coarse, and as many fine
     sharpness: float = Field(default=200.0, gt=0)  # gamma
     learning_rate: float = Field(default=1e-3, gt=0)
+    root_condition: bool = True  # colour depends on T
 
 
 class LossSettings(Section):
@@ -179,6 +180,27 @@ def load_settings(preset: str, overrides: list[str] | None = None) -> Settings:
             if not isinstance(node, dict):
                 raise CaptureError(f"--set {override}: {section} is not a section")
         node[leaf] = yaml.safe_load(value)
+    return _validated(tree, path)
+
+
+def with_changes(settings: Settings, path: Path) -> Settings:
+    """Settings with those values replaced that a YAML file names, such as one of `configs/ablations/`.
+
+    Raises CaptureError with one line if a key or value is not allowed.
+    """
+    return _validated(_merged(settings.model_dump(), yaml.safe_load(path.read_text()) or {}), path)
+
+
+def _merged(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """A tree with the leaves of another put in."""
+    merged = dict(tree)
+    for name, value in changes.items():
+        both = isinstance(tree.get(name), dict) and isinstance(value, dict)
+        merged[name] = _merged(tree[name], value) if both else value
+    return merged
+
+
+def _validated(tree: dict[str, Any], path: Path) -> Settings:
     try:
         return Settings.model_validate(tree)
     except ValidationError as error:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from hnerf.body.descriptor import BodyMeshes, ClosestPoints
+from hnerf.body.descriptor import BodyMeshes
 from hnerf.body.rig import (
     Rig,
     joint_transforms,
@@ -24,13 +24,15 @@ from hnerf.body.rig import (
 @dataclass(frozen=True)
 class Descriptor:
     """d (N,) metres, negative inside; s (N, 3) on the rest body; y (N, 3) canonical position; normal (N, 3) of the rest
-    body at s, turned into the world; near (N,) bool: within reach (the rest is meaningless where it is False)."""
+    body at s, turned into the world; near (N,) bool: within reach (the rest is meaningless where it is False); vertex
+    (N,) the closest corner of the closest triangle."""
 
     d: Tensor
     s: Tensor
     y: Tensor
     normal: Tensor
     near: Tensor
+    vertex: Tensor
 
 
 class PoseCorrection(nn.Module):
@@ -102,6 +104,7 @@ class PosedBodies:
         correction."""
         found = self._meshes.closest_points(points_m, frame, reach_m, exact_sign)
         corners = self.rig.faces[found.face.clamp(min=0)]  # (N, 3)
+        vertex = corners.gather(1, found.barycentric.argmax(1, keepdim=True))[:, 0]
         flat = frame.long()[:, None] * len(self.rig.vertices_m) + corners
         weights = found.barycentric[..., None]
         p = (self.vertices_m.flatten(0, 1)[flat] * weights).sum(1)
@@ -112,18 +115,15 @@ class PosedBodies:
         normal = found.sign[:, None] * offset / distance.clamp(min=1e-9)[:, None]
         moved = points_m - points_m.detach()  # zero, but carries the gradient
         if correction is not None:
-            moved = moved - self._displacement(points_m.detach(), frame, corners, found, correction)
+            moved = moved - self._displacement(points_m.detach(), frame, vertex, correction)
         tangential = moved - normal * (normal * moved).sum(-1, keepdim=True)
         y = s + (inverse @ (offset + moved)[..., None])[..., 0]
         s = s + (inverse @ tangential[..., None])[..., 0]
         d = found.sign * distance + (normal * moved).sum(-1)
-        return Descriptor(d, s, y, normal, found.face >= 0)
+        return Descriptor(d, s, y, normal, found.face >= 0, vertex)
 
-    def _displacement(
-        self, points_m: Tensor, frame: Tensor, corners: Tensor, found: ClosestPoints, correction: PoseCorrection
-    ) -> Tensor:
-        """How far the correction carries the body at each point, (N, 3)."""
-        nearest = corners.gather(1, found.barycentric.argmax(1, keepdim=True))[:, 0]
+    def _displacement(self, points_m: Tensor, frame: Tensor, nearest: Tensor, correction: PoseCorrection) -> Tensor:
+        """How far the correction carries the body at each point with its nearest vertex (N,): (N, 3)."""
         frame = frame.long()
         share = self._subtree_weights[nearest]  # (N, free + 1)
         pivots = torch.cat([self._joints[:, self._free, :3, 3], self._joints[:, :1, :3, 3]], 1)  # (n, free + 1, 3)

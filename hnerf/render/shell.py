@@ -1,6 +1,7 @@
 """Where the person can be: one voxel grid a frame that says empty, shell or solid. Rays are sampled in the shell
 alone."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,24 +22,29 @@ class ShellGrid:
     cell_m: float
 
     @staticmethod
-    def around(surfaces_m: Tensor, outer_m: float, inner_m: float, cell_m: float) -> "ShellGrid":
-        """The shell from `inner_m` inside closed surfaces to `outer_m` outside, from dense points on them (n, V, 3).
+    def around(surfaces_m: Tensor, outer_m: Tensor, inner_m: Tensor, cell_m: float) -> "ShellGrid":
+        """The shell around closed surfaces, from dense points on them (n, V, 3) with the shell's own thickness outside
+        and inside at each point, (V,) metres.
 
-        Cell centres are up to half a diagonal from a point's own, so the shell is that much thicker than asked.
+        Distances are between the centres of cells, half a diagonal is added to them: the shell is up to a cell thicker
+        than asked, seldom thinner. A cell takes the greatest thickness in the neighbourhood of its nearest point.
         """
-        margin_m = outer_m + 2 * cell_m
+        margin_m = float(outer_m.max()) + 2 * cell_m
         lower = surfaces_m.amin(1) - margin_m
         size = ((surfaces_m.amax(1) + margin_m - lower).amax(0) / cell_m).ceil().int().tolist()
         index = ((surfaces_m - lower[:, None]) / cell_m).long().cpu().numpy()
         slack_m = cell_m * 3**0.5 / 2
         grids = []
         for frame in index:
+            at = tuple(frame.T)
             surface = np.zeros(size, bool)
-            surface[frame[:, 0], frame[:, 1], frame[:, 2]] = True
-            distance_m = cell_m * ndimage.distance_transform_edt(~surface)
+            surface[at] = True
+            nearest = ndimage.distance_transform_edt(~surface, return_distances=False, return_indices=True)
+            distance_m = cell_m * np.linalg.norm(nearest - np.indices(size), axis=0)
+            outer, inner = (_greatest_nearby(size, at, t.cpu().numpy())[tuple(nearest)] for t in (outer_m, inner_m))
             inside = ndimage.binary_fill_holes(distance_m <= cell_m)  # a cell thicker, so that no gap lets it leak
-            cells = np.where(inside | (distance_m <= outer_m + slack_m), SHELL, EMPTY)
-            cells[inside & (distance_m > inner_m + slack_m)] = SOLID
+            cells = np.where(inside | (distance_m <= outer + slack_m), SHELL, EMPTY)
+            cells[inside & (distance_m > inner + slack_m)] = SOLID
             grids.append(torch.from_numpy(cells.astype(np.uint8)))
         return ShellGrid(torch.stack(grids).to(surfaces_m.device), lower, cell_m)
 
@@ -59,7 +65,7 @@ class ShellGrid:
         whether the ray meets the shell at all. jitter (R, K) in [0, 1): where each sample lies in its stratum."""
         size_m = self.cell_m * torch.tensor(self.cells.shape[1:], device=origins_m.device)
         near, far = box_interval(origins_m, directions, self.lower_m[frame], self.lower_m[frame] + size_m)
-        bins = max(self.cells.shape[1:])
+        bins = max(1, math.ceil(float((far - near).max()) / self.cell_m))
         edges = near[:, None] + (far - near)[:, None] * torch.linspace(0, 1, bins + 1, device=near.device)
         middles = (edges[:, 1:] + edges[:, :-1]) / 2
         state = self.look_up(origins_m[:, None] + directions[:, None] * middles[..., None], frame)
@@ -74,6 +80,30 @@ class ShellGrid:
         inside = wanted - cumulative.gather(1, upper - 1)
         width = (far - near)[:, None] / bins
         return edges.gather(1, upper - 1) + inside * width, met
+
+
+def lattice(vertices_m: Tensor, faces: Tensor, spacing_m: float) -> tuple[Tensor, Tensor]:
+    """Points on a surface, vertices among them, no farther apart along edges than `spacing_m`: corner indices (P, 3)
+    and barycentric weights (P, 3), which hold in any pose."""
+    corners_m = vertices_m[faces]
+    longest_m = (corners_m - corners_m.roll(1, 1)).norm(dim=-1).amax(1)
+    parts = (longest_m / spacing_m).ceil().long().clamp(min=1)
+    corners, weights = [], []
+    for n in parts.unique().tolist():
+        steps = torch.cartesian_prod(torch.arange(n + 1), torch.arange(n + 1))
+        steps = steps[steps.sum(1) <= n]
+        inside = torch.cat([steps, n - steps.sum(1, keepdim=True)], 1).to(vertices_m) / n
+        split = faces[parts == n]
+        corners.append(split.repeat_interleave(len(inside), 0))
+        weights.append(inside.repeat(len(split), 1))
+    return torch.cat(corners), torch.cat(weights)
+
+
+def _greatest_nearby(size: list[int], at: tuple[np.ndarray, ...], values: np.ndarray) -> np.ndarray:
+    """Greatest of the values that fall into a cell or its neighbours, an array of this size."""
+    greatest = np.zeros(size, np.float32)
+    np.maximum.at(greatest, at, values)
+    return ndimage.maximum_filter(greatest, 3)
 
 
 def box_interval(origins_m: Tensor, directions: Tensor, lower_m: Tensor, upper_m: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,14 +4,18 @@ import torch
 from torch import Tensor, nn
 
 from hnerf.body.canonical import Descriptor, PoseCorrection, PosedBodies
+from hnerf.body.descriptor import vertex_normals
 from hnerf.body.rig import Rig
 from hnerf.config import FastFieldSettings
 from hnerf.field.canonical import CanonicalField
 from hnerf.render.compositing import alpha_from_sdf, weights_from_alpha
-from hnerf.render.shell import ShellGrid
+from hnerf.render.shell import ShellGrid, lattice
 from hnerf.training.conditions import Conditions, Draws, pose_inputs
 from hnerf.training.losses import RaySamples
 
+SETTLED = 5.0  # where the logistic of density is 1 or 0 within 1 %
+ROOM_M = 0.012  # for what the surface still moves, and what poses that were not asked about do to it
+TIGHTEN_STEP_M = 0.004
 NEGLIGIBLE = 1e-3  # a sample of less weight gets no colour
 FAR_M = 10.0  # farther than any point that is asked about
 
@@ -20,12 +24,21 @@ class FastField(nn.Module):
     """Networks, sharpness and the canonical body; no pose of its own."""
 
     canonical_m: Tensor
+    outer_m: Tensor
+    inner_m: Tensor
+    corners: Tensor
+    weights: Tensor
 
     def __init__(self, rig: Rig, settings: FastFieldSettings):
         super().__init__()
         self.settings = settings
         self.samples = settings.samples
         self.register_buffer("canonical_m", rig.vertices_m.clone())
+        for name in ("outer_m", "inner_m"):
+            self.register_buffer(name, torch.full((len(rig.vertices_m),), getattr(settings, name)))
+        corners, weights = lattice(rig.vertices_m, rig.faces, settings.shell_cell_m)
+        self.register_buffer("corners", corners, persistent=False)
+        self.register_buffer("weights", weights, persistent=False)
         margin_m = settings.outer_m + 0.01
         self.field = CanonicalField(
             rig.vertices_m.amin(0) - margin_m,
@@ -47,8 +60,28 @@ class FastField(nn.Module):
 
     def region(self, bodies: PosedBodies) -> ShellGrid:
         """Where rays are sampled: the shell around bodies as they stand now."""
-        s = self.settings
-        return ShellGrid.around(bodies.vertices_m, s.outer_m, s.inner_m, s.shell_cell_m)
+        points_m = (bodies.vertices_m[:, self.corners] * self.weights[..., None]).sum(-2)
+        outer_m, inner_m = (thickness[self.corners].amax(1) for thickness in (self.outer_m, self.inner_m))
+        return ShellGrid.around(points_m, outer_m, inner_m, self.settings.shell_cell_m)
+
+    @torch.no_grad()
+    def tighten(self, rig: Rig, pose: Tensor) -> None:
+        """Make the shell no thicker than what can be seen: where, in any of some poses (n, P), the opacity's logistic
+        has not yet settled, with some room to move. Nothing outside the old shell is asked."""
+        s, rest = self.settings, torch.zeros(1, len(rig.joints_m), 3, device=self.canonical_m.device)
+        bodies = PosedBodies(rig, rest, torch.eye(4, device=rest.device)[None], self.canonical_m)
+        depths_m = torch.arange(-s.inner_m, s.outer_m, TIGHTEN_STEP_M, device=rest.device)
+        normals = vertex_normals(bodies.vertices_m[0], rig.faces)
+        points = (bodies.vertices_m[0, :, None] + depths_m[:, None] * normals[:, None]).flatten(0, 1)
+        described = bodies.describe(points, torch.zeros(len(points), dtype=torch.long, device=rest.device), s.outer_m)
+        settled_m = SETTLED / self.log_sharpness.exp()
+        seen = torch.zeros_like(described.near)
+        for row in pose:
+            d_hat = described.d + self._residual(described, row.expand(len(points), -1))
+            seen |= described.near & (d_hat.abs() < settled_m)
+        for name, side in (("outer_m", described.d), ("inner_m", -described.d)):
+            reached = torch.zeros_like(self.outer_m).scatter_reduce_(0, described.vertex[seen], side[seen], "amax")
+            self.get_buffer(name).copy_((reached + ROOM_M).minimum(self.get_buffer(name)))
 
     def parameter_groups(self) -> list[dict]:
         """Adam groups; feature grids bear a larger rate than networks."""
@@ -73,23 +106,25 @@ class FastField(nn.Module):
     ) -> tuple[RaySamples, Tensor]:
         """Radiance and distance along rays (R, 3) of body rows (R,); also depths (R, K)."""
         depths, met = region.sample_rays(origins_m, directions, frame, draws.jitter)
-        points = (origins_m[:, None] + directions[:, None] * depths[..., None]).flatten(0, 1)
-        row = frame.repeat_interleave(depths.shape[1])
-        described = bodies.describe(points, row, self.reach_m, correction)
-        near = described.near & met.repeat_interleave(depths.shape[1])
-        d = torch.where(near, described.d, self.reach_m)
+        hit = torch.nonzero(met)[:, 0]  # only these rays are asked about; the others see nothing
+        points = origins_m[hit, None] + directions[hit, None] * depths[hit][..., None]
+        row = frame[hit].repeat_interleave(depths.shape[1])
+        described = bodies.describe(points.flatten(0, 1), row, self.reach_m, correction)
         pose = conditions.pose[row]
-        residual = torch.where(near, self._residual(described, pose), 0.0)
-        d, residual = d.view_as(depths), residual.view_as(depths)
+        d = torch.where(described.near, described.d, self.reach_m).view(len(hit), depths.shape[1])
+        residual = torch.where(described.near, self._residual(described, pose), 0.0).view_as(d)
         alpha = alpha_from_sdf(d + residual, self.log_sharpness.exp())
         colour = self._colour(described, pose, weights_from_alpha(alpha.detach()).flatten() > NEGLIGIBLE)
-        norms = described.d.new_zeros(0)
+        norms = d.new_zeros(0)
         if draws.probe is not None:
-            norms = self._gradient_norms(described, residual, near, pose, draws.probe)
-        samples = RaySamples(
-            alpha, alpha, torch.ones_like(d), colour.view(*depths.shape, 3), None, d, residual, norms, draws.beyond
-        )
-        return samples, depths
+            norms = self._gradient_norms(described, residual, pose, draws.probe[hit])
+
+        def everywhere(values: Tensor, elsewhere: float) -> Tensor:
+            return values.new_full((len(met), *values.shape[1:]), elsewhere).index_copy(0, hit, values)
+
+        alpha, d, residual = everywhere(alpha, 0.0), everywhere(d, self.reach_m), everywhere(residual, 0.0)
+        colour = everywhere(colour.view(len(hit), depths.shape[1], 3), 0.0)
+        return RaySamples(alpha, alpha, torch.ones_like(d), colour, None, d, residual, norms, draws.beyond), depths
 
     def _residual(self, described: Descriptor, pose: Tensor) -> Tensor:
         """dd (N,) in the shell; 0 beyond it and deeper inside, where no ray asks and the body's d is enough."""
@@ -104,14 +139,12 @@ class FastField(nn.Module):
         seen = self.field.colour(described.y[pick], described.d[pick], described.normal[pick], pose[pick])
         return colour.index_copy(0, pick, seen)
 
-    def _gradient_norms(
-        self, described: Descriptor, residual: Tensor, near: Tensor, pose: Tensor, probe: Tensor
-    ) -> Tensor:
+    def _gradient_norms(self, described: Descriptor, residual: Tensor, pose: Tensor, probe: Tensor) -> Tensor:
         """|grad d_hat| in the canonical frame at one sample a ray, probe (R,) in [0, 1), by forward differences: the
         interpolation of a grid has no useful second derivative."""
         rays, samples = residual.shape
         pick = torch.arange(rays, device=probe.device) * samples + (probe * samples).long()
-        pick = pick[near[pick]]
+        pick = pick[described.near[pick]]
         step_m = self.settings.gradient_step_m
         y, d = described.y[pick].detach(), described.d[pick].detach()
         outward = nn.functional.normalize((y - described.s[pick]) * d.sign()[:, None], dim=-1)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import binary_cross_entropy, relu
+from torch.nn.functional import relu
 
 from hnerf.body.canonical import PoseCorrection
 from hnerf.render.compositing import composite, weights_from_alpha
@@ -74,14 +74,19 @@ def geometry(samples: RaySamples, threshold: float, steepness: float) -> Tensor:
     if samples.density is None:
         return samples.d.new_zeros(())
     opaque = torch.sigmoid(steepness * (samples.density - threshold)).clamp(EPSILON, 1 - EPSILON)
-    bce = binary_cross_entropy(opaque, samples.alpha_dot, reduction="none")
-    return (samples.in_box * bce).sum(1).mean()
+    return (samples.in_box * _cross_entropy(opaque, samples.alpha_dot)).sum(1).mean()
 
 
 def segmentation(distance: Tensor, target: Target, sharpness: float) -> Tensor:
     """seg, fit: BCE(M, sigmoid(-gamma min_i d_i)) for distances (R, K): d_hat for seg, the body's own d for fit."""
     covered = torch.sigmoid(-sharpness * distance.amin(1)).clamp(EPSILON, 1 - EPSILON)
-    return binary_cross_entropy(covered, target.person)
+    return _cross_entropy(covered, target.person).mean()
+
+
+def _cross_entropy(predicted: Tensor, target: Tensor) -> Tensor:
+    """BCE of probabilities inside (0, 1). Lets a NaN through, which torch's own refuses, so that the step can be
+    skipped."""
+    return -(target * predicted.log() + (1 - target) * (1 - predicted).log())
 
 
 def eikonal(samples: RaySamples) -> Tensor:

@@ -47,8 +47,8 @@ class PaperField(nn.Module):
         self.register_buffer("canonical_m", rig.vertices_m.clone())
         self.register_buffer("centre_m", root[:, :3, 3].mean(0))
         poses = pose_inputs(rig, torch.zeros(1, len(rig.joints_m), 3)).shape[1]
-        point, pose, turn = (3, 0, 0) if static else (4, poses, 12)
-        self.radiance = RadianceMLP(point, pose, turn)
+        point, pose, self.turn = (3, 0, 0) if static else (4, poses, 12 if settings.root_condition else 0)
+        self.radiance = RadianceMLP(point, pose, self.turn)
         self.residual = ResidualMLP(point, pose)
 
     def region(self, bodies: PosedBodies) -> Boxes:
@@ -56,6 +56,9 @@ class PaperField(nn.Module):
         margin, half = self.settings.box_margin_m, self.settings.scene_m
         lower, upper = bodies.vertices_m.amin(1) - margin, bodies.vertices_m.amax(1) + margin
         return Boxes(lower, upper, self.centre_m - half, self.centre_m + half)
+
+    def tighten(self, rig: Rig, pose: Tensor) -> None:
+        """Nothing: the paper samples the whole box."""
 
     def parameter_groups(self) -> list[dict]:
         """Adam groups."""
@@ -152,7 +155,8 @@ class PaperField(nn.Module):
         outside = torch.cat([scaled, torch.full_like(scaled[:, :1], OUTSIDE_DISTANCE)], -1)
         inner = torch.cat([described.s, described.d[:, None]], -1) / self.settings.scene_m
         pose = torch.zeros_like(conditions.pose[row]).index_copy(0, pick, conditions.pose[row[pick]])
-        root = torch.zeros_like(conditions.root[row]).index_copy(0, pick, conditions.root[row[pick]])
+        turn = conditions.root[:, : self.turn]
+        root = torch.zeros_like(turn[row]).index_copy(0, pick, turn[row[pick]])
         return self.radiance(outside.index_copy(0, pick, inner), pose, root, view)
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:

@@ -34,6 +34,7 @@ SKIPS_ALLOWED = 2  # in a row; one more non-finite step stops the run
 HELD_OUT_RAYS = 2048
 LEAST_COVERAGE = 0.2  # of the person's pixels; below it the surface has collapsed
 LOG_STEPS = 25
+POSES_APART = 6  # training poses between those that say how thick the shell must be
 
 
 class Trainer:
@@ -98,6 +99,8 @@ class Trainer:
             self.seconds = time.monotonic() - started
             if self.step % self.settings.absorb_steps == 0 or self.step in (self.settings.steps, self.steps):
                 self.stage.bodies.absorb(self.objective.correction)
+                if self.step <= self.settings.steps:
+                    self.field.tighten(self.stage.bodies.rig, self.conditions.pose[self.train_rows[::POSES_APART]])
                 self._stand(self.stage.bodies)
             if self.step % LOG_STEPS == 0 or self.step in (1, self.settings.steps, self.steps):
                 self._record(terms)

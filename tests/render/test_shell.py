@@ -1,13 +1,19 @@
 import pytest
 import torch
 
-from hnerf.render.shell import EMPTY, SHELL, SOLID, ShellGrid, box_interval
+from hnerf.render.shell import EMPTY, SHELL, SOLID, ShellGrid, box_interval, lattice
 
 
 def sphere(radius_m: float) -> torch.Tensor:
     """Dense points on a sphere about the origin, (1, N, 3)."""
     points = torch.randn(40000, 3, generator=torch.Generator().manual_seed(0))
     return radius_m * torch.nn.functional.normalize(points, dim=-1)[None]
+
+
+def even_shell(surface: torch.Tensor, outer_m: float, inner_m: float, cell_m: float) -> ShellGrid:
+    """As thick everywhere."""
+    outer, inner = (torch.full((surface.shape[1],), thickness) for thickness in (outer_m, inner_m))
+    return ShellGrid.around(surface, outer, inner, cell_m)
 
 
 def test_box_interval_by_hand():
@@ -21,15 +27,34 @@ def test_box_interval_by_hand():
 
 
 def test_states_around_a_sphere():
-    grid = ShellGrid.around(sphere(0.3), outer_m=0.05, inner_m=0.04, cell_m=0.02)
+    grid = even_shell(sphere(0.3), outer_m=0.05, inner_m=0.04, cell_m=0.02)
     points = torch.tensor([[[0.0, 0, 0], [0.27, 0, 0], [0.33, 0, 0], [0.42, 0, 0], [5.0, 0, 0]]])
     assert grid.look_up(points, torch.zeros(1, dtype=torch.long))[0].tolist() == [SOLID, SHELL, SHELL, EMPTY, EMPTY]
+
+
+def test_the_shell_is_as_thick_as_its_surface_asks():
+    """Thick on the side of x > 0, thin on the other: 8 cm off is shell on one side alone."""
+    surface = sphere(0.3)
+    outer = torch.where(surface[0, :, 0] > 0, 0.1, 0.02)
+    grid = ShellGrid.around(surface, outer, torch.full_like(outer, 0.02), 0.01)
+    points = torch.tensor([[[0.38, 0.0, 0.0], [-0.38, 0.0, 0.0], [0.31, 0, 0], [-0.31, 0, 0]]])
+    assert grid.look_up(points, torch.zeros(1, dtype=torch.long))[0].tolist() == [SHELL, EMPTY, SHELL, SHELL]
+
+
+def test_a_lattice_divides_long_edges():
+    """A right triangle with legs of 3: spacing 1.5 cuts its longest edge (4.24) in three, so 10 points in all."""
+    vertices = torch.tensor([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
+    corners, weights = lattice(vertices, torch.tensor([[0, 1, 2]]), 1.5)
+    points = (vertices[corners] * weights[..., None]).sum(1)
+    expected = {(x, y, 0) for x in range(4) for y in range(4) if x + y <= 3}
+    assert {tuple(p) for p in points.round().int().tolist()} == expected and len(points) == 10
+    torch.testing.assert_close(points, points.round())
 
 
 def test_samples_lie_in_the_shell_before_the_solid():
     """Through the middle of a sphere of 0.3 m from 1 m away: entered 5 cm before the surface, left at the solid
     core."""
-    grid = ShellGrid.around(sphere(0.3), outer_m=0.05, inner_m=0.04, cell_m=0.01)
+    grid = even_shell(sphere(0.3), outer_m=0.05, inner_m=0.04, cell_m=0.01)
     depths, met = grid.sample_rays(
         torch.tensor([[-1.0, 0.0, 0.0], [-1.0, 0.6, 0.0]]),
         torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
@@ -44,7 +69,7 @@ def test_samples_lie_in_the_shell_before_the_solid():
 
 def test_a_gap_between_two_shells_is_not_sampled():
     """Beside the solid core a ray crosses the shell twice; nothing is sampled outside it."""
-    grid = ShellGrid.around(torch.cat([sphere(0.1) - 0.3, sphere(0.1) + 0.3], 1), 0.03, 0.2, 0.01)
+    grid = even_shell(torch.cat([sphere(0.1) - 0.3, sphere(0.1) + 0.3], 1), 0.03, 0.2, 0.01)
     depths, _ = grid.sample_rays(
         torch.full((1, 3), -1.0), torch.full((1, 3), 3**-0.5), torch.zeros(1, dtype=torch.long), torch.rand(1, 64)
     )

@@ -63,6 +63,12 @@ def test_geometry_vanishes_where_the_sdf_is_the_density():
     assert losses.geometry(replace(SAMPLES, density=None), 50.0, 0.1).item() == 0
 
 
+def test_not_a_number_passes_through_the_cross_entropy():
+    """So that the step is skipped with its cause, and no library's error takes its place."""
+    broken = torch.full_like(SAMPLES.d, torch.nan)
+    assert losses.segmentation(broken, TARGET, 80.0).isnan()
+
+
 def test_segmentation():
     """min d_hat: -0.02 on the person, 0.14 beside; gamma 80: -log sigmoid(1.6) - log(1 - sigmoid(-11.2))."""
     expected = -math.log(1 / (1 + math.exp(-1.6))) - math.log(1 - 1 / (1 + math.exp(11.2)))

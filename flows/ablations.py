@@ -1,0 +1,150 @@
+"""What each part of the method is worth: a training and an evaluation for every file in `configs/ablations/`.
+
+A file holds the settings in which its row differs from the preset. Stages whose settings it leaves alone are shared by
+all rows, and rows that are finished are found again, both through the store.
+"""
+
+import json
+import logging
+import os
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+from flows.train_subject import find_masks
+from hnerf.capture.capture import Capture
+from hnerf.config import CONFIGS, Settings, load_settings, with_changes
+from hnerf.errors import CaptureError
+from tasks.calibration import calibrate
+from tasks.capture import ingest
+from tasks.evaluation import evaluate
+from tasks.fit import fit
+from tasks.launcher import LostWorkerError
+from tasks.source import Source, read_capture
+from tasks.store import Store
+from tasks.training import train
+
+log = logging.getLogger("hnerf.ablations")
+
+ABLATIONS = CONFIGS / "ablations"
+FULL = "full"
+COLUMNS = {  # in a split's scores; cells show training poses / novel poses
+    "psnr": ("PSNR", "{:.2f}"),
+    "ssim": ("SSIM", "{:.3f}"),
+    "mask_iou": ("mask IoU", "{:.3f}"),
+    "geometry.chamfer_l2_e3": ("Chamfer x1e-3 m²", "{:.3f}"),
+    "geometry.normal_consistency": ("NC", "{:.3f}"),
+    "geometry.iou": ("IoU", "{:.3f}"),
+}
+
+
+def ablate(capture: Path, preset: str, store: Path, overrides: list[str], only: Collection[str] = ()) -> Path:
+    """Run the full method and each ablation; returns the table, `<store>/ablations/<subject>-<preset>.md`, which has a
+    JSON file beside it. Both are written anew after every row.
+
+    only: names of ablations, all where there are none. A row whose training fails says why and the rest go on; a worker
+    that was killed (LostWorkerError) ends the command, and the same command goes on from there.
+    """
+    rows, left_out = choose(load_settings(preset, overrides), only)
+    shelf = Store(store.resolve())
+    source, truth = read_capture(capture)
+    subject = Capture.load(ingest(shelf, source, rows[FULL].capture).root).name
+    table = shelf.root / "ablations" / f"{subject}-{Path(preset).stem}.md"
+    result: dict[str, Any] = {"subject": subject, "preset": preset, "overrides": overrides, "left_out": left_out}
+    result["rows"] = {}
+    for name, settings in rows.items():
+        log.info("%s", name)
+        result["rows"][name] = measure(shelf, source, truth, settings)
+        table.parent.mkdir(parents=True, exist_ok=True)
+        _write(table.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
+        _write(table, as_markdown(result))
+    return table
+
+
+def choose(full: Settings, only: Collection[str]) -> tuple[dict[str, Settings], dict[str, str]]:
+    """Settings of each row, the full method first, and why the other ablations have none."""
+    known = {path.stem: path for path in sorted(ABLATIONS.glob("*.yaml"))}
+    unknown = sorted(set(only) - set(known))
+    if unknown:
+        raise CaptureError(f"--only {unknown[0]}: no such ablation; there are {', '.join(known)}")
+    rows, left_out = {FULL: full}, {}
+    for name in only or known:
+        settings = with_changes(full, known[name])
+        reason = why_pointless(full, settings)
+        if reason:
+            left_out[name] = reason
+        else:
+            rows[name] = settings
+    return rows, left_out
+
+
+def why_pointless(full: Settings, ablated: Settings) -> str | None:
+    """Why an ablation would train the same avatar again; None if it would not."""
+    if ablated == full:
+        return "off already"
+    machinery = full.training.machinery
+    idle = "paper" if machinery == "fast" else "fast"
+    training = ablated.training.model_copy(update={idle: getattr(full.training, idle)})
+    if ablated.model_copy(update={"training": training}) == full:
+        return f"the {machinery} machinery has no such part"
+    return None
+
+
+def measure(shelf: Store, source: Source, truth: Source, settings: Settings) -> dict[str, Any]:
+    """A row's figures: scores of both splits, seconds and device of its training; {"error": one line} if that fails."""
+    recording = ingest(shelf, source, settings.capture)
+    calibration = calibrate(shelf, recording, settings.calibration)
+    masks = find_masks(shelf, recording, calibration, settings)
+    body = fit(shelf, recording, calibration, masks, settings.fit)
+    try:
+        model = train(shelf, recording, calibration, masks, body, settings.training)
+    except LostWorkerError:
+        raise
+    except RuntimeError as error:
+        log.warning("%s", error)
+        return {"error": str(error).splitlines()[-1]}
+    report = evaluate(shelf, truth, recording, calibration, masks, body, model, settings.evaluation)
+    metrics = json.loads((report.root / "metrics.json").read_text())
+    trained = json.loads((model.root / "report.json").read_text())
+    return {key: trained[key] for key in ("seconds", "device")} | {
+        key: metrics[key] for key in ("protocol", "novel_view", "novel_pose")
+    }
+
+
+def as_markdown(result: dict[str, Any]) -> str:
+    """A row for each run that was made, then the ablations that have none, then how figures were taken."""
+    with_overrides = f" with {', '.join(result['overrides'])}" if result["overrides"] else ""
+    titles = ["", *(title for title, _ in COLUMNS.values()), "training, s", "on"]
+    lines = [f"# Ablations of {result['subject']}, preset `{result['preset']}`{with_overrides}", ""]
+    lines += ["Two figures in a cell: training poses from test cameras / novel poses.", ""]
+    lines += [_line(titles), "|" + "---|" * len(titles)]
+    lines += [_line([name, *_cells(row)]) for name, row in result["rows"].items()]
+    if result["left_out"]:
+        lines += ["", "Left out:", "", *(f"- {name}: {reason}" for name, reason in result["left_out"].items())]
+    protocols = {row["protocol"] for row in result["rows"].values() if "protocol" in row}
+    return "\n".join([*lines, "", *sorted(protocols), ""])
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    if "error" in row:
+        return [row["error"].replace("|", "/"), *[""] * (len(COLUMNS) + 1)]
+    splits = row["novel_view"], row["novel_pose"]
+    scores = [" / ".join(_score(split, key, form) for split in splits) for key, (_, form) in COLUMNS.items()]
+    return [*scores, f"{row['seconds']:.0f}", row["device"]]
+
+
+def _score(split: dict[str, Any], key: str, form: str) -> str:
+    value: Any = split
+    for part in key.split("."):
+        value = (value or {}).get(part)
+    return "-" if value is None else form.format(value)
+
+
+def _line(cells: list[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _write(path: Path, text: str) -> None:
+    beside = path.with_name(f"{path.name}.partial")
+    beside.write_text(text)
+    os.replace(beside, path)

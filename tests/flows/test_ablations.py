@@ -1,0 +1,165 @@
+"""Which ablations are worth a row, and the table from figures that were made up."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from flows import ablations as module
+from flows.ablations import ablate, as_markdown, choose
+from flows.cli import main
+from hnerf.config import TrainingSettings, load_settings
+from hnerf.errors import CaptureError
+from tasks.launcher import LostWorkerError
+
+SPLIT = {
+    "psnr": 30.126,
+    "ssim": 0.9,
+    "mask_iou": 0.95,
+    "geometry": {"chamfer_l2_e3": 0.05, "normal_consistency": 0.94, "iou": 0.875},
+}
+
+
+@pytest.fixture
+def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainingSettings]:
+    """Every stage replaced; the list gathers the training settings of each row. Training fails without noise and loses
+    its worker without the eikonal loss; evaluation finds as many dB as the segmentation loss weighs."""
+    trained: list[TrainingSettings] = []
+
+    def train(*inputs: Any) -> Any:
+        settings = inputs[-1]
+        trained.append(settings)
+        if settings.noise == 0:
+            raise RuntimeError("rank 0 ended with exit code 1\nTrainingError: the surface is empty")
+        if settings.losses.eikonal == 0:
+            raise LostWorkerError("rank 0 was killed by SIGKILL")
+        (tmp_path / "report.json").write_text('{"seconds": 61.7, "device": "abacus", "steps": 3}')
+        return SimpleNamespace(root=tmp_path)
+
+    def evaluate(*inputs: Any) -> Any:
+        split = SPLIT | {"psnr": trained[-1].losses.segmentation}
+        metrics = {"protocol": "By eye.", "novel_view": split, "novel_pose": split, "seconds": 5.0}
+        (tmp_path / "metrics.json").write_text(json.dumps(metrics))
+        return SimpleNamespace(root=tmp_path)
+
+    for name in ("calibrate", "find_masks", "fit"):
+        monkeypatch.setattr(module, name, lambda *_: None)
+    monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path))
+    monkeypatch.setattr(module, "read_capture", lambda _: (None, None))
+    monkeypatch.setattr(module.Capture, "load", lambda _: SimpleNamespace(name="ada"))
+    monkeypatch.setattr(module, "train", train)
+    monkeypatch.setattr(module, "evaluate", evaluate)
+    return trained
+
+
+def test_the_paper_preset_has_a_row_for_every_loss_and_switch() -> None:
+    rows, left_out = choose(load_settings("paper"), [])
+    losses = {f"no-{name}" for name in load_settings("paper").training.losses.model_dump()}
+    constants = {"no-eta", "no-density_threshold", "no-density_steepness", "no-sharpness_per_m"}
+    assert next(iter(rows)) == "full"
+    assert set(rows) == {"full", "no-opt", "no-root", "no-noise"} | losses - constants
+    assert left_out == {}
+
+
+def test_rows_differ_from_the_preset_in_one_setting() -> None:
+    full = load_settings("paper")
+    rows, _ = choose(full, [])
+    before = _leaves(full.model_dump())
+    after = {name: dict(_leaves(row.model_dump()).items() - before.items()) for name, row in rows.items()}
+    assert after.pop("full") == {}
+    assert after.pop("no-opt") == {"training.pose_learning_rate": 0}
+    assert after.pop("no-root") == {"training.paper.root_condition": False}
+    assert after.pop("no-noise") == {"training.noise": 0}
+    assert after == {f"no-{name}": {f"training.losses.{name}": 0} for name in (row[3:] for row in after)}
+
+
+def _leaves(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in tree.items():
+        found |= _leaves(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return found
+
+
+def test_what_is_off_or_unused_is_left_out() -> None:
+    rows, left_out = choose(load_settings("fast"), [])
+    assert left_out == {
+        **dict.fromkeys(["no-blend", "no-fit", "no-geometry", "no-increment", "no-mask"], "off already"),
+        "no-root": "the fast machinery has no such part",
+    }
+    shown = ["full", "no-eikonal", "no-noise", "no-opt", "no-reconstruction", "no-residual", "no-segmentation"]
+    assert list(rows) == shown
+
+
+def test_an_override_counts_as_the_preset_but_not_against_the_ablation() -> None:
+    rows, left_out = choose(load_settings("fast", ["training.losses.mask=0.5", "training.steps=7"]), ["no-mask"])
+    assert left_out == {}
+    assert [row.training.losses.mask for row in rows.values()] == [0.5, 0.0]
+    assert [row.training.steps for row in rows.values()] == [7, 7]
+
+
+def test_unknown_names_are_refused() -> None:
+    with pytest.raises(CaptureError, match="--only no-hair: no such ablation; there are no-blend, no-eikonal"):
+        choose(load_settings("fast"), ["no-hair"])
+
+
+def test_the_table_by_hand() -> None:
+    bare = {"psnr": None, "ssim": None, "mask_iou": None, "geometry": None}
+    result = {
+        "subject": "ada",
+        "preset": "fast",
+        "overrides": ["training.steps=7"],
+        "rows": {
+            "full": {"novel_view": SPLIT, "novel_pose": bare, "seconds": 61.7, "device": "abacus", "protocol": "Eye."},
+            "no-opt": {"error": "a | b"},
+        },
+        "left_out": {"no-mask": "off already"},
+    }
+    assert as_markdown(result).splitlines() == [
+        "# Ablations of ada, preset `fast` with training.steps=7",
+        "",
+        "Two figures in a cell: training poses from test cameras / novel poses.",
+        "",
+        "|  | PSNR | SSIM | mask IoU | Chamfer x1e-3 m² | NC | IoU | training, s | on |",
+        "|---|---|---|---|---|---|---|---|---|",
+        "| full | 30.13 / - | 0.900 / - | 0.950 / - | 0.050 / - | 0.940 / - | 0.875 / - | 62 | abacus |",
+        "| no-opt | a / b |  |  |  |  |  |  |  |",
+        "",
+        "Left out:",
+        "",
+        "- no-mask: off already",
+        "",
+        "Eye.",
+    ]
+
+
+def test_a_row_that_fails_says_so_and_the_rest_go_on(stages: list[TrainingSettings], tmp_path: Path) -> None:
+    table = ablate(tmp_path, "fast", tmp_path / "store", [], ["no-noise", "no-segmentation"])
+    assert table == tmp_path / "store" / "ablations" / "ada-fast.md"
+    result = json.loads(table.with_suffix(".json").read_text())
+    rows = result["rows"]
+    assert list(rows) == ["full", "no-noise", "no-segmentation"]
+    assert rows["no-noise"] == {"error": "TrainingError: the surface is empty"}
+    assert [rows[name]["novel_view"]["psnr"] for name in ("full", "no-segmentation")] == [0.02, 0.0]
+    assert rows["full"]["seconds"] == 61.7
+    assert table.read_text() == as_markdown(result)
+
+
+def test_a_lost_worker_ends_the_command_and_finished_rows_stand(stages: list[TrainingSettings], tmp_path: Path) -> None:
+    with pytest.raises(LostWorkerError):
+        ablate(tmp_path, "fast", tmp_path / "store", [], ["no-opt", "no-eikonal", "no-residual"])
+    result = json.loads((tmp_path / "store" / "ablations" / "ada-fast.json").read_text())
+    assert list(result["rows"]) == ["full", "no-opt"]
+    assert len(stages) == 3
+
+
+def test_the_command_prints_the_table(
+    stages: list[TrainingSettings], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--store", str(tmp_path / "store"), "--set", "training.losses.segmentation=12", "--only", "no-mask"]
+    assert main(["ablate", str(tmp_path), *options]) == 0
+    shown = capsys.readouterr().out
+    assert "| full | 12.00 / 12.00 |" in shown
+    assert "- no-mask: off already" in shown
+    assert f"table: {tmp_path / 'store' / 'ablations' / 'ada-fast.md'}" in shown

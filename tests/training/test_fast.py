@@ -1,0 +1,77 @@
+"""The fast field's shell: tightened to what can be seen, and rays that miss it are asked nothing."""
+
+import pytest
+import torch
+
+from hnerf.body.canonical import PosedBodies
+from hnerf.config import FastFieldSettings
+from hnerf.training.conditions import Conditions, Draws
+from hnerf.training.fast import ROOM_M, SETTLED, TIGHTEN_STEP_M, FastField
+from tests.body.boxes import box_rig
+
+RIG = box_rig(splits=3)
+SETTINGS = FastFieldSettings(samples=32, geometry_cells=(4,), colour_cells=(4,), width=8, shell_cell_m=0.05)
+
+
+def standing() -> tuple[PosedBodies, Conditions]:
+    theta, root = torch.zeros(1, 2, 3), torch.eye(4)[None]
+    return PosedBodies(RIG, theta, root, RIG.vertices_m), Conditions.of(RIG, theta, root, 2.5)
+
+
+def field_of(sharpness_per_m: float) -> FastField:
+    torch.manual_seed(0)
+    field = FastField(RIG, SETTINGS)
+    field.log_sharpness.data.fill_(sharpness_per_m).log_()
+    return field
+
+
+def test_the_shell_is_tightened_to_where_the_opacity_changes():
+    """Untrained, d_hat is d: a logistic of 1000 per metre has settled 5 mm from the skin, one of 10 nowhere."""
+    _, conditions = standing()
+    sharp, soft = field_of(1000.0), field_of(10.0)
+    for field in (sharp, soft):
+        field.tighten(RIG, conditions.pose)
+    seen_m = SETTLED / 1000
+    for thickness in (sharp.outer_m, sharp.inner_m):
+        assert (thickness <= seen_m + ROOM_M + 1e-6).all()
+        assert thickness.max().item() == pytest.approx(seen_m + ROOM_M, abs=TIGHTEN_STEP_M)
+    assert soft.outer_m.max().item() == pytest.approx(SETTINGS.outer_m)
+    assert soft.inner_m.max().item() == pytest.approx(SETTINGS.inner_m)
+
+
+def test_a_tight_shell_shows_the_same_picture():
+    bodies, conditions = standing()
+    field = field_of(1000.0)
+    origins = torch.tensor([[0.5, 0.4, 3.0], [0.31, 0.62, 3.0], [0.1, 0.8, 3.0]])
+    directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3)
+    frame, draws = torch.zeros(3, dtype=torch.long), Draws.still(3, SETTINGS.samples, torch.device("cpu"))
+
+    def coverage() -> torch.Tensor:
+        samples, _ = field.sample(bodies, field.region(bodies), origins, directions, frame, conditions, draws)
+        return 1 - (1 - samples.alpha).prod(1)
+
+    before = coverage()
+    field.tighten(RIG, conditions.pose)
+    torch.testing.assert_close(coverage(), before, atol=0.01, rtol=0)
+    assert (before > 0.95).all()
+
+
+def test_rays_that_miss_the_shell_see_nothing_and_change_nothing():
+    """The middle one of three passes 1 m beside the box; the others are as if it were not there."""
+    bodies, conditions = standing()
+    field = field_of(100.0)
+    origins = torch.tensor([[0.5, 0.5, 3.0], [2.0, 0.5, 3.0], [0.4, 0.6, 3.0]])
+    directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3)
+
+    def sampled(pick: list[int]) -> list[torch.Tensor]:
+        draws = Draws.still(len(pick), SETTINGS.samples, torch.device("cpu"))
+        frame = torch.zeros(len(pick), dtype=torch.long)
+        found, _ = field.sample(bodies, field.region(bodies), origins[pick], directions[pick], frame, conditions, draws)
+        return [found.alpha, found.colour, found.d, found.residual]
+
+    alpha, colour, d, residual = sampled([0, 1, 2])
+    assert not alpha[1].any() and not colour[1].any() and not residual[1].any()
+    assert (d[1] == field.reach_m).all()
+    assert not sampled([1])[0].any()
+    for all_three, alone in zip((alpha, colour, d, residual), sampled([0, 2]), strict=True):
+        torch.testing.assert_close(all_three[[0, 2]], alone, atol=1e-6, rtol=0)
