@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from flows.ablations import ablate
 from flows.train_subject import train_subject
 from hnerf.calibration.boards import calibrate_from_boards
 from hnerf.capture.formats.export import WRITERS, write_cameras
@@ -20,6 +21,7 @@ from hnerf.capture.notes import read_notes
 from hnerf.capture.performer import PerformerSettings, write_performer
 from hnerf.config import load_settings
 from hnerf.errors import CaptureError
+from hnerf.render.show import KINDS, Wish, render_subject
 from tasks.calibration import calibrate
 from tasks.capture import ingest
 from tasks.source import read_capture
@@ -85,6 +87,16 @@ def _parser() -> argparse.ArgumentParser:
     cameras.add_argument("--out", type=Path, default=Path("cameras"), help="the folder to write (default: cameras)")
     cameras.set_defaults(command=lambda o: _cameras(o.folder, o.format, o.out))
 
+    ablations = commands.add_parser("ablate", help="train without each part of the method in turn: a table")
+    ablations.add_argument("capture", type=Path, help="the recording's folder")
+    ablations.add_argument("--preset", default="fast", help="a name under configs/ or a YAML file (default: fast)")
+    ablations.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
+    ablations.add_argument("--set", dest="overrides", action="append", default=[], metavar="a.b=c", help="in all rows")
+    ablations.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these of configs/ablations/")
+    ablations.set_defaults(command=lambda o: _ablate(o.capture, o.preset, o.store, o.overrides, o.only))
+
+    _add_render(commands.add_parser("render", help="pictures and video of a trained person"))
+
     synth = commands.add_parser("synth", help="write a synthetic capture with ground truth")
     synth.add_argument("out", type=Path, help="the folder to write")
     synth.set_defaults(command=lambda o: _synth(o.out))
@@ -94,10 +106,60 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_render(render: argparse.ArgumentParser) -> None:
+    render.add_argument("subject", type=Path, help="<store>/subjects/<name>, as `run` left it")
+    render.add_argument("--out", type=Path, default=Path("pictures"), help="the folder to write (default: pictures)")
+    render.add_argument("--what", default="colour", metavar="LIST", help=f"of {','.join(KINDS)} (default: colour)")
+    view = render.add_mutually_exclusive_group()
+    view.add_argument("--camera", help="a recorded camera's name (default: an orbit)")
+    view.add_argument("--path", type=Path, help="a JSON list of cameras, or a folder of them, to fly along")
+    render.add_argument("--radius", type=float, metavar="M", help="of the orbit (default: the recorded cameras')")
+    render.add_argument("--height", type=float, metavar="M", help="of the orbit over the person's middle")
+    render.add_argument("--motion", type=Path, help="another subject's folder, or an AMASS .npz (default: its own)")
+    render.add_argument("--frames", default=":", metavar="A:B:STEP", help="poses to show, or one number (default: all)")
+    render.add_argument("--between", type=int, nargs=2, metavar="FRAME", help="interpolate between two frames' poses")
+    render.add_argument("--shape", action="append", default=[], metavar="NAME=+X", help="add to a shape value")
+    render.add_argument("--volume", type=float, metavar="PERCENT", help="change of the body's volume, like -40 or 80")
+    render.add_argument("--size", type=int, metavar="PX", help="longest side of a picture (default: as recorded)")
+    render.add_argument("--pictures", type=int, metavar="N", help="how many (default: one a pose)")
+    render.set_defaults(command=_render)
+
+
+def _render(options: argparse.Namespace) -> None:
+    wish = Wish(
+        camera=options.camera,
+        path=options.path,
+        radius_m=options.radius,
+        height_m=options.height,
+        motion=options.motion,
+        frames=options.frames,
+        between=options.between and tuple(options.between),
+        shape=dict(map(_shape_change, options.shape)),
+        volume=None if options.volume is None else options.volume / 100,
+        what=tuple(dict.fromkeys(options.what.split(","))),
+        size_px=options.size,
+        pictures=options.pictures,
+    )
+    print(f"{render_subject(options.subject, wish, options.out)} pictures: {options.out}")
+
+
+def _shape_change(text: str) -> tuple[str, float]:
+    name, _, amount = text.partition("=")
+    try:
+        return name, float(amount)
+    except ValueError:
+        raise CaptureError(f"shape {text}: give a name and what to add, like weight=+0.4") from None
+
+
 def _run(capture: Path, preset: str, store: Path, overrides: list[str]) -> None:
     folder = train_subject.fn(capture, preset, store, overrides)
     print(f"report: {folder / 'evaluation' / 'report.html'}")
     print(f"asset:  {folder / 'asset' / 'avatar.usdz'}")
+
+
+def _ablate(capture: Path, preset: str, store: Path, overrides: list[str], only: list[str]) -> None:
+    table = ablate(capture, preset, store, overrides, only)
+    print(f"{table.read_text()}\ntable: {table}")
 
 
 def _check(capture: Path, preset: str, store: Path) -> None:

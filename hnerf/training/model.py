@@ -15,6 +15,7 @@ from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.camera import Camera
 from hnerf.config import TrainingSettings
+from hnerf.errors import CaptureError
 from hnerf.render.avatar import Rendering
 from hnerf.render.compositing import composite, weights_from_alpha
 from hnerf.training.conditions import Conditions, Draws
@@ -85,7 +86,7 @@ class TrainedAvatar:
 
 
 def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvatar:
-    """The subject that training left in `folder`."""
+    """The subject that training left in `folder`; CaptureError if another version of the field left it."""
     stored = json.loads((folder / "settings.json").read_text())
     settings = TrainingSettings.model_validate(stored["training"])
     body = BodyFit.load(folder)
@@ -93,5 +94,8 @@ def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvat
     tensors = load_file(folder / "model.safetensors", device=str(device))
     before_tuning = dataclasses.replace(body, rig=dataclasses.replace(body.rig, vertices_m=tensors["canonical_m"]))
     field = build_field(settings, before_tuning, stored["static"]).to(device)
-    field.load_state_dict(tensors)
+    try:
+        field.load_state_dict(tensors)
+    except RuntimeError:
+        raise CaptureError(f"{folder / 'model.safetensors'}: of another version; train the subject again") from None
     return TrainedAvatar(field.eval(), body, settings.paper.scene_m)

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
 from hnerf.config import TrainingSettings
+from hnerf.errors import CaptureError
 from hnerf.training import trainer as trainer_module
 from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
 from hnerf.training.model import load_avatar
@@ -91,6 +92,15 @@ def test_loads_after_the_shape_has_changed(tmp_path: Path):
     avatar = load_avatar(tmp_path)
     assert avatar.body.rig.vertices_m[:, 2].max().item() == pytest.approx(2.5, abs=0.02)
     assert all(torch.equal(p, q) for p, q in zip(avatar.field.parameters(), trainer.field.parameters(), strict=True))
+
+
+def test_a_model_of_another_version_is_refused(tmp_path: Path):
+    capture, masks, body = record(tmp_path / "capture")
+    Trainer(capture, masks, body, with_changes(steps=1, novel_pose_steps=0), tmp_path, ALONE).run()
+    tensors = load_file(tmp_path / "model.safetensors")
+    save_file({name: t for name, t in tensors.items() if name != "outer_m"}, tmp_path / "model.safetensors")
+    with pytest.raises(CaptureError, match=r"model.safetensors: of another version; train the subject again"):
+        load_avatar(tmp_path)
 
 
 def test_novel_pixels_never_reach_the_field(tmp_path: Path):

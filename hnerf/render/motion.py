@@ -1,0 +1,171 @@
+"""Poses to show an avatar in: another motion on this body, and what lies between two poses. A motion is a BodyFit."""
+
+import dataclasses
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from hnerf.body.body_model import body_model
+from hnerf.body.fit_result import BodyFit
+from hnerf.body.given_start import given_start
+from hnerf.body.rig import joint_transforms, pose_vertices
+from hnerf.capture.capture import Capture
+from hnerf.capture.given_poses import JOINTS, GivenPoses
+from hnerf.config import FitSettings
+from hnerf.errors import CaptureError
+
+AMASS_WIDTHS = (72, 156, 165)  # numbers a pose of SMPL, SMPL-H and SMPL-X; the first 22 joints are the same
+AMASS_RATES = ("mocap_framerate", "mocap_frame_rate")
+BODY_JOINTS = 22
+DEFAULT_FPS = 30.0
+
+
+@dataclass(frozen=True)
+class Motion:
+    """body: poses on the rig that they were made for; fps: of its frames; up: "y" or "z", its world's vertical axis."""
+
+    body: BodyFit
+    fps: float
+    up: str
+
+
+def read_motion(path: Path, frames: str = ":") -> Motion:
+    """Frames (see `select`) of another subject, by its folder with capture and training or fit, or of an AMASS .npz.
+
+    AMASS poses are SMPL's, told to the joints of anny's average body; fingers and toes stay at rest.
+    Raises CaptureError where there is no motion, or not these frames.
+    """
+    if path.is_dir():
+        return _subject_motion(path, frames)
+    given, fps = _read_amass(path)
+    chosen = list(select(tuple(range(len(given.theta))), frames, path))
+    given = dataclasses.replace(given, theta=given.theta[chosen], root=given.root[chosen])
+    pose = given_start(given, body_model(FitSettings()))
+    rig = pose.rig.to(dtype=torch.float32)
+    return Motion(BodyFit(rig, tuple(chosen), pose.theta.float(), pose.root.float()), fps, "z")
+
+
+def select(frames: tuple[int, ...], wanted: str, source: Path) -> tuple[int, ...]:
+    """Those of some frame numbers that `wanted` names: "12", or "FIRST:END:STEP" with END left out, like a slice.
+
+    Raises CaptureError, naming the source, where there is none.
+    """
+    if not re.fullmatch(r"\d+|\d*:\d*(:[1-9]\d*)?", wanted):
+        raise CaptureError(f"frames {wanted}: give a number like 12, or FIRST:END:STEP like 0:24:2")
+    parts = [int(part) if part else None for part in wanted.split(":")]
+    numbers = range(*slice(*parts).indices(max(frames) + 1)) if ":" in wanted else range(int(wanted), int(wanted) + 1)
+    chosen = tuple(frame for frame in frames if frame in numbers)
+    if not chosen:
+        raise CaptureError(f"{source}: no frames {wanted}; it has {min(frames)} to {max(frames)}")
+    return chosen
+
+
+def rows(body: BodyFit, frames: tuple[int, ...]) -> BodyFit:
+    """The poses of some frames alone."""
+    index = [body.index(frame) for frame in frames]
+    return dataclasses.replace(body, frames=frames, theta=body.theta[index], root=body.root[index])
+
+
+def adopted(own: BodyFit, motion: Motion, up: str) -> BodyFit:
+    """The motion on the body of `own`: joints of the same names turn alike.
+
+    The motion's middle comes where that of `own` is, and its floor, the lowest point of all its frames, onto the
+    lowest point of `own`; in each frame the lowest point of this body is as high above the floor as that of the body
+    that the motion came with. `up`: the vertical axis of the world of `own`. Raises CaptureError where a joint is
+    missing.
+    """
+    other, names = motion.body, motion.body.rig.joint_names
+    theta = torch.zeros(len(other.frames), len(own.rig.joint_names), 3)
+    for j in own.rig.free.nonzero()[:, 0].tolist():
+        if own.rig.joint_names[j] not in names:
+            raise CaptureError(f"motion: has no joint {own.rig.joint_names[j]}; take one fitted with this body model")
+        theta[:, j] = other.theta[:, names.index(own.rig.joint_names[j])]
+    turn = torch.eye(4)
+    turn[:3, :3] = _upright(motion.up, up)
+    placed = BodyFit(own.rig, other.frames, theta, turn @ other.root)
+    apart_m = _pelvis_m(own).mean(0) - _pelvis_m(placed).mean(0)
+    lowest_m = lowest_points_m(other, motion.up)
+    return lifted(_moved(placed, apart_m), lowest_m - lowest_m.min() + lowest_points_m(own, up).min(), up)
+
+
+def between(body: BodyFit, first: int, last: int, count: int) -> BodyFit:
+    """`count` poses from frame `first` to frame `last`, both among them; numbered from 0.
+
+    Every joint and the root turn evenly about one axis (Shoemake 1985), the root moves on a straight line.
+    """
+    a, b = body.index(first), body.index(last)
+    share = np.linspace(0, 1, count)
+    start, end = (Rotation.from_rotvec(body.theta[k].numpy()) for k in (a, b))
+    theta = np.stack([_part_way(start, end, t).as_rotvec() for t in share])
+    root = torch.lerp(body.root[a], body.root[b], torch.from_numpy(share).to(body.root)[:, None, None])
+    start, end = (Rotation.from_matrix(body.root[k, :3, :3].numpy()) for k in (a, b))
+    turns = np.stack([_part_way(start, end, t).as_matrix() for t in share])
+    root[:, :3, :3] = torch.from_numpy(turns)
+    return BodyFit(body.rig, tuple(range(count)), torch.from_numpy(theta).to(body.theta), root)
+
+
+def lowest_points_m(body: BodyFit, up: str) -> Tensor:
+    """Height (n,) of each pose's lowest vertex, along the world's axis `up`."""
+    poses = zip(body.theta, body.root, strict=True)  # one at a time: all at once fill the memory
+    return torch.stack([pose_vertices(body.rig, *pose)[:, "xyz".index(up)].min() for pose in poses])
+
+
+def lifted(body: BodyFit, heights_m: Tensor, up: str) -> BodyFit:
+    """The same poses, moved along the axis `up` until their lowest vertices are at `heights_m` (n,)."""
+    move_m = (heights_m - lowest_points_m(body, up))[:, None] * torch.eye(3)["xyz".index(up)]
+    return _moved(body, move_m)
+
+
+def _moved(body: BodyFit, move_m: Tensor) -> BodyFit:
+    root = body.root.clone()
+    root[:, :3, 3] += move_m
+    return dataclasses.replace(body, root=root)
+
+
+def _pelvis_m(body: BodyFit) -> Tensor:
+    return joint_transforms(body.rig, body.rig.joints_m, body.theta, body.root)[:, 0, :3, 3]
+
+
+def _part_way(start: Rotation, end: Rotation, share: float) -> Rotation:
+    return start * Rotation.from_rotvec(share * (start.inv() * end).as_rotvec())
+
+
+def _upright(from_up: str, to_up: str) -> Tensor:
+    """Rotation (3, 3) of one world's vertical axis into the other's, about x."""
+    quarter = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # y to z
+    if from_up == to_up:
+        return torch.eye(3)
+    return quarter if from_up == "y" else quarter.T
+
+
+def _subject_motion(folder: Path, frames: str) -> Motion:
+    found = [folder / stage for stage in ("training", "fit") if (folder / stage / "body.npz").is_file()]
+    if not found or not (folder / "capture" / "capture.json").is_file():
+        raise CaptureError(f"{folder}: holds no fitted body; give <store>/subjects/<name> or an AMASS .npz")
+    body, capture = BodyFit.load(found[0]), Capture.load(folder / "capture")
+    return Motion(rows(body, select(body.frames, frames, folder)), capture.fps, capture.up)
+
+
+def _read_amass(path: Path) -> tuple[GivenPoses, float]:
+    """SMPL's parameters of an AMASS file (Mahmood et al. 2019), with its frames per second; Z is up."""
+    keys = ("poses", "trans", *AMASS_RATES)
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            found = {key: np.asarray(stored[key], np.float64) for key in keys if key in stored}
+    except (AttributeError, OSError, TypeError, ValueError):
+        raise CaptureError(f"{path}: is no .npz of plain arrays; give an AMASS file or a subject's folder") from None
+    poses, trans = found.get("poses", np.zeros(0)), found.get("trans", np.zeros(0))
+    known = poses.ndim == 2 and poses.shape[1] in AMASS_WIDTHS and trans.shape == (len(poses), 3) and len(poses) > 0
+    if not known or not (np.isfinite(poses).all() and np.isfinite(trans).all()):
+        raise CaptureError(f"{path}: poses {poses.shape}, trans {trans.shape} are not AMASS's (n, 156) and (n, 3)")
+    given = dataclasses.replace(GivenPoses.unknown(len(poses)), theta=np.zeros((len(poses), JOINTS, 3)))
+    given.theta[:, :BODY_JOINTS] = poses[:, : 3 * BODY_JOINTS].reshape(-1, BODY_JOINTS, 3)
+    given.root[:] = np.eye(4)
+    given.root[:, :3, 3] = trans
+    rates = [float(found[key]) for key in AMASS_RATES if key in found]
+    return given, rates[0] if rates else DEFAULT_FPS

@@ -1,0 +1,107 @@
+"""What an avatar looks like, written as files: colour, depth, normals, mask and mesh of every shot."""
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import read_rgb
+from hnerf.capture.footage import Video
+from hnerf.evaluation.evaluate import posed_surface
+from hnerf.render.avatar import Avatar, Rendering
+
+log = logging.getLogger("hnerf.render")
+
+LOG_EVERY_S = 10.0
+COVERED = 0.5  # alpha from which a pixel has a depth and a normal
+NORMAL_STEP_M = 0.003
+TETRAHEDRON = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
+Shot = tuple[Camera, int]  # and the frame of avatar.body whose pose is shown
+
+
+def write_pictures(avatar: Avatar, shots: Sequence[Shot], what: Sequence[str], fps: float, out: Path) -> None:
+    """`<kind>/<number>.png` (`.ply` for mesh) of every shot, for each kind in `what`; and `colour.mp4`.
+
+    colour: 8-bit over black. mask: coverage, 0 to 255. depth: 16-bit, millimetres along the viewing axis, 0 where
+    there is nobody. normals: 8-bit, (n + 1) / 2 with x right, y up, z towards the camera, black where there is nobody.
+    mesh: the surface in world metres.
+    """
+    for kind in what:
+        (out / kind).mkdir(parents=True)
+    next_log = time.perf_counter() + LOG_EVERY_S
+    for number, shot in enumerate(shots):
+        images = _images(avatar, shot, what)
+        for kind, image in images.items():
+            if not cv2.imwrite(str(out / kind / f"{number:06d}.png"), image):
+                raise OSError(f"{out / kind}: cannot write image {number}")
+        if "mesh" in what:
+            posed_surface(avatar, shot[1]).export(out / "mesh" / f"{number:06d}.ply")
+        if time.perf_counter() > next_log:
+            log.info("rendered %d of %d", number + 1, len(shots))
+            next_log = time.perf_counter() + LOG_EVERY_S
+    if "colour" in what:
+        write_video(out / "colour", fps, out / "colour.mp4")
+
+
+def write_video(folder: Path, fps: float, path: Path) -> None:
+    """The PNG files of a folder, in order, as an MPEG-4 video. Raises OSError unless all can be read back."""
+    files = sorted(folder.glob("*.png"))
+    height_px, width_px = read_rgb(files[0]).shape[:2]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width_px, height_px))
+    for file in files:
+        writer.write(cv2.cvtColor(read_rgb(file), cv2.COLOR_RGB2BGR))
+    writer.release()
+    count = len(Video.open(path).frames)
+    if count != len(files):
+        raise OSError(f"{path}: {count} of {len(files)} frames were written")
+
+
+def depth_image(rendering: Rendering, camera: Camera) -> Tensor:
+    """(H, W) uint16 millimetres along the viewing axis, from a rendering's depths along its rays."""
+    _, directions = camera.rays(_pixels(camera))
+    ahead = torch.from_numpy(directions @ camera.forward).to(rendering.depth_m)
+    return (1000 * rendering.depth_m * ahead * (rendering.alpha > COVERED)).round().clamp(0, 65535).to(torch.uint16)
+
+
+@torch.no_grad()
+def normal_image(avatar: Avatar, rendering: Rendering, camera: Camera, theta: Tensor, root: Tensor) -> Tensor:
+    """(H, W, 3) uint8 normals as `write_pictures` tells: the gradient of the signed distance where rays end, by
+    differences at the corners of a tetrahedron."""
+    covered = rendering.alpha > COVERED
+    origins, directions = (torch.from_numpy(a.copy()).to(rendering.depth_m) for a in camera.rays(_pixels(camera)))
+    points_m = origins[covered] + rendering.depth_m[covered][:, None] * directions[covered]
+    corners = torch.tensor(TETRAHEDRON).to(points_m)
+    around_m = (points_m + NORMAL_STEP_M * corners[:, None]).flatten(0, 1)  # (4 N, 3)
+    distances_m = avatar.signed_distance(around_m, theta, root).view(len(corners), -1)
+    seen = torch.nn.functional.normalize(distances_m.T @ corners, dim=-1) @ torch.from_numpy(camera.R.T).to(points_m)
+    image = torch.zeros(*covered.shape, 3, dtype=torch.uint8, device=covered.device)
+    image[covered] = (127.5 * (seen * seen.new_tensor([1, -1, -1]) + 1)).round().to(torch.uint8)
+    return image
+
+
+def _images(avatar: Avatar, shot: Shot, what: Sequence[str]) -> dict[str, np.ndarray]:
+    """The asked kinds that are images, as cv2 writes them."""
+    camera, frame = shot
+    row = avatar.body.index(frame)
+    theta, root = avatar.body.theta[row], avatar.body.root[row]
+    if set(what) <= {"mesh"}:
+        return {}
+    seen = avatar.render(camera, theta, root)
+    kinds: dict[str, Callable[[], Tensor]] = {
+        "colour": lambda: (255 * seen.rgb).round().to(torch.uint8).flip(-1),
+        "mask": lambda: (255 * seen.alpha).round().clamp(0, 255).to(torch.uint8),
+        "depth": lambda: depth_image(seen, camera),
+        "normals": lambda: normal_image(avatar, seen, camera, theta, root).flip(-1),
+    }
+    return {kind: make().cpu().numpy() for kind, make in kinds.items() if kind in what}
+
+
+def _pixels(camera: Camera) -> np.ndarray:
+    """(H, W, 2) x and y of every pixel."""
+    return np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), -1).astype(np.float64)

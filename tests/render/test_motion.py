@@ -1,0 +1,151 @@
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.body.rig import joint_transforms
+from hnerf.errors import CaptureError
+from hnerf.render.motion import Motion, adopted, between, lowest_points_m, read_motion, rows, select
+from tests.asset.figure import bending_body, capture, column_rig
+
+
+def giant() -> BodyFit:
+    """A body twice as large, its joints in another order, that stands bent at x = 10 and then jumps 30 cm at x = 11."""
+    rig = column_rig()
+    rig = dataclasses.replace(rig, vertices_m=2 * rig.vertices_m, joints_m=2 * rig.joints_m)
+    extra = torch.tensor([[0.0, 0, 3]])
+    names, parents = ("root", "hat", "upper.L"), torch.tensor([-1, 0, 0])
+    joints_m = torch.cat([rig.joints_m[:1], extra, rig.joints_m[1:]])
+    skin_joints = torch.where(rig.skin_joints == 1, 2, rig.skin_joints)
+    free = torch.tensor([False, True, True])
+    rig = dataclasses.replace(
+        rig, joint_names=names, parents=parents, joints_m=joints_m, skin_joints=skin_joints, free=free
+    )
+    theta = torch.zeros(2, 3, 3)
+    theta[:, 1, 2], theta[:, 2, 0] = 9.0, torch.tensor([0.1, 0.2])
+    root = torch.eye(4).repeat(2, 1, 1)
+    root[:, :3, 3] = torch.tensor([[10.0, 0, 5], [11, 0, 5.3]])
+    return BodyFit(rig, (4, 5), theta, root)
+
+
+def in_y_up(body: BodyFit) -> BodyFit:
+    turn = torch.eye(4)
+    turn[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # z to y
+    return dataclasses.replace(body, root=turn @ body.root)
+
+
+@pytest.mark.parametrize("up", ["z", "y"])
+def test_another_motion_stands_where_this_body_stood(up: str) -> None:
+    own = bending_body()  # its lowest point is at 0.5 m, its root joint at x = 0.5 in the mean, and y = 2
+    motion = Motion(giant() if up == "z" else in_y_up(giant()), 10.0, up)
+    found = adopted(own, motion, "z")
+    torch.testing.assert_close(found.theta[:, 1], torch.tensor([[0.1, 0, 0], [0.2, 0, 0]]))
+    assert found.theta[:, 0].count_nonzero() == 0
+    torch.testing.assert_close(lowest_points_m(found, "z"), torch.tensor([0.5, 0.8]))
+    torch.testing.assert_close(found.root[:, :2, 3], torch.tensor([[0.0, 2], [1, 2]]))
+    torch.testing.assert_close(found.root[:, :3, :3], torch.eye(3).repeat(2, 1, 1))
+    assert found.rig is own.rig
+
+
+def test_a_motion_without_a_joint_that_turns_is_refused() -> None:
+    other = bending_body()
+    other = dataclasses.replace(other, rig=dataclasses.replace(other.rig, joint_names=("root", "tail")))
+    with pytest.raises(CaptureError, match=r"no joint upper\.L"):
+        adopted(bending_body(), Motion(other, 10.0, "z"), "z")
+
+
+def test_half_way_between_two_poses_is_half_the_turn() -> None:
+    body = bending_body()
+    body.theta[0, 1], body.theta[1, 1] = torch.tensor([0.0, 0, 0]), torch.tensor([math.pi / 2, 0, 0])
+    body.root[:2, :3, 3] = torch.tensor([[0.0, 0, 0], [2, 4, 6]])
+    body.root[0, :3, :3] = torch.eye(3)
+    body.root[1, :3, :3] = torch.from_numpy(Rotation.from_euler("z", 90, degrees=True).as_matrix())
+    found = between(body, 3, 4, 3)
+    assert found.frames == (0, 1, 2)
+    expected = torch.tensor([[0.0, 0, 0], [math.pi / 4, 0, 0], [math.pi / 2, 0, 0]])
+    torch.testing.assert_close(found.theta[:, 1], expected)
+    torch.testing.assert_close(found.root[1, :3, 3], torch.tensor([1.0, 2, 3]))
+    half = math.sqrt(0.5)
+    torch.testing.assert_close(found.root[1, :3, :3], torch.tensor([[half, -half, 0], [half, half, 0], [0, 0, 1]]))
+    torch.testing.assert_close(found.root[[0, 2]], body.root[:2])
+
+
+def test_the_turn_between_two_poses_goes_the_short_way() -> None:
+    body = bending_body()
+    body.theta[0, 1], body.theta[1, 1] = torch.tensor([0.0, 0, 3.0]), torch.tensor([0.0, 0, -3.0])
+    middle = between(body, 3, 4, 3).theta[1, 1]
+    assert middle.norm() == pytest.approx(math.pi, abs=1e-5)  # over half a turn, not back through zero
+
+
+@pytest.mark.parametrize(
+    ("wanted", "chosen"),
+    [(":", (3, 4, 5, 8)), ("4", (4,)), ("4:8", (4, 5)), ("::2", (4, 8)), ("3:9:5", (3, 8)), ("5:", (5, 8))],
+)
+def test_frames_are_chosen_by_number(wanted: str, chosen: tuple[int, ...]) -> None:
+    assert select((3, 4, 5, 8), wanted, Path("ada")) == chosen
+
+
+@pytest.mark.parametrize(("wanted", "message"), [("6", "ada: no frames 6; it has 3 to 8"), ("a:b", "FIRST:END:STEP")])
+def test_frames_that_are_not_there_are_refused(wanted: str, message: str) -> None:
+    with pytest.raises(CaptureError, match=message):
+        select((3, 4, 5, 8), wanted, Path("ada"))
+
+
+def test_rows_are_found_by_frame() -> None:
+    body = bending_body()
+    torch.testing.assert_close(rows(body, (5, 8)).theta, body.theta[2:])
+
+
+def test_the_fit_of_another_subject_is_read_with_its_rate(tmp_path: Path) -> None:
+    for name in ("capture", "fit"):
+        (tmp_path / name).mkdir()
+    dataclasses.replace(capture(), root=tmp_path / "capture").save()
+    bending_body().save(tmp_path / "fit")
+    motion = read_motion(tmp_path, "4:6")
+    assert (motion.fps, motion.up, motion.body.frames) == (10.0, "z", (4, 5))
+    torch.testing.assert_close(motion.body.root, bending_body().root[1:3])
+
+
+def test_amass_poses_turn_the_likes_of_smpls_joints(tmp_path: Path) -> None:
+    poses, trans = np.zeros((3, 156)), np.array([[0, 0, 9.0], [0.5, 1, 1.2], [0.5, 1, 1.2]])
+    poses[:, 0] = np.pi / 2  # SMPL's Y up to AMASS's Z up
+    poses[2, 3 * 16 + 2] = -np.pi / 2  # the left arm from level to straight down
+    np.savez(tmp_path / "walk.npz", poses=poses, trans=trans, mocap_framerate=120.0, gender="neutral")
+    motion = read_motion(tmp_path / "walk.npz", "1:")
+    assert (motion.fps, motion.up, motion.body.frames) == (120.0, "z", (1, 2))
+    rig = motion.body.rig
+    joints_m = joint_transforms(rig, rig.joints_m, motion.body.theta, motion.body.root)[..., :3, 3]
+    at = {
+        name: joints_m[:, rig.joint_names.index(name)] for name in ("upperarm01.L", "wrist.L", "head", "upperleg01.L")
+    }
+    arm = torch.nn.functional.normalize(at["wrist.L"] - at["upperarm01.L"], dim=-1)
+    torch.testing.assert_close(arm, torch.tensor([[1.0, 0, 0], [0, 0, -1]]), atol=0.15, rtol=0)  # 9 degrees
+    assert (at["head"][:, 2] > at["upperleg01.L"][:, 2] + 0.5).all()
+    # The mean SMPL body turns about its pelvis at (0, -0.23, 0.03), and is then moved; its hips are 9 cm below.
+    hip = torch.tensor([1 - 0.23, 1.2 + 0.03 - 0.09])
+    torch.testing.assert_close(at["upperleg01.L"][0, 1:], hip, atol=0.03, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"poses": np.zeros((2, 100)), "trans": np.zeros((2, 3))}, "not AMASS's"),
+        ({"poses": np.zeros((2, 156)), "trans": np.zeros((3, 3))}, "not AMASS's"),
+        ({"poses": np.full((2, 156), np.nan), "trans": np.zeros((2, 3))}, "not AMASS's"),
+        ({"poses": np.array([None]), "trans": np.zeros((2, 3))}, "plain arrays"),
+    ],
+)
+def test_what_is_no_motion_is_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
+    np.savez(tmp_path / "walk.npz", **arrays)  # type: ignore[arg-type]
+    with pytest.raises(CaptureError, match=f"walk.npz: .*{message}"):
+        read_motion(tmp_path / "walk.npz")
+
+
+def test_a_folder_without_a_fit_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="holds no fitted body"):
+        read_motion(tmp_path)

@@ -1,0 +1,95 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from hnerf.capture.camera import Camera
+from hnerf.capture.footage import Video
+from hnerf.render import pictures
+from hnerf.render.avatar import Rendering
+from hnerf.render.pictures import depth_image, normal_image, write_pictures, write_video
+from tests.evaluation.ball import RADIUS_M, RENDERED, SIZE_PX, BallAvatar, ball_camera, ball_fit, centre_m, seen
+
+CAMERA = ball_camera("a", 0.0)  # 0.75 m from the ball, on the x axis
+
+
+class SolidBall(BallAvatar):
+    """The ball with its depths: the ball of frame 0 is 0.65 m from the camera."""
+
+    def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
+        pixels = np.stack(np.meshgrid(np.arange(SIZE_PX), np.arange(SIZE_PX)), -1).astype(np.float64)
+        origins, directions = camera.rays(pixels)
+        towards = root[:3, 3].numpy() - origins
+        middle = (towards * directions).sum(-1)
+        inside = RADIUS_M**2 - (towards**2).sum(-1) + middle**2
+        depth = np.where(inside > 0, middle - np.sqrt(inside.clip(0)), 0)
+        alpha = torch.from_numpy(inside > 0).float()
+        return Rendering(alpha[..., None].expand(-1, -1, 3) * RENDERED / 255, alpha, torch.from_numpy(depth).float())
+
+
+def test_depth_is_measured_along_the_viewing_axis() -> None:
+    pixels = np.stack(np.meshgrid(np.arange(SIZE_PX), np.arange(SIZE_PX)), -1).astype(np.float64)
+    oblique = 1 / (CAMERA.rays(pixels)[1] @ CAMERA.forward)  # a wall 2 m ahead is further along slanting rays
+    alpha = torch.ones(SIZE_PX, SIZE_PX)
+    alpha[0, 0] = 0.4
+    depth = depth_image(Rendering(torch.zeros(SIZE_PX, SIZE_PX, 3), alpha, torch.from_numpy(2 * oblique)), CAMERA)
+    assert depth.dtype == torch.uint16
+    assert depth[0, 0] == 0
+    assert set(depth.flatten()[1:].tolist()) == {2000}
+
+
+def test_normals_of_a_ball_point_away_from_its_middle() -> None:
+    ball = SolidBall(ball_fit())
+    theta, root = ball.body.theta[0], ball.body.root[0]
+    rendering = ball.render(CAMERA, theta, root)
+    image = normal_image(ball, rendering, CAMERA, theta, root).numpy()
+    rays = CAMERA.rays(np.array([[40.0, 28]]))  # right of the middle, and above it
+    point_m = rays[0] + rays[1] * rendering.depth_m[28, 40].item()
+    x, y, z = CAMERA.R @ ((point_m[0] - centre_m(0)) / RADIUS_M)
+    np.testing.assert_allclose(image[28, 40], 127.5 * (np.array([x, -y, -z]) + 1), atol=2)
+    assert (image[28, 40] > 127).all()
+    assert (image[~seen(CAMERA, centre_m(0))] == 0).all()
+
+
+def test_every_kind_is_written_for_every_shot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hnerf.evaluation.evaluate.MESH_CELLS", 48)
+    ball = SolidBall(ball_fit())
+    shots = [(CAMERA, 0), (ball_camera("b", 90.0), 3)]
+    write_pictures(ball, shots, ("colour", "depth", "normals", "mask", "mesh"), 5.0, tmp_path)
+    for number, (camera, frame) in enumerate(shots):
+        images = {
+            kind: cv2.imread(str(tmp_path / kind / f"{number:06d}.png"), cv2.IMREAD_UNCHANGED)
+            for kind in ("colour", "depth", "normals", "mask")
+        }
+        mask = seen(camera, centre_m(frame))
+        np.testing.assert_array_equal(images["colour"], np.where(mask, RENDERED, 0)[..., None].repeat(3, -1))
+        np.testing.assert_array_equal(images["mask"], np.where(mask, 255, 0))
+        assert images["depth"].dtype == np.uint16
+        np.testing.assert_array_equal(images["depth"] > 0, mask)
+        assert images["normals"][mask][:, 0].min() > 127  # blue, which cv2 reads first: towards the camera
+        mesh = trimesh.load_mesh(tmp_path / "mesh" / f"{number:06d}.ply")
+        np.testing.assert_allclose(mesh.bounds.mean(0), centre_m(frame), atol=1e-3)
+        np.testing.assert_allclose(mesh.extents, 2 * RADIUS_M, atol=2e-3)
+    depth = cv2.imread(str(tmp_path / "depth" / "000000.png"), cv2.IMREAD_UNCHANGED)
+    assert depth[31, 31] == pytest.approx(650, abs=1)
+    video = Video.open(tmp_path / "colour.mp4")
+    assert (len(video.frames), video.fps) == (2, 5.0)
+    middle = next(iter(video.read([0]))).rgb[32, 32]
+    np.testing.assert_allclose(middle, RENDERED, atol=6)
+
+
+def test_only_what_was_asked_for_is_written(tmp_path: Path) -> None:
+    write_pictures(SolidBall(ball_fit()), [(CAMERA, 0)], ("mask",), 5.0, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mask"]
+
+
+def test_a_video_that_lost_frames_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.zeros((16, 16, 3), np.uint8))
+    monkeypatch.setattr(pictures.Video, "open", lambda path: Video(path, (0, 1), 5.0))
+    with pytest.raises(OSError, match="2 of 3 frames"):
+        write_video(tmp_path, 5.0, tmp_path / "colour.mp4")

@@ -1,0 +1,71 @@
+import dataclasses
+import math
+import re
+
+import pytest
+import torch
+
+from hnerf.body.rig import Rig
+from hnerf.errors import CaptureError
+from hnerf.render.motion import lowest_points_m
+from hnerf.render.shape import volume_m3, with_values, with_volume, worn_by
+from tests.asset.figure import bending_body, column_rig
+
+
+def changeable_rig() -> Rig:
+    """The column: "weight" widens it by its radius a unit, so that volume goes with (1 + weight) squared; "length"
+    stretches it away from z = 0.8 by its length a unit."""
+    rig = column_rig()
+    weight = rig.vertices_m * torch.tensor([1.0, 1, 0])
+    length = (rig.vertices_m - torch.tensor([0, 0, 0.8])) * torch.tensor([0.0, 0, 1])
+    return dataclasses.replace(
+        rig,
+        beta=torch.tensor([0.3, 0.6]),
+        beta_names=("weight", "length"),
+        shape_basis=torch.stack([weight, length]),
+        joint_basis=torch.zeros(2, 2, 3),
+    )
+
+
+@pytest.mark.parametrize(("change", "weight"), [(0.44, 0.5), (-0.51, 0.0), (0.0, 0.3)])
+def test_volume_changes_as_asked(change: float, weight: float) -> None:
+    rig = changeable_rig()
+    found = with_volume(rig, change)
+    torch.testing.assert_close(found.beta, torch.tensor([weight, 0.6]), atol=1e-3, rtol=0)
+    assert volume_m3(found) == pytest.approx((1 + change) * volume_m3(rig), rel=1e-3)
+
+
+@pytest.mark.parametrize("change", [20.0, -1.2, math.nan])
+def test_a_volume_out_of_reach_is_refused(change: float) -> None:
+    with pytest.raises(CaptureError, match="out of this body's reach"):
+        with_volume(changeable_rig(), change)
+
+
+def test_a_body_without_weight_has_no_other_volume() -> None:
+    with pytest.raises(CaptureError, match="no shape value weight"):
+        with_volume(column_rig(), 0.4)
+
+
+def test_values_are_added_by_name() -> None:
+    rig = changeable_rig()
+    found = with_values(rig, {"length": 0.5})
+    torch.testing.assert_close(found.beta, torch.tensor([0.3, 1.1]))
+    assert found.vertices_m[:, 2].aminmax() == (pytest.approx(-0.4), pytest.approx(2.0))
+
+
+def test_a_shape_that_turns_its_skin_inside_out_is_refused() -> None:
+    for change in (-2.0, math.nan):
+        with pytest.raises(CaptureError, match=re.escape(f"weight {change:+.2f}: folds ")):
+            with_values(changeable_rig(), {"weight": change})
+
+
+def test_an_unknown_value_is_refused_with_those_that_there_are() -> None:
+    with pytest.raises(CaptureError, match="fat: this body's values are weight, length"):
+        with_values(changeable_rig(), {"fat": 1.0})
+
+
+def test_another_shape_stands_on_the_same_floor() -> None:
+    body = dataclasses.replace(bending_body(), rig=changeable_rig())
+    longer = worn_by(with_values(body.rig, {"length": 0.5}), body, "z")
+    torch.testing.assert_close(lowest_points_m(longer, "z"), torch.full((4,), 0.5))
+    torch.testing.assert_close(longer.root[:, :2], body.root[:, :2])
