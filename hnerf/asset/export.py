@@ -26,6 +26,7 @@ from hnerf.body.rig import Rig
 from hnerf.capture.capture import Capture
 from hnerf.config import AssetSettings
 from hnerf.render.avatar import Avatar
+from hnerf.spread import spread
 
 log = logging.getLogger("hnerf.asset")
 
@@ -43,8 +44,7 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
         layout = unwrap(surface.vertices, surface.faces, settings.texture_px)
         rig = dressed_rig(avatar.body.rig.to("cpu"), surface, layout)
     with _timed("texture", seconds):
-        spread = np.linspace(0, len(capture.train_frames) - 1, min(settings.texture_poses, len(capture.train_frames)))
-        posed = _dressed_body(avatar.body, rig, tuple(capture.train_frames[round(i)] for i in spread))
+        posed = _dressed_body(avatar.body, rig, tuple(spread(capture.train_frames, settings.texture_poses)))
         texture = bake(avatar, posed, layout, settings.texture_px)
     with _timed("files", seconds):
         staged = stage_avatar(_dressed_body(avatar.body, rig, capture.frames), texture, capture.up)

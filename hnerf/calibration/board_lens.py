@@ -7,6 +7,7 @@ import numpy as np
 
 from hnerf.calibration.board_rig import whole_enough
 from hnerf.capture.lens import Lens
+from hnerf.spread import spread
 
 MAX_PICTURES = 40  # evenly chosen
 MIN_PICTURES = 10
@@ -44,16 +45,15 @@ def estimate_lens(name: str, corners_m: np.ndarray, corners_px: np.ndarray, size
 
     The standard deviation is that of the least squares (cv2.calibrateCameraExtended).
     """
-    shown = np.flatnonzero(whole_enough(corners_m, np.isfinite(corners_px[..., 0])))
-    chosen = shown[np.unique(np.linspace(0, len(shown) - 1, min(MAX_PICTURES, len(shown))).round().astype(int))]
+    chosen = spread(np.flatnonzero(whole_enough(corners_m, np.isfinite(corners_px[..., 0]))).tolist(), MAX_PICTURES)
     if len(chosen) < MIN_PICTURES:
         return LensEstimate(len(chosen))
     seen = [np.isfinite(corners_px[f, :, 0]) for f in chosen]
     points_m = [corners_m[s].astype(np.float32) for s in seen]
     points_px = [corners_px[f, s].astype(np.float32) for f, s in zip(chosen, seen, strict=True)]
-    _, K, distortion, turns, _, spread, _, _ = cv2.calibrateCameraExtended(
+    _, K, distortion, turns, _, deviation, _, _ = cv2.calibrateCameraExtended(
         points_m, points_px, size_px, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
     )
     lens = Lens(name, K, distortion.ravel()[:4], np.eye(3), np.zeros(3), size_px)
     tilted = sum(abs(cv2.Rodrigues(turn)[0][2, 2]) < np.cos(np.deg2rad(TILT_DEG)) for turn in turns)
-    return LensEstimate(len(chosen), lens, tilted, float(max(spread[0, 0] / K[0, 0], spread[1, 0] / K[1, 1])))
+    return LensEstimate(len(chosen), lens, tilted, float(max(deviation[0, 0] / K[0, 0], deviation[1, 0] / K[1, 1])))

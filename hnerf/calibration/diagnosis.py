@@ -88,9 +88,15 @@ def trimmed_cost_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> float:
     points_m, _, _ = triangulate(projections, keypoints, inlier_px=np.inf)
     diagonal_px = np.array([[np.hypot(c.width_px, c.height_px)] for c in cameras])
     residuals = np.fmin(reprojection_px(projections, points_m, keypoints), diagonal_px)
-    rows = [np.sort(row[use]) for row, use in zip(residuals, seen & (seen.sum(0) >= 2), strict=True)]
-    costs = [row[: max(1, int(TRIM * len(row)))].mean() for row in rows if len(row)]
+    used = seen & (seen.sum(0) >= 2)
+    costs = [trimmed_mean(row[use], TRIM) for row, use in zip(residuals, used, strict=True) if use.any()]
     return float(np.mean(costs)) if costs else np.inf
+
+
+def trimmed_mean(values: np.ndarray, share: float) -> float:
+    """Mean of the lowest share of the finite values; infinite where there are none."""
+    ordered = np.sort(values[np.isfinite(values)])
+    return float(ordered[: max(1, int(share * len(ordered)))].mean()) if len(ordered) else np.inf
 
 
 def cost_without_each_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> dict[str, float]:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,8 @@ from hnerf.calibration.synchronise import Timing
 from hnerf.calibration.witnesses import Witnesses
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
+from hnerf.capture.formats.easymocap import write_easymocap
+from hnerf.capture.lens import pinhole
 from hnerf.errors import CaptureError
 
 SEVERITY = ("ok", "refined", "suspect", "rejected")
@@ -75,7 +76,7 @@ class CalibrationReport:
         there are witnesses, `witnesses.png`."""
         out.mkdir(parents=True, exist_ok=True)
         rejected = {name for name, v in self.verdicts.items() if v.status == "rejected"}
-        _write_easymocap(out, [camera for name, camera in self.cameras.items() if name not in rejected])
+        write_easymocap(out, [pinhole(camera) for name, camera in self.cameras.items() if name not in rejected])
         (out / "report.json").write_text(json.dumps(self._plain(), indent=1))
         status = {name: self.verdicts[name].status if name in self.verdicts else "unjudged" for name in self.cameras}
         draw_cameras(out / "cameras.png", list(self.cameras.values()), status, self.up, self.before, self.after)
@@ -136,22 +137,3 @@ def load_cameras(out: Path, capture: Capture) -> Capture:
     offsets = {name: found[name]["frame_offset"] for name in train_cameras if found[name]["frame_offset"]}
     used = dataclasses.replace(capture.with_cameras(cameras), train_cameras=train_cameras)
     return used.synchronised(offsets) if offsets else used
-
-
-def _write_easymocap(out: Path, cameras: Sequence[Camera]) -> None:
-    intri, extri = (cv2.FileStorage(str(out / name), cv2.FILE_STORAGE_WRITE) for name in ("intri.yml", "extri.yml"))
-    for storage in (intri, extri):
-        storage.startWriteStruct("names", cv2.FILE_NODE_SEQ)
-        for camera in cameras:
-            storage.write("", camera.name)
-        storage.endWriteStruct()
-    for camera in cameras:
-        intri.write(f"K_{camera.name}", camera.K)
-        intri.write(f"dist_{camera.name}", np.zeros((1, 5)))
-        intri.write(f"W_{camera.name}", camera.width_px)
-        intri.write(f"H_{camera.name}", camera.height_px)
-        extri.write(f"R_{camera.name}", cv2.Rodrigues(camera.R)[0])
-        extri.write(f"Rot_{camera.name}", camera.R)
-        extri.write(f"T_{camera.name}", camera.t_m.reshape(3, 1))
-    intri.release()
-    extri.release()

@@ -13,13 +13,14 @@ import cv2
 import numpy as np
 from skimage.measure import find_contours
 
+from hnerf.calibration.diagnosis import trimmed_mean
 from hnerf.calibration.triangulation import subject_keypoints
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings, SegmentationSettings
-from hnerf.segmentation.cut import cut
-from hnerf.segmentation.difference import difference, masked_median, noise_level
-from hnerf.segmentation.prior import Prior, keypoint_priors, window_around
+from hnerf.segmentation.backends import AgainstBackground
+from hnerf.segmentation.prior import keypoint_priors
+from hnerf.spread import spread
 
 FRAMES = 8  # evenly spread: neighbours say the same again
 PLATE_FRAMES = 24  # from which the background is made where there is no clean plate
@@ -62,7 +63,8 @@ class Outline:
         points = points[((points > 1) & (points < last - 1)).all(1)]
         rows, columns = np.nonzero(whole)
         size_px = float(np.hypot(np.ptp(columns), np.ptp(rows)))
-        return Outline(_spread(points, POINTS), distance_px, np.array([columns.mean(), rows.mean()]), size_px)
+        points = points[spread(range(len(points)), POINTS)]
+        return Outline(points, distance_px, np.array([columns.mean(), rows.mean()]), size_px)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,11 +86,11 @@ class Outlines:
         """
         found = subject_keypoints(capture)
         everyone = np.all([(seen[..., 2] > 0).any(1) for seen in found.values()], axis=0)
-        shown = _spread(np.flatnonzero(everyone), FRAMES)
+        shown = spread(np.flatnonzero(everyone).tolist(), FRAMES)
         log.info("outlines of %d cameras at %d instants", len(found), len(shown))
         by_camera = {name: _outlines(capture, name, found[name], shown) for name in found}
         usable = {name: outlines for name, outlines in by_camera.items() if any(outlines)}
-        return Outlines(usable, tuple(shown.tolist())) if len(usable) > 1 else None
+        return Outlines(usable, tuple(shown)) if len(usable) > 1 else None
 
     def at(self, position: int) -> "Outlines":
         """One instant alone, by its position in `instants`."""
@@ -100,8 +102,7 @@ class Outlines:
         Most rays pass through the middle of the hull and cannot miss it: with exact masks a true rig costs almost
         nothing, and one whose camera is a degree off a few tenths of a pixel.
         """
-        ordered = np.sort(np.concatenate(list(self.residuals_px(cameras).values())))
-        return float(ordered[: max(1, int(TRIM * len(ordered)))].mean()) if len(ordered) else np.inf
+        return trimmed_mean(np.concatenate(list(self.residuals_px(cameras).values())), TRIM)
 
     def residuals_px(self, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
         """Per camera how far the rays of its outline miss the person as the other cameras see it, (n,) pixels >= 0.
@@ -171,7 +172,7 @@ def _outside_px(seen: Sequence[tuple[Camera, Outline]], points_m: np.ndarray) ->
     return worst
 
 
-def _outlines(capture: Capture, name: str, keypoints: np.ndarray, shown: np.ndarray) -> list[Outline | None]:
+def _outlines(capture: Capture, name: str, keypoints: np.ndarray, shown: Sequence[int]) -> list[Outline | None]:
     """One camera's outlines at the frames of these indices; keypoints (frames, 25, 3) of the subject."""
     outlines = []
     for i, mask in zip(shown, _masks(capture, name, shown), strict=True):
@@ -182,41 +183,16 @@ def _outlines(capture: Capture, name: str, keypoints: np.ndarray, shown: np.ndar
     return outlines
 
 
-def _masks(capture: Capture, name: str, shown: np.ndarray) -> list[np.ndarray]:
+def _masks(capture: Capture, name: str, shown: Sequence[int]) -> list[np.ndarray]:
     """The person's masks in one camera at the frames of these indices, (H, W) bool."""
     given = [capture.given_mask(name, capture.frames[i]) for i in shown]
     if all(mask is not None for mask in given):
         return [mask for mask in given if mask is not None]
     settings = SegmentationSettings()
     priors = keypoint_priors(dataclasses.replace(capture, train_cameras=(name,)), settings)[name]
-    plate, known = _plate(capture, name, priors)
-    shadowed = capture.background(name) is None
-    return [_mask(capture.image(name, capture.frames[i]), plate, known, priors[i], settings, shadowed) for i in shown]
-
-
-def _plate(capture: Capture, name: str, priors: Sequence[Prior]) -> tuple[np.ndarray, np.ndarray]:
-    """The background (H, W, 3) as it was recorded, or its median over time, and (H, W) bool where it is known."""
     plate = capture.background(name)
-    if plate is not None:
-        return plate, np.ones(plate.shape[:2], bool)
-    chosen = _spread(np.arange(len(priors)), PLATE_FRAMES)
-    return masked_median([capture.image(name, capture.frames[i]) for i in chosen], [priors[i] for i in chosen])
-
-
-def _mask(
-    image: np.ndarray,
-    plate: np.ndarray,
-    known: np.ndarray,
-    prior: Prior,
-    settings: SegmentationSettings,
-    shadowed: bool,
-) -> np.ndarray:
-    mask, window = np.zeros(image.shape[:2], bool), window_around(prior.reach)
-    found = difference(image[window], plate[window], noise_level(image, plate), settings, shadowed)
-    mask[window] = cut(image[window], found, prior.cropped(window), known[window])
-    return mask
-
-
-def _spread(rows: np.ndarray, count: int) -> np.ndarray:
-    """At most this many of the rows, evenly spread."""
-    return rows[np.unique(np.linspace(0, len(rows) - 1, count).round().astype(int))] if len(rows) else rows
+    if plate is None:
+        backend = AgainstBackground.of_median(capture, name, priors, PLATE_FRAMES, settings)
+    else:
+        backend = AgainstBackground.of_plate(capture, name, plate, settings)
+    return [backend.mask(capture.frames[i], priors[i]) for i in shown]

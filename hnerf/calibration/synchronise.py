@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hnerf.calibration.diagnosis import TRIM, trimmed_cost_px
+from hnerf.calibration.diagnosis import TRIM, trimmed_cost_px, trimmed_mean
 from hnerf.calibration.triangulation import triangulate
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
@@ -269,13 +269,8 @@ def _cost_by_step(view: _View, parts: Sequence[np.ndarray]) -> dict[int, list[fl
         if np.count_nonzero(weights.any(1)) >= enough:
             unexplained = _unexplained(residuals, view.by_pose, _robust(residuals, view.by_pose, weights))
             distances = np.where(weights > 0, np.linalg.norm(unexplained, axis=-1), np.nan)
-            costs[step] = [_trimmed_mean(distances[part]) for part in parts]
+            costs[step] = [trimmed_mean(distances[part], TRIM) for part in parts]
     return costs
-
-
-def _trimmed_mean(distances: np.ndarray) -> float:
-    ordered = np.sort(distances[np.isfinite(distances)])
-    return float(ordered[: max(1, int(TRIM * len(ordered)))].mean()) if len(ordered) else np.inf
 
 
 def _parabola(view: _View, middle: int) -> _Parabola:

@@ -26,6 +26,7 @@ from hnerf.capture.normalise import Normaliser
 from hnerf.capture.notes import Notes, capture_name, chosen_cameras, chosen_frames, read_notes
 from hnerf.config import CaptureSettings
 from hnerf.errors import CaptureError
+from hnerf.spread import spread
 
 DEFAULT_FPS = 30.0
 # Padding and cropping by encoders moves sizes by a few pixels; the calibration stage judges what it did to the cameras.
@@ -160,7 +161,7 @@ def _lens_as_recorded(lens: Lens, footage: Footage, frames: tuple[int, ...]) -> 
     recorded_px = (first.rgb.shape[1], first.rgb.shape[0])
     if lens.size_px in (None, recorded_px):
         return lens, None
-    chosen = {frames[round(i)] for i in np.linspace(0, len(frames) - 1, BAR_FRAMES)}
+    chosen = set(spread(frames, BAR_FRAMES))
     area = picture_area([p.rgb for p in footage.read(chosen) if p.rgb.shape == first.rgb.shape])
     matched = fitted(lens, area, recorded_px)
     if matched:

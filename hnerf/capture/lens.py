@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from hnerf.capture.camera import Camera
 from hnerf.capture.guarded import check_camera_name, check_image_size
 from hnerf.errors import CaptureError
 
@@ -25,6 +26,12 @@ class Lens:
     R: np.ndarray
     t_m: np.ndarray
     size_px: tuple[int, int] | None
+
+
+def pinhole(camera: Camera) -> Lens:
+    """A camera of undistorted images, as a file describes it."""
+    size_px = (camera.width_px, camera.height_px)
+    return Lens(camera.name, camera.K, np.zeros(5), camera.R, camera.t_m, size_px)
 
 
 def checked_lens(

@@ -20,8 +20,9 @@ from hnerf.evaluation import geometry, metrics
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.report import write_report
-from hnerf.evaluation.views import SPLITS, TRAINING_VIEW, View, all_views, some_views, split_frames, spread
+from hnerf.evaluation.views import SPLITS, TRAINING_VIEW, View, all_views, some_views, split_frames
 from hnerf.render.avatar import Avatar
+from hnerf.spread import spread
 
 log = logging.getLogger("hnerf.evaluation")
 

@@ -1,12 +1,10 @@
 """Which images of a capture are rendered, under which split, and where they lie."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from hnerf.capture.capture import Capture
+from hnerf.spread import spread
 
 SPLITS = ("novel_view", "novel_pose")
 TRAINING_VIEW = "training_view"  # shown in the report, never scored
@@ -49,10 +47,3 @@ def some_views(capture: Capture, split: str, count: int) -> list[View]:
         return []
     frames = spread(split_frames(capture, split), count)
     return [View(split, cameras[k % len(cameras)], frame) for k, frame in enumerate(frames)]
-
-
-def spread(frames: Sequence[int], count: int) -> list[int]:
-    """At most `count` of the frames, evenly spread, the first and the last among them."""
-    if len(frames) <= count:
-        return list(frames)
-    return [frames[k] for k in np.linspace(0, len(frames) - 1, count).round().astype(int)]

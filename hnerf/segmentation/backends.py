@@ -1,5 +1,6 @@
 """Four ways to a mask, behind one interface: given, learned, against a clean plate, against a median over time."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -12,6 +13,7 @@ from hnerf.segmentation.cut import components_within, cut
 from hnerf.segmentation.difference import difference, masked_median, noise_level
 from hnerf.segmentation.learned import Network
 from hnerf.segmentation.prior import Prior, window_around
+from hnerf.spread import spread
 
 CLEAN_PLATE, MEDIAN = "clean plate", "median around the fitted body"
 MEDIAN_FRAMES = 60  # evenly chosen, for the background without a plate
@@ -73,6 +75,23 @@ class AgainstBackground:
     settings: SegmentationSettings
     name: str
 
+    @staticmethod
+    def of_plate(
+        capture: Capture, camera: str, plate: np.ndarray, settings: SegmentationSettings
+    ) -> "AgainstBackground":
+        """A clean plate is known everywhere."""
+        return AgainstBackground(capture, camera, plate, np.ones(plate.shape[:2], bool), settings, CLEAN_PLATE)
+
+    @staticmethod
+    def of_median(
+        capture: Capture, camera: str, priors: Sequence[Prior], count: int, settings: SegmentationSettings
+    ) -> "AgainstBackground":
+        """The background from at most `count` frames, where the priors, in the order of the frames, leave it free."""
+        chosen = spread(range(len(priors)), count)
+        images = [capture.image(camera, capture.frames[i]) for i in chosen]
+        plate, known = masked_median(images, [priors[i] for i in chosen])
+        return AgainstBackground(capture, camera, plate, known, settings, MEDIAN)
+
     def mask(self, frame: int, prior: Prior) -> np.ndarray:
         """Cut out of the window within reach."""
         image, window = self.capture.image(self.camera, frame), window_around(prior.reach)
@@ -99,12 +118,9 @@ def choose_backend(
         return Learned(capture, camera, network)
     plate = capture.background(camera)
     if plate is not None:
-        return AgainstBackground(capture, camera, plate, np.ones(plate.shape[:2], bool), settings, CLEAN_PLATE)
+        return AgainstBackground.of_plate(capture, camera, plate, settings)
     if not fitted:
         raise CaptureError(
             f"{capture.name}: camera {camera} has neither masks nor a plate (background/{camera}.jpg); fit a body first"
         )
-    chosen = np.unique(np.linspace(0, len(priors) - 1, MEDIAN_FRAMES).round().astype(int))
-    images = [capture.image(camera, capture.frames[i]) for i in chosen]
-    plate, known = masked_median(images, [priors[i] for i in chosen])
-    return AgainstBackground(capture, camera, plate, known, settings, MEDIAN)
+    return AgainstBackground.of_median(capture, camera, priors, MEDIAN_FRAMES, settings)

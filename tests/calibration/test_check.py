@@ -62,6 +62,17 @@ def test_a_good_calibration_is_left_alone(tmp_path: Path) -> None:
             np.testing.assert_array_equal(getattr(camera, field), getattr(capture.cameras[name], field))
 
 
+def test_cameras_of_any_name_are_read_back(tmp_path: Path) -> None:
+    """Recordings name cameras as they like; OpenCV's own writer refuses brackets and blanks."""
+    cameras = [dataclasses.replace(camera, name=f"Camera ({i})") for i, camera in enumerate(ring(4))]
+    capture = write_capture(tmp_path / "in", cameras, detections(cameras, 2))
+    check_calibration(capture, SETTINGS).save(tmp_path / "out")
+    used = load_cameras(tmp_path / "out", capture).cameras
+    assert list(used) == [camera.name for camera in cameras]
+    for camera in cameras:
+        np.testing.assert_array_equal(used[camera.name].R, camera.R)
+
+
 def test_leave_one_out_names_the_turned_camera() -> None:
     cameras = ring(4)
     keypoints = np.stack([seen.reshape(-1, 3) for seen in detections(cameras, noise_px=2).values()])

@@ -1,6 +1,7 @@
 from pathlib import Path
 
-from hnerf.evaluation.views import TRAINING_VIEW, View, all_views, some_views, spread
+from hnerf.evaluation.views import TRAINING_VIEW, View, all_views, some_views
+from hnerf.spread import spread
 from tests.evaluation.ball import write_ball_capture
 
 

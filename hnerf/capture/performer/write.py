@@ -12,6 +12,8 @@ import numpy as np
 from hnerf.body.anny import anny_rig
 from hnerf.body.rig import Rig, joint_transforms, pose_vertices
 from hnerf.capture.camera import Camera
+from hnerf.capture.formats.easymocap import write_easymocap
+from hnerf.capture.lens import pinhole
 from hnerf.capture.performer.detect import detect
 from hnerf.capture.performer.dressed import Dressed, midpoints, vertex_normals
 from hnerf.capture.performer.look import FACE
@@ -73,7 +75,7 @@ def write_performer(out: Path, settings: PerformerSettings) -> None:
     views = {camera.name: View.of(camera) for camera in ring_of_cameras(settings.size_px)}
     for name, view in views.items():
         _write_jpeg(out / "background" / f"{name}.jpg", view.plate)
-    _write_calibration(out, [view.camera for view in views.values()])
+    write_easymocap(out, [pinhole(view.camera) for view in views.values()])
     _write_toml(out, settings)
 
     instants = []
@@ -152,26 +154,6 @@ def _write_view(out: Path, frame: int, view: View, instant: Instant, rng: np.ran
     path.parent.mkdir(parents=True, exist_ok=True)
     person = {"person_id": [-1], "pose_keypoints_2d": detected.round(3).ravel().tolist()}
     path.write_text(json.dumps({"version": 1.3, "people": [person]}))
-
-
-def _write_calibration(out: Path, cameras: list[Camera]) -> None:
-    for file in ("intri.yml", "extri.yml"):
-        storage = cv2.FileStorage(str(out / file), cv2.FILE_STORAGE_WRITE)
-        storage.startWriteStruct("names", cv2.FILE_NODE_SEQ)
-        for camera in cameras:
-            storage.write("", camera.name)
-        storage.endWriteStruct()
-        for camera in cameras:
-            if file == "intri.yml":
-                storage.write(f"K_{camera.name}", camera.K)
-                storage.write(f"dist_{camera.name}", np.zeros((1, 5)))
-                storage.write(f"H_{camera.name}", camera.height_px)
-                storage.write(f"W_{camera.name}", camera.width_px)
-            else:
-                storage.write(f"R_{camera.name}", cv2.Rodrigues(camera.R)[0])
-                storage.write(f"Rot_{camera.name}", camera.R)
-                storage.write(f"T_{camera.name}", camera.t_m[:, None])
-        storage.release()
 
 
 def _write_toml(out: Path, settings: PerformerSettings) -> None:
