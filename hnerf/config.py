@@ -98,6 +98,24 @@ class PaperFieldSettings(Section):
     root_condition: bool = True  # colour depends on T
 
 
+class NerfSettings(Section):
+    """NeRF, a compared method (hnerf/baselines/nerf.py)."""
+
+    box_margin_m: float = Field(default=0.1, gt=0)
+    samples: int = Field(default=32, ge=2)  # coarse, and as many fine
+    width: int = Field(default=64, ge=2)
+    learning_rate: float = Field(default=2e-3, gt=0)
+
+
+class IdrSettings(Section):
+    """IDR, a compared method (hnerf/baselines/idr.py)."""
+
+    box_margin_m: float = Field(default=0.1, gt=0)
+    samples: int = Field(default=32, ge=3)  # a ray, to find its least distance
+    width: int = Field(default=64, ge=2)
+    learning_rate: float = Field(default=1e-3, gt=0)
+
+
 class LossSettings(Section):
     """Weights of the nine losses in the form of hnerf/training/losses.py, and their constants."""
 
@@ -110,6 +128,7 @@ class LossSettings(Section):
     residual: float = Field(default=5e-4, ge=0)
     fit: float = Field(default=1.0, ge=0)
     increment: float = Field(default=0.02, ge=0)
+    elastic: float = Field(default=0.0, ge=0)  # not H-NeRF's: of Nerfies' deformation
     eta: float = Field(default=1.0, ge=0)  # of the surroundings in blend; 0.25 where floor or furniture is near
     density_threshold: float = Field(default=50.0, gt=0)  # sigma_h, per scene unit
     density_steepness: float = Field(default=0.1, gt=0)  # lambda; docs/method.md says why
@@ -117,11 +136,14 @@ class LossSettings(Section):
 
 
 class TrainingSettings(Section):
-    machinery: Literal["fast", "paper"] = "fast"
+    machinery: Literal["fast", "paper", "nerf", "idr"] = "fast"
     fast: FastFieldSettings = FastFieldSettings()
     paper: PaperFieldSettings = PaperFieldSettings()
+    nerf: NerfSettings = NerfSettings()
+    idr: IdrSettings = IdrSettings()
     losses: LossSettings = LossSettings()
     steps: int = Field(default=400, ge=1)
+    seconds: float | None = Field(default=None, gt=0)  # at which the field's training ends if its steps have not
     novel_pose_steps: int = Field(default=100, ge=0)  # poses of novel frames, against the finished field
     frames_per_step: int = Field(default=8, ge=1)
     rays_per_frame: int = Field(default=384, ge=1)
@@ -130,12 +152,14 @@ class TrainingSettings(Section):
     final_learning_rate: float = Field(default=0.1, gt=0, le=1)  # share of the first that is left at the end
     noise: float = Field(default=0.1, ge=0)  # on theta, T and v
     checkpoint_steps: int = Field(default=100, ge=1)
+    snapshots_s: tuple[float, ...] = ()  # when the subject is saved as it stands, below `snapshots/`
     processes: int = Field(default=0, ge=0)  # 0: one a GPU, or one
     seed: int = Field(default=0, ge=0)
 
 
 class EvaluationSettings(Section):
     max_meshes: int = Field(default=4, ge=1)  # a split
+    max_images: int | None = Field(default=None, ge=1)  # a split; None: all
     report_rows: int = Field(default=3, ge=1)  # frames shown of each split
 
 

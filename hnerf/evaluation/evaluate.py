@@ -1,6 +1,7 @@
 """Render, mesh and score a trained avatar by the protocol of docs/method.md, and report what was found."""
 
 import dataclasses
+import itertools
 import json
 import logging
 import time
@@ -20,7 +21,7 @@ from hnerf.evaluation import geometry, metrics
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.report import write_report
-from hnerf.evaluation.views import SPLITS, TRAINING_VIEW, View, all_views, some_views, split_frames
+from hnerf.evaluation.views import SPLITS, TRAINING_VIEW, View, some_views, split_frames
 from hnerf.render.avatar import Avatar
 from hnerf.spread import spread
 
@@ -51,12 +52,12 @@ def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) 
     started = time.perf_counter()
     capture = inputs.capture
     truth = GroundTruth(inputs.capture_folder, capture) if (inputs.capture_folder / "ground_truth").is_dir() else None
-    views = [view for split in SPLITS for view in all_views(capture, split)]
+    views = {split: some_views(capture, split, settings.max_images) for split in SPLITS}
     shown = some_views(capture, TRAINING_VIEW, settings.report_rows)
-    image_seconds = render(inputs.avatar, capture, views + shown, out)
+    image_seconds = render(inputs.avatar, capture, [*itertools.chain(*views.values()), *shown], out)
     rendered = time.perf_counter()
     found: dict[str, Any] = {"protocol": PROTOCOL, "lpips": LPIPS, "seconds_per_image": image_seconds}
-    found |= {split: score_split(capture, split, truth, out) for split in SPLITS}
+    found |= {split: score_split(split, views[split], truth, out) for split in SPLITS}
     true_meshes = {} if truth is None else truth.meshes()
     for split in SPLITS:
         frames = mesh_frames(split_frames(capture, split), true_meshes, settings.max_meshes)
@@ -89,10 +90,9 @@ def render(avatar: Avatar, capture: Capture, views: list[View], out: Path) -> fl
     return float(np.median(seconds))
 
 
-def score_split(capture: Capture, split: str, truth: GroundTruth | None, out: Path) -> dict[str, Any]:
+def score_split(split: str, views: list[View], truth: GroundTruth | None, out: Path) -> dict[str, Any]:
     """Mean image figures of a split's renderings, and each image's; null with a reason where there are none."""
     nothing: dict[str, Any] = {"n": 0, "psnr": None, "ssim": None, "mask_iou": None, "per_image": []}
-    views = all_views(capture, split)
     if not views:
         missing = "test cameras" if split == "novel_view" else "novel-pose frames"
         return nothing | {"reason": f"the capture has no {missing}"}

@@ -40,10 +40,10 @@ def all_views(capture: Capture, split: str) -> list[View]:
     return [View(split, c, f) for c in split_cameras(capture, split) for f in split_frames(capture, split)]
 
 
-def some_views(capture: Capture, split: str, count: int) -> list[View]:
-    """At most `count` images of a split: frames spread over the recording, the cameras in turn."""
+def some_views(capture: Capture, split: str, count: int | None) -> list[View]:
+    """At most `count` images of a split, all if None: frames spread over the recording, the cameras in turn."""
     cameras = split_cameras(capture, split)
-    if not cameras:
-        return []
+    if count is None or not cameras:
+        return all_views(capture, split)
     frames = spread(split_frames(capture, split), count)
     return [View(split, cameras[k % len(cameras)], frame) for k, frame in enumerate(frames)]

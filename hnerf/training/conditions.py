@@ -17,21 +17,23 @@ Batch = TypeVar("Batch", bound="DataclassInstance")
 
 @dataclass(frozen=True)
 class Conditions:
-    """By body row: pose (n, 3 free) the free joints' angles; root (n, 12) the rows of T, translation in scene units."""
+    """By body row: pose (n, 3 free) the free joints' angles; root (n, 12) the rows of T, translation in scene units;
+    moment (n,) the row of the fit whose pose it is, -1 for a pose that no frame has."""
 
     pose: Tensor
     root: Tensor
+    moment: Tensor
 
     @staticmethod
-    def of(rig: Rig, theta: Tensor, root: Tensor, scene_m: float) -> "Conditions":
+    def of(rig: Rig, theta: Tensor, root: Tensor, moment: Tensor, scene_m: float) -> "Conditions":
         """theta (n, J, 3), root (n, 4, 4); scene_m: metres in a scene unit."""
         scaled = torch.cat([root[:, :3, :3], root[:, :3, 3:] / scene_m], -1)
-        return Conditions(pose_inputs(rig, theta), scaled.flatten(1))
+        return Conditions(pose_inputs(rig, theta), scaled.flatten(1), moment)
 
     def noisy(self, sigma: float, generator: torch.Generator) -> "Conditions":
         """With Gaussian noise on theta and T, so that networks do not learn poses by heart (paper, section 4)."""
         pose, root = (sigma * torch.randn(c.shape, generator=generator).to(c) for c in (self.pose, self.root))
-        return Conditions(self.pose + pose, self.root + root)
+        return dataclasses.replace(self, pose=self.pose + pose, root=self.root + root)
 
 
 @dataclass(frozen=True)

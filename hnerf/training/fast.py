@@ -11,6 +11,7 @@ from hnerf.field.canonical import CanonicalField
 from hnerf.render.compositing import alpha_from_sdf, weights_from_alpha
 from hnerf.render.shell import ShellGrid, lattice
 from hnerf.training.conditions import Conditions, Draws, pose_inputs
+from hnerf.training.field import Field
 from hnerf.training.losses import RaySamples
 
 SETTLED = 5.0  # where the logistic of density is 1 or 0 within 1 %
@@ -20,10 +21,9 @@ NEGLIGIBLE = 1e-3  # a sample of less weight gets no colour
 FAR_M = 10.0  # farther than any point that is asked about
 
 
-class FastField(nn.Module):
+class FastField(Field):
     """Networks, sharpness and the canonical body; no pose of its own."""
 
-    canonical_m: Tensor
     outer_m: Tensor
     inner_m: Tensor
     corners: Tensor

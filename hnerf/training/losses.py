@@ -18,7 +18,8 @@ EPSILON = 1e-6  # keeps logarithms finite
 class RaySamples:
     """What a model says of a batch of rays. (R, K) each: alpha of the radiance field, alpha_dot of the SDF, in_box b,
     d of the body, residual dd, spatial_gradient |grad d_hat| (or a subset of samples, any shape); colour (R, K, 3);
-    density (R, K) or None where the SDF itself is the density; beyond (R, 3): the colour behind the samples."""
+    density (R, K) or None where the SDF itself is the density; beyond (R, 3): the colour behind the samples;
+    elastic: energy of a deformation at samples of its choice, or None where nothing is deformed."""
 
     alpha: Tensor
     alpha_dot: Tensor
@@ -29,6 +30,7 @@ class RaySamples:
     residual: Tensor
     gradient_norm: Tensor
     beyond: Tensor
+    elastic: Tensor | None = None
 
     @property
     def d_hat(self) -> Tensor:
@@ -103,6 +105,12 @@ def increment(correction: PoseCorrection) -> Tensor:
     """inc: |dbeta|_2 + mean_t |dtheta_t|_2."""
     turn, move_m, shape = correction.totals()
     return _norm(shape) + _norm(torch.cat([turn.flatten(1), move_m], 1)).mean()
+
+
+def elastic(samples: RaySamples) -> Tensor:
+    """Mean of a deformation's elastic energy (Park et al. 2021, eq. 3 and 4)."""
+    assert samples.elastic is not None
+    return samples.elastic.mean()
 
 
 def _norm(x: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ from hnerf.render.avatar import Rendering
 from hnerf.render.compositing import composite, weights_from_alpha
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.fast import FastField
+from hnerf.training.field import Field
 from hnerf.training.paper import PaperField
 from hnerf.training.pixels import within_reach
 
@@ -27,7 +28,7 @@ RAYS_AT_ONCE = 16384
 POINTS_AT_ONCE = 262144
 
 
-def build_field(settings: TrainingSettings, body: BodyFit, static: bool) -> FastField | PaperField:
+def build_field(settings: TrainingSettings, body: BodyFit, static: bool) -> Field:
     """An untrained field around the fitted body; static: the capture has one training frame."""
     if settings.machinery == "fast":
         return FastField(body.rig, settings.fast)
@@ -38,7 +39,7 @@ def build_field(settings: TrainingSettings, body: BodyFit, static: bool) -> Fast
 class TrainedAvatar:
     """A field and the fine-tuned body: the Avatar of hnerf/render/avatar.py."""
 
-    field: FastField | PaperField
+    field: Field
     body: BodyFit
     scene_m: float
 
@@ -82,7 +83,9 @@ class TrainedAvatar:
     def _pose(self, theta: Tensor, root: Tensor) -> tuple[PosedBodies, Conditions]:
         rig = self.body.rig
         bodies = PosedBodies(rig, theta[None], root[None], self.field.canonical_m)
-        return bodies, Conditions.of(rig, theta[None], root[None], self.scene_m)
+        same = (self.body.theta == theta).flatten(1).all(1) & (self.body.root == root).flatten(1).all(1)
+        moment = torch.nonzero(same)[:1, 0] if same.any() else torch.full((1,), -1, device=theta.device)
+        return bodies, Conditions.of(rig, theta[None], root[None], moment, self.scene_m)
 
 
 def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvatar:

@@ -8,7 +8,7 @@ both.
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from hnerf.body.canonical import Descriptor, PoseCorrection, PosedBodies
 from hnerf.body.rig import Rig
@@ -17,6 +17,7 @@ from hnerf.field.mlp import RadianceMLP, ResidualMLP
 from hnerf.render.compositing import alpha_from_density, occupancy, weights_from_alpha
 from hnerf.render.shell import box_interval
 from hnerf.training.conditions import Conditions, Draws, pose_inputs
+from hnerf.training.field import Field
 from hnerf.training.losses import RaySamples
 
 OUTSIDE_DISTANCE = 1.0  # the constant d of a point outside the person's box
@@ -33,17 +34,17 @@ class Boxes:
     scene_upper_m: Tensor
 
 
-class PaperField(nn.Module):
+class PaperField(Field):
     """F and DH; dynamic: on (s, d) and theta; static (one frame): on x itself, unconditioned."""
 
-    canonical_m: Tensor
+    own_background = True
     centre_m: Tensor
 
     def __init__(self, rig: Rig, root: Tensor, settings: PaperFieldSettings, static: bool):
         """root (n, 4, 4): the training poses, which the scene is centred on."""
         super().__init__()
         self.settings, self.static = settings, static
-        self.samples = settings.samples
+        self.samples, self.unit_m = settings.samples, settings.scene_m
         self.register_buffer("canonical_m", rig.vertices_m.clone())
         self.register_buffer("centre_m", root[:, :3, 3].mean(0))
         poses = pose_inputs(rig, torch.zeros(1, len(rig.joints_m), 3)).shape[1]
@@ -56,9 +57,6 @@ class PaperField(nn.Module):
         margin, half = self.settings.box_margin_m, self.settings.scene_m
         lower, upper = bodies.vertices_m.amin(1) - margin, bodies.vertices_m.amax(1) + margin
         return Boxes(lower, upper, self.centre_m - half, self.centre_m + half)
-
-    def tighten(self, rig: Rig, pose: Tensor) -> None:
-        """Nothing: the paper samples the whole box."""
 
     def parameter_groups(self) -> list[dict]:
         """Adam groups."""

@@ -27,6 +27,14 @@ class Processes:
             dist.init_process_group("nccl" if cuda else "gloo")
         return Processes(rank, world_size, device)
 
+    def any(self, here: bool) -> bool:
+        """Whether it is so in any of the processes."""
+        if self.world_size == 1:
+            return here
+        flag = torch.tensor(float(here), device=self.device)
+        dist.all_reduce(flag, dist.ReduceOp.MAX)
+        return bool(flag)
+
     @property
     def leads(self) -> bool:
         """Whether this process writes files and logs."""

@@ -10,8 +10,7 @@ from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.config import TrainingSettings
 from hnerf.training import losses
 from hnerf.training.conditions import Conditions, Draws
-from hnerf.training.fast import FastField
-from hnerf.training.paper import PaperField
+from hnerf.training.field import Field
 from hnerf.training.pixels import Rays
 
 
@@ -30,19 +29,18 @@ class Stage:
 class Objective(nn.Module):
     """Field and pose correction with their losses; the forward pass is what DistributedDataParallel wraps."""
 
-    def __init__(self, field: FastField | PaperField, correction: PoseCorrection, settings: TrainingSettings):
+    def __init__(self, field: Field, correction: PoseCorrection, settings: TrainingSettings):
         super().__init__()
         self.field, self.correction, self.settings = field, correction, settings
 
     def forward(self, stage: Stage, rays: Rays, conditions: Conditions, draws: Draws) -> dict[str, Tensor]:
         """The weighted losses by name; their sum is minimised."""
-        own_background = isinstance(self.field, PaperField)
-        target, draws = aim(rays, draws, own_background)
+        target, draws = aim(rays, draws, self.field.own_background)
         samples, _ = self.field.sample(
             stage.bodies, stage.region, rays.origins_m, rays.directions, rays.frame, conditions, draws, self.correction
         )
         s = self.settings.losses
-        sharpness = self.settings.paper.sharpness if own_background else s.sharpness_per_m
+        sharpness = s.sharpness_per_m * self.field.unit_m
         terms = {
             "reconstruction": lambda: losses.reconstruction(samples, target),
             "mask": lambda: losses.mask(samples, target),
@@ -53,6 +51,7 @@ class Objective(nn.Module):
             "residual": lambda: losses.residual(samples),
             "fit": lambda: losses.segmentation(samples.d, target, sharpness),
             "increment": lambda: losses.increment(self.correction),
+            "elastic": lambda: losses.elastic(samples),
         }
         return {name: getattr(s, name) * term() for name, term in terms.items() if getattr(s, name)}
 

@@ -62,6 +62,7 @@ class Trainer:
         held_out = [rows[f] for f in capture.novel_pose_frames if f in rows and f not in capture.train_frames]
         self.novel_rows = torch.tensor(held_out, dtype=torch.long, device=device)
         self.step, self.skipped, self.seconds = 0, 0, 0.0
+        self.field_steps = settings.steps  # fewer where the time is up before
         self.history: list[dict[str, Any]] = []
         self._stand(bodies)
         self._resume()
@@ -69,7 +70,7 @@ class Trainer:
     @property
     def steps(self) -> int:
         """Of both phases."""
-        return self.settings.steps + (self.settings.novel_pose_steps if self._novel_poses_learn else 0)
+        return self.field_steps + (self.settings.novel_pose_steps if self._novel_poses_learn else 0)
 
     @property
     def _novel_poses_learn(self) -> bool:
@@ -82,7 +83,8 @@ class Trainer:
     def _stand(self, bodies: PosedBodies) -> None:
         """Take the bodies as they stand now for the coming steps."""
         self.stage = Stage(bodies, self.field.region(bodies))
-        self.conditions = Conditions.of(bodies.rig, bodies.theta, bodies.root, self.settings.paper.scene_m)
+        moment = torch.arange(len(bodies.theta), device=bodies.theta.device)
+        self.conditions = Conditions.of(bodies.rig, bodies.theta, bodies.root, moment, self.settings.paper.scene_m)
 
     def run(self) -> dict[str, Any]:
         """Train to the end, write the subject's files and return the report."""
@@ -91,18 +93,24 @@ class Trainer:
             devices = [self.processes.device] if self.processes.device.type == "cuda" else None
             module = DistributedDataParallel(self.objective, device_ids=devices, find_unused_parameters=True)
         started, last_log = time.monotonic() - self.seconds, time.monotonic()
+        snapshots_s = [s for s in sorted(self.settings.snapshots_s) if s > self.seconds]
         while self.step < self.steps:
-            if self.step == self.settings.steps:
+            if self.step == self.field_steps:
                 self._freeze_field()
             terms = self._optimise(module)
             self.step += 1
             self.seconds = time.monotonic() - started
-            if self.step % self.settings.absorb_steps == 0 or self.step in (self.settings.steps, self.steps):
-                self.stage.bodies.absorb(self.objective.correction)
-                if self.step <= self.settings.steps:
-                    self.field.tighten(self.stage.bodies.rig, self.conditions.pose[self.train_rows[::POSES_APART]])
-                self._stand(self.stage.bodies)
-            if self.step % LOG_STEPS == 0 or self.step in (1, self.settings.steps, self.steps):
+            if self.step < self.field_steps and self._time_is_up():
+                self.field_steps = self.step
+            if self.step % self.settings.absorb_steps == 0 or self.step in (self.field_steps, self.steps):
+                self._absorb()
+            if snapshots_s and self.processes.any(self.seconds >= snapshots_s[0]):
+                self._absorb()
+                if self.processes.leads:
+                    self._save(self.out / "snapshots" / f"{snapshots_s[0]:g}")
+                snapshots_s.pop(0)
+                started = time.monotonic() - self.seconds  # watching takes no time
+            if self.step % LOG_STEPS == 0 or self.step in (1, self.field_steps, self.steps):
                 self._record(terms)
                 if time.monotonic() - last_log > 5 and self.processes.leads:
                     last_log = time.monotonic()
@@ -112,6 +120,15 @@ class Trainer:
         self._require_surface()
         return self._finish() if self.processes.leads else {}
 
+    def _time_is_up(self) -> bool:
+        return self.settings.seconds is not None and self.processes.any(self.seconds >= self.settings.seconds)
+
+    def _absorb(self) -> None:
+        self.stage.bodies.absorb(self.objective.correction)
+        if self.step <= self.field_steps:
+            self.field.tighten(self.stage.bodies.rig, self.conditions.pose[self.train_rows[::POSES_APART]])
+        self._stand(self.stage.bodies)
+
     def _freeze_field(self) -> None:
         """Novel poses are fitted to the finished field, so that it never sees their pixels."""
         for parameter in [*self.field.parameters(), self.objective.correction.shape]:
@@ -119,7 +136,7 @@ class Trainer:
 
     def _optimise(self, module: torch.nn.Module) -> dict[str, Tensor]:
         s, p = self.settings, self.processes
-        rows = self.train_rows if self.step < s.steps else self.novel_rows
+        rows = self.train_rows if self.step < self.field_steps else self.novel_rows
         pick = torch.randperm(len(rows), generator=self.generator)[: s.frames_per_step].to(rows.device)
         rays = self.pixels.draw(rows[pick], s.rays_per_frame, self.generator)
         draws = Draws.random(len(rays.frame), self.field.samples, s.noise, self.generator, p.device)
@@ -145,17 +162,19 @@ class Trainer:
 
     def _set_rates(self) -> None:
         s = self.settings
-        phase_step, phase_steps = (
-            (self.step, s.steps) if self.step < s.steps else (self.step - s.steps, s.novel_pose_steps)
-        )
-        factor = s.final_learning_rate ** (phase_step / phase_steps) * min(1.0, (phase_step + 1) / WARM_UP_STEPS)
+        phase_step = self.step if self.step < self.field_steps else self.step - self.field_steps
+        if phase_step == self.step:
+            done = max(self.step / s.steps, self.seconds / s.seconds if s.seconds else 0.0)
+        else:
+            done = phase_step / s.novel_pose_steps
+        factor = s.final_learning_rate**done * min(1.0, (phase_step + 1) / WARM_UP_STEPS)
         for group, rate in zip(self.optimizer.param_groups, self.first_rates, strict=True):
             group["lr"] = rate * factor
 
     def _record(self, terms: dict[str, Tensor]) -> None:
         row: dict[str, Any] = {"step": self.step, "seconds": round(self.seconds, 2)}
         row["losses"] = {name: value.item() for name, value in terms.items()}
-        if len(self.novel_rows) and self.step <= self.settings.steps:
+        if len(self.novel_rows) and self.step <= self.field_steps:
             row["held_out"] = {"psnr": self._held_out_psnr()}
         self.history.append(row)
 
@@ -192,6 +211,7 @@ class Trainer:
             "step": self.step,
             "skipped": self.skipped,
             "seconds": self.seconds,
+            "field_steps": self.field_steps,
             "objective": self.objective.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
@@ -206,24 +226,31 @@ class Trainer:
         if state is None:
             return
         self.step, self.skipped, self.seconds = state["step"], state["skipped"], state["seconds"]
+        self.field_steps = state["field_steps"]
         self.objective.load_state_dict(state["objective"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"].cpu())
         self.history = json.loads(state["history"])
         rig = self.body.rig.reshaped(state["beta"])
         self._stand(PosedBodies(rig, state["theta"], state["root"], self.field.canonical_m))
-        if self.step > self.settings.steps:
+        if self.step > self.field_steps:
             self._freeze_field()
         logger.info("resumed at step %d", self.step)
 
-    def _finish(self) -> dict[str, Any]:
-        bodies, out = self.stage.bodies, self.out
+    def _save(self, folder: Path) -> None:
+        """What `load_avatar` reads: field, settings and fine-tuned body."""
+        folder.mkdir(parents=True, exist_ok=True)
+        bodies = self.stage.bodies
         body = BodyFit(bodies.rig.to("cpu"), self.body.frames, bodies.theta.cpu(), bodies.root.cpu())
-        body.save(out)
+        body.save(folder)
         tensors = {name: t.detach().cpu().contiguous() for name, t in self.field.state_dict().items()}
-        save_file(tensors, out / "model.safetensors")
+        save_file(tensors, folder / "model.safetensors")
         settings = {"static": self.static, "training": self.settings.model_dump()}
-        (out / "settings.json").write_text(json.dumps(settings, indent=1))
+        (folder / "settings.json").write_text(json.dumps(settings, indent=1))
+
+    def _finish(self) -> dict[str, Any]:
+        out = self.out
+        self._save(out)
         (out / "history.jsonl").write_text("".join(json.dumps(row) + "\n" for row in self.history))
         turn, move_m, _ = self.objective.correction.totals()
         report = {

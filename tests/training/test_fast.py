@@ -15,7 +15,7 @@ SETTINGS = FastFieldSettings(samples=32, geometry_cells=(4,), colour_cells=(4,),
 
 def standing() -> tuple[PosedBodies, Conditions]:
     theta, root = torch.zeros(1, 2, 3), torch.eye(4)[None]
-    return PosedBodies(RIG, theta, root, RIG.vertices_m), Conditions.of(RIG, theta, root, 2.5)
+    return PosedBodies(RIG, theta, root, RIG.vertices_m), Conditions.of(RIG, theta, root, torch.zeros(1).long(), 2.5)
 
 
 def field_of(sharpness_per_m: float) -> FastField:

@@ -23,6 +23,7 @@ SAMPLES = RaySamples(
     residual=torch.tensor([[-0.02, -0.03], [0.04, -0.05]]),
     gradient_norm=torch.tensor([1.5, 0.8]),
     beyond=torch.tensor([BLACK, BLACK]),
+    elastic=torch.tensor([0.2, 0.0, 0.7]),
 )
 TARGET = Target(colour=torch.tensor([RED, BLACK]), person=torch.tensor([1.0, 0.0]), weight=torch.ones(2))
 
@@ -97,6 +98,10 @@ def test_increment():
         correction.shape.copy_(torch.tensor([3.0, 4.0]))
         correction.turn[0, 0, 0], correction.absorbed_move_m[0, 1] = 3.0, 4.0
     assert losses.increment(correction).item() == pytest.approx(7.5)
+
+
+def test_elastic():
+    assert losses.elastic(SAMPLES).item() == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize("name", ["reconstruction", "mask", "eikonal", "residual"])

@@ -16,7 +16,8 @@ RIG = box_rig()
 def seen(field: PaperField, root_condition: Tensor) -> tuple[Tensor, Tensor]:
     """Density and colour along one ray through the box, for a condition that says where the root is."""
     bodies = PosedBodies(RIG, torch.zeros(1, 2, 3), torch.eye(4)[None], RIG.vertices_m)
-    conditions = Conditions(Conditions.of(RIG, bodies.theta, bodies.root, 2.5).pose, root_condition)
+    moment = torch.zeros(1, dtype=torch.long)
+    conditions = Conditions(Conditions.of(RIG, bodies.theta, bodies.root, moment, 2.5).pose, root_condition, moment)
     origin, direction = torch.tensor([[0.5, 0.4, 2.4]]), torch.tensor([[0.0, 0.0, -1.0]])
     draws = Draws.still(1, field.samples, torch.device("cpu"))
     samples, _ = field.sample(

@@ -94,6 +94,36 @@ def test_loads_after_the_shape_has_changed(tmp_path: Path):
     assert all(torch.equal(p, q) for p, q in zip(avatar.field.parameters(), trainer.field.parameters(), strict=True))
 
 
+def test_time_ends_the_field_and_slows_it_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Steps of a quarter of a second: one second is up after four of them, when rates have come down to a tenth; the
+    novel poses still get their four."""
+    capture, masks, body = record(tmp_path / "capture")
+    trainer = Trainer(capture, masks, body, with_changes(seconds=1.0, steps=1000), tmp_path, ALONE)
+    monkeypatch.setattr(trainer_module, "WARM_UP_STEPS", 1)
+    now_s = 0.0
+
+    def optimise_in_a_quarter(module: torch.nn.Module) -> dict[str, torch.Tensor]:
+        nonlocal now_s
+        now_s += 0.25
+        return Trainer._optimise(trainer, module)
+
+    monkeypatch.setattr(trainer, "_optimise", optimise_in_a_quarter)
+    monkeypatch.setattr(trainer_module.time, "monotonic", lambda: now_s)
+    trainer.run()
+    assert (trainer.field_steps, trainer.step) == (4, 8)
+    trainer.step, trainer.seconds, trainer.field_steps = 4, 1.0, 1000
+    trainer._set_rates()
+    assert trainer.optimizer.param_groups[0]["lr"] == pytest.approx(0.1 * trainer.first_rates[0])
+
+
+def test_a_snapshot_is_a_subject(tmp_path: Path):
+    capture, masks, body = record(tmp_path / "capture")
+    Trainer(capture, masks, body, with_changes(snapshots_s=[1e-6]), tmp_path, ALONE).run()
+    early, late = load_avatar(tmp_path / "snapshots" / "1e-06"), load_avatar(tmp_path)
+    assert early.field.log_sharpness != late.field.log_sharpness
+    assert early.render(capture.cameras["0"], early.body.theta[0], early.body.root[0]).alpha.max() > 0.5
+
+
 def test_a_model_of_another_version_is_refused(tmp_path: Path):
     capture, masks, body = record(tmp_path / "capture")
     Trainer(capture, masks, body, with_changes(steps=1, novel_pose_steps=0), tmp_path, ALONE).run()

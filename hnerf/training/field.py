@@ -1,0 +1,58 @@
+"""What trainer and renderer ask of a field."""
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+from torch import Tensor, nn
+
+from hnerf.body.canonical import PoseCorrection, PosedBodies
+from hnerf.body.rig import Rig
+from hnerf.training.conditions import Conditions, Draws
+from hnerf.training.losses import RaySamples
+
+
+class Field(nn.Module, ABC):
+    """H-NeRF's two machineries and the methods it is compared to.
+
+    canonical_m (V, 3): the rig's canonical vertices, saved with the field; samples: random numbers that a ray needs;
+    unit_m: metres in a unit of the distances that `sample` returns; own_background: whether the field models the
+    photograph's surroundings, or is composited over the clean plate.
+    """
+
+    own_background: ClassVar[bool] = False
+    canonical_m: Tensor
+    samples: int
+    unit_m: float = 1.0
+
+    @abstractmethod
+    def region(self, bodies: PosedBodies) -> Any:
+        """Where rays are sampled, by body row."""
+
+    def tighten(self, rig: Rig, pose: Tensor) -> None:
+        """Make that region no larger than what can be seen in some poses (n, P)."""
+
+    @abstractmethod
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """Adam groups."""
+
+    @abstractmethod
+    def sample(
+        self,
+        bodies: PosedBodies,
+        region: Any,
+        origins_m: Tensor,
+        directions: Tensor,
+        frame: Tensor,
+        conditions: Conditions,
+        draws: Draws,
+        correction: PoseCorrection | None = None,
+    ) -> tuple[RaySamples, Tensor]:
+        """Radiance and distance along rays (R, 3) of body rows (R,); also depths (R, K) in metres."""
+
+    @abstractmethod
+    def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
+        """d_hat (N,) metres at points (N, 3) around the first body, negative inside."""
+
+    @abstractmethod
+    def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
+        """c (N, 3) at points (N, 3) around the first body, seen along directions (N, 3)."""
