@@ -19,9 +19,9 @@ from torch import Tensor
 from hnerf.body.anny import anny_rig
 from hnerf.body.canonical import PosedBodies
 from hnerf.body.descriptor import closest_points_reference, vertex_normals
-from hnerf.config import FastFieldSettings
 
 REFERENCE_POINTS = 16  # every triangle against every point: seconds, and memory
+OUTER_M, INNER_M = 0.07, 0.03  # of a shell around the body
 RUNS = 5
 
 
@@ -41,12 +41,12 @@ def main() -> None:
 
 def measure(count: int, frames: int) -> dict[str, float]:
     """Points a second, by what is asked."""
-    rig, shell = anny_rig(), FastFieldSettings()
+    rig = anny_rig()
     theta, root = torch.zeros(frames, len(rig.joints_m), 3), torch.eye(4).expand(frames, 4, 4)
     bodies = PosedBodies(rig, theta, root, rig.vertices_m)
     correction = bodies.correction()
-    points_m, frame = shell_points(rig.vertices_m, rig.faces, count, shell), torch.arange(count) % frames
-    reach_m = shell.outer_m + 2 * shell.shell_cell_m
+    points_m, frame = shell_points(rig.vertices_m, rig.faces, count), torch.arange(count) % frames
+    reach_m = OUTER_M + 0.04
 
     def learning() -> None:
         found = bodies.describe(points_m, frame, reach_m, correction)
@@ -65,11 +65,11 @@ def measure(count: int, frames: int) -> dict[str, float]:
     return {name: points / median_s(work) for name, (work, points) in asked.items()}
 
 
-def shell_points(vertices_m: Tensor, faces: Tensor, count: int, shell: FastFieldSettings) -> Tensor:
+def shell_points(vertices_m: Tensor, faces: Tensor, count: int) -> Tensor:
     """Points (count, 3) evenly spread in depth over the shell."""
     generator = torch.Generator().manual_seed(0)
     pick = torch.randint(len(vertices_m), (count,), generator=generator)
-    depth_m = torch.rand(count, 1, generator=generator) * (shell.outer_m + shell.inner_m) - shell.inner_m
+    depth_m = torch.rand(count, 1, generator=generator) * (OUTER_M + INNER_M) - INNER_M
     return vertices_m[pick] + depth_m * vertex_normals(vertices_m, faces)[pick]
 
 

@@ -70,17 +70,18 @@ class FitSettings(Section):
 
 
 class FastFieldSettings(Section):
-    """The fast machinery: shell, grids and small networks."""
+    """The fast machinery: shell, grids and small networks. What is 0, or has no cells, the scene decides
+    (hnerf/training/budget.py)."""
 
-    outer_m: float = Field(default=0.07, gt=0)  # the shell's thickness outside the body
-    inner_m: float = Field(default=0.03, gt=0)  # and inside
+    outer_m: float = Field(default=0.0, ge=0)  # the shell's thickness outside the body
+    inner_m: float = Field(default=0.0, ge=0)  # and inside
     shell_cell_m: float = Field(default=0.02, gt=0)
-    samples: int = Field(default=24, ge=2)
-    geometry_cells: tuple[int, ...] = (16, 32, 64)  # on the box's longest side, a level each
-    colour_cells: tuple[int, ...] = (24, 64, 112, 192)
+    samples: int = Field(default=0, ge=0)
+    geometry_cells: tuple[int, ...] = ()  # on the box's longest side, a level each
+    colour_cells: tuple[int, ...] = ()
     channels: int = Field(default=4, ge=1)
     width: int = Field(default=64, ge=1)
-    pose_width: int = Field(default=8, ge=1)
+    pose_width: int = Field(default=0, ge=0)
     initial_sharpness_per_m: float = Field(default=100.0, gt=0)
     gradient_step_m: float = Field(default=0.005, gt=0)
     grid_learning_rate: float = Field(default=5e-2, gt=0)
@@ -102,9 +103,9 @@ class NerfSettings(Section):
     """NeRF, a compared method (hnerf/baselines/nerf.py)."""
 
     box_margin_m: float = Field(default=0.1, gt=0)
-    samples: int = Field(default=32, ge=2)  # coarse, and as many fine
+    samples: int = Field(default=24, ge=2)  # coarse, and as many fine
     width: int = Field(default=64, ge=2)
-    learning_rate: float = Field(default=2e-3, gt=0)
+    learning_rate: float = Field(default=5e-3, gt=0)
 
 
 class IdrSettings(Section):
@@ -142,7 +143,7 @@ class TrainingSettings(Section):
     nerf: NerfSettings = NerfSettings()
     idr: IdrSettings = IdrSettings()
     losses: LossSettings = LossSettings()
-    steps: int = Field(default=400, ge=1)
+    steps: int = Field(default=0, ge=0)  # 0: the scene decides
     seconds: float | None = Field(default=None, gt=0)  # at which the field's training ends if its steps have not
     novel_pose_steps: int = Field(default=100, ge=0)  # poses of novel frames, against the finished field
     frames_per_step: int = Field(default=8, ge=1)

@@ -33,7 +33,7 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
     ("text", "named"),
     [
         ("training: {losses: {hair: 0}}", "training.losses.hair"),
-        ("training: {steps: 0}", "training.steps"),
+        ("training: {steps: -1}", "training.steps"),
         ("training:", "training"),
         ("training: {steps: {a: 1}}", "training.steps"),
     ],

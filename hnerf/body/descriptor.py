@@ -7,6 +7,7 @@ is four times faster, and wrong only inside a body that intersects itself, near 
 there.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import torch
@@ -69,6 +70,7 @@ class BodyMeshes:
     def __init__(self, vertices_m: Tensor, faces: Tensor):
         """vertices_m (n, V, 3), faces (F, 3)."""
         wp.init()
+        self._threads = ThreadPoolExecutor(torch.get_num_threads())
         self._device = wp.device_from_torch(vertices_m.device)
         self._faces = faces
         self._indices = wp.from_torch(faces.to(torch.int32).flatten().contiguous())
@@ -89,23 +91,36 @@ class BodyMeshes:
     ) -> ClosestPoints:
         """Closest surface point of mesh `mesh_index` (N,) to each of `points_m` (N, 3), if within `reach_m`."""
         n, device = len(points_m), points_m.device
+        mesh_index, points_m = mesh_index.to(torch.int32).contiguous(), points_m.detach().float().contiguous()
         face = torch.empty(n, dtype=torch.int32, device=device)
         barycentric = torch.zeros(n, 3, device=device)
         sign = torch.empty(n, device=device)
-        wp.launch(
-            _closest_kernel,
-            n,
-            inputs=[
-                self._ids,
-                wp.from_torch(mesh_index.to(torch.int32).contiguous()),
-                wp.from_torch(points_m.detach().float().contiguous(), dtype=wp.vec3),
-                wp.from_torch(self._normals, dtype=wp.vec3),
-                reach_m,
-                NEVER_SURE if exact_sign else SURE_COSINE,
-            ],
-            outputs=[wp.from_torch(face), wp.from_torch(barycentric, dtype=wp.vec3), wp.from_torch(sign)],
-            device=self._device,
-        )
+
+        def find(part: slice) -> None:
+            wp.launch(
+                _closest_kernel,
+                len(face[part]),
+                inputs=[
+                    self._ids,
+                    wp.from_torch(mesh_index[part]),
+                    wp.from_torch(points_m[part], dtype=wp.vec3),
+                    wp.from_torch(self._normals, dtype=wp.vec3),
+                    reach_m,
+                    NEVER_SURE if exact_sign else SURE_COSINE,
+                ],
+                outputs=[
+                    wp.from_torch(face[part]),
+                    wp.from_torch(barycentric[part], dtype=wp.vec3),
+                    wp.from_torch(sign[part]),
+                ],
+                device=self._device,
+            )
+
+        if device.type == "cuda":
+            find(slice(n))
+        else:  # warp itself uses one thread of a CPU
+            size = max(1, -(-n // torch.get_num_threads()))
+            list(self._threads.map(find, [slice(start, min(start + size, n)) for start in range(0, n, size)]))
         return ClosestPoints(face.long(), barycentric, sign)
 
 

@@ -1,5 +1,7 @@
 """The networks of the paper: F, eight layers of 256, and DH, six of 128; Swish, a skip connection to the middle."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
@@ -7,10 +9,13 @@ from hnerf.field.encoding import positional_encoding
 
 
 class SkipMLP(nn.Module):
-    """`layers` linear layers of `width` with Swish; the input is fed again into the middle one."""
+    """`layers` linear layers of `width`, Swish unless said otherwise; the input is fed again into the middle one."""
 
-    def __init__(self, inputs: int, width: int, layers: int):
+    def __init__(
+        self, inputs: int, width: int, layers: int, activation: Callable[[Tensor], Tensor] = nn.functional.silu
+    ):
         super().__init__()
+        self.activation = activation
         self.middle = layers // 2
         sizes = [inputs] + [width] * (layers - 1)
         sizes[self.middle] += inputs
@@ -20,7 +25,7 @@ class SkipMLP(nn.Module):
         """(N, inputs) to (N, width)."""
         h = x
         for k, layer in enumerate(self.layers):
-            h = nn.functional.silu(layer(torch.cat([h, x], -1) if k == self.middle else h))
+            h = self.activation(layer(torch.cat([h, x], -1) if k == self.middle else h))
         return h
 
 

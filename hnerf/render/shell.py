@@ -66,7 +66,7 @@ class ShellGrid:
         size_m = self.cell_m * torch.tensor(self.cells.shape[1:], device=origins_m.device)
         near, far = box_interval(origins_m, directions, self.lower_m[frame], self.lower_m[frame] + size_m)
         bins = max(1, math.ceil(float((far - near).max()) / self.cell_m))
-        edges = near[:, None] + (far - near)[:, None] * torch.linspace(0, 1, bins + 1, device=near.device)
+        edges = near[:, None] + self.cell_m * torch.arange(bins + 1, device=near.device)  # whatever the other rays
         middles = (edges[:, 1:] + edges[:, :-1]) / 2
         state = self.look_up(origins_m[:, None] + directions[:, None] * middles[..., None], frame)
         before_solid = (state == SOLID).cumsum(1) == 0
@@ -78,8 +78,7 @@ class ShellGrid:
         wanted = (strata + jitter) / samples * cumulative[:, -1:]
         upper = torch.searchsorted(cumulative, wanted.contiguous(), right=True).clamp(1, bins)
         inside = wanted - cumulative.gather(1, upper - 1)
-        width = (far - near)[:, None] / bins
-        return edges.gather(1, upper - 1) + inside * width, met
+        return edges.gather(1, upper - 1) + inside * self.cell_m, met
 
 
 def lattice(vertices_m: Tensor, faces: Tensor, spacing_m: float) -> tuple[Tensor, Tensor]:

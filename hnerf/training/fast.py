@@ -32,7 +32,7 @@ class FastField(Field):
     def __init__(self, rig: Rig, settings: FastFieldSettings):
         super().__init__()
         self.settings = settings
-        self.samples = settings.samples
+        self.samples, self.margin_m = settings.samples, settings.outer_m + settings.shell_cell_m
         self.register_buffer("canonical_m", rig.vertices_m.clone())
         for name in ("outer_m", "inner_m"):
             self.register_buffer(name, torch.full((len(rig.vertices_m),), getattr(settings, name)))

@@ -15,7 +15,8 @@ class Field(nn.Module, ABC):
     """H-NeRF's two machineries and the methods it is compared to.
 
     canonical_m (V, 3): the rig's canonical vertices, saved with the field; samples: random numbers that a ray needs;
-    unit_m: metres in a unit of the distances that `sample` returns; own_background: whether the field models the
+    unit_m: metres in a unit of the distances that `sample` returns; margin_m: how far around the body anything can be
+    seen; own_background: whether the field models the
     photograph's surroundings, or is composited over the clean plate.
     """
 
@@ -23,6 +24,7 @@ class Field(nn.Module, ABC):
     canonical_m: Tensor
     samples: int
     unit_m: float = 1.0
+    margin_m: float = 0.1
 
     @abstractmethod
     def region(self, bodies: PosedBodies) -> Any:

@@ -11,6 +11,9 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from hnerf.baselines.idr import IdrField
+from hnerf.baselines.nerf import NerfField
+from hnerf.baselines.static import require_one_moment
 from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.camera import Camera
@@ -32,6 +35,12 @@ def build_field(settings: TrainingSettings, body: BodyFit, static: bool) -> Fiel
     """An untrained field around the fitted body; static: the capture has one training frame."""
     if settings.machinery == "fast":
         return FastField(body.rig, settings.fast)
+    if settings.machinery == "nerf":
+        require_one_moment(static, "NeRF")
+        return NerfField(body, settings.nerf)
+    if settings.machinery == "idr":
+        require_one_moment(static, "IDR")
+        return IdrField(body, settings.idr)
     return PaperField(body.rig, body.root, settings.paper, static)
 
 
@@ -49,7 +58,7 @@ class TrainedAvatar:
         bodies, conditions = self._pose(theta, root)
         region: Any = self.field.region(bodies)
         device = bodies.vertices_m.device
-        y, x = np.nonzero(within_reach(camera, bodies.vertices_m[0].cpu().numpy()))
+        y, x = np.nonzero(within_reach(camera, bodies.vertices_m[0].cpu().numpy(), self.field.margin_m))
         origins, directions = camera.rays(np.stack([x, y], 1).astype(np.float64))
         flat = torch.zeros(camera.height_px * camera.width_px, 5, device=device)
         index = torch.from_numpy(y * camera.width_px + x).to(device)

@@ -12,7 +12,6 @@ from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.segmentation.segment import Masks
 
-REACH_M = 0.1  # around the body, within which a pixel can be the person's
 EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel may mix person and surroundings
 
 
@@ -70,7 +69,7 @@ class Pixels:
 
 
 def gather_pixels(
-    capture: Capture, masks: Masks, body: BodyFit, frames: tuple[int, ...], device: torch.device
+    capture: Capture, masks: Masks, body: BodyFit, frames: tuple[int, ...], reach_m: float, device: torch.device
 ) -> Pixels:
     """Pixels of the training cameras in `frames` within reach of the fitted body, or on the mask; none where the mask
     was dropped."""
@@ -86,7 +85,7 @@ def gather_pixels(
             if (camera.name, frame) not in masks:
                 continue
             mask = masks.get(camera.name, frame)
-            wanted = within_reach(camera, vertices_m[body.index(frame)]) | mask
+            wanted = within_reach(camera, vertices_m[body.index(frame)], reach_m) | mask
             y, x = np.nonzero(wanted)
             columns["camera"].append(np.full(len(x), c, np.uint8))
             columns["xy_px"].append(np.stack([x, y], 1).astype(np.int16))
@@ -109,15 +108,15 @@ def gather_pixels(
     )
 
 
-def within_reach(camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels whose rays pass within about REACH_M of the body; its vertices, each a disc of that
+def within_reach(camera: Camera, vertices_m: np.ndarray, reach_m: float) -> np.ndarray:
+    """(H, W) bool: pixels whose rays pass within about `reach_m` of the body; its vertices, each a disc of that
     radius."""
     xy, depth_m = camera.project(vertices_m)
     picture = np.zeros((camera.height_px, camera.width_px), np.uint8)
     xy = np.round(xy[depth_m > 0]).astype(int)
     seen = (xy >= 0).all(1) & (xy < [camera.width_px, camera.height_px]).all(1)
     picture[xy[seen, 1], xy[seen, 0]] = 1
-    radius = int(np.ceil(REACH_M * camera.K[0, 0] / np.median(depth_m)))
+    radius = int(np.ceil(reach_m * camera.K[0, 0] / np.median(depth_m)))
     return cv2.dilate(picture, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)) > 0
 
 

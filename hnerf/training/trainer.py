@@ -1,6 +1,7 @@
 """Training: the field with the poses of the training frames, then the poses of novel frames against the finished
 field."""
 
+import dataclasses
 import json
 import logging
 import resource
@@ -19,6 +20,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.config import TrainingSettings
 from hnerf.segmentation.segment import Masks
+from hnerf.training.budget import Scene, decide
 from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
 from hnerf.training.conditions import Conditions, Draws, own_share
 from hnerf.training.losses import pixel
@@ -43,7 +45,8 @@ class Trainer:
     def __init__(
         self, capture: Capture, masks: Masks, body: BodyFit, settings: TrainingSettings, out: Path, processes: Processes
     ):
-        self.settings, self.out, self.processes = settings, out, processes
+        self.settings, self.decisions = decide(Scene.of(capture, masks, body), settings)
+        settings, self.out, self.processes = self.settings, out, processes
         device = processes.device
         torch.manual_seed(settings.seed)
         self.generator = torch.Generator().manual_seed(settings.seed)
@@ -55,7 +58,7 @@ class Trainer:
         self.optimizer = torch.optim.Adam(self._parameter_groups(), betas=(0.9, 0.99), eps=1e-12)
         self.first_rates = [group["lr"] for group in self.optimizer.param_groups]
         logger.info("gathering pixels")
-        self.pixels: Pixels = gather_pixels(capture, masks, body, body.frames, device)
+        self.pixels: Pixels = gather_pixels(capture, masks, body, body.frames, self.field.margin_m, device)
         seen = self.pixels.starts.diff() > 0  # not where a frame's masks were all dropped
         rows = {frame: row for row, frame in enumerate(body.frames) if seen[row]}
         self.train_rows = torch.tensor([rows[f] for f in capture.train_frames if f in rows], device=device)
@@ -245,7 +248,8 @@ class Trainer:
         body.save(folder)
         tensors = {name: t.detach().cpu().contiguous() for name, t in self.field.state_dict().items()}
         save_file(tensors, folder / "model.safetensors")
-        settings = {"static": self.static, "training": self.settings.model_dump()}
+        decisions = {name: dataclasses.asdict(decision) for name, decision in self.decisions.items()}
+        settings = {"static": self.static, "training": self.settings.model_dump(), "decisions": decisions}
         (folder / "settings.json").write_text(json.dumps(settings, indent=1))
 
     def _finish(self) -> dict[str, Any]:

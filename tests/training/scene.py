@@ -24,6 +24,7 @@ TINY = TrainingSettings.model_validate(
             "geometry_cells": [4],
             "colour_cells": [4],
             "width": 8,
+            "pose_width": 8,
             "outer_m": 0.2,
             "inner_m": 0.1,
             "shell_cell_m": 0.05,

@@ -10,7 +10,16 @@ from hnerf.training.fast import ROOM_M, SETTLED, TIGHTEN_STEP_M, FastField
 from tests.body.boxes import box_rig
 
 RIG = box_rig(splits=3)
-SETTINGS = FastFieldSettings(samples=32, geometry_cells=(4,), colour_cells=(4,), width=8, shell_cell_m=0.05)
+SETTINGS = FastFieldSettings(
+    outer_m=0.07,
+    inner_m=0.03,
+    samples=32,
+    geometry_cells=(4,),
+    colour_cells=(4,),
+    width=8,
+    pose_width=8,
+    shell_cell_m=0.05,
+)
 
 
 def standing() -> tuple[PosedBodies, Conditions]:

@@ -70,10 +70,11 @@ def test_interrupted_training_ends_as_if_it_was_not(tmp_path: Path, monkeypatch:
 def test_overfits_the_column(tmp_path: Path):
     """A few seconds are enough for a render of a training view within 40 dB, in the right place."""
     capture, masks, body = record(tmp_path / "capture")
-    fast = TINY.fast.model_dump() | {"samples": 16, "network_learning_rate": 0.02, "grid_learning_rate": 0.05}
+    rates = {"network_learning_rate": 0.02, "grid_learning_rate": 0.05}
+    fast = TINY.fast.model_dump() | rates | {"samples": 16, "outer_m": 0.1}
     out = tmp_path / "out"
     out.mkdir()
-    train(capture, masks, body, with_changes(fast=fast, steps=120, rays_per_frame=256), out, ALONE)
+    train(capture, masks, body, with_changes(fast=fast, steps=180, rays_per_frame=256), out, ALONE)
     avatar = load_avatar(out)
     drawn = avatar.render(capture.cameras["0"], avatar.body.theta[0], avatar.body.root[0])
     mask = torch.from_numpy(masks.get("0", 0))

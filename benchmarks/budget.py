@@ -1,0 +1,122 @@
+"""Whether the scene decides well: what twice and half the decided size, or number of steps, is worth.
+
+usage: python benchmarks/budget.py STORE [CAPTURE ...]
+
+Trains preset `fast` on shared captures (default: the three rendered ones) as hnerf/training/budget.py decides, then
+with grids of twice and of half the cells' number and as many times the samples a ray, then with twice and half the
+steps; everything else stays. Held-out figures by the evaluation's protocol, of a few images. What is in STORE is not
+made again. Writes `benchmarks/results/budget.json` and `.md`.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from provenance import SHARED, provenance, sentence, table, write_result
+
+from flows.train_subject import find_masks
+from hnerf.config import Settings, TrainingSettings, load_settings
+from hnerf.study.plan import ScoringSettings
+from tasks.benchmark import score_training
+from tasks.calibration import calibrate
+from tasks.capture import ingest
+from tasks.fit import fit
+from tasks.source import read_capture
+from tasks.store import Store
+from tasks.training import train
+
+CAPTURES = ["valid-wave", "valid-walk", "valid-turn-mono"]
+DECIDED = "as decided"
+SCORING = ScoringSettings(images=8, meshes=1, snapshot_images=1, snapshot_meshes=0, frame_sizes_px=(256,))
+
+
+def main() -> None:
+    """Train and score all variants of all captures, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("store", type=Path)
+    parser.add_argument("captures", nargs="*", default=CAPTURES)
+    options = parser.parse_args()
+    captures = {name: measure(SHARED / "data" / name, Store(options.store.resolve())) for name in options.captures}
+    result = provenance() | {"captures": captures}
+    markdown = "\n".join(["# The scene decides the size", "", sentence(result), *as_lines(captures)])
+    write_result("budget", result, markdown)
+    print(markdown)
+
+
+def measure(folder: Path, shelf: Store) -> dict[str, Any]:
+    """The decisions for a capture, and figures of each variant."""
+    settings = load_settings("fast")
+    decided, scores = train_and_score(folder, shelf, settings)
+    variants = {DECIDED: scores}
+    for name, training in {
+        "twice the size": resized(decided, 2.0),
+        "half the size": resized(decided, 0.5),
+        "twice the steps": decided.model_copy(update={"steps": 2 * decided.steps}),
+        "half the steps": decided.model_copy(update={"steps": decided.steps // 2}),
+    }.items():
+        variants[name] = train_and_score(folder, shelf, settings.model_copy(update={"training": training}))[1]
+    reasons = variants[DECIDED].pop("decisions")
+    return {"decisions": reasons, "variants": {name: figures(found) for name, found in variants.items()}}
+
+
+def train_and_score(folder: Path, shelf: Store, settings: Settings) -> tuple[TrainingSettings, dict[str, Any]]:
+    """The training's settings with everything decided; its scores, with the decisions among them."""
+    source, truth = read_capture(folder)
+    recording = ingest(shelf, source, settings.capture)
+    calibration = calibrate(shelf, recording, settings.calibration)
+    masks = find_masks(shelf, recording, calibration, settings)
+    body = fit(shelf, recording, calibration, masks, settings.fit)
+    model = train(shelf, recording, calibration, masks, body, settings.training)
+    scores = score_training(shelf, truth, recording, calibration, model, SCORING)
+    stored = json.loads((model.root / "settings.json").read_text())
+    found = json.loads((scores.root / "scores.json").read_text())
+    return TrainingSettings.model_validate(stored["training"]), found | {"decisions": stored["decisions"]}
+
+
+def resized(training: TrainingSettings, factor: float) -> TrainingSettings:
+    """With so many times the cells, and samples a ray."""
+    fast, side = training.fast, float(np.cbrt(factor))
+    changes = {
+        "colour_cells": tuple(round(side * n) for n in fast.colour_cells),
+        "geometry_cells": tuple(round(side * n) for n in fast.geometry_cells),
+        "samples": round(factor * fast.samples),
+    }
+    return training.model_copy(update={"fast": fast.model_copy(update=changes)})
+
+
+def figures(found: dict[str, Any]) -> dict[str, Any]:
+    """What the table shows of a variant's scores."""
+    report, view, pose = found["training"], found["novel_view"], found["novel_pose"]
+    geometry = view["geometry"] or {}
+    return {
+        "training_s": report["seconds"],
+        "model_mib": report["model_mib"],
+        "peak_memory_gib": report["peak_memory_gib"],
+        "frame_256_s": found["frame_seconds"]["256"],
+        "novel_view_psnr": view["psnr"],
+        "novel_pose_psnr": pose["psnr"],
+        "chamfer_l2_e3": geometry.get("chamfer_l2_e3"),
+    }
+
+
+def as_lines(captures: dict[str, Any]) -> list[str]:
+    """A section for each capture: decisions with reasons, then variants against what was decided."""
+    lines: list[str] = []
+    for name, found in captures.items():
+        decisions = [[key, f"{d['value']}", d["reason"]] for key, d in found["decisions"].items()]
+        lines += ["", f"## {name}", "", *table([["setting", "decided", "because"], *decisions]), ""]
+        titles = ["", "training, s", "model, MiB", "memory, GiB", "256 px frame, s", "PSNR", "new poses", "Chamfer"]
+        lines += table([titles, *([title, *cells(row)] for title, row in found["variants"].items())])
+    return [*lines, ""]
+
+
+def cells(row: dict[str, Any]) -> list[str]:
+    """A variant's figures as text."""
+    forms = ("{:.0f}", "{:.1f}", "{:.1f}", "{:.2f}", "{:.2f}", "{:.2f}", "{:.3f}")
+    return ["-" if v is None else form.format(v) for v, form in zip(row.values(), forms, strict=True)]
+
+
+if __name__ == "__main__":
+    main()

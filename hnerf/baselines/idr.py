@@ -1,0 +1,212 @@
+"""IDR (Yariv et al., Multiview Neural Surface Reconstruction by Disentangling Geometry and Appearance, NeurIPS
+2020)."""
+
+import itertools
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from hnerf.baselines.static import Boxes, StaticField, along, stratified
+from hnerf.body.canonical import PoseCorrection, PosedBodies
+from hnerf.body.fit_result import BodyFit
+from hnerf.config import IdrSettings
+from hnerf.field.encoding import positional_encoding
+from hnerf.field.mlp import SkipMLP
+from hnerf.training.conditions import Conditions, Draws
+from hnerf.training.losses import RaySamples
+
+LAYERS, COLOUR_LAYERS = 8, 4
+POSITION_OCTAVES, VIEW_OCTAVES = 6, 4
+SOFTPLUS_SHARPNESS = 100.0
+INITIAL_RADIUS = 0.75  # of the first sphere, over half the box's shortest side
+TRACE_STEPS, SECANT_STEPS = 10, 8
+CONVERGED_M = 1e-4
+LEAST_SLOPE = 0.05  # of the distance along a ray that meets its surface; keeps grazing rays' gradients finite
+
+
+class SdfNetwork(nn.Module):
+    """gamma(x) -> (f, z): the signed distance and a feature, the last hidden layer."""
+
+    def __init__(self, width: int, radius: float):
+        super().__init__()
+        self.trunk = SkipMLP(3 * (1 + 2 * POSITION_OCTAVES), width, LAYERS, nn.Softplus(SOFTPLUS_SHARPNESS))
+        self.head = nn.Linear(width, 1)
+        self._become_a_sphere(width, radius)
+
+    @torch.no_grad()
+    def _become_a_sphere(self, width: int, radius: float) -> None:
+        """f(x) = |x| - radius, roughly: the geometric initialisation of Atzmon and Lipman 2020 (SAL), theorem 1, with
+        the sines and cosines unheard and the second input too. The bias is what makes f vanish on that sphere on
+        average: -radius is the limit for ReLU and wide layers, where softplus does not lift every unit."""
+        for k, layer in enumerate(self.trunk.layers):
+            assert isinstance(layer, nn.Linear)
+            nn.init.zeros_(layer.bias)
+            nn.init.normal_(layer.weight, 0, math.sqrt(2 / width))
+            layer.weight[:, 3 if k == 0 else width :] = 0
+        nn.init.normal_(self.head.weight, math.sqrt(math.pi / width), 1e-4)
+        nn.init.zeros_(self.head.bias)
+        sphere = radius * nn.functional.normalize(torch.randn(1024, 3), dim=-1)
+        nn.init.constant_(self.head.bias, -float(self(sphere)[0].mean()))
+
+    def forward(self, point: Tensor) -> tuple[Tensor, Tensor]:
+        """point (..., 3): f (...), z (..., width)."""
+        z = self.trunk(positional_encoding(point, POSITION_OCTAVES))
+        return self.head(z)[..., 0], z
+
+
+class IdrField(StaticField):
+    """Static; a signed distance field whose surface is met by sphere tracing and moves with the colours' gradients.
+
+    `sample` gives one sample a ray (K = 1): the point of the surface, with alpha 1 where the ray meets it and 0 where
+    it does not, coloured by the rendering network on (x, n, v, z). Its distance `d` is not the one at that point (it is
+    0) but the least along the ray, which is what the mask loss asks for. So IDR's masked colour loss is `mask`, its
+    mask loss is `segmentation`, and its eikonal loss, at points drawn in the box, `eikonal`.
+
+    Simplified: the mask loss is also asked of rays that rightly meet the surface, where it is flat, with one sharpness
+    instead of five that grow; no bidirectional tracing, the samples of the mask loss say whether tracing overshot;
+    smaller networks without weight normalisation (512 wide there); no camera is learned. Renders have hard outlines, as
+    in the paper: a ray meets the surface or does not.
+    """
+
+    def __init__(self, body: BodyFit, settings: IdrSettings):
+        super().__init__(body, settings.box_margin_m, settings.samples, settings.learning_rate)
+        boxes = Boxes.around(body.vertices_m(), settings.box_margin_m)
+        radius = INITIAL_RADIUS * float((boxes.upper_m - boxes.lower_m).min() / 2 / self.scale_m)
+        self.geometry = SdfNetwork(settings.width, radius)
+        sizes = [6 + 3 * (1 + 2 * VIEW_OCTAVES) + settings.width] + [settings.width] * COLOUR_LAYERS
+        layers = [m for a, b in itertools.pairwise(sizes) for m in (nn.Linear(a, b), nn.ReLU())]
+        self.rendering = nn.Sequential(*layers, nn.Linear(settings.width, 3), nn.Sigmoid())
+
+    def sample(
+        self,
+        bodies: PosedBodies,
+        region: Boxes,
+        origins_m: Tensor,
+        directions: Tensor,
+        frame: Tensor,
+        conditions: Conditions,
+        draws: Draws,
+        correction: PoseCorrection | None = None,
+    ) -> tuple[RaySamples, Tensor]:
+        """As Field.sample, with one sample a ray."""
+        near, far = region.interval(origins_m, directions, frame)
+        with torch.no_grad():
+            tried = stratified(near, far, draws.jitter)
+            distances = self.distance(along(origins_m[:, None], directions[:, None], tried))
+            met, hit = trace(self.distance, origins_m, directions, near, far, tried, distances)
+            least, at = distances.min(1)
+            nearest = torch.where(hit & (least > 0), met, tried.gather(1, at[:, None])[:, 0])
+        d = self.distance(along(origins_m, directions, nearest))[:, None]
+        pick = torch.nonzero(hit)[:, 0]
+        seen = self._surface_colour(origins_m[pick], directions[pick], met[pick])
+        norms = d.new_zeros(0)
+        if draws.probe is not None:
+            assert draws.finer is not None
+            lower, upper = region.lower_m[frame], region.upper_m[frame]
+            norms = self._evaluate(lower + (upper - lower) * draws.finer[:, :3])[1].norm(dim=-1)
+        alpha = hit[:, None].to(d)
+        colour = torch.zeros_like(origins_m).index_copy(0, pick, seen)[:, None]
+        inside = torch.ones_like(d)
+        return RaySamples(alpha, alpha, inside, colour, None, d, torch.zeros_like(d), norms, draws.beyond), met[:, None]
+
+    def distance(self, points_m: Tensor) -> Tensor:
+        """f (...) metres at points (..., 3)."""
+        return self.scale_m * self.geometry(self.scaled(points_m))[0]
+
+    def _evaluate(self, points_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """f (N,) metres, its gradient (N, 3) and z (N, width); with a graph behind all three if gradients are on."""
+        learns = torch.is_grad_enabled()
+        with torch.enable_grad():
+            points_m = points_m if points_m.requires_grad else points_m.detach().requires_grad_()
+            f, z = self.geometry(self.scaled(points_m))
+            f = self.scale_m * f
+            (gradient,) = torch.autograd.grad(f.sum(), points_m, create_graph=learns)
+        return (f, gradient, z) if learns else (f.detach(), gradient, z.detach())
+
+    def _surface_colour(self, origins_m: Tensor, directions: Tensor, depths_m: Tensor) -> Tensor:
+        """c (N, 3) where rays meet the surface; the point moves with the network's parameters."""
+        points = along(origins_m, directions, depths_m)
+        if torch.is_grad_enabled():
+            f, gradient, _ = self._evaluate(points)
+            points = intersection(points, directions, f, gradient)
+        return self._radiance(points, directions)
+
+    def _radiance(self, points_m: Tensor, directions: Tensor) -> Tensor:
+        """The rendering network on (x, n, v, z)."""
+        _, gradient, z = self._evaluate(points_m)
+        normal = nn.functional.normalize(gradient, dim=-1)
+        view = positional_encoding(directions, VIEW_OCTAVES)
+        return self.rendering(torch.cat([self.scaled(points_m), normal, view, z], -1))
+
+    def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
+        """c (N, 3) at points (N, 3) seen along directions (N, 3)."""
+        return self._radiance(points_m, directions)
+
+
+def intersection(points_m: Tensor, directions: Tensor, distance: Tensor, gradient: Tensor) -> Tensor:
+    """x^ = x0 - v f(x0; theta) / (grad f(x0; theta0) . v0) (equation 3): the points x0 (N, 3) themselves, with the
+    derivative of the true intersection by theta. distance (N,) with its graph, gradient (N, 3); v (N, 3)."""
+    slope = (gradient.detach() * directions).sum(-1).clamp(max=-LEAST_SLOPE)
+    return points_m - directions * ((distance - distance.detach()) / slope)[:, None]
+
+
+def trace(
+    distance: Callable[[Tensor], Tensor],
+    origins_m: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    tried: Tensor,
+    distances: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Where rays (R, 3) first enter the surface between near and far (R,): depths (R,), far where they do not, and (R,)
+    bool whether they do.
+
+    Sphere tracing, and the secant method where it did not converge or went past a crossing that distances (R, K) at
+    sorted depths `tried` (R, K) betray (section 3 and the supplement's ray tracing).
+    """
+    met, hit = _march(distance, origins_m, directions, near, far)
+    enters = (distances[:, :-1] > 0) & (distances[:, 1:] <= 0)
+    first = enters.int().argmax(1, keepdim=True)
+    overshot = enters.any(1) & ~(hit & (met <= tried.gather(1, first + 1)[:, 0]))
+    pick = torch.nonzero(overshot)[:, 0]
+    start, end = (tried.gather(1, first + k)[pick, 0] for k in (0, 1))
+    above, below = (distances.gather(1, first + k)[pick, 0] for k in (0, 1))
+    refined = _secant(distance, origins_m[pick], directions[pick], start, end, above, below)
+    return torch.where(hit, met, far).index_copy(0, pick, refined), hit | overshot
+
+
+def _march(
+    distance: Callable[[Tensor], Tensor], origins_m: Tensor, directions: Tensor, near: Tensor, far: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Sphere tracing from near: depths (R,), and whether they ended on the surface."""
+    depths, hit, moving = near.clone(), torch.zeros_like(near, dtype=torch.bool), near < far
+    for _ in range(TRACE_STEPS):
+        pick = torch.nonzero(moving)[:, 0]
+        step = distance(along(origins_m[pick], directions[pick], depths[pick]))
+        depths[pick] += step
+        within = (depths[pick] >= near[pick]) & (depths[pick] <= far[pick])
+        hit[pick] = within & (step.abs() <= CONVERGED_M)
+        moving[pick] = within & ~hit[pick]
+    return depths, hit
+
+
+def _secant(
+    distance: Callable[[Tensor], Tensor],
+    origins_m: Tensor,
+    directions: Tensor,
+    start: Tensor,
+    end: Tensor,
+    above: Tensor,
+    below: Tensor,
+) -> Tensor:
+    """The root between depths start and end (N,), where the distance is `above` > 0 and `below` <= 0."""
+    for _ in range(SECANT_STEPS):
+        middle = start + above / (above - below) * (end - start)
+        value = distance(along(origins_m, directions, middle))
+        outside = value > 0
+        start, above = torch.where(outside, middle, start), torch.where(outside, value, above)
+        end, below = torch.where(outside, end, middle), torch.where(outside, below, value)
+    return start + above / (above - below) * (end - start)

@@ -1,0 +1,114 @@
+"""NeRF (Mildenhall et al., Representing Scenes as Neural Radiance Fields for View Synthesis, ECCV 2020)."""
+
+import torch
+from torch import Tensor, nn
+
+from hnerf.baselines.static import Boxes, StaticField, along, stratified
+from hnerf.body.canonical import PoseCorrection, PosedBodies
+from hnerf.body.fit_result import BodyFit
+from hnerf.config import NerfSettings
+from hnerf.field.encoding import positional_encoding
+from hnerf.field.mlp import SkipMLP
+from hnerf.render.compositing import alpha_from_density, weights_from_alpha
+from hnerf.training.conditions import Conditions, Draws
+from hnerf.training.losses import RaySamples
+from hnerf.training.paper import resample
+
+LAYERS = 8
+POSITION_OCTAVES, VIEW_OCTAVES = 10, 4
+DENSITY_GAIN = 10.0  # densities of an opaque surface are tens to hundreds: so that they are within reach of few steps
+SURFACE_DENSITY_PER_M = 20.0  # sigma_h of H-NeRF, 50 per scene unit of 2.5 m: where a surface is read off
+BAND_M = 0.01  # bound of the distance that is read off
+
+
+class NerfNetwork(nn.Module):
+    """(gamma(x), gamma(v)) -> (sigma, c); density does not depend on the view (figure 7 of the paper)."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.trunk = SkipMLP(3 * (1 + 2 * POSITION_OCTAVES), width, LAYERS)
+        self.density = nn.Linear(width, 1)
+        view = 3 * (1 + 2 * VIEW_OCTAVES)
+        self.colour = nn.Sequential(nn.Linear(width + view, width // 2), nn.SiLU(), nn.Linear(width // 2, 3))
+
+    def forward(self, point: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
+        """point in [-1, 1], view, (..., 3) each: density (...) per unit of point's coordinates, colour (..., 3)."""
+        features = self.trunk(positional_encoding(point, POSITION_OCTAVES))
+        density = nn.functional.softplus(DENSITY_GAIN * self.density(features)[..., 0])
+        encoded = positional_encoding(view, VIEW_OCTAVES)
+        return density, torch.sigmoid(self.colour(torch.cat([features, encoded], -1)))
+
+
+class NerfField(StaticField):
+    """Static; a coarse and a fine network, hierarchical sampling, colour that depends on the view, no body but its box.
+
+    The first samples of a ray are the coarse network's; their opacity is `alpha_dot`, that of the fine network's
+    samples `alpha`, each zero where the other's samples are. So the loss `reconstruction` is that of the fine colour,
+    and `blend` with eta = 1 that of the coarse one: the two terms of the paper's equation 6.
+
+    Simplified: both terms are absolute errors, as for all compared methods, not squared ones; as many fine samples as
+    coarse ones (64 and 128 there); smaller networks, so that minutes on two CPU cores mean something (8 layers as
+    published, `width` 256 there); Swish as in H-NeRF instead of ReLU, which took several times as many steps to leave
+    an empty box; softplus instead of ReLU for the density, which cannot die; rays end with the person's box, behind
+    which the plate stands.
+    """
+
+    def __init__(self, body: BodyFit, settings: NerfSettings):
+        super().__init__(body, settings.box_margin_m, settings.samples, settings.learning_rate)
+        self.coarse, self.fine = NerfNetwork(settings.width), NerfNetwork(settings.width)
+
+    def sample(
+        self,
+        bodies: PosedBodies,
+        region: Boxes,
+        origins_m: Tensor,
+        directions: Tensor,
+        frame: Tensor,
+        conditions: Conditions,
+        draws: Draws,
+        correction: PoseCorrection | None = None,
+    ) -> tuple[RaySamples, Tensor]:
+        """As Field.sample: `samples` of the coarse network, then twice as many of the fine one (K = 3 x samples)."""
+        assert draws.finer is not None
+        near, far = region.interval(origins_m, directions, frame)
+        first = stratified(near, far, draws.jitter)
+        first_alpha, first_density, first_colour = self._look(self.coarse, origins_m, directions, first, far)
+        drawn = resample(first, near, far, weights_from_alpha(first_alpha.detach()), draws.finer)
+        every = torch.cat([first, drawn], 1).sort(1).values
+        alpha, density, colour = self._look(self.fine, origins_m, directions, every, far)
+        d = self._read_off(torch.cat([first_density, density], 1))
+        samples = RaySamples(
+            alpha=torch.cat([torch.zeros_like(first_alpha), alpha], 1),
+            alpha_dot=torch.cat([first_alpha, torch.zeros_like(alpha)], 1),
+            in_box=torch.ones_like(d),
+            colour=torch.cat([first_colour, colour], 1),
+            density=None,
+            d=d,
+            residual=torch.zeros_like(d),
+            gradient_norm=d.new_zeros(0),
+            beyond=draws.beyond,
+        )
+        return samples, torch.cat([first, every], 1)
+
+    def _look(
+        self, network: NerfNetwork, origins_m: Tensor, directions: Tensor, depths_m: Tensor, far_m: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """alpha, density (R, K) and colour (R, K, 3) at depths (R, K); the last sample reaches to the box's end."""
+        points = self.scaled(along(origins_m[:, None], directions[:, None], depths_m))
+        density, colour = network(points, directions[:, None].expand_as(points))
+        spacing = torch.diff(depths_m, dim=1, append=far_m[:, None]) / self.scale_m
+        return alpha_from_density(density, spacing), density, colour
+
+    def _read_off(self, density: Tensor) -> Tensor:
+        """BAND_M (sigma_h - sigma) / (sigma_h + sigma): zero where the density is sigma_h, negative where it is more,
+        within BAND_M. Its sign and its zero set mean something; its size does not."""
+        threshold = SURFACE_DENSITY_PER_M * self.scale_m
+        return BAND_M * (threshold - density) / (threshold + density)
+
+    def distance(self, points_m: Tensor) -> Tensor:
+        """Of the fine network's surface of density sigma_h, bounded by BAND_M."""
+        return self._read_off(self.fine(self.scaled(points_m), torch.zeros_like(points_m))[0])
+
+    def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
+        """c (N, 3) of the fine network at points (N, 3) seen along directions (N, 3)."""
+        return self.fine(self.scaled(points_m), directions)[1]

@@ -1,0 +1,152 @@
+"""The scene decides the size: what a capture's pixels, masks and poses ask of the fast machinery, and no more.
+
+A setting of 0, or no cells, is open; what a preset or an override names stands. `benchmarks/budget.py` measures what
+twice and half as much are worth.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.capture import Capture
+from hnerf.config import FastFieldSettings, TrainingSettings
+from hnerf.render.silhouette import silhouette
+from hnerf.segmentation.masks import Masks
+from hnerf.spread import spread
+
+ALIGNMENT_M = 0.01  # to which surfaces of different frames lie on each other; what is finer blurs, whatever the cells
+COLOUR_LEVELS, GEOMETRY_LEVELS = 4, 3  # of the grids, from the coarsest to the finest in equal ratios
+COARSEST_CELLS = {"colour": 24, "geometry": 16}
+GEOMETRY_COARSER = 3  # times than colour: cloth hangs in folds, prints have edges
+PATH = 2.4  # of a ray through the shell, in thicknesses of it, in the mean over rays that meet a person
+ROOM_M = 0.015  # beyond where masks reach, for poses that are still wrong
+THINNEST_M, THICKEST_M = 0.03, 0.15
+MASKS_A_CAMERA = 6  # are looked at
+STILL_RAD = 0.05  # spread of joints below which nothing can be learned from their angles
+POSE_WIDTH = 8
+LOOKS = 0.5  # how often a person's pixel is drawn in the mean
+LEAST_STEPS, MOST_STEPS = 300, 600
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A setting's value and why it is that."""
+
+    value: int | float | tuple[int, ...]
+    reason: str
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What was recorded, as far as it decides sizes. footprint_m: of a pixel on the body, median over cameras;
+    outside_m, inside_m: how far masks reach out of the fitted body and stay inside it, 99 % of their outlines; side_m:
+    longest of the rest body; spread_rad: of the free joints, mean; person_px: pixels of the person in all training
+    images."""
+
+    frames: int
+    footprint_m: float
+    outside_m: float
+    inside_m: float
+    side_m: float
+    spread_rad: float
+    person_px: int
+
+    @staticmethod
+    def of(capture: Capture, masks: Masks, body: BodyFit) -> "Scene":
+        """Looks at some masks of every training camera."""
+        vertices_m, faces = body.vertices_m().numpy(), body.rig.faces.numpy()
+        footprints_m, outlines_m, images, areas_px = [], [], 0, []
+        for camera in (capture.cameras[name] for name in capture.train_cameras):
+            kept = [frame for frame in capture.train_frames if (camera.name, frame) in masks]
+            images += len(kept)
+            for frame in spread(kept, MASKS_A_CAMERA):
+                points_m = vertices_m[body.index(frame)]
+                footprints_m.append(float(np.median(camera.project(points_m)[1])) / camera.K[0, 0])
+                covered = silhouette(camera, points_m, faces)
+                mask = masks.get(camera.name, frame)
+                outlines_m.append(footprints_m[-1] * _beyond_px(mask, covered))
+                areas_px.append(mask.sum())
+        inside_m, outside_m = np.percentile(np.concatenate(outlines_m), [1, 99])
+        rows = [body.index(frame) for frame in capture.train_frames]
+        angles = body.theta[rows][:, body.rig.free]
+        return Scene(
+            frames=len(capture.train_frames),
+            footprint_m=float(np.median(footprints_m)),
+            outside_m=float(max(outside_m, 0)),
+            inside_m=float(max(-inside_m, 0)),
+            side_m=float((body.rig.vertices_m.amax(0) - body.rig.vertices_m.amin(0)).max()),
+            spread_rad=float((angles - angles.mean(0)).square().sum(-1).mean(0).sqrt().mean()),
+            person_px=round(images * float(np.mean(areas_px))),
+        )
+
+
+def decide(scene: Scene, settings: TrainingSettings) -> tuple[TrainingSettings, dict[str, Decision]]:
+    """The settings with all that was open decided, and each decision by its setting's name."""
+    wanted = _field(scene, settings.fast) if settings.machinery == "fast" else {}
+    made = {name: decision for name, decision in wanted.items() if not getattr(settings.fast, name)}
+    fast = settings.fast.model_copy(update={name: decision.value for name, decision in made.items()})
+    decisions = {f"fast.{name}": decision for name, decision in made.items()}
+    if not settings.steps:
+        decisions["steps"] = _steps(scene, settings)
+    steps = decisions["steps"].value if not settings.steps else settings.steps
+    return settings.model_copy(update={"fast": fast, "steps": steps}), decisions
+
+
+def _field(scene: Scene, given: FastFieldSettings) -> dict[str, Decision]:
+    cell_m = max(scene.footprint_m, ALIGNMENT_M)
+    finest = f"a pixel covers {_mm(scene.footprint_m)}, frames align to {_mm(ALIGNMENT_M)}: cells of {_mm(cell_m)}"
+    outer_m, inner_m = (_thickness_m(reach_m) for reach_m in (scene.outside_m, scene.inside_m))
+    outer_m, inner_m = given.outer_m or outer_m, given.inner_m or inner_m
+    still = scene.spread_rad < STILL_RAD
+    cells = scene.side_m / cell_m
+    return {
+        "outer_m": Decision(outer_m, f"masks reach {_mm(scene.outside_m)} out of the fitted body, and room"),
+        "inner_m": Decision(inner_m, f"masks stay {_mm(scene.inside_m)} inside the fitted body, and room"),
+        "samples": Decision(
+            max(8, round(PATH * (outer_m + inner_m) / ALIGNMENT_M)),
+            f"one each {_mm(ALIGNMENT_M)} of a ray through a shell of {_mm(outer_m + inner_m)}",
+        ),
+        "colour_cells": Decision(_ladder(COARSEST_CELLS["colour"], cells, COLOUR_LEVELS), finest),
+        "geometry_cells": Decision(
+            _ladder(COARSEST_CELLS["geometry"], cells / GEOMETRY_COARSER, GEOMETRY_LEVELS),
+            f"{GEOMETRY_COARSER} times coarser than colour",
+        ),
+        "pose_width": Decision(
+            1 if still else POSE_WIDTH,
+            f"joints spread {np.rad2deg(scene.spread_rad):.1f} degrees over {scene.frames} frames"
+            + (": too little to learn from" if still else ""),
+        ),
+    }
+
+
+def _steps(scene: Scene, settings: TrainingSettings) -> Decision:
+    rays = settings.frames_per_step * settings.rays_per_frame
+    wanted = LOOKS * scene.person_px / rays
+    steps = int(np.clip(round(wanted, -1), LEAST_STEPS, MOST_STEPS))
+    reason = f"{scene.person_px} pixels of the person at {rays} rays a step ask for {wanted:.0f}"
+    return Decision(steps, f"{reason}; never fewer than {LEAST_STEPS} or more than {MOST_STEPS}")
+
+
+def _beyond_px(mask: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """Distance of a mask's outline from the body's silhouette, (P,), negative inside it."""
+    outline = mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
+    outwards = cv2.distanceTransform((~covered).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    inwards = cv2.distanceTransform(covered.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return (outwards - inwards)[outline]
+
+
+def _thickness_m(reach_m: float) -> float:
+    return round(float(np.clip(reach_m + ROOM_M, THINNEST_M, THICKEST_M)), 3)
+
+
+def _ladder(coarsest: int, finest: float, levels: int) -> tuple[int, ...]:
+    """Cells of each level along the longest side; one level where the finest is no finer than the coarsest."""
+    if finest <= coarsest:
+        return (max(2, round(finest)),)
+    return tuple(int(n) for n in np.geomspace(coarsest, finest, levels).round())
+
+
+def _mm(metres: float) -> str:
+    return f"{1e3 * metres:.1f} mm"

@@ -1,0 +1,80 @@
+"""A recording that a static method can learn in seconds: a ball, coloured by its normal, before a grey plate. The body
+fitted to it is a unit box: nothing but its extent tells about the ball."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+from hnerf.config import TrainingSettings
+from hnerf.training.model import TrainedAvatar, load_avatar
+from hnerf.training.processes import Processes
+from hnerf.training.trainer import train
+from tests.body.boxes import box_rig
+from tests.training.scene import SIZE_PX, KnownMasks, _write, look_at
+
+MIDDLE_M, RADIUS_M = np.full(3, 0.5), 0.35
+ALONE = Processes(0, 1, torch.device("cpu"))
+RING = tuple("01234567")  # every 45 degrees
+
+
+def render(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """The ball as a camera sees it: colour (H, W, 3) in [0, 255], black elsewhere; mask (H, W)."""
+    y, x = np.mgrid[:SIZE_PX, :SIZE_PX]
+    origins, directions = camera.rays(np.stack([x.ravel(), y.ravel()], 1).astype(np.float64))
+    along = ((MIDDLE_M - origins) * directions).sum(1)
+    beside_sq = ((MIDDLE_M - origins) ** 2).sum(1) - along**2
+    mask = beside_sq < RADIUS_M**2
+    depth = along - np.sqrt(np.maximum(RADIUS_M**2 - beside_sq, 0))
+    normal = (origins + depth[:, None] * directions - MIDDLE_M) / RADIUS_M
+    colour = np.where(mask[:, None], 127.5 + 100 * normal, 0)
+    return colour.reshape(SIZE_PX, SIZE_PX, 3), mask.reshape(SIZE_PX, SIZE_PX)
+
+
+def body() -> BodyFit:
+    """The unit box that stands for the ball's body."""
+    return BodyFit(box_rig(splits=4), (0,), torch.zeros(1, 2, 3), torch.eye(4)[None])
+
+
+def record(folder: Path) -> tuple[Capture, KnownMasks, BodyFit]:
+    """Write the recording of one frame to `folder`; eight cameras, all of them for training."""
+    cameras, masks = {}, {}
+    for k, name in enumerate(RING):
+        turn = k * np.pi / 4
+        camera = look_at(name, MIDDLE_M + np.array([2 * np.cos(turn), 2 * np.sin(turn), 0.4]), MIDDLE_M)
+        colour, mask = render(camera)
+        _write(folder / "images" / name / "000000.png", np.where(mask[..., None], colour, 128))
+        _write(folder / "background" / f"{name}.png", np.full_like(colour, 128))
+        cameras[name], masks[name, 0] = camera, mask
+    sizes = dict.fromkeys(cameras, (SIZE_PX, SIZE_PX))
+    capture = Capture("ball", folder, cameras, RING, (), (0,), (), 10.0, "z", sizes, sizes)
+    return capture, KnownMasks(masks), body()
+
+
+def trained(folder: Path, settings: TrainingSettings, cameras: tuple[str, ...]) -> TrainedAvatar:
+    """What is learned of the ball from some of the ring's cameras."""
+    capture, masks, fit = record(folder / "capture")
+    capture = dataclasses.replace(capture, train_cameras=cameras)
+    (folder / "out").mkdir()
+    train(capture, masks, fit, settings, folder / "out", ALONE)
+    return load_avatar(folder / "out")
+
+
+def psnr(avatar: TrainedAvatar, folder: Path, name: str) -> float:
+    """Of the whole picture that a camera of the ring sees, over black."""
+    camera = record(folder / "capture")[0].cameras[name]
+    drawn = avatar.render(camera, avatar.body.theta[0], avatar.body.root[0])
+    wanted = torch.from_numpy(render(camera)[0] / 255).float()
+    return float(-10 * torch.log10(((drawn.rgb - wanted) ** 2).mean()))
+
+
+def radii_m(avatar: TrainedAvatar, directions: torch.Tensor) -> torch.Tensor:
+    """How far from the ball's middle the outermost surface lies along directions (N, 3), (N,)."""
+    steps_m = torch.linspace(0, 1, 201)
+    points = torch.from_numpy(MIDDLE_M).float() + directions[:, None] * steps_m[:, None]
+    inside = avatar.signed_distance(points.flatten(0, 1), avatar.body.theta[0], avatar.body.root[0]).view(-1, 201) < 0
+    return (inside * steps_m).amax(1)

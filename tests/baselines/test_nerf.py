@@ -1,0 +1,121 @@
+import dataclasses
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from hnerf.baselines.nerf import BAND_M, SURFACE_DENSITY_PER_M, NerfField
+from hnerf.baselines.static import Boxes
+from hnerf.body.canonical import PosedBodies
+from hnerf.config import load_settings
+from hnerf.errors import CaptureError
+from hnerf.training.conditions import Conditions, Draws
+from hnerf.training.losses import RaySamples, Target, blend, reconstruction
+from hnerf.training.model import build_field
+from tests.baselines.ball import RING, body, psnr, trained
+
+SMALL = [
+    "training.steps=150",
+    "training.rays_per_frame=256",
+    "training.nerf.width=32",
+    "training.nerf.samples=16",
+    "training.nerf.learning_rate=0.01",
+]
+
+
+class Fog(torch.nn.Module):
+    """A network that says the same everywhere."""
+
+    def __init__(self, density: float, grey: float):
+        super().__init__()
+        self.said = density, grey
+
+    def forward(self, point: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.full_like(point[..., 0], self.said[0]), torch.full_like(point, self.said[1])
+
+
+@pytest.fixture
+def fog() -> NerfField:
+    """The unit box with 0.5 m around it, whose half edge is 1 m; a thin dark coarse fog and a dense bright fine one."""
+    field = NerfField(body(), load_settings("nerf", ["training.nerf.box_margin_m=0.5"]).training.nerf)
+    field.coarse, field.fine = Fog(0.5, 0.25), Fog(2.0, 0.75)
+    return field
+
+
+def look(field: NerfField, jitter: Draws) -> tuple[RaySamples, Tensor]:
+    """One ray through the middle of the box, 2 m inside it, before white; another that misses it."""
+    fit = body()
+    bodies = PosedBodies(fit.rig, fit.theta, fit.root, field.canonical_m)
+    conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.zeros(1, dtype=torch.long), 2.5)
+    origins = torch.tensor([[-3.0, 0.5, 0.5], [-3.0, 5.0, 0.5]])
+    directions, frame = torch.tensor([[1.0, 0, 0]]).repeat(2, 1), torch.zeros(2, dtype=torch.long)
+    draws = dataclasses.replace(jitter, beyond=torch.ones(2, 3))
+    return field.sample(bodies, field.region(bodies), origins, directions, frame, conditions, draws)
+
+
+def test_both_colours_by_hand(fog: NerfField) -> None:
+    """Strata of 2 m / 24 with their samples at the start: both networks see the whole 2 m. Fine 0.75 (1 - e^-4) + e^-4,
+    coarse 0.25 (1 - e^-1) + e^-1; the ray that misses the box sees white."""
+    still = Draws.still(2, 24, torch.device("cpu"))
+    zero = torch.zeros(2, 24)
+    samples, depths = look(fog, dataclasses.replace(still, jitter=zero, finer=zero))
+    assert samples.alpha.shape == depths.shape == (2, 72)
+    target = Target(torch.zeros(2, 3), torch.ones(2), torch.ones(2))
+    fine, coarse = 0.75 + 0.25 * math.exp(-4), 0.25 + 0.75 * math.exp(-1)
+    assert reconstruction(samples, target).item() == pytest.approx(3 * (fine + 1) / 2, abs=1e-4)
+    assert blend(samples, target, 1.0).item() == pytest.approx(3 * (coarse + 1) / 2, abs=1e-4)
+    assert depths[0, 0].item() == pytest.approx(2.5)  # the box starts at x = -0.5
+
+
+def test_fine_samples_crowd_where_the_coarse_network_saw_something(fog: NerfField) -> None:
+    """A coarse wall from 4 m on, all opaque: the 24 fine samples that are drawn lie in the cell where it begins, which
+    reaches half-way to the samples beside it, 2 m / 24 apart."""
+
+    class Wall(Fog):
+        def forward(self, point: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
+            return 1e4 * (point[..., 0] > 0.5).float(), torch.zeros_like(point)  # x > 1 m
+
+    fog.coarse = Wall(0, 0)
+    _, depths = look(fog, Draws.still(2, 24, torch.device("cpu")))
+    first = 4 + 1 / 24  # the first coarse sample behind the wall's face
+    assert ((depths[0, 24:] - first).abs() <= 1 / 24 + 1e-4).sum() >= 24
+
+
+def test_the_surface_is_where_the_density_is_sigma_h(fog: NerfField) -> None:
+    """With a half edge of 1 m sigma_h is 20 a unit: 0 there, BAND_M in empty space, -BAND_M / 3 at twice sigma_h."""
+    fit = body()
+    bodies = PosedBodies(fit.rig, fit.theta, fit.root, fog.canonical_m)
+    conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.zeros(1, dtype=torch.long), 2.5)
+    for density, distance in ((SURFACE_DENSITY_PER_M, 0.0), (0.0, BAND_M), (2 * SURFACE_DENSITY_PER_M, -BAND_M / 3)):
+        fog.fine = Fog(density, 0)
+        found = fog.signed_distance(bodies, torch.full((1, 3), 0.5), conditions)
+        assert found.item() == pytest.approx(distance, abs=1e-7)
+    outside = torch.tensor([[4.5, 4.5, 0.5]])  # 3 m and 3 m beyond the box: dense or not, nothing is there
+    assert fog.signed_distance(bodies, outside, conditions).item() == pytest.approx(3 * 2**0.5, rel=1e-6)
+
+
+def test_distance_to_a_box_by_hand() -> None:
+    """A box of 2 m: 1 m deep in the middle, 0.25 m near a face, 1 m before a face, the root of 3 from a corner."""
+    boxes = Boxes(torch.full((1, 3), -1.0), torch.ones(1, 3))
+    points = torch.tensor([[0.0, 0, 0], [0.75, 0, 0], [0, -2, 0], [2, 2, 2]])
+    torch.testing.assert_close(boxes.signed_distance(points), torch.tensor([-1.0, -0.25, 1.0, 3**0.5]))
+
+
+def test_more_than_one_moment_is_refused() -> None:
+    with pytest.raises(CaptureError, match="NeRF models one moment"):
+        build_field(load_settings("nerf").training, body(), static=False)
+
+
+def test_overfits_the_ball(tmp_path: Path) -> None:
+    """Eight views: 20 dB in a training view."""
+    avatar = trained(tmp_path, load_settings("nerf", SMALL).training, RING)
+    assert psnr(avatar, tmp_path, "0") > 20
+
+
+def test_two_opposite_views_say_nothing_of_the_view_between(tmp_path: Path) -> None:
+    """The networks learn the two pictures, not the ball: from the side at least 6 dB are lost."""
+    avatar = trained(tmp_path, load_settings("nerf", SMALL).training, ("0", "4"))
+    assert psnr(avatar, tmp_path, "0") > 20
+    assert psnr(avatar, tmp_path, "2") < psnr(avatar, tmp_path, "0") - 6

@@ -1,0 +1,78 @@
+"""What a scene asks for, by hand; and how a scene is measured."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.config import TrainingSettings
+from hnerf.training.budget import Scene, decide
+from tests.training.scene import record
+
+SCENE = Scene(
+    frames=24,
+    footprint_m=0.02,
+    outside_m=0.035,
+    inside_m=0.005,
+    side_m=1.92,
+    spread_rad=0.3,
+    person_px=2_000_000,
+)
+
+
+def decided(scene: Scene, **given: object) -> tuple[TrainingSettings, dict]:
+    settings = TrainingSettings.model_validate({"frames_per_step": 10, "rays_per_frame": 250} | given)
+    return decide(scene, settings)
+
+
+def test_sizes_by_hand():
+    """Pixels of 2 cm: 96 cells on 1.92 m, in steps of 4 ** (1 / 3) from 24; 32 for geometry, in steps of 2 ** (1 / 2)
+    from 16. Masks reach 3.5 cm out and 0.5 cm in, with 1.5 cm of room: 5 cm and, at least, 3 cm; 2.4 x 8 cm / 1 cm = 19
+    samples. Two million pixels at 2500 a step, each looked at half a time: 400 steps."""
+    settings, decisions = decided(SCENE)
+    fast = settings.fast
+    assert fast.colour_cells == (24, 38, 60, 96)
+    assert fast.geometry_cells == (16, 23, 32)
+    assert (fast.outer_m, fast.inner_m, fast.samples) == (0.05, 0.03, 19)
+    assert (fast.pose_width, settings.steps) == (8, 400)
+    assert decisions["fast.samples"].reason == "one each 10.0 mm of a ray through a shell of 80.0 mm"
+
+
+def test_no_finer_than_frames_align():
+    """Pixels of 1 mm would ask for 1920 cells; frames align to 1 cm."""
+    fast = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": 0.001}))[0].fast
+    assert fast.colour_cells[-1] == 192
+    assert fast.geometry_cells[-1] == 64
+
+
+def test_what_is_given_stands():
+    settings, decisions = decided(SCENE, steps=7, fast={"samples": 5, "outer_m": 0.2})
+    assert (settings.steps, settings.fast.samples, settings.fast.outer_m) == (7, 5, 0.2)
+    assert set(decisions) == {"fast.inner_m", "fast.colour_cells", "fast.geometry_cells", "fast.pose_width"}
+
+
+@pytest.mark.parametrize(("person_px", "steps"), [(1000, 300), (10**9, 600)])
+def test_steps_have_bounds(person_px: int, steps: int):
+    assert decided(SCENE.__class__(**{**vars(SCENE), "person_px": person_px}))[0].steps == steps
+
+
+def test_one_pose_teaches_nothing_about_poses():
+    settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "spread_rad": 0.01}))
+    assert settings.fast.pose_width == 1
+    assert decisions["fast.pose_width"].reason.endswith("too little to learn from")
+
+
+def test_a_scene_as_it_is_measured(tmp_path: Path):
+    """Cameras at 4.03 m with a focal length of 38.4 px: 0.105 m a pixel. The masks are the body's own silhouettes,
+    whose outline is its outermost pixels: half a pixel to one and a half inside. One joint of two is free and bends by
+    0 and 0.2 rad in the two training frames: 0.1 from their mean."""
+    capture, masks, body = record(tmp_path / "capture")
+    scene = Scene.of(capture, masks, body)
+    assert scene.frames == 2
+    assert scene.footprint_m == pytest.approx(0.105, abs=0.003)
+    assert scene.outside_m == 0.0
+    assert 0.09 < scene.inside_m < 0.2
+    assert scene.side_m == pytest.approx(2.0)
+    assert scene.spread_rad == pytest.approx(0.1)
+    areas = [masks.get(c, f).sum() for c in capture.train_cameras for f in capture.train_frames]
+    assert scene.person_px == pytest.approx(np.sum(areas), rel=0.01)
