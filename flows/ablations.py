@@ -6,7 +6,6 @@ all rows, and rows that are finished are found again, both through the store.
 
 import json
 import logging
-import os
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from flows.train_subject import find_masks
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, Settings, load_settings, with_changes
 from hnerf.errors import CaptureError
+from hnerf.study.files import replace_text
 from tasks.calibration import calibrate
 from tasks.capture import ingest
 from tasks.evaluation import evaluate
@@ -56,8 +56,8 @@ def ablate(capture: Path, preset: str, store: Path, overrides: list[str], only: 
         log.info("%s", name)
         result["rows"][name] = measure(shelf, source, truth, settings)
         table.parent.mkdir(parents=True, exist_ok=True)
-        _write(table.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
-        _write(table, as_markdown(result))
+        replace_text(table.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
+        replace_text(table, as_markdown(result))
     return table
 
 
@@ -142,9 +142,3 @@ def _score(split: dict[str, Any], key: str, form: str) -> str:
 
 def _line(cells: list[str]) -> str:
     return f"| {' | '.join(cells)} |"
-
-
-def _write(path: Path, text: str) -> None:
-    beside = path.with_name(f"{path.name}.partial")
-    beside.write_text(text)
-    os.replace(beside, path)

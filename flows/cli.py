@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from flows.ablations import ablate
+from flows.benchmark import benchmark
+from flows.stability import stability
 from flows.train_subject import train_subject
 from hnerf.calibration.boards import calibrate_from_boards
 from hnerf.capture.formats.export import WRITERS, write_cameras
@@ -87,6 +89,8 @@ def _parser() -> argparse.ArgumentParser:
     cameras.add_argument("--out", type=Path, default=Path("cameras"), help="the folder to write (default: cameras)")
     cameras.set_defaults(command=lambda o: _cameras(o.folder, o.format, o.out))
 
+    _add_benchmark(commands.add_parser("benchmark", help="compare methods: accuracy against training and frame time"))
+
     ablations = commands.add_parser("ablate", help="train without each part of the method in turn: a table")
     ablations.add_argument("capture", type=Path, help="the recording's folder")
     ablations.add_argument("--preset", default="fast", help="a name under configs/ or a YAML file (default: fast)")
@@ -95,6 +99,7 @@ def _parser() -> argparse.ArgumentParser:
     ablations.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these of configs/ablations/")
     ablations.set_defaults(command=lambda o: _ablate(o.capture, o.preset, o.store, o.overrides, o.only))
 
+    _add_stability(commands.add_parser("stability", help="make a capture worse in many ways: what breaks"))
     _add_render(commands.add_parser("render", help="pictures and video of a trained person"))
 
     synth = commands.add_parser("synth", help="write a synthetic capture with ground truth")
@@ -104,6 +109,41 @@ def _parser() -> argparse.ArgumentParser:
     demo = commands.add_parser("demo", help=f"synth and run in ./{DEMO}, in minutes")
     demo.set_defaults(command=lambda o: _demo())
     return parser
+
+
+def _add_benchmark(command: argparse.ArgumentParser) -> None:
+    command.add_argument("capture", type=Path, help="the recording's folder")
+    study = command.add_mutually_exclusive_group()
+    study.add_argument("--study", default="dynamic", help="a name under configs/benchmark/ or a YAML file")
+    study.add_argument("--quick", dest="study", action="store_const", const="quick", help="the study for 15 minutes")
+    command.add_argument("--methods", metavar="LIST", help="of the study, or presets, instead of all: fast,nerf")
+    command.add_argument("--seconds", type=_positive, metavar="S", help="of every training, instead of the study's")
+    command.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
+    command.set_defaults(command=_benchmark)
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise ValueError(text)
+    return value
+
+
+def _benchmark(options: argparse.Namespace) -> None:
+    methods = options.methods.split(",") if options.methods else None
+    table = benchmark.fn(options.capture, options.study, methods, options.seconds, options.store)
+    print(f"{table.read_text()}\ntable: {table}\nchart: {table.with_suffix('.png')}")
+
+
+def _add_stability(command: argparse.ArgumentParser) -> None:
+    command.add_argument("capture", type=Path, help="the recording's folder")
+    study = command.add_mutually_exclusive_group()
+    study.add_argument("--study", default="full", help="a name under configs/stability/ or a YAML file (default: full)")
+    study.add_argument("--quick", dest="study", action="store_const", const="quick", help="the study for 15 minutes")
+    command.add_argument("--methods", type=lambda names: names.split(","), default=[], metavar="LIST", help="presets")
+    command.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these degradations of the study")
+    command.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
+    command.set_defaults(command=lambda o: _stability(o.capture, o.study, o.store, o.methods, o.only))
 
 
 def _add_render(render: argparse.ArgumentParser) -> None:
@@ -159,6 +199,11 @@ def _run(capture: Path, preset: str, store: Path, overrides: list[str]) -> None:
 
 def _ablate(capture: Path, preset: str, store: Path, overrides: list[str], only: list[str]) -> None:
     table = ablate(capture, preset, store, overrides, only)
+    print(f"{table.read_text()}\ntable: {table}")
+
+
+def _stability(capture: Path, study: str, store: Path, methods: list[str], only: list[str]) -> None:
+    table = stability.fn(capture, study, store, methods, only)
     print(f"{table.read_text()}\ntable: {table}")
 
 

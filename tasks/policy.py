@@ -18,7 +18,7 @@ from tasks.store import Artifact, Store, sha256_of
 
 LASTING = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 
-Input = Artifact | Source | Section | None
+Input = Artifact | Source | Section | tuple[str, ...] | tuple[int, ...] | None
 
 
 def stage_key(task: str, version: str, inputs: dict[str, Input]) -> str:
@@ -29,8 +29,8 @@ def stage_key(task: str, version: str, inputs: dict[str, Input]) -> str:
 
 
 def _identity(value: Input) -> Any:
-    if value is None:
-        return None
+    if value is None or isinstance(value, tuple):
+        return value
     if isinstance(value, Section):
         return value.model_dump()
     if isinstance(value, Source):

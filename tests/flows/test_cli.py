@@ -13,7 +13,7 @@ from tests.shared_data import shared_capture
     [
         (["run", "absent"], "absent: no such folder"),
         (["check", "absent"], "absent: no such folder"),
-        (["run", "absent", "--preset", "best"], "best: no such preset or file; presets are demo, fast, paper"),
+        (["run", "absent", "--preset", "best"], "best: no such preset or file; presets are "),
         (["run", "absent", "--set", "training.stepz=1"], "training.stepz"),
         (["synth", "."], "exists; give the name of a new folder"),
     ],

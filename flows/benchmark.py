@@ -1,0 +1,118 @@
+"""Speed against accuracy: methods trained on the same data, scored while they train, timed, and charted."""
+
+import base64
+import json
+import logging
+import re
+from pathlib import Path
+from typing import Any
+
+from prefect import flow
+from prefect.artifacts import create_markdown_artifact
+from prefect.context import FlowRunContext
+
+from flows.train_subject import find_masks
+from hnerf.capture.capture import Capture
+from hnerf.config import Settings
+from hnerf.errors import CaptureError
+from hnerf.study.plan import ScoringSettings, Study, Variant, load_study
+from hnerf.study.publish import publish
+from tasks.benchmark import score_training
+from tasks.calibration import calibrate
+from tasks.capture import ingest
+from tasks.fit import fit
+from tasks.launcher import LostWorkerError
+from tasks.source import Source, read_capture
+from tasks.store import Artifact, Store
+from tasks.study import subset_capture
+from tasks.training import train
+
+log = logging.getLogger("hnerf.benchmark")
+
+
+@flow(name="benchmark", flow_run_name="{capture}-{study}")
+def benchmark(
+    capture: Path,
+    study: str = "dynamic",
+    methods: list[str] | None = None,
+    seconds: float | None = None,
+    store: Path = Path("store"),
+) -> Path:
+    """Train and score every method of a study on every variant; returns `<store>/benchmark/<subject>-<study>.md`, which
+    has CSV, JSON and charts beside it, all written anew after every training.
+
+    study: a name under configs/benchmark/ or a YAML file; methods: of the study, or presets, instead of all; seconds:
+    of every training, instead of the study's. A method that fails says why and the rest go on; a worker that was killed
+    ends the flow, and the same call goes on in the training that it was in.
+    """
+    plan = load_study(study).narrowed(methods or [], seconds)
+    settings = {name: plan.settings(name) for name in plan.methods}
+    shelf = Store(store.resolve())
+    source, truth = read_capture(capture)
+    recorded = Capture.load(ingest(shelf, source, next(iter(settings.values())).capture).root)
+    result = blank(plan, Path(study).stem, recorded)
+    table = publish(result, shelf.root)
+    for title, entry in result["variants"].items():
+        variant = plan.variants[title]
+        for name in () if "left_out" in entry else variant.methods or plan.methods:
+            log.info("%s: %s", title, name)
+            entry["methods"][name] = measure(shelf, source, truth, variant, settings[name], plan.scoring)
+            table = publish(result, shelf.root)
+    _announce(table)
+    return table
+
+
+def blank(plan: Study, study: str, recorded: Capture) -> dict[str, Any]:
+    """A result without figures, in the form of hnerf/study/results.py."""
+    described = plan.model_dump(include={"title", "notes", "seconds", "sweep", "methods"})
+    variants = {title: describe(variant, recorded) for title, variant in plan.variants.items()}
+    return {"subject": recorded.name, "study": study} | described | {"variants": variants}
+
+
+def describe(variant: Variant, recorded: Capture) -> dict[str, Any]:
+    """How many cameras and frames a variant trains on; why it is left out where the capture has not as many."""
+    try:
+        cameras, frames, _ = variant.parts(recorded)
+    except CaptureError as error:
+        return {"left_out": str(error)}
+    counts = {"cameras": len(cameras or recorded.train_cameras), "frames": len(frames or recorded.train_frames)}
+    return counts | {"methods": {}}
+
+
+def measure(
+    shelf: Store, source: Source, truth: Source, variant: Variant, settings: Settings, scoring: ScoringSettings
+) -> dict[str, Any]:
+    """A method's scores on a variant, and the folder of their files in the store; {"error": one line} if it fails."""
+    recording = ingest(shelf, source, settings.capture)
+    parts = variant.parts(Capture.load(recording.root))
+    if parts != (None, None, None):
+        recording = subset_capture(shelf, recording, *parts)
+    try:
+        calibration, model = trained(shelf, recording, settings)
+    except LostWorkerError:
+        raise
+    except (CaptureError, RuntimeError) as error:
+        log.warning("%s", error)
+        return {"error": str(error).splitlines()[-1]}
+    scores = score_training(shelf, truth, recording, calibration, model, scoring)
+    found: dict[str, Any] = json.loads((scores.root / "scores.json").read_text())
+    return found | {"folder": str(scores.root.relative_to(shelf.root))}
+
+
+def trained(shelf: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact]:
+    """The calibration and the training that a recording comes to."""
+    calibration = calibrate(shelf, recording, settings.calibration)
+    masks = find_masks(shelf, recording, calibration, settings)
+    body = fit(shelf, recording, calibration, masks, settings.fit)
+    return calibration, train(shelf, recording, calibration, masks, body, settings.training)
+
+
+def _announce(table: Path) -> None:
+    """The table with its charts on the flow run's page, where there is one."""
+    if FlowRunContext.get():
+        text = re.sub(r"(?<=\]\()[^)]+\.png", lambda name: _data_uri(table.with_name(name[0])), table.read_text())
+        create_markdown_artifact(text, key="benchmark", description=f"Speed against accuracy: {table.stem}")
+
+
+def _data_uri(picture: Path) -> str:
+    return f"data:image/png;base64,{base64.b64encode(picture.read_bytes()).decode()}"

@@ -1,0 +1,189 @@
+"""Where each method breaks: the same capture, made worse in one way at a time."""
+
+import json
+import logging
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from prefect import flow
+from prefect.artifacts import create_markdown_artifact
+from prefect.context import FlowRunContext
+
+from flows.train_subject import find_masks
+from hnerf.capture.capture import Capture
+from hnerf.config import Settings, load_settings
+from hnerf.errors import CaptureError
+from hnerf.study.degrade import KINDS, Degradation, degrade_settings
+from hnerf.study.files import replace_text
+from hnerf.study.stability import Stability, load_stability
+from hnerf.study.stability_charts import curve_chart, matrix_chart
+from hnerf.study.stability_report import REFERENCE, as_markdown
+from hnerf.study.verdict import Verdict, judge
+from tasks.calibration import calibrate
+from tasks.capture import ingest
+from tasks.evaluation import evaluate
+from tasks.fit import fit
+from tasks.launcher import LostWorkerError
+from tasks.policy import LASTING
+from tasks.source import Source, read_capture
+from tasks.store import Artifact, Store
+from tasks.study import check_meshes, degrade_capture, degrade_fit, degrade_masks, show_in_extreme_poses
+from tasks.training import train
+
+log = logging.getLogger("hnerf.stability")
+
+Figures = dict[str, Any]
+
+
+@flow(name="stability", flow_run_name="{capture}")
+def stability(
+    capture: Path,
+    study: str = "full",
+    store: Path = Path("store"),
+    methods: Sequence[str] = (),
+    only: Sequence[str] = (),
+) -> Path:
+    """Run each method on a capture made worse in every way that a study names; returns the table,
+    `<store>/stability/<subject>-<study>.md`, which has JSON beside it, both written anew after every run, and charts
+    when it ends, however it ends.
+
+    study: a name under configs/stability/ or a YAML file; methods: presets in place of the study's; only: names of
+    degradations. A failure is a result and the rest go on; a worker that was killed (LostWorkerError) ends the command,
+    and the same command goes on from there.
+    """
+    plan = load_stability(study).only(only)
+    plan = plan.model_copy(update={"methods": tuple(methods)}) if methods else plan
+    presets = {name: load_settings(name, list(plan.overrides)) for name in plan.methods}
+    shelf = Store(store.resolve())
+    source, truth = read_capture(capture)
+    subject = Capture.load(ingest(shelf, source, next(iter(presets.values())).capture).root).name
+    table = shelf.root / "stability" / f"{subject}-{Path(study).stem}.md"
+    table.parent.mkdir(parents=True, exist_ok=True)
+    result: Figures = {"subject": subject, "study": study, "plan": plan.model_dump(mode="json")}
+    result |= {"left_out": plan.left_out(), "protocol": None, "runs": []}
+    try:
+        for run in _runs(shelf, source, truth, plan, presets):
+            result["protocol"] = run.pop("protocol", None) or result["protocol"]
+            result["runs"].append(run)
+            _tell(result, [], table)
+    finally:
+        _tell(result, _draw(result, table), table)
+    if FlowRunContext.get():
+        create_markdown_artifact(table.read_text(), key="stability", description=f"Where methods break on {subject}")
+    return table
+
+
+def _runs(
+    shelf: Store, source: Source, truth: Source, plan: Stability, presets: dict[str, Settings]
+) -> Iterator[Figures]:
+    """Every run's row: its method, degradation and verdict, and figures where there are any. A method without a good
+    run to compare with has no others."""
+    for method, preset in presets.items():
+        for seed in plan.seeds:
+            settings = preset.model_copy(update={"training": preset.training.model_copy(update={"seed": seed})})
+            log.info("%s, seed %d, as recorded", method, seed)
+            good = attempt(shelf, source, truth, settings, None)
+            row = {"method": method, "seed": seed}
+            yield row | {"kind": REFERENCE, "strength": None} | judged(good, good)
+            if "error" in good:
+                continue
+            for kind, strengths in plan.degradations.items():
+                for strength in strengths:
+                    log.info("%s, seed %d, %s: %g", method, seed, KINDS[kind].label, strength)
+                    degradation = Degradation(kind=kind, strength=strength, seed=seed)
+                    found = attempt(shelf, source, truth, settings, degradation)
+                    yield row | {"kind": kind, "strength": strength} | judged(found, good)
+
+
+def judged(found: Figures, good: Figures) -> Figures:
+    """Figures with their verdict."""
+    verdict = Verdict(*found["error"]) if "error" in found else judge(found, good, found["faults"])
+    return {key: value for key, value in found.items() if key != "error"} | {
+        "verdict": verdict.word,
+        "reason": verdict.reason,
+    }
+
+
+def attempt(
+    shelf: Store, source: Source, truth: Source, settings: Settings, degradation: Degradation | None
+) -> Figures:
+    """What `measure` found, or {"error": (verdict, reason)}: bad input that was told before or by training is refused,
+    anything else that went wrong has failed."""
+    at_bad_input = "refused"
+    try:
+        stages = prepare(shelf, source, settings, degradation)
+        training = settings.training
+        if degradation and KINDS[degradation.kind].place == "settings":
+            training = degrade_settings(training, degradation)
+        model = train(shelf, *stages, training)
+        at_bad_input = "failed"
+        return measure(shelf, source, truth, settings, degradation, stages, model)
+    except LostWorkerError:
+        raise
+    except CaptureError as error:
+        return {"error": (at_bad_input, str(error))}
+    except Exception as error:  # whatever breaks is what the study is after
+        if isinstance(error, OSError) and not isinstance(error, LASTING):
+            raise  # a full disk, a lost share
+        log.warning("%s: %s", type(error).__name__, error)
+        return {"error": ("failed", str(error).splitlines()[-1] if str(error) else type(error).__name__)}
+
+
+def prepare(
+    shelf: Store, source: Source, settings: Settings, degradation: Degradation | None
+) -> tuple[Artifact, Artifact, Artifact, Artifact]:
+    """Capture, calibration, masks and body, made worse at the degradation's place."""
+    place = KINDS[degradation.kind].place if degradation else None
+    recording = ingest(shelf, source, settings.capture)
+    if degradation and place == "capture":
+        recording = degrade_capture(shelf, recording, degradation)
+    calibration = calibrate(shelf, recording, settings.calibration)
+    masks = find_masks(shelf, recording, calibration, settings)
+    if degradation and place == "masks":
+        masks = degrade_masks(shelf, recording, calibration, masks, degradation)
+    body = fit(shelf, recording, calibration, masks, settings.fit)
+    if degradation and place == "fit":
+        body = degrade_fit(shelf, body, degradation)
+    return recording, calibration, masks, body
+
+
+def measure(
+    shelf: Store,
+    source: Source,
+    truth: Source,
+    settings: Settings,
+    degradation: Degradation | None,
+    stages: tuple[Artifact, Artifact, Artifact, Artifact],
+    model: Artifact,
+) -> Figures:
+    """Faults of surfaces; PSNR, SSIM and Chamfer distance against the truth, None where there is none."""
+    nothing = {"psnr": None, "ssim": None, "chamfer_mm": None}
+    if degradation and KINDS[degradation.kind].place == "poses":
+        return nothing | {"faults": _faults(show_in_extreme_poses(shelf, model, degradation))}
+    report = evaluate(shelf, truth, *stages, model, settings.evaluation)
+    *_, good_body = prepare(shelf, source, settings, None)
+    metrics = json.loads((report.root / "metrics.json").read_text())
+    split = metrics["novel_pose" if metrics["novel_pose"]["n"] else "novel_view"]
+    chamfer_mm = (split["geometry"] or {}).get("chamfer_mm")
+    found = {"psnr": split["psnr"], "ssim": split["ssim"], "chamfer_mm": chamfer_mm, "protocol": metrics["protocol"]}
+    found["seconds"] = json.loads((model.root / "report.json").read_text())["seconds"]
+    return found | {"faults": _faults(check_meshes(shelf, report, good_body))}
+
+
+def _faults(checked: Artifact) -> list[str]:
+    surfaces = json.loads((checked.root / "surface.json").read_text())
+    return [surface["fault"] for surface in surfaces.values() if surface["fault"]]
+
+
+def _tell(result: Figures, charts: list[str], table: Path) -> None:
+    replace_text(table.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
+    replace_text(table, as_markdown(result, charts))
+
+
+def _draw(result: Figures, table: Path) -> list[str]:
+    """Names of the charts that there is something to draw for."""
+    paths = {key: table.with_name(f"{table.stem}-{key}.png") for key in ("matrix", "psnr", "chamfer_mm")}
+    matrix_chart(result, paths["matrix"])
+    drawn = [key for key in ("psnr", "chamfer_mm") if curve_chart(result, key, paths[key])]
+    return [paths[key].name for key in ("matrix", *drawn)]

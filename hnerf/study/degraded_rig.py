@@ -1,0 +1,61 @@
+"""A capture with fewer cameras or frames, or with one camera that points elsewhere or lags."""
+
+import dataclasses
+import shutil
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+
+from hnerf.capture.capture import Capture
+from hnerf.errors import CaptureError
+from hnerf.study.subset import copy_pixels, subset, write_arrays, write_keypoints
+
+T = TypeVar("T")
+
+
+def leave_cameras(capture: Capture, count: float, rng: np.random.Generator, out: Path) -> None:
+    """Keep `count` training cameras, drawn at random; CaptureError if there are no more than that."""
+    subset(capture, out, _drawn(capture.name, "cameras", capture.train_cameras, count, rng), None, None)
+
+
+def leave_frames(capture: Capture, count: float, rng: np.random.Generator, out: Path) -> None:
+    """Keep `count` training frames, drawn at random; CaptureError if there are no more than that."""
+    subset(capture, out, None, _drawn(capture.name, "frames", capture.train_frames, count, rng), None)
+
+
+def turn_camera(capture: Capture, angle_deg: float, rng: np.random.Generator, out: Path) -> None:
+    """One training camera's extrinsics turned about its centre and an axis at random; its images stay."""
+    camera = capture.cameras[str(rng.choice(capture.train_cameras))]
+    axis = rng.normal(size=3)
+    turn = cv2.Rodrigues(np.deg2rad(angle_deg) * axis / np.linalg.norm(axis))[0]
+    turned = dataclasses.replace(camera, R=turn @ camera.R, t_m=turn @ camera.t_m)
+    subset(capture.with_cameras(capture.cameras | {camera.name: turned}), out, None, None, None)
+
+
+def put_out_of_step(capture: Capture, frames: float, rng: np.random.Generator, out: Path) -> None:
+    """One training camera, at random, shows at each frame what it saw that many frames before; its first picture stands
+    still until then."""
+    late = str(rng.choice(capture.train_cameras))
+    kept = dataclasses.replace(capture, root=out)
+    write_arrays(capture, kept)
+    for name in capture.cameras:
+        copy_pixels(capture, kept, name)
+    rows = np.maximum(np.arange(len(capture.frames)) - round(frames), 0)
+    found = {name: capture.keypoints(name) for name in capture.cameras}
+    keypoints = {name: people for name, people in found.items() if people is not None}
+    if late in keypoints:
+        write_keypoints(out, keypoints | {late: keypoints[late][rows]})
+    for folder in ("images", "masks"):
+        for frame, row in zip(capture.frames, rows, strict=True):
+            for source in (capture.root / folder / late).glob(f"{capture.frames[row]:06d}.*"):
+                shutil.copyfile(source, out / folder / late / f"{frame:06d}{source.suffix}")
+    kept.save()
+
+
+def _drawn(name: str, what: str, there_are: tuple[T, ...], count: float, rng: np.random.Generator) -> tuple[T, ...]:
+    if count >= len(there_are):
+        raise CaptureError(f"{name}: has only {len(there_are)} training {what}; leave fewer than that")
+    rows = np.sort(rng.permutation(len(there_are))[: round(count)])
+    return tuple(there_are[row] for row in rows)

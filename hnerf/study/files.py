@@ -1,0 +1,11 @@
+"""Tables that are written anew while somebody may be reading them."""
+
+import os
+from pathlib import Path
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write beside and rename."""
+    beside = path.with_name(f"{path.name}.partial")
+    beside.write_text(text)
+    os.replace(beside, path)

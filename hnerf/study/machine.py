@@ -1,0 +1,28 @@
+"""The machine that figures were taken on."""
+
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import torch
+
+
+def machine() -> dict[str, Any]:
+    """Processor, cores, GPU (None where there is none) and the versions that speed depends on."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return {
+        "cpu": names[0] if names else platform.processor(),
+        "cores": os.cpu_count(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def in_words(found: dict[str, Any]) -> str:
+    """The same as part of a sentence."""
+    gpu = found["gpu"] or "no GPU"
+    return f"{found['cpu']}, {found['cores']} cores, {gpu}, torch {found['torch']}, Python {found['python']}"

@@ -1,0 +1,116 @@
+"""What a benchmark compares: methods on parts of a capture, as a YAML file under `configs/benchmark/` says."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import yaml
+from pydantic import Field, ValidationError
+
+from hnerf.capture.capture import Capture
+from hnerf.config import CONFIGS, Section, Settings, load_settings
+from hnerf.errors import CaptureError
+from hnerf.spread import spread
+
+STUDIES = CONFIGS / "benchmark"
+FIRST_SNAPSHOT_S = 15.0  # where a training has no limit that could be halved
+
+
+class Variant(Section):
+    """Part of a capture. cameras, frames: of training, how many of them or which; None is all."""
+
+    cameras: int | tuple[str, ...] | None = None
+    frames: int | tuple[int, ...] | None = None
+    novel_poses: bool = True
+    methods: tuple[str, ...] = ()  # of the study's; none is all
+
+    def parts(self, capture: Capture) -> tuple[tuple[str, ...] | None, tuple[int, ...] | None, tuple[int, ...] | None]:
+        """Training cameras, training frames and novel-pose frames to keep, None for all.
+
+        Fewer cameras are taken at equal steps of the capture's order, frames evenly spread over time. CaptureError if
+        the capture has not as many.
+        """
+        cameras, frames = self.cameras, self.frames
+        if isinstance(cameras, int):
+            there_are = _at_least(cameras, capture.train_cameras, "training cameras")
+            cameras = tuple(there_are[k * len(there_are) // cameras] for k in range(cameras))
+        if isinstance(frames, int):
+            frames = tuple(spread(_at_least(frames, capture.train_frames, "training frames"), frames))
+        return cameras, frames, None if self.novel_poses else ()
+
+
+class ScoringSettings(Section):
+    """How much of what is held out is rendered and meshed. split: of curves and charts; new poses in any case where no
+    camera is held out."""
+
+    split: Literal["novel_view", "novel_pose"] = "novel_view"
+    images: int | None = Field(default=None, ge=1)  # a split, of the finished model; None: all
+    meshes: int = Field(default=2, ge=1)  # a split
+    snapshot_images: int = Field(default=4, ge=1)
+    snapshot_meshes: int = Field(default=1, ge=0)
+    frame_sizes_px: tuple[int, ...] = Field(default=(256, 512), min_length=1)  # longest sides of images that are timed
+
+
+class Study(Section):
+    """A benchmark. methods: presets; seconds: of every training, None to each preset's own end; snapshots: how many are
+    scored before it."""
+
+    title: str
+    notes: tuple[str, ...] = ()  # what a reader has to know, such as what is left out
+    seconds: float | None = Field(default=None, gt=0)
+    snapshots: int = Field(default=4, ge=0, le=12)
+    sweep: Literal["cameras", "frames"] | None = None  # what the variants differ in, for a chart of its own
+    methods: tuple[str, ...] = Field(min_length=1)
+    variants: dict[str, Variant] = Field(min_length=1)
+    scoring: ScoringSettings = ScoringSettings()
+
+    def settings(self, method: str) -> Settings:
+        """All stages' settings; training stops after `seconds` and is saved on the way."""
+        settings = load_settings(method)
+        training = {"seconds": self.seconds, "snapshots_s": snapshot_times_s(self.seconds, self.snapshots)}
+        return settings.model_copy(update={"training": settings.training.model_copy(update=training)})
+
+    def narrowed(self, names: Sequence[str], seconds: float | None) -> "Study":
+        """The study of these methods alone and this time limit; one that it does not have is tried on every variant.
+        Where there are no names it keeps its methods, and where there is no limit, its own."""
+        methods = tuple(names) or self.methods
+        variants = {}
+        for title, variant in self.variants.items():
+            there = variant.methods or self.methods
+            if kept := tuple(name for name in methods if name in there or name not in self.methods):
+                variants[title] = variant.model_copy(update={"methods": kept})
+        changes = {"methods": methods, "variants": variants, "seconds": seconds or self.seconds}
+        return self.model_copy(update=changes)
+
+
+def load_study(name: str) -> Study:
+    """A study by its name or its file's path; CaptureError with one line if there is none or a key is not allowed."""
+    path = STUDIES / f"{name}.yaml" if (STUDIES / f"{name}.yaml").exists() else Path(name)
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in STUDIES.glob("*.yaml")))
+        raise CaptureError(f"{name}: no such study or file; studies are {known}")
+    try:
+        study = Study.model_validate(yaml.safe_load(path.read_text()))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise CaptureError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    for title, variant in study.variants.items():
+        for method in variant.methods:
+            if method not in study.methods:
+                raise CaptureError(
+                    f"{path}: variants.{title}: no method {method}; there are {', '.join(study.methods)}"
+                )
+    return study
+
+
+def snapshot_times_s(seconds: float | None, count: int) -> tuple[float, ...]:
+    """The time limit halved `count` times over, in ascending order; without a limit, doublings of 15 s."""
+    if seconds is None:
+        return tuple(FIRST_SNAPSHOT_S * 2**k for k in range(count))
+    return tuple(seconds / 2**k for k in range(count, 0, -1))
+
+
+def _at_least(count: int, items: Sequence, what: str) -> Sequence:
+    if len(items) < count:
+        raise CaptureError(f"the capture has {len(items)} {what}, not {count}")
+    return items

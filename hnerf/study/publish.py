@@ -1,0 +1,70 @@
+"""The files of a benchmark's result: JSON, CSV, Markdown, and charts beside them."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hnerf.capture.capture import read_rgb
+from hnerf.study import charts, results
+from hnerf.study.files import replace_text
+
+NEARNESS = (  # figure of an image, split, label of the axis
+    ("view_angle_deg", "novel_view", "angle from the nearest training camera, degrees"),
+    ("pose_distance_mm", "novel_pose", "mean distance of the surface from the nearest training pose, mm"),
+)
+PSNR = "held-out PSNR, dB"
+
+
+def publish(result: dict[str, Any], store: Path) -> Path:
+    """Write `<store>/benchmark/<subject>-<study>.{md,csv,json}` and its PNGs anew; the Markdown file's path."""
+    table = store / "benchmark" / f"{result['subject']}-{result['study']}.md"
+    table.parent.mkdir(parents=True, exist_ok=True)
+    drawn = draw(result, store, table)
+    replace_text(table.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
+    replace_text(table.with_suffix(".csv"), results.as_csv(result))
+    replace_text(table, results.as_markdown(result, [path.name for path in drawn]))
+    return table
+
+
+def draw(result: Mapping[str, Any], store: Path, table: Path) -> list[Path]:
+    """Every chart that the result has figures for; their paths."""
+    looks, caption, variants = charts.styles(result["methods"]), results.caption(result), result["variants"]
+    paths = {name: table.with_name(f"{table.stem}{name}.png") for name in ("", "-sweep", "-nearness", "-pictures")}
+    for path in paths.values():
+        path.unlink(missing_ok=True)
+    panels = {
+        title: (results.psnr_curves(variant), results.frame_points(variant)) for title, variant in variants.items()
+    }
+    if rows := {results.heading(title, variants[title]): row for title, row in panels.items() if any(row)}:
+        frame = f"time of a frame of {results.timed_px(result)} px, s (log scale)"
+        charts.speed_chart(rows, looks, ("training, s (log scale)", frame, PSNR), caption, paths[""])
+    if result["sweep"] and (curves := results.sweep_curves(result)):
+        charts.sweep_chart(curves, looks, f"training {result['sweep']}", PSNR, caption, paths["-sweep"])
+    near = [
+        (f"{title}, {results.SPLITS[split]}", label, clouds)
+        for title, variant in variants.items()
+        for key, split, label in NEARNESS
+        if (clouds := results.clouds(variant, split, key))
+    ]
+    if near:
+        charts.nearness_chart(near, looks, f"{PSNR} (an image)", caption, paths["-nearness"])
+    pictures = [row for title, variant in variants.items() for row in picture_rows(title, variant, store)]
+    if pictures:
+        charts.picture_grid(pictures, caption, paths["-pictures"])
+    return [path for path in paths.values() if path.exists()]
+
+
+def picture_rows(title: str, variant: Mapping[str, Any], store: Path) -> list[tuple[str, list[tuple[str, Any]]]]:
+    """Of each pictured image: the truth, and each method's rendering with its PSNR."""
+    methods = results.scored(variant)
+    rows = []
+    for k, view in enumerate(next(iter(methods.values()))["pictures"] if methods else []):
+        pictures = []
+        for name, scores in methods.items():
+            folder = store / scores["folder"] / "pictures"
+            (psnr,) = (row["psnr"] for row in scores[scores["split"]]["per_image"] if view.items() <= row.items())
+            pictures.append((f"{name}, {psnr:.1f} dB", read_rgb(folder / f"{k}-render.png")))
+        truth = read_rgb(folder / f"{k}-truth.png")
+        rows.append((f"{title}: frame {view['frame']}, camera {view['camera']}", [("truth", truth), *pictures]))
+    return rows

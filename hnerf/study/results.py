@@ -1,0 +1,177 @@
+"""A benchmark's result as tables: Markdown for people, CSV for spreadsheets; and what its charts show.
+
+A result is a plain tree, as the JSON file has it:
+    {subject, study, title, notes, seconds, sweep, methods: [name], variants: {title: {cameras, frames,
+     methods: {name: scores of hnerf/study/scoring.py, or {"error": one line}}} or {"left_out": why}}}
+"""
+
+import csv
+import io
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from hnerf.study.curves import Point, seconds_to
+from hnerf.study.machine import in_words
+
+SPLITS = {"novel_view": "new views", "novel_pose": "new poses"}
+COLUMNS = {  # in a split's scores; cells show new views / new poses
+    "psnr": ("PSNR, dB", "{:.2f}"),
+    "ssim": ("SSIM", "{:.3f}"),
+    "mask_iou": ("mask IoU", "{:.3f}"),
+    "geometry.chamfer_l2_e3": ("Chamfer x1e-3 m²", "{:.3f}"),
+    "geometry.normal_consistency": ("NC", "{:.3f}"),
+    "geometry.iou": ("IoU", "{:.3f}"),
+}
+COSTS = {  # of a training
+    "seconds": ("training, s", "{:.0f}"),
+    "peak_memory_gib": ("peak memory, GiB", "{:.1f}"),
+    "model_mib": ("model, MiB", "{:.1f}"),
+}
+NEAR_BEST_DB = 1.0
+
+
+def scored(variant: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """A variant's methods that were trained and scored."""
+    return {name: scores for name, scores in variant.get("methods", {}).items() if "error" not in scores}
+
+
+def psnr_curves(variant: Mapping[str, Any]) -> dict[str, list[Point]]:
+    """Of each method: PSNR over training seconds; only methods of which images could be scored."""
+    curves = {
+        name: [(row["seconds"], row["psnr"]) for row in scores["curve"] if row["psnr"] is not None]
+        for name, scores in scored(variant).items()
+    }
+    return {name: curve for name, curve in curves.items() if curve}
+
+
+def frame_points(variant: Mapping[str, Any]) -> dict[str, Point]:
+    """Of each method: seconds of a frame at the smallest size that was timed, and PSNR of the finished model."""
+    methods = scored(variant).items()
+    points = {
+        name: (_smallest(scores["frame_seconds"])[1], scores[scores["split"]]["psnr"]) for name, scores in methods
+    }
+    return {name: (seconds, psnr) for name, (seconds, psnr) in points.items() if psnr is not None}
+
+
+def heading(title: str, variant: Mapping[str, Any]) -> str:
+    """A variant's title and what its charts are about."""
+    return f"{title}, {' and '.join(sorted({SPLITS[scores['split']] for scores in scored(variant).values()}))}"
+
+
+def timed_px(result: Mapping[str, Any]) -> str:
+    """The smallest image, by its longest side, that was timed."""
+    return min((size for variant in result["variants"].values() for size in _sizes(variant)), key=int)
+
+
+def sweep_curves(result: Mapping[str, Any]) -> dict[str, list[Point]]:
+    """Of each method: PSNR of the finished model over the number of cameras or frames, in ascending order."""
+    curves: dict[str, list[Point]] = {}
+    for variant in result["variants"].values():
+        for name, (_, psnr) in frame_points(variant).items():
+            curves.setdefault(name, []).append((variant[result["sweep"]], psnr))
+    return {name: sorted(points) for name, points in curves.items()}
+
+
+def clouds(variant: Mapping[str, Any], split: str, key: str) -> dict[str, list[Point]]:
+    """Of each method: PSNR of every image of a split over a figure of the image, such as "view_angle_deg"."""
+    found = {
+        name: [(row[key], row["psnr"]) for row in scores[split]["per_image"]]
+        for name, scores in scored(variant).items()
+    }
+    return {name: points for name, points in found.items() if points}
+
+
+def near_best_seconds(variant: Mapping[str, Any]) -> dict[str, float | None]:
+    """When each method came within 1 dB of the best end of all of a variant; None if it never did."""
+    curves = psnr_curves(variant)
+    best = max((curve[-1][1] for curve in curves.values()), default=0.0)
+    return {name: seconds_to(curve, best - NEAR_BEST_DB) for name, curve in curves.items()}
+
+
+def caption(result: Mapping[str, Any]) -> str:
+    """What was measured, and on which machines."""
+    machines = sorted({in_words(s["machine"]) for v in result["variants"].values() for s in scored(v).values()})
+    limit = f"{result['seconds']:g} s of training" if result["seconds"] else "training to each preset's own end"
+    return f"{result['subject']}, study {result['study']}: {limit}; on {'; on '.join(machines) or 'no machine yet'}."
+
+
+def as_markdown(result: Mapping[str, Any], pictures: list[str]) -> str:
+    """The whole result for people. pictures: paths from where the text will lie."""
+    lines = [f"# {result['title']}: {result['subject']}", "", caption(result), ""]
+    lines += [f"- {note}" for note in result["notes"]] + [""] * bool(result["notes"])
+    lines += [f"![{picture}]({picture})\n" for picture in pictures]
+    lines += ["Two figures in a cell: new views / new poses.", ""]
+    for title, variant in result["variants"].items():
+        lines += [f"## {title}", "", *_variant_lines(variant), ""]
+    everything = [scores for variant in result["variants"].values() for scores in scored(variant).values()]
+    lines += [f"LPIPS: {text}." for text in sorted({scores["lpips"] for scores in everything})]
+    return "\n".join([*lines, "", *sorted({scores["protocol"] for scores in everything}), ""])
+
+
+def _variant_lines(variant: Mapping[str, Any]) -> list[str]:
+    if "left_out" in variant:
+        return [f"Left out: {variant['left_out']}."]
+    sizes = _sizes(variant)
+    titles = ["method", *(t for t, _ in COLUMNS.values()), *(t for t, _ in COSTS.values())]
+    titles += [f"frame at {size} px, s" for size in sizes] + [f"s to best - {NEAR_BEST_DB:g} dB"]
+    near_best = near_best_seconds(variant)
+    lines = [f"{variant['cameras']} training cameras, {variant['frames']} training frames.", ""]
+    lines += [_line(titles), "|" + "---|" * len(titles)]
+    reasons: dict[str, list[str]] = {}
+    for name, scores in variant["methods"].items():
+        if "error" in scores:
+            lines.append(_line([name, scores["error"].replace("|", "/"), *[""] * (len(titles) - 2)]))
+            continue
+        cells = [" / ".join(_shown(_pick(scores[s], key), form) for s in SPLITS) for key, (_, form) in COLUMNS.items()]
+        cells += [_shown(scores["training"][key], form) for key, (_, form) in COSTS.items()]
+        cells += [_shown(scores["frame_seconds"].get(size), "{:.2f}") for size in sizes]
+        lines.append(_line([name, *cells, _shown(near_best.get(name), "{:.0f}")]))
+        for reason in _reasons(scores):
+            reasons.setdefault(reason, []).append(name)
+    missing = [f"- {', '.join(names)}: {reason}" for reason, names in reasons.items()]
+    return [*lines, *(["", *missing] if missing else [])]
+
+
+def as_csv(result: Mapping[str, Any]) -> str:
+    """A row for each method of each variant, one figure a cell; empty where there is none."""
+    sizes = sorted({size for variant in result["variants"].values() for size in _sizes(variant)}, key=int)
+    keys = [f"{split}.{key}" for split in SPLITS for key in COLUMNS] + [f"training.{key}" for key in COSTS]
+    keys += [f"frame_seconds.{size}" for size in sizes]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["variant", "cameras", "frames", "method", *keys, "error"])
+    for title, variant in result["variants"].items():
+        for name, scores in variant.get("methods", {}).items():
+            figures = ["" if (value := _pick(scores, key)) is None else value for key in keys]
+            writer.writerow([title, variant["cameras"], variant["frames"], name, *figures, scores.get("error", "")])
+    return out.getvalue()
+
+
+def _reasons(scores: Mapping[str, Any]) -> Iterator[str]:
+    for split, name in SPLITS.items():
+        for key in ("reason", "geometry_reason"):
+            if key in scores[split] and not (key == "geometry_reason" and "reason" in scores[split]):
+                yield f"no {'images' if key == 'reason' else 'surfaces'} of {name}: {scores[split][key]}"
+
+
+def _sizes(variant: Mapping[str, Any]) -> list[str]:
+    return sorted({size for scores in scored(variant).values() for size in scores["frame_seconds"]}, key=int)
+
+
+def _smallest(frame_seconds: Mapping[str, float]) -> tuple[str, float]:
+    return min(frame_seconds.items(), key=lambda item: int(item[0]))
+
+
+def _pick(tree: Mapping[str, Any], key: str) -> Any:
+    value: Any = tree
+    for part in key.split("."):
+        value = (value or {}).get(part)
+    return value
+
+
+def _shown(value: float | None, form: str) -> str:
+    return "-" if value is None else form.format(value)
+
+
+def _line(cells: list[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -1,0 +1,63 @@
+"""What a stability study tries: a YAML file under `configs/stability/`."""
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Annotated
+
+import yaml
+from pydantic import Field, ValidationError
+
+from hnerf.config import CONFIGS, Section
+from hnerf.errors import CaptureError
+from hnerf.study.degrade import KINDS, NOT_MADE, check_strengths
+
+STUDIES = CONFIGS / "stability"
+FULL = "full"
+
+
+class Stability(Section):
+    """Presets, seeds of degradations and training, settings changed in all runs, and each degradation's strengths, the
+    mildest first."""
+
+    methods: Annotated[tuple[str, ...], Field(min_length=1)]
+    seeds: Annotated[tuple[int, ...], Field(min_length=1)]
+    overrides: tuple[str, ...] = ()
+    degradations: dict[str, tuple[float, ...]]
+
+    def only(self, names: Collection[str]) -> "Stability":
+        """The study of these degradations only, of all where there are no names; CaptureError for one it has not."""
+        for name in names:
+            if name not in self.degradations:
+                raise CaptureError(f"--only {name}: not in this study; it has {', '.join(self.degradations)}")
+        chosen = {name: values for name, values in self.degradations.items() if not names or name in names}
+        return self.model_copy(update={"degradations": chosen})
+
+    def left_out(self) -> list[str]:
+        """What it does not try, in lines for people: against `configs/stability/full.yaml`, and what no study can."""
+        full = load_stability(FULL)
+        lines = [f"`{name}` as a method" for name in full.methods if name not in self.methods]
+        seeds = len(full.seeds) - len(self.seeds)
+        lines += [f"{seeds} of {len(full.seeds)} seeds: no spread is known from so few"] if seeds > 0 else []
+        lines += [f"what the preset says: `{override}` instead" for override in self.overrides]
+        for name, strengths in full.degradations.items():
+            missing = [f"{s:g}" for s in strengths if s not in self.degradations.get(name, ())]
+            if missing:
+                lines.append(f"{KINDS[name].label}: {', '.join(missing)}")
+        return lines + [f"{name}: {reason}" for name, reason in NOT_MADE.items()]
+
+
+def load_stability(study: str) -> Stability:
+    """A study by its name under `configs/stability/` or its file's path; CaptureError, one line, on what is wrong."""
+    named = STUDIES / f"{study}.yaml"
+    path = named if named.exists() else Path(study)
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in STUDIES.glob("*.yaml")))
+        raise CaptureError(f"{study}: no such study or file; studies are {known}")
+    try:
+        found = Stability.model_validate(yaml.safe_load(path.read_text()) or {})
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise CaptureError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    for kind, strengths in found.degradations.items():
+        check_strengths(kind, strengths)
+    return found

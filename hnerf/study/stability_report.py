@@ -1,0 +1,78 @@
+"""Tables of a stability study, in Markdown.
+
+Runs are plain rows: method, seed, kind, strength, verdict, reason, and figures where there are any.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from hnerf.study.degrade import KINDS
+from hnerf.study.surface import LENGTHS, VOLUMES
+from hnerf.study.verdict import DEGRADED_DB, DEGRADED_RATIO, FAILED_DB, FAILED_RATIO, WORST_LAST
+
+REFERENCE = "as recorded"
+LEGEND = (
+    f"**ok**: at most {DEGRADED_DB:g} dB of PSNR lost against the same method and seed on the capture as recorded, and "
+    f"a Chamfer distance of at most {DEGRADED_RATIO:g} times that. **degraded**: worse. **failed**: over {FAILED_DB:g} "
+    f"dB or {FAILED_RATIO:g} times, a crash, no surface, one that is not watertight or not of the body's size (volume "
+    f"{VOLUMES[0]:g} to {VOLUMES[1]:g}, length {LENGTHS[0]:g} to {LENGTHS[1]:g} of it). **refused**: an earlier stage "
+    "or the training said what is wrong with the input. Novel poses from test cameras are scored, which no degradation "
+    "touches; training views' poses where the capture has no others. A surface is the largest component that meshing "
+    "finds; what floats beside it does not count."
+)
+
+Row = dict[str, Any]
+
+
+def worst(result: Row, method: str, kind: str, strength: float) -> Row | None:
+    """The worst run over seeds, None where there is none yet. Without a good run to compare with, that run stands for
+    all."""
+    found = [r for r in result["runs"] if r["method"] == method and r["kind"] == kind and r["strength"] == strength]
+    good = [r for r in result["runs"] if r["method"] == method and r["kind"] == REFERENCE]
+    found += [r for r in good if "psnr" not in r]
+    return max(found, key=lambda r: WORST_LAST.index(r["verdict"]), default=None)
+
+
+def breaking_strength(result: Row, method: str, kind: str) -> str:
+    """The mildest strength at which the worst seed fails or is refused, or how far it holds."""
+    strengths = result["plan"]["degradations"][kind]
+    runs = [worst(result, method, kind, strength) for strength in strengths]
+    for strength, run in zip(strengths, runs, strict=True):
+        if run and run["verdict"] in ("failed", "refused"):
+            return f"{strength:g} ({run['verdict']})"
+    tried = [f"{strength:g}" for strength, run in zip(strengths, runs, strict=True) if run]
+    return f"holds to {tried[-1]}" if tried else "-"
+
+
+def as_markdown(result: Row, charts: Sequence[str]) -> str:
+    """Where each method breaks, charts, every run, what was left out, and what verdicts mean."""
+    methods, kinds = result["plan"]["methods"], result["plan"]["degradations"]
+    lines = [f"# Stability of {', '.join(methods)} on {result['subject']}: study `{result['study']}`", "", LEGEND, ""]
+    lines += ["## Where each method breaks", "", *_table(["degradation", *methods])]
+    for kind in kinds:
+        lines.append(_line([KINDS[kind].label, *(breaking_strength(result, method, kind) for method in methods)]))
+    lines += ["", *(f"![{chart}]({chart})" for chart in charts), "", "## Runs", ""]
+    lines += _table(["method", "degradation", "strength", "seed", "verdict", "PSNR, dB", "SSIM", "Chamfer, mm"])
+    lines += [_line(_cells(run)) for run in result["runs"]]
+    lines += ["", "## Left out", "", *(f"- {line}" for line in result["left_out"]), ""]
+    return "\n".join([*lines, *([result["protocol"], ""] if result["protocol"] else [])])
+
+
+def _cells(run: Row) -> list[str]:
+    kind = KINDS[run["kind"]].label if run["kind"] in KINDS else run["kind"]
+    strength = "" if run["strength"] is None else f"{run['strength']:g}"
+    verdict = f"{run['verdict']}: {run['reason']}" if run["reason"] else run["verdict"]
+    scores = [_score(run.get(key), digits) for key, digits in (("psnr", 2), ("ssim", 3), ("chamfer_mm", 2))]
+    return [run["method"], kind, strength, str(run["seed"]), verdict.replace("|", "/"), *scores]
+
+
+def _score(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _table(titles: list[str]) -> list[str]:
+    return [_line(titles), "|" + "---|" * len(titles)]
+
+
+def _line(cells: list[str]) -> str:
+    return f"| {' | '.join(cells)} |"

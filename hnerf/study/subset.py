@@ -1,0 +1,86 @@
+"""A smaller capture from a capture: fewer training cameras, fewer frames."""
+
+import dataclasses
+import shutil
+from collections.abc import Collection
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from hnerf.capture.boards import BOARDS_FILE
+from hnerf.capture.capture import Capture
+from hnerf.errors import CaptureError
+
+T = TypeVar("T")
+
+
+def subset(
+    capture: Capture,
+    out: Path,
+    cameras: tuple[str, ...] | None,
+    train_frames: tuple[int, ...] | None,
+    novel_pose_frames: tuple[int, ...] | None,
+) -> None:
+    """Write another normalised capture into `out` with only these training cameras and frames; None keeps all.
+
+    capture: as ingested, its cameras in step. Test cameras stay. Frames keep their numbers, so that ground truth is
+    found by them. CaptureError if a camera or frame is not one of the capture's, or nothing is left to train on.
+    """
+    train_cameras = _chosen(capture, "training camera", cameras, capture.train_cameras)
+    kept = dataclasses.replace(
+        capture,
+        root=out,
+        cameras={name: capture.cameras[name] for name in (*train_cameras, *capture.test_cameras)},
+        train_cameras=train_cameras,
+        train_frames=_chosen(capture, "training frame", train_frames, capture.train_frames),
+        novel_pose_frames=_chosen(capture, "novel-pose frame", novel_pose_frames, capture.novel_pose_frames),
+    )
+    if not kept.train_cameras or not kept.train_frames:
+        raise CaptureError(f"{capture.name}: no training camera or frame would be left; keep one of each")
+    write_arrays(capture, kept)
+    copy_files(capture.root, out, {Path(BOARDS_FILE).stem})
+    for name in kept.cameras:
+        copy_pixels(capture, kept, name)
+    kept.save()
+
+
+def write_arrays(capture: Capture, kept: Capture) -> None:
+    """Keypoints and given poses of the frames and cameras that are kept."""
+    rows = np.searchsorted(capture.frames, kept.frames)
+    found = {name: capture.keypoints(name) for name in kept.cameras}
+    write_keypoints(kept.root, {name: people[rows] for name, people in found.items() if people is not None})
+    poses = capture.given_poses()
+    if poses:
+        dataclasses.replace(poses, theta=poses.theta[rows], root=poses.root[rows]).save(kept.root / "poses.npz")
+
+
+def write_keypoints(root: Path, keypoints: dict[str, np.ndarray]) -> None:
+    """`keypoints.npz`, by camera; none where nothing was detected."""
+    root.mkdir(parents=True, exist_ok=True)
+    if keypoints:
+        np.savez_compressed(root / "keypoints.npz", **keypoints)  # type: ignore[arg-type]
+
+
+def copy_pixels(capture: Capture, kept: Capture, camera: str) -> None:
+    """One camera's images, clean plate and given masks, file by file as they are."""
+    for folder in ("images", "masks"):
+        copy_files(capture.root / folder / camera, kept.root / folder / camera, {f"{f:06d}" for f in kept.frames})
+    copy_files(capture.root / "background", kept.root / "background", {camera})
+
+
+def copy_files(source: Path, target: Path, stems: Collection[str]) -> None:
+    """The files of a folder, if there is one, whose names without suffix are among `stems`."""
+    for path in sorted(source.glob("*")):
+        if path.stem in stems:
+            target.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, target / path.name)
+
+
+def _chosen(capture: Capture, what: str, wanted: tuple[T, ...] | None, there_are: tuple[T, ...]) -> tuple[T, ...]:
+    if wanted is None:
+        return there_are
+    for one in wanted:
+        if one not in there_are:
+            raise CaptureError(f"{capture.name}: no {what} {one}; there are {', '.join(map(str, there_are))}")
+    return tuple(one for one in there_are if one in wanted)

@@ -1,0 +1,51 @@
+"""Whether a reconstructed surface is a person's: closed, and as large as the body in it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from torch import Tensor
+
+from hnerf.asset.surface import extract_surface
+from hnerf.body.rig import pose_vertices
+from hnerf.errors import CaptureError
+from hnerf.evaluation.evaluate import MESH_MARGIN_M
+from hnerf.render.avatar import Avatar
+
+CELLS = 128  # on the longest side: enough to see a hole of a finger's width
+# Of the body's own. Clothes and hair add up to a half of its volume; what is worn over the head or held, some height. A
+# person without legs loses a third of the volume and half of the length; a shell or a limb alone, more.
+VOLUMES = 0.7, 1.8
+LENGTHS = 0.8, 1.25
+
+
+@dataclass(frozen=True)
+class SurfaceCheck:
+    """fault: what is wrong with a surface in one line, None if nothing; volume and length (the longest side of the box
+    around it) as shares of the body's, None where there is no surface."""
+
+    fault: str | None
+    volume: float | None = None
+    length: float | None = None
+
+
+def check_surface(mesh: trimesh.Trimesh, body_m: np.ndarray, faces: np.ndarray) -> SurfaceCheck:
+    """Judge a surface, the largest component that was found, by the posed body: vertices (V, 3) and faces (F, 3)."""
+    body = trimesh.Trimesh(body_m, faces, process=False)
+    volume, length = float(mesh.volume / body.volume), float(mesh.extents.max() / body.extents.max())
+    fault = None if mesh.is_watertight else "surface is not watertight"
+    for name, value, (low, high) in (("volume", volume, VOLUMES), ("length", length, LENGTHS)):
+        if not low <= value <= high:
+            fault = fault or f"surface has {value:.2f} of the body's {name}"
+    return SurfaceCheck(fault, volume, length)
+
+
+def check_pose(avatar: Avatar, theta: Tensor, root: Tensor) -> SurfaceCheck:
+    """Judge the avatar's surface in a pose theta (J, 3), root (4, 4)."""
+    body_m = pose_vertices(avatar.body.rig, theta, root)
+    lower_m, upper_m = body_m.amin(0) - MESH_MARGIN_M, body_m.amax(0) + MESH_MARGIN_M
+    try:
+        mesh = extract_surface(lambda x: avatar.signed_distance(x, theta, root), lower_m, upper_m, CELLS)
+    except CaptureError as error:
+        return SurfaceCheck(str(error))
+    return check_surface(mesh, body_m.cpu().numpy(), avatar.body.rig.faces.cpu().numpy())

@@ -1,0 +1,44 @@
+"""What came of a run under bad conditions, next to the same run under good ones."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+Word = Literal["ok", "degraded", "failed", "refused"]
+WORST_LAST: tuple[Word, ...] = ("ok", "degraded", "refused", "failed")
+
+# 1 dB is a quarter more squared error, seen side by side and hardly otherwise; 6 dB is four times as much.
+DEGRADED_DB, FAILED_DB = 1.0, 6.0
+# A quarter more distance, too; at three times the distance of a good run, parts of the body lie elsewhere.
+DEGRADED_RATIO, FAILED_RATIO = 1.25, 3.0
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """reason: one line, empty where it is ok."""
+
+    word: Word
+    reason: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.word}: {self.reason}" if self.reason else self.word
+
+
+def judge(scores: dict[str, Any], reference: dict[str, Any], faults: list[str]) -> Verdict:
+    """`scores` and `reference` hold psnr (dB) and chamfer_mm of the same images and surfaces, degraded and not, or None
+    where there is no truth; faults: what is wrong with surfaces, which is failure whatever the scores."""
+    if faults:
+        return Verdict("failed", faults[0])
+    words: list[tuple[Word, str]] = [("ok", "")]
+    if None not in (scores["psnr"], reference["psnr"]):
+        lost_db = reference["psnr"] - scores["psnr"]
+        words.append((_word(lost_db, DEGRADED_DB, FAILED_DB), f"{lost_db:.1f} dB of PSNR lost"))
+    if None not in (scores["chamfer_mm"], reference["chamfer_mm"]):
+        ratio = scores["chamfer_mm"] / reference["chamfer_mm"]
+        words.append((_word(ratio, DEGRADED_RATIO, FAILED_RATIO), f"Chamfer distance times {ratio:.2f}"))
+    worst = max((word for word, _ in words), key=WORST_LAST.index)
+    return Verdict(worst, "; ".join(reason for word, reason in words if word == worst and word != "ok"))
+
+
+def _word(value: float, degraded: float, failed: float) -> Word:
+    """NaN is a failure."""
+    return "ok" if value <= degraded else "degraded" if value <= failed else "failed"

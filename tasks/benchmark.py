@@ -1,0 +1,35 @@
+"""A benchmark's own stage: scores of a training on the way and at its end, and what an image costs."""
+
+from pathlib import Path
+
+import torch
+
+from hnerf.evaluation.ground_truth import GroundTruth
+from hnerf.study.plan import ScoringSettings
+from hnerf.study.scoring import Scene, score
+from tasks.calibration import calibrated
+from tasks.source import GROUND_TRUTH, Source
+from tasks.stage import stage
+from tasks.store import Artifact
+
+
+@stage("scoring", version="1")
+def score_training(
+    out: Path,
+    truth: Source,
+    recording: Artifact,
+    calibration: Artifact,
+    training: Artifact,
+    settings: ScoringSettings,
+) -> dict[str, float]:
+    """Held-out figures of a training's snapshots and of its end; time of a frame."""
+    found = score(scene(truth, recording, calibration), training.root, settings, out)
+    psnr = found[found["split"]]["psnr"]
+    return {} if psnr is None else {"psnr": psnr}
+
+
+def scene(truth: Source, recording: Artifact, calibration: Artifact) -> Scene:
+    """What trainings on a recording are scored against, on the GPU where there is one."""
+    capture = calibrated(recording, calibration)
+    known = GroundTruth(truth.root, capture) if (truth.root / GROUND_TRUTH).is_dir() else None
+    return Scene(capture, known, "cuda" if torch.cuda.is_available() else "cpu")

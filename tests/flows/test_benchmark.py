@@ -1,0 +1,190 @@
+"""The flow with stages that cost nothing, and its own stage's place in the store."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from flows import benchmark as module
+from flows.benchmark import benchmark
+from flows.cli import main
+from hnerf.config import TrainingSettings
+from hnerf.errors import CaptureError
+from hnerf.study import publish as publish_module
+from hnerf.study.plan import ScoringSettings
+from tasks import benchmark as tasks_module
+from tasks.launcher import LostWorkerError
+from tasks.source import Source
+from tasks.store import Artifact, Store
+from tests.study.test_benchmark_results import scores
+
+RECORDED = SimpleNamespace(name="ada", train_cameras=("1", "2", "3", "4"), train_frames=(0, 1, 2), test_cameras=("5",))
+STUDY = """
+title: Toys
+seconds: 60
+snapshots: 2
+methods: [fast, demo, paper]
+variants:
+  all: {methods: [fast, demo]}
+  one frame: {frames: 1, novel_poses: false}
+  many: {cameras: 8}
+"""
+
+
+PSNR = {"fast": 30.0, "paper": 20.0}
+
+
+class Stages(list[tuple[str, TrainingSettings]]):
+    """The trainings that were asked for: of which recording, with which settings; `fails` by machinery."""
+
+    fails: dict[str, Exception]
+
+
+@pytest.fixture
+def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
+    """Every stage replaced."""
+    asked = Stages()
+    asked.fails = {}
+
+    def train(shelf: Any, recording: Any, *others: Any) -> Any:
+        settings = others[-1]
+        asked.append((recording.title, settings))
+        if settings.machinery in asked.fails:
+            raise asked.fails[settings.machinery]
+        return SimpleNamespace(machinery=settings.machinery)
+
+    def score_training(shelf: Any, truth: Any, recording: Any, calibration: Any, model: Any, settings: Any) -> Any:
+        folder = shelf.root / "scoring" / model.machinery
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "scores.json").write_text(json.dumps(scores(PSNR[model.machinery], 1.0, "") | {"pictures": []}))
+        return SimpleNamespace(root=folder)
+
+    for name in ("calibrate", "find_masks", "fit"):
+        monkeypatch.setattr(module, name, lambda *_: None)
+    monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path, title="whole"))
+    monkeypatch.setattr(module, "subset_capture", lambda _, recording, *parts: SimpleNamespace(title=str(parts)))
+    monkeypatch.setattr(module, "read_capture", lambda _: (None, None))
+    monkeypatch.setattr(module.Capture, "load", lambda _: RECORDED)
+    monkeypatch.setattr(module, "train", train)
+    monkeypatch.setattr(module, "score_training", score_training)
+    return asked
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No charts, which take a second each time."""
+    monkeypatch.setattr(publish_module, "draw", lambda *_: [])
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> str:
+    (tmp_path / "toys.yaml").write_text(STUDY)
+    return str(tmp_path / "toys.yaml")
+
+
+def read(table: Path) -> dict[str, Any]:
+    result: dict[str, Any] = json.loads(table.with_suffix(".json").read_text())
+    return result
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_every_method_of_every_variant_is_trained_alike(stages: Stages, study: str, tmp_path: Path) -> None:
+    table = benchmark.fn(tmp_path, study, store=tmp_path / "store")
+    one = str((None, (0,), ()))
+    assert [title for title, _ in stages] == ["whole", "whole", one, one, one]
+    assert [settings.machinery for _, settings in stages] == ["fast", "fast", "fast", "fast", "paper"]
+    assert {(settings.seconds, settings.snapshots_s) for _, settings in stages} == {(60.0, (15.0, 30.0))}
+    assert table == tmp_path / "store" / "benchmark" / "ada-toys.md"
+    variants = read(table)["variants"]
+    assert list(variants["all"]["methods"]) == ["fast", "demo"]
+    assert (variants["one frame"]["cameras"], variants["one frame"]["frames"]) == (4, 1)
+    assert variants["many"] == {"left_out": "the capture has 4 training cameras, not 8"}
+    assert variants["all"]["methods"]["fast"]["folder"] == "scoring/fast"
+    assert variants["all"]["methods"]["demo"]["novel_view"]["psnr"] == 30.0
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("error", [RuntimeError("rank 0\nthe surface is empty"), CaptureError("the surface is empty")])
+def test_a_method_that_fails_says_so_and_the_rest_go_on(
+    stages: Stages, study: str, tmp_path: Path, error: Exception
+) -> None:
+    stages.fails["fast"] = error
+    methods = read(benchmark.fn(tmp_path, study, store=tmp_path / "store"))["variants"]["one frame"]["methods"]
+    assert methods["fast"] == {"error": "the surface is empty"}
+    assert methods["paper"]["novel_view"]["psnr"] == 20.0
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_lost_worker_ends_the_flow_and_what_is_finished_stands(stages: Stages, study: str, tmp_path: Path) -> None:
+    stages.fails["paper"] = LostWorkerError("rank 0 was killed by SIGKILL")
+    with pytest.raises(LostWorkerError):
+        benchmark.fn(tmp_path, study, store=tmp_path / "store")
+    variants = read(tmp_path / "store" / "benchmark" / "ada-toys.md")["variants"]
+    assert list(variants["one frame"]["methods"]) == ["fast", "demo"]
+
+
+def test_the_command_prints_table_and_chart(
+    stages: Stages, study: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--study", study, "--methods", "demo", "--seconds", "8", "--store", str(tmp_path / "store")]
+    assert main(["benchmark", str(tmp_path), *options]) == 0
+    assert [settings.snapshots_s for _, settings in stages] == [(2.0, 4.0)] * 2
+    shown = capsys.readouterr().out
+    assert "| demo | 30.00 / - |" in shown
+    chart = tmp_path / "store" / "benchmark" / "ada-toys.png"
+    assert f"chart: {chart}" in shown and chart.exists()
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_quick_is_a_study(stages: Stages, tmp_path: Path) -> None:
+    assert main(["benchmark", str(tmp_path), "--quick", "--methods", "fast", "--store", str(tmp_path / "store")]) == 0
+    assert (tmp_path / "store" / "benchmark" / "ada-quick.md").exists()
+    with pytest.raises(SystemExit):
+        main(["benchmark", str(tmp_path), "--quick", "--study", "static"])
+
+
+def test_bad_names_end_with_one_line(stages: Stages, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["benchmark", str(tmp_path), "--methods", "fats", "--store", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith("hnerf: fats: no such preset or file")
+    with pytest.raises(SystemExit):
+        main(["benchmark", str(tmp_path), "--seconds", "-3"])
+    assert stages == []
+
+
+def test_the_flow_runs_page_shows_the_charts_themselves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[str] = []
+    monkeypatch.setattr(module.FlowRunContext, "get", lambda: True)
+    monkeypatch.setattr(module, "create_markdown_artifact", lambda text, **_: shown.append(text))
+    (tmp_path / "ada-toys.png").write_bytes(b"chart")
+    (tmp_path / "ada-toys.md").write_text("# Toys\n\n![ada-toys.png](ada-toys.png)\n")
+    module._announce(tmp_path / "ada-toys.md")
+    assert shown == ["# Toys\n\n![ada-toys.png](data:image/png;base64,Y2hhcnQ=)\n"]
+
+
+def test_scores_are_found_again_until_what_is_scored_or_how_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted: list[Path] = []
+
+    def score(scene: Any, training: Path, settings: ScoringSettings, out: Path) -> dict[str, Any]:
+        counted.append(training)
+        return scores(30.0, 1.0, "")
+
+    monkeypatch.setattr(tasks_module, "score", score)
+    monkeypatch.setattr(tasks_module, "scene", lambda *_: None)
+    truth = Source(root=tmp_path, name="ada", digest="1")
+    recording, calibration, model = (Artifact(stage=s, root=tmp_path / s, files={}) for s in ("a", "b", "c"))
+    shelf = Store(tmp_path / "store")
+
+    def run(truth: Source, settings: ScoringSettings) -> Artifact:
+        return tasks_module.score_training(shelf, truth, recording, calibration, model, settings)
+
+    first = run(truth, ScoringSettings())
+    assert run(truth, ScoringSettings()) == first
+    assert first.metrics == {"psnr": 30.0}
+    assert counted == [tmp_path / "c"]
+    run(truth, ScoringSettings(images=3))
+    run(truth.model_copy(update={"digest": "2"}), ScoringSettings())
+    assert len(counted) == 3

@@ -1,0 +1,180 @@
+"""Which stages are given what was made worse, and what becomes of runs that break; stages are made up."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from flows import stability as module
+from flows.cli import main
+from flows.stability import stability
+from hnerf.errors import CaptureError
+from tasks.launcher import LostWorkerError
+
+STUDY = """
+methods: [fast]
+seeds: [0, 1]
+degradations:
+  image_noise: [5, 40]
+  mask_eroded: [1]
+  pose_noise: [2]
+  learning_rate_up: [10]
+  extreme_poses: [45, 60]
+"""
+
+
+@pytest.fixture
+def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """Every stage replaced by one that names its input; the list gathers each training's inputs.
+
+    Noise of 40 is refused by calibration; eroded masks crash the training; pose noise loses 2 dB; the surface breaks in
+    poses of 60 degrees."""
+    trained: list[dict[str, Any]] = []
+
+    def made(name: str, **files: Any) -> Any:
+        folder = tmp_path / "made" / name
+        folder.mkdir(parents=True, exist_ok=True)
+        for file, content in files.items():
+            (folder / f"{file}.json").write_text(json.dumps(content))
+        return SimpleNamespace(root=folder, name=name)
+
+    def calibrate(_: Any, recording: Any, __: Any) -> Any:
+        if recording.name == "image_noise 40":
+            raise CaptureError("ada: cameras see no person")
+        return made("cameras")
+
+    def train(_: Any, recording: Any, cameras: Any, masks: Any, body: Any, settings: Any) -> Any:
+        trained.append({"recording": recording.name, "masks": masks.name, "body": body.name, "settings": settings})
+        if masks.name == "mask_eroded 1":
+            raise RuntimeError("rank 0 ended with exit code 1\nValueError: empty")
+        return made("model", report={"seconds": 60.0})
+
+    def evaluate(_: Any, __: Any, recording: Any, cameras: Any, masks: Any, body: Any, *rest: Any) -> Any:
+        psnr = 28.0 if body.name == "pose_noise 2" else 30.0
+        split = {"n": 2, "psnr": psnr, "ssim": 0.9, "geometry": {"chamfer_mm": 6.0}}
+        return made("report", metrics={"protocol": "By eye.", "novel_view": split | {"psnr": 0}, "novel_pose": split})
+
+    def degrade(*inputs: Any) -> Any:
+        return made(f"{inputs[-1].kind} {inputs[-1].strength:g}")
+
+    def show(_: Any, __: Any, degradation: Any) -> Any:
+        fault = "surface is not watertight" if degradation.strength == 60 else None
+        return made("poses", surface={"pose 0": {"fault": None}, "pose 1": {"fault": fault}})
+
+    replaced = {
+        "read_capture": lambda _: (None, None),
+        "ingest": lambda *_: made("capture"),
+        "calibrate": calibrate,
+        "find_masks": lambda *_: made("masks"),
+        "fit": lambda *_: made("body"),
+        "train": train,
+        "evaluate": evaluate,
+        "degrade_capture": degrade,
+        "degrade_masks": degrade,
+        "degrade_fit": degrade,
+        "check_meshes": lambda *_: made("surfaces", surface={"000001": {"fault": None}}),
+        "show_in_extreme_poses": show,
+    }
+    for name, stage in replaced.items():
+        monkeypatch.setattr(module, name, stage)
+    monkeypatch.setattr(module.Capture, "load", lambda _: SimpleNamespace(name="ada"))
+    (tmp_path / "mine.yaml").write_text(STUDY)
+    return trained
+
+
+def study(tmp_path: Path, **options: Any) -> dict[str, Any]:
+    """What the study of this file finds."""
+    table = stability.fn(tmp_path, str(tmp_path / "mine.yaml"), tmp_path / "store", **options)
+    assert table == tmp_path / "store" / "stability" / "ada-mine.md"
+    return dict(json.loads(table.with_suffix(".json").read_text()))
+
+
+def test_every_run_has_a_verdict(stages: list[dict[str, Any]], tmp_path: Path) -> None:
+    found = study(tmp_path)
+    seen = [(r["kind"], r["strength"], r["verdict"], r["reason"]) for r in found["runs"] if r["seed"] == 1]
+    assert seen == [
+        ("as recorded", None, "ok", ""),
+        ("image_noise", 5, "ok", ""),
+        ("image_noise", 40, "refused", "ada: cameras see no person"),
+        ("mask_eroded", 1, "failed", "ValueError: empty"),
+        ("pose_noise", 2, "degraded", "2.0 dB of PSNR lost"),
+        ("learning_rate_up", 10, "ok", ""),
+        ("extreme_poses", 45, "ok", ""),
+        ("extreme_poses", 60, "failed", "surface is not watertight"),
+    ]
+    assert len(found["runs"]) == 2 * len(seen)
+    assert found["protocol"] == "By eye."
+    charts = {path.name for path in (tmp_path / "store" / "stability").glob("*.png")}
+    assert charts == {"ada-mine-matrix.png", "ada-mine-psnr.png", "ada-mine-chamfer_mm.png"}
+
+
+def test_each_degradation_is_put_in_at_its_place(stages: list[dict[str, Any]], tmp_path: Path) -> None:
+    study(tmp_path)
+    inputs = [(s["recording"], s["masks"], s["body"]) for s in stages if s["settings"].seed == 0]
+    good = ("capture", "masks", "body")
+    assert inputs == [
+        good,
+        ("image_noise 5", "masks", "body"),
+        ("capture", "mask_eroded 1", "body"),
+        ("capture", "masks", "pose_noise 2"),
+        good,  # learning rate
+        good,  # extreme poses, the store has this training already
+        good,
+    ]
+    rates = [s["settings"].fast.network_learning_rate for s in stages if s["settings"].seed == 0]
+    assert rates == pytest.approx([0.01, 0.01, 0.01, 0.01, 0.1, 0.01, 0.01])
+
+
+def test_a_method_that_cannot_take_the_capture_at_all_is_tried_once_a_seed(
+    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def train(*_: Any) -> Any:
+        raise CaptureError("NeRF models one moment; choose one frame")
+
+    monkeypatch.setattr(module, "train", train)
+    runs = study(tmp_path)["runs"]
+    assert [(r["kind"], r["verdict"]) for r in runs] == [("as recorded", "refused")] * 2
+    assert "NeRF models one moment" in runs[0]["reason"]
+
+
+def test_bad_input_in_evaluation_is_failure(
+    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def evaluate(*_: Any) -> Any:
+        raise CaptureError("signed distance field: no surface in its box")
+
+    monkeypatch.setattr(module, "evaluate", evaluate)
+    assert {r["verdict"] for r in study(tmp_path, only=["pose_noise"])["runs"]} == {"failed"}
+
+
+@pytest.mark.parametrize("error", [LostWorkerError("rank 0 was killed"), OSError(28, "No space left on device")])
+def test_what_the_machine_did_ends_the_command_and_finished_runs_stand(
+    error: Exception, stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def degrade_fit(*_: Any) -> Any:
+        raise error
+
+    monkeypatch.setattr(module, "degrade_fit", degrade_fit)
+    with pytest.raises(type(error)):
+        study(tmp_path)
+    found = json.loads((tmp_path / "store" / "stability" / "ada-mine.json").read_text())
+    assert [r["kind"] for r in found["runs"]] == ["as recorded", "image_noise", "image_noise", "mask_eroded"]
+
+
+def test_the_command_prints_the_table(
+    stages: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--study", str(tmp_path / "mine.yaml"), "--store", str(tmp_path / "store"), "--only", "pose_noise"]
+    assert main(["stability", str(tmp_path), "--methods", "fast,paper", *options]) == 0
+    shown = capsys.readouterr().out
+    assert "| pose noise, ° a joint | holds to 2 | holds to 2 |" in shown
+    assert f"table: {tmp_path / 'store' / 'stability' / 'ada-mine.md'}" in shown
+
+
+def test_unknown_names_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stability", str(tmp_path), "--quick", "--only", "hats"]) == 2
+    assert "--only hats: not in this study" in capsys.readouterr().err
+    assert main(["stability", str(tmp_path), "--quick", "--methods", "best"]) == 2
+    assert "best: no such preset or file" in capsys.readouterr().err

@@ -1,0 +1,46 @@
+"""A normalised capture made by hand: two training cameras and a test camera, five frames."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+
+SIZE_PX = 16
+FRAMES = (2, 4, 6, 8, 10)
+K = np.array([[16.0, 0, 7.5], [0, 16.0, 7.5], [0, 0, 1]])
+# 01 looks along world +x from (-4, 0, 1), 02 along +y from (0, -4, 1), 03 along -x from (4, 0, 1); z is up.
+ROTATIONS = {
+    "01": np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
+    "02": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "03": np.array([[0.0, 1, 0], [0, 0, -1], [-1, 0, 0]]),
+}
+
+
+def write_recording(folder: Path) -> Capture:
+    """Images of value 100 + frame, plates of 50, masks of the middle 8 x 8 px; keypoints 1 at (frame, 5), sure; the
+    rest of them in the image's middle. Cameras 01 and 02 train."""
+    sizes = dict.fromkeys(ROTATIONS, (SIZE_PX, SIZE_PX))
+    cameras = {name: Camera(name, K, R, np.array([0.0, 1, 4]), SIZE_PX, SIZE_PX) for name, R in ROTATIONS.items()}
+    capture = Capture("ada", folder, cameras, ("01", "02"), ("03",), FRAMES[:3], FRAMES[3:], 10.0, "z", sizes, sizes)
+    mask = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
+    mask[4:12, 4:12] = 255
+    for name in ROTATIONS:
+        for frame in FRAMES:
+            write(folder / "images" / name / f"{frame:06d}.png", np.full((SIZE_PX, SIZE_PX, 3), 100 + frame))
+            write(folder / "masks" / name / f"{frame:06d}.png", mask)
+        write(folder / "background" / f"{name}.png", np.full((SIZE_PX, SIZE_PX, 3), 50))
+    people = np.full((len(FRAMES), 1, 25, 3), 7.5)
+    people[..., 2] = 1
+    people[:, 0, 1, 0], people[:, 0, 1, 1] = FRAMES, 5
+    np.savez_compressed(folder / "keypoints.npz", **dict.fromkeys(ROTATIONS, people))  # type: ignore[arg-type]
+    capture.save()
+    return capture
+
+
+def write(path: Path, pixels: np.ndarray) -> None:
+    """One PNG."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), pixels.astype(np.uint8))

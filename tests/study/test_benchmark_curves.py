@@ -1,0 +1,41 @@
+"""Fronts and crossings worked out by hand."""
+
+import pytest
+
+from hnerf.study.curves import binned, pareto_front, seconds_to
+
+
+def test_the_front_is_what_nothing_beats_cheapest_first() -> None:
+    points = {
+        "slow and good": (4.0, 30.0),
+        "fast and fair": (1.0, 25.0),
+        "slower, no better": (5.0, 30.0),
+        "between, worse than the fast one": (2.0, 24.0),
+        "between": (2.0, 26.0),
+    }
+    assert pareto_front(points) == ["fast and fair", "between", "slow and good"]
+
+
+def test_equal_points_are_on_the_front_both() -> None:
+    assert pareto_front({"a": (1.0, 20.0), "b": (1.0, 20.0), "c": (1.0, 19.0)}) == ["a", "b"]
+
+
+def test_a_level_is_reached_between_points_in_log_time() -> None:
+    # 20 dB at 10 s, 24 dB at 1000 s: half the rise at the geometric mean of the times, a quarter at 10 * 100^(1/4)
+    curve = [(10.0, 20.0), (1000.0, 24.0)]
+    assert seconds_to(curve, 22.0) == pytest.approx(100.0)
+    assert seconds_to(curve, 21.0) == pytest.approx(31.6228, rel=1e-5)
+    assert seconds_to(curve, 24.0) == pytest.approx(1000.0)
+
+
+def test_a_level_below_the_first_point_is_reached_there_and_one_above_all_never() -> None:
+    curve = [(10.0, 20.0), (20.0, 25.0), (40.0, 23.0)]
+    assert seconds_to(curve, 15.0) == 10.0
+    assert seconds_to(curve, 25.5) is None
+    assert seconds_to([], 1.0) is None
+
+
+def test_bins_hold_equally_many_points_in_the_order_of_x() -> None:
+    points = [(4.0, 8.0), (1.0, 2.0), (2.0, 6.0), (3.0, 4.0)]
+    assert binned(points, 2) == [(1.5, 4.0), (3.5, 6.0)]
+    assert binned(points[:1], 5) == [(4.0, 8.0)]

@@ -1,0 +1,93 @@
+"""Studies as files, and the parts of a capture that their variants name."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from hnerf.errors import CaptureError
+from hnerf.study.plan import STUDIES, Study, Variant, load_study, snapshot_times_s
+
+RECORDED: Any = SimpleNamespace(train_cameras=("a", "b", "c", "d"), train_frames=(0, 2, 4, 6, 8))
+
+
+def write(folder: Path, text: str) -> str:
+    (folder / "study.yaml").write_text(text)
+    return str(folder / "study.yaml")
+
+
+def test_studies_that_are_promised_are_there_and_valid() -> None:
+    studies = {path.stem: load_study(path.stem) for path in STUDIES.glob("*.yaml")}
+    assert set(studies) == {"quick", "dynamic", "static", "cameras", "frames", "monocular"}
+    assert set(studies["quick"].methods) == {"fast", "paper-small", "nerf"}
+    assert studies["quick"].variants["one frame"].methods == ("fast", "nerf")
+    assert [v.cameras for v in studies["cameras"].variants.values()] == [2, 4, 8, 16, 32]
+    assert [v.frames for v in studies["frames"].variants.values()] == [1, 5, 10, 20, 40]
+
+
+def test_methods_of_ready_studies_have_valid_settings() -> None:
+    for path in STUDIES.glob("*.yaml"):
+        study = load_study(path.stem)
+        for method in study.methods:
+            training = study.settings(method).training
+            assert training.seconds == study.seconds
+            assert len(training.snapshots_s) == study.snapshots
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("title: t\nmethods: [a]\nvariants: {all: {}}\nspeed: 3", "speed: Extra inputs"),
+        ("title: t\nmethods: [a]\nvariants: {all: {views: 3}}", "variants.all.views: Extra inputs"),
+        ("title: t\nmethods: [a]\nvariants: {all: {methods: [b]}}", "variants.all: no method b; there"),
+        ("title: t\nmethods: [a]\nvariants: {}", "variants: Dictionary should have at least 1"),
+    ],
+)
+def test_bad_studies_are_refused_by_key(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(CaptureError, match=message):
+        load_study(write(tmp_path, text))
+
+
+def test_unknown_studies_are_refused() -> None:
+    with pytest.raises(CaptureError, match="speed: no such study or file; studies are cameras, dynamic"):
+        load_study("speed")
+
+
+def test_parts_by_number_and_by_name() -> None:
+    assert Variant().parts(RECORDED) == (None, None, None)
+    assert Variant(cameras=2, frames=3, novel_poses=False).parts(RECORDED) == (("a", "c"), (0, 4, 8), ())
+    assert Variant(cameras=3, frames=1).parts(RECORDED) == (("a", "b", "c"), (0,), None)
+    assert Variant(cameras=("d",), frames=(2,)).parts(RECORDED) == (("d",), (2,), None)
+
+
+def test_more_than_was_recorded_is_refused() -> None:
+    with pytest.raises(CaptureError, match="the capture has 4 training cameras, not 8"):
+        Variant(cameras=8).parts(RECORDED)
+    with pytest.raises(CaptureError, match="the capture has 5 training frames, not 6"):
+        Variant(frames=6).parts(RECORDED)
+
+
+def test_snapshots_halve_the_limit_or_double_from_a_quarter_minute() -> None:
+    assert snapshot_times_s(80.0, 3) == (10.0, 20.0, 40.0)
+    assert snapshot_times_s(None, 3) == (15.0, 30.0, 60.0)
+    assert snapshot_times_s(80.0, 0) == ()
+
+
+def test_narrowing_keeps_methods_where_they_were_and_tries_presets_everywhere() -> None:
+    study = Study(
+        title="t",
+        seconds=60,
+        methods=("a", "b"),
+        variants={"all": Variant(methods=("b",)), "one": Variant(frames=1)},
+    )
+    assert study.narrowed([], None) == study.model_copy(
+        update={"variants": {"all": Variant(methods=("b",)), "one": Variant(frames=1, methods=("a", "b"))}}
+    )
+    narrowed = study.narrowed(["a", "demo"], 5.0)
+    assert narrowed.methods == ("a", "demo")
+    assert {title: variant.methods for title, variant in narrowed.variants.items()} == {
+        "all": ("demo",),
+        "one": ("a", "demo"),
+    }
+    assert narrowed.seconds == 5.0

@@ -1,0 +1,173 @@
+"""Tables and charts of a result that was made up."""
+
+import csv
+import io
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from hnerf.study import charts
+from hnerf.study.publish import publish
+from hnerf.study.results import (
+    as_csv,
+    as_markdown,
+    caption,
+    clouds,
+    frame_points,
+    heading,
+    near_best_seconds,
+    sweep_curves,
+    timed_px,
+)
+
+MACHINE = {"cpu": "Abacus", "cores": 2, "gpu": None, "torch": "2", "python": "3"}
+GEOMETRY = {"chamfer_l2_e3": 0.05, "normal_consistency": 0.94, "iou": 0.875}
+
+
+def split(psnr: float) -> dict[str, Any]:
+    rows = [
+        {"camera": "c", "frame": f, "psnr": psnr + f, "view_angle_deg": 40.0 + f, "pose_distance_mm": 3.0}
+        for f in (0, 2)
+    ]
+    return {"n": 2, "psnr": psnr, "ssim": 0.9, "mask_iou": 0.95, "per_image": rows, "geometry": GEOMETRY}
+
+
+def scores(psnr: float, frame_s: float, folder: str) -> dict[str, Any]:
+    nothing = {"n": 0, "psnr": None, "ssim": None, "mask_iou": None, "reason": "no poses", "per_image": []}
+    return {
+        "machine": MACHINE,
+        "protocol": "By eye.",
+        "lpips": "not available: no weights",
+        "split": "novel_view",
+        "training": {"seconds": 61.7, "peak_memory_gib": 1.25, "model_mib": 28.5},
+        "curve": [{"seconds": 10.0, "psnr": psnr - 4}, {"seconds": 1000.0, "psnr": psnr}],
+        "novel_view": split(psnr),
+        "novel_pose": nothing | {"geometry": None, "geometry_reason": "no poses"},
+        "frame_seconds": {"512": 4 * frame_s, "256": frame_s},
+        "pictures": [{"camera": "c", "frame": 0}],
+        "folder": folder,
+    }
+
+
+def result(**changes: Any) -> dict[str, Any]:
+    methods = {
+        "fast": scores(30.0, 0.5, "scoring/f"),
+        "nerf": scores(26.0, 2.0, "scoring/n"),
+        "idr": {"error": "a | b"},
+    }
+    few = {"fast": scores(28.0, 0.5, "scoring/f")}
+    return {
+        "subject": "ada",
+        "study": "toy",
+        "title": "Toys",
+        "notes": ["A note."],
+        "seconds": 60.0,
+        "sweep": "cameras",
+        "methods": ["fast", "nerf", "idr"],
+        "variants": {
+            "4 cameras": {"cameras": 4, "frames": 1, "methods": methods},
+            "2 cameras": {"cameras": 2, "frames": 1, "methods": few},
+            "8 cameras": {"left_out": "the capture has 4 training cameras, not 8"},
+        },
+    } | changes
+
+
+def test_the_markdown_by_hand() -> None:
+    assert as_markdown(result(), ["chart.png"]).splitlines()[:23] == [
+        "# Toys: ada",
+        "",
+        "ada, study toy: 60 s of training; on Abacus, 2 cores, no GPU, torch 2, Python 3.",
+        "",
+        "- A note.",
+        "",
+        "![chart.png](chart.png)",
+        "",
+        "Two figures in a cell: new views / new poses.",
+        "",
+        "## 4 cameras",
+        "",
+        "4 training cameras, 1 training frames.",
+        "",
+        "| method | PSNR, dB | SSIM | mask IoU | Chamfer x1e-3 m² | NC | IoU | training, s | peak memory, GiB "
+        "| model, MiB | frame at 256 px, s | frame at 512 px, s | s to best - 1 dB |",
+        "|" + "---|" * 13,
+        "| fast | 30.00 / - | 0.900 / - | 0.950 / - | 0.050 / - | 0.940 / - | 0.875 / - | 62 | 1.2 | 28.5 | 0.50 "
+        "| 2.00 | 316 |",
+        "| nerf | 26.00 / - | 0.900 / - | 0.950 / - | 0.050 / - | 0.940 / - | 0.875 / - | 62 | 1.2 | 28.5 | 2.00 "
+        "| 8.00 | - |",
+        "| idr | a / b |  |  |  |  |  |  |  |  |  |  |  |",
+        "",
+        "- fast, nerf: no images of new poses: no poses",
+        "",
+        "## 2 cameras",
+    ]
+    text = as_markdown(result(), [])
+    assert "Left out: the capture has 4 training cameras, not 8." in text
+    assert text.endswith("LPIPS: not available: no weights.\n\nBy eye.\n")
+
+
+def test_the_csv_has_a_row_for_each_method_of_each_variant() -> None:
+    rows = list(csv.DictReader(io.StringIO(as_csv(result()))))
+    assert [(row["variant"], row["method"]) for row in rows] == [
+        ("4 cameras", "fast"),
+        ("4 cameras", "nerf"),
+        ("4 cameras", "idr"),
+        ("2 cameras", "fast"),
+    ]
+    assert rows[0]["novel_view.geometry.iou"] == "0.875" and rows[0]["novel_pose.psnr"] == ""
+    assert rows[1]["frame_seconds.256"] == "2.0"
+    assert rows[2]["error"] == "a | b" and rows[2]["novel_view.psnr"] == ""
+
+
+def test_what_charts_show() -> None:
+    variants = result()["variants"]
+    assert heading("4 cameras", variants["4 cameras"]) == "4 cameras, new views"
+    assert timed_px(result()) == "256"
+    assert frame_points(variants["4 cameras"]) == {"fast": (0.5, 30.0), "nerf": (2.0, 26.0)}
+    assert sweep_curves(result()) == {"fast": [(2, 28.0), (4, 30.0)], "nerf": [(4, 26.0)]}
+    assert clouds(variants["2 cameras"], "novel_view", "view_angle_deg") == {"fast": [(40.0, 28.0), (42.0, 30.0)]}
+    # from 26 dB at 10 s to 30 dB at 1000 s: 29 dB after three quarters of the way in log time
+    near = near_best_seconds(variants["4 cameras"])
+    assert near == {"fast": pytest.approx(10 * 100**0.75), "nerf": None}
+
+
+def test_captions_name_limit_and_machine() -> None:
+    assert "training to each preset's own end; on Abacus" in caption(result(seconds=None))
+    assert caption(result(variants={})).endswith("on no machine yet.")
+
+
+def test_everything_is_published_and_old_charts_go(tmp_path: Path) -> None:
+    for name, grey in (("f", 200), ("n", 90)):
+        for kind in ("render", "truth"):
+            path = tmp_path / "scoring" / name / "pictures" / f"0-{kind}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), np.full((40, 30, 3), grey, np.uint8))
+    table = publish(result(), tmp_path)
+    assert table == tmp_path / "benchmark" / "ada-toy.md"
+    names = {path.name for path in table.parent.iterdir()}
+    drawn = {f"ada-toy{name}.png" for name in ("", "-sweep", "-nearness", "-pictures")}
+    assert names == {"ada-toy.md", "ada-toy.csv", "ada-toy.json"} | drawn
+    assert all(f"![{name}]({name})" in table.read_text() for name in drawn)
+    assert json.loads(table.with_suffix(".json").read_text()) == result()
+    publish(result(variants={}), tmp_path)
+    assert {path.suffix for path in table.parent.iterdir()} == {".md", ".csv", ".json"}
+
+
+def test_methods_differ_in_line_and_marker_so_that_grey_prints_do() -> None:
+    looks = charts.styles([f"method {k}" for k in range(6)]).values()
+    assert len({look["linestyle"] for look in looks}) == len({look["marker"] for look in looks}) == 6
+
+
+def test_names_at_line_ends_do_not_lie_upon_each_other() -> None:
+    figure, axes = charts._figure(1, 1)
+    curves = {"a": [(1.0, 20.0), (10.0, 30.0)], "b": [(1.0, 21.0), (10.0, 30.1)], "c": [(1.0, 10.0), (10.0, 15.0)]}
+    charts.lines(axes[0][0], curves, charts.styles(curves))
+    figure.canvas.draw()
+    boxes = sorted((text.get_window_extent() for text in axes[0][0].texts), key=lambda box: box.y0)
+    assert len(boxes) == 3
+    assert all(lower.y1 <= upper.y0 + 1 for lower, upper in itertools.pairwise(boxes))

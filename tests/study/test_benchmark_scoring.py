@@ -1,0 +1,151 @@
+"""Scores of a made-up training, whose models are grey balls of known colours."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from hnerf.evaluation.ground_truth import GroundTruth
+from hnerf.evaluation.metrics import mask_box
+from hnerf.render.avatar import Rendering
+from hnerf.study import scoring
+from hnerf.study.plan import ScoringSettings
+from hnerf.study.scoring import Scene, frame_seconds, score, why_no_novel_poses
+from tests.evaluation.ball import (
+    PHOTOGRAPHED,
+    RADIUS_M,
+    BallAvatar,
+    ball_camera,
+    ball_fit,
+    centre_m,
+    seen,
+    write_ball_capture,
+    write_ball_truth,
+)
+
+GAP_M = 0.01  # between the ball and its true surface
+GREYS = {
+    "training": 102,
+    "5": 51,
+    "10": 76.5,
+    "12": 0,
+}  # of 255: the finished model, and the snapshots by their seconds
+SETTINGS = ScoringSettings(meshes=1, snapshot_images=2, snapshot_meshes=0, frame_sizes_px=(16, 32))
+
+
+class GreyBall(BallAvatar):
+    """The ball in a grey of its own; every rendering's size is noted."""
+
+    def __init__(self, grey: float):
+        super().__init__(ball_fit())
+        object.__setattr__(self, "grey", grey)
+        object.__setattr__(self, "sizes", [])
+
+    def render(self, camera: Any, theta: torch.Tensor, root: torch.Tensor) -> Rendering:
+        self.sizes.append((camera.width_px, camera.height_px))
+        alpha = torch.from_numpy(seen(camera, root[:3, 3].numpy())).float()
+        return Rendering(alpha[..., None].expand(-1, -1, 3) * self.grey / 255, alpha, alpha)
+
+
+def scored(
+    base: Path, test_cameras: tuple[str, ...], settings: ScoringSettings = SETTINGS, machinery: str = "fast"
+) -> dict[str, Any]:
+    """Scores, in `base`/out, of a training of 15 s whose field had 12, with snapshots before and after the field's
+    end."""
+    training = base / "training"
+    for name in ("5", "10", "12"):
+        (training / "snapshots" / name).mkdir(parents=True)
+    stored = {"static": False, "training": {"machinery": machinery, "seconds": 12.0}}
+    (training / "settings.json").write_text(json.dumps(stored))
+    (training / "report.json").write_text('{"seconds": 15.0, "peak_memory_gib": 1.5, "model_mib": 7.0}')
+    capture = write_ball_capture(base / "capture", "ball", test_cameras)
+    write_ball_truth(capture, RADIUS_M + GAP_M)
+    out = base / "out"
+    out.mkdir()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scoring, "load_avatar", lambda path, device: GreyBall(GREYS[path.name]))
+        return score(Scene(capture, GroundTruth(capture.root, capture), "cpu"), training, settings, out)
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where everything lies of a capture with one test camera."""
+    folder = tmp_path_factory.mktemp("scored")
+    scored(folder, ("c",))
+    return folder
+
+
+@pytest.fixture
+def found(base: Path) -> dict[str, Any]:
+    """Its scores."""
+    read: dict[str, Any] = json.loads((base / "out" / "scores.json").read_text())
+    return read
+
+
+def psnr_db(grey: float, camera: str, frame: int) -> float:
+    """Of a ball in this grey: only its own pixels are off, all by the same."""
+    mask = seen(ball_camera(camera, {"a": 0.0, "c": 160.0}[camera]), centre_m(frame))
+    return -10 * np.log10(mask[mask_box(mask)].mean() * ((PHOTOGRAPHED - round(grey)) / 255) ** 2)
+
+
+def test_the_curve_is_of_snapshots_before_the_end_and_of_the_end_at_the_limit(found: dict[str, Any]) -> None:
+    assert [row["seconds"] for row in found["curve"]] == [5.0, 10.0, 12.0]
+    assert found["split"] == "novel_view"
+    for row, grey in zip(found["curve"], (51, 76.5, 102), strict=True):
+        assert row["n"] == 2
+        assert row["psnr"] == pytest.approx(np.mean([psnr_db(grey, "c", f) for f in (0, 2)]), abs=1e-3)
+        assert row["geometry_reason"] == "the study asks for no surface here"
+    assert found["novel_view"]["psnr"] == pytest.approx(np.mean([psnr_db(102, "c", f) for f in (0, 1, 2)]), abs=1e-3)
+    assert found["novel_view"]["geometry"]["chamfer_mm"] == pytest.approx(1e3 * GAP_M, rel=0.02)
+    assert found["training"]["model_mib"] == 7.0
+
+
+def test_new_poses_count_the_seconds_that_fitting_them_took(tmp_path: Path) -> None:
+    found = scored(tmp_path, ())
+    assert found["split"] == "novel_pose"
+    assert [row["seconds"] for row in found["curve"]] == [5.0, 10.0, 12.0, 15.0]
+    assert found["novel_view"]["psnr"] is None
+    assert found["novel_view"]["reason"] == "the capture has no test cameras"
+
+
+def test_images_stand_beside_their_distance_from_training(found: dict[str, Any]) -> None:
+    rows = found["novel_view"]["per_image"]
+    assert [row["frame"] for row in rows] == [0, 1, 2]
+    assert rows[0]["view_angle_deg"] == pytest.approx(80.0, abs=1e-3)  # cameras at 0, 80 and 160 degrees
+    assert [row["pose_distance_mm"] for row in rows] == [0.0, 0.0, 0.0]
+
+
+def test_pictures_of_truth_and_rendering_lie_side_by_side(base: Path, found: dict[str, Any]) -> None:
+    assert found["pictures"] == [{"camera": "c", "frame": 0}, {"camera": "c", "frame": 2}]
+    names = {path.name for path in (base / "out" / "pictures").iterdir()}
+    assert names == {f"{k}-{name}.png" for k in (0, 1) for name in ("render", "truth")}
+
+
+def test_a_method_without_poses_has_a_reason_instead_of_figures(tmp_path: Path) -> None:
+    found = scored(tmp_path, ("c",), SETTINGS.model_copy(update={"split": "novel_pose"}), "nerf")
+    assert found["novel_pose"]["psnr"] is None and found["novel_pose"]["geometry"] is None
+    assert found["novel_pose"]["reason"] == "NeRF models one moment"
+    assert found["curve"] == []
+    assert found["novel_view"]["n"] == 3
+
+
+def test_who_has_no_novel_poses() -> None:
+    def reason(machinery: str, static: bool) -> str | None:
+        return why_no_novel_poses({"static": static, "training": {"machinery": machinery}})
+
+    assert [reason(name, False) for name in ("fast", "paper", "neural_body")] == [None] * 3
+    assert reason("fast", True) is None
+    assert re.match("H-NeRF's static network", reason("paper", True) or "")
+    assert re.match("Nerfies has no pose", reason("nerfies", False) or "")
+
+
+def test_a_frame_is_timed_at_its_longest_side() -> None:
+    avatar = GreyBall(100)
+    wide = replace(ball_camera("a", 0.0), width_px=64, height_px=32)
+    assert frame_seconds(avatar, wide, 0, 16) > 0
+    assert avatar.sizes == [(16, 8)] * 3

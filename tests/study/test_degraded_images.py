@@ -1,0 +1,83 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.capture.capture import Capture
+from hnerf.study.degraded_images import blur
+from hnerf.study.occluder import person_middle, pillar
+from tests.study.recording import SIZE_PX, write, write_recording
+from tests.study.test_degraded_rig import degraded
+
+
+def test_noise_has_its_spread_in_training_cameras_alone(tmp_path: Path) -> None:
+    bad = degraded(tmp_path, "image_noise", 10)
+    noise = np.stack([bad.image(name, frame).astype(float) - 100 - frame for name in ("01", "02") for frame in (2, 4)])
+    assert noise.std() == pytest.approx(10, rel=0.1)  # 3072 values, through JPEG of quality 95
+    assert np.ptp(bad.image("03", 2)) == 0
+    plate = bad.background("01")
+    assert plate is not None
+    assert plate.std() == pytest.approx(10, rel=0.2)
+    assert bad.given_mask("01", 2).sum() == 64  # type: ignore[union-attr]
+
+
+def test_blur_spreads_by_a_share_of_the_width(tmp_path: Path) -> None:
+    good = write_recording(tmp_path / "good")
+    dot = np.zeros((SIZE_PX, SIZE_PX, 3))
+    dot[8, 8] = 255
+    write(good.root / "images" / "01" / "000002.png", dot)
+    blur(good, 6.25, np.random.default_rng(0), tmp_path / "bad")  # 1 px
+    shown = Capture.load(tmp_path / "bad").image("01", 2)[..., 0].astype(int)
+    # 255 / (2 pi) = 40.6 in the middle, times exp(-1 / 2) beside it, exp(-2) two pixels away; JPEG errs by a few levels
+    assert [shown[8, 8], shown[8, 9], shown[7, 8], shown[8, 10]] == pytest.approx([40.6, 24.6, 24.6, 5.5], abs=4)
+
+
+def test_exposures_are_shared_out(tmp_path: Path) -> None:
+    bad = degraded(tmp_path, "exposure", 1)
+    assert sorted(int(bad.image(name, 2)[0, 0, 0]) for name in ("01", "02")) == [51, 204]  # 102 / 2, 102 x 2
+    assert sorted(int(bad.background(name)[0, 0, 0]) for name in ("01", "02")) == [25, 100]  # type: ignore[index]
+    assert bad.image("03", 2)[0, 0, 0] == 102
+
+
+def test_half_size(tmp_path: Path) -> None:
+    bad = degraded(tmp_path, "small_images", 0.5)
+    assert bad.image("01", 2).shape == (8, 8, 3)
+    assert bad.image("03", 2).shape == (16, 16, 3)
+    # Pixel centres at integers: x' = (x + 1/2) / 2 - 1/2.
+    assert bad.cameras["01"].K.tolist() == [[8, 0, 3.5], [0, 8, 3.5], [0, 0, 1]]
+    assert bad.keypoints("01")[0, 0, 1].tolist() == [0.75, 2.25, 1]  # type: ignore[index]
+    assert bad.keypoints("03")[0, 0, 1].tolist() == [2, 5, 1]  # type: ignore[index]
+    mask = bad.given_mask("01", 2)
+    assert mask is not None
+    assert np.argwhere(mask).min(0).tolist() == [2, 2]
+    assert mask.sum() == 16
+    assert bad.background("01").shape == (8, 8, 3)  # type: ignore[union-attr]
+
+
+def test_the_person_stands_where_rays_meet(tmp_path: Path) -> None:
+    """Keypoints' mean is 0.1 px or so off the images' middle, where both axes cross at (0, 0, 1)."""
+    assert person_middle(write_recording(tmp_path)) == pytest.approx([0, 0, 1], abs=0.1)
+
+
+def test_the_pillar_stands_on_the_way_to_the_camera(tmp_path: Path) -> None:
+    camera = write_recording(tmp_path).cameras["01"]  # at (-4, 0, 1)
+    corners_m = pillar(np.array([0.0, 0, 1]), camera, np.array([0.0, 0, 1]), 0.5)
+    assert corners_m.min(0) == pytest.approx([-1.85, -0.25, -0.2])
+    assert corners_m.max(0) == pytest.approx([-1.35, 0.25, 2.2])
+
+
+def test_a_pillar_hides_pixels_masks_and_keypoints_of_the_camera_behind_it(tmp_path: Path) -> None:
+    """Nearest at 2.15 m from a camera of 16 px focal length, 0.5 m are 3.7 px; the other camera sees it 1.35 m to the
+    left of the person and not in front of him."""
+    bad = degraded(tmp_path, "occluder", 0.5)
+    grey = {name: (bad.image(name, 2).astype(int).max(-1) < 99).sum(0) for name in bad.cameras}  # rows a column
+    behind = [name for name, columns in grey.items() if columns.any()]
+    assert len(behind) == 1
+    assert behind[0] in ("01", "02")
+    assert np.flatnonzero(grey[behind[0]]).tolist() == [6, 7, 8, 9]
+    mask, keypoints = bad.given_mask(behind[0], 2), bad.keypoints(behind[0])
+    assert mask is not None
+    assert keypoints is not None
+    assert mask.sum() == 64 - 4 * 8
+    assert not keypoints[0, 0, 0].any()  # 7.5 px
+    assert keypoints[0, 0, 1].tolist() == [2, 5, 1]

@@ -1,0 +1,66 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.capture.capture import Capture
+from hnerf.segmentation.masks import Masks, encode
+from hnerf.study.degrade import Degradation, degrade_masks
+from tests.study.recording import write_recording
+
+SIZE_PX = 100
+BOX = slice(20, 60), slice(30, 70)  # 40 x 40
+
+
+def masks() -> Masks:
+    """One box in frames 2 and 4 of camera 01."""
+    mask = np.zeros((SIZE_PX, SIZE_PX), bool)
+    mask[BOX] = True
+    return Masks({("01", frame): encode(mask) for frame in (2, 4)}, {"cameras": {}})
+
+
+def changed(tmp_path: Path, kind: str, strength: float) -> list[np.ndarray]:
+    """The masks, degraded."""
+    capture = write_recording(tmp_path)
+    bad = degrade_masks(masks(), capture, Degradation(kind=kind, strength=strength, seed=0))
+    assert list(bad.encoded) == [("01", 2), ("01", 4)]
+    return [bad.get("01", frame) for frame in (2, 4)]
+
+
+def test_three_per_cent_of_the_width_are_three_pixels(tmp_path: Path) -> None:
+    eroded, _ = changed(tmp_path, "mask_eroded", 3)
+    assert eroded.sum() == 34 * 34
+    assert eroded[23:57, 33:67].all()
+    dilated, _ = changed(tmp_path, "mask_dilated", 3)
+    # Sides grow by 3; of each corner's 3 x 3 px, those at most 3 px away (1, 1 to 2, 2) are 4.
+    assert dilated.sum() == 40 * 40 + 4 * 40 * 3 + 4 * 4
+
+
+def test_holes_take_their_share_and_no_more_than_a_disc_over(tmp_path: Path) -> None:
+    pierced = changed(tmp_path, "mask_holes", 25)
+    disc = 60  # radius of 0.1 x 40 = 4 px
+    for mask in pierced:
+        assert 1200 - disc < mask.sum() <= 1200
+        assert not mask[~masks().get("01", 2)].any()
+    assert not np.array_equal(pierced[0], pierced[1])
+
+
+def test_a_limb_is_cut_off_around_its_bone(tmp_path: Path) -> None:
+    """All limbs' keypoints at the same two places: from (40, 40) to (50, 40), on to (55, 40), 8 px thick."""
+    capture = write_recording(tmp_path)
+    people = np.zeros((5, 1, 25, 3))
+    people[:, 0, [3, 6, 10, 13]] = 40, 40, 1
+    people[:, 0, [4, 7, 11, 14]] = 50, 40, 1
+    np.savez_compressed(tmp_path / "keypoints.npz", **dict.fromkeys(capture.cameras, people))  # type: ignore[arg-type]
+    bad = degrade_masks(masks(), Capture.load(tmp_path), Degradation(kind="mask_limb", strength=100, seed=0))
+    cut = masks().get("01", 2) & ~bad.get("01", 2)
+    assert cut[40, 38:58].all()
+    rows, columns = np.nonzero(cut)
+    assert (rows.min(), rows.max()) == pytest.approx((36, 44), abs=1)
+    assert (columns.min(), columns.max()) == pytest.approx((36, 59), abs=1)
+
+
+def test_no_limb_is_missing_from_no_masks(tmp_path: Path) -> None:
+    capture = write_recording(tmp_path)
+    spared = degrade_masks(masks(), capture, Degradation(kind="mask_limb", strength=1e-9, seed=0))
+    assert np.array_equal(spared.get("01", 2), masks().get("01", 2))

@@ -1,0 +1,137 @@
+"""The studies as they are kept, and tables and charts from runs that were made up."""
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+
+from hnerf.config import load_settings
+from hnerf.errors import CaptureError
+from hnerf.study.degrade import KINDS
+from hnerf.study.stability import Stability, load_stability
+from hnerf.study.stability_charts import SHADES, curve_chart, matrix_chart
+from hnerf.study.stability_report import as_markdown, breaking_strength
+
+
+def test_the_full_study_tries_everything_at_four_or_five_strengths_and_three_seeds() -> None:
+    full = load_stability("full")
+    assert set(full.degradations) == set(KINDS)
+    assert {len(s) for name, s in full.degradations.items() if name != "cameras_left"} <= {4, 5}
+    assert len(full.seeds) == 3
+    assert full.left_out() == [
+        "loose clothing: cannot be made from a given capture; the person of `hnerf synth` wears a loose shirt",
+        "long hair: cannot be made from a given capture",
+    ]
+
+
+def test_the_quick_study_tries_the_two_milder_strengths_and_says_what_it_left_out() -> None:
+    full, quick = load_stability("full"), load_stability("quick")
+    assert quick.degradations == {name: full.degradations[name][:2] for name in quick.degradations}
+    for method in quick.methods:
+        load_settings(method, list(quick.overrides))
+    left_out = quick.left_out()
+    assert "`paper` as a method" in left_out
+    assert "2 of 3 seeds: no spread is known from so few" in left_out
+    assert "what the preset says: `training.steps=100` instead" in left_out
+    assert "one camera turned, °: 2, 3" in left_out
+    assert "blur, % of image width: 0.25, 0.5, 1, 2" in left_out
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("methods: [fast]\nseeds: [0]\ndegradations: {mask_holes: [5]}\nspeed: 3", "speed: Extra inputs"),
+        ("methods: []\nseeds: [0]\ndegradations: {}", "methods: "),
+        ("methods: [fast]\nseeds: [0]\ndegradations: {hats: [5]}", "degradation hats: no such thing"),
+        ("methods: [fast]\nseeds: [0]\ndegradations: {mask_holes: [5, 2, 3]}", "the mildest first"),
+    ],
+)
+def test_bad_studies_are_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(text)
+    with pytest.raises(CaptureError, match=message) as told:
+        load_stability(str(tmp_path / "mine.yaml"))
+    assert "\n" not in str(told.value)
+
+
+def test_unknown_studies_and_degradations_are_refused() -> None:
+    with pytest.raises(CaptureError, match="slow: no such study or file; studies are full, quick"):
+        load_stability("slow")
+    with pytest.raises(CaptureError, match="--only hats: not in this study; it has cameras_left, "):
+        load_stability("quick").only(["hats"])
+    assert list(load_stability("quick").only(["pose_noise"]).degradations) == ["pose_noise"]
+
+
+def run(method: str, kind: str, strength: float | None, seed: int, verdict: str, psnr: float | None) -> dict[str, Any]:
+    """A row; one without figures where there is no PSNR and the verdict is not good."""
+    row = {"method": method, "kind": kind, "strength": strength, "seed": seed, "verdict": verdict, "reason": ""}
+    if verdict in ("ok", "degraded"):
+        return row | {"psnr": psnr, "ssim": 0.9, "chamfer_mm": None if psnr is None else 36 - psnr}
+    return row | {"reason": "too | bad"}
+
+
+RESULT = {
+    "subject": "ada",
+    "study": "mine",
+    "plan": Stability(
+        methods=("fast", "nerf"),
+        seeds=(0, 1),
+        degradations={"pose_noise": (1, 2, 5), "mask_holes": (5, 10)},
+    ).model_dump(mode="json"),
+    "left_out": ["hats"],
+    "protocol": "By eye.",
+    "runs": [
+        *(run("fast", "as recorded", None, seed, "ok", 30 + seed) for seed in (0, 1)),
+        *(run("fast", "pose_noise", 1, seed, "ok", 29.5 + seed) for seed in (0, 1)),
+        run("fast", "pose_noise", 2, 0, "degraded", 27.0),
+        run("fast", "pose_noise", 2, 1, "failed", None),
+        run("fast", "pose_noise", 5, 0, "refused", None),
+        run("fast", "mask_holes", 5, 0, "ok", 30.0),
+        run("nerf", "as recorded", None, 0, "refused", None),
+    ],
+}
+
+
+def test_a_method_breaks_where_its_worst_seed_does() -> None:
+    assert breaking_strength(RESULT, "fast", "pose_noise") == "2 (failed)"
+    assert breaking_strength(RESULT, "fast", "mask_holes") == "holds to 5"
+    assert breaking_strength(RESULT, "nerf", "mask_holes") == "5 (refused)"
+
+
+def test_the_tables_by_hand() -> None:
+    lines = as_markdown(RESULT, ["a.png"]).splitlines()
+    start = lines.index("## Where each method breaks")
+    assert lines[start + 2 : start + 10] == [
+        "| degradation | fast | nerf |",
+        "|---|---|---|",
+        "| pose noise, ° a joint | 2 (failed) | 1 (refused) |",
+        "| holes, % of each mask | holds to 5 | 5 (refused) |",
+        "",
+        "![a.png](a.png)",
+        "",
+        "## Runs",
+    ]
+    assert "| fast | pose noise, ° a joint | 2 | 0 | degraded | 27.00 | 0.900 | 9.00 |" in lines
+    assert "| fast | pose noise, ° a joint | 2 | 1 | failed: too / bad | - | - | - |" in lines
+    assert "- hats" in lines
+    assert lines[-1] == "By eye."
+
+
+def test_the_matrix_has_a_shade_for_each_verdict(tmp_path: Path) -> None:
+    matrix_chart(RESULT, tmp_path / "matrix.png")
+    picture = cv2.imread(str(tmp_path / "matrix.png"))
+    assert picture is not None
+    colours = {tuple(bgr) for bgr in picture.reshape(-1, 3).tolist()}
+    assert {tuple(int(shade[k : k + 2], 16) for k in (5, 3, 1)) for shade in SHADES.values()} <= colours
+    luma = [(1, 0.3), (3, 0.59), (5, 0.11)]  # ITU-R BT.601, red, green, blue
+    greys = sorted(sum(int(shade[k : k + 2], 16) * weight for k, weight in luma) for shade in SHADES.values())
+    assert all(lighter - darker > 15 for darker, lighter in itertools.pairwise(greys))
+
+
+def test_curves_are_drawn_where_there_are_figures(tmp_path: Path) -> None:
+    assert curve_chart(RESULT, "psnr", tmp_path / "psnr.png")
+    assert (tmp_path / "psnr.png").stat().st_size > 10_000
+    nothing = RESULT | {"runs": [r for r in RESULT["runs"] if "psnr" not in r]}  # type: ignore[union-attr, operator]
+    assert not curve_chart(nothing, "psnr", tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()

@@ -1,0 +1,43 @@
+from pathlib import Path
+
+import pytest
+
+from hnerf.capture.capture import Capture
+from hnerf.errors import CaptureError
+from hnerf.study.subset import subset
+from tests.study.recording import write_recording
+
+
+def test_a_subset_has_the_rows_and_files_that_were_chosen(tmp_path: Path) -> None:
+    subset(write_recording(tmp_path / "all"), tmp_path / "few", ("02",), (6, 2), (10,))
+    few = Capture.load(tmp_path / "few")
+    assert (few.train_cameras, few.test_cameras, tuple(few.cameras)) == (("02",), ("03",), ("02", "03"))
+    assert (few.train_frames, few.novel_pose_frames, few.frames) == ((2, 6), (10,), (2, 6, 10))
+    keypoints = few.keypoints("02")
+    assert keypoints is not None
+    assert keypoints[:, 0, 1, 0].tolist() == [2, 6, 10]
+    assert few.image("02", 6)[0, 0].tolist() == [106, 106, 106]
+    stored = sorted(str(p.relative_to(few.root)) for p in few.root.rglob("*.png"))
+    names = [f"{camera}/{frame:06d}.png" for camera in ("02", "03") for frame in (2, 6, 10)]
+    pictures = [f"{folder}/{name}" for folder in ("images", "masks") for name in names]
+    assert stored == ["background/02.png", "background/03.png", *pictures]
+
+
+def test_none_keeps_everything(tmp_path: Path) -> None:
+    capture = write_recording(tmp_path / "all")
+    subset(capture, tmp_path / "same", None, None, None)
+    folders = capture.root, tmp_path / "same"
+    before, after = ({p.relative_to(root): p.read_bytes() for p in root.rglob("*.png")} for root in folders)
+    assert before == after
+    assert len(before) == 2 * 3 * 5 + 3
+    assert (tmp_path / "same" / "capture.json").read_text() == (capture.root / "capture.json").read_text()
+
+
+def test_what_is_not_there_is_refused(tmp_path: Path) -> None:
+    capture = write_recording(tmp_path / "all")
+    with pytest.raises(CaptureError, match="ada: no training camera 03; there are 01, 02"):
+        subset(capture, tmp_path / "a", ("03",), None, None)
+    with pytest.raises(CaptureError, match="ada: no training frame 8; there are 2, 4, 6"):
+        subset(capture, tmp_path / "b", None, (8,), None)
+    with pytest.raises(CaptureError, match="no training camera or frame would be left"):
+        subset(capture, tmp_path / "c", None, (), None)

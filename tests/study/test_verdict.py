@@ -1,0 +1,28 @@
+import pytest
+
+from hnerf.study.verdict import judge
+
+GOOD = {"psnr": 30.0, "chamfer_mm": 6.0}
+
+
+@pytest.mark.parametrize(
+    ("psnr", "chamfer_mm", "told"),
+    [
+        (29.0, 7.5, "ok"),
+        (31.0, 5.0, "ok"),
+        (28.5, 7.5, "degraded: 1.5 dB of PSNR lost"),
+        (29.0, 9.0, "degraded: Chamfer distance times 1.50"),
+        (28.0, 12.0, "degraded: 2.0 dB of PSNR lost; Chamfer distance times 2.00"),
+        (23.0, 12.0, "failed: 7.0 dB of PSNR lost"),
+        (28.0, 24.0, "failed: Chamfer distance times 4.00"),
+        (float("nan"), 6.0, "failed: nan dB of PSNR lost"),
+        (None, 6.0, "ok"),
+        (None, None, "ok"),
+    ],
+)
+def test_the_worse_of_both_figures_counts(psnr: float | None, chamfer_mm: float | None, told: str) -> None:
+    assert str(judge({"psnr": psnr, "chamfer_mm": chamfer_mm}, GOOD, [])) == told
+
+
+def test_a_surface_that_is_no_persons_is_failure_whatever_the_scores() -> None:
+    assert str(judge(GOOD, GOOD, ["no surface", "a hole"])) == "failed: no surface"

@@ -1,0 +1,93 @@
+"""Stages of studies through a store, on a capture made by hand."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+import trimesh
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.capture import Capture
+from hnerf.study.degrade import Degradation
+from tasks.store import Artifact, Store
+from tasks.study import check_meshes, degrade_capture, degrade_fit, subset_capture
+from tests.body.boxes import box_rig
+from tests.study.recording import write_recording
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store")
+
+
+def recording(store: Store) -> Artifact:
+    return store.obtain("capture", "ada", lambda out: {"cameras": len(write_recording(out).cameras)})
+
+
+def body(store: Store) -> Artifact:
+    """The unit box in frames 2 and 4."""
+
+    def write(out: Path) -> dict[str, float]:
+        BodyFit(box_rig(), (2, 4), torch.zeros(2, 2, 3), torch.eye(4).repeat(2, 1, 1)).save(out)
+        (out / "report.json").write_text("{}")
+        return {}
+
+    return store.obtain("fit", "ada", write)
+
+
+def test_what_is_chosen_is_part_of_a_subsets_key(store: Store) -> None:
+    few = subset_capture(store, recording(store), ("01",), (2, 4), None)
+    assert few.metrics == {"cameras": 2, "frames": 4}
+    again = subset_capture(store, recording(store), ("01",), (2, 4), None)
+    other = subset_capture(store, recording(store), ("02",), (2, 4), None)
+    fewer = subset_capture(store, recording(store), ("01",), (2,), None)
+    assert again.root == few.root
+    assert len({few.root, other.root, fewer.root}) == 3
+
+
+def test_strength_and_seed_are_part_of_a_degradations_key(store: Store) -> None:
+    made = [
+        degrade_capture(store, recording(store), Degradation(kind="image_noise", strength=strength, seed=seed))
+        for strength, seed in ((5, 0), (5, 0), (6, 0), (5, 1))
+    ]
+    assert made[0].root == made[1].root
+    assert len({artifact.root for artifact in made}) == 3
+    assert Capture.load(made[0].root).train_cameras == ("01", "02")
+
+
+def test_a_degraded_fit_is_a_fit_with_the_good_ones_report(store: Store) -> None:
+    bad = degrade_fit(store, body(store), Degradation(kind="wrong_shape", strength=20, seed=0))
+    assert set(bad.files) == set(body(store).files) == {"body.npz", "rig.npz", "report.json"}
+    assert not torch.equal(BodyFit.load(bad.root).rig.vertices_m, box_rig().vertices_m)
+
+
+def test_a_surface_that_touches_itself_stays_closed(store: Store) -> None:
+    """Two boxes with an edge at the same place, whose vertices are their own."""
+
+    def write(out: Path) -> dict[str, float]:
+        (out / "meshes").mkdir()
+        small = trimesh.creation.box((0.1, 0.1, 1.0)).apply_translation((0.55, 0.55, 0))
+        both = trimesh.util.concatenate([trimesh.creation.box((1.0, 1.0, 1.0)), small])
+        both.export(out / "meshes" / "000002.ply")
+        return {}
+
+    checked = check_meshes(store, store.obtain("evaluation", "twin", write), body(store))
+    found = json.loads((checked.root / "surface.json").read_text())["000002"]
+    assert found["fault"] is None
+    assert (found["volume"], found["length"]) == pytest.approx((1.01, 1.1), rel=1e-4)
+
+
+def test_meshes_are_judged_by_the_body_of_their_frame(store: Store) -> None:
+    def write(out: Path) -> dict[str, float]:
+        (out / "meshes").mkdir()
+        for frame, side_m in ((2, 1.0), (4, 0.5)):
+            trimesh.creation.box((side_m,) * 3).export(out / "meshes" / f"{frame:06d}.ply")
+        return {}
+
+    checked = check_meshes(store, store.obtain("evaluation", "ada", write), body(store))
+    found = json.loads((checked.root / "surface.json").read_text())
+    assert found["000002"]["fault"] is None
+    assert found["000004"]["fault"] == "surface has 0.12 of the body's volume"
+    assert found["000004"]["volume"] == pytest.approx(0.125)
+    assert checked.metrics == {"faults": 1}
