@@ -1,0 +1,120 @@
+"""How every stage's cost grows with frames, cameras and pixels.
+
+usage: python benchmarks/scaling.py STORE [CAPTURE]
+
+Runs the stages of preset `fast`, training cut to a number of steps, on parts of a shared capture (default valid-wave)
+and on images of other sizes, each in turn, in a store that is emptied first. Writes `benchmarks/results/scaling.json`,
+`.md` and `.png`; the straight lines of the chart are what a cost in proportion would be.
+"""
+
+import argparse
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from provenance import RESULTS, SHARED, provenance, sentence, table, write_result
+
+from flows.train_subject import find_masks
+from hnerf.capture.capture import Capture
+from hnerf.config import load_settings
+from hnerf.spread import spread
+from hnerf.study.degrade import Degradation
+from tasks.calibration import calibrate, calibrated
+from tasks.capture import ingest
+from tasks.fit import fit
+from tasks.source import read_capture
+from tasks.store import Artifact, Store
+from tasks.study import degrade_capture, subset_capture
+from tasks.training import train, trained
+
+STEPS = 60
+AXES = {"frames": (6, 12, 24), "cameras": (1, 2, 4), "pixels": (0.25, 1.0, 4.0)}  # pixels: in times the recorded
+MARKERS = "os^Dv"
+
+
+def main() -> None:
+    """Time all parts, print, draw and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("store", type=Path)
+    parser.add_argument("capture", nargs="?", default="valid-wave")
+    options = parser.parse_args()
+    shutil.rmtree(options.store, ignore_errors=True)
+    shelf = Store(options.store.resolve())
+    source, _ = read_capture(SHARED / "data" / options.capture)
+    recording = ingest(shelf, source, load_settings("fast").capture)
+    seconds = {
+        axis: {str(amount): measure(shelf, part(shelf, recording, axis, amount)) for amount in amounts}
+        for axis, amounts in AXES.items()
+    }
+    result = provenance() | {"capture": options.capture, "steps": STEPS, "seconds": seconds}
+    lines = [f"# Cost against frames, cameras and pixels: {options.capture}", "", sentence(result), ""]
+    lines += [f"Seconds of a stage; training is {STEPS} steps and what comes before and after them.", ""]
+    for axis, rows in seconds.items():
+        stages = list(next(iter(rows.values())))
+        lines += table([[axis, *stages], *([n, *(f"{row[s]:.1f}" for s in stages)] for n, row in rows.items())])
+        lines.append("")
+    write_result("scaling", result, "\n".join([*lines, "![seconds against size](scaling.png)", ""]))
+    draw(seconds, RESULTS / "scaling.png")
+    print("\n".join(lines))
+
+
+def part(shelf: Store, recording: Artifact, axis: str, amount: float) -> Artifact:
+    """So many training frames or cameras, or so many times the pixels."""
+    capture = Capture.load(recording.root)
+    if axis == "frames":
+        return subset_capture(shelf, recording, None, tuple(spread(capture.train_frames, int(amount))), ())
+    if axis == "cameras":
+        return subset_capture(shelf, recording, capture.train_cameras[: int(amount)], None, ())
+    if amount == 1:
+        return subset_capture(shelf, recording, None, None, ())
+    kind = "small_images" if amount < 1 else "large_images"
+    resized = degrade_capture(shelf, recording, Degradation(kind=kind, strength=amount**0.5, seed=0))
+    return subset_capture(shelf, resized, None, None, ())
+
+
+def measure(shelf: Store, recording: Artifact) -> dict[str, float]:
+    """Seconds of each stage and of one image."""
+    settings = load_settings("fast", [f"training.steps={STEPS}"])
+    seconds: dict[str, float] = {}
+
+    def timed(name: str, work: Callable[[], Any]) -> Any:
+        started = time.perf_counter()
+        found = work()
+        seconds[name] = time.perf_counter() - started
+        return found
+
+    calibration = timed("calibration", lambda: calibrate(shelf, recording, settings.calibration))
+    masks = timed("segmentation", lambda: find_masks(shelf, recording, calibration, settings))
+    body = timed("fit", lambda: fit(shelf, recording, calibration, masks, settings.fit))
+    model = timed("training", lambda: train(shelf, recording, calibration, masks, body, settings.training))
+    avatar, capture = trained(model), calibrated(recording, calibration)
+    camera = capture.cameras[capture.train_cameras[0]]
+    avatar.render(camera, avatar.body.theta[0], avatar.body.root[0])
+    timed("one image", lambda: avatar.render(camera, avatar.body.theta[0], avatar.body.root[0]))
+    return seconds
+
+
+def draw(seconds: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
+    """A panel an axis, both scales logarithmic; grey lines have the slope of a cost in proportion."""
+    figure = Figure(figsize=(11, 3.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, (axis, rows) in zip(figure.subplots(1, len(seconds), sharey=True), seconds.items(), strict=True):
+        amounts = [float(n) for n in rows]
+        for marker, stage in zip(MARKERS, next(iter(rows.values())), strict=True):
+            spent = [row[stage] for row in rows.values()]
+            axes.loglog(amounts, spent, marker=marker, color="black", linewidth=1, markersize=5, label=stage)
+            axes.loglog(amounts, [spent[0] * n / amounts[0] for n in amounts], color="0.75", linewidth=1, zorder=0)
+        axes.set_xlabel("pixels, in times the recorded" if axis == "pixels" else f"training {axis}")
+        axes.set_xticks(amounts, [f"{n:g}" for n in amounts])
+        axes.minorticks_off()
+    figure.axes[0].set_ylabel("seconds")
+    figure.axes[-1].legend(frameon=False, fontsize=8)
+    figure.savefig(path, dpi=130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,45 @@
+"""Studies of speed, accuracy and stability on a shared capture, kept where the README finds them.
+
+usage: python benchmarks/studies.py STORE CAPTURE benchmark|stability STUDY [--methods a,b] [--seconds S]
+
+Runs `hnerf benchmark` or `hnerf stability` with STORE, in which finished work is found again, and copies its tables and
+charts to `benchmarks/results/<kind>/`.
+"""
+
+import argparse
+import shutil
+from pathlib import Path
+
+from provenance import RESULTS, SHARED, provenance, sentence
+
+from flows.benchmark import benchmark
+from flows.stability import stability
+
+
+def main() -> None:
+    """Run one study, copy what it wrote and say where it comes from."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("store", type=Path)
+    parser.add_argument("capture")
+    parser.add_argument("kind", choices=["benchmark", "stability"])
+    parser.add_argument("study")
+    parser.add_argument("--methods", default="")
+    parser.add_argument("--seconds", type=float)
+    options = parser.parse_args()
+    folder = SHARED / "data" / options.capture
+    methods = [name for name in options.methods.split(",") if name]
+    if options.kind == "benchmark":
+        table = benchmark.fn(folder, options.study, methods, options.seconds, options.store)
+    else:
+        table = stability.fn(folder, options.study, options.store, methods)
+    kept = RESULTS / options.kind
+    kept.mkdir(parents=True, exist_ok=True)
+    for path in [*table.parent.glob(f"{table.stem}.*"), *table.parent.glob(f"{table.stem}-*.png")]:
+        shutil.copy(path, kept / path.name)
+    text = f"{table.read_text()}\nMade by `benchmarks/studies.py`: {sentence(provenance())}\n"
+    (kept / table.name).write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
