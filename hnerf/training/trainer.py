@@ -100,6 +100,7 @@ class Trainer:
         while self.step < self.steps:
             if self.step == self.field_steps:
                 self._freeze_field()
+                self.optimizer.state.clear()  # its momentum would carry on the training poses
             terms = self._optimise(module)
             self.step += 1
             self.seconds = time.monotonic() - started

@@ -135,7 +135,8 @@ def test_a_model_of_another_version_is_refused(tmp_path: Path):
 
 
 def test_novel_pixels_never_reach_the_field(tmp_path: Path):
-    """Without the second phase the field is the same to the bit: it learns from training frames alone."""
+    """Without the second phase the field is the same to the bit: it learns from training frames alone. The training
+    poses stay where they were, too."""
     recording = record(tmp_path / "capture")
     models = []
     for steps in (0, 4):
@@ -144,6 +145,9 @@ def test_novel_pixels_never_reach_the_field(tmp_path: Path):
         train(*recording, with_changes(novel_pose_steps=steps), out, ALONE)
         models.append(load_file(out / "model.safetensors"))
     assert all(torch.equal(models[0][name], models[1][name]) for name in models[0])
+    poses = [load_avatar(tmp_path / f"{steps}").body.theta for steps in (0, 4)]
+    torch.testing.assert_close(poses[0][:2], poses[1][:2], atol=1e-6, rtol=0)
+    assert (poses[0][2] - poses[1][2]).abs().max() > 2e-5
 
 
 def test_not_a_number_stops_the_run_with_its_cause(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
