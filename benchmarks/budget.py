@@ -16,16 +16,13 @@ from typing import Any
 import numpy as np
 from provenance import SHARED, provenance, sentence, table, write_result
 
-from flows.train_subject import find_masks
+from flows.benchmark import trained
 from hnerf.config import Settings, TrainingSettings, load_settings
 from hnerf.study.plan import ScoringSettings
 from tasks.benchmark import score_training
-from tasks.calibration import calibrate
 from tasks.capture import ingest
-from tasks.fit import fit
 from tasks.source import read_capture
 from tasks.store import Store
-from tasks.training import train
 
 CAPTURES = ["valid-wave", "valid-walk", "valid-turn-mono"]
 DECIDED = "as decided"
@@ -65,10 +62,7 @@ def train_and_score(folder: Path, shelf: Store, settings: Settings) -> tuple[Tra
     """The training's settings with everything decided; its scores, with the decisions among them."""
     source, truth = read_capture(folder)
     recording = ingest(shelf, source, settings.capture)
-    calibration = calibrate(shelf, recording, settings.calibration)
-    masks = find_masks(shelf, recording, calibration, settings)
-    body = fit(shelf, recording, calibration, masks, settings.fit)
-    model = train(shelf, recording, calibration, masks, body, settings.training)
+    calibration, model = trained(shelf, recording, settings)
     scores = score_training(shelf, truth, recording, calibration, model, SCORING)
     stored = json.loads((model.root / "settings.json").read_text())
     found = json.loads((scores.root / "scores.json").read_text())

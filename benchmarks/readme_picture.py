@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import trimesh
 
+from hnerf.asset.surface import posed_surface
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
-from hnerf.evaluation.evaluate import posed_surface
 from hnerf.evaluation.mesh_queries import Surface
 from hnerf.evaluation.pictures import clay, crop, cropped_camera, frame_person, overlay_surface
 from hnerf.training.model import load_avatar

@@ -12,11 +12,26 @@ from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 from torch import Tensor
 
+from hnerf.body.rig import pose_vertices
 from hnerf.errors import CaptureError
+from hnerf.render.avatar import Avatar
 
 SLOPE_BOUND = 2.0  # |gradient| that skipping empty space allows for; a true distance has 1
 COARSEST_STRIDE = 9  # nodes; refined by threes, so that a coarse node is the centre of the block it stands for
 CHUNK_POINTS = 1 << 17
+POSED_CELLS = 256  # on the longest side of the box
+POSED_MARGIN_M = 0.2  # around the naked body: hair, shoes, loose clothes
+
+
+def posed_surface(avatar: Avatar, frame: int) -> trimesh.Trimesh:
+    """The zero surface of the avatar's signed distance in a frame's pose, in world metres (single precision)."""
+    k = avatar.body.index(frame)
+    theta, root = avatar.body.theta[k], avatar.body.root[k]
+    body_m = pose_vertices(avatar.body.rig, theta, root)
+    lower_m, upper_m = body_m.amin(0) - POSED_MARGIN_M, body_m.amax(0) + POSED_MARGIN_M
+    with torch.no_grad():
+        mesh = extract_surface(lambda x: avatar.signed_distance(x, theta, root), lower_m, upper_m, POSED_CELLS)
+    return trimesh.Trimesh(mesh.vertices.astype(np.float32), mesh.faces, process=False)
 
 
 def extract_surface(

@@ -20,6 +20,8 @@ from hnerf.body.rig import (
     vertex_transforms,
 )
 
+FAR_M = 10.0  # as a reach: farther than any point that is asked about
+
 
 @dataclass(frozen=True)
 class Descriptor:

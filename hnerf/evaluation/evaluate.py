@@ -13,8 +13,7 @@ import numpy as np
 import torch
 import trimesh
 
-from hnerf.asset.surface import extract_surface
-from hnerf.body.rig import pose_vertices
+from hnerf.asset.surface import POSED_CELLS, posed_surface
 from hnerf.capture.capture import Capture, read_rgb
 from hnerf.config import EvaluationSettings
 from hnerf.evaluation import geometry, metrics
@@ -27,15 +26,13 @@ from hnerf.spread import spread
 
 log = logging.getLogger("hnerf.evaluation")
 
-MESH_CELLS = 256  # on the longest side of the box
-MESH_MARGIN_M = 0.2  # around the naked body: hair, shoes, loose clothes
 LOG_EVERY_S = 10.0
 PROTOCOL = (
     "Images: PSNR, SSIM (Gaussian window of 11 px, sigma 1.5) of 8-bit images over black, data range 1, inside the box "
     "of the true mask padded by 20 px; mask IoU of pixels brighter than 8/255. Mean over images. "
     "novel_view: training frames from test cameras; novel_pose: frames kept from training, from test cameras, or from "
     "training cameras where there are no test cameras; their poses are fitted from training cameras. "
-    f"Geometry: zero surface of the signed distance by marching cubes, {MESH_CELLS} cells on the longest side; "
+    f"Geometry: zero surface of the signed distance by marching cubes, {POSED_CELLS} cells on the longest side; "
     f"{geometry.SAMPLES} samples a surface before those that cannot be seen from outside are dropped, fixed seed; "
     "Chamfer: mean of both directions of the mean squared distance from sample to surface, m^2 x 1e3, and of the mean "
     "distance in mm; normal consistency: mean |cos| at nearest points; IoU by winding number on a "
@@ -136,14 +133,3 @@ def score_meshes(
         return {"geometry": None, "geometry_reason": "the capture has no ground-truth surface in these frames"}
     means = {name: float(np.mean([score[name] for score in scores])) for name in scores[0]}
     return {"geometry": means | {"n": len(scores), "frames": [f for f in frames if f in true_meshes]}}
-
-
-def posed_surface(avatar: Avatar, frame: int) -> trimesh.Trimesh:
-    """The zero surface of the avatar's signed distance in a frame's pose, in world metres (single precision)."""
-    k = avatar.body.index(frame)
-    theta, root = avatar.body.theta[k], avatar.body.root[k]
-    body_m = pose_vertices(avatar.body.rig, theta, root)
-    lower_m, upper_m = body_m.amin(0) - MESH_MARGIN_M, body_m.amax(0) + MESH_MARGIN_M
-    with torch.no_grad():
-        mesh = extract_surface(lambda x: avatar.signed_distance(x, theta, root), lower_m, upper_m, MESH_CELLS)
-    return trimesh.Trimesh(mesh.vertices.astype(np.float32), mesh.faces, process=False)

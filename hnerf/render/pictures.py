@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hnerf.asset.surface import posed_surface
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import read_rgb
 from hnerf.capture.footage import Video
-from hnerf.evaluation.evaluate import posed_surface
 from hnerf.render.avatar import Avatar, Rendering
 
 log = logging.getLogger("hnerf.render")

@@ -10,9 +10,6 @@ import numpy as np
 
 from hnerf.errors import CaptureError
 
-# An edge lies anywhere between two pixels' centres: they are 75 % and 25 % covered on average.
-COVERED = np.array([0.25, 0.5, 0.25], np.float32)
-
 
 @dataclass(frozen=True)
 class Masks:
@@ -24,10 +21,6 @@ class Masks:
     def __contains__(self, view: tuple[str, int]) -> bool:
         """Whether this (camera, frame) has a mask that can be trusted."""
         return view in self.encoded
-
-    def soft(self, camera: str, frame: int) -> np.ndarray:
-        """(H, W) float32 in [0, 1]: the share of each pixel that the person covers, as far as a mask tells it."""
-        return cv2.sepFilter2D(self.get(camera, frame).astype(np.float32), -1, COVERED, COVERED)
 
     def get(self, camera: str, frame: int) -> np.ndarray:
         """(H, W) bool, True on the person."""

@@ -6,10 +6,9 @@ import numpy as np
 import trimesh
 from torch import Tensor
 
-from hnerf.asset.surface import extract_surface
+from hnerf.asset.surface import POSED_MARGIN_M, extract_surface
 from hnerf.body.rig import pose_vertices
 from hnerf.errors import CaptureError
-from hnerf.evaluation.evaluate import MESH_MARGIN_M
 from hnerf.render.avatar import Avatar
 
 CELLS = 128  # on the longest side: enough to see a hole of a finger's width
@@ -43,7 +42,7 @@ def check_surface(mesh: trimesh.Trimesh, body_m: np.ndarray, faces: np.ndarray) 
 def check_pose(avatar: Avatar, theta: Tensor, root: Tensor) -> SurfaceCheck:
     """Judge the avatar's surface in a pose theta (J, 3), root (4, 4)."""
     body_m = pose_vertices(avatar.body.rig, theta, root)
-    lower_m, upper_m = body_m.amin(0) - MESH_MARGIN_M, body_m.amax(0) + MESH_MARGIN_M
+    lower_m, upper_m = body_m.amin(0) - POSED_MARGIN_M, body_m.amax(0) + POSED_MARGIN_M
     try:
         mesh = extract_surface(lambda x: avatar.signed_distance(x, theta, root), lower_m, upper_m, CELLS)
     except CaptureError as error:

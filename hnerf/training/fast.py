@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from hnerf.body.canonical import Descriptor, PoseCorrection, PosedBodies
+from hnerf.body.canonical import FAR_M, Descriptor, PoseCorrection, PosedBodies
 from hnerf.body.descriptor import vertex_normals
 from hnerf.body.rig import Rig
 from hnerf.config import FastFieldSettings
@@ -18,7 +18,6 @@ SETTLED = 5.0  # where the logistic of density is 1 or 0 within 1 %
 ROOM_M = 0.012  # for what the surface still moves, and what poses that were not asked about do to it
 TIGHTEN_STEP_M = 0.004
 NEGLIGIBLE = 1e-3  # a sample of less weight gets no colour
-FAR_M = 10.0  # farther than any point that is asked about
 
 
 class FastField(Field):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from hnerf.body.canonical import Descriptor, PoseCorrection, PosedBodies
+from hnerf.body.canonical import FAR_M, Descriptor, PoseCorrection, PosedBodies
 from hnerf.body.rig import Rig
 from hnerf.config import PaperFieldSettings
 from hnerf.field.mlp import RadianceMLP, ResidualMLP
@@ -21,7 +21,6 @@ from hnerf.training.field import Field
 from hnerf.training.losses import RaySamples
 
 OUTSIDE_DISTANCE = 1.0  # the constant d of a point outside the person's box
-FAR_M = 10.0  # farther than any point that is asked about
 
 
 @dataclass(frozen=True)

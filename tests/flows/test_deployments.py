@@ -52,6 +52,13 @@ def test_deployment_run_takes_a_capture(deployed: str) -> None:
     assert run.parameters == {"capture": "/recordings/ada"}
 
 
+@pytest.mark.parametrize("study", ["benchmark", "stability"])
+def test_studies_are_deployed_too(deployed: str, study: str) -> None:
+    prefect(deployed, "deployment", "run", f"{study}/local", "-p", "capture=/recordings/ada", "-p", "study=quick")
+    (run,) = runs_of(study)
+    assert run.parameters == {"capture": "/recordings/ada", "study": "quick"}
+
+
 def test_parameters_are_checked_before_there_is_a_run(deployed: str) -> None:
     with pytest.raises(AssertionError, match="overrides"):
         prefect(deployed, "deployment", "run", "train-subject/local", "-p", "capture=/a", "-p", "overrides=3")

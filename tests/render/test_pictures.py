@@ -56,7 +56,7 @@ def test_normals_of_a_ball_point_away_from_its_middle() -> None:
 
 
 def test_every_kind_is_written_for_every_shot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hnerf.evaluation.evaluate.MESH_CELLS", 48)
+    monkeypatch.setattr("hnerf.asset.surface.POSED_CELLS", 48)
     ball = SolidBall(ball_fit())
     shots = [(CAMERA, 0), (ball_camera("b", 90.0), 3)]
     write_pictures(ball, shots, ("colour", "depth", "normals", "mask", "mesh"), 5.0, tmp_path)

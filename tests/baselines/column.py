@@ -1,0 +1,49 @@
+"""What a dynamic method learns in seconds of the bending column (tests/training/scene.py): two frames, four cameras."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.capture import Capture
+from hnerf.config import TrainingSettings
+from hnerf.training.model import TrainedAvatar, load_avatar
+from hnerf.training.processes import Processes
+from hnerf.training.trainer import train
+from tests.body.boxes import box_rig
+from tests.training.scene import record
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A recording and what was learned of its frames 0 and 1."""
+
+    capture: Capture
+    body: BodyFit
+    avatar: TrainedAvatar
+
+    def psnr(self, frame: int) -> float:
+        """Of the photographs of a frame, drawn over their plate, all cameras together."""
+        errors = []
+        for name, camera in self.capture.cameras.items():
+            drawn = self.avatar.render(camera, self.body.theta[frame], self.body.root[frame])
+            plate = torch.from_numpy(self.capture.background(name) / 255).float()
+            shown = drawn.rgb + (1 - drawn.alpha[..., None]) * plate
+            errors.append((shown - torch.from_numpy(self.capture.image(name, frame) / 255).float()).square().mean())
+        return float(-10 * torch.log10(torch.stack(errors).mean()))
+
+
+def learn(folder: Path, settings: TrainingSettings, bends_rad: tuple[float, float, float]) -> Learned:
+    """Train on the column bent as in the first two frames; the third is a novel pose."""
+    capture, masks, body = record(folder / "capture", bends_rad)
+    (folder / "out").mkdir()
+    train(capture, masks, body, settings, folder / "out", Processes(0, 1, torch.device("cpu")))
+    return Learned(capture, body, load_avatar(folder / "out"))
+
+
+def three_poses() -> BodyFit:
+    """The column upright and bent, as a fit of three frames."""
+    theta = torch.zeros(3, 2, 3)
+    theta[:, 1, 1] = torch.tensor([0.0, 0.3, 0.6])
+    return BodyFit(box_rig(bend_segments=6, splits=2), (0, 1, 2), theta, torch.eye(4).repeat(3, 1, 1))
