@@ -4,10 +4,10 @@ A preset is a YAML file under `configs/`; `load_settings("fast", ["training.seco
 """
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from hnerf.errors import CaptureError
 
@@ -117,6 +117,30 @@ class IdrSettings(Section):
     learning_rate: float = Field(default=1e-3, gt=0)
 
 
+class NeuralBodySettings(Section):
+    """NeuralBody, a compared method (hnerf/baselines/neural_body.py)."""
+
+    box_margin_m: float = Field(default=0.1, gt=0)
+    samples: int = Field(default=32, ge=2)
+    voxel_m: float = Field(default=0.015, gt=0)
+    code_width: int = Field(default=16, ge=1)  # of a vertex
+    appearance_width: int = Field(default=16, ge=1)  # of a frame
+    channels: int = Field(default=32, ge=1)
+    width: int = Field(default=64, ge=1)
+    learning_rate: float = Field(default=5e-3, gt=0)
+
+
+class NerfiesSettings(Section):
+    """Nerfies, a compared method (hnerf/baselines/nerfies.py)."""
+
+    box_margin_m: float = Field(default=0.1, gt=0)
+    samples: int = Field(default=24, ge=2)  # coarse, and as many fine
+    width: int = Field(default=64, ge=2)
+    code_width: int = Field(default=8, ge=1)  # of a frame
+    anneal_steps: int = Field(default=500, ge=1)  # until the deformation has all its octaves
+    learning_rate: float = Field(default=5e-3, gt=0)
+
+
 class LossSettings(Section):
     """Weights of the nine losses in the form of hnerf/training/losses.py, and their constants."""
 
@@ -137,11 +161,13 @@ class LossSettings(Section):
 
 
 class TrainingSettings(Section):
-    machinery: Literal["fast", "paper", "nerf", "idr"] = "fast"
+    machinery: Literal["fast", "paper", "nerf", "idr", "neural_body", "nerfies"] = "fast"
     fast: FastFieldSettings = FastFieldSettings()
     paper: PaperFieldSettings = PaperFieldSettings()
     nerf: NerfSettings = NerfSettings()
     idr: IdrSettings = IdrSettings()
+    neural_body: NeuralBodySettings = NeuralBodySettings()
+    nerfies: NerfiesSettings = NerfiesSettings()
     losses: LossSettings = LossSettings()
     steps: int = Field(default=0, ge=0)  # 0: the scene decides
     seconds: float | None = Field(default=None, gt=0)  # at which the field's training ends if its steps have not
@@ -156,6 +182,12 @@ class TrainingSettings(Section):
     snapshots_s: tuple[float, ...] = ()  # when the subject is saved as it stands, below `snapshots/`
     processes: int = Field(default=0, ge=0)  # 0: one a GPU, or one
     seed: int = Field(default=0, ge=0)
+
+    @model_validator(mode="after")
+    def _only_h_nerf_tunes_poses(self) -> Self:
+        if self.pose_learning_rate and self.machinery not in ("fast", "paper"):
+            raise ValueError(f"{self.machinery} does not tune poses: set pose_learning_rate to 0")
+        return self
 
 
 class EvaluationSettings(Section):

@@ -36,6 +36,7 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("training: {steps: -1}", "training.steps"),
         ("training:", "training"),
         ("training: {steps: {a: 1}}", "training.steps"),
+        ("training: {machinery: nerf}", "training: Value error, nerf does not tune poses"),
     ],
 )
 def test_what_is_not_allowed_is_refused_by_file_and_key(tmp_path: Path, text: str, named: str) -> None:

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from hnerf.baselines.idr import IdrField
 from hnerf.baselines.nerf import NerfField
+from hnerf.baselines.nerfies import NerfiesField
+from hnerf.baselines.neural_body import NeuralBodyField
 from hnerf.baselines.static import require_one_moment
 from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
@@ -41,6 +43,10 @@ def build_field(settings: TrainingSettings, body: BodyFit, static: bool) -> Fiel
     if settings.machinery == "idr":
         require_one_moment(static, "IDR")
         return IdrField(body, settings.idr)
+    if settings.machinery == "neural_body":
+        return NeuralBodyField(body, settings.neural_body)
+    if settings.machinery == "nerfies":
+        return NerfiesField(body, settings.nerfies)
     return PaperField(body.rig, body.root, settings.paper, static)
 
 

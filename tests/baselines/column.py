@@ -28,8 +28,9 @@ class Learned:
         errors = []
         for name, camera in self.capture.cameras.items():
             drawn = self.avatar.render(camera, self.body.theta[frame], self.body.root[frame])
-            plate = torch.from_numpy(self.capture.background(name) / 255).float()
-            shown = drawn.rgb + (1 - drawn.alpha[..., None]) * plate
+            plate = self.capture.background(name)
+            assert plate is not None
+            shown = drawn.rgb + (1 - drawn.alpha[..., None]) * torch.from_numpy(plate / 255).float()
             errors.append((shown - torch.from_numpy(self.capture.image(name, frame) / 255).float()).square().mean())
         return float(-10 * torch.log10(torch.stack(errors).mean()))
 

@@ -66,11 +66,11 @@ def look_at(name: str, centre_m: np.ndarray, target_m: np.ndarray) -> Camera:
     return Camera(name, K, R, -R @ centre_m, SIZE_PX, SIZE_PX)
 
 
-def record(folder: Path) -> tuple[Capture, KnownMasks, BodyFit]:
-    """Write the recording to `folder`; frame 2 is a novel pose."""
+def record(folder: Path, bends_rad: tuple[float, ...] = (0.0, 0.2, 0.4)) -> tuple[Capture, KnownMasks, BodyFit]:
+    """Write the recording to `folder`, bent so far in each frame; frame 2 is a novel pose."""
     rig = box_rig(bend_segments=6, splits=4)
     theta = torch.zeros(len(FRAMES), 2, 3)
-    theta[:, 1, 1] = torch.tensor([0.0, 0.2, 0.4])
+    theta[:, 1, 1] = torch.tensor(bends_rad)
     body = BodyFit(rig, FRAMES, theta, torch.eye(4).repeat(len(FRAMES), 1, 1))
     middle = np.array([0.5, 0.5, 1.0])
     directions = [(4, 0), (0, 4), (-4, 0), (0, -4)]

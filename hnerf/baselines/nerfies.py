@@ -1,0 +1,179 @@
+"""Nerfies (Park et al., Nerfies: Deformable Neural Radiance Fields, ICCV 2021)."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from hnerf.baselines.dynamic import DynamicField
+from hnerf.baselines.nerf import NerfNetwork
+from hnerf.baselines.static import Boxes, along, stratified
+from hnerf.body.canonical import PoseCorrection, PosedBodies
+from hnerf.body.fit_result import BodyFit
+from hnerf.body.rig import rotation_from_axis_angle
+from hnerf.config import NerfiesSettings
+from hnerf.field.encoding import positional_encoding
+from hnerf.field.mlp import SkipMLP
+from hnerf.render.compositing import weights_from_alpha
+from hnerf.training.conditions import Conditions, Draws
+from hnerf.training.losses import RaySamples
+from hnerf.training.paper import resample
+
+OCTAVES, LAYERS = 6, 6  # of the deformation
+STILL = 1e-5  # spread of its last layer at the start: nothing is deformed
+ROBUST_SCALE = 0.03  # c of the elastic energy
+LEAST_STRETCH = 1e-6  # keeps its logarithm finite
+
+
+class Deformation(nn.Module):
+    """W: (gamma_alpha(x), omega) -> a screw motion of x (section 3.2 of the paper)."""
+
+    def __init__(self, code_width: int, width: int):
+        super().__init__()
+        self.trunk = SkipMLP(3 * (1 + 2 * OCTAVES) + code_width, width, LAYERS)
+        self.screw = nn.Linear(width, 6)
+        nn.init.uniform_(self.screw.weight, -STILL, STILL)
+        nn.init.zeros_(self.screw.bias)
+
+    def forward(self, points: Tensor, code: Tensor, octaves: Tensor) -> Tensor:
+        """points (N, 3) in the field's coordinates, code (N, C), octaves () that count so far: (N, 3)."""
+        encoded = annealed(positional_encoding(points, OCTAVES), octaves)
+        turn, move = self.screw(self.trunk(torch.cat([encoded, code], 1))).split(3, 1)
+        rotation, translation = screw_motion(turn, move)
+        return (rotation @ points[..., None])[..., 0] + translation
+
+
+class NerfiesField(DynamicField):
+    """Dynamic; every frame's code deforms the space of its moment into one template, a NeRF. No body but its box.
+
+    It has no pose to set. A pose that no frame has (Conditions.moment = -1), and a frame that was not trained on, take
+    the code zero: the template as the deformation of that code leaves it, the same whatever the pose, cut by the pose's
+    box. Where that box is elsewhere there is little or nothing.
+
+    Simplified: one template network serves coarse and fine samples, and only the fine pass is trained, as H-NeRF does
+    it; networks and numbers of samples are smaller, so that minutes on two CPU cores mean something; no appearance
+    codes, as the captures' cameras keep their exposure; no points of the background that are told to stand still, as
+    the background comes from the clean plate; the elastic energy, which is weighted by what a sample adds to its pixel,
+    is estimated at one sample a ray drawn by that weight. Activations and the mean absolute colour error are those of
+    NerfField.
+    """
+
+    steps_taken: Tensor
+
+    def __init__(self, body: BodyFit, settings: NerfiesSettings):
+        super().__init__(body, settings.box_margin_m, settings.samples, settings.code_width)
+        self.settings = settings
+        self.deformation = Deformation(settings.code_width, settings.width)
+        self.template = NerfNetwork(settings.width)
+        self.register_buffer("steps_taken", torch.zeros((), dtype=torch.long))
+
+    def region(self, bodies: PosedBodies) -> Boxes:
+        """The box of each body."""
+        return self.box(bodies)
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """One group."""
+        return [{"params": list(self.parameters()), "lr": self.settings.learning_rate}]
+
+    def sample(
+        self,
+        bodies: PosedBodies,
+        region: Boxes,
+        origins_m: Tensor,
+        directions: Tensor,
+        frame: Tensor,
+        conditions: Conditions,
+        draws: Draws,
+        correction: PoseCorrection | None = None,
+    ) -> tuple[RaySamples, Tensor]:
+        """As Field.sample, over coarse and fine samples together (K = 2 x samples). A call with draws.probe is a step
+        of training: it counts for annealing, and has an elastic energy."""
+        assert draws.finer is not None
+        near, far = region.interval(origins_m, directions, frame)
+        first = stratified(near, far, draws.jitter)
+
+        def look(depths_m: Tensor) -> RaySamples:
+            points = along(origins_m[:, None], directions[:, None], depths_m)
+            code = self.code(conditions)[frame][:, None].expand(-1, depths_m.shape[1], -1)
+            template = self._deform(self.scaled(points).flatten(0, 1), code.flatten(0, 1)).view_as(points)
+            density, colour = self.template(template, directions[:, None].expand_as(points))
+            return self.seen(density, colour, depths_m, far, beyond=draws.beyond)
+
+        with torch.no_grad():
+            drawn = resample(first, near, far, weights_from_alpha(look(first).alpha), draws.finer)
+        depths = torch.cat([first, drawn], 1).sort(1).values
+        samples = look(depths)
+        if draws.probe is None:
+            return samples, depths
+        weights = weights_from_alpha(samples.alpha.detach())
+        pick = choose(weights, draws.probe)
+        points = along(origins_m, directions, depths.gather(1, pick[:, None])[:, 0])
+        code = self.code(conditions)[frame]
+        change = jacobian(lambda x: self._deform(x, code), self.scaled(points))
+        self.steps_taken += 1
+        return dataclasses.replace(samples, elastic=weights.sum(1) * elastic_energy(change)), depths
+
+    def _deform(self, points: Tensor, code: Tensor) -> Tensor:
+        octaves = OCTAVES * self.steps_taken / self.settings.anneal_steps
+        return self.deformation(points, code, octaves)
+
+    def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
+        """Of the surface of density sigma_h (NerfField's) at the first body's moment; its box cuts and closes it."""
+        density = self._ask(points_m, torch.zeros_like(points_m), conditions)[0]
+        return torch.maximum(self.read_off(density), self.box(bodies).signed_distance(points_m))
+
+    def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
+        """c (N, 3) at points (N, 3) of the first body's moment seen along directions (N, 3)."""
+        return self._ask(points_m, directions, conditions)[1]
+
+    def _ask(self, points_m: Tensor, directions: Tensor, conditions: Conditions) -> tuple[Tensor, Tensor]:
+        code = self.code(conditions)[:1].expand(len(points_m), -1)
+        return self.template(self._deform(self.scaled(points_m), code), directions)
+
+
+def screw_motion(turn: Tensor, move: Tensor) -> tuple[Tensor, Tensor]:
+    """Exponential of screws (..., 3) and (..., 3): rotation (..., 3, 3), translation (..., 3) (equations 8 to 10).
+
+    The translation is G move, G = I + (1 - cos a) / a^2 [turn] + (a - sin a) / a^3 [turn]^2 with the angle a = |turn|.
+    """
+    angle_squared = turn.square().sum(-1, keepdim=True)
+    small = angle_squared < 1e-4
+    safe = torch.where(small, torch.ones_like(angle_squared), angle_squared)
+    angle = safe.sqrt()
+    first = torch.where(small, 0.5 - angle_squared / 24, (1 - angle.cos()) / safe)
+    second = torch.where(small, 1 / 6 - angle_squared / 120, (angle - angle.sin()) / (safe * angle))
+    once = torch.linalg.cross(turn, move)
+    return rotation_from_axis_angle(turn), move + first * once + second * torch.linalg.cross(turn, once)
+
+
+def annealed(encoded: Tensor, octaves: Tensor) -> Tensor:
+    """A positional encoding (N, 3 (1 + 2 m)) of which only so many octaves count, the next one in part (equation 6):
+    octave j by (1 - cos(pi clamp(octaves - j, 0, 1))) / 2."""
+    count = (encoded.shape[1] // 3 - 1) // 2
+    share = (octaves - torch.arange(count, device=encoded.device)).clamp(0, 1)
+    weight = ((1 - (torch.pi * share).cos()) / 2).repeat_interleave(3)
+    return encoded * torch.cat([torch.ones_like(weight[:3]), weight, weight]).to(encoded)
+
+
+def jacobian(function: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
+    """d f_i / d x_j (N, 3, 3) of a function of each point (N, 3) alone, itself differentiable."""
+    points = points.detach().requires_grad_()
+    moved = function(points)
+    return torch.stack([torch.autograd.grad(moved[:, k].sum(), points, create_graph=True)[0] for k in range(3)], 1)
+
+
+def elastic_energy(change: Tensor) -> Tensor:
+    """rho(|log Sigma|_F) (N,) of Jacobians (N, 3, 3) with singular values Sigma; rho(x) = 2 (x/c)^2 / ((x/c)^2 + 4)
+    (equations 3 and 4)."""
+    stretch = torch.linalg.svdvals(change).clamp(min=LEAST_STRETCH)
+    strain = (stretch.log() / ROBUST_SCALE).square().sum(-1)
+    return 2 * strain / (strain + 4)
+
+
+def choose(weights: Tensor, uniform: Tensor) -> Tensor:
+    """An index (R,) into each row of weights (R, K), as likely as its weight; uniform (R,) in [0, 1)."""
+    cumulative = weights.cumsum(1)
+    wanted = uniform[:, None] * cumulative[:, -1:]
+    return torch.searchsorted(cumulative, wanted, right=True)[:, 0].clamp(max=weights.shape[1] - 1)

@@ -1,0 +1,179 @@
+"""NeuralBody (Peng et al., Neural Body: Implicit Neural Representations with Structured Latent Codes for Novel View
+Synthesis of Dynamic Humans, CVPR 2021)."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from hnerf.baselines.dynamic import DynamicField
+from hnerf.baselines.nerf import DENSITY_GAIN
+from hnerf.baselines.static import Boxes, along, stratified
+from hnerf.baselines.voxels import Voxels
+from hnerf.body.canonical import PoseCorrection, PosedBodies
+from hnerf.body.fit_result import BodyFit
+from hnerf.config import NeuralBodySettings
+from hnerf.field.encoding import positional_encoding
+from hnerf.training.conditions import Conditions, Draws
+from hnerf.training.losses import RaySamples
+
+LEVELS = 5  # the finest takes the codes, the four others are read (section 3.2 of the paper)
+POSITION_OCTAVES, VIEW_OCTAVES = 10, 4
+CODE_SPREAD = 0.1  # of the vertices' codes at the start
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """By body row: box, root (n, 4, 4), voxels around the body in its root frame, and the codes diffused over them at
+    the levels that are read; None in training, where they change with every step."""
+
+    box: Boxes
+    root: Tensor
+    voxels: list[Voxels]
+    diffused: list[list[Tensor]] | None
+
+
+class SparseConvolution(nn.Module):
+    """3 x 3 x 3 over active voxels, with normalisation and ReLU."""
+
+    def __init__(self, inputs: int, outputs: int):
+        super().__init__()
+        self.linear = nn.Linear(27 * inputs, outputs, bias=False)
+        self.norm = nn.LayerNorm(outputs)
+
+    def forward(self, values: Tensor, rows: Tensor) -> Tensor:
+        """values (N + 1, inputs) and rows (M, 27) of stencils: (M + 1, outputs), the last row zero as of values."""
+        found = self.norm(self.linear(nn.functional.embedding(rows, values).flatten(1))).relu()
+        return torch.cat([found, torch.zeros_like(found[:1])])
+
+
+class Diffusion(nn.Module):
+    """Codes of vertices to features around the body, at LEVELS - 1 resolutions."""
+
+    def __init__(self, code_width: int, channels: int):
+        super().__init__()
+        inputs = [code_width] + [channels] * (LEVELS - 2)
+        self.first = SparseConvolution(code_width, code_width)
+        self.coarser = nn.ModuleList(SparseConvolution(n, channels) for n in inputs)
+        self.beside = nn.ModuleList(SparseConvolution(channels, channels) for _ in inputs)
+
+    def forward(self, codes: Tensor, voxels: Voxels) -> list[Tensor]:
+        """codes (V, C): (N + 1, channels) at each level that is read, the last row zero."""
+        total = codes.new_zeros(len(voxels.count) + 1, codes.shape[1]).index_add(0, voxels.vertex, codes)
+        values = total / torch.cat([voxels.count, voxels.count.new_ones(1)])[:, None]
+        values = self.first(values, voxels.levels[0].beside)
+        found = []
+        for level, coarser, beside in zip(voxels.levels[1:], self.coarser, self.beside, strict=True):
+            values = beside(coarser(values, level.below), level.beside)
+            found.append(values)
+        return found
+
+
+class NeuralBodyField(DynamicField):
+    """Dynamic; a code on every vertex of the body, diffused by sparse convolutions in the root frame of the posed body;
+    density from what they say at a point, colour also from the view, the position in the world and a code of the
+    frame's appearance, which is zero for poses that were not trained.
+
+    Simplified: voxels of `voxel_m` (5 mm there), one convolution between those of stride 2 where there are two or
+    three, fewer channels, narrower networks, and fewer samples (64 there), so that minutes on two CPU cores mean
+    something; layers are normalised by voxel, not by batch, so that a frame looks the same whatever is trained beside
+    it; Swish instead of ReLU and softplus for the density as in NerfField; the mean absolute colour error as for all
+    compared methods, not the squared one; codes of a voxel's vertices are averaged.
+
+    `region` of a field in evaluation mode runs the convolutions; each `sample` of one in training runs them once for
+    each frame that it is asked about.
+    """
+
+    def __init__(self, body: BodyFit, settings: NeuralBodySettings):
+        super().__init__(body, settings.box_margin_m, settings.samples, settings.appearance_width)
+        self.settings = settings
+        width, features = settings.width, settings.channels * (LEVELS - 1)
+        self.vertex_codes = nn.Parameter(CODE_SPREAD * torch.randn(len(body.rig.vertices_m), settings.code_width))
+        self.diffusion = Diffusion(settings.code_width, settings.channels)
+        self.trunk = nn.Sequential(
+            nn.Linear(features, width),
+            nn.SiLU(),
+            nn.Linear(width, width),
+            nn.SiLU(),
+            nn.Linear(width, width),
+            nn.SiLU(),
+        )
+        self.density = nn.Linear(width, 1)
+        encoded = 3 * (2 + 2 * (POSITION_OCTAVES + VIEW_OCTAVES))
+        self.radiance = nn.Sequential(
+            nn.Linear(width + settings.appearance_width + encoded, width), nn.SiLU(), nn.Linear(width, 3), nn.Sigmoid()
+        )
+
+    def region(self, bodies: PosedBodies) -> Surroundings:
+        """Box and voxels of each body; where the field no longer learns, what the convolutions make of them."""
+        local_m = _into_root(bodies.vertices_m, bodies.root)
+        voxels = [Voxels.around(points_m, self.settings.voxel_m, LEVELS) for points_m in local_m]
+        diffused = None if self.training else [self.diffusion(self.vertex_codes, v) for v in voxels]
+        return Surroundings(self.box(bodies), bodies.root, voxels, diffused)
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """One group."""
+        return [{"params": list(self.parameters()), "lr": self.settings.learning_rate}]
+
+    def sample(
+        self,
+        bodies: PosedBodies,
+        region: Surroundings,
+        origins_m: Tensor,
+        directions: Tensor,
+        frame: Tensor,
+        conditions: Conditions,
+        draws: Draws,
+        correction: PoseCorrection | None = None,
+    ) -> tuple[RaySamples, Tensor]:
+        """As Field.sample, at `samples` depths in the body's box."""
+        near, far = region.box.interval(origins_m, directions, frame)
+        depths = stratified(near, far, draws.jitter)
+        points = along(origins_m[:, None], directions[:, None], depths).flatten(0, 1)
+        row, view = (x.repeat_interleave(self.samples, 0) for x in (frame, directions))
+        features = self.trunk(self._features(region, points, row))
+        density = self._density(features).view_as(depths)
+        colour = self._colour(features, points, view, row, conditions).view(*depths.shape, 3)
+        return self.seen(density, colour, depths, far, beyond=draws.beyond), depths
+
+    def _features(self, region: Surroundings, points_m: Tensor, row: Tensor) -> Tensor:
+        """What the diffused codes say at points (N, 3) around bodies of rows (N,), all levels side by side."""
+        found = points_m.new_zeros(len(points_m), self.settings.channels * (LEVELS - 1))
+        for body in row.unique().tolist():
+            voxels = region.voxels[body]
+            diffused = region.diffused[body] if region.diffused else self.diffusion(self.vertex_codes, voxels)
+            pick = torch.nonzero(row == body)[:, 0]
+            local_m = _into_root(points_m[pick][None], region.root[body][None])[0]
+            read = [
+                level.read(values, voxels.coordinates(local_m, k))
+                for k, (level, values) in enumerate(zip(voxels.levels[1:], diffused, strict=True), 1)
+            ]
+            found = found.index_copy(0, pick, torch.cat(read, 1))
+        return found
+
+    def _density(self, features: Tensor) -> Tensor:
+        return nn.functional.softplus(DENSITY_GAIN * self.density(features)[:, 0])
+
+    def _colour(self, features: Tensor, points_m: Tensor, view: Tensor, row: Tensor, conditions: Conditions) -> Tensor:
+        encoded = positional_encoding(self.scaled(points_m), POSITION_OCTAVES)
+        inputs = [features, self.code(conditions)[row], encoded, positional_encoding(view, VIEW_OCTAVES)]
+        return self.radiance(torch.cat(inputs, 1))
+
+    def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
+        """Of the surface of density sigma_h (NerfField's) around the first body; the box cuts and closes it."""
+        region = self.region(bodies)
+        row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
+        density = self._density(self.trunk(self._features(region, points_m, row)))
+        return torch.maximum(self.read_off(density), region.box.signed_distance(points_m))
+
+    def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
+        """c (N, 3) at points around the first body seen along directions (N, 3)."""
+        row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
+        features = self.trunk(self._features(self.region(bodies), points_m, row))
+        return self._colour(features, points_m, directions, row, conditions)
+
+
+def _into_root(points_m: Tensor, root: Tensor) -> Tensor:
+    """World points (n, N, 3) in the frames of roots (n, 4, 4), world from body."""
+    return (points_m - root[:, None, :3, 3]) @ root[:, :3, :3]
