@@ -268,6 +268,7 @@ class Trainer:
             "model_mib": (out / "model.safetensors").stat().st_size / 2**20,
             "mean_turn_deg": float(np.rad2deg(turn.norm(dim=-1).mean().item())),
             "mean_move_mm": float(1e3 * move_m.norm(dim=-1).mean().item()),
+            "decisions": [{"setting": name} | dataclasses.asdict(d) for name, d in self.decisions.items()],
         }
         (out / "report.json").write_text(json.dumps(report, indent=1))
         for left in out.glob(f"{NAME}*"):
