@@ -26,12 +26,17 @@ POSED_MARGIN_M = 0.2  # around the naked body: hair, shoes, loose clothes
 def posed_surface(avatar: Avatar, frame: int) -> trimesh.Trimesh:
     """The zero surface of the avatar's signed distance in a frame's pose, in world metres (single precision)."""
     k = avatar.body.index(frame)
-    theta, root = avatar.body.theta[k], avatar.body.root[k]
+    mesh = surface_in_pose(avatar, avatar.body.theta[k], avatar.body.root[k], POSED_CELLS)
+    return trimesh.Trimesh(mesh.vertices.astype(np.float32), mesh.faces, process=False)
+
+
+def surface_in_pose(avatar: Avatar, theta: Tensor, root: Tensor, cells: int) -> trimesh.Trimesh:
+    """The zero surface in a pose theta (J, 3), root (4, 4), in world metres; cells on the longest side of a box around
+    the body. Raises CaptureError as `extract_surface` does."""
     body_m = pose_vertices(avatar.body.rig, theta, root)
     lower_m, upper_m = body_m.amin(0) - POSED_MARGIN_M, body_m.amax(0) + POSED_MARGIN_M
     with torch.no_grad():
-        mesh = extract_surface(lambda x: avatar.signed_distance(x, theta, root), lower_m, upper_m, POSED_CELLS)
-    return trimesh.Trimesh(mesh.vertices.astype(np.float32), mesh.faces, process=False)
+        return extract_surface(lambda x: avatar.signed_distance(x, theta, root), lower_m, upper_m, cells)
 
 
 def extract_surface(

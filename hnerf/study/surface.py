@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from torch import Tensor
 
-from hnerf.asset.surface import POSED_MARGIN_M, extract_surface
+from hnerf.asset.surface import surface_in_pose
 from hnerf.body.rig import pose_vertices
 from hnerf.errors import CaptureError
 from hnerf.render.avatar import Avatar
@@ -41,10 +41,9 @@ def check_surface(mesh: trimesh.Trimesh, body_m: np.ndarray, faces: np.ndarray) 
 
 def check_pose(avatar: Avatar, theta: Tensor, root: Tensor) -> SurfaceCheck:
     """Judge the avatar's surface in a pose theta (J, 3), root (4, 4)."""
-    body_m = pose_vertices(avatar.body.rig, theta, root)
-    lower_m, upper_m = body_m.amin(0) - POSED_MARGIN_M, body_m.amax(0) + POSED_MARGIN_M
     try:
-        mesh = extract_surface(lambda x: avatar.signed_distance(x, theta, root), lower_m, upper_m, CELLS)
+        mesh = surface_in_pose(avatar, theta, root, CELLS)
     except CaptureError as error:
         return SurfaceCheck(str(error))
+    body_m = pose_vertices(avatar.body.rig, theta, root)
     return check_surface(mesh, body_m.cpu().numpy(), avatar.body.rig.faces.cpu().numpy())
