@@ -3,12 +3,11 @@
 usage: python benchmarks/scaling.py STORE [CAPTURE]
 
 Runs the stages of preset `fast`, training cut to a number of steps, on parts of a shared capture (default valid-wave)
-and on images of other sizes, each in turn, in a store that is emptied first. Writes `benchmarks/results/scaling.json`,
+and on images of other sizes, each in turn, in a new store. Writes `benchmarks/results/scaling.json`,
 `.md` and `.png`; the straight lines of the chart are what a cost in proportion would be.
 """
 
 import argparse
-import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -42,7 +41,8 @@ def main() -> None:
     parser.add_argument("store", type=Path)
     parser.add_argument("capture", nargs="?", default="valid-wave")
     options = parser.parse_args()
-    shutil.rmtree(options.store, ignore_errors=True)
+    if options.store.exists():
+        parser.error(f"{options.store} exists; name a new folder, so that nothing is found again")
     shelf = Store(options.store.resolve())
     source, _ = read_capture(SHARED / "data" / options.capture)
     recording = ingest(shelf, source, load_settings("fast").capture)

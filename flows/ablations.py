@@ -13,7 +13,7 @@ from typing import Any
 from flows.train_subject import find_masks
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, Settings, load_settings, with_changes
-from hnerf.errors import CaptureError
+from hnerf.errors import CaptureError, one_line
 from hnerf.study.files import replace_text
 from tasks.calibration import calibrate
 from tasks.capture import ingest
@@ -102,7 +102,7 @@ def measure(shelf: Store, source: Source, truth: Source, settings: Settings) -> 
         raise
     except RuntimeError as error:
         log.warning("%s", error)
-        return {"error": str(error).splitlines()[-1]}
+        return {"error": one_line(error)}
     report = evaluate(shelf, truth, recording, calibration, masks, body, model, settings.evaluation)
     metrics = json.loads((report.root / "metrics.json").read_text())
     trained = json.loads((model.root / "report.json").read_text())

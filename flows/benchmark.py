@@ -14,7 +14,7 @@ from prefect.context import FlowRunContext
 from flows.train_subject import find_masks
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
-from hnerf.errors import CaptureError
+from hnerf.errors import CaptureError, one_line
 from hnerf.study.plan import ScoringSettings, Study, Variant, load_study
 from hnerf.study.publish import publish
 from tasks.benchmark import score_training
@@ -93,7 +93,7 @@ def measure(
         raise
     except (CaptureError, RuntimeError) as error:
         log.warning("%s", error)
-        return {"error": str(error).splitlines()[-1]}
+        return {"error": one_line(error)}
     scores = score_training(shelf, truth, recording, calibration, model, scoring)
     found: dict[str, Any] = json.loads((scores.root / "scores.json").read_text())
     return found | {"folder": str(scores.root.relative_to(shelf.root))}

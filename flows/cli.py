@@ -125,14 +125,16 @@ def _add_benchmark(command: argparse.ArgumentParser) -> None:
 def _positive(text: str) -> float:
     value = float(text)
     if not 0 < value < float("inf"):
-        raise ValueError(text)
+        raise argparse.ArgumentTypeError("give seconds above 0")
     return value
 
 
 def _benchmark(options: argparse.Namespace) -> None:
     methods = options.methods.split(",") if options.methods else None
     table = benchmark.fn(options.capture, options.study, methods, options.seconds, options.store)
-    print(f"{table.read_text()}\ntable: {table}\nchart: {table.with_suffix('.png')}")
+    print(f"{table.read_text()}\ntable: {table}")
+    if (chart := table.with_suffix(".png")).exists():
+        print(f"chart: {chart}")
 
 
 def _add_stability(command: argparse.ArgumentParser) -> None:

@@ -13,7 +13,7 @@ from prefect.context import FlowRunContext
 from flows.train_subject import find_masks
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
-from hnerf.errors import CaptureError
+from hnerf.errors import CaptureError, NotPossibleError, one_line
 from hnerf.study.degrade import KINDS, Degradation, degrade_settings
 from hnerf.study.files import replace_text
 from hnerf.study.stability import Stability, load_stability
@@ -64,6 +64,9 @@ def stability(
     result |= {"left_out": plan.left_out(), "protocol": None, "runs": []}
     try:
         for run in _runs(shelf, source, truth, plan, presets):
+            if "left_out" in run:
+                result["left_out"].append(run["left_out"])
+                continue
             result["protocol"] = run.pop("protocol", None) or result["protocol"]
             result["runs"].append(run)
             _tell(result, [], table)
@@ -77,8 +80,8 @@ def stability(
 def _runs(
     shelf: Store, source: Source, truth: Source, plan: Stability, presets: dict[str, Settings]
 ) -> Iterator[Figures]:
-    """Every run's row: its method, degradation and verdict, and figures where there are any. A method without a good
-    run to compare with has no others."""
+    """Every run's row: its method, degradation and verdict, and figures where there are any; or {"left_out": what and
+    why}. A method without a good run to compare with has no others."""
     for method, preset in presets.items():
         for seed in plan.seeds:
             settings = preset.model_copy(update={"training": preset.training.model_copy(update={"seed": seed})})
@@ -93,6 +96,9 @@ def _runs(
                     log.info("%s, seed %d, %s: %g", method, seed, KINDS[kind].label, strength)
                     degradation = Degradation(kind=kind, strength=strength, seed=seed)
                     found = attempt(shelf, source, truth, settings, degradation)
+                    if "left_out" in found:
+                        yield {"left_out": f"{KINDS[kind].label}, {strength:g}: {found['left_out']}"}
+                        continue
                     yield row | {"kind": kind, "strength": strength} | judged(found, good)
 
 
@@ -109,7 +115,8 @@ def attempt(
     shelf: Store, source: Source, truth: Source, settings: Settings, degradation: Degradation | None
 ) -> Figures:
     """What `measure` found, or {"error": (verdict, reason)}: bad input that was told before or by training is refused,
-    anything else that went wrong has failed."""
+    anything else that went wrong has failed; or {"left_out": reason} where the capture does not allow it to be
+    tried."""
     at_bad_input = "refused"
     try:
         stages = prepare(shelf, source, settings, degradation)
@@ -121,13 +128,15 @@ def attempt(
         return measure(shelf, source, truth, settings, degradation, stages, model)
     except LostWorkerError:
         raise
+    except NotPossibleError as error:
+        return {"left_out": str(error)}
     except CaptureError as error:
         return {"error": (at_bad_input, str(error))}
     except Exception as error:  # whatever breaks is what the study is after
         if isinstance(error, OSError) and not isinstance(error, LASTING):
             raise  # a full disk, a lost share
         log.warning("%s: %s", type(error).__name__, error)
-        return {"error": ("failed", str(error).splitlines()[-1] if str(error) else type(error).__name__)}
+        return {"error": ("failed", one_line(error))}
 
 
 def prepare(
@@ -166,7 +175,9 @@ def measure(
     metrics = json.loads((report.root / "metrics.json").read_text())
     split = metrics["novel_pose" if metrics["novel_pose"]["n"] else "novel_view"]
     chamfer_mm = (split["geometry"] or {}).get("chamfer_mm")
-    found = {"psnr": split["psnr"], "ssim": split["ssim"], "chamfer_mm": chamfer_mm, "protocol": metrics["protocol"]}
+    found = nothing | {"chamfer_mm": chamfer_mm, "protocol": metrics["protocol"]}
+    if Capture.load(stages[0].root).test_cameras:
+        found |= {"psnr": split["psnr"], "ssim": split["ssim"]}
     found["seconds"] = json.loads((model.root / "report.json").read_text())["seconds"]
     return found | {"faults": _faults(check_meshes(shelf, report, good_body))}
 

@@ -126,3 +126,5 @@ def check_strengths(kind: str, strengths: tuple[float, ...]) -> None:
     falling = all(a > b for a, b in itertools.pairwise(strengths))
     if not strengths or not (growing or falling) or not all(math.isfinite(s) and s > 0 for s in strengths):
         raise CaptureError(f"degradation {kind}: give strengths above 0, the mildest first")
+    if kind in ("mask_holes", "mask_limb") and max(strengths) > 100:
+        raise CaptureError(f"degradation {kind}: a share in %, at most 100")

@@ -7,7 +7,7 @@ import numpy as np
 
 from hnerf.calibration.triangulation import subject_keypoints
 from hnerf.capture.capture import Capture
-from hnerf.errors import CaptureError
+from hnerf.errors import NotPossibleError
 from hnerf.segmentation.masks import Masks, encode
 
 LIMBS = ((3, 4), (6, 7), (10, 11), (13, 14))  # BODY_25: elbow to wrist, knee to ankle; right, left
@@ -39,7 +39,7 @@ def cut_limb(masks: Masks, capture: Capture, percent: float, rng: np.random.Gene
     CaptureError where nothing was detected, since keypoints tell where limbs are.
     """
     if not capture.has_keypoints:
-        raise CaptureError(f"{capture.name}: has no keypoints; they tell where limbs are")
+        raise NotPossibleError(f"{capture.name}: has no keypoints; they tell where limbs are")
     keypoints = subject_keypoints(capture)
 
     def cut(camera: str, frame: int, mask: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from hnerf.capture.capture import Capture
-from hnerf.errors import CaptureError
+from hnerf.errors import NotPossibleError
 from hnerf.study.subset import copy_pixels, subset, write_arrays, write_keypoints
 
 T = TypeVar("T")
@@ -56,6 +56,6 @@ def put_out_of_step(capture: Capture, frames: float, rng: np.random.Generator, o
 
 def _drawn(name: str, what: str, there_are: tuple[T, ...], count: float, rng: np.random.Generator) -> tuple[T, ...]:
     if count >= len(there_are):
-        raise CaptureError(f"{name}: has only {len(there_are)} training {what}; leave fewer than that")
+        raise NotPossibleError(f"{name}: has only {len(there_are)} training {what}; leave fewer than that")
     rows = np.sort(rng.permutation(len(there_are))[: round(count)])
     return tuple(there_are[row] for row in rows)

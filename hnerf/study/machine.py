@@ -9,13 +9,15 @@ import torch
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores, GPU (None where there is none) and the versions that speed depends on."""
+    """Processor, cores and how many of them torch uses, GPU (None where there is none), and the versions that speed
+    depends on."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return {
         "cpu": names[0] if names else platform.processor(),
-        "cores": os.cpu_count(),
+        "cores": len(os.sched_getaffinity(0)),
+        "threads": torch.get_num_threads(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "torch": torch.__version__,
         "python": platform.python_version(),
@@ -24,5 +26,5 @@ def machine() -> dict[str, Any]:
 
 def in_words(found: dict[str, Any]) -> str:
     """The same as part of a sentence."""
-    gpu = found["gpu"] or "no GPU"
-    return f"{found['cpu']}, {found['cores']} cores, {gpu}, torch {found['torch']}, Python {found['python']}"
+    cores, gpu = f"{found['threads']} of {found['cores']} cores", found["gpu"] or "no GPU"
+    return f"{found['cpu']}, {cores}, {gpu}, torch {found['torch']}, Python {found['python']}"

@@ -8,7 +8,7 @@ import numpy as np
 from hnerf.calibration.triangulation import subject_keypoints
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
-from hnerf.errors import CaptureError
+from hnerf.errors import NotPossibleError
 from hnerf.study.degraded_images import rewrite
 from hnerf.study.subset import write_keypoints
 
@@ -41,7 +41,9 @@ def put_in_front(capture: Capture, width_m: float, rng: np.random.Generator, out
 def person_middle(capture: Capture) -> np.ndarray:
     """The point (3,) nearest to all rays through the middle of the person's keypoints, over all frames."""
     if not capture.has_keypoints or len(capture.train_cameras) < 2:
-        raise CaptureError(f"{capture.name}: nobody knows where the person stands; needs keypoints from two cameras")
+        raise NotPossibleError(
+            f"{capture.name}: nobody knows where the person stands; needs keypoints from two cameras"
+        )
     left, right = np.zeros((3, 3)), np.zeros(3)
     for name, seen in subject_keypoints(capture).items():
         found = seen[seen[..., 2] > 0]

@@ -57,7 +57,7 @@ def draw(result: Mapping[str, Any], store: Path, table: Path) -> list[Path]:
 
 def picture_rows(title: str, variant: Mapping[str, Any], store: Path) -> list[tuple[str, list[tuple[str, Any]]]]:
     """Of each pictured image: the truth, and each method's rendering with its PSNR."""
-    methods = results.scored(variant)
+    methods = {name: scores for name, scores in results.scored(variant).items() if scores["pictures"]}
     rows = []
     for k, view in enumerate(next(iter(methods.values()))["pictures"] if methods else []):
         pictures = []

@@ -38,8 +38,8 @@ NO_NOVEL_POSES = {
 }
 HOW = (
     "Training seconds: the trainer's own clock, without reading the capture. Curves: fewer images and surfaces than "
-    "tables, the same ones at every point and for all methods; the last point is the finished subject, at the time "
-    "limit where there is one; fitting novel poses to it counts only where new poses are what is scored. "
+    "tables, the same ones at every point and for all methods; the last point is the finished subject; fitting "
+    "novel poses to it counts only where new poses are what is scored. "
     f"Time of a frame: median of {REPEATS} renderings of a whole image, of one where it takes over {LONG_S:.0f} s. "
     "Peak memory: on a CPU that of the training process, all libraries included; on a GPU what tensors took."
 )
@@ -95,12 +95,9 @@ def curve(
 ) -> list[dict[str, Any]]:
     """Seconds of training and figures of every snapshot, and last of the finished model, in the order of time."""
     report = json.loads((training / "report.json").read_text())
-    limit_s = json.loads((training / "settings.json").read_text())["training"]["seconds"]
-    end_s = report["seconds"]
-    if limit_s and split == "novel_view":
-        end_s = min(end_s, limit_s)
-    folders = {float(path.name): path for path in (training / "snapshots").glob("*")}
-    models = [(s, load_avatar(folders[s], scene.device)) for s in sorted(folders) if s < end_s]
+    end_s = report["field_seconds" if split == "novel_view" else "seconds"]
+    taken = {json.loads((f / "settings.json").read_text())["seconds"]: f for f in (training / "snapshots").glob("*")}
+    models = [(s, load_avatar(taken[s], scene.device)) for s in sorted(taken) if s < end_s]
     rows = []
     for seconds, avatar in [*models, (end_s, finished)]:
         folder = out / "snapshots" / f"{seconds:g}"

@@ -22,7 +22,7 @@ class Stability(Section):
     methods: Annotated[tuple[str, ...], Field(min_length=1)]
     seeds: Annotated[tuple[int, ...], Field(min_length=1)]
     overrides: tuple[str, ...] = ()
-    degradations: dict[str, tuple[float, ...]]
+    degradations: Annotated[dict[str, tuple[float, ...]], Field(min_length=1)]
 
     def only(self, names: Collection[str]) -> "Stability":
         """The study of these degradations only, of all where there are no names; CaptureError for one it has not."""

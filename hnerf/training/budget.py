@@ -12,6 +12,7 @@ import numpy as np
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.config import FastFieldSettings, TrainingSettings
+from hnerf.errors import CaptureError
 from hnerf.render.silhouette import silhouette
 from hnerf.segmentation.masks import Masks
 from hnerf.spread import spread
@@ -68,6 +69,8 @@ class Scene:
                 mask = masks.get(camera.name, frame)
                 outlines_m.append(footprints_m[-1] * _beyond_px(mask, covered))
                 areas_px.append(mask.sum())
+        if not sum(map(len, outlines_m)):
+            raise CaptureError(f"{capture.name}: no mask shows the person; see the report of the segmentation")
         inside_m, outside_m = np.percentile(np.concatenate(outlines_m), [1, 99])
         rows = [body.index(frame) for frame in capture.train_frames]
         angles = body.theta[rows][:, body.rig.free]

@@ -27,13 +27,18 @@ class Processes:
             dist.init_process_group("nccl" if cuda else "gloo")
         return Processes(rank, world_size, device)
 
-    def any(self, here: bool) -> bool:
-        """Whether it is so in any of the processes."""
+    def greatest(self, value: float) -> float:
+        """Of all processes' values."""
         if self.world_size == 1:
-            return here
-        flag = torch.tensor(float(here), device=self.device)
-        dist.all_reduce(flag, dist.ReduceOp.MAX)
-        return bool(flag)
+            return value
+        found = torch.tensor(value, dtype=torch.float64, device=self.device)
+        dist.all_reduce(found, dist.ReduceOp.MAX)
+        return float(found)
+
+    def wait(self) -> None:
+        """For each other."""
+        if self.world_size > 1:
+            dist.barrier()
 
     @property
     def leads(self) -> bool:

@@ -65,7 +65,7 @@ class Trainer:
         held_out = [rows[f] for f in capture.novel_pose_frames if f in rows and f not in capture.train_frames]
         self.novel_rows = torch.tensor(held_out, dtype=torch.long, device=device)
         self.step, self.skipped, self.seconds = 0, 0, 0.0
-        self.field_steps = settings.steps  # fewer where the time is up before
+        self.field_steps, self.field_seconds = settings.steps, 0.0  # fewer steps where the time is up before
         self.history: list[dict[str, Any]] = []
         self._stand(bodies)
         self._resume()
@@ -103,16 +103,19 @@ class Trainer:
                 self.optimizer.state.clear()  # its momentum would carry on the training poses
             terms = self._optimise(module)
             self.step += 1
-            self.seconds = time.monotonic() - started
-            if self.step < self.field_steps and self._time_is_up():
+            self.seconds = self.processes.greatest(time.monotonic() - started)  # one clock, as rates follow it
+            if self.step < self.field_steps and self.settings.seconds and self.seconds >= self.settings.seconds:
                 self.field_steps = self.step
+            if self.step == self.field_steps:
+                self.field_seconds = self.seconds
             if self.step % self.settings.absorb_steps == 0 or self.step in (self.field_steps, self.steps):
                 self._absorb()
-            if snapshots_s and self.processes.any(self.seconds >= snapshots_s[0]):
+            if snapshots_s and self.seconds >= snapshots_s[0]:
                 self._absorb()
                 if self.processes.leads:
                     self._save(self.out / "snapshots" / f"{snapshots_s[0]:g}")
                 snapshots_s.pop(0)
+                self.processes.wait()
                 started = time.monotonic() - self.seconds  # watching takes no time
             if self.step % LOG_STEPS == 0 or self.step in (1, self.field_steps, self.steps):
                 self._record(terms)
@@ -123,9 +126,6 @@ class Trainer:
                 save_checkpoint(self.out, self._state())
         self._require_surface()
         return self._finish() if self.processes.leads else {}
-
-    def _time_is_up(self) -> bool:
-        return self.settings.seconds is not None and self.processes.any(self.seconds >= self.settings.seconds)
 
     def _absorb(self) -> None:
         self.stage.bodies.absorb(self.objective.correction)
@@ -216,6 +216,7 @@ class Trainer:
             "skipped": self.skipped,
             "seconds": self.seconds,
             "field_steps": self.field_steps,
+            "field_seconds": self.field_seconds,
             "objective": self.objective.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
@@ -230,7 +231,7 @@ class Trainer:
         if state is None:
             return
         self.step, self.skipped, self.seconds = state["step"], state["skipped"], state["seconds"]
-        self.field_steps = state["field_steps"]
+        self.field_steps, self.field_seconds = state["field_steps"], state["field_seconds"]
         self.objective.load_state_dict(state["objective"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"].cpu())
@@ -251,6 +252,7 @@ class Trainer:
         save_file(tensors, folder / "model.safetensors")
         decisions = {name: dataclasses.asdict(decision) for name, decision in self.decisions.items()}
         settings = {"static": self.static, "training": self.settings.model_dump(), "decisions": decisions}
+        settings["seconds"] = self.seconds
         (folder / "settings.json").write_text(json.dumps(settings, indent=1))
 
     def _finish(self) -> dict[str, Any]:
@@ -262,6 +264,7 @@ class Trainer:
             "device": _device_name(self.processes.device),
             "processes": self.processes.world_size,
             "seconds": self.seconds,
+            "field_seconds": self.field_seconds,
             "steps": self.step,
             "peak_memory_gib": _peak_memory_gib(self.processes.device),
             "parameters": sum(p.numel() for p in self.field.parameters()),

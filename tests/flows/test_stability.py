@@ -10,7 +10,7 @@ import pytest
 from flows import stability as module
 from flows.cli import main
 from flows.stability import stability
-from hnerf.errors import CaptureError
+from hnerf.errors import CaptureError, NotPossibleError
 from tasks.launcher import LostWorkerError
 
 STUDY = """
@@ -79,7 +79,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
     }
     for name, stage in replaced.items():
         monkeypatch.setattr(module, name, stage)
-    monkeypatch.setattr(module.Capture, "load", lambda _: SimpleNamespace(name="ada"))
+    monkeypatch.setattr(module.Capture, "load", lambda _: SimpleNamespace(name="ada", test_cameras=("c",)))
     (tmp_path / "mine.yaml").write_text(STUDY)
     return trained
 
@@ -108,6 +108,26 @@ def test_every_run_has_a_verdict(stages: list[dict[str, Any]], tmp_path: Path) -
     assert found["protocol"] == "By eye."
     charts = {path.name for path in (tmp_path / "store" / "stability").glob("*.png")}
     assert charts == {"ada-mine-matrix.png", "ada-mine-psnr.png", "ada-mine-chamfer_mm.png"}
+
+
+def test_what_a_capture_does_not_allow_is_left_out_and_no_verdict(
+    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def degrade_masks(*_: Any) -> Any:
+        raise NotPossibleError("ada: has no keypoints")
+
+    monkeypatch.setattr(module, "degrade_masks", degrade_masks)
+    found = study(tmp_path, only=["mask_eroded"])
+    assert [run["kind"] for run in found["runs"]] == ["as recorded", "as recorded"]
+    assert "masks eroded, % of image width, 1: ada: has no keypoints" in found["left_out"]
+
+
+def test_without_test_cameras_images_are_not_compared(
+    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module.Capture, "load", lambda _: SimpleNamespace(name="ada", test_cameras=()))
+    runs = study(tmp_path, only=["pose_noise"])["runs"]
+    assert [(run["psnr"], run["chamfer_mm"], run["verdict"]) for run in runs[:2]] == [(None, 6.0, "ok")] * 2
 
 
 def test_each_degradation_is_put_in_at_its_place(stages: list[dict[str, Any]], tmp_path: Path) -> None:

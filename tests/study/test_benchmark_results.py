@@ -25,7 +25,7 @@ from hnerf.study.results import (
     timed_px,
 )
 
-MACHINE = {"cpu": "Abacus", "cores": 2, "gpu": None, "torch": "2", "python": "3"}
+MACHINE = {"cpu": "Abacus", "cores": 2, "threads": 1, "gpu": None, "torch": "2", "python": "3"}
 GEOMETRY = {"chamfer_l2_e3": 0.05, "normal_consistency": 0.94, "iou": 0.875}
 
 
@@ -81,7 +81,7 @@ def test_the_markdown_by_hand() -> None:
     assert as_markdown(result(), ["chart.png"]).splitlines()[:23] == [
         "# Toys: ada",
         "",
-        "ada, study toy: 60 s of training; on Abacus, 2 cores, no GPU, torch 2, Python 3.",
+        "ada, study toy: 60 s of training; on Abacus, 1 of 2 cores, no GPU, torch 2, Python 3.",
         "",
         "- A note.",
         "",
