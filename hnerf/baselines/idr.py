@@ -8,7 +8,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.static import Boxes, StaticField, along, stratified
+from hnerf.baselines.box import Boxes, along, stratified
+from hnerf.baselines.static import StaticField
 from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import IdrSettings

@@ -3,13 +3,14 @@
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.static import Boxes, StaticField, along, stratified
+from hnerf.baselines.box import Boxes, along, stratified
+from hnerf.baselines.static import StaticField
 from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import NerfSettings
 from hnerf.field.encoding import positional_encoding
 from hnerf.field.mlp import SkipMLP
-from hnerf.render.compositing import alpha_from_density, weights_from_alpha
+from hnerf.render.compositing import weights_from_alpha
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.losses import RaySamples
 from hnerf.training.paper import resample
@@ -17,8 +18,6 @@ from hnerf.training.paper import resample
 LAYERS = 8
 POSITION_OCTAVES, VIEW_OCTAVES = 10, 4
 DENSITY_GAIN = 10.0  # densities of an opaque surface are tens to hundreds: so that they are within reach of few steps
-SURFACE_DENSITY_PER_M = 20.0  # sigma_h of H-NeRF, 50 per scene unit of 2.5 m: where a surface is read off
-BAND_M = 0.01  # bound of the distance that is read off
 
 
 class NerfNetwork(nn.Module):
@@ -76,7 +75,7 @@ class NerfField(StaticField):
         drawn = resample(first, near, far, weights_from_alpha(first_alpha.detach()), draws.finer)
         every = torch.cat([first, drawn], 1).sort(1).values
         alpha, density, colour = self._look(self.fine, origins_m, directions, every, far)
-        d = self._read_off(torch.cat([first_density, density], 1))
+        d = self.read_off(torch.cat([first_density, density], 1))
         samples = RaySamples(
             alpha=torch.cat([torch.zeros_like(first_alpha), alpha], 1),
             alpha_dot=torch.cat([first_alpha, torch.zeros_like(alpha)], 1),
@@ -96,18 +95,11 @@ class NerfField(StaticField):
         """alpha, density (R, K) and colour (R, K, 3) at depths (R, K); the last sample reaches to the box's end."""
         points = self.scaled(along(origins_m[:, None], directions[:, None], depths_m))
         density, colour = network(points, directions[:, None].expand_as(points))
-        spacing = torch.diff(depths_m, dim=1, append=far_m[:, None]) / self.scale_m
-        return alpha_from_density(density, spacing), density, colour
-
-    def _read_off(self, density: Tensor) -> Tensor:
-        """BAND_M (sigma_h - sigma) / (sigma_h + sigma): zero where the density is sigma_h, negative where it is more,
-        within BAND_M. Its sign and its zero set mean something; its size does not."""
-        threshold = SURFACE_DENSITY_PER_M * self.scale_m
-        return BAND_M * (threshold - density) / (threshold + density)
+        return self.opacity(density, depths_m, far_m), density, colour
 
     def distance(self, points_m: Tensor) -> Tensor:
         """Of the fine network's surface of density sigma_h, bounded by BAND_M."""
-        return self._read_off(self.fine(self.scaled(points_m), torch.zeros_like(points_m))[0])
+        return self.read_off(self.fine(self.scaled(points_m), torch.zeros_like(points_m))[0])
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """c (N, 3) of the fine network at points (N, 3) seen along directions (N, 3)."""

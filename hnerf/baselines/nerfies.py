@@ -2,14 +2,13 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from hnerf.baselines.box import Boxes, along, stratified
 from hnerf.baselines.dynamic import DynamicField
 from hnerf.baselines.nerf import NerfNetwork
-from hnerf.baselines.static import Boxes, along, stratified
 from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import rotation_from_axis_angle
@@ -63,19 +62,11 @@ class NerfiesField(DynamicField):
     steps_taken: Tensor
 
     def __init__(self, body: BodyFit, settings: NerfiesSettings):
-        super().__init__(body, settings.box_margin_m, settings.samples, settings.code_width)
+        super().__init__(body, settings.box_margin_m, settings.samples, settings.learning_rate, settings.code_width)
         self.settings = settings
         self.deformation = Deformation(settings.code_width, settings.width)
         self.template = NerfNetwork(settings.width)
         self.register_buffer("steps_taken", torch.zeros((), dtype=torch.long))
-
-    def region(self, bodies: PosedBodies) -> Boxes:
-        """The box of each body."""
-        return self.box(bodies)
-
-    def parameter_groups(self) -> list[dict[str, Any]]:
-        """One group."""
-        return [{"params": list(self.parameters()), "lr": self.settings.learning_rate}]
 
     def sample(
         self,

@@ -2,14 +2,13 @@
 Synthesis of Dynamic Humans, CVPR 2021)."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from hnerf.baselines.box import Boxes, along, stratified
 from hnerf.baselines.dynamic import DynamicField
 from hnerf.baselines.nerf import DENSITY_GAIN
-from hnerf.baselines.static import Boxes, along, stratified
 from hnerf.baselines.voxels import Voxels
 from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.fit_result import BodyFit
@@ -86,7 +85,9 @@ class NeuralBodyField(DynamicField):
     """
 
     def __init__(self, body: BodyFit, settings: NeuralBodySettings):
-        super().__init__(body, settings.box_margin_m, settings.samples, settings.appearance_width)
+        super().__init__(
+            body, settings.box_margin_m, settings.samples, settings.learning_rate, settings.appearance_width
+        )
         self.settings = settings
         width, features = settings.width, settings.channels * (LEVELS - 1)
         self.vertex_codes = nn.Parameter(CODE_SPREAD * torch.randn(len(body.rig.vertices_m), settings.code_width))
@@ -111,10 +112,6 @@ class NeuralBodyField(DynamicField):
         voxels = [Voxels.around(points_m, self.settings.voxel_m, LEVELS) for points_m in local_m]
         diffused = None if self.training else [self.diffusion(self.vertex_codes, v) for v in voxels]
         return Surroundings(self.box(bodies), bodies.root, voxels, diffused)
-
-    def parameter_groups(self) -> list[dict[str, Any]]:
-        """One group."""
-        return [{"params": list(self.parameters()), "lr": self.settings.learning_rate}]
 
     def sample(
         self,

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from hnerf.baselines.nerf import BAND_M, SURFACE_DENSITY_PER_M, NerfField
-from hnerf.baselines.static import Boxes
+from hnerf.baselines.box import BAND_M, SURFACE_DENSITY_PER_M, Boxes
+from hnerf.baselines.nerf import NerfField
 from hnerf.body.canonical import PosedBodies
 from hnerf.config import load_settings
 from hnerf.errors import CaptureError

@@ -1,0 +1,97 @@
+"""What all compared methods share: rays are sampled in the person's box, and in its coordinates."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hnerf.body.canonical import PosedBodies
+from hnerf.body.fit_result import BodyFit
+from hnerf.render.compositing import alpha_from_density
+from hnerf.render.shell import box_interval
+from hnerf.training.field import Field
+
+SURFACE_DENSITY_PER_M = 20.0  # sigma_h of H-NeRF, 50 per scene unit of 2.5 m: where a surface is read off
+BAND_M = 0.01  # bound of the distance that is read off
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """The person's box by body row: lower_m, upper_m (n, 3)."""
+
+    lower_m: Tensor
+    upper_m: Tensor
+
+    @staticmethod
+    def around(vertices_m: Tensor, margin_m: float) -> "Boxes":
+        """The extent of bodies (n, V, 3) and a margin."""
+        return Boxes(vertices_m.amin(1) - margin_m, vertices_m.amax(1) + margin_m)
+
+    def interval(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
+        """Entry and exit depths (R,) of rays (R, 3) in the boxes of body rows (R,); equal where the box is missed."""
+        return box_interval(origins_m, directions, self.lower_m[frame], self.upper_m[frame])
+
+    def signed_distance(self, points_m: Tensor) -> Tensor:
+        """Of points (N, 3) to the first box, (N,) metres, negative inside."""
+        beyond = torch.maximum(self.lower_m[0] - points_m, points_m - self.upper_m[0])
+        return beyond.clamp(min=0).norm(dim=-1) + beyond.amax(-1).clamp(max=0)
+
+
+class BoxField(Field):
+    """A field over the boxes of all poses, in coordinates that put their middle at 0 and the ends of the longest side
+    at -1 and 1. Densities are per unit of these coordinates.
+
+    The methods were published for a bounded object, a person cut out of the picture, or the whole scene; here the
+    surroundings come from the clean plate, so rays are sampled in the person's box only. What the networks say outside
+    the box was never trained, so the surface ends there.
+    """
+
+    centre_m: Tensor
+    scale_m: Tensor
+
+    def __init__(self, body: BodyFit, box_margin_m: float, samples: int, learning_rate: float):
+        super().__init__()
+        self.box_margin_m, self.samples, self.learning_rate = box_margin_m, samples, learning_rate
+        boxes = Boxes.around(body.vertices_m(), box_margin_m)
+        lower_m, upper_m = boxes.lower_m.amin(0), boxes.upper_m.amax(0)
+        self.register_buffer("canonical_m", body.rig.vertices_m.clone())
+        self.register_buffer("centre_m", (lower_m + upper_m) / 2)
+        self.register_buffer("scale_m", (upper_m - lower_m).max() / 2)
+
+    def box(self, bodies: PosedBodies) -> Boxes:
+        """The box of each body."""
+        return Boxes.around(bodies.vertices_m, self.box_margin_m)
+
+    def region(self, bodies: PosedBodies) -> Any:
+        """The boxes."""
+        return self.box(bodies)
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """One group."""
+        return [{"params": list(self.parameters()), "lr": self.learning_rate}]
+
+    def scaled(self, points_m: Tensor) -> Tensor:
+        """World points in the boxes' coordinates."""
+        return (points_m - self.centre_m) / self.scale_m
+
+    def opacity(self, density: Tensor, depths_m: Tensor, far_m: Tensor) -> Tensor:
+        """alpha (R, K) of densities at depths (R, K); the last sample reaches to the box's end (R,)."""
+        return alpha_from_density(density, torch.diff(depths_m, dim=1, append=far_m[:, None]) / self.scale_m)
+
+    def read_off(self, density: Tensor) -> Tensor:
+        """BAND_M (sigma_h - sigma) / (sigma_h + sigma): zero where the density is sigma_h, negative where it is more,
+        within BAND_M. Its sign and its zero set mean something; its size does not."""
+        threshold = SURFACE_DENSITY_PER_M * self.scale_m
+        return BAND_M * (threshold - density) / (threshold + density)
+
+
+def stratified(near: Tensor, far: Tensor, jitter: Tensor) -> Tensor:
+    """Depths (R, K), one in each of K equal parts of [near, far] (R,), at jitter (R, K) in [0, 1) of its part."""
+    strata = torch.arange(jitter.shape[1], device=near.device)
+    return near[:, None] + (far - near)[:, None] * (strata + jitter) / jitter.shape[1]
+
+
+def along(origins_m: Tensor, directions: Tensor, depths_m: Tensor) -> Tensor:
+    """Points (..., 3) at depths (...) of rays (..., 3)."""
+    return origins_m + directions * depths_m[..., None]
