@@ -102,7 +102,9 @@ def draw(seconds: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
     """A panel an axis, both scales logarithmic; grey lines have the slope of a cost in proportion."""
     figure = Figure(figsize=(11, 3.8), layout="constrained")
     FigureCanvasAgg(figure)
-    for axes, (axis, rows) in zip(figure.subplots(1, len(seconds), sharey=True), seconds.items(), strict=True):
+    for axes, (axis, rows) in zip(
+        figure.subplots(1, len(seconds), sharey=True, squeeze=False)[0], seconds.items(), strict=True
+    ):
         amounts = [float(n) for n in rows]
         for marker, stage in zip(MARKERS, next(iter(rows.values())), strict=True):
             spent = [row[stage] for row in rows.values()]
