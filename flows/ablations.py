@@ -14,7 +14,9 @@ from flows.train_subject import find_masks
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, Settings, load_settings, with_changes
 from hnerf.errors import CaptureError, one_line
+from hnerf.study import results
 from hnerf.study.files import replace_text
+from hnerf.study.tables import head, line, pick, shown
 from tasks.calibration import calibrate
 from tasks.capture import ingest
 from tasks.evaluation import evaluate
@@ -28,14 +30,7 @@ log = logging.getLogger("hnerf.ablations")
 
 ABLATIONS = CONFIGS / "ablations"
 FULL = "full"
-COLUMNS = {  # in a split's scores; cells show training poses / novel poses
-    "psnr": ("PSNR", "{:.2f}"),
-    "ssim": ("SSIM", "{:.3f}"),
-    "mask_iou": ("mask IoU", "{:.3f}"),
-    "geometry.chamfer_l2_e3": ("Chamfer x1e-3 m²", "{:.3f}"),
-    "geometry.normal_consistency": ("NC", "{:.3f}"),
-    "geometry.iou": ("IoU", "{:.3f}"),
-}
+COLUMNS = results.COLUMNS | {"psnr": ("PSNR", "{:.2f}")}  # cells show training poses / novel poses
 
 
 def ablate(capture: Path, preset: str, store: Path, overrides: list[str], only: Collection[str] = ()) -> Path:
@@ -117,8 +112,8 @@ def as_markdown(result: dict[str, Any]) -> str:
     titles = ["", *(title for title, _ in COLUMNS.values()), "training, s", "on"]
     lines = [f"# Ablations of {result['subject']}, preset `{result['preset']}`{with_overrides}", ""]
     lines += ["Two figures in a cell: training poses from test cameras / novel poses.", ""]
-    lines += [_line(titles), "|" + "---|" * len(titles)]
-    lines += [_line([name, *_cells(row)]) for name, row in result["rows"].items()]
+    lines += head(titles)
+    lines += [line([name, *_cells(row)]) for name, row in result["rows"].items()]
     if result["left_out"]:
         lines += ["", "Left out:", "", *(f"- {name}: {reason}" for name, reason in result["left_out"].items())]
     protocols = {row["protocol"] for row in result["rows"].values() if "protocol" in row}
@@ -129,16 +124,5 @@ def _cells(row: dict[str, Any]) -> list[str]:
     if "error" in row:
         return [row["error"].replace("|", "/"), *[""] * (len(COLUMNS) + 1)]
     splits = row["novel_view"], row["novel_pose"]
-    scores = [" / ".join(_score(split, key, form) for split in splits) for key, (_, form) in COLUMNS.items()]
+    scores = [" / ".join(shown(pick(split, key), form) for split in splits) for key, (_, form) in COLUMNS.items()]
     return [*scores, f"{row['seconds']:.0f}", row["device"]]
-
-
-def _score(split: dict[str, Any], key: str, form: str) -> str:
-    value: Any = split
-    for part in key.split("."):
-        value = (value or {}).get(part)
-    return "-" if value is None else form.format(value)
-
-
-def _line(cells: list[str]) -> str:
-    return f"| {' | '.join(cells)} |"

@@ -4,12 +4,14 @@ A preset is a YAML file under `configs/`; `load_settings("fast", ["training.seco
 """
 
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from hnerf.errors import CaptureError
+
+S = TypeVar("S", bound="Section")
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 
@@ -221,10 +223,7 @@ def load_settings(preset: str, overrides: list[str] | None = None) -> Settings:
 
     Raises CaptureError with one line if the preset is unknown, or a key or value is not allowed.
     """
-    path = CONFIGS / f"{preset}.yaml" if (CONFIGS / f"{preset}.yaml").exists() else Path(preset)
-    if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in CONFIGS.glob("*.yaml")))
-        raise CaptureError(f"{preset}: no such preset or file; presets are {known}")
+    path = named_file(preset, CONFIGS, "preset", "presets")
     tree: dict[str, Any] = yaml.safe_load(path.read_text()) or {}
     for override in overrides or []:
         key, equals, value = override.partition("=")
@@ -237,7 +236,7 @@ def load_settings(preset: str, overrides: list[str] | None = None) -> Settings:
             if not isinstance(node, dict):
                 raise CaptureError(f"--set {override}: {section} is not a section")
         node[leaf] = yaml.safe_load(value)
-    return _validated(tree, path)
+    return validated(Settings, tree, path)
 
 
 def with_changes(settings: Settings, path: Path) -> Settings:
@@ -245,7 +244,7 @@ def with_changes(settings: Settings, path: Path) -> Settings:
 
     Raises CaptureError with one line if a key or value is not allowed.
     """
-    return _validated(_merged(settings.model_dump(), yaml.safe_load(path.read_text()) or {}), path)
+    return validated(Settings, _merged(settings.model_dump(), yaml.safe_load(path.read_text()) or {}), path)
 
 
 def _merged(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
@@ -257,9 +256,19 @@ def _merged(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _validated(tree: dict[str, Any], path: Path) -> Settings:
+def named_file(name: str, folder: Path, one: str, many: str) -> Path:
+    """The YAML file of this name in a folder, or else at this path; CaptureError, which lists those of the folder."""
+    path = folder / f"{name}.yaml" if (folder / f"{name}.yaml").exists() else Path(name)
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
+        raise CaptureError(f"{name}: no such {one} or file; {many} are {known}")
+    return path
+
+
+def validated(kind: type[S], tree: Any, path: Path) -> S:
+    """A section from the tree that a YAML file holds; CaptureError, one line with file and key, on what is wrong."""
     try:
-        return Settings.model_validate(tree)
+        return kind.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
         raise CaptureError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None

@@ -86,12 +86,6 @@ class BoxField(Field):
         return BAND_M * (threshold - density) / (threshold + density)
 
 
-def stratified(near: Tensor, far: Tensor, jitter: Tensor) -> Tensor:
-    """Depths (R, K), one in each of K equal parts of [near, far] (R,), at jitter (R, K) in [0, 1) of its part."""
-    strata = torch.arange(jitter.shape[1], device=near.device)
-    return near[:, None] + (far - near)[:, None] * (strata + jitter) / jitter.shape[1]
-
-
 def along(origins_m: Tensor, directions: Tensor, depths_m: Tensor) -> Tensor:
     """Points (..., 3) at depths (...) of rays (..., 3)."""
     return origins_m + directions * depths_m[..., None]

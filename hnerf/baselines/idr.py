@@ -8,13 +8,14 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import Boxes, along, stratified
+from hnerf.baselines.box import Boxes, along
 from hnerf.baselines.static import StaticField
 from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import IdrSettings
 from hnerf.field.encoding import positional_encoding
 from hnerf.field.mlp import SkipMLP
+from hnerf.render.shell import stratified
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.losses import RaySamples
 

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import Boxes, along, stratified
+from hnerf.baselines.box import Boxes, along
 from hnerf.baselines.static import StaticField
 from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.fit_result import BodyFit
@@ -11,6 +11,7 @@ from hnerf.config import NerfSettings
 from hnerf.field.encoding import positional_encoding
 from hnerf.field.mlp import SkipMLP
 from hnerf.render.compositing import weights_from_alpha
+from hnerf.render.shell import stratified
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.losses import RaySamples
 from hnerf.training.paper import resample

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import Boxes, along, stratified
+from hnerf.baselines.box import Boxes, along
 from hnerf.baselines.dynamic import DynamicField
 from hnerf.baselines.nerf import NerfNetwork
 from hnerf.body.canonical import PoseCorrection, PosedBodies
@@ -16,6 +16,7 @@ from hnerf.config import NerfiesSettings
 from hnerf.field.encoding import positional_encoding
 from hnerf.field.mlp import SkipMLP
 from hnerf.render.compositing import weights_from_alpha
+from hnerf.render.shell import stratified
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.losses import RaySamples
 from hnerf.training.paper import resample

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import Boxes, along, stratified
+from hnerf.baselines.box import Boxes, along
 from hnerf.baselines.dynamic import DynamicField
 from hnerf.baselines.nerf import DENSITY_GAIN
 from hnerf.baselines.voxels import Voxels
@@ -14,6 +14,7 @@ from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import NeuralBodySettings
 from hnerf.field.encoding import positional_encoding
+from hnerf.render.shell import stratified
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.losses import RaySamples
 

@@ -111,3 +111,9 @@ def box_interval(origins_m: Tensor, directions: Tensor, lower_m: Tensor, upper_m
     a, b = (lower_m - origins_m) * inverse, (upper_m - origins_m) * inverse
     near = torch.minimum(a, b).amax(-1).clamp(min=0)
     return near, torch.maximum(torch.maximum(a, b).amin(-1), near)
+
+
+def stratified(near: Tensor, far: Tensor, jitter: Tensor) -> Tensor:
+    """Depths (R, K), one in each of K equal parts of [near, far] (R,), at jitter (R, K) in [0, 1) of its part."""
+    strata = torch.arange(jitter.shape[1], device=near.device)
+    return near[:, None] + (far - near)[:, None] * (strata + jitter) / jitter.shape[1]

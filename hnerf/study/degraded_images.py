@@ -13,7 +13,7 @@ import numpy as np
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.capture.normalise import JPEG_OPTIONS
-from hnerf.study.subset import copy_pixels, write_arrays, write_keypoints
+from hnerf.study.subset import copy_pixels, read_keypoints, write_arrays, write_keypoints
 
 PixelChange = Callable[[str, np.ndarray], np.ndarray]
 
@@ -45,8 +45,7 @@ def resize(capture: Capture, scale: float, rng: np.random.Generator, out: Path) 
         return _resized(pixels, small[camera])
 
     rewrite(capture.with_cameras(capture.cameras | small), out, resized, resized)
-    found = {name: capture.keypoints(name) for name in capture.cameras}
-    keypoints = {name: people for name, people in found.items() if people is not None}
+    keypoints = read_keypoints(capture)
     for name in set(keypoints) & set(small):
         keypoints[name] = _moved(keypoints[name], cameras[name], small[name])
     write_keypoints(out, keypoints)

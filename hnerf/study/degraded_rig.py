@@ -10,7 +10,7 @@ import numpy as np
 
 from hnerf.capture.capture import Capture
 from hnerf.errors import NotPossibleError
-from hnerf.study.subset import copy_pixels, subset, write_arrays, write_keypoints
+from hnerf.study.subset import copy_pixels, read_keypoints, subset, write_arrays, write_keypoints
 
 T = TypeVar("T")
 
@@ -43,8 +43,7 @@ def put_out_of_step(capture: Capture, frames: float, rng: np.random.Generator, o
     for name in capture.cameras:
         copy_pixels(capture, kept, name)
     rows = np.maximum(np.arange(len(capture.frames)) - round(frames), 0)
-    found = {name: capture.keypoints(name) for name in capture.cameras}
-    keypoints = {name: people for name, people in found.items() if people is not None}
+    keypoints = read_keypoints(capture)
     if late in keypoints:
         write_keypoints(out, keypoints | {late: keypoints[late][rows]})
     for folder in ("images", "masks"):

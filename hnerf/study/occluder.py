@@ -10,7 +10,7 @@ from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.errors import NotPossibleError
 from hnerf.study.degraded_images import rewrite
-from hnerf.study.subset import write_keypoints
+from hnerf.study.subset import read_keypoints, write_keypoints
 
 WAY = 0.4  # of the way from the person to the camera
 HALF_HEIGHT_M = 1.2
@@ -33,8 +33,7 @@ def put_in_front(capture: Capture, width_m: float, rng: np.random.Generator, out
         lambda camera, rgb: np.where(hidden[camera][..., None], GREY, rgb),
         lambda camera, mask: mask * ~hidden[camera],
     )
-    found = {name: capture.keypoints(name) for name in capture.cameras}
-    keypoints = {name: people for name, people in found.items() if people is not None}
+    keypoints = read_keypoints(capture)
     write_keypoints(out, {n: _without(k, hidden[n]) if n in hidden else k for n, k in keypoints.items()})
 
 

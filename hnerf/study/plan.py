@@ -1,14 +1,13 @@
 """What a benchmark compares: methods on parts of a capture, as a YAML file under `configs/benchmark/` says."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Literal
 
 import yaml
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from hnerf.capture.capture import Capture
-from hnerf.config import CONFIGS, Section, Settings, load_settings
+from hnerf.config import CONFIGS, Section, Settings, load_settings, named_file, validated
 from hnerf.errors import CaptureError
 from hnerf.spread import spread
 
@@ -85,15 +84,8 @@ class Study(Section):
 
 def load_study(name: str) -> Study:
     """A study by its name or its file's path; CaptureError with one line if there is none or a key is not allowed."""
-    path = STUDIES / f"{name}.yaml" if (STUDIES / f"{name}.yaml").exists() else Path(name)
-    if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in STUDIES.glob("*.yaml")))
-        raise CaptureError(f"{name}: no such study or file; studies are {known}")
-    try:
-        study = Study.model_validate(yaml.safe_load(path.read_text()))
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise CaptureError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    path = named_file(name, STUDIES, "study", "studies")
+    study = validated(Study, yaml.safe_load(path.read_text()), path)
     for title, variant in study.variants.items():
         for method in variant.methods:
             if method not in study.methods:

@@ -12,6 +12,7 @@ from typing import Any
 
 from hnerf.study.curves import Point, seconds_to
 from hnerf.study.machine import in_words
+from hnerf.study.tables import head, line, pick, shown
 
 SPLITS = {"novel_view": "new views", "novel_pose": "new poses"}
 COLUMNS = {  # in a split's scores; cells show new views / new poses
@@ -116,16 +117,16 @@ def _variant_lines(variant: Mapping[str, Any]) -> list[str]:
     titles += [f"frame at {size} px, s" for size in sizes] + [f"s to best - {NEAR_BEST_DB:g} dB"]
     near_best = near_best_seconds(variant)
     lines = [f"{variant['cameras']} training cameras, {variant['frames']} training frames.", ""]
-    lines += [_line(titles), "|" + "---|" * len(titles)]
+    lines += head(titles)
     reasons: dict[str, list[str]] = {}
     for name, scores in variant["methods"].items():
         if "error" in scores:
-            lines.append(_line([name, scores["error"].replace("|", "/"), *[""] * (len(titles) - 2)]))
+            lines.append(line([name, scores["error"].replace("|", "/"), *[""] * (len(titles) - 2)]))
             continue
-        cells = [" / ".join(_shown(_pick(scores[s], key), form) for s in SPLITS) for key, (_, form) in COLUMNS.items()]
-        cells += [_shown(scores["training"][key], form) for key, (_, form) in COSTS.items()]
-        cells += [_shown(scores["frame_seconds"].get(size), "{:.2f}") for size in sizes]
-        lines.append(_line([name, *cells, _shown(near_best.get(name), "{:.0f}")]))
+        cells = [" / ".join(shown(pick(scores[s], key), form) for s in SPLITS) for key, (_, form) in COLUMNS.items()]
+        cells += [shown(scores["training"][key], form) for key, (_, form) in COSTS.items()]
+        cells += [shown(scores["frame_seconds"].get(size), "{:.2f}") for size in sizes]
+        lines.append(line([name, *cells, shown(near_best.get(name), "{:.0f}")]))
         for reason in _reasons(scores):
             reasons.setdefault(reason, []).append(name)
     missing = [f"- {', '.join(names)}: {reason}" for reason, names in reasons.items()]
@@ -142,7 +143,7 @@ def as_csv(result: Mapping[str, Any]) -> str:
     writer.writerow(["variant", "cameras", "frames", "method", *keys, "error"])
     for title, variant in result["variants"].items():
         for name, scores in variant.get("methods", {}).items():
-            figures = ["" if (value := _pick(scores, key)) is None else value for key in keys]
+            figures = ["" if (value := pick(scores, key)) is None else value for key in keys]
             writer.writerow([title, variant["cameras"], variant["frames"], name, *figures, scores.get("error", "")])
     return out.getvalue()
 
@@ -160,18 +161,3 @@ def _sizes(variant: Mapping[str, Any]) -> list[str]:
 
 def _smallest(frame_seconds: Mapping[str, float]) -> tuple[str, float]:
     return min(frame_seconds.items(), key=lambda item: int(item[0]))
-
-
-def _pick(tree: Mapping[str, Any], key: str) -> Any:
-    value: Any = tree
-    for part in key.split("."):
-        value = (value or {}).get(part)
-    return value
-
-
-def _shown(value: float | None, form: str) -> str:
-    return "-" if value is None else form.format(value)
-
-
-def _line(cells: list[str]) -> str:
-    return f"| {' | '.join(cells)} |"

@@ -1,13 +1,12 @@
 """What a stability study tries: a YAML file under `configs/stability/`."""
 
 from collections.abc import Collection
-from pathlib import Path
 from typing import Annotated
 
 import yaml
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from hnerf.config import CONFIGS, Section
+from hnerf.config import CONFIGS, Section, named_file, validated
 from hnerf.errors import CaptureError
 from hnerf.study.degrade import KINDS, NOT_MADE, check_strengths
 
@@ -48,16 +47,8 @@ class Stability(Section):
 
 def load_stability(study: str) -> Stability:
     """A study by its name under `configs/stability/` or its file's path; CaptureError, one line, on what is wrong."""
-    named = STUDIES / f"{study}.yaml"
-    path = named if named.exists() else Path(study)
-    if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in STUDIES.glob("*.yaml")))
-        raise CaptureError(f"{study}: no such study or file; studies are {known}")
-    try:
-        found = Stability.model_validate(yaml.safe_load(path.read_text()) or {})
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise CaptureError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    path = named_file(study, STUDIES, "study", "studies")
+    found = validated(Stability, yaml.safe_load(path.read_text()) or {}, path)
     for kind, strengths in found.degradations.items():
         check_strengths(kind, strengths)
     return found

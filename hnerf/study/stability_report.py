@@ -8,6 +8,7 @@ from typing import Any
 
 from hnerf.study.degrade import KINDS
 from hnerf.study.surface import LENGTHS, VOLUMES
+from hnerf.study.tables import head, line, shown
 from hnerf.study.verdict import DEGRADED_DB, DEGRADED_RATIO, FAILED_DB, FAILED_RATIO, WORST_LAST
 
 REFERENCE = "as recorded"
@@ -49,12 +50,12 @@ def as_markdown(result: Row, charts: Sequence[str]) -> str:
     """Where each method breaks, charts, every run, what was left out, and what verdicts mean."""
     methods, kinds = result["plan"]["methods"], result["plan"]["degradations"]
     lines = [f"# Stability of {', '.join(methods)} on {result['subject']}: study `{result['study']}`", "", LEGEND, ""]
-    lines += ["## Where each method breaks", "", *_table(["degradation", *methods])]
+    lines += ["## Where each method breaks", "", *head(["degradation", *methods])]
     for kind in kinds:
-        lines.append(_line([KINDS[kind].label, *(breaking_strength(result, method, kind) for method in methods)]))
+        lines.append(line([KINDS[kind].label, *(breaking_strength(result, method, kind) for method in methods)]))
     lines += ["", *(f"![{chart}]({chart})" for chart in charts), "", "## Runs", ""]
-    lines += _table(["method", "degradation", "strength", "seed", "verdict", "PSNR, dB", "SSIM", "Chamfer, mm"])
-    lines += [_line(_cells(run)) for run in result["runs"]]
+    lines += head(["method", "degradation", "strength", "seed", "verdict", "PSNR, dB", "SSIM", "Chamfer, mm"])
+    lines += [line(_cells(run)) for run in result["runs"]]
     lines += ["", "## Left out", "", *(f"- {line}" for line in result["left_out"]), ""]
     return "\n".join([*lines, *([result["protocol"], ""] if result["protocol"] else [])])
 
@@ -63,17 +64,5 @@ def _cells(run: Row) -> list[str]:
     kind = KINDS[run["kind"]].label if run["kind"] in KINDS else run["kind"]
     strength = "" if run["strength"] is None else f"{run['strength']:g}"
     verdict = f"{run['verdict']}: {run['reason']}" if run["reason"] else run["verdict"]
-    scores = [_score(run.get(key), digits) for key, digits in (("psnr", 2), ("ssim", 3), ("chamfer_mm", 2))]
+    scores = [shown(run.get(key), f"{{:.{digits}f}}") for key, digits in (("psnr", 2), ("ssim", 3), ("chamfer_mm", 2))]
     return [run["method"], kind, strength, str(run["seed"]), verdict.replace("|", "/"), *scores]
-
-
-def _score(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _table(titles: list[str]) -> list[str]:
-    return [_line(titles), "|" + "---|" * len(titles)]
-
-
-def _line(cells: list[str]) -> str:
-    return f"| {' | '.join(cells)} |"

@@ -48,11 +48,17 @@ def subset(
 def write_arrays(capture: Capture, kept: Capture) -> None:
     """Keypoints and given poses of the frames and cameras that are kept."""
     rows = np.searchsorted(capture.frames, kept.frames)
-    found = {name: capture.keypoints(name) for name in kept.cameras}
-    write_keypoints(kept.root, {name: people[rows] for name, people in found.items() if people is not None})
+    found = read_keypoints(capture)
+    write_keypoints(kept.root, {name: found[name][rows] for name in kept.cameras if name in found})
     poses = capture.given_poses()
     if poses:
         dataclasses.replace(poses, theta=poses.theta[rows], root=poses.root[rows]).save(kept.root / "poses.npz")
+
+
+def read_keypoints(capture: Capture) -> dict[str, np.ndarray]:
+    """Of every camera in which anyone was detected: (frames, people, 25, 3), px and score."""
+    found = {name: capture.keypoints(name) for name in capture.cameras}
+    return {name: people for name, people in found.items() if people is not None}
 
 
 def write_keypoints(root: Path, keypoints: dict[str, np.ndarray]) -> None:

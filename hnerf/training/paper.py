@@ -15,7 +15,7 @@ from hnerf.body.rig import Rig
 from hnerf.config import PaperFieldSettings
 from hnerf.field.mlp import RadianceMLP, ResidualMLP
 from hnerf.render.compositing import alpha_from_density, occupancy, weights_from_alpha
-from hnerf.render.shell import box_interval
+from hnerf.render.shell import box_interval, stratified
 from hnerf.training.conditions import Conditions, Draws, pose_inputs
 from hnerf.training.field import Field
 from hnerf.training.losses import RaySamples
@@ -74,8 +74,7 @@ class PaperField(Field):
     ) -> tuple[RaySamples, Tensor]:
         """As FastField.sample, over coarse and fine samples together (K = 2 x samples)."""
         near, far = box_interval(origins_m, directions, region.scene_lower_m, region.scene_upper_m)
-        strata = torch.arange(self.samples, device=near.device)
-        coarse = near[:, None] + (far - near)[:, None] * (strata + draws.jitter) / self.samples
+        coarse = stratified(near, far, draws.jitter)
         view = directions if draws.view is None else directions + draws.view
         depths = coarse
         with torch.no_grad():

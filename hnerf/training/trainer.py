@@ -108,10 +108,14 @@ class Trainer:
                 self.field_steps = self.step
             if self.step == self.field_steps:
                 self.field_seconds = self.seconds
-            if self.step % self.settings.absorb_steps == 0 or self.step in (self.field_steps, self.steps):
+            snapshot_due = bool(snapshots_s) and self.seconds >= snapshots_s[0]
+            if (
+                snapshot_due
+                or self.step % self.settings.absorb_steps == 0
+                or self.step in (self.field_steps, self.steps)
+            ):
                 self._absorb()
-            if snapshots_s and self.seconds >= snapshots_s[0]:
-                self._absorb()
+            if snapshot_due:
                 if self.processes.leads:
                     self._save(self.out / "snapshots" / f"{snapshots_s[0]:g}")
                 snapshots_s.pop(0)
