@@ -84,10 +84,12 @@ class FastFieldSettings(Section):
     channels: int = Field(default=4, ge=1)
     width: int = Field(default=64, ge=1)
     pose_width: int = Field(default=0, ge=0)
+    nodes: int = Field(default=0, ge=0)  # of each frame's deformation; none where its learning rate is 0
     initial_sharpness_per_m: float = Field(default=100.0, gt=0)
     gradient_step_m: float = Field(default=0.005, gt=0)
     grid_learning_rate: float = Field(default=5e-2, gt=0)
     network_learning_rate: float = Field(default=1e-2, gt=0)
+    deformation_learning_rate: float = Field(default=1e-3, ge=0)  # metres; 0: frames do not deform the body
 
 
 class PaperFieldSettings(Section):
@@ -155,7 +157,7 @@ class LossSettings(Section):
     residual: float = Field(default=5e-4, ge=0)
     fit: float = Field(default=1.0, ge=0)
     increment: float = Field(default=0.02, ge=0)
-    elastic: float = Field(default=0.0, ge=0)  # not H-NeRF's: of Nerfies' deformation
+    elastic: float = Field(default=0.0, ge=0)  # not the paper's: of a deformation, as `fast` and Nerfies have
     eta: float = Field(default=1.0, ge=0)  # of the surroundings in blend; 0.25 where floor or furniture is near
     density_threshold: float = Field(default=50.0, gt=0)  # sigma_h, per scene unit
     density_steepness: float = Field(default=0.1, gt=0)  # lambda; docs/method.md says why

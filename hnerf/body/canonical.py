@@ -26,15 +26,21 @@ FAR_M = 10.0  # as a reach: farther than any point that is asked about
 @dataclass(frozen=True)
 class Descriptor:
     """d (N,) metres, negative inside; s (N, 3) on the rest body; y (N, 3) canonical position; normal (N, 3) of the rest
-    body at s, turned into the world; near (N,) bool: within reach (the rest is meaningless where it is False); vertex
-    (N,) the closest corner of the closest triangle."""
+    body at s, turned into the world; near (N,) bool: within reach (the rest is meaningless where it is False); corners
+    (N, 3) of the closest triangle, barycentric (N, 3) of the closest point in it."""
 
     d: Tensor
     s: Tensor
     y: Tensor
     normal: Tensor
     near: Tensor
-    vertex: Tensor
+    corners: Tensor
+    barycentric: Tensor
+
+    @property
+    def vertex(self) -> Tensor:
+        """The closest corner of the closest triangle, (N,)."""
+        return nearest_corner(self.corners, self.barycentric)
 
 
 class PoseCorrection(nn.Module):
@@ -85,7 +91,7 @@ class PosedBodies:
         self.theta, self.root = theta.detach(), root.detach()
         rig = self.rig
         blended = vertex_transforms(rig, skinning_transforms(rig, rig.joints_m, self.theta, self.root))
-        self._linear = blended[..., :3]
+        self._linear = blended[..., :3].contiguous()
         self._inverse = torch.linalg.inv(self._linear)
         self.vertices_m = pose_vertices(rig, self.theta, self.root)
         self._joints = joint_transforms(rig, rig.joints_m, self.theta, self.root)
@@ -106,23 +112,22 @@ class PosedBodies:
         correction."""
         found = self._meshes.closest_points(points_m, frame, reach_m, exact_sign)
         corners = self.rig.faces[found.face.clamp(min=0)]  # (N, 3)
-        vertex = corners.gather(1, found.barycentric.argmax(1, keepdim=True))[:, 0]
-        flat = frame.long()[:, None] * len(self.rig.vertices_m) + corners
-        weights = found.barycentric[..., None]
-        p = (self.vertices_m.flatten(0, 1)[flat] * weights).sum(1)
-        s = (self._canonical_m[corners] * weights).sum(1)
-        inverse = (self._inverse.flatten(0, 1).flatten(1)[flat] * weights).sum(1).unflatten(-1, (3, 3))
+        posed = frame.long()[:, None] * len(self.rig.vertices_m) + corners
+        p = blended(self.vertices_m.flatten(0, 1), posed, found.barycentric)
+        s = blended(self._canonical_m, corners, found.barycentric)
+        inverse = blended(self._inverse.flatten(0, 1).flatten(1), posed, found.barycentric).unflatten(-1, (3, 3))
         offset = points_m.detach() - p
         distance = offset.norm(dim=-1)
         normal = found.sign[:, None] * offset / distance.clamp(min=1e-9)[:, None]
         moved = points_m - points_m.detach()  # zero, but carries the gradient
         if correction is not None:
-            moved = moved - self._displacement(points_m.detach(), frame, vertex, correction)
+            nearest = nearest_corner(corners, found.barycentric)
+            moved = moved - self._displacement(points_m.detach(), frame, nearest, correction)
         tangential = moved - normal * (normal * moved).sum(-1, keepdim=True)
         y = s + (inverse @ (offset + moved)[..., None])[..., 0]
         s = s + (inverse @ tangential[..., None])[..., 0]
         d = found.sign * distance + (normal * moved).sum(-1)
-        return Descriptor(d, s, y, normal, found.face >= 0, vertex)
+        return Descriptor(d, s, y, normal, found.face >= 0, corners, found.barycentric)
 
     def _displacement(self, points_m: Tensor, frame: Tensor, nearest: Tensor, correction: PoseCorrection) -> Tensor:
         """How far the correction carries the body at each point with its nearest vertex (N,): (N, 3)."""
@@ -134,7 +139,7 @@ class PosedBodies:
         everywhere = (share @ twists[present].transpose(0, 1).flatten(1)).unflatten(1, (len(present), 6))
         blended = everywhere.gather(1, own[:, None, None].expand(-1, 1, 6))[:, 0]  # one product beats a gather a point
         moved = torch.linalg.cross(blended[:, :3], points_m) + blended[:, 3:] + correction.move_m[frame]
-        bulge = torch.einsum("b,nbd->nd", correction.shape, self.rig.shape_basis[:, nearest].transpose(0, 1))
+        bulge = torch.einsum("b,bvd->vd", correction.shape, self.rig.shape_basis)[nearest]
         linear = self._linear.flatten(0, 1)[frame * len(self.rig.vertices_m) + nearest]
         return moved + (linear @ bulge[..., None])[..., 0]
 
@@ -158,6 +163,16 @@ class PosedBodies:
         for name, parameter in correction.named_parameters():
             correction.get_buffer(f"absorbed_{name}").add_(parameter)
             parameter.zero_()
+
+
+def nearest_corner(corners: Tensor, barycentric: Tensor) -> Tensor:
+    """Of corners (N, 3) the one (N,) whose barycentric weight is greatest."""
+    return corners.gather(1, barycentric.argmax(1, keepdim=True))[:, 0]
+
+
+def blended(values: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor:
+    """Rows (V, D) at corners (N, 3), weighted and summed (N, D), in one pass."""
+    return nn.functional.embedding_bag(corners, values, per_sample_weights=barycentric.to(values), mode="sum")
 
 
 def axis_angle_from_rotation(rotation: Tensor) -> Tensor:

@@ -27,6 +27,7 @@ THINNEST_M, THICKEST_M = 0.03, 0.15
 MASKS_A_CAMERA = 6  # are looked at
 STILL_RAD = 0.05  # spread of joints below which nothing can be learned from their angles
 POSE_WIDTH = 8
+NODES = 128  # about 12 cm apart: what they cannot follow, such as a collar, is the canonical surface's own
 LOOKS = 0.5  # how often a person's pixel is drawn in the mean
 LEAST_STEPS, MOST_STEPS = 300, 600
 
@@ -103,6 +104,7 @@ def _field(scene: Scene, given: FastFieldSettings) -> dict[str, Decision]:
     outer_m, inner_m = (_thickness_m(reach_m) for reach_m in (scene.outside_m, scene.inside_m))
     outer_m, inner_m = given.outer_m or outer_m, given.inner_m or inner_m
     still = scene.spread_rad < STILL_RAD
+    rigid = scene.frames == 1 or not given.deformation_learning_rate
     cells = scene.side_m / cell_m
     return {
         "outer_m": Decision(outer_m, f"masks reach {_mm(scene.outside_m)} out of the fitted body, and room"),
@@ -120,6 +122,12 @@ def _field(scene: Scene, given: FastFieldSettings) -> dict[str, Decision]:
             1 if still else POSE_WIDTH,
             f"joints spread {np.rad2deg(scene.spread_rad):.1f} degrees over {scene.frames} frames"
             + (": too little to learn from" if still else ""),
+        ),
+        "nodes": Decision(
+            0 if rigid else NODES,
+            "one frame, or no learning rate: nothing to deform"
+            if rigid
+            else f"skinning does not move the clothes of {scene.frames} frames alike",
         ),
     }
 

@@ -1,5 +1,7 @@
 """The fast avatar: radiance and SDF co-learned on grids over the canonical shell, rendered in the shell alone."""
 
+import dataclasses
+
 import torch
 from torch import Tensor, nn
 
@@ -8,6 +10,7 @@ from hnerf.body.descriptor import vertex_normals
 from hnerf.body.rig import Rig
 from hnerf.config import FastFieldSettings
 from hnerf.field.canonical import CanonicalField
+from hnerf.field.deformation import FrameDeformation
 from hnerf.render.compositing import alpha_from_sdf, weights_from_alpha
 from hnerf.render.shell import ShellGrid, lattice
 from hnerf.training.conditions import Conditions, Draws, pose_inputs
@@ -17,18 +20,20 @@ from hnerf.training.losses import RaySamples
 SETTLED = 5.0  # where the logistic of density is 1 or 0 within 1 %
 ROOM_M = 0.012  # for what the surface still moves, and what poses that were not asked about do to it
 TIGHTEN_STEP_M = 0.004
+ELASTIC_M = 0.01  # a displacement whose elastic energy is 1
 NEGLIGIBLE = 1e-3  # a sample of less weight gets no colour
 
 
 class FastField(Field):
-    """Networks, sharpness and the canonical body; no pose of its own."""
+    """Networks, sharpness, the canonical body and its deformation in every frame; no pose of its own."""
 
     outer_m: Tensor
     inner_m: Tensor
     corners: Tensor
     weights: Tensor
 
-    def __init__(self, rig: Rig, settings: FastFieldSettings):
+    def __init__(self, rig: Rig, settings: FastFieldSettings, frames: int):
+        """frames: rows of the fit that the field is trained with."""
         super().__init__()
         self.settings = settings
         self.samples, self.margin_m = settings.samples, settings.outer_m + settings.shell_cell_m
@@ -49,6 +54,9 @@ class FastField(Field):
             settings.pose_width,
             pose_inputs(rig, torch.zeros(1, len(rig.joints_m), 3)).shape[1],
             settings.outer_m,
+        )
+        self.deformation = (
+            FrameDeformation(rig.vertices_m, rig.faces, settings.nodes, frames) if settings.nodes else None
         )
         self.log_sharpness = nn.Parameter(torch.tensor(settings.initial_sharpness_per_m).log())
 
@@ -84,13 +92,19 @@ class FastField(Field):
 
     def parameter_groups(self) -> list[dict]:
         """Adam groups; feature grids bear a larger rate than networks."""
-        grids = [p for name, p in self.named_parameters() if "grids" in name]
-        networks = [p for name, p in self.named_parameters() if "grids" not in name and p is not self.log_sharpness]
+        s, networks = self.settings, [*self.field.pose_code.parameters()]
+        networks += [*self.field.geometry.parameters(), *self.field.radiance.parameters()]
+        grids = [*self.field.geometry_grids.parameters(), *self.field.colour_grids.parameters()]
         return [
-            {"params": grids, "lr": self.settings.grid_learning_rate},
-            {"params": networks, "lr": self.settings.network_learning_rate},
-            {"params": [self.log_sharpness], "lr": self.settings.grid_learning_rate},
+            {"params": grids, "lr": s.grid_learning_rate},
+            {"params": networks, "lr": s.network_learning_rate},
+            {"params": [self.log_sharpness], "lr": s.grid_learning_rate},
+            {"params": self.frame_parameters(), "lr": s.deformation_learning_rate},
         ]
+
+    def frame_parameters(self) -> list[nn.Parameter]:
+        """The deformations."""
+        return [] if self.deformation is None else [self.deformation.displacement]
 
     def sample(
         self,
@@ -108,7 +122,8 @@ class FastField(Field):
         hit = torch.nonzero(met)[:, 0]  # only these rays are asked about; the others see nothing
         points = origins_m[hit, None] + directions[hit, None] * depths[hit][..., None]
         row = frame[hit].repeat_interleave(depths.shape[1])
-        described = bodies.describe(points.flatten(0, 1), row, self.reach_m, correction)
+        moment = conditions.moment[row]
+        described, moved = self._deformed(bodies.describe(points.flatten(0, 1), row, self.reach_m, correction), moment)
         pose = conditions.pose[row]
         d = torch.where(described.near, described.d, self.reach_m).view(len(hit), depths.shape[1])
         residual = torch.where(described.near, self._residual(described, pose), 0.0).view_as(d)
@@ -123,7 +138,16 @@ class FastField(Field):
 
         alpha, d, residual = everywhere(alpha, 0.0), everywhere(d, self.reach_m), everywhere(residual, 0.0)
         colour = everywhere(colour.view(len(hit), depths.shape[1], 3), 0.0)
-        return RaySamples(alpha, alpha, torch.ones_like(d), colour, None, d, residual, norms, draws.beyond), depths
+        elastic = None if moved is None else (moved[described.near] / ELASTIC_M).square().sum(-1)
+        samples = RaySamples(alpha, alpha, torch.ones_like(d), colour, None, d, residual, norms, draws.beyond, elastic)
+        return samples, depths
+
+    def _deformed(self, described: Descriptor, moment: Tensor) -> tuple[Descriptor, Tensor | None]:
+        """Descriptors (N,) on the body as the frames of rows `moment` (N,) deform it, and the displacements (N, 3)."""
+        if self.deformation is None:
+            return described, None
+        moved, outwards = self.deformation(described, moment)
+        return dataclasses.replace(described, y=described.y - moved, d=described.d - outwards), moved
 
     def _residual(self, described: Descriptor, pose: Tensor) -> Tensor:
         """dd (N,) in the shell; 0 beyond it and deeper inside, where no ray asks and the body's d is enough."""
@@ -157,11 +181,11 @@ class FastField(Field):
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """d_hat (N,) at points (N, 3) around the first body; beyond reach the body's own distance stands alone."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
-        described = bodies.describe(points_m, row, FAR_M, exact_sign=True)
+        described, _ = self._deformed(bodies.describe(points_m, row, FAR_M, exact_sign=True), conditions.moment[row])
         return described.d + self._residual(described, conditions.pose[row])
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """c (N, 3) at points around the first body; this field does not depend on the viewing direction."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
-        described = bodies.describe(points_m, row, FAR_M)
+        described, _ = self._deformed(bodies.describe(points_m, row, FAR_M), conditions.moment[row])
         return self.field.colour(described.y, described.d, described.normal, conditions.pose[row])

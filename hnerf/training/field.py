@@ -37,6 +37,11 @@ class Field(nn.Module, ABC):
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Adam groups."""
 
+    def frame_parameters(self) -> list[nn.Parameter]:
+        """Those of single frames, with frames first: for novel frames they are fitted to the finished field, as poses
+        are."""
+        return []
+
     @abstractmethod
     def sample(
         self,

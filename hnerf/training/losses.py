@@ -108,9 +108,9 @@ def increment(correction: PoseCorrection) -> Tensor:
 
 
 def elastic(samples: RaySamples) -> Tensor:
-    """Mean of a deformation's elastic energy (Park et al. 2021, eq. 3 and 4)."""
-    assert samples.elastic is not None
-    return samples.elastic.mean()
+    """Mean of a deformation's elastic energy; nothing where nothing is deformed."""
+    energy = samples.d.new_zeros(1) if samples.elastic is None else samples.elastic
+    return energy.sum() / max(len(energy), 1)
 
 
 def _norm(x: Tensor) -> Tensor:

@@ -36,7 +36,7 @@ POINTS_AT_ONCE = 262144
 def build_field(settings: TrainingSettings, body: BodyFit, static: bool) -> Field:
     """An untrained field around the fitted body; static: the capture has one training frame."""
     if settings.machinery == "fast":
-        return FastField(body.rig, settings.fast)
+        return FastField(body.rig, settings.fast, len(body.frames))
     if settings.machinery == "nerf":
         require_one_moment(static, "NeRF")
         return NerfField(body, settings.nerf)

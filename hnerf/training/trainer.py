@@ -55,7 +55,7 @@ class Trainer:
         self.field = build_field(settings, self.body, self.static).to(device)
         bodies = PosedBodies(self.body.rig, self.body.theta, self.body.root, self.field.canonical_m)
         self.objective = Objective(self.field, bodies.correction(), settings)
-        self.optimizer = torch.optim.Adam(self._parameter_groups(), betas=(0.9, 0.99), eps=1e-12)
+        self.optimizer = torch.optim.Adam(self._parameter_groups(), betas=(0.9, 0.99), eps=1e-12, fused=True)
         self.first_rates = [group["lr"] for group in self.optimizer.param_groups]
         logger.info("gathering pixels")
         self.pixels: Pixels = gather_pixels(capture, masks, body, body.frames, self.field.margin_m, device)
@@ -139,8 +139,10 @@ class Trainer:
 
     def _freeze_field(self) -> None:
         """Novel poses are fitted to the finished field, so that it never sees their pixels."""
-        for parameter in [*self.field.parameters(), self.objective.correction.shape]:
-            parameter.requires_grad_(False)
+        self.field.requires_grad_(False)
+        self.objective.correction.shape.requires_grad_(False)
+        for parameter in self.field.frame_parameters():
+            parameter.requires_grad_(True)
 
     def _optimise(self, module: torch.nn.Module) -> dict[str, Tensor]:
         s, p = self.settings, self.processes

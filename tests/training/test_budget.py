@@ -48,7 +48,13 @@ def test_no_finer_than_frames_align():
 def test_what_is_given_stands():
     settings, decisions = decided(SCENE, steps=7, fast={"samples": 5, "outer_m": 0.2})
     assert (settings.steps, settings.fast.samples, settings.fast.outer_m) == (7, 5, 0.2)
-    assert set(decisions) == {"fast.inner_m", "fast.colour_cells", "fast.geometry_cells", "fast.pose_width"}
+    assert set(decisions) == {
+        "fast.inner_m",
+        "fast.colour_cells",
+        "fast.geometry_cells",
+        "fast.pose_width",
+        "fast.nodes",
+    }
 
 
 @pytest.mark.parametrize(("person_px", "steps"), [(1000, 300), (10**9, 600)])
@@ -60,6 +66,12 @@ def test_one_pose_teaches_nothing_about_poses():
     settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "spread_rad": 0.01}))
     assert settings.fast.pose_width == 1
     assert decisions["fast.pose_width"].reason.endswith("too little to learn from")
+
+
+@pytest.mark.parametrize(("frames", "rate", "nodes"), [(24, 1e-3, 128), (1, 1e-3, 0), (24, 0.0, 0)])
+def test_a_single_frame_does_not_deform_the_body(frames: int, rate: float, nodes: int):
+    scene = SCENE.__class__(**{**vars(SCENE), "frames": frames})
+    assert decided(scene, fast={"deformation_learning_rate": rate})[0].fast.nodes == nodes
 
 
 def test_a_scene_as_it_is_measured(tmp_path: Path):

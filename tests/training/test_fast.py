@@ -29,7 +29,7 @@ def standing() -> tuple[PosedBodies, Conditions]:
 
 def field_of(sharpness_per_m: float) -> FastField:
     torch.manual_seed(0)
-    field = FastField(RIG, SETTINGS)
+    field = FastField(RIG, SETTINGS, 1)
     field.log_sharpness.data.fill_(sharpness_per_m).log_()
     return field
 

@@ -102,6 +102,7 @@ def test_increment():
 
 def test_elastic():
     assert losses.elastic(SAMPLES).item() == pytest.approx(0.3)
+    assert losses.elastic(replace(SAMPLES, elastic=None)).item() == 0
 
 
 @pytest.mark.parametrize("name", ["reconstruction", "mask", "eikonal", "residual"])

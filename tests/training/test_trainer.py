@@ -136,7 +136,7 @@ def test_a_model_of_another_version_is_refused(tmp_path: Path):
 
 def test_novel_pixels_never_reach_the_field(tmp_path: Path):
     """Without the second phase the field is the same to the bit: it learns from training frames alone. The training
-    poses stay where they were, too."""
+    poses and deformations stay where they were, too; those of the novel frame do not."""
     recording = record(tmp_path / "capture")
     models = []
     for steps in (0, 4):
@@ -144,7 +144,10 @@ def test_novel_pixels_never_reach_the_field(tmp_path: Path):
         out.mkdir()
         train(*recording, with_changes(novel_pose_steps=steps), out, ALONE)
         models.append(load_file(out / "model.safetensors"))
+    deformations = [model.pop("deformation.displacement") for model in models]
     assert all(torch.equal(models[0][name], models[1][name]) for name in models[0])
+    assert torch.equal(deformations[0][[0, 1, 3]], deformations[1][[0, 1, 3]])
+    assert (deformations[0][2] != deformations[1][2]).any()
     poses = [load_avatar(tmp_path / f"{steps}").body.theta for steps in (0, 4)]
     torch.testing.assert_close(poses[0][:2], poses[1][:2], atol=1e-6, rtol=0)
     assert (poses[0][2] - poses[1][2]).abs().max() > 2e-5

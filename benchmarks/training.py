@@ -1,0 +1,91 @@
+"""`fast` beside `paper` after an hour: how long each needs to show unseen pixels as well.
+
+usage: python benchmarks/training.py STORE [CAPTURE] [--seconds S]
+
+Trains preset `paper`, in smaller batches than a GPU would take, for S seconds (default 3600) and preset `fast` to its
+end on a shared capture (default valid-wave). Both write down, every 25 steps, the PSNR of the same pixels of frames
+that neither is trained on, in training cameras, as the body was fitted: an indicator, not the evaluation's protocol.
+What is in STORE is not made again. Writes `benchmarks/results/training.json`, `.md` and `.png`.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from provenance import RESULTS, SHARED, provenance, sentence, table, write_result
+
+from flows.benchmark import trained
+from hnerf.config import Settings, load_settings
+from tasks.capture import ingest
+from tasks.source import read_capture
+from tasks.store import Store
+
+BATCH = ["training.frames_per_step=4", "training.rays_per_frame=64"]
+LINES = {"fast": "-", "paper": "--"}
+
+
+def main() -> None:
+    """Train both, print, draw and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("store", type=Path)
+    parser.add_argument("capture", nargs="?", default="valid-wave")
+    parser.add_argument("--seconds", type=float, default=3600.0)
+    options = parser.parse_args()
+    shelf = Store(options.store.resolve())
+    budget = [f"training.seconds={options.seconds}", "training.novel_pose_steps=0"]
+    presets = {"fast": load_settings("fast", budget[1:]), "paper": load_settings("paper", [*BATCH, *budget])}
+    curves = {name: train_one(shelf, SHARED / "data" / options.capture, s) for name, s in presets.items()}
+    target = curves["paper"][-1]["psnr"]
+    reached_s = next((row["seconds"] for row in curves["fast"] if row["psnr"] >= target), None)
+    paper_s = curves["paper"][-1]["seconds"]
+    result = provenance() | {"capture": options.capture, "batch": BATCH, "curves": curves}
+    result |= {"paper_psnr": target, "paper_s": paper_s, "fast_s": reached_s}
+    rows = [["preset", "steps", "seconds", "PSNR of unseen frames' pixels"]]
+    rows += [
+        [name, str(end["step"]), f"{end['seconds']:.0f}", f"{end['psnr']:.2f}"]
+        for name, end in ((name, curve[-1]) for name, curve in curves.items())
+    ]
+    told = "`fast` never has it."
+    if reached_s is not None:
+        told = f"`fast` is seen to have it after {reached_s:.1f} s, {paper_s / reached_s:.0f} times as soon."
+    lines = [f"# `fast` beside `paper`: {options.capture}", "", sentence(result), "", *table(rows), ""]
+    lines += [
+        f"After {paper_s:.0f} s `paper` has {target:.2f} dB; {told}",
+        "",
+        "![PSNR against time](training.png)",
+        "",
+    ]
+    write_result("training", result, "\n".join(lines))
+    draw(curves, RESULTS / "training.png")
+    print("\n".join(lines))
+
+
+def train_one(shelf: Store, folder: Path, settings: Settings) -> list[dict[str, Any]]:
+    """Step, seconds and held-out PSNR along a training."""
+    source, _ = read_capture(folder)
+    _, model = trained(shelf, ingest(shelf, source, settings.capture), settings)
+    rows = [json.loads(line) for line in (model.root / "history.jsonl").read_text().splitlines()]
+    return [
+        {"step": r["step"], "seconds": r["seconds"], "psnr": r["held_out"]["psnr"]} for r in rows if "held_out" in r
+    ]
+
+
+def draw(curves: dict[str, list[dict[str, Any]]], path: Path) -> None:
+    """PSNR against seconds of training, on a logarithmic axis."""
+    figure = Figure(figsize=(6, 3.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    for name, curve in curves.items():
+        seconds, psnr = ([row[key] for row in curve] for key in ("seconds", "psnr"))
+        axes.semilogx(seconds, psnr, LINES[name], color="black", label=name)
+    axes.set_xlabel("seconds of training")
+    axes.set_ylabel("PSNR of unseen frames' pixels, dB")
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=130)
+
+
+if __name__ == "__main__":
+    main()

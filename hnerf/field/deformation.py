@@ -1,0 +1,51 @@
+"""What skinning leaves over: every frame moves the canonical body's surface a little (docs/method.md)."""
+
+import torch
+from torch import Tensor, nn
+
+from hnerf.body.canonical import Descriptor, blended
+from hnerf.body.descriptor import vertex_normals
+
+TINY = 1e-9
+OVERLAP = 0.5  # width of a node's reach, in the greatest distance of a vertex from its node
+
+
+class FrameDeformation(nn.Module):
+    """Displacements of nodes spread over the body, in every frame; vertices follow the nodes around them.
+
+    The embedded deformation of Sumner et al. 2007 without its rotations. displacement (frames + 1, nodes, 3) in
+    canonical metres starts at zero; its last row stays there: it is that of a pose that no frame has.
+    """
+
+    shares: Tensor
+    normals: Tensor
+
+    def __init__(self, vertices_m: Tensor, faces: Tensor, nodes: int, frames: int):
+        """vertices_m (V, 3), faces (F, 3): the canonical body."""
+        super().__init__()
+        squared = torch.cdist(vertices_m, vertices_m[spread_over(vertices_m, nodes)]).square()  # (V, nodes)
+        width_squared = OVERLAP**2 * squared.amin(1).max().clamp(min=TINY)
+        self.register_buffer("shares", torch.softmax(-squared / width_squared, 1), persistent=False)
+        self.register_buffer("normals", vertex_normals(vertices_m, faces), persistent=False)
+        self.displacement = nn.Parameter(torch.zeros(frames + 1, nodes, 3))
+
+    def forward(self, described: Descriptor, moment: Tensor) -> tuple[Tensor, Tensor]:
+        """How far the surface next to described points is displaced in the frames of rows `moment` (N,), -1 for none:
+        (N, 3), and along its normal (N,); canonical metres."""
+        present, own = torch.unique(moment, return_inverse=True)
+        moved = self.shares @ self.displacement[present]  # (present, V, 3)
+        outwards = (moved * self.normals).sum(-1, keepdim=True)
+        table = torch.cat([moved, outwards], -1).flatten(0, 1)
+        found = blended(table, own[:, None] * len(self.shares) + described.corners, described.barycentric)
+        return found[:, :3], found[:, 3]
+
+
+def spread_over(points_m: Tensor, count: int) -> list[int]:
+    """Indices of points far from each other: the first, then always the one farthest from those chosen before
+    (Gonzalez 1985)."""
+    chosen = [0]
+    distance_m = (points_m - points_m[0]).norm(dim=1)
+    while len(chosen) < count:
+        chosen.append(int(distance_m.argmax()))
+        distance_m = distance_m.minimum((points_m - points_m[chosen[-1]]).norm(dim=1))
+    return chosen

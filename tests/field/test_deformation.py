@@ -1,0 +1,83 @@
+"""Deformation of single frames: nodes and their shares by hand, gradients in double precision, a surface that moves."""
+
+import pytest
+import torch
+
+from hnerf.body.canonical import Descriptor, PosedBodies
+from hnerf.config import FastFieldSettings
+from hnerf.field.deformation import FrameDeformation, spread_over
+from hnerf.training.conditions import Conditions
+from hnerf.training.fast import FastField
+from tests.body.boxes import box_rig
+
+RIG = box_rig()
+CENTIMETRES = torch.tensor([[0.01, 0.0, 0.0], [0.0, 0.0, 0.02]])
+
+
+def at(corners: list[int], barycentric: list[float]) -> Descriptor:
+    """A point next to a triangle of the box."""
+    nowhere, corner = torch.zeros(1, 3), torch.tensor([corners])
+    return Descriptor(
+        torch.zeros(1), nowhere, nowhere, nowhere, torch.ones(1).bool(), corner, torch.tensor([barycentric])
+    )
+
+
+def deformation(nodes: int) -> FrameDeformation:
+    found = FrameDeformation(RIG.vertices_m, RIG.faces, nodes, frames=2)
+    found.displacement.data[:2] = CENTIMETRES[:, None]
+    return found
+
+
+def test_nodes_lie_far_from_each_other():
+    """On a line, from 0: 10 is farthest, then 4 (4 from 0 and 6 from 10), then 7 (3 from 4 and from 10)."""
+    line = torch.tensor([0.0, 1.0, 4.0, 7.0, 10.0])[:, None].expand(-1, 3)
+    assert spread_over(line, 4) == [0, 4, 2, 3]
+
+
+def test_all_follow_a_single_node_and_none_where_no_frame_is_meant():
+    moments = torch.tensor([0, 1, -1])
+    described = at([4, 5, 6], [0.5, 0.25, 0.25])
+    moved = torch.cat([deformation(1)(described, m[None])[0] for m in moments])
+    torch.testing.assert_close(moved, torch.cat([CENTIMETRES, torch.zeros(1, 3)]))
+
+
+def test_shares_by_hand():
+    """Nodes at corners 0 and 6, opposite ones. All corners are within 1 of one of them, so nodes reach 0.5: corner 1, 1
+    from node 0 and sqrt(2) from node 6, follows node 0 with 1 / (1 + exp((1 - 2) / 0.25))."""
+    found = FrameDeformation(RIG.vertices_m, RIG.faces, 2, frames=1)
+    found.displacement.data[0, 0] = torch.tensor([1.0, 0.0, 0.0])
+    moved, outwards = found(at([1, 1, 1], [0.2, 0.3, 0.5]), torch.tensor([0]))
+    share = 1 / (1 + torch.exp(torch.tensor(-1 / 0.25)))
+    torch.testing.assert_close(moved, torch.tensor([[share, 0.0, 0.0]]))
+    torch.testing.assert_close(outwards, share * found.normals[1, :1])
+
+
+def test_gradient_in_double():
+    found = deformation(3).double()
+    described = at([4, 5, 6], [0.5, 0.25, 0.25])
+    described = Descriptor(*(v.double() if v.is_floating_point() else v for v in vars(described).values()))
+
+    def moved(displacement: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return torch.func.functional_call(found, {"displacement": displacement}, (described, torch.tensor([1])))
+
+    assert torch.autograd.gradcheck(moved, found.displacement.detach().requires_grad_())
+
+
+def test_a_frame_moves_the_surface_it_shows():
+    """A box of 1 m, all of it 2 cm up in frame 1: its top is at 1.02 m there, at 1 m in frame 0 and in a pose that no
+    frame has."""
+    torch.manual_seed(0)
+    settings = FastFieldSettings(
+        outer_m=0.1, inner_m=0.1, samples=8, geometry_cells=(4,), colour_cells=(4,), pose_width=1, nodes=1
+    )
+    rig = box_rig(splits=3)
+    field = FastField(rig, settings, frames=2)
+    assert field.deformation is not None
+    field.deformation.displacement.data[1] = CENTIMETRES[1]
+    theta, root, point_m = torch.zeros(1, 2, 3), torch.eye(4)[None], torch.tensor([[0.5, 0.5, 1.03]])
+    bodies = PosedBodies(rig, theta, root, rig.vertices_m)
+    found = [
+        field.signed_distance(bodies, point_m, Conditions.of(rig, theta, root, torch.tensor([moment]), 2.5)).item()
+        for moment in (0, 1, -1)
+    ]
+    assert found == pytest.approx([0.03, 0.01, 0.03], abs=1e-5)
