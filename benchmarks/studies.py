@@ -28,6 +28,7 @@ def main() -> None:
     options = parser.parse_args()
     folder = SHARED / "data" / options.capture
     methods = [name for name in options.methods.split(",") if name]
+    where = sentence(provenance())  # of the checkout before it gets new results
     if options.kind == "benchmark":
         table = benchmark.fn(folder, options.study, methods, options.seconds, options.store)
     else:
@@ -36,7 +37,7 @@ def main() -> None:
     kept.mkdir(parents=True, exist_ok=True)
     for path in [*table.parent.glob(f"{table.stem}.*"), *table.parent.glob(f"{table.stem}-*.png")]:
         shutil.copy(path, kept / path.name)
-    text = f"{table.read_text()}\nMade by `benchmarks/studies.py`: {sentence(provenance())}\n"
+    text = f"{table.read_text()}\nMade by `benchmarks/studies.py`: {where}\n"
     (kept / table.name).write_text(text)
     print(text)
 
