@@ -33,7 +33,8 @@ class FrameDeformation(nn.Module):
         """How far the surface next to described points is displaced in the frames of rows `moment` (N,), -1 for none:
         (N, 3), and along its normal (N,); canonical metres."""
         present, own = torch.unique(moment, return_inverse=True)
-        moved = self.shares @ self.displacement[present]  # (present, V, 3)
+        displaced = self.displacement[present].transpose(0, 1).flatten(1)  # (nodes, 3 present): one product of matrices
+        moved = (self.shares @ displaced).unflatten(1, (-1, 3)).transpose(0, 1)  # (present, V, 3)
         outwards = (moved * self.normals).sum(-1, keepdim=True)
         table = torch.cat([moved, outwards], -1).flatten(0, 1)
         found = blended(table, own[:, None] * len(self.shares) + described.corners, described.barycentric)
