@@ -3,8 +3,8 @@
 usage: python benchmarks/budget.py STORE [CAPTURE ...]
 
 Trains preset `fast` on shared captures (default: the three rendered ones) as hnerf/training/budget.py decides, then
-with grids of twice and of half the cells' number and as many times the samples a ray, then with twice and half the
-steps; everything else stays. Held-out figures by the evaluation's protocol, of a few images. What is in STORE is not
+with grids of twice and of half the cells' number and as many times the samples a ray and the nodes, then with twice and
+half the steps; everything else stays. Held-out figures by the evaluation's protocol, of a few images. What is in STORE is not
 made again. Writes `benchmarks/results/budget.json` and `.md`.
 """
 
@@ -70,12 +70,13 @@ def train_and_score(folder: Path, shelf: Store, settings: Settings) -> tuple[Tra
 
 
 def resized(training: TrainingSettings, factor: float) -> TrainingSettings:
-    """With so many times the cells, and samples a ray."""
+    """With so many times the cells, samples a ray, and nodes that deform the body."""
     fast, side = training.fast, float(np.cbrt(factor))
     changes = {
         "colour_cells": tuple(round(side * n) for n in fast.colour_cells),
         "geometry_cells": tuple(round(side * n) for n in fast.geometry_cells),
         "samples": round(factor * fast.samples),
+        "nodes": round(factor * fast.nodes),
     }
     return training.model_copy(update={"fast": fast.model_copy(update=changes)})
 

@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from hnerf.training.model import load_avatar
 from hnerf.training.processes import Processes
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import Trainer, train
-from tests.training.scene import TINY, record
+from tests.training.scene import FRAMES, TINY, record
 
 ALONE = Processes(0, 1, torch.device("cpu"))
 
@@ -153,6 +154,14 @@ def test_novel_pixels_never_reach_the_field(tmp_path: Path):
     assert (poses[0][2] - poses[1][2]).abs().max() > 2e-5
 
 
+def test_a_single_training_frame_has_nothing_to_deform(tmp_path: Path):
+    """The novel frames' poses are fitted all the same."""
+    capture, masks, body = record(tmp_path / "capture")
+    train(replace(capture, train_frames=FRAMES[:1]), masks, body, TINY, tmp_path, ALONE)
+    assert not any("deformation" in name for name in load_file(tmp_path / "model.safetensors"))
+    assert (load_avatar(tmp_path).body.theta[2] - body.theta[2]).abs().max() > 2e-5
+
+
 def test_not_a_number_stops_the_run_with_its_cause(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     capture, masks, body = record(tmp_path / "capture")
     trainer = Trainer(capture, masks, body, TINY, tmp_path, ALONE)
@@ -187,7 +196,7 @@ import sys, torch
 from pathlib import Path
 from hnerf.training import trainer
 from hnerf.training.processes import Processes
-from tests.training.scene import TINY, record
+from tests.training.scene import FRAMES, TINY, record
 torch.set_num_threads(1)
 root = Path(sys.argv[1])
 p = Processes.join()
