@@ -4,8 +4,8 @@ usage: python benchmarks/budget.py STORE [CAPTURE ...]
 
 Trains preset `fast` on shared captures (default: the three rendered ones) as hnerf/training/budget.py decides, then
 with grids of twice and of half the cells' number and as many times the samples a ray and the nodes, then with twice and
-half the steps; everything else stays. Held-out figures by the evaluation's protocol, of a few images. What is in STORE is not
-made again. Writes `benchmarks/results/budget.json` and `.md`.
+half the steps; everything else stays. Held-out figures by the evaluation's protocol, of a few images. What is in STORE
+is not made again. Writes `benchmarks/results/budget.json` and `.md`.
 """
 
 import argparse
