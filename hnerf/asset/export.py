@@ -37,6 +37,7 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
     Raises CaptureError if the field has no surface, InvalidAsset if a package does not pass validation.
     """
     seconds: dict[str, float] = {}
+    avatar = avatar.without_frames()  # one surface and one texture stand for all of them
     with _timed("surface", seconds):
         dense = canonical_surface(avatar, settings)
     with _timed("mesh", seconds):

@@ -1,5 +1,6 @@
 """What skinning leaves over: every frame moves the canonical body's surface a little (docs/method.md)."""
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -23,7 +24,8 @@ class FrameDeformation(nn.Module):
     def __init__(self, vertices_m: Tensor, faces: Tensor, nodes: int, frames: int):
         """vertices_m (V, 3), faces (F, 3): the canonical body."""
         super().__init__()
-        squared = torch.cdist(vertices_m, vertices_m[spread_over(vertices_m, nodes)]).square()  # (V, nodes)
+        chosen = spread_over(vertices_m.double().cpu().numpy(), nodes)  # the same ones whatever the device
+        squared = torch.cdist(vertices_m, vertices_m[chosen]).square()  # (V, nodes)
         width_squared = OVERLAP**2 * squared.amin(1).max().clamp(min=TINY)
         self.register_buffer("shares", torch.softmax(-squared / width_squared, 1), persistent=False)
         self.register_buffer("normals", vertex_normals(vertices_m, faces), persistent=False)
@@ -33,20 +35,28 @@ class FrameDeformation(nn.Module):
         """How far the surface next to described points is displaced in the frames of rows `moment` (N,), -1 for none:
         (N, 3), and along its normal (N,); canonical metres."""
         present, own = torch.unique(moment, return_inverse=True)
-        displaced = self.displacement[present].transpose(0, 1).flatten(1)  # (nodes, 3 present): one product of matrices
-        moved = (self.shares @ displaced).unflatten(1, (-1, 3)).transpose(0, 1)  # (present, V, 3)
+        moved = self._of_vertices(present)
         outwards = (moved * self.normals).sum(-1, keepdim=True)
         table = torch.cat([moved, outwards], -1).flatten(0, 1)
         found = blended(table, own[:, None] * len(self.shares) + described.corners, described.barycentric)
         return found[:, :3], found[:, 3]
 
+    def outwards(self) -> Tensor:
+        """How far vertices go along their normals, by frame and in no frame, (frames + 1, V)."""
+        rows = torch.arange(len(self.displacement), device=self.displacement.device)
+        return (self._of_vertices(rows) * self.normals).sum(-1)
 
-def spread_over(points_m: Tensor, count: int) -> list[int]:
+    def _of_vertices(self, rows: Tensor) -> Tensor:
+        """(n, V, 3) of some rows of `displacement`, as one product of matrices."""
+        return (self.shares @ self.displacement[rows].transpose(0, 1).flatten(1)).unflatten(1, (-1, 3)).transpose(0, 1)
+
+
+def spread_over(points_m: np.ndarray, count: int) -> list[int]:
     """Indices of points far from each other: the first, then always the one farthest from those chosen before
     (Gonzalez 1985)."""
     chosen = [0]
-    distance_m = (points_m - points_m[0]).norm(dim=1)
+    distance_m = np.linalg.norm(points_m - points_m[0], axis=1)
     while len(chosen) < count:
         chosen.append(int(distance_m.argmax()))
-        distance_m = distance_m.minimum((points_m - points_m[chosen[-1]]).norm(dim=1))
+        distance_m = np.minimum(distance_m, np.linalg.norm(points_m - points_m[chosen[-1]], axis=1))
     return chosen

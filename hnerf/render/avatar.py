@@ -28,6 +28,10 @@ class Avatar(Protocol):
     @property
     def body(self) -> BodyFit: ...
 
+    def without_frames(self) -> "Avatar":
+        """The same person without what was learned of single frames only, as it looks in a pose that no frame has."""
+        ...
+
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
         """Colour, coverage and depth of the person alone."""
         ...

@@ -82,13 +82,16 @@ class FastField(Field):
         points = (bodies.vertices_m[0, :, None] + depths_m[:, None] * normals[:, None]).flatten(0, 1)
         described = bodies.describe(points, torch.zeros(len(points), dtype=torch.long, device=rest.device), s.outer_m)
         settled_m = SETTLED / self.log_sharpness.exp()
+        outwards_m = points.new_zeros(1, 1) if self.deformation is None else self.deformation.outwards()
         seen = torch.zeros_like(described.near)
         for row in pose:
             d_hat = described.d + self._residual(described, row.expand(len(points), -1))
             seen |= described.near & (d_hat.abs() < settled_m)
-        for name, side in (("outer_m", described.d), ("inner_m", -described.d)):
-            reached = torch.zeros_like(self.outer_m).scatter_reduce_(0, described.vertex[seen], side[seen], "amax")
-            self.get_buffer(name).copy_((reached + ROOM_M).minimum(self.get_buffer(name)))
+        for name, side in (("outer_m", 1), ("inner_m", -1)):
+            reached = torch.zeros_like(self.outer_m)
+            reached = reached.scatter_reduce_(0, described.vertex[seen], side * described.d[seen], "amax")
+            deformed = (side * outwards_m).amax(0).clamp(min=0)  # in the frame that goes farthest
+            self.get_buffer(name).copy_((reached + deformed + ROOM_M).minimum(self.get_buffer(name)))
 
     def parameter_groups(self) -> list[dict]:
         """Adam groups; feature grids bear a larger rate than networks."""
@@ -122,8 +125,8 @@ class FastField(Field):
         hit = torch.nonzero(met)[:, 0]  # only these rays are asked about; the others see nothing
         points = origins_m[hit, None] + directions[hit, None] * depths[hit][..., None]
         row = frame[hit].repeat_interleave(depths.shape[1])
-        moment = conditions.moment[row]
-        described, moved = self._deformed(bodies.describe(points.flatten(0, 1), row, self.reach_m, correction), moment)
+        skin = bodies.describe(points.flatten(0, 1), row, self.reach_m, correction)
+        described, moved = self._deformed(skin, conditions.moment[row])
         pose = conditions.pose[row]
         d = torch.where(described.near, described.d, self.reach_m).view(len(hit), depths.shape[1])
         residual = torch.where(described.near, self._residual(described, pose), 0.0).view_as(d)
@@ -131,14 +134,17 @@ class FastField(Field):
         colour = self._colour(described, pose, weights_from_alpha(alpha.detach()).flatten() > NEGLIGIBLE)
         norms = d.new_zeros(0)
         if draws.probe is not None:
-            norms = self._gradient_norms(described, residual, pose, draws.probe[hit])
+            norms = self._gradient_norms(described, skin, residual.shape, pose, draws.probe[hit])
+        elastic = None
+        if moved is not None:
+            energy = torch.where(described.near, (moved / ELASTIC_M).square().sum(-1), 0.0)
+            elastic = energy.view_as(d).mean(1)
 
         def everywhere(values: Tensor, elsewhere: float) -> Tensor:
             return values.new_full((len(met), *values.shape[1:]), elsewhere).index_copy(0, hit, values)
 
         alpha, d, residual = everywhere(alpha, 0.0), everywhere(d, self.reach_m), everywhere(residual, 0.0)
         colour = everywhere(colour.view(len(hit), depths.shape[1], 3), 0.0)
-        elastic = None if moved is None else (moved[described.near] / ELASTIC_M).square().sum(-1)
         samples = RaySamples(alpha, alpha, torch.ones_like(d), colour, None, d, residual, norms, draws.beyond, elastic)
         return samples, depths
 
@@ -162,20 +168,24 @@ class FastField(Field):
         seen = self.field.colour(described.y[pick], described.d[pick], described.normal[pick], pose[pick])
         return colour.index_copy(0, pick, seen)
 
-    def _gradient_norms(self, described: Descriptor, residual: Tensor, pose: Tensor, probe: Tensor) -> Tensor:
+    def _gradient_norms(
+        self, described: Descriptor, skin: Descriptor, shape: torch.Size, pose: Tensor, probe: Tensor
+    ) -> Tensor:
         """|grad d_hat| in the canonical frame at one sample a ray, probe (R,) in [0, 1), by forward differences: the
-        interpolation of a grid has no useful second derivative."""
-        rays, samples = residual.shape
+        interpolation of a grid has no useful second derivative. shape: rays and samples of a ray; skin: descriptors
+        before the deformation, which say where outwards is. Gradients flow to the field alone."""
+        rays, samples = shape
         pick = torch.arange(rays, device=probe.device) * samples + (probe * samples).long()
         pick = pick[described.near[pick]]
         step_m = self.settings.gradient_step_m
         y, d = described.y[pick].detach(), described.d[pick].detach()
-        outward = nn.functional.normalize((y - described.s[pick]) * d.sign()[:, None], dim=-1)
+        away = (skin.y - skin.s)[pick].detach() * skin.d[pick].detach().sign()[:, None]
+        outward = nn.functional.normalize(away, dim=-1)
         ahead = [
             self.field.residual(y + step_m * axis, d + step_m * outward @ axis, pose[pick])
             for axis in torch.eye(3, device=y.device)
         ]
-        here = residual.flatten()[pick][:, None]
+        here = self.field.residual(y, d, pose[pick])[:, None]
         return (outward + (torch.stack(ahead, -1) - here) / step_m).norm(dim=-1)
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:

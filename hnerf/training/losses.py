@@ -19,7 +19,7 @@ class RaySamples:
     """What a model says of a batch of rays. (R, K) each: alpha of the radiance field, alpha_dot of the SDF, in_box b,
     d of the body, residual dd, spatial_gradient |grad d_hat| (or a subset of samples, any shape); colour (R, K, 3);
     density (R, K) or None where the SDF itself is the density; beyond (R, 3): the colour behind the samples;
-    elastic: energy of a deformation at samples of its choice, or None where nothing is deformed."""
+    elastic: energy of a deformation on rays that it knows of, or None where nothing is deformed."""
 
     alpha: Tensor
     alpha_dot: Tensor
@@ -108,9 +108,9 @@ def increment(correction: PoseCorrection) -> Tensor:
 
 
 def elastic(samples: RaySamples) -> Tensor:
-    """Mean of a deformation's elastic energy; nothing where nothing is deformed."""
+    """Elastic energy of a deformation, mean over rays; nothing where nothing is deformed."""
     energy = samples.d.new_zeros(1) if samples.elastic is None else samples.elastic
-    return energy.sum() / max(len(energy), 1)
+    return energy.sum() / len(samples.d)
 
 
 def _norm(x: Tensor) -> Tensor:

@@ -52,11 +52,13 @@ def build_field(settings: TrainingSettings, body: BodyFit, static: bool) -> Fiel
 
 @dataclass(frozen=True)
 class TrainedAvatar:
-    """A field and the fine-tuned body: the Avatar of hnerf/render/avatar.py."""
+    """A field and the fine-tuned body: the Avatar of hnerf/render/avatar.py. learned: the poses of the frames that the
+    field knows, whatever body and poses are shown."""
 
     field: Field
     body: BodyFit
     scene_m: float
+    learned: BodyFit
 
     @torch.no_grad()
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
@@ -81,6 +83,11 @@ class TrainedAvatar:
         image = flat.view(camera.height_px, camera.width_px, 5)
         return Rendering(image[..., :3].clamp(0, 1), image[..., 3], image[..., 4])
 
+    def without_frames(self) -> "TrainedAvatar":
+        """The same avatar, in no pose of which it knows more than in others."""
+        none = dataclasses.replace(self.learned, theta=self.learned.theta[:0], root=self.learned.root[:0], frames=())
+        return dataclasses.replace(self, learned=none)
+
     @torch.no_grad()
     def signed_distance(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
         """d_hat at world points (N, 3), (N,) metres."""
@@ -98,9 +105,13 @@ class TrainedAvatar:
     def _pose(self, theta: Tensor, root: Tensor) -> tuple[PosedBodies, Conditions]:
         rig = self.body.rig
         bodies = PosedBodies(rig, theta[None], root[None], self.field.canonical_m)
-        same = (self.body.theta == theta).flatten(1).all(1) & (self.body.root == root).flatten(1).all(1)
-        moment = torch.nonzero(same)[:1, 0] if same.any() else torch.full((1,), -1, device=theta.device)
-        return bodies, Conditions.of(rig, theta[None], root[None], moment, self.scene_m)
+        return bodies, Conditions.of(rig, theta[None], root[None], self._moment(theta, root), self.scene_m)
+
+    def _moment(self, theta: Tensor, root: Tensor) -> Tensor:
+        """The learned row (1,) whose joints turn like theta, of several the one whose root is nearest; -1 for none."""
+        same = torch.nonzero((self.learned.theta == theta).flatten(1).all(1))[:, 0]
+        apart = (self.learned.root[same] - root).flatten(1).norm(dim=1)
+        return same[apart.argmin(keepdim=True)] if len(same) else torch.full((1,), -1, device=theta.device)
 
 
 def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvatar:
@@ -116,4 +127,4 @@ def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvat
         field.load_state_dict(tensors)
     except RuntimeError:
         raise CaptureError(f"{folder / 'model.safetensors'}: of another version; train the subject again") from None
-    return TrainedAvatar(field.eval(), body, settings.paper.scene_m)
+    return TrainedAvatar(field.eval(), body, settings.paper.scene_m, body)

@@ -1,5 +1,5 @@
-"""Training: the field with the poses of the training frames, then the poses of novel frames against the finished
-field."""
+"""Training: the field with the poses of the training frames, then what belongs to novel frames, their poses and
+deformations, against the finished field."""
 
 import dataclasses
 import json
@@ -73,11 +73,12 @@ class Trainer:
     @property
     def steps(self) -> int:
         """Of both phases."""
-        return self.field_steps + (self.settings.novel_pose_steps if self._novel_poses_learn else 0)
+        return self.field_steps + (self.settings.novel_pose_steps if self._novel_frames_learn else 0)
 
     @property
-    def _novel_poses_learn(self) -> bool:
-        return len(self.novel_rows) > 0 and self.settings.pose_learning_rate > 0
+    def _novel_frames_learn(self) -> bool:
+        learns = self.settings.pose_learning_rate > 0 or len(self.field.frame_parameters()) > 0
+        return learns and len(self.novel_rows) > 0
 
     def _parameter_groups(self) -> list[dict[str, Any]]:
         rate = self.settings.pose_learning_rate

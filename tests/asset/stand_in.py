@@ -19,6 +19,9 @@ class StandInAvatar:
     body: BodyFit
     queries: int = 0
 
+    def without_frames(self) -> "StandInAvatar":
+        return self
+
     def signed_distance(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
         vertices_m = pose_vertices(self.body.rig, theta, root)
         found = self._closest(points_m, vertices_m)

@@ -30,6 +30,9 @@ class BallAvatar:
 
     body: BodyFit
 
+    def without_frames(self) -> "BallAvatar":
+        return self
+
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
         alpha = torch.from_numpy(seen(camera, root[:3, 3].numpy())).float()
         return Rendering(alpha[..., None].expand(-1, -1, 3) * RENDERED / 255, alpha, alpha)

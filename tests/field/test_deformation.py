@@ -1,7 +1,9 @@
 """Deformation of single frames: nodes and their shares by hand, gradients in double precision, a surface that moves."""
 
+import numpy as np
 import pytest
 import torch
+from torch import nn
 
 from hnerf.body.canonical import Descriptor, PosedBodies
 from hnerf.config import FastFieldSettings
@@ -30,7 +32,7 @@ def deformation(nodes: int) -> FrameDeformation:
 
 def test_nodes_lie_far_from_each_other():
     """On a line, from 0: 10 is farthest, then 4 (4 from 0 and 6 from 10), then 7 (3 from 4 and from 10)."""
-    line = torch.tensor([0.0, 1.0, 4.0, 7.0, 10.0])[:, None].expand(-1, 3)
+    line = np.array([0.0, 1.0, 4.0, 7.0, 10.0])[:, None]
     assert spread_over(line, 4) == [0, 4, 2, 3]
 
 
@@ -63,21 +65,40 @@ def test_gradient_in_double():
     assert torch.autograd.gradcheck(moved, found.displacement.detach().requires_grad_())
 
 
-def test_a_frame_moves_the_surface_it_shows():
-    """A box of 1 m, all of it 2 cm up in frame 1: its top is at 1.02 m there, at 1 m in frame 0 and in a pose that no
-    frame has."""
+def test_how_far_vertices_go_outwards():
+    """All go 1 cm along x in frame 0: corner 0, at the origin, goes inwards, corner 1, at (1, 0, 0), outwards; in frame
+    1 all go 2 cm up, corner 1 inwards."""
+    found = deformation(1)
+    across, up, nowhere = found.outwards()
+    torch.testing.assert_close(across, 0.01 * found.normals[:, 0])
+    assert across[0] < -0.003 and across[1] > 0.003 and up[1] < -0.003
+    assert (nowhere == 0).all()
+
+
+@pytest.mark.parametrize("moved_m", [[0.0, 0.0, 0.02], [0.015, -0.01, 0.0]])
+def test_a_frame_moves_all_that_the_field_knows(moved_m: list[float]):
+    """A box in frame 1, moved along the normal or across it, shows at x + m what it shows at x in frame 0 and in a
+    pose that no frame has: distance, with a residual of any form, and colour."""
     torch.manual_seed(0)
     settings = FastFieldSettings(
-        outer_m=0.1, inner_m=0.1, samples=8, geometry_cells=(4,), colour_cells=(4,), pose_width=1, nodes=1
+        outer_m=0.1, inner_m=0.1, samples=8, geometry_cells=(16,), colour_cells=(16,), pose_width=1, nodes=1
     )
     rig = box_rig(splits=3)
     field = FastField(rig, settings, frames=2)
     assert field.deformation is not None
-    field.deformation.displacement.data[1] = CENTIMETRES[1]
-    theta, root, point_m = torch.zeros(1, 2, 3), torch.eye(4)[None], torch.tensor([[0.5, 0.5, 1.03]])
+    field.deformation.displacement.data[1] = torch.tensor(moved_m)
+    nn.init.normal_(field.field.geometry[-1].weight)
+    for level in field.field.geometry_grids.levels:
+        nn.init.normal_(level)
+    theta, root = torch.zeros(1, 2, 3), torch.eye(4)[None]
     bodies = PosedBodies(rig, theta, root, rig.vertices_m)
-    found = [
-        field.signed_distance(bodies, point_m, Conditions.of(rig, theta, root, torch.tensor([moment]), 2.5)).item()
-        for moment in (0, 1, -1)
-    ]
-    assert found == pytest.approx([0.03, 0.01, 0.03], abs=1e-5)
+    points_m = torch.tensor([[0.43, 0.51, 1.03], [0.55, 0.38, 1.01]])
+
+    def seen(at_m: torch.Tensor, moment: int) -> torch.Tensor:
+        known = Conditions.of(rig, theta, root, torch.tensor([moment]), 2.5)
+        distance_m = field.signed_distance(bodies, at_m, known)
+        return torch.cat([distance_m[:, None], field.colour(bodies, at_m, at_m, known)], 1)
+
+    torch.testing.assert_close(seen(points_m + torch.tensor(moved_m), 1), seen(points_m, 0), atol=1e-4, rtol=1e-3)
+    torch.testing.assert_close(seen(points_m, -1), seen(points_m, 0))
+    assert (seen(points_m, 1) - seen(points_m, 0)).abs().max() > 1e-3

@@ -196,11 +196,13 @@ import sys, torch
 from pathlib import Path
 from hnerf.training import trainer
 from hnerf.training.processes import Processes
-from tests.training.scene import FRAMES, TINY, record
+from tests.training.scene import TINY, record
 torch.set_num_threads(1)
 root = Path(sys.argv[1])
 p = Processes.join()
-t = trainer.Trainer(*record(root / f"capture{p.rank}"), TINY, root, p)
+settings = TINY.model_copy(update={"losses": TINY.losses.model_copy(update={"elastic": 0.1})})
+t = trainer.Trainer(*record(root / f"capture{p.rank}"), settings, root, p)
+t.field.deformation.displacement.data[:-1] = 0.01
 module = t.objective
 if p.world_size > 1:
     module = torch.nn.parallel.DistributedDataParallel(module, find_unused_parameters=True)
@@ -223,7 +225,8 @@ def test_two_ranks_have_the_gradients_of_one(tmp_path: Path):
         subprocess.run([sys.executable, *launcher, str(script), str(root)], check=True, env=_environment())
         gradients.append(torch.load(root / "gradients.pt", weights_only=True))
     assert gradients[0].keys() == gradients[1].keys()
-    assert any(g.abs().max() > 0 for name, g in gradients[0].items() if "correction" in name)
+    for learned in ("correction", "deformation"):
+        assert any(g.abs().max() > 0 for name, g in gradients[0].items() if learned in name)
     for name, gradient in gradients[0].items():
         torch.testing.assert_close(
             gradients[1][name], gradient, atol=1e-6, rtol=1e-4, msg=lambda m, n=name: f"{n}: {m}"
