@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hnerf.study.machine import in_words, machine
+from hnerf.study.tables import head, line
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -32,8 +33,7 @@ def write_result(name: str, result: dict[str, Any], markdown: str) -> None:
 
 def table(rows: list[list[str]]) -> list[str]:
     """Lines of a Markdown table; the first row is its head."""
-    body = ["| " + " | ".join(row) + " |" for row in rows]
-    return [body[0], "|" + "---|" * len(rows[0]), *body[1:]]
+    return [*head(rows[0]), *map(line, rows[1:])]
 
 
 def _commit() -> str:

@@ -84,7 +84,7 @@ class FastFieldSettings(Section):
     channels: int = Field(default=4, ge=1)
     width: int = Field(default=64, ge=1)
     pose_width: int = Field(default=0, ge=0)
-    nodes: int = Field(default=0, ge=0)  # of each frame's deformation; none where its learning rate is 0
+    nodes: int = Field(default=0, ge=0)  # of each frame's deformation
     initial_sharpness_per_m: float = Field(default=100.0, gt=0)
     gradient_step_m: float = Field(default=0.005, gt=0)
     grid_learning_rate: float = Field(default=5e-2, gt=0)
@@ -175,7 +175,7 @@ class TrainingSettings(Section):
     losses: LossSettings = LossSettings()
     steps: int = Field(default=0, ge=0)  # 0: the scene decides
     seconds: float | None = Field(default=None, gt=0)  # at which the field's training ends if its steps have not
-    novel_pose_steps: int = Field(default=100, ge=0)  # poses of novel frames, against the finished field
+    novel_pose_steps: int = Field(default=100, ge=0)  # what belongs to novel frames, against the finished field
     frames_per_step: int = Field(default=8, ge=1)
     rays_per_frame: int = Field(default=384, ge=1)
     pose_learning_rate: float = Field(default=5e-4, ge=0)  # 0 keeps the fitted poses and shape

@@ -56,7 +56,7 @@ def as_markdown(result: Row, charts: Sequence[str]) -> str:
     lines += ["", *(f"![{chart}]({chart})" for chart in charts), "", "## Runs", ""]
     lines += head(["method", "degradation", "strength", "seed", "verdict", "PSNR, dB", "SSIM", "Chamfer, mm"])
     lines += [line(_cells(run)) for run in result["runs"]]
-    lines += ["", "## Left out", "", *(f"- {line}" for line in result["left_out"]), ""]
+    lines += ["", "## Left out", "", *(f"- {reason}" for reason in result["left_out"]), ""]
     return "\n".join([*lines, *([result["protocol"], ""] if result["protocol"] else [])])
 
 

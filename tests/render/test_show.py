@@ -1,4 +1,5 @@
-"""`hnerf render` on a subject that was never trained: a column whose field is as it was made."""
+"""`hnerf render` on a subject that was never trained: a column whose field is as it was made, but for frames that
+deform it."""
 
 import json
 from pathlib import Path
@@ -6,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from safetensors.torch import save_file
 
 from flows.cli import main
@@ -13,6 +15,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.footage import Video
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.lens import Lens
+from hnerf.render.motion import between
 from hnerf.training.model import build_field, load_avatar
 from tests.training.scene import TINY, record
 
@@ -31,10 +34,12 @@ def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
     in_step = {name: {"frame_offset": 0} for name in capture.cameras}
     (folder / "calibration" / "report.json").write_text(json.dumps({"cameras": in_step}))
     body.save(folder / "training")
-    field = build_field(TINY, body, False)
+    settings = TINY.model_copy(update={"fast": TINY.fast.model_copy(update={"nodes": 1})})
+    field = build_field(settings, body, False)
+    field.deformation.displacement.data[:3, 0, 0] = torch.tensor([0.0, 0.15, -0.15])  # to either side, frame by frame
     tensors = {name: value.contiguous() for name, value in field.state_dict().items()}
     save_file(tensors, folder / "training" / "model.safetensors")
-    stored = {"static": False, "training": TINY.model_dump()}
+    stored = {"static": False, "training": settings.model_dump()}
     (folder / "training" / "settings.json").write_text(json.dumps(stored))
     return folder
 
@@ -57,6 +62,27 @@ def test_a_recorded_camera_shows_every_fitted_frame(subject: Path, tmp_path: Pat
     video = Video.open(tmp_path / "out" / "colour.mp4")
     assert (len(video.frames), video.fps) == (3, 10.0)
     assert not (tmp_path / "out.partial").exists()
+
+
+def test_a_frame_shown_alone_keeps_its_deformation_and_no_other_pose_has_one(subject: Path, tmp_path: Path) -> None:
+    """Frames 1 and 2 stand 15 cm to either side of their poses, 1.4 pixels; halfway between them is neither."""
+    wishes = {"alone": ["--frames", "1"], "between": ["--between", "1", "2", "--pictures", "3"]}
+    for name, wish in wishes.items():
+        view = ["--camera", "0", "--what", "colour", *wish]
+        assert main(["render", str(subject), "--out", str(tmp_path / name), *view]) == 0
+    avatar = load_avatar(subject / "training")
+    camera = Capture.load(subject / "capture").cameras["0"]
+    halfway = between(avatar.body, 1, 2, 3)
+    expected = {
+        "alone/colour/000000.png": avatar.render(camera, avatar.body.theta[1], avatar.body.root[1]),
+        "between/colour/000001.png": avatar.without_frames().render(camera, halfway.theta[1], halfway.root[1]),
+        "between/colour/000002.png": avatar.render(camera, avatar.body.theta[2], avatar.body.root[2]),
+    }
+    for path, rendering in expected.items():
+        found = cv2.imread(str(tmp_path / path))
+        np.testing.assert_allclose(found[..., ::-1], (255 * rendering.rgb).round().numpy(), atol=1)
+    with_none = avatar.without_frames().render(camera, avatar.body.theta[1], avatar.body.root[1])
+    assert (with_none.alpha - expected["alone/colour/000000.png"].alpha).abs().max() > 0.3
 
 
 def test_an_orbit_round_one_pose_has_the_size_and_number_asked_for(subject: Path, tmp_path: Path) -> None:
