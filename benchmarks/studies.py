@@ -1,9 +1,10 @@
-"""Studies of speed, accuracy and stability on a shared capture, kept where the README finds them.
+"""Studies of speed, accuracy, stability and ablations on a shared capture, kept where the README finds them.
 
 usage: python benchmarks/studies.py STORE CAPTURE benchmark|stability STUDY [--methods a,b] [--seconds S]
+       python benchmarks/studies.py STORE CAPTURE ablations PRESET [--methods no-opt,no-noise]
 
-Runs `hnerf benchmark` or `hnerf stability` with STORE, in which finished work is found again, and copies its tables and
-charts to `benchmarks/results/<kind>/`.
+Runs `hnerf benchmark`, `hnerf stability` or `hnerf ablate` with STORE, in which finished work is found again, and
+copies its tables and charts to `benchmarks/results/<kind>/`. Ablations are scored on a few images.
 """
 
 import argparse
@@ -12,8 +13,11 @@ from pathlib import Path
 
 from provenance import RESULTS, SHARED, provenance, sentence
 
+from flows.ablations import ablate
 from flows.benchmark import benchmark
 from flows.stability import stability
+
+FEW = ["evaluation.max_images=8", "evaluation.max_meshes=2", "evaluation.report_rows=1"]
 
 
 def main() -> None:
@@ -21,7 +25,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("store", type=Path)
     parser.add_argument("capture")
-    parser.add_argument("kind", choices=["benchmark", "stability"])
+    parser.add_argument("kind", choices=["benchmark", "stability", "ablations"])
     parser.add_argument("study")
     parser.add_argument("--methods", default="")
     parser.add_argument("--seconds", type=float)
@@ -31,6 +35,8 @@ def main() -> None:
     where = sentence(provenance())  # of the checkout before it gets new results
     if options.kind == "benchmark":
         table = benchmark.fn(folder, options.study, methods, options.seconds, options.store)
+    elif options.kind == "ablations":
+        table = ablate(folder, options.study, options.store, FEW, methods)
     else:
         table = stability.fn(folder, options.study, options.store, methods)
     kept = RESULTS / options.kind

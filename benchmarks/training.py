@@ -2,11 +2,11 @@
 
 usage: python benchmarks/training.py STORE [CAPTURE] [--seconds S]
 
-Trains preset `paper`, in smaller batches than a GPU would take, for S seconds (default 3600) and preset `fast` to its
-end on a shared capture (default valid-wave). Both write down, every 25 steps, the PSNR of the same pixels of frames
-that neither is trained on, in training cameras, as the body was fitted: an indicator, not the evaluation's protocol,
-and one that a capture without novel poses does not have. What is in STORE is not made again. Writes
-`benchmarks/results/training.json`, `.md` and `.png`.
+Trains preset `paper`, in smaller batches than a GPU would take, for S seconds (default 3600; a step takes 20 s on one
+CPU core) and preset `fast` to its end on a shared capture (default valid-wave). Both write down, every 25 steps, the
+PSNR of the same pixels of frames that neither is trained on, in training cameras, as the body was fitted: an indicator,
+not the evaluation's protocol, and one that a capture without novel poses does not have. What is in STORE is not made
+again. Writes `benchmarks/results/training.json`, `.md` and `.png`.
 """
 
 import argparse
