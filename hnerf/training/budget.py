@@ -47,6 +47,7 @@ class Scene:
     longest of the rest body; spread_rad: of the free joints, mean; person_px: pixels of the person in all training
     images."""
 
+    cameras: int
     frames: int
     footprint_m: float
     outside_m: float
@@ -76,6 +77,7 @@ class Scene:
         rows = [body.index(frame) for frame in capture.train_frames]
         angles = body.theta[rows][:, body.rig.free]
         return Scene(
+            cameras=len(capture.train_cameras),
             frames=len(capture.train_frames),
             footprint_m=float(np.median(footprints_m)),
             outside_m=float(max(outside_m, 0)),
@@ -104,7 +106,6 @@ def _field(scene: Scene, given: FastFieldSettings) -> dict[str, Decision]:
     outer_m, inner_m = (_thickness_m(reach_m) for reach_m in (scene.outside_m, scene.inside_m))
     outer_m, inner_m = given.outer_m or outer_m, given.inner_m or inner_m
     still = scene.spread_rad < STILL_RAD
-    rigid = scene.frames == 1 or not given.deformation_learning_rate
     cells = scene.side_m / cell_m
     return {
         "outer_m": Decision(outer_m, f"masks reach {_mm(scene.outside_m)} out of the fitted body, and room"),
@@ -123,13 +124,18 @@ def _field(scene: Scene, given: FastFieldSettings) -> dict[str, Decision]:
             f"joints spread {np.rad2deg(scene.spread_rad):.1f} degrees over {scene.frames} frames"
             + (": too little to learn from" if still else ""),
         ),
-        "nodes": Decision(
-            0 if rigid else NODES,
-            "one frame, or no learning rate: nothing to deform"
-            if rigid
-            else f"skinning does not move the clothes of {scene.frames} frames alike",
-        ),
+        "nodes": _nodes(scene, given),
     }
+
+
+def _nodes(scene: Scene, given: FastFieldSettings) -> Decision:
+    if not given.deformation_learning_rate:
+        return Decision(0, "no learning rate for them")
+    if scene.frames == 1:
+        return Decision(0, "one frame: it is the canonical body's own form")
+    if scene.cameras == 1:
+        return Decision(0, "one camera does not see where clothes move")
+    return Decision(NODES, f"skinning does not move the clothes of {scene.frames} frames alike")
 
 
 def _steps(scene: Scene, settings: TrainingSettings) -> Decision:

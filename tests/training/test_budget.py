@@ -10,6 +10,7 @@ from hnerf.training.budget import Scene, decide
 from tests.training.scene import record
 
 SCENE = Scene(
+    cameras=4,
     frames=24,
     footprint_m=0.02,
     outside_m=0.035,
@@ -68,9 +69,11 @@ def test_one_pose_teaches_nothing_about_poses():
     assert decisions["fast.pose_width"].reason.endswith("too little to learn from")
 
 
-@pytest.mark.parametrize(("frames", "rate", "nodes"), [(24, 1e-3, 128), (1, 1e-3, 0), (24, 0.0, 0)])
-def test_a_single_frame_does_not_deform_the_body(frames: int, rate: float, nodes: int):
-    scene = SCENE.__class__(**{**vars(SCENE), "frames": frames})
+@pytest.mark.parametrize(
+    ("cameras", "frames", "rate", "nodes"), [(4, 24, 1e-3, 128), (4, 1, 1e-3, 0), (1, 24, 1e-3, 0), (4, 24, 0.0, 0)]
+)
+def test_a_single_frame_or_camera_does_not_deform_the_body(cameras: int, frames: int, rate: float, nodes: int):
+    scene = SCENE.__class__(**{**vars(SCENE), "cameras": cameras, "frames": frames})
     assert decided(scene, fast={"deformation_learning_rate": rate})[0].fast.nodes == nodes
 
 
@@ -80,7 +83,7 @@ def test_a_scene_as_it_is_measured(tmp_path: Path):
     0 and 0.2 rad in the two training frames: 0.1 from their mean."""
     capture, masks, body = record(tmp_path / "capture")
     scene = Scene.of(capture, masks, body)
-    assert scene.frames == 2
+    assert (scene.cameras, scene.frames) == (4, 2)
     assert scene.footprint_m == pytest.approx(0.105, abs=0.003)
     assert scene.outside_m == 0.0
     assert 0.09 < scene.inside_m < 0.2
