@@ -35,20 +35,20 @@ class FrameDeformation(nn.Module):
         """How far the surface next to described points is displaced in the frames of rows `moment` (N,), -1 for none:
         (N, 3), and along its normal (N,); canonical metres."""
         present, own = torch.unique(moment, return_inverse=True)
-        moved = self._of_vertices(present)
-        outwards = (moved * self.normals).sum(-1, keepdim=True)
-        table = torch.cat([moved, outwards], -1).flatten(0, 1)
+        table = self._of_vertices(present).flatten(0, 1)
         found = blended(table, own[:, None] * len(self.shares) + described.corners, described.barycentric)
         return found[:, :3], found[:, 3]
 
     def outwards(self) -> Tensor:
         """How far vertices go along their normals, by frame and in no frame, (frames + 1, V)."""
         rows = torch.arange(len(self.displacement), device=self.displacement.device)
-        return (self._of_vertices(rows) * self.normals).sum(-1)
+        return self._of_vertices(rows)[..., 3]
 
     def _of_vertices(self, rows: Tensor) -> Tensor:
-        """(n, V, 3) of some rows of `displacement`, as one product of matrices."""
-        return (self.shares @ self.displacement[rows].transpose(0, 1).flatten(1)).unflatten(1, (-1, 3)).transpose(0, 1)
+        """Of some rows of `displacement`, and how far that is along the vertices' normals: (n, V, 4)."""
+        every_row = self.displacement[rows].transpose(0, 1).flatten(1)  # (nodes, 3 n), for one product of matrices
+        moved = (self.shares @ every_row).unflatten(1, (-1, 3)).transpose(0, 1)
+        return torch.cat([moved, (moved * self.normals).sum(-1, keepdim=True)], -1)
 
 
 def spread_over(points_m: np.ndarray, count: int) -> list[int]:

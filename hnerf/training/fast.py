@@ -134,7 +134,7 @@ class FastField(Field):
         colour = self._colour(described, pose, weights_from_alpha(alpha.detach()).flatten() > NEGLIGIBLE)
         norms = d.new_zeros(0)
         if draws.probe is not None:
-            norms = self._gradient_norms(described, skin, residual.shape, pose, draws.probe[hit])
+            norms = self._gradient_norms(described, skin, pose, draws.probe[hit])
         elastic = None
         if moved is not None:
             energy = torch.where(described.near, (moved / ELASTIC_M).square().sum(-1), 0.0)
@@ -168,14 +168,11 @@ class FastField(Field):
         seen = self.field.colour(described.y[pick], described.d[pick], described.normal[pick], pose[pick])
         return colour.index_copy(0, pick, seen)
 
-    def _gradient_norms(
-        self, described: Descriptor, skin: Descriptor, shape: torch.Size, pose: Tensor, probe: Tensor
-    ) -> Tensor:
+    def _gradient_norms(self, described: Descriptor, skin: Descriptor, pose: Tensor, probe: Tensor) -> Tensor:
         """|grad d_hat| in the canonical frame at one sample a ray, probe (R,) in [0, 1), by forward differences: the
-        interpolation of a grid has no useful second derivative. shape: rays and samples of a ray; skin: descriptors
-        before the deformation, which say where outwards is. Gradients flow to the field alone."""
-        rays, samples = shape
-        pick = torch.arange(rays, device=probe.device) * samples + (probe * samples).long()
+        interpolation of a grid has no useful second derivative. skin: descriptors before the deformation, which say
+        where outwards is. Gradients flow to the field alone."""
+        pick = torch.arange(len(probe), device=probe.device) * self.samples + (probe * self.samples).long()
         pick = pick[described.near[pick]]
         step_m = self.settings.gradient_step_m
         y, d = described.y[pick].detach(), described.d[pick].detach()

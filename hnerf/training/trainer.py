@@ -139,7 +139,7 @@ class Trainer:
         self._stand(self.stage.bodies)
 
     def _freeze_field(self) -> None:
-        """Novel poses are fitted to the finished field, so that it never sees their pixels."""
+        """What belongs to novel frames is fitted to the finished field, so that it never learns from their pixels."""
         self.field.requires_grad_(False)
         self.objective.correction.shape.requires_grad_(False)
         for parameter in self.field.frame_parameters():

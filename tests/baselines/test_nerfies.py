@@ -22,7 +22,7 @@ from hnerf.training.losses import RaySamples
 from tests.baselines.column import Learned, learn, three_poses
 
 SMALL = [
-    "training.steps=100",
+    "training.steps=140",
     "training.rays_per_frame=96",
     "training.nerfies.samples=12",
     "training.nerfies.width=32",
@@ -167,8 +167,8 @@ def test_overfits_two_frames(learned: Learned) -> None:
 
 
 def test_a_pose_that_no_frame_has_shows_the_template(learned: Learned) -> None:
-    """Upright as it was trained, though asked to bend: 3 dB worse; the surface is the same for two such poses."""
-    assert learned.psnr(2) < min(learned.psnr(frame) for frame in (0, 1)) - 3
+    """Upright as it was trained, though asked to bend: 4 dB worse; the surface is the same for two such poses."""
+    assert learned.psnr(2) < min(learned.psnr(frame) for frame in (0, 1)) - 4
     one, other = torch.zeros(2, 2, 3)
     one[1, 1], other[1, 1] = 0.3, 0.35
     points = torch.rand(500, 3) * torch.tensor([0.8, 0.8, 1.8])
