@@ -21,6 +21,7 @@ from hnerf.body.given_start import given_start, seen_on, told_of
 from hnerf.body.initial_root import root_from_image, root_from_space
 from hnerf.body.keypoint_fit import Likely, Problem, levenberg_marquardt, metres_per_pixel, project
 from hnerf.body.observations import Observations, observe, runs
+from hnerf.body.one_view import Balance, Habit, OneView
 from hnerf.body.pose_prior import PosePrior, Smoothness
 from hnerf.capture.capture import Capture
 from hnerf.config import FitSettings
@@ -53,23 +54,26 @@ def fit_body(capture: Capture, masks: "Masks | None", settings: FitSettings) -> 
         begin = given_start(given, model) if given else None
         seen = observe(capture) if capture.has_keypoints or begin is None else seen_on(begin, capture)
         smoothness = Smoothness(runs(capture), capture.fps, settings.acceleration_mps2 * LIVELINESS)
+        up = "xyz".index(capture.up)
+        one_view = OneView(Balance(up)) if len(seen.cameras) == 1 else None
         with _timed(seconds, "start"):
             pose = begin or start(capture, seen, model)
         if len(seen.cameras) > 1:
             with _timed(seconds, "keypoints in space"):
-                problem = problem_of(model, pose, seen, smoothness, settings, offsets=HELD, proportions=HELD)
+                problem = problem_of(model, pose, seen, smoothness, settings, HELD, HELD)
                 pose = levenberg_marquardt(problem, pose, problem.in_space, KEYPOINT_STEPS)
         with _timed(seconds, "keypoints in images"):
-            problem = problem_of(model, pose, seen, smoothness, settings, offsets=1, proportions=HELD)
+            problem = problem_of(model, pose, seen, smoothness, settings, 1, HELD, one_view)
             pose = levenberg_marquardt(problem, pose, problem.in_images, KEYPOINT_STEPS)
-            if len(seen.cameras) == 1:
-                pose = unflipped(problem, pose, runs(capture))
+            if one_view:
+                one_view = replace(one_view, habit=Habit(runs(capture), seen.cameras[0]))
+                pose = unflipped(replace(problem, one_view=one_view), pose, runs(capture))
         if masks is not None:
             with _timed(seconds, "outlines"):
-                problem = problem_of(model, pose, seen, smoothness, settings, offsets=1, proportions=1)
+                problem = problem_of(model, pose, seen, smoothness, settings, 1, 1, one_view)
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
                 weights = ContourWeights(settings.inside_m, settings.outside_m, settings.clothing_m, settings.spacing_m)
-                pose = refine(problem, pose, edges, weights, "xyz".index(capture.up), settings.contour_steps)
+                pose = refine(problem, pose, edges, weights, up, settings.contour_steps)
         fit = BodyFit(pose.rig.to(dtype=torch.float32), capture.frames, pose.theta.float(), pose.root.float())
         report = _report(capture, masks, seen, pose, fit, seconds)
         return fit, report | ({"given_poses": told_of(model, capture)} if begin else {})
@@ -100,7 +104,8 @@ def start(capture: Capture, seen: Observations, model: BodyModel) -> Pose:
 
 def unflipped(problem: Problem, pose: Pose, follow: list[tuple[int, ...]]) -> Pose:
     """One view shows a bent limb and its mirror image in depth alike; a few frames that fell for the mirror image are
-    outvoted by their neighbours. `follow`: frames in order, by run. The pose as it was where nothing is gained."""
+    outvoted by their neighbours. `follow`: frames in order, by run. Without the vote where nothing is gained."""
+    pose = levenberg_marquardt(problem, pose, problem.in_images, KEYPOINT_STEPS)
     parts = np.split(pose.theta.numpy(), np.cumsum([len(run) for run in follow])[:-1])
     theta = np.concatenate([median_filter(part, (NEIGHBOURS, 1, 1), mode="nearest") for part in parts])
     again = replace(pose, theta=torch.from_numpy(theta))
@@ -111,7 +116,7 @@ def unflipped(problem: Problem, pose: Pose, follow: list[tuple[int, ...]]) -> Po
 
 def problem_of(
     model: BodyModel, pose: Pose, seen: Observations, smoothness: Smoothness, settings: FitSettings, offsets: float,
-    proportions: float,
+    proportions: float, one_view: OneView | None = None,
 ) -> Problem:  # fmt: skip
     """`offsets` and `proportions` scale the spread of the keypoint offsets and of the shape's details."""
     likely = Likely(
@@ -125,7 +130,7 @@ def problem_of(
         model.low,
         model.high,
     )
-    return Problem(seen, metres_per_pixel(seen.cameras, pose), likely, smoothness, model.rig)
+    return Problem(seen, metres_per_pixel(seen.cameras, pose), likely, smoothness, model.rig, one_view)
 
 
 def _outlines(capture: Capture, masks: "Masks", scale_m: Tensor, spacing_m: float) -> list[list[Outline | None]]:

@@ -10,6 +10,7 @@ from torch import Tensor
 from hnerf.body.articulation import Articulation, Points, Pose, with_offsets
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.observations import Observations
+from hnerf.body.one_view import OneView
 from hnerf.body.pose_prior import PosePrior, Smoothness
 from hnerf.body.rig import Rig
 from hnerf.capture.camera import Camera
@@ -40,13 +41,15 @@ Information = tuple[
 @dataclass(frozen=True)
 class Problem:
     """What was seen and what is likely; assembles the normal equations at a pose. Shared unknowns: beta (B,), then the
-    offsets (75,). scale_m (C, n) metres a pixel spans at the person: held fixed, or coming nearer would pay."""
+    offsets (75,). scale_m (C, n) metres a pixel spans at the person: held fixed, or coming nearer would pay. one_view:
+    with one camera only."""
 
     seen: Observations
     scale_m: Tensor
     likely: Likely
     smoothness: Smoothness
     reshape: Callable[[Tensor], Rig]
+    one_view: OneView | None = None
 
     def assemble(self, pose: Pose, inform: Callable[[Tensor], Information]) -> tuple[float, NormalEquations]:
         """Cost and normal equations of the keypoints, as `inform` weighs them, and of all that is likely."""
@@ -67,6 +70,8 @@ class Problem:
         cost += self._add_shape_prior(equations, pose)
         cost += PosePrior(articulation).add(equations, pose)
         cost += self.smoothness.add(equations, x, by_frame)
+        if self.one_view:
+            cost += self.one_view.add(equations, articulation, pose, x, by_frame)
         return cost, equations
 
     def _add_shape_prior(self, equations: NormalEquations, pose: Pose) -> float:
