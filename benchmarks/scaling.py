@@ -3,7 +3,7 @@
 usage: python benchmarks/scaling.py STORE [CAPTURE]
 
 Runs the stages of preset `fast`, training cut to a number of steps, on parts of a shared capture (default valid-wave)
-and on images of other sizes, each in turn, in a new store. Writes `benchmarks/results/scaling.json`,
+and on images of other sizes, each in turn, in a store of its own. Writes `benchmarks/results/scaling.json`,
 `.md` and `.png`; the straight lines of the chart are what a cost in proportion would be.
 """
 
@@ -43,11 +43,12 @@ def main() -> None:
     options = parser.parse_args()
     if options.store.exists():
         parser.error(f"{options.store} exists; name a new folder, so that nothing is found again")
-    shelf = Store(options.store.resolve())
+    folder = options.store.resolve()
+    shelf = Store(folder / "captures")
     source, _ = read_capture(SHARED / "data" / options.capture)
     recording = ingest(shelf, source, load_settings("fast").capture)
     seconds = {
-        axis: {str(amount): measure(shelf, part(shelf, recording, axis, amount)) for amount in amounts}
+        axis: {str(n): measure(Store(folder / f"{axis}-{n}"), part(shelf, recording, axis, n)) for n in amounts}
         for axis, amounts in AXES.items()
     }
     result = provenance() | {"capture": options.capture, "steps": STEPS, "seconds": seconds}

@@ -51,8 +51,9 @@ def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) 
     capture = inputs.capture
     truth = GroundTruth(inputs.capture_folder, capture) if (inputs.capture_folder / "ground_truth").is_dir() else None
     views = {split: some_views(capture, split, settings.max_images) for split in SPLITS}
-    shown = some_views(capture, TRAINING_VIEW, settings.report_rows)
-    image_seconds = render(inputs.avatar, capture, [*itertools.chain(*views.values()), *shown], out)
+    shown = [some_views(capture, split, settings.report_rows) for split in (TRAINING_VIEW, *SPLITS)]
+    wanted = dict.fromkeys(itertools.chain(*views.values(), *shown))
+    image_seconds = render(inputs.avatar, capture, list(wanted), out)
     rendered = time.perf_counter()
     found: dict[str, Any] = {"protocol": PROTOCOL, "lpips": LPIPS, "seconds_per_image": image_seconds}
     found |= {split: score_split(split, views[split], truth, out) for split in SPLITS}

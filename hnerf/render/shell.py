@@ -63,22 +63,30 @@ class ShellGrid:
     ) -> tuple[Tensor, Tensor]:
         """Depths (R, K) in metres, sorted, spread evenly over the shell up to the first solid cell; and (R,) bool:
         whether the ray meets the shell at all. jitter (R, K) in [0, 1): where each sample lies in its stratum."""
+        edges, cumulative = self._march(origins_m, directions, frame)
+        samples = jitter.shape[1]
+        strata = torch.arange(samples, device=edges.device, dtype=edges.dtype)
+        wanted = (strata + jitter) / samples * cumulative[:, -1:]
+        upper = torch.searchsorted(cumulative, wanted.contiguous(), right=True).clamp(1, edges.shape[1] - 1)
+        inside = wanted - cumulative.gather(1, upper - 1)
+        return edges.gather(1, upper - 1) + inside * self.cell_m, cumulative[:, -1] > 0
+
+    def path_m(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
+        """How long the ways are over which `sample_rays` spreads the samples, (R,) metres."""
+        return self.cell_m * self._march(origins_m, directions, frame)[1][:, -1]
+
+    def _march(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
+        """Depths (R, B + 1) of equal steps through the grid, and how many of the steps before each are in the shell and
+        in front of the first solid cell, (R, B + 1)."""
         size_m = self.cell_m * torch.tensor(self.cells.shape[1:], device=origins_m.device)
         near, far = box_interval(origins_m, directions, self.lower_m[frame], self.lower_m[frame] + size_m)
-        bins = max(1, math.ceil(float((far - near).max()) / self.cell_m))
+        bins = max(1, math.ceil(float((far - near).max()) / self.cell_m)) if len(near) else 1
         edges = near[:, None] + self.cell_m * torch.arange(bins + 1, device=near.device)  # whatever the other rays
         middles = (edges[:, 1:] + edges[:, :-1]) / 2
         state = self.look_up(origins_m[:, None] + directions[:, None] * middles[..., None], frame)
         before_solid = (state == SOLID).cumsum(1) == 0
         weight = ((state == SHELL) & before_solid).float()
-        met = weight.any(1)
-        cumulative = torch.cat([torch.zeros_like(near)[:, None], weight.cumsum(1)], 1)
-        samples = jitter.shape[1]
-        strata = torch.arange(samples, device=near.device, dtype=near.dtype)
-        wanted = (strata + jitter) / samples * cumulative[:, -1:]
-        upper = torch.searchsorted(cumulative, wanted.contiguous(), right=True).clamp(1, bins)
-        inside = wanted - cumulative.gather(1, upper - 1)
-        return edges.gather(1, upper - 1) + inside * self.cell_m, met
+        return edges, torch.cat([torch.zeros_like(near)[:, None], weight.cumsum(1)], 1)
 
 
 def lattice(vertices_m: Tensor, faces: Tensor, spacing_m: float) -> tuple[Tensor, Tensor]:

@@ -14,13 +14,15 @@ from hnerf.field.deformation import FrameDeformation
 from hnerf.render.compositing import alpha_from_sdf, weights_from_alpha
 from hnerf.render.shell import ShellGrid, lattice
 from hnerf.training.conditions import Conditions, Draws, pose_inputs
-from hnerf.training.field import Field
+from hnerf.training.field import Field, pixels
 from hnerf.training.losses import RaySamples
 
 SETTLED = 5.0  # where the logistic of density is 1 or 0 within 1 %
 ROOM_M = 0.012  # for what the surface still moves, and what poses that were not asked about do to it
 TIGHTEN_STEP_M = 0.004
 ELASTIC_M = 0.01  # a displacement whose elastic energy is 1
+SPACING_M = 0.012  # at most, between the samples of a rendering; those of training are jittered and fewer
+SAMPLES = (6, 12, 18, 24, 36, 64)  # of which a ray gets the first that is enough
 NEGLIGIBLE = 1e-3  # a sample of less weight gets no colour
 
 
@@ -147,6 +149,27 @@ class FastField(Field):
         colour = everywhere(colour.view(len(hit), depths.shape[1], 3), 0.0)
         samples = RaySamples(alpha, alpha, torch.ones_like(d), colour, None, d, residual, norms, draws.beyond, elastic)
         return samples, depths
+
+    def look(
+        self,
+        bodies: PosedBodies,
+        region: ShellGrid,
+        origins_m: Tensor,
+        directions: Tensor,
+        frame: Tensor,
+        conditions: Conditions,
+    ) -> Tensor:
+        """As `Field.look`, with as many samples as a ray's way through the shell asks for."""
+        needed = region.path_m(origins_m, directions, frame) / SPACING_M
+        seen, fewer = origins_m.new_zeros(len(frame), 5), 0
+        for count in SAMPLES:
+            pick = torch.nonzero((needed > fewer) & ((needed <= count) | (count == SAMPLES[-1])))[:, 0]
+            rays = (origins_m[pick], directions[pick], frame[pick])
+            still = Draws.still(len(pick), count, frame.device)
+            samples, depths = self.sample(bodies, region, *rays, conditions, still)
+            seen[pick] = pixels(weights_from_alpha(samples.alpha), samples.colour, depths)
+            fewer = count
+        return seen
 
     def _deformed(self, described: Descriptor, moment: Tensor) -> tuple[Descriptor, Tensor | None]:
         """Descriptors (N,) on the body as the frames of rows `moment` (N,) deform it, and the displacements (N, 3)."""

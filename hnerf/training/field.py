@@ -3,10 +3,12 @@
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor, nn
 
 from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.rig import Rig
+from hnerf.render.compositing import composite, weights_from_alpha
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.losses import RaySamples
 
@@ -56,6 +58,21 @@ class Field(nn.Module, ABC):
     ) -> tuple[RaySamples, Tensor]:
         """Radiance and distance along rays (R, 3) of body rows (R,); also depths (R, K) in metres."""
 
+    def look(
+        self,
+        bodies: PosedBodies,
+        region: Any,
+        origins_m: Tensor,
+        directions: Tensor,
+        frame: Tensor,
+        conditions: Conditions,
+    ) -> Tensor:
+        """The person alone along rays (R, 3) of body rows (R,), from b alpha (docs/method.md, evaluation): colour over
+        black, coverage, and depth in metres, 0 where nothing is, (R, 5)."""
+        still = Draws.still(len(frame), self.samples, frame.device)
+        samples, depths = self.sample(bodies, region, origins_m, directions, frame, conditions, still)
+        return pixels(weights_from_alpha(samples.in_box * samples.alpha), samples.colour, depths)
+
     @abstractmethod
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """d_hat (N,) metres at points (N, 3) around the first body, negative inside."""
@@ -63,3 +80,11 @@ class Field(nn.Module, ABC):
     @abstractmethod
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """c (N, 3) at points (N, 3) around the first body, seen along directions (N, 3)."""
+
+
+def pixels(weights: Tensor, colour: Tensor, depths: Tensor) -> Tensor:
+    """Colour over black, coverage and mean depth (R, 5) of samples with weights (R, K), colour (R, K, 3) and depths (R,
+    K)."""
+    alpha = weights.sum(1, keepdim=True)
+    depth = (weights * depths).sum(1, keepdim=True) / alpha.clamp(min=1e-6)
+    return torch.cat([composite(weights, colour), alpha, depth * (alpha > 0)], 1)

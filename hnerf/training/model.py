@@ -22,8 +22,7 @@ from hnerf.capture.camera import Camera
 from hnerf.config import TrainingSettings
 from hnerf.errors import CaptureError
 from hnerf.render.avatar import Rendering
-from hnerf.render.compositing import composite, weights_from_alpha
-from hnerf.training.conditions import Conditions, Draws
+from hnerf.training.conditions import Conditions
 from hnerf.training.fast import FastField
 from hnerf.training.field import Field
 from hnerf.training.paper import PaperField
@@ -62,7 +61,7 @@ class TrainedAvatar:
 
     @torch.no_grad()
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
-        """Colour, coverage and depth of the person alone, from b alpha (docs/method.md, evaluation)."""
+        """Colour, coverage and depth of the person alone."""
         bodies, conditions = self._pose(theta, root)
         region: Any = self.field.region(bodies)
         device = bodies.vertices_m.device
@@ -74,12 +73,7 @@ class TrainedAvatar:
             part = slice(start, start + RAYS_AT_ONCE)
             o, d = (torch.from_numpy(np.ascontiguousarray(a[part])).float().to(device) for a in (origins, directions))
             row = torch.zeros(len(o), dtype=torch.long, device=device)
-            still = Draws.still(len(o), self.field.samples, device)
-            samples, depths = self.field.sample(bodies, region, o, d, row, conditions, still)
-            weights = weights_from_alpha(samples.in_box * samples.alpha)
-            alpha = weights.sum(1, keepdim=True)
-            depth = (weights * depths).sum(1, keepdim=True) / alpha.clamp(min=1e-6)
-            flat[index[part]] = torch.cat([composite(weights, samples.colour), alpha, depth * (alpha > 0)], 1)
+            flat[index[part]] = self.field.look(bodies, region, o, d, row, conditions)
         image = flat.view(camera.height_px, camera.width_px, 5)
         return Rendering(image[..., :3].clamp(0, 1), image[..., 3], image[..., 4])
 

@@ -77,6 +77,16 @@ def test_image_figures_by_hand(scored: Scored) -> None:
     assert found == json.loads((base / "subject" / "evaluation" / "metrics.json").read_text())
 
 
+def test_the_report_may_show_more_images_than_are_scored(tmp_path: Path) -> None:
+    capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
+    write_ball_truth(capture, RADIUS_M)
+    out = tmp_path / "evaluation"
+    out.mkdir()
+    settings = EvaluationSettings(max_images=1, max_meshes=1, report_rows=3)
+    found = evaluate(ball_inputs(capture, tmp_path / "stages"), settings, out)
+    assert found["novel_view"]["n"] == 1 and (out / "report.html").is_file()
+
+
 def test_geometry_figures_by_hand(scored: Scored) -> None:
     geometry = scored[1]["novel_view"]["geometry"]
     assert geometry["chamfer_mm"] == pytest.approx(1e3 * GAP_M, rel=0.01)

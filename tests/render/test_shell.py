@@ -55,12 +55,11 @@ def test_samples_lie_in_the_shell_before_the_solid():
     """Through the middle of a sphere of 0.3 m from 1 m away: entered 5 cm before the surface, left at the solid
     core."""
     grid = even_shell(sphere(0.3), outer_m=0.05, inner_m=0.04, cell_m=0.01)
-    depths, met = grid.sample_rays(
-        torch.tensor([[-1.0, 0.0, 0.0], [-1.0, 0.6, 0.0]]),
-        torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
-        torch.zeros(2, dtype=torch.long),
-        torch.full((2, 16), 0.5),
-    )
+    origins_m, directions = torch.tensor([[-1.0, 0.0, 0.0], [-1.0, 0.6, 0.0]]), torch.eye(3)[[0, 0]]
+    rays = (origins_m, directions, torch.zeros(2, dtype=torch.long))
+    depths, met = grid.sample_rays(*rays, torch.full((2, 16), 0.5))
+    path_m = grid.path_m(*rays)
+    assert path_m[0].item() == pytest.approx(0.09, abs=0.03) and path_m[1] == 0
     assert met.tolist() == [True, False]
     assert (depths[0].diff() > 0).all()
     assert depths[0, 0].item() == pytest.approx(0.65, abs=0.03)

@@ -6,7 +6,8 @@ import torch
 from hnerf.body.canonical import PosedBodies
 from hnerf.config import FastFieldSettings
 from hnerf.training.conditions import Conditions, Draws
-from hnerf.training.fast import ROOM_M, SETTLED, TIGHTEN_STEP_M, FastField
+from hnerf.training.fast import ROOM_M, SAMPLES, SETTLED, SPACING_M, TIGHTEN_STEP_M, FastField
+from hnerf.training.field import Field
 from tests.body.boxes import box_rig
 
 RIG = box_rig(splits=3)
@@ -84,3 +85,18 @@ def test_rays_that_miss_the_shell_see_nothing_and_change_nothing():
     assert not sampled([1])[0].any()
     for all_three, alone in zip((alpha, colour, d, residual), sampled([0, 2]), strict=True):
         torch.testing.assert_close(all_three[[0, 2]], alone, atol=1e-6, rtol=0)
+
+
+def test_a_picture_with_as_many_samples_as_the_way_asks_for_is_that_of_many():
+    """Straight and slanted rays, whose ways through the shell differ, and one that misses; beside 32 samples each."""
+    bodies, conditions = standing()
+    field = field_of(200.0)
+    origins = torch.tensor([[0.5, 0.4, 3.0], [0.02, 0.9, 3.0], [0.5, 0.1, 3.0], [2.0, 0.5, 3.0]])
+    directions = torch.tensor([[0.0, 0.0, -1.0], [0.0, -0.02, -1.0], [0.05, 0.1, -1.0], [0.0, 0.0, -1.0]])
+    directions = torch.nn.functional.normalize(directions, dim=-1)
+    rays = (bodies, field.region(bodies), origins, directions, torch.zeros(4, dtype=torch.long), conditions)
+    needed = field.region(bodies).path_m(*rays[2:5]) / SPACING_M
+    assert len({sum(float(n) > count for count in SAMPLES) for n in needed}) >= 3
+    found, expected = field.look(*rays), Field.look(field, *rays)
+    torch.testing.assert_close(found, expected, atol=0.02, rtol=0)
+    assert (found[:3, 3] > 0.5).all() and not found[3].any()
