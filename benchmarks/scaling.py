@@ -45,13 +45,14 @@ def main() -> None:
         parser.error(f"{options.store} exists; name a new folder, so that nothing is found again")
     folder = options.store.resolve()
     shelf = Store(folder / "captures")
+    where = provenance()
     source, _ = read_capture(SHARED / "data" / options.capture)
     recording = ingest(shelf, source, load_settings("fast").capture)
     seconds = {
         axis: {str(n): measure(Store(folder / f"{axis}-{n}"), part(shelf, recording, axis, n)) for n in amounts}
         for axis, amounts in AXES.items()
     }
-    result = provenance() | {"capture": options.capture, "steps": STEPS, "seconds": seconds}
+    result = where | {"capture": options.capture, "steps": STEPS, "seconds": seconds}
     lines = [f"# Cost against frames, cameras and pixels: {options.capture}", "", sentence(result), ""]
     lines += [f"Seconds of a stage; training is {STEPS} steps and what comes before and after them.", ""]
     for axis, rows in seconds.items():

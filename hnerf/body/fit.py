@@ -66,7 +66,7 @@ def fit_body(capture: Capture, masks: "Masks | None", settings: FitSettings) -> 
             problem = problem_of(model, pose, seen, smoothness, settings, 1, HELD, one_view)
             pose = levenberg_marquardt(problem, pose, problem.in_images, KEYPOINT_STEPS)
             if one_view:
-                one_view = replace(one_view, habit=Habit(runs(capture), seen.cameras[0]))
+                one_view = replace(one_view, habit=Habit(_by_split(capture), pose, seen.cameras[0]))
                 pose = unflipped(replace(problem, one_view=one_view), pose, runs(capture))
         if masks is not None:
             with _timed(seconds, "outlines"):
@@ -131,6 +131,13 @@ def problem_of(
         model.high,
     )
     return Problem(seen, metres_per_pixel(seen.cameras, pose), likely, smoothness, model.rig, one_view)
+
+
+def _by_split(capture: Capture) -> list[list[int]]:
+    """Rows of the training frames, and of those of novel poses."""
+    novel = set(capture.novel_pose_frames)
+    rows = [[t for t, frame in enumerate(capture.frames) if (frame in novel) == wanted] for wanted in (False, True)]
+    return [group for group in rows if group]
 
 
 def _outlines(capture: Capture, masks: "Masks", scale_m: Tensor, spacing_m: float) -> list[list[Outline | None]]:

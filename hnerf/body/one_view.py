@@ -19,16 +19,17 @@ BALANCE_M = 0.05
 HABIT_DEG = 7.0
 BALANCE_FADES, HABIT_FADES = 3.0, 2.0  # standard deviations from which the pull fades: a step, another posture
 
-# Shares of the body's mass (Winter 2009, table 4.1), each segment's half at either end: BODY_25 keypoint and share.
+# Shares of the body's mass (Winter 2009, table 4.1), half at either end of a segment, arms at the elbows: BODY_25
+# keypoint and share.
 TRUNK = {1: 0.289, 8: 0.289}  # head and trunk: neck and middle of the hips
 ARMS = {3: 0.05, 6: 0.05}  # elbows
 THIGHS = {9: 0.05, 12: 0.05, 10: 0.05, 13: 0.05}  # hips and knees
 SHANKS = {10: 0.0305, 13: 0.0305, 11: 0.0305, 14: 0.0305}  # knees and ankles, with the feet
-SUPPORT = {19: 0.25, 21: 0.25, 22: 0.25, 24: 0.25}  # big toes and heels
+SUPPORT = {11: 0.5, 14: 0.5}  # ankles: where keypoints put the trunk's middle line, it stands above them
 
 
 def centre_of_mass_over_feet() -> Tensor:
-    """Coefficients (25,) of the keypoints, which sum to 0: the centre of mass less the middle of the feet."""
+    """Coefficients (25,) of the keypoints, which sum to 0: the centre of mass less the middle of the ankles."""
     shares = torch.zeros(25, dtype=torch.float64)
     for segment in (TRUNK, ARMS, THIGHS, SHANKS):
         for keypoint, share in segment.items():
@@ -40,7 +41,7 @@ def centre_of_mass_over_feet() -> Tensor:
 
 
 class Balance:
-    """The centre of mass is above the middle of the feet, give or take 5 cm either way, except when it is not:
+    """The centre of mass is above the middle of the ankles, give or take 5 cm either way, except when it is not:
     Geman-McClure lets a step or a jump go."""
 
     def __init__(self, up: int) -> None:
@@ -62,34 +63,38 @@ class Balance:
 
 
 class Habit:
-    """A joint is likely to be turned as it mostly is: by 7 degrees about its median over a run of frames, and
-    Geman-McClure lets another posture go. It counts as far as the camera sees the body from all sides in that run, as
-    only then the median is known in depth: by 1 - |mean of the directions to the camera, seen from the body|."""
+    """A joint is likely to be turned as it mostly is: by 7 degrees about its median over a group of frames, and
+    Geman-McClure lets another posture go. It counts as far as the camera sees the body from all sides in that group, as
+    only then the median is known in depth."""
 
-    def __init__(self, runs: list[tuple[int, ...]], camera: Camera) -> None:
-        self.lengths = [len(run) for run in runs]
-        self.centre_m = torch.from_numpy(camera.centre_m)
+    def __init__(self, groups: list[list[int]], pose: Pose, camera: Camera) -> None:
+        """groups: the frames' rows, each in one of them; pose: as far as it is known, to tell how the body turns."""
+        self.groups = groups
+        self.trust = torch.zeros(len(pose.root), dtype=pose.root.dtype)
+        for rows in groups:
+            self.trust[rows] = turning(pose.root[rows], camera)
 
     def add(self, equations: NormalEquations, articulation: Articulation, pose: Pose) -> float:
         """Returns the cost. The median's own derivative is left out."""
         turns = pose.theta[:, articulation.joints[1:]]  # (n, M - 1, 3)
-        parts = turns.split(self.lengths)
-        off = turns - torch.cat([part.median(0, keepdim=True).values.expand_as(part) for part in parts])
-        trust = self.turning(pose)
-        squared = off.square().sum(-1) * trust[:, None]
-        weight, cost = faded(squared, math.radians(HABIT_DEG), HABIT_FADES)
-        weight = weight * trust[:, None]
+        usual = torch.zeros_like(turns)
+        for rows in self.groups:
+            usual[rows] = turns[rows].quantile(0.5, dim=0)
+        off, trust = turns - usual, self.trust[:, None]
+        weight, cost = faded(off.square().sum(-1) * trust, math.radians(HABIT_DEG), HABIT_FADES)
+        weight = weight * trust
         equations.frame_gradient[:, 6:] += (weight[..., None] * off).flatten(1).numpy()
         at = np.arange(6, articulation.unknowns)
         equations.frame[0][:, at, at] += weight.repeat_interleave(3, 1).numpy()
         return cost
 
-    def turning(self, pose: Pose) -> Tensor:
-        """How far the body turns in the run of each frame, (n,): 0 where it faces the camera in one way, 1 where from
-        all sides alike."""
-        towards = pose.root[:, :3, :3].mT @ (self.centre_m - pose.root[:, :3, 3])[..., None]
-        views = torch.nn.functional.normalize(towards[..., 0], dim=-1).split(self.lengths)
-        return torch.cat([(1 - view.mean(0).norm()).expand(len(view)) for view in views])
+
+def turning(root: Tensor, camera: Camera) -> float:
+    """How far a body turns before a camera, roots (n, 4, 4): 0 if it faces the camera in one way, 1 if from all sides
+    alike. That is 1 - |mean of the unit directions to the camera|, level, as seen from the body."""
+    towards = root[:, :3, :3].mT @ (torch.from_numpy(camera.centre_m) - root[:, :3, 3])[..., None]
+    level = torch.nn.functional.normalize(towards[:, :2, 0], dim=-1)
+    return float(1 - level.mean(0).norm())
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ class ShellGrid:
         in front of the first solid cell, (R, B + 1)."""
         size_m = self.cell_m * torch.tensor(self.cells.shape[1:], device=origins_m.device)
         near, far = box_interval(origins_m, directions, self.lower_m[frame], self.lower_m[frame] + size_m)
-        bins = max(1, math.ceil(float((far - near).max()) / self.cell_m)) if len(near) else 1
+        bins = max(1, math.ceil(float((far - near).max()) / self.cell_m))
         edges = near[:, None] + self.cell_m * torch.arange(bins + 1, device=near.device)  # whatever the other rays
         middles = (edges[:, 1:] + edges[:, :-1]) / 2
         state = self.look_up(origins_m[:, None] + directions[:, None] * middles[..., None], frame)

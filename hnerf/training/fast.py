@@ -21,8 +21,8 @@ SETTLED = 5.0  # where the logistic of density is 1 or 0 within 1 %
 ROOM_M = 0.012  # for what the surface still moves, and what poses that were not asked about do to it
 TIGHTEN_STEP_M = 0.004
 ELASTIC_M = 0.01  # a displacement whose elastic energy is 1
-SPACING_M = 0.012  # at most, between the samples of a rendering; those of training are jittered and fewer
-SAMPLES = (6, 12, 18, 24, 36, 64)  # of which a ray gets the first that is enough
+SPACING_M = 0.012  # between the samples of a rendering; twice as many gain 0.05 dB on valid-wave for twice the time
+SAMPLES = (6, 12, 18, 24, 36, 64)  # of which a ray gets the first that is enough, or the last
 NEGLIGIBLE = 1e-3  # a sample of less weight gets no colour
 
 
@@ -164,11 +164,12 @@ class FastField(Field):
         seen, fewer = origins_m.new_zeros(len(frame), 5), 0
         for count in SAMPLES:
             pick = torch.nonzero((needed > fewer) & ((needed <= count) | (count == SAMPLES[-1])))[:, 0]
-            rays = (origins_m[pick], directions[pick], frame[pick])
-            still = Draws.still(len(pick), count, frame.device)
-            samples, depths = self.sample(bodies, region, *rays, conditions, still)
-            seen[pick] = pixels(weights_from_alpha(samples.alpha), samples.colour, depths)
             fewer = count
+            if len(pick):
+                rays = (origins_m[pick], directions[pick], frame[pick])
+                still = Draws.still(len(pick), count, frame.device)
+                samples, depths = self.sample(bodies, region, *rays, conditions, still)
+                seen[pick] = pixels(weights_from_alpha(samples.alpha), samples.colour, depths)
         return seen
 
     def _deformed(self, described: Descriptor, moment: Tensor) -> tuple[Descriptor, Tensor | None]:
