@@ -60,17 +60,21 @@ def fit_body(capture: Capture, masks: "Masks | None", settings: FitSettings) -> 
             pose = begin or start(capture, seen, model)
         if len(seen.cameras) > 1:
             with _timed(seconds, "keypoints in space"):
-                problem = problem_of(model, pose, seen, smoothness, settings, HELD, HELD)
+                problem = problem_of(model, pose, seen, smoothness, settings, offsets=HELD, proportions=HELD)
                 pose = levenberg_marquardt(problem, pose, problem.in_space, KEYPOINT_STEPS)
         with _timed(seconds, "keypoints in images"):
-            problem = problem_of(model, pose, seen, smoothness, settings, 1, HELD, one_view)
+            problem = problem_of(
+                model, pose, seen, smoothness, settings, offsets=1, proportions=HELD, one_view=one_view
+            )
             pose = levenberg_marquardt(problem, pose, problem.in_images, KEYPOINT_STEPS)
             if one_view:
                 one_view = replace(one_view, habit=Habit(_by_split(capture), pose, seen.cameras[0]))
                 pose = unflipped(replace(problem, one_view=one_view), pose, runs(capture))
         if masks is not None:
             with _timed(seconds, "outlines"):
-                problem = problem_of(model, pose, seen, smoothness, settings, 1, 1, one_view)
+                problem = problem_of(
+                    model, pose, seen, smoothness, settings, offsets=1, proportions=1, one_view=one_view
+                )
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
                 weights = ContourWeights(settings.inside_m, settings.outside_m, settings.clothing_m, settings.spacing_m)
                 pose = refine(problem, pose, edges, weights, up, settings.contour_steps)

@@ -14,7 +14,7 @@ from hnerf.field.deformation import FrameDeformation
 from hnerf.render.compositing import alpha_from_sdf, weights_from_alpha
 from hnerf.render.shell import ShellGrid, lattice
 from hnerf.training.conditions import Conditions, Draws, pose_inputs
-from hnerf.training.field import Field, pixels
+from hnerf.training.field import Field
 from hnerf.training.losses import RaySamples
 
 SETTLED = 5.0  # where the logistic of density is 1 or 0 within 1 %
@@ -150,27 +150,12 @@ class FastField(Field):
         samples = RaySamples(alpha, alpha, torch.ones_like(d), colour, None, d, residual, norms, draws.beyond, elastic)
         return samples, depths
 
-    def look(
-        self,
-        bodies: PosedBodies,
-        region: ShellGrid,
-        origins_m: Tensor,
-        directions: Tensor,
-        frame: Tensor,
-        conditions: Conditions,
-    ) -> Tensor:
-        """As `Field.look`, with as many samples as a ray's way through the shell asks for."""
+    def samples_needed(self, region: ShellGrid, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
+        """As many as a ray's way through the shell asks for."""
         needed = region.path_m(origins_m, directions, frame) / SPACING_M
-        seen, fewer = origins_m.new_zeros(len(frame), 5), 0
-        for count in SAMPLES:
-            pick = torch.nonzero((needed > fewer) & ((needed <= count) | (count == SAMPLES[-1])))[:, 0]
-            fewer = count
-            if len(pick):
-                rays = (origins_m[pick], directions[pick], frame[pick])
-                still = Draws.still(len(pick), count, frame.device)
-                samples, depths = self.sample(bodies, region, *rays, conditions, still)
-                seen[pick] = pixels(weights_from_alpha(samples.alpha), samples.colour, depths)
-        return seen
+        steps = torch.tensor(SAMPLES, device=frame.device)
+        enough = torch.searchsorted(steps.to(needed), needed).clamp(max=len(SAMPLES) - 1)
+        return torch.where(needed > 0, steps[enough], 0)
 
     def _deformed(self, described: Descriptor, moment: Tensor) -> tuple[Descriptor, Tensor | None]:
         """Descriptors (N,) on the body as the frames of rows `moment` (N,) deform it, and the displacements (N, 3)."""

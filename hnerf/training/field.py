@@ -58,6 +58,11 @@ class Field(nn.Module, ABC):
     ) -> tuple[RaySamples, Tensor]:
         """Radiance and distance along rays (R, 3) of body rows (R,); also depths (R, K) in metres."""
 
+    def samples_needed(self, region: Any, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
+        """How many samples a rendering takes along rays (R, 3) of body rows (R,): (R,) long, 0 where nothing can be
+        seen."""
+        return torch.full((len(frame),), self.samples, device=frame.device)
+
     def look(
         self,
         bodies: PosedBodies,
@@ -69,9 +74,18 @@ class Field(nn.Module, ABC):
     ) -> Tensor:
         """The person alone along rays (R, 3) of body rows (R,), from b alpha (docs/method.md, evaluation): colour over
         black, coverage, and depth in metres, 0 where nothing is, (R, 5)."""
-        still = Draws.still(len(frame), self.samples, frame.device)
-        samples, depths = self.sample(bodies, region, origins_m, directions, frame, conditions, still)
-        return pixels(weights_from_alpha(samples.in_box * samples.alpha), samples.colour, depths)
+        needed = self.samples_needed(region, origins_m, directions, frame)
+        seen = origins_m.new_zeros(len(frame), 5)
+        for count in needed[needed > 0].unique().tolist():
+            pick = torch.nonzero(needed == count)[:, 0]
+            rays = (origins_m[pick], directions[pick], frame[pick])
+            still = Draws.still(len(pick), count, frame.device)
+            samples, depths = self.sample(bodies, region, *rays, conditions, still)
+            weights = weights_from_alpha(samples.in_box * samples.alpha)
+            alpha = weights.sum(1, keepdim=True)
+            depth = (weights * depths).sum(1, keepdim=True) / alpha.clamp(min=1e-6)
+            seen[pick] = torch.cat([composite(weights, samples.colour), alpha, depth * (alpha > 0)], 1)
+        return seen
 
     @abstractmethod
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
@@ -80,11 +94,3 @@ class Field(nn.Module, ABC):
     @abstractmethod
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """c (N, 3) at points (N, 3) around the first body, seen along directions (N, 3)."""
-
-
-def pixels(weights: Tensor, colour: Tensor, depths: Tensor) -> Tensor:
-    """Colour over black, coverage and mean depth (R, 5) of samples with weights (R, K), colour (R, K, 3) and depths (R,
-    K)."""
-    alpha = weights.sum(1, keepdim=True)
-    depth = (weights * depths).sum(1, keepdim=True) / alpha.clamp(min=1e-6)
-    return torch.cat([composite(weights, colour), alpha, depth * (alpha > 0)], 1)
