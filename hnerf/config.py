@@ -77,7 +77,7 @@ class FastFieldSettings(Section):
 
     outer_m: float = Field(default=0.0, ge=0)  # the shell's thickness outside the body
     inner_m: float = Field(default=0.0, ge=0)  # and inside
-    shell_cell_m: float = Field(default=0.02, gt=0)
+    shell_cell_m: float = Field(default=0.015, gt=0)
     samples: int = Field(default=0, ge=0)
     geometry_cells: tuple[int, ...] = ()  # on the box's longest side, a level each
     colour_cells: tuple[int, ...] = ()

@@ -10,6 +10,7 @@ from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.render.compositing import alpha_from_density
 from hnerf.render.shell import box_interval
+from hnerf.training.conditions import Conditions
 from hnerf.training.field import Field
 
 SURFACE_DENSITY_PER_M = 20.0  # sigma_h of H-NeRF, 50 per scene unit of 2.5 m: where a surface is read off
@@ -63,7 +64,7 @@ class BoxField(Field):
         """The box of each body."""
         return Boxes.around(bodies.vertices_m, self.box_margin_m)
 
-    def region(self, bodies: PosedBodies) -> Any:
+    def region(self, bodies: PosedBodies, conditions: Conditions) -> Any:
         """The boxes."""
         return self.box(bodies)
 

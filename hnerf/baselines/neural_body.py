@@ -107,7 +107,7 @@ class NeuralBodyField(DynamicField):
             nn.Linear(width + settings.appearance_width + encoded, width), nn.SiLU(), nn.Linear(width, 3), nn.Sigmoid()
         )
 
-    def region(self, bodies: PosedBodies) -> Surroundings:
+    def region(self, bodies: PosedBodies, conditions: Conditions) -> Surroundings:
         """Box and voxels of each body; where the field no longer learns, what the convolutions make of them."""
         local_m = _into_root(bodies.vertices_m, bodies.root)
         voxels = [Voxels.around(points_m, self.settings.voxel_m, LEVELS) for points_m in local_m]
@@ -160,7 +160,7 @@ class NeuralBodyField(DynamicField):
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """Of the surface of density sigma_h (NerfField's) around the first body; the box cuts and closes it."""
-        region = self.region(bodies)
+        region = self.region(bodies, conditions)
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         density = self._density(self.trunk(self._features(region, points_m, row)))
         return torch.maximum(self.read_off(density), region.box.signed_distance(points_m))
@@ -168,7 +168,7 @@ class NeuralBodyField(DynamicField):
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """c (N, 3) at points around the first body seen along directions (N, 3)."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
-        features = self.trunk(self._features(self.region(bodies), points_m, row))
+        features = self.trunk(self._features(self.region(bodies, conditions), points_m, row))
         return self._colour(features, points_m, directions, row, conditions)
 
 

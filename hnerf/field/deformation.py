@@ -39,10 +39,10 @@ class FrameDeformation(nn.Module):
         found = blended(table, own[:, None] * len(self.shares) + described.corners, described.barycentric)
         return found[:, :3], found[:, 3]
 
-    def outwards(self) -> Tensor:
-        """How far vertices go along their normals, by frame and in no frame, (frames + 1, V)."""
-        rows = torch.arange(len(self.displacement), device=self.displacement.device)
-        return self._of_vertices(rows)[..., 3]
+    @torch.no_grad()
+    def outwards(self, moment: Tensor) -> Tensor:
+        """How far vertices go along their normals in the frames of rows `moment` (n,), -1 for none, (n, V)."""
+        return self._of_vertices(moment)[..., 3]
 
     def _of_vertices(self, rows: Tensor) -> Tensor:
         """Of some rows of `displacement`, and how far that is along the vertices' normals: (n, V, 4)."""

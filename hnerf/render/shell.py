@@ -2,7 +2,9 @@
 alone."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -10,6 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 EMPTY, SHELL, SOLID = 0, 1, 2
+SLACK = 3**0.5 / 2  # half a diagonal of a cell, in cells
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,7 @@ class ShellGrid:
     @staticmethod
     def around(surfaces_m: Tensor, outer_m: Tensor, inner_m: Tensor, cell_m: float) -> "ShellGrid":
         """The shell around closed surfaces, from dense points on them (n, V, 3) with the shell's own thickness outside
-        and inside at each point, (V,) metres.
+        and inside at each point, (n, V) metres.
 
         Distances are between the centres of cells, half a diagonal is added to them: the shell is up to a cell thicker
         than asked, seldom thinner. A cell takes the greatest thickness in the neighbourhood of its nearest point.
@@ -32,61 +35,53 @@ class ShellGrid:
         margin_m = float(outer_m.max()) + 2 * cell_m
         lower = surfaces_m.amin(1) - margin_m
         size = ((surfaces_m.amax(1) + margin_m - lower).amax(0) / cell_m).ceil().int().tolist()
-        index = ((surfaces_m - lower[:, None]) / cell_m).long().cpu().numpy()
-        slack_m = cell_m * 3**0.5 / 2
-        grids = []
-        for frame in index:
-            at = tuple(frame.T)
-            surface = np.zeros(size, bool)
-            surface[at] = True
-            nearest = ndimage.distance_transform_edt(~surface, return_distances=False, return_indices=True)
-            distance_m = cell_m * np.linalg.norm(nearest - np.indices(size), axis=0)
-            outer, inner = (_greatest_nearby(size, at, t.cpu().numpy())[tuple(nearest)] for t in (outer_m, inner_m))
-            inside = ndimage.binary_fill_holes(distance_m <= cell_m)  # a cell thicker, so that no gap lets it leak
-            cells = np.where(inside | (distance_m <= outer + slack_m), SHELL, EMPTY)
-            cells[inside & (distance_m > inner + slack_m)] = SOLID
-            grids.append(torch.from_numpy(cells.astype(np.uint8)))
-        return ShellGrid(torch.stack(grids).to(surfaces_m.device), lower, cell_m)
+        index = ((surfaces_m - lower[:, None]) / cell_m).long()
+        by_frame = (t.cpu().numpy() for t in (index, outer_m / cell_m, inner_m / cell_m))
+        with ThreadPoolExecutor(torch.get_num_threads()) as threads:
+            cells = list(threads.map(partial(_cells_around, size), *by_frame))
+        return ShellGrid(torch.from_numpy(np.stack(cells)).to(surfaces_m.device), lower, cell_m)
 
-    def look_up(self, points_m: Tensor, frame: Tensor) -> Tensor:
-        """State of the cell around world points (R, K, 3) in frames (R,): (R, K) uint8, EMPTY outside the grid."""
-        x_cells, y_cells, z_cells = self.cells.shape[1:]
-        index = ((points_m - self.lower_m[frame][:, None]) / self.cell_m).floor().long()
-        limit = torch.tensor([x_cells, y_cells, z_cells], device=index.device)
-        outside = ((index < 0) | (index >= limit)).any(-1)
-        x, y, z = index.clamp(min=0).minimum(limit - 1).unbind(-1)
-        flat = ((frame[:, None] * x_cells + x) * y_cells + y) * z_cells + z
-        return self.cells.flatten()[flat].masked_fill(outside, EMPTY)
+    def look_up(self, origins_m: Tensor, directions: Tensor, depths_m: Tensor, frame: Tensor) -> Tensor:
+        """State of the cells at depths (R, K) along rays (R, 3) in frames (R,): (R, K) uint8. Beyond the grid it is
+        that of its outermost cells, which are EMPTY."""
+        origins, directions = (origins_m - self.lower_m[frame]) / self.cell_m, directions / self.cell_m
+        flat = frame[:, None].int()
+        for axis, size in enumerate(self.cells.shape[1:]):
+            index = torch.addcmul(origins[:, axis, None], directions[:, axis, None], depths_m)
+            flat = flat * size + index.clamp_(0, size - 1).int()
+        return self.cells.flatten().index_select(0, flat.flatten()).view_as(flat)
 
     def sample_rays(
         self, origins_m: Tensor, directions: Tensor, frame: Tensor, jitter: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Depths (R, K) in metres, sorted, spread evenly over the shell up to the first solid cell; and (R,) bool:
-        whether the ray meets the shell at all. jitter (R, K) in [0, 1): where each sample lies in its stratum."""
-        edges, cumulative = self._march(origins_m, directions, frame)
+        whether the ray meets the shell at all, and whether a solid cell ends it. jitter (R, K) in [0, 1): where each
+        sample lies in its stratum."""
+        edges, cumulative, ends = self._march(origins_m, directions, frame)
         samples = jitter.shape[1]
         strata = torch.arange(samples, device=edges.device, dtype=edges.dtype)
         wanted = (strata + jitter) / samples * cumulative[:, -1:]
         upper = torch.searchsorted(cumulative, wanted.contiguous(), right=True).clamp(1, edges.shape[1] - 1)
         inside = wanted - cumulative.gather(1, upper - 1)
-        return edges.gather(1, upper - 1) + inside * self.cell_m, cumulative[:, -1] > 0
+        return edges.gather(1, upper - 1) + inside * self.cell_m, cumulative[:, -1] > 0, ends
 
     def path_m(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
         """How long the ways are over which `sample_rays` spreads the samples, (R,) metres."""
         return self.cell_m * self._march(origins_m, directions, frame)[1][:, -1]
 
-    def _march(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
-        """Depths (R, B + 1) of equal steps through the grid, and how many of the steps before each are in the shell and
-        in front of the first solid cell, (R, B + 1)."""
+    def _march(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Depths (R, B + 1) of equal steps through the grid, how many of the steps before each are in the shell and in
+        front of the first solid cell, (R, B + 1), and whether there is a solid cell, (R,) bool."""
         size_m = self.cell_m * torch.tensor(self.cells.shape[1:], device=origins_m.device)
         near, far = box_interval(origins_m, directions, self.lower_m[frame], self.lower_m[frame] + size_m)
         bins = max(1, math.ceil(float((far - near).max()) / self.cell_m))
         edges = near[:, None] + self.cell_m * torch.arange(bins + 1, device=near.device)  # whatever the other rays
         middles = (edges[:, 1:] + edges[:, :-1]) / 2
-        state = self.look_up(origins_m[:, None] + directions[:, None] * middles[..., None], frame)
-        before_solid = (state == SOLID).cumsum(1) == 0
-        weight = ((state == SHELL) & before_solid).float()
-        return edges, torch.cat([torch.zeros_like(near)[:, None], weight.cumsum(1)], 1)
+        state = self.look_up(origins_m, directions, middles, frame)
+        reached = state.cummax(1).values  # EMPTY < SHELL < SOLID
+        weight = ((state == SHELL) & (reached < SOLID)).float()
+        cumulative = torch.cat([torch.zeros_like(near)[:, None], weight.cumsum(1)], 1)
+        return edges, cumulative, reached[:, -1] == SOLID
 
 
 def lattice(vertices_m: Tensor, faces: Tensor, spacing_m: float) -> tuple[Tensor, Tensor]:
@@ -104,6 +99,23 @@ def lattice(vertices_m: Tensor, faces: Tensor, spacing_m: float) -> tuple[Tensor
         corners.append(split.repeat_interleave(len(inside), 0))
         weights.append(inside.repeat(len(split), 1))
     return torch.cat(corners), torch.cat(weights)
+
+
+def _cells_around(size: list[int], points: np.ndarray, outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
+    """States of a frame's cells around points in cells (V, 3) with thicknesses (V,), all in cells."""
+    at = tuple(points.T)
+    surface = np.zeros(size, bool)
+    surface[at] = True
+    distance, nearest = ndimage.distance_transform_edt(~surface, return_indices=True)
+    away, _ = ndimage.label(distance > 1)  # a cell thicker, so that no gap lets it leak
+    inside = away != away[0, 0, 0]
+    cells = np.where(inside, np.uint8(SOLID), np.uint8(EMPTY))
+    band = np.nonzero(distance <= max(outer.max(), inner.max()) + SLACK)
+    next_to = tuple(nearest[:, *band])
+    outer, inner = (_greatest_nearby(size, at, thickness)[next_to] for thickness in (outer, inner))
+    within = distance[band] <= np.where(inside[band], inner, outer) + SLACK
+    cells[tuple(axis[within] for axis in band)] = SHELL
+    return cells
 
 
 def _greatest_nearby(size: list[int], at: tuple[np.ndarray, ...], values: np.ndarray) -> np.ndarray:

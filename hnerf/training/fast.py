@@ -67,16 +67,21 @@ class FastField(Field):
         """How far from the body a sample can lie: the shell and the slack of its cells."""
         return self.settings.outer_m + 2 * self.settings.shell_cell_m
 
-    def region(self, bodies: PosedBodies) -> ShellGrid:
-        """Where rays are sampled: the shell around bodies as they stand now."""
+    def region(self, bodies: PosedBodies, conditions: Conditions) -> ShellGrid:
+        """Where rays are sampled: the shell around bodies as they stand now, where their frames displace it to."""
         points_m = (bodies.vertices_m[:, self.corners] * self.weights[..., None]).sum(-2)
-        outer_m, inner_m = (thickness[self.corners].amax(1) for thickness in (self.outer_m, self.inner_m))
-        return ShellGrid.around(points_m, outer_m, inner_m, self.settings.shell_cell_m)
+        outwards_m = 0.0 if self.deformation is None else self.deformation.outwards(conditions.moment)
+        s, least_m = self.settings, self.settings.shell_cell_m
+        outer_m = (self.outer_m + outwards_m).clamp(least_m, s.outer_m)
+        inner_m = (self.inner_m - outwards_m).clamp(least_m, s.inner_m)
+        outer_m, inner_m = (t.expand(len(points_m), -1)[:, self.corners].amax(-1) for t in (outer_m, inner_m))
+        return ShellGrid.around(points_m, outer_m, inner_m, s.shell_cell_m)
 
     @torch.no_grad()
     def tighten(self, rig: Rig, pose: Tensor) -> None:
         """Make the shell no thicker than what can be seen: where, in any of some poses (n, P), the opacity's logistic
-        has not yet settled, with some room to move. Nothing outside the old shell is asked."""
+        has not yet settled, with some room to move. Nothing outside the old shell is asked, and of no frame's
+        deformation, with which the shell moves."""
         s, rest = self.settings, torch.zeros(1, len(rig.joints_m), 3, device=self.canonical_m.device)
         bodies = PosedBodies(rig, rest, torch.eye(4, device=rest.device)[None], self.canonical_m)
         depths_m = torch.arange(-s.inner_m, s.outer_m, TIGHTEN_STEP_M, device=rest.device)
@@ -84,7 +89,6 @@ class FastField(Field):
         points = (bodies.vertices_m[0, :, None] + depths_m[:, None] * normals[:, None]).flatten(0, 1)
         described = bodies.describe(points, torch.zeros(len(points), dtype=torch.long, device=rest.device), s.outer_m)
         settled_m = SETTLED / self.log_sharpness.exp()
-        outwards_m = points.new_zeros(1, 1) if self.deformation is None else self.deformation.outwards()
         seen = torch.zeros_like(described.near)
         for row in pose:
             d_hat = described.d + self._residual(described, row.expand(len(points), -1))
@@ -92,8 +96,7 @@ class FastField(Field):
         for name, side in (("outer_m", 1), ("inner_m", -1)):
             reached = torch.zeros_like(self.outer_m)
             reached = reached.scatter_reduce_(0, described.vertex[seen], side * described.d[seen], "amax")
-            deformed = (side * outwards_m).amax(0).clamp(min=0)  # in the frame that goes farthest
-            self.get_buffer(name).copy_((reached + deformed + ROOM_M).minimum(self.get_buffer(name)))
+            self.get_buffer(name).copy_((reached + ROOM_M).minimum(self.get_buffer(name)))
 
     def parameter_groups(self) -> list[dict]:
         """Adam groups; feature grids bear a larger rate than networks."""
@@ -123,7 +126,7 @@ class FastField(Field):
         correction: PoseCorrection | None = None,
     ) -> tuple[RaySamples, Tensor]:
         """Radiance and distance along rays (R, 3) of body rows (R,); also depths (R, K)."""
-        depths, met = region.sample_rays(origins_m, directions, frame, draws.jitter)
+        depths, met, ended = region.sample_rays(origins_m, directions, frame, draws.jitter)
         hit = torch.nonzero(met)[:, 0]  # only these rays are asked about; the others see nothing
         points = origins_m[hit, None] + directions[hit, None] * depths[hit][..., None]
         row = frame[hit].repeat_interleave(depths.shape[1])
@@ -133,6 +136,7 @@ class FastField(Field):
         d = torch.where(described.near, described.d, self.reach_m).view(len(hit), depths.shape[1])
         residual = torch.where(described.near, self._residual(described, pose), 0.0).view_as(d)
         alpha = alpha_from_sdf(d + residual, self.log_sharpness.exp())
+        alpha[:, -1] = ended[hit]  # nothing shines through the core, even where the surface lies deeper than the shell
         colour = self._colour(described, pose, weights_from_alpha(alpha.detach()).flatten() > NEGLIGIBLE)
         norms = d.new_zeros(0)
         if draws.probe is not None:

@@ -29,7 +29,7 @@ class Field(nn.Module, ABC):
     margin_m: float = 0.1
 
     @abstractmethod
-    def region(self, bodies: PosedBodies) -> Any:
+    def region(self, bodies: PosedBodies, conditions: Conditions) -> Any:
         """Where rays are sampled, by body row."""
 
     def tighten(self, rig: Rig, pose: Tensor) -> None:

@@ -63,7 +63,7 @@ class TrainedAvatar:
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
         """Colour, coverage and depth of the person alone."""
         bodies, conditions = self._pose(theta, root)
-        region: Any = self.field.region(bodies)
+        region: Any = self.field.region(bodies, conditions)
         device = bodies.vertices_m.device
         y, x = np.nonzero(within_reach(camera, bodies.vertices_m[0].cpu().numpy(), self.field.margin_m))
         origins, directions = camera.rays(np.stack([x, y], 1).astype(np.float64))

@@ -51,7 +51,7 @@ class PaperField(Field):
         self.radiance = RadianceMLP(point, pose, self.turn)
         self.residual = ResidualMLP(point, pose)
 
-    def region(self, bodies: PosedBodies) -> Boxes:
+    def region(self, bodies: PosedBodies, conditions: Conditions) -> Boxes:
         """Box B of each pose: the body's extent and a margin."""
         margin, half = self.settings.box_margin_m, self.settings.scene_m
         lower, upper = bodies.vertices_m.amin(1) - margin, bodies.vertices_m.amax(1) + margin

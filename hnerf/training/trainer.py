@@ -86,9 +86,9 @@ class Trainer:
 
     def _stand(self, bodies: PosedBodies) -> None:
         """Take the bodies as they stand now for the coming steps."""
-        self.stage = Stage(bodies, self.field.region(bodies))
         moment = torch.arange(len(bodies.theta), device=bodies.theta.device)
         self.conditions = Conditions.of(bodies.rig, bodies.theta, bodies.root, moment, self.settings.paper.scene_m)
+        self.stage = Stage(bodies, self.field.region(bodies, self.conditions))
 
     def run(self) -> dict[str, Any]:
         """Train to the end, write the subject's files and return the report."""
@@ -199,14 +199,15 @@ class Trainer:
 
     @torch.no_grad()
     def _look(self, rows: Tensor, generator: torch.Generator) -> tuple[Tensor, Any, Tensor]:
-        """Rays at some frames as the model renders them: colour (R, 3), the rays, coverage (R,)."""
+        """Rays at some frames as the model renders them: colour (R, 3), the rays, and what covers them in front of the
+        last sample, where a solid core may end them, (R,)."""
         rays = self.pixels.draw(rows, HELD_OUT_RAYS // len(rows) + 1, generator)
         draws = Draws.still(len(rays.frame), self.field.samples, self.processes.device)
         samples, _ = self.field.sample(
             self.stage.bodies, self.stage.region, rays.origins_m, rays.directions, rays.frame, self.conditions, draws
         )
         inside = samples.in_box * samples.alpha
-        return pixel(inside, samples), rays, 1 - (1 - inside).prod(1)
+        return pixel(inside, samples), rays, 1 - (1 - inside[:, :-1]).prod(1)
 
     def _require_surface(self) -> None:
         _, rays, coverage = self._look(self.train_rows, torch.Generator().manual_seed(self.settings.seed))

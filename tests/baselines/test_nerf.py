@@ -52,7 +52,7 @@ def look(field: NerfField, jitter: Draws) -> tuple[RaySamples, Tensor]:
     origins = torch.tensor([[-3.0, 0.5, 0.5], [-3.0, 5.0, 0.5]])
     directions, frame = torch.tensor([[1.0, 0, 0]]).repeat(2, 1), torch.zeros(2, dtype=torch.long)
     draws = dataclasses.replace(jitter, beyond=torch.ones(2, 3))
-    return field.sample(bodies, field.region(bodies), origins, directions, frame, conditions, draws)
+    return field.sample(bodies, field.region(bodies, conditions), origins, directions, frame, conditions, draws)
 
 
 def test_both_colours_by_hand(fog: NerfField) -> None:

@@ -119,7 +119,7 @@ def look(field: NerfiesField, training: bool) -> RaySamples:
     still = Draws.still(1, field.samples, cpu)
     draws = Draws.random(1, field.samples, 0.0, torch.Generator().manual_seed(0), cpu) if training else still
     row = torch.zeros(1, dtype=torch.long)
-    return field.sample(bodies, field.region(bodies), origins, directions, row, conditions, draws)[0]
+    return field.sample(bodies, field.region(bodies, conditions), origins, directions, row, conditions, draws)[0]
 
 
 def test_training_counts_its_steps_and_rendering_does_not(field: NerfiesField) -> None:

@@ -48,13 +48,13 @@ def look(field: NeuralBodyField, region: Surroundings, rows: list[int]) -> torch
 def test_codes_are_diffused_once_a_frame_in_training_and_once_a_rendering(field: NeuralBodyField) -> None:
     calls: list[int] = []
     field.diffusion.register_forward_hook(lambda *_: calls.append(1))
-    region = field.region(posed(field)[0])
+    region = field.region(*posed(field))
     look(field, region, [0, 2])
     assert len(calls) == 2
     look(field, region, [1, 1])
     assert len(calls) == 3
     field.eval()
-    region = field.region(posed(field, torch.eye(4))[0])
+    region = field.region(*posed(field, torch.eye(4)))
     assert len(calls) == 4
     for _ in range(3):
         look(field, region, [0, 0])
@@ -62,10 +62,9 @@ def test_codes_are_diffused_once_a_frame_in_training_and_once_a_rendering(field:
 
 
 def test_sees_the_same_in_training_as_in_evaluation(field: NeuralBodyField) -> None:
-    bodies, _ = posed(field)
-    learning = look(field, field.region(bodies), [0, 2])
+    learning = look(field, field.region(*posed(field)), [0, 2])
     field.eval()
-    torch.testing.assert_close(learning, look(field, field.region(bodies), [0, 2]))
+    torch.testing.assert_close(learning, look(field, field.region(*posed(field)), [0, 2]))
 
 
 def test_density_moves_with_the_root(field: NeuralBodyField) -> None:

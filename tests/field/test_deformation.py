@@ -69,7 +69,7 @@ def test_how_far_vertices_go_outwards():
     """All go 1 cm along x in frame 0: corner 0, at the origin, goes inwards, corner 1, at (1, 0, 0), outwards; in frame
     1 all go 2 cm up, corner 1 inwards."""
     found = deformation(1)
-    across, up, nowhere = found.outwards()
+    across, up, nowhere = found.outwards(torch.tensor([0, 1, -1]))
     torch.testing.assert_close(across, 0.01 * found.normals[:, 0])
     assert across[0] < -0.003 and across[1] > 0.003 and up[1] < -0.003
     assert (nowhere == 0).all()

@@ -12,8 +12,13 @@ def sphere(radius_m: float) -> torch.Tensor:
 
 def even_shell(surface: torch.Tensor, outer_m: float, inner_m: float, cell_m: float) -> ShellGrid:
     """As thick everywhere."""
-    outer, inner = (torch.full((surface.shape[1],), thickness) for thickness in (outer_m, inner_m))
+    outer, inner = (torch.full(surface.shape[:2], thickness) for thickness in (outer_m, inner_m))
     return ShellGrid.around(surface, outer, inner, cell_m)
+
+
+def along_x(grid: ShellGrid, x_m: list[float]) -> list[int]:
+    """States of the first frame's cells on the x axis."""
+    return grid.look_up(torch.zeros(1, 3), torch.eye(3)[:1], torch.tensor([x_m]), torch.zeros(1).long())[0].tolist()
 
 
 def test_box_interval_by_hand():
@@ -28,17 +33,15 @@ def test_box_interval_by_hand():
 
 def test_states_around_a_sphere():
     grid = even_shell(sphere(0.3), outer_m=0.05, inner_m=0.04, cell_m=0.02)
-    points = torch.tensor([[[0.0, 0, 0], [0.27, 0, 0], [0.33, 0, 0], [0.42, 0, 0], [5.0, 0, 0]]])
-    assert grid.look_up(points, torch.zeros(1, dtype=torch.long))[0].tolist() == [SOLID, SHELL, SHELL, EMPTY, EMPTY]
+    assert along_x(grid, [0.0, 0.27, 0.33, 0.42, 5.0]) == [SOLID, SHELL, SHELL, EMPTY, EMPTY]
 
 
 def test_the_shell_is_as_thick_as_its_surface_asks():
     """Thick on the side of x > 0, thin on the other: 8 cm off is shell on one side alone."""
     surface = sphere(0.3)
-    outer = torch.where(surface[0, :, 0] > 0, 0.1, 0.02)
+    outer = torch.where(surface[..., 0] > 0, 0.1, 0.02)
     grid = ShellGrid.around(surface, outer, torch.full_like(outer, 0.02), 0.01)
-    points = torch.tensor([[[0.38, 0.0, 0.0], [-0.38, 0.0, 0.0], [0.31, 0, 0], [-0.31, 0, 0]]])
-    assert grid.look_up(points, torch.zeros(1, dtype=torch.long))[0].tolist() == [SHELL, EMPTY, SHELL, SHELL]
+    assert along_x(grid, [0.38, -0.38, 0.31, -0.31]) == [SHELL, EMPTY, SHELL, SHELL]
 
 
 def test_a_lattice_divides_long_edges():
@@ -57,10 +60,10 @@ def test_samples_lie_in_the_shell_before_the_solid():
     grid = even_shell(sphere(0.3), outer_m=0.05, inner_m=0.04, cell_m=0.01)
     origins_m, directions = torch.tensor([[-1.0, 0.0, 0.0], [-1.0, 0.6, 0.0]]), torch.eye(3)[[0, 0]]
     rays = (origins_m, directions, torch.zeros(2, dtype=torch.long))
-    depths, met = grid.sample_rays(*rays, torch.full((2, 16), 0.5))
+    depths, met, ended = grid.sample_rays(*rays, torch.full((2, 16), 0.5))
     path_m = grid.path_m(*rays)
     assert path_m[0].item() == pytest.approx(0.09, abs=0.03) and path_m[1] == 0
-    assert met.tolist() == [True, False]
+    assert met.tolist() == ended.tolist() == [True, False]
     assert (depths[0].diff() > 0).all()
     assert depths[0, 0].item() == pytest.approx(0.65, abs=0.03)
     assert depths[0, -1].item() == pytest.approx(0.74, abs=0.03)
@@ -69,7 +72,7 @@ def test_samples_lie_in_the_shell_before_the_solid():
 def test_a_gap_between_two_shells_is_not_sampled():
     """Beside the solid core a ray crosses the shell twice; nothing is sampled outside it."""
     grid = even_shell(torch.cat([sphere(0.1) - 0.3, sphere(0.1) + 0.3], 1), 0.03, 0.2, 0.01)
-    depths, _ = grid.sample_rays(
+    depths, *_ = grid.sample_rays(
         torch.full((1, 3), -1.0), torch.full((1, 3), 3**-0.5), torch.zeros(1, dtype=torch.long), torch.rand(1, 64)
     )
     position = (-1 + depths[0] * 3**-0.5)[:, None].expand(-1, 3)

@@ -57,7 +57,9 @@ def test_a_tight_shell_shows_the_same_picture():
     frame, draws = torch.zeros(3, dtype=torch.long), Draws.still(3, SETTINGS.samples, torch.device("cpu"))
 
     def coverage() -> torch.Tensor:
-        samples, _ = field.sample(bodies, field.region(bodies), origins, directions, frame, conditions, draws)
+        samples, _ = field.sample(
+            bodies, field.region(bodies, conditions), origins, directions, frame, conditions, draws
+        )
         return 1 - (1 - samples.alpha).prod(1)
 
     before = coverage()
@@ -76,7 +78,9 @@ def test_rays_that_miss_the_shell_see_nothing_and_change_nothing():
     def sampled(pick: list[int]) -> list[torch.Tensor]:
         draws = Draws.still(len(pick), SETTINGS.samples, torch.device("cpu"))
         frame = torch.zeros(len(pick), dtype=torch.long)
-        found, _ = field.sample(bodies, field.region(bodies), origins[pick], directions[pick], frame, conditions, draws)
+        found, _ = field.sample(
+            bodies, field.region(bodies, conditions), origins[pick], directions[pick], frame, conditions, draws
+        )
         return [found.alpha, found.colour, found.d, found.residual]
 
     alpha, colour, d, residual = sampled([0, 1, 2])
@@ -94,11 +98,52 @@ def test_a_picture_with_as_many_samples_as_the_way_asks_for_is_that_of_many(monk
     origins = torch.tensor([[0.5, 0.4, 3.0], [0.02, 0.9, 3.0], [0.5, 0.1, 3.0], [2.0, 0.5, 3.0]])
     directions = torch.tensor([[0.0, 0.0, -1.0], [0.0, -0.02, -1.0], [0.05, 0.1, -1.0], [0.0, 0.0, -1.0]])
     directions = torch.nn.functional.normalize(directions, dim=-1)
-    rays = (bodies, field.region(bodies), origins, directions, torch.zeros(4, dtype=torch.long), conditions)
-    needed = field.region(bodies).path_m(*rays[2:5]) / SPACING_M
+    rays = (bodies, field.region(bodies, conditions), origins, directions, torch.zeros(4, dtype=torch.long), conditions)
+    needed = field.region(bodies, conditions).path_m(*rays[2:5]) / SPACING_M
     assert len({sum(float(n) > count for count in SAMPLES) for n in needed}) >= 3
     found = field.look(*rays)
     monkeypatch.setattr(FastField, "samples_needed", Field.samples_needed)
     expected = field.look(*rays)
     torch.testing.assert_close(found, expected, atol=0.02, rtol=0)
     assert (found[:3, 3] > 0.5).all() and not found[3].any()
+
+
+def test_a_ray_ends_at_the_solid_core_where_the_surface_lies_deeper():
+    """Of a box that is 10 cm smaller than the body, in a shell 3 cm deep, no sample sees the surface: a ray through the
+    middle is opaque all the same, at its last sample, and one that grazes the shell alone sees nothing."""
+    bodies, conditions = standing()
+    field = field_of(500.0)
+    last = field.field.geometry[-1]
+    assert isinstance(last, torch.nn.Linear)
+    last.bias.data.fill_(0.1 / SETTINGS.outer_m)
+    origins, directions = torch.tensor([[0.5, 0.5, 3.0], [-0.05, 0.5, 3.0]]), -torch.eye(3)[[2, 2]]
+    frame, draws = torch.zeros(2, dtype=torch.long), Draws.still(2, SETTINGS.samples, torch.device("cpu"))
+    region = field.region(bodies, conditions)
+    samples, _ = field.sample(bodies, region, origins, directions, frame, conditions, draws)
+    assert samples.d_hat.min() > 0.02 and samples.alpha[:, :-1].max() < 0.01
+    with torch.no_grad():
+        seen = field.look(bodies, region, origins, directions, frame, conditions)
+    assert seen[0, 3] == pytest.approx(1) and seen[0, 4] > 3 - bodies.vertices_m[0, :, 2].max() and seen[1, 3] < 0.01
+
+
+def test_the_shell_moves_with_the_surface_of_a_frame():
+    """A frame that lies 2 cm further out everywhere has its shell 2 cm further out, at most where the setting ends."""
+    settings = SETTINGS.model_copy(update={"nodes": 1, "shell_cell_m": 0.01})
+    field = FastField(RIG, settings, 1)
+    assert field.deformation is not None
+    field.outer_m.fill_(0.02)
+    field.inner_m.fill_(0.03)
+    field.deformation.displacement.data[0, 0] = torch.tensor([0.0, 0.0, 0.02])
+    bodies, _ = standing()
+    ray = torch.tensor([[0.5, 0.5, 3.0]]), torch.tensor([[0.0, 0.0, -1.0]]), torch.zeros(1, dtype=torch.long)
+
+    def ways(moment: int) -> tuple[float, float]:
+        """Depths of the first and the last sample on a ray from above."""
+        moments = Conditions.of(RIG, bodies.theta, bodies.root, torch.tensor([moment]), 2.5)
+        depths, _, ended = field.region(bodies, moments).sample_rays(*ray, torch.full((1, 64), 0.5))
+        assert ended.all()
+        return depths[0, 0].item(), depths[0, -1].item()
+
+    (began, ended), (still_began, still_ended) = ways(0), ways(-1)
+    assert still_began - began == pytest.approx(0.02, abs=0.006)
+    assert still_ended - ended == pytest.approx(0.02, abs=0.011)

@@ -21,7 +21,7 @@ def seen(field: PaperField, root_condition: Tensor) -> tuple[Tensor, Tensor]:
     origin, direction = torch.tensor([[0.5, 0.4, 2.4]]), torch.tensor([[0.0, 0.0, -1.0]])
     draws = Draws.still(1, field.samples, torch.device("cpu"))
     samples, _ = field.sample(
-        bodies, field.region(bodies), origin, direction, torch.zeros(1, dtype=torch.long), conditions, draws
+        bodies, field.region(bodies, conditions), origin, direction, torch.zeros(1, dtype=torch.long), conditions, draws
     )
     assert samples.in_box.any()
     return samples.density, samples.colour
