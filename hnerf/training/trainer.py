@@ -110,11 +110,9 @@ class Trainer:
             if self.step == self.field_steps:
                 self.field_seconds = self.seconds
             snapshot_due = bool(snapshots_s) and self.seconds >= snapshots_s[0]
-            if (
-                snapshot_due
-                or self.step % self.settings.absorb_steps == 0
-                or self.step in (self.field_steps, self.steps)
-            ):
+            checkpoint_due = self.step % self.settings.checkpoint_steps == 0
+            absorb_due = self.step % self.settings.absorb_steps == 0 or self.step in (self.field_steps, self.steps)
+            if absorb_due or snapshot_due or checkpoint_due:  # who resumes finds the bodies where they stood
                 self._absorb()
             if snapshot_due:
                 if self.processes.leads:
@@ -127,7 +125,7 @@ class Trainer:
                 if time.monotonic() - last_log > 5 and self.processes.leads:
                     last_log = time.monotonic()
                     logger.info("step %d of %d, %.0f s: %s", self.step, self.steps, self.seconds, self.history[-1])
-            if self.step % self.settings.checkpoint_steps == 0 and self.processes.leads:
+            if checkpoint_due and self.processes.leads:
                 save_checkpoint(self.out, self._state())
         self._require_surface()
         return self._finish() if self.processes.leads else {}
