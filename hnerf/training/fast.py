@@ -135,8 +135,9 @@ class FastField(Field):
         pose = conditions.pose[row]
         d = torch.where(described.near, described.d, self.reach_m).view(len(hit), depths.shape[1])
         residual = torch.where(described.near, self._residual(described, pose), 0.0).view_as(d)
-        alpha = alpha_from_sdf(d + residual, self.log_sharpness.exp())
-        alpha[:, -1] = ended[hit]  # nothing shines through the core, even where the surface lies deeper than the shell
+        alpha_dot = alpha_from_sdf(d + residual, self.log_sharpness.exp())
+        core = torch.zeros_like(alpha_dot[:, -1:]) + ended[hit, None]  # ends a ray even if the surface lies deeper
+        alpha = torch.cat([alpha_dot[:, :-1], core], 1)
         colour = self._colour(described, pose, weights_from_alpha(alpha.detach()).flatten() > NEGLIGIBLE)
         norms = d.new_zeros(0)
         if draws.probe is not None:
@@ -149,9 +150,10 @@ class FastField(Field):
         def everywhere(values: Tensor, elsewhere: float) -> Tensor:
             return values.new_full((len(met), *values.shape[1:]), elsewhere).index_copy(0, hit, values)
 
-        alpha, d, residual = everywhere(alpha, 0.0), everywhere(d, self.reach_m), everywhere(residual, 0.0)
+        alpha, alpha_dot, residual = (everywhere(values, 0.0) for values in (alpha, alpha_dot, residual))
         colour = everywhere(colour.view(len(hit), depths.shape[1], 3), 0.0)
-        samples = RaySamples(alpha, alpha, torch.ones_like(d), colour, None, d, residual, norms, draws.beyond, elastic)
+        d, in_box = everywhere(d, self.reach_m), torch.ones_like(alpha)
+        samples = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, draws.beyond, elastic)
         return samples, depths
 
     def samples_needed(self, region: ShellGrid, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:

@@ -197,15 +197,16 @@ class Trainer:
 
     @torch.no_grad()
     def _look(self, rows: Tensor, generator: torch.Generator) -> tuple[Tensor, Any, Tensor]:
-        """Rays at some frames as the model renders them: colour (R, 3), the rays, and what covers them in front of the
-        last sample, where a solid core may end them, (R,)."""
+        """Rays at some frames as the model renders them: colour (R, 3), the rays, and how far radiance and surface both
+        cover them, (R,)."""
         rays = self.pixels.draw(rows, HELD_OUT_RAYS // len(rows) + 1, generator)
         draws = Draws.still(len(rays.frame), self.field.samples, self.processes.device)
         samples, _ = self.field.sample(
             self.stage.bodies, self.stage.region, rays.origins_m, rays.directions, rays.frame, self.conditions, draws
         )
-        inside = samples.in_box * samples.alpha
-        return pixel(inside, samples), rays, 1 - (1 - inside[:, :-1]).prod(1)
+        by_radiance, by_surface = (1 - (1 - samples.in_box * a).prod(1) for a in (samples.alpha, samples.alpha_dot))
+        colour = pixel(samples.in_box * samples.alpha, samples)
+        return colour, rays, torch.minimum(by_radiance, by_surface)
 
     def _require_surface(self) -> None:
         _, rays, coverage = self._look(self.train_rows, torch.Generator().manual_seed(self.settings.seed))
@@ -228,7 +229,7 @@ class Trainer:
             "generator": self.generator.get_state(),
             "theta": bodies.theta,
             "root": bodies.root,
-            "beta": bodies.rig.beta,
+            "rig": {name: getattr(bodies.rig, name) for name in ("vertices_m", "joints_m", "beta")},
             "history": json.dumps(self.history),
         }
 
@@ -242,7 +243,7 @@ class Trainer:
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"].cpu())
         self.history = json.loads(state["history"])
-        rig = self.body.rig.reshaped(state["beta"])
+        rig = dataclasses.replace(self.body.rig, **state["rig"])
         self._stand(PosedBodies(rig, state["theta"], state["root"], self.field.canonical_m))
         if self.step > self.field_steps:
             self._freeze_field()
