@@ -1,0 +1,53 @@
+"""How long finished subjects take to be rendered, on one core and on all.
+
+usage: python benchmarks/rendering.py SUBJECT [SUBJECT ...]
+
+Each SUBJECT is a folder that `hnerf run` left (`store/subjects/NAME`). Its first training pose is rendered for its
+first test camera, or training camera where it has no other, as an image whose longest side is 256 and 512 px; on a GPU,
+where there is one. Medians. Run it on an idle machine. Writes `benchmarks/results/rendering.json` and `.md`.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+from provenance import provenance, sentence, table, write_result
+
+from hnerf.calibration.check import load_cameras
+from hnerf.capture.capture import Capture
+from hnerf.study.scoring import frame_seconds
+from hnerf.training.model import load_avatar
+
+SIDES_PX = (256, 512)
+
+
+def main() -> None:
+    """Render, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("subjects", nargs="+", type=Path, metavar="SUBJECT")
+    options = parser.parse_args()
+    result = provenance()
+    cores = sorted({1, result["machine"]["threads"]})
+    result["seconds"] = {subject.name: measure(subject, cores) for subject in options.subjects}
+    rows = [["subject", *(f"{side} px, threads: {n}" for side in SIDES_PX for n in cores)]]
+    rows += [[name, *(f"{s:.2f} s" for s in found.values())] for name, found in result["seconds"].items()]
+    text = "\n".join(["# Rendering a frame", "", sentence(result), "", *table(rows), ""])
+    write_result("rendering", result, text)
+    print(text)
+
+
+def measure(subject: Path, cores: list[int]) -> dict[str, float]:
+    """Median seconds by longest side and number of threads."""
+    avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
+    capture = load_cameras(subject / "calibration", Capture.load(subject / "capture"))
+    camera = capture.cameras[(*capture.test_cameras, *capture.train_cameras)[0]]
+    found = {}
+    for side_px in SIDES_PX:
+        for threads in cores:
+            torch.set_num_threads(threads)
+            found[f"{side_px} px, {threads}"] = frame_seconds(avatar, camera, capture.train_frames[0], side_px)
+    return found
+
+
+if __name__ == "__main__":
+    main()
