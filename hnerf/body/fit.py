@@ -14,14 +14,15 @@ from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from hnerf.body.articulation import Articulation, Pose
+from hnerf.body.balance import Balance
 from hnerf.body.body_model import BodyModel, body_model
 from hnerf.body.contour_fit import ContourWeights, Outline, outline, refine
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.given_start import given_start, seen_on, told_of
+from hnerf.body.habit import Habit
 from hnerf.body.initial_root import root_from_image, root_from_space
 from hnerf.body.keypoint_fit import Likely, Problem, levenberg_marquardt, metres_per_pixel, project
 from hnerf.body.observations import Observations, observe, runs
-from hnerf.body.one_view import Balance, Habit, OneView
 from hnerf.body.pose_prior import PosePrior, Smoothness
 from hnerf.capture.capture import Capture
 from hnerf.config import FitSettings
@@ -55,7 +56,7 @@ def fit_body(capture: Capture, masks: "Masks | None", settings: FitSettings) -> 
         seen = observe(capture) if capture.has_keypoints or begin is None else seen_on(begin, capture)
         smoothness = Smoothness(runs(capture), capture.fps, settings.acceleration_mps2 * LIVELINESS)
         up = "xyz".index(capture.up)
-        one_view = OneView(Balance(up)) if len(seen.cameras) == 1 else None
+        balance = Balance(up) if len(seen.cameras) == 1 else None
         with _timed(seconds, "start"):
             pose = begin or start(capture, seen, model)
         if len(seen.cameras) > 1:
@@ -63,18 +64,18 @@ def fit_body(capture: Capture, masks: "Masks | None", settings: FitSettings) -> 
                 problem = problem_of(model, pose, seen, smoothness, settings, offsets=HELD, proportions=HELD)
                 pose = levenberg_marquardt(problem, pose, problem.in_space, KEYPOINT_STEPS)
         with _timed(seconds, "keypoints in images"):
-            problem = problem_of(
-                model, pose, seen, smoothness, settings, offsets=1, proportions=HELD, one_view=one_view
-            )
+            problem = problem_of(model, pose, seen, smoothness, settings, offsets=1, proportions=HELD)
+            problem = replace(problem, balance=balance)
             pose = levenberg_marquardt(problem, pose, problem.in_images, KEYPOINT_STEPS)
-            if one_view:
-                one_view = replace(one_view, habit=Habit(_by_split(capture), pose, seen.cameras[0]))
-                pose = unflipped(replace(problem, one_view=one_view), pose, runs(capture))
+            if balance:
+                habit = Habit.of_one_view(_by_split(capture), pose, seen.cameras[0])
+                pose = unflipped(replace(problem, habit=habit), pose, runs(capture))
+            else:
+                habit = Habit.of_hands(len(pose.root), Articulation(pose.rig))
         if masks is not None:
             with _timed(seconds, "outlines"):
-                problem = problem_of(
-                    model, pose, seen, smoothness, settings, offsets=1, proportions=1, one_view=one_view
-                )
+                problem = problem_of(model, pose, seen, smoothness, settings, offsets=1, proportions=1)
+                problem = replace(problem, balance=balance, habit=habit)
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
                 weights = ContourWeights(settings.inside_m, settings.outside_m, settings.clothing_m, settings.spacing_m)
                 pose = refine(problem, pose, edges, weights, up, settings.contour_steps)
@@ -120,7 +121,7 @@ def unflipped(problem: Problem, pose: Pose, follow: list[tuple[int, ...]]) -> Po
 
 def problem_of(
     model: BodyModel, pose: Pose, seen: Observations, smoothness: Smoothness, settings: FitSettings, offsets: float,
-    proportions: float, one_view: OneView | None = None,
+    proportions: float,
 ) -> Problem:  # fmt: skip
     """`offsets` and `proportions` scale the spread of the keypoint offsets and of the shape's details."""
     likely = Likely(
@@ -134,7 +135,7 @@ def problem_of(
         model.low,
         model.high,
     )
-    return Problem(seen, metres_per_pixel(seen.cameras, pose), likely, smoothness, model.rig, one_view)
+    return Problem(seen, metres_per_pixel(seen.cameras, pose), likely, smoothness, model.rig)
 
 
 def _by_split(capture: Capture) -> list[list[int]]:

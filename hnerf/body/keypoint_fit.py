@@ -8,11 +8,13 @@ import torch
 from torch import Tensor
 
 from hnerf.body.articulation import Articulation, Points, Pose, with_offsets
+from hnerf.body.balance import Balance
+from hnerf.body.habit import Habit
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.observations import Observations
-from hnerf.body.one_view import OneView
 from hnerf.body.pose_prior import PosePrior, Smoothness
 from hnerf.body.rig import Rig
+from hnerf.body.robust import faded
 from hnerf.capture.camera import Camera
 
 NEAR_M = 0.1  # nothing nearer is in a camera's picture
@@ -41,15 +43,16 @@ Information = tuple[
 @dataclass(frozen=True)
 class Problem:
     """What was seen and what is likely; assembles the normal equations at a pose. Shared unknowns: beta (B,), then the
-    offsets (75,). scale_m (C, n) metres a pixel spans at the person: held fixed, or coming nearer would pay. one_view:
-    with one camera only."""
+    offsets (75,). scale_m (C, n) metres a pixel spans at the person: held fixed, or coming nearer would pay. balance:
+    with one camera only; habit: None as long as no posture is known."""
 
     seen: Observations
     scale_m: Tensor
     likely: Likely
     smoothness: Smoothness
     reshape: Callable[[Tensor], Rig]
-    one_view: OneView | None = None
+    balance: Balance | None = None
+    habit: Habit | None = None
 
     def assemble(self, pose: Pose, inform: Callable[[Tensor], Information]) -> tuple[float, NormalEquations]:
         """Cost and normal equations of the keypoints, as `inform` weighs them, and of all that is likely."""
@@ -70,8 +73,10 @@ class Problem:
         cost += self._add_shape_prior(equations, pose)
         cost += PosePrior(articulation).add(equations, pose)
         cost += self.smoothness.add(equations, x, by_frame)
-        if self.one_view:
-            cost += self.one_view.add(equations, articulation, pose, x, by_frame)
+        if self.balance:
+            cost += self.balance.add(equations, x, by_frame)
+        if self.habit:
+            cost += self.habit.add(equations, articulation, pose)
         return cost, equations
 
     def _add_shape_prior(self, equations: NormalEquations, pose: Pose) -> float:
@@ -114,10 +119,9 @@ class Problem:
         return matrix, pull, cost
 
     def _robust(self, squared: Tensor, trust: Tensor) -> tuple[Tensor, float]:
-        """Geman-McClure (1987): weights of the re-weighted least squares, and the cost."""
-        scale = self.likely.keypoint_outlier_m**2
-        weight = trust / self.likely.keypoint_m**2
-        return weight / (1 + squared / scale) ** 2, 0.5 * float((weight * squared / (1 + squared / scale)).sum())
+        """Weights, and the cost."""
+        weight, cost = faded(squared, self.likely.keypoint_m, self.likely.keypoint_outlier_m)
+        return trust * weight, float((trust * cost).sum())
 
     def moved(self, pose: Pose, equations: NormalEquations, damping: float) -> Pose:
         """The pose after a damped Gauss-Newton step, its rig linearised anew."""

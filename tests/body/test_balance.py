@@ -1,0 +1,50 @@
+import math
+
+import numpy as np
+import torch
+
+from hnerf.body.anny import anny_rig
+from hnerf.body.articulation import Articulation, Pose
+from hnerf.body.balance import BALANCE_M, Balance, centre_of_mass_over_feet
+from hnerf.body.normal_equations import NormalEquations
+from tests.body.test_articulation import random_pose
+from tests.body.test_pose_prior import resting
+from tests.body.two_bone import two_bone_rig
+
+
+def test_the_centre_of_mass_is_above_the_feet_of_who_stands_upright() -> None:
+    """Neck .289; a knee bears half a thigh and half a shank and foot, .05 + .0305. The likeliest pose is in balance
+    within half a standard deviation."""
+    shares = centre_of_mass_over_feet()
+    assert abs(float(shares.sum())) < 1e-12
+    np.testing.assert_allclose(shares[[1, 10]], [0.289, 0.0805])
+    articulation = Articulation(anny_rig().to(dtype=torch.float64))
+    x, _, _ = articulation.jacobian(articulation.keypoints(), articulation.pose(resting(articulation)))
+    assert float(torch.einsum("k,nkc->nc", shares, x)[:, :2].norm()) < BALANCE_M / 2
+
+
+def test_five_centimetres_off_balance_cost_a_half_less_what_fades() -> None:
+    """Trunk forwards so that the centre of mass moves by 5 cm: 0.5 / (1 + 1/9). Upwards is free; far off, hardly more
+    than 0.5 x 9 is to pay."""
+    balance, x = Balance(up=2), torch.zeros(1, 25, 3, dtype=torch.float64)
+    jacobian = torch.zeros(1, 25, 3, 9, dtype=torch.float64)
+    for axis, far, cost in ((0, 0.05, 0.45), (1, 0.05, 0.45), (2, 0.05, 0.0), (0, 5.0, 4.5 / (1 + 9e-4))):
+        moved = x.clone()
+        moved[0, [1, 8], axis] = far / 0.578
+        assert math.isclose(balance.add(NormalEquations(1, 9, 0), moved, jacobian), cost, abs_tol=1e-9)
+
+
+def test_the_gradient_of_balance_is_that_of_its_cost() -> None:
+    rig = two_bone_rig()
+    articulation, pose = Articulation(rig), random_pose(rig, 2)
+
+    def cost_and_equations(at: Pose) -> tuple[float, NormalEquations]:
+        x, by_frame, _ = articulation.jacobian(articulation.keypoints(), articulation.pose(at))
+        equations = NormalEquations(2, articulation.unknowns, 0)
+        return Balance(up=1).add(equations, 0.3 * x, 0.3 * by_frame), equations
+
+    direction = torch.randn(2, articulation.unknowns, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    ends = [cost_and_equations(articulation.moved(pose, sign * 1e-6 * direction))[0] for sign in (1, -1)]
+    slope = (cost_and_equations(pose)[1].frame_gradient * direction.numpy()).sum()
+    assert abs(slope) > 1e-3
+    np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-6, rtol=1e-6)
