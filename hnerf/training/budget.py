@@ -20,7 +20,7 @@ from hnerf.spread import spread
 ALIGNMENT_M = 0.01  # to which surfaces of different frames lie on each other; what is finer blurs, whatever the cells
 COLOUR_LEVELS, GEOMETRY_LEVELS = 4, 3  # of the grids, from the coarsest to the finest in equal ratios
 COARSEST_CELLS = {"colour": 24, "geometry": 16}
-GEOMETRY_COARSER = 3  # times than colour: cloth hangs in folds, prints have edges
+GEOMETRY_COARSER = 1.5  # times than colour: fingers and folds are larger than prints
 PATH = 2.4  # of a ray through the shell, in thicknesses of it, in the mean over rays that meet a person
 SAMPLE_M = 0.006  # between samples: surfaces come out smoother and nearer than with one each centimetre
 ROOM_M = 0.015  # beyond where masks reach, for poses that are still wrong

@@ -27,13 +27,13 @@ def decided(scene: Scene, **given: object) -> tuple[TrainingSettings, dict]:
 
 
 def test_sizes_by_hand():
-    """Pixels of 2 cm: 96 cells on 1.92 m, in steps of 4 ** (1 / 3) from 24; 32 for geometry, in steps of 2 ** (1 / 2)
-    from 16. Masks reach 3.5 cm out and 0.5 cm in, with 1.5 cm of room: 5 cm and, at least, 3 cm; 2.4 x 8 cm / 6 mm = 32
+    """Pixels of 2 cm: 96 cells on 1.92 m, in steps of 4 ** (1 / 3) from 24; 64 for geometry, in steps of 2 from
+    16. Masks reach 3.5 cm out and 0.5 cm in, with 1.5 cm of room: 5 cm and, at least, 3 cm; 2.4 x 8 cm / 6 mm = 32
     samples. Two million pixels at 2500 a step, each looked at half a time: 400 steps."""
     settings, decisions = decided(SCENE)
     fast = settings.fast
     assert fast.colour_cells == (24, 38, 60, 96)
-    assert fast.geometry_cells == (16, 23, 32)
+    assert fast.geometry_cells == (16, 32, 64)
     assert (fast.outer_m, fast.inner_m, fast.samples) == (0.05, 0.03, 32)
     assert (fast.pose_width, settings.steps) == (8, 400)
     assert decisions["fast.samples"].reason == "one each 6.0 mm of a ray through a shell of 80.0 mm"
@@ -43,7 +43,7 @@ def test_no_finer_than_frames_align():
     """Pixels of 1 mm would ask for 1920 cells; frames align to 1 cm."""
     fast = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": 0.001}))[0].fast
     assert fast.colour_cells[-1] == 192
-    assert fast.geometry_cells[-1] == 64
+    assert fast.geometry_cells[-1] == 128
 
 
 def test_what_is_given_stands():
