@@ -27,7 +27,8 @@ def main() -> None:
     parser.add_argument("subjects", nargs="+", type=Path, metavar="SUBJECT")
     options = parser.parse_args()
     result = provenance()
-    cores = sorted({1, result["machine"]["threads"]})
+    threads = result["machine"]["threads"]
+    cores = [threads] if torch.cuda.is_available() else sorted({1, threads})
     result["seconds"] = {subject.name: measure(subject, cores) for subject in options.subjects}
     rows = [["subject", *(f"{side} px, threads: {n}" for side in SIDES_PX for n in cores)]]
     rows += [[name, *(f"{s:.2f} s" for s in found.values())] for name, found in result["seconds"].items()]

@@ -45,10 +45,10 @@ class ShellGrid:
         """State of the cells at depths (R, K) along rays (R, 3) in frames (R,): (R, K) uint8. Beyond the grid it is
         that of its outermost cells, which are EMPTY."""
         origins, directions = (origins_m - self.lower_m[frame]) / self.cell_m, directions / self.cell_m
-        flat = frame[:, None].int()
+        flat = frame[:, None].to(torch.int32 if self.cells.numel() < 2**31 else torch.int64)
         for axis, size in enumerate(self.cells.shape[1:]):
             index = torch.addcmul(origins[:, axis, None], directions[:, axis, None], depths_m)
-            flat = flat * size + index.clamp_(0, size - 1).int()
+            flat = flat * size + index.clamp_(0, size - 1).to(flat.dtype)
         return self.cells.flatten().index_select(0, flat.flatten()).view_as(flat)
 
     def sample_rays(

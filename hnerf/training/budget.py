@@ -107,7 +107,7 @@ def _field(scene: Scene, given: FastFieldSettings) -> dict[str, Decision]:
     outer_m, inner_m = (_thickness_m(reach_m) for reach_m in (scene.outside_m, scene.inside_m))
     outer_m, inner_m = given.outer_m or outer_m, given.inner_m or inner_m
     still = scene.spread_rad < STILL_RAD
-    cells = scene.side_m / cell_m
+    colour_cells = given.colour_cells or _ladder(COARSEST_CELLS["colour"], scene.side_m / cell_m, COLOUR_LEVELS)
     return {
         "outer_m": Decision(outer_m, f"masks reach {_mm(scene.outside_m)} out of the fitted body, and room"),
         "inner_m": Decision(inner_m, f"masks stay {_mm(scene.inside_m)} inside the fitted body, and room"),
@@ -115,9 +115,9 @@ def _field(scene: Scene, given: FastFieldSettings) -> dict[str, Decision]:
             max(8, round(PATH * (outer_m + inner_m) / SAMPLE_M)),
             f"one each {_mm(SAMPLE_M)} of a ray through a shell of {_mm(outer_m + inner_m)}",
         ),
-        "colour_cells": Decision(_ladder(COARSEST_CELLS["colour"], cells, COLOUR_LEVELS), finest),
+        "colour_cells": Decision(colour_cells, finest),
         "geometry_cells": Decision(
-            _ladder(COARSEST_CELLS["geometry"], cells / GEOMETRY_COARSER, GEOMETRY_LEVELS),
+            _ladder(COARSEST_CELLS["geometry"], colour_cells[-1] / GEOMETRY_COARSER, GEOMETRY_LEVELS),
             f"{GEOMETRY_COARSER} times coarser than colour",
         ),
         "pose_width": Decision(

@@ -5,7 +5,7 @@ import dataclasses
 import torch
 from torch import Tensor, nn
 
-from hnerf.body.canonical import FAR_M, Descriptor, PoseCorrection, PosedBodies
+from hnerf.body.canonical import FAR_M, Descriptor, PoseCorrection, PosedBodies, blended
 from hnerf.body.descriptor import vertex_normals
 from hnerf.body.rig import Rig
 from hnerf.config import FastFieldSettings
@@ -65,16 +65,18 @@ class FastField(Field):
     @property
     def reach_m(self) -> float:
         """How far from the body a sample can lie: the shell and the slack of its cells."""
-        return self.settings.outer_m + 2 * self.settings.shell_cell_m
+        return max(self.settings.outer_m, self.settings.inner_m) + 2 * self.settings.shell_cell_m
 
     def region(self, bodies: PosedBodies, conditions: Conditions) -> ShellGrid:
         """Where rays are sampled: the shell around bodies as they stand now, where their frames displace it to."""
-        points_m = (bodies.vertices_m[:, self.corners] * self.weights[..., None]).sum(-2)
-        outwards_m = 0.0 if self.deformation is None else self.deformation.outwards(conditions.moment)
+        points_m = torch.stack([blended(v, self.corners, self.weights) for v in bodies.vertices_m])
+        outwards_m = points_m.new_zeros(len(points_m), 1)
+        if self.deformation is not None:
+            outwards_m = self.deformation.outwards(conditions.moment)
         s, least_m = self.settings, self.settings.shell_cell_m
         outer_m = (self.outer_m + outwards_m).clamp(least_m, s.outer_m)
         inner_m = (self.inner_m - outwards_m).clamp(least_m, s.inner_m)
-        outer_m, inner_m = (t.expand(len(points_m), -1)[:, self.corners].amax(-1) for t in (outer_m, inner_m))
+        outer_m, inner_m = (torch.stack([t[self.corners].amax(-1) for t in side]) for side in (outer_m, inner_m))
         return ShellGrid.around(points_m, outer_m, inner_m, s.shell_cell_m)
 
     @torch.no_grad()
@@ -87,7 +89,9 @@ class FastField(Field):
         depths_m = torch.arange(-s.inner_m, s.outer_m, TIGHTEN_STEP_M, device=rest.device)
         normals = vertex_normals(bodies.vertices_m[0], rig.faces)
         points = (bodies.vertices_m[0, :, None] + depths_m[:, None] * normals[:, None]).flatten(0, 1)
-        described = bodies.describe(points, torch.zeros(len(points), dtype=torch.long, device=rest.device), s.outer_m)
+        described = bodies.describe(
+            points, torch.zeros(len(points), dtype=torch.long, device=rest.device), self.reach_m
+        )
         settled_m = SETTLED / self.log_sharpness.exp()
         seen = torch.zeros_like(described.near)
         for row in pose:
@@ -126,7 +130,7 @@ class FastField(Field):
         correction: PoseCorrection | None = None,
     ) -> tuple[RaySamples, Tensor]:
         """Radiance and distance along rays (R, 3) of body rows (R,); also depths (R, K)."""
-        depths, met, ended = region.sample_rays(origins_m, directions, frame, draws.jitter)
+        depths, met, core = region.sample_rays(origins_m, directions, frame, draws.jitter)
         hit = torch.nonzero(met)[:, 0]  # only these rays are asked about; the others see nothing
         points = origins_m[hit, None] + directions[hit, None] * depths[hit][..., None]
         row = frame[hit].repeat_interleave(depths.shape[1])
@@ -136,8 +140,8 @@ class FastField(Field):
         d = torch.where(described.near, described.d, self.reach_m).view(len(hit), depths.shape[1])
         residual = torch.where(described.near, self._residual(described, pose), 0.0).view_as(d)
         alpha_dot = alpha_from_sdf(d + residual, self.log_sharpness.exp())
-        core = torch.zeros_like(alpha_dot[:, -1:]) + ended[hit, None]  # ends a ray even if the surface lies deeper
-        alpha = torch.cat([alpha_dot[:, :-1], core], 1)
+        end = torch.where(core[hit, None], 1.0, alpha_dot[:, -1:])  # nothing shines through, if the surface lies deeper
+        alpha = torch.cat([alpha_dot[:, :-1], end], 1)
         colour = self._colour(described, pose, weights_from_alpha(alpha.detach()).flatten() > NEGLIGIBLE)
         norms = d.new_zeros(0)
         if draws.probe is not None:

@@ -82,9 +82,9 @@ class Field(nn.Module, ABC):
             still = Draws.still(len(pick), count, frame.device)
             samples, depths = self.sample(bodies, region, *rays, conditions, still)
             weights = weights_from_alpha(samples.in_box * samples.alpha)
-            alpha = weights.sum(1, keepdim=True)
-            depth = (weights * depths).sum(1, keepdim=True) / alpha.clamp(min=1e-6)
-            seen[pick] = torch.cat([composite(weights, samples.colour), alpha, depth * (alpha > 0)], 1)
+            cover = weights.sum(1, keepdim=True)
+            depth = (weights * depths).sum(1, keepdim=True) / cover.clamp(min=1e-6)
+            seen[pick] = torch.cat([composite(weights, samples.colour), cover, depth * (cover > 0)], 1)
         return seen
 
     @abstractmethod

@@ -24,8 +24,8 @@ def test_the_centre_of_mass_is_above_the_feet_of_who_stands_upright() -> None:
 
 
 def test_five_centimetres_off_balance_cost_a_half_less_what_fades() -> None:
-    """Trunk forwards so that the centre of mass moves by 5 cm: 0.5 / (1 + 1/9). Upwards is free; far off, hardly more
-    than 0.5 x 9 is to pay."""
+    """Trunk forwards so that the centre of mass moves by 5 cm: 0.5 / (1 + 1/9). Upwards is free; far off, nearly
+    0.5 x 9 are to pay."""
     balance, x = Balance(up=2), torch.zeros(1, 25, 3, dtype=torch.float64)
     jacobian = torch.zeros(1, 25, 3, 9, dtype=torch.float64)
     for axis, far, cost in ((0, 0.05, 0.45), (1, 0.05, 0.45), (2, 0.05, 0.0), (0, 5.0, 4.5 / (1 + 9e-4))):

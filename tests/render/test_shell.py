@@ -44,6 +44,16 @@ def test_the_shell_is_as_thick_as_its_surface_asks():
     assert along_x(grid, [0.38, -0.38, 0.31, -0.31]) == [SHELL, EMPTY, SHELL, SHELL]
 
 
+def test_every_frame_has_its_own_surface_and_thickness():
+    """A sphere of 0.3 m with a shell of 2 cm, and one of 0.2 m with 8 cm: 5 cm outside either."""
+    outer = torch.tensor([0.02, 0.08])[:, None].expand(-1, 40000)
+    surfaces = torch.cat([sphere(0.3), sphere(0.2)])
+    grid = ShellGrid.around(surfaces, outer, torch.full_like(outer, 0.04), 0.01)
+    along, frames = torch.tensor([[0.35], [0.25], [0.35], [0.25]]), torch.tensor([0, 1, 1, 0])
+    found = grid.look_up(torch.zeros(4, 3), torch.eye(3)[[0, 0, 0, 0]], along, frames)[:, 0].tolist()
+    assert found == [EMPTY, SHELL, EMPTY, SOLID]
+
+
 def test_a_lattice_divides_long_edges():
     """A right triangle with legs of 3: spacing 1.5 cuts its longest edge (4.24) in three, so 10 points in all."""
     vertices = torch.tensor([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 3.0, 0.0]])

@@ -46,6 +46,11 @@ def test_no_finer_than_frames_align():
     assert fast.geometry_cells[-1] == 128
 
 
+def test_geometry_follows_the_colours_cells_that_are_given():
+    """128 / 1.5 = 85, whatever the pixels ask for."""
+    assert decided(SCENE, fast={"colour_cells": [24, 128]})[0].fast.geometry_cells[-1] == 85
+
+
 def test_what_is_given_stands():
     settings, decisions = decided(SCENE, steps=7, fast={"samples": 5, "outer_m": 0.2})
     assert (settings.steps, settings.fast.samples, settings.fast.outer_m) == (7, 5, 0.2)

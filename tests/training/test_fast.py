@@ -108,42 +108,68 @@ def test_a_picture_with_as_many_samples_as_the_way_asks_for_is_that_of_many(monk
     assert (found[:3, 3] > 0.5).all() and not found[3].any()
 
 
-def test_a_ray_ends_at_the_solid_core_where_the_surface_lies_deeper():
-    """Of a box that is 10 cm smaller than the body, in a shell 3 cm deep, no sample sees the surface: a ray through the
-    middle is opaque all the same, at its last sample, and one that grazes the shell alone sees nothing."""
-    bodies, conditions = standing()
-    field = field_of(500.0)
+def deeper_by(distance_m: float, settings: FastFieldSettings = SETTINGS) -> FastField:
+    """A field whose surface lies deeper than the body everywhere in the shell."""
+    torch.manual_seed(0)
+    field = FastField(RIG, settings, 1)
+    field.log_sharpness.data.fill_(500.0).log_()
     last = field.field.geometry[-1]
     assert isinstance(last, torch.nn.Linear)
-    last.bias.data.fill_(0.1 / SETTINGS.outer_m)
+    last.bias.data.fill_(distance_m / settings.outer_m)
+    return field
+
+
+def test_a_rendered_ray_ends_at_the_solid_core_where_the_surface_lies_deeper():
+    """Of a surface 10 cm inside the body, in a shell 3 cm deep, no sample sees anything: a ray through the middle is
+    opaque all the same, at its last sample and in that sample's colour, and one that grazes the shell sees nothing."""
+    bodies, conditions = standing()
+    field = deeper_by(0.1)
     origins, directions = torch.tensor([[0.5, 0.5, 3.0], [-0.05, 0.5, 3.0]]), -torch.eye(3)[[2, 2]]
-    frame, draws = torch.zeros(2, dtype=torch.long), Draws.still(2, SETTINGS.samples, torch.device("cpu"))
+    rays = origins, directions, torch.zeros(2, dtype=torch.long)
     region = field.region(bodies, conditions)
-    samples, _ = field.sample(bodies, region, origins, directions, frame, conditions, draws)
-    assert samples.d_hat.min() > 0.02 and samples.alpha[:, :-1].max() < 0.01
+    count = int(field.samples_needed(region, *rays)[0])
+    draws = Draws.still(2, count, torch.device("cpu"))
     with torch.no_grad():
-        seen = field.look(bodies, region, origins, directions, frame, conditions)
-    assert seen[0, 3] == pytest.approx(1) and seen[0, 4] > 3 - bodies.vertices_m[0, :, 2].max() and seen[1, 3] < 0.01
+        samples, depths = field.sample(bodies, region, *rays, conditions, draws)
+        seen = field.look(bodies, region, *rays, conditions)
+    assert samples.d_hat.min() > 0.02 and samples.alpha_dot.max() < 0.01
+    assert seen[0, 3] == pytest.approx(1) and seen[0, 4] == pytest.approx(depths[0, -1].item(), abs=1e-4)
+    torch.testing.assert_close(seen[0, :3], samples.colour[0, -1], atol=1e-3, rtol=0)
+    assert samples.colour[0, -1].min() > 0 and seen[1, 3] < 0.01
+
+
+def test_a_shell_deeper_than_high_finds_the_surface_at_its_bottom():
+    """3 cm outside, 10 cm inside, and a surface 7 cm inside the body: farther from the skin than the shell is high."""
+    settings = SETTINGS.model_copy(update={"outer_m": 0.03, "inner_m": 0.1, "shell_cell_m": 0.015})
+    bodies, conditions = standing()
+    field = deeper_by(0.07, settings)
+    field.tighten(RIG, conditions.pose)
+    ray = torch.tensor([[0.5, 0.5, 3.0]]), -torch.eye(3)[[2]], torch.zeros(1, dtype=torch.long)
+    with torch.no_grad():
+        seen = field.look(bodies, field.region(bodies, conditions), *ray, conditions)[0]
+    top_m = 3 - bodies.vertices_m[0, :, 2].max().item()
+    assert seen[3] == pytest.approx(1, abs=0.01) and seen[4].item() - top_m == pytest.approx(0.07, abs=0.01)
 
 
 def test_the_shell_moves_with_the_surface_of_a_frame():
-    """A frame that lies 2 cm further out everywhere has its shell 2 cm further out, at most where the setting ends."""
-    settings = SETTINGS.model_copy(update={"nodes": 1, "shell_cell_m": 0.01})
-    field = FastField(RIG, settings, 1)
+    """Of a frame that lies 2 cm higher the shell is 2 cm higher; of one that lies 6 cm higher its upper end goes no
+    farther than the setting of 7 cm, 5 cm above where it was."""
+    settings = SETTINGS.model_copy(update={"nodes": 1, "shell_cell_m": 0.01, "inner_m": 0.1})
+    field = FastField(RIG, settings, 2)
     assert field.deformation is not None
     field.outer_m.fill_(0.02)
-    field.inner_m.fill_(0.03)
-    field.deformation.displacement.data[0, 0] = torch.tensor([0.0, 0.0, 0.02])
+    field.inner_m.fill_(0.07)
+    field.deformation.displacement.data[:2, 0, 2] = torch.tensor([0.02, 0.06])
     bodies, _ = standing()
-    ray = torch.tensor([[0.5, 0.5, 3.0]]), torch.tensor([[0.0, 0.0, -1.0]]), torch.zeros(1, dtype=torch.long)
+    ray = torch.tensor([[0.5, 0.5, 3.0]]), -torch.eye(3)[[2]], torch.zeros(1, dtype=torch.long)
 
-    def ways(moment: int) -> tuple[float, float]:
+    def ends(moment: int) -> torch.Tensor:
         """Depths of the first and the last sample on a ray from above."""
         moments = Conditions.of(RIG, bodies.theta, bodies.root, torch.tensor([moment]), 2.5)
-        depths, _, ended = field.region(bodies, moments).sample_rays(*ray, torch.full((1, 64), 0.5))
-        assert ended.all()
-        return depths[0, 0].item(), depths[0, -1].item()
+        depths, _, core = field.region(bodies, moments).sample_rays(*ray, torch.full((1, 64), 0.5))
+        assert core.all()
+        return depths[0, [0, -1]]
 
-    (began, ended), (still_began, still_ended) = ways(0), ways(-1)
-    assert still_began - began == pytest.approx(0.02, abs=0.006)
-    assert still_ended - ended == pytest.approx(0.02, abs=0.011)
+    still = ends(-1)
+    torch.testing.assert_close(still - ends(0), torch.tensor([0.02, 0.02]), atol=0.011, rtol=0)
+    torch.testing.assert_close(still - ends(1), torch.tensor([0.05, 0.06]), atol=0.011, rtol=0)
