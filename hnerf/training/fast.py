@@ -160,6 +160,10 @@ class FastField(Field):
         samples = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, draws.beyond, elastic)
         return samples, depths
 
+    def coverage(self, samples: RaySamples) -> Tensor:
+        """By the surface, not by the core that ends rays behind it."""
+        return 1 - (1 - samples.alpha_dot).prod(1)
+
     def samples_needed(self, region: ShellGrid, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
         """As many as a ray's way through the shell asks for."""
         needed = region.path_m(origins_m, directions, frame) / SPACING_M

@@ -87,6 +87,10 @@ class Field(nn.Module, ABC):
             seen[pick] = torch.cat([composite(weights, samples.colour), cover, depth * (cover > 0)], 1)
         return seen
 
+    def coverage(self, samples: RaySamples) -> Tensor:
+        """How far what the field has learned covers rays, (R,)."""
+        return 1 - (1 - samples.in_box * samples.alpha).prod(1)
+
     @abstractmethod
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """d_hat (N,) metres at points (N, 3) around the first body, negative inside."""

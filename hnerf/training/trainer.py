@@ -197,16 +197,13 @@ class Trainer:
 
     @torch.no_grad()
     def _look(self, rows: Tensor, generator: torch.Generator) -> tuple[Tensor, Any, Tensor]:
-        """Rays at some frames as the model renders them: colour (R, 3), the rays, and how far radiance and surface both
-        cover them, (R,)."""
+        """Rays at some frames as the model renders them: colour (R, 3), the rays, coverage (R,)."""
         rays = self.pixels.draw(rows, HELD_OUT_RAYS // len(rows) + 1, generator)
         draws = Draws.still(len(rays.frame), self.field.samples, self.processes.device)
         samples, _ = self.field.sample(
             self.stage.bodies, self.stage.region, rays.origins_m, rays.directions, rays.frame, self.conditions, draws
         )
-        by_radiance, by_surface = (1 - (1 - samples.in_box * a).prod(1) for a in (samples.alpha, samples.alpha_dot))
-        colour = pixel(samples.in_box * samples.alpha, samples)
-        return colour, rays, torch.minimum(by_radiance, by_surface)
+        return pixel(samples.in_box * samples.alpha, samples), rays, self.field.coverage(samples)
 
     def _require_surface(self) -> None:
         _, rays, coverage = self._look(self.train_rows, torch.Generator().manual_seed(self.settings.seed))

@@ -132,7 +132,7 @@ def test_a_rendered_ray_ends_at_the_solid_core_where_the_surface_lies_deeper():
     with torch.no_grad():
         samples, depths = field.sample(bodies, region, *rays, conditions, draws)
         seen = field.look(bodies, region, *rays, conditions)
-    assert samples.d_hat.min() > 0.02 and samples.alpha_dot.max() < 0.01
+    assert samples.d_hat.min() > 0.02 and field.coverage(samples).max() < 0.01
     assert seen[0, 3] == pytest.approx(1) and seen[0, 4] == pytest.approx(depths[0, -1].item(), abs=1e-4)
     torch.testing.assert_close(seen[0, :3], samples.colour[0, -1], atol=1e-3, rtol=0)
     assert samples.colour[0, -1].min() > 0 and seen[1, 3] < 0.01
