@@ -4,7 +4,7 @@ usage: python benchmarks/score_shared.py [CAPTURE ...] [--preset NAME] [--store 
 
 Needs `../shared` beside this checkout (`data/`, `accept/score_run.py`) and the package installed. Writes
 `benchmarks/results/RESULT.json` and `.md`, by default `shared-NAME`. Stages that the store has already are not run
-again: seconds of the whole run mean something for an empty store only.
+again, so that for a subject that it has seconds of the whole run mean nothing and are left out.
 """
 
 import argparse
@@ -50,7 +50,7 @@ def measure(capture: Path, preset: str, store: Path, overrides: list[str]) -> di
     """Run the pipeline on one capture and score it; {"error": its last line} where it fails."""
     command = [str(Path(sys.executable).with_name("hnerf")), "run", str(capture), "--preset", preset]
     command += ["--store", str(store), *(f"--set={override}" for override in overrides)]
-    started = time.perf_counter()
+    known, started = (store / "subjects" / capture.name).exists(), time.perf_counter()
     lines: list[str] = []
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as run:
         assert run.stdout is not None
@@ -61,7 +61,7 @@ def measure(capture: Path, preset: str, store: Path, overrides: list[str]) -> di
         return {"error": next((line for line in reversed(lines) if line), f"exit status {run.returncode}")}
     report = next(line.removeprefix("report:").strip() for line in lines if line.startswith("report:"))
     subject = Path(report).parent.parent
-    figures: dict[str, Any] = {"run_seconds": time.perf_counter() - started}
+    figures: dict[str, Any] = {"run_seconds": None if known else time.perf_counter() - started}
     figures["training"] = json.loads((subject / "training" / "report.json").read_text())
     figures["own_metrics"] = json.loads((subject / "evaluation" / "metrics.json").read_text())
     return figures | {"score": score(subject, capture)}
@@ -115,7 +115,8 @@ def _cost_table(captures: dict[str, Any]) -> list[str]:
             fit = (figures["score"] or {}).get("fit")
             joints = "" if fit is None else f"{fit['limb_joint_error_mm']:.1f}"
             image = f"{figures['own_metrics']['seconds_per_image']:.2f}"
-            rows.append([name, joints, f"{figures['training']['seconds']:.0f}", image, f"{figures['run_seconds']:.0f}"])
+            run = "" if figures["run_seconds"] is None else f"{figures['run_seconds']:.0f}"
+            rows.append([name, joints, f"{figures['training']['seconds']:.0f}", image, run])
     return table(rows)
 
 
