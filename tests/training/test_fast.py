@@ -60,7 +60,7 @@ def test_a_tight_shell_shows_the_same_picture():
         samples, _ = field.sample(
             bodies, field.region(bodies, conditions), origins, directions, frame, conditions, draws
         )
-        return 1 - (1 - samples.alpha).prod(1)
+        return field.coverage(samples)
 
     before = coverage()
     field.tighten(RIG, conditions.pose)
