@@ -70,6 +70,7 @@ def fit_body(capture: Capture, masks: "Masks | None", settings: FitSettings) -> 
             if balance:
                 habit = Habit.of_one_view(_by_split(capture), pose, seen.cameras[0])
                 pose = unflipped(replace(problem, habit=habit), pose, runs(capture))
+                habit = habit.learned(pose)
             else:
                 habit = Habit.of_hands(len(pose.root), Articulation(pose.rig))
         if masks is not None:

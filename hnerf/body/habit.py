@@ -1,7 +1,7 @@
 """Joints are likely to be turned as they mostly are: what is seen badly is told by the frames in which it is seen."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,29 +12,33 @@ from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.robust import faded
 from hnerf.capture.camera import Camera
 
-HABIT_DEG = 7.0
-FADES_DEG = 14.0  # from where the pull fades: another posture
-HANDS = 2.0  # trust in the turn of the wrists, which only outlines tell: 5 degrees
+WRISTS_DEG, OTHER_WRISTS_DEG = 5.0, 10.0
+POSTURE_DEG, OTHER_POSTURE_DEG = 7.0, 14.0
+STILLEST_DEG = 2.0
+CHI_MEDIAN = 1.54  # of the length of a vector of three unit normals
+TINY = 1e-6  # keeps the usual turn of what no frame is trusted to tell where it is
 
 
 @dataclass(frozen=True)
 class Habit:
-    """A joint is likely to be turned by 7 degrees about its median over a group of frames, and Geman-McClure lets
-    another posture go.
+    """A joint is likely to be turned by `spread` about its median over a group of frames, and Geman-McClure lets
+    another posture go from `other` on.
 
-    groups: the frames' rows, each in one of them; trust (n, M - 1) by frame and free joint: 0 is none, 4 half the
-    angle.
+    groups: the frames' rows, each in one of them; trust (n, M - 1) by frame and free joint: 0 is none, 1 all; spread
+    (n, M - 1) and other in radians.
     """
 
     groups: list[list[int]]
     trust: Tensor
+    spread: Tensor
+    other: float
 
     @staticmethod
     def of_hands(frames: int, articulation: Articulation) -> "Habit":
         """Of the wrists alone, over all frames: no keypoint shows how they turn."""
         names = [articulation.rig.joint_names[joint] for joint in articulation.joints[1:].tolist()]
-        trust = torch.tensor([HANDS * name.startswith("wrist") for name in names], dtype=torch.float64)
-        return Habit([list(range(frames))], trust.expand(frames, -1))
+        trust = torch.tensor([name.startswith("wrist") for name in names], dtype=torch.float64)
+        return Habit.alike([list(range(frames))], trust.expand(frames, -1), WRISTS_DEG, OTHER_WRISTS_DEG)
 
     @staticmethod
     def of_one_view(groups: list[list[int]], pose: Pose, camera: Camera) -> "Habit":
@@ -44,21 +48,49 @@ class Habit:
         trust = torch.zeros(len(pose.root), len(Articulation(pose.rig).joints) - 1, dtype=pose.root.dtype)
         for rows in groups:
             trust[rows] = turning(pose.root[rows], camera)
-        return Habit(groups, trust)
+        return Habit.alike(groups, trust, POSTURE_DEG, OTHER_POSTURE_DEG)
+
+    @staticmethod
+    def alike(groups: list[list[int]], trust: Tensor, spread_deg: float, other_deg: float) -> "Habit":
+        """With the same spread for all joints and frames."""
+        return Habit(groups, trust, torch.full_like(trust, math.radians(spread_deg)), math.radians(other_deg))
+
+    def learned(self, pose: Pose) -> "Habit":
+        """With each joint's spread as it is in a first fit: who stands still while turning may be held to it, who walks
+        may not. Between 2 degrees and what was believed before."""
+        length = self._off(pose.theta[:, Articulation(pose.rig).joints[1:]]).norm(dim=-1) / CHI_MEDIAN
+        spread = self.spread.clone()
+        for rows in self.groups:
+            spread[rows] = length[rows].quantile(0.5, dim=0).clamp(min=math.radians(STILLEST_DEG)).minimum(spread[rows])
+        return replace(self, spread=spread)
+
+    def _off(self, turns: Tensor) -> Tensor:
+        """From the medians, (n, M - 1, 3) radians."""
+        off = torch.zeros_like(turns)
+        for rows in self.groups:
+            off[rows] = turns[rows] - turns[rows].quantile(0.5, dim=0)
+        return off
+
+    def unknowns(self, articulation: Articulation) -> int:
+        """How many usual turns there are, shared unknowns of their own."""
+        return len(self.groups) * (articulation.unknowns - 6)
 
     def add(self, equations: NormalEquations, articulation: Articulation, pose: Pose) -> float:
-        """Returns the cost. The median's own derivative is left out."""
-        turns = pose.theta[:, articulation.joints[1:]]  # (n, M - 1, 3)
-        usual = torch.zeros_like(turns)
-        for rows in self.groups:
-            usual[rows] = turns[rows].quantile(0.5, dim=0)
-        off = turns - usual
-        squared = off.square().sum(-1) * self.trust
-        weight, cost = faded(squared, math.radians(HABIT_DEG), math.radians(FADES_DEG))
-        weight = weight * self.trust
-        equations.frame_gradient[:, 6:] += (weight[..., None] * off).flatten(1).numpy()
+        """Returns the cost. Usual turns move together with the frames' own: they are the last shared unknowns, so that
+        a step does not hold the frames to the medians from before it; after it the medians are taken anew."""
+        off = self._off(pose.theta[:, articulation.joints[1:]])
+        weight, cost = faded(off.square().sum(-1) * self.trust, self.spread, self.other)
+        weights = (weight * self.trust).repeat_interleave(3, 1).numpy()  # (n, 3 (M - 1))
+        pull = weights * off.flatten(1).numpy()
+        equations.frame_gradient[:, 6:] += pull
         at = np.arange(6, articulation.unknowns)
-        equations.frame[0][:, at, at] += weight.repeat_interleave(3, 1).numpy()
+        equations.frame[0][:, at, at] += weights
+        first = len(equations.shared) - self.unknowns(articulation)
+        for group, rows in enumerate(self.groups):
+            own = first + group * len(at) + np.arange(len(at))
+            equations.border[np.array(rows)[:, None], at, own] -= weights[rows]
+            equations.shared[own, own] += weights[rows].sum(0) + TINY
+            equations.shared_gradient[own] -= pull[rows].sum(0)
         return float(cost.sum())
 
 

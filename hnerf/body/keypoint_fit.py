@@ -62,14 +62,16 @@ class Problem:
         x, by_frame, by_shape = articulation.jacobian(points, joints)
         by_shared = torch.cat([by_shape, _offset_jacobian(points, joints.rotations)], -1)
         matrix, pull, cost = inform(x)
-        equations = NormalEquations(len(x), articulation.unknowns, by_shared.shape[-1])
+        own = by_shared.shape[-1]
+        habits = self.habit.unknowns(articulation) if self.habit else 0
+        equations = NormalEquations(len(x), articulation.unknowns, own + habits)
         weighted = (matrix @ by_frame).flatten(1, 2)
         frame, shared, gradient = by_frame.flatten(1, 2), by_shared.flatten(1, 2), pull.flatten(1)[..., None]
         equations.frame[0] += (frame.mT @ weighted).numpy()
-        equations.border += (weighted.mT @ shared).numpy()
-        equations.shared += ((matrix @ by_shared).flatten(0, 2).mT @ by_shared.flatten(0, 2)).numpy()
+        equations.border[..., :own] += (weighted.mT @ shared).numpy()
+        equations.shared[:own, :own] += ((matrix @ by_shared).flatten(0, 2).mT @ by_shared.flatten(0, 2)).numpy()
         equations.frame_gradient += (frame.mT @ gradient)[..., 0].numpy()
-        equations.shared_gradient += (shared.mT @ gradient)[..., 0].sum(0).numpy()
+        equations.shared_gradient[:own] += (shared.mT @ gradient)[..., 0].sum(0).numpy()
         cost += self._add_shape_prior(equations, pose)
         cost += PosePrior(articulation).add(equations, pose)
         cost += self.smoothness.add(equations, x, by_frame)
@@ -89,9 +91,10 @@ class Problem:
         excess = float(rig.vertices_m[top, 2] - rig.vertices_m[bottom, 2] - likely.stature_m) / likely.stature_spread_m
         by_beta = ((rig.shape_basis[:, top, 2] - rig.shape_basis[:, bottom, 2]) / likely.stature_spread_m).numpy()
         shape = slice(0, len(by_beta))
-        equations.shared[np.diag_indices(len(values))] += precision.numpy()
+        at = np.arange(len(values))
+        equations.shared[at, at] += precision.numpy()
         equations.shared[shape, shape] += np.outer(by_beta, by_beta)
-        equations.shared_gradient += (precision * values).numpy()
+        equations.shared_gradient[at] += (precision * values).numpy()
         equations.shared_gradient[shape] += excess * by_beta
         return 0.5 * float((precision * values**2).sum()) + 0.5 * excess**2
 
@@ -125,11 +128,12 @@ class Problem:
 
     def moved(self, pose: Pose, equations: NormalEquations, damping: float) -> Pose:
         """The pose after a damped Gauss-Newton step, its rig linearised anew."""
-        beta, unbounded = pose.rig.beta, torch.full((pose.offsets_m.numel(),), torch.inf)
+        beta = pose.rig.beta
+        unbounded = torch.full((len(equations.shared) - len(beta),), torch.inf)
         low = torch.cat([self.likely.beta_low - beta, -unbounded]).numpy()
         high = torch.cat([self.likely.beta_high - beta, unbounded]).numpy()
         frame, shared = (torch.from_numpy(part) for part in equations.step(damping, low, high))
-        change, offsets = shared.split([len(beta), pose.offsets_m.numel()])
+        change, offsets = shared[: len(beta) + pose.offsets_m.numel()].tensor_split([len(beta)])
         moved = Articulation(pose.rig).moved(pose, frame)
         return replace(moved, rig=self.reshape(beta + change), offsets_m=pose.offsets_m + offsets.reshape(-1, 3))
 
