@@ -30,7 +30,7 @@ STILL_RAD = 0.05  # spread of joints below which nothing can be learned from the
 POSE_WIDTH = 8
 NODES = 128  # about 12 cm apart: what they cannot follow, such as a collar, is the canonical surface's own
 LOOKS = 0.5  # how often a person's pixel is drawn in the mean
-LEAST_STEPS, MOST_STEPS = 300, 600
+LEAST_STEPS, MOST_STEPS = 600, 1200
 
 
 @dataclass(frozen=True)
