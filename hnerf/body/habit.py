@@ -12,9 +12,9 @@ from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.robust import faded
 from hnerf.capture.camera import Camera
 
-WRISTS_DEG, OTHER_WRISTS_DEG = 5.0, 10.0
+WRISTS_DEG, OTHER_WRISTS_DEG = 5.0, 10.0  # how far a joint is usually off, and from where it is another posture
 POSTURE_DEG, OTHER_POSTURE_DEG = 7.0, 14.0
-STILLEST_DEG = 2.0
+STILLEST_DEG = 2.0  # nobody stands stiller, as far as a first fit can tell
 CHI_MEDIAN = 1.54  # of the length of a vector of three unit normals
 TINY = 1e-6  # keeps the usual turn of what no frame is trusted to tell where it is
 

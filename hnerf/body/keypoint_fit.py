@@ -43,8 +43,8 @@ Information = tuple[
 @dataclass(frozen=True)
 class Problem:
     """What was seen and what is likely; assembles the normal equations at a pose. Shared unknowns: beta (B,), then the
-    offsets (75,). scale_m (C, n) metres a pixel spans at the person: held fixed, or coming nearer would pay. balance:
-    with one camera only; habit: None as long as no posture is known."""
+    offsets (75,), then what is usual by the habit. scale_m (C, n) metres a pixel spans at the person: held fixed, or
+    coming nearer would pay. balance: with one camera only; habit: None as long as no posture is known."""
 
     seen: Observations
     scale_m: Tensor
@@ -133,7 +133,7 @@ class Problem:
         low = torch.cat([self.likely.beta_low - beta, -unbounded]).numpy()
         high = torch.cat([self.likely.beta_high - beta, unbounded]).numpy()
         frame, shared = (torch.from_numpy(part) for part in equations.step(damping, low, high))
-        change, offsets = shared[: len(beta) + pose.offsets_m.numel()].tensor_split([len(beta)])
+        change, offsets, _ = shared.tensor_split([len(beta), len(beta) + pose.offsets_m.numel()])
         moved = Articulation(pose.rig).moved(pose, frame)
         return replace(moved, rig=self.reshape(beta + change), offsets_m=pose.offsets_m + offsets.reshape(-1, 3))
 
