@@ -4,7 +4,6 @@ alone."""
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
@@ -34,12 +33,17 @@ class ShellGrid:
         """
         margin_m = float(outer_m.max()) + 2 * cell_m
         lower = surfaces_m.amin(1) - margin_m
-        size = ((surfaces_m.amax(1) + margin_m - lower).amax(0) / cell_m).ceil().int().tolist()
+        sizes = ((surfaces_m.amax(1) + margin_m - lower) / cell_m).ceil().long()
         index = ((surfaces_m - lower[:, None]) / cell_m).long()
-        by_frame = (t.cpu().numpy() for t in (index, outer_m / cell_m, inner_m / cell_m))
+        cells = np.full((len(sizes), *sizes.amax(0).tolist()), EMPTY, np.uint8)
+
+        def fill(own: np.ndarray, size: np.ndarray, *surface: np.ndarray) -> None:
+            own[tuple(map(slice, size))] = _cells_around(size, *surface)
+
+        by_frame = (t.cpu().numpy() for t in (sizes, index, outer_m / cell_m, inner_m / cell_m))
         with ThreadPoolExecutor(torch.get_num_threads()) as threads:
-            cells = list(threads.map(partial(_cells_around, size), *by_frame))
-        return ShellGrid(torch.from_numpy(np.stack(cells)).to(surfaces_m.device), lower, cell_m)
+            list(threads.map(fill, cells, *by_frame))
+        return ShellGrid(torch.from_numpy(cells).to(surfaces_m.device), lower, cell_m)
 
     def look_up(self, origins_m: Tensor, directions: Tensor, depths_m: Tensor, frame: Tensor) -> Tensor:
         """State of the cells at depths (R, K) along rays (R, 3) in frames (R,): (R, K) uint8. Beyond the grid it is
@@ -101,7 +105,7 @@ def lattice(vertices_m: Tensor, faces: Tensor, spacing_m: float) -> tuple[Tensor
     return torch.cat(corners), torch.cat(weights)
 
 
-def _cells_around(size: list[int], points: np.ndarray, outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
+def _cells_around(size: np.ndarray, points: np.ndarray, outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
     """States of a frame's cells around points in cells (V, 3) with thicknesses (V,), all in cells."""
     at = tuple(points.T)
     surface = np.zeros(size, bool)
@@ -118,7 +122,7 @@ def _cells_around(size: list[int], points: np.ndarray, outer: np.ndarray, inner:
     return cells
 
 
-def _greatest_nearby(size: list[int], at: tuple[np.ndarray, ...], values: np.ndarray) -> np.ndarray:
+def _greatest_nearby(size: np.ndarray, at: tuple[np.ndarray, ...], values: np.ndarray) -> np.ndarray:
     """Greatest of the values that fall into a cell or its neighbours, an array of this size."""
     greatest = np.zeros(size, np.float32)
     np.maximum.at(greatest, at, values)

@@ -23,6 +23,9 @@ TIGHTEN_STEP_M = 0.004
 ELASTIC_M = 0.01  # a displacement whose elastic energy is 1
 SPACING_M = 0.012  # between the samples of a rendering; twice as many gain 0.05 dB on valid-wave for twice the time
 SAMPLES = (6, 12, 18, 24, 36, 64)  # of which a ray gets the first that is enough, or the last
+COARSE = (
+    0.75  # of the training has half the samples: valid-wave is as accurate with them, in three quarters of the time
+)
 NEGLIGIBLE = 1e-3  # a sample of less weight gets no colour
 
 
@@ -164,6 +167,10 @@ class FastField(Field):
         """By the surface, not by the core that ends rays behind it."""
         return 1 - (1 - samples.alpha_dot).prod(1)
 
+    def samples_in_training(self, done: float) -> int:
+        """Half of them first, while the surface is not where it will be."""
+        return self.samples if done >= COARSE else -(-self.samples // 2)
+
     def samples_needed(self, region: ShellGrid, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
         """As many as a ray's way through the shell asks for."""
         needed = region.path_m(origins_m, directions, frame) / SPACING_M
@@ -195,7 +202,8 @@ class FastField(Field):
         """|grad d_hat| in the canonical frame at one sample a ray, probe (R,) in [0, 1), by forward differences: the
         interpolation of a grid has no useful second derivative. skin: descriptors before the deformation, which say
         where outwards is. Gradients flow to the field alone."""
-        pick = torch.arange(len(probe), device=probe.device) * self.samples + (probe * self.samples).long()
+        samples = len(described.d) // len(probe)
+        pick = torch.arange(len(probe), device=probe.device) * samples + (probe * samples).long()
         pick = pick[described.near[pick]]
         step_m = self.settings.gradient_step_m
         y, d = described.y[pick].detach(), described.d[pick].detach()

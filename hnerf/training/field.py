@@ -58,6 +58,10 @@ class Field(nn.Module, ABC):
     ) -> tuple[RaySamples, Tensor]:
         """Radiance and distance along rays (R, 3) of body rows (R,); also depths (R, K) in metres."""
 
+    def samples_in_training(self, done: float) -> int:
+        """Random numbers that a ray needs when so much of the training, 0 to 1, is over."""
+        return self.samples
+
     def samples_needed(self, region: Any, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
         """How many samples a rendering takes along rays (R, 3) of body rows (R,): (R,) long, 0 where nothing can be
         seen."""

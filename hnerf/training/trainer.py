@@ -6,6 +6,7 @@ import json
 import logging
 import resource
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
 from hnerf.training.conditions import Conditions, Draws, own_share
 from hnerf.training.losses import pixel
 from hnerf.training.model import build_field
-from hnerf.training.pixels import Pixels, gather_pixels
+from hnerf.training.pixels import Pixels, Rays, gather_pixels
 from hnerf.training.processes import Processes
 from hnerf.training.step import Objective, Stage, TrainingError, not_finite
 
@@ -37,6 +38,7 @@ HELD_OUT_RAYS = 2048
 LEAST_COVERAGE = 0.2  # of the person's pixels; below it the surface has collapsed
 LOG_STEPS = 25
 POSES_APART = 6  # training poses between those that say how thick the shell must be
+HALVES = 2  # of a batch, side by side on a CPU: operations are too small to share cores; two sums have one order only
 
 
 class Trainer:
@@ -64,6 +66,9 @@ class Trainer:
         self.train_rows = torch.tensor([rows[f] for f in capture.train_frames if f in rows], device=device)
         held_out = [rows[f] for f in capture.novel_pose_frames if f in rows and f not in capture.train_frames]
         self.novel_rows = torch.tensor(held_out, dtype=torch.long, device=device)
+        threads = torch.get_num_threads()
+        self.parts = HALVES if device.type == "cpu" and processes.world_size == 1 and threads > 1 else 1
+        self.side_by_side = ThreadPoolExecutor(self.parts, "part", torch.set_num_threads, (threads // self.parts,))
         self.step, self.skipped, self.seconds = 0, 0, 0.0
         self.field_steps, self.field_seconds = settings.steps, 0.0  # fewer steps where the time is up before
         self.history: list[dict[str, Any]] = []
@@ -148,13 +153,13 @@ class Trainer:
         rows = self.train_rows if self.step < self.field_steps else self.novel_rows
         pick = torch.randperm(len(rows), generator=self.generator)[: s.frames_per_step].to(rows.device)
         rays = self.pixels.draw(rows[pick], s.rays_per_frame, self.generator)
-        draws = Draws.random(len(rays.frame), self.field.samples, s.noise, self.generator, p.device)
+        samples = self.field.samples_in_training(self._done())
+        draws = Draws.random(len(rays.frame), samples, s.noise, self.generator, p.device)
         conditions = self.conditions.noisy(s.noise, self.generator)
         self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
         share = own_share(rays, p.rank, p.world_size), conditions, own_share(draws, p.rank, p.world_size)
-        terms = module(self.stage, *share)
-        torch.stack(list(terms.values())).sum().backward()
+        terms = self._backward(module, *share)
         gradients = [q.grad for q in self.objective.parameters() if q.grad is not None]
         fault = not_finite(terms, gradients, self.step)
         if fault is None:
@@ -169,14 +174,28 @@ class Trainer:
                 )
         return terms
 
-    def _set_rates(self) -> None:
+    def _backward(self, module: torch.nn.Module, rays: Rays, conditions: Conditions, draws: Draws) -> dict[str, Tensor]:
+        """Adds the gradients of a batch to the parameters'; the losses by name."""
+
+        def of_part(part: int) -> dict[str, Tensor]:
+            terms = module(self.stage, own_share(rays, part, n), conditions, own_share(draws, part, n))
+            (torch.stack(list(terms.values())).sum() / n).backward()
+            return {name: term.detach() for name, term in terms.items()}
+
+        n = self.parts
+        found = list(self.side_by_side.map(of_part, range(n))) if n > 1 else [of_part(0)]
+        return {name: torch.stack([terms[name] for terms in found]).mean() for name in found[0]}
+
+    def _done(self) -> float:
+        """How much of the phase is over."""
         s = self.settings
+        if self.step < self.field_steps:
+            return max(self.step / s.steps, self.seconds / s.seconds if s.seconds else 0.0)
+        return (self.step - self.field_steps) / s.novel_pose_steps
+
+    def _set_rates(self) -> None:
         phase_step = self.step if self.step < self.field_steps else self.step - self.field_steps
-        if phase_step == self.step:
-            done = max(self.step / s.steps, self.seconds / s.seconds if s.seconds else 0.0)
-        else:
-            done = phase_step / s.novel_pose_steps
-        factor = s.final_learning_rate**done * min(1.0, (phase_step + 1) / WARM_UP_STEPS)
+        factor = self.settings.final_learning_rate ** self._done() * min(1.0, (phase_step + 1) / WARM_UP_STEPS)
         for group, rate in zip(self.optimizer.param_groups, self.first_rates, strict=True):
             group["lr"] = rate * factor
 

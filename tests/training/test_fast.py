@@ -173,3 +173,9 @@ def test_the_shell_moves_with_the_surface_of_a_frame():
     still = ends(-1)
     torch.testing.assert_close(still - ends(0), torch.tensor([0.02, 0.02]), atol=0.011, rtol=0)
     torch.testing.assert_close(still - ends(1), torch.tensor([0.05, 0.06]), atol=0.011, rtol=0)
+
+
+def test_training_begins_with_half_the_samples():
+    """Of 32 samples 16 for three quarters of the steps, then all; a rendering has what it asks for."""
+    field = FastField(RIG, SETTINGS, 1)
+    assert [field.samples_in_training(done) for done in (0.0, 0.74, 0.75, 1.0)] == [16, 16, 32, 32]

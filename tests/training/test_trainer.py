@@ -72,7 +72,7 @@ def test_overfits_the_column(tmp_path: Path):
     """A few seconds are enough for a render of a training view within 40 dB, in the right place."""
     capture, masks, body = record(tmp_path / "capture")
     rates = {"network_learning_rate": 0.02, "grid_learning_rate": 0.05}
-    fast = TINY.fast.model_dump() | rates | {"samples": 16, "outer_m": 0.1}
+    fast = TINY.fast.model_dump() | rates | {"samples": 32, "outer_m": 0.1}
     out = tmp_path / "out"
     out.mkdir()
     train(capture, masks, body, with_changes(fast=fast, steps=180, rays_per_frame=256), out, ALONE)
@@ -231,6 +231,25 @@ def test_two_ranks_have_the_gradients_of_one(tmp_path: Path):
         torch.testing.assert_close(
             gradients[1][name], gradient, atol=1e-6, rtol=1e-4, msg=lambda m, n=name: f"{n}: {m}"
         )
+
+
+def test_two_halves_side_by_side_have_the_gradients_of_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """On a CPU with two threads, whichever half ends first: bit by bit the same each time, and those of one batch but
+    for the order of sums."""
+    gradients = []
+    for threads in (1, 2, 2):
+        monkeypatch.setattr(torch, "get_num_threads", lambda n=threads: n)
+        t = Trainer(*record(tmp_path / "capture"), TINY, tmp_path, ALONE)
+        assert t.parts == threads
+        t.optimizer.step = lambda: None
+        terms = t._optimise(t.objective)
+        found = {name: q.grad for name, q in t.objective.named_parameters() if q.grad is not None}
+        gradients.append(found | {name: term.detach() for name, term in terms.items()})
+    whole, halves, again = gradients
+    assert whole.keys() == halves.keys() and any("correction" in name for name in whole)
+    for name, gradient in whole.items():
+        torch.testing.assert_close(halves[name], gradient, atol=1e-6, rtol=1e-4)
+        torch.testing.assert_close(halves[name], again[name], atol=0, rtol=0)
 
 
 def _environment() -> dict[str, str]:
