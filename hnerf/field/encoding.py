@@ -11,7 +11,8 @@ def positional_encoding(x: Tensor, octaves: int) -> Tensor:
 
 
 class FeatureGrids(nn.Module):
-    """Dense grids of several resolutions over a box, trilinearly interpolated and concatenated.
+    """Dense grids of several resolutions over a box, trilinearly interpolated and concatenated; zero at first, and
+    where nothing was learned.
 
     cells: cells of each level along the box's longest side; channels: features a level.
     """
@@ -27,7 +28,7 @@ class FeatureGrids(nn.Module):
         self.levels = nn.ParameterList()
         for n in cells:
             x, y, z = (int(s) + 1 for s in (size / size.max() * n).round())
-            self.levels.append(nn.Parameter(torch.empty(1, channels, z, y, x).uniform_(-0.1, 0.1)))
+            self.levels.append(nn.Parameter(torch.zeros(1, channels, z, y, x)))
         self.width = channels * len(cells)
 
     def forward(self, y_m: Tensor) -> Tensor:

@@ -20,11 +20,11 @@ from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.camera import Camera
 from hnerf.config import TrainingSettings
-from hnerf.errors import CaptureError
 from hnerf.render.avatar import Rendering
 from hnerf.training.conditions import Conditions
 from hnerf.training.fast import FastField
 from hnerf.training.field import Field
+from hnerf.training.model_file import fill_field
 from hnerf.training.paper import PaperField
 from hnerf.training.pixels import within_reach
 
@@ -114,11 +114,9 @@ def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvat
     settings = TrainingSettings.model_validate(stored["training"])
     body = BodyFit.load(folder)
     body = BodyFit(body.rig.to(device), body.frames, body.theta.to(device), body.root.to(device))
-    tensors = load_file(folder / "model.safetensors", device=str(device))
+    path = folder / "model.safetensors"
+    tensors = load_file(path, device=str(device))
     before_tuning = dataclasses.replace(body, rig=dataclasses.replace(body.rig, vertices_m=tensors["canonical_m"]))
     field = build_field(settings, before_tuning, stored["static"]).to(device)
-    try:
-        field.load_state_dict(tensors)
-    except RuntimeError:
-        raise CaptureError(f"{folder / 'model.safetensors'}: of another version; train the subject again") from None
+    fill_field(field, tensors, path)
     return TrainedAvatar(field.eval(), body, settings.paper.scene_m, body)

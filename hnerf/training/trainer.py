@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
@@ -26,6 +25,7 @@ from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
 from hnerf.training.conditions import Conditions, Draws, own_share
 from hnerf.training.losses import pixel
 from hnerf.training.model import build_field
+from hnerf.training.model_file import write_field
 from hnerf.training.pixels import Pixels, Rays, gather_pixels
 from hnerf.training.processes import Processes
 from hnerf.training.step import Objective, Stage, TrainingError, not_finite
@@ -271,8 +271,7 @@ class Trainer:
         bodies = self.stage.bodies
         body = BodyFit(bodies.rig.to("cpu"), self.body.frames, bodies.theta.cpu(), bodies.root.cpu())
         body.save(folder)
-        tensors = {name: t.detach().cpu().contiguous() for name, t in self.field.state_dict().items()}
-        save_file(tensors, folder / "model.safetensors")
+        write_field(self.field, folder / "model.safetensors")
         decisions = {name: dataclasses.asdict(decision) for name, decision in self.decisions.items()}
         settings = {"static": self.static, "training": self.settings.model_dump(), "decisions": decisions}
         settings["seconds"] = self.seconds

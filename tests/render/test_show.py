@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import save_file
 
 from flows.cli import main
 from hnerf.capture.capture import Capture
@@ -17,6 +16,7 @@ from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.lens import Lens
 from hnerf.render.motion import between
 from hnerf.training.model import build_field, load_avatar
+from hnerf.training.model_file import write_field
 from tests.training.scene import TINY, record
 
 
@@ -37,8 +37,7 @@ def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
     settings = TINY.model_copy(update={"fast": TINY.fast.model_copy(update={"nodes": 1})})
     field = build_field(settings, body, False)
     field.deformation.displacement.data[:3, 0, 0] = torch.tensor([0.0, 0.15, -0.15])  # to either side, frame by frame
-    tensors = {name: value.contiguous() for name, value in field.state_dict().items()}
-    save_file(tensors, folder / "training" / "model.safetensors")
+    write_field(field, folder / "training" / "model.safetensors")
     stored = {"static": False, "training": settings.model_dump()}
     (folder / "training" / "settings.json").write_text(json.dumps(stored))
     return folder
