@@ -23,9 +23,7 @@ TIGHTEN_STEP_M = 0.004
 ELASTIC_M = 0.01  # a displacement whose elastic energy is 1
 SPACING_M = 0.012  # between the samples of a rendering; twice as many gain 0.05 dB on valid-wave for twice the time
 SAMPLES = (6, 12, 18, 24, 36, 64)  # of which a ray gets the first that is enough, or the last
-COARSE = (
-    0.75  # of the training has half the samples: valid-wave is as accurate with them, in three quarters of the time
-)
+COARSE = 0.75  # of the training has half the samples: as accurate on three captures, in three quarters of the time
 NEGLIGIBLE = 1e-3  # a sample of less weight gets no colour
 
 
@@ -148,7 +146,7 @@ class FastField(Field):
         colour = self._colour(described, pose, weights_from_alpha(alpha.detach()).flatten() > NEGLIGIBLE)
         norms = d.new_zeros(0)
         if draws.probe is not None:
-            norms = self._gradient_norms(described, skin, pose, draws.probe[hit])
+            norms = self._gradient_norms(described, skin, pose, draws.probe[hit], depths.shape[1])
         elastic = None
         if moved is not None:
             energy = torch.where(described.near, (moved / ELASTIC_M).square().sum(-1), 0.0)
@@ -198,11 +196,12 @@ class FastField(Field):
         seen = self.field.colour(described.y[pick], described.d[pick], described.normal[pick], pose[pick])
         return colour.index_copy(0, pick, seen)
 
-    def _gradient_norms(self, described: Descriptor, skin: Descriptor, pose: Tensor, probe: Tensor) -> Tensor:
-        """|grad d_hat| in the canonical frame at one sample a ray, probe (R,) in [0, 1), by forward differences: the
-        interpolation of a grid has no useful second derivative. skin: descriptors before the deformation, which say
+    def _gradient_norms(
+        self, described: Descriptor, skin: Descriptor, pose: Tensor, probe: Tensor, samples: int
+    ) -> Tensor:
+        """|grad d_hat| in the canonical frame at one of a ray's samples, probe (R,) in [0, 1), by forward differences:
+        the interpolation of a grid has no useful second derivative. skin: descriptors before the deformation, which say
         where outwards is. Gradients flow to the field alone."""
-        samples = len(described.d) // len(probe)
         pick = torch.arange(len(probe), device=probe.device) * samples + (probe * samples).long()
         pick = pick[described.near[pick]]
         step_m = self.settings.gradient_step_m

@@ -87,6 +87,9 @@ def test_rays_that_miss_the_shell_see_nothing_and_change_nothing():
     assert not alpha[1].any() and not colour[1].any() and not residual[1].any()
     assert (d[1] == field.reach_m).all()
     assert not sampled([1])[0].any()
+    where = (bodies, field.region(bodies, conditions), origins[[1]], directions[:1], torch.zeros(1, dtype=torch.long))
+    draws = Draws.random(1, 5, 0.0, torch.Generator(), torch.device("cpu"))
+    assert field.sample(*where, conditions, draws)[0].gradient_norm.shape == (0,)
     for all_three, alone in zip((alpha, colour, d, residual), sampled([0, 2]), strict=True):
         torch.testing.assert_close(all_three[[0, 2]], alone, atol=1e-6, rtol=0)
 
