@@ -149,17 +149,16 @@ class Trainer:
             parameter.requires_grad_(True)
 
     def _optimise(self, module: torch.nn.Module) -> dict[str, Tensor]:
-        s, p = self.settings, self.processes
+        s, device = self.settings, self.processes.device
         rows = self.train_rows if self.step < self.field_steps else self.novel_rows
         pick = torch.randperm(len(rows), generator=self.generator)[: s.frames_per_step].to(rows.device)
         rays = self.pixels.draw(rows[pick], s.rays_per_frame, self.generator)
         samples = self.field.samples_in_training(self._done())
-        draws = Draws.random(len(rays.frame), samples, s.noise, self.generator, p.device)
+        draws = Draws.random(len(rays.frame), samples, s.noise, self.generator, device)
         conditions = self.conditions.noisy(s.noise, self.generator)
         self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
-        share = own_share(rays, p.rank, p.world_size), conditions, own_share(draws, p.rank, p.world_size)
-        terms = self._backward(module, *share)
+        terms = self._backward(module, rays, conditions, draws)
         gradients = [q.grad for q in self.objective.parameters() if q.grad is not None]
         fault = not_finite(terms, gradients, self.step)
         if fault is None:
@@ -175,14 +174,15 @@ class Trainer:
         return terms
 
     def _backward(self, module: torch.nn.Module, rays: Rays, conditions: Conditions, draws: Draws) -> dict[str, Tensor]:
-        """Adds the gradients of a batch to the parameters'; the losses by name."""
+        """Adds the gradients of this process's share of a joint batch to the parameters'; the losses by name."""
+        n, p = self.parts, self.processes
 
         def of_part(part: int) -> dict[str, Tensor]:
-            terms = module(self.stage, own_share(rays, part, n), conditions, own_share(draws, part, n))
+            mine = p.rank * n + part, p.world_size * n
+            terms = module(self.stage, own_share(rays, *mine), conditions, own_share(draws, *mine))
             (torch.stack(list(terms.values())).sum() / n).backward()
             return {name: term.detach() for name, term in terms.items()}
 
-        n = self.parts
         found = list(self.side_by_side.map(of_part, range(n))) if n > 1 else [of_part(0)]
         return {name: torch.stack([terms[name] for terms in found]).mean() for name in found[0]}
 
