@@ -21,16 +21,23 @@ def settle_edge(mask: np.ndarray, image: np.ndarray, plate: np.ndarray) -> np.nd
     pixels just inside; the background is the plate, darkened as just outside. Coverage is the least-squares solution.
     """
     inside, outside = (cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) for m in (mask, ~mask))
-    image, plate = image.astype(np.float32), plate.astype(np.float32)
-    person, _ = _nearby(image, inside > PURE_PX)
-    darkening, weight = _nearby(np.log((image + DARK) / (plate + DARK)), outside > PURE_PX)
-    background = (plate + DARK) * np.exp(np.where(weight[..., None] > 0, darkening, 0)) - DARK
+    person, _ = _nearby(image.astype(np.float32), inside > PURE_PX)
+    background = shaded_plate(mask, image, plate)
     apart, mixed = (person - background) @ COLOUR.T, (image - background) @ COLOUR.T
     evidence = cv2.GaussianBlur(np.stack([(apart * mixed).sum(-1), (apart**2).sum(-1), mask], -1, dtype=np.float32),
                                 (0, 0), BLUR_PX)  # fmt: skip
     coverage = (evidence[..., 0] + DOUBT * evidence[..., 2]) / (evidence[..., 1] + DOUBT)
     mixing = (inside <= BAND_PX) & (outside <= BAND_PX)
     return np.where(mixing, coverage >= 0.5, mask)
+
+
+def shaded_plate(mask: np.ndarray, image: np.ndarray, plate: np.ndarray) -> np.ndarray:
+    """What is behind the pixels at a mask's edge, (H, W, 3) float32 RGB: the plate, as much darker or brighter as the
+    image is just outside the mask (H, W) bool, where shadows fall on it."""
+    image, plate = image.astype(np.float32) + DARK, plate.astype(np.float32) + DARK
+    outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    darkening, weight = _nearby(np.log(image / plate), outside > PURE_PX)
+    return plate * np.exp(np.where(weight[..., None] > 0, darkening, 0)) - DARK
 
 
 def _nearby(values: np.ndarray, pure: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

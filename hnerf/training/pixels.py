@@ -10,6 +10,7 @@ from torch import Tensor
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
+from hnerf.segmentation.edge import shaded_plate
 from hnerf.segmentation.segment import Masks
 
 EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel may mix person and surroundings
@@ -18,7 +19,7 @@ EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel m
 @dataclass(frozen=True)
 class Rays:
     """A batch: origins_m, directions (R, 3); frame (R,) row of the body fit; colour (R, 3) in [0, 1]; person (R,) bool;
-    edge (R,) bool: near the mask's outline; plate (R, 3) the clean plate's colour, or None."""
+    edge (R,) bool: near the mask's outline; plate (R, 3) the clean plate's colour with the shadows on it, or None."""
 
     origins_m: Tensor
     directions: Tensor
@@ -89,11 +90,13 @@ def gather_pixels(
             y, x = np.nonzero(wanted)
             columns["camera"].append(np.full(len(x), c, np.uint8))
             columns["xy_px"].append(np.stack([x, y], 1).astype(np.int16))
-            columns["colour"].append(capture.image(camera.name, frame)[y, x])
+            image = capture.image(camera.name, frame)
+            columns["colour"].append(image[y, x])
             columns["person"].append(mask[y, x])
             columns["edge"].append(_edge(mask)[y, x])
             if plate is not None:
-                columns["plate"].append(plate[y, x])
+                shaded = shaded_plate(mask, image, plate)[y, x]
+                columns["plate"].append(shaded.clip(0, 255).round().astype(np.uint8))
             count += len(x)
         starts.append(starts[-1] + count)
     with_plates = all(plate is not None for plate in plates)

@@ -152,7 +152,7 @@ class Trainer:
         s, device = self.settings, self.processes.device
         rows = self.train_rows if self.step < self.field_steps else self.novel_rows
         pick = torch.randperm(len(rows), generator=self.generator)[: s.frames_per_step].to(rows.device)
-        rays = self.pixels.draw(rows[pick], s.rays_per_frame, self.generator)
+        rays = self.pixels.draw(rows[pick], s.frames_per_step * s.rays_per_frame // len(pick), self.generator)
         samples = self.field.samples_in_training(self._done())
         draws = Draws.random(len(rays.frame), samples, s.noise, self.generator, device)
         conditions = self.conditions.noisy(s.noise, self.generator)

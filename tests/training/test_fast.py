@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from hnerf.body.canonical import PosedBodies
+from hnerf.body.canonical import Descriptor, PosedBodies
 from hnerf.config import FastFieldSettings
 from hnerf.training.conditions import Conditions, Draws
-from hnerf.training.fast import ROOM_M, SAMPLES, SETTLED, SPACING_M, TIGHTEN_STEP_M, FastField
+from hnerf.training.fast import ROOM_M, SAMPLES, SETTLED, SPACING_M, TIGHTEN_STEP_M, FastField, at_surface
 from hnerf.training.field import Field
 from tests.body.boxes import box_rig
 
@@ -182,3 +182,34 @@ def test_training_begins_with_half_the_samples():
     """Of 32 samples 16 for three quarters of the steps, then all; a rendering has what it asks for."""
     field = FastField(RIG, SETTINGS, 1)
     assert [field.samples_in_training(done) for done in (0.0, 0.74, 0.75, 1.0)] == [16, 16, 32, 32]
+
+
+def on_a_ray(depth_m: list[float], near: list[bool]) -> Descriptor:
+    """Descriptors of one ray's samples at some heights above the skin z = 0, which it meets head-on."""
+    d, zero = torch.tensor(depth_m), torch.zeros(len(depth_m))
+    y, normal = torch.stack([zero, zero, d], 1), torch.stack([d, zero, zero], 1)  # a normal that tells samples apart
+    return Descriptor(d, y, y, normal, torch.tensor(near), torch.zeros(len(d), 3).long(), torch.zeros(len(d), 3))
+
+
+def test_colours_are_those_of_the_surface_between_two_samples():
+    """Heights 12, 6, -2, -8 mm above the skin, and a surface 1 mm above it: the second sample moves 5 / 8 of the way to
+    the third, the first as near as the second one; those behind stay."""
+    described = on_a_ray([0.012, 0.006, -0.002, -0.008], [True] * 4)
+    moved = at_surface(described, described.d[None] - 0.001)
+    expected = torch.tensor([0.006, 0.001, -0.002, -0.008])
+    assert torch.allclose(moved.d, expected, atol=1e-7)
+    assert torch.allclose(moved.y[:, 2], expected, atol=1e-7)
+    assert torch.allclose(moved.normal[:, 0], expected, atol=1e-7)
+
+
+def test_samples_stay_where_the_next_one_is_out_of_reach_or_on_another_limb():
+    described = on_a_ray([0.005, -0.005, 0.005, -0.005], [True, False, True, True])
+    described.y[3, 0] = 0.1
+    moved = at_surface(described, described.d[None])
+    assert torch.equal(moved.d, described.d)
+    assert torch.equal(moved.y, described.y)
+
+
+def test_samples_stay_where_the_surface_is_left():
+    described = on_a_ray([0.001, 0.004, 0.004, 0.009], [True] * 4)
+    assert torch.equal(at_surface(described, described.d[None]).d, described.d)

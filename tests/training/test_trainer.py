@@ -13,6 +13,7 @@ from hnerf.errors import CaptureError
 from hnerf.training import trainer as trainer_module
 from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
 from hnerf.training.model import load_avatar
+from hnerf.training.pixels import Pixels, Rays
 from hnerf.training.processes import Processes
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import Trainer, train
@@ -257,3 +258,21 @@ def _environment() -> dict[str, str]:
     import os
 
     return os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent.parent), "OMP_NUM_THREADS": "1"}
+
+
+def test_a_step_has_as_many_rays_however_few_the_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Four frames of 64 rays are asked for; two are trained on, and one is novel."""
+    drawn = []
+    draw = Pixels.draw
+
+    def counted(self: Pixels, frames: torch.Tensor, rays_per_frame: int, generator: torch.Generator) -> Rays:
+        drawn.append((len(frames), rays_per_frame))
+        return draw(self, frames, rays_per_frame, generator)
+
+    monkeypatch.setattr(trainer_module, "LOG_STEPS", 100)
+    monkeypatch.setattr(Pixels, "draw", counted)
+    trainer = Trainer(*record(tmp_path / "capture"), with_changes(frames_per_step=4), tmp_path, ALONE)
+    for step in (0, trainer.field_steps):
+        trainer.step = step
+        trainer._optimise(trainer.objective)
+    assert drawn == [(2, 128), (1, 256)]

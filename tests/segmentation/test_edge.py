@@ -1,0 +1,25 @@
+"""What is behind the pixels at a mask's edge."""
+
+import numpy as np
+import pytest
+
+from hnerf.segmentation.edge import shaded_plate
+
+
+def test_the_plate_at_an_edge_is_as_dark_as_the_image_beside_it():
+    """A bright person on the left of a plate of 100; the ground on the right lies in a shadow of 50."""
+    plate = np.full((40, 60, 3), 100, np.uint8)
+    mask = np.zeros((40, 60), bool)
+    mask[:, :30] = True
+    image = np.where(mask[..., None], 200, 50).astype(np.uint8).repeat(3, -1)
+    shaded = shaded_plate(mask, image, plate)
+    assert shaded[20, 29:32] == pytest.approx(np.full((3, 3), 50), abs=0.5)  # the edge is between 29 and 30
+    assert shaded[20, 0] == pytest.approx(100)  # nothing near it shows the ground
+
+
+def test_an_unshaded_plate_stays_as_it_is():
+    plate = np.random.default_rng(0).integers(0, 256, (20, 20, 3)).astype(np.uint8)
+    mask = np.zeros((20, 20), bool)
+    mask[5:15, 5:15] = True
+    image = np.where(mask[..., None], 255 - plate, plate)
+    assert shaded_plate(mask, image, plate) == pytest.approx(plate.astype(float), abs=0.01)
