@@ -11,8 +11,10 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.segmentation.edge import shaded_plate
+from hnerf.segmentation.prior import window_around
 from hnerf.segmentation.segment import Masks
 
+AT_EDGES = 1 / 3  # of the rays: half of the error is there, most of it in hands and feet, which are little else
 EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel may mix person and surroundings
 
 
@@ -32,10 +34,13 @@ class Rays:
 
 @dataclass(frozen=True)
 class Pixels:
-    """Pixels of all images, ordered by frame. starts (n + 1,): each frame's range. camera (P,), xy_px (P, 2) int16;
-    colour, plate (P, 3) uint8; person, edge (P,) bool; inverse_K, R (C, 3, 3); centres_m (C, 3)."""
+    """Pixels of all images, ordered by frame. starts (n + 1,): each frame's range. edges (E,), edge_starts (n + 1,):
+    indices of those at edges likewise, or of all pixels of a frame that has none there. camera (P,), xy_px (P, 2)
+    int16; colour, plate (P, 3) uint8; person, edge (P,) bool; rays_from_px (C, 3, 3); centres_m (C, 3)."""
 
     starts: Tensor
+    edges: Tensor
+    edge_starts: Tensor
     camera: Tensor
     xy_px: Tensor
     colour: Tensor
@@ -46,10 +51,11 @@ class Pixels:
     centres_m: Tensor
 
     def draw(self, frames: Tensor, rays_per_frame: int, generator: torch.Generator) -> Rays:
-        """`rays_per_frame` pixels of each of the frames (rows), drawn with replacement."""
-        first, after = self.starts[frames], self.starts[frames + 1]
-        unit = torch.rand(len(frames), rays_per_frame, generator=generator, dtype=torch.float64).to(first.device)
-        pick = (first[:, None] + (unit * (after - first)[:, None]).long()).flatten()
+        """`rays_per_frame` pixels of each of the frames (rows), AT_EDGES of them at edges, drawn with replacement."""
+        unit = torch.rand(len(frames), rays_per_frame, generator=generator, dtype=torch.float64).to(frames.device)
+        count = round(AT_EDGES * rays_per_frame)
+        at_edges = self.edges[_within(self.edge_starts, frames, unit[:, :count])]
+        pick = torch.cat([at_edges, _within(self.starts, frames, unit[:, count:])], 1).flatten()
         camera = self.camera[pick].long()
         origins_m, directions = self.rays(camera, self.xy_px[pick])
         return Rays(
@@ -79,9 +85,9 @@ def gather_pixels(
     plates = [capture.background(name) for name in names]
     vertices_m = body.vertices_m().numpy()
     columns: dict[str, list[np.ndarray]] = {k: [] for k in ("camera", "xy_px", "colour", "plate", "person", "edge")}
-    starts = [0]
+    starts, edges, edge_starts = [0], [], [0]
     for frame in frames:
-        count = 0
+        first = len(columns["edge"])
         for c, (camera, plate) in enumerate(zip(cameras, plates, strict=True)):
             if (camera.name, frame) not in masks:
                 continue
@@ -95,20 +101,31 @@ def gather_pixels(
             columns["person"].append(mask[y, x])
             columns["edge"].append(_edge(mask)[y, x])
             if plate is not None:
-                shaded = shaded_plate(mask, image, plate)[y, x]
+                window = window_around(wanted)
+                shaded = shaded_plate(mask[window], image[window], plate[window])[wanted[window]]
                 columns["plate"].append(shaded.clip(0, 255).round().astype(np.uint8))
-            count += len(x)
-        starts.append(starts[-1] + count)
+        edge = np.concatenate([np.zeros(0, bool), *columns["edge"][first:]])
+        edges.append(starts[-1] + (np.flatnonzero(edge) if edge.any() else np.arange(len(edge))))
+        starts.append(starts[-1] + len(edge))
+        edge_starts.append(edge_starts[-1] + len(edges[-1]))
     with_plates = all(plate is not None for plate in plates)
     stacked = {k: torch.from_numpy(np.concatenate(v)).to(device) for k, v in columns.items() if k != "plate"}
     inverse = np.stack([c.R.T @ np.linalg.inv(c.K) for c in cameras])
     return Pixels(
         starts=torch.tensor(starts, device=device),
+        edges=torch.from_numpy(np.concatenate(edges)).to(device),
+        edge_starts=torch.tensor(edge_starts, device=device),
         plate=torch.from_numpy(np.concatenate(columns["plate"])).to(device) if with_plates else None,
         rays_from_px=torch.from_numpy(inverse).float().to(device),
         centres_m=torch.from_numpy(np.stack([c.centre_m for c in cameras])).float().to(device),
         **stacked,
     )
+
+
+def _within(starts: Tensor, rows: Tensor, unit: Tensor) -> Tensor:
+    """Indices (n, k) in the ranges of some rows (n,), at unit (n, k) in [0, 1) of each."""
+    first, after = starts[rows, None], starts[rows + 1, None]
+    return first + (unit * (after - first)).long()
 
 
 def within_reach(camera: Camera, vertices_m: np.ndarray, reach_m: float) -> np.ndarray:
