@@ -177,7 +177,7 @@ class TrainingSettings(Section):
     seconds: float | None = Field(default=None, gt=0)  # at which the field's training ends if its steps have not
     novel_pose_steps: int = Field(default=100, ge=0)  # what belongs to novel frames, against the finished field
     frames_per_step: int = Field(default=8, ge=1)
-    rays_per_frame: int = Field(default=192, ge=1)
+    rays_per_frame: int = Field(default=192, ge=1)  # of so many frames; where there are fewer, they share these rays
     pose_learning_rate: float = Field(default=5e-4, ge=0)  # 0 keeps the fitted poses and shape
     absorb_steps: int = Field(default=100, ge=1)  # between exact updates of the posed bodies; also at checkpoints
     final_learning_rate: float = Field(default=0.1, gt=0, le=1)  # share of the first that is left at the end

@@ -83,6 +83,7 @@ def gather_pixels(
     names = capture.train_cameras
     cameras = [capture.cameras[name] for name in names]
     plates = [capture.background(name) for name in names]
+    with_plates = all(plate is not None for plate in plates)
     vertices_m = body.vertices_m().numpy()
     columns: dict[str, list[np.ndarray]] = {k: [] for k in ("camera", "xy_px", "colour", "plate", "person", "edge")}
     starts, edges, edge_starts = [0], [], [0]
@@ -100,7 +101,7 @@ def gather_pixels(
             columns["colour"].append(image[y, x])
             columns["person"].append(mask[y, x])
             columns["edge"].append(_edge(mask)[y, x])
-            if plate is not None:
+            if plate is not None and with_plates:
                 window = window_around(wanted)
                 shaded = shaded_plate(mask[window], image[window], plate[window])[wanted[window]]
                 columns["plate"].append(shaded.clip(0, 255).round().astype(np.uint8))
@@ -108,7 +109,6 @@ def gather_pixels(
         edges.append(starts[-1] + (np.flatnonzero(edge) if edge.any() else np.arange(len(edge))))
         starts.append(starts[-1] + len(edge))
         edge_starts.append(edge_starts[-1] + len(edges[-1]))
-    with_plates = all(plate is not None for plate in plates)
     stacked = {k: torch.from_numpy(np.concatenate(v)).to(device) for k, v in columns.items() if k != "plate"}
     inverse = np.stack([c.R.T @ np.linalg.inv(c.K) for c in cameras])
     return Pixels(

@@ -269,7 +269,6 @@ def test_a_step_has_as_many_rays_however_few_the_frames(tmp_path: Path, monkeypa
         drawn.append((len(frames), rays_per_frame))
         return draw(self, frames, rays_per_frame, generator)
 
-    monkeypatch.setattr(trainer_module, "LOG_STEPS", 100)
     monkeypatch.setattr(Pixels, "draw", counted)
     trainer = Trainer(*record(tmp_path / "capture"), with_changes(frames_per_step=4), tmp_path, ALONE)
     for step in (0, trainer.field_steps):
