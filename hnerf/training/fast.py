@@ -25,6 +25,7 @@ SPACING_M = 0.012  # between the samples of a rendering; twice as many gain 0.05
 SAMPLES = (6, 12, 18, 24, 36, 64)  # of which a ray gets the first that is enough, or the last
 COARSE = 0.75  # of the training has half the samples: as accurate on three captures, in three quarters of the time
 JOINED_M = 0.03  # between neighbours on a ray, in the canonical volume: farther apart, they lie on different limbs
+GRAZING_M = 1e-4  # of descent from a sample to the next, below which the way to the surface has no useful derivative
 NEGLIGIBLE = 1e-3  # a sample of less weight gets no colour
 
 
@@ -145,7 +146,7 @@ class FastField(Field):
         end = torch.where(core[hit, None], 1.0, alpha_dot[:, -1:])  # nothing shines through, if the surface lies deeper
         alpha = torch.cat([alpha_dot[:, :-1], end], 1)
         visible = weights_from_alpha(alpha.detach()).flatten() > NEGLIGIBLE
-        colour = self._colour(at_surface(described, (d + residual).detach()), pose, visible)
+        colour = self._colour(at_surface(described, d + residual), pose, visible)
         norms = d.new_zeros(0)
         if draws.probe is not None:
             norms = self._gradient_norms(described, skin, pose, draws.probe[hit], depths.shape[1])
@@ -234,14 +235,17 @@ def at_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:
     """Samples (R K,) of rays moved on to where d_hat (R, K), linear from each to the next, is zero or nearest to it.
 
     A sample's opacity is that of the way to the next one, its colour that of the surface which makes it opaque. Left
-    where they are: a ray's last sample, and those whose next one is out of reach or on another limb.
+    where they are: a ray's last sample, and those whose next one is out of reach or on another limb. Gradients flow
+    through the place of the zero, too (as in IDR, Yariv et al. 2020): a body that moves along a ray shows the same
+    point to it, and without that term would be drawn away from or towards its camera.
     """
     y, d, normal, near = (
         t.unflatten(0, d_hat.shape) for t in (described.y, described.d, described.normal, described.near)
     )
     ahead, after = d_hat[:, :-1], d_hat[:, 1:]
     joined = near[:, :-1] & near[:, 1:] & ((y[:, 1:] - y[:, :-1]).norm(dim=-1) < JOINED_M)
-    share = torch.where(joined & (ahead > after), ahead / (ahead - after), 0.0).clamp(0, 1)[..., None]
+    descent_m = (ahead - after).clamp(min=GRAZING_M)
+    share = torch.where(joined & (ahead > after), ahead / descent_m, 0.0).clamp(0, 1)[..., None]
 
     def moved(values: Tensor) -> Tensor:
         return torch.cat([torch.lerp(values[:, :-1], values[:, 1:], share), values[:, -1:]], 1).flatten(0, 1)

@@ -1,5 +1,8 @@
 """The fast field's shell: tightened to what can be seen, and rays that miss it are asked nothing."""
 
+import dataclasses
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -8,6 +11,7 @@ from hnerf.config import FastFieldSettings
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.fast import ROOM_M, SAMPLES, SETTLED, SPACING_M, TIGHTEN_STEP_M, FastField, at_surface
 from hnerf.training.field import Field
+from hnerf.training.losses import pixel
 from tests.body.boxes import box_rig
 
 RIG = box_rig(splits=3)
@@ -208,6 +212,58 @@ def test_samples_stay_where_the_next_one_is_out_of_reach_or_on_another_limb():
     moved = at_surface(described, described.d[None])
     assert torch.equal(moved.d, described.d)
     assert torch.equal(moved.y, described.y)
+
+
+def test_a_surface_is_met_at_the_same_point_when_its_body_moves_along_the_ray():
+    """A ray falls at 45 degrees, 4 mm down and 4 mm along x a sample, from 3 mm above the skin at x = 0 to 1 mm below:
+    it meets it at x = 3 mm. The body moved along the ray by e shows the same point; moved down by e, the ray meets it e
+    later in x."""
+    x, height = torch.tensor([[0.0, 0.004], [0.003, -0.001]], dtype=torch.double)
+
+    def met_at(along: torch.Tensor, down: torch.Tensor) -> torch.Tensor:
+        d = height + along + down
+        y = torch.stack([x - along, torch.zeros_like(x), d], 1)
+        described = dataclasses.replace(on_a_ray([0.0, 0.0], [True] * 2), d=d, y=y, normal=y)
+        return at_surface(described, d[None]).y[0]
+
+    still = torch.zeros((), dtype=torch.double, requires_grad=True)
+    skin = torch.tensor([0.003, 0.0, 0.0], dtype=torch.double)
+    torch.testing.assert_close(met_at(still, still), skin, atol=1e-12, rtol=0)
+    along, down = torch.autograd.functional.jacobian(met_at, (still, still))
+    torch.testing.assert_close(along, torch.zeros_like(skin), atol=1e-9, rtol=0)
+    torch.testing.assert_close(down, torch.tensor([1.0, 0.0, 0.0], dtype=torch.double), atol=1e-9, rtol=0)
+    assert torch.autograd.gradcheck(met_at, (still, still), eps=1e-7)
+
+
+def test_a_pixel_pulls_at_its_body_as_its_colour_changes_when_the_body_moves():
+    """Gradients of a slanted ray's colour to the body's position are its central differences over 0.2 mm."""
+    bodies, conditions = standing()
+    field, correction = field_of(500.0), bodies.correction()
+    for grid in field.field.colour_grids.parameters():
+        torch.nn.init.normal_(grid)
+    direction = torch.nn.functional.normalize(torch.tensor([[0.4, 0.3, -1.0]]), dim=-1)
+    rays = (torch.tensor([[0.5, 0.4, 0.5]]) - 2 * direction, direction, torch.zeros(1, dtype=torch.long))
+    draws = Draws.still(1, SETTINGS.samples, torch.device("cpu"))
+
+    def colour(move_m: torch.Tensor) -> torch.Tensor:
+        moved = {"move_m": move_m[None], "turn": correction.turn, "shape": correction.shape}
+        where = (bodies, field.region(bodies, conditions), *rays)
+        samples, _ = field.sample(*where, conditions, draws, SimpleNamespace(**moved))
+        return pixel(samples.alpha, samples)[0]
+
+    step_m = 1e-4
+    steps = [(colour(step_m * axis) - colour(-step_m * axis)) / (2 * step_m) for axis in torch.eye(3)]
+    pull = torch.autograd.functional.jacobian(colour, torch.zeros(3))
+    assert pull.abs().max() > 0.1
+    torch.testing.assert_close(pull, torch.stack(steps, 1), atol=1e-3, rtol=0)
+
+
+def test_a_ray_that_grazes_the_surface_has_finite_gradients():
+    described = on_a_ray([0.001, 0.001, 0.0, 0.0], [True] * 4)
+    d_hat = described.d[None].requires_grad_()
+    at_surface(described, d_hat).y.sum().backward()
+    assert d_hat.grad is not None
+    assert torch.isfinite(d_hat.grad).all()
 
 
 def test_samples_stay_where_the_surface_is_left():
