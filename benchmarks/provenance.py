@@ -37,7 +37,11 @@ def table(rows: list[list[str]]) -> list[str]:
 
 
 def _commit() -> str:
-    """The checkout's commit, marked where files differ from it."""
-    command = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=12"]
-    described = subprocess.run(command, capture_output=True, text=True)
-    return described.stdout.strip() or "not committed"
+    """The checkout's commit, marked where files other than results differ from it."""
+
+    def git(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True)
+
+    commit = git("rev-parse", "--short=12", "HEAD").stdout.strip()
+    changed = git("diff", "--quiet", "HEAD", "--", ".", ":!benchmarks/results").returncode
+    return f"{commit}-dirty" if commit and changed else commit or "not committed"
