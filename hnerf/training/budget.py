@@ -29,8 +29,8 @@ MASKS_A_CAMERA = 6  # are looked at
 STILL_RAD = 0.05  # spread of joints below which nothing can be learned from their angles
 POSE_WIDTH = 8
 NODES = 128  # about 12 cm apart: what they cannot follow, such as a collar, is the canonical surface's own
-LOOKS = 0.75  # how often a person's pixel is drawn in the mean
-LEAST_STEPS, MOST_STEPS = 600, 2000
+LOOKS = 1.5  # how often a person's pixel is drawn in the mean
+LEAST_STEPS, MOST_STEPS = 600, 4000
 STEPS_A_FRAME = 270  # that see it, until its body stands as deep as one camera can tell; twice as many gain 0.4 dB
 
 

@@ -29,13 +29,13 @@ def decided(scene: Scene, **given: object) -> tuple[TrainingSettings, dict]:
 def test_sizes_by_hand():
     """Pixels of 2 cm: 96 cells on 1.92 m, in steps of 4 ** (1 / 3) from 24; 64 for geometry, in steps of 2 from
     16. Masks reach 3.5 cm out and 0.5 cm in, with 1.5 cm of room: 5 cm and, at least, 3 cm; 2.4 x 8 cm / 6 mm = 32
-    samples. Four million pixels at 2500 a step, each looked at three quarters of a time: 1200 steps."""
+    samples. Four million pixels at 2500 a step, each looked at one and a half times: 2400 steps."""
     settings, decisions = decided(SCENE)
     fast = settings.fast
     assert fast.colour_cells == (24, 38, 60, 96)
     assert fast.geometry_cells == (16, 32, 64)
     assert (fast.outer_m, fast.inner_m, fast.samples) == (0.05, 0.03, 32)
-    assert (fast.pose_width, settings.steps) == (8, 1200)
+    assert (fast.pose_width, settings.steps) == (8, 2400)
     assert decisions["fast.samples"].reason == "one each 6.0 mm of a ray through a shell of 80.0 mm"
 
 
@@ -63,7 +63,7 @@ def test_what_is_given_stands():
     }
 
 
-@pytest.mark.parametrize(("person_px", "steps"), [(1000, 600), (10**9, 2000)])
+@pytest.mark.parametrize(("person_px", "steps"), [(1000, 600), (10**9, 4000)])
 def test_steps_have_bounds(person_px: int, steps: int):
     assert decided(SCENE.__class__(**{**vars(SCENE), "person_px": person_px}))[0].steps == steps
 
