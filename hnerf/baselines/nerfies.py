@@ -80,8 +80,8 @@ class NerfiesField(DynamicField):
         draws: Draws,
         correction: PoseCorrection | None = None,
     ) -> tuple[RaySamples, Tensor]:
-        """As Field.sample, over coarse and fine samples together (K = 2 x samples). A call with draws.probe is a step
-        of training: it counts for annealing, and has an elastic energy."""
+        """As Field.sample, over coarse and fine samples together (K = 2 x samples). A call with draws.probe, as in
+        training, has an elastic energy."""
         assert draws.finer is not None
         near, far = region.interval(origins_m, directions, frame)
         first = stratified(near, far, draws.jitter)
@@ -104,8 +104,11 @@ class NerfiesField(DynamicField):
         points = along(origins_m, directions, depths.gather(1, pick[:, None])[:, 0])
         code = self.code(conditions)[frame]
         change = jacobian(lambda x: self._deform(x, code), self.scaled(points))
-        self.steps_taken += 1
         return dataclasses.replace(samples, elastic=weights.sum(1) * elastic_energy(change)), depths
+
+    def step_taken(self) -> None:
+        """Counts for annealing."""
+        self.steps_taken += 1
 
     def _deform(self, points: Tensor, code: Tensor) -> Tensor:
         octaves = OCTAVES * self.steps_taken / self.settings.anneal_steps

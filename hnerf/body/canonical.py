@@ -14,7 +14,6 @@ from hnerf.body.descriptor import BodyMeshes
 from hnerf.body.rig import (
     Rig,
     joint_transforms,
-    pose_vertices,
     rotation_from_axis_angle,
     skinning_transforms,
     vertex_transforms,
@@ -90,11 +89,21 @@ class PosedBodies:
     def _pose(self, theta: Tensor, root: Tensor) -> None:
         self.theta, self.root = theta.detach(), root.detach()
         rig = self.rig
-        blended = vertex_transforms(rig, skinning_transforms(rig, rig.joints_m, self.theta, self.root))
-        self._linear = blended[..., :3].contiguous()
+        posed = vertex_transforms(rig, skinning_transforms(rig, rig.joints_m, self.theta, self.root))
+        self._linear = posed[..., :3].contiguous()
         self._inverse = torch.linalg.inv(self._linear)
-        self.vertices_m = pose_vertices(rig, self.theta, self.root)
+        self.vertices_m = (self._linear @ rig.vertices_m[..., None])[..., 0] + posed[..., 3]
         self._joints = joint_transforms(rig, rig.joints_m, self.theta, self.root)
+        self._carried = self._shape_carries()
+
+    def _shape_carries(self) -> Tensor:
+        """(n J, 3 B): how a unit of each shape moves what each joint carries rigidly, beyond turning the rest body's
+        own change: the joint's way in the world less that in the rest body, turned."""
+        rotations, basis = self._joints[..., :3, :3], self.rig.joint_basis.permute(1, 2, 0)
+        moved = [self.root[:, :3, :3] @ basis[0]]
+        for joint, parent in enumerate(self.rig.parents.tolist()[1:], 1):
+            moved.append(moved[parent] + rotations[:, parent] @ (basis[joint] - basis[parent]))
+        return (torch.stack(moved, 1) - rotations @ basis).flatten(2).flatten(0, 1)
 
     def correction(self) -> PoseCorrection:
         """A correction of zero for these frames."""
@@ -137,15 +146,18 @@ class PosedBodies:
         twists = torch.cat([correction.turn, -torch.linalg.cross(correction.turn, pivots)], -1)  # (n, free + 1, 6)
         present, own = torch.unique(frame, return_inverse=True)
         everywhere = (share @ twists[present].transpose(0, 1).flatten(1)).unflatten(1, (len(present), 6))
-        blended = everywhere.gather(1, own[:, None, None].expand(-1, 1, 6))[:, 0]  # one product beats a gather a point
-        moved = torch.linalg.cross(blended[:, :3], points_m) + blended[:, 3:] + correction.move_m[frame]
+        twist = everywhere.gather(1, own[:, None, None].expand(-1, 1, 6))[:, 0]  # one product beats a gather a point
+        moved = torch.linalg.cross(twist[:, :3], points_m) + twist[:, 3:] + correction.move_m[frame]
         bulge = torch.einsum("b,bvd->vd", correction.shape, self.rig.shape_basis)[nearest]
         linear = self._linear.flatten(0, 1)[frame * len(self.rig.vertices_m) + nearest]
-        return moved + (linear @ bulge[..., None])[..., 0]
+        carried = (self._carried.unflatten(1, (3, -1)) @ correction.shape).contiguous()
+        joints = frame[:, None] * len(self.rig.joints_m) + self.rig.skin_joints[nearest]
+        return moved + (linear @ bulge[..., None])[..., 0] + blended(carried, joints, self.rig.skin_weights[nearest])
 
     @torch.no_grad()
-    def absorb(self, correction: PoseCorrection) -> None:
-        """Move the bodies by the correction, exactly through the kinematic chain, and set it to zero."""
+    def absorb(self, correction: PoseCorrection, alike: Tensor | None = None) -> None:
+        """Move the bodies by the correction, exactly through the kinematic chain, and set it to zero. Rows `alike` are
+        one posture: their joints turn as they do in the mean."""
         rig, free = self.rig, self._free
         rotations = rotation_from_axis_angle(self.theta)
         above = self._joints[:, rig.parents[free].clamp(min=0), :3, :3]
@@ -154,6 +166,8 @@ class PosedBodies:
         )
         theta, root = self.theta.clone(), self.root.clone()
         theta[:, free] = axis_angle_from_rotation(turned)
+        if alike is not None:
+            theta[alike] = theta[alike].mean(0)
         turn, pivot = rotation_from_axis_angle(correction.turn[:, -1]), self._joints[:, 0, :3, 3]
         root[:, :3, :3] = turn @ root[:, :3, :3]
         root[:, :3, 3] = (turn @ (root[:, :3, 3] - pivot)[..., None])[..., 0] + pivot + correction.move_m
@@ -171,7 +185,7 @@ def nearest_corner(corners: Tensor, barycentric: Tensor) -> Tensor:
 
 
 def blended(values: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor:
-    """Rows (V, D) at corners (N, 3), weighted and summed (N, D), in one pass."""
+    """Rows (V, D) at K corners (N, K), weighted and summed (N, D), in one pass."""
     return nn.functional.embedding_bag(corners, values, per_sample_weights=barycentric.to(values), mode="sum")
 
 

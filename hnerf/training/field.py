@@ -62,6 +62,9 @@ class Field(nn.Module, ABC):
         """Random numbers that a ray needs when so much of the training, 0 to 1, is over."""
         return self.samples
 
+    def step_taken(self) -> None:
+        """Said once after each step of the training, in however many parts it was made."""
+
     def samples_needed(self, region: Any, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
         """How many samples a rendering takes along rays (R, 3) of body rows (R,): (R,) long, 0 where nothing can be
         seen."""

