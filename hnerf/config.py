@@ -179,6 +179,7 @@ class TrainingSettings(Section):
     frames_per_step: int = Field(default=8, ge=1)
     rays_per_frame: int = Field(default=192, ge=1)  # of so many frames; where there are fewer, they share these rays
     pose_learning_rate: float = Field(default=5e-4, ge=0)  # 0 keeps the fitted poses and shape
+    one_posture: bool | None = None  # in all training frames: only the root moves; None: the scene decides
     absorb_steps: int = Field(default=100, ge=1)  # between exact updates of the posed bodies; also at checkpoints
     final_learning_rate: float = Field(default=0.1, gt=0, le=1)  # share of the first that is left at the end
     noise: float = Field(default=0.1, ge=0)  # on theta, T and v

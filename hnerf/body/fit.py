@@ -39,6 +39,7 @@ LIVELINESS = np.array([2, 1, 1, 2, 3, 1, 2, 3, 1, 1, 2, 3, 1, 2, 3, 2, 2, 2, 2, 
 NEIGHBOURS = 5  # frames that vote on which way a limb bends in depth
 KEYPOINT_STEPS = 30  # Levenberg-Marquardt steps at most; it stops by itself
 HELD = 0.1  # of its spread: keypoints alone say little of proportions, and at first nothing of a detector's habits
+ONE_POSTURE_COSTS = 1.5  # times; noise of keypoints alone 1.1 to 1.3, joints that sway by a degree 1.4, by two 2.0
 POOR_IOU, POOR_KEYPOINT_M = 0.75, 0.06  # beyond which a frame is flagged
 
 
@@ -70,7 +71,7 @@ def fit_body(capture: Capture, masks: "Masks | None", settings: FitSettings) -> 
             if balance:
                 habit = Habit.of_one_view(_by_split(capture), pose, seen.cameras[0])
                 pose = unflipped(replace(problem, habit=habit), pose, runs(capture))
-                habit = habit.learned(pose)
+                pose, habit = as_still_as_seen(problem, pose, habit)
             else:
                 habit = Habit.of_hands(len(pose.root), Articulation(pose.rig))
         if masks is not None:
@@ -118,6 +119,20 @@ def unflipped(problem: Problem, pose: Pose, follow: list[tuple[int, ...]]) -> Po
     again = levenberg_marquardt(problem, again, problem.in_images, KEYPOINT_STEPS)
     before, after = (problem.assemble(p, problem.in_images)[0] for p in (pose, again))
     return again if after < before else pose
+
+
+def as_still_as_seen(problem: Problem, pose: Pose, habit: Habit) -> tuple[Pose, Habit]:
+    """Who turns before the only camera in one posture is held to it, so that all frames tell together how deep a limb
+    lies; otherwise each joint keeps the spread it has. One posture it is where the keypoints, and all that is likely
+    beside the habit, agree with it nearly as well as with a pose a frame."""
+    learned = habit.learned(pose)
+    still = learned.of_one_posture()
+    if still is None:
+        return pose, learned
+    held = levenberg_marquardt(replace(problem, habit=still), pose, problem.in_images, KEYPOINT_STEPS)
+    free_cost, held_cost = (problem.assemble(p, problem.in_images)[0] for p in (pose, held))
+    log.info("one posture in all frames costs %.2f times what a pose a frame does", held_cost / free_cost)
+    return (held, still) if held_cost < ONE_POSTURE_COSTS * free_cost else (pose, learned)
 
 
 def problem_of(

@@ -15,6 +15,8 @@ from hnerf.capture.camera import Camera
 WRISTS_DEG, OTHER_WRISTS_DEG = 5.0, 10.0  # how far a joint is usually off, and from where it is another posture
 POSTURE_DEG, OTHER_POSTURE_DEG = 7.0, 14.0
 STILLEST_DEG = 2.0  # nobody stands stiller, as far as a first fit can tell
+ONE_POSTURE_DEG = 0.1  # spread of joints that stand still: next to none
+ALL_SIDES = 0.5  # trust from which a posture is known well enough to be the only one
 CHI_MEDIAN = 1.54  # of the length of a vector of three unit normals
 TINY = 1e-6  # keeps the usual turn of what no frame is trusted to tell where it is
 
@@ -63,6 +65,12 @@ class Habit:
         for rows in self.groups:
             spread[rows] = length[rows].quantile(0.5, dim=0).clamp(min=math.radians(STILLEST_DEG)).minimum(spread[rows])
         return replace(self, spread=spread)
+
+    def of_one_posture(self) -> "Habit | None":
+        """With next to no spread in groups of frames that see the body from all sides; None without such a group."""
+        known = self.trust.amin(1, keepdim=True) > ALL_SIDES
+        still = torch.where(known, math.radians(ONE_POSTURE_DEG), self.spread)
+        return replace(self, spread=still) if known.any() else None
 
     def _off(self, turns: Tensor) -> Tensor:
         """From the medians, (n, M - 1, 3) radians."""

@@ -27,6 +27,7 @@ ROOM_M = 0.015  # beyond where masks reach, for poses that are still wrong
 THINNEST_M, THICKEST_M = 0.03, 0.15
 MASKS_A_CAMERA = 6  # are looked at
 STILL_RAD = 0.05  # spread of joints below which nothing can be learned from their angles
+ONE_POSTURE_RAD = 0.002  # spread of joints as the fit leaves it where it found one posture in all frames
 POSE_WIDTH = 8
 NODES = 128  # about 12 cm apart: what they cannot follow, such as a collar, is the canonical surface's own
 LOOKS = 1.5  # how often a person's pixel is drawn in the mean
@@ -96,10 +97,11 @@ def decide(scene: Scene, settings: TrainingSettings) -> tuple[TrainingSettings, 
     made = {name: decision for name, decision in wanted.items() if not getattr(settings.fast, name)}
     fast = settings.fast.model_copy(update={name: decision.value for name, decision in made.items()})
     decisions = {f"fast.{name}": decision for name, decision in made.items()}
-    if not settings.steps:
-        decisions["steps"] = _steps(scene, settings)
-    steps = decisions["steps"].value if not settings.steps else settings.steps
-    return settings.model_copy(update={"fast": fast, "steps": steps}), decisions
+    whole = {"steps": _steps(scene, settings)} if not settings.steps else {}
+    if settings.one_posture is None:
+        whole["one_posture"] = _one_posture(scene, settings)
+    update = {name: decision.value for name, decision in whole.items()}
+    return settings.model_copy(update={"fast": fast} | update), decisions | whole
 
 
 def _field(scene: Scene, given: FastFieldSettings) -> dict[str, Decision]:
@@ -138,6 +140,13 @@ def _nodes(scene: Scene, given: FastFieldSettings) -> Decision:
     if scene.cameras == 1:
         return Decision(0, "one camera does not see where clothes move")
     return Decision(NODES, f"skinning does not move the clothes of {scene.frames} frames alike")
+
+
+def _one_posture(scene: Scene, settings: TrainingSettings) -> Decision:
+    fitted = f"fitted joints spread {np.rad2deg(scene.spread_rad):.2f} degrees over {scene.frames} frames"
+    if settings.machinery != "fast" or scene.frames == 1:
+        return Decision(False, "each frame has its own pose")
+    return Decision(scene.spread_rad < ONE_POSTURE_RAD, fitted)
 
 
 def _steps(scene: Scene, settings: TrainingSettings) -> Decision:

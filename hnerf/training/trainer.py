@@ -136,7 +136,7 @@ class Trainer:
         return self._finish() if self.processes.leads else {}
 
     def _absorb(self) -> None:
-        self.stage.bodies.absorb(self.objective.correction)
+        self.stage.bodies.absorb(self.objective.correction, self.train_rows if self.settings.one_posture else None)
         if self.step <= self.field_steps:
             self.field.tighten(self.stage.bodies.rig, self.conditions.pose[self.train_rows[::POSES_APART]])
         self._stand(self.stage.bodies)
@@ -159,6 +159,11 @@ class Trainer:
         self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
         terms = self._backward(module, rays, conditions, draws)
+        self.field.step_taken()
+        if self.step >= self.field_steps:  # what pulls all frames back to the fit is not for frames that are finished
+            for pose in (self.objective.correction.turn, self.objective.correction.move_m):
+                if pose.grad is not None:
+                    pose.grad[self.train_rows] = 0.0
         gradients = [q.grad for q in self.objective.parameters() if q.grad is not None]
         fault = not_finite(terms, gradients, self.step)
         if fault is None:

@@ -3,15 +3,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from hnerf.body.anny import anny_rig
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.balance import Balance, centre_of_mass_over_feet
 from hnerf.body.body_model import body_model
-from hnerf.body.fit import problem_of
+from hnerf.body.fit import as_still_as_seen, problem_of
 from hnerf.body.habit import Habit, turning
-from hnerf.body.keypoint_fit import levenberg_marquardt
+from hnerf.body.keypoint_fit import Problem, levenberg_marquardt
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.observations import observe, runs
 from hnerf.body.pose_prior import Smoothness
@@ -22,6 +23,8 @@ from tests.body.test_articulation import random_pose
 from tests.body.two_bone import two_bone_rig
 
 CAMERA = replace(ring_camera("0", 0.0), t_m=np.array([0.0, 0.0, 3.0]))  # level with the origin
+
+ARMS = [f"{bone}arm01.{side}" for bone in ("upper", "lower") for side in "LR"]
 
 
 def turned(yaw: list[float], bend: list[float]) -> Pose:
@@ -101,20 +104,54 @@ def test_only_wrists_have_a_habit_that_several_cameras_need() -> None:
         assert equations.frame_gradient.any() == (cost > 0)
 
 
-def test_a_person_who_turns_before_one_camera_neither_leans_nor_sways(tmp_path: Path) -> None:
-    """One posture from eight sides, keypoints 2 px off: arms sway half as much at most, the lean is 0.7 at most."""
+def turning_person(folder: Path, sway_deg: float) -> tuple[Problem, Pose]:
+    """One posture from eight sides, but for arms that swing from frame to frame; keypoints 2 px off."""
     still, yaw = moving_body((0,)), np.arange(8) * np.pi / 4
     root = still.root.repeat(8, 1, 1)
     root[:, :3, :3] = rotation_from_axis_angle(torch.tensor([[0.0, 0.0, angle] for angle in yaw]))
-    truth = replace(still, frames=tuple(range(8)), theta=torch.zeros(8, *still.theta.shape[1:]), root=root)
-    capture, settings = record(tmp_path, truth, {"0": ring_camera("0", 0.3)}, ("0",)), FitSettings()
+    theta = torch.zeros(8, *still.theta.shape[1:])
+    for bone in ARMS:
+        swing = math.radians(sway_deg) * torch.tensor([(-1.0) ** k for k in range(8)])
+        theta[:, still.rig.joint_names.index(bone), 0] = swing
+    truth = replace(still, frames=tuple(range(8)), theta=theta, root=root)
+    capture, settings = record(folder, truth, {"0": ring_camera("0", 0.3)}, ("0",)), FitSettings()
     seen = observe(capture)
     noise = torch.randn(seen.pixels.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     seen = replace(seen, pixels=seen.pixels + 2 * noise)
-    smoothness = Smoothness(runs(capture), 10.0, np.full(25, 30.0))
     offsets_m = torch.zeros(25, 3, dtype=torch.float64)
     begin = Pose(truth.rig.to(dtype=torch.float64), truth.theta.double(), truth.root.double(), offsets_m)
-    arms = [truth.rig.joint_names.index(f"{bone}arm01.{side}") for bone in ("upper", "lower") for side in "LR"]
+    smoothness = Smoothness(runs(capture), 10.0, np.full(25, 30.0))
+    return problem_of(body_model(settings), begin, seen, smoothness, settings, 1, 0.1), begin
+
+
+@pytest.mark.parametrize(("sway_deg", "held"), [(0.0, True), (10.0, False)])
+def test_who_turns_in_one_posture_is_held_to_it(sway_deg: float, held: bool, tmp_path: Path) -> None:
+    """Within a thousandth of a radian; arms that swing by 10 degrees keep doing so."""
+    problem, begin = turning_person(tmp_path, sway_deg)
+    problem = replace(problem, balance=Balance(up=2))
+    habit = Habit.of_one_view([list(range(8))], begin, problem.seen.cameras[0])
+    first = levenberg_marquardt(replace(problem, habit=habit), begin, problem.in_images, 30)
+    pose, kept = as_still_as_seen(problem, first, habit)
+    arms = pose.theta[:, [begin.rig.joint_names.index(bone) for bone in ARMS]]
+    spread_rad = (arms - arms.mean(0)).norm(dim=-1).mean()
+    assert (spread_rad < 1e-3) if held else (spread_rad > math.radians(5))
+    assert math.isclose(kept.spread.rad2deg().max(), 0.1, rel_tol=1e-9) == held
+
+
+def test_one_posture_is_told_from_all_sides_only() -> None:
+    """Eight sides are, two views square to each other (trust 0.29) are not; the spread there stays."""
+    pose = turned([0.0, 2.0, 4.0, 0.0, math.pi / 2], [0.0] * 5)
+    habit = Habit.of_one_view([[0, 1, 2], [3, 4]], pose, CAMERA)
+    still = habit.of_one_posture()
+    assert still is not None
+    torch.testing.assert_close(still.spread[[0, 3], 0].rad2deg(), torch.tensor([0.1, 7.0]).double())
+    assert Habit.of_one_view([[0, 1], [2, 3, 4]], turned([0.0] * 5, [0.0] * 5), CAMERA).of_one_posture() is None
+
+
+def test_a_person_who_turns_before_one_camera_neither_leans_nor_sways(tmp_path: Path) -> None:
+    """One posture from eight sides: arms sway half as much at most, the lean is 0.7 at most."""
+    problem, begin = turning_person(tmp_path, 0.0)
+    arms = [begin.rig.joint_names.index(bone) for bone in ARMS]
 
     def over_feet(pose: Pose) -> torch.Tensor:
         articulation = Articulation(pose.rig)
@@ -122,14 +159,12 @@ def test_a_person_who_turns_before_one_camera_neither_leans_nor_sways(tmp_path: 
         return torch.einsum("k,nkc->nc", centre_of_mass_over_feet(), x)[:, :2]
 
     def lean_and_sway(balance: Balance | None, habit: Habit | None) -> tuple[float, float]:
-        problem = problem_of(body_model(settings), begin, seen, smoothness, settings, 1, 0.1)
-        problem = replace(problem, balance=balance, habit=habit)
-        pose = levenberg_marquardt(problem, begin, problem.in_images, 30)
+        pose = levenberg_marquardt(replace(problem, balance=balance, habit=habit), begin, problem.in_images, 30)
         turns = pose.theta[:, arms]
         lean_m = (over_feet(pose) - over_feet(begin)).norm(dim=-1).mean()
         return float(lean_m), float((turns - turns.mean(0)).norm(dim=-1).mean())
 
-    habit = Habit.of_one_view([list(range(8))], begin, seen.cameras[0])
+    habit = Habit.of_one_view([list(range(8))], begin, problem.seen.cameras[0])
     lean_m, sway = lean_and_sway(None, None)
     mended_lean_m, mended_sway = lean_and_sway(Balance(up=2), habit)
     assert mended_lean_m < 0.7 * lean_m and mended_sway < 0.5 * sway

@@ -60,7 +60,18 @@ def test_what_is_given_stands():
         "fast.geometry_cells",
         "fast.pose_width",
         "fast.nodes",
+        "one_posture",
     }
+
+
+@pytest.mark.parametrize(
+    ("machinery", "spread_rad", "one"), [("fast", 0.001, True), ("fast", 0.003, False), ("paper", 0.001, False)]
+)
+def test_frames_that_were_fitted_with_one_posture_keep_one(machinery: str, spread_rad: float, one: bool):
+    """The published method gives each frame its own; so does what is given."""
+    scene = SCENE.__class__(**{**vars(SCENE), "spread_rad": spread_rad})
+    assert decided(scene, machinery=machinery)[0].one_posture is one
+    assert decided(scene, one_posture=not one)[0].one_posture is not one
 
 
 @pytest.mark.parametrize(("person_px", "steps"), [(1000, 600), (10**9, 4000)])

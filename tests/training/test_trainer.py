@@ -156,6 +156,32 @@ def test_novel_pixels_never_reach_the_field(tmp_path: Path):
     assert (poses[0][2] - poses[1][2]).abs().max() > 2e-5
 
 
+def test_finished_poses_stay_whatever_pulls_them_to_the_fit(tmp_path: Path):
+    """While novel poses are fitted, the increments' loss still sees all frames."""
+    recording, poses = record(tmp_path / "capture"), []
+    for steps in (0, 4):
+        settings = with_changes(novel_pose_steps=steps, losses=TINY.losses.model_copy(update={"increment": 1.0}))
+        out = tmp_path / f"{steps}"
+        out.mkdir()
+        train(*recording, settings, out, ALONE)
+        poses.append(load_avatar(out).body.theta[:2])
+    torch.testing.assert_close(poses[0], poses[1], atol=1e-6, rtol=0)
+
+
+def test_training_frames_of_one_posture_keep_one(tmp_path: Path):
+    """Its joints turn alike in all of them; roots and the novel frame go their own ways."""
+    capture, masks, body = record(tmp_path / "capture")
+    rows = [body.index(frame) for frame in capture.train_frames]
+    body.theta[rows] = body.theta[rows].mean(0)
+    train(capture, masks, body, with_changes(one_posture=True, novel_pose_steps=4), tmp_path, ALONE)
+    tuned = load_avatar(tmp_path).body
+    turn = tuned.theta - body.theta
+    assert turn[rows].abs().max() > 1e-4
+    torch.testing.assert_close(tuned.theta[rows], tuned.theta[rows[:1]].expand(len(rows), -1, -1), atol=1e-6, rtol=0)
+    assert (turn[2] - turn[0]).abs().max() > 2e-5
+    assert (tuned.root[rows[0]] - body.root[rows[0]] - tuned.root[rows[1]] + body.root[rows[1]]).abs().max() > 1e-5
+
+
 def test_a_single_training_frame_has_nothing_to_deform(tmp_path: Path):
     """The novel frames' poses are fitted all the same."""
     capture, masks, body = record(tmp_path / "capture")
