@@ -224,10 +224,10 @@ class Settings(Section):
 def load_settings(preset: str, overrides: list[str] | None = None) -> Settings:
     """Settings from a preset's name or a YAML file's path, with overrides like "training.steps=100".
 
-    Raises CaptureError with one line if the preset is unknown, or a key or value is not allowed.
+    Raises CaptureError with one line if the preset is unknown or no YAML, or a key or value is not allowed.
     """
     path = named_file(preset, CONFIGS, "preset", "presets")
-    tree: dict[str, Any] = yaml.safe_load(path.read_text()) or {}
+    tree = read_yaml(path)
     for override in overrides or []:
         key, equals, value = override.partition("=")
         if not equals:
@@ -238,16 +238,16 @@ def load_settings(preset: str, overrides: list[str] | None = None) -> Settings:
             node = node.setdefault(section, {})
             if not isinstance(node, dict):
                 raise CaptureError(f"--set {override}: {section} is not a section")
-        node[leaf] = yaml.safe_load(value)
+        node[leaf] = _parsed(value, f"--set {override}")
     return validated(Settings, tree, path)
 
 
 def with_changes(settings: Settings, path: Path) -> Settings:
     """Settings with those values replaced that a YAML file names, such as one of `configs/ablations/`.
 
-    Raises CaptureError with one line if a key or value is not allowed.
+    Raises CaptureError with one line if the file is no YAML, or a key or value is not allowed.
     """
-    return validated(Settings, _merged(settings.model_dump(), yaml.safe_load(path.read_text()) or {}), path)
+    return validated(Settings, _merged(settings.model_dump(), read_yaml(path)), path)
 
 
 def _merged(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
@@ -266,6 +266,21 @@ def named_file(name: str, folder: Path, one: str, many: str) -> Path:
         known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
         raise CaptureError(f"{name}: no such {one} or file; {many} are {known}")
     return path
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The keys and values of a YAML file, none of an empty one; CaptureError, one line, where it holds no such."""
+    tree = _parsed(path.read_bytes(), str(path))
+    if not isinstance(tree, dict | None):
+        raise CaptureError(f"{path}: holds no keys and values; write it as `name: value`")
+    return tree or {}
+
+
+def _parsed(text: str | bytes, source: str) -> Any:
+    try:
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date such as 2026-13-01
+        raise CaptureError(f"{source}: is not YAML ({' '.join(str(error).split())}); correct it") from None
 
 
 def validated(kind: type[S], tree: Any, path: Path) -> S:

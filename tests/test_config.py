@@ -1,9 +1,13 @@
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from hnerf.config import load_settings, with_changes
 from hnerf.errors import CaptureError
+from hnerf.study.plan import load_study
+from hnerf.study.stability import load_stability
 
 
 def changes(folder: Path, text: str) -> Path:
@@ -43,3 +47,36 @@ def test_what_is_not_allowed_is_refused_by_file_and_key(tmp_path: Path, text: st
     path = changes(tmp_path, text)
     with pytest.raises(CaptureError, match=f"{path}: {named}: "):
         with_changes(load_settings("fast"), path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"training: [100", "is not YAML "),
+        (b"title: \xe9t\xe9", "is not YAML "),
+        (b"title: 2026-13-01", "is not YAML "),
+        (b"- training", "holds no keys and values"),
+        (b"fast", "holds no keys and values"),
+    ],
+)
+@pytest.mark.parametrize(
+    "load",
+    [
+        lambda path: load_settings(str(path), ["training.steps=7"]),
+        lambda path: with_changes(load_settings("fast"), path),
+        lambda path: load_study(str(path)),
+        lambda path: load_stability(str(path)),
+    ],
+)
+def test_files_that_are_no_tables_are_one_line(
+    load: Callable[[Path], Any], content: bytes, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_bytes(content)
+    with pytest.raises(CaptureError, match=f"^{path}: {message}[^\n]*$"):
+        load(path)
+
+
+def test_an_override_that_is_no_yaml_is_one_line() -> None:
+    with pytest.raises(CaptureError, match=r"^--set training\.steps=\[100: is not YAML [^\n]*; correct it$"):
+        load_settings("fast", ["training.steps=[100"])

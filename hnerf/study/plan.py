@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 from typing import Literal
 
-import yaml
 from pydantic import Field
 
 from hnerf.capture.capture import Capture
-from hnerf.config import CONFIGS, Section, Settings, load_settings, named_file, validated
+from hnerf.config import CONFIGS, Section, Settings, load_settings, named_file, read_yaml, validated
 from hnerf.errors import CaptureError
 from hnerf.spread import spread
 
@@ -85,7 +84,7 @@ class Study(Section):
 def load_study(name: str) -> Study:
     """A study by its name or its file's path; CaptureError with one line if there is none or a key is not allowed."""
     path = named_file(name, STUDIES, "study", "studies")
-    study = validated(Study, yaml.safe_load(path.read_text()), path)
+    study = validated(Study, read_yaml(path), path)
     for title, variant in study.variants.items():
         for method in variant.methods:
             if method not in study.methods:

@@ -3,10 +3,9 @@
 from collections.abc import Collection
 from typing import Annotated
 
-import yaml
 from pydantic import Field
 
-from hnerf.config import CONFIGS, Section, named_file, validated
+from hnerf.config import CONFIGS, Section, named_file, read_yaml, validated
 from hnerf.errors import CaptureError
 from hnerf.study.degrade import KINDS, NOT_MADE, check_strengths
 
@@ -48,7 +47,7 @@ class Stability(Section):
 def load_stability(study: str) -> Stability:
     """A study by its name under `configs/stability/` or its file's path; CaptureError, one line, on what is wrong."""
     path = named_file(study, STUDIES, "study", "studies")
-    found = validated(Stability, yaml.safe_load(path.read_text()) or {}, path)
+    found = validated(Stability, read_yaml(path), path)
     for kind, strengths in found.degradations.items():
         check_strengths(kind, strengths)
     return found
