@@ -202,11 +202,11 @@ class EvaluationSettings(Section):
 
 
 class AssetSettings(Section):
-    grid_cells: int = 256  # of marching cubes, on the longest side
-    margin_m: float = 0.2  # how far hair and clothes may stand off the body
-    faces: int = 20_000
-    texture_px: int = 1024
-    texture_poses: int = 3  # of the capture; each texel takes the median colour
+    grid_cells: int = Field(default=256, ge=16)  # of marching cubes, on the longest side
+    margin_m: float = Field(default=0.2, gt=0)  # how far hair and clothes may stand off the body
+    faces: int = Field(default=20_000, ge=100)
+    texture_px: int = Field(default=1024, ge=16)
+    texture_poses: int = Field(default=3, ge=1)  # of the capture; each texel takes the median colour
 
 
 class Settings(Section):
