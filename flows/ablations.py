@@ -21,7 +21,7 @@ from tasks.calibration import calibrate
 from tasks.capture import ingest
 from tasks.evaluation import evaluate
 from tasks.fit import fit
-from tasks.launcher import LostWorkerError
+from tasks.policy import may_pass
 from tasks.source import Source, read_capture
 from tasks.store import Store
 from tasks.training import train
@@ -37,8 +37,8 @@ def ablate(capture: Path, preset: str, store: Path, overrides: list[str], only: 
     """Run the full method and each ablation; returns the table, `<store>/ablations/<subject>-<preset>.md`, which has a
     JSON file beside it. Both are written anew after every row.
 
-    only: names of ablations, all where there are none. A row whose training fails says why and the rest go on; a worker
-    that was killed (LostWorkerError) ends the command, and the same command goes on from there.
+    only: names of ablations, all where there are none. A row whose training or evaluation fails says why and the rest
+    go on; a worker that was killed (LostWorkerError) ends the command, and the same command goes on from there.
     """
     rows, left_out = choose(load_settings(preset, overrides), only)
     shelf = Store(store.resolve())
@@ -86,19 +86,19 @@ def why_pointless(full: Settings, ablated: Settings) -> str | None:
 
 
 def measure(shelf: Store, source: Source, truth: Source, settings: Settings) -> dict[str, Any]:
-    """A row's figures: scores of both splits, seconds and device of its training; {"error": one line} if that fails."""
+    """A row's figures: scores of both splits, seconds and device of its training; {"error": one line} if one fails."""
     recording = ingest(shelf, source, settings.capture)
     calibration = calibrate(shelf, recording, settings.calibration)
     masks = find_masks(shelf, recording, calibration, settings)
     body = fit(shelf, recording, calibration, masks, settings.fit)
     try:
         model = train(shelf, recording, calibration, masks, body, settings.training)
-    except LostWorkerError:
-        raise
-    except RuntimeError as error:
-        log.warning("%s", error)
+        report = evaluate(shelf, truth, recording, calibration, masks, body, model, settings.evaluation)
+    except Exception as error:  # what breaks without a part is what the table is after
+        if may_pass(error):
+            raise  # a full disk, a lost share, a killed worker
+        log.warning("%s: %s", type(error).__name__, error)
         return {"error": one_line(error)}
-    report = evaluate(shelf, truth, recording, calibration, masks, body, model, settings.evaluation)
     metrics = json.loads((report.root / "metrics.json").read_text())
     trained = json.loads((model.root / "report.json").read_text())
     return {key: trained[key] for key in ("seconds", "device")} | {

@@ -24,8 +24,7 @@ from tasks.calibration import calibrate
 from tasks.capture import ingest
 from tasks.evaluation import evaluate
 from tasks.fit import fit
-from tasks.launcher import LostWorkerError
-from tasks.policy import LASTING
+from tasks.policy import may_pass
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
 from tasks.study import check_meshes, degrade_capture, degrade_fit, degrade_masks, show_in_extreme_poses
@@ -126,15 +125,13 @@ def attempt(
         model = train(shelf, *stages, training)
         at_bad_input = "failed"
         return measure(shelf, source, truth, settings, degradation, stages, model)
-    except LostWorkerError:
-        raise
     except NotPossibleError as error:
         return {"left_out": str(error)}
     except CaptureError as error:
         return {"error": (at_bad_input, str(error))}
     except Exception as error:  # whatever breaks is what the study is after
-        if isinstance(error, OSError) and not isinstance(error, LASTING):
-            raise  # a full disk, a lost share
+        if may_pass(error):
+            raise  # a full disk, a lost share, a killed worker
         log.warning("%s: %s", type(error).__name__, error)
         return {"error": ("failed", one_line(error))}
 

@@ -67,6 +67,10 @@ class StorePolicy(CachePolicy):
 
 
 def is_transient(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
-    """Prefect's retry condition: input and output that failed, timeouts and lost workers; nothing else."""
-    error = state.result(raise_on_failure=False)
+    """Prefect's retry condition."""
+    return may_pass(state.result(raise_on_failure=False))
+
+
+def may_pass(error: object) -> bool:
+    """Whether a later try may overcome it: input and output that failed, timeouts and lost workers; nothing else."""
     return isinstance(error, OSError | LostWorkerError) and not isinstance(error, LASTING)

@@ -157,6 +157,34 @@ def test_a_row_that_fails_says_so_and_the_rest_go_on(stages: list[TrainingSettin
     assert table.read_text() == as_markdown(result)
 
 
+def test_a_surface_that_cannot_be_meshed_fails_its_row_alone(
+    stages: list[TrainingSettings], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = module.evaluate
+
+    def evaluate(*inputs: Any) -> Any:
+        if stages[-1].losses.residual == 0:
+            raise CaptureError("signed distance field: no surface in its box")
+        return good(*inputs)
+
+    monkeypatch.setattr(module, "evaluate", evaluate)
+    table = ablate(tmp_path, "fast", tmp_path / "store", [], ["no-residual", "no-segmentation"])
+    rows = json.loads(table.with_suffix(".json").read_text())["rows"]
+    assert rows["no-residual"] == {"error": "signed distance field: no surface in its box"}
+    assert list(rows) == ["full", "no-residual", "no-segmentation"] and "psnr" in rows["no-segmentation"]["novel_view"]
+
+
+def test_a_full_disk_ends_the_command(
+    stages: list[TrainingSettings], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def evaluate(*_: Any) -> Any:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module, "evaluate", evaluate)
+    with pytest.raises(OSError, match="No space"):
+        ablate(tmp_path, "fast", tmp_path / "store", [], ["no-opt"])
+
+
 def test_a_lost_worker_ends_the_command_and_finished_rows_stand(stages: list[TrainingSettings], tmp_path: Path) -> None:
     with pytest.raises(LostWorkerError):
         ablate(tmp_path, "fast", tmp_path / "store", [], ["no-opt", "no-eikonal", "no-residual"])
