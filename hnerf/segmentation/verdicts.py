@@ -4,12 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hnerf.capture.timing import usual_step
 from hnerf.segmentation.prior import Prior
 
 LEAST_AREA = 0.1  # of the prior's core: less is no person
 LEAST_COVERED = 0.5  # of the core
 JUMP = 1.3  # ratio of areas between neighbours in time
-NEIGHBOURS = 4  # nearest frames, at most so far away, whose median area a mask is held against
+NEIGHBOURS = 4  # nearest frames, at most so many usual steps away, whose median area a mask is held against
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,9 @@ def jumps(frames: tuple[int, ...], verdicts: list[Verdict], expected_px: list[in
     area_px = np.array([v.area_px for v in verdicts], float)
     ratio = area_px / np.maximum(expected_px, 1)
     usable = np.array([v.fault is None for v in verdicts])
+    reach = NEIGHBOURS * usual_step(frames)
     for i, frame in enumerate(frames):
-        others = [j for j in range(len(frames)) if j != i and usable[j] and abs(frames[j] - frame) <= NEIGHBOURS]
+        others = [j for j in range(len(frames)) if j != i and usable[j] and abs(frames[j] - frame) <= reach]
         near = sorted(others, key=lambda j: abs(frames[j] - frame))[:NEIGHBOURS]
         if not usable[i] or len(near) < NEIGHBOURS:
             continue

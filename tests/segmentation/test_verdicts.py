@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from hnerf.segmentation.prior import Prior
 from hnerf.segmentation.verdicts import Verdict, judge, jumps
@@ -33,10 +34,12 @@ def test_cut_off_by_the_border_is_noted_only() -> None:
     assert verdict.note == "cut off by the image's border (bottom)"
 
 
-def test_jumps_need_both_neighbours_and_prior() -> None:
-    # Frame 2 leaks to twice its area; frame 6 is twice as large because the person is; frame 20 has no neighbours.
-    frames = (0, 1, 2, 3, 4, 5, 6, 7, 8, 20)
+@pytest.mark.parametrize("stride", [1, 3, 10])
+def test_jumps_need_both_neighbours_and_prior(stride: int) -> None:
+    # The third frame leaks to twice its area; the seventh is twice as large because the person is; the last has no
+    # neighbours.
+    frames = tuple(stride * frame for frame in (0, 1, 2, 3, 4, 5, 6, 7, 8, 20))
     areas = [100, 100, 200, 100, 100, 100, 200, 100, 100, 300]
     expected = [50, 50, 50, 50, 50, 50, 100, 50, 50, 50]
     found = jumps(frames, [Verdict(None, None, area) for area in areas], expected)
-    assert found == {2: "area jumps from 100 to 200 px"}
+    assert found == {2 * stride: "area jumps from 100 to 200 px"}
