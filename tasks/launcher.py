@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -18,12 +19,13 @@ GRACE_S = 40  # torchrun gives its ranks 30 s to end before it kills them
 LAST_LINES = 20
 RANK_LINE = re.compile(r"^\[default\d+\]:")
 FAILURE = re.compile(r"failed \(exitcode: (-?\d+)\) local_rank: (\d+)")
+KILLED = (signal.SIGKILL, signal.SIGTERM)  # from outside; other signals are the process's own doing, every time
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _libc = ctypes.CDLL(None)
 
 
 class LostWorkerError(RuntimeError):
-    """A rank was killed from outside (out of memory, a lost machine): worth another try."""
+    """A rank or torchrun was killed from outside (out of memory, a lost machine): worth another try."""
 
 
 def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
@@ -31,11 +33,11 @@ def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
 
     Raises CaptureError if a rank ends with BAD_INPUT, LostWorkerError if one was killed, RuntimeError with the last
     lines of the first failing rank otherwise. All ranks end with the caller, however he ends: torchrun hears of his
-    death by signal, and takes its ranks along.
+    death by signal, and takes its ranks along; they hear of torchrun's in the same way.
     """
     with TemporaryDirectory(prefix="hnerf-ranks-") as logs:
         command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
-        command += ["--tee=3", f"--log-dir={logs}", "-m", module, *arguments]
+        command += ["--tee=3", f"--log-dir={logs}", "-m", "tasks.rank", module, *arguments]
         agent = subprocess.Popen(
             command,
             stdout=subprocess.PIPE,
@@ -44,7 +46,7 @@ def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
             errors="replace",
             env=_environment(processes),
             start_new_session=True,
-            preexec_fn=_end_with_parent,
+            preexec_fn=partial(end_with_parent, signal.SIGTERM),
         )
         try:
             failure = _follow(agent, logging.getLogger(module))
@@ -52,7 +54,13 @@ def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
             _stop(agent)
             raise
         if agent.returncode:
-            raise _error(module, Path(logs), failure)
+            raise _error(module, Path(logs), agent.returncode, failure)
+
+
+def end_with_parent(last: signal.Signals) -> None:
+    """Have the kernel (Linux) send this process a signal when the one that started it dies."""
+    if hasattr(_libc, "prctl"):
+        _libc.prctl(PR_SET_PDEATHSIG, last)
 
 
 def _environment(processes: int) -> dict[str, str]:
@@ -60,10 +68,6 @@ def _environment(processes: int) -> dict[str, str]:
     otherwise: threads that spin make a step take many times as long when anything else runs on the machine."""
     threads = max(1, len(os.sched_getaffinity(0)) // processes)
     return {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "PASSIVE", **os.environ}
-
-
-def _end_with_parent() -> None:
-    _libc.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _follow(agent: "subprocess.Popen[str]", log: logging.Logger) -> re.Match[str] | None:
@@ -79,16 +83,19 @@ def _follow(agent: "subprocess.Popen[str]", log: logging.Logger) -> re.Match[str
 
 
 def _stop(agent: "subprocess.Popen[str]") -> None:
-    """Let torchrun end its ranks; kill it if it does not."""
+    """Let torchrun end its ranks; kill it, and them with it, if it does not."""
     agent.terminate()
     try:
         agent.wait(timeout=GRACE_S)
     except subprocess.TimeoutExpired:
-        os.killpg(agent.pid, signal.SIGKILL)
+        agent.kill()
         agent.wait()
 
 
-def _error(module: str, logs: Path, failure: re.Match[str] | None) -> Exception:
+def _error(module: str, logs: Path, ended: int, failure: re.Match[str] | None) -> Exception:
+    """What went wrong, from torchrun's exit code and its word on the first rank that failed."""
+    if ended < 0:
+        return LostWorkerError(f"{module}: torchrun was killed by {signal.Signals(-ended).name}")
     if failure is None:
         return RuntimeError(f"{module}: torchrun did not start")
     code, rank = int(failure[1]), failure[2]
@@ -96,6 +103,7 @@ def _error(module: str, logs: Path, failure: re.Match[str] | None) -> Exception:
     lines = "".join(written).strip().splitlines()[-LAST_LINES:]
     if code == BAD_INPUT and lines:
         return CaptureError(lines[-1])
-    if code < 0:
+    if -code in KILLED:
         return LostWorkerError(f"{module}: rank {rank} was killed by {signal.Signals(-code).name}")
-    return RuntimeError("\n".join([f"{module}: rank {rank} ended with exit code {code}", *lines]))
+    how = f"crashed with {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+    return RuntimeError("\n".join([f"{module}: rank {rank} {how}", *lines]))

@@ -18,6 +18,8 @@ def main(mode: str, folder: Path) -> None:
         raise ValueError("boom in rank one")
     if rank == 1 and mode == "killed":
         os.kill(os.getpid(), signal.SIGKILL)
+    if rank == 1 and mode == "crash":
+        os.kill(os.getpid(), signal.SIGSEGV)
     if mode == "ok":
         print(f"rank {rank} of {os.environ['WORLD_SIZE']}")
         return

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -41,6 +42,7 @@ def test_lines_of_all_ranks_reach_the_log(tmp_path: Path, caplog: pytest.LogCapt
         ("bad", CaptureError, r"^a\.jpg: bad; write it again$"),
         ("raise", RuntimeError, r"rank 1 ended with exit code 1(.|\n)*ValueError: boom in rank one$"),
         ("killed", LostWorkerError, "rank 1 was killed by SIGKILL"),
+        ("crash", RuntimeError, "rank 1 crashed with SIGSEGV"),
     ],
 )
 def test_one_failing_rank_ends_all_with_its_message(
@@ -48,7 +50,7 @@ def test_one_failing_rank_ends_all_with_its_message(
 ) -> None:
     with pytest.raises(error) as caught:
         run_ranks(RANKS, [mode, str(tmp_path)], processes=2)
-    assert re.search(message, str(caught.value))
+    assert type(caught.value) is error and re.search(message, str(caught.value))
     assert still_running(tmp_path) == []
 
 
@@ -63,4 +65,15 @@ def test_ranks_end_with_the_caller(tmp_path: Path, fatal: signal.Signals) -> Non
     wait_until_running(tmp_path, 2)
     os.kill(caller.pid, fatal)
     caller.wait()
+    wait_until_running(tmp_path, 0)
+
+
+def test_ranks_end_with_torchrun_which_is_worth_another_try(tmp_path: Path) -> None:
+    with ThreadPoolExecutor() as pool:
+        launched = pool.submit(run_ranks, RANKS, ["sleep", str(tmp_path)], 2)
+        wait_until_running(tmp_path, 2)
+        rank = Path(f"/proc/{still_running(tmp_path)[0]}/status").read_text()
+        os.kill(int(re.search(r"PPid:\t(\d+)", rank)[1]), signal.SIGKILL)
+        with pytest.raises(LostWorkerError, match="torchrun was killed by SIGKILL"):
+            launched.result(PATIENCE_S)
     wait_until_running(tmp_path, 0)

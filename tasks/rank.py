@@ -1,0 +1,12 @@
+"""One process of several, as the launcher has torchrun start it: python -m tasks.rank MODULE ARGUMENTS."""
+
+import runpy
+import signal
+import sys
+
+from tasks.launcher import end_with_parent
+
+if __name__ == "__main__":
+    end_with_parent(signal.SIGKILL)  # before the module's imports, which take seconds
+    del sys.argv[0]
+    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
