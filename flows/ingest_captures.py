@@ -2,12 +2,14 @@
 
 import hashlib
 import logging
+import os
 import time
 from pathlib import Path
 
 from prefect import flow
 from prefect.deployments import run_deployment
 
+from hnerf.errors import CaptureError
 from tasks.source import capture_files, read_capture
 
 DEPLOYMENT = "train-subject/local"
@@ -22,7 +24,8 @@ def ingest_captures(
     """Start `train-subject` once for every capture in the subfolders of `folder`; returns those started now.
 
     `folder` is made if it is not there. A capture is known by its content: moved, renamed or copied, it is not trained
-    again. One that was touched less than `settle_s` seconds ago is still being written and waits for the next look.
+    again. One that was touched less than `settle_s` seconds ago is still being written and waits for the next look, and
+    so does one that cannot be read, which is logged.
     `<store>/ingested/<digest>` records where each was found and the flow run that trains it.
     """
     ledger = store.resolve() / "ingested"
@@ -30,11 +33,15 @@ def ingest_captures(
     folder.mkdir(parents=True, exist_ok=True)
     started = []
     for capture in sorted(path for path in folder.resolve().iterdir() if path.is_dir() and path.name[0] != "."):
-        files = capture_files(capture)
-        glimpse = _glimpse(files)
-        if not files or _age_s(files) < settle_s or (ledger / glimpse).exists():
+        try:
+            files = capture_files(capture)
+            glimpse = _glimpse(files)
+            if not files or _age_s(files) < settle_s or (ledger / glimpse).exists():
+                continue
+            digest = read_capture(capture)[0].digest
+        except (CaptureError, OSError) as error:  # OSError: a file that is gone by now
+            log.error("%s", error)
             continue
-        digest = read_capture(capture)[0].digest
         if not (ledger / digest).exists():
             parameters = {"capture": str(capture), "preset": preset, "store": str(store.resolve())}
             run = run_deployment(
@@ -57,5 +64,5 @@ def _glimpse(files: list[Path]) -> str:
     listing = hashlib.sha256()
     for path in files:
         stat = path.lstat()
-        listing.update(f"{path} {stat.st_size} {stat.st_mtime_ns}\n".encode())
+        listing.update(os.fsencode(f"{path} {stat.st_size} {stat.st_mtime_ns}\n"))
     return f"seen-{listing.hexdigest()}"

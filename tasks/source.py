@@ -4,6 +4,7 @@ import hashlib
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import NoReturn
 
 from pydantic import BaseModel
 
@@ -26,11 +27,14 @@ def read_capture(folder: Path) -> tuple[Source, Source]:
     """What was recorded, and what is known to be true of it: all files but those of `ground_truth/`, and only those.
 
     Hidden files do not count. A symbolic link counts as the text it holds: what it points at is either in the folder
-    itself or none of ours. Raises CaptureError if there is no such folder.
+    itself or none of ours. Raises CaptureError if there is no such folder, or a file that cannot be read.
     """
     folder = folder.resolve()
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder; give the capture's folder")
+    shown = os.fsencode(folder).decode(errors="replace")
+    if shown != str(folder):
+        raise CaptureError(f"{shown}: the folder's name is not UTF-8; rename it")
     truth = folder / GROUND_TRUTH
     files = capture_files(folder)
     parts = [f for f in files if not f.is_relative_to(truth)], [f for f in files if f.is_relative_to(truth)]
@@ -39,9 +43,10 @@ def read_capture(folder: Path) -> tuple[Source, Source]:
 
 
 def capture_files(folder: Path) -> list[Path]:
-    """The files and symbolic links in a capture folder, sorted; no hidden ones, no devices."""
+    """The files and symbolic links in a capture folder, sorted; no hidden ones, no devices. CaptureError on a folder
+    that cannot be read."""
     found = []
-    for parent, folders, files in os.walk(folder):
+    for parent, folders, files in os.walk(folder, onerror=_refuse):
         links = [name for name in folders if (Path(parent) / name).is_symlink()]
         folders[:] = [name for name in folders if not name.startswith(".")]
         paths = [Path(parent) / name for name in files + links if not name.startswith(".")]
@@ -52,6 +57,15 @@ def capture_files(folder: Path) -> list[Path]:
 def _digest(folder: Path, files: Iterable[Path]) -> str:
     listing = hashlib.sha256()
     for path in files:
-        content = os.readlink(path) if path.is_symlink() else sha256_of(path)
-        listing.update(f"{content} {path.relative_to(folder)}\n".encode())
+        try:
+            content = os.readlink(path) if path.is_symlink() else sha256_of(path)
+        except OSError as error:
+            _refuse(error, path)
+        listing.update(os.fsencode(f"{content} {path.relative_to(folder)}\n"))
     return listing.hexdigest()
+
+
+def _refuse(error: OSError, path: Path | None = None) -> NoReturn:
+    raise CaptureError(
+        f"{path or error.filename}: cannot be read ({error.strerror}); make it readable or take it out of the folder"
+    ) from None

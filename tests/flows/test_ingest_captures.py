@@ -1,3 +1,4 @@
+import os
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -7,6 +8,8 @@ import pytest
 
 from flows import ingest_captures as module
 from flows.ingest_captures import ingest_captures
+from hnerf.errors import CaptureError
+from tasks.source import read_capture
 
 
 @pytest.fixture
@@ -63,6 +66,26 @@ def test_folders_still_being_written_hidden_and_empty_ones_wait(watched: Path, r
     shutil.copytree(watched / "ada", watched / ".incoming")
     (watched / "empty").mkdir()
     assert look(watched, settle_s=1000.0) == []
+    assert look(watched) == ["ada", "bob"]
+
+
+def test_a_capture_that_cannot_be_read_is_said_and_the_others_go_on(
+    watched: Path, runs: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def unreadable(capture: Path) -> Any:
+        if capture.name == "ada":
+            raise CaptureError("0.jpg: cannot be read; make it readable")
+        return read_capture(capture)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(module, "read_capture", unreadable)
+        assert look(watched) == ["bob"]
+    assert "0.jpg: cannot be read" in caplog.text
+    assert look(watched) == ["ada"]
+
+
+def test_names_that_are_not_utf_8_are_captures_too(watched: Path, runs: list[dict[str, Any]]) -> None:
+    (watched / "ada" / os.fsdecode(b"caf\xe9.txt")).touch()
     assert look(watched) == ["ada", "bob"]
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 
 from hnerf.errors import CaptureError
+from tasks import source as module
 from tasks.source import read_capture
 
 
@@ -67,6 +68,31 @@ def test_links_and_devices_are_not_followed(folder: Path) -> None:
     (folder / "images" / "endless.jpg").symlink_to("/dev/zero")
     os.mkfifo(folder / "images" / "pipe.jpg")
     assert digest(folder)
+
+
+def test_a_name_that_is_not_utf_8_counts_by_its_bytes(folder: Path) -> None:
+    before = digest(folder)
+    (folder / os.fsdecode(b"caf\xe9.txt")).touch()
+    named = digest(folder)
+    (folder / os.fsdecode(b"caf\xe9.txt")).rename(folder / os.fsdecode(b"caf\xe8.txt"))
+    assert len({before, named, digest(folder)}) == 3
+
+
+def test_a_folder_whose_name_is_not_utf_8_is_bad_input(folder: Path) -> None:
+    with pytest.raises(CaptureError, match="jos�: the folder's name is not UTF-8; rename it"):
+        read_capture(folder.rename(folder.with_name(os.fsdecode(b"jos\xe9"))))
+
+
+def test_what_cannot_be_read_is_bad_input(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> str:
+        raise PermissionError(13, "Permission denied", "images")
+
+    with monkeypatch.context() as locked, pytest.raises(CaptureError, match=r"0\.jpg: cannot be read \(Permission"):
+        locked.setattr(module, "sha256_of", refused)
+        read_capture(folder)
+    monkeypatch.setattr(os, "scandir", refused)
+    with pytest.raises(CaptureError, match=r"images: cannot be read \(Permission denied\); make it readable"):
+        read_capture(folder)
 
 
 def test_missing_folder_is_bad_input(tmp_path: Path) -> None:
