@@ -26,22 +26,23 @@ from hnerf.errors import CaptureError
 from hnerf.render.show import KINDS, Wish, render_subject
 from tasks.calibration import calibrate
 from tasks.capture import ingest
+from tasks.launcher import GaveUpError
 from tasks.source import read_capture
 from tasks.store import Store
 
 DEMO = Path("demo")
-BAD_INPUT = 2
+FAILED, BAD_INPUT = 1, 2
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one command; 2 and one line on stderr for input that cannot be used."""
+    """Run one command; one line on stderr and 2 for input that cannot be used, 1 for a training that cannot go on."""
     options = _parser().parse_args(argv)
     try:
         with _progress():
             options.command(options)
-    except CaptureError as error:
+    except (CaptureError, GaveUpError) as error:
         print(f"hnerf: {error}", file=sys.stderr)
-        return BAD_INPUT
+        return BAD_INPUT if isinstance(error, CaptureError) else FAILED
     return 0
 
 

@@ -14,7 +14,6 @@ from tempfile import TemporaryDirectory
 
 from hnerf.errors import CaptureError
 
-BAD_INPUT = 2  # exit code of a rank that met a CaptureError, whose message is its last line on stderr
 GRACE_S = 40  # torchrun gives its ranks 30 s to end before it kills them
 LAST_LINES = 20
 RANK_LINE = re.compile(r"^\[default\d+\]:")
@@ -28,12 +27,20 @@ class LostWorkerError(RuntimeError):
     """A rank or torchrun was killed from outside (out of memory, a lost machine): worth another try."""
 
 
+class GaveUpError(RuntimeError):
+    """A rank could not go on, for a reason that lies in its work and that the message, one line, tells."""
+
+
+# By exit code: what a rank means that says why it ends in its last line on stderr.
+TOLD: dict[int, type[Exception]] = {2: CaptureError, 3: GaveUpError}
+
+
 def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
     """`python -m module arguments` in `processes` processes; their lines go to its logger as they come.
 
-    Raises CaptureError if a rank ends with BAD_INPUT, LostWorkerError if one was killed, RuntimeError with the last
-    lines of the first failing rank otherwise. All ranks end with the caller, however he ends: torchrun hears of his
-    death by signal, and takes its ranks along; they hear of torchrun's in the same way.
+    Raises what TOLD says if a rank ends so, LostWorkerError if one was killed, RuntimeError with the last lines of the
+    first failing rank otherwise. All ranks end with the caller, however he ends: torchrun hears of his death by signal,
+    and takes its ranks along; they hear of torchrun's in the same way.
     """
     with TemporaryDirectory(prefix="hnerf-ranks-") as logs:
         command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
@@ -101,8 +108,8 @@ def _error(module: str, logs: Path, ended: int, failure: re.Match[str] | None) -
     code, rank = int(failure[1]), failure[2]
     written = [path.read_text(errors="replace") for path in logs.glob(f"*/attempt_0/{rank}/stderr.log")]
     lines = "".join(written).strip().splitlines()[-LAST_LINES:]
-    if code == BAD_INPUT and lines:
-        return CaptureError(lines[-1])
+    if code in TOLD and lines:
+        return TOLD[code](lines[-1])
     if -code in KILLED:
         return LostWorkerError(f"{module}: rank {rank} was killed by {signal.Signals(-code).name}")
     how = f"crashed with {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"

@@ -17,11 +17,12 @@ from hnerf.config import TrainingSettings
 from hnerf.errors import CaptureError
 from hnerf.segmentation.segment import Masks
 from hnerf.training.processes import Processes
+from hnerf.training.step import TrainingError
 from hnerf.training.trainer import train
 
 
 def main() -> int:
-    """Exit status 0, or 2 with one line on standard error for bad input."""
+    """Exit status 0, or one line on standard error and 2 for bad input, 3 for a training that cannot go on."""
     parser = argparse.ArgumentParser(description=__doc__)
     for name in ("capture", "calibration", "masks", "fit"):
         parser.add_argument(name, type=Path)
@@ -37,6 +38,9 @@ def main() -> int:
     except CaptureError as error:
         print(error, file=sys.stderr)
         return 2
+    except TrainingError as error:
+        print(error, file=sys.stderr)
+        return 3
     finally:
         if dist.is_initialized():
             dist.destroy_process_group()

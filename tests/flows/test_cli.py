@@ -5,6 +5,7 @@ import pytest
 
 from flows import cli
 from flows.cli import main
+from tasks.launcher import GaveUpError
 from tests.shared_data import shared_capture
 
 
@@ -31,6 +32,17 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert line.startswith("hnerf: ")
     assert message in line
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_training_that_cannot_go_on_is_one_line_and_exit_code_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def train(*_: object) -> None:
+        raise GaveUpError("the surface is empty: check masks and body fit")
+
+    monkeypatch.setattr(cli.train_subject, "fn", train)
+    assert main(["run", "ada"]) == 1
+    assert capsys.readouterr().err == "hnerf: the surface is empty: check masks and body fit\n"
 
 
 def test_unreadable_capture_leaves_nothing_half_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

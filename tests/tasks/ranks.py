@@ -14,6 +14,9 @@ def main(mode: str, folder: Path) -> None:
     if rank == 1 and mode == "bad":
         print("a warning\na.jpg: bad; write it again", file=sys.stderr)
         sys.exit(2)
+    if rank == 1 and mode == "stuck":
+        print("a warning\nno surface: check the masks", file=sys.stderr)
+        sys.exit(3)
     if rank == 1 and mode == "raise":
         raise ValueError("boom in rank one")
     if rank == 1 and mode == "killed":

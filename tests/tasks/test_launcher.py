@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from hnerf.errors import CaptureError
-from tasks.launcher import LostWorkerError, run_ranks
+from tasks.launcher import GaveUpError, LostWorkerError, run_ranks
 
 RANKS = "tests.tasks.ranks"
 PATIENCE_S = 60.0
@@ -40,6 +40,7 @@ def test_lines_of_all_ranks_reach_the_log(tmp_path: Path, caplog: pytest.LogCapt
     ("mode", "error", "message"),
     [
         ("bad", CaptureError, r"^a\.jpg: bad; write it again$"),
+        ("stuck", GaveUpError, "^no surface: check the masks$"),
         ("raise", RuntimeError, r"rank 1 ended with exit code 1(.|\n)*ValueError: boom in rank one$"),
         ("killed", LostWorkerError, "rank 1 was killed by SIGKILL"),
         ("crash", RuntimeError, "rank 1 crashed with SIGSEGV"),
