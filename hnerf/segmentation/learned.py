@@ -46,7 +46,14 @@ class Network:
         values = pixels.astype(np.float32)[None] / 255
         if self.channels_first:
             values = np.ascontiguousarray(values.transpose(0, 3, 1, 2))
-        found = np.squeeze(self.session.run(None, {self.session.get_inputs()[0].name: values})[0])
+        try:
+            outputs = self.session.run(None, {self.session.get_inputs()[0].name: values})
+        except Exception as error:  # as above
+            reason = " ".join(str(error).split())
+            raise CaptureError(
+                f"{self.path}: does not run on {values.shape}: {reason}; export it for any size"
+            ) from None
+        found = np.squeeze(outputs[0])
         if found.ndim != 2 or found.min() < -TOLERANCE or found.max() > 1 + TOLERANCE:
             raise CaptureError(
                 f"{self.path}: its first output must be one map of probabilities; it is {found.shape}, "

@@ -81,3 +81,17 @@ def test_files_that_are_no_such_network(tmp_path: Path) -> None:
     (tmp_path / "flat.onnx").write_bytes(model.SerializeToString())
     with pytest.raises(CaptureError, match="needs one float input"):
         Network(tmp_path / "flat.onnx")
+
+
+def test_a_network_that_loads_but_does_not_run(tmp_path: Path) -> None:
+    """It takes any height and width, and then wants 4 x 4 pixels."""
+    size = helper.make_tensor("size", TensorProto.INT64, [4], [1, 3, 4, 4])
+    node = helper.make_node("Reshape", ["image", "size"], ["person"])
+    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, "H", "W"])
+    graph = helper.make_graph(
+        [node], "fixed", [image], [helper.make_tensor_value_info("person", TensorProto.FLOAT, None)], [size]
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    (tmp_path / "fixed.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(CaptureError, match=r"fixed\.onnx: does not run on \(1, 3, 10, 20\): [^\n]*any size$"):
+        Network(tmp_path / "fixed.onnx").probability(np.zeros((10, 20, 3), np.uint8))
