@@ -5,11 +5,13 @@ import logging
 import os
 import time
 from pathlib import Path
+from uuid import uuid4
 
 from prefect import flow
 from prefect.deployments import run_deployment
 
 from hnerf.errors import CaptureError
+from hnerf.study.files import replace_text
 from tasks.source import capture_files, read_capture
 
 DEPLOYMENT = "train-subject/local"
@@ -44,14 +46,21 @@ def ingest_captures(
             continue
         if not (ledger / digest).exists():
             parameters = {"capture": str(capture), "preset": preset, "store": str(store.resolve())}
-            run = run_deployment(
-                DEPLOYMENT, parameters=parameters, timeout=0, as_subflow=False, idempotency_key=f"{ledger} {digest}"
-            )
+            key = f"{_own_id(ledger)} {digest}"
+            run = run_deployment(DEPLOYMENT, parameters=parameters, timeout=0, as_subflow=False, idempotency_key=key)
             (ledger / digest).write_text(f"{capture}\n{run.id}\n")  # type: ignore[union-attr]
             log.info("started %s for %s", DEPLOYMENT, capture)
             started.append(capture.name)
         (ledger / glimpse).touch()
     return started
+
+
+def _own_id(ledger: Path) -> str:
+    """A ledger's random id: Prefect gives back the finished run of a key it knows, even where the store is another."""
+    path = ledger / "id"
+    if not path.exists():
+        replace_text(path, uuid4().hex)
+    return path.read_text()
 
 
 def _age_s(files: list[Path]) -> float:

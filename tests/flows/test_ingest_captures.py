@@ -56,6 +56,26 @@ def test_a_copy_or_a_new_name_is_the_same_capture(watched: Path, runs: list[dict
     assert look(watched) == []
 
 
+def test_a_store_that_was_deleted_trains_again(watched: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Prefect starts nothing for a key it knows: a look that was cut short has the same again, a new store another."""
+    keys: list[str] = []
+
+    def run_deployment(*_: Any, idempotency_key: str, **__: Any) -> SimpleNamespace:
+        keys.append(idempotency_key)
+        return SimpleNamespace(id=f"run-{len(keys)}")
+
+    monkeypatch.setattr(module, "run_deployment", run_deployment)
+    look(watched)
+    for record in (watched.parent / "store" / "ingested").iterdir():
+        if record.name != "id":  # as if the machine had gone down before they were written
+            record.unlink()
+    look(watched)
+    assert keys[:2] == keys[2:] and len(set(keys)) == 2
+    shutil.rmtree(watched.parent / "store")
+    look(watched)
+    assert len(set(keys)) == 4
+
+
 def test_changed_content_is_a_new_capture(watched: Path, runs: list[dict[str, Any]]) -> None:
     look(watched)
     (watched / "ada" / "images" / "0.jpg").write_text("other pixels")
