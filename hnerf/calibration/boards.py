@@ -167,6 +167,7 @@ def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], d
                 f"{footage.path / name}: is {size_px[0]} x {size_px[1]} px, but its intrinsics are for {known_px[0]} x "
                 f"{known_px[1]}; use one size"
             )
+        lenses[name] = dataclasses.replace(lenses[name], size_px=size_px)
     return lenses, words
 
 

@@ -34,6 +34,13 @@ def pinhole(camera: Camera) -> Lens:
     return Lens(camera.name, camera.K, np.zeros(5), camera.R, camera.t_m, size_px)
 
 
+def known_size(lens: Lens) -> tuple[int, int]:
+    """The (width, height) that a file to be written has to say; CaptureError where it is not known."""
+    if lens.size_px is None:
+        raise CaptureError(f"intri.yml: camera {lens.name} has no size; add W_{lens.name} and H_{lens.name}")
+    return lens.size_px
+
+
 def checked_lens(
     sources: tuple[Path, Path],
     name: object,

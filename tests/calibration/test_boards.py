@@ -16,6 +16,7 @@ from hnerf.capture.boards import Board, BoardCorners, BoardFootage
 from hnerf.capture.camera import Camera
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.easymocap import EasyMocap
+from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.lens import Lens
 from hnerf.errors import CaptureError
 from tests.calibration.synthetic import look_at, turned, write_capture
@@ -177,6 +178,18 @@ def test_close_footage_gives_the_intrinsics(tmp_path: Path, monkeypatch: pytest.
     read["intrinsic"] = footage("intrinsic", close_up(0.7)[:9])
     with pytest.raises(CaptureError, match="intrinsic/a: does not fix the intrinsics"):
         calibrate_from_boards(tmp_path)
+
+
+def test_given_intrinsics_without_a_size_have_that_of_the_footage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = Lens("a", np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0]), np.eye(3),
+                 np.zeros(3), None)  # fmt: skip
+    write_cameras(tmp_path, [given], "easymocap")
+    footage = BoardFootage(tmp_path, BOARD, tuple(range(9)), {"a": close_up(0.7)[:9]}, {"a": (1280, 720)})
+    read = {"extrinsic": footage, "intrinsic": None}
+    monkeypatch.setattr(calibration_boards, "read_board_footage", lambda _, part: read[part])
+    assert calibrate_from_boards(tmp_path).lenses["a"].size_px == (1280, 720)
 
 
 def test_undistortion_keeps_what_is_absent_absent() -> None:

@@ -1,5 +1,6 @@
 """Cameras in other tools' files: read, written, and read back; numbers worked out by hand."""
 
+import dataclasses
 import struct
 from pathlib import Path
 
@@ -114,6 +115,19 @@ def test_what_is_written_reads_back(layout: str, reader: type[Layout], tmp_path:
         assert np.allclose(found.R, lens.R, atol=1e-12) and np.allclose(found.t_m, lens.t_m, atol=1e-12)
         padded = [np.pad(d, (0, 5 - len(d))) for d in (found.distortion, lens.distortion)]
         assert np.allclose(*padded, atol=1e-12)
+
+
+@pytest.mark.parametrize("layout", ["colmap", "caliscope", "aniposelib"])
+def test_files_that_must_say_a_size_are_not_written_without(layout: str, tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="camera cam_3 has no size; add W_cam_3 and H_cam_3"):
+        write_cameras(tmp_path, [LENSES[0], dataclasses.replace(LENSES[1], size_px=None)], layout)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_caliscope_numbers_have_no_leading_zeros(tmp_path: Path) -> None:
+    names = ("cam_01", "cam_08", "cam_10")
+    write_cameras(tmp_path, [dataclasses.replace(a, name=b) for a, b in zip(LENSES, names, strict=True)], "caliscope")
+    assert list(recognise(tmp_path).lenses()) == ["cam_0", "cam_1", "cam_2"]
 
 
 def test_colmap_sees_the_same_pixels(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 Pictures and all else lie as in the EasyMocap layout. Caliscope names the footage of its camera 0 `cam_0`.
 """
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.formats.pose2sim import lens_from_table
 from hnerf.capture.guarded import inside, read_toml
-from hnerf.capture.lens import Lens
+from hnerf.capture.lens import Lens, known_size
 from hnerf.errors import CaptureError
 
 FILES = ("camera_array.toml", "calibration.toml")
@@ -39,9 +40,10 @@ class Caliscope(EasyMocap):
 
 
 def write_caliscope(out: Path, lenses: Sequence[Lens]) -> None:
-    """`camera_array.toml`; cameras are numbered in their order, unless all are called cam_<number> already."""
+    """`camera_array.toml`; cameras are numbered in their order, unless all are called cam_<number> already (without
+    leading zeros, which are no numbers in TOML). CaptureError on a lens without size."""
     numbers = [lens.name.removeprefix("cam_") for lens in lenses]
-    if not all(lens.name.startswith("cam_") and n.isdecimal() for lens, n in zip(lenses, numbers, strict=True)):
+    if not all(re.fullmatch("cam_(0|[1-9][0-9]*)", lens.name) for lens in lenses):
         numbers = [str(i) for i in range(len(lenses))]
     tables = (
         f"[cameras.{n}]\ncam_id = {n}\nrotation_count = 0\nignore = false\n"
@@ -52,7 +54,7 @@ def write_caliscope(out: Path, lenses: Sequence[Lens]) -> None:
 
 
 def write_aniposelib(out: Path, lenses: Sequence[Lens]) -> None:
-    """`calibration.toml`, in metres; Pose2Sim reads it as `Calib.toml`, too."""
+    """`calibration.toml`, in metres; Pose2Sim reads it as `Calib.toml`, too. CaptureError on a lens without size."""
     tables = (
         f'[cam_{i}]\nname = "{lens.name}"\n{_numbers(lens)}rotation = {cv2.Rodrigues(lens.R)[0].ravel().tolist()}\n'
         for i, lens in enumerate(lenses)
@@ -61,10 +63,9 @@ def write_aniposelib(out: Path, lenses: Sequence[Lens]) -> None:
 
 
 def _numbers(lens: Lens) -> str:
-    size = "" if lens.size_px is None else f"size = {list(lens.size_px)}\n"
     distortions = np.pad(lens.distortion, (0, 5 - len(lens.distortion))).tolist()
     matrix = f"matrix = {lens.K.tolist()}\ndistortions = {distortions}\n"
-    return f"{size}{matrix}fisheye = false\ntranslation = {lens.t_m.tolist()}\n"
+    return f"size = {list(known_size(lens))}\n{matrix}fisheye = false\ntranslation = {lens.t_m.tolist()}\n"
 
 
 def _caliscope_tables(path: Path) -> dict[str, dict[str, Any]]:

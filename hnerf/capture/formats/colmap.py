@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.guarded import check_camera_name, inside, read_bytes, read_text
-from hnerf.capture.lens import Lens, checked_lens
+from hnerf.capture.lens import Lens, checked_lens, known_size
 from hnerf.errors import CaptureError
 
 PIXEL_CENTRE = 0.5  # COLMAP's; here a pixel's centre is at its integer coordinates
@@ -81,10 +81,8 @@ def write_colmap(out: Path, lenses: Sequence[Lens]) -> None:
     """`sparse/0` as text, an image `<camera>/000000.jpg` a camera, no points; CaptureError on a lens without size."""
     model = pycolmap.Reconstruction()
     for number, lens in enumerate(lenses, start=1):
-        if lens.size_px is None:
-            raise CaptureError(f"intri.yml: camera {lens.name} has no size; add W_{lens.name} and H_{lens.name}")
         name, parameters = _colmap_parameters(lens)
-        width_px, height_px = lens.size_px
+        width_px, height_px = known_size(lens)
         model.add_camera_with_trivial_rig(
             pycolmap.Camera(camera_id=number, model=name, width=width_px, height=height_px, params=parameters)
         )
