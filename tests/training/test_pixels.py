@@ -2,10 +2,16 @@
 
 from pathlib import Path
 
+import cv2
+import numpy as np
+import pytest
 import torch
 
-from hnerf.training.pixels import Pixels, gather_pixels
+from hnerf.capture.camera import Camera
+from hnerf.training.pixels import Pixels, gather_pixels, within_reach
 from tests.training.scene import record
+
+AHEAD = Camera("ahead", np.diag([50.0, 50.0, 1.0]), np.eye(3), np.zeros(3), 60, 40)
 
 
 def test_a_third_of_the_rays_is_drawn_at_edges():
@@ -51,3 +57,29 @@ def test_a_frame_without_edges_offers_all_its_pixels(tmp_path: Path):
         masks.masks[camera, 0][:] = True
     pixels = gather_pixels(capture, masks, body, body.frames, 0.2, torch.device("cpu"))
     assert torch.equal(pixels.edges[: pixels.edge_starts[1]], torch.arange(int(pixels.starts[1])))
+
+
+def test_what_a_body_inside_the_image_reaches_is_its_dilation():
+    """20 cm at 2 m and 50 px focal length are 5 px."""
+    xy = np.random.default_rng(0).integers([8, 8], [52, 32], (30, 2))
+    picture = np.zeros((40, 60), np.uint8)
+    picture[xy[:, 1], xy[:, 0]] = 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (11, 11))
+    reached = within_reach(AHEAD, np.hstack([xy / 25, np.full((30, 1), 2.0)]), 0.2)
+    assert np.array_equal(reached, cv2.dilate(picture, disc) > 0)
+
+
+def test_a_body_beside_the_image_reaches_into_it():
+    """A vertex 3 px left of the image, in row 20, is a disc of 5 px: columns 0 to 2 of that row."""
+    reached = within_reach(AHEAD, np.array([[-3 / 25, 20 / 25, 2.0]]), 0.2)
+    assert np.flatnonzero(reached[20]).tolist() == [0, 1, 2]
+    assert reached.any(1).nonzero()[0].tolist() == [16, 17, 18, 19, 20, 21, 22, 23, 24]
+
+
+@pytest.mark.parametrize("depths_m", [(-1.0, -2.0), (-1.0, -1.0, 2.0), (1e-6, 1e-6)])
+def test_a_body_behind_or_at_the_camera(depths_m: tuple[float, ...]):
+    """Nothing is reached behind it, all is from where it stands; who stands astride reaches as far as what is ahead."""
+    vertices_m = np.array([[0.4 * depth, 0.4 * depth, depth] for depth in depths_m])
+    reached = within_reach(AHEAD, vertices_m, 0.2)
+    assert reached[20, 20] == (depths_m[-1] > 0)
+    assert reached.all() == (0 < depths_m[-1] < 1)
