@@ -9,6 +9,7 @@ from torch import Tensor
 from hnerf.calibration.triangulation import subject_keypoints, triangulate
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
+from hnerf.capture.timing import usual_step
 
 
 @dataclass(frozen=True)
@@ -37,11 +38,12 @@ def observe(capture: Capture) -> Observations:
 
 
 def runs(capture: Capture) -> list[tuple[int, ...]]:
-    """Frames that follow each other in time: a gap in the numbers, or another split, starts a new run."""
-    novel = set(capture.novel_pose_frames)
+    """Frames that follow each other in time: a step in the numbers other than the usual one, or another split, starts
+    a new run."""
+    novel, step = set(capture.novel_pose_frames), usual_step(capture.frames)
     found: list[list[int]] = []
     for frame in capture.frames:
-        if found and frame == found[-1][-1] + 1 and (frame in novel) == (found[-1][-1] in novel):
+        if found and frame == found[-1][-1] + step and (frame in novel) == (found[-1][-1] in novel):
             found[-1].append(frame)
         else:
             found.append([frame])

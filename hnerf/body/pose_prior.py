@@ -3,6 +3,7 @@
 A joint's rotation vector is read along three axes of the resting body: flexion, twist about the bone, and sideways.
 """
 
+import itertools
 import math
 
 import numpy as np
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.normal_equations import NormalEquations
+from hnerf.capture.timing import usual_step
 
 # Standard deviations from rest in degrees: flexion, twist, sideways; chosen wide, as what everyday movement spans.
 SPREAD_DEG = {
@@ -110,11 +112,12 @@ class Smoothness:
     when they do: Geman-McClure lets a sudden movement or a cut go. It is not applied across gaps in the frames."""
 
     def __init__(self, runs: list[tuple[int, ...]], fps: float, sigma_mps2: np.ndarray) -> None:
-        """runs: frames that follow each other; sigma_mps2 (25,): standard deviations."""
+        """runs: frames that follow each other, one usual step apart; fps: of frame numbers; sigma_mps2 (25,): standard
+        deviations."""
         starts = np.cumsum([0] + [len(run) for run in runs])
         triples = [np.arange(a, a + len(run) - 2) for a, run in zip(starts, runs, strict=False)]
         self.first = np.concatenate(triples)  # of each three frames, (T,)
-        self.sigma_m = sigma_mps2 / fps**2
+        self.sigma_m = sigma_mps2 * usual_step([*itertools.chain(*runs)]) ** 2 / fps**2
 
     def add(self, equations: NormalEquations, keypoints_m: Tensor, jacobian: Tensor) -> float:
         """keypoints_m (n, 25, 3), jacobian (n, 25, 3, U); returns the cost. The shape's part in an acceleration is

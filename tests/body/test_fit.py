@@ -98,6 +98,11 @@ def test_runs_break_at_gaps_and_between_splits(tmp_path: Path) -> None:
     assert runs(capture) == [(0, 1, 2), (5, 6)]
 
 
+def test_frames_of_a_stride_follow_each_other(tmp_path: Path) -> None:
+    capture = record(tmp_path, moving_body((0, 3, 6, 15, 18)), RING, ("0",))
+    assert runs(capture) == [(0, 3, 6), (15, 18)]
+
+
 def test_the_normal_equations_hold_the_gradient_of_the_cost(tmp_path: Path) -> None:
     """Along a random direction through poses, shape and offsets, by central differences."""
     capture = record(tmp_path, moving_body((0, 1, 2)), RING, ("0", "1"))

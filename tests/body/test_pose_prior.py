@@ -96,6 +96,15 @@ def test_constant_velocity_is_free_and_a_jerk_costs_its_square() -> None:
     assert math.isclose(smoothness.add(NormalEquations(3, 9, 0), x, jacobian), 25 * 0.5 * 0.9, rel_tol=1e-6)
 
 
+def test_smoothness_of_a_stride_is_per_second() -> None:
+    """Every fifth frame at 50 a second is ten a second: the same acceleration costs the same."""
+    x = torch.randn(3, 25, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    jacobian = torch.zeros(3, 25, 3, 9, dtype=torch.float64)
+    each, fifth = Smoothness([(0, 1, 2)], 10.0, np.ones(25)), Smoothness([(0, 5, 10)], 50.0, np.ones(25))
+    costs = [smoothness.add(NormalEquations(3, 9, 0), x, jacobian) for smoothness in (each, fifth)]
+    assert math.isclose(*costs, rel_tol=1e-12)
+
+
 def test_smoothness_does_not_reach_across_runs_of_frames() -> None:
     smoothness = Smoothness([(0, 1), (5, 6)], 10.0, np.ones(25))
     x = torch.randn(4, 25, 3, dtype=torch.float64)
