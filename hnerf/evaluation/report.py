@@ -180,9 +180,13 @@ def png_uri(path: Path) -> str:
 
 
 def costs(stages: dict[str, dict[str, Any]], found: dict[str, Any]) -> list[tuple[str, str]]:
-    """What it took: seconds of each stage that recorded them, memory, size, time of one image."""
-    rows = [(f"{name}, seconds", readable(report["seconds"])) for name, report in stages.items() if "seconds" in report]
-    rows += [(f"Evaluation: {name}, seconds", readable(seconds)) for name, seconds in found["seconds"].items()]
+    """What it took: seconds of each stage that recorded them, of each part where it did, memory, size, time of one
+    image."""
+    rows = []
+    for name, report in (stages | {"Evaluation": found}).items():
+        seconds = report.get("seconds", {})
+        parts = {f"{name}: {part}": s for part, s in seconds.items()} if isinstance(seconds, dict) else {name: seconds}
+        rows += [(f"{part}, seconds", readable(s)) for part, s in parts.items()]
     rows.append(("One image, seconds (median)", readable(found["seconds_per_image"])))
     training = stages["Training"]
     sizes = ("device", "processes", "steps", "peak_memory_gib", "parameters", "model_mib")

@@ -1,7 +1,7 @@
 from pathlib import Path
 from typing import Any
 
-from hnerf.evaluation.report import is_rows, notes, readable, summary
+from hnerf.evaluation.report import costs, is_rows, notes, readable, summary
 from tests.evaluation.ball import ball_inputs, write_ball_capture
 
 
@@ -34,6 +34,21 @@ def test_summary_shows_a_dash_where_there_is_no_figure() -> None:
     assert values["PSNR"] == ["30.13", "–"]
     assert values["Surface distance"] == ["8.0", "–"]
     assert values["Chamfer"] == ["0.123", "–"]
+
+
+def test_costs_have_a_row_a_part_of_a_stage() -> None:
+    stages = {
+        "Calibration": {},
+        "Body fit": {"seconds": {"start": 0.5, "outlines": 12.25}},
+        "Training": {"seconds": 60.0},
+    }
+    assert costs(stages, {"seconds": {"rendering": 3.5}, "seconds_per_image": 0.1}) == [
+        ("Body fit: start, seconds", "0.5"),
+        ("Body fit: outlines, seconds", "12.25"),
+        ("Training, seconds", "60"),
+        ("Evaluation: rendering, seconds", "3.5"),
+        ("One image, seconds (median)", "0.1"),
+    ]
 
 
 def test_notes_say_what_was_left_out_and_what_was_compared_to(tmp_path: Path) -> None:
