@@ -22,6 +22,7 @@ from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.report import write_report
 from hnerf.evaluation.views import SPLITS, TRAINING_VIEW, View, some_views, split_frames
 from hnerf.render.avatar import Avatar
+from hnerf.render.pictures import write_image
 from hnerf.spread import spread
 
 log = logging.getLogger("hnerf.evaluation")
@@ -82,7 +83,7 @@ def render(avatar: Avatar, capture: Capture, views: list[View], out: Path) -> fl
         seconds.append(time.perf_counter() - started)
         path = view.path(out)
         path.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(path), cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
+        write_image(path, cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
         if time.perf_counter() > next_log:
             log.info("rendered %d of %d images", len(seconds), len(views))
             next_log = time.perf_counter() + LOG_EVERY_S

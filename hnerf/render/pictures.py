@@ -38,8 +38,7 @@ def write_pictures(avatar: Avatar, shots: Sequence[Shot], what: Sequence[str], f
     for number, shot in enumerate(shots):
         images = _images(avatar, shot, what)
         for kind, image in images.items():
-            if not cv2.imwrite(str(out / kind / f"{number:06d}.png"), image):
-                raise OSError(f"{out / kind}: cannot write image {number}")
+            write_image(out / kind / f"{number:06d}.png", image)
         if "mesh" in what:
             posed_surface(avatar, shot[1]).export(out / "mesh" / f"{number:06d}.ply")
         if time.perf_counter() > next_log:
@@ -47,6 +46,13 @@ def write_pictures(avatar: Avatar, shots: Sequence[Shot], what: Sequence[str], f
             next_log = time.perf_counter() + LOG_EVERY_S
     if "colour" in what:
         write_video(out / "colour", fps, out / "colour.mp4")
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """An image as cv2 has it, grey or (H, W, 3) BGR, in the format that the name says. Raises OSError if it cannot be
+    written."""
+    if not cv2.imwrite(str(path), image):
+        raise OSError(f"{path}: cannot be written; is the disk full?")
 
 
 def write_video(folder: Path, fps: float, path: Path) -> None:

@@ -19,6 +19,7 @@ from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.pictures import crop, frame_person
 from hnerf.evaluation.views import SPLITS, View, all_views, split_frames
 from hnerf.render.avatar import Avatar
+from hnerf.render.pictures import write_image
 from hnerf.spread import spread
 from hnerf.study.machine import machine
 from hnerf.study.nearness import pose_distances_mm, view_angle_deg
@@ -135,7 +136,7 @@ def write_pictures(scene: Scene, split: str, per_image: list[dict[str, Any]], ou
         box = frame_person(scene.truth.mask(**row))
         both = {"render": read_rgb(View(split, **row).path(out)), "truth": scene.truth.on_black(**row)[0]}
         for name, picture in both.items():
-            cv2.imwrite(str(out / "pictures" / f"{k}-{name}.png"), cv2.cvtColor(crop(picture, box), cv2.COLOR_RGB2BGR))
+            write_image(out / "pictures" / f"{k}-{name}.png", cv2.cvtColor(crop(picture, box), cv2.COLOR_RGB2BGR))
     return chosen
 
 

@@ -14,14 +14,17 @@ import pytest
 import trimesh
 
 from hnerf.config import EvaluationSettings
-from hnerf.evaluation.evaluate import evaluate, mesh_frames
+from hnerf.evaluation.evaluate import evaluate, mesh_frames, render
 from hnerf.evaluation.geometry import score_geometry
 from hnerf.evaluation.metrics import mask_box
+from hnerf.evaluation.views import View
 from tests.evaluation.ball import (
     PHOTOGRAPHED,
     RADIUS_M,
     RENDERED,
+    BallAvatar,
     ball_camera,
+    ball_fit,
     ball_inputs,
     centre_m,
     seen,
@@ -126,6 +129,14 @@ def test_figures_agree_with_the_independent_program(scored: Scored) -> None:
     ours = score_geometry(predicted, truth, np.random.default_rng(0), samples=30000, nodes=80)  # as that program does
     for name in ("chamfer_l2_e3", "chamfer_mm", "normal_consistency", "iou", "watertight"):
         assert getattr(ours, name) == pytest.approx(theirs["novel_view"]["geometry"][name], rel=1e-6), name
+
+
+def test_a_rendering_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    """A folder has its name."""
+    view = View("novel_view", "c", 1)
+    view.path(tmp_path).mkdir(parents=True)
+    with pytest.raises(OSError, match=r"000001\.png: cannot be written"):
+        render(BallAvatar(ball_fit()), write_ball_capture(tmp_path / "capture", "ball", ("c",)), [view], tmp_path)
 
 
 def test_without_truth_figures_are_null_with_a_reason(unscored: Scored) -> None:

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 import torch
 
+from hnerf.evaluation.evaluate import render
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.metrics import mask_box
+from hnerf.evaluation.views import View
 from hnerf.render.avatar import Rendering
 from hnerf.study import scoring
 from hnerf.study.plan import ScoringSettings
-from hnerf.study.scoring import Scene, frame_seconds, score, why_no_novel_poses
+from hnerf.study.scoring import Scene, frame_seconds, score, why_no_novel_poses, write_pictures
 from tests.evaluation.ball import (
     PHOTOGRAPHED,
     RADIUS_M,
@@ -127,6 +129,16 @@ def test_pictures_of_truth_and_rendering_lie_side_by_side(base: Path, found: dic
     assert found["pictures"] == [{"camera": "c", "frame": 0}, {"camera": "c", "frame": 2}]
     names = {path.name for path in (base / "out" / "pictures").iterdir()}
     assert names == {f"{k}-{name}.png" for k in (0, 1) for name in ("render", "truth")}
+
+
+def test_a_picture_that_cannot_be_written_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = write_ball_capture(tmp_path, "ball", ("c",))
+    write_ball_truth(capture, RADIUS_M)
+    render(BallAvatar(ball_fit()), capture, [View("novel_view", "c", 1)], tmp_path)
+    monkeypatch.setattr("cv2.imwrite", lambda path, image: False)
+    scene, shown = Scene(capture, GroundTruth(tmp_path, capture), "cpu"), [{"camera": "c", "frame": 1}]
+    with pytest.raises(OSError, match=r"0-render\.png: cannot be written"):
+        write_pictures(scene, "novel_view", shown, tmp_path)
 
 
 def test_a_method_without_poses_has_a_reason_instead_of_figures(tmp_path: Path) -> None:
