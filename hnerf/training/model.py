@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from pydantic import ValidationError
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -24,7 +25,7 @@ from hnerf.render.avatar import Rendering
 from hnerf.training.conditions import Conditions
 from hnerf.training.fast import FastField
 from hnerf.training.field import Field
-from hnerf.training.model_file import fill_field
+from hnerf.training.model_file import fill_field, other_version
 from hnerf.training.paper import PaperField
 from hnerf.training.pixels import within_reach
 
@@ -109,14 +110,24 @@ class TrainedAvatar:
 
 
 def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvatar:
-    """The subject that training left in `folder`; CaptureError if another version of the field left it."""
-    stored = json.loads((folder / "settings.json").read_text())
-    settings = TrainingSettings.model_validate(stored["training"])
+    """The subject that training left in `folder`; CaptureError if another version left it."""
+    settings, static = _stored_settings(folder / "settings.json")
     body = BodyFit.load(folder)
     body = BodyFit(body.rig.to(device), body.frames, body.theta.to(device), body.root.to(device))
     path = folder / "model.safetensors"
     tensors = load_file(path, device=str(device))
+    if "canonical_m" not in tensors:
+        raise other_version(path)
     before_tuning = dataclasses.replace(body, rig=dataclasses.replace(body.rig, vertices_m=tensors["canonical_m"]))
-    field = build_field(settings, before_tuning, stored["static"]).to(device)
+    field = build_field(settings, before_tuning, static).to(device)
     fill_field(field, tensors, path)
     return TrainedAvatar(field.eval(), body, settings.paper.scene_m, body)
+
+
+def _stored_settings(path: Path) -> tuple[TrainingSettings, bool]:
+    """What a subject was trained with, and whether it had one training frame."""
+    stored = json.loads(path.read_text())
+    try:
+        return TrainingSettings.model_validate(stored["training"]), stored["static"]
+    except (KeyError, ValidationError):
+        raise other_version(path) from None

@@ -37,7 +37,12 @@ def fill_field(field: nn.Module, tensors: dict[str, Tensor], path: Path) -> None
             tensors[name] = grid
         field.load_state_dict(tensors)
     except (KeyError, RuntimeError):
-        raise CaptureError(f"{path}: of another version; train the subject again") from None
+        raise other_version(path) from None
+
+
+def other_version(path: Path) -> CaptureError:
+    """The error of a file that another version of the library wrote."""
+    return CaptureError(f"{path}: of another version; train the subject again")
 
 
 def _grids(field: nn.Module) -> list[str]:
