@@ -54,7 +54,7 @@ class Capture:
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         """(H, W, 3) uint8 RGB, of the recorded frame nearest in time."""
-        return read_rgb(_only(self.root / "images" / camera, f"{self._recorded(camera, frame):06d}"))
+        return read_rgb(_only(self.root / "images" / camera, f"{self.recorded(camera, frame):06d}"))
 
     def background(self, camera: str) -> np.ndarray | None:
         """Clean plate, (H, W, 3) uint8 RGB, or None where the recording has none."""
@@ -63,7 +63,7 @@ class Capture:
 
     def given_mask(self, camera: str, frame: int) -> np.ndarray | None:
         """(H, W) bool, True on the person, of the recorded frame nearest in time; None where there is none."""
-        path = self.root / "masks" / camera / f"{self._recorded(camera, frame):06d}.png"
+        path = self.root / "masks" / camera / f"{self.recorded(camera, frame):06d}.png"
         if not path.exists():
             return None
         mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -115,7 +115,8 @@ class Capture:
             stored_frames=stored,
         )
 
-    def _recorded(self, camera: str, frame: int) -> int:
+    def recorded(self, camera: str, frame: int) -> int:
+        """The number of a camera's recorded frame nearest in time to a frame."""
         return nearest_frame(frame, self.frame_offsets.get(camera, 0.0))
 
     def save(self) -> None:

@@ -18,7 +18,8 @@ MASKED_IMAGE = "image x ground-truth mask"
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """Readers of an original capture folder's `ground_truth/`; images come at the size of the capture's camera."""
+    """Readers of an original capture folder's `ground_truth/`; images are of the recorded frame nearest in time, as
+    those of the capture are, and come at the size of its camera."""
 
     folder: Path
     capture: Capture
@@ -30,7 +31,7 @@ class GroundTruth:
 
     def mask(self, camera: str, frame: int) -> np.ndarray:
         """(H, W) bool, True on the person."""
-        path = self._path("masks", camera, f"{frame:06d}.png")
+        path = self._path("masks", camera, f"{self.capture.recorded(camera, frame):06d}.png")
         return self._at_camera_size(read_image(path)[..., 0], camera, cv2.INTER_NEAREST) > 127
 
     def on_black(self, camera: str, frame: int) -> tuple[np.ndarray, str]:
@@ -38,7 +39,7 @@ class GroundTruth:
 
         `on_black/`, whose edge pixels are weighted by coverage, where it has the view; else the photograph x the mask.
         """
-        path = self._path("on_black", camera, f"{frame:06d}.jpg")
+        path = self._path("on_black", camera, f"{self.capture.recorded(camera, frame):06d}.jpg")
         if path.exists():
             return self._at_camera_size(read_image(path), camera, cv2.INTER_AREA), ON_BLACK
         return self.capture.image(camera, frame) * self.mask(camera, frame)[..., None], MASKED_IMAGE

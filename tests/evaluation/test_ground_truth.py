@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -29,6 +30,18 @@ def test_on_black_comes_first_and_at_the_camera_size(truth: GroundTruth) -> None
     image, source = truth.on_black("c", 1)
     assert source == "ground_truth/on_black"
     assert np.array_equal(image, np.full((64, 64, 3), 90))
+
+
+def test_truth_is_of_the_instant_of_the_photograph(truth: GroundTruth) -> None:
+    """Camera c recorded the instant of frame 1 in its frame 2."""
+    in_step = replace(truth, capture=truth.capture.synchronised({"c": 1.0}))
+    expected = seen(truth.capture.cameras["c"], centre_m(2))
+    assert np.array_equal(in_step.mask("c", 1), expected)
+    assert np.array_equal(in_step.on_black("c", 1)[0][..., 0], expected * PHOTOGRAPHED)
+    path = truth.folder / "ground_truth" / "on_black" / "c" / "000002.jpg"
+    path.parent.mkdir(parents=True)
+    cv2.imwrite(str(path), np.full((64, 64, 3), 90, np.uint8))
+    assert in_step.on_black("c", 1)[0].max() == 90
 
 
 def test_a_missing_mask_is_named(truth: GroundTruth) -> None:
