@@ -41,9 +41,11 @@ def all_views(capture: Capture, split: str) -> list[View]:
 
 
 def some_views(capture: Capture, split: str, count: int | None) -> list[View]:
-    """At most `count` images of a split, all if None: frames spread over the recording, the cameras in turn."""
-    cameras = split_cameras(capture, split)
+    """At most `count` images of a split, all if None: frames spread over the recording, the cameras in turn; where
+    there are fewer frames than that, spread over all images."""
+    cameras, frames = split_cameras(capture, split), split_frames(capture, split)
     if count is None or not cameras:
         return all_views(capture, split)
-    frames = spread(split_frames(capture, split), count)
-    return [View(split, cameras[k % len(cameras)], frame) for k, frame in enumerate(frames)]
+    if len(frames) < count:
+        return spread(all_views(capture, split), count)
+    return [View(split, cameras[k % len(cameras)], frame) for k, frame in enumerate(spread(frames, count))]

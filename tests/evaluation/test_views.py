@@ -23,6 +23,14 @@ def test_shown_views_take_the_cameras_in_turn(tmp_path: Path) -> None:
     assert [(v.camera, v.frame) for v in shown] == [("a", 0), ("b", 1), ("a", 2)]
 
 
+def test_one_frame_is_shown_from_several_cameras(tmp_path: Path) -> None:
+    """The ball's novel frames are one; three test cameras see it."""
+    capture = write_ball_capture(tmp_path, "ball", ("c", "d", "e"))
+    assert [v.camera for v in some_views(capture, "novel_pose", 3)] == ["c", "d", "e"]
+    assert [v.camera for v in some_views(capture, "novel_pose", 2)] == ["c", "e"]
+    assert [(v.camera, v.frame) for v in some_views(capture, "novel_view", 3)] == [("c", 0), ("d", 1), ("e", 2)]
+
+
 def test_spread_keeps_both_ends() -> None:
     assert spread(range(10), 4) == [0, 3, 6, 9]
     assert spread((5, 7), 4) == [5, 7]
