@@ -77,7 +77,7 @@ def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> Boar
     calibration/extrinsic/ itself. The world is the first camera, or the board as it lies in frame `ground_frame` (Z up,
     origin at its top left corner). CaptureError where the footage does not hold what is needed.
     """
-    footage = read_board_footage(folder, "extrinsic")
+    footage = read_board_footage(folder, "extrinsic", ground_frame)
     if footage is None:
         raise CaptureError(
             f"{folder / 'calibration' / 'extrinsic'}: no board footage, or no charuco.toml and no [board] in "

@@ -179,9 +179,12 @@ def read_board(folder: Path) -> Board | None:
     return board
 
 
-def read_board_footage(folder: Path, part: Literal["extrinsic", "intrinsic"]) -> BoardFootage | None:
+def read_board_footage(
+    folder: Path, part: Literal["extrinsic", "intrinsic"], wanted: int | None = None
+) -> BoardFootage | None:
     """The corners in the footage of calibration/<part>/; None where there is no footage or no board is described.
 
+    Of long footage every so many frames are looked at, frame `wanted` among them if there is one.
     Of extrinsic footage, all cameras' pictures of one frame number are taken to be of one moment; videos are numbered
     by `timestamps.csv` (Caliscope's) if that is there. CaptureError on files that cannot be read or do not match.
     """
@@ -193,7 +196,8 @@ def read_board_footage(folder: Path, part: Literal["extrinsic", "intrinsic"]) ->
         return None
     numbers = _frame_numbers(path, footage, synchronised=part == "extrinsic")
     frames = tuple(sorted({number for of_camera in numbers.values() for number in of_camera}))
-    frames = frames[:: math.ceil(len(frames) / MAX_FRAMES)]
+    step = math.ceil(len(frames) / MAX_FRAMES)
+    frames = frames[frames.index(wanted) % step if wanted in frames else 0 :: step]
     corners_px, sizes_px = {}, {}
     for name, pictures in footage.items():
         corners_px[name], sizes_px[name] = _corners(board, pictures, numbers[name], frames)

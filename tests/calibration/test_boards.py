@@ -171,7 +171,7 @@ def test_close_footage_gives_the_intrinsics(tmp_path: Path, monkeypatch: pytest.
         return BoardFootage(tmp_path / part, BOARD, tuple(range(len(corners_px))), seen_px, size_px)
 
     read = {"extrinsic": footage("extrinsic", close_up(0.7)[:9]), "intrinsic": footage("intrinsic", close_up(0.7))}
-    monkeypatch.setattr(calibration_boards, "read_board_footage", lambda _, part: read[part])
+    monkeypatch.setattr(calibration_boards, "read_board_footage", lambda _, part, *__: read[part])
     calibration = calibrate_from_boards(tmp_path)
     assert calibration.lenses["a"].K[0, 0] == pytest.approx(900, rel=0.005)
     assert calibration.intrinsics["a"].startswith("from intrinsic/: 20 pictures")
@@ -188,7 +188,7 @@ def test_given_intrinsics_without_a_size_have_that_of_the_footage(
     write_cameras(tmp_path, [given], "easymocap")
     footage = BoardFootage(tmp_path, BOARD, tuple(range(9)), {"a": close_up(0.7)[:9]}, {"a": (1280, 720)})
     read = {"extrinsic": footage, "intrinsic": None}
-    monkeypatch.setattr(calibration_boards, "read_board_footage", lambda _, part: read[part])
+    monkeypatch.setattr(calibration_boards, "read_board_footage", lambda _, part, *__: read[part])
     assert calibrate_from_boards(tmp_path).lenses["a"].size_px == (1280, 720)
 
 
@@ -213,9 +213,16 @@ def test_the_floor_is_the_board_that_lies_on_it(tmp_path: Path, monkeypatch: pyt
     found = dict(zip("abc", corners_px, strict=True))
     footage = BoardFootage(tmp_path, BOARD, frames, found, dict.fromkeys("abc", (1000, 1000)))
     read = {"extrinsic": footage, "intrinsic": None}
-    monkeypatch.setattr(calibration_boards, "read_board_footage", lambda _, part: read[part])
+    looked_for: list[int] = []
+
+    def read_footage(_: Path, part: str, *wanted: int) -> BoardFootage | None:
+        looked_for.extend(wanted)
+        return read[part]
+
+    monkeypatch.setattr(calibration_boards, "read_board_footage", read_footage)
     monkeypatch.setattr(calibration_boards, "_intrinsics", lambda *_: (intrinsics, dict.fromkeys("abc", "given")))
     calibration = calibrate_from_boards(tmp_path, ground_frame=100 + FRAMES - 1)
+    assert looked_for == [100 + FRAMES - 1]
     for camera, lens in zip(cameras, calibration.lenses.values(), strict=True):
         assert -lens.R.T @ lens.t_m == pytest.approx(camera.centre_m - flat[1], abs=0.005)
     assert compare_pairs(cameras, calibration.fit.cameras)["a-c"]["turned_deg"] < 0.1

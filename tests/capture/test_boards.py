@@ -149,6 +149,9 @@ def test_long_footage_is_sampled_evenly(tmp_path: Path, monkeypatch: pytest.Monk
     rec.write_video(tmp_path / "calibration" / "extrinsic" / "cam_0.mp4", 10)
     footage = read_board_footage(tmp_path, "extrinsic")
     assert footage is not None and footage.frames == (0, 3, 6, 9)
+    for wanted, frames in {7: (1, 4, 7), 6: (0, 3, 6, 9), 99: (0, 3, 6, 9)}.items():
+        shifted = read_board_footage(tmp_path, "extrinsic", wanted)
+        assert shifted is not None and shifted.frames == frames
     assert len(Video.open(tmp_path / "calibration" / "extrinsic" / "cam_0.mp4").frames) == 10
 
 
