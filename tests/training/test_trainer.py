@@ -4,6 +4,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -138,14 +139,17 @@ def test_a_model_of_another_version_is_refused(tmp_path: Path):
 
 
 def test_novel_pixels_never_reach_the_field(tmp_path: Path):
-    """Without the second phase the field is the same to the bit: it learns from training frames alone. The training
-    poses and deformations stay where they were, too; those of the novel frame do not."""
-    recording = record(tmp_path / "capture")
+    """Without the second phase, and with other colours in the novel frame, the field is the same to the bit: it learns
+    from training frames alone. The training poses and deformations stay where they were, too; those of the novel frame
+    do not."""
     models = []
     for steps in (0, 4):
         out = tmp_path / f"{steps}"
-        out.mkdir()
-        train(*recording, with_changes(novel_pose_steps=steps), out, ALONE)
+        capture, masks, body = record(out / "capture")
+        if steps:
+            for path in (out / "capture" / "images").glob(f"*/{FRAMES[2]:06d}.png"):
+                assert cv2.imwrite(str(path), 255 - cv2.imread(str(path)))
+        train(capture, masks, body, with_changes(novel_pose_steps=steps), out, ALONE)
         models.append(load_file(out / "model.safetensors"))
     deformations = [model.pop("deformation.displacement") for model in models]
     assert all(torch.equal(models[0][name], models[1][name]) for name in models[0])
