@@ -27,7 +27,7 @@ def evaluate(
     training: Artifact,
     settings: EvaluationSettings,
 ) -> dict[str, float]:
-    """Renderings, meshes and figures by the protocol of docs/method.md, and a report for people."""
+    """Renderings, meshes and figures by the evaluation protocol of docs/method.md, and a report for people."""
     inputs = EvaluationInputs(
         capture_folder=truth.root,
         capture=calibrated(recording, calibration),

@@ -29,7 +29,7 @@ class BodyFit:
         return pose_vertices(self.rig, self.theta, self.root)
 
     def save(self, folder: Path) -> None:
-        """Write `body.npz` (the contract of docs/design.md) and `rig.npz`."""
+        """Write `body.npz` (its keys: docs/design.md) and `rig.npz`."""
         joints = joint_transforms(self.rig, self.rig.joints_m, self.theta, self.root)[..., :3, 3]
         np.savez(
             folder / "body.npz",

@@ -1,4 +1,4 @@
-"""Render, mesh and score a trained avatar by the protocol of docs/method.md, and report what was found."""
+"""Render, mesh and score a trained avatar by the evaluation protocol of docs/method.md, and report what was found."""
 
 import dataclasses
 import itertools

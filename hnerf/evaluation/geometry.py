@@ -37,7 +37,7 @@ def score_geometry(
     samples: int = SAMPLES,
     nodes: int = OCCUPANCY_NODES,
 ) -> GeometryScore:
-    """Score one mesh against another, both in world metres (protocol: docs/method.md)."""
+    """Score one mesh against another, both in world metres (docs/method.md, "Evaluation protocol")."""
     surfaces = Surface(predicted), Surface(truth)
     (points_p, normals_p), (points_t, normals_t) = (outer_samples(s, samples, rng) for s in surfaces)
     distance_p, face_t = surfaces[1].closest(points_p)

@@ -1,4 +1,4 @@
-"""Image figures of the protocol in docs/method.md: 8-bit images over black, inside the person's padded box."""
+"""Image figures of the evaluation protocol (docs/method.md): 8-bit images over black, in the person's padded box."""
 
 from dataclasses import dataclass
 

@@ -10,7 +10,7 @@ def alpha_from_density(density: Tensor, spacing: Tensor) -> Tensor:
 
 
 def occupancy(signed_distance: Tensor, sharpness: Tensor | float) -> Tensor:
-    """alpha_dot = sigmoid(-gamma d_hat): 1 inside (docs/method.md, erratum 1)."""
+    """alpha_dot = sigmoid(-gamma d_hat): 1 inside (docs/method.md, "The nine losses")."""
     return torch.sigmoid(-sharpness * signed_distance)
 
 

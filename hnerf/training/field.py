@@ -79,8 +79,8 @@ class Field(nn.Module, ABC):
         frame: Tensor,
         conditions: Conditions,
     ) -> Tensor:
-        """The person alone along rays (R, 3) of body rows (R,), from b alpha (docs/method.md, evaluation): colour over
-        black, coverage, and depth in metres, 0 where nothing is, (R, 5)."""
+        """The person alone along rays (R, 3) of body rows (R,), from b alpha (docs/method.md, "Evaluation protocol"):
+        colour over black, coverage, and depth in metres, 0 where nothing is, (R, 5)."""
         needed = self.samples_needed(region, origins_m, directions, frame)
         seen = origins_m.new_zeros(len(frame), 5)
         for count in needed[needed > 0].unique().tolist():
