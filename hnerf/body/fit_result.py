@@ -24,6 +24,10 @@ class BodyFit:
         """Row of a capture's frame."""
         return self.frames.index(frame)
 
+    def to(self, device: torch.device | str) -> "BodyFit":
+        """The same fit on another device."""
+        return BodyFit(self.rig.to(device), self.frames, self.theta.to(device), self.root.to(device))
+
     def vertices_m(self) -> Tensor:
         """(n, V, 3) posed vertices in the world."""
         return pose_vertices(self.rig, self.theta, self.root)

@@ -70,9 +70,7 @@ def render_subject(subject: Path, wish: Wish, out: Path) -> int:
 
 def on_body(avatar: TrainedAvatar, body: BodyFit) -> TrainedAvatar:
     """The avatar with another body under its clothes, other poses, or both; the rig keeps its topology."""
-    device = avatar.body.theta.device
-    moved = BodyFit(body.rig.to(device), body.frames, body.theta.to(device), body.root.to(device))
-    return dataclasses.replace(avatar, body=moved)
+    return dataclasses.replace(avatar, body=body.to(avatar.body.theta.device))
 
 
 def _checked(subject: Path, wish: Wish, out: Path) -> Capture:

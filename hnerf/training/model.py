@@ -112,8 +112,7 @@ class TrainedAvatar:
 def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvatar:
     """The subject that training left in `folder`; CaptureError if another version left it."""
     settings, static = _stored_settings(folder / "settings.json")
-    body = BodyFit.load(folder)
-    body = BodyFit(body.rig.to(device), body.frames, body.theta.to(device), body.root.to(device))
+    body = BodyFit.load(folder).to(device)
     path = folder / "model.safetensors"
     tensors = load_file(path, device=str(device))
     if "canonical_m" not in tensors:

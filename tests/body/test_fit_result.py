@@ -25,3 +25,9 @@ def test_what_was_saved_is_loaded_and_keeps_the_contract(tmp_path: Path) -> None
         np.testing.assert_allclose(stored["vertices"][1, 3], [6.5, 0, 1], atol=1e-6)
         assert stored["joint_names"].tolist() == ["root", "elbow", "tip"]
         np.testing.assert_allclose(stored["beta"], [0.3])
+
+
+def test_a_fit_moves_to_a_device_whole() -> None:
+    fit = BodyFit(two_bone_rig(), (3,), torch.zeros(1, 3, 3), torch.eye(4)[None]).to("meta")
+    assert fit.frames == (3,)
+    assert {tensor.device.type for tensor in (fit.theta, fit.root, fit.rig.vertices_m, fit.rig.faces)} == {"meta"}
