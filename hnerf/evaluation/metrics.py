@@ -25,12 +25,12 @@ def score_image(rendered: np.ndarray, reference: np.ndarray, mask: np.ndarray) -
     return ImageScore(psnr(a, b), ssim(a, b), mask_iou(rendered, mask))
 
 
-def mask_box(mask: np.ndarray, padding_px: int = BOX_PADDING_PX) -> tuple[slice, slice]:
+def mask_box(mask: np.ndarray) -> tuple[slice, slice]:
     """Rows and columns of a mask's (H, W) bounding box, padded and cut to the image. The mask is not empty."""
     rows, columns = np.nonzero(mask)
     return (
-        slice(max(0, int(rows.min()) - padding_px), int(rows.max()) + 1 + padding_px),
-        slice(max(0, int(columns.min()) - padding_px), int(columns.max()) + 1 + padding_px),
+        slice(max(0, int(rows.min()) - BOX_PADDING_PX), int(rows.max()) + 1 + BOX_PADDING_PX),
+        slice(max(0, int(columns.min()) - BOX_PADDING_PX), int(columns.max()) + 1 + BOX_PADDING_PX),
     )
 
 

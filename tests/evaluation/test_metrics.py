@@ -23,7 +23,6 @@ def test_mask_box_is_padded_and_cut_to_the_image() -> None:
     rows, columns = mask_box(mask)
     assert range(100)[rows] == range(10, 61)  # 30 - 20 to 40 + 20
     assert range(80)[columns] == range(0, 29)  # 5 - 20 is outside; 8 + 20
-    assert mask_box(mask, padding_px=0) == (slice(30, 41), slice(5, 9))
 
 
 def test_mask_iou_counts_pixels_brighter_than_the_level() -> None:
