@@ -13,7 +13,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("scoring", version="4")
+@stage("scoring", version="5")
 def score_training(
     out: Path,
     truth: Source,

@@ -53,7 +53,7 @@ class Trainer:
         torch.manual_seed(settings.seed)
         self.generator = torch.Generator().manual_seed(settings.seed)
         self.static = len(capture.train_frames) == 1
-        self.body = BodyFit(body.rig.to(device), body.frames, body.theta.to(device), body.root.to(device))
+        self.body = body.to(device)
         self.field = build_field(settings, self.body, self.static).to(device)
         bodies = PosedBodies(self.body.rig, self.body.theta, self.body.root, self.field.canonical_m)
         self.objective = Objective(self.field, bodies.correction(), settings)
@@ -274,8 +274,7 @@ class Trainer:
         """What `load_avatar` reads: field, settings and fine-tuned body."""
         folder.mkdir(parents=True, exist_ok=True)
         bodies = self.stage.bodies
-        body = BodyFit(bodies.rig.to("cpu"), self.body.frames, bodies.theta.cpu(), bodies.root.cpu())
-        body.save(folder)
+        BodyFit(bodies.rig, self.body.frames, bodies.theta, bodies.root).to("cpu").save(folder)
         write_field(self.field, folder / "model.safetensors")
         decisions = {name: dataclasses.asdict(decision) for name, decision in self.decisions.items()}
         settings = {"static": self.static, "training": self.settings.model_dump(), "decisions": decisions}
