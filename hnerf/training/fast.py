@@ -169,7 +169,7 @@ class FastField(Field):
         return 1 - (1 - samples.alpha_dot).prod(1)
 
     def samples_in_training(self, done: float) -> int:
-        """Half of them first, while the surface is not where it will be."""
+        """Half of them first in either phase, while surface or novel poses are not where they will be."""
         return self.samples if done >= COARSE else -(-self.samples // 2)
 
     def samples_needed(self, region: ShellGrid, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:

@@ -81,14 +81,14 @@ def test_steps_have_bounds(person_px: int, steps: int):
 
 @pytest.mark.parametrize(
     ("cameras", "frames", "rate", "steps"),
-    [(1, 40, 5e-4, 1080), (4, 40, 5e-4, 600), (1, 1, 5e-4, 600), (1, 40, 0, 600)],
+    [(1, 40, 5e-4, 2160), (4, 40, 5e-4, 600), (1, 1, 5e-4, 600), (1, 40, 0, 600)],
 )
 def test_one_camera_needs_time_to_find_how_deep_bodies_stand(cameras: int, frames: int, rate: float, steps: int):
-    """270 steps that see each of 40 frames, 10 of them a step: 1080; nothing to find in one frame or in given poses."""
+    """540 steps that see each of 40 frames, 10 of them a step: 2160; nothing to find in one frame or in given poses."""
     scene = SCENE.__class__(**{**vars(SCENE), "cameras": cameras, "frames": frames, "person_px": 1000})
     settings, decisions = decided(scene, pose_learning_rate=rate)
     assert settings.steps == steps
-    assert ("depths of 40 bodies" in decisions["steps"].reason) == (steps == 1080)
+    assert ("depths of 40 bodies" in decisions["steps"].reason) == (steps == 2160)
 
 
 def test_one_pose_teaches_nothing_about_poses():
