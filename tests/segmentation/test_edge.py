@@ -23,3 +23,14 @@ def test_an_unshaded_plate_stays_as_it_is():
     mask[5:15, 5:15] = True
     image = np.where(mask[..., None], 255 - plate, plate)
     assert shaded_plate(mask, image, plate) == pytest.approx(plate.astype(float), abs=0.01)
+
+
+def test_a_mask_that_ends_within_the_person_shades_nothing():
+    """A grey person before a motley wall: where the mask is 4 px too small, the person is beside it, as bright as no
+    shadow makes the wall. With the right mask the wall is."""
+    plate = np.random.default_rng(0).integers(20, 256, (60, 60, 1)).astype(np.uint8).repeat(3, -1)
+    person, small = np.zeros((2, 60, 60), bool)
+    person[10:50, 10:50], small[14:46, 14:46] = True, True
+    image = np.where(person[..., None], np.uint8(90), plate // 2)
+    assert np.array_equal(shaded_plate(small, image, plate), plate)
+    assert shaded_plate(person, image, plate)[30, 52] == pytest.approx(plate[30, 52] / 2, abs=1)

@@ -61,7 +61,7 @@ def test_bad_studies_are_refused_in_one_line(text: str, message: str, tmp_path: 
 
 
 def test_unknown_studies_and_degradations_are_refused() -> None:
-    with pytest.raises(CaptureError, match="slow: no such study or file; studies are full, mild, quick"):
+    with pytest.raises(CaptureError, match="slow: no such study or file; studies are full, masks, mild, quick"):
         load_stability("slow")
     with pytest.raises(CaptureError, match="--only hats: not in this study; it has cameras_left, "):
         load_stability("quick").only(["hats"])
