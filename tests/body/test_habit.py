@@ -139,7 +139,7 @@ def test_who_turns_in_one_posture_is_held_to_it(sway_deg: float, held: bool, tmp
 
 
 def test_one_posture_is_told_from_all_sides_only() -> None:
-    """Eight sides are, two views square to each other (trust 0.29) are not; the spread there stays."""
+    """Three sides are, two views square to each other (trust 0.29) are not; the spread there stays."""
     pose = turned([0.0, 2.0, 4.0, 0.0, math.pi / 2], [0.0] * 5)
     habit = Habit.of_one_view([[0, 1, 2], [3, 4]], pose, CAMERA)
     still = habit.of_one_posture()
