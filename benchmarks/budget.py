@@ -5,7 +5,7 @@ usage: python benchmarks/budget.py STORE [CAPTURE ...]
 Trains preset `fast` on shared captures (default: the three rendered ones) as hnerf/training/budget.py decides, then
 with grids of twice and of half the cells' number and as many times the samples a ray and the nodes, then with twice and
 half the steps; everything else stays. Held-out figures by the evaluation's protocol, of a few images. What is in STORE
-is not made again. Writes `benchmarks/results/budget.json` and `.md`.
+is not made again. Writes `benchmarks/results/budget.json` and `.md`, in which other captures stay as they are.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from provenance import SHARED, provenance, sentence, table, write_result
+from provenance import RESULTS, SHARED, provenance, sentence, table, write_result
 
 from flows.benchmark import trained
 from hnerf.config import Settings, TrainingSettings, load_settings
@@ -35,11 +35,12 @@ def main() -> None:
     parser.add_argument("store", type=Path)
     parser.add_argument("captures", nargs="*", default=CAPTURES)
     options = parser.parse_args()
-    captures = {name: measure(SHARED / "data" / name, Store(options.store.resolve())) for name in options.captures}
-    result = provenance() | {"captures": captures}
-    markdown = "\n".join(["# The scene decides the size", "", sentence(result), *as_lines(captures)])
-    write_result("budget", result, markdown)
-    print(markdown)
+    found = RESULTS / "budget.json"
+    captures = json.loads(found.read_text())["captures"] if found.exists() else {}
+    for name in options.captures:
+        captures[name] = provenance() | measure(SHARED / "data" / name, Store(options.store.resolve()))
+        write_result("budget", {"captures": captures}, as_markdown(captures))
+    print(as_markdown(captures))
 
 
 def measure(folder: Path, shelf: Store) -> dict[str, Any]:
@@ -96,15 +97,16 @@ def figures(found: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def as_lines(captures: dict[str, Any]) -> list[str]:
+def as_markdown(captures: dict[str, Any]) -> str:
     """A section for each capture: decisions with reasons, then variants against what was decided."""
-    lines: list[str] = []
+    lines = ["# The scene decides the size"]
     for name, found in captures.items():
         decisions = [[key, f"{d['value']}", d["reason"]] for key, d in found["decisions"].items()]
-        lines += ["", f"## {name}", "", *table([["setting", "decided", "because"], *decisions]), ""]
+        lines += ["", f"## {name}", "", sentence(found)]
+        lines += ["", *table([["setting", "decided", "because"], *decisions]), ""]
         titles = ["", "training, s", "model, MiB", "memory, GiB", "256 px frame, s", "PSNR", "new poses", "Chamfer"]
         lines += table([titles, *([title, *cells(row)] for title, row in found["variants"].items())])
-    return [*lines, ""]
+    return "\n".join([*lines, ""])
 
 
 def cells(row: dict[str, Any]) -> list[str]:
