@@ -18,7 +18,7 @@ from hnerf.capture.camera import Camera
 
 LOSS_SCALE_PX = 0.5  # residuals beyond pull linearly, not quadratically (soft L1)
 FRAMES_PER_PX = 0.1  # a picture this much off its time costs as much as a corner one pixel off
-MAX_OFFSET_FRAMES = 1.0  # the motion is known between neighbouring frames, not beyond
+MAX_OFFSET_FRAMES = 1.0  # cameras that start together differ by no more
 MAX_ITERATIONS = 60
 COST_TOLERANCE = 1e-4  # relative; cameras then stand still to a thousandth of a degree
 
@@ -55,14 +55,20 @@ class BoardFit:
 
 
 def adjust(
-    cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np.ndarray, boards: Poses, moving: Sequence[bool]
+    cameras: Sequence[Camera],
+    corners_m: np.ndarray,
+    corners_px: np.ndarray,
+    boards: Poses,
+    moving: Sequence[bool],
+    frame_step: int,
 ) -> BoardFit:
     """Least squares with a robust loss over board poses, time offsets, and the cameras that are `moving`.
 
-    corners_m (N, 3) on the board; corners_px (C, F, N, 2) undistorted, NaN where not seen; frames are consecutive.
+    corners_m (N, 3) on the board; corners_px (C, F, N, 2) undistorted, NaN where not seen, of every `frame_step`-th
+    frame of the footage, whose frames offsets count.
     Rotations are updated on the left, R <- exp(w) R (Triggs et al. 2000, Bundle Adjustment, section 2.2).
     """
-    problem = _Problem(cameras, corners_m, corners_px, boards, np.asarray(moving))
+    problem = _Problem(cameras, corners_m, corners_px, boards, np.asarray(moving), frame_step)
     start = np.zeros(problem.size)
     limits = np.full(problem.size, np.inf)
     limits[problem.offsets] = MAX_OFFSET_FRAMES
@@ -90,9 +96,10 @@ class _Problem:
         corners_px: np.ndarray,
         boards: Poses,
         moving: np.ndarray,
+        frame_step: int,
     ) -> None:
         self.cameras, self.corners_m, self.corners_px, self.boards = cameras, corners_m, corners_px, boards
-        self.moving = moving
+        self.moving, self.frame_step = moving, frame_step
         self.seen = np.isfinite(corners_px[..., 0])  # (C, F, N)
         self.camera, self.frame = np.nonzero(self.seen.any(-1))  # of each picture
         self.picture, self.corner = np.nonzero(self.seen[self.camera, self.frame])  # of each observation
@@ -156,7 +163,7 @@ class _Problem:
     def _moved(self, boards: Poses, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Each picture's board at the picture's own time: the parabola through its frame and the two beside it, in
         translation and in the rotation vector away from its frame. A frame that is missing mirrors the other one."""
-        frame, s = self.frame, offsets[:, None]
+        frame, s = self.frame, offsets[:, None] / self.frame_step
         own = np.arange(len(self.before))
         no_before, no_after = (self.before == own)[:, None], (self.after == own)[:, None]
         beside = self.before, self.after

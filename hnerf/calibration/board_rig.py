@@ -52,11 +52,13 @@ def linked(corners_px: np.ndarray) -> np.ndarray:
     return np.flatnonzero(group == np.bincount(group, minlength=1).argmax())
 
 
-def solve_rig(cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np.ndarray) -> BoardFit:
+def solve_rig(
+    cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np.ndarray, frame_step: int = 1
+) -> BoardFit:
     """Poses of cameras of which only the intrinsics are known, the first being the world.
 
-    corners_m (N, 3); corners_px (C, F, N, 2) undistorted, NaN where not seen, of `flat_only`. CaptureError if the board
-    does not link them.
+    corners_m (N, 3); corners_px (C, F, N, 2) undistorted, NaN where not seen, of `flat_only`, in every `frame_step`-th
+    frame of the footage. CaptureError if the board does not link them.
     """
     alone = ", ".join(cameras[i].name for i in set(range(len(cameras))).difference(linked(corners_px)))
     if alone:
@@ -67,13 +69,15 @@ def solve_rig(cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np.n
     views = _view_poses(cameras, corners_m, corners_px)
     cameras = _chained(cameras, views)
     boards = _board_poses(cameras, corners_m, corners_px, views)
-    return adjust(cameras, corners_m, corners_px, boards, [i > 0 for i in range(len(cameras))])
+    return adjust(cameras, corners_m, corners_px, boards, [i > 0 for i in range(len(cameras))], frame_step)
 
 
-def solve_boards(cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np.ndarray) -> BoardFit:
+def solve_boards(
+    cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np.ndarray, frame_step: int = 1
+) -> BoardFit:
     """As `solve_rig`, with cameras that stay as they are."""
     boards = _board_poses(cameras, corners_m, corners_px, _view_poses(cameras, corners_m, corners_px))
-    return adjust(cameras, corners_m, corners_px, boards, [False] * len(cameras))
+    return adjust(cameras, corners_m, corners_px, boards, [False] * len(cameras), frame_step)
 
 
 def compare_pairs(cameras: Sequence[Camera], others: Sequence[Camera]) -> dict[str, dict[str, float]]:

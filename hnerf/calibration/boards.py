@@ -88,7 +88,7 @@ def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> Boar
     corners_px = np.stack([undistorted(footage.corners_px[name], lens) for name, lens in lenses.items()])
     cameras = [Camera(n, lens.K, np.eye(3), np.zeros(3), *footage.sizes_px[n]) for n, lens in lenses.items()]
     log.info("adjusting %d cameras to %d corners", len(cameras), int(np.isfinite(corners_px[..., 0]).sum()))
-    fit = solve_rig(cameras, corners_m, flat_only(corners_m, corners_px))
+    fit = solve_rig(cameras, corners_m, flat_only(corners_m, corners_px), footage.frame_step)
     if ground_frame is not None:
         fit = _on_ground(fit, footage, ground_frame)
     lenses = {c.name: dataclasses.replace(lenses[c.name], R=c.R, t_m=c.t_m) for c in fit.cameras}
@@ -113,7 +113,8 @@ def board_witness(capture: Capture) -> dict[str, Any] | None:
     if len(chosen) < 2:
         return {"frames": corners_px.shape[1], "cameras": {}, "pairs": {}, "unlinked_cameras": names}
     cameras, corners_px = [cameras[i] for i in chosen], corners_px[chosen]
-    own, given = (solve(cameras, stored.corners_m, corners_px) for solve in (solve_rig, solve_boards))
+    seen = stored.corners_m, corners_px, stored.frame_step
+    own, given = (solve(cameras, *seen) for solve in (solve_rig, solve_boards))
     figures = {
         camera.name: _figures(given, i) | {"footage_rms_px": _rms(own.error_px(i))} for i, camera in enumerate(cameras)
     }

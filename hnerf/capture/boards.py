@@ -5,6 +5,7 @@ camera; `charuco.toml` (Caliscope's keys) or a table `[board]` in `capture.toml`
 """
 
 import csv
+import dataclasses
 import logging
 import math
 import re
@@ -101,11 +102,13 @@ class Detector:
 
 @dataclass(frozen=True)
 class BoardFootage:
-    """corners_px: per camera (frames, N, 2) as recorded, NaN where not seen, in the order of `frames`."""
+    """corners_px: per camera (frames, N, 2) as recorded, NaN where not seen, in the order of `frames`, which are every
+    `frame_step`-th."""
 
     path: Path
     board: Board
     frames: tuple[int, ...]
+    frame_step: int
     corners_px: dict[str, np.ndarray]
     sizes_px: dict[str, tuple[int, int]]
 
@@ -113,16 +116,16 @@ class BoardFootage:
 @dataclass(frozen=True)
 class BoardCorners:
     """`boards.npz` of a normalised capture: corners_m (N, 3) on the board; corners_px (C, F, N, 2) in the linear
-    cameras' pixels, NaN where not seen."""
+    cameras' pixels, NaN where not seen, in every `frame_step`-th frame of the footage."""
 
     cameras: tuple[str, ...]
     corners_m: np.ndarray
     corners_px: np.ndarray
+    frame_step: int
 
     def save(self, root: Path) -> None:
         """Write `boards.npz` into a normalised capture."""
-        plain = {"cameras": np.array(self.cameras), "corners_m": self.corners_m, "corners_px": self.corners_px}
-        np.savez_compressed(root / BOARDS_FILE, **plain)  # type: ignore[arg-type]
+        np.savez_compressed(root / BOARDS_FILE, **dataclasses.asdict(self))
 
 
 def normalised_corners(footage: BoardFootage, normalisers: dict[str, Normaliser]) -> BoardCorners:
@@ -144,7 +147,7 @@ def normalised_corners(footage: BoardFootage, normalisers: dict[str, Normaliser]
         seen = np.isfinite(footage.corners_px[name][..., :1])
         corners = np.concatenate([np.nan_to_num(footage.corners_px[name]), seen], -1)
         corners_px.append(np.where(seen, normalisers[name].keypoints(corners)[..., :2], np.nan))
-    return BoardCorners(names, footage.board.corners_m, np.array(corners_px))
+    return BoardCorners(names, footage.board.corners_m, np.array(corners_px), footage.frame_step)
 
 
 def load_board_corners(root: Path) -> BoardCorners | None:
@@ -152,7 +155,9 @@ def load_board_corners(root: Path) -> BoardCorners | None:
     if not (root / BOARDS_FILE).exists():
         return None
     with np.load(root / BOARDS_FILE, allow_pickle=False) as stored:
-        return BoardCorners(tuple(stored["cameras"].tolist()), stored["corners_m"], stored["corners_px"])
+        return BoardCorners(
+            tuple(stored["cameras"].tolist()), stored["corners_m"], stored["corners_px"], int(stored["frame_step"])
+        )
 
 
 def read_board(folder: Path) -> Board | None:
@@ -203,7 +208,7 @@ def read_board_footage(
         corners_px[name], sizes_px[name] = _corners(board, pictures, numbers[name], frames)
         shown = int(np.isfinite(corners_px[name][..., 0]).any(-1).sum())
         log.info("%s: board found in %d of %d frames", pictures.path, shown, len(frames))
-    return BoardFootage(path, board, frames, corners_px, sizes_px)
+    return BoardFootage(path, board, frames, step, corners_px, sizes_px)
 
 
 def _corners(

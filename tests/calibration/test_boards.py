@@ -81,6 +81,15 @@ def test_cameras_and_their_lag_are_found() -> None:
     assert np.sqrt((fit.error_px() ** 2).mean()) == pytest.approx(NOISE_PX * np.sqrt(2), abs=0.03)
 
 
+def test_offsets_count_frames_of_the_footage() -> None:
+    """Every second frame: what lies 0.4 of the pictures' distance apart is 0.8 frames."""
+    cameras = rig()
+    fit = solve_rig(cameras, BOARD.corners_m, flat_only(BOARD.corners_m, seen(cameras, {"b": LAG})), frame_step=2)
+    lag = np.nanmedian(fit.offsets_frames[1] - fit.offsets_frames[0])
+    assert lag == pytest.approx(2 * LAG, abs=0.1)
+    assert max(figures["turned_deg"] for figures in compare_pairs(cameras, fit.cameras).values()) < 0.3
+
+
 def test_a_corner_off_its_plane_and_a_picture_of_few_are_dropped() -> None:
     corners_px = seen(rig(), {})[:1, :2]
     corners_px[0, 0, 7] += [3.0, 0]
@@ -106,17 +115,17 @@ def test_the_witness_tells_what_it_knows_nothing_about(tmp_path: Path) -> None:
     corners_px = seen(rig(), {})
     corners_px[2] = np.nan
     capture = write_capture(tmp_path, rig(), {camera.name: np.zeros((2, 1, 25, 3)) for camera in rig()})
-    BoardCorners(("a", "b", "c"), BOARD.corners_m, corners_px).save(capture.root)
+    BoardCorners(("a", "b", "c"), BOARD.corners_m, corners_px, 1).save(capture.root)
     found = board_witness(capture)
     assert found is not None and found["unlinked_cameras"] == ["c"] and list(found["cameras"]) == ["a", "b"]
-    BoardCorners(("a",), BOARD.corners_m, corners_px[:1]).save(capture.root)
+    BoardCorners(("a",), BOARD.corners_m, corners_px[:1], 1).save(capture.root)
     found = board_witness(capture)
     assert found is not None and found["unlinked_cameras"] == ["a"] and found["cameras"] == {}
 
 
 def test_the_witness_names_the_camera_that_moved(tmp_path: Path) -> None:
     cameras = rig()
-    stored = BoardCorners(("a", "b", "c"), BOARD.corners_m, seen(cameras, {}))
+    stored = BoardCorners(("a", "b", "c"), BOARD.corners_m, seen(cameras, {}), 1)
     bumped = [cameras[0], turned(cameras[1], 1.0), cameras[2]]
     capture = write_capture(tmp_path / "bumped", bumped, {camera.name: np.zeros((2, 1, 25, 3)) for camera in cameras})
     assert board_witness(capture) is None
@@ -168,7 +177,7 @@ def test_a_lens_is_believed_only_if_the_pictures_fix_it() -> None:
 def test_close_footage_gives_the_intrinsics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def footage(part: str, corners_px: np.ndarray) -> BoardFootage:
         seen_px, size_px = {"a": corners_px}, {"a": (1280, 720)}
-        return BoardFootage(tmp_path / part, BOARD, tuple(range(len(corners_px))), seen_px, size_px)
+        return BoardFootage(tmp_path / part, BOARD, tuple(range(len(corners_px))), 1, seen_px, size_px)
 
     read = {"extrinsic": footage("extrinsic", close_up(0.7)[:9]), "intrinsic": footage("intrinsic", close_up(0.7))}
     monkeypatch.setattr(calibration_boards, "read_board_footage", lambda _, part, *__: read[part])
@@ -186,7 +195,7 @@ def test_given_intrinsics_without_a_size_have_that_of_the_footage(
     given = Lens("a", np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0]), np.eye(3),
                  np.zeros(3), None)  # fmt: skip
     write_cameras(tmp_path, [given], "easymocap")
-    footage = BoardFootage(tmp_path, BOARD, tuple(range(9)), {"a": close_up(0.7)[:9]}, {"a": (1280, 720)})
+    footage = BoardFootage(tmp_path, BOARD, tuple(range(9)), 1, {"a": close_up(0.7)[:9]}, {"a": (1280, 720)})
     read = {"extrinsic": footage, "intrinsic": None}
     monkeypatch.setattr(calibration_boards, "read_board_footage", lambda _, part, *__: read[part])
     assert calibrate_from_boards(tmp_path).lenses["a"].size_px == (1280, 720)
@@ -211,7 +220,7 @@ def test_the_floor_is_the_board_that_lies_on_it(tmp_path: Path, monkeypatch: pyt
     intrinsics = {c.name: Lens(c.name, c.K, np.zeros(4), np.eye(3), np.zeros(3), (1000, 1000)) for c in cameras}
     frames = tuple(range(100, 100 + FRAMES))
     found = dict(zip("abc", corners_px, strict=True))
-    footage = BoardFootage(tmp_path, BOARD, frames, found, dict.fromkeys("abc", (1000, 1000)))
+    footage = BoardFootage(tmp_path, BOARD, frames, 1, found, dict.fromkeys("abc", (1000, 1000)))
     read = {"extrinsic": footage, "intrinsic": None}
     looked_for: list[int] = []
 

@@ -148,7 +148,7 @@ def test_long_footage_is_sampled_evenly(tmp_path: Path, monkeypatch: pytest.Monk
     (tmp_path / "charuco.toml").write_text(CHARUCO)
     rec.write_video(tmp_path / "calibration" / "extrinsic" / "cam_0.mp4", 10)
     footage = read_board_footage(tmp_path, "extrinsic")
-    assert footage is not None and footage.frames == (0, 3, 6, 9)
+    assert footage is not None and footage.frames == (0, 3, 6, 9) and footage.frame_step == 3
     for wanted, frames in {7: (1, 4, 7), 6: (0, 3, 6, 9), 99: (0, 3, 6, 9)}.items():
         shifted = read_board_footage(tmp_path, "extrinsic", wanted)
         assert shifted is not None and shifted.frames == frames
@@ -168,5 +168,10 @@ def test_ingest_keeps_the_corners_in_the_pixels_it_writes(tmp_path: Path) -> Non
     (folder / "charuco.toml").write_text(CHARUCO)
     capture = ingest(folder, CaptureSettings(max_side_px=160), tmp_path / "out")
     stored = load_board_corners(capture.root)
-    assert stored is not None and stored.cameras == rec.CAMERAS and stored.corners_px.shape == (2, 1, 12, 2)
+    assert (
+        stored is not None
+        and stored.cameras == rec.CAMERAS
+        and stored.frame_step == 1
+        and stored.corners_px.shape == (2, 1, 12, 2)
+    )
     assert stored.corners_px[0, 0, 0].tolist() == pytest.approx([99.5 / 2 - 0.25, 59.5 / 2 - 0.25], abs=0.13)
