@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from hnerf.body.fit_result import BodyFit
@@ -53,7 +54,7 @@ def stage_avatar(dressed: BodyFit, texture: np.ndarray, up: str) -> StagedAvatar
     """
     rig, body = dressed.rig, Y_UP_FROM_Z_UP
     world = stage_from_world(up)
-    transforms = joint_transforms(rig, rig.joints_m.double(), dressed.theta.double(), dressed.root.double()).numpy()
+    transforms = joint_transforms(rig.to(dtype=torch.float64), dressed.theta.double(), dressed.root.double()).numpy()
     staged = _rotation_4x4(world) @ transforms @ _rotation_4x4(body.T)
     local = staged.copy()
     parents = rig.parents.numpy()

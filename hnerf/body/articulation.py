@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from hnerf.body.rig import Rig, joint_transforms, rotation_from_axis_angle
+from hnerf.body.rig import Rig, joint_transforms, posed_joint_basis, rotation_from_axis_angle
 
 
 @dataclass(frozen=True)
@@ -85,16 +85,13 @@ class Articulation:
 
     def pose(self, pose: Pose) -> PosedJoints:
         """Place the moving joints."""
-        world = joint_transforms(self.rig, self.rig.joints_m, pose.theta, pose.root)[:, self.joints]
-        rotations, positions = world[..., :3, :3], world[..., :3, 3]
+        world = joint_transforms(self.rig, pose.theta, pose.root)
+        rotations, positions = world[:, self.joints, :3, :3], world[:, self.joints, :3, 3]
         above = rotations[:, self.parents]
         axes = above @ left_jacobian(pose.theta[:, self.joints])
         axes[:, 0] = torch.eye(3, dtype=axes.dtype)
-        shape = [rotations[:, 0] @ self.rest_basis_m[0]]
-        for m in range(1, len(self.joints)):
-            parent = int(self.parents[m])
-            shape.append(shape[parent] + above[:, m] @ (self.rest_basis_m[m] - self.rest_basis_m[parent]))
-        return PosedJoints(rotations, positions, axes, torch.stack(shape, 1))
+        shape = posed_joint_basis(self.rig, world, pose.root)[:, self.joints]
+        return PosedJoints(rotations, positions, axes, shape)
 
     def surface(self, joints: PosedJoints, frame: int) -> Tensor:
         """Every vertex in one frame, (V, 3) world."""

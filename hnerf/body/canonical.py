@@ -14,6 +14,7 @@ from hnerf.body.descriptor import BodyMeshes
 from hnerf.body.rig import (
     Rig,
     joint_transforms,
+    posed_joint_basis,
     rotation_from_axis_angle,
     skinning_transforms,
     vertex_transforms,
@@ -89,21 +90,18 @@ class PosedBodies:
     def _pose(self, theta: Tensor, root: Tensor) -> None:
         self.theta, self.root = theta.detach(), root.detach()
         rig = self.rig
-        posed = vertex_transforms(rig, skinning_transforms(rig, rig.joints_m, self.theta, self.root))
+        self._joints = joint_transforms(rig, self.theta, self.root)
+        posed = vertex_transforms(rig, skinning_transforms(self._joints, rig.joints_m))
         self._linear = posed[..., :3].contiguous()
         self._inverse = torch.linalg.inv(self._linear)
         self.vertices_m = (self._linear @ rig.vertices_m[..., None])[..., 0] + posed[..., 3]
-        self._joints = joint_transforms(rig, rig.joints_m, self.theta, self.root)
         self._carried = self._shape_carries()
 
     def _shape_carries(self) -> Tensor:
         """(n J, 3 B): how a unit of each shape moves what each joint carries rigidly, beyond turning the rest body's
         own change: the joint's way in the world less that in the rest body, turned."""
-        rotations, basis = self._joints[..., :3, :3], self.rig.joint_basis.permute(1, 2, 0)
-        moved = [self.root[:, :3, :3] @ basis[0]]
-        for joint, parent in enumerate(self.rig.parents.tolist()[1:], 1):
-            moved.append(moved[parent] + rotations[:, parent] @ (basis[joint] - basis[parent]))
-        return (torch.stack(moved, 1) - rotations @ basis).flatten(2).flatten(0, 1)
+        turned = self._joints[..., :3, :3] @ self.rig.joint_basis.permute(1, 2, 0)
+        return (posed_joint_basis(self.rig, self._joints, self.root) - turned).flatten(2).flatten(0, 1)
 
     def correction(self) -> PoseCorrection:
         """A correction of zero for these frames."""

@@ -34,7 +34,7 @@ class BodyFit:
 
     def save(self, folder: Path) -> None:
         """Write `body.npz` (its keys: docs/design.md) and `rig.npz`."""
-        joints = joint_transforms(self.rig, self.rig.joints_m, self.theta, self.root)[..., :3, 3]
+        joints = joint_transforms(self.rig, self.theta, self.root)[..., :3, 3]
         np.savez(
             folder / "body.npz",
             theta=self.theta.numpy(),

@@ -8,7 +8,9 @@ SMPL, Loper et al. 2015), so every rest orientation is the identity.
 """
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +44,15 @@ class Rig:
     skin_weights: Tensor
     free: Tensor
     keypoint_weights: Tensor
+
+    @cached_property
+    def levels(self) -> list[Tensor]:
+        """The root, its children, theirs, and so on: joints (k,) of each."""
+        depth = [0]
+        for parent in self.parents.tolist()[1:]:
+            depth.append(depth[parent] + 1)
+        depths = torch.tensor(depth, device=self.parents.device)
+        return [torch.nonzero(depths == level)[:, 0] for level in range(max(depth) + 1)]
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "Rig":
         """The same rig on another device; `dtype` changes the floating tensors only."""
@@ -95,38 +106,39 @@ def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
     return torch.eye(3, dtype=cross.dtype, device=cross.device) + sinc * cross + half * (cross @ cross)
 
 
-def joint_transforms(rig: Rig, joints_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+def joint_transforms(rig: Rig, theta: Tensor, root: Tensor) -> Tensor:
     """World transform of every joint, (..., J, 4, 4).
 
-    joints_m (J, 3) rest joints; theta (..., J, 3) radians; root (..., 4, 4) world from body (T in docs/method.md).
+    theta (..., J, 3) radians; root (..., 4, 4) world from body (T in docs/method.md).
     """
-    rotations = rotation_from_axis_angle(theta)
-    parents = rig.parents.tolist()
-    offsets = joints_m - torch.where(rig.parents[:, None] >= 0, joints_m[rig.parents.clamp(min=0)], 0.0)
-    world: list[Tensor] = []
-    for j, parent in enumerate(parents):
-        above = root if parent < 0 else world[parent]
-        rotation = above[..., :3, :3] @ rotations[..., j, :, :]
-        translation = above[..., :3, 3:] + above[..., :3, :3] @ offsets[j, :, None]
-        top = torch.cat([rotation, translation], -1)
-        bottom = torch.tensor([0, 0, 0, 1], dtype=top.dtype, device=top.device).expand(*top.shape[:-2], 1, 4)
-        world.append(torch.cat([top, bottom], -2))
-    return torch.stack(world, -3)
+    rotations, offsets = rotation_from_axis_angle(theta), _from_above(rig, rig.joints_m)
+    top = torch.cat([rotations, offsets[..., None].expand(*rotations.shape[:-1], 1)], -1)
+    bottom = torch.tensor([0, 0, 0, 1], dtype=top.dtype, device=top.device).expand(*top.shape[:-2], 1, 4)
+    own = torch.cat([top, bottom], -2)
+    first = root[..., None, :, :] @ own[..., :1, :, :]
+    return _downwards(rig, first, lambda above, joints: above @ own[..., joints, :, :])
 
 
-def skinning_transforms(rig: Rig, joints_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
-    """World from rest pose for a point rigidly on each joint, (..., J, 4, 4): G_j [I | -joint_j]."""
-    world = joint_transforms(rig, joints_m, theta, root)
+def posed_joint_basis(rig: Rig, world: Tensor, root: Tensor) -> Tensor:
+    """How a unit of each shape moves the posed joints, (n, J, 3, B) metres. world (n, J, 4, 4): `joint_transforms`;
+    root (n, 4, 4)."""
+    offsets = _from_above(rig, rig.joint_basis.transpose(0, 1)).transpose(1, 2)  # (J, 3, B)
+    turned = world[:, rig.parents.clamp(min=0), :3, :3] @ offsets
+    first = root[:, None, :3, :3] @ offsets[:1]
+    return _downwards(rig, first, lambda above, joints: above + turned[:, joints])
+
+
+def skinning_transforms(world: Tensor, joints_m: Tensor) -> Tensor:
+    """World from rest pose for a point rigidly on each joint, (..., J, 4, 4): G_j [I | -joint_j]. world: G, of
+    `joint_transforms`; joints_m (J, 3) at rest."""
     moved = world[..., :3, 3] - (world[..., :3, :3] @ joints_m[..., None])[..., 0]
     return torch.cat([torch.cat([world[..., :3, :3], moved[..., None]], -1), world[..., 3:, :]], -2)
 
 
-def pose_vertices(rig: Rig, theta: Tensor, root: Tensor, beta: Tensor | None = None) -> Tensor:
-    """Posed vertices in the world, (..., V, 3) metres. theta (..., J, 3), root (..., 4, 4), beta (B,) or the rig's
-    own."""
-    vertices_m, joints_m = (rig.vertices_m, rig.joints_m) if beta is None else rig.shaped(beta)
-    transforms = vertex_transforms(rig, skinning_transforms(rig, joints_m, theta, root))
-    return (transforms[..., :3, :3] @ vertices_m[..., None])[..., 0] + transforms[..., :3, 3]
+def pose_vertices(rig: Rig, theta: Tensor, root: Tensor) -> Tensor:
+    """Posed vertices in the world, (..., V, 3) metres. theta (..., J, 3), root (..., 4, 4)."""
+    transforms = vertex_transforms(rig, skinning_transforms(joint_transforms(rig, theta, root), rig.joints_m))
+    return (transforms[..., :3, :3] @ rig.vertices_m[..., None])[..., 0] + transforms[..., :3, 3]
 
 
 def vertex_transforms(rig: Rig, transforms: Tensor) -> Tensor:
@@ -135,3 +147,18 @@ def vertex_transforms(rig: Rig, transforms: Tensor) -> Tensor:
     dense = torch.zeros(len(rig.skin_weights), len(rig.joints_m), dtype=top.dtype, device=top.device)
     dense.scatter_add_(1, rig.skin_joints, rig.skin_weights)
     return (dense @ top).unflatten(-1, (3, 4))
+
+
+def _from_above(rig: Rig, values: Tensor) -> Tensor:
+    """Values (J, ...) of joints less those of the joints above them; the root's own."""
+    return torch.cat([values[:1], values[1:] - values[rig.parents[1:]]])
+
+
+def _downwards(rig: Rig, first: Tensor, step: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """Values of all joints (..., J, a, b) from the root's (..., 1, a, b), level by level: step(values of the joints
+    above, joints (k,))."""
+    values, before = [first], rig.levels[0]
+    for joints in rig.levels[1:]:
+        values.append(step(values[-1][..., torch.searchsorted(before, rig.parents[joints]), :, :], joints))
+        before = joints
+    return torch.cat(values, -3)[..., torch.cat(rig.levels).argsort(), :, :]

@@ -128,7 +128,7 @@ def _moved(body: BodyFit, move_m: Tensor) -> BodyFit:
 
 
 def _pelvis_m(body: BodyFit) -> Tensor:
-    return joint_transforms(body.rig, body.rig.joints_m, body.theta, body.root)[:, 0, :3, 3]
+    return joint_transforms(body.rig, body.theta, body.root)[:, 0, :3, 3]
 
 
 def _part_way(start: Rotation, end: Rotation, share: float) -> Rotation:

@@ -24,7 +24,7 @@ RING = {str(k): ring_camera(str(k), 0.3 + k * np.pi / 2) for k in range(4)} | {"
 
 def joint_error_m(a: BodyFit, b: BodyFit) -> torch.Tensor:
     """(n, free joints) distances."""
-    where = [joint_transforms(body.rig, body.rig.joints_m, body.theta, body.root)[..., :3, 3] for body in (a, b)]
+    where = [joint_transforms(body.rig, body.theta, body.root)[..., :3, 3] for body in (a, b)]
     return (where[0] - where[1]).norm(dim=-1)[:, a.rig.free]
 
 
@@ -63,7 +63,7 @@ def test_neighbours_outvote_an_arm_mirrored_in_depth(tmp_path: Path) -> None:
     wrist = truth.rig.joint_names.index("wrist.L")
 
     def off_m(found: Pose) -> float:
-        where = [joint_transforms(p.rig, p.rig.joints_m, p.theta, p.root)[3, wrist, :3, 3] for p in (found, pose)]
+        where = [joint_transforms(p.rig, p.theta, p.root)[3, wrist, :3, 3] for p in (found, pose)]
         return float((where[0] - where[1]).norm())
 
     assert off_m(mirrored) > 0.5  # descent alone stays there

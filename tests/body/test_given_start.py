@@ -44,7 +44,7 @@ def parameters() -> GivenPoses:
 
 
 def joints_m(body: BodyFit | Pose) -> Tensor:
-    return joint_transforms(body.rig, body.rig.joints_m, body.theta, body.root)[..., :3, 3].double()
+    return joint_transforms(body.rig, body.theta, body.root)[..., :3, 3].double()
 
 
 def recorded(model_file: Path, folder: Path, given: GivenPoses) -> tuple[Capture, BodyFit]:

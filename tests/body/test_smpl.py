@@ -72,7 +72,7 @@ def test_given_parameters_put_joints_where_smpl_has_them(model_file: Path) -> No
     """Exactly; and vertices where skin is rigid: those of one joint only, less the rest pose's blend shape."""
     model, given = body_model(FitSettings(body_model=model_file)), random_parameters()
     pose = given_start(given, model)
-    joints = joint_transforms(pose.rig, pose.rig.joints_m, pose.theta, pose.root)[..., :3, 3].numpy()
+    joints = joint_transforms(pose.rig, pose.theta, pose.root)[..., :3, 3].numpy()
     vertices = pose_vertices(pose.rig, pose.theta, pose.root).numpy()
     weights, posedirs = made_up_smpl()["weights"], made_up_smpl()["posedirs"]
     rigid = (weights.max(1) == 1) & ~posedirs.any((1, 2))
@@ -129,7 +129,7 @@ def test_a_fit_to_its_own_keypoints_recovers_pose_and_shape(model_file: Path, tm
     truth = BodyFit(rig.to(dtype=torch.float32), (0, 1, 2), theta, root)
     capture = record(tmp_path, truth, RING, tuple(RING))
     fit, report = fit_body(capture, None, FitSettings(body_model=model_file))
-    joints = [joint_transforms(b.rig, b.rig.joints_m, b.theta, b.root)[..., :3, 3] for b in (fit, truth)]
+    joints = [joint_transforms(b.rig, b.theta, b.root)[..., :3, 3] for b in (fit, truth)]
     assert float((joints[0] - joints[1]).norm(dim=-1).max()) < 0.02
     assert float((fit.rig.beta - truth.rig.beta).abs()[:4].max()) < 0.4 and max(report["keypoint_residual_px"]) < 1
 

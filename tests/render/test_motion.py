@@ -119,7 +119,7 @@ def test_amass_poses_turn_the_likes_of_smpls_joints(tmp_path: Path) -> None:
     motion = read_motion(tmp_path / "walk.npz", "1:")
     assert (motion.fps, motion.up, motion.body.frames) == (120.0, "z", (1, 2))
     rig = motion.body.rig
-    joints_m = joint_transforms(rig, rig.joints_m, motion.body.theta, motion.body.root)[..., :3, 3]
+    joints_m = joint_transforms(rig, motion.body.theta, motion.body.root)[..., :3, 3]
     at = {
         name: joints_m[:, rig.joint_names.index(name)] for name in ("upperarm01.L", "wrist.L", "head", "upperleg01.L")
     }

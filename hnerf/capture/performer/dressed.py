@@ -10,7 +10,7 @@ import numpy as np
 from scipy import sparse
 from torch import Tensor
 
-from hnerf.body.rig import Rig, skinning_transforms
+from hnerf.body.rig import Rig, joint_transforms, skinning_transforms
 
 GARMENTS = ("skin", "shirt", "trousers", "shoes", "hair")
 SMOOTHING_STEPS = 30
@@ -73,7 +73,9 @@ class Dressed:
 
     def posed_m(self, theta: Tensor, root: Tensor, gait_phase: float) -> np.ndarray:
         """(V, 3) world vertices. theta (J, 3), root (4, 4); the gait's phase in radians moves the folds and the hem."""
-        transforms = skinning_transforms(self.rig, self.rig.joints_m, theta, root)[:, :3].double().numpy()
+        transforms = (
+            skinning_transforms(joint_transforms(self.rig, theta, root), self.rig.joints_m)[:, :3].double().numpy()
+        )
         blended = np.einsum("vj,jab->vab", self.weights, transforms, optimize=True)
         worn_m = self.worn_m + self._cloth_offset_m(gait_phase)
         return np.einsum("vab,vb->va", blended[:, :, :3], worn_m) + blended[:, :, 3]

@@ -132,7 +132,7 @@ def _instant(dressed: Dressed, pose: Pose) -> Instant:
     face_m = (rig.keypoint_weights[list(FACE)] @ rig.vertices_m).double().numpy()
     return Instant(
         keypoints_m=(rig.keypoint_weights @ pose_vertices(rig, pose.theta, root)).double().numpy(),
-        joints_m=joint_transforms(rig, rig.joints_m, pose.theta, root)[:, :3, 3].double().numpy(),
+        joints_m=joint_transforms(rig, pose.theta, root)[:, :3, 3].double().numpy(),
         person=Painted(vertices_m, dressed.faces, caster, looks, face_m),
         shadow=floor_shadow(caster, root[:3, 3].numpy(), lights),
         ground_m=root[:3, 3].double().numpy(),
