@@ -1,8 +1,8 @@
 """The same avatar on another body: shape values changed, or more or less volume."""
 
+import dataclasses
 from collections.abc import Mapping
 
-import numpy as np
 import torch
 import trimesh
 from scipy.optimize import brentq
@@ -14,8 +14,8 @@ from hnerf.errors import CaptureError
 from hnerf.render.motion import lifted, lowest_points_m
 
 FOLDED_SHARE = 0.005  # of the triangles that may turn over before a shape is refused; half a per cent is not seen
-STEP, FARTHEST = 0.25, 3.0  # changes of the weight value that are tried; its own range is 1
-VOLUME_VALUE = "weight"
+THICKER = -0.9, 2.0  # shares of the way from the bones to the skin that may be added
+AS_THICK = "neck", "wrist", "foot"  # in names of joints whose parts, with all below them, stay: head, hands, feet
 
 
 def with_values(rig: Rig, changes: Mapping[str, float]) -> Rig:
@@ -28,33 +28,46 @@ def with_values(rig: Rig, changes: Mapping[str, float]) -> Rig:
         if name not in rig.beta_names:
             raise CaptureError(f"shape {name}: this body's values are {', '.join(rig.beta_names)}")
         beta[rig.beta_names.index(name)] += change
-    shaped = rig.reshaped(beta)
-    upright = (_normals(shaped) * _normals(rig)).sum(1) >= 0  # not so where a value is not a number
-    folded = float((~upright).float().mean())
-    if folded > FOLDED_SHARE:
-        told = ", ".join(f"{name} {change:+.2f}" for name, change in changes.items())
-        raise CaptureError(f"shape {told}: folds {100 * folded:.1f} % of the skin over; ask for a smaller change")
-    return shaped
+    told = ", ".join(f"{name} {change:+.2f}" for name, change in changes.items())
+    return _unfolded(rig.reshaped(beta), rig, f"shape {told}")
 
 
 def with_volume(rig: Rig, change: float) -> Rig:
-    """The rig at rest with another volume, by its value for weight: -0.4 is 40 % less.
+    """The rig with another volume at rest: -0.4 is 40 % less. Trunk and limbs get thicker or thinner about their bones.
 
-    Raises CaptureError where the rig has no such value, or the change is out of its reach.
+    Raises CaptureError where the change is out of reach, and where the skin would fold over.
     """
-    wanted_m3 = (1 + change) * volume_m3(rig)
-    weight = torch.tensor([name == VOLUME_VALUE for name in rig.beta_names])
-    if not weight.any():
-        raise CaptureError(f"volume: this body has no shape value {VOLUME_VALUE}; change its shape values instead")
+    wanted_m3, outwards_m = (1 + change) * volume_m3(rig), outwards(rig)
 
-    def missing_m3(amount: float) -> float:
-        return volume_m3(rig.reshaped(rig.beta + amount * weight)) - wanted_m3
+    def thicker(share: float) -> Rig:
+        return dataclasses.replace(rig, vertices_m=rig.vertices_m + share * outwards_m)
 
-    amounts = np.copysign(np.arange(STEP, FARTHEST + STEP, STEP), change)
-    enough = next((float(amount) for amount in amounts if missing_m3(0.0) * missing_m3(float(amount)) <= 0), None)
-    if enough is None:
-        raise CaptureError(f"volume {100 * change:+.0f} %: out of this body's reach; ask for a smaller change")
-    return with_values(rig, {VOLUME_VALUE: brentq(missing_m3, 0.0, enough, xtol=1e-4)})
+    def missing_m3(share: float) -> float:
+        return volume_m3(thicker(share)) - wanted_m3
+
+    told = f"volume {100 * change:+.0f} %"
+    if not missing_m3(THICKER[0]) < 0 < missing_m3(THICKER[1]):
+        raise CaptureError(f"{told}: out of this body's reach; ask for a smaller change")
+    return _unfolded(thicker(brentq(missing_m3, *THICKER, xtol=1e-4)), rig, told)
+
+
+def outwards(rig: Rig) -> Tensor:
+    """(V, 3) metres: from the nearest points of the bones that carry a vertex to it, blended by its skin weights; zero
+    for head, hands and feet. A bone reaches from its joint to the joints below."""
+    moved_m, parents, stays = torch.zeros_like(rig.vertices_m), rig.parents.tolist(), set()
+    for joint, parent in enumerate(parents):
+        if parent in stays or any(part in rig.joint_names[joint] for part in AS_THICK):
+            stays.add(joint)
+            continue
+        start_m = rig.joints_m[joint]
+        ends_m = torch.stack([start_m, *(rig.joints_m[j] for j, above in enumerate(parents) if above == joint)])
+        along_m, from_start_m = ends_m - start_m, rig.vertices_m - start_m
+        share = from_start_m @ along_m.T / (along_m**2).sum(1).clamp(min=1e-12)  # (V, bones)
+        away_m = from_start_m[:, None] - share.clamp(0, 1)[..., None] * along_m
+        nearest = away_m.norm(dim=2).argmin(1)
+        weight = (rig.skin_weights * (rig.skin_joints == joint)).sum(1, keepdim=True)
+        moved_m += weight * away_m[torch.arange(len(away_m)), nearest]
+    return moved_m
 
 
 def volume_m3(rig: Rig) -> float:
@@ -65,6 +78,15 @@ def volume_m3(rig: Rig) -> float:
 def worn_by(rig: Rig, body: BodyFit, up: str) -> BodyFit:
     """The poses of `body` on a reshaped rig, every lowest point as high as before along the world's axis `up`."""
     return lifted(BodyFit(rig, body.frames, body.theta, body.root), lowest_points_m(body, up), up)
+
+
+def _unfolded(shaped: Rig, rig: Rig, told: str) -> Rig:
+    """`shaped`; CaptureError, after `told`, if too much of its skin has turned over."""
+    upright = (_normals(shaped) * _normals(rig)).sum(1) >= 0  # not so where a value is not a number
+    folded = float((~upright).float().mean())
+    if folded > FOLDED_SHARE:
+        raise CaptureError(f"{told}: folds {100 * folded:.1f} % of the skin over; ask for a smaller change")
+    return shaped
 
 
 def _normals(rig: Rig) -> Tensor:

@@ -5,10 +5,11 @@ import re
 import pytest
 import torch
 
+from hnerf.body.anny import ADULT, BETA_NAMES, anny_rig
 from hnerf.body.rig import Rig
 from hnerf.errors import CaptureError
 from hnerf.render.motion import lowest_points_m
-from hnerf.render.shape import volume_m3, with_values, with_volume, worn_by
+from hnerf.render.shape import outwards, volume_m3, with_values, with_volume, worn_by
 from tests.asset.figure import bending_body, column_rig
 
 
@@ -27,23 +28,49 @@ def changeable_rig() -> Rig:
     )
 
 
-@pytest.mark.parametrize(("change", "weight"), [(0.44, 0.5), (-0.51, 0.0), (0.0, 0.3)])
-def test_volume_changes_as_asked(change: float, weight: float) -> None:
-    rig = changeable_rig()
+def bone_rig(upper: str) -> Rig:
+    """The column with bones along its whole axis."""
+    joints_m = torch.tensor([[0.0, 0, 0], [0, 0, 0.8], [0, 0, 1.6]])
+    changes = {"joints_m": joints_m, "joint_names": ("root", upper, "tip"), "parents": torch.tensor([-1, 0, 1])}
+    return dataclasses.replace(changeable_rig(), **changes)
+
+
+@pytest.mark.parametrize("change", [0.44, -0.51, 0.0])
+def test_volume_changes_as_asked(change: float) -> None:
+    """A column's volume goes with its radius squared, and its ends stay where they are."""
+    rig = bone_rig("upper")
     found = with_volume(rig, change)
-    torch.testing.assert_close(found.beta, torch.tensor([weight, 0.6]), atol=1e-3, rtol=0)
+    radius = math.sqrt(1 + change)
+    torch.testing.assert_close(found.vertices_m, rig.vertices_m * torch.tensor([radius, radius, 1]), atol=1e-4, rtol=0)
     assert volume_m3(found) == pytest.approx((1 + change) * volume_m3(rig), rel=1e-3)
+
+
+def test_head_hands_and_feet_stay_as_thick_as_they_are() -> None:
+    """Skin of the neck's bone, above z = 0.9, stays; below z = 0.7 all of it goes away from the axis."""
+    rig = bone_rig("neck01")
+    z = rig.vertices_m[:, 2]
+    away_m = outwards(rig)
+    assert not away_m[z > 0.91].any()
+    lower = z < 0.69
+    torch.testing.assert_close(away_m[lower], rig.vertices_m[lower] * torch.tensor([1.0, 1, 0]))
+
+
+@pytest.mark.parametrize("gender", [0.0, 0.5, 1.0])
+def test_whole_bodies_lose_and_gain_volume_without_folds(gender: float) -> None:
+    beta = torch.tensor(ADULT)
+    beta[BETA_NAMES.index("gender")] = gender
+    rig = anny_rig(beta)
+    for change in (-0.4, 0.8):
+        found = with_volume(rig, change)
+        assert volume_m3(found) == pytest.approx((1 + change) * volume_m3(rig), rel=1e-3)
+        tall = [float(r.vertices_m[:, 2].max() - r.vertices_m[:, 2].min()) for r in (rig, found)]
+        assert tall[1] == pytest.approx(tall[0])
 
 
 @pytest.mark.parametrize("change", [20.0, -1.2, math.nan])
 def test_a_volume_out_of_reach_is_refused(change: float) -> None:
     with pytest.raises(CaptureError, match="out of this body's reach"):
-        with_volume(changeable_rig(), change)
-
-
-def test_a_body_without_weight_has_no_other_volume() -> None:
-    with pytest.raises(CaptureError, match="no shape value weight"):
-        with_volume(column_rig(), 0.4)
+        with_volume(bone_rig("upper"), change)
 
 
 def test_values_are_added_by_name() -> None:

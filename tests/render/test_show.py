@@ -126,7 +126,7 @@ def test_a_taller_body_reaches_higher_in_the_picture(subject: Path, tmp_path: Pa
         (["--motion", "absent.npz"], "absent.npz: is no .npz"),
         (["--path", "absent.json"], "absent.json: cannot be read"),
         (["--shape", "height"], "shape height: give a name and what to add"),
-        (["--volume", "80"], "no shape value weight"),
+        (["--volume", "-100"], "volume -100 %: out of this body's reach"),
         (["--radius", "-1"], "radius"),
     ],
 )
