@@ -98,7 +98,7 @@ class PaperFieldSettings(Section):
     scene_m: float = Field(default=2.5, gt=0)  # half the scene's edge, the unit of sigma_h and gamma
     box_margin_m: float = Field(default=0.1, gt=0)
     samples: int = Field(default=256, ge=2)  # coarse, and as many fine
-    sharpness: float = Field(default=200.0, gt=0)  # gamma
+    gamma: float = Field(default=200.0, gt=0)
     learning_rate: float = Field(default=1e-3, gt=0)
     root_condition: bool = True  # colour depends on T
 
@@ -117,6 +117,7 @@ class IdrSettings(Section):
 
     box_margin_m: float = Field(default=0.1, gt=0)
     samples: int = Field(default=32, ge=3)  # a ray, to find its least distance
+    alpha_per_m: float = Field(default=50.0, gt=0)  # sharpness of the mask loss
     width: int = Field(default=64, ge=2)
     learning_rate: float = Field(default=1e-3, gt=0)
 
@@ -161,7 +162,6 @@ class LossSettings(Section):
     eta: float = Field(default=1.0, ge=0)  # of the surroundings in blend; 0.25 where floor or furniture is near
     density_threshold: float = Field(default=50.0, gt=0)  # sigma_h, per scene unit
     density_steepness: float = Field(default=0.1, gt=0)  # lambda; docs/method.md says why
-    sharpness_per_m: float = Field(default=80.0, gt=0)  # gamma = 200 per 2.5 m
 
 
 class TrainingSettings(Section):

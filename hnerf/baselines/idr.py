@@ -74,6 +74,7 @@ class IdrField(StaticField):
 
     def __init__(self, body: BodyFit, settings: IdrSettings):
         super().__init__(body, settings.box_margin_m, settings.samples, settings.learning_rate)
+        self.gamma = settings.alpha_per_m
         boxes = Boxes.around(body.vertices_m(), settings.box_margin_m)
         radius = INITIAL_RADIUS * float((boxes.upper_m - boxes.lower_m).min() / 2 / self.scale_m)
         self.geometry = SdfNetwork(settings.width, radius)

@@ -17,15 +17,15 @@ class Field(nn.Module, ABC):
     """H-NeRF's two machineries and the methods it is compared to.
 
     canonical_m (V, 3): the rig's canonical vertices, saved with the field; samples: random numbers that a ray needs;
-    unit_m: metres in a unit of the distances that `sample` returns; margin_m: how far around the body anything can be
-    seen; own_background: whether the field models the
-    photograph's surroundings, or is composited over the clean plate.
+    gamma: how sharp the outline of the distances that `sample` returns is, a unit of them; margin_m: how far around the
+    body anything can be seen; own_background: whether the field models the photograph's surroundings, or is composited
+    over the clean plate.
     """
 
     own_background: ClassVar[bool] = False
     canonical_m: Tensor
     samples: int
-    unit_m: float = 1.0
+    gamma: float = 80.0  # a metre: the paper's 200 in a scene of 2.5 m
     margin_m: float = 0.1
 
     @abstractmethod

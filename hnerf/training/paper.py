@@ -43,7 +43,7 @@ class PaperField(Field):
         """root (n, 4, 4): the training poses, which the scene is centred on."""
         super().__init__()
         self.settings, self.static = settings, static
-        self.samples, self.unit_m = settings.samples, settings.scene_m
+        self.samples, self.gamma = settings.samples, settings.gamma
         self.register_buffer("canonical_m", rig.vertices_m.clone())
         self.register_buffer("centre_m", root[:, :3, 3].mean(0))
         poses = pose_inputs(rig, torch.zeros(1, len(rig.joints_m), 3)).shape[1]
@@ -122,7 +122,7 @@ class PaperField(Field):
         d, residual = d.view(rays, samples), residual.view(rays, samples)
         return RaySamples(
             alpha=alpha_from_density(density, spacing),
-            alpha_dot=occupancy(d + residual, self.settings.sharpness),
+            alpha_dot=occupancy(d + residual, self.gamma),
             in_box=inside.float().view(rays, samples),
             colour=colour.view(rays, samples, 3),
             density=density,

@@ -50,12 +50,12 @@ class Pixels:
     rays_from_px: Tensor
     centres_m: Tensor
 
-    def draw(self, frames: Tensor, rays_per_frame: int, generator: torch.Generator) -> Rays:
-        """`rays_per_frame` pixels of each of the frames (rows), AT_EDGES of them at edges, drawn with replacement."""
+    def draw(self, frames: Tensor, rays_per_frame: int, generator: torch.Generator, at_edges: float = AT_EDGES) -> Rays:
+        """`rays_per_frame` pixels of each of the frames (rows), a share of them at edges, drawn with replacement."""
         unit = torch.rand(len(frames), rays_per_frame, generator=generator, dtype=torch.float64).to(frames.device)
-        count = round(AT_EDGES * rays_per_frame)
-        at_edges = self.edges[_within(self.edge_starts, frames, unit[:, :count])]
-        pick = torch.cat([at_edges, _within(self.starts, frames, unit[:, count:])], 1).flatten()
+        count = round(at_edges * rays_per_frame)
+        mixed = self.edges[_within(self.edge_starts, frames, unit[:, :count])]
+        pick = torch.cat([mixed, _within(self.starts, frames, unit[:, count:])], 1).flatten()
         camera = self.camera[pick].long()
         origins_m, directions = self.rays(camera, self.xy_px[pick])
         return Rays(

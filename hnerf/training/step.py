@@ -40,16 +40,15 @@ class Objective(nn.Module):
             stage.bodies, stage.region, rays.origins_m, rays.directions, rays.frame, conditions, draws, self.correction
         )
         s = self.settings.losses
-        sharpness = s.sharpness_per_m * self.field.unit_m
         terms = {
             "reconstruction": lambda: losses.reconstruction(samples, target),
             "mask": lambda: losses.mask(samples, target),
             "blend": lambda: losses.blend(samples, target, s.eta),
             "geometry": lambda: losses.geometry(samples, s.density_threshold, s.density_steepness),
-            "segmentation": lambda: losses.segmentation(samples.d_hat, target, sharpness),
+            "segmentation": lambda: losses.segmentation(samples.d_hat, target, self.field.gamma),
             "eikonal": lambda: losses.eikonal(samples),
             "residual": lambda: losses.residual(samples),
-            "fit": lambda: losses.segmentation(samples.d, target, sharpness),
+            "fit": lambda: losses.segmentation(samples.d, target, self.field.gamma),
             "increment": lambda: losses.increment(self.correction),
             "elastic": lambda: losses.elastic(samples),
         }

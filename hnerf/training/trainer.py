@@ -4,6 +4,7 @@ deformations, against the finished field."""
 import dataclasses
 import json
 import logging
+import math
 import resource
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -26,7 +27,7 @@ from hnerf.training.conditions import Conditions, Draws, own_share
 from hnerf.training.losses import pixel
 from hnerf.training.model import build_field
 from hnerf.training.model_file import write_field
-from hnerf.training.pixels import Pixels, Rays, gather_pixels
+from hnerf.training.pixels import AT_EDGES, Pixels, Rays, gather_pixels
 from hnerf.training.processes import Processes
 from hnerf.training.step import Objective, Stage, TrainingError, not_finite
 
@@ -60,7 +61,9 @@ class Trainer:
         self.optimizer = torch.optim.Adam(self._parameter_groups(), betas=(0.9, 0.99), eps=1e-12, fused=True)
         self.first_rates = [group["lr"] for group in self.optimizer.param_groups]
         logger.info("gathering pixels")
-        self.pixels: Pixels = gather_pixels(capture, masks, body, body.frames, self.field.margin_m, device)
+        reach_m = math.inf if self.field.own_background else self.field.margin_m
+        self.pixels: Pixels = gather_pixels(capture, masks, body, body.frames, reach_m, device)
+        self.at_edges = 0.0 if self.field.own_background else AT_EDGES  # the paper draws from all pixels alike
         seen = self.pixels.starts.diff() > 0  # not where a frame's masks were all dropped
         rows = {frame: row for row, frame in enumerate(body.frames) if seen[row]}
         self.train_rows = torch.tensor([rows[f] for f in capture.train_frames if f in rows], device=device)
@@ -152,7 +155,8 @@ class Trainer:
         s, device = self.settings, self.processes.device
         rows = self.train_rows if self.step < self.field_steps else self.novel_rows
         pick = torch.randperm(len(rows), generator=self.generator)[: s.frames_per_step].to(rows.device)
-        rays = self.pixels.draw(rows[pick], s.frames_per_step * s.rays_per_frame // len(pick), self.generator)
+        count = s.frames_per_step * s.rays_per_frame // len(pick)
+        rays = self.pixels.draw(rows[pick], count, self.generator, self.at_edges)
         samples = self.field.samples_in_training(self._done())
         draws = Draws.random(len(rays.frame), samples, s.noise, self.generator, device)
         conditions = self.conditions.noisy(s.noise, self.generator)
@@ -216,7 +220,8 @@ class Trainer:
         """PSNR on person pixels of novel-pose frames in training cameras, which the field is not trained on."""
         generator = torch.Generator().manual_seed(self.settings.seed)
         pixel_colour, rays, _ = self._look(self.novel_rows, generator)
-        error = (pixel_colour - rays.colour)[rays.person & ~rays.edge]
+        mixed = rays.edge & (not self.field.own_background)  # with what only such a field knows
+        error = (pixel_colour - rays.colour)[rays.person & ~mixed]
         return float(-10 * torch.log10((error**2).mean()))
 
     @torch.no_grad()

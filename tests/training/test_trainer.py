@@ -3,6 +3,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
@@ -290,14 +291,25 @@ def _environment() -> dict[str, str]:
     return os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent.parent), "OMP_NUM_THREADS": "1"}
 
 
+def test_a_field_with_its_own_background_learns_from_every_pixel(tmp_path: Path):
+    """The paper draws from all pixels alike; a composited field needs those near the person."""
+    scene = record(tmp_path)
+    height, width = scene[0].image("0", 0).shape[:2]
+    images = len(scene[0].train_cameras) * len(scene[2].frames)
+    for machinery, whole, at_edges in (("paper", True, 0.0), ("fast", False, 1 / 3)):
+        trainer = Trainer(*scene, with_changes(machinery=machinery), tmp_path / "out", ALONE)
+        assert (len(trainer.pixels.edge) == images * height * width) == whole
+        assert trainer.at_edges == pytest.approx(at_edges)
+
+
 def test_a_step_has_as_many_rays_however_few_the_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Four frames of 64 rays are asked for; two are trained on, and one is novel."""
     drawn = []
     draw = Pixels.draw
 
-    def counted(self: Pixels, frames: torch.Tensor, rays_per_frame: int, generator: torch.Generator) -> Rays:
+    def counted(self: Pixels, frames: torch.Tensor, rays_per_frame: int, *others: Any) -> Rays:
         drawn.append((len(frames), rays_per_frame))
-        return draw(self, frames, rays_per_frame, generator)
+        return draw(self, frames, rays_per_frame, *others)
 
     monkeypatch.setattr(Pixels, "draw", counted)
     trainer = Trainer(*record(tmp_path / "capture"), with_changes(frames_per_step=4), tmp_path, ALONE)
