@@ -109,7 +109,7 @@ def _split_table(captures: dict[str, Any], split: str) -> list[str]:
 
 
 def _cost_table(captures: dict[str, Any]) -> list[str]:
-    rows = [["capture", "limb joints, mm", "training, s", "of it the field", "on", "one image, s", "whole run, s"]]
+    rows = [["capture", "limb joints, mm", "before training, s", "training, s", "of it the field", "on", "one image, s", "whole run, s"]]
     for name, figures in captures.items():
         if "error" not in figures:
             fit = (figures["score"] or {}).get("fit")
@@ -117,7 +117,7 @@ def _cost_table(captures: dict[str, Any]) -> list[str]:
             image = f"{figures['own_metrics']['seconds_per_image']:.2f}"
             run = "" if figures["run_seconds"] is None else f"{figures['run_seconds']:.0f}"
             training = figures["training"]
-            seconds = [f"{training[key]:.0f}" for key in ("seconds", "field_seconds")]
+            seconds = [f"{training[key]:.0f}" for key in ("setup_seconds", "seconds", "field_seconds")]
             rows.append([name, joints, *seconds, training["device"], image, run])
     return table(rows)
 

@@ -48,6 +48,7 @@ class Trainer:
     def __init__(
         self, capture: Capture, masks: Masks, body: BodyFit, settings: TrainingSettings, out: Path, processes: Processes
     ):
+        began = time.monotonic()
         self.settings, self.decisions = decide(Scene.of(capture, masks, body), settings)
         settings, self.out, self.processes = self.settings, out, processes
         device = processes.device
@@ -77,6 +78,7 @@ class Trainer:
         self.history: list[dict[str, Any]] = []
         self._stand(bodies)
         self._resume()
+        self.setup_seconds = time.monotonic() - began
 
     @property
     def steps(self) -> int:
@@ -294,6 +296,7 @@ class Trainer:
         report = {
             "device": _device_name(self.processes.device),
             "processes": self.processes.world_size,
+            "setup_seconds": self.setup_seconds,
             "seconds": self.seconds,
             "field_seconds": self.field_seconds,
             "steps": self.step,
