@@ -1,13 +1,15 @@
-"""What an avatar looks like, written as files: colour, depth, normals, mask and mesh of every shot."""
+"""What an avatar looks like, written as files: colour, depth, normals, mask and mesh of every shot, and videos."""
 
 import logging
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from hnerf.asset.surface import posed_surface
@@ -20,17 +22,19 @@ log = logging.getLogger("hnerf.render")
 
 LOG_EVERY_S = 10.0
 COVERED = 0.5  # alpha from which a pixel has a depth and a normal
+NEAREST, FARTHEST = 255, 64  # greys of a depth video
 NORMAL_STEP_M = 0.003
 TETRAHEDRON = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
 Shot = tuple[Camera, int]  # and the frame of avatar.body whose pose is shown
 
 
 def write_pictures(avatar: Avatar, shots: Sequence[Shot], what: Sequence[str], fps: float, out: Path) -> None:
-    """`<kind>/<number>.png` (`.ply` for mesh) of every shot, for each kind in `what`; and `colour.mp4`.
+    """`<kind>/<number>.png` (`.ply` for mesh) of every shot, for each kind in `what`; and each kind's images
+    as `<kind>.mp4`.
 
     colour: 8-bit over black. mask: coverage, 0 to 255. depth: 16-bit, millimetres along the viewing axis, 0 where
     there is nobody. normals: 8-bit, (n + 1) / 2 with x right, y up, z towards the camera, black where there is nobody.
-    mesh: the surface in world metres.
+    mesh: the surface in world metres. The video of depths is grey: `read_depth_grey`.
     """
     for kind in what:
         (out / kind).mkdir(parents=True)
@@ -44,8 +48,9 @@ def write_pictures(avatar: Avatar, shots: Sequence[Shot], what: Sequence[str], f
         if time.perf_counter() > next_log:
             log.info("rendered %d of %d", number + 1, len(shots))
             next_log = time.perf_counter() + LOG_EVERY_S
-    if "colour" in what:
-        write_video(out / "colour", fps, out / "colour.mp4")
+    for kind in [kind for kind in what if kind != "mesh"]:
+        read = partial(read_depth_grey, span_mm=depth_span_mm(out / kind)) if kind == "depth" else read_rgb
+        write_video(out / kind, fps, out / f"{kind}.mp4", read)
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
@@ -55,17 +60,35 @@ def write_image(path: Path, image: np.ndarray) -> None:
         raise OSError(f"{path}: cannot be written; is the disk full?")
 
 
-def write_video(folder: Path, fps: float, path: Path) -> None:
-    """The PNG files of a folder, in order, as an MPEG-4 video. Raises OSError unless all can be read back."""
+def write_video(folder: Path, fps: float, path: Path, read: Callable[[Path], np.ndarray] = read_rgb) -> None:
+    """The PNG files of a folder, in order, as an MPEG-4 video; `read` gives (H, W, 3) uint8 RGB of each. Raises OSError
+    unless all can be read back."""
     files = sorted(folder.glob("*.png"))
-    height_px, width_px = read_rgb(files[0]).shape[:2]
+    height_px, width_px = read(files[0]).shape[:2]
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width_px, height_px))
     for file in files:
-        writer.write(cv2.cvtColor(read_rgb(file), cv2.COLOR_RGB2BGR))
+        writer.write(cv2.cvtColor(read(file), cv2.COLOR_RGB2BGR))
     writer.release()
     count = len(Video.open(path).frames)
     if count != len(files):
         raise OSError(f"{path}: {count} of {len(files)} frames were written")
+
+
+def depth_span_mm(folder: Path) -> tuple[int, int]:
+    """Nearest and farthest millimetre of the person in a folder's depth images; 65535, 0 where there is nobody."""
+    depths_mm = (np.array(Image.open(file)) for file in folder.glob("*.png"))
+    spans_mm = [(d.min(where=d > 0, initial=65535), d.max()) for d in depths_mm]
+    return min(int(near) for near, _ in spans_mm), max(int(far) for _, far in spans_mm)
+
+
+def read_depth_grey(path: Path, span_mm: tuple[int, int]) -> np.ndarray:
+    """(H, W, 3) uint8 of a depth image: white at the near end of the span, dark at the far end, linear between, black
+    where there is nobody."""
+    depth_mm = np.array(Image.open(path))
+    near_mm, far_mm = span_mm
+    away = (depth_mm.astype(np.float32) - near_mm) / max(far_mm - near_mm, 1)
+    grey = np.where(depth_mm > 0, NEAREST + (FARTHEST - NEAREST) * away, 0)
+    return grey.round().astype(np.uint8)[..., None].repeat(3, -1)
 
 
 def depth_image(rendering: Rendering, camera: Camera) -> Tensor:

@@ -24,7 +24,7 @@ from hnerf.training.model import TrainedAvatar, load_avatar
 
 KINDS = ("colour", "depth", "normals", "mask", "mesh")
 ORBIT_PICTURES = 60  # of somebody who stands still
-MAX_SIZE_PX = 8192
+MAX_SIZE_PX = 8000  # a square video of it can still be read back
 
 
 @dataclass(frozen=True)

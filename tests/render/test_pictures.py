@@ -11,7 +11,14 @@ from hnerf.capture.camera import Camera
 from hnerf.capture.footage import Video
 from hnerf.render import pictures
 from hnerf.render.avatar import Rendering
-from hnerf.render.pictures import depth_image, normal_image, write_pictures, write_video
+from hnerf.render.pictures import (
+    depth_image,
+    depth_span_mm,
+    normal_image,
+    read_depth_grey,
+    write_pictures,
+    write_video,
+)
 from tests.evaluation.ball import RADIUS_M, RENDERED, SIZE_PX, BallAvatar, ball_camera, ball_fit, centre_m, seen
 
 CAMERA = ball_camera("a", 0.0)  # 0.75 m from the ball, on the x axis
@@ -76,15 +83,39 @@ def test_every_kind_is_written_for_every_shot(tmp_path: Path, monkeypatch: pytes
         np.testing.assert_allclose(mesh.extents, 2 * RADIUS_M, atol=2e-3)
     depth = cv2.imread(str(tmp_path / "depth" / "000000.png"), cv2.IMREAD_UNCHANGED)
     assert depth[31, 31] == pytest.approx(650, abs=1)
-    video = Video.open(tmp_path / "colour.mp4")
-    assert (len(video.frames), video.fps) == (2, 5.0)
-    middle = next(iter(video.read([0]))).rgb[32, 32]
-    np.testing.assert_allclose(middle, RENDERED, atol=6)
+
+
+def test_every_kind_of_image_is_a_video_too(tmp_path: Path) -> None:
+    write_pictures(SolidBall(ball_fit()), [(CAMERA, 0)] * 2, ("colour", "depth", "normals", "mask"), 5.0, tmp_path)
+    towards_camera = (127.5, 127.5, 255)
+    for kind, middle in {"colour": RENDERED, "depth": 255, "normals": towards_camera, "mask": 255}.items():
+        video = Video.open(tmp_path / f"{kind}.mp4")
+        assert (len(video.frames), video.fps) == (2, 5.0)
+        for picture in video.read([0, 1]):
+            np.testing.assert_allclose(picture.rgb[31, 31], middle, atol=16, err_msg=kind)
+            assert picture.rgb[0, 0].max() < 16  # nobody
+
+
+def test_greys_of_depths_by_hand(tmp_path: Path) -> None:
+    depths_mm = np.array([[[0, 2000], [2100, 2200]], [[0, 0], [2400, 0]], [[0, 0], [0, 0]]], np.uint16)
+    for k, depth_mm in enumerate(depths_mm):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), depth_mm)
+    assert depth_span_mm(tmp_path) == (2000, 2400)
+    first, second, third = (read_depth_grey(tmp_path / f"{k}.png", (2000, 2400)) for k in range(3))
+    # 255 to 64 in 400 mm: 100 mm are 47.75
+    np.testing.assert_array_equal(first[..., 0], [[0, 255], [207, 160]])
+    np.testing.assert_array_equal(second[..., 2], [[0, 0], [64, 0]])
+    assert third.shape == (2, 2, 3) and not third.any()
+
+
+def test_nobody_in_any_depth_image_is_a_black_video(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((16, 16), np.uint16))
+    assert not read_depth_grey(tmp_path / "0.png", depth_span_mm(tmp_path)).any()
 
 
 def test_only_what_was_asked_for_is_written(tmp_path: Path) -> None:
     write_pictures(SolidBall(ball_fit()), [(CAMERA, 0)], ("mask",), 5.0, tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["mask"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mask", "mask.mp4"]
 
 
 def test_a_video_that_lost_frames_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
