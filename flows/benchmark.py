@@ -1,9 +1,7 @@
 """Speed against accuracy: methods trained on the same data, scored while they train, timed, and charted."""
 
-import base64
 import json
 import logging
-import re
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ from flows.train_subject import find_masks
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
 from hnerf.errors import CaptureError, one_line
+from hnerf.study.files import with_pictures
 from hnerf.study.plan import ScoringSettings, Study, Variant, load_study
 from hnerf.study.publish import publish
 from tasks.benchmark import score_training
@@ -110,9 +109,5 @@ def trained(shelf: Store, recording: Artifact, settings: Settings) -> tuple[Arti
 def _announce(table: Path) -> None:
     """The table with its charts on the flow run's page, where there is one."""
     if FlowRunContext.get():
-        text = re.sub(r"(?<=\]\()[^)]+\.png", lambda name: _data_uri(table.with_name(name[0])), table.read_text())
-        create_markdown_artifact(text, key="benchmark", description=f"Speed against accuracy: {table.stem}")
-
-
-def _data_uri(picture: Path) -> str:
-    return f"data:image/png;base64,{base64.b64encode(picture.read_bytes()).decode()}"
+        description = f"Speed against accuracy: {table.stem}"
+        create_markdown_artifact(with_pictures(table), key="benchmark", description=description)

@@ -15,7 +15,7 @@ from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
 from hnerf.errors import CaptureError, NotPossibleError, one_line
 from hnerf.study.degrade import KINDS, Degradation, degrade_settings
-from hnerf.study.files import replace_text
+from hnerf.study.files import replace_text, with_pictures
 from hnerf.study.stability import Stability, load_stability
 from hnerf.study.stability_charts import curve_chart, matrix_chart
 from hnerf.study.stability_report import REFERENCE, as_markdown
@@ -72,7 +72,8 @@ def stability(
     finally:
         _tell(result, _draw(result, table), table)
     if FlowRunContext.get():
-        create_markdown_artifact(table.read_text(), key="stability", description=f"Where methods break on {subject}")
+        description = f"Where methods break on {subject}"
+        create_markdown_artifact(with_pictures(table), key="stability", description=description)
     return table
 
 

@@ -1,5 +1,6 @@
 """Which stages are given what was made worse, and what becomes of runs that break; stages are made up."""
 
+import base64
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -108,6 +109,19 @@ def test_every_run_has_a_verdict(stages: list[dict[str, Any]], tmp_path: Path) -
     assert found["protocol"] == "By eye."
     charts = {path.name for path in (tmp_path / "store" / "stability").glob("*.png")}
     assert charts == {"ada-mine-matrix.png", "ada-mine-psnr.png", "ada-mine-chamfer_mm.png"}
+
+
+def test_the_flow_runs_page_shows_the_charts_themselves(
+    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[str] = []
+    monkeypatch.setattr(module.FlowRunContext, "get", lambda: True)
+    monkeypatch.setattr(module, "create_markdown_artifact", lambda text, **_: shown.append(text))
+    study(tmp_path, only=["pose_noise"])
+    chart = (tmp_path / "store" / "stability" / "ada-mine-matrix.png").read_bytes()
+    (text,) = shown
+    assert f"![ada-mine-matrix.png](data:image/png;base64,{base64.b64encode(chart).decode()})" in text
+    assert ".png)" not in text
 
 
 def test_what_a_capture_does_not_allow_is_left_out_and_no_verdict(
