@@ -11,7 +11,7 @@ from hnerf.body.rig import Rig
 from hnerf.config import FastFieldSettings
 from hnerf.field.canonical import CanonicalField
 from hnerf.field.deformation import FrameDeformation
-from hnerf.render.compositing import alpha_from_sdf, weights_from_alpha
+from hnerf.render.compositing import alpha_from_sdf, occupancy, weights_from_alpha
 from hnerf.render.shell import ShellGrid, lattice
 from hnerf.training.conditions import Conditions, Draws, pose_inputs
 from hnerf.training.field import Field
@@ -160,13 +160,13 @@ class FastField(Field):
 
         alpha, alpha_dot, residual = (everywhere(values, 0.0) for values in (alpha, alpha_dot, residual))
         colour = everywhere(colour.view(len(hit), depths.shape[1], 3), 0.0)
-        d, in_box = everywhere(d, self.reach_m), torch.ones_like(alpha)
+        d, in_box = everywhere(d, self.reach_m), everywhere(torch.ones_like(d), 0.0)
         samples = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, draws.beyond, elastic)
         return samples, depths
 
     def coverage(self, samples: RaySamples) -> Tensor:
-        """By the surface, not by the core that ends rays behind it."""
-        return 1 - (1 - samples.alpha_dot).prod(1)
+        """By the surface, not by the core that ends rays behind it; rays that begin inside it are covered, too."""
+        return occupancy(samples.d_hat, self.log_sharpness.exp()).amax(1)
 
     def samples_in_training(self, done: float) -> int:
         """Half of them first in either phase, while surface or novel poses are not where they will be."""

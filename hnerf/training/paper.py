@@ -155,6 +155,10 @@ class PaperField(Field):
         root = torch.zeros_like(turn[row]).index_copy(0, pick, turn[row[pick]])
         return self.radiance(outside.index_copy(0, pick, inner), pose, root, view)
 
+    def coverage(self, samples: RaySamples) -> Tensor:
+        """By the SDF: its greatest occupancy along a ray, which is what the loss `seg` compares with the mask."""
+        return (samples.in_box * samples.alpha_dot).amax(1)
+
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """d_hat (N,) metres at points (N, 3) around the first body."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)

@@ -24,7 +24,7 @@ from hnerf.segmentation.segment import Masks
 from hnerf.training.budget import Scene, decide
 from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
 from hnerf.training.conditions import Conditions, Draws, own_share
-from hnerf.training.losses import pixel
+from hnerf.training.losses import RaySamples, pixel
 from hnerf.training.model import build_field
 from hnerf.training.model_file import write_field
 from hnerf.training.pixels import AT_EDGES, Pixels, Rays, gather_pixels
@@ -221,25 +221,30 @@ class Trainer:
     def _held_out_psnr(self) -> float:
         """PSNR on person pixels of novel-pose frames in training cameras, which the field is not trained on."""
         generator = torch.Generator().manual_seed(self.settings.seed)
-        pixel_colour, rays, _ = self._look(self.novel_rows, generator)
+        rays, samples = self._look(self.novel_rows, generator)
         mixed = rays.edge & (not self.field.own_background)  # with what only such a field knows
-        error = (pixel_colour - rays.colour)[rays.person & ~mixed]
+        error = (pixel(samples.in_box * samples.alpha, samples) - rays.colour)[rays.person & ~mixed]
         return float(-10 * torch.log10((error**2).mean()))
 
     @torch.no_grad()
-    def _look(self, rows: Tensor, generator: torch.Generator) -> tuple[Tensor, Any, Tensor]:
-        """Rays at some frames as the model renders them: colour (R, 3), the rays, coverage (R,)."""
+    def _look(self, rows: Tensor, generator: torch.Generator) -> tuple[Rays, RaySamples]:
+        """Rays at some frames and what the model samples on them for a rendering."""
         rays = self.pixels.draw(rows, HELD_OUT_RAYS // len(rows) + 1, generator)
         draws = Draws.still(len(rays.frame), self.field.samples, self.processes.device)
         samples, _ = self.field.sample(
             self.stage.bodies, self.stage.region, rays.origins_m, rays.directions, rays.frame, self.conditions, draws
         )
-        return pixel(samples.in_box * samples.alpha, samples), rays, self.field.coverage(samples)
+        return rays, samples
 
     def _require_surface(self) -> None:
-        _, rays, coverage = self._look(self.train_rows, torch.Generator().manual_seed(self.settings.seed))
-        person, around = coverage[rays.person].mean(), coverage[~rays.person & ~rays.edge].mean()
-        if person < LEAST_COVERAGE:
+        """TrainingError where the surface is empty or fills the box: of the surroundings, rays that pass the box are
+        asked, away from outlines unless pixels are so large that there are no others."""
+        rays, samples = self._look(self.train_rows, torch.Generator().manual_seed(self.settings.seed))
+        coverage = self.field.coverage(samples)
+        beside = ~rays.person & (samples.in_box > 0).any(1)
+        clear = beside & ~rays.edge
+        person, around = coverage[rays.person].mean(), coverage[clear if clear.any() else beside].mean()
+        if not person >= LEAST_COVERAGE:  # nor where it is not a number
             raise TrainingError(f"the surface is empty (covers {person:.0%} of the person): check masks and body fit")
         if around > 1 - LEAST_COVERAGE:
             raise TrainingError(f"the surface fills the box (covers {around:.0%} of the surroundings): check the masks")

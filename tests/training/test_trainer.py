@@ -210,12 +210,6 @@ def test_not_a_number_stops_the_run_with_its_cause(tmp_path: Path, monkeypatch: 
     assert all(torch.equal(before[name], p) for name, p in trainer.field.named_parameters())
 
 
-def test_an_empty_surface_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(trainer_module, "LEAST_COVERAGE", 1.1)
-    with pytest.raises(TrainingError, match="surface is empty"):
-        train(*record(tmp_path / "capture"), TINY, tmp_path, ALONE)
-
-
 def test_checkpoint_is_replaced_whole(tmp_path: Path):
     save_checkpoint(tmp_path, {"step": 1, "x": torch.ones(2)})
     save_checkpoint(tmp_path, {"step": 2, "x": torch.zeros(2)})

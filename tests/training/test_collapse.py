@@ -1,0 +1,58 @@
+"""A surface that is empty or fills the box ends a training with an error; the bar is the one that users have."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from hnerf.training.fast import FastField
+from hnerf.training.field import Field
+from hnerf.training.paper import PaperField
+from hnerf.training.processes import Processes
+from hnerf.training.step import TrainingError
+from hnerf.training.trainer import Trainer
+from tests.training.scene import TINY, record
+
+FAR = 10.0  # units of the residual's last layer: metres away in either machinery
+
+
+def trainer_of(folder: Path, machinery: str) -> Trainer:
+    """One that takes two steps."""
+    settings = TINY.model_copy(update={"machinery": machinery, "steps": 2, "novel_pose_steps": 0})
+    return Trainer(*record(folder / "capture"), settings, folder, Processes(0, 1, torch.device("cpu")))
+
+
+def move_surface(field: Field, outwards: float) -> None:
+    """Add so much to the distance that the field's network takes from the body's."""
+    assert isinstance(field, PaperField | FastField)
+    last = field.residual.residual if isinstance(field, PaperField) else field.field.geometry[-1]
+    assert isinstance(last, nn.Linear)
+    last.bias.data.sub_(outwards)
+
+
+@pytest.mark.parametrize("machinery", ["fast", "paper"])
+def test_the_body_itself_is_a_surface(tmp_path: Path, machinery: str):
+    trainer_of(tmp_path, machinery).run()
+
+
+@pytest.mark.parametrize("machinery", ["fast", "paper"])
+@pytest.mark.parametrize(
+    ("outwards", "message"),
+    [
+        (-FAR, r"surface is empty \(covers 0% of the person\): check masks and body fit"),
+        (FAR, r"surface fills the box \(covers 100% of the surroundings\): check the masks"),
+    ],
+)
+def test_a_collapsed_surface_is_an_error(tmp_path: Path, machinery: str, outwards: float, message: str):
+    trainer = trainer_of(tmp_path, machinery)
+    move_surface(trainer.field, outwards)
+    with pytest.raises(TrainingError, match=message):
+        trainer.run()
+
+
+def test_a_distance_that_is_not_a_number_is_no_surface(tmp_path: Path):
+    trainer = trainer_of(tmp_path, "fast")
+    move_surface(trainer.field, float("nan"))
+    with pytest.raises(TrainingError, match="surface is empty"):
+        trainer._require_surface()
