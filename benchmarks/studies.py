@@ -36,7 +36,7 @@ def main() -> None:
     if options.kind == "benchmark":
         table = benchmark.fn(folder, options.study, methods, options.seconds, options.store)
     elif options.kind == "ablations":
-        table = ablate(folder, options.study, options.store, FEW, methods)
+        table = ablate.fn(folder, options.study, options.store, FEW, methods)
     else:
         table = stability.fn(folder, options.study, options.store, methods)
     kept = RESULTS / options.kind

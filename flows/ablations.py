@@ -6,9 +6,13 @@ all rows, and rows that are finished are found again, both through the store.
 
 import json
 import logging
-from collections.abc import Collection
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from prefect import flow
+from prefect.artifacts import create_markdown_artifact
+from prefect.context import FlowRunContext
 
 from flows.train_subject import find_masks
 from hnerf.capture.capture import Capture
@@ -33,14 +37,22 @@ FULL = "full"
 COLUMNS = results.COLUMNS | {"psnr": ("PSNR", "{:.2f}")}  # cells show training poses / novel poses
 
 
-def ablate(capture: Path, preset: str, store: Path, overrides: list[str], only: Collection[str] = ()) -> Path:
+@flow(name="ablate", flow_run_name="{capture}-{preset}")
+def ablate(
+    capture: Path,
+    preset: str = "fast",
+    store: Path = Path("store"),
+    overrides: Sequence[str] = (),
+    only: Sequence[str] = (),
+) -> Path:
     """Run the full method and each ablation; returns the table, `<store>/ablations/<subject>-<preset>.md`, which has a
     JSON file beside it. Both are written anew after every row.
 
-    only: names of ablations, all where there are none. A row whose training or evaluation fails says why and the rest
-    go on; a worker that was killed (LostWorkerError) ends the command, and the same command goes on from there.
+    preset: a name under configs/ or a YAML file; overrides: settings like "training.steps=100", in all rows; only:
+    names of ablations, all where there are none. A row whose training or evaluation fails says why and the rest go on;
+    a worker that was killed (LostWorkerError) ends the command, and the same command goes on from there.
     """
-    rows, left_out = choose(load_settings(preset, overrides), only)
+    rows, left_out = choose(load_settings(preset, list(overrides)), only)
     shelf = Store(store.resolve())
     source, truth = read_capture(capture)
     subject = Capture.load(ingest(shelf, source, rows[FULL].capture).root).name
@@ -53,10 +65,13 @@ def ablate(capture: Path, preset: str, store: Path, overrides: list[str], only: 
         table.parent.mkdir(parents=True, exist_ok=True)
         replace_text(table.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
         replace_text(table, as_markdown(result))
+    if FlowRunContext.get():
+        description = f"What each part of {preset} is worth on {subject}"
+        create_markdown_artifact(table.read_text(), key="ablations", description=description)
     return table
 
 
-def choose(full: Settings, only: Collection[str]) -> tuple[dict[str, Settings], dict[str, str]]:
+def choose(full: Settings, only: Sequence[str]) -> tuple[dict[str, Settings], dict[str, str]]:
     """Settings of each row, the full method first, and why the other ablations have none."""
     known = {path.stem: path for path in sorted(ABLATIONS.glob("*.yaml"))}
     unknown = sorted(set(only) - set(known))

@@ -201,7 +201,7 @@ def _run(capture: Path, preset: str, store: Path, overrides: list[str]) -> None:
 
 
 def _ablate(capture: Path, preset: str, store: Path, overrides: list[str], only: list[str]) -> None:
-    table = ablate(capture, preset, store, overrides, only)
+    table = ablate.fn(capture, preset, store, overrides, only)
     print(f"{table.read_text()}\ntable: {table}")
 
 

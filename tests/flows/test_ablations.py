@@ -146,7 +146,7 @@ def test_the_table_by_hand() -> None:
 
 
 def test_a_row_that_fails_says_so_and_the_rest_go_on(stages: list[TrainingSettings], tmp_path: Path) -> None:
-    table = ablate(tmp_path, "fast", tmp_path / "store", [], ["no-noise", "no-segmentation"])
+    table = ablate.fn(tmp_path, "fast", tmp_path / "store", [], ["no-noise", "no-segmentation"])
     assert table == tmp_path / "store" / "ablations" / "ada-fast.md"
     result = json.loads(table.with_suffix(".json").read_text())
     rows = result["rows"]
@@ -155,6 +155,16 @@ def test_a_row_that_fails_says_so_and_the_rest_go_on(stages: list[TrainingSettin
     assert [rows[name]["novel_view"]["psnr"] for name in ("full", "no-segmentation")] == [0.02, 0.0]
     assert rows["full"]["seconds"] == 61.7
     assert table.read_text() == as_markdown(result)
+
+
+def test_the_flow_runs_page_shows_the_table(
+    stages: list[TrainingSettings], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[str] = []
+    monkeypatch.setattr(module.FlowRunContext, "get", lambda: True)
+    monkeypatch.setattr(module, "create_markdown_artifact", lambda text, **_: shown.append(text))
+    table = ablate.fn(tmp_path, store=tmp_path / "store", only=["no-opt"])
+    assert shown == [table.read_text()]
 
 
 def test_a_surface_that_cannot_be_meshed_fails_its_row_alone(
@@ -168,7 +178,7 @@ def test_a_surface_that_cannot_be_meshed_fails_its_row_alone(
         return good(*inputs)
 
     monkeypatch.setattr(module, "evaluate", evaluate)
-    table = ablate(tmp_path, "fast", tmp_path / "store", [], ["no-residual", "no-segmentation"])
+    table = ablate.fn(tmp_path, "fast", tmp_path / "store", [], ["no-residual", "no-segmentation"])
     rows = json.loads(table.with_suffix(".json").read_text())["rows"]
     assert rows["no-residual"] == {"error": "signed distance field: no surface in its box"}
     assert list(rows) == ["full", "no-residual", "no-segmentation"] and "psnr" in rows["no-segmentation"]["novel_view"]
@@ -182,12 +192,12 @@ def test_a_full_disk_ends_the_command(
 
     monkeypatch.setattr(module, "evaluate", evaluate)
     with pytest.raises(OSError, match="No space"):
-        ablate(tmp_path, "fast", tmp_path / "store", [], ["no-opt"])
+        ablate.fn(tmp_path, "fast", tmp_path / "store", [], ["no-opt"])
 
 
 def test_a_lost_worker_ends_the_command_and_finished_rows_stand(stages: list[TrainingSettings], tmp_path: Path) -> None:
     with pytest.raises(LostWorkerError):
-        ablate(tmp_path, "fast", tmp_path / "store", [], ["no-opt", "no-eikonal", "no-residual"])
+        ablate.fn(tmp_path, "fast", tmp_path / "store", [], ["no-opt", "no-eikonal", "no-residual"])
     result = json.loads((tmp_path / "store" / "ablations" / "ada-fast.json").read_text())
     assert list(result["rows"]) == ["full", "no-opt"]
     assert len(stages) == 3

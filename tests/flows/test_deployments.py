@@ -52,11 +52,11 @@ def test_deployment_run_takes_a_capture(deployed: str) -> None:
     assert run.parameters == {"capture": "/recordings/ada"}
 
 
-@pytest.mark.parametrize("study", ["benchmark", "stability"])
-def test_studies_are_deployed_too(deployed: str, study: str) -> None:
-    prefect(deployed, "deployment", "run", f"{study}/local", "-p", "capture=/recordings/ada", "-p", "study=quick")
-    (run,) = runs_of(study)
-    assert run.parameters == {"capture": "/recordings/ada", "study": "quick"}
+@pytest.mark.parametrize(("flow", "what"), [("benchmark", "study"), ("stability", "study"), ("ablate", "preset")])
+def test_studies_are_deployed_too(deployed: str, flow: str, what: str) -> None:
+    prefect(deployed, "deployment", "run", f"{flow}/local", "-p", "capture=/recordings/ada", "-p", f"{what}=mine")
+    (run,) = runs_of(flow)
+    assert run.parameters == {"capture": "/recordings/ada", what: "mine"}
 
 
 def test_parameters_are_checked_before_there_is_a_run(deployed: str) -> None:
