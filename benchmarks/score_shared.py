@@ -109,7 +109,8 @@ def _split_table(captures: dict[str, Any], split: str) -> list[str]:
 
 
 def _cost_table(captures: dict[str, Any]) -> list[str]:
-    rows = [["capture", "limb joints, mm", "before training, s", "training, s", "of it the field", "on", "one image, s", "whole run, s"]]
+    costs = ["before training, s", "training, s", "of it the field", "on", "one image, s", "whole run, s"]
+    rows = [["capture", "limb joints, mm", *costs]]
     for name, figures in captures.items():
         if "error" not in figures:
             fit = (figures["score"] or {}).get("fit")
