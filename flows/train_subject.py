@@ -41,7 +41,9 @@ def train_subject(
     model = shelf.show(subject, train(shelf, recording, calibration, masks, body, settings.training))
     report = evaluate(shelf, truth, recording, calibration, masks, body, model, settings.evaluation)
     shelf.show(subject, report)
-    asset = shelf.show(subject, export(shelf, recording, calibration, model, settings.asset))
+    asset = export(shelf, recording, calibration, model, settings.asset)
+    for artifact in (recording, calibration, masks, body, model, report, asset):
+        shelf.show(subject, artifact)  # again: another run of this name may have come between
     _announce(subject, report, asset)
     return shelf.subject_folder(subject)
 

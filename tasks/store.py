@@ -26,6 +26,9 @@ from hnerf.errors import CaptureError
 
 log = logging.getLogger("hnerf.store")
 
+# Each is made from those before it.
+STAGES = ("capture", "calibration", "segmentation", "fit", "training", "evaluation", "asset")
+
 
 class StoredFile(BaseModel):
     """What a file must be for the artifact to be whole."""
@@ -108,9 +111,13 @@ class Store:
             raise CaptureError(f"capture.toml: name {subject!r} cannot be a folder's name; choose another")
         link = self.subject_folder(subject) / artifact.stage
         link.parent.mkdir(parents=True, exist_ok=True)
+        target = os.path.relpath(artifact.root, link.parent)
+        if link.is_symlink() and os.readlink(link) != target:  # what was made from the old one no longer belongs to it
+            for stage in STAGES[STAGES.index(artifact.stage) + 1 :]:
+                (link.parent / stage).unlink(missing_ok=True)
         beside = link.with_name(f".{artifact.stage}.{os.getpid()}")
         beside.unlink(missing_ok=True)
-        beside.symlink_to(os.path.relpath(artifact.root, link.parent))
+        beside.symlink_to(target)
         os.replace(beside, link)
         return artifact
 

@@ -189,7 +189,7 @@ def _report(
     return {
         "seconds": seconds,
         "frames": list(fit.frames),
-        "keypoint_residual_px": [round(float(value), 2) for value in residual_px],
+        "keypoint_residual_px": [None if np.isnan(value) else round(float(value), 2) for value in residual_px],
         "silhouette_iou": iou,
         "poor_frames": flagged,
         "stature_m": round(float(vertices_m[:, 2].max() - vertices_m[:, 2].min()), 3),

@@ -7,6 +7,8 @@ hinges without an axis. Pose blend shapes (`posedirs`) act on that rest pose onc
 joints are less full than SMPL's own. Fingers, toes, jaw and eyes are locked. Expressions are left out.
 """
 
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -150,7 +152,7 @@ def _read(path: Path) -> dict[str, Any]:
         try:
             with np.load(path, allow_pickle=False) as archive:
                 found = {key: archive[key] for key in KEYS if key in archive}
-        except (AttributeError, OSError, TypeError, ValueError):
+        except (AttributeError, EOFError, OSError, TypeError, ValueError, zipfile.BadZipFile, zlib.error):
             raise CaptureError(f"{path}: is no .npz of plain arrays; convert the model again") from None
     missing = [key for key in KEYS if key not in found]
     if missing:

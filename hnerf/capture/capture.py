@@ -29,7 +29,8 @@ class Capture:
     `recorded_sizes_px`: the (width, height) of the files as recorded; `picture_areas_px`: where in the recorded picture
     black bars prove the calibrated one to lie, for which K was changed at the door. `up`: "z" or "y", the world's
     vertical axis. `frame_offsets`: of cameras out of step (hnerf.capture.timing); `stored_frames`: what the files hold,
-    where frames were dropped since.
+    where frames were dropped since; `frame_step`: how far the numbers of the recording lie apart. `recorded_lenses`: K
+    and distortion of the files as recorded, of cameras that were undistorted.
     """
 
     name: str
@@ -46,6 +47,8 @@ class Capture:
     picture_areas_px: dict[str, Area] = dataclasses.field(default_factory=dict)
     frame_offsets: dict[str, float] = dataclasses.field(default_factory=dict)
     stored_frames: tuple[int, ...] = ()
+    frame_step: int = 1
+    recorded_lenses: dict[str, tuple[list[list[float]], list[float]]] = dataclasses.field(default_factory=dict)
 
     @property
     def frames(self) -> tuple[int, ...]:
@@ -106,7 +109,9 @@ class Capture:
     def synchronised(self, frame_offsets: dict[str, float]) -> "Capture":
         """The same recording with these cameras' offsets; frames are dropped that one of them did not record."""
         stored = self.stored_frames or self.frames
-        kept = {f for f in stored if all(nearest_frame(f, o) in stored for o in frame_offsets.values())}
+        kept = {
+            f for f in stored if all(nearest_frame(f, o, self.frame_step) in stored for o in frame_offsets.values())
+        }
         return dataclasses.replace(
             self,
             train_frames=tuple(f for f in self.train_frames if f in kept),
@@ -117,7 +122,7 @@ class Capture:
 
     def recorded(self, camera: str, frame: int) -> int:
         """The number of a camera's recorded frame nearest in time to a frame."""
-        return nearest_frame(frame, self.frame_offsets.get(camera, 0.0))
+        return nearest_frame(frame, self.frame_offsets.get(camera, 0.0), self.frame_step)
 
     def save(self) -> None:
         """Write `capture.json` into `root`."""

@@ -24,6 +24,7 @@ from hnerf.capture.keypoint_sets import to_body_25
 from hnerf.capture.lens import Lens
 from hnerf.capture.normalise import Normaliser
 from hnerf.capture.notes import Notes, capture_name, chosen_cameras, chosen_frames, read_notes
+from hnerf.capture.timing import usual_step
 from hnerf.config import CaptureSettings
 from hnerf.errors import CaptureError
 from hnerf.spread import spread
@@ -95,6 +96,8 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
         calibrated_sizes_px={name: lenses[name].size_px or n.recorded_size_px for name, n in normalisers.items()},
         recorded_sizes_px={name: n.recorded_size_px for name, n in normalisers.items()},
         picture_areas_px=areas,
+        frame_step=usual_step(recorded),
+        recorded_lenses={c: (n.lens.K.tolist(), n.lens.distortion.tolist()) for c, n in normalisers.items() if n.maps},
     )
     capture.save()
     return capture

@@ -2,6 +2,7 @@
 
 import math
 import re
+import unicodedata
 from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Literal
@@ -64,7 +65,7 @@ def read_notes(folder: Path) -> Notes:
 
 def capture_name(folder: Path, notes: Notes) -> str:
     """What the subject is called; it becomes a folder name, so CaptureError if it cannot be one."""
-    name = folder.resolve().name if notes.name is None else notes.name
+    name = unicodedata.normalize("NFC", folder.resolve().name if notes.name is None else notes.name)  # macOS: NFD
     if not re.fullmatch(r"\w[\w .()-]{0,127}", name):
         raise CaptureError(f"{folder / 'capture.toml'}: name {name!r}: use letters, digits, '_', '-', '.' and spaces")
     return name

@@ -11,9 +11,9 @@ from scipy.optimize import linear_sum_assignment
 SAME_PERSON = 0.3  # of a person's height: how far keypoints may move, on average, from one frame to the next
 
 
-def nearest_frame(frame: int, offset_frames: float) -> int:
-    """The recorded frame nearest to an instant."""
-    return int(np.floor(frame + offset_frames + 0.5))
+def nearest_frame(frame: int, offset_frames: float, step: int = 1) -> int:
+    """The recorded frame nearest to an instant, where frame numbers are `step` apart."""
+    return frame + step * int(np.floor(offset_frames / step + 0.5))
 
 
 def usual_step(frames: Sequence[int]) -> int:

@@ -100,6 +100,8 @@ def score_split(split: str, views: list[View], truth: GroundTruth | None, out: P
         return nothing | {"reason": "the capture has no ground-truth masks"}
     rows, references = [], set()
     for view in views:
+        if not truth.has_mask(view.camera, view.frame):
+            continue
         mask = truth.mask(view.camera, view.frame)
         if not mask.any():
             continue

@@ -69,7 +69,7 @@ def _mask_and_reference(
     view: View, image: np.ndarray, inputs: EvaluationInputs, truth: GroundTruth | None
 ) -> tuple[np.ndarray | None, tuple[str, np.ndarray] | None]:
     """The mask (H, W) bool and the captioned picture to compare with, or None where there is none."""
-    if view.split != TRAINING_VIEW and truth is not None and truth.has_masks:
+    if view.split != TRAINING_VIEW and truth is not None and truth.has_mask(view.camera, view.frame):
         return truth.mask(view.camera, view.frame), ("Ground truth", truth.on_black(view.camera, view.frame)[0])
     if (view.camera, view.frame) not in inputs.masks:
         return None, None

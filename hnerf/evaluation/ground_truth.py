@@ -10,6 +10,8 @@ import trimesh
 
 from hnerf.capture.capture import Capture
 from hnerf.capture.guarded import inside, read_image
+from hnerf.capture.lens import Lens
+from hnerf.capture.normalise import Normaliser
 from hnerf.errors import CaptureError
 
 ON_BLACK = "ground_truth/on_black"
@@ -29,10 +31,13 @@ class GroundTruth:
         """Whether images can be scored."""
         return self._path("masks").is_dir()
 
+    def has_mask(self, camera: str, frame: int) -> bool:
+        """Whether this image can be scored: somebody may have drawn a few masks by hand."""
+        return self._mask_path(camera, frame).exists()
+
     def mask(self, camera: str, frame: int) -> np.ndarray:
         """(H, W) bool, True on the person."""
-        path = self._path("masks", camera, f"{self.capture.recorded(camera, frame):06d}.png")
-        return self._at_camera_size(read_image(path)[..., 0], camera, cv2.INTER_NEAREST) > 127
+        return self._as_rendered(read_image(self._mask_path(camera, frame))[..., 0], camera, cv2.INTER_NEAREST) > 127
 
     def on_black(self, camera: str, frame: int) -> tuple[np.ndarray, str]:
         """The person alone over black, (H, W, 3) uint8, and where that comes from.
@@ -41,7 +46,7 @@ class GroundTruth:
         """
         path = self._path("on_black", camera, f"{self.capture.recorded(camera, frame):06d}.jpg")
         if path.exists():
-            return self._at_camera_size(read_image(path), camera, cv2.INTER_AREA), ON_BLACK
+            return self._as_rendered(read_image(path), camera), ON_BLACK
         return self.capture.image(camera, frame) * self.mask(camera, frame)[..., None], MASKED_IMAGE
 
     def meshes(self) -> dict[int, trimesh.Trimesh]:
@@ -61,6 +66,15 @@ class GroundTruth:
     def _path(self, *parts: str) -> Path:
         return inside(self.folder, "ground_truth", *parts)
 
-    def _at_camera_size(self, image: np.ndarray, camera: str, interpolation: int) -> np.ndarray:
+    def _mask_path(self, camera: str, frame: int) -> Path:
+        return self._path("masks", camera, f"{self.capture.recorded(camera, frame):06d}.png")
+
+    def _as_rendered(self, image: np.ndarray, camera: str, interpolation: int = cv2.INTER_AREA) -> np.ndarray:
+        """A picture as recorded, undistorted and shrunk as the photographs were at the door."""
         size = (self.capture.cameras[camera].width_px, self.capture.cameras[camera].height_px)
+        recorded_px = self.capture.recorded_sizes_px.get(camera)
+        if camera in self.capture.recorded_lenses and image.shape[1::-1] == recorded_px:
+            K, distortion = map(np.array, self.capture.recorded_lenses[camera])
+            lens = Lens(camera, K, distortion, np.eye(3), np.zeros(3), recorded_px)
+            return Normaliser.create(lens, recorded_px, max(size)).pixels(image)
         return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=interpolation)

@@ -2,6 +2,8 @@
 
 import dataclasses
 import re
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +25,7 @@ AMASS_WIDTHS = (72, 156, 165)  # numbers a pose of SMPL, SMPL-H and SMPL-X; the 
 AMASS_RATES = ("mocap_framerate", "mocap_frame_rate")
 BODY_JOINTS = 22
 DEFAULT_FPS = 30.0
+MAX_FPS = 10_000.0
 
 
 @dataclass(frozen=True)
@@ -157,7 +160,7 @@ def _read_amass(path: Path) -> tuple[GivenPoses, float]:
     try:
         with np.load(path, allow_pickle=False) as stored:
             found = {key: np.asarray(stored[key], np.float64) for key in keys if key in stored}
-    except (AttributeError, OSError, TypeError, ValueError):
+    except (AttributeError, EOFError, OSError, TypeError, ValueError, zipfile.BadZipFile, zlib.error):
         raise CaptureError(f"{path}: is no .npz of plain arrays; give an AMASS file or a subject's folder") from None
     poses, trans = found.get("poses", np.zeros(0)), found.get("trans", np.zeros(0))
     known = poses.ndim == 2 and poses.shape[1] in AMASS_WIDTHS and trans.shape == (len(poses), 3) and len(poses) > 0
@@ -167,5 +170,7 @@ def _read_amass(path: Path) -> tuple[GivenPoses, float]:
     given.theta[:, :BODY_JOINTS] = poses[:, : 3 * BODY_JOINTS].reshape(-1, BODY_JOINTS, 3)
     given.root[:] = np.eye(4)
     given.root[:, :3, 3] = trans
-    rates = [float(found[key]) for key in AMASS_RATES if key in found]
-    return given, rates[0] if rates else DEFAULT_FPS
+    rate = next((found[key] for key in AMASS_RATES if key in found), np.array(DEFAULT_FPS))
+    if rate.size != 1 or not 0 < rate.item() <= MAX_FPS:
+        raise CaptureError(f"{path}: {rate.tolist()} frames per second; correct {AMASS_RATES[0]}")
+    return given, rate.item()

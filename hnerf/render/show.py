@@ -15,6 +15,7 @@ from hnerf.body.rig import pose_vertices
 from hnerf.calibration.check import load_cameras
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
+from hnerf.capture.timing import usual_step
 from hnerf.errors import CaptureError
 from hnerf.render.cameras_along import along, orbit, read_path
 from hnerf.render.motion import Motion, adopted, between, read_motion, rows, select
@@ -99,7 +100,7 @@ def _motion(subject: Path, wish: Wish, capture: Capture) -> Motion:
         motion = read_motion(wish.motion, wish.frames)
         motion = dataclasses.replace(motion, body=adopted(own, motion, capture.up), up=capture.up)
     body = motion.body
-    fps = motion.fps / min(np.diff(body.frames), default=1)
+    fps = motion.fps / usual_step(body.frames)
     if wish.between is not None:
         for frame in wish.between:
             select(body.frames, str(frame), wish.motion or subject)

@@ -16,6 +16,7 @@ def people_at(*x_px: float) -> np.ndarray:
 
 def test_nearest_frame_by_hand() -> None:
     assert [nearest_frame(10, offset) for offset in (-0.6, -0.4, 0.4, 0.5, 2.7)] == [9, 10, 10, 11, 13]
+    assert [nearest_frame(20, offset, 10) for offset in (-4.1, -6.0, 5.0, 27.0)] == [20, 10, 30, 50]  # 0, 10, 20, ...
 
 
 def test_keypoints_between_frames_by_hand() -> None:

@@ -5,6 +5,8 @@ import cv2
 import numpy as np
 import pytest
 
+from hnerf.capture.lens import Lens
+from hnerf.capture.normalise import Normaliser
 from hnerf.errors import CaptureError
 from hnerf.evaluation.ground_truth import GroundTruth
 from tests.evaluation.ball import PHOTOGRAPHED, centre_m, seen, write_ball_capture, write_ball_truth
@@ -42,6 +44,29 @@ def test_truth_is_of_the_instant_of_the_photograph(truth: GroundTruth) -> None:
     path.parent.mkdir(parents=True)
     cv2.imwrite(str(path), np.full((64, 64, 3), 90, np.uint8))
     assert in_step.on_black("c", 1)[0].max() == 90
+
+
+def test_truth_is_undistorted_as_photographs_are(truth: GroundTruth) -> None:
+    """By the Normaliser, which photographs go through at the door; a distorted lens moves the outline."""
+    camera = truth.capture.cameras["c"]
+    size_px = (camera.width_px, camera.height_px)
+    distortion = np.array([0.0, 0.0, 0.5, 0.5])
+    straight = truth.mask("c", 1)
+    bent = replace(
+        truth.capture,
+        recorded_sizes_px={"c": size_px},
+        recorded_lenses={"c": (camera.K.tolist(), distortion.tolist())},
+    )
+    found = replace(truth, capture=bent).mask("c", 1)
+    lens = Lens("c", camera.K, distortion, np.eye(3), np.zeros(3), size_px)
+    expected = Normaliser.create(lens, size_px, max(size_px)).pixels(255 * straight.astype(np.uint8)) > 127
+    assert np.array_equal(found, expected) and not np.array_equal(found, straight)
+
+
+def test_a_mask_that_nobody_drew_is_not_there(truth: GroundTruth) -> None:
+    assert truth.has_mask("c", 1)
+    (truth.folder / "ground_truth" / "masks" / "c" / "000001.png").unlink()
+    assert not truth.has_mask("c", 1)
 
 
 def test_a_missing_mask_is_named(truth: GroundTruth) -> None:

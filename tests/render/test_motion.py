@@ -138,11 +138,21 @@ def test_amass_poses_turn_the_likes_of_smpls_joints(tmp_path: Path) -> None:
         ({"poses": np.zeros((2, 156)), "trans": np.zeros((3, 3))}, "not AMASS's"),
         ({"poses": np.full((2, 156), np.nan), "trans": np.zeros((2, 3))}, "not AMASS's"),
         ({"poses": np.array([None]), "trans": np.zeros((2, 3))}, "plain arrays"),
+        ({"poses": np.zeros((2, 72)), "trans": np.zeros((2, 3)), "mocap_framerate": np.array(0)}, "frames per second"),
+        ({"poses": np.zeros((2, 72)), "trans": np.zeros((2, 3)), "mocap_framerate": np.ones(2)}, "frames per second"),
     ],
 )
 def test_what_is_no_motion_is_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "walk.npz", **arrays)  # type: ignore[arg-type]
     with pytest.raises(CaptureError, match=f"walk.npz: .*{message}"):
+        read_motion(tmp_path / "walk.npz")
+
+
+def test_half_a_file_is_no_motion(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "walk.npz", poses=np.zeros((2, 156)), trans=np.zeros((2, 3)))
+    whole = (tmp_path / "walk.npz").read_bytes()
+    (tmp_path / "walk.npz").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(CaptureError, match=r"walk\.npz: is no \.npz of plain arrays"):
         read_motion(tmp_path / "walk.npz")
 
 

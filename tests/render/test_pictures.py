@@ -9,6 +9,7 @@ from torch import Tensor
 
 from hnerf.capture.camera import Camera
 from hnerf.capture.footage import Video
+from hnerf.errors import CaptureError
 from hnerf.render import pictures
 from hnerf.render.avatar import Rendering
 from hnerf.render.pictures import (
@@ -94,6 +95,22 @@ def test_every_kind_of_image_is_a_video_too(tmp_path: Path) -> None:
         for picture in video.read([0, 1]):
             np.testing.assert_allclose(picture.rgb[31, 31], middle, atol=16, err_msg=kind)
             assert picture.rgb[0, 0].max() < 16  # nobody
+
+
+@pytest.mark.parametrize("fps", [200 / 3, 29.97, 1000 / 3])
+def test_a_video_has_its_rate_as_nearly_as_the_format_can(fps: float, tmp_path: Path) -> None:
+    (tmp_path / "colour").mkdir()
+    for number in range(2):
+        cv2.imwrite(str(tmp_path / "colour" / f"{number:06d}.png"), np.zeros((16, 16, 3), np.uint8))
+    write_video(tmp_path / "colour", fps, tmp_path / "colour.mp4")
+    assert Video.open(tmp_path / "colour.mp4").fps == pytest.approx(fps, rel=1e-3)
+
+
+def test_an_image_of_one_row_is_no_video(tmp_path: Path) -> None:
+    (tmp_path / "colour").mkdir()
+    cv2.imwrite(str(tmp_path / "colour" / "000000.png"), np.zeros((1, 16, 3), np.uint8))
+    with pytest.raises(CaptureError, match="no video of 16 x 1 px; ask for a larger size"):
+        write_video(tmp_path / "colour", 5.0, tmp_path / "colour.mp4")
 
 
 def test_greys_of_depths_by_hand(tmp_path: Path) -> None:

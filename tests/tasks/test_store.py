@@ -138,6 +138,16 @@ def test_view_points_at_the_latest(tmp_path: Path) -> None:
     assert list(link.parent.iterdir()) == [link]
 
 
+def test_view_never_mixes_what_was_made_from_other_things(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    for stage in ("fit", "training", "asset"):
+        store.show("ada", store.obtain(stage, "old", write_abc))
+    store.show("ada", store.obtain("training", "old", write_abc))  # the same again
+    assert {path.name for path in (tmp_path / "subjects" / "ada").iterdir()} == {"fit", "training", "asset"}
+    store.show("ada", store.obtain("fit", "new", write_abc))
+    assert [path.name for path in (tmp_path / "subjects" / "ada").iterdir()] == ["fit"]
+
+
 @pytest.mark.parametrize("name", ["", "..", "../../home", "a/b"])
 def test_view_stays_within_the_store(tmp_path: Path, name: str) -> None:
     store = Store(tmp_path)

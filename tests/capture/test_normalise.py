@@ -1,0 +1,28 @@
+"""Keypoints of distorted lenses, and names of folders."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hnerf.capture.lens import Lens
+from hnerf.capture.normalise import Normaliser
+from hnerf.capture.notes import Notes, capture_name
+
+
+def test_keypoints_near_the_edge_are_undistorted_exactly() -> None:
+    """Points of the linear camera, distorted by OpenCV, come back to where they were."""
+    K, distortion = np.array([[870.0, 0, 960], [0, 870, 540], [0, 0, 1]]), np.array([-0.25, 0.0, 0.0, 0.0])
+    lens = Lens("a", K, distortion, np.eye(3), np.zeros(3), (1920, 1080))
+    x, y = np.meshgrid(np.linspace(-0.85, 0.85, 5), np.linspace(-0.5, 0.5, 5))
+    rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
+    seen_px = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, distortion)[0][:, 0]
+    recorded = np.concatenate([seen_px, np.ones((25, 1))], -1)[None]
+    expected_px = (rays @ K.T)[:, :2]
+    found = Normaliser.create(lens, (1920, 1080), 1920).keypoints(recorded)
+    np.testing.assert_allclose(found[0, :, :2], expected_px, atol=0.02)
+
+
+def test_a_folder_named_on_a_mac_has_the_same_name() -> None:
+    composed, decomposed = "J\u00fcrgen", "Ju\u0308rgen"
+    assert capture_name(Path("/recordings") / decomposed, Notes()) == composed
