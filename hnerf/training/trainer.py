@@ -177,7 +177,8 @@ class Trainer:
             self.skipped = 0
         else:
             self.skipped += 1
-            logger.warning("%s: step skipped", fault)
+            frames = ", ".join(str(self.body.frames[row]) for row in rows[pick].tolist())
+            logger.warning("%s: rays of frames %s, seed %d: step skipped", fault, frames, s.seed)
             if self.skipped > SKIPS_ALLOWED:
                 raise TrainingError(
                     f"{fault}, {self.skipped} times in a row; lower the learning rates or check the fit"

@@ -138,3 +138,30 @@ def test_gradients_of_coupled_losses_in_double():
     assert torch.autograd.gradcheck(
         coupled, (alpha_dot, double.density.requires_grad_(), double.residual.requires_grad_())
     )
+
+
+def test_gradients_of_what_pulls_poses_and_deformations_back_in_double():
+    correction = PoseCorrection(2, 1, 3).double()
+    generator = torch.Generator().manual_seed(0)
+    shapes = [p.shape for p in correction.parameters()]
+    values = [torch.randn(shape, generator=generator, dtype=torch.float64).requires_grad_() for shape in shapes]
+
+    def pulled(*parameters: torch.Tensor) -> torch.Tensor:
+        named = dict(zip((name for name, _ in correction.named_parameters()), parameters, strict=True))
+        return torch.func.functional_call(Increment(correction), {f"correction.{k}": v for k, v in named.items()}, ())
+
+    assert torch.autograd.gradcheck(pulled, values)
+    double = replace(SAMPLES, **{k: v.double() for k, v in vars(SAMPLES).items()})
+    energy = torch.rand(3, generator=generator, dtype=torch.float64).requires_grad_()
+    assert torch.autograd.gradcheck(lambda e: losses.elastic(replace(double, elastic=e)), energy)
+
+
+class Increment(torch.nn.Module):
+    """The loss as a module, so that parameters can be put in."""
+
+    def __init__(self, correction: PoseCorrection) -> None:
+        super().__init__()
+        self.correction = correction
+
+    def forward(self) -> torch.Tensor:
+        return losses.increment(self.correction)

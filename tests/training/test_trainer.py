@@ -1,4 +1,5 @@
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -195,7 +196,9 @@ def test_a_single_training_frame_has_nothing_to_deform(tmp_path: Path):
     assert (load_avatar(tmp_path).body.theta[2] - body.theta[2]).abs().max() > 2e-5
 
 
-def test_not_a_number_stops_the_run_with_its_cause(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_not_a_number_stops_the_run_with_its_cause(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
     capture, masks, body = record(tmp_path / "capture")
     trainer = Trainer(capture, masks, body, TINY, tmp_path, ALONE)
     before = {name: p.clone() for name, p in trainer.field.named_parameters()}
@@ -207,6 +210,25 @@ def test_not_a_number_stops_the_run_with_its_cause(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(trainer.objective, "forward", poison)
     with pytest.raises(TrainingError, match=r"reconstruction.*not finite.*3 times in a row"):
         trainer.run()
+    assert all(torch.equal(before[name], p) for name, p in trainer.field.named_parameters())
+    first = caplog.messages[0]
+    assert re.fullmatch(r"step 0: reconstruction.* not finite: rays of frames [01], [01], seed 0: step skipped", first)
+
+
+def test_a_gradient_that_is_not_finite_skips_the_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The root of the sum of squares has one at zero, where its own value is finite."""
+    trainer = Trainer(*record(tmp_path / "capture"), TINY, tmp_path, ALONE)
+    before = {name: p.clone() for name, p in trainer.field.named_parameters()}
+    whole = trainer.objective.forward
+
+    def rooted(*arguments):
+        zero = sum(p.sum() for p in trainer.field.parameters()) * 0.0
+        return whole(*arguments) | {"rooted": zero.sqrt()}
+
+    monkeypatch.setattr(trainer.objective, "forward", rooted)
+    terms = trainer._optimise(trainer.objective)
+    assert all(torch.isfinite(term) for term in terms.values())
+    assert trainer.skipped == 1
     assert all(torch.equal(before[name], p) for name, p in trainer.field.named_parameters())
 
 
