@@ -1,4 +1,5 @@
 import json
+import math
 import re
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from hnerf.config import TrainingSettings
+from hnerf.config import TrainingSettings, load_settings
 from hnerf.errors import CaptureError
 from hnerf.training import trainer as trainer_module
 from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
@@ -86,6 +87,27 @@ def test_overfits_the_column(tmp_path: Path):
     wanted = torch.from_numpy(capture.image("0", 0)) / 255 * mask[..., None]
     assert -10 * torch.log10(((drawn.rgb - wanted) ** 2).mean()) > 40
     assert drawn.depth_m[mask].mean().item() == pytest.approx(3.6, abs=0.4)
+
+
+def test_the_paper_learns_by_all_nine_losses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """With the preset's weights, on one batch again and again, so that its chance does not hide what was learned."""
+    losses = load_settings("paper").training.losses
+    settings = with_changes(machinery="paper", paper={"samples": 16}, losses=losses, steps=15, novel_pose_steps=0)
+    trainer = Trainer(*record(tmp_path / "capture"), settings, tmp_path, ALONE)
+
+    def optimise_the_same(module: torch.nn.Module) -> dict[str, torch.Tensor]:
+        trainer.generator.manual_seed(0)
+        return Trainer._optimise(trainer, module)
+
+    monkeypatch.setattr(trainer, "_optimise", optimise_the_same)
+    monkeypatch.setattr(trainer_module, "WARM_UP_STEPS", 1)
+    monkeypatch.setattr(trainer_module, "HELD_OUT_RAYS", 64)
+    trainer.run()
+    first, last = (trainer.history[k]["losses"] for k in (0, -1))
+    colour, shape = {"reconstruction", "mask", "blend"}, {"geometry", "segmentation", "eikonal"}
+    assert first.keys() == last.keys() == colour | shape | {"residual", "fit", "increment"}
+    assert all(math.isfinite(value) and value > 0 for value in last.values())
+    assert sum(last.values()) < 0.95 * sum(first.values())
 
 
 def test_loads_after_the_shape_has_changed(tmp_path: Path):
