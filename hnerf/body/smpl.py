@@ -7,8 +7,6 @@ hinges without an axis. Pose blend shapes (`posedirs`) act on that rest pose onc
 joints are less full than SMPL's own. Fingers, toes, jaw and eyes are locked. Expressions are left out.
 """
 
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +17,7 @@ import torch
 from torch import Tensor
 
 from hnerf.body.rig import Rig
+from hnerf.capture.guarded import NO_ARRAYS
 from hnerf.capture.pickled import read_pickle
 from hnerf.errors import CaptureError
 
@@ -152,7 +151,7 @@ def _read(path: Path) -> dict[str, Any]:
         try:
             with np.load(path, allow_pickle=False) as archive:
                 found = {key: archive[key] for key in KEYS if key in archive}
-        except (AttributeError, EOFError, OSError, TypeError, ValueError, zipfile.BadZipFile, zlib.error):
+        except NO_ARRAYS:
             raise CaptureError(f"{path}: is no .npz of plain arrays; convert the model again") from None
     missing = [key for key in KEYS if key not in found]
     if missing:

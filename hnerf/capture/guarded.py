@@ -3,6 +3,8 @@
 import json
 import re
 import tomllib
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,8 @@ from hnerf.errors import CaptureError
 
 MAX_IMAGE_PIXELS = 64_000_000
 MAX_TEXT_BYTES = 16_000_000
+# What reading arrays from a file raises that is no whole .npz of plain arrays.
+NO_ARRAYS = (AttributeError, EOFError, OSError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 _IMAGE_MODES = ("1", "L", "P", "RGB", "RGBA")  # 8 bits a channel: others would be clipped
 _CAMERA_NAME = re.compile(r"\w[\w ()-]{0,63}")  # becomes a folder name, and a glob without wildcards

@@ -1,6 +1,5 @@
 """What a capture folder knows about the truth: masks, the person on black, and surfaces, under `ground_truth/`."""
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import numpy as np
 import trimesh
 
 from hnerf.capture.capture import Capture
-from hnerf.capture.guarded import inside, read_image
+from hnerf.capture.guarded import NO_ARRAYS, inside, read_image
 from hnerf.capture.lens import Lens
 from hnerf.capture.normalise import Normaliser
 from hnerf.errors import CaptureError
@@ -60,7 +59,7 @@ class GroundTruth:
             if not (faces.min() >= 0 and faces.max() < vertices.shape[1] and np.isfinite(vertices).all()):
                 raise ValueError("a face names no vertex, or a vertex is not finite")
             return {int(f): trimesh.Trimesh(v, faces, process=False) for f, v in zip(frames, vertices, strict=True)}
-        except (OSError, ValueError, KeyError, IndexError, zipfile.BadZipFile) as error:
+        except (*NO_ARRAYS, KeyError, IndexError) as error:
             raise CaptureError(f"{path}: no true surfaces to read ({error}); write it again or delete it") from None
 
     def _path(self, *parts: str) -> Path:

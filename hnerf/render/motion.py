@@ -2,8 +2,6 @@
 
 import dataclasses
 import re
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +16,7 @@ from hnerf.body.given_start import given_start
 from hnerf.body.rig import joint_transforms, pose_vertices
 from hnerf.capture.capture import Capture
 from hnerf.capture.given_poses import JOINTS, GivenPoses
+from hnerf.capture.guarded import NO_ARRAYS
 from hnerf.config import FitSettings
 from hnerf.errors import CaptureError
 
@@ -160,7 +159,7 @@ def _read_amass(path: Path) -> tuple[GivenPoses, float]:
     try:
         with np.load(path, allow_pickle=False) as stored:
             found = {key: np.asarray(stored[key], np.float64) for key in keys if key in stored}
-    except (AttributeError, EOFError, OSError, TypeError, ValueError, zipfile.BadZipFile, zlib.error):
+    except NO_ARRAYS:
         raise CaptureError(f"{path}: is no .npz of plain arrays; give an AMASS file or a subject's folder") from None
     poses, trans = found.get("poses", np.zeros(0)), found.get("trans", np.zeros(0))
     known = poses.ndim == 2 and poses.shape[1] in AMASS_WIDTHS and trans.shape == (len(poses), 3) and len(poses) > 0

@@ -1,8 +1,6 @@
 import json
 import math
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -262,48 +260,6 @@ def test_checkpoint_is_replaced_whole(tmp_path: Path):
     assert state is not None and state["step"] == 2
 
 
-RANK = """
-import sys, torch
-from pathlib import Path
-from hnerf.training import trainer
-from hnerf.training.processes import Processes
-from tests.training.scene import TINY, record
-torch.set_num_threads(1)
-root = Path(sys.argv[1])
-p = Processes.join()
-settings = TINY.model_copy(update={"losses": TINY.losses.model_copy(update={"elastic": 0.1})})
-t = trainer.Trainer(*record(root / f"capture{p.rank}"), settings, root, p)
-t.field.deformation.displacement.data[:-1] = 0.01
-module = t.objective
-if p.world_size > 1:
-    module = torch.nn.parallel.DistributedDataParallel(module, find_unused_parameters=True)
-t.optimizer.step = lambda: None
-t._optimise(module)
-if p.leads:
-    torch.save({n: q.grad for n, q in t.objective.named_parameters() if q.grad is not None}, root / "gradients.pt")
-"""
-
-
-def test_two_ranks_have_the_gradients_of_one(tmp_path: Path):
-    """Two gloo processes with half the rays each: the averaged gradients are those of one process with all rays."""
-    gradients = []
-    for ranks in (1, 2):
-        root = tmp_path / f"{ranks}"
-        root.mkdir()
-        script = root / "rank.py"
-        script.write_text(RANK)
-        launcher = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
-        subprocess.run([sys.executable, *launcher, str(script), str(root)], check=True, env=_environment())
-        gradients.append(torch.load(root / "gradients.pt", weights_only=True))
-    assert gradients[0].keys() == gradients[1].keys()
-    for learned in ("correction", "deformation"):
-        assert any(g.abs().max() > 0 for name, g in gradients[0].items() if learned in name)
-    for name, gradient in gradients[0].items():
-        torch.testing.assert_close(
-            gradients[1][name], gradient, atol=1e-6, rtol=1e-4, msg=lambda m, n=name: f"{n}: {m}"
-        )
-
-
 def test_two_halves_side_by_side_have_the_gradients_of_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """On a CPU with two threads, whichever half ends first: bit by bit the same each time, and those of one batch but
     for the order of sums."""
@@ -321,12 +277,6 @@ def test_two_halves_side_by_side_have_the_gradients_of_the_whole(tmp_path: Path,
     for name, gradient in whole.items():
         torch.testing.assert_close(halves[name], gradient, atol=1e-6, rtol=1e-4)
         torch.testing.assert_close(halves[name], again[name], atol=0, rtol=0)
-
-
-def _environment() -> dict[str, str]:
-    import os
-
-    return os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent.parent), "OMP_NUM_THREADS": "1"}
 
 
 def test_a_field_with_its_own_background_learns_from_every_pixel(tmp_path: Path):
