@@ -48,8 +48,9 @@ log = logging.getLogger("hnerf.capture")
 def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
     """Read a capture folder (any of LAYOUTS) and write it normalised into `out`.
 
-    Images are undistorted, and shrunk to `settings.max_side_px`; keypoints and masks with them. CaptureError, one line
-    that names the file, on anything missing, unreadable, contradictory or unsafe.
+    Images are undistorted, and shrunk to `settings.max_side_px`; keypoints and masks with them. Where `capture.toml`
+    names no frames, those before anybody is detected and after are left out. CaptureError, one line that names the
+    file, on anything missing, unreadable, contradictory or unsafe.
     """
     layout, notes = recognise(folder), read_notes(folder)
     subject = capture_name(folder, notes)
@@ -59,24 +60,28 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
     recorded = _common_frames(footage)
     frames = chosen_frames(folder, notes, recorded, layout.novel_pose_share, settings.max_frames)
     wanted = tuple(sorted(frames.train + frames.novel_pose))
+    detected = {name: _detections(layout, name, wanted, recorded) for name in footage}
+    people = {name: found for name, found in detected.items() if found is not None}
+    poses = layout.given_poses(wanted)
+    if poses and not poses.known.any():
+        raise CaptureError(f"{folder}: its poses are of none of these frames; choose others, or take the poses out")
+    if not notes.frames and not poses:
+        there = _while_somebody_is_there([people[name] for name in cameras.train if name in people], wanted)
+        wanted, people = wanted[there], {name: found[there] for name, found in people.items()}
+        if not set(frames.train) & set(wanted):
+            raise CaptureError(f"{folder}: nobody is detected in any training frame; name others in capture.toml")
 
     out.mkdir(parents=True, exist_ok=True)
     normalisers: dict[str, Normaliser] = {}
-    detected: dict[str, np.ndarray] = {}
     areas: dict[str, Area] = {}
     for name in footage:
         log.info("camera %s: %d frames from %s", name, len(wanted), footage[name].path)
         lens, area = _lens_as_recorded(lenses[name], footage[name], wanted)
         areas |= {name: area} if area else {}
         normalisers[name] = _write_pixels(layout, lens, footage[name], wanted, settings, out)
-        found = _detections(layout, name, wanted, recorded)
-        detected |= {} if found is None else {name: found}
-    if detected:
-        keypoints = {name: normalisers[name].keypoints(k) for name, k in to_body_25(detected, notes.keypoints).items()}
+    if people:
+        keypoints = {name: normalisers[name].keypoints(k) for name, k in to_body_25(people, notes.keypoints).items()}
         np.savez_compressed(out / "keypoints.npz", **keypoints)  # type: ignore[arg-type]
-    poses = layout.given_poses(wanted)
-    if poses and not poses.known.any():
-        raise CaptureError(f"{folder}: its poses are of none of these frames; choose others, or take the poses out")
     if poses:
         poses.save(out / "poses.npz")
     boards = read_board_footage(folder, "extrinsic")
@@ -89,8 +94,8 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
         cameras={name: _in_metres(n.camera, notes) for name, n in normalisers.items()},
         train_cameras=tuple(cameras.train),
         test_cameras=tuple(cameras.test),
-        train_frames=tuple(frames.train),
-        novel_pose_frames=tuple(frames.novel_pose),
+        train_frames=tuple(frame for frame in frames.train if frame in wanted),
+        novel_pose_frames=tuple(frame for frame in frames.novel_pose if frame in wanted),
         fps=notes.fps or next(iter(footage.values())).fps or DEFAULT_FPS,
         up=notes.up,
         calibrated_sizes_px={name: lenses[name].size_px or n.recorded_size_px for name, n in normalisers.items()},
@@ -212,6 +217,19 @@ def _detections(layout: Layout, camera: str, wanted: tuple[int, ...], recorded: 
             raise CaptureError(f"{path}: {points.shape[1]} keypoints a person where others have {count}; detect again")
         row[: len(points)] = points
     return stacked
+
+
+def _while_somebody_is_there(people: list[np.ndarray], frames: tuple[int, ...]) -> slice:
+    """From the first to the last frame in which any camera, (frames, people, K, 3), saw anybody: before and after there
+    is no pose to find. All frames where nobody was ever seen, which is for the calibration stage to say."""
+    seen = np.flatnonzero(np.any([(found[..., 2] > 0).any((1, 2)) for found in people], axis=0))
+    if not people or not len(seen):
+        return slice(None)
+    there = slice(int(seen[0]), int(seen[-1]) + 1)
+    empty = frames[: there.start] + frames[there.stop :]
+    if empty:
+        log.warning("%d frames left out, with nobody yet or any more: %s", len(empty), ", ".join(map(str, empty)))
+    return there
 
 
 def _in_metres(camera: Camera, notes: Notes) -> Camera:

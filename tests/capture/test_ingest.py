@@ -80,6 +80,24 @@ def test_long_recordings_are_strided_evenly(folder: Path, tmp_path: Path) -> Non
     assert ingest(folder, CaptureSettings(max_frames=3), tmp_path / "out").train_frames == (0, 2, 4)
 
 
+def test_frames_before_anybody_walks_in_and_after_are_left_out(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Seen by camera 02 in frames 1 and 3 alone, by camera 01 in none: 0 and 4 go, the gap at 2 stays."""
+    for camera, empty in (("01", rec.FRAMES), ("02", (0, 2, 4))):
+        for frame in empty:
+            rec.write_keypoints(folder / "openpose" / camera / f"{frame:06d}_keypoints.json", [])
+    capture = ingest(folder, SETTINGS, tmp_path / "out")
+    assert capture.train_frames == (1, 2, 3)
+    assert "2 frames left out, with nobody yet or any more: 0, 4" in caplog.text
+    found = {camera: capture.keypoints(camera) for camera in rec.CAMERAS}
+    assert found["02"] is not None and found["02"][:, 0, 0, 0].tolist() == [4.0, 0.0, 6.0]
+    assert found["01"] is not None and not found["01"].any()
+    assert {path.stem for path in (tmp_path / "out" / "images" / "01").iterdir()} == {"000001", "000002", "000003"}
+    (folder / "capture.toml").write_text("[frames]\ntrain = [0, 1]\n")
+    assert ingest(folder, SETTINGS, tmp_path / "named").train_frames == (0, 1)
+
+
 def test_keypoints_hold_all_people_in_frame_order(folder: Path, tmp_path: Path) -> None:
     keypoints = ingest(folder, SETTINGS, tmp_path / "out").keypoints("02")
     assert keypoints is not None and keypoints.shape == (5, 2, 25, 3)
