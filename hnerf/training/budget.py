@@ -17,12 +17,13 @@ from hnerf.render.silhouette import silhouette
 from hnerf.segmentation.masks import Masks
 from hnerf.spread import spread
 
-ALIGNMENT_M = 0.01  # to which surfaces of different frames lie on each other; what is finer blurs, whatever the cells
+ALIGNMENT_M = 0.01  # to which surfaces of different poses lie on each other; what is finer blurs, whatever the cells
+FINEST_M = 0.004  # cells of one posture, for memory: half as large take eight times as much
 COLOUR_LEVELS, GEOMETRY_LEVELS = 4, 3  # of the grids, from the coarsest to the finest in equal ratios
 COARSEST_CELLS = {"colour": 24, "geometry": 16}
 GEOMETRY_COARSER = 1.5  # times than colour: fingers and folds are larger than prints
 PATH = 2.4  # of a ray through the shell, in thicknesses of it, in the mean over rays that meet a person
-SAMPLE_M = 0.006  # between samples: surfaces come out smoother and nearer than with one each centimetre
+SAMPLE_CELLS, LONGEST_SAMPLE_M = 0.6, 0.006  # between samples: smoother and nearer surfaces than with one each cell
 ROOM_M = 0.015  # beyond where masks reach, for poses that are still wrong
 THINNEST_M, THICKEST_M = 0.03, 0.15
 MASKS_A_CAMERA = 6  # are looked at
@@ -105,8 +106,11 @@ def decide(scene: Scene, settings: TrainingSettings) -> tuple[TrainingSettings, 
 
 
 def _field(scene: Scene, given: FastFieldSettings) -> dict[str, Decision]:
-    cell_m = max(scene.footprint_m, ALIGNMENT_M)
-    finest = f"a pixel covers {_mm(scene.footprint_m)}, frames align to {_mm(ALIGNMENT_M)}: cells of {_mm(cell_m)}"
+    posed = scene.frames > 1 and scene.spread_rad >= ONE_POSTURE_RAD
+    cell_m = max(scene.footprint_m, ALIGNMENT_M if posed else FINEST_M)
+    sample_m = min(SAMPLE_CELLS * cell_m, LONGEST_SAMPLE_M)
+    align = f"poses align to {_mm(ALIGNMENT_M)}" if posed else "there is one posture"
+    finest = f"a pixel covers {_mm(scene.footprint_m)}, {align}: cells of {_mm(cell_m)}"
     outer_m, inner_m = (_thickness_m(reach_m) for reach_m in (scene.outside_m, scene.inside_m))
     outer_m, inner_m = given.outer_m or outer_m, given.inner_m or inner_m
     still = scene.spread_rad < STILL_RAD
@@ -115,8 +119,8 @@ def _field(scene: Scene, given: FastFieldSettings) -> dict[str, Decision]:
         "outer_m": Decision(outer_m, f"masks reach {_mm(scene.outside_m)} out of the fitted body, and room"),
         "inner_m": Decision(inner_m, f"masks stay {_mm(scene.inside_m)} inside the fitted body, and room"),
         "samples": Decision(
-            max(8, round(PATH * (outer_m + inner_m) / SAMPLE_M)),
-            f"one each {_mm(SAMPLE_M)} of a ray through a shell of {_mm(outer_m + inner_m)}",
+            max(8, round(PATH * (outer_m + inner_m) / sample_m)),
+            f"one each {_mm(sample_m)} of a ray through a shell of {_mm(outer_m + inner_m)}",
         ),
         "colour_cells": Decision(colour_cells, finest),
         "geometry_cells": Decision(

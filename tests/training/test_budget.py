@@ -46,6 +46,15 @@ def test_no_finer_than_frames_align():
     assert fast.geometry_cells[-1] == 128
 
 
+@pytest.mark.parametrize("still", [{"frames": 1}, {"spread_rad": 0.001}])
+def test_one_posture_is_as_fine_as_its_pixels(still: dict):
+    """Pixels of 5 mm: 384 cells on 1.92 m, 256 for geometry, a sample each 3 mm: 2.4 x 8 cm / 3 mm = 64."""
+    settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": 0.005, **still}))
+    assert (settings.fast.colour_cells[-1], settings.fast.geometry_cells[-1]) == (384, 256)
+    assert settings.fast.samples == 64
+    assert "there is one posture: cells of 5.0 mm" in decisions["fast.colour_cells"].reason
+
+
 def test_geometry_follows_the_colours_cells_that_are_given():
     """128 / 1.5 = 85, whatever the pixels ask for."""
     assert decided(SCENE, fast={"colour_cells": [24, 128]})[0].fast.geometry_cells[-1] == 85
