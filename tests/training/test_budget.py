@@ -48,11 +48,12 @@ def test_no_finer_than_frames_align():
 
 @pytest.mark.parametrize("still", [{"frames": 1}, {"spread_rad": 0.001}])
 def test_one_posture_is_as_fine_as_its_pixels(still: dict):
-    """Pixels of 5 mm: 384 cells on 1.92 m, 256 for geometry, a sample each 3 mm: 2.4 x 8 cm / 3 mm = 64."""
-    settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": 0.005, **still}))
-    assert (settings.fast.colour_cells[-1], settings.fast.geometry_cells[-1]) == (384, 256)
-    assert settings.fast.samples == 64
-    assert "there is one posture: cells of 5.0 mm" in decisions["fast.colour_cells"].reason
+    """Down to 8 mm: 240 cells on 1.92 m, 160 for geometry, a sample each 4.8 mm: 2.4 x 8 cm / 4.8 mm = 40."""
+    for footprint_m in (0.008, 0.001):
+        settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": footprint_m, **still}))
+        assert (settings.fast.colour_cells[-1], settings.fast.geometry_cells[-1]) == (240, 160)
+        assert settings.fast.samples == 40
+        assert "there is one posture: cells of 8.0 mm" in decisions["fast.colour_cells"].reason
 
 
 def test_geometry_follows_the_colours_cells_that_are_given():
