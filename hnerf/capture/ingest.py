@@ -58,18 +58,12 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
     cameras = chosen_cameras(folder, notes, list(lenses), layout.training_cameras())
     footage = {name: layout.footage(name) for name in cameras.train + cameras.test}
     recorded = _common_frames(footage)
-    frames = chosen_frames(folder, notes, recorded, layout.novel_pose_share, settings.max_frames)
-    wanted = tuple(sorted(frames.train + frames.novel_pose))
-    detected = {name: _detections(layout, name, wanted, recorded) for name in footage}
+    detected = {name: _detections(layout, name, recorded) for name in footage}
     people = {name: found for name, found in detected.items() if found is not None}
-    poses = layout.given_poses(wanted)
-    if poses and not poses.known.any():
-        raise CaptureError(f"{folder}: its poses are of none of these frames; choose others, or take the poses out")
-    if not notes.frames and not poses:
-        there = _while_somebody_is_there([people[name] for name in cameras.train if name in people], wanted)
-        wanted, people = wanted[there], {name: found[there] for name, found in people.items()}
-        if not set(frames.train) & set(wanted):
-            raise CaptureError(f"{folder}: nobody is detected in any training frame; name others in capture.toml")
+    seen = [people[name] for name in cameras.train if name in people]
+    there = recorded if notes.frames else _while_somebody_is_there(seen, recorded)
+    frames = chosen_frames(folder, notes, there, layout.novel_pose_share, settings.max_frames)
+    wanted = tuple(sorted(frames.train + frames.novel_pose))
 
     out.mkdir(parents=True, exist_ok=True)
     normalisers: dict[str, Normaliser] = {}
@@ -80,8 +74,13 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
         areas |= {name: area} if area else {}
         normalisers[name] = _write_pixels(layout, lens, footage[name], wanted, settings, out)
     if people:
-        keypoints = {name: normalisers[name].keypoints(k) for name, k in to_body_25(people, notes.keypoints).items()}
+        rows = np.searchsorted(recorded, wanted)
+        people = to_body_25({name: found[rows] for name, found in people.items()}, notes.keypoints)
+        keypoints = {name: normalisers[name].keypoints(found) for name, found in people.items()}
         np.savez_compressed(out / "keypoints.npz", **keypoints)  # type: ignore[arg-type]
+    poses = layout.given_poses(wanted)
+    if poses and not poses.known.any():
+        raise CaptureError(f"{folder}: its poses are of none of these frames; choose others, or take the poses out")
     if poses:
         poses.save(out / "poses.npz")
     boards = read_board_footage(folder, "extrinsic")
@@ -94,8 +93,8 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
         cameras={name: _in_metres(n.camera, notes) for name, n in normalisers.items()},
         train_cameras=tuple(cameras.train),
         test_cameras=tuple(cameras.test),
-        train_frames=tuple(frame for frame in frames.train if frame in wanted),
-        novel_pose_frames=tuple(frame for frame in frames.novel_pose if frame in wanted),
+        train_frames=tuple(frames.train),
+        novel_pose_frames=tuple(frames.novel_pose),
         fps=notes.fps or next(iter(footage.values())).fps or DEFAULT_FPS,
         up=notes.up,
         calibrated_sizes_px={name: lenses[name].size_px or n.recorded_size_px for name, n in normalisers.items()},
@@ -196,16 +195,16 @@ def _per_frame(
     return {frame: files[frame] for frame in wanted}
 
 
-def _detections(layout: Layout, camera: str, wanted: tuple[int, ...], recorded: tuple[int, ...]) -> np.ndarray | None:
+def _detections(layout: Layout, camera: str, recorded: tuple[int, ...]) -> np.ndarray | None:
     """(frames, most people, K, 3) as detected, absent people zero: of the layout's files, else of a list of results in
     keypoints/<camera>.json; None where there is neither."""
     files, results = layout.keypoint_files(camera), inside(layout.folder, "keypoints", f"{camera}.json")
     if files:
-        chosen = _per_frame(files, wanted, recorded, "keypoints").values()
+        chosen = _per_frame(files, recorded, recorded, "keypoints").values()
         paths = [file.path if isinstance(file, Stored) else file for file in chosen]
         people = [file.read() if isinstance(file, Stored) else read_openpose(file) for file in chosen]
     elif results.is_file():
-        paths, people = [results] * len(wanted), read_results(results, wanted)
+        paths, people = [results] * len(recorded), read_results(results, recorded)
     else:
         return None
     count = next((p.shape[1] for p in people if len(p)), 0)
@@ -219,17 +218,17 @@ def _detections(layout: Layout, camera: str, wanted: tuple[int, ...], recorded: 
     return stacked
 
 
-def _while_somebody_is_there(people: list[np.ndarray], frames: tuple[int, ...]) -> slice:
-    """From the first to the last frame in which any camera, (frames, people, K, 3), saw anybody: before and after there
-    is no pose to find. All frames where nobody was ever seen, which is for the calibration stage to say."""
+def _while_somebody_is_there(people: list[np.ndarray], frames: tuple[int, ...]) -> tuple[int, ...]:
+    """The frames from the first to the last in which any camera, (frames, people, K, 3), saw anybody: before and after
+    there is no pose to find. All frames where nobody was ever seen, which is for the calibration stage to say."""
     seen = np.flatnonzero(np.any([(found[..., 2] > 0).any((1, 2)) for found in people], axis=0))
     if not people or not len(seen):
-        return slice(None)
-    there = slice(int(seen[0]), int(seen[-1]) + 1)
-    empty = frames[: there.start] + frames[there.stop :]
-    if empty:
-        log.warning("%d frames left out, with nobody yet or any more: %s", len(empty), ", ".join(map(str, empty)))
-    return there
+        return frames
+    before, after = frames[: seen[0]], frames[seen[-1] + 1 :]
+    for empty, why in ((before, "nobody is there yet"), (after, "nobody is there any more")):
+        if empty:
+            log.warning("frames %d to %d left out: %s", empty[0], empty[-1], why)
+    return frames[seen[0] : seen[-1] + 1]
 
 
 def _in_metres(camera: Camera, notes: Notes) -> Camera:

@@ -89,7 +89,8 @@ def test_frames_before_anybody_walks_in_and_after_are_left_out(
             rec.write_keypoints(folder / "openpose" / camera / f"{frame:06d}_keypoints.json", [])
     capture = ingest(folder, SETTINGS, tmp_path / "out")
     assert capture.train_frames == (1, 2, 3)
-    assert "2 frames left out, with nobody yet or any more: 0, 4" in caplog.text
+    assert "frames 0 to 0 left out: nobody is there yet" in caplog.text
+    assert "frames 4 to 4 left out: nobody is there any more" in caplog.text
     found = {camera: capture.keypoints(camera) for camera in rec.CAMERAS}
     assert found["02"] is not None and found["02"][:, 0, 0, 0].tolist() == [4.0, 0.0, 6.0]
     assert found["01"] is not None and not found["01"].any()

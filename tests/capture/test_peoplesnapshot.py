@@ -75,14 +75,14 @@ def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
         with pytest.raises(CaptureError, match=names):
             ingest(folder, CaptureSettings(), tmp_path / "out")
 
-    (folder / "masks.hdf5").write_bytes(b"nothing")
-    refused(r"masks\.hdf5: not a readable HDF5 file")
-    write_hdf5(folder / "masks.hdf5", masks=np.zeros((5, 48, 64), np.uint8))
-    refused(r"masks\.hdf5: 5 masks for 6 frames")
     with h5py.File(folder / "reconstructed_poses.hdf5", "r+") as file:
         del file["betas"]
         file["betas"] = h5py.ExternalLink("/etc/hostname", "betas")
     refused(r"reconstructed_poses\.hdf5: has no array of numbers called betas")
+    write_hdf5(folder / "masks.hdf5", masks=np.zeros((5, 48, 64), np.uint8))
+    refused(r"masks\.hdf5: 5 masks for 6 frames")
+    (folder / "masks.hdf5").write_bytes(b"nothing")
+    refused(r"masks\.hdf5: not a readable HDF5 file")
     write_hdf5(folder / "keypoints.hdf5", keypoints=np.full((6, 54), np.nan))
     refused(r"keypoints\.hdf5: keypoints is not \(N, 54\) finite numbers")
     (folder / "camera.pkl").write_bytes(pickle.dumps({"camera_f": [1]}))

@@ -87,12 +87,12 @@ def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
         with pytest.raises(CaptureError, match=names):
             ingest(folder, CaptureSettings(), tmp_path / "out")
 
-    (folder / "mask_cihp" / "Camera_B2" / "000001.png").unlink()
-    refused(r"mask_cihp/Camera_B2/000001\.png")
     write_parameters(folder / "params" / "1.npy", np.zeros(10))
     refused(r"1\.npy: 10 turns and 10 shape values are not SMPL's")
     (folder / "params" / "1.npy").rename(folder / "params" / "9.npy")
     refused(r"its poses are of none of these frames")
+    (folder / "mask_cihp" / "Camera_B2" / "000001.png").unlink()
+    refused(r"mask_cihp/Camera_B2/000001\.png")
     annotations = np.load(folder / "annots.npy", allow_pickle=True).item()
     annotations["ims"][0]["ims"][1] = "../secret/000000.jpg"
     np.save(folder / "annots.npy", annotations, allow_pickle=True)
