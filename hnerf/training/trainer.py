@@ -36,7 +36,8 @@ logger = logging.getLogger("hnerf.training")
 WARM_UP_STEPS = 20
 SKIPS_ALLOWED = 2  # in a row; one more non-finite step stops the run
 HELD_OUT_RAYS = 2048
-LEAST_COVERAGE = 0.2  # of the person's pixels; below it the surface has collapsed
+LEAST_COVERAGE = 0.1  # of the person's pixels; below it the surface has collapsed
+LOOKS_A_RAY = 256  # at least, through a whole scene: with 16 the body itself seems to cover 39 % instead of 64
 LOG_STEPS = 25
 POSES_APART = 6  # training poses between those that say how thick the shell must be
 HALVES = 2  # of a batch, side by side on a CPU: operations are too small to share cores; two sums have one order only
@@ -222,16 +223,16 @@ class Trainer:
     def _held_out_psnr(self) -> float:
         """PSNR on person pixels of novel-pose frames in training cameras, which the field is not trained on."""
         generator = torch.Generator().manual_seed(self.settings.seed)
-        rays, samples = self._look(self.novel_rows, generator)
+        rays, samples = self._look(self.novel_rows, generator, self.field.samples)
         mixed = rays.edge & (not self.field.own_background)  # with what only such a field knows
         error = (pixel(samples.in_box * samples.alpha, samples) - rays.colour)[rays.person & ~mixed]
         return float(-10 * torch.log10((error**2).mean()))
 
     @torch.no_grad()
-    def _look(self, rows: Tensor, generator: torch.Generator) -> tuple[Rays, RaySamples]:
-        """Rays at some frames and what the model samples on them for a rendering."""
+    def _look(self, rows: Tensor, generator: torch.Generator, count: int) -> tuple[Rays, RaySamples]:
+        """Rays at some frames and what the model samples on them for a rendering, so many random numbers a ray."""
         rays = self.pixels.draw(rows, HELD_OUT_RAYS // len(rows) + 1, generator)
-        draws = Draws.still(len(rays.frame), self.field.samples, self.processes.device)
+        draws = Draws.still(len(rays.frame), count, self.processes.device)
         samples, _ = self.field.sample(
             self.stage.bodies, self.stage.region, rays.origins_m, rays.directions, rays.frame, self.conditions, draws
         )
@@ -240,7 +241,8 @@ class Trainer:
     def _require_surface(self) -> None:
         """TrainingError where the surface is empty or fills the box: of the surroundings, rays that pass the box are
         asked, away from outlines unless pixels are so large that there are no others."""
-        rays, samples = self._look(self.train_rows, torch.Generator().manual_seed(self.settings.seed))
+        count = max(self.field.samples, LOOKS_A_RAY) if self.field.own_background else self.field.samples
+        rays, samples = self._look(self.train_rows, torch.Generator().manual_seed(self.settings.seed), count)
         coverage = self.field.coverage(samples)
         beside = ~rays.person & (samples.in_box > 0).any(1)
         clear = beside & ~rays.edge

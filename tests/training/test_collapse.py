@@ -11,7 +11,7 @@ from hnerf.training.field import Field
 from hnerf.training.paper import PaperField
 from hnerf.training.processes import Processes
 from hnerf.training.step import TrainingError
-from hnerf.training.trainer import Trainer
+from hnerf.training.trainer import LEAST_COVERAGE, Trainer
 from tests.training.scene import TINY, record
 
 FAR = 10.0  # units of the residual's last layer: metres away in either machinery
@@ -34,6 +34,15 @@ def move_surface(field: Field, outwards: float) -> None:
 @pytest.mark.parametrize("machinery", ["fast", "paper"])
 def test_the_body_itself_is_a_surface(tmp_path: Path, machinery: str):
     trainer_of(tmp_path, machinery).run()
+
+
+def test_a_surface_between_the_samples_of_a_training_is_no_collapse(tmp_path: Path):
+    """Two samples a ray, across 5 m, hardly ever fall into the column."""
+    trainer = trainer_of(tmp_path, "paper")
+    trainer.field.samples = 2
+    rays, samples = trainer._look(trainer.train_rows, torch.Generator().manual_seed(0), 2)
+    assert trainer.field.coverage(samples)[rays.person].mean() < LEAST_COVERAGE
+    trainer._require_surface()
 
 
 @pytest.mark.parametrize("machinery", ["fast", "paper"])
