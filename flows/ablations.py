@@ -54,7 +54,7 @@ def ablate(
     """
     rows, left_out = choose(load_settings(preset, list(overrides)), only)
     shelf = Store(store.resolve())
-    source, truth = read_capture(capture)
+    source, truth = read_capture(capture, store)
     subject = Capture.load(ingest(shelf, source, rows[FULL].capture).root).name
     table = shelf.root / "ablations" / f"{subject}-{Path(preset).stem}.md"
     result: dict[str, Any] = {"subject": subject, "preset": preset, "overrides": overrides, "left_out": left_out}

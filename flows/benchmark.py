@@ -47,7 +47,7 @@ def benchmark(
     plan = load_study(study).narrowed(methods or [], seconds)
     settings = {name: plan.settings(name) for name in plan.methods}
     shelf = Store(store.resolve())
-    source, truth = read_capture(capture)
+    source, truth = read_capture(capture, store)
     recorded = Capture.load(ingest(shelf, source, next(iter(settings.values())).capture).root)
     result = blank(plan, Path(study).stem, recorded)
     table = publish(result, shelf.root)

@@ -213,7 +213,7 @@ def _stability(capture: Path, study: str, store: Path, methods: list[str], only:
 def _check(capture: Path, preset: str, store: Path) -> None:
     settings = load_settings(preset)
     shelf = Store(store.resolve())
-    source, _ = read_capture(capture)
+    source, _ = read_capture(capture, store)
     recording = ingest(shelf, source, settings.capture)
     calibration = calibrate(shelf, recording, settings.calibration)
     print("\n".join(_table(json.loads((calibration.root / "report.json").read_text()))))

@@ -55,7 +55,7 @@ def stability(
     plan = plan.model_copy(update={"methods": tuple(methods)}) if methods else plan
     presets = {name: load_settings(name, list(plan.overrides)) for name in plan.methods}
     shelf = Store(store.resolve())
-    source, truth = read_capture(capture)
+    source, truth = read_capture(capture, store)
     subject = Capture.load(ingest(shelf, source, next(iter(presets.values())).capture).root).name
     table = shelf.root / "stability" / f"{subject}-{Path(study).stem}.md"
     table.parent.mkdir(parents=True, exist_ok=True)

@@ -30,7 +30,7 @@ def train_subject(
     """
     settings = load_settings(preset, overrides)
     shelf = Store(store.resolve())
-    source, truth = read_capture(capture)
+    source, truth = read_capture(capture, store)
 
     recording = ingest(shelf, source, settings.capture)
     subject = Capture.load(recording.root).name

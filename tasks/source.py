@@ -23,15 +23,18 @@ class Source(BaseModel):
     digest: str
 
 
-def read_capture(folder: Path) -> tuple[Source, Source]:
+def read_capture(folder: Path, store: Path | None = None) -> tuple[Source, Source]:
     """What was recorded, and what is known to be true of it: all files but those of `ground_truth/`, and only those.
 
     Hidden files do not count. A symbolic link counts as the text it holds: what it points at is either in the folder
-    itself or none of ours. Raises CaptureError if there is no such folder, or a file that cannot be read.
+    itself or none of ours. Raises CaptureError if there is no such folder, a file that cannot be read, or the store
+    lies in the capture, which would be another one after every run.
     """
     folder = folder.resolve()
     if not folder.is_dir():
         raise CaptureError(f"{folder}: no such folder; give the capture's folder")
+    if store and store.resolve().is_relative_to(folder):
+        raise CaptureError(f"{store.resolve()}: lies in the capture's folder; give --store another place")
     shown = os.fsencode(folder).decode(errors="replace")
     if shown != str(folder):
         raise CaptureError(f"{shown}: the folder's name is not UTF-8; rename it")

@@ -13,7 +13,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("training", version="18", resumable=True)
+@stage("training", version="19", resumable=True)
 def train(
     out: Path,
     recording: Artifact,

@@ -17,6 +17,7 @@ from hnerf.body.rig import Rig
 from hnerf.body.robust import faded
 from hnerf.capture.camera import Camera
 
+ROOT, UNSEEN = np.arange(6), 1e-6  # information on a root of which nothing else is known: it stays where it was put
 NEAR_M = 0.1  # nothing nearer is in a camera's picture
 
 
@@ -65,6 +66,7 @@ class Problem:
         own = by_shared.shape[-1]
         habits = self.habit.unknowns(articulation) if self.habit else 0
         equations = NormalEquations(len(x), articulation.unknowns, own + habits)
+        equations.frame[0][:, ROOT, ROOT] += UNSEEN
         weighted = (matrix @ by_frame).flatten(1, 2)
         frame, shared, gradient = by_frame.flatten(1, 2), by_shared.flatten(1, 2), pull.flatten(1)[..., None]
         equations.frame[0] += (frame.mT @ weighted).numpy()

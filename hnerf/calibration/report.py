@@ -2,12 +2,12 @@
 
 import dataclasses
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 
 from hnerf.calibration.diagnosis import Measure
 from hnerf.calibration.picture import draw_cameras
@@ -42,8 +42,8 @@ class CameraVerdict:
         timing = self.timing
         offset = {
             "observable": not timing.reason,
-            "frames": None if np.isnan(timing.offset_frames) else timing.offset_frames,
-            "standard_error_frames": None if np.isnan(timing.error_frames) else timing.error_frames,
+            "frames": timing.offset_frames,
+            "standard_error_frames": timing.error_frames,
             "reason": timing.reason,
         }
         return dataclasses.asdict(self) | {"timing": offset}
@@ -77,7 +77,7 @@ class CalibrationReport:
         out.mkdir(parents=True, exist_ok=True)
         rejected = {name for name, v in self.verdicts.items() if v.status == "rejected"}
         write_easymocap(out, [pinhole(camera) for name, camera in self.cameras.items() if name not in rejected])
-        (out / "report.json").write_text(json.dumps(self._plain(), indent=1))
+        (out / "report.json").write_text(json.dumps(_finite(self._plain()), indent=1, allow_nan=False))
         status = {name: self.verdicts[name].status if name in self.verdicts else "unjudged" for name in self.cameras}
         draw_cameras(out / "cameras.png", list(self.cameras.values()), status, self.up, self.before, self.after)
         if self.witnesses and self.after:
@@ -114,6 +114,15 @@ class CalibrationReport:
             "as_used": self.witnesses.plain([self.cameras[name] for name in self.verdicts], self.after),
             "board_footage": self.witnesses.boards or "none: the recording has no calibration/ footage of a board",
         }
+
+
+def _finite(tree: Any) -> Any:
+    """The same without NaN and infinity, which JSON does not know: null."""
+    if isinstance(tree, dict):
+        return {key: _finite(value) for key, value in tree.items()}
+    if isinstance(tree, list | tuple):
+        return [_finite(value) for value in tree]
+    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
 
 
 def load_cameras(out: Path, capture: Capture) -> Capture:

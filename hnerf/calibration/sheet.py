@@ -64,6 +64,8 @@ def _draw_outline(axes: Axes, cameras: Sequence[Camera], camera: Camera, witness
     if outline is None:
         return
     residuals_px = outlines.residuals_px(cameras)[camera.name]
+    if len(residuals_px) == 0:  # no other camera has one at the same instants
+        return
     told = f"mean {residuals_px.mean():.2f} px, 95 % below {np.percentile(residuals_px, 95):.1f} px"
     axes.set_title(f"{camera.name}: outline, {told}", fontsize=10)
     _scatter(axes, outline.points_px, outlines.at(middle).residuals_px(cameras)[camera.name], 14)

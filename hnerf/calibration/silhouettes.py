@@ -61,6 +61,8 @@ class Outline:
         points = max(edges, key=len)[:-1, ::-1] - 1
         last = np.array(mask.shape[::-1]) - 1
         points = points[((points > 1) & (points < last - 1)).all(1)]
+        if len(points) == 0:
+            return None
         rows, columns = np.nonzero(whole)
         size_px = float(np.hypot(np.ptp(columns), np.ptp(rows)))
         points = points[spread(range(len(points)), POINTS)]

@@ -59,13 +59,13 @@ def _best_pair(projections: np.ndarray, keypoints: np.ndarray, confidence: np.nd
     best_cost = np.full(count, np.inf)
     points_m = np.full((count, 3), np.nan)
     members = np.zeros((cameras, count), bool)
-    for pair in combinations(range(cameras), 2):
+    for both in map(list, combinations(range(cameras), 2)):
         in_pair = np.zeros((cameras, 1), bool)
-        in_pair[list(pair)] = True
-        candidate_m = _solve(projections, keypoints, confidence * in_pair)
+        in_pair[both] = True
+        candidate_m = _solve(projections[both], keypoints[both], confidence[both])
         far = reprojection_px(projections, candidate_m, keypoints)
         cost = np.where(confidence > 0, confidence * np.nan_to_num(far, nan=1e6), 0).sum(0)
-        better = (confidence[list(pair)] > 0).all(0) & (cost < best_cost)
+        better = (confidence[both] > 0).all(0) & (cost < best_cost)
         best_cost[better], points_m[better], members[:, better] = cost[better], candidate_m[better], in_pair
     return points_m, members
 

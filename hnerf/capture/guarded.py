@@ -16,10 +16,10 @@ from hnerf.errors import CaptureError
 MAX_IMAGE_PIXELS = 64_000_000
 MAX_TEXT_BYTES = 16_000_000
 # What reading arrays from a file raises that is no whole .npz of plain arrays.
-NO_ARRAYS = (AttributeError, EOFError, OSError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
+NO_ARRAYS = (AttributeError, EOFError, MemoryError, OSError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 _IMAGE_MODES = ("1", "L", "P", "RGB", "RGBA")  # 8 bits a channel: others would be clipped
-_CAMERA_NAME = re.compile(r"\w[\w ()-]{0,63}")  # becomes a folder name, and a glob without wildcards
+_CAMERA_NAME = re.compile(r"\w([\w ()-]{0,62}[\w()-])?")  # becomes a folder name, and a glob without wildcards
 
 
 def check_camera_name(name: object, source: Path) -> str:

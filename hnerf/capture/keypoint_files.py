@@ -58,7 +58,7 @@ def _people(path: Path, triples: list[Any]) -> np.ndarray:
         return np.zeros((0, 0, 3))
     try:
         points = np.array(triples, dtype=np.float64).reshape(len(triples), -1, 3)
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         raise CaptureError(f"{path}: keypoints are not triples of numbers, as many a person; detect again") from None
     if points.shape[1] not in COUNTS:
         raise CaptureError(f"{path}: {points.shape[1]} keypoints a person; sets that are read: {KNOWN}")

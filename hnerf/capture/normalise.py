@@ -87,10 +87,12 @@ class Normaliser:
         self.write_image(read_image(source), source, source, target)
 
     def write_mask(self, recorded: np.ndarray, source: Path, target: Path) -> None:
-        """A mask (H, W) uint8 from file `source` (anything but black is the person) as 0/255 PNG."""
+        """A mask (H, W) uint8 from file `source` as 0/255 PNG. The person is anything but black; in a JPEG, where edges
+        ring, anything light."""
         self._check_size(recorded, source)
         target.parent.mkdir(parents=True, exist_ok=True)
-        _write(target, np.where(self.pixels(np.where(recorded > 0, 255, 0).astype(np.uint8)) > 127, 255, 0), [])
+        black = 127 if source.suffix.lower() in (".jpg", ".jpeg") else 0
+        _write(target, np.where(self.pixels(np.where(recorded > black, 255, 0).astype(np.uint8)) > 127, 255, 0), [])
 
     def _check_size(self, pixels: np.ndarray, source: Path) -> None:
         height_px, width_px = pixels.shape[:2]

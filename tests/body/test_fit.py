@@ -72,6 +72,21 @@ def test_neighbours_outvote_an_arm_mirrored_in_depth(tmp_path: Path) -> None:
     assert unflipped(problem, mended, runs(capture)).theta.sub(mended.theta).abs().max() < 0.02
 
 
+@pytest.mark.parametrize("cameras", [("0",), ("0", "1", "2", "3")])
+def test_a_lone_frame_that_is_hardly_seen_stays_near_the_others(tmp_path: Path, cameras: tuple[str, ...]) -> None:
+    """Frame 9 has no neighbours in time; one camera of four sees it, or none at all."""
+    truth = moving_body((0, 1, 2, 3, 9))
+    capture = record(tmp_path, truth, RING, cameras)
+    with np.load(tmp_path / "keypoints.npz") as stored:
+        keypoints = {name: found.copy() for name, found in stored.items()}
+    for name in cameras[:1] if len(cameras) == 1 else cameras[1:]:
+        keypoints[name][4] = 0
+    np.savez(tmp_path / "keypoints.npz", **keypoints)  # type: ignore[arg-type]
+    fit, _ = fit_body(capture, None, FitSettings())
+    assert fit.frames == truth.frames and fit.root.isfinite().all()
+    assert (fit.root[4, :3, 3] - fit.root[3, :3, 3]).norm() < 1.0
+
+
 def test_keypoints_alone_seed_a_segmentation(tmp_path: Path) -> None:
     truth = moving_body((0, 1))
     capture = record(tmp_path, truth, RING, ("0", "1", "2", "3"))

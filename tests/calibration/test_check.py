@@ -62,6 +62,30 @@ def test_a_good_calibration_is_left_alone(tmp_path: Path) -> None:
             np.testing.assert_array_equal(getattr(camera, field), getattr(capture.cameras[name], field))
 
 
+def test_without_legs_the_height_is_not_known(tmp_path: Path) -> None:
+    """JSON has no NaN: null, which every reader takes."""
+    cameras = ring(4)
+    seen = detections(cameras, 2)
+    for points in seen.values():
+        points[..., [10, 11, 13, 14], :] = 0
+    check_calibration(write_capture(tmp_path / "in", cameras, seen), SETTINGS).save(tmp_path / "out")
+    stored = json.loads((tmp_path / "out" / "report.json").read_text(), parse_constant=pytest.fail)
+    assert stored["body_height_m"] is None and stored["trimmed_cost_px"]["after"] > 0
+
+
+@pytest.mark.parametrize(("noise_px", "status"), [(10, "suspect"), (20, "rejected")])
+def test_a_camera_of_bad_detections_is_suspect_then_rejected(tmp_path: Path, noise_px: float, status: str) -> None:
+    """No camera explains them: what can be used is used and marked, what cannot is left out from here on."""
+    cameras = ring(4)
+    seen = detections(cameras, 2) | {"c2": detections(cameras, noise_px, seed=1)["c2"]}
+    capture = write_capture(tmp_path / "in", cameras, seen)
+    report = check_calibration(capture, SETTINGS)
+    assert report.verdict == report.verdicts["c2"].status == status
+    report.save(tmp_path / "out")
+    used = load_cameras(tmp_path / "out", capture)
+    assert ("c2" in used.cameras) == ("c2" in used.train_cameras) == (status == "suspect")
+
+
 def test_cameras_of_any_name_are_read_back(tmp_path: Path) -> None:
     """Recordings name cameras as they like; OpenCV's own writer refuses brackets and blanks."""
     cameras = [dataclasses.replace(camera, name=f"Camera ({i})") for i, camera in enumerate(ring(4))]

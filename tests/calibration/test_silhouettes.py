@@ -49,6 +49,7 @@ def test_no_outline_where_the_image_ends() -> None:
     cut_off[10:, 5:15] = True
     found = Outline.around(cut_off)
     assert found is not None and found.points_px[:, 1].max() < 18
+    assert Outline.around(np.ones((20, 30), bool)) is None  # the camera stands too near to see any edge
 
 
 def test_a_true_rig_costs_nothing() -> None:

@@ -106,6 +106,10 @@ EASYMOCAP = {
         lambda f: rec.write_keypoints(f / "openpose/01/000001_keypoints.json", [np.zeros((18, 3))]),
         "000001_keypoints.json",
     ),
+    "keypoint beyond all numbers": (
+        lambda f: _edit(f / "openpose/01/000001_keypoints.json", "4.0", "9" * 400),
+        "000001_keypoints.json: keypoints are not triples of numbers",
+    ),
     "keypoints nested deeply": (
         lambda f: (f / "openpose/01/000001_keypoints.json").write_text("[" * 100_000),
         "000001_keypoints.json",

@@ -157,9 +157,10 @@ def test_caliscope_cameras_that_are_ignored_stay_away(tmp_path: Path) -> None:
     text = (tmp_path / "camera_array.toml").read_text().replace("ignore = false", "ignore = true", 1)
     (tmp_path / "camera_array.toml").write_text(text)
     assert list(recognise(tmp_path).lenses()) == ["cam_3", "cam_4"]
-    (tmp_path / "camera_array.toml").write_text(text.replace("cam_id = 3", 'cam_id = "../3"'))
-    with pytest.raises(CaptureError, match="camera name"):
-        recognise(tmp_path).lenses()
+    for name in ("../3", "cam 3 "):  # OpenCV, which keeps the cameras that are used, drops a blank at the end
+        (tmp_path / "camera_array.toml").write_text(text.replace("cam_id = 3", f'cam_id = "{name}"'))
+        with pytest.raises(CaptureError, match="camera name"):
+            recognise(tmp_path).lenses()
     (tmp_path / "camera_array.toml").write_text("cameras = [1]\n")
     with pytest.raises(CaptureError, match="no tables"):
         recognise(tmp_path).lenses()

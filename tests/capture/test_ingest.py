@@ -123,6 +123,18 @@ def test_shrinking_takes_camera_keypoints_and_masks_along(folder: Path, tmp_path
     assert shrunk is not None and shrunk[:5, :8].all() and not shrunk[6:].any() and not shrunk[:, 8:].any()
 
 
+def test_masks_in_a_jpeg_do_not_grow(folder: Path, tmp_path: Path) -> None:
+    """Beside an edge a JPEG is hardly ever black."""
+    mask = np.zeros((rec.HEIGHT, rec.WIDTH, 3), np.uint8)
+    mask[3:13, 5:19] = 255
+    for camera in rec.CAMERAS:
+        for frame in rec.FRAMES:
+            rec.write_png(folder / "masks" / camera / f"{frame:06d}.jpg", mask)
+    assert (cv2.imread(str(folder / "masks" / "01" / "000000.jpg"))[..., 0] > 0).sum() > 140
+    found = ingest(folder, SETTINGS, tmp_path / "out").given_mask("01", 0)
+    assert found is not None and np.array_equal(found, mask[..., 0] > 0)
+
+
 def test_distorted_recording_comes_out_linear(folder: Path, tmp_path: Path) -> None:
     """k1 = -0.5: what the lens shows at radius r (1 - 0.5 r^2) belongs at radius r."""
     rec.write_calibration(folder, distortion=(-0.5, 0, 0, 0))

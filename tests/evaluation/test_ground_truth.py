@@ -84,6 +84,16 @@ def test_faces_without_vertices_are_refused(truth: GroundTruth, faces: list[list
         truth.meshes()
 
 
+def test_more_than_fits_in_memory_is_refused(truth: GroundTruth, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> np.ndarray:
+        raise MemoryError("Unable to allocate 1.07 PiB")
+
+    np.savez(truth.folder / "ground_truth" / "meshes.npz", faces=np.zeros((1, 3), int))
+    monkeypatch.setattr(np.lib.format, "read_array", full)
+    with pytest.raises(CaptureError, match=r"meshes\.npz: no true surfaces to read \(Unable to allocate"):
+        truth.meshes()
+
+
 def test_a_pickle_is_refused(truth: GroundTruth) -> None:
     path = truth.folder / "ground_truth" / "meshes.npz"
     np.savez(path, faces=np.array([{}], dtype=object), vertices=np.zeros((1, 3, 3)), frames=np.array([0]))

@@ -95,6 +95,13 @@ def test_what_cannot_be_read_is_bad_input(folder: Path, monkeypatch: pytest.Monk
         read_capture(folder)
 
 
+def test_a_store_in_the_capture_is_bad_input(folder: Path) -> None:
+    """Its files would change the capture's digest, so that nothing would be found again."""
+    read_capture(folder, folder.parent / "store")
+    with pytest.raises(CaptureError, match="store: lies in the capture's folder; give --store another place"):
+        read_capture(folder, folder / "store")
+
+
 def test_missing_folder_is_bad_input(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="no such folder"):
         read_capture(tmp_path / "absent")

@@ -59,5 +59,5 @@ def lens_from_table(source: Path, key: str, table: Any) -> Lens:
             t_m=np.array(table["translation"], dtype=np.float64),
             size_px=(float(width_px), float(height_px)),
         )
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise CaptureError(f"{source}: camera {key}: {error} is missing or no number; calibrate again") from None
