@@ -47,7 +47,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainingSett
     for name in ("calibrate", "find_masks", "fit"):
         monkeypatch.setattr(module, name, lambda *_: None)
     monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path))
-    monkeypatch.setattr(module, "read_capture", lambda _: (None, None))
+    monkeypatch.setattr(module, "read_capture", lambda *_: (None, None))
     monkeypatch.setattr(module.Capture, "load", lambda _: SimpleNamespace(name="ada"))
     monkeypatch.setattr(module, "train", train)
     monkeypatch.setattr(module, "evaluate", evaluate)

@@ -65,7 +65,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
         return made("poses", surface={"pose 0": {"fault": None}, "pose 1": {"fault": fault}})
 
     replaced = {
-        "read_capture": lambda _: (None, None),
+        "read_capture": lambda *_: (None, None),
         "ingest": lambda *_: made("capture"),
         "calibrate": calibrate,
         "find_masks": lambda *_: made("masks"),
