@@ -37,6 +37,7 @@ WARM_UP_STEPS = 20
 SKIPS_ALLOWED = 2  # in a row; one more non-finite step stops the run
 HELD_OUT_RAYS = 2048
 LEAST_COVERAGE = 0.1  # of the person's pixels; below it the surface has collapsed
+MOST_AROUND = 0.8  # of the surroundings; above it the surface fills the box
 LOOKS_A_RAY = 64  # at least, through a whole scene: valid-wave's body covers 38 % by 16, 59 % by 64, 64 % by 256
 LOG_STEPS = 25
 POSES_APART = 6  # training poses between those that say how thick the shell must be
@@ -249,7 +250,7 @@ class Trainer:
         person, around = coverage[rays.person].mean(), coverage[clear if clear.any() else beside].mean()
         if not person >= LEAST_COVERAGE:  # nor where it is not a number
             raise TrainingError(f"the surface is empty (covers {person:.0%} of the person): check masks and body fit")
-        if around > 1 - LEAST_COVERAGE:
+        if around > MOST_AROUND:
             raise TrainingError(f"the surface fills the box (covers {around:.0%} of the surroundings): check the masks")
 
     def _state(self) -> dict[str, Any]:
