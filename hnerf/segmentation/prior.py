@@ -23,6 +23,10 @@ NEAR_SHARE = 0.03  # of the person's height: how wrong a body fitted to keypoint
 SOLE_SHARE = 0.06  # of the person's height: how far a shoe may go on below the lowest keypoint
 UPRIGHT = 0.7  # cosine between the image's and the world's vertical from which down is down
 HEAD_SHARE = 0.45  # of the distance from neck to nose: radius of the head about a point a little above the nose
+FACE = (15, 16, 17, 18)
+LEGS = ((9, 10, 11, (22, 23, 24)), (12, 13, 14, (19, 20, 21)))  # hip, knee, ankle, foot
+NOSE_ABOVE_NECK, THIGH = 0.45, 0.8  # of the distance from neck to mid-hip, along which what is not seen is likely
+FOOT_SHARE = 0.1  # of the person's height: how far a foot that is not seen may go on around its ankle
 
 
 @dataclass(frozen=True)
@@ -40,15 +44,17 @@ class Prior:
     height_px: float
 
     @staticmethod
-    def around(body: np.ndarray, core: np.ndarray, height_px: float, reach: float, upright: bool = False) -> "Prior":
-        """Grown from a body (H, W) bool; reach in heights of the person.
+    def around(
+        core: np.ndarray, body: np.ndarray, likely: np.ndarray, height_px: float, reach: float, upright: bool = False
+    ) -> "Prior":
+        """Grown from where the body is, seen or likely, (H, W) bool; reach in heights of the person.
 
         In an upright image what hangs much below the lowest part of the body is its reflection.
         """
-        away_px = cv2.distanceTransform(np.where(body, 0, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+        away_px = cv2.distanceTransform(np.where(likely, 0, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
         within = away_px <= reach * height_px
-        if upright and body.any():
-            within[int(np.flatnonzero(body.any(1))[-1] + SOLE_SHARE * height_px) + 1 :] = False
+        if upright and likely.any():
+            within[int(np.flatnonzero(likely.any(1))[-1] + SOLE_SHARE * height_px) + 1 :] = False
         return Prior(core, body, within & (away_px <= NEAR_SHARE * height_px), within, height_px)
 
     def cropped(self, window: tuple[slice, slice]) -> "Prior":
@@ -61,7 +67,7 @@ def keypoint_priors(capture: Capture, settings: SegmentationSettings) -> dict[st
     priors = {}
     for name, sticks in _sticks(capture).items():
         upright = _is_upright(capture, name)
-        priors[name] = [Prior.around(s.body, s.core, s.height_px, settings.reach, upright) for s in sticks]
+        priors[name] = [Prior.around(s.core, s.body, s.likely, s.height_px, settings.reach, upright) for s in sticks]
     return priors
 
 
@@ -74,7 +80,8 @@ def body_priors(capture: Capture, body: BodyFit, settings: SegmentationSettings)
         for frame, stick in zip(capture.frames, sticks, strict=True):
             covered = silhouette(capture.cameras[name], vertices_m[body.index(frame)], faces)
             core = cv2.erode(covered.astype(np.uint8), disc(CORE_SHARE * stick.height_px)).astype(bool)
-            priors[name].append(Prior.around(covered | stick.body, core, stick.height_px, settings.reach / 2, upright))
+            covered |= stick.body
+            priors[name].append(Prior.around(core, covered, covered, stick.height_px, settings.reach / 2, upright))
     return priors
 
 
@@ -104,24 +111,33 @@ def _consistent_keypoints(capture: Capture, body: BodyFit | None) -> dict[str, n
     """(frames, 25, 2) pixels a camera; NaN for a keypoint that is never seen.
 
     Triangulated and projected where several cameras see the person, so that a detector's outliers are gone; gaps in
-    time are interpolated. The body's own where the recording has none.
+    time are interpolated; what no two cameras ever see together is left as each has it. The body's own where the
+    recording has none.
     """
     if body is not None and not capture.has_keypoints:
         points_m = (body.rig.keypoint_weights @ body.vertices_m()).numpy()
         return {name: capture.cameras[name].project(points_m)[0] for name in capture.train_cameras}
     found = subject_keypoints(capture)
+    seen = {name: _interpolated(np.where(k[..., 2:] > 0, k[..., :2], np.nan)) for name, k in found.items()}
     cameras = [capture.cameras[name] for name in capture.train_cameras]
     if len(cameras) == 1:
-        keypoints = found[cameras[0].name]
-        return {cameras[0].name: _interpolated(np.where(keypoints[..., 2:] > 0, keypoints[..., :2], np.nan))}
+        return seen
     flat = np.stack([found[camera.name].reshape(-1, 3) for camera in cameras])
     points_m, _, _ = triangulate(np.stack([camera.projection for camera in cameras]), flat)
     poses_m = _interpolated(points_m.reshape(-1, 25, 3))
-    return {camera.name: camera.project(poses_m)[0] for camera in cameras}
+    together = {camera.name: camera.project(poses_m)[0] for camera in cameras}
+    return {name: np.where(np.isfinite(pose_px), pose_px, seen[name]) for name, pose_px in together.items()}
 
 
 def _interpolated(tracks: np.ndarray) -> np.ndarray:
-    """(frames, 25, D) with NaN gaps filled linearly in time."""
+    """(frames, 25, D) with NaN gaps filled linearly in time: in the mid-hip's own place, in all others' from it."""
+    hip = _filled(tracks[:, 8:9])
+    origin = hip if np.isfinite(hip).all() else np.zeros_like(hip)
+    return origin + _filled(tracks - origin)
+
+
+def _filled(tracks: np.ndarray) -> np.ndarray:
+    """(frames, ...) with NaN gaps filled linearly in time."""
     filled = tracks.copy()
     at = np.arange(len(tracks))
     for track in filled.reshape(len(tracks), -1).T:
@@ -131,45 +147,80 @@ def _interpolated(tracks: np.ndarray) -> np.ndarray:
     return filled
 
 
+def _likely(pose_px: np.ndarray) -> np.ndarray:
+    """A pose (25, 2) with head and legs where they are likely in line with the trunk, if they are not seen."""
+    likely = pose_px.copy()
+    trunk_px = pose_px[8] - pose_px[1]
+
+    def fill(joint: int, at_px: np.ndarray) -> None:
+        if not np.isfinite(likely[joint]).all():
+            likely[joint] = at_px
+
+    face = [k for k in FACE if np.isfinite(pose_px[k]).all()]
+    fill(0, pose_px[face].mean(0) if face else pose_px[1] - NOSE_ABOVE_NECK * trunk_px)
+    for hip, knee, ankle, _ in LEGS:
+        fill(hip, pose_px[8])
+        fill(knee, likely[hip] + THIGH * trunk_px)
+        fill(ankle, 2 * likely[knee] - likely[hip])
+    return likely
+
+
 @dataclass(frozen=True)
 class _Stick:
-    """A drawn stick figure, (H, W) bool: body, and core without the feet, where shadows touch the person."""
+    """A drawn stick figure, (H, W) bool: core without the feet, where shadows touch the person; body with them; likely
+    also with what no keypoint shows."""
 
     core: np.ndarray
     body: np.ndarray
+    likely: np.ndarray
     height_px: float
 
 
 def _sticks(capture: Capture, body: BodyFit | None = None) -> dict[str, list[_Stick]]:
     """Per training camera the stick figures of `capture.frames`."""
-    sticks = {}
-    for name, poses_px in _consistent_keypoints(capture, body).items():
-        seen = np.isfinite(poses_px).all(-1, keepdims=True)
-        heights_px = person_heights_px(np.concatenate([np.nan_to_num(poses_px), seen], -1)).tolist()
-        camera = capture.cameras[name]
-        sticks[name] = [_stick(camera, pose_px, h) for pose_px, h in zip(poses_px, heights_px, strict=True)]
-    return sticks
+    return {
+        name: [_stick(capture.cameras[name], pose_px) for pose_px in poses_px]
+        for name, poses_px in _consistent_keypoints(capture, body).items()
+    }
 
 
-def _stick(camera: Camera, pose_px: np.ndarray, height_px: float) -> _Stick:
-    """Limbs as thick lines, trunk as a polygon, head as a disc. pose_px (25, 2)."""
+def _stick(camera: Camera, pose_px: np.ndarray) -> _Stick:
+    """pose_px (25, 2), NaN where nothing is known."""
+    whole_px = _likely(pose_px)
+    known = np.isfinite(whole_px).all(-1, keepdims=True)
+    height_px = float(person_heights_px(np.concatenate([np.nan_to_num(whole_px), known], -1)))
+    core, body = _drawn(camera, pose_px, height_px)
+    likely = _drawn(camera, whole_px, height_px)[1].astype(np.uint8)
+    for _, _, ankle, foot in LEGS:
+        if known[ankle] and not np.isfinite(pose_px[list(foot)]).any():
+            cv2.circle(likely, _pixel(camera, whole_px[ankle]), round(FOOT_SHARE * height_px), 1, cv2.FILLED)
+    return _Stick(core, body, body | likely.astype(bool), height_px)
+
+
+def _drawn(camera: Camera, pose_px: np.ndarray, height_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Limbs as thick lines, trunk as a polygon, head as a disc, (H, W) bool: without feet and with them."""
     seen = np.isfinite(pose_px).all(-1)
     image = np.zeros((camera.height_px, camera.width_px), np.uint8)
     width_px = max(1, round(2 * CORE_SHARE * height_px))
-    # Cut off far outside the image: drawing takes 32-bit integers.
-    at = np.nan_to_num(pose_px).clip(-4 * max(image.shape), 5 * max(image.shape)).round().astype(np.int32)
 
     def draw(limbs: tuple[tuple[int, int], ...], times: int = 1) -> np.ndarray:
         for a, b in limbs:
             if seen[a] and seen[b]:
-                cv2.line(image, at[a].tolist(), at[b].tolist(), 1, times * width_px)
+                cv2.line(image, _pixel(camera, pose_px[a]), _pixel(camera, pose_px[b]), 1, times * width_px)
         return image.astype(bool)
 
     if seen[list(TRUNK)].all():
-        cv2.fillConvexPoly(image, cv2.convexHull(at[list(TRUNK)]), 1)
+        cv2.fillConvexPoly(image, cv2.convexHull(np.array([_pixel(camera, pose_px[k]) for k in TRUNK])), 1)
     if seen[0] and seen[1]:
-        up = at[0] - at[1]
-        radius_px = round(HEAD_SHARE * float(np.linalg.norm(up)) + CORE_SHARE * height_px)
-        cv2.circle(image, (at[0] + 0.15 * up).round().astype(int).tolist(), radius_px, 1, cv2.FILLED)
+        up_px = pose_px[0] - pose_px[1]
+        radius_px = round(HEAD_SHARE * float(np.linalg.norm(up_px)) + CORE_SHARE * height_px)
+        cv2.circle(image, _pixel(camera, pose_px[0] + 0.15 * up_px), radius_px, 1, cv2.FILLED)
     draw(THICK, times=2)
-    return _Stick(draw(LIMBS), draw(FEET), height_px)
+    return draw(LIMBS), draw(FEET)
+
+
+def _pixel(camera: Camera, at_px: np.ndarray) -> tuple[int, int]:
+    """Cut off far outside the image: drawing takes 32-bit integers."""
+    farthest_px = 5 * max(camera.width_px, camera.height_px)
+    x, y = at_px.clip(-farthest_px, farthest_px).round().astype(int).tolist()
+    return x, y

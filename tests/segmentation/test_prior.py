@@ -1,0 +1,53 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.config import SegmentationSettings
+from hnerf.segmentation.prior import _interpolated, _likely, keypoint_priors
+from tests.segmentation.scene import write_scene
+
+HEAD, LEGS, FEET = [0, 15, 16, 17, 18], [10, 11, 13, 14, *range(19, 25)], list(range(19, 25))
+
+
+@pytest.mark.parametrize(
+    ("cameras", "unseen", "after"),
+    [(2, HEAD, 0), (2, HEAD, 1), (1, HEAD, 0), (1, LEGS, 0), (2, FEET, 0)],
+    ids=["head by one camera of two", "head later on", "head by the only camera", "legs", "feet"],
+)
+def test_what_no_keypoint_shows_is_within_reach(tmp_path: Path, cameras: int, unseen: list[int], after: int) -> None:
+    capture, truth = write_scene(tmp_path, cameras, moves_m=2.0)
+    with np.load(tmp_path / "keypoints.npz") as stored:
+        found = {name: stored[name] for name in stored.files}
+    found["c0"][after:, :, unseen] = 0
+    if unseen == FEET:
+        found["c1"][:, :, unseen] = 0
+    np.savez(tmp_path / "keypoints.npz", **found)
+    priors = keypoint_priors(capture, SegmentationSettings())
+    for (camera, frame), person in truth.items():
+        assert priors[camera][frame].reach[person].all()
+
+
+def test_head_and_legs_in_line_with_the_trunk_by_hand() -> None:
+    # Neck at (50, 20), mid-hip at (50, 40), the left knee seen off that line; nothing else is.
+    pose_px = np.full((25, 2), np.nan)
+    pose_px[1], pose_px[8], pose_px[12], pose_px[13] = (50, 20), (50, 40), (52, 40), (60, 50)
+    likely = _likely(pose_px)
+    assert likely[0].tolist() == [50, 11]  # 0.45 of 20 px above the neck
+    assert likely[10].tolist() == [50, 56]  # 0.8 of 20 px below the mid-hip, as no hip is seen
+    assert likely[11].tolist() == [50, 72]
+    assert likely[14].tolist() == [68, 60]  # as far again as from hip to knee
+    assert np.isnan(likely[4]).all()
+    pose_px[[17, 18]] = (46, 12), (48, 14)
+    assert _likely(pose_px)[0].tolist() == [47, 13]  # between what is seen of the face
+
+
+def test_gaps_move_with_the_mid_hip_by_hand() -> None:
+    # The mid-hip walks 10 px a frame; the nose is seen 50 px above it at first and not again.
+    tracks = np.full((3, 25, 2), np.nan)
+    tracks[:, 8] = [[0, 100], [10, 100], [20, 100]]
+    tracks[0, 0] = [0, 50]
+    assert _interpolated(tracks)[:, 0].tolist() == [[0, 50], [10, 50], [20, 50]]
+    assert np.isnan(_interpolated(tracks)[:, 5]).all()
+    tracks[:, 8] = np.nan
+    assert _interpolated(tracks)[:, 0].tolist() == [[0, 50]] * 3
