@@ -87,8 +87,8 @@ def fit_body(capture: Capture, masks: "Masks | None", settings: FitSettings) -> 
 
 
 def start(capture: Capture, seen: Observations, model: BodyModel) -> Pose:
-    """The likeliest pose of an average body, placed by shoulders and hips in space, or by head and trunk in the image
-    of a single camera; frames where that fails stand as their nearest neighbour does."""
+    """The likeliest pose of an average body, placed by head and trunk, in space or in the image of a single camera;
+    frames where that fails stand as their nearest neighbour does."""
     rig = model.rig(None)
     articulation = Articulation(rig)
     rest_m = (rig.keypoint_weights @ rig.vertices_m).numpy()
@@ -100,8 +100,8 @@ def start(capture: Capture, seen: Observations, model: BodyModel) -> Pose:
     placed = {t: root for t, root in enumerate(roots) if root is not None}
     if len(placed) < len(roots) / 2:
         raise CaptureError(
-            f"{capture.root / 'keypoints.npz'}: shoulders and hips are found by enough cameras in only {len(placed)} "
-            f"of {len(roots)} frames; check the keypoint files and the calibration, or leave those frames out"
+            f"{capture.root / 'keypoints.npz'}: head and trunk are found by enough cameras in only {len(placed)} of "
+            f"{len(roots)} frames; check the keypoint files and the calibration, or leave those frames out"
         )
     nearest = [placed[min(placed, key=lambda known: abs(known - t))] for t in range(len(roots))]
     theta = torch.zeros(len(roots), len(rig.joints_m), 3, dtype=torch.float64)

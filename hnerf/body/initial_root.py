@@ -7,6 +7,7 @@ from hnerf.capture.camera import Camera
 
 TORSO = (2, 5, 9, 12)  # shoulders and hips in BODY_25
 HEAD_AND_TORSO = (0, 1, 2, 5, 8, 9, 12, 15, 16, 17, 18)
+WIDE_M = 0.05  # root mean square distance from a line, below which points do not say how a body is turned about it
 
 
 def kabsch(source: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -20,9 +21,14 @@ def kabsch(source: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def root_from_space(rest_m: np.ndarray, points_m: np.ndarray) -> np.ndarray | None:
-    """World from body (4, 4) by shoulders and hips: rest_m and points_m (25, 3); None where one of the four is NaN."""
-    torso = list(TORSO)
-    return kabsch(rest_m[torso], points_m[torso]) if np.isfinite(points_m[torso]).all() else None
+    """World from body (4, 4) by shoulders and hips, or if one of them is NaN, by what is known of head and torso:
+    rest_m and points_m (25, 3). None where that is fewer than four points, or all of them lie on a line."""
+    known = np.isfinite(points_m).all(-1)
+    chosen = [k for k in (TORSO if known[list(TORSO)].all() else HEAD_AND_TORSO) if known[k]]
+    if len(chosen) < 4:
+        return None
+    spread_m = np.linalg.svd(rest_m[chosen] - rest_m[chosen].mean(0), compute_uv=False) / np.sqrt(len(chosen))
+    return kabsch(rest_m[chosen], points_m[chosen]) if spread_m[1] > WIDE_M else None
 
 
 def root_from_image(camera: Camera, rest_m: np.ndarray, keypoints: np.ndarray) -> np.ndarray | None:

@@ -101,7 +101,7 @@ def test_a_person_seen_by_too_few_cameras_is_bad_input(tmp_path: Path) -> None:
         keypoints = dict(stored)
     keypoints["1"][1:, ..., 2] = 0
     np.savez(tmp_path / "keypoints.npz", **keypoints)
-    with pytest.raises(CaptureError, match=r"keypoints.npz: shoulders and hips .* in only 1 of 3 frames"):
+    with pytest.raises(CaptureError, match=r"keypoints.npz: head and trunk .* in only 1 of 3 frames"):
         fit_body(capture, None, FitSettings())
     (tmp_path / "keypoints.npz").unlink()
     with pytest.raises(CaptureError, match=r"no keypoints"):

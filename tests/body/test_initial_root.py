@@ -37,8 +37,20 @@ def test_shoulders_and_hips_place_the_body_in_space() -> None:
     found = root_from_space(rest, points)
     assert found is not None
     np.testing.assert_allclose(found, root, atol=1e-9)
-    points[9] = np.nan  # a hip does
-    assert root_from_space(rest, points) is None
+    points[9] = np.nan  # nor a hip, as long as the rest of head and trunk is known
+    found = root_from_space(rest, points)
+    assert found is not None
+    np.testing.assert_allclose(found, root, atol=1e-9)
+
+
+def test_three_points_or_a_line_do_not_place_the_body() -> None:
+    rest = rest_keypoints()
+    for known in ([2, 5, 9], [0, 1, 2, 8], [1, 2, 5, 8, 9]):
+        points = np.full((25, 3), np.nan)
+        points[known] = rest[known]
+        assert (root_from_space(rest, points) is None) == (len(known) == 3)
+    on_a_line = np.arange(25)[:, None] * np.array([0.0, 0.0, 0.1])
+    assert root_from_space(on_a_line, on_a_line) is None
 
 
 def test_one_image_places_the_body_facing_the_right_way() -> None:
