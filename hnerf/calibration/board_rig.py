@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from hnerf.calibration.board_bundle import BoardFit, Poses, adjust
 from hnerf.capture.camera import Camera
 from hnerf.capture.lens import Lens
+from hnerf.capture.normalise import UNDISTORTED
 from hnerf.errors import CaptureError
 
 MIN_CORNERS = 6  # that a picture must show to be used: the pose of a plane from 12 numbers
@@ -148,7 +149,7 @@ def _board_poses(cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: n
 
 def undistorted(corners_px: np.ndarray, lens: Lens) -> np.ndarray:
     """(..., 2) pixels as recorded to those of the linear camera with the same K; NaN stays."""
-    flat = cv2.undistortPoints(corners_px.reshape(-1, 1, 2), lens.K, lens.distortion, P=lens.K)
+    flat = cv2.undistortPoints(corners_px.reshape(-1, 1, 2), lens.K, lens.distortion, P=lens.K, criteria=UNDISTORTED)
     return flat.reshape(corners_px.shape)
 
 

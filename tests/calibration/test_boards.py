@@ -209,6 +209,15 @@ def test_undistortion_keeps_what_is_absent_absent() -> None:
     assert flat[0, 0].tolist() == pytest.approx([150, 50], abs=0.01) and np.isnan(flat[0, 1]).all()
 
 
+def test_undistortion_of_a_wide_lens_comes_back_in_the_corners() -> None:
+    lens = Lens("a", np.array([[1100.0, 0, 960], [0, 1100, 540], [0, 0, 1]]), np.array([-0.25, 0.05, 0, 0]), np.eye(3),
+                np.zeros(3), None)  # fmt: skip
+    straight = np.array([[100.0, 100], [1800, 60], [960, 540], [200, 1000]])
+    directions = np.c_[(straight - (960, 540)) / 1100, np.ones(4)]
+    bent = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), lens.K, lens.distortion)[0][:, 0]
+    np.testing.assert_allclose(undistorted(bent, lens), straight, atol=0.01)
+
+
 def test_the_floor_is_the_board_that_lies_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the last frame the board lies flat under cameras that look down on it: their heights are what z says."""
     cameras = rig()
