@@ -31,6 +31,7 @@ __all__ = ["check_calibration", "load_cameras"]
 
 ROTATION_TOLERANCE = 1e-3
 COINCIDENT_M = 0.005
+UPRIGHT = 0.5  # mean cosine between the trunk and up, below which somebody lies or bends all the time, or up is not up
 REJECT_FACTOR = 2.0  # times `max_residual_px`: a camera so far off, that no refinement brought back, is not used
 
 
@@ -70,7 +71,7 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
         raise CaptureError(f"{capture.name}: fewer than two cameras agree on the person; calibrate again")
     every = capture.cameras | {camera.name: camera for camera in used}
     held_out_px |= refinement.held_out_px
-    notes += refinement.notes
+    notes += [*refinement.notes, *_upright_notes(after.points_m, capture.up)]
     return CalibrationReport(
         every,
         verdicts,
@@ -135,6 +136,23 @@ def _check_height(capture: Capture, found: Measure) -> None:
     unit = unit_of(found.body_height_m)
     cause = f"the translations look like {unit}; set the right units" if unit else "give the translations in metres"
     raise CaptureError(f"{capture.name}: the person would be {found.body_height_m:.4g} m tall; {cause}")
+
+
+def _upright_notes(points_m: np.ndarray, up: str) -> list[str]:
+    """What is odd about the trunk's direction, mid-hip to neck of points (frames, 25, 3), against the world's `up`."""
+    trunk_m = points_m[:, 1] - points_m[:, 8]
+    trunk_m = trunk_m[np.isfinite(trunk_m).all(1)]
+    if not len(trunk_m):
+        return []
+    mean = (trunk_m / np.linalg.norm(trunk_m, axis=1, keepdims=True)).mean(0)
+    if mean["xyz".index(up)] > UPRIGHT:
+        return []
+    axis = int(np.abs(mean).argmax())
+    found = f"{'-' if mean[axis] < 0 else '+'}{'xyz'[axis]}"
+    return [
+        f"from hips to neck is {found} mostly, not up (+{up}): unless the person lies or bends, set up in capture.toml "
+        "(y or z), or calibrate again with a world that stands upright"
+    ]
 
 
 def _check_agreement(capture: Capture, found: Measure, settings: CalibrationSettings) -> None:

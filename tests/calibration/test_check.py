@@ -62,6 +62,15 @@ def test_a_good_calibration_is_left_alone(tmp_path: Path) -> None:
             np.testing.assert_array_equal(getattr(camera, field), getattr(capture.cameras[name], field))
 
 
+def test_a_world_that_does_not_stand_upright_is_told(tmp_path: Path) -> None:
+    """Turned by a right angle about x: what was up the z axis points down the y axis."""
+    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # of the world: z to y
+    fallen = [dataclasses.replace(camera, R=camera.R @ turn) for camera in ring(4)]
+    capture = write_capture(tmp_path / "in", fallen, detections(ring(4), 2))
+    (note,) = check_calibration(capture, SETTINGS).notes
+    assert note.startswith("from hips to neck is -y mostly, not up (+z)")
+
+
 def test_without_legs_the_height_is_not_known(tmp_path: Path) -> None:
     """JSON has no NaN: null, which every reader takes."""
     cameras = ring(4)
