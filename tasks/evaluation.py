@@ -16,7 +16,7 @@ from tasks.store import Artifact
 from tasks.training import trained
 
 
-@stage("evaluation", version="6")
+@stage("evaluation", version="7")
 def evaluate(
     out: Path,
     truth: Source,

@@ -36,7 +36,7 @@ class GroundTruth:
 
     def mask(self, camera: str, frame: int) -> np.ndarray:
         """(H, W) bool, True on the person."""
-        return self._as_rendered(read_image(self._mask_path(camera, frame))[..., 0], camera, cv2.INTER_NEAREST) > 127
+        return self._as_rendered(read_image(self._mask_path(camera, frame))[..., 0], camera) > 127
 
     def on_black(self, camera: str, frame: int) -> tuple[np.ndarray, str]:
         """The person alone over black, (H, W, 3) uint8, and where that comes from.
@@ -68,7 +68,7 @@ class GroundTruth:
     def _mask_path(self, camera: str, frame: int) -> Path:
         return self._path("masks", camera, f"{self.capture.recorded(camera, frame):06d}.png")
 
-    def _as_rendered(self, image: np.ndarray, camera: str, interpolation: int = cv2.INTER_AREA) -> np.ndarray:
+    def _as_rendered(self, image: np.ndarray, camera: str) -> np.ndarray:
         """A picture as recorded, undistorted and shrunk as the photographs were at the door."""
         size = (self.capture.cameras[camera].width_px, self.capture.cameras[camera].height_px)
         recorded_px = self.capture.recorded_sizes_px.get(camera)
@@ -76,4 +76,4 @@ class GroundTruth:
             K, distortion = map(np.array, self.capture.recorded_lenses[camera])
             lens = Lens(camera, K, distortion, np.eye(3), np.zeros(3), recorded_px)
             return Normaliser.create(lens, recorded_px, max(size)).pixels(image)
-        return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=interpolation)
+        return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)

@@ -34,6 +34,14 @@ def test_on_black_comes_first_and_at_the_camera_size(truth: GroundTruth) -> None
     assert np.array_equal(image, np.full((64, 64, 3), 90))
 
 
+def test_a_mask_of_the_recording_is_shrunk_by_area(truth: GroundTruth) -> None:
+    """Columns 5 and up of 256: of the four that make column 1 three are the person's, the first of them is not."""
+    mask = np.zeros((256, 256), np.uint8)
+    mask[:, 5:] = 255
+    cv2.imwrite(str(truth.folder / "ground_truth" / "masks" / "c" / "000001.png"), mask)
+    assert truth.mask("c", 1)[0, :3].tolist() == [False, True, True]
+
+
 def test_truth_is_of_the_instant_of_the_photograph(truth: GroundTruth) -> None:
     """Camera c recorded the instant of frame 1 in its frame 2."""
     in_step = replace(truth, capture=truth.capture.synchronised({"c": 1.0}))
