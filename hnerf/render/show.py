@@ -120,7 +120,7 @@ def _cameras(wish: Wish, capture: Capture, body: BodyFit) -> list[Camera]:
             raise CaptureError(f"camera {wish.camera}: the recording has {', '.join(capture.cameras)}")
         found = [capture.cameras[wish.camera]] * (wish.pictures or poses or 1)
     elif wish.path is not None:
-        keys = read_path(wish.path, (recorded[0].width_px, recorded[0].height_px))
+        keys = read_path(wish.path, capture.recorded_sizes_px[recorded[0].name])
         found = along(keys, wish.pictures or poses or len(keys))
     else:
         count = wish.pictures or poses or ORBIT_PICTURES

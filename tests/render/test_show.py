@@ -1,6 +1,7 @@
 """`hnerf render` on a subject that was never trained: a column whose field is as it was made, but for frames that
 deform it."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -10,11 +11,13 @@ import pytest
 import torch
 
 from flows.cli import main
+from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.footage import Video
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.lens import Lens
 from hnerf.render.motion import between
+from hnerf.render.show import Wish, _cameras
 from hnerf.training.model import build_field, load_avatar
 from hnerf.training.model_file import write_field
 from tests.training.scene import TINY, record
@@ -94,6 +97,16 @@ def test_an_orbit_round_one_pose_has_the_size_and_number_asked_for(subject: Path
         y, x = np.nonzero(mask > 127)
         assert abs((x.min() + x.max()) / 2 - 23.5) < 4  # seen in the middle, from all sides
         assert abs((y.min() + y.max()) / 2 - 23.5) < 4
+
+
+def test_a_path_without_sizes_has_that_of_the_recording(subject: Path, tmp_path: Path) -> None:
+    """Its intrinsics are of the pictures as recorded, not as they were shrunk at the door."""
+    capture = Capture.load(subject / "capture")
+    lens = Lens("a", capture.cameras["2"].K, np.zeros(5), capture.cameras["2"].R, capture.cameras["2"].t_m, None)
+    write_cameras(tmp_path / "path", [lens], "easymocap")
+    shrunk = dataclasses.replace(capture, recorded_sizes_px=dict.fromkeys(capture.cameras, (500, 300)))
+    (found,) = _cameras(Wish(path=tmp_path / "path", pictures=1), shrunk, BodyFit.load(subject / "training"))
+    assert (found.width_px, found.height_px) == (500, 300)
 
 
 def test_interpolation_and_another_motion(subject: Path, tmp_path: Path) -> None:
