@@ -136,7 +136,10 @@ def _what_to_cut(cameras: Sequence[str], offsets: dict[str, float]) -> str:
     earliest = min(offsets.get(name, 0.0) for name in cameras)
     cuts = {name: round(offsets.get(name, 0.0) - earliest) for name in cameras}
     orders = ", ".join(f"{cut} from camera {name}" for name, cut in cuts.items() if cut)
-    return f"out of step: {late}; cut frames from the start of videos: {orders}; and ingest again"
+    return (
+        f"out of step: {late}; cut frames from the start of recordings: {orders}, and from those of test cameras that "
+        "are as late; then cut all to the same length and ingest again"
+    )
 
 
 def synchronise(

@@ -151,13 +151,17 @@ def _agreements(cameras: list[Camera], people: list[np.ndarray]) -> list[np.ndar
     """How well each hypothesis (a person in one camera being a person in another) explains each person: per camera
     (n, P), from 0 to 1."""
     projections = np.stack([camera.projection for camera in cameras])
-    shown = [np.flatnonzero(found[..., 2].any(1)) for found in people]
-    pairs = [(a, i, b, j) for a, b in combinations(range(len(cameras)), 2) for i in shown[a] for j in shown[b]]
-    views = np.zeros((len(cameras), len(pairs), 25, 3))
-    for n, (a, i, b, j) in enumerate(pairs):
-        views[a, n], views[b, n] = people[a][i], people[b][j]
-    flat = views.reshape(len(cameras), -1, 3)
-    points_m = _solve(projections, flat, _confidence(flat)).reshape(-1, 25, 3)
+    shown = [found[found[..., 2].any(1)] for found in people]
+    hypotheses_m = [np.zeros((0, 25, 3))]
+    for a, b in combinations(range(len(cameras)), 2):
+        views = np.stack(
+            [
+                shown[a].repeat(len(shown[b]), axis=0).reshape(-1, 3),
+                np.tile(shown[b], (len(shown[a]), 1, 1)).reshape(-1, 3),
+            ]
+        )
+        hypotheses_m.append(_solve(projections[[a, b]], views, _confidence(views)).reshape(-1, 25, 3))
+    points_m = np.concatenate(hypotheses_m)
     return [_support(camera, points_m, found) for camera, found in zip(cameras, people, strict=True)]
 
 
