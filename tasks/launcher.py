@@ -72,9 +72,10 @@ def end_with_parent(last: signal.Signals) -> None:
 
 def _environment(processes: int) -> dict[str, str]:
     """The cores shared out evenly among the ranks, and threads that sleep while they wait, unless the user has said
-    otherwise: threads that spin make a step take many times as long when anything else runs on the machine."""
+    otherwise: threads that spin make a step take many times as long when anything else runs on the machine. Modules are
+    not looked for in the folder that the user stands in, whatever its files are called."""
     threads = max(1, len(os.sched_getaffinity(0)) // processes)
-    return {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "PASSIVE", **os.environ}
+    return {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "PASSIVE", **os.environ, "PYTHONSAFEPATH": "1"}
 
 
 def _follow(agent: "subprocess.Popen[str]", log: logging.Logger) -> re.Match[str] | None:

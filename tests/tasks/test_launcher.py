@@ -17,6 +17,12 @@ RANKS = "tests.tasks.ranks"
 PATIENCE_S = 60.0
 
 
+@pytest.fixture(autouse=True)
+def ranks_find_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tests are not installed."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+
+
 def still_running(folder: Path) -> list[int]:
     """Process ids of the ranks that have begun and not ended."""
     ids = [int(path.name) for path in folder.iterdir()]
@@ -34,6 +40,13 @@ def test_lines_of_all_ranks_reach_the_log(tmp_path: Path, caplog: pytest.LogCapt
     with caplog.at_level(logging.INFO, logger=RANKS):
         run_ranks(RANKS, ["ok", str(tmp_path)], processes=2)
     assert sorted(caplog.messages) == ["rank 0 of 2", "rank 1 of 2"]
+
+
+def test_files_where_the_user_stands_are_no_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("tasks.py", "torch.py"):
+        (tmp_path / name).write_text("raise SystemExit(1)")
+    monkeypatch.chdir(tmp_path)
+    run_ranks(RANKS, ["ok", str(tmp_path)], processes=1)
 
 
 @pytest.mark.parametrize(
