@@ -39,9 +39,12 @@ def _identity(value: Input) -> Any:
 
 
 def _content(path: Path) -> str:
-    """A file that a setting names counts by its bytes, wherever it lies; one that is missing is for the stage to
-    refuse."""
-    return sha256_of(path) if path.is_file() else str(path)
+    """A file that a setting names counts by its bytes, wherever it lies, and so do those beside it whose names go on
+    where its name ends, like `seg.onnx.data`: external weights. One that is missing is for the stage to refuse."""
+    if not path.is_file():
+        return str(path)
+    beside = sorted(p for p in path.parent.iterdir() if p.name.startswith(path.name) and p != path and p.is_file())
+    return " ".join([sha256_of(path), *(f"{p.name.removeprefix(path.name)} {sha256_of(p)}" for p in beside)])
 
 
 class StorePolicy(CachePolicy):

@@ -4,7 +4,7 @@ from typing import Any
 import pytest
 from prefect.states import Failed
 
-from hnerf.config import CaptureSettings, FitSettings, Section
+from hnerf.config import CaptureSettings, FitSettings, Section, SegmentationSettings
 from hnerf.errors import CaptureError
 from tasks.launcher import LostWorkerError
 from tasks.policy import is_transient, stage_key
@@ -58,6 +58,17 @@ def test_a_file_that_a_setting_names_counts_by_its_bytes(tmp_path: Path) -> None
         (tmp_path / name).write_bytes(content)
     a, b, c, absent = (key(settings=FitSettings(body_model=tmp_path / f"{name}.npz")) for name in "abcd")
     assert a == b and len({a, c, absent, key(settings=FitSettings())}) == 4
+
+
+def test_external_weights_of_a_network_count_too(tmp_path: Path) -> None:
+    def network(place: str, weights: str) -> SegmentationSettings:
+        (tmp_path / place).mkdir()
+        for name, content in (("seg.onnx", "graph"), ("seg.onnx.data", weights), ("other.onnx.data", place)):
+            (tmp_path / place / name).write_text(content)
+        return SegmentationSettings(model=tmp_path / place / "seg.onnx")
+
+    one, same, other = network("a", "one"), network("b", "one"), network("c", "two")
+    assert key(settings=one) == key(settings=same) != key(settings=other)
 
 
 def test_inputs_are_told_apart_by_their_part() -> None:
