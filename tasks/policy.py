@@ -1,5 +1,6 @@
 """When a stage's work need not be done again, and when it is worth trying again."""
 
+import errno
 import hashlib
 import json
 from pathlib import Path
@@ -17,6 +18,7 @@ from tasks.source import Source
 from tasks.store import Artifact, Store, sha256_of
 
 LASTING = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
+LASTING_NUMBERS = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTEMPTY)  # which have no class of their own
 
 Input = Artifact | Source | Section | tuple[str, ...] | tuple[int, ...] | None
 
@@ -76,4 +78,9 @@ def is_transient(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
 
 def may_pass(error: object) -> bool:
     """Whether a later try may overcome it: input and output that failed, timeouts and lost workers; nothing else."""
-    return isinstance(error, OSError | LostWorkerError) and not isinstance(error, LASTING)
+    return isinstance(error, OSError | LostWorkerError) and not will_last(error)
+
+
+def will_last(error: Exception) -> bool:
+    """Whether input or output failed for a reason that lies in the path, which no later try overcomes."""
+    return isinstance(error, LASTING) or (isinstance(error, OSError) and error.errno in LASTING_NUMBERS)

@@ -1,3 +1,4 @@
+import errno
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,11 @@ def test_key_in_numbers() -> None:
         (FileNotFoundError("a.jpg"), False),
         (PermissionError("a.jpg"), False),
         (IsADirectoryError("a.jpg"), False),
+        (OSError(errno.ENOSPC, "No space left on device"), True),
+        (OSError(errno.EROFS, "Read-only file system"), False),
+        (OSError(errno.ENAMETOOLONG, "File name too long"), False),
+        (OSError(errno.ELOOP, "Too many levels of symbolic links"), False),
+        (OSError(errno.ENOTEMPTY, "Directory not empty"), False),
         (CaptureError("a.jpg: bad"), False),
         (ValueError("bug"), False),
     ],
