@@ -16,6 +16,7 @@ from flows.ablations import ablate
 from flows.benchmark import benchmark
 from flows.stability import stability
 from flows.train_subject import train_subject
+from hnerf.asset.validation import InvalidAsset
 from hnerf.calibration.boards import calibrate_from_boards
 from hnerf.capture.formats.export import WRITERS, write_cameras
 from hnerf.capture.ingest import recognise
@@ -27,6 +28,7 @@ from hnerf.render.show import KINDS, Wish, render_subject
 from tasks.calibration import calibrate
 from tasks.capture import ingest
 from tasks.launcher import GaveUpError
+from tasks.policy import will_last
 from tasks.source import read_capture
 from tasks.store import Store
 
@@ -35,15 +37,26 @@ FAILED, BAD_INPUT = 1, 2
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one command; one line on stderr and 2 for input that cannot be used, 1 for a training that cannot go on."""
+    """Run one command; one line on stderr and 2 for input and paths that cannot be used, 1 for a training that cannot
+    go on or an asset that must not be handed over."""
     options = _parser().parse_args(argv)
     try:
         with _progress():
             options.command(options)
-    except (CaptureError, GaveUpError) as error:
-        print(f"hnerf: {error}", file=sys.stderr)
-        return BAD_INPUT if isinstance(error, CaptureError) else FAILED
+    except CaptureError as error:
+        return _told(error, BAD_INPUT)
+    except (GaveUpError, InvalidAsset) as error:
+        return _told(error, FAILED)
+    except OSError as error:
+        if error.filename is None or not will_last(error):
+            raise
+        return _told(f"{error.filename}: {error.strerror}; give another path, or mend this one", BAD_INPUT)
     return 0
+
+
+def _told(why: object, status: int) -> int:
+    print("hnerf:", " ".join(str(why).splitlines()), file=sys.stderr)
+    return status
 
 
 @contextmanager

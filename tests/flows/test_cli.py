@@ -1,3 +1,4 @@
+import errno
 import json
 from pathlib import Path
 
@@ -5,6 +6,7 @@ import pytest
 
 from flows import cli
 from flows.cli import main
+from hnerf.asset.validation import InvalidAsset
 from tasks.launcher import GaveUpError
 from tests.shared_data import shared_capture
 
@@ -43,6 +45,37 @@ def test_a_training_that_cannot_go_on_is_one_line_and_exit_code_1(
     monkeypatch.setattr(cli.train_subject, "fn", train)
     assert main(["run", "ada"]) == 1
     assert capsys.readouterr().err == "hnerf: the surface is empty: check masks and body fit\n"
+
+
+def test_an_asset_that_is_not_valid_is_one_line_and_exit_code_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def train(*_: object) -> None:
+        raise InvalidAsset("avatar.usdz: there is no mesh;\nno skeleton")
+
+    monkeypatch.setattr(cli.train_subject, "fn", train)
+    assert main(["run", "ada"]) == 1
+    assert capsys.readouterr().err == "hnerf: avatar.usdz: there is no mesh; no skeleton\n"
+
+
+def test_a_store_that_cannot_be_made_is_one_line_and_exit_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "ada").mkdir()
+    (tmp_path / "plain").touch()
+    for store, why in ((tmp_path / "plain" / "x", "Not a directory"), (tmp_path / ("x" * 300), "File name too long")):
+        assert main(["check", str(tmp_path / "ada"), "--store", str(store)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"hnerf: {store}") and why in line
+
+
+def test_a_fault_that_may_pass_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def train(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error", "a.jpg")
+
+    monkeypatch.setattr(cli.train_subject, "fn", train)
+    with pytest.raises(OSError, match="Input/output error"):
+        main(["run", "ada"])
 
 
 def test_unreadable_capture_leaves_nothing_half_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
