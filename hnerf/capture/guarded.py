@@ -20,12 +20,16 @@ NO_ARRAYS = (AttributeError, EOFError, MemoryError, OSError, TypeError, ValueErr
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 _IMAGE_MODES = ("1", "L", "P", "RGB", "RGBA")  # 8 bits a channel: others would be clipped
 _CAMERA_NAME = re.compile(r"\w([\w ()-]{0,62}[\w()-])?")  # becomes a folder name, and a glob without wildcards
+_ARGUMENTS = ("file", "allow_pickle")  # of np.savez, which takes keypoints by camera name
 
 
 def check_camera_name(name: object, source: Path) -> str:
-    """`name` if it can be a folder's name; CaptureError naming `source` otherwise (separators, dots, wildcards)."""
+    """`name` if it can be a folder's name and an array's in a .npz; CaptureError naming `source` otherwise (separators,
+    dots, wildcards)."""
     if not isinstance(name, str) or not _CAMERA_NAME.fullmatch(name):
         raise CaptureError(f"{source}: camera name {name!r}: use letters, digits, '_', '-', spaces and ()")
+    if name in _ARGUMENTS:
+        raise CaptureError(f"{source}: a camera cannot be called {name!r}; rename it")
     return name
 
 

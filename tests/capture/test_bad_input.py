@@ -52,6 +52,11 @@ def _toml(text: str) -> Callable[[Path], object]:
     return lambda folder: (folder / "capture.toml").write_text(text)
 
 
+def _call_a_camera_file(folder: Path) -> None:
+    for path in (folder / "intri.yml", folder / "extri.yml"):
+        path.write_text(path.read_text().replace('"01"', '"file"').replace("_01:", "_file:"))
+
+
 EASYMOCAP = {
     "extri missing": (lambda f: (f / "extri.yml").unlink(), "extri.yml"),
     "intri is a pickle": (lambda f: (f / "intri.yml").write_bytes(pickle.dumps(Bomb())), "intri.yml"),
@@ -66,6 +71,7 @@ EASYMOCAP = {
     "matrix shorter than declared": (lambda f: _edit(f / "intri.yml", "cols: 3", "cols: 5"), "intri.yml: K_01"),
     "intri of a gigabyte": (lambda f: os.truncate(f / "intri.yml", 10**9), "intri.yml"),
     "camera name leaves the folder": (lambda f: _edit(f / "intri.yml", '"01"', '"../01"'), "intri.yml"),
+    "camera called as np.savez's argument": (_call_a_camera_file, "intri.yml: a camera cannot be"),
     "camera without a folder": (lambda f: (f / "images/02").rename(f / "images/03"), "images/02"),
     "camera without images": (lambda f: [p.unlink() for p in (f / "images/02").iterdir()], "images/02"),
     "unequal frame counts": (lambda f: (f / "images/02/000004.png").unlink(), "images/02: 4 frames"),
