@@ -53,7 +53,8 @@ def main() -> None:
 def measure(subject: Path, source: Path) -> dict[str, Any]:
     """Figures of one finished fit against the ground truth of its recording."""
     capture = load_cameras(subject / "calibration", Capture.load(subject / "capture"))
-    fit, report = BodyFit.load(subject / "fit"), json.loads((subject / "fit" / "report.json").read_text())
+    fit, folder = BodyFit.load(subject / "fit"), (subject / "fit").resolve()
+    seconds = json.loads(folder.with_name(f"{folder.name}.json").read_text())["metrics"]
     joints = runpy.run_path(str(SHARED / "accept" / "score_run.py"))["joints"](subject, source)
     ious, outside = [], []
     for frame, vertices_m in zip(fit.frames, fit.vertices_m().numpy(), strict=True):
@@ -68,7 +69,7 @@ def measure(subject: Path, source: Path) -> dict[str, Any]:
         "iou": float(np.mean(ious)),
         "outside_share": float(np.mean(outside)),
         "outside_share_worst": float(np.max(outside)),
-        "seconds_per_frame": sum(report["seconds"].values()) / len(fit.frames),
+        "seconds_per_frame": sum(seconds.values()) / len(fit.frames),
     }
 
 

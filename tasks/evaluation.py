@@ -37,6 +37,7 @@ def evaluate(
         calibration_folder=calibration.root,
         segmentation_folder=segmentation.root,
         fit_folder=body.root,
+        fit_seconds=body.metrics,
         training_folder=training.root,
     )
     return _headline(evaluate_avatar(inputs, settings, out))

@@ -15,9 +15,11 @@ from tasks.store import Artifact
 def fit(
     out: Path, recording: Artifact, calibration: Artifact, segmentation: Artifact | None, settings: FitSettings
 ) -> dict[str, float]:
-    """One shape and a pose a frame, from keypoints, and from contours where there are masks."""
+    """One shape and a pose a frame, from keypoints, and from contours where there are masks. The figures are seconds of
+    each part; no file has them, so that the same body made again is the same artifact."""
     masks = Masks.load(segmentation.root) if segmentation else None
     body, report = fit_body(calibrated(recording, calibration), masks, settings)
+    seconds: dict[str, float] = report.pop("seconds")
     body.save(out)
     (out / "report.json").write_text(json.dumps(report, indent=1))
-    return {}
+    return seconds

@@ -1,6 +1,6 @@
 """What evaluation is given."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from hnerf.body.fit_result import BodyFit
@@ -14,7 +14,8 @@ class EvaluationInputs:
     """Everything made before evaluation.
 
     capture_folder: as recorded, for its ground_truth/; capture: with the calibrated cameras; fitted: the body before
-    training (avatar.body holds the fine-tuned one); the folders hold their stages' report.json.
+    training (avatar.body holds the fine-tuned one); the folders hold their stages' report.json; fit_seconds: of each
+    part of the fit.
     """
 
     capture_folder: Path
@@ -26,3 +27,4 @@ class EvaluationInputs:
     segmentation_folder: Path
     fit_folder: Path
     training_folder: Path
+    fit_seconds: dict[str, float] = field(default_factory=dict)

@@ -88,7 +88,10 @@ def stage_reports(inputs: EvaluationInputs) -> dict[str, dict[str, Any]]:
         "Training": inputs.training_folder,
     }
     paths = {name: folder / "report.json" for name, folder in folders.items()}
-    return {name: json.loads(path.read_text()) if path.exists() else {} for name, path in paths.items()}
+    reports = {name: json.loads(path.read_text()) if path.exists() else {} for name, path in paths.items()}
+    if inputs.fit_seconds:
+        reports["Body fit"] |= {"seconds": inputs.fit_seconds}
+    return reports
 
 
 def image_sizes(inputs: EvaluationInputs) -> str:

@@ -1,7 +1,8 @@
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from hnerf.evaluation.report import costs, is_rows, notes, readable, summary
+from hnerf.evaluation.report import costs, is_rows, notes, readable, stage_reports, summary
 from tests.evaluation.ball import ball_inputs, write_ball_capture
 
 
@@ -49,6 +50,12 @@ def test_costs_have_a_row_a_part_of_a_stage() -> None:
         ("Evaluation: rendering, seconds", "3.5"),
         ("One image, seconds (median)", "0.1"),
     ]
+
+
+def test_seconds_of_the_fit_are_among_the_costs(tmp_path: Path) -> None:
+    inputs = ball_inputs(write_ball_capture(tmp_path / "capture", "ball", ("c",)), tmp_path / "stages")
+    stages = stage_reports(replace(inputs, fit_seconds={"start": 0.5}))
+    assert costs(stages, {"seconds_per_image": 0.1})[0] == ("Body fit: start, seconds", "0.5")
 
 
 def test_notes_say_what_was_left_out_and_what_was_compared_to(tmp_path: Path) -> None:

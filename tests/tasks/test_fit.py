@@ -1,0 +1,32 @@
+"""What a fitted body becomes in the store; the fit is made up."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hnerf.config import FitSettings
+from tasks import fit as module
+from tasks.store import Artifact, Store
+
+
+class Body:
+    """Of one file."""
+
+    def save(self, out: Path) -> None:
+        (out / "body.npz").write_bytes(b"body")
+
+
+def test_the_same_body_made_again_is_the_same_artifact_however_long_it_took(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "calibrated", lambda *_: None)
+    given = Artifact(stage="capture", root=tmp_path, files={})
+
+    def made(store: str, seconds: float) -> Artifact:
+        report: dict[str, Any] = {"seconds": {"start": seconds}, "stature_m": 1.8}
+        monkeypatch.setattr(module, "fit_body", lambda *_: (Body(), report))
+        return module.fit(Store(tmp_path / store), given, given, None, FitSettings())
+
+    quick, slow = made("a", 1.0), made("b", 2.0)
+    assert quick.digest == slow.digest and slow.metrics == {"start": 2.0}
