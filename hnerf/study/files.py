@@ -13,10 +13,15 @@ def replace_text(path: Path, text: str) -> None:
     os.replace(beside, path)
 
 
+def picture(name: str) -> str:
+    """Markdown that shows a file, whose name may hold spaces and parentheses."""
+    return f"![{name}](<{name}>)"
+
+
 def with_pictures(table: Path) -> str:
-    """A Markdown file's text, with the PNG files beside it that it shows as data URIs. OSError where one is missing."""
-    return re.sub(r"(?<=\]\()[^)]+\.png", lambda name: _data_uri(table.with_name(name[0])), table.read_text())
+    """A Markdown file's text, PNG files beside it that `picture` shows as data URIs. OSError where one is missing."""
+    return re.sub(r"(?<=\]\()<([^>]+\.png)>", lambda shown: _data_uri(table.with_name(shown[1])), table.read_text())
 
 
-def _data_uri(picture: Path) -> str:
-    return f"data:image/png;base64,{base64.b64encode(picture.read_bytes()).decode()}"
+def _data_uri(path: Path) -> str:
+    return f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}"

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from hnerf.study.curves import Point, seconds_to
+from hnerf.study.files import picture
 from hnerf.study.machine import in_words
 from hnerf.study.tables import head, line, pick, shown
 
@@ -97,10 +98,10 @@ def caption(result: Mapping[str, Any]) -> str:
 
 
 def as_markdown(result: Mapping[str, Any], pictures: list[str]) -> str:
-    """The whole result for people. pictures: paths from where the text will lie."""
+    """The whole result for people. pictures: names of files beside the text."""
     lines = [f"# {result['title']}: {result['subject']}", "", caption(result), ""]
     lines += [f"- {note}" for note in result["notes"]] + [""] * bool(result["notes"])
-    lines += [f"![{picture}]({picture})\n" for picture in pictures]
+    lines += [f"{picture(name)}\n" for name in pictures]
     lines += ["Two figures in a cell: new views / new poses.", ""]
     for title, variant in result["variants"].items():
         lines += [f"## {title}", "", *_variant_lines(variant), ""]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from hnerf.study.degrade import KINDS
+from hnerf.study.files import picture
 from hnerf.study.surface import LENGTHS, VOLUMES
 from hnerf.study.tables import head, line, shown
 from hnerf.study.verdict import DEGRADED_DB, DEGRADED_RATIO, FAILED_DB, FAILED_RATIO, WORST_LAST
@@ -53,7 +54,7 @@ def as_markdown(result: Row, charts: Sequence[str]) -> str:
     lines += ["## Where each method breaks", "", *head(["degradation", *methods])]
     for kind in kinds:
         lines.append(line([KINDS[kind].label, *(breaking_strength(result, method, kind) for method in methods)]))
-    lines += ["", *(f"![{chart}]({chart})" for chart in charts), "", "## Runs", ""]
+    lines += ["", *map(picture, charts), "", "## Runs", ""]
     lines += head(["method", "degradation", "strength", "seed", "verdict", "PSNR, dB", "SSIM", "Chamfer, mm"])
     lines += [line(_cells(run)) for run in result["runs"]]
     lines += ["", "## Left out", "", *(f"- {reason}" for reason in result["left_out"]), ""]

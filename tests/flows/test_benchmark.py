@@ -13,6 +13,7 @@ from flows.cli import main
 from hnerf.config import TrainingSettings
 from hnerf.errors import CaptureError
 from hnerf.study import publish as publish_module
+from hnerf.study.files import picture
 from hnerf.study.plan import ScoringSettings
 from tasks import benchmark as tasks_module
 from tasks.launcher import LostWorkerError
@@ -157,10 +158,10 @@ def test_the_flow_runs_page_shows_the_charts_themselves(tmp_path: Path, monkeypa
     shown: list[str] = []
     monkeypatch.setattr(module.FlowRunContext, "get", lambda: True)
     monkeypatch.setattr(module, "create_markdown_artifact", lambda text, **_: shown.append(text))
-    (tmp_path / "ada-toys.png").write_bytes(b"chart")
-    (tmp_path / "ada-toys.md").write_text("# Toys\n\n![ada-toys.png](ada-toys.png)\n")
-    module._announce(tmp_path / "ada-toys.md")
-    assert shown == ["# Toys\n\n![ada-toys.png](data:image/png;base64,Y2hhcnQ=)\n"]
+    (tmp_path / "Ada (2) b-toys.png").write_bytes(b"chart")
+    (tmp_path / "Ada (2) b-toys.md").write_text(f"# Toys\n\n{picture('Ada (2) b-toys.png')}\n")
+    module._announce(tmp_path / "Ada (2) b-toys.md")
+    assert shown == ["# Toys\n\n![Ada (2) b-toys.png](data:image/png;base64,Y2hhcnQ=)\n"]
 
 
 def test_scores_are_found_again_until_what_is_scored_or_how_changes(

@@ -78,14 +78,14 @@ def result(**changes: Any) -> dict[str, Any]:
 
 
 def test_the_markdown_by_hand() -> None:
-    assert as_markdown(result(), ["chart.png"]).splitlines()[:23] == [
+    assert as_markdown(result(), ["a (b).png"]).splitlines()[:23] == [
         "# Toys: ada",
         "",
         "ada, study toy: 60 s of training; on Abacus, 1 of 2 cores, no GPU, torch 2, Python 3.",
         "",
         "- A note.",
         "",
-        "![chart.png](chart.png)",
+        "![a (b).png](<a (b).png>)",
         "",
         "Two figures in a cell: new views / new poses.",
         "",
@@ -152,7 +152,7 @@ def test_everything_is_published_and_old_charts_go(tmp_path: Path) -> None:
     names = {path.name for path in table.parent.iterdir()}
     drawn = {f"ada-toy{name}.png" for name in ("", "-sweep", "-nearness", "-pictures")}
     assert names == {"ada-toy.md", "ada-toy.csv", "ada-toy.json"} | drawn
-    assert all(f"![{name}]({name})" in table.read_text() for name in drawn)
+    assert all(f"![{name}](<{name}>)" in table.read_text() for name in drawn)
     assert json.loads(table.with_suffix(".json").read_text()) == result()
     publish(result(variants={}), tmp_path)
     assert {path.suffix for path in table.parent.iterdir()} == {".md", ".csv", ".json"}

@@ -105,7 +105,7 @@ def test_a_method_breaks_where_its_worst_seed_does() -> None:
 
 
 def test_the_tables_by_hand() -> None:
-    lines = as_markdown(RESULT, ["a.png"]).splitlines()
+    lines = as_markdown(RESULT, ["a (b).png"]).splitlines()
     start = lines.index("## Where each method breaks")
     assert lines[start + 2 : start + 10] == [
         "| degradation | fast | nerf |",
@@ -113,7 +113,7 @@ def test_the_tables_by_hand() -> None:
         "| pose noise, ° a joint | 2 (failed) | 1 (refused) |",
         "| holes, % of each mask | holds to 5 | 5 (refused) |",
         "",
-        "![a.png](a.png)",
+        "![a (b).png](<a (b).png>)",
         "",
         "## Runs",
     ]
