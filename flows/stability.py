@@ -64,7 +64,8 @@ def stability(
     try:
         for run in _runs(shelf, source, truth, plan, presets):
             if "left_out" in run:
-                result["left_out"].append(run["left_out"])
+                if run["left_out"] not in result["left_out"]:  # every method and seed says so
+                    result["left_out"].append(run["left_out"])
                 continue
             result["protocol"] = run.pop("protocol", None) or result["protocol"]
             result["runs"].append(run)
