@@ -7,6 +7,7 @@ import torch
 
 from hnerf.config import TrainingSettings
 from hnerf.render.avatar import Avatar
+from hnerf.training.checkpoint import remove_checkpoint
 from hnerf.training.model import load_avatar
 from tasks.launcher import run_ranks
 from tasks.stage import stage
@@ -27,6 +28,7 @@ def train(
     processes = settings.processes or max(1, torch.cuda.device_count())
     run_ranks("hnerf.training.run", [*inputs, settings.model_dump_json(), str(out)], processes)
     report = json.loads((out / "report.json").read_text())
+    remove_checkpoint(out)
     return {name: report[name] for name in ("steps", "seconds", "peak_memory_gib", "model_mib")}
 
 

@@ -19,6 +19,12 @@ def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
     os.replace(beside, folder / NAME)
 
 
+def remove_checkpoint(folder: Path) -> None:
+    """Of a training whose files are safe; and what an interrupted write left."""
+    for path in folder.glob(f"{NAME}*"):
+        path.unlink()
+
+
 def load_checkpoint(folder: Path, device: torch.device) -> dict[str, Any] | None:
     """The last checkpoint, or None where there is none."""
     path = folder / NAME

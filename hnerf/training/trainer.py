@@ -22,7 +22,7 @@ from hnerf.capture.capture import Capture
 from hnerf.config import TrainingSettings
 from hnerf.segmentation.segment import Masks
 from hnerf.training.budget import Scene, decide
-from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
+from hnerf.training.checkpoint import load_checkpoint, save_checkpoint
 from hnerf.training.conditions import Conditions, Draws, own_share
 from hnerf.training.losses import RaySamples, pixel
 from hnerf.training.model import build_field
@@ -122,7 +122,7 @@ class Trainer:
             if self.step == self.field_steps:
                 self.field_seconds = self.seconds
             snapshot_due = bool(snapshots_s) and self.seconds >= snapshots_s[0]
-            checkpoint_due = self.step % self.settings.checkpoint_steps == 0
+            checkpoint_due = self.step % self.settings.checkpoint_steps == 0 or self.step == self.steps
             absorb_due = self.step % self.settings.absorb_steps == 0 or self.step in (self.field_steps, self.steps)
             if absorb_due or snapshot_due or checkpoint_due:  # who resumes finds the bodies where they stood
                 self._absorb()
@@ -317,8 +317,6 @@ class Trainer:
             "decisions": [{"setting": name} | dataclasses.asdict(d) for name, d in self.decisions.items()],
         }
         (out / "report.json").write_text(json.dumps(report, indent=1))
-        for left in out.glob(f"{NAME}*"):
-            left.unlink()
         return report
 
 
@@ -332,6 +330,8 @@ def train(
 ) -> dict[str, Any]:
     """Train the subject into `out`, from its checkpoint where there is one; the report as a dict.
 
+    The last checkpoint stays, so that who is stopped before the files are safe need only write them again;
+    `remove_checkpoint` is for the caller.
     Raises TrainingError where the surface collapses or the losses stay non-finite.
     """
     return Trainer(capture, masks, body, settings, out, processes or Processes.join()).run()

@@ -68,7 +68,20 @@ def test_interrupted_training_ends_as_if_it_was_not(tmp_path: Path, monkeypatch:
         [json.loads(row)["losses"] for row in (f / "history.jsonl").read_text().splitlines()] for f in (whole, parts)
     ]
     assert losses[0] == losses[1]
-    assert not (parts / NAME).exists()
+
+
+@pytest.mark.parametrize("novel_pose_steps", [0, 4])
+def test_a_finished_training_that_was_stopped_before_its_files_were_safe_only_writes_them_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, novel_pose_steps: int
+) -> None:
+    recording, settings = record(tmp_path / "capture"), with_changes(steps=11, novel_pose_steps=novel_pose_steps)
+    first = train(*recording, settings, tmp_path, ALONE)
+    written = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
+    monkeypatch.delattr(Trainer, "_optimise")  # no step is taken
+    again = train(*recording, settings, tmp_path, ALONE)
+    assert again["steps"] == first["steps"] == 11 + novel_pose_steps
+    kept = {name for name, content in written.items() if (tmp_path / name).read_bytes() == content}
+    assert written.keys() - kept <= {"report.json"}  # setup took another time
 
 
 def test_overfits_the_column(tmp_path: Path):

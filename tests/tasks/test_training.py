@@ -1,0 +1,31 @@
+"""What a training leaves in the store; the ranks are made up."""
+
+from pathlib import Path
+
+import pytest
+
+from hnerf.config import TrainingSettings
+from tasks import training as module
+from tasks.store import Artifact, Store
+
+
+def test_the_checkpoint_is_there_until_the_ranks_are_done_and_never_in_the_artifact(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ranks(*arguments: object) -> None:
+        out = Path(arguments[1][-1])  # type: ignore[index]
+        found.append(sorted(path.name for path in out.iterdir()))
+        for name in ("checkpoint.pt", "checkpoint.pt.tmp"):
+            (out / name).write_bytes(b"state")
+        (out / "report.json").write_text('{"steps": 1, "seconds": 2.0, "peak_memory_gib": 3.0, "model_mib": 4.0}')
+        if len(found) == 1:
+            raise OSError("lost")
+
+    found: list[list[str]] = []
+    monkeypatch.setattr(module, "run_ranks", ranks)
+    given = Artifact(stage="capture", root=tmp_path, files={})
+    with pytest.raises(OSError, match="lost"):
+        module.train(Store(tmp_path), given, given, given, given, TrainingSettings())
+    made = module.train(Store(tmp_path), given, given, given, given, TrainingSettings())
+    assert found == [[], ["checkpoint.pt", "checkpoint.pt.tmp", "report.json"]]
+    assert list(made.files) == ["report.json"] == [path.name for path in made.root.iterdir()]
