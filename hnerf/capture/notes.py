@@ -1,5 +1,6 @@
 """`capture.toml`: what a layout does not say itself, and which cameras and frames are for what."""
 
+import logging
 import math
 import re
 import unicodedata
@@ -12,6 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from hnerf.capture.guarded import inside, read_toml
 from hnerf.capture.keypoint_sets import KeypointSetName
 from hnerf.errors import CaptureError
+
+log = logging.getLogger("hnerf.capture")
 
 FrameNumber = Annotated[int, Field(ge=0, le=999_999)]
 
@@ -94,7 +97,11 @@ def chosen_frames(
         novel = recorded[len(recorded) - int(novel_pose_share * len(recorded)) :]
         train = recorded[: len(recorded) - len(novel)]
         stride = math.ceil(len(train) / max_frames)
-        return FrameSplit(train=list(train[::stride]), novel_pose=list(novel[::stride]))
+        split = FrameSplit(train=list(train[::stride]), novel_pose=list(novel[::stride]))
+        if stride > 1:
+            taken = len(split.train) + len(split.novel_pose)
+            log.info("%d of %d frames taken, one in %d; name others in capture.toml", taken, len(recorded), stride)
+        return split
     _check(folder, "frame", notes.frames.train + notes.frames.novel_pose, recorded, "the recording")
     return notes.frames
 

@@ -1,5 +1,6 @@
 """What comes through the door: pixels, cameras and keypoints of a small recording, worked out by hand."""
 
+import logging
 from pathlib import Path
 
 import cv2
@@ -78,6 +79,17 @@ def test_capture_toml_names_and_splits(folder: Path, tmp_path: Path) -> None:
 
 def test_long_recordings_are_strided_evenly(folder: Path, tmp_path: Path) -> None:
     assert ingest(folder, CaptureSettings(max_frames=3), tmp_path / "out").train_frames == (0, 2, 4)
+
+
+def test_how_many_frames_of_a_long_recording_are_taken_is_told(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO, "hnerf.capture"):
+        ingest(folder, CaptureSettings(max_frames=3), tmp_path / "out")
+        assert "3 of 5 frames taken, one in 2; name others in capture.toml" in caplog.text
+        caplog.clear()
+        ingest(folder, CaptureSettings(max_frames=5), tmp_path / "all")
+        assert "frames taken" not in caplog.text
 
 
 def test_frames_before_anybody_walks_in_and_after_are_left_out(
