@@ -12,6 +12,7 @@ import trimesh
 
 from hnerf.asset.surface import posed_surface
 from hnerf.body.fit_result import BodyFit
+from hnerf.calibration.check import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.evaluation.mesh_queries import Surface
 from hnerf.evaluation.pictures import clay, crop, cropped_camera, frame_person, overlay_surface
@@ -26,7 +27,7 @@ def main() -> None:
     parser.add_argument("--frame", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("docs/valid-wave.png"))
     options = parser.parse_args()
-    capture = Capture.load(options.subject / "capture")
+    capture = load_cameras(options.subject / "calibration", Capture.load(options.subject / "capture"))
     fitted, avatar = BodyFit.load(options.subject / "fit"), load_avatar(options.subject / "training")
     camera, row = capture.cameras[options.camera], avatar.body.index(options.frame)
     drawn = avatar.render(camera, avatar.body.theta[row], avatar.body.root[row])
