@@ -25,6 +25,7 @@ MIN_FRAMES = 8  # that a shifted camera must share with the others, at the best 
 STRETCHES = 12  # of frames, each left out once
 POSSIBLE, CERTAIN = 2.0, 5.0  # standard errors that an offset must exceed to be suspected, and to be believed
 LEAST_OFFSET = 0.1  # frames: less is within what the parabola can tell
+FARTHEST_FRAMES = 1.2  # between an instant and the picture that shows it
 OBSERVABLE_STEPS = 0.5  # standard error up to which an offset says something
 CLEAR_BEND = 2.0  # standard errors by which one step must raise the distances
 REWEIGHTED = 5  # rounds of iteratively re-weighted least squares
@@ -116,16 +117,23 @@ def put_in_step(
 ) -> tuple[Capture, dict[str, float], list[str]]:
     """The capture with the offsets that `synchronise` found (the very same without any), costs tried, and notes.
 
-    Raises CaptureError where more than half of the frames would be lost, since what was ingested lacks the moments
-    that the offsets ask for; it says what to cut.
+    Raises CaptureError where more than half of the frames would be lost or shown by pictures more than a frame away,
+    since what was ingested lacks the moments that the offsets ask for; it says what to cut.
     """
     offsets, held_out_px, notes = synchronise(cameras, keypoints, capture.frames, settings)
     if not offsets:
         return capture, held_out_px, notes
     in_step = capture.synchronised(offsets)
     lost = [frame for frame in capture.frames if frame not in in_step.frames]
-    if 2 * len(lost) > len(capture.frames) or not in_step.train_frames:
+    off_frames = {name: in_step.recorded(name, 0) - offset for name, offset in offsets.items()}
+    farthest = max(off_frames, key=lambda name: abs(off_frames[name]))
+    if 2 * len(lost) > len(capture.frames) or not in_step.train_frames or abs(off_frames[farthest]) > FARTHEST_FRAMES:
         raise CaptureError(f"{capture.name}: {_what_to_cut(capture.train_cameras, offsets)}")
+    if in_step.frame_step != capture.frame_step:
+        what = (
+            f"frames between were not taken: pictures of camera {farthest} are {off_frames[farthest]:+.2f} frames off"
+        )
+        notes = [*notes, what]
     if lost:
         notes = [*notes, f"{len(lost)} frames dropped that not every camera recorded: {', '.join(map(str, lost))}"]
     return in_step, held_out_px, notes

@@ -17,7 +17,7 @@ import numpy as np
 from hnerf.capture.bars import Area
 from hnerf.capture.camera import Camera
 from hnerf.capture.given_poses import GivenPoses
-from hnerf.capture.timing import nearest_frame, resample
+from hnerf.capture.timing import nearest_frame, resample, usual_step
 from hnerf.errors import CaptureError
 
 
@@ -107,13 +107,16 @@ class Capture:
         return dataclasses.replace(self, cameras=cameras)
 
     def synchronised(self, frame_offsets: dict[str, float]) -> "Capture":
-        """The same recording with these cameras' offsets; frames are dropped that one of them did not record."""
+        """The same recording with these cameras' offsets; frames are dropped that one of them did not record. Where
+        those would be most, since frames between were not taken at the door, the nearest that were taken stand in."""
         stored = self.stored_frames or self.frames
-        kept = {
-            f for f in stored if all(nearest_frame(f, o, self.frame_step) in stored for o in frame_offsets.values())
-        }
+        for step in (self.frame_step, usual_step(stored)):
+            kept = {f for f in stored if all(nearest_frame(f, o, step) in stored for o in frame_offsets.values())}
+            if 2 * len(kept) >= len(stored):
+                break
         return dataclasses.replace(
             self,
+            frame_step=step,
             train_frames=tuple(f for f in self.train_frames if f in kept),
             novel_pose_frames=tuple(f for f in self.novel_pose_frames if f in kept),
             frame_offsets=frame_offsets,

@@ -111,6 +111,22 @@ def test_strided_frames_say_what_to_cut(tmp_path: Path, no_pictures: None) -> No
     assert "2 from camera c1, 2 from camera c2, 2 from camera c3" in str(caught.value)
 
 
+def test_strided_frames_show_what_is_less_than_a_frame_off(tmp_path: Path, no_pictures: None) -> None:
+    """Keypoints are put in step; of the frames that were taken, each picture is the nearest to its own instant."""
+    strided = recorded({"c0": 0.8}, frames=4 * FRAMES, noise_px=0.5, speed=0.5)[:, ::4]
+    capture = capture_of(tmp_path / "in", strided, frames=tuple(range(0, 4 * FRAMES, 4)))
+    report = check_calibration(capture, SETTINGS)
+    assert report.verdicts["c0"].frame_offset == pytest.approx(0.8, abs=0.1)
+    assert any("pictures of camera c0 are -0.8" in note for note in report.notes)
+    report.save(tmp_path / "out")
+    used = load_cameras(tmp_path / "out", capture)
+    assert used.frames == capture.frames
+    assert [used.recorded("c0", frame) for frame in used.frames] == list(used.frames)
+    found, given = used.keypoints("c0"), capture.keypoints("c0")
+    assert found is not None and given is not None
+    assert np.abs(found[5] - (0.8 * given[5] + 0.2 * given[6])).max() < 2
+
+
 def test_recorded_frame_numbers_count() -> None:
     # Frames 16 to 23 were never ingested: neighbours in the array are not neighbours in time.
     frames = [frame for frame in range(FRAMES) if not 16 <= frame < 24]
