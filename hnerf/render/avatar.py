@@ -33,7 +33,7 @@ class Avatar(Protocol):
         ...
 
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
-        """Colour, coverage and depth of the person alone."""
+        """Colour, coverage and depth of the person alone; colour as a training camera of this name is exposed."""
         ...
 
     def signed_distance(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:

@@ -40,7 +40,7 @@ STEPS_A_FRAME = 540  # that see it, until its body stands as deep as one camera 
 class Decision:
     """A setting's value and why it is that."""
 
-    value: int | float | tuple[int, ...]
+    value: int | float | tuple[float, ...]
     reason: str
 
 

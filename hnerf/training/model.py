@@ -23,6 +23,7 @@ from hnerf.capture.camera import Camera
 from hnerf.config import TrainingSettings
 from hnerf.render.avatar import Rendering
 from hnerf.training.conditions import Conditions
+from hnerf.training.exposure import Gains
 from hnerf.training.fast import FastField
 from hnerf.training.field import Field
 from hnerf.training.model_file import fill_field, other_version
@@ -53,12 +54,13 @@ def build_field(settings: TrainingSettings, body: BodyFit, static: bool) -> Fiel
 @dataclass(frozen=True)
 class TrainedAvatar:
     """A field and the fine-tuned body: the Avatar of hnerf/render/avatar.py. learned: the poses of the frames that the
-    field knows, whatever body and poses are shown."""
+    field knows, whatever body and poses are shown; gains: of cameras by name, as which others show it at 1."""
 
     field: Field
     body: BodyFit
     scene_m: float
     learned: BodyFit
+    gains: Gains = dataclasses.field(default_factory=dict)
 
     @torch.no_grad()
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
@@ -76,7 +78,8 @@ class TrainedAvatar:
             row = torch.zeros(len(o), dtype=torch.long, device=device)
             flat[index[part]] = self.field.look(bodies, region, o, d, row, conditions)
         image = flat.view(camera.height_px, camera.width_px, 5)
-        return Rendering(image[..., :3].clamp(0, 1), image[..., 3], image[..., 4])
+        gain = torch.tensor(self.gains.get(camera.name, (1.0, 1.0, 1.0)), device=device)
+        return Rendering((gain * image[..., :3]).clamp(0, 1), image[..., 3], image[..., 4])
 
     def without_frames(self) -> "TrainedAvatar":
         """The same avatar, in no pose of which it knows more than in others."""
@@ -111,7 +114,7 @@ class TrainedAvatar:
 
 def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvatar:
     """The subject that training left in `folder`; CaptureError if another version left it."""
-    settings, static = _stored_settings(folder / "settings.json")
+    settings, static, gains = _stored_settings(folder / "settings.json")
     body = BodyFit.load(folder).to(device)
     path = folder / "model.safetensors"
     tensors = load_file(path, device=str(device))
@@ -120,13 +123,14 @@ def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvat
     before_tuning = dataclasses.replace(body, rig=dataclasses.replace(body.rig, vertices_m=tensors["canonical_m"]))
     field = build_field(settings, before_tuning, static).to(device)
     fill_field(field, tensors, path)
-    return TrainedAvatar(field.eval(), body, settings.paper.scene_m, body)
+    return TrainedAvatar(field.eval(), body, settings.paper.scene_m, body, gains)
 
 
-def _stored_settings(path: Path) -> tuple[TrainingSettings, bool]:
-    """What a subject was trained with, and whether it had one training frame."""
+def _stored_settings(path: Path) -> tuple[TrainingSettings, bool, Gains]:
+    """What a subject was trained with, whether it had one training frame, and the gains of its cameras."""
     stored = json.loads(path.read_text())
     try:
-        return TrainingSettings.model_validate(stored["training"]), stored["static"]
+        gains = {name: tuple(gain) for name, gain in stored.get("gains", {}).items()}
+        return TrainingSettings.model_validate(stored["training"]), stored["static"], gains
     except (KeyError, ValidationError):
         raise other_version(path) from None

@@ -1,5 +1,6 @@
 """Every training pixel that the person can reach, on the device, ready to be drawn as rays."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import cv2
@@ -67,6 +68,15 @@ class Pixels:
             self.edge[pick],
             None if self.plate is None else self.plate[pick] / 255,
         )
+
+    def levelled(self, gains: Tensor) -> "Pixels":
+        """As cameras would show them that were exposed alike: colour and plate by the gains (C, 3) of their cameras."""
+
+        def level(shown: Tensor) -> Tensor:
+            return (shown / gains[self.camera.long()]).round().clamp(0, 255).to(shown.dtype)
+
+        plate = None if self.plate is None else level(self.plate)
+        return dataclasses.replace(self, colour=level(self.colour), plate=plate)
 
     def rays(self, camera: Tensor, xy_px: Tensor) -> tuple[Tensor, Tensor]:
         """Origins and unit directions (R, 3) of pixels (R, 2) of cameras (R,)."""

@@ -24,6 +24,7 @@ from hnerf.segmentation.segment import Masks
 from hnerf.training.budget import Scene, decide
 from hnerf.training.checkpoint import load_checkpoint, save_checkpoint
 from hnerf.training.conditions import Conditions, Draws, own_share
+from hnerf.training.exposure import camera_gains
 from hnerf.training.losses import RaySamples, pixel
 from hnerf.training.model import build_field
 from hnerf.training.model_file import write_field
@@ -66,6 +67,10 @@ class Trainer:
         logger.info("gathering pixels")
         reach_m = math.inf if self.field.own_background else self.field.margin_m
         self.pixels: Pixels = gather_pixels(capture, masks, body, body.frames, reach_m, device)
+        self.gains, self.decisions["gains"] = camera_gains(capture, masks, body)
+        if self.gains:
+            by_camera = [self.gains[name] for name in capture.train_cameras]
+            self.pixels = self.pixels.levelled(torch.tensor(by_camera, device=device))
         self.at_edges = 0.0 if self.field.own_background else AT_EDGES  # the paper draws from all pixels alike
         seen = self.pixels.starts.diff() > 0  # not where a frame's masks were all dropped
         rows = {frame: row for row, frame in enumerate(body.frames) if seen[row]}
@@ -293,8 +298,12 @@ class Trainer:
         BodyFit(bodies.rig, self.body.frames, bodies.theta, bodies.root).to("cpu").save(folder)
         write_field(self.field, folder / "model.safetensors")
         decisions = {name: dataclasses.asdict(decision) for name, decision in self.decisions.items()}
-        settings = {"static": self.static, "training": self.settings.model_dump(), "decisions": decisions}
-        settings["seconds"] = self.seconds
+        settings: dict[str, Any] = {
+            "static": self.static,
+            "training": self.settings.model_dump(),
+            "decisions": decisions,
+        }
+        settings |= {"gains": self.gains, "seconds": self.seconds}
         (folder / "settings.json").write_text(json.dumps(settings, indent=1))
 
     def _finish(self) -> dict[str, Any]:

@@ -1,0 +1,85 @@
+"""How differently the cameras are exposed: gains a camera and channel, by what two of them see of the same places."""
+
+from itertools import combinations
+
+import numpy as np
+import trimesh
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.camera import Camera
+from hnerf.capture.capture import Capture
+from hnerf.evaluation.mesh_queries import Surface
+from hnerf.segmentation.masks import Masks
+from hnerf.spread import spread
+from hnerf.training.budget import Decision
+
+LOOKS = 8  # frames that are looked at
+FACING = 0.4  # least cosine between a place's normal and its direction to the camera
+DARK, BRIGHT = 15, 245  # of 255: beyond, a level is cut off or noise
+LEAST_PLACES = 100  # that two cameras share, for their ratio to count
+TELLING = 0.06  # of a gain's logarithm: less is what shading and a body fitted a little wrong leave
+
+Gains = dict[str, tuple[float, float, float]]
+
+
+def camera_gains(capture: Capture, masks: Masks, body: BodyFit) -> tuple[Gains, Decision]:
+    """Gains (R, G, B) of the training cameras, of geometric mean 1, and why (their means over channels); none where
+    cameras are exposed alike.
+
+    Cameras a and b show the same place of the body brighter or darker by median ratios r_ab over places and frames;
+    log g_b - log g_a = log r_ab is solved for all pairs by least squares, weighted by their numbers of places.
+    """
+    names = capture.train_cameras
+    ratios: dict[tuple[int, int], list[np.ndarray]] = {pair: [] for pair in combinations(range(len(names)), 2)}
+    for frame in spread(capture.train_frames, LOOKS) if ratios else ():
+        shown = trimesh.Trimesh(body.vertices_m()[body.index(frame)].numpy(), body.rig.faces.numpy(), process=False)
+        surface = Surface(shown)
+        levels = [_levels(capture, masks, surface, name, frame) for name in names]
+        for (a, b), found in ratios.items():
+            both = np.isfinite(levels[a] + levels[b]).all(1)
+            found.append(np.log(levels[b][both] / levels[a][both]))
+    pairs = {pair: np.concatenate(found) for pair, found in ratios.items()}
+    logs = solve_gains(len(names), {pair: found for pair, found in pairs.items() if len(found) >= LEAST_PLACES})
+    furthest = float(np.abs(logs).max())
+    told = f"seeing the same places of the body, cameras differ from their mean by {np.expm1(furthest):.0%} at most"
+    if furthest < TELLING:
+        return {}, Decision(1.0, f"{told}: no more than shading may" if logs.any() else "no two cameras to compare")
+    gains = {name: (float(r), float(g), float(b)) for name, (r, g, b) in zip(names, np.exp(logs), strict=True)}
+    return gains, Decision(tuple(round(float(np.mean(g)), 3) for g in gains.values()), told)
+
+
+def solve_gains(cameras: int, pairs: dict[tuple[int, int], np.ndarray]) -> np.ndarray:
+    """Logarithms of gains (C, 3), of mean 0 among cameras that pairs connect, from logarithms of ratios (n, 3) each."""
+    rows, wanted = np.zeros((len(pairs), cameras)), np.zeros((len(pairs), 3))
+    for k, ((a, b), found) in enumerate(pairs.items()):
+        weight = np.sqrt(len(found))
+        rows[k, [a, b]], wanted[k] = (-weight, weight), weight * np.median(found, 0)
+    return np.linalg.lstsq(rows, wanted, rcond=None)[0] if pairs else np.zeros((cameras, 3))
+
+
+def _levels(capture: Capture, masks: Masks, surface: Surface, name: str, frame: int) -> np.ndarray:
+    """What a camera shows at the body's vertices, (V, 3) of 255; NaN where they are hidden, or say nothing."""
+    levels = np.full(surface.mesh.vertices.shape, np.nan)
+    if (name, frame) not in masks:
+        return levels
+    camera = capture.cameras[name]
+    seen, xy = _in_sight(camera, surface)
+    x, y = xy.T
+    levels[seen] = capture.image(name, frame)[y, x]
+    telling = masks.get(name, frame)[y, x] & (levels[seen] > DARK).all(1) & (levels[seen] < BRIGHT).all(1)
+    levels[np.flatnonzero(seen)[~telling]] = np.nan
+    return levels
+
+
+def _in_sight(camera: Camera, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """(V,) bool: vertices that face the camera and that nothing hides; the pixels (n, 2) of these."""
+    mesh = surface.mesh
+    away = camera.centre_m - mesh.vertices
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    xy = np.round(camera.project(mesh.vertices)[0])
+    inside = ((xy >= 0) & (xy < (camera.width_px, camera.height_px))).all(1)
+    seen = inside & ((away * mesh.vertex_normals).sum(1) > FACING)
+    hits = surface.cast(np.broadcast_to(camera.centre_m, (int(seen.sum()), 3)), -away[seen])
+    met = (mesh.faces[hits.face] == np.flatnonzero(seen)[:, None]).any(1)
+    seen[np.flatnonzero(seen)[~met]] = False
+    return seen, xy[seen].astype(int)

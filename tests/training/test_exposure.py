@@ -1,0 +1,105 @@
+"""What two cameras see of the same places tells how differently they are exposed."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from hnerf.evaluation.mesh_queries import Surface
+from hnerf.training.exposure import _in_sight, camera_gains, solve_gains
+from hnerf.training.model import TrainedAvatar, build_field
+from hnerf.training.pixels import Pixels, gather_pixels
+from tests.training.scene import TINY, KnownMasks, look_at, record
+
+BALL = trimesh.creation.icosphere(subdivisions=5)  # 10242 vertices 1 m around the origin
+RING = {name: look_at(name, 4.0 * np.array([x, y, 0]), np.zeros(3)).resized(128, 128)
+        for name, x, y in [("a", 1, 0), ("b", 0, 1), ("c", -1, 0), ("d", 0, -1)]}  # fmt: skip
+
+
+def photograph(name: str, gain: tuple[float, ...]) -> np.ndarray:
+    """(128, 128, 3): a ball that is brighter above than below, as a camera of this gain shows it."""
+    camera = RING[name]
+    y, x = np.mgrid[:128, :128]
+    origin, directions = camera.rays(np.stack([x, y], -1).reshape(-1, 2).astype(float))
+    along = -(origin * directions).sum(1)
+    missed2 = (origin**2).sum(1) - along**2
+    hit_m = origin + (along - np.sqrt((1 - missed2).clip(0)))[:, None] * directions
+    level = np.where(missed2 < 1, 100 + 40 * hit_m[:, 2], 128)
+    return (level[:, None] * gain).round().reshape(128, 128, 3).astype(np.uint8)
+
+
+def measured(gains: dict[str, tuple[float, float, float]]) -> Any:
+    pictures = {name: photograph(name, gain) for name, gain in gains.items()}
+    capture: Any = SimpleNamespace(
+        train_cameras=tuple(gains), train_frames=(3,), cameras=RING, image=lambda name, frame: pictures[name]
+    )
+    body: Any = SimpleNamespace(
+        vertices_m=lambda: torch.from_numpy(BALL.vertices.copy())[None],
+        rig=SimpleNamespace(faces=torch.from_numpy(BALL.faces.copy())),
+        index=lambda frame: 0,
+    )
+    masks: Any = KnownMasks({(name, 3): np.ones((128, 128), bool) for name in gains})
+    return camera_gains(capture, masks, body)
+
+
+def test_gains_by_hand() -> None:
+    """b is twice as bright as a and as c: about a mean of 2^(1/3), a and c at 1, b at 2. d shares nothing."""
+    twice = np.full((400, 3), np.log(2))
+    logs = solve_gains(4, {(0, 1): twice, (1, 2): -twice})
+    assert np.exp(logs[:, 0]) == pytest.approx([2 ** (-1 / 3), 2 ** (2 / 3), 2 ** (-1 / 3), 1])
+
+
+def test_the_larger_number_of_places_counts_more() -> None:
+    """Three cameras in a ring whose ratios contradict each other by log 0.3: shares as 1 / 300, 1 / 300 and 1 / 100."""
+    logs = solve_gains(3, {(0, 1): np.zeros((300, 3)), (1, 2): np.zeros((300, 3)), (0, 2): np.full((100, 3), 0.3)})
+    assert logs[2, 0] - logs[0, 0] == pytest.approx(0.3 * (1 / 150) / (1 / 150 + 1 / 100))
+
+
+def test_gains_of_cameras_that_see_the_same_ball() -> None:
+    true = {"a": (0.8, 0.8, 0.9), "b": (1.2, 1.1, 1.0), "c": (1.0, 1.0, 1.0), "d": (1.1, 1.2, 1.0)}
+    found, decision = measured(true)
+    mean = np.exp(np.mean([np.log(gain) for gain in true.values()], 0))
+    for name, gain in true.items():
+        assert found[name] == pytest.approx(tuple(gain / mean), rel=0.01)
+    assert "differ from their mean by 27%" in decision.reason  # red of a: (1.2 x 1.1 / 0.8^3)^(1/4) = 1.267
+
+
+def test_nothing_is_changed_where_shading_may_be_the_cause_or_nobody_compares() -> None:
+    assert measured({"a": (1, 1, 1), "b": (1.03, 1, 1), "c": (1, 1, 1), "d": (1, 1, 1)})[0] == {}
+    assert measured({"a": (0.5, 0.5, 0.5), "c": (1, 1, 1)})[1].reason == "no two cameras to compare"  # back to back
+    assert measured({"a": (0.5, 0.5, 0.5)})[0] == {}
+
+
+def test_what_is_hidden_is_not_in_sight() -> None:
+    """A ball of a quarter of the size between camera a and the other one hides the middle of it."""
+    small = trimesh.creation.icosphere(subdivisions=4, radius=0.25).apply_translation([2, 0, 0])
+    seen, _ = _in_sight(RING["a"], Surface(trimesh.util.concatenate([BALL, small])))
+    places = BALL.vertices[seen[: len(BALL.vertices)]]
+    assert len(places) > 100
+    assert (np.hypot(places[:, 1], places[:, 2]) / (4 - places[:, 0]) > 0.12).all()  # beside the small one's cone
+    assert seen[len(BALL.vertices) :].any()
+
+
+def test_pixels_are_levelled_by_their_cameras(tmp_path: Path) -> None:
+    capture, masks, body = record(tmp_path)
+    pixels: Pixels = gather_pixels(capture, masks, body, body.frames, 0.2, torch.device("cpu"))
+    levelled = pixels.levelled(torch.tensor([[2.0, 1, 0.5], [1, 1, 1], [1, 1, 1], [1, 1, 1]]))
+    first = pixels.camera == 0
+    assert levelled.colour[first & pixels.person].unique(dim=0).tolist() == [[100, 50, 100]]  # of 200, 50, 50
+    assert pixels.plate is not None and levelled.plate is not None
+    assert levelled.plate[first].unique(dim=0).tolist() == [[64, 128, 255]]  # of 128
+    assert torch.equal(levelled.colour[~first], pixels.colour[~first])
+
+
+def test_a_training_camera_shows_what_its_gain_makes_of_it(tmp_path: Path) -> None:
+    capture, _, body = record(tmp_path)
+    avatar = TrainedAvatar(build_field(TINY, body, False), body, 1.0, body, {"0": (0.5, 1.0, 2.0)})
+    plain = TrainedAvatar(avatar.field, body, 1.0, body)
+    for name, gain in (("0", (0.5, 1.0, 2.0)), ("1", (1.0, 1.0, 1.0))):
+        shown, expected = (a.render(capture.cameras[name], body.theta[0], body.root[0]).rgb for a in (avatar, plain))
+        assert expected.max() > 0.1
+        assert torch.equal(shown, (expected * torch.tensor(gain)).clamp(0, 1))
