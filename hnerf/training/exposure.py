@@ -17,7 +17,7 @@ LOOKS = 8  # frames that are looked at
 FACING = 0.4  # least cosine between a place's normal and its direction to the camera
 DARK, BRIGHT = 15, 245  # of 255: beyond, a level is cut off or noise
 LEAST_PLACES = 100  # that two cameras share, for their ratio to count
-TELLING = 0.06  # of a gain's logarithm: less is what shading and a body fitted a little wrong leave
+TELLING = 0.1  # of a gain's logarithm: shading, and bodies fitted a little wrong, leave 0.03 of cameras exposed alike
 
 Gains = dict[str, tuple[float, float, float]]
 

@@ -69,7 +69,7 @@ def test_gains_of_cameras_that_see_the_same_ball() -> None:
 
 
 def test_nothing_is_changed_where_shading_may_be_the_cause_or_nobody_compares() -> None:
-    assert measured({"a": (1, 1, 1), "b": (1.03, 1, 1), "c": (1, 1, 1), "d": (1, 1, 1)})[0] == {}
+    assert measured({"a": (1, 1, 1), "b": (1.1, 1, 1), "c": (1, 1, 1), "d": (1, 1, 1)})[0] == {}
     assert measured({"a": (0.5, 0.5, 0.5), "c": (1, 1, 1)})[1].reason == "no two cameras to compare"  # back to back
     assert measured({"a": (0.5, 0.5, 0.5)})[0] == {}
 
