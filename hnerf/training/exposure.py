@@ -76,8 +76,9 @@ def _in_sight(camera: Camera, surface: Surface) -> tuple[np.ndarray, np.ndarray]
     mesh = surface.mesh
     away = camera.centre_m - mesh.vertices
     away /= np.linalg.norm(away, axis=1, keepdims=True)
-    xy = np.round(camera.project(mesh.vertices)[0])
-    inside = ((xy >= 0) & (xy < (camera.width_px, camera.height_px))).all(1)
+    xy, depth_m = camera.project(mesh.vertices)
+    xy = np.round(xy)
+    inside = ((xy >= 0) & (xy < (camera.width_px, camera.height_px))).all(1) & (depth_m > 0)
     seen = inside & ((away * mesh.vertex_normals).sum(1) > FACING)
     hits = surface.cast(np.broadcast_to(camera.centre_m, (int(seen.sum()), 3)), -away[seen])
     met = (mesh.faces[hits.face] == np.flatnonzero(seen)[:, None]).any(1)

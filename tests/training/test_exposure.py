@@ -1,5 +1,6 @@
 """What two cameras see of the same places tells how differently they are exposed."""
 
+import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -82,6 +83,9 @@ def test_what_is_hidden_is_not_in_sight() -> None:
     assert len(places) > 100
     assert (np.hypot(places[:, 1], places[:, 2]) / (4 - places[:, 0]) > 0.12).all()  # beside the small one's cone
     assert seen[len(BALL.vertices) :].any()
+    turned = np.diag([-1.0, 1, -1])
+    away = dataclasses.replace(RING["a"], R=turned @ RING["a"].R, t_m=turned @ RING["a"].t_m)
+    assert not _in_sight(away, Surface(BALL))[0].any()  # it is behind the camera
 
 
 def test_pixels_are_levelled_by_their_cameras(tmp_path: Path) -> None:
