@@ -25,7 +25,7 @@ MIN_FRAMES = 8  # that a shifted camera must share with the others, at the best 
 STRETCHES = 12  # of frames, each left out once
 POSSIBLE, CERTAIN = 2.0, 5.0  # standard errors that an offset must exceed to be suspected, and to be believed
 LEAST_OFFSET = 0.1  # frames: less is within what the parabola can tell
-FARTHEST_FRAMES = 1.2  # between an instant and the picture that shows it
+FARTHEST = 1.2  # recorded frames between an instant and the picture that shows it
 OBSERVABLE_STEPS = 0.5  # standard error up to which an offset says something
 CLEAR_BEND = 2.0  # standard errors by which one step must raise the distances
 REWEIGHTED = 5  # rounds of iteratively re-weighted least squares
@@ -127,7 +127,8 @@ def put_in_step(
     lost = [frame for frame in capture.frames if frame not in in_step.frames]
     off_frames = {name: in_step.recorded(name, 0) - offset for name, offset in offsets.items()}
     farthest = max(off_frames, key=lambda name: abs(off_frames[name]))
-    if 2 * len(lost) > len(capture.frames) or not in_step.train_frames or abs(off_frames[farthest]) > FARTHEST_FRAMES:
+    too_far = abs(off_frames[farthest]) > FARTHEST * capture.frame_step
+    if 2 * len(lost) > len(capture.frames) or not in_step.train_frames or too_far:
         raise CaptureError(f"{capture.name}: {_what_to_cut(capture.train_cameras, offsets)}")
     if in_step.frame_step != capture.frame_step:
         what = (

@@ -125,6 +125,8 @@ def _cameras(wish: Wish, capture: Capture, body: BodyFit) -> list[Camera]:
     else:
         count = wish.pictures or poses or ORBIT_PICTURES
         found = orbit(recorded, _middle_m(body), count, capture.up, wish.radius_m, wish.height_m)
+    if wish.camera is None:  # made after a recorded one, but not exposed as it is
+        found = [dataclasses.replace(camera, name="") for camera in found]
     return found if wish.size_px is None else [_sized(camera, wish.size_px) for camera in found]
 
 

@@ -31,9 +31,9 @@ def camera_gains(capture: Capture, masks: Masks, body: BodyFit) -> tuple[Gains, 
     """
     names = capture.train_cameras
     ratios: dict[tuple[int, int], list[np.ndarray]] = {pair: [] for pair in combinations(range(len(names)), 2)}
+    vertices_m, faces = body.vertices_m().numpy(), body.rig.faces.numpy()
     for frame in spread(capture.train_frames, LOOKS) if ratios else ():
-        shown = trimesh.Trimesh(body.vertices_m()[body.index(frame)].numpy(), body.rig.faces.numpy(), process=False)
-        surface = Surface(shown)
+        surface = Surface(trimesh.Trimesh(vertices_m[body.index(frame)], faces, process=False))
         levels = [_levels(capture, masks, surface, name, frame) for name in names]
         for (a, b), found in ratios.items():
             both = np.isfinite(levels[a] + levels[b]).all(1)

@@ -16,6 +16,7 @@ from hnerf.segmentation.prior import window_around
 from hnerf.segmentation.segment import Masks
 
 AT_EDGES = 1 / 3  # of the rays: half of the error is there, most of it in hands and feet, which are little else
+LEVELLED_AT_ONCE = 1 << 20  # pixels, which bounds memory
 EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel may mix person and surroundings
 
 
@@ -73,7 +74,8 @@ class Pixels:
         """As cameras would show them that were exposed alike: colour and plate by the gains (C, 3) of their cameras."""
 
         def level(shown: Tensor) -> Tensor:
-            return (shown / gains[self.camera.long()]).round().clamp(0, 255).to(shown.dtype)
+            parts = zip(shown.split(LEVELLED_AT_ONCE), self.camera.split(LEVELLED_AT_ONCE), strict=True)
+            return torch.cat([(part / gains[camera.long()]).round().clamp(0, 255).byte() for part, camera in parts])
 
         plate = None if self.plate is None else level(self.plate)
         return dataclasses.replace(self, colour=level(self.colour), plate=plate)

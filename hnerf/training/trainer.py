@@ -339,7 +339,7 @@ def train(
 ) -> dict[str, Any]:
     """Train the subject into `out`, from its checkpoint where there is one; the report as a dict.
 
-    The last checkpoint stays, so that who is stopped before the files are safe need only write them again;
+    The last checkpoint stays, so that who is stopped while the files are written need only write them again;
     `remove_checkpoint` is for the caller.
     Raises TrainingError where the surface collapses or the losses stay non-finite.
     """

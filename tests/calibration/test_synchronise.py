@@ -4,8 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hnerf.calibration import synchronise as synchronise_module
 from hnerf.calibration.check import check_calibration, load_cameras
-from hnerf.calibration.synchronise import measure_timing, synchronise
+from hnerf.calibration.synchronise import measure_timing, put_in_step, synchronise
 from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
 from hnerf.errors import CaptureError
@@ -125,6 +126,18 @@ def test_strided_frames_show_what_is_less_than_a_frame_off(tmp_path: Path, no_pi
     found, given = used.keypoints("c0"), capture.keypoints("c0")
     assert found is not None and given is not None
     assert np.abs(found[5] - (0.8 * given[5] + 0.2 * given[6])).max() < 2
+
+
+def test_numbers_with_gaps_count_in_recorded_frames(
+    tmp_path: Path, no_pictures: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of pictures numbered 0, 5, 10, ... one that is 2 numbers late is 0.4 of a picture away from its instant."""
+    numbers = tuple(range(0, 5 * FRAMES, 5))
+    capture = dataclasses.replace(capture_of(tmp_path, recorded({}), frames=numbers), frame_step=5)
+    monkeypatch.setattr(synchronise_module, "synchronise", lambda *_: ({"c1": 2.0}, {}, []))
+    in_step, _, notes = put_in_step(capture, ring(4), recorded({}), SETTINGS)
+    assert in_step.frames == numbers
+    assert not notes
 
 
 def test_recorded_frame_numbers_count() -> None:

@@ -109,6 +109,15 @@ def test_a_path_without_sizes_has_that_of_the_recording(subject: Path, tmp_path:
     assert (found.width_px, found.height_px) == (500, 300)
 
 
+def test_cameras_that_did_not_record_have_no_exposure_of_their_own(subject: Path) -> None:
+    """An orbit is made after the first camera, and a path's may be called like any: neither has its gain."""
+    capture, body = Capture.load(subject / "capture"), BodyFit.load(subject / "training")
+    assert not {camera.name for camera in _cameras(Wish(), capture, body)} & set(capture.cameras)
+    along_recorded = _cameras(Wish(path=subject / "calibration"), capture, body)
+    assert not {camera.name for camera in along_recorded} & set(capture.cameras)
+    assert {camera.name for camera in _cameras(Wish(camera="2"), capture, body)} == {"2"}
+
+
 def test_interpolation_and_another_motion(subject: Path, tmp_path: Path) -> None:
     wish = ["--between", "0", "2", "--pictures", "5", "--motion", str(subject), "--path", str(subject / "calibration")]
     assert main(["render", str(subject), "--out", str(tmp_path / "out"), "--what", "depth", *wish]) == 0
