@@ -23,6 +23,7 @@ NEAR_SHARE = 0.03  # of the person's height: how wrong a body fitted to keypoint
 SOLE_SHARE = 0.06  # of the person's height: how far a shoe may go on below the lowest keypoint
 UPRIGHT = 0.7  # cosine between the image's and the world's vertical from which down is down
 HEAD_SHARE = 0.45  # of the distance from neck to nose: radius of the head about a point a little above the nose
+FAR = 5  # widths or heights of the image, beyond which nothing is drawn
 FACE = (15, 16, 17, 18)
 LEGS = ((9, 10, 11, (22, 23, 24)), (12, 13, 14, (19, 20, 21)))  # hip, knee, ankle, foot
 NOSE_ABOVE_NECK, THIGH = 0.45, 0.8  # of the distance from neck to mid-hip, along which what is not seen is likely
@@ -185,7 +186,9 @@ def _sticks(capture: Capture, body: BodyFit | None = None) -> dict[str, list[_St
 
 
 def _stick(camera: Camera, pose_px: np.ndarray) -> _Stick:
-    """pose_px (25, 2), NaN where nothing is known."""
+    """pose_px (25, 2), NaN where nothing is known; cut off far outside the image, as drawing takes small integers."""
+    far_px = FAR * max(camera.width_px, camera.height_px)
+    pose_px = pose_px.clip(-far_px, far_px)
     whole_px = _likely(pose_px)
     known = np.isfinite(whole_px).all(-1, keepdims=True)
     height_px = float(person_heights_px(np.concatenate([np.nan_to_num(whole_px), known], -1)))
@@ -193,7 +196,7 @@ def _stick(camera: Camera, pose_px: np.ndarray) -> _Stick:
     likely = _drawn(camera, whole_px, height_px)[1].astype(np.uint8)
     for _, _, ankle, foot in LEGS:
         if known[ankle] and not np.isfinite(pose_px[list(foot)]).any():
-            cv2.circle(likely, _pixel(camera, whole_px[ankle]), round(FOOT_SHARE * height_px), 1, cv2.FILLED)
+            cv2.circle(likely, _pixel(whole_px[ankle]), round(FOOT_SHARE * height_px), 1, cv2.FILLED)
     return _Stick(core, body, body | likely.astype(bool), height_px)
 
 
@@ -206,21 +209,19 @@ def _drawn(camera: Camera, pose_px: np.ndarray, height_px: float) -> tuple[np.nd
     def draw(limbs: tuple[tuple[int, int], ...], times: int = 1) -> np.ndarray:
         for a, b in limbs:
             if seen[a] and seen[b]:
-                cv2.line(image, _pixel(camera, pose_px[a]), _pixel(camera, pose_px[b]), 1, times * width_px)
+                cv2.line(image, _pixel(pose_px[a]), _pixel(pose_px[b]), 1, times * width_px)
         return image.astype(bool)
 
     if seen[list(TRUNK)].all():
-        cv2.fillConvexPoly(image, cv2.convexHull(np.array([_pixel(camera, pose_px[k]) for k in TRUNK])), 1)
+        cv2.fillConvexPoly(image, cv2.convexHull(np.array([_pixel(pose_px[k]) for k in TRUNK])), 1)
     if seen[0] and seen[1]:
         up_px = pose_px[0] - pose_px[1]
         radius_px = round(HEAD_SHARE * float(np.linalg.norm(up_px)) + CORE_SHARE * height_px)
-        cv2.circle(image, _pixel(camera, pose_px[0] + 0.15 * up_px), radius_px, 1, cv2.FILLED)
+        cv2.circle(image, _pixel(pose_px[0] + 0.15 * up_px), radius_px, 1, cv2.FILLED)
     draw(THICK, times=2)
     return draw(LIMBS), draw(FEET)
 
 
-def _pixel(camera: Camera, at_px: np.ndarray) -> tuple[int, int]:
-    """Cut off far outside the image: drawing takes 32-bit integers."""
-    farthest_px = 5 * max(camera.width_px, camera.height_px)
-    x, y = at_px.clip(-farthest_px, farthest_px).round().astype(int).tolist()
+def _pixel(at_px: np.ndarray) -> tuple[int, int]:
+    x, y = at_px.round().astype(int).tolist()
     return x, y

@@ -28,6 +28,17 @@ def test_what_no_keypoint_shows_is_within_reach(tmp_path: Path, cameras: int, un
         assert priors[camera][frame].reach[person].all()
 
 
+def test_a_detection_far_outside_the_image_is_drawn_no_farther_than_that(tmp_path: Path) -> None:
+    capture, truth = write_scene(tmp_path, 1)
+    with np.load(tmp_path / "keypoints.npz") as stored:
+        found = {name: stored[name] for name in stored.files}
+    found["c0"][0, 0, 4, :2] = 1e7, -1e9
+    np.savez(tmp_path / "keypoints.npz", **found)
+    prior = keypoint_priors(capture, SegmentationSettings())["c0"][0]
+    assert 5 * 400 < prior.height_px < 6 * 400  # from 5 heights above the image to the feet in it
+    assert prior.reach[truth["c0", 0]].all()
+
+
 def test_head_and_legs_in_line_with_the_trunk_by_hand() -> None:
     # Neck at (50, 20), mid-hip at (50, 40), the left knee seen off that line; nothing else is.
     pose_px = np.full((25, 2), np.nan)
