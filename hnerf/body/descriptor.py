@@ -73,18 +73,23 @@ class BodyMeshes:
         self._threads = ThreadPoolExecutor(torch.get_num_threads())
         self._device = wp.device_from_torch(vertices_m.device)
         self._faces = faces
-        self._indices = wp.from_torch(faces.to(torch.int32).flatten().contiguous())
-        self.move(vertices_m)
-
-    def move(self, vertices_m: Tensor) -> None:
-        """Replace the vertices (n, V, 3) of every copy."""
-        vertices_m = vertices_m.detach().float().contiguous()
+        indices = wp.from_torch(faces.to(torch.int32).flatten().contiguous())
         self._meshes = [
-            wp.Mesh(points=wp.from_torch(v, dtype=wp.vec3), indices=self._indices, support_winding_number=True)
-            for v in vertices_m
+            wp.Mesh(points=points, indices=indices, support_winding_number=True) for points in self._at(vertices_m)
         ]
         self._ids = wp.array([m.id for m in self._meshes], dtype=wp.uint64, device=self._device)
+
+    def move(self, vertices_m: Tensor) -> None:
+        """Replace the vertices (n, V, 3) of every copy, by others nearby: the hierarchies are refitted, not built
+        again."""
+        for mesh, points in zip(self._meshes, self._at(vertices_m), strict=True):
+            mesh.points = points
+
+    def _at(self, vertices_m: Tensor) -> list[wp.array]:
+        """Each copy's vertices for warp, which keeps no others of its own; their normals for the sign."""
+        vertices_m = vertices_m.detach().float().contiguous()
         self._normals = vertex_normals(vertices_m, self._faces)
+        return [wp.from_torch(v, dtype=wp.vec3) for v in vertices_m]
 
     def closest_points(
         self, points_m: Tensor, mesh_index: Tensor, reach_m: float, exact_sign: bool = False

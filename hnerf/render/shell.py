@@ -10,6 +10,8 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from hnerf.body.canonical import blended
+
 EMPTY, SHELL, SOLID = 0, 1, 2
 SLACK = 3**0.5 / 2  # half a diagonal of a cell, in cells
 
@@ -24,26 +26,30 @@ class ShellGrid:
     cell_m: float
 
     @staticmethod
-    def around(surfaces_m: Tensor, outer_m: Tensor, inner_m: Tensor, cell_m: float) -> "ShellGrid":
-        """The shell around closed surfaces, from dense points on them (n, V, 3) with the shell's own thickness outside
-        and inside at each point, (n, V) metres.
+    def around(
+        vertices_m: Tensor, outer_m: Tensor, inner_m: Tensor, points: tuple[Tensor, Tensor], cell_m: float
+    ) -> "ShellGrid":
+        """The shell around closed surfaces, from their vertices (n, V, 3) with the shell's own thickness outside and
+        inside at each, (n, V) metres, and dense points on them, as `lattice` gives them.
 
         Distances are between the centres of cells, half a diagonal is added to them: the shell is up to a cell thicker
         than asked, seldom thinner. A cell takes the greatest thickness in the neighbourhood of its nearest point.
         """
+        corners, weights = points
         margin_m = float(outer_m.max()) + 2 * cell_m
-        lower = surfaces_m.amin(1) - margin_m
-        sizes = ((surfaces_m.amax(1) + margin_m - lower) / cell_m).ceil().long()
-        index = ((surfaces_m - lower[:, None]) / cell_m).long()
+        lower = vertices_m.amin(1) - margin_m
+        sizes = ((vertices_m.amax(1) + margin_m - lower) / cell_m).ceil().long()
         cells = np.full((len(sizes), *sizes.amax(0).tolist()), EMPTY, np.uint8)
 
-        def fill(own: np.ndarray, size: np.ndarray, *surface: np.ndarray) -> None:
-            own[tuple(map(slice, size))] = _cells_around(size, *surface)
+        def fill(row: int) -> None:
+            index = ((blended(vertices_m[row], corners, weights) - lower[row]) / cell_m).long()
+            thickness = (side[row][corners].amax(-1) / cell_m for side in (outer_m, inner_m))
+            size, *surface = (t.cpu().numpy() for t in (sizes[row], index, *thickness))
+            cells[row][tuple(map(slice, size))] = _cells_around(size, *surface)
 
-        by_frame = (t.cpu().numpy() for t in (sizes, index, outer_m / cell_m, inner_m / cell_m))
-        with ThreadPoolExecutor(torch.get_num_threads()) as threads:
-            list(threads.map(fill, cells, *by_frame))
-        return ShellGrid(torch.from_numpy(cells).to(surfaces_m.device), lower, cell_m)
+        with ThreadPoolExecutor(torch.get_num_threads()) as threads:  # a frame a thread, which bounds memory
+            list(threads.map(fill, range(len(cells))))
+        return ShellGrid(torch.from_numpy(cells).to(vertices_m.device), lower, cell_m)
 
     def look_up(self, origins_m: Tensor, directions: Tensor, depths_m: Tensor, frame: Tensor) -> Tensor:
         """State of the cells at depths (R, K) along rays (R, 3) in frames (R,): (R, K) uint8. Beyond the grid it is

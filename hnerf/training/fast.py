@@ -5,7 +5,7 @@ import dataclasses
 import torch
 from torch import Tensor, nn
 
-from hnerf.body.canonical import FAR_M, Descriptor, PoseCorrection, PosedBodies, blended
+from hnerf.body.canonical import FAR_M, Descriptor, PoseCorrection, PosedBodies
 from hnerf.body.descriptor import vertex_normals
 from hnerf.body.rig import Rig
 from hnerf.config import FastFieldSettings
@@ -72,15 +72,13 @@ class FastField(Field):
 
     def region(self, bodies: PosedBodies, conditions: Conditions) -> ShellGrid:
         """Where rays are sampled: the shell around bodies as they stand now, where their frames displace it to."""
-        points_m = torch.stack([blended(v, self.corners, self.weights) for v in bodies.vertices_m])
-        outwards_m = points_m.new_zeros(len(points_m), 1)
+        outwards_m = bodies.vertices_m.new_zeros(len(bodies.vertices_m), 1)
         if self.deformation is not None:
             outwards_m = self.deformation.outwards(conditions.moment)
         s, least_m = self.settings, self.settings.shell_cell_m
         outer_m = (self.outer_m + outwards_m).clamp(least_m, s.outer_m)
         inner_m = (self.inner_m - outwards_m).clamp(least_m, s.inner_m)
-        outer_m, inner_m = (torch.stack([t[self.corners].amax(-1) for t in side]) for side in (outer_m, inner_m))
-        return ShellGrid.around(points_m, outer_m, inner_m, s.shell_cell_m)
+        return ShellGrid.around(bodies.vertices_m, outer_m, inner_m, (self.corners, self.weights), s.shell_cell_m)
 
     @torch.no_grad()
     def tighten(self, rig: Rig, pose: Tensor) -> None:
@@ -89,21 +87,20 @@ class FastField(Field):
         deformation, with which the shell moves."""
         s, rest = self.settings, torch.zeros(1, len(rig.joints_m), 3, device=self.canonical_m.device)
         bodies = PosedBodies(rig, rest, torch.eye(4, device=rest.device)[None], self.canonical_m)
-        depths_m = torch.arange(-s.inner_m, s.outer_m, TIGHTEN_STEP_M, device=rest.device)
         normals = vertex_normals(bodies.vertices_m[0], rig.faces)
-        points = (bodies.vertices_m[0, :, None] + depths_m[:, None] * normals[:, None]).flatten(0, 1)
-        described = bodies.describe(
-            points, torch.zeros(len(points), dtype=torch.long, device=rest.device), self.reach_m
-        )
+        only = torch.zeros(len(normals), dtype=torch.long, device=rest.device)
         settled_m = SETTLED / self.log_sharpness.exp()
-        seen = torch.zeros_like(described.near)
-        for row in pose:
-            d_hat = described.d + self._residual(described, row.expand(len(points), -1))
-            seen |= described.near & (d_hat.abs() < settled_m)
-        for name, side in (("outer_m", 1), ("inner_m", -1)):
-            reached = torch.zeros_like(self.outer_m)
-            reached = reached.scatter_reduce_(0, described.vertex[seen], side * described.d[seen], "amax")
-            self.get_buffer(name).copy_((reached + ROOM_M).minimum(self.get_buffer(name)))
+        reached_m = {1: torch.zeros_like(self.outer_m), -1: torch.zeros_like(self.inner_m)}
+        for depth_m in torch.arange(-s.inner_m, s.outer_m, TIGHTEN_STEP_M).tolist():
+            described = bodies.describe(bodies.vertices_m[0] + depth_m * normals, only, self.reach_m)
+            seen = torch.zeros_like(described.near)
+            for row in pose:
+                d_hat = described.d + self._residual(described, row.expand(len(normals), -1))
+                seen |= described.near & (d_hat.abs() < settled_m)
+            for side, reached in reached_m.items():
+                reached.scatter_reduce_(0, described.vertex[seen], side * described.d[seen], "amax")
+        for side, thickness_m in ((1, self.outer_m), (-1, self.inner_m)):
+            thickness_m.copy_((reached_m[side] + ROOM_M).minimum(thickness_m))
 
     def parameter_groups(self) -> list[dict]:
         """Adam groups; feature grids bear a larger rate than networks."""

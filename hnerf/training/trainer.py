@@ -286,7 +286,8 @@ class Trainer:
         self.generator.set_state(state["generator"].cpu())
         self.history = json.loads(state["history"])
         rig = dataclasses.replace(self.body.rig, **state["rig"])
-        self._stand(PosedBodies(rig, state["theta"], state["root"], self.field.canonical_m))
+        self.stage.bodies.stand(rig, state["theta"], state["root"])  # from the fit, as they did: bit by bit the same
+        self._stand(self.stage.bodies)
         if self.step > self.field_steps:
             self._freeze_field()
         logger.info("resumed at step %d", self.step)

@@ -62,6 +62,19 @@ def test_fast_form_agrees_with_the_reference(exact: bool):
     assert torch.equal(fast.sign, slow.sign)
 
 
+@pytest.mark.parametrize("exact", [False, True])
+def test_moved_bodies_are_found_where_they_are(exact: bool):
+    """A unit box that is moved to [1, 2] along x: the points of `test_box_by_hand`, moved along, find the same."""
+    vertices, away = box_vertices(), torch.tensor([1.0, 0.0, 0.0])
+    points = away + torch.tensor([[2.0, 0.5, 0.5], [0.5, 0.5, 0.4]])
+    meshes = BodyMeshes(vertices[None], box_faces())
+    meshes.move((vertices + away)[None])
+    found = meshes.closest_points(points, torch.zeros(2, dtype=torch.int32), 5.0, exact)
+    closest = ((vertices + away)[box_faces()[found.face]] * found.barycentric[..., None]).sum(1)
+    torch.testing.assert_close(closest, torch.tensor([[2.0, 0.5, 0.5], [1.5, 0.5, 0.0]]))
+    assert found.sign.tolist() == [1.0, -1.0]
+
+
 def test_exact_sign_inside_a_body_that_intersects_itself():
     """Two unit boxes that overlap from x = 0.6 to 1: at x = 0.55 the nearest surface is the second box's buried wall,
     and the point outside that wall, but inside the first box."""

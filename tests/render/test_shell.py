@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from hnerf.render.shell import EMPTY, SHELL, SOLID, ShellGrid, box_interval, lattice
+from tests.body.boxes import box_faces, box_vertices
 
 
 def sphere(radius_m: float) -> torch.Tensor:
@@ -10,10 +11,17 @@ def sphere(radius_m: float) -> torch.Tensor:
     return radius_m * torch.nn.functional.normalize(points, dim=-1)[None]
 
 
+def around(surface: torch.Tensor, outer: torch.Tensor, inner: torch.Tensor, cell_m: float) -> ShellGrid:
+    """Of surfaces whose vertices are dense: they alone are the points."""
+    corners = torch.arange(surface.shape[1])[:, None].expand(-1, 3)
+    points = corners, torch.tensor([1.0, 0.0, 0.0]).expand(len(corners), -1)
+    return ShellGrid.around(surface, outer, inner, points, cell_m)
+
+
 def even_shell(surface: torch.Tensor, outer_m: float, inner_m: float, cell_m: float) -> ShellGrid:
     """As thick everywhere."""
     outer, inner = (torch.full(surface.shape[:2], thickness) for thickness in (outer_m, inner_m))
-    return ShellGrid.around(surface, outer, inner, cell_m)
+    return around(surface, outer, inner, cell_m)
 
 
 def along_x(grid: ShellGrid, x_m: list[float]) -> list[int]:
@@ -40,7 +48,7 @@ def test_the_shell_is_as_thick_as_its_surface_asks():
     """Thick on the side of x > 0, thin on the other: 8 cm off is shell on one side alone."""
     surface = sphere(0.3)
     outer = torch.where(surface[..., 0] > 0, 0.1, 0.02)
-    grid = ShellGrid.around(surface, outer, torch.full_like(outer, 0.02), 0.01)
+    grid = around(surface, outer, torch.full_like(outer, 0.02), 0.01)
     assert along_x(grid, [0.38, -0.38, 0.31, -0.31]) == [SHELL, EMPTY, SHELL, SHELL]
 
 
@@ -48,10 +56,19 @@ def test_every_frame_has_its_own_surface_and_thickness():
     """A sphere of 0.3 m with a shell of 2 cm, and one of 0.2 m with 8 cm: 5 cm outside either."""
     outer = torch.tensor([0.02, 0.08])[:, None].expand(-1, 40000)
     surfaces = torch.cat([sphere(0.3), sphere(0.2)])
-    grid = ShellGrid.around(surfaces, outer, torch.full_like(outer, 0.04), 0.01)
+    grid = around(surfaces, outer, torch.full_like(outer, 0.04), 0.01)
     along, frames = torch.tensor([[0.35], [0.25], [0.35], [0.25]]), torch.tensor([0, 1, 1, 0])
     found = grid.look_up(torch.zeros(4, 3), torch.eye(3)[[0, 0, 0, 0]], along, frames)[:, 0].tolist()
     assert found == [EMPTY, SHELL, EMPTY, SOLID]
+
+
+def test_between_vertices_a_surface_is_where_its_points_are():
+    """A unit box about the origin, thick at the corners of x > 0: its faces there and opposite, away from corners."""
+    corners_m = box_vertices() - 0.5
+    outer = torch.where(corners_m[None, :, 0] > 0, 0.2, 0.02)
+    points = lattice(corners_m, box_faces(), 0.01)
+    grid = ShellGrid.around(corners_m[None], outer, torch.full_like(outer, 0.02), points, 0.02)
+    assert along_x(grid, [0.5, 0.65, -0.5, -0.65]) == [SHELL, SHELL, SHELL, EMPTY]
 
 
 def test_a_lattice_divides_long_edges():
