@@ -27,7 +27,7 @@ from tasks.fit import fit
 from tasks.policy import may_pass
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
-from tasks.study import check_meshes, degrade_capture, degrade_fit, degrade_masks, show_in_extreme_poses
+from tasks.study import check_meshes, degrade_capture, degrade_fit, degrade_masks, dress, show_in_extreme_poses
 from tasks.training import train
 
 log = logging.getLogger("hnerf.stability")
@@ -120,7 +120,7 @@ def attempt(
     tried."""
     at_bad_input = "refused"
     try:
-        stages = prepare(shelf, source, settings, degradation)
+        stages = prepare(shelf, source, truth, settings, degradation)
         training = settings.training
         if degradation and KINDS[degradation.kind].place == "settings":
             training = degrade_settings(training, degradation)
@@ -139,13 +139,16 @@ def attempt(
 
 
 def prepare(
-    shelf: Store, source: Source, settings: Settings, degradation: Degradation | None
+    shelf: Store, source: Source, truth: Source, settings: Settings, degradation: Degradation | None
 ) -> tuple[Artifact, Artifact, Artifact, Artifact]:
     """Capture, calibration, masks and body, made worse at the degradation's place."""
     place = KINDS[degradation.kind].place if degradation else None
     recording = ingest(shelf, source, settings.capture)
     if degradation and place == "capture":
         recording = degrade_capture(shelf, recording, degradation)
+    if degradation and place == "worn":
+        good, cameras, _, body = prepare(shelf, source, truth, settings, None)
+        recording = dress(shelf, truth, good, cameras, body, degradation)
     calibration = calibrate(shelf, recording, settings.calibration)
     masks = find_masks(shelf, recording, calibration, settings)
     if degradation and place == "masks":
@@ -169,8 +172,10 @@ def measure(
     nothing = {"psnr": None, "ssim": None, "chamfer_mm": None}
     if degradation and KINDS[degradation.kind].place == "poses":
         return nothing | {"faults": _faults(show_in_extreme_poses(shelf, model, degradation))}
+    *_, good_body = prepare(shelf, source, truth, settings, None)
+    if degradation and KINDS[degradation.kind].place == "worn":
+        _, truth = read_capture(stages[0].root)
     report = evaluate(shelf, truth, *stages, model, settings.evaluation)
-    *_, good_body = prepare(shelf, source, settings, None)
     metrics = json.loads((report.root / "metrics.json").read_text())
     split = metrics["novel_pose" if metrics["novel_pose"]["n"] else "novel_view"]
     chamfer_mm = (split["geometry"] or {}).get("chamfer_mm")

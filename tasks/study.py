@@ -9,15 +9,18 @@ import trimesh
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
+from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.segmentation.masks import Masks
 from hnerf.study.degrade import Degradation
 from hnerf.study.degrade import degrade_capture as write_degraded
 from hnerf.study.degrade import degrade_fit as disturbed
 from hnerf.study.degrade import degrade_masks as degraded
+from hnerf.study.degrade import dress as write_dressed
 from hnerf.study.degraded_fit import extreme_poses
 from hnerf.study.subset import subset
 from hnerf.study.surface import SurfaceCheck, check_pose, check_surface
 from tasks.calibration import calibrated
+from tasks.source import Source
 from tasks.stage import stage
 from tasks.store import Artifact
 from tasks.training import trained
@@ -43,6 +46,16 @@ def subset_capture(
 def degrade_capture(out: Path, recording: Artifact, degradation: Degradation) -> dict[str, float]:
     """A capture made worse; what `ingest` would have written of it."""
     write_degraded(Capture.load(recording.root), degradation, out)
+    return {}
+
+
+@stage("study-worn", version="1")
+def dress(
+    out: Path, truth: Source, recording: Artifact, calibration: Artifact, body: Artifact, degradation: Degradation
+) -> dict[str, float]:
+    """A capture whose person wears more than was recorded, and under `ground_truth/` what is known to be true of it."""
+    capture = calibrated(recording, calibration)
+    write_dressed(capture, BodyFit.load(body.root), GroundTruth(truth.root, capture), degradation, out)
     return {}
 
 

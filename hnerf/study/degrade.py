@@ -13,10 +13,11 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.config import Section, TrainingSettings
 from hnerf.errors import CaptureError
+from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.segmentation.masks import Masks
-from hnerf.study import degraded_fit, degraded_images, degraded_masks, degraded_rig, occluder
+from hnerf.study import degraded_fit, degraded_images, degraded_masks, degraded_rig, occluder, worn
 
-Place = Literal["capture", "masks", "fit", "settings", "poses"]
+Place = Literal["capture", "worn", "masks", "fit", "settings", "poses"]
 Rng = np.random.Generator
 
 
@@ -35,8 +36,8 @@ class Degradation(Section):
 
 @dataclass(frozen=True)
 class Kind:
-    """place: after which stage it is applied, "poses" being those that a finished avatar is shown in; label with the
-    strength's unit."""
+    """place: after which stage it is applied, "worn" being the capture once its body is fitted, "poses" those that a
+    finished avatar is shown in; label with the strength's unit."""
 
     place: Place
     label: str
@@ -77,6 +78,8 @@ KINDS = {
     "small_images": Kind("capture", "image size, share"),
     "large_images": Kind("capture", "image size, multiple"),
     "occluder": Kind("capture", "pillar in front, width in m"),
+    "skirt": Kind("worn", "skirt, hem off the legs in m"),
+    "long_hair": Kind("worn", "long hair, m"),
     "mask_eroded": Kind("masks", "masks eroded, % of image width"),
     "mask_dilated": Kind("masks", "masks dilated, % of image width"),
     "mask_holes": Kind("masks", "holes, % of each mask"),
@@ -88,15 +91,15 @@ KINDS = {
     "extreme_poses": Kind("poses", "new pose, ° a joint"),
 }
 
-NOT_MADE = {
-    "loose clothing": "cannot be made from a given capture; the person of `hnerf synth` wears a loose shirt",
-    "long hair": "cannot be made from a given capture",
-}
-
 
 def degrade_capture(capture: Capture, degradation: Degradation, out: Path) -> None:
     """Write the degraded capture, normalised like the one given, into `out`."""
     CAPTURE[degradation.kind](capture, degradation.strength, degradation.rng, out)
+
+
+def dress(capture: Capture, body: BodyFit, truth: GroundTruth, degradation: Degradation, out: Path) -> None:
+    """Write the capture and what is known of it with clothes or hair that no body model expresses, into `out`."""
+    worn.put_on(degradation.kind, degradation.strength, degradation.rng, capture, body, truth, out)
 
 
 def degrade_masks(masks: Masks, capture: Capture, degradation: Degradation) -> Masks:

@@ -60,14 +60,14 @@ def rewrite(capture: Capture, out: Path, change: PixelChange, change_mask: Pixel
         copy_pixels(capture, kept, name)
     for name in capture.train_cameras:
         for frame in capture.frames:
-            _write(out / "images" / name / f"{frame:06d}.jpg", change(name, capture.image(name, frame)))
+            write_pixels(out / "images" / name / f"{frame:06d}.jpg", change(name, capture.image(name, frame)))
             mask = capture.given_mask(name, frame)
             if mask is not None:
                 grey = change_mask(name, np.where(mask, 255, 0).astype(np.uint8))
-                _write(out / "masks" / name / f"{frame:06d}.png", np.where(grey > 127, 255, 0).astype(np.uint8))
+                write_pixels(out / "masks" / name / f"{frame:06d}.png", np.where(grey > 127, 255, 0).astype(np.uint8))
         plate = capture.background(name)
         if plate is not None:
-            _write(out / "background" / f"{name}.jpg", change(name, plate))
+            write_pixels(out / "background" / f"{name}.jpg", change(name, plate))
     kept.save()
 
 
@@ -88,10 +88,9 @@ def _to_8_bit(rgb: np.ndarray) -> np.ndarray:
     return rgb.round().clip(0, 255).astype(np.uint8)
 
 
-def _write(path: Path, pixels: np.ndarray) -> None:
-    """Grey (H, W), or RGB (H, W, 3)."""
+def write_pixels(path: Path, pixels: np.ndarray) -> None:
+    """Grey (H, W), or RGB (H, W, 3); JPEG as at the door."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(
-        str(path), np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels), JPEG_OPTIONS
-    ):
+    options = JPEG_OPTIONS if path.suffix == ".jpg" else []
+    if not cv2.imwrite(str(path), np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels), options):
         raise OSError(f"{path}: cannot be written")

@@ -7,7 +7,7 @@ from pydantic import Field
 
 from hnerf.config import CONFIGS, Section, named_file, read_yaml, validated
 from hnerf.errors import CaptureError
-from hnerf.study.degrade import KINDS, NOT_MADE, check_strengths
+from hnerf.study.degrade import KINDS, check_strengths
 
 STUDIES = CONFIGS / "stability"
 FULL = "full"
@@ -31,7 +31,7 @@ class Stability(Section):
         return self.model_copy(update={"degradations": chosen})
 
     def left_out(self) -> list[str]:
-        """What it does not try, in lines for people: against `configs/stability/full.yaml`, and what no study can."""
+        """What it does not try, in lines for people, against `configs/stability/full.yaml`."""
         full = load_stability(FULL)
         lines = [f"`{name}` as a method" for name in full.methods if name not in self.methods]
         seeds = len(full.seeds) - len(self.seeds)
@@ -41,7 +41,7 @@ class Stability(Section):
             missing = [f"{s:g}" for s in strengths if s not in self.degradations.get(name, ())]
             if missing:
                 lines.append(f"{KINDS[name].label}: {', '.join(missing)}")
-        return lines + [f"{name}: {reason}" for name, reason in NOT_MADE.items()]
+        return lines
 
 
 def load_stability(study: str) -> Stability:

@@ -19,9 +19,10 @@ LEGEND = (
     f"dB or {FAILED_RATIO:g} times, a crash, no surface, one that is not watertight or not of the body's size (volume "
     f"{VOLUMES[0]:g} to {VOLUMES[1]:g}, length {LENGTHS[0]:g} to {LENGTHS[1]:g} of it). **refused**: an earlier stage "
     "or the training said what is wrong with the input. Novel poses from test cameras are scored, which no degradation "
-    "touches; training poses where the capture has no others. Without test cameras images are not compared, since what "
-    "is done to training cameras would be done to what they are scored on. A surface is the largest component that "
-    "meshing finds; what floats beside it does not count."
+    "touches, but that they and the truth wear the skirt or the hair, too; training poses where the capture has no "
+    "others. Without test cameras images are not compared, since what is done to training cameras would be done to "
+    "what they are scored on. A surface is the largest component that meshing finds; what floats beside it does not "
+    "count."
 )
 
 Row = dict[str, Any]
@@ -57,7 +58,7 @@ def as_markdown(result: Row, charts: Sequence[str]) -> str:
     lines += ["", *map(picture, charts), "", "## Runs", ""]
     lines += head(["method", "degradation", "strength", "seed", "verdict", "PSNR, dB", "SSIM", "Chamfer, mm"])
     lines += [line(_cells(run)) for run in result["runs"]]
-    lines += ["", "## Left out", "", *(f"- {reason}" for reason in result["left_out"]), ""]
+    lines += ["", "## Left out", "", *(f"- {reason}" for reason in result["left_out"] or ["nothing"]), ""]
     return "\n".join([*lines, *([result["protocol"], ""] if result["protocol"] else [])])
 
 

@@ -19,6 +19,7 @@ methods: [fast]
 seeds: [0, 1]
 degradations:
   image_noise: [5, 40]
+  skirt: [0.02]
   mask_eroded: [1]
   pose_noise: [2]
   learning_rate_up: [10]
@@ -52,7 +53,8 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
             raise RuntimeError("rank 0 ended with exit code 1\nValueError: empty")
         return made("model", report={"seconds": 60.0})
 
-    def evaluate(_: Any, __: Any, recording: Any, cameras: Any, masks: Any, body: Any, *rest: Any) -> Any:
+    def evaluate(_: Any, truth: Any, recording: Any, cameras: Any, masks: Any, body: Any, *rest: Any) -> Any:
+        assert truth == ("of skirt 0.02" if recording.name == "skirt 0.02" else "true")
         psnr = 28.0 if body.name == "pose_noise 2" else 30.0
         split = {"n": 2, "psnr": psnr, "ssim": 0.9, "geometry": {"chamfer_mm": 6.0}}
         return made("report", metrics={"protocol": "By eye.", "novel_view": split | {"psnr": 0}, "novel_pose": split})
@@ -60,12 +62,19 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
     def degrade(*inputs: Any) -> Any:
         return made(f"{inputs[-1].kind} {inputs[-1].strength:g}")
 
+    def dress(_: Any, truth: Any, recording: Any, cameras: Any, body: Any, degradation: Any) -> Any:
+        assert (truth, recording.name, body.name) == ("true", "capture", "body")
+        return degrade(degradation)
+
+    def read_capture(folder: Path, store: Path | None = None) -> tuple[Any, Any]:
+        return None, "true" if store else f"of {folder.name}"
+
     def show(_: Any, __: Any, degradation: Any) -> Any:
         fault = "surface is not watertight" if degradation.strength == 60 else None
         return made("poses", surface={"pose 0": {"fault": None}, "pose 1": {"fault": fault}})
 
     replaced = {
-        "read_capture": lambda *_: (None, None),
+        "read_capture": read_capture,
         "ingest": lambda *_: made("capture"),
         "calibrate": calibrate,
         "find_masks": lambda *_: made("masks"),
@@ -75,6 +84,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
         "degrade_capture": degrade,
         "degrade_masks": degrade,
         "degrade_fit": degrade,
+        "dress": dress,
         "check_meshes": lambda *_: made("surfaces", surface={"000001": {"fault": None}}),
         "show_in_extreme_poses": show,
     }
@@ -99,6 +109,7 @@ def test_every_run_has_a_verdict(stages: list[dict[str, Any]], tmp_path: Path) -
         ("as recorded", None, "ok", ""),
         ("image_noise", 5, "ok", ""),
         ("image_noise", 40, "refused", "ada: cameras see no person"),
+        ("skirt", 0.02, "ok", ""),
         ("mask_eroded", 1, "failed", "ValueError: empty"),
         ("pose_noise", 2, "degraded", "2.0 dB of PSNR lost"),
         ("learning_rate_up", 10, "ok", ""),
@@ -151,6 +162,7 @@ def test_each_degradation_is_put_in_at_its_place(stages: list[dict[str, Any]], t
     assert inputs == [
         good,
         ("image_noise 5", "masks", "body"),
+        ("skirt 0.02", "masks", "body"),
         ("capture", "mask_eroded 1", "body"),
         ("capture", "masks", "pose_noise 2"),
         good,  # learning rate
@@ -158,7 +170,7 @@ def test_each_degradation_is_put_in_at_its_place(stages: list[dict[str, Any]], t
         good,
     ]
     rates = [s["settings"].fast.network_learning_rate for s in stages if s["settings"].seed == 0]
-    assert rates == pytest.approx([0.01, 0.01, 0.01, 0.01, 0.1, 0.01, 0.01])
+    assert rates == pytest.approx([0.01, 0.01, 0.01, 0.01, 0.01, 0.1, 0.01, 0.01])
 
 
 def test_a_method_that_cannot_take_the_capture_at_all_is_tried_once_a_seed(
@@ -194,7 +206,7 @@ def test_what_the_machine_did_ends_the_command_and_finished_runs_stand(
     with pytest.raises(type(error)):
         study(tmp_path)
     found = json.loads((tmp_path / "store" / "stability" / "ada-mine.json").read_text())
-    assert [r["kind"] for r in found["runs"]] == ["as recorded", "image_noise", "image_noise", "mask_eroded"]
+    assert [r["kind"] for r in found["runs"]] == ["as recorded", "image_noise", "image_noise", "skirt", "mask_eroded"]
 
 
 def test_the_command_prints_the_table(

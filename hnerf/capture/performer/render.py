@@ -3,6 +3,7 @@
 # mypy: disable-error-code="valid-type, attr-defined, no-untyped-def, misc"
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import warp as wp
@@ -112,6 +113,17 @@ def irradiance(normals: np.ndarray, visible: np.ndarray, lights: tuple[np.ndarra
     return (np.clip(normals @ directions.T, 0, None) * visible) @ strength
 
 
+class Lit(Protocol):
+    """What `render_person` draws: something that rays are cast at, and its colours in [0, 1] at those that hit."""
+
+    @property
+    def vertices_m(self) -> np.ndarray: ...
+
+    def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> Hits: ...
+
+    def colours(self, hits: Hits) -> np.ndarray: ...
+
+
 @dataclass(frozen=True)
 class Painted:
     """A posed, lit person. looks (V, 9): what `person_colour` needs (3 rest_m, 5 depths_m), and the arriving light."""
@@ -122,13 +134,17 @@ class Painted:
     looks: np.ndarray
     face_m: np.ndarray
 
+    def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> Hits:
+        """First hits of rays from one origin (3,) along unit directions (N, 3)."""
+        return self.caster.cast(origin_m, directions)
+
     def colours(self, hits: Hits) -> np.ndarray:
         """Lit colours in [0, 1] of those rays that hit, (M, 3)."""
         values = hits.interpolate(self.looks, self.faces)
         return (person_colour(self.face_m, values[:, :3], values[:, 3:-1]) * values[:, -1:]).clip(0, 1)
 
 
-def render_person(person: Painted, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def render_person(person: Lit, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Over black, edge pixels weighted by coverage, (H, W, 3); coverage (H, W); whether the centre ray hits (H, W)."""
     rgb = np.zeros((camera.height_px, camera.width_px, 3))
     coverage, mask = np.zeros(rgb.shape[:2]), np.zeros(rgb.shape[:2], bool)
@@ -139,7 +155,7 @@ def render_person(person: Painted, camera: Camera) -> tuple[np.ndarray, np.ndarr
     pixels = np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), -1)
     for offset in subpixel_offsets_px():
         _, directions = camera.rays(pixels + offset)
-        hits = person.caster.cast(camera.centre_m, directions.reshape(-1, 3))
+        hits = person.cast(camera.centre_m, directions.reshape(-1, 3))
         here = (hits.face >= 0).reshape(pixels.shape[:2])
         rgb[window][here] += person.colours(hits) / SUPERSAMPLES**2
         coverage[window] += here / SUPERSAMPLES**2
