@@ -25,11 +25,12 @@ Rng = np.random.Generator
 
 NOSE, R_HIP, R_KNEE, L_HIP, L_KNEE, R_EAR, L_EAR = 0, 9, 10, 12, 13, 17, 18  # BODY_25
 AROUND, ALONG = 64, 24  # vertices of a tube
+ANGLES = 2 * np.pi * np.arange(AROUND)[:, None] / AROUND
 FOLDS, FOLD_DEPTH = 8, 0.3  # of the skirt; depth as a share of how far the hem stands off
 BACK, FALLS_BACK, WIDTH, THICKNESS = 0.55, 0.15, 0.65, 0.35  # of hair, in distances of the ears; metres a metre
 SWAY = 0.15  # of the hair's length
 STEP_RAD = 0.4  # by which folds and sway move on from frame to frame, at random
-CLOTH = np.array([[0.55, 0.16, 0.20], [0.80, 0.62, 0.42]])  # of its checks
+CLOTH = np.array([[0.45, 0.18, 0.20], [0.58, 0.34, 0.30]])  # of its checks
 HAIR = np.array([[0.20, 0.12, 0.07], [0.30, 0.19, 0.11]])  # of its strands
 
 
@@ -42,12 +43,9 @@ class Worn:
     pattern: np.ndarray
 
     @staticmethod
-    def tube(middles_m: np.ndarray, a_m: np.ndarray, b_m: np.ndarray, pattern: np.ndarray) -> "Worn":
-        """Down along middles (n, ALONG, 3), around them as far as the half axes (n, ALONG, AROUND, 3) of each
-        direction; a x b points up."""
-        angle = 2 * np.pi * np.arange(AROUND)[:, None] / AROUND
-        rings_m = middles_m[:, :, None] + np.cos(angle) * a_m + np.sin(angle) * b_m
-        ends_m = middles_m[:, [0, -1]]
+    def tube(rings_m: np.ndarray, pattern: np.ndarray) -> "Worn":
+        """Down rings (n, ALONG, AROUND, 3), each counter-clockwise seen from above."""
+        ends_m = rings_m[:, [0, -1]].mean(2)
         return Worn(np.concatenate([rings_m.reshape(len(rings_m), -1, 3), ends_m], 1), pattern)
 
     @property
@@ -102,17 +100,19 @@ class Shown:
 
 
 def skirt(keypoints_m: np.ndarray, up: np.ndarray, flare_m: float, rng: Rng) -> Worn:
-    """From the hips to the knees of keypoints (n, 25, 3), its hem so far off the legs; up (3,)."""
+    """From the hips to the knees of keypoints (n, 25, 3), around both thighs, its hem so far off them; up (3,)."""
     right_hip, left_hip, right_knee, left_knee = (keypoints_m[:, k] for k in (R_HIP, L_HIP, R_KNEE, L_KNEE))
     width_m = float(np.linalg.norm(right_hip - left_hip, axis=1).mean())
-    apart_m = np.linalg.norm(right_knee - left_knee, axis=1)[:, None, None, None]
-    down = np.linspace(0, 1, ALONG)[:, None]
-    middles_m = ((right_hip + left_hip) / 2)[:, None] * (1 - down) + ((right_knee + left_knee) / 2)[:, None] * down
-    folds = np.cos(FOLDS * 2 * np.pi * np.arange(AROUND)[:, None] / AROUND + _phases(len(keypoints_m), rng))
-    hem_m = apart_m / 2 + width_m / 2 + flare_m * (1 + FOLD_DEPTH * folds)
-    radius_m = (1 - down[..., None]) * width_m + down[..., None] * hem_m
-    left, back = _level_axes(left_hip - right_hip, up)
-    return Worn.tube(middles_m, radius_m * left[:, None, None], radius_m * back[:, None, None], CLOTH)
+    hips_m, knees_m = (right_hip + left_hip) / 2, (right_knee + left_knee) / 2
+    left, back = _level_axes(left_hip - right_hip, hips_m - knees_m)
+    outwards = np.cos(ANGLES) * left[:, None, None] + np.sin(ANGLES) * back[:, None, None]
+    down = np.linspace(0, 1, ALONG)[:, None, None]
+    folds = np.cos(FOLDS * ANGLES + _phases(len(keypoints_m), rng))
+    hem_m = width_m / 2 + flare_m * (1 + FOLD_DEPTH * folds)
+    half_apart_m = ((left_knee - right_knee) / 2)[:, None, None]
+    side = np.tanh(2 * (outwards * half_apart_m / _lengths(half_apart_m)).sum(-1, keepdims=True))  # right -1, left 1
+    middles_m = hips_m[:, None, None] * (1 - down) + (knees_m[:, None, None] + side * half_apart_m) * down
+    return Worn.tube(middles_m + (width_m * (1 - down) + hem_m * down) * outwards, CLOTH)
 
 
 def long_hair(keypoints_m: np.ndarray, up: np.ndarray, length_m: float, rng: Rng) -> Worn:
@@ -124,9 +124,8 @@ def long_hair(keypoints_m: np.ndarray, up: np.ndarray, length_m: float, rng: Rng
     sway_m = SWAY * drop_m**2 / length_m * np.sin(_phases(len(keypoints_m), rng)[:, 0])
     middles_m = ears_m[:, None] - drop_m * up - (BACK * head_m + FALLS_BACK * drop_m) * front[:, None]
     middles_m = middles_m + sway_m * left[:, None]
-    shape = np.ones((ALONG, AROUND, 1)) * head_m
-    axes_m = WIDTH * shape * -left[:, None, None], THICKNESS * shape * front[:, None, None]
-    return Worn.tube(middles_m, *axes_m, HAIR)
+    outwards = THICKNESS * np.cos(ANGLES) * front[:, None, None] + WIDTH * np.sin(ANGLES) * left[:, None, None]
+    return Worn.tube(middles_m[:, :, None] + head_m * outwards, HAIR)
 
 
 WORN: dict[str, Callable[[np.ndarray, np.ndarray, float, Rng], Worn]] = {"skirt": skirt, "long_hair": long_hair}
@@ -188,7 +187,10 @@ def _phases(frames: int, rng: Rng) -> np.ndarray:
 
 
 def _level_axes(towards: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors (n, 3) at right angles to up (3,): along `towards` (n, 3), and to the left of it."""
-    level = towards - (towards @ up)[:, None] * up
-    level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-9)
-    return level, np.cross(up, level)
+    """Unit vectors (n, 3) at right angles to up, (3,) or (n, 3): along `towards` (n, 3), and to the left of it."""
+    level, left = towards - up * ((towards * up).sum(-1) / (up * up).sum(-1))[:, None], np.cross(up, towards)
+    return level / _lengths(level), left / _lengths(left)
+
+
+def _lengths(vectors: np.ndarray) -> np.ndarray:
+    return np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)

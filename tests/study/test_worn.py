@@ -30,26 +30,32 @@ def standing() -> np.ndarray:
 
 
 def test_a_skirt_hangs_from_the_hips_to_the_knees_and_its_folds_move() -> None:
-    """Waist 20 cm, the distance of the hips, around (0, 0, 1); hem 15 + 10 + 10 cm around (0, 0, 0.5), give or take
-    folds of 3 cm."""
+    """Waist 20 cm, the distance of the hips, around (0, 0, 1); hem 10 + 10 cm, give or take folds of 3 cm, off the line
+    between the knees at 0.5 m, of which tanh 2 of either half are reached to the left and the right."""
     made = skirt(standing(), UP, 0.1, np.random.default_rng(0))
     first = made.vertices_m[0]
     rings_m = first[:-2].reshape(worn.ALONG, worn.AROUND, 3)
     assert rings_m[0, :, 2] == pytest.approx(1.0)
     assert rings_m[-1, :, 2] == pytest.approx(0.5)
-    radius_m = np.linalg.norm(rings_m[..., :2], axis=-1)
-    assert radius_m[0] == pytest.approx(0.2)
-    assert (radius_m[-1].min(), radius_m[-1].max()) == pytest.approx((0.32, 0.38), abs=1e-3)
+    assert np.linalg.norm(rings_m[0, :, :2], axis=-1) == pytest.approx(0.2)
+    left, back, right, front = rings_m[-1, :: worn.AROUND // 4]
+    fold_m = back[1] - 0.2  # the same one at every eighth of a turn
+    assert 0 < abs(fold_m) < 0.03
+    assert (back[0], front[0], front[1]) == pytest.approx((0, 0, -0.2 - fold_m))
+    assert (left[0], right[0]) == pytest.approx([s * (0.15 * np.tanh(2) + 0.2 + fold_m) for s in (1, -1)])
     assert np.abs(made.vertices_m[1] - first).max() > 1e-3
 
 
 def test_what_is_worn_is_a_closed_surface_with_its_inside_inside() -> None:
-    """A skirt that does not flare is a cone from 0.2 to 0.25 m over 0.5 m, less 0.16 % for having 64 corners."""
-    made = skirt(standing(), UP, 1e-9, np.random.default_rng(0))
+    """Around knees that touch, a skirt that does not flare is a cone from 0.2 to 0.1 m over 0.5 m, less 0.16 % for
+    having 64 corners."""
+    keypoints_m = standing()
+    keypoints_m[:, [worn.R_KNEE, worn.L_KNEE], 0] = 0
+    made = skirt(keypoints_m, UP, 1e-9, np.random.default_rng(0))
     mesh = trimesh.Trimesh(made.vertices_m[0], made.faces, process=False)
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
-    assert mesh.volume == pytest.approx(np.pi / 3 * 0.5 * (0.2**2 + 0.2 * 0.25 + 0.25**2), rel=2e-3)
+    assert mesh.volume == pytest.approx(np.pi / 3 * 0.5 * (0.2**2 + 0.2 * 0.1 + 0.1**2), rel=2e-3)
 
 
 def test_hair_hangs_behind_the_head() -> None:
@@ -68,10 +74,10 @@ def test_hair_hangs_behind_the_head() -> None:
 
 def column(keypoints_m: np.ndarray, up: np.ndarray, half_m: float, rng: np.random.Generator) -> Worn:
     """Upright around (0, 0), from 1.5 to 0.5 m."""
-    middles_m = np.zeros((len(keypoints_m), worn.ALONG, 3))
-    middles_m[..., 2] = np.linspace(1.5, 0.5, worn.ALONG)
-    half_axis = half_m * np.ones((*middles_m.shape[:2], worn.AROUND, 1))
-    return Worn.tube(middles_m, half_axis * np.eye(3)[0], half_axis * np.eye(3)[1], np.ones((2, 3)))
+    rings_m = np.zeros((len(keypoints_m), worn.ALONG, worn.AROUND, 3))
+    rings_m[..., 2] = np.linspace(1.5, 0.5, worn.ALONG)[:, None]
+    rings_m[..., :2] = half_m * np.concatenate([np.cos(worn.ANGLES), np.sin(worn.ANGLES)], 1)
+    return Worn.tube(rings_m, np.ones((2, 3)))
 
 
 def dressed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Capture, GroundTruth]:
