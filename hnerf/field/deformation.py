@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hnerf.body.canonical import Descriptor, blended
+from hnerf.body.canonical import Descriptor, blended, occurring
 from hnerf.body.descriptor import vertex_normals
 
 TINY = 1e-9
@@ -34,7 +34,7 @@ class FrameDeformation(nn.Module):
     def forward(self, described: Descriptor, moment: Tensor) -> tuple[Tensor, Tensor]:
         """How far the surface next to described points is displaced in the frames of rows `moment` (N,), -1 for none:
         (N, 3), and along its normal (N,); canonical metres."""
-        present, own = torch.unique(moment, return_inverse=True)
+        present, own = occurring(moment, len(self.displacement))
         table = self._of_vertices(present).flatten(0, 1)
         found = blended(table, own[:, None] * len(self.shares) + described.corners, described.barycentric)
         return found[:, :3], found[:, 3]

@@ -136,7 +136,7 @@ class FastField(Field):
         row = frame[hit].repeat_interleave(depths.shape[1])
         skin = bodies.describe(points.flatten(0, 1), row, self.reach_m, correction)
         described, moved = self._deformed(skin, conditions.moment[row])
-        pose = conditions.pose[row]
+        pose = conditions.pose.index_select(0, row)
         d = torch.where(described.near, described.d, self.reach_m).view(len(hit), depths.shape[1])
         residual = torch.where(described.near, self._residual(described, pose), 0.0).view_as(d)
         alpha_dot = alpha_from_sdf(d + residual, self.log_sharpness.exp())
@@ -193,7 +193,8 @@ class FastField(Field):
         """Colours (N, 3) of the samples that count, zero elsewhere."""
         pick = torch.nonzero(visible)[:, 0]
         colour = described.d.new_zeros(len(visible), 3)
-        seen = self.field.colour(described.y[pick], described.d[pick], described.normal[pick], pose[pick])
+        at = (t.index_select(0, pick) for t in (described.y, described.d, described.normal, pose))
+        seen = self.field.colour(*at)
         return colour.index_copy(0, pick, seen)
 
     def _gradient_norms(
@@ -208,12 +209,11 @@ class FastField(Field):
         y, d = described.y[pick].detach(), described.d[pick].detach()
         away = (skin.y - skin.s)[pick].detach() * skin.d[pick].detach().sign()[:, None]
         outward = nn.functional.normalize(away, dim=-1)
-        ahead = [
-            self.field.residual(y + step_m * axis, d + step_m * outward @ axis, pose[pick])
-            for axis in torch.eye(3, device=y.device)
-        ]
-        here = self.field.residual(y, d, pose[pick])[:, None]
-        return (outward + (torch.stack(ahead, -1) - here) / step_m).norm(dim=-1)
+        axes = torch.cat([y.new_zeros(1, 3), torch.eye(3, device=y.device)])  # here, and a step along each axis
+        d = d + step_m * axes @ outward.T
+        y = y + step_m * axes[:, None]
+        found = self.field.residual(y.flatten(0, 1), d.flatten(), pose[pick].repeat(len(axes), 1)).view_as(d)
+        return (outward + (found[1:] - found[0]).T / step_m).norm(dim=-1)
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """d_hat (N,) at points (N, 3) around the first body; beyond reach the body's own distance stands alone."""

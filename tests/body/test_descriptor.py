@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from hnerf.body.anny import anny_rig
-from hnerf.body.canonical import PosedBodies, axis_angle_from_rotation
+from hnerf.body.canonical import PosedBodies, axis_angle_from_rotation, blended, occurring
 from hnerf.body.descriptor import BodyMeshes, closest_points_reference, solid_angle
 from hnerf.body.rig import Rig, pose_vertices, rotation_from_axis_angle
 from tests.body.boxes import box_faces, box_rig, box_vertices
@@ -238,3 +238,23 @@ def test_a_shape_moves_vertices_as_skinning_does() -> None:
     found = bodies._displacement(bodies.vertices_m[0], torch.zeros_like(vertices), vertices, correction)
     expected = pose_vertices(rig.reshaped(rig.beta + change), theta, root) - bodies.vertices_m
     torch.testing.assert_close(found, expected[0], atol=1e-9, rtol=0)
+
+
+def test_blending_by_hand_and_its_gradient_in_double():
+    """Rows 1 and 2 by a quarter and three quarters, row 0 twice; the gradient to a row is the sum of its shares."""
+    rows = torch.tensor([[1.0, 10.0], [2.0, 20.0], [4.0, 40.0]], dtype=torch.float64, requires_grad=True)
+    corners, weights = torch.tensor([[1, 2], [0, 0]]), torch.tensor([[0.25, 0.75], [0.5, 0.5]])
+    mixed = blended(rows, corners, weights)
+    assert mixed.tolist() == [[3.5, 35.0], [1.0, 10.0]]
+    mixed[:, 0].sum().backward()
+    assert rows.grad is not None
+    assert rows.grad.tolist() == [[1, 0], [0.25, 0], [0.75, 0]]
+    assert torch.autograd.gradcheck(lambda r: blended(r, corners, weights), (rows,))
+
+
+def test_occurring_rows_are_those_of_unique():
+    """Of six rows, 1 and 4 occur; -1 is the last one."""
+    present, own = occurring(torch.tensor([4, 1, 1, 4]), 6)
+    assert (present.tolist(), own.tolist()) == ([1, 4], [1, 0, 0, 1])
+    present, own = occurring(torch.tensor([2, -1]), 6)
+    assert (present.tolist(), own.tolist()) == ([2, 5], [0, 1])
