@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hnerf.study.machine import in_words, machine
-from hnerf.study.tables import head, line
+from hnerf.tables import head, line
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"

@@ -20,7 +20,7 @@ from hnerf.config import CONFIGS, Settings, load_settings, with_changes
 from hnerf.errors import CaptureError, one_line
 from hnerf.study import results
 from hnerf.study.files import replace_text
-from hnerf.study.tables import head, line, pick, shown
+from hnerf.tables import head, line, pick, shown
 from tasks.calibration import calibrate
 from tasks.capture import ingest
 from tasks.evaluation import evaluate
@@ -52,7 +52,7 @@ def ablate(
     names of ablations, all where there are none. A row whose training or evaluation fails says why and the rest go on;
     a worker that was killed (LostWorkerError) ends the command, and the same command goes on from there.
     """
-    rows, left_out = choose(load_settings(preset, list(overrides)), only)
+    rows, left_out = choose(load_settings(preset, overrides), only)
     shelf = Store(store.resolve())
     source, truth = read_capture(capture, store)
     subject = Capture.load(ingest(shelf, source, rows[FULL].capture).root).name

@@ -2,10 +2,9 @@
 
 import argparse
 import dataclasses
+import errno
 import json
 import logging
-import os
-import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,16 +23,18 @@ from hnerf.capture.notes import read_notes
 from hnerf.capture.performer import PerformerSettings, write_performer
 from hnerf.config import load_settings
 from hnerf.errors import CaptureError
+from hnerf.new_folder import new_folder
 from hnerf.render.show import KINDS, Wish, render_subject
 from tasks.calibration import calibrate
 from tasks.capture import ingest
 from tasks.launcher import GaveUpError
 from tasks.policy import will_last
 from tasks.source import read_capture
-from tasks.store import Store
+from tasks.store import Store, require_whole
 
 DEMO = Path("demo")
 FAILED, BAD_INPUT = 1, 2
+NO_ROOM = (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # None: our own, of libraries that do not say why
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -48,6 +49,8 @@ def main(argv: list[str] | None = None) -> int:
     except (GaveUpError, InvalidAsset) as error:
         return _told(error, FAILED)
     except OSError as error:
+        if error.errno in NO_ROOM:
+            return _told(f"{error}; make room and give the same command again", FAILED)
         if error.filename is None or not will_last(error):
             raise
         return _told(f"{error.filename}: {error.strerror}; give another path, or mend this one", BAD_INPUT)
@@ -94,7 +97,9 @@ def _parser() -> argparse.ArgumentParser:
     boards.add_argument("folder", type=Path, help="a folder with calibration/extrinsic/ and charuco.toml")
     boards.add_argument("--out", type=Path, default=Path("cameras"), help="the folder to write (default: cameras)")
     boards.add_argument("--format", choices=WRITERS, action="append", default=[], help="write these files, too")
-    boards.add_argument("--ground-frame", type=int, metavar="N", help="when the board lies on the floor, at the origin")
+    boards.add_argument(
+        "--ground-frame", type=_not_negative, metavar="N", help="when the board lies on the floor, at the origin"
+    )
     boards.set_defaults(command=lambda o: _calibrate(o.folder, o.out, o.format, o.ground_frame))
 
     cameras = commands.add_parser("cameras", help="write a recording's cameras as other tools read them")
@@ -128,12 +133,21 @@ def _parser() -> argparse.ArgumentParser:
 def _add_benchmark(command: argparse.ArgumentParser) -> None:
     command.add_argument("capture", type=Path, help="the recording's folder")
     study = command.add_mutually_exclusive_group()
-    study.add_argument("--study", default="dynamic", help="a name under configs/benchmark/ or a YAML file")
+    study.add_argument(
+        "--study", default="dynamic", help="a name under configs/benchmark/ or a YAML file (default: dynamic)"
+    )
     study.add_argument("--quick", dest="study", action="store_const", const="quick", help="the study for 15 minutes")
     command.add_argument("--methods", metavar="LIST", help="of the study, or presets, instead of all: fast,nerf")
     command.add_argument("--seconds", type=_positive, metavar="S", help="of every training, instead of the study's")
     command.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
     command.set_defaults(command=_benchmark)
+
+
+def _not_negative(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError("give 0 or more")
+    return value
 
 
 def _positive(text: str) -> float:
@@ -182,6 +196,9 @@ def _add_render(render: argparse.ArgumentParser) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
+    for subject in (options.subject, options.motion):
+        if subject and subject.is_dir():
+            require_whole(subject)
     wish = Wish(
         camera=options.camera,
         path=options.path,
@@ -244,8 +261,9 @@ def _table(report: dict[str, Any]) -> list[str]:
 
 
 def _calibrate(folder: Path, out: Path, layouts: list[str], ground_frame: int | None) -> None:
-    found = calibrate_from_boards(folder, ground_frame)
-    found.save(out, layouts)
+    with new_folder(out) as partial:
+        found = calibrate_from_boards(folder, ground_frame)
+        found.save(partial, layouts)
     print(f"{'camera':<12} {'pictures':>8} {'RMS px':>7}  intrinsics")
     report = found.report()
     for name, camera in report["cameras"].items():
@@ -254,19 +272,16 @@ def _calibrate(folder: Path, out: Path, layouts: list[str], ground_frame: int | 
 
 
 def _cameras(folder: Path, layout: str, out: Path) -> None:
-    lenses = recognise(folder).lenses().values()
-    metres_per_unit = read_notes(folder).metres_per_unit
-    write_cameras(out, [dataclasses.replace(lens, t_m=metres_per_unit * lens.t_m) for lens in lenses], layout)
+    with new_folder(out) as partial:
+        lenses = recognise(folder).lenses().values()
+        metres_per_unit = read_notes(folder).metres_per_unit
+        write_cameras(partial, [dataclasses.replace(lens, t_m=metres_per_unit * lens.t_m) for lens in lenses], layout)
     print(f"cameras: {out}")
 
 
 def _synth(out: Path) -> None:
-    if out.exists():
-        raise CaptureError(f"{out}: exists; give the name of a new folder")
-    partial = out.with_name(f"{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    write_performer(partial, PerformerSettings())
-    os.replace(partial, out)
+    with new_folder(out) as partial:
+        write_performer(partial, PerformerSettings())
 
 
 def _demo() -> None:

@@ -53,7 +53,7 @@ def stability(
     """
     plan = load_stability(study).only(only)
     plan = plan.model_copy(update={"methods": tuple(methods)}) if methods else plan
-    presets = {name: load_settings(name, list(plan.overrides)) for name in plan.methods}
+    presets = {name: load_settings(name, plan.overrides) for name in plan.methods}
     shelf = Store(store.resolve())
     source, truth = read_capture(capture, store)
     subject = Capture.load(ingest(shelf, source, next(iter(presets.values())).capture).root).name

@@ -28,7 +28,7 @@ def train_subject(
     capture: the recording's folder; preset: a name under configs/ or a YAML file; store: where artifacts are kept;
     overrides: settings like "training.steps=100".
     """
-    settings = load_settings(preset, overrides)
+    settings = load_settings(preset, overrides or ())
     shelf = Store(store.resolve())
     source, truth = read_capture(capture, store)
 

@@ -3,11 +3,12 @@
 A preset is a YAML file under `configs/`; `load_settings("fast", ["training.seconds=60"])` reads one and overrides it.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, Self, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
 
 from hnerf.errors import CaptureError
 
@@ -19,7 +20,7 @@ CONFIGS = Path(__file__).parent.parent / "configs"
 class Section(BaseModel):
     """One stage's settings: frozen, no unknown keys, no values outside their type."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class CaptureSettings(Section):
@@ -79,8 +80,8 @@ class FastFieldSettings(Section):
     inner_m: float = Field(default=0.0, ge=0)  # and inside
     shell_cell_m: float = Field(default=0.015, gt=0)
     samples: int = Field(default=0, ge=0)
-    geometry_cells: tuple[int, ...] = ()  # on the box's longest side, a level each
-    colour_cells: tuple[int, ...] = ()
+    geometry_cells: tuple[PositiveInt, ...] = ()  # on the box's longest side, a level each
+    colour_cells: tuple[PositiveInt, ...] = ()
     channels: int = Field(default=4, ge=1)
     width: int = Field(default=64, ge=1)
     pose_width: int = Field(default=0, ge=0)
@@ -184,7 +185,7 @@ class TrainingSettings(Section):
     final_learning_rate: float = Field(default=0.1, gt=0, le=1)  # share of the first that is left at the end
     noise: float = Field(default=0.1, ge=0)  # on theta, T and v
     checkpoint_steps: int = Field(default=100, ge=1)
-    snapshots_s: tuple[float, ...] = ()  # when the subject is saved as it stands, below `snapshots/`
+    snapshots_s: tuple[PositiveFloat, ...] = ()  # when the subject is saved as it stands, below `snapshots/`
     processes: int = Field(default=0, ge=0)  # 0: one a GPU, or one
     seed: int = Field(default=0, ge=0)
 
@@ -221,14 +222,15 @@ class Settings(Section):
     asset: AssetSettings = AssetSettings()
 
 
-def load_settings(preset: str, overrides: list[str] | None = None) -> Settings:
+def load_settings(preset: str, overrides: Sequence[str] = ()) -> Settings:
     """Settings from a preset's name or a YAML file's path, with overrides like "training.steps=100".
 
     Raises CaptureError with one line if the preset is unknown or no YAML, or a key or value is not allowed.
     """
     path = named_file(preset, CONFIGS, "preset", "presets")
     tree = read_yaml(path)
-    for override in overrides or []:
+    settings = validated(Settings, tree, path)  # before overrides, which are no fault of the file
+    for override in overrides:
         key, equals, value = override.partition("=")
         if not equals:
             raise CaptureError(f"--set {override}: write it as section.name=value")
@@ -239,7 +241,7 @@ def load_settings(preset: str, overrides: list[str] | None = None) -> Settings:
             if not isinstance(node, dict):
                 raise CaptureError(f"--set {override}: {section} is not a section")
         node[leaf] = _parsed(value, f"--set {override}")
-    return validated(Settings, tree, path)
+    return validated(Settings, tree, " ".join(f"--set {override}" for override in overrides)) if overrides else settings
 
 
 def with_changes(settings: Settings, path: Path) -> Settings:
@@ -283,10 +285,10 @@ def _parsed(text: str | bytes, source: str) -> Any:
         raise CaptureError(f"{source}: is not YAML ({' '.join(str(error).split())}); correct it") from None
 
 
-def validated(kind: type[S], tree: Any, path: Path) -> S:
-    """A section from the tree that a YAML file holds; CaptureError, one line with file and key, on what is wrong."""
+def validated(kind: type[S], tree: Any, source: Path | str) -> S:
+    """A section from the tree that a YAML file holds; CaptureError, one line with source and key, on what is wrong."""
     try:
         return kind.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
-        raise CaptureError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise CaptureError(f"{source}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None

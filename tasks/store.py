@@ -162,6 +162,15 @@ class Store:
         return artifact
 
 
+def require_whole(subject: Path) -> None:
+    """CaptureError where an artifact that `<store>/subjects/<name>` links to has changed since it was recorded."""
+    for link in sorted(subject.iterdir()):
+        root = link.resolve()
+        recorded = link.name in STAGES and root.with_name(f"{root.name}.json").is_file()
+        if recorded and Store(root.parents[1]).find(link.name, root.name) is None:
+            raise CaptureError(f"{root}: damaged; give the same `hnerf run` again, which makes it anew")
+
+
 def sha256_of(path: Path) -> str:
     """SHA-256 of a file's bytes, hexadecimal."""
     with path.open("rb") as file:

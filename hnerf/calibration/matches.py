@@ -17,6 +17,7 @@ MIN_MATCHES = 15  # and a share: a fundamental matrix fits some wrong matches by
 MIN_INLIERS = 0.3
 
 log = logging.getLogger("hnerf.calibration")
+pycolmap.logging.minloglevel = 1  # warnings; not which device SIFT takes
 
 
 @dataclasses.dataclass(frozen=True)

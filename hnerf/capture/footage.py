@@ -1,5 +1,6 @@
 """The pictures of one camera as recorded: a folder of images, or a video."""
 
+import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,10 @@ import numpy as np
 
 from hnerf.capture.guarded import check_image_size, read_image
 from hnerf.errors import CaptureError
+
+# What is wrong with a video is told in one line of ours.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 
 class Picture(NamedTuple):

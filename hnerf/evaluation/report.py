@@ -16,6 +16,7 @@ from hnerf.evaluation.galleries import Gallery, Picture, surface_row, view_row
 from hnerf.evaluation.ground_truth import MASKED_IMAGE, GroundTruth
 from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.views import SPLITS, TRAINING_VIEW, View, some_views
+from hnerf.tables import pick
 
 FIGURES = (  # where in a split's scores, name, unit, format, what it means
     (
@@ -104,17 +105,10 @@ def summary(found: dict[str, Any]) -> list[dict[str, Any]]:
     """One row a figure: name, unit, meaning, and the value of each split ("–" where there is none)."""
     rows = []
     for key, name, unit, form, meaning in FIGURES:
-        values = [_pick(found[split], key) for split in SPLITS]
+        values = [pick(found[split], key) for split in SPLITS]
         shown = ["–" if value is None else form.format(value) for value in values]
         rows.append({"name": name, "unit": unit, "meaning": meaning, "values": shown})
     return rows
-
-
-def _pick(scores: dict[str, Any], key: str) -> float | None:
-    value: Any = scores
-    for part in key.split("."):
-        value = None if value is None else value[part]
-    return value
 
 
 def galleries(

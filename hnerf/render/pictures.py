@@ -17,7 +17,6 @@ from hnerf.asset.surface import posed_surface
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import read_rgb
 from hnerf.capture.footage import Video
-from hnerf.errors import CaptureError
 from hnerf.render.avatar import Avatar, Rendering
 
 log = logging.getLogger("hnerf.render")
@@ -67,8 +66,6 @@ def write_video(folder: Path, fps: float, path: Path, read: Callable[[Path], np.
     unless all can be read back."""
     files = sorted(folder.glob("*.png"))
     height_px, width_px = read(files[0]).shape[:2]
-    if min(height_px, width_px) < 2:
-        raise CaptureError(f"{path}: no video of {width_px} x {height_px} px; ask for a larger size")
     fps = round(fps, max(0, int(math.log10(65535 / fps))))  # MPEG-4 counts time in parts of at most 1/65535 s
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width_px, height_px))
     for file in files:

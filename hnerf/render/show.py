@@ -2,8 +2,6 @@
 
 import dataclasses
 import itertools
-import os
-import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,6 +15,7 @@ from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.capture.timing import usual_step
 from hnerf.errors import CaptureError
+from hnerf.new_folder import new_folder
 from hnerf.render.cameras_along import along, orbit, read_path
 from hnerf.render.motion import Motion, adopted, between, read_motion, rows, select
 from hnerf.render.pictures import Shot, write_pictures
@@ -25,7 +24,7 @@ from hnerf.training.model import TrainedAvatar, load_avatar
 
 KINDS = ("colour", "depth", "normals", "mask", "mesh")
 ORBIT_PICTURES = 60  # of somebody who stands still
-MAX_SIZE_PX = 8000  # a square video of it can still be read back
+MIN_SIZE_PX, MAX_SIZE_PX = 2, 8000  # a square video of either can still be read back
 
 
 @dataclass(frozen=True)
@@ -57,15 +56,13 @@ def render_subject(subject: Path, wish: Wish, out: Path) -> int:
 
     See `write_pictures` for the files. Raises CaptureError for a wish that cannot be met.
     """
-    capture = _checked(subject, wish, out)
-    motion = _motion(subject, wish, capture)
-    cameras = _cameras(wish, capture, motion.body)
-    shots: list[Shot] = list(zip(cameras, itertools.cycle(motion.body.frames), strict=False))
-    avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
-    partial = out.with_name(f"{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    write_pictures(on_body(avatar, motion.body), shots, wish.what, motion.fps, partial)
-    os.replace(partial, out)
+    with new_folder(out) as partial:
+        capture = _checked(subject, wish)
+        motion = _motion(subject, wish, capture)
+        cameras = _cameras(wish, capture, motion.body)
+        shots: list[Shot] = list(zip(cameras, itertools.cycle(motion.body.frames), strict=False))
+        avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
+        write_pictures(on_body(avatar, motion.body), shots, wish.what, motion.fps, partial)
     return len(shots)
 
 
@@ -74,18 +71,16 @@ def on_body(avatar: TrainedAvatar, body: BodyFit) -> TrainedAvatar:
     return dataclasses.replace(avatar, body=body.to(avatar.body.theta.device))
 
 
-def _checked(subject: Path, wish: Wish, out: Path) -> Capture:
+def _checked(subject: Path, wish: Wish) -> Capture:
     """The subject's capture through its calibrated cameras; CaptureError for what is plainly wrong."""
     for file in ("capture/capture.json", "calibration/intri.yml", "training/model.safetensors"):
         if not (subject / file).is_file():
             raise CaptureError(f"{subject / file}: missing; give <store>/subjects/<name> of a finished `hnerf run`")
-    if out.exists():
-        raise CaptureError(f"{out}: exists; give the name of a new folder")
     unknown = [kind for kind in wish.what if kind not in KINDS]
     if unknown or not wish.what:
         raise CaptureError(f"what {','.join(unknown)}: choose from {', '.join(KINDS)}")
-    if wish.size_px is not None and not 1 <= wish.size_px <= MAX_SIZE_PX:
-        raise CaptureError(f"size {wish.size_px} px: give 1 to {MAX_SIZE_PX}")
+    if (wish.camera or wish.path) and (wish.radius_m is not None or wish.height_m is not None):
+        raise CaptureError("--radius and --height are an orbit's; leave them out, or --camera and --path")
     if wish.pictures is not None and wish.pictures < 1:
         raise CaptureError(f"{wish.pictures} pictures: give 1 or more")
     return load_cameras(subject / "calibration", Capture.load(subject / "capture"))
@@ -127,7 +122,11 @@ def _cameras(wish: Wish, capture: Capture, body: BodyFit) -> list[Camera]:
         found = orbit(recorded, _middle_m(body), count, capture.up, wish.radius_m, wish.height_m)
     if wish.camera is None:  # made after a recorded one, but not exposed as it is
         found = [dataclasses.replace(camera, name="") for camera in found]
-    return found if wish.size_px is None else [_sized(camera, wish.size_px) for camera in found]
+    found = found if wish.size_px is None else [_sized(camera, wish.size_px) for camera in found]
+    width_px, height_px = found[0].width_px, found[0].height_px  # of all
+    if min(width_px, height_px) < MIN_SIZE_PX or max(width_px, height_px) > MAX_SIZE_PX:
+        raise CaptureError(f"pictures of {width_px} x {height_px} px: a side has {MIN_SIZE_PX} to {MAX_SIZE_PX}")
+    return found
 
 
 def _middle_m(body: BodyFit) -> np.ndarray:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, PositiveInt
 
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, Section, Settings, load_settings, named_file, read_yaml, validated
@@ -17,8 +17,8 @@ FIRST_SNAPSHOT_S = 15.0  # where a training has no limit that could be halved
 class Variant(Section):
     """Part of a capture. cameras, frames: of training, how many of them or which; None is all."""
 
-    cameras: int | tuple[str, ...] | None = None
-    frames: int | tuple[int, ...] | None = None
+    cameras: PositiveInt | tuple[str, ...] | None = None
+    frames: PositiveInt | tuple[int, ...] | None = None
     novel_poses: bool = True
     methods: tuple[str, ...] = ()  # of the study's; none is all
 
@@ -46,7 +46,9 @@ class ScoringSettings(Section):
     meshes: int = Field(default=2, ge=1)  # a split
     snapshot_images: int = Field(default=4, ge=1)
     snapshot_meshes: int = Field(default=1, ge=0)
-    frame_sizes_px: tuple[int, ...] = Field(default=(256, 512), min_length=1)  # longest sides of images that are timed
+    frame_sizes_px: tuple[PositiveInt, ...] = Field(
+        default=(256, 512), min_length=1
+    )  # longest sides of images that are timed
 
 
 class Study(Section):

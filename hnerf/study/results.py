@@ -13,7 +13,7 @@ from typing import Any
 from hnerf.study.curves import Point, seconds_to
 from hnerf.study.files import picture
 from hnerf.study.machine import in_words
-from hnerf.study.tables import head, line, pick, shown
+from hnerf.tables import head, line, pick, shown
 
 SPLITS = {"novel_view": "new views", "novel_pose": "new poses"}
 COLUMNS = {  # in a split's scores; cells show new views / new poses
@@ -93,7 +93,7 @@ def near_best_seconds(variant: Mapping[str, Any]) -> dict[str, float | None]:
 def caption(result: Mapping[str, Any]) -> str:
     """What was measured, and on which machines."""
     machines = sorted({in_words(s["machine"]) for v in result["variants"].values() for s in scored(v).values()})
-    limit = f"{result['seconds']:g} s of training" if result["seconds"] else "training to each preset's own end"
+    limit = f"{result['seconds']:g} s for each field" if result["seconds"] else "training to each preset's own end"
     return f"{result['subject']}, study {result['study']}: {limit}; on {'; on '.join(machines) or 'no machine yet'}."
 
 

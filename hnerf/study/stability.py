@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, NonNegativeInt
 
 from hnerf.config import CONFIGS, Section, named_file, read_yaml, validated
 from hnerf.errors import CaptureError
@@ -18,7 +18,7 @@ class Stability(Section):
     mildest first."""
 
     methods: Annotated[tuple[str, ...], Field(min_length=1)]
-    seeds: Annotated[tuple[int, ...], Field(min_length=1)]
+    seeds: Annotated[tuple[NonNegativeInt, ...], Field(min_length=1)]
     overrides: tuple[str, ...] = ()
     degradations: Annotated[dict[str, tuple[float, ...]], Field(min_length=1)]
 
@@ -49,5 +49,8 @@ def load_stability(study: str) -> Stability:
     path = named_file(study, STUDIES, "study", "studies")
     found = validated(Stability, read_yaml(path), path)
     for kind, strengths in found.degradations.items():
-        check_strengths(kind, strengths)
+        try:
+            check_strengths(kind, strengths)
+        except CaptureError as error:
+            raise CaptureError(f"{path}: {error}") from None
     return found

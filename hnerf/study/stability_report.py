@@ -9,8 +9,8 @@ from typing import Any
 from hnerf.study.degrade import KINDS
 from hnerf.study.files import picture
 from hnerf.study.surface import LENGTHS, VOLUMES
-from hnerf.study.tables import head, line, shown
 from hnerf.study.verdict import DEGRADED_DB, DEGRADED_RATIO, FAILED_DB, FAILED_RATIO, WORST_LAST
+from hnerf.tables import head, line, shown
 
 REFERENCE = "as recorded"
 LEGEND = (

@@ -19,9 +19,6 @@ class Verdict:
     word: Word
     reason: str = ""
 
-    def __str__(self) -> str:
-        return f"{self.word}: {self.reason}" if self.reason else self.word
-
 
 def judge(scores: dict[str, Any], reference: dict[str, Any], faults: list[str]) -> Verdict:
     """`scores` and `reference` hold psnr (dB) and chamfer_mm of the same images and surfaces, degraded and not, or None

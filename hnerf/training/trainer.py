@@ -144,6 +144,8 @@ class Trainer:
                     logger.info("step %d of %d, %.0f s: %s", self.step, self.steps, self.seconds, self.history[-1])
             if checkpoint_due and self.processes.leads:
                 save_checkpoint(self.out, self._state())
+        if self.processes.leads:
+            (self.out / "history.jsonl").write_text("".join(json.dumps(row) + "\n" for row in self.history))
         self._require_surface()
         return self._finish() if self.processes.leads else {}
 
@@ -310,7 +312,6 @@ class Trainer:
     def _finish(self) -> dict[str, Any]:
         out = self.out
         self._save(out)
-        (out / "history.jsonl").write_text("".join(json.dumps(row) + "\n" for row in self.history))
         turn, move_m, _ = self.objective.correction.totals()
         report = {
             "device": _device_name(self.processes.device),

@@ -17,7 +17,9 @@ from tests.shared_data import shared_capture
         (["run", "absent"], "absent: no such folder"),
         (["check", "absent"], "absent: no such folder"),
         (["run", "absent", "--preset", "best"], "best: no such preset or file; presets are "),
-        (["run", "absent", "--set", "training.stepz=1"], "training.stepz"),
+        (["run", "absent", "--set", "training.stepz=1"], "hnerf: --set training.stepz=1: training.stepz: Extra"),
+        (["run", "absent", "--set", "training.noise=.inf"], "training.noise: Input should be a finite number"),
+        (["run", "absent", "--set", "training.fast.colour_cells=[8,-3]"], "training.fast.colour_cells.1"),
         (["synth", "."], "exists; give the name of a new folder"),
     ],
 )
@@ -78,6 +80,29 @@ def test_a_fault_that_may_pass_keeps_its_traceback(monkeypatch: pytest.MonkeyPat
         main(["run", "ada"])
 
 
+def test_a_full_disk_is_one_line_and_exit_code_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for error in (OSError("a.png: cannot be written; is the disk full?"), OSError(errno.ENOSPC, "No space left", "b")):
+
+        def train(*_: object, error: OSError = error) -> None:
+            raise error
+
+        monkeypatch.setattr(cli.train_subject, "fn", train)
+        assert main(["run", "ada"]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line == f"hnerf: {error}; make room and give the same command again"
+
+
+def test_cameras_are_not_written_over_the_recordings_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "ada").mkdir()
+    for command in (["cameras", str(tmp_path / "ada"), "--format", "easymocap"], ["calibrate", str(tmp_path / "ada")]):
+        assert main([*command, "--out", str(tmp_path / "ada")]) == 2
+        assert "exists; give the name of a new folder" in capsys.readouterr().err
+    assert main(["cameras", str(tmp_path / "ada"), "--format", "colmap", "--out", str(tmp_path / "new")]) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["ada"]
+
+
 def test_unreadable_capture_leaves_nothing_half_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "ada").mkdir()
     (tmp_path / "ada" / "notes.txt").write_text("no cameras here")
@@ -98,10 +123,10 @@ def test_check_prints_every_camera_and_the_verdict(tmp_path: Path, capsys: pytes
 
 def test_synth_writes_whole_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(out: Path, settings: object) -> None:
-        out.mkdir()
+        (out / "half").touch()
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli, "write_performer", interrupted)
     with pytest.raises(KeyboardInterrupt):
         main(["synth", str(tmp_path / "ada")])
-    assert not (tmp_path / "ada").exists()
+    assert list(tmp_path.iterdir()) == []

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from hnerf.capture.camera import Camera
 from hnerf.capture.footage import Video
-from hnerf.errors import CaptureError
 from hnerf.render import pictures
 from hnerf.render.avatar import Rendering
 from hnerf.render.pictures import (
@@ -104,13 +103,6 @@ def test_a_video_has_its_rate_as_nearly_as_the_format_can(fps: float, tmp_path: 
         cv2.imwrite(str(tmp_path / "colour" / f"{number:06d}.png"), np.zeros((16, 16, 3), np.uint8))
     write_video(tmp_path / "colour", fps, tmp_path / "colour.mp4")
     assert Video.open(tmp_path / "colour.mp4").fps == pytest.approx(fps, rel=1e-3)
-
-
-def test_an_image_of_one_row_is_no_video(tmp_path: Path) -> None:
-    (tmp_path / "colour").mkdir()
-    cv2.imwrite(str(tmp_path / "colour" / "000000.png"), np.zeros((1, 16, 3), np.uint8))
-    with pytest.raises(CaptureError, match="no video of 16 x 1 px; ask for a larger size"):
-        write_video(tmp_path / "colour", 5.0, tmp_path / "colour.mp4")
 
 
 def test_greys_of_depths_by_hand(tmp_path: Path) -> None:

@@ -141,7 +141,8 @@ def test_a_taller_body_reaches_higher_in_the_picture(subject: Path, tmp_path: Pa
     [
         (["--camera", "9"], "camera 9: the recording has 0, 1, 2, 3"),
         (["--what", "colour,xray"], "what xray: choose from colour, depth, normals, mask, mesh"),
-        (["--size", "0"], "size 0 px"),
+        (["--size", "0"], "pictures of 1 x 1 px: a side has 2 to 8000"),
+        (["--camera", "0", "--height", "1"], "--radius and --height are an orbit's"),
         (["--pictures", "0"], "0 pictures"),
         (["--frames", "7"], "no frames 7; it has 0 to 2"),
         (["--between", "0", "7"], "no frames 7; it has 0 to 2"),

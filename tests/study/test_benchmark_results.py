@@ -81,7 +81,7 @@ def test_the_markdown_by_hand() -> None:
     assert as_markdown(result(), ["a (b).png"]).splitlines()[:23] == [
         "# Toys: ada",
         "",
-        "ada, study toy: 60 s of training; on Abacus, 1 of 2 cores, no GPU, torch 2, Python 3.",
+        "ada, study toy: 60 s for each field; on Abacus, 1 of 2 cores, no GPU, torch 2, Python 3.",
         "",
         "- A note.",
         "",

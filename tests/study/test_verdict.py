@@ -1,6 +1,6 @@
 import pytest
 
-from hnerf.study.verdict import judge
+from hnerf.study.verdict import Verdict, judge
 
 GOOD = {"psnr": 30.0, "chamfer_mm": 6.0}
 
@@ -21,8 +21,9 @@ GOOD = {"psnr": 30.0, "chamfer_mm": 6.0}
     ],
 )
 def test_the_worse_of_both_figures_counts(psnr: float | None, chamfer_mm: float | None, told: str) -> None:
-    assert str(judge({"psnr": psnr, "chamfer_mm": chamfer_mm}, GOOD, [])) == told
+    verdict = judge({"psnr": psnr, "chamfer_mm": chamfer_mm}, GOOD, [])
+    assert ": ".join(filter(None, (verdict.word, verdict.reason))) == told
 
 
 def test_a_surface_that_is_no_persons_is_failure_whatever_the_scores() -> None:
-    assert str(judge(GOOD, GOOD, ["no surface", "a hole"])) == "failed: no surface"
+    assert judge(GOOD, GOOD, ["no surface", "a hole"]) == Verdict("failed", "no surface")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hnerf.errors import CaptureError
-from tasks.store import Store
+from tasks.store import Store, require_whole
 
 # Not forked: a child would inherit Prefect's threads half-way.
 SPAWN = multiprocessing.get_context("spawn")
@@ -154,3 +154,17 @@ def test_view_stays_within_the_store(tmp_path: Path, name: str) -> None:
     artifact = store.obtain("fit", "k", write_abc)
     with pytest.raises(CaptureError, match=r"capture\.toml: name"):
         store.show(name, artifact)
+
+
+def test_a_subject_whose_artifact_was_damaged_is_refused(tmp_path: Path) -> None:
+    shelf = Store(tmp_path)
+    made = shelf.show("ada", shelf.obtain("fit", "k", write_abc))
+    require_whole(tmp_path / "subjects" / "ada")
+    (made.root / "deep" / "letters").write_text("abd")
+    with pytest.raises(CaptureError, match="fit/k: damaged; give the same `hnerf run` again"):
+        require_whole(tmp_path / "subjects" / "ada")
+
+
+def test_a_subject_that_was_copied_out_of_its_store_is_not_known_to_be_damaged(tmp_path: Path) -> None:
+    (tmp_path / "ada" / "fit").mkdir(parents=True)
+    require_whole(tmp_path / "ada")

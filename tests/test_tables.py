@@ -1,6 +1,6 @@
 """Lines of Markdown tables, by hand."""
 
-from hnerf.study.tables import head, line, pick, shown
+from hnerf.tables import head, line, pick, shown
 
 
 def test_a_table() -> None:
