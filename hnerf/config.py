@@ -39,7 +39,7 @@ class PerformerSettings(Section):
 
 
 class CalibrationSettings(Section):
-    max_residual_px: float = Field(default=5.0, gt=0)  # median a camera may show before the whole rig is refined
+    max_residual_px: float = Field(default=5.0, gt=0)  # median a camera may show, more of a person taller than 357 px
     min_improvement: float = Field(default=0.02, ge=0, lt=1)  # share by which held-out frames must gain to accept it
 
 

@@ -12,6 +12,7 @@ from hnerf.calibration.diagnosis import (
     explain,
     gross_limit_px,
     measure,
+    median_height_px,
     undo_mistake,
     unit_of,
 )
@@ -32,6 +33,7 @@ __all__ = ["check_calibration", "load_cameras"]
 ROTATION_TOLERANCE = 1e-3
 COINCIDENT_M = 0.005
 UPRIGHT = 0.5  # mean cosine between the trunk and up, below which somebody lies or bends all the time, or up is not up
+RESIDUAL_SHARE = 0.014  # of the person's height: 5 px of 357
 REJECT_FACTOR = 2.0  # times `max_residual_px`: a camera so far off, that no refinement brought back, is not used
 
 
@@ -47,6 +49,7 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
     given = [capture.cameras[name] for name in capture.train_cameras]
     if len(given) == 1:
         return _monocular(capture, keypoints[0])
+    settings = _for_size(settings, median_height_px(keypoints))
     before = measure(given, keypoints)
     _check_convention(capture, given, keypoints, before)
     cameras, mistakes = undo_mistake(given, keypoints)
@@ -94,6 +97,11 @@ def _keypoints(capture: Capture) -> np.ndarray:
                 f"{capture.name}: camera {name} never shows the person; check its keypoints or leave it out"
             )
     return np.stack([found[name] for name in capture.train_cameras])
+
+
+def _for_size(settings: CalibrationSettings, height_px: float) -> CalibrationSettings:
+    """Residuals that a person of this height may leave: what detectors err grows with him."""
+    return settings.model_copy(update={"max_residual_px": max(settings.max_residual_px, RESIDUAL_SHARE * height_px)})
 
 
 def _check_numbers(capture: Capture) -> None:

@@ -132,8 +132,13 @@ def unit_of(height: float) -> str | None:
 
 def gross_limit_px(keypoints: np.ndarray) -> float:
     """The trimmed cost beyond which a calibration is wrong rather than stale. keypoints (C, frames, 25, 3)."""
+    return GROSS_SHARE * median_height_px(keypoints)
+
+
+def median_height_px(keypoints: np.ndarray) -> float:
+    """Of the person, over all pictures. keypoints (C, frames, 25, 3)."""
     heights = person_heights_px(keypoints.reshape(-1, 25, 3))
-    return GROSS_SHARE * float(np.median(heights[heights > 0]))
+    return float(np.median(heights[heights > 0]))
 
 
 def explain(cameras: Sequence[Camera], keypoints: np.ndarray) -> str | None:

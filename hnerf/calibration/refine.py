@@ -177,9 +177,9 @@ def held_out_cost_px(
     """Trimmed cost of keypoints (C, frames, 25, 3), each part judged with cameras that were adjusted to another part.
 
     The parts share neither frames nor joints: what a detector gets wrong about one joint, in frame after frame, does
-    not prove a camera wrong.
+    not prove a camera wrong. One frame alone is parted by its joints.
     """
-    first, second = np.array_split(keypoints, 2, axis=1)
+    first, second = np.array_split(keypoints, 2, axis=1) if keypoints.shape[1] > 1 else (keypoints, keypoints)
     costs = []
     for fitted, judged in ((first[:, :, ::2], second[:, :, 1::2]), (second[:, :, 1::2], first[:, :, ::2])):
         adjusted = adjust(cameras, fitted, free, focal) if free else cameras

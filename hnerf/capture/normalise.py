@@ -12,6 +12,7 @@ from hnerf.capture.guarded import read_image
 from hnerf.capture.lens import Lens
 from hnerf.errors import CaptureError
 
+MOST_LABELS = 64  # different levels; a mask of more has soft edges
 JPEG_OPTIONS = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
 UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-3)  # OpenCV's own 5 rounds miss by pixels
@@ -87,11 +88,12 @@ class Normaliser:
         self.write_image(read_image(source), source, source, target)
 
     def write_mask(self, recorded: np.ndarray, source: Path, target: Path) -> None:
-        """A mask (H, W) uint8 from file `source` as 0/255 PNG. The person is anything but black; in a JPEG, where edges
-        ring, anything light."""
+        """A mask (H, W) uint8 from file `source` as 0/255 PNG. The person is anything but black; in a matte, and in a
+        JPEG, where edges ring, anything light."""
         self._check_size(recorded, source)
         target.parent.mkdir(parents=True, exist_ok=True)
-        black = 127 if source.suffix.lower() in (".jpg", ".jpeg") else 0
+        soft = source.suffix.lower() in (".jpg", ".jpeg") or len(np.unique(recorded)) > MOST_LABELS
+        black = 127 if soft else 0
         _write(target, np.where(self.pixels(np.where(recorded > black, 255, 0).astype(np.uint8)) > 127, 255, 0), [])
 
     def _check_size(self, pixels: np.ndarray, source: Path) -> None:

@@ -16,7 +16,7 @@ from hnerf.errors import CaptureError
 
 log = logging.getLogger("hnerf.capture")
 
-FrameNumber = Annotated[int, Field(ge=0, le=999_999)]
+FrameNumber = Annotated[int, Field(ge=0, le=999_999_999)]
 
 
 class _Table(BaseModel):

@@ -10,7 +10,7 @@ from hnerf.capture.capture import Capture
 from hnerf.config import SegmentationSettings
 from hnerf.errors import CaptureError
 from hnerf.segmentation.cut import components_within, cut
-from hnerf.segmentation.difference import difference, masked_median, noise_level
+from hnerf.segmentation.difference import difference, levelled, masked_median, noise_level, surroundings
 from hnerf.segmentation.learned import Network
 from hnerf.segmentation.prior import Prior, window_around
 from hnerf.spread import spread
@@ -98,8 +98,10 @@ class AgainstBackground:
         mask = np.zeros(image.shape[:2], bool)
         if not prior.reach.any():
             return mask
-        noise, is_median = noise_level(image, self.plate), self.name == MEDIAN
-        found = difference(image[window], self.plate[window], noise, self.settings, shadowed=is_median)
+        free = surroundings(prior, self.known)
+        plate = levelled(self.plate, image, free)
+        noise, is_median = noise_level(image, plate, free), self.name == MEDIAN
+        found = difference(image[window], plate[window], noise, self.settings, shadowed=is_median)
         mask[window] = cut(image[window], found, prior.cropped(window), self.known[window])
         return mask
 

@@ -16,6 +16,8 @@ EDGE_OF_SHADOW = 0.1  # log brightness over which a shadow beyond the darkest be
 PERSON_BRIGHTNESS, PERSON_CHROMA = 0.6, 0.25  # spread of a person's log ratio to what is behind
 NOISE_FACTOR = 0.8  # the robust estimate of noise counts JPEG's blocks twice
 ROUNDING = 0.5  # grey levels
+ENOUGH = 0.02  # of an image, to tell noise and exposure by
+ALIKE = 0.02  # of exposures: noise and JPEG feign as much
 APART_GAIN, APART_FLOOR = 16.0, 16.0  # of the picture of differences, which cameras' square-root noise makes even
 PAINT_PX = 3  # from which a pixel never seen takes its colour
 HIDDEN = 256  # sorts behind every grey level
@@ -31,10 +33,29 @@ class Difference:
     plate: np.ndarray
 
 
-def noise_level(image: np.ndarray, plate: np.ndarray) -> float:
-    """Standard deviation of their difference, grey levels; most of the image must be background."""
-    apart = image[::4, ::4].astype(np.float32) - plate[::4, ::4]
-    return 1.4826 * float(np.median(np.abs(apart))) + ROUNDING
+def surroundings(prior: Prior, known: np.ndarray) -> np.ndarray:
+    """(H, W) bool: where background is seen and `known`, as far from the person as there is enough of it."""
+    for free in (~prior.reach & known, ~prior.near & known):
+        if free.mean() > ENOUGH:
+            return free
+    return ~prior.body & known
+
+
+def levelled(plate: np.ndarray, image: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """The plate as bright and as tinted as the image is where it shows background, `free` (H, W): cameras that expose
+    by themselves do so anew when a person comes in. As it is where they are alike."""
+    if not free.any():
+        return plate
+    gains = np.median((image[free] + DARK) / (plate[free] + DARK), 0)
+    if np.abs(gains - 1).max() < ALIKE:
+        return plate
+    return ((plate + DARK) * gains - DARK).round().clip(0, 255).astype(np.uint8)
+
+
+def noise_level(image: np.ndarray, plate: np.ndarray, free: np.ndarray) -> float:
+    """Standard deviation of their difference where both show background, `free` (H, W); grey levels."""
+    apart = image[free].astype(np.float32) - plate[free]
+    return (1.4826 * float(np.median(np.abs(apart))) if len(apart) else 0.0) + ROUNDING
 
 
 def difference(

@@ -25,6 +25,7 @@ UPRIGHT = 0.7  # cosine between the image's and the world's vertical from which 
 HEAD_SHARE = 0.45  # of the distance from neck to nose: radius of the head about a point a little above the nose
 FAR = 5  # widths or heights of the image, beyond which nothing is drawn
 FACE = (15, 16, 17, 18)
+SHOULDERS, HIP_WIDTH = (2, 5), 0.8  # of the shoulders', for hips that are not seen
 LEGS = ((9, 10, 11, (22, 23, 24)), (12, 13, 14, (19, 20, 21)))  # hip, knee, ankle, foot
 NOSE_ABOVE_NECK, THIGH = 0.45, 0.8  # of the distance from neck to mid-hip, along which what is not seen is likely
 FOOT_SHARE = 0.1  # of the person's height: how far a foot that is not seen may go on around its ankle
@@ -149,18 +150,22 @@ def _filled(tracks: np.ndarray) -> np.ndarray:
 
 
 def _likely(pose_px: np.ndarray) -> np.ndarray:
-    """A pose (25, 2) with head and legs where they are likely in line with the trunk, if they are not seen."""
+    """A pose (25, 2) with head, hips and legs where they are likely in line with each other, if they are not seen."""
     likely = pose_px.copy()
-    trunk_px = pose_px[8] - pose_px[1]
 
     def fill(joint: int, at_px: np.ndarray) -> None:
         if not np.isfinite(likely[joint]).all():
             likely[joint] = at_px
 
     face = [k for k in FACE if np.isfinite(pose_px[k]).all()]
-    fill(0, pose_px[face].mean(0) if face else pose_px[1] - NOSE_ABOVE_NECK * trunk_px)
-    for hip, knee, ankle, _ in LEGS:
-        fill(hip, pose_px[8])
+    if face:
+        fill(0, pose_px[face].mean(0))
+    fill(8, pose_px[1] + (pose_px[1] - likely[0]) / NOSE_ABOVE_NECK)
+    trunk_px = likely[8] - pose_px[1]
+    fill(0, pose_px[1] - NOSE_ABOVE_NECK * trunk_px)
+    for shoulder, (hip, knee, ankle, _) in zip(SHOULDERS, LEGS, strict=True):
+        fill(hip, likely[8] + HIP_WIDTH * (pose_px[shoulder] - pose_px[1]))
+        fill(hip, likely[8])
         fill(knee, likely[hip] + THIGH * trunk_px)
         fill(ankle, 2 * likely[knee] - likely[hip])
     return likely

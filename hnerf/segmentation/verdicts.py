@@ -9,6 +9,7 @@ from hnerf.segmentation.prior import Prior
 
 LEAST_AREA = 0.1  # of the prior's core: less is no person
 LEAST_COVERED = 0.5  # of the core
+LEAST_WITHIN = 0.5  # of the mask, of where the person can be
 JUMP = 1.3  # ratio of areas between neighbours in time
 NEIGHBOURS = 4  # nearest frames, at most so many usual steps away, whose median area a mask is held against
 
@@ -33,6 +34,8 @@ def judge(mask: np.ndarray, prior: Prior) -> Verdict:
         fault = "the mask is inverted (255 must be on the person)"
     elif expected_px and mask[prior.core].mean() < LEAST_COVERED:
         fault = "the mask misses the person"
+    elif prior.reach.any() and mask[prior.reach].sum() < LEAST_WITHIN * area_px:
+        fault = "the mask is mostly not the person"
     named = [side for side, cut in zip(("top", "bottom", "left", "right"), sides, strict=True) if cut]
     return Verdict(fault, f"cut off by the image's border ({', '.join(named)})" if named else None, area_px)
 

@@ -17,14 +17,15 @@ LOOKS = 8  # frames that are looked at
 FACING = 0.4  # least cosine between a place's normal and its direction to the camera
 DARK, BRIGHT = 15, 245  # of 255: beyond, a level is cut off or noise
 LEAST_PLACES = 100  # that two cameras share, for their ratio to count
+MOST = 0.5  # of the cameras
 TELLING = 0.1  # of a gain's logarithm: shading, and bodies fitted a little wrong, leave 0.03 of cameras exposed alike
 
 Gains = dict[str, tuple[float, float, float]]
 
 
 def camera_gains(capture: Capture, masks: Masks, body: BodyFit) -> tuple[Gains, Decision]:
-    """Gains (R, G, B) of the training cameras, of geometric mean 1, and why (their means over channels); none where
-    cameras are exposed alike.
+    """Gains (R, G, B) of the training cameras, and why (their means over channels); none where cameras are exposed
+    alike. Those of most cameras are 1 where most agree, else the geometric mean of all is.
 
     Cameras a and b show the same place of the body brighter or darker by median ratios r_ab over places and frames;
     log g_b - log g_a = log r_ab is solved for all pairs by least squares, weighted by their numbers of places.
@@ -40,8 +41,11 @@ def camera_gains(capture: Capture, masks: Masks, body: BodyFit) -> tuple[Gains, 
             found.append(np.log(levels[b][both] / levels[a][both]))
     pairs = {pair: np.concatenate(found) for pair, found in ratios.items()}
     logs = solve_gains(len(names), {pair: found for pair, found in pairs.items() if len(found) >= LEAST_PLACES})
+    usual = np.median(logs, 0)
+    if (np.abs(logs - usual).max(1) < TELLING).mean() > MOST:
+        logs = logs - usual
     furthest = float(np.abs(logs).max())
-    told = f"seeing the same places of the body, cameras differ from their mean by {np.expm1(furthest):.0%} at most"
+    told = f"seeing the same places of the body, cameras differ from what is usual by {np.expm1(furthest):.0%} at most"
     if furthest < TELLING:
         return {}, Decision(1.0, f"{told}: no more than shading may" if logs.any() else "no two cameras to compare")
     gains = {name: (float(r), float(g), float(b)) for name, (r, g, b) in zip(names, np.exp(logs), strict=True)}

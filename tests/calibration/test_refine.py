@@ -84,6 +84,12 @@ def test_a_wrong_focal_length_is_refined_where_the_pose_does_not_suffice(tmp_pat
     assert np.median(error_px) < 1
 
 
+def test_one_moment_is_enough_to_refine_a_camera(tmp_path: Path) -> None:
+    given = with_c2(lambda c: turned(c, 2.0))
+    found = refined(tmp_path, given, keypoints_of()[:, :1])
+    assert [new is not old for new, old in zip(found.cameras, given, strict=True)] == [False, False, True, False]
+
+
 def test_two_cameras_wrong_leave_the_others_alone(tmp_path: Path) -> None:
     given = [turned(c, 1.0, axis=i) if i < 2 else c for i, c in enumerate(ring(4))]
     found = refined(tmp_path, given, keypoints_of())

@@ -147,6 +147,21 @@ def test_masks_in_a_jpeg_do_not_grow(folder: Path, tmp_path: Path) -> None:
     assert found is not None and np.array_equal(found, mask[..., 0] > 0)
 
 
+def test_mattes_are_cut_in_the_middle_of_their_edges_and_labels_are_not(folder: Path, tmp_path: Path) -> None:
+    """A ramp of 6 px beside the person, of 256 levels in another corner; labels of 1 are the person."""
+    matte, labels = np.zeros((rec.HEIGHT, rec.WIDTH, 3), np.uint8), np.zeros((rec.HEIGHT, rec.WIDTH, 3), np.uint8)
+    matte[3:13, 5:19], labels[3:13, 5:19] = 255, 1
+    matte[3:13, 19:22] = np.array([190, 120, 60])[:, None]
+    matte[13:] = np.linspace(0, 100, matte[13:, :, 0].size).reshape(matte.shape[0] - 13, -1)[..., None]
+    for camera in rec.CAMERAS:
+        for frame in rec.FRAMES:
+            rec.write_png(folder / "masks" / camera / f"{frame:06d}.png", matte if frame == rec.FRAMES[0] else labels)
+    capture = ingest(folder, SETTINGS, tmp_path / "out")
+    soft, hard = (capture.given_mask("01", frame) for frame in rec.FRAMES[:2])
+    assert soft is not None and np.array_equal(soft, matte[..., 0] > 127)
+    assert hard is not None and np.array_equal(hard, labels[..., 0] > 0)
+
+
 def test_distorted_recording_comes_out_linear(folder: Path, tmp_path: Path) -> None:
     """k1 = -0.5: what the lens shows at radius r (1 - 0.5 r^2) belongs at radius r."""
     rec.write_calibration(folder, distortion=(-0.5, 0, 0, 0))

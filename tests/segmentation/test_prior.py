@@ -8,12 +8,13 @@ from hnerf.segmentation.prior import _interpolated, _likely, keypoint_priors
 from tests.segmentation.scene import write_scene
 
 HEAD, LEGS, FEET = [0, 15, 16, 17, 18], [10, 11, 13, 14, *range(19, 25)], list(range(19, 25))
+HIPS = [8, 9, 12]
 
 
 @pytest.mark.parametrize(
     ("cameras", "unseen", "after"),
-    [(2, HEAD, 0), (2, HEAD, 1), (1, HEAD, 0), (1, LEGS, 0), (2, FEET, 0)],
-    ids=["head by one camera of two", "head later on", "head by the only camera", "legs", "feet"],
+    [(2, HEAD, 0), (2, HEAD, 1), (1, HEAD, 0), (1, LEGS, 0), (2, FEET, 0), (1, HIPS, 0)],
+    ids=["head by one camera of two", "head later on", "head by the only camera", "legs", "feet", "hips"],
 )
 def test_what_no_keypoint_shows_is_within_reach(tmp_path: Path, cameras: int, unseen: list[int], after: int) -> None:
     capture, truth = write_scene(tmp_path, cameras, moves_m=2.0)
@@ -49,8 +50,19 @@ def test_head_and_legs_in_line_with_the_trunk_by_hand() -> None:
     assert likely[11].tolist() == [50, 72]
     assert likely[14].tolist() == [68, 60]  # as far again as from hip to knee
     assert np.isnan(likely[4]).all()
+    pose_px[2] = 45, 20
+    assert _likely(pose_px)[9].tolist() == [46, 40]  # 0.8 of the shoulder's 5 px beside the mid-hip
     pose_px[[17, 18]] = (46, 12), (48, 14)
     assert _likely(pose_px)[0].tolist() == [47, 13]  # between what is seen of the face
+
+
+def test_hips_in_line_with_the_head_by_hand() -> None:
+    """The nose is 9 px above the neck at (50, 20): the mid-hip is 9 / 0.45 = 20 px below it."""
+    pose_px = np.full((25, 2), np.nan)
+    pose_px[0], pose_px[1], pose_px[2], pose_px[5] = (50, 11), (50, 20), (45, 20), (55, 20)
+    likely = _likely(pose_px)
+    assert likely[[8, 9, 12]] == pytest.approx(np.array([[50, 40], [46, 40], [54, 40]]))
+    assert likely[10] == pytest.approx([46, 56])
 
 
 def test_gaps_move_with_the_mid_hip_by_hand() -> None:

@@ -11,7 +11,7 @@ from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings, SegmentationSettings
 from hnerf.errors import CaptureError
 from hnerf.segmentation.cut import components_within
-from hnerf.segmentation.difference import difference, masked_median, noise_level
+from hnerf.segmentation.difference import difference, levelled, masked_median, noise_level, surroundings
 from hnerf.segmentation.edge import settle_edge
 from hnerf.segmentation.masks import encode, movement_px
 from hnerf.segmentation.prior import Prior
@@ -32,11 +32,38 @@ def test_a_shadow_is_not_the_person_by_hand() -> None:
     image = plate.copy()
     image[10:30, 10:30] = (90, 72, 54)
     image[10:30, 50:70] = (54, 72, 90)
-    found = difference(image, plate, noise_level(image, plate), SETTINGS)
+    found = difference(image, plate, noise_level(image, plate, np.ones((40, 80), bool)), SETTINGS)
     assert (found.odds[12:28, 12:28] < -1).all()
     assert (found.odds[12:28, 52:68] > 4).all()
     assert (found.odds[:8] < -4).all()
     assert (found.apart[:8] == 128).all()
+
+
+def test_noise_and_exposure_are_those_of_the_background_by_hand() -> None:
+    """Two thirds of the picture are the person's. Beside him the plate is 20 % darker, but for a step of 2 levels up
+    and down, once DARK is added to either: 150 + 6 against 124 + 6, give or take 2."""
+    plate, image = np.full((8, 30, 3), 124, np.uint8), np.full((8, 30, 3), 150, np.uint8)
+    image[:, :20] = 30
+    image[::2, 20:] += 2
+    image[1::2, 20:] -= 2
+    body = np.zeros((8, 30), bool)
+    body[:, :20] = True
+    free = surroundings(Prior(body, body, body, body, 8.0), np.ones_like(body))
+    assert free.tolist() == (~body).tolist()
+    bright = levelled(plate, image, free)
+    assert np.unique(bright).tolist() == [150]
+    assert noise_level(image, bright, free) == pytest.approx(1.4826 * 2 + 0.5)
+    assert levelled(image, image, free) is image
+
+
+def test_background_is_looked_for_ever_nearer_to_the_person() -> None:
+    wide, narrow = np.ones((10, 10), bool), np.zeros((10, 10), bool)
+    narrow[2:] = True
+    known = np.ones_like(wide)
+    assert surroundings(Prior(narrow, narrow, narrow, wide, 8.0), known).tolist() == (~narrow).tolist()
+    known[0] = False
+    assert surroundings(Prior(narrow, narrow, wide, wide, 8.0), known).sum() == 10
+    assert levelled(np.zeros((10, 10, 3), np.uint8), np.ones((10, 10, 3), np.uint8), ~wide).max() == 0
 
 
 def test_only_a_median_may_hold_shadows_itself() -> None:

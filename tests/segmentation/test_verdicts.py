@@ -21,6 +21,14 @@ def test_empty_inverted_and_astray() -> None:
     assert "misses the person" in str(judge(np.roll(BODY, 5, axis=1), PRIOR).fault)
 
 
+def test_a_mask_of_something_else_too() -> None:
+    """Of 400 px a person can be within 48; of twice as many as his, just half."""
+    assert "mostly not the person" in str(judge(np.ones_like(BODY), PRIOR).fault)
+    wide = BODY.copy()
+    wide[4:16, 12:16] = True
+    assert judge(wide, PRIOR).fault is None
+
+
 def test_inverted_without_a_prior() -> None:
     nothing = np.zeros_like(BODY)
     assert "inverted" in str(judge(~BODY, Prior(nothing, nothing, nothing, nothing, 0.0)).fault)
