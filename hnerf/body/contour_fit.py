@@ -71,7 +71,7 @@ def outline(mask: np.ndarray, spacing_px: float) -> Outline:
     normals = -slope / np.linalg.norm(slope, axis=1, keepdims=True).clip(1e-9)
     inside, outside = (cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, 5) for m in (mask, ~mask))
     distance = np.where(mask, 0.5 - inside, outside - 0.5)
-    return Outline(points[:, ::-1], normals[:, ::-1], distance.astype(np.float64))
+    return Outline(points[:, ::-1], normals[:, ::-1], distance)
 
 
 def _resampled(line: np.ndarray, spacing_px: float) -> np.ndarray:

@@ -191,7 +191,7 @@ def _masks(capture: Capture, name: str, shown: Sequence[int]) -> list[np.ndarray
     if all(mask is not None for mask in given):
         return [mask for mask in given if mask is not None]
     settings = SegmentationSettings()
-    priors = keypoint_priors(dataclasses.replace(capture, train_cameras=(name,)), settings)[name]
+    ((_, priors),) = keypoint_priors(dataclasses.replace(capture, train_cameras=(name,)), settings)
     plate = capture.background(name)
     if plate is None:
         backend = AgainstBackground.of_median(capture, name, priors, PLATE_FRAMES, settings)

@@ -1,5 +1,6 @@
 """Where in an image the subject can be, from keypoints or from a fitted body."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -64,27 +65,25 @@ class Prior:
         return Prior(self.core[window], self.body[window], self.near[window], self.reach[window], self.height_px)
 
 
-def keypoint_priors(capture: Capture, settings: SegmentationSettings) -> dict[str, list[Prior]]:
-    """Stick figures in every training camera, in the order of `capture.frames`."""
-    priors = {}
-    for name, sticks in _sticks(capture).items():
-        upright = _is_upright(capture, name)
-        priors[name] = [Prior.around(s.core, s.body, s.likely, s.height_px, settings.reach, upright) for s in sticks]
-    return priors
+def keypoint_priors(capture: Capture, settings: SegmentationSettings) -> Iterator[tuple[str, list[Prior]]]:
+    """Stick figures, of one training camera after the other, in the order of `capture.frames`."""
+    for name, sticks in _sticks(capture):
+        rest = settings.reach, _is_upright(capture, name)
+        yield name, [Prior.around(s.core, s.body, s.likely, s.height_px, *rest) for s in sticks]
 
 
-def body_priors(capture: Capture, body: BodyFit, settings: SegmentationSettings) -> dict[str, list[Prior]]:
-    """The fitted body together with the stick figure, which a poor fit may have left, in every training camera."""
+def body_priors(capture: Capture, body: BodyFit, settings: SegmentationSettings) -> Iterator[tuple[str, list[Prior]]]:
+    """The fitted body together with the stick figure, which a poor fit may have left, of one training camera after the
+    other."""
     vertices_m, faces = body.vertices_m().numpy(), body.rig.faces.numpy()
-    priors: dict[str, list[Prior]] = {}
-    for name, sticks in _sticks(capture, body).items():
-        priors[name], upright = [], _is_upright(capture, name)
+    for name, sticks in _sticks(capture, body):
+        priors, upright = [], _is_upright(capture, name)
         for frame, stick in zip(capture.frames, sticks, strict=True):
             covered = silhouette(capture.cameras[name], vertices_m[body.index(frame)], faces)
             core = cv2.erode(covered.astype(np.uint8), disc(CORE_SHARE * stick.height_px)).astype(bool)
             covered |= stick.body
-            priors[name].append(Prior.around(core, covered, covered, stick.height_px, settings.reach / 2, upright))
-    return priors
+            priors.append(Prior.around(core, covered, covered, stick.height_px, settings.reach / 2, upright))
+        yield name, priors
 
 
 def _is_upright(capture: Capture, camera: str) -> bool:
@@ -182,12 +181,10 @@ class _Stick:
     height_px: float
 
 
-def _sticks(capture: Capture, body: BodyFit | None = None) -> dict[str, list[_Stick]]:
+def _sticks(capture: Capture, body: BodyFit | None = None) -> Iterator[tuple[str, list[_Stick]]]:
     """Per training camera the stick figures of `capture.frames`."""
-    return {
-        name: [_stick(capture.cameras[name], pose_px) for pose_px in poses_px]
-        for name, poses_px in _consistent_keypoints(capture, body).items()
-    }
+    for name, poses_px in _consistent_keypoints(capture, body).items():
+        yield name, [_stick(capture.cameras[name], pose_px) for pose_px in poses_px]
 
 
 def _stick(camera: Camera, pose_px: np.ndarray) -> _Stick:

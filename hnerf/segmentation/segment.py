@@ -32,15 +32,15 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
     network = None if settings.model is None else Network(settings.model)
     encoded: dict[tuple[str, int], bytes] = {}
     cameras: dict[str, Any] = {}
-    for name in capture.train_cameras:
-        backend = choose_backend(capture, name, priors[name], body is not None, network, settings)
+    for name, own in priors:
+        backend = choose_backend(capture, name, own, body is not None, network, settings)
         log.info("camera %s: %d masks, %s", name, len(capture.frames), backend.name)
         verdicts = []
-        for frame, prior in zip(capture.frames, priors[name], strict=True):
+        for frame, prior in zip(capture.frames, own, strict=True):
             mask = backend.mask(frame, prior)
             verdicts.append(judge(mask, prior))
             encoded[name, frame] = encode(mask)
-        cameras[name] = {"backend": backend.name} | _findings(capture, name, verdicts, priors[name])
+        cameras[name] = {"backend": backend.name} | _findings(capture, name, verdicts, own)
         for row in cameras[name]["dropped"]:
             del encoded[name, row["frame"]]
     return Masks(encoded, {"cameras": cameras})

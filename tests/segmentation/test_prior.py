@@ -24,7 +24,7 @@ def test_what_no_keypoint_shows_is_within_reach(tmp_path: Path, cameras: int, un
     if unseen == FEET:
         found["c1"][:, :, unseen] = 0
     np.savez(tmp_path / "keypoints.npz", **found)
-    priors = keypoint_priors(capture, SegmentationSettings())
+    priors = dict(keypoint_priors(capture, SegmentationSettings()))
     for (camera, frame), person in truth.items():
         assert priors[camera][frame].reach[person].all()
 
@@ -35,7 +35,7 @@ def test_a_detection_far_outside_the_image_is_drawn_no_farther_than_that(tmp_pat
         found = {name: stored[name] for name in stored.files}
     found["c0"][0, 0, 4, :2] = 1e7, -1e9
     np.savez(tmp_path / "keypoints.npz", **found)
-    prior = keypoint_priors(capture, SegmentationSettings())["c0"][0]
+    prior = dict(keypoint_priors(capture, SegmentationSettings()))["c0"][0]
     assert 5 * 400 < prior.height_px < 6 * 400  # from 5 heights above the image to the feet in it
     assert prior.reach[truth["c0", 0]].all()
 
