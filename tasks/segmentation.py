@@ -15,7 +15,7 @@ from tasks.store import Artifact
 MOVED = "moved_px"
 
 
-@stage("segmentation", version="5")
+@stage("segmentation", version="6")
 def segment(
     out: Path,
     recording: Artifact,
