@@ -54,8 +54,17 @@ def levelled(plate: np.ndarray, image: np.ndarray, free: np.ndarray) -> np.ndarr
 
 def noise_level(image: np.ndarray, plate: np.ndarray, free: np.ndarray) -> float:
     """Standard deviation of their difference where both show background, `free` (H, W); grey levels."""
-    apart = image[free].astype(np.float32) - plate[free]
-    return (1.4826 * float(np.median(np.abs(apart))) if len(apart) else 0.0) + ROUNDING
+    apart = np.abs(image[free].astype(np.int16) - plate[free]).ravel()
+    return (1.4826 * grouped_median(apart) if len(apart) else 0.0) + ROUNDING
+
+
+def grouped_median(numbers: np.ndarray) -> float:
+    """Median of whole numbers from 0 on, (N,), each taken as spread over all that is rounded to it: the plain one would
+    jump, where few numbers are different."""
+    share = np.bincount(numbers) / len(numbers)
+    middle = int(np.searchsorted(share.cumsum(), 0.5))
+    into = (0.5 - share[:middle].sum()) / share[middle]
+    return middle - 0.5 + into if middle else 0.5 * into
 
 
 def difference(
