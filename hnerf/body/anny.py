@@ -2,13 +2,15 @@
 
 import dataclasses
 import functools
+from typing import TYPE_CHECKING
 
-import anny
 import torch
-from anny.models.model_data import TopologyConfig
 from torch import Tensor
 
 from hnerf.body.rig import Rig
+
+if TYPE_CHECKING:  # imported where it is used: it takes seconds, which commands without a body need not wait
+    import anny
 
 PHENOTYPES = ("gender", "age", "muscle", "weight", "height", "proportions")
 
@@ -59,8 +61,11 @@ BODY_25 = (
 
 
 @functools.cache
-def _model() -> anny.Anny:
+def _model() -> "anny.Anny":
     """The body model; the first construction on a machine takes about a minute and is cached on disk by anny."""
+    import anny
+    from anny.models.model_data import TopologyConfig
+
     labels = [f"{part}-incr" for name in LOCAL_CHANGES for part in name.split("+")]
     model = anny.Anny(topology=TopologyConfig(base_mesh="makehuman", eyes=False, tongue=False), local_changes=labels)
     assert tuple(model.phenotype_labels) == PHENOTYPES
@@ -132,9 +137,11 @@ def _coefficients(beta: Tensor) -> Tensor:
     return torch.cat([rows[: -2 * unchanged.shape[1]], local])
 
 
-def _keypoint_weights(model: anny.Anny) -> Tensor:
+def _keypoint_weights(model: "anny.Anny") -> Tensor:
     """BODY_25 regression weights (25, V). Eyes lose their removed eyeball vertices, so rows are normalised again."""
-    path = anny.paths.get_anny_root_dir() / "data" / "keypoints" / "coco.pth"
+    from anny.paths import get_anny_root_dir
+
+    path = get_anny_root_dir() / "data" / "keypoints" / "coco.pth"
     stored = torch.load(path, weights_only=True)
     rows = []
     for name in BODY_25:
