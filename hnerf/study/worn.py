@@ -1,6 +1,6 @@
 """A capture in which the person wears what no body model expresses: a wide skirt, or long hair.
 
-Both hang from the body by gravity and move in their own way: the folds of the skirt run around it, the hair sways. They
+Both move in their own way: the skirt spans both thighs and its folds run around it, the hair hangs down and sways. They
 are drawn over every picture, before or behind the body that was fitted to the good capture, and over what is known to
 be true of it.
 """
@@ -100,7 +100,7 @@ class Shown:
 
 
 def skirt(keypoints_m: np.ndarray, up: np.ndarray, flare_m: float, rng: Rng) -> Worn:
-    """From the hips to the knees of keypoints (n, 25, 3), around both thighs, its hem so far off them; up (3,)."""
+    """From the hips to the knees of keypoints (n, 25, 3), around both thighs; how far its hem is off them."""
     right_hip, left_hip, right_knee, left_knee = (keypoints_m[:, k] for k in (R_HIP, L_HIP, R_KNEE, L_KNEE))
     width_m = float(np.linalg.norm(right_hip - left_hip, axis=1).mean())
     hips_m, knees_m = (right_hip + left_hip) / 2, (right_knee + left_knee) / 2
@@ -151,6 +151,7 @@ def put_on(
     if meshes:
         vertices_m = [np.concatenate([worn.vertices_m[capture.frames.index(f)], m.vertices]) for f, m in meshes.items()]
         true_faces = next(iter(meshes.values())).faces + len(worn.vertices_m[0])
+        (out / "ground_truth").mkdir(exist_ok=True)
         np.savez_compressed(
             out / "ground_truth" / "meshes.npz",
             faces=np.concatenate([worn.faces, true_faces]),
