@@ -1,6 +1,6 @@
 """From detected keypoints to points in space: robust triangulation, and which detected person is the subject."""
 
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -14,7 +14,8 @@ AGREEMENT_REACH = 0.15  # of a person's height in the image: where a detection s
 UNEXPLAINED = 0.1  # weight of a detection that the other cameras do not support: a camera may be badly calibrated
 CANDIDATES = 8  # combinations of people kept a frame
 SINGULAR = 1e-12  # of the normal equations' trace: parallel rays meet far away instead of nowhere
-JUMP_COST = 0.5  # of one camera's best score, for moving by the person's own height between frames
+JUMP_COST = 4.0  # of one camera's best score, for moving by the person's own height between frames
+USUAL_JUMPS = 2.0  # times the median movement between frames, which cost nothing
 
 
 def triangulate(
@@ -126,25 +127,30 @@ def subject_keypoints(capture: Capture) -> dict[str, np.ndarray]:
 
 
 def _frame_candidates(cameras: list[Camera], people: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """The best combinations of people in one frame: indices (n, C), -1 for nobody, and their scores (n,).
+    """The best combinations of people in one frame: indices (n, C), -1 for nobody, and their scores (n,), the best one
+    first; with and without those whom no other camera sees where they are.
 
     people: per camera (P, 25, 3). The score is the mean over cameras of prominence times agreement.
     """
     prominence = [_prominence(camera, found) for camera, found in zip(cameras, people, strict=True)]
     agreements = _agreements(cameras, people) if len(cameras) > 1 else [np.eye(len(people[0]))]
+    if len(agreements[0]) == 0:  # one camera alone shows somebody
+        agreements = [np.zeros((1, len(found))) for found in people]
     picks = np.full((len(agreements[0]), len(cameras)), -1)
-    scores = np.zeros(len(picks))
+    scores, supported = np.zeros(picks.shape), np.zeros(picks.shape, bool)
     for c, agreement in enumerate(agreements):
-        if len(picks) == 0 or not prominence[c].any():
+        if not prominence[c].any():
             continue
         value = (UNEXPLAINED + agreement) * prominence[c]
         picks[:, c] = value.argmax(1)
-        scores += value.max(1) / len(cameras)
-    picks, first = np.unique(picks, axis=0, return_index=True)
-    order = np.argsort(-scores[first])[:CANDIDATES]
-    if len(order) == 0:
-        return np.full((1, len(cameras)), -1), np.zeros(1)
-    return picks[order], scores[first][order]
+        scores[:, c] = value.max(1) / len(cameras)
+        supported[:, c] = np.take_along_axis(agreement, picks[:, c : c + 1], 1)[:, 0] > 0
+    picks = np.concatenate([picks, np.where(supported, picks, -1), np.full((1, len(cameras)), -1)])
+    total = np.concatenate([scores.sum(1), np.where(supported, scores, 0).sum(1), [0.0]])
+    best = np.argsort(-total, kind="stable")
+    _, first = np.unique(picks[best], axis=0, return_index=True)
+    kept = best[np.sort(first)[:CANDIDATES]]
+    return picks[kept], total[kept]
 
 
 def _agreements(cameras: list[Camera], people: list[np.ndarray]) -> list[np.ndarray]:
@@ -194,29 +200,36 @@ def _prominence(camera: Camera, people: np.ndarray) -> np.ndarray:
 
 
 def _follow(candidates: list[tuple[np.ndarray, np.ndarray]], people: list[np.ndarray]) -> np.ndarray:
-    """The most probable sequence of combinations, (frames, C): Viterbi with a cost for jumping in the image."""
-    total, back = candidates[0][1], []
-    for i in range(1, len(candidates)):
-        (before, _), (now, score) = candidates[i - 1], candidates[i]
-        jump = _jump([p[i - 1] for p in people], before, [p[i] for p in people], now)
-        best_before = total[:, None] - JUMP_COST * jump
+    """The most probable sequence of combinations, (frames, C): Viterbi with a cost for jumping in the image, by more
+    than is usual here. Who is not seen is where he was seen last."""
+    shown = [_shown([p[i] for p in people], picks) for i, (picks, _) in enumerate(candidates)]
+    best = [[one[:1] for one in frame] for frame in shown]
+    usual = USUAL_JUMPS * float(np.median([_jump(a, b)[0, 0] for a, b in pairwise(best)])) if len(best) > 1 else 0.0
+    last, total, back = shown[0], candidates[0][1], []
+    for now, (picks, score) in zip(shown[1:], candidates[1:], strict=True):
+        best_before = total[:, None] - JUMP_COST * _jump(last, now, usual)
         back.append(best_before.argmax(0))
         total = best_before.max(0) + score
+        seen = (picks >= 0).T[..., None, None]
+        last = [np.where(is_seen, new, old[back[-1]]) for is_seen, new, old in zip(seen, now, last, strict=True)]
     path = [int(total.argmax())]
     for step in reversed(back):
         path.append(int(step[path[-1]]))
     return np.stack([picks[k] for (picks, _), k in zip(candidates, reversed(path), strict=True)])
 
 
-def _jump(
-    before: list[np.ndarray], picks_before: np.ndarray, now: list[np.ndarray], picks_now: np.ndarray
-) -> np.ndarray:
-    """Mean over cameras of the movement in person heights, at most 1 a camera: (n before, n now)."""
-    jumps = np.zeros((len(picks_before), len(picks_now)))
-    for c in range(len(before)):
-        a, b = before[c][picks_before[:, c]][:, None], now[c][picks_now[:, c]][None]
-        there = (picks_before[:, c] >= 0)[:, None] & (picks_now[:, c] >= 0)
-        both = np.minimum(a[..., 2], b[..., 2]) * there[..., None]
+def _shown(people: list[np.ndarray], picks: np.ndarray) -> list[np.ndarray]:
+    """Per camera the keypoints (n, 25, 3) of the picked people of one frame, 0 for nobody."""
+    return [np.where((pick >= 0)[:, None, None], found[pick], 0.0) for found, pick in zip(people, picks.T, strict=True)]
+
+
+def _jump(before: list[np.ndarray], now: list[np.ndarray], usual: float = 0.0) -> np.ndarray:
+    """Mean over cameras of the movement beyond `usual` in person heights, at most 1 a camera, from each of people
+    (n, 25, 3) to each of others (m, 25, 3): (n, m)."""
+    jumps = np.zeros((len(before[0]), len(now[0])))
+    for was, is_now in zip(before, now, strict=True):
+        a, b = was[:, None], is_now[None]
+        both = np.minimum(a[..., 2], b[..., 2])
         distance = np.linalg.norm(a[..., :2] - b[..., :2], axis=-1) / person_heights_px(b).clip(1)[..., None]
-        jumps += ((distance.clip(0, 1) * both).sum(-1) / both.sum(-1).clip(1e-9)) / len(before)
+        jumps += (((distance - usual).clip(0, 1) * both).sum(-1) / both.sum(-1).clip(1e-9)) / len(before)
     return jumps

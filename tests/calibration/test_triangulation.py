@@ -84,6 +84,25 @@ def test_the_subject_is_whom_all_cameras_see(tmp_path: Path) -> None:
         np.testing.assert_array_equal(chosen[camera.name], subject[camera.name][:, 0])
 
 
+@pytest.mark.parametrize(("stride", "missed"), [(1, slice(4, 7)), (5, slice(0))])
+@pytest.mark.parametrize("cameras", [1, 3, 4])
+def test_nobody_else_is_taken_for_the_subject(tmp_path: Path, cameras: int, stride: int, missed: slice) -> None:
+    """He walks 13 % of his height from frame to frame, or half of it. Somebody stands some metres
+    off; the first camera misses the subject for three frames."""
+    rig, order = ring(cameras), stride * np.arange(12) % 12
+    both, expected = {}, {}
+    for camera in rig:
+        uv = camera.project(walk_m()[0] + [-2.5, 1.6, 0])[0]
+        other = np.broadcast_to(np.concatenate([uv, np.full((25, 1), 0.8)], 1), (12, 1, 25, 3))
+        subject = detections(rig, noise_px=1)[camera.name][order]
+        if camera.name == "c0":
+            subject[missed] = 0
+        both[camera.name], expected[camera.name] = np.concatenate([subject, other], 1), subject[:, 0]
+    chosen = subject_keypoints(write_capture(tmp_path, rig, both))
+    for name, keypoints in expected.items():
+        np.testing.assert_array_equal(chosen[name], keypoints)
+
+
 def test_one_camera_takes_the_largest_and_most_central(tmp_path: Path) -> None:
     camera = ring(4)[0]
     subject = detections([camera], noise_px=1)["c0"]
