@@ -16,7 +16,7 @@ EDGE_OF_SHADOW = 0.1  # log brightness over which a shadow beyond the darkest be
 PERSON_BRIGHTNESS, PERSON_CHROMA = 0.6, 0.25  # spread of a person's log ratio to what is behind
 NOISE_FACTOR = 0.8  # the robust estimate of noise counts JPEG's blocks twice
 ROUNDING = 0.5  # grey levels
-ENOUGH = 0.02  # of an image, to tell noise and exposure by
+MOST, ENOUGH = 0.5, 0.02  # of an image, to tell noise and exposure by
 ALIKE = 0.02  # of exposures: noise and JPEG feign as much
 APART_GAIN, APART_FLOOR = 16.0, 16.0  # of the picture of differences, which cameras' square-root noise makes even
 PAINT_PX = 3  # from which a pixel never seen takes its colour
@@ -53,18 +53,11 @@ def levelled(plate: np.ndarray, image: np.ndarray, free: np.ndarray) -> np.ndarr
 
 
 def noise_level(image: np.ndarray, plate: np.ndarray, free: np.ndarray) -> float:
-    """Standard deviation of their difference where both show background, `free` (H, W); grey levels."""
-    apart = np.abs(image[free].astype(np.int16) - plate[free]).ravel()
-    return (1.4826 * grouped_median(apart) if len(apart) else 0.0) + ROUNDING
-
-
-def grouped_median(numbers: np.ndarray) -> float:
-    """Median of whole numbers from 0 on, (N,), each taken as spread over all that is rounded to it: the plain one would
-    jump, where few numbers are different."""
-    share = np.bincount(numbers) / len(numbers)
-    middle = int(np.searchsorted(share.cumsum(), 0.5))
-    into = (0.5 - share[:middle].sum()) / share[middle]
-    return middle - 0.5 + into if middle else 0.5 * into
+    """Standard deviation of their difference where both show background, `free` (H, W); grey levels. In all of a
+    picture most of which is free: what shadows change is then in the noise, and not taken for the person."""
+    free = np.ones_like(free) if free.mean() > MOST else free
+    apart = image[free].astype(np.float32) - plate[free]
+    return (1.4826 * float(np.median(np.abs(apart))) if len(apart) else 0.0) + ROUNDING
 
 
 def difference(

@@ -11,7 +11,7 @@ from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings, SegmentationSettings
 from hnerf.errors import CaptureError
 from hnerf.segmentation.cut import components_within
-from hnerf.segmentation.difference import difference, grouped_median, levelled, masked_median, noise_level, surroundings
+from hnerf.segmentation.difference import difference, levelled, masked_median, noise_level, surroundings
 from hnerf.segmentation.edge import settle_edge
 from hnerf.segmentation.masks import encode, movement_px
 from hnerf.segmentation.prior import Prior
@@ -54,15 +54,7 @@ def test_noise_and_exposure_are_those_of_the_background_by_hand() -> None:
     assert np.unique(bright).tolist() == [150]
     assert noise_level(image, bright, free) == pytest.approx(1.4826 * 2 + 0.5)
     assert levelled(image, image, free) is image
-
-
-@pytest.mark.parametrize(
-    ("numbers", "median"),
-    [([0, 0, 1, 1, 1, 1, 2, 2], 1.0), ([0, 1, 1, 1], 5 / 6), ([2, 2], 2.0), ([0, 0, 0, 1], 1 / 3)],
-)
-def test_grouped_median_by_hand(numbers: list[int], median: float) -> None:
-    """Of 0, 1, 1, 1 the half is a third into the ones, which begin at 0.5; zeros end there."""
-    assert grouped_median(np.array(numbers)) == pytest.approx(median)
+    assert noise_level(image, bright, body) == pytest.approx(1.4826 * 120 + 0.5)  # most is free: all of it, 150 and 30
 
 
 def test_background_is_looked_for_ever_nearer_to_the_person() -> None:
