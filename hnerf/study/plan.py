@@ -46,9 +46,7 @@ class ScoringSettings(Section):
     meshes: int = Field(default=2, ge=1)  # a split
     snapshot_images: int = Field(default=4, ge=1)
     snapshot_meshes: int = Field(default=1, ge=0)
-    frame_sizes_px: tuple[PositiveInt, ...] = Field(
-        default=(256, 512), min_length=1
-    )  # longest sides of images that are timed
+    frame_sizes_px: tuple[PositiveInt, ...] = Field(default=(256, 512), min_length=1)  # longest sides, of timed images
 
 
 class Study(Section):
