@@ -13,7 +13,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from provenance import RESULTS, SHARED, provenance, sentence, table, write_result
 
@@ -103,7 +102,6 @@ def measure(shelf: Store, recording: Artifact) -> dict[str, float]:
 def draw(seconds: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
     """A panel an axis, both scales logarithmic; grey lines have the slope of a cost in proportion."""
     figure = Figure(figsize=(11, 3.8), layout="constrained")
-    FigureCanvasAgg(figure)
     for axes, (axis, rows) in zip(
         figure.subplots(1, len(seconds), sharey=True, squeeze=False)[0], seconds.items(), strict=True
     ):

@@ -14,7 +14,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from provenance import RESULTS, SHARED, provenance, sentence, table, write_result
 
@@ -88,7 +87,6 @@ def train_one(shelf: Store, folder: Path, settings: Settings) -> tuple[list[dict
 def draw(curves: dict[str, list[dict[str, Any]]], path: Path) -> None:
     """PSNR against seconds of training, on a logarithmic axis."""
     figure = Figure(figsize=(6, 3.6), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     for name, curve in curves.items():
         seconds, psnr = ([row[key] for row in curve] for key in ("seconds", "psnr"))

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from hnerf.calibration.board_bundle import BoardFit
@@ -18,7 +17,6 @@ def draw_boards(path: Path, fit: BoardFit) -> None:
     columns = min(count, COLUMNS)
     rows = -(-count // columns)
     figure = Figure(figsize=(5 * columns, 3.4 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for i, camera in enumerate(fit.cameras):
         frame, corner = np.nonzero(np.isfinite(fit.residuals_px[i, ..., 0]))

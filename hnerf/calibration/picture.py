@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from hnerf.calibration.diagnosis import Measure
@@ -28,7 +27,6 @@ def draw_cameras(
 ) -> None:
     """Write the picture as PNG. `status` by camera; `before`, `after`: what `measure` found, None with one camera."""
     figure = Figure(figsize=(16, 5.5), layout="constrained")
-    FigureCanvasAgg(figure)
     above, side, bars = figure.subplots(1, 3)
     vertical = {"y": 1, "z": 2}[up]
     first, second = (axis for axis in range(3) if axis != vertical)

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PathCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -27,7 +26,6 @@ def draw_witnesses(path: Path, witnesses: Witnesses, cameras: Sequence[Camera], 
     capture, outlines = witnesses.capture, witnesses.outlines
     instant = outlines.instants[len(outlines.instants) // 2] if outlines else len(capture.frames) // 2
     figure = Figure(figsize=(3 * PANEL_INCHES + 1, PANEL_INCHES * len(cameras) + 0.6), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = figure.subplots(len(cameras), 3, squeeze=False)
     for row, camera, detected in zip(panels, cameras, witnesses.keypoints[:, instant], strict=True):
         for axes, frame in zip(row, [*[capture.frames[instant]] * 2, witnesses.matches.frame], strict=True):

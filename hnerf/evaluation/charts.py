@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -67,7 +66,6 @@ def _chart(path: Path, series: dict[str, Points], x_label: str, y_label: str, sc
 
 def _figure(panels: int) -> tuple[Figure, list[Axes]]:
     figure = Figure(figsize=(9.6, 3.4), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
     return figure, list(figure.subplots(1, panels, squeeze=False)[0])
 
 
@@ -77,9 +75,14 @@ def _line(axes: Axes, points: Points, colour: str, label: str | None) -> None:
 
 
 def _finish(axes: Axes, x_label: str, y_label: str) -> None:
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    style(axes, x_label, y_label)
+
+
+def style(axes: Axes, x_label: str, y_label: str) -> None:
+    """Labels, and the looks that all charts share."""
     axes.set_xlabel(x_label, color=INK)
     axes.set_ylabel(y_label, color=INK)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(color=FAINT, linewidth=0.7)
     axes.tick_params(colors=INK, labelsize=9)
     for side, spine in axes.spines.items():

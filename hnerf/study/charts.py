@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from hnerf.evaluation.charts import COLOURS, FAINT, INK
+from hnerf.evaluation.charts import COLOURS, INK, style
 from hnerf.study.curves import Point, binned, pareto_front
 
 LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
@@ -92,7 +91,6 @@ def picture_grid(rows: Sequence[tuple[str, Sequence[tuple[str, Any]]]], caption:
     """Pictures (H, W, 3) uint8 of each row side by side, each under its name, the row's title before the first."""
     columns = max(len(pictures) for _, pictures in rows)
     figure = Figure(figsize=(2.0 * columns + 0.4, 2.9 * len(rows) + 0.5), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(len(rows), columns, squeeze=False)
     for panel in axes.flat:
         panel.set_xticks([])
@@ -159,7 +157,6 @@ def _name(ends: Mapping[str, Point], axes: Axes, looks: Mapping[str, Style], lif
 def _figure(rows: int, columns: int) -> tuple[Figure, Any]:
     size = PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows + 0.5
     figure = Figure(figsize=size, dpi=130, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False)
     for panel in axes.flat:
         panel.margins(x=0.08, y=0.12)
@@ -168,13 +165,7 @@ def _figure(rows: int, columns: int) -> tuple[Figure, Any]:
 
 def _decorate(axes: Axes, title: str, x_label: str, y_label: str) -> None:
     axes.set_title(title, color=INK, fontsize=10, loc="left")
-    axes.set_xlabel(x_label, color=INK)
-    axes.set_ylabel(y_label, color=INK)
-    axes.grid(color=FAINT, linewidth=0.7)
-    axes.tick_params(colors=INK, labelsize=9)
-    for side, spine in axes.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color(FAINT)
+    style(axes, x_label, y_label)
 
 
 def _logarithmic(axes: Axes) -> None:

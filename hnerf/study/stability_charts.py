@@ -6,18 +6,17 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
-from hnerf.evaluation.charts import COLOURS, FAINT, INK
+from hnerf.evaluation.charts import FAINT, INK, style
+from hnerf.study.charts import Style, styles
 from hnerf.study.degrade import KINDS
 from hnerf.study.stability_report import REFERENCE, Row, worst
 
 SHADES = {"ok": "#e8f1ec", "degraded": "#f2c877", "refused": "#9dbbdc", "failed": "#a3293d"}
 LETTERS = {"ok": "o", "degraded": "D", "refused": "R", "failed": "F"}
 LABELS = {"psnr": "PSNR, dB", "chamfer_mm": "Chamfer distance, mm"}
-DASHES, MARKERS = ("-", "--", "-.", ":"), "osD^vP*X"
 CAPTION = "line: mean over seeds; band: their range; cross: a seed without a figure"
 COLUMNS = 4  # of panels
 CELL, GAP = (0.52, 0.42), 0.4  # of the matrix in inches; between methods, in cells
@@ -31,7 +30,7 @@ def matrix_chart(result: Row, path: Path) -> None:
     wide = max(map(len, kinds.values()))
     across, down = len(methods) * (wide + GAP) - GAP, len(kinds) + 0.6  # in cells
     width, height = max(LEFT + across * CELL[0] + 0.2, LEGEND), down * CELL[1] + BOTTOM
-    figure = _figure(width, height)
+    figure = Figure(figsize=(width, height), dpi=150)
     axes = figure.add_axes((LEFT / width, BOTTOM / height, across * CELL[0] / width, down * CELL[1] / height))
     for column, method in enumerate(methods):
         left = column * (wide + GAP)
@@ -59,24 +58,19 @@ def curve_chart(result: Row, key: str, path: Path) -> bool:
         return False
     columns = min(COLUMNS, len(kinds))
     rows = math.ceil(len(kinds) / columns)
-    figure = _figure(max(3.2 * columns, LEGEND), 2.5 * rows + 0.6)
-    figure.set_layout_engine("constrained")
+    size = max(3.2 * columns, LEGEND), 2.5 * rows + 0.6
+    figure = Figure(figsize=size, dpi=150, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
     for axes in grid.flat[len(kinds) :]:
         axes.set_visible(False)
     for axes, (kind, strengths) in zip(grid.flat, kinds.items(), strict=False):
-        for k, method in enumerate(result["plan"]["methods"]):
-            _curve(axes, [r for r in result["runs"] if r["method"] == method], kind, strengths, key, k)
+        for k, (method, look) in enumerate(styles(result["plan"]["methods"]).items()):
+            _curve(axes, [r for r in result["runs"] if r["method"] == method], kind, strengths, key, look, k)
         axes.set_xticks(range(len(strengths) + 1), ["none", *(f"{s:g}" for s in strengths)])
         axes.set_xlim(-0.3, len(strengths) + 0.3)
-        axes.set_xlabel(KINDS[kind].label, color=INK, fontsize=9)
-        axes.grid(color=FAINT, linewidth=0.7)
-        axes.tick_params(colors=INK, labelsize=8)
-        for side, spine in axes.spines.items():
-            spine.set_visible(side in ("left", "bottom"))
-            spine.set_color(FAINT)
+        style(axes, KINDS[kind].label, "")
     for axes in grid[:, 0]:
-        axes.set_ylabel(LABELS[key], color=INK, fontsize=9)
+        axes.set_ylabel(LABELS[key], color=INK)
     handles, labels = grid.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", ncols=len(labels), frameon=False, labelcolor=INK)
     figure.supxlabel(CAPTION, fontsize=7, color=INK)
@@ -93,18 +87,13 @@ def _cell(axes: Axes, x: float, y: float, strength: float, run: Row | None) -> N
     axes.text(x + 0.5, y + 0.74, f"{strength:g}", ha="center", va="center", fontsize=6.5, color=ink)
 
 
-def _curve(axes: Axes, runs: list[Row], kind: str, strengths: list[float], key: str, k: int) -> None:
+def _curve(axes: Axes, runs: list[Row], kind: str, strengths: list[float], key: str, look: Style, k: int) -> None:
     """One method's line in a panel; k counts methods."""
     by_place = [[r for r in runs if r["kind"] == REFERENCE]]
     by_place += [[r for r in runs if r["kind"] == kind and r["strength"] == strength] for strength in strengths]
     values: list[Any] = [[r[key] for r in place if r.get(key) is not None] for place in by_place]
     x = [place for place, found in enumerate(values) if found]
     means, lows, highs = ([f(values[place]) for place in x] for f in (np.mean, min, max))
-    look: dict[str, Any] = {
-        "color": COLOURS[k % len(COLOURS)],
-        "linestyle": DASHES[k % len(DASHES)],
-        "marker": MARKERS[k % 8],
-    }
     axes.plot(x, means, linewidth=1.6, markersize=4, label=runs[0]["method"] if runs else None, **look)
     axes.fill_between(x, lows, highs, color=look["color"], alpha=0.2, linewidth=0)
     gone = [place for place, found in enumerate(by_place) if len(found) > len(values[place])]
@@ -118,10 +107,3 @@ def _curve(axes: Axes, runs: list[Row], kind: str, strengths: list[float], key: 
         markeredgewidth=2,
         transform=bottom,
     )
-
-
-def _figure(width: float, height: float) -> Figure:
-    """Of so many inches."""
-    figure = Figure(figsize=(width, height), dpi=150)
-    FigureCanvasAgg(figure)
-    return figure

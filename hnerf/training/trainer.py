@@ -141,7 +141,8 @@ class Trainer:
                 self._record(terms)
                 if time.monotonic() - last_log > 5 and self.processes.leads:
                     last_log = time.monotonic()
-                    logger.info("step %d of %d, %.0f s: %s", self.step, self.steps, self.seconds, self.history[-1])
+                    told = _in_words(self.history[-1])
+                    logger.info("step %d of %d, %.0f s: %s", self.step, self.steps, self.seconds, told)
             if checkpoint_due and self.processes.leads:
                 save_checkpoint(self.out, self._state())
         if self.processes.leads:
@@ -346,6 +347,12 @@ def train(
     Raises TrainingError where the surface collapses or the losses stay non-finite.
     """
     return Trainer(capture, masks, body, settings, out, processes or Processes.join()).run()
+
+
+def _in_words(row: dict[str, Any]) -> str:
+    """A row of the history for who waits: losses that are not zero, and PSNR on unseen frames where there is any."""
+    told = [f"{name} {value:.2g}" for name, value in row["losses"].items() if value]
+    return ", ".join(told + [f"{row['held_out']['psnr']:.1f} dB on unseen frames"] * ("held_out" in row))
 
 
 def _device_name(device: torch.device) -> str:
