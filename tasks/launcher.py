@@ -1,13 +1,14 @@
 """Run a module in several processes under torchrun, none of which outlives the caller."""
 
 import ctypes
+import json
 import logging
 import os
 import re
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,8 +32,14 @@ class GaveUpError(RuntimeError):
     """A rank could not go on, for a reason that lies in its work and that the message, one line, tells."""
 
 
+def _failed_io(told: str) -> OSError:
+    """From JSON: errno, what it means, file; an errno of null where a library did not say."""
+    number, why, name = json.loads(told)
+    return OSError(why) if number is None else OSError(number, why, name)
+
+
 # By exit code: what a rank means that says why it ends in its last line on stderr.
-TOLD: dict[int, type[Exception]] = {2: CaptureError, 3: GaveUpError}
+TOLD: dict[int, Callable[[str], Exception]] = {2: CaptureError, 3: GaveUpError, 4: _failed_io}
 
 
 def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:

@@ -15,7 +15,7 @@ from tasks.store import Artifact
 MOVED = "moved_px"
 
 
-@stage("segmentation", version="6")
+@stage("segmentation", version="7")
 def segment(
     out: Path,
     recording: Artifact,

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from hnerf.body.descriptor import BodyMeshes
@@ -21,6 +22,7 @@ from hnerf.body.rig import (
     vertex_transforms,
 )
 
+ON_EDGE = 1e-5  # a barycentric weight below it is none
 FAR_M = 10.0  # as a reach: farther than any point that is asked about
 
 
@@ -137,11 +139,24 @@ class PosedBodies:
         if correction is not None:
             nearest = nearest_corner(corners, found.barycentric)
             moved = moved - self._displacement(points_m.detach(), frame, nearest, correction)
-        tangential = moved - normal * (normal * moved).sum(-1, keepdim=True)
         y = s + (inverse @ (offset + moved)[..., None])[..., 0]
-        s = s + (inverse @ tangential[..., None])[..., 0]
+        s = s + (inverse @ self._along(posed, found.barycentric, normal, moved)[..., None])[..., 0]
         d = found.sign * distance + (normal * moved).sum(-1)
         return Descriptor(d, s, y, normal, found.face >= 0, corners, found.barycentric)
+
+    def _along(self, posed: Tensor, barycentric: Tensor, normal: Tensor, moved: Tensor) -> Tensor:
+        """How the closest point follows a point that moves by `moved` (N, 3): along the face that it lies on, along the
+        edge if it lies on one, and not at all if it is a corner. posed (N, 3): rows of the posed vertices."""
+        on_face = moved - normal * (normal * moved).sum(-1, keepdim=True)
+        away = barycentric < ON_EDGE
+        cornered = torch.nonzero(away.any(1))[:, 0]
+        edge = (away[cornered].sum(1) == 1).float()[:, None]
+        opposite = away[cornered].int().argmax(1)
+        ends = [posed[cornered, (opposite + k) % 3] for k in (1, 2)]
+        start, end = (self.vertices_m.flatten(0, 1).index_select(0, rows) for rows in ends)
+        along = nn.functional.normalize(end - start, dim=-1)
+        on_edge = edge * along * (along * moved.index_select(0, cornered)).sum(-1, keepdim=True)
+        return on_face.index_copy(0, cornered, on_edge)
 
     def _displacement(self, points_m: Tensor, frame: Tensor, nearest: Tensor, correction: PoseCorrection) -> Tensor:
         """How far the correction carries the body at each point with its nearest vertex (N,): (N, 3)."""
@@ -174,6 +189,8 @@ class PosedBodies:
         theta[:, free] = axis_angle_from_rotation(turned)
         if alike is not None:
             theta[alike] = theta[alike].mean(0)
+            own = above @ rotation_from_axis_angle(theta[:, free]) @ (above @ rotations[:, free]).transpose(-1, -2)
+            correction.turn[alike, :-1] = axis_angle_from_rotation(own)[alike]  # what they did turn
         turn, pivot = rotation_from_axis_angle(correction.turn[:, -1]), self._joints[:, 0, :3, 3]
         root[:, :3, :3] = turn @ root[:, :3, :3]
         root[:, :3, 3] = (turn @ (root[:, :3, 3] - pivot)[..., None])[..., 0] + pivot + correction.move_m
@@ -219,19 +236,9 @@ def occurring(rows: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
-    """(..., 3, 3) to (..., 3) axis-angle in radians; exact below a half turn (logarithm of a rotation)."""
-    skew = torch.stack(
-        [
-            rotation[..., 2, 1] - rotation[..., 1, 2],
-            rotation[..., 0, 2] - rotation[..., 2, 0],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ],
-        -1,
-    )
-    sine = skew.norm(dim=-1) / 2
-    cosine = (rotation.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
-    scale = torch.where(sine > 1e-7, torch.atan2(sine, cosine) / (2 * sine.clamp(min=1e-12)), 0.5)
-    return skew * scale[..., None]
+    """(..., 3, 3) to (..., 3) axis-angle in radians, up to a half turn; without a gradient."""
+    turns = Rotation.from_matrix(rotation.detach().cpu().double().reshape(-1, 3, 3).numpy()).as_rotvec()
+    return torch.from_numpy(turns).to(rotation).view(rotation.shape[:-1])
 
 
 def _subtree_weights(rig: Rig, free: Tensor) -> Tensor:

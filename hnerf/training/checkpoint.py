@@ -13,7 +13,10 @@ def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
     """Replace the checkpoint in `folder` atomically. state: tensors, numbers, strings and containers of them."""
     beside = folder / f"{NAME}.tmp"  # what an interrupted write leaves, the next one overwrites
     with beside.open("wb") as file:
-        torch.save(state, file)
+        try:
+            torch.save(state, file)
+        except RuntimeError as error:  # torch's own, while it closes what could not be written
+            raise (error.__context__ if isinstance(error.__context__, OSError) else error) from None
         file.flush()
         os.fsync(file.fileno())
     os.replace(beside, folder / NAME)

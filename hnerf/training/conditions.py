@@ -28,11 +28,12 @@ class Conditions:
     def of(rig: Rig, theta: Tensor, root: Tensor, moment: Tensor, scene_m: float) -> "Conditions":
         """theta (n, J, 3), root (n, 4, 4); scene_m: metres in a scene unit."""
         scaled = torch.cat([root[:, :3, :3], root[:, :3, 3:] / scene_m], -1)
-        return Conditions(pose_inputs(rig, theta), scaled.flatten(1), moment)
+        return Conditions(theta[:, rig.free].flatten(1), scaled.flatten(1), moment)
 
     def noisy(self, sigma: float, generator: torch.Generator) -> "Conditions":
         """With Gaussian noise on theta and T, so that networks do not learn poses by heart (paper, section 4)."""
-        pose, root = (sigma * torch.randn(c.shape, generator=generator).to(c) for c in (self.pose, self.root))
+        device = self.pose.device
+        pose, root = (sigma * torch.randn(c.shape, generator=generator, device=device) for c in (self.pose, self.root))
         return dataclasses.replace(self, pose=self.pose + pose, root=self.root + root)
 
 
@@ -49,12 +50,13 @@ class Draws:
     view: Tensor | None = None
 
     @staticmethod
-    def random(rays: int, samples: int, view_sigma: float, generator: torch.Generator, device: torch.device) -> "Draws":
-        """For one training step."""
-        jitter, finer = (torch.rand(rays, samples, generator=generator).to(device) for _ in range(2))
-        beyond = torch.rand(rays, 3, generator=generator).to(device)
-        probe = torch.rand(rays, generator=generator).to(device)
-        view = view_sigma * torch.randn(rays, 3, generator=generator).to(device)
+    def random(rays: int, samples: int, view_sigma: float, generator: torch.Generator) -> "Draws":
+        """For one training step, on the generator's device."""
+        device = generator.device
+        jitter, finer = (torch.rand(rays, samples, generator=generator, device=device) for _ in range(2))
+        beyond = torch.rand(rays, 3, generator=generator, device=device)
+        probe = torch.rand(rays, generator=generator, device=device)
+        view = view_sigma * torch.randn(rays, 3, generator=generator, device=device)
         return Draws(jitter, beyond, finer, probe, view)
 
     def over(self, beyond: Tensor) -> "Draws":
@@ -66,11 +68,6 @@ class Draws:
         """For a rendering: every sample in the middle of its stratum, black beyond."""
         middle = torch.full((rays, samples), 0.5, device=device)
         return Draws(middle, torch.zeros(rays, 3, device=device), middle)
-
-
-def pose_inputs(rig: Rig, theta: Tensor) -> Tensor:
-    """What networks see of poses (n, J, 3): the free joints' angles in radians, (n, 3 free)."""
-    return theta[:, rig.free].flatten(1)
 
 
 def own_share(batch: Batch, rank: int, world_size: int) -> Batch:

@@ -13,7 +13,7 @@ from hnerf.field.canonical import CanonicalField
 from hnerf.field.deformation import FrameDeformation
 from hnerf.render.compositing import alpha_from_sdf, occupancy, weights_from_alpha
 from hnerf.render.shell import ShellGrid, lattice
-from hnerf.training.conditions import Conditions, Draws, pose_inputs
+from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.field import Field
 from hnerf.training.losses import RaySamples
 
@@ -57,7 +57,7 @@ class FastField(Field):
             settings.channels,
             settings.width,
             settings.pose_width,
-            pose_inputs(rig, torch.zeros(1, len(rig.joints_m), 3)).shape[1],
+            3 * int(rig.free.sum()),
             settings.outer_m,
         )
         self.deformation = (

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import relu
+from torch.nn.functional import relu, softplus
 
 from hnerf.body.canonical import PoseCorrection
 from hnerf.render.compositing import composite, weights_from_alpha
@@ -80,9 +80,10 @@ def geometry(samples: RaySamples, threshold: float, steepness: float) -> Tensor:
 
 
 def segmentation(distance: Tensor, target: Target, sharpness: float) -> Tensor:
-    """seg, fit: BCE(M, sigmoid(-gamma min_i d_i)) for distances (R, K): d_hat for seg, the body's own d for fit."""
-    covered = torch.sigmoid(-sharpness * distance.amin(1)).clamp(EPSILON, 1 - EPSILON)
-    return _cross_entropy(covered, target.person).mean()
+    """seg, fit: BCE(M, sigmoid(-gamma min_i d_i)) for distances (R, K): d_hat for seg, the body's own d for fit. From
+    the logit, so that a person's pixel pulls a body however far it is."""
+    logit = -sharpness * distance.amin(1)
+    return (softplus(logit) - target.person * logit).mean()
 
 
 def _cross_entropy(predicted: Tensor, target: Tensor) -> Tensor:

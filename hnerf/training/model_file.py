@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from hnerf.errors import CaptureError
@@ -22,7 +22,7 @@ def write_field(field: nn.Module, path: Path) -> None:
         touched = features.any(1)
         tensors[name + TOUCHED] = torch.from_numpy(np.packbits(touched.numpy()))
         tensors[name + FEATURES] = features[touched].half().contiguous()
-    save_file(tensors, path)
+    path.write_bytes(save(tensors))  # as its own writer tells a full disk by no OSError
 
 
 def fill_field(field: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:

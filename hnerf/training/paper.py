@@ -16,7 +16,7 @@ from hnerf.config import PaperFieldSettings
 from hnerf.field.mlp import RadianceMLP, ResidualMLP
 from hnerf.render.compositing import alpha_from_density, occupancy, weights_from_alpha
 from hnerf.render.shell import box_interval, stratified
-from hnerf.training.conditions import Conditions, Draws, pose_inputs
+from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.field import Field
 from hnerf.training.losses import RaySamples
 
@@ -46,8 +46,8 @@ class PaperField(Field):
         self.samples, self.gamma = settings.samples, settings.gamma
         self.register_buffer("canonical_m", rig.vertices_m.clone())
         self.register_buffer("centre_m", root[:, :3, 3].mean(0))
-        poses = pose_inputs(rig, torch.zeros(1, len(rig.joints_m), 3)).shape[1]
-        point, pose, self.turn = (3, 0, 0) if static else (4, poses, 12 if settings.root_condition else 0)
+        turn = 12 if settings.root_condition else 0
+        point, pose, self.turn = (3, 0, 0) if static else (4, 3 * int(rig.free.sum()), turn)
         self.radiance = RadianceMLP(point, pose, self.turn)
         self.residual = ResidualMLP(point, pose)
 

@@ -17,6 +17,7 @@ from hnerf.segmentation.segment import Masks
 
 AT_EDGES = 1 / 3  # of the rays: half of the error is there, most of it in hands and feet, which are little else
 LEVELLED_AT_ONCE = 1 << 20  # pixels, which bounds memory
+NEAREST_PERCENT = 1  # of the vertices: a finger alone does not widen the reach of all others
 EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel may mix person and surroundings
 
 
@@ -54,7 +55,8 @@ class Pixels:
 
     def draw(self, frames: Tensor, rays_per_frame: int, generator: torch.Generator, at_edges: float = AT_EDGES) -> Rays:
         """`rays_per_frame` pixels of each of the frames (rows), a share of them at edges, drawn with replacement."""
-        unit = torch.rand(len(frames), rays_per_frame, generator=generator, dtype=torch.float64).to(frames.device)
+        shape = len(frames), rays_per_frame
+        unit = torch.rand(shape, generator=generator, dtype=torch.float64, device=frames.device)
         count = round(at_edges * rays_per_frame)
         mixed = self.edges[_within(self.edge_starts, frames, unit[:, :count])]
         pick = torch.cat([mixed, _within(self.starts, frames, unit[:, count:])], 1).flatten()
@@ -142,13 +144,16 @@ def _within(starts: Tensor, rows: Tensor, unit: Tensor) -> Tensor:
 
 def within_reach(camera: Camera, vertices_m: np.ndarray, reach_m: float) -> np.ndarray:
     """(H, W) bool: pixels whose rays pass within about `reach_m` of the body; its vertices before the camera, in the
-    image or beside it, each a disc of that radius."""
+    image or beside it, each a disc of the radius that the nearest ones need."""
     size_px = np.array([camera.width_px, camera.height_px])
+    if np.isinf(reach_m):
+        return np.ones(size_px[::-1], bool)
     xy, depth_m = camera.project(vertices_m)
     xy, depth_m = xy[depth_m > 0], depth_m[depth_m > 0]
     if not len(depth_m):
         return np.zeros(size_px[::-1], bool)
-    radius = int(np.ceil(min(reach_m * camera.K[0, 0] / np.median(depth_m), np.hypot(*size_px))))
+    nearest_m, focal_px = np.percentile(depth_m, NEAREST_PERCENT), max(camera.K[0, 0], camera.K[1, 1])
+    radius = int(np.ceil(min(reach_m * focal_px / nearest_m, np.hypot(*size_px))))
     xy = np.round(xy) + radius
     x, y = xy[((xy >= 0) & (xy < size_px + 2 * radius)).all(1)].astype(int).T
     outside = np.ones(size_px[::-1] + 2 * radius, np.uint8)

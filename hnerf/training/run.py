@@ -4,6 +4,7 @@ usage: python -m hnerf.training.run CAPTURE CALIBRATION MASKS FIT SETTINGS_JSON 
 """
 
 import argparse
+import json
 import logging
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.calibration.check import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.config import TrainingSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import CaptureError, one_line
 from hnerf.segmentation.segment import Masks
 from hnerf.training.processes import Processes
 from hnerf.training.step import TrainingError
@@ -22,7 +23,8 @@ from hnerf.training.trainer import train
 
 
 def main() -> int:
-    """Exit status 0, or one line on standard error and 2 for bad input, 3 for a training that cannot go on."""
+    """Exit status 0, or one line on standard error and 2 for bad input, 3 for a training that cannot go on, 4 for input
+    or output that failed, as JSON: errno, what it means, file."""
     parser = argparse.ArgumentParser(description=__doc__)
     for name in ("capture", "calibration", "masks", "fit"):
         parser.add_argument(name, type=Path)
@@ -41,6 +43,11 @@ def main() -> int:
     except TrainingError as error:
         print(error, file=sys.stderr)
         return 3
+    except OSError as error:
+        print(
+            json.dumps([error.errno, error.strerror or one_line(error), error.filename], default=str), file=sys.stderr
+        )
+        return 4
     finally:
         if dist.is_initialized():
             dist.destroy_process_group()

@@ -74,10 +74,10 @@ def aim(rays: Rays, draws: Draws, own_background: bool) -> tuple[losses.Target, 
 
 
 def not_finite(terms: dict[str, Tensor], gradients: list[Tensor], step: int) -> str | None:
-    """None where all is finite, else which losses or gradients are not."""
-    bad = [name for name, value in terms.items() if not torch.isfinite(value)]
+    """None where all is finite, else which losses or gradients are not; a device is asked once."""
+    values = torch.stack([value.detach() for value in terms.values()] + [g.sum() for g in gradients])
+    finite = values.isfinite().tolist()
+    bad = [name for name, fine in zip(terms, finite, strict=False) if not fine]
     if bad:
         return f"step {step}: {', '.join(bad)} not finite"
-    if not all(torch.isfinite(g.sum()) for g in gradients):
-        return f"step {step}: a gradient is not finite"
-    return None
+    return None if all(finite) else f"step {step}: a gradient is not finite"

@@ -56,7 +56,7 @@ class Trainer:
         settings, self.out, self.processes = self.settings, out, processes
         device = processes.device
         torch.manual_seed(settings.seed)
-        self.generator = torch.Generator().manual_seed(settings.seed)
+        self.generator = torch.Generator(device).manual_seed(settings.seed)
         self.static = len(capture.train_frames) == 1
         self.body = body.to(device)
         self.field = build_field(settings, self.body, self.static).to(device)
@@ -164,13 +164,13 @@ class Trainer:
             parameter.requires_grad_(True)
 
     def _optimise(self, module: torch.nn.Module) -> dict[str, Tensor]:
-        s, device = self.settings, self.processes.device
+        s = self.settings
         rows = self.train_rows if self.step < self.field_steps else self.novel_rows
-        pick = torch.randperm(len(rows), generator=self.generator)[: s.frames_per_step].to(rows.device)
+        pick = torch.randperm(len(rows), generator=self.generator, device=rows.device)[: s.frames_per_step]
         count = s.frames_per_step * s.rays_per_frame // len(pick)
         rays = self.pixels.draw(rows[pick], count, self.generator, self.at_edges)
         samples = self.field.samples_in_training(self._done())
-        draws = Draws.random(len(rays.frame), samples, s.noise, self.generator, device)
+        draws = Draws.random(len(rays.frame), samples, s.noise, self.generator)
         conditions = self.conditions.noisy(s.noise, self.generator)
         self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
@@ -231,15 +231,16 @@ class Trainer:
     @torch.no_grad()
     def _held_out_psnr(self) -> float:
         """PSNR on person pixels of novel-pose frames in training cameras, which the field is not trained on."""
-        generator = torch.Generator().manual_seed(self.settings.seed)
-        rays, samples = self._look(self.novel_rows, generator, self.field.samples)
+        rays, samples = self._look(self.novel_rows, self.field.samples)
         mixed = rays.edge & (not self.field.own_background)  # with what only such a field knows
         error = (pixel(samples.in_box * samples.alpha, samples) - rays.colour)[rays.person & ~mixed]
         return float(-10 * torch.log10((error**2).mean()))
 
     @torch.no_grad()
-    def _look(self, rows: Tensor, generator: torch.Generator, count: int) -> tuple[Rays, RaySamples]:
-        """Rays at some frames and what the model samples on them for a rendering, so many random numbers a ray."""
+    def _look(self, rows: Tensor, count: int) -> tuple[Rays, RaySamples]:
+        """Rays at some frames, the same ones each time, and what the model samples on them for a rendering, so many
+        random numbers a ray."""
+        generator = torch.Generator(self.processes.device).manual_seed(self.settings.seed)
         rays = self.pixels.draw(rows, HELD_OUT_RAYS // len(rows) + 1, generator)
         draws = Draws.still(len(rays.frame), count, self.processes.device)
         samples, _ = self.field.sample(
@@ -251,7 +252,7 @@ class Trainer:
         """TrainingError where the surface is empty or fills the box: of the surroundings, rays that pass the box are
         asked, away from outlines unless pixels are so large that there are no others."""
         count = max(self.field.samples, LOOKS_A_RAY) if self.field.own_background else self.field.samples
-        rays, samples = self._look(self.train_rows, torch.Generator().manual_seed(self.settings.seed), count)
+        rays, samples = self._look(self.train_rows, count)
         coverage = self.field.coverage(samples)
         beside = ~rays.person & (samples.in_box > 0).any(1)
         clear = beside & ~rays.edge
@@ -352,7 +353,8 @@ def train(
 def _in_words(row: dict[str, Any]) -> str:
     """A row of the history for who waits: losses that are not zero, and PSNR on unseen frames where there is any."""
     told = [f"{name} {value:.2g}" for name, value in row["losses"].items() if value]
-    return ", ".join(told + [f"{row['held_out']['psnr']:.1f} dB on unseen frames"] * ("held_out" in row))
+    told += [f"{value['psnr']:.1f} dB on unseen frames" for name, value in row.items() if name == "held_out"]
+    return ", ".join(told)
 
 
 def _device_name(device: torch.device) -> str:

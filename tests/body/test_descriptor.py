@@ -200,6 +200,40 @@ def test_gradient_to_the_shape():
     assert gradient.tolist() == pytest.approx([-1.0])
 
 
+@pytest.mark.parametrize(
+    ("point", "follows"),
+    [
+        ([0.4, 0.3, 1.2], [1.0, 1.0, 0.0]),  # above the top face
+        ([1.1, 0.3, 1.2], [0.0, 1.0, 0.0]),  # beside its edge along y
+        ([1.1, -0.2, 1.2], [0.0, 0.0, 0.0]),  # beside its corner
+    ],
+)
+def test_the_closest_point_follows_along_face_and_edge(point: list[float], follows: list[float]):
+    """ds_k / dx_k of a unit box, also against finite differences."""
+    rig = box_rig()
+    bodies = PosedBodies(rig, torch.zeros(1, 2, 3), torch.eye(4)[None], rig.vertices_m)
+    x, step, only = torch.tensor([point], requires_grad=True), 1e-2, torch.zeros(1, dtype=torch.int32)
+    s = bodies.describe(x, only, 5.0).s[0]
+    found = [torch.autograd.grad(s[k], x, retain_graph=True)[0][0, k].item() for k in range(3)]
+    assert found == pytest.approx(follows, abs=1e-5)
+    for k in range(3):
+        ahead, behind = (bodies.describe(x + sign * step * torch.eye(3)[k], only, 5.0).s[0, k] for sign in (1, -1))
+        assert (ahead - behind).item() / (2 * step) == pytest.approx(follows[k], abs=1e-4)
+
+
+def test_of_one_posture_what_was_turned_is_kept():
+    """Two frames turned by +0.02 and -0.02 rad turn by nothing together; 0.04 more in one are 0.02 in both."""
+    rig = box_rig()
+    bodies = PosedBodies(rig, torch.zeros(2, 2, 3), torch.eye(4).repeat(2, 1, 1), rig.vertices_m)
+    correction = bodies.correction()
+    for second, mean in ((-0.02, 0.0), (0.06, 0.04)):
+        with torch.no_grad():
+            correction.turn[0, 0, 0], correction.turn[1, 0, 0] = 0.02, second
+        bodies.absorb(correction, alike=torch.arange(2))
+        torch.testing.assert_close(bodies.theta[:, 1, 0], torch.full((2,), mean))
+        torch.testing.assert_close(correction.totals()[0][:, 0, 0], torch.full((2,), mean))
+
+
 def test_absorbing_keeps_the_total():
     rig = box_rig()
     bodies = PosedBodies(rig, torch.zeros(1, 2, 3), torch.eye(4)[None], rig.vertices_m)
@@ -215,6 +249,12 @@ def test_absorbing_keeps_the_total():
 def test_logarithm_inverts_the_exponential():
     angles = torch.tensor([[0.0, 0.0, 0.0], [1e-5, 0.0, 0.0], [0.5, -1.0, 0.3], [0.0, 3.0, 0.0]]).double()
     torch.testing.assert_close(axis_angle_from_rotation(rotation_from_axis_angle(angles)), angles)
+
+
+def test_logarithm_of_a_half_turn():
+    """About z, to either side."""
+    found = axis_angle_from_rotation(torch.diag(torch.tensor([-1.0, -1.0, 1.0])))
+    torch.testing.assert_close(found.abs(), torch.tensor([0.0, 0.0, torch.pi]))
 
 
 def test_the_rig_of_the_tests_is_closed():

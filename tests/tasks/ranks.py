@@ -17,6 +17,9 @@ def main(mode: str, folder: Path) -> None:
     if rank == 1 and mode == "stuck":
         print("a warning\nno surface: check the masks", file=sys.stderr)
         sys.exit(3)
+    if rank == 1 and mode == "full":
+        print('a warning\n[28, "No space left on device", "b.pt"]', file=sys.stderr)
+        sys.exit(4)
     if rank == 1 and mode == "raise":
         raise ValueError("boom in rank one")
     if rank == 1 and mode == "killed":

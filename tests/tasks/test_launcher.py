@@ -54,6 +54,7 @@ def test_files_where_the_user_stands_are_no_modules(tmp_path: Path, monkeypatch:
     [
         ("bad", CaptureError, r"^a\.jpg: bad; write it again$"),
         ("stuck", GaveUpError, "^no surface: check the masks$"),
+        ("full", OSError, r"^\[Errno 28\] No space left on device: 'b\.pt'$"),
         ("raise", RuntimeError, r"rank 1 ended with exit code 1(.|\n)*ValueError: boom in rank one$"),
         ("killed", LostWorkerError, "rank 1 was killed by SIGKILL"),
         ("crash", RuntimeError, "rank 1 crashed with SIGSEGV"),

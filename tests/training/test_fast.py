@@ -92,7 +92,7 @@ def test_rays_that_miss_the_shell_see_nothing_and_change_nothing():
     assert (d[1] == field.reach_m).all()
     assert not sampled([1])[0].any()
     where = (bodies, field.region(bodies, conditions), origins[[1]], directions[:1], torch.zeros(1, dtype=torch.long))
-    draws = Draws.random(1, 5, 0.0, torch.Generator(), torch.device("cpu"))
+    draws = Draws.random(1, 5, 0.0, torch.Generator())
     assert field.sample(*where, conditions, draws)[0].gradient_norm.shape == (0,)
     for all_three, alone in zip((alpha, colour, d, residual), sampled([0, 2]), strict=True):
         torch.testing.assert_close(all_three[[0, 2]], alone, atol=1e-6, rtol=0)

@@ -76,6 +76,15 @@ def test_segmentation():
     assert losses.segmentation(SAMPLES.d_hat, TARGET, 80.0).item() == pytest.approx(expected / 2, rel=1e-3)
 
 
+def test_a_pixel_pulls_a_body_however_far():
+    """-log sigmoid(-80 x 0.3) is 24, of slope 80 a metre."""
+    far = torch.full((2, 1), 0.3, requires_grad=True)
+    loss = losses.segmentation(far, replace(TARGET, person=torch.ones(2)), 80.0)
+    loss.backward()
+    assert loss.item() == pytest.approx(24.0) and far.grad is not None
+    assert far.grad.flatten().tolist() == pytest.approx([40.0, 40.0])
+
+
 def test_fit_takes_the_body_alone():
     """min d = 0.01 on the person: outside, -log sigmoid(-0.8)."""
     expected = -math.log(1 / (1 + math.exp(0.8))) - math.log(1 - 1 / (1 + math.exp(8)))

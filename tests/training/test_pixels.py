@@ -74,6 +74,17 @@ def test_a_body_beside_the_image_reaches_into_it():
     assert reached.any(1).nonzero()[0].tolist() == [16, 17, 18, 19, 20, 21, 22, 23, 24]
 
 
+def test_an_arm_towards_the_camera_reaches_as_far_as_it_is_large():
+    """20 cm at 1 m are 10 px, though most of the body is at 2 m, where they are 5."""
+    arm, body = np.tile([[20 / 50, 20 / 50, 1.0]], (3, 1)), np.tile([[50 / 25, 20 / 25, 2.0]], (20, 1))
+    reached = within_reach(AHEAD, np.vstack([arm, body]), 0.2)
+    assert np.flatnonzero(reached[20]).tolist() == [*range(10, 31), *range(40, 60)]
+
+
+def test_with_no_bound_all_is_reached():
+    assert within_reach(AHEAD, np.array([[0.0, 0.0, -1.0]]), np.inf).all()
+
+
 @pytest.mark.parametrize("depths_m", [(-1.0, -2.0), (-1.0, -1.0, 2.0), (1e-6, 1e-6)])
 def test_a_body_behind_or_at_the_camera(depths_m: tuple[float, ...]):
     """Nothing is reached behind it, all is from where it stands; who stands astride reaches as far as what is ahead."""

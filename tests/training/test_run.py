@@ -1,6 +1,7 @@
 """How a rank ends."""
 
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -9,9 +10,17 @@ from hnerf.training import run
 from hnerf.training.step import TrainingError
 
 
-@pytest.mark.parametrize(("error", "code"), [(CaptureError("a.npz: is cut short"), 2), (TrainingError("empty"), 3)])
+@pytest.mark.parametrize(
+    ("error", "code", "told"),
+    [
+        (CaptureError("a.npz: is cut short"), 2, "a.npz: is cut short"),
+        (TrainingError("empty"), 3, "empty"),
+        (OSError(28, "No space left", Path("b.pt")), 4, '[28, "No space left", "b.pt"]'),
+        (OSError("c.png: cannot be written"), 4, '[null, "c.png: cannot be written", null]'),
+    ],
+)
 def test_what_is_told_is_the_last_line_and_an_exit_code(
-    error: Exception, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    error: Exception, code: int, told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fails(*_: object) -> None:
         raise error
@@ -20,4 +29,4 @@ def test_what_is_told_is_the_last_line_and_an_exit_code(
     monkeypatch.setattr(run.Processes, "join", lambda: None)
     monkeypatch.setattr(run.Capture, "load", fails)
     assert run.main() == code
-    assert capsys.readouterr().err == f"{error}\n"
+    assert capsys.readouterr().err == f"{told}\n"

@@ -1,6 +1,7 @@
 import json
 import math
 import re
+import resource
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -265,12 +266,31 @@ def test_a_gradient_that_is_not_finite_skips_the_step(tmp_path: Path, monkeypatc
     assert all(torch.equal(before[name], p) for name, p in trainer.field.named_parameters())
 
 
+def test_progress_is_told_in_words():
+    row = {"step": 25, "seconds": 7.0, "losses": {"reconstruction": 0.1234, "elastic": 0.0}}
+    assert trainer_module._in_words(row) == "reconstruction 0.12"
+    assert (
+        trainer_module._in_words(row | {"held_out": {"psnr": 17.06}}) == "reconstruction 0.12, 17.1 dB on unseen frames"
+    )
+
+
 def test_checkpoint_is_replaced_whole(tmp_path: Path):
     save_checkpoint(tmp_path, {"step": 1, "x": torch.ones(2)})
     save_checkpoint(tmp_path, {"step": 2, "x": torch.zeros(2)})
     assert [p.name for p in tmp_path.iterdir()] == [NAME]
     state = load_checkpoint(tmp_path, torch.device("cpu"))
     assert state is not None and state["step"] == 2
+
+
+def test_a_full_disk_is_an_os_error(tmp_path: Path):
+    """torch tells the second one as a RuntimeError of its own."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, limits[1]))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            save_checkpoint(tmp_path, {"x": torch.ones(1 << 16)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def test_two_halves_side_by_side_have_the_gradients_of_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
