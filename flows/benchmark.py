@@ -17,7 +17,7 @@ from hnerf.study.files import with_pictures
 from hnerf.study.plan import ScoringSettings, Study, Variant, load_study
 from hnerf.study.publish import publish
 from tasks.benchmark import score_training
-from tasks.calibration import calibrate
+from tasks.calibration import calibrate, calibrated
 from tasks.capture import ingest
 from tasks.fit import fit
 from tasks.launcher import LostWorkerError
@@ -50,13 +50,13 @@ def benchmark(
     source, truth = read_capture(capture, store)
     recorded = Capture.load(ingest(shelf, source, next(iter(settings.values())).capture).root)
     result = blank(plan, Path(study).stem, recorded)
-    table = publish(result, shelf.root)
     for title, entry in result["variants"].items():
         variant = plan.variants[title]
         for name in () if "left_out" in entry else variant.methods or plan.methods:
             log.info("%s: %s", title, name)
             entry["methods"][name] = measure(shelf, source, truth, variant, settings[name], plan.scoring)
-            table = publish(result, shelf.root)
+            publish(result, shelf.root)  # not before, so that what an earlier call found stands until then
+    table = publish(result, shelf.root)
     _announce(table)
     return table
 
@@ -95,7 +95,9 @@ def measure(
         return {"error": one_line(error)}
     scores = score_training(shelf, truth, recording, calibration, model, scoring)
     found: dict[str, Any] = json.loads((scores.root / "scores.json").read_text())
-    return found | {"folder": str(scores.root.relative_to(shelf.root))}
+    taken = calibrated(recording, calibration)
+    counts = {"cameras": len(taken.train_cameras), "frames": len(taken.train_frames)}
+    return found | {"trained_on": counts, "folder": str(scores.root.relative_to(shelf.root))}
 
 
 def trained(shelf: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from prefect import flow
 from prefect.artifacts import create_markdown_artifact
 from prefect.context import FlowRunContext
@@ -33,6 +34,7 @@ from tasks.training import train
 log = logging.getLogger("hnerf.stability")
 
 Figures = dict[str, Any]
+IMAGE_FIGURES = ("psnr", "ssim", "empty_psnr")
 
 
 @flow(name="stability", flow_run_name="{capture}")
@@ -104,12 +106,23 @@ def _runs(
 
 
 def judged(found: Figures, good: Figures) -> Figures:
-    """Figures with their verdict."""
-    verdict = Verdict(*found["error"]) if "error" in found else judge(found, good, found["faults"])
-    return {key: value for key, value in found.items() if key != "error"} | {
-        "verdict": verdict.word,
-        "reason": verdict.reason,
-    }
+    """Verdict and means over the images and surfaces that both runs have, None where there are none."""
+    if "error" in found:
+        verdict, row = Verdict(*found["error"]), {}
+    else:
+        row, reference = in_common(found, good), in_common(good, found)
+        verdict = judge(row, reference, found["faults"])
+        row |= {key: found[key] for key in ("protocol", "seconds") if key in found}
+    return row | {"verdict": verdict.word, "reason": verdict.reason}
+
+
+def in_common(one: Figures, other: Figures) -> Figures:
+    """Means of one run's figures over the images and surfaces that the other has as well, and how many these are."""
+    images = [score for view, score in one["images"].items() if view in other["images"]]
+    surfaces = [chamfer_mm for frame, chamfer_mm in one["surfaces"].items() if frame in other["surfaces"]]
+    means = {key: float(np.mean([s[key] for s in images])) if images else None for key in IMAGE_FIGURES}
+    means["chamfer_mm"] = float(np.mean(surfaces)) if surfaces else None
+    return means | {"images": len(images), "surfaces": len(surfaces)}
 
 
 def attempt(
@@ -168,22 +181,25 @@ def measure(
     stages: tuple[Artifact, Artifact, Artifact, Artifact],
     model: Artifact,
 ) -> Figures:
-    """Faults of surfaces; PSNR, SSIM and Chamfer distance against the truth, None where there is none."""
-    nothing = {"psnr": None, "ssim": None, "chamfer_mm": None}
+    """Faults of surfaces; figures of each image and the Chamfer distance of each surface against the truth, as far as
+    there is one, of novel poses, or of training poses where the capture as recorded has no others."""
     if degradation and KINDS[degradation.kind].place == "poses":
-        return nothing | {"faults": _faults(show_in_extreme_poses(shelf, model, degradation))}
-    *_, good_body = prepare(shelf, source, truth, settings, None)
+        return {"images": {}, "surfaces": {}, "faults": _faults(show_in_extreme_poses(shelf, model, degradation))}
+    recorded, *_, good_body = prepare(shelf, source, truth, settings, None)
     if degradation and KINDS[degradation.kind].place == "worn":
         _, truth = read_capture(stages[0].root)
     report = evaluate(shelf, truth, *stages, model, settings.evaluation)
     metrics = json.loads((report.root / "metrics.json").read_text())
-    split = metrics["novel_pose" if metrics["novel_pose"]["n"] else "novel_view"]
-    chamfer_mm = (split["geometry"] or {}).get("chamfer_mm")
-    found = nothing | {"chamfer_mm": chamfer_mm, "protocol": metrics["protocol"]}
-    if Capture.load(stages[0].root).test_cameras:
-        found |= {"psnr": split["psnr"], "ssim": split["ssim"]}
-    found["seconds"] = json.loads((model.root / "report.json").read_text())["seconds"]
-    return found | {"faults": _faults(check_meshes(shelf, report, good_body))}
+    capture = Capture.load(recorded.root)
+    split = metrics["novel_pose" if capture.novel_pose_frames else "novel_view"]
+    surfaces = (split["geometry"] or {"per_surface": []})["per_surface"]
+    return {
+        "images": {(r["camera"], r["frame"]): r for r in split["per_image"] if capture.test_cameras},
+        "surfaces": {surface["frame"]: surface["chamfer_mm"] for surface in surfaces},
+        "faults": _faults(check_meshes(shelf, report, good_body)),
+        "protocol": metrics["protocol"],
+        "seconds": json.loads((model.root / "report.json").read_text())["seconds"],
+    }
 
 
 def _faults(checked: Artifact) -> list[str]:

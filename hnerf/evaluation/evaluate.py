@@ -28,6 +28,7 @@ from hnerf.spread import spread
 log = logging.getLogger("hnerf.evaluation")
 
 LOG_EVERY_S = 10.0
+MEANS = ("psnr", "ssim", "mask_iou", "empty_psnr", "one_colour_psnr")  # over a split's images
 PROTOCOL = (
     "Images: PSNR, SSIM (Gaussian window of 11 px, sigma 1.5) of 8-bit images over black, data range 1, inside the box "
     "of the true mask padded by 20 px; mask IoU of pixels brighter than 8/255. Mean over images. "
@@ -92,27 +93,28 @@ def render(avatar: Avatar, capture: Capture, views: list[View], out: Path) -> fl
 
 def score_split(split: str, views: list[View], truth: GroundTruth | None, out: Path) -> dict[str, Any]:
     """Mean image figures of a split's renderings, and each image's; null with a reason where there are none."""
-    nothing: dict[str, Any] = {"n": 0, "psnr": None, "ssim": None, "mask_iou": None, "per_image": []}
+    nothing: dict[str, Any] = {"n": 0, "per_image": []} | dict.fromkeys(MEANS)
     if not views:
         missing = "test cameras" if split == "novel_view" else "novel-pose frames"
         return nothing | {"reason": f"the capture has no {missing}"}
     if truth is None or not truth.has_masks:
         return nothing | {"reason": "the capture has no ground-truth masks"}
     rows, references = [], set()
-    for view in views:
-        if not truth.has_mask(view.camera, view.frame):
-            continue
+    known = [view for view in views if truth.has_mask(view.camera, view.frame)]
+    for view in known:
         mask = truth.mask(view.camera, view.frame)
         if not mask.any():
             continue
         reference, source = truth.on_black(view.camera, view.frame)
         score = metrics.score_image(read_rgb(view.path(out)), reference, mask)
         references.add(source)
-        rows.append({"camera": view.camera, "frame": view.frame} | dataclasses.asdict(score))
+        row: dict[str, Any] = {"camera": view.camera, "frame": view.frame} | dataclasses.asdict(score)
+        rows.append(row | metrics.floors(reference, mask))
     if not rows:
-        return nothing | {"reason": "no image of this split shows the person"}
-    means = {name: float(np.mean([row[name] for row in rows])) for name in ("psnr", "ssim", "mask_iou")}
-    without = {"without_person": len(views) - len(rows)}
+        why = "no image of this split shows the person" if known else "no image of this split has a ground-truth mask"
+        return nothing | {"reason": why}
+    means = {name: float(np.mean([row[name] for row in rows])) for name in MEANS}
+    without = {"without_mask": len(views) - len(known), "without_person": len(known) - len(rows)}
     return {"n": len(rows)} | means | without | {"reference": " and ".join(sorted(references)), "per_image": rows}
 
 
@@ -132,9 +134,10 @@ def score_meshes(
         mesh.export(out / "meshes" / f"{frame:06d}.ply")
         if frame in true_meshes:
             rng = np.random.default_rng(0)
-            scores.append(dataclasses.asdict(geometry.score_geometry(mesh, true_meshes[frame], rng)))
+            score = dataclasses.asdict(geometry.score_geometry(mesh, true_meshes[frame], rng))
+            scores.append({"frame": frame} | score)
         log.info("meshed frame %d: %d faces", frame, len(mesh.faces))
     if not scores:
         return {"geometry": None, "geometry_reason": "the capture has no ground-truth surface in these frames"}
-    means = {name: float(np.mean([score[name] for score in scores])) for name in scores[0]}
-    return {"geometry": means | {"n": len(scores), "frames": [f for f in frames if f in true_meshes]}}
+    means = {name: float(np.mean([score[name] for score in scores])) for name in scores[0] if name != "frame"}
+    return {"geometry": means | {"n": len(scores), "per_surface": scores}}

@@ -25,6 +25,14 @@ def score_image(rendered: np.ndarray, reference: np.ndarray, mask: np.ndarray) -
     return ImageScore(psnr(a, b), ssim(a, b), mask_iou(rendered, mask))
 
 
+def floors(reference: np.ndarray, mask: np.ndarray) -> dict[str, float]:
+    """PSNR of who knows little: of an empty picture, and of one colour, the person's mean, in the true mask."""
+    box = mask_box(mask)
+    truth = reference[box].astype(np.float32) / 255
+    one_colour = mask[box][..., None] * truth[mask[box]].mean(0)
+    return {"empty_psnr": psnr(np.zeros_like(truth), truth), "one_colour_psnr": psnr(one_colour, truth)}
+
+
 def mask_box(mask: np.ndarray) -> tuple[slice, slice]:
     """Rows and columns of a mask's (H, W) bounding box, padded and cut to the image. The mask is not empty."""
     rows, columns = np.nonzero(mask)

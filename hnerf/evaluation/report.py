@@ -201,6 +201,8 @@ def notes(inputs: EvaluationInputs, found: dict[str, Any]) -> list[str]:
             lines.append(f"{title}: no surface figures, since {scores['geometry_reason']}.")
         if MASKED_IMAGE in scores.get("reference", ""):
             lines.append(f"{title}: compared to photographs under the true mask, whose edge pixels hold background.")
+        if scores.get("without_mask"):
+            lines.append(f"{title}: {scores['without_mask']} images have no ground-truth mask and are not scored.")
         if scores.get("without_person"):
             lines.append(f"{title}: {scores['without_person']} images do not show the person and are not scored.")
     if not inputs.capture.test_cameras:

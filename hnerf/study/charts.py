@@ -36,21 +36,27 @@ def styles(methods: Iterable[str]) -> dict[str, Style]:
 
 
 def speed_chart(
-    rows: Mapping[str, tuple[Curves, Mapping[str, Point]]],
+    rows: Mapping[str, tuple[Curves, Mapping[str, Point], Mapping[str, float]]],
     looks: Mapping[str, Style],
     labels: tuple[str, str, str],
     caption: str,
     path: Path,
 ) -> None:
-    """A row for each title: accuracy over training seconds, and over the time of a frame with its Pareto front.
+    """A row for each title: accuracy over training seconds, above the accuracy of what needs no training, and over the
+    time of a frame with its Pareto front.
 
     labels: of training time, time of a frame, accuracy.
     """
     figure, axes = _figure(len(rows), 2)
-    for (left, right), (title, (curves, points)) in zip(axes, rows.items(), strict=True):
+    for (left, right), (title, (curves, points, floors)) in zip(axes, rows.items(), strict=True):
         for panel in (left, right):
             _logarithmic(panel)
         lines(left, curves, looks)
+        for name, height in floors.items():
+            left.axhline(height, color=INK, linewidth=0.8, linestyle=(0, (1, 2)), zorder=1)
+            left.annotate(
+                name, (0.01, height), (0, 3), ("axes fraction", "data"), "offset points", fontsize=8, color=INK
+            )
         _decorate(left, title, labels[0], labels[2])
         front(right, points, looks)
         _decorate(right, title, labels[1], labels[2])

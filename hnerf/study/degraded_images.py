@@ -13,7 +13,13 @@ import numpy as np
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.capture.normalise import JPEG_OPTIONS
-from hnerf.study.subset import copy_pixels, read_keypoints, write_arrays, write_keypoints
+from hnerf.study.subset import (
+    copy_pixels,
+    read_keypoints,
+    require_several_cameras,
+    write_arrays,
+    write_keypoints,
+)
 
 PixelChange = Callable[[str, np.ndarray], np.ndarray]
 
@@ -30,6 +36,7 @@ def blur(capture: Capture, percent: float, rng: np.random.Generator, out: Path) 
 
 def expose_differently(capture: Capture, stops: float, rng: np.random.Generator, out: Path) -> None:
     """Gains from 2^-stops to 2^stops, evenly shared out among the training cameras in an order at random."""
+    require_several_cameras(capture)
     names = rng.permutation(capture.train_cameras)
     gains = dict(zip(names.tolist(), 2 ** np.linspace(-stops, stops, len(names)), strict=True))
     rewrite(capture, out, lambda camera, rgb: _to_8_bit(rgb * gains[camera]))

@@ -10,7 +10,14 @@ import numpy as np
 
 from hnerf.capture.capture import Capture
 from hnerf.errors import NotPossibleError
-from hnerf.study.subset import copy_pixels, read_keypoints, subset, write_arrays, write_keypoints
+from hnerf.study.subset import (
+    copy_pixels,
+    read_keypoints,
+    require_several_cameras,
+    subset,
+    write_arrays,
+    write_keypoints,
+)
 
 T = TypeVar("T")
 
@@ -27,6 +34,7 @@ def leave_frames(capture: Capture, count: float, rng: np.random.Generator, out: 
 
 def turn_camera(capture: Capture, angle_deg: float, rng: np.random.Generator, out: Path) -> None:
     """One training camera's extrinsics turned about its centre and an axis at random; its images stay."""
+    require_several_cameras(capture)
     camera = capture.cameras[str(rng.choice(capture.train_cameras))]
     axis = rng.normal(size=3)
     turn = cv2.Rodrigues(np.deg2rad(angle_deg) * axis / np.linalg.norm(axis))[0]
@@ -37,6 +45,7 @@ def turn_camera(capture: Capture, angle_deg: float, rng: np.random.Generator, ou
 def put_out_of_step(capture: Capture, frames: float, rng: np.random.Generator, out: Path) -> None:
     """One training camera, at random, shows at each frame what it saw that many frames before; its first picture stands
     still until then."""
+    require_several_cameras(capture)
     late = str(rng.choice(capture.train_cameras))
     kept = dataclasses.replace(capture, root=out)
     write_arrays(capture, kept)

@@ -31,16 +31,18 @@ def draw(result: Mapping[str, Any], store: Path, table: Path) -> list[Path]:
     """Every chart that the result has figures for; their paths."""
     looks, caption, variants = charts.styles(result["methods"]), results.caption(result), result["variants"]
     paths = {name: table.with_name(f"{table.stem}{name}.png") for name in ("", "-sweep", "-nearness", "-pictures")}
-    for path in paths.values():
-        path.unlink(missing_ok=True)
+    drawn = []
     panels = {
-        title: (results.psnr_curves(variant), results.frame_points(variant)) for title, variant in variants.items()
+        title: (results.psnr_curves(variant), results.frame_points(variant), results.floors(variant))
+        for title, variant in variants.items()
     }
     if rows := {results.heading(title, variants[title]): row for title, row in panels.items() if any(row)}:
         frame = f"time of a frame of {results.timed_px(result)} px, s (log scale)"
         charts.speed_chart(rows, looks, ("training, s (log scale)", frame, PSNR), caption, paths[""])
+        drawn.append(paths[""])
     if result["sweep"] and (curves := results.sweep_curves(result)):
         charts.sweep_chart(curves, looks, f"training {result['sweep']}", PSNR, caption, paths["-sweep"])
+        drawn.append(paths["-sweep"])
     near = [
         (f"{title}, {results.SPLITS[split]}", label, clouds)
         for title, variant in variants.items()
@@ -49,10 +51,14 @@ def draw(result: Mapping[str, Any], store: Path, table: Path) -> list[Path]:
     ]
     if near:
         charts.nearness_chart(near, looks, f"{PSNR} (an image)", caption, paths["-nearness"])
+        drawn.append(paths["-nearness"])
     pictures = [row for title, variant in variants.items() for row in picture_rows(title, variant, store)]
     if pictures:
         charts.picture_grid(pictures, caption, paths["-pictures"])
-    return [path for path in paths.values() if path.exists()]
+        drawn.append(paths["-pictures"])
+    for path in set(paths.values()) - set(drawn):
+        path.unlink(missing_ok=True)  # of an earlier call
+    return drawn
 
 
 def picture_rows(title: str, variant: Mapping[str, Any], store: Path) -> list[tuple[str, list[tuple[str, Any]]]]:

@@ -30,6 +30,7 @@ COSTS = {  # of a training
     "model_mib": ("model, MiB", "{:.1f}"),
 }
 NEAR_BEST_DB = 1.0
+FLOORS = {"one_colour_psnr": "one colour in the true outline", "empty_psnr": "an empty picture"}
 
 
 def scored(variant: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -55,6 +56,12 @@ def frame_points(variant: Mapping[str, Any]) -> dict[str, Point]:
     return {name: (seconds, psnr) for name, (seconds, psnr) in points.items() if psnr is not None}
 
 
+def floors(variant: Mapping[str, Any]) -> dict[str, float]:
+    """PSNR, over the images of the curves, of what needs no method; nothing where no image could be scored."""
+    ends = [scores["curve"][-1] for scores in scored(variant).values() if scores["curve"]]
+    return {title: end[key] for end in ends[:1] for key, title in FLOORS.items() if end["psnr"] is not None}
+
+
 def heading(title: str, variant: Mapping[str, Any]) -> str:
     """A variant's title and what its charts are about."""
     return f"{title}, {' and '.join(sorted({SPLITS[scores['split']] for scores in scored(variant).values()}))}"
@@ -70,7 +77,8 @@ def sweep_curves(result: Mapping[str, Any]) -> dict[str, list[Point]]:
     curves: dict[str, list[Point]] = {}
     for variant in result["variants"].values():
         for name, (_, psnr) in frame_points(variant).items():
-            curves.setdefault(name, []).append((variant[result["sweep"]], psnr))
+            trained_on = variant["methods"][name]["trained_on"]
+            curves.setdefault(name, []).append((trained_on[result["sweep"]], psnr))
     return {name: sorted(points) for name, points in curves.items()}
 
 
@@ -130,6 +138,13 @@ def _variant_lines(variant: Mapping[str, Any]) -> list[str]:
         lines.append(line([name, *cells, shown(near_best.get(name), "{:.0f}")]))
         for reason in _reasons(scores):
             reasons.setdefault(reason, []).append(name)
+        if scores["trained_on"] != {key: variant[key] for key in scores["trained_on"]}:
+            told = "trained on {cameras} cameras and {frames} frames: calibration left the others out"
+            reasons.setdefault(told.format(**scores["trained_on"]), []).append(name)
+    for key, title in FLOORS.items() if scored(variant) else ():
+        known = [[v for m in scored(variant).values() if (v := m[s][key]) is not None] for s in SPLITS]
+        both = " / ".join(shown(values[0] if values else None, "{:.2f}") for values in known)
+        lines.append(line([title, both, *[""] * (len(titles) - 2)]))
     missing = [f"- {', '.join(names)}: {reason}" for reason, names in reasons.items()]
     return [*lines, *(["", *missing] if missing else [])]
 

@@ -14,7 +14,7 @@ import torch
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture, read_rgb
 from hnerf.errors import CaptureError
-from hnerf.evaluation.evaluate import LPIPS, PROTOCOL, mesh_frames, render, score_meshes, score_split
+from hnerf.evaluation.evaluate import LPIPS, MEANS, PROTOCOL, mesh_frames, render, score_meshes, score_split
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.pictures import crop, frame_person
 from hnerf.evaluation.views import SPLITS, View, all_views, split_frames
@@ -68,8 +68,8 @@ def score(scene: Scene, training: Path, settings: ScoringSettings, out: Path) ->
     found["curve"] = [] if split == "novel_pose" and reason else curve(scene, split, training, avatar, settings, out)
     for name in SPLITS:
         if name == "novel_pose" and reason:
-            found[name] = {"n": 0, "psnr": None, "ssim": None, "mask_iou": None, "reason": reason}
-            found[name] |= {"per_image": [], "geometry": None, "geometry_reason": reason}
+            found[name] = {"n": 0, "per_image": [], "reason": reason} | dict.fromkeys(MEANS)
+            found[name] |= {"geometry": None, "geometry_reason": reason}
         else:
             found[name] = score_at(scene, avatar, name, settings.images, settings.meshes, out)
             add_nearness(scene.capture, avatar, name, found[name]["per_image"])

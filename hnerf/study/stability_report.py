@@ -9,31 +9,34 @@ from typing import Any
 from hnerf.study.degrade import KINDS
 from hnerf.study.files import picture
 from hnerf.study.surface import LENGTHS, VOLUMES
-from hnerf.study.verdict import DEGRADED_DB, DEGRADED_RATIO, FAILED_DB, FAILED_RATIO, WORST_LAST
+from hnerf.study.verdict import DEGRADED_DB, DEGRADED_RATIO, FAILED_DB, FAILED_RATIO, FAILED_SHARE, WORST_LAST
 from hnerf.tables import head, line, shown
 
 REFERENCE = "as recorded"
 LEGEND = (
     f"**ok**: at most {DEGRADED_DB:g} dB of PSNR lost against the same method and seed on the capture as recorded, and "
     f"a Chamfer distance of at most {DEGRADED_RATIO:g} times that. **degraded**: worse. **failed**: over {FAILED_DB:g} "
-    f"dB or {FAILED_RATIO:g} times, a crash, no surface, one that is not watertight or not of the body's size (volume "
-    f"{VOLUMES[0]:g} to {VOLUMES[1]:g}, length {LENGTHS[0]:g} to {LENGTHS[1]:g} of it). **refused**: an earlier stage "
-    "or the training said what is wrong with the input. Novel poses from test cameras are scored, which no degradation "
-    "touches, but that they and the truth wear the skirt or the hair, too; training poses where the capture has no "
-    "others. Without test cameras images are not compared, since what is done to training cameras would be done to "
-    "what they are scored on. A surface is the largest component that meshing finds; what floats beside it does not "
-    "count."
+    f"dB, or {FAILED_SHARE:g} of what that run has above an empty picture, or {FAILED_RATIO:g} times the distance; "
+    "pictures no better than empty ones, a crash, no surface, one that is not watertight or not of the body's size "
+    f"(volume {VOLUMES[0]:g} to {VOLUMES[1]:g}, length {LENGTHS[0]:g} to {LENGTHS[1]:g} of it). **refused**: an "
+    "earlier stage or the training said what is wrong with the input. Novel poses from test cameras are scored, which "
+    "no degradation touches, but that they and the truth wear the skirt or the hair, too; training poses where the "
+    "capture has no others. Runs are compared by the images and surfaces that both have: a frame that a degradation "
+    "took away counts in neither. Without test cameras images are not compared, since what is done to training cameras "
+    "would be done to what they are scored on. A surface is the largest component that meshing finds; what floats "
+    "beside it does not count."
 )
 
 Row = dict[str, Any]
 
 
 def worst(result: Row, method: str, kind: str, strength: float) -> Row | None:
-    """The worst run over seeds, None where there is none yet. Without a good run to compare with, that run stands for
-    all."""
+    """The worst run over seeds, None where there is none yet. Where no seed has a good run to compare with, these runs
+    stand for all."""
     found = [r for r in result["runs"] if r["method"] == method and r["kind"] == kind and r["strength"] == strength]
     good = [r for r in result["runs"] if r["method"] == method and r["kind"] == REFERENCE]
-    found += [r for r in good if "psnr" not in r]
+    if all("psnr" not in r for r in good):
+        found += good
     return max(found, key=lambda r: WORST_LAST.index(r["verdict"]), default=None)
 
 

@@ -10,9 +10,15 @@ import numpy as np
 
 from hnerf.capture.boards import BOARDS_FILE
 from hnerf.capture.capture import Capture
-from hnerf.errors import CaptureError
+from hnerf.errors import CaptureError, NotPossibleError
 
 T = TypeVar("T")
+
+
+def require_several_cameras(capture: Capture) -> None:
+    """NotPossibleError where one camera alone differs from no other."""
+    if len(capture.train_cameras) < 2:
+        raise NotPossibleError(f"{capture.name}: has one training camera; there is none to differ from")
 
 
 def subset(

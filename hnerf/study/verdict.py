@@ -8,6 +8,7 @@ WORST_LAST: tuple[Word, ...] = ("ok", "degraded", "refused", "failed")
 
 # 1 dB is a quarter more squared error, seen side by side and hardly otherwise; 6 dB is four times as much.
 DEGRADED_DB, FAILED_DB = 1.0, 6.0
+FAILED_SHARE = 0.5  # of what a good run has above an empty picture, where that is less than 6 dB
 # A quarter more distance, too; at three times the distance of a good run, parts of the body lie elsewhere.
 DEGRADED_RATIO, FAILED_RATIO = 1.25, 3.0
 
@@ -22,13 +23,17 @@ class Verdict:
 
 def judge(scores: dict[str, Any], reference: dict[str, Any], faults: list[str]) -> Verdict:
     """`scores` and `reference` hold psnr (dB) and chamfer_mm of the same images and surfaces, degraded and not, or None
-    where there is no truth; faults: what is wrong with surfaces, which is failure whatever the scores."""
+    where there is no truth, `reference` also empty_psnr, of an empty picture; faults: what is wrong with surfaces,
+    which is failure whatever the scores."""
     if faults:
         return Verdict("failed", faults[0])
     words: list[tuple[Word, str]] = [("ok", "")]
     if None not in (scores["psnr"], reference["psnr"]):
-        lost_db = reference["psnr"] - scores["psnr"]
-        words.append((_word(lost_db, DEGRADED_DB, FAILED_DB), f"{lost_db:.1f} dB of PSNR lost"))
+        if scores["psnr"] <= reference["empty_psnr"]:
+            return Verdict("failed", "pictures are no better than empty ones")
+        lost_db, above_db = reference["psnr"] - scores["psnr"], reference["psnr"] - reference["empty_psnr"]
+        failed_db = min(FAILED_DB, FAILED_SHARE * above_db)
+        words.append((_word(lost_db, DEGRADED_DB, failed_db), f"{lost_db:.1f} dB of PSNR lost"))
     if None not in (scores["chamfer_mm"], reference["chamfer_mm"]):
         ratio = scores["chamfer_mm"] / reference["chamfer_mm"]
         words.append((_word(ratio, DEGRADED_RATIO, FAILED_RATIO), f"Chamfer distance times {ratio:.2f}"))

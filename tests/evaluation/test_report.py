@@ -60,11 +60,12 @@ def test_seconds_of_the_fit_are_among_the_costs(tmp_path: Path) -> None:
 
 def test_notes_say_what_was_left_out_and_what_was_compared_to(tmp_path: Path) -> None:
     inputs = ball_inputs(write_ball_capture(tmp_path / "capture", "ball", ("c",)), tmp_path / "stages")
-    view = {"reference": "image x ground-truth mask", "without_person": 2}
+    view = {"reference": "image x ground-truth mask", "without_mask": 3, "without_person": 2}
     found = {"lpips": "not available: no weights", "novel_view": view, "novel_pose": {"reason": "of rain"}}
     assert notes(inputs, found) == [
         "LPIPS is not available: no weights.",
         "New views: compared to photographs under the true mask, whose edge pixels hold background.",
+        "New views: 3 images have no ground-truth mask and are not scored.",
         "New views: 2 images do not show the person and are not scored.",
         "New poses: no image figures, since of rain.",
     ]

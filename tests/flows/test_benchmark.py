@@ -67,6 +67,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
     monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path, title="whole"))
     monkeypatch.setattr(module, "subset_capture", lambda _, recording, *parts: SimpleNamespace(title=str(parts)))
     monkeypatch.setattr(module, "read_capture", lambda *_: (None, None))
+    monkeypatch.setattr(module, "calibrated", lambda *_: RECORDED)
     monkeypatch.setattr(module.Capture, "load", lambda _: RECORDED)
     monkeypatch.setattr(module, "train", train)
     monkeypatch.setattr(module, "score_training", score_training)

@@ -56,8 +56,12 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
     def evaluate(_: Any, truth: Any, recording: Any, cameras: Any, masks: Any, body: Any, *rest: Any) -> Any:
         assert truth == ("of skirt 0.02" if recording.name == "skirt 0.02" else "true")
         psnr = 28.0 if body.name == "pose_noise 2" else 30.0
-        split = {"n": 2, "psnr": psnr, "ssim": 0.9, "geometry": {"chamfer_mm": 6.0}}
-        return made("report", metrics={"protocol": "By eye.", "novel_view": split | {"psnr": 0}, "novel_pose": split})
+        late = recording.name == "image_noise 5"  # which has easy images of its own
+        views = {1: psnr + 2, 3: psnr - 2} if not late else {1: 32.0, 4: 99.0}
+        images = [{"camera": "c", "frame": f, "psnr": db, "ssim": 0.9, "empty_psnr": 18.0} for f, db in views.items()]
+        surfaces = [{"frame": 1, "chamfer_mm": 6.0}, {"frame": 4, "chamfer_mm": 1.0}][: 1 + late]
+        split = {"per_image": images, "geometry": {"per_surface": surfaces}}
+        return made("report", metrics={"protocol": "By eye.", "novel_view": None, "novel_pose": split})
 
     def degrade(*inputs: Any) -> Any:
         return made(f"{inputs[-1].kind} {inputs[-1].strength:g}")
@@ -90,7 +94,8 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
     }
     for name, stage in replaced.items():
         monkeypatch.setattr(module, name, stage)
-    monkeypatch.setattr(module.Capture, "load", lambda _: SimpleNamespace(name="ada", test_cameras=("c",)))
+    capture = SimpleNamespace(name="ada", test_cameras=("c",), novel_pose_frames=(1, 3, 4))
+    monkeypatch.setattr(module.Capture, "load", lambda _: capture)
     (tmp_path / "mine.yaml").write_text(STUDY)
     return trained
 
@@ -122,6 +127,15 @@ def test_every_run_has_a_verdict(stages: list[dict[str, Any]], tmp_path: Path) -
     assert charts == {"ada-mine-matrix.png", "ada-mine-psnr.png", "ada-mine-chamfer_mm.png"}
 
 
+def test_runs_are_compared_by_the_images_and_surfaces_that_both_have(
+    stages: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    """Of the noisy run frame 1 alone, in which both have 32 dB and 6 mm; the good run's mean of both is 30."""
+    good, noisy = study(tmp_path, only=["image_noise"])["runs"][:2]
+    assert (good["psnr"], good["images"], good["chamfer_mm"], good["surfaces"]) == (30.0, 2, 6.0, 1)
+    assert (noisy["psnr"], noisy["images"], noisy["chamfer_mm"], noisy["surfaces"]) == (32.0, 1, 6.0, 1)
+
+
 def test_the_flow_runs_page_shows_the_charts_themselves(
     stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -150,7 +164,8 @@ def test_what_a_capture_does_not_allow_is_left_out_and_no_verdict(
 def test_without_test_cameras_images_are_not_compared(
     stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module.Capture, "load", lambda _: SimpleNamespace(name="ada", test_cameras=()))
+    capture = SimpleNamespace(name="ada", test_cameras=(), novel_pose_frames=(1, 3))
+    monkeypatch.setattr(module.Capture, "load", lambda _: capture)
     runs = study(tmp_path, only=["pose_noise"])["runs"]
     assert [(run["psnr"], run["chamfer_mm"], run["verdict"]) for run in runs[:2]] == [(None, 6.0, "ok")] * 2
 

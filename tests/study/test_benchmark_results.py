@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from hnerf.evaluation.evaluate import MEANS
 from hnerf.study import charts
 from hnerf.study.publish import publish
 from hnerf.study.results import (
@@ -34,18 +35,24 @@ def split(psnr: float) -> dict[str, Any]:
         {"camera": "c", "frame": f, "psnr": psnr + f, "view_angle_deg": 40.0 + f, "pose_distance_mm": 3.0}
         for f in (0, 2)
     ]
-    return {"n": 2, "psnr": psnr, "ssim": 0.9, "mask_iou": 0.95, "per_image": rows, "geometry": GEOMETRY}
+    floors = {"empty_psnr": 18.0, "one_colour_psnr": 25.0}
+    return {"n": 2, "psnr": psnr, "ssim": 0.9, "mask_iou": 0.95, "per_image": rows, "geometry": GEOMETRY} | floors
 
 
 def scores(psnr: float, frame_s: float, folder: str) -> dict[str, Any]:
-    nothing = {"n": 0, "psnr": None, "ssim": None, "mask_iou": None, "reason": "no poses", "per_image": []}
+    nothing = {"n": 0, "per_image": [], "reason": "no poses"} | dict.fromkeys(MEANS)
+    curve = [
+        {"seconds": s, "psnr": db, "empty_psnr": 18.5, "one_colour_psnr": 25.5}
+        for s, db in ((10.0, psnr - 4), (1e3, psnr))
+    ]
     return {
         "machine": MACHINE,
         "protocol": "By eye.",
         "lpips": "not available: no weights",
         "split": "novel_view",
         "training": {"seconds": 61.7, "peak_memory_gib": 1.25, "model_mib": 28.5},
-        "curve": [{"seconds": 10.0, "psnr": psnr - 4}, {"seconds": 1000.0, "psnr": psnr}],
+        "curve": curve,
+        "trained_on": {"cameras": 4, "frames": 1},
         "novel_view": split(psnr),
         "novel_pose": nothing | {"geometry": None, "geometry_reason": "no poses"},
         "frame_seconds": {"512": 4 * frame_s, "256": frame_s},
@@ -60,7 +67,7 @@ def result(**changes: Any) -> dict[str, Any]:
         "nerf": scores(26.0, 2.0, "scoring/n"),
         "idr": {"error": "a | b"},
     }
-    few = {"fast": scores(28.0, 0.5, "scoring/f")}
+    few = {"fast": scores(28.0, 0.5, "scoring/f") | {"trained_on": {"cameras": 2, "frames": 1}}}
     return {
         "subject": "ada",
         "study": "toy",
@@ -78,7 +85,7 @@ def result(**changes: Any) -> dict[str, Any]:
 
 
 def test_the_markdown_by_hand() -> None:
-    assert as_markdown(result(), ["a (b).png"]).splitlines()[:23] == [
+    assert as_markdown(result(), ["a (b).png"]).splitlines()[:25] == [
         "# Toys: ada",
         "",
         "ada, study toy: 60 s for each field; on Abacus, 1 of 2 cores, no GPU, torch 2, Python 3.",
@@ -101,6 +108,8 @@ def test_the_markdown_by_hand() -> None:
         "| nerf | 26.00 / - | 0.900 / - | 0.950 / - | 0.050 / - | 0.940 / - | 0.875 / - | 62 | 1.2 | 28.5 | 2.00 "
         "| 8.00 | - |",
         "| idr | a / b |  |  |  |  |  |  |  |  |  |  |  |",
+        "| one colour in the true outline | 25.00 / - |  |  |  |  |  |  |  |  |  |  |  |",
+        "| an empty picture | 18.00 / - |  |  |  |  |  |  |  |  |  |  |  |",
         "",
         "- fast, nerf: no images of new poses: no poses",
         "",
@@ -109,6 +118,14 @@ def test_the_markdown_by_hand() -> None:
     text = as_markdown(result(), [])
     assert "Left out: the capture has 4 training cameras, not 8." in text
     assert text.endswith("LPIPS: not available: no weights.\n\nBy eye.\n")
+
+
+def test_what_calibration_left_out_is_told_and_not_plotted() -> None:
+    of_three = result()
+    of_three["variants"]["4 cameras"]["methods"]["fast"]["trained_on"] = {"cameras": 3, "frames": 1}
+    text = as_markdown(of_three, [])
+    assert "- fast: trained on 3 cameras and 1 frames: calibration left the others out" in text
+    assert sweep_curves(of_three)["fast"] == [(2, 28.0), (3, 30.0)]
 
 
 def test_the_csv_has_a_row_for_each_method_of_each_variant() -> None:

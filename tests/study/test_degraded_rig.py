@@ -1,10 +1,11 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hnerf.capture.capture import Capture
-from hnerf.errors import CaptureError
+from hnerf.errors import CaptureError, NotPossibleError
 from hnerf.study.degrade import Degradation, check_strengths, degrade_capture
 from tests.study.recording import FRAMES, write_recording
 
@@ -28,6 +29,15 @@ def test_cameras_and_frames_that_are_left(tmp_path: Path) -> None:
 def test_what_there_is_already_cannot_be_left(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="ada: has only 2 training cameras; leave fewer than that"):
         degraded(tmp_path, "cameras_left", 2)
+
+
+@pytest.mark.parametrize("kind", ["camera_turned", "camera_out_of_step", "exposure"])
+def test_one_camera_alone_differs_from_none(tmp_path: Path, kind: str) -> None:
+    """It would turn, delay or darken the world, which scores would hold against the avatar."""
+    capture = write_recording(tmp_path / "good")
+    alone = replace(capture, train_cameras=capture.train_cameras[:1])
+    with pytest.raises(NotPossibleError, match="ada: has one training camera; there is none to differ from"):
+        degrade_capture(alone, Degradation(kind=kind, strength=1.0, seed=0), tmp_path / "bad")
 
 
 def test_one_training_camera_turns_about_its_centre(tmp_path: Path) -> None:

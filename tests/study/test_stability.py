@@ -101,6 +101,14 @@ def test_a_method_breaks_where_its_worst_seed_does() -> None:
     assert breaking_strength(RESULT, "nerf", "mask_holes") == "5 (refused)"
 
 
+def test_a_seed_without_a_good_run_says_nothing_of_the_others() -> None:
+    """Seed 1 cannot take the capture as recorded; seed 0 holds."""
+    rows = [run("fast", "as recorded", None, 0, "ok", 30.0), run("fast", "as recorded", None, 1, "failed", None)]
+    result = RESULT | {"runs": [*rows, run("fast", "pose_noise", 1, 0, "ok", 30.0)]}
+    assert breaking_strength(result, "fast", "pose_noise") == "holds to 1"
+    assert breaking_strength(result, "fast", "mask_holes") == "-"
+
+
 def test_the_tables_by_hand() -> None:
     lines = as_markdown(RESULT, ["a (b).png"]).splitlines()
     start = lines.index("## Where each method breaks")

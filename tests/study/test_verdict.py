@@ -2,7 +2,7 @@ import pytest
 
 from hnerf.study.verdict import Verdict, judge
 
-GOOD = {"psnr": 30.0, "chamfer_mm": 6.0}
+GOOD = {"psnr": 30.0, "chamfer_mm": 6.0, "empty_psnr": 18.0}
 
 
 @pytest.mark.parametrize(
@@ -14,6 +14,7 @@ GOOD = {"psnr": 30.0, "chamfer_mm": 6.0}
         (29.0, 9.0, "degraded: Chamfer distance times 1.50"),
         (28.0, 12.0, "degraded: 2.0 dB of PSNR lost; Chamfer distance times 2.00"),
         (23.0, 12.0, "failed: 7.0 dB of PSNR lost"),
+        (17.9, 6.0, "failed: pictures are no better than empty ones"),
         (28.0, 24.0, "failed: Chamfer distance times 4.00"),
         (float("nan"), 6.0, "failed: nan dB of PSNR lost"),
         (None, 6.0, "ok"),
@@ -23,6 +24,18 @@ GOOD = {"psnr": 30.0, "chamfer_mm": 6.0}
 def test_the_worse_of_both_figures_counts(psnr: float | None, chamfer_mm: float | None, told: str) -> None:
     verdict = judge({"psnr": psnr, "chamfer_mm": chamfer_mm}, GOOD, [])
     assert ": ".join(filter(None, (verdict.word, verdict.reason))) == told
+
+
+def test_half_of_what_a_good_run_has_above_an_empty_picture_is_failure() -> None:
+    """20 dB where an empty picture has 16."""
+    poor = {"psnr": 20.0, "chamfer_mm": None, "empty_psnr": 16.0}
+    assert judge(poor | {"psnr": 18.1}, poor, []).word == "degraded"
+    assert judge(poor | {"psnr": 17.9}, poor, []).word == "failed"
+
+
+def test_a_good_run_is_judged_too() -> None:
+    worthless = {"psnr": 15.0, "chamfer_mm": None, "empty_psnr": 16.0}
+    assert judge(worthless, worthless, []).word == "failed"
 
 
 def test_a_surface_that_is_no_persons_is_failure_whatever_the_scores() -> None:
