@@ -18,7 +18,7 @@ import numpy as np
 from provenance import SHARED, provenance, sentence, table, write_result
 
 from hnerf.body.fit_result import BodyFit
-from hnerf.calibration.check import load_cameras
+from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.render.silhouette import silhouette
 

@@ -12,7 +12,7 @@ import trimesh
 
 from hnerf.asset.surface import posed_surface
 from hnerf.body.fit_result import BodyFit
-from hnerf.calibration.check import load_cameras
+from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.evaluation.mesh_queries import Surface
 from hnerf.evaluation.pictures import clay, crop, cropped_camera, frame_person, overlay_surface

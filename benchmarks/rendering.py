@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from provenance import provenance, sentence, table, write_result
 
-from hnerf.calibration.check import load_cameras
+from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.study.scoring import frame_seconds
 from hnerf.training.model import load_avatar

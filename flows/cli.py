@@ -20,8 +20,8 @@ from hnerf.calibration.boards import calibrate_from_boards
 from hnerf.capture.formats.export import WRITERS, write_cameras
 from hnerf.capture.ingest import recognise
 from hnerf.capture.notes import read_notes
-from hnerf.capture.performer import PerformerSettings, write_performer
-from hnerf.config import load_settings
+from hnerf.capture.performer import write_performer
+from hnerf.config import PerformerSettings, load_settings
 from hnerf.errors import CaptureError
 from hnerf.new_folder import new_folder
 from hnerf.render.show import KINDS, Wish, render_subject

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, V
 
 from hnerf.errors import CaptureError
 
-S = TypeVar("S", bound="Section")
+S = TypeVar("S", bound=BaseModel)
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 
@@ -204,7 +204,6 @@ class EvaluationSettings(Section):
 
 class AssetSettings(Section):
     grid_cells: int = Field(default=256, ge=16)  # of marching cubes, on the longest side
-    margin_m: float = Field(default=0.2, gt=0)  # how far hair and clothes may stand off the body
     faces: int = Field(default=20_000, ge=100)
     texture_px: int = Field(default=1024, ge=16)
     texture_poses: int = Field(default=3, ge=1)  # of the capture; each texel takes the median colour
@@ -286,9 +285,10 @@ def _parsed(text: str | bytes, source: str) -> Any:
 
 
 def validated(kind: type[S], tree: Any, source: Path | str) -> S:
-    """A section from the tree that a YAML file holds; CaptureError, one line with source and key, on what is wrong."""
+    """A model from the tree that a YAML or TOML file holds; CaptureError, one line with source and key, on what is
+    wrong."""
     try:
         return kind.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
-        raise CaptureError(f"{source}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise CaptureError(f"{source}: {'.'.join(map(str, first['loc']))}: {first['msg']}; correct it") from None

@@ -10,7 +10,7 @@ from tasks.store import Artifact
 from tasks.training import trained
 
 
-@stage("asset", version="1")
+@stage("asset", version="2")
 def export(
     out: Path, recording: Artifact, calibration: Artifact, training: Artifact, settings: AssetSettings
 ) -> dict[str, float]:

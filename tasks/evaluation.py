@@ -8,7 +8,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.config import EvaluationSettings
 from hnerf.evaluation.evaluate import evaluate as evaluate_avatar
 from hnerf.evaluation.inputs import EvaluationInputs
-from hnerf.segmentation.segment import Masks
+from hnerf.segmentation.masks import Masks
 from tasks.calibration import calibrated
 from tasks.source import Source
 from tasks.stage import stage

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from hnerf.body.fit import fit_body
 from hnerf.config import FitSettings
-from hnerf.segmentation.segment import Masks
+from hnerf.segmentation.masks import Masks
 from tasks.calibration import calibrated
 from tasks.stage import stage
 from tasks.store import Artifact

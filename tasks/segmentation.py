@@ -5,8 +5,7 @@ from pathlib import Path
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.config import SegmentationSettings
-from hnerf.segmentation.masks import movement_px
-from hnerf.segmentation.segment import Masks
+from hnerf.segmentation.masks import Masks, movement_px
 from hnerf.segmentation.segment import segment as segment_person
 from tasks.calibration import calibrated
 from tasks.stage import stage

@@ -41,7 +41,6 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("training:", "training"),
         ("training: {steps: {a: 1}}", "training.steps"),
         ("asset: {grid_cells: 0}", "asset.grid_cells"),
-        ("asset: {margin_m: 0}", "asset.margin_m"),
         ("asset: {faces: -1}", "asset.faces"),
         ("asset: {texture_px: -1}", "asset.texture_px"),
         ("asset: {texture_poses: 0}", "asset.texture_poses"),

@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 import torch
-import trimesh
 
 from hnerf.asset.glb import write_glb
 from hnerf.asset.rig_transfer import dressed_rig
 from hnerf.asset.simplify import simplified
 from hnerf.asset.staging import stage_avatar
-from hnerf.asset.surface import extract_surface
+from hnerf.asset.surface import surface_in_pose
 from hnerf.asset.texture import bake, unwrap
 from hnerf.asset.usd import write_cache, write_skinned
 from hnerf.asset.validation import validate_package
@@ -39,7 +38,8 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
     seconds: dict[str, float] = {}
     avatar = avatar.without_frames()  # one surface and one texture stand for all of them
     with _timed("surface", seconds):
-        dense = canonical_surface(avatar, settings)
+        rest = avatar.body.theta.new_zeros(len(avatar.body.rig.joints_m), 3), torch.eye(4).to(avatar.body.theta)
+        dense = surface_in_pose(avatar, *rest, settings.grid_cells)
     with _timed("mesh", seconds):
         surface = simplified(dense, settings.faces)
         layout = unwrap(surface.vertices, surface.faces, settings.texture_px)
@@ -73,18 +73,6 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
     }
     (out / "report.json").write_text(json.dumps(report, indent=1))
     return report
-
-
-def canonical_surface(avatar: Avatar, settings: AssetSettings) -> trimesh.Trimesh:
-    """The clothed surface in the rest pose of the fitted shape, in the body frame."""
-    rig = avatar.body.rig
-    device = rig.vertices_m.device
-    theta, root = torch.zeros(len(rig.joints_m), 3, device=device), torch.eye(4, device=device)
-    lower_m = rig.vertices_m.min(0).values - settings.margin_m
-    upper_m = rig.vertices_m.max(0).values + settings.margin_m
-    return extract_surface(
-        lambda points_m: avatar.signed_distance(points_m, theta, root), lower_m, upper_m, settings.grid_cells
-    )
 
 
 def _dressed_body(body: BodyFit, rig: Rig, frames: tuple[int, ...]) -> BodyFit:

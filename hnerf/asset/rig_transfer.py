@@ -44,9 +44,7 @@ def transfer_skin(rig: Rig, vertices_m: Tensor, faces: Tensor) -> tuple[Tensor, 
     """
     body, only = BodyMeshes(rig.vertices_m[None], rig.faces), torch.zeros(len(vertices_m), dtype=torch.int32)
     found = body.closest_points(vertices_m, only, REACH_M)
-    dense = torch.zeros(len(rig.vertices_m), len(rig.joints_m))
-    dense.scatter_add_(1, rig.skin_joints, rig.skin_weights)
-    weights = (dense[rig.faces[found.face]] * found.barycentric[..., None]).sum(1)
+    weights = (rig.dense_weights[rig.faces[found.face]] * found.barycentric[..., None]).sum(1)
     start, end = _edges(faces)
     neighbours = torch.bincount(start, minlength=len(weights))[:, None]
     for _ in range(SMOOTHING_PASSES):

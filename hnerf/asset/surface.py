@@ -7,8 +7,6 @@ from collections.abc import Callable
 import numpy as np
 import torch
 import trimesh
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 from torch import Tensor
 
@@ -18,7 +16,6 @@ from hnerf.render.avatar import Avatar
 
 SLOPE_BOUND = 2.0  # |gradient| that skipping empty space allows for; a true distance has 1
 COARSEST_STRIDE = 9  # nodes; refined by threes, so that a coarse node is the centre of the block it stands for
-CHUNK_POINTS = 1 << 17
 POSED_CELLS = 256  # on the longest side of the box
 POSED_MARGIN_M = 0.2  # around the naked body: hair, shoes, loose clothes
 
@@ -57,10 +54,10 @@ def extract_surface(
         found = "everything is inside" if values.max() <= 0 else "everything is outside"
         raise CaptureError(f"signed distance field: no surface in its box ({found}); train longer or check masks")
     vertices, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")  # in steps from `lower_m`
-    vertices, faces = _largest_component(vertices, faces)
-    if vertices.min() <= 0 or (vertices >= np.array(nodes) - 1).any():
+    mesh = _largest_component(trimesh.Trimesh(vertices, faces, process=False))
+    if mesh.vertices.min() <= 0 or (mesh.vertices >= np.array(nodes) - 1).any():
         raise CaptureError("signed distance field: the surface fills its box; train longer or check masks and body fit")
-    return trimesh.Trimesh(vertices * step_m + lower_m.cpu().numpy(), faces, process=False)
+    return trimesh.Trimesh(mesh.vertices * step_m + lower_m.cpu().numpy(), mesh.faces, process=False)
 
 
 @torch.no_grad()
@@ -79,7 +76,7 @@ def _sample_near_surface(
     values = torch.empty(shape, device=device)
     while True:
         points_m = lower_m + (index * stride + stride // 2) * step_m
-        distances_m = torch.cat([signed_distance(chunk).float() for chunk in points_m.split(CHUNK_POINTS)])
+        distances_m = signed_distance(points_m).float()
         values[index.unbind(1)] = distances_m
         if stride == 1:
             return values[: nodes[0], : nodes[1], : nodes[2]]
@@ -90,14 +87,9 @@ def _sample_near_surface(
         stride //= 3
 
 
-def _largest_component(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The connected part with the largest area: vertices (V, 3), faces (F, 3)."""
-    start, end = faces.ravel(), np.roll(faces, 1, axis=1).ravel()
-    count = len(vertices)
-    edges = coo_matrix((np.ones(len(start), bool), (start, end)), (count, count))
-    _, label = connected_components(edges, directed=False)
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    kept = label == np.bincount(label[faces[:, 0]], area).argmax()
-    renumbered = np.cumsum(kept) - 1
-    return vertices[kept], renumbered[faces[kept[faces[:, 0]]]]
+def _largest_component(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Leaves the connected part with the largest area."""
+    part = trimesh.graph.connected_component_labels(mesh.edges, len(mesh.vertices))[mesh.faces[:, 0]]
+    mesh.update_faces(part == np.bincount(part, mesh.area_faces).argmax())
+    mesh.remove_unreferenced_vertices()
+    return mesh

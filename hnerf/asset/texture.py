@@ -16,7 +16,6 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig, pose_vertices
 from hnerf.render.avatar import Avatar
 
-CHUNK_POINTS = 1 << 16
 CHART_PADDING_PX = 4
 MAX_STEP_M = 0.03  # skinning is not further off; a longer distance is another limb's
 SUBPIXEL_BITS = 8
@@ -106,8 +105,7 @@ def _colours_in_pose(avatar: Avatar, rig: Rig, texels: Texels, theta: Tensor, ro
     corners, weights = faces[texels.face.to(device)], texels.barycentric.to(device)[..., None]
     points_m = ((vertices_m - height_m[:, None] * normals)[corners] * weights).sum(1)
     inward = -torch.nn.functional.normalize((normals[corners] * weights).sum(1), dim=1)
-    chunks = zip(points_m.split(CHUNK_POINTS), inward.split(CHUNK_POINTS), strict=True)
-    return torch.cat([avatar.colour(p, v, theta, root).cpu() for p, v in chunks])
+    return avatar.colour(points_m, inward, theta, root).cpu()
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

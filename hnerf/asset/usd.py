@@ -7,7 +7,6 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, Vt
@@ -15,7 +14,7 @@ from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, Vt
 from hnerf.asset.staging import StagedAvatar
 from hnerf.body.descriptor import vertex_normals
 from hnerf.capture.camera import Camera
-from hnerf.render.pictures import write_image
+from hnerf.capture.capture import write_image
 
 ROOT = Sdf.Path("/Avatar")
 APERTURE = 0.36  # width of the film gate in tenths of a scene unit: arrives as 36 mm at one metre a unit
@@ -185,7 +184,7 @@ def _bind_skin(mesh: UsdGeom.Mesh, skeleton: UsdSkel.Skeleton, avatar: StagedAva
 def _package(stage: Usd.Stage, avatar: StagedAvatar, path: Path) -> None:
     layer = Path(stage.GetRootLayer().realPath)
     stage.GetRootLayer().Save()
-    write_image(layer.parent / TEXTURE_NAME, cv2.cvtColor(avatar.texture, cv2.COLOR_RGB2BGR))
+    write_image(layer.parent / TEXTURE_NAME, avatar.texture)
     if not UsdUtils.CreateNewARKitUsdzPackage(str(layer), str(path)):
         raise OSError(f"{path}: USD could not write the package; is the disk full?")
 

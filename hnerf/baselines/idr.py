@@ -106,7 +106,6 @@ class IdrField(StaticField):
         seen = self._surface_colour(origins_m[pick], directions[pick], met[pick])
         norms = d.new_zeros(0)
         if draws.probe is not None:
-            assert draws.finer is not None
             lower, upper = region.lower_m[frame], region.upper_m[frame]
             norms = self._evaluate(lower + (upper - lower) * draws.finer[:, :3])[1].norm(dim=-1)
         alpha = hit[:, None].to(d)

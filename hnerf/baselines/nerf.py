@@ -69,7 +69,6 @@ class NerfField(StaticField):
         correction: PoseCorrection | None = None,
     ) -> tuple[RaySamples, Tensor]:
         """As Field.sample: `samples` of the coarse network, then twice as many of the fine one (K = 3 x samples)."""
-        assert draws.finer is not None
         near, far = region.interval(origins_m, directions, frame)
         first = stratified(near, far, draws.jitter)
         first_alpha, first_density, first_colour = self._look(self.coarse, origins_m, directions, first, far)

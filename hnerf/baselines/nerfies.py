@@ -82,7 +82,6 @@ class NerfiesField(DynamicField):
     ) -> tuple[RaySamples, Tensor]:
         """As Field.sample, over coarse and fine samples together (K = 2 x samples). A call with draws.probe, as in
         training, has an elastic energy."""
-        assert draws.finer is not None
         near, far = region.interval(origins_m, directions, frame)
         first = stratified(near, far, draws.jitter)
 

@@ -244,8 +244,7 @@ def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
 def _subtree_weights(rig: Rig, free: Tensor) -> Tensor:
     """(V, free + 1): the skin weight that each free joint carries with all below it; the last column is the root's,
     1."""
-    dense = rig.skin_weights.new_zeros(len(rig.skin_weights), len(rig.joints_m))
-    dense.scatter_add_(1, rig.skin_joints, rig.skin_weights)
+    dense = rig.dense_weights.clone()
     for joint in range(len(rig.joints_m) - 1, 0, -1):
         dense[:, rig.parents[joint]] += dense[:, joint]
     return torch.cat([dense[:, free], dense.new_ones(len(dense), 1)], 1)

@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,9 +28,7 @@ from hnerf.capture.capture import Capture
 from hnerf.config import FitSettings
 from hnerf.errors import CaptureError
 from hnerf.render.silhouette import silhouette
-
-if TYPE_CHECKING:
-    from hnerf.segmentation.masks import Masks
+from hnerf.segmentation.masks import Masks
 
 log = logging.getLogger("hnerf.fit")
 
@@ -43,7 +41,7 @@ ONE_POSTURE_COSTS = 1.5  # times; noise of keypoints alone 1.1 to 1.3, joints th
 POOR_IOU, POOR_KEYPOINT_M = 0.75, 0.06  # beyond which a frame is flagged
 
 
-def fit_body(capture: Capture, masks: "Masks | None", settings: FitSettings) -> tuple[BodyFit, dict[str, Any]]:
+def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tuple[BodyFit, dict[str, Any]]:
     """The body in every frame of a capture, from training cameras only; without masks, from keypoints alone.
 
     Returns the fit and a plain report: seconds by stage, the shape, and for each frame the median keypoint residual in
@@ -161,7 +159,7 @@ def _by_split(capture: Capture) -> list[list[int]]:
     return [group for group in rows if group]
 
 
-def _outlines(capture: Capture, masks: "Masks", scale_m: Tensor, spacing_m: float) -> list[list[Outline | None]]:
+def _outlines(capture: Capture, masks: Masks, scale_m: Tensor, spacing_m: float) -> list[list[Outline | None]]:
     """By frame and training camera; None where a mask was dropped or is empty."""
     edges: list[list[Outline | None]] = []
     for t, frame in enumerate(capture.frames):
@@ -173,7 +171,7 @@ def _outlines(capture: Capture, masks: "Masks", scale_m: Tensor, spacing_m: floa
 
 
 def _report(
-    capture: Capture, masks: "Masks | None", seen: Observations, pose: Pose, fit: BodyFit, seconds: dict[str, float]
+    capture: Capture, masks: Masks | None, seen: Observations, pose: Pose, fit: BodyFit, seconds: dict[str, float]
 ) -> dict[str, Any]:
     """Plain values that say how good the fit is."""
     residual_px = _keypoint_residuals_px(seen, fit)
@@ -206,7 +204,7 @@ def _keypoint_residuals_px(seen: Observations, fit: BodyFit) -> np.ndarray:
     return distance.transpose(0, 1).flatten(1).nanmedian(1).values.numpy()
 
 
-def _silhouette_iou(capture: Capture, masks: "Masks", fit: BodyFit) -> list[float | None]:
+def _silhouette_iou(capture: Capture, masks: Masks, fit: BodyFit) -> list[float | None]:
     """Mean over training cameras of the naked body's IoU with the masks, by frame; None where all were dropped."""
     faces = fit.rig.faces.numpy()
     means: list[float | None] = []

@@ -54,6 +54,12 @@ class Rig:
         depths = torch.tensor(depth, device=self.parents.device)
         return [torch.nonzero(depths == level)[:, 0] for level in range(max(depth) + 1)]
 
+    @cached_property
+    def dense_weights(self) -> Tensor:
+        """Skin weights of all joints (V, J)."""
+        dense = self.skin_weights.new_zeros(len(self.skin_weights), len(self.joints_m))
+        return dense.scatter_add_(1, self.skin_joints, self.skin_weights)
+
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "Rig":
         """The same rig on another device; `dtype` changes the floating tensors only."""
         changed: dict[str, Any] = {}
@@ -144,9 +150,7 @@ def pose_vertices(rig: Rig, theta: Tensor, root: Tensor) -> Tensor:
 def vertex_transforms(rig: Rig, transforms: Tensor) -> Tensor:
     """Blend joint transforms (..., J, 4, 4) to vertices: (..., V, 3, 4), world from rest pose."""
     top = transforms[..., :3, :].flatten(-2)  # (..., J, 12)
-    dense = torch.zeros(len(rig.skin_weights), len(rig.joints_m), dtype=top.dtype, device=top.device)
-    dense.scatter_add_(1, rig.skin_joints, rig.skin_weights)
-    return (dense @ top).unflatten(-1, (3, 4))
+    return (rig.dense_weights @ top).unflatten(-1, (3, 4))
 
 
 def _from_above(rig: Rig, values: Tensor) -> Tensor:

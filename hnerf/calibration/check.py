@@ -18,7 +18,7 @@ from hnerf.calibration.diagnosis import (
 )
 from hnerf.calibration.monocular import ground_reasons, intrinsics_reasons
 from hnerf.calibration.refine import refine
-from hnerf.calibration.report import CalibrationReport, CameraVerdict, load_cameras
+from hnerf.calibration.report import CalibrationReport, CameraVerdict
 from hnerf.calibration.sizes import size_reasons
 from hnerf.calibration.synchronise import Timing, measure_timing, put_in_step
 from hnerf.calibration.triangulation import subject_keypoints
@@ -28,9 +28,6 @@ from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
 from hnerf.errors import CaptureError
 
-__all__ = ["check_calibration", "load_cameras"]
-
-ROTATION_TOLERANCE = 1e-3
 COINCIDENT_M = 0.005
 UPRIGHT = 0.5  # mean cosine between the trunk and up, below which somebody lies or bends all the time, or up is not up
 RESIDUAL_SHARE = 0.014  # of the person's height: 5 px of 357
@@ -42,7 +39,6 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
 
     Raises CaptureError, naming the likely cause, on a calibration that no person can have been seen with.
     """
-    _check_numbers(capture)
     if not capture.has_keypoints and capture.given_poses():
         return _unchecked(capture)
     keypoints = _keypoints(capture)
@@ -102,20 +98,6 @@ def _keypoints(capture: Capture) -> np.ndarray:
 def _for_size(settings: CalibrationSettings, height_px: float) -> CalibrationSettings:
     """Residuals that a person of this height may leave: what detectors err grows with him."""
     return settings.model_copy(update={"max_residual_px": max(settings.max_residual_px, RESIDUAL_SHARE * height_px)})
-
-
-def _check_numbers(capture: Capture) -> None:
-    """What is wrong whatever the cameras saw."""
-    for camera in capture.cameras.values():
-        where = f"{capture.name}: camera {camera.name}"
-        if not all(np.isfinite(values).all() for values in (camera.K, camera.R, camera.t_m)):
-            raise CaptureError(f"{where}: NaN or infinity in its calibration; calibrate again")
-        if camera.K[0, 0] <= 0 or camera.K[1, 1] <= 0:
-            raise CaptureError(f"{where}: focal length is not positive; calibrate again")
-        if np.abs(camera.R @ camera.R.T - np.eye(3)).max() > ROTATION_TOLERANCE:
-            raise CaptureError(f"{where}: R is not a rotation; write an orthonormal 3x3 matrix")
-        if np.linalg.det(camera.R) < 0:
-            raise CaptureError(f"{where}: R mirrors (det -1); use right-handed axes")
 
 
 def _check_convention(capture: Capture, cameras: Sequence[Camera], keypoints: np.ndarray, found: Measure) -> None:

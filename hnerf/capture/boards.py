@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from hnerf.capture.footage import Footage, ImageFolder, Video
 from hnerf.capture.guarded import (
@@ -28,6 +28,7 @@ from hnerf.capture.guarded import (
     read_toml,
 )
 from hnerf.capture.normalise import Normaliser
+from hnerf.config import validated
 from hnerf.errors import CaptureError
 
 MAX_FRAMES = 200  # of each camera in which the board is looked for, evenly strided
@@ -168,12 +169,7 @@ def read_board(folder: Path) -> Board | None:
         if not charuco.exists():
             return None
         source, table = charuco, _from_caliscope(charuco)
-    try:
-        board = Board.model_validate(table)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        raise CaptureError(f"{source}: board: {where}: {first['msg']}; correct it") from None
+    board = validated(Board, table, f"{source}: board")
     if board.dictionary is None and (board.columns + board.rows) % 2 == 0:
         raise CaptureError(
             f"{source}: a checkerboard of {board.columns} x {board.rows} squares looks the same upside down; "

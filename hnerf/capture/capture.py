@@ -20,6 +20,8 @@ from hnerf.capture.given_poses import GivenPoses
 from hnerf.capture.timing import nearest_frame, resample, usual_step
 from hnerf.errors import CaptureError
 
+JPEG_OPTIONS = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+
 
 @dataclass(frozen=True)
 class Capture:
@@ -161,6 +163,15 @@ def read_rgb(path: Path) -> np.ndarray:
     if bgr is None:
         raise CaptureError(f"{path}: not a readable image; export it again as JPEG or PNG")
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+
+def write_image(path: Path, pixels: np.ndarray) -> None:
+    """An image, grey (H, W) or RGB (H, W, 3), in the format that the name says, in a folder that need not be there yet:
+    JPEG without chroma subsampling. OSError if it cannot be written."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    as_stored = np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels)
+    if not cv2.imwrite(str(path), as_stored, JPEG_OPTIONS if path.suffix == ".jpg" else []):
+        raise OSError(f"{path}: cannot be written; is the disk full?")
 
 
 def _only(folder: Path, stem: str) -> Path:

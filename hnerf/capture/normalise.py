@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 
 from hnerf.capture.camera import Camera
+from hnerf.capture.capture import write_image
 from hnerf.capture.guarded import read_image
 from hnerf.capture.lens import Lens
 from hnerf.errors import CaptureError
 
 MOST_LABELS = 64  # different levels; a mask of more has soft edges
-JPEG_OPTIONS = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
 UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-3)  # OpenCV's own 5 rounds miss by pixels
 
@@ -77,11 +77,11 @@ class Normaliser:
         fifth of a PNG's size.
         """
         self._check_size(rgb, source)
-        target.parent.mkdir(parents=True, exist_ok=True)
         if verbatim and not self.changes_pixels:
+            target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(verbatim, target.with_name(target.name + verbatim.suffix.lower()))
         else:
-            _write(target.with_name(f"{target.name}.jpg"), self.pixels(rgb)[..., ::-1], JPEG_OPTIONS)
+            write_image(target.with_name(f"{target.name}.jpg"), self.pixels(rgb))
 
     def write_plate(self, source: Path, target: Path) -> None:
         """A clean plate, like any image."""
@@ -91,10 +91,10 @@ class Normaliser:
         """A mask (H, W) uint8 from file `source` as 0/255 PNG. The person is anything but black; in a matte, and in a
         JPEG, where edges ring, anything light."""
         self._check_size(recorded, source)
-        target.parent.mkdir(parents=True, exist_ok=True)
         soft = source.suffix.lower() in (".jpg", ".jpeg") or len(np.unique(recorded)) > MOST_LABELS
         black = 127 if soft else 0
-        _write(target, np.where(self.pixels(np.where(recorded > black, 255, 0).astype(np.uint8)) > 127, 255, 0), [])
+        person = self.pixels(np.where(recorded > black, 255, 0).astype(np.uint8)) > 127
+        write_image(target, np.where(person, 255, 0).astype(np.uint8))
 
     def _check_size(self, pixels: np.ndarray, source: Path) -> None:
         height_px, width_px = pixels.shape[:2]
@@ -103,8 +103,3 @@ class Normaliser:
                 f"{source}: is {width_px} x {height_px} px, but camera {self.lens.name} records "
                 f"{self.recorded_size_px[0]} x {self.recorded_size_px[1]}; give all its pictures one size"
             )
-
-
-def _write(path: Path, pixels: np.ndarray, options: list[int]) -> None:
-    if not cv2.imwrite(str(path), np.ascontiguousarray(pixels, dtype=np.uint8), options):
-        raise OSError(f"{path}: cannot be written")

@@ -8,10 +8,11 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from hnerf.capture.guarded import inside, read_toml
 from hnerf.capture.keypoint_sets import KeypointSetName
+from hnerf.config import validated
 from hnerf.errors import CaptureError
 
 log = logging.getLogger("hnerf.capture")
@@ -59,11 +60,7 @@ class Notes(_Table):
 def read_notes(folder: Path) -> Notes:
     """The folder's `capture.toml`, or the defaults without one; CaptureError on a bad key or value."""
     path = inside(folder, "capture.toml")
-    try:
-        return Notes.model_validate(read_toml(path)) if path.exists() else Notes()
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise CaptureError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}; correct it") from None
+    return validated(Notes, read_toml(path), path) if path.exists() else Notes()
 
 
 def capture_name(folder: Path, notes: Notes) -> str:

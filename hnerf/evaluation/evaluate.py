@@ -8,13 +8,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 import trimesh
 
 from hnerf.asset.surface import POSED_CELLS, posed_surface
-from hnerf.capture.capture import Capture, read_rgb
+from hnerf.capture.capture import Capture, read_rgb, write_image
 from hnerf.config import EvaluationSettings
 from hnerf.evaluation import geometry, metrics
 from hnerf.evaluation.ground_truth import GroundTruth
@@ -22,7 +21,6 @@ from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.report import write_report
 from hnerf.evaluation.views import SPLITS, TRAINING_VIEW, View, some_views, split_frames
 from hnerf.render.avatar import Avatar
-from hnerf.render.pictures import write_image
 from hnerf.spread import spread
 
 log = logging.getLogger("hnerf.evaluation")
@@ -82,9 +80,7 @@ def render(avatar: Avatar, capture: Capture, views: list[View], out: Path) -> fl
             rgb = avatar.render(capture.cameras[view.camera], avatar.body.theta[k], avatar.body.root[k]).rgb
             pixels = (rgb.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
         seconds.append(time.perf_counter() - started)
-        path = view.path(out)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_image(path, cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
+        write_image(view.path(out), pixels)
         if time.perf_counter() > next_log:
             log.info("rendered %d of %d images", len(seconds), len(views))
             next_log = time.perf_counter() + LOG_EVERY_S

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from hnerf.asset.surface import posed_surface
 from hnerf.capture.camera import Camera
-from hnerf.capture.capture import read_rgb
+from hnerf.capture.capture import read_rgb, write_image
 from hnerf.capture.footage import Video
 from hnerf.render.avatar import Avatar, Rendering
 
@@ -52,13 +52,6 @@ def write_pictures(avatar: Avatar, shots: Sequence[Shot], what: Sequence[str], f
     for kind in [kind for kind in what if kind != "mesh"]:
         read = partial(read_depth_grey, span_mm=depth_span_mm(out / kind)) if kind == "depth" else read_rgb
         write_video(out / kind, fps, out / f"{kind}.mp4", read)
-
-
-def write_image(path: Path, image: np.ndarray) -> None:
-    """An image as cv2 has it, grey or (H, W, 3) BGR, in the format that the name says. Raises OSError if it cannot be
-    written."""
-    if not cv2.imwrite(str(path), image):
-        raise OSError(f"{path}: cannot be written; is the disk full?")
 
 
 def write_video(folder: Path, fps: float, path: Path, read: Callable[[Path], np.ndarray] = read_rgb) -> None:
@@ -117,7 +110,7 @@ def normal_image(avatar: Avatar, rendering: Rendering, camera: Camera, theta: Te
 
 
 def _images(avatar: Avatar, shot: Shot, what: Sequence[str]) -> dict[str, np.ndarray]:
-    """The asked kinds that are images, as cv2 writes them."""
+    """The asked kinds that are images, grey or RGB."""
     camera, frame = shot
     row = avatar.body.index(frame)
     theta, root = avatar.body.theta[row], avatar.body.root[row]
@@ -125,10 +118,10 @@ def _images(avatar: Avatar, shot: Shot, what: Sequence[str]) -> dict[str, np.nda
         return {}
     seen = avatar.render(camera, theta, root)
     kinds: dict[str, Callable[[], Tensor]] = {
-        "colour": lambda: (255 * seen.rgb).round().to(torch.uint8).flip(-1),
+        "colour": lambda: (255 * seen.rgb).round().to(torch.uint8),
         "mask": lambda: (255 * seen.alpha).round().clamp(0, 255).to(torch.uint8),
         "depth": lambda: depth_image(seen, camera),
-        "normals": lambda: normal_image(avatar, seen, camera, theta, root).flip(-1),
+        "normals": lambda: normal_image(avatar, seen, camera, theta, root),
     }
     return {kind: make().cpu().numpy() for kind, make in kinds.items() if kind in what}
 

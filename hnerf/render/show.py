@@ -10,7 +10,7 @@ import torch
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import pose_vertices
-from hnerf.calibration.check import load_cameras
+from hnerf.calibration.report import load_cameras
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.capture.timing import usual_step

@@ -16,8 +16,6 @@ from hnerf.segmentation.masks import Masks, encode
 from hnerf.segmentation.prior import Prior, body_priors, keypoint_priors
 from hnerf.segmentation.verdicts import Verdict, judge, jumps
 
-__all__ = ["Masks", "segment"]
-
 log = logging.getLogger("hnerf.segmentation")
 
 

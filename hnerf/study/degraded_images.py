@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 
 from hnerf.capture.camera import Camera
-from hnerf.capture.capture import Capture
-from hnerf.capture.normalise import JPEG_OPTIONS
+from hnerf.capture.capture import Capture, write_image
 from hnerf.study.subset import (
     copy_pixels,
     read_keypoints,
@@ -67,14 +66,14 @@ def rewrite(capture: Capture, out: Path, change: PixelChange, change_mask: Pixel
         copy_pixels(capture, kept, name)
     for name in capture.train_cameras:
         for frame in capture.frames:
-            write_pixels(out / "images" / name / f"{frame:06d}.jpg", change(name, capture.image(name, frame)))
+            write_image(out / "images" / name / f"{frame:06d}.jpg", change(name, capture.image(name, frame)))
             mask = capture.given_mask(name, frame)
             if mask is not None:
                 grey = change_mask(name, np.where(mask, 255, 0).astype(np.uint8))
-                write_pixels(out / "masks" / name / f"{frame:06d}.png", np.where(grey > 127, 255, 0).astype(np.uint8))
+                write_image(out / "masks" / name / f"{frame:06d}.png", np.where(grey > 127, 255, 0).astype(np.uint8))
         plate = capture.background(name)
         if plate is not None:
-            write_pixels(out / "background" / f"{name}.jpg", change(name, plate))
+            write_image(out / "background" / f"{name}.jpg", change(name, plate))
     kept.save()
 
 
@@ -93,11 +92,3 @@ def _moved(keypoints: np.ndarray, old: Camera, new: Camera) -> np.ndarray:
 
 def _to_8_bit(rgb: np.ndarray) -> np.ndarray:
     return rgb.round().clip(0, 255).astype(np.uint8)
-
-
-def write_pixels(path: Path, pixels: np.ndarray) -> None:
-    """Grey (H, W), or RGB (H, W, 3); JPEG as at the door."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    options = JPEG_OPTIONS if path.suffix == ".jpg" else []
-    if not cv2.imwrite(str(path), np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels), options):
-        raise OSError(f"{path}: cannot be written")

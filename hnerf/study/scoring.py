@@ -7,19 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
 from hnerf.capture.camera import Camera
-from hnerf.capture.capture import Capture, read_rgb
+from hnerf.capture.capture import Capture, read_rgb, write_image
 from hnerf.errors import CaptureError
 from hnerf.evaluation.evaluate import LPIPS, MEANS, PROTOCOL, mesh_frames, render, score_meshes, score_split
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.pictures import crop, frame_person
 from hnerf.evaluation.views import SPLITS, View, all_views, split_frames
 from hnerf.render.avatar import Avatar
-from hnerf.render.pictures import write_image
 from hnerf.spread import spread
 from hnerf.study.machine import machine
 from hnerf.study.nearness import pose_distances_mm, view_angle_deg
@@ -130,13 +128,12 @@ def score_at(scene: Scene, avatar: Avatar, split: str, images: int | None, meshe
 def write_pictures(scene: Scene, split: str, per_image: list[dict[str, Any]], out: Path) -> list[dict[str, Any]]:
     """Write a few scored renderings and the truth, cut to the person, as `pictures/<k>-{render,truth}.png`; which."""
     chosen = [{key: row[key] for key in ("camera", "frame")} for row in spread(per_image, PICTURES)]
-    (out / "pictures").mkdir()
     for k, row in enumerate(chosen):
         assert scene.truth is not None  # something was scored
         box = frame_person(scene.truth.mask(**row))
         both = {"render": read_rgb(View(split, **row).path(out)), "truth": scene.truth.on_black(**row)[0]}
         for name, picture in both.items():
-            write_image(out / "pictures" / f"{k}-{name}.png", cv2.cvtColor(crop(picture, box), cv2.COLOR_RGB2BGR))
+            write_image(out / "pictures" / f"{k}-{name}.png", crop(picture, box))
     return chosen
 
 

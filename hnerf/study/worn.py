@@ -13,11 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from hnerf.body.fit_result import BodyFit
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.performer.dressed import vertex_normals
 from hnerf.capture.performer.render import Caster, Hits, dome_lights, irradiance, render_person
 from hnerf.evaluation.ground_truth import ON_BLACK, GroundTruth
-from hnerf.study.degraded_images import write_pixels
 from hnerf.study.occluder import UP
 from hnerf.study.subset import copy_files, write_arrays
 
@@ -171,13 +170,13 @@ def _draw(shown: Shown, capture: Capture, truth: GroundTruth, camera: str, frame
         return np.where(person | mask, 255, 0).astype(np.uint8)
 
     file = Path(camera) / f"{frame:06d}.png"
-    write_pixels(out / "images" / file.with_suffix(".jpg"), over(capture.image(camera, frame)))
+    write_image(out / "images" / file.with_suffix(".jpg"), over(capture.image(camera, frame)))
     given = capture.given_mask(camera, frame)
     if given is not None:
-        write_pixels(out / "masks" / file, joined(given))
+        write_image(out / "masks" / file, joined(given))
     if truth.has_mask(camera, frame):
-        write_pixels(out / "ground_truth" / "masks" / file, joined(truth.mask(camera, frame)))
-        write_pixels(out / ON_BLACK / file.with_suffix(".jpg"), over(truth.on_black(camera, frame)[0]))
+        write_image(out / "ground_truth" / "masks" / file, joined(truth.mask(camera, frame)))
+        write_image(out / ON_BLACK / file.with_suffix(".jpg"), over(truth.on_black(camera, frame)[0]))
 
 
 def _phases(frames: int, rng: Rng) -> np.ndarray:

@@ -45,7 +45,7 @@ class Draws:
 
     jitter: Tensor
     beyond: Tensor
-    finer: Tensor | None = None
+    finer: Tensor
     probe: Tensor | None = None
     view: Tensor | None = None
 

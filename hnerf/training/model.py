@@ -31,7 +31,7 @@ from hnerf.training.paper import PaperField
 from hnerf.training.pixels import within_reach
 
 RAYS_AT_ONCE = 16384
-POINTS_AT_ONCE = 262144
+POINTS_AT_ONCE = 1 << 17
 
 
 def build_field(settings: TrainingSettings, body: BodyFit, static: bool) -> Field:

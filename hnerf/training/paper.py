@@ -79,7 +79,6 @@ class PaperField(Field):
         depths = coarse
         with torch.no_grad():
             rough = self._evaluate(bodies, region, origins_m, directions, view, frame, conditions, coarse, draws, None)
-            assert draws.finer is not None
             finer = resample(coarse, near, far, weights_from_alpha(rough.alpha), draws.finer)
             depths = torch.cat([coarse, finer], 1).sort(1).values
         out = self._evaluate(bodies, region, origins_m, directions, view, frame, conditions, depths, draws, correction)

@@ -12,8 +12,8 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.segmentation.edge import shaded_plate
+from hnerf.segmentation.masks import Masks
 from hnerf.segmentation.prior import window_around
-from hnerf.segmentation.segment import Masks
 
 AT_EDGES = 1 / 3  # of the rays: half of the error is there, most of it in hands and feet, which are little else
 LEVELLED_AT_ONCE = 1 << 20  # pixels, which bounds memory

@@ -12,11 +12,11 @@ from pathlib import Path
 import torch.distributed as dist
 
 from hnerf.body.fit_result import BodyFit
-from hnerf.calibration.check import load_cameras
+from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.config import TrainingSettings
 from hnerf.errors import CaptureError, one_line
-from hnerf.segmentation.segment import Masks
+from hnerf.segmentation.masks import Masks
 from hnerf.training.processes import Processes
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import train

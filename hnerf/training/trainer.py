@@ -20,7 +20,7 @@ from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.config import TrainingSettings
-from hnerf.segmentation.segment import Masks
+from hnerf.segmentation.masks import Masks
 from hnerf.training.budget import Scene, decide
 from hnerf.training.checkpoint import load_checkpoint, save_checkpoint
 from hnerf.training.conditions import Conditions, Draws, own_share

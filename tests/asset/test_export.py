@@ -2,8 +2,10 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
-from hnerf.asset.export import canonical_surface, export_asset
+from hnerf.asset.export import export_asset
+from hnerf.asset.surface import surface_in_pose
 from hnerf.config import AssetSettings
 from tests.asset.figure import bending_body, capture
 from tests.asset.stand_in import CLOTHING_M, StandInAvatar
@@ -12,7 +14,8 @@ SMALL = AssetSettings(grid_cells=96, faces=2000, texture_px=128)
 
 
 def test_surface_is_the_grown_body() -> None:
-    surface = canonical_surface(StandInAvatar(bending_body()), SMALL)
+    body = bending_body()
+    surface = surface_in_pose(StandInAvatar(body), torch.zeros_like(body.theta[0]), torch.eye(4), SMALL.grid_cells)
     lower_m, upper_m = surface.bounds
     assert lower_m == pytest.approx([-0.15 - CLOTHING_M, -0.15 - CLOTHING_M, -CLOTHING_M], abs=0.002)
     assert upper_m == pytest.approx([0.15 + CLOTHING_M, 0.15 + CLOTHING_M, 1.6 + CLOTHING_M], abs=0.002)

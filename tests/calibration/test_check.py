@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from hnerf.calibration.check import check_calibration, load_cameras
+from hnerf.calibration.check import check_calibration
 from hnerf.calibration.diagnosis import MISTAKES, body_height_m, cost_without_each_px, unit_of
+from hnerf.calibration.report import load_cameras
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
@@ -184,18 +185,12 @@ def test_swapped_files_fit_no_convention(tmp_path: Path) -> None:
         check_calibration(write_capture(tmp_path, shuffled, detections(cameras, 1)), SETTINGS)
 
 
-@pytest.mark.parametrize(
-    ("mistake", "words"),
-    [
-        (lambda c: dataclasses.replace(c, t_m=np.array([np.nan, 0, 0])), "camera c0: NaN"),
-        (lambda c: dataclasses.replace(c, R=1.1 * c.R), "camera c0: R is not a rotation"),
-        (lambda c: dataclasses.replace(c, R=np.diag([-1, 1, 1]) @ c.R), "camera c0: R mirrors"),
-        (lambda c: dataclasses.replace(ring(4)[1], name=c.name), "c0 and c1 stand at one place"),
-    ],
-)
-def test_impossible_numbers_name_the_camera(tmp_path: Path, mistake: Mistake, words: str) -> None:
-    with pytest.raises(CaptureError, match=words):
-        check_calibration(recorded_with(tmp_path, mistake, only=0), SETTINGS)
+def test_cameras_at_one_place_are_named(tmp_path: Path) -> None:
+    def moved(camera: Camera) -> Camera:
+        return dataclasses.replace(ring(4)[1], name=camera.name)
+
+    with pytest.raises(CaptureError, match="c0 and c1 stand at one place"):
+        check_calibration(recorded_with(tmp_path, moved, only=0), SETTINGS)
 
 
 def test_a_camera_that_never_shows_the_person_is_named(tmp_path: Path) -> None:

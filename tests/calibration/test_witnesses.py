@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from hnerf.calibration.check import check_calibration, load_cameras
+from hnerf.calibration.check import check_calibration
 from hnerf.calibration.diagnosis import measure
 from hnerf.calibration.matches import Matches
+from hnerf.calibration.report import load_cameras
 from hnerf.calibration.sheet import draw_witnesses
 from hnerf.calibration.silhouettes import Outlines
 from hnerf.calibration.triangulation import subject_keypoints

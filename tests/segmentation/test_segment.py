@@ -13,9 +13,9 @@ from hnerf.errors import CaptureError
 from hnerf.segmentation.cut import components_within
 from hnerf.segmentation.difference import difference, levelled, masked_median, noise_level, surroundings
 from hnerf.segmentation.edge import settle_edge
-from hnerf.segmentation.masks import encode, movement_px
+from hnerf.segmentation.masks import Masks, encode, movement_px
 from hnerf.segmentation.prior import Prior
-from hnerf.segmentation.segment import Masks, segment
+from hnerf.segmentation.segment import segment
 from tests.segmentation.scene import only_frames, write_masks, write_scene
 from tests.shared_data import shared_capture
 

@@ -135,7 +135,7 @@ def test_a_picture_that_cannot_be_written_is_an_error(tmp_path: Path, monkeypatc
     capture = write_ball_capture(tmp_path, "ball", ("c",))
     write_ball_truth(capture, RADIUS_M)
     render(BallAvatar(ball_fit()), capture, [View("novel_view", "c", 1)], tmp_path)
-    monkeypatch.setattr("cv2.imwrite", lambda path, image: False)
+    monkeypatch.setattr("cv2.imwrite", lambda *_: False)
     scene, shown = Scene(capture, GroundTruth(tmp_path, capture), "cpu"), [{"camera": "c", "frame": 1}]
     with pytest.raises(OSError, match=r"0-render\.png: cannot be written"):
         write_pictures(scene, "novel_view", shown, tmp_path)

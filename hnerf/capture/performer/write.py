@@ -6,12 +6,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from hnerf.body.anny import anny_rig
 from hnerf.body.rig import Rig, joint_transforms, pose_vertices
 from hnerf.capture.camera import Camera
+from hnerf.capture.capture import write_image
 from hnerf.capture.formats.easymocap import write_easymocap
 from hnerf.capture.lens import pinhole
 from hnerf.capture.performer.detect import detect
@@ -74,7 +74,7 @@ def write_performer(out: Path, settings: PerformerSettings) -> None:
     dressed = Dressed.on(rig, np.random.default_rng(settings.seed))
     views = {camera.name: View.of(camera) for camera in ring_of_cameras(settings.size_px)}
     for name, view in views.items():
-        _write_jpeg(out / "background" / f"{name}.jpg", view.plate)
+        write_image(out / "background" / f"{name}.jpg", _eight_bit(view.plate))
     write_easymocap(out, [pinhole(view.camera) for view in views.values()])
     _write_toml(out, settings)
 
@@ -145,10 +145,12 @@ def _write_view(out: Path, frame: int, view: View, instant: Instant, rng: np.ran
     on_black, coverage, mask = render_person(instant.person, camera)
     photograph = on_black + (1 - coverage[..., None]) * view.shadowed(instant.shadow, instant.ground_m)
     noise = rng.normal(0, SENSOR_NOISE / 255, photograph.shape)
-    _write_jpeg(out / "images" / camera.name / f"{frame:06d}.jpg", photograph + noise)
-    _write(out / "ground_truth" / "masks" / camera.name / f"{frame:06d}.png", np.where(mask, 255, 0), [])
+    write_image(out / "images" / camera.name / f"{frame:06d}.jpg", _eight_bit(photograph + noise))
+    write_image(
+        out / "ground_truth" / "masks" / camera.name / f"{frame:06d}.png", np.where(mask, 255, 0).astype(np.uint8)
+    )
     if camera.name in TEST_CAMERAS:
-        _write_jpeg(out / "ground_truth" / "on_black" / camera.name / f"{frame:06d}.jpg", on_black)
+        write_image(out / "ground_truth" / "on_black" / camera.name / f"{frame:06d}.jpg", _eight_bit(on_black))
     detected = detect(instant.keypoints_m, camera, instant.person.caster, rng)
     path = out / "openpose" / camera.name / f"{frame:06d}_keypoints.json"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -192,13 +194,6 @@ def _write_truth(out: Path, rig: Rig, dressed: Dressed, instants: list[Instant])
     )
 
 
-def _write_jpeg(path: Path, rgb: np.ndarray) -> None:
-    """(H, W, 3) in [0, 1]."""
-    options = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
-    _write(path, (rgb[..., ::-1] * 255).round().clip(0, 255), options)
-
-
-def _write(path: Path, pixels: np.ndarray, options: list[int]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), np.ascontiguousarray(pixels, dtype=np.uint8), options):
-        raise OSError(f"{path}: cannot be written")
+def _eight_bit(rgb: np.ndarray) -> np.ndarray:
+    """From [0, 1]."""
+    return (rgb * 255).round().clip(0, 255).astype(np.uint8)
