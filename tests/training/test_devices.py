@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from hnerf.asset.surface import surface_in_pose
 from hnerf.render.pictures import depth_image, normal_image
 from hnerf.training import trainer as trainer_module
 from hnerf.training.model import load_avatar
@@ -37,4 +38,6 @@ def test_trains_loads_and_renders_on_one_device(tmp_path: Path, monkeypatch: pyt
         shown = avatar.render(camera, theta, root)
         assert shown.rgb.device == device
         assert depth_image(shown, camera).shape == normal_image(avatar, shown, camera, theta, root).shape[:2]
+        if machinery == "fast":  # others have no surface yet
+            assert surface_in_pose(avatar, theta, root, 32).is_watertight
         assert avatar.colour(avatar.body.rig.vertices_m, avatar.body.rig.vertices_m, theta, root).device == device
