@@ -140,7 +140,8 @@ class PosedBodies:
             nearest = nearest_corner(corners, found.barycentric)
             moved = moved - self._displacement(points_m.detach(), frame, nearest, correction)
         y = s + (inverse @ (offset + moved)[..., None])[..., 0]
-        s = s + (inverse @ self._along(posed, found.barycentric, normal, moved)[..., None])[..., 0]
+        if moved.requires_grad:  # nothing else follows: renderings need not ask along what
+            s = s + (inverse @ self._along(posed, found.barycentric, normal, moved)[..., None])[..., 0]
         d = found.sign * distance + (normal * moved).sum(-1)
         return Descriptor(d, s, y, normal, found.face >= 0, corners, found.barycentric)
 

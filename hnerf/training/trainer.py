@@ -353,7 +353,8 @@ def train(
 def _in_words(row: dict[str, Any]) -> str:
     """A row of the history for who waits: losses that are not zero, and PSNR on unseen frames where there is any."""
     told = [f"{name} {value:.2g}" for name, value in row["losses"].items() if value]
-    told += [f"{value['psnr']:.1f} dB on unseen frames" for name, value in row.items() if name == "held_out"]
+    if "held_out" in row:
+        told.append(f"{row['held_out']['psnr']:.1f} dB on unseen frames")
     return ", ".join(told)
 
 
