@@ -28,6 +28,12 @@ def test_the_mild_study_tries_the_two_milder_strengths_of_all() -> None:
     assert mild.degradations == {name: strengths[:2] for name, strengths in full.degradations.items()}
 
 
+def test_the_brief_study_tries_everything_with_what_the_mild_one_trains() -> None:
+    full, mild, brief = load_stability("full"), load_stability("mild"), load_stability("brief")
+    assert brief.degradations == full.degradations
+    assert (brief.methods, brief.overrides) == (mild.methods, mild.overrides)
+
+
 def test_the_quick_study_tries_the_two_milder_strengths_and_says_what_it_left_out() -> None:
     full, quick = load_stability("full"), load_stability("quick")
     assert quick.degradations == {name: full.degradations[name][:2] for name in quick.degradations}
@@ -58,7 +64,7 @@ def test_bad_studies_are_refused_in_one_line(text: str, message: str, tmp_path: 
 
 
 def test_unknown_studies_and_degradations_are_refused() -> None:
-    with pytest.raises(CaptureError, match="slow: no such study or file; studies are full, mild, quick"):
+    with pytest.raises(CaptureError, match="slow: no such study or file; studies are brief, full, mild, quick"):
         load_stability("slow")
     with pytest.raises(CaptureError, match="--only hats: not in this study; it has cameras_left, "):
         load_stability("quick").only(["hats"])
