@@ -1,9 +1,10 @@
-"""A trained field on disk, no larger than what it learned: a grid's nodes that no ray has touched are zero and left
-out, the others are stored in half precision."""
+"""A trained field on disk, no larger than what it learned: grids in 8 bits a feature, deflated, so that nodes that no
+ray has touched, which are zero, take no room."""
 
+import math
+import zlib
 from pathlib import Path
 
-import numpy as np
 import torch
 from safetensors.torch import save
 from torch import Tensor, nn
@@ -11,17 +12,19 @@ from torch import Tensor, nn
 from hnerf.errors import CaptureError
 from hnerf.field.encoding import FeatureGrids
 
-TOUCHED, FEATURES = ".touched", ".features"  # what becomes of a grid: a bit a node, (n, C) of those that are set
+STEP, STEPS = ".step", ".steps"  # what becomes of a grid: a unit, and how many of it each feature is, a node's together
+MOST = 127  # of them
 
 
 def write_field(field: nn.Module, path: Path) -> None:
     """All that the field has learned, as safetensors."""
     tensors = {name: value.detach().cpu().contiguous() for name, value in field.state_dict().items()}
     for name in _grids(field):
-        features = tensors.pop(name)[0].flatten(1).T
-        touched = features.any(1)
-        tensors[name + TOUCHED] = torch.from_numpy(np.packbits(touched.numpy()))
-        tensors[name + FEATURES] = features[touched].half().contiguous()
+        features = tensors.pop(name)[0].movedim(0, -1)
+        step = (features.abs().max() / MOST).clamp(min=torch.finfo(features.dtype).tiny)
+        steps = (features / step).round().to(torch.int8).contiguous()
+        packed = bytearray(zlib.compress(steps.numpy().tobytes()))
+        tensors |= {name + STEP: step, name + STEPS: torch.frombuffer(packed, dtype=torch.uint8)}
     path.write_bytes(save(tensors))  # as its own writer tells a full disk by no OSError
 
 
@@ -30,13 +33,14 @@ def fill_field(field: nn.Module, tensors: dict[str, Tensor], path: Path) -> None
     tensors = dict(tensors)
     try:
         for name in _grids(field):
-            grid = torch.zeros_like(field.get_parameter(name))
-            nodes = grid[0].flatten(1)
-            touched = np.unpackbits(tensors.pop(name + TOUCHED).cpu().numpy(), count=nodes.shape[1]).astype(bool)
-            nodes[:, torch.from_numpy(touched).to(nodes.device)] = tensors.pop(name + FEATURES).float().T
-            tensors[name] = grid
+            _, channels, *nodes = field.get_parameter(name).shape
+            packed, step = (tensors.pop(name + part) for part in (STEPS, STEP))
+            room = channels * math.prod(nodes) + 1  # whatever the file pretends to hold
+            steps = zlib.decompressobj().decompress(packed.cpu().numpy().tobytes(), room)
+            features = torch.frombuffer(bytearray(steps), dtype=torch.int8).view(*nodes, channels).movedim(-1, 0)
+            tensors[name] = features[None].to(step) * step
         field.load_state_dict(tensors)
-    except (KeyError, RuntimeError):
+    except (KeyError, RuntimeError, ValueError, zlib.error):
         raise other_version(path) from None
 
 
