@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from prefect import flow
-from prefect.artifacts import create_markdown_artifact
-from prefect.context import FlowRunContext
 
+from flows.run_page import show
 from flows.train_subject import find_masks
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, Settings, load_settings, with_changes
@@ -65,9 +64,7 @@ def ablate(
         table.parent.mkdir(parents=True, exist_ok=True)
         replace_text(table.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
         replace_text(table, as_markdown(result))
-    if FlowRunContext.get():
-        description = f"What each part of {preset} is worth on {subject}"
-        create_markdown_artifact(table.read_text(), key="ablations", description=description)
+    show(table.read_text(), "ablations", f"What each part of {preset} is worth on {subject}")
     return table
 
 

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from prefect import flow
-from prefect.artifacts import create_markdown_artifact
-from prefect.context import FlowRunContext
 
+from flows.run_page import show
 from flows.train_subject import find_masks
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
@@ -49,15 +48,15 @@ def benchmark(
     shelf = Store(store.resolve())
     source, truth = read_capture(capture, store)
     recorded = Capture.load(ingest(shelf, source, next(iter(settings.values())).capture).root)
-    result = blank(plan, Path(study).stem, recorded)
+    result, table = blank(plan, Path(study).stem, recorded), None
     for title, entry in result["variants"].items():
         variant = plan.variants[title]
         for name in () if "left_out" in entry else variant.methods or plan.methods:
             log.info("%s: %s", title, name)
             entry["methods"][name] = measure(shelf, source, truth, variant, settings[name], plan.scoring)
-            publish(result, shelf.root)  # not before, so that what an earlier call found stands until then
-    table = publish(result, shelf.root)
-    _announce(table)
+            table = publish(result, shelf.root)  # not before, so that what an earlier call found stands until then
+    table = table or publish(result, shelf.root)  # where every variant is left out
+    show(with_pictures(table), "benchmark", f"Speed against accuracy: {table.stem}")
     return table
 
 
@@ -106,10 +105,3 @@ def trained(shelf: Store, recording: Artifact, settings: Settings) -> tuple[Arti
     masks = find_masks(shelf, recording, calibration, settings)
     body = fit(shelf, recording, calibration, masks, settings.fit)
     return calibration, train(shelf, recording, calibration, masks, body, settings.training)
-
-
-def _announce(table: Path) -> None:
-    """The table with its charts on the flow run's page, where there is one."""
-    if FlowRunContext.get():
-        description = f"Speed against accuracy: {table.stem}"
-        create_markdown_artifact(with_pictures(table), key="benchmark", description=description)

@@ -80,17 +80,19 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="hnerf", description="From a folder of calibrated video to an avatar.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    run = commands.add_parser("run", help="train one person and export the avatar")
-    run.add_argument("capture", type=Path, help="the recording's folder")
-    run.add_argument("--preset", default="fast", help="a name under configs/ or a YAML file (default: fast)")
-    run.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
+    capture, preset = (argparse.ArgumentParser(add_help=False) for _ in range(2))
+    capture.add_argument("capture", type=Path, help="the recording's folder")
+    capture.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
+    preset.add_argument("--preset", default="fast", help="a name under configs/ or a YAML file (default: fast)")
+
+    def of_capture(name: str, *more: argparse.ArgumentParser, what: str) -> argparse.ArgumentParser:
+        return commands.add_parser(name, help=what, parents=[capture, *more])
+
+    run = of_capture("run", preset, what="train one person and export the avatar")
     run.add_argument("--set", dest="overrides", action="append", default=[], metavar="a.b=c", help="override a setting")
     run.set_defaults(command=lambda o: _run(o.capture, o.preset, o.store, o.overrides))
 
-    check = commands.add_parser("check", help="read a recording and check its cameras, nothing more")
-    check.add_argument("capture", type=Path, help="the recording's folder")
-    check.add_argument("--preset", default="fast", help="a name under configs/ or a YAML file (default: fast)")
-    check.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
+    check = of_capture("check", preset, what="read a recording and check its cameras, nothing more")
     check.set_defaults(command=lambda o: _check(o.capture, o.preset, o.store))
 
     boards = commands.add_parser("calibrate", help="find the cameras from footage of a calibration board")
@@ -108,17 +110,14 @@ def _parser() -> argparse.ArgumentParser:
     cameras.add_argument("--out", type=Path, default=Path("cameras"), help="the folder to write (default: cameras)")
     cameras.set_defaults(command=lambda o: _cameras(o.folder, o.format, o.out))
 
-    _add_benchmark(commands.add_parser("benchmark", help="compare methods: accuracy against training and frame time"))
+    _add_benchmark(of_capture("benchmark", what="compare methods: accuracy against training and frame time"))
 
-    ablations = commands.add_parser("ablate", help="train without each part of the method in turn: a table")
-    ablations.add_argument("capture", type=Path, help="the recording's folder")
-    ablations.add_argument("--preset", default="fast", help="a name under configs/ or a YAML file (default: fast)")
-    ablations.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
+    ablations = of_capture("ablate", preset, what="train without each part of the method in turn: a table")
     ablations.add_argument("--set", dest="overrides", action="append", default=[], metavar="a.b=c", help="in all rows")
     ablations.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these of configs/ablations/")
-    ablations.set_defaults(command=lambda o: _ablate(o.capture, o.preset, o.store, o.overrides, o.only))
+    ablations.set_defaults(command=lambda o: _show(ablate.fn(o.capture, o.preset, o.store, o.overrides, o.only)))
 
-    _add_stability(commands.add_parser("stability", help="make a capture worse in many ways: what breaks"))
+    _add_stability(of_capture("stability", what="make a capture worse in many ways: what breaks"))
     _add_render(commands.add_parser("render", help="pictures and video of a trained person"))
 
     synth = commands.add_parser("synth", help="write a synthetic capture with ground truth")
@@ -131,7 +130,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_benchmark(command: argparse.ArgumentParser) -> None:
-    command.add_argument("capture", type=Path, help="the recording's folder")
     study = command.add_mutually_exclusive_group()
     study.add_argument(
         "--study", default="dynamic", help="a name under configs/benchmark/ or a YAML file (default: dynamic)"
@@ -139,7 +137,6 @@ def _add_benchmark(command: argparse.ArgumentParser) -> None:
     study.add_argument("--quick", dest="study", action="store_const", const="quick", help="the study for 15 minutes")
     command.add_argument("--methods", metavar="LIST", help="of the study, or presets, instead of all: fast,nerf")
     command.add_argument("--seconds", type=_positive, metavar="S", help="of every training, instead of the study's")
-    command.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
     command.set_defaults(command=_benchmark)
 
 
@@ -160,20 +157,18 @@ def _positive(text: str) -> float:
 def _benchmark(options: argparse.Namespace) -> None:
     methods = options.methods.split(",") if options.methods else None
     table = benchmark.fn(options.capture, options.study, methods, options.seconds, options.store)
-    print(f"{table.read_text()}\ntable: {table}")
+    _show(table)
     if (chart := table.with_suffix(".png")).exists():
         print(f"chart: {chart}")
 
 
 def _add_stability(command: argparse.ArgumentParser) -> None:
-    command.add_argument("capture", type=Path, help="the recording's folder")
     study = command.add_mutually_exclusive_group()
     study.add_argument("--study", default="full", help="a name under configs/stability/ or a YAML file (default: full)")
     study.add_argument("--quick", dest="study", action="store_const", const="quick", help="the study for 15 minutes")
     command.add_argument("--methods", type=lambda names: names.split(","), default=[], metavar="LIST", help="presets")
     command.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these degradations of the study")
-    command.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
-    command.set_defaults(command=lambda o: _stability(o.capture, o.study, o.store, o.methods, o.only))
+    command.set_defaults(command=lambda o: _show(stability.fn(o.capture, o.study, o.store, o.methods, o.only)))
 
 
 def _add_render(render: argparse.ArgumentParser) -> None:
@@ -230,13 +225,7 @@ def _run(capture: Path, preset: str, store: Path, overrides: list[str]) -> None:
     print(f"asset:  {folder / 'asset' / 'avatar.usdz'}")
 
 
-def _ablate(capture: Path, preset: str, store: Path, overrides: list[str], only: list[str]) -> None:
-    table = ablate.fn(capture, preset, store, overrides, only)
-    print(f"{table.read_text()}\ntable: {table}")
-
-
-def _stability(capture: Path, study: str, store: Path, methods: list[str], only: list[str]) -> None:
-    table = stability.fn(capture, study, store, methods, only)
+def _show(table: Path) -> None:
     print(f"{table.read_text()}\ntable: {table}")
 
 

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 from prefect import flow
-from prefect.artifacts import create_markdown_artifact
-from prefect.context import FlowRunContext
 
+from flows.run_page import show
 from flows.train_subject import find_masks
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
@@ -74,9 +73,7 @@ def stability(
             _tell(result, [], table)
     finally:
         _tell(result, _draw(result, table), table)
-    if FlowRunContext.get():
-        description = f"Where methods break on {subject}"
-        create_markdown_artifact(with_pictures(table), key="stability", description=description)
+    show(with_pictures(table), "stability", f"Where methods break on {subject}")
     return table
 
 

@@ -3,9 +3,8 @@
 from pathlib import Path
 
 from prefect import flow
-from prefect.artifacts import create_markdown_artifact
-from prefect.context import FlowRunContext
 
+from flows.run_page import show
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
 from tasks.asset import export
@@ -44,7 +43,7 @@ def train_subject(
     asset = export(shelf, recording, calibration, model, settings.asset)
     for artifact in (recording, calibration, masks, body, model, report, asset):
         shelf.show(subject, artifact)  # again: another run of this name may have come between
-    _announce(subject, report, asset)
+    show(_figures(subject, report, asset), "result", f"What came of {subject}")
     return shelf.subject_folder(subject)
 
 
@@ -62,11 +61,9 @@ def find_masks(shelf: Store, recording: Artifact, calibration: Artifact, setting
     return masks
 
 
-def _announce(subject: str, report: Artifact, asset: Artifact) -> None:
-    """Figures and places on the flow run's page, where there is one."""
-    if not FlowRunContext.get():
-        return
+def _figures(subject: str, report: Artifact, asset: Artifact) -> str:
+    """Figures and places."""
     lines = [f"# {subject}", "", "| figure | value |", "|---|---|"]
     lines += [f"| {name} | {value:.4g} |" for name, value in report.metrics.items()]
     lines += ["", f"Report: `{report.root / 'report.html'}`", f"Asset: `{asset.root / 'avatar.usdz'}`"]
-    create_markdown_artifact("\n".join(lines), key="result", description=f"What came of {subject}")
+    return "\n".join(lines)

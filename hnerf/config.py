@@ -86,8 +86,6 @@ class FastFieldSettings(Section):
     width: int = Field(default=64, ge=1)
     pose_width: int = Field(default=0, ge=0)
     nodes: int = Field(default=0, ge=0)  # of each frame's deformation
-    initial_sharpness_per_m: float = Field(default=100.0, gt=0)
-    gradient_step_m: float = Field(default=0.005, gt=0)
     grid_learning_rate: float = Field(default=5e-2, gt=0)
     network_learning_rate: float = Field(default=1e-2, gt=0)
     deformation_learning_rate: float = Field(default=1e-3, ge=0)  # metres; 0: frames do not deform the body
@@ -97,7 +95,6 @@ class PaperFieldSettings(Section):
     """The paper's machinery; distances inside it are in scene units."""
 
     scene_m: float = Field(default=2.5, gt=0)  # half the scene's edge, the unit of sigma_h and gamma
-    box_margin_m: float = Field(default=0.1, gt=0)
     samples: int = Field(default=256, ge=2)  # coarse, and as many fine
     gamma: float = Field(default=200.0, gt=0)
     learning_rate: float = Field(default=1e-3, gt=0)
@@ -107,7 +104,6 @@ class PaperFieldSettings(Section):
 class NerfSettings(Section):
     """NeRF, a compared method (hnerf/baselines/nerf.py)."""
 
-    box_margin_m: float = Field(default=0.1, gt=0)
     samples: int = Field(default=24, ge=2)  # coarse, and as many fine
     width: int = Field(default=64, ge=2)
     learning_rate: float = Field(default=5e-3, gt=0)
@@ -116,9 +112,7 @@ class NerfSettings(Section):
 class IdrSettings(Section):
     """IDR, a compared method (hnerf/baselines/idr.py)."""
 
-    box_margin_m: float = Field(default=0.1, gt=0)
     samples: int = Field(default=32, ge=3)  # a ray, to find its least distance
-    alpha_per_m: float = Field(default=50.0, gt=0)  # sharpness of the mask loss
     width: int = Field(default=64, ge=2)
     learning_rate: float = Field(default=1e-3, gt=0)
 
@@ -126,11 +120,9 @@ class IdrSettings(Section):
 class NeuralBodySettings(Section):
     """NeuralBody, a compared method (hnerf/baselines/neural_body.py)."""
 
-    box_margin_m: float = Field(default=0.1, gt=0)
     samples: int = Field(default=32, ge=2)
     voxel_m: float = Field(default=0.015, gt=0)
     code_width: int = Field(default=16, ge=1)  # of a vertex
-    appearance_width: int = Field(default=16, ge=1)  # of a frame
     channels: int = Field(default=32, ge=1)
     width: int = Field(default=64, ge=1)
     learning_rate: float = Field(default=5e-3, gt=0)
@@ -139,7 +131,6 @@ class NeuralBodySettings(Section):
 class NerfiesSettings(Section):
     """Nerfies, a compared method (hnerf/baselines/nerfies.py)."""
 
-    box_margin_m: float = Field(default=0.1, gt=0)
     samples: int = Field(default=24, ge=2)  # coarse, and as many fine
     width: int = Field(default=64, ge=2)
     code_width: int = Field(default=8, ge=1)  # of a frame
@@ -182,7 +173,6 @@ class TrainingSettings(Section):
     pose_learning_rate: float = Field(default=5e-4, ge=0)  # 0 keeps the fitted poses and shape
     one_posture: bool | None = None  # in all training frames: only the root moves; None: the scene decides
     absorb_steps: int = Field(default=100, ge=1)  # between exact updates of the posed bodies; also at checkpoints
-    final_learning_rate: float = Field(default=0.1, gt=0, le=1)  # share of the first that is left at the end
     noise: float = Field(default=0.1, ge=0)  # on theta, T and v
     checkpoint_steps: int = Field(default=100, ge=1)
     snapshots_s: tuple[PositiveFloat, ...] = ()  # when the subject is saved as it stands, below `snapshots/`

@@ -1,6 +1,5 @@
 """What all compared methods share: rays are sampled in the person's box, and in its coordinates."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -9,34 +8,12 @@ from torch import Tensor
 from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.render.compositing import alpha_from_density
-from hnerf.render.shell import box_interval
+from hnerf.render.shell import Boxes
 from hnerf.training.conditions import Conditions
 from hnerf.training.field import Field
 
 SURFACE_DENSITY_PER_M = 20.0  # sigma_h of H-NeRF, 50 per scene unit of 2.5 m: where a surface is read off
 BAND_M = 0.01  # bound of the distance that is read off
-
-
-@dataclass(frozen=True)
-class Boxes:
-    """The person's box by body row: lower_m, upper_m (n, 3)."""
-
-    lower_m: Tensor
-    upper_m: Tensor
-
-    @staticmethod
-    def around(vertices_m: Tensor, margin_m: float) -> "Boxes":
-        """The extent of bodies (n, V, 3) and a margin."""
-        return Boxes(vertices_m.amin(1) - margin_m, vertices_m.amax(1) + margin_m)
-
-    def interval(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
-        """Entry and exit depths (R,) of rays (R, 3) in the boxes of body rows (R,); equal where the box is missed."""
-        return box_interval(origins_m, directions, self.lower_m[frame], self.upper_m[frame])
-
-    def signed_distance(self, points_m: Tensor) -> Tensor:
-        """Of points (N, 3) to the first box, (N,) metres, negative inside."""
-        beyond = torch.maximum(self.lower_m[0] - points_m, points_m - self.upper_m[0])
-        return beyond.clamp(min=0).norm(dim=-1) + beyond.amax(-1).clamp(max=0)
 
 
 class BoxField(Field):
@@ -51,10 +28,10 @@ class BoxField(Field):
     centre_m: Tensor
     scale_m: Tensor
 
-    def __init__(self, body: BodyFit, box_margin_m: float, samples: int, learning_rate: float):
+    def __init__(self, body: BodyFit, samples: int, learning_rate: float):
         super().__init__()
-        self.box_margin_m, self.samples, self.learning_rate = box_margin_m, samples, learning_rate
-        boxes = Boxes.around(body.vertices_m(), box_margin_m)
+        self.samples, self.learning_rate = samples, learning_rate
+        boxes = Boxes.around(body.vertices_m(), self.margin_m)
         lower_m, upper_m = boxes.lower_m.amin(0), boxes.upper_m.amax(0)
         self.register_buffer("canonical_m", body.rig.vertices_m.clone())
         self.register_buffer("centre_m", (lower_m + upper_m) / 2)
@@ -62,7 +39,7 @@ class BoxField(Field):
 
     def box(self, bodies: PosedBodies) -> Boxes:
         """The box of each body."""
-        return Boxes.around(bodies.vertices_m, self.box_margin_m)
+        return Boxes.around(bodies.vertices_m, self.margin_m)
 
     def region(self, bodies: PosedBodies, conditions: Conditions) -> Any:
         """The boxes."""

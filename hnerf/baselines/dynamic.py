@@ -15,8 +15,8 @@ class DynamicField(BoxField):
     """Codes start at zero and stay there where a frame is not trained on; a pose that no frame has (Conditions.moment =
     -1) takes zero."""
 
-    def __init__(self, body: BodyFit, box_margin_m: float, samples: int, learning_rate: float, code_width: int):
-        super().__init__(body, box_margin_m, samples, learning_rate)
+    def __init__(self, body: BodyFit, samples: int, learning_rate: float, code_width: int):
+        super().__init__(body, samples, learning_rate)
         self.codes = nn.Parameter(torch.zeros(len(body.frames), code_width))
 
     def code(self, conditions: Conditions) -> Tensor:

@@ -8,14 +8,14 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import Boxes, along
+from hnerf.baselines.box import along
 from hnerf.baselines.static import StaticField
 from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import IdrSettings
 from hnerf.field.encoding import positional_encoding
 from hnerf.field.mlp import SkipMLP
-from hnerf.render.shell import stratified
+from hnerf.render.shell import Boxes, stratified
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.losses import RaySamples
 
@@ -72,10 +72,11 @@ class IdrField(StaticField):
     in the paper: a ray meets the surface or does not.
     """
 
+    gamma = 50.0  # a metre: sharpness of the mask loss
+
     def __init__(self, body: BodyFit, settings: IdrSettings):
-        super().__init__(body, settings.box_margin_m, settings.samples, settings.learning_rate)
-        self.gamma = settings.alpha_per_m
-        boxes = Boxes.around(body.vertices_m(), settings.box_margin_m)
+        super().__init__(body, settings.samples, settings.learning_rate)
+        boxes = Boxes.around(body.vertices_m(), self.margin_m)
         radius = INITIAL_RADIUS * float((boxes.upper_m - boxes.lower_m).min() / 2 / self.scale_m)
         self.geometry = SdfNetwork(settings.width, radius)
         sizes = [6 + 3 * (1 + 2 * VIEW_OCTAVES) + settings.width] + [settings.width] * COLOUR_LAYERS

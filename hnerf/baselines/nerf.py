@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import Boxes, along
+from hnerf.baselines.box import along
 from hnerf.baselines.static import StaticField
 from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.fit_result import BodyFit
@@ -11,7 +11,7 @@ from hnerf.config import NerfSettings
 from hnerf.field.encoding import positional_encoding
 from hnerf.field.mlp import SkipMLP
 from hnerf.render.compositing import weights_from_alpha
-from hnerf.render.shell import stratified
+from hnerf.render.shell import Boxes, stratified
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.losses import RaySamples
 from hnerf.training.paper import resample
@@ -54,7 +54,7 @@ class NerfField(StaticField):
     """
 
     def __init__(self, body: BodyFit, settings: NerfSettings):
-        super().__init__(body, settings.box_margin_m, settings.samples, settings.learning_rate)
+        super().__init__(body, settings.samples, settings.learning_rate)
         self.coarse, self.fine = NerfNetwork(settings.width), NerfNetwork(settings.width)
 
     def sample(

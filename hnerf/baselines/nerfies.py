@@ -6,7 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import Boxes, along
+from hnerf.baselines.box import along
 from hnerf.baselines.dynamic import DynamicField
 from hnerf.baselines.nerf import NerfNetwork
 from hnerf.body.canonical import PoseCorrection, PosedBodies
@@ -16,7 +16,7 @@ from hnerf.config import NerfiesSettings
 from hnerf.field.encoding import positional_encoding
 from hnerf.field.mlp import SkipMLP
 from hnerf.render.compositing import weights_from_alpha
-from hnerf.render.shell import stratified
+from hnerf.render.shell import Boxes, stratified
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.losses import RaySamples
 from hnerf.training.paper import resample
@@ -63,7 +63,7 @@ class NerfiesField(DynamicField):
     steps_taken: Tensor
 
     def __init__(self, body: BodyFit, settings: NerfiesSettings):
-        super().__init__(body, settings.box_margin_m, settings.samples, settings.learning_rate, settings.code_width)
+        super().__init__(body, settings.samples, settings.learning_rate, settings.code_width)
         self.settings = settings
         self.deformation = Deformation(settings.code_width, settings.width)
         self.template = NerfNetwork(settings.width)

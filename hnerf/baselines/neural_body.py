@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import Boxes, along
+from hnerf.baselines.box import along
 from hnerf.baselines.dynamic import DynamicField
 from hnerf.baselines.nerf import DENSITY_GAIN
 from hnerf.baselines.voxels import Voxels
@@ -14,12 +14,13 @@ from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import NeuralBodySettings
 from hnerf.field.encoding import positional_encoding
-from hnerf.render.shell import stratified
+from hnerf.render.shell import Boxes, stratified
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.losses import RaySamples
 
 LEVELS = 5  # the finest takes the codes, the four others are read (section 3.2 of the paper)
 POSITION_OCTAVES, VIEW_OCTAVES = 10, 4
+APPEARANCE_WIDTH = 16  # of a frame's code
 CODE_SPREAD = 0.1  # of the vertices' codes at the start
 
 
@@ -86,9 +87,7 @@ class NeuralBodyField(DynamicField):
     """
 
     def __init__(self, body: BodyFit, settings: NeuralBodySettings):
-        super().__init__(
-            body, settings.box_margin_m, settings.samples, settings.learning_rate, settings.appearance_width
-        )
+        super().__init__(body, settings.samples, settings.learning_rate, APPEARANCE_WIDTH)
         self.settings = settings
         width, features = settings.width, settings.channels * (LEVELS - 1)
         self.vertex_codes = nn.Parameter(CODE_SPREAD * torch.randn(len(body.rig.vertices_m), settings.code_width))
@@ -104,7 +103,7 @@ class NeuralBodyField(DynamicField):
         self.density = nn.Linear(width, 1)
         encoded = 3 * (2 + 2 * (POSITION_OCTAVES + VIEW_OCTAVES))
         self.radiance = nn.Sequential(
-            nn.Linear(width + settings.appearance_width + encoded, width), nn.SiLU(), nn.Linear(width, 3), nn.Sigmoid()
+            nn.Linear(width + APPEARANCE_WIDTH + encoded, width), nn.SiLU(), nn.Linear(width, 3), nn.Sigmoid()
         )
 
     def region(self, bodies: PosedBodies, conditions: Conditions) -> Surroundings:

@@ -135,6 +135,28 @@ def _greatest_nearby(size: np.ndarray, at: tuple[np.ndarray, ...], values: np.nd
     return ndimage.maximum_filter(greatest, 3)
 
 
+@dataclass(frozen=True)
+class Boxes:
+    """The person's box by body row: lower_m, upper_m (n, 3)."""
+
+    lower_m: Tensor
+    upper_m: Tensor
+
+    @staticmethod
+    def around(vertices_m: Tensor, margin_m: float) -> "Boxes":
+        """The extent of bodies (n, V, 3) and a margin."""
+        return Boxes(vertices_m.amin(1) - margin_m, vertices_m.amax(1) + margin_m)
+
+    def interval(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
+        """Entry and exit depths (R,) of rays (R, 3) in the boxes of body rows (R,); equal where the box is missed."""
+        return box_interval(origins_m, directions, self.lower_m[frame], self.upper_m[frame])
+
+    def signed_distance(self, points_m: Tensor) -> Tensor:
+        """Of points (N, 3) to the first box, (N,) metres, negative inside."""
+        beyond = torch.maximum(self.lower_m[0] - points_m, points_m - self.upper_m[0])
+        return beyond.clamp(min=0).norm(dim=-1) + beyond.amax(-1).clamp(max=0)
+
+
 def box_interval(origins_m: Tensor, directions: Tensor, lower_m: Tensor, upper_m: Tensor) -> tuple[Tensor, Tensor]:
     """Entry and exit depths (R,) of rays in axis-aligned boxes (R, 3); equal where the box is missed (slab method)."""
     inverse = 1 / torch.where(directions.abs() < 1e-9, torch.full_like(directions, 1e-9), directions)

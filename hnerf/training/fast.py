@@ -17,7 +17,10 @@ from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.field import Field
 from hnerf.training.losses import RaySamples
 
+INITIAL_SHARPNESS_PER_M = 100.0  # of the logistic that makes opacity of distance
+GRADIENT_STEP_M = 0.005
 SETTLED = 5.0  # where the logistic of density is 1 or 0 within 1 %
+GRID_ROOM_M = 0.01  # between shell and the end of the grids
 ROOM_M = 0.012  # for what the surface still moves, and what poses that were not asked about do to it
 TIGHTEN_STEP_M = 0.004
 ELASTIC_M = 0.01  # a displacement whose elastic energy is 1
@@ -48,10 +51,10 @@ class FastField(Field):
         corners, weights = lattice(rig.vertices_m, rig.faces, settings.shell_cell_m)
         self.register_buffer("corners", corners, persistent=False)
         self.register_buffer("weights", weights, persistent=False)
-        margin_m = settings.outer_m + 0.01
+        beyond_m = settings.outer_m + GRID_ROOM_M
         self.field = CanonicalField(
-            rig.vertices_m.amin(0) - margin_m,
-            rig.vertices_m.amax(0) + margin_m,
+            rig.vertices_m.amin(0) - beyond_m,
+            rig.vertices_m.amax(0) + beyond_m,
             settings.geometry_cells,
             settings.colour_cells,
             settings.channels,
@@ -63,7 +66,7 @@ class FastField(Field):
         self.deformation = (
             FrameDeformation(rig.vertices_m, rig.faces, settings.nodes, frames) if settings.nodes else None
         )
-        self.log_sharpness = nn.Parameter(torch.tensor(settings.initial_sharpness_per_m).log())
+        self.log_sharpness = nn.Parameter(torch.tensor(INITIAL_SHARPNESS_PER_M).log())
 
     @property
     def reach_m(self) -> float:
@@ -205,15 +208,14 @@ class FastField(Field):
         where outwards is. Gradients flow to the field alone."""
         pick = torch.arange(len(probe), device=probe.device) * samples + (probe * samples).long()
         pick = pick[described.near[pick]]
-        step_m = self.settings.gradient_step_m
         y, d = described.y[pick].detach(), described.d[pick].detach()
         away = (skin.y - skin.s)[pick].detach() * skin.d[pick].detach().sign()[:, None]
         outward = nn.functional.normalize(away, dim=-1)
         axes = torch.cat([y.new_zeros(1, 3), torch.eye(3, device=y.device)])  # here, and a step along each axis
-        d = d + step_m * axes @ outward.T
-        y = y + step_m * axes[:, None]
+        d = d + GRADIENT_STEP_M * axes @ outward.T
+        y = y + GRADIENT_STEP_M * axes[:, None]
         found = self.field.residual(y.flatten(0, 1), d.flatten(), pose[pick].repeat(len(axes), 1)).view_as(d)
-        return (outward + (found[1:] - found[0]).T / step_m).norm(dim=-1)
+        return (outward + (found[1:] - found[0]).T / GRADIENT_STEP_M).norm(dim=-1)
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """d_hat (N,) at points (N, 3) around the first body; beyond reach the body's own distance stands alone."""

@@ -5,8 +5,6 @@ coarse and the fine samples; the fine ones are drawn from the coarse weights wit
 both.
 """
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
@@ -15,22 +13,12 @@ from hnerf.body.rig import Rig
 from hnerf.config import PaperFieldSettings
 from hnerf.field.mlp import RadianceMLP, ResidualMLP
 from hnerf.render.compositing import alpha_from_density, occupancy, weights_from_alpha
-from hnerf.render.shell import box_interval, stratified
+from hnerf.render.shell import Boxes, box_interval, stratified
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.field import Field
 from hnerf.training.losses import RaySamples
 
 OUTSIDE_DISTANCE = 1.0  # the constant d of a point outside the person's box
-
-
-@dataclass(frozen=True)
-class Boxes:
-    """The person's box by row (n, 3) each, and the scene's own box (3,): metres."""
-
-    lower_m: Tensor
-    upper_m: Tensor
-    scene_lower_m: Tensor
-    scene_upper_m: Tensor
 
 
 class PaperField(Field):
@@ -53,9 +41,7 @@ class PaperField(Field):
 
     def region(self, bodies: PosedBodies, conditions: Conditions) -> Boxes:
         """Box B of each pose: the body's extent and a margin."""
-        margin, half = self.settings.box_margin_m, self.settings.scene_m
-        lower, upper = bodies.vertices_m.amin(1) - margin, bodies.vertices_m.amax(1) + margin
-        return Boxes(lower, upper, self.centre_m - half, self.centre_m + half)
+        return Boxes.around(bodies.vertices_m, self.margin_m)
 
     def parameter_groups(self) -> list[dict]:
         """Adam groups."""
@@ -73,7 +59,8 @@ class PaperField(Field):
         correction: PoseCorrection | None = None,
     ) -> tuple[RaySamples, Tensor]:
         """As FastField.sample, over coarse and fine samples together (K = 2 x samples)."""
-        near, far = box_interval(origins_m, directions, region.scene_lower_m, region.scene_upper_m)
+        half_m = self.settings.scene_m
+        near, far = box_interval(origins_m, directions, self.centre_m - half_m, self.centre_m + half_m)
         coarse = stratified(near, far, draws.jitter)
         view = directions if draws.view is None else directions + draws.view
         depths = coarse

@@ -35,6 +35,7 @@ from hnerf.training.step import Objective, Stage, TrainingError, not_finite
 logger = logging.getLogger("hnerf.training")
 
 WARM_UP_STEPS = 20
+FINAL_LEARNING_RATE = 0.1  # share of the first that is left at the end
 SKIPS_ALLOWED = 2  # in a row; one more non-finite step stops the run
 HELD_OUT_RAYS = 2048
 LEAST_COVERAGE = 0.1  # of the person's pixels; below it the surface has collapsed
@@ -217,7 +218,7 @@ class Trainer:
 
     def _set_rates(self) -> None:
         phase_step = self.step if self.step < self.field_steps else self.step - self.field_steps
-        factor = self.settings.final_learning_rate ** self._done() * min(1.0, (phase_step + 1) / WARM_UP_STEPS)
+        factor = FINAL_LEARNING_RATE ** self._done() * min(1.0, (phase_step + 1) / WARM_UP_STEPS)
         for group, rate in zip(self.optimizer.param_groups, self.first_rates, strict=True):
             group["lr"] = rate * factor
 

@@ -6,11 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from hnerf.baselines.box import BAND_M, SURFACE_DENSITY_PER_M, Boxes
+from hnerf.baselines.box import BAND_M, SURFACE_DENSITY_PER_M
 from hnerf.baselines.nerf import NerfField
 from hnerf.body.canonical import PosedBodies
 from hnerf.config import load_settings
 from hnerf.errors import CaptureError
+from hnerf.render.shell import Boxes
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.losses import RaySamples, Target, blend, reconstruction
 from hnerf.training.model import build_field
@@ -36,10 +37,14 @@ class Fog(torch.nn.Module):
         return torch.full_like(point[..., 0], self.said[0]), torch.full_like(point, self.said[1])
 
 
+class Roomy(NerfField):
+    margin_m = 0.5
+
+
 @pytest.fixture
 def fog() -> NerfField:
     """The unit box with 0.5 m around it, whose half edge is 1 m; a thin dark coarse fog and a dense bright fine one."""
-    field = NerfField(body(), load_settings("nerf", ["training.nerf.box_margin_m=0.5"]).training.nerf)
+    field = Roomy(body(), load_settings("nerf").training.nerf)
     field.coarse, field.fine = Fog(0.5, 0.25), Fog(2.0, 0.75)
     return field
 

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from flows import ablations as module
+from flows import run_page
 from flows.ablations import ablate, as_markdown, choose
 from flows.cli import main
 from hnerf.config import TrainingSettings, load_settings
@@ -161,8 +162,8 @@ def test_the_flow_runs_page_shows_the_table(
     stages: list[TrainingSettings], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown: list[str] = []
-    monkeypatch.setattr(module.FlowRunContext, "get", lambda: True)
-    monkeypatch.setattr(module, "create_markdown_artifact", lambda text, **_: shown.append(text))
+    monkeypatch.setattr(run_page.FlowRunContext, "get", lambda: True)
+    monkeypatch.setattr(run_page, "create_markdown_artifact", lambda text, **_: shown.append(text))
     table = ablate.fn(tmp_path, store=tmp_path / "store", only=["no-opt"])
     assert shown == [table.read_text()]
 

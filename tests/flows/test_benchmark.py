@@ -1,5 +1,6 @@
 """The flow with stages that cost nothing, and its own stage's place in the store."""
 
+import base64
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,12 +9,13 @@ from typing import Any
 import pytest
 
 from flows import benchmark as module
+from flows import run_page
 from flows.benchmark import benchmark
 from flows.cli import main
 from hnerf.config import TrainingSettings
 from hnerf.errors import CaptureError
 from hnerf.study import publish as publish_module
-from hnerf.study.files import picture
+from hnerf.study.files import picture, with_pictures
 from hnerf.study.plan import ScoringSettings
 from tasks import benchmark as tasks_module
 from tasks.launcher import LostWorkerError
@@ -155,14 +157,24 @@ def test_bad_names_end_with_one_line(stages: Stages, tmp_path: Path, capsys: pyt
     assert stages == []
 
 
-def test_the_flow_runs_page_shows_the_charts_themselves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("stages")
+def test_the_flow_runs_page_shows_the_charts_themselves(
+    study: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shown: list[str] = []
-    monkeypatch.setattr(module.FlowRunContext, "get", lambda: True)
-    monkeypatch.setattr(module, "create_markdown_artifact", lambda text, **_: shown.append(text))
+    monkeypatch.setattr(run_page.FlowRunContext, "get", lambda: True)
+    monkeypatch.setattr(run_page, "create_markdown_artifact", lambda text, **_: shown.append(text))
+    table = benchmark.fn(tmp_path, study, ["demo"], store=tmp_path / "store")
+    chart = base64.b64encode(table.with_suffix(".png").read_bytes()).decode()
+    (text,) = shown
+    assert f"![ada-toys.png](data:image/png;base64,{chart})" in text
+
+
+def test_charts_are_found_whatever_the_captures_name(tmp_path: Path) -> None:
     (tmp_path / "Ada (2) b-toys.png").write_bytes(b"chart")
     (tmp_path / "Ada (2) b-toys.md").write_text(f"# Toys\n\n{picture('Ada (2) b-toys.png')}\n")
-    module._announce(tmp_path / "Ada (2) b-toys.md")
-    assert shown == ["# Toys\n\n![Ada (2) b-toys.png](data:image/png;base64,Y2hhcnQ=)\n"]
+    shown = with_pictures(tmp_path / "Ada (2) b-toys.md")
+    assert shown == "# Toys\n\n![Ada (2) b-toys.png](data:image/png;base64,Y2hhcnQ=)\n"
 
 
 def test_scores_are_found_again_until_what_is_scored_or_how_changes(

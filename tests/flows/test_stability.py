@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from flows import run_page
 from flows import stability as module
 from flows.cli import main
 from flows.stability import stability
@@ -140,8 +141,8 @@ def test_the_flow_runs_page_shows_the_charts_themselves(
     stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown: list[str] = []
-    monkeypatch.setattr(module.FlowRunContext, "get", lambda: True)
-    monkeypatch.setattr(module, "create_markdown_artifact", lambda text, **_: shown.append(text))
+    monkeypatch.setattr(run_page.FlowRunContext, "get", lambda: True)
+    monkeypatch.setattr(run_page, "create_markdown_artifact", lambda text, **_: shown.append(text))
     study(tmp_path, only=["pose_noise"])
     chart = (tmp_path / "store" / "stability" / "ada-mine-matrix.png").read_bytes()
     (text,) = shown
