@@ -156,6 +156,9 @@ class LossSettings(Section):
     density_steepness: float = Field(default=0.1, gt=0)  # lambda; docs/method.md says why
 
 
+H_NERF = ("fast", "paper")  # machineries; the others are compared methods
+
+
 class TrainingSettings(Section):
     machinery: Literal["fast", "paper", "nerf", "idr", "neural_body", "nerfies"] = "fast"
     fast: FastFieldSettings = FastFieldSettings()
@@ -181,7 +184,7 @@ class TrainingSettings(Section):
 
     @model_validator(mode="after")
     def _only_h_nerf_tunes_poses(self) -> Self:
-        if self.pose_learning_rate and self.machinery not in ("fast", "paper"):
+        if self.pose_learning_rate and self.machinery not in H_NERF:
             raise ValueError(f"{self.machinery} does not tune poses: set pose_learning_rate to 0")
         return self
 

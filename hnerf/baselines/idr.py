@@ -24,6 +24,7 @@ POSITION_OCTAVES, VIEW_OCTAVES = 6, 4
 SOFTPLUS_SHARPNESS = 100.0
 INITIAL_RADIUS = 0.75  # of the first sphere, over half the box's shortest side
 TRACE_STEPS, SECANT_STEPS = 10, 8
+DEEP = 10.0  # over the sharpness: the distance inside that the mask loss takes for certain
 CONVERGED_M = 1e-4
 LEAST_SLOPE = 0.05  # of the distance along a ray that meets its surface; keeps grazing rays' gradients finite
 
@@ -63,13 +64,13 @@ class IdrField(StaticField):
 
     `sample` gives one sample a ray (K = 1): the point of the surface, with alpha 1 where the ray meets it and 0 where
     it does not, coloured by the rendering network on (x, n, v, z). Its distance `d` is not the one at that point (it is
-    0) but the least along the ray, which is what the mask loss asks for. So IDR's masked colour loss is `mask`, its
-    mask loss is `segmentation`, and its eikonal loss, at points drawn in the box, `eikonal`.
+    0) but the least along the ray, which is what the mask loss asks for, or where the ray meets the surface one deep
+    inside, with its slope: the loss then asks nothing of rays that rightly meet it, all of others. So IDR's masked
+    colour loss is `mask`, its mask loss is `segmentation`, and its eikonal loss, at points drawn in the box, `eikonal`.
 
-    Simplified: the mask loss is also asked of rays that rightly meet the surface, where it is flat, with one sharpness
-    instead of five that grow; no bidirectional tracing, the samples of the mask loss say whether tracing overshot;
-    smaller networks without weight normalisation (512 wide there); no camera is learned. Renders have hard outlines, as
-    in the paper: a ray meets the surface or does not.
+    Simplified: the mask loss has one sharpness instead of five that grow; no bidirectional tracing, the samples of the
+    mask loss say whether tracing overshot; smaller networks without weight normalisation (512 wide there); no camera is
+    learned. Renders have hard outlines, as in the paper: a ray meets the surface or does not.
     """
 
     gamma = 50.0  # a metre: sharpness of the mask loss
@@ -103,6 +104,7 @@ class IdrField(StaticField):
             least, at = distances.min(1)
             nearest = torch.where(hit & (least > 0), met, tried.gather(1, at[:, None])[:, 0])
         d = self.distance(along(origins_m, directions, nearest))[:, None]
+        d = torch.where(hit[:, None], d - d.detach() - DEEP / self.gamma, d)
         pick = torch.nonzero(hit)[:, 0]
         seen = self._surface_colour(origins_m[pick], directions[pick], met[pick])
         norms = d.new_zeros(0)

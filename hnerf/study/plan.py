@@ -6,11 +6,12 @@ from typing import Literal
 from pydantic import Field, PositiveInt
 
 from hnerf.capture.capture import Capture
-from hnerf.config import CONFIGS, Section, Settings, load_settings, named_file, read_yaml, validated
+from hnerf.config import CONFIGS, H_NERF, Section, Settings, load_settings, named_file, read_yaml, validated
 from hnerf.errors import CaptureError
 from hnerf.spread import spread
 
 STUDIES = CONFIGS / "benchmark"
+UNTIL_TIME_IS_UP = 1_000_000  # steps
 FIRST_SNAPSHOT_S = 15.0  # where a training has no limit that could be halved
 
 
@@ -63,9 +64,12 @@ class Study(Section):
     scoring: ScoringSettings = ScoringSettings()
 
     def settings(self, method: str) -> Settings:
-        """All stages' settings; training stops after `seconds` and is saved on the way."""
+        """All stages' settings; training stops after `seconds` and is saved on the way. Steps that are written down end
+        H-NeRF alone: they are how long it needs, but what a compared method can do in its time is the question."""
         settings = load_settings(method)
         training = {"seconds": self.seconds, "snapshots_s": snapshot_times_s(self.seconds, self.snapshots)}
+        if self.seconds and settings.training.machinery not in H_NERF:
+            training["steps"] = UNTIL_TIME_IS_UP
         return settings.model_copy(update={"training": settings.training.model_copy(update=training)})
 
     def narrowed(self, names: Sequence[str], seconds: float | None) -> "Study":

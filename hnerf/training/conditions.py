@@ -71,6 +71,9 @@ class Draws:
 
 
 def own_share(batch: Batch, rank: int, world_size: int) -> Batch:
-    """This rank's rays of a joint batch: a dataclass whose tensors all have the rays first."""
+    """This rank's rays of a joint batch, a dataclass whose tensors all have the rays first: those that follow each
+    other, so that a share has few frames."""
     own = {f.name: getattr(batch, f.name) for f in dataclasses.fields(batch)}
-    return dataclasses.replace(batch, **{k: v if v is None else v[rank::world_size] for k, v in own.items()})
+    return dataclasses.replace(
+        batch, **{k: v if v is None else v.tensor_split(world_size)[rank] for k, v in own.items()}
+    )

@@ -2,12 +2,14 @@
 
 import dataclasses
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hnerf.body.canonical import FAR_M, Descriptor, PoseCorrection, PosedBodies
 from hnerf.body.descriptor import vertex_normals
 from hnerf.body.rig import Rig
+from hnerf.capture.camera import Camera
 from hnerf.config import FastFieldSettings
 from hnerf.field.canonical import CanonicalField
 from hnerf.field.deformation import FrameDeformation
@@ -16,6 +18,7 @@ from hnerf.render.shell import ShellGrid, lattice
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.field import Field
 from hnerf.training.losses import RaySamples
+from hnerf.training.pixels import within_reach
 
 INITIAL_SHARPNESS_PER_M = 100.0  # of the logistic that makes opacity of distance
 GRADIENT_STEP_M = 0.005
@@ -44,7 +47,7 @@ class FastField(Field):
         """frames: rows of the fit that the field is trained with."""
         super().__init__()
         self.settings = settings
-        self.samples, self.margin_m = settings.samples, settings.outer_m + settings.shell_cell_m
+        self.samples = settings.samples
         self.register_buffer("canonical_m", rig.vertices_m.clone())
         for name in ("outer_m", "inner_m"):
             self.register_buffer(name, torch.full((len(rig.vertices_m),), getattr(settings, name)))
@@ -72,6 +75,10 @@ class FastField(Field):
     def reach_m(self) -> float:
         """How far from the body a sample can lie: the shell and the slack of its cells."""
         return max(self.settings.outer_m, self.settings.inner_m) + 2 * self.settings.shell_cell_m
+
+    def reached(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
+        """Pixels whose rays pass through the shell."""
+        return within_reach(camera, vertices_m, self.settings.outer_m + self.settings.shell_cell_m)
 
     def region(self, bodies: PosedBodies, conditions: Conditions) -> ShellGrid:
         """Where rays are sampled: the shell around bodies as they stand now, where their frames displace it to."""

@@ -3,14 +3,17 @@
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.rig import Rig
+from hnerf.capture.camera import Camera
 from hnerf.render.compositing import composite, weights_from_alpha
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.losses import RaySamples
+from hnerf.training.pixels import within_box
 
 
 class Field(nn.Module, ABC):
@@ -18,8 +21,8 @@ class Field(nn.Module, ABC):
 
     canonical_m (V, 3): the rig's canonical vertices, saved with the field; samples: random numbers that a ray needs;
     gamma: how sharp the outline of the distances that `sample` returns is, a unit of them; margin_m: how far around the
-    body anything can be seen; own_background: whether the field models the photograph's surroundings, or is composited
-    over the clean plate.
+    body's extent anything can be seen; own_background: whether the field models the photograph's surroundings, or is
+    composited over the clean plate.
     """
 
     own_background: ClassVar[bool] = False
@@ -34,6 +37,10 @@ class Field(nn.Module, ABC):
 
     def tighten(self, rig: Rig, pose: Tensor) -> None:
         """Make that region no larger than what can be seen in some poses (n, P)."""
+
+    def reached(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
+        """(H, W) bool: pixels that can show anything where the body's vertices are (V, 3)."""
+        return within_box(camera, vertices_m, self.margin_m)
 
     @abstractmethod
     def parameter_groups(self) -> list[dict[str, Any]]:

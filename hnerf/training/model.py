@@ -28,7 +28,6 @@ from hnerf.training.fast import FastField
 from hnerf.training.field import Field
 from hnerf.training.model_file import fill_field, other_version
 from hnerf.training.paper import PaperField
-from hnerf.training.pixels import within_reach
 
 RAYS_AT_ONCE = 16384
 POINTS_AT_ONCE = 1 << 17
@@ -68,7 +67,7 @@ class TrainedAvatar:
         bodies, conditions = self._pose(theta, root)
         region: Any = self.field.region(bodies, conditions)
         device = bodies.vertices_m.device
-        y, x = np.nonzero(within_reach(camera, bodies.vertices_m[0].cpu().numpy(), self.field.margin_m))
+        y, x = np.nonzero(self.field.reached(camera, bodies.vertices_m[0].cpu().numpy()))
         origins, directions = camera.rays(np.stack([x, y], 1).astype(np.float64))
         flat = torch.zeros(camera.height_px * camera.width_px, 5, device=device)
         index = torch.from_numpy(y * camera.width_px + x).to(device)

@@ -1,6 +1,8 @@
 """Every training pixel that the person can reach, on the device, ready to be drawn as rays."""
 
 import dataclasses
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -18,7 +20,11 @@ from hnerf.segmentation.prior import window_around
 AT_EDGES = 1 / 3  # of the rays: half of the error is there, most of it in hands and feet, which are little else
 LEVELLED_AT_ONCE = 1 << 20  # pixels, which bounds memory
 NEAREST_PERCENT = 1  # of the vertices: a finger alone does not widen the reach of all others
+FARTHEST_PX = 1e5  # from the image's corner: more is not asked of what fills polygons
 EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel may mix person and surroundings
+
+Reached = Callable[[Camera, np.ndarray], np.ndarray]
+"""Which pixels (H, W) of a camera can show anything of a body with vertices (V, 3)."""
 
 
 @dataclass(frozen=True)
@@ -90,10 +96,10 @@ class Pixels:
 
 
 def gather_pixels(
-    capture: Capture, masks: Masks, body: BodyFit, frames: tuple[int, ...], reach_m: float, device: torch.device
+    capture: Capture, masks: Masks, body: BodyFit, frames: tuple[int, ...], reached: Reached, device: torch.device
 ) -> Pixels:
-    """Pixels of the training cameras in `frames` within reach of the fitted body, or on the mask; none where the mask
-    was dropped."""
+    """Pixels of the training cameras in `frames` that are reached from the fitted body, or on the mask; none where the
+    mask was dropped."""
     names = capture.train_cameras
     cameras = [capture.cameras[name] for name in names]
     plates = [capture.background(name) for name in names]
@@ -107,7 +113,7 @@ def gather_pixels(
             if (camera.name, frame) not in masks:
                 continue
             mask = masks.get(camera.name, frame)
-            wanted = within_reach(camera, vertices_m[body.index(frame)], reach_m) | mask
+            wanted = reached(camera, vertices_m[body.index(frame)]) | mask
             y, x = np.nonzero(wanted)
             columns["camera"].append(np.full(len(x), c, np.uint8))
             columns["xy_px"].append(np.stack([x, y], 1).astype(np.int16))
@@ -142,12 +148,27 @@ def _within(starts: Tensor, rows: Tensor, unit: Tensor) -> Tensor:
     return first + (unit * (after - first)).long()
 
 
+def everywhere(camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
+    """(H, W) bool: all pixels."""
+    return np.ones((camera.height_px, camera.width_px), bool)
+
+
+def within_box(camera: Camera, vertices_m: np.ndarray, margin_m: float) -> np.ndarray:
+    """(H, W) bool: pixels whose rays meet the extent of the body (V, 3) and a margin; all where that lies about the
+    camera."""
+    lower_m, upper_m = vertices_m.min(0) - margin_m, vertices_m.max(0) + margin_m
+    corners_px, depth_m = camera.project(np.array(list(itertools.product(*zip(lower_m, upper_m, strict=True)))))
+    if depth_m.min() <= 0:
+        return everywhere(camera, vertices_m)
+    met = np.zeros((camera.height_px, camera.width_px), np.uint8)
+    outline = cv2.convexHull(corners_px.clip(-FARTHEST_PX, FARTHEST_PX).round().astype(np.int32))
+    return cv2.fillConvexPoly(met, outline, 1) > 0
+
+
 def within_reach(camera: Camera, vertices_m: np.ndarray, reach_m: float) -> np.ndarray:
     """(H, W) bool: pixels whose rays pass within about `reach_m` of the body; its vertices before the camera, in the
     image or beside it, each a disc of the radius that the nearest ones need."""
     size_px = np.array([camera.width_px, camera.height_px])
-    if np.isinf(reach_m):
-        return np.ones(size_px[::-1], bool)
     xy, depth_m = camera.project(vertices_m)
     xy, depth_m = xy[depth_m > 0], depth_m[depth_m > 0]
     if not len(depth_m):

@@ -4,7 +4,6 @@ deformations, against the finished field."""
 import dataclasses
 import json
 import logging
-import math
 import resource
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -28,7 +27,7 @@ from hnerf.training.exposure import camera_gains
 from hnerf.training.losses import RaySamples, pixel
 from hnerf.training.model import build_field
 from hnerf.training.model_file import write_field
-from hnerf.training.pixels import AT_EDGES, Pixels, Rays, gather_pixels
+from hnerf.training.pixels import AT_EDGES, Pixels, Rays, everywhere, gather_pixels
 from hnerf.training.processes import Processes
 from hnerf.training.step import Objective, Stage, TrainingError, not_finite
 
@@ -66,8 +65,8 @@ class Trainer:
         self.optimizer = torch.optim.Adam(self._parameter_groups(), betas=(0.9, 0.99), eps=1e-12, fused=True)
         self.first_rates = [group["lr"] for group in self.optimizer.param_groups]
         logger.info("gathering pixels")
-        reach_m = math.inf if self.field.own_background else self.field.margin_m
-        self.pixels: Pixels = gather_pixels(capture, masks, body, body.frames, reach_m, device)
+        reached = everywhere if self.field.own_background else self.field.reached
+        self.pixels: Pixels = gather_pixels(capture, masks, body, body.frames, reached, device)
         self.gains, self.decisions["gains"] = camera_gains(capture, masks, body)
         if self.gains:
             by_camera = [self.gains[name] for name in capture.train_cameras]

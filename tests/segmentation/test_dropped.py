@@ -6,7 +6,7 @@ import torch
 
 from hnerf.body.fit import _outlines, _silhouette_iou
 from hnerf.segmentation.masks import Masks, encode
-from hnerf.training.pixels import gather_pixels
+from hnerf.training.pixels import everywhere, gather_pixels
 from tests.training.scene import record
 
 
@@ -24,7 +24,8 @@ def test_fit_and_training_do_without(tmp_path: Path) -> None:
     assert iou == [1.0, None, 1.0]
 
     pixels, all_pixels = (
-        gather_pixels(capture, m, body, capture.frames, 0.1, torch.device("cpu")) for m in (masks, Masks(whole, {}))
+        gather_pixels(capture, m, body, capture.frames, everywhere, torch.device("cpu"))
+        for m in (masks, Masks(whole, {}))
     )
     count, all_count = pixels.starts.diff().tolist(), all_pixels.starts.diff().tolist()
     assert count[1] == 0 and count[2] == all_count[2]

@@ -13,7 +13,7 @@ import trimesh
 from hnerf.evaluation.mesh_queries import Surface
 from hnerf.training.exposure import _in_sight, camera_gains, solve_gains
 from hnerf.training.model import TrainedAvatar, build_field
-from hnerf.training.pixels import Pixels, gather_pixels
+from hnerf.training.pixels import Pixels, everywhere, gather_pixels
 from tests.training.scene import TINY, KnownMasks, look_at, record
 
 BALL = trimesh.creation.icosphere(subdivisions=5)  # 10242 vertices 1 m around the origin
@@ -98,7 +98,7 @@ def test_what_is_hidden_is_not_in_sight() -> None:
 
 def test_pixels_are_levelled_by_their_cameras(tmp_path: Path) -> None:
     capture, masks, body = record(tmp_path)
-    pixels: Pixels = gather_pixels(capture, masks, body, body.frames, 0.2, torch.device("cpu"))
+    pixels: Pixels = gather_pixels(capture, masks, body, body.frames, everywhere, torch.device("cpu"))
     levelled = pixels.levelled(torch.tensor([[2.0, 1, 0.5], [1, 1, 1], [1, 1, 1], [1, 1, 1]]))
     first = pixels.camera == 0
     assert levelled.colour[first & pixels.person].unique(dim=0).tolist() == [[100, 50, 100]]  # of 200, 50, 50

@@ -1,5 +1,6 @@
 """Which pixels a step draws, and where a recording's edges are."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -7,10 +8,11 @@ import pytest
 import torch
 
 from hnerf.capture.camera import Camera
-from hnerf.training.pixels import Pixels, gather_pixels, within_reach
+from hnerf.training.pixels import Pixels, everywhere, gather_pixels, within_box, within_reach
 from tests.training.scene import record
 
 AHEAD = Camera("ahead", np.diag([50.0, 50.0, 1.0]), np.eye(3), np.zeros(3), 60, 40)
+REACHED = functools.partial(within_reach, reach_m=0.2)
 
 
 def test_a_third_of_the_rays_is_drawn_at_edges():
@@ -41,7 +43,7 @@ def test_a_third_of_the_rays_is_drawn_at_edges():
 
 def test_edges_are_found_in_every_frame(tmp_path: Path):
     capture, masks, body = record(tmp_path)
-    pixels = gather_pixels(capture, masks, body, body.frames, 0.2, torch.device("cpu"))
+    pixels = gather_pixels(capture, masks, body, body.frames, REACHED, torch.device("cpu"))
     assert torch.equal(pixels.edges, torch.nonzero(pixels.edge)[:, 0])
     for row in range(len(body.frames)):
         own = pixels.edges[pixels.edge_starts[row] : pixels.edge_starts[row + 1]]
@@ -54,7 +56,7 @@ def test_a_frame_without_edges_offers_all_its_pixels(tmp_path: Path):
     capture, masks, body = record(tmp_path)
     for camera in capture.train_cameras:
         masks.masks[camera, 0][:] = True
-    pixels = gather_pixels(capture, masks, body, body.frames, 0.2, torch.device("cpu"))
+    pixels = gather_pixels(capture, masks, body, body.frames, REACHED, torch.device("cpu"))
     assert torch.equal(pixels.edges[: pixels.edge_starts[1]], torch.arange(int(pixels.starts[1])))
 
 
@@ -81,8 +83,24 @@ def test_an_arm_towards_the_camera_reaches_as_far_as_it_is_large():
     assert np.flatnonzero(reached[20]).tolist() == [*range(10, 31), *range(40, 60)]
 
 
-def test_with_no_bound_all_is_reached():
-    assert within_reach(AHEAD, np.array([[0.0, 0.0, -1.0]]), np.inf).all()
+def test_a_box_is_met_within_the_outline_of_its_corners():
+    """With its margin 2 to 4 m away: the near side spans columns 5 to 35 and rows 5 to 25, the far one 2.5 to 17.5 and
+    2.5 to 12.5, and their upper edges are joined by a line through (26.5, 3.75)."""
+    met = within_box(AHEAD, np.array([[0.4, 0.4, 2.2], [1.2, 0.8, 3.8]]), 0.2)
+    y, x = np.array([(3, 3), (5, 35), (25, 5), (25, 35), (15, 20), (4, 27)]).T
+    assert met[y, x].all()
+    y, x = np.array([(1, 1), (26, 20), (15, 36), (4, 35), (2, 27), (25, 3)]).T
+    assert not met[y, x].any()
+
+
+def test_a_box_around_the_camera_is_met_everywhere():
+    vertices_m = np.array([[-1.0, -1, -1], [1, 1, 1]])
+    assert within_box(AHEAD, vertices_m, 0.2).all()
+    assert np.array_equal(everywhere(AHEAD, vertices_m), np.ones((40, 60), bool))
+
+
+def test_a_box_beside_the_image_is_not_met():
+    assert not within_box(AHEAD, np.array([[-3.0, 0.0, 2.0], [-1.0, 1.0, 2.5]]), 0.2).any()
 
 
 @pytest.mark.parametrize("depths_m", [(-1.0, -2.0), (-1.0, -1.0, 2.0), (1e-6, 1e-6)])
