@@ -4,6 +4,7 @@ fitted to it is a unit box: nothing but its extent tells about the ball."""
 import dataclasses
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 
@@ -70,6 +71,17 @@ def psnr(avatar: TrainedAvatar, folder: Path, name: str) -> float:
     drawn = avatar.render(camera, avatar.body.theta[0], avatar.body.root[0])
     wanted = torch.from_numpy(render(camera)[0] / 255).float()
     return float(-10 * torch.log10(((drawn.rgb - wanted) ** 2).mean()))
+
+
+def inner_psnr(avatar: TrainedAvatar, folder: Path, name: str) -> tuple[float, float]:
+    """Of the ball's colours, two pixels and more inside its outline, and what one colour for all of them is worth."""
+    camera = record(folder / "capture")[0].cameras[name]
+    colour, mask = render(camera)
+    inside = torch.from_numpy(cv2.erode(mask.astype(np.uint8), np.ones((5, 5))) > 0)
+    wanted = torch.from_numpy(colour / 255).float()[inside]
+    drawn = avatar.render(camera, avatar.body.theta[0], avatar.body.root[0]).rgb[inside]
+    errors = torch.stack([(found - wanted).square().mean() for found in (drawn, wanted.mean(0))])
+    return tuple((-10 * errors.log10()).tolist())
 
 
 def radii_m(avatar: TrainedAvatar, directions: torch.Tensor) -> torch.Tensor:

@@ -161,7 +161,8 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Learned:
 
 
 def test_overfits_two_frames(learned: Learned) -> None:
-    """28 dB in both."""
+    """28 dB in both, after as many steps as were asked for."""
+    assert learned.avatar.field.steps_taken == 140
     assert min(learned.psnr(frame) for frame in (0, 1)) > 28
 
 
@@ -176,11 +177,11 @@ def test_a_pose_that_no_frame_has_shows_the_template(learned: Learned) -> None:
 
 
 def test_large_articulated_motion_is_beyond_the_deformation(learned: Learned, tmp_path: Path) -> None:
-    """Bent by 115 degrees to either side, the same training leaves even its own two frames 1.5 dB worse, though
-    nothing but the motion differs, and in place of a surface something that shares less than half of its volume: .36 to
-    .45 over three seeds, where who hardly moves has .59 to .66."""
+    """Bent by 115 degrees to either side, the same training leaves even its own two frames 3 dB worse, though nothing
+    but the motion differs (4.7 to 6 over three seeds), and in place of a surface something that shares about half of
+    its volume: .43 to .52, where who hardly moves has .58 to .65."""
     bending = learn(tmp_path, load_settings("nerfies", SMALL).training, (-2.0, 2.0, 0.0))
     worse, better = (sum(x.psnr(frame) for frame in (0, 1)) / 2 for x in (bending, learned))
-    assert worse < better - 1.5
+    assert worse < better - 3
     few, most = ([x.overlap(frame) for frame in (0, 1)] for x in (bending, learned))
-    assert max(few) < 0.5 < min(most) and max(few) < min(most) - 0.1
+    assert max(few) < min(most) - 0.05

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from hnerf.config import load_settings
 from hnerf.errors import CaptureError
 from hnerf.study.plan import STUDIES, Study, Variant, load_study, snapshot_times_s
 
@@ -91,3 +92,11 @@ def test_narrowing_keeps_methods_where_they_were_and_tries_presets_everywhere() 
         "one": ("a", "demo"),
     }
     assert narrowed.seconds == 5.0
+
+
+def test_only_the_clock_ends_a_compared_method() -> None:
+    study = load_study("dynamic")
+    steps = {name: study.settings(name).training.steps for name in ("fast", "paper", "neural-body", "nerfies")}
+    assert steps == {"fast": 0, "paper": 10_000, "neural-body": 1_000_000, "nerfies": 1_000_000}
+    forever = study.model_copy(update={"seconds": None})
+    assert forever.settings("nerfies").training.steps == load_settings("nerfies").training.steps
