@@ -23,15 +23,12 @@ def test_the_full_study_tries_everything_at_four_or_five_strengths_and_three_see
     assert full.left_out() == []
 
 
-def test_the_mild_study_tries_the_two_milder_strengths_of_all() -> None:
-    full, mild = load_stability("full"), load_stability("mild")
-    assert mild.degradations == {name: strengths[:2] for name, strengths in full.degradations.items()}
-
-
-def test_the_brief_study_tries_everything_with_what_the_mild_one_trains() -> None:
-    full, mild, brief = load_stability("full"), load_stability("mild"), load_stability("brief")
+def test_the_brief_studies_train_alike_all_strengths_once_or_the_milder_ones_with_three_seeds() -> None:
+    full, brief, seeds = load_stability("full"), load_stability("brief"), load_stability("seeds")
     assert brief.degradations == full.degradations
-    assert (brief.methods, brief.overrides) == (mild.methods, mild.overrides)
+    assert seeds.degradations == {name: full.degradations[name][:2] for name in seeds.degradations}
+    assert (brief.methods, brief.overrides) == (seeds.methods, seeds.overrides)
+    assert (brief.seeds, seeds.seeds) == ((0,), full.seeds)
 
 
 def test_the_quick_study_tries_the_two_milder_strengths_and_says_what_it_left_out() -> None:
@@ -64,7 +61,7 @@ def test_bad_studies_are_refused_in_one_line(text: str, message: str, tmp_path: 
 
 
 def test_unknown_studies_and_degradations_are_refused() -> None:
-    with pytest.raises(CaptureError, match="slow: no such study or file; studies are brief, full, mild, quick"):
+    with pytest.raises(CaptureError, match="slow: no such study or file; studies are brief, full, quick, seeds"):
         load_stability("slow")
     with pytest.raises(CaptureError, match="--only hats: not in this study; it has cameras_left, "):
         load_stability("quick").only(["hats"])
