@@ -59,7 +59,7 @@ def score(scene: Scene, training: Path, settings: ScoringSettings, out: Path) ->
     training: the folder that training left. A figure that cannot be had is null, and a reason stands beside it.
     """
     avatar = load_avatar(training, scene.device)
-    reason = why_no_novel_poses(json.loads((training / "settings.json").read_text()))
+    reason = why_no_novel_poses(training)
     found: dict[str, Any] = {"machine": machine(), "protocol": f"{PROTOCOL} {HOW}", "lpips": LPIPS}
     split = settings.split if scene.capture.test_cameras else "novel_pose"
     found["split"], found["training"] = split, json.loads((training / "report.json").read_text())
@@ -81,8 +81,9 @@ def score(scene: Scene, training: Path, settings: ScoringSettings, out: Path) ->
     return found
 
 
-def why_no_novel_poses(stored: dict[str, Any]) -> str | None:
-    """Why a trained model cannot show poses that it was not trained on; None if it can. stored: its settings.json."""
+def why_no_novel_poses(training: Path) -> str | None:
+    """Why what training left in a folder cannot show poses that it was not trained on; None if it can."""
+    stored = json.loads((training / "settings.json").read_text())
     machinery: str = stored["training"]["machinery"]
     if machinery == "paper" and stored["static"]:
         return f"H-NeRF's static network {ONE_MOMENT}"

@@ -149,9 +149,11 @@ def test_a_method_without_poses_has_a_reason_instead_of_figures(tmp_path: Path) 
     assert found["novel_view"]["n"] == 3
 
 
-def test_who_has_no_novel_poses() -> None:
+def test_who_has_no_novel_poses(tmp_path: Path) -> None:
     def reason(machinery: str, static: bool) -> str | None:
-        return why_no_novel_poses({"static": static, "training": {"machinery": machinery}})
+        stored = {"static": static, "training": {"machinery": machinery}}
+        (tmp_path / "settings.json").write_text(json.dumps(stored))
+        return why_no_novel_poses(tmp_path)
 
     assert [reason(name, False) for name in ("fast", "paper", "neural_body")] == [None] * 3
     assert reason("fast", True) is None
