@@ -110,9 +110,11 @@ def curve(
 
 
 def score_at(scene: Scene, avatar: Avatar, split: str, images: int | None, meshes: int, out: Path) -> dict[str, Any]:
-    """A split's figures in the form of evaluation, of at most as many images and surfaces; None is all."""
+    """A split's figures in the form of evaluation, of at most as many images and surfaces of which the truth is known;
+    None is all."""
     views: list[View] = all_views(scene.capture, split)
-    views = views if images is None else spread(views, images)
+    known = [view for view in views if scene.truth and scene.truth.has_mask(view.camera, view.frame)]
+    views = spread(known or views, images or len(views))
     if views:
         render(avatar, scene.capture, views, out)
     found = score_split(split, views, scene.truth, out)
