@@ -8,22 +8,21 @@ import json
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from prefect import flow
 
 from flows.run_page import show
-from flows.train_subject import find_masks
+from flows.train_subject import prepared
 from hnerf.capture.capture import Capture
-from hnerf.config import CONFIGS, Settings, load_settings, with_changes
+from hnerf.config import CONFIGS, Settings, TrainingSettings, load_settings, with_changes
 from hnerf.errors import CaptureError, one_line
 from hnerf.study import results
 from hnerf.study.files import replace_text
+from hnerf.study.scoring import why_no_novel_poses
 from hnerf.tables import head, line, pick, shown
-from tasks.calibration import calibrate
 from tasks.capture import ingest
 from tasks.evaluation import evaluate
-from tasks.fit import fit
 from tasks.policy import may_pass
 from tasks.source import Source, read_capture
 from tasks.store import Store
@@ -33,6 +32,7 @@ log = logging.getLogger("hnerf.ablations")
 
 ABLATIONS = CONFIGS / "ablations"
 FULL = "full"
+MACHINERIES = get_args(TrainingSettings.model_fields["machinery"].annotation)  # a section of settings each
 COLUMNS = results.COLUMNS | {"psnr": ("PSNR", "{:.2f}")}  # cells show training poses / novel poses
 
 
@@ -90,22 +90,19 @@ def why_pointless(full: Settings, ablated: Settings) -> str | None:
     if ablated == full:
         return "off already"
     machinery = full.training.machinery
-    idle = "paper" if machinery == "fast" else "fast"
-    training = ablated.training.model_copy(update={idle: getattr(full.training, idle)})
-    if ablated.model_copy(update={"training": training}) == full:
+    idle = {name: getattr(full.training, name) for name in MACHINERIES if name != machinery}
+    if ablated.model_copy(update={"training": ablated.training.model_copy(update=idle)}) == full:
         return f"the {machinery} machinery has no such part"
     return None
 
 
 def measure(shelf: Store, source: Source, truth: Source, settings: Settings) -> dict[str, Any]:
-    """A row's figures: scores of both splits, seconds and device of its training; {"error": one line} if one fails."""
-    recording = ingest(shelf, source, settings.capture)
-    calibration = calibrate(shelf, recording, settings.calibration)
-    masks = find_masks(shelf, recording, calibration, settings)
-    body = fit(shelf, recording, calibration, masks, settings.fit)
+    """A row's figures: scores of both splits, of novel poses only what the method can show, seconds and device of its
+    training; {"error": one line} if one fails."""
+    stages = prepared(shelf, ingest(shelf, source, settings.capture), settings)
     try:
-        model = train(shelf, recording, calibration, masks, body, settings.training)
-        report = evaluate(shelf, truth, recording, calibration, masks, body, model, settings.evaluation)
+        model = train(shelf, *stages, settings.training)
+        report = evaluate(shelf, truth, *stages, model, settings.evaluation)
     except Exception as error:  # what breaks without a part is what the table is after
         if may_pass(error):
             raise  # a full disk, a lost share, a killed worker
@@ -113,6 +110,8 @@ def measure(shelf: Store, source: Source, truth: Source, settings: Settings) -> 
         return {"error": one_line(error)}
     metrics = json.loads((report.root / "metrics.json").read_text())
     trained = json.loads((model.root / "report.json").read_text())
+    if reason := why_no_novel_poses(model.root):
+        metrics["novel_pose"] = {"reason": reason}
     return {key: trained[key] for key in ("seconds", "device")} | {
         key: metrics[key] for key in ("protocol", "novel_view", "novel_pose")
     }
@@ -128,7 +127,10 @@ def as_markdown(result: dict[str, Any]) -> str:
     lines += [line([name, *_cells(row)]) for name, row in result["rows"].items()]
     if result["left_out"]:
         lines += ["", "Left out:", "", *(f"- {name}: {reason}" for name, reason in result["left_out"].items())]
-    protocols = {row["protocol"] for row in result["rows"].values() if "protocol" in row}
+    found = [row for row in result["rows"].values() if "error" not in row]
+    reasons = {reason for row in found if (reason := row["novel_pose"].get("reason"))}
+    lines += ["", *(f"No images of new poses: {reason}." for reason in sorted(reasons))] if reasons else []
+    protocols = {row["protocol"] for row in found}
     return "\n".join([*lines, "", *sorted(protocols), ""])
 
 

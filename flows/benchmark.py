@@ -8,7 +8,7 @@ from typing import Any
 from prefect import flow
 
 from flows.run_page import show
-from flows.train_subject import find_masks
+from flows.train_subject import prepared
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
 from hnerf.errors import CaptureError, one_line
@@ -16,10 +16,9 @@ from hnerf.study.files import with_pictures
 from hnerf.study.plan import ScoringSettings, Study, Variant, load_study
 from hnerf.study.publish import publish
 from tasks.benchmark import score_training
-from tasks.calibration import calibrate, calibrated
+from tasks.calibration import calibrated
 from tasks.capture import ingest
-from tasks.fit import fit
-from tasks.launcher import LostWorkerError
+from tasks.policy import may_pass
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
 from tasks.study import subset_capture
@@ -81,18 +80,18 @@ def measure(
     shelf: Store, source: Source, truth: Source, variant: Variant, settings: Settings, scoring: ScoringSettings
 ) -> dict[str, Any]:
     """A method's scores on a variant, and the folder of their files in the store; {"error": one line} if it fails."""
-    recording = ingest(shelf, source, settings.capture)
-    parts = variant.parts(Capture.load(recording.root))
-    if parts != (None, None, None):
-        recording = subset_capture(shelf, recording, *parts)
     try:
+        recording = ingest(shelf, source, settings.capture)
+        parts = variant.parts(Capture.load(recording.root))
+        if parts != (None, None, None):
+            recording = subset_capture(shelf, recording, *parts)
         calibration, model = trained(shelf, recording, settings)
-    except LostWorkerError:
-        raise
-    except (CaptureError, RuntimeError) as error:
-        log.warning("%s", error)
+        scores = score_training(shelf, truth, recording, calibration, model, scoring)
+    except Exception as error:  # one method's fault, of which the others know nothing
+        if may_pass(error):
+            raise  # a full disk, a lost share, a killed worker
+        log.warning("%s: %s", type(error).__name__, error)
         return {"error": one_line(error)}
-    scores = score_training(shelf, truth, recording, calibration, model, scoring)
     found: dict[str, Any] = json.loads((scores.root / "scores.json").read_text())
     taken = calibrated(recording, calibration)
     counts = {"cameras": len(taken.train_cameras), "frames": len(taken.train_frames)}
@@ -101,7 +100,5 @@ def measure(
 
 def trained(shelf: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact]:
     """The calibration and the training that a recording comes to."""
-    calibration = calibrate(shelf, recording, settings.calibration)
-    masks = find_masks(shelf, recording, calibration, settings)
-    body = fit(shelf, recording, calibration, masks, settings.fit)
-    return calibration, train(shelf, recording, calibration, masks, body, settings.training)
+    stages = prepared(shelf, recording, settings)
+    return stages[1], train(shelf, *stages, settings.training)

@@ -135,9 +135,15 @@ def _add_benchmark(command: argparse.ArgumentParser) -> None:
         "--study", default="dynamic", help="a name under configs/benchmark/ or a YAML file (default: dynamic)"
     )
     study.add_argument("--quick", dest="study", action="store_const", const="quick", help="the study for 15 minutes")
-    command.add_argument("--methods", metavar="LIST", help="of the study, or presets, instead of all: fast,nerf")
+    command.add_argument(
+        "--methods", type=_names, metavar="LIST", help="of the study, or presets, instead of all: fast,nerf"
+    )
     command.add_argument("--seconds", type=_positive, metavar="S", help="of every training, instead of the study's")
     command.set_defaults(command=_benchmark)
+
+
+def _names(text: str) -> list[str]:
+    return [stripped for name in text.split(",") if (stripped := name.strip())]
 
 
 def _not_negative(text: str) -> int:
@@ -155,8 +161,7 @@ def _positive(text: str) -> float:
 
 
 def _benchmark(options: argparse.Namespace) -> None:
-    methods = options.methods.split(",") if options.methods else None
-    table = benchmark.fn(options.capture, options.study, methods, options.seconds, options.store)
+    table = benchmark.fn(options.capture, options.study, options.methods, options.seconds, options.store)
     _show(table)
     if (chart := table.with_suffix(".png")).exists():
         print(f"chart: {chart}")
@@ -166,7 +171,7 @@ def _add_stability(command: argparse.ArgumentParser) -> None:
     study = command.add_mutually_exclusive_group()
     study.add_argument("--study", default="full", help="a name under configs/stability/ or a YAML file (default: full)")
     study.add_argument("--quick", dest="study", action="store_const", const="quick", help="the study for 15 minutes")
-    command.add_argument("--methods", type=lambda names: names.split(","), default=[], metavar="LIST", help="presets")
+    command.add_argument("--methods", type=_names, default=[], metavar="LIST", help="presets")
     command.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these degradations of the study")
     command.set_defaults(command=lambda o: _show(stability.fn(o.capture, o.study, o.store, o.methods, o.only)))
 

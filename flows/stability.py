@@ -1,5 +1,6 @@
 """Where each method breaks: the same capture, made worse in one way at a time."""
 
+import contextlib
 import json
 import logging
 from collections.abc import Iterator, Sequence
@@ -10,17 +11,17 @@ import numpy as np
 from prefect import flow
 
 from flows.run_page import show
-from flows.train_subject import find_masks
+from flows.train_subject import prepared
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
 from hnerf.errors import CaptureError, NotPossibleError, one_line
 from hnerf.study.degrade import KINDS, Degradation, degrade_settings
 from hnerf.study.files import replace_text, with_pictures
+from hnerf.study.scoring import why_no_novel_poses
 from hnerf.study.stability import Stability, load_stability
 from hnerf.study.stability_charts import curve_chart, matrix_chart
 from hnerf.study.stability_report import REFERENCE, as_markdown
-from hnerf.study.verdict import Verdict, judge
-from tasks.calibration import calibrate
+from hnerf.study.verdict import BROKEN, Verdict, judge
 from tasks.capture import ingest
 from tasks.evaluation import evaluate
 from tasks.fit import fit
@@ -71,8 +72,12 @@ def stability(
             result["protocol"] = run.pop("protocol", None) or result["protocol"]
             result["runs"].append(run)
             _tell(result, [], table)
-    finally:
-        _tell(result, _draw(result, table), table)
+    except BaseException:  # Ctrl-C, too
+        if result["runs"]:
+            with contextlib.suppress(Exception):  # which would hide what ended the study
+                _tell(result, _draw(result, table), table)
+        raise
+    _tell(result, _draw(result, table), table)
     show(with_pictures(table), "stability", f"Where methods break on {subject}")
     return table
 
@@ -81,15 +86,16 @@ def _runs(
     shelf: Store, source: Source, truth: Source, plan: Stability, presets: dict[str, Settings]
 ) -> Iterator[Figures]:
     """Every run's row: its method, degradation and verdict, and figures where there are any; or {"left_out": what and
-    why}. A method without a good run to compare with has no others."""
+    why}. A method whose run to compare with broke has no others of that seed."""
     for method, preset in presets.items():
         for seed in plan.seeds:
             settings = preset.model_copy(update={"training": preset.training.model_copy(update={"seed": seed})})
             log.info("%s, seed %d, as recorded", method, seed)
             good = attempt(shelf, source, truth, settings, None)
             row = {"method": method, "seed": seed}
-            yield row | {"kind": REFERENCE, "strength": None} | judged(good, good)
-            if "error" in good:
+            reference = row | {"kind": REFERENCE, "strength": None} | judged(good, good)
+            yield reference
+            if reference["verdict"] in BROKEN:
                 continue
             for kind, strengths in plan.degradations.items():
                 for strength in strengths:
@@ -103,13 +109,17 @@ def _runs(
 
 
 def judged(found: Figures, good: Figures) -> Figures:
-    """Verdict and means over the images and surfaces that both runs have, None where there are none."""
+    """Verdict and means over the images and surfaces that both runs have, None where there are none; those of the good
+    run as "reference"."""
+    row: Figures = {}
     if "error" in found:
-        verdict, row = Verdict(*found["error"]), {}
+        verdict = Verdict(*found["error"])
+    elif "images" not in found:
+        verdict = judge(None, {}, found["faults"])
     else:
         row, reference = in_common(found, good), in_common(good, found)
         verdict = judge(row, reference, found["faults"])
-        row |= {key: found[key] for key in ("protocol", "seconds") if key in found}
+        row |= {"reference": reference, "protocol": found["protocol"], "seconds": found["seconds"]}
     return row | {"verdict": verdict.word, "reason": verdict.reason}
 
 
@@ -156,14 +166,13 @@ def prepare(
     recording = ingest(shelf, source, settings.capture)
     if degradation and place == "capture":
         recording = degrade_capture(shelf, recording, degradation)
+    recording, calibration, masks, body = prepared(shelf, recording, settings)
     if degradation and place == "worn":
-        good, cameras, _, body = prepare(shelf, source, truth, settings, None)
-        recording = dress(shelf, truth, good, cameras, body, degradation)
-    calibration = calibrate(shelf, recording, settings.calibration)
-    masks = find_masks(shelf, recording, calibration, settings)
+        recording = dress(shelf, truth, recording, calibration, body, degradation)
+        return prepared(shelf, recording, settings)
     if degradation and place == "masks":
         masks = degrade_masks(shelf, recording, calibration, masks, degradation)
-    body = fit(shelf, recording, calibration, masks, settings.fit)
+        body = fit(shelf, recording, calibration, masks, settings.fit)
     if degradation and place == "fit":
         body = degrade_fit(shelf, body, degradation)
     return recording, calibration, masks, body
@@ -179,29 +188,35 @@ def measure(
     model: Artifact,
 ) -> Figures:
     """Faults of surfaces; figures of each image and the Chamfer distance of each surface against the truth, as far as
-    there is one, of novel poses, or of training poses where the capture as recorded has no others."""
+    there is one, of novel poses, or of training poses where the capture as recorded or the method has no others. Of
+    extreme poses faults alone."""
+    no_poses = why_no_novel_poses(model.root)
     if degradation and KINDS[degradation.kind].place == "poses":
-        return {"images": {}, "surfaces": {}, "faults": _faults(show_in_extreme_poses(shelf, model, degradation))}
+        if no_poses:
+            raise NotPossibleError(no_poses)
+        return {"faults": _faults(show_in_extreme_poses(shelf, model, degradation))}
     recorded, *_, good_body = prepare(shelf, source, truth, settings, None)
     if degradation and KINDS[degradation.kind].place == "worn":
         _, truth = read_capture(stages[0].root)
     report = evaluate(shelf, truth, *stages, model, settings.evaluation)
     metrics = json.loads((report.root / "metrics.json").read_text())
     capture = Capture.load(recorded.root)
-    split = metrics["novel_pose" if capture.novel_pose_frames else "novel_view"]
+    novel = capture.novel_pose_frames
+    split = metrics["novel_pose" if novel and not no_poses else "novel_view"]
     surfaces = (split["geometry"] or {"per_surface": []})["per_surface"]
     return {
         "images": {(r["camera"], r["frame"]): r for r in split["per_image"] if capture.test_cameras},
         "surfaces": {surface["frame"]: surface["chamfer_mm"] for surface in surfaces},
-        "faults": _faults(check_meshes(shelf, report, good_body)),
+        "faults": _faults(check_meshes(shelf, report, good_body), novel if no_poses else ()),
         "protocol": metrics["protocol"],
         "seconds": json.loads((model.root / "report.json").read_text())["seconds"],
     }
 
 
-def _faults(checked: Artifact) -> list[str]:
-    surfaces = json.loads((checked.root / "surface.json").read_text())
-    return [surface["fault"] for surface in surfaces.values() if surface["fault"]]
+def _faults(checked: Artifact, without: Sequence[int] = ()) -> list[str]:
+    """Of all surfaces but those of some frames."""
+    surfaces, names = json.loads((checked.root / "surface.json").read_text()), {f"{frame:06d}" for frame in without}
+    return [surface["fault"] for name, surface in surfaces.items() if surface["fault"] and name not in names]
 
 
 def _tell(result: Figures, charts: list[str], table: Path) -> None:
@@ -212,6 +227,8 @@ def _tell(result: Figures, charts: list[str], table: Path) -> None:
 def _draw(result: Figures, table: Path) -> list[str]:
     """Names of the charts that there is something to draw for."""
     paths = {key: table.with_name(f"{table.stem}-{key}.png") for key in ("matrix", "psnr", "chamfer_mm")}
+    for path in paths.values():
+        path.unlink(missing_ok=True)  # of an earlier call
     matrix_chart(result, paths["matrix"])
     drawn = [key for key in ("psnr", "chamfer_mm") if curve_chart(result, key, paths[key])]
     return [paths[key].name for key in ("matrix", *drawn)]

@@ -47,6 +47,13 @@ def train_subject(
     return shelf.subject_folder(subject)
 
 
+def prepared(shelf: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact, Artifact, Artifact]:
+    """What training and evaluation are given of a recording: itself, calibration, masks and body."""
+    calibration = calibrate(shelf, recording, settings.calibration)
+    masks = find_masks(shelf, recording, calibration, settings)
+    return recording, calibration, masks, fit(shelf, recording, calibration, masks, settings.fit)
+
+
 def find_masks(shelf: Store, recording: Artifact, calibration: Artifact, settings: Settings) -> Artifact:
     """Segment; where that needs a body, fit one to keypoints first, and go round until the masks stand still."""
     if not needs_body(recording, settings.segmentation):

@@ -119,7 +119,10 @@ def lines(axes: Axes, curves: Curves, looks: Mapping[str, Style]) -> None:
 
 
 def front(axes: Axes, points: Mapping[str, Point], looks: Mapping[str, Style]) -> None:
-    """A mark a method, and the front: what lies right of it and below is beaten in both time and accuracy."""
+    """A mark a method, and the front: what lies right of it and below is beaten in both time and accuracy.
+    Nothing where there is no point."""
+    if not points:
+        return
     for name, point in points.items():
         axes.plot(*point, **looks[name] | {"linestyle": "none", "markersize": 8})
     (_, right), (bottom, _) = axes.get_xlim(), axes.get_ylim()

@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -37,64 +37,48 @@ class Degradation(Section):
 @dataclass(frozen=True)
 class Kind:
     """place: after which stage it is applied, "worn" being the capture once its body is fitted, "poses" those that a
-    finished avatar is shown in; label with the strength's unit."""
+    finished avatar is shown in; label with the strength's unit.
+
+    change: of the capture, written into a folder; of masks; or of a fitted body. Strengths go from `none`, at which
+    nothing would change, to `most`, which may be one of them; whole: they count something.
+    """
 
     place: Place
     label: str
+    change: Callable[..., Any] | None = None
+    none: float = 0.0
+    most: float = math.inf
+    whole: bool = False
 
-
-CaptureChange = Callable[[Capture, float, Rng, Path], None]
-MasksChange = Callable[[Masks, Capture, float, Rng], Masks]
-FitChange = Callable[[BodyFit, float, Rng], BodyFit]
-
-CAPTURE: dict[str, CaptureChange] = {
-    "cameras_left": degraded_rig.leave_cameras,
-    "frames_left": degraded_rig.leave_frames,
-    "camera_turned": degraded_rig.turn_camera,
-    "camera_out_of_step": degraded_rig.put_out_of_step,
-    "image_noise": degraded_images.add_noise,
-    "image_blur": degraded_images.blur,
-    "exposure": degraded_images.expose_differently,
-    "small_images": degraded_images.resize,
-    "large_images": degraded_images.resize,
-    "occluder": occluder.put_in_front,
-}
-MASKS: dict[str, MasksChange] = {
-    "mask_eroded": degraded_masks.erode,
-    "mask_dilated": degraded_masks.dilate,
-    "mask_holes": degraded_masks.pierce,
-    "mask_limb": degraded_masks.cut_limb,
-}
-FIT: dict[str, FitChange] = {"pose_noise": degraded_fit.disturb_poses, "wrong_shape": degraded_fit.change_shape}
 
 KINDS = {
-    "cameras_left": Kind("capture", "training cameras left"),
-    "frames_left": Kind("capture", "training frames left"),
-    "camera_turned": Kind("capture", "one camera turned, °"),
-    "camera_out_of_step": Kind("capture", "one camera late, frames"),
-    "image_noise": Kind("capture", "image noise, levels of 255"),
-    "image_blur": Kind("capture", "blur, % of image width"),
-    "exposure": Kind("capture", "exposure between cameras, ± stops"),
-    "small_images": Kind("capture", "image size, share"),
-    "large_images": Kind("capture", "image size, multiple"),
-    "occluder": Kind("capture", "pillar in front, width in m"),
+    "cameras_left": Kind("capture", "training cameras left", degraded_rig.leave_cameras, math.inf, 1, whole=True),
+    "frames_left": Kind("capture", "training frames left", degraded_rig.leave_frames, math.inf, 1, whole=True),
+    "camera_turned": Kind("capture", "one camera turned, °", degraded_rig.turn_camera),
+    "camera_out_of_step": Kind("capture", "one camera late, frames", degraded_rig.put_out_of_step, whole=True),
+    "image_noise": Kind("capture", "image noise, levels of 255", degraded_images.add_noise),
+    "image_blur": Kind("capture", "blur, % of image width", degraded_images.blur),
+    "exposure": Kind("capture", "exposure between cameras, ± stops", degraded_images.expose_differently),
+    "small_images": Kind("capture", "image size, share", degraded_images.resize, 1, 0),
+    "large_images": Kind("capture", "image size, multiple", degraded_images.resize, 1),
+    "occluder": Kind("capture", "pillar in front, width in m", occluder.put_in_front),
     "skirt": Kind("worn", "skirt, hem off the legs in m"),
     "long_hair": Kind("worn", "long hair, m"),
-    "mask_eroded": Kind("masks", "masks eroded, % of image width"),
-    "mask_dilated": Kind("masks", "masks dilated, % of image width"),
-    "mask_holes": Kind("masks", "holes, % of each mask"),
-    "mask_limb": Kind("masks", "limb missing, % of masks"),
-    "pose_noise": Kind("fit", "pose noise, ° a joint"),
-    "wrong_shape": Kind("fit", "wrong shape, mm on average"),
-    "learning_rate_up": Kind("settings", "learning rate times"),
-    "learning_rate_down": Kind("settings", "learning rate times"),
+    "mask_eroded": Kind("masks", "masks eroded, % of image width", degraded_masks.erode),
+    "mask_dilated": Kind("masks", "masks dilated, % of image width", degraded_masks.dilate),
+    "mask_holes": Kind("masks", "holes, % of each mask", degraded_masks.pierce, most=100),
+    "mask_limb": Kind("masks", "limb missing, % of masks", degraded_masks.cut_limb, most=100),
+    "pose_noise": Kind("fit", "pose noise, ° a joint", degraded_fit.disturb_poses),
+    "wrong_shape": Kind("fit", "wrong shape, mm on average", degraded_fit.change_shape),
+    "learning_rate_up": Kind("settings", "learning rate higher, times", none=1),
+    "learning_rate_down": Kind("settings", "learning rate lower, times", none=1, most=0),
     "extreme_poses": Kind("poses", "new pose, ° a joint"),
 }
 
 
 def degrade_capture(capture: Capture, degradation: Degradation, out: Path) -> None:
     """Write the degraded capture, normalised like the one given, into `out`."""
-    CAPTURE[degradation.kind](capture, degradation.strength, degradation.rng, out)
+    _change(degradation)(capture, degradation.strength, degradation.rng, out)
 
 
 def dress(capture: Capture, body: BodyFit, truth: GroundTruth, degradation: Degradation, out: Path) -> None:
@@ -104,12 +88,14 @@ def dress(capture: Capture, body: BodyFit, truth: GroundTruth, degradation: Degr
 
 def degrade_masks(masks: Masks, capture: Capture, degradation: Degradation) -> Masks:
     """The same views' masks, degraded."""
-    return MASKS[degradation.kind](masks, capture, degradation.strength, degradation.rng)
+    changed: Masks = _change(degradation)(masks, capture, degradation.strength, degradation.rng)
+    return changed
 
 
 def degrade_fit(body: BodyFit, degradation: Degradation) -> BodyFit:
     """The same frames' poses or the shape, degraded."""
-    return FIT[degradation.kind](body, degradation.strength, degradation.rng)
+    changed: BodyFit = _change(degradation)(body, degradation.strength, degradation.rng)
+    return changed
 
 
 def degrade_settings(settings: TrainingSettings, degradation: Degradation) -> TrainingSettings:
@@ -121,13 +107,20 @@ def degrade_settings(settings: TrainingSettings, degradation: Degradation) -> Tr
     return settings.model_copy(update={settings.machinery: changed, "pose_learning_rate": pose_learning_rate})
 
 
-def check_strengths(kind: str, strengths: tuple[float, ...]) -> None:
-    """CaptureError unless the degradation is known and its strengths go one way, the mildest first."""
-    if kind not in KINDS:
-        raise CaptureError(f"degradation {kind}: no such thing; there are {', '.join(KINDS)}")
-    growing = all(a < b for a, b in itertools.pairwise(strengths))
-    falling = all(a > b for a, b in itertools.pairwise(strengths))
-    if not strengths or not (growing or falling) or not all(math.isfinite(s) and s > 0 for s in strengths):
-        raise CaptureError(f"degradation {kind}: give strengths above 0, the mildest first")
-    if kind in ("mask_holes", "mask_limb") and max(strengths) > 100:
-        raise CaptureError(f"degradation {kind}: a share in %, at most 100")
+def check_strengths(name: str, strengths: tuple[float, ...]) -> None:
+    """CaptureError unless the degradation is known and its strengths go its way, the mildest first."""
+    if name not in KINDS:
+        raise CaptureError(f"degradation {name}: no such thing; there are {', '.join(KINDS)}")
+    kind = KINDS[name]
+    (low, high), way = sorted((kind.none, kind.most)), 1 if kind.none < kind.most else -1
+    onwards = all(way * a < way * b for a, b in itertools.pairwise((kind.none, *strengths)))
+    valid = all(0 < s < math.inf and low <= s <= high and not (kind.whole and s % 1) for s in strengths)
+    if not (strengths and onwards and valid):
+        what = f"{'whole ' * kind.whole}numbers between {low:g} and {high:g} that {'rise' if way > 0 else 'fall'}"
+        raise CaptureError(f"degradation {name}: give {what}, the mildest first")
+
+
+def _change(degradation: Degradation) -> Callable[..., Any]:
+    change = KINDS[degradation.kind].change
+    assert change is not None  # of capture, masks and fit
+    return change

@@ -45,6 +45,8 @@ def turn_camera(capture: Capture, angle_deg: float, rng: np.random.Generator, ou
 def put_out_of_step(capture: Capture, frames: float, rng: np.random.Generator, out: Path) -> None:
     """One training camera, at random, shows at each frame what it saw that many frames before; its first picture stands
     still until then."""
+    if not 1 <= round(frames) < len(capture.frames):
+        raise NotPossibleError(f"{capture.name}: has {len(capture.frames)} frames; none can be {frames:g} late")
     require_several_cameras(capture)
     late = str(rng.choice(capture.train_cameras))
     kept = dataclasses.replace(capture, root=out)

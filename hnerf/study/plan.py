@@ -9,6 +9,7 @@ from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, H_NERF, Section, Settings, load_settings, named_file, read_yaml, validated
 from hnerf.errors import CaptureError
 from hnerf.spread import spread
+from hnerf.study.subset import chosen
 
 STUDIES = CONFIGS / "benchmark"
 UNTIL_TIME_IS_UP = 1_000_000  # steps
@@ -27,14 +28,18 @@ class Variant(Section):
         """Training cameras, training frames and novel-pose frames to keep, None for all.
 
         Fewer cameras are taken at equal steps of the capture's order, frames evenly spread over time. CaptureError if
-        the capture has not as many.
+        the capture has not as many, or not one of that name.
         """
         cameras, frames = self.cameras, self.frames
         if isinstance(cameras, int):
             there_are = _at_least(cameras, capture.train_cameras, "training cameras")
             cameras = tuple(there_are[k * len(there_are) // cameras] for k in range(cameras))
+        elif cameras is not None:
+            cameras = chosen(capture, "training camera", cameras, capture.train_cameras)
         if isinstance(frames, int):
             frames = tuple(spread(_at_least(frames, capture.train_frames, "training frames"), frames))
+        elif frames is not None:
+            frames = chosen(capture, "training frame", frames, capture.train_frames)
         return cameras, frames, None if self.novel_poses else ()
 
 

@@ -62,15 +62,14 @@ def draw(result: Mapping[str, Any], store: Path, table: Path) -> list[Path]:
 
 
 def picture_rows(title: str, variant: Mapping[str, Any], store: Path) -> list[tuple[str, list[tuple[str, Any]]]]:
-    """Of each pictured image: the truth, and each method's rendering with its PSNR."""
-    methods = {name: scores for name, scores in results.scored(variant).items() if scores["pictures"]}
-    rows = []
-    for k, view in enumerate(next(iter(methods.values()))["pictures"] if methods else []):
-        pictures = []
-        for name, scores in methods.items():
-            folder = store / scores["folder"] / "pictures"
-            (psnr,) = (row["psnr"] for row in scores[scores["split"]]["per_image"] if view.items() <= row.items())
-            pictures.append((f"{name}, {psnr:.1f} dB", read_rgb(folder / f"{k}-render.png")))
-        truth = read_rgb(folder / f"{k}-truth.png")
-        rows.append((f"{title}: frame {view['frame']}, camera {view['camera']}", [("truth", truth), *pictures]))
-    return rows
+    """Of each pictured image: the truth, and the rendering of each method that pictured it, with its PSNR."""
+    found: dict[str, list[tuple[str, Any]]] = {}
+    for name, scores in results.scored(variant).items():
+        folder = store / scores["folder"] / "pictures"
+        psnr = {(row["camera"], row["frame"]): row["psnr"] for row in scores[scores["split"]]["per_image"]}
+        for k, view in enumerate(scores["pictures"]):
+            heading = f"{title}: frame {view['frame']}, camera {view['camera']}"
+            row = found.setdefault(heading, [("truth", read_rgb(folder / f"{k}-truth.png"))])
+            told = f"{name}, {psnr[view['camera'], view['frame']]:.1f} dB"
+            row.append((told, read_rgb(folder / f"{k}-render.png")))
+    return list(found.items())

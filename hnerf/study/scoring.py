@@ -59,7 +59,7 @@ def score(scene: Scene, training: Path, settings: ScoringSettings, out: Path) ->
     training: the folder that training left. A figure that cannot be had is null, and a reason stands beside it.
     """
     avatar = load_avatar(training, scene.device)
-    reason = why_no_novel_poses(json.loads((training / "settings.json").read_text()))
+    reason = why_no_novel_poses(training)
     found: dict[str, Any] = {"machine": machine(), "protocol": f"{PROTOCOL} {HOW}", "lpips": LPIPS}
     split = settings.split if scene.capture.test_cameras else "novel_pose"
     found["split"], found["training"] = split, json.loads((training / "report.json").read_text())
@@ -81,8 +81,9 @@ def score(scene: Scene, training: Path, settings: ScoringSettings, out: Path) ->
     return found
 
 
-def why_no_novel_poses(stored: dict[str, Any]) -> str | None:
-    """Why a trained model cannot show poses that it was not trained on; None if it can. stored: its settings.json."""
+def why_no_novel_poses(training: Path) -> str | None:
+    """Why what training left in a folder cannot show poses that it was not trained on; None if it can."""
+    stored = json.loads((training / "settings.json").read_text())
     machinery: str = stored["training"]["machinery"]
     if machinery == "paper" and stored["static"]:
         return f"H-NeRF's static network {ONE_MOMENT}"
@@ -109,9 +110,11 @@ def curve(
 
 
 def score_at(scene: Scene, avatar: Avatar, split: str, images: int | None, meshes: int, out: Path) -> dict[str, Any]:
-    """A split's figures in the form of evaluation, of at most as many images and surfaces; None is all."""
+    """A split's figures in the form of evaluation, of at most as many images and surfaces of which the truth is known;
+    None is all."""
     views: list[View] = all_views(scene.capture, split)
-    views = views if images is None else spread(views, images)
+    known = [view for view in views if scene.truth and scene.truth.has_mask(view.camera, view.frame)]
+    views = spread(known or views, images or len(views))
     if views:
         render(avatar, scene.capture, views, out)
     found = score_split(split, views, scene.truth, out)

@@ -14,13 +14,13 @@ from hnerf.study.charts import Style, styles
 from hnerf.study.degrade import KINDS
 from hnerf.study.stability_report import REFERENCE, Row, worst
 
-SHADES = {"ok": "#e8f1ec", "degraded": "#f2c877", "refused": "#9dbbdc", "failed": "#a3293d"}
-LETTERS = {"ok": "o", "degraded": "D", "refused": "R", "failed": "F"}
+SHADES = {"ok": "#e8f1ec", "degraded": "#f2c877", "refused": "#9dbbdc", "failed": "#a3293d", "unscored": "#949494"}
+LETTERS = {"ok": "o", "degraded": "D", "refused": "R", "failed": "F", "unscored": "?"}
 LABELS = {"psnr": "PSNR, dB", "chamfer_mm": "Chamfer distance, mm"}
-CAPTION = "line: mean over seeds; band: their range; cross: a seed without a figure"
+CAPTION = "line: mean over seeds; band: range; dotted: as recorded, over the same; cross: a seed without a figure"
 COLUMNS = 4  # of panels
 CELL, GAP = (0.52, 0.42), 0.4  # of the matrix in inches; between methods, in cells
-LEFT, BOTTOM, LEGEND = 2.7, 0.4, 5.0  # inches
+LEFT, BOTTOM, LEGEND = 2.7, 0.4, 6.2  # inches
 
 
 def matrix_chart(result: Row, path: Path) -> None:
@@ -45,13 +45,14 @@ def matrix_chart(result: Row, path: Path) -> None:
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
     patches = [Patch(facecolor=SHADES[w], edgecolor=INK, label=f"{LETTERS[w]}  {w}") for w in SHADES]
-    figure.legend(handles=patches, loc="lower right", ncols=4, frameon=False, fontsize=9, labelcolor=INK)
+    figure.legend(handles=patches, loc="lower right", ncols=len(SHADES), frameon=False, fontsize=9, labelcolor=INK)
     figure.savefig(path, facecolor="white")
 
 
 def curve_chart(result: Row, key: str, path: Path) -> bool:
     """A panel for each degradation: a figure of every method over strength, from the capture as recorded; line the mean
-    and band the range over seeds, a cross where a seed has no figure. False, and no file, where there is none."""
+    and band the range over seeds, dotted what the reference has over the same images or surfaces, a cross where a seed
+    has no figure. False, and no file, where there is none."""
     measured = {run["kind"] for run in result["runs"] if run.get(key) is not None} - {REFERENCE}
     kinds = {kind: strengths for kind, strengths in result["plan"]["degradations"].items() if kind in measured}
     if not kinds:
@@ -92,7 +93,9 @@ def _curve(axes: Axes, runs: list[Row], kind: str, strengths: list[float], key: 
     by_place = [[r for r in runs if r["kind"] == REFERENCE]]
     by_place += [[r for r in runs if r["kind"] == kind and r["strength"] == strength] for strength in strengths]
     values: list[Any] = [[r[key] for r in place if r.get(key) is not None] for place in by_place]
+    good: list[Any] = [[r["reference"][key] for r in place if r.get(key) is not None] for place in by_place]
     x = [place for place, found in enumerate(values) if found]
+    axes.plot(x, [np.mean(good[place]) for place in x], ":", color=look["color"], linewidth=1.0)
     means, lows, highs = ([f(values[place]) for place in x] for f in (np.mean, min, max))
     axes.plot(x, means, linewidth=1.6, markersize=4, label=runs[0]["method"] if runs else None, **look)
     axes.fill_between(x, lows, highs, color=look["color"], alpha=0.2, linewidth=0)

@@ -9,7 +9,7 @@ from typing import Any
 from hnerf.study.degrade import KINDS
 from hnerf.study.files import picture
 from hnerf.study.surface import LENGTHS, VOLUMES
-from hnerf.study.verdict import DEGRADED_DB, DEGRADED_RATIO, FAILED_DB, FAILED_RATIO, FAILED_SHARE, WORST_LAST
+from hnerf.study.verdict import BROKEN, DEGRADED_DB, DEGRADED_RATIO, FAILED_DB, FAILED_RATIO, FAILED_SHARE, WORST_LAST
 from hnerf.tables import head, line, shown
 
 REFERENCE = "as recorded"
@@ -19,12 +19,14 @@ LEGEND = (
     f"dB, or {FAILED_SHARE:g} of what that run has above an empty picture, or {FAILED_RATIO:g} times the distance; "
     "pictures no better than empty ones, a crash, no surface, one that is not watertight or not of the body's size "
     f"(volume {VOLUMES[0]:g} to {VOLUMES[1]:g}, length {LENGTHS[0]:g} to {LENGTHS[1]:g} of it). **refused**: an "
-    "earlier stage or the training said what is wrong with the input. Novel poses from test cameras are scored, which "
-    "no degradation touches, but that they and the truth wear the skirt or the hair, too; training poses where the "
-    "capture has no others. Runs are compared by the images and surfaces that both have: a frame that a degradation "
-    "took away counts in neither. Without test cameras images are not compared, since what is done to training cameras "
-    "would be done to what they are scored on. A surface is the largest component that meshing finds; what floats "
-    "beside it does not count."
+    "earlier stage or the training said what is wrong with the input. **unscored**: nothing is known to be true of the "
+    "images and surfaces that both runs show, so that neither good nor bad can be told; extreme poses are judged by "
+    "surfaces alone. Novel poses from test cameras are scored, which no degradation touches, but that they and the "
+    "truth wear the skirt or the hair, too; training poses where the capture or the method has no others. Runs are "
+    "compared by the images and surfaces that both have, and so are the differences in parentheses: a frame that a "
+    "degradation took away counts in neither. Without test cameras images are not compared, since what is done to "
+    "training cameras would be done to what they are scored on. A surface is the largest component that meshing finds; "
+    "what floats beside it does not count."
 )
 
 Row = dict[str, Any]
@@ -35,20 +37,20 @@ def worst(result: Row, method: str, kind: str, strength: float) -> Row | None:
     stand for all."""
     found = [r for r in result["runs"] if r["method"] == method and r["kind"] == kind and r["strength"] == strength]
     good = [r for r in result["runs"] if r["method"] == method and r["kind"] == REFERENCE]
-    if all("psnr" not in r for r in good):
+    if all(r["verdict"] in BROKEN for r in good):
         found += good
     return max(found, key=lambda r: WORST_LAST.index(r["verdict"]), default=None)
 
 
 def breaking_strength(result: Row, method: str, kind: str) -> str:
-    """The mildest strength at which the worst seed fails or is refused, or how far it holds."""
+    """The mildest strength at which the worst seed fails or is refused, or how far it is known to hold."""
     strengths = result["plan"]["degradations"][kind]
     runs = [worst(result, method, kind, strength) for strength in strengths]
     for strength, run in zip(strengths, runs, strict=True):
-        if run and run["verdict"] in ("failed", "refused"):
+        if run and run["verdict"] in BROKEN:
             return f"{strength:g} ({run['verdict']})"
-    tried = [f"{strength:g}" for strength, run in zip(strengths, runs, strict=True) if run]
-    return f"holds to {tried[-1]}" if tried else "-"
+    held = [f"{s:g}" for s, run in zip(strengths, runs, strict=True) if run and run["verdict"] != "unscored"]
+    return f"holds to {held[-1]}" if held else "unscored" if any(runs) else "-"
 
 
 def as_markdown(result: Row, charts: Sequence[str]) -> str:
@@ -69,5 +71,13 @@ def _cells(run: Row) -> list[str]:
     kind = KINDS[run["kind"]].label if run["kind"] in KINDS else run["kind"]
     strength = "" if run["strength"] is None else f"{run['strength']:g}"
     verdict = f"{run['verdict']}: {run['reason']}" if run["reason"] else run["verdict"]
-    scores = [shown(run.get(key), f"{{:.{digits}f}}") for key, digits in (("psnr", 2), ("ssim", 3), ("chamfer_mm", 2))]
+    scores = [_compared(run, key, digits) for key, digits in (("psnr", 2), ("ssim", 3), ("chamfer_mm", 2))]
     return [run["method"], kind, strength, str(run["seed"]), verdict.replace("|", "/"), *scores]
+
+
+def _compared(run: Row, key: str, digits: int) -> str:
+    """A figure and, of a degraded run, how much it differs from the reference over the same images or surfaces."""
+    value = run.get(key)
+    if value is None or run["kind"] == REFERENCE:
+        return shown(value, f"{{:.{digits}f}}")
+    return f"{value:.{digits}f} ({value - run['reference'][key]:+.{digits}f})"

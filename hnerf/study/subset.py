@@ -33,14 +33,14 @@ def subset(
     capture: as ingested, its cameras in step. Test cameras stay. Frames keep their numbers, so that ground truth is
     found by them. CaptureError if a camera or frame is not one of the capture's, or nothing is left to train on.
     """
-    train_cameras = _chosen(capture, "training camera", cameras, capture.train_cameras)
+    train_cameras = chosen(capture, "training camera", cameras, capture.train_cameras)
     kept = dataclasses.replace(
         capture,
         root=out,
         cameras={name: capture.cameras[name] for name in (*train_cameras, *capture.test_cameras)},
         train_cameras=train_cameras,
-        train_frames=_chosen(capture, "training frame", train_frames, capture.train_frames),
-        novel_pose_frames=_chosen(capture, "novel-pose frame", novel_pose_frames, capture.novel_pose_frames),
+        train_frames=chosen(capture, "training frame", train_frames, capture.train_frames),
+        novel_pose_frames=chosen(capture, "novel-pose frame", novel_pose_frames, capture.novel_pose_frames),
     )
     if not kept.train_cameras or not kept.train_frames:
         raise CaptureError(f"{capture.name}: no training camera or frame would be left; keep one of each")
@@ -89,7 +89,8 @@ def copy_files(source: Path, target: Path, stems: Collection[str]) -> None:
             shutil.copyfile(path, target / path.name)
 
 
-def _chosen(capture: Capture, what: str, wanted: tuple[T, ...] | None, there_are: tuple[T, ...]) -> tuple[T, ...]:
+def chosen(capture: Capture, what: str, wanted: tuple[T, ...] | None, there_are: tuple[T, ...]) -> tuple[T, ...]:
+    """Those of a capture's that are wanted, in its order, None for all; CaptureError for one that it has not."""
     if wanted is None:
         return there_are
     for one in wanted:

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
-Word = Literal["ok", "degraded", "failed", "refused"]
-WORST_LAST: tuple[Word, ...] = ("ok", "degraded", "refused", "failed")
+Word = Literal["ok", "unscored", "degraded", "refused", "failed"]
+WORST_LAST: tuple[Word, ...] = ("ok", "unscored", "degraded", "refused", "failed")
+BROKEN: tuple[Word, ...] = ("refused", "failed")
 
 # 1 dB is a quarter more squared error, seen side by side and hardly otherwise; 6 dB is four times as much.
 DEGRADED_DB, FAILED_DB = 1.0, 6.0
@@ -21,13 +22,15 @@ class Verdict:
     reason: str = ""
 
 
-def judge(scores: dict[str, Any], reference: dict[str, Any], faults: list[str]) -> Verdict:
+def judge(scores: dict[str, Any] | None, reference: dict[str, Any], faults: list[str]) -> Verdict:
     """`scores` and `reference` hold psnr (dB) and chamfer_mm of the same images and surfaces, degraded and not, or None
-    where there is no truth, `reference` also empty_psnr, of an empty picture; faults: what is wrong with surfaces,
-    which is failure whatever the scores."""
+    where there is no truth, `reference` also empty_psnr, of an empty picture; `scores` is None where surfaces alone are
+    judged. faults: what is wrong with surfaces, which is failure whatever the scores."""
     if faults:
         return Verdict("failed", faults[0])
-    words: list[tuple[Word, str]] = [("ok", "")]
+    if scores is None:
+        return Verdict("ok")
+    words: list[tuple[Word, str]] = []
     if None not in (scores["psnr"], reference["psnr"]):
         if scores["psnr"] <= reference["empty_psnr"]:
             return Verdict("failed", "pictures are no better than empty ones")
@@ -37,6 +40,8 @@ def judge(scores: dict[str, Any], reference: dict[str, Any], faults: list[str]) 
     if None not in (scores["chamfer_mm"], reference["chamfer_mm"]):
         ratio = scores["chamfer_mm"] / reference["chamfer_mm"]
         words.append((_word(ratio, DEGRADED_RATIO, FAILED_RATIO), f"Chamfer distance times {ratio:.2f}"))
+    if not words:
+        return Verdict("unscored", "no image or surface is scored in both runs")
     worst = max((word for word, _ in words), key=WORST_LAST.index)
     return Verdict(worst, "; ".join(reason for word, reason in words if word == worst and word != "ok"))
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from flows import ablations as module
-from flows import run_page
+from flows import run_page, train_subject
 from flows.ablations import ablate, as_markdown, choose
 from flows.cli import main
 from hnerf.config import TrainingSettings, load_settings
@@ -37,6 +37,8 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainingSett
         if settings.losses.eikonal == 0:
             raise LostWorkerError("rank 0 was killed by SIGKILL")
         (tmp_path / "report.json").write_text('{"seconds": 61.7, "device": "abacus", "steps": 3}')
+        stored = {"static": True, "training": {"machinery": settings.machinery}}
+        (tmp_path / "settings.json").write_text(json.dumps(stored))
         return SimpleNamespace(root=tmp_path)
 
     def evaluate(*inputs: Any) -> Any:
@@ -46,7 +48,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainingSett
         return SimpleNamespace(root=tmp_path)
 
     for name in ("calibrate", "find_masks", "fit"):
-        monkeypatch.setattr(module, name, lambda *_: None)
+        monkeypatch.setattr(train_subject, name, lambda *_: None)
     monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path))
     monkeypatch.setattr(module, "read_capture", lambda *_: (None, None))
     monkeypatch.setattr(module.Capture, "load", lambda _: SimpleNamespace(name="ada"))
@@ -100,6 +102,13 @@ def test_what_is_off_or_unused_is_left_out() -> None:
         "no-segmentation",
     ]
     assert list(rows) == shown
+
+
+@pytest.mark.parametrize("preset", ["nerf", "idr", "neural-body", "nerfies"])
+def test_parts_of_h_nerf_are_left_out_of_other_methods(preset: str) -> None:
+    _, left_out = choose(load_settings(preset), ["no-root", "no-deformation"])
+    machinery = preset.replace("-", "_")
+    assert left_out == dict.fromkeys(["no-root", "no-deformation"], f"the {machinery} machinery has no such part")
 
 
 def test_an_override_counts_as_the_preset_but_not_against_the_ablation() -> None:
@@ -156,6 +165,15 @@ def test_a_row_that_fails_says_so_and_the_rest_go_on(stages: list[TrainingSettin
     assert [rows[name]["novel_view"]["psnr"] for name in ("full", "no-segmentation")] == [0.02, 0.0]
     assert rows["full"]["seconds"] == 61.7
     assert table.read_text() == as_markdown(result)
+
+
+def test_new_poses_are_not_scored_of_what_has_none(stages: list[TrainingSettings], tmp_path: Path) -> None:
+    """The paper's method on one moment."""
+    table = ablate.fn(tmp_path, "paper", tmp_path / "store", [], ["no-segmentation"])
+    rows = json.loads(table.with_suffix(".json").read_text())["rows"]
+    assert rows["full"]["novel_pose"] == {"reason": "H-NeRF's static network models one moment"}
+    assert "| full | 0.02 / - |" in table.read_text()
+    assert "No images of new poses: H-NeRF's static network models one moment." in table.read_text()
 
 
 def test_the_flow_runs_page_shows_the_table(

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from flows import benchmark as module
-from flows import run_page
+from flows import run_page, train_subject
 from flows.benchmark import benchmark
 from flows.cli import main
 from hnerf.config import TrainingSettings
@@ -65,7 +65,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
         return SimpleNamespace(root=folder)
 
     for name in ("calibrate", "find_masks", "fit"):
-        monkeypatch.setattr(module, name, lambda *_: None)
+        monkeypatch.setattr(train_subject, name, lambda *_: None)
     monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path, title="whole"))
     monkeypatch.setattr(module, "subset_capture", lambda _, recording, *parts: SimpleNamespace(title=str(parts)))
     monkeypatch.setattr(module, "read_capture", lambda *_: (None, None))
@@ -121,6 +121,41 @@ def test_a_method_that_fails_says_so_and_the_rest_go_on(
 
 
 @pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("stage", ["subset_capture", "score_training"])
+def test_a_method_that_cannot_be_given_its_part_or_scored_fails_alone(
+    stages: Stages, study: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str
+) -> None:
+    good = getattr(module, stage)
+
+    def broken(*inputs: Any) -> Any:
+        if stages[-1][1].machinery == "fast":
+            raise ValueError("the surface is empty")
+        return good(*inputs)
+
+    monkeypatch.setattr(module, stage, broken)
+    variants = read(benchmark.fn(tmp_path, study, store=tmp_path / "store"))["variants"]
+    assert variants["one frame"]["methods"]["fast"] == {"error": "the surface is empty"}
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_full_disk_ends_the_flow(stages: Stages, study: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def score_training(*_: Any) -> Any:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module, "score_training", score_training)
+    with pytest.raises(OSError, match="No space"):
+        benchmark.fn(tmp_path, study, store=tmp_path / "store")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_camera_that_the_capture_lacks_is_told_before_anything_is_trained(stages: Stages, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("title: t\nmethods: [fast]\nvariants: {two: {cameras: ['1', '9']}}")
+    found = read(benchmark.fn(tmp_path, str(tmp_path / "mine.yaml"), store=tmp_path / "store"))["variants"]
+    assert found["two"] == {"left_out": "ada: no training camera 9; there are 1, 2, 3, 4"}
+    assert stages == []
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_a_lost_worker_ends_the_flow_and_what_is_finished_stands(stages: Stages, study: str, tmp_path: Path) -> None:
     stages.fails["paper"] = LostWorkerError("rank 0 was killed by SIGKILL")
     with pytest.raises(LostWorkerError):
@@ -132,7 +167,7 @@ def test_a_lost_worker_ends_the_flow_and_what_is_finished_stands(stages: Stages,
 def test_the_command_prints_table_and_chart(
     stages: Stages, study: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = ["--study", study, "--methods", "demo", "--seconds", "8", "--store", str(tmp_path / "store")]
+    options = ["--study", study, "--methods", " demo", "--seconds", "8", "--store", str(tmp_path / "store")]
     assert main(["benchmark", str(tmp_path), *options]) == 0
     assert [settings.snapshots_s for _, settings in stages] == [(2.0, 4.0)] * 2
     shown = capsys.readouterr().out

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from flows import run_page
+from flows import run_page, train_subject
 from flows import stability as module
 from flows.cli import main
 from flows.stability import stability
@@ -52,7 +52,8 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
         trained.append({"recording": recording.name, "masks": masks.name, "body": body.name, "settings": settings})
         if masks.name == "mask_eroded 1":
             raise RuntimeError("rank 0 ended with exit code 1\nValueError: empty")
-        return made("model", report={"seconds": 60.0})
+        stored = {"static": recording.name == "frames_left 1", "training": {"machinery": settings.machinery}}
+        return made(f"model of {recording.name}", report={"seconds": 60.0}, settings=stored)
 
     def evaluate(_: Any, truth: Any, recording: Any, cameras: Any, masks: Any, body: Any, *rest: Any) -> Any:
         assert truth == ("of skirt 0.02" if recording.name == "skirt 0.02" else "true")
@@ -62,7 +63,8 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
         images = [{"camera": "c", "frame": f, "psnr": db, "ssim": 0.9, "empty_psnr": 18.0} for f, db in views.items()]
         surfaces = [{"frame": 1, "chamfer_mm": 6.0}, {"frame": 4, "chamfer_mm": 1.0}][: 1 + late]
         split = {"per_image": images, "geometry": {"per_surface": surfaces}}
-        return made("report", metrics={"protocol": "By eye.", "novel_view": None, "novel_pose": split})
+        view = {"per_image": [images[0] | {"frame": 0, "psnr": 40.0}], "geometry": None}
+        return made("report", metrics={"protocol": "By eye.", "novel_view": view, "novel_pose": split})
 
     def degrade(*inputs: Any) -> Any:
         return made(f"{inputs[-1].kind} {inputs[-1].strength:g}")
@@ -94,7 +96,9 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
         "show_in_extreme_poses": show,
     }
     for name, stage in replaced.items():
-        monkeypatch.setattr(module, name, stage)
+        for place in (module, train_subject):  # which `prepared` is of
+            if hasattr(place, name):
+                monkeypatch.setattr(place, name, stage)
     capture = SimpleNamespace(name="ada", test_cameras=("c",), novel_pose_frames=(1, 3, 4))
     monkeypatch.setattr(module.Capture, "load", lambda _: capture)
     (tmp_path / "mine.yaml").write_text(STUDY)
@@ -135,6 +139,9 @@ def test_runs_are_compared_by_the_images_and_surfaces_that_both_have(
     good, noisy = study(tmp_path, only=["image_noise"])["runs"][:2]
     assert (good["psnr"], good["images"], good["chamfer_mm"], good["surfaces"]) == (30.0, 2, 6.0, 1)
     assert (noisy["psnr"], noisy["images"], noisy["chamfer_mm"], noisy["surfaces"]) == (32.0, 1, 6.0, 1)
+    assert (noisy["reference"]["psnr"], noisy["reference"]["images"]) == (32.0, 1)
+    table = (tmp_path / "store" / "stability" / "ada-mine.md").read_text()
+    assert "| ok | 32.00 (+0.00) | 0.900 (+0.000) | 6.00 (+0.00) |" in table
 
 
 def test_the_flow_runs_page_shows_the_charts_themselves(
@@ -221,15 +228,97 @@ def test_what_the_machine_did_ends_the_command_and_finished_runs_stand(
     monkeypatch.setattr(module, "degrade_fit", degrade_fit)
     with pytest.raises(type(error)):
         study(tmp_path)
-    found = json.loads((tmp_path / "store" / "stability" / "ada-mine.json").read_text())
+    table = tmp_path / "store" / "stability" / "ada-mine.md"
+    found = json.loads(table.with_suffix(".json").read_text())
     assert [r["kind"] for r in found["runs"]] == ["as recorded", "image_noise", "image_noise", "skirt", "mask_eroded"]
+    assert "![ada-mine-matrix.png]" in table.read_text()
+
+
+def test_what_ends_the_first_run_leaves_an_earlier_study_as_it_was(
+    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def train(*_: Any) -> Any:
+        raise KeyboardInterrupt
+
+    earlier = study(tmp_path, only=["pose_noise"])
+    monkeypatch.setattr(module, "train", train)
+    with pytest.raises(KeyboardInterrupt):
+        study(tmp_path, only=["pose_noise"])
+    folder = tmp_path / "store" / "stability"
+    assert json.loads((folder / "ada-mine.json").read_text()) == earlier
+    assert "holds to 2" in (folder / "ada-mine.md").read_text()
+
+
+def test_a_chart_that_cannot_be_drawn_hides_nothing(
+    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def degrade_fit(*_: Any) -> Any:
+        raise LostWorkerError("rank 0 was killed")
+
+    def matrix_chart(*_: Any) -> None:
+        raise ValueError("no ink")
+
+    monkeypatch.setattr(module, "degrade_fit", degrade_fit)
+    monkeypatch.setattr(module, "matrix_chart", matrix_chart)
+    with pytest.raises(LostWorkerError):
+        study(tmp_path, only=["pose_noise"])
+
+
+def test_charts_of_an_earlier_call_go(stages: list[dict[str, Any]], tmp_path: Path) -> None:
+    """Poses of which nothing but the surface is judged have no curves."""
+    study(tmp_path, only=["pose_noise"])
+    study(tmp_path, only=["extreme_poses"])
+    charts = {path.name for path in (tmp_path / "store" / "stability").glob("*.png")}
+    assert charts == {"ada-mine-matrix.png"}
+
+
+def test_a_run_to_compare_with_that_fails_is_kept_and_ends_its_seed(
+    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torn = SimpleNamespace(root=tmp_path / "torn")
+    torn.root.mkdir()
+    (torn.root / "surface.json").write_text(json.dumps({"000001": {"fault": "surface is not watertight"}}))
+    monkeypatch.setattr(module, "check_meshes", lambda *_: torn)
+    table = study(tmp_path, only=["pose_noise"])
+    told = [(r["kind"], r["seed"], r["verdict"], r["reason"]) for r in table["runs"]]
+    assert told == [("as recorded", seed, "failed", "surface is not watertight") for seed in (0, 1)]
+    text = (tmp_path / "store" / "stability" / "ada-mine.md").read_text()
+    assert "| pose noise, ° a joint | 2 (failed) |" in text
+
+
+def test_what_has_no_new_poses_is_judged_on_new_views(
+    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nerfies has none at all; the paper's method has none of one frame, and then nothing in common with the others."""
+    torn = SimpleNamespace(root=tmp_path / "torn")
+    torn.root.mkdir()
+    (torn.root / "surface.json").write_text(json.dumps({"000001": {"fault": "surface is not watertight"}}))
+    (tmp_path / "mine.yaml").write_text(
+        "methods: [nerfies, paper]\nseeds: [0]\ndegradations: {frames_left: [2, 1], extreme_poses: [45]}"
+    )
+    good = module.check_meshes
+    monkeypatch.setattr(
+        module, "check_meshes", lambda *inputs: torn if stages[-1]["settings"].machinery == "nerfies" else good(*inputs)
+    )
+    found = study(tmp_path)
+    told = [(r["method"], r["kind"], r["strength"], r["verdict"], r.get("psnr")) for r in found["runs"]]
+    assert told == [
+        ("nerfies", "as recorded", None, "ok", 40.0),
+        ("nerfies", "frames_left", 2, "ok", 40.0),
+        ("nerfies", "frames_left", 1, "ok", 40.0),
+        ("paper", "as recorded", None, "ok", 30.0),
+        ("paper", "frames_left", 2, "ok", 30.0),
+        ("paper", "frames_left", 1, "unscored", None),
+        ("paper", "extreme_poses", 45, "ok", None),
+    ]
+    assert any("Nerfies has no pose to set" in reason for reason in found["left_out"])
 
 
 def test_the_command_prints_the_table(
     stages: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = ["--study", str(tmp_path / "mine.yaml"), "--store", str(tmp_path / "store"), "--only", "pose_noise"]
-    assert main(["stability", str(tmp_path), "--methods", "fast,paper", *options]) == 0
+    assert main(["stability", str(tmp_path), "--methods", "fast, paper", *options]) == 0
     shown = capsys.readouterr().out
     assert "| pose noise, ° a joint | holds to 2 | holds to 2 |" in shown
     assert f"table: {tmp_path / 'store' / 'stability' / 'ada-mine.md'}" in shown

@@ -10,7 +10,7 @@ from hnerf.config import load_settings
 from hnerf.errors import CaptureError
 from hnerf.study.plan import STUDIES, Study, Variant, load_study, snapshot_times_s
 
-RECORDED: Any = SimpleNamespace(train_cameras=("a", "b", "c", "d"), train_frames=(0, 2, 4, 6, 8))
+RECORDED: Any = SimpleNamespace(name="ada", train_cameras=("a", "b", "c", "d"), train_frames=(0, 2, 4, 6, 8))
 
 
 def write(folder: Path, text: str) -> str:
@@ -67,6 +67,13 @@ def test_more_than_was_recorded_is_refused() -> None:
         Variant(cameras=8).parts(RECORDED)
     with pytest.raises(CaptureError, match="the capture has 5 training frames, not 6"):
         Variant(frames=6).parts(RECORDED)
+
+
+def test_names_that_were_not_recorded_are_refused() -> None:
+    with pytest.raises(CaptureError, match="ada: no training camera e; there are a, b, c, d"):
+        Variant(cameras=("a", "e")).parts(RECORDED)
+    with pytest.raises(CaptureError, match="ada: no training frame 3; there are 0, 2, 4, 6, 8"):
+        Variant(frames=(3,)).parts(RECORDED)
 
 
 def test_snapshots_halve_the_limit_or_double_from_a_quarter_minute() -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from hnerf.evaluation.evaluate import MEANS
 from hnerf.study import charts
-from hnerf.study.publish import publish
+from hnerf.study.publish import picture_rows, publish
 from hnerf.study.results import (
     as_csv,
     as_markdown,
@@ -158,12 +158,37 @@ def test_captions_name_limit_and_machine() -> None:
     assert caption(result(variants={})).endswith("on no machine yet.")
 
 
-def test_everything_is_published_and_old_charts_go(tmp_path: Path) -> None:
+def write_pictures(store: Path) -> None:
+    """What the methods pictured."""
     for name, grey in (("f", 200), ("n", 90)):
         for kind in ("render", "truth"):
-            path = tmp_path / "scoring" / name / "pictures" / f"0-{kind}.png"
+            path = store / "scoring" / name / "pictures" / f"0-{kind}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(path), np.full((40, 30, 3), grey, np.uint8))
+
+
+def test_methods_that_were_scored_on_other_images_are_published(tmp_path: Path) -> None:
+    write_pictures(tmp_path)
+    several = result()
+    methods = several["variants"]["4 cameras"]["methods"]
+    other = {"camera": "c", "frame": 2}
+    methods["nerf"] |= {"pictures": [other], "novel_view": split(26.0) | {"per_image": [other | {"psnr": 26.0}]}}
+    rows = picture_rows("4 cameras", several["variants"]["4 cameras"], tmp_path)
+    assert [(title, [name for name, _ in row]) for title, row in rows] == [
+        ("4 cameras: frame 0, camera c", ["truth", "fast, 30.0 dB"]),
+        ("4 cameras: frame 2, camera c", ["truth", "nerf, 26.0 dB"]),
+    ]
+
+
+def test_curves_without_a_figure_at_their_end_have_no_front(tmp_path: Path) -> None:
+    nothing = scores(30.0, 0.5, "") | {"pictures": []}
+    nothing["novel_view"] |= {"psnr": None, "per_image": []}
+    publish(result(sweep=None, variants={"all": {"cameras": 4, "frames": 1, "methods": {"fast": nothing}}}), tmp_path)
+    assert (tmp_path / "benchmark" / "ada-toy.png").exists()
+
+
+def test_everything_is_published_and_old_charts_go(tmp_path: Path) -> None:
+    write_pictures(tmp_path)
     table = publish(result(), tmp_path)
     assert table == tmp_path / "benchmark" / "ada-toy.md"
     names = {path.name for path in table.parent.iterdir()}

@@ -17,7 +17,7 @@ from hnerf.evaluation.views import View
 from hnerf.render.avatar import Rendering
 from hnerf.study import scoring
 from hnerf.study.plan import ScoringSettings
-from hnerf.study.scoring import Scene, frame_seconds, score, why_no_novel_poses, write_pictures
+from hnerf.study.scoring import Scene, frame_seconds, score, score_at, why_no_novel_poses, write_pictures
 from tests.evaluation.ball import (
     PHOTOGRAPHED,
     RADIUS_M,
@@ -149,14 +149,27 @@ def test_a_method_without_poses_has_a_reason_instead_of_figures(tmp_path: Path) 
     assert found["novel_view"]["n"] == 3
 
 
-def test_who_has_no_novel_poses() -> None:
+def test_who_has_no_novel_poses(tmp_path: Path) -> None:
     def reason(machinery: str, static: bool) -> str | None:
-        return why_no_novel_poses({"static": static, "training": {"machinery": machinery}})
+        stored = {"static": static, "training": {"machinery": machinery}}
+        (tmp_path / "settings.json").write_text(json.dumps(stored))
+        return why_no_novel_poses(tmp_path)
 
     assert [reason(name, False) for name in ("fast", "paper", "neural_body")] == [None] * 3
     assert reason("fast", True) is None
     assert re.match("H-NeRF's static network", reason("paper", True) or "")
     assert re.match("Nerfies has no pose", reason("nerfies", False) or "")
+
+
+def test_images_are_chosen_of_those_whose_truth_is_known(tmp_path: Path) -> None:
+    """Of three frames the middle one alone has a mask, and one image is asked for."""
+    capture = write_ball_capture(tmp_path, "ball", ("c",))
+    write_ball_truth(capture, RADIUS_M)
+    for frame in (0, 2):
+        (tmp_path / "ground_truth" / "masks" / "c" / f"{frame:06d}.png").unlink()
+    scene = Scene(capture, GroundTruth(tmp_path, capture), "cpu")
+    found = score_at(scene, GreyBall(102), "novel_view", 1, 0, tmp_path)
+    assert [row["frame"] for row in found["per_image"]] == [1]
 
 
 def test_a_frame_is_timed_at_its_longest_side() -> None:

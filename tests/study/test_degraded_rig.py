@@ -6,7 +6,7 @@ import pytest
 
 from hnerf.capture.capture import Capture
 from hnerf.errors import CaptureError, NotPossibleError
-from hnerf.study.degrade import Degradation, check_strengths, degrade_capture
+from hnerf.study.degrade import KINDS, Degradation, check_strengths, degrade_capture
 from tests.study.recording import FRAMES, write_recording
 
 
@@ -63,6 +63,12 @@ def test_a_late_camera_shows_what_it_saw_before(tmp_path: Path) -> None:
     assert list(keypoints.values()) == [[2, 4, 6, 8, 10]] * 2
 
 
+@pytest.mark.parametrize("frames", [0.4, 5])
+def test_a_delay_that_no_frame_shows_cannot_be_tried(tmp_path: Path, frames: float) -> None:
+    with pytest.raises(NotPossibleError, match=f"ada: has 5 frames; none can be {frames:g} late"):
+        degraded(tmp_path, "camera_out_of_step", frames)
+
+
 def test_seeds_differ_and_repeat(tmp_path: Path) -> None:
     cameras = [degraded(tmp_path / f"{k}", "camera_turned", 1, seed).cameras for k, seed in enumerate((0, 0, 1))]
     turns = [np.stack([camera.R for camera in rig.values()]) for rig in cameras]
@@ -70,11 +76,40 @@ def test_seeds_differ_and_repeat(tmp_path: Path) -> None:
     assert not np.allclose(turns[0], turns[2])
 
 
-@pytest.mark.parametrize("strengths", [(), (1.0, 3.0, 2.0), (1.0, 1.0), (0.0, 1.0), (float("nan"),)])
+@pytest.mark.parametrize("strengths", [(), (1.0, 3.0, 2.0), (1.0, 1.0), (0.0, 1.0), (float("nan"),), (float("inf"),)])
 def test_strengths_go_one_way(strengths: tuple[float, ...]) -> None:
-    with pytest.raises(CaptureError, match="degradation mask_holes: give strengths above 0, the mildest first"):
+    with pytest.raises(CaptureError, match="mask_holes: give numbers between 0 and 100 that rise, the mildest first"):
         check_strengths("mask_holes", strengths)
+
+
+@pytest.mark.parametrize(
+    ("kind", "strengths", "told"),
+    [
+        ("cameras_left", (1, 2, 3), "whole numbers between 1 and inf that fall"),
+        ("cameras_left", (0.5,), "whole numbers between 1 and inf that fall"),
+        ("frames_left", (2.5, 1), "whole numbers between 1 and inf that fall"),
+        ("camera_out_of_step", (0.4,), "whole numbers between 0 and inf that rise"),
+        ("small_images", (0.1, 0.5), "numbers between 0 and 1 that fall"),
+        ("small_images", (1.5, 0.5), "numbers between 0 and 1 that fall"),
+        ("large_images", (0.9, 0.5), "numbers between 1 and inf that rise"),
+        ("learning_rate_down", (0.03, 0.5), "numbers between 0 and 1 that fall"),
+        ("learning_rate_up", (1, 3), "numbers between 1 and inf that rise"),
+        ("mask_limb", (50, 120), "numbers between 0 and 100 that rise"),
+    ],
+)
+def test_each_kind_has_its_way_and_bounds(kind: str, strengths: tuple[float, ...], told: str) -> None:
+    with pytest.raises(CaptureError, match=f"degradation {kind}: give {told}, the mildest first"):
+        check_strengths(kind, strengths)
+
+
+def test_bounds_that_can_be_reached_are_strengths() -> None:
     check_strengths("cameras_left", (3, 2, 1))
+    check_strengths("mask_limb", (10, 100))
+
+
+def test_kinds_are_told_apart_by_their_labels() -> None:
+    labels = [kind.label for kind in KINDS.values()]
+    assert len(set(labels)) == len(labels)
 
 
 def test_unknown_degradations_are_refused() -> None:

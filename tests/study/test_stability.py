@@ -72,7 +72,8 @@ def run(method: str, kind: str, strength: float | None, seed: int, verdict: str,
     """A row; one without figures where there is no PSNR and the verdict is not good."""
     row = {"method": method, "kind": kind, "strength": strength, "seed": seed, "verdict": verdict, "reason": ""}
     if verdict in ("ok", "degraded"):
-        return row | {"psnr": psnr, "ssim": 0.9, "chamfer_mm": None if psnr is None else 36 - psnr}
+        good = {"psnr": 30.0 + seed, "ssim": 0.9, "chamfer_mm": 6.0 - seed}
+        return row | {"psnr": psnr, "ssim": 0.9, "chamfer_mm": None if psnr is None else 36 - psnr, "reference": good}
     return row | {"reason": "too | bad"}
 
 
@@ -112,6 +113,20 @@ def test_a_seed_without_a_good_run_says_nothing_of_the_others() -> None:
     assert breaking_strength(result, "fast", "mask_holes") == "-"
 
 
+def test_nothing_is_said_to_hold_of_which_nothing_is_known() -> None:
+    good = run("fast", "as recorded", None, 0, "unscored", None)
+    unknown = RESULT | {"runs": [good, run("fast", "pose_noise", 1, 0, "unscored", None)]}
+    assert breaking_strength(unknown, "fast", "pose_noise") == "unscored"
+    partly = RESULT | {"runs": [*RESULT["runs"][:4], run("fast", "pose_noise", 2, 0, "unscored", None)]}  # type: ignore[index]
+    assert breaking_strength(partly, "fast", "pose_noise") == "holds to 1"
+
+
+def test_a_failed_run_to_compare_with_stands_for_all() -> None:
+    """It has figures, too: pictures that are no better than empty ones."""
+    failed = run("fast", "as recorded", None, 0, "ok", 10.0) | {"verdict": "failed"}
+    assert breaking_strength(RESULT | {"runs": [failed]}, "fast", "pose_noise") == "1 (failed)"
+
+
 def test_the_tables_by_hand() -> None:
     lines = as_markdown(RESULT, ["a (b).png"]).splitlines()
     start = lines.index("## Where each method breaks")
@@ -125,7 +140,10 @@ def test_the_tables_by_hand() -> None:
         "",
         "## Runs",
     ]
-    assert "| fast | pose noise, ° a joint | 2 | 0 | degraded | 27.00 | 0.900 | 9.00 |" in lines
+    assert (
+        "| fast | pose noise, ° a joint | 2 | 0 | degraded | 27.00 (-3.00) | 0.900 (+0.000) | 9.00 (+3.00) |" in lines
+    )
+    assert "| fast | as recorded |  | 1 | ok | 31.00 | 0.900 | 5.00 |" in lines
     assert "| fast | pose noise, ° a joint | 2 | 1 | failed: too / bad | - | - | - |" in lines
     assert "- hats" in lines
     assert lines[-1] == "By eye."

@@ -18,7 +18,7 @@ GOOD = {"psnr": 30.0, "chamfer_mm": 6.0, "empty_psnr": 18.0}
         (28.0, 24.0, "failed: Chamfer distance times 4.00"),
         (float("nan"), 6.0, "failed: nan dB of PSNR lost"),
         (None, 6.0, "ok"),
-        (None, None, "ok"),
+        (None, None, "unscored: no image or surface is scored in both runs"),
     ],
 )
 def test_the_worse_of_both_figures_counts(psnr: float | None, chamfer_mm: float | None, told: str) -> None:
@@ -40,3 +40,10 @@ def test_a_good_run_is_judged_too() -> None:
 
 def test_a_surface_that_is_no_persons_is_failure_whatever_the_scores() -> None:
     assert judge(GOOD, GOOD, ["no surface", "a hole"]) == Verdict("failed", "no surface")
+    unknown = {"psnr": None, "chamfer_mm": None}
+    assert judge(unknown, unknown, ["no surface"]) == Verdict("failed", "no surface")
+
+
+def test_surfaces_alone_are_judged_where_nothing_is_to_be_compared() -> None:
+    assert judge(None, {}, []) == Verdict("ok")
+    assert judge(None, {}, ["no surface"]) == Verdict("failed", "no surface")
