@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 import torch
 from scipy.ndimage import map_coordinates
-from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 from skimage.measure import find_contours
 
 from hnerf.body.articulation import Articulation, Pose, PosedJoints
+from hnerf.body.descriptor import normals_of
 from hnerf.body.keypoint_fit import Problem, project
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.capture.camera import Camera
@@ -147,7 +147,7 @@ def refine(
 ) -> Pose:
     """Gauss-Newton steps on outlines and keypoints, matched anew before each. edges: by frame and camera, None without
     a mask; up: the world's vertical axis, used with one camera only."""
-    surface = Surface(pose.rig.faces.numpy(), len(pose.rig.vertices_m))
+    faces = pose.rig.faces.numpy()
     for step in range(steps):
         articulation = Articulation(pose.rig)
         joints = articulation.pose(pose)
@@ -155,9 +155,9 @@ def refine(
         residuals = []
         for t, row in enumerate(edges):
             vertices_m = articulation.surface(joints, t).numpy()
-            normals = surface.normals(vertices_m)
+            normals = normals_of(vertices_m, faces)
             found = [
-                match(camera, edge, float(scale_m[t]), vertices_m, normals, surface.faces, weights)
+                match(camera, edge, float(scale_m[t]), vertices_m, normals, faces, weights)
                 for camera, scale_m, edge in zip(problem.seen.cameras, problem.scale_m, row, strict=True)
                 if edge is not None
             ]
@@ -194,18 +194,3 @@ def _add_rows(
     equations.shared[shape, shape] += weighted_s.T @ s
     equations.frame_gradient[frame] += weighted_j.T @ rows.residual_m
     equations.shared_gradient[shape] += weighted_s.T @ rows.residual_m
-
-
-class Surface:
-    """Faces (F, 3) of V vertices, ready for normals."""
-
-    def __init__(self, faces: np.ndarray, vertices: int) -> None:
-        self.faces = faces
-        rows, columns = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
-        self.sums = csr_matrix((np.ones(len(rows)), (rows, columns)), (vertices, len(faces)))
-
-    def normals(self, vertices_m: np.ndarray) -> np.ndarray:
-        """Area-weighted unit normals (V, 3)."""
-        a, b, c = (vertices_m[self.faces[:, k]] for k in range(3))
-        normals = self.sums @ np.cross(b - a, c - a)
-        return normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12)

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture, write_image
-from hnerf.capture.performer.dressed import vertex_normals
 from hnerf.capture.performer.render import Caster, Hits, dome_lights, irradiance, render_person
 from hnerf.evaluation.ground_truth import ON_BLACK, GroundTruth
 from hnerf.study.occluder import UP
@@ -83,7 +83,7 @@ class Shown:
         directions, strength = dome_lights()
         if up == "y":
             directions = directions[:, [0, 2, 1]] * [1, 1, -1]
-        normals = vertex_normals(vertices_m, faces)
+        normals = normals_of(vertices_m, faces)
         visible = both.visibility(vertices_m + 3e-3 * normals, directions)
         light = irradiance(normals, visible, (directions, strength))
         return Shown(vertices_m, faces, (worn.colours * light[:, None]).clip(0, 1), both)

@@ -1,6 +1,7 @@
 import numpy as np
 
-from hnerf.body.contour_fit import ContourWeights, Surface, match, outline
+from hnerf.body.contour_fit import ContourWeights, match, outline
+from hnerf.body.descriptor import normals_of
 from tests.body.recorded_body import ring_camera
 
 WEIGHTS = ContourWeights(inside_m=0.01, outside_m=0.02, clothing_m=0.1, spacing_m=0.01)
@@ -39,7 +40,7 @@ def test_an_outline_runs_between_the_pixels_and_points_outwards() -> None:
 def test_normals_point_out_of_a_ball() -> None:
     vertices, faces = ball(1.0, 0.0)
     equator = np.abs(vertices[:, 2]) < 0.5
-    normals = Surface(faces, len(vertices)).normals(vertices)
+    normals = normals_of(vertices, faces)
     np.testing.assert_allclose(normals[equator], vertices[equator], atol=0.03)
 
 
@@ -47,7 +48,7 @@ def test_a_body_too_small_is_pulled_outwards_and_one_too_large_is_pushed_in() ->
     """A ball of 0.2 m at 3 m, 281.6 px focal length, looks 18.8 px large; the masks are 5 px larger and smaller."""
     camera = ring_camera("a", 0.3)
     vertices, faces = ball(0.2, 1.0)
-    normals = Surface(faces, len(vertices)).normals(vertices)
+    normals = normals_of(vertices, faces)
     scale_m = 3 / 281.6
     seen_px = 281.6 * 0.2 / np.sqrt(3**2 - 0.2**2)
     for grow_px, sigma_m in ((5, 0.02), (-5, 0.01)):
@@ -66,5 +67,5 @@ def test_a_body_that_fills_its_mask_is_left_alone() -> None:
     camera = ring_camera("a", 0.3)
     vertices, faces = ball(0.2, 1.0)
     edge = outline(disc(281.6 * 0.2 / np.sqrt(3**2 - 0.2**2)), 1.0)
-    rows = match(camera, edge, 3 / 281.6, vertices, Surface(faces, len(vertices)).normals(vertices), faces, WEIGHTS)
+    rows = match(camera, edge, 3 / 281.6, vertices, normals_of(vertices, faces), faces, WEIGHTS)
     assert np.abs(rows.residual_m).max() < 1.0 * 3 / 281.6

@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from hnerf.body.anny import anny_rig
+from hnerf.body.descriptor import normals_of
 from hnerf.body.rig import Rig, joint_transforms, pose_vertices
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import write_image
 from hnerf.capture.formats.easymocap import write_easymocap
 from hnerf.capture.lens import pinhole
 from hnerf.capture.performer.detect import detect
-from hnerf.capture.performer.dressed import Dressed, midpoints, vertex_normals
+from hnerf.capture.performer.dressed import Dressed, midpoints
 from hnerf.capture.performer.look import FACE
 from hnerf.capture.performer.motion import Pose, walk_pose
 from hnerf.capture.performer.render import (
@@ -123,7 +124,7 @@ def _instant(dressed: Dressed, pose: Pose) -> Instant:
     root[2, 3] -= float(dressed.posed_m(pose.theta, root, pose.gait_phase)[:, 2].min())
     vertices_m = dressed.posed_m(pose.theta, root, pose.gait_phase)
     lights, caster = dome_lights(), Caster(vertices_m, dressed.faces)
-    normals = vertex_normals(vertices_m, dressed.faces)
+    normals = normals_of(vertices_m, dressed.faces)
     # Shadows are soft: it is enough to look from the body's own vertices, not from all that refinement added.
     body = slice(len(vertices_m) - len(dressed.edges))
     visible = midpoints(caster.visibility(vertices_m[body] + 3e-3 * normals[body], lights[0]), dressed.edges)
