@@ -15,8 +15,9 @@ import numpy as np
 from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture, write_image
-from hnerf.capture.performer.render import Caster, Hits, dome_lights, irradiance, render_person
+from hnerf.capture.performer.render import Caster, dome_lights, irradiance, render_person
 from hnerf.evaluation.ground_truth import ON_BLACK, GroundTruth
+from hnerf.render.rays import RayHits
 from hnerf.study.occluder import UP
 from hnerf.study.subset import copy_files, write_arrays
 
@@ -88,12 +89,12 @@ class Shown:
         light = irradiance(normals, visible, (directions, strength))
         return Shown(vertices_m, faces, (worn.colours * light[:, None]).clip(0, 1), both)
 
-    def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> Hits:
+    def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> RayHits:
         """First hits of rays from one origin (3,) along unit directions (N, 3); none where the body comes first."""
         hits = self.both.cast(origin_m, directions)
         return dataclasses.replace(hits, face=np.where(hits.face < len(self.faces), hits.face, -1))
 
-    def colours(self, hits: Hits) -> np.ndarray:
+    def colours(self, hits: RayHits) -> np.ndarray:
         """Lit colours in [0, 1] of those rays that hit, (M, 3)."""
         return hits.interpolate(self.colour, self.faces)
 
