@@ -44,9 +44,7 @@ class Dressed:
     def on(rig: Rig, rng: np.random.Generator) -> "Dressed":
         """Dress a rest body; `rng` chooses where the folds lie."""
         body_m, body_faces = rig.vertices_m.double().numpy(), rig.faces.numpy()
-        weights = np.zeros((len(body_m), len(rig.joint_names)))
-        rows = np.arange(len(body_m))[:, None]
-        np.add.at(weights, (rows, rig.skin_joints.numpy()), rig.skin_weights.double().numpy())
+        weights = rig.dense_weights.double().numpy()
         depths_m = _garment_depths(rig, body_m, weights)
         average = _averaging(body_faces, len(body_m))
         loose = _smoothstep(depths_m[:, 1:4].max(1) / 0.06)[:, None]
