@@ -18,7 +18,6 @@ from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.performer.render import Caster, dome_lights, irradiance, render_person
 from hnerf.evaluation.ground_truth import ON_BLACK, GroundTruth
 from hnerf.render.rays import RayHits
-from hnerf.study.occluder import UP
 from hnerf.study.subset import copy_files, write_arrays
 
 Rng = np.random.Generator
@@ -138,7 +137,8 @@ def put_on(
     known to be true. Keypoints stay: detectors guess what cloth hides. Board footage is left out."""
     bodies_m, faces = body.vertices_m().double().numpy(), body.rig.faces.numpy()
     rows = [body.index(frame) for frame in capture.frames]
-    worn = WORN[kind](body.rig.keypoint_weights.double().numpy() @ bodies_m[rows], UP[capture.up], strength, rng)
+    keypoints_m = body.rig.keypoint_weights.double().numpy() @ bodies_m[rows]
+    worn = WORN[kind](keypoints_m, np.eye(3)["xyz".index(capture.up)], strength, rng)
     kept = dataclasses.replace(capture, root=out, frame_offsets={}, stored_frames=(), recorded_lenses={})
     write_arrays(capture, kept)
     for row, frame in enumerate(capture.frames):
