@@ -8,7 +8,6 @@ import numpy as np
 
 from hnerf.capture.bars import Area, fitted, picture_area
 from hnerf.capture.boards import normalised_corners, read_board_footage
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.capture.footage import Footage
 from hnerf.capture.formats.caliscope import Caliscope
@@ -23,7 +22,7 @@ from hnerf.capture.keypoint_files import read_openpose, read_results
 from hnerf.capture.keypoint_sets import to_body_25
 from hnerf.capture.lens import Lens
 from hnerf.capture.normalise import Normaliser
-from hnerf.capture.notes import Notes, capture_name, chosen_cameras, chosen_frames, read_notes
+from hnerf.capture.notes import capture_name, chosen_cameras, chosen_frames, read_notes
 from hnerf.capture.timing import usual_step
 from hnerf.config import CaptureSettings
 from hnerf.errors import CaptureError
@@ -90,7 +89,10 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
     capture = Capture(
         name=subject,
         root=out,
-        cameras={name: _in_metres(n.camera, notes) for name, n in normalisers.items()},
+        cameras={
+            name: dataclasses.replace(n.camera, t_m=n.camera.t_m * notes.metres_per_unit)
+            for name, n in normalisers.items()
+        },
         train_cameras=tuple(cameras.train),
         test_cameras=tuple(cameras.test),
         train_frames=tuple(frames.train),
@@ -155,7 +157,7 @@ def _write_pixels(
     assert normaliser is not None  # a split has at least one training frame
     plate = layout.plate_file(lens.name)
     if plate:
-        normaliser.write_plate(plate, out / "background" / lens.name)
+        normaliser.write_image(read_image(plate), plate, plate, out / "background" / lens.name)
     return normaliser
 
 
@@ -229,7 +231,3 @@ def _while_somebody_is_there(people: list[np.ndarray], frames: tuple[int, ...]) 
         if empty:
             log.warning("frames %d to %d left out: %s", empty[0], empty[-1], why)
     return frames[seen[0] : seen[-1] + 1]
-
-
-def _in_metres(camera: Camera, notes: Notes) -> Camera:
-    return dataclasses.replace(camera, t_m=camera.t_m * notes.metres_per_unit)
