@@ -114,11 +114,11 @@ def _trials(name: str, trials: int, untouched: int) -> list[dict[str, Any]]:
         whole = ingest(SHARED / "data" / name, CaptureSettings(), Path(folder) / "whole")
         with np.load(SHARED / "data" / name / "ground_truth" / "joints.npz", allow_pickle=False) as stored:
             truth_m = stored["positions"][:, :25].astype(np.float64)
-        outlines, matches = Outlines.of(whole, CalibrationSettings()), Matches.of(whole)
+        outlines, matches = Outlines.of(whole), Matches.of(whole)
         for seed, (what, fault) in enumerate(schedule):
             trial = Trial(whole, truth_m, fault, seed, Path(folder) / f"{seed}")
             with (
-                mock.patch.object(Outlines, "of", lambda capture, settings: outlines),
+                mock.patch.object(Outlines, "of", lambda capture: outlines),
                 mock.patch.object(Matches, "of", lambda capture: matches),
             ):
                 done.append({"fault": what, "seed": seed, **trial.run()})

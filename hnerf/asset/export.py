@@ -43,12 +43,12 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
     with _timed("mesh", seconds):
         surface = simplified(dense, settings.faces)
         layout = unwrap(surface.vertices, surface.faces, settings.texture_px)
-        rig = dressed_rig(avatar.body.rig.to("cpu"), surface, layout)
+        rig = dressed_rig(avatar.body.rig.to("cpu"), surface)
     with _timed("texture", seconds):
         posed = _dressed_body(avatar.body, rig, tuple(spread(capture.train_frames, settings.texture_poses)))
         texture = bake(avatar, posed, layout, settings.texture_px)
     with _timed("files", seconds):
-        staged = stage_avatar(_dressed_body(avatar.body, rig, capture.frames), texture, capture.up)
+        staged = stage_avatar(_dressed_body(avatar.body, rig, capture.frames), layout, texture, capture.up)
         cameras = list(capture.cameras.values())
         write_skinned(out / "avatar.usdz", staged, cameras, capture.fps)
         write_cache(out / "avatar_cache.usdz", staged, cameras, capture.fps)

@@ -5,10 +5,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pygltflib as gltf
-import torch
 
 from hnerf.asset.staging import StagedAvatar
-from hnerf.body.descriptor import vertex_normals
+from hnerf.body.descriptor import normals_of
 
 COMPONENT_TYPES = {"float32": gltf.FLOAT, "uint16": gltf.UNSIGNED_SHORT, "uint32": gltf.UNSIGNED_INT}
 SHAPES = {(): gltf.SCALAR, (2,): gltf.VEC2, (3,): gltf.VEC3, (4,): gltf.VEC4, (4, 4): gltf.MAT4}
@@ -81,8 +80,7 @@ def _primitive(writer: GlbWriter, avatar: StagedAvatar) -> gltf.Primitive:
     """Vertices are split where the texture has a seam; influences beyond four go into a second set."""
     vertex = np.zeros(len(avatar.uvs), np.int64)
     vertex[avatar.face_uvs] = avatar.faces
-    points = torch.from_numpy(avatar.rest_points_m)
-    normals = vertex_normals(points, torch.from_numpy(avatar.faces)).numpy()
+    normals = normals_of(avatar.rest_points_m, avatar.faces)
     attributes = gltf.Attributes(
         POSITION=_vertex_data(writer, avatar.rest_points_m[vertex], np.float32),
         NORMAL=_vertex_data(writer, normals[vertex], np.float32),

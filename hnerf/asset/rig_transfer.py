@@ -6,7 +6,6 @@ import torch
 import trimesh
 from torch import Tensor
 
-from hnerf.asset.texture import UvLayout
 from hnerf.body.descriptor import BodyMeshes
 from hnerf.body.rig import Rig
 
@@ -15,7 +14,7 @@ SMOOTHING_PASSES = 4
 REACH_M = 10.0  # nothing of a person is further from the body than this
 
 
-def dressed_rig(rig: Rig, surface: trimesh.Trimesh, layout: UvLayout) -> Rig:
+def dressed_rig(rig: Rig, surface: trimesh.Trimesh) -> Rig:
     """The same joints under a surface in the rest pose. Shape is frozen (no basis left), and it has no keypoints."""
     vertices_m = torch.from_numpy(surface.vertices).float()
     faces = torch.from_numpy(surface.faces).long()
@@ -24,8 +23,6 @@ def dressed_rig(rig: Rig, surface: trimesh.Trimesh, layout: UvLayout) -> Rig:
         rig,
         vertices_m=vertices_m,
         faces=faces,
-        uvs=torch.from_numpy(layout.uvs),
-        face_uvs=torch.from_numpy(layout.face_uvs),
         beta=rig.beta[:0],
         beta_names=(),
         shape_basis=torch.zeros(0, len(vertices_m), 3),

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from hnerf.asset.texture import UvLayout
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import joint_transforms
 
@@ -46,7 +47,7 @@ class StagedAvatar:
         return self.rest_joints_m - above
 
 
-def stage_avatar(dressed: BodyFit, texture: np.ndarray, up: str) -> StagedAvatar:
+def stage_avatar(dressed: BodyFit, layout: UvLayout, texture: np.ndarray, up: str) -> StagedAvatar:
     """Turn a dressed body (see `dressed_rig`) and its motion to Y up. `up`: the vertical axis of the world, "y" or "z".
 
     The body frame is Z up whatever the world is. With W stage from world, B stage from body and G_j the world transform
@@ -63,8 +64,8 @@ def stage_avatar(dressed: BodyFit, texture: np.ndarray, up: str) -> StagedAvatar
     return StagedAvatar(
         rest_points_m=rig.vertices_m.double().numpy() @ body.T,
         faces=rig.faces.numpy(),
-        uvs=rig.uvs.double().numpy(),
-        face_uvs=rig.face_uvs.numpy(),
+        uvs=layout.uvs.astype(np.float64),
+        face_uvs=layout.face_uvs,
         skin_joints=rig.skin_joints.numpy(),
         skin_weights=rig.skin_weights.double().numpy(),
         joint_names=rig.joint_names,

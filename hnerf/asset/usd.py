@@ -8,11 +8,10 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-import torch
 from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, Vt
 
 from hnerf.asset.staging import StagedAvatar
-from hnerf.body.descriptor import vertex_normals
+from hnerf.body.descriptor import normals_of
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import write_image
 
@@ -32,7 +31,7 @@ def write_skinned(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], f
         mesh = _define_mesh(stage, body.GetPath().AppendChild("Surface"), avatar)
         mesh.CreatePointsAttr(_vec3f(avatar.rest_points_m))
         mesh.CreateExtentAttr(_extent(avatar.rest_points_m))
-        mesh.CreateNormalsAttr(_vec3f(_normals(avatar.rest_points_m, avatar.faces)))
+        mesh.CreateNormalsAttr(_vec3f(normals_of(avatar.rest_points_m, avatar.faces)))
         _bind_skin(mesh, _define_skeleton(stage, body.GetPath().AppendChild("Skeleton"), avatar), avatar)
         _package(stage, avatar, path)
 
@@ -46,7 +45,7 @@ def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps
         for frame, posed in zip(avatar.frames, avatar.points_m, strict=True):
             points.Set(_vec3f(posed), float(frame))
             extents.Set(_extent(posed), float(frame))
-            normals.Set(_vec3f(_normals(posed, avatar.faces)), float(frame))
+            normals.Set(_vec3f(normals_of(posed, avatar.faces)), float(frame))
         _package(stage, avatar, path)
 
 
@@ -187,10 +186,6 @@ def _package(stage: Usd.Stage, avatar: StagedAvatar, path: Path) -> None:
     write_image(layer.parent / TEXTURE_NAME, avatar.texture)
     if not UsdUtils.CreateNewARKitUsdzPackage(str(layer), str(path)):
         raise OSError(f"{path}: USD could not write the package; is the disk full?")
-
-
-def _normals(points_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    return vertex_normals(torch.from_numpy(points_m), torch.from_numpy(faces)).numpy()
 
 
 def _vec3f(values: np.ndarray) -> Vt.Vec3fArray:

@@ -100,8 +100,6 @@ def _average() -> Rig:
     return Rig(
         vertices_m=model.template_vertices,
         faces=model.faces.long(),
-        uvs=model.texture_coordinates,
-        face_uvs=model.face_texture_coordinate_indices,
         joints_m=model.template_bone_heads,
         joint_names=joint_names,
         parents=torch.tensor(model.bone_parents),

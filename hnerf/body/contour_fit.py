@@ -12,14 +12,15 @@ import cv2
 import numpy as np
 import torch
 from scipy.ndimage import map_coordinates
-from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 from skimage.measure import find_contours
 
 from hnerf.body.articulation import Articulation, Pose, PosedJoints
+from hnerf.body.descriptor import normals_of
 from hnerf.body.keypoint_fit import Problem, project
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.capture.camera import Camera
+from hnerf.config import FitSettings
 from hnerf.render.silhouette import silhouette
 
 log = logging.getLogger("hnerf.fit")
@@ -52,16 +53,6 @@ class Rows:
     weight: np.ndarray
 
 
-@dataclass(frozen=True)
-class ContourWeights:
-    """Standard deviations in metres: see FitSettings."""
-
-    inside_m: float
-    outside_m: float
-    clothing_m: float
-    spacing_m: float
-
-
 def outline(mask: np.ndarray, spacing_px: float) -> Outline:
     """The edge of a mask (H, W) bool, sampled about every spacing_px."""
     soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), MASK_BLUR_PX)
@@ -83,20 +74,20 @@ def _resampled(line: np.ndarray, spacing_px: float) -> np.ndarray:
 
 def match(
     camera: Camera, edge: Outline, scale_m: float, vertices_m: np.ndarray, normals: np.ndarray, faces: np.ndarray,
-    weights: ContourWeights,
+    settings: FitSettings,
 ) -> Rows:  # fmt: skip
     """Rows of one camera and frame. scale_m: metres a pixel spans; vertices_m and normals (V, 3)."""
     rim = _rim(camera, vertices_m, normals, faces)
     uv, by_x = (t.numpy() for t in project(camera, torch.from_numpy(vertices_m[rim])))
     flat = normals[rim] @ camera.R[:2].T
     flat /= np.linalg.norm(flat, axis=1, keepdims=True).clip(1e-9)
-    pairs = [_cover(edge, uv, flat), _contain(edge, uv, weights.spacing_m / scale_m)]
+    pairs = [_cover(edge, uv, flat), _contain(edge, uv, settings.spacing_m / scale_m)]
     ids, direction, residual_px = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
     gradient = np.einsum("ri,ric->rc", direction, by_x[ids]) * scale_m
     residual_m = residual_px * scale_m
     ids = rim[ids]
-    loose = weights.outside_m**-2 / (1 + (residual_m / weights.clothing_m) ** 2) ** 2  # Geman-McClure
-    return Rows(ids, gradient, residual_m, np.where(residual_m > 0, weights.inside_m**-2, loose))
+    loose = settings.outside_m**-2 / (1 + (residual_m / settings.clothing_m) ** 2) ** 2  # Geman-McClure
+    return Rows(ids, gradient, residual_m, np.where(residual_m > 0, settings.inside_m**-2, loose))
 
 
 def _rim(camera: Camera, vertices_m: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -142,22 +133,20 @@ def _contain(edge: Outline, rim_px: np.ndarray, spacing_px: float) -> tuple[np.n
     return first[out], slope[out], distance[out]
 
 
-def refine(
-    problem: Problem, pose: Pose, edges: list[list[Outline | None]], weights: ContourWeights, up: int, steps: int
-) -> Pose:
+def refine(problem: Problem, pose: Pose, edges: list[list[Outline | None]], settings: FitSettings, up: int) -> Pose:
     """Gauss-Newton steps on outlines and keypoints, matched anew before each. edges: by frame and camera, None without
     a mask; up: the world's vertical axis, used with one camera only."""
-    surface = Surface(pose.rig.faces.numpy(), len(pose.rig.vertices_m))
-    for step in range(steps):
+    faces = pose.rig.faces.numpy()
+    for step in range(settings.contour_steps):
         articulation = Articulation(pose.rig)
         joints = articulation.pose(pose)
         _, equations = problem.assemble(pose, problem.in_images)
         residuals = []
         for t, row in enumerate(edges):
             vertices_m = articulation.surface(joints, t).numpy()
-            normals = surface.normals(vertices_m)
+            normals = normals_of(vertices_m, faces)
             found = [
-                match(camera, edge, float(scale_m[t]), vertices_m, normals, surface.faces, weights)
+                match(camera, edge, float(scale_m[t]), vertices_m, normals, faces, settings)
                 for camera, scale_m, edge in zip(problem.seen.cameras, problem.scale_m, row, strict=True)
                 if edge is not None
             ]
@@ -168,7 +157,9 @@ def refine(
                 residuals.append(rows.residual_m)
         pose = problem.moved(pose, equations, DAMPING)
         error_mm = 1e3 * np.concatenate([np.zeros(0), *residuals])
-        log.info("outlines, step %d of %d: %.1f mm rms", step + 1, steps, np.sqrt((error_mm**2).mean()))
+        log.info(
+            "outlines, step %d of %d: %.1f mm rms", step + 1, settings.contour_steps, np.sqrt((error_mm**2).mean())
+        )
     return pose
 
 
@@ -194,18 +185,3 @@ def _add_rows(
     equations.shared[shape, shape] += weighted_s.T @ s
     equations.frame_gradient[frame] += weighted_j.T @ rows.residual_m
     equations.shared_gradient[shape] += weighted_s.T @ rows.residual_m
-
-
-class Surface:
-    """Faces (F, 3) of V vertices, ready for normals."""
-
-    def __init__(self, faces: np.ndarray, vertices: int) -> None:
-        self.faces = faces
-        rows, columns = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
-        self.sums = csr_matrix((np.ones(len(rows)), (rows, columns)), (vertices, len(faces)))
-
-    def normals(self, vertices_m: np.ndarray) -> np.ndarray:
-        """Area-weighted unit normals (V, 3)."""
-        a, b, c = (vertices_m[self.faces[:, k]] for k in range(3))
-        normals = self.sums @ np.cross(b - a, c - a)
-        return normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12)

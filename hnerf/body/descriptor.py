@@ -10,6 +10,7 @@ there.
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import warp as wp
 from torch import Tensor
@@ -183,3 +184,8 @@ def vertex_normals(vertices_m: Tensor, faces: Tensor) -> Tensor:
     for k in range(3):
         normals.index_add_(-2, faces[:, k], torch.linalg.cross(b - a, c - a))
     return torch.nn.functional.normalize(normals, dim=-1)
+
+
+def normals_of(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The same of NumPy arrays."""
+    return vertex_normals(torch.from_numpy(vertices_m), torch.from_numpy(faces)).numpy()

@@ -16,7 +16,7 @@ from torch import Tensor
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.balance import Balance
 from hnerf.body.body_model import BodyModel, body_model
-from hnerf.body.contour_fit import ContourWeights, Outline, outline, refine
+from hnerf.body.contour_fit import Outline, outline, refine
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.given_start import given_start, seen_on, told_of
 from hnerf.body.habit import Habit
@@ -77,8 +77,7 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
                 problem = problem_of(model, pose, seen, smoothness, settings, offsets=1, proportions=1)
                 problem = replace(problem, balance=balance, habit=habit)
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
-                weights = ContourWeights(settings.inside_m, settings.outside_m, settings.clothing_m, settings.spacing_m)
-                pose = refine(problem, pose, edges, weights, up, settings.contour_steps)
+                pose = refine(problem, pose, edges, settings, up)
         fit = BodyFit(pose.rig.to(dtype=torch.float32), capture.frames, pose.theta.float(), pose.root.float())
         report = _report(capture, masks, seen, pose, fit, seconds)
         return fit, report | ({"given_poses": told_of(model, capture)} if begin else {})

@@ -23,16 +23,14 @@ from torch import Tensor
 class Rig:
     """Rest body at shape `beta`, and how it moves.
 
-    vertices_m (V, 3), faces (F, 3) long, uvs (U, 2), face_uvs (F, 3) long, joints_m (J, 3), parents (J,) long with -1
-    at the root and parents before children, shape_basis (B, V, 3) and joint_basis (B, J, 3): metres per unit of beta
-    around `beta` (B,). skin_joints (V, K) long, skin_weights (V, K) summing to 1. free (J,) bool: joints that may turn.
-    keypoint_weights (25, V): BODY_25 keypoints from the vertices.
+    vertices_m (V, 3), faces (F, 3) long, joints_m (J, 3), parents (J,) long with -1 at the root and parents before
+    children, shape_basis (B, V, 3) and joint_basis (B, J, 3): metres per unit of beta around `beta` (B,).
+    skin_joints (V, K) long, skin_weights (V, K) summing to 1. free (J,) bool: joints that may turn. keypoint_weights
+    (25, V): BODY_25 keypoints from the vertices.
     """
 
     vertices_m: Tensor
     faces: Tensor
-    uvs: Tensor
-    face_uvs: Tensor
     joints_m: Tensor
     joint_names: tuple[str, ...]
     parents: Tensor

@@ -100,8 +100,6 @@ def read_smpl(path: Path) -> Smpl:
     rig = Rig(
         vertices_m=vertices_m[0, kept],
         faces=faces,
-        uvs=torch.zeros(1, 2, dtype=torch.float64),  # the files have none; the asset gets a layout of its own
-        face_uvs=torch.zeros_like(faces),
         joints_m=joints_m[0],
         joint_names=names,
         parents=torch.tensor(parents),

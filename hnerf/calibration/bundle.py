@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pycolmap
+from scipy.spatial.transform import Rotation
 
 from hnerf.calibration.triangulation import reprojection_px, triangulate
 from hnerf.capture.camera import Camera
@@ -101,8 +102,8 @@ def align(cameras: Sequence[Camera], to: Sequence[Camera]) -> list[Camera]:
     World rotation: chordal mean of R_to^T R (Hartley et al. 2013, Rotation Averaging, section 5); scale and shift:
     least squares on the centres.
     """
-    u, _, vt = np.linalg.svd(sum(old.R.T @ new.R for new, old in zip(cameras, to, strict=True)))
-    world = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    turns = Rotation.from_matrix(np.stack([old.R.T @ new.R for new, old in zip(cameras, to, strict=True)]))
+    world = turns.mean().as_matrix()
     centres = np.stack([camera.centre_m for camera in cameras]) @ world.T
     wanted = np.stack([camera.centre_m for camera in to])
     spread, wanted_spread = centres - centres.mean(0), wanted - wanted.mean(0)

@@ -52,7 +52,7 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
     _check_height(capture, measure(cameras, keypoints) if mistakes else before)
     in_step, held_out_px, notes = put_in_step(capture, cameras, keypoints, settings)
     keypoints = keypoints if in_step is capture else _keypoints(in_step)
-    witnesses = Witnesses.of(in_step, keypoints, settings)
+    witnesses = Witnesses.of(in_step, keypoints)
     refinement = refine(in_step, cameras, keypoints, witnesses.outlines, witnesses.matches, settings)
     used = refinement.cameras
     after = measure(used, keypoints)

@@ -47,15 +47,10 @@ class Measure:
     points_m: np.ndarray
 
     @property
-    def worst(self) -> str | None:
-        """The camera whose removal lowers the trimmed cost most; None with two cameras."""
-        return min(self.cost_without_px, key=self.cost_without_px.__getitem__, default=None)
-
-    @property
     def misfit(self) -> str | None:
-        """The worst camera, if the others agree far better without it."""
+        """The camera whose removal lowers the trimmed cost most, if the others agree far better without it."""
         share = MISFIT_SHARE_OF_THREE if len(self.cost_without_px) == 3 else MISFIT_SHARE
-        worst = self.worst
+        worst = min(self.cost_without_px, key=self.cost_without_px.__getitem__, default=None)
         return worst if worst and self.cost_without_px[worst] < share * self.cost_px else None
 
 

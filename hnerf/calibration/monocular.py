@@ -51,7 +51,7 @@ def stature_on_ground_m(camera: Camera, keypoints: np.ndarray, up: str) -> float
     The standing foot is where a ray to a toe or heel meets height 0 nearest to the camera: those of a lifted foot meet
     it farther off. keypoints (frames, 25, 3).
     """
-    vertical = {"y": 1, "z": 2}[up]
+    vertical = "xyz".index(up)
     origin = camera.centre_m
     _, soles = camera.rays(keypoints[:, SOLES, :2])
     with np.errstate(divide="ignore", invalid="ignore"):

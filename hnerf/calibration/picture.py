@@ -9,9 +9,8 @@ from matplotlib.figure import Figure
 
 from hnerf.calibration.diagnosis import Measure
 from hnerf.capture.camera import Camera
+from hnerf.segmentation.prior import FEET, LIMBS
 
-LIMBS = [(0, 1), (1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7), (1, 8), (8, 9), (9, 10), (10, 11), (8, 12), (12, 13),
-         (13, 14), (14, 19), (14, 21), (11, 22), (11, 24)]  # fmt: skip
 SHOWN_FRAMES = 5
 FRUSTUM_SHARE = 0.15  # of the distance to the person
 COLOURS = {"ok": "tab:green", "refined": "tab:blue", "suspect": "tab:orange", "rejected": "tab:red", "unjudged": "0.6"}
@@ -28,7 +27,7 @@ def draw_cameras(
     """Write the picture as PNG. `status` by camera; `before`, `after`: what `measure` found, None with one camera."""
     figure = Figure(figsize=(16, 5.5), layout="constrained")
     above, side, bars = figure.subplots(1, 3)
-    vertical = {"y": 1, "z": 2}[up]
+    vertical = "xyz".index(up)
     first, second = (axis for axis in range(3) if axis != vertical)
     points_m = np.zeros((0, 25, 3)) if after is None else after.points_m
     for axes, across, along, title in (
@@ -51,7 +50,7 @@ def _draw_scene(
 ) -> None:
     """Frusta and the person's limbs (frames, 25, 2) in one plane of the world."""
     for pose in person[:: max(1, len(person) // SHOWN_FRAMES)]:
-        for a, b in LIMBS:
+        for a, b in LIMBS + FEET:
             axes.plot(*pose[[a, b]].T, color="0.3", linewidth=0.8)
     for camera in cameras:
         colour = COLOURS[status[camera.name]]

@@ -10,9 +10,9 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from hnerf.calibration.diagnosis import Measure
-from hnerf.calibration.picture import LIMBS
 from hnerf.calibration.witnesses import NO_MATCHES, Witnesses
 from hnerf.capture.camera import Camera
+from hnerf.segmentation.prior import FEET, LIMBS
 
 SCALE_PX = Normalize(0, 10)  # residuals, from green to red
 COLOURS = "RdYlGn_r"
@@ -45,7 +45,7 @@ def draw_witnesses(path: Path, witnesses: Witnesses, cameras: Sequence[Camera], 
 def _draw_keypoints(axes: Axes, camera: Camera, detected: np.ndarray, points_m: np.ndarray) -> PathCollection:
     """Detections (25, 3) as discs, coloured by how far the person's joints (25, 3), as lines, lie from them."""
     uv, _ = camera.project(points_m)
-    for a, b in LIMBS:
+    for a, b in LIMBS + FEET:
         axes.plot(*uv[[a, b]].T, color="white", linewidth=1)
     seen = detected[:, 2] > 0
     return _scatter(axes, detected[seen, :2], np.linalg.norm(uv[seen] - detected[seen, :2], axis=-1), 26)

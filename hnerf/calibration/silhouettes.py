@@ -17,7 +17,7 @@ from hnerf.calibration.diagnosis import trimmed_mean
 from hnerf.calibration.triangulation import subject_keypoints
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
-from hnerf.config import CalibrationSettings, SegmentationSettings
+from hnerf.config import SegmentationSettings
 from hnerf.segmentation.backends import AgainstBackground
 from hnerf.segmentation.prior import keypoint_priors
 from hnerf.spread import spread
@@ -80,7 +80,7 @@ class Outlines:
     instants: tuple[int, ...]
 
     @staticmethod
-    def of(capture: Capture, settings: CalibrationSettings) -> "Outlines | None":
+    def of(capture: Capture) -> "Outlines | None":
         """Of the training cameras at a few instants, from given masks, clean plates, or a median of the images.
 
         The masks use each camera's own keypoints only, so that a wrong calibration cannot spoil them. None where fewer

@@ -12,7 +12,6 @@ from hnerf.calibration.matches import Matches
 from hnerf.calibration.silhouettes import Outlines
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
-from hnerf.config import CalibrationSettings
 
 NO_OUTLINES = "fewer than two cameras have a mask, or a background from which one could be made"
 NO_MATCHES = "no overlap: no matches"
@@ -33,9 +32,9 @@ class Witnesses:
     boards: dict[str, Any] | None
 
     @staticmethod
-    def of(capture: Capture, keypoints: np.ndarray, settings: CalibrationSettings) -> "Witnesses":
+    def of(capture: Capture, keypoints: np.ndarray) -> "Witnesses":
         """With what the pictures show beside the keypoints."""
-        outlines, matches = Outlines.of(capture, settings), Matches.of(capture)
+        outlines, matches = Outlines.of(capture), Matches.of(capture)
         return Witnesses(capture, keypoints, outlines, matches, board_witness(capture))
 
     def plain(self, cameras: Sequence[Camera], found: Measure) -> dict[str, Any]:

@@ -8,7 +8,6 @@ import numpy as np
 
 from hnerf.capture.bars import Area, fitted, picture_area
 from hnerf.capture.boards import normalised_corners, read_board_footage
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.capture.footage import Footage
 from hnerf.capture.formats.caliscope import Caliscope
@@ -20,10 +19,10 @@ from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.formats.zjumocap import ZjuMocap
 from hnerf.capture.guarded import inside, read_image
 from hnerf.capture.keypoint_files import read_openpose, read_results
-from hnerf.capture.keypoint_sets import to_body_25
+from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
 from hnerf.capture.lens import Lens
 from hnerf.capture.normalise import Normaliser
-from hnerf.capture.notes import Notes, capture_name, chosen_cameras, chosen_frames, read_notes
+from hnerf.capture.notes import capture_name, chosen_cameras, chosen_frames, read_notes
 from hnerf.capture.timing import usual_step
 from hnerf.config import CaptureSettings
 from hnerf.errors import CaptureError
@@ -66,18 +65,10 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
     wanted = tuple(sorted(frames.train + frames.novel_pose))
 
     out.mkdir(parents=True, exist_ok=True)
-    normalisers: dict[str, Normaliser] = {}
-    areas: dict[str, Area] = {}
-    for name in footage:
-        log.info("camera %s: %d frames from %s", name, len(wanted), footage[name].path)
-        lens, area = _lens_as_recorded(lenses[name], footage[name], wanted)
-        areas |= {name: area} if area else {}
-        normalisers[name] = _write_pixels(layout, lens, footage[name], wanted, settings, out)
+    normalisers, areas = _write_cameras(layout, lenses, footage, wanted, settings, out)
     if people:
         rows = np.searchsorted(recorded, wanted)
-        people = to_body_25({name: found[rows] for name, found in people.items()}, notes.keypoints)
-        keypoints = {name: normalisers[name].keypoints(found) for name, found in people.items()}
-        np.savez_compressed(out / "keypoints.npz", **keypoints)  # type: ignore[arg-type]
+        _write_keypoints({name: found[rows] for name, found in people.items()}, notes.keypoints, normalisers, out)
     poses = layout.given_poses(wanted)
     if poses and not poses.known.any():
         raise CaptureError(f"{folder}: its poses are of none of these frames; choose others, or take the poses out")
@@ -90,7 +81,10 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
     capture = Capture(
         name=subject,
         root=out,
-        cameras={name: _in_metres(n.camera, notes) for name, n in normalisers.items()},
+        cameras={
+            name: dataclasses.replace(n.camera, t_m=n.camera.t_m * notes.metres_per_unit)
+            for name, n in normalisers.items()
+        },
         train_cameras=tuple(cameras.train),
         test_cameras=tuple(cameras.test),
         train_frames=tuple(frames.train),
@@ -133,6 +127,30 @@ def _common_frames(footage: dict[str, Footage]) -> tuple[int, ...]:
     return first.frames
 
 
+def _write_cameras(
+    layout: Layout, lenses: dict[str, Lens], footage: dict[str, Footage], frames: tuple[int, ...],
+    settings: CaptureSettings, out: Path,
+) -> tuple[dict[str, Normaliser], dict[str, Area]]:  # fmt: skip
+    """Pixels of every camera: what was done to them, and of those with proven black bars where their picture lies."""
+    normalisers: dict[str, Normaliser] = {}
+    areas: dict[str, Area] = {}
+    for name, recording in footage.items():
+        log.info("camera %s: %d frames from %s", name, len(frames), recording.path)
+        lens, area = _lens_as_recorded(lenses[name], recording, frames)
+        areas |= {name: area} if area else {}
+        normalisers[name] = _write_pixels(layout, lens, recording, frames, settings, out)
+    return normalisers, areas
+
+
+def _write_keypoints(
+    people: dict[str, np.ndarray], named: KeypointSetName | None, normalisers: dict[str, Normaliser], out: Path
+) -> None:
+    """People by camera, (frames, people, K, 3) as detected."""
+    found = to_body_25(people, named)
+    keypoints = {name: normalisers[name].keypoints(points) for name, points in found.items()}
+    np.savez_compressed(out / "keypoints.npz", **keypoints)  # type: ignore[arg-type]
+
+
 def _write_pixels(
     layout: Layout, lens: Lens, footage: Footage, frames: tuple[int, ...], settings: CaptureSettings, out: Path
 ) -> Normaliser:
@@ -155,7 +173,7 @@ def _write_pixels(
     assert normaliser is not None  # a split has at least one training frame
     plate = layout.plate_file(lens.name)
     if plate:
-        normaliser.write_plate(plate, out / "background" / lens.name)
+        normaliser.write_image(read_image(plate), plate, plate, out / "background" / lens.name)
     return normaliser
 
 
@@ -229,7 +247,3 @@ def _while_somebody_is_there(people: list[np.ndarray], frames: tuple[int, ...]) 
         if empty:
             log.warning("frames %d to %d left out: %s", empty[0], empty[-1], why)
     return frames[seen[0] : seen[-1] + 1]
-
-
-def _in_metres(camera: Camera, notes: Notes) -> Camera:
-    return dataclasses.replace(camera, t_m=camera.t_m * notes.metres_per_unit)

@@ -9,7 +9,6 @@ import numpy as np
 
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import write_image
-from hnerf.capture.guarded import read_image
 from hnerf.capture.lens import Lens
 from hnerf.errors import CaptureError
 
@@ -82,10 +81,6 @@ class Normaliser:
             shutil.copyfile(verbatim, target.with_name(target.name + verbatim.suffix.lower()))
         else:
             write_image(target.with_name(f"{target.name}.jpg"), self.pixels(rgb))
-
-    def write_plate(self, source: Path, target: Path) -> None:
-        """A clean plate, like any image."""
-        self.write_image(read_image(source), source, source, target)
 
     def write_mask(self, recorded: np.ndarray, source: Path, target: Path) -> None:
         """A mask (H, W) uint8 from file `source` as 0/255 PNG. The person is anything but black; in a matte, and in a

@@ -1,12 +1,12 @@
 """Closest points, sides and ray hits of a triangle mesh, by warp's bounding-volume hierarchy."""
 
-# mypy: disable-error-code="valid-type, index, attr-defined, no-untyped-def"
-
-from dataclasses import dataclass
+# mypy: disable-error-code="no-untyped-def"
 
 import numpy as np
 import trimesh
 import warp as wp
+
+from hnerf.render.rays import RayHits, cast, vectors
 
 wp.config.log_level = wp.LOG_ERROR
 
@@ -52,37 +52,13 @@ def _escape_kernel(
             return
 
 
-@wp.kernel
-def _cast_kernel(
-    mesh: wp.uint64,
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    face: wp.array(dtype=int),
-    barycentric: wp.array(dtype=wp.vec3),
-):
-    i = wp.tid()
-    face[i] = -1
-    query = wp.mesh_query_ray(mesh, origins[i], directions[i], 1.0e3)
-    if query.result:
-        face[i] = query.face
-        barycentric[i] = wp.vec3(query.u, query.v, 1.0 - query.u - query.v)
-
-
-@dataclass(frozen=True)
-class RayHits:
-    """face (N,), -1 where a ray meets nothing; barycentric (N, 3) of the hit."""
-
-    face: np.ndarray
-    barycentric: np.ndarray
-
-
 class Surface:
     """A mesh ready for queries. Points and directions are (N, 3), metres."""
 
     def __init__(self, mesh: trimesh.Trimesh):
         self.mesh = mesh
         self._warp_mesh = wp.Mesh(
-            points=_vectors(mesh.vertices),
+            points=vectors(mesh.vertices),
             indices=wp.array(np.asarray(mesh.faces, np.int32).ravel(), dtype=int),
             support_winding_number=True,
         )
@@ -91,34 +67,29 @@ class Surface:
         """Distance to the surface in metres (N,) and the face nearest (N,)."""
         n = len(points_m)
         distance, face = wp.zeros(n, dtype=float), wp.zeros(n, dtype=int)
-        wp.launch(_closest_kernel, n, [self._warp_mesh.id, _vectors(points_m), distance, face])
+        wp.launch(_closest_kernel, n, [self._warp_mesh.id, vectors(points_m), distance, face])
         return distance.numpy(), face.numpy()
 
     def inside(self, points_m: np.ndarray) -> np.ndarray:
         """Whether the winding number is over one half, (N,) bool (Jacobson et al. 2013)."""
         inside = wp.zeros(len(points_m), dtype=int)
-        wp.launch(_inside_kernel, len(points_m), [self._warp_mesh.id, _vectors(points_m), inside])
+        wp.launch(_inside_kernel, len(points_m), [self._warp_mesh.id, vectors(points_m), inside])
         return inside.numpy() > 0
 
     def escapes(self, points_m: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Whether a ray along any of the directions (K, 3) leaves a point without meeting the surface, (N,) bool."""
         escapes = wp.zeros(len(points_m), dtype=int)
-        wp.launch(
-            _escape_kernel, len(points_m), [self._warp_mesh.id, _vectors(points_m), _vectors(directions), escapes]
-        )
+        wp.launch(_escape_kernel, len(points_m), [self._warp_mesh.id, vectors(points_m), vectors(directions), escapes])
         return escapes.numpy() > 0
 
     def cast(self, origins_m: np.ndarray, directions: np.ndarray) -> RayHits:
-        """First hits of rays."""
-        n = len(origins_m)
-        face, barycentric = wp.zeros(n, dtype=int), wp.zeros(n, dtype=wp.vec3)
-        wp.launch(_cast_kernel, n, [self._warp_mesh.id, _vectors(origins_m), _vectors(directions), face, barycentric])
-        return RayHits(face.numpy(), barycentric.numpy())
+        """First hits of rays, from an origin each or from one (3,)."""
+        return cast(self._warp_mesh, origins_m, directions)
 
     def near(self, points_m: np.ndarray, reach_m: float) -> np.ndarray:
         """Whether the surface comes within reach of a point, (N,) bool."""
         near = wp.zeros(len(points_m), dtype=int)
-        wp.launch(_near_kernel, len(points_m), [self._warp_mesh.id, _vectors(points_m), reach_m, near])
+        wp.launch(_near_kernel, len(points_m), [self._warp_mesh.id, vectors(points_m), reach_m, near])
         return near.numpy() > 0
 
     def occupancy(self, lower_m: np.ndarray, upper_m: np.ndarray, nodes: int) -> np.ndarray:
@@ -143,7 +114,3 @@ class Surface:
 def _cube(side: int) -> np.ndarray:
     """The integer points of [0, side)^3, (side^3, 3)."""
     return np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3)
-
-
-def _vectors(array: np.ndarray) -> wp.array:
-    return wp.array(np.ascontiguousarray(array, np.float32), dtype=wp.vec3)

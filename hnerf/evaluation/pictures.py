@@ -8,8 +8,9 @@ import numpy as np
 import trimesh
 
 from hnerf.capture.camera import Camera
-from hnerf.evaluation.mesh_queries import RayHits, Surface
+from hnerf.evaluation.mesh_queries import Surface
 from hnerf.evaluation.metrics import mask_box
+from hnerf.render.rays import RayHits
 
 PICTURE_PX = (300, 400)  # width, height of a picture in the report
 SUPERSAMPLING = 2
@@ -102,7 +103,7 @@ def distance_map(surface: Surface, truth: Surface, camera: Camera) -> np.ndarray
     fine = _finer(camera)
     hits = _cast(surface, fine)
     met = hits.face >= 0
-    distance_m, _ = truth.closest(_interpolate(surface.mesh, surface.mesh.vertices, hits))
+    distance_m, _ = truth.closest(hits.interpolate(surface.mesh.vertices, surface.mesh.faces))
     steps = np.linspace(0, FULL_DISTANCE_M, len(DISTANCE_COLOURS))
     colours = np.zeros((len(met), 3), np.float32)
     colours[met] = np.stack([np.interp(distance_m, steps, channel) for channel in DISTANCE_COLOURS.T], 1)
@@ -132,16 +133,10 @@ def _cast(surface: Surface, camera: Camera) -> RayHits:
     return surface.cast(*camera.rays(pixels.astype(np.float64)))
 
 
-def _interpolate(mesh: trimesh.Trimesh, values: np.ndarray, hits: RayHits) -> np.ndarray:
-    """Values at vertices (V, 3) carried to the hits that met something, (n, 3)."""
-    met = hits.face >= 0
-    return (values[mesh.faces[hits.face[met]]] * hits.barycentric[met, :, None]).sum(1)
-
-
 def _normals(mesh: trimesh.Trimesh, hits: RayHits) -> np.ndarray:
     """Smooth unit normals (N, 3) at hits, 0 where there is none."""
     normals = np.zeros((len(hits.face), 3))
-    smooth = _interpolate(mesh, mesh.vertex_normals, hits)
+    smooth = hits.interpolate(mesh.vertex_normals, mesh.faces)
     normals[hits.face >= 0] = smooth / np.linalg.norm(smooth, axis=1, keepdims=True).clip(1e-9)
     return normals
 

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from hnerf.config import FastFieldSettings
 from hnerf.field.encoding import FeatureGrids, positional_encoding
 
 
@@ -13,22 +14,12 @@ class CanonicalField(nn.Module):
     colour here. n is the body's normal in the world: it carries the root transform T's effect on shading.
     """
 
-    def __init__(
-        self,
-        lower_m: Tensor,
-        upper_m: Tensor,
-        geometry_cells: tuple[int, ...],
-        colour_cells: tuple[int, ...],
-        channels: int,
-        width: int,
-        pose_width: int,
-        pose_inputs: int,
-        reach_m: float,
-    ):
+    def __init__(self, lower_m: Tensor, upper_m: Tensor, settings: FastFieldSettings, pose_inputs: int):
         super().__init__()
-        self.reach_m = reach_m
-        self.geometry_grids = FeatureGrids(lower_m, upper_m, geometry_cells, channels)
-        self.colour_grids = FeatureGrids(lower_m, upper_m, colour_cells, channels)
+        width, pose_width, channels = settings.width, settings.pose_width, settings.channels
+        self.unit_m = settings.outer_m
+        self.geometry_grids = FeatureGrids(lower_m, upper_m, settings.geometry_cells, channels)
+        self.colour_grids = FeatureGrids(lower_m, upper_m, settings.colour_cells, channels)
         self.pose_code = nn.Linear(pose_inputs, pose_width, bias=False)
         last = nn.Linear(width, 1)
         nn.init.zeros_(last.weight)
@@ -43,12 +34,12 @@ class CanonicalField(nn.Module):
         )
 
     def _inputs(self, features: Tensor, d: Tensor, pose: Tensor) -> list[Tensor]:
-        return [features, d[:, None] / self.reach_m, self.pose_code(pose)]
+        return [features, d[:, None] / self.unit_m, self.pose_code(pose)]
 
     def residual(self, y_m: Tensor, d_m: Tensor, pose: Tensor) -> Tensor:
         """dd (N,) metres at y (N, 3), d (N,), pose (N, P); zero at the start of training."""
         features = self.geometry_grids(y_m)
-        return self.reach_m * self.geometry(torch.cat(self._inputs(features, d_m, pose), -1))[:, 0]
+        return self.unit_m * self.geometry(torch.cat(self._inputs(features, d_m, pose), -1))[:, 0]
 
     def colour(self, y_m: Tensor, d_m: Tensor, normal: Tensor, pose: Tensor) -> Tensor:
         """c (N, 3) in [0, 1]."""

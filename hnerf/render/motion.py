@@ -103,10 +103,10 @@ def between(body: BodyFit, first: int, last: int, count: int) -> BodyFit:
     a, b = body.index(first), body.index(last)
     share = np.linspace(0, 1, count)
     start, end = (Rotation.from_rotvec(body.theta[k].numpy()) for k in (a, b))
-    theta = np.stack([_part_way(start, end, t).as_rotvec() for t in share])
+    theta = np.stack([(start * (start.inv() * end) ** t).as_rotvec() for t in share])
     root = torch.lerp(body.root[a], body.root[b], torch.from_numpy(share).to(body.root)[:, None, None])
     start, end = (Rotation.from_matrix(body.root[k, :3, :3].numpy()) for k in (a, b))
-    turns = np.stack([_part_way(start, end, t).as_matrix() for t in share])
+    turns = np.stack([(start * (start.inv() * end) ** t).as_matrix() for t in share])
     root[:, :3, :3] = torch.from_numpy(turns)
     return BodyFit(body.rig, tuple(range(count)), torch.from_numpy(theta).to(body.theta), root)
 
@@ -131,10 +131,6 @@ def _moved(body: BodyFit, move_m: Tensor) -> BodyFit:
 
 def _pelvis_m(body: BodyFit) -> Tensor:
     return joint_transforms(body.rig, body.theta, body.root)[:, 0, :3, 3]
-
-
-def _part_way(start: Rotation, end: Rotation, share: float) -> Rotation:
-    return start * Rotation.from_rotvec(share * (start.inv() * end).as_rotvec())
 
 
 def _upright(from_up: str, to_up: str) -> Tensor:

@@ -15,7 +15,6 @@ from hnerf.study.subset import read_keypoints, write_keypoints
 WAY = 0.4  # of the way from the person to the camera
 HALF_HEIGHT_M = 1.2
 GREY = np.array([96, 96, 96], np.uint8)
-UP = {"z": np.array([0.0, 0.0, 1.0]), "y": np.array([0.0, 1.0, 0.0])}
 
 
 def put_in_front(capture: Capture, width_m: float, rng: np.random.Generator, out: Path) -> None:
@@ -25,7 +24,8 @@ def put_in_front(capture: Capture, width_m: float, rng: np.random.Generator, out
     Cameras that would see it behind or beside the person do not show it. CaptureError if nobody knows where he stands.
     """
     person_m = person_middle(capture)
-    corners_m = pillar(person_m, capture.cameras[str(rng.choice(capture.train_cameras))], UP[capture.up], width_m)
+    up = np.eye(3)["xyz".index(capture.up)]
+    corners_m = pillar(person_m, capture.cameras[str(rng.choice(capture.train_cameras))], up, width_m)
     hidden = {name: _hidden(capture.cameras[name], corners_m, person_m) for name in capture.train_cameras}
     rewrite(
         capture,

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
+from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture, write_image
-from hnerf.capture.performer.dressed import vertex_normals
-from hnerf.capture.performer.render import Caster, Hits, dome_lights, irradiance, render_person
+from hnerf.capture.performer.render import Caster, dome_lights, irradiance, render_person
 from hnerf.evaluation.ground_truth import ON_BLACK, GroundTruth
-from hnerf.study.occluder import UP
+from hnerf.render.rays import RayHits
 from hnerf.study.subset import copy_files, write_arrays
 
 Rng = np.random.Generator
@@ -83,17 +83,17 @@ class Shown:
         directions, strength = dome_lights()
         if up == "y":
             directions = directions[:, [0, 2, 1]] * [1, 1, -1]
-        normals = vertex_normals(vertices_m, faces)
+        normals = normals_of(vertices_m, faces)
         visible = both.visibility(vertices_m + 3e-3 * normals, directions)
         light = irradiance(normals, visible, (directions, strength))
         return Shown(vertices_m, faces, (worn.colours * light[:, None]).clip(0, 1), both)
 
-    def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> Hits:
+    def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> RayHits:
         """First hits of rays from one origin (3,) along unit directions (N, 3); none where the body comes first."""
         hits = self.both.cast(origin_m, directions)
         return dataclasses.replace(hits, face=np.where(hits.face < len(self.faces), hits.face, -1))
 
-    def colours(self, hits: Hits) -> np.ndarray:
+    def colours(self, hits: RayHits) -> np.ndarray:
         """Lit colours in [0, 1] of those rays that hit, (M, 3)."""
         return hits.interpolate(self.colour, self.faces)
 
@@ -137,7 +137,8 @@ def put_on(
     known to be true. Keypoints stay: detectors guess what cloth hides. Board footage is left out."""
     bodies_m, faces = body.vertices_m().double().numpy(), body.rig.faces.numpy()
     rows = [body.index(frame) for frame in capture.frames]
-    worn = WORN[kind](body.rig.keypoint_weights.double().numpy() @ bodies_m[rows], UP[capture.up], strength, rng)
+    keypoints_m = body.rig.keypoint_weights.double().numpy() @ bodies_m[rows]
+    worn = WORN[kind](keypoints_m, np.eye(3)["xyz".index(capture.up)], strength, rng)
     kept = dataclasses.replace(capture, root=out, frame_offsets={}, stored_frames=(), recorded_lenses={})
     write_arrays(capture, kept)
     for row, frame in enumerate(capture.frames):

@@ -84,7 +84,7 @@ def _in_sight(camera: Camera, surface: Surface) -> tuple[np.ndarray, np.ndarray]
     xy = np.round(xy)
     inside = ((xy >= 0) & (xy < (camera.width_px, camera.height_px))).all(1) & (depth_m > 0)
     seen = inside & ((away * mesh.vertex_normals).sum(1) > FACING)
-    hits = surface.cast(np.broadcast_to(camera.centre_m, (int(seen.sum()), 3)), -away[seen])
+    hits = surface.cast(camera.centre_m, -away[seen])
     met = (mesh.faces[hits.face] == np.flatnonzero(seen)[:, None]).any(1)
     seen[np.flatnonzero(seen)[~met]] = False
     return seen, xy[seen].astype(int)

@@ -55,17 +55,8 @@ class FastField(Field):
         self.register_buffer("corners", corners, persistent=False)
         self.register_buffer("weights", weights, persistent=False)
         beyond_m = settings.outer_m + GRID_ROOM_M
-        self.field = CanonicalField(
-            rig.vertices_m.amin(0) - beyond_m,
-            rig.vertices_m.amax(0) + beyond_m,
-            settings.geometry_cells,
-            settings.colour_cells,
-            settings.channels,
-            settings.width,
-            settings.pose_width,
-            3 * int(rig.free.sum()),
-            settings.outer_m,
-        )
+        lower_m, upper_m = rig.vertices_m.amin(0) - beyond_m, rig.vertices_m.amax(0) + beyond_m
+        self.field = CanonicalField(lower_m, upper_m, settings, 3 * int(rig.free.sum()))
         self.deformation = (
             FrameDeformation(rig.vertices_m, rig.faces, settings.nodes, frames) if settings.nodes else None
         )

@@ -15,5 +15,5 @@ def staged() -> StagedAvatar:
     body = bending_body()
     clothes = upright_column(0.18, -0.05, 1.65)
     layout = unwrap(clothes.vertices, clothes.faces, 64)
-    dressed = dataclasses.replace(body, rig=dressed_rig(body.rig, clothes, layout))
-    return stage_avatar(dressed, np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8), "z")
+    dressed = dataclasses.replace(body, rig=dressed_rig(body.rig, clothes))
+    return stage_avatar(dressed, layout, np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8), "z")

@@ -23,8 +23,6 @@ def column_rig() -> Rig:
     return Rig(
         vertices_m=vertices_m,
         faces=torch.from_numpy(column.faces).long(),
-        uvs=torch.zeros(1, 2),
-        face_uvs=torch.zeros(len(column.faces), 3, dtype=torch.long),
         joints_m=torch.tensor([[0.0, 0, 0], [0, 0, 0.8]]),
         joint_names=("root", "upper.L"),
         parents=torch.tensor([-1, 0]),

@@ -45,7 +45,7 @@ def test_colours_are_read_on_the_fields_own_surface() -> None:
     body = bending_body()
     clothes = upright_column(0.175, 0.2, 1.4)  # 1.5 cm outside the field's surface; its caps are far inside
     layout = unwrap(clothes.vertices, clothes.faces, 64)
-    posed = dataclasses.replace(body, rig=dressed_rig(body.rig, clothes, layout))
+    posed = dataclasses.replace(body, rig=dressed_rig(body.rig, clothes))
     bake(Recording(body), posed, layout, 64)
     assert len(read_m) == len(body.frames)
     for distance_m in read_m:
@@ -56,7 +56,7 @@ def test_baked_colours_are_those_of_the_point_on_the_rest_body() -> None:
     body = bending_body()
     clothes = upright_column(0.16, 0.0, 1.6)
     layout = unwrap(clothes.vertices, clothes.faces, 256)
-    rig = dressed_rig(body.rig, clothes, layout)
+    rig = dressed_rig(body.rig, clothes)
     image = bake(StandInAvatar(body), dataclasses.replace(body, rig=rig), layout, 256)
     middle_uv = layout.uvs[layout.face_uvs].mean(1)
     pixel = image[((1 - middle_uv[:, 1]) * 256).astype(int), (middle_uv[:, 0] * 256).astype(int)]

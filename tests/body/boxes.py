@@ -39,8 +39,6 @@ def box_rig(bend_segments: int = 0, splits: int = 0) -> Rig:
     return Rig(
         vertices_m=vertices,
         faces=faces,
-        uvs=torch.zeros(1, 2),
-        face_uvs=torch.zeros_like(faces),
         joints_m=torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 1.0]]),
         joint_names=("lower", "upper"),
         parents=torch.tensor([-1, 0]),

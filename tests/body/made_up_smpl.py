@@ -19,7 +19,7 @@ PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18,
 ENDS = {0: 3, 3: 6, 6: 9, 9: 12, 12: 15, 1: 4, 2: 5, 4: 7, 5: 8, 7: 10, 8: 11, 13: 16, 14: 17, 16: 18, 17: 19, 18: 20,
         19: 21}  # fmt: skip
 RADII_M = {0: 0.12, 3: 0.12, 6: 0.12, 9: 0.12, 12: 0.06, 15: 0.09, 1: 0.08, 2: 0.08, 4: 0.05, 5: 0.05}
-LEFT_SHOULDER, LEFT_ELBOW = 16, 18
+LEFT_ELBOW = 18
 
 # By the smplx package's vertex_ids, SMPL's then SMPL-X's: vertex, the joint that carries it, and its place from there.
 LANDMARKS = (

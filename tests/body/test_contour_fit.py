@@ -1,9 +1,11 @@
 import numpy as np
 
-from hnerf.body.contour_fit import ContourWeights, Surface, match, outline
+from hnerf.body.contour_fit import match, outline
+from hnerf.body.descriptor import normals_of
+from hnerf.config import FitSettings
 from tests.body.recorded_body import ring_camera
 
-WEIGHTS = ContourWeights(inside_m=0.01, outside_m=0.02, clothing_m=0.1, spacing_m=0.01)
+SETTINGS = FitSettings(inside_m=0.01, outside_m=0.02, clothing_m=0.1, spacing_m=0.01)
 
 
 def ball(radius_m: float, height_m: float) -> tuple[np.ndarray, np.ndarray]:
@@ -39,7 +41,7 @@ def test_an_outline_runs_between_the_pixels_and_points_outwards() -> None:
 def test_normals_point_out_of_a_ball() -> None:
     vertices, faces = ball(1.0, 0.0)
     equator = np.abs(vertices[:, 2]) < 0.5
-    normals = Surface(faces, len(vertices)).normals(vertices)
+    normals = normals_of(vertices, faces)
     np.testing.assert_allclose(normals[equator], vertices[equator], atol=0.03)
 
 
@@ -47,12 +49,12 @@ def test_a_body_too_small_is_pulled_outwards_and_one_too_large_is_pushed_in() ->
     """A ball of 0.2 m at 3 m, 281.6 px focal length, looks 18.8 px large; the masks are 5 px larger and smaller."""
     camera = ring_camera("a", 0.3)
     vertices, faces = ball(0.2, 1.0)
-    normals = Surface(faces, len(vertices)).normals(vertices)
+    normals = normals_of(vertices, faces)
     scale_m = 3 / 281.6
     seen_px = 281.6 * 0.2 / np.sqrt(3**2 - 0.2**2)
     for grow_px, sigma_m in ((5, 0.02), (-5, 0.01)):
         edge = outline(disc(seen_px + grow_px), 1.0)
-        rows = match(camera, edge, scale_m, vertices, normals, faces, WEIGHTS)
+        rows = match(camera, edge, scale_m, vertices, normals, faces, SETTINGS)
         assert len(rows.vertices) > 20
         np.testing.assert_allclose(np.abs(rows.residual_m).max(), 5 * scale_m, atol=0.6 * scale_m)
         assert (-np.sign(grow_px) * rows.residual_m > 2 * scale_m).all()  # rim vertices lie up to 2.5 px deep
@@ -66,5 +68,5 @@ def test_a_body_that_fills_its_mask_is_left_alone() -> None:
     camera = ring_camera("a", 0.3)
     vertices, faces = ball(0.2, 1.0)
     edge = outline(disc(281.6 * 0.2 / np.sqrt(3**2 - 0.2**2)), 1.0)
-    rows = match(camera, edge, 3 / 281.6, vertices, Surface(faces, len(vertices)).normals(vertices), faces, WEIGHTS)
+    rows = match(camera, edge, 3 / 281.6, vertices, normals_of(vertices, faces), faces, SETTINGS)
     assert np.abs(rows.residual_m).max() < 1.0 * 3 / 281.6

@@ -20,8 +20,6 @@ def two_bone_rig() -> Rig:
     return Rig(
         vertices_m=vertices,
         faces=torch.tensor([[0, 1, 2], [1, 2, 3], [2, 3, 4]]),
-        uvs=torch.zeros(5, 2),
-        face_uvs=torch.tensor([[0, 1, 2], [1, 2, 3], [2, 3, 4]]),
         joints_m=torch.tensor([[0.0, 0, 0], [0, 0, 1], [0, 0, 2]]),
         joint_names=("root", "elbow", "tip"),
         parents=torch.tensor([-1, 0, 1]),

@@ -8,6 +8,7 @@ import numpy as np
 
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
+from hnerf.render import cameras_along
 
 SIZE_PX = 1000
 FRAMES = 12
@@ -23,14 +24,8 @@ STANDING_M = np.array([
 
 def look_at(name: str, centre_m: np.ndarray, target_m: np.ndarray) -> Camera:
     """A camera of 1000 x 1000 px and focal length 1000 px, upright."""
-    forward = target_m - centre_m
-    forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    R = np.stack([right, np.cross(forward, right), forward])
-    middle = (SIZE_PX - 1) / 2
-    K = np.array([[1000.0, 0, middle], [0, 1000, middle], [0, 0, 1]])
-    return Camera(name, K, R, -R @ centre_m, SIZE_PX, SIZE_PX)
+    like = Camera(name, np.diag([1000.0, 1000, 1]), np.eye(3), np.zeros(3), SIZE_PX, SIZE_PX)
+    return cameras_along.look_at(like, centre_m, target_m, np.array([0, 0, 1]))
 
 
 def ring(count: int) -> list[Camera]:

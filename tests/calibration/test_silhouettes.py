@@ -11,7 +11,7 @@ from hnerf.calibration.silhouettes import Outline, Outlines
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
-from hnerf.config import CalibrationSettings, CaptureSettings
+from hnerf.config import CaptureSettings
 from tests.calibration.synthetic import SIZE_PX, look_at, ring, turned
 from tests.shared_data import shared_capture
 
@@ -96,7 +96,7 @@ def wave(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 def test_a_rendered_capture_tells_a_turned_camera(wave: Capture) -> None:
-    seen = Outlines.of(wave, CalibrationSettings())
+    seen = Outlines.of(wave)
     assert seen is not None
     cameras = [wave.cameras[name] for name in wave.train_cameras]
     assert seen.cost_px(cameras) < 0.05
@@ -109,7 +109,7 @@ def test_wrong_cameras_do_not_change_the_masks(wave: Capture) -> None:
     inverted = {
         name: dataclasses.replace(c, R=c.R.T, t_m=-c.R.T @ c.t_m) for name, c in wave.cameras.items()
     }  # fmt: skip
-    a, b = (Outlines.of(capture, CalibrationSettings()) for capture in (wave, wave.with_cameras(inverted)))
+    a, b = (Outlines.of(capture) for capture in (wave, wave.with_cameras(inverted)))
     assert a is not None and b is not None
     for name in wave.train_cameras:
         for one, other in zip(a.by_camera[name], b.by_camera[name], strict=True):

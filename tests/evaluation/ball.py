@@ -74,8 +74,6 @@ def ball_fit() -> BodyFit:
     rig = Rig(
         vertices_m=torch.tensor(ball.vertices, dtype=torch.float32),
         faces=torch.tensor(ball.faces, dtype=torch.long),
-        uvs=torch.zeros(1, 2),
-        face_uvs=torch.zeros(len(ball.faces), 3, dtype=torch.long),
         joints_m=torch.zeros(1, 3),
         joint_names=("root",),
         parents=torch.tensor([-1]),

@@ -11,6 +11,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.config import TrainingSettings
+from hnerf.render import cameras_along
 from hnerf.render.silhouette import silhouette
 from tests.body.boxes import box_rig
 
@@ -58,12 +59,8 @@ class KnownMasks:
 
 def look_at(name: str, centre_m: np.ndarray, target_m: np.ndarray) -> Camera:
     """A camera at `centre_m` that sees `target_m` in the middle, z up."""
-    forward = (target_m - centre_m) / np.linalg.norm(target_m - centre_m)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    R = np.stack([right, np.cross(forward, right), forward])
-    K = np.array([[1.2 * SIZE_PX, 0, (SIZE_PX - 1) / 2], [0, 1.2 * SIZE_PX, (SIZE_PX - 1) / 2], [0, 0, 1]])
-    return Camera(name, K, R, -R @ centre_m, SIZE_PX, SIZE_PX)
+    like = Camera(name, np.diag([1.2 * SIZE_PX, 1.2 * SIZE_PX, 1]), np.eye(3), np.zeros(3), SIZE_PX, SIZE_PX)
+    return cameras_along.look_at(like, centre_m, target_m, np.array([0, 0, 1]))
 
 
 def record(folder: Path, bends_rad: tuple[float, ...] = (0.0, 0.2, 0.4)) -> tuple[Capture, KnownMasks, BodyFit]:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import sparse
 from torch import Tensor
 
+from hnerf.body.descriptor import normals_of
 from hnerf.body.rig import Rig, joint_transforms, skinning_transforms
 
 GARMENTS = ("skin", "shirt", "trousers", "shoes", "hair")
@@ -43,13 +44,11 @@ class Dressed:
     def on(rig: Rig, rng: np.random.Generator) -> "Dressed":
         """Dress a rest body; `rng` chooses where the folds lie."""
         body_m, body_faces = rig.vertices_m.double().numpy(), rig.faces.numpy()
-        weights = np.zeros((len(body_m), len(rig.joint_names)))
-        rows = np.arange(len(body_m))[:, None]
-        np.add.at(weights, (rows, rig.skin_joints.numpy()), rig.skin_weights.double().numpy())
+        weights = rig.dense_weights.double().numpy()
         depths_m = _garment_depths(rig, body_m, weights)
         average = _averaging(body_faces, len(body_m))
         loose = _smoothstep(depths_m[:, 1:4].max(1) / 0.06)[:, None]
-        smooth_m, smooth_weights, outward = body_m, weights, vertex_normals(body_m, body_faces)
+        smooth_m, smooth_weights, outward = body_m, weights, normals_of(body_m, body_faces)
         for _ in range(SMOOTHING_STEPS):
             smooth_m, smooth_weights = average @ smooth_m, average @ smooth_weights
         for _ in range(SMOOTHING_STEPS // 3):
@@ -107,14 +106,6 @@ class Dressed:
 def midpoints(per_vertex: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Values at body vertices (V, ...) to values at the refined vertices: those, then the middles of edges (E, 2)."""
     return np.concatenate([per_vertex, per_vertex[edges].mean(1)])
-
-
-def vertex_normals(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(V, 3) unit normals, area-weighted."""
-    corners = vertices_m[faces]
-    crossed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    summed = np.stack([np.bincount(faces.ravel(), np.repeat(c, 3), len(vertices_m)) for c in crossed.T], -1)
-    return summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-12)
 
 
 def _garment_depths(rig: Rig, rest_m: np.ndarray, weights: np.ndarray) -> np.ndarray:

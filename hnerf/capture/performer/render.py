@@ -1,6 +1,6 @@
 """Rendering by ray casting: a mesh lit by a dome of soft lights, in front of a room, and its shadow on the floor."""
 
-# mypy: disable-error-code="valid-type, attr-defined, no-untyped-def, misc"
+# mypy: disable-error-code="misc, no-untyped-def"
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from hnerf.capture.camera import Camera
 from hnerf.capture.performer.look import person_colour, room_colour
+from hnerf.render.rays import RayHits, cast, vectors
 
 wp.config.log_level = wp.LOG_ERROR
 
@@ -18,24 +19,6 @@ SUPERSAMPLES = 3  # a side; odd, so that one ray goes through the pixel's centre
 KEY_DIRECTION = np.array([0.5, -0.6, 0.75])  # to the brightest part of the dome
 LIGHTS, BRIGHTNESS = 20, 1.25
 SHADOW_HALF_SIDE_M, SHADOW_CELLS = 1.6, 80
-
-
-@wp.kernel
-def _cast(
-    mesh: wp.uint64,
-    origin: wp.vec3,
-    directions: wp.array(dtype=wp.vec3),
-    face: wp.array(dtype=wp.int32),
-    barycentric: wp.array(dtype=wp.vec3),
-    distance: wp.array(dtype=wp.float32),
-):
-    i = wp.tid()
-    hit = wp.mesh_query_ray(mesh, origin, directions[i], 100.0)
-    face[i] = -1
-    if hit.result:
-        face[i] = hit.face
-        barycentric[i] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
-        distance[i] = hit.t
 
 
 @wp.kernel
@@ -50,47 +33,23 @@ def _lit(
         visible[i, k] = 1.0
 
 
-@dataclass(frozen=True)
-class Hits:
-    """Where rays meet a mesh: face (N,), -1 for none; barycentric (N, 3); distance_m (N,)."""
-
-    face: np.ndarray
-    barycentric: np.ndarray
-    distance_m: np.ndarray
-
-    def interpolate(self, per_vertex: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """Values at vertices (V, C) to values at those rays that hit, (M, C)."""
-        seen = self.face >= 0
-        return np.einsum("nk,nkc->nc", self.barycentric[seen], per_vertex[faces[self.face[seen]]])
-
-
 class Caster:
     """A mesh that rays can be cast at, on the CPU."""
 
     def __init__(self, vertices_m: np.ndarray, faces: np.ndarray) -> None:
         corners = wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
-        self.mesh = wp.Mesh(_vectors(vertices_m), corners)
+        self.mesh = wp.Mesh(vectors(vertices_m, "cpu"), corners)
 
-    def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> Hits:
+    def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> RayHits:
         """First hits of rays from one origin (3,) along unit directions (N, 3)."""
-        n = len(directions)
-        face = wp.empty(n, dtype=wp.int32, device="cpu")
-        barycentric = wp.zeros(n, dtype=wp.vec3, device="cpu")
-        distance = wp.zeros(n, dtype=wp.float32, device="cpu")
-        inputs = [self.mesh.id, wp.vec3(*map(float, origin_m)), _vectors(directions), face, barycentric, distance]
-        wp.launch(_cast, n, inputs, device="cpu")
-        return Hits(face.numpy(), barycentric.numpy(), distance.numpy())
+        return cast(self.mesh, origin_m, directions)
 
     def visibility(self, points_m: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """(N, K): 1 where a point (N, 3) sees infinity along a direction (K, 3), else 0."""
         visible = wp.zeros((len(points_m), len(directions)), dtype=wp.float32, device="cpu")
-        inputs = [self.mesh.id, _vectors(points_m), _vectors(directions), visible]
+        inputs = [self.mesh.id, vectors(points_m, "cpu"), vectors(directions, "cpu"), visible]
         wp.launch(_lit, visible.shape, inputs, device="cpu")
         return visible.numpy()
-
-
-def _vectors(array: np.ndarray) -> wp.array:
-    return wp.array(np.ascontiguousarray(array, np.float32), dtype=wp.vec3, device="cpu")
 
 
 def dome_lights() -> tuple[np.ndarray, np.ndarray]:
@@ -119,9 +78,9 @@ class Lit(Protocol):
     @property
     def vertices_m(self) -> np.ndarray: ...
 
-    def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> Hits: ...
+    def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> RayHits: ...
 
-    def colours(self, hits: Hits) -> np.ndarray: ...
+    def colours(self, hits: RayHits) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -134,11 +93,11 @@ class Painted:
     looks: np.ndarray
     face_m: np.ndarray
 
-    def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> Hits:
+    def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> RayHits:
         """First hits of rays from one origin (3,) along unit directions (N, 3)."""
         return self.caster.cast(origin_m, directions)
 
-    def colours(self, hits: Hits) -> np.ndarray:
+    def colours(self, hits: RayHits) -> np.ndarray:
         """Lit colours in [0, 1] of those rays that hit, (M, 3)."""
         values = hits.interpolate(self.looks, self.faces)
         return (person_colour(self.face_m, values[:, :3], values[:, 3:-1]) * values[:, -1:]).clip(0, 1)

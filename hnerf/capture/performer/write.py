@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from hnerf.body.anny import anny_rig
+from hnerf.body.descriptor import normals_of
 from hnerf.body.rig import Rig, joint_transforms, pose_vertices
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import write_image
 from hnerf.capture.formats.easymocap import write_easymocap
 from hnerf.capture.lens import pinhole
 from hnerf.capture.performer.detect import detect
-from hnerf.capture.performer.dressed import Dressed, midpoints, vertex_normals
+from hnerf.capture.performer.dressed import Dressed, midpoints
 from hnerf.capture.performer.look import FACE
 from hnerf.capture.performer.motion import Pose, walk_pose
 from hnerf.capture.performer.render import (
@@ -28,6 +29,7 @@ from hnerf.capture.performer.render import (
     render_person,
 )
 from hnerf.config import PerformerSettings
+from hnerf.render.cameras_along import look_at
 
 TRAIN_CAMERAS, TEST_CAMERAS = ("01", "02", "03", "04"), ("05", "06")
 CAMERA_DISTANCE_M, CAMERA_HEIGHT_M, AIM_HEIGHT_M = 3.0, 1.45, 0.92
@@ -96,18 +98,13 @@ def write_performer(out: Path, settings: PerformerSettings) -> None:
 
 def ring_of_cameras(size_px: int) -> list[Camera]:
     """Four training cameras at right angles, then two test cameras half-way between, all looking at the middle."""
+    focal_px, aim_m, up = size_px / 2 / HALF_VIEW, np.array([0, 0, AIM_HEIGHT_M]), np.array([0, 0, 1])
     cameras = []
     for name, angle_deg in zip((*TRAIN_CAMERAS, *TEST_CAMERAS), (0, 90, 180, 270, 45, 225), strict=True):
         angle = np.radians(angle_deg)
         centre_m = np.array([CAMERA_DISTANCE_M * np.cos(angle), CAMERA_DISTANCE_M * np.sin(angle), CAMERA_HEIGHT_M])
-        forward = np.array([0, 0, AIM_HEIGHT_M]) - centre_m
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0, 0, 1])
-        right /= np.linalg.norm(right)
-        R = np.stack([right, np.cross(forward, right), forward])
-        focal_px, middle_px = size_px / 2 / HALF_VIEW, (size_px - 1) / 2
-        K = np.array([[focal_px, 0, middle_px], [0, focal_px, middle_px], [0, 0, 1]])
-        cameras.append(Camera(name, K, R, -R @ centre_m, size_px, size_px))
+        like = Camera(name, np.diag([focal_px, focal_px, 1]), np.eye(3), np.zeros(3), size_px, size_px)
+        cameras.append(look_at(like, centre_m, aim_m, up))
     return cameras
 
 
@@ -123,7 +120,7 @@ def _instant(dressed: Dressed, pose: Pose) -> Instant:
     root[2, 3] -= float(dressed.posed_m(pose.theta, root, pose.gait_phase)[:, 2].min())
     vertices_m = dressed.posed_m(pose.theta, root, pose.gait_phase)
     lights, caster = dome_lights(), Caster(vertices_m, dressed.faces)
-    normals = vertex_normals(vertices_m, dressed.faces)
+    normals = normals_of(vertices_m, dressed.faces)
     # Shadows are soft: it is enough to look from the body's own vertices, not from all that refinement added.
     body = slice(len(vertices_m) - len(dressed.edges))
     visible = midpoints(caster.visibility(vertices_m[body] + 3e-3 * normals[body], lights[0]), dressed.edges)
