@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from hnerf.capture.footage import Footage, ImageFolder, Video
 from hnerf.capture.guarded import (
     IMAGE_SUFFIXES,
+    VIDEO_SUFFIXES,
     check_camera_name,
     files_in,
     inside,
@@ -268,7 +269,7 @@ def _footage(folder: Path, part: str) -> dict[str, Footage]:
     root = inside(folder, "calibration", part)
     found: dict[str, Footage] = {}
     for path in sorted(root.iterdir()) if root.is_dir() else []:
-        if path.name.startswith(".") or (path.is_file() and path.suffix != ".mp4"):
+        if path.name.startswith(".") or (path.is_file() and path.suffix.lower() not in VIDEO_SUFFIXES):
             continue
         path = inside(folder, "calibration", part, path.name)
         name = check_camera_name(path.stem if path.is_file() else path.name, path)
@@ -277,7 +278,7 @@ def _footage(folder: Path, part: str) -> dict[str, Footage]:
         if path.is_file():
             found[name] = Video.open(path)
             continue
-        files = [p for p in files_in(folder, "calibration", part, path.name) if p.suffix.lower() in IMAGE_SUFFIXES]
+        files = files_in(folder, "calibration", part, path.name, suffixes=IMAGE_SUFFIXES)
         if not files:
             raise CaptureError(f"{path}: no JPEG or PNG images; add them or remove the folder")
         found[name] = ImageFolder(path, numbered(files, "images"))

@@ -18,7 +18,7 @@ from hnerf.capture.formats.layout import Layout, Stored
 from hnerf.capture.formats.peoplesnapshot import PeopleSnapshot
 from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.formats.zjumocap import ZjuMocap
-from hnerf.capture.guarded import inside, read_image
+from hnerf.capture.guarded import JSON_SUFFIXES, file_named, read_image
 from hnerf.capture.keypoint_files import read_openpose, read_results
 from hnerf.capture.keypoint_sets import to_body_25
 from hnerf.capture.lens import Lens
@@ -32,6 +32,7 @@ from hnerf.spread import spread
 DEFAULT_FPS = 30.0
 # Padding and cropping by encoders moves sizes by a few pixels; the calibration stage judges what it did to the cameras.
 SIZE_TOLERANCE = 0.02
+RATE_TOLERANCE = 0.01
 LAYOUTS: tuple[type[Layout], ...] = (
     ZjuMocap,
     PeopleSnapshot,
@@ -130,6 +131,11 @@ def _common_frames(footage: dict[str, Footage]) -> tuple[int, ...]:
                 f"{other.path}: {len(other.frames)} frames, but camera {first_name} has {numbers}; "
                 "give all cameras the same frames"
             )
+        if first.fps and other.fps and abs(other.fps - first.fps) > RATE_TOLERANCE * first.fps:
+            raise CaptureError(
+                f"{other.path}: {other.fps:.4g} frames a second, but {first.path} has {first.fps:.4g}; "
+                "export all videos at the same rate"
+            )
     return first.frames
 
 
@@ -198,7 +204,8 @@ def _per_frame(
 def _detections(layout: Layout, camera: str, recorded: tuple[int, ...]) -> np.ndarray | None:
     """(frames, most people, K, 3) as detected, absent people zero: of the layout's files, else of a list of results in
     keypoints/<camera>.json; None where there is neither."""
-    files, results = layout.keypoint_files(camera), inside(layout.folder, "keypoints", f"{camera}.json")
+    files = layout.keypoint_files(camera)
+    results = file_named(layout.folder, camera, "keypoints", suffixes=JSON_SUFFIXES)
     if files:
         chosen = _per_frame(files, recorded, recorded, "keypoints").values()
         paths = [file.path if isinstance(file, Stored) else file for file in chosen]

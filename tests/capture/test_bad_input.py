@@ -131,6 +131,10 @@ EASYMOCAP = {
     "toml is not TOML": (_toml("name = "), "capture.toml"),
     "toml with an unknown key": (_toml('[cameras]\ntrain = ["01"]\nvalidation = ["02"]\n'), "cameras.validation"),
     "toml with unknown units": (_toml('units = "inch"\n'), "units"),
+    "toml with a mistyped table": (_toml('[Camera]\ntrain = ["01"]\n'), "Camera has no meaning; did you mean cameras?"),
+    "toml with a mistyped key": (_toml('unit = "mm"\n'), "unit has no meaning; did you mean units?"),
+    "toml in another encoding": (lambda f: (f / "capture.toml").write_bytes(b'name = "J\xfcrgen"'), "is not UTF-8"),
+    "toml name too long for a folder": (_toml(f'name = "{100 * "张"}"\n'), "name of 300 bytes"),
     "toml with an unknown camera": (_toml('[cameras]\ntrain = ["01", "07"]\n'), "camera 07"),
     "toml with a camera twice": (_toml('[cameras]\ntrain = ["01"]\ntest = ["01"]\n'), "named twice"),
     "toml with an unknown frame": (_toml("[frames]\ntrain = [0, 5]\n"), "frame 5"),
@@ -158,6 +162,10 @@ POSE2SIM = {
     "video is none": (lambda f: (f / "videos/cam02.mp4").write_bytes(b"0" * 100), "videos/cam02.mp4"),
     "video cut short": (lambda f: _cut_video(f / "videos/cam02.mp4"), "videos/cam02.mp4"),
     "unequal frame counts": (lambda f: rec.write_video(f / "videos/cam02.mp4", 9), "videos/cam02.mp4: 9 frames"),
+    "video of another rate": (
+        lambda f: rec.write_video(f / "videos/cam02.mp4", 10, fps=24),
+        "videos/cam02.mp4: 24 frames a second, but",
+    ),
     "video of another size": (
         lambda f: rec.write_video(f / "videos/cam02.mp4", 10, (48, 64)),
         "videos/cam02.mp4: is 48 x 64",

@@ -125,6 +125,16 @@ def test_dropped_frames_are_placed_by_the_table(tmp_path: Path) -> None:
         read_board_footage(tmp_path, "extrinsic")
 
 
+def test_footage_with_a_suffix_in_upper_case_is_not_left_out(tmp_path: Path) -> None:
+    (tmp_path / "charuco.toml").write_text(CHARUCO)
+    for name in ("cam_0.mp4", "cam_1.MP4"):
+        rec.write_video(tmp_path / "video.mp4", 2)
+        (tmp_path / "calibration" / "extrinsic").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "video.mp4").rename(tmp_path / "calibration" / "extrinsic" / name)
+    footage = read_board_footage(tmp_path, "extrinsic")
+    assert footage is not None and list(footage.corners_px) == ["cam_0", "cam_1"]
+
+
 def test_videos_of_other_lengths_are_refused(tmp_path: Path) -> None:
     (tmp_path / "charuco.toml").write_text(CHARUCO)
     for camera, count in {"cam_0": 3, "cam_1": 4}.items():
