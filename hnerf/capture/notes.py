@@ -7,9 +7,16 @@ import re
 import unicodedata
 from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+)
 
 from hnerf.capture.guarded import inside, read_toml
 from hnerf.capture.keypoint_sets import KeypointSetName
@@ -54,6 +61,14 @@ class Notes(_Table):
     keypoints: KeypointSetName | None = None
     cameras: CameraSplit | None = None
     frames: FrameSplit | None = None
+
+    @field_validator("units", mode="wrap")
+    @classmethod
+    def _one_message_for_all(cls, units: Any, checked: ValidatorFunctionWrapHandler) -> Any:
+        try:
+            return checked(units)
+        except ValidationError:
+            raise ValueError('give "m", "mm", or a number: how many metres a unit has') from None
 
     @property
     def metres_per_unit(self) -> float:

@@ -34,6 +34,14 @@ def _nan_keypoint(folder: Path) -> None:
     rec.write_keypoints(folder / "openpose/01/000001_keypoints.json", [points])
 
 
+def _scale_keypoints(factor: float) -> Callable[[Path], object]:
+    def damage(folder: Path) -> None:
+        for path in (folder / "openpose/01").iterdir():
+            rec.write_keypoints(path, [factor * np.tile([7.0, 5.0, 0.1], (25, 1))])
+
+    return damage
+
+
 def _link(folder: Path, name: str) -> None:
     target = folder.parent / "elsewhere"
     (folder / name).rename(target)
@@ -120,6 +128,8 @@ EASYMOCAP = {
         lambda f: (f / "openpose/01/000001_keypoints.json").write_text("[" * 100_000),
         "000001_keypoints.json",
     ),
+    "keypoints in shares of the picture": (_scale_keypoints(0.1), "openpose/01: keypoints from 0.7 to 0.7 and 0.5 to"),
+    "keypoints of larger pictures": (_scale_keypoints(4), "not in the pixels of pictures of 24 x 16"),
     "NaN keypoint": (_nan_keypoint, "000001_keypoints.json"),
     "a thousand people": (
         lambda f: (f / "openpose/01/000001_keypoints.json").write_text(json.dumps({"people": [{}] * 1000})),
@@ -135,6 +145,7 @@ EASYMOCAP = {
     "toml with a mistyped key": (_toml('unit = "mm"\n'), "unit has no meaning; did you mean units?"),
     "toml in another encoding": (lambda f: (f / "capture.toml").write_bytes(b'name = "J\xfcrgen"'), "is not UTF-8"),
     "toml name too long for a folder": (_toml(f'name = "{100 * "张"}"\n'), "name of 300 bytes"),
+    "toml with endless units": (_toml("units = inf\n"), 'units: Value error, give "m", "mm", or a number'),
     "toml with an unknown camera": (_toml('[cameras]\ntrain = ["01", "07"]\n'), "camera 07"),
     "toml with a camera twice": (_toml('[cameras]\ntrain = ["01"]\ntest = ["01"]\n'), "named twice"),
     "toml with an unknown frame": (_toml("[frames]\ntrain = [0, 5]\n"), "frame 5"),
