@@ -251,6 +251,7 @@ def _table(report: dict[str, Any]) -> list[str]:
         median, p95 = ("-" if px is None else f"{px:.2f}" for px in (camera["median_px"], camera["p95_px"]))
         remarks = "; ".join(camera["reasons"])
         lines.append(f"{name:<12} {camera['status']:<9} {median:>9} {p95:>9}  {remarks}".rstrip())
+    lines += [f"{name:<12} not judged: a camera for testing" for name in report["unjudged_cameras"]]
     return [*lines, *report["notes"], f"verdict: {report['verdict']}"]
 
 

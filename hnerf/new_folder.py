@@ -1,9 +1,9 @@
 """Folders that come into being whole or not at all."""
 
 import os
-import shutil
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from hnerf.errors import CaptureError
@@ -15,11 +15,15 @@ def new_folder(out: Path) -> Iterator[Path]:
     wrong before. CaptureError where `out` exists."""
     if out.exists():
         raise CaptureError(f"{out}: exists; give the name of a new folder")
-    partial = out.with_name(f"{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
+    missing = [parent for parent in out.parents if not parent.exists()]
+    out.parent.mkdir(parents=True, exist_ok=True)
     try:
-        partial.mkdir(parents=True)
-        yield partial
-        os.replace(partial, out)
+        with tempfile.TemporaryDirectory(dir=out.parent, prefix=f"{out.name}.partial-") as beside:
+            partial = Path(beside) / out.name  # unlike `beside`, readable by whom the umask says
+            partial.mkdir()
+            yield partial
+            os.replace(partial, out)
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        for parent in missing:
+            with suppress(OSError):  # not empty: all was written
+                parent.rmdir()

@@ -15,12 +15,14 @@ from hnerf.calibration.board_lens import LensEstimate, estimate_lens
 from hnerf.calibration.board_picture import draw_boards
 from hnerf.calibration.board_rig import (
     MIN_CORNERS,
+    MIN_SHARED,
     compare_pairs,
     flat_only,
     linked,
     solve_boards,
     solve_rig,
     undistorted,
+    whole_enough,
 )
 from hnerf.capture.boards import BoardFootage, load_board_corners, read_board_footage
 from hnerf.capture.camera import Camera
@@ -83,6 +85,7 @@ def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> Boar
             f"{folder / 'calibration' / 'extrinsic'}: no board footage, or no charuco.toml and no [board] in "
             "capture.toml to describe the board; see docs/formats.md"
         )
+    _check_board_found(footage)
     lenses, intrinsics = _intrinsics(folder, footage)
     corners_m = footage.board.corners_m
     corners_px = np.stack([undistorted(footage.corners_px[name], lens) for name, lens in lenses.items()])
@@ -143,6 +146,17 @@ def visible_and_found(fit: BoardFit, corners_m: np.ndarray) -> tuple[np.ndarray,
         by_others = np.delete(found, i, axis=0).any(0)
         visible[i] = by_others & (inside.sum(-1) >= MIN_CORNERS) & (cosine > np.cos(np.deg2rad(MAX_TILT_DEG)))
     return visible, found
+
+
+def _check_board_found(footage: BoardFootage) -> None:
+    """CaptureError where no camera sees enough of the board to be linked: it is hardly the board that is described."""
+    corners_px = np.stack(list(footage.corners_px.values()))
+    found = whole_enough(footage.board.corners_m, np.isfinite(corners_px[..., 0]))
+    if found.sum(1).max() < MIN_SHARED:
+        raise CaptureError(
+            f"{footage.path}: this board was found in {found.sum()} of {found.size} pictures; check its columns, rows, "
+            "dictionary and inverted in charuco.toml or capture.toml"
+        )
 
 
 def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], dict[str, str]]:

@@ -8,6 +8,8 @@ import numpy as np
 
 from hnerf.calibration.diagnosis import (
     BODY_HEIGHT_M,
+    UNITS_M,
+    USUAL_HEIGHT_M,
     Measure,
     explain,
     gross_limit_px,
@@ -29,6 +31,7 @@ from hnerf.config import CalibrationSettings
 from hnerf.errors import CaptureError
 
 COINCIDENT_M = 0.005
+COMMON_HEIGHT_M = (1.4, 2.05)  # of adults; others are children, or in another unit
 UPRIGHT = 0.5  # mean cosine between the trunk and up, below which somebody lies or bends all the time, or up is not up
 RESIDUAL_SHARE = 0.014  # of the person's height: 5 px of 357
 REJECT_FACTOR = 2.0  # times `max_residual_px`: a camera so far off, that no refinement brought back, is not used
@@ -70,7 +73,7 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
         raise CaptureError(f"{capture.name}: fewer than two cameras agree on the person; calibrate again")
     every = capture.cameras | {camera.name: camera for camera in used}
     held_out_px |= refinement.held_out_px
-    notes += [*refinement.notes, *_upright_notes(after.points_m, capture.up)]
+    notes += [*refinement.notes, *_height_notes(after.body_height_m), *_upright_notes(after.points_m, capture.up)]
     return CalibrationReport(
         every,
         verdicts,
@@ -103,7 +106,8 @@ def _for_size(settings: CalibrationSettings, height_px: float) -> CalibrationSet
 def _check_convention(capture: Capture, cameras: Sequence[Camera], keypoints: np.ndarray, found: Measure) -> None:
     """CaptureError if the rig as a whole follows another convention, or two cameras stand at one place.
 
-    Conventions come first: the centres of an inverted ring of cameras coincide.
+    Conventions come first: the centres of an inverted ring of cameras coincide. In a wrong unit all are near, which is
+    for `_check_height` to say.
     """
     cause = explain(cameras, keypoints) if found.cost_px > gross_limit_px(keypoints) else None
     if cause:
@@ -112,7 +116,7 @@ def _check_convention(capture: Capture, cameras: Sequence[Camera], keypoints: np
             "write world to camera, x_camera = R x_world + T, y down, z forward"
         )
     for a, b in combinations(cameras, 2):
-        if np.linalg.norm(a.centre_m - b.centre_m) < COINCIDENT_M:
+        if np.linalg.norm(a.centre_m - b.centre_m) < COINCIDENT_M and not unit_of(found.body_height_m):
             raise CaptureError(
                 f"{capture.name}: cameras {a.name} and {b.name} stand at one place; give each its own extrinsics"
             )
@@ -124,8 +128,24 @@ def _check_height(capture: Capture, found: Measure) -> None:
     if low <= found.body_height_m <= high or np.isnan(found.body_height_m):
         return
     unit = unit_of(found.body_height_m)
-    cause = f"the translations look like {unit}; set the right units" if unit else "give the translations in metres"
-    raise CaptureError(f"{capture.name}: the person would be {found.body_height_m:.4g} m tall; {cause}")
+    cause = f"the translations look like {unit}; " if unit else ""
+    factor = UNITS_M[unit] if unit else USUAL_HEIGHT_M / found.body_height_m
+    raise CaptureError(
+        f"{capture.name}: the person would be {found.body_height_m:.4g} m tall; {cause}{_other_units(factor)}"
+    )
+
+
+def _height_notes(height_m: float) -> list[str]:
+    """How tall the person is, and what to do if that is not so."""
+    low, high = COMMON_HEIGHT_M
+    if np.isnan(height_m):
+        return []
+    doubt = f": if that is wrong, {_other_units(USUAL_HEIGHT_M / height_m)}" if not low <= height_m <= high else ""
+    return [f"the person is {height_m:.2f} m tall{doubt}"]
+
+
+def _other_units(factor: float) -> str:
+    return f'in capture.toml multiply units ("m" is 1, "mm" 0.001) by {factor:.4g}'
 
 
 def _upright_notes(points_m: np.ndarray, up: str) -> list[str]:

@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from hnerf.capture.footage import Footage, ImageFolder, Video
 from hnerf.capture.guarded import (
     IMAGE_SUFFIXES,
+    VIDEO_SUFFIXES,
     check_camera_name,
     files_in,
     inside,
@@ -187,7 +188,8 @@ def read_board_footage(
 
     Of long footage every so many frames are looked at, frame `wanted` among them if there is one.
     Of extrinsic footage, all cameras' pictures of one frame number are taken to be of one moment; videos are numbered
-    by `timestamps.csv` (Caliscope's) if that is there. CaptureError on files that cannot be read or do not match.
+    by `timestamps.csv` (Caliscope's) if that is there. CaptureError on files that cannot be read or do not match,
+    or where there is no frame `wanted`.
     """
     path = inside(folder, "calibration", part)
     footage, board = _footage(folder, part), read_board(folder)
@@ -197,8 +199,10 @@ def read_board_footage(
         return None
     numbers = _frame_numbers(path, footage, synchronised=part == "extrinsic")
     frames = tuple(sorted({number for of_camera in numbers.values() for number in of_camera}))
+    if wanted is not None and wanted not in frames:
+        raise CaptureError(f"{path}: has no frame {wanted}; name one of {frames[0]} to {frames[-1]}")
     step = math.ceil(len(frames) / MAX_FRAMES)
-    frames = frames[frames.index(wanted) % step if wanted in frames else 0 :: step]
+    frames = frames[0 if wanted is None else frames.index(wanted) % step :: step]
     corners_px, sizes_px = {}, {}
     for name, pictures in footage.items():
         corners_px[name], sizes_px[name] = _corners(board, pictures, numbers[name], frames)
@@ -268,7 +272,7 @@ def _footage(folder: Path, part: str) -> dict[str, Footage]:
     root = inside(folder, "calibration", part)
     found: dict[str, Footage] = {}
     for path in sorted(root.iterdir()) if root.is_dir() else []:
-        if path.name.startswith(".") or (path.is_file() and path.suffix != ".mp4"):
+        if path.name.startswith(".") or (path.is_file() and path.suffix.lower() not in VIDEO_SUFFIXES):
             continue
         path = inside(folder, "calibration", part, path.name)
         name = check_camera_name(path.stem if path.is_file() else path.name, path)
@@ -277,7 +281,7 @@ def _footage(folder: Path, part: str) -> dict[str, Footage]:
         if path.is_file():
             found[name] = Video.open(path)
             continue
-        files = [p for p in files_in(folder, "calibration", part, path.name) if p.suffix.lower() in IMAGE_SUFFIXES]
+        files = files_in(folder, "calibration", part, path.name, suffixes=IMAGE_SUFFIXES)
         if not files:
             raise CaptureError(f"{path}: no JPEG or PNG images; add them or remove the folder")
         found[name] = ImageFolder(path, numbered(files, "images"))

@@ -18,7 +18,9 @@ MAX_TEXT_BYTES = 16_000_000
 # What reading arrays from a file raises that is no whole .npz of plain arrays.
 NO_ARRAYS = (AttributeError, EOFError, MemoryError, OSError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
-_IMAGE_MODES = ("1", "L", "P", "RGB", "RGBA")  # 8 bits a channel: others would be clipped
+VIDEO_SUFFIXES = (".mp4",)
+JSON_SUFFIXES = (".json",)
+_IMAGE_MODES = ("1", "L", "LA", "P", "RGB", "RGBA")  # 8 bits a channel: others would be clipped
 _CAMERA_NAME = re.compile(r"\w([\w ()-]{0,62}[\w()-])?")  # becomes a folder name, and a glob without wildcards
 _ARGUMENTS = ("file", "allow_pickle")  # of np.savez, which takes keypoints by camera name
 
@@ -45,18 +47,21 @@ def inside(root: Path, *parts: str) -> Path:
     return path
 
 
-def files_in(root: Path, *parts: str) -> list[Path]:
-    """The files of a folder inside the capture, sorted by name; empty if there is no such folder."""
+def files_in(root: Path, *parts: str, suffixes: tuple[str, ...] = ()) -> list[Path]:
+    """The files of a folder inside the capture, sorted by name; empty if there is no such folder. suffixes: in lower
+    case, those to keep, however they are written; none keeps all."""
     folder = inside(root, *parts)
     if not folder.is_dir():
         return []
     paths = (inside(root, *parts, found.name) for found in sorted(folder.iterdir()) if not found.name.startswith("."))
-    return [path for path in paths if path.is_file()]
+    return [path for path in paths if path.is_file() and (not suffixes or path.suffix.lower() in suffixes)]
 
 
-def images_named(root: Path, stem: str, *parts: str) -> list[Path]:
-    """The image files called `stem` (any known suffix) in a folder inside the capture."""
-    return [p for p in files_in(root, *parts) if p.stem == stem and p.suffix.lower() in IMAGE_SUFFIXES]
+def file_named(root: Path, stem: str, *parts: str, suffixes: tuple[str, ...]) -> Path:
+    """The file called `stem` with one of these suffixes, as `files_in` has them, in a folder inside the capture; where
+    there is none, the path that it would have with the first of them."""
+    found = [path for path in files_in(root, *parts, suffixes=suffixes) if path.stem == stem]
+    return found[0] if found else inside(root, *parts, stem + suffixes[0])
 
 
 def numbered(paths: list[Path], what: str) -> dict[int, Path]:
@@ -85,11 +90,12 @@ def read_bytes(path: Path, max_bytes: int) -> bytes:
 
 
 def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """A small UTF-8 text file; CaptureError if it is missing, empty, too large, or not text (a pickle, an archive)."""
+    """A small UTF-8 text file, which may begin with a mark that says so; CaptureError if it is missing, empty, too
+    large, or not text (a pickle, an archive)."""
     try:
-        text = read_bytes(path, max_bytes).decode("utf-8")
+        text = read_bytes(path, max_bytes).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise CaptureError(f"{path}: is binary where text belongs (a pickle?); export it again as text") from None
+        raise CaptureError(f"{path}: is not UTF-8 text (a pickle, or another encoding?); save it as UTF-8") from None
     if not text.strip():
         raise CaptureError(f"{path}: is empty; export it again")
     return text

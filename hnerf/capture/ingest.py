@@ -9,7 +9,7 @@ import numpy as np
 from hnerf.capture.bars import Area, fitted, picture_area
 from hnerf.capture.boards import normalised_corners, read_board_footage
 from hnerf.capture.capture import Capture
-from hnerf.capture.footage import Footage
+from hnerf.capture.footage import Footage, Picture
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.colmap import Colmap
 from hnerf.capture.formats.easymocap import EasyMocap
@@ -17,7 +17,7 @@ from hnerf.capture.formats.layout import Layout, Stored
 from hnerf.capture.formats.peoplesnapshot import PeopleSnapshot
 from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.formats.zjumocap import ZjuMocap
-from hnerf.capture.guarded import inside, read_image
+from hnerf.capture.guarded import JSON_SUFFIXES, file_named, read_image
 from hnerf.capture.keypoint_files import read_openpose, read_results
 from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
 from hnerf.capture.lens import Lens
@@ -31,6 +31,8 @@ from hnerf.spread import spread
 DEFAULT_FPS = 30.0
 # Padding and cropping by encoders moves sizes by a few pixels; the calibration stage judges what it did to the cameras.
 SIZE_TOLERANCE = 0.02
+RATE_TOLERANCE = 0.01
+MOST_OUTSIDE = 0.5  # share of keypoints outside of their pictures: detectors guess some that are cut off
 LAYOUTS: tuple[type[Layout], ...] = (
     ZjuMocap,
     PeopleSnapshot,
@@ -57,7 +59,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
     cameras = chosen_cameras(folder, notes, list(lenses), layout.training_cameras())
     footage = {name: layout.footage(name) for name in cameras.train + cameras.test}
     recorded = _common_frames(footage)
-    detected = {name: _detections(layout, name, recorded) for name in footage}
+    detected = {name: _detections(layout, name, pictures) for name, pictures in footage.items()}
     people = {name: found for name, found in detected.items() if found is not None}
     seen = [people[name] for name in cameras.train if name in people]
     there = recorded if notes.frames else _while_somebody_is_there(seen, recorded)
@@ -123,6 +125,11 @@ def _common_frames(footage: dict[str, Footage]) -> tuple[int, ...]:
             raise CaptureError(
                 f"{other.path}: {len(other.frames)} frames, but camera {first_name} has {numbers}; "
                 "give all cameras the same frames"
+            )
+        if first.fps and other.fps and abs(other.fps - first.fps) > RATE_TOLERANCE * first.fps:
+            raise CaptureError(
+                f"{other.path}: {other.fps:.4g} frames a second, but {first.path} has {first.fps:.4g}; "
+                "export all videos at the same rate"
             )
     return first.frames
 
@@ -213,10 +220,12 @@ def _per_frame(
     return {frame: files[frame] for frame in wanted}
 
 
-def _detections(layout: Layout, camera: str, recorded: tuple[int, ...]) -> np.ndarray | None:
+def _detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | None:
     """(frames, most people, K, 3) as detected, absent people zero: of the layout's files, else of a list of results in
-    keypoints/<camera>.json; None where there is neither."""
-    files, results = layout.keypoint_files(camera), inside(layout.folder, "keypoints", f"{camera}.json")
+    keypoints/<camera>.json; None where there is neither. CaptureError where they are not in the pictures' pixels."""
+    recorded = footage.frames
+    files = layout.keypoint_files(camera)
+    results = file_named(layout.folder, camera, "keypoints", suffixes=JSON_SUFFIXES)
     if files:
         chosen = _per_frame(files, recorded, recorded, "keypoints").values()
         paths = [file.path if isinstance(file, Stored) else file for file in chosen]
@@ -233,7 +242,23 @@ def _detections(layout: Layout, camera: str, recorded: tuple[int, ...]) -> np.nd
         if points.shape[1] != count:
             raise CaptureError(f"{path}: {points.shape[1]} keypoints a person where others have {count}; detect again")
         row[: len(points)] = points
+    place = paths[0] if len(set(paths)) == 1 else paths[0].parent
+    _check_in_pixels(place, stacked[stacked[..., 2] > 0][:, :2], next(footage.read(recorded[:1])))
     return stacked
+
+
+def _check_in_pixels(place: Path, points: np.ndarray, picture: Picture) -> None:
+    """CaptureError if keypoints (n, 2), all of a camera's, cannot be in the pixels of its pictures."""
+    size_px = np.array(picture.rgb.shape[1::-1])
+    if not len(points):
+        return
+    outside = ((points < 0) | (points > size_px)).any(-1).mean()
+    if outside > MOST_OUTSIDE or points.max() <= 1:
+        spans = " and ".join(f"{low:.4g} to {high:.4g}" for low, high in zip(points.min(0), points.max(0), strict=True))
+        raise CaptureError(
+            f"{place}: keypoints from {spans} are not in the pixels of pictures of {size_px[0]} x {size_px[1]}; "
+            "detect them in these pictures, or scale them"
+        )
 
 
 def _while_somebody_is_there(people: list[np.ndarray], frames: tuple[int, ...]) -> tuple[int, ...]:

@@ -28,13 +28,19 @@ def read_openpose(path: Path) -> np.ndarray:
 def read_results(path: Path, frames: Iterable[int]) -> list[np.ndarray]:
     """As `read_openpose`, for each of the frames: of a list of {image_id, keypoints, score}, as MMPose, RTMPose and
     AlphaPose write for a whole recording. image_id: the frame's number, or an image name that ends in it. Frames that
-    it leaves out show nobody. CaptureError if it is no such file."""
+    it leaves out show nobody. CaptureError if it is no such file, or is of other frames."""
     try:
         people: dict[int, list[Any]] = {}
         for result in read_json(path):
             people.setdefault(_frame(result["image_id"]), []).append(result["keypoints"])
     except (KeyError, TypeError, ValueError):
         raise CaptureError(f"{path}: no list of image_id and keypoints; write COCO results again") from None
+    frames = tuple(frames)
+    if strange := sorted(set(people).difference(frames)):
+        raise CaptureError(
+            f"{path}: image_id {strange[0]} is none of the recording's frames {frames[0]} to {frames[-1]}; "
+            "number them as the pictures are, videos from 0"
+        )
     return [_people(path, _few(path, people.get(frame, []))) for frame in frames]
 
 

@@ -1,14 +1,22 @@
 """`capture.toml`: what a layout does not say itself, and which cameras and frames are for what."""
 
+import difflib
 import logging
 import math
 import re
 import unicodedata
 from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+)
 
 from hnerf.capture.guarded import inside, read_toml
 from hnerf.capture.keypoint_sets import KeypointSetName
@@ -16,6 +24,9 @@ from hnerf.config import validated
 from hnerf.errors import CaptureError
 
 log = logging.getLogger("hnerf.capture")
+
+TYPING_ERROR = 0.8  # likeness (difflib's) of an unknown key to a known one, from which on it is taken for a mistake
+MAX_NAME_BYTES = 200  # file systems take 255, for names that are made of it too
 
 FrameNumber = Annotated[int, Field(ge=0, le=999_999_999)]
 
@@ -51,6 +62,14 @@ class Notes(_Table):
     cameras: CameraSplit | None = None
     frames: FrameSplit | None = None
 
+    @field_validator("units", mode="wrap")
+    @classmethod
+    def _one_message_for_all(cls, units: Any, checked: ValidatorFunctionWrapHandler) -> Any:
+        try:
+            return checked(units)
+        except ValidationError:
+            raise ValueError('give "m", "mm", or a number: how many metres a unit has') from None
+
     @property
     def metres_per_unit(self) -> float:
         """The calibration's unit of length."""
@@ -60,7 +79,13 @@ class Notes(_Table):
 def read_notes(folder: Path) -> Notes:
     """The folder's `capture.toml`, or the defaults without one; CaptureError on a bad key or value."""
     path = inside(folder, "capture.toml")
-    return validated(Notes, read_toml(path), path) if path.exists() else Notes()
+    if not path.exists():
+        return Notes()
+    tree, known = read_toml(path), [*Notes.model_fields, "board"]
+    for key in sorted(set(tree).difference(known)):
+        if meant := difflib.get_close_matches(key.lower(), known, 1, TYPING_ERROR):
+            raise CaptureError(f"{path}: {key} has no meaning; did you mean {meant[0]}? Else call it something else")
+    return validated(Notes, tree, path)
 
 
 def capture_name(folder: Path, notes: Notes) -> str:
@@ -68,6 +93,8 @@ def capture_name(folder: Path, notes: Notes) -> str:
     name = unicodedata.normalize("NFC", folder.resolve().name if notes.name is None else notes.name)  # macOS: NFD
     if not re.fullmatch(r"\w[\w .()-]{0,127}", name):
         raise CaptureError(f"{folder / 'capture.toml'}: name {name!r}: use letters, digits, '_', '-', '.' and spaces")
+    if len(name.encode()) > MAX_NAME_BYTES:
+        raise CaptureError(f"{folder / 'capture.toml'}: name of {len(name.encode())} bytes; keep to {MAX_NAME_BYTES}")
     return name
 
 

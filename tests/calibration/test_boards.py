@@ -251,6 +251,16 @@ def test_the_floor_is_the_board_that_lies_on_it(tmp_path: Path, monkeypatch: pyt
     assert written["b"].t_m == pytest.approx(calibration.lenses["b"].t_m) and (tmp_path / "out" / "boards.png").exists()
 
 
+def test_a_board_that_is_found_nowhere_is_hardly_that_board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = dict.fromkeys("ab", np.full((9, len(BOARD.corners_m), 2), np.nan))
+    found["a"] = seen(rig(), {})[0, :9].copy()
+    found["a"][2:] = np.nan
+    footage = BoardFootage(tmp_path, BOARD, tuple(range(9)), 1, found, dict.fromkeys("ab", (1000, 1000)))
+    monkeypatch.setattr(calibration_boards, "read_board_footage", lambda *_: footage)
+    with pytest.raises(CaptureError, match="this board was found in 2 of 18 pictures; check its columns"):
+        calibrate_from_boards(tmp_path)
+
+
 def test_real_footage_gives_the_shipped_cameras() -> None:
     folder = shared_capture("caliscope-charuco")
     calibration = calibrate_from_boards(folder)

@@ -57,6 +57,7 @@ def test_a_good_calibration_is_left_alone(tmp_path: Path) -> None:
     assert report.verdict == "ok"
     assert report.after is not None
     assert report.after.body_height_m == pytest.approx(1.79, abs=0.02)
+    assert report.notes == (f"the person is {report.after.body_height_m:.2f} m tall",)
     report.save(tmp_path / "out")
     for name, camera in load_cameras(tmp_path / "out", capture).cameras.items():
         for field in ("K", "R", "t_m"):
@@ -68,7 +69,7 @@ def test_a_world_that_does_not_stand_upright_is_told(tmp_path: Path) -> None:
     turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # of the world: z to y
     fallen = [dataclasses.replace(camera, R=camera.R @ turn) for camera in ring(4)]
     capture = write_capture(tmp_path / "in", fallen, detections(ring(4), 2))
-    (note,) = check_calibration(capture, SETTINGS).notes
+    *_, note = check_calibration(capture, SETTINGS).notes
     assert note.startswith("from hips to neck is -y mostly, not up (+z)")
 
 
@@ -170,10 +171,24 @@ def test_a_wrong_convention_in_one_camera_is_named(tmp_path: Path) -> None:
 
 
 def test_millimetres_are_named(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match=r"1793 m tall.*millimetres"):
+    with pytest.raises(CaptureError, match=r"1793 m tall; .* millimetres; in capture.toml multiply units .* by 0.001$"):
         check_calibration(
             recorded_with(tmp_path, lambda c: dataclasses.replace(c, t_m=1000 * c.t_m), noise_px=0), SETTINGS
         )
+
+
+def test_metres_declared_as_millimetres_are_not_taken_for_one_place(tmp_path: Path) -> None:
+    tiny = recorded_with(tmp_path, lambda c: dataclasses.replace(c, t_m=0.001 * c.t_m), noise_px=0)
+    with pytest.raises(CaptureError, match=r"metres declared as millimetres; .* by 1000$"):
+        check_calibration(tiny, SETTINGS)
+
+
+def test_a_person_of_unusual_height_is_told_not_refused(tmp_path: Path) -> None:
+    small = recorded_with(tmp_path, lambda c: dataclasses.replace(c, t_m=0.6 * c.t_m), noise_px=0)
+    (note,) = check_calibration(small, SETTINGS).notes
+    # 0.6 of the figure's 1.793 m; 1.7 / 1.076 = 1.58.
+    assert note.startswith("the person is 1.08 m tall: if that is wrong, in capture.toml multiply units")
+    assert float(note.split()[-1]) == pytest.approx(1.58, abs=0.01)
 
 
 def test_swapped_files_fit_no_convention(tmp_path: Path) -> None:

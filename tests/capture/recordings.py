@@ -64,10 +64,10 @@ def write_easymocap(folder: Path) -> Path:
     return folder
 
 
-def write_video(path: Path, count: int, size_px: tuple[int, int] = (64, 48)) -> None:
+def write_video(path: Path, count: int, size_px: tuple[int, int] = (64, 48), fps: float = 25.0) -> None:
     """Frame f is grey of value 20 + 20 f."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 25.0, size_px)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size_px)
     assert writer.isOpened()
     for frame in range(count):
         writer.write(np.full((size_px[1], size_px[0], 3), 20 + 20 * frame, np.uint8))

@@ -34,6 +34,14 @@ def _nan_keypoint(folder: Path) -> None:
     rec.write_keypoints(folder / "openpose/01/000001_keypoints.json", [points])
 
 
+def _scale_keypoints(factor: float) -> Callable[[Path], object]:
+    def damage(folder: Path) -> None:
+        for path in (folder / "openpose/01").iterdir():
+            rec.write_keypoints(path, [factor * np.tile([7.0, 5.0, 0.1], (25, 1))])
+
+    return damage
+
+
 def _link(folder: Path, name: str) -> None:
     target = folder.parent / "elsewhere"
     (folder / name).rename(target)
@@ -120,6 +128,8 @@ EASYMOCAP = {
         lambda f: (f / "openpose/01/000001_keypoints.json").write_text("[" * 100_000),
         "000001_keypoints.json",
     ),
+    "keypoints in shares of the picture": (_scale_keypoints(0.1), "openpose/01: keypoints from 0.7 to 0.7 and 0.5 to"),
+    "keypoints of larger pictures": (_scale_keypoints(4), "not in the pixels of pictures of 24 x 16"),
     "NaN keypoint": (_nan_keypoint, "000001_keypoints.json"),
     "a thousand people": (
         lambda f: (f / "openpose/01/000001_keypoints.json").write_text(json.dumps({"people": [{}] * 1000})),
@@ -131,6 +141,11 @@ EASYMOCAP = {
     "toml is not TOML": (_toml("name = "), "capture.toml"),
     "toml with an unknown key": (_toml('[cameras]\ntrain = ["01"]\nvalidation = ["02"]\n'), "cameras.validation"),
     "toml with unknown units": (_toml('units = "inch"\n'), "units"),
+    "toml with a mistyped table": (_toml('[Camera]\ntrain = ["01"]\n'), "Camera has no meaning; did you mean cameras?"),
+    "toml with a mistyped key": (_toml('unit = "mm"\n'), "unit has no meaning; did you mean units?"),
+    "toml in another encoding": (lambda f: (f / "capture.toml").write_bytes(b'name = "J\xfcrgen"'), "is not UTF-8"),
+    "toml name too long for a folder": (_toml(f'name = "{100 * "张"}"\n'), "name of 300 bytes"),
+    "toml with endless units": (_toml("units = inf\n"), 'units: Value error, give "m", "mm", or a number'),
     "toml with an unknown camera": (_toml('[cameras]\ntrain = ["01", "07"]\n'), "camera 07"),
     "toml with a camera twice": (_toml('[cameras]\ntrain = ["01"]\ntest = ["01"]\n'), "named twice"),
     "toml with an unknown frame": (_toml("[frames]\ntrain = [0, 5]\n"), "frame 5"),
@@ -158,6 +173,10 @@ POSE2SIM = {
     "video is none": (lambda f: (f / "videos/cam02.mp4").write_bytes(b"0" * 100), "videos/cam02.mp4"),
     "video cut short": (lambda f: _cut_video(f / "videos/cam02.mp4"), "videos/cam02.mp4"),
     "unequal frame counts": (lambda f: rec.write_video(f / "videos/cam02.mp4", 9), "videos/cam02.mp4: 9 frames"),
+    "video of another rate": (
+        lambda f: rec.write_video(f / "videos/cam02.mp4", 10, fps=24),
+        "videos/cam02.mp4: 24 frames a second, but",
+    ),
     "video of another size": (
         lambda f: rec.write_video(f / "videos/cam02.mp4", 10, (48, 64)),
         "videos/cam02.mp4: is 48 x 64",

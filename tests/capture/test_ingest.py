@@ -6,8 +6,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from hnerf.capture.capture import Capture
+from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
 from tests.capture import recordings as rec
@@ -198,6 +200,36 @@ def test_padding_within_two_percent_is_let_through_and_reported(folder: Path, tm
     assert capture.calibrated_sizes_px["01"] == (2400, 1600) and capture.recorded_sizes_px["01"] == (2352, 1600)
     assert (capture.cameras["01"].width_px, capture.cameras["01"].height_px) == (1176, 800)
     assert capture.cameras["01"].K[0, 0] == pytest.approx(10.0)  # the calibrated 20, halved with the image
+
+
+def test_grey_images_with_alpha_are_read(folder: Path, tmp_path: Path) -> None:
+    for path in (folder / "images" / "01").iterdir():
+        Image.open(path).convert("LA").save(path)
+    grey = ingest(folder, SETTINGS, tmp_path / "out").image("01", 0)
+    assert np.array_equal(grey[..., 0], grey[..., 1])
+
+
+def test_a_mark_of_utf_8_is_no_content(folder: Path, tmp_path: Path) -> None:
+    (folder / "capture.toml").write_text('name = "ada"', encoding="utf-8-sig")
+    path = folder / "openpose" / "01" / "000000_keypoints.json"
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    assert ingest(folder, SETTINGS, tmp_path / "out").name == "ada"
+
+
+def test_suffixes_may_be_in_upper_case(tmp_path: Path) -> None:
+    for write in (rec.write_easymocap, rec.write_pose2sim):
+        folder = write(tmp_path / write.__name__)
+        for path in [*folder.glob("openpose/*/*"), *folder.glob("pose/*/*"), *folder.glob("videos/*")]:
+            path.rename(path.with_suffix(path.suffix.upper()))
+        assert ingest(folder, SETTINGS, tmp_path / f"{write.__name__}-out").has_keypoints
+
+
+def test_numbers_without_zeros_before_them_are_sorted_as_numbers(tmp_path: Path) -> None:
+    folder = rec.write_pose2sim(tmp_path / "walker")
+    for path in (folder / "pose" / "cam01_json").iterdir():
+        path.rename(path.with_stem(f"cam01_{int(path.stem[-6:]) + 5}"))  # 5 to 14
+    files = Pose2Sim(folder).keypoint_files("cam01")
+    assert [str(files[i]).rsplit("_", 1)[1] for i in (0, 4, 5, 9)] == ["5.json", "9.json", "10.json", "14.json"]
 
 
 def test_videos_are_read_by_frame(tmp_path: Path) -> None:

@@ -102,6 +102,8 @@ def test_lists_of_results_are_read_by_frame(tmp_path: Path) -> None:
     two, three, four = read_results(tmp_path / "01.json", (2, 3, 4))
     assert np.allclose(two, points(17)[None]) and len(three) == 0
     assert four.shape == (2, 17, 3) and (four[1, :, 2] == 1).all()
+    with pytest.raises(CaptureError, match=r"01\.json: image_id 4 is none of the recording's frames 1 to 3"):
+        read_results(tmp_path / "01.json", (1, 2, 3))
     (tmp_path / "01.json").write_text(json.dumps([{"image_id": "cover", "keypoints": []}]))
     with pytest.raises(CaptureError, match=r"01\.json: no list of image_id"):
         read_results(tmp_path / "01.json", (0,))

@@ -119,6 +119,8 @@ def test_check_prints_every_camera_and_the_verdict(tmp_path: Path, capsys: pytes
     report = json.loads(next(tmp_path.glob("calibration/*/report.json")).read_text())
     assert [line.split()[0] for line in table[1 : 1 + len(report["cameras"])]] == list(report["cameras"])
     assert f"verdict: {report['verdict']}" in table
+    for name in ("05", "06"):
+        assert f"{name:<12} not judged: a camera for testing" in table
 
 
 def test_synth_writes_whole_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

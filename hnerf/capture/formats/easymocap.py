@@ -11,7 +11,16 @@ import yaml
 
 from hnerf.capture.footage import Footage, ImageFolder, Video
 from hnerf.capture.formats.layout import Layout, Stored
-from hnerf.capture.guarded import IMAGE_SUFFIXES, files_in, images_named, inside, numbered, read_text
+from hnerf.capture.guarded import (
+    IMAGE_SUFFIXES,
+    JSON_SUFFIXES,
+    VIDEO_SUFFIXES,
+    file_named,
+    files_in,
+    inside,
+    numbered,
+    read_text,
+)
 from hnerf.capture.lens import Lens, checked_lens
 from hnerf.errors import CaptureError
 
@@ -36,10 +45,10 @@ class EasyMocap(Layout):
 
     def footage(self, camera: str) -> Footage:
         """images/<camera>/, else videos/<camera>.mp4."""
-        files = [p for p in files_in(self.folder, "images", camera) if p.suffix.lower() in IMAGE_SUFFIXES]
+        files = files_in(self.folder, "images", camera, suffixes=IMAGE_SUFFIXES)
         if files:
             return ImageFolder(self.folder / "images" / camera, numbered(files, "images"))
-        video = inside(self.folder, "videos", f"{camera}.mp4")
+        video = file_named(self.folder, camera, "videos", suffixes=VIDEO_SUFFIXES)
         if not video.exists():
             raise CaptureError(
                 f"{self.folder / 'images' / camera}: no JPEG or PNG images, and no {video}; "
@@ -49,21 +58,21 @@ class EasyMocap(Layout):
 
     def keypoint_files(self, camera: str) -> dict[int, Path | Stored]:
         """openpose/<camera>/<frame>_keypoints.json."""
-        files = [p for p in files_in(self.folder, "openpose", camera) if p.suffix == ".json"]
+        files = files_in(self.folder, "openpose", camera, suffixes=JSON_SUFFIXES)
         return dict(numbered(files, "keypoints"))
 
     def mask_files(self, camera: str) -> dict[int, Path | Stored]:
         """masks/<camera>/<frame>.png, or mask/."""
         for name in ("masks", "mask"):
-            files = [p for p in files_in(self.folder, name, camera) if p.suffix.lower() in IMAGE_SUFFIXES]
+            files = files_in(self.folder, name, camera, suffixes=IMAGE_SUFFIXES)
             if files:
                 return dict(numbered(files, "masks"))
         return {}
 
     def plate_file(self, camera: str) -> Path | None:
         """background/<camera>.jpg or .png."""
-        found = images_named(self.folder, camera, "background")
-        return found[0] if found else None
+        plate = file_named(self.folder, camera, "background", suffixes=IMAGE_SUFFIXES)
+        return plate if plate.exists() else None
 
 
 def write_easymocap(out: Path, lenses: Sequence[Lens]) -> None:

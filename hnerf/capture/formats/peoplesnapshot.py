@@ -14,7 +14,7 @@ import numpy as np
 from hnerf.capture.footage import Footage, Video
 from hnerf.capture.formats.layout import Layout, Stored
 from hnerf.capture.given_poses import JOINTS, GivenPoses
-from hnerf.capture.guarded import MAX_IMAGE_PIXELS, files_in, inside
+from hnerf.capture.guarded import MAX_IMAGE_PIXELS, VIDEO_SUFFIXES, files_in, inside
 from hnerf.capture.lens import Lens, checked_lens
 from hnerf.capture.pickled import read_pickle
 from hnerf.errors import CaptureError
@@ -50,7 +50,7 @@ class PeopleSnapshot(Layout):
 
     def footage(self, camera: str) -> Footage:
         """The one video, which bears the subject's name."""
-        videos = [path for path in files_in(self.folder) if path.suffix == ".mp4"]
+        videos = files_in(self.folder, suffixes=VIDEO_SUFFIXES)
         if len(videos) != 1:
             raise CaptureError(f"{self.folder}: {len(videos)} videos .mp4; leave exactly one")
         return Video.open(videos[0])

@@ -1,5 +1,6 @@
 """The Pose2Sim layout: calibration/Calib*.toml, videos/<camera>.mp4, pose/<camera>_json/*.json."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -8,7 +9,7 @@ import numpy as np
 
 from hnerf.capture.footage import Footage, Video
 from hnerf.capture.formats.layout import Layout, Stored
-from hnerf.capture.guarded import files_in, inside, read_toml
+from hnerf.capture.guarded import JSON_SUFFIXES, VIDEO_SUFFIXES, file_named, files_in, read_toml
 from hnerf.capture.lens import Lens, checked_lens
 from hnerf.errors import CaptureError
 
@@ -37,11 +38,17 @@ class Pose2Sim(Layout):
 
     def footage(self, camera: str) -> Footage:
         """videos/<camera>.mp4."""
-        return Video.open(inside(self.folder, "videos", f"{camera}.mp4"))
+        return Video.open(file_named(self.folder, camera, "videos", suffixes=VIDEO_SUFFIXES))
 
     def keypoint_files(self, camera: str) -> dict[int, Path | Stored]:
-        """pose/<camera>_json/*.json, one a video frame in the order of their names."""
-        return dict(enumerate(p for p in files_in(self.folder, "pose", f"{camera}_json") if p.suffix == ".json"))
+        """pose/<camera>_json/*.json, one a video frame in the order of the numbers in their names."""
+        files = sorted(files_in(self.folder, "pose", f"{camera}_json", suffixes=JSON_SUFFIXES), key=_numbers_as_such)
+        return dict(enumerate(files))
+
+
+def _numbers_as_such(path: Path) -> list[str | int]:
+    """A key that sorts walk_9 before walk_10."""
+    return [int(part) if part.isdecimal() else part for part in re.split("([0-9]+)", path.stem)]
 
 
 def lens_from_table(source: Path, key: str, table: Any) -> Lens:
