@@ -8,7 +8,7 @@ from tasks.source import Source
 from tasks.stage import stage
 
 
-@stage("capture", version="6")
+@stage("capture", version="7")
 def ingest(out: Path, source: Source, settings: CaptureSettings) -> dict[str, float]:
     """Read a recording in whatever layout it has; undistort and normalise it."""
     capture = ingest_folder(source.root, settings, out)
