@@ -21,8 +21,8 @@ class BoxField(Field):
     at -1 and 1. Densities are per unit of these coordinates.
 
     The methods were published for a bounded object, a person cut out of the picture, or the whole scene; here the
-    surroundings come from the clean plate, so rays are sampled in the person's box only. What the networks say outside
-    the box was never trained, so the surface ends there.
+    surroundings come from the clean plate, so rays are sampled in the person's box only, those of all pixels that see
+    it. What the networks say outside the box was never trained, so the surface ends there.
     """
 
     centre_m: Tensor
