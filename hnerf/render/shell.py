@@ -1,5 +1,5 @@
-"""Where the person can be: one voxel grid a frame that says empty, shell or solid. Rays are sampled in the shell
-alone."""
+"""Where the person can be: one voxel grid a frame that says empty, shell or solid, with rays sampled in the shell
+alone; or, for the published methods, a box."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor

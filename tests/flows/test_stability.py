@@ -272,12 +272,17 @@ def test_charts_of_an_earlier_call_go(stages: list[dict[str, Any]], tmp_path: Pa
     assert charts == {"ada-mine-matrix.png"}
 
 
+def torn_surface(root: Path) -> SimpleNamespace:
+    """What a check of meshes finds of a surface that is not closed."""
+    root.mkdir()
+    (root / "surface.json").write_text(json.dumps({"000001": {"fault": "surface is not watertight"}}))
+    return SimpleNamespace(root=root)
+
+
 def test_a_run_to_compare_with_that_fails_is_kept_and_ends_its_seed(
     stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    torn = SimpleNamespace(root=tmp_path / "torn")
-    torn.root.mkdir()
-    (torn.root / "surface.json").write_text(json.dumps({"000001": {"fault": "surface is not watertight"}}))
+    torn = torn_surface(tmp_path / "torn")
     monkeypatch.setattr(module, "check_meshes", lambda *_: torn)
     table = study(tmp_path, only=["pose_noise"])
     told = [(r["kind"], r["seed"], r["verdict"], r["reason"]) for r in table["runs"]]
@@ -290,9 +295,7 @@ def test_what_has_no_new_poses_is_judged_on_new_views(
     stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nerfies has none at all; the paper's method has none of one frame, and then nothing in common with the others."""
-    torn = SimpleNamespace(root=tmp_path / "torn")
-    torn.root.mkdir()
-    (torn.root / "surface.json").write_text(json.dumps({"000001": {"fault": "surface is not watertight"}}))
+    torn = torn_surface(tmp_path / "torn")
     (tmp_path / "mine.yaml").write_text(
         "methods: [nerfies, paper]\nseeds: [0]\ndegradations: {frames_left: [2, 1], extreme_poses: [45]}"
     )
