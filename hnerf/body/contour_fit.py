@@ -2,7 +2,8 @@
 
 Two kinds of match, both point to line (Chen and Medioni 1992, in the image): every point of the mask's contour pulls
 the nearest rim vertex of the projected body, and every rim vertex outside the mask is pushed back in. A body belongs
-inside its clothes, so the second is strict and the first is loose and robust: cloth and hair stand away from the skin.
+inside its clothes, so the second is strict and the first is loose: cloth and hair stand away from the skin. Both are
+robust (Geman and McClure 1987): a limb far outside a mask is one that the mask lacks.
 """
 
 import logging
@@ -86,8 +87,10 @@ def match(
     gradient = np.einsum("ri,ric->rc", direction, by_x[ids]) * scale_m
     residual_m = residual_px * scale_m
     ids = rim[ids]
-    loose = settings.outside_m**-2 / (1 + (residual_m / settings.clothing_m) ** 2) ** 2  # Geman-McClure
-    return Rows(ids, gradient, residual_m, np.where(residual_m > 0, settings.inside_m**-2, loose))
+    out = residual_m > 0
+    spread_m = np.where(out, settings.inside_m, settings.outside_m)
+    fades_at_m = np.where(out, settings.mask_outlier_m, settings.clothing_m)
+    return Rows(ids, gradient, residual_m, (spread_m * (1 + (residual_m / fades_at_m) ** 2)) ** -2)
 
 
 def _rim(camera: Camera, vertices_m: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
