@@ -68,7 +68,6 @@ class FitSettings(Section):
     inside_m: float = Field(default=0.008, gt=0)  # of a mask's edge inside the body
     outside_m: float = Field(default=0.02, gt=0)  # of a mask's edge outside the body
     clothing_m: float = Field(default=0.08, gt=0)  # distance at which cloth and hair no longer pull the body outwards
-    mask_outlier_m: float = Field(default=0.03, gt=0)  # distance at which a part that a mask lacks is not pushed in
     spacing_m: float = Field(default=0.03, gt=0)  # between the points of an outline
     contour_steps: int = Field(default=10, ge=1)
 

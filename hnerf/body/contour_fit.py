@@ -2,8 +2,8 @@
 
 Two kinds of match, both point to line (Chen and Medioni 1992, in the image): every point of the mask's contour pulls
 the nearest rim vertex of the projected body, and every rim vertex outside the mask is pushed back in. A body belongs
-inside its clothes, so the second is strict and the first is loose: cloth and hair stand away from the skin. Both are
-robust (Geman and McClure 1987): a limb far outside a mask is one that the mask lacks.
+inside its clothes, so the second is strict and the first is loose and fades: cloth and hair stand away from the skin. A
+limb far outside a mask, which the mask lacks, pushes no harder than one that sticks out a little (Huber 1964).
 """
 
 import logging
@@ -32,6 +32,7 @@ RIM_DEPTH_PX = 2.5  # pixels from the border of the body's silhouette
 SAME_WAY = 0.5  # cosine between the outlines' normals above which points may match
 GROUND_M = 0.01  # how near the ground the lowest vertex of a frame is
 NO_GROUND_M = 0.15  # and from which distance there is no reason to believe so
+HUBER = 1.345  # spreads from which what sticks out of a mask pushes no harder; 95 % as good as least squares on noise
 DAMPING = 1e-4  # more would hold back depth and scale, which the outlines of one camera hardly tell
 
 
@@ -87,10 +88,9 @@ def match(
     gradient = np.einsum("ri,ric->rc", direction, by_x[ids]) * scale_m
     residual_m = residual_px * scale_m
     ids = rim[ids]
-    out = residual_m > 0
-    spread_m = np.where(out, settings.inside_m, settings.outside_m)
-    fades_at_m = np.where(out, settings.mask_outlier_m, settings.clothing_m)
-    return Rows(ids, gradient, residual_m, (spread_m * (1 + (residual_m / fades_at_m) ** 2)) ** -2)
+    loose = settings.outside_m**-2 / (1 + (residual_m / settings.clothing_m) ** 2) ** 2  # Geman-McClure
+    strict = settings.inside_m**-2 * np.minimum(1, HUBER * settings.inside_m / np.abs(residual_m).clip(1e-9))
+    return Rows(ids, gradient, residual_m, np.where(residual_m > 0, strict, loose))
 
 
 def _rim(camera: Camera, vertices_m: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
