@@ -16,7 +16,7 @@ from tasks.store import Artifact
 from tasks.training import trained
 
 
-@stage("evaluation", version="8")
+@stage("evaluation", version="9")
 def evaluate(
     out: Path,
     truth: Source,

@@ -19,7 +19,7 @@ from hnerf.evaluation import geometry, metrics
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.report import write_report
-from hnerf.evaluation.views import SPLITS, TRAINING_VIEW, View, some_views, split_frames
+from hnerf.evaluation.views import SPLITS, TRAINING_VIEW, View, all_views, some_views, split_frames
 from hnerf.render.avatar import Avatar
 from hnerf.spread import spread
 
@@ -50,8 +50,8 @@ def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) 
     started = time.perf_counter()
     capture = inputs.capture
     truth = GroundTruth(inputs.capture_folder, capture) if (inputs.capture_folder / "ground_truth").is_dir() else None
-    views = {split: some_views(capture, split, settings.max_images) for split in SPLITS}
-    shown = [some_views(capture, split, settings.report_rows) for split in (TRAINING_VIEW, *SPLITS)]
+    views = {split: scored_views(capture, split, truth, settings.max_images) for split in SPLITS}
+    shown = [some_views(all_views(capture, split), settings.report_rows) for split in (TRAINING_VIEW, *SPLITS)]
     wanted = dict.fromkeys(itertools.chain(*views.values(), *shown))
     image_seconds = render(inputs.avatar, capture, list(wanted), out)
     rendered = time.perf_counter()
@@ -67,6 +67,19 @@ def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) 
     (out / "metrics.json").write_text(json.dumps(found, indent=1))
     log.info("evaluation took %.0f s, %.0f s of them rendering", found["seconds"]["all"], rendered - started)
     return found
+
+
+def scored_views(capture: Capture, split: str, truth: GroundTruth | None, count: int | None) -> list[View]:
+    """All images of a split, or at most `count` of those whose true mask is known; of all where none is."""
+    views = all_views(capture, split)
+    if count is None:
+        return views
+    return some_views(known_views(views, truth) or views, count)
+
+
+def known_views(views: list[View], truth: GroundTruth | None) -> list[View]:
+    """Those whose true mask is known."""
+    return [view for view in views if truth and truth.has_mask(view.camera, view.frame)]
 
 
 def render(avatar: Avatar, capture: Capture, views: list[View], out: Path) -> float:
@@ -96,7 +109,7 @@ def score_split(split: str, views: list[View], truth: GroundTruth | None, out: P
     if truth is None or not truth.has_masks:
         return nothing | {"reason": "the capture has no ground-truth masks"}
     rows, references = [], set()
-    known = [view for view in views if truth.has_mask(view.camera, view.frame)]
+    known = known_views(views, truth)
     for view in known:
         mask = truth.mask(view.camera, view.frame)
         if not mask.any():

@@ -15,7 +15,7 @@ from hnerf.evaluation import charts
 from hnerf.evaluation.galleries import Gallery, Picture, surface_row, view_row
 from hnerf.evaluation.ground_truth import MASKED_IMAGE, GroundTruth
 from hnerf.evaluation.inputs import EvaluationInputs
-from hnerf.evaluation.views import SPLITS, TRAINING_VIEW, View, some_views
+from hnerf.evaluation.views import SPLITS, TRAINING_VIEW, View, all_views, some_views
 from hnerf.tables import pick
 
 FIGURES = (  # where in a split's scores, name, unit, format, what it means
@@ -122,7 +122,7 @@ def galleries(
     """Training views, then a gallery for each split that has images, then the surfaces."""
     made = []
     for split in (TRAINING_VIEW, *SPLITS):
-        views = dict.fromkeys(some_views(inputs.capture, split, settings.report_rows), "")
+        views = dict.fromkeys(some_views(all_views(inputs.capture, split), settings.report_rows), "")
         if split in SPLITS and found[split]["per_image"]:
             worst = min(found[split]["per_image"], key=lambda score: score["psnr"])
             views[View(split, worst["camera"], worst["frame"])] = f"the worst of this split, {worst['psnr']:.1f} dB"

@@ -40,12 +40,11 @@ def all_views(capture: Capture, split: str) -> list[View]:
     return [View(split, c, f) for c in split_cameras(capture, split) for f in split_frames(capture, split)]
 
 
-def some_views(capture: Capture, split: str, count: int | None) -> list[View]:
-    """At most `count` images of a split, all if None: frames spread over the recording, the cameras in turn; where
-    there are fewer frames than that, spread over all images."""
-    cameras, frames = split_cameras(capture, split), split_frames(capture, split)
-    if count is None or not cameras:
-        return all_views(capture, split)
+def some_views(views: list[View], count: int) -> list[View]:
+    """At most `count` of a split's images: frames spread over the recording, the cameras in turn; where there are fewer
+    frames than that, spread over all images."""
+    frames = sorted({view.frame for view in views})
     if len(frames) < count:
-        return spread(all_views(capture, split), count)
-    return [View(split, cameras[k % len(cameras)], frame) for k, frame in enumerate(spread(frames, count))]
+        return spread(views, count)
+    seen = {frame: [view for view in views if view.frame == frame] for frame in spread(frames, count)}
+    return [own[k % len(own)] for k, own in enumerate(seen.values())]

@@ -13,7 +13,16 @@ import torch
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture, read_rgb, write_image
 from hnerf.errors import CaptureError
-from hnerf.evaluation.evaluate import LPIPS, MEANS, PROTOCOL, mesh_frames, render, score_meshes, score_split
+from hnerf.evaluation.evaluate import (
+    LPIPS,
+    MEANS,
+    PROTOCOL,
+    known_views,
+    mesh_frames,
+    render,
+    score_meshes,
+    score_split,
+)
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.pictures import crop, frame_person
 from hnerf.evaluation.views import SPLITS, View, all_views, split_frames
@@ -112,9 +121,8 @@ def curve(
 def score_at(scene: Scene, avatar: Avatar, split: str, images: int | None, meshes: int, out: Path) -> dict[str, Any]:
     """A split's figures in the form of evaluation, of at most as many images and surfaces of which the truth is known;
     None is all."""
-    views: list[View] = all_views(scene.capture, split)
-    known = [view for view in views if scene.truth and scene.truth.has_mask(view.camera, view.frame)]
-    views = spread(known or views, images or len(views))
+    views = all_views(scene.capture, split)
+    views = spread(known_views(views, scene.truth) or views, images or len(views))
     if views:
         render(avatar, scene.capture, views, out)
     found = score_split(split, views, scene.truth, out)

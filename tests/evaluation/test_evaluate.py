@@ -90,6 +90,19 @@ def test_the_report_may_show_more_images_than_are_scored(tmp_path: Path) -> None
     assert found["novel_view"]["n"] == 1 and (out / "report.html").is_file()
 
 
+def test_few_images_are_chosen_among_those_with_a_true_mask(tmp_path: Path) -> None:
+    """Of frames 0 to 2 the first and the last would be taken, but only 1 has a mask."""
+    capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
+    write_ball_truth(capture, RADIUS_M)
+    for frame in (0, 2):
+        (capture.root / "ground_truth" / "masks" / "c" / f"{frame:06d}.png").unlink()
+    out = tmp_path / "evaluation"
+    out.mkdir()
+    settings = EvaluationSettings(max_images=2, max_meshes=1, report_rows=1)
+    found = evaluate(ball_inputs(capture, tmp_path / "stages"), settings, out)
+    assert [row["frame"] for row in found["novel_view"]["per_image"]] == [1]
+
+
 def test_geometry_figures_by_hand(scored: Scored) -> None:
     geometry = scored[1]["novel_view"]["geometry"]
     assert geometry["chamfer_mm"] == pytest.approx(1e3 * GAP_M, rel=0.01)
