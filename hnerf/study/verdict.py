@@ -47,5 +47,5 @@ def judge(scores: dict[str, Any] | None, reference: dict[str, Any], faults: list
 
 
 def _word(value: float, degraded: float, failed: float) -> Word:
-    """NaN is a failure."""
-    return "ok" if value <= degraded else "degraded" if value <= failed else "failed"
+    """NaN is a failure; so is what is over `failed`, though that be less than `degraded`."""
+    return "failed" if not value <= failed else "degraded" if value > degraded else "ok"

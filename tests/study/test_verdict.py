@@ -33,6 +33,13 @@ def test_half_of_what_a_good_run_has_above_an_empty_picture_is_failure() -> None
     assert judge(poor | {"psnr": 17.9}, poor, []).word == "failed"
 
 
+def test_what_loses_most_of_little_is_failure_though_it_lose_less_than_a_decibel() -> None:
+    """17.5 dB where an empty picture has 16: 0.9 dB less is more than half of it, 0.7 dB less is not."""
+    little = {"psnr": 17.5, "chamfer_mm": None, "empty_psnr": 16.0}
+    assert judge(little | {"psnr": 16.6}, little, []) == Verdict("failed", "0.9 dB of PSNR lost")
+    assert judge(little | {"psnr": 16.8}, little, []) == Verdict("ok")
+
+
 def test_a_good_run_is_judged_too() -> None:
     worthless = {"psnr": 15.0, "chamfer_mm": None, "empty_psnr": 16.0}
     assert judge(worthless, worthless, []).word == "failed"
