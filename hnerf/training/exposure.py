@@ -25,7 +25,8 @@ Gains = dict[str, tuple[float, float, float]]
 
 def camera_gains(capture: Capture, masks: Masks, body: BodyFit) -> tuple[Gains, Decision]:
     """Gains (R, G, B) of the training cameras, and why (their means over channels); none where cameras are exposed
-    alike. Those of most cameras are 1 where most agree, else the geometric mean of all is.
+    alike. Those of most cameras are 1 where most agree, else the geometric mean of all is; a camera that shares no
+    places with another is taken for a usual one.
 
     Cameras a and b show the same place of the body brighter or darker by median ratios r_ab over places and frames;
     log g_b - log g_a = log r_ab is solved for all pairs by least squares, weighted by their numbers of places.
@@ -40,9 +41,12 @@ def camera_gains(capture: Capture, masks: Masks, body: BodyFit) -> tuple[Gains, 
             both = np.isfinite(levels[a] + levels[b]).all(1)
             found.append(np.log(levels[b][both] / levels[a][both]))
     pairs = {pair: np.concatenate(found) for pair, found in ratios.items()}
-    logs = solve_gains(len(names), {pair: found for pair, found in pairs.items() if len(found) >= LEAST_PLACES})
-    usual = np.median(logs, 0)
-    if (np.abs(logs - usual).max(1) < TELLING).mean() > MOST:
+    told_of = {pair: found for pair, found in pairs.items() if len(found) >= LEAST_PLACES}
+    logs = solve_gains(len(names), told_of)
+    known = np.isin(np.arange(len(names)), list(told_of)) | (not told_of)
+    usual = np.median(logs[known], 0)
+    logs[~known] = usual
+    if (np.abs(logs - usual)[known].max(1) < TELLING).mean() > MOST:
         logs = logs - usual
     furthest = float(np.abs(logs).max())
     told = f"seeing the same places of the body, cameras differ from what is usual by {np.expm1(furthest):.0%} at most"

@@ -33,7 +33,7 @@ def photograph(name: str, gain: tuple[float, ...]) -> np.ndarray:
     return (level[:, None] * gain).round().reshape(128, 128, 3).astype(np.uint8)
 
 
-def measured(gains: dict[str, tuple[float, float, float]]) -> Any:
+def measured(gains: dict[str, tuple[float, float, float]], unmasked: str = "") -> Any:
     pictures = {name: photograph(name, gain) for name, gain in gains.items()}
     capture: Any = SimpleNamespace(
         train_cameras=tuple(gains), train_frames=(3,), cameras=RING, image=lambda name, frame: pictures[name]
@@ -43,7 +43,7 @@ def measured(gains: dict[str, tuple[float, float, float]]) -> Any:
         rig=SimpleNamespace(faces=torch.from_numpy(BALL.faces.copy())),
         index=lambda frame: 0,
     )
-    masks: Any = KnownMasks({(name, 3): np.ones((128, 128), bool) for name in gains})
+    masks: Any = KnownMasks({(name, 3): np.ones((128, 128), bool) for name in gains if name != unmasked})
     return camera_gains(capture, masks, body)
 
 
@@ -75,6 +75,12 @@ def test_most_cameras_that_agree_stay_as_they_are() -> None:
     for name, gain in (("a", 1), ("b", 1), ("c", 1), ("d", 1.5)):
         assert found[name] == pytest.approx((gain,) * 3, rel=0.01)
     assert "differ from what is usual by 50%" in decision.reason
+
+
+def test_a_camera_that_nobody_compares_is_taken_for_a_usual_one() -> None:
+    """a and b agree, c is brighter; d has no mask in the frame that is looked at."""
+    found, _ = measured({"a": (1, 1, 1), "b": (1, 1, 1), "c": (1.3, 1.3, 1.3), "d": (1, 1, 1)}, unmasked="d")
+    assert [found[name][0] for name in "abcd"] == pytest.approx([1, 1, 1.3, 1], rel=0.01)
 
 
 def test_nothing_is_changed_where_shading_may_be_the_cause_or_nobody_compares() -> None:
