@@ -53,14 +53,25 @@ def test_three_points_or_a_line_do_not_place_the_body() -> None:
     assert root_from_space(on_a_line, on_a_line) is None
 
 
+CAMERA = Camera("a", np.array([[500.0, 0, 255], [0, 500, 255], [0, 0, 1]]),
+                np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.array([0, 0, 3.0]), 512, 512)  # fmt: skip
+
+
 def test_one_image_places_the_body_facing_the_right_way() -> None:
     rest = rest_keypoints()
-    camera = Camera("a", np.array([[500.0, 0, 255], [0, 500, 255], [0, 0, 1]]),
-                    np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), np.array([0, 0, 3.0]), 512, 512)  # fmt: skip
     for angle in (0.0, 1.5, 3.0, 4.5):
         root = turned(0.3, angle)
-        pixels = camera.project(rest @ root[:3, :3].T + root[:3, 3])[0]
-        found = root_from_image(camera, rest, np.column_stack([pixels, np.ones(25)]))
+        pixels = CAMERA.project(rest @ root[:3, :3].T + root[:3, 3])[0]
+        found = root_from_image(CAMERA, rest, np.column_stack([pixels, np.ones(25)]))
         assert found is not None
         np.testing.assert_allclose(found, root, atol=1e-4)
-    assert root_from_image(camera, rest, np.zeros((25, 3))) is None
+    assert root_from_image(CAMERA, rest, np.zeros((25, 3))) is None
+
+
+def test_a_keypoint_that_the_others_contradict_does_not_place_the_body() -> None:
+    rest, root = rest_keypoints(), turned(0.3, 1.5)
+    pixels = CAMERA.project(rest @ root[:3, :3].T + root[:3, 3])[0]
+    pixels[2] += (150, -100)  # a shoulder that was found on somebody else
+    found = root_from_image(CAMERA, rest, np.column_stack([pixels, np.ones(25)]))
+    assert found is not None
+    np.testing.assert_allclose(found, root, atol=1e-4)
