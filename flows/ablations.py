@@ -48,14 +48,15 @@ def ablate(
     JSON file beside it. Both are written anew after every row.
 
     preset: a name under configs/ or a YAML file; overrides: settings like "training.steps=100", in all rows; only:
-    names of ablations, all where there are none. A row whose training or evaluation fails says why and the rest go on;
-    a worker that was killed (LostWorkerError) ends the command, and the same command goes on from there.
+    names of ablations, whose table's name ends in "-part", all where there are none. A row whose training or
+    evaluation fails says why and the rest go on; a worker that was killed (LostWorkerError) ends the command, and the
+    same command goes on from there.
     """
     rows, left_out = choose(load_settings(preset, overrides), only)
     shelf = Store(store.resolve())
     source, truth = read_capture(capture, store)
     subject = Capture.load(ingest(shelf, source, rows[FULL].capture).root).name
-    table = shelf.root / "ablations" / f"{subject}-{Path(preset).stem}.md"
+    table = shelf.root / "ablations" / f"{subject}-{Path(preset).stem}{'-part' if only else ''}.md"
     result: dict[str, Any] = {"subject": subject, "preset": preset, "overrides": overrides, "left_out": left_out}
     result["rows"] = {}
     for name, settings in rows.items():

@@ -50,8 +50,8 @@ def stability(
     when it ends, however it ends.
 
     study: a name under configs/stability/ or a YAML file; methods: presets in place of the study's; only: names of
-    degradations. A failure is a result and the rest go on; a worker that was killed (LostWorkerError) ends the command,
-    and the same command goes on from there.
+    degradations, whose table's name ends in "-part". A failure is a result and the rest go on; a worker that was killed
+    (LostWorkerError) ends the command, and the same command goes on from there.
     """
     plan = load_stability(study).only(only)
     plan = plan.model_copy(update={"methods": tuple(methods)}) if methods else plan
@@ -59,7 +59,7 @@ def stability(
     shelf = Store(store.resolve())
     source, truth = read_capture(capture, store)
     subject = Capture.load(ingest(shelf, source, next(iter(presets.values())).capture).root).name
-    table = shelf.root / "stability" / f"{subject}-{Path(study).stem}.md"
+    table = shelf.root / "stability" / f"{subject}-{Path(study).stem}{'-part' if only else ''}.md"
     table.parent.mkdir(parents=True, exist_ok=True)
     result: Figures = {"subject": subject, "study": study, "plan": plan.model_dump(mode="json")}
     result |= {"left_out": plan.left_out(), "protocol": None, "runs": []}

@@ -42,7 +42,7 @@ def subset_capture(
     return {"cameras": len(kept.cameras), "frames": len(kept.frames)}
 
 
-@stage("study-capture", version="1")
+@stage("study-capture", version="2")
 def degrade_capture(out: Path, recording: Artifact, degradation: Degradation) -> dict[str, float]:
     """A capture made worse; what `ingest` would have written of it."""
     write_degraded(Capture.load(recording.root), degradation, out)

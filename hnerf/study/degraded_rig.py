@@ -59,6 +59,8 @@ def put_out_of_step(capture: Capture, frames: float, rng: np.random.Generator, o
         write_keypoints(out, keypoints | {late: keypoints[late][rows]})
     for folder in ("images", "masks"):
         for frame, row in zip(capture.frames, rows, strict=True):
+            for own in (out / folder / late).glob(f"{frame:06d}.*"):
+                own.unlink()  # the earlier frame may have no mask
             for source in (capture.root / folder / late).glob(f"{capture.frames[row]:06d}.*"):
                 shutil.copyfile(source, out / folder / late / f"{frame:06d}{source.suffix}")
     kept.save()

@@ -157,7 +157,7 @@ def test_the_table_by_hand() -> None:
 
 def test_a_row_that_fails_says_so_and_the_rest_go_on(stages: list[TrainingSettings], tmp_path: Path) -> None:
     table = ablate.fn(tmp_path, "fast", tmp_path / "store", [], ["no-noise", "no-segmentation"])
-    assert table == tmp_path / "store" / "ablations" / "ada-fast.md"
+    assert table == tmp_path / "store" / "ablations" / "ada-fast-part.md"
     result = json.loads(table.with_suffix(".json").read_text())
     rows = result["rows"]
     assert list(rows) == ["full", "no-noise", "no-segmentation"]
@@ -217,7 +217,7 @@ def test_a_full_disk_ends_the_command(
 def test_a_lost_worker_ends_the_command_and_finished_rows_stand(stages: list[TrainingSettings], tmp_path: Path) -> None:
     with pytest.raises(LostWorkerError):
         ablate.fn(tmp_path, "fast", tmp_path / "store", [], ["no-opt", "no-eikonal", "no-residual"])
-    result = json.loads((tmp_path / "store" / "ablations" / "ada-fast.json").read_text())
+    result = json.loads((tmp_path / "store" / "ablations" / "ada-fast-part.json").read_text())
     assert list(result["rows"]) == ["full", "no-opt"]
     assert len(stages) == 3
 
@@ -230,4 +230,4 @@ def test_the_command_prints_the_table(
     shown = capsys.readouterr().out
     assert "| full | 12.00 / 12.00 |" in shown
     assert "- no-mask: off already" in shown
-    assert f"table: {tmp_path / 'store' / 'ablations' / 'ada-fast.md'}" in shown
+    assert f"table: {tmp_path / 'store' / 'ablations' / 'ada-fast-part.md'}" in shown

@@ -108,7 +108,8 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
 def study(tmp_path: Path, **options: Any) -> dict[str, Any]:
     """What the study of this file finds."""
     table = stability.fn(tmp_path, str(tmp_path / "mine.yaml"), tmp_path / "store", **options)
-    assert table == tmp_path / "store" / "stability" / "ada-mine.md"
+    part = "-part" if options.get("only") else ""
+    assert table == tmp_path / "store" / "stability" / f"ada-mine{part}.md"
     return dict(json.loads(table.with_suffix(".json").read_text()))
 
 
@@ -140,7 +141,7 @@ def test_runs_are_compared_by_the_images_and_surfaces_that_both_have(
     assert (good["psnr"], good["images"], good["chamfer_mm"], good["surfaces"]) == (30.0, 2, 6.0, 1)
     assert (noisy["psnr"], noisy["images"], noisy["chamfer_mm"], noisy["surfaces"]) == (32.0, 1, 6.0, 1)
     assert (noisy["reference"]["psnr"], noisy["reference"]["images"]) == (32.0, 1)
-    table = (tmp_path / "store" / "stability" / "ada-mine.md").read_text()
+    table = (tmp_path / "store" / "stability" / "ada-mine-part.md").read_text()
     assert "| ok | 32.00 (+0.00) | 0.900 (+0.000) | 6.00 (+0.00) |" in table
 
 
@@ -151,9 +152,9 @@ def test_the_flow_runs_page_shows_the_charts_themselves(
     monkeypatch.setattr(run_page.FlowRunContext, "get", lambda: True)
     monkeypatch.setattr(run_page, "create_markdown_artifact", lambda text, **_: shown.append(text))
     study(tmp_path, only=["pose_noise"])
-    chart = (tmp_path / "store" / "stability" / "ada-mine-matrix.png").read_bytes()
+    chart = (tmp_path / "store" / "stability" / "ada-mine-part-matrix.png").read_bytes()
     (text,) = shown
-    assert f"![ada-mine-matrix.png](data:image/png;base64,{base64.b64encode(chart).decode()})" in text
+    assert f"![ada-mine-part-matrix.png](data:image/png;base64,{base64.b64encode(chart).decode()})" in text
     assert ".png)" not in text
 
 
@@ -245,8 +246,8 @@ def test_what_ends_the_first_run_leaves_an_earlier_study_as_it_was(
     with pytest.raises(KeyboardInterrupt):
         study(tmp_path, only=["pose_noise"])
     folder = tmp_path / "store" / "stability"
-    assert json.loads((folder / "ada-mine.json").read_text()) == earlier
-    assert "holds to 2" in (folder / "ada-mine.md").read_text()
+    assert json.loads((folder / "ada-mine-part.json").read_text()) == earlier
+    assert "holds to 2" in (folder / "ada-mine-part.md").read_text()
 
 
 def test_a_chart_that_cannot_be_drawn_hides_nothing(
@@ -264,12 +265,21 @@ def test_a_chart_that_cannot_be_drawn_hides_nothing(
         study(tmp_path, only=["pose_noise"])
 
 
+def test_a_study_of_few_degradations_leaves_the_whole_one_as_it_was(
+    stages: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    study(tmp_path)
+    files = {path: path.read_bytes() for path in (tmp_path / "store" / "stability").iterdir()}
+    study(tmp_path, only=["pose_noise"])
+    assert {path: path.read_bytes() for path in files} == files
+
+
 def test_charts_of_an_earlier_call_go(stages: list[dict[str, Any]], tmp_path: Path) -> None:
     """Poses of which nothing but the surface is judged have no curves."""
     study(tmp_path, only=["pose_noise"])
     study(tmp_path, only=["extreme_poses"])
     charts = {path.name for path in (tmp_path / "store" / "stability").glob("*.png")}
-    assert charts == {"ada-mine-matrix.png"}
+    assert charts == {"ada-mine-part-matrix.png"}
 
 
 def torn_surface(root: Path) -> SimpleNamespace:
@@ -287,7 +297,7 @@ def test_a_run_to_compare_with_that_fails_is_kept_and_ends_its_seed(
     table = study(tmp_path, only=["pose_noise"])
     told = [(r["kind"], r["seed"], r["verdict"], r["reason"]) for r in table["runs"]]
     assert told == [("as recorded", seed, "failed", "surface is not watertight") for seed in (0, 1)]
-    text = (tmp_path / "store" / "stability" / "ada-mine.md").read_text()
+    text = (tmp_path / "store" / "stability" / "ada-mine-part.md").read_text()
     assert "| pose noise, ° a joint | 2 (failed) |" in text
 
 
@@ -324,7 +334,7 @@ def test_the_command_prints_the_table(
     assert main(["stability", str(tmp_path), "--methods", "fast, paper", *options]) == 0
     shown = capsys.readouterr().out
     assert "| pose noise, ° a joint | holds to 2 | holds to 2 |" in shown
-    assert f"table: {tmp_path / 'store' / 'stability' / 'ada-mine.md'}" in shown
+    assert f"table: {tmp_path / 'store' / 'stability' / 'ada-mine-part.md'}" in shown
 
 
 def test_unknown_names_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

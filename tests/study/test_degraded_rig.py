@@ -63,6 +63,15 @@ def test_a_late_camera_shows_what_it_saw_before(tmp_path: Path) -> None:
     assert list(keypoints.values()) == [[2, 4, 6, 8, 10]] * 2
 
 
+def test_a_late_camera_has_no_mask_where_it_had_none_before(tmp_path: Path) -> None:
+    capture = write_recording(tmp_path / "good")
+    for name in capture.train_cameras:
+        (capture.root / "masks" / name / "000004.png").unlink()
+    degrade_capture(capture, Degradation(kind="camera_out_of_step", strength=1.0, seed=0), tmp_path / "bad")
+    masked = [[path.stem for path in sorted((tmp_path / "bad" / "masks" / name).iterdir())] for name in ("01", "02")]
+    assert sorted(masked) == [["000002", "000004", "000008", "000010"], ["000002", "000006", "000008", "000010"]]
+
+
 @pytest.mark.parametrize("frames", [0.4, 5])
 def test_a_delay_that_no_frame_shows_cannot_be_tried(tmp_path: Path, frames: float) -> None:
     with pytest.raises(NotPossibleError, match=f"ada: has 5 frames; none can be {frames:g} late"):
