@@ -15,6 +15,7 @@ from hnerf.calibration.diagnosis import (
     gross_limit_px,
     measure,
     median_height_px,
+    size_ratio,
     undo_mistake,
     unit_of,
 )
@@ -104,17 +105,23 @@ def _for_size(settings: CalibrationSettings, height_px: float) -> CalibrationSet
 
 
 def _check_convention(capture: Capture, cameras: Sequence[Camera], keypoints: np.ndarray, found: Measure) -> None:
-    """CaptureError if the rig as a whole follows another convention, or two cameras stand at one place.
+    """CaptureError if the rig as a whole follows another convention or is of pictures of another size, or two cameras
+    stand at one place.
 
     Conventions come first: the centres of an inverted ring of cameras coincide. In a wrong unit all are near, which is
     for `_check_height` to say.
     """
-    cause = explain(cameras, keypoints) if found.cost_px > gross_limit_px(keypoints) else None
-    if cause:
-        raise CaptureError(
-            f"{capture.name}: keypoints are off by {found.cost_px:.0f} px because {cause}; "
-            "write world to camera, x_camera = R x_world + T, y down, z forward"
-        )
+    if found.cost_px > gross_limit_px(keypoints):
+        off = f"{capture.name}: keypoints are off by {found.cost_px:.0f} px"
+        if cause := explain(cameras, keypoints):
+            raise CaptureError(
+                f"{off} because {cause}; write world to camera, x_camera = R x_world + T, y down, z forward"
+            )
+        if ratio := size_ratio(cameras, keypoints):
+            raise CaptureError(
+                f"{off} because intrinsics and keypoints are of pictures of different sizes (K times {ratio:.2f} would "
+                "fit); give both in the pixels of these pictures"
+            )
     for a, b in combinations(cameras, 2):
         if np.linalg.norm(a.centre_m - b.centre_m) < COINCIDENT_M and not unit_of(found.body_height_m):
             raise CaptureError(

@@ -33,6 +33,9 @@ MISTAKES_OF_ONE: dict[str, Callable[[Camera], Camera]] = {  # in all cameras the
     for unit, metres in UNITS_M.items()
 }
 
+SIZE_RATIOS = np.geomspace(1 / 5, 5, 161)  # of pictures; within 2 % of each other
+OTHER_SIZE = 1.2  # times as large or small: nearer to 1, a refined K may be as good
+
 
 @dataclasses.dataclass(frozen=True)
 class Measure:
@@ -144,6 +147,23 @@ def explain(cameras: Sequence[Camera], keypoints: np.ndarray) -> str | None:
         cause for cause, undo in MISTAKES.items() if trimmed_cost_px([undo(c) for c in cameras], flat) <= limit_px
     ]
     return " or ".join(explaining) or None
+
+
+def size_ratio(cameras: Sequence[Camera], keypoints: np.ndarray) -> float | None:
+    """How many times as large all K would have to be, those of pictures of another size, for the calibration to fit
+    keypoints (C, frames, 25, 3); None if that is near 1 or none fits, and where one camera may be to blame: of three
+    or more if the others agree, of two always."""
+    flat, limit_px = keypoints.reshape(len(cameras), -1, 3), gross_limit_px(keypoints)
+    if len(cameras) < 3 or min(cost_without_each_px(cameras, flat).values()) <= limit_px:
+        return None
+    costs_px = [trimmed_cost_px([_of_other_size(c, ratio) for c in cameras], flat) for ratio in SIZE_RATIOS]
+    best = int(np.argmin(costs_px))
+    ratio = float(SIZE_RATIOS[best])
+    return ratio if costs_px[best] <= limit_px and max(ratio, 1 / ratio) > OTHER_SIZE else None
+
+
+def _of_other_size(camera: Camera, ratio: float) -> Camera:
+    return dataclasses.replace(camera, K=np.diag([ratio, ratio, 1]) @ camera.K)
 
 
 def undo_mistake(cameras: list[Camera], keypoints: np.ndarray) -> tuple[list[Camera], dict[str, str]]:

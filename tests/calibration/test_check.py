@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.check import check_calibration
-from hnerf.calibration.diagnosis import MISTAKES, body_height_m, cost_without_each_px, unit_of
+from hnerf.calibration.diagnosis import MISTAKES, body_height_m, cost_without_each_px, size_ratio, unit_of
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
@@ -162,6 +162,25 @@ def test_each_wrong_convention_is_named(tmp_path: Path, cause: str) -> None:
     assert cause in str(caught.value)
     assert " or " not in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("count", [3, 4])
+@pytest.mark.parametrize("ratio", [0.25, 0.64, 1.5, 2])
+def test_intrinsics_of_another_picture_size_are_named(tmp_path: Path, count: int, ratio: float) -> None:
+    """Units are not blamed, though the person would be 0.4 to 8.5 m tall."""
+    wrong = recorded_with(tmp_path, lambda c: dataclasses.replace(c, K=np.diag([ratio, ratio, 1]) @ c.K), count=count)
+    with pytest.raises(CaptureError, match=r"pictures of different sizes \(K times [0-9.]+ would fit\)") as caught:
+        check_calibration(wrong, SETTINGS)
+    assert float(str(caught.value).split("times ")[1].split()[0]) == pytest.approx(1 / ratio, rel=0.02)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_camera_that_is_far_off_is_not_one_of_another_picture_size(count: int) -> None:
+    """Of two cameras, K 0.74 times as large would fit as well."""
+    cameras = ring(count)
+    seen = np.stack([points[:, 0] for points in detections(cameras, 2).values()])
+    assert size_ratio([turned(cameras[0], 20), *cameras[1:]], seen) is None
+    assert size_ratio(cameras, seen) is None
 
 
 def test_a_wrong_convention_in_one_camera_is_named(tmp_path: Path) -> None:
