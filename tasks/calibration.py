@@ -10,7 +10,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("calibration", version="6")
+@stage("calibration", version="7")
 def calibrate(out: Path, recording: Artifact, settings: CalibrationSettings) -> dict[str, float]:
     """Check the cameras against what they saw; leave those to be used from here on."""
     report = check_calibration(Capture.load(recording.root), settings)
