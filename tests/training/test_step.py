@@ -1,0 +1,94 @@
+"""What a step aims at, and which numbers each of its losses is given."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from hnerf.body.canonical import PoseCorrection
+from hnerf.config import LossSettings, TrainingSettings
+from hnerf.training import losses
+from hnerf.training.conditions import Draws
+from hnerf.training.pixels import Rays
+from hnerf.training.step import Objective, aim
+from tests.training.test_losses import SAMPLES, TARGET
+
+BEYOND, SEEN, PLATE = torch.rand(3, 4, 3, generator=torch.Generator().manual_seed(0))
+PERSON = torch.tensor([True, True, False, False])
+EDGE = torch.tensor([False, True, True, False])
+
+
+def aimed(plate: Tensor | None, own_background: bool = False) -> tuple[losses.Target, Draws]:
+    """Of pixels inside the person, on both sides of the outline, and in the surroundings."""
+    none = torch.zeros(4, 3)
+    rays = Rays(none, none, torch.zeros(4, dtype=torch.long), SEEN, PERSON, EDGE, plate)
+    return aim(rays, Draws(none, BEYOND, none), own_background)
+
+
+@pytest.mark.parametrize("plate", [None, PLATE])
+def test_a_field_with_a_background_aims_at_the_photograph(plate: Tensor | None) -> None:
+    target, draws = aimed(plate, own_background=True)
+    assert torch.equal(target.colour, SEEN)
+    assert target.weight.tolist() == [1, 1, 1, 1]
+    assert target.person.tolist() == [1, 1, 0, 0]
+    assert draws.beyond is BEYOND
+
+
+def test_over_a_clean_plate_every_pixel_counts() -> None:
+    """The outline's as photographed, for they mix person and plate; the surroundings are the plate."""
+    target, draws = aimed(PLATE)
+    assert torch.equal(target.colour, torch.cat([SEEN[:3], PLATE[3:]]))
+    assert target.weight.tolist() == [1, 1, 1, 1]
+    assert target.person.tolist() == [1, 1, 0, 0]
+    assert torch.equal(draws.beyond, PLATE)
+
+
+def test_without_a_plate_surroundings_are_random_and_the_outline_is_left_out() -> None:
+    target, draws = aimed(None)
+    assert torch.equal(target.colour[[0, 3]], torch.stack([SEEN[0], BEYOND[3]]))
+    assert target.weight.tolist() == [1, 0, 0, 1]
+    assert target.person.tolist() == [1, 1, 0, 0]
+    assert torch.equal(draws.beyond, BEYOND)
+
+
+def test_each_loss_is_given_its_own_numbers() -> None:
+    """The rays of test_losses through a field whose gamma is 80: each of its ten figures, times its weight."""
+    s = LossSettings(
+        **{"reconstruction": 2, "mask": 3, "blend": 5, "geometry": 7, "segmentation": 11, "eikonal": 13},
+        **{"residual": 17, "fit": 19, "increment": 23, "elastic": 29, "eta": 0.25},
+    )
+    field: Any = torch.nn.Module()
+    field.own_background, field.gamma = True, 80.0
+    field.sample = lambda *inputs: (SAMPLES, None)
+    correction = PoseCorrection(frames=2, free_joints=0, shapes=2)
+    correction.absorbed_shape.copy_(torch.tensor([3.0, 4.0]))
+    none, stage = torch.zeros(2, 3), SimpleNamespace(bodies=None, region=None)
+    rays = Rays(none, none, none, TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)
+    terms = Objective(field, correction, TrainingSettings(losses=s))(stage, rays, None, Draws(none, none, none))
+    expected = {
+        "reconstruction": 2 * 0.475,
+        "mask": 3 * 0.375,
+        "blend": 5 * 1.025,
+        "geometry": 7 * losses.geometry(SAMPLES, 50.0, 0.1).item(),
+        "segmentation": 11 * losses.segmentation(SAMPLES.d_hat, TARGET, 80.0).item(),
+        "eikonal": 13 * 0.145,
+        "residual": 17 * 0.02,
+        "fit": 19 * losses.segmentation(SAMPLES.d, TARGET, 80.0).item(),
+        "increment": 23 * 5,
+        "elastic": 29 * 0.1,
+    }
+    assert {name: term.item() for name, term in terms.items()} == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_loss_without_weight_is_not_asked() -> None:
+    assert LossSettings().elastic == 0
+    field: Any = torch.nn.Module()
+    field.own_background, field.gamma = True, 80.0
+    field.sample = lambda *inputs: (SAMPLES, None)
+    none, stage = torch.zeros(2, 3), SimpleNamespace(bodies=None, region=None)
+    rays = Rays(none, none, none, TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)
+    settings = TrainingSettings(losses=LossSettings(mask=0, geometry=0))
+    terms = Objective(field, PoseCorrection(2, 0, 2), settings)(stage, rays, None, Draws(none, none, none))
+    assert not {"mask", "geometry", "elastic"} & terms.keys()
