@@ -1,0 +1,221 @@
+"""Put faults into a copy of the code, one at a time, and see whether tests turn red:
+
+    python tests/faults.py [--at-once 2] [NAME ...]
+
+A fault is an exact text of a file and what stands there instead. All of them are put in unless some are named. The
+checkout stays as it is. The exit status is 1 if a fault is missed, 2 if the tests fail without any or a text is not
+found exactly once.
+"""
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+COPIED = ("hnerf", "tests", "configs", "pyproject.toml")
+PYTEST = (sys.executable, "-m", "pytest", "-o", "addopts=", "-x", "-q", "-p", "no:cacheprovider")
+
+PAPER, FAST = "hnerf/training/paper.py", "hnerf/training/fast.py"
+LOSSES, STEP = "hnerf/training/losses.py", "hnerf/training/step.py"
+CONDITIONS, TRAINER = "hnerf/training/conditions.py", "hnerf/training/trainer.py"
+COMPOSITING, CANONICAL = "hnerf/render/compositing.py", "hnerf/field/canonical.py"
+ENCODING, MLP = "hnerf/field/encoding.py", "hnerf/field/mlp.py"
+BODIES, PIXELS = "hnerf/body/canonical.py", "hnerf/training/pixels.py"
+
+BY_PAPER, BY_LOSSES = "tests/training/test_paper.py", "tests/training/test_losses.py"
+BY_STEP, BY_CONDITIONS = "tests/training/test_step.py", "tests/training/test_conditions.py"
+BY_TRAINER, BY_TIGHTEN = "tests/training/test_trainer_step.py", "tests/training/test_tighten.py"
+BY_RAY, BY_CANONICAL = "tests/training/test_fast_ray.py", "tests/field/test_canonical.py"
+BY_FAST, BY_COMPOSITING = "tests/training/test_fast.py", "tests/render/test_compositing.py"
+BY_ENCODING, BY_MLP = "tests/field/test_encoding.py", "tests/field/test_mlp.py"
+BY_EXPOSURE = "tests/training/test_exposure.py"
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is put into a file in place of an exact text, and the tests that should see it."""
+
+    name: str
+    file: str
+    text: str
+    instead: str
+    tests: str
+
+
+FAULTS = (
+    # what F and DH of the published method are asked, and the units of what they answer
+    Fault("paper-view-noise", PAPER, "else directions + draws.view", "else directions", BY_PAPER),
+    Fault("paper-root-noise", CONDITIONS, "root=self.root + root", "root=self.root", BY_CONDITIONS),
+    Fault("paper-theta-noise", CONDITIONS, "pose=self.pose + pose", "pose=self.pose", BY_CONDITIONS),
+    Fault("paper-density-unit", PAPER, "+ 1e10) / self.settings.scene_m", "+ 1e10)", BY_PAPER),
+    Fault("paper-eikonal-unit", PAPER, "(d_in + residual_in).sum() * self.settings.scene_m",
+          "(d_in + residual_in).sum()", BY_PAPER),
+    Fault("paper-outside-distance", PAPER, "OUTSIDE_DISTANCE = 1.0", "OUTSIDE_DISTANCE = 0.3", BY_PAPER),
+    Fault("paper-pose-outside", PAPER, "torch.zeros_like(conditions.pose[row])", "conditions.pose[row]", BY_PAPER),
+    Fault("paper-root-outside", PAPER, "torch.zeros_like(turn[row])", "turn[row]", BY_PAPER),
+    Fault("paper-importance", PAPER, "resample(coarse, near, far, weights_from_alpha(rough.alpha), draws.finer)",
+          "stratified(near, far, draws.finer)", BY_PAPER),
+    Fault("paper-fine-cells", PAPER, "(middles[:, 1:] + middles[:, :-1]) / 2", "middles[:, 1:]", BY_PAPER),
+    Fault("paper-fine-gradient", PAPER, "with torch.no_grad():", "with torch.enable_grad():", BY_PAPER),
+    Fault("paper-centre", PAPER, "(points_m - self.centre_m) / self", "points_m / self", BY_PAPER),
+    Fault("paper-residual-input-unit", PAPER,
+          "scaled = torch.cat([described.s, described.d[:, None]], -1) / self.settings.scene_m",
+          "scaled = torch.cat([described.s, described.d[:, None]], -1)", BY_PAPER),
+    Fault("paper-distance-unit", PAPER, "d_in = described.d / self.settings.scene_m", "d_in = described.d", BY_PAPER),
+    Fault("paper-frame", PAPER, "conditions.pose[row[pick]])", "conditions.pose[0 * row[pick]])", BY_PAPER),
+    Fault("paper-static-theta", PAPER, "self.radiance(scaled, conditions.pose[row, :0],",
+          "self.radiance(scaled, conditions.pose[row],", BY_PAPER),
+    Fault("paper-box", PAPER, "in_box=inside.float()", "in_box=torch.ones_like(d)", BY_PAPER),
+    Fault("paper-surface-unit", PAPER, "self.settings.scene_m * self._residual(", "self._residual(", BY_PAPER),
+    Fault("paper-root-unit", CONDITIONS, "root[:, :3, 3:] / scene_m", "root[:, :3, 3:]", BY_CONDITIONS),
+    Fault("paper-octaves", MLP, "OCTAVES = 8", "OCTAVES = 6", BY_MLP),
+    Fault("paper-residual-octaves", MLP, "OCTAVES = 1\n", "OCTAVES = 2\n", BY_MLP),
+    Fault("encoding-octaves", ENCODING, "2.0 ** torch.arange(octaves", "2.0 * torch.arange(octaves", BY_ENCODING),
+    # from samples to pixels
+    Fault("occupancy-sign", COMPOSITING, "torch.sigmoid(-sharpness", "torch.sigmoid(sharpness", BY_COMPOSITING),
+    Fault("weights-shifted", COMPOSITING, "1 - alpha[:, :-1]], 1)", "1 - alpha[:, 1:]], 1)", BY_COMPOSITING),
+    Fault("weights-unshaded", COMPOSITING, "alpha * before.cumprod(1)", "alpha * before", BY_COMPOSITING),
+    Fault("surface-order", COMPOSITING, "log_phi[:, 1:] - log_phi[:, :-1]", "log_phi[:, :-1] - log_phi[:, 1:]",
+          BY_COMPOSITING),
+    # the losses
+    Fault("reconstruction-weight", LOSSES, "(target.weight * (target.colour", "((target.colour", BY_LOSSES),
+    Fault("mask-swapped", LOSSES, "target.person * error", "(1 - target.person) * error", BY_LOSSES),
+    Fault("mask-box", LOSSES, "pixel(samples.in_box * samples.alpha, samples)", "pixel(samples.alpha, samples)",
+          BY_LOSSES),
+    Fault("blend-eta", LOSSES, "eta * (1 - target.person)", "(1 - target.person)", BY_LOSSES),
+    Fault("blend-outside", LOSSES, " + (1 - samples.in_box) * samples.alpha", "", BY_LOSSES),
+    Fault("geometry-sign", LOSSES, "(samples.density - threshold)", "(threshold - samples.density)", BY_LOSSES),
+    Fault("segmentation-sign", LOSSES, "logit = -sharpness", "logit = sharpness", BY_LOSSES),
+    Fault("segmentation-mean", LOSSES, "distance.amin(1)", "distance.mean(1)", BY_LOSSES),
+    Fault("eikonal-slope", LOSSES, "(samples.gradient_norm - 1)", "samples.gradient_norm", BY_LOSSES),
+    Fault("residual-sign", LOSSES, "relu(samples.residual)", "relu(-samples.residual)", BY_LOSSES),
+    Fault("increment-sum", LOSSES, "move_m], 1)).mean()", "move_m], 1)).sum()", BY_LOSSES),
+    Fault("increment-forgets", BODIES, "self.move_m + self.absorbed_move_m", "self.move_m", BY_LOSSES),
+    Fault("fit-clothed", STEP, "segmentation(samples.d, target", "segmentation(samples.d_hat, target", BY_STEP),
+    Fault("segmentation-naked", STEP, "segmentation(samples.d_hat, target", "segmentation(samples.d, target", BY_STEP),
+    # what a step aims at
+    Fault("fast-edge-pixels", STEP, "(~rays.edge).float()), draws", "everywhere), draws", BY_STEP),
+    Fault("plate-ignored", STEP, "if rays.plate is not None:", "if False:", BY_STEP),
+    Fault("plate-at-outline", STEP, "(rays.person | rays.edge)[:, None]", "rays.person[:, None]", BY_STEP),
+    Fault("background-black", STEP, "rays.colour, draws.beyond)", "rays.colour, 0 * draws.beyond)", BY_STEP),
+    # what the networks of `fast` are asked
+    Fault("fast-colour-normal", CANONICAL, "positional_encoding(normal, 1)", "positional_encoding(0 * normal, 1)",
+          BY_CANONICAL),
+    Fault("fast-pose-code", CANONICAL, "self.pose_code(pose)]", "0 * self.pose_code(pose)]", BY_CANONICAL),
+    Fault("fast-residual-unit", CANONICAL, "self.unit_m * self.geometry(", "self.geometry(", BY_CANONICAL),
+    Fault("fast-frame", FAST, "conditions.pose.index_select(0, row)", "conditions.pose[0 * row]", BY_RAY),
+    Fault("fast-eikonal-inside", FAST, " * skin.d[pick].detach().sign()[:, None]", "", BY_RAY),
+    Fault("fast-difference-step", FAST, "GRADIENT_STEP_M = 0.005", "GRADIENT_STEP_M = 0.03", BY_RAY),
+    Fault("fast-eikonal-body", FAST, "y, d = described.y[pick].detach(),", "y, d = described.y[pick],", BY_RAY),
+    Fault("fast-elastic-unit", FAST, "(moved / ELASTIC_M)", "moved", BY_RAY),
+    Fault("fast-colour-place", FAST, "self._colour(at_surface(described, d + residual),", "self._colour(described,",
+          BY_RAY),
+    Fault("fast-core", FAST, "torch.where(core[hit, None], 1.0, alpha_dot[:, -1:])", "alpha_dot[:, -1:]", BY_FAST),
+    Fault("fast-tighten-sides", FAST, "side * described.d[seen]", "-side * described.d[seen]", BY_TIGHTEN),
+    Fault("fast-tighten-poses", FAST, "seen |= described.near", "seen = described.near", BY_TIGHTEN),
+    # what the trainer hands to a step
+    Fault("trainer-noise", TRAINER, "self.conditions.noisy(s.noise, self.generator)", "self.conditions", BY_TRAINER),
+    Fault("trainer-view-noise", TRAINER, "samples, s.noise, self.generator)", "samples, 0.0, self.generator)",
+          BY_TRAINER),
+    Fault("fast-levelling", TRAINER, "if self.gains:", "if False:", BY_TRAINER),
+    Fault("levelling-inverse", PIXELS, "part / gains[camera.long()]", "part * gains[camera.long()]", BY_EXPOSURE),
+    Fault("trainer-novel-frames", TRAINER, "rows = self.train_rows if self.step",
+          "rows = torch.cat([self.train_rows, self.novel_rows]) if self.step", BY_TRAINER),
+    Fault("trainer-field-goes-on", TRAINER, "self.field.requires_grad_(False)", "pass", BY_TRAINER),
+    Fault("trainer-poses-go-on", TRAINER, "pose.grad[self.train_rows] = 0.0", "pass", BY_TRAINER),
+    Fault("trainer-decay", TRAINER, "FINAL_LEARNING_RATE ** self._done() * ", "", BY_TRAINER),
+    Fault("trainer-tighten", TRAINER, "if self.step <= self.field_steps:", "if False:", BY_TRAINER),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Of a fault: the first test that turned red, or None; how long it took."""
+
+    fault: Fault
+    red: str | None
+    seconds: float
+
+    def __str__(self) -> str:
+        found = f"caught by {self.red}" if self.red else f"MISSED by {self.fault.tests}"
+        return f"{self.fault.name:26} {found} ({self.seconds:.0f} s)"
+
+
+def with_fault(fault: Fault, root: Path) -> str:
+    """The file's text with the fault in it; ValueError if what it replaces is not found exactly once."""
+    text = (root / fault.file).read_text()
+    if (times := text.count(fault.text)) != 1:
+        raise ValueError(f"{fault.name}: found {times} times in {fault.file}, not once: {fault.text!r}")
+    return text.replace(fault.text, fault.instead)
+
+
+@contextmanager
+def copied(root: Path) -> Iterator[Path]:
+    """A copy of the code and its tests, for as long as it is needed."""
+    with tempfile.TemporaryDirectory(prefix="hnerf-faults-") as folder:
+        for name in COPIED:
+            if (root / name).is_dir():
+                shutil.copytree(root / name, Path(folder, name), ignore=shutil.ignore_patterns("__pycache__"))
+            elif (root / name).exists():
+                shutil.copy(root / name, folder)
+        yield Path(folder)
+
+
+def first_red(folder: Path, tests: list[str]) -> str | None:
+    """The first test that fails there, None if all pass; RuntimeError, with what pytest says, if they cannot be run."""
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run([*PYTEST, *tests], cwd=folder, env=environment, capture_output=True, text=True)
+    red = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
+    if done.returncode > 1 or (done.returncode == 1 and not red):
+        raise RuntimeError(f"pytest {' '.join(tests)} ends with {done.returncode}:\n{done.stdout[-3000:]}{done.stderr}")
+    return red.group(1) if red and done.returncode else None
+
+
+def judge(fault: Fault, root: Path = ROOT) -> Verdict:
+    """Whether the fault's tests see it."""
+    began, faulty = time.monotonic(), with_fault(fault, root)
+    with copied(root) as folder:
+        (folder / fault.file).write_text(faulty)
+        red = first_red(folder, [fault.tests])
+    return Verdict(fault, red, time.monotonic() - began)
+
+
+def main() -> int:
+    """Judge the faults that are asked for; the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help="of faults; all of them unless given")
+    parser.add_argument("--at-once", type=int, default=1, help="how many are tried side by side")
+    asked = parser.parse_args()
+    if unknown := set(asked.names) - {fault.name for fault in FAULTS}:
+        parser.error(f"no such fault: {', '.join(sorted(unknown))}; there are {', '.join(f.name for f in FAULTS)}")
+    faults = [fault for fault in FAULTS if not asked.names or fault.name in asked.names]
+    try:
+        for fault in faults:
+            with_fault(fault, ROOT)
+        with copied(ROOT) as folder:
+            if red := first_red(folder, sorted({fault.tests for fault in faults})):
+                raise ValueError(f"{red} fails without any fault")
+    except ValueError as error:
+        print(error, file=sys.stderr)
+        return 2
+    missed = 0
+    with ThreadPoolExecutor(asked.at_once) as side_by_side:
+        for verdict in side_by_side.map(judge, faults):
+            print(verdict, flush=True)
+            missed += verdict.red is None
+    print(f"{len(faults) - missed} of {len(faults)} caught")
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,59 @@
+"""The fault program on a code of one line; and that its own faults can still be put in."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.faults import FAULTS, ROOT, Fault, judge, with_fault
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=[fault.name for fault in FAULTS])
+def test_a_fault_can_be_put_in(fault: Fault) -> None:
+    """Its text is there exactly once, and its file is still one that Python reads; its tests are there."""
+    faulty = with_fault(fault, ROOT)
+    assert faulty != (ROOT / fault.file).read_text()
+    compile(faulty, fault.file, "exec")
+    assert (ROOT / fault.tests).is_file()
+
+
+def test_names_are_unique() -> None:
+    assert len({fault.name for fault in FAULTS}) == len(FAULTS)
+
+
+@pytest.fixture
+def code(tmp_path: Path) -> Path:
+    (tmp_path / "hnerf").mkdir()
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "hnerf" / "sums.py").write_text("def total(a, b):\n    return a + b\n")
+    (tmp_path / "tests" / "test_sums.py").write_text(
+        "from hnerf.sums import total\n\n\ndef test_total():\n    assert total(2, 2) == 4\n"
+    )
+    return tmp_path
+
+
+def test_faults_are_caught_or_missed(code: Path) -> None:
+    """2 + 2 is 4, and so is 2 x 2, but not 2 - 2. The code stays as it was."""
+    before = (code / "hnerf" / "sums.py").read_text()
+    minus, times = (Fault("sum", "hnerf/sums.py", "a + b", f"a {sign} b", "tests/test_sums.py") for sign in "-*")
+    assert judge(minus, code).red == "tests/test_sums.py::test_total"
+    assert judge(times, code).red is None
+    assert (code / "hnerf" / "sums.py").read_text() == before
+
+
+def test_what_cannot_run_is_no_catch(code: Path) -> None:
+    broken = Fault("sum", "hnerf/sums.py", "a + b", "a +", "tests/test_sums.py")
+    with pytest.raises(RuntimeError, match="SyntaxError"):
+        judge(broken, code)
+
+
+@pytest.mark.parametrize(("text", "times"), [("a * b", 0), ("a", 3)])
+def test_a_text_that_is_not_there_once_is_refused(code: Path, text: str, times: int) -> None:
+    with pytest.raises(ValueError, match=rf"^sum: found {times} times in hnerf/sums.py, not once"):
+        judge(Fault("sum", "hnerf/sums.py", text, "b", "tests/test_sums.py"), code)
+
+
+def test_unknown_names_are_refused() -> None:
+    done = subprocess.run([sys.executable, "tests/faults.py", "gravity"], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 2 and "no such fault: gravity" in done.stderr

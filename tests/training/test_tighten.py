@@ -1,0 +1,62 @@
+"""How thick the shell is left on each side of the skin."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from hnerf.config import FastFieldSettings
+from hnerf.training.fast import FastField
+from tests.body.boxes import box_rig
+
+RIG = box_rig(splits=2)
+SETTINGS = FastFieldSettings(
+    outer_m=0.08, inner_m=0.06, shell_cell_m=0.05, samples=4, geometry_cells=(2,), colour_cells=(2,), pose_width=1
+)
+SEEN_M = 0.005  # to either side of a surface with a logistic of 1000 a metre
+ROOM_M = 0.012
+STEP_M = 0.004  # at which it is looked for
+
+
+def tightened(residual: Callable[[Tensor, Tensor, Tensor], Tensor], poses: list[float]) -> tuple[Tensor, Tensor]:
+    """Thicknesses outside and inside at the vertices within faces: at edges the nearest point of a normal's ray
+    differs."""
+    field = FastField(RIG, SETTINGS, 1)
+    field.log_sharpness.data.fill_(1000.0).log_()
+    field.field.residual = residual
+    field.tighten(RIG, torch.tensor(poses)[:, None].expand(-1, 3))
+    within = ((RIG.vertices_m > 0.1) & (RIG.vertices_m < 0.9)).sum(1) == 2
+    assert within.any()
+    return field.outer_m[within], field.inner_m[within]
+
+
+@pytest.mark.parametrize(
+    ("surfaces_m", "outer_m", "inner_m"),
+    [
+        ([0.03], 0.03 + SEEN_M + ROOM_M, ROOM_M),  # nothing is seen inside
+        ([-0.02], ROOM_M, 0.02 + SEEN_M + ROOM_M),
+        ([0.03, -0.02], 0.03 + SEEN_M + ROOM_M, 0.02 + SEEN_M + ROOM_M),  # in the one pose and the other
+        ([0.075], 0.08, ROOM_M),  # never thicker than it was
+    ],
+)
+def test_each_side_is_as_thick_as_its_own_surface_asks_for(
+    surfaces_m: list[float], outer_m: float, inner_m: float
+) -> None:
+    """A surface that lies so far outside the skin, in each of some poses."""
+    outer, inner = tightened(lambda y, d, pose: -pose[:, 0], surfaces_m)
+    assert ((outer - outer_m).abs() <= STEP_M + 1e-6).all()
+    assert ((inner - inner_m).abs() <= STEP_M + 1e-6).all()
+
+
+def test_vertices_are_tightened_each_by_what_is_seen_there() -> None:
+    """4 cm outside above the middle, at the skin below."""
+    field = FastField(RIG, SETTINGS, 1)
+    field.log_sharpness.data.fill_(1000.0).log_()
+    field.field.residual = lambda y, d, pose: torch.where(y[:, 2] > 0.5, -0.04, 0.0)
+    field.tighten(RIG, torch.zeros(1, 3))
+    x, y, z = RIG.vertices_m.T
+    side = ((x - 0.5).abs() == 0.5) & (y > 0.1) & (y < 0.9)
+    above, below = (field.outer_m[side & height] for height in ((z > 0.6) & (z < 0.9), (z > 0.1) & (z < 0.4)))
+    assert (above - 0.04 - SEEN_M - ROOM_M).abs().max() <= STEP_M + 1e-6
+    assert (below - SEEN_M - ROOM_M).abs().max() <= STEP_M + 1e-6

@@ -1,0 +1,153 @@
+"""What the trainer hands to a step: which pixels, with what noise, around which bodies."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from hnerf.config import TrainingSettings
+from hnerf.training import trainer as trainer_module
+from hnerf.training.budget import Decision
+from hnerf.training.conditions import Conditions, Draws
+from hnerf.training.pixels import Rays
+from hnerf.training.processes import Processes
+from hnerf.training.step import Stage
+from hnerf.training.trainer import Trainer
+from tests.training.scene import TINY, record
+
+MACHINERIES = pytest.mark.parametrize("machinery", ["fast", "paper"])
+
+
+class Listener(torch.nn.Module):
+    """Stands in for the objective: keeps what it is handed, in however many parts."""
+
+    def __init__(self, trainer: Trainer):
+        super().__init__()
+        self.trainer, self.parts = trainer, []
+
+    def forward(self, stage: Stage, rays: Rays, conditions: Conditions, draws: Draws) -> dict[str, Tensor]:
+        self.parts.append((rays, conditions, draws))
+        return {"nothing": sum(p.sum() for p in self.trainer.objective.parameters() if p.requires_grad) * 0.0}
+
+    def all(self, part: int, name: str) -> Tensor:
+        """Of all parts' rays (0) or draws (2) the tensor of this name."""
+        return torch.cat([getattr(handed[part], name) for handed in self.parts])
+
+
+def trainer_of(folder: Path, **changes: Any) -> Trainer:
+    settings = TrainingSettings.model_validate(TINY.model_dump() | changes)
+    return Trainer(*record(folder / "capture"), settings, folder, Processes(0, 1, torch.device("cpu")))
+
+
+def handed_over(trainer: Trainer) -> Listener:
+    listener = Listener(trainer)
+    trainer._optimise(listener)
+    return listener
+
+
+@MACHINERIES
+def test_noise_reaches_the_networks(tmp_path: Path, machinery: str) -> None:
+    """Of 0.1 on theta, T and v: root mean squares over the 9, 36 and 384 numbers that are drawn."""
+    trainer = trainer_of(tmp_path, machinery=machinery)
+    listener = handed_over(trainer)
+    for _, conditions, _ in listener.parts:
+        for noise, least, most in (
+            (conditions.pose - trainer.conditions.pose, 0.03, 0.25),
+            (conditions.root - trainer.conditions.root, 0.07, 0.13),
+        ):
+            assert least < noise.square().mean().sqrt() < most
+            assert (noise != 0).all()
+    view = listener.all(2, "view")
+    assert view.shape == (128, 3) and 0.09 < view.square().mean().sqrt() < 0.11
+
+
+def test_no_noise_where_none_is_asked_for(tmp_path: Path) -> None:
+    trainer = trainer_of(tmp_path, noise=0.0)
+    listener = handed_over(trainer)
+    for _, conditions, _ in listener.parts:
+        assert torch.equal(conditions.pose, trainer.conditions.pose)
+        assert torch.equal(conditions.root, trainer.conditions.root)
+    assert not listener.all(2, "view").any()
+
+
+def test_frames_of_novel_poses_are_not_trained_on(tmp_path: Path) -> None:
+    """Rows 0 and 1 while the field learns, row 2 when it is finished."""
+    trainer = trainer_of(tmp_path)
+    assert handed_over(trainer).all(0, "frame").unique().tolist() == [0, 1]
+    trainer.step = trainer.field_steps
+    assert handed_over(trainer).all(0, "frame").unique().tolist() == [2]
+
+
+def test_only_what_belongs_to_novel_frames_is_fitted_to_a_finished_field(tmp_path: Path) -> None:
+    """Their pose and displacement: not the field, nor training frames, nor the shape, though a loss pulls at all."""
+    trainer = trainer_of(tmp_path, losses=TINY.losses.model_copy(update={"increment": 1.0}))
+    with torch.no_grad():
+        for parameter in trainer.objective.correction.parameters():
+            parameter.fill_(1e-3)
+    before = {name: p.detach().clone() for name, p in trainer.objective.named_parameters()}
+    trainer.step = trainer.field_steps
+    trainer._freeze_field()
+    trainer._optimise(trainer.objective)
+    moved = {name: p != before[name] for name, p in trainer.objective.named_parameters()}
+    of_frames = {f"correction.{name}" for name in ("turn", "move_m")} | {"field.deformation.displacement"}
+    assert {name for name, changed in moved.items() if changed.any()} == of_frames
+    for name in of_frames:
+        assert not moved[name][[0, 1, *range(3, len(moved[name]))]].any()
+
+
+def test_rates_rise_for_20_steps_and_fall_to_a_tenth(tmp_path: Path) -> None:
+    """In both phases: 1/20 of 10^0 at the first step, 10/20 of 10^-0.09 at the tenth, 10^-0.5 half-way."""
+    trainer = trainer_of(tmp_path, steps=100, novel_pose_steps=100)
+    assert trainer.first_rates == [0.05, 0.01, 0.05, 0.001, 0.0005]
+    for start in (0, 100):
+        for step, factor in ((0, 1 / 20), (9, 0.5 * 10**-0.09), (50, 10**-0.5), (100 - 1e-9, 0.1)):
+            trainer.step = start + step
+            trainer._set_rates()
+            rates = [group["lr"] for group in trainer.optimizer.param_groups]
+            assert rates == pytest.approx([factor * rate for rate in trainer.first_rates])
+
+
+def test_cameras_are_levelled_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Camera 0 shows red twice as bright as the others do: the person is (200, 50, 50) before a plate of 128."""
+    gains = {"0": (2.0, 1.0, 1.0), "1": (1.0, 1.0, 1.0), "2": (1.0, 1.0, 1.0), "3": (1.0, 1.0, 1.0)}
+    monkeypatch.setattr(trainer_module, "camera_gains", lambda *inputs: (gains, Decision(2.0, "twice as bright")))
+    handed = handed_over(trainer_of(tmp_path, machinery="paper", rays_per_frame=512))
+    colour, plate, person, edge = (handed.all(0, name) for name in ("colour", "plate", "person", "edge"))
+    first = handed.all(0, "origins_m")[:, 0] > 4  # camera 0 stands at x = 4.5 m
+    for camera, red, grey in ((first, [100, 50, 50], [64, 128, 128]), (~first, [200, 50, 50], [128, 128, 128])):
+        assert (255 * colour[camera & person]).round().unique(dim=0).tolist() == [red]
+        assert (255 * plate[camera & ~edge]).round().unique(dim=0).tolist() == [grey]
+
+
+def test_the_shell_is_tightened_with_the_bodies_until_the_field_is_finished(tmp_path: Path) -> None:
+    """From 20 cm: untrained, the surface is the skin, whose logistic of 100 a metre has settled 5 cm from it; 1.2 cm
+    are left as room. The region that rays are sampled in is the new one."""
+    trainer = trainer_of(tmp_path, absorb_steps=1)
+    cells = (trainer.stage.region.cells == 1).sum()
+    trainer.step = trainer.field_steps + 1
+    trainer._absorb()
+    assert trainer.field.outer_m.max().item() == pytest.approx(0.2)
+    trainer.step = 1
+    trainer._absorb()
+    assert trainer.field.outer_m.max().item() == pytest.approx(0.062, abs=0.004)
+    assert trainer.field.inner_m.max().item() == pytest.approx(0.062, abs=0.004)
+    assert (trainer.stage.region.cells == 1).sum() < 0.7 * cells
+
+
+@MACHINERIES
+def test_bodies_take_up_what_was_learned_of_them(tmp_path: Path, machinery: str) -> None:
+    """A bend of 0.1 and a move of 1 cm: then the networks are told so, and the correction is none."""
+    trainer = trainer_of(tmp_path, machinery=machinery)
+    before = trainer.conditions
+    with torch.no_grad():
+        trainer.objective.correction.turn[1, 0, 1] = 0.1
+        trainer.objective.correction.move_m[0, 2] = 0.01
+    trainer.step = 1
+    trainer._absorb()
+    after = trainer.conditions
+    assert (after.pose - before.pose)[:, 1].tolist() == pytest.approx([0, 0.1, 0], abs=1e-6)
+    assert (after.root - before.root)[:, 11].tolist() == pytest.approx([0.01 / 2.5, 0, 0], abs=1e-6)
+    assert not any(p.any() for p in trainer.objective.correction.parameters())
+    torch.testing.assert_close(trainer.stage.bodies.root[0, :3, 3], torch.tensor([0.0, 0, 0.01]))
