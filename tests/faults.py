@@ -80,6 +80,10 @@ FAULTS = (
     Fault("paper-root-unit", CONDITIONS, "root[:, :3, 3:] / scene_m", "root[:, :3, 3:]", BY_CONDITIONS),
     Fault("paper-octaves", MLP, "OCTAVES = 8", "OCTAVES = 6", BY_MLP),
     Fault("paper-residual-octaves", MLP, "OCTAVES = 1\n", "OCTAVES = 2\n", BY_MLP),
+    Fault("paper-trunk-pose", MLP, "features = self.trunk(torch.cat([positional_encoding(point, self.OCTAVES), pose]",
+          "features = self.trunk(torch.cat([positional_encoding(point, self.OCTAVES), 0 * pose]", BY_MLP),
+    Fault("paper-residual-pose", MLP, "point, self.OCTAVES), pose], -1)))[:, 0]",
+          "point, self.OCTAVES), 0 * pose], -1)))[:, 0]", BY_MLP),
     Fault("encoding-octaves", ENCODING, "2.0 ** torch.arange(octaves", "2.0 * torch.arange(octaves", BY_ENCODING),
     # from samples to pixels
     Fault("occupancy-sign", COMPOSITING, "torch.sigmoid(-sharpness", "torch.sigmoid(sharpness", BY_COMPOSITING),

@@ -19,6 +19,8 @@ def test_sizes_of_the_paper():
     ]
     residual = ResidualMLP(4, 57)
     assert [layer.out_features for layer in residual.trunk.layers] == [128] * 6
+    inputs = 4 * 3 + 57  # one octave
+    assert [layer.in_features for layer in residual.trunk.layers] == [inputs, 128, 128, 128 + inputs, 128, 128]
 
 
 def test_density_does_not_see_root_or_view():
@@ -28,6 +30,15 @@ def test_density_does_not_see_root_or_view():
     two = network(point, pose, torch.ones(5, 12), torch.ones(5, 3))
     assert torch.equal(one[0], two[0])
     assert not torch.equal(one[1], two[1])
+
+
+def test_density_colour_and_distance_see_the_pose():
+    radiance, residual = RadianceMLP(4, 3, 12), ResidualMLP(4, 3)
+    torch.nn.init.normal_(residual.residual.weight)
+    point, root, view = torch.rand(5, 4), torch.rand(5, 12), torch.rand(5, 3)
+    poses = torch.zeros(5, 3), torch.ones(5, 3)
+    one, two = ([*radiance(point, pose, root, view), residual(point, pose)] for pose in poses)
+    assert not any(torch.equal(here, there) for here, there in zip(one, two, strict=True))
 
 
 def test_residual_starts_at_zero():
