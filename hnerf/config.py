@@ -96,9 +96,19 @@ class PaperFieldSettings(Section):
 
     scene_m: float = Field(default=2.5, gt=0)  # half the scene's edge, the unit of sigma_h and gamma
     samples: int = Field(default=256, ge=2)  # coarse, and as many fine
+    box_samples: int = Field(default=0, ge=0)  # of the coarse ones, within the person's box alone
+    rays: Literal["image", "box"] = "image"  # train on all pixels, or on those whose rays meet the person's box
     gamma: float = Field(default=200.0, gt=0)
     learning_rate: float = Field(default=1e-3, gt=0)
     root_condition: bool = True  # colour depends on T
+    view_octaves: int = Field(default=0, ge=0)  # of the encoding of v
+    bfloat16: bool = False  # matrix products of F and DH in half precision
+
+    @model_validator(mode="after")
+    def _some_samples_lie_outside_the_box(self) -> Self:
+        if self.box_samples >= self.samples:
+            raise ValueError(f"box_samples is {self.box_samples}: set fewer than the {self.samples} samples")
+        return self
 
 
 class NerfSettings(Section):
@@ -153,7 +163,7 @@ class LossSettings(Section):
     elastic: float = Field(default=0.0, ge=0)  # not the paper's: of a deformation, as `fast` and Nerfies have
     eta: float = Field(default=1.0, ge=0)  # of the surroundings in blend; 0.25 where floor or furniture is near
     density_threshold: float = Field(default=50.0, gt=0)  # sigma_h, per scene unit
-    density_steepness: float = Field(default=0.1, gt=0)  # lambda; docs/method.md says why
+    density_steepness: float = Field(default=0.02, gt=0)  # lambda; docs/method.md says why
 
 
 H_NERF = ("fast", "paper")  # machineries; the others are compared methods

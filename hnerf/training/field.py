@@ -42,6 +42,11 @@ class Field(nn.Module, ABC):
         """(H, W) bool: pixels that can show anything where the body's vertices are (V, 3)."""
         return within_box(camera, vertices_m, self.margin_m)
 
+    def pixels_to_train_on(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
+        """Return (H, W) bool: pixels that training draws from beside those of the mask, where the body's vertices are
+        (V, 3)."""
+        return self.reached(camera, vertices_m)
+
     @abstractmethod
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Adam groups."""

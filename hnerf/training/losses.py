@@ -72,11 +72,13 @@ def blend(samples: RaySamples, target: Target, eta: float) -> Tensor:
 
 
 def geometry(samples: RaySamples, threshold: float, steepness: float) -> Tensor:
-    """geom: sum_i b_i BCE(sigmoid(lambda (sigma_i - sigma_h)), alpha_dot_i); 0 where the SDF is the density."""
+    """geom: sum_i b_i BCE(sigmoid(lambda (sigma_i - sigma_h)), alpha_dot_i), the label first, as in the paper's seg; 0
+    where the SDF is the density."""
     if samples.density is None:
         return samples.d.new_zeros(())
-    opaque = torch.sigmoid(steepness * (samples.density - threshold)).clamp(EPSILON, 1 - EPSILON)
-    return (samples.in_box * _cross_entropy(opaque, samples.alpha_dot)).sum(1).mean()
+    opaque = torch.sigmoid(steepness * (samples.density - threshold))
+    occupied = samples.alpha_dot.clamp(EPSILON, 1 - EPSILON)
+    return (samples.in_box * _cross_entropy(occupied, opaque)).sum(1).mean()
 
 
 def segmentation(distance: Tensor, target: Target, sharpness: float) -> Tensor:

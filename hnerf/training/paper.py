@@ -5,11 +5,13 @@ coarse and the fine samples; the fine ones are drawn from the coarse weights wit
 both.
 """
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from hnerf.body.canonical import FAR_M, Descriptor, PoseCorrection, PosedBodies
 from hnerf.body.rig import Rig
+from hnerf.capture.camera import Camera
 from hnerf.config import PaperFieldSettings
 from hnerf.field.mlp import RadianceMLP, ResidualMLP
 from hnerf.render.compositing import alpha_from_density, occupancy, weights_from_alpha
@@ -17,6 +19,7 @@ from hnerf.render.shell import Boxes, box_interval, stratified
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.field import Field
 from hnerf.training.losses import RaySamples
+from hnerf.training.pixels import everywhere
 
 OUTSIDE_DISTANCE = 1.0  # the constant d of a point outside the person's box
 
@@ -36,12 +39,16 @@ class PaperField(Field):
         self.register_buffer("centre_m", root[:, :3, 3].mean(0))
         turn = 12 if settings.root_condition else 0
         point, pose, self.turn = (3, 0, 0) if static else (4, 3 * int(rig.free.sum()), turn)
-        self.radiance = RadianceMLP(point, pose, self.turn)
-        self.residual = ResidualMLP(point, pose)
+        self.radiance = RadianceMLP(point, pose, self.turn, settings.view_octaves, settings.bfloat16)
+        self.residual = ResidualMLP(point, pose, settings.bfloat16)
 
     def region(self, bodies: PosedBodies, conditions: Conditions) -> Boxes:
         """Box B of each pose: the body's extent and a margin."""
         return Boxes.around(bodies.vertices_m, self.margin_m)
+
+    def pixels_to_train_on(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
+        """Return all pixels of the image, as the paper does, or those whose rays meet box B."""
+        return (everywhere if self.settings.rays == "image" else self.reached)(camera, vertices_m)
 
     def parameter_groups(self) -> list[dict]:
         """Adam groups."""
@@ -59,9 +66,12 @@ class PaperField(Field):
         correction: PoseCorrection | None = None,
     ) -> tuple[RaySamples, Tensor]:
         """As FastField.sample, over coarse and fine samples together (K = 2 x samples)."""
-        half_m = self.settings.scene_m
+        half_m, inner = self.settings.scene_m, self.settings.box_samples
         near, far = box_interval(origins_m, directions, self.centre_m - half_m, self.centre_m + half_m)
-        coarse = stratified(near, far, draws.jitter)
+        coarse = stratified(near, far, draws.jitter[:, inner:])
+        if inner:
+            entry, leave = (t.clamp(near, far) for t in region.interval(origins_m, directions, frame))
+            coarse = torch.cat([coarse, stratified(entry, leave, draws.jitter[:, :inner])], 1).sort(1).values
         view = directions if draws.view is None else directions + draws.view
         depths = coarse
         with torch.no_grad():

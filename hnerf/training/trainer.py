@@ -27,7 +27,7 @@ from hnerf.training.exposure import camera_gains
 from hnerf.training.losses import RaySamples, pixel
 from hnerf.training.model import build_field
 from hnerf.training.model_file import write_field
-from hnerf.training.pixels import AT_EDGES, Pixels, Rays, everywhere, gather_pixels
+from hnerf.training.pixels import AT_EDGES, Pixels, Rays, gather_pixels
 from hnerf.training.processes import Processes
 from hnerf.training.step import Objective, Stage, TrainingError, not_finite
 
@@ -65,8 +65,8 @@ class Trainer:
         self.optimizer = torch.optim.Adam(self._parameter_groups(), betas=(0.9, 0.99), eps=1e-12, fused=True)
         self.first_rates = [group["lr"] for group in self.optimizer.param_groups]
         logger.info("gathering pixels")
-        reached = everywhere if self.field.own_background else self.field.reached
-        self.pixels: Pixels = gather_pixels(capture, masks, body, body.frames, reached, device)
+        wanted = self.field.pixels_to_train_on
+        self.pixels: Pixels = gather_pixels(capture, masks, body, body.frames, wanted, device)
         self.gains, self.decisions["gains"] = camera_gains(capture, masks, body)
         if self.gains:
             by_camera = [self.gains[name] for name in capture.train_cameras]

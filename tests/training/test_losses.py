@@ -55,9 +55,18 @@ def test_blend():
 
 
 def test_geometry():
-    """sigmoid(0.1 (60 - 50)) = 0.731 against 0; sigmoid(0) = 0.5 against 1; sigmoid(-5) against 0; outside ignored."""
-    expected = -math.log(1 - 1 / (1 + math.exp(-1))) - math.log(0.5) - math.log(1 - 1 / (1 + math.exp(5)))
-    assert losses.geometry(SAMPLES, 50.0, 0.1).item() == pytest.approx(expected / 2, rel=1e-5)
+    """Labels sigmoid(0.1 (60 - 50)) = 0.731, sigmoid(0) = 0.5 and sigmoid(-5) = 0.0067; predictions 0.2, 0.9 and 0.1;
+    outside ignored."""
+    samples = replace(SAMPLES, alpha_dot=torch.tensor([[0.2, 0.9], [0.1, 0.5]]))
+    labels = 1 / (1 + math.exp(-1)), 0.5, 1 / (1 + math.exp(5))
+    expected = [-p * math.log(q) - (1 - p) * math.log(1 - q) for p, q in zip(labels, (0.2, 0.9, 0.1), strict=True)]
+    assert losses.geometry(samples, 50.0, 0.1).item() == pytest.approx(sum(expected) / 2, rel=1e-5)
+
+
+def test_geometry_of_certain_predictions_is_finite():
+    """Predictions 0, 1 and 0 are taken as 1e-6 from there: the labels cost 0.731, 0.5 and 0.0067 times 13.8."""
+    labels = 1 / (1 + math.exp(-1)) + 0.5 + 1 / (1 + math.exp(5))
+    assert losses.geometry(SAMPLES, 50.0, 0.1).item() == pytest.approx(labels * 6 * math.log(10) / 2, rel=2e-3)
 
 
 def test_geometry_vanishes_where_the_sdf_is_the_density():
