@@ -78,7 +78,7 @@ def make(root: Path, results: Sequence[Result], store: Path, jobs: int) -> int:
             ready = next((result for result in waiting if result.threads <= free), None)
             if ready:
                 waiting.remove(ready)
-                running.append(Job(root, ready, store, jobs))
+                running.append(Job(root, ready, store))
                 continue
             time.sleep(LOOK_S)
             for job in [job for job in running if not job.running()]:
@@ -108,9 +108,10 @@ def why_not(root: Path, result: Result, jobs: int) -> str | None:
 class Job:
     """A program under way that makes one result, with what was known when it began."""
 
-    def __init__(self, root: Path, result: Result, store: Path, jobs: int) -> None:
-        self.root, self.result, self.jobs = root, result, jobs
+    def __init__(self, root: Path, result: Result, store: Path) -> None:
+        self.root, self.result = root, result
         self.commit, self.digest = clean_commit(root), code_digest(root, result)
+        self.loads: list[float] = []
         self.before = {path: path.stat().st_mtime_ns for path in result_files(root, result)}
         flat, used = result.name.replace("/", "-"), " ".join(result.command)
         new, logs = store / f"{flat}-{self.digest[:12]}", store / "logs"
@@ -134,7 +135,8 @@ class Job:
 
     def running(self) -> bool:
         """Whether the program has not ended."""
-        self.watch.tick()
+        if self.watch.tick() or not self.loads:
+            self.loads.append(os.getloadavg()[0])
         return self.process.poll() is None
 
     def stop(self) -> None:
@@ -158,7 +160,7 @@ class Job:
             "commit": self.commit,
             "date": datetime.now(UTC).date().isoformat(),
             "machine": machine() | {"threads": self.result.threads},
-            "jobs": self.jobs,
+            "load": sum(self.loads) / len(self.loads),
             "seconds": self.watch.seconds if self.watch.whole else known["seconds"],
             "files": file_digests(self.root, self.result),
         }

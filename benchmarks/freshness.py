@@ -1,7 +1,7 @@
 """Whether a result is what the present code would make: digests of code, and the record of every result.
 
 `benchmarks/results/provenance.json` holds, by the result's name, the digest of the code that made it, commit, date,
-machine, how many programs ran side by side, seconds, and the SHA-256 of each of its files; `provenance.md` shows it.
+machine, its mean load meanwhile, seconds, and the SHA-256 of each of its files; `provenance.md` shows it.
 """
 
 import ast
@@ -89,9 +89,9 @@ def save_record(root: Path, name: str, record: dict[str, Any]) -> None:
     records = load_records(root) | {name: record}
     path = root / "benchmarks" / "results" / "provenance.json"
     replace_text(path, json.dumps(dict(sorted(records.items())), indent=1) + "\n")
-    rows = [["result", "seconds", "commit", "date", "machine", "programs side by side"]]
+    rows = [["result", "seconds", "commit", "date", "machine", "load"]]
     for made, r in sorted(records.items()):
-        rows.append([made, shown_seconds(r), r["commit"], r["date"], in_words(r["machine"]), str(r["jobs"])])
+        rows.append([made, shown_seconds(r), r["commit"], r["date"], in_words(r["machine"]), f"{r['load']:.1f}"])
     lines = ["# Where results come from", "", "Made by `benchmarks/all.py`; see docs/results.md.", "", *table(rows), ""]
     replace_text(path.with_suffix(".md"), "\n".join(lines))
 

@@ -20,8 +20,9 @@ REFUSED = 2
 def provenance() -> dict[str, Any]:
     """What stands at the head of every file of results; a program's first call, as it ends the program as
     `clean_commit` does, and where the code that would be measured is another checkout's."""
-    if Path(hnerf.__file__).parent.parent != ROOT:
-        _refuse(f"hnerf is imported from {Path(hnerf.__file__).parent}; give PYTHONPATH={ROOT}")
+    package = Path(hnerf.__file__).resolve().parent
+    if package.parent != ROOT:
+        _refuse(f"hnerf is imported from {package}; give PYTHONPATH={ROOT}")
     return {"machine": machine(), "commit": clean_commit(ROOT), "date": datetime.now(UTC).date().isoformat()}
 
 

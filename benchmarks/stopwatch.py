@@ -3,6 +3,7 @@
 import json
 import time
 from pathlib import Path
+from typing import Any
 
 SAVE_S = 10.0
 
@@ -15,8 +16,9 @@ class Stopwatch:
     """
 
     def __init__(self, path: Path, digest: str) -> None:
-        new = {"digest": digest, "seconds": 0.0, "whole": True, "done": False}
-        found = json.loads(path.read_text()) if path.exists() else new
+        found: dict[str, Any] = {"digest": digest, "seconds": 0.0, "whole": True, "done": False}
+        if path.exists():
+            found = json.loads(path.read_text())
         goes_on = found["digest"] == digest and not found["done"]
         self.path, self.digest = path, digest
         self.whole = goes_on and found["whole"]
@@ -28,10 +30,12 @@ class Stopwatch:
         """So far."""
         return self.earlier_s + time.monotonic() - self.started_s
 
-    def tick(self) -> None:
-        """Save now and then, for when this process is killed."""
-        if time.monotonic() - self.saved_s > SAVE_S:
+    def tick(self) -> bool:
+        """Save now and then, for when this process is killed; returns whether it did."""
+        due = time.monotonic() - self.saved_s > SAVE_S
+        if due:
             self.save(done=False)
+        return due
 
     def save(self, done: bool) -> None:
         """Write the file."""

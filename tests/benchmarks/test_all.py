@@ -40,8 +40,9 @@ def test_what_is_fresh_is_passed_over_and_what_is_not_is_made(
     assert checkout.calls() == ["one", "two"]
     record = load_records(checkout.root)["one"]
     assert (len(record["digest"]), len(record["commit"]), list(record["files"])) == (64, 12, ["one.md"])
-    assert (record["jobs"], record["machine"]["threads"]) == (1, 1)
+    assert record["machine"]["threads"] == 1
     assert 0 < record["seconds"] < 20
+    assert record["load"] >= 0
     assert "| one | 0 |" in checkout.text("provenance")
     assert make(checkout.root, [ONE, TWO], checkout.store, 1) == 0
     assert checkout.calls() == ["one", "two"]
