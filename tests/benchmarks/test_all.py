@@ -41,9 +41,9 @@ def test_what_is_fresh_is_passed_over_and_what_is_not_is_made(
     record = load_records(checkout.root)["one"]
     assert (len(record["digest"]), len(record["commit"]), list(record["files"])) == (64, 12, ["one.md"])
     assert record["machine"]["threads"] == 1
-    assert 0 < record["seconds"] < 20
+    assert record["seconds"] > 0
     assert record["load"] >= 0
-    assert "| one | 0 |" in checkout.text("provenance")
+    assert f"| one | {record['seconds']:.0f} | {record['commit']} |" in checkout.text("provenance")
     assert make(checkout.root, [ONE, TWO], checkout.store, 1) == 0
     assert checkout.calls() == ["one", "two"]
     assert capsys.readouterr().out.splitlines()[-2:] == ["one: fresh", "two: fresh"]
@@ -158,7 +158,7 @@ def test_the_list_says_what_is_fresh_and_why_not(checkout: Checkout) -> None:
     make(checkout.root, [ONE], checkout.store, 1)
     record = load_records(checkout.root)["one"]
     lines = module.listing(checkout.root, [ONE, TWO])
-    assert lines[2] == f"| one | fresh | 0 | {record['digest'][:12]} | {record['commit']} |"
+    assert lines[2] == f"| one | fresh | {record['seconds']:.0f} | {record['digest'][:12]} | {record['commit']} |"
     assert lines[3] == "| two | stale: not recorded | - | - | - |"
 
 
