@@ -35,10 +35,10 @@ def main() -> None:
     parser.add_argument("store", type=Path)
     parser.add_argument("captures", nargs="*", default=CAPTURES)
     options = parser.parse_args()
-    found = RESULTS / "budget.json"
+    where, found = provenance(), RESULTS / "budget.json"
     captures = json.loads(found.read_text())["captures"] if found.exists() else {}
     for name in options.captures:
-        captures[name] = provenance() | measure(SHARED / "data" / name, Store(options.store.resolve()))
+        captures[name] = where | measure(SHARED / "data" / name, Store(options.store.resolve()))
         write_result("budget", {"captures": captures}, as_markdown(captures))
     print(as_markdown(captures))
 

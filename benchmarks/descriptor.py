@@ -31,8 +31,8 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=100_000)
     parser.add_argument("--frames", type=int, default=8)
     options = parser.parse_args()
-    rows = measure(options.points, options.frames)
-    result = provenance() | {"points": options.points, "frames": options.frames, "points_per_s": rows}
+    where, rows = provenance(), measure(options.points, options.frames)
+    result = where | {"points": options.points, "frames": options.frames, "points_per_s": rows}
     shown = [["what is asked", "points a second"], *([name, f"{rate:,.0f}"] for name, rate in rows.items())]
     markdown = "\n".join(["# Body descriptor", "", sentence(result), "", *table(shown), ""])
     write_result("descriptor", result, markdown)

@@ -1,15 +1,15 @@
 """How well the body is fitted to the shared captures, and what it costs.
 
-usage: python benchmarks/fit.py STORE
+usage: python benchmarks/fit.py STORE [CAPTURE ...]
 
-STORE is where `hnerf run` or `benchmarks/score_shared.py` kept its results. Limb joints are compared by the independent
-program `../shared/accept/score_run.py`; silhouettes of the naked body with the true masks, in every frame and training
-camera. Writes `benchmarks/results/fit.json` and `.md`.
+Fits by preset `fast` (default: the three rendered captures) what STORE does not have. Limb joints are compared by the
+independent program `../shared/accept/score_run.py`; silhouettes of the naked body with the true masks, in every frame
+and training camera. Writes `benchmarks/results/fit.json` and `.md`.
 """
 
 import argparse
-import json
 import runpy
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,16 @@ import cv2
 import numpy as np
 from provenance import SHARED, provenance, sentence, table, write_result
 
+from flows.train_subject import prepared
 from hnerf.body.fit_result import BodyFit
-from hnerf.calibration.report import load_cameras
-from hnerf.capture.capture import Capture
+from hnerf.config import load_settings
 from hnerf.render.silhouette import silhouette
+from tasks.calibration import calibrated
+from tasks.capture import ingest
+from tasks.source import read_capture
+from tasks.store import Store
 
+CAPTURES = ("valid-turn-mono", "valid-walk", "valid-wave")
 COLUMNS = {
     "cameras": ("cameras", "{}"),
     "limb_joint_error_mm": ("limb joints, mm", "{:.1f}"),
@@ -34,13 +39,14 @@ COLUMNS = {
 
 
 def main() -> None:
-    """Measure every capture with ground truth that the store has, print and write."""
+    """Fit and measure every capture, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("store", type=Path)
-    subjects = sorted((parser.parse_args().store / "subjects").iterdir())
-    with_truth = [s for s in subjects if (SHARED / "data" / s.name / "ground_truth").is_dir()]
-    captures = {subject.name: measure(subject, SHARED / "data" / subject.name) for subject in with_truth}
-    result = provenance() | {"captures": captures}
+    parser.add_argument("captures", nargs="*", default=CAPTURES, metavar="CAPTURE")
+    options = parser.parse_args()
+    where, shelf = provenance(), Store(options.store.resolve())
+    captures = {name: measure(SHARED / "data" / name, shelf) for name in options.captures}
+    result = where | {"captures": captures}
     rows = [["capture", *(title for title, _ in COLUMNS.values())]]
     rows += [
         [name, *(form.format(found[key]) for key, (_, form) in COLUMNS.items())] for name, found in captures.items()
@@ -50,16 +56,19 @@ def main() -> None:
     print(markdown)
 
 
-def measure(subject: Path, source: Path) -> dict[str, Any]:
-    """Figures of one finished fit against the ground truth of its recording."""
-    capture = load_cameras(subject / "calibration", Capture.load(subject / "capture"))
-    fit, folder = BodyFit.load(subject / "fit"), (subject / "fit").resolve()
-    seconds = json.loads(folder.with_name(f"{folder.name}.json").read_text())["metrics"]
-    joints = runpy.run_path(str(SHARED / "accept" / "score_run.py"))["joints"](subject, source)
+def measure(folder: Path, shelf: Store) -> dict[str, Any]:
+    """Figures of a capture's fit against its ground truth."""
+    settings = load_settings("fast")
+    source, _ = read_capture(folder)
+    recording, calibration, _, made = prepared(shelf, ingest(shelf, source, settings.capture), settings)
+    capture, fit = calibrated(recording, calibration), BodyFit.load(made.root)
+    with tempfile.TemporaryDirectory() as subject:
+        (Path(subject) / "fit").symlink_to(made.root)
+        joints = runpy.run_path(str(SHARED / "accept" / "score_run.py"))["joints"](Path(subject), folder)
     ious, outside = [], []
     for frame, vertices_m in zip(fit.frames, fit.vertices_m().numpy(), strict=True):
         for name in capture.train_cameras:
-            path = source / "ground_truth" / "masks" / name / f"{frame:06d}.png"
+            path = folder / "ground_truth" / "masks" / name / f"{frame:06d}.png"
             mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 127
             body = silhouette(capture.cameras[name], vertices_m, fit.rig.faces.numpy())
             ious.append((body & mask).sum() / (body | mask).sum())
@@ -69,7 +78,7 @@ def measure(subject: Path, source: Path) -> dict[str, Any]:
         "iou": float(np.mean(ious)),
         "outside_share": float(np.mean(outside)),
         "outside_share_worst": float(np.max(outside)),
-        "seconds_per_frame": sum(seconds.values()) / len(fit.frames),
+        "seconds_per_frame": sum(made.metrics.values()) / len(fit.frames),
     }
 
 

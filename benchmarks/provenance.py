@@ -2,21 +2,28 @@
 
 import json
 import subprocess
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
+import hnerf
 from hnerf.study.machine import in_words, machine
 from hnerf.tables import head, line
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 SHARED = ROOT.parent / "shared"
+REFUSED = 2
 
 
 def provenance() -> dict[str, Any]:
-    """What stands at the head of every file of results."""
-    return {"machine": machine(), "commit": _commit(), "date": datetime.now(UTC).date().isoformat()}
+    """What stands at the head of every file of results; a program's first call, as it ends the program as
+    `clean_commit` does, and where the code that would be measured is another checkout's."""
+    package = Path(hnerf.__file__).resolve().parent
+    if package.parent != ROOT:
+        _refuse(f"hnerf is imported from {package}; give PYTHONPATH={ROOT}")
+    return {"machine": machine(), "commit": clean_commit(ROOT), "date": datetime.now(UTC).date().isoformat()}
 
 
 def sentence(result: dict[str, Any]) -> str:
@@ -25,7 +32,8 @@ def sentence(result: dict[str, Any]) -> str:
 
 
 def write_result(name: str, result: dict[str, Any], markdown: str) -> None:
-    """Write `benchmarks/results/NAME.json` and `.md`."""
+    """Write `benchmarks/results/NAME.json` and `.md`, unless the checkout was changed since the program began."""
+    clean_commit(ROOT)
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")
     (RESULTS / f"{name}.md").write_text(markdown)
@@ -36,12 +44,23 @@ def table(rows: list[list[str]]) -> list[str]:
     return [*head(rows[0]), *map(line, rows[1:])]
 
 
-def _commit() -> str:
-    """The checkout's commit, marked where files other than results differ from it."""
+def clean_commit(root: Path) -> str:
+    """The checkout's commit; ends the program with one line and exit code 2 where there is none, or where files other
+    than results differ from it or are unknown to it."""
 
-    def git(*arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True)
+    def git(*arguments: str) -> str:
+        return subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True).stdout
 
-    commit = git("rev-parse", "--short=12", "HEAD").stdout.strip()
-    changed = git("diff", "--quiet", "HEAD", "--", ".", ":!benchmarks/results").returncode
-    return f"{commit}-dirty" if commit and changed else commit or "not committed"
+    commit = git("rev-parse", "--short=12", "HEAD").strip()
+    if not commit:
+        _refuse(f"{root} has no commit; results are made from a git checkout")
+    changed = [line[3:] for line in git("status", "--porcelain", "--", ".", ":!benchmarks/results").splitlines()]
+    if changed:
+        more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
+        _refuse(f"{changed[0]}{more} not as in commit {commit}; commit first: results are made from clean checkouts")
+    return commit
+
+
+def _refuse(why: str) -> NoReturn:
+    print(f"{Path(sys.argv[0]).name}: {why}", file=sys.stderr)
+    raise SystemExit(REFUSED)

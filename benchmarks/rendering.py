@@ -1,35 +1,40 @@
 """How long finished subjects take to be rendered, on one core and on all.
 
-usage: python benchmarks/rendering.py SUBJECT [SUBJECT ...]
+usage: python benchmarks/rendering.py STORE [CAPTURE ...]
 
-Each SUBJECT is a folder that `hnerf run` left (`store/subjects/NAME`). Its first training pose is rendered for its
-first test camera, or training camera where it has no other, as an image whose longest side is 256 and 512 px; on a GPU,
-where there is one. Medians. Run it on an idle machine. Writes `benchmarks/results/rendering.json` and `.md`.
+The first training pose of each shared capture (default: the three rendered ones), trained by preset `fast` where STORE
+does not have it, is rendered for its first test camera, or training camera where it has no other, as an image whose
+longest side is 256 and 512 px; on a GPU, where there is one. Medians. Run it on an idle machine. Writes
+`benchmarks/results/rendering.json` and `.md`.
 """
 
 import argparse
 from pathlib import Path
 
 import torch
-from provenance import provenance, sentence, table, write_result
+from provenance import SHARED, provenance, sentence, table, write_result
 
+from flows.train_subject import train_subject
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.study.scoring import frame_seconds
 from hnerf.training.model import load_avatar
 
+CAPTURES = ("valid-wave", "valid-walk", "valid-turn-mono")
 SIDES_PX = (256, 512)
 
 
 def main() -> None:
-    """Render, print and write."""
+    """Train, render, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("subjects", nargs="+", type=Path, metavar="SUBJECT")
+    parser.add_argument("store", type=Path)
+    parser.add_argument("captures", nargs="*", default=CAPTURES, metavar="CAPTURE")
     options = parser.parse_args()
     result = provenance()
     threads = result["machine"]["threads"]
     cores = [threads] if torch.cuda.is_available() else sorted({1, threads})
-    result["seconds"] = {subject.name: measure(subject, cores) for subject in options.subjects}
+    subjects = [train_subject.fn(SHARED / "data" / name, "fast", options.store) for name in options.captures]
+    result["seconds"] = {subject.name: measure(subject, cores) for subject in subjects}
     rows = [["subject", *(f"{side} px, threads: {n}" for side in SIDES_PX for n in cores)]]
     rows += [[name, *(f"{s:.2f} s" for s in found.values())] for name, found in result["seconds"].items()]
     text = "\n".join(["# Rendering a frame", "", sentence(result), "", *table(rows), ""])

@@ -1,13 +1,14 @@
 """How every stage's cost grows with frames, cameras and pixels.
 
-usage: python benchmarks/scaling.py STORE [CAPTURE]
+usage: python benchmarks/scaling.py [CAPTURE]
 
 Runs the stages of preset `fast`, training cut to a number of steps, on parts of a shared capture (default valid-wave)
-and on images of other sizes, each in turn, in a store of its own. Writes `benchmarks/results/scaling.json`,
+and on images of other sizes, each in turn, in a new store. Writes `benchmarks/results/scaling.json`,
 `.md` and `.png`; the straight lines of the chart are what a cost in proportion would be.
 """
 
 import argparse
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -37,20 +38,18 @@ MARKERS = "os^Dv"
 def main() -> None:
     """Time all parts, print, draw and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("store", type=Path)
     parser.add_argument("capture", nargs="?", default="valid-wave")
     options = parser.parse_args()
-    if options.store.exists():
-        parser.error(f"{options.store} exists; name a new folder, so that nothing is found again")
-    folder = options.store.resolve()
-    shelf = Store(folder / "captures")
     where = provenance()
     source, _ = read_capture(SHARED / "data" / options.capture)
-    recording = ingest(shelf, source, load_settings("fast").capture)
-    seconds = {
-        axis: {str(n): measure(Store(folder / f"{axis}-{n}"), part(shelf, recording, axis, n)) for n in amounts}
-        for axis, amounts in AXES.items()
-    }
+    with tempfile.TemporaryDirectory(prefix="hnerf-scaling-") as name:
+        folder = Path(name)
+        shelf = Store(folder / "captures")
+        recording = ingest(shelf, source, load_settings("fast").capture)
+        seconds = {
+            axis: {str(n): measure(Store(folder / f"{axis}-{n}"), part(shelf, recording, axis, n)) for n in amounts}
+            for axis, amounts in AXES.items()
+        }
     result = where | {"capture": options.capture, "steps": STEPS, "seconds": seconds}
     lines = [f"# Cost against frames, cameras and pixels: {options.capture}", "", sentence(result), ""]
     lines += [f"Seconds of a stage; training is {STEPS} steps and what comes before and after them.", ""]

@@ -9,13 +9,17 @@ again, so that for a subject that it has seconds of the whole run mean nothing a
 
 import argparse
 import json
+import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from provenance import ROOT, SHARED, provenance, sentence, table, write_result
+
+from tasks.launcher import end_with_parent
 
 SCORE_RUN = SHARED / "accept" / "score_run.py"
 CAPTURES = ("valid-walk", "valid-wave", "valid-turn-mono", "pose2sim-balance")
@@ -52,7 +56,8 @@ def measure(capture: Path, preset: str, store: Path, overrides: list[str]) -> di
     command += ["--store", str(store), *(f"--set={override}" for override in overrides)]
     known, started = (store / "subjects" / capture.name).exists(), time.perf_counter()
     lines: list[str] = []
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as run:
+    ends = partial(end_with_parent, signal.SIGTERM)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, preexec_fn=ends) as run:
         assert run.stdout is not None
         for line in run.stdout:
             print(line, end="", flush=True)

@@ -4,16 +4,14 @@ usage: python benchmarks/studies.py STORE CAPTURE benchmark|stability STUDY [--m
        python benchmarks/studies.py STORE CAPTURE ablations PRESET [--methods no-opt,no-noise]
 
 Runs `hnerf benchmark`, `hnerf stability` or `hnerf ablate` with STORE, in which finished work is found again, and
-copies its tables and charts to `benchmarks/results/<kind>/`, and with a new STORE how long it all took. Ablations are
-scored on a few images.
+copies its tables and charts to `benchmarks/results/<kind>/`. Ablations are scored on a few images.
 """
 
 import argparse
 import shutil
-import time
 from pathlib import Path
 
-from provenance import RESULTS, SHARED, provenance, sentence
+from provenance import RESULTS, ROOT, SHARED, clean_commit, provenance, sentence
 
 from flows.ablations import ablate
 from flows.benchmark import benchmark
@@ -34,20 +32,19 @@ def main() -> None:
     options = parser.parse_args()
     folder = SHARED / "data" / options.capture
     methods = [name for name in options.methods.split(",") if name]
-    where = sentence(provenance())  # of the checkout before it gets new results
-    new, started = not options.store.exists(), time.perf_counter()
+    where = sentence(provenance())
     if options.kind == "benchmark":
         table = benchmark.fn(folder, options.study, methods, options.seconds, options.store)
     elif options.kind == "ablations":
         table = ablate.fn(folder, options.study, options.store, FEW, methods)
     else:
         table = stability.fn(folder, options.study, options.store, methods)
+    clean_commit(ROOT)  # still
     kept = RESULTS / options.kind
     kept.mkdir(parents=True, exist_ok=True)
     for path in [*table.parent.glob(f"{table.stem}.*"), *table.parent.glob(f"{table.stem}-*.png")]:
         shutil.copy(path, kept / path.name)
-    took = f" All of it took {(time.perf_counter() - started) / 60:.0f} minutes." if new else ""
-    text = f"{table.read_text()}\nMade by `benchmarks/studies.py`: {where}{took}\n"
+    text = f"{table.read_text()}\nMade by `benchmarks/studies.py`: {where}\n"
     (kept / table.name).write_text(text)
     print(text)
 

@@ -1,0 +1,191 @@
+"""Make every committed result again that the present code would make otherwise, and say how long each took.
+
+usage: python benchmarks/all.py [NAME ...] [--store STORE] [--jobs 1|2] [--list]
+
+NAME is a result's name in benchmarks/registry.py or a pattern of names, such as "stability/*"; without any, all are
+meant. Fresh results are passed over, and so are those whose capture is not in `../shared/data` beside this checkout.
+Refuses, with exit code 2, to measure a checkout with changes. Give the same command again after an interruption: what
+is done is fresh, and what was under way finds its finished trainings in STORE. One that fails is told at the end, with
+exit code 1, and keeps none of the others from being made. `--list` shows the state of each and makes nothing.
+"""
+
+import argparse
+import fnmatch
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+
+from freshness import code_digest, file_digests, load_records, result_files, save_record, shown_seconds, why_stale
+from provenance import ROOT, clean_commit, table
+from registry import REGISTRY, Result
+from stopwatch import Stopwatch
+
+from hnerf.study.machine import machine
+from tasks.launcher import end_with_parent
+
+FAILED = 1
+LOOK_S = 0.2  # between two looks at what is running
+
+
+def main(argv: list[str] | None = None) -> int:
+    """1 if any result could not be made."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME")
+    parser.add_argument("--store", type=Path, default=ROOT / "store", help="of trainings and logs (default: store)")
+    parser.add_argument("--jobs", type=int, choices=(1, 2), default=1, help="programs side by side, one thread each")
+    parser.add_argument("--list", action="store_true", help="show which results are fresh, and make none")
+    options = parser.parse_args(argv)
+    unknown = [name for name in options.names if not fnmatch.filter([r.name for r in REGISTRY], name)]
+    if unknown:
+        parser.error(f"{unknown[0]}: no such result; there are {', '.join(r.name for r in REGISTRY)}")
+    chosen = [r for r in REGISTRY if not options.names or any(fnmatch.fnmatch(r.name, n) for n in options.names)]
+    if options.list:
+        print("\n".join(listing(ROOT, chosen)))
+        return 0
+    return make(ROOT, chosen, options.store.resolve(), options.jobs)
+
+
+def listing(root: Path, results: Sequence[Result]) -> list[str]:
+    """A table of results: fresh or why not, and what is recorded of each."""
+    records = load_records(root)
+    rows = [["result", "state", "seconds", "code", "commit"]]
+    for result in results:
+        why, record = why_stale(root, result, records), records.get(result.name)
+        known = [shown_seconds(record), record["digest"][:12], record["commit"]] if record else ["-", "-", "-"]
+        rows.append([result.name, f"stale: {why}" if why else "fresh", *known])
+    return table(rows)
+
+
+def make(root: Path, results: Sequence[Result], store: Path, jobs: int) -> int:
+    """Make those that are not fresh, in their order, as far as cores are free; 1 if any failed."""
+    clean_commit(root)
+    waiting, running, failed = [], list[Job](), dict[str, str]()
+    for result in results:
+        passed_over = why_not(root, result, jobs)
+        if passed_over:
+            print(f"{result.name}: {passed_over}", flush=True)
+        else:
+            waiting.append(result)
+    try:
+        while waiting or running:
+            free = jobs - sum(job.result.threads for job in running)
+            ready = next((result for result in waiting if result.threads <= free), None)
+            if ready:
+                waiting.remove(ready)
+                running.append(Job(root, ready, store))
+                continue
+            time.sleep(LOOK_S)
+            for job in [job for job in running if not job.running()]:
+                running.remove(job)
+                fault = job.finish()
+                if fault:
+                    failed[job.result.name] = fault
+                print(f"{job.result.name}: {fault or f'{job.watch.seconds:.0f} s'}", flush=True)
+    finally:  # Ctrl-C, a checkout that was changed meanwhile
+        for job in running:
+            job.stop()
+    for name, fault in failed.items():
+        print(f"failed: {name}: {fault}", file=sys.stderr)
+    return FAILED if failed else 0
+
+
+def why_not(root: Path, result: Result, jobs: int) -> str | None:
+    """Why a result is passed over; None if it is to be made."""
+    if why_stale(root, result, load_records(root)) is None:
+        return "fresh"
+    absent = [name for name in result.captures if not (root.parent / "shared" / "data" / name).is_dir()]
+    if absent:
+        return f"left out: no ../shared/data/{absent[0]}"
+    return "left out: takes both cores; give --jobs 2" if result.threads > jobs else None
+
+
+class Job:
+    """A program under way that makes one result, with what was known when it began."""
+
+    def __init__(self, root: Path, result: Result, store: Path) -> None:
+        self.root, self.result = root, result
+        self.commit, self.digest = clean_commit(root), code_digest(root, result)
+        self.loads: list[float] = []
+        self.before = {path: path.stat().st_mtime_ns for path in result_files(root, result)}
+        flat, used = result.name.replace("/", "-"), " ".join(result.command)
+        new, logs = store / f"{flat}-{self.digest[:12]}", store / "logs"
+        for folder in (logs, new) if "{new}" in used else (logs,):
+            folder.mkdir(parents=True, exist_ok=True)
+        state = new / "seconds.json" if "{new}" in used else logs / f"{flat}.json"
+        if "{store}" not in used and "{new}" not in used:
+            state.unlink(missing_ok=True)  # nothing is left to go on from
+        self.log, self.watch = logs / f"{flat}.log", Stopwatch(state, self.digest)
+        program, *arguments = (argument.format(store=store, new=new) for argument in result.command)
+        print(f"{result.name}: under way, {self.log}", flush=True)
+        with self.log.open("w") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, str(root / "benchmarks" / program), *arguments],
+                cwd=root,
+                env=environment(root, result.threads),
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                preexec_fn=partial(end_with_parent, signal.SIGTERM),
+            )
+
+    def running(self) -> bool:
+        """Whether the program has not ended."""
+        if self.watch.tick() or not self.loads:
+            self.loads.append(os.getloadavg()[0])
+        return self.process.poll() is None
+
+    def stop(self) -> None:
+        """End the program, and with it what it has started; its time counts when the same work goes on."""
+        self.process.terminate()
+        self.process.wait()
+        self.watch.save(done=False)
+
+    def finish(self) -> str | None:
+        """Record the result of a program that has ended; or say why there is none."""
+        fault = self._fault()
+        self.watch.save(done=fault is None)
+        if fault:
+            return fault
+        for path in result_files(self.root, self.result):
+            if path not in self._written():
+                path.unlink()  # of an earlier run, which had more to show
+        known = load_records(self.root).get(self.result.name, {"seconds": None})
+        record = {
+            "digest": self.digest,
+            "commit": self.commit,
+            "date": datetime.now(UTC).date().isoformat(),
+            "machine": machine() | {"threads": self.result.threads},
+            "load": sum(self.loads) / len(self.loads),
+            "seconds": self.watch.seconds if self.watch.whole else known["seconds"],
+            "files": file_digests(self.root, self.result),
+        }
+        save_record(self.root, self.result.name, record)
+        return None
+
+    def _fault(self) -> str | None:
+        if self.process.returncode:
+            lines = self.log.read_text(errors="replace").split("\n")
+            last = next((line for line in reversed(lines) if line.strip()), "no word")
+            return f"exit code {self.process.returncode}: {last.strip()} ({self.log})"
+        if code_digest(self.root, self.result) != self.digest:
+            return "its code was changed while it ran"
+        return None if self._written() else f"wrote nothing that is called {' or '.join(self.result.files)}"
+
+    def _written(self) -> list[Path]:
+        found = result_files(self.root, self.result)
+        return [path for path in found if path.stat().st_mtime_ns != self.before.get(path)]
+
+
+def environment(root: Path, threads: int) -> dict[str, str]:
+    """This checkout's packages before installed ones, and so many threads in whatever computes."""
+    counted = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(threads))
+    return os.environ | counted | {"PYTHONPATH": str(root)}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

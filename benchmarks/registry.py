@@ -1,0 +1,77 @@
+"""Which results there are, what makes each, and what it needs."""
+
+from dataclasses import dataclass
+
+CALIBRATED = ("valid-walk", "valid-wave")
+RENDERED = (*CALIBRATED, "valid-turn-mono")
+
+
+@dataclass(frozen=True)
+class Result:
+    """Files of one name under benchmarks/results/.
+
+    command: a program under benchmarks/ and its arguments, where {store} is the store of all results, and {new} a
+    folder that nobody else uses and no other version of the code, for programs that time the whole of their work;
+    files: patterns under benchmarks/results/; captures: under ../shared/data; configs: patterns under configs/ without
+    ".yaml"; runs: modules that the program starts and does not import; threads: of the program.
+    """
+
+    name: str
+    command: tuple[str, ...]
+    files: tuple[str, ...]
+    captures: tuple[str, ...] = ()
+    configs: tuple[str, ...] = ()
+    runs: tuple[str, ...] = ()
+    threads: int = 1
+
+
+def measured(
+    name: str, *command: str, captures: tuple[str, ...] = (), configs: tuple[str, ...] = (), threads: int = 1
+) -> Result:
+    """A JSON file and a table, and the chart that some have."""
+    return Result(name, command, (f"{name}.*",), captures, configs, threads=threads)
+
+
+def shared(name: str, capture: str, threads: int = 1) -> Result:
+    """The whole pipeline on one capture, timed."""
+    command = ("score_shared.py", capture, "--store", "{new}", "--name", name)
+    return Result(name, command, (f"{name}.*",), (capture,), ("fast",), ("flows.train_subject",), threads)
+
+
+def study(kind: str, name: str, *methods: str, store: str = "{store}", threads: int = 1) -> Result:
+    """A benchmark or stability study of valid-wave."""
+    title, chosen = f"{kind}/valid-wave-{name}", ("--methods", ",".join(methods))
+    command = ("studies.py", store, "valid-wave", kind, name, *chosen)
+    files = (f"{title}.*", f"{title}-*.png")
+    return Result(title, command, files, ("valid-wave",), (f"{kind}/{name}", *methods), threads=threads)
+
+
+def ablations(preset: str) -> Result:
+    """The method without each part, on valid-wave."""
+    command = ("studies.py", "{store}", "valid-wave", "ablations", preset)
+    title = f"ablations/valid-wave-{preset}"
+    return Result(title, command, (f"{title}.*",), ("valid-wave",), (preset, "ablations/*"))
+
+
+REGISTRY = (
+    measured("descriptor", "descriptor.py"),
+    measured("boards", "boards.py", captures=("caliscope-charuco",)),
+    measured("calibration-faults", "calibration.py", captures=CALIBRATED),
+    measured("segmentation", "segmentation.py", captures=RENDERED),
+    measured("fit", "fit.py", "{store}", captures=RENDERED, configs=("fast",)),
+    shared("shared-fast-wave", "valid-wave"),
+    shared("shared-fast-walk", "valid-walk"),
+    shared("shared-fast-one-camera", "valid-turn-mono"),
+    shared("shared-fast-real", "pose2sim-balance"),
+    measured("scaling", "scaling.py", captures=("valid-wave",), configs=("fast",)),
+    study("stability", "quick", "fast"),
+    study("stability", "brief", "fast"),
+    study("stability", "seeds", "fast"),
+    ablations("fast"),
+    study("benchmark", "static", "fast", "paper-small", "nerf", "idr"),
+    study("benchmark", "dynamic", "fast", "neural-body", "nerfies"),
+    measured("budget", "budget.py", "{store}", captures=RENDERED, configs=("fast",)),
+    shared("shared-fast-two-threads", "valid-wave", threads=2),
+    measured("rendering", "rendering.py", "{store}", captures=RENDERED, configs=("fast",), threads=2),
+    study("benchmark", "quick", "fast", "paper-small", "nerf", store="{new}", threads=2),
+)

@@ -1,0 +1,169 @@
+"""Results are made once, in order, over interruptions and failures; programs and checkouts are made up."""
+
+import json
+import time
+from pathlib import Path
+
+import all as module
+import pytest
+from all import make
+from freshness import load_records
+
+from tests.benchmarks.checkout import PROGRAM, Checkout, made
+
+ONE, TWO = made("one"), made("two")
+WAITS = "import time\nif name == 'slow' and not (Path(store) / 'go').exists():\n    time.sleep(60)\n"
+MEETS = """
+import time
+began = time.monotonic()
+while len((Path(store) / "calls").read_text().split()) < 2:
+    assert time.monotonic() < began + 20, "alone"
+    time.sleep(0.05)
+"""
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Checkout:
+    return Checkout(tmp_path)
+
+
+def before_writing(checkout: Checkout, lines: str) -> None:
+    """Have the program do something after it has said that it was called."""
+    checkout.write("benchmarks/program.py", PROGRAM.replace("results =", f"{lines}\nresults ="))
+    checkout.commit()
+
+
+def test_what_is_fresh_is_passed_over_and_what_is_not_is_made(
+    checkout: Checkout, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert make(checkout.root, [ONE, TWO], checkout.store, 1) == 0
+    assert checkout.calls() == ["one", "two"]
+    record = load_records(checkout.root)["one"]
+    assert (len(record["digest"]), len(record["commit"]), list(record["files"])) == (64, 12, ["one.md"])
+    assert record["machine"]["threads"] == 1
+    assert record["seconds"] > 0
+    assert record["load"] >= 0
+    assert f"| one | {record['seconds']:.0f} | {record['commit']} |" in checkout.text("provenance")
+    assert make(checkout.root, [ONE, TWO], checkout.store, 1) == 0
+    assert checkout.calls() == ["one", "two"]
+    assert capsys.readouterr().out.splitlines()[-2:] == ["one: fresh", "two: fresh"]
+
+
+def test_changed_code_makes_a_result_anew_and_keeps_the_time_of_the_whole_work(checkout: Checkout) -> None:
+    make(checkout.root, [ONE], checkout.store, 1)
+    first = load_records(checkout.root)["one"]
+    checkout.write("hnerf/far.py", "NUMBER = 2\n")
+    checkout.commit()
+    assert make(checkout.root, [ONE], checkout.store, 1) == 0
+    second = load_records(checkout.root)["one"]
+    assert checkout.text("one") == "2\n"
+    assert second["commit"] != first["commit"]
+    assert second["seconds"] == first["seconds"]  # the store was not new this time
+    fresh_store = checkout.store.with_name("another")
+    fresh_store.mkdir()
+    checkout.write("hnerf/far.py", "NUMBER = 3\n")
+    checkout.commit()
+    assert make(checkout.root, [ONE], fresh_store, 1) == 0
+    assert load_records(checkout.root)["one"]["seconds"] != first["seconds"]
+
+
+def test_a_checkout_with_changes_is_refused(checkout: Checkout) -> None:
+    checkout.write("hnerf/far.py", "NUMBER = 2\n")
+    with pytest.raises(SystemExit) as ended:
+        make(checkout.root, [ONE], checkout.store, 1)
+    assert ended.value.code == 2
+    assert checkout.calls() == []
+
+
+def test_an_interrupted_run_goes_on_where_it_was(checkout: Checkout, monkeypatch: pytest.MonkeyPatch) -> None:
+    before_writing(checkout, WAITS)
+    slow, sleep = made("slow"), time.sleep
+
+    def interrupt(seconds: float) -> None:
+        if "slow" in checkout.calls():
+            raise KeyboardInterrupt
+        sleep(seconds)
+
+    monkeypatch.setattr(module.time, "sleep", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        make(checkout.root, [ONE, slow, TWO], checkout.store, 1)
+    assert checkout.calls() == ["one", "slow"]
+    assert list(load_records(checkout.root)) == ["one"]
+    spent_s = json.loads((checkout.store / "logs" / "slow.json").read_text())["seconds"]
+    monkeypatch.undo()
+    (checkout.store / "go").touch()
+    assert make(checkout.root, [ONE, slow, TWO], checkout.store, 1) == 0
+    assert checkout.calls() == ["one", "slow", "slow", "two"]
+    assert load_records(checkout.root)["slow"]["seconds"] > spent_s
+
+
+def test_one_that_fails_is_told_at_the_end_and_others_go_on(
+    checkout: Checkout, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before_writing(checkout, "if name == 'bad':\n    print('broken', file=sys.stderr)\n    sys.exit(3)")
+    assert make(checkout.root, [made("bad"), ONE], checkout.store, 1) == 1
+    assert checkout.calls() == ["bad", "one"]
+    assert list(load_records(checkout.root)) == ["one"]
+    assert capsys.readouterr().err.startswith("failed: bad: exit code 3: broken (")
+
+
+def test_code_that_changes_while_it_runs_gives_no_result(
+    checkout: Checkout, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before_writing(checkout, "Path('hnerf/far.py').write_text('NUMBER = 4')")
+    assert make(checkout.root, [ONE], checkout.store, 1) == 1
+    assert load_records(checkout.root) == {}
+    assert "its code was changed while it ran" in capsys.readouterr().err
+
+
+def test_files_that_are_no_longer_written_go_and_none_is_a_failure(
+    checkout: Checkout, capsys: pytest.CaptureFixture[str]
+) -> None:
+    checkout.write("benchmarks/results/one-old.md", "1")
+    both = made("one", program="program.py")
+    both = type(both)(both.name, both.command, ("one.md", "one-*.md"))
+    assert make(checkout.root, [both], checkout.store, 1) == 0
+    assert list(load_records(checkout.root)["one"]["files"]) == ["one.md"]
+    assert not (checkout.root / "benchmarks" / "results" / "one-old.md").exists()
+    nothing = type(both)("nothing", ("program.py", "else", "{store}"), ("nothing.md",))
+    assert make(checkout.root, [nothing], checkout.store, 1) == 1
+    assert "wrote nothing that is called nothing.md" in capsys.readouterr().err
+
+
+def test_absent_captures_and_cores_leave_a_result_out(checkout: Checkout, capsys: pytest.CaptureFixture[str]) -> None:
+    far, wide = made("far", captures=("absent",)), made("wide", threads=2)
+    assert make(checkout.root, [far, wide], checkout.store, 1) == 0
+    assert checkout.calls() == []
+    told = capsys.readouterr().out.splitlines()
+    assert told == ["far: left out: no ../shared/data/absent", "wide: left out: takes both cores; give --jobs 2"]
+    (checkout.root.parent / "shared" / "data" / "absent").mkdir(parents=True)
+    assert make(checkout.root, [far, wide], checkout.store, 2) == 0
+    assert checkout.calls() == ["far", "wide"]
+
+
+def test_two_jobs_run_side_by_side(checkout: Checkout) -> None:
+    before_writing(checkout, MEETS)
+    assert make(checkout.root, [ONE, TWO], checkout.store, 2) == 0
+
+
+def test_new_is_a_folder_of_this_result_and_this_code(checkout: Checkout) -> None:
+    before_writing(checkout, "(Path(store) / 'kept').touch()")
+    timed = type(ONE)("a/b", ("program.py", "b", "{new}"), ("b.md",))
+    assert make(checkout.root, [timed], checkout.store, 1) == 0
+    digest = load_records(checkout.root)["a/b"]["digest"]
+    assert (checkout.store / f"a-b-{digest[:12]}" / "kept").exists()
+
+
+def test_the_list_says_what_is_fresh_and_why_not(checkout: Checkout) -> None:
+    make(checkout.root, [ONE], checkout.store, 1)
+    record = load_records(checkout.root)["one"]
+    lines = module.listing(checkout.root, [ONE, TWO])
+    assert lines[2] == f"| one | fresh | {record['seconds']:.0f} | {record['digest'][:12]} | {record['commit']} |"
+    assert lines[3] == "| two | stale: not recorded | - | - | - |"
+
+
+def test_an_unknown_name_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        module.main(["nonsense"])
+    assert ended.value.code == 2
+    assert "nonsense: no such result" in capsys.readouterr().err

@@ -1,0 +1,127 @@
+"""What changes the digest of a result's code, and what does not; which results are fresh."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from freshness import code_digest, sources, why_stale
+from provenance import RESULTS, ROOT
+from registry import REGISTRY
+
+from tests.benchmarks.checkout import Checkout, made
+
+ONE = made("one", configs=("fast",))
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Checkout:
+    return Checkout(tmp_path)
+
+
+def test_sources_are_the_program_and_what_it_imports_at_any_remove(checkout: Checkout) -> None:
+    names = [str(path.relative_to(checkout.root)) for path in sources(checkout.root, ONE)]
+    assert names == ["benchmarks/program.py", "hnerf/__init__.py", "hnerf/far.py", "hnerf/near.py"]
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("hnerf/far.py", "NUMBER = 2\n"),
+        ("hnerf/__init__.py", "VERSION = 2\n"),
+        ("configs/fast.yaml", "steps: 11\n"),
+        ("benchmarks/program.py", "import hnerf.near\n"),
+    ],
+)
+def test_code_and_settings_change_the_digest(checkout: Checkout, name: str, text: str) -> None:
+    before = code_digest(checkout.root, ONE)
+    checkout.write(name, text)
+    assert code_digest(checkout.root, ONE) != before
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("hnerf/far.py", '"""A docstring."""\n\nNUMBER   = (1)  # a comment\n'),
+        ("hnerf/unused.py", "NUMBER = 2\n"),
+        ("configs/fast.yaml", "steps:   10  # a comment\n"),
+    ],
+)
+def test_comments_docstrings_formatting_and_other_modules_do_not(checkout: Checkout, name: str, text: str) -> None:
+    before = code_digest(checkout.root, ONE)
+    checkout.write(name, text)
+    assert code_digest(checkout.root, ONE) == before
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "def late():\n    from hnerf.unused import NUMBER\n    return NUMBER\nNUMBER = 1\n",
+        'NUMBER = 1\nRUN = ["-m", "hnerf.unused"]\n',
+        "NUMBER = 1\nimport hnerf.unused as other\n",
+    ],
+)
+def test_modules_imported_late_or_started_by_name_count(checkout: Checkout, text: str) -> None:
+    checkout.write("hnerf/far.py", text)
+    assert checkout.root / "hnerf" / "unused.py" in sources(checkout.root, ONE)
+
+
+def test_programs_import_their_neighbours_and_packages_do_not(checkout: Checkout) -> None:
+    neighbour = checkout.root / "benchmarks" / "neighbour.py"
+    checkout.write("hnerf/far.py", "import neighbour\nNUMBER = 1\n")
+    assert neighbour not in sources(checkout.root, ONE)
+    checkout.write("benchmarks/program.py", "import neighbour\n")
+    assert neighbour in sources(checkout.root, ONE)
+
+
+def test_a_program_that_is_started_counts_as_told(checkout: Checkout) -> None:
+    assert checkout.root / "hnerf" / "unused.py" in sources(checkout.root, made("one", runs=("hnerf.unused",)))
+
+
+def test_the_command_counts(checkout: Checkout) -> None:
+    assert code_digest(checkout.root, made("one")) != code_digest(checkout.root, made("two"))
+
+
+def _remove(path: Path) -> None:
+    path.unlink()
+
+
+def _edit(path: Path) -> None:
+    path.write_text("34.5")
+
+
+@pytest.mark.parametrize("harm", [_remove, _edit])
+def test_a_result_is_stale_where_its_files_are_not_as_they_were_made(
+    checkout: Checkout, harm: Callable[[Path], None]
+) -> None:
+    checkout.write("benchmarks/results/one.md", "1")
+    digest = code_digest(checkout.root, ONE)
+    records = {"one": {"digest": digest, "files": {"one.md": sha256_of_1}}}
+    assert why_stale(checkout.root, ONE, {}) == "not recorded"
+    assert why_stale(checkout.root, ONE, records) is None
+    harm(checkout.root / "benchmarks" / "results" / "one.md")
+    assert why_stale(checkout.root, ONE, records) == "one.md is not as it was made"
+    checkout.write("hnerf/far.py", "NUMBER = 2\n")
+    assert why_stale(checkout.root, ONE, records) == "its code has changed"
+
+
+sha256_of_1 = "6b86b273ff34fce19d6b804eff5a3f5747ada4eaa22f1d49c01e52ddb7875b4b"  # printf 1 | sha256sum
+
+
+def test_every_committed_file_is_of_one_result() -> None:
+    files = [path for path in RESULTS.rglob("*") if path.is_file() and path.stem != "provenance"]
+    owners = {path: [r.name for r in REGISTRY for f in r.files if path in RESULTS.glob(f)] for path in files}
+    assert {str(path): names for path, names in owners.items() if len(names) != 1} == {}
+
+
+def test_every_entry_names_a_program_settings_and_itself_once() -> None:
+    assert len({result.name for result in REGISTRY}) == len(REGISTRY)
+    for result in REGISTRY:
+        assert (ROOT / "benchmarks" / result.command[0]).is_file()
+        assert len(code_digest(ROOT, result)) == 64
+
+
+def test_a_training_is_among_what_a_study_depends_on() -> None:
+    study = next(result for result in REGISTRY if result.name == "benchmark/valid-wave-static")
+    names = {str(path.relative_to(ROOT)) for path in sources(ROOT, study)}
+    assert {"hnerf/training/run.py", "tasks/rank.py", "hnerf/baselines/idr.py", "benchmarks/provenance.py"} <= names
+    assert "benchmarks/segmentation.py" not in names

@@ -1,0 +1,47 @@
+"""Seconds of work over interruptions, with a clock that is set by hand."""
+
+from pathlib import Path
+
+import pytest
+import stopwatch
+from stopwatch import Stopwatch
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The time, as the only item."""
+    now = [100.0]
+    monkeypatch.setattr(stopwatch.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_an_interrupted_run_of_the_same_code_goes_on(tmp_path: Path, clock: list[float]) -> None:
+    first = Stopwatch(tmp_path / "state.json", "a")
+    clock[0] = 130.0
+    first.save(done=False)
+    clock[0] = 500.0
+    second = Stopwatch(tmp_path / "state.json", "a")
+    clock[0] = 512.0
+    assert (second.seconds, second.whole) == (42.0, True)
+
+
+def test_a_killed_run_has_lost_ten_seconds_at_most(tmp_path: Path, clock: list[float]) -> None:
+    killed = Stopwatch(tmp_path / "state.json", "a")
+    for clock[0] in (109.0, 111.0, 115.0):
+        killed.tick()
+    assert Stopwatch(tmp_path / "state.json", "a").seconds == 11.0
+
+
+@pytest.mark.parametrize(("digest", "done"), [("b", False), ("a", True)])
+def test_what_other_code_or_a_finished_run_left_is_not_timed(
+    tmp_path: Path, clock: list[float], digest: str, done: bool
+) -> None:
+    first = Stopwatch(tmp_path / "state.json", "a")
+    clock[0] = 130.0
+    first.save(done)
+    second = Stopwatch(tmp_path / "state.json", digest)
+    clock[0] = 135.0
+    assert (second.seconds, second.whole) == (5.0, False)
+    second.save(done=False)
+    third = Stopwatch(tmp_path / "state.json", digest)
+    assert (third.seconds, third.whole) == (5.0, False)
