@@ -16,13 +16,12 @@ UNTIL_TIME_IS_UP = 1_000_000  # steps
 FIRST_SNAPSHOT_S = 15.0  # where a training has no limit that could be halved
 
 
-class Variant(Section):
+class Part(Section):
     """Part of a capture. cameras, frames: of training, how many of them or which; None is all."""
 
     cameras: PositiveInt | tuple[str, ...] | None = None
     frames: PositiveInt | tuple[int, ...] | None = None
     novel_poses: bool = True
-    methods: tuple[str, ...] = ()  # of the study's; none is all
 
     def parts(self, capture: Capture) -> tuple[tuple[str, ...] | None, tuple[int, ...] | None, tuple[int, ...] | None]:
         """Training cameras, training frames and novel-pose frames to keep, None for all.
@@ -41,6 +40,12 @@ class Variant(Section):
         elif frames is not None:
             frames = chosen(capture, "training frame", frames, capture.train_frames)
         return cameras, frames, None if self.novel_poses else ()
+
+
+class Variant(Part):
+    """Part of a capture, and the methods of the study that are tried on it; none is all."""
+
+    methods: tuple[str, ...] = ()
 
 
 class ScoringSettings(Section):
