@@ -61,7 +61,7 @@ def benchmark(
 
 def blank(plan: Study, study: str, recorded: Capture) -> dict[str, Any]:
     """A result without figures, in the form of hnerf/study/results.py."""
-    described = plan.model_dump(include={"title", "notes", "seconds", "sweep", "methods"})
+    described = plan.model_dump(include={"title", "notes", "claims", "seconds", "sweep", "methods"})
     variants = {title: describe(variant, recorded) for title, variant in plan.variants.items()}
     return {"subject": recorded.name, "study": study} | described | {"variants": variants}
 

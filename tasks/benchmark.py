@@ -13,7 +13,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("scoring", version="8")
+@stage("scoring", version="9")
 def score_training(
     out: Path,
     truth: Source,

@@ -8,10 +8,10 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from hnerf.evaluation.charts import COLOURS, INK, style
-from hnerf.study.curves import Point, binned, pareto_front
+from hnerf.study.curves import Point, bin_edges, binned, pareto_front
 
 LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
@@ -20,7 +20,6 @@ PANEL_POINTS = 190  # of those, from the lowest to the highest value that an axi
 LABEL_GAP = 0.07  # of a panel's height, between names at line ends
 ABOVE_LINE = 7.0  # points of type
 CAPTION_LETTERS = 13  # on an inch
-BINS = 5
 
 Curves = Mapping[str, Sequence[Point]]
 Style = dict[str, Any]
@@ -64,30 +63,42 @@ def speed_chart(
 
 
 def sweep_chart(
-    curves: Curves, looks: Mapping[str, Style], x_label: str, y_label: str, caption: str, path: Path
+    panels: Sequence[tuple[str, Curves]], looks: Mapping[str, Style], x_label: str, caption: str, path: Path
 ) -> None:
-    """A figure of the finished models over what the variants of a study differ in."""
-    figure, axes = _figure(1, 1)
-    panel = axes[0][0]
-    lines(panel, curves, looks)
-    _decorate(panel, "", x_label, y_label)
-    panel.xaxis.set_major_locator(MaxNLocator(integer=True))
+    """A panel for each (label, curves): a figure of the finished models over what the variants of a study differ in,
+    each step of it as wide as the number grows by."""
+    figure, axes = _figure(1, len(panels))
+    for panel, (y_label, curves) in zip(axes[0], panels, strict=True):
+        panel.set_xscale("log")
+        lines(panel, curves, looks)
+        _decorate(panel, "", x_label, y_label)
+        places = sorted({x for points in curves.values() for x, _ in points})
+        panel.set_xticks(places, [f"{x:g}" for x in places])
+        panel.xaxis.set_minor_locator(NullLocator())
     _save(figure, caption, path)
 
 
 def nearness_chart(
-    panels: Sequence[tuple[str, str, Curves]], looks: Mapping[str, Style], axis: str, caption: str, path: Path
+    panels: Sequence[tuple[str, Sequence[str], Curves]],
+    looks: Mapping[str, Style],
+    bins: int,
+    caption: str,
+    path: Path,
 ) -> None:
-    """A panel for each (title, label of x, points by method): every image as a mark, means of equally many as a
-    line."""
+    """A panel for each (title, labels of x and y, points by method): every image or surface as a mark, means of bins of
+    equal width as a line, and how many there are in a bin."""
     figure, axes = _figure(-(-len(panels) // 2), min(2, len(panels)))
     slots = [panel for row in axes for panel in row]
-    for panel, (title, x_label, clouds) in zip(slots, panels, strict=False):
+    for panel, (title, labels, clouds) in zip(slots, panels, strict=False):
+        edges = bin_edges(clouds.values(), bins)
+        means = {name: binned(points, edges) for name, points in clouds.items()}
         for name, points in clouds.items():
             look = looks[name] | {"linestyle": "none", "markersize": 3.5, "alpha": 0.35, "markeredgewidth": 0}
             panel.plot(*zip(*points, strict=True), **look)
-        lines(panel, {name: binned(points, BINS) for name, points in clouds.items()}, looks)
-        _decorate(panel, title, x_label, axis)
+        lines(panel, {name: [(x, y) for x, y, _ in found] for name, found in means.items()}, looks)
+        for x, _, count in max(means.values(), key=len):
+            panel.annotate(f"n = {count}", (x, 0.01), xycoords=panel.get_xaxis_transform(), ha="center", fontsize=7)
+        _decorate(panel, title, *labels)
     for panel in slots[len(panels) :]:
         panel.set_axis_off()
     _save(figure, caption, path)

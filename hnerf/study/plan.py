@@ -1,9 +1,9 @@
 """What a benchmark compares: methods on parts of a capture, as a YAML file under `configs/benchmark/` says."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field, PositiveInt
+from pydantic import Field, PositiveInt, model_validator
 
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, H_NERF, Section, Settings, load_settings, named_file, read_yaml, validated
@@ -48,6 +48,21 @@ class Variant(Part):
     methods: tuple[str, ...] = ()
 
 
+class Claim(Section):
+    """What the paper says in its words, and which figures tell whether it is seen here: hnerf/study/claims.py."""
+
+    says: str
+    check: Literal[
+        "more_is_better",
+        "loses_least",
+        "ahead",
+        "falls_with_angle",
+        "ahead_at_every_angle",
+        "no_trend_with_pose",
+        "others_have_no_surface",
+    ]
+
+
 class ScoringSettings(Section):
     """How much of what is held out is rendered and meshed. split: of curves and charts; new poses in any case where no
     camera is held out."""
@@ -61,17 +76,25 @@ class ScoringSettings(Section):
 
 
 class Study(Section):
-    """A benchmark. methods: presets; seconds: of every training, None to each preset's own end; snapshots: how many are
-    scored before it."""
+    """A benchmark. methods: presets, that of H-NeRF first; seconds: of every training, None to each preset's own end;
+    snapshots: how many are scored before it."""
 
     title: str
     notes: tuple[str, ...] = ()  # what a reader has to know, such as what is left out
+    claims: tuple[Claim, ...] = ()
     seconds: float | None = Field(default=None, gt=0)
     snapshots: int = Field(default=4, ge=0, le=12)
     sweep: Literal["cameras", "frames"] | None = None  # what the variants differ in, for a chart of its own
     methods: tuple[str, ...] = Field(min_length=1)
     variants: dict[str, Variant] = Field(min_length=1)
     scoring: ScoringSettings = ScoringSettings()
+
+    @model_validator(mode="after")
+    def _claims_of_a_sweep_have_one(self) -> Self:
+        for claim in self.claims:
+            if claim.check in ("more_is_better", "loses_least") and not self.sweep:
+                raise ValueError(f"claims: {claim.check} asks for a sweep")
+        return self
 
     def settings(self, method: str) -> Settings:
         """All stages' settings; training stops after `seconds` and is saved on the way. Steps that are written down end

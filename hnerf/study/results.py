@@ -1,7 +1,7 @@
 """A benchmark's result as tables: Markdown for people, CSV for spreadsheets; and what its charts show.
 
 A result is a plain tree, as the JSON file has it:
-    {subject, study, title, notes, seconds, sweep, methods: [name], variants: {title: {cameras, frames,
+    {subject, study, title, notes, claims, seconds, sweep, methods: [name], variants: {title: {cameras, frames,
      methods: {name: scores of hnerf/study/scoring.py, or {"error": one line}}} or {"left_out": why}}}
 """
 
@@ -30,6 +30,7 @@ COSTS = {  # of a training
     "model_mib": ("model, MiB", "{:.1f}"),
 }
 NEAR_BEST_DB = 1.0
+BINS = 6  # of the distance from training
 FLOORS = {"one_colour_psnr": "one colour in the true outline", "empty_psnr": "an empty picture"}
 
 
@@ -72,22 +73,23 @@ def timed_px(result: Mapping[str, Any]) -> str:
     return min((size for variant in result["variants"].values() for size in _sizes(variant)), key=int)
 
 
-def sweep_curves(result: Mapping[str, Any]) -> dict[str, list[Point]]:
-    """Of each method: PSNR of the finished model over the number of cameras or frames, in ascending order."""
+def sweep_curves(result: Mapping[str, Any], key: str = "psnr") -> dict[str, list[Point]]:
+    """Of each method: a figure of the finished model over the number of cameras or frames, in ascending order."""
     curves: dict[str, list[Point]] = {}
     for variant in result["variants"].values():
-        for name, (_, psnr) in frame_points(variant).items():
-            trained_on = variant["methods"][name]["trained_on"]
-            curves.setdefault(name, []).append((trained_on[result["sweep"]], psnr))
+        for name, scores in scored(variant).items():
+            if (value := pick(scores[scores["split"]], key)) is not None:
+                curves.setdefault(name, []).append((scores["trained_on"][result["sweep"]], value))
     return {name: sorted(points) for name, points in curves.items()}
 
 
-def clouds(variant: Mapping[str, Any], split: str, key: str) -> dict[str, list[Point]]:
-    """Of each method: PSNR of every image of a split over a figure of the image, such as "view_angle_deg"."""
-    found = {
-        name: [(row[key], row["psnr"]) for row in scores[split]["per_image"]]
-        for name, scores in scored(variant).items()
-    }
+def clouds(variant: Mapping[str, Any], split: str, x: str, y: str = "psnr") -> dict[str, list[Point]]:
+    """Of each method: PSNR of every image of a split, or a figure of its surfaces such as "chamfer_mm", over how far
+    each is from training, such as "view_angle_deg"."""
+    found = {}
+    for name, scores in scored(variant).items():
+        rows = scores[split]["per_image"] if y == "psnr" else (scores[split]["geometry"] or {}).get("per_surface", [])
+        found[name] = [(row[x], row[y]) for row in rows]
     return {name: points for name, points in found.items() if points}
 
 
@@ -105,11 +107,11 @@ def caption(result: Mapping[str, Any]) -> str:
     return f"{result['subject']}, study {result['study']}: {limit}; on {'; on '.join(machines) or 'no machine yet'}."
 
 
-def as_markdown(result: Mapping[str, Any], pictures: list[str]) -> str:
-    """The whole result for people. pictures: names of files beside the text."""
+def as_markdown(result: Mapping[str, Any], pictures: list[str], claims: list[str]) -> str:
+    """The whole result for people. pictures: names of files beside the text; claims: lines of hnerf/study/claims.py."""
     lines = [f"# {result['title']}: {result['subject']}", "", caption(result), ""]
     lines += [f"- {note}" for note in result["notes"]] + [""] * bool(result["notes"])
-    lines += [f"{picture(name)}\n" for name in pictures]
+    lines += [f"{picture(name)}\n" for name in pictures] + claims + [""] * bool(claims)
     lines += ["Two figures in a cell: new views / new poses.", ""]
     for title, variant in result["variants"].items():
         lines += [f"## {title}", "", *_variant_lines(variant), ""]

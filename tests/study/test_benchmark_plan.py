@@ -20,7 +20,10 @@ def write(folder: Path, text: str) -> str:
 
 def test_studies_that_are_promised_are_there_and_valid() -> None:
     studies = {path.stem: load_study(path.stem) for path in STUDIES.glob("*.yaml")}
-    assert set(studies) == {"quick", "dynamic", "static", "cameras", "frames", "monocular"}
+    of_the_paper = {"cameras", "view-angle", "frames", "pose-distance", "monocular", "nerfies"}
+    assert set(studies) == {"quick", "dynamic", "static"} | of_the_paper
+    assert all(studies[name].claims for name in of_the_paper)
+    assert all(studies[name].scoring.images == 48 for name in ("view-angle", "pose-distance"))
     assert set(studies["quick"].methods) == {"fast", "paper-small", "nerf"}
     assert studies["quick"].variants["one frame"].methods == ("fast", "nerf")
     assert [v.cameras for v in studies["cameras"].variants.values()] == [2, 4, 8, 16, 32]
@@ -43,6 +46,8 @@ def test_methods_of_ready_studies_have_valid_settings() -> None:
         ("title: t\nmethods: [a]\nvariants: {all: {views: 3}}", "variants.all.views: Extra inputs"),
         ("title: t\nmethods: [a]\nvariants: {all: {methods: [b]}}", "variants.all: no method b; there"),
         ("title: t\nmethods: [a]\nvariants: {}", "variants: Dictionary should have at least 1"),
+        ("title: t\nmethods: [a]\nvariants: {a: {}}\nclaims: [{says: a, check: more_is_better}]", "asks for a sweep"),
+        ("title: t\nmethods: [a]\nvariants: {a: {}}\nclaims: [{says: a, check: faith}]", "claims.0.check: Input"),
     ],
 )
 def test_bad_studies_are_refused_by_key(tmp_path: Path, text: str, message: str) -> None:

@@ -27,12 +27,13 @@ from hnerf.study.results import (
 )
 
 MACHINE = {"cpu": "Abacus", "cores": 2, "threads": 1, "gpu": None, "torch": "2", "python": "3"}
-GEOMETRY = {"chamfer_l2_e3": 0.05, "normal_consistency": 0.94, "iou": 0.875}
+SURFACES = [{"frame": 0, "chamfer_mm": 5.0, "pose_distance_deg": 3.0}]
+GEOMETRY = {"chamfer_l2_e3": 0.05, "normal_consistency": 0.94, "iou": 0.875, "per_surface": SURFACES}
 
 
 def split(psnr: float) -> dict[str, Any]:
     rows = [
-        {"camera": "c", "frame": f, "psnr": psnr + f, "view_angle_deg": 40.0 + f, "pose_distance_mm": 3.0}
+        {"camera": "c", "frame": f, "psnr": psnr + f, "view_angle_deg": 40.0 + f, "pose_distance_deg": 3.0}
         for f in (0, 2)
     ]
     floors = {"empty_psnr": 18.0, "one_colour_psnr": 25.0}
@@ -73,6 +74,7 @@ def result(**changes: Any) -> dict[str, Any]:
         "study": "toy",
         "title": "Toys",
         "notes": ["A note."],
+        "claims": [],
         "seconds": 60.0,
         "sweep": "cameras",
         "methods": ["fast", "nerf", "idr"],
@@ -85,7 +87,7 @@ def result(**changes: Any) -> dict[str, Any]:
 
 
 def test_the_markdown_by_hand() -> None:
-    assert as_markdown(result(), ["a (b).png"]).splitlines()[:25] == [
+    assert as_markdown(result(), ["a (b).png"], ["- A claim."]).splitlines()[:27] == [
         "# Toys: ada",
         "",
         "ada, study toy: 60 s for each field; on Abacus, 1 of 2 cores, no GPU, torch 2, Python 3.",
@@ -93,6 +95,8 @@ def test_the_markdown_by_hand() -> None:
         "- A note.",
         "",
         "![a (b).png](<a (b).png>)",
+        "",
+        "- A claim.",
         "",
         "Two figures in a cell: new views / new poses.",
         "",
@@ -115,7 +119,7 @@ def test_the_markdown_by_hand() -> None:
         "",
         "## 2 cameras",
     ]
-    text = as_markdown(result(), [])
+    text = as_markdown(result(), [], [])
     assert "Left out: the capture has 4 training cameras, not 8." in text
     assert text.endswith("LPIPS: not available: no weights.\n\nBy eye.\n")
 
@@ -123,7 +127,7 @@ def test_the_markdown_by_hand() -> None:
 def test_what_calibration_left_out_is_told_and_not_plotted() -> None:
     of_three = result()
     of_three["variants"]["4 cameras"]["methods"]["fast"]["trained_on"] = {"cameras": 3, "frames": 1}
-    text = as_markdown(of_three, [])
+    text = as_markdown(of_three, [], [])
     assert "- fast: trained on 3 cameras and 1 frames: calibration left the others out" in text
     assert sweep_curves(of_three)["fast"] == [(2, 28.0), (3, 30.0)]
 
@@ -148,6 +152,9 @@ def test_what_charts_show() -> None:
     assert frame_points(variants["4 cameras"]) == {"fast": (0.5, 30.0), "nerf": (2.0, 26.0)}
     assert sweep_curves(result()) == {"fast": [(2, 28.0), (4, 30.0)], "nerf": [(4, 26.0)]}
     assert clouds(variants["2 cameras"], "novel_view", "view_angle_deg") == {"fast": [(40.0, 28.0), (42.0, 30.0)]}
+    assert sweep_curves(result(), "geometry.chamfer_l2_e3")["fast"] == [(2, 0.05), (4, 0.05)]
+    surfaces = clouds(variants["2 cameras"], "novel_view", "pose_distance_deg", "chamfer_mm")
+    assert surfaces == {"fast": [(3.0, 5.0)]} and not clouds(variants["2 cameras"], "novel_pose", "view_angle_deg")
     # from 26 dB at 10 s to 30 dB at 1000 s: 29 dB after three quarters of the way in log time
     near = near_best_seconds(variants["4 cameras"])
     assert near == {"fast": pytest.approx(10 * 100**0.75), "nerf": None}

@@ -122,7 +122,9 @@ def test_images_stand_beside_their_distance_from_training(found: dict[str, Any])
     rows = found["novel_view"]["per_image"]
     assert [row["frame"] for row in rows] == [0, 1, 2]
     assert rows[0]["view_angle_deg"] == pytest.approx(80.0, abs=1e-3)  # cameras at 0, 80 and 160 degrees
-    assert [row["pose_distance_mm"] for row in rows] == [0.0, 0.0, 0.0]
+    assert [row["pose_distance_deg"] for row in rows] == [0.0, 0.0, 0.0]
+    (surface,) = found["novel_view"]["geometry"]["per_surface"]
+    assert surface["pose_distance_deg"] == 0.0
 
 
 def test_pictures_of_truth_and_rendering_lie_side_by_side(base: Path, found: dict[str, Any]) -> None:
