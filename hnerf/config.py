@@ -140,7 +140,8 @@ class NerfiesSettings(Section):
     """Nerfies, a compared method (hnerf/baselines/nerfies.py)."""
 
     samples: int = Field(default=24, ge=2)  # coarse, and as many fine
-    width: int = Field(default=64, ge=2)
+    width: int = Field(default=64, ge=2)  # of the template
+    deformation_width: int = Field(default=64, ge=2)
     code_width: int = Field(default=8, ge=1)  # of a frame
     anneal_steps: int = Field(default=500, ge=1)  # until the deformation has all its octaves
     learning_rate: float = Field(default=5e-3, gt=0)

@@ -2,6 +2,7 @@
 
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,21 @@ CAPTION_LETTERS = 13  # on an inch
 
 Curves = Mapping[str, Sequence[Point]]
 Style = dict[str, Any]
+NO_ENDS: Mapping[str, str] = {}
+
+
+@dataclass(frozen=True)
+class Speed:
+    """What a row of the speed chart shows, by method: curves (training seconds, accuracy), why they end where that is
+    known, points (time of a frame, accuracy); and the accuracy of what needs no training, by title."""
+
+    curves: Curves
+    ends: Mapping[str, str]
+    points: Mapping[str, Point]
+    floors: Mapping[str, float]
+
+    def __bool__(self) -> bool:
+        return bool(self.curves or self.points)
 
 
 def styles(methods: Iterable[str]) -> dict[str, Style]:
@@ -35,30 +51,32 @@ def styles(methods: Iterable[str]) -> dict[str, Style]:
 
 
 def speed_chart(
-    rows: Mapping[str, tuple[Curves, Mapping[str, Point], Mapping[str, float]]],
+    rows: Mapping[str, Speed],
     looks: Mapping[str, Style],
     labels: tuple[str, str, str],
     caption: str,
     path: Path,
 ) -> None:
     """A row for each title: accuracy over training seconds, above the accuracy of what needs no training, and over the
-    time of a frame with its Pareto front.
+    time of a frame with its Pareto front. A curve whose end has a reason is named with it.
 
     labels: of training time, time of a frame, accuracy.
     """
     figure, axes = _figure(len(rows), 2)
-    for (left, right), (title, (curves, points, floors)) in zip(axes, rows.items(), strict=True):
+    for (left, right), (title, row) in zip(axes, rows.items(), strict=True):
         for panel in (left, right):
-            _logarithmic(panel)
-        lines(left, curves, looks)
-        for name, height in floors.items():
+            panel.set_xscale("log")
+        lines(left, row.curves, looks, row.ends)
+        for name, height in row.floors.items():
             left.axhline(height, color=INK, linewidth=0.8, linestyle=(0, (1, 2)), zorder=1)
             left.annotate(
                 name, (0.01, height), (0, 3), ("axes fraction", "data"), "offset points", fontsize=8, color=INK
             )
         _decorate(left, title, labels[0], labels[2])
-        front(right, points, looks)
+        front(right, row.points, looks)
         _decorate(right, title, labels[1], labels[2])
+        for panel in (left, right):
+            _plain_numbers(panel)
     _save(figure, caption, path)
 
 
@@ -121,12 +139,16 @@ def picture_grid(rows: Sequence[tuple[str, Sequence[tuple[str, Any]]]], caption:
     _save(figure, caption, path)
 
 
-def lines(axes: Axes, curves: Curves, looks: Mapping[str, Style]) -> None:
-    """A line a method, its name at the line's end."""
+def lines(axes: Axes, curves: Curves, looks: Mapping[str, Style], ends: Mapping[str, str] = NO_ENDS) -> None:
+    """A line a method, its name at the line's end; where there is a reason why it ends, the reason beside the name and
+    a large mark with a bar."""
     drawn = {name: points for name, points in curves.items() if points}
     for name, points in drawn.items():
         axes.plot(*zip(*points, strict=True), linewidth=1.7, markersize=5, **looks[name])
-    _name({name: points[-1] for name, points in drawn.items()}, axes, looks)
+        if name in ends:
+            axes.plot(*points[-1], "|", color=INK, markersize=22, markeredgewidth=1.6, zorder=3)
+            axes.plot(*points[-1], **looks[name] | {"markersize": 9, "markeredgecolor": INK, "zorder": 4})
+    _name({name: points[-1] for name, points in drawn.items()}, axes, looks, ends=ends)
 
 
 def front(axes: Axes, points: Mapping[str, Point], looks: Mapping[str, Style]) -> None:
@@ -154,16 +176,23 @@ def front(axes: Axes, points: Mapping[str, Point], looks: Mapping[str, Style]) -
     axes.legend(loc="best", frameon=False, fontsize=8, labelcolor=INK)
 
 
-def _name(ends: Mapping[str, Point], axes: Axes, looks: Mapping[str, Style], lift: float = 0.0) -> None:
-    """Names right of their points, lifted by points of type, and more where they would lie upon each other."""
+def _name(
+    places: Mapping[str, Point],
+    axes: Axes,
+    looks: Mapping[str, Style],
+    lift: float = 0.0,
+    ends: Mapping[str, str] = NO_ENDS,
+) -> None:
+    """Names right of their places, each with its end's reason, lifted by points of type, and more where they would lie
+    upon each other."""
     low, high = axes.get_ylim()
     free = low
-    for name, (x, y) in sorted(ends.items(), key=lambda end: end[1][1]):
+    for name, (x, y) in sorted(places.items(), key=lambda place: place[1][1]):
         height = max(y, free)
         free = height + LABEL_GAP * (high - low)
         shift = (9, lift + (height - y) / (high - low) * PANEL_POINTS)
         axes.annotate(
-            name,
+            f"{name}: {ends[name]}" if name in ends else name,
             (x, y),
             shift,
             textcoords="offset points",
@@ -188,10 +217,10 @@ def _decorate(axes: Axes, title: str, x_label: str, y_label: str) -> None:
     style(axes, x_label, y_label)
 
 
-def _logarithmic(axes: Axes) -> None:
-    """A logarithmic x axis with plain numbers at 1, 2, 3, 5 and 7 of every decade."""
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0, 7.0)))
+def _plain_numbers(axes: Axes) -> None:
+    """A logarithmic x axis with plain numbers at 1, 2, 3, 5 and 7 of every decade, at 1 and 3 where there are many."""
+    low, high = axes.get_xlim()
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0, 7.0) if high < 100 * low else (1.0, 3.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     axes.xaxis.set_minor_locator(NullLocator())
 

@@ -30,6 +30,15 @@ def seconds_to(curve: Sequence[Point], level: float) -> float | None:
     return None
 
 
+def value_at(curve: Sequence[Point], seconds: float) -> float | None:
+    """A curve of (seconds, figure) at a time, linear in log seconds between its points and level after the last; None
+    before the first."""
+    if not curve or seconds < curve[0][0]:
+        return None
+    times, values = zip(*curve, strict=True)
+    return float(np.interp(math.log(seconds), np.log(times), values))
+
+
 def bin_edges(clouds: Iterable[Sequence[Point]], bins: int) -> list[float]:
     """Equal steps from the least to the greatest x of all points, bins + 1 edges; none where there are no points."""
     x = [x for points in clouds for x, _ in points]

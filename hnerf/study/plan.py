@@ -9,6 +9,7 @@ from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, H_NERF, Section, Settings, load_settings, named_file, read_yaml, validated
 from hnerf.errors import CaptureError
 from hnerf.spread import spread
+from hnerf.study.convergence import FIRST_S
 from hnerf.study.subset import chosen
 
 STUDIES = CONFIGS / "benchmark"
@@ -77,13 +78,15 @@ class ScoringSettings(Section):
 
 class Study(Section):
     """A benchmark. methods: presets, that of H-NeRF first; seconds: of every training, None to each preset's own end;
-    snapshots: how many are scored before it."""
+    snapshots: how many are scored before it; until_flat: instead of them longer and longer trainings up to `seconds`
+    (hnerf/study/convergence.py)."""
 
     title: str
     notes: tuple[str, ...] = ()  # what a reader has to know, such as what is left out
     claims: tuple[Claim, ...] = ()
     seconds: float | None = Field(default=None, gt=0)
     snapshots: int = Field(default=4, ge=0, le=12)
+    until_flat: bool = False
     sweep: Literal["cameras", "frames"] | None = None  # what the variants differ in, for a chart of its own
     methods: tuple[str, ...] = Field(min_length=1)
     variants: dict[str, Variant] = Field(min_length=1)
@@ -96,12 +99,19 @@ class Study(Section):
                 raise ValueError(f"claims: {claim.check} asks for a sweep")
         return self
 
-    def settings(self, method: str) -> Settings:
-        """All stages' settings; training stops after `seconds` and is saved on the way. Steps that are written down end
-        H-NeRF alone: they are how long it needs, but what a compared method can do in its time is the question."""
-        settings = load_settings(method)
-        training = {"seconds": self.seconds, "snapshots_s": snapshot_times_s(self.seconds, self.snapshots)}
-        if self.seconds and settings.training.machinery not in H_NERF:
+    @model_validator(mode="after")
+    def _flat_within_a_time(self) -> Self:
+        if self.until_flat and (self.seconds is None or self.seconds < FIRST_S or self.snapshots):
+            raise ValueError(f"until_flat: asks for `snapshots: 0` and a longest training, `seconds` of {FIRST_S:g} up")
+        return self
+
+    def settings(self, method: str, seconds: float | None = None) -> Settings:
+        """All stages' settings; training stops after `seconds`, of the study where they are None, and is saved on the
+        way. Steps that are written down end H-NeRF alone: they are how long it needs, but what a compared method can do
+        in its time is the question."""
+        settings, seconds = load_settings(method), seconds or self.seconds
+        training = {"seconds": seconds, "snapshots_s": snapshot_times_s(seconds, self.snapshots)}
+        if seconds and settings.training.machinery not in H_NERF:
             training["steps"] = UNTIL_TIME_IS_UP
         return settings.model_copy(update={"training": settings.training.model_copy(update=training)})
 

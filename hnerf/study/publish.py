@@ -38,10 +38,15 @@ def draw(result: Mapping[str, Any], store: Path, table: Path) -> list[Path]:
     paths = {name: table.with_name(f"{table.stem}{name}.png") for name in ("", "-sweep", "-nearness", "-pictures")}
     drawn = []
     panels = {
-        title: (results.psnr_curves(variant), results.frame_points(variant), results.floors(variant))
+        title: charts.Speed(
+            results.psnr_curves(variant),
+            results.ends(variant),
+            results.frame_points(variant),
+            results.floors(variant),
+        )
         for title, variant in variants.items()
     }
-    if rows := {results.heading(title, variants[title]): row for title, row in panels.items() if any(row)}:
+    if rows := {results.heading(title, variants[title]): row for title, row in panels.items() if row}:
         frame = f"time of a frame of {results.timed_px(result)} px, s (log scale)"
         charts.speed_chart(rows, looks, ("training, s (log scale)", frame, PSNR), caption, paths[""])
         drawn.append(paths[""])

@@ -1,8 +1,10 @@
 """A benchmark's result as tables: Markdown for people, CSV for spreadsheets; and what its charts show.
 
 A result is a plain tree, as the JSON file has it:
-    {subject, study, title, notes, claims, seconds, sweep, methods: [name], variants: {title: {cameras, frames,
-     methods: {name: scores of hnerf/study/scoring.py, or {"error": one line}}} or {"left_out": why}}}
+    {subject, study, title, notes, claims, seconds, until_flat, sweep, methods: [name],
+     variants: {title: {cameras, frames,
+      methods: {name: scores of hnerf/study/scoring.py, and "ended", a key of ENDS, where the study trains until curves
+       are flat; or {"error": one line}}} or {"left_out": why}}}
 """
 
 import csv
@@ -10,7 +12,8 @@ import io
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from hnerf.study.curves import Point, seconds_to
+from hnerf.study.convergence import HOW
+from hnerf.study.curves import Point, seconds_to, value_at
 from hnerf.study.files import picture
 from hnerf.study.machine import in_words
 from hnerf.tables import head, line, pick, shown
@@ -31,6 +34,8 @@ COSTS = {  # of a training
 }
 NEAR_BEST_DB = 1.0
 BINS = 6  # of the distance from training
+AFTER_S = {60.0: "60 s", 600.0: "10 min", 3600.0: "1 h"}
+ENDS = {"flat": "flat", "limit": "out of time", "steps": "its steps are done"}  # why a method has no longer training
 FLOORS = {"one_colour_psnr": "one colour in the true outline", "empty_psnr": "an empty picture"}
 
 
@@ -93,6 +98,11 @@ def clouds(variant: Mapping[str, Any], split: str, x: str, y: str = "psnr") -> d
     return {name: points for name, points in found.items() if points}
 
 
+def ends(variant: Mapping[str, Any]) -> dict[str, str]:
+    """Of each method that was trained until its curve was flat: why it was not trained for longer, in words."""
+    return {name: ENDS[scores["ended"]] for name, scores in scored(variant).items() if "ended" in scores}
+
+
 def near_best_seconds(variant: Mapping[str, Any]) -> dict[str, float | None]:
     """When each method came within 1 dB of the best end of all of a variant; None if it never did."""
     curves = psnr_curves(variant)
@@ -104,6 +114,7 @@ def caption(result: Mapping[str, Any]) -> str:
     """What was measured, and on which machines."""
     machines = sorted({in_words(s["machine"]) for v in result["variants"].values() for s in scored(v).values()})
     limit = f"{result['seconds']:g} s for each field" if result["seconds"] else "training to each preset's own end"
+    limit = f"{HOW}; {result['seconds']:g} s at most" if result["until_flat"] else limit
     return f"{result['subject']}, study {result['study']}: {limit}; on {'; on '.join(machines) or 'no machine yet'}."
 
 
@@ -147,8 +158,25 @@ def _variant_lines(variant: Mapping[str, Any]) -> list[str]:
         known = [[v for m in scored(variant).values() if (v := m[s][key]) is not None] for s in SPLITS]
         both = " / ".join(shown(values[0] if values else None, "{:.2f}") for values in known)
         lines.append(line([title, both, *[""] * (len(titles) - 2)]))
+    lines += _timeline(variant)
     missing = [f"- {', '.join(names)}: {reason}" for reason, names in reasons.items()]
     return [*lines, *(["", *missing] if missing else [])]
+
+
+def _timeline(variant: Mapping[str, Any]) -> list[str]:
+    """A table of the curves of methods that were trained until they were flat; nothing where none was."""
+    curves, why = psnr_curves(variant), ends(variant)
+    if not why:
+        return []
+    lines = ["", "PSNR of the curve's images, dB; between trainings linear in the logarithm of time.", ""]
+    lines += head(["method", *AFTER_S.values(), "at its end", "best", "ended"])
+    for name, curve in curves.items():
+        (end_s, at_end), (best_s, best) = curve[-1], max(curve, key=lambda point: point[1])
+        cells = [shown(value_at(curve, seconds), "{:.2f}") for seconds in AFTER_S]
+        lines.append(
+            line([name, *cells, f"{at_end:.2f}", f"{best:.2f} ({best_s:.0f} s)", f"{end_s:.0f} s, {why[name]}"])
+        )
+    return lines
 
 
 def as_csv(result: Mapping[str, Any]) -> str:

@@ -70,7 +70,7 @@ def score(scene: Scene, training: Path, settings: ScoringSettings, out: Path) ->
     avatar = load_avatar(training, scene.device)
     reason = why_no_novel_poses(training)
     found: dict[str, Any] = {"machine": machine(), "protocol": f"{PROTOCOL} {HOW}", "lpips": LPIPS}
-    split = settings.split if scene.capture.test_cameras else "novel_pose"
+    split = curve_split(scene, settings)
     found["split"], found["training"] = split, json.loads((training / "report.json").read_text())
     found["curve"] = [] if split == "novel_pose" and reason else curve(scene, split, training, avatar, settings, out)
     for name in SPLITS:
@@ -88,6 +88,21 @@ def score(scene: Scene, training: Path, settings: ScoringSettings, out: Path) ->
     }
     (out / "scores.json").write_text(json.dumps(found, indent=1))
     return found
+
+
+def score_end(scene: Scene, training: Path, settings: ScoringSettings, out: Path) -> dict[str, Any]:
+    """Write `scores.json` with what training reported and the last point of its curve alone; what it holds."""
+    reason, split = why_no_novel_poses(training), curve_split(scene, settings)
+    avatar = load_avatar(training, scene.device)
+    rows = [] if split == "novel_pose" and reason else curve(scene, split, training, avatar, settings, out)
+    found = {"training": json.loads((training / "report.json").read_text()), "curve": rows[-1:]}
+    (out / "scores.json").write_text(json.dumps(found, indent=1))
+    return found
+
+
+def curve_split(scene: Scene, settings: ScoringSettings) -> str:
+    """The split that curves are of."""
+    return settings.split if scene.capture.test_cameras else "novel_pose"
 
 
 def why_no_novel_poses(training: Path) -> str | None:

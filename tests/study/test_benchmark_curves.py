@@ -2,7 +2,7 @@
 
 import pytest
 
-from hnerf.study.curves import bin_edges, binned, pareto_front, seconds_to
+from hnerf.study.curves import bin_edges, binned, pareto_front, seconds_to, value_at
 
 
 def test_the_front_is_what_nothing_beats_cheapest_first() -> None:
@@ -33,6 +33,13 @@ def test_a_level_below_the_first_point_is_reached_there_and_one_above_all_never(
     assert seconds_to(curve, 15.0) == 10.0
     assert seconds_to(curve, 25.5) is None
     assert seconds_to([], 1.0) is None
+
+
+def test_a_curve_between_its_points_before_and_after() -> None:
+    curve = [(10.0, 20.0), (1000.0, 24.0)]
+    assert value_at(curve, 100.0) == pytest.approx(22.0)
+    assert value_at(curve, 9.9) is None and value_at([], 10.0) is None
+    assert value_at(curve, 10.0) == 20.0 and value_at(curve, 5000.0) == 24.0
 
 
 def test_bins_are_equally_wide_and_empty_ones_are_left_out() -> None:

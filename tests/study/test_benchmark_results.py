@@ -19,6 +19,7 @@ from hnerf.study.results import (
     as_markdown,
     caption,
     clouds,
+    ends,
     frame_points,
     heading,
     near_best_seconds,
@@ -76,6 +77,7 @@ def result(**changes: Any) -> dict[str, Any]:
         "notes": ["A note."],
         "claims": [],
         "seconds": 60.0,
+        "until_flat": False,
         "sweep": "cameras",
         "methods": ["fast", "nerf", "idr"],
         "variants": {
@@ -122,6 +124,23 @@ def test_the_markdown_by_hand() -> None:
     text = as_markdown(result(), [], [])
     assert "Left out: the capture has 4 training cameras, not 8." in text
     assert text.endswith("LPIPS: not available: no weights.\n\nBy eye.\n")
+
+
+def test_what_methods_had_on_the_way_and_why_they_ended() -> None:
+    """nerf from 22 dB at 10 s to 26 at 1000: at 600 s 22 + 2 lg 60. idr was never scored."""
+    flat = result(until_flat=True)
+    methods = flat["variants"]["4 cameras"]["methods"]
+    methods["fast"] |= {"ended": "steps", "curve": [{"seconds": 20.0, "psnr": 31.0}, {"seconds": 40.0, "psnr": 30.0}]}
+    methods["nerf"]["ended"] = "flat"
+    lines = as_markdown(flat, [], []).splitlines()
+    start = lines.index("| method | 60 s | 10 min | 1 h | at its end | best | ended |")
+    assert lines[start + 2 : start + 5] == [
+        "| fast | 30.00 | 30.00 | 30.00 | 30.00 | 31.00 (20 s) | 40 s, its steps are done |",
+        "| nerf | 23.56 | 25.56 | 26.00 | 26.00 | 26.00 (1000 s) | 1000 s, flat |",
+        "",
+    ]
+    assert ends(flat["variants"]["4 cameras"]) == {"fast": "its steps are done", "nerf": "flat"}
+    assert "each from the start" in caption(flat) and "60 s at most" in caption(flat)
 
 
 def test_what_calibration_left_out_is_told_and_not_plotted() -> None:
@@ -210,6 +229,15 @@ def test_everything_is_published_and_old_charts_go(tmp_path: Path) -> None:
 def test_methods_differ_in_line_and_marker_so_that_grey_prints_do() -> None:
     looks = charts.styles([f"method {k}" for k in range(6)]).values()
     assert len({look["linestyle"] for look in looks}) == len({look["marker"] for look in looks}) == 6
+
+
+def test_ends_with_a_reason_are_marked_and_named() -> None:
+    _, axes = charts._figure(1, 1)
+    curves = {"a": [(10.0, 20.0), (20.0, 30.0)], "b": [(10.0, 21.0), (40.0, 25.0)]}
+    charts.lines(axes[0][0], curves, charts.styles(curves), {"a": "flat"})
+    assert {text.get_text() for text in axes[0][0].texts} == {"a: flat", "b"}
+    bars = [line for line in axes[0][0].lines if line.get_marker() == "|"]
+    assert [line.get_xydata().tolist() for line in bars] == [[[20.0, 30.0]]]
 
 
 def test_names_at_line_ends_do_not_lie_upon_each_other() -> None:
