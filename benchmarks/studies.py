@@ -1,7 +1,9 @@
-"""Studies of speed, accuracy, stability and ablations on a shared capture, kept where the README finds them.
+"""Studies of speed, accuracy, stability and ablations on a capture, kept where the README finds them.
 
 usage: python benchmarks/studies.py STORE CAPTURE benchmark|stability STUDY [--methods a,b] [--seconds S]
        python benchmarks/studies.py STORE CAPTURE ablations PRESET [--methods no-opt,no-noise]
+
+CAPTURE is the name of a shared capture, or a folder.
 
 Runs `hnerf benchmark`, `hnerf stability` or `hnerf ablate` with STORE, in which finished work is found again, and
 copies its tables and charts to `benchmarks/results/<kind>/`. Ablations are scored on a few images.
@@ -30,7 +32,8 @@ def main() -> None:
     parser.add_argument("--methods", default="")
     parser.add_argument("--seconds", type=float)
     options = parser.parse_args()
-    folder = SHARED / "data" / options.capture
+    shared = SHARED / "data" / options.capture
+    folder = shared if shared.is_dir() else Path(options.capture)
     methods = [name for name in options.methods.split(",") if name]
     where = sentence(provenance())
     if options.kind == "benchmark":

@@ -12,10 +12,11 @@ from flows.train_subject import prepared
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
 from hnerf.errors import CaptureError, one_line
+from hnerf.study.convergence import flat, limits_s
 from hnerf.study.files import with_pictures
-from hnerf.study.plan import ScoringSettings, Study, Variant, load_study
+from hnerf.study.plan import Study, Variant, load_study
 from hnerf.study.publish import publish
-from tasks.benchmark import score_training
+from tasks.benchmark import score_end_of_training, score_training
 from tasks.calibration import calibrated
 from tasks.capture import ingest
 from tasks.policy import may_pass
@@ -43,16 +44,16 @@ def benchmark(
     ends the flow, and the same call goes on in the training that it was in.
     """
     plan = load_study(study).narrowed(methods or [], seconds)
-    settings = {name: plan.settings(name) for name in plan.methods}
+    capture_settings = [plan.settings(name).capture for name in plan.methods]  # presets that are wrong say so first
     shelf = Store(store.resolve())
     source, truth = read_capture(capture, store)
-    recorded = Capture.load(ingest(shelf, source, next(iter(settings.values())).capture).root)
+    recorded = Capture.load(ingest(shelf, source, capture_settings[0]).root)
     result, table = blank(plan, Path(study).stem, recorded), None
     for title, entry in result["variants"].items():
         variant = plan.variants[title]
         for name in () if "left_out" in entry else variant.methods or plan.methods:
             log.info("%s: %s", title, name)
-            entry["methods"][name] = measure(shelf, source, truth, variant, settings[name], plan.scoring)
+            entry["methods"][name] = measure(shelf, source, truth, variant, plan, name)
             table = publish(result, shelf.root)  # not before, so that what an earlier call found stands until then
     table = table or publish(result, shelf.root)  # where every variant is left out
     show(with_pictures(table), "benchmark", f"Speed against accuracy: {table.stem}")
@@ -61,7 +62,7 @@ def benchmark(
 
 def blank(plan: Study, study: str, recorded: Capture) -> dict[str, Any]:
     """A result without figures, in the form of hnerf/study/results.py."""
-    described = plan.model_dump(include={"title", "notes", "seconds", "sweep", "methods"})
+    described = plan.model_dump(include={"title", "notes", "claims", "seconds", "until_flat", "sweep", "methods"})
     variants = {title: describe(variant, recorded) for title, variant in plan.variants.items()}
     return {"subject": recorded.name, "study": study} | described | {"variants": variants}
 
@@ -76,29 +77,53 @@ def describe(variant: Variant, recorded: Capture) -> dict[str, Any]:
     return counts | {"methods": {}}
 
 
-def measure(
-    shelf: Store, source: Source, truth: Source, variant: Variant, settings: Settings, scoring: ScoringSettings
-) -> dict[str, Any]:
+def measure(shelf: Store, source: Source, truth: Source, variant: Variant, plan: Study, method: str) -> dict[str, Any]:
     """A method's scores on a variant, and the folder of their files in the store; {"error": one line} if it fails."""
     try:
+        settings, more = plan.settings(method), dict[str, Any]()
         recording = ingest(shelf, source, settings.capture)
         parts = variant.parts(Capture.load(recording.root))
         if parts != (None, None, None):
             recording = subset_capture(shelf, recording, *parts)
-        calibration, model = trained(shelf, recording, settings)
-        scores = score_training(shelf, truth, recording, calibration, model, scoring)
+        stages = prepared(shelf, recording, settings)
+        if plan.until_flat:
+            settings, more = until_flat(shelf, truth, stages, plan, method)
+        model = train(shelf, *stages, settings.training)
+        scores = score_training(shelf, truth, recording, stages[1], model, plan.scoring)
     except Exception as error:  # one method's fault, of which the others know nothing
         if may_pass(error):
             raise  # a full disk, a lost share, a killed worker
         log.warning("%s: %s", type(error).__name__, error)
         return {"error": one_line(error)}
     found: dict[str, Any] = json.loads((scores.root / "scores.json").read_text())
-    taken = calibrated(recording, calibration)
+    taken = calibrated(recording, stages[1])
     counts = {"cameras": len(taken.train_cameras), "frames": len(taken.train_frames)}
-    return found | {"trained_on": counts, "folder": str(scores.root.relative_to(shelf.root))}
+    return found | more | {"trained_on": counts, "folder": str(scores.root.relative_to(shelf.root))}
 
 
-def trained(shelf: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact]:
-    """The calibration and the training that a recording comes to."""
-    stages = prepared(shelf, recording, settings)
-    return stages[1], train(shelf, *stages, settings.training)
+def until_flat(
+    shelf: Store, truth: Source, stages: tuple[Artifact, Artifact, Artifact, Artifact], plan: Study, method: str
+) -> tuple[Settings, dict[str, Any]]:
+    """Settings of the last of longer and longer trainings; the curve of all, and why there are no longer ones. One that
+    fails has no point: it may be too young for a surface."""
+    assert plan.seconds is not None
+    points: list[dict[str, Any]] = []
+    for limit_s in limits_s(plan.seconds):
+        settings, ended = plan.settings(method, limit_s), "limit"
+        try:
+            model = train(shelf, *stages, settings.training)
+            point = score_end_of_training(shelf, truth, *stages[:2], model, plan.scoring)
+        except Exception as error:
+            if may_pass(error):
+                raise
+            log.warning("after %g s: %s", limit_s, one_line(error))
+            continue
+        found = json.loads((point.root / "scores.json").read_text())
+        points += found["curve"]
+        if found["training"]["field_seconds"] < limit_s:
+            ended = "steps"
+        elif flat([(row["seconds"], row["psnr"]) for row in points if row["psnr"] is not None]):
+            ended = "flat"
+        if ended != "limit":
+            break
+    return settings, {"curve": points, "ended": ended}

@@ -6,7 +6,7 @@ import errno
 import json
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from hnerf.capture.formats.export import WRITERS, write_cameras
 from hnerf.capture.ingest import recognise
 from hnerf.capture.notes import read_notes
 from hnerf.capture.performer import write_performer
-from hnerf.config import PerformerSettings, load_settings
+from hnerf.config import PerformerSettings, load_settings, overridden
 from hnerf.errors import CaptureError
 from hnerf.new_folder import new_folder
 from hnerf.render.show import KINDS, Wish, render_subject
@@ -122,7 +122,10 @@ def _parser() -> argparse.ArgumentParser:
 
     synth = commands.add_parser("synth", help="write a synthetic capture with ground truth")
     synth.add_argument("out", type=Path, help="the folder to write")
-    synth.set_defaults(command=lambda o: _synth(o.out))
+    synth.add_argument(
+        "--set", dest="overrides", action="append", default=[], metavar="a=b", help="such as train_cameras=32"
+    )
+    synth.set_defaults(command=lambda o: _synth(o.out, o.overrides))
 
     demo = commands.add_parser("demo", help=f"synth and run in ./{DEMO}, in minutes")
     demo.set_defaults(command=lambda o: _demo())
@@ -274,9 +277,10 @@ def _cameras(folder: Path, layout: str, out: Path) -> None:
     print(f"cameras: {out}")
 
 
-def _synth(out: Path) -> None:
+def _synth(out: Path, overrides: Sequence[str] = ()) -> None:
+    settings = overridden(PerformerSettings(), overrides)
     with new_folder(out) as partial:
-        write_performer(partial, PerformerSettings())
+        write_performer(partial, settings)
 
 
 def _demo() -> None:

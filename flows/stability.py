@@ -21,14 +21,22 @@ from hnerf.study.scoring import why_no_novel_poses
 from hnerf.study.stability import Stability, load_stability
 from hnerf.study.stability_charts import curve_chart, matrix_chart
 from hnerf.study.stability_report import REFERENCE, as_markdown
-from hnerf.study.verdict import BROKEN, Verdict, judge
+from hnerf.study.verdict import BROKEN, Verdict, judge, near_border
 from tasks.capture import ingest
 from tasks.evaluation import evaluate
 from tasks.fit import fit
 from tasks.policy import may_pass
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
-from tasks.study import check_meshes, degrade_capture, degrade_fit, degrade_masks, dress, show_in_extreme_poses
+from tasks.study import (
+    check_meshes,
+    degrade_capture,
+    degrade_fit,
+    degrade_masks,
+    dress,
+    show_in_extreme_poses,
+    subset_capture,
+)
 from tasks.training import train
 
 log = logging.getLogger("hnerf.stability")
@@ -58,7 +66,7 @@ def stability(
     presets = {name: load_settings(name, plan.overrides) for name in plan.methods}
     shelf = Store(store.resolve())
     source, truth = read_capture(capture, store)
-    subject = Capture.load(ingest(shelf, source, next(iter(presets.values())).capture).root).name
+    subject = Capture.load(recorded(shelf, source, plan, next(iter(presets.values()))).root).name
     table = shelf.root / "stability" / f"{subject}-{Path(study).stem}{'-part' if only else ''}.md"
     table.parent.mkdir(parents=True, exist_ok=True)
     result: Figures = {"subject": subject, "study": study, "plan": plan.model_dump(mode="json")}
@@ -86,32 +94,57 @@ def _runs(
     shelf: Store, source: Source, truth: Source, plan: Stability, presets: dict[str, Settings]
 ) -> Iterator[Figures]:
     """Every run's row: its method, degradation and verdict, and figures where there are any; or {"left_out": what and
-    why}. A method whose run to compare with broke has no others of that seed."""
+    why}."""
+    tried = [(kind, strength) for kind, strengths in plan.degradations.items() for strength in strengths]
     for method, preset in presets.items():
+        recording = recorded(shelf, source, plan, preset)
+        near = set()
         for seed in plan.seeds:
-            settings = preset.model_copy(update={"training": preset.training.model_copy(update={"seed": seed})})
-            log.info("%s, seed %d, as recorded", method, seed)
-            good = attempt(shelf, source, truth, settings, None)
-            row = {"method": method, "seed": seed}
-            reference = row | {"kind": REFERENCE, "strength": None} | judged(good, good)
-            yield reference
-            if reference["verdict"] in BROKEN:
-                continue
-            for kind, strengths in plan.degradations.items():
-                for strength in strengths:
-                    log.info("%s, seed %d, %s: %g", method, seed, KINDS[kind].label, strength)
-                    degradation = Degradation(kind=kind, strength=strength, seed=seed)
-                    found = attempt(shelf, source, truth, settings, degradation)
-                    if "left_out" in found:
-                        yield {"left_out": f"{KINDS[kind].label}, {strength:g}: {found['left_out']}"}
-                        continue
-                    yield row | {"kind": kind, "strength": strength} | judged(found, good)
+            for run in _runs_of_seed(shelf, recording, truth, method, preset, seed, tried):
+                if run.get("near_border"):
+                    near.add((run["kind"], run["strength"]))
+                yield run
+        for seed in plan.border_seeds if near else ():
+            yield from _runs_of_seed(shelf, recording, truth, method, preset, seed, [at for at in tried if at in near])
+
+
+def _runs_of_seed(
+    shelf: Store,
+    recording: Artifact,
+    truth: Source,
+    method: str,
+    preset: Settings,
+    seed: int,
+    tried: Sequence[tuple[str, float]],
+) -> Iterator[Figures]:
+    """The run to compare with, and, unless that broke, a run for each kind and strength."""
+    settings = preset.model_copy(update={"training": preset.training.model_copy(update={"seed": seed})})
+    log.info("%s, seed %d, as recorded", method, seed)
+    good = attempt(shelf, recording, truth, settings, None)
+    row = {"method": method, "seed": seed}
+    reference = row | {"kind": REFERENCE, "strength": None} | judged(good, good)
+    yield reference
+    for kind, strength in tried if reference["verdict"] not in BROKEN else ():
+        log.info("%s, seed %d, %s: %g", method, seed, KINDS[kind].label, strength)
+        found = attempt(shelf, recording, truth, settings, Degradation(kind=kind, strength=strength, seed=seed))
+        if "left_out" in found:
+            yield {"left_out": f"{KINDS[kind].label}, {strength:g}: {found['left_out']}"}
+            continue
+        yield row | {"kind": kind, "strength": strength} | judged(found, good)
+
+
+def recorded(shelf: Store, source: Source, plan: Stability, settings: Settings) -> Artifact:
+    """The recording, or that part of it which stands for all."""
+    recording = ingest(shelf, source, settings.capture)
+    parts = plan.part.parts(Capture.load(recording.root))
+    return recording if parts == (None, None, None) else subset_capture(shelf, recording, *parts)
 
 
 def judged(found: Figures, good: Figures) -> Figures:
-    """Verdict and means over the images and surfaces that both runs have, None where there are none; those of the good
-    run as "reference"."""
+    """Verdict, whether it is near a border, and means over the images and surfaces that both runs have, None where
+    there are none; those of the good run as "reference"."""
     row: Figures = {}
+    near = False
     if "error" in found:
         verdict = Verdict(*found["error"])
     elif "images" not in found:
@@ -119,8 +152,9 @@ def judged(found: Figures, good: Figures) -> Figures:
     else:
         row, reference = in_common(found, good), in_common(good, found)
         verdict = judge(row, reference, found["faults"])
+        near = near_border(row, reference, found["faults"])
         row |= {"reference": reference, "protocol": found["protocol"], "seconds": found["seconds"]}
-    return row | {"verdict": verdict.word, "reason": verdict.reason}
+    return row | {"verdict": verdict.word, "reason": verdict.reason, "near_border": near}
 
 
 def in_common(one: Figures, other: Figures) -> Figures:
@@ -133,20 +167,20 @@ def in_common(one: Figures, other: Figures) -> Figures:
 
 
 def attempt(
-    shelf: Store, source: Source, truth: Source, settings: Settings, degradation: Degradation | None
+    shelf: Store, recording: Artifact, truth: Source, settings: Settings, degradation: Degradation | None
 ) -> Figures:
     """What `measure` found, or {"error": (verdict, reason)}: bad input that was told before or by training is refused,
     anything else that went wrong has failed; or {"left_out": reason} where the capture does not allow it to be
     tried."""
     at_bad_input = "refused"
     try:
-        stages = prepare(shelf, source, truth, settings, degradation)
+        stages = prepare(shelf, recording, truth, settings, degradation)
         training = settings.training
         if degradation and KINDS[degradation.kind].place == "settings":
             training = degrade_settings(training, degradation)
         model = train(shelf, *stages, training)
         at_bad_input = "failed"
-        return measure(shelf, source, truth, settings, degradation, stages, model)
+        return measure(shelf, recording, truth, settings, degradation, stages, model)
     except NotPossibleError as error:
         return {"left_out": str(error)}
     except CaptureError as error:
@@ -159,11 +193,10 @@ def attempt(
 
 
 def prepare(
-    shelf: Store, source: Source, truth: Source, settings: Settings, degradation: Degradation | None
+    shelf: Store, recording: Artifact, truth: Source, settings: Settings, degradation: Degradation | None
 ) -> tuple[Artifact, Artifact, Artifact, Artifact]:
     """Capture, calibration, masks and body, made worse at the degradation's place."""
     place = KINDS[degradation.kind].place if degradation else None
-    recording = ingest(shelf, source, settings.capture)
     if degradation and place == "capture":
         recording = degrade_capture(shelf, recording, degradation)
     recording, calibration, masks, body = prepared(shelf, recording, settings)
@@ -180,7 +213,7 @@ def prepare(
 
 def measure(
     shelf: Store,
-    source: Source,
+    recording: Artifact,
     truth: Source,
     settings: Settings,
     degradation: Degradation | None,
@@ -195,12 +228,12 @@ def measure(
         if no_poses:
             raise NotPossibleError(no_poses)
         return {"faults": _faults(show_in_extreme_poses(shelf, model, degradation))}
-    recorded, *_, good_body = prepare(shelf, source, truth, settings, None)
+    *_, good_body = prepare(shelf, recording, truth, settings, None)
     if degradation and KINDS[degradation.kind].place == "worn":
         _, truth = read_capture(stages[0].root)
     report = evaluate(shelf, truth, *stages, model, settings.evaluation)
     metrics = json.loads((report.root / "metrics.json").read_text())
-    capture = Capture.load(recorded.root)
+    capture = Capture.load(recording.root)
     novel = capture.novel_pose_frames
     split = metrics["novel_pose" if novel and not no_poses else "novel_view"]
     surfaces = (split["geometry"] or {"per_surface": []})["per_surface"]

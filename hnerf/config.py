@@ -33,9 +33,17 @@ class PerformerSettings(Section):
 
     seed: int = Field(default=0, ge=0)
     size_px: int = Field(default=256, ge=16, le=4096)
+    train_cameras: int = Field(default=4, ge=1)  # on a ring, at equal angles
+    test_cameras: int = Field(default=2, ge=0)  # half-way between two of those each, evenly spread
     train_frames: int = Field(default=20, ge=1)
     novel_pose_frames: int = Field(default=6, ge=0)
     fps: float = Field(default=10.0, gt=0)
+
+    @model_validator(mode="after")
+    def _one_test_camera_in_a_gap(self) -> Self:
+        if self.test_cameras > self.train_cameras:
+            raise ValueError("test_cameras: there is one at most between two training cameras")
+        return self
 
 
 class CalibrationSettings(Section):
@@ -142,7 +150,8 @@ class NerfiesSettings(Section):
     """Nerfies, a compared method (hnerf/baselines/nerfies.py)."""
 
     samples: int = Field(default=24, ge=2)  # coarse, and as many fine
-    width: int = Field(default=64, ge=2)
+    width: int = Field(default=64, ge=2)  # of the template
+    deformation_width: int = Field(default=64, ge=2)
     code_width: int = Field(default=8, ge=1)  # of a frame
     anneal_steps: int = Field(default=500, ge=1)  # until the deformation has all its octaves
     learning_rate: float = Field(default=5e-3, gt=0)
@@ -230,8 +239,12 @@ def load_settings(preset: str, overrides: Sequence[str] = ()) -> Settings:
     Raises CaptureError with one line if the preset is unknown or no YAML, or a key or value is not allowed.
     """
     path = named_file(preset, CONFIGS, "preset", "presets")
-    tree = read_yaml(path)
-    settings = validated(Settings, tree, path)  # before overrides, which are no fault of the file
+    return overridden(validated(Settings, read_yaml(path), path), overrides)
+
+
+def overridden(settings: S, overrides: Sequence[str]) -> S:
+    """Settings with overrides like "training.steps=100"; CaptureError, one line, for a key or value not allowed."""
+    tree = settings.model_dump()
     for override in overrides:
         key, equals, value = override.partition("=")
         if not equals:
@@ -243,7 +256,8 @@ def load_settings(preset: str, overrides: Sequence[str] = ()) -> Settings:
             if not isinstance(node, dict):
                 raise CaptureError(f"--set {override}: {section} is not a section")
         node[leaf] = _parsed(value, f"--set {override}")
-    return validated(Settings, tree, " ".join(f"--set {override}" for override in overrides)) if overrides else settings
+    told = " ".join(f"--set {override}" for override in overrides)
+    return validated(type(settings), tree, told) if overrides else settings
 
 
 def with_changes(settings: Settings, path: Path) -> Settings:

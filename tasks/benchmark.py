@@ -6,14 +6,14 @@ import torch
 
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.study.plan import ScoringSettings
-from hnerf.study.scoring import Scene, score
+from hnerf.study.scoring import Scene, score, score_end
 from tasks.calibration import calibrated
 from tasks.source import GROUND_TRUTH, Source
 from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("scoring", version="8")
+@stage("scoring", version="9")
 def score_training(
     out: Path,
     truth: Source,
@@ -26,6 +26,20 @@ def score_training(
     found = score(scene(truth, recording, calibration), training.root, settings, out)
     psnr = found[found["split"]]["psnr"]
     return {} if psnr is None else {"psnr": psnr}
+
+
+@stage("scoring-end", version="1")
+def score_end_of_training(
+    out: Path,
+    truth: Source,
+    recording: Artifact,
+    calibration: Artifact,
+    training: Artifact,
+    settings: ScoringSettings,
+) -> dict[str, float]:
+    """The last point of a training's curve, no more."""
+    found = score_end(scene(truth, recording, calibration), training.root, settings, out)
+    return {"steps": found["training"]["steps"], "seconds": found["training"]["field_seconds"]}
 
 
 def scene(truth: Source, recording: Artifact, calibration: Artifact) -> Scene:

@@ -65,7 +65,7 @@ class NerfiesField(DynamicField):
     def __init__(self, body: BodyFit, settings: NerfiesSettings):
         super().__init__(body, settings.samples, settings.learning_rate, settings.code_width)
         self.settings = settings
-        self.deformation = Deformation(settings.code_width, settings.width)
+        self.deformation = Deformation(settings.code_width, settings.deformation_width)
         self.template = NerfNetwork(settings.width)
         self.register_buffer("steps_taken", torch.zeros((), dtype=torch.long))
 

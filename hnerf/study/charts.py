@@ -2,16 +2,17 @@
 
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from hnerf.evaluation.charts import COLOURS, INK, style
-from hnerf.study.curves import Point, binned, pareto_front
+from hnerf.study.curves import Point, bin_edges, binned, pareto_front
 
 LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
@@ -20,10 +21,24 @@ PANEL_POINTS = 190  # of those, from the lowest to the highest value that an axi
 LABEL_GAP = 0.07  # of a panel's height, between names at line ends
 ABOVE_LINE = 7.0  # points of type
 CAPTION_LETTERS = 13  # on an inch
-BINS = 5
 
 Curves = Mapping[str, Sequence[Point]]
 Style = dict[str, Any]
+NO_ENDS: Mapping[str, str] = {}
+
+
+@dataclass(frozen=True)
+class Speed:
+    """What a row of the speed chart shows, by method: curves (training seconds, accuracy), why they end where that is
+    known, points (time of a frame, accuracy); and the accuracy of what needs no training, by title."""
+
+    curves: Curves
+    ends: Mapping[str, str]
+    points: Mapping[str, Point]
+    floors: Mapping[str, float]
+
+    def __bool__(self) -> bool:
+        return bool(self.curves or self.points)
 
 
 def styles(methods: Iterable[str]) -> dict[str, Style]:
@@ -36,58 +51,72 @@ def styles(methods: Iterable[str]) -> dict[str, Style]:
 
 
 def speed_chart(
-    rows: Mapping[str, tuple[Curves, Mapping[str, Point], Mapping[str, float]]],
+    rows: Mapping[str, Speed],
     looks: Mapping[str, Style],
     labels: tuple[str, str, str],
     caption: str,
     path: Path,
 ) -> None:
     """A row for each title: accuracy over training seconds, above the accuracy of what needs no training, and over the
-    time of a frame with its Pareto front.
+    time of a frame with its Pareto front. A curve whose end has a reason is named with it.
 
     labels: of training time, time of a frame, accuracy.
     """
     figure, axes = _figure(len(rows), 2)
-    for (left, right), (title, (curves, points, floors)) in zip(axes, rows.items(), strict=True):
+    for (left, right), (title, row) in zip(axes, rows.items(), strict=True):
         for panel in (left, right):
-            _logarithmic(panel)
-        lines(left, curves, looks)
-        for name, height in floors.items():
+            panel.set_xscale("log")
+        lines(left, row.curves, looks, row.ends)
+        for name, height in row.floors.items():
             left.axhline(height, color=INK, linewidth=0.8, linestyle=(0, (1, 2)), zorder=1)
             left.annotate(
                 name, (0.01, height), (0, 3), ("axes fraction", "data"), "offset points", fontsize=8, color=INK
             )
         _decorate(left, title, labels[0], labels[2])
-        front(right, points, looks)
+        front(right, row.points, looks)
         _decorate(right, title, labels[1], labels[2])
+        for panel in (left, right):
+            _plain_numbers(panel)
     _save(figure, caption, path)
 
 
 def sweep_chart(
-    curves: Curves, looks: Mapping[str, Style], x_label: str, y_label: str, caption: str, path: Path
+    panels: Sequence[tuple[str, Curves]], looks: Mapping[str, Style], x_label: str, caption: str, path: Path
 ) -> None:
-    """A figure of the finished models over what the variants of a study differ in."""
-    figure, axes = _figure(1, 1)
-    panel = axes[0][0]
-    lines(panel, curves, looks)
-    _decorate(panel, "", x_label, y_label)
-    panel.xaxis.set_major_locator(MaxNLocator(integer=True))
+    """A panel for each (label, curves): a figure of the finished models over what the variants of a study differ in,
+    each step of it as wide as the number grows by."""
+    figure, axes = _figure(1, len(panels))
+    for panel, (y_label, curves) in zip(axes[0], panels, strict=True):
+        panel.set_xscale("log")
+        lines(panel, curves, looks)
+        _decorate(panel, "", x_label, y_label)
+        places = sorted({x for points in curves.values() for x, _ in points})
+        panel.set_xticks(places, [f"{x:g}" for x in places])
+        panel.xaxis.set_minor_locator(NullLocator())
     _save(figure, caption, path)
 
 
 def nearness_chart(
-    panels: Sequence[tuple[str, str, Curves]], looks: Mapping[str, Style], axis: str, caption: str, path: Path
+    panels: Sequence[tuple[str, Sequence[str], Curves]],
+    looks: Mapping[str, Style],
+    bins: int,
+    caption: str,
+    path: Path,
 ) -> None:
-    """A panel for each (title, label of x, points by method): every image as a mark, means of equally many as a
-    line."""
+    """A panel for each (title, labels of x and y, points by method): every image or surface as a mark, means of bins of
+    equal width as a line, and how many there are in a bin."""
     figure, axes = _figure(-(-len(panels) // 2), min(2, len(panels)))
     slots = [panel for row in axes for panel in row]
-    for panel, (title, x_label, clouds) in zip(slots, panels, strict=False):
+    for panel, (title, labels, clouds) in zip(slots, panels, strict=False):
+        edges = bin_edges(clouds.values(), bins)
+        means = {name: binned(points, edges) for name, points in clouds.items()}
         for name, points in clouds.items():
             look = looks[name] | {"linestyle": "none", "markersize": 3.5, "alpha": 0.35, "markeredgewidth": 0}
             panel.plot(*zip(*points, strict=True), **look)
-        lines(panel, {name: binned(points, BINS) for name, points in clouds.items()}, looks)
-        _decorate(panel, title, x_label, axis)
+        lines(panel, {name: [(x, y) for x, y, _ in found] for name, found in means.items()}, looks)
+        for x, _, count in max(means.values(), key=len):
+            panel.annotate(f"n = {count}", (x, 0.01), xycoords=panel.get_xaxis_transform(), ha="center", fontsize=7)
+        _decorate(panel, title, *labels)
     for panel in slots[len(panels) :]:
         panel.set_axis_off()
     _save(figure, caption, path)
@@ -110,12 +139,16 @@ def picture_grid(rows: Sequence[tuple[str, Sequence[tuple[str, Any]]]], caption:
     _save(figure, caption, path)
 
 
-def lines(axes: Axes, curves: Curves, looks: Mapping[str, Style]) -> None:
-    """A line a method, its name at the line's end."""
+def lines(axes: Axes, curves: Curves, looks: Mapping[str, Style], ends: Mapping[str, str] = NO_ENDS) -> None:
+    """A line a method, its name at the line's end; where there is a reason why it ends, the reason beside the name and
+    a large mark with a bar."""
     drawn = {name: points for name, points in curves.items() if points}
     for name, points in drawn.items():
         axes.plot(*zip(*points, strict=True), linewidth=1.7, markersize=5, **looks[name])
-    _name({name: points[-1] for name, points in drawn.items()}, axes, looks)
+        if name in ends:
+            axes.plot(*points[-1], "|", color=INK, markersize=22, markeredgewidth=1.6, zorder=3)
+            axes.plot(*points[-1], **looks[name] | {"markersize": 9, "markeredgecolor": INK, "zorder": 4})
+    _name({name: points[-1] for name, points in drawn.items()}, axes, looks, ends=ends)
 
 
 def front(axes: Axes, points: Mapping[str, Point], looks: Mapping[str, Style]) -> None:
@@ -143,16 +176,23 @@ def front(axes: Axes, points: Mapping[str, Point], looks: Mapping[str, Style]) -
     axes.legend(loc="best", frameon=False, fontsize=8, labelcolor=INK)
 
 
-def _name(ends: Mapping[str, Point], axes: Axes, looks: Mapping[str, Style], lift: float = 0.0) -> None:
-    """Names right of their points, lifted by points of type, and more where they would lie upon each other."""
+def _name(
+    places: Mapping[str, Point],
+    axes: Axes,
+    looks: Mapping[str, Style],
+    lift: float = 0.0,
+    ends: Mapping[str, str] = NO_ENDS,
+) -> None:
+    """Names right of their places, each with its end's reason, lifted by points of type, and more where they would lie
+    upon each other."""
     low, high = axes.get_ylim()
     free = low
-    for name, (x, y) in sorted(ends.items(), key=lambda end: end[1][1]):
+    for name, (x, y) in sorted(places.items(), key=lambda place: place[1][1]):
         height = max(y, free)
         free = height + LABEL_GAP * (high - low)
         shift = (9, lift + (height - y) / (high - low) * PANEL_POINTS)
         axes.annotate(
-            name,
+            f"{name}: {ends[name]}" if name in ends else name,
             (x, y),
             shift,
             textcoords="offset points",
@@ -177,10 +217,10 @@ def _decorate(axes: Axes, title: str, x_label: str, y_label: str) -> None:
     style(axes, x_label, y_label)
 
 
-def _logarithmic(axes: Axes) -> None:
-    """A logarithmic x axis with plain numbers at 1, 2, 3, 5 and 7 of every decade."""
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0, 7.0)))
+def _plain_numbers(axes: Axes) -> None:
+    """A logarithmic x axis with plain numbers at 1, 2, 3, 5 and 7 of every decade, at 1 and 3 where there are many."""
+    low, high = axes.get_xlim()
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0, 7.0) if high < 100 * low else (1.0, 3.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     axes.xaxis.set_minor_locator(NullLocator())
 

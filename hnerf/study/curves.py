@@ -1,7 +1,7 @@
 """Accuracy against cost: what dominates what, and when a level is reached."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -30,7 +30,24 @@ def seconds_to(curve: Sequence[Point], level: float) -> float | None:
     return None
 
 
-def binned(points: Sequence[Point], bins: int) -> list[Point]:
-    """Means of x and y over bins of equally many points, in the order of x; never more bins than points."""
-    ordered = np.array(sorted(points))
-    return [(float(x), float(y)) for x, y in (part.mean(0) for part in np.array_split(ordered, bins) if len(part))]
+def value_at(curve: Sequence[Point], seconds: float) -> float | None:
+    """A curve of (seconds, figure) at a time, linear in log seconds between its points and level after the last; None
+    before the first."""
+    if not curve or seconds < curve[0][0]:
+        return None
+    times, values = zip(*curve, strict=True)
+    return float(np.interp(math.log(seconds), np.log(times), values))
+
+
+def bin_edges(clouds: Iterable[Sequence[Point]], bins: int) -> list[float]:
+    """Equal steps from the least to the greatest x of all points, bins + 1 edges; none where there are no points."""
+    x = [x for points in clouds for x, _ in points]
+    return np.linspace(min(x), max(x), bins + 1).tolist() if x else []
+
+
+def binned(points: Sequence[Point], edges: Sequence[float]) -> list[tuple[float, float, int]]:
+    """Mean x, mean y and number of the points between two edges, of bins that have any; the last edge is inside."""
+    found = np.array(points)
+    place = np.digitize(found[:, 0], edges[1:-1])
+    parts = [found[place == k] for k in range(len(edges) - 1)]
+    return [(float(part[:, 0].mean()), float(part[:, 1].mean()), len(part)) for part in parts if len(part)]

@@ -3,10 +3,9 @@
 from collections.abc import Iterable
 
 import numpy as np
-import torch
 
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.rig import pose_vertices
+from hnerf.body.rig import rotation_from_axis_angle
 from hnerf.capture.camera import Camera
 
 
@@ -17,14 +16,15 @@ def view_angle_deg(camera: Camera, others: Iterable[Camera], middle_m: np.ndarra
     return float(np.rad2deg(np.arccos(np.clip(max(cosines), -1, 1))))
 
 
-def pose_distances_mm(body: BodyFit, frames: Iterable[int], others: Iterable[int]) -> dict[int, float]:
-    """For each frame, how far the surface of its pose is from that of the nearest of other frames: mean distance of
-    corresponding vertices in the body frame, so that walking or turning as a whole is no distance."""
-    still = torch.eye(4, device=body.theta.device).expand(len(body.frames), 4, 4)
-    vertices_m = pose_vertices(body.rig, body.theta, still).cpu()
-    known = vertices_m[[body.index(frame) for frame in others]]
-    apart_m = {f: (known - vertices_m[body.index(f)]).norm(dim=-1).mean(1).min() for f in frames}
-    return {frame: 1e3 * float(distance_m) for frame, distance_m in apart_m.items()}
+def pose_distances_deg(body: BodyFit, frames: Iterable[int], others: Iterable[int]) -> dict[int, float]:
+    """For each frame, how far its pose is from the nearest of other frames: the mean over free joints of the angle of
+    the rotation between, so that walking or turning as a whole is no distance."""
+    turns = rotation_from_axis_angle(body.theta[:, body.rig.free].double()).cpu()
+    known = turns[[body.index(frame) for frame in others]]
+    # |A - B| of two rotations is sqrt(8) sin of half the angle between.
+    halves = {f: (known - turns[body.index(f)]).flatten(2).norm(dim=-1) / 8**0.5 for f in frames}
+    angles_deg = {f: (2 * sine.clamp(max=1).asin()).rad2deg() for f, sine in halves.items()}
+    return {f: float(angle_deg.sum(1).min()) / max(1, turns.shape[1]) for f, angle_deg in angles_deg.items()}
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

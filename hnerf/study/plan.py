@@ -1,14 +1,15 @@
 """What a benchmark compares: methods on parts of a capture, as a YAML file under `configs/benchmark/` says."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field, PositiveInt
+from pydantic import Field, PositiveInt, model_validator
 
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, H_NERF, Section, Settings, load_settings, named_file, read_yaml, validated
 from hnerf.errors import CaptureError
 from hnerf.spread import spread
+from hnerf.study.convergence import FIRST_S
 from hnerf.study.subset import chosen
 
 STUDIES = CONFIGS / "benchmark"
@@ -16,13 +17,12 @@ UNTIL_TIME_IS_UP = 1_000_000  # steps
 FIRST_SNAPSHOT_S = 15.0  # where a training has no limit that could be halved
 
 
-class Variant(Section):
+class Part(Section):
     """Part of a capture. cameras, frames: of training, how many of them or which; None is all."""
 
     cameras: PositiveInt | tuple[str, ...] | None = None
     frames: PositiveInt | tuple[int, ...] | None = None
     novel_poses: bool = True
-    methods: tuple[str, ...] = ()  # of the study's; none is all
 
     def parts(self, capture: Capture) -> tuple[tuple[str, ...] | None, tuple[int, ...] | None, tuple[int, ...] | None]:
         """Training cameras, training frames and novel-pose frames to keep, None for all.
@@ -43,6 +43,27 @@ class Variant(Section):
         return cameras, frames, None if self.novel_poses else ()
 
 
+class Variant(Part):
+    """Part of a capture, and the methods of the study that are tried on it; none is all."""
+
+    methods: tuple[str, ...] = ()
+
+
+class Claim(Section):
+    """What the paper says in its words, and which figures tell whether it is seen here: hnerf/study/claims.py."""
+
+    says: str
+    check: Literal[
+        "more_is_better",
+        "loses_least",
+        "ahead",
+        "falls_with_angle",
+        "ahead_at_every_angle",
+        "no_trend_with_pose",
+        "others_have_no_surface",
+    ]
+
+
 class ScoringSettings(Section):
     """How much of what is held out is rendered and meshed. split: of curves and charts; new poses in any case where no
     camera is held out."""
@@ -56,24 +77,41 @@ class ScoringSettings(Section):
 
 
 class Study(Section):
-    """A benchmark. methods: presets; seconds: of every training, None to each preset's own end; snapshots: how many are
-    scored before it."""
+    """A benchmark. methods: presets, that of H-NeRF first; seconds: of every training, None to each preset's own end;
+    snapshots: how many are scored before it; until_flat: instead of them longer and longer trainings up to `seconds`
+    (hnerf/study/convergence.py)."""
 
     title: str
     notes: tuple[str, ...] = ()  # what a reader has to know, such as what is left out
+    claims: tuple[Claim, ...] = ()
     seconds: float | None = Field(default=None, gt=0)
     snapshots: int = Field(default=4, ge=0, le=12)
+    until_flat: bool = False
     sweep: Literal["cameras", "frames"] | None = None  # what the variants differ in, for a chart of its own
     methods: tuple[str, ...] = Field(min_length=1)
     variants: dict[str, Variant] = Field(min_length=1)
     scoring: ScoringSettings = ScoringSettings()
 
-    def settings(self, method: str) -> Settings:
-        """All stages' settings; training stops after `seconds` and is saved on the way. Steps that are written down end
-        H-NeRF alone: they are how long it needs, but what a compared method can do in its time is the question."""
-        settings = load_settings(method)
-        training = {"seconds": self.seconds, "snapshots_s": snapshot_times_s(self.seconds, self.snapshots)}
-        if self.seconds and settings.training.machinery not in H_NERF:
+    @model_validator(mode="after")
+    def _claims_of_a_sweep_have_one(self) -> Self:
+        for claim in self.claims:
+            if claim.check in ("more_is_better", "loses_least") and not self.sweep:
+                raise ValueError(f"claims: {claim.check} asks for a sweep")
+        return self
+
+    @model_validator(mode="after")
+    def _flat_within_a_time(self) -> Self:
+        if self.until_flat and (self.seconds is None or self.seconds < FIRST_S or self.snapshots):
+            raise ValueError(f"until_flat: asks for `snapshots: 0` and a longest training, `seconds` of {FIRST_S:g} up")
+        return self
+
+    def settings(self, method: str, seconds: float | None = None) -> Settings:
+        """All stages' settings; training stops after `seconds`, of the study where they are None, and is saved on the
+        way. Steps that are written down end H-NeRF alone: they are how long it needs, but what a compared method can do
+        in its time is the question."""
+        settings, seconds = load_settings(method), seconds or self.seconds
+        training = {"seconds": seconds, "snapshots_s": snapshot_times_s(seconds, self.snapshots)}
+        if seconds and settings.training.machinery not in H_NERF:
             training["steps"] = UNTIL_TIME_IS_UP
         return settings.model_copy(update={"training": settings.training.model_copy(update=training)})
 

@@ -7,13 +7,18 @@ from typing import Any
 
 from hnerf.capture.capture import read_rgb
 from hnerf.study import charts, results
+from hnerf.study.claims import told
 from hnerf.study.files import replace_text
 
-NEARNESS = (  # figure of an image, split, label of the axis
-    ("view_angle_deg", "novel_view", "angle from the nearest training camera, degrees"),
-    ("pose_distance_mm", "novel_pose", "mean distance of the surface from the nearest training pose, mm"),
+PSNR, CHAMFER = "held-out PSNR, dB", "Chamfer distance"
+ANGLE = "angle from the nearest training camera, degrees"
+POSE = "angle from the nearest training pose, degrees a joint"
+NEARNESS = (  # distance from training, split, figure, labels of both
+    ("view_angle_deg", "novel_view", "psnr", ANGLE, f"{PSNR} (an image)"),
+    ("pose_distance_deg", "novel_pose", "psnr", POSE, f"{PSNR} (an image)"),
+    ("pose_distance_deg", "novel_pose", "chamfer_mm", POSE, f"{CHAMFER} (a surface), mm"),
 )
-PSNR = "held-out PSNR, dB"
+SWEPT = {"psnr": PSNR, "geometry.chamfer_l2_e3": f"{CHAMFER}, 1e-3 m²"}
 
 
 def publish(result: dict[str, Any], store: Path) -> Path:
@@ -23,7 +28,7 @@ def publish(result: dict[str, Any], store: Path) -> Path:
     drawn = draw(result, store, table)
     replace_text(table.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
     replace_text(table.with_suffix(".csv"), results.as_csv(result))
-    replace_text(table, results.as_markdown(result, [path.name for path in drawn]))
+    replace_text(table, results.as_markdown(result, [path.name for path in drawn], told(result)))
     return table
 
 
@@ -33,24 +38,30 @@ def draw(result: Mapping[str, Any], store: Path, table: Path) -> list[Path]:
     paths = {name: table.with_name(f"{table.stem}{name}.png") for name in ("", "-sweep", "-nearness", "-pictures")}
     drawn = []
     panels = {
-        title: (results.psnr_curves(variant), results.frame_points(variant), results.floors(variant))
+        title: charts.Speed(
+            results.psnr_curves(variant),
+            results.ends(variant),
+            results.frame_points(variant),
+            results.floors(variant),
+        )
         for title, variant in variants.items()
     }
-    if rows := {results.heading(title, variants[title]): row for title, row in panels.items() if any(row)}:
+    if rows := {results.heading(title, variants[title]): row for title, row in panels.items() if row}:
         frame = f"time of a frame of {results.timed_px(result)} px, s (log scale)"
         charts.speed_chart(rows, looks, ("training, s (log scale)", frame, PSNR), caption, paths[""])
         drawn.append(paths[""])
-    if result["sweep"] and (curves := results.sweep_curves(result)):
-        charts.sweep_chart(curves, looks, f"training {result['sweep']}", PSNR, caption, paths["-sweep"])
+    swept = {key: results.sweep_curves(result, key) for key in SWEPT} if result["sweep"] else {}
+    if panels_of_sweep := [(SWEPT[key], curves) for key, curves in swept.items() if curves]:
+        charts.sweep_chart(panels_of_sweep, looks, f"training {result['sweep']}", caption, paths["-sweep"])
         drawn.append(paths["-sweep"])
     near = [
-        (f"{title}, {results.SPLITS[split]}", label, clouds)
+        (f"{title}, {results.SPLITS[split]}", labels, clouds)
         for title, variant in variants.items()
-        for key, split, label in NEARNESS
-        if (clouds := results.clouds(variant, split, key))
+        for x, split, y, *labels in NEARNESS
+        if (clouds := results.clouds(variant, split, x, y))
     ]
     if near:
-        charts.nearness_chart(near, looks, f"{PSNR} (an image)", caption, paths["-nearness"])
+        charts.nearness_chart(near, looks, results.BINS, caption, paths["-nearness"])
         drawn.append(paths["-nearness"])
     pictures = [row for title, variant in variants.items() for row in picture_rows(title, variant, store)]
     if pictures:

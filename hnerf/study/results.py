@@ -1,8 +1,10 @@
 """A benchmark's result as tables: Markdown for people, CSV for spreadsheets; and what its charts show.
 
 A result is a plain tree, as the JSON file has it:
-    {subject, study, title, notes, seconds, sweep, methods: [name], variants: {title: {cameras, frames,
-     methods: {name: scores of hnerf/study/scoring.py, or {"error": one line}}} or {"left_out": why}}}
+    {subject, study, title, notes, claims, seconds, until_flat, sweep, methods: [name],
+     variants: {title: {cameras, frames,
+      methods: {name: scores of hnerf/study/scoring.py, and "ended", a key of ENDS, where the study trains until curves
+       are flat; or {"error": one line}}} or {"left_out": why}}}
 """
 
 import csv
@@ -10,7 +12,8 @@ import io
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from hnerf.study.curves import Point, seconds_to
+from hnerf.study.convergence import HOW
+from hnerf.study.curves import Point, seconds_to, value_at
 from hnerf.study.files import picture
 from hnerf.study.machine import in_words
 from hnerf.tables import head, line, pick, shown
@@ -30,6 +33,9 @@ COSTS = {  # of a training
     "model_mib": ("model, MiB", "{:.1f}"),
 }
 NEAR_BEST_DB = 1.0
+BINS = 6  # of the distance from training
+AFTER_S = {60.0: "60 s", 600.0: "10 min", 3600.0: "1 h"}
+ENDS = {"flat": "flat", "limit": "out of time", "steps": "its steps are done"}  # why a method has no longer training
 FLOORS = {"one_colour_psnr": "one colour in the true outline", "empty_psnr": "an empty picture"}
 
 
@@ -72,23 +78,29 @@ def timed_px(result: Mapping[str, Any]) -> str:
     return min((size for variant in result["variants"].values() for size in _sizes(variant)), key=int)
 
 
-def sweep_curves(result: Mapping[str, Any]) -> dict[str, list[Point]]:
-    """Of each method: PSNR of the finished model over the number of cameras or frames, in ascending order."""
+def sweep_curves(result: Mapping[str, Any], key: str = "psnr") -> dict[str, list[Point]]:
+    """Of each method: a figure of the finished model over the number of cameras or frames, in ascending order."""
     curves: dict[str, list[Point]] = {}
     for variant in result["variants"].values():
-        for name, (_, psnr) in frame_points(variant).items():
-            trained_on = variant["methods"][name]["trained_on"]
-            curves.setdefault(name, []).append((trained_on[result["sweep"]], psnr))
+        for name, scores in scored(variant).items():
+            if (value := pick(scores[scores["split"]], key)) is not None:
+                curves.setdefault(name, []).append((scores["trained_on"][result["sweep"]], value))
     return {name: sorted(points) for name, points in curves.items()}
 
 
-def clouds(variant: Mapping[str, Any], split: str, key: str) -> dict[str, list[Point]]:
-    """Of each method: PSNR of every image of a split over a figure of the image, such as "view_angle_deg"."""
-    found = {
-        name: [(row[key], row["psnr"]) for row in scores[split]["per_image"]]
-        for name, scores in scored(variant).items()
-    }
+def clouds(variant: Mapping[str, Any], split: str, x: str, y: str = "psnr") -> dict[str, list[Point]]:
+    """Of each method: PSNR of every image of a split, or a figure of its surfaces such as "chamfer_mm", over how far
+    each is from training, such as "view_angle_deg"."""
+    found = {}
+    for name, scores in scored(variant).items():
+        rows = scores[split]["per_image"] if y == "psnr" else (scores[split]["geometry"] or {}).get("per_surface", [])
+        found[name] = [(row[x], row[y]) for row in rows]
     return {name: points for name, points in found.items() if points}
+
+
+def ends(variant: Mapping[str, Any]) -> dict[str, str]:
+    """Of each method that was trained until its curve was flat: why it was not trained for longer, in words."""
+    return {name: ENDS[scores["ended"]] for name, scores in scored(variant).items() if "ended" in scores}
 
 
 def near_best_seconds(variant: Mapping[str, Any]) -> dict[str, float | None]:
@@ -102,14 +114,15 @@ def caption(result: Mapping[str, Any]) -> str:
     """What was measured, and on which machines."""
     machines = sorted({in_words(s["machine"]) for v in result["variants"].values() for s in scored(v).values()})
     limit = f"{result['seconds']:g} s for each field" if result["seconds"] else "training to each preset's own end"
+    limit = f"{HOW}; {result['seconds']:g} s at most" if result["until_flat"] else limit
     return f"{result['subject']}, study {result['study']}: {limit}; on {'; on '.join(machines) or 'no machine yet'}."
 
 
-def as_markdown(result: Mapping[str, Any], pictures: list[str]) -> str:
-    """The whole result for people. pictures: names of files beside the text."""
+def as_markdown(result: Mapping[str, Any], pictures: list[str], claims: list[str]) -> str:
+    """The whole result for people. pictures: names of files beside the text; claims: lines of hnerf/study/claims.py."""
     lines = [f"# {result['title']}: {result['subject']}", "", caption(result), ""]
     lines += [f"- {note}" for note in result["notes"]] + [""] * bool(result["notes"])
-    lines += [f"{picture(name)}\n" for name in pictures]
+    lines += [f"{picture(name)}\n" for name in pictures] + claims + [""] * bool(claims)
     lines += ["Two figures in a cell: new views / new poses.", ""]
     for title, variant in result["variants"].items():
         lines += [f"## {title}", "", *_variant_lines(variant), ""]
@@ -145,8 +158,25 @@ def _variant_lines(variant: Mapping[str, Any]) -> list[str]:
         known = [[v for m in scored(variant).values() if (v := m[s][key]) is not None] for s in SPLITS]
         both = " / ".join(shown(values[0] if values else None, "{:.2f}") for values in known)
         lines.append(line([title, both, *[""] * (len(titles) - 2)]))
+    lines += _timeline(variant)
     missing = [f"- {', '.join(names)}: {reason}" for reason, names in reasons.items()]
     return [*lines, *(["", *missing] if missing else [])]
+
+
+def _timeline(variant: Mapping[str, Any]) -> list[str]:
+    """A table of the curves of methods that were trained until they were flat; nothing where none was."""
+    curves, why = psnr_curves(variant), ends(variant)
+    if not why:
+        return []
+    lines = ["", "PSNR of the curve's images, dB; between trainings linear in the logarithm of time.", ""]
+    lines += head(["method", *AFTER_S.values(), "at its end", "best", "ended"])
+    for name, curve in curves.items():
+        (end_s, at_end), (best_s, best) = curve[-1], max(curve, key=lambda point: point[1])
+        cells = [shown(value_at(curve, seconds), "{:.2f}") for seconds in AFTER_S]
+        lines.append(
+            line([name, *cells, f"{at_end:.2f}", f"{best:.2f} ({best_s:.0f} s)", f"{end_s:.0f} s, {why[name]}"])
+        )
+    return lines
 
 
 def as_csv(result: Mapping[str, Any]) -> str:

@@ -29,7 +29,7 @@ from hnerf.evaluation.views import SPLITS, View, all_views, split_frames
 from hnerf.render.avatar import Avatar
 from hnerf.spread import spread
 from hnerf.study.machine import machine
-from hnerf.study.nearness import pose_distances_mm, view_angle_deg
+from hnerf.study.nearness import pose_distances_deg, view_angle_deg
 from hnerf.study.plan import ScoringSettings
 from hnerf.training.model import load_avatar
 
@@ -70,7 +70,7 @@ def score(scene: Scene, training: Path, settings: ScoringSettings, out: Path) ->
     avatar = load_avatar(training, scene.device)
     reason = why_no_novel_poses(training)
     found: dict[str, Any] = {"machine": machine(), "protocol": f"{PROTOCOL} {HOW}", "lpips": LPIPS}
-    split = settings.split if scene.capture.test_cameras else "novel_pose"
+    split = curve_split(scene, settings)
     found["split"], found["training"] = split, json.loads((training / "report.json").read_text())
     found["curve"] = [] if split == "novel_pose" and reason else curve(scene, split, training, avatar, settings, out)
     for name in SPLITS:
@@ -79,7 +79,7 @@ def score(scene: Scene, training: Path, settings: ScoringSettings, out: Path) ->
             found[name] |= {"geometry": None, "geometry_reason": reason}
         else:
             found[name] = score_at(scene, avatar, name, settings.images, settings.meshes, out)
-            add_nearness(scene.capture, avatar, name, found[name]["per_image"])
+            add_nearness(scene.capture, avatar, name, found[name])
     found["pictures"] = write_pictures(scene, split, found[split]["per_image"], out)
     camera = next(iter(scene.capture.cameras.values()))
     found["frame_seconds"] = {
@@ -88,6 +88,21 @@ def score(scene: Scene, training: Path, settings: ScoringSettings, out: Path) ->
     }
     (out / "scores.json").write_text(json.dumps(found, indent=1))
     return found
+
+
+def score_end(scene: Scene, training: Path, settings: ScoringSettings, out: Path) -> dict[str, Any]:
+    """Write `scores.json` with what training reported and the last point of its curve alone; what it holds."""
+    reason, split = why_no_novel_poses(training), curve_split(scene, settings)
+    avatar = load_avatar(training, scene.device)
+    rows = [] if split == "novel_pose" and reason else curve(scene, split, training, avatar, settings, out)
+    found = {"training": json.loads((training / "report.json").read_text()), "curve": rows[-1:]}
+    (out / "scores.json").write_text(json.dumps(found, indent=1))
+    return found
+
+
+def curve_split(scene: Scene, settings: ScoringSettings) -> str:
+    """The split that curves are of."""
+    return settings.split if scene.capture.test_cameras else "novel_pose"
 
 
 def why_no_novel_poses(training: Path) -> str | None:
@@ -148,16 +163,17 @@ def write_pictures(scene: Scene, split: str, per_image: list[dict[str, Any]], ou
     return chosen
 
 
-def add_nearness(capture: Capture, avatar: Avatar, split: str, per_image: list[dict[str, Any]]) -> None:
-    """Put beside each image's figures how far its view and its pose are from those of training."""
-    apart_mm = pose_distances_mm(avatar.body, split_frames(capture, split), capture.train_frames)
+def add_nearness(capture: Capture, avatar: Avatar, split: str, found: dict[str, Any]) -> None:
+    """Put beside each image's and surface's figures how far its view and its pose are from those of training."""
+    apart_deg = pose_distances_deg(avatar.body, split_frames(capture, split), capture.train_frames)
     vertices_m = avatar.body.vertices_m().cpu().numpy()
     middles_m = (vertices_m.min(1) + vertices_m.max(1)) / 2
     trained = [capture.cameras[name] for name in capture.train_cameras]
-    for row in per_image:
+    for row in found["per_image"]:
         middle_m = middles_m[avatar.body.index(row["frame"])]
         row["view_angle_deg"] = view_angle_deg(capture.cameras[row["camera"]], trained, middle_m)
-        row["pose_distance_mm"] = apart_mm[row["frame"]]
+    for row in [*found["per_image"], *((found["geometry"] or {}).get("per_surface", ()))]:
+        row["pose_distance_deg"] = apart_deg[row["frame"]]
 
 
 def frame_seconds(avatar: Avatar, camera: Camera, frame: int, side_px: int) -> float:

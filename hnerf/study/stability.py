@@ -8,6 +8,7 @@ from pydantic import Field, NonNegativeInt
 from hnerf.config import CONFIGS, Section, named_file, read_yaml, validated
 from hnerf.errors import CaptureError
 from hnerf.study.degrade import KINDS, check_strengths
+from hnerf.study.plan import Part
 
 STUDIES = CONFIGS / "stability"
 FULL = "full"
@@ -15,10 +16,13 @@ FULL = "full"
 
 class Stability(Section):
     """Presets, seeds of degradations and training, settings changed in all runs, and each degradation's strengths, the
-    mildest first."""
+    mildest first. border_seeds: further seeds, of what is near the border of two verdicts by those before; part: of the
+    capture that stands for all of it."""
 
     methods: Annotated[tuple[str, ...], Field(min_length=1)]
     seeds: Annotated[tuple[NonNegativeInt, ...], Field(min_length=1)]
+    border_seeds: tuple[NonNegativeInt, ...] = ()
+    part: Part = Part()
     overrides: tuple[str, ...] = ()
     degradations: Annotated[dict[str, tuple[float, ...]], Field(min_length=1)]
 
@@ -35,7 +39,11 @@ class Stability(Section):
         full = load_stability(FULL)
         lines = [f"`{name}` as a method" for name in full.methods if name not in self.methods]
         seeds = len(full.seeds) - len(self.seeds)
-        lines += [f"{seeds} of {len(full.seeds)} seeds: no spread is known from so few"] if seeds > 0 else []
+        but = ", but where a verdict is near its border" if self.border_seeds else ": no spread is known from so few"
+        lines += [f"{seeds} of {len(full.seeds)} seeds{but}"] if seeds > 0 else []
+        if self.part != Part():
+            kept = self.part.model_dump(exclude_defaults=True).items()
+            lines.append(f"the capture beyond a part of it: {', '.join(f'{key} {value}' for key, value in kept)}")
         lines += [f"what the preset says: `{override}` instead" for override in self.overrides]
         for name, strengths in full.degradations.items():
             missing = [f"{s:g}" for s in strengths if s not in self.degradations.get(name, ())]

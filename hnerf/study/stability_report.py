@@ -3,6 +3,7 @@
 Runs are plain rows: method, seed, kind, strength, verdict, reason, and figures where there are any.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -26,7 +27,8 @@ LEGEND = (
     "compared by the images and surfaces that both have, and so are the differences in parentheses: a frame that a "
     "degradation took away counts in neither. Without test cameras images are not compared, since what is done to "
     "training cameras would be done to what they are scored on. A surface is the largest component that meshing finds; "
-    "what floats beside it does not count."
+    "what floats beside it does not count. A method **holds to** the strongest strength up to which the worst seed of "
+    "every one is ok."
 )
 
 Row = dict[str, Any]
@@ -42,24 +44,25 @@ def worst(result: Row, method: str, kind: str, strength: float) -> Row | None:
     return max(found, key=lambda r: WORST_LAST.index(r["verdict"]), default=None)
 
 
-def breaking_strength(result: Row, method: str, kind: str) -> str:
-    """The mildest strength at which the worst seed fails or is refused, or how far it is known to hold."""
+def how_far(result: Row, method: str, kind: str) -> str:
+    """The strongest strength up to which the worst seed of each is ok, the first at which it is degraded, and the first
+    at which it fails or is refused, as far as there are such."""
     strengths = result["plan"]["degradations"][kind]
-    runs = [worst(result, method, kind, strength) for strength in strengths]
-    for strength, run in zip(strengths, runs, strict=True):
-        if run and run["verdict"] in BROKEN:
-            return f"{strength:g} ({run['verdict']})"
-    held = [f"{s:g}" for s, run in zip(strengths, runs, strict=True) if run and run["verdict"] != "unscored"]
-    return f"holds to {held[-1]}" if held else "unscored" if any(runs) else "-"
+    runs = [(f"{s:g}", run["verdict"]) for s in strengths if (run := worst(result, method, kind, s))]
+    held = [strength for strength, _ in itertools.takewhile(lambda run: run[1] == "ok", runs)]
+    told = [f"holds to {held[-1]}"] if held else []
+    for words in (("degraded",), BROKEN):
+        told += [f"{verdict} at {strength}" for strength, verdict in runs if verdict in words][:1]
+    return ", ".join(told) or ("unscored" if runs else "-")
 
 
 def as_markdown(result: Row, charts: Sequence[str]) -> str:
-    """Where each method breaks, charts, every run, what was left out, and what verdicts mean."""
+    """How far each method holds, charts, every run, what was left out, and what verdicts mean."""
     methods, kinds = result["plan"]["methods"], result["plan"]["degradations"]
     lines = [f"# Stability of {', '.join(methods)} on {result['subject']}: study `{result['study']}`", "", LEGEND, ""]
-    lines += ["## Where each method breaks", "", *head(["degradation", *methods])]
+    lines += ["## How far each method holds", "", *head(["degradation", *methods])]
     for kind in kinds:
-        lines.append(line([KINDS[kind].label, *(breaking_strength(result, method, kind) for method in methods)]))
+        lines.append(line([KINDS[kind].label, *(how_far(result, method, kind) for method in methods)]))
     lines += ["", *map(picture, charts), "", "## Runs", ""]
     lines += head(["method", "degradation", "strength", "seed", "verdict", "PSNR, dB", "SSIM", "Chamfer, mm"])
     lines += [line(_cells(run)) for run in result["runs"]]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from pydantic import ValidationError
 
 from hnerf.body.anny import anny_rig
 from hnerf.capture.capture import Capture
@@ -16,6 +17,7 @@ from hnerf.capture.ingest import ingest
 from hnerf.capture.performer import write_performer
 from hnerf.capture.performer.dressed import Dressed
 from hnerf.capture.performer.render import Caster, dome_lights, floor_shadow, irradiance
+from hnerf.capture.performer.write import camera_names, ring_of_cameras
 from hnerf.config import CaptureSettings, PerformerSettings
 
 TINY = PerformerSettings(size_px=64, train_frames=3, novel_pose_frames=1)
@@ -44,6 +46,22 @@ def test_same_seed_same_bytes(folder: Path, tmp_path: Path) -> None:
     for name in ("images/05/000000.jpg", "openpose/02/000000_keypoints.json", "ground_truth/masks/01/000000.png"):
         digests = [hashlib.sha256((root / name).read_bytes()).hexdigest() for root in (folder, tmp_path)]
         assert digests[0] == digests[1]
+
+
+def test_the_ring_by_hand() -> None:
+    """32 cameras are 11.25 degrees apart; of 16 test cameras each stands half-way, in every second gap."""
+
+    def angles_deg(**settings: int) -> list[float]:
+        centres = [camera.centre_m for camera in ring_of_cameras(PerformerSettings(**settings))]
+        return [float(np.degrees(np.arctan2(y, x)) % 360) for x, y, _ in centres]
+
+    assert angles_deg() == pytest.approx([0, 90, 180, 270, 45, 225])
+    many = angles_deg(train_cameras=32, test_cameras=16)
+    assert many[:3] == pytest.approx([0, 11.25, 22.5]) and many[32:35] == pytest.approx([5.625, 28.125, 50.625])
+    assert len(many) == 48
+    assert camera_names(PerformerSettings(train_cameras=3, test_cameras=1)) == (["01", "02", "03"], ["04"])
+    with pytest.raises(ValidationError, match="one at most between two training cameras"):
+        PerformerSettings(train_cameras=1)
 
 
 def test_joints_lie_inside_the_masks(folder: Path, capture: Capture) -> None:

@@ -110,6 +110,42 @@ def test_every_method_of_every_variant_is_trained_alike(stages: Stages, study: s
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_trainings_get_longer_until_they_gain_nothing_or_time_or_steps_are_over(
+    stages: Stages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """fast has steps for 30 s; demo, made NeRF, is flat at 640 s and too young for a surface at 10 s."""
+    psnr = {20.0: 18.0, 40.0: 18.0, 80.0: 20.0, 160.0: 24.0, 320.0: 25.0, 640.0: 25.05}
+
+    def score_end(shelf: Any, truth: Any, recording: Any, calibration: Any, model: Any, settings: Any) -> Any:
+        name, training = stages[-1][1].machinery, stages[-1][1]
+        seconds = min(training.seconds, 30.0) if name == "fast" else training.seconds
+        point = {"seconds": seconds, "psnr": 30.0 if name == "fast" else psnr[seconds]}
+        (tmp_path / "scores.json").write_text(json.dumps({"training": {"field_seconds": seconds}, "curve": [point]}))
+        return SimpleNamespace(root=tmp_path)
+
+    def train(shelf: Any, recording: Any, *others: Any) -> Any:
+        if others[-1].machinery == "nerf" and others[-1].seconds == 10.0:
+            raise CaptureError("the surface is empty")
+        return good(shelf, recording, *others)
+
+    good = module.train
+    monkeypatch.setattr(module, "train", train)
+    monkeypatch.setattr(module, "score_end_of_training", score_end)
+    monkeypatch.setitem(PSNR, "nerf", 25.05)
+    text = "title: t\nmethods: [fast, nerf]\nvariants: {one: {}}\nuntil_flat: true\nsnapshots: 0\nseconds: "
+    (tmp_path / "mine.yaml").write_text(f"{text}10800")
+    found = read(benchmark.fn(tmp_path, str(tmp_path / "mine.yaml"), store=tmp_path / "store"))
+    fast, nerf = found["variants"]["one"]["methods"].values()
+    assert (fast["ended"], [row["seconds"] for row in fast["curve"]]) == ("steps", [10.0, 20.0, 30.0])
+    assert (nerf["ended"], [row["seconds"] for row in nerf["curve"]]) == ("flat", list(psnr))
+    assert [training.seconds for _, training in stages][-2:] == [640.0, 640.0]  # the second is in the store
+    assert nerf["novel_view"]["psnr"] == 25.05
+    (tmp_path / "mine.yaml").write_text(f"{text}100")
+    found = read(benchmark.fn(tmp_path, str(tmp_path / "mine.yaml"), store=tmp_path / "store"))
+    assert found["variants"]["one"]["methods"]["nerf"]["ended"] == "limit"
+
+
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("error", [RuntimeError("rank 0\nthe surface is empty"), CaptureError("the surface is empty")])
 def test_a_method_that_fails_says_so_and_the_rest_go_on(
     stages: Stages, study: str, tmp_path: Path, error: Exception

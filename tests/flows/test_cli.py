@@ -7,6 +7,7 @@ import pytest
 from flows import cli
 from flows.cli import main
 from hnerf.asset.validation import InvalidAsset
+from hnerf.config import PerformerSettings
 from tasks.launcher import GaveUpError
 from tests.shared_data import shared_capture
 
@@ -21,6 +22,7 @@ from tests.shared_data import shared_capture
         (["run", "absent", "--set", "training.noise=.inf"], "training.noise: Input should be a finite number"),
         (["run", "absent", "--set", "training.fast.colour_cells=[8,-3]"], "training.fast.colour_cells.1"),
         (["synth", "."], "exists; give the name of a new folder"),
+        (["synth", "ring", "--set", "cameras=32"], "hnerf: --set cameras=32: cameras: Extra"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(
@@ -121,6 +123,14 @@ def test_check_prints_every_camera_and_the_verdict(tmp_path: Path, capsys: pytes
     assert f"verdict: {report['verdict']}" in table
     for name in ("05", "06"):
         assert f"{name:<12} not judged: a camera for testing" in table
+
+
+def test_synth_takes_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written: list[PerformerSettings] = []
+    monkeypatch.setattr(cli, "write_performer", lambda out, settings: written.append(settings))
+    assert main(["synth", str(tmp_path / "ring"), "--set", "train_cameras=32", "--set", "train_frames=1"]) == 0
+    assert main(["synth", str(tmp_path / "ada")]) == 0
+    assert written == [PerformerSettings(train_cameras=32, train_frames=1), PerformerSettings()]
 
 
 def test_synth_writes_whole_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

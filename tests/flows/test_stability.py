@@ -209,6 +209,42 @@ def test_a_method_that_cannot_take_the_capture_at_all_is_tried_once_a_seed(
     assert "NeRF models one moment" in runs[0]["reason"]
 
 
+def test_further_seeds_try_what_is_near_a_border_and_nothing_else(
+    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = STUDY.replace("seeds: [0, 1]", "seeds: [0]\nborder_seeds: [3, 4]")
+    (tmp_path / "mine.yaml").write_text(text)
+    runs = study(tmp_path, only=["pose_noise", "image_noise"])["runs"]  # 2 dB are near no border
+    assert {run["seed"] for run in runs} == {0}
+    monkeypatch.setattr("hnerf.study.verdict.DEGRADED_DB", 2.2)
+    runs = study(tmp_path, only=["pose_noise", "image_noise"])["runs"]
+    assert [(run["seed"], run["kind"]) for run in runs if run["seed"]] == [
+        (3, "as recorded"),
+        (3, "pose_noise"),
+        (4, "as recorded"),
+        (4, "pose_noise"),
+    ]
+
+
+def test_a_part_stands_for_the_capture(
+    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = module.Capture.load(tmp_path)
+    whole.train_frames = (2, 5)
+    whole.train_cameras = ("a", "b")
+
+    def subset_capture(_: Any, recording: Any, *parts: Any) -> Any:
+        assert (recording.name, parts) == ("capture", (None, (2,), ()))
+        return SimpleNamespace(root=tmp_path, name="moment")
+
+    monkeypatch.setattr(module, "subset_capture", subset_capture)
+    part = "part: {frames: 1, novel_poses: false}"
+    (tmp_path / "mine.yaml").write_text(STUDY.replace("seeds: [0, 1]", f"seeds: [0]\n{part}"))
+    found = study(tmp_path, only=["pose_noise"])
+    assert [(s["recording"], s["body"]) for s in stages] == [("moment", "body"), ("moment", "pose_noise 2")]
+    assert "the capture beyond a part of it: frames 1, novel_poses False" in found["left_out"]
+
+
 def test_bad_input_in_evaluation_is_failure(
     stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -247,7 +283,7 @@ def test_what_ends_the_first_run_leaves_an_earlier_study_as_it_was(
         study(tmp_path, only=["pose_noise"])
     folder = tmp_path / "store" / "stability"
     assert json.loads((folder / "ada-mine-part.json").read_text()) == earlier
-    assert "holds to 2" in (folder / "ada-mine-part.md").read_text()
+    assert "degraded at 2" in (folder / "ada-mine-part.md").read_text()
 
 
 def test_a_chart_that_cannot_be_drawn_hides_nothing(
@@ -298,7 +334,7 @@ def test_a_run_to_compare_with_that_fails_is_kept_and_ends_its_seed(
     told = [(r["kind"], r["seed"], r["verdict"], r["reason"]) for r in table["runs"]]
     assert told == [("as recorded", seed, "failed", "surface is not watertight") for seed in (0, 1)]
     text = (tmp_path / "store" / "stability" / "ada-mine-part.md").read_text()
-    assert "| pose noise, ° a joint | 2 (failed) |" in text
+    assert "| pose noise, ° a joint | failed at 2 |" in text
 
 
 def test_what_has_no_new_poses_is_judged_on_new_views(
@@ -333,7 +369,7 @@ def test_the_command_prints_the_table(
     options = ["--study", str(tmp_path / "mine.yaml"), "--store", str(tmp_path / "store"), "--only", "pose_noise"]
     assert main(["stability", str(tmp_path), "--methods", "fast, paper", *options]) == 0
     shown = capsys.readouterr().out
-    assert "| pose noise, ° a joint | holds to 2 | holds to 2 |" in shown
+    assert "| pose noise, ° a joint | degraded at 2 | degraded at 2 |" in shown
     assert f"table: {tmp_path / 'store' / 'stability' / 'ada-mine-part.md'}" in shown
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from hnerf.study.curves import binned, pareto_front, seconds_to
+from hnerf.study.curves import bin_edges, binned, pareto_front, seconds_to, value_at
 
 
 def test_the_front_is_what_nothing_beats_cheapest_first() -> None:
@@ -35,7 +35,17 @@ def test_a_level_below_the_first_point_is_reached_there_and_one_above_all_never(
     assert seconds_to([], 1.0) is None
 
 
-def test_bins_hold_equally_many_points_in_the_order_of_x() -> None:
-    points = [(4.0, 8.0), (1.0, 2.0), (2.0, 6.0), (3.0, 4.0)]
-    assert binned(points, 2) == [(1.5, 4.0), (3.5, 6.0)]
-    assert binned(points[:1], 5) == [(4.0, 8.0)]
+def test_a_curve_between_its_points_before_and_after() -> None:
+    curve = [(10.0, 20.0), (1000.0, 24.0)]
+    assert value_at(curve, 100.0) == pytest.approx(22.0)
+    assert value_at(curve, 9.9) is None and value_at([], 10.0) is None
+    assert value_at(curve, 10.0) == 20.0 and value_at(curve, 5000.0) == 24.0
+
+
+def test_bins_are_equally_wide_and_empty_ones_are_left_out() -> None:
+    points = [(9.0, 8.0), (0.0, 2.0), (1.0, 6.0), (2.0, 4.0)]
+    assert bin_edges([points[:2], points[2:]], 3) == [0.0, 3.0, 6.0, 9.0]
+    assert binned(points, [0.0, 3.0, 6.0, 9.0]) == [(1.0, 4.0, 3), (9.0, 8.0, 1)]
+    assert binned([(3.0, 1.0)], [0.0, 3.0, 6.0]) == [(3.0, 1.0, 1)]  # an edge is the next bin's
+    assert binned(points[:1], bin_edges([points[:1]], 5)) == [(9.0, 8.0, 1)]
+    assert bin_edges([], 3) == []

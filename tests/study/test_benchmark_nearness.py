@@ -1,12 +1,13 @@
 """Angles and distances worked out by hand."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.rig import pose_vertices
-from hnerf.study.nearness import pose_distances_mm, view_angle_deg
+from hnerf.study.nearness import pose_distances_deg, view_angle_deg
 from tests.body.boxes import box_rig
 from tests.evaluation.ball import ball_camera
 
@@ -18,15 +19,24 @@ def test_the_angle_is_that_to_the_nearest_camera() -> None:
     assert view_angle_deg(others[0], others, np.array([0, 0, 1.0])) == pytest.approx(0.0, abs=1e-5)
 
 
-def test_a_pose_is_as_far_as_its_vertices_from_the_nearest_pose_wherever_the_body_stands() -> None:
-    rig = box_rig(bend_segments=6, splits=4)
-    theta = torch.zeros(4, 2, 3)
-    theta[:, 1, 1] = torch.tensor([0.0, 0.2, 0.5, 0.2])
-    root = torch.eye(4).repeat(4, 1, 1)
+def test_a_pose_is_as_far_as_its_free_joints_turn_to_the_nearest_pose_wherever_the_body_stands() -> None:
+    """Two free joints. Frame 12 turns one by 90 degrees from frame 10 and 60 from frame 11, whose other joint is the
+    same: 30 in the mean. In frame 14 it is 90 degrees about x against 90 about y: 120 degrees between (a third of a
+    turn about the cube's diagonal), and 90 from frame 10: 45 in the mean."""
+    rig = dataclasses.replace(box_rig(), free=torch.tensor([True, True]))
+    theta = torch.zeros(5, 2, 3)
+    theta[:4, 1, 1] = torch.tensor([0.0, 30.0, 90.0, 30.0]).deg2rad()
+    theta[4, 1, 0] = np.pi / 2
+    root = torch.eye(4).repeat(5, 1, 1)
     root[3, :3, 3] = torch.tensor([3.0, 0.0, 0.0])
-    found = pose_distances_mm(BodyFit(rig, (10, 11, 12, 13), theta, root), [12, 13, 10], [10, 11])
-    bent, more = (pose_vertices(rig, theta[k], torch.eye(4)) for k in (1, 2))
-    assert found[12] == pytest.approx(1e3 * float((bent - more).norm(dim=1).mean()), rel=1e-5)
-    assert found[12] > 10
-    assert found[13] == pytest.approx(0.0, abs=1e-3)
-    assert found[10] == 0.0
+    body = BodyFit(rig, (10, 11, 12, 13, 14), theta, root)
+    found = pose_distances_deg(body, [12, 13, 10, 14], [10, 11])
+    assert found == {
+        12: pytest.approx(30.0, abs=1e-4),
+        13: pytest.approx(0.0, abs=1e-4),
+        10: 0.0,
+        14: pytest.approx(45.0, abs=1e-4),
+    }
+    assert pose_distances_deg(body, [14], [12])[14] == pytest.approx(60.0, abs=1e-4)
+    one = dataclasses.replace(body, rig=dataclasses.replace(rig, free=torch.tensor([False, True])))
+    assert pose_distances_deg(one, [14], [12])[14] == pytest.approx(120.0, abs=1e-4)

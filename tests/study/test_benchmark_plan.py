@@ -20,7 +20,12 @@ def write(folder: Path, text: str) -> str:
 
 def test_studies_that_are_promised_are_there_and_valid() -> None:
     studies = {path.stem: load_study(path.stem) for path in STUDIES.glob("*.yaml")}
-    assert set(studies) == {"quick", "dynamic", "static", "cameras", "frames", "monocular"}
+    of_the_paper = {"cameras", "view-angle", "frames", "pose-distance", "monocular", "nerfies"}
+    to_convergence = {"static-converged", "dynamic-converged"}
+    assert set(studies) == {"quick", "dynamic", "static"} | of_the_paper | to_convergence
+    assert all(studies[name].until_flat and studies[name].seconds == 3 * 3600 for name in to_convergence)
+    assert all(studies[name].claims for name in of_the_paper)
+    assert all(studies[name].scoring.images == 48 for name in ("view-angle", "pose-distance"))
     assert set(studies["quick"].methods) == {"fast", "paper-small", "nerf"}
     assert studies["quick"].variants["one frame"].methods == ("fast", "nerf")
     assert [v.cameras for v in studies["cameras"].variants.values()] == [2, 4, 8, 16, 32]
@@ -33,6 +38,7 @@ def test_methods_of_ready_studies_have_valid_settings() -> None:
         for method in study.methods:
             training = study.settings(method).training
             assert training.seconds == study.seconds
+            assert study.settings(method, 20.0).training.seconds == 20.0
             assert len(training.snapshots_s) == study.snapshots
 
 
@@ -42,12 +48,24 @@ def test_methods_of_ready_studies_have_valid_settings() -> None:
         ("title: t\nmethods: [a]\nvariants: {all: {}}\nspeed: 3", "speed: Extra inputs"),
         ("title: t\nmethods: [a]\nvariants: {all: {views: 3}}", "variants.all.views: Extra inputs"),
         ("title: t\nmethods: [a]\nvariants: {all: {methods: [b]}}", "variants.all: no method b; there"),
+        ("title: t\nmethods: [a]\nvariants: {a: {}}\nuntil_flat: true\nsnapshots: 0", "until_flat: asks for"),
+        ("title: t\nmethods: [a]\nvariants: {a: {}}\nuntil_flat: true\nseconds: 60", "until_flat: asks for"),
         ("title: t\nmethods: [a]\nvariants: {}", "variants: Dictionary should have at least 1"),
+        ("title: t\nmethods: [a]\nvariants: {a: {}}\nclaims: [{says: a, check: more_is_better}]", "asks for a sweep"),
+        ("title: t\nmethods: [a]\nvariants: {a: {}}\nclaims: [{says: a, check: faith}]", "claims.0.check: Input"),
     ],
 )
 def test_bad_studies_are_refused_by_key(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(CaptureError, match=message):
         load_study(write(tmp_path, text))
+
+
+def test_wide_methods_are_the_small_ones_but_for_their_networks() -> None:
+    for name, widths in {"nerf": 256, "idr": 512, "neural-body": 256, "nerfies": 256}.items():
+        small, wide = load_settings(name).training, load_settings(f"{name}-wide").training
+        own = getattr(wide, wide.machinery)
+        assert own.width == widths
+        assert wide == small.model_copy(update={wide.machinery: own})
 
 
 def test_unknown_studies_are_refused() -> None:

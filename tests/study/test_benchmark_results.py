@@ -19,6 +19,7 @@ from hnerf.study.results import (
     as_markdown,
     caption,
     clouds,
+    ends,
     frame_points,
     heading,
     near_best_seconds,
@@ -27,12 +28,13 @@ from hnerf.study.results import (
 )
 
 MACHINE = {"cpu": "Abacus", "cores": 2, "threads": 1, "gpu": None, "torch": "2", "python": "3"}
-GEOMETRY = {"chamfer_l2_e3": 0.05, "normal_consistency": 0.94, "iou": 0.875}
+SURFACES = [{"frame": 0, "chamfer_mm": 5.0, "pose_distance_deg": 3.0}]
+GEOMETRY = {"chamfer_l2_e3": 0.05, "normal_consistency": 0.94, "iou": 0.875, "per_surface": SURFACES}
 
 
 def split(psnr: float) -> dict[str, Any]:
     rows = [
-        {"camera": "c", "frame": f, "psnr": psnr + f, "view_angle_deg": 40.0 + f, "pose_distance_mm": 3.0}
+        {"camera": "c", "frame": f, "psnr": psnr + f, "view_angle_deg": 40.0 + f, "pose_distance_deg": 3.0}
         for f in (0, 2)
     ]
     floors = {"empty_psnr": 18.0, "one_colour_psnr": 25.0}
@@ -73,7 +75,9 @@ def result(**changes: Any) -> dict[str, Any]:
         "study": "toy",
         "title": "Toys",
         "notes": ["A note."],
+        "claims": [],
         "seconds": 60.0,
+        "until_flat": False,
         "sweep": "cameras",
         "methods": ["fast", "nerf", "idr"],
         "variants": {
@@ -85,7 +89,7 @@ def result(**changes: Any) -> dict[str, Any]:
 
 
 def test_the_markdown_by_hand() -> None:
-    assert as_markdown(result(), ["a (b).png"]).splitlines()[:25] == [
+    assert as_markdown(result(), ["a (b).png"], ["- A claim."]).splitlines()[:27] == [
         "# Toys: ada",
         "",
         "ada, study toy: 60 s for each field; on Abacus, 1 of 2 cores, no GPU, torch 2, Python 3.",
@@ -93,6 +97,8 @@ def test_the_markdown_by_hand() -> None:
         "- A note.",
         "",
         "![a (b).png](<a (b).png>)",
+        "",
+        "- A claim.",
         "",
         "Two figures in a cell: new views / new poses.",
         "",
@@ -115,15 +121,32 @@ def test_the_markdown_by_hand() -> None:
         "",
         "## 2 cameras",
     ]
-    text = as_markdown(result(), [])
+    text = as_markdown(result(), [], [])
     assert "Left out: the capture has 4 training cameras, not 8." in text
     assert text.endswith("LPIPS: not available: no weights.\n\nBy eye.\n")
+
+
+def test_what_methods_had_on_the_way_and_why_they_ended() -> None:
+    """nerf from 22 dB at 10 s to 26 at 1000: at 600 s 22 + 2 lg 60. idr was never scored."""
+    flat = result(until_flat=True)
+    methods = flat["variants"]["4 cameras"]["methods"]
+    methods["fast"] |= {"ended": "steps", "curve": [{"seconds": 20.0, "psnr": 31.0}, {"seconds": 40.0, "psnr": 30.0}]}
+    methods["nerf"]["ended"] = "flat"
+    lines = as_markdown(flat, [], []).splitlines()
+    start = lines.index("| method | 60 s | 10 min | 1 h | at its end | best | ended |")
+    assert lines[start + 2 : start + 5] == [
+        "| fast | 30.00 | 30.00 | 30.00 | 30.00 | 31.00 (20 s) | 40 s, its steps are done |",
+        "| nerf | 23.56 | 25.56 | 26.00 | 26.00 | 26.00 (1000 s) | 1000 s, flat |",
+        "",
+    ]
+    assert ends(flat["variants"]["4 cameras"]) == {"fast": "its steps are done", "nerf": "flat"}
+    assert "each from the start" in caption(flat) and "60 s at most" in caption(flat)
 
 
 def test_what_calibration_left_out_is_told_and_not_plotted() -> None:
     of_three = result()
     of_three["variants"]["4 cameras"]["methods"]["fast"]["trained_on"] = {"cameras": 3, "frames": 1}
-    text = as_markdown(of_three, [])
+    text = as_markdown(of_three, [], [])
     assert "- fast: trained on 3 cameras and 1 frames: calibration left the others out" in text
     assert sweep_curves(of_three)["fast"] == [(2, 28.0), (3, 30.0)]
 
@@ -148,6 +171,9 @@ def test_what_charts_show() -> None:
     assert frame_points(variants["4 cameras"]) == {"fast": (0.5, 30.0), "nerf": (2.0, 26.0)}
     assert sweep_curves(result()) == {"fast": [(2, 28.0), (4, 30.0)], "nerf": [(4, 26.0)]}
     assert clouds(variants["2 cameras"], "novel_view", "view_angle_deg") == {"fast": [(40.0, 28.0), (42.0, 30.0)]}
+    assert sweep_curves(result(), "geometry.chamfer_l2_e3")["fast"] == [(2, 0.05), (4, 0.05)]
+    surfaces = clouds(variants["2 cameras"], "novel_view", "pose_distance_deg", "chamfer_mm")
+    assert surfaces == {"fast": [(3.0, 5.0)]} and not clouds(variants["2 cameras"], "novel_pose", "view_angle_deg")
     # from 26 dB at 10 s to 30 dB at 1000 s: 29 dB after three quarters of the way in log time
     near = near_best_seconds(variants["4 cameras"])
     assert near == {"fast": pytest.approx(10 * 100**0.75), "nerf": None}
@@ -203,6 +229,15 @@ def test_everything_is_published_and_old_charts_go(tmp_path: Path) -> None:
 def test_methods_differ_in_line_and_marker_so_that_grey_prints_do() -> None:
     looks = charts.styles([f"method {k}" for k in range(6)]).values()
     assert len({look["linestyle"] for look in looks}) == len({look["marker"] for look in looks}) == 6
+
+
+def test_ends_with_a_reason_are_marked_and_named() -> None:
+    _, axes = charts._figure(1, 1)
+    curves = {"a": [(10.0, 20.0), (20.0, 30.0)], "b": [(10.0, 21.0), (40.0, 25.0)]}
+    charts.lines(axes[0][0], curves, charts.styles(curves), {"a": "flat"})
+    assert {text.get_text() for text in axes[0][0].texts} == {"a: flat", "b"}
+    bars = [line for line in axes[0][0].lines if line.get_marker() == "|"]
+    assert [line.get_xydata().tolist() for line in bars] == [[[20.0, 30.0]]]
 
 
 def test_names_at_line_ends_do_not_lie_upon_each_other() -> None:

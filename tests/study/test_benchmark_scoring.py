@@ -17,7 +17,7 @@ from hnerf.evaluation.views import View
 from hnerf.render.avatar import Rendering
 from hnerf.study import scoring
 from hnerf.study.plan import ScoringSettings
-from hnerf.study.scoring import Scene, frame_seconds, score, score_at, why_no_novel_poses, write_pictures
+from hnerf.study.scoring import Scene, frame_seconds, score, score_at, score_end, why_no_novel_poses, write_pictures
 from tests.evaluation.ball import (
     PHOTOGRAPHED,
     RADIUS_M,
@@ -110,6 +110,17 @@ def test_the_curve_is_of_snapshots_when_they_were_taken_and_of_the_end_of_the_fi
     assert found["training"]["model_mib"] == 7.0
 
 
+def test_of_a_longer_training_the_end_alone_is_scored(base: Path, found: dict[str, Any], tmp_path: Path) -> None:
+    capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
+    write_ball_truth(capture, RADIUS_M + GAP_M)
+    scene = Scene(capture, GroundTruth(capture.root, capture), "cpu")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scoring, "load_avatar", lambda path, device: GreyBall(GREYS[path.name]))
+        end = score_end(scene, base / "training", SETTINGS, tmp_path)
+    assert end == {"training": found["training"], "curve": found["curve"][-1:]}
+    assert json.loads((tmp_path / "scores.json").read_text()) == end
+
+
 def test_new_poses_count_the_seconds_that_fitting_them_took(tmp_path: Path) -> None:
     found = scored(tmp_path, ())
     assert found["split"] == "novel_pose"
@@ -122,7 +133,9 @@ def test_images_stand_beside_their_distance_from_training(found: dict[str, Any])
     rows = found["novel_view"]["per_image"]
     assert [row["frame"] for row in rows] == [0, 1, 2]
     assert rows[0]["view_angle_deg"] == pytest.approx(80.0, abs=1e-3)  # cameras at 0, 80 and 160 degrees
-    assert [row["pose_distance_mm"] for row in rows] == [0.0, 0.0, 0.0]
+    assert [row["pose_distance_deg"] for row in rows] == [0.0, 0.0, 0.0]
+    (surface,) = found["novel_view"]["geometry"]["per_surface"]
+    assert surface["pose_distance_deg"] == 0.0
 
 
 def test_pictures_of_truth_and_rendering_lie_side_by_side(base: Path, found: dict[str, Any]) -> None:

@@ -10,9 +10,10 @@ import pytest
 from hnerf.config import load_settings
 from hnerf.errors import CaptureError
 from hnerf.study.degrade import KINDS
+from hnerf.study.plan import Part
 from hnerf.study.stability import Stability, load_stability
 from hnerf.study.stability_charts import SHADES, curve_chart, matrix_chart
-from hnerf.study.stability_report import as_markdown, breaking_strength
+from hnerf.study.stability_report import as_markdown, how_far
 
 
 def test_the_full_study_tries_everything_at_four_or_five_strengths_and_three_seeds() -> None:
@@ -29,6 +30,27 @@ def test_the_brief_studies_train_alike_all_strengths_once_or_the_milder_ones_wit
     assert seeds.degradations == {name: full.degradations[name][:2] for name in seeds.degradations}
     assert (brief.methods, brief.overrides) == (seeds.methods, seeds.overrides)
     assert (brief.seeds, seeds.seeds) == ((0,), full.seeds)
+
+
+def test_studies_of_other_methods_and_of_full_training() -> None:
+    full, fast = load_stability("full"), load_stability("fast")
+    assert (fast.methods, fast.degradations) == (("fast",), full.degradations)
+    assert (*fast.seeds, *fast.border_seeds) == full.seeds
+    assert not [override for override in fast.overrides if override.startswith("training")]
+    assert "2 of 3 seeds, but where a verdict is near its border" in fast.left_out()
+    milder = {name: strengths[:2] for name, strengths in full.degradations.items()}
+    moving, still = load_stability("methods"), load_stability("one-moment")
+    assert moving.degradations == milder
+    assert still.degradations == {k: v for k, v in milder.items() if k not in ("frames_left", "camera_out_of_step")}
+    assert still.part == Part(frames=1, novel_poses=False)
+    assert {*moving.methods, *still.methods} == {"fast", "neural-body", "nerfies", "nerf", "idr"}
+    published = load_stability("published")
+    assert published.methods == ("paper-small", "neural-body")
+    assert published.degradations == {name: milder[name] for name in published.degradations}
+    assert {KINDS[name].place for name in published.degradations} == {"capture", "masks", "fit", "poses"}
+    for study in (fast, moving, still, published):
+        for method in study.methods:
+            load_settings(method, list(study.overrides))
 
 
 def test_the_quick_study_tries_the_two_milder_strengths_and_says_what_it_left_out() -> None:
@@ -61,7 +83,7 @@ def test_bad_studies_are_refused_in_one_line(text: str, message: str, tmp_path: 
 
 
 def test_unknown_studies_and_degradations_are_refused() -> None:
-    with pytest.raises(CaptureError, match="slow: no such study or file; studies are brief, full, quick, seeds"):
+    with pytest.raises(CaptureError, match="slow: no such study or file; studies are brief, fast, full, methods, "):
         load_stability("slow")
     with pytest.raises(CaptureError, match="--only hats: not in this study; it has cameras_left, "):
         load_stability("quick").only(["hats"])
@@ -99,42 +121,52 @@ RESULT = {
 }
 
 
-def test_a_method_breaks_where_its_worst_seed_does() -> None:
-    assert breaking_strength(RESULT, "fast", "pose_noise") == "2 (failed)"
-    assert breaking_strength(RESULT, "fast", "mask_holes") == "holds to 5"
-    assert breaking_strength(RESULT, "nerf", "mask_holes") == "5 (refused)"
+def test_a_method_holds_as_far_as_its_worst_seed_is_ok() -> None:
+    assert how_far(RESULT, "fast", "pose_noise") == "holds to 1, failed at 2"
+    assert how_far(RESULT, "fast", "mask_holes") == "holds to 5"
+    assert how_far(RESULT, "nerf", "mask_holes") == "refused at 5"
+
+
+def test_what_is_degraded_does_not_hold_though_a_stronger_one_is_ok() -> None:
+    words = {1: "degraded", 2: "ok", 5: "failed"}
+    rows = [run("fast", "pose_noise", s, 0, word, 30.0) for s, word in words.items()]
+    result = RESULT | {"runs": [run("fast", "as recorded", None, 0, "ok", 30.0), *rows]}
+    assert how_far(result, "fast", "pose_noise") == "degraded at 1, failed at 5"
+    rows[0] = run("fast", "pose_noise", 1, 0, "ok", 30.0)
+    rows[1] = run("fast", "pose_noise", 2, 0, "degraded", 28.0)
+    assert how_far(result | {"runs": rows}, "fast", "pose_noise") == "holds to 1, degraded at 2, failed at 5"
 
 
 def test_a_seed_without_a_good_run_says_nothing_of_the_others() -> None:
     """Seed 1 cannot take the capture as recorded; seed 0 holds."""
     rows = [run("fast", "as recorded", None, 0, "ok", 30.0), run("fast", "as recorded", None, 1, "failed", None)]
     result = RESULT | {"runs": [*rows, run("fast", "pose_noise", 1, 0, "ok", 30.0)]}
-    assert breaking_strength(result, "fast", "pose_noise") == "holds to 1"
-    assert breaking_strength(result, "fast", "mask_holes") == "-"
+    assert how_far(result, "fast", "pose_noise") == "holds to 1"
+    assert how_far(result, "fast", "mask_holes") == "-"
 
 
 def test_nothing_is_said_to_hold_of_which_nothing_is_known() -> None:
     good = run("fast", "as recorded", None, 0, "unscored", None)
     unknown = RESULT | {"runs": [good, run("fast", "pose_noise", 1, 0, "unscored", None)]}
-    assert breaking_strength(unknown, "fast", "pose_noise") == "unscored"
+    assert how_far(unknown, "fast", "pose_noise") == "unscored"
     partly = RESULT | {"runs": [*RESULT["runs"][:4], run("fast", "pose_noise", 2, 0, "unscored", None)]}  # type: ignore[index]
-    assert breaking_strength(partly, "fast", "pose_noise") == "holds to 1"
+    assert how_far(partly, "fast", "pose_noise") == "holds to 1"
 
 
 def test_a_failed_run_to_compare_with_stands_for_all() -> None:
     """It has figures, too: pictures that are no better than empty ones."""
     failed = run("fast", "as recorded", None, 0, "ok", 10.0) | {"verdict": "failed"}
-    assert breaking_strength(RESULT | {"runs": [failed]}, "fast", "pose_noise") == "1 (failed)"
+    assert how_far(RESULT | {"runs": [failed]}, "fast", "pose_noise") == "failed at 1"
 
 
 def test_the_tables_by_hand() -> None:
     lines = as_markdown(RESULT, ["a (b).png"]).splitlines()
-    start = lines.index("## Where each method breaks")
+    start = lines.index("## How far each method holds")
     assert lines[start + 2 : start + 10] == [
         "| degradation | fast | nerf |",
         "|---|---|---|",
-        "| pose noise, ° a joint | 2 (failed) | 1 (refused) |",
-        "| holes, % of each mask | holds to 5 | 5 (refused) |",
+        "| pose noise, ° a joint | holds to 1, failed at 2 | refused at 1 |",
+        "| holes, % of each mask | holds to 5 | refused at 5 |",
         "",
         "![a (b).png](<a (b).png>)",
         "",

