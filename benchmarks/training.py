@@ -73,7 +73,7 @@ def train_one(shelf: Store, folder: Path, settings: Settings) -> tuple[list[dict
     """Step, seconds and held-out PSNR along a training; and why there is no avatar, if there is none."""
     source, _ = read_capture(folder)
     try:
-        _, model = trained(shelf, ingest(shelf, source, settings.capture), settings)
+        *_, model = trained(shelf, ingest(shelf, source, settings.capture), settings)
         history, reason = model.root / "history.jsonl", None
     except GaveUpError as error:  # the paper's body shrinks before it comes back: docs/method.md
         (history,), reason = (shelf.root / "training").glob("*.partial/history.jsonl"), str(error)

@@ -17,11 +17,10 @@ from hnerf.study.plan import ScoringSettings, Study, Variant, load_study
 from hnerf.study.publish import publish
 from tasks.benchmark import score_training
 from tasks.calibration import calibrated
-from tasks.capture import ingest
+from tasks.capture import ingest, subset_capture
 from tasks.policy import may_pass
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
-from tasks.study import subset_capture
 from tasks.training import train
 
 log = logging.getLogger("hnerf.benchmark")
@@ -85,8 +84,8 @@ def measure(
         parts = variant.parts(Capture.load(recording.root))
         if parts != (None, None, None):
             recording = subset_capture(shelf, recording, *parts)
-        calibration, model = trained(shelf, recording, settings)
-        scores = score_training(shelf, truth, recording, calibration, model, scoring)
+        calibration, body, model = trained(shelf, recording, settings)
+        scores = score_training(shelf, truth, recording, calibration, body, model, scoring)
     except Exception as error:  # one method's fault, of which the others know nothing
         if may_pass(error):
             raise  # a full disk, a lost share, a killed worker
@@ -98,7 +97,8 @@ def measure(
     return found | {"trained_on": counts, "folder": str(scores.root.relative_to(shelf.root))}
 
 
-def trained(shelf: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact]:
-    """The calibration and the training that a recording comes to."""
+def trained(shelf: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact, Artifact]:
+    """The calibration, the body and the training that a recording comes to."""
     stages = prepared(shelf, recording, settings)
-    return stages[1], train(shelf, *stages, settings.training)
+    _, calibration, _, body = stages
+    return calibration, body, train(shelf, *stages, settings.training)
