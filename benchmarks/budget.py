@@ -63,8 +63,8 @@ def train_and_score(folder: Path, shelf: Store, settings: Settings) -> tuple[Tra
     """The training's settings with everything decided; its scores, with the decisions among them."""
     source, truth = read_capture(folder)
     recording = ingest(shelf, source, settings.capture)
-    calibration, model = trained(shelf, recording, settings)
-    scores = score_training(shelf, truth, recording, calibration, model, SCORING)
+    calibration, body, model = trained(shelf, recording, settings)
+    scores = score_training(shelf, truth, recording, calibration, body, model, SCORING)
     stored = json.loads((model.root / "settings.json").read_text())
     found = json.loads((scores.root / "scores.json").read_text())
     return TrainingSettings.model_validate(stored["training"]), found | {"decisions": stored["decisions"]}
@@ -104,7 +104,7 @@ def as_markdown(captures: dict[str, Any]) -> str:
         decisions = [[key, f"{d['value']}", d["reason"]] for key, d in found["decisions"].items()]
         lines += ["", f"## {name}", "", sentence(found)]
         lines += ["", *table([["setting", "decided", "because"], *decisions]), ""]
-        titles = ["", "training, s", "model, MiB", "memory, GiB", "256 px frame, s", "PSNR", "new poses", "Chamfer"]
+        titles = ["", "training, s", "model, MiB", "memory, GiB", "256 px frame, s", "PSNR", "animated", "Chamfer"]
         lines += table([titles, *([title, *cells(row)] for title, row in found["variants"].items())])
     return "\n".join([*lines, ""])
 

@@ -19,6 +19,7 @@ from typing import Any
 
 from provenance import ROOT, SHARED, provenance, sentence, table, write_result
 
+from hnerf.evaluation.views import NEW_POSES
 from tasks.launcher import end_with_parent
 
 SCORE_RUN = SHARED / "accept" / "score_run.py"
@@ -89,8 +90,10 @@ def as_markdown(result: dict[str, Any]) -> str:
         "",
         f"{sentence(result)} Scored by the independent program.",
     ]
-    for split, title in (("novel_view", "Training poses, test cameras"), ("novel_pose", "New poses")):
+    for split, title in (("novel_view", "Training poses, test cameras"), ("novel_pose", "New poses, animated")):
         lines += ["", f"## {title}", "", *_split_table(result["captures"], split)]
+    lines += ["", "## New poses in three columns, by the evaluation itself", "", *_columns_table(result["captures"])]
+    lines += ["", "## Cameras left out, by the evaluation itself", "", *_holdout_table(result["captures"])]
     lines += ["", "## Cost and body fit", "", *_cost_table(result["captures"])]
     protocols = {c["own_metrics"]["protocol"] for c in result["captures"].values() if "own_metrics" in c}
     note = "The independent program samples 30 000 points a surface and counts volumes on an 80^3 grid."
@@ -111,6 +114,37 @@ def _split_table(captures: dict[str, Any], split: str) -> list[str]:
         shown = ["" if v is None else form.format(v) for v, (_, form) in zip(values, columns.values(), strict=True)]
         rows.append([name, str(found["n"]), *shown])
     return table(rows)
+
+
+def _columns_table(captures: dict[str, Any]) -> list[str]:
+    """PSNR / SSIM / mask IoU of animated, posed and tracked new poses; why there are none."""
+    rows = [["capture", "animated", "posed", "tracked"]]
+    for name, figures in captures.items():
+        if "error" not in figures:
+            own = figures["own_metrics"]
+            rows.append([name, *(_in_a_cell(own[column]) for column in NEW_POSES)])
+    return table(rows)
+
+
+def _holdout_table(captures: dict[str, Any]) -> list[str]:
+    """PSNR / SSIM / mask IoU of every camera that was left out, and their mean; why there are none."""
+    rows = [["capture", "camera left out", "training poses", "new poses, animated"]]
+    for name, figures in captures.items():
+        if "error" in figures:
+            continue
+        held_out = figures["own_metrics"]["holdout"]
+        if held_out is None:
+            rows.append([name, "", figures["own_metrics"]["holdout_reason"], ""])
+            continue
+        for camera, found in (held_out["cameras"] | {"mean": held_out["mean"]}).items():
+            rows.append([name, camera, _in_a_cell(found["novel_view"]), _in_a_cell(found["novel_pose"])])
+    return table(rows)
+
+
+def _in_a_cell(found: dict[str, Any]) -> str:
+    if found["psnr"] is None:
+        return str(found.get("reason", ""))
+    return " / ".join(form.format(found[key]) for key, (_, form) in IMAGE_COLUMNS.items())
 
 
 def _cost_table(captures: dict[str, Any]) -> list[str]:

@@ -19,8 +19,7 @@ from hnerf.config import CONFIGS, Settings, TrainingSettings, load_settings, wit
 from hnerf.errors import CaptureError, one_line
 from hnerf.study import results
 from hnerf.study.files import replace_text
-from hnerf.study.scoring import why_no_novel_poses
-from hnerf.tables import head, line, pick, shown
+from hnerf.tables import head, line
 from tasks.capture import ingest
 from tasks.evaluation import evaluate
 from tasks.policy import may_pass
@@ -33,7 +32,7 @@ log = logging.getLogger("hnerf.ablations")
 ABLATIONS = CONFIGS / "ablations"
 FULL = "full"
 MACHINERIES = get_args(TrainingSettings.model_fields["machinery"].annotation)  # a section of settings each
-COLUMNS = results.COLUMNS | {"psnr": ("PSNR", "{:.2f}")}  # cells show training poses / novel poses
+COLUMNS = results.COLUMNS | {"psnr": ("PSNR", "{:.2f}")}
 
 
 @flow(name="ablate", flow_run_name="{capture}-{preset}")
@@ -98,8 +97,7 @@ def why_pointless(full: Settings, ablated: Settings) -> str | None:
 
 
 def measure(shelf: Store, source: Source, truth: Source, settings: Settings) -> dict[str, Any]:
-    """A row's figures: scores of both splits, of novel poses only what the method can show, seconds and device of its
-    training; {"error": one line} if one fails."""
+    """A row's figures: scores of every split, seconds and device of its training; {"error": one line} if one fails."""
     stages = prepared(shelf, ingest(shelf, source, settings.capture), settings)
     try:
         model = train(shelf, *stages, settings.training)
@@ -111,10 +109,8 @@ def measure(shelf: Store, source: Source, truth: Source, settings: Settings) -> 
         return {"error": one_line(error)}
     metrics = json.loads((report.root / "metrics.json").read_text())
     trained = json.loads((model.root / "report.json").read_text())
-    if reason := why_no_novel_poses(model.root):
-        metrics["novel_pose"] = {"reason": reason}
     return {key: trained[key] for key in ("seconds", "device")} | {
-        key: metrics[key] for key in ("protocol", "novel_view", "novel_pose")
+        key: metrics[key] for key in ("protocol", *results.SPLITS)
     }
 
 
@@ -123,14 +119,14 @@ def as_markdown(result: dict[str, Any]) -> str:
     with_overrides = f" with {', '.join(result['overrides'])}" if result["overrides"] else ""
     titles = ["", *(title for title, _ in COLUMNS.values()), "training, s", "on"]
     lines = [f"# Ablations of {result['subject']}, preset `{result['preset']}`{with_overrides}", ""]
-    lines += ["Two figures in a cell: training poses from test cameras / novel poses.", ""]
+    lines += [results.CELL, ""]
     lines += head(titles)
     lines += [line([name, *_cells(row)]) for name, row in result["rows"].items()]
     if result["left_out"]:
         lines += ["", "Left out:", "", *(f"- {name}: {reason}" for name, reason in result["left_out"].items())]
     found = [row for row in result["rows"].values() if "error" not in row]
-    reasons = {reason for row in found if (reason := row["novel_pose"].get("reason"))}
-    lines += ["", *(f"No images of new poses: {reason}." for reason in sorted(reasons))] if reasons else []
+    reasons = {reason: None for row in found for reason in results.reasons(row)}
+    lines += ["", *(f"- {reason}" for reason in reasons)] if reasons else []
     protocols = {row["protocol"] for row in found}
     return "\n".join([*lines, "", *sorted(protocols), ""])
 
@@ -138,6 +134,5 @@ def as_markdown(result: dict[str, Any]) -> str:
 def _cells(row: dict[str, Any]) -> list[str]:
     if "error" in row:
         return [row["error"].replace("|", "/"), *[""] * (len(COLUMNS) + 1)]
-    splits = row["novel_view"], row["novel_pose"]
-    scores = [" / ".join(shown(pick(split, key), form) for split in splits) for key, (_, form) in COLUMNS.items()]
+    scores = [results.cell(row, key, form) for key, (_, form) in COLUMNS.items()]
     return [*scores, f"{row['seconds']:.0f}", row["device"]]

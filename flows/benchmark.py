@@ -18,11 +18,10 @@ from hnerf.study.plan import Study, Variant, load_study
 from hnerf.study.publish import publish
 from tasks.benchmark import score_end_of_training, score_training
 from tasks.calibration import calibrated
-from tasks.capture import ingest
+from tasks.capture import ingest, subset_capture
 from tasks.policy import may_pass
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
-from tasks.study import subset_capture
 from tasks.training import train
 
 log = logging.getLogger("hnerf.benchmark")
@@ -89,7 +88,8 @@ def measure(shelf: Store, source: Source, truth: Source, variant: Variant, plan:
         if plan.until_flat:
             settings, more = until_flat(shelf, truth, stages, plan, method)
         model = train(shelf, *stages, settings.training)
-        scores = score_training(shelf, truth, recording, stages[1], model, plan.scoring)
+        _, calibration, _, body = stages
+        scores = score_training(shelf, truth, recording, calibration, body, model, plan.scoring)
     except Exception as error:  # one method's fault, of which the others know nothing
         if may_pass(error):
             raise  # a full disk, a lost share, a killed worker
@@ -107,12 +107,13 @@ def until_flat(
     """Settings of the last of longer and longer trainings; the curve of all, and why there are no longer ones. One that
     fails has no point: it may be too young for a surface."""
     assert plan.seconds is not None
+    recording, calibration, _, body = stages
     points: list[dict[str, Any]] = []
     for limit_s in limits_s(plan.seconds):
         settings, ended = plan.settings(method, limit_s), "limit"
         try:
             model = train(shelf, *stages, settings.training)
-            point = score_end_of_training(shelf, truth, *stages[:2], model, plan.scoring)
+            point = score_end_of_training(shelf, truth, recording, calibration, body, model, plan.scoring)
         except Exception as error:
             if may_pass(error):
                 raise
@@ -127,3 +128,10 @@ def until_flat(
         if ended != "limit":
             break
     return settings, {"curve": points, "ended": ended}
+
+
+def trained(shelf: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact, Artifact]:
+    """The calibration, the body and the training that a recording comes to."""
+    stages = prepared(shelf, recording, settings)
+    _, calibration, _, body = stages
+    return calibration, body, train(shelf, *stages, settings.training)

@@ -15,14 +15,15 @@ from flows.train_subject import prepared
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
 from hnerf.errors import CaptureError, NotPossibleError, one_line
+from hnerf.evaluation.columns import why_no_novel_poses
+from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, TRACKED
 from hnerf.study.degrade import KINDS, Degradation, degrade_settings
 from hnerf.study.files import replace_text, with_pictures
-from hnerf.study.scoring import why_no_novel_poses
 from hnerf.study.stability import Stability, load_stability
 from hnerf.study.stability_charts import curve_chart, matrix_chart
 from hnerf.study.stability_report import REFERENCE, as_markdown
 from hnerf.study.verdict import BROKEN, Verdict, judge, near_border
-from tasks.capture import ingest
+from tasks.capture import ingest, subset_capture
 from tasks.evaluation import evaluate
 from tasks.fit import fit
 from tasks.policy import may_pass
@@ -35,14 +36,13 @@ from tasks.study import (
     degrade_masks,
     dress,
     show_in_extreme_poses,
-    subset_capture,
 )
 from tasks.training import train
 
 log = logging.getLogger("hnerf.stability")
 
 Figures = dict[str, Any]
-IMAGE_FIGURES = ("psnr", "ssim", "empty_psnr")
+IMAGE_FIGURES = ("psnr", "ssim", "empty_psnr", "posed_psnr", "tracked_psnr")
 
 
 @flow(name="stability", flow_run_name="{capture}")
@@ -161,7 +161,8 @@ def in_common(one: Figures, other: Figures) -> Figures:
     """Means of one run's figures over the images and surfaces that the other has as well, and how many these are."""
     images = [score for view, score in one["images"].items() if view in other["images"]]
     surfaces = [chamfer_mm for frame, chamfer_mm in one["surfaces"].items() if frame in other["surfaces"]]
-    means = {key: float(np.mean([s[key] for s in images])) if images else None for key in IMAGE_FIGURES}
+    known = {key: [s[key] for s in images if s.get(key) is not None] for key in IMAGE_FIGURES}
+    means = {key: float(np.mean(values)) if values else None for key, values in known.items()}
     means["chamfer_mm"] = float(np.mean(surfaces)) if surfaces else None
     return means | {"images": len(images), "surfaces": len(surfaces)}
 
@@ -221,8 +222,9 @@ def measure(
     model: Artifact,
 ) -> Figures:
     """Faults of surfaces; figures of each image and the Chamfer distance of each surface against the truth, as far as
-    there is one, of novel poses, or of training poses where the capture as recorded or the method has no others. Of
-    extreme poses faults alone."""
+    there is one, of novel poses, animated, or of training poses where the capture as recorded or the method has no
+    others. Of extreme poses faults alone. A fit that was made worse is trained on; novel poses are shown as the good
+    one has them."""
     no_poses = why_no_novel_poses(model.root)
     if degradation and KINDS[degradation.kind].place == "poses":
         if no_poses:
@@ -231,25 +233,37 @@ def measure(
     *_, good_body = prepare(shelf, recording, truth, settings, None)
     if degradation and KINDS[degradation.kind].place == "worn":
         _, truth = read_capture(stages[0].root)
-    report = evaluate(shelf, truth, *stages, model, settings.evaluation)
+    recorded, calibration, masks, body = stages
+    if degradation and KINDS[degradation.kind].place == "fit":
+        body = good_body
+    report = evaluate(shelf, truth, recorded, calibration, masks, body, model, settings.evaluation)
     metrics = json.loads((report.root / "metrics.json").read_text())
-    capture = Capture.load(recording.root)
-    novel = capture.novel_pose_frames
-    split = metrics["novel_pose" if novel and not no_poses else "novel_view"]
-    surfaces = (split["geometry"] or {"per_surface": []})["per_surface"]
+    novel = Capture.load(recording.root).novel_pose_frames and not no_poses
+    split = ANIMATED if novel else NOVEL_VIEW
+    surfaces = (metrics[split]["geometry"] or {"per_surface": []})["per_surface"]
     return {
-        "images": {(r["camera"], r["frame"]): r for r in split["per_image"] if capture.test_cameras},
+        "images": _images(metrics, split),
         "surfaces": {surface["frame"]: surface["chamfer_mm"] for surface in surfaces},
-        "faults": _faults(check_meshes(shelf, report, good_body), novel if no_poses else ()),
+        "faults": _faults(check_meshes(shelf, report, good_body)),
         "protocol": metrics["protocol"],
         "seconds": json.loads((model.root / "report.json").read_text())["seconds"],
     }
 
 
-def _faults(checked: Artifact, without: Sequence[int] = ()) -> list[str]:
-    """Of all surfaces but those of some frames."""
-    surfaces, names = json.loads((checked.root / "surface.json").read_text()), {f"{frame:06d}" for frame in without}
-    return [surface["fault"] for name, surface in surfaces.items() if surface["fault"] and name not in names]
+def _images(metrics: Figures, split: str) -> dict[tuple[str, int], Figures]:
+    """Figures of each image by camera and frame; of animated poses also what they have posed and tracked."""
+    images = {(row["camera"], row["frame"]): dict(row) for row in metrics[split]["per_image"]}
+    others = {"posed_psnr": POSED, "tracked_psnr": TRACKED} if split == ANIMATED else {}
+    for key, other in others.items():
+        for row in metrics[other]["per_image"]:
+            images[row["camera"], row["frame"]][key] = row["psnr"]
+    return images
+
+
+def _faults(checked: Artifact) -> list[str]:
+    """Of all surfaces."""
+    surfaces = json.loads((checked.root / "surface.json").read_text())
+    return [surface["fault"] for surface in surfaces.values() if surface["fault"]]
 
 
 def _tell(result: Figures, charts: list[str], table: Path) -> None:

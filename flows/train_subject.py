@@ -6,11 +6,13 @@ from prefect import flow
 
 from flows.run_page import show
 from hnerf.capture.capture import Capture
+from hnerf.capture.ingest import recorded_cameras
 from hnerf.config import Settings, load_settings
+from hnerf.evaluation.holdout import cameras_left_out
 from tasks.asset import export
-from tasks.calibration import calibrate
-from tasks.capture import ingest
-from tasks.evaluation import evaluate
+from tasks.calibration import calibrate, calibrated
+from tasks.capture import ingest, subset_capture
+from tasks.evaluation import evaluate, evaluate_held_out
 from tasks.fit import fit
 from tasks.segmentation import needs_body, segment, settled
 from tasks.source import read_capture
@@ -25,20 +27,26 @@ def train_subject(
     """Train one person and export the avatar; returns the folder that links to each stage's result.
 
     capture: the recording's folder; preset: a name under configs/ or a YAML file; store: where artifacts are kept;
-    overrides: settings like "training.steps=100".
+    overrides: settings like "training.steps=100". Where `evaluation.holdout` names a camera, a second field is trained
+    without it, or one without each camera in turn.
     """
     settings = load_settings(preset, overrides or ())
     shelf = Store(store.resolve())
     source, truth = read_capture(capture, store)
+    if settings.evaluation.holdout:
+        recorded = recorded_cameras(source.root)
+        cameras_left_out(recorded.train, recorded.test, settings.evaluation.holdout)  # refused before any work
 
     recording = ingest(shelf, source, settings.capture)
     subject = Capture.load(recording.root).name
     shelf.show(subject, recording)
     calibration = shelf.show(subject, calibrate(shelf, recording, settings.calibration))
+    left_out = left_out_cameras(recording, calibration, settings)
     masks = shelf.show(subject, find_masks(shelf, recording, calibration, settings))
     body = shelf.show(subject, fit(shelf, recording, calibration, masks, settings.fit))
     model = shelf.show(subject, train(shelf, recording, calibration, masks, body, settings.training))
-    report = evaluate(shelf, truth, recording, calibration, masks, body, model, settings.evaluation)
+    held_out = tuple(without(camera, shelf, recording, calibration, masks, settings) for camera in left_out)
+    report = evaluate(shelf, truth, recording, calibration, masks, body, model, settings.evaluation, held_out)
     shelf.show(subject, report)
     asset = export(shelf, recording, calibration, model, settings.asset)
     for artifact in (recording, calibration, masks, body, model, report, asset):
@@ -49,9 +57,35 @@ def train_subject(
 
 def prepared(shelf: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact, Artifact, Artifact]:
     """What training and evaluation are given of a recording: itself, calibration, masks and body."""
-    calibration = calibrate(shelf, recording, settings.calibration)
+    return fitted(shelf, recording, calibrate(shelf, recording, settings.calibration), settings)
+
+
+def fitted(
+    shelf: Store, recording: Artifact, calibration: Artifact, settings: Settings
+) -> tuple[Artifact, Artifact, Artifact, Artifact]:
+    """The same of a recording whose cameras were calibrated."""
     masks = find_masks(shelf, recording, calibration, settings)
     return recording, calibration, masks, fit(shelf, recording, calibration, masks, settings.fit)
+
+
+def left_out_cameras(recording: Artifact, calibration: Artifact, settings: Settings) -> tuple[str, ...]:
+    """Of the cameras that calibration left those that a field is to be trained without."""
+    if settings.evaluation.holdout is None:
+        return ()
+    used = calibrated(recording, calibration)
+    return cameras_left_out(used.train_cameras, used.test_cameras, settings.evaluation.holdout)
+
+
+def without(
+    camera: str, shelf: Store, recording: Artifact, calibration: Artifact, masks: Artifact, settings: Settings
+) -> Artifact:
+    """Masks, body and field made anew without a camera, scored on it and its `masks`; where cameras stand is known from
+    all of them."""
+    others = tuple(name for name in calibrated(recording, calibration).train_cameras if name != camera)
+    stages = fitted(shelf, subset_capture(shelf, recording, others, None, None), calibration, settings)
+    model = train(shelf, *stages, settings.training)
+    scored = settings.evaluation.model_copy(update={"holdout": camera})  # whether it is one of several or not
+    return evaluate_held_out(shelf, recording, calibration, masks, stages[-1], model, scored)
 
 
 def find_masks(shelf: Store, recording: Artifact, calibration: Artifact, settings: Settings) -> Artifact:

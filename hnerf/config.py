@@ -212,6 +212,7 @@ class EvaluationSettings(Section):
     max_meshes: int = Field(default=4, ge=1)  # a split
     max_images: int | None = Field(default=None, ge=1)  # a split; None: all
     report_rows: int = Field(default=3, ge=1)  # frames shown of each split
+    holdout: str | None = None  # a camera, or "each" in turn, that a second, scored field goes without; no test cameras
 
 
 class AssetSettings(Section):

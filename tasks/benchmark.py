@@ -4,6 +4,7 @@ from pathlib import Path
 
 import torch
 
+from hnerf.body.fit_result import BodyFit
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.study.plan import ScoringSettings
 from hnerf.study.scoring import Scene, score, score_end
@@ -19,11 +20,12 @@ def score_training(
     truth: Source,
     recording: Artifact,
     calibration: Artifact,
+    body: Artifact,
     training: Artifact,
     settings: ScoringSettings,
 ) -> dict[str, float]:
     """Held-out figures of a training's snapshots and of its end; time of a frame."""
-    found = score(scene(truth, recording, calibration), training.root, settings, out)
+    found = score(scene(truth, recording, calibration, body), training.root, settings, out)
     psnr = found[found["split"]]["psnr"]
     return {} if psnr is None else {"psnr": psnr}
 
@@ -34,16 +36,17 @@ def score_end_of_training(
     truth: Source,
     recording: Artifact,
     calibration: Artifact,
+    body: Artifact,
     training: Artifact,
     settings: ScoringSettings,
 ) -> dict[str, float]:
     """The last point of a training's curve, no more."""
-    found = score_end(scene(truth, recording, calibration), training.root, settings, out)
+    found = score_end(scene(truth, recording, calibration, body), training.root, settings, out)
     return {"steps": found["training"]["steps"], "seconds": found["training"]["field_seconds"]}
 
 
-def scene(truth: Source, recording: Artifact, calibration: Artifact) -> Scene:
+def scene(truth: Source, recording: Artifact, calibration: Artifact, body: Artifact) -> Scene:
     """What trainings on a recording are scored against, on the GPU where there is one."""
     capture = calibrated(recording, calibration)
     known = GroundTruth(truth.root, capture) if (truth.root / GROUND_TRUTH).is_dir() else None
-    return Scene(capture, known, "cuda" if torch.cuda.is_available() else "cpu")
+    return Scene(capture, BodyFit.load(body.root), known, "cuda" if torch.cuda.is_available() else "cpu")

@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
+from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest as ingest_folder
+from hnerf.capture.subset import subset
 from hnerf.config import CaptureSettings
 from tasks.source import Source
 from tasks.stage import stage
+from tasks.store import Artifact
 
 
 @stage("capture", version="7")
@@ -13,3 +16,17 @@ def ingest(out: Path, source: Source, settings: CaptureSettings) -> dict[str, fl
     """Read a recording in whatever layout it has; undistort and normalise it."""
     capture = ingest_folder(source.root, settings, out)
     return {"cameras": len(capture.cameras), "frames": len(capture.frames)}
+
+
+@stage("subset", version="1")
+def subset_capture(
+    out: Path,
+    recording: Artifact,
+    cameras: tuple[str, ...] | None,
+    train_frames: tuple[int, ...] | None,
+    novel_pose_frames: tuple[int, ...] | None,
+) -> dict[str, float]:
+    """A capture with only these training cameras and frames; None keeps all. Test cameras stay."""
+    subset(Capture.load(recording.root), out, cameras, train_frames, novel_pose_frames)
+    kept = Capture.load(out)
+    return {"cameras": len(kept.cameras), "frames": len(kept.frames)}

@@ -1,13 +1,15 @@
 """Stage 6: how good it is, and what it cost."""
 
-import itertools
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import EvaluationSettings
 from hnerf.evaluation.evaluate import evaluate as evaluate_avatar
+from hnerf.evaluation.holdout import score_held_out
 from hnerf.evaluation.inputs import EvaluationInputs
+from hnerf.evaluation.views import SPLITS
 from hnerf.segmentation.masks import Masks
 from tasks.calibration import calibrated
 from tasks.source import Source
@@ -16,7 +18,7 @@ from tasks.store import Artifact
 from tasks.training import trained
 
 
-@stage("evaluation", version="9")
+@stage("evaluation", version="10")
 def evaluate(
     out: Path,
     truth: Source,
@@ -26,8 +28,10 @@ def evaluate(
     body: Artifact,
     training: Artifact,
     settings: EvaluationSettings,
+    held_out: tuple[Artifact, ...] = (),
 ) -> dict[str, float]:
-    """Renderings, meshes and figures by the evaluation protocol of docs/method.md, and a report for people."""
+    """Renderings, meshes and figures by the evaluation protocol of docs/method.md, and a report for people. held_out:
+    what `evaluate_held_out` found, one a camera."""
     inputs = EvaluationInputs(
         capture_folder=truth.root,
         capture=calibrated(recording, calibration),
@@ -39,11 +43,31 @@ def evaluate(
         fit_folder=body.root,
         fit_seconds=body.metrics,
         training_folder=training.root,
+        held_out_folders=tuple(scores.root for scores in held_out),
     )
-    return _headline(evaluate_avatar(inputs, settings, out))
+    found = evaluate_avatar(inputs, settings, out)
+    held_out_mean = _headline((found["holdout"] or {"mean": {}})["mean"])
+    return _headline(found) | {f"holdout {name}": value for name, value in held_out_mean.items()}
 
 
-def _headline(found: dict[str, Any]) -> dict[str, float]:
-    """The mean image figures of both splits, those that there are."""
-    wanted = itertools.product(("novel_view", "novel_pose"), ("psnr", "ssim"))
-    return {f"{split} {name}": found[split][name] for split, name in wanted if found[split][name] is not None}
+@stage("holdout", version="1")
+def evaluate_held_out(
+    out: Path,
+    recording: Artifact,
+    calibration: Artifact,
+    segmentation: Artifact,
+    body: Artifact,
+    training: Artifact,
+    settings: EvaluationSettings,
+) -> dict[str, float]:
+    """Figures of a camera, `settings.holdout`, against its own masks. Recording, calibration and segmentation are with
+    that camera, body and training without it."""
+    capture, masks = calibrated(recording, calibration), Masks.load(segmentation.root)
+    avatar, fitted = trained(training), BodyFit.load(body.root)
+    return _headline(score_held_out(capture, masks, avatar, fitted, training.root, settings, out))
+
+
+def _headline(found: Mapping[str, Any]) -> dict[str, float]:
+    """The mean image figures of each split, those that there are."""
+    means = {f"{split} {name}": found[split][name] for split in SPLITS if split in found for name in ("psnr", "ssim")}
+    return {name: value for name, value in means.items() if value is not None}

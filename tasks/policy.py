@@ -20,7 +20,7 @@ from tasks.store import Artifact, Store, sha256_of
 LASTING = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 LASTING_NUMBERS = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTEMPTY)  # which have no class of their own
 
-Input = Artifact | Source | Section | tuple[str, ...] | tuple[int, ...] | None
+Input = Artifact | Source | Section | tuple[str, ...] | tuple[int, ...] | tuple[Artifact, ...] | None
 
 
 def stage_key(task: str, version: str, inputs: dict[str, Input]) -> str:
@@ -30,8 +30,10 @@ def stage_key(task: str, version: str, inputs: dict[str, Input]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def _identity(value: Input) -> Any:
-    if value is None or isinstance(value, tuple):
+def _identity(value: Input | str | int) -> Any:
+    if isinstance(value, tuple):
+        return [_identity(one) for one in value]
+    if value is None or isinstance(value, str | int):
         return value
     if isinstance(value, Section):
         return value.model_dump()

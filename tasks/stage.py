@@ -42,9 +42,10 @@ class Stage(Generic[P]):
 
     def __call__(self, store: Store, *args: P.args, **kwargs: P.kwargs) -> Artifact:
         _, *parameters = inspect.signature(self.write).parameters.values()
-        inputs = inspect.Signature(parameters).bind(*args, **kwargs).arguments
+        inputs = inspect.Signature(parameters).bind(*args, **kwargs)
+        inputs.apply_defaults()
         run = self.task if FlowRunContext.get() else self.task.fn
-        return run(store=store, inputs=dict(inputs))
+        return run(store=store, inputs=dict(inputs.arguments))
 
     def _run(self, store: Store, inputs: dict[str, Input]) -> Artifact:
         key = stage_key(self.name, self.version, inputs)

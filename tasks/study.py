@@ -17,7 +17,6 @@ from hnerf.study.degrade import degrade_fit as disturbed
 from hnerf.study.degrade import degrade_masks as degraded
 from hnerf.study.degrade import dress as write_dressed
 from hnerf.study.degraded_fit import extreme_poses
-from hnerf.study.subset import subset
 from hnerf.study.surface import SurfaceCheck, check_pose, check_surface
 from tasks.calibration import calibrated
 from tasks.source import Source
@@ -26,20 +25,6 @@ from tasks.store import Artifact
 from tasks.training import trained
 
 EXTREME_POSES = 3  # shown of each strength and seed
-
-
-@stage("study-subset", version="1")
-def subset_capture(
-    out: Path,
-    recording: Artifact,
-    cameras: tuple[str, ...] | None,
-    train_frames: tuple[int, ...] | None,
-    novel_pose_frames: tuple[int, ...] | None,
-) -> dict[str, float]:
-    """A capture with only these training cameras and frames; None keeps all. Test cameras stay."""
-    subset(Capture.load(recording.root), out, cameras, train_frames, novel_pose_frames)
-    kept = Capture.load(out)
-    return {"cameras": len(kept.cameras), "frames": len(kept.frames)}
 
 
 @stage("study-capture", version="2")

@@ -126,12 +126,13 @@ def _finite(tree: Any) -> Any:
 
 
 def load_cameras(out: Path, capture: Capture) -> Capture:
-    """The capture seen through the cameras that `save` wrote, and in step; rejected training cameras are gone."""
+    """The capture seen through those of its cameras that `save` wrote, and in step; rejected training cameras are
+    gone. The capture may have fewer cameras than were calibrated."""
     intri, extri = (cv2.FileStorage(str(out / name), cv2.FILE_STORAGE_READ) for name in ("intri.yml", "extri.yml"))
     if not (intri.isOpened() and extri.isOpened()):
         raise CaptureError(f"{out}: intri.yml or extri.yml cannot be read; run the calibration stage again")
     names = intri.getNode("names")
-    kept = [names.at(i).string() for i in range(names.size())]
+    kept = [name for i in range(names.size()) if (name := names.at(i).string()) in capture.cameras]
     cameras = {
         name: dataclasses.replace(
             capture.cameras[name],

@@ -165,11 +165,20 @@ def read_rgb(path: Path) -> np.ndarray:
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
+def read_rgba(path: Path) -> np.ndarray:
+    """(H, W, 4) uint8, as `write_image` wrote it; CaptureError if it cannot be read or has no alpha."""
+    bgra = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if bgra is None or bgra.shape[2:] != (4,):
+        raise CaptureError(f"{path}: no readable image with an alpha channel; make it again")
+    return cv2.cvtColor(bgra, cv2.COLOR_BGRA2RGBA)
+
+
 def write_image(path: Path, pixels: np.ndarray) -> None:
-    """An image, grey (H, W) or RGB (H, W, 3), in the format that the name says, in a folder that need not be there yet:
-    JPEG without chroma subsampling. OSError if it cannot be written."""
+    """An image, grey (H, W), RGB (H, W, 3) or RGBA (H, W, 4), in the format that the name says, in a folder that need
+    not be there yet: JPEG without chroma subsampling. OSError if it cannot be written."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    as_stored = np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels)
+    colour = pixels.ndim == 3
+    as_stored = np.concatenate([pixels[..., 2::-1], pixels[..., 3:]], -1) if colour else np.ascontiguousarray(pixels)
     if not cv2.imwrite(str(path), as_stored, JPEG_OPTIONS if path.suffix == ".jpg" else []):
         raise OSError(f"{path}: cannot be written; is the disk full?")
 

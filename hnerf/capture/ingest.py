@@ -22,7 +22,7 @@ from hnerf.capture.keypoint_files import read_openpose, read_results
 from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
 from hnerf.capture.lens import Lens
 from hnerf.capture.normalise import Normaliser
-from hnerf.capture.notes import capture_name, chosen_cameras, chosen_frames, read_notes
+from hnerf.capture.notes import CameraSplit, capture_name, chosen_cameras, chosen_frames, read_notes
 from hnerf.capture.timing import usual_step
 from hnerf.config import CaptureSettings
 from hnerf.errors import CaptureError
@@ -101,6 +101,12 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
     )
     capture.save()
     return capture
+
+
+def recorded_cameras(folder: Path) -> CameraSplit:
+    """Which cameras of a capture folder are for training and which for testing; CaptureError as `ingest`."""
+    layout = recognise(folder)
+    return chosen_cameras(folder, read_notes(folder), list(layout.lenses()), layout.training_cameras())
 
 
 def recognise(folder: Path) -> Layout:

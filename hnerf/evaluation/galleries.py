@@ -1,5 +1,6 @@
 """Rows of pictures for the report: what a camera saw, what was made of it, and how far it is off."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from hnerf.evaluation import pictures
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.mesh_queries import Surface
+from hnerf.evaluation.metrics import COVERED_LEVEL
 from hnerf.evaluation.views import TRAINING_VIEW, View
 
 
@@ -40,28 +42,37 @@ class Gallery:
     rows: list[Row]
 
 
-def view_row(view: View, rendered: np.ndarray, inputs: EvaluationInputs, truth: GroundTruth | None, note: str) -> Row:
-    """Input, mask, fitted body, rendering, reference and error, cut to the person.
+def view_row(
+    view: View,
+    rendered: np.ndarray,
+    inputs: EvaluationInputs,
+    truth: GroundTruth | None,
+    note: str,
+    body: BodyFit | None,
+    others: Mapping[str, np.ndarray],
+) -> Row:
+    """Input, mask, fitted body, rendering, reference, error, and other renderings by caption, cut to the person.
 
-    A scored view is compared to the truth; a training view, or one without a truth, to the photograph under its mask.
+    Renderings are (H, W, 4), RGB over black and coverage; body None: none is shown. A scored view is compared to the
+    truth; a training view, or one without a truth, to the photograph under its mask.
     """
     image = inputs.capture.image(view.camera, view.frame)
     mask, reference = _mask_and_reference(view, image, inputs, truth)
-    lit = rendered.max(-1) > 0
-    box = pictures.frame_person(lit if mask is None else lit | mask)
+    covered = rendered[..., 3] > COVERED_LEVEL
+    box = pictures.frame_person(covered if mask is None else covered | mask)
     camera = pictures.cropped_camera(inputs.capture.cameras[view.camera], box)
-    cut_image, cut_rendered = pictures.crop(image, box), pictures.crop(rendered, box)
+    cut_image, cut_rendered = pictures.crop(image, box), pictures.crop(rendered[..., :3], box)
     row = [("Input", cut_image)]
     if mask is not None:
         cut_mask = pictures.crop(mask.astype(np.uint8) * 255, box) > 127
         row.append(("Mask", pictures.show_mask(cut_image, cut_mask)))
-    row.append(
-        ("Fitted body", pictures.overlay_surface(cut_image, Surface(_body_mesh(inputs.fitted, view.frame)), camera))
-    )
+    if body is not None:
+        row.append(("Fitted body", pictures.overlay_surface(cut_image, Surface(_body_mesh(body, view.frame)), camera)))
     row.append(("Render", cut_rendered))
     if reference is not None:
         caption, cut_reference = reference[0], pictures.crop(reference[1], box)
         row += [(caption, cut_reference), ("Error", pictures.error_map(cut_rendered, cut_reference))]
+    row += [(caption, pictures.crop(other[..., :3], box)) for caption, other in others.items()]
     return Row(f"Frame {view.frame}, camera {view.camera}", note, _captioned(row))
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -17,9 +18,30 @@ ON_BLACK = "ground_truth/on_black"
 MASKED_IMAGE = "image x ground-truth mask"
 
 
+class Truth(Protocol):
+    """What images are scored against."""
+
+    @property
+    def has_masks(self) -> bool:
+        """Whether images can be scored."""
+        ...
+
+    def has_mask(self, camera: str, frame: int) -> bool:
+        """Whether this image can be scored."""
+        ...
+
+    def mask(self, camera: str, frame: int) -> np.ndarray:
+        """(H, W) bool, True on the person."""
+        ...
+
+    def on_black(self, camera: str, frame: int) -> tuple[np.ndarray, str]:
+        """The person alone over black, (H, W, 3) uint8, and where that comes from."""
+        ...
+
+
 @dataclass(frozen=True)
 class GroundTruth:
-    """Readers of an original capture folder's `ground_truth/`; images are of the recorded frame nearest in time, as
+    """The Truth of an original capture folder's `ground_truth/`; images are of the recorded frame nearest in time, as
     those of the capture are, and come at the size of its camera."""
 
     folder: Path

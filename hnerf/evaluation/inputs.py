@@ -14,8 +14,8 @@ class EvaluationInputs:
     """Everything made before evaluation.
 
     capture_folder: as recorded, for its ground_truth/; capture: with the calibrated cameras; fitted: the body before
-    training (avatar.body holds the fine-tuned one); the folders hold their stages' report.json; fit_seconds: of each
-    part of the fit.
+    training (avatar.body holds the fine-tuned one); the folders hold their stages' report.json; held_out_folders: what
+    `score_held_out` left, one a camera; fit_seconds: of each part of the fit.
     """
 
     capture_folder: Path
@@ -27,4 +27,5 @@ class EvaluationInputs:
     segmentation_folder: Path
     fit_folder: Path
     training_folder: Path
+    held_out_folders: tuple[Path, ...] = ()
     fit_seconds: dict[str, float] = field(default_factory=dict)

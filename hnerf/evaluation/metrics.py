@@ -6,12 +6,12 @@ import numpy as np
 from skimage.metrics import structural_similarity
 
 BOX_PADDING_PX = 20
-COVERED_LEVEL = 8  # of 255; a rendered pixel brighter than this in any channel counts as person
+COVERED_LEVEL = 127  # of 255; a rendered pixel that is covered by more counts as person, however dark it is
 
 
 @dataclass(frozen=True)
 class ImageScore:
-    """psnr in dB; ssim in [-1, 1]; mask_iou: rendered pixels that are not black against the mask, in [0, 1]."""
+    """psnr in dB; ssim in [-1, 1]; mask_iou: covered pixels against the mask, in [0, 1]."""
 
     psnr: float
     ssim: float
@@ -19,10 +19,11 @@ class ImageScore:
 
 
 def score_image(rendered: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> ImageScore:
-    """Score a rendering against a reference, both (H, W, 3) uint8 over black; mask (H, W) bool, not empty."""
+    """Score a rendering (H, W, 4), over black and its coverage, against a reference (H, W, 3) over black, both uint8;
+    mask (H, W) bool, not empty."""
     box = mask_box(mask)
-    a, b = rendered[box].astype(np.float32) / 255, reference[box].astype(np.float32) / 255
-    return ImageScore(psnr(a, b), ssim(a, b), mask_iou(rendered, mask))
+    a, b = rendered[box][..., :3].astype(np.float32) / 255, reference[box].astype(np.float32) / 255
+    return ImageScore(psnr(a, b), ssim(a, b), mask_iou(rendered[..., 3], mask))
 
 
 def floors(reference: np.ndarray, mask: np.ndarray) -> dict[str, float]:
@@ -56,7 +57,8 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
     )
 
 
-def mask_iou(rendered: np.ndarray, mask: np.ndarray) -> float:
-    """Intersection over union of a rendering's (H, W, 3) uint8 lit pixels and a mask (H, W) bool."""
-    lit = rendered.max(-1) > COVERED_LEVEL
-    return float((lit & mask).sum() / (lit | mask).sum())
+def mask_iou(coverage: np.ndarray, mask: np.ndarray) -> float:
+    """Intersection over union of the pixels that a rendering covers (H, W) uint8 by more than a half, and a mask (H, W)
+    bool."""
+    covered = coverage > COVERED_LEVEL
+    return float((covered & mask).sum() / (covered | mask).sum())

@@ -3,20 +3,34 @@
 import base64
 import json
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
 import trimesh
 
-from hnerf.capture.capture import read_rgb
+from hnerf.capture.capture import read_rgba
 from hnerf.config import EvaluationSettings
 from hnerf.evaluation import charts
 from hnerf.evaluation.galleries import Gallery, Picture, surface_row, view_row
 from hnerf.evaluation.ground_truth import MASKED_IMAGE, GroundTruth
+from hnerf.evaluation.images import TUNED_ON
 from hnerf.evaluation.inputs import EvaluationInputs
-from hnerf.evaluation.views import SPLITS, TRAINING_VIEW, View, all_views, some_views
-from hnerf.tables import pick
+from hnerf.evaluation.views import (
+    ANIMATED,
+    NOVEL_VIEW,
+    POSED,
+    PRIMARY,
+    SPLITS,
+    TRACKED,
+    TRAINING_VIEW,
+    View,
+    all_views,
+    some_views,
+)
+from hnerf.tables import pick, shown
 
 FIGURES = (  # where in a split's scores, name, unit, format, what it means
     (
@@ -27,7 +41,7 @@ FIGURES = (  # where in a split's scores, name, unit, format, what it means
         "Pixel error, logarithmic. Higher is better; 3 dB more is half the squared error.",
     ),
     ("ssim", "SSIM", "", "{:.3f}", "Likeness of local structure: edges, folds, pattern. 1 is identical."),
-    ("mask_iou", "Mask IoU", "", "{:.3f}", "Overlap of the rendered and the true outline. 1 is identical."),
+    ("mask_iou", "Mask IoU", "", "{:.3f}", "Overlap of what is rendered and the true mask. 1 is identical."),
     ("geometry.chamfer_mm", "Surface distance", "mm", "{:.1f}", "Mean distance between the surface and the true one."),
     ("geometry.chamfer_l2_e3", "Chamfer", "m² × 10⁻³", "{:.3f}", "Mean squared distance; far-off parts weigh more."),
     (
@@ -39,7 +53,17 @@ FIGURES = (  # where in a split's scores, name, unit, format, what it means
     ),
     ("geometry.iou", "Volume IoU", "", "{:.3f}", "Overlap of the volumes. 1 is identical."),
 )
-SPLIT_TITLES = {"novel_view": "New views", "novel_pose": "New poses"}
+SPLIT_TITLES = {
+    NOVEL_VIEW: "New views",
+    ANIMATED: "New poses, animated",
+    POSED: "New poses, posed",
+    TRACKED: "New poses, tracked",
+}
+COLUMNS = (  # of new poses
+    ("Animated", "poses as they were fitted before training, nothing tuned: what the avatar does in any motion"),
+    ("Posed", "poses tuned on the training cameras' pictures of these frames"),
+    ("Tracked", "poses and each frame's own deformation tuned on them"),
+)
 LONG_LIST = 12
 
 
@@ -66,6 +90,9 @@ def write_report(
         capture=inputs.capture,
         size_px=image_sizes(inputs),
         split_titles=SPLIT_TITLES,
+        columns=COLUMNS,
+        reasons=reasons(found),
+        held_out=held_out_rows(found),
         found=found,
         summary=summary(found),
         galleries=galleries(inputs, settings, truth, true_meshes, found, out),
@@ -106,9 +133,21 @@ def summary(found: dict[str, Any]) -> list[dict[str, Any]]:
     rows = []
     for key, name, unit, form, meaning in FIGURES:
         values = [pick(found[split], key) for split in SPLITS]
-        shown = ["–" if value is None else form.format(value) for value in values]
-        rows.append({"name": name, "unit": unit, "meaning": meaning, "values": shown})
+        cells = ["–" if value is None else form.format(value) for value in values]
+        rows.append({"name": name, "unit": unit, "meaning": meaning, "values": cells})
     return rows
+
+
+def held_out_rows(found: dict[str, Any]) -> list[list[str]]:
+    """Cells of a table: a row for each camera that was left out, and their mean."""
+    if found["holdout"] is None:
+        return []
+    forms = {"psnr": "{:.2f}", "ssim": "{:.3f}", "mask_iou": "{:.3f}"}
+    scores = {f"Camera {name}": by_split for name, by_split in found["holdout"]["cameras"].items()}
+    return [
+        [name, *(shown(by_split[split][key], form) for split in PRIMARY for key, form in forms.items())]
+        for name, by_split in (scores | {"Mean": found["holdout"]["mean"]}).items()
+    ]
 
 
 def galleries(
@@ -119,17 +158,42 @@ def galleries(
     found: dict[str, Any],
     out: Path,
 ) -> list[Gallery]:
-    """Training views, then a gallery for each split that has images, then the surfaces."""
+    """Training views, new views and new poses as far as there are images, cameras left out, then the surfaces."""
     made = []
-    for split in (TRAINING_VIEW, *SPLITS):
+    for split in (TRAINING_VIEW, NOVEL_VIEW, ANIMATED):
         views = dict.fromkeys(some_views(all_views(inputs.capture, split), settings.report_rows), "")
         if split in SPLITS and found[split]["per_image"]:
             worst = min(found[split]["per_image"], key=lambda score: score["psnr"])
             views[View(split, worst["camera"], worst["frame"])] = f"the worst of this split, {worst['psnr']:.1f} dB"
-        rows = [view_row(view, read_rgb(view.path(out)), inputs, truth, note) for view, note in views.items()]
+        rows = [
+            view_row(view, read_rgba(view.path(out)), inputs, truth, note, inputs.fitted, _other_columns(view, out))
+            for view, note in views.items()
+            if view.path(out).exists()  # a method that has no new poses shows none
+        ]
         if rows:
             made.append(Gallery(*_gallery_words(split, inputs), rows))
+    if inputs.held_out_folders:
+        made.append(held_out_gallery(inputs, found["holdout"]["cameras"]))
     return [*made, surface_gallery(inputs, true_meshes, out)]
+
+
+def _other_columns(view: View, out: Path) -> dict[str, np.ndarray]:
+    """Renderings by caption of the same image in the other columns of new poses that there are."""
+    paths = {name: replace(view, split=split).path(out) for name, split in (("Posed", POSED), ("Tracked", TRACKED))}
+    return {name: read_rgba(path) for name, path in paths.items() if view.split == ANIMATED and path.exists()}
+
+
+def held_out_gallery(inputs: EvaluationInputs, cameras: dict[str, Any]) -> Gallery:
+    """The first image of the training frames and of the new poses that each camera left out was scored on."""
+    rows = []
+    for folder, (camera, scores) in zip(inputs.held_out_folders, cameras.items(), strict=True):
+        for split in PRIMARY:
+            for score in scores[split]["per_image"][:1]:
+                view = View(split, camera, score["frame"])
+                note = f"{SPLIT_TITLES[split].lower()}, {score['psnr']:.1f} dB"
+                rows.append(view_row(view, read_rgba(view.path(folder)), inputs, None, note, None, {}))
+    text = "Cameras that neither the body nor the field shown here was made with, against their own masks."
+    return Gallery("Cameras left out", text, rows)
 
 
 def _gallery_words(split: str, inputs: EvaluationInputs) -> tuple[str, str]:
@@ -137,9 +201,11 @@ def _gallery_words(split: str, inputs: EvaluationInputs) -> tuple[str, str]:
         return "Training views", "What training saw: how well the avatar explains its own data. No test."
     if split == "novel_view":
         return "New views", "Frames that training saw, from cameras that it never saw."
+    frames = "Frames that the field was not trained on, in poses as fitted before training (Render), and tuned on the"
+    frames += " training cameras' pictures of them (Posed), with a deformation of the frame's own, too (Tracked);"
     if inputs.capture.test_cameras:
-        return "New poses", "Frames that training never saw, from cameras that it never saw."
-    return "New poses", "Frames that training never saw, from the training cameras: the capture has no test camera."
+        return "New poses", f"{frames} from cameras that neither fit nor training ever saw."
+    return "New poses", f"{frames} from the training cameras, to look at: the capture has no test camera. No test."
 
 
 def surface_gallery(inputs: EvaluationInputs, true_meshes: dict[int, trimesh.Trimesh], out: Path) -> Gallery:
@@ -192,11 +258,9 @@ def costs(stages: dict[str, dict[str, Any]], found: dict[str, Any]) -> list[tupl
 
 def notes(inputs: EvaluationInputs, found: dict[str, Any]) -> list[str]:
     """What is missing or must be kept in mind when the figures are read."""
-    lines = [f"LPIPS is {found['lpips']}."]
-    for split in SPLITS:
+    lines = [f"LPIPS is {found['lpips']}.", *reasons(found)]
+    for split in PRIMARY:
         scores, title = found[split], SPLIT_TITLES[split]
-        if "reason" in scores:
-            lines.append(f"{title}: no image figures, since {scores['reason']}.")
         if "geometry_reason" in scores:
             lines.append(f"{title}: no surface figures, since {scores['geometry_reason']}.")
         if MASKED_IMAGE in scores.get("reference", ""):
@@ -206,7 +270,19 @@ def notes(inputs: EvaluationInputs, found: dict[str, Any]) -> list[str]:
         if scores.get("without_person"):
             lines.append(f"{title}: {scores['without_person']} images do not show the person and are not scored.")
     if not inputs.capture.test_cameras:
-        lines.append("Without a test camera nothing here measures a new viewpoint; training views are shown instead.")
+        lines.append("Without a test camera this field is not scored on images; training views are shown instead.")
+    return lines
+
+
+def reasons(found: dict[str, Any]) -> list[str]:
+    """Why there are no image figures, a line for each reason."""
+    by_reason: dict[str, list[str]] = {}
+    for split in SPLITS:
+        if "reason" in found[split]:
+            by_reason.setdefault(found[split]["reason"], []).append(SPLIT_TITLES[split])
+    lines = [f"{'; '.join(titles)}: no image figures, since {reason}." for reason, titles in by_reason.items()]
+    if TUNED_ON in by_reason and found["holdout"] is None:
+        lines.append(f"Cameras left out: no figures, since {found['holdout_reason']}.")
     return lines
 
 

@@ -6,7 +6,11 @@ from pathlib import Path
 from hnerf.capture.capture import Capture
 from hnerf.spread import spread
 
-SPLITS = ("novel_view", "novel_pose")
+NOVEL_VIEW = "novel_view"
+ANIMATED, POSED, TRACKED = "novel_pose", "novel_pose_posed", "novel_pose_tracked"  # hnerf/evaluation/columns.py
+NEW_POSES = (ANIMATED, POSED, TRACKED)
+SPLITS = (NOVEL_VIEW, *NEW_POSES)
+PRIMARY = (NOVEL_VIEW, ANIMATED)  # meshed, and what a camera that was left out is scored on
 TRAINING_VIEW = "training_view"  # shown in the report, never scored
 
 
@@ -25,12 +29,13 @@ class View:
 
 def split_frames(capture: Capture, split: str) -> tuple[int, ...]:
     """The frames whose poses a split is about; novel_view and the training views are about the training frames."""
-    return capture.novel_pose_frames if split == "novel_pose" else capture.train_frames
+    return capture.novel_pose_frames if split in NEW_POSES else capture.train_frames
 
 
 def split_cameras(capture: Capture, split: str) -> tuple[str, ...]:
-    """The cameras a split is seen from: test cameras; where there are none, new poses from the training cameras."""
-    if split == TRAINING_VIEW or (split == "novel_pose" and not capture.test_cameras):
+    """The cameras a split is seen from: test cameras; where there are none, new poses from the training cameras, for
+    people to look at."""
+    if split == TRAINING_VIEW or (split in NEW_POSES and not capture.test_cameras):
         return capture.train_cameras
     return capture.test_cameras
 

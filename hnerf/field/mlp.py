@@ -25,19 +25,20 @@ class SkipMLP(nn.Module):
         bfloat16: bool = False,
     ):
         super().__init__()
-        self.activation, self.bfloat16 = activation, bfloat16
+        self.activation, self.half_precision = activation, bfloat16
         self.middle = layers // 2
         sizes = [inputs] + [width] * (layers - 1)
         sizes[self.middle] += inputs
-        self.layers = nn.ModuleList(nn.Linear(size, width) for size in sizes)
-        for layer in self.layers:
+        layers = [nn.Linear(size, width) for size in sizes]
+        for layer in layers:
             nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
             nn.init.zeros_(layer.bias)
+        self.layers = nn.ModuleList(layers)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, inputs) to (N, width)."""
         h = x
-        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.bfloat16):
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.half_precision):
             for k, layer in enumerate(self.layers):
                 h = self.activation(layer(torch.cat([h, x], -1) if k == self.middle else h))
         return h.to(x.dtype)

@@ -32,6 +32,10 @@ class Avatar(Protocol):
         """The same person without what was learned of single frames only, as it looks in a pose that no frame has."""
         ...
 
+    def on_body(self, body: BodyFit) -> "Avatar":
+        """The same person with another body under the clothes, other poses, or both; the rig keeps its topology."""
+        ...
+
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
         """Colour, coverage and depth of the person alone; colour as a training camera of this name is exposed."""
         ...

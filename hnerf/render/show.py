@@ -20,7 +20,7 @@ from hnerf.render.cameras_along import along, orbit, read_path
 from hnerf.render.motion import Motion, adopted, between, read_motion, rows, select
 from hnerf.render.pictures import Shot, write_pictures
 from hnerf.render.shape import with_values, with_volume, worn_by
-from hnerf.training.model import TrainedAvatar, load_avatar
+from hnerf.training.model import load_avatar
 
 KINDS = ("colour", "depth", "normals", "mask", "mesh")
 ORBIT_PICTURES = 60  # of somebody who stands still
@@ -62,13 +62,8 @@ def render_subject(subject: Path, wish: Wish, out: Path) -> int:
         cameras = _cameras(wish, capture, motion.body)
         shots: list[Shot] = list(zip(cameras, itertools.cycle(motion.body.frames), strict=False))
         avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
-        write_pictures(on_body(avatar, motion.body), shots, wish.what, motion.fps, partial)
+        write_pictures(avatar.on_body(motion.body), shots, wish.what, motion.fps, partial)
     return len(shots)
-
-
-def on_body(avatar: TrainedAvatar, body: BodyFit) -> TrainedAvatar:
-    """The avatar with another body under its clothes, other poses, or both; the rig keeps its topology."""
-    return dataclasses.replace(avatar, body=body.to(avatar.body.theta.device))
 
 
 def _checked(subject: Path, wish: Wish) -> Capture:

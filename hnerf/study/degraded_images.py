@@ -12,7 +12,7 @@ import numpy as np
 
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture, write_image
-from hnerf.study.subset import (
+from hnerf.capture.subset import (
     copy_pixels,
     read_keypoints,
     require_several_cameras,

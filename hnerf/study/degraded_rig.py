@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 
 from hnerf.capture.capture import Capture
-from hnerf.errors import NotPossibleError
-from hnerf.study.subset import (
+from hnerf.capture.subset import (
     copy_pixels,
     read_keypoints,
     require_several_cameras,
@@ -18,6 +17,7 @@ from hnerf.study.subset import (
     write_arrays,
     write_keypoints,
 )
+from hnerf.errors import NotPossibleError
 
 T = TypeVar("T")
 

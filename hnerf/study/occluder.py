@@ -8,9 +8,9 @@ import numpy as np
 from hnerf.calibration.triangulation import subject_keypoints
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
+from hnerf.capture.subset import read_keypoints, write_keypoints
 from hnerf.errors import NotPossibleError
 from hnerf.study.degraded_images import rewrite
-from hnerf.study.subset import read_keypoints, write_keypoints
 
 WAY = 0.4  # of the way from the person to the camera
 HALF_HEIGHT_M = 1.2

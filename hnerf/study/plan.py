@@ -6,11 +6,11 @@ from typing import Literal, Self
 from pydantic import Field, PositiveInt, model_validator
 
 from hnerf.capture.capture import Capture
+from hnerf.capture.subset import chosen
 from hnerf.config import CONFIGS, H_NERF, Section, Settings, load_settings, named_file, read_yaml, validated
 from hnerf.errors import CaptureError
 from hnerf.spread import spread
 from hnerf.study.convergence import FIRST_S
-from hnerf.study.subset import chosen
 
 STUDIES = CONFIGS / "benchmark"
 UNTIL_TIME_IS_UP = 1_000_000  # steps
@@ -65,8 +65,7 @@ class Claim(Section):
 
 
 class ScoringSettings(Section):
-    """How much of what is held out is rendered and meshed. split: of curves and charts; new poses in any case where no
-    camera is held out."""
+    """How much of what is held out is rendered and meshed. split: of curves and charts."""
 
     split: Literal["novel_view", "novel_pose"] = "novel_view"
     images: int | None = Field(default=None, ge=1)  # a split, of the finished model; None: all

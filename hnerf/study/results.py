@@ -12,14 +12,24 @@ import io
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, PRIMARY, TRACKED
 from hnerf.study.convergence import HOW
 from hnerf.study.curves import Point, seconds_to, value_at
 from hnerf.study.files import picture
 from hnerf.study.machine import in_words
 from hnerf.tables import head, line, pick, shown
 
-SPLITS = {"novel_view": "new views", "novel_pose": "new poses"}
-COLUMNS = {  # in a split's scores; cells show new views / new poses
+SPLITS = {
+    NOVEL_VIEW: "new views",
+    ANIMATED: "animated new poses",
+    POSED: "posed new poses",
+    TRACKED: "tracked new poses",
+}
+CELL = (
+    "In a cell: new views / new poses animated / posed / tracked, as the protocol below has it; of surfaces: new views "
+    "/ animated."
+)
+COLUMNS = {  # in a split's scores
     "psnr": ("PSNR, dB", "{:.2f}"),
     "ssim": ("SSIM", "{:.3f}"),
     "mask_iou": ("mask IoU", "{:.3f}"),
@@ -123,7 +133,7 @@ def as_markdown(result: Mapping[str, Any], pictures: list[str], claims: list[str
     lines = [f"# {result['title']}: {result['subject']}", "", caption(result), ""]
     lines += [f"- {note}" for note in result["notes"]] + [""] * bool(result["notes"])
     lines += [f"{picture(name)}\n" for name in pictures] + claims + [""] * bool(claims)
-    lines += ["Two figures in a cell: new views / new poses.", ""]
+    lines += [CELL, ""]
     for title, variant in result["variants"].items():
         lines += [f"## {title}", "", *_variant_lines(variant), ""]
     everything = [scores for variant in result["variants"].values() for scores in scored(variant).values()]
@@ -140,27 +150,37 @@ def _variant_lines(variant: Mapping[str, Any]) -> list[str]:
     near_best = near_best_seconds(variant)
     lines = [f"{variant['cameras']} training cameras, {variant['frames']} training frames.", ""]
     lines += head(titles)
-    reasons: dict[str, list[str]] = {}
+    missing: dict[str, list[str]] = {}
     for name, scores in variant["methods"].items():
         if "error" in scores:
             lines.append(line([name, scores["error"].replace("|", "/"), *[""] * (len(titles) - 2)]))
             continue
-        cells = [" / ".join(shown(pick(scores[s], key), form) for s in SPLITS) for key, (_, form) in COLUMNS.items()]
+        cells = [cell(scores, key, form) for key, (_, form) in COLUMNS.items()]
         cells += [shown(scores["training"][key], form) for key, (_, form) in COSTS.items()]
         cells += [shown(scores["frame_seconds"].get(size), "{:.2f}") for size in sizes]
         lines.append(line([name, *cells, shown(near_best.get(name), "{:.0f}")]))
-        for reason in _reasons(scores):
-            reasons.setdefault(reason, []).append(name)
+        for reason in reasons(scores):
+            missing.setdefault(reason, []).append(name)
         if scores["trained_on"] != {key: variant[key] for key in scores["trained_on"]}:
-            told = "trained on {cameras} cameras and {frames} frames: calibration left the others out"
-            reasons.setdefault(told.format(**scores["trained_on"]), []).append(name)
+            fewer = "trained on {cameras} cameras and {frames} frames: calibration left the others out"
+            missing.setdefault(fewer.format(**scores["trained_on"]), []).append(name)
     for key, title in FLOORS.items() if scored(variant) else ():
         known = [[v for m in scored(variant).values() if (v := m[s][key]) is not None] for s in SPLITS]
-        both = " / ".join(shown(values[0] if values else None, "{:.2f}") for values in known)
-        lines.append(line([title, both, *[""] * (len(titles) - 2)]))
+        of_each = " / ".join(shown(values[0] if values else None, "{:.2f}") for values in known)
+        lines.append(line([title, of_each, *[""] * (len(titles) - 2)]))
     lines += _timeline(variant)
-    missing = [f"- {', '.join(names)}: {reason}" for reason, names in reasons.items()]
-    return [*lines, *(["", *missing] if missing else [])]
+    told = [f"- {', '.join(names)}: {reason}" for reason, names in missing.items()]
+    return [*lines, *(["", *told] if told else [])]
+
+
+def cell(scores: Mapping[str, Any], key: str, form: str) -> str:
+    """A figure of every split that can have it, as CELL says."""
+    return " / ".join(shown(pick(scores[split], key), form) for split in splits_of(key))
+
+
+def splits_of(key: str) -> tuple[str, ...]:
+    """The splits that have a figure of COLUMNS: the primary ones have surfaces."""
+    return PRIMARY if key.startswith("geometry.") else tuple(SPLITS)
 
 
 def _timeline(variant: Mapping[str, Any]) -> list[str]:
@@ -182,7 +202,8 @@ def _timeline(variant: Mapping[str, Any]) -> list[str]:
 def as_csv(result: Mapping[str, Any]) -> str:
     """A row for each method of each variant, one figure a cell; empty where there is none."""
     sizes = sorted({size for variant in result["variants"].values() for size in _sizes(variant)}, key=int)
-    keys = [f"{split}.{key}" for split in SPLITS for key in COLUMNS] + [f"training.{key}" for key in COSTS]
+    keys = [f"{split}.{key}" for split in SPLITS for key in COLUMNS if split in splits_of(key)]
+    keys += [f"training.{key}" for key in COSTS]
     keys += [f"frame_seconds.{size}" for size in sizes]
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -194,11 +215,13 @@ def as_csv(result: Mapping[str, Any]) -> str:
     return out.getvalue()
 
 
-def _reasons(scores: Mapping[str, Any]) -> Iterator[str]:
+def reasons(scores: Mapping[str, Any]) -> Iterator[str]:
+    """Why splits lack figures; where no new pose has any, that is told once."""
     for split, name in SPLITS.items():
-        for key in ("reason", "geometry_reason"):
-            if key in scores[split] and not (key == "geometry_reason" and "reason" in scores[split]):
-                yield f"no {'images' if key == 'reason' else 'surfaces'} of {name}: {scores[split][key]}"
+        if "reason" in scores[split] and (split in PRIMARY or "reason" not in scores[ANIMATED]):
+            yield f"no images of {name}: {scores[split]['reason']}"
+        elif "geometry_reason" in scores[split] and "reason" not in scores[split]:
+            yield f"no surfaces of {name}: {scores[split]['geometry_reason']}"
 
 
 def _sizes(variant: Mapping[str, Any]) -> list[str]:

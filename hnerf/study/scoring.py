@@ -10,22 +10,16 @@ from typing import Any
 import numpy as np
 import torch
 
+from hnerf.body.fit_result import BodyFit
 from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture, read_rgb, write_image
 from hnerf.errors import CaptureError
-from hnerf.evaluation.evaluate import (
-    LPIPS,
-    MEANS,
-    PROTOCOL,
-    known_views,
-    mesh_frames,
-    render,
-    score_meshes,
-    score_split,
-)
+from hnerf.evaluation.columns import shown_as, why_not_shown
+from hnerf.evaluation.evaluate import LPIPS, PROTOCOL, mesh_frames, score_meshes
 from hnerf.evaluation.ground_truth import GroundTruth
+from hnerf.evaluation.images import known_views, render, score_split, unscored
 from hnerf.evaluation.pictures import crop, frame_person
-from hnerf.evaluation.views import SPLITS, View, all_views, split_frames
+from hnerf.evaluation.views import PRIMARY, SPLITS, View, all_views, split_frames
 from hnerf.render.avatar import Avatar
 from hnerf.spread import spread
 from hnerf.study.machine import machine
@@ -38,16 +32,10 @@ log = logging.getLogger("hnerf.study")
 PICTURES = 2
 REPEATS = 3
 LONG_S = 10.0  # an image that takes as long is timed once
-ONE_MOMENT = "models one moment"
-NO_NOVEL_POSES = {
-    "nerf": f"NeRF {ONE_MOMENT}",
-    "idr": f"IDR {ONE_MOMENT}",
-    "nerfies": "Nerfies has no pose to set: it replays the moments it was trained on",
-}
 HOW = (
     "Training seconds: the trainer's own clock, without reading the capture. Curves: fewer images and surfaces than "
-    "tables, the same ones at every point and for all methods; the last point is the finished subject; fitting "
-    "novel poses to it counts only where new poses are what is scored. "
+    "tables, the same ones at every point and for all methods, new poses animated; the last point is the finished "
+    "field. "
     f"Time of a frame: median of {REPEATS} renderings of a whole image, of one where it takes over {LONG_S:.0f} s. "
     "Peak memory: on a CPU that of the training process, all libraries included; on a GPU what tensors took."
 )
@@ -55,9 +43,11 @@ HOW = (
 
 @dataclass(frozen=True)
 class Scene:
-    """What scoring needs besides a training: the capture with calibrated cameras, and the truth where there is one."""
+    """What scoring needs besides a training: the capture with calibrated cameras, the body as fitted before training,
+    and the truth where there is one."""
 
     capture: Capture
+    fitted: BodyFit
     truth: GroundTruth | None
     device: str
 
@@ -67,19 +57,21 @@ def score(scene: Scene, training: Path, settings: ScoringSettings, out: Path) ->
 
     training: the folder that training left. A figure that cannot be had is null, and a reason stands beside it.
     """
-    avatar = load_avatar(training, scene.device)
-    reason = why_no_novel_poses(training)
+    avatar, split = load_avatar(training, scene.device), settings.split
+    lacking = {name: why for name in SPLITS if (why := why_not_shown(name, training))}
     found: dict[str, Any] = {"machine": machine(), "protocol": f"{PROTOCOL} {HOW}", "lpips": LPIPS}
-    split = curve_split(scene, settings)
     found["split"], found["training"] = split, json.loads((training / "report.json").read_text())
-    found["curve"] = [] if split == "novel_pose" and reason else curve(scene, split, training, avatar, settings, out)
+    scored = scene.capture.test_cameras and split not in lacking
+    found["curve"] = curve(scene, split, training, avatar, settings, out) if scored else []
     for name in SPLITS:
-        if name == "novel_pose" and reason:
-            found[name] = {"n": 0, "per_image": [], "reason": reason} | dict.fromkeys(MEANS)
-            found[name] |= {"geometry": None, "geometry_reason": reason}
-        else:
-            found[name] = score_at(scene, avatar, name, settings.images, settings.meshes, out)
-            add_nearness(scene.capture, avatar, name, found[name])
+        if name in lacking:
+            found[name] = unscored(lacking[name])
+            if name in PRIMARY:
+                found[name] |= {"geometry": None, "geometry_reason": lacking[name]}
+            continue
+        column = shown_as(name, avatar, scene.fitted)
+        found[name] = score_at(scene, column, name, settings.images, settings.meshes, out)
+        add_nearness(scene.capture, column, name, found[name])
     found["pictures"] = write_pictures(scene, split, found[split]["per_image"], out)
     camera = next(iter(scene.capture.cameras.values()))
     found["frame_seconds"] = {
@@ -92,41 +84,27 @@ def score(scene: Scene, training: Path, settings: ScoringSettings, out: Path) ->
 
 def score_end(scene: Scene, training: Path, settings: ScoringSettings, out: Path) -> dict[str, Any]:
     """Write `scores.json` with what training reported and the last point of its curve alone; what it holds."""
-    reason, split = why_no_novel_poses(training), curve_split(scene, settings)
-    avatar = load_avatar(training, scene.device)
-    rows = [] if split == "novel_pose" and reason else curve(scene, split, training, avatar, settings, out)
+    avatar, split = load_avatar(training, scene.device), settings.split
+    scored = scene.capture.test_cameras and not why_not_shown(split, training)
+    rows = curve(scene, split, training, avatar, settings, out) if scored else []
     found = {"training": json.loads((training / "report.json").read_text()), "curve": rows[-1:]}
     (out / "scores.json").write_text(json.dumps(found, indent=1))
     return found
 
 
-def curve_split(scene: Scene, settings: ScoringSettings) -> str:
-    """The split that curves are of."""
-    return settings.split if scene.capture.test_cameras else "novel_pose"
-
-
-def why_no_novel_poses(training: Path) -> str | None:
-    """Why what training left in a folder cannot show poses that it was not trained on; None if it can."""
-    stored = json.loads((training / "settings.json").read_text())
-    machinery: str = stored["training"]["machinery"]
-    if machinery == "paper" and stored["static"]:
-        return f"H-NeRF's static network {ONE_MOMENT}"
-    return NO_NOVEL_POSES.get(machinery)
-
-
 def curve(
     scene: Scene, split: str, training: Path, finished: Avatar, settings: ScoringSettings, out: Path
 ) -> list[dict[str, Any]]:
-    """Seconds of training and figures of every snapshot, and last of the finished model, in the order of time."""
-    report = json.loads((training / "report.json").read_text())
-    end_s = report["field_seconds" if split == "novel_view" else "seconds"]
+    """Seconds of training and figures of every snapshot, and last of the finished field, in the order of time."""
+    end_s = json.loads((training / "report.json").read_text())["field_seconds"]
     taken = {json.loads((f / "settings.json").read_text())["seconds"]: f for f in (training / "snapshots").glob("*")}
     models = [(s, load_avatar(taken[s], scene.device)) for s in sorted(taken) if s < end_s]
     rows = []
     for seconds, avatar in [*models, (end_s, finished)]:
         folder = out / "snapshots" / f"{seconds:g}"
         folder.mkdir(parents=True)
-        figures = score_at(scene, avatar, split, settings.snapshot_images, settings.snapshot_meshes, folder)
+        column = shown_as(split, avatar, scene.fitted)
+        figures = score_at(scene, column, split, settings.snapshot_images, settings.snapshot_meshes, folder)
         del figures["per_image"]
         rows.append({"seconds": seconds} | figures)
         log.info("after %.0f s: %s dB", seconds, figures["psnr"])
@@ -134,13 +112,15 @@ def curve(
 
 
 def score_at(scene: Scene, avatar: Avatar, split: str, images: int | None, meshes: int, out: Path) -> dict[str, Any]:
-    """A split's figures in the form of evaluation, of at most as many images and surfaces of which the truth is known;
-    None is all."""
+    """A split's figures in the form of evaluation, of its avatar and at most as many images and surfaces of which the
+    truth is known; None is all."""
     views = all_views(scene.capture, split)
     views = spread(known_views(views, scene.truth) or views, images or len(views))
-    if views:
-        render(avatar, scene.capture, views, out)
-    found = score_split(split, views, scene.truth, out)
+    if views and scene.capture.test_cameras:
+        render({split: avatar}, scene.capture, views, out)
+    found = score_split(scene.capture, split, views, scene.truth, out)
+    if split not in PRIMARY:
+        return found
     if not meshes:
         return found | {"geometry": None, "geometry_reason": "the study asks for no surface here"}
     true_meshes = scene.truth.meshes() if scene.truth else {}

@@ -23,13 +23,22 @@ LEGEND = (
     "earlier stage or the training said what is wrong with the input. **unscored**: nothing is known to be true of the "
     "images and surfaces that both runs show, so that neither good nor bad can be told; extreme poses are judged by "
     "surfaces alone. Novel poses from test cameras are scored, which no degradation touches, but that they and the "
-    "truth wear the skirt or the hair, too; training poses where the capture or the method has no others. Runs are "
-    "compared by the images and surfaces that both have, and so are the differences in parentheses: a frame that a "
-    "degradation took away counts in neither. Without test cameras images are not compared, since what is done to "
-    "training cameras would be done to what they are scored on. A surface is the largest component that meshing finds; "
+    "truth wear the skirt or the hair, too. They are animated: in poses as fitted before training, and where a "
+    "degradation is of the fit itself, as fitted without it; PSNR of the same images posed and tracked stands beside. "
+    "Training poses are scored where the capture or the method has no others. Runs are compared by the images and "
+    "surfaces that both have, and so are the differences in parentheses: a frame that a degradation took away counts "
+    "in neither. Without test cameras images are not compared. A surface is the largest component that meshing finds; "
     "what floats beside it does not count. A method **holds to** the strongest strength up to which the worst seed of "
     "every one is ok."
 )
+
+FIGURES = {  # title and digits of a run's
+    "psnr": ("PSNR, dB", 2),
+    "posed_psnr": ("posed, dB", 2),
+    "tracked_psnr": ("tracked, dB", 2),
+    "ssim": ("SSIM", 3),
+    "chamfer_mm": ("Chamfer, mm", 2),
+}
 
 Row = dict[str, Any]
 
@@ -64,7 +73,7 @@ def as_markdown(result: Row, charts: Sequence[str]) -> str:
     for kind in kinds:
         lines.append(line([KINDS[kind].label, *(how_far(result, method, kind) for method in methods)]))
     lines += ["", *map(picture, charts), "", "## Runs", ""]
-    lines += head(["method", "degradation", "strength", "seed", "verdict", "PSNR, dB", "SSIM", "Chamfer, mm"])
+    lines += head(["method", "degradation", "strength", "seed", "verdict", *(title for title, _ in FIGURES.values())])
     lines += [line(_cells(run)) for run in result["runs"]]
     lines += ["", "## Left out", "", *(f"- {reason}" for reason in result["left_out"] or ["nothing"]), ""]
     return "\n".join([*lines, *([result["protocol"], ""] if result["protocol"] else [])])
@@ -74,7 +83,7 @@ def _cells(run: Row) -> list[str]:
     kind = KINDS[run["kind"]].label if run["kind"] in KINDS else run["kind"]
     strength = "" if run["strength"] is None else f"{run['strength']:g}"
     verdict = f"{run['verdict']}: {run['reason']}" if run["reason"] else run["verdict"]
-    scores = [_compared(run, key, digits) for key, digits in (("psnr", 2), ("ssim", 3), ("chamfer_mm", 2))]
+    scores = [_compared(run, key, digits) for key, (_, digits) in FIGURES.items()]
     return [run["method"], kind, strength, str(run["seed"]), verdict.replace("|", "/"), *scores]
 
 

@@ -16,9 +16,9 @@ from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.performer.render import Caster, dome_lights, irradiance, render_person
+from hnerf.capture.subset import copy_files, write_arrays
 from hnerf.evaluation.ground_truth import ON_BLACK, GroundTruth
 from hnerf.render.rays import RayHits
-from hnerf.study.subset import copy_files, write_arrays
 
 Rng = np.random.Generator
 

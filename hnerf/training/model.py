@@ -85,6 +85,10 @@ class TrainedAvatar:
         none = dataclasses.replace(self.learned, theta=self.learned.theta[:0], root=self.learned.root[:0], frames=())
         return dataclasses.replace(self, learned=none)
 
+    def on_body(self, body: BodyFit) -> "TrainedAvatar":
+        """The avatar with another body under its clothes, other poses, or both; the rig keeps its topology."""
+        return dataclasses.replace(self, body=body.to(self.body.theta.device))
+
     @torch.no_grad()
     def signed_distance(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
         """d_hat at world points (N, 3), (N,) metres."""

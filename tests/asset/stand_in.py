@@ -22,6 +22,9 @@ class StandInAvatar:
     def without_frames(self) -> "StandInAvatar":
         return self
 
+    def on_body(self, body: BodyFit) -> "StandInAvatar":
+        return StandInAvatar(body)
+
     def signed_distance(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
         vertices_m = pose_vertices(self.body.rig, theta, root)
         found = self._closest(points_m, vertices_m)

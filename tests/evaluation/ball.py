@@ -1,6 +1,7 @@
 """A made-up subject: a ball that a stand-in avatar shows in one colour, before cameras that look at it from around."""
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -22,20 +23,27 @@ SIZE_PX = 64
 FRAMES = (0, 1, 2, 3)  # the last for new poses
 NOVEL = (3,)
 RENDERED, PHOTOGRAPHED = 102, 153  # grey levels, of 255
+TUNED_M = 0.02  # by which training lifted the body of the new frame: two pixels
 
 
 @dataclass(frozen=True)
 class BallAvatar:
-    """The ball in grey; its distance is exact."""
+    """The ball in grey; its distance is exact. Frames have it darker by what they know of themselves."""
 
     body: BodyFit
+    grey: float = RENDERED
+    frames_darken_by: float = 0
 
     def without_frames(self) -> "BallAvatar":
-        return self
+        return replace(self, frames_darken_by=0)
+
+    def on_body(self, body: BodyFit) -> "BallAvatar":
+        return replace(self, body=body)
 
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
         alpha = torch.from_numpy(seen(camera, root[:3, 3].numpy())).float()
-        return Rendering(alpha[..., None].expand(-1, -1, 3) * RENDERED / 255, alpha, alpha)
+        grey = (self.grey - self.frames_darken_by) / 255
+        return Rendering(alpha[..., None].expand(-1, -1, 3) * grey, alpha, alpha)
 
     def signed_distance(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
         return (points_m - root[:3, 3]).norm(dim=1) - RADIUS_M
@@ -120,12 +128,28 @@ def write_ball_truth(capture: Capture, radius_m: float) -> None:
     np.savez(path, faces=ball.faces, vertices=vertices, frames=np.array([0]))
 
 
+def tuned(fit: BodyFit) -> BodyFit:
+    """The fit with the new frame's body lifted."""
+    root = fit.root.clone()
+    root[FRAMES.index(NOVEL[0]), 2, 3] += TUNED_M
+    return replace(fit, root=root)
+
+
+def write_settings(training: Path, machinery: str = "fast", nodes: int = 8, steps: int = 80) -> None:
+    """What training says of itself, as far as columns of new poses go by it."""
+    fast = machinery == "fast"
+    settings = {"machinery": machinery, "pose_learning_rate": 5e-4 * fast, "novel_pose_steps": steps}
+    settings |= {machinery: {"nodes": nodes} if fast else {}}
+    (training / "settings.json").write_text(json.dumps({"static": False, "training": settings}))
+
+
 def ball_inputs(capture: Capture, stages: Path) -> EvaluationInputs:
     """Everything before evaluation; `stages` has a folder of each earlier stage."""
     fit = ball_fit()
     folders = {f"{name}_folder": stages / name for name in ("calibration", "segmentation", "fit", "training")}
     for folder in folders.values():
         folder.mkdir(parents=True)
+    write_settings(folders["training_folder"])
     return EvaluationInputs(
         capture_folder=capture.root,
         capture=capture,

@@ -1,5 +1,6 @@
 """The whole of evaluation on a made-up subject whose figures are known, and against the independent scoring program."""
 
+import dataclasses
 import json
 import re
 import subprocess
@@ -14,22 +15,27 @@ import pytest
 import trimesh
 
 from hnerf.config import EvaluationSettings
-from hnerf.evaluation.evaluate import evaluate, mesh_frames, render
+from hnerf.evaluation import evaluate as module
+from hnerf.evaluation.evaluate import evaluate, mesh_frames
 from hnerf.evaluation.geometry import score_geometry
+from hnerf.evaluation.images import render
 from hnerf.evaluation.metrics import mask_box
 from hnerf.evaluation.views import View
 from tests.evaluation.ball import (
     PHOTOGRAPHED,
     RADIUS_M,
     RENDERED,
+    TUNED_M,
     BallAvatar,
     ball_camera,
     ball_fit,
     ball_inputs,
     centre_m,
     seen,
+    tuned,
     write_ball_capture,
     write_ball_truth,
+    write_settings,
 )
 
 SCORE_RUN = Path(__file__).parents[2].parent / "shared" / "accept" / "score_run.py"
@@ -46,6 +52,8 @@ def scored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
     capture = write_ball_capture(base / "capture", "ball", ("c",))
     write_ball_truth(capture, RADIUS_M + GAP_M)
     inputs = ball_inputs(capture, base / "stages")
+    avatar = BallAvatar(tuned(inputs.fitted), PHOTOGRAPHED, PHOTOGRAPHED - RENDERED)
+    inputs = dataclasses.replace(inputs, avatar=avatar)
     history = [{"step": k, "seconds": 2.0 * k, "losses": {"rec": 0.1}, "held_out": {"psnr": 20.0 + k}} for k in (0, 1)]
     (inputs.training_folder / "history.jsonl").write_text("\n".join(map(json.dumps, history)))
     (inputs.training_folder / "report.json").write_text(json.dumps({"device": "a processor", "seconds": 12.5}))
@@ -75,7 +83,8 @@ def test_image_figures_by_hand(scored: Scored) -> None:
         psnr.append(-10 * np.log10(error))
     assert found["novel_view"]["psnr"] == pytest.approx(np.mean(psnr), abs=1e-4)
     assert found["novel_view"]["mask_iou"] == 1.0
-    assert [found[split]["n"] for split in ("novel_view", "novel_pose")] == [3, 1]
+    columns = ("novel_pose", "novel_pose_posed", "novel_pose_tracked")
+    assert [found[split]["n"] for split in ("novel_view", *columns)] == [3, 1, 1, 1]
     assert found["novel_view"]["reference"] == "image x ground-truth mask"
     assert found == json.loads((base / "subject" / "evaluation" / "metrics.json").read_text())
 
@@ -119,13 +128,14 @@ def test_renderings_and_meshes_lie_where_the_contract_says(scored: Scored) -> No
     written = {str(p.relative_to(out)) for p in out.rglob("*") if p.suffix in (".png", ".ply") and p.parent != out}
     assert {p for p in written if "training_view" not in p} == {
         *(f"renders/novel_view/c/{f:06d}.png" for f in (0, 1, 2)),
-        "renders/novel_pose/c/000003.png",
+        *(f"renders/novel_pose{column}/c/000003.png" for column in ("", "_posed", "_tracked")),
         "meshes/000000.ply",
         "meshes/000003.ply",
     }
     image = cv2.imread(str(out / "renders/novel_view/c/000001.png"), cv2.IMREAD_UNCHANGED)
-    assert image is not None and image.shape == (64, 64, 3) and image.dtype == np.uint8
+    assert image is not None and image.shape == (64, 64, 4) and image.dtype == np.uint8
     assert np.array_equal(image[..., 0], seen(TEST_CAMERA, centre_m(1)) * RENDERED)
+    assert np.array_equal(image[..., 3], seen(TEST_CAMERA, centre_m(1)) * 255)
 
 
 def test_figures_agree_with_the_independent_program(scored: Scored) -> None:
@@ -150,21 +160,100 @@ def test_a_rendering_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     view = View("novel_view", "c", 1)
     view.path(tmp_path).mkdir(parents=True)
     with pytest.raises(OSError, match=r"000001\.png: cannot be written"):
-        render(BallAvatar(ball_fit()), write_ball_capture(tmp_path / "capture", "ball", ("c",)), [view], tmp_path)
+        render(
+            {"novel_view": BallAvatar(ball_fit())},
+            write_ball_capture(tmp_path / "capture", "ball", ("c",)),
+            [view],
+            tmp_path,
+        )
 
 
 def test_without_truth_figures_are_null_with_a_reason(unscored: Scored) -> None:
     _, found = unscored
     assert found["novel_view"]["psnr"] is None and "no test cameras" in found["novel_view"]["reason"]
-    assert found["novel_pose"]["psnr"] is None and "no ground-truth masks" in found["novel_pose"]["reason"]
+    assert found["novel_pose"]["psnr"] is None and "no test camera" in found["novel_pose"]["reason"]
     assert found["novel_pose"]["geometry"] is None
     assert "no ground-truth surface" in found["novel_pose"]["geometry_reason"]
 
 
 def test_without_test_cameras_no_training_image_is_a_new_view(unscored: Scored) -> None:
     renders = unscored[0] / "renders"
-    assert sorted(p.name for p in renders.iterdir()) == ["novel_pose", "training_view"]
+    columns = ["novel_pose", "novel_pose_posed", "novel_pose_tracked"]
+    assert sorted(p.name for p in renders.iterdir()) == [*columns, "training_view"]
     assert sorted(p.parent.name for p in (renders / "novel_pose").rglob("*.png")) == ["a", "b"]
+
+
+def test_new_poses_are_shown_as_fitted_as_tuned_and_as_tracked(scored: Scored) -> None:
+    """Without what frames know the ball has the photograph's grey, so that the fit, where the truth is, is perfect;
+    what was tuned is two pixels too high, what was tracked is darker as well."""
+    out, found = scored[0] / "subject" / "evaluation", scored[1]
+    true = seen(TEST_CAMERA, centre_m(3))
+    lifted = seen(TEST_CAMERA, centre_m(3) + np.array([0, 0, TUNED_M]))
+    for split, place, grey in (
+        ("novel_pose", true, PHOTOGRAPHED),
+        ("novel_pose_posed", lifted, PHOTOGRAPHED),
+        ("novel_pose_tracked", lifted, RENDERED),
+    ):
+        image = cv2.imread(str(out / "renders" / split / "c" / "000003.png"), cv2.IMREAD_UNCHANGED)
+        assert image is not None and np.array_equal(image[..., 0], place * grey), split
+        error = (place * grey / 255.0 - true * PHOTOGRAPHED / 255.0)[mask_box(true)]
+        assert found[split]["psnr"] == pytest.approx(-10 * np.log10((error**2).mean() + 1e-10), abs=1e-4)
+        assert found[split]["mask_iou"] == pytest.approx((place & true).sum() / (place | true).sum())
+    assert found["novel_pose"]["psnr"] == 100.0 and found["novel_pose_posed"]["mask_iou"] < 0.9
+    mesh = trimesh.load_mesh(out / "meshes" / "000003.ply", process=False)
+    assert mesh.bounds.mean(0) == pytest.approx(centre_m(3), abs=1e-3)
+
+
+def test_the_report_shows_all_three_side_by_side(scored: Scored) -> None:
+    text = (scored[0] / "subject" / "evaluation" / "report.html").read_text()
+    for column in ("", "_posed", "_tracked"):
+        assert f"{scored[1][f'novel_pose{column}']['psnr']:.2f}" in text
+    assert 'alt="Posed"' in text and 'alt="Tracked"' in text
+    assert "not trained on, in poses as fitted before training" in text
+
+
+def evaluated(base: Path, test_cameras: tuple[str, ...], truth: bool, machinery: str) -> tuple[Path, dict[str, Any]]:
+    """Where the evaluation of a ball lies, and what it found; without a report."""
+    capture = write_ball_capture(base / "capture", "ball", test_cameras)
+    if truth:
+        write_ball_truth(capture, RADIUS_M)
+    inputs = ball_inputs(capture, base / "stages")
+    write_settings(inputs.training_folder, machinery)
+    out = base / "evaluation"
+    out.mkdir()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "write_report", lambda *_: None)
+        return out, evaluate(inputs, EvaluationSettings(max_meshes=1, report_rows=1), out)
+
+
+def test_a_method_that_tunes_nothing_has_one_column(tmp_path: Path) -> None:
+    out, found = evaluated(tmp_path, ("c",), False, "neural_body")
+    assert found["novel_pose_posed"]["reason"] == "no pose of these frames was tuned"
+    assert found["novel_pose_tracked"]["reason"] == "these frames have no deformation of their own"
+    assert sorted(p.name for p in (out / "renders").iterdir()) == ["novel_pose", "novel_view", "training_view"]
+    for split in ("novel_view", "novel_pose"):  # test cameras alone are no truth
+        assert "no ground-truth masks" in found[split]["reason"]
+
+
+def test_a_method_without_poses_shows_no_new_ones(tmp_path: Path) -> None:
+    out, found = evaluated(tmp_path, ("c",), False, "nerfies")
+    assert "Nerfies has no pose to set" in found["novel_pose"]["reason"]
+    assert "Nerfies has no pose to set" in found["novel_pose"]["geometry_reason"]
+    assert sorted(p.name for p in (out / "renders").iterdir()) == ["novel_view", "training_view"]
+    assert [p.stem for p in (out / "meshes").iterdir()] == ["000000"]
+
+
+def test_nothing_is_scored_on_pixels_of_training_cameras(tmp_path: Path) -> None:
+    """Though the truth of every image is known."""
+    out, found = evaluated(tmp_path, (), True, "fast")
+    for split in ("novel_view", "novel_pose", "novel_pose_posed", "novel_pose_tracked"):
+        assert (found[split]["n"], found[split]["psnr"], found[split]["per_image"]) == (0, None, [])
+    assert "evaluation.holdout" in found["novel_pose"]["reason"]
+    assert found["holdout"] is None and "evaluation.holdout=each" in found["holdout_reason"]
+    rendered = sorted((out / "renders" / "novel_pose").rglob("*.png"))
+    assert [p.parent.name for p in rendered] == ["a", "b"]  # to look at
+    assert len(list((out / "renders" / "novel_pose_tracked").rglob("*.png"))) == 1  # what the report shows
+    assert found["novel_view"]["geometry"]["n"] == 1  # no pixels are needed
 
 
 class _Page(HTMLParser):
@@ -220,7 +309,7 @@ def test_report_escapes_what_captures_say(scored: Scored, unscored: Scored) -> N
 
 def test_report_without_truth_says_so(unscored: Scored) -> None:
     text = (unscored[0] / "report.html").read_text()
-    assert "the capture has no ground-truth masks" in text and "training views are shown instead" in text
+    assert "the capture has no test camera" in text and "training views are shown instead" in text
     assert 'alt="Ground truth"' not in text and 'alt="Input × mask"' in text
     assert "No history was recorded" in text
 

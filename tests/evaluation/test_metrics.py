@@ -25,13 +25,25 @@ def test_mask_box_is_padded_and_cut_to_the_image() -> None:
     assert range(80)[columns] == range(0, 29)  # 5 - 20 is outside; 8 + 20
 
 
-def test_mask_iou_counts_pixels_brighter_than_the_level() -> None:
-    rendered = np.zeros((2, 4, 3), np.uint8)
-    rendered[0, :3, 1] = 9
-    rendered[1, :, 0] = 8  # not brighter
+def test_mask_iou_counts_pixels_covered_by_more_than_a_half() -> None:
+    coverage = np.zeros((2, 4), np.uint8)
+    coverage[0, :3] = 128
+    coverage[1, :] = 127  # no more than a half
     mask = np.zeros((2, 4), bool)
     mask[0, 1:] = True
-    assert mask_iou(rendered, mask) == pytest.approx(2 / 4)
+    assert mask_iou(coverage, mask) == pytest.approx(2 / 4)
+
+
+def test_black_hair_on_black_counts() -> None:
+    """Of a head of 4 pixels the upper two are hair, black in picture and rendering; by brightness they are lost."""
+    mask = np.zeros((16, 16), bool)
+    mask[2:4, 2:4] = True
+    reference = np.zeros((16, 16, 3), np.uint8)
+    reference[3, 2:4] = 200
+    rendered = np.dstack([reference, 255 * mask.astype(np.uint8)])
+    assert score_image(rendered, reference, mask).mask_iou == 1.0
+    rendered[2, 2:4, 3] = 0  # no hair
+    assert score_image(rendered, reference, mask).mask_iou == pytest.approx(2 / 4)
 
 
 def test_floors_of_a_person_of_two_greys() -> None:
@@ -49,7 +61,7 @@ def test_score_image_looks_into_the_box_only() -> None:
     reference = np.zeros((100, 100, 3), np.uint8)
     mask = np.zeros((100, 100), bool)
     mask[50, 50] = True
-    rendered = reference.copy()
+    rendered = np.zeros((100, 100, 4), np.uint8)
     rendered[0, 0] = 255  # outside the box of 41 x 41 px
     rendered[50, 50] = 51  # 0.2
     assert score_image(rendered, reference, mask).psnr == pytest.approx(-10 * np.log10(0.2**2 / 41**2), abs=1e-4)

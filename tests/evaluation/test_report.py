@@ -31,10 +31,12 @@ def test_summary_shows_a_dash_where_there_is_no_figure() -> None:
     geometry = {"chamfer_mm": 8.04, "chamfer_l2_e3": 0.1234, "normal_consistency": 0.95, "iou": 0.9}
     view = {"psnr": 30.126, "ssim": 0.9, "mask_iou": 0.95, "geometry": geometry}
     pose = {"psnr": None, "ssim": None, "mask_iou": None, "geometry": None}
-    values = {row["name"]: row["values"] for row in summary({"novel_view": view, "novel_pose": pose})}
-    assert values["PSNR"] == ["30.13", "–"]
-    assert values["Surface distance"] == ["8.0", "–"]
-    assert values["Chamfer"] == ["0.123", "–"]
+    posed, tracked = pose | {"psnr": 28.0}, pose | {"psnr": 29.0}
+    found = {"novel_view": view, "novel_pose": pose, "novel_pose_posed": posed, "novel_pose_tracked": tracked}
+    values = {row["name"]: row["values"] for row in summary(found)}
+    assert values["PSNR"] == ["30.13", "–", "28.00", "29.00"]
+    assert values["Surface distance"] == ["8.0", "–", "–", "–"]
+    assert values["Chamfer"] == ["0.123", "–", "–", "–"]
 
 
 def test_costs_have_a_row_a_part_of_a_stage() -> None:
@@ -61,11 +63,12 @@ def test_seconds_of_the_fit_are_among_the_costs(tmp_path: Path) -> None:
 def test_notes_say_what_was_left_out_and_what_was_compared_to(tmp_path: Path) -> None:
     inputs = ball_inputs(write_ball_capture(tmp_path / "capture", "ball", ("c",)), tmp_path / "stages")
     view = {"reference": "image x ground-truth mask", "without_mask": 3, "without_person": 2}
-    found = {"lpips": "not available: no weights", "novel_view": view, "novel_pose": {"reason": "of rain"}}
+    rain = {f"novel_pose{column}": {"reason": "of rain"} for column in ("", "_posed", "_tracked")}
+    found = {"lpips": "not available: no weights", "novel_view": view} | rain
     assert notes(inputs, found) == [
         "LPIPS is not available: no weights.",
+        "New poses, animated; New poses, posed; New poses, tracked: no image figures, since of rain.",
         "New views: compared to photographs under the true mask, whose edge pixels hold background.",
         "New views: 3 images have no ground-truth mask and are not scored.",
         "New views: 2 images do not show the person and are not scored.",
-        "New poses: no image figures, since of rain.",
     ]

@@ -8,7 +8,8 @@ from tests.evaluation.ball import write_ball_capture
 def test_splits_with_test_cameras(tmp_path: Path) -> None:
     capture = write_ball_capture(tmp_path, "ball", ("c", "d"))
     assert all_views(capture, "novel_view") == [View("novel_view", c, f) for c in ("c", "d") for f in (0, 1, 2)]
-    assert all_views(capture, "novel_pose") == [View("novel_pose", "c", 3), View("novel_pose", "d", 3)]
+    for column in ("novel_pose", "novel_pose_posed", "novel_pose_tracked"):
+        assert all_views(capture, column) == [View(column, "c", 3), View(column, "d", 3)]
 
 
 def test_splits_without_test_cameras(tmp_path: Path) -> None:

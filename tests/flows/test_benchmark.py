@@ -58,14 +58,16 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
             raise asked.fails[settings.machinery]
         return SimpleNamespace(machinery=settings.machinery)
 
-    def score_training(shelf: Any, truth: Any, recording: Any, calibration: Any, model: Any, settings: Any) -> Any:
+    def score_training(shelf: Any, truth: Any, recording: Any, calibration: Any, body: Any, model: Any, _: Any) -> Any:
+        assert body == "body"
         folder = shelf.root / "scoring" / model.machinery
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "scores.json").write_text(json.dumps(scores(PSNR[model.machinery], 1.0, "") | {"pictures": []}))
         return SimpleNamespace(root=folder)
 
-    for name in ("calibrate", "find_masks", "fit"):
+    for name in ("calibrate", "find_masks"):
         monkeypatch.setattr(train_subject, name, lambda *_: None)
+    monkeypatch.setattr(train_subject, "fit", lambda *_: "body")
     monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path, title="whole"))
     monkeypatch.setattr(module, "subset_capture", lambda _, recording, *parts: SimpleNamespace(title=str(parts)))
     monkeypatch.setattr(module, "read_capture", lambda *_: (None, None))
@@ -207,7 +209,7 @@ def test_the_command_prints_table_and_chart(
     assert main(["benchmark", str(tmp_path), *options]) == 0
     assert [settings.snapshots_s for _, settings in stages] == [(2.0, 4.0)] * 2
     shown = capsys.readouterr().out
-    assert "| demo | 30.00 / - |" in shown
+    assert "| demo | 30.00 / - / - / - |" in shown
     chart = tmp_path / "store" / "benchmark" / "ada-toys.png"
     assert f"chart: {chart}" in shown and chart.exists()
 
@@ -260,11 +262,11 @@ def test_scores_are_found_again_until_what_is_scored_or_how_changes(
     monkeypatch.setattr(tasks_module, "score", score)
     monkeypatch.setattr(tasks_module, "scene", lambda *_: None)
     truth = Source(root=tmp_path, name="ada", digest="1")
-    recording, calibration, model = (Artifact(stage=s, root=tmp_path / s, files={}) for s in ("a", "b", "c"))
+    recording, calibration, body, model = (Artifact(stage=s, root=tmp_path / s, files={}) for s in "abdc")
     shelf = Store(tmp_path / "store")
 
     def run(truth: Source, settings: ScoringSettings) -> Artifact:
-        return tasks_module.score_training(shelf, truth, recording, calibration, model, settings)
+        return tasks_module.score_training(shelf, truth, recording, calibration, body, model, settings)
 
     first = run(truth, ScoringSettings())
     assert run(truth, ScoringSettings()) == first

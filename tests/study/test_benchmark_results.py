@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from hnerf.evaluation.evaluate import MEANS
+from hnerf.evaluation.images import unscored
 from hnerf.study import charts
 from hnerf.study.publish import picture_rows, publish
 from hnerf.study.results import (
+    CELL,
     as_csv,
     as_markdown,
     caption,
@@ -42,7 +43,6 @@ def split(psnr: float) -> dict[str, Any]:
 
 
 def scores(psnr: float, frame_s: float, folder: str) -> dict[str, Any]:
-    nothing = {"n": 0, "per_image": [], "reason": "no poses"} | dict.fromkeys(MEANS)
     curve = [
         {"seconds": s, "psnr": db, "empty_psnr": 18.5, "one_colour_psnr": 25.5}
         for s, db in ((10.0, psnr - 4), (1e3, psnr))
@@ -56,7 +56,9 @@ def scores(psnr: float, frame_s: float, folder: str) -> dict[str, Any]:
         "curve": curve,
         "trained_on": {"cameras": 4, "frames": 1},
         "novel_view": split(psnr),
-        "novel_pose": nothing | {"geometry": None, "geometry_reason": "no poses"},
+        "novel_pose": unscored("no poses") | {"geometry": None, "geometry_reason": "no poses"},
+        "novel_pose_posed": unscored("no poses"),
+        "novel_pose_tracked": unscored("no poses"),
         "frame_seconds": {"512": 4 * frame_s, "256": frame_s},
         "pictures": [{"camera": "c", "frame": 0}],
         "folder": folder,
@@ -100,7 +102,7 @@ def test_the_markdown_by_hand() -> None:
         "",
         "- A claim.",
         "",
-        "Two figures in a cell: new views / new poses.",
+        CELL,
         "",
         "## 4 cameras",
         "",
@@ -109,15 +111,17 @@ def test_the_markdown_by_hand() -> None:
         "| method | PSNR, dB | SSIM | mask IoU | Chamfer x1e-3 m² | NC | IoU | training, s | peak memory, GiB "
         "| model, MiB | frame at 256 px, s | frame at 512 px, s | s to best - 1 dB |",
         "|" + "---|" * 13,
-        "| fast | 30.00 / - | 0.900 / - | 0.950 / - | 0.050 / - | 0.940 / - | 0.875 / - | 62 | 1.2 | 28.5 | 0.50 "
+        "| fast | 30.00 / - / - / - | 0.900 / - / - / - | 0.950 / - / - / - "
+        "| 0.050 / - | 0.940 / - | 0.875 / - | 62 | 1.2 | 28.5 | 0.50 "
         "| 2.00 | 316 |",
-        "| nerf | 26.00 / - | 0.900 / - | 0.950 / - | 0.050 / - | 0.940 / - | 0.875 / - | 62 | 1.2 | 28.5 | 2.00 "
+        "| nerf | 26.00 / - / - / - | 0.900 / - / - / - | 0.950 / - / - / - "
+        "| 0.050 / - | 0.940 / - | 0.875 / - | 62 | 1.2 | 28.5 | 2.00 "
         "| 8.00 | - |",
         "| idr | a / b |  |  |  |  |  |  |  |  |  |  |  |",
-        "| one colour in the true outline | 25.00 / - |  |  |  |  |  |  |  |  |  |  |  |",
-        "| an empty picture | 18.00 / - |  |  |  |  |  |  |  |  |  |  |  |",
+        "| one colour in the true outline | 25.00 / - / - / - |  |  |  |  |  |  |  |  |  |  |  |",
+        "| an empty picture | 18.00 / - / - / - |  |  |  |  |  |  |  |  |  |  |  |",
         "",
-        "- fast, nerf: no images of new poses: no poses",
+        "- fast, nerf: no images of animated new poses: no poses",
         "",
         "## 2 cameras",
     ]
@@ -141,6 +145,25 @@ def test_what_methods_had_on_the_way_and_why_they_ended() -> None:
     ]
     assert ends(flat["variants"]["4 cameras"]) == {"fast": "its steps are done", "nerf": "flat"}
     assert "each from the start" in caption(flat) and "60 s at most" in caption(flat)
+
+
+def test_new_poses_have_three_columns_and_surfaces_one() -> None:
+    """The compared method tunes nothing."""
+    several = result()
+    methods = several["variants"]["4 cameras"]["methods"]
+    columns = {"novel_pose": 27.0, "novel_pose_posed": 28.0, "novel_pose_tracked": 29.0}
+    methods["fast"] |= {name: split(db) for name, db in columns.items()}
+    methods["nerf"] |= {"novel_pose": split(22.0), "novel_pose_posed": unscored("no pose of these frames was tuned")}
+    text, (fast, nerf, *_) = as_markdown(several, [], []), csv.DictReader(io.StringIO(as_csv(several)))
+    assert "| fast | 30.00 / 27.00 / 28.00 / 29.00 |" in text and "| 0.050 / 0.050 |" in text
+    assert "| nerf | 26.00 / 22.00 / - / - |" in text
+    assert "- nerf: no images of posed new poses: no pose of these frames was tuned" in text
+    assert (fast["novel_pose.psnr"], fast["novel_pose_posed.psnr"], fast["novel_pose_tracked.psnr"]) == (
+        "27.0",
+        "28.0",
+        "29.0",
+    )
+    assert nerf["novel_pose_tracked.psnr"] == "" and "novel_pose_tracked.geometry.iou" not in fast
 
 
 def test_what_calibration_left_out_is_told_and_not_plotted() -> None:

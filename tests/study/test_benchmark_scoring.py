@@ -2,7 +2,7 @@
 
 import json
 import re
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 import torch
 
-from hnerf.evaluation.evaluate import render
+from hnerf.capture.capture import Capture
+from hnerf.evaluation.columns import why_no_novel_poses
 from hnerf.evaluation.ground_truth import GroundTruth
+from hnerf.evaluation.images import render
 from hnerf.evaluation.metrics import mask_box
 from hnerf.evaluation.views import View
 from hnerf.render.avatar import Rendering
 from hnerf.study import scoring
 from hnerf.study.plan import ScoringSettings
-from hnerf.study.scoring import Scene, frame_seconds, score, score_at, score_end, why_no_novel_poses, write_pictures
+from hnerf.study.scoring import Scene, frame_seconds, score, score_at, score_end, write_pictures
 from tests.evaluation.ball import (
     PHOTOGRAPHED,
     RADIUS_M,
@@ -26,8 +28,10 @@ from tests.evaluation.ball import (
     ball_fit,
     centre_m,
     seen,
+    tuned,
     write_ball_capture,
     write_ball_truth,
+    write_settings,
 )
 
 GAP_M = 0.01  # between the ball and its true surface
@@ -40,18 +44,15 @@ GREYS = {
 SETTINGS = ScoringSettings(meshes=1, snapshot_images=2, snapshot_meshes=0, frame_sizes_px=(16, 32))
 
 
-class GreyBall(BallAvatar):
-    """The ball in a grey of its own; every rendering's size is noted."""
+@dataclass(frozen=True)
+class SizedBall(BallAvatar):
+    """The ball; every rendering's size is noted."""
 
-    def __init__(self, grey: float):
-        super().__init__(ball_fit())
-        object.__setattr__(self, "grey", grey)
-        object.__setattr__(self, "sizes", [])
+    sizes: list[tuple[int, int]] = field(default_factory=list)
 
     def render(self, camera: Any, theta: torch.Tensor, root: torch.Tensor) -> Rendering:
         self.sizes.append((camera.width_px, camera.height_px))
-        alpha = torch.from_numpy(seen(camera, root[:3, 3].numpy())).float()
-        return Rendering(alpha[..., None].expand(-1, -1, 3) * self.grey / 255, alpha, alpha)
+        return super().render(camera, theta, root)
 
 
 def scored(
@@ -65,7 +66,7 @@ def scored(
         folder = training / "snapshots" / name
         folder.mkdir(parents=True)
         (folder / "settings.json").write_text(json.dumps(stored | {"seconds": seconds}))
-    (training / "settings.json").write_text(json.dumps(stored | {"seconds": 15.0}))
+    write_settings(training, machinery)
     report = {"seconds": 15.0, "field_seconds": 12.0, "peak_memory_gib": 1.5, "model_mib": 7.0}
     (training / "report.json").write_text(json.dumps(report))
     capture = write_ball_capture(base / "capture", "ball", test_cameras)
@@ -73,8 +74,13 @@ def scored(
     out = base / "out"
     out.mkdir()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scoring, "load_avatar", lambda path, device: GreyBall(GREYS[path.name]))
-        return score(Scene(capture, GroundTruth(capture.root, capture), "cpu"), training, settings, out)
+        patch.setattr(scoring, "load_avatar", lambda path, device: BallAvatar(tuned(ball_fit()), GREYS[path.name]))
+        return score(scene(capture), training, settings, out)
+
+
+def scene(capture: Capture) -> Scene:
+    """What the ball is scored against."""
+    return Scene(capture, ball_fit(), GroundTruth(capture.root, capture), "cpu")
 
 
 @pytest.fixture(scope="module")
@@ -113,20 +119,34 @@ def test_the_curve_is_of_snapshots_when_they_were_taken_and_of_the_end_of_the_fi
 def test_of_a_longer_training_the_end_alone_is_scored(base: Path, found: dict[str, Any], tmp_path: Path) -> None:
     capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
     write_ball_truth(capture, RADIUS_M + GAP_M)
-    scene = Scene(capture, GroundTruth(capture.root, capture), "cpu")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scoring, "load_avatar", lambda path, device: GreyBall(GREYS[path.name]))
-        end = score_end(scene, base / "training", SETTINGS, tmp_path)
+        patch.setattr(scoring, "load_avatar", lambda path, device: BallAvatar(tuned(ball_fit()), GREYS[path.name]))
+        end = score_end(scene(capture), base / "training", SETTINGS, tmp_path)
     assert end == {"training": found["training"], "curve": found["curve"][-1:]}
     assert json.loads((tmp_path / "scores.json").read_text()) == end
 
 
-def test_new_poses_count_the_seconds_that_fitting_them_took(tmp_path: Path) -> None:
+def test_curves_of_new_poses_are_animated_and_end_with_the_field(tmp_path: Path) -> None:
+    """They need no fitting to the finished field. Training lifted the new frame's body by two pixels."""
+    found = scored(tmp_path, ("c",), SETTINGS.model_copy(update={"split": "novel_pose"}))
+    assert [row["seconds"] for row in found["curve"]] == [6.5, 10.0, 12.0]
+    for row, grey in zip(found["curve"], (51, 76.5, 102), strict=True):
+        assert row["psnr"] == pytest.approx(psnr_db(grey, "c", 3), abs=1e-3)
+    assert found["novel_pose"]["psnr"] == pytest.approx(psnr_db(102, "c", 3), abs=1e-3)
+    assert found["novel_pose"]["mask_iou"] == 1.0
+    for column in ("posed", "tracked"):  # one picture here, as no frame knows anything of itself
+        assert found[f"novel_pose_{column}"]["mask_iou"] < 0.9
+        assert "geometry" not in found[f"novel_pose_{column}"]
+
+
+def test_without_a_test_camera_nothing_is_scored_on_images(tmp_path: Path) -> None:
     found = scored(tmp_path, ())
-    assert found["split"] == "novel_pose"
-    assert [row["seconds"] for row in found["curve"]] == [6.5, 10.0, 12.0, 15.0]
+    assert found["curve"] == [] and found["pictures"] == []
     assert found["novel_view"]["psnr"] is None
     assert found["novel_view"]["reason"] == "the capture has no test cameras"
+    assert found["novel_pose"]["psnr"] is None and "evaluation.holdout" in found["novel_pose"]["reason"]
+    assert found["novel_view"]["geometry"]["n"] == 1
+    assert not (tmp_path / "out" / "renders").exists()
 
 
 def test_images_stand_beside_their_distance_from_training(found: dict[str, Any]) -> None:
@@ -147,11 +167,11 @@ def test_pictures_of_truth_and_rendering_lie_side_by_side(base: Path, found: dic
 def test_a_picture_that_cannot_be_written_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = write_ball_capture(tmp_path, "ball", ("c",))
     write_ball_truth(capture, RADIUS_M)
-    render(BallAvatar(ball_fit()), capture, [View("novel_view", "c", 1)], tmp_path)
+    render({"novel_view": BallAvatar(ball_fit())}, capture, [View("novel_view", "c", 1)], tmp_path)
     monkeypatch.setattr("cv2.imwrite", lambda *_: False)
-    scene, shown = Scene(capture, GroundTruth(tmp_path, capture), "cpu"), [{"camera": "c", "frame": 1}]
+    shown = [{"camera": "c", "frame": 1}]
     with pytest.raises(OSError, match=r"0-render\.png: cannot be written"):
-        write_pictures(scene, "novel_view", shown, tmp_path)
+        write_pictures(scene(capture), "novel_view", shown, tmp_path)
 
 
 def test_a_method_without_poses_has_a_reason_instead_of_figures(tmp_path: Path) -> None:
@@ -180,13 +200,12 @@ def test_images_are_chosen_of_those_whose_truth_is_known(tmp_path: Path) -> None
     write_ball_truth(capture, RADIUS_M)
     for frame in (0, 2):
         (tmp_path / "ground_truth" / "masks" / "c" / f"{frame:06d}.png").unlink()
-    scene = Scene(capture, GroundTruth(tmp_path, capture), "cpu")
-    found = score_at(scene, GreyBall(102), "novel_view", 1, 0, tmp_path)
+    found = score_at(scene(capture), BallAvatar(ball_fit()), "novel_view", 1, 0, tmp_path)
     assert [row["frame"] for row in found["per_image"]] == [1]
 
 
 def test_a_frame_is_timed_at_its_longest_side() -> None:
-    avatar = GreyBall(100)
+    avatar = SizedBall(ball_fit())
     wide = replace(ball_camera("a", 0.0), width_px=64, height_px=32)
     assert frame_seconds(avatar, wide, 0, 16) > 0
     assert avatar.sizes == [(16, 8)] * 3

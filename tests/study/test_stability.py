@@ -172,11 +172,10 @@ def test_the_tables_by_hand() -> None:
         "",
         "## Runs",
     ]
-    assert (
-        "| fast | pose noise, ° a joint | 2 | 0 | degraded | 27.00 (-3.00) | 0.900 (+0.000) | 9.00 (+3.00) |" in lines
-    )
-    assert "| fast | as recorded |  | 1 | ok | 31.00 | 0.900 | 5.00 |" in lines
-    assert "| fast | pose noise, ° a joint | 2 | 1 | failed: too / bad | - | - | - |" in lines
+    figures = "27.00 (-3.00) | - | - | 0.900 (+0.000) | 9.00 (+3.00)"
+    assert f"| fast | pose noise, ° a joint | 2 | 0 | degraded | {figures} |" in lines
+    assert "| fast | as recorded |  | 1 | ok | 31.00 | - | - | 0.900 | 5.00 |" in lines
+    assert "| fast | pose noise, ° a joint | 2 | 1 | failed: too / bad | - | - | - | - | - |" in lines
     assert "- hats" in lines
     assert lines[-1] == "By eye."
 

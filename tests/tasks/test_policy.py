@@ -22,8 +22,8 @@ def source(digest: str = "d", name: str = "ada", root: str = "/here/ada") -> Sou
 
 
 def key(task: str = "fit", version: str = "1", **changed: Any) -> str:
-    inputs = {"source": source(), "body": artifact(), "settings": CaptureSettings(), "rough": None} | changed
-    return stage_key(task, version, inputs)
+    inputs: dict[str, Any] = {"source": source(), "body": artifact(), "settings": CaptureSettings(), "rough": None}
+    return stage_key(task, version, inputs | {"several": (artifact(), artifact("b"))} | changed)
 
 
 @pytest.mark.parametrize(
@@ -32,6 +32,7 @@ def key(task: str = "fit", version: str = "1", **changed: Any) -> str:
         {"source": source(root="/there/ada")},
         {"body": artifact(root="/other/store/fit/k").model_copy(update={"metrics": {"seconds": 2.0}})},
         {"settings": CaptureSettings(max_side_px=CaptureSettings().max_side_px)},
+        {"several": (artifact(root="/other/store/fit/k"), artifact("b"))},
     ],
 )
 def test_key_is_the_same_wherever_the_bytes_lie(same: dict[str, Any]) -> None:
@@ -48,6 +49,8 @@ def test_key_is_the_same_wherever_the_bytes_lie(same: dict[str, Any]) -> None:
         {"body": artifact("b")},
         {"settings": CaptureSettings(max_side_px=64)},
         {"rough": artifact()},
+        {"held_out": ()},
+        {"held_out": (artifact(),)},
     ],
 )
 def test_key_changes_with_name_version_bytes_and_settings(other: dict[str, Any]) -> None:

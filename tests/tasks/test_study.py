@@ -10,8 +10,9 @@ import trimesh
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.study.degrade import Degradation
+from tasks.capture import subset_capture
 from tasks.store import Artifact, Store
-from tasks.study import check_meshes, degrade_capture, degrade_fit, subset_capture
+from tasks.study import check_meshes, degrade_capture, degrade_fit
 from tests.body.boxes import box_rig
 from tests.study.recording import write_recording
 

@@ -3,8 +3,8 @@ from pathlib import Path
 import pytest
 
 from hnerf.capture.capture import Capture
+from hnerf.capture.subset import subset
 from hnerf.errors import CaptureError
-from hnerf.study.subset import subset
 from tests.study.recording import write_recording
 
 

@@ -1,0 +1,98 @@
+"""Images of a split: which, rendered, and scored."""
+
+import dataclasses
+import logging
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from hnerf.capture.capture import Capture, read_rgba, write_image
+from hnerf.evaluation import metrics
+from hnerf.evaluation.ground_truth import Truth
+from hnerf.evaluation.views import NEW_POSES, View, all_views, some_views
+from hnerf.render.avatar import Avatar, Rendering
+
+log = logging.getLogger("hnerf.evaluation")
+
+LOG_EVERY_S = 10.0
+MEANS = ("psnr", "ssim", "mask_iou", "empty_psnr", "one_colour_psnr")  # over a split's images
+TUNED_ON = (
+    "the capture has no test camera, and training cameras saw these frames when their poses were fitted; "
+    "evaluation.holdout scores a field that was trained without one of them"
+)
+
+
+def scored_views(capture: Capture, split: str, truth: Truth | None, count: int | None) -> list[View]:
+    """All images of a split, or at most `count` of those whose true mask is known; of all where none is."""
+    views = all_views(capture, split)
+    if count is None:
+        return views
+    return some_views(known_views(views, truth) or views, count)
+
+
+def known_views(views: list[View], truth: Truth | None) -> list[View]:
+    """Those whose true mask is known."""
+    return [view for view in views if truth and truth.has_mask(view.camera, view.frame)]
+
+
+def render(avatars: Mapping[str, Avatar], capture: Capture, views: list[View], out: Path) -> float:
+    """Write every view as its split's avatar looks in the poses of its `body`: 8-bit RGBA, colour over black and
+    coverage. Returns the median seconds of one image, without writing it."""
+    seconds: list[float] = []
+    next_log = time.perf_counter() + LOG_EVERY_S
+    for view in views:
+        started = time.perf_counter()
+        body = avatars[view.split].body
+        k = body.index(view.frame)
+        with torch.no_grad():
+            pixels = rgba(avatars[view.split].render(capture.cameras[view.camera], body.theta[k], body.root[k]))
+        seconds.append(time.perf_counter() - started)
+        write_image(view.path(out), pixels)
+        if time.perf_counter() > next_log:
+            log.info("rendered %d of %d images", len(seconds), len(views))
+            next_log = time.perf_counter() + LOG_EVERY_S
+    return float(np.median(seconds))
+
+
+def rgba(rendering: Rendering) -> np.ndarray:
+    """(H, W, 4) uint8: colour over black, and coverage."""
+    both = torch.cat([rendering.rgb, rendering.alpha[..., None]], -1)
+    return (both.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+
+
+def score_split(capture: Capture, split: str, views: list[View], truth: Truth | None, out: Path) -> dict[str, Any]:
+    """Mean image figures of a split's renderings, and each image's; null with a reason where there are none."""
+    if not views:
+        missing = "novel-pose frames" if split in NEW_POSES else "test cameras"
+        return unscored(f"the capture has no {missing}")
+    if not capture.test_cameras:
+        return unscored(TUNED_ON)
+    if truth is None or not truth.has_masks:
+        return unscored("the capture has no ground-truth masks")
+    rows, references = [], set()
+    known = known_views(views, truth)
+    for view in known:
+        mask = truth.mask(view.camera, view.frame)
+        if not mask.any():
+            continue
+        reference, source = truth.on_black(view.camera, view.frame)
+        score = metrics.score_image(read_rgba(view.path(out)), reference, mask)
+        references.add(source)
+        row: dict[str, Any] = {"camera": view.camera, "frame": view.frame} | dataclasses.asdict(score)
+        rows.append(row | metrics.floors(reference, mask))
+    if not rows:
+        return unscored(
+            "no image of this split shows the person" if known else "no image of this split has a mask to score it by"
+        )
+    means = {name: float(np.mean([row[name] for row in rows])) for name in MEANS}
+    without = {"without_mask": len(views) - len(known), "without_person": len(known) - len(rows)}
+    return {"n": len(rows)} | means | without | {"reference": " and ".join(sorted(references)), "per_image": rows}
+
+
+def unscored(reason: str) -> dict[str, Any]:
+    """The figures of a split without any."""
+    return {"n": 0, "per_image": []} | dict.fromkeys(MEANS) | {"reason": reason}

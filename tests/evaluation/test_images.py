@@ -1,0 +1,29 @@
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from hnerf.capture.capture import read_rgb, read_rgba, write_image
+from hnerf.errors import CaptureError
+from hnerf.evaluation.images import rgba
+from hnerf.render.avatar import Rendering
+
+
+def test_renderings_are_colour_over_black_and_coverage(tmp_path: Path) -> None:
+    """A pixel that red covers by a half, and one of black hair; who knows nothing of alpha sees them over black."""
+    alpha = torch.tensor([[0.5, 1.0]])
+    picture = rgba(Rendering(torch.tensor([[[0.5, 0.0, 0.0], [0.0, 0.0, 0.0]]]), alpha, alpha))
+    assert picture.tolist() == [[[128, 0, 0, 128], [0, 0, 0, 255]]]
+    write_image(tmp_path / "a.png", picture)
+    assert np.array_equal(read_rgba(tmp_path / "a.png"), picture)
+    assert np.array_equal(read_rgb(tmp_path / "a.png"), picture[..., :3])
+    stored = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
+    assert stored is not None and stored[0, 0].tolist() == [0, 0, 128, 128]  # BGRA
+
+
+def test_a_picture_without_coverage_is_no_rendering(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.png", np.zeros((2, 2, 3), np.uint8))
+    with pytest.raises(CaptureError, match=r"a\.png: no readable image with an alpha channel"):
+        read_rgba(tmp_path / "a.png")

@@ -1,0 +1,146 @@
+"""Fields trained without a camera: what reaches their fit and training, and what comes of it."""
+
+import dataclasses
+import inspect
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows import train_subject as module
+from flows.cli import main
+from flows.train_subject import train_subject
+from hnerf.capture.capture import Capture
+from hnerf.capture.formats.easymocap import write_easymocap
+from hnerf.capture.lens import pinhole
+from tasks.calibration import calibrated
+from tasks.stage import Stage
+from tasks.store import Artifact
+from tests.study.recording import ROTATIONS, write_recording
+
+CAMERAS = tuple(ROTATIONS)  # 01, 02, 03
+HELD_OUT = ["evaluation.holdout=each"]
+
+
+def write_three(out: Path) -> None:
+    """The recording by hand, with all its cameras for training."""
+    dataclasses.replace(write_recording(out), train_cameras=CAMERAS, test_cameras=()).save()
+
+
+@pytest.fixture
+def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """Every call of a stage that did work: its name and inputs. Only the stage that takes cameras out is itself."""
+    made: list[dict[str, Any]] = []
+
+    def spied(stage: Stage[Any]) -> Stage[Any]:
+        def write(out: Path, **inputs: Any) -> dict[str, float]:
+            made.append({"stage": stage.name} | inputs)
+            if stage.name == "capture":
+                write_three(out)
+            elif stage.name == "calibration":
+                cameras = Capture.load(inputs["recording"].root).cameras
+                write_easymocap(out, [pinhole(camera) for camera in cameras.values()])
+                (out / "report.json").write_text(json.dumps({"cameras": {n: {"frame_offset": 0.0} for n in cameras}}))
+            else:
+                (out / "made").write_text(str(len(made)))
+            return {}
+
+        write.__signature__ = inspect.signature(stage.write)  # type: ignore[attr-defined]
+        return Stage(write, stage.name, "test", resumable=False)
+
+    for name in ("ingest", "calibrate", "segment", "fit", "train", "evaluate", "evaluate_held_out", "export"):
+        monkeypatch.setattr(module, name, spied(getattr(module, name)))
+    monkeypatch.setattr(module, "needs_body", lambda *_: True)
+    monkeypatch.setattr(module, "settled", lambda *_: True)
+    (tmp_path / "ada").mkdir()
+    whole = write_recording(tmp_path / "whole")
+    write_easymocap(tmp_path / "ada", [pinhole(camera) for camera in whole.cameras.values()])
+    (tmp_path / "ada" / "images").mkdir()
+    return made
+
+
+def of(calls: list[dict[str, Any]], stage: str) -> list[dict[str, Any]]:
+    return [call for call in calls if call["stage"] == stage]
+
+
+def test_a_camera_left_out_never_reaches_fit_masks_or_training(calls: list[dict[str, Any]], tmp_path: Path) -> None:
+    train_subject.fn(tmp_path / "ada", "demo", tmp_path / "store", ["evaluation.holdout='02'"])
+    for stage, times in (("segmentation", 2), ("fit", 4), ("training", 2)):  # once with all cameras, once without
+        assert len(of(calls, stage)) == times
+        without = [call for call in of(calls, stage) if call["recording"].stage == "subset"]
+        assert len(without) == times // 2
+        for call in without:
+            assert calibrated(call["recording"], call["calibration"]).train_cameras == ("01", "03")
+            root = call["recording"].root
+            assert not [path for path in root.rglob("*") if "02" in path.relative_to(root).parts or path.stem == "02"]
+            assert Capture.load(root).keypoints("02") is None
+    whole, left = of(calls, "training")
+    assert whole["recording"].stage == "capture"
+    assert {left[name].root for name in ("segmentation", "body")}.isdisjoint(
+        whole[name].root for name in ("segmentation", "body")
+    )
+
+
+def test_a_camera_left_out_is_scored_with_the_masks_of_the_whole_run(
+    calls: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    train_subject.fn(tmp_path / "ada", "demo", tmp_path / "store", ["evaluation.holdout='02'"])
+    (scored,), (whole, left) = of(calls, "holdout"), of(calls, "training")
+    assert scored["settings"].holdout == "02"
+    assert scored["recording"].stage == "capture" and scored["segmentation"] == whole["segmentation"]
+    assert scored["body"] == left["body"] and scored["body"] != whole["body"]
+    (report,) = of(calls, "evaluation")
+    assert [artifact.stage for artifact in report["held_out"]] == ["holdout"]
+
+
+def test_each_camera_is_left_out_once_and_found_again(calls: list[dict[str, Any]], tmp_path: Path) -> None:
+    train_subject.fn(tmp_path / "ada", "demo", tmp_path / "store", HELD_OUT)
+    assert [call["settings"].holdout for call in of(calls, "holdout")] == list(CAMERAS)
+    assert len(of(calls, "training")) == 4
+    done = len(calls)
+    train_subject.fn(tmp_path / "ada", "demo", tmp_path / "store", HELD_OUT)
+    assert len(calls) == done
+    train_subject.fn(tmp_path / "ada", "demo", tmp_path / "store", ["evaluation.holdout='02'"])
+    assert [call["stage"] for call in calls[done:]] == ["evaluation"]  # the rest is known
+
+
+def test_without_the_setting_nothing_is_left_out(calls: list[dict[str, Any]], tmp_path: Path) -> None:
+    train_subject.fn(tmp_path / "ada", "demo", tmp_path / "store", [])
+    assert len(of(calls, "training")) == 1 and of(calls, "holdout") == []
+    assert of(calls, "evaluation")[0]["held_out"] == ()
+
+
+@pytest.mark.parametrize(
+    ("holdout", "notes", "message"),
+    [
+        ("cam9", "name = 'ada'", "evaluation.holdout=cam9: no such training camera; there are 01, 02, 03"),
+        ("each", "[cameras]\ntrain = ['01', '02']\n", "of 2 training cameras fewer than 2 would be left"),
+    ],
+)
+def test_what_cannot_be_left_out_is_told_before_any_work(
+    calls: list[dict[str, Any]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    holdout: str,
+    notes: str,
+    message: str,
+) -> None:
+    (tmp_path / "ada" / "capture.toml").write_text(notes)
+    options = ["--store", str(tmp_path / "store"), "--set", f"evaluation.holdout={holdout}"]
+    assert main(["run", str(tmp_path / "ada"), *options]) == 2
+    told = capsys.readouterr().err
+    assert message in told and told.count("\n") == 1
+    assert calls == []
+
+
+def test_what_calibration_rejects_cannot_be_left_out(
+    calls: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without_03(recording: Artifact, calibration: Artifact) -> Capture:
+        return dataclasses.replace(calibrated(recording, calibration), train_cameras=("01", "02"))
+
+    monkeypatch.setattr(module, "calibrated", without_03)
+    assert main(["run", str(tmp_path / "ada"), "--store", str(tmp_path / "store"), "--set", HELD_OUT[0]]) == 2
+    assert "of 2 training cameras" in capsys.readouterr().err
+    assert of(calls, "fit") == []
