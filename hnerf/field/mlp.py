@@ -29,11 +29,11 @@ class SkipMLP(nn.Module):
         self.middle = layers // 2
         sizes = [inputs] + [width] * (layers - 1)
         sizes[self.middle] += inputs
-        layers = [nn.Linear(size, width) for size in sizes]
-        for layer in layers:
+        linear = [nn.Linear(size, width) for size in sizes]
+        for layer in linear:
             nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
             nn.init.zeros_(layer.bias)
-        self.layers = nn.ModuleList(layers)
+        self.layers = nn.ModuleList(linear)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, inputs) to (N, width)."""

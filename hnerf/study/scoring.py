@@ -152,7 +152,7 @@ def add_nearness(capture: Capture, avatar: Avatar, split: str, found: dict[str, 
     for row in found["per_image"]:
         middle_m = middles_m[avatar.body.index(row["frame"])]
         row["view_angle_deg"] = view_angle_deg(capture.cameras[row["camera"]], trained, middle_m)
-    for row in [*found["per_image"], *((found["geometry"] or {}).get("per_surface", ()))]:
+    for row in [*found["per_image"], *((found.get("geometry") or {}).get("per_surface", ()))]:
         row["pose_distance_deg"] = apart_deg[row["frame"]]
 
 
