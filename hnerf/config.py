@@ -180,6 +180,7 @@ class TrainingSettings(Section):
     checkpoint_steps: int = Field(default=100, ge=1)
     snapshots_s: tuple[PositiveFloat, ...] = ()  # when the subject is saved as it stands, below `snapshots/`
     processes: int = Field(default=0, ge=0)  # 0: one a GPU, or one
+    memory_gib: float | None = Field(default=None, gt=0)  # a process, for the rays of a step; None: what is free
     seed: int = Field(default=0, ge=0)
 
     @model_validator(mode="after")
