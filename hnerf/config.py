@@ -99,6 +99,7 @@ class PaperFieldSettings(Section):
     gamma: float = Field(default=200.0, gt=0)
     learning_rate: float = Field(default=1e-3, gt=0)
     root_condition: bool = True  # colour depends on T
+    bf16: bool = False  # the networks' layers but the last ones multiply in bfloat16
 
 
 class NerfSettings(Section):

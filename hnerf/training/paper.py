@@ -38,6 +38,7 @@ class PaperField(Field):
         point, pose, self.turn = (3, 0, 0) if static else (4, 3 * int(rig.free.sum()), turn)
         self.radiance = RadianceMLP(point, pose, self.turn)
         self.residual = ResidualMLP(point, pose)
+        self.radiance.trunk.bf16 = self.residual.trunk.bf16 = settings.bf16
 
     def region(self, bodies: PosedBodies, conditions: Conditions) -> Boxes:
         """Box B of each pose: the body's extent and a margin."""
