@@ -110,7 +110,7 @@ class PaperFieldSettings(Section):
     learning_rate: float = Field(default=1e-3, gt=0)
     root_condition: bool = True  # colour depends on T
     view_octaves: int = Field(default=0, ge=0)  # of the encoding of v
-    bfloat16: bool = False  # matrix products of F and DH in half precision
+    bf16: bool = False  # the networks' layers but the last ones multiply in bfloat16
 
     @model_validator(mode="after")
     def _some_samples_lie_outside_the_box(self) -> Self:
@@ -199,6 +199,7 @@ class TrainingSettings(Section):
     checkpoint_steps: int = Field(default=100, ge=1)
     snapshots_s: tuple[PositiveFloat, ...] = ()  # when the subject is saved as it stands, below `snapshots/`
     processes: int = Field(default=0, ge=0)  # 0: one a GPU, or one
+    memory_gib: float | None = Field(default=None, gt=0)  # a process, for the rays of a step; None: what is free
     seed: int = Field(default=0, ge=0)
 
     @model_validator(mode="after")

@@ -1,6 +1,7 @@
 """The networks of the paper: F, eight layers of 256, and DH, six of 128; Swish, a skip connection to the middle."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
 
 import torch
 from torch import Tensor, nn
@@ -12,8 +13,8 @@ class SkipMLP(nn.Module):
     """`layers` linear layers of `width`, Swish unless said otherwise; the input is fed again into the middle one.
 
     Weights start as He et al. (2015) draw them, biases at zero: torch's own start leaves the output of eight layers
-    nearly constant over space. bfloat16: multiply matrices in half precision, which takes less than half of the time on
-    processors that can; weights and outputs keep their precision.
+    nearly constant over space. bf16: multiply, and keep what lies between the layers, in bfloat16, for half the memory
+    and less time on processors that can.
     """
 
     def __init__(
@@ -22,10 +23,10 @@ class SkipMLP(nn.Module):
         width: int,
         layers: int,
         activation: Callable[[Tensor], Tensor] = nn.functional.silu,
-        bfloat16: bool = False,
+        bf16: bool = False,
     ):
         super().__init__()
-        self.activation, self.half_precision = activation, bfloat16
+        self.activation, self.bf16 = activation, bf16
         self.middle = layers // 2
         sizes = [inputs] + [width] * (layers - 1)
         sizes[self.middle] += inputs
@@ -37,8 +38,9 @@ class SkipMLP(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, inputs) to (N, width)."""
-        h = x
-        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.half_precision):
+        h, kind = x, x.device.type
+        # not cached: threads share the cache, where one without gradients would leave weights cast for all
+        with torch.autocast(kind, torch.bfloat16, cache_enabled=False) if self.bf16 else nullcontext():
             for k, layer in enumerate(self.layers):
                 h = self.activation(layer(torch.cat([h, x], -1) if k == self.middle else h))
         return h.to(x.dtype)
@@ -51,12 +53,12 @@ class RadianceMLP(nn.Module):
     OCTAVES = 8
 
     def __init__(
-        self, point_inputs: int, pose_inputs: int, root_inputs: int, view_octaves: int = 0, bfloat16: bool = False
+        self, point_inputs: int, pose_inputs: int, root_inputs: int, view_octaves: int = 0, bf16: bool = False
     ):
         super().__init__()
         self.view_octaves = view_octaves
         encoded = point_inputs * (1 + 2 * self.OCTAVES)
-        self.trunk = SkipMLP(encoded + pose_inputs, 256, 8, bfloat16=bfloat16)
+        self.trunk = SkipMLP(encoded + pose_inputs, 256, 8, bf16=bf16)
         self.density = nn.Linear(256, 1)
         seen = root_inputs + 3 * (1 + 2 * view_octaves)
         self.colour = nn.Sequential(nn.Linear(256 + seen, 128), nn.SiLU(), nn.Linear(128, 3))
@@ -75,9 +77,9 @@ class ResidualMLP(nn.Module):
 
     OCTAVES = 1
 
-    def __init__(self, point_inputs: int, pose_inputs: int, bfloat16: bool = False):
+    def __init__(self, point_inputs: int, pose_inputs: int, bf16: bool = False):
         super().__init__()
-        self.trunk = SkipMLP(point_inputs * (1 + 2 * self.OCTAVES) + pose_inputs, 128, 6, bfloat16=bfloat16)
+        self.trunk = SkipMLP(point_inputs * (1 + 2 * self.OCTAVES) + pose_inputs, 128, 6, bf16=bf16)
         self.residual = nn.Linear(128, 1)
         nn.init.zeros_(self.residual.weight)
         nn.init.zeros_(self.residual.bias)

@@ -1,6 +1,7 @@
 """What the fields are conditioned on beside the point, and the random numbers of one step."""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
@@ -77,3 +78,9 @@ def own_share(batch: Batch, rank: int, world_size: int) -> Batch:
     return dataclasses.replace(
         batch, **{k: v if v is None else v.tensor_split(world_size)[rank] for k, v in own.items()}
     )
+
+
+def joined(batches: Sequence[Batch]) -> Batch:
+    """Shares of a batch, one after another."""
+    own = {f.name: [getattr(batch, f.name) for batch in batches] for f in dataclasses.fields(batches[0])}
+    return dataclasses.replace(batches[0], **{k: None if v[0] is None else torch.cat(v) for k, v in own.items()})

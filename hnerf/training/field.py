@@ -22,10 +22,12 @@ class Field(nn.Module, ABC):
     canonical_m (V, 3): the rig's canonical vertices, saved with the field; samples: random numbers that a ray needs;
     gamma: how sharp the outline of the distances that `sample` returns is, a unit of them; margin_m: how far around the
     body's extent anything can be seen; own_background: whether the field models the photograph's surroundings, or is
-    composited over the clean plate.
+    composited over the clean plate; whole_images: whether training draws from all pixels, or from those that `reached`
+    names and those of the mask.
     """
 
     own_background: ClassVar[bool] = False
+    whole_images: bool = False
     canonical_m: Tensor
     samples: int
     gamma: float = 80.0  # a metre: the paper's 200 in a scene of 2.5 m
@@ -41,11 +43,6 @@ class Field(nn.Module, ABC):
     def reached(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
         """(H, W) bool: pixels that can show anything where the body's vertices are (V, 3)."""
         return within_box(camera, vertices_m, self.margin_m)
-
-    def pixels_to_train_on(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
-        """Return (H, W) bool: pixels that training draws from beside those of the mask, where the body's vertices are
-        (V, 3)."""
-        return self.reached(camera, vertices_m)
 
     @abstractmethod
     def parameter_groups(self) -> list[dict[str, Any]]:

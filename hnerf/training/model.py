@@ -30,6 +30,7 @@ from hnerf.training.model_file import fill_field, other_version
 from hnerf.training.paper import PaperField
 
 RAYS_AT_ONCE = 16384
+SAMPLES_AT_ONCE = 1 << 20  # coarse ones, of fields that take many on a ray: a network keeps some KiB for each
 POINTS_AT_ONCE = 1 << 17
 
 
@@ -71,8 +72,9 @@ class TrainedAvatar:
         origins, directions = camera.rays(np.stack([x, y], 1).astype(np.float64))
         flat = torch.zeros(camera.height_px * camera.width_px, 5, device=device)
         index = torch.from_numpy(y * camera.width_px + x).to(device)
-        for start in range(0, len(x), RAYS_AT_ONCE):
-            part = slice(start, start + RAYS_AT_ONCE)
+        count = max(1, min(RAYS_AT_ONCE, SAMPLES_AT_ONCE // self.field.samples))
+        for start in range(0, len(x), count):
+            part = slice(start, start + count)
             o, d = (torch.from_numpy(np.ascontiguousarray(a[part])).float().to(device) for a in (origins, directions))
             row = torch.zeros(len(o), dtype=torch.long, device=device)
             flat[index[part]] = self.field.look(bodies, region, o, d, row, conditions)

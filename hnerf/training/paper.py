@@ -5,13 +5,11 @@ coarse and the fine samples; the fine ones are drawn from the coarse weights wit
 both.
 """
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from hnerf.body.canonical import FAR_M, Descriptor, PoseCorrection, PosedBodies
 from hnerf.body.rig import Rig
-from hnerf.capture.camera import Camera
 from hnerf.config import PaperFieldSettings
 from hnerf.field.mlp import RadianceMLP, ResidualMLP
 from hnerf.render.compositing import alpha_from_density, occupancy, weights_from_alpha
@@ -19,7 +17,6 @@ from hnerf.render.shell import Boxes, box_interval, stratified
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.field import Field
 from hnerf.training.losses import RaySamples
-from hnerf.training.pixels import everywhere
 
 OUTSIDE_DISTANCE = 1.0  # the constant d of a point outside the person's box
 
@@ -34,21 +31,18 @@ class PaperField(Field):
         """root (n, 4, 4): the training poses, which the scene is centred on."""
         super().__init__()
         self.settings, self.static = settings, static
+        self.whole_images = settings.rays == "image"
         self.samples, self.gamma = settings.samples, settings.gamma
         self.register_buffer("canonical_m", rig.vertices_m.clone())
         self.register_buffer("centre_m", root[:, :3, 3].mean(0))
         turn = 12 if settings.root_condition else 0
         point, pose, self.turn = (3, 0, 0) if static else (4, 3 * int(rig.free.sum()), turn)
-        self.radiance = RadianceMLP(point, pose, self.turn, settings.view_octaves, settings.bfloat16)
-        self.residual = ResidualMLP(point, pose, settings.bfloat16)
+        self.radiance = RadianceMLP(point, pose, self.turn, settings.view_octaves, settings.bf16)
+        self.residual = ResidualMLP(point, pose, settings.bf16)
 
     def region(self, bodies: PosedBodies, conditions: Conditions) -> Boxes:
         """Box B of each pose: the body's extent and a margin."""
         return Boxes.around(bodies.vertices_m, self.margin_m)
-
-    def pixels_to_train_on(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
-        """Return all pixels of the image, as the paper does, or those whose rays meet box B."""
-        return (everywhere if self.settings.rays == "image" else self.reached)(camera, vertices_m)
 
     def parameter_groups(self) -> list[dict]:
         """Adam groups."""

@@ -12,6 +12,7 @@ from hnerf.training import losses
 from hnerf.training.conditions import Conditions, Draws
 from hnerf.training.field import Field
 from hnerf.training.pixels import Rays
+from hnerf.training.processes import Processes
 
 
 class TrainingError(RuntimeError):
@@ -73,11 +74,14 @@ def aim(rays: Rays, draws: Draws, own_background: bool) -> tuple[losses.Target, 
     return losses.Target(colour, person, (~rays.edge).float()), draws
 
 
-def not_finite(terms: dict[str, Tensor], gradients: list[Tensor], step: int) -> str | None:
-    """None where all is finite, else which losses or gradients are not; a device is asked once."""
+def not_finite(terms: dict[str, Tensor], gradients: list[Tensor], step: int, processes: Processes) -> str | None:
+    """None where all is finite in all processes, so that they go on or skip together; else which losses or gradients
+    are not. A device is asked once."""
     values = torch.stack([value.detach() for value in terms.values()] + [g.sum() for g in gradients])
     finite = values.isfinite().tolist()
+    if not processes.greatest(float(not all(finite))):
+        return None
+    if all(finite):
+        return f"step {step}: not finite in another process"
     bad = [name for name, fine in zip(terms, finite, strict=False) if not fine]
-    if bad:
-        return f"step {step}: {', '.join(bad)} not finite"
-    return None if all(finite) else f"step {step}: a gradient is not finite"
+    return f"step {step}: {', '.join(bad) if bad else 'a gradient is'} not finite"

@@ -4,9 +4,9 @@ deformations, against the finished field."""
 import dataclasses
 import json
 import logging
+import math
 import resource
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,14 @@ from hnerf.config import TrainingSettings
 from hnerf.segmentation.masks import Masks
 from hnerf.training.budget import Scene, decide
 from hnerf.training.checkpoint import load_checkpoint, save_checkpoint
-from hnerf.training.conditions import Conditions, Draws, own_share
+from hnerf.training.conditions import Conditions, Draws, joined, own_share
 from hnerf.training.exposure import camera_gains
+from hnerf.training.gather import gather_pixels
 from hnerf.training.losses import RaySamples, pixel
 from hnerf.training.model import build_field
 from hnerf.training.model_file import write_field
-from hnerf.training.pixels import AT_EDGES, Pixels, Rays, gather_pixels
+from hnerf.training.parts import decide_parts
+from hnerf.training.pixels import AT_EDGES, Rays
 from hnerf.training.processes import Processes
 from hnerf.training.step import Objective, Stage, TrainingError, not_finite
 
@@ -41,8 +43,8 @@ LEAST_COVERAGE = 0.1  # of the person's pixels; below it the surface has collaps
 MOST_AROUND = 0.8  # of the surroundings; above it the surface fills the box
 LOOKS_A_RAY = 64  # at least, through a whole scene: valid-wave's body covers 38 % by 16, 59 % by 64, 64 % by 256
 LOG_STEPS = 25
+ATTEMPTED_FRAMES = 8  # at most, to see what memory rays need
 POSES_APART = 6  # training poses between those that say how thick the shell must be
-HALVES = 2  # of a batch, side by side on a CPU: operations are too small to share cores; two sums have one order only
 
 
 class Trainer:
@@ -64,26 +66,22 @@ class Trainer:
         self.objective = Objective(self.field, bodies.correction(), settings)
         self.optimizer = torch.optim.Adam(self._parameter_groups(), betas=(0.9, 0.99), eps=1e-12, fused=True)
         self.first_rates = [group["lr"] for group in self.optimizer.param_groups]
-        logger.info("gathering pixels")
-        wanted = self.field.pixels_to_train_on
-        self.pixels: Pixels = gather_pixels(capture, masks, body, body.frames, wanted, device)
         self.gains, self.decisions["gains"] = camera_gains(capture, masks, body)
-        if self.gains:
-            by_camera = [self.gains[name] for name in capture.train_cameras]
-            self.pixels = self.pixels.levelled(torch.tensor(by_camera, device=device))
+        logger.info("gathering pixels")
+        reached = None if self.field.whole_images else self.field.reached
+        self.pixels = gather_pixels(capture, masks, body, body.frames, reached, self.gains, out, processes)
         self.at_edges = 0.0 if self.field.own_background else AT_EDGES  # the paper draws from all pixels alike
         seen = self.pixels.starts.diff() > 0  # not where a frame's masks were all dropped
         rows = {frame: row for row, frame in enumerate(body.frames) if seen[row]}
         self.train_rows = torch.tensor([rows[f] for f in capture.train_frames if f in rows], device=device)
         held_out = [rows[f] for f in capture.novel_pose_frames if f in rows and f not in capture.train_frames]
         self.novel_rows = torch.tensor(held_out, dtype=torch.long, device=device)
-        threads = torch.get_num_threads()
-        self.parts = HALVES if device.type == "cpu" and processes.world_size == 1 and threads > 1 else 1
-        self.side_by_side = ThreadPoolExecutor(self.parts, "part", torch.set_num_threads, (threads // self.parts,))
         self.step, self.skipped, self.seconds = 0, 0, 0.0
         self.field_steps, self.field_seconds = settings.steps, 0.0  # fewer steps where the time is up before
         self.history: list[dict[str, Any]] = []
         self._stand(bodies)
+        rays = settings.frames_per_step * settings.rays_per_frame
+        self.parts, self.decisions["parts"] = decide_parts(rays, settings.memory_gib, self._attempt, processes)
         self._resume()
         self.setup_seconds = time.monotonic() - began
 
@@ -174,14 +172,14 @@ class Trainer:
         conditions = self.conditions.noisy(s.noise, self.generator)
         self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
-        terms = self._backward(module, rays, conditions, draws)
+        terms = self.parts.backward(module, self.stage, rays, conditions, draws, self.processes)
         self.field.step_taken()
         if self.step >= self.field_steps:  # what pulls all frames back to the fit is not for frames that are finished
             for pose in (self.objective.correction.turn, self.objective.correction.move_m):
                 if pose.grad is not None:
                     pose.grad[self.train_rows] = 0.0
         gradients = [q.grad for q in self.objective.parameters() if q.grad is not None]
-        fault = not_finite(terms, gradients, self.step)
+        fault = not_finite(terms, gradients, self.step, self.processes)
         if fault is None:
             self.optimizer.step()
             self.skipped = 0
@@ -195,18 +193,15 @@ class Trainer:
                 )
         return terms
 
-    def _backward(self, module: torch.nn.Module, rays: Rays, conditions: Conditions, draws: Draws) -> dict[str, Tensor]:
-        """Adds the gradients of this process's share of a joint batch to the parameters'; the losses by name."""
-        n, p = self.parts, self.processes
-
-        def of_part(part: int) -> dict[str, Tensor]:
-            mine = p.rank * n + part, p.world_size * n
-            terms = module(self.stage, own_share(rays, *mine), conditions, own_share(draws, *mine))
-            (torch.stack(list(terms.values())).sum() / n).backward()
-            return {name: term.detach() for name, term in terms.items()}
-
-        found = list(self.side_by_side.map(of_part, range(n))) if n > 1 else [of_part(0)]
-        return {name: torch.stack([terms[name] for terms in found]).mean() for name in found[0]}
+    def _attempt(self, about: int) -> tuple[int, Tensor]:
+        """The number of rays, about so many, and the loss of a batch as at the end of the training; takes no random
+        number that the training would."""
+        generator = torch.Generator(self.processes.device).manual_seed(self.settings.seed)
+        rows, noise = self.train_rows[: self.settings.frames_per_step][:ATTEMPTED_FRAMES], self.settings.noise
+        rays = self.pixels.draw(rows, about // len(rows), generator, self.at_edges)
+        draws = Draws.random(len(rays.frame), self.field.samples_in_training(1.0), noise, generator)
+        terms = self.objective(self.stage, rays, self.conditions.noisy(noise, generator), draws)
+        return len(rays.frame), torch.stack(list(terms.values())).sum()
 
     def _done(self) -> float:
         """How much of the phase is over."""
@@ -242,11 +237,12 @@ class Trainer:
         random numbers a ray."""
         generator = torch.Generator(self.processes.device).manual_seed(self.settings.seed)
         rays = self.pixels.draw(rows, HELD_OUT_RAYS // len(rows) + 1, generator)
-        draws = Draws.still(len(rays.frame), count, self.processes.device)
-        samples, _ = self.field.sample(
-            self.stage.bodies, self.stage.region, rays.origins_m, rays.directions, rays.frame, self.conditions, draws
-        )
-        return rays, samples
+        parts, found = math.ceil(len(rays.frame) / self.parts.most_rays), []
+        for own in (own_share(rays, part, parts) for part in range(parts)):
+            draws = Draws.still(len(own.frame), count, self.processes.device)
+            where = own.origins_m, own.directions, own.frame
+            found.append(self.field.sample(self.stage.bodies, self.stage.region, *where, self.conditions, draws)[0])
+        return rays, joined(found)
 
     def _require_surface(self) -> None:
         """TrainingError where the surface is empty or fills the box: of the surroundings, rays that pass the box are

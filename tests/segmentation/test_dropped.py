@@ -6,8 +6,12 @@ import torch
 
 from hnerf.body.fit import _outlines, _silhouette_iou
 from hnerf.segmentation.masks import Masks, encode
-from hnerf.training.pixels import everywhere, gather_pixels
+from hnerf.training.gather import gather_pixels
+from hnerf.training.pixels import everywhere
+from hnerf.training.processes import Processes
 from tests.training.scene import record
+
+ALONE = Processes(0, 1, torch.device("cpu"))
 
 
 def test_fit_and_training_do_without(tmp_path: Path) -> None:
@@ -24,11 +28,12 @@ def test_fit_and_training_do_without(tmp_path: Path) -> None:
     assert iou == [1.0, None, 1.0]
 
     pixels, all_pixels = (
-        gather_pixels(capture, m, body, capture.frames, everywhere, torch.device("cpu"))
+        gather_pixels(capture, m, body, capture.frames, everywhere, {}, tmp_path, ALONE)
         for m in (masks, Masks(whole, {}))
     )
     count, all_count = pixels.starts.diff().tolist(), all_pixels.starts.diff().tolist()
     assert count[1] == 0 and count[2] == all_count[2]
     first = slice(0, count[0])
-    assert sorted(set(pixels.camera[first].tolist())) == [0, 2, 3]
-    assert count[0] == int((all_pixels.camera[: all_count[0]] != 1).sum())
+    camera, all_camera = (p.where(torch.arange(len(p.person)))[0] for p in (pixels, all_pixels))
+    assert sorted(set(camera[first].tolist())) == [0, 2, 3]
+    assert count[0] == int((all_camera[: all_count[0]] != 1).sum())

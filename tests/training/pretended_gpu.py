@@ -132,7 +132,9 @@ def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     monkeypatch.setattr(torch, "Generator", OfCuda)
     monkeypatch.setattr(torch, "manual_seed", torch.default_generator.manual_seed)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "pretended")
-    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 0)
+    for counted in ("max_memory_allocated", "memory_allocated", "memory_reserved", "reset_peak_memory_stats"):
+        monkeypatch.setattr(torch.cuda, counted, lambda device: 0)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1 << 30, 1 << 30))
     monkeypatch.setattr(torch.nn.functional, "embedding_bag", embedding_bag)
     monkeypatch.setattr(canonical, "BodyMeshes", Meshes)
     monkeypatch.setattr(model, "load_file", load_file)

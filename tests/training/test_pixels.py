@@ -8,10 +8,13 @@ import pytest
 import torch
 
 from hnerf.capture.camera import Camera
-from hnerf.training.pixels import Pixels, everywhere, gather_pixels, within_box, within_reach
+from hnerf.training.gather import gather_pixels
+from hnerf.training.pixels import Pixels, Reached, everywhere, within_box, within_reach
+from hnerf.training.processes import Processes
 from tests.training.scene import record
 
 AHEAD = Camera("ahead", np.diag([50.0, 50.0, 1.0]), np.eye(3), np.zeros(3), 60, 40)
+ALONE = Processes(0, 1, torch.device("cpu"))
 REACHED = functools.partial(within_reach, reach_m=0.2)
 
 
@@ -23,12 +26,14 @@ def test_a_third_of_the_rays_is_drawn_at_edges():
         starts=torch.tensor([0, 4, 6]),
         edges=torch.tensor([0, 4, 5]),
         edge_starts=torch.tensor([0, 1, 3]),
-        camera=torch.zeros(6, dtype=torch.uint8),
-        xy_px=number[:, None].expand(6, 2).short(),
+        image_starts=torch.tensor([0, 4, 6]),
+        image_camera=torch.tensor([0, 0]),
+        place=number.int(),
         colour=number[:, None].expand(6, 3).to(torch.uint8),
         plate=None,
         person=edge,
         edge=edge,
+        widths_px=torch.tensor([3]),
         rays_from_px=torch.eye(3)[None],
         centres_m=torch.zeros(1, 3),
     )
@@ -41,9 +46,48 @@ def test_a_third_of_the_rays_is_drawn_at_edges():
     assert 30 < int((drawn[1, 100:] == 0).sum()) < 70  # a quarter of the others, by chance
 
 
+def test_where_a_pixel_lies_follows_from_its_image() -> None:
+    """Images of 3 x 2, 2 x 2 and again 3 x 2 pixels of cameras 0, 1 and 0, first whole, then of the last one two."""
+    none = torch.zeros(0)
+    names = ("starts", "edges", "edge_starts", "colour", "plate", "person", "edge", "rays_from_px", "centres_m")
+    like = dict.fromkeys(names, none)
+    images = {"image_camera": torch.tensor([0, 1, 0]), "widths_px": torch.tensor([3, 2])}
+    whole = Pixels(image_starts=torch.tensor([0, 6, 10, 16]), place=None, **images, **like)
+    camera, xy_px = whole.where(torch.tensor([0, 5, 6, 9, 10, 14]))
+    assert camera.tolist() == [0, 0, 1, 1, 0, 0]
+    assert xy_px.tolist() == [[0, 0], [2, 1], [0, 0], [1, 1], [0, 0], [1, 1]]
+    place = torch.tensor([0, 1, 2, 3, 4, 5, 2], dtype=torch.int32)  # the second image shows nothing of interest
+    some = Pixels(image_starts=torch.tensor([0, 5, 5, 7]), place=place, **images, **like)
+    camera, xy_px = some.where(torch.tensor([4, 5, 6]))
+    assert camera.tolist() == [0, 0, 0]
+    assert xy_px.tolist() == [[1, 1], [2, 1], [2, 0]]
+
+
+@pytest.mark.parametrize("reached", [REACHED, None])
+def test_pixels_show_what_the_images_do(tmp_path: Path, reached: Reached | None) -> None:
+    """Whole images where nothing says what is reached, then without plates."""
+    capture, masks, body = record(tmp_path)
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "plate.pixels").write_bytes(b"of a process that was killed")
+    pixels = gather_pixels(capture, masks, body, body.frames, reached, {}, out, ALONE)
+    assert not any(out.iterdir())
+    assert (pixels.place is None) == (pixels.plate is None) == (reached is None)
+    camera, xy_px = pixels.where(torch.arange(len(pixels.person)))
+    row = torch.arange(len(body.frames)).repeat_interleave(pixels.starts.diff())
+    for c, name in enumerate(capture.train_cameras):
+        for r, frame in enumerate(body.frames):
+            own = (camera == c) & (row == r)
+            x, y = xy_px[own].T.numpy()
+            assert len(x) == 32 * 32 if reached is None else 0 < len(x) < 32 * 32
+            assert np.array_equal(pixels.colour[own].numpy(), capture.image(name, frame)[y, x])
+            assert np.array_equal(pixels.person[own].numpy(), masks.get(name, frame)[y, x])
+            assert pixels.edge[own].any()
+
+
 def test_edges_are_found_in_every_frame(tmp_path: Path):
     capture, masks, body = record(tmp_path)
-    pixels = gather_pixels(capture, masks, body, body.frames, REACHED, torch.device("cpu"))
+    pixels = gather_pixels(capture, masks, body, body.frames, REACHED, {}, tmp_path, ALONE)
     assert torch.equal(pixels.edges, torch.nonzero(pixels.edge)[:, 0])
     for row in range(len(body.frames)):
         own = pixels.edges[pixels.edge_starts[row] : pixels.edge_starts[row + 1]]
@@ -56,7 +100,7 @@ def test_a_frame_without_edges_offers_all_its_pixels(tmp_path: Path):
     capture, masks, body = record(tmp_path)
     for camera in capture.train_cameras:
         masks.masks[camera, 0][:] = True
-    pixels = gather_pixels(capture, masks, body, body.frames, REACHED, torch.device("cpu"))
+    pixels = gather_pixels(capture, masks, body, body.frames, REACHED, {}, tmp_path, ALONE)
     assert torch.equal(pixels.edges[: pixels.edge_starts[1]], torch.arange(int(pixels.starts[1])))
 
 

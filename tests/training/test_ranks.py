@@ -14,6 +14,7 @@ from hnerf.training import trainer as trainer_module
 from hnerf.training.checkpoint import NAME
 from hnerf.training.processes import Processes
 from hnerf.training.trainer import train
+from tests.training.first_step import gradients, untrained
 from tests.training.scene import TINY, record
 
 ALONE = Processes(0, 1, torch.device("cpu"))
@@ -36,52 +37,28 @@ Trainer(*record(root / f"capture{p.rank}"), TINY, root, p).run()
 """
 
 
-def launched(ranks: int, script: Path, root: Path) -> int:
-    """The exit status of torchrun with so many processes of the script."""
+def launched(ranks: int, program: list[str]) -> int:
+    """The exit status of torchrun with so many processes of the program."""
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
-    return subprocess.run([*launcher, str(script), str(root)], env=environment).returncode
+    return subprocess.run([*launcher, *program], env=environment).returncode
 
 
-GRADIENTS = """
-import sys, torch
-from pathlib import Path
-from hnerf.training import trainer
-from hnerf.training.processes import Processes
-from tests.training.scene import TINY, record
-torch.set_num_threads(1)
-root = Path(sys.argv[1])
-p = Processes.join()
-settings = TINY.model_copy(update={"losses": TINY.losses.model_copy(update={"elastic": 0.1})})
-t = trainer.Trainer(*record(root / f"capture{p.rank}"), settings, root, p)
-t.field.deformation.displacement.data[:-1] = 0.01
-module = t.objective
-if p.world_size > 1:
-    module = torch.nn.parallel.DistributedDataParallel(module, find_unused_parameters=True)
-t.optimizer.step = lambda: None
-t._optimise(module)
-if p.leads:
-    torch.save({n: q.grad for n, q in t.objective.named_parameters() if q.grad is not None}, root / "gradients.pt")
-"""
-
-
-def test_two_ranks_have_the_gradients_of_one(tmp_path: Path):
-    """Two gloo processes with half the rays each: the averaged gradients are those of one process with all rays."""
-    gradients = []
-    for ranks in (1, 2):
-        root = tmp_path / f"{ranks}"
-        root.mkdir()
-        script = root / "rank.py"
-        script.write_text(GRADIENTS)
-        assert launched(ranks, script, root) == 0
-        gradients.append(torch.load(root / "gradients.pt", weights_only=True))
-    assert gradients[0].keys() == gradients[1].keys()
-    for learned in ("correction", "deformation"):
-        assert any(g.abs().max() > 0 for name, g in gradients[0].items() if learned in name)
-    for name, gradient in gradients[0].items():
-        torch.testing.assert_close(
-            gradients[1][name], gradient, atol=1e-6, rtol=1e-4, msg=lambda m, n=name: f"{n}: {m}"
-        )
+@pytest.mark.parametrize("machinery", ["fast", "paper"])
+def test_two_ranks_in_three_parts_have_the_gradients_of_one_batch(tmp_path: Path, machinery: str) -> None:
+    """Two gloo processes with half the 128 rays each, in parts of 22 and 21: the gradients are those of one process
+    with all rays. Both skip a step whose loss is not finite in one of them alone."""
+    alone = untrained(tmp_path / "one", machinery, ALONE)
+    one, root = gradients(alone, alone.objective), tmp_path / "two"
+    root.mkdir()
+    assert launched(2, ["-m", "tests.training.first_step", f"{root}", machinery, "3"]) == 0
+    two = torch.load(root / "gradients.pt", weights_only=True)
+    assert one.keys() == two.keys()
+    for learned in ("correction", "deformation") if machinery == "fast" else ("correction", "radiance"):
+        assert any(g.abs().max() > 0 for name, g in one.items() if learned in name)
+    for name, gradient in one.items():
+        torch.testing.assert_close(two[name], gradient, atol=1e-6, rtol=1e-4, msg=lambda m, n=name: f"{n}: {m}")
+    assert [(root / f"skipped{rank}").read_text() for rank in (0, 1)] == ["1", "1"]
 
 
 def test_one_process_goes_on_where_two_were_killed(
@@ -92,7 +69,7 @@ def test_one_process_goes_on_where_two_were_killed(
     killed, whole = tmp_path / "killed", tmp_path / "whole"
     killed.mkdir(), whole.mkdir()
     (tmp_path / "rank.py").write_text(KILLED)
-    assert launched(2, tmp_path / "rank.py", killed) != 0
+    assert launched(2, [f"{tmp_path / 'rank.py'}", f"{killed}"]) != 0
     assert (killed / NAME).exists() and not (killed / "model.safetensors").exists()
     scene = record(tmp_path / "capture")
     with caplog.at_level(logging.INFO, "hnerf.training"):

@@ -1,0 +1,147 @@
+"""The pixels of a training, gathered by one process and held once a machine, whatever the number of processes."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.capture import Capture
+from hnerf.segmentation.edge import shaded_plate
+from hnerf.segmentation.masks import Masks
+from hnerf.segmentation.prior import window_around
+from hnerf.training.exposure import Gains
+from hnerf.training.pixels import Pixels, Reached
+from hnerf.training.processes import Processes
+
+EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel may mix person and surroundings
+SUFFIX = ".pixels"  # of the files that hold columns of Pixels, of these kinds and widths
+COLUMNS = {
+    "starts": (torch.int64, 1),
+    "edges": (torch.int64, 1),
+    "edge_starts": (torch.int64, 1),
+    "image_starts": (torch.int64, 1),
+    "image_camera": (torch.int64, 1),
+    "place": (torch.int32, 1),
+    "colour": (torch.uint8, 3),
+    "plate": (torch.uint8, 3),
+    "person": (torch.bool, 1),
+    "edge": (torch.bool, 1),
+}
+NUMPY = {torch.int64: np.int64, torch.int32: np.int32, torch.uint8: np.uint8, torch.bool: np.bool_}
+
+
+def gather_pixels(
+    capture: Capture,
+    masks: Masks,
+    body: BodyFit,
+    frames: tuple[int, ...],
+    reached: Reached | None,
+    gains: Gains,
+    folder: Path,
+    processes: Processes,
+) -> Pixels:
+    """Pixels of the training cameras in `frames` that are reached from the fitted body, or on the mask; none where the
+    mask was dropped. reached None: all pixels, without plates, for a field with a background of its own.
+
+    Colours and plates are as cameras would show them that were exposed alike: by the gains of their cameras, if any.
+    One process gathers, image by image, into files in `folder`; all map them, so that the machine holds them once, and
+    gives way to what is more urgent where they are not asked for. They have no name by the time this returns: the disk
+    has their room again when the last process ends, however it ends.
+    """
+    if processes.leads:
+        folder.mkdir(parents=True, exist_ok=True)
+        _remove(folder)  # what a killed process left
+        _write_pixels(capture, masks, body, frames, reached, gains, folder)
+    processes.wait()
+    columns: dict[str, Any] = {name: _mapped(folder / f"{name}{SUFFIX}", *kind) for name, kind in COLUMNS.items()}
+    processes.wait()
+    if processes.leads:
+        _remove(folder)
+    cameras = [capture.cameras[name] for name in capture.train_cameras]
+    return Pixels(
+        widths_px=torch.tensor([c.width_px for c in cameras]),
+        rays_from_px=torch.from_numpy(np.stack([c.R.T @ np.linalg.inv(c.K) for c in cameras])).float(),
+        centres_m=torch.from_numpy(np.stack([c.centre_m for c in cameras])).float(),
+        **columns,
+    )
+
+
+def _write_pixels(
+    capture: Capture,
+    masks: Masks,
+    body: BodyFit,
+    frames: tuple[int, ...],
+    reached: Reached | None,
+    gains: Gains,
+    folder: Path,
+) -> None:
+    """The columns of Pixels, a file each, frame by frame."""
+    cameras = [capture.cameras[name] for name in capture.train_cameras]
+    found = [capture.background(camera.name) for camera in cameras] if reached else []
+    plates = [plate for plate in found if plate is not None]
+    with_plates = reached is not None and len(plates) == len(cameras)
+    vertices_m = body.vertices_m().numpy()
+    ends = {"starts": 0, "edge_starts": 0, "image_starts": 0}
+
+    def append(name: str, values: Any) -> None:
+        with (folder / f"{name}{SUFFIX}").open("ab") as file:
+            file.write(np.ascontiguousarray(values, NUMPY[COLUMNS[name][0]]).data)
+
+    def close(name: str, count: int) -> None:
+        ends[name] += count
+        append(name, [ends[name]])
+
+    for name in ends:
+        close(name, 0)
+    for frame in frames:
+        edges = [np.zeros(0, bool)]
+        for c, camera in enumerate(cameras):
+            if (camera.name, frame) not in masks:
+                continue
+            image, mask = capture.image(camera.name, frame), masks.get(camera.name, frame)
+            wanted = np.ones_like(mask) if reached is None else reached(camera, vertices_m[body.index(frame)]) | mask
+            gain = gains.get(camera.name)
+            if reached:
+                append("place", np.flatnonzero(wanted))
+            append("colour", _levelled(image[wanted], gain))
+            append("person", mask[wanted])
+            edges.append(_edge(mask)[wanted])
+            append("edge", edges[-1])
+            append("image_camera", [c])
+            close("image_starts", len(edges[-1]))
+            if with_plates:
+                window = window_around(wanted)
+                shaded = shaded_plate(mask[window], image[window], plates[c][window])[wanted[window]]
+                append("plate", _levelled(shaded.clip(0, 255).round().astype(np.uint8), gain))
+        edge = np.concatenate(edges)
+        mixed = np.flatnonzero(edge) if edge.any() else np.arange(len(edge))
+        append("edges", ends["starts"] + mixed)
+        close("edge_starts", len(mixed))
+        close("starts", len(edge))
+
+
+def _levelled(shown: np.ndarray, gain: tuple[float, float, float] | None) -> np.ndarray:
+    """Colours (P, 3) uint8 as a camera of gain 1 would show them."""
+    return shown if gain is None else (shown / np.array(gain, np.float32)).round().clip(0, 255).astype(np.uint8)
+
+
+def _mapped(path: Path, kind: torch.dtype, width: int) -> Tensor | None:
+    """What the file holds, (N,) or (N, width), in memory that processes share; None where there is no file."""
+    if not path.exists():
+        return None
+    flat = torch.from_file(str(path), False, path.stat().st_size // kind.itemsize, dtype=kind)
+    return flat.view(-1, width) if width > 1 else flat
+
+
+def _remove(folder: Path) -> None:
+    for path in folder.glob(f"*{SUFFIX}"):
+        path.unlink()
+
+
+def _edge(mask: np.ndarray) -> np.ndarray:
+    kernel = np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_GRADIENT, kernel) > 0

@@ -1,0 +1,121 @@
+"""The rays of a step in parts, as many as memory asks for: their gradients add up to those of one joint batch."""
+
+import math
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+
+from hnerf.training.budget import Decision
+from hnerf.training.conditions import Conditions, Draws, own_share
+from hnerf.training.pixels import Rays
+from hnerf.training.processes import Processes
+from hnerf.training.step import Stage
+
+HALVES = 2  # of a batch, side by side on a CPU: operations are too small to share cores; two sums have one order only
+USABLE = 0.8  # of what is free: allocators lose some, and rays differ
+PEAK = 1.3  # of a step on a CPU in times what it saves for its gradients: 1.26 to 1.29 by hand, for `fast` and `paper`
+FEW, MORE = 32, 64  # rays that are tried
+GIB = 2**30
+MEMINFO = Path("/proc/meminfo")
+
+
+class Parts:
+    """Of a process's rays: `count`, side by side in threads of their own or one after another; most_rays: that fit
+    into memory at once."""
+
+    def __init__(self, count: int, side_by_side: bool, most_rays: float):
+        self.count, self.most_rays, self.pool = count, most_rays, None
+        if side_by_side:
+            threads = torch.get_num_threads() // count
+            self.pool = ThreadPoolExecutor(count, "part", torch.set_num_threads, (threads,))
+
+    def backward(
+        self,
+        module: nn.Module,
+        stage: Stage,
+        rays: Rays,
+        conditions: Conditions,
+        draws: Draws,
+        processes: Processes,
+    ) -> dict[str, Tensor]:
+        """Add the gradients of this process's share of a joint batch to the parameters'; the losses by name.
+
+        Losses are means over rays, or do not depend on them: with parts weighted by their rays, either add up to what
+        the joint batch has. `module` takes the mean over processes, with the last part.
+        """
+        n, world_size = self.count, processes.world_size
+
+        def of_part(part: int) -> dict[str, Tensor]:
+            mine = processes.rank * n + part, world_size * n
+            own = own_share(rays, *mine)
+            weight = world_size * len(own.frame) / len(rays.frame)
+            waiting = module if part < n - 1 and isinstance(module, DistributedDataParallel) else None
+            with waiting.no_sync() if waiting else nullcontext():
+                terms = module(stage, own, conditions, own_share(draws, *mine))
+                (weight * torch.stack(list(terms.values())).sum()).backward()
+            return {name: weight * term.detach() for name, term in terms.items()}
+
+        found = list(self.pool.map(of_part, range(n))) if self.pool else [of_part(part) for part in range(n)]
+        return {name: torch.stack([terms[name] for terms in found]).sum() for name in found[0]}
+
+
+def decide_parts(
+    rays: int, memory_gib: float | None, attempt: Callable[[int], tuple[int, Tensor]], processes: Processes
+) -> tuple[Parts, Decision]:
+    """In how many parts each process takes so many rays a step, and why.
+
+    memory_gib: for them; None: what is free. attempt: the number of rays and the loss of a batch of about so many. What
+    two small ones need is measured: what they differ by is the rays', the rest is there once.
+    """
+    device, share = processes.device, math.ceil(rays / processes.world_size)
+    if device.type == "cuda":
+        _peak_bytes(attempt, FEW, device)  # what libraries allocate once
+    (few, least), (more, most) = (_peak_bytes(attempt, about, device) for about in (FEW, MORE))
+    each = max(1.0, (most - least) / (more - few))
+    room = USABLE * _free_bytes(processes) if memory_gib is None else memory_gib * GIB
+    most_rays = max(1.0, (room - least) / each + few)
+    count = int(processes.greatest(min(math.ceil(share / most_rays), max(1, share // 2))))
+    reason = f"a ray needs {each / 2**20:.2f} MiB, {share} rays {(least + (share - few) * each) / GIB:.2f} GiB"
+    reason += f", of {room / GIB:.1f} GiB that may be taken" if memory_gib or count > 1 else ": there is room for them"
+    side_by_side = count == 1 and device.type == "cpu" and processes.world_size == 1 and torch.get_num_threads() > 1
+    if side_by_side:
+        count, reason = HALVES, f"{reason}, side by side in threads"
+    return Parts(count, side_by_side, most_rays), Decision(count, reason)
+
+
+def _peak_bytes(attempt: Callable[[int], tuple[int, Tensor]], about: int, device: torch.device) -> tuple[int, float]:
+    """Rays of a small batch and what a step of them needs at its peak: as allocated on a GPU; on a CPU, where nobody
+    counts, in proportion to what it saves for its gradients."""
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_allocated(device)
+        rays, loss = attempt(about)
+        loss.backward()
+        return rays, torch.cuda.max_memory_allocated(device) - before
+    saved = {}
+
+    def count(tensor: Tensor) -> Tensor:
+        storage = tensor.untyped_storage()
+        saved[storage.data_ptr()] = storage.nbytes()
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
+        rays, _ = attempt(about)
+    return rays, PEAK * sum(saved.values())
+
+
+def _free_bytes(processes: Processes) -> float:
+    """On a GPU of one's own, or this process's share of the machine's; all one could ask for where nobody tells."""
+    device = processes.device
+    if device.type == "cuda":
+        kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        return torch.cuda.mem_get_info(device)[0] + kept
+    told = MEMINFO.read_text().splitlines() if MEMINFO.exists() else []
+    free = [1024 * int(line.split()[1]) for line in told if line.startswith("MemAvailable:")]
+    return free[0] / processes.world_size if free else sys.maxsize

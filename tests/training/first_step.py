@@ -1,0 +1,57 @@
+"""The first step of a training by any number of processes; as a script, by those that torchrun starts.
+
+usage: python -m tests.training.first_step FOLDER MACHINERY PARTS
+"""
+
+import sys
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
+
+from hnerf.config import LossSettings, TrainingSettings
+from hnerf.training.parts import Parts
+from hnerf.training.processes import Processes
+from hnerf.training.trainer import Trainer
+from tests.training.scene import TINY, record
+
+
+def untrained(folder: Path, machinery: str, processes: Processes, memory_gib: float | None = None) -> Trainer:
+    """With all losses, and something to deform; its steps find gradients and move nothing."""
+    losses = LossSettings(elastic=0.1 if machinery == "fast" else 0.0)
+    changes = {"machinery": machinery, "losses": losses, "memory_gib": memory_gib}
+    settings = TrainingSettings.model_validate(TINY.model_dump() | changes)
+    trainer = Trainer(*record(folder / f"capture{processes.rank}"), settings, folder, processes)
+    if machinery == "fast":
+        trainer.field.deformation.displacement.data[:-1] = 0.01
+    trainer.optimizer.step = lambda: None  # type: ignore[method-assign]
+    return trainer
+
+
+def gradients(trainer: Trainer, module: torch.nn.Module) -> dict[str, Tensor]:
+    """Of a step, by parameter."""
+    trainer._optimise(module)
+    return {name: q.grad.clone() for name, q in trainer.objective.named_parameters() if q.grad is not None}
+
+
+def main(folder: Path, machinery: str, parts: int) -> None:
+    """Leave the gradients of a step, and how many steps each rank skips where one has a loss that is not finite."""
+    torch.set_num_threads(1)
+    processes = Processes.join()
+    trainer = untrained(folder, machinery, processes)
+    trainer.parts = Parts(parts, False, 1e9)
+    module = DistributedDataParallel(trainer.objective, find_unused_parameters=True)
+    found = gradients(trainer, module)
+    if processes.leads:
+        torch.save(found, folder / "gradients.pt")
+    assert trainer.skipped == 0
+    forward, odd = trainer.objective.forward, torch.tensor(float("nan") if processes.rank else 0.0)
+    trainer.objective.forward = lambda *batch: forward(*batch) | {"odd": odd}  # type: ignore[method-assign]
+    finite = gradients(trainer, module)
+    assert all(gradient.isfinite().all() for gradient in finite.values())  # so that they tell nothing
+    (folder / f"skipped{processes.rank}").write_text(str(trainer.skipped))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]))

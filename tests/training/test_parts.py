@@ -1,0 +1,103 @@
+"""A batch in parts has the gradients of the whole, and as many parts as memory asks for."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from hnerf.training import parts as parts_module
+from hnerf.training.conditions import Draws
+from hnerf.training.parts import GIB, PEAK, USABLE, Parts, decide_parts
+from hnerf.training.pixels import Rays
+from hnerf.training.processes import Processes
+from tests.training.first_step import gradients, untrained
+
+CPU = torch.device("cpu")
+ALONE = Processes(0, 1, CPU)
+
+
+class Scale(nn.Module):
+    """Losses of a number w: the mean over rays of w x, and 3 w, whatever the rays."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.w = nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
+
+    def forward(self, stage: object, rays: Rays, conditions: object, draws: Draws) -> dict[str, Tensor]:
+        """`mean` and `increment`."""
+        assert len(draws.jitter) == len(rays.frame) > 0
+        return {"mean": (self.w * rays.origins_m[:, 0]).mean(), "increment": 3 * self.w}
+
+
+@pytest.mark.parametrize(
+    ("world_size", "count", "side_by_side"), [(1, 1, False), (1, 2, True), (1, 3, False), (2, 3, False)]
+)
+def test_parts_of_unequal_size_add_up_to_the_joint_batch(
+    monkeypatch: pytest.MonkeyPatch, world_size: int, count: int, side_by_side: bool
+) -> None:
+    """x of seven rays is 1 to 7, 4 in the mean: d/dw = 4 + 3. Three parts of 3, 2 and 2 rays have means of 2, 4.5 and
+    6.5, whose mean is 4.33; two processes of three parts have one of two rays and five of one."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    x = torch.arange(1.0, 8, dtype=torch.float64)[:, None].expand(7, 3)
+    rays = Rays(x, x, torch.zeros(7, dtype=torch.long), x, x[:, 0] > 0, x[:, 0] > 0, None)
+    means, slopes = [], []
+    for rank in range(world_size):
+        module = Scale()
+        terms = Parts(count, side_by_side, 7).backward(
+            module, None, rays, None, Draws.still(7, 1, CPU), Processes(rank, world_size, CPU)
+        )
+        means.append(terms["mean"].item())
+        slopes.append(module.w.grad.item())
+    assert sum(slopes) / world_size == pytest.approx(7, rel=1e-14)
+    assert sum(means) / world_size == pytest.approx(8, rel=1e-14)  # w 4
+
+
+def attempted(about: int) -> tuple[int, Tensor]:
+    """A loss of rays that saves 1024 doubles for each, and 1000 for all."""
+    learned = torch.ones((), dtype=torch.float64, requires_grad=True)
+    both = [learned * torch.ones(n, dtype=torch.float64) for n in (1024 * about, 1000)]
+    return about, both[0].sum() + both[1].sum()
+
+
+@pytest.mark.parametrize(("rays", "world_size", "parts"), [(100, 1, 1), (101, 1, 2), (1000, 1, 10), (1000, 4, 3)])
+def test_parts_follow_from_the_memory_that_a_ray_needs(
+    monkeypatch: pytest.MonkeyPatch, rays: int, world_size: int, parts: int
+) -> None:
+    """8 KiB a ray and 8000 bytes beside them, in room for 100 rays and a half, given or free."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    monkeypatch.setattr(Processes, "greatest", lambda self, value: value)
+    room = PEAK * (8000 + 8192 * 100.5)
+    processes = Processes(0, world_size, CPU)
+    made, decision = decide_parts(rays, room / GIB, attempted, processes)
+    assert made.count == decision.value == parts
+    assert made.most_rays == pytest.approx(100.5, abs=0.01)
+    assert decision.reason.startswith("a ray needs 0.01 MiB")
+    monkeypatch.setattr(parts_module, "_free_bytes", lambda processes: room / USABLE)
+    assert decide_parts(rays, None, attempted, processes)[0].count == parts
+
+
+def test_what_fits_is_taken_in_halves_side_by_side_on_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where there are threads for them; what does not fit comes one part after another."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    made, decision = decide_parts(100, 1.0, attempted, ALONE)
+    assert made.count == decision.value == 2 and made.pool is not None
+    made, _ = decide_parts(100, PEAK * (8000 + 8192 * 50.5) / GIB, attempted, ALONE)
+    assert made.count == 2 and made.pool is None
+
+
+@pytest.mark.parametrize("machinery", ["fast", "paper"])
+def test_memory_changes_the_number_of_parts_and_not_the_gradients(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, machinery: str
+) -> None:
+    """128 rays of a MB each in 50 MB: 43, 43 and 42."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    monkeypatch.setattr(parts_module, "_peak_bytes", lambda attempt, about, device: (about, 1e6 * about))
+    found = []
+    for memory_gib, count in ((None, 1), (50e6 / GIB, 3)):
+        trainer = untrained(tmp_path, machinery, ALONE, memory_gib=memory_gib)
+        assert trainer.parts.count == count
+        found.append(gradients(trainer, trainer.objective))
+    assert found[0].keys() == found[1].keys()
+    for name, gradient in found[0].items():
+        torch.testing.assert_close(found[1][name], gradient, atol=1e-6, rtol=1e-4, msg=lambda m, n=name: f"{n}: {m}")
