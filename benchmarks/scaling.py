@@ -23,11 +23,11 @@ from hnerf.config import load_settings
 from hnerf.spread import spread
 from hnerf.study.degrade import Degradation
 from tasks.calibration import calibrate, calibrated
-from tasks.capture import ingest
+from tasks.capture import ingest, subset_capture
 from tasks.fit import fit
 from tasks.source import read_capture
 from tasks.store import Artifact, Store
-from tasks.study import degrade_capture, subset_capture
+from tasks.study import degrade_capture
 from tasks.training import train, trained
 
 STEPS = 60

@@ -202,10 +202,10 @@ def _gallery_words(split: str, inputs: EvaluationInputs) -> tuple[str, str]:
     if split == "novel_view":
         return "New views", "Frames that training saw, from cameras that it never saw."
     frames = "Frames that the field was not trained on, in poses as fitted before training (Render), and tuned on the"
-    frames += " training cameras' pictures of them (Posed), with a deformation of the frame's own, too (Tracked);"
+    frames += " training cameras' pictures of them (Posed), with a deformation of the frame's own, too (Tracked),"
     if inputs.capture.test_cameras:
-        return "New poses", f"{frames} from cameras that neither fit nor training ever saw."
-    return "New poses", f"{frames} from the training cameras, to look at: the capture has no test camera. No test."
+        return "New poses", f"{frames} seen from cameras that neither fit nor training ever saw."
+    return "New poses", f"{frames} seen from the training cameras. No test: the capture has no test camera."
 
 
 def surface_gallery(inputs: EvaluationInputs, true_meshes: dict[int, trimesh.Trimesh], out: Path) -> Gallery:
