@@ -157,6 +157,9 @@ class NerfiesSettings(Section):
     learning_rate: float = Field(default=5e-3, gt=0)
 
 
+GeometryRoles = Literal["surface_leads", "print"]
+
+
 class LossSettings(Section):
     """Weights of the nine losses in the form of hnerf/training/losses.py, and their constants."""
 
@@ -172,6 +175,7 @@ class LossSettings(Section):
     elastic: float = Field(default=0.0, ge=0)  # not the paper's: of a deformation, as `fast` and Nerfies have
     eta: float = Field(default=1.0, ge=0)  # of the surroundings in blend; 0.25 where floor or furniture is near
     density_threshold: float = Field(default=50.0, gt=0)  # sigma_h, per scene unit
+    geometry_roles: GeometryRoles = "surface_leads"  # whether geom moves the density alone, or both, as printed
     density_steepness: float = Field(default=0.02, gt=0)  # lambda; docs/method.md says why
 
 

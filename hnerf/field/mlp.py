@@ -12,8 +12,7 @@ from hnerf.field.encoding import positional_encoding
 class SkipMLP(nn.Module):
     """`layers` linear layers of `width`, Swish unless said otherwise; the input is fed again into the middle one.
 
-    Weights start as He et al. (2015) draw them, biases at zero: torch's own start leaves the output of eight layers
-    nearly constant over space. bf16: multiply, and keep what lies between the layers, in bfloat16, for half the memory
+    bf16: multiply, and keep what lies between the layers, in bfloat16, for half the memory
     and less time on processors that can.
     """
 
@@ -30,11 +29,15 @@ class SkipMLP(nn.Module):
         self.middle = layers // 2
         sizes = [inputs] + [width] * (layers - 1)
         sizes[self.middle] += inputs
-        linear = [nn.Linear(size, width) for size in sizes]
-        for layer in linear:
+        self.layers = nn.ModuleList(nn.Linear(size, width) for size in sizes)
+
+    def start_as_he(self) -> None:
+        """Draw weights as He et al. (2015) do, biases zero: torch's own start leaves the output of eight layers nearly
+        constant over space."""
+        for layer in self.layers:
+            assert isinstance(layer, nn.Linear)
             nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
             nn.init.zeros_(layer.bias)
-        self.layers = nn.ModuleList(linear)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, inputs) to (N, width)."""
@@ -59,6 +62,7 @@ class RadianceMLP(nn.Module):
         self.view_octaves = view_octaves
         encoded = point_inputs * (1 + 2 * self.OCTAVES)
         self.trunk = SkipMLP(encoded + pose_inputs, 256, 8, bf16=bf16)
+        self.trunk.start_as_he()
         self.density = nn.Linear(256, 1)
         seen = root_inputs + 3 * (1 + 2 * view_octaves)
         self.colour = nn.Sequential(nn.Linear(256 + seen, 128), nn.SiLU(), nn.Linear(128, 3))

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import relu, softplus
 
 from hnerf.body.canonical import PoseCorrection
+from hnerf.config import GeometryRoles
 from hnerf.render.compositing import composite, weights_from_alpha
 
 EPSILON = 1e-6  # keeps logarithms finite
@@ -71,14 +72,17 @@ def blend(samples: RaySamples, target: Target, eta: float) -> Tensor:
     return (target.weight * (target.person + eta * (1 - target.person)) * error).mean()
 
 
-def geometry(samples: RaySamples, threshold: float, steepness: float) -> Tensor:
-    """geom: sum_i b_i BCE(sigmoid(lambda (sigma_i - sigma_h)), alpha_dot_i), the label first, as in the paper's seg; 0
-    where the SDF is the density."""
+def geometry(samples: RaySamples, threshold: float, steepness: float, roles: GeometryRoles) -> Tensor:
+    """geom: sum_i b_i BCE(sigmoid(lambda (sigma_i - sigma_h)), alpha_dot_i); 0 where the SDF is the density.
+
+    roles: "print" takes the density for the label, as the paper's seg has the label first, and moves both; with
+    "surface_leads" the density follows alpha_dot, which is held (docs/method.md, "The coupling of density and surface").
+    """
     if samples.density is None:
         return samples.d.new_zeros(())
-    opaque = torch.sigmoid(steepness * (samples.density - threshold))
-    occupied = samples.alpha_dot.clamp(EPSILON, 1 - EPSILON)
-    return (samples.in_box * _cross_entropy(occupied, opaque)).sum(1).mean()
+    opaque, occupied = torch.sigmoid(steepness * (samples.density - threshold)), samples.alpha_dot
+    predicted, label = (occupied, opaque) if roles == "print" else (opaque, occupied.detach())
+    return (samples.in_box * _cross_entropy(predicted.clamp(EPSILON, 1 - EPSILON), label)).sum(1).mean()
 
 
 def segmentation(distance: Tensor, target: Target, sharpness: float) -> Tensor:

@@ -54,23 +54,40 @@ def test_blend():
     assert losses.blend(SAMPLES, TARGET, eta=0.25).item() == pytest.approx((2 + 0.25 * 0.2) / 2)
 
 
-def test_geometry():
-    """Labels sigmoid(0.1 (60 - 50)) = 0.731, sigmoid(0) = 0.5 and sigmoid(-5) = 0.0067; predictions 0.2, 0.9 and 0.1;
-    outside ignored."""
-    samples = replace(SAMPLES, alpha_dot=torch.tensor([[0.2, 0.9], [0.1, 0.5]]))
-    labels = 1 / (1 + math.exp(-1)), 0.5, 1 / (1 + math.exp(5))
-    expected = [-p * math.log(q) - (1 - p) * math.log(1 - q) for p, q in zip(labels, (0.2, 0.9, 0.1), strict=True)]
-    assert losses.geometry(samples, 50.0, 0.1).item() == pytest.approx(sum(expected) / 2, rel=1e-5)
+LABELS = 1 / (1 + math.exp(-1)), 0.5, 1 / (1 + math.exp(5))  # sigmoid(0.1 (sigma - 50)) of 60, 50 and 0
+COUPLED = replace(SAMPLES, alpha_dot=torch.tensor([[0.2, 0.9], [0.1, 0.5]]))
+
+
+def cross_entropies(predicted: tuple[float, ...], labels: tuple[float, ...]) -> float:
+    """Half the sum, which is the mean over two rays."""
+    both = zip(predicted, labels, strict=True)
+    return sum(-p * math.log(q) - (1 - p) * math.log(1 - q) for q, p in both) / 2
+
+
+def test_geometry_in_the_roles_of_the_print():
+    """Densities are labels of the predictions 0.2, 0.9 and 0.1; what is outside the box is ignored."""
+    expected = cross_entropies((0.2, 0.9, 0.1), LABELS)
+    assert losses.geometry(COUPLED, 50.0, 0.1, "print").item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_geometry_where_the_surface_leads():
+    """Densities are predictions of the labels 0.2, 0.9 and 0.1, which take no gradient."""
+    occupied, density = COUPLED.alpha_dot.clone().requires_grad_(), COUPLED.density.clone().requires_grad_()
+    loss = losses.geometry(replace(COUPLED, alpha_dot=occupied, density=density), 50.0, 0.1, "surface_leads")
+    assert loss.item() == pytest.approx(cross_entropies(LABELS, (0.2, 0.9, 0.1)), rel=1e-5)
+    loss.backward()
+    assert occupied.grad is None and density.grad is not None
+    assert density.grad[0].tolist() == pytest.approx([0.1 * (LABELS[0] - 0.2) / 2, 0.1 * (0.5 - 0.9) / 2], rel=1e-4)
 
 
 def test_geometry_of_certain_predictions_is_finite():
     """Predictions 0, 1 and 0 are taken as 1e-6 from there: the labels cost 0.731, 0.5 and 0.0067 times 13.8."""
-    labels = 1 / (1 + math.exp(-1)) + 0.5 + 1 / (1 + math.exp(5))
-    assert losses.geometry(SAMPLES, 50.0, 0.1).item() == pytest.approx(labels * 6 * math.log(10) / 2, rel=2e-3)
+    certain = sum(LABELS) * 6 * math.log(10) / 2
+    assert losses.geometry(SAMPLES, 50.0, 0.1, "print").item() == pytest.approx(certain, rel=2e-3)
 
 
 def test_geometry_vanishes_where_the_sdf_is_the_density():
-    assert losses.geometry(replace(SAMPLES, density=None), 50.0, 0.1).item() == 0
+    assert losses.geometry(replace(SAMPLES, density=None), 50.0, 0.1, "print").item() == 0
 
 
 def test_not_a_number_passes_through_the_cross_entropy():
@@ -148,7 +165,7 @@ def test_gradients_of_coupled_losses_in_double():
         samples = replace(double, alpha_dot=alpha_dot, density=density, residual=residual)
         return (
             losses.blend(samples, target, 0.25)
-            + losses.geometry(samples, 50.0, 0.1)
+            + losses.geometry(samples, 50.0, 0.1, "print")
             + losses.segmentation(samples.d_hat, target, 80.0)
         )
 

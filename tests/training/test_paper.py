@@ -211,7 +211,7 @@ def test_each_loss_of_a_ray() -> None:
         return 1 / (1 + math.exp(-x))
 
     opaque = sigmoid(0.02 * (2 * math.log(2) - 50))
-    crossed = [-(opaque * math.log(a) + (1 - opaque) * math.log(1 - a)) for a in map(sigmoid, (-9, 1, 1))]
+    crossed = [-(a * math.log(opaque) + (1 - a) * math.log(1 - opaque)) for a in map(sigmoid, (-9, 1, 1))]
     expected = {
         "reconstruction": 3 * (1 - (2**-1.2 - 2**-2.9)),
         "mask": 3 * 2**-1.7,
