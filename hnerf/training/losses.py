@@ -76,7 +76,7 @@ def geometry(samples: RaySamples, threshold: float, steepness: float, roles: Geo
     """geom: sum_i b_i BCE(sigmoid(lambda (sigma_i - sigma_h)), alpha_dot_i); 0 where the SDF is the density.
 
     roles: "print" takes the density for the label, as the paper's seg has the label first, and moves both; with
-    "surface_leads" the density follows alpha_dot, which is held (docs/method.md, "The coupling of density and surface").
+    "surface_leads" the density follows alpha_dot, which is held (docs/method.md, "The nine losses").
     """
     if samples.density is None:
         return samples.d.new_zeros(())
