@@ -22,10 +22,11 @@ class Field(nn.Module, ABC):
     canonical_m (V, 3): the rig's canonical vertices, saved with the field; samples: random numbers that a ray needs;
     gamma: how sharp the outline of the distances that `sample` returns is, a unit of them; margin_m: how far around the
     body's extent anything can be seen; own_background: whether the field models the photograph's surroundings, or is
-    composited over the clean plate.
+    composited over the clean plate; common_rest: whether the rest body takes what training changes in all poses alike.
     """
 
     own_background: ClassVar[bool] = False
+    common_rest: ClassVar[bool] = False
     canonical_m: Tensor
     samples: int
     gamma: float = 80.0  # a metre: the paper's 200 in a scene of 2.5 m
@@ -37,6 +38,9 @@ class Field(nn.Module, ABC):
 
     def tighten(self, rig: Rig, pose: Tensor) -> None:
         """Make that region no larger than what can be seen in some poses (n, P)."""
+
+    def learn_for_all(self, rows: Tensor) -> None:
+        """Give poses of which nothing is known what the frames of some rows (n,) have in common."""
 
     def reached(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
         """(H, W) bool: pixels that can show anything where the body's vertices are (V, 3)."""
