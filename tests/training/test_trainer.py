@@ -234,7 +234,7 @@ def test_what_all_poses_changed_alike_is_the_rest_bodys(tmp_path: Path, machiner
     tuned, rows = trainer.stage.bodies, trainer.train_rows
     turn = tuned.theta[rows] - body.theta[rows]
     assert turn.abs().max() > 1e-3
-    assert (turn.mean(0).abs().max() < 1e-5) == common
+    assert (turn.mean(0).abs().max() < 1e-4) == common
     assert torch.equal(tuned.theta[2], body.theta[2])
     reshaped = body.rig.reshaped(tuned.rig.beta)
     moved_m = (tuned.rig.vertices_m - reshaped.vertices_m).abs().max()
