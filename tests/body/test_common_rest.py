@@ -31,7 +31,7 @@ def placed(moved_m: Tensor) -> Tensor:
     return root
 
 
-def test_the_rest_body_turns_as_all_joints_do_in_the_mean():
+def test_the_rest_body_turns_as_all_joints_do_in_the_mean() -> None:
     """By 0.05 and 0.15: rest bends by 0.1, frames keep -0.05 and 0.05 of it. A corner 0.5 m before the joint and 1 m
     above it turns about the joint."""
     root = placed(torch.zeros(2, 3))
@@ -45,7 +45,7 @@ def test_the_rest_body_turns_as_all_joints_do_in_the_mean():
     torch.testing.assert_close(stands, root)
 
 
-def test_the_rest_body_moves_as_all_bodies_do_along_their_own_axes():
+def test_the_rest_body_moves_as_all_bodies_do_along_their_own_axes() -> None:
     """1 cm and 3 cm to the left in the mean 2 cm; the second body looks along another axis of the world."""
     left_m = torch.tensor([[0.01, 0.0, 0.0], [0.03, 0.0, 0.0]])
     before, theta = placed(torch.zeros(2, 3)), bent(BEND_RAD)
@@ -56,7 +56,7 @@ def test_the_rest_body_moves_as_all_bodies_do_along_their_own_axes():
     torch.testing.assert_close(own, theta, atol=1e-6, rtol=0)
 
 
-def test_bodies_stay_where_they_are():
+def test_bodies_stay_where_they_are() -> None:
     """What one bone carries exactly; between bones by 0.1 rad squared of half a metre at most."""
     generator = torch.Generator().manual_seed(0)
     before = bent(BEND_RAD), placed(torch.zeros(2, 3))
