@@ -79,7 +79,7 @@ def match(
     settings: FitSettings,
 ) -> Rows:  # fmt: skip
     """Rows of one camera and frame. scale_m: metres a pixel spans; vertices_m and normals (V, 3)."""
-    rim = _rim(camera, vertices_m, normals, faces)
+    rim = rim_of(camera, vertices_m, normals, faces)
     uv, by_x = (t.numpy() for t in project(camera, torch.from_numpy(vertices_m[rim])))
     flat = normals[rim] @ camera.R[:2].T
     flat /= np.linalg.norm(flat, axis=1, keepdims=True).clip(1e-9)
@@ -93,7 +93,7 @@ def match(
     return Rows(ids, gradient, residual_m, np.where(residual_m > 0, strict, loose))
 
 
-def _rim(camera: Camera, vertices_m: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def rim_of(camera: Camera, vertices_m: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Vertices (N,) on the body's outline in the image: seen edge-on, and near the border of its silhouette."""
     view = vertices_m - camera.centre_m
     edge_on = np.abs((view * normals).sum(1)) < FACING * np.linalg.norm(view, axis=1)
@@ -156,7 +156,7 @@ def refine(problem: Problem, pose: Pose, edges: list[list[Outline | None]], sett
             if len(row) == 1:
                 found.append(_standing(vertices_m, up))
             for rows in found:
-                _add_rows(equations, articulation, joints, t, rows)
+                add_rows(equations, articulation, joints, t, rows)
                 residuals.append(rows.residual_m)
         pose = problem.moved(pose, equations, DAMPING)
         error_mm = 1e3 * np.concatenate([np.zeros(0), *residuals])
@@ -175,7 +175,7 @@ def _standing(vertices_m: np.ndarray, up: int) -> Rows:
     return Rows(np.array([lowest]), np.eye(3)[[up]], np.array([height_m]), np.array([weight]))
 
 
-def _add_rows(
+def add_rows(
     equations: NormalEquations, articulation: Articulation, joints: PosedJoints, frame: int, rows: Rows
 ) -> None:
     """Add a frame's rows to the normal equations."""

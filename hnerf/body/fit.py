@@ -16,6 +16,7 @@ from torch import Tensor
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.balance import Balance
 from hnerf.body.body_model import BodyModel, body_model
+from hnerf.body.clothed_fit import refine_clothed
 from hnerf.body.contour_fit import Outline, outline, refine
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.given_start import given_start, seen_on, told_of
@@ -78,6 +79,8 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
                 problem = replace(problem, balance=balance, habit=habit)
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
                 pose = refine(problem, pose, edges, settings, up)
+            with _timed(seconds, "clothes"):
+                pose = refine_clothed(problem, pose, edges)
         fit = BodyFit(pose.rig.to(dtype=torch.float32), capture.frames, pose.theta.float(), pose.root.float())
         report = _report(capture, masks, seen, pose, fit, seconds)
         return fit, report | ({"given_poses": told_of(model, capture)} if begin else {})

@@ -15,7 +15,7 @@ class FrameDeformation(nn.Module):
     """Displacements of nodes spread over the body, in every frame; vertices follow the nodes around them.
 
     The embedded deformation of Sumner et al. 2007 without its rotations. displacement (frames + 1, nodes, 3) in
-    canonical metres starts at zero; its last row stays there: it is that of a pose that no frame has.
+    canonical metres starts at zero; its last row is that of a pose that no frame has.
     """
 
     shares: Tensor
@@ -38,6 +38,13 @@ class FrameDeformation(nn.Module):
         table = self._of_vertices(present).flatten(0, 1)
         found = blended(table, own[:, None] * len(self.shares) + described.corners, described.barycentric)
         return found[:, :3], found[:, 3]
+
+    @torch.no_grad()
+    def learn_for_all(self, rows: Tensor) -> None:
+        """Displace all but some frames, rows (n,), as these are in the mean."""
+        others = torch.ones(len(self.displacement), dtype=torch.bool, device=rows.device)
+        others[rows] = False
+        self.displacement[others] = self.displacement[rows].mean(0)
 
     @torch.no_grad()
     def outwards(self, moment: Tensor) -> Tensor:

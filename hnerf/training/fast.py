@@ -38,6 +38,7 @@ NEGLIGIBLE = 1e-3  # a sample of less weight gets no colour
 class FastField(Field):
     """Networks, sharpness, the canonical body and its deformation in every frame; no pose of its own."""
 
+    common_rest = True
     outer_m: Tensor
     inner_m: Tensor
     corners: Tensor
@@ -102,6 +103,11 @@ class FastField(Field):
                 reached.scatter_reduce_(0, described.vertex[seen], side * described.d[seen], "amax")
         for side, thickness_m in ((1, self.outer_m), (-1, self.inner_m)):
             thickness_m.copy_((reached_m[side] + ROOM_M).minimum(thickness_m))
+
+    def learn_for_all(self, rows: Tensor) -> None:
+        """The mean deformation."""
+        if self.deformation is not None:
+            self.deformation.learn_for_all(rows)
 
     def parameter_groups(self) -> list[dict]:
         """Adam groups; feature grids bear a larger rate than networks."""

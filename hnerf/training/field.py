@@ -23,10 +23,11 @@ class Field(nn.Module, ABC):
     gamma: how sharp the outline of the distances that `sample` returns is, a unit of them; margin_m: how far around the
     body's extent anything can be seen; own_background: whether the field models the photograph's surroundings, or is
     composited over the clean plate; whole_images: whether training draws from all pixels, or from those that `reached`
-    names and those of the mask.
+    names and those of the mask; common_rest: whether the rest body takes what training changes in all poses alike.
     """
 
     own_background: ClassVar[bool] = False
+    common_rest: ClassVar[bool] = False
     whole_images: bool = False
     canonical_m: Tensor
     samples: int
@@ -39,6 +40,9 @@ class Field(nn.Module, ABC):
 
     def tighten(self, rig: Rig, pose: Tensor) -> None:
         """Make that region no larger than what can be seen in some poses (n, P)."""
+
+    def learn_for_all(self, rows: Tensor) -> None:
+        """Give poses of which nothing is known what the frames of some rows (n,) have in common."""
 
     def reached(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
         """(H, W) bool: pixels that can show anything where the body's vertices are (V, 3)."""

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from hnerf.body.canonical import PosedBodies
+from hnerf.body.common_rest import with_common_rest
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.config import TrainingSettings
@@ -151,8 +152,20 @@ class Trainer:
     def _absorb(self) -> None:
         self.stage.bodies.absorb(self.objective.correction, self.train_rows if self.settings.one_posture else None)
         if self.step <= self.field_steps:
+            self._learn_for_all()
             self.field.tighten(self.stage.bodies.rig, self.conditions.pose[self.train_rows[::POSES_APART]])
         self._stand(self.stage.bodies)
+
+    def _learn_for_all(self) -> None:
+        """What training frames have in common holds for all poses: in one posture that is the posture itself."""
+        rows, bodies = self.train_rows, self.stage.bodies
+        self.field.learn_for_all(rows)
+        if not self.field.common_rest or self.settings.one_posture or len(rows) < 2:
+            return
+        theta, root = bodies.theta.clone(), bodies.root.clone()
+        fitted, tuned = ((t[rows], r[rows]) for t, r in ((self.body.theta, self.body.root), (theta, root)))
+        rig, theta[rows], root[rows] = with_common_rest(bodies.rig, fitted, tuned)
+        bodies.stand(rig, theta, root)
 
     def _freeze_field(self) -> None:
         """What belongs to novel frames is fitted to the finished field, so that it never learns from their pixels."""

@@ -65,6 +65,16 @@ def test_gradient_in_double():
     assert torch.autograd.gradcheck(moved, found.displacement.detach().requires_grad_())
 
 
+def test_poses_without_a_frame_of_their_own_are_displaced_as_frames_are_in_the_mean():
+    """Frames 0 and 2 by 1 cm along x and by 2 cm upwards: 0.5 cm and 1 cm for frame 1 and for what no frame has."""
+    found = FrameDeformation(RIG.vertices_m, RIG.faces, 2, frames=3)
+    found.displacement.data[[0, 2]] = CENTIMETRES[:, None]
+    found.learn_for_all(torch.tensor([0, 2]))
+    mean = torch.tensor([0.005, 0.0, 0.01])
+    expected = torch.stack([CENTIMETRES[0], mean, CENTIMETRES[1], mean])[:, None].expand(-1, 2, -1)
+    torch.testing.assert_close(found.displacement.data, expected)
+
+
 def test_how_far_vertices_go_outwards():
     """All go 1 cm along x in frame 0: corner 0, at the origin, goes inwards, corner 1, at (1, 0, 0), outwards; in frame
     1 all go 2 cm up, corner 1 inwards."""

@@ -223,6 +223,28 @@ def test_training_frames_of_one_posture_keep_one(tmp_path: Path):
     assert (tuned.root[rows[0]] - body.root[rows[0]] - tuned.root[rows[1]] + body.root[rows[1]]).abs().max() > 1e-5
 
 
+@pytest.mark.parametrize(("machinery", "common"), [("fast", True), ("paper", False)])
+def test_what_all_poses_changed_alike_is_the_rest_bodys(tmp_path: Path, machinery: str, common: bool):
+    """Training poses then turn by nothing in the mean, and a new pose gets what they got: its theta stays as fitted,
+    and the rest body's vertices do not; so it is displaced. The published method keeps its rest body."""
+    capture, masks, body = record(tmp_path / "capture")
+    settings = with_changes(machinery=machinery, pose_learning_rate=0.01, novel_pose_steps=0)
+    trainer = Trainer(capture, masks, body, settings, tmp_path, ALONE)
+    trainer.run()
+    tuned, rows = trainer.stage.bodies, trainer.train_rows
+    turn = tuned.theta[rows] - body.theta[rows]
+    assert turn.abs().max() > 1e-3
+    assert (turn.mean(0).abs().max() < 1e-4) == common
+    torch.testing.assert_close(tuned.theta[2], body.theta[2], atol=1e-6, rtol=0)
+    reshaped = body.rig.reshaped(tuned.rig.beta)
+    moved_m = (tuned.rig.vertices_m - reshaped.vertices_m).abs().max()
+    assert moved_m > 1e-3 if common else moved_m < 1e-6
+    if common:
+        displacement = load_file(tmp_path / "model.safetensors")["deformation.displacement"]
+        torch.testing.assert_close(displacement[-1], displacement[rows].mean(0))
+        assert displacement[-1].abs().max() > 0
+
+
 def test_a_single_training_frame_has_nothing_to_deform(tmp_path: Path):
     """The novel frames' poses are fitted all the same."""
     capture, masks, body = record(tmp_path / "capture")

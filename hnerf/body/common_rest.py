@@ -1,0 +1,44 @@
+"""What a change of poses has in common in all frames belongs to the rest body: then a pose that no frame has gets it,
+too."""
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from hnerf.body.canonical import axis_angle_from_rotation
+from hnerf.body.rig import Rig, joint_transforms, pose_vertices, rotation_from_axis_angle
+
+
+def with_common_rest(
+    rig: Rig, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]
+) -> tuple[Rig, Tensor, Tensor]:
+    """The rig that rests as all frames have turned and moved in the mean, and the poses that put it where it stands
+    after; poses before now show it turned and moved like that.
+
+    before, after: theta (n, J, 3) and root (n, 4, 4). Joints and what is rigid on one are where they were; what is
+    blended between joints differs by the square of the mean turn. The shape's basis, which would turn likewise, stays.
+    """
+    theta, root = _mean_change(before, after)
+    resting = joint_transforms(rig, theta, root)
+    vertices_m = pose_vertices(rig, theta, root)
+    changed = dataclasses.replace(rig, vertices_m=vertices_m, joints_m=resting[:, :3, 3].contiguous())
+    world = joint_transforms(rig, *after)
+    rotation = world[..., :3, :3] @ resting[:, :3, :3].mT
+    above = rotation[:, rig.parents.clamp(min=0)]
+    own = axis_angle_from_rotation(above.mT @ rotation)
+    own[:, 0] = 0
+    stands = after[1].clone()
+    stands[:, :3, :3] = rotation[:, 0]
+    stands[:, :3, 3] = world[:, 0, :3, 3] - (rotation[:, 0] @ changed.joints_m[0, :, None])[..., 0]
+    return changed, own, stands
+
+
+def _mean_change(before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """The mean over frames of how joints turn, (J, 3) in their own axes, and of how the body turns and moves in its
+    own frame, (4, 4)."""
+    turned = rotation_from_axis_angle(before[0]).mT @ rotation_from_axis_angle(after[0])
+    moved = torch.linalg.inv(before[1]) @ after[1]
+    root = moved.mean(0)
+    root[:3, :3] = rotation_from_axis_angle(axis_angle_from_rotation(moved[:, :3, :3]).mean(0))
+    return axis_angle_from_rotation(turned).mean(0), root
