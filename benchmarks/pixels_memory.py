@@ -3,15 +3,14 @@
 usage: python benchmarks/pixels_memory.py [--frames 60] [--cameras 8] [--size-px 1024]
 
 Images are noise, so that no part of them can be left out, masks are discs. Each process reads all pixels once, so that
-all are in memory, and draws rays; what all hold together is the sum of their proportional shares (Pss), in which a page
-that several map counts once. Writes `benchmarks/results/pixels-memory.json` and `.md`.
+all are in memory; what all hold together is the sum of their proportional shares (Pss), in which a page that several
+map counts once. Writes `benchmarks/results/pixels-memory.json` and `.md`.
 """
 
 import argparse
 import json
 import os
 import socket
-import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
@@ -26,8 +25,6 @@ from hnerf.training.gather import gather_pixels
 from hnerf.training.processes import Processes
 
 PROCESSES = (1, 2, 4)
-FRAMES_PER_STEP, RAYS_PER_FRAME = 8, 512  # of preset `paper`
-DRAWS = 20
 GIB = 2**30
 
 
@@ -39,19 +36,10 @@ def main() -> None:
     options = parser.parse_args()
     rows = {str(n): measure(n, options.frames, options.cameras, options.size_px) for n in PROCESSES}
     size = f"{options.frames} frames x {options.cameras} cameras x {options.size_px} px"
-    shown = [
-        [
-            "processes",
-            "all hold, GiB",
-            "before their pixels",
-            "pixels, once",
-            "most while gathering",
-            "a step's rays, ms",
-        ]
-    ]
+    shown = [["processes", "all hold, GiB", "before their pixels", "pixels, once", "most while gathering"]]
     for n, row in rows.items():
         sizes = (row["all_gib"], row["before_gib"], row["all_gib"] - row["before_gib"], row["gathering_gib"])
-        shown.append([n, *(f"{gib:.2f}" for gib in sizes), f"{row['draw_ms']:.1f}"])
+        shown.append([n, *(f"{gib:.2f}" for gib in sizes)])
     result = provenance() | {"size": size, "processes": rows}
     told = f"{size}; the most that the gathering process holds of its own, without the files that it writes."
     markdown = "\n".join(["# Host memory of pixels", "", sentence(result), "", told, "", *table(shown), ""])
@@ -60,8 +48,7 @@ def main() -> None:
 
 
 def measure(processes: int, frames: int, cameras: int, size_px: int) -> dict[str, float]:
-    """GiB of all processes together before and after they have their pixels, of the gathering one while it does, and
-    the milliseconds of a draw."""
+    """GiB of all processes together before and after they have their pixels, and of the gathering one while it does."""
     with socket.socket() as free, TemporaryDirectory() as folder:
         free.bind(("127.0.0.1", 0))
         os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}
@@ -72,7 +59,6 @@ def measure(processes: int, frames: int, cameras: int, size_px: int) -> dict[str
         "before_gib": sum(row["before"] for row in found) / GIB,
         "all_gib": sum(row["after"] for row in found) / GIB,
         "gathering_gib": found[0]["anonymous"] / GIB,
-        "draw_ms": 1e3 * max(row["draw_s"] for row in found),
     }
 
 
@@ -89,11 +75,6 @@ def one(rank: int, processes: int, frames: int, cameras: int, size_px: int, fold
     found["anonymous"] = capture.most
     for column in (pixels.colour, pixels.person, pixels.edge):
         column.numpy().max()
-    generator = torch.Generator().manual_seed(rank)
-    started = time.perf_counter()
-    for _ in range(DRAWS):
-        pixels.draw(torch.randperm(frames, generator=generator)[:FRAMES_PER_STEP], RAYS_PER_FRAME, generator, 0.0)
-    found["draw_s"] = (time.perf_counter() - started) / DRAWS
     here.wait()
     found["after"] = held("Pss")
     here.wait()
