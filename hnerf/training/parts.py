@@ -100,14 +100,14 @@ def _peak_bytes(attempt: Callable[[int], tuple[int, Tensor]], about: int, device
         return rays, torch.cuda.max_memory_allocated(device) - before
     saved = {}
 
-    def count(tensor: Tensor) -> Tensor:
+    def keep(tensor: Tensor) -> Tensor:
         storage = tensor.untyped_storage()
-        saved[storage.data_ptr()] = storage.nbytes()
+        saved[storage.data_ptr()] = storage  # kept, so that no other takes its place
         return tensor
 
-    with torch.autograd.graph.saved_tensors_hooks(count, lambda tensor: tensor):
+    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
         rays, _ = attempt(about)
-    return rays, PEAK * sum(saved.values())
+    return rays, PEAK * sum(storage.nbytes() for storage in saved.values())
 
 
 def _free_bytes(processes: Processes) -> float:

@@ -1,0 +1,128 @@
+"""Host memory of a training's pixels, as `paper` keeps them, by the number of processes.
+
+usage: python benchmarks/pixels_memory.py [--frames 60] [--cameras 8] [--size-px 1024]
+
+Images are noise, so that no part of them can be left out, masks are discs. Each process reads all pixels once, so that
+all are in memory; what all hold together is the sum of their proportional shares (Pss), in which a page that several
+map counts once. Writes `benchmarks/results/pixels-memory.json` and `.md`.
+"""
+
+import argparse
+import json
+import os
+import socket
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+import torch.multiprocessing as multiprocessing
+from provenance import provenance, sentence, table, write_result
+
+from hnerf.training.gather import gather_pixels
+from hnerf.training.processes import Processes
+
+PROCESSES = (1, 2, 4)
+GIB = 2**30
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name, default in (("frames", 60), ("cameras", 8), ("size-px", 1024)):
+        parser.add_argument(f"--{name}", type=int, default=default)
+    options = parser.parse_args()
+    rows = {str(n): measure(n, options.frames, options.cameras, options.size_px) for n in PROCESSES}
+    size = f"{options.frames} frames x {options.cameras} cameras x {options.size_px} px"
+    shown = [["processes", "all hold, GiB", "before their pixels", "pixels, once", "most while gathering"]]
+    for n, row in rows.items():
+        sizes = (row["all_gib"], row["before_gib"], row["all_gib"] - row["before_gib"], row["gathering_gib"])
+        shown.append([n, *(f"{gib:.2f}" for gib in sizes)])
+    result = provenance() | {"size": size, "processes": rows}
+    told = f"{size}; the most that the gathering process holds of its own, without the files that it writes."
+    markdown = "\n".join(["# Host memory of pixels", "", sentence(result), "", told, "", *table(shown), ""])
+    write_result("pixels-memory", result, markdown)
+    print(markdown)
+
+
+def measure(processes: int, frames: int, cameras: int, size_px: int) -> dict[str, float]:
+    """GiB of all processes together before and after they have their pixels, and of the gathering one while it does."""
+    with socket.socket() as free, TemporaryDirectory() as folder:
+        free.bind(("127.0.0.1", 0))
+        os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}
+        free.close()
+        multiprocessing.spawn(one, (processes, frames, cameras, size_px, Path(folder)), processes)
+        found = [json.loads((Path(folder) / f"{rank}.json").read_text()) for rank in range(processes)]
+    return {
+        "before_gib": sum(row["before"] for row in found) / GIB,
+        "all_gib": sum(row["after"] for row in found) / GIB,
+        "gathering_gib": found[0]["anonymous"] / GIB,
+    }
+
+
+def one(rank: int, processes: int, frames: int, cameras: int, size_px: int, folder: Path) -> None:
+    """What process `rank` does and measures."""
+    os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(processes)}
+    torch.set_num_threads(1)
+    here, found = Processes.join(), {}
+    capture, masks, body = made_up(frames, cameras, size_px)
+    here.wait()
+    found["before"] = held("Pss")
+    here.wait()
+    pixels = gather_pixels(capture, masks, body, body.frames, None, {}, folder, here)
+    found["anonymous"] = capture.most
+    for column in (pixels.colour, pixels.person, pixels.edge):
+        column.numpy().max()
+    here.wait()
+    found["after"] = held("Pss")
+    here.wait()
+    (folder / f"{rank}.json").write_text(json.dumps(found))
+
+
+def held(name: str) -> int:
+    """Bytes of this process that Linux counts by this name."""
+    lines = Path("/proc/self/smaps_rollup").read_text().splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
+
+
+class Noise(SimpleNamespace):
+    """What is asked of a capture; most: bytes that the process held of its own, at the most, when an image was read."""
+
+    most = 0
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        """(H, W, 3) uint8."""
+        self.most = max(self.most, held("Anonymous"))
+        shape = self.cameras[camera].height_px, self.cameras[camera].width_px, 3
+        return np.random.default_rng([int(camera), frame]).integers(0, 256, shape, np.uint8)
+
+    def background(self, camera: str) -> None:
+        """There are no plates."""
+
+
+class Discs(SimpleNamespace):
+    """What is asked of masks."""
+
+    def __contains__(self, view: tuple[str, int]) -> bool:
+        """All are there."""
+        return True
+
+    def get(self, camera: str, frame: int) -> np.ndarray:
+        """(H, W) bool."""
+        y, x = np.ogrid[: self.size_px, : self.size_px]
+        return (x - self.size_px // 2) ** 2 + (y - self.size_px // 2) ** 2 < (self.size_px // 4) ** 2
+
+
+def made_up(frames: int, cameras: int, size_px: int) -> tuple[Any, Any, Any]:
+    """Capture, masks and body fit, as far as whole images ask for them."""
+    camera = SimpleNamespace(width_px=size_px, height_px=size_px, K=np.eye(3), R=np.eye(3), centre_m=np.zeros(3))
+    names = tuple(f"{k}" for k in range(cameras))
+    by_name = {name: SimpleNamespace(**vars(camera), name=name) for name in names}
+    body = SimpleNamespace(frames=tuple(range(frames)), vertices_m=lambda: torch.zeros(frames, 1, 3))
+    return Noise(train_cameras=names, cameras=by_name), Discs(size_px=size_px), body
+
+
+if __name__ == "__main__":
+    main()
