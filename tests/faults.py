@@ -31,6 +31,7 @@ CONDITIONS, TRAINER = "hnerf/training/conditions.py", "hnerf/training/trainer.py
 COMPOSITING, CANONICAL = "hnerf/render/compositing.py", "hnerf/field/canonical.py"
 ENCODING, MLP = "hnerf/field/encoding.py", "hnerf/field/mlp.py"
 BODIES, PIXELS = "hnerf/body/canonical.py", "hnerf/training/pixels.py"
+GATHER = "hnerf/training/gather.py"
 
 BY_PAPER, BY_LOSSES = "tests/training/test_paper.py", "tests/training/test_losses.py"
 BY_STEP, BY_CONDITIONS = "tests/training/test_step.py", "tests/training/test_conditions.py"
@@ -98,6 +99,11 @@ FAULTS = (
           BY_LOSSES),
     Fault("blend-eta", LOSSES, "eta * (1 - target.person)", "(1 - target.person)", BY_LOSSES),
     Fault("blend-outside", LOSSES, " + (1 - samples.in_box) * samples.alpha", "", BY_LOSSES),
+    Fault("paper-box-samples", PAPER, "stratified(entry, leave, ", "stratified(near, far, ", BY_PAPER),
+    Fault("paper-start", MLP, "        self.trunk.start_as_he()\n", "", BY_MLP),
+    Fault("paper-view-octaves", MLP, "encoding(view, self", "encoding(0 * view, self", BY_MLP),
+    Fault("geometry-moves-the-surface", LOSSES, "occupied.detach()", "occupied", BY_LOSSES),
+    Fault("geometry-roles", LOSSES, 'if roles == "print"', 'if roles != "print"', BY_LOSSES),
     Fault("geometry-sign", LOSSES, "(samples.density - threshold)", "(threshold - samples.density)", BY_LOSSES),
     Fault("segmentation-sign", LOSSES, "logit = -sharpness", "logit = sharpness", BY_LOSSES),
     Fault("segmentation-mean", LOSSES, "distance.amin(1)", "distance.mean(1)", BY_LOSSES),
@@ -131,8 +137,8 @@ FAULTS = (
     Fault("trainer-noise", TRAINER, "self.conditions.noisy(s.noise, self.generator)", "self.conditions", BY_TRAINER),
     Fault("trainer-view-noise", TRAINER, "samples, s.noise, self.generator)", "samples, 0.0, self.generator)",
           BY_TRAINER),
-    Fault("fast-levelling", TRAINER, "if self.gains:", "if False:", BY_TRAINER),
-    Fault("levelling-inverse", PIXELS, "part / gains[camera.long()]", "part * gains[camera.long()]", BY_EXPOSURE),
+    Fault("fast-levelling", TRAINER, "reached, self.gains, out", "reached, {}, out", BY_TRAINER),
+    Fault("levelling-inverse", GATHER, "shown / np.array(gain", "shown * np.array(gain", BY_EXPOSURE),
     Fault("trainer-novel-frames", TRAINER, "rows = self.train_rows if self.step",
           "rows = torch.cat([self.train_rows, self.novel_rows]) if self.step", BY_TRAINER),
     Fault("trainer-field-goes-on", TRAINER, "self.field.requires_grad_(False)", "pass", BY_TRAINER),

@@ -81,8 +81,10 @@ def decide_parts(
     room = USABLE * _free_bytes(processes) if memory_gib is None else memory_gib * GIB
     most_rays = max(1.0, (room - least) / each + few)
     count = int(processes.greatest(min(math.ceil(share / most_rays), max(1, share // 2))))
-    reason = f"a ray needs {each / 2**20:.2f} MiB, {share} rays {(least + (share - few) * each) / GIB:.2f} GiB"
-    reason += f", of {room / GIB:.1f} GiB that may be taken" if memory_gib or count > 1 else ": there is room for them"
+    reason = "there is room for a step's rays"  # without figures, so that identical runs record the same
+    if memory_gib or count > 1:
+        needed_gib = (least + (share - few) * each) / GIB
+        reason = f"{share} rays need {needed_gib:.2f} GiB, of {room / GIB:.1f} GiB that may be taken"
     side_by_side = count == 1 and device.type == "cpu" and processes.world_size == 1 and torch.get_num_threads() > 1
     if side_by_side:
         count, reason = HALVES, f"{reason}, side by side in threads"

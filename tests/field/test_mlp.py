@@ -82,3 +82,23 @@ def test_products_in_bfloat16_are_wrong_by_a_few_percent_at_most():
     for exact, found in zip(slopes(network, points), reduced, strict=True):
         assert found.dtype == torch.float32
         assert 1e-3 < (found - exact).norm() / exact.norm() < 0.03
+
+
+def test_density_differs_over_space_from_the_start():
+    """With torch's own initial weights its standard deviation is below 0.001."""
+    torch.manual_seed(0)
+    network = RadianceMLP(4, 57, 12)
+    density, _ = network(2 * torch.rand(500, 4) - 1, torch.zeros(500, 57), torch.zeros(500, 12), torch.zeros(500, 3))
+    assert density.std() > 0.01
+
+
+def test_views_are_encoded_where_asked():
+    """(v, sin pi v, cos pi v): nine inputs instead of three; a view of 1 looks like one of -1 but for v itself."""
+    network = RadianceMLP(4, 3, 12, view_octaves=1)
+    assert network.colour[0].in_features == 256 + 12 + 9
+    with torch.no_grad():
+        network.colour[0].weight[:, 268:271] = 0  # v
+    point, pose, root = torch.rand(2, 4), torch.rand(2, 3), torch.rand(2, 12)
+    one, other = (network(point, pose, root, torch.full((2, 3), v))[1] for v in (1.0, -1.0))
+    torch.testing.assert_close(one, other)
+    assert not torch.allclose(one, network(point, pose, root, torch.full((2, 3), 0.5))[1])

@@ -102,6 +102,22 @@ def test_fine_samples_lie_where_the_coarse_ones_have_weight(static: bool) -> Non
     assert not depths.requires_grad  # no gradient moves them
 
 
+def test_some_coarse_samples_lie_in_the_box_alone() -> None:
+    """Two of four in the middles of the scene's halves, at 2 and 4 m, two of those of B, which is met from 2.45 to
+    3.65 m."""
+    field = field_of(static=True, box_samples=2)
+    sampled(field)
+    same(field.radiance.asked[0][0][:, 0], torch.tensor([-0.5, -0.125, 0.175, 0.5]))
+
+
+def test_a_ray_beside_the_box_has_all_its_samples_in_the_scene() -> None:
+    field, (standing, conditions) = field_of(static=True, box_samples=2), bodies()
+    beside = torch.tensor([[-1.0, 1.9, 0.25]]), *RAY[1:]
+    samples, depths = field.sample(standing, field.region(standing, conditions), *beside, conditions, DRAWS)
+    assert samples.in_box.sum() == 0 and samples.alpha.isfinite().all()
+    assert (depths.diff() >= 0).all() and depths.min() >= 1 and depths.max() <= 5
+
+
 def test_coarse_samples_are_asked_first() -> None:
     field = field_of()
     sampled(field)

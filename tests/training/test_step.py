@@ -71,7 +71,7 @@ def test_each_loss_is_given_its_own_numbers() -> None:
         "reconstruction": 2 * 0.475,
         "mask": 3 * 0.375,
         "blend": 5 * 1.025,
-        "geometry": 7 * losses.geometry(SAMPLES, 50.0, 0.1).item(),
+        "geometry": 7 * losses.geometry(SAMPLES, 50.0, 0.02, "surface_leads").item(),
         "segmentation": 11 * losses.segmentation(SAMPLES.d_hat, TARGET, 80.0).item(),
         "eikonal": 13 * 0.145,
         "residual": 17 * 0.02,

@@ -113,7 +113,7 @@ def test_cameras_are_levelled_before_training(tmp_path: Path, monkeypatch: pytes
     """Camera 2 shows red twice as bright as the others do: the person is (200, 50, 50) before a plate of 128."""
     gains = dict.fromkeys("0123", (1.0, 1.0, 1.0)) | {"2": (2.0, 1.0, 1.0)}
     monkeypatch.setattr(trainer_module, "camera_gains", lambda *inputs: (gains, Decision(2.0, "twice as bright")))
-    handed = handed_over(trainer_of(tmp_path, machinery="paper", rays_per_frame=512))
+    handed = handed_over(trainer_of(tmp_path, rays_per_frame=512))
     colour, plate, person, edge = (handed.all(0, name) for name in ("colour", "plate", "person", "edge"))
     bright = handed.all(0, "origins_m")[:, 0] < -3  # camera 2 stands at x = -3.5 m
     for camera, red, grey in ((bright, [100, 50, 50], [64, 128, 128]), (~bright, [200, 50, 50], [128, 128, 128])):
@@ -138,7 +138,9 @@ def test_the_shell_is_tightened_with_the_bodies_until_the_field_is_finished(tmp_
 
 @MACHINERIES
 def test_bodies_take_up_what_was_learned_of_them(tmp_path: Path, machinery: str) -> None:
-    """A bend of 0.1 and a move of 1 cm: then the networks are told so, and the correction is none."""
+    """A bend of 0.1 and a move of 1 cm: then the networks are told so, and the correction is none. What both training
+    frames have in common of it, half, `fast` gives to the rest body; the novel frame is told of neither."""
+    common = 0.5 if machinery == "fast" else 0.0
     trainer = trainer_of(tmp_path, machinery=machinery)
     before = trainer.conditions
     with torch.no_grad():
@@ -147,7 +149,8 @@ def test_bodies_take_up_what_was_learned_of_them(tmp_path: Path, machinery: str)
     trainer.step = 1
     trainer._absorb()
     after = trainer.conditions
-    assert (after.pose - before.pose)[:, 1].tolist() == pytest.approx([0, 0.1, 0], abs=1e-6)
-    assert (after.root - before.root)[:, 11].tolist() == pytest.approx([0.01 / 2.5, 0, 0], abs=1e-6)
+    assert (after.pose - before.pose)[:, 1].tolist() == pytest.approx([-0.1 * common, 0.1 * (1 - common), 0], abs=1e-6)
+    moved_m = [0.01 * (1 - common), -0.01 * common, 0]
+    assert (2.5 * (after.root - before.root)[:, 11]).tolist() == pytest.approx(moved_m, abs=1e-5)
     assert not any(p.any() for p in trainer.objective.correction.parameters())
-    torch.testing.assert_close(trainer.stage.bodies.root[0, :3, 3], torch.tensor([0.0, 0, 0.01]))
+    assert trainer.stage.bodies.root[0, :3, 3].tolist() == pytest.approx([0, 0, moved_m[0]], abs=1e-5)
