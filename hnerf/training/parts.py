@@ -84,7 +84,7 @@ def decide_parts(
     reason = "there is room for a step's rays"  # without figures, so that identical runs record the same
     if memory_gib or count > 1:
         needed_gib = (least + (share - few) * each) / GIB
-        reason = f"{share} rays need {needed_gib:.2f} GiB, of {room / GIB:.1f} GiB that may be taken"
+        reason = f"a ray needs {each / 2**20:.2f} MiB, {share} rays {needed_gib:.2f} GiB, of {room / GIB:.1f} GiB"
     side_by_side = count == 1 and device.type == "cpu" and processes.world_size == 1 and torch.get_num_threads() > 1
     if side_by_side:
         count, reason = HALVES, f"{reason}, side by side in threads"
