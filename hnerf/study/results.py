@@ -9,6 +9,7 @@ A result is a plain tree, as the JSON file has it:
 
 import csv
 import io
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -192,7 +193,9 @@ def _timeline(variant: Mapping[str, Any]) -> list[str]:
     lines += head(["method", *AFTER_S.values(), "at its end", "best", "ended"])
     for name, curve in curves.items():
         (end_s, at_end), (best_s, best) = curve[-1], max(curve, key=lambda point: point[1])
-        cells = [shown(value_at(curve, seconds), "{:.2f}") for seconds in AFTER_S]
+        known_s = end_s if why[name] == ENDS["limit"] else math.inf  # a longer training would have had more
+        values = [value_at(curve, seconds) if seconds <= known_s else None for seconds in AFTER_S]
+        cells = [shown(value, "{:.2f}") for value in values]
         lines.append(
             line([name, *cells, f"{at_end:.2f}", f"{best:.2f} ({best_s:.0f} s)", f"{end_s:.0f} s, {why[name]}"])
         )

@@ -143,6 +143,9 @@ def test_what_methods_had_on_the_way_and_why_they_ended() -> None:
         "| nerf | 23.56 | 25.56 | 26.00 | 26.00 | 26.00 (1000 s) | 1000 s, flat |",
         "",
     ]
+    methods["nerf"]["ended"] = "limit"
+    assert "| nerf | 23.56 | 25.56 | - | 26.00 | 26.00 (1000 s) | 1000 s, out of time |" in as_markdown(flat, [], [])
+    methods["nerf"]["ended"] = "flat"
     assert ends(flat["variants"]["4 cameras"]) == {"fast": "its steps are done", "nerf": "flat"}
     assert "each from the start" in caption(flat) and "60 s at most" in caption(flat)
 
