@@ -64,6 +64,7 @@ REGISTRY = (
     shared("shared-fast-one-camera", "valid-turn-mono"),
     shared("shared-fast-real", "pose2sim-balance"),
     measured("scaling", "scaling.py", captures=("valid-wave",), configs=("fast",)),
+    measured("pixels-memory", "pixels_memory.py"),
     study("stability", "quick", "fast"),
     study("stability", "brief", "fast"),
     study("stability", "seeds", "fast"),
