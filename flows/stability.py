@@ -29,14 +29,7 @@ from tasks.fit import fit
 from tasks.policy import may_pass
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
-from tasks.study import (
-    check_meshes,
-    degrade_capture,
-    degrade_fit,
-    degrade_masks,
-    dress,
-    show_in_extreme_poses,
-)
+from tasks.study import check_meshes, degrade_capture, degrade_fit, degrade_masks, dress, show_in_extreme_poses
 from tasks.training import train
 
 log = logging.getLogger("hnerf.stability")

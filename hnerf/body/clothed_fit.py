@@ -1,24 +1,23 @@
 """Outlines against the clothed body: how far clothes and hair stand away from each vertex, the same in all frames.
 
 A naked body never fits its masks: each frame's pose moves towards what sleeves and hair add, another way in every
-pose. What outlines of all frames have in common is therefore learned
-beside the poses, along the vertices' normals; what is left pulls a body both ways.
+pose. What outlines of all frames have in common is therefore learned beside the poses, along the vertices' normals;
+what is left pulls a body both ways.
 """
 
 import logging
 from dataclasses import replace
 
 import numpy as np
-import torch
 from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import laplacian
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
 from hnerf.body.articulation import Articulation, Pose
-from hnerf.body.contour_fit import DAMPING, Outline, Rows, add_rows, rim_of
+from hnerf.body.contour_fit import DAMPING, Outline, Rows, add_rows, rim_in_image
 from hnerf.body.descriptor import normals_of
-from hnerf.body.keypoint_fit import Problem, project
+from hnerf.body.keypoint_fit import Problem
 from hnerf.capture.camera import Camera
 
 log = logging.getLogger("hnerf.fit")
@@ -65,12 +64,9 @@ def match(
 ) -> Rows:
     """Every point of a mask's contour to the nearest rim vertex of the clothed body, negative where this is too small;
     weights fall from 1 (Geman-McClure). scale_m: metres a pixel spans; vertices_m and normals (V, 3)."""
-    rim = rim_of(camera, vertices_m, normals, faces)
+    rim, uv, by_x, flat = rim_in_image(camera, vertices_m, normals, faces)
     if len(rim) == 0 or len(edge.points_px) == 0:
         return Rows(np.zeros(0, int), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
-    uv, by_x = (t.numpy() for t in project(camera, torch.from_numpy(vertices_m[rim])))
-    flat = normals[rim] @ camera.R[:2].T
-    flat /= np.linalg.norm(flat, axis=1, keepdims=True).clip(1e-9)
     apart_px, nearest = cKDTree(uv).query(edge.points_px)
     same_way = (flat[nearest] * edge.normals).sum(1) > SAME_WAY
     keep = same_way & (apart_px * scale_m < FARTHEST_M)

@@ -79,10 +79,7 @@ def match(
     settings: FitSettings,
 ) -> Rows:  # fmt: skip
     """Rows of one camera and frame. scale_m: metres a pixel spans; vertices_m and normals (V, 3)."""
-    rim = rim_of(camera, vertices_m, normals, faces)
-    uv, by_x = (t.numpy() for t in project(camera, torch.from_numpy(vertices_m[rim])))
-    flat = normals[rim] @ camera.R[:2].T
-    flat /= np.linalg.norm(flat, axis=1, keepdims=True).clip(1e-9)
+    rim, uv, by_x, flat = rim_in_image(camera, vertices_m, normals, faces)
     pairs = [_cover(edge, uv, flat), _contain(edge, uv, settings.spacing_m / scale_m)]
     ids, direction, residual_px = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
     gradient = np.einsum("ri,ric->rc", direction, by_x[ids]) * scale_m
@@ -93,7 +90,19 @@ def match(
     return Rows(ids, gradient, residual_m, np.where(residual_m > 0, strict, loose))
 
 
-def rim_of(camera: Camera, vertices_m: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def rim_in_image(
+    camera: Camera, vertices_m: np.ndarray, normals: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the vertices (N,) on the body's outline, where they are seen (N, 2) px, by how much that changes with
+    their place (N, 2, 3) px a metre, and their unit normals in the image (N, 2)."""
+    rim = _rim(camera, vertices_m, normals, faces)
+    uv, by_x = (t.numpy() for t in project(camera, torch.from_numpy(vertices_m[rim])))
+    flat = normals[rim] @ camera.R[:2].T
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True).clip(1e-9)
+    return rim, uv, by_x, flat
+
+
+def _rim(camera: Camera, vertices_m: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Vertices (N,) on the body's outline in the image: seen edge-on, and near the border of its silhouette."""
     view = vertices_m - camera.centre_m
     edge_on = np.abs((view * normals).sum(1)) < FACING * np.linalg.norm(view, axis=1)

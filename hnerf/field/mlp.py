@@ -12,8 +12,8 @@ from hnerf.field.encoding import positional_encoding
 class SkipMLP(nn.Module):
     """`layers` linear layers of `width`, Swish unless said otherwise; the input is fed again into the middle one.
 
-    bf16: multiply, and keep what lies between the layers, in bfloat16, for half the memory
-    and less time on processors that can.
+    bf16: multiply, and keep what lies between the layers, in bfloat16, for half the memory and less time on processors
+    that can.
     """
 
     def __init__(
