@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 CALIBRATED = ("valid-walk", "valid-wave")
 RENDERED = (*CALIBRATED, "valid-turn-mono")
+FEW = ("evaluation.max_images=12", "evaluation.max_meshes=3")  # a split, where each takes a quarter of a minute
 
 
 @dataclass(frozen=True)
@@ -32,10 +33,11 @@ def measured(
     return Result(name, command, (f"{name}.*",), captures, configs, threads=threads)
 
 
-def shared(name: str, capture: str, threads: int = 1) -> Result:
+def shared(name: str, capture: str, preset: str = "fast", *changes: str, threads: int = 1) -> Result:
     """The whole pipeline on one capture, timed."""
-    command = ("score_shared.py", capture, "--store", "{new}", "--name", name)
-    return Result(name, command, (f"{name}.*",), (capture,), ("fast",), ("flows.train_subject",), threads)
+    command = ("score_shared.py", capture, "--preset", preset, "--store", "{new}", "--name", name)
+    command += tuple(f"--set={change}" for change in changes)
+    return Result(name, command, (f"{name}.*",), (capture,), (preset,), ("flows.train_subject",), threads)
 
 
 def study(kind: str, name: str, *methods: str, store: str = "{store}", threads: int = 1) -> Result:
@@ -46,9 +48,10 @@ def study(kind: str, name: str, *methods: str, store: str = "{store}", threads: 
     return Result(title, command, files, ("valid-wave",), (f"{kind}/{name}", *methods), threads=threads)
 
 
-def ablations(preset: str) -> Result:
+def ablations(preset: str, *changes: str) -> Result:
     """The method without each part, on valid-wave."""
     command = ("studies.py", "{store}", "valid-wave", "ablations", preset)
+    command += tuple(f"--set={change}" for change in changes)
     title = f"ablations/valid-wave-{preset}"
     return Result(title, command, (f"{title}.*",), ("valid-wave",), (preset, "ablations/*"))
 
@@ -63,12 +66,14 @@ REGISTRY = (
     shared("shared-fast-walk", "valid-walk"),
     shared("shared-fast-one-camera", "valid-turn-mono"),
     shared("shared-fast-real", "pose2sim-balance"),
+    shared("shared-paper-small-wave", "valid-wave", "paper-small", *FEW),
     measured("scaling", "scaling.py", captures=("valid-wave",), configs=("fast",)),
     measured("pixels-memory", "pixels_memory.py"),
     study("stability", "quick", "fast"),
     study("stability", "brief", "fast"),
     study("stability", "seeds", "fast"),
     ablations("fast"),
+    ablations("paper-small", "training.steps=600"),
     study("benchmark", "static", "fast", "paper-small", "nerf", "idr"),
     study("benchmark", "dynamic", "fast", "neural-body", "nerfies"),
     measured("budget", "budget.py", "{store}", captures=RENDERED, configs=("fast",)),

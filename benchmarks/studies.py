@@ -1,7 +1,7 @@
 """Studies of speed, accuracy, stability and ablations on a capture, kept where the README finds them.
 
 usage: python benchmarks/studies.py STORE CAPTURE benchmark|stability STUDY [--methods a,b] [--seconds S]
-       python benchmarks/studies.py STORE CAPTURE ablations PRESET [--methods no-opt,no-noise]
+       python benchmarks/studies.py STORE CAPTURE ablations PRESET [--methods no-opt,no-noise] [--set a.b=c]
 
 CAPTURE is the name of a shared capture, or a folder.
 
@@ -31,6 +31,7 @@ def main() -> None:
     parser.add_argument("study")
     parser.add_argument("--methods", default="")
     parser.add_argument("--seconds", type=float)
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="a.b=c", help="of ablations")
     options = parser.parse_args()
     shared = SHARED / "data" / options.capture
     folder = shared if shared.is_dir() else Path(options.capture)
@@ -39,7 +40,7 @@ def main() -> None:
     if options.kind == "benchmark":
         table = benchmark.fn(folder, options.study, methods, options.seconds, options.store)
     elif options.kind == "ablations":
-        table = ablate.fn(folder, options.study, options.store, FEW, methods)
+        table = ablate.fn(folder, options.study, options.store, [*FEW, *options.overrides], methods)
     else:
         table = stability.fn(folder, options.study, options.store, methods)
     clean_commit(ROOT)  # still
