@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from provenance import SHARED, provenance, sentence, table, write_result
 
-from hnerf.calibration.board_rig import compare_pairs, solve_boards, solve_rig
-from hnerf.calibration.boards import calibrate_from_boards
-from hnerf.capture.camera import Camera
+from hnerf.calibration.boards.calibrate import calibrate_from_boards
+from hnerf.calibration.boards.rig import compare_pairs, solve_boards, solve_rig
 from hnerf.capture.formats.caliscope import Caliscope
+from hnerf.geometry.camera import Camera
 
 FOOTAGE = "caliscope-charuco"
 PROTOCOL = (

@@ -2,10 +2,11 @@
 
 usage: python benchmarks/budget.py STORE [CAPTURE ...]
 
-Trains preset `fast` on shared captures (default: the three rendered ones) as hnerf/training/budget.py decides, then
-with grids of twice and of half the cells' number and as many times the samples a ray and the nodes, then with twice and
-half the steps; everything else stays. Held-out figures by the evaluation's protocol, of a few images. What is in STORE
-is not made again. Writes `benchmarks/results/budget.json` and `.md`, in which other captures stay as they are.
+Trains preset `fast` on shared captures (default: the three rendered ones) as hnerf/training/auto_settings.py decides,
+then with grids of twice and of half the cells' number and as many times the samples a ray and the nodes, then with
+twice and half the steps; everything else stays. Held-out figures by the evaluation's protocol, of a few images. What
+is in STORE is not made again. Writes `benchmarks/results/budget.json` and `.md`, in which other captures stay as they
+are.
 """
 
 import argparse
@@ -18,7 +19,7 @@ from provenance import RESULTS, SHARED, provenance, sentence, table, write_resul
 
 from flows.benchmark import trained
 from hnerf.config import Settings, TrainingSettings, load_settings
-from hnerf.study.plan import ScoringSettings
+from hnerf.study.benchmark.plan import ScoringSettings
 from tasks.benchmark import score_training
 from tasks.capture import ingest
 from tasks.source import read_capture

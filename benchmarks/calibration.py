@@ -27,11 +27,11 @@ from provenance import SHARED, provenance, sentence, table, write_result
 from hnerf.calibration.check import check_calibration
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.silhouettes import Outlines
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.config import CalibrationSettings, CaptureSettings
 from hnerf.errors import CaptureError
+from hnerf.geometry.camera import Camera
 
 CAPTURES = ("valid-walk", "valid-wave")
 RUN_SHARE = 0.75

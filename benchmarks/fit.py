@@ -20,7 +20,7 @@ from provenance import SHARED, provenance, sentence, table, write_result
 from flows.train_subject import prepared
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import load_settings
-from hnerf.render.silhouette import silhouette
+from hnerf.geometry.silhouette import silhouette
 from tasks.calibration import calibrated
 from tasks.capture import ingest
 from tasks.source import read_capture

@@ -17,7 +17,7 @@ import yaml
 from provenance import table
 from registry import Result
 
-from hnerf.study.files import replace_text
+from hnerf.files import replace_text
 from hnerf.study.machine import in_words
 
 MODULE = re.compile(r"[a-z]\w*(\.\w+)+")  # started by name, as the ranks of a training are

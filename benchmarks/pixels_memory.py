@@ -21,8 +21,8 @@ import torch
 import torch.multiprocessing as multiprocessing
 from provenance import provenance, sentence, table, write_result
 
+from hnerf.training.distributed import Processes
 from hnerf.training.gather import gather_pixels
-from hnerf.training.processes import Processes
 
 PROCESSES = (1, 2, 4)
 GIB = 2**30

@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import trimesh
 
-from hnerf.asset.surface import posed_surface
+from hnerf.avatar.surface import posed_surface
+from hnerf.avatar.trained import load_avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
-from hnerf.evaluation.mesh_queries import Surface
 from hnerf.evaluation.pictures import clay, crop, cropped_camera, frame_person, overlay_surface
-from hnerf.training.model import load_avatar
+from hnerf.geometry.mesh_queries import Surface
 
 
 def main() -> None:

@@ -15,10 +15,10 @@ import torch
 from provenance import SHARED, provenance, sentence, table, write_result
 
 from flows.train_subject import train_subject
+from hnerf.avatar.trained import load_avatar
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
-from hnerf.study.scoring import frame_seconds
-from hnerf.training.model import load_avatar
+from hnerf.study.benchmark.scoring import frame_seconds
 
 CAPTURES = ("valid-wave", "valid-walk", "valid-turn-mono")
 SIDES_PX = (256, 512)

@@ -20,8 +20,8 @@ from provenance import RESULTS, SHARED, provenance, sentence, table, write_resul
 from flows.train_subject import find_masks
 from hnerf.capture.capture import Capture
 from hnerf.config import load_settings
-from hnerf.spread import spread
-from hnerf.study.degrade import Degradation
+from hnerf.evenly_spaced import evenly_spaced
+from hnerf.study.degradations.catalogue import Degradation
 from tasks.calibration import calibrate, calibrated
 from tasks.capture import ingest, subset_capture
 from tasks.fit import fit
@@ -66,7 +66,7 @@ def part(shelf: Store, recording: Artifact, axis: str, amount: float) -> Artifac
     """So many training frames or cameras, or so many times the pixels."""
     capture = Capture.load(recording.root)
     if axis == "frames":
-        return subset_capture(shelf, recording, None, tuple(spread(capture.train_frames, int(amount))), ())
+        return subset_capture(shelf, recording, None, tuple(evenly_spaced(capture.train_frames, int(amount))), ())
     if axis == "cameras":
         return subset_capture(shelf, recording, capture.train_cameras[: int(amount)], None, ())
     if amount == 1:

@@ -25,8 +25,8 @@ from hnerf.body.fit import fit_body
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
+from hnerf.capture.masks import Masks, movement_px
 from hnerf.config import CaptureSettings, FitSettings, SegmentationSettings
-from hnerf.segmentation.masks import Masks, movement_px
 from hnerf.segmentation.prior import window_around
 from hnerf.segmentation.segment import segment
 

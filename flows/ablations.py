@@ -17,8 +17,8 @@ from flows.train_subject import prepared
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, Settings, TrainingSettings, load_settings, with_changes
 from hnerf.errors import CaptureError, one_line
-from hnerf.study import results
-from hnerf.study.files import replace_text
+from hnerf.files import replace_text
+from hnerf.study.benchmark import results
 from hnerf.tables import head, line
 from tasks.capture import ingest
 from tasks.evaluation import evaluate

@@ -12,10 +12,10 @@ from flows.train_subject import prepared
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
 from hnerf.errors import CaptureError, one_line
-from hnerf.study.convergence import flat, limits_s
-from hnerf.study.files import with_pictures
-from hnerf.study.plan import Study, Variant, load_study
-from hnerf.study.publish import publish
+from hnerf.files import with_pictures
+from hnerf.study.benchmark.convergence import flat, limits_s
+from hnerf.study.benchmark.plan import Study, Variant, load_study
+from hnerf.study.benchmark.publish import publish
 from tasks.benchmark import score_end_of_training, score_training
 from tasks.calibration import calibrated
 from tasks.capture import ingest, subset_capture
@@ -60,7 +60,7 @@ def benchmark(
 
 
 def blank(plan: Study, study: str, recorded: Capture) -> dict[str, Any]:
-    """A result without figures, in the form of hnerf/study/results.py."""
+    """A result without figures, in the form of hnerf/study/benchmark/results.py."""
     described = plan.model_dump(include={"title", "notes", "claims", "seconds", "until_flat", "sweep", "methods"})
     variants = {title: describe(variant, recorded) for title, variant in plan.variants.items()}
     return {"subject": recorded.name, "study": study} | described | {"variants": variants}

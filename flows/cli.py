@@ -16,15 +16,15 @@ from flows.benchmark import benchmark
 from flows.stability import stability
 from flows.train_subject import train_subject
 from hnerf.asset.validation import InvalidAsset
-from hnerf.calibration.boards import calibrate_from_boards
+from hnerf.calibration.boards.calibrate import calibrate_from_boards
 from hnerf.capture.formats.export import WRITERS, write_cameras
 from hnerf.capture.ingest import recognise
-from hnerf.capture.notes import read_notes
-from hnerf.capture.performer import write_performer
+from hnerf.capture.manifest import read_notes
 from hnerf.config import PerformerSettings, load_settings, overridden
 from hnerf.errors import CaptureError
-from hnerf.new_folder import new_folder
-from hnerf.render.show import KINDS, Wish, render_subject
+from hnerf.files import new_folder
+from hnerf.render.subject import KINDS, Wish, render_subject
+from hnerf.synthetic import write_performer
 from tasks.calibration import calibrate
 from tasks.capture import ingest
 from tasks.launcher import GaveUpError

@@ -11,7 +11,7 @@ from prefect import flow
 from prefect.deployments import run_deployment
 
 from hnerf.errors import CaptureError
-from hnerf.study.files import replace_text
+from hnerf.files import replace_text
 from tasks.source import capture_files, read_capture
 
 DEPLOYMENT = "train-subject/local"

@@ -17,12 +17,12 @@ from hnerf.config import Settings, load_settings
 from hnerf.errors import CaptureError, NotPossibleError, one_line
 from hnerf.evaluation.columns import why_no_novel_poses
 from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, TRACKED
-from hnerf.study.degrade import KINDS, Degradation, degrade_settings
-from hnerf.study.files import replace_text, with_pictures
-from hnerf.study.stability import Stability, load_stability
-from hnerf.study.stability_charts import curve_chart, matrix_chart
-from hnerf.study.stability_report import REFERENCE, as_markdown
-from hnerf.study.verdict import BROKEN, Verdict, judge, near_border
+from hnerf.files import replace_text, with_pictures
+from hnerf.study.degradations.catalogue import KINDS, Degradation, degrade_settings
+from hnerf.study.stability.charts import curve_chart, matrix_chart
+from hnerf.study.stability.plan import Stability, load_stability
+from hnerf.study.stability.report import REFERENCE, as_markdown
+from hnerf.study.stability.verdict import BROKEN, Verdict, judge, near_border
 from tasks.capture import ingest, subset_capture
 from tasks.evaluation import evaluate
 from tasks.fit import fit

@@ -82,7 +82,7 @@ class FitSettings(Section):
 
 class FastFieldSettings(Section):
     """The fast machinery: shell, grids and small networks. What is 0, or has no cells, the scene decides
-    (hnerf/training/budget.py)."""
+    (hnerf/training/auto_settings.py)."""
 
     outer_m: float = Field(default=0.0, ge=0)  # the shell's thickness outside the body
     inner_m: float = Field(default=0.0, ge=0)  # and inside

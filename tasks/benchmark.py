@@ -6,8 +6,8 @@ import torch
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.evaluation.ground_truth import GroundTruth
-from hnerf.study.plan import ScoringSettings
-from hnerf.study.scoring import Scene, score, score_end
+from hnerf.study.benchmark.plan import ScoringSettings
+from hnerf.study.benchmark.scoring import Scene, score, score_end
 from tasks.calibration import calibrated
 from tasks.source import GROUND_TRUTH, Source
 from tasks.stage import stage

@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from hnerf.body.fit_result import BodyFit
+from hnerf.capture.masks import Masks
 from hnerf.config import EvaluationSettings
 from hnerf.evaluation.evaluate import evaluate as evaluate_avatar
 from hnerf.evaluation.holdout import score_held_out
 from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.views import SPLITS
-from hnerf.segmentation.masks import Masks
 from tasks.calibration import calibrated
 from tasks.source import Source
 from tasks.stage import stage

@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 
 from hnerf.body.fit import fit_body
+from hnerf.capture.masks import Masks
 from hnerf.config import FitSettings
-from hnerf.segmentation.masks import Masks
 from tasks.calibration import calibrated
 from tasks.stage import stage
 from tasks.store import Artifact

@@ -4,8 +4,8 @@ from pathlib import Path
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks, movement_px
 from hnerf.config import SegmentationSettings
-from hnerf.segmentation.masks import Masks, movement_px
 from hnerf.segmentation.segment import segment as segment_person
 from tasks.calibration import calibrated
 from tasks.stage import stage

@@ -9,14 +9,14 @@ import trimesh
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks
 from hnerf.evaluation.ground_truth import GroundTruth
-from hnerf.segmentation.masks import Masks
-from hnerf.study.degrade import Degradation
-from hnerf.study.degrade import degrade_capture as write_degraded
-from hnerf.study.degrade import degrade_fit as disturbed
-from hnerf.study.degrade import degrade_masks as degraded
-from hnerf.study.degrade import dress as write_dressed
-from hnerf.study.degraded_fit import extreme_poses
+from hnerf.study.degradations.catalogue import Degradation
+from hnerf.study.degradations.catalogue import degrade_capture as write_degraded
+from hnerf.study.degradations.catalogue import degrade_fit as disturbed
+from hnerf.study.degradations.catalogue import degrade_masks as degraded
+from hnerf.study.degradations.catalogue import dress as write_dressed
+from hnerf.study.degradations.fit import extreme_poses
 from hnerf.study.surface import SurfaceCheck, check_pose, check_surface
 from tasks.calibration import calibrated
 from tasks.source import Source

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import torch
 
+from hnerf.avatar.avatar import Avatar
+from hnerf.avatar.trained import load_avatar
 from hnerf.config import TrainingSettings
-from hnerf.render.avatar import Avatar
 from hnerf.training.checkpoint import remove_checkpoint
-from hnerf.training.model import load_avatar
 from tasks.launcher import run_ranks
 from tasks.stage import stage
 from tasks.store import Artifact

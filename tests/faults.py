@@ -25,20 +25,20 @@ ROOT = Path(__file__).parents[1]
 COPIED = ("hnerf", "tests", "configs", "pyproject.toml")
 PYTEST = (sys.executable, "-m", "pytest", "-o", "addopts=", "-x", "-q", "-p", "no:cacheprovider")
 
-PAPER, FAST = "hnerf/training/paper.py", "hnerf/training/fast.py"
+PAPER, FAST = "hnerf/fields/paper.py", "hnerf/fields/fast.py"
 LOSSES, STEP = "hnerf/training/losses.py", "hnerf/training/step.py"
-CONDITIONS, TRAINER = "hnerf/training/conditions.py", "hnerf/training/trainer.py"
-COMPOSITING, CANONICAL = "hnerf/render/compositing.py", "hnerf/field/canonical.py"
-ENCODING, MLP = "hnerf/field/encoding.py", "hnerf/field/mlp.py"
+CONDITIONS, TRAINER = "hnerf/fields/conditions.py", "hnerf/training/trainer.py"
+COMPOSITING, CANONICAL = "hnerf/fields/compositing.py", "hnerf/fields/grids.py"
+ENCODING, MLP = "hnerf/fields/encoding.py", "hnerf/fields/mlp.py"
 BODIES, PIXELS = "hnerf/body/canonical.py", "hnerf/training/pixels.py"
 GATHER = "hnerf/training/gather.py"
 
-BY_PAPER, BY_LOSSES = "tests/training/test_paper.py", "tests/training/test_losses.py"
-BY_STEP, BY_CONDITIONS = "tests/training/test_step.py", "tests/training/test_conditions.py"
+BY_PAPER, BY_LOSSES = "tests/fields/test_paper.py", "tests/training/test_losses.py"
+BY_STEP, BY_CONDITIONS = "tests/training/test_step.py", "tests/fields/test_conditions.py"
 BY_TRAINER, BY_TIGHTEN = "tests/training/test_trainer_step.py", "tests/training/test_tighten.py"
-BY_RAY, BY_CANONICAL = "tests/training/test_fast_ray.py", "tests/field/test_canonical.py"
-BY_FAST, BY_COMPOSITING = "tests/training/test_fast.py", "tests/render/test_compositing.py"
-BY_ENCODING, BY_MLP = "tests/field/test_encoding.py", "tests/field/test_mlp.py"
+BY_RAY, BY_CANONICAL = "tests/fields/test_fast_ray.py", "tests/fields/test_grids.py"
+BY_FAST, BY_COMPOSITING = "tests/fields/test_fast.py", "tests/fields/test_compositing.py"
+BY_ENCODING, BY_MLP = "tests/fields/test_encoding.py", "tests/fields/test_mlp.py"
 BY_EXPOSURE = "tests/training/test_exposure.py"
 
 

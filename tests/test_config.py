@@ -6,8 +6,8 @@ import pytest
 
 from hnerf.config import load_settings, with_changes
 from hnerf.errors import CaptureError
-from hnerf.study.plan import load_study
-from hnerf.study.stability import load_stability
+from hnerf.study.benchmark.plan import load_study
+from hnerf.study.stability.plan import load_stability
 
 
 def changes(folder: Path, text: str) -> Path:

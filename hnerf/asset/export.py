@@ -16,16 +16,16 @@ from hnerf.asset.glb import write_glb
 from hnerf.asset.rig_transfer import dressed_rig
 from hnerf.asset.simplify import simplified
 from hnerf.asset.staging import stage_avatar
-from hnerf.asset.surface import surface_in_pose
 from hnerf.asset.texture import bake, unwrap
 from hnerf.asset.usd import write_cache, write_skinned
 from hnerf.asset.validation import validate_package
+from hnerf.avatar.avatar import Avatar
+from hnerf.avatar.surface import surface_in_pose
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
 from hnerf.capture.capture import Capture
 from hnerf.config import AssetSettings
-from hnerf.render.avatar import Avatar
-from hnerf.spread import spread
+from hnerf.evenly_spaced import evenly_spaced
 
 log = logging.getLogger("hnerf.asset")
 
@@ -45,7 +45,7 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
         layout = unwrap(surface.vertices, surface.faces, settings.texture_px)
         rig = dressed_rig(avatar.body.rig.to("cpu"), surface)
     with _timed("texture", seconds):
-        posed = _dressed_body(avatar.body, rig, tuple(spread(capture.train_frames, settings.texture_poses)))
+        posed = _dressed_body(avatar.body, rig, tuple(evenly_spaced(capture.train_frames, settings.texture_poses)))
         texture = bake(avatar, posed, layout, settings.texture_px)
     with _timed("files", seconds):
         staged = stage_avatar(_dressed_body(avatar.body, rig, capture.frames), layout, texture, capture.up)

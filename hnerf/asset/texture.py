@@ -11,10 +11,10 @@ import xatlas
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
+from hnerf.avatar.avatar import Avatar
 from hnerf.body.descriptor import vertex_normals
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig, pose_vertices
-from hnerf.render.avatar import Avatar
 
 CHART_PADDING_PX = 4
 MAX_STEP_M = 0.03  # skinning is not further off; a longer distance is another limb's

@@ -12,8 +12,8 @@ from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, Vt
 
 from hnerf.asset.staging import StagedAvatar
 from hnerf.body.descriptor import normals_of
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import write_image
+from hnerf.geometry.camera import Camera
 
 ROOT = Sdf.Path("/Avatar")
 APERTURE = 0.36  # width of the film gate in tenths of a scene unit: arrives as 36 mm at one metre a unit

@@ -7,10 +7,10 @@ from torch import Tensor
 
 from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
-from hnerf.render.compositing import alpha_from_density
-from hnerf.render.shell import Boxes
-from hnerf.training.conditions import Conditions
-from hnerf.training.field import Field
+from hnerf.fields.base import Field
+from hnerf.fields.compositing import alpha_from_density
+from hnerf.fields.conditions import Conditions
+from hnerf.fields.shell import Boxes
 
 SURFACE_DENSITY_PER_M = 20.0  # sigma_h of H-NeRF, 50 per scene unit of 2.5 m: where a surface is read off
 BAND_M = 0.01  # bound of the distance that is read off

@@ -7,8 +7,8 @@ from torch import Tensor, nn
 
 from hnerf.baselines.box import BoxField
 from hnerf.body.fit_result import BodyFit
-from hnerf.training.conditions import Conditions
-from hnerf.training.losses import RaySamples
+from hnerf.fields.conditions import Conditions
+from hnerf.fields.samples import RaySamples
 
 
 class DynamicField(BoxField):

@@ -13,11 +13,11 @@ from hnerf.baselines.static import StaticField
 from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import IdrSettings
-from hnerf.field.encoding import positional_encoding
-from hnerf.field.mlp import SkipMLP
-from hnerf.render.shell import Boxes, stratified
-from hnerf.training.conditions import Conditions, Draws
-from hnerf.training.losses import RaySamples
+from hnerf.fields.conditions import Conditions, Draws
+from hnerf.fields.encoding import positional_encoding
+from hnerf.fields.mlp import SkipMLP
+from hnerf.fields.samples import RaySamples
+from hnerf.fields.shell import Boxes, stratified
 
 LAYERS, COLOUR_LAYERS = 8, 4
 POSITION_OCTAVES, VIEW_OCTAVES = 6, 4

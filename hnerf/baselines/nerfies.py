@@ -13,13 +13,13 @@ from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import rotation_from_axis_angle
 from hnerf.config import NerfiesSettings
-from hnerf.field.encoding import positional_encoding
-from hnerf.field.mlp import SkipMLP
-from hnerf.render.compositing import weights_from_alpha
-from hnerf.render.shell import Boxes, stratified
-from hnerf.training.conditions import Conditions, Draws
-from hnerf.training.losses import RaySamples
-from hnerf.training.paper import resample
+from hnerf.fields.compositing import weights_from_alpha
+from hnerf.fields.conditions import Conditions, Draws
+from hnerf.fields.encoding import positional_encoding
+from hnerf.fields.mlp import SkipMLP
+from hnerf.fields.paper import resample
+from hnerf.fields.samples import RaySamples
+from hnerf.fields.shell import Boxes, stratified
 
 OCTAVES, LAYERS = 6, 6  # of the deformation
 STILL = 1e-5  # spread of its last layer at the start: nothing is deformed

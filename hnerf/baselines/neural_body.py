@@ -13,10 +13,10 @@ from hnerf.baselines.voxels import Voxels
 from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import NeuralBodySettings
-from hnerf.field.encoding import positional_encoding
-from hnerf.render.shell import Boxes, stratified
-from hnerf.training.conditions import Conditions, Draws
-from hnerf.training.losses import RaySamples
+from hnerf.fields.conditions import Conditions, Draws
+from hnerf.fields.encoding import positional_encoding
+from hnerf.fields.samples import RaySamples
+from hnerf.fields.shell import Boxes, stratified
 
 LEVELS = 5  # the finest takes the codes, the four others are read (section 3.2 of the paper)
 POSITION_OCTAVES, VIEW_OCTAVES = 10, 4

@@ -8,7 +8,7 @@ from torch import Tensor
 from hnerf.baselines.box import BoxField
 from hnerf.body.canonical import PosedBodies
 from hnerf.errors import CaptureError
-from hnerf.training.conditions import Conditions
+from hnerf.fields.conditions import Conditions
 
 
 class StaticField(BoxField):

@@ -18,7 +18,7 @@ from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.contour_fit import DAMPING, Outline, Rows, add_rows, rim_in_image
 from hnerf.body.descriptor import normals_of
 from hnerf.body.keypoint_fit import Problem
-from hnerf.capture.camera import Camera
+from hnerf.geometry.camera import Camera
 
 log = logging.getLogger("hnerf.fit")
 

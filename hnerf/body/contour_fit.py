@@ -20,9 +20,9 @@ from hnerf.body.articulation import Articulation, Pose, PosedJoints
 from hnerf.body.descriptor import normals_of
 from hnerf.body.keypoint_fit import Problem, project
 from hnerf.body.normal_equations import NormalEquations
-from hnerf.capture.camera import Camera
 from hnerf.config import FitSettings
-from hnerf.render.silhouette import silhouette
+from hnerf.geometry.camera import Camera
+from hnerf.geometry.silhouette import silhouette
 
 log = logging.getLogger("hnerf.fit")
 

@@ -20,16 +20,16 @@ from hnerf.body.clothed_fit import refine_clothed
 from hnerf.body.contour_fit import Outline, outline, refine
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.given_start import given_start, seen_on, told_of
-from hnerf.body.habit import Habit
 from hnerf.body.initial_root import root_from_image, root_from_space
 from hnerf.body.keypoint_fit import Likely, Problem, levenberg_marquardt, metres_per_pixel, project
 from hnerf.body.observations import Observations, observe, runs
 from hnerf.body.pose_prior import PosePrior, Smoothness
+from hnerf.body.posture_prior import Habit
 from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks
 from hnerf.config import FitSettings
 from hnerf.errors import CaptureError
-from hnerf.render.silhouette import silhouette
-from hnerf.segmentation.masks import Masks
+from hnerf.geometry.silhouette import silhouette
 
 log = logging.getLogger("hnerf.fit")
 

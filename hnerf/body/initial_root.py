@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from hnerf.capture.camera import Camera
+from hnerf.geometry.camera import Camera
 
 TORSO = (2, 5, 9, 12)  # shoulders and hips in BODY_25
 HEAD_AND_TORSO = (0, 1, 2, 5, 8, 9, 12, 15, 16, 17, 18)

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from hnerf.body.articulation import Articulation, Points, Pose, with_offsets
 from hnerf.body.balance import Balance
-from hnerf.body.habit import Habit
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.observations import Observations
 from hnerf.body.pose_prior import PosePrior, Smoothness
+from hnerf.body.posture_prior import Habit
 from hnerf.body.rig import Rig
 from hnerf.body.robust import faded
-from hnerf.capture.camera import Camera
+from hnerf.geometry.camera import Camera
 
 ROOT, UNSEEN = np.arange(6), 1e-6  # information on a root of which nothing else is known: it stays where it was put
 NEAR_M = 0.1  # nothing nearer is in a camera's picture

@@ -6,10 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hnerf.calibration.triangulation import subject_keypoints, triangulate
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
+from hnerf.capture.subject import subject_keypoints
 from hnerf.capture.timing import usual_step
+from hnerf.geometry.camera import Camera
+from hnerf.geometry.triangulation import triangulate
 
 
 @dataclass(frozen=True)

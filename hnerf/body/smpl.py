@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from hnerf.body.rig import Rig
-from hnerf.capture.guarded import NO_ARRAYS
-from hnerf.capture.pickled import read_pickle
+from hnerf.capture.safe_io import NO_ARRAYS
+from hnerf.capture.safe_pickle import read_pickle
 from hnerf.errors import CaptureError
 
 BETAS = 10

@@ -7,9 +7,9 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from hnerf.calibration.triangulation import reprojection_px, triangulate
-from hnerf.capture.camera import Camera
-from hnerf.spread import spread
+from hnerf.evenly_spaced import evenly_spaced
+from hnerf.geometry.camera import Camera
+from hnerf.geometry.triangulation import reprojection_px, triangulate
 
 ROUNDS = 3  # triangulate, adjust, and again with the better cameras
 LOSS_SCALE_PX = 2.0  # about a detector's noise
@@ -27,7 +27,7 @@ def adjust(
     Where two others are fixed, they alone place the points, and every keypoint of a free camera counts, far off
     as it may be. Where all are free, the rig is moved as a whole, and scaled, to the old cameras: the world stays.
     """
-    chosen = spread(range(keypoints.shape[1]), MAX_FRAMES)
+    chosen = evenly_spaced(range(keypoints.shape[1]), MAX_FRAMES)
     flat = keypoints[:, chosen].reshape(len(cameras), -1, 3)
     moving = np.array([camera.name in free for camera in cameras])
     judges = ~moving if (~moving).sum() >= 2 else np.ones_like(moving)

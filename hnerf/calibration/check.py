@@ -19,17 +19,17 @@ from hnerf.calibration.diagnosis import (
     undo_mistake,
     unit_of,
 )
+from hnerf.calibration.evidence import Witnesses
 from hnerf.calibration.monocular import ground_reasons, intrinsics_reasons
 from hnerf.calibration.refine import refine
 from hnerf.calibration.report import CalibrationReport, CameraVerdict
 from hnerf.calibration.sizes import size_reasons
 from hnerf.calibration.synchronise import Timing, measure_timing, put_in_step
-from hnerf.calibration.triangulation import subject_keypoints
-from hnerf.calibration.witnesses import Witnesses
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
+from hnerf.capture.subject import subject_keypoints
 from hnerf.config import CalibrationSettings
 from hnerf.errors import CaptureError
+from hnerf.geometry.camera import Camera
 
 COINCIDENT_M = 0.005
 COMMON_HEIGHT_M = (1.4, 2.05)  # of adults; others are children, or in another unit

@@ -5,8 +5,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from hnerf.calibration.triangulation import person_heights_px, reprojection_px, triangulate
-from hnerf.capture.camera import Camera
+from hnerf.capture.subject import person_heights_px
+from hnerf.geometry.camera import Camera
+from hnerf.geometry.triangulation import reprojection_px, triangulate
 
 TRIM = 0.8  # share of the residuals that count; the rest are detector errors
 BODY_HEIGHT_M = (0.5, 2.3)

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pycolmap
 
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
+from hnerf.geometry.camera import Camera
 
 INLIER_PX = 3.0  # of the fundamental matrix that verifies matches
 MIN_MATCHES = 15  # and a share: a fundamental matrix fits some wrong matches by chance

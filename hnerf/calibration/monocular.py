@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hnerf.capture.camera import Camera
+from hnerf.geometry.camera import Camera
 
 FIELD_OF_VIEW_DEG = (10.0, 120.0)  # of the longer side: beyond lies no lens that people are filmed with
 MIDDLE = 1 / 3  # of the image's sides: the principal point of an uncropped picture lies inside

@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hnerf.calibration.diagnosis import Measure
-from hnerf.capture.camera import Camera
-from hnerf.segmentation.prior import FEET, LIMBS
+from hnerf.capture.keypoint_sets import FEET, LIMBS
+from hnerf.geometry.camera import Camera
 
 SHOWN_FRAMES = 5
 FRUSTUM_SHARE = 0.15  # of the distance to the person

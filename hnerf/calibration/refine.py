@@ -11,9 +11,9 @@ from hnerf.calibration.diagnosis import measure, trimmed_cost_px
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.silhouettes import Outlines
 from hnerf.calibration.sizes import CHANGES, unexplained
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
+from hnerf.geometry.camera import Camera
 
 OUTLINE_NOISE, OUTLINE_NOISE_PX = 0.05, 0.05  # a share, and pixels, by which outlines may fit worse by chance
 MATCH_NOISE_PX = 0.5  # by which matches of a pair of cameras may

@@ -10,15 +10,15 @@ from typing import Any
 import cv2
 
 from hnerf.calibration.diagnosis import Measure
+from hnerf.calibration.evidence import Witnesses
 from hnerf.calibration.picture import draw_cameras
 from hnerf.calibration.sheet import draw_witnesses
 from hnerf.calibration.synchronise import Timing
-from hnerf.calibration.witnesses import Witnesses
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.capture.formats.easymocap import write_easymocap
 from hnerf.capture.lens import pinhole
 from hnerf.errors import CaptureError
+from hnerf.geometry.camera import Camera
 
 SEVERITY = ("ok", "refined", "suspect", "rejected")
 

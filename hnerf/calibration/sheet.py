@@ -10,9 +10,9 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from hnerf.calibration.diagnosis import Measure
-from hnerf.calibration.witnesses import NO_MATCHES, Witnesses
-from hnerf.capture.camera import Camera
-from hnerf.segmentation.prior import FEET, LIMBS
+from hnerf.calibration.evidence import NO_MATCHES, Witnesses
+from hnerf.capture.keypoint_sets import FEET, LIMBS
+from hnerf.geometry.camera import Camera
 
 SCALE_PX = Normalize(0, 10)  # residuals, from green to red
 COLOURS = "RdYlGn_r"

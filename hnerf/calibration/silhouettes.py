@@ -14,13 +14,13 @@ import numpy as np
 from skimage.measure import find_contours
 
 from hnerf.calibration.diagnosis import trimmed_mean
-from hnerf.calibration.triangulation import subject_keypoints
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
+from hnerf.capture.subject import subject_keypoints
 from hnerf.config import SegmentationSettings
+from hnerf.evenly_spaced import evenly_spaced
+from hnerf.geometry.camera import Camera
 from hnerf.segmentation.backends import AgainstBackground
 from hnerf.segmentation.prior import keypoint_priors
-from hnerf.spread import spread
 
 FRAMES = 8  # evenly spread: neighbours say the same again
 PLATE_FRAMES = 24  # from which the background is made where there is no clean plate
@@ -65,7 +65,7 @@ class Outline:
             return None
         rows, columns = np.nonzero(whole)
         size_px = float(np.hypot(np.ptp(columns), np.ptp(rows)))
-        points = points[spread(range(len(points)), POINTS)]
+        points = points[evenly_spaced(range(len(points)), POINTS)]
         return Outline(points, distance_px, np.array([columns.mean(), rows.mean()]), size_px)
 
 
@@ -88,7 +88,7 @@ class Outlines:
         """
         found = subject_keypoints(capture)
         everyone = np.all([(seen[..., 2] > 0).any(1) for seen in found.values()], axis=0)
-        shown = spread(np.flatnonzero(everyone).tolist(), FRAMES)
+        shown = evenly_spaced(np.flatnonzero(everyone).tolist(), FRAMES)
         log.info("outlines of %d cameras at %d instants", len(found), len(shown))
         by_camera = {name: _outlines(capture, name, found[name], shown) for name in found}
         usable = {name: outlines for name, outlines in by_camera.items() if any(outlines)}

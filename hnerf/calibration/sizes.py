@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
+from hnerf.geometry.camera import Camera
 
 Change = Callable[[Camera, tuple[int, int], tuple[int, int]], Camera]
 

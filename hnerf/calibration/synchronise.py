@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from hnerf.calibration.diagnosis import TRIM, trimmed_cost_px, trimmed_mean
-from hnerf.calibration.triangulation import triangulate
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.capture.timing import resample, usual_step
 from hnerf.config import CalibrationSettings
 from hnerf.errors import CaptureError
+from hnerf.geometry.camera import Camera
+from hnerf.geometry.triangulation import triangulate
 
 MAX_STEPS = 10  # shifts that are looked at, either way, in steps between the capture's frames
 MIN_FRAMES = 8  # that a shifted camera must share with the others, at the best shift and on either side of it

@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 
 from hnerf.capture.bars import Area
-from hnerf.capture.camera import Camera
 from hnerf.capture.given_poses import GivenPoses
 from hnerf.capture.timing import nearest_frame, resample, usual_step
 from hnerf.errors import CaptureError
+from hnerf.geometry.camera import Camera
 
 JPEG_OPTIONS = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 

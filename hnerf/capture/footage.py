@@ -9,7 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from hnerf.capture.guarded import check_image_size, read_image
+from hnerf.capture.safe_io import check_image_size, read_image
 from hnerf.errors import CaptureError
 
 # What is wrong with a video is told in one line of ours.

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hnerf.capture.bars import Area, fitted, picture_area
-from hnerf.capture.boards import normalised_corners, read_board_footage
+from hnerf.capture.board_footage import normalised_corners, read_board_footage
 from hnerf.capture.capture import Capture
 from hnerf.capture.footage import Footage, Picture
 from hnerf.capture.formats.caliscope import Caliscope
@@ -17,16 +17,16 @@ from hnerf.capture.formats.layout import Layout, Stored
 from hnerf.capture.formats.peoplesnapshot import PeopleSnapshot
 from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.formats.zjumocap import ZjuMocap
-from hnerf.capture.guarded import JSON_SUFFIXES, file_named, read_image
 from hnerf.capture.keypoint_files import read_openpose, read_results
 from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
 from hnerf.capture.lens import Lens
+from hnerf.capture.manifest import CameraSplit, capture_name, chosen_cameras, chosen_frames, read_notes
 from hnerf.capture.normalise import Normaliser
-from hnerf.capture.notes import CameraSplit, capture_name, chosen_cameras, chosen_frames, read_notes
+from hnerf.capture.safe_io import JSON_SUFFIXES, file_named, read_image
 from hnerf.capture.timing import usual_step
 from hnerf.config import CaptureSettings
 from hnerf.errors import CaptureError
-from hnerf.spread import spread
+from hnerf.evenly_spaced import evenly_spaced
 
 DEFAULT_FPS = 30.0
 # Padding and cropping by encoders moves sizes by a few pixels; the calibration stage judges what it did to the cameras.
@@ -199,7 +199,7 @@ def _lens_as_recorded(lens: Lens, footage: Footage, frames: tuple[int, ...]) -> 
     recorded_px = (first.rgb.shape[1], first.rgb.shape[0])
     if lens.size_px in (None, recorded_px):
         return lens, None
-    chosen = set(spread(frames, BAR_FRAMES))
+    chosen = set(evenly_spaced(frames, BAR_FRAMES))
     area = picture_area([p.rgb for p in footage.read(chosen) if p.rgb.shape == first.rgb.shape])
     matched = fitted(lens, area, recorded_px)
     if matched:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from hnerf.capture.guarded import read_json
 from hnerf.capture.keypoint_sets import COUNTS, KNOWN
+from hnerf.capture.safe_io import read_json
 from hnerf.errors import CaptureError
 
 MAX_PEOPLE = 64

@@ -6,9 +6,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hnerf.capture.camera import Camera
-from hnerf.capture.guarded import check_camera_name, check_image_size
+from hnerf.capture.safe_io import check_camera_name, check_image_size
 from hnerf.errors import CaptureError
+from hnerf.geometry.camera import Camera
 
 MIN_FOCAL_PX = 1.0
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import write_image
 from hnerf.capture.lens import Lens
 from hnerf.errors import CaptureError
+from hnerf.geometry.camera import Camera
 
 MOST_LABELS = 64  # different levels; a mask of more has soft edges
 

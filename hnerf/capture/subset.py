@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from hnerf.capture.boards import BOARDS_FILE
+from hnerf.capture.board_footage import BOARDS_FILE
 from hnerf.capture.capture import Capture
 from hnerf.errors import CaptureError, NotPossibleError
 

@@ -4,9 +4,9 @@ was tuned on the pictures of these very frames."""
 import json
 from pathlib import Path
 
+from hnerf.avatar.avatar import Avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.evaluation.views import ANIMATED, NEW_POSES, POSED, TRACKED
-from hnerf.render.avatar import Avatar
 
 ONE_MOMENT = "models one moment"
 NO_NOVEL_POSES = {

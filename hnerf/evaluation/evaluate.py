@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from hnerf.asset.surface import POSED_CELLS, posed_surface
+from hnerf.avatar.avatar import Avatar
+from hnerf.avatar.surface import POSED_CELLS, posed_surface
 from hnerf.config import EvaluationSettings
 from hnerf.evaluation import geometry
 from hnerf.evaluation.columns import shown_as, why_not_shown
@@ -21,8 +22,7 @@ from hnerf.evaluation.images import render, score_split, scored_views, unscored
 from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.report import write_report
 from hnerf.evaluation.views import POSED, PRIMARY, SPLITS, TRACKED, TRAINING_VIEW, all_views, some_views, split_frames
-from hnerf.render.avatar import Avatar
-from hnerf.spread import spread
+from hnerf.evenly_spaced import evenly_spaced
 
 log = logging.getLogger("hnerf.evaluation")
 
@@ -82,7 +82,7 @@ def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) 
 
 def mesh_frames(frames: tuple[int, ...], true_meshes: dict[int, trimesh.Trimesh], count: int) -> list[int]:
     """The frames to mesh: at most `count`, spread over those with a true surface, or over all where none has one."""
-    return spread([f for f in frames if f in true_meshes] or frames, count)
+    return evenly_spaced([f for f in frames if f in true_meshes] or frames, count)
 
 
 def score_meshes(

@@ -11,9 +11,9 @@ from hnerf.body.rig import pose_vertices
 from hnerf.evaluation import pictures
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.inputs import EvaluationInputs
-from hnerf.evaluation.mesh_queries import Surface
 from hnerf.evaluation.metrics import COVERED_LEVEL
 from hnerf.evaluation.views import TRAINING_VIEW, View
+from hnerf.geometry.mesh_queries import Surface
 
 
 @dataclass(frozen=True)

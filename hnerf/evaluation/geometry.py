@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
-from hnerf.evaluation.mesh_queries import Surface
+from hnerf.geometry.mesh_queries import Surface
 
 SAMPLES = 40_000  # a surface, before what is hidden drops out
 ESCAPE_DIRECTIONS = 48

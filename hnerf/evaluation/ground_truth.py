@@ -9,9 +9,9 @@ import numpy as np
 import trimesh
 
 from hnerf.capture.capture import Capture
-from hnerf.capture.guarded import NO_ARRAYS, inside, read_image
 from hnerf.capture.lens import Lens
 from hnerf.capture.normalise import Normaliser
+from hnerf.capture.safe_io import NO_ARRAYS, inside, read_image
 from hnerf.errors import CaptureError
 
 ON_BLACK = "ground_truth/on_black"

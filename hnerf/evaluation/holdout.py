@@ -9,15 +9,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from hnerf.avatar.avatar import Avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks
 from hnerf.config import EvaluationSettings
 from hnerf.errors import CaptureError
 from hnerf.evaluation.columns import shown_as, why_not_shown
 from hnerf.evaluation.images import render, score_split, scored_views, unscored
 from hnerf.evaluation.views import PRIMARY
-from hnerf.render.avatar import Avatar
-from hnerf.segmentation.masks import Masks
 
 EACH = "each"
 LEAST_CAMERAS = 2  # left to train on

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from hnerf.avatar.avatar import Avatar, Rendering
 from hnerf.capture.capture import Capture, read_rgba, write_image
 from hnerf.evaluation import metrics
 from hnerf.evaluation.ground_truth import Truth
 from hnerf.evaluation.views import NEW_POSES, View, all_views, some_views
-from hnerf.render.avatar import Avatar, Rendering
 
 log = logging.getLogger("hnerf.evaluation")
 

@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from hnerf.avatar.avatar import Avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
-from hnerf.render.avatar import Avatar
-from hnerf.segmentation.masks import Masks
+from hnerf.capture.masks import Masks
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import trimesh
 
-from hnerf.capture.camera import Camera
-from hnerf.evaluation.mesh_queries import Surface
 from hnerf.evaluation.metrics import mask_box
-from hnerf.render.rays import RayHits
+from hnerf.geometry.camera import Camera
+from hnerf.geometry.mesh_queries import Surface
+from hnerf.geometry.rays import RayHits
 
 PICTURE_PX = (300, 400)  # width, height of a picture in the report
 SUPERSAMPLING = 2

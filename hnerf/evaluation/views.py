@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hnerf.capture.capture import Capture
-from hnerf.spread import spread
+from hnerf.evenly_spaced import evenly_spaced
 
 NOVEL_VIEW = "novel_view"
 ANIMATED, POSED, TRACKED = "novel_pose", "novel_pose_posed", "novel_pose_tracked"  # hnerf/evaluation/columns.py
@@ -50,6 +50,6 @@ def some_views(views: list[View], count: int) -> list[View]:
     frames than that, spread over all images."""
     frames = sorted({view.frame for view in views})
     if len(frames) < count:
-        return spread(views, count)
-    seen = {frame: [view for view in views if view.frame == frame] for frame in spread(frames, count)}
+        return evenly_spaced(views, count)
+    seen = {frame: [view for view in views if view.frame == frame] for frame in evenly_spaced(frames, count)}
     return [own[k % len(own)] for k, own in enumerate(seen.values())]

@@ -16,7 +16,7 @@ from hnerf.body.given_start import given_start
 from hnerf.body.rig import joint_transforms, pose_vertices
 from hnerf.capture.capture import Capture
 from hnerf.capture.given_poses import JOINTS, GivenPoses
-from hnerf.capture.guarded import NO_ARRAYS
+from hnerf.capture.safe_io import NO_ARRAYS
 from hnerf.config import FitSettings
 from hnerf.errors import CaptureError
 

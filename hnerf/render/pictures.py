@@ -13,11 +13,11 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from hnerf.asset.surface import posed_surface
-from hnerf.capture.camera import Camera
+from hnerf.avatar.avatar import Avatar, Rendering
+from hnerf.avatar.surface import posed_surface
 from hnerf.capture.capture import read_rgb, write_image
 from hnerf.capture.footage import Video
-from hnerf.render.avatar import Avatar, Rendering
+from hnerf.geometry.camera import Camera
 
 log = logging.getLogger("hnerf.render")
 

@@ -9,11 +9,11 @@ import numpy as np
 from hnerf.capture.capture import Capture
 from hnerf.config import SegmentationSettings
 from hnerf.errors import CaptureError
+from hnerf.evenly_spaced import evenly_spaced
 from hnerf.segmentation.cut import components_within, cut
 from hnerf.segmentation.difference import difference, levelled, masked_median, noise_level, surroundings
 from hnerf.segmentation.learned import Network
 from hnerf.segmentation.prior import Prior, window_around
-from hnerf.spread import spread
 
 CLEAN_PLATE, MEDIAN = "clean plate", "median around the fitted body"
 MEDIAN_FRAMES = 60  # evenly chosen, for the background without a plate
@@ -87,7 +87,7 @@ class AgainstBackground:
         capture: Capture, camera: str, priors: Sequence[Prior], count: int, settings: SegmentationSettings
     ) -> "AgainstBackground":
         """The background from at most `count` frames, where the priors, in the order of the frames, leave it free."""
-        chosen = spread(range(len(priors)), count)
+        chosen = evenly_spaced(range(len(priors)), count)
         images = [capture.image(camera, capture.frames[i]) for i in chosen]
         plate, known = masked_median(images, [priors[i] for i in chosen])
         return AgainstBackground(capture, camera, plate, known, settings, MEDIAN)

@@ -7,15 +7,14 @@ import cv2
 import numpy as np
 
 from hnerf.body.fit_result import BodyFit
-from hnerf.calibration.triangulation import person_heights_px, subject_keypoints, triangulate
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
+from hnerf.capture.keypoint_sets import FEET, LIMBS
+from hnerf.capture.subject import person_heights_px, subject_keypoints
 from hnerf.config import SegmentationSettings
-from hnerf.render.silhouette import silhouette
+from hnerf.geometry.camera import Camera
+from hnerf.geometry.silhouette import silhouette
+from hnerf.geometry.triangulation import triangulate
 
-LIMBS = ((1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7), (8, 9), (9, 10), (10, 11), (8, 12), (12, 13), (13, 14),
-         (1, 8), (0, 1))  # fmt: skip
-FEET = ((11, 24), (11, 22), (14, 21), (14, 19))
 TRUNK = (2, 5, 12, 9)
 THICK = ((1, 8), (9, 10), (12, 13))  # trunk seen from the side, and thighs: twice as thick as other limbs
 CORE_SHARE = 0.02  # of the person's height: half the width of a limb that is surely body

@@ -8,11 +8,11 @@ import numpy as np
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks, encode
 from hnerf.config import SegmentationSettings
 from hnerf.errors import CaptureError
 from hnerf.segmentation.backends import choose_backend
 from hnerf.segmentation.learned import Network
-from hnerf.segmentation.masks import Masks, encode
 from hnerf.segmentation.prior import Prior, body_priors, keypoint_priors
 from hnerf.segmentation.verdicts import Verdict, judge, jumps
 

@@ -6,10 +6,10 @@ import numpy as np
 import trimesh
 from torch import Tensor
 
-from hnerf.asset.surface import surface_in_pose
+from hnerf.avatar.avatar import Avatar
+from hnerf.avatar.surface import surface_in_pose
 from hnerf.body.rig import pose_vertices
 from hnerf.errors import CaptureError
-from hnerf.render.avatar import Avatar
 
 CELLS = 128  # on the longest side: enough to see a hole of a finger's width
 # Of the body's own. Clothes and hair add up to a half of its volume; what is worn over the head or held, some height. A

@@ -5,13 +5,14 @@ from itertools import combinations
 import numpy as np
 import trimesh
 
+from hnerf.avatar.trained import Gains
 from hnerf.body.fit_result import BodyFit
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
-from hnerf.evaluation.mesh_queries import Surface
-from hnerf.segmentation.masks import Masks
-from hnerf.spread import spread
-from hnerf.training.budget import Decision
+from hnerf.capture.masks import Masks
+from hnerf.evenly_spaced import evenly_spaced
+from hnerf.geometry.camera import Camera
+from hnerf.geometry.mesh_queries import Surface
+from hnerf.training.auto_settings import Decision
 
 LOOKS = 8  # frames that are looked at
 FACING = 0.4  # least cosine between a place's normal and its direction to the camera
@@ -19,8 +20,6 @@ DARK, BRIGHT = 15, 245  # of 255: beyond, a level is cut off or noise
 LEAST_PLACES = 100  # that two cameras share, for their ratio to count
 MOST = 0.5  # of the cameras
 TELLING = 0.1  # of a gain's logarithm: shading, and bodies fitted a little wrong, leave 0.03 of cameras exposed alike
-
-Gains = dict[str, tuple[float, float, float]]
 
 
 def camera_gains(capture: Capture, masks: Masks, body: BodyFit) -> tuple[Gains, Decision]:
@@ -34,7 +33,7 @@ def camera_gains(capture: Capture, masks: Masks, body: BodyFit) -> tuple[Gains, 
     names = capture.train_cameras
     ratios: dict[tuple[int, int], list[np.ndarray]] = {pair: [] for pair in combinations(range(len(names)), 2)}
     vertices_m, faces = body.vertices_m().numpy(), body.rig.faces.numpy()
-    for frame in spread(capture.train_frames, LOOKS) if ratios else ():
+    for frame in evenly_spaced(capture.train_frames, LOOKS) if ratios else ():
         surface = Surface(trimesh.Trimesh(vertices_m[body.index(frame)], faces, process=False))
         levels = [_levels(capture, masks, surface, name, frame) for name in names]
         for (a, b), found in ratios.items():

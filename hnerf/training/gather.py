@@ -8,14 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hnerf.avatar.trained import Gains
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks
+from hnerf.geometry.reach import Reached
 from hnerf.segmentation.edge import shaded_plate
-from hnerf.segmentation.masks import Masks
 from hnerf.segmentation.prior import window_around
-from hnerf.training.exposure import Gains
-from hnerf.training.pixels import Pixels, Reached
-from hnerf.training.processes import Processes
+from hnerf.training.distributed import Processes
+from hnerf.training.pixels import Pixels
 
 EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel may mix person and surroundings
 SUFFIX = ".pixels"  # of the files that hold columns of Pixels, of these kinds and widths

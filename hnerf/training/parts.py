@@ -11,10 +11,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from hnerf.training.budget import Decision
-from hnerf.training.conditions import Conditions, Draws, own_share
+from hnerf.fields.conditions import Conditions, Draws, own_share
+from hnerf.training.auto_settings import Decision
+from hnerf.training.distributed import Processes
 from hnerf.training.pixels import Rays
-from hnerf.training.processes import Processes
 from hnerf.training.step import Stage
 
 HALVES = 2  # of a batch, side by side on a CPU: operations are too small to share cores; two sums have one order only

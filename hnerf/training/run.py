@@ -14,10 +14,10 @@ import torch.distributed as dist
 from hnerf.body.fit_result import BodyFit
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks
 from hnerf.config import TrainingSettings
 from hnerf.errors import CaptureError, one_line
-from hnerf.segmentation.masks import Masks
-from hnerf.training.processes import Processes
+from hnerf.training.distributed import Processes
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import train
 

@@ -8,11 +8,11 @@ from torch import Tensor, nn
 
 from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.config import TrainingSettings
+from hnerf.fields.base import Field
+from hnerf.fields.conditions import Conditions, Draws
 from hnerf.training import losses
-from hnerf.training.conditions import Conditions, Draws
-from hnerf.training.field import Field
+from hnerf.training.distributed import Processes
 from hnerf.training.pixels import Rays
-from hnerf.training.processes import Processes
 
 
 class TrainingError(RuntimeError):

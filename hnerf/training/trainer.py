@@ -15,23 +15,24 @@ import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
+from hnerf.avatar.model_file import write_field
+from hnerf.avatar.trained import build_field
 from hnerf.body.canonical import PosedBodies
 from hnerf.body.common_rest import with_common_rest
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks
 from hnerf.config import TrainingSettings
-from hnerf.segmentation.masks import Masks
-from hnerf.training.budget import Scene, decide
+from hnerf.fields.conditions import Conditions, Draws, joined, own_share
+from hnerf.fields.samples import RaySamples
+from hnerf.training.auto_settings import Scene, decide
 from hnerf.training.checkpoint import load_checkpoint, save_checkpoint
-from hnerf.training.conditions import Conditions, Draws, joined, own_share
+from hnerf.training.distributed import Processes
 from hnerf.training.exposure import camera_gains
 from hnerf.training.gather import gather_pixels
-from hnerf.training.losses import RaySamples, pixel
-from hnerf.training.model import build_field
-from hnerf.training.model_file import write_field
+from hnerf.training.losses import pixel
 from hnerf.training.parts import decide_parts
 from hnerf.training.pixels import AT_EDGES, Rays
-from hnerf.training.processes import Processes
 from hnerf.training.step import Objective, Stage, TrainingError, not_finite
 
 logger = logging.getLogger("hnerf.training")

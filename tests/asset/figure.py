@@ -9,8 +9,8 @@ import trimesh
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
+from hnerf.geometry.camera import Camera
 
 FRAMES = (3, 4, 5, 8)  # with a gap
 

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from hnerf.avatar.avatar import Rendering
 from hnerf.body.descriptor import BodyMeshes, ClosestPoints
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import pose_vertices
-from hnerf.capture.camera import Camera
-from hnerf.render.avatar import Rendering
+from hnerf.geometry.camera import Camera
 
 CLOTHING_M = 0.01
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from hnerf.asset.export import export_asset
-from hnerf.asset.surface import surface_in_pose
+from hnerf.avatar.surface import surface_in_pose
 from hnerf.config import AssetSettings
 from tests.asset.figure import bending_body, capture
 from tests.asset.stand_in import CLOTHING_M, StandInAvatar

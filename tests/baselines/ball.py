@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import torch
 
+from hnerf.avatar.trained import TrainedAvatar, load_avatar
 from hnerf.body.fit_result import BodyFit
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.config import TrainingSettings
-from hnerf.training.model import TrainedAvatar, load_avatar
-from hnerf.training.processes import Processes
+from hnerf.geometry.camera import Camera
+from hnerf.training.distributed import Processes
 from hnerf.training.trainer import train
 from tests.body.boxes import box_rig
 from tests.training.scene import SIZE_PX, KnownMasks, _write, look_at

@@ -7,14 +7,14 @@ import numpy as np
 import torch
 import trimesh
 
-from hnerf.asset.surface import surface_in_pose
+from hnerf.avatar.surface import surface_in_pose
+from hnerf.avatar.trained import TrainedAvatar, load_avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import pose_vertices
 from hnerf.capture.capture import Capture
 from hnerf.config import TrainingSettings
 from hnerf.evaluation.geometry import score_geometry
-from hnerf.training.model import TrainedAvatar, load_avatar
-from hnerf.training.processes import Processes
+from hnerf.training.distributed import Processes
 from hnerf.training.trainer import train
 from tests.body.boxes import box_rig
 from tests.training.scene import record

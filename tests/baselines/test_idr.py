@@ -4,10 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from hnerf.avatar.trained import build_field
 from hnerf.baselines.idr import SdfNetwork, intersection, trace
 from hnerf.config import load_settings
 from hnerf.errors import CaptureError
-from hnerf.training.model import build_field
 from tests.baselines.ball import RADIUS_M, RING, body, inner_psnr, psnr, radii_m, trained
 
 SMALL = [

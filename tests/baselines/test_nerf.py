@@ -7,15 +7,16 @@ import pytest
 import torch
 from torch import Tensor
 
+from hnerf.avatar.trained import build_field
 from hnerf.baselines.box import BAND_M, SURFACE_DENSITY_PER_M
 from hnerf.baselines.nerf import NerfField
 from hnerf.body.canonical import PosedBodies
 from hnerf.config import load_settings
 from hnerf.errors import CaptureError
-from hnerf.render.shell import Boxes
-from hnerf.training.conditions import Conditions, Draws
-from hnerf.training.losses import RaySamples, Target, blend, reconstruction
-from hnerf.training.model import build_field
+from hnerf.fields.conditions import Conditions, Draws
+from hnerf.fields.samples import RaySamples
+from hnerf.fields.shell import Boxes
+from hnerf.training.losses import Target, blend, reconstruction
 from tests.baselines.ball import RING, body, inner_psnr, psnr, record, trained
 
 SMALL = [

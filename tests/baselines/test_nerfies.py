@@ -16,9 +16,9 @@ from hnerf.baselines.nerfies import (
 )
 from hnerf.body.canonical import PosedBodies
 from hnerf.config import load_settings
-from hnerf.field.encoding import positional_encoding
-from hnerf.training.conditions import Conditions, Draws
-from hnerf.training.losses import RaySamples
+from hnerf.fields.conditions import Conditions, Draws
+from hnerf.fields.encoding import positional_encoding
+from hnerf.fields.samples import RaySamples
 from tests.baselines.column import Learned, learn, three_poses
 
 SMALL = [

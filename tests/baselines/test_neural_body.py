@@ -7,7 +7,7 @@ import torch
 from hnerf.baselines.neural_body import NeuralBodyField, Surroundings
 from hnerf.body.canonical import PosedBodies
 from hnerf.config import load_settings
-from hnerf.training.conditions import Conditions, Draws
+from hnerf.fields.conditions import Conditions, Draws
 from tests.baselines.column import learn, three_poses
 
 SMALL = [

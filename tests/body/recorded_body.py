@@ -9,9 +9,9 @@ import torch
 from hnerf.body.anny import ADULT, BETA_NAMES, anny_rig
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import rotation_from_axis_angle
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
-from hnerf.render.silhouette import silhouette
+from hnerf.geometry.camera import Camera
+from hnerf.geometry.silhouette import silhouette
 
 
 @dataclass(frozen=True)

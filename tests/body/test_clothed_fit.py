@@ -17,7 +17,7 @@ from hnerf.body.observations import observe, runs
 from hnerf.body.pose_prior import Smoothness
 from hnerf.body.rig import joint_transforms
 from hnerf.config import FitSettings
-from hnerf.render.silhouette import silhouette
+from hnerf.geometry.silhouette import silhouette
 from tests.body.recorded_body import moving_body, record, ring_camera
 from tests.body.test_contour_fit import ball, disc
 

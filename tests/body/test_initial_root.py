@@ -3,7 +3,7 @@ import numpy as np
 
 from hnerf.body.anny import anny_rig
 from hnerf.body.initial_root import kabsch, root_from_image, root_from_space
-from hnerf.capture.camera import Camera
+from hnerf.geometry.camera import Camera
 
 
 def rest_keypoints() -> np.ndarray:

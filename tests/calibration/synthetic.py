@@ -6,9 +6,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
-from hnerf.render import cameras_along
+from hnerf.geometry.camera import Camera
+from hnerf.render import trajectory as cameras_along
 
 SIZE_PX = 1000
 FRAMES = 12

@@ -10,11 +10,11 @@ import pytest
 from hnerf.calibration.check import check_calibration
 from hnerf.calibration.diagnosis import MISTAKES, body_height_m, cost_without_each_px, size_ratio, unit_of
 from hnerf.calibration.report import load_cameras
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.config import CalibrationSettings, CaptureSettings
 from hnerf.errors import CaptureError
+from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import STANDING_M, detections, ring, turned, walk_m, write_capture
 from tests.shared_data import shared_capture
 

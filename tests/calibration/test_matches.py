@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.matches import Matches, _verified, fundamental, sampson_px
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
+from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import look_at, turned
 from tests.shared_data import shared_capture
 

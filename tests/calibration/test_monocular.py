@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.monocular import ground_reasons, intrinsics_reasons, stature_on_ground_m
-from hnerf.calibration.triangulation import subject_keypoints
 from hnerf.capture.ingest import ingest
+from hnerf.capture.subject import subject_keypoints
 from hnerf.config import CaptureSettings
 from tests.calibration.synthetic import STANDING_M, detections, ring
 from tests.shared_data import shared_capture

@@ -10,8 +10,8 @@ from hnerf.calibration.check import check_calibration
 from hnerf.calibration.diagnosis import MISTAKES, MISTAKES_OF_ONE, undo_mistake
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.refine import Refinement, refine
-from hnerf.capture.camera import Camera
 from hnerf.config import CalibrationSettings
+from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import FRAMES, detections, ring, turned, walk_m, write_capture
 
 SETTINGS = CalibrationSettings()

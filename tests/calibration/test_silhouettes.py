@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.silhouettes import Outline, Outlines
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
+from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import SIZE_PX, look_at, ring, turned
 from tests.shared_data import shared_capture
 

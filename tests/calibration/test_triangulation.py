@@ -4,9 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hnerf.calibration.triangulation import subject_keypoints, triangulate
-from hnerf.capture.camera import Camera
+from hnerf.capture.subject import subject_keypoints
 from hnerf.errors import CaptureError
+from hnerf.geometry.camera import Camera
+from hnerf.geometry.triangulation import triangulate
 from tests.calibration.synthetic import detections, ring, walk_m, write_capture
 
 

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from hnerf.capture.lens import Lens
+from hnerf.capture.manifest import Notes, capture_name
 from hnerf.capture.normalise import Normaliser
-from hnerf.capture.notes import Notes, capture_name
 
 
 def test_keypoints_near_the_edge_are_undistorted_exactly() -> None:

@@ -4,9 +4,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.capture.timing import nearest_frame, resample
+from hnerf.geometry.camera import Camera
 
 
 def people_at(*x_px: float) -> np.ndarray:

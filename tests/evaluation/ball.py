@@ -10,13 +10,13 @@ import torch
 import trimesh
 from torch import Tensor
 
+from hnerf.avatar.avatar import Rendering
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks, encode
 from hnerf.evaluation.inputs import EvaluationInputs
-from hnerf.render.avatar import Rendering
-from hnerf.segmentation.masks import Masks, encode
+from hnerf.geometry.camera import Camera
 
 RADIUS_M = 0.1
 SIZE_PX = 64

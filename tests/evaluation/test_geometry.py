@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from hnerf.evaluation.geometry import outer_samples, score_geometry, volume_overlap
-from hnerf.evaluation.mesh_queries import Surface
+from hnerf.geometry.mesh_queries import Surface
 
 
 def plane(height_m: float = 0.0, tilt_deg: float = 0.0) -> trimesh.Trimesh:

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks, encode
 from hnerf.config import EvaluationSettings
 from hnerf.errors import CaptureError
 from hnerf.evaluation.evaluate import evaluate
 from hnerf.evaluation.holdout import LABEL, cameras_left_out, gathered, score_held_out
 from hnerf.evaluation.metrics import mask_box
-from hnerf.segmentation.masks import Masks, encode
 from tests.evaluation.ball import (
     FRAMES,
     PHOTOGRAPHED,

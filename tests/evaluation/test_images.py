@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import torch
 
+from hnerf.avatar.avatar import Rendering
 from hnerf.capture.capture import read_rgb, read_rgba, write_image
 from hnerf.errors import CaptureError
 from hnerf.evaluation.images import rgba
-from hnerf.render.avatar import Rendering
 
 
 def test_renderings_are_colour_over_black_and_coverage(tmp_path: Path) -> None:

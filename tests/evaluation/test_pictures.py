@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from hnerf.evaluation import pictures
-from hnerf.evaluation.mesh_queries import Surface
+from hnerf.geometry.mesh_queries import Surface
 from tests.evaluation.ball import ball_camera
 
 

@@ -1,7 +1,7 @@
 from pathlib import Path
 
 from hnerf.evaluation.views import TRAINING_VIEW, View, all_views, some_views
-from hnerf.spread import spread
+from hnerf.evenly_spaced import evenly_spaced
 from tests.evaluation.ball import write_ball_capture
 
 
@@ -41,8 +41,8 @@ def test_some_of_a_few_views_are_spread_over_their_frames() -> None:
 
 
 def test_spread_keeps_both_ends() -> None:
-    assert spread(range(10), 4) == [0, 3, 6, 9]
-    assert spread((5, 7), 4) == [5, 7]
+    assert evenly_spaced(range(10), 4) == [0, 3, 6, 9]
+    assert evenly_spaced((5, 7), 4) == [5, 7]
 
 
 def test_path_of_a_rendering() -> None:

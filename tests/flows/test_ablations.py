@@ -14,7 +14,7 @@ from flows.cli import main
 from hnerf.config import TrainingSettings, load_settings
 from hnerf.errors import CaptureError
 from hnerf.evaluation.images import unscored
-from hnerf.study import results
+from hnerf.study.benchmark import results
 from tasks.launcher import LostWorkerError
 
 SPLIT = {

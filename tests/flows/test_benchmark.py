@@ -14,9 +14,9 @@ from flows.benchmark import benchmark
 from flows.cli import main
 from hnerf.config import TrainingSettings
 from hnerf.errors import CaptureError
-from hnerf.study import publish as publish_module
-from hnerf.study.files import picture, with_pictures
-from hnerf.study.plan import ScoringSettings
+from hnerf.files import picture, with_pictures
+from hnerf.study.benchmark import publish as publish_module
+from hnerf.study.benchmark.plan import ScoringSettings
 from tasks import benchmark as tasks_module
 from tasks.launcher import LostWorkerError
 from tasks.source import Source

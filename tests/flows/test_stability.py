@@ -223,7 +223,7 @@ def test_further_seeds_try_what_is_near_a_border_and_nothing_else(
     (tmp_path / "mine.yaml").write_text(text)
     runs = study(tmp_path, only=["pose_noise", "image_noise"])["runs"]  # 2 dB are near no border
     assert {run["seed"] for run in runs} == {0}
-    monkeypatch.setattr("hnerf.study.verdict.DEGRADED_DB", 2.2)
+    monkeypatch.setattr("hnerf.study.stability.verdict.DEGRADED_DB", 2.2)
     runs = study(tmp_path, only=["pose_noise", "image_noise"])["runs"]
     assert [(run["seed"], run["kind"]) for run in runs if run["seed"]] == [
         (3, "as recorded"),

@@ -10,8 +10,8 @@ import pytest
 
 from flows import train_subject as module
 from flows.train_subject import train_subject
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
+from hnerf.geometry.camera import Camera
 from tasks.stage import Stage
 from tasks.store import Artifact
 

@@ -7,10 +7,10 @@ import torch
 import trimesh
 from torch import Tensor
 
-from hnerf.capture.camera import Camera
+from hnerf.avatar.avatar import Rendering
 from hnerf.capture.footage import Video
+from hnerf.geometry.camera import Camera
 from hnerf.render import pictures
-from hnerf.render.avatar import Rendering
 from hnerf.render.pictures import (
     depth_image,
     depth_span_mm,
@@ -63,7 +63,7 @@ def test_normals_of_a_ball_point_away_from_its_middle() -> None:
 
 
 def test_every_kind_is_written_for_every_shot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hnerf.asset.surface.POSED_CELLS", 48)
+    monkeypatch.setattr("hnerf.avatar.surface.POSED_CELLS", 48)
     ball = SolidBall(ball_fit())
     shots = [(CAMERA, 0), (ball_camera("b", 90.0), 3)]
     write_pictures(ball, shots, ("colour", "depth", "normals", "mask", "mesh"), 5.0, tmp_path)

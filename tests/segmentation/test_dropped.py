@@ -5,10 +5,10 @@ from pathlib import Path
 import torch
 
 from hnerf.body.fit import _outlines, _silhouette_iou
-from hnerf.segmentation.masks import Masks, encode
+from hnerf.capture.masks import Masks, encode
+from hnerf.geometry.reach import everywhere
+from hnerf.training.distributed import Processes
 from hnerf.training.gather import gather_pixels
-from hnerf.training.pixels import everywhere
-from hnerf.training.processes import Processes
 from tests.training.scene import record
 
 ALONE = Processes(0, 1, torch.device("cpu"))

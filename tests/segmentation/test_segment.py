@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from hnerf.capture.ingest import ingest
+from hnerf.capture.masks import Masks, encode, movement_px
 from hnerf.config import CaptureSettings, SegmentationSettings
 from hnerf.errors import CaptureError
 from hnerf.segmentation.cut import components_within
 from hnerf.segmentation.difference import difference, levelled, masked_median, noise_level, surroundings
 from hnerf.segmentation.edge import settle_edge
-from hnerf.segmentation.masks import Masks, encode, movement_px
 from hnerf.segmentation.prior import Prior
 from hnerf.segmentation.segment import segment
 from tests.segmentation.scene import only_frames, write_masks, write_scene

@@ -5,8 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
+from hnerf.geometry.camera import Camera
 
 SIZE_PX = 16
 FRAMES = (2, 4, 6, 8, 10)

@@ -4,8 +4,8 @@ from typing import Any, get_args
 
 import pytest
 
-from hnerf.study.claims import CHECKS, told
-from hnerf.study.plan import Claim
+from hnerf.study.benchmark.claims import CHECKS, told
+from hnerf.study.benchmark.plan import Claim
 from tests.study.test_benchmark_results import scores
 
 

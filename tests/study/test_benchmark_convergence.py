@@ -2,7 +2,7 @@
 
 import pytest
 
-from hnerf.study.convergence import flat, limits_s
+from hnerf.study.benchmark.convergence import flat, limits_s
 
 
 def test_times_double_up_to_the_longest() -> None:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from hnerf.study.curves import bin_edges, binned, pareto_front, seconds_to, value_at
+from hnerf.study.benchmark.curves import bin_edges, binned, pareto_front, seconds_to, value_at
 
 
 def test_the_front_is_what_nothing_beats_cheapest_first() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from hnerf.config import load_settings
 from hnerf.errors import CaptureError
-from hnerf.study.plan import STUDIES, Study, Variant, load_study, snapshot_times_s
+from hnerf.study.benchmark.plan import STUDIES, Study, Variant, load_study, snapshot_times_s
 
 RECORDED: Any = SimpleNamespace(name="ada", train_cameras=("a", "b", "c", "d"), train_frames=(0, 2, 4, 6, 8))
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from hnerf.evaluation.images import unscored
-from hnerf.study import charts
-from hnerf.study.publish import picture_rows, publish
-from hnerf.study.results import (
+from hnerf.study.benchmark import charts
+from hnerf.study.benchmark.publish import picture_rows, publish
+from hnerf.study.benchmark.results import (
     CELL,
     as_csv,
     as_markdown,

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 import torch
 
+from hnerf.avatar.avatar import Rendering
 from hnerf.capture.capture import Capture
 from hnerf.evaluation.columns import why_no_novel_poses
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.images import render
 from hnerf.evaluation.metrics import mask_box
 from hnerf.evaluation.views import View
-from hnerf.render.avatar import Rendering
-from hnerf.study import scoring
-from hnerf.study.plan import ScoringSettings
-from hnerf.study.scoring import Scene, frame_seconds, score, score_at, score_end, write_pictures
+from hnerf.study.benchmark import scoring
+from hnerf.study.benchmark.plan import ScoringSettings
+from hnerf.study.benchmark.scoring import Scene, frame_seconds, score, score_at, score_end, write_pictures
 from tests.evaluation.ball import (
     PHOTOGRAPHED,
     RADIUS_M,

@@ -4,8 +4,8 @@ import torch
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import load_settings
-from hnerf.study.degrade import Degradation, degrade_fit, degrade_settings
-from hnerf.study.degraded_fit import extreme_poses
+from hnerf.study.degradations.catalogue import Degradation, degrade_fit, degrade_settings
+from hnerf.study.degradations.fit import extreme_poses
 from tests.body.boxes import box_rig
 
 FRAMES = tuple(range(400))

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from hnerf.capture.capture import Capture
-from hnerf.study.degraded_images import blur
-from hnerf.study.occluder import person_middle, pillar
+from hnerf.study.degradations.images import blur
+from hnerf.study.degradations.occluder import person_middle, pillar
 from tests.study.recording import SIZE_PX, write, write_recording
-from tests.study.test_degraded_rig import degraded
+from tests.study.test_degraded_cameras import degraded
 
 
 def test_noise_has_its_spread_in_training_cameras_alone(tmp_path: Path) -> None:

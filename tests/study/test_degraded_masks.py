@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from hnerf.capture.capture import Capture
-from hnerf.segmentation.masks import Masks, encode
-from hnerf.study.degrade import Degradation, degrade_masks
+from hnerf.capture.masks import Masks, encode
+from hnerf.study.degradations.catalogue import Degradation, degrade_masks
 from tests.study.recording import write_recording
 
 SIZE_PX = 100

@@ -9,11 +9,11 @@ import pytest
 
 from hnerf.config import load_settings
 from hnerf.errors import CaptureError
-from hnerf.study.degrade import KINDS
-from hnerf.study.plan import Part
-from hnerf.study.stability import Stability, load_stability
-from hnerf.study.stability_charts import SHADES, curve_chart, matrix_chart
-from hnerf.study.stability_report import as_markdown, how_far
+from hnerf.study.benchmark.plan import Part
+from hnerf.study.degradations.catalogue import KINDS
+from hnerf.study.stability.charts import SHADES, curve_chart, matrix_chart
+from hnerf.study.stability.plan import Stability, load_stability
+from hnerf.study.stability.report import as_markdown, how_far
 
 
 def test_the_full_study_tries_everything_at_four_or_five_strengths_and_three_seeds() -> None:

@@ -1,6 +1,6 @@
 import pytest
 
-from hnerf.study.verdict import Verdict, judge, near_border
+from hnerf.study.stability.verdict import Verdict, judge, near_border
 
 GOOD = {"psnr": 30.0, "chamfer_mm": 6.0, "empty_psnr": 18.0}
 

@@ -9,7 +9,7 @@ import trimesh
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
-from hnerf.study.degrade import Degradation
+from hnerf.study.degradations.catalogue import Degradation
 from tasks.capture import subset_capture
 from tasks.store import Artifact, Store
 from tasks.study import check_meshes, degrade_capture, degrade_fit

@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from hnerf.config import LossSettings, TrainingSettings
+from hnerf.training.distributed import Processes
 from hnerf.training.parts import Parts
-from hnerf.training.processes import Processes
 from hnerf.training.trainer import Trainer
 from tests.training.scene import TINY, record
 

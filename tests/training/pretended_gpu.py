@@ -12,9 +12,10 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map
 
+from hnerf.avatar import trained as model
 from hnerf.body import canonical
 from hnerf.body.descriptor import BodyMeshes, ClosestPoints
-from hnerf.training import model, trainer
+from hnerf.training import trainer
 
 CUDA = torch.device("cuda", 0)
 INDEXING = ("aten.index.", "aten.index_put", "aten._index_put")

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 
 from hnerf.body.fit_result import BodyFit
-from hnerf.capture.camera import Camera
 from hnerf.capture.capture import Capture
 from hnerf.config import TrainingSettings
-from hnerf.render import cameras_along
-from hnerf.render.silhouette import silhouette
+from hnerf.geometry.camera import Camera
+from hnerf.geometry.silhouette import silhouette
+from hnerf.render import trajectory as cameras_along
 from tests.body.boxes import box_rig
 
 SIZE_PX = 32

@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import nn
 
-from hnerf.training.fast import FastField
-from hnerf.training.field import Field
-from hnerf.training.paper import PaperField
-from hnerf.training.processes import Processes
+from hnerf.fields.base import Field
+from hnerf.fields.fast import FastField
+from hnerf.fields.paper import PaperField
+from hnerf.training.distributed import Processes
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import LEAST_COVERAGE, Trainer
 from tests.training.scene import TINY, record

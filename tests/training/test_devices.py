@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from hnerf.asset.surface import surface_in_pose
+from hnerf.avatar.surface import surface_in_pose
+from hnerf.avatar.trained import load_avatar
 from hnerf.render.pictures import depth_image, normal_image
 from hnerf.training import trainer as trainer_module
-from hnerf.training.model import load_avatar
-from hnerf.training.processes import Processes
+from hnerf.training.distributed import Processes
 from hnerf.training.trainer import train
 from tests.training.pretended_gpu import pretended_gpu
 from tests.training.scene import TINY, record

@@ -10,12 +10,12 @@ import pytest
 import torch
 import trimesh
 
-from hnerf.evaluation.mesh_queries import Surface
+from hnerf.avatar.trained import TrainedAvatar, build_field
+from hnerf.geometry.mesh_queries import Surface
+from hnerf.geometry.reach import everywhere
+from hnerf.training.distributed import Processes
 from hnerf.training.exposure import _in_sight, camera_gains, solve_gains
 from hnerf.training.gather import gather_pixels
-from hnerf.training.model import TrainedAvatar, build_field
-from hnerf.training.pixels import everywhere
-from hnerf.training.processes import Processes
 from tests.training.scene import TINY, KnownMasks, look_at, record
 
 ALONE = Processes(0, 1, torch.device("cpu"))

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from hnerf.body.canonical import PoseCorrection
+from hnerf.fields.samples import RaySamples
 from hnerf.training import losses
-from hnerf.training.losses import RaySamples, Target
+from hnerf.training.losses import Target
 
 RED, GREEN, BLACK = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]
 

@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from hnerf.fields.conditions import Draws
 from hnerf.training import parts as parts_module
 from hnerf.training import trainer as trainer_module
-from hnerf.training.conditions import Draws
+from hnerf.training.distributed import Processes
 from hnerf.training.parts import GIB, PEAK, USABLE, Parts, decide_parts
 from hnerf.training.pixels import Rays
-from hnerf.training.processes import Processes
 from tests.training.first_step import gradients, untrained
 
 CPU = torch.device("cpu")

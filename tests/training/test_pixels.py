@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from hnerf.capture.camera import Camera
+from hnerf.geometry.camera import Camera
+from hnerf.geometry.reach import Reached, everywhere, within_box, within_reach
+from hnerf.training.distributed import Processes
 from hnerf.training.gather import gather_pixels
-from hnerf.training.pixels import Pixels, Reached, everywhere, within_box, within_reach
-from hnerf.training.processes import Processes
+from hnerf.training.pixels import Pixels
 from tests.training.scene import record
 
 AHEAD = Camera("ahead", np.diag([50.0, 50.0, 1.0]), np.eye(3), np.zeros(3), 60, 40)

@@ -12,7 +12,7 @@ import torch
 
 from hnerf.training import trainer as trainer_module
 from hnerf.training.checkpoint import NAME
-from hnerf.training.processes import Processes
+from hnerf.training.distributed import Processes
 from hnerf.training.trainer import train
 from tests.training.first_step import gradients, untrained
 from tests.training.scene import TINY, record
@@ -21,7 +21,7 @@ ALONE = Processes(0, 1, torch.device("cpu"))
 KILLED = """
 import os, signal, sys, torch
 from pathlib import Path
-from hnerf.training.processes import Processes
+from hnerf.training.distributed import Processes
 from hnerf.training.trainer import Trainer
 from tests.training.scene import TINY, record
 torch.set_num_threads(1)

@@ -1,6 +1,6 @@
 import torch
 
-from hnerf.training.paper import resample
+from hnerf.fields.paper import resample
 
 
 def test_fine_samples_by_hand():

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from hnerf.body.canonical import PoseCorrection
 from hnerf.config import LossSettings, TrainingSettings
+from hnerf.fields.conditions import Draws
 from hnerf.training import losses
-from hnerf.training.conditions import Draws
 from hnerf.training.pixels import Rays
 from hnerf.training.step import Objective, aim
 from tests.training.test_losses import SAMPLES, TARGET

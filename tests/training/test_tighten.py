@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from hnerf.config import FastFieldSettings
-from hnerf.training.fast import FastField
+from hnerf.fields.fast import FastField
 from tests.body.boxes import box_rig
 
 RIG = box_rig(splits=2)

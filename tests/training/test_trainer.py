@@ -11,13 +11,13 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from hnerf.avatar.trained import load_avatar
 from hnerf.config import TrainingSettings, load_settings
 from hnerf.errors import CaptureError
 from hnerf.training import trainer as trainer_module
 from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
-from hnerf.training.model import load_avatar
+from hnerf.training.distributed import Processes
 from hnerf.training.pixels import Pixels, Rays
-from hnerf.training.processes import Processes
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import Trainer, train
 from tests.training.scene import FRAMES, TINY, record

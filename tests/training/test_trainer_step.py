@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from hnerf.config import TrainingSettings
+from hnerf.fields.conditions import Conditions, Draws
 from hnerf.training import trainer as trainer_module
-from hnerf.training.budget import Decision
-from hnerf.training.conditions import Conditions, Draws
+from hnerf.training.auto_settings import Decision
+from hnerf.training.distributed import Processes
 from hnerf.training.pixels import Rays
-from hnerf.training.processes import Processes
 from hnerf.training.step import Stage
 from hnerf.training.trainer import Trainer
 from tests.training.scene import TINY, record

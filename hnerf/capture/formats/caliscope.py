@@ -13,8 +13,8 @@ import numpy as np
 
 from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.formats.pose2sim import lens_from_table
-from hnerf.capture.guarded import inside, read_toml
 from hnerf.capture.lens import Lens, known_size
+from hnerf.capture.safe_io import inside, read_toml
 from hnerf.errors import CaptureError
 
 FILES = ("camera_array.toml", "calibration.toml")

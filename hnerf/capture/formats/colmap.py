@@ -14,8 +14,8 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from hnerf.capture.formats.easymocap import EasyMocap
-from hnerf.capture.guarded import check_camera_name, inside, read_bytes, read_text
 from hnerf.capture.lens import Lens, checked_lens, known_size
+from hnerf.capture.safe_io import check_camera_name, inside, read_bytes, read_text
 from hnerf.errors import CaptureError
 
 PIXEL_CENTRE = 0.5  # COLMAP's; here a pixel's centre is at its integer coordinates

@@ -11,7 +11,8 @@ import yaml
 
 from hnerf.capture.footage import Footage, ImageFolder, Video
 from hnerf.capture.formats.layout import Layout, Stored
-from hnerf.capture.guarded import (
+from hnerf.capture.lens import Lens, checked_lens
+from hnerf.capture.safe_io import (
     IMAGE_SUFFIXES,
     JSON_SUFFIXES,
     VIDEO_SUFFIXES,
@@ -21,7 +22,6 @@ from hnerf.capture.guarded import (
     numbered,
     read_text,
 )
-from hnerf.capture.lens import Lens, checked_lens
 from hnerf.errors import CaptureError
 
 MAX_CALIBRATION_BYTES = 1_000_000

@@ -14,9 +14,9 @@ import numpy as np
 from hnerf.capture.footage import Footage, Video
 from hnerf.capture.formats.layout import Layout, Stored
 from hnerf.capture.given_poses import JOINTS, GivenPoses
-from hnerf.capture.guarded import MAX_IMAGE_PIXELS, VIDEO_SUFFIXES, files_in, inside
 from hnerf.capture.lens import Lens, checked_lens
-from hnerf.capture.pickled import read_pickle
+from hnerf.capture.safe_io import MAX_IMAGE_PIXELS, VIDEO_SUFFIXES, files_in, inside
+from hnerf.capture.safe_pickle import read_pickle
 from hnerf.errors import CaptureError
 
 CAMERA = "camera"

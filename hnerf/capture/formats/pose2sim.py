@@ -9,8 +9,8 @@ import numpy as np
 
 from hnerf.capture.footage import Footage, Video
 from hnerf.capture.formats.layout import Layout, Stored
-from hnerf.capture.guarded import JSON_SUFFIXES, VIDEO_SUFFIXES, file_named, files_in, read_toml
 from hnerf.capture.lens import Lens, checked_lens
+from hnerf.capture.safe_io import JSON_SUFFIXES, VIDEO_SUFFIXES, file_named, files_in, read_toml
 from hnerf.errors import CaptureError
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from hnerf.capture.footage import Footage, ImageFolder
 from hnerf.capture.formats.layout import Layout, Stored
 from hnerf.capture.given_poses import JOINTS, GivenPoses
-from hnerf.capture.guarded import inside
 from hnerf.capture.lens import Lens, checked_lens
-from hnerf.capture.pickled import read_pickled_npy
+from hnerf.capture.safe_io import inside
+from hnerf.capture.safe_pickle import read_pickled_npy
 from hnerf.errors import CaptureError
 
 # NeuralBody's configs train on these of ZJU-MoCap's 21 to 23 cameras, and on all but the last of Human3.6M's 4.

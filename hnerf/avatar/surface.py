@@ -1,0 +1,95 @@
+"""The zero surface of a signed distance field as a closed triangle mesh."""
+
+import itertools
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+import trimesh
+from skimage.measure import marching_cubes
+from torch import Tensor
+
+from hnerf.avatar.avatar import Avatar
+from hnerf.body.rig import pose_vertices
+from hnerf.errors import CaptureError
+
+SLOPE_BOUND = 2.0  # |gradient| that skipping empty space allows for; a true distance has 1
+COARSEST_STRIDE = 9  # nodes; refined by threes, so that a coarse node is the centre of the block it stands for
+POSED_CELLS = 256  # on the longest side of the box
+POSED_MARGIN_M = 0.2  # around the naked body: hair, shoes, loose clothes
+
+
+def posed_surface(avatar: Avatar, frame: int) -> trimesh.Trimesh:
+    """The zero surface of the avatar's signed distance in a frame's pose, in world metres (single precision)."""
+    k = avatar.body.index(frame)
+    mesh = surface_in_pose(avatar, avatar.body.theta[k], avatar.body.root[k], POSED_CELLS)
+    return trimesh.Trimesh(mesh.vertices.astype(np.float32), mesh.faces, process=False)
+
+
+def surface_in_pose(avatar: Avatar, theta: Tensor, root: Tensor, cells: int) -> trimesh.Trimesh:
+    """The zero surface in a pose theta (J, 3), root (4, 4), in world metres; cells on the longest side of a box around
+    the body. Raises CaptureError as `extract_surface` does."""
+    body_m = pose_vertices(avatar.body.rig, theta, root)
+    lower_m, upper_m = body_m.amin(0) - POSED_MARGIN_M, body_m.amax(0) + POSED_MARGIN_M
+    with torch.no_grad():
+        return extract_surface(lambda x: avatar.signed_distance(x, theta, root), lower_m, upper_m, cells)
+
+
+def extract_surface(
+    signed_distance: Callable[[Tensor], Tensor], lower_m: Tensor, upper_m: Tensor, cells: int
+) -> trimesh.Trimesh:
+    """Largest closed component of the zero surface inside a box, by marching cubes; faces turn outwards.
+
+    signed_distance: points (N, 3) in metres, on the device of `lower_m`, to metres (N,), negative inside.
+    lower_m, upper_m (3,): the box; cells: how many on its longest side, cubic.
+    Raises CaptureError if the field has no surface in the box, or one that the box cuts.
+    """
+    step_m = float((upper_m - lower_m).max()) / cells
+    nodes = [math.ceil(float(side_m) / step_m - 1e-4) + 1 for side_m in upper_m - lower_m]
+    values = _sample_near_surface(signed_distance, lower_m, step_m, nodes).cpu().numpy()
+    if not np.isfinite(values).all():
+        raise CaptureError("signed distance field: not finite; training diverged, lower its learning rate")
+    if not values.min() < 0 < values.max():
+        found = "everything is inside" if values.max() <= 0 else "everything is outside"
+        raise CaptureError(f"signed distance field: no surface in its box ({found}); train longer or check masks")
+    vertices, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")  # in steps from `lower_m`
+    mesh = _largest_component(trimesh.Trimesh(vertices, faces, process=False))
+    if mesh.vertices.min() <= 0 or (mesh.vertices >= np.array(nodes) - 1).any():
+        raise CaptureError("signed distance field: the surface fills its box; train longer or check masks and body fit")
+    return trimesh.Trimesh(mesh.vertices * step_m + lower_m.cpu().numpy(), mesh.faces, process=False)
+
+
+@torch.no_grad()
+def _sample_near_surface(
+    signed_distance: Callable[[Tensor], Tensor], lower_m: Tensor, step_m: float, nodes: list[int]
+) -> Tensor:
+    """Distances on a grid of `nodes`, exact near the surface; elsewhere the distance at the middle of the block around.
+
+    A block whose middle is further from the surface than its corners, times SLOPE_BOUND, cannot meet the surface.
+    """
+    stride = COARSEST_STRIDE
+    shape = [math.ceil(n / stride) for n in nodes]
+    device = lower_m.device
+    index = torch.cartesian_prod(*(torch.arange(n, device=device) for n in shape))
+    children = torch.tensor(list(itertools.product(range(3), repeat=3)), device=device)
+    values = torch.empty(shape, device=device)
+    while True:
+        points_m = lower_m + (index * stride + stride // 2) * step_m
+        distances_m = signed_distance(points_m).float()
+        values[index.unbind(1)] = distances_m
+        if stride == 1:
+            return values[: nodes[0], : nodes[1], : nodes[2]]
+        reach_m = SLOPE_BOUND * (math.sqrt(3) / 2 * stride + 1) * step_m
+        index = (index[distances_m.abs() <= reach_m, None] * 3 + children).flatten(0, 1)
+        for axis in range(3):
+            values = values.repeat_interleave(3, axis)
+        stride //= 3
+
+
+def _largest_component(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Leaves the connected part with the largest area."""
+    part = trimesh.graph.connected_component_labels(mesh.edges, len(mesh.vertices))[mesh.faces[:, 0]]
+    mesh.update_faces(part == np.bincount(part, mesh.area_faces).argmax())
+    mesh.remove_unreferenced_vertices()
+    return mesh

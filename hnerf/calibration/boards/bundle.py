@@ -1,0 +1,188 @@
+"""Joint adjustment of cameras, board poses and the moments of the pictures, to the corners of a board that is moved.
+
+Cameras without a common shutter picture a moving board at moments that differ by up to a frame, and differ anew in
+every frame; corners are then off by many pixels, always along the board's path. So each picture has a time offset of
+its own, and the board moves between frames as a rigid body. For a board at rest nothing depends on it.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.sparse import csr_matrix
+from scipy.spatial.transform import Rotation
+
+from hnerf.geometry.camera import Camera
+
+LOSS_SCALE_PX = 0.5  # residuals beyond pull linearly, not quadratically (soft L1)
+FRAMES_PER_PX = 0.1  # a picture this much off its time costs as much as a corner one pixel off
+MAX_OFFSET_FRAMES = 1.0  # cameras that start together differ by no more
+MAX_ITERATIONS = 60
+COST_TOLERANCE = 1e-4  # relative; cameras then stand still to a thousandth of a degree
+
+
+@dataclass(frozen=True)
+class Poses:
+    """A board in the world for each frame: R (F, 3, 3), t_m (F, 3), world from board; identity where not seen."""
+
+    R: np.ndarray
+    t_m: np.ndarray
+
+
+@dataclass(frozen=True)
+class BoardFit:
+    """seen_px (C, F, N, 2): the corners used, undistorted, NaN where there are none; projected_px: all corners of the
+    pictures that have some. offsets_frames (C, F): when a picture was taken, after its frame's common time."""
+
+    cameras: list[Camera]
+    boards: Poses
+    seen_px: np.ndarray
+    projected_px: np.ndarray
+    offsets_frames: np.ndarray
+
+    @property
+    def residuals_px(self) -> np.ndarray:
+        """(C, F, N, 2) projected less seen, NaN where not seen."""
+        return self.projected_px - self.seen_px
+
+    def error_px(self, camera: int | None = None) -> np.ndarray:
+        """Distances of all corners seen by one camera, or by all: (n,)."""
+        residuals_px = self.residuals_px if camera is None else self.residuals_px[camera]
+        found = np.linalg.norm(residuals_px, axis=-1).ravel()
+        return found[np.isfinite(found)]
+
+
+def adjust(
+    cameras: Sequence[Camera],
+    corners_m: np.ndarray,
+    corners_px: np.ndarray,
+    boards: Poses,
+    moving: Sequence[bool],
+    frame_step: int,
+) -> BoardFit:
+    """Least squares with a robust loss over board poses, time offsets, and the cameras that are `moving`.
+
+    corners_m (N, 3) on the board; corners_px (C, F, N, 2) undistorted, NaN where not seen, of every `frame_step`-th
+    frame of the footage, whose frames offsets count.
+    Rotations are updated on the left, R <- exp(w) R (Triggs et al. 2000, Bundle Adjustment, section 2.2).
+    """
+    problem = _Problem(cameras, corners_m, corners_px, boards, np.asarray(moving), frame_step)
+    start = np.zeros(problem.size)
+    limits = np.full(problem.size, np.inf)
+    limits[problem.offsets] = MAX_OFFSET_FRAMES
+    solved = least_squares(
+        problem.residuals,
+        start,
+        bounds=(-limits, limits),
+        jac_sparsity=problem.sparsity(),
+        loss="soft_l1",
+        f_scale=LOSS_SCALE_PX,
+        x_scale="jac",
+        ftol=COST_TOLERANCE,
+        max_nfev=MAX_ITERATIONS,
+    )
+    return problem.fit(solved.x)
+
+
+class _Problem:
+    """Unknowns in one vector: 6 a camera, 6 a frame (rotation, then translation), 1 a picture that shows the board."""
+
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        corners_m: np.ndarray,
+        corners_px: np.ndarray,
+        boards: Poses,
+        moving: np.ndarray,
+        frame_step: int,
+    ) -> None:
+        self.cameras, self.corners_m, self.corners_px, self.boards = cameras, corners_m, corners_px, boards
+        self.moving, self.frame_step = moving, frame_step
+        self.seen = np.isfinite(corners_px[..., 0])  # (C, F, N)
+        self.camera, self.frame = np.nonzero(self.seen.any(-1))  # of each picture
+        self.picture, self.corner = np.nonzero(self.seen[self.camera, self.frame])  # of each observation
+        self.observed_px = corners_px[self.camera, self.frame][self.picture, self.corner]
+        self.K = np.stack([camera.K for camera in cameras])
+        count, frames = corners_px.shape[:2]
+        self.before, self.after = _neighbours(self.seen.any((0, 2)))
+        self.offsets = slice(6 * (count + frames), 6 * (count + frames) + len(self.camera))
+        self.size = self.offsets.stop
+
+    def residuals(self, x: np.ndarray) -> np.ndarray:
+        """Two a corner in pixels, then one a picture for its time offset."""
+        R, t_m, boards = self._poses(x)
+        uv = self._project(R, t_m, boards, x[self.offsets])[self.picture, self.corner]
+        return np.concatenate([(uv - self.observed_px).ravel(), x[self.offsets] / FRAMES_PER_PX])
+
+    def sparsity(self) -> csr_matrix:
+        """Which residual depends on which unknown."""
+        count, pictures = len(self.cameras), len(self.camera)
+        frames = self.frame, self.before[self.frame], self.after[self.frame]
+        blocks = np.stack([self.camera, *(count + frame for frame in frames)], -1)
+        columns = (6 * blocks[..., None] + np.arange(6)).reshape(pictures, -1)
+        columns = np.concatenate([columns, self.offsets.start + np.arange(pictures)[:, None]], -1)
+        of_corners = np.repeat(columns[self.picture], 2, axis=0)
+        rows = np.repeat(np.arange(len(of_corners)), columns.shape[1])
+        last = len(of_corners) + np.arange(pictures)
+        row, column = np.concatenate([rows, last]), np.concatenate([of_corners.ravel(), columns[:, -1]])
+        return csr_matrix((np.ones(len(row), bool), (row, column)), shape=(last[-1] + 1, self.size))
+
+    def fit(self, x: np.ndarray) -> BoardFit:
+        """The unknowns as cameras, poses and what is left over."""
+        R, t_m, boards = self._poses(x)
+        cameras = [
+            dataclasses.replace(camera, R=R[i], t_m=t_m[i]) if self.moving[i] else camera
+            for i, camera in enumerate(self.cameras)
+        ]
+        offsets_frames = np.full(self.seen.shape[:2], np.nan)
+        offsets_frames[self.camera, self.frame] = x[self.offsets]
+        projected_px = np.full_like(self.corners_px, np.nan)
+        projected_px[self.camera, self.frame] = self._project(R, t_m, boards, x[self.offsets])
+        return BoardFit(cameras, boards, self.corners_px, projected_px, offsets_frames)
+
+    def _poses(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, Poses]:
+        """R (C, 3, 3) and t_m (C, 3) of the cameras, and the boards."""
+        steps = x[: self.offsets.start].reshape(-1, 6)
+        of_cameras = steps[: len(self.cameras)] * self.moving[:, None]
+        of_boards = steps[len(self.cameras) :]
+        R = _exp(of_cameras[:, :3]) @ np.stack([camera.R for camera in self.cameras])
+        t_m = of_cameras[:, 3:] + np.stack([camera.t_m for camera in self.cameras])
+        return R, t_m, Poses(_exp(of_boards[:, :3]) @ self.boards.R, of_boards[:, 3:] + self.boards.t_m)
+
+    def _project(self, R: np.ndarray, t_m: np.ndarray, boards: Poses, offsets: np.ndarray) -> np.ndarray:
+        """(pictures, N, 2) pixels of all corners."""
+        board_R, board_t_m = self._moved(boards, offsets)
+        own = R[self.camera]
+        to_camera, shift_m = own @ board_R, (own @ board_t_m[..., None])[..., 0] + t_m[self.camera]
+        x = np.einsum("pij,nj->pni", to_camera, self.corners_m) + shift_m[:, None]
+        uv = np.einsum("pij,pnj->pni", self.K[self.camera], x)
+        return uv[..., :2] / uv[..., 2:]
+
+    def _moved(self, boards: Poses, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Each picture's board at the picture's own time: the parabola through its frame and the two beside it, in
+        translation and in the rotation vector away from its frame. A frame that is missing mirrors the other one."""
+        frame, s = self.frame, offsets[:, None] / self.frame_step
+        own = np.arange(len(self.before))
+        no_before, no_after = (self.before == own)[:, None], (self.after == own)[:, None]
+        beside = self.before, self.after
+        turned = [Rotation.from_matrix(np.swapaxes(boards.R, -1, -2) @ boards.R[i]).as_rotvec() for i in beside]
+        moved = [boards.t_m[i] - boards.t_m for i in beside]
+        paths = []
+        for to_before, to_after in (turned, moved):
+            to_before = np.where(no_before, -to_after, to_before)
+            to_after = np.where(no_after, -to_before, to_after)
+            paths.append(s * (to_after - to_before)[frame] / 2 + s**2 * (to_after + to_before)[frame] / 2)
+        return boards.R[frame] @ _exp(paths[0]), boards.t_m[frame] + paths[1]
+
+
+def _neighbours(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The frame before and the frame after each one; itself where that one is missing. seen: (F,) bool."""
+    own = np.arange(len(seen))
+    before, after = np.maximum(own - 1, 0), np.minimum(own + 1, len(seen) - 1)
+    return np.where(seen[before], before, own), np.where(seen[after], after, own)
+
+
+def _exp(vectors: np.ndarray) -> np.ndarray:
+    return Rotation.from_rotvec(vectors).as_matrix()

@@ -1,0 +1,223 @@
+"""Cameras from footage of a calibration board, and what such footage says about cameras that are given."""
+
+import dataclasses
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hnerf.calibration.boards.bundle import BoardFit, Poses
+from hnerf.calibration.boards.lens import LensEstimate, estimate_lens
+from hnerf.calibration.boards.picture import draw_boards
+from hnerf.calibration.boards.rig import (
+    MIN_CORNERS,
+    MIN_SHARED,
+    compare_pairs,
+    flat_only,
+    linked,
+    solve_boards,
+    solve_rig,
+    undistorted,
+    whole_enough,
+)
+from hnerf.capture.board_footage import BoardFootage, load_board_corners, read_board_footage
+from hnerf.capture.capture import Capture
+from hnerf.capture.formats.export import write_cameras
+from hnerf.capture.ingest import recognise
+from hnerf.capture.lens import Lens
+from hnerf.errors import CaptureError
+from hnerf.geometry.camera import Camera
+
+MAX_TILT_DEG = 75.0  # beyond, a board is too slanted to be read
+CALIBRATION_FILES = ("intri.yml", "camera_array.toml", "calibration.toml", "sparse", "calibration/Calib*.toml")
+
+log = logging.getLogger("hnerf.calibration")
+
+
+@dataclass(frozen=True)
+class BoardCalibration:
+    """lenses: as recorded, with distortion; intrinsics: where each came from, in words; corners_m (N, 3); corners_px
+    (C, F, N, 2): all that was found, undistorted, of which `fit` has the used ones."""
+
+    lenses: dict[str, Lens]
+    intrinsics: dict[str, str]
+    corners_m: np.ndarray
+    corners_px: np.ndarray
+    fit: BoardFit
+
+    def report(self) -> dict[str, Any]:
+        """What `report.json` holds. Residuals in undistorted pixels, offsets in frames of the footage."""
+        visible, found = visible_and_found(self.fit, self.corners_m)
+        cameras = {
+            camera.name: _figures(self.fit, i)
+            | {
+                "corners_not_flat": int(np.isfinite(self.corners_px[i, ..., 0]).sum()) - len(self.fit.error_px(i)),
+                "board_visible": int(visible[i].sum()),
+                "of_these_found": int((visible[i] & found[i]).sum()),
+                "intrinsics": self.intrinsics[camera.name],
+            }
+            for i, camera in enumerate(self.fit.cameras)
+        }
+        return {"frames": found.shape[1], "rms_px": _rms(self.fit.error_px()), "cameras": cameras}
+
+    def save(self, out: Path, layouts: Sequence[str] = ()) -> None:
+        """Write `intri.yml`, `extri.yml`, `report.json` and `boards.png`, and the cameras in further layouts."""
+        for layout in {"easymocap", *layouts}:
+            write_cameras(out, list(self.lenses.values()), layout)
+        (out / "report.json").write_text(json.dumps(self.report(), indent=1))
+        draw_boards(out / "boards.png", self.fit)
+
+
+def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> BoardCalibration:
+    """Cameras from the board footage in a folder's `calibration/`.
+
+    Intrinsics come from calibration/intrinsic/, else from the folder's calibration files, else from
+    calibration/extrinsic/ itself. The world is the first camera, or the board as it lies in frame `ground_frame` (Z up,
+    origin at its top left corner). CaptureError where the footage does not hold what is needed.
+    """
+    footage = read_board_footage(folder, "extrinsic", ground_frame)
+    if footage is None:
+        raise CaptureError(
+            f"{folder / 'calibration' / 'extrinsic'}: no board footage, or no charuco.toml and no [board] in "
+            "capture.toml to describe the board; see docs/formats.md"
+        )
+    _check_board_found(footage)
+    lenses, intrinsics = _intrinsics(folder, footage)
+    corners_m = footage.board.corners_m
+    corners_px = np.stack([undistorted(footage.corners_px[name], lens) for name, lens in lenses.items()])
+    cameras = [Camera(n, lens.K, np.eye(3), np.zeros(3), *footage.sizes_px[n]) for n, lens in lenses.items()]
+    log.info("adjusting %d cameras to %d corners", len(cameras), int(np.isfinite(corners_px[..., 0]).sum()))
+    fit = solve_rig(cameras, corners_m, flat_only(corners_m, corners_px), footage.frame_step)
+    if ground_frame is not None:
+        fit = _on_ground(fit, footage, ground_frame)
+    lenses = {c.name: dataclasses.replace(lenses[c.name], R=c.R, t_m=c.t_m) for c in fit.cameras}
+    return BoardCalibration(lenses, intrinsics, corners_m, corners_px, fit)
+
+
+def board_witness(capture: Capture) -> dict[str, Any] | None:
+    """What board footage says about a capture's cameras; None where the recording has none.
+
+    "cameras": per camera the corners' distances (px) from the board that all cameras agree on, with the cameras as
+    given, and as `footage_rms_px` with those that the footage itself gives. "pairs": `compare_pairs` of the two.
+    "unlinked_cameras": those that never see the board together with the others, about which nothing is known.
+    """
+    stored = load_board_corners(capture.root)
+    if stored is None:
+        return None
+    known = [i for i, name in enumerate(stored.cameras) if name in capture.cameras]
+    cameras, corners_px = [capture.cameras[stored.cameras[i]] for i in known], stored.corners_px[known]
+    corners_px = flat_only(stored.corners_m, corners_px)
+    chosen = linked(corners_px)
+    names = [camera.name for camera in cameras]
+    if len(chosen) < 2:
+        return {"frames": corners_px.shape[1], "cameras": {}, "pairs": {}, "unlinked_cameras": names}
+    cameras, corners_px = [cameras[i] for i in chosen], corners_px[chosen]
+    seen = stored.corners_m, corners_px, stored.frame_step
+    own, given = (solve(cameras, *seen) for solve in (solve_rig, solve_boards))
+    figures = {
+        camera.name: _figures(given, i) | {"footage_rms_px": _rms(own.error_px(i))} for i, camera in enumerate(cameras)
+    }
+    return {
+        "frames": corners_px.shape[1],
+        "cameras": figures,
+        "pairs": compare_pairs(cameras, own.cameras),
+        "unlinked_cameras": [name for i, name in enumerate(names) if i not in chosen],
+    }
+
+
+def visible_and_found(fit: BoardFit, corners_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(C, F) bool twice: where a camera must be able to see the board, and where it was found, whole enough both times.
+
+    Visible: another camera found it, and placed as the fit has it, at least MIN_CORNERS corners fall into this camera's
+    picture and the board faces it within MAX_TILT_DEG. Hands and heads in the way are not known: such pictures count.
+    """
+    found = np.isfinite(fit.residuals_px[..., 0]).sum(-1) >= MIN_CORNERS
+    corners = np.einsum("fij,nj->fni", fit.boards.R, corners_m) + fit.boards.t_m[:, None]
+    visible = np.zeros_like(found)
+    for i, camera in enumerate(fit.cameras):
+        uv, depth_m = camera.project(corners)
+        inside = ((uv > -0.5) & (uv < [camera.width_px - 0.5, camera.height_px - 0.5])).all(-1) & (depth_m > 0)
+        towards = corners.mean(1) - camera.centre_m
+        cosine = (fit.boards.R[..., 2] * towards).sum(-1) / np.linalg.norm(towards, axis=-1)
+        by_others = np.delete(found, i, axis=0).any(0)
+        visible[i] = by_others & (inside.sum(-1) >= MIN_CORNERS) & (cosine > np.cos(np.deg2rad(MAX_TILT_DEG)))
+    return visible, found
+
+
+def _check_board_found(footage: BoardFootage) -> None:
+    """CaptureError where no camera sees enough of the board to be linked: it is hardly the board that is described."""
+    corners_px = np.stack(list(footage.corners_px.values()))
+    found = whole_enough(footage.board.corners_m, np.isfinite(corners_px[..., 0]))
+    if found.sum(1).max() < MIN_SHARED:
+        raise CaptureError(
+            f"{footage.path}: this board was found in {found.sum()} of {found.size} pictures; check its columns, rows, "
+            "dictionary and inverted in charuco.toml or capture.toml"
+        )
+
+
+def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], dict[str, str]]:
+    """Of every camera in the extrinsic footage, and where they come from in words."""
+    close = read_board_footage(folder, "intrinsic")
+    given = recognise(folder).lenses() if any(any(folder.glob(name)) for name in CALIBRATION_FILES) else {}
+    lenses, words = {}, {}
+    for name, size_px in footage.sizes_px.items():
+        source = close if close is not None and name in close.corners_px else footage
+        found = estimate_lens(name, source.board.corners_m, source.corners_px[name], source.sizes_px[name])
+        if source is footage and name in given:
+            lenses[name], words[name] = given[name], f"given; {_compared(found, given[name])}"
+        elif found.believed:
+            lenses[name], words[name] = found.believed, f"from {source.path.name}/: {found.certainty}"
+        else:
+            raise CaptureError(
+                f"{source.path / name}: does not fix the intrinsics ({found.certainty}); film the board closer, "
+                "tilted and in all corners of the picture, or give intrinsics"
+            )
+        known_px = lenses[name].size_px or size_px
+        if known_px != size_px:
+            raise CaptureError(
+                f"{footage.path / name}: is {size_px[0]} x {size_px[1]} px, but its intrinsics are for {known_px[0]} x "
+                f"{known_px[1]}; use one size"
+            )
+        lenses[name] = dataclasses.replace(lenses[name], size_px=size_px)
+    return lenses, words
+
+
+def _compared(found: LensEstimate, given: Lens) -> str:
+    if found.believed is None:
+        return f"not verified by the footage ({found.certainty})"
+    differs = 100 * (found.believed.K[0, 0] / given.K[0, 0] - 1)
+    return f"the footage's own focal length differs by {differs:+.1f} % ({found.certainty})"
+
+
+def _on_ground(fit: BoardFit, footage: BoardFootage, ground_frame: int) -> BoardFit:
+    """The rig in the world whose origin and floor are the board in one frame. The board's z is down: turned about x."""
+    index = footage.frames.index(ground_frame) if ground_frame in footage.frames else -1
+    if index < 0 or not np.isfinite(fit.residuals_px[:, index]).any():
+        raise CaptureError(f"{footage.path}: no board in frame {ground_frame}; name a frame in which it lies flat")
+    to_ground = np.diag([1.0, -1.0, -1.0]) @ fit.boards.R[index].T
+    origin_m = fit.boards.t_m[index]
+    cameras = [dataclasses.replace(c, R=c.R @ to_ground.T, t_m=c.R @ origin_m + c.t_m) for c in fit.cameras]
+    boards = Poses(to_ground @ fit.boards.R, (fit.boards.t_m - origin_m) @ to_ground.T)
+    return dataclasses.replace(fit, cameras=cameras, boards=boards)
+
+
+def _figures(fit: BoardFit, camera: int) -> dict[str, Any]:
+    """What one camera's corners say."""
+    error_px, offsets = fit.error_px(camera), fit.offsets_frames[camera]
+    offsets = offsets[np.isfinite(offsets)]
+    at = np.quantile(offsets, [0.05, 0.5, 0.95]).tolist() if len(offsets) else None
+    return {
+        "pictures": len(offsets),
+        "corners": len(error_px),
+        "rms_px": _rms(error_px),
+        "median_px": float(np.median(error_px)) if len(error_px) else None,
+        "offset_frames_p5_p50_p95": at,
+    }
+
+
+def _rms(error_px: np.ndarray) -> float | None:
+    return float(np.sqrt((error_px**2).mean())) if len(error_px) else None

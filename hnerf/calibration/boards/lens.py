@@ -1,0 +1,61 @@
+"""One camera's intrinsics from pictures of a board, and whether the pictures suffice."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from hnerf.calibration.boards.rig import whole_enough
+from hnerf.capture.lens import Lens
+from hnerf.evenly_spaced import evenly_spaced
+
+MAX_PICTURES = 40  # evenly chosen
+MIN_PICTURES = 10
+MIN_TILTED = 5  # of the pictures: boards parallel to the image say nothing about the focal length, nor does its spread
+TILT_DEG = 15.0
+MAX_FOCAL_SPREAD = 0.01  # standard deviation of an estimated focal length that is still believed, relative
+
+
+@dataclass(frozen=True)
+class LensEstimate:
+    """pictures: used; lens: None if they are too few; tilted: those of them with the board TILT_DEG or more out of
+    the image plane; focal_spread: the focal length's relative standard deviation."""
+
+    pictures: int
+    lens: Lens | None = None
+    tilted: int = 0
+    focal_spread: float = np.inf
+
+    @property
+    def believed(self) -> Lens | None:
+        """The lens if the pictures fix it."""
+        return self.lens if self.focal_spread <= MAX_FOCAL_SPREAD and self.tilted >= MIN_TILTED else None
+
+    @property
+    def certainty(self) -> str:
+        """In words."""
+        if self.lens is None:
+            return f"{self.pictures} pictures of the board where {MIN_PICTURES} are needed"
+        known = f"focal length known to {100 * self.focal_spread:.1f} %"
+        return f"{self.pictures} pictures of the board, {self.tilted} of them tilted, {known}"
+
+
+def estimate_lens(name: str, corners_m: np.ndarray, corners_px: np.ndarray, size_px: tuple[int, int]) -> LensEstimate:
+    """Intrinsics and distortion k1 k2 p1 p2 from corners_px (F, N, 2) as recorded, NaN where not seen (Zhang 2000).
+
+    The standard deviation is that of the least squares (cv2.calibrateCameraExtended).
+    """
+    chosen = evenly_spaced(
+        np.flatnonzero(whole_enough(corners_m, np.isfinite(corners_px[..., 0]))).tolist(), MAX_PICTURES
+    )
+    if len(chosen) < MIN_PICTURES:
+        return LensEstimate(len(chosen))
+    seen = [np.isfinite(corners_px[f, :, 0]) for f in chosen]
+    points_m = [corners_m[s].astype(np.float32) for s in seen]
+    points_px = [corners_px[f, s].astype(np.float32) for f, s in zip(chosen, seen, strict=True)]
+    _, K, distortion, turns, _, deviation, _, _ = cv2.calibrateCameraExtended(
+        points_m, points_px, size_px, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
+    )
+    lens = Lens(name, K, distortion.ravel()[:4], np.eye(3), np.zeros(3), size_px)
+    tilted = sum(abs(cv2.Rodrigues(turn)[0][2, 2]) < np.cos(np.deg2rad(TILT_DEG)) for turn in turns)
+    return LensEstimate(len(chosen), lens, tilted, float(max(deviation[0, 0] / K[0, 0], deviation[1, 0] / K[1, 1])))

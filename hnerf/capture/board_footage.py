@@ -1,0 +1,326 @@
+"""Footage of a calibration board: what the board is, and where its corners are seen.
+
+`calibration/extrinsic/` and `calibration/intrinsic/` hold a video `<camera>.mp4` or a folder of images `<camera>/` per
+camera; `charuco.toml` (Caliscope's keys) or a table `[board]` in `capture.toml` describes the board.
+"""
+
+import csv
+import dataclasses
+import logging
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from hnerf.capture.footage import Footage, ImageFolder, Video
+from hnerf.capture.normalise import Normaliser
+from hnerf.capture.safe_io import (
+    IMAGE_SUFFIXES,
+    VIDEO_SUFFIXES,
+    check_camera_name,
+    files_in,
+    inside,
+    numbered,
+    read_text,
+    read_toml,
+)
+from hnerf.config import validated
+from hnerf.errors import CaptureError
+
+MAX_FRAMES = 200  # of each camera in which the board is looked for, evenly strided
+BOARDS_FILE = "boards.npz"
+METRES = {"inch": 0.0254, "cm": 0.01}
+
+log = logging.getLogger("hnerf.capture")
+
+
+class Board(BaseModel):
+    """A flat board of squares; without a dictionary of markers a plain checkerboard.
+
+    `marker_share`: of a square's side; `inverted`: printed white on black.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    columns: int = Field(ge=3, le=64)
+    rows: int = Field(ge=3, le=64)
+    square_m: float = Field(gt=0, le=2)
+    dictionary: str | None = Field(default=None, pattern=r"^DICT_[A-Z0-9_]{1,32}$")
+    marker_share: float = Field(default=0.75, gt=0, lt=1)
+    inverted: bool = False
+
+    @property
+    def corners_m(self) -> np.ndarray:
+        """(N, 3) inner corners row by row: x right, y down, z into the board, from the board's top left corner."""
+        y, x = np.mgrid[1 : self.rows, 1 : self.columns]
+        return self.square_m * np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
+
+
+class Detector:
+    """Looks for one board in pictures."""
+
+    def __init__(self, board: Board) -> None:
+        self.board = board
+        self.charuco = None
+        if board.dictionary:
+            parameters = cv2.aruco.CharucoParameters()
+            parameters.minMarkers = 1  # corners beside a hand keep one of their two markers; bad ones are dropped later
+            self.charuco = cv2.aruco.CharucoDetector(_charuco(board), parameters)
+
+    def corners_px(self, rgb: np.ndarray) -> np.ndarray:
+        """(N, 2) of the board's corners in an RGB picture, NaN where not seen."""
+        grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        if self.board.inverted:
+            grey = 255 - grey
+        return self._checkerboard(grey) if self.charuco is None else self._charuco_corners(grey)
+
+    def _charuco_corners(self, grey: np.ndarray) -> np.ndarray:
+        assert self.charuco is not None
+        corners_px = np.full((len(self.board.corners_m), 2), np.nan)
+        found, ids, _, _ = self.charuco.detectBoard(grey)
+        if ids is not None:
+            corners_px[ids.ravel()] = found.reshape(-1, 2)
+        return corners_px
+
+    def _checkerboard(self, grey: np.ndarray) -> np.ndarray:
+        """All corners or none, the same one first whichever way the board is held.
+
+        `read_board` admits only boards whose first and last square differ in colour: the black one is the first.
+        """
+        columns, rows = self.board.columns - 1, self.board.rows - 1
+        found, corners_px = cv2.findChessboardCornersSB(grey, (columns, rows), flags=cv2.CALIB_CB_ACCURACY)
+        if not found:
+            return np.full((columns * rows, 2), np.nan)
+        grid = corners_px.reshape(rows, columns, 2).astype(np.float64)
+        if _brightness(grey, grid[:2, :2]) > _brightness(grey, grid[-2:, -2:]):
+            grid = grid[::-1, ::-1]
+        return grid.reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class BoardFootage:
+    """corners_px: per camera (frames, N, 2) as recorded, NaN where not seen, in the order of `frames`, which are every
+    `frame_step`-th."""
+
+    path: Path
+    board: Board
+    frames: tuple[int, ...]
+    frame_step: int
+    corners_px: dict[str, np.ndarray]
+    sizes_px: dict[str, tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class BoardCorners:
+    """`boards.npz` of a normalised capture: corners_m (N, 3) on the board; corners_px (C, F, N, 2) in the linear
+    cameras' pixels, NaN where not seen, in every `frame_step`-th frame of the footage."""
+
+    cameras: tuple[str, ...]
+    corners_m: np.ndarray
+    corners_px: np.ndarray
+    frame_step: int
+
+    def save(self, root: Path) -> None:
+        """Write `boards.npz` into a normalised capture."""
+        np.savez_compressed(root / BOARDS_FILE, **dataclasses.asdict(self))
+
+
+def normalised_corners(footage: BoardFootage, normalisers: dict[str, Normaliser]) -> BoardCorners:
+    """The corners that a capture's cameras saw, in the pixels of the linear cameras; CaptureError if they recorded the
+    board at another size."""
+    names = tuple(name for name in footage.corners_px if name in normalisers)
+    if not names:
+        raise CaptureError(
+            f"{footage.path}: shows cameras {', '.join(footage.corners_px)}, none of them recorded here; rename them"
+        )
+    corners_px = []
+    for name in names:
+        size_px, recorded_px = footage.sizes_px[name], normalisers[name].recorded_size_px
+        if size_px != recorded_px:
+            raise CaptureError(
+                f"{footage.path / name}: is {size_px[0]} x {size_px[1]} px, but the recording of that camera is "
+                f"{recorded_px[0]} x {recorded_px[1]}; film the board at the same size or take its footage out"
+            )
+        seen = np.isfinite(footage.corners_px[name][..., :1])
+        corners = np.concatenate([np.nan_to_num(footage.corners_px[name]), seen], -1)
+        corners_px.append(np.where(seen, normalisers[name].keypoints(corners)[..., :2], np.nan))
+    return BoardCorners(names, footage.board.corners_m, np.array(corners_px), footage.frame_step)
+
+
+def load_board_corners(root: Path) -> BoardCorners | None:
+    """What a normalised capture says about a board; None where the recording has no footage of one."""
+    if not (root / BOARDS_FILE).exists():
+        return None
+    with np.load(root / BOARDS_FILE, allow_pickle=False) as stored:
+        return BoardCorners(
+            tuple(stored["cameras"].tolist()), stored["corners_m"], stored["corners_px"], int(stored["frame_step"])
+        )
+
+
+def read_board(folder: Path) -> Board | None:
+    """The board that the folder describes, None if it describes none; CaptureError on a bad description."""
+    notes, charuco = inside(folder, "capture.toml"), inside(folder, "charuco.toml")
+    source, table = notes, (read_toml(notes) if notes.exists() else {}).get("board")
+    if table is None:
+        if not charuco.exists():
+            return None
+        source, table = charuco, _from_caliscope(charuco)
+    board = validated(Board, table, f"{source}: board")
+    if board.dictionary is None and (board.columns + board.rows) % 2 == 0:
+        raise CaptureError(
+            f"{source}: a checkerboard of {board.columns} x {board.rows} squares looks the same upside down; "
+            "use one with an odd and an even number of squares, or a ChArUco board"
+        )
+    if board.dictionary:
+        _check_markers(source, board)
+    return board
+
+
+def read_board_footage(
+    folder: Path, part: Literal["extrinsic", "intrinsic"], wanted: int | None = None
+) -> BoardFootage | None:
+    """The corners in the footage of calibration/<part>/; None where there is no footage or no board is described.
+
+    Of long footage every so many frames are looked at, frame `wanted` among them if there is one.
+    Of extrinsic footage, all cameras' pictures of one frame number are taken to be of one moment; videos are numbered
+    by `timestamps.csv` (Caliscope's) if that is there. CaptureError on files that cannot be read or do not match,
+    or where there is no frame `wanted`.
+    """
+    path = inside(folder, "calibration", part)
+    footage, board = _footage(folder, part), read_board(folder)
+    if footage and board is None:
+        log.info("%s: not used, no charuco.toml and no [board] in capture.toml says what board it shows", path)
+    if not footage or board is None:
+        return None
+    numbers = _frame_numbers(path, footage, synchronised=part == "extrinsic")
+    frames = tuple(sorted({number for of_camera in numbers.values() for number in of_camera}))
+    if wanted is not None and wanted not in frames:
+        raise CaptureError(f"{path}: has no frame {wanted}; name one of {frames[0]} to {frames[-1]}")
+    step = math.ceil(len(frames) / MAX_FRAMES)
+    frames = frames[0 if wanted is None else frames.index(wanted) % step :: step]
+    corners_px, sizes_px = {}, {}
+    for name, pictures in footage.items():
+        corners_px[name], sizes_px[name] = _corners(board, pictures, numbers[name], frames)
+        shown = int(np.isfinite(corners_px[name][..., 0]).any(-1).sum())
+        log.info("%s: board found in %d of %d frames", pictures.path, shown, len(frames))
+    return BoardFootage(path, board, frames, step, corners_px, sizes_px)
+
+
+def _corners(
+    board: Board, pictures: Footage, numbers: tuple[int, ...], frames: tuple[int, ...]
+) -> tuple[np.ndarray, tuple[int, int]]:
+    """(frames, N, 2) of one camera, and its pictures' size. numbers: the common ones of its own frames."""
+    detector, size_px = Detector(board), None
+    corners_px = np.full((len(frames), len(board.corners_m), 2), np.nan)
+    row = {frame: i for i, frame in enumerate(frames)}
+    wanted = {own: row[number] for number, own in zip(numbers, pictures.frames, strict=True) if number in row}
+    for picture in pictures.read(wanted):
+        shape_px = picture.rgb.shape[1], picture.rgb.shape[0]
+        size_px = size_px or shape_px
+        if size_px != shape_px:
+            raise CaptureError(
+                f"{picture.file}: is {shape_px[0]} x {shape_px[1]} px, unlike the pictures before; use one size"
+            )
+        corners_px[wanted[picture.frame]] = detector.corners_px(picture.rgb)
+    if size_px is None:
+        raise CaptureError(f"{pictures.path}: none of its frames is among those looked at; give all cameras the same")
+    return corners_px, size_px
+
+
+def _charuco(board: Board) -> cv2.aruco.CharucoBoard:
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary or ""))
+    size = (board.columns, board.rows)
+    return cv2.aruco.CharucoBoard(size, board.square_m, board.marker_share * board.square_m, dictionary)
+
+
+def _check_markers(source: Path, board: Board) -> None:
+    known = getattr(cv2.aruco, board.dictionary or "", None)
+    if not isinstance(known, int):
+        raise CaptureError(f"{source}: board: dictionary {board.dictionary}: not one of OpenCV's; correct it")
+    have = len(cv2.aruco.getPredefinedDictionary(known).bytesList)
+    if have < board.columns * board.rows // 2:
+        raise CaptureError(f"{source}: board: {board.dictionary} has only {have} markers; correct rows and columns")
+
+
+def _from_caliscope(path: Path) -> dict[str, Any]:
+    """Caliscope's charuco.toml in our terms: the size measured on the print comes before that of the page."""
+    table = read_toml(path)
+    try:
+        square_m = 0.01 * float(table.get("square_size_override_cm") or 0)
+        if not square_m:
+            sides = table["board_width"] / table["columns"], table["board_height"] / table["rows"]
+            square_m = METRES[table["units"]] * float(min(sides))
+        return {
+            "columns": table["columns"],
+            "rows": table["rows"],
+            "square_m": square_m,
+            "dictionary": table["dictionary"],
+            "marker_share": table["aruco_scale"],
+            "inverted": table["inverted"],
+        }
+    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+        raise CaptureError(f"{path}: board: {error} is missing or no number; write it again with Caliscope") from None
+
+
+def _footage(folder: Path, part: str) -> dict[str, Footage]:
+    """By camera, in the order of their names."""
+    root = inside(folder, "calibration", part)
+    found: dict[str, Footage] = {}
+    for path in sorted(root.iterdir()) if root.is_dir() else []:
+        if path.name.startswith(".") or (path.is_file() and path.suffix.lower() not in VIDEO_SUFFIXES):
+            continue
+        path = inside(folder, "calibration", part, path.name)
+        name = check_camera_name(path.stem if path.is_file() else path.name, path)
+        if name in found:
+            raise CaptureError(f"{path}: camera {name} has a video and a folder of images; keep one of them")
+        if path.is_file():
+            found[name] = Video.open(path)
+            continue
+        files = files_in(folder, "calibration", part, path.name, suffixes=IMAGE_SUFFIXES)
+        if not files:
+            raise CaptureError(f"{path}: no JPEG or PNG images; add them or remove the folder")
+        found[name] = ImageFolder(path, numbered(files, "images"))
+    return found
+
+
+def _frame_numbers(root: Path, footage: dict[str, Footage], synchronised: bool) -> dict[str, tuple[int, ...]]:
+    """For each camera the common number of each of its frames."""
+    stamps = inside(root, "timestamps.csv")
+    if not synchronised or not stamps.exists():
+        videos = [pictures for pictures in footage.values() if isinstance(pictures, Video)]
+        if synchronised and len({len(video.frames) for video in videos}) > 1:
+            raise CaptureError(f"{root}: the videos differ in length; cut them to the same frames")
+        return {name: pictures.frames for name, pictures in footage.items()}
+    numbers = _sync_indices(stamps)
+    for name, pictures in footage.items():
+        if len(numbers.get(name, ())) != len(pictures.frames):
+            raise CaptureError(
+                f"{stamps}: {len(numbers.get(name, ()))} rows of {name}, but {len(pictures.frames)} frames in "
+                f"{pictures.path}; export both again, or remove the table if all cameras have the same frames"
+            )
+    return numbers
+
+
+def _sync_indices(path: Path) -> dict[str, tuple[int, ...]]:
+    """Caliscope's table: a row for every frame of every camera, `sync_index` common to those of one moment."""
+    found: dict[str, list[int]] = {}
+    for row in csv.DictReader(read_text(path).splitlines()):
+        index, camera = row.get("sync_index") or "", row.get("cam_id") or row.get("port") or ""
+        if not (re.fullmatch(r"[0-9]{1,9}", index) and re.fullmatch(r"[0-9]{1,4}", camera)):
+            raise CaptureError(f"{path}: a row has no whole sync_index and cam_id; export it again or remove it")
+        found.setdefault(f"cam_{camera}", []).append(int(index))
+    return {name: tuple(sorted(indices)) for name, indices in found.items()}
+
+
+def _brightness(grey: np.ndarray, square_px: np.ndarray) -> float:
+    """Mean grey level inside the square between (2, 2, 2) corners, half its side about its middle."""
+    middle = square_px.mean((0, 1))
+    inner = (middle + 0.5 * (square_px - middle)).reshape(4, 2)[[0, 1, 3, 2]]
+    mask = np.zeros_like(grey)
+    cv2.fillConvexPoly(mask, inner.round().astype(np.int32), 255)
+    return float(cv2.mean(grey, mask)[0])

@@ -1,5 +1,0 @@
-"""A synthetic performer: a clothed person walks in a room before calibrated cameras; with exact ground truth."""
-
-from hnerf.capture.performer.write import write_performer
-
-__all__ = ["write_performer"]

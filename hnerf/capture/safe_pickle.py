@@ -1,0 +1,173 @@
+"""Pickles of plain data (numbers, text, dicts, lists, numpy arrays), read without running anything that they name.
+
+Old captures and body models come as pickles, and unpickling runs whatever a stranger wrote. Here every class that a
+pickle may name is one of the stand-ins below, which only hold what they are given; all others are refused. Arrays are
+made afterwards, from bytes of the length that their shape declares.
+"""
+
+import io
+import math
+import pickle
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+from hnerf.capture.safe_io import read_bytes
+from hnerf.errors import CaptureError
+
+MAX_BYTES = 1_000_000_000  # the largest SMPL-X model has half of that
+_KINDS = re.compile(r"[biufOSU?][0-9]*")
+
+
+def read_pickle(path: Path) -> Any:
+    """Plain data of a pickle file (text of Python 2 as latin-1); sparse matrices become scipy's CSC arrays, chumpy's
+    become numpy's. CaptureError if it is missing, too large or damaged, or names anything else."""
+    return _plain_data(path, io.BytesIO(read_bytes(path, MAX_BYTES)))
+
+
+def read_pickled_npy(path: Path) -> Any:
+    """As `read_pickle`, what `numpy.save` makes of one Python object."""
+    stream = io.BytesIO(read_bytes(path, MAX_BYTES))
+    try:
+        version = np.lib.format.read_magic(stream)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read_header(stream)
+    except ValueError:
+        raise CaptureError(f"{path}: is no .npy file; export it again") from None
+    if shape != () or dtype.kind != "O":
+        raise CaptureError(f"{path}: holds no dictionary; export it again")
+    return _plain_data(path, stream).item()
+
+
+def _plain_data(path: Path, stream: io.BytesIO) -> Any:
+    try:
+        return _plain(_Unpickler(stream, encoding="latin1").load(), {})
+    except Exception as error:  # a damaged pickle can raise nearly anything
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CaptureError(f"{path}: not a pickle of plain data ({reason}); convert it to .npz") from None
+
+
+class _StandIn:
+    """Holds what a pickle gives an object: the arguments of its making, and its state."""
+
+    state: Any = None
+
+    def __init__(self, *arguments: Any) -> None:
+        self.arguments = arguments
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+    def plain(self, done: dict[int, Any]) -> Any:
+        raise pickle.UnpicklingError(f"{type(self).__name__} is no data")
+
+
+class _Dtype(_StandIn):
+    """numpy.dtype(code, align, copy), state (version, byte order, ...): numbers, text, or Python objects."""
+
+    def plain(self, done: dict[int, Any]) -> Any:
+        code, order = str(self.arguments[0]), str(self.state[1]) if self.state else "|"
+        if not _KINDS.fullmatch(code) or order not in "<>|=":
+            raise pickle.UnpicklingError(f"an array of type {code}")
+        return np.dtype(code).newbyteorder(order)  # type: ignore[arg-type]
+
+
+class _Array(_StandIn):
+    """numpy.ndarray, state (version, shape, dtype, column-major, bytes or list of objects)."""
+
+    def plain(self, done: dict[int, Any]) -> Any:
+        _, shape, kind, column_major, data = self.state
+        dtype = _plain(kind, done)
+        if dtype.kind != "O":
+            data = data.encode("latin1") if isinstance(data, str) else data
+            flat = np.frombuffer(data, dtype)
+        else:
+            flat = np.empty(len(data), object)
+            flat[:] = [_plain(item, done) for item in data]
+        if not all(isinstance(n, int) and n >= 0 for n in shape) or math.prod(shape) != len(flat):
+            raise pickle.UnpicklingError("an array of another size than it declares")
+        return flat.reshape(shape, order="F" if column_major else "C")
+
+
+class _Scalar(_StandIn):
+    """numpy.core.multiarray.scalar(dtype, bytes)."""
+
+    def plain(self, done: dict[int, Any]) -> Any:
+        dtype, data = self.arguments
+        return np.frombuffer(data.encode("latin1") if isinstance(data, str) else data, _plain(dtype, done))[0]
+
+
+class _Sparse(_StandIn):
+    """scipy.sparse.csc_matrix, its attributes."""
+
+    def plain(self, done: dict[int, Any]) -> Any:
+        parts = _plain(self.state, done)
+        shape = tuple(int(n) for n in parts["_shape" if "_shape" in parts else "shape"])
+        matrix = scipy.sparse.csc_array((parts["data"], parts["indices"], parts["indptr"]), shape=shape)
+        matrix.check_format(full_check=True)
+        return matrix
+
+
+class _Chumpy(_StandIn):
+    """chumpy.Ch, an array of a package that is no longer kept: its value is the attribute x."""
+
+    def plain(self, done: dict[int, Any]) -> Any:
+        return np.asarray(_plain(self.state["x"], done))
+
+
+def _reconstructed(kind: Any, *_: Any) -> _StandIn:
+    """numpy's _reconstruct(class, shape, type) and copyreg's _reconstructor(class, base, state): the state follows."""
+    if not (isinstance(kind, type) and issubclass(kind, _StandIn)):
+        raise pickle.UnpicklingError("a class of an unknown kind")
+    return kind()
+
+
+def _encoded(text: str, encoding: str) -> bytes:
+    """_codecs.encode, by which Python 3 writes bytes for Python 2."""
+    return text.encode("latin1")
+
+
+_ALLOWED: dict[tuple[str, str], Any] = {
+    ("numpy", "dtype"): _Dtype,
+    ("numpy", "ndarray"): _Array,
+    ("_codecs", "encode"): _encoded,
+    ("copy_reg", "_reconstructor"): _reconstructed,
+    ("copyreg", "_reconstructor"): _reconstructed,
+    ("__builtin__", "object"): object,
+    ("builtins", "object"): object,
+    ("__builtin__", "set"): set,
+    ("builtins", "set"): set,
+    ("chumpy.ch", "Ch"): _Chumpy,
+    **{(module, "_reconstruct"): _reconstructed for module in ("numpy.core.multiarray", "numpy._core.multiarray")},
+    **{(module, "scalar"): _Scalar for module in ("numpy.core.multiarray", "numpy._core.multiarray")},
+    **{(f"scipy.sparse.{module}", "csc_matrix"): _Sparse for module in ("csc", "_csc")},
+}
+
+
+class _Unpickler(pickle._Unpickler):  # in Python: the one in C allocates whatever a pickle's memo index says
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in _ALLOWED:
+            raise pickle.UnpicklingError(f"it names {module}.{name}")
+        return _ALLOWED[module, name]
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise pickle.UnpicklingError("it refers to other files")
+
+
+def _plain(value: Any, done: dict[int, Any]) -> Any:
+    """`value` with its stand-ins turned into what they stand for; done: by identity, so that what a pickle holds many
+    times over is made once."""
+    if not isinstance(value, _StandIn | dict | list | tuple):
+        return value
+    if id(value) not in done:
+        done[id(value)] = None  # what holds itself is cut off there
+        if isinstance(value, _StandIn):
+            done[id(value)] = value.plain(done)
+        elif isinstance(value, dict):
+            done[id(value)] = {key: _plain(item, done) for key, item in value.items()}
+        else:
+            done[id(value)] = type(value)(_plain(item, done) for item in value)
+    return done[id(value)]

@@ -1,0 +1,152 @@
+"""From detected keypoints to points in space: robust triangulation, and which detected person is the subject."""
+
+from itertools import combinations, pairwise
+
+import numpy as np
+
+from hnerf.capture.capture import Capture
+from hnerf.errors import CaptureError
+from hnerf.geometry.camera import Camera
+from hnerf.geometry.triangulation import confidence_of, solve_points
+
+AGREEMENT_REACH = 0.15  # of a person's height in the image: where a detection stops supporting a hypothesis
+UNEXPLAINED = 0.1  # weight of a detection that the other cameras do not support: a camera may be badly calibrated
+CANDIDATES = 8  # combinations of people kept a frame
+JUMP_COST = 4.0  # of one camera's best score, for moving by the person's own height between frames
+USUAL_JUMPS = 2.0  # times the median movement between frames, which cost nothing
+
+
+def subject_keypoints(capture: Capture) -> dict[str, np.ndarray]:
+    """The subject's keypoints in every training camera, (frames, 25, 3) in the order of `capture.frames`.
+
+    Where several people are detected, the subject is whom most cameras agree on (two-view triangulation predicts where
+    each camera must see the person), weighted by size, confidence and nearness to the image's centre, and followed
+    through time (Viterbi). Confidence is 0 where the person is not detected. Test cameras are never read.
+    Raises CaptureError where no frame shows a person in two cameras (in one, if there is only one).
+    """
+    names = capture.train_cameras
+    detections = {name: capture.keypoints(name) for name in names}
+    for name, found in detections.items():
+        if found is None:
+            raise CaptureError(f"{capture.name}: camera {name}: no keypoints; run a keypoint detector on its images")
+    people = [np.nan_to_num(found).astype(np.float64) for found in detections.values() if found is not None]
+    seen = np.array([(p[..., 2] > 0).any((1, 2)) for p in people])  # (cameras, frames)
+    if not (seen.sum(0) >= min(2, len(names))).any():
+        raise CaptureError(f"{capture.name}: no person found in any frame by enough cameras; check the keypoint files")
+    if all(p.shape[1] == 1 for p in people):
+        return {name: p[:, 0] for name, p in zip(names, people, strict=True)}
+    cameras = [capture.cameras[name] for name in names]
+    choice = _follow([_frame_candidates(cameras, [p[i] for p in people]) for i in range(len(capture.frames))], people)
+    chosen = {}
+    for c, name in enumerate(names):
+        chosen[name] = people[c][np.arange(len(choice)), choice[:, c]] * (choice[:, c] >= 0)[:, None, None]
+    return chosen
+
+
+def _frame_candidates(cameras: list[Camera], people: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The best combinations of people in one frame: indices (n, C), -1 for nobody, and their scores (n,), the best one
+    first; with and without those whom no other camera sees where they are.
+
+    people: per camera (P, 25, 3). The score is the mean over cameras of prominence times agreement.
+    """
+    prominence = [_prominence(camera, found) for camera, found in zip(cameras, people, strict=True)]
+    agreements = _agreements(cameras, people) if len(cameras) > 1 else [np.eye(len(people[0]))]
+    if len(agreements[0]) == 0:  # one camera alone shows somebody
+        agreements = [np.zeros((1, len(found))) for found in people]
+    picks = np.full((len(agreements[0]), len(cameras)), -1)
+    scores, supported = np.zeros(picks.shape), np.zeros(picks.shape, bool)
+    for c, agreement in enumerate(agreements):
+        if not prominence[c].any():
+            continue
+        value = (UNEXPLAINED + agreement) * prominence[c]
+        picks[:, c] = value.argmax(1)
+        scores[:, c] = value.max(1) / len(cameras)
+        supported[:, c] = np.take_along_axis(agreement, picks[:, c : c + 1], 1)[:, 0] > 0
+    picks = np.concatenate([picks, np.where(supported, picks, -1), np.full((1, len(cameras)), -1)])
+    total = np.concatenate([scores.sum(1), np.where(supported, scores, 0).sum(1), [0.0]])
+    best = np.argsort(-total, kind="stable")
+    _, first = np.unique(picks[best], axis=0, return_index=True)
+    kept = best[np.sort(first)[:CANDIDATES]]
+    return picks[kept], total[kept]
+
+
+def _agreements(cameras: list[Camera], people: list[np.ndarray]) -> list[np.ndarray]:
+    """How well each hypothesis (a person in one camera being a person in another) explains each person: per camera
+    (n, P), from 0 to 1."""
+    projections = np.stack([camera.projection for camera in cameras])
+    shown = [found[found[..., 2].any(1)] for found in people]
+    hypotheses_m = [np.zeros((0, 25, 3))]
+    for a, b in combinations(range(len(cameras)), 2):
+        views = np.stack(
+            [
+                shown[a].repeat(len(shown[b]), axis=0).reshape(-1, 3),
+                np.tile(shown[b], (len(shown[a]), 1, 1)).reshape(-1, 3),
+            ]
+        )
+        hypotheses_m.append(solve_points(projections[[a, b]], views, confidence_of(views)).reshape(-1, 25, 3))
+    points_m = np.concatenate(hypotheses_m)
+    return [_support(camera, points_m, found) for camera, found in zip(cameras, people, strict=True)]
+
+
+def _support(camera: Camera, points_m: np.ndarray, people: np.ndarray) -> np.ndarray:
+    """(n, P): confidence-weighted share of the keypoints of people (P, 25, 3) that points (n, 25, 3) project onto."""
+    uv, depth_m = camera.project(points_m)
+    height_px = person_heights_px(people).clip(1)
+    distance = np.linalg.norm(uv[:, None] - people[None, ..., :2], axis=-1) / height_px[:, None]
+    hit = np.where((depth_m[:, None] > 0) & np.isfinite(distance), 1 - distance / AGREEMENT_REACH, 0).clip(0)
+    weight = people[..., 2]
+    return (hit * weight).sum(-1) / weight.sum(-1).clip(1e-9)
+
+
+def person_heights_px(people: np.ndarray) -> np.ndarray:
+    """Largest side of each person's keypoint box, (P,)."""
+    visible = people[..., 2:] > 0
+    low = np.where(visible, people[..., :2], np.inf).min(-2)
+    high = np.where(visible, people[..., :2], -np.inf).max(-2)
+    return (high - low).max(-1).clip(0)
+
+
+def _prominence(camera: Camera, people: np.ndarray) -> np.ndarray:
+    """Size x confidence x centrality of each person, (P,), from 0 to 1."""
+    size_px = np.array([camera.width_px, camera.height_px])
+    weight = people[..., 2:]
+    centre = (people[..., :2] * weight).sum(-2) / weight.sum(-2).clip(1e-9)
+    off_centre = np.linalg.norm((centre - size_px / 2) / size_px, axis=-1)
+    height = (person_heights_px(people) / camera.height_px).clip(0, 1)
+    return height * people[..., 2].mean(-1).clip(0, 1) * np.exp(-2 * off_centre**2)
+
+
+def _follow(candidates: list[tuple[np.ndarray, np.ndarray]], people: list[np.ndarray]) -> np.ndarray:
+    """The most probable sequence of combinations, (frames, C): Viterbi with a cost for jumping in the image, by more
+    than is usual here. Who is not seen is where he was seen last."""
+    shown = [_shown([p[i] for p in people], picks) for i, (picks, _) in enumerate(candidates)]
+    best = [[one[:1] for one in frame] for frame in shown]
+    usual = USUAL_JUMPS * float(np.median([_jump(a, b)[0, 0] for a, b in pairwise(best)])) if len(best) > 1 else 0.0
+    last, total, back = shown[0], candidates[0][1], []
+    for now, (picks, score) in zip(shown[1:], candidates[1:], strict=True):
+        best_before = total[:, None] - JUMP_COST * _jump(last, now, usual)
+        back.append(best_before.argmax(0))
+        total = best_before.max(0) + score
+        seen = (picks >= 0).T[..., None, None]
+        last = [np.where(is_seen, new, old[back[-1]]) for is_seen, new, old in zip(seen, now, last, strict=True)]
+    path = [int(total.argmax())]
+    for step in reversed(back):
+        path.append(int(step[path[-1]]))
+    return np.stack([picks[k] for (picks, _), k in zip(candidates, reversed(path), strict=True)])
+
+
+def _shown(people: list[np.ndarray], picks: np.ndarray) -> list[np.ndarray]:
+    """Per camera the keypoints (n, 25, 3) of the picked people of one frame, 0 for nobody."""
+    return [np.where((pick >= 0)[:, None, None], found[pick], 0.0) for found, pick in zip(people, picks.T, strict=True)]
+
+
+def _jump(before: list[np.ndarray], now: list[np.ndarray], usual: float = 0.0) -> np.ndarray:
+    """Mean over cameras of the movement beyond `usual` in person heights, at most 1 a camera, from each of people
+    (n, 25, 3) to each of others (m, 25, 3): (n, m)."""
+    jumps = np.zeros((len(before[0]), len(now[0])))
+    for was, is_now in zip(before, now, strict=True):
+        a, b = was[:, None], is_now[None]
+        both = np.minimum(a[..., 2], b[..., 2])
+        distance = np.linalg.norm(a[..., :2] - b[..., :2], axis=-1) / person_heights_px(b).clip(1)[..., None]
+        jumps += (((distance - usual).clip(0, 1) * both).sum(-1) / both.sum(-1).clip(1e-9)) / len(before)
+    return jumps

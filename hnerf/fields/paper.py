@@ -1,0 +1,180 @@
+"""H-NeRF as published: F and DH of the paper, whole rays, background included.
+
+Distances are in scene units (metres / scene_m) inside the networks and losses, metres outside. One network F serves the
+coarse and the fine samples; the fine ones are drawn from the coarse weights without a gradient, and the losses see
+both.
+"""
+
+import torch
+from torch import Tensor
+
+from hnerf.body.canonical import FAR_M, Descriptor, PoseCorrection, PosedBodies
+from hnerf.body.rig import Rig
+from hnerf.config import PaperFieldSettings
+from hnerf.fields.base import Field
+from hnerf.fields.compositing import alpha_from_density, occupancy, weights_from_alpha
+from hnerf.fields.conditions import Conditions, Draws
+from hnerf.fields.mlp import RadianceMLP, ResidualMLP
+from hnerf.fields.samples import RaySamples
+from hnerf.fields.shell import Boxes, box_interval, stratified
+
+OUTSIDE_DISTANCE = 1.0  # the constant d of a point outside the person's box
+
+
+class PaperField(Field):
+    """F and DH; dynamic: on (s, d) and theta; static (one frame): on x itself, unconditioned."""
+
+    own_background = True
+    centre_m: Tensor
+
+    def __init__(self, rig: Rig, root: Tensor, settings: PaperFieldSettings, static: bool):
+        """root (n, 4, 4): the training poses, which the scene is centred on."""
+        super().__init__()
+        self.settings, self.static = settings, static
+        self.whole_images = settings.rays == "image"
+        self.samples, self.gamma = settings.samples, settings.gamma
+        self.register_buffer("canonical_m", rig.vertices_m.clone())
+        self.register_buffer("centre_m", root[:, :3, 3].mean(0))
+        turn = 12 if settings.root_condition else 0
+        point, pose, self.turn = (3, 0, 0) if static else (4, 3 * int(rig.free.sum()), turn)
+        self.radiance = RadianceMLP(point, pose, self.turn, settings.view_octaves, settings.bf16)
+        self.residual = ResidualMLP(point, pose, settings.bf16)
+
+    def region(self, bodies: PosedBodies, conditions: Conditions) -> Boxes:
+        """Box B of each pose: the body's extent and a margin."""
+        return Boxes.around(bodies.vertices_m, self.margin_m)
+
+    def parameter_groups(self) -> list[dict]:
+        """Adam groups."""
+        return [{"params": list(self.parameters()), "lr": self.settings.learning_rate}]
+
+    def sample(
+        self,
+        bodies: PosedBodies,
+        region: Boxes,
+        origins_m: Tensor,
+        directions: Tensor,
+        frame: Tensor,
+        conditions: Conditions,
+        draws: Draws,
+        correction: PoseCorrection | None = None,
+    ) -> tuple[RaySamples, Tensor]:
+        """As FastField.sample, over coarse and fine samples together (K = 2 x samples)."""
+        half_m, inner = self.settings.scene_m, self.settings.box_samples
+        near, far = box_interval(origins_m, directions, self.centre_m - half_m, self.centre_m + half_m)
+        coarse = stratified(near, far, draws.jitter[:, inner:])
+        if inner:
+            entry, leave = (t.clamp(near, far) for t in region.interval(origins_m, directions, frame))
+            coarse = torch.cat([coarse, stratified(entry, leave, draws.jitter[:, :inner])], 1).sort(1).values
+        view = directions if draws.view is None else directions + draws.view
+        depths = coarse
+        with torch.no_grad():
+            rough = self._evaluate(bodies, region, origins_m, directions, view, frame, conditions, coarse, draws, None)
+            finer = resample(coarse, near, far, weights_from_alpha(rough.alpha), draws.finer)
+            depths = torch.cat([coarse, finer], 1).sort(1).values
+        out = self._evaluate(bodies, region, origins_m, directions, view, frame, conditions, depths, draws, correction)
+        return out, depths
+
+    def _evaluate(
+        self,
+        bodies: PosedBodies,
+        region: Boxes,
+        origins_m: Tensor,
+        directions: Tensor,
+        view: Tensor,
+        frame: Tensor,
+        conditions: Conditions,
+        depths: Tensor,
+        draws: Draws,
+        correction: PoseCorrection | None,
+    ) -> RaySamples:
+        rays, samples = depths.shape
+        points = (origins_m[:, None] + directions[:, None] * depths[..., None]).flatten(0, 1)
+        row = frame.repeat_interleave(samples)
+        inside = ((points >= region.lower_m[row]) & (points <= region.upper_m[row])).all(-1)
+        train = draws.probe is not None and torch.is_grad_enabled()
+        pick = torch.nonzero(inside)[:, 0]
+        queried = points[pick].detach().requires_grad_(train)
+        described = bodies.describe(queried, row[pick], FAR_M, correction)
+        residual_in = self._residual(queried, described, row[pick], conditions)
+        d_in = described.d / self.settings.scene_m
+        norms = d_in.new_zeros(0)
+        if train:
+            gradient = torch.autograd.grad(
+                (d_in + residual_in).sum() * self.settings.scene_m, queried, create_graph=True
+            )
+            norms = gradient[0].norm(dim=-1)
+        d = points.new_full((len(points),), OUTSIDE_DISTANCE).index_copy(0, pick, d_in)
+        residual = torch.zeros_like(d).index_copy(0, pick, residual_in)
+        density, colour = self._radiance(points, described, pick, row, view.repeat_interleave(samples, 0), conditions)
+        spacing = torch.diff(depths, dim=1, append=depths[:, -1:] + 1e10) / self.settings.scene_m
+        density = density.view(rays, samples)
+        d, residual = d.view(rays, samples), residual.view(rays, samples)
+        return RaySamples(
+            alpha=alpha_from_density(density, spacing),
+            alpha_dot=occupancy(d + residual, self.gamma),
+            in_box=inside.float().view(rays, samples),
+            colour=colour.view(rays, samples, 3),
+            density=density,
+            d=d,
+            residual=residual,
+            gradient_norm=norms,
+            beyond=torch.zeros_like(draws.beyond),
+        )
+
+    def _scaled(self, points_m: Tensor) -> Tensor:
+        return (points_m - self.centre_m) / self.settings.scene_m
+
+    def _residual(self, points_m: Tensor, described: Descriptor, row: Tensor, conditions: Conditions) -> Tensor:
+        if self.static:
+            return self.residual(self._scaled(points_m), conditions.pose[row, :0])
+        scaled = torch.cat([described.s, described.d[:, None]], -1) / self.settings.scene_m
+        return self.residual(scaled, conditions.pose[row])
+
+    def _radiance(
+        self, points_m: Tensor, described: Descriptor, pick: Tensor, row: Tensor, view: Tensor, conditions: Conditions
+    ) -> tuple[Tensor, Tensor]:
+        """Outside the box the input is x with a constant distance, and neither pose nor root counts."""
+        scaled = self._scaled(points_m)
+        if self.static:
+            return self.radiance(scaled, conditions.pose[row, :0], conditions.root[row, :0], view)
+        outside = torch.cat([scaled, torch.full_like(scaled[:, :1], OUTSIDE_DISTANCE)], -1)
+        inner = torch.cat([described.s, described.d[:, None]], -1) / self.settings.scene_m
+        pose = torch.zeros_like(conditions.pose[row]).index_copy(0, pick, conditions.pose[row[pick]])
+        turn = conditions.root[:, : self.turn]
+        root = torch.zeros_like(turn[row]).index_copy(0, pick, turn[row[pick]])
+        return self.radiance(outside.index_copy(0, pick, inner), pose, root, view)
+
+    def coverage(self, samples: RaySamples) -> Tensor:
+        """By the SDF: its greatest occupancy along a ray, which is what the loss `seg` compares with the mask."""
+        return (samples.in_box * samples.alpha_dot).amax(1)
+
+    def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
+        """d_hat (N,) metres at points (N, 3) around the first body."""
+        row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
+        described = bodies.describe(points_m, row, FAR_M, exact_sign=True)
+        return described.d + self.settings.scene_m * self._residual(points_m, described, row, conditions)
+
+    def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
+        """c (N, 3) at points around the first body seen along directions (N, 3)."""
+        row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
+        described = bodies.describe(points_m, row, FAR_M)
+        return self._radiance(
+            points_m, described, torch.arange(len(row), device=row.device), row, directions, conditions
+        )[1]
+
+
+def resample(middles: Tensor, near: Tensor, far: Tensor, weights: Tensor, uniform: Tensor) -> Tensor:
+    """Depths (R, K) drawn from piecewise constant weights (R, K) (Mildenhall et al. 2020, section 5.2).
+
+    middles (R, K): the samples that the weights belong to; their cells meet half-way. uniform (R, K) in [0, 1): strata.
+    """
+    edges = torch.cat([near[:, None], (middles[:, 1:] + middles[:, :-1]) / 2, far[:, None]], 1)
+    cumulative = torch.cat([torch.zeros_like(near)[:, None], (weights + 1e-5).cumsum(1)], 1)
+    cumulative = cumulative / cumulative[:, -1:]
+    count = uniform.shape[1]
+    wanted = (torch.arange(count, device=near.device) + uniform) / count
+    upper = torch.searchsorted(cumulative, wanted.contiguous(), right=True).clamp(1, edges.shape[1] - 1)
+    below, above = cumulative.gather(1, upper - 1), cumulative.gather(1, upper)
+    start, end = edges.gather(1, upper - 1), edges.gather(1, upper)
+    return start + (end - start) * (wanted - below) / (above - below).clamp(min=1e-9)

@@ -1,0 +1,116 @@
+"""Closest points, sides and ray hits of a triangle mesh, by warp's bounding-volume hierarchy."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+import numpy as np
+import trimesh
+import warp as wp
+
+from hnerf.geometry.rays import RayHits, cast, vectors
+
+wp.config.log_level = wp.LOG_ERROR
+
+REACH_M = 10.0
+RAY_START_M = 2.0e-3  # escape rays start this far off their surface, so that they do not meet it at once
+BLOCKS = (8, 4, 2, 1)  # nodes on a side of the blocks of `Surface.occupancy`
+
+
+@wp.kernel
+def _closest_kernel(
+    mesh: wp.uint64, points: wp.array(dtype=wp.vec3), distance: wp.array(dtype=float), face: wp.array(dtype=int)
+):
+    i = wp.tid()
+    query = wp.mesh_query_point_no_sign(mesh, points[i], REACH_M)
+    distance[i] = wp.length(points[i] - wp.mesh_eval_position(mesh, query.face, query.u, query.v))
+    face[i] = query.face
+
+
+@wp.kernel
+def _near_kernel(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), reach_m: float, near: wp.array(dtype=int)):
+    i = wp.tid()
+    if wp.mesh_query_point_no_sign(mesh, points[i], reach_m).result:
+        near[i] = 1
+
+
+@wp.kernel
+def _inside_kernel(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), inside: wp.array(dtype=int)):
+    i = wp.tid()
+    query = wp.mesh_query_point_sign_winding_number(mesh, points[i], REACH_M)
+    if query.result and query.sign < 0.0:
+        inside[i] = 1
+
+
+@wp.kernel
+def _escape_kernel(
+    mesh: wp.uint64, points: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3), escapes: wp.array(dtype=int)
+):
+    i = wp.tid()
+    for k in range(directions.shape[0]):
+        start = points[i] + directions[k] * RAY_START_M
+        if not wp.mesh_query_ray(mesh, start, directions[k], REACH_M).result:
+            escapes[i] = 1
+            return
+
+
+class Surface:
+    """A mesh ready for queries. Points and directions are (N, 3), metres."""
+
+    def __init__(self, mesh: trimesh.Trimesh):
+        self.mesh = mesh
+        self._warp_mesh = wp.Mesh(
+            points=vectors(mesh.vertices),
+            indices=wp.array(np.asarray(mesh.faces, np.int32).ravel(), dtype=int),
+            support_winding_number=True,
+        )
+
+    def closest(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distance to the surface in metres (N,) and the face nearest (N,)."""
+        n = len(points_m)
+        distance, face = wp.zeros(n, dtype=float), wp.zeros(n, dtype=int)
+        wp.launch(_closest_kernel, n, [self._warp_mesh.id, vectors(points_m), distance, face])
+        return distance.numpy(), face.numpy()
+
+    def inside(self, points_m: np.ndarray) -> np.ndarray:
+        """Whether the winding number is over one half, (N,) bool (Jacobson et al. 2013)."""
+        inside = wp.zeros(len(points_m), dtype=int)
+        wp.launch(_inside_kernel, len(points_m), [self._warp_mesh.id, vectors(points_m), inside])
+        return inside.numpy() > 0
+
+    def escapes(self, points_m: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Whether a ray along any of the directions (K, 3) leaves a point without meeting the surface, (N,) bool."""
+        escapes = wp.zeros(len(points_m), dtype=int)
+        wp.launch(_escape_kernel, len(points_m), [self._warp_mesh.id, vectors(points_m), vectors(directions), escapes])
+        return escapes.numpy() > 0
+
+    def cast(self, origins_m: np.ndarray, directions: np.ndarray) -> RayHits:
+        """First hits of rays, from an origin each or from one (3,)."""
+        return cast(self._warp_mesh, origins_m, directions)
+
+    def near(self, points_m: np.ndarray, reach_m: float) -> np.ndarray:
+        """Whether the surface comes within reach of a point, (N,) bool."""
+        near = wp.zeros(len(points_m), dtype=int)
+        wp.launch(_near_kernel, len(points_m), [self._warp_mesh.id, vectors(points_m), reach_m, near])
+        return near.numpy() > 0
+
+    def occupancy(self, lower_m: np.ndarray, upper_m: np.ndarray, nodes: int) -> np.ndarray:
+        """`inside` at the nodes^3 grid points of a box, bool; nodes is a multiple of the coarsest block.
+
+        A block whose corners are nearer to its middle than the surface is lies on its middle's side; others are split.
+        (An open mesh also changes sides away from its surface, where the winding number closes it over a hole: a block
+        there is decided by its middle.)
+        """
+        step_m = (upper_m - lower_m) / (nodes - 1)
+        occupied = np.zeros((nodes,) * 3, bool)
+        blocks = _cube(nodes // BLOCKS[0])
+        for side in BLOCKS:
+            middles_m = lower_m + (blocks * side + (side - 1) / 2) * step_m
+            to_split = (side > 1) & self.near(middles_m, (side - 1) / 2 * float(np.linalg.norm(step_m)))
+            members = (blocks[~to_split] * side)[:, None] + _cube(side)
+            occupied[tuple(np.moveaxis(members, -1, 0))] = self.inside(middles_m[~to_split])[:, None]
+            blocks = ((blocks[to_split] * 2)[:, None] + _cube(2)).reshape(-1, 3)
+        return occupied
+
+
+def _cube(side: int) -> np.ndarray:
+    """The integer points of [0, side)^3, (side^3, 3)."""
+    return np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3)

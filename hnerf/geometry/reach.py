@@ -1,0 +1,49 @@
+"""Which pixels of a camera can show anything of a body."""
+
+import itertools
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from hnerf.geometry.camera import Camera
+
+NEAREST_PERCENT = 1  # of the vertices: a finger alone does not widen the reach of all others
+FARTHEST_PX = 1e5  # from the image's corner: more is not asked of what fills polygons
+Reached = Callable[[Camera, np.ndarray], np.ndarray]
+"""Which pixels (H, W) of a camera can show anything of a body with vertices (V, 3)."""
+
+
+def everywhere(camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
+    """(H, W) bool: all pixels."""
+    return np.ones((camera.height_px, camera.width_px), bool)
+
+
+def within_box(camera: Camera, vertices_m: np.ndarray, margin_m: float) -> np.ndarray:
+    """(H, W) bool: pixels whose rays meet the extent of the body (V, 3) and a margin; all where that lies about the
+    camera."""
+    lower_m, upper_m = vertices_m.min(0) - margin_m, vertices_m.max(0) + margin_m
+    corners_px, depth_m = camera.project(np.array(list(itertools.product(*zip(lower_m, upper_m, strict=True)))))
+    if depth_m.min() <= 0:
+        return everywhere(camera, vertices_m)
+    met = np.zeros((camera.height_px, camera.width_px), np.uint8)
+    outline = cv2.convexHull(corners_px.clip(-FARTHEST_PX, FARTHEST_PX).round().astype(np.int32))
+    return cv2.fillConvexPoly(met, outline, 1) > 0
+
+
+def within_reach(camera: Camera, vertices_m: np.ndarray, reach_m: float) -> np.ndarray:
+    """(H, W) bool: pixels whose rays pass within about `reach_m` of the body; its vertices before the camera, in the
+    image or beside it, each a disc of the radius that the nearest ones need."""
+    size_px = np.array([camera.width_px, camera.height_px])
+    xy, depth_m = camera.project(vertices_m)
+    xy, depth_m = xy[depth_m > 0], depth_m[depth_m > 0]
+    if not len(depth_m):
+        return np.zeros(size_px[::-1], bool)
+    nearest_m, focal_px = np.percentile(depth_m, NEAREST_PERCENT), max(camera.K[0, 0], camera.K[1, 1])
+    radius = int(np.ceil(min(reach_m * focal_px / nearest_m, np.hypot(*size_px))))
+    xy = np.round(xy) + radius
+    x, y = xy[((xy >= 0) & (xy < size_px + 2 * radius)).all(1)].astype(int).T
+    outside = np.ones(size_px[::-1] + 2 * radius, np.uint8)
+    outside[y, x] = 0
+    apart_px = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return apart_px[radius:-radius, radius:-radius] <= radius

@@ -1,0 +1,125 @@
+"""Whether a result shows what the paper says."""
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from hnerf.study.benchmark.curves import bin_edges, binned
+from hnerf.study.benchmark.results import BINS, clouds, scored, sweep_curves
+from hnerf.tables import pick
+
+Result = Mapping[str, Any]
+Finding = tuple[bool, str]  # whether a figure is as the paper says, and the figure in words
+
+FIGURES = {
+    "psnr": ("{:.1f} dB", 1),
+    "geometry.chamfer_l2_e3": ("Chamfer {:.2f}", -1),
+}  # how it is told; -1: less is better
+WEAK = 0.5  # correlation below which nothing is said to depend
+NO_SURFACE = 0.1  # IoU
+
+
+def told(result: Result) -> list[str]:
+    """A line of Markdown for each claim of the study: whether it is seen in the figures, and which these are."""
+    lines = []
+    for claim in result["claims"]:
+        findings = list(CHECKS[claim["check"]](result))
+        verdict = "yes" if all(seen for seen, _ in findings) else "no"
+        figures = "; ".join(words for _, words in findings)
+        lines.append(
+            f"- The paper: “{claim['says']}” Seen here: {f'{verdict}: {figures}' if findings else 'no figures'}."
+        )
+    return lines
+
+
+def more_is_better(result: Result) -> Iterator[Finding]:
+    """Of every method: the figures with the most cameras or frames are better than with the fewest."""
+    for key, (form, sign) in FIGURES.items():
+        for name, curve in sweep_curves(result, key).items():
+            (_, few), (_, many) = curve[0], curve[-1]
+            if len(curve) > 1:
+                yield sign * (many - few) > 0, f"{name} {form.format(few)} to {form.format(many)}"
+
+
+def loses_least(result: Result) -> Iterator[Finding]:
+    """From the most cameras or frames to the fewest, the first method loses less than each other."""
+    for key, (form, sign) in FIGURES.items():
+        lost = {name: sign * (c[-1][1] - c[0][1]) for name, c in sweep_curves(result, key).items() if len(c) > 1}
+        first = result["methods"][0]
+        for name in [name for name in lost if name != first] if first in lost else ():
+            words = f"{first} loses {form.format(lost[first])}, {name} {form.format(lost[name])}"
+            yield lost[first] < lost[name], words
+
+
+def ahead(result: Result) -> Iterator[Finding]:
+    """In every variant the first method's figures are better than each other's."""
+    for title, variant in result["variants"].items():
+        for key, (form, sign) in FIGURES.items():
+            values = {name: pick(scores[scores["split"]], key) for name, scores in scored(variant).items()}
+            known: dict[str, float] = {name: value for name, value in values.items() if value is not None}
+            own = known.pop(result["methods"][0], None)
+            if own is None or not known:
+                continue
+            value, best = max((sign * value, name) for name, value in known.items())
+            words = f"{title}: {result['methods'][0]} {form.format(own)}, {best} {form.format(sign * value)}"
+            yield sign * own > value, words
+
+
+def falls_with_angle(result: Result) -> Iterator[Finding]:
+    """Of every method: images farthest in angle from training cameras are worse than the nearest."""
+    for title, by_method in _angles(result):
+        for name, bins in by_method.items():
+            (near, at_near, _), (far, at_far, _) = bins[0], bins[-1]
+            if len(bins) > 1:
+                words = f"{title}: {name} {at_near:.1f} dB at {near:.0f}°, {at_far:.1f} at {far:.0f}°"
+                yield at_far < at_near, words
+
+
+def ahead_at_every_angle(result: Result) -> Iterator[Finding]:
+    """In every bin of angles the first method is better than each other."""
+    for title, by_method in _angles(result):
+        own = by_method.pop(result["methods"][0], [])
+        for name, bins in by_method.items() if own else ():
+            leads = [mine - other for (_, mine, _), (_, other, _) in zip(own, bins, strict=True)]
+            yield min(leads) > 0, f"{title}: {min(leads):+.1f} to {max(leads):+.1f} dB to {name}"
+
+
+def no_trend_with_pose(result: Result) -> Iterator[Finding]:
+    """The first method's images of new poses do not depend on how far these are from training's."""
+    for title, variant in result["variants"].items():
+        points = clouds(variant, "novel_pose", "pose_distance_deg").get(result["methods"][0], [])
+        if len({x for x, _ in points}) > 2:
+            r = float(np.corrcoef(np.array(points).T)[0, 1])
+            yield abs(r) < WEAK, f"{title}: correlation {r:+.2f} over {len(points)} images"
+
+
+def others_have_no_surface(result: Result) -> Iterator[Finding]:
+    """Of no method but the first the surface covers the person's volume."""
+    for title, variant in result["variants"].items():
+        for name, scores in itertools.islice(scored(variant).items(), 1, None):
+            iou = pick(scores[scores["split"]], "geometry.iou") or 0.0
+            yield iou < NO_SURFACE, f"{title}: {name} IoU {iou:.2f}"
+
+
+CHECKS: dict[str, Callable[[Result], Iterator[Finding]]] = {
+    check.__name__: check
+    for check in (
+        more_is_better,
+        loses_least,
+        ahead,
+        falls_with_angle,
+        ahead_at_every_angle,
+        no_trend_with_pose,
+        others_have_no_surface,
+    )
+}
+
+
+def _angles(result: Result) -> Iterator[tuple[str, dict[str, list[tuple[float, float, int]]]]]:
+    """Of each variant: by method, mean angle, mean PSNR and count of every bin of view angles."""
+    for title, variant in result["variants"].items():
+        found = clouds(variant, "novel_view", "view_angle_deg")
+        edges = bin_edges(found.values(), BINS)
+        yield title, {name: binned(points, edges) for name, points in found.items()}

@@ -1,0 +1,170 @@
+"""What a training was worth: its snapshots and its end scored on what was held out, images timed."""
+
+import json
+import logging
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from hnerf.avatar.avatar import Avatar
+from hnerf.avatar.trained import load_avatar
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.capture import Capture, read_rgb, write_image
+from hnerf.errors import CaptureError
+from hnerf.evaluation.columns import shown_as, why_not_shown
+from hnerf.evaluation.evaluate import LPIPS, PROTOCOL, mesh_frames, score_meshes
+from hnerf.evaluation.ground_truth import GroundTruth
+from hnerf.evaluation.images import known_views, render, score_split, unscored
+from hnerf.evaluation.pictures import crop, frame_person
+from hnerf.evaluation.views import PRIMARY, SPLITS, View, all_views, split_frames
+from hnerf.evenly_spaced import evenly_spaced
+from hnerf.geometry.camera import Camera
+from hnerf.study.benchmark.plan import ScoringSettings
+from hnerf.study.benchmark.training_distance import pose_distances_deg, view_angle_deg
+from hnerf.study.machine import machine
+
+log = logging.getLogger("hnerf.study")
+
+PICTURES = 2
+REPEATS = 3
+LONG_S = 10.0  # an image that takes as long is timed once
+HOW = (
+    "Training seconds: the trainer's own clock, without reading the capture. Curves: fewer images and surfaces than "
+    "tables, the same ones at every point and for all methods, new poses animated; the last point is the finished "
+    "field. "
+    f"Time of a frame: median of {REPEATS} renderings of a whole image, of one where it takes over {LONG_S:.0f} s. "
+    "Peak memory: on a CPU that of the training process, all libraries included; on a GPU what tensors took."
+)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What scoring needs besides a training: the capture with calibrated cameras, the body as fitted before training,
+    and the truth where there is one."""
+
+    capture: Capture
+    fitted: BodyFit
+    truth: GroundTruth | None
+    device: str
+
+
+def score(scene: Scene, training: Path, settings: ScoringSettings, out: Path) -> dict[str, Any]:
+    """Write `scores.json`, renderings and meshes into `out`; what scores.json holds.
+
+    training: the folder that training left. A figure that cannot be had is null, and a reason stands beside it.
+    """
+    avatar, split = load_avatar(training, scene.device), settings.split
+    lacking = {name: why for name in SPLITS if (why := why_not_shown(name, training))}
+    found: dict[str, Any] = {"machine": machine(), "protocol": f"{PROTOCOL} {HOW}", "lpips": LPIPS}
+    found["split"], found["training"] = split, json.loads((training / "report.json").read_text())
+    scored = scene.capture.test_cameras and split not in lacking
+    found["curve"] = curve(scene, split, training, avatar, settings, out) if scored else []
+    for name in SPLITS:
+        if name in lacking:
+            found[name] = unscored(lacking[name])
+            if name in PRIMARY:
+                found[name] |= {"geometry": None, "geometry_reason": lacking[name]}
+            continue
+        column = shown_as(name, avatar, scene.fitted)
+        found[name] = score_at(scene, column, name, settings.images, settings.meshes, out)
+        add_nearness(scene.capture, column, name, found[name])
+    found["pictures"] = write_pictures(scene, split, found[split]["per_image"], out)
+    camera = next(iter(scene.capture.cameras.values()))
+    found["frame_seconds"] = {
+        str(side): frame_seconds(avatar, camera, scene.capture.train_frames[0], side)
+        for side in settings.frame_sizes_px
+    }
+    (out / "scores.json").write_text(json.dumps(found, indent=1))
+    return found
+
+
+def score_end(scene: Scene, training: Path, settings: ScoringSettings, out: Path) -> dict[str, Any]:
+    """Write `scores.json` with what training reported and the last point of its curve alone; what it holds."""
+    avatar, split = load_avatar(training, scene.device), settings.split
+    scored = scene.capture.test_cameras and not why_not_shown(split, training)
+    rows = curve(scene, split, training, avatar, settings, out) if scored else []
+    found = {"training": json.loads((training / "report.json").read_text()), "curve": rows[-1:]}
+    (out / "scores.json").write_text(json.dumps(found, indent=1))
+    return found
+
+
+def curve(
+    scene: Scene, split: str, training: Path, finished: Avatar, settings: ScoringSettings, out: Path
+) -> list[dict[str, Any]]:
+    """Seconds of training and figures of every snapshot, and last of the finished field, in the order of time."""
+    end_s = json.loads((training / "report.json").read_text())["field_seconds"]
+    taken = {json.loads((f / "settings.json").read_text())["seconds"]: f for f in (training / "snapshots").glob("*")}
+    models = [(s, load_avatar(taken[s], scene.device)) for s in sorted(taken) if s < end_s]
+    rows = []
+    for seconds, avatar in [*models, (end_s, finished)]:
+        folder = out / "snapshots" / f"{seconds:g}"
+        folder.mkdir(parents=True)
+        column = shown_as(split, avatar, scene.fitted)
+        figures = score_at(scene, column, split, settings.snapshot_images, settings.snapshot_meshes, folder)
+        del figures["per_image"]
+        rows.append({"seconds": seconds} | figures)
+        log.info("after %.0f s: %s dB", seconds, figures["psnr"])
+    return rows
+
+
+def score_at(scene: Scene, avatar: Avatar, split: str, images: int | None, meshes: int, out: Path) -> dict[str, Any]:
+    """A split's figures in the form of evaluation, of its avatar and at most as many images and surfaces of which the
+    truth is known; None is all."""
+    views = all_views(scene.capture, split)
+    views = evenly_spaced(known_views(views, scene.truth) or views, images or len(views))
+    if views and scene.capture.test_cameras:
+        render({split: avatar}, scene.capture, views, out)
+    found = score_split(scene.capture, split, views, scene.truth, out)
+    if split not in PRIMARY:
+        return found
+    if not meshes:
+        return found | {"geometry": None, "geometry_reason": "the study asks for no surface here"}
+    true_meshes = scene.truth.meshes() if scene.truth else {}
+    frames = [f for f in mesh_frames(split_frames(scene.capture, split), true_meshes, meshes) if f in true_meshes]
+    try:
+        return found | score_meshes(avatar, frames, true_meshes, out)
+    except CaptureError as error:  # a result of young or failed models, not a fault of the study
+        return found | {"geometry": None, "geometry_reason": str(error)}
+
+
+def write_pictures(scene: Scene, split: str, per_image: list[dict[str, Any]], out: Path) -> list[dict[str, Any]]:
+    """Write a few scored renderings and the truth, cut to the person, as `pictures/<k>-{render,truth}.png`; which."""
+    chosen = [{key: row[key] for key in ("camera", "frame")} for row in evenly_spaced(per_image, PICTURES)]
+    for k, row in enumerate(chosen):
+        assert scene.truth is not None  # something was scored
+        box = frame_person(scene.truth.mask(**row))
+        both = {"render": read_rgb(View(split, **row).path(out)), "truth": scene.truth.on_black(**row)[0]}
+        for name, picture in both.items():
+            write_image(out / "pictures" / f"{k}-{name}.png", crop(picture, box))
+    return chosen
+
+
+def add_nearness(capture: Capture, avatar: Avatar, split: str, found: dict[str, Any]) -> None:
+    """Put beside each image's and surface's figures how far its view and its pose are from those of training."""
+    apart_deg = pose_distances_deg(avatar.body, split_frames(capture, split), capture.train_frames)
+    vertices_m = avatar.body.vertices_m().cpu().numpy()
+    middles_m = (vertices_m.min(1) + vertices_m.max(1)) / 2
+    trained = [capture.cameras[name] for name in capture.train_cameras]
+    for row in found["per_image"]:
+        middle_m = middles_m[avatar.body.index(row["frame"])]
+        row["view_angle_deg"] = view_angle_deg(capture.cameras[row["camera"]], trained, middle_m)
+    for row in [*found["per_image"], *((found.get("geometry") or {}).get("per_surface", ()))]:
+        row["pose_distance_deg"] = apart_deg[row["frame"]]
+
+
+def frame_seconds(avatar: Avatar, camera: Camera, frame: int, side_px: int) -> float:
+    """Median seconds of rendering a fitted pose to an image of this longest side."""
+    scale = side_px / max(camera.width_px, camera.height_px)
+    resized = camera.resized(round(camera.width_px * scale), round(camera.height_px * scale))
+    k = avatar.body.index(frame)
+    seconds: list[float] = []
+    while not seconds or (len(seconds) < REPEATS and seconds[0] < LONG_S):
+        started = time.perf_counter()
+        with torch.no_grad():
+            avatar.render(resized, avatar.body.theta[k], avatar.body.root[k]).rgb.cpu()
+        seconds.append(time.perf_counter() - started)
+    return float(np.median(seconds))

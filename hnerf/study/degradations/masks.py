@@ -1,0 +1,81 @@
+"""Masks that are too small, too large, full of holes, or lack a limb."""
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks, encode
+from hnerf.capture.subject import subject_keypoints
+from hnerf.errors import NotPossibleError
+
+LIMBS = ((3, 4), (6, 7), (10, 11), (13, 14))  # BODY_25: elbow to wrist, knee to ankle; right, left
+BEYOND = 0.5  # of a limb's length: where hand or foot ends
+THICKNESS = 0.8  # of a limb's length
+HOLE_RADIUS = 0.1  # of the square root of a mask's area
+
+MaskChange = Callable[[str, int, np.ndarray], np.ndarray]
+
+
+def erode(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
+    """Take away what lies within this share of the image's width of the edge, inside."""
+    return _changed(masks, lambda _, __, mask: _edge_distance_px(mask) > percent / 100 * mask.shape[1])
+
+
+def dilate(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
+    """Add what lies within this share of the image's width of the person."""
+    return _changed(masks, lambda _, __, mask: _edge_distance_px(~mask) <= percent / 100 * mask.shape[1])
+
+
+def pierce(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
+    """Take away discs at random places until this share of each mask is gone."""
+    return _changed(masks, lambda _, __, mask: _pierced(mask, percent / 100, rng))
+
+
+def cut_limb(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
+    """Take a forearm with its hand, or a lower leg with its foot, away from this share of the masks, at random.
+
+    CaptureError where nothing was detected, since keypoints tell where limbs are.
+    """
+    if not capture.has_keypoints:
+        raise NotPossibleError(f"{capture.name}: has no keypoints; they tell where limbs are")
+    keypoints = subject_keypoints(capture)
+
+    def cut(camera: str, frame: int, mask: np.ndarray) -> np.ndarray:
+        hit, limb = rng.random() < percent / 100, LIMBS[rng.integers(len(LIMBS))]
+        person = keypoints[camera][capture.frames.index(frame)]
+        return mask & ~_limb(person, limb, mask.shape) if hit else mask
+
+    return _changed(masks, cut)
+
+
+def _changed(masks: Masks, change: MaskChange) -> Masks:
+    views = sorted(masks.encoded)
+    return Masks({view: encode(change(*view, masks.get(*view))) for view in views}, masks.report)
+
+
+def _edge_distance_px(mask: np.ndarray) -> np.ndarray:
+    """(H, W): distance of each pixel of a mask to the nearest that is not in it, 0 outside."""
+    return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+
+
+def _pierced(mask: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
+    left, pixels = mask.astype(np.uint8), np.argwhere(mask)
+    radius_px = max(1, round(HOLE_RADIUS * len(pixels) ** 0.5))
+    while left.sum() > (1 - share) * len(pixels):
+        y, x = pixels[rng.integers(len(pixels))]
+        cv2.circle(left, (int(x), int(y)), radius_px, 0, cv2.FILLED)
+    return left.astype(bool)
+
+
+def _limb(person: np.ndarray, limb: tuple[int, int], shape: tuple[int, ...]) -> np.ndarray:
+    """(H, W) bool: around a limb's bone and beyond its end, of a person's keypoints (25, 3); empty where not seen."""
+    covered = np.zeros(shape, np.uint8)
+    start, end = person[limb[0]], person[limb[1]]
+    if start[2] > 0 and end[2] > 0:
+        along_px = end[:2] - start[:2]
+        thickness_px = max(1, round(THICKNESS * float(np.linalg.norm(along_px))))
+        ends = start[:2], end[:2] + BEYOND * along_px
+        cv2.polylines(covered, [np.round(ends).astype(np.int32)], False, 1, thickness_px)
+    return covered.astype(bool)

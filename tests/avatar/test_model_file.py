@@ -1,0 +1,81 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import nn
+
+from hnerf.avatar.model_file import fill_field, write_field
+from hnerf.errors import CaptureError
+from hnerf.fields.encoding import FeatureGrids
+
+
+def small_field(cells: int = 4) -> nn.Module:
+    """A grid of 2 x 3 x 5 nodes (x, y, z) with two features, or a finer one, and a number."""
+    field = nn.Module()
+    field.grids = FeatureGrids(torch.zeros(3), torch.tensor([1.0, 2.0, 4.0]), (cells,), 2)
+    field.sharpness = nn.Parameter(torch.tensor(1 / 3))
+    return field
+
+
+def written_and_read(learned: nn.Module, path: Path) -> nn.Module:
+    read = small_field()
+    write_field(learned, path)
+    fill_field(read, load_file(path), path)
+    return read
+
+
+def test_a_grid_is_stored_in_steps_of_a_127th_of_its_greatest_feature(tmp_path: Path):
+    """-12.7 makes the step 0.1, of which 3.14 is 31 and 0.04 none; the number beside the grid stays as it is."""
+    learned = small_field()
+    learned.grids.levels[0].data[0, 1, 3, 2, 1] = -12.7
+    learned.grids.levels[0].data[0, 0, 0, 0, 0] = 3.14
+    learned.grids.levels[0].data[0, 0, 4, 1, 0] = 0.04
+    read = written_and_read(learned, tmp_path / "model.safetensors")
+    expected = torch.zeros(1, 2, 5, 3, 2)
+    expected[0, 1, 3, 2, 1], expected[0, 0, 0, 0, 0] = -12.7, 3.1
+    torch.testing.assert_close(read.grids.levels[0].data, expected)
+    assert read.sharpness == learned.sharpness
+
+
+def test_a_grid_that_has_learned_nothing_comes_back_empty(tmp_path: Path):
+    read = written_and_read(small_field(), tmp_path / "model.safetensors")
+    assert read.grids.levels[0].count_nonzero() == 0
+
+
+def test_nodes_that_nothing_was_learned_of_take_no_room(tmp_path: Path):
+    """41 x 21 x 11 nodes of 2 features, of which a tenth has random values: less than 3 bytes a node of those."""
+    learned, path = small_field(cells=40), tmp_path / "model.safetensors"
+    nodes = learned.grids.levels[0].data
+    nodes[:, :, :4] = torch.rand(nodes[:, :, :4].shape, generator=torch.Generator().manual_seed(0))
+    write_field(learned, path)
+    assert path.stat().st_size < 3 * nodes[0, 0, :4].numel() + 500
+    assert nodes[0, 0].numel() > 5 * nodes[0, 0, :4].numel()
+
+
+@pytest.mark.parametrize("name", ["grids.levels.0.steps", "grids.levels.0.step", "sharpness"])
+def test_what_lacks_a_part_is_of_another_version(tmp_path: Path, name: str):
+    path = tmp_path / "model.safetensors"
+    write_field(small_field(), path)
+    stored = load_file(path)
+    del stored[name]
+    with pytest.raises(CaptureError, match=r"model.safetensors: of another version; train the subject again"):
+        fill_field(small_field(), stored, path)
+
+
+@pytest.mark.parametrize("cells", [2, 8])
+def test_a_grid_of_another_size_is_of_another_version(tmp_path: Path, cells: int):
+    path = tmp_path / "model.safetensors"
+    write_field(small_field(cells), path)
+    with pytest.raises(CaptureError, match=r"of another version"):
+        fill_field(small_field(), load_file(path), path)
+
+
+def test_a_damaged_grid_is_of_another_version(tmp_path: Path):
+    path = tmp_path / "model.safetensors"
+    write_field(small_field(), path)
+    stored = load_file(path)
+    stored["grids.levels.0.steps"] = torch.from_numpy(np.arange(20, dtype=np.uint8))
+    with pytest.raises(CaptureError, match=r"of another version"):
+        fill_field(small_field(), stored, path)

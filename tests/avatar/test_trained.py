@@ -1,0 +1,73 @@
+"""Subjects that nobody has trained: what other versions left, how they are built and shown."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from hnerf.avatar import trained as model
+from hnerf.avatar.model_file import write_field
+from hnerf.avatar.trained import build_field, load_avatar
+from hnerf.body.canonical import PosedBodies
+from hnerf.config import TrainingSettings
+from hnerf.errors import CaptureError
+from hnerf.fields.paper import PaperField
+from tests.training.scene import TINY, record
+
+
+@pytest.fixture
+def subject(tmp_path: Path) -> Path:
+    body = record(tmp_path / "capture")[2]
+    body.save(tmp_path)
+    write_field(build_field(TINY, body, False), tmp_path / "model.safetensors")
+    (tmp_path / "settings.json").write_text(json.dumps({"static": False, "training": TINY.model_dump()}))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "stored",
+    [
+        {"static": False, "training": TINY.model_dump() | {"momentum": 1}},
+        {"static": False},
+        {"training": TINY.model_dump()},
+    ],
+)
+def test_other_settings_are_refused(subject: Path, stored: dict[str, object]):
+    (subject / "settings.json").write_text(json.dumps(stored))
+    with pytest.raises(CaptureError, match=r"settings\.json: of another version; train the subject again$"):
+        load_avatar(subject)
+
+
+def test_a_field_without_its_body_is_refused(subject: Path):
+    path = subject / "model.safetensors"
+    load_avatar(subject)
+    save_file({name: tensor for name, tensor in load_file(path).items() if name != "canonical_m"}, path)
+    with pytest.raises(CaptureError, match=r"model\.safetensors: of another version; train the subject again$"):
+        load_avatar(subject)
+
+
+@pytest.mark.parametrize("bf16", [False, True])
+def test_both_networks_of_the_paper_multiply_as_the_settings_say(tmp_path: Path, bf16: bool) -> None:
+    changes = {"machinery": "paper", "paper": {"bf16": bf16}}
+    field = build_field(TrainingSettings.model_validate(changes), record(tmp_path)[2], False)
+    assert isinstance(field, PaperField)
+    assert field.radiance.trunk.bf16 is field.residual.trunk.bf16 is bf16
+
+
+def test_the_more_samples_rays_have_the_fewer_are_rendered_at_once(subject: Path, monkeypatch: pytest.MonkeyPatch):
+    """Eight a ray, and room for 2048."""
+    capture, _, body = record(subject / "capture")
+    avatar, at_once = load_avatar(subject), []
+    look = avatar.field.look
+
+    def counted(bodies: PosedBodies, region: object, origins_m: Tensor, *rest: Any) -> Tensor:
+        at_once.append(len(origins_m))
+        return look(bodies, region, origins_m, *rest)
+
+    monkeypatch.setattr(avatar.field, "look", counted)
+    monkeypatch.setattr(model, "SAMPLES_AT_ONCE", 2048)
+    avatar.render(capture.cameras["0"], body.theta[0], body.root[0])
+    assert len(at_once) > 1 and set(at_once[:-1]) == {256} and at_once[-1] <= 256

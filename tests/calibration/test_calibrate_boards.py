@@ -1,0 +1,273 @@
+"""Cameras from a board: known cameras around a board on a known path, and the real footage."""
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hnerf.calibration.boards import calibrate as calibration_boards
+from hnerf.calibration.boards.bundle import Poses
+from hnerf.calibration.boards.calibrate import board_witness, calibrate_from_boards, visible_and_found
+from hnerf.calibration.boards.lens import estimate_lens
+from hnerf.calibration.boards.rig import compare_pairs, flat_only, solve_boards, solve_rig, undistorted, whole_enough
+from hnerf.capture.board_footage import Board, BoardCorners, BoardFootage
+from hnerf.capture.formats.caliscope import Caliscope
+from hnerf.capture.formats.easymocap import EasyMocap
+from hnerf.capture.formats.export import write_cameras
+from hnerf.capture.lens import Lens
+from hnerf.errors import CaptureError
+from hnerf.geometry.camera import Camera
+from tests.calibration.synthetic import look_at, turned, write_capture
+from tests.shared_data import shared_capture
+
+BOARD = Board(columns=6, rows=5, square_m=0.05)
+FRAMES = 16
+LAG = 0.4  # frames, of camera b
+NOISE_PX = 0.1
+
+
+def rig() -> list[Camera]:
+    """Three cameras 1.5 m from the board's path, 30 degrees apart, in a world that is none of theirs."""
+    target = np.array([0, 0, 1.0])
+    centres = [[1.5 * np.sin(a), -1.5 * np.cos(a), 1.2] for a in np.deg2rad([-30, 0, 30])]
+    return [look_at(name, np.array(c), target) for name, c in zip("abc", centres, strict=True)]
+
+
+def board_at(time: float) -> tuple[np.ndarray, np.ndarray]:
+    """World from board at a time in frames: a board that faces the cameras, swings, and goes along a circle."""
+    facing = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x right, y down, z away from the cameras
+    swing = cv2.Rodrigues(np.array([0.5 * np.sin(0.3 * time), 0.4 * np.cos(0.2 * time), 0.1 * time]))[0]
+    t_m = np.array([0.25 * np.cos(0.25 * time), 0.2 * np.sin(0.4 * time), 1 + 0.25 * np.sin(0.25 * time)])
+    return facing @ swing, t_m
+
+
+def seen(cameras: list[Camera], lags: dict[str, float]) -> np.ndarray:
+    """(C, F, N, 2) with noise; a camera with a lag pictures every moment that much later."""
+    corners_px = np.zeros((len(cameras), FRAMES, len(BOARD.corners_m), 2))
+    for i, camera in enumerate(cameras):
+        for f in range(FRAMES):
+            R, t_m = board_at(f + lags.get(camera.name, 0.0))
+            corners_px[i, f] = camera.project(BOARD.corners_m @ R.T + t_m)[0]
+    return corners_px + NOISE_PX * np.random.default_rng(0).normal(size=corners_px.shape)
+
+
+def test_pairs_are_compared_in_degrees_and_centimetres() -> None:
+    cameras = rig()
+    moved = turned(cameras[1], 1.0)
+    moved = dataclasses.replace(moved, t_m=moved.t_m + np.array([0.02, 0, 0]))
+    pairs = compare_pairs(cameras, [cameras[0], moved, cameras[2]])
+    assert pairs["a-b"] == pytest.approx({"turned_deg": 1.0, "moved_cm": 2.0})
+    assert pairs["a-c"] == pytest.approx({"turned_deg": 0.0, "moved_cm": 0.0}, abs=1e-6)
+    # c seen from b: b turned by a degree, so c's centre, 1.5 x 2 sin 15 degrees away, swings by that times a degree.
+    assert pairs["b-c"]["turned_deg"] == pytest.approx(1.0)
+    assert abs(pairs["b-c"]["moved_cm"] - 100 * 3 * np.sin(np.pi / 12) * np.deg2rad(1)) < 2.0
+
+
+def test_cameras_and_their_lag_are_found() -> None:
+    cameras = rig()
+    corners_px = seen(cameras, {"b": LAG})
+    corners_px[2, :4] = np.nan
+    corners_px[0, 5, 3] += 30.0  # one corner mistaken for another
+    fit = solve_rig(cameras, BOARD.corners_m, flat_only(BOARD.corners_m, corners_px))
+    for figures in compare_pairs(cameras, fit.cameras).values():
+        assert figures["turned_deg"] < 0.3 and figures["moved_cm"] < 0.8  # 4 degrees and 8 cm if b's lag is denied
+    # Only differences between cameras can be known: a and c were in step, b later.
+    lag = np.nanmedian(fit.offsets_frames[1] - fit.offsets_frames[0])
+    assert lag == pytest.approx(LAG, abs=0.05)
+    assert np.isnan(fit.residuals_px[0, 5, 3]).all() and np.isfinite(fit.residuals_px[0, 5, 4]).all()
+    # Noise of 0.1 px in x and y is 0.14 px of distance.
+    assert np.sqrt((fit.error_px() ** 2).mean()) == pytest.approx(NOISE_PX * np.sqrt(2), abs=0.03)
+
+
+def test_offsets_count_frames_of_the_footage() -> None:
+    """Every second frame: what lies 0.4 of the pictures' distance apart is 0.8 frames."""
+    cameras = rig()
+    fit = solve_rig(cameras, BOARD.corners_m, flat_only(BOARD.corners_m, seen(cameras, {"b": LAG})), frame_step=2)
+    lag = np.nanmedian(fit.offsets_frames[1] - fit.offsets_frames[0])
+    assert lag == pytest.approx(2 * LAG, abs=0.1)
+    assert max(figures["turned_deg"] for figures in compare_pairs(cameras, fit.cameras).values()) < 0.3
+
+
+def test_a_corner_off_its_plane_and_a_picture_of_few_are_dropped() -> None:
+    corners_px = seen(rig(), {})[:1, :2]
+    corners_px[0, 0, 7] += [3.0, 0]
+    corners_px[0, 1, 5:] = np.nan  # five are left
+    kept = np.isfinite(flat_only(BOARD.corners_m, corners_px)[..., 0])
+    assert np.flatnonzero(~kept[0, 0]).tolist() == [7] and not kept[0, 1].any()
+
+
+def test_a_pose_needs_six_corners_in_two_rows() -> None:
+    seen = np.zeros((4, 20), bool)  # five columns, four rows
+    seen[0, :6] = seen[1, :7] = seen[2, :5] = seen[3, [0, 1, 5, 6, 10]] = True
+    assert whole_enough(BOARD.corners_m, seen).tolist() == [False, True, False, False]
+
+
+def test_unlinked_cameras_are_refused() -> None:
+    corners_px = seen(rig(), {})
+    corners_px[2, 2:] = np.nan  # c shares two frames
+    with pytest.raises(CaptureError, match="camera c: shares fewer than 3 frames"):
+        solve_rig(rig(), BOARD.corners_m, corners_px)
+
+
+def test_the_witness_tells_what_it_knows_nothing_about(tmp_path: Path) -> None:
+    corners_px = seen(rig(), {})
+    corners_px[2] = np.nan
+    capture = write_capture(tmp_path, rig(), {camera.name: np.zeros((2, 1, 25, 3)) for camera in rig()})
+    BoardCorners(("a", "b", "c"), BOARD.corners_m, corners_px, 1).save(capture.root)
+    found = board_witness(capture)
+    assert found is not None and found["unlinked_cameras"] == ["c"] and list(found["cameras"]) == ["a", "b"]
+    BoardCorners(("a",), BOARD.corners_m, corners_px[:1], 1).save(capture.root)
+    found = board_witness(capture)
+    assert found is not None and found["unlinked_cameras"] == ["a"] and found["cameras"] == {}
+
+
+def test_the_witness_names_the_camera_that_moved(tmp_path: Path) -> None:
+    cameras = rig()
+    stored = BoardCorners(("a", "b", "c"), BOARD.corners_m, seen(cameras, {}), 1)
+    bumped = [cameras[0], turned(cameras[1], 1.0), cameras[2]]
+    capture = write_capture(tmp_path / "bumped", bumped, {camera.name: np.zeros((2, 1, 25, 3)) for camera in cameras})
+    assert board_witness(capture) is None
+    stored.save(capture.root)
+    found = board_witness(capture)
+    assert found is not None
+    rms_px = {name: camera["rms_px"] for name, camera in found["cameras"].items()}
+    # One degree at a focal length of 1000 px is 17.5 px; the other two agree and hold the board.
+    assert 10 < rms_px["b"] < 20 and max(rms_px["a"], rms_px["c"]) < 5
+    assert max(camera["footage_rms_px"] for camera in found["cameras"].values()) < 0.2
+    assert found["pairs"]["a-b"]["turned_deg"] == pytest.approx(1.0, abs=0.1)
+    assert found["pairs"]["a-c"]["turned_deg"] < 0.1
+
+
+def test_visible_means_facing_inside_and_found_by_another() -> None:
+    """The board shows its back in frame 1, nobody but c finds it in frame 2, and it is far above all in frame 3."""
+    cameras = rig()
+    R, t_m = board_at(0)
+    boards = Poses(np.stack([R, R @ np.diag([-1.0, 1, -1]), R, R]), np.stack([t_m, t_m, t_m, t_m + np.eye(3)[2] * 5]))
+    corners_px = np.stack([[c.project(BOARD.corners_m @ R.T + t)[0] for R, t in zip(boards.R, boards.t_m, strict=True)]
+                           for c in cameras])  # fmt: skip
+    corners_px[:2, 2] = np.nan
+    fit = solve_boards(cameras, BOARD.corners_m, corners_px)
+    visible, found = visible_and_found(dataclasses.replace(fit, boards=boards), BOARD.corners_m)
+    assert visible[:, 0].all() and not visible[:, 1].any() and not visible[:, 3].any()
+    assert visible[:, 2].tolist() == [True, True, False] and found[:, 2].tolist() == [False, False, True]
+
+
+def close_up(tilt: float) -> np.ndarray:
+    """(20, N, 2) corners that a lens of 900 px and k1 = -0.2 sees, the board turned by up to `tilt` about each axis."""
+    K, distortion = np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0])
+    rng = np.random.default_rng(1)
+    poses = [(rng.uniform(-tilt, tilt, 3), rng.uniform([-0.3, -0.2, 0.6], [0.1, 0.05, 0.6])) for _ in range(20)]
+    views = [cv2.projectPoints(BOARD.corners_m, r, t, K, distortion)[0].reshape(-1, 2) for r, t in poses]
+    return np.stack(views) + NOISE_PX * rng.normal(size=(20, 20, 2))
+
+
+def test_a_lens_is_believed_only_if_the_pictures_fix_it() -> None:
+    """Boards that all face the camera say nothing about the focal length, and nine are too few."""
+    tilted, facing, few = (
+        estimate_lens("a", BOARD.corners_m, corners_px, (1280, 720))
+        for corners_px in (close_up(0.7), close_up(0.0), close_up(0.7)[:9])
+    )
+    assert tilted.believed is not None and tilted.believed.K[0, 0] == pytest.approx(900, rel=0.005)
+    assert tilted.believed.distortion[0] == pytest.approx(-0.2, abs=0.02)
+    assert facing.believed is None and few.believed is None and few.pictures == 9
+
+
+def test_close_footage_gives_the_intrinsics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def footage(part: str, corners_px: np.ndarray) -> BoardFootage:
+        seen_px, size_px = {"a": corners_px}, {"a": (1280, 720)}
+        return BoardFootage(tmp_path / part, BOARD, tuple(range(len(corners_px))), 1, seen_px, size_px)
+
+    read = {"extrinsic": footage("extrinsic", close_up(0.7)[:9]), "intrinsic": footage("intrinsic", close_up(0.7))}
+    monkeypatch.setattr(calibration_boards, "read_board_footage", lambda _, part, *__: read[part])
+    calibration = calibrate_from_boards(tmp_path)
+    assert calibration.lenses["a"].K[0, 0] == pytest.approx(900, rel=0.005)
+    assert calibration.intrinsics["a"].startswith("from intrinsic/: 20 pictures")
+    read["intrinsic"] = footage("intrinsic", close_up(0.7)[:9])
+    with pytest.raises(CaptureError, match="intrinsic/a: does not fix the intrinsics"):
+        calibrate_from_boards(tmp_path)
+
+
+def test_given_intrinsics_without_a_size_have_that_of_the_footage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = Lens("a", np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0]), np.eye(3),
+                 np.zeros(3), None)  # fmt: skip
+    write_cameras(tmp_path, [given], "easymocap")
+    footage = BoardFootage(tmp_path, BOARD, tuple(range(9)), 1, {"a": close_up(0.7)[:9]}, {"a": (1280, 720)})
+    read = {"extrinsic": footage, "intrinsic": None}
+    monkeypatch.setattr(calibration_boards, "read_board_footage", lambda _, part, *__: read[part])
+    assert calibrate_from_boards(tmp_path).lenses["a"].size_px == (1280, 720)
+
+
+def test_undistortion_keeps_what_is_absent_absent() -> None:
+    lens = Lens("a", np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), np.array([0.1, 0, 0, 0]), np.eye(3),
+                np.zeros(3), None)  # fmt: skip
+    # At radius 1 the lens pictures 1 + 0.1; so pixel 50 + 110 is that of 50 + 100 without distortion.
+    flat = undistorted(np.array([[[160.0, 50], [np.nan, np.nan]]]), lens)
+    assert flat[0, 0].tolist() == pytest.approx([150, 50], abs=0.01) and np.isnan(flat[0, 1]).all()
+
+
+def test_undistortion_of_a_wide_lens_comes_back_in_the_corners() -> None:
+    lens = Lens("a", np.array([[1100.0, 0, 960], [0, 1100, 540], [0, 0, 1]]), np.array([-0.25, 0.05, 0, 0]), np.eye(3),
+                np.zeros(3), None)  # fmt: skip
+    straight = np.array([[100.0, 100], [1800, 60], [960, 540], [200, 1000]])
+    directions = np.c_[(straight - (960, 540)) / 1100, np.ones(4)]
+    bent = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), lens.K, lens.distortion)[0][:, 0]
+    np.testing.assert_allclose(undistorted(bent, lens), straight, atol=0.01)
+
+
+def test_the_floor_is_the_board_that_lies_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the last frame the board lies flat under cameras that look down on it: their heights are what z says."""
+    cameras = rig()
+    corners_px = seen(cameras, {})
+    flat = np.diag([1.0, -1, -1]), np.array([-0.1, 0.1, 0.8])  # z down, at the height of 0.8 m
+    for i, camera in enumerate(cameras):
+        corners_px[i, -2] = np.nan  # it was put down out of sight
+        corners_px[i, -1] = camera.project(BOARD.corners_m @ flat[0].T + flat[1])[0]
+    intrinsics = {c.name: Lens(c.name, c.K, np.zeros(4), np.eye(3), np.zeros(3), (1000, 1000)) for c in cameras}
+    frames = tuple(range(100, 100 + FRAMES))
+    found = dict(zip("abc", corners_px, strict=True))
+    footage = BoardFootage(tmp_path, BOARD, frames, 1, found, dict.fromkeys("abc", (1000, 1000)))
+    read = {"extrinsic": footage, "intrinsic": None}
+    looked_for: list[int] = []
+
+    def read_footage(_: Path, part: str, *wanted: int) -> BoardFootage | None:
+        looked_for.extend(wanted)
+        return read[part]
+
+    monkeypatch.setattr(calibration_boards, "read_board_footage", read_footage)
+    monkeypatch.setattr(calibration_boards, "_intrinsics", lambda *_: (intrinsics, dict.fromkeys("abc", "given")))
+    calibration = calibrate_from_boards(tmp_path, ground_frame=100 + FRAMES - 1)
+    assert looked_for == [100 + FRAMES - 1]
+    for camera, lens in zip(cameras, calibration.lenses.values(), strict=True):
+        assert -lens.R.T @ lens.t_m == pytest.approx(camera.centre_m - flat[1], abs=0.005)
+    assert compare_pairs(cameras, calibration.fit.cameras)["a-c"]["turned_deg"] < 0.1
+    with pytest.raises(CaptureError, match="no board in frame 7"):
+        calibrate_from_boards(tmp_path, ground_frame=7)
+    calibration.save(tmp_path / "out")
+    written = EasyMocap(tmp_path / "out").lenses()
+    assert written["b"].t_m == pytest.approx(calibration.lenses["b"].t_m) and (tmp_path / "out" / "boards.png").exists()
+
+
+def test_a_board_that_is_found_nowhere_is_hardly_that_board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = dict.fromkeys("ab", np.full((9, len(BOARD.corners_m), 2), np.nan))
+    found["a"] = seen(rig(), {})[0, :9].copy()
+    found["a"][2:] = np.nan
+    footage = BoardFootage(tmp_path, BOARD, tuple(range(9)), 1, found, dict.fromkeys("ab", (1000, 1000)))
+    monkeypatch.setattr(calibration_boards, "read_board_footage", lambda *_: footage)
+    with pytest.raises(CaptureError, match="this board was found in 2 of 18 pictures; check its columns"):
+        calibrate_from_boards(tmp_path)
+
+
+def test_real_footage_gives_the_shipped_cameras() -> None:
+    folder = shared_capture("caliscope-charuco")
+    calibration = calibrate_from_boards(folder)
+    report = calibration.report()
+    assert report["rms_px"] < 0.5
+    cameras = report["cameras"].values()
+    assert sum(c["of_these_found"] for c in cameras) > 0.8 * sum(c["board_visible"] for c in cameras) > 160
+    shipped = [Camera(lens.name, lens.K, lens.R, lens.t_m, 1280, 720) for lens in Caliscope(folder).lenses().values()]
+    pairs = compare_pairs(shipped, calibration.fit.cameras)
+    assert len(pairs) == 6 and all(p["turned_deg"] < 2 and p["moved_cm"] < 3 for p in pairs.values())

@@ -1,0 +1,194 @@
+"""What the board is and where its corners are, worked out by hand."""
+
+import re
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hnerf.capture.board_footage import Board, Detector, load_board_corners, read_board, read_board_footage
+from hnerf.capture.footage import Video
+from hnerf.capture.ingest import ingest
+from hnerf.config import CaptureSettings
+from hnerf.errors import CaptureError
+from tests.capture import recordings as rec
+
+CHARUCO = """
+columns = 4
+rows = 5
+board_height = 11.0
+board_width = 8.5
+dictionary = "DICT_4X4_1000"
+units = "inch"
+aruco_scale = 0.75
+square_size_override_cm = 5.4
+inverted = true
+"""
+SQUARE_PX = 40
+
+
+def charuco_picture(inverted: bool) -> np.ndarray:
+    """The board above, 160 x 200 px, alone on 320 x 240 px grey, its top left pixel at (60, 20)."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
+    drawn = cv2.aruco.CharucoBoard((4, 5), 0.054, 0.0405, dictionary).generateImage((4 * SQUARE_PX, 5 * SQUARE_PX))
+    picture = np.full((240, 320), 128, np.uint8)
+    picture[20:220, 60:220] = 255 - drawn if inverted else drawn
+    return np.stack([picture] * 3, -1)
+
+
+def checkerboard_picture(columns: int, rows: int) -> np.ndarray:
+    """Squares of 40 px from pixel (60, 60) on white, the first one black; the margin as wide as one and a half."""
+    y, x = np.mgrid[: rows * SQUARE_PX, : columns * SQUARE_PX]
+    picture = np.full((rows * SQUARE_PX + 120, columns * SQUARE_PX + 120), 255, np.uint8)
+    picture[60:-60, 60:-60] = np.where((x // SQUARE_PX + y // SQUARE_PX) % 2, 255, 0)
+    return np.stack([picture] * 3, -1)
+
+
+def test_corners_lie_row_by_row_between_the_squares() -> None:
+    corners_m = Board(columns=4, rows=3, square_m=0.1).corners_m
+    expected = [[0.1, 0.1, 0], [0.2, 0.1, 0], [0.3, 0.1, 0], [0.1, 0.2, 0], [0.2, 0.2, 0], [0.3, 0.2, 0]]
+    assert corners_m.tolist() == pytest.approx(np.array(expected))
+
+
+def test_the_measured_square_comes_before_the_page(tmp_path: Path) -> None:
+    (tmp_path / "charuco.toml").write_text(CHARUCO)
+    board = read_board(tmp_path)
+    assert board is not None and board.square_m == pytest.approx(0.054) and board.inverted
+    (tmp_path / "charuco.toml").write_text(CHARUCO.replace("square_size_override_cm = 5.4\n", ""))
+    page = read_board(tmp_path)
+    assert page is not None and page.square_m == pytest.approx(min(8.5 / 4, 11 / 5) * 0.0254)
+
+
+def test_capture_toml_describes_a_board_too(tmp_path: Path) -> None:
+    (tmp_path / "capture.toml").write_text("[board]\ncolumns = 7\nrows = 6\nsquare_m = 0.1\n")
+    assert read_board(tmp_path) == Board(columns=7, rows=6, square_m=0.1)
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("columns = 6\nrows = 8\nsquare_m = 0.1", "looks the same upside down"),
+        ("columns = 100000\nrows = 5\nsquare_m = 0.1", "board: columns"),
+        ('columns = 4\nrows = 5\nsquare_m = 0.1\ndictionary = "DICT_4X4_9"', "not one of OpenCV's"),
+        ('columns = 4\nrows = 5\nsquare_m = 0.1\ndictionary = "os.system"', "board: dictionary"),
+        ('columns = 20\nrows = 20\nsquare_m = 0.1\ndictionary = "DICT_4X4_50"', "only 50 markers"),
+        ("columns = 4\nrows = 5\nsquare_m = nan", "board: square_m"),
+        ("columns = 4\nrows = 5\nsquare_m = 0.1\nsides = 2", "board: sides"),
+    ],
+)
+def test_bad_descriptions_are_refused(table: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "capture.toml").write_text(f"[board]\n{table}\n")
+    with pytest.raises(CaptureError, match="capture.toml.*" + message):
+        read_board(tmp_path)
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_charuco_corners_lie_on_the_edges_of_pixels(inverted: bool) -> None:
+    """Between pixels 60 + 40 k - 1 and 60 + 40 k, whose centres are integers: at 59.5 + 40 k."""
+    board = Board(columns=4, rows=5, square_m=0.054, dictionary="DICT_4X4_1000", inverted=inverted)
+    found = Detector(board).corners_px(charuco_picture(inverted))
+    expected = [[59.5 + 40 * x, 19.5 + 40 * y] for y in (1, 2, 3, 4) for x in (1, 2, 3)]
+    assert np.abs(found - expected).max() < 0.25
+    assert np.isnan(Detector(board).corners_px(charuco_picture(not inverted))).all()
+
+
+@pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
+def test_a_checkerboards_first_corner_stays_the_first(quarter_turns: int) -> None:
+    picture = checkerboard_picture(6, 5)
+    found = Detector(Board(columns=6, rows=5, square_m=0.1)).corners_px(np.rot90(picture, quarter_turns).copy())
+    grid = np.array([[59.5 + 40 * x, 59.5 + 40 * y] for y in (1, 2, 3, 4) for x in (1, 2, 3, 4, 5)])
+    height, width = picture.shape[:2]
+    for _ in range(quarter_turns):  # np.rot90 turns counter-clockwise: (x, y) to (y, width - 1 - x)
+        grid = np.stack([grid[:, 1], width - 1 - grid[:, 0]], -1)
+        height, width = width, height
+    assert np.abs(found - grid).max() < 0.25
+
+
+def test_dropped_frames_are_placed_by_the_table(tmp_path: Path) -> None:
+    """cam_0 has no picture of moment 11; the board is in its last one, and in no picture of cam_1."""
+    (tmp_path / "charuco.toml").write_text(CHARUCO)
+    root = tmp_path / "calibration" / "extrinsic"
+    blank = np.full((240, 320, 3), 128, np.uint8)
+    for camera, pictures in {"cam_0": [blank, charuco_picture(True)], "cam_1": [blank] * 3}.items():
+        for i, picture in enumerate(pictures):
+            rec.write_png(root / camera / f"{i}.png", picture)
+    rows = ["sync_index,cam_id,frame_time", "10,0,1.0", "10,1,1.0", "11,1,1.1", "12,1,1.2", "12,0,1.2"]
+    (root / "timestamps.csv").write_text("\n".join(rows))
+    footage = read_board_footage(tmp_path, "extrinsic")
+    assert footage is not None and footage.frames == (10, 11, 12)
+    assert np.isfinite(footage.corners_px["cam_0"]).all((1, 2)).tolist() == [False, False, True]
+    assert np.isnan(footage.corners_px["cam_1"]).all()
+    (root / "timestamps.csv").write_text("\n".join(rows[:-1]))
+    with pytest.raises(CaptureError, match=r"timestamps\.csv: 1 rows of cam_0, but 2 frames"):
+        read_board_footage(tmp_path, "extrinsic")
+
+
+def test_footage_with_a_suffix_in_upper_case_is_not_left_out(tmp_path: Path) -> None:
+    (tmp_path / "charuco.toml").write_text(CHARUCO)
+    for name in ("cam_0.mp4", "cam_1.MP4"):
+        rec.write_video(tmp_path / "video.mp4", 2)
+        (tmp_path / "calibration" / "extrinsic").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "video.mp4").rename(tmp_path / "calibration" / "extrinsic" / name)
+    footage = read_board_footage(tmp_path, "extrinsic")
+    assert footage is not None and list(footage.corners_px) == ["cam_0", "cam_1"]
+
+
+def test_videos_of_other_lengths_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "charuco.toml").write_text(CHARUCO)
+    for camera, count in {"cam_0": 3, "cam_1": 4}.items():
+        rec.write_video(tmp_path / "calibration" / "extrinsic" / f"{camera}.mp4", count)
+    with pytest.raises(CaptureError, match="videos differ in length"):
+        read_board_footage(tmp_path, "extrinsic")
+    assert read_board_footage(tmp_path, "intrinsic") is None
+
+
+def test_links_in_the_footage_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "secret").mkdir()
+    (tmp_path / "capture" / "calibration" / "extrinsic").mkdir(parents=True)
+    (tmp_path / "capture" / "calibration" / "extrinsic" / "cam_0").symlink_to(tmp_path / "secret")
+    (tmp_path / "capture" / "charuco.toml").write_text(CHARUCO)
+    with pytest.raises(CaptureError, match="cam_0: is a symbolic link"):
+        read_board_footage(tmp_path / "capture", "extrinsic")
+
+
+def test_a_wanted_frame_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "charuco.toml").write_text(CHARUCO)
+    rec.write_video(tmp_path / "calibration" / "extrinsic" / "cam_0.mp4", 3)
+    with pytest.raises(CaptureError, match="extrinsic: has no frame 3; name one of 0 to 2"):
+        read_board_footage(tmp_path, "extrinsic", 3)
+
+
+def test_long_footage_is_sampled_evenly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hnerf.capture.board_footage.MAX_FRAMES", 4)
+    (tmp_path / "charuco.toml").write_text(CHARUCO)
+    rec.write_video(tmp_path / "calibration" / "extrinsic" / "cam_0.mp4", 10)
+    footage = read_board_footage(tmp_path, "extrinsic")
+    assert footage is not None and footage.frames == (0, 3, 6, 9) and footage.frame_step == 3
+    for wanted, frames in {7: (1, 4, 7), 6: (0, 3, 6, 9)}.items():
+        shifted = read_board_footage(tmp_path, "extrinsic", wanted)
+        assert shifted is not None and shifted.frames == frames
+    assert len(Video.open(tmp_path / "calibration" / "extrinsic" / "cam_0.mp4").frames) == 10
+
+
+def test_ingest_keeps_the_corners_in_the_pixels_it_writes(tmp_path: Path) -> None:
+    """Half the size: x becomes x / 2 - 1 / 4."""
+    folder = rec.write_easymocap(tmp_path / "ada")
+    for name in ("images", "openpose"):
+        shutil.rmtree(folder / name)
+    intri = re.sub(r"(W_0\d): 24", r"\1: 320", (folder / "intri.yml").read_text())
+    (folder / "intri.yml").write_text(re.sub(r"(H_0\d): 16", r"\1: 240", intri))
+    for camera in rec.CAMERAS:
+        rec.write_png(folder / "images" / camera / "000000.png", charuco_picture(True))
+        rec.write_png(folder / "calibration" / "extrinsic" / camera / "000003.png", charuco_picture(True))
+    (folder / "charuco.toml").write_text(CHARUCO)
+    capture = ingest(folder, CaptureSettings(max_side_px=160), tmp_path / "out")
+    stored = load_board_corners(capture.root)
+    assert (
+        stored is not None
+        and stored.cameras == rec.CAMERAS
+        and stored.frame_step == 1
+        and stored.corners_px.shape == (2, 1, 12, 2)
+    )
+    assert stored.corners_px[0, 0, 0].tolist() == pytest.approx([99.5 / 2 - 0.25, 59.5 / 2 - 0.25], abs=0.13)

@@ -1,0 +1,125 @@
+"""Pickles give plain data, and run nothing."""
+
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+from hnerf.capture.safe_pickle import read_pickle, read_pickled_npy
+from hnerf.errors import CaptureError
+
+DATA: dict[str, Any] = {
+    "K": [np.arange(9.0).reshape(3, 3), np.asfortranarray(np.arange(6, dtype=np.float32).reshape(2, 3))],
+    "ims": np.array([{"ims": ["a", "b"]}, {"ims": []}], object),
+    "count": np.float64(2.5),
+    "kintree": np.array([[2**32 - 1, 0]], np.uint32),
+    "big": np.array([1.5, 2], ">f4"),
+    "flags": np.array([True, False]),
+}
+
+
+class Bomb:
+    """Leaves a trace if anyone loads it."""
+
+    def __reduce__(self) -> tuple:
+        return os.system, ("touch pickle-was-loaded",)
+
+
+def dumped(path: Path, value: object, protocol: int = 4) -> Path:
+    path.write_bytes(pickle.dumps(value, protocol))
+    return path
+
+
+@pytest.mark.parametrize("protocol", [0, 1, 2, 3, 4])
+def test_plain_data_comes_back(tmp_path: Path, protocol: int) -> None:
+    found = read_pickle(dumped(tmp_path / "a.pkl", DATA, protocol))
+    assert np.array_equal(found["K"][0], DATA["K"][0]) and np.array_equal(found["K"][1], DATA["K"][1])
+    assert found["ims"].shape == (2,) and found["ims"][0] == {"ims": ["a", "b"]}
+    assert found["count"] == 2.5 and found["big"].tolist() == [1.5, 2] and found["flags"].tolist() == [True, False]
+    assert found["kintree"].dtype == np.uint32 and found["kintree"].tolist() == [[4294967295, 0]]
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4])
+def test_sparse_matrices_come_back(tmp_path: Path, protocol: int) -> None:
+    dense = np.array([[0.0, 2, 0], [1, 0, 0.5]])
+    found = read_pickle(dumped(tmp_path / "a.pkl", {"J": scipy.sparse.csc_matrix(dense)}, protocol))
+    assert np.array_equal(found["J"].toarray(), dense)
+
+
+def test_python_2_wrote_text_as_bytes(tmp_path: Path) -> None:
+    """numpy under Python 2: numpy.core.multiarray, and a string of bytes; 2.0 is 40 00 00 00 00 00 00 00, big end
+    first."""
+    (tmp_path / "a.pkl").write_bytes(
+        b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\ntS'b'\ntR"
+        b"(I1\n(I1\ntcnumpy\ndtype\n(S'f8'\nI0\nI1\ntR(I3\nS'<'\nNNNI-1\nI-1\nI0\ntbI00\n"
+        b"S'\\x00\\x00\\x00\\x00\\x00\\x00\\x00@'\ntb."
+    )
+    assert read_pickle(tmp_path / "a.pkl").tolist() == [2.0]
+
+
+def test_chumpy_arrays_become_plain(tmp_path: Path) -> None:
+    """As its objects are stored: class, then attributes, of which x is the value; without chumpy at hand."""
+    numbers = pickle.dumps(np.array([3.0, 4.0]), 2)[2:-1]  # without its PROTO and STOP
+    stored = (
+        b"ccopy_reg\n_reconstructor\n(cchumpy.ch\nCh\nc__builtin__\nobject\nNtR(dS'x'\n" + numbers + b"sS'want'\nNsb."
+    )
+    (tmp_path / "a.pkl").write_bytes(b"\x80\x02" + stored)
+    assert read_pickle(tmp_path / "a.pkl").tolist() == [3.0, 4.0]
+    (tmp_path / "a.pkl").write_bytes(b"\x80\x02" + stored.replace(b"chumpy.ch\nCh", b"chumpy.reordering\nSelect"))
+    with pytest.raises(CaptureError, match=r"a\.pkl: .* names chumpy.reordering.Select\); convert it to \.npz"):
+        read_pickle(tmp_path / "a.pkl")
+
+
+def test_npy_files_of_one_dictionary(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", {"poses": np.ones((1, 72))}, allow_pickle=True)  # type: ignore[arg-type]
+    assert read_pickled_npy(tmp_path / "a.npy")["poses"].shape == (1, 72)
+    np.save(tmp_path / "b.npy", np.ones(3))
+    with pytest.raises(CaptureError, match=r"b\.npy: holds no dictionary"):
+        read_pickled_npy(tmp_path / "b.npy")
+
+
+def _of_a_terabyte() -> bytes:
+    """An array that declares 10^12 numbers and has two."""
+    stored = pickle.dumps(np.ones(2), 0)
+    assert stored.count(b"I2\n") == 1
+    return stored.replace(b"I2\n", b"I1000000000000\n")
+
+
+BAD = {
+    "a call": pickle.dumps({"cams": Bomb()}),
+    "a call in an array": pickle.dumps(np.array([Bomb()], object)),
+    "an allowed function's own attribute": b"cnumpy\nfromfile\n(S'/etc/passwd'\ntR.",
+    "a call by a stand-in": b"cnumpy.core.multiarray\n_reconstruct\n(c__builtin__\nset\n(I0\ntS'b'\ntR.",
+    "more than it holds": _of_a_terabyte(),
+    "cut short": pickle.dumps(DATA)[:300],
+    "nested deeply": b"(" * 5000 + b"l" * 5000 + b".",
+    "text": b"hello",
+    "nothing": b"",
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_is_no_plain_data_is_refused(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.pkl").write_bytes(BAD[case])
+    with pytest.raises(CaptureError, match=r"a\.pkl: not a pickle of plain data"):
+        read_pickle(tmp_path / "a.pkl")
+    assert not (tmp_path / "pickle-was-loaded").exists()
+
+
+def test_what_a_pickle_holds_often_is_made_once(tmp_path: Path) -> None:
+    """Forty lists, each holding the next twice: a million million if each were copied."""
+    nested: list[Any] = [np.ones(1)]
+    for _ in range(40):
+        nested = [nested, nested]
+    found = read_pickle(dumped(tmp_path / "a.pkl", nested))
+    assert found[0] is found[1]
+
+
+def test_a_huge_memo_index_allocates_nothing(tmp_path: Path) -> None:
+    (tmp_path / "a.pkl").write_bytes(b"\x80\x02]r\xff\xff\xff\x7f.")
+    assert read_pickle(tmp_path / "a.pkl") == []

@@ -1,0 +1,114 @@
+"""Deformation of single frames: nodes and their shares by hand, gradients in double precision, a surface that moves."""
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from hnerf.body.canonical import Descriptor, PosedBodies
+from hnerf.config import FastFieldSettings
+from hnerf.fields.conditions import Conditions
+from hnerf.fields.deformation import FrameDeformation, spread_over
+from hnerf.fields.fast import FastField
+from tests.body.boxes import box_rig
+
+RIG = box_rig()
+CENTIMETRES = torch.tensor([[0.01, 0.0, 0.0], [0.0, 0.0, 0.02]])
+
+
+def at(corners: list[int], barycentric: list[float]) -> Descriptor:
+    """A point next to a triangle of the box."""
+    nowhere, corner = torch.zeros(1, 3), torch.tensor([corners])
+    return Descriptor(
+        torch.zeros(1), nowhere, nowhere, nowhere, torch.ones(1).bool(), corner, torch.tensor([barycentric])
+    )
+
+
+def deformation(nodes: int) -> FrameDeformation:
+    found = FrameDeformation(RIG.vertices_m, RIG.faces, nodes, frames=2)
+    found.displacement.data[:2] = CENTIMETRES[:, None]
+    return found
+
+
+def test_nodes_lie_far_from_each_other():
+    """On a line, from 0: 10 is farthest, then 4 (4 from 0 and 6 from 10), then 7 (3 from 4 and from 10)."""
+    line = np.array([0.0, 1.0, 4.0, 7.0, 10.0])[:, None]
+    assert spread_over(line, 4) == [0, 4, 2, 3]
+
+
+def test_all_follow_a_single_node_and_none_where_no_frame_is_meant():
+    moments = torch.tensor([0, 1, -1])
+    described = at([4, 5, 6], [0.5, 0.25, 0.25])
+    moved = torch.cat([deformation(1)(described, m[None])[0] for m in moments])
+    torch.testing.assert_close(moved, torch.cat([CENTIMETRES, torch.zeros(1, 3)]))
+
+
+def test_shares_by_hand():
+    """Nodes at corners 0 and 6, opposite ones. All corners are within 1 of one of them, so nodes reach 0.5: corner 1, 1
+    from node 0 and sqrt(2) from node 6, follows node 0 with 1 / (1 + exp((1 - 2) / 0.25))."""
+    found = FrameDeformation(RIG.vertices_m, RIG.faces, 2, frames=1)
+    found.displacement.data[0, 0] = torch.tensor([1.0, 0.0, 0.0])
+    moved, outwards = found(at([1, 1, 1], [0.2, 0.3, 0.5]), torch.tensor([0]))
+    share = 1 / (1 + torch.exp(torch.tensor(-1 / 0.25)))
+    torch.testing.assert_close(moved, torch.tensor([[share, 0.0, 0.0]]))
+    torch.testing.assert_close(outwards, share * found.normals[1, :1])
+
+
+def test_gradient_in_double():
+    found = deformation(3).double()
+    described = at([4, 5, 6], [0.5, 0.25, 0.25])
+    described = Descriptor(*(v.double() if v.is_floating_point() else v for v in vars(described).values()))
+
+    def moved(displacement: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return torch.func.functional_call(found, {"displacement": displacement}, (described, torch.tensor([1])))
+
+    assert torch.autograd.gradcheck(moved, found.displacement.detach().requires_grad_())
+
+
+def test_poses_without_a_frame_of_their_own_are_displaced_as_frames_are_in_the_mean():
+    """Frames 0 and 2 by 1 cm along x and by 2 cm upwards: 0.5 cm and 1 cm for frame 1 and for what no frame has."""
+    found = FrameDeformation(RIG.vertices_m, RIG.faces, 2, frames=3)
+    found.displacement.data[[0, 2]] = CENTIMETRES[:, None]
+    found.learn_for_all(torch.tensor([0, 2]))
+    mean = torch.tensor([0.005, 0.0, 0.01])
+    expected = torch.stack([CENTIMETRES[0], mean, CENTIMETRES[1], mean])[:, None].expand(-1, 2, -1)
+    torch.testing.assert_close(found.displacement.data, expected)
+
+
+def test_how_far_vertices_go_outwards():
+    """All go 1 cm along x in frame 0: corner 0, at the origin, goes inwards, corner 1, at (1, 0, 0), outwards; in frame
+    1 all go 2 cm up, corner 1 inwards."""
+    found = deformation(1)
+    across, up, nowhere = found.outwards(torch.tensor([0, 1, -1]))
+    torch.testing.assert_close(across, 0.01 * found.normals[:, 0])
+    assert across[0] < -0.003 and across[1] > 0.003 and up[1] < -0.003
+    assert (nowhere == 0).all()
+
+
+@pytest.mark.parametrize("moved_m", [[0.0, 0.0, 0.02], [0.015, -0.01, 0.0]])
+def test_a_frame_moves_all_that_the_field_knows(moved_m: list[float]):
+    """A box in frame 1, moved along the normal or across it, shows at x + m what it shows at x in frame 0 and in a
+    pose that no frame has: distance, with a residual of any form, and colour."""
+    torch.manual_seed(0)
+    settings = FastFieldSettings(
+        outer_m=0.1, inner_m=0.1, samples=8, geometry_cells=(16,), colour_cells=(16,), pose_width=1, nodes=1
+    )
+    rig = box_rig(splits=3)
+    field = FastField(rig, settings, frames=2)
+    assert field.deformation is not None
+    field.deformation.displacement.data[1] = torch.tensor(moved_m)
+    nn.init.normal_(field.field.geometry[-1].weight)
+    for level in field.field.geometry_grids.levels:
+        nn.init.normal_(level)
+    theta, root = torch.zeros(1, 2, 3), torch.eye(4)[None]
+    bodies = PosedBodies(rig, theta, root, rig.vertices_m)
+    points_m = torch.tensor([[0.43, 0.51, 1.03], [0.55, 0.38, 1.01]])
+
+    def seen(at_m: torch.Tensor, moment: int) -> torch.Tensor:
+        known = Conditions.of(rig, theta, root, torch.tensor([moment]), 2.5)
+        distance_m = field.signed_distance(bodies, at_m, known)
+        return torch.cat([distance_m[:, None], field.colour(bodies, at_m, at_m, known)], 1)
+
+    torch.testing.assert_close(seen(points_m + torch.tensor(moved_m), 1), seen(points_m, 0), atol=1e-4, rtol=1e-3)
+    torch.testing.assert_close(seen(points_m, -1), seen(points_m, 0))
+    assert (seen(points_m, 1) - seen(points_m, 0)).abs().max() > 1e-3

@@ -1,0 +1,271 @@
+"""The fast field's shell: tightened to what can be seen, and rays that miss it are asked nothing."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from hnerf.body.canonical import Descriptor, PosedBodies
+from hnerf.config import FastFieldSettings
+from hnerf.fields.base import Field
+from hnerf.fields.conditions import Conditions, Draws
+from hnerf.fields.fast import ROOM_M, SAMPLES, SETTLED, SPACING_M, TIGHTEN_STEP_M, FastField, at_surface
+from hnerf.training.losses import pixel
+from tests.body.boxes import box_rig
+
+RIG = box_rig(splits=3)
+SETTINGS = FastFieldSettings(
+    outer_m=0.07,
+    inner_m=0.03,
+    samples=32,
+    geometry_cells=(4,),
+    colour_cells=(4,),
+    width=8,
+    pose_width=8,
+    shell_cell_m=0.05,
+)
+
+
+def standing() -> tuple[PosedBodies, Conditions]:
+    theta, root = torch.zeros(1, 2, 3), torch.eye(4)[None]
+    return PosedBodies(RIG, theta, root, RIG.vertices_m), Conditions.of(RIG, theta, root, torch.zeros(1).long(), 2.5)
+
+
+def field_of(sharpness_per_m: float) -> FastField:
+    torch.manual_seed(0)
+    field = FastField(RIG, SETTINGS, 1)
+    field.log_sharpness.data.fill_(sharpness_per_m).log_()
+    return field
+
+
+def test_the_shell_is_tightened_to_where_the_opacity_changes():
+    """Untrained, d_hat is d: a logistic of 1000 per metre has settled 5 mm from the skin, one of 10 nowhere."""
+    _, conditions = standing()
+    sharp, soft = field_of(1000.0), field_of(10.0)
+    for field in (sharp, soft):
+        field.tighten(RIG, conditions.pose)
+    seen_m = SETTLED / 1000
+    for thickness in (sharp.outer_m, sharp.inner_m):
+        assert (thickness <= seen_m + ROOM_M + 1e-6).all()
+        assert thickness.max().item() == pytest.approx(seen_m + ROOM_M, abs=TIGHTEN_STEP_M)
+    assert soft.outer_m.max().item() == pytest.approx(SETTINGS.outer_m)
+    assert soft.inner_m.max().item() == pytest.approx(SETTINGS.inner_m)
+
+
+def test_a_tight_shell_shows_the_same_picture():
+    bodies, conditions = standing()
+    field = field_of(1000.0)
+    origins = torch.tensor([[0.5, 0.4, 3.0], [0.31, 0.62, 3.0], [0.1, 0.8, 3.0]])
+    directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3)
+    frame, draws = torch.zeros(3, dtype=torch.long), Draws.still(3, SETTINGS.samples, torch.device("cpu"))
+
+    def coverage() -> torch.Tensor:
+        samples, _ = field.sample(
+            bodies, field.region(bodies, conditions), origins, directions, frame, conditions, draws
+        )
+        return field.coverage(samples)
+
+    before = coverage()
+    field.tighten(RIG, conditions.pose)
+    torch.testing.assert_close(coverage(), before, atol=0.01, rtol=0)
+    assert (before > 0.95).all()
+
+
+def test_rays_that_miss_the_shell_see_nothing_and_change_nothing():
+    """The middle one of three passes 1 m beside the box; the others are as if it were not there."""
+    bodies, conditions = standing()
+    field = field_of(100.0)
+    origins = torch.tensor([[0.5, 0.5, 3.0], [2.0, 0.5, 3.0], [0.4, 0.6, 3.0]])
+    directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3)
+
+    def sampled(pick: list[int]) -> list[torch.Tensor]:
+        draws = Draws.still(len(pick), SETTINGS.samples, torch.device("cpu"))
+        frame = torch.zeros(len(pick), dtype=torch.long)
+        found, _ = field.sample(
+            bodies, field.region(bodies, conditions), origins[pick], directions[pick], frame, conditions, draws
+        )
+        return [found.alpha, found.colour, found.d, found.residual]
+
+    alpha, colour, d, residual = sampled([0, 1, 2])
+    assert not alpha[1].any() and not colour[1].any() and not residual[1].any()
+    assert (d[1] == field.reach_m).all()
+    assert not sampled([1])[0].any()
+    where = (bodies, field.region(bodies, conditions), origins[[1]], directions[:1], torch.zeros(1, dtype=torch.long))
+    draws = Draws.random(1, 5, 0.0, torch.Generator())
+    assert field.sample(*where, conditions, draws)[0].gradient_norm.shape == (0,)
+    for all_three, alone in zip((alpha, colour, d, residual), sampled([0, 2]), strict=True):
+        torch.testing.assert_close(all_three[[0, 2]], alone, atol=1e-6, rtol=0)
+
+
+def test_a_picture_with_as_many_samples_as_the_way_asks_for_is_that_of_many(monkeypatch: pytest.MonkeyPatch):
+    """Straight and slanted rays, whose ways through the shell differ, and one that misses; beside 32 samples each."""
+    bodies, conditions = standing()
+    field = field_of(200.0)
+    origins = torch.tensor([[0.5, 0.4, 3.0], [0.02, 0.9, 3.0], [0.5, 0.1, 3.0], [2.0, 0.5, 3.0]])
+    directions = torch.tensor([[0.0, 0.0, -1.0], [0.0, -0.02, -1.0], [0.05, 0.1, -1.0], [0.0, 0.0, -1.0]])
+    directions = torch.nn.functional.normalize(directions, dim=-1)
+    rays = (bodies, field.region(bodies, conditions), origins, directions, torch.zeros(4, dtype=torch.long), conditions)
+    needed = field.region(bodies, conditions).path_m(*rays[2:5]) / SPACING_M
+    assert len({sum(float(n) > count for count in SAMPLES) for n in needed}) >= 3
+    found = field.look(*rays)
+    monkeypatch.setattr(FastField, "samples_needed", Field.samples_needed)
+    expected = field.look(*rays)
+    torch.testing.assert_close(found, expected, atol=0.02, rtol=0)
+    assert (found[:3, 3] > 0.5).all() and not found[3].any()
+
+
+def deeper_by(distance_m: float, settings: FastFieldSettings = SETTINGS) -> FastField:
+    """A field whose surface lies deeper than the body everywhere in the shell."""
+    torch.manual_seed(0)
+    field = FastField(RIG, settings, 1)
+    field.log_sharpness.data.fill_(500.0).log_()
+    last = field.field.geometry[-1]
+    assert isinstance(last, torch.nn.Linear)
+    last.bias.data.fill_(distance_m / settings.outer_m)
+    return field
+
+
+def test_a_rendered_ray_ends_at_the_solid_core_where_the_surface_lies_deeper():
+    """Of a surface 10 cm inside the body, in a shell 3 cm deep, no sample sees anything: a ray through the middle is
+    opaque all the same, at its last sample and in that sample's colour, and one that grazes the shell sees nothing."""
+    bodies, conditions = standing()
+    field = deeper_by(0.1)
+    origins, directions = torch.tensor([[0.5, 0.5, 3.0], [-0.05, 0.5, 3.0]]), -torch.eye(3)[[2, 2]]
+    rays = origins, directions, torch.zeros(2, dtype=torch.long)
+    region = field.region(bodies, conditions)
+    count = int(field.samples_needed(region, *rays)[0])
+    draws = Draws.still(2, count, torch.device("cpu"))
+    with torch.no_grad():
+        samples, depths = field.sample(bodies, region, *rays, conditions, draws)
+        seen = field.look(bodies, region, *rays, conditions)
+    assert samples.d_hat.min() > 0.02 and field.coverage(samples).max() < 0.01
+    assert seen[0, 3] == pytest.approx(1) and seen[0, 4] == pytest.approx(depths[0, -1].item(), abs=1e-4)
+    torch.testing.assert_close(seen[0, :3], samples.colour[0, -1], atol=1e-3, rtol=0)
+    assert samples.colour[0, -1].min() > 0 and seen[1, 3] < 0.01
+
+
+def test_a_shell_deeper_than_high_finds_the_surface_at_its_bottom():
+    """3 cm outside, 10 cm inside, and a surface 7 cm inside the body: farther from the skin than the shell is high."""
+    settings = SETTINGS.model_copy(update={"outer_m": 0.03, "inner_m": 0.1, "shell_cell_m": 0.015})
+    bodies, conditions = standing()
+    field = deeper_by(0.07, settings)
+    field.tighten(RIG, conditions.pose)
+    ray = torch.tensor([[0.5, 0.5, 3.0]]), -torch.eye(3)[[2]], torch.zeros(1, dtype=torch.long)
+    with torch.no_grad():
+        seen = field.look(bodies, field.region(bodies, conditions), *ray, conditions)[0]
+    top_m = 3 - bodies.vertices_m[0, :, 2].max().item()
+    assert seen[3] == pytest.approx(1, abs=0.01) and seen[4].item() - top_m == pytest.approx(0.07, abs=0.01)
+
+
+def test_the_shell_moves_with_the_surface_of_a_frame():
+    """Of a frame that lies 2 cm higher the shell is 2 cm higher; of one that lies 6 cm higher its upper end goes no
+    farther than the setting of 7 cm, 5 cm above where it was."""
+    settings = SETTINGS.model_copy(update={"nodes": 1, "shell_cell_m": 0.01, "inner_m": 0.1})
+    field = FastField(RIG, settings, 2)
+    assert field.deformation is not None
+    field.outer_m.fill_(0.02)
+    field.inner_m.fill_(0.07)
+    field.deformation.displacement.data[:2, 0, 2] = torch.tensor([0.02, 0.06])
+    bodies, _ = standing()
+    ray = torch.tensor([[0.5, 0.5, 3.0]]), -torch.eye(3)[[2]], torch.zeros(1, dtype=torch.long)
+
+    def ends(moment: int) -> torch.Tensor:
+        """Depths of the first and the last sample on a ray from above."""
+        moments = Conditions.of(RIG, bodies.theta, bodies.root, torch.tensor([moment]), 2.5)
+        depths, _, core = field.region(bodies, moments).sample_rays(*ray, torch.full((1, 64), 0.5))
+        assert core.all()
+        return depths[0, [0, -1]]
+
+    still = ends(-1)
+    torch.testing.assert_close(still - ends(0), torch.tensor([0.02, 0.02]), atol=0.011, rtol=0)
+    torch.testing.assert_close(still - ends(1), torch.tensor([0.05, 0.06]), atol=0.011, rtol=0)
+
+
+def test_training_begins_with_half_the_samples():
+    """Of 32 samples 16 for three quarters of the steps, then all; a rendering has what it asks for."""
+    field = FastField(RIG, SETTINGS, 1)
+    assert [field.samples_in_training(done) for done in (0.0, 0.74, 0.75, 1.0)] == [16, 16, 32, 32]
+
+
+def on_a_ray(depth_m: list[float], near: list[bool]) -> Descriptor:
+    """Descriptors of one ray's samples at some heights above the skin z = 0, which it meets head-on."""
+    d, zero = torch.tensor(depth_m), torch.zeros(len(depth_m))
+    y, normal = torch.stack([zero, zero, d], 1), torch.stack([d, zero, zero], 1)  # a normal that tells samples apart
+    return Descriptor(d, y, y, normal, torch.tensor(near), torch.zeros(len(d), 3).long(), torch.zeros(len(d), 3))
+
+
+def test_colours_are_those_of_the_surface_between_two_samples():
+    """Heights 12, 6, -2, -8 mm above the skin, and a surface 1 mm above it: the second sample moves 5 / 8 of the way to
+    the third, the first as near as the second one; those behind stay."""
+    described = on_a_ray([0.012, 0.006, -0.002, -0.008], [True] * 4)
+    moved = at_surface(described, described.d[None] - 0.001)
+    expected = torch.tensor([0.006, 0.001, -0.002, -0.008])
+    assert torch.allclose(moved.d, expected, atol=1e-7)
+    assert torch.allclose(moved.y[:, 2], expected, atol=1e-7)
+    assert torch.allclose(moved.normal[:, 0], expected, atol=1e-7)
+
+
+def test_samples_stay_where_the_next_one_is_out_of_reach_or_on_another_limb():
+    described = on_a_ray([0.005, -0.005, 0.005, -0.005], [True, False, True, True])
+    described.y[3, 0] = 0.1
+    moved = at_surface(described, described.d[None])
+    assert torch.equal(moved.d, described.d)
+    assert torch.equal(moved.y, described.y)
+
+
+def test_a_surface_is_met_at_the_same_point_when_its_body_moves_along_the_ray():
+    """A ray falls at 45 degrees, 4 mm down and 4 mm along x a sample, from 3 mm above the skin at x = 0 to 1 mm below:
+    it meets it at x = 3 mm. The body moved along the ray by e shows the same point; moved down by e, the ray meets it e
+    later in x."""
+    x, height = torch.tensor([[0.0, 0.004], [0.003, -0.001]], dtype=torch.double)
+
+    def met_at(along: torch.Tensor, down: torch.Tensor) -> torch.Tensor:
+        d = height + along + down
+        y = torch.stack([x - along, torch.zeros_like(x), d], 1)
+        described = dataclasses.replace(on_a_ray([0.0, 0.0], [True] * 2), d=d, y=y, normal=y)
+        return at_surface(described, d[None]).y[0]
+
+    still = torch.zeros((), dtype=torch.double, requires_grad=True)
+    skin = torch.tensor([0.003, 0.0, 0.0], dtype=torch.double)
+    torch.testing.assert_close(met_at(still, still), skin, atol=1e-12, rtol=0)
+    along, down = torch.autograd.functional.jacobian(met_at, (still, still))
+    torch.testing.assert_close(along, torch.zeros_like(skin), atol=1e-9, rtol=0)
+    torch.testing.assert_close(down, torch.tensor([1.0, 0.0, 0.0], dtype=torch.double), atol=1e-9, rtol=0)
+    assert torch.autograd.gradcheck(met_at, (still, still), eps=1e-7)
+
+
+def test_a_pixel_pulls_at_its_body_as_its_colour_changes_when_the_body_moves():
+    """Gradients of a slanted ray's colour to the body's position are its central differences over 0.2 mm."""
+    bodies, conditions = standing()
+    field, correction = field_of(500.0), bodies.correction()
+    for grid in field.field.colour_grids.parameters():
+        torch.nn.init.normal_(grid)
+    direction = torch.nn.functional.normalize(torch.tensor([[0.4, 0.3, -1.0]]), dim=-1)
+    rays = (torch.tensor([[0.5, 0.4, 0.5]]) - 2 * direction, direction, torch.zeros(1, dtype=torch.long))
+    draws = Draws.still(1, SETTINGS.samples, torch.device("cpu"))
+
+    def colour(move_m: torch.Tensor) -> torch.Tensor:
+        moved = {"move_m": move_m[None], "turn": correction.turn, "shape": correction.shape}
+        where = (bodies, field.region(bodies, conditions), *rays)
+        samples, _ = field.sample(*where, conditions, draws, SimpleNamespace(**moved))
+        return pixel(samples.alpha, samples)[0]
+
+    step_m = 1e-4
+    steps = [(colour(step_m * axis) - colour(-step_m * axis)) / (2 * step_m) for axis in torch.eye(3)]
+    pull = torch.autograd.functional.jacobian(colour, torch.zeros(3))
+    assert pull.abs().max() > 0.1
+    torch.testing.assert_close(pull, torch.stack(steps, 1), atol=1e-3, rtol=0)
+
+
+def test_a_ray_that_grazes_the_surface_has_finite_gradients():
+    described = on_a_ray([0.001, 0.001, 0.0, 0.0], [True] * 4)
+    d_hat = described.d[None].requires_grad_()
+    at_surface(described, d_hat).y.sum().backward()
+    assert d_hat.grad is not None
+    assert torch.isfinite(d_hat.grad).all()
+
+
+def test_samples_stay_where_the_surface_is_left():
+    described = on_a_ray([0.001, 0.004, 0.004, 0.009], [True] * 4)
+    assert torch.equal(at_surface(described, described.d[None]).d, described.d)

@@ -1,0 +1,123 @@
+"""One ray through the fast field, its networks replaced by known functions: what they are asked, and how steep the
+distance is that they make.
+
+The body is the unit box, turned a quarter about z: the ray comes along x and meets its face at x = 1.55 m, where the
+canonical place is (0.4, 1, 0.25) and the canonical normal is y. The shell reaches 6 cm out and 4 cm in.
+"""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from hnerf.body.canonical import PosedBodies
+from hnerf.config import FastFieldSettings
+from hnerf.fields.compositing import weights_from_alpha
+from hnerf.fields.conditions import Conditions, Draws
+from hnerf.fields.fast import FastField
+from hnerf.fields.samples import RaySamples
+from tests.body.boxes import box_rig
+
+RIG = box_rig()
+THETA = torch.tensor([[[0.0, 0, 0], [-0.4, 0.5, 0.6]], [[0.0, 0, 0], [0.1, 0.2, 0.3]]])
+ROOT = torch.eye(4).repeat(2, 1, 1)
+ROOT[1, :2] = torch.tensor([[0.0, -1, 0, 2.55], [1, 0, 0, 0]])
+SETTINGS = FastFieldSettings(
+    outer_m=0.06, inner_m=0.04, shell_cell_m=0.02, samples=12, geometry_cells=(2,), colour_cells=(2,), pose_width=1
+)
+RAY = torch.tensor([[-1.0, 0.4, 0.25]]), torch.tensor([[1.0, 0, 0]]), torch.tensor([1])
+OUTERMOST, INNERMOST = 0.0, 0.99  # of the ray's samples
+
+Distance = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+def field_of(residual: Distance, nodes: int = 0) -> FastField:
+    """A field with a sharp surface, of which DH is known."""
+    field = FastField(RIG, SETTINGS.model_copy(update={"nodes": nodes}), 2)
+    field.log_sharpness.data.fill_(2000.0).log_()
+    field.field.residual = residual
+    return field
+
+
+def nothing(y_m: Tensor, d_m: Tensor, pose: Tensor) -> Tensor:
+    return torch.zeros_like(d_m)
+
+
+def sampled(field: FastField, probe: float | None = None) -> RaySamples:
+    bodies = PosedBodies(RIG, THETA, ROOT, RIG.vertices_m)
+    conditions = Conditions.of(RIG, THETA, ROOT, torch.arange(2), 2.5)
+    draws = Draws(torch.full((1, 12), 0.5), torch.rand(1, 3), torch.zeros(1, 12))
+    if probe is not None:
+        draws = Draws(draws.jitter, draws.beyond, draws.finer, torch.tensor([probe]))
+    return field.sample(bodies, field.region(bodies, conditions), *RAY, conditions, draws, bodies.correction())[0]
+
+
+def same(found: Tensor, expected: list[float]) -> None:
+    torch.testing.assert_close(found.detach(), torch.tensor(expected), atol=1e-4, rtol=0)
+
+
+def test_the_networks_see_the_canonical_place_the_frames_pose_and_the_normal_in_the_world() -> None:
+    """Of a surface 1 cm outside the body. F is asked where the ray meets it, DH at every sample."""
+    asked: dict[str, tuple[Tensor, ...]] = {}
+
+    def residual(*inputs: Tensor) -> Tensor:
+        asked["residual"] = inputs
+        return torch.full_like(inputs[1], -0.01)
+
+    def colour(*inputs: Tensor) -> Tensor:
+        asked["colour"] = inputs
+        return inputs[0]
+
+    field = field_of(residual)
+    field.field.colour = colour
+    samples = sampled(field)
+    place, depth, normal, pose = asked["colour"]
+    at = int((depth - 0.01).abs().argmin())
+    same(place[at], [0.4, 1.01, 0.25])
+    same(depth[at], 0.01)
+    same(normal[at], [-1.0, 0, 0])
+    same(pose[at], [0.1, 0.2, 0.3])
+    place, depth, pose = asked["residual"]
+    assert torch.equal(depth.detach(), samples.d[0]) and (depth.diff() < 0).all()
+    same(place[:, 1], (1 + depth).tolist())
+    same(pose, [[0.1, 0.2, 0.3]] * 12)
+    same(samples.colour[0, weights_from_alpha(samples.alpha)[0].argmax()], [0.4, 1.01, 0.25])
+    same(samples.residual, [[-0.01] * 12])
+
+
+@pytest.mark.parametrize("probe", [OUTERMOST, INNERMOST])
+def test_the_distance_is_as_steep_as_in_the_world(probe: float) -> None:
+    """It rises along the normal by 1 a metre for the body, 0.5 and 0.2 for the residual's second coordinate and
+    distance, and across it by 0.3: the same outside the skin and inside."""
+    samples = sampled(field_of(lambda y, d, pose: 0.3 * y[:, 0] + 0.5 * y[:, 1] + 0.2 * d), probe)
+    assert (samples.d[0, int(12 * probe)] > 0.01) == (probe == OUTERMOST)
+    same(samples.gradient_norm, [(1.7**2 + 0.3**2) ** 0.5])
+
+
+def test_the_gradient_is_a_forward_difference_over_5_mm() -> None:
+    """Of 40 (y - 1)^2, where y - 1 is d: 80 d + 40 x 0.005."""
+    samples = sampled(field_of(lambda y, d, pose: 40 * (y[:, 1] - 1) ** 2), OUTERMOST)
+    same(samples.gradient_norm, [1 + 80 * samples.d[0, 0].item() + 0.2])
+
+
+def test_the_eikonal_loss_moves_no_body() -> None:
+    """It is the field's alone; a rendering does not ask for it."""
+    assert not sampled(field_of(lambda y, d, pose: y[:, 0] * d), OUTERMOST).gradient_norm.requires_grad
+    assert sampled(field_of(nothing)).gradient_norm.shape == (0,)
+
+
+def test_the_energy_of_a_displacement() -> None:
+    """2 cm along y in the ray's frame, 1 cm of which is the unit: 4 at each sample. The body's surface is met 2 cm
+    earlier."""
+    field = field_of(nothing, nodes=1)
+    assert field.deformation is not None
+    still = sampled(field)
+    assert still.elastic is not None
+    same(still.elastic, [0.0])
+    field.deformation.displacement.data[1, 0, 1] = 0.02
+    field.outer_m.fill_(0.03)
+    moved = sampled(field)
+    assert moved.elastic is not None
+    same(moved.elastic, [4.0])
+    assert moved.d.min() < 0 < moved.d.max() < 0.06

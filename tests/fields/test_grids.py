@@ -1,0 +1,67 @@
+"""What the fast field's two networks are asked at a point, and the units of their answers, by hand."""
+
+import torch
+from torch import Tensor, nn
+
+from hnerf.config import FastFieldSettings
+from hnerf.fields.grids import CanonicalField
+
+SETTINGS = FastFieldSettings(
+    outer_m=0.05, geometry_cells=(1, 2), colour_cells=(1,), channels=1, width=4, pose_width=2, samples=1
+)
+Y, D = torch.tensor([[0.2, 0.3, 0.4]]), torch.tensor([-0.01])
+NORMAL, POSE = torch.tensor([[1.0, 0.0, -0.5]]), torch.tensor([[0.1, 0.2, 0.3]])
+CODE = [0.3, -0.2]  # of this pose: its last number, and less its second one
+
+
+class First(nn.Module):
+    """A network that answers with its first inputs."""
+
+    def __init__(self, outputs: int):
+        super().__init__()
+        self.outputs, self.asked = outputs, torch.empty(0)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        self.asked = inputs.detach()
+        return inputs[:, : self.outputs]
+
+
+def known_field() -> CanonicalField:
+    """Features are 0.5 and 0.25 of geometry, 2 of colour, wherever it is asked."""
+    field = CanonicalField(torch.zeros(3), torch.ones(3), SETTINGS, 3)
+    levels = [*field.geometry_grids.levels, *field.colour_grids.levels]
+    for level, feature in zip(levels, (0.5, 0.25, 2.0), strict=True):
+        level.data.fill_(feature)
+    field.pose_code.weight.data = torch.tensor([[0.0, 0, 1], [0, -1, 0]])
+    field.geometry, field.radiance = First(1), First(3)
+    return field
+
+
+def test_geometry_sees_features_distance_and_pose() -> None:
+    """The distance in units of the shell's height, as its answer is: half of 5 cm."""
+    field = known_field()
+    found = field.residual(Y, D, POSE)
+    torch.testing.assert_close(field.geometry.asked, torch.tensor([[0.5, 0.25, -0.2, *CODE]]))
+    torch.testing.assert_close(found.detach(), torch.tensor([0.025]))
+
+
+def test_colour_sees_features_distance_pose_and_normal() -> None:
+    """The normal with one octave: sines of pi, 0 and -pi / 2, cosines of the same."""
+    field = known_field()
+    found = field.colour(Y, D, NORMAL, POSE)
+    encoded = [1.0, 0, -0.5, 0, 0, -1, -1, 1, 0]
+    torch.testing.assert_close(field.radiance.asked, torch.tensor([[2.0, -0.2, *CODE, *encoded]]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(found.detach(), torch.sigmoid(torch.tensor([[2.0, -0.2, 0.3]])))
+
+
+def test_no_network_answers_before_it_is_trained() -> None:
+    """The surface is the body's own; each pose and each place may change both answers."""
+    torch.manual_seed(0)
+    field = CanonicalField(torch.zeros(3), torch.ones(3), SETTINGS, 3)
+    assert field.residual(Y, D, POSE).item() == 0
+    nn.init.normal_(field.geometry[-1].weight)
+    for level in field.geometry_grids.levels:
+        nn.init.normal_(level)
+    here = field.residual(Y, D, POSE)
+    for changed in ((Y + 0.1, D, POSE), (Y, D + 0.01, POSE), (Y, D, POSE + 0.1)):
+        assert (field.residual(*changed) - here).abs() > 1e-6

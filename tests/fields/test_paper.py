@@ -1,0 +1,271 @@
+"""One ray through the published field, its networks replaced by known functions: what they are asked, and what becomes
+of their answers.
+
+A scene unit is 2 m. The body is the unit box, turned a quarter about z: it stands between x = 1.55 and 2.55 m, its box
+B between 1.45 and 2.65. The ray comes along x from 1 m before the scene, so that x is its depth less 1 m. A fog leaves
+half of the light after each metre: of four coarse samples in the middles of their metres the weights are 1/2, 1/4, 1/8
+and 1/8, and fine ones at .6 of their quarters of these lie at 1.3 and 1.8 m in the first metre, 2.6 m in the second and
+4.2 m in the last.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from hnerf.body.canonical import PosedBodies
+from hnerf.config import LossSettings, PaperFieldSettings, load_settings
+from hnerf.fields.conditions import Conditions, Draws
+from hnerf.fields.paper import PaperField
+from hnerf.fields.samples import RaySamples
+from hnerf.training.pixels import Rays
+from hnerf.training.step import Objective, Stage
+from tests.body.boxes import box_rig
+
+RIG = box_rig()
+THETA = torch.tensor([[[0.0, 0, 0], [-0.4, 0.5, 0.6]], [[0.0, 0, 0], [0.1, 0.2, 0.3]]])
+ROOT = torch.eye(4).repeat(2, 1, 1)
+ROOT[0, :3, 3] = torch.tensor([1.45, 0.4, -1.0])  # so that the middle of the scene is (2, 0.2, -0.5)
+ROOT[1, :2] = torch.tensor([[0.0, -1, 0, 2.55], [1, 0, 0, 0]])
+SETTINGS = PaperFieldSettings(scene_m=2.0, samples=4)
+RAY = torch.tensor([[-1.0, 0.4, 0.25]]), torch.tensor([[1.0, 0, 0]]), torch.tensor([1])
+DRAWS = Draws(torch.full((1, 4), 0.5), torch.ones(1, 3), torch.full((1, 4), 0.6), probe=torch.zeros(1))
+
+DEPTHS_M = [1.3, 1.5, 1.8, 2.5, 2.6, 3.5, 4.2, 4.5]
+INSIDE = torch.tensor([0.0, 0, 0, 1, 1, 1, 0, 0])  # B, 5 cm before the body's face, 5 cm behind it and before the other
+X = [-0.85, -0.75, -0.6, -0.25, -0.2, 0.25, 0.6, 0.75]  # in scene units
+S_D = [[0.2, 0.5, 0.125, 0.025], [0.2, 0.5, 0.125, -0.025], [0.2, 0.0, 0.125, -0.025]]
+TURN = [0.0, -1, 0, 1.275, 1, 0, 0, 0, 0, 0, 1, 0]  # the rows of T, its translation in scene units
+
+
+class Fog(nn.Module):
+    """F: the same density everywhere, colours painted by where it is asked."""
+
+    def __init__(self, paint: Callable[[Tensor], Tensor] = lambda point: point[:, :3]):
+        super().__init__()
+        self.paint, self.asked = paint, []
+        self.density = nn.Parameter(torch.tensor(2 * math.log(2)))  # a scene unit, which is two metres
+
+    def forward(self, point: Tensor, pose: Tensor, root: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
+        self.asked.append((point.detach(), pose, root, view))
+        return self.density.expand(len(point)), self.paint(point)
+
+
+class Slope(nn.Module):
+    """DH: a tenth of its first input."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked: list[tuple[Tensor, Tensor]] = []
+
+    def forward(self, point: Tensor, pose: Tensor) -> Tensor:
+        self.asked.append((point.detach(), pose))
+        return 0.1 * point[:, 0]
+
+
+def field_of(static: bool = False, **changes: object) -> PaperField:
+    field = PaperField(RIG, ROOT, SETTINGS.model_copy(update=changes), static)
+    field.radiance, field.residual = Fog(), Slope()
+    return field
+
+
+def bodies() -> tuple[PosedBodies, Conditions]:
+    return PosedBodies(RIG, THETA, ROOT, RIG.vertices_m), Conditions.of(RIG, THETA, ROOT, torch.arange(2), 2.0)
+
+
+def sampled(field: PaperField, draws: Draws = DRAWS) -> tuple[RaySamples, Tensor]:
+    standing, conditions = bodies()
+    return field.sample(standing, field.region(standing, conditions), *RAY, conditions, draws)
+
+
+def rows(values: list[list[float]]) -> Tensor:
+    return torch.tensor(values)
+
+
+def outside(dimensions: int) -> Tensor:
+    """The ray's points in scene units, with the constant distance outside B where there are four dimensions."""
+    return rows([[x, 0.1, 0.375, 1.0][:dimensions] for x in X])
+
+
+def same(found: Tensor, expected: Tensor, atol: float = 2e-4) -> None:
+    """Fine samples lie within 0.1 mm of where they are expected: no cell of theirs is without any weight."""
+    torch.testing.assert_close(found.detach(), expected, atol=atol, rtol=0)
+
+
+@pytest.mark.parametrize("static", [False, True])
+def test_fine_samples_lie_where_the_coarse_ones_have_weight(static: bool) -> None:
+    _, depths = sampled(field_of(static))
+    same(depths, rows([DEPTHS_M]))
+    assert not depths.requires_grad  # no gradient moves them
+
+
+def test_some_coarse_samples_lie_in_the_box_alone() -> None:
+    """Two of four in the middles of the scene's halves, at 2 and 4 m, two of those of B, which is met from 2.45 to
+    3.65 m."""
+    field = field_of(static=True, box_samples=2)
+    sampled(field)
+    same(field.radiance.asked[0][0][:, 0], torch.tensor([-0.5, -0.125, 0.175, 0.5]))
+
+
+def test_a_ray_beside_the_box_has_all_its_samples_in_the_scene() -> None:
+    field, (standing, conditions) = field_of(static=True, box_samples=2), bodies()
+    beside = torch.tensor([[-1.0, 1.9, 0.25]]), *RAY[1:]
+    samples, depths = field.sample(standing, field.region(standing, conditions), *beside, conditions, DRAWS)
+    assert samples.in_box.sum() == 0 and samples.alpha.isfinite().all()
+    assert (depths.diff() >= 0).all() and depths.min() >= 1 and depths.max() <= 5
+
+
+def test_coarse_samples_are_asked_first() -> None:
+    field = field_of()
+    sampled(field)
+    (coarse, *_), (both, *_) = field.radiance.asked
+    same(coarse, rows([outside(4)[1].tolist(), S_D[0], S_D[2], outside(4)[7].tolist()]))
+    assert len(both) == 8
+
+
+def test_f_sees_the_body_in_its_box_and_the_place_with_a_constant_outside() -> None:
+    """(s, d) in scene units; x - centre in scene units and distance 1; pose and root of the ray's own frame, zero
+    outside."""
+    field = field_of()
+    sampled(field)
+    point, pose, root, view = field.radiance.asked[-1]
+    same(point, torch.cat([outside(4)[:3], rows(S_D), outside(4)[6:]]))
+    same(pose, INSIDE[:, None] * torch.tensor([0.1, 0.2, 0.3]))
+    same(root, INSIDE[:, None] * torch.tensor(TURN))
+    same(view, rows([[1.0, 0, 0]] * 8))
+
+
+def test_dh_sees_the_body_and_the_pose() -> None:
+    field = field_of()
+    sampled(field)
+    point, pose = field.residual.asked[-1]
+    same(point, rows(S_D))
+    same(pose, rows([[0.1, 0.2, 0.3]] * 3))
+
+
+def test_the_networks_see_the_noise() -> None:
+    """On theta and T within B, on v everywhere."""
+    field, (standing, conditions) = field_of(), bodies()
+    noisy = replace(conditions, pose=conditions.pose + 0.01, root=conditions.root + 0.02)
+    draws = replace(DRAWS, view=torch.tensor([[0.0, 0.03, -0.04]]))
+    field.sample(standing, field.region(standing, noisy), *RAY, noisy, draws)
+    for _, pose, root, view in field.radiance.asked:
+        within = pose.abs().sum(1) > 0
+        same(pose[within], rows([[0.11, 0.21, 0.31]]).expand(int(within.sum()), 3))
+        same(root[within], torch.tensor(TURN).expand(int(within.sum()), 12) + 0.02)
+        assert within.any() and not root[~within].any()
+        same(view, rows([[1.0, 0.03, -0.04]]).expand_as(view))
+    same(field.residual.asked[-1][1], rows([[0.11, 0.21, 0.31]] * 3))
+
+
+def test_f_sees_no_root_where_it_is_no_condition() -> None:
+    field = field_of(root_condition=False)
+    sampled(field)
+    assert field.radiance.asked[-1][2].shape == (8, 0)
+
+
+def test_the_static_form_sees_the_place_alone() -> None:
+    """Three coordinates in and outside B, neither pose nor root; of DH those in B are asked."""
+    field = field_of(static=True)
+    sampled(field)
+    point, pose, root, view = field.radiance.asked[-1]
+    same(point, outside(3))
+    assert pose.shape == root.shape == (8, 0)
+    same(view, rows([[1.0, 0, 0]] * 8))
+    point, pose = field.residual.asked[-1]
+    same(point, outside(3)[3:6])
+    assert pose.shape == (3, 0)
+
+
+@pytest.mark.parametrize("static", [False, True])
+def test_density_counts_per_scene_unit(static: bool) -> None:
+    """A metre takes half of the light; behind the last sample nothing is seen."""
+    samples, _ = sampled(field_of(static))
+    ways_m = [0.2, 0.3, 0.7, 0.1, 0.9, 0.7, 0.3]
+    same(samples.alpha, rows([[1 - 0.5**way for way in ways_m] + [1.0]]))
+    same(samples.density, torch.full((1, 8), 2 * math.log(2)))
+    assert not samples.beyond.any()
+
+
+@pytest.mark.parametrize(
+    ("static", "residual", "norms"),
+    [(False, [0.02, 0.02, 0.02], [1.01**0.5] * 3), (True, [-0.025, -0.02, 0.025], [0.9, 0.9, 1.1])],
+)
+def test_distances_are_in_scene_units_and_their_gradient_in_metres(
+    static: bool, residual: list[float], norms: list[float]
+) -> None:
+    """Outside B the body is 1 away and has no residual. From the faces d rises by 1 a metre, along or against x, the
+    residual by a tenth: along the face, as s moves with the point, or in the static form along x."""
+    samples, _ = sampled(field_of(static))
+    same(samples.in_box, INSIDE[None])
+    d, dd = torch.ones(8), torch.zeros(8)
+    d[3:6], dd[3:6] = torch.tensor([0.025, -0.025, -0.025]), torch.tensor(residual)
+    same(samples.d, d[None])
+    same(samples.residual, dd[None])
+    same(samples.alpha_dot, 1 / (1 + torch.exp(200 * (d + dd)))[None], atol=2e-3)
+    same(samples.gradient_norm, torch.tensor(norms))
+    assert sampled(field_of(static), replace(DRAWS, probe=None))[0].gradient_norm.shape == (0,)  # a rendering
+
+
+def test_each_loss_of_a_ray() -> None:
+    """The ray is on the person, who is white; F paints B white and all else black. Before B half of the light is lost
+    1.2 times, in it 1.7 times: 2^-1.2 - 2^-2.9 of C, 1 - 2^-1.7 of C~ is white. d_hat is .045, -.005 and -.005: of C^,
+    2^-1.2 comes through to alpha_dot sigmoid(-9), sigmoid(1), sigmoid(1). Weights are the paper's."""
+    field, (standing, conditions) = field_of(), bodies()
+    field.radiance = Fog(lambda point: (point[:, 3:] != 1).float().expand(-1, 3))
+    correction = standing.correction()
+    correction.absorbed_shape.fill_(3.0)
+    correction.absorbed_move_m[1, 1] = 4.0  # of two frames
+    rays = Rays(*RAY, torch.ones(1, 3), torch.tensor([True]), torch.tensor([False]), None)
+    objective = Objective(field, correction, load_settings("paper").training)
+    terms = objective(Stage(standing, field.region(standing, conditions)), rays, conditions, DRAWS)
+
+    def sigmoid(x: float) -> float:
+        return 1 / (1 + math.exp(-x))
+
+    opaque = sigmoid(0.02 * (2 * math.log(2) - 50))
+    crossed = [-(a * math.log(opaque) + (1 - a) * math.log(1 - opaque)) for a in map(sigmoid, (-9, 1, 1))]
+    expected = {
+        "reconstruction": 3 * (1 - (2**-1.2 - 2**-2.9)),
+        "mask": 3 * 2**-1.7,
+        "blend": 0.1 * 3 * (1 - 2**-1.2 * (1 - sigmoid(9) * sigmoid(-1) ** 2)),
+        "geometry": 0.02 * sum(crossed),
+        "segmentation": 0.02 * -math.log(sigmoid(200 * 0.005)),
+        "eikonal": 1e-6 * 3 * (1.01**0.5 - 1) ** 2,
+        "residual": 5e-4 * 3 * 0.02,
+        "fit": 1.0 * -math.log(sigmoid(200 * 0.025)),
+        "increment": 0.02 * (3 + 4 / 2),
+    }
+    assert {name: term.item() for name, term in terms.items()} == pytest.approx(expected, rel=5e-3, abs=1e-12)
+
+
+def test_numbers_of_the_paper() -> None:
+    """Section 4 and the supplement's parameters."""
+    training = load_settings("paper").training
+    paper, losses = training.paper, training.losses
+    assert (paper.samples, paper.gamma, paper.learning_rate, paper.scene_m) == (256, 200, 1e-3, 2.5)
+    assert (training.steps, training.frames_per_step * training.rays_per_frame, training.noise) == (10_000, 4096, 0.1)
+    assert losses.density_threshold == 50
+    weights = [losses.reconstruction, losses.mask, losses.blend, losses.geometry, losses.segmentation]
+    weights += [losses.eikonal, losses.residual, losses.fit, losses.increment, losses.elastic]
+    assert weights == [1, 1, 0.1, 0.02, 0.02, 1e-6, 5e-4, 1, 0.02, 0]
+    assert LossSettings().eta == losses.eta == 1
+
+
+def test_what_is_asked_of_a_point_is_what_was_asked_in_training() -> None:
+    """5 cm above the first body, at (0.5, 0.2, 1) of it: d_hat is .05 + 2 x .1 x .25 m."""
+    field, (standing, conditions) = field_of(), bodies()
+    point_m, view = torch.tensor([[1.95, 0.6, 0.05]]), torch.tensor([[0.0, 0, -1]])
+    same(field.signed_distance(standing, point_m, conditions), torch.tensor([0.1]))
+    same(field.colour(standing, point_m, view, conditions), rows([[0.25, 0.1, 0.5]]))
+    point, pose, root, seen = field.radiance.asked[-1]
+    same(point, rows([[0.25, 0.1, 0.5, 0.025]]))
+    same(pose, rows([[-0.4, 0.5, 0.6]]))
+    same(root, rows([[1.0, 0, 0, 0.725, 0, 1, 0, 0.2, 0, 0, 1, -0.5]]))
+    same(seen, view)
+    static = field_of(static=True)
+    same(static.signed_distance(standing, point_m, conditions), torch.tensor([0.05 + 2 * 0.1 * -0.025]))
+    same(static.colour(standing, point_m, view, conditions), rows([[-0.025, 0.2, 0.275]]))

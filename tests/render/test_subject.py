@@ -1,0 +1,172 @@
+"""`hnerf render` on a subject that was never trained: a column whose field is as it was made, but for frames that
+deform it."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from flows.cli import main
+from hnerf.avatar.model_file import write_field
+from hnerf.avatar.trained import build_field, load_avatar
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.capture import Capture
+from hnerf.capture.footage import Video
+from hnerf.capture.formats.export import write_cameras
+from hnerf.capture.lens import Lens
+from hnerf.render.motion import between
+from hnerf.render.subject import Wish, _cameras
+from tests.training.scene import TINY, record
+
+
+@pytest.fixture(scope="module")
+def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A column 2 m high that four cameras see 4 m off, in frames 0 to 2."""
+    folder = tmp_path_factory.mktemp("subjects") / "column"
+    for stage in ("capture", "calibration", "training"):
+        (folder / stage).mkdir(parents=True)
+    capture, _, body = record(folder / "capture")
+    capture.save()
+    cameras = capture.cameras.values()
+    lenses = [Lens(c.name, c.K, np.zeros(5), c.R, c.t_m, (c.width_px, c.height_px)) for c in cameras]
+    write_cameras(folder / "calibration", lenses, "easymocap")
+    in_step = {name: {"frame_offset": 0} for name in capture.cameras}
+    (folder / "calibration" / "report.json").write_text(json.dumps({"cameras": in_step}))
+    body.save(folder / "training")
+    settings = TINY.model_copy(update={"fast": TINY.fast.model_copy(update={"nodes": 1})})
+    field = build_field(settings, body, False)
+    field.deformation.displacement.data[:3, 0, 0] = torch.tensor([0.0, 0.15, -0.15])  # to either side, frame by frame
+    write_field(field, folder / "training" / "model.safetensors")
+    stored = {"static": False, "training": settings.model_dump()}
+    (folder / "training" / "settings.json").write_text(json.dumps(stored))
+    return folder
+
+
+def numbers(out: Path, kind: str) -> list[str]:
+    return sorted(path.stem for path in (out / kind).iterdir())
+
+
+def test_a_recorded_camera_shows_every_fitted_frame(subject: Path, tmp_path: Path) -> None:
+    assert main(["render", str(subject), "--camera", "2", "--out", str(tmp_path / "out"), "--what", "colour,mask"]) == 0
+    assert numbers(tmp_path / "out", "mask") == ["000000", "000001", "000002"]
+    avatar = load_avatar(subject / "training")
+    camera = Capture.load(subject / "capture").cameras["2"]
+    for row in range(3):
+        rgb = avatar.render(camera, avatar.body.theta[row], avatar.body.root[row]).rgb
+        expected = (255 * rgb).round().numpy()
+        found = cv2.imread(str(tmp_path / "out" / "colour" / f"{row:06d}.png"))
+        assert expected.max() > 50
+        np.testing.assert_allclose(found[..., ::-1], expected, atol=1)
+    video = Video.open(tmp_path / "out" / "colour.mp4")
+    assert (len(video.frames), video.fps) == (3, 10.0)
+    assert not (tmp_path / "out.partial").exists()
+
+
+def test_a_frame_shown_alone_keeps_its_deformation_and_no_other_pose_has_one(subject: Path, tmp_path: Path) -> None:
+    """Frames 1 and 2 stand 15 cm to either side of their poses, 1.4 pixels; halfway between them is neither."""
+    wishes = {"alone": ["--frames", "1"], "between": ["--between", "1", "2", "--pictures", "3"]}
+    for name, wish in wishes.items():
+        view = ["--camera", "0", "--what", "colour", *wish]
+        assert main(["render", str(subject), "--out", str(tmp_path / name), *view]) == 0
+    avatar = load_avatar(subject / "training")
+    camera = Capture.load(subject / "capture").cameras["0"]
+    halfway = between(avatar.body, 1, 2, 3)
+    expected = {
+        "alone/colour/000000.png": avatar.render(camera, avatar.body.theta[1], avatar.body.root[1]),
+        "between/colour/000001.png": avatar.without_frames().render(camera, halfway.theta[1], halfway.root[1]),
+        "between/colour/000002.png": avatar.render(camera, avatar.body.theta[2], avatar.body.root[2]),
+    }
+    for path, rendering in expected.items():
+        found = cv2.imread(str(tmp_path / path))
+        np.testing.assert_allclose(found[..., ::-1], (255 * rendering.rgb).round().numpy(), atol=1)
+    with_none = avatar.without_frames().render(camera, avatar.body.theta[1], avatar.body.root[1])
+    assert (with_none.alpha - expected["alone/colour/000000.png"].alpha).abs().max() > 0.3
+
+
+def test_an_orbit_round_one_pose_has_the_size_and_number_asked_for(subject: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    wish = ["--frames", "1", "--pictures", "4", "--size", "48", "--what", "mask"]
+    assert main(["render", str(subject), "--out", str(out), *wish]) == 0
+    masks = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted((out / "mask").iterdir())]
+    assert [mask.shape for mask in masks] == [(48, 48)] * 4
+    for mask in masks:
+        y, x = np.nonzero(mask > 127)
+        assert abs((x.min() + x.max()) / 2 - 23.5) < 4  # seen in the middle, from all sides
+        assert abs((y.min() + y.max()) / 2 - 23.5) < 4
+
+
+def test_a_path_without_sizes_has_that_of_the_recording(subject: Path, tmp_path: Path) -> None:
+    """Its intrinsics are of the pictures as recorded, not as they were shrunk at the door."""
+    capture = Capture.load(subject / "capture")
+    lens = Lens("a", capture.cameras["2"].K, np.zeros(5), capture.cameras["2"].R, capture.cameras["2"].t_m, None)
+    write_cameras(tmp_path / "path", [lens], "easymocap")
+    shrunk = dataclasses.replace(capture, recorded_sizes_px=dict.fromkeys(capture.cameras, (500, 300)))
+    (found,) = _cameras(Wish(path=tmp_path / "path", pictures=1), shrunk, BodyFit.load(subject / "training"))
+    assert (found.width_px, found.height_px) == (500, 300)
+
+
+def test_cameras_that_did_not_record_have_no_exposure_of_their_own(subject: Path) -> None:
+    """An orbit is made after the first camera, and a path's may be called like any: neither has its gain."""
+    capture, body = Capture.load(subject / "capture"), BodyFit.load(subject / "training")
+    assert not {camera.name for camera in _cameras(Wish(), capture, body)} & set(capture.cameras)
+    along_recorded = _cameras(Wish(path=subject / "calibration"), capture, body)
+    assert not {camera.name for camera in along_recorded} & set(capture.cameras)
+    assert {camera.name for camera in _cameras(Wish(camera="2"), capture, body)} == {"2"}
+
+
+def test_interpolation_and_another_motion(subject: Path, tmp_path: Path) -> None:
+    wish = ["--between", "0", "2", "--pictures", "5", "--motion", str(subject), "--path", str(subject / "calibration")]
+    assert main(["render", str(subject), "--out", str(tmp_path / "out"), "--what", "depth", *wish]) == 0
+    assert len(numbers(tmp_path / "out", "depth")) == 5
+
+
+def test_a_taller_body_reaches_higher_in_the_picture(subject: Path, tmp_path: Path) -> None:
+    tops = []
+    for name, wish in (("as_fitted", []), ("taller", ["--shape", "height=+0.4"])):
+        out = tmp_path / name
+        view = ["--camera", "0", "--frames", "0", "--what", "mask"]
+        assert main(["render", str(subject), "--out", str(out), *view, *wish]) == 0
+        mask = cv2.imread(str(out / "mask" / "000000.png"), cv2.IMREAD_GRAYSCALE)
+        tops.append(int(np.nonzero(mask.max(1) > 127)[0].min()))
+    # 38.4 px focal length, 4 m away: 40 cm are about 4 pixels.
+    assert 2 <= tops[0] - tops[1] <= 6
+
+
+@pytest.mark.parametrize(
+    ("wish", "message"),
+    [
+        (["--camera", "9"], "camera 9: the recording has 0, 1, 2, 3"),
+        (["--what", "colour,xray"], "what xray: choose from colour, depth, normals, mask, mesh"),
+        (["--size", "0"], "pictures of 1 x 1 px: a side has 2 to 8000"),
+        (["--camera", "0", "--height", "1"], "--radius and --height are an orbit's"),
+        (["--pictures", "0"], "0 pictures"),
+        (["--frames", "7"], "no frames 7; it has 0 to 2"),
+        (["--between", "0", "7"], "no frames 7; it has 0 to 2"),
+        (["--motion", "absent.npz"], "absent.npz: is no .npz"),
+        (["--path", "absent.json"], "absent.json: cannot be read"),
+        (["--shape", "height"], "shape height: give a name and what to add"),
+        (["--volume", "-100"], "volume -100 %: out of this body's reach"),
+        (["--radius", "-1"], "radius"),
+    ],
+)
+def test_a_wish_that_cannot_be_met_is_one_line(
+    wish: list[str], message: str, subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["render", str(subject), "--out", str(tmp_path / "out"), *wish]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_there_is_not_written_over(subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["render", str(subject), "--out", str(tmp_path)]) == 2
+    assert "exists; give the name of a new folder" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_no_subject_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["render", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert "capture.json: missing; give <store>/subjects/<name>" in capsys.readouterr().err

@@ -1,0 +1,42 @@
+"""Angles and distances worked out by hand."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.study.benchmark.training_distance import pose_distances_deg, view_angle_deg
+from tests.body.boxes import box_rig
+from tests.evaluation.ball import ball_camera
+
+
+def test_the_angle_is_that_to_the_nearest_camera() -> None:
+    others = [ball_camera("a", 0.0), ball_camera("b", 80.0)]
+    assert view_angle_deg(ball_camera("c", 50.0), others, np.array([0, 0, 1.0])) == pytest.approx(30.0)
+    assert view_angle_deg(ball_camera("c", -170.0), others, np.array([0, 0, 1.0])) == pytest.approx(110.0)
+    assert view_angle_deg(others[0], others, np.array([0, 0, 1.0])) == pytest.approx(0.0, abs=1e-5)
+
+
+def test_a_pose_is_as_far_as_its_free_joints_turn_to_the_nearest_pose_wherever_the_body_stands() -> None:
+    """Two free joints. Frame 12 turns one by 90 degrees from frame 10 and 60 from frame 11, whose other joint is the
+    same: 30 in the mean. In frame 14 it is 90 degrees about x against 90 about y: 120 degrees between (a third of a
+    turn about the cube's diagonal), and 90 from frame 10: 45 in the mean."""
+    rig = dataclasses.replace(box_rig(), free=torch.tensor([True, True]))
+    theta = torch.zeros(5, 2, 3)
+    theta[:4, 1, 1] = torch.tensor([0.0, 30.0, 90.0, 30.0]).deg2rad()
+    theta[4, 1, 0] = np.pi / 2
+    root = torch.eye(4).repeat(5, 1, 1)
+    root[3, :3, 3] = torch.tensor([3.0, 0.0, 0.0])
+    body = BodyFit(rig, (10, 11, 12, 13, 14), theta, root)
+    found = pose_distances_deg(body, [12, 13, 10, 14], [10, 11])
+    assert found == {
+        12: pytest.approx(30.0, abs=1e-4),
+        13: pytest.approx(0.0, abs=1e-4),
+        10: 0.0,
+        14: pytest.approx(45.0, abs=1e-4),
+    }
+    assert pose_distances_deg(body, [14], [12])[14] == pytest.approx(60.0, abs=1e-4)
+    one = dataclasses.replace(body, rig=dataclasses.replace(rig, free=torch.tensor([False, True])))
+    assert pose_distances_deg(one, [14], [12])[14] == pytest.approx(120.0, abs=1e-4)

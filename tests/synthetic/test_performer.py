@@ -1,0 +1,158 @@
+"""The performer's truth is true: what its files say fits together, and its clothes are beyond the body model."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+from pydantic import ValidationError
+
+from hnerf.body.anny import anny_rig
+from hnerf.capture.capture import Capture
+from hnerf.capture.ingest import ingest
+from hnerf.config import CaptureSettings, PerformerSettings
+from hnerf.synthetic import write_performer
+from hnerf.synthetic.dressed import Dressed
+from hnerf.synthetic.render import Caster, dome_lights, floor_shadow, irradiance
+from hnerf.synthetic.write import camera_names, ring_of_cameras
+
+TINY = PerformerSettings(size_px=64, train_frames=3, novel_pose_frames=1)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("performer") / "performer"
+    write_performer(path, TINY)
+    return path
+
+
+@pytest.fixture(scope="module")
+def capture(folder: Path) -> Capture:
+    return ingest(folder, CaptureSettings(), folder.parent / "ingested")
+
+
+def test_it_is_read_like_any_capture(capture: Capture) -> None:
+    assert capture.train_cameras == ("01", "02", "03", "04") and capture.test_cameras == ("05", "06")
+    assert capture.train_frames == (0, 1, 2) and capture.novel_pose_frames == (3,)
+    assert capture.image("06", 3).shape == (64, 64, 3) and capture.background("03") is not None
+
+
+def test_same_seed_same_bytes(folder: Path, tmp_path: Path) -> None:
+    write_performer(tmp_path, PerformerSettings(size_px=64, train_frames=1, novel_pose_frames=0))
+    for name in ("images/05/000000.jpg", "openpose/02/000000_keypoints.json", "ground_truth/masks/01/000000.png"):
+        digests = [hashlib.sha256((root / name).read_bytes()).hexdigest() for root in (folder, tmp_path)]
+        assert digests[0] == digests[1]
+
+
+def test_the_ring_by_hand() -> None:
+    """32 cameras are 11.25 degrees apart; of 16 test cameras each stands half-way, in every second gap."""
+
+    def angles_deg(**settings: int) -> list[float]:
+        centres = [camera.centre_m for camera in ring_of_cameras(PerformerSettings(**settings))]
+        return [float(np.degrees(np.arctan2(y, x)) % 360) for x, y, _ in centres]
+
+    assert angles_deg() == pytest.approx([0, 90, 180, 270, 45, 225])
+    many = angles_deg(train_cameras=32, test_cameras=16)
+    assert many[:3] == pytest.approx([0, 11.25, 22.5]) and many[32:35] == pytest.approx([5.625, 28.125, 50.625])
+    assert len(many) == 48
+    assert camera_names(PerformerSettings(train_cameras=3, test_cameras=1)) == (["01", "02", "03"], ["04"])
+    with pytest.raises(ValidationError, match="one at most between two training cameras"):
+        PerformerSettings(train_cameras=1)
+
+
+def test_joints_lie_inside_the_masks(folder: Path, capture: Capture) -> None:
+    with np.load(folder / "ground_truth" / "joints.npz", allow_pickle=False) as truth:
+        names, positions = [str(n) for n in truth["names"]], truth["positions"]
+    scored = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
+    assert {f"rig:{side}{limb}" for side in ("Left", "Right") for limb in scored} <= set(names)
+    limbs = [i for i, n in enumerate(names) if n.startswith("rig:") and n.endswith(("Arm", "Leg", "Hips", "Neck"))]
+    for camera in capture.cameras.values():
+        for frame in capture.frames:
+            mask = cv2.imread(str(folder / "ground_truth" / "masks" / camera.name / f"{frame:06d}.png"), 0) > 127
+            x, y = camera.project(positions[frame, limbs])[0].round().astype(int).T
+            assert mask[y, x].all()
+
+
+def test_image_is_person_over_plate(folder: Path, capture: Capture) -> None:
+    """Inside the mask the photograph is the person; far outside, and off the shadowed floor, it is the plate."""
+    mask = cv2.imread(str(folder / "ground_truth" / "masks" / "05" / "000002.png"), 0) > 127
+    alone = cv2.imread(str(folder / "ground_truth" / "on_black" / "05" / "000002.jpg"))[..., ::-1].astype(float)
+    image, plate = capture.image("05", 2).astype(float), capture.background("05")
+    assert plate is not None
+    core = cv2.erode(mask.astype(np.uint8), np.ones((3, 3))) > 0
+    far = cv2.dilate(mask.astype(np.uint8), np.ones((7, 7))) == 0
+    far[32:] = False  # the upper half shows only walls
+    assert core.sum() > 100 and far.sum() > 1000
+    assert np.abs(image - alone)[core].mean() < 4 and np.abs(image - plate)[far].mean() < 3
+    assert alone[far].max() < 12 and np.abs(image - plate)[core].mean() > 20
+
+
+def test_keypoints_are_noisy_but_right(folder: Path, capture: Capture) -> None:
+    """1.5 px at 256 is 0.375 px at 64; a normal error in two dimensions has its median at 1.18 sigma."""
+    with np.load(folder / "ground_truth" / "joints.npz", allow_pickle=False) as truth:
+        exact_m = truth["positions"][:, :25]
+    errors_px = []
+    for camera in capture.cameras.values():
+        keypoints = capture.keypoints(camera.name)
+        assert keypoints is not None
+        seen = keypoints[:, 0, :, 2] > 0.5
+        errors_px.append(np.linalg.norm(keypoints[:, 0, :, :2] - camera.project(exact_m)[0], axis=-1)[seen])
+    assert 0.9 * 0.375 < np.median(np.concatenate(errors_px)) < 1.5 * 0.375
+    confidences = np.concatenate([capture.keypoints(c)[..., 2].ravel() for c in capture.cameras])  # type: ignore[index]
+    assert 0.05 < (confidences < 0.5).mean() < 0.6
+
+
+def test_meshes_are_closed_and_stand_on_the_floor(folder: Path) -> None:
+    with np.load(folder / "ground_truth" / "meshes.npz", allow_pickle=False) as truth:
+        faces, vertices_m, frames = truth["faces"], truth["vertices"], truth["frames"]
+    mesh = trimesh.Trimesh(vertices_m[0], faces, process=False)
+    assert frames.tolist() == [0] and mesh.is_watertight and mesh.volume > 0.05
+    assert vertices_m[0, :, 2].min() == pytest.approx(0, abs=1e-5) and 1.6 < vertices_m[0, :, 2].max() < 2.0
+
+
+def test_clothes_are_beyond_the_body() -> None:
+    """Shirt, trousers and hair stand centimetres off the skin, hands and face not at all; folds move with the gait."""
+    rig = anny_rig()
+    dressed = Dressed.on(rig, np.random.default_rng(0))
+    rest = torch.zeros(len(rig.joint_names), 3), torch.eye(4)
+    worn_m = [dressed.posed_m(*rest, gait_phase=phase) for phase in (0.0, 1.5)]
+    away_m = np.linalg.norm(worn_m[0] - dressed.rest_m, axis=1)
+    depth_m, deepest = dressed.depths_m, dressed.depths_m.argmax(1)
+    for garment, least_m in ((1, 0.02), (2, 0.012), (4, 0.015)):
+        assert np.median(away_m[deepest == garment]) > least_m
+    bare = depth_m[:, 1:].max(1) < -0.01
+    assert bare.sum() > 5000 and away_m[bare].max() < 1e-5
+    moved_m = np.linalg.norm(worn_m[1] - worn_m[0], axis=1)
+    assert moved_m[deepest == 1].max() > 0.01 and moved_m[bare].max() == 0
+
+
+def test_rays_meet_a_known_square() -> None:
+    """The square z = 1, |x|, |y| <= 1 of two triangles."""
+    vertices_m = np.array([[-1.0, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
+    caster = Caster(vertices_m, np.array([[0, 1, 2], [0, 2, 3]]))
+    hits = caster.cast(np.array([0.5, -0.25, 3.0]), np.array([[0.0, 0, -1], [0, 0, 1]]))
+    assert hits.face.tolist() == [0, -1] and hits.distance_m[0] == pytest.approx(2.0)
+    met_m = hits.interpolate(vertices_m, np.array([[0, 1, 2], [0, 2, 3]]))
+    assert met_m[0].tolist() == pytest.approx([0.5, -0.25, 1.0])
+    visible = caster.visibility(np.array([[0.0, 0, 0], [0, 0, 2]]), np.array([[0.0, 0, 1]]))
+    assert visible.tolist() == [[0.0], [1.0]]
+
+
+def test_light_of_an_open_sky() -> None:
+    lights = dome_lights()
+    up, down = np.array([[0.0, 0, 1], [0, 0, -1]])
+    bright = irradiance(np.stack([up, down]), np.ones((2, len(lights[1]))), lights)
+    assert bright[0] == pytest.approx(1.25) and 0 < bright[1] < 0.3
+    roof = Caster(np.array([[-9.0, -9, 1], [9, -9, 1], [0, 9, 1]]), np.array([[0, 1, 2]]))
+    assert floor_shadow(roof, np.zeros(3), lights).min() < 0.2
+    nothing = Caster(np.array([[0.0, 0, -5], [1, 0, -5], [0, 1, -5]]), np.array([[0, 1, 2]]))
+    assert floor_shadow(nothing, np.zeros(3), lights).min() == pytest.approx(1.0)
+
+
+def test_openpose_files_are_openpose(folder: Path) -> None:
+    stored = json.loads((folder / "openpose" / "01" / "000000_keypoints.json").read_text())
+    assert len(stored["people"]) == 1 and len(stored["people"][0]["pose_keypoints_2d"]) == 75

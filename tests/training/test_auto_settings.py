@@ -1,0 +1,131 @@
+"""What a scene asks for, by hand; and how a scene is measured."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.config import TrainingSettings
+from hnerf.training.auto_settings import Scene, decide
+from tests.training.scene import record
+
+SCENE = Scene(
+    cameras=4,
+    frames=24,
+    footprint_m=0.02,
+    outside_m=0.035,
+    inside_m=0.005,
+    side_m=1.92,
+    spread_rad=0.3,
+    person_px=4_000_000,
+)
+
+
+def decided(scene: Scene, **given: object) -> tuple[TrainingSettings, dict]:
+    settings = TrainingSettings.model_validate({"frames_per_step": 10, "rays_per_frame": 250} | given)
+    return decide(scene, settings)
+
+
+def test_sizes_by_hand():
+    """Pixels of 2 cm: 96 cells on 1.92 m, in steps of 4 ** (1 / 3) from 24; 64 for geometry, in steps of 2 from
+    16. Masks reach 3.5 cm out and 0.5 cm in, with 1.5 cm of room: 5 cm and, at least, 3 cm; 2.4 x 8 cm / 6 mm = 32
+    samples. Four million pixels at 2500 a step, each looked at one and a half times: 2400 steps."""
+    settings, decisions = decided(SCENE)
+    fast = settings.fast
+    assert fast.colour_cells == (24, 38, 60, 96)
+    assert fast.geometry_cells == (16, 32, 64)
+    assert (fast.outer_m, fast.inner_m, fast.samples) == (0.05, 0.03, 32)
+    assert (fast.pose_width, settings.steps) == (8, 2400)
+    assert decisions["fast.samples"].reason == "one each 6.0 mm of a ray through a shell of 80.0 mm"
+
+
+def test_no_finer_than_frames_align():
+    """Pixels of 1 mm would ask for 1920 cells; frames align to 1 cm."""
+    fast = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": 0.001}))[0].fast
+    assert fast.colour_cells[-1] == 192
+    assert fast.geometry_cells[-1] == 128
+
+
+@pytest.mark.parametrize("still", [{"frames": 1}, {"spread_rad": 0.001}])
+def test_one_posture_is_as_fine_as_its_pixels(still: dict):
+    """Down to 8 mm: 240 cells on 1.92 m, 160 for geometry, a sample each 4.8 mm: 2.4 x 8 cm / 4.8 mm = 40."""
+    for footprint_m in (0.008, 0.001):
+        settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": footprint_m, **still}))
+        assert (settings.fast.colour_cells[-1], settings.fast.geometry_cells[-1]) == (240, 160)
+        assert settings.fast.samples == 40
+        assert "there is one posture: cells of 8.0 mm" in decisions["fast.colour_cells"].reason
+
+
+def test_geometry_follows_the_colours_cells_that_are_given():
+    """128 / 1.5 = 85, whatever the pixels ask for."""
+    assert decided(SCENE, fast={"colour_cells": [24, 128]})[0].fast.geometry_cells[-1] == 85
+
+
+def test_what_is_given_stands():
+    settings, decisions = decided(SCENE, steps=7, fast={"samples": 5, "outer_m": 0.2})
+    assert (settings.steps, settings.fast.samples, settings.fast.outer_m) == (7, 5, 0.2)
+    assert set(decisions) == {
+        "fast.inner_m",
+        "fast.colour_cells",
+        "fast.geometry_cells",
+        "fast.pose_width",
+        "fast.nodes",
+        "one_posture",
+    }
+
+
+@pytest.mark.parametrize(
+    ("machinery", "spread_rad", "one"), [("fast", 0.001, True), ("fast", 0.003, False), ("paper", 0.001, False)]
+)
+def test_frames_that_were_fitted_with_one_posture_keep_one(machinery: str, spread_rad: float, one: bool):
+    """The published method gives each frame its own; so does what is given."""
+    scene = SCENE.__class__(**{**vars(SCENE), "spread_rad": spread_rad})
+    assert decided(scene, machinery=machinery)[0].one_posture is one
+    assert decided(scene, one_posture=not one)[0].one_posture is not one
+
+
+@pytest.mark.parametrize(("person_px", "steps"), [(1000, 600), (10**9, 4000)])
+def test_steps_have_bounds(person_px: int, steps: int):
+    assert decided(SCENE.__class__(**{**vars(SCENE), "person_px": person_px}))[0].steps == steps
+
+
+@pytest.mark.parametrize(
+    ("cameras", "frames", "rate", "steps"),
+    [(1, 40, 5e-4, 2160), (4, 40, 5e-4, 600), (1, 1, 5e-4, 600), (1, 40, 0, 600)],
+)
+def test_one_camera_needs_time_to_find_how_deep_bodies_stand(cameras: int, frames: int, rate: float, steps: int):
+    """540 steps that see each of 40 frames, 10 of them a step: 2160; nothing to find in one frame or in given poses."""
+    scene = SCENE.__class__(**{**vars(SCENE), "cameras": cameras, "frames": frames, "person_px": 1000})
+    settings, decisions = decided(scene, pose_learning_rate=rate)
+    assert settings.steps == steps
+    assert ("depths of 40 bodies" in decisions["steps"].reason) == (steps == 2160)
+
+
+def test_one_pose_teaches_nothing_about_poses():
+    settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "spread_rad": 0.01}))
+    assert settings.fast.pose_width == 1
+    assert decisions["fast.pose_width"].reason.endswith("too little to learn from")
+
+
+@pytest.mark.parametrize(
+    ("cameras", "frames", "rate", "nodes"), [(4, 24, 1e-3, 128), (4, 1, 1e-3, 0), (1, 24, 1e-3, 0), (4, 24, 0.0, 0)]
+)
+def test_a_single_frame_or_camera_does_not_deform_the_body(cameras: int, frames: int, rate: float, nodes: int):
+    scene = SCENE.__class__(**{**vars(SCENE), "cameras": cameras, "frames": frames})
+    assert decided(scene, fast={"deformation_learning_rate": rate})[0].fast.nodes == nodes
+
+
+def test_a_scene_as_it_is_measured(tmp_path: Path):
+    """Cameras at 4.03 m with a focal length of 38.4 px: 0.105 m a pixel. The masks are the body's own silhouettes,
+    whose outline is its outermost pixels: half a pixel to one and a half inside. One joint of two is free and bends by
+    0 and 0.2 rad in the two training frames: 0.1 from their mean."""
+    capture, masks, body = record(tmp_path / "capture")
+    scene = Scene.of(capture, masks, body)
+    assert (scene.cameras, scene.frames) == (4, 2)
+    assert scene.footprint_m == pytest.approx(0.105, abs=0.003)
+    assert scene.outside_m == 0.0
+    assert 0.09 < scene.inside_m < 0.2
+    assert scene.side_m == pytest.approx(2.0)
+    assert scene.spread_rad == pytest.approx(0.1)
+    areas = [masks.get(c, f).sum() for c in capture.train_cameras for f in capture.train_frames]
+    assert scene.person_px == pytest.approx(np.sum(areas), rel=0.01)
