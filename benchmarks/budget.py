@@ -44,10 +44,10 @@ def main() -> None:
     print(as_markdown(captures))
 
 
-def measure(folder: Path, shelf: Store) -> dict[str, Any]:
+def measure(folder: Path, store: Store) -> dict[str, Any]:
     """The decisions for a capture, and figures of each variant."""
     settings = load_settings("fast")
-    decided, scores = train_and_score(folder, shelf, settings)
+    decided, scores = train_and_score(folder, store, settings)
     variants = {DECIDED: scores}
     for name, training in {
         "twice the size": resized(decided, 2.0),
@@ -55,17 +55,17 @@ def measure(folder: Path, shelf: Store) -> dict[str, Any]:
         "twice the steps": decided.model_copy(update={"steps": 2 * decided.steps}),
         "half the steps": decided.model_copy(update={"steps": decided.steps // 2}),
     }.items():
-        variants[name] = train_and_score(folder, shelf, settings.model_copy(update={"training": training}))[1]
+        variants[name] = train_and_score(folder, store, settings.model_copy(update={"training": training}))[1]
     reasons = variants[DECIDED].pop("decisions")
     return {"decisions": reasons, "variants": {name: figures(found) for name, found in variants.items()}}
 
 
-def train_and_score(folder: Path, shelf: Store, settings: Settings) -> tuple[TrainingSettings, dict[str, Any]]:
+def train_and_score(folder: Path, store: Store, settings: Settings) -> tuple[TrainingSettings, dict[str, Any]]:
     """The training's settings with everything decided; its scores, with the decisions among them."""
     source, truth = read_capture(folder)
-    recording = ingest(shelf, source, settings.capture)
-    calibration, body, model = trained(shelf, recording, settings)
-    scores = score_training(shelf, truth, recording, calibration, body, model, SCORING)
+    recording = ingest(store, source, settings.capture)
+    calibration, body, model = trained(store, recording, settings)
+    scores = score_training(store, truth, recording, calibration, body, model, SCORING)
     stored = json.loads((model.root / "settings.json").read_text())
     found = json.loads((scores.root / "scores.json").read_text())
     return TrainingSettings.model_validate(stored["training"]), found | {"decisions": stored["decisions"]}

@@ -30,7 +30,7 @@ from hnerf.calibration.silhouettes import Outlines
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.config import CalibrationSettings, CaptureSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 CAPTURES = ("valid-walk", "valid-wave")
@@ -157,7 +157,7 @@ class Trial:
         capture, started = self._broken(), time.perf_counter()
         try:
             report = check_calibration(capture, CalibrationSettings())
-        except CaptureError as refusal:
+        except InputError as refusal:
             said = str(refusal).removeprefix(f"{capture.name}: ")
             named = bool(self.fault.cause) and self.fault.cause in said and " or " not in said
             return {"camera": self.name, "seconds": time.perf_counter() - started, "named": named, "refused": said}
@@ -167,11 +167,11 @@ class Trial:
         changed = {name: verdict.reasons for name, verdict in report.verdicts.items() if verdict.status != "ok"}
         offset = used.frame_offsets.get(self.name, 0.0)
         right = set(changed) == ({self.name} if self.fault is not UNTOUCHED else set()) and not self.fault.rig
-        told = any(self.fault.cause in reason for reason in changed.get(self.name, [""]))
+        message = any(self.fault.cause in reason for reason in changed.get(self.name, [""]))
         return {
             "camera": self.name,
             "seconds": seconds,
-            "named": right and told and abs(offset + self.late) < 0.5,
+            "named": right and message and abs(offset + self.late) < 0.5,
             "changed": changed,
             "frame_offsets": used.frame_offsets,
             "after_px": self._error_px(used),

@@ -44,8 +44,8 @@ def main() -> None:
     parser.add_argument("store", type=Path)
     parser.add_argument("captures", nargs="*", default=CAPTURES, metavar="CAPTURE")
     options = parser.parse_args()
-    where, shelf = provenance(), Store(options.store.resolve())
-    captures = {name: measure(SHARED / "data" / name, shelf) for name in options.captures}
+    where, store = provenance(), Store(options.store.resolve())
+    captures = {name: measure(SHARED / "data" / name, store) for name in options.captures}
     result = where | {"captures": captures}
     rows = [["capture", *(title for title, _ in COLUMNS.values())]]
     rows += [
@@ -56,11 +56,11 @@ def main() -> None:
     print(markdown)
 
 
-def measure(folder: Path, shelf: Store) -> dict[str, Any]:
+def measure(folder: Path, store: Store) -> dict[str, Any]:
     """Figures of a capture's fit against its ground truth."""
     settings = load_settings("fast")
     source, _ = read_capture(folder)
-    recording, calibration, _, made = prepared(shelf, ingest(shelf, source, settings.capture), settings)
+    recording, calibration, _, made = prepared(store, ingest(store, source, settings.capture), settings)
     capture, fit = calibrated(recording, calibration), BodyFit.load(made.root)
     with tempfile.TemporaryDirectory() as subject:
         (Path(subject) / "fit").symlink_to(made.root)

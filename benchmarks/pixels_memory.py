@@ -21,7 +21,7 @@ import torch
 import torch.multiprocessing as multiprocessing
 from provenance import provenance, sentence, table, write_result
 
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.gather import gather_pixels
 
 PROCESSES = (1, 2, 4)
@@ -41,8 +41,8 @@ def main() -> None:
         sizes = (row["all_gib"], row["before_gib"], row["all_gib"] - row["before_gib"], row["gathering_gib"])
         shown.append([n, *(f"{gib:.2f}" for gib in sizes)])
     result = provenance() | {"size": size, "processes": rows}
-    told = f"{size}; the most that the gathering process holds of its own, without the files that it writes."
-    markdown = "\n".join(["# Host memory of pixels", "", sentence(result), "", told, "", *table(shown), ""])
+    message = f"{size}; the most that the gathering process holds of its own, without the files that it writes."
+    markdown = "\n".join(["# Host memory of pixels", "", sentence(result), "", message, "", *table(shown), ""])
     write_result("pixels-memory", result, markdown)
     print(markdown)
 
@@ -66,18 +66,18 @@ def one(rank: int, processes: int, frames: int, cameras: int, size_px: int, fold
     """What process `rank` does and measures."""
     os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(processes)}
     torch.set_num_threads(1)
-    here, found = Processes.join(), {}
+    here, found = Distributed.join(), {}
     capture, masks, body = made_up(frames, cameras, size_px)
-    here.wait()
+    here.barrier()
     found["before"] = held("Pss")
-    here.wait()
+    here.barrier()
     pixels = gather_pixels(capture, masks, body, body.frames, None, {}, folder, here)
     found["anonymous"] = capture.most
     for column in (pixels.colour, pixels.person, pixels.edge):
         column.numpy().view(np.uint8).max()  # of truths it would stop at the first
-    here.wait()
+    here.barrier()
     found["after"] = held("Pss")
-    here.wait()
+    here.barrier()
     (folder / f"{rank}.json").write_text(json.dumps(found))
 
 

@@ -44,10 +44,10 @@ def main() -> None:
     source, _ = read_capture(SHARED / "data" / options.capture)
     with tempfile.TemporaryDirectory(prefix="hnerf-scaling-") as name:
         folder = Path(name)
-        shelf = Store(folder / "captures")
-        recording = ingest(shelf, source, load_settings("fast").capture)
+        store = Store(folder / "captures")
+        recording = ingest(store, source, load_settings("fast").capture)
         seconds = {
-            axis: {str(n): measure(Store(folder / f"{axis}-{n}"), part(shelf, recording, axis, n)) for n in amounts}
+            axis: {str(n): measure(Store(folder / f"{axis}-{n}"), part(store, recording, axis, n)) for n in amounts}
             for axis, amounts in AXES.items()
         }
     result = where | {"capture": options.capture, "steps": STEPS, "seconds": seconds}
@@ -62,21 +62,21 @@ def main() -> None:
     print("\n".join(lines))
 
 
-def part(shelf: Store, recording: Artifact, axis: str, amount: float) -> Artifact:
+def part(store: Store, recording: Artifact, axis: str, amount: float) -> Artifact:
     """So many training frames or cameras, or so many times the pixels."""
     capture = Capture.load(recording.root)
     if axis == "frames":
-        return subset_capture(shelf, recording, None, tuple(evenly_spaced(capture.train_frames, int(amount))), ())
+        return subset_capture(store, recording, None, tuple(evenly_spaced(capture.train_frames, int(amount))), ())
     if axis == "cameras":
-        return subset_capture(shelf, recording, capture.train_cameras[: int(amount)], None, ())
+        return subset_capture(store, recording, capture.train_cameras[: int(amount)], None, ())
     if amount == 1:
-        return subset_capture(shelf, recording, None, None, ())
+        return subset_capture(store, recording, None, None, ())
     kind = "small_images" if amount < 1 else "large_images"
-    resized = degrade_capture(shelf, recording, Degradation(kind=kind, strength=amount**0.5, seed=0))
-    return subset_capture(shelf, resized, None, None, ())
+    resized = degrade_capture(store, recording, Degradation(kind=kind, strength=amount**0.5, seed=0))
+    return subset_capture(store, resized, None, None, ())
 
 
-def measure(shelf: Store, recording: Artifact) -> dict[str, float]:
+def measure(store: Store, recording: Artifact) -> dict[str, float]:
     """Seconds of each stage and of one image."""
     settings = load_settings("fast", [f"training.steps={STEPS}"])
     seconds: dict[str, float] = {}
@@ -87,10 +87,10 @@ def measure(shelf: Store, recording: Artifact) -> dict[str, float]:
         seconds[name] = time.perf_counter() - started
         return found
 
-    calibration = timed("calibration", lambda: calibrate(shelf, recording, settings.calibration))
-    masks = timed("segmentation", lambda: find_masks(shelf, recording, calibration, settings))
-    body = timed("fit", lambda: fit(shelf, recording, calibration, masks, settings.fit))
-    model = timed("training", lambda: train(shelf, recording, calibration, masks, body, settings.training))
+    calibration = timed("calibration", lambda: calibrate(store, recording, settings.calibration))
+    masks = timed("segmentation", lambda: find_masks(store, recording, calibration, settings))
+    body = timed("fit", lambda: fit(store, recording, calibration, masks, settings.fit))
+    model = timed("training", lambda: train(store, recording, calibration, masks, body, settings.training))
     avatar, capture = trained(model), calibrated(recording, calibration)
     camera = capture.cameras[capture.train_cameras[0]]
     avatar.render(camera, avatar.body.theta[0], avatar.body.root[0])

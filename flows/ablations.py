@@ -12,17 +12,17 @@ from typing import Any, get_args
 
 from prefect import flow
 
-from flows.run_page import show
+from flows.run_page import publish_markdown
 from flows.train_subject import prepared
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, Settings, TrainingSettings, load_settings, with_changes
-from hnerf.errors import CaptureError, one_line
+from hnerf.errors import InputError, one_line
 from hnerf.files import replace_text
 from hnerf.study.benchmark import results
 from hnerf.tables import head, line
 from tasks.capture import ingest
 from tasks.evaluation import evaluate
-from tasks.policy import may_pass
+from tasks.policy import is_retryable
 from tasks.source import Source, read_capture
 from tasks.store import Store
 from tasks.training import train
@@ -52,19 +52,19 @@ def ablate(
     same command goes on from there.
     """
     rows, left_out = choose(load_settings(preset, overrides), only)
-    shelf = Store(store.resolve())
+    artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
-    subject = Capture.load(ingest(shelf, source, rows[FULL].capture).root).name
-    table = shelf.root / "ablations" / f"{subject}-{Path(preset).stem}{'-part' if only else ''}.md"
+    subject = Capture.load(ingest(artifact_store, source, rows[FULL].capture).root).name
+    table = artifact_store.root / "ablations" / f"{subject}-{Path(preset).stem}{'-part' if only else ''}.md"
     result: dict[str, Any] = {"subject": subject, "preset": preset, "overrides": overrides, "left_out": left_out}
     result["rows"] = {}
     for name, settings in rows.items():
         log.info("%s", name)
-        result["rows"][name] = measure(shelf, source, truth, settings)
+        result["rows"][name] = measure(artifact_store, source, truth, settings)
         table.parent.mkdir(parents=True, exist_ok=True)
         replace_text(table.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
         replace_text(table, as_markdown(result))
-    show(table.read_text(), "ablations", f"What each part of {preset} is worth on {subject}")
+    publish_markdown(table.read_text(), "ablations", f"What each part of {preset} is worth on {subject}")
     return table
 
 
@@ -73,7 +73,7 @@ def choose(full: Settings, only: Sequence[str]) -> tuple[dict[str, Settings], di
     known = {path.stem: path for path in sorted(ABLATIONS.glob("*.yaml"))}
     unknown = sorted(set(only) - set(known))
     if unknown:
-        raise CaptureError(f"--only {unknown[0]}: no such ablation; there are {', '.join(known)}")
+        raise InputError(f"--only {unknown[0]}: no such ablation; there are {', '.join(known)}")
     rows, left_out = {FULL: full}, {}
     for name in only or known:
         settings = with_changes(full, known[name])
@@ -96,14 +96,14 @@ def why_pointless(full: Settings, ablated: Settings) -> str | None:
     return None
 
 
-def measure(shelf: Store, source: Source, truth: Source, settings: Settings) -> dict[str, Any]:
+def measure(store: Store, source: Source, truth: Source, settings: Settings) -> dict[str, Any]:
     """A row's figures: scores of every split, seconds and device of its training; {"error": one line} if one fails."""
-    stages = prepared(shelf, ingest(shelf, source, settings.capture), settings)
+    stages = prepared(store, ingest(store, source, settings.capture), settings)
     try:
-        model = train(shelf, *stages, settings.training)
-        report = evaluate(shelf, truth, *stages, model, settings.evaluation)
+        model = train(store, *stages, settings.training)
+        report = evaluate(store, truth, *stages, model, settings.evaluation)
     except Exception as error:  # what breaks without a part is what the table is after
-        if may_pass(error):
+        if is_retryable(error):
             raise  # a full disk, a lost share, a killed worker
         log.warning("%s: %s", type(error).__name__, error)
         return {"error": one_line(error)}

@@ -7,11 +7,11 @@ from typing import Any
 
 from prefect import flow
 
-from flows.run_page import show
+from flows.run_page import publish_markdown
 from flows.train_subject import prepared
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
-from hnerf.errors import CaptureError, one_line
+from hnerf.errors import InputError, one_line
 from hnerf.files import with_pictures
 from hnerf.study.benchmark.convergence import flat, limits_s
 from hnerf.study.benchmark.plan import Study, Variant, load_study
@@ -19,7 +19,7 @@ from hnerf.study.benchmark.publish import publish
 from tasks.benchmark import score_end_of_training, score_training
 from tasks.calibration import calibrated
 from tasks.capture import ingest, subset_capture
-from tasks.policy import may_pass
+from tasks.policy import is_retryable
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
 from tasks.training import train
@@ -44,18 +44,20 @@ def benchmark(
     """
     plan = load_study(study).narrowed(methods or [], seconds)
     capture_settings = [plan.settings(name).capture for name in plan.methods]  # presets that are wrong say so first
-    shelf = Store(store.resolve())
+    artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
-    recorded = Capture.load(ingest(shelf, source, capture_settings[0]).root)
+    recorded = Capture.load(ingest(artifact_store, source, capture_settings[0]).root)
     result, table = blank(plan, Path(study).stem, recorded), None
     for title, entry in result["variants"].items():
         variant = plan.variants[title]
         for name in () if "left_out" in entry else variant.methods or plan.methods:
             log.info("%s: %s", title, name)
-            entry["methods"][name] = measure(shelf, source, truth, variant, plan, name)
-            table = publish(result, shelf.root)  # not before, so that what an earlier call found stands until then
-    table = table or publish(result, shelf.root)  # where every variant is left out
-    show(with_pictures(table), "benchmark", f"Speed against accuracy: {table.stem}")
+            entry["methods"][name] = measure(artifact_store, source, truth, variant, plan, name)
+            table = publish(
+                result, artifact_store.root
+            )  # not before, so that what an earlier call found stands until then
+    table = table or publish(result, artifact_store.root)  # where every variant is left out
+    publish_markdown(with_pictures(table), "benchmark", f"Speed against accuracy: {table.stem}")
     return table
 
 
@@ -70,39 +72,39 @@ def describe(variant: Variant, recorded: Capture) -> dict[str, Any]:
     """How many cameras and frames a variant trains on; why it is left out where the capture has not as many."""
     try:
         cameras, frames, _ = variant.parts(recorded)
-    except CaptureError as error:
+    except InputError as error:
         return {"left_out": str(error)}
     counts = {"cameras": len(cameras or recorded.train_cameras), "frames": len(frames or recorded.train_frames)}
     return counts | {"methods": {}}
 
 
-def measure(shelf: Store, source: Source, truth: Source, variant: Variant, plan: Study, method: str) -> dict[str, Any]:
+def measure(store: Store, source: Source, truth: Source, variant: Variant, plan: Study, method: str) -> dict[str, Any]:
     """A method's scores on a variant, and the folder of their files in the store; {"error": one line} if it fails."""
     try:
         settings, more = plan.settings(method), dict[str, Any]()
-        recording = ingest(shelf, source, settings.capture)
+        recording = ingest(store, source, settings.capture)
         parts = variant.parts(Capture.load(recording.root))
         if parts != (None, None, None):
-            recording = subset_capture(shelf, recording, *parts)
-        stages = prepared(shelf, recording, settings)
+            recording = subset_capture(store, recording, *parts)
+        stages = prepared(store, recording, settings)
         if plan.until_flat:
-            settings, more = until_flat(shelf, truth, stages, plan, method)
-        model = train(shelf, *stages, settings.training)
+            settings, more = until_flat(store, truth, stages, plan, method)
+        model = train(store, *stages, settings.training)
         _, calibration, _, body = stages
-        scores = score_training(shelf, truth, recording, calibration, body, model, plan.scoring)
+        scores = score_training(store, truth, recording, calibration, body, model, plan.scoring)
     except Exception as error:  # one method's fault, of which the others know nothing
-        if may_pass(error):
+        if is_retryable(error):
             raise  # a full disk, a lost share, a killed worker
         log.warning("%s: %s", type(error).__name__, error)
         return {"error": one_line(error)}
     found: dict[str, Any] = json.loads((scores.root / "scores.json").read_text())
     taken = calibrated(recording, stages[1])
     counts = {"cameras": len(taken.train_cameras), "frames": len(taken.train_frames)}
-    return found | more | {"trained_on": counts, "folder": str(scores.root.relative_to(shelf.root))}
+    return found | more | {"trained_on": counts, "folder": str(scores.root.relative_to(store.root))}
 
 
 def until_flat(
-    shelf: Store, truth: Source, stages: tuple[Artifact, Artifact, Artifact, Artifact], plan: Study, method: str
+    store: Store, truth: Source, stages: tuple[Artifact, Artifact, Artifact, Artifact], plan: Study, method: str
 ) -> tuple[Settings, dict[str, Any]]:
     """Settings of the last of longer and longer trainings; the curve of all, and why there are no longer ones. One that
     fails has no point: it may be too young for a surface."""
@@ -112,10 +114,10 @@ def until_flat(
     for limit_s in limits_s(plan.seconds):
         settings, ended = plan.settings(method, limit_s), "limit"
         try:
-            model = train(shelf, *stages, settings.training)
-            point = score_end_of_training(shelf, truth, recording, calibration, body, model, plan.scoring)
+            model = train(store, *stages, settings.training)
+            point = score_end_of_training(store, truth, recording, calibration, body, model, plan.scoring)
         except Exception as error:
-            if may_pass(error):
+            if is_retryable(error):
                 raise
             log.warning("after %g s: %s", limit_s, one_line(error))
             continue
@@ -130,8 +132,8 @@ def until_flat(
     return settings, {"curve": points, "ended": ended}
 
 
-def trained(shelf: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact, Artifact]:
+def trained(store: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact, Artifact]:
     """The calibration, the body and the training that a recording comes to."""
-    stages = prepared(shelf, recording, settings)
+    stages = prepared(store, recording, settings)
     _, calibration, _, body = stages
-    return calibration, body, train(shelf, *stages, settings.training)
+    return calibration, body, train(store, *stages, settings.training)

@@ -19,16 +19,16 @@ from hnerf.asset.validation import InvalidAsset
 from hnerf.calibration.boards.calibrate import calibrate_from_boards
 from hnerf.capture.formats.export import WRITERS, write_cameras
 from hnerf.capture.ingest import recognise
-from hnerf.capture.manifest import read_notes
+from hnerf.capture.manifest import read_manifest
 from hnerf.config import PerformerSettings, load_settings, overridden
-from hnerf.errors import CaptureError
-from hnerf.files import new_folder
-from hnerf.render.subject import KINDS, Wish, render_subject
+from hnerf.errors import InputError
+from hnerf.files import atomic_folder
+from hnerf.render.subject import KINDS, RenderOptions, render_subject
 from hnerf.synthetic import write_performer
 from tasks.calibration import calibrate
 from tasks.capture import ingest
 from tasks.launcher import GaveUpError
-from tasks.policy import will_last
+from tasks.policy import is_permanent
 from tasks.source import read_capture
 from tasks.store import Store, require_whole
 
@@ -44,20 +44,20 @@ def main(argv: list[str] | None = None) -> int:
     try:
         with _progress():
             options.command(options)
-    except CaptureError as error:
-        return _told(error, BAD_INPUT)
+    except InputError as error:
+        return _fail(error, BAD_INPUT)
     except (GaveUpError, InvalidAsset) as error:
-        return _told(error, FAILED)
+        return _fail(error, FAILED)
     except OSError as error:
         if error.errno in NO_ROOM:
-            return _told(f"{error}; make room and give the same command again", FAILED)
-        if error.filename is None or not will_last(error):
+            return _fail(f"{error}; make room and give the same command again", FAILED)
+        if error.filename is None or not is_permanent(error):
             raise
-        return _told(f"{error.filename}: {error.strerror}; give another path, or mend this one", BAD_INPUT)
+        return _fail(f"{error.filename}: {error.strerror}; give another path, or mend this one", BAD_INPUT)
     return 0
 
 
-def _told(why: object, status: int) -> int:
+def _fail(why: object, status: int) -> int:
     print("hnerf:", " ".join(str(why).splitlines()), file=sys.stderr)
     return status
 
@@ -92,7 +92,7 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--set", dest="overrides", action="append", default=[], metavar="a.b=c", help="override a setting")
     run.set_defaults(command=lambda o: _run(o.capture, o.preset, o.store, o.overrides))
 
-    check = of_capture("check", preset, what="read a recording and check its cameras, nothing more")
+    check = of_capture("check-cameras", preset, what="read a recording and check its cameras, nothing more")
     check.set_defaults(command=lambda o: _check(o.capture, o.preset, o.store))
 
     boards = commands.add_parser("calibrate", help="find the cameras from footage of a calibration board")
@@ -104,7 +104,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     boards.set_defaults(command=lambda o: _calibrate(o.folder, o.out, o.format, o.ground_frame))
 
-    cameras = commands.add_parser("cameras", help="write a recording's cameras as other tools read them")
+    cameras = commands.add_parser("export-cameras", help="write a recording's cameras as other tools read them")
     cameras.add_argument("folder", type=Path, help="a recording, or a folder that `calibrate` wrote")
     cameras.add_argument("--format", choices=WRITERS, required=True)
     cameras.add_argument("--out", type=Path, default=Path("cameras"), help="the folder to write (default: cameras)")
@@ -202,7 +202,7 @@ def _render(options: argparse.Namespace) -> None:
     for subject in (options.subject, options.motion):
         if subject and subject.is_dir():
             require_whole(subject)
-    wish = Wish(
+    wish = RenderOptions(
         camera=options.camera,
         path=options.path,
         radius_m=options.radius,
@@ -224,7 +224,7 @@ def _shape_change(text: str) -> tuple[str, float]:
     try:
         return name, float(amount)
     except ValueError:
-        raise CaptureError(f"shape {text}: give a name and what to add, like weight=+0.4") from None
+        raise InputError(f"shape {text}: give a name and what to add, like weight=+0.4") from None
 
 
 def _run(capture: Path, preset: str, store: Path, overrides: list[str]) -> None:
@@ -239,10 +239,10 @@ def _show(table: Path) -> None:
 
 def _check(capture: Path, preset: str, store: Path) -> None:
     settings = load_settings(preset)
-    shelf = Store(store.resolve())
+    artifact_store = Store(store.resolve())
     source, _ = read_capture(capture, store)
-    recording = ingest(shelf, source, settings.capture)
-    calibration = calibrate(shelf, recording, settings.calibration)
+    recording = ingest(artifact_store, source, settings.capture)
+    calibration = calibrate(artifact_store, recording, settings.calibration)
     print("\n".join(_table(json.loads((calibration.root / "report.json").read_text()))))
     print(f"picture: {calibration.root / 'cameras.png'}")
 
@@ -259,7 +259,7 @@ def _table(report: dict[str, Any]) -> list[str]:
 
 
 def _calibrate(folder: Path, out: Path, layouts: list[str], ground_frame: int | None) -> None:
-    with new_folder(out) as partial:
+    with atomic_folder(out) as partial:
         found = calibrate_from_boards(folder, ground_frame)
         found.save(partial, layouts)
     print(f"{'camera':<12} {'pictures':>8} {'RMS px':>7}  intrinsics")
@@ -270,16 +270,16 @@ def _calibrate(folder: Path, out: Path, layouts: list[str], ground_frame: int | 
 
 
 def _cameras(folder: Path, layout: str, out: Path) -> None:
-    with new_folder(out) as partial:
+    with atomic_folder(out) as partial:
         lenses = recognise(folder).lenses().values()
-        metres_per_unit = read_notes(folder).metres_per_unit
+        metres_per_unit = read_manifest(folder).metres_per_unit
         write_cameras(partial, [dataclasses.replace(lens, t_m=metres_per_unit * lens.t_m) for lens in lenses], layout)
     print(f"cameras: {out}")
 
 
 def _synth(out: Path, overrides: Sequence[str] = ()) -> None:
     settings = overridden(PerformerSettings(), overrides)
-    with new_folder(out) as partial:
+    with atomic_folder(out) as partial:
         write_performer(partial, settings)
 
 

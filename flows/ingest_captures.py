@@ -10,7 +10,7 @@ from uuid import uuid4
 from prefect import flow
 from prefect.deployments import run_deployment
 
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.files import replace_text
 from tasks.source import capture_files, read_capture
 
@@ -41,7 +41,7 @@ def ingest_captures(
             if not files or _age_s(files) < settle_s or (ledger / glimpse).exists():
                 continue
             digest = read_capture(capture)[0].digest
-        except (CaptureError, OSError) as error:  # OSError: a file that is gone by now
+        except (InputError, OSError) as error:  # OSError: a file that is gone by now
             log.error("%s", error)
             continue
         if not (ledger / digest).exists():

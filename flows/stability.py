@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from prefect import flow
 
-from flows.run_page import show
+from flows.run_page import publish_markdown
 from flows.train_subject import prepared
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
-from hnerf.errors import CaptureError, NotPossibleError, one_line
+from hnerf.errors import InputError, NotApplicableError, one_line
 from hnerf.evaluation.columns import why_no_novel_poses
 from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, TRACKED
 from hnerf.files import replace_text, with_pictures
@@ -22,11 +22,11 @@ from hnerf.study.degradations.catalogue import KINDS, Degradation, degrade_setti
 from hnerf.study.stability.charts import curve_chart, matrix_chart
 from hnerf.study.stability.plan import Stability, load_stability
 from hnerf.study.stability.report import REFERENCE, as_markdown
-from hnerf.study.stability.verdict import BROKEN, Verdict, judge, near_border
+from hnerf.study.stability.verdict import BROKEN, RunVerdict, judge, near_border
 from tasks.capture import ingest, subset_capture
 from tasks.evaluation import evaluate
 from tasks.fit import fit
-from tasks.policy import may_pass
+from tasks.policy import is_retryable
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
 from tasks.study import check_meshes, degrade_capture, degrade_fit, degrade_masks, dress, show_in_extreme_poses
@@ -57,15 +57,15 @@ def stability(
     plan = load_stability(study).only(only)
     plan = plan.model_copy(update={"methods": tuple(methods)}) if methods else plan
     presets = {name: load_settings(name, plan.overrides) for name in plan.methods}
-    shelf = Store(store.resolve())
+    artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
-    subject = Capture.load(recorded(shelf, source, plan, next(iter(presets.values()))).root).name
-    table = shelf.root / "stability" / f"{subject}-{Path(study).stem}{'-part' if only else ''}.md"
+    subject = Capture.load(recorded(artifact_store, source, plan, next(iter(presets.values()))).root).name
+    table = artifact_store.root / "stability" / f"{subject}-{Path(study).stem}{'-part' if only else ''}.md"
     table.parent.mkdir(parents=True, exist_ok=True)
     result: Figures = {"subject": subject, "study": study, "plan": plan.model_dump(mode="json")}
     result |= {"left_out": plan.left_out(), "protocol": None, "runs": []}
     try:
-        for run in _runs(shelf, source, truth, plan, presets):
+        for run in _runs(artifact_store, source, truth, plan, presets):
             if "left_out" in run:
                 if run["left_out"] not in result["left_out"]:  # every method and seed says so
                     result["left_out"].append(run["left_out"])
@@ -79,30 +79,30 @@ def stability(
                 _tell(result, _draw(result, table), table)
         raise
     _tell(result, _draw(result, table), table)
-    show(with_pictures(table), "stability", f"Where methods break on {subject}")
+    publish_markdown(with_pictures(table), "stability", f"Where methods break on {subject}")
     return table
 
 
 def _runs(
-    shelf: Store, source: Source, truth: Source, plan: Stability, presets: dict[str, Settings]
+    store: Store, source: Source, truth: Source, plan: Stability, presets: dict[str, Settings]
 ) -> Iterator[Figures]:
     """Every run's row: its method, degradation and verdict, and figures where there are any; or {"left_out": what and
     why}."""
     tried = [(kind, strength) for kind, strengths in plan.degradations.items() for strength in strengths]
     for method, preset in presets.items():
-        recording = recorded(shelf, source, plan, preset)
+        recording = recorded(store, source, plan, preset)
         near = set()
         for seed in plan.seeds:
-            for run in _runs_of_seed(shelf, recording, truth, method, preset, seed, tried):
+            for run in _runs_of_seed(store, recording, truth, method, preset, seed, tried):
                 if run.get("near_border"):
                     near.add((run["kind"], run["strength"]))
                 yield run
         for seed in plan.border_seeds if near else ():
-            yield from _runs_of_seed(shelf, recording, truth, method, preset, seed, [at for at in tried if at in near])
+            yield from _runs_of_seed(store, recording, truth, method, preset, seed, [at for at in tried if at in near])
 
 
 def _runs_of_seed(
-    shelf: Store,
+    store: Store,
     recording: Artifact,
     truth: Source,
     method: str,
@@ -113,33 +113,33 @@ def _runs_of_seed(
     """The run to compare with, and, unless that broke, a run for each kind and strength."""
     settings = preset.model_copy(update={"training": preset.training.model_copy(update={"seed": seed})})
     log.info("%s, seed %d, as recorded", method, seed)
-    good = attempt(shelf, recording, truth, settings, None)
+    good = attempt(store, recording, truth, settings, None)
     row = {"method": method, "seed": seed}
     reference = row | {"kind": REFERENCE, "strength": None} | judged(good, good)
     yield reference
     for kind, strength in tried if reference["verdict"] not in BROKEN else ():
         log.info("%s, seed %d, %s: %g", method, seed, KINDS[kind].label, strength)
-        found = attempt(shelf, recording, truth, settings, Degradation(kind=kind, strength=strength, seed=seed))
+        found = attempt(store, recording, truth, settings, Degradation(kind=kind, strength=strength, seed=seed))
         if "left_out" in found:
             yield {"left_out": f"{KINDS[kind].label}, {strength:g}: {found['left_out']}"}
             continue
         yield row | {"kind": kind, "strength": strength} | judged(found, good)
 
 
-def recorded(shelf: Store, source: Source, plan: Stability, settings: Settings) -> Artifact:
+def recorded(store: Store, source: Source, plan: Stability, settings: Settings) -> Artifact:
     """The recording, or that part of it which stands for all."""
-    recording = ingest(shelf, source, settings.capture)
+    recording = ingest(store, source, settings.capture)
     parts = plan.part.parts(Capture.load(recording.root))
-    return recording if parts == (None, None, None) else subset_capture(shelf, recording, *parts)
+    return recording if parts == (None, None, None) else subset_capture(store, recording, *parts)
 
 
 def judged(found: Figures, good: Figures) -> Figures:
-    """Verdict, whether it is near a border, and means over the images and surfaces that both runs have, None where
+    """RunVerdict, whether it is near a border, and means over the images and surfaces that both runs have, None where
     there are none; those of the good run as "reference"."""
     row: Figures = {}
     near = False
     if "error" in found:
-        verdict = Verdict(*found["error"])
+        verdict = RunVerdict(*found["error"])
     elif "images" not in found:
         verdict = judge(None, {}, found["faults"])
     else:
@@ -161,52 +161,52 @@ def in_common(one: Figures, other: Figures) -> Figures:
 
 
 def attempt(
-    shelf: Store, recording: Artifact, truth: Source, settings: Settings, degradation: Degradation | None
+    store: Store, recording: Artifact, truth: Source, settings: Settings, degradation: Degradation | None
 ) -> Figures:
     """What `measure` found, or {"error": (verdict, reason)}: bad input that was told before or by training is refused,
     anything else that went wrong has failed; or {"left_out": reason} where the capture does not allow it to be
     tried."""
     at_bad_input = "refused"
     try:
-        stages = prepare(shelf, recording, truth, settings, degradation)
+        stages = prepare(store, recording, truth, settings, degradation)
         training = settings.training
         if degradation and KINDS[degradation.kind].place == "settings":
             training = degrade_settings(training, degradation)
-        model = train(shelf, *stages, training)
+        model = train(store, *stages, training)
         at_bad_input = "failed"
-        return measure(shelf, recording, truth, settings, degradation, stages, model)
-    except NotPossibleError as error:
+        return measure(store, recording, truth, settings, degradation, stages, model)
+    except NotApplicableError as error:
         return {"left_out": str(error)}
-    except CaptureError as error:
+    except InputError as error:
         return {"error": (at_bad_input, str(error))}
     except Exception as error:  # whatever breaks is what the study is after
-        if may_pass(error):
+        if is_retryable(error):
             raise  # a full disk, a lost share, a killed worker
         log.warning("%s: %s", type(error).__name__, error)
         return {"error": ("failed", one_line(error))}
 
 
 def prepare(
-    shelf: Store, recording: Artifact, truth: Source, settings: Settings, degradation: Degradation | None
+    store: Store, recording: Artifact, truth: Source, settings: Settings, degradation: Degradation | None
 ) -> tuple[Artifact, Artifact, Artifact, Artifact]:
     """Capture, calibration, masks and body, made worse at the degradation's place."""
     place = KINDS[degradation.kind].place if degradation else None
     if degradation and place == "capture":
-        recording = degrade_capture(shelf, recording, degradation)
-    recording, calibration, masks, body = prepared(shelf, recording, settings)
+        recording = degrade_capture(store, recording, degradation)
+    recording, calibration, masks, body = prepared(store, recording, settings)
     if degradation and place == "worn":
-        recording = dress(shelf, truth, recording, calibration, body, degradation)
-        return prepared(shelf, recording, settings)
+        recording = dress(store, truth, recording, calibration, body, degradation)
+        return prepared(store, recording, settings)
     if degradation and place == "masks":
-        masks = degrade_masks(shelf, recording, calibration, masks, degradation)
-        body = fit(shelf, recording, calibration, masks, settings.fit)
+        masks = degrade_masks(store, recording, calibration, masks, degradation)
+        body = fit(store, recording, calibration, masks, settings.fit)
     if degradation and place == "fit":
-        body = degrade_fit(shelf, body, degradation)
+        body = degrade_fit(store, body, degradation)
     return recording, calibration, masks, body
 
 
 def measure(
-    shelf: Store,
+    store: Store,
     recording: Artifact,
     truth: Source,
     settings: Settings,
@@ -221,15 +221,15 @@ def measure(
     no_poses = why_no_novel_poses(model.root)
     if degradation and KINDS[degradation.kind].place == "poses":
         if no_poses:
-            raise NotPossibleError(no_poses)
-        return {"faults": _faults(show_in_extreme_poses(shelf, model, degradation))}
-    *_, good_body = prepare(shelf, recording, truth, settings, None)
+            raise NotApplicableError(no_poses)
+        return {"faults": _faults(show_in_extreme_poses(store, model, degradation))}
+    *_, good_body = prepare(store, recording, truth, settings, None)
     if degradation and KINDS[degradation.kind].place == "worn":
         _, truth = read_capture(stages[0].root)
     recorded, calibration, masks, body = stages
     if degradation and KINDS[degradation.kind].place == "fit":
         body = good_body
-    report = evaluate(shelf, truth, recorded, calibration, masks, body, model, settings.evaluation)
+    report = evaluate(store, truth, recorded, calibration, masks, body, model, settings.evaluation)
     metrics = json.loads((report.root / "metrics.json").read_text())
     novel = Capture.load(recording.root).novel_pose_frames and not no_poses
     split = ANIMATED if novel else NOVEL_VIEW
@@ -237,7 +237,7 @@ def measure(
     return {
         "images": _images(metrics, split),
         "surfaces": {surface["frame"]: surface["chamfer_mm"] for surface in surfaces},
-        "faults": _faults(check_meshes(shelf, report, good_body)),
+        "faults": _faults(check_meshes(store, report, good_body)),
         "protocol": metrics["protocol"],
         "seconds": json.loads((model.root / "report.json").read_text())["seconds"],
     }

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from prefect import flow
 
-from flows.run_page import show
+from flows.run_page import publish_markdown
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import recorded_cameras
 from hnerf.config import Settings, load_settings
@@ -31,41 +31,43 @@ def train_subject(
     without it, or one without each camera in turn.
     """
     settings = load_settings(preset, overrides or ())
-    shelf = Store(store.resolve())
+    artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
     if settings.evaluation.holdout:
         recorded = recorded_cameras(source.root)
         cameras_left_out(recorded.train, recorded.test, settings.evaluation.holdout)  # refused before any work
 
-    recording = ingest(shelf, source, settings.capture)
+    recording = ingest(artifact_store, source, settings.capture)
     subject = Capture.load(recording.root).name
-    shelf.show(subject, recording)
-    calibration = shelf.show(subject, calibrate(shelf, recording, settings.calibration))
+    artifact_store.link_latest(subject, recording)
+    calibration = artifact_store.link_latest(subject, calibrate(artifact_store, recording, settings.calibration))
     left_out = left_out_cameras(recording, calibration, settings)
-    masks = shelf.show(subject, find_masks(shelf, recording, calibration, settings))
-    body = shelf.show(subject, fit(shelf, recording, calibration, masks, settings.fit))
-    model = shelf.show(subject, train(shelf, recording, calibration, masks, body, settings.training))
-    held_out = tuple(without(camera, shelf, recording, calibration, masks, settings) for camera in left_out)
-    report = evaluate(shelf, truth, recording, calibration, masks, body, model, settings.evaluation, held_out)
-    shelf.show(subject, report)
-    asset = export(shelf, recording, calibration, model, settings.asset)
+    masks = artifact_store.link_latest(subject, find_masks(artifact_store, recording, calibration, settings))
+    body = artifact_store.link_latest(subject, fit(artifact_store, recording, calibration, masks, settings.fit))
+    model = artifact_store.link_latest(
+        subject, train(artifact_store, recording, calibration, masks, body, settings.training)
+    )
+    held_out = tuple(without(camera, artifact_store, recording, calibration, masks, settings) for camera in left_out)
+    report = evaluate(artifact_store, truth, recording, calibration, masks, body, model, settings.evaluation, held_out)
+    artifact_store.link_latest(subject, report)
+    asset = export(artifact_store, recording, calibration, model, settings.asset)
     for artifact in (recording, calibration, masks, body, model, report, asset):
-        shelf.show(subject, artifact)  # again: another run of this name may have come between
-    show(_figures(subject, report, asset), "result", f"What came of {subject}")
-    return shelf.subject_folder(subject)
+        artifact_store.link_latest(subject, artifact)  # again: another run of this name may have come between
+    publish_markdown(_figures(subject, report, asset), "result", f"What came of {subject}")
+    return artifact_store.subject_folder(subject)
 
 
-def prepared(shelf: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact, Artifact, Artifact]:
+def prepared(store: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact, Artifact, Artifact]:
     """What training and evaluation are given of a recording: itself, calibration, masks and body."""
-    return fitted(shelf, recording, calibrate(shelf, recording, settings.calibration), settings)
+    return fitted(store, recording, calibrate(store, recording, settings.calibration), settings)
 
 
 def fitted(
-    shelf: Store, recording: Artifact, calibration: Artifact, settings: Settings
+    store: Store, recording: Artifact, calibration: Artifact, settings: Settings
 ) -> tuple[Artifact, Artifact, Artifact, Artifact]:
     """The same of a recording whose cameras were calibrated."""
-    masks = find_masks(shelf, recording, calibration, settings)
-    return recording, calibration, masks, fit(shelf, recording, calibration, masks, settings.fit)
+    masks = find_masks(store, recording, calibration, settings)
+    return recording, calibration, masks, fit(store, recording, calibration, masks, settings.fit)
 
 
 def left_out_cameras(recording: Artifact, calibration: Artifact, settings: Settings) -> tuple[str, ...]:
@@ -77,25 +79,25 @@ def left_out_cameras(recording: Artifact, calibration: Artifact, settings: Setti
 
 
 def without(
-    camera: str, shelf: Store, recording: Artifact, calibration: Artifact, masks: Artifact, settings: Settings
+    camera: str, store: Store, recording: Artifact, calibration: Artifact, masks: Artifact, settings: Settings
 ) -> Artifact:
     """Masks, body and field made anew without a camera, scored on it and its `masks`; where cameras stand is known from
     all of them."""
     others = tuple(name for name in calibrated(recording, calibration).train_cameras if name != camera)
-    stages = fitted(shelf, subset_capture(shelf, recording, others, None, None), calibration, settings)
-    model = train(shelf, *stages, settings.training)
+    stages = fitted(store, subset_capture(store, recording, others, None, None), calibration, settings)
+    model = train(store, *stages, settings.training)
     scored = settings.evaluation.model_copy(update={"holdout": camera})  # whether it is one of several or not
-    return evaluate_held_out(shelf, recording, calibration, masks, stages[-1], model, scored)
+    return evaluate_held_out(store, recording, calibration, masks, stages[-1], model, scored)
 
 
-def find_masks(shelf: Store, recording: Artifact, calibration: Artifact, settings: Settings) -> Artifact:
+def find_masks(store: Store, recording: Artifact, calibration: Artifact, settings: Settings) -> Artifact:
     """Segment; where that needs a body, fit one to keypoints first, and go round until the masks stand still."""
     if not needs_body(recording, settings.segmentation):
-        return segment(shelf, recording, calibration, None, None, settings.segmentation)
+        return segment(store, recording, calibration, None, None, settings.segmentation)
     masks = None
     for _ in range(settings.segmentation.rounds):
-        body = fit(shelf, recording, calibration, masks, settings.fit)
-        masks = segment(shelf, recording, calibration, body, masks, settings.segmentation)
+        body = fit(store, recording, calibration, masks, settings.fit)
+        masks = segment(store, recording, calibration, body, masks, settings.segmentation)
         if settled(masks, settings.segmentation):
             break
     assert masks is not None  # there is a round at least

@@ -10,7 +10,7 @@ from typing import Any, Literal, Self, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
 
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 S = TypeVar("S", bound=BaseModel)
 
@@ -69,8 +69,8 @@ class FitSettings(Section):
     keypoint_outlier_m: float = Field(default=0.15, gt=0)  # distance at which a keypoint's pull fades
     offset_m: float = Field(default=0.02, gt=0)  # between the detector's idea of a keypoint and the body model's
     stature_m: float = Field(default=1.72, gt=0)  # mean height of people
-    stature_spread_m: float = Field(default=0.08, gt=0)
-    phenotype_spread: float = Field(default=0.25, gt=0)
+    stature_std_m: float = Field(default=0.08, gt=0)
+    phenotype_std: float = Field(default=0.25, gt=0)
     local_change_spread: float = Field(default=0.3, gt=0)
     acceleration_mps2: float = Field(default=10.0, gt=0)  # of the trunk; hands and feet three to four times as much
     inside_m: float = Field(default=0.008, gt=0)  # of a mask's edge inside the body
@@ -242,34 +242,34 @@ class Settings(Section):
 def load_settings(preset: str, overrides: Sequence[str] = ()) -> Settings:
     """Settings from a preset's name or a YAML file's path, with overrides like "training.steps=100".
 
-    Raises CaptureError with one line if the preset is unknown or no YAML, or a key or value is not allowed.
+    Raises InputError with one line if the preset is unknown or no YAML, or a key or value is not allowed.
     """
     path = named_file(preset, CONFIGS, "preset", "presets")
     return overridden(validated(Settings, read_yaml(path), path), overrides)
 
 
 def overridden(settings: S, overrides: Sequence[str]) -> S:
-    """Settings with overrides like "training.steps=100"; CaptureError, one line, for a key or value not allowed."""
+    """Settings with overrides like "training.steps=100"; InputError, one line, for a key or value not allowed."""
     tree = settings.model_dump()
     for override in overrides:
         key, equals, value = override.partition("=")
         if not equals:
-            raise CaptureError(f"--set {override}: write it as section.name=value")
+            raise InputError(f"--set {override}: write it as section.name=value")
         *sections, leaf = key.split(".")
         node = tree
         for section in sections:
             node = node.setdefault(section, {})
             if not isinstance(node, dict):
-                raise CaptureError(f"--set {override}: {section} is not a section")
+                raise InputError(f"--set {override}: {section} is not a section")
         node[leaf] = _parsed(value, f"--set {override}")
-    told = " ".join(f"--set {override}" for override in overrides)
-    return validated(type(settings), tree, told) if overrides else settings
+    message = " ".join(f"--set {override}" for override in overrides)
+    return validated(type(settings), tree, message) if overrides else settings
 
 
 def with_changes(settings: Settings, path: Path) -> Settings:
     """Settings with those values replaced that a YAML file names, such as one of `configs/ablations/`.
 
-    Raises CaptureError with one line if the file is no YAML, or a key or value is not allowed.
+    Raises InputError with one line if the file is no YAML, or a key or value is not allowed.
     """
     return validated(Settings, _merged(settings.model_dump(), read_yaml(path)), path)
 
@@ -284,19 +284,19 @@ def _merged(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def named_file(name: str, folder: Path, one: str, many: str) -> Path:
-    """The YAML file of this name in a folder, or else at this path; CaptureError, which lists those of the folder."""
+    """The YAML file of this name in a folder, or else at this path; InputError, which lists those of the folder."""
     path = folder / f"{name}.yaml" if (folder / f"{name}.yaml").exists() else Path(name)
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
-        raise CaptureError(f"{name}: no such {one} or file; {many} are {known}")
+        raise InputError(f"{name}: no such {one} or file; {many} are {known}")
     return path
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The keys and values of a YAML file, none of an empty one; CaptureError, one line, where it holds no such."""
+    """The keys and values of a YAML file, none of an empty one; InputError, one line, where it holds no such."""
     tree = _parsed(path.read_bytes(), str(path))
     if not isinstance(tree, dict | None):
-        raise CaptureError(f"{path}: holds no keys and values; write it as `name: value`")
+        raise InputError(f"{path}: holds no keys and values; write it as `name: value`")
     return tree or {}
 
 
@@ -304,14 +304,14 @@ def _parsed(text: str | bytes, source: str) -> Any:
     try:
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date such as 2026-13-01
-        raise CaptureError(f"{source}: is not YAML ({' '.join(str(error).split())}); correct it") from None
+        raise InputError(f"{source}: is not YAML ({' '.join(str(error).split())}); correct it") from None
 
 
 def validated(kind: type[S], tree: Any, source: Path | str) -> S:
-    """A model from the tree that a YAML or TOML file holds; CaptureError, one line with source and key, on what is
+    """A model from the tree that a YAML or TOML file holds; InputError, one line with source and key, on what is
     wrong."""
     try:
         return kind.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
-        raise CaptureError(f"{source}: {'.'.join(map(str, first['loc']))}: {first['msg']}; correct it") from None
+        raise InputError(f"{source}: {'.'.join(map(str, first['loc']))}: {first['msg']}; correct it") from None

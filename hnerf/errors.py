@@ -1,11 +1,11 @@
 """The one error that bad input raises."""
 
 
-class CaptureError(Exception):
+class InputError(Exception):
     """Bad input. The message is one line that names the file and says what to do; it is never retried."""
 
 
-class NotPossibleError(CaptureError):
+class NotApplicableError(InputError):
     """What was asked for cannot be tried on this capture; nothing is wrong with either."""
 
 

@@ -8,15 +8,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 
 @contextmanager
-def new_folder(out: Path) -> Iterator[Path]:
+def atomic_folder(out: Path) -> Iterator[Path]:
     """An empty folder beside `out` to write into: it takes that name when all is written, and is gone if anything goes
-    wrong before. CaptureError where `out` exists."""
+    wrong before. InputError where `out` exists."""
     if out.exists():
-        raise CaptureError(f"{out}: exists; give the name of a new folder")
+        raise InputError(f"{out}: exists; give the name of a new folder")
     missing = [parent for parent in out.parents if not parent.exists()]
     out.parent.mkdir(parents=True, exist_ok=True)
     try:

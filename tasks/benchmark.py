@@ -7,7 +7,7 @@ import torch
 from hnerf.body.fit_result import BodyFit
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.study.benchmark.plan import ScoringSettings
-from hnerf.study.benchmark.scoring import Scene, score, score_end
+from hnerf.study.benchmark.scoring import ScoringScene, score, score_end
 from tasks.calibration import calibrated
 from tasks.source import GROUND_TRUTH, Source
 from tasks.stage import stage
@@ -45,8 +45,8 @@ def score_end_of_training(
     return {"steps": found["training"]["steps"], "seconds": found["training"]["field_seconds"]}
 
 
-def scene(truth: Source, recording: Artifact, calibration: Artifact, body: Artifact) -> Scene:
+def scene(truth: Source, recording: Artifact, calibration: Artifact, body: Artifact) -> ScoringScene:
     """What trainings on a recording are scored against, on the GPU where there is one."""
     capture = calibrated(recording, calibration)
     known = GroundTruth(truth.root, capture) if (truth.root / GROUND_TRUTH).is_dir() else None
-    return Scene(capture, BodyFit.load(body.root), known, "cuda" if torch.cuda.is_available() else "cpu")
+    return ScoringScene(capture, BodyFit.load(body.root), known, "cuda" if torch.cuda.is_available() else "cpu")

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 GRACE_S = 40  # torchrun gives its ranks 30 s to end before it kills them
 LAST_LINES = 20
@@ -32,14 +32,14 @@ class GaveUpError(RuntimeError):
     """A rank could not go on, for a reason that lies in its work and that the message, one line, tells."""
 
 
-def _failed_io(told: str) -> OSError:
+def _failed_io(message: str) -> OSError:
     """From JSON: errno, what it means, file; an errno of null where a library did not say."""
-    number, why, name = json.loads(told)
+    number, why, name = json.loads(message)
     return OSError(why) if number is None else OSError(number, why, name)
 
 
 # By exit code: what a rank means that says why it ends in its last line on stderr.
-TOLD: dict[int, Callable[[str], Exception]] = {2: CaptureError, 3: GaveUpError, 4: _failed_io}
+TOLD: dict[int, Callable[[str], Exception]] = {2: InputError, 3: GaveUpError, 4: _failed_io}
 
 
 def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:

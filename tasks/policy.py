@@ -75,14 +75,14 @@ class StorePolicy(CachePolicy):
 
 def is_transient(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
     """Prefect's retry condition."""
-    return may_pass(state.result(raise_on_failure=False))
+    return is_retryable(state.result(raise_on_failure=False))
 
 
-def may_pass(error: object) -> bool:
+def is_retryable(error: object) -> bool:
     """Whether a later try may overcome it: input and output that failed, timeouts and lost workers; nothing else."""
-    return isinstance(error, OSError | LostWorkerError) and not will_last(error)
+    return isinstance(error, OSError | LostWorkerError) and not is_permanent(error)
 
 
-def will_last(error: Exception) -> bool:
+def is_permanent(error: Exception) -> bool:
     """Whether input or output failed for a reason that lies in the path, which no later try overcomes."""
     return isinstance(error, LASTING) or (isinstance(error, OSError) and error.errno in LASTING_NUMBERS)

@@ -8,7 +8,7 @@ from typing import NoReturn
 
 from pydantic import BaseModel
 
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tasks.store import sha256_of
 
 GROUND_TRUTH = "ground_truth"
@@ -27,17 +27,17 @@ def read_capture(folder: Path, store: Path | None = None) -> tuple[Source, Sourc
     """What was recorded, and what is known to be true of it: all files but those of `ground_truth/`, and only those.
 
     Hidden files do not count. A symbolic link counts as the text it holds: what it points at is either in the folder
-    itself or none of ours. Raises CaptureError if there is no such folder, a file that cannot be read, or the store
+    itself or none of ours. Raises InputError if there is no such folder, a file that cannot be read, or the store
     lies in the capture, which would be another one after every run.
     """
     folder = folder.resolve()
     if not folder.is_dir():
-        raise CaptureError(f"{folder}: no such folder; give the capture's folder")
+        raise InputError(f"{folder}: no such folder; give the capture's folder")
     if store and store.resolve().is_relative_to(folder):
-        raise CaptureError(f"{store.resolve()}: lies in the capture's folder; give --store another place")
+        raise InputError(f"{store.resolve()}: lies in the capture's folder; give --store another place")
     shown = os.fsencode(folder).decode(errors="replace")
     if shown != str(folder):
-        raise CaptureError(f"{shown}: the folder's name is not UTF-8; rename it")
+        raise InputError(f"{shown}: the folder's name is not UTF-8; rename it")
     truth = folder / GROUND_TRUTH
     files = capture_files(folder)
     parts = [f for f in files if not f.is_relative_to(truth)], [f for f in files if f.is_relative_to(truth)]
@@ -46,7 +46,7 @@ def read_capture(folder: Path, store: Path | None = None) -> tuple[Source, Sourc
 
 
 def capture_files(folder: Path) -> list[Path]:
-    """The files and symbolic links in a capture folder, sorted; no hidden ones, no devices. CaptureError on a folder
+    """The files and symbolic links in a capture folder, sorted; no hidden ones, no devices. InputError on a folder
     that cannot be read."""
     found = []
     for parent, folders, files in os.walk(folder, onerror=_refuse):
@@ -69,6 +69,6 @@ def _digest(folder: Path, files: Iterable[Path]) -> str:
 
 
 def _refuse(error: OSError, path: Path | None = None) -> NoReturn:
-    raise CaptureError(
+    raise InputError(
         f"{path or error.filename}: cannot be read ({error.strerror}); make it readable or take it out of the folder"
     ) from None

@@ -49,7 +49,7 @@ class Stage(Generic[P]):
 
     def _run(self, store: Store, inputs: dict[str, Input]) -> Artifact:
         key = stage_key(self.name, self.version, inputs)
-        return store.obtain(self.name, key, lambda out: self.write(out, **inputs), self.resumable)  # type: ignore[call-arg, arg-type]
+        return store.get_or_compute(self.name, key, lambda out: self.write(out, **inputs), self.resumable)  # type: ignore[call-arg, arg-type]
 
 
 def stage(name: str, version: str, resumable: bool = False) -> Callable[[Write[P]], Stage[P]]:

@@ -22,7 +22,7 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 log = logging.getLogger("hnerf.store")
 
@@ -81,7 +81,7 @@ class Store:
         log.warning("%s is damaged or gone: %s will be computed again", damaged, stage)
         return None
 
-    def obtain(
+    def get_or_compute(
         self, stage: str, key: str, write: Callable[[Path], dict[str, float]], resumable: bool = False
     ) -> Artifact:
         """The artifact, found, or else made by `write(folder)`, which returns its figures.
@@ -100,15 +100,15 @@ class Store:
             try:
                 metrics = write(partial)
             except BaseException as error:
-                if not resumable or isinstance(error, CaptureError):
+                if not resumable or isinstance(error, InputError):
                     shutil.rmtree(partial)
                 raise
             return self._commit(stage, key, metrics)
 
-    def show(self, subject: str, artifact: Artifact) -> Artifact:
+    def link_latest(self, subject: str, artifact: Artifact) -> Artifact:
         """Point `<store>/subjects/<subject>/<stage>` at the artifact; returns it."""
         if subject in ("", ".", "..") or "/" in subject:
-            raise CaptureError(f"capture.toml: name {subject!r} cannot be a folder's name; choose another")
+            raise InputError(f"capture.toml: name {subject!r} cannot be a folder's name; choose another")
         link = self.subject_folder(subject) / artifact.stage
         link.parent.mkdir(parents=True, exist_ok=True)
         target = os.path.relpath(artifact.root, link.parent)
@@ -163,12 +163,12 @@ class Store:
 
 
 def require_whole(subject: Path) -> None:
-    """CaptureError where an artifact that `<store>/subjects/<name>` links to has changed since it was recorded."""
+    """InputError where an artifact that `<store>/subjects/<name>` links to has changed since it was recorded."""
     for link in sorted(subject.iterdir()):
         root = link.resolve()
         recorded = link.name in STAGES and root.with_name(f"{root.name}.json").is_file()
         if recorded and Store(root.parents[1]).find(link.name, root.name) is None:
-            raise CaptureError(f"{root}: damaged; give the same `hnerf run` again, which makes it anew")
+            raise InputError(f"{root}: damaged; give the same `hnerf run` again, which makes it anew")
 
 
 def sha256_of(path: Path) -> str:

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from hnerf.config import load_settings, with_changes
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.study.benchmark.plan import load_study
 from hnerf.study.stability.plan import load_stability
 
@@ -49,7 +49,7 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
 )
 def test_what_is_not_allowed_is_refused_by_file_and_key(tmp_path: Path, text: str, named: str) -> None:
     path = changes(tmp_path, text)
-    with pytest.raises(CaptureError, match=f"{path}: {named}: "):
+    with pytest.raises(InputError, match=f"{path}: {named}: "):
         with_changes(load_settings("fast"), path)
 
 
@@ -77,10 +77,10 @@ def test_files_that_are_no_tables_are_one_line(
 ) -> None:
     path = tmp_path / "mine.yaml"
     path.write_bytes(content)
-    with pytest.raises(CaptureError, match=f"^{path}: {message}[^\n]*$"):
+    with pytest.raises(InputError, match=f"^{path}: {message}[^\n]*$"):
         load(path)
 
 
 def test_an_override_that_is_no_yaml_is_one_line() -> None:
-    with pytest.raises(CaptureError, match=r"^--set training\.steps=\[100: is not YAML [^\n]*; correct it$"):
+    with pytest.raises(InputError, match=r"^--set training\.steps=\[100: is not YAML [^\n]*; correct it$"):
         load_settings("fast", ["training.steps=[100"])

@@ -2,14 +2,14 @@ from pathlib import Path
 
 import pytest
 
-from hnerf.errors import CaptureError
-from hnerf.files import new_folder
+from hnerf.errors import InputError
+from hnerf.files import atomic_folder
 
 
 def test_it_takes_its_name_when_all_is_written(tmp_path: Path) -> None:
     (tmp_path / "ada.partial").mkdir()
     (tmp_path / "ada.partial" / "old").touch()
-    with new_folder(tmp_path / "ada") as folder:
+    with atomic_folder(tmp_path / "ada") as folder:
         (folder / "new").touch()
         assert not (tmp_path / "ada").exists()
     left = ["ada", "ada.partial", "ada.partial/old", "ada/new"]  # a folder of that name is not ours
@@ -18,7 +18,7 @@ def test_it_takes_its_name_when_all_is_written(tmp_path: Path) -> None:
 
 
 def test_it_is_gone_if_anything_goes_wrong(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), new_folder(tmp_path / "a" / "b" / "ada") as folder:
+    with pytest.raises(KeyboardInterrupt), atomic_folder(tmp_path / "a" / "b" / "ada") as folder:
         (folder / "half").touch()
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
@@ -26,6 +26,6 @@ def test_it_is_gone_if_anything_goes_wrong(tmp_path: Path) -> None:
 
 def test_what_exists_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "ada").mkdir()
-    with pytest.raises(CaptureError, match="ada: exists; give the name of a new folder"), new_folder(tmp_path / "ada"):
+    with pytest.raises(InputError, match="ada: exists; give the name of a new folder"), atomic_folder(tmp_path / "ada"):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["ada"]

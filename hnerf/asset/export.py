@@ -33,7 +33,7 @@ log = logging.getLogger("hnerf.asset")
 def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out: Path) -> dict[str, Any]:
     """Write `avatar.usdz`, `avatar_cache.usdz`, `avatar.glb` and `report.json` into `out`; returns the report.
 
-    Raises CaptureError if the field has no surface, InvalidAsset if a package does not pass validation.
+    Raises InputError if the field has no surface, InvalidAsset if a package does not pass validation.
     """
     seconds: dict[str, float] = {}
     avatar = avatar.without_frames()  # one surface and one texture stand for all of them

@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.fields.encoding import FeatureGrids
 
 STEP, STEPS = ".step", ".steps"  # what becomes of a grid: a unit, and how many of it each feature is, a node's together
@@ -29,7 +29,7 @@ def write_field(field: nn.Module, path: Path) -> None:
 
 
 def fill_field(field: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
-    """Give the field what tensors read from `path` say; CaptureError if another version of it was written there."""
+    """Give the field what tensors read from `path` say; InputError if another version of it was written there."""
     tensors = dict(tensors)
     try:
         for name in _grids(field):
@@ -44,9 +44,9 @@ def fill_field(field: nn.Module, tensors: dict[str, Tensor], path: Path) -> None
         raise other_version(path) from None
 
 
-def other_version(path: Path) -> CaptureError:
+def other_version(path: Path) -> InputError:
     """The error of a file that another version of the library wrote."""
-    return CaptureError(f"{path}: of another version; train the subject again")
+    return InputError(f"{path}: of another version; train the subject again")
 
 
 def _grids(field: nn.Module) -> list[str]:

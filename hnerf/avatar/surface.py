@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hnerf.avatar.avatar import Avatar
 from hnerf.body.rig import pose_vertices
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 SLOPE_BOUND = 2.0  # |gradient| that skipping empty space allows for; a true distance has 1
 COARSEST_STRIDE = 9  # nodes; refined by threes, so that a coarse node is the centre of the block it stands for
@@ -29,7 +29,7 @@ def posed_surface(avatar: Avatar, frame: int) -> trimesh.Trimesh:
 
 def surface_in_pose(avatar: Avatar, theta: Tensor, root: Tensor, cells: int) -> trimesh.Trimesh:
     """The zero surface in a pose theta (J, 3), root (4, 4), in world metres; cells on the longest side of a box around
-    the body. Raises CaptureError as `extract_surface` does."""
+    the body. Raises InputError as `extract_surface` does."""
     body_m = pose_vertices(avatar.body.rig, theta, root)
     lower_m, upper_m = body_m.amin(0) - POSED_MARGIN_M, body_m.amax(0) + POSED_MARGIN_M
     with torch.no_grad():
@@ -43,20 +43,20 @@ def extract_surface(
 
     signed_distance: points (N, 3) in metres, on the device of `lower_m`, to metres (N,), negative inside.
     lower_m, upper_m (3,): the box; cells: how many on its longest side, cubic.
-    Raises CaptureError if the field has no surface in the box, or one that the box cuts.
+    Raises InputError if the field has no surface in the box, or one that the box cuts.
     """
     step_m = float((upper_m - lower_m).max()) / cells
     nodes = [math.ceil(float(side_m) / step_m - 1e-4) + 1 for side_m in upper_m - lower_m]
     values = _sample_near_surface(signed_distance, lower_m, step_m, nodes).cpu().numpy()
     if not np.isfinite(values).all():
-        raise CaptureError("signed distance field: not finite; training diverged, lower its learning rate")
+        raise InputError("signed distance field: not finite; training diverged, lower its learning rate")
     if not values.min() < 0 < values.max():
         found = "everything is inside" if values.max() <= 0 else "everything is outside"
-        raise CaptureError(f"signed distance field: no surface in its box ({found}); train longer or check masks")
+        raise InputError(f"signed distance field: no surface in its box ({found}); train longer or check masks")
     vertices, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")  # in steps from `lower_m`
     mesh = _largest_component(trimesh.Trimesh(vertices, faces, process=False))
     if mesh.vertices.min() <= 0 or (mesh.vertices >= np.array(nodes) - 1).any():
-        raise CaptureError("signed distance field: the surface fills its box; train longer or check masks and body fit")
+        raise InputError("signed distance field: the surface fills its box; train longer or check masks and body fit")
     return trimesh.Trimesh(mesh.vertices * step_m + lower_m.cpu().numpy(), mesh.faces, process=False)
 
 

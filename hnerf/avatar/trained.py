@@ -78,7 +78,7 @@ class TrainedAvatar:
             part = slice(start, start + count)
             o, d = (torch.from_numpy(np.ascontiguousarray(a[part])).float().to(device) for a in (origins, directions))
             row = torch.zeros(len(o), dtype=torch.long, device=device)
-            flat[index[part]] = self.field.look(bodies, region, o, d, row, conditions)
+            flat[index[part]] = self.field.render_rays(bodies, region, o, d, row, conditions)
         image = flat.view(camera.height_px, camera.width_px, 5)
         gain = torch.tensor(self.gains.get(camera.name, (1.0, 1.0, 1.0)), device=device)
         return Rendering((gain * image[..., :3]).clamp(0, 1), image[..., 3], image[..., 4])
@@ -109,9 +109,9 @@ class TrainedAvatar:
     def _pose(self, theta: Tensor, root: Tensor) -> tuple[PosedBodies, Conditions]:
         rig = self.body.rig
         bodies = PosedBodies(rig, theta[None], root[None], self.field.canonical_m)
-        return bodies, Conditions.of(rig, theta[None], root[None], self._moment(theta, root), self.scene_m)
+        return bodies, Conditions.of(rig, theta[None], root[None], self._frame_row(theta, root), self.scene_m)
 
-    def _moment(self, theta: Tensor, root: Tensor) -> Tensor:
+    def _frame_row(self, theta: Tensor, root: Tensor) -> Tensor:
         """The learned row (1,) whose joints turn like theta, of several the one whose root is nearest; -1 for none."""
         same = torch.nonzero((self.learned.theta == theta).flatten(1).all(1))[:, 0]
         apart = (self.learned.root[same] - root).flatten(1).norm(dim=1)
@@ -119,7 +119,7 @@ class TrainedAvatar:
 
 
 def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvatar:
-    """The subject that training left in `folder`; CaptureError if another version left it."""
+    """The subject that training left in `folder`; InputError if another version left it."""
     settings, static, gains = _stored_settings(folder / "settings.json")
     body = BodyFit.load(folder).to(device)
     path = folder / "model.safetensors"

@@ -12,8 +12,8 @@ from hnerf.fields.samples import RaySamples
 
 
 class DynamicField(BoxField):
-    """Codes start at zero and stay there where a frame is not trained on; a pose that no frame has (Conditions.moment =
-    -1) takes zero."""
+    """Codes start at zero and stay there where a frame is not trained on; a pose that no frame has
+    (Conditions.frame_row = -1) takes zero."""
 
     def __init__(self, body: BodyFit, samples: int, learning_rate: float, code_width: int):
         super().__init__(body, samples, learning_rate)
@@ -22,7 +22,7 @@ class DynamicField(BoxField):
     def code(self, conditions: Conditions) -> Tensor:
         """By body row, (n, code_width)."""
         nobody = torch.zeros_like(self.codes[:1])
-        return torch.cat([self.codes, nobody])[conditions.moment]  # -1 is the last row
+        return torch.cat([self.codes, nobody])[conditions.frame_row]  # -1 is the last row
 
     def seen(self, density: Tensor, colour: Tensor, depths_m: Tensor, far_m: Tensor, **more: Any) -> RaySamples:
         """Density (R, K) and colour (R, K, 3) at depths (R, K) as samples; the last one reaches to the box's end."""

@@ -48,9 +48,9 @@ class Deformation(nn.Module):
 class NerfiesField(DynamicField):
     """Dynamic; every frame's code deforms the space of its moment into one template, a NeRF. No body but its box.
 
-    It has no pose to set. A pose that no frame has (Conditions.moment = -1), and a frame that was not trained on, take
-    the code zero: the template as the deformation of that code leaves it, the same whatever the pose, cut by the pose's
-    box. Where that box is elsewhere there is little or nothing.
+    It has no pose to set. A pose that no frame has (Conditions.frame_row = -1), and a frame that was not trained on,
+    take the code zero: the template as the deformation of that code leaves it, the same whatever the pose, cut by the
+    pose's box. Where that box is elsewhere there is little or nothing.
 
     Simplified: one template network serves coarse and fine samples, and only the fine pass is trained, as H-NeRF does
     it; networks and numbers of samples are smaller, so that minutes on two CPU cores mean something; no appearance

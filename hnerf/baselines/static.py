@@ -7,7 +7,7 @@ from torch import Tensor
 
 from hnerf.baselines.box import BoxField
 from hnerf.body.canonical import PosedBodies
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.fields.conditions import Conditions
 
 
@@ -24,6 +24,6 @@ class StaticField(BoxField):
 
 
 def require_one_moment(static: bool, method: str) -> None:
-    """CaptureError where there is more than one training frame."""
+    """InputError where there is more than one training frame."""
     if not static:
-        raise CaptureError(f"{method} models one moment; choose a single training frame, or another machinery")
+        raise InputError(f"{method} models one moment; choose a single training frame, or another machinery")

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from hnerf.body.normal_equations import NormalEquations
-from hnerf.body.robust import faded
+from hnerf.body.robust import geman_mcclure
 
 BALANCE_M = 0.05
 FADES_M = 0.15  # from where the pull fades: a step or a jump
@@ -46,7 +46,7 @@ class Balance:
         off, by_frame = (
             torch.einsum("k,nkc...->nc...", self.shares, t)[:, self.level] for t in (keypoints_m, jacobian)
         )
-        weight, cost = faded(off.square().sum(-1), BALANCE_M, FADES_M)
+        weight, cost = geman_mcclure(off.square().sum(-1), BALANCE_M, FADES_M)
         weighted = weight[:, None, None] * by_frame
         equations.frame[0] += (weighted.mT @ by_frame).numpy()
         equations.frame_gradient += torch.einsum("ncu,nc->nu", weighted, off).numpy()

@@ -90,7 +90,7 @@ class PosedBodies:
         self._pose(theta, root)
         self._meshes = BodyMeshes(self.vertices_m, rig.faces)
 
-    def stand(self, rig: Rig, theta: Tensor, root: Tensor) -> None:
+    def set_poses(self, rig: Rig, theta: Tensor, root: Tensor) -> None:
         """Take other poses and another shape, nearby."""
         self.rig = rig
         self._pose(theta, root)
@@ -195,7 +195,7 @@ class PosedBodies:
         turn, pivot = rotation_from_axis_angle(correction.turn[:, -1]), self._joints[:, 0, :3, 3]
         root[:, :3, :3] = turn @ root[:, :3, :3]
         root[:, :3, 3] = (turn @ (root[:, :3, 3] - pivot)[..., None])[..., 0] + pivot + correction.move_m
-        self.stand(rig.reshaped(rig.beta + correction.shape), theta, root)
+        self.set_poses(rig.reshaped(rig.beta + correction.shape), theta, root)
         for name, parameter in correction.named_parameters():
             correction.get_buffer(f"absorbed_{name}").add_(parameter)
             parameter.zero_()

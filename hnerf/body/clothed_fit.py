@@ -95,8 +95,8 @@ def _worn(rows: Rows, more_m: np.ndarray) -> Rows:
 
 
 def _faded(residual_m: np.ndarray) -> np.ndarray:
-    faded: np.ndarray = 1 / (1 + (residual_m / FADES_M) ** 2) ** 2
-    return faded
+    geman_mcclure: np.ndarray = 1 / (1 + (residual_m / FADES_M) ** 2) ** 2
+    return geman_mcclure
 
 
 def _neighbours(faces: np.ndarray, vertices: int) -> csr_array:

@@ -21,14 +21,14 @@ from hnerf.body.contour_fit import Outline, outline, refine
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.given_start import given_start, seen_on, told_of
 from hnerf.body.initial_root import root_from_image, root_from_space
-from hnerf.body.keypoint_fit import Likely, Problem, levenberg_marquardt, metres_per_pixel, project
+from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel, project
 from hnerf.body.observations import Observations, observe, runs
 from hnerf.body.pose_prior import PosePrior, Smoothness
-from hnerf.body.posture_prior import Habit
+from hnerf.body.posture_prior import PosturePrior
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.config import FitSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.geometry.silhouette import silhouette
 
 log = logging.getLogger("hnerf.fit")
@@ -47,7 +47,7 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
 
     Returns the fit and a plain report: seconds by stage, the shape, and for each frame the median keypoint residual in
     px and the silhouette's IoU with the masks (None without), with the frames where these are poor. Raises
-    CaptureError where keypoints are missing or the person is seen by too few cameras in too many frames.
+    InputError where keypoints are missing or the person is seen by too few cameras in too many frames.
     """
     with threadpool_limits(1):  # so small are the tensors that threads cost more than they give
         seconds: dict[str, float] = {}
@@ -68,11 +68,11 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
             problem = replace(problem, balance=balance)
             pose = levenberg_marquardt(problem, pose, problem.in_images, KEYPOINT_STEPS)
             if balance:
-                habit = Habit.of_one_view(_by_split(capture), pose, seen.cameras[0])
-                pose = unflipped(replace(problem, habit=habit), pose, runs(capture))
-                pose, habit = as_still_as_seen(problem, pose, habit)
+                habit = PosturePrior.of_one_view(_by_split(capture), pose, seen.cameras[0])
+                pose = resolve_depth_flips(replace(problem, habit=habit), pose, runs(capture))
+                pose, habit = hold_single_posture(problem, pose, habit)
             else:
-                habit = Habit.of_hands(len(pose.root), Articulation(pose.rig))
+                habit = PosturePrior.of_hands(len(pose.root), Articulation(pose.rig))
         if masks is not None:
             with _timed(seconds, "outlines"):
                 problem = problem_of(model, pose, seen, smoothness, settings, offsets=1, proportions=1)
@@ -99,7 +99,7 @@ def start(capture: Capture, seen: Observations, model: BodyModel) -> Pose:
         roots = [root_from_image(seen.cameras[0], rest_m, keypoints) for keypoints in views]
     placed = {t: root for t, root in enumerate(roots) if root is not None}
     if len(placed) < len(roots) / 2:
-        raise CaptureError(
+        raise InputError(
             f"{capture.root / 'keypoints.npz'}: head and trunk are found by enough cameras in only {len(placed)} of "
             f"{len(roots)} frames; check the keypoint files and the calibration, or leave those frames out"
         )
@@ -109,7 +109,7 @@ def start(capture: Capture, seen: Observations, model: BodyModel) -> Pose:
     return Pose(rig, theta, torch.from_numpy(np.stack(nearest)), torch.zeros(25, 3, dtype=torch.float64))
 
 
-def unflipped(problem: Problem, pose: Pose, follow: list[tuple[int, ...]]) -> Pose:
+def resolve_depth_flips(problem: Problem, pose: Pose, follow: list[tuple[int, ...]]) -> Pose:
     """One view shows a bent limb and its mirror image in depth alike; a few frames that fell for the mirror image are
     outvoted by their neighbours. `follow`: frames in order, by run. Without the vote where nothing is gained."""
     pose = levenberg_marquardt(problem, pose, problem.in_images, KEYPOINT_STEPS)
@@ -121,7 +121,7 @@ def unflipped(problem: Problem, pose: Pose, follow: list[tuple[int, ...]]) -> Po
     return again if after < before else pose
 
 
-def as_still_as_seen(problem: Problem, pose: Pose, habit: Habit) -> tuple[Pose, Habit]:
+def hold_single_posture(problem: Problem, pose: Pose, habit: PosturePrior) -> tuple[Pose, PosturePrior]:
     """Who turns before the only camera in one posture is held to it, so that all frames tell together how deep a limb
     lies; otherwise each joint keeps the spread it has. One posture it is where the keypoints, and all that is likely
     beside the habit, agree with it nearly as well as with a pose a frame."""
@@ -140,12 +140,12 @@ def problem_of(
     proportions: float,
 ) -> Problem:  # fmt: skip
     """`offsets` and `proportions` scale the spread of the keypoint offsets and of the shape's details."""
-    likely = Likely(
+    likely = FitPriors(
         settings.keypoint_m,
         settings.keypoint_outlier_m,
         settings.offset_m * offsets,
         settings.stature_m,
-        settings.stature_spread_m,
+        settings.stature_std_m,
         model.mean,
         torch.where(model.details, proportions * model.spread, model.spread),
         model.low,

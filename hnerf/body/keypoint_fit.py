@@ -12,9 +12,9 @@ from hnerf.body.balance import Balance
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.observations import Observations
 from hnerf.body.pose_prior import PosePrior, Smoothness
-from hnerf.body.posture_prior import Habit
+from hnerf.body.posture_prior import PosturePrior
 from hnerf.body.rig import Rig
-from hnerf.body.robust import faded
+from hnerf.body.robust import geman_mcclure
 from hnerf.geometry.camera import Camera
 
 ROOT, UNSEEN = np.arange(6), 1e-6  # information on a root of which nothing else is known: it stays where it was put
@@ -22,14 +22,14 @@ NEAR_M = 0.1  # nothing nearer is in a camera's picture
 
 
 @dataclass(frozen=True)
-class Likely:
+class FitPriors:
     """Known before looking: standard deviations in metres; the shape's mean, spread and range, each (B,)."""
 
     keypoint_m: float
     keypoint_outlier_m: float
     offset_m: float
     stature_m: float
-    stature_spread_m: float
+    stature_std_m: float
     beta_mean: Tensor
     beta_spread: Tensor
     beta_low: Tensor
@@ -49,11 +49,11 @@ class Problem:
 
     seen: Observations
     scale_m: Tensor
-    likely: Likely
+    likely: FitPriors
     smoothness: Smoothness
     reshape: Callable[[Tensor], Rig]
     balance: Balance | None = None
-    habit: Habit | None = None
+    habit: PosturePrior | None = None
 
     def assemble(self, pose: Pose, inform: Callable[[Tensor], Information]) -> tuple[float, NormalEquations]:
         """Cost and normal equations of the keypoints, as `inform` weighs them, and of all that is likely."""
@@ -90,8 +90,8 @@ class Problem:
         values = torch.cat([rig.beta - likely.beta_mean, offsets])
         precision = torch.cat([likely.beta_spread, torch.full_like(offsets, likely.offset_m)]) ** -2
         top, bottom = rig.vertices_m[:, 2].argmax(), rig.vertices_m[:, 2].argmin()
-        excess = float(rig.vertices_m[top, 2] - rig.vertices_m[bottom, 2] - likely.stature_m) / likely.stature_spread_m
-        by_beta = ((rig.shape_basis[:, top, 2] - rig.shape_basis[:, bottom, 2]) / likely.stature_spread_m).numpy()
+        excess = float(rig.vertices_m[top, 2] - rig.vertices_m[bottom, 2] - likely.stature_m) / likely.stature_std_m
+        by_beta = ((rig.shape_basis[:, top, 2] - rig.shape_basis[:, bottom, 2]) / likely.stature_std_m).numpy()
         shape = slice(0, len(by_beta))
         at = np.arange(len(values))
         equations.shared[at, at] += precision.numpy()
@@ -125,7 +125,7 @@ class Problem:
 
     def _robust(self, squared: Tensor, trust: Tensor) -> tuple[Tensor, float]:
         """Weights, and the cost."""
-        weight, cost = faded(squared, self.likely.keypoint_m, self.likely.keypoint_outlier_m)
+        weight, cost = geman_mcclure(squared, self.likely.keypoint_m, self.likely.keypoint_outlier_m)
         return trust * weight, float((trust * cost).sum())
 
     def moved(self, pose: Pose, equations: NormalEquations, damping: float) -> Pose:

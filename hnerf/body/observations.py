@@ -25,7 +25,7 @@ class Observations:
 
 
 def observe(capture: Capture) -> Observations:
-    """Keypoints of every frame, from training cameras only. Raises CaptureError where the capture has none."""
+    """Keypoints of every frame, from training cameras only. Raises InputError where the capture has none."""
     people = subject_keypoints(capture)
     cameras = tuple(capture.cameras[name] for name in capture.train_cameras)
     keypoints = np.stack([people[camera.name] for camera in cameras])

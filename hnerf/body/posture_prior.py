@@ -9,7 +9,7 @@ from torch import Tensor
 
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.normal_equations import NormalEquations
-from hnerf.body.robust import faded
+from hnerf.body.robust import geman_mcclure
 from hnerf.geometry.camera import Camera
 
 WRISTS_DEG, OTHER_WRISTS_DEG = 5.0, 10.0  # how far a joint is usually off, and from where it is another posture
@@ -22,7 +22,7 @@ TINY = 1e-6  # keeps the usual turn of what no frame is trusted to tell where it
 
 
 @dataclass(frozen=True)
-class Habit:
+class PosturePrior:
     """A joint is likely to be turned by `spread` about its median over a group of frames, and Geman-McClure lets
     another posture go from `other` on.
 
@@ -36,28 +36,28 @@ class Habit:
     other: float
 
     @staticmethod
-    def of_hands(frames: int, articulation: Articulation) -> "Habit":
+    def of_hands(frames: int, articulation: Articulation) -> "PosturePrior":
         """Of the wrists alone, over all frames: no keypoint shows how they turn."""
         names = [articulation.rig.joint_names[joint] for joint in articulation.joints[1:].tolist()]
         trust = torch.tensor([name.startswith("wrist") for name in names], dtype=torch.float64)
-        return Habit.alike([list(range(frames))], trust.expand(frames, -1), WRISTS_DEG, OTHER_WRISTS_DEG)
+        return PosturePrior.alike([list(range(frames))], trust.expand(frames, -1), WRISTS_DEG, OTHER_WRISTS_DEG)
 
     @staticmethod
-    def of_one_view(groups: list[list[int]], pose: Pose, camera: Camera) -> "Habit":
+    def of_one_view(groups: list[list[int]], pose: Pose, camera: Camera) -> "PosturePrior":
         """Of all joints, as far as the only camera sees the body from all sides in a group of frames: only then their
         medians are known in depth. One view hardly tells a limb bent towards it from one bent away. pose: as far as it
         is known, to tell how the body turns."""
         trust = torch.zeros(len(pose.root), len(Articulation(pose.rig).joints) - 1, dtype=pose.root.dtype)
         for rows in groups:
             trust[rows] = turning(pose.root[rows], camera)
-        return Habit.alike(groups, trust, POSTURE_DEG, OTHER_POSTURE_DEG)
+        return PosturePrior.alike(groups, trust, POSTURE_DEG, OTHER_POSTURE_DEG)
 
     @staticmethod
-    def alike(groups: list[list[int]], trust: Tensor, spread_deg: float, other_deg: float) -> "Habit":
+    def alike(groups: list[list[int]], trust: Tensor, spread_deg: float, other_deg: float) -> "PosturePrior":
         """With the same spread for all joints and frames."""
-        return Habit(groups, trust, torch.full_like(trust, math.radians(spread_deg)), math.radians(other_deg))
+        return PosturePrior(groups, trust, torch.full_like(trust, math.radians(spread_deg)), math.radians(other_deg))
 
-    def learned(self, pose: Pose) -> "Habit":
+    def learned(self, pose: Pose) -> "PosturePrior":
         """With each joint's spread as it is in a first fit: who stands still while turning may be held to it, who walks
         may not. Between 2 degrees and what was believed before."""
         length = self._off(pose.theta[:, Articulation(pose.rig).joints[1:]]).norm(dim=-1) / CHI_MEDIAN
@@ -66,7 +66,7 @@ class Habit:
             spread[rows] = length[rows].quantile(0.5, dim=0).clamp(min=math.radians(STILLEST_DEG)).minimum(spread[rows])
         return replace(self, spread=spread)
 
-    def of_one_posture(self) -> "Habit | None":
+    def of_one_posture(self) -> "PosturePrior | None":
         """With next to no spread in groups of frames that see the body from all sides; None without such a group."""
         known = self.trust.amin(1, keepdim=True) > ALL_SIDES
         still = torch.where(known, math.radians(ONE_POSTURE_DEG), self.spread)
@@ -87,7 +87,7 @@ class Habit:
         """Returns the cost. Usual turns move together with the frames' own: they are the last shared unknowns, so that
         a step does not hold the frames to the medians from before it; after it the medians are taken anew."""
         off = self._off(pose.theta[:, articulation.joints[1:]])
-        weight, cost = faded(off.square().sum(-1) * self.trust, self.spread, self.other)
+        weight, cost = geman_mcclure(off.square().sum(-1) * self.trust, self.spread, self.other)
         weights = (weight * self.trust).repeat_interleave(3, 1).numpy()  # (n, 3 (M - 1))
         pull = weights * off.flatten(1).numpy()
         equations.frame_gradient[:, 6:] += pull

@@ -3,7 +3,7 @@
 from torch import Tensor
 
 
-def faded(squared: Tensor, sigma: float | Tensor, fades_at: float) -> tuple[Tensor, Tensor]:
+def geman_mcclure(squared: Tensor, sigma: float | Tensor, fades_at: float) -> tuple[Tensor, Tensor]:
     """Geman-McClure (1987): weights of the re-weighted least squares for squared residuals, and the costs, each of
     their shape. A residual well below `fades_at` costs half its square over sigma^2, one far beyond nearly
     fades_at^2 / (2 sigma^2)."""

@@ -19,7 +19,7 @@ from torch import Tensor
 from hnerf.body.rig import Rig
 from hnerf.capture.safe_io import NO_ARRAYS
 from hnerf.capture.safe_pickle import read_pickle
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 BETAS = 10
 BODY_FROM_SMPL = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)  # Y up, facing +Z; see rig.py
@@ -77,7 +77,7 @@ class Smpl:
 
 
 def read_smpl(path: Path) -> Smpl:
-    """The model in a .npz or .pkl file. Raises CaptureError where the file is missing or holds no SMPL, SMPL-H or
+    """The model in a .npz or .pkl file. Raises InputError where the file is missing or holds no SMPL, SMPL-H or
     SMPL-X model."""
     data = _checked(path, _read(path))
     weights, regressor = data["weights"], data["J_regressor"]
@@ -141,7 +141,7 @@ def _shortest_turn(a: Tensor, b: Tensor) -> Tensor:
 def _read(path: Path) -> dict[str, Any]:
     """The arrays of KEYS; sparse ones made dense."""
     if not path.is_file():
-        raise CaptureError(f"{path}: no such body model; give the path of an SMPL, SMPL-H or SMPL-X file, or anny")
+        raise InputError(f"{path}: no such body model; give the path of an SMPL, SMPL-H or SMPL-X file, or anny")
     if path.suffix == ".pkl":
         stored = read_pickle(path)
         found = {key: stored[key] for key in KEYS if key in stored} if isinstance(stored, dict) else {}
@@ -150,22 +150,22 @@ def _read(path: Path) -> dict[str, Any]:
             with np.load(path, allow_pickle=False) as archive:
                 found = {key: archive[key] for key in KEYS if key in archive}
         except NO_ARRAYS:
-            raise CaptureError(f"{path}: is no .npz of plain arrays; convert the model again") from None
+            raise InputError(f"{path}: is no .npz of plain arrays; convert the model again") from None
     missing = [key for key in KEYS if key not in found]
     if missing:
-        raise CaptureError(f"{path}: no {', '.join(missing)}; give an SMPL, SMPL-H or SMPL-X model")
+        raise InputError(f"{path}: no {', '.join(missing)}; give an SMPL, SMPL-H or SMPL-X model")
     return {key: value.toarray() if scipy.sparse.issparse(value) else value for key, value in found.items()}
 
 
 def _checked(path: Path, data: dict[str, Any]) -> dict[str, Tensor]:
-    """As float64 tensors; CaptureError unless all shapes are those of a known model, and all numbers finite."""
+    """As float64 tensors; InputError unless all shapes are those of a known model, and all numbers finite."""
     try:
         arrays = {key: torch.from_numpy(np.array(data[key], dtype=np.float64)) for key in KEYS}
     except (TypeError, ValueError):
-        raise CaptureError(f"{path}: holds more than arrays of numbers; convert the model again") from None
+        raise InputError(f"{path}: holds more than arrays of numbers; convert the model again") from None
     vertices, joints = len(arrays["v_template"]), len(arrays["J_regressor"])
     if vertices not in MESHES or joints not in FURTHER_JOINTS:
-        raise CaptureError(f"{path}: {vertices} vertices and {joints} joints are no SMPL, SMPL-H or SMPL-X model")
+        raise InputError(f"{path}: {vertices} vertices and {joints} joints are no SMPL, SMPL-H or SMPL-X model")
     shapes: dict[str, tuple[int, ...]] = {
         "v_template": (vertices, 3),
         "posedirs": (vertices, 3, 9 * (joints - 1)),
@@ -181,7 +181,7 @@ def _checked(path: Path, data: dict[str, Any]) -> dict[str, Tensor]:
     faces = arrays["f"]
     wrong += [] if faces.shape[1:] == (3,) and faces.min() >= 0 and faces.max() < vertices else ["f"]
     if wrong or arrays["shapedirs"].shape[2] < BETAS:
-        raise CaptureError(f"{path}: {(wrong or ['shapedirs'])[0]} is not that of such a model; convert it again")
+        raise InputError(f"{path}: {(wrong or ['shapedirs'])[0]} is not that of such a model; convert it again")
     return arrays
 
 

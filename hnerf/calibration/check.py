@@ -19,7 +19,7 @@ from hnerf.calibration.diagnosis import (
     undo_mistake,
     unit_of,
 )
-from hnerf.calibration.evidence import Witnesses
+from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.monocular import ground_reasons, intrinsics_reasons
 from hnerf.calibration.refine import refine
 from hnerf.calibration.report import CalibrationReport, CameraVerdict
@@ -28,7 +28,7 @@ from hnerf.calibration.synchronise import Timing, measure_timing, put_in_step
 from hnerf.capture.capture import Capture
 from hnerf.capture.subject import subject_keypoints
 from hnerf.config import CalibrationSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 COINCIDENT_M = 0.005
@@ -41,7 +41,7 @@ REJECT_FACTOR = 2.0  # times `max_residual_px`: a camera so far off, that no ref
 def check_calibration(capture: Capture, settings: CalibrationSettings) -> CalibrationReport:
     """Judge the training cameras by the subject's keypoints; undo, synchronise and refine what held-out frames prove.
 
-    Raises CaptureError, naming the likely cause, on a calibration that no person can have been seen with.
+    Raises InputError, naming the likely cause, on a calibration that no person can have been seen with.
     """
     if not capture.has_keypoints and capture.given_poses():
         return _unchecked(capture)
@@ -56,7 +56,7 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
     _check_height(capture, measure(cameras, keypoints) if mistakes else before)
     in_step, held_out_px, notes = put_in_step(capture, cameras, keypoints, settings)
     keypoints = keypoints if in_step is capture else _keypoints(in_step)
-    witnesses = Witnesses.of(in_step, keypoints)
+    witnesses = Evidence.of(in_step, keypoints)
     refinement = refine(in_step, cameras, keypoints, witnesses.outlines, witnesses.matches, settings)
     used = refinement.cameras
     after = measure(used, keypoints)
@@ -71,7 +71,7 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
         status = "refined" if new is not old or offset else "ok"
         verdicts[name] = _verdict(name, status, before, after, offset, timing[name], reasons, settings)
     if sum(v.status != "rejected" for v in verdicts.values()) < 2:
-        raise CaptureError(f"{capture.name}: fewer than two cameras agree on the person; calibrate again")
+        raise InputError(f"{capture.name}: fewer than two cameras agree on the person; calibrate again")
     every = capture.cameras | {camera.name: camera for camera in used}
     held_out_px |= refinement.held_out_px
     notes += [*refinement.notes, *_height_notes(after.body_height_m), *_upright_notes(after.points_m, capture.up)]
@@ -89,11 +89,11 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
 
 
 def _keypoints(capture: Capture) -> np.ndarray:
-    """The subject's keypoints in the training cameras, (C, frames, 25, 3); CaptureError where a camera has none."""
+    """The subject's keypoints in the training cameras, (C, frames, 25, 3); InputError where a camera has none."""
     found = subject_keypoints(capture)
     for name, seen in found.items():
         if not (seen[..., 2] > 0).any():
-            raise CaptureError(
+            raise InputError(
                 f"{capture.name}: camera {name} never shows the person; check its keypoints or leave it out"
             )
     return np.stack([found[name] for name in capture.train_cameras])
@@ -105,7 +105,7 @@ def _for_size(settings: CalibrationSettings, height_px: float) -> CalibrationSet
 
 
 def _check_convention(capture: Capture, cameras: Sequence[Camera], keypoints: np.ndarray, found: Measure) -> None:
-    """CaptureError if the rig as a whole follows another convention or is of pictures of another size, or two cameras
+    """InputError if the rig as a whole follows another convention or is of pictures of another size, or two cameras
     stand at one place.
 
     Conventions come first: the centres of an inverted ring of cameras coincide. In a wrong unit all are near, which is
@@ -114,30 +114,30 @@ def _check_convention(capture: Capture, cameras: Sequence[Camera], keypoints: np
     if found.cost_px > gross_limit_px(keypoints):
         off = f"{capture.name}: keypoints are off by {found.cost_px:.0f} px"
         if cause := explain(cameras, keypoints):
-            raise CaptureError(
+            raise InputError(
                 f"{off} because {cause}; write world to camera, x_camera = R x_world + T, y down, z forward"
             )
         if ratio := size_ratio(cameras, keypoints):
-            raise CaptureError(
+            raise InputError(
                 f"{off} because intrinsics and keypoints are of pictures of different sizes (K times {ratio:.2f} would "
                 "fit); give both in the pixels of these pictures"
             )
     for a, b in combinations(cameras, 2):
         if np.linalg.norm(a.centre_m - b.centre_m) < COINCIDENT_M and not unit_of(found.body_height_m):
-            raise CaptureError(
+            raise InputError(
                 f"{capture.name}: cameras {a.name} and {b.name} stand at one place; give each its own extrinsics"
             )
 
 
 def _check_height(capture: Capture, found: Measure) -> None:
-    """CaptureError if the person would be a giant or a dwarf, naming the unit that makes him one of us."""
+    """InputError if the person would be a giant or a dwarf, naming the unit that makes him one of us."""
     low, high = BODY_HEIGHT_M
     if low <= found.body_height_m <= high or np.isnan(found.body_height_m):
         return
     unit = unit_of(found.body_height_m)
     cause = f"the translations look like {unit}; " if unit else ""
     factor = UNITS_M[unit] if unit else USUAL_HEIGHT_M / found.body_height_m
-    raise CaptureError(
+    raise InputError(
         f"{capture.name}: the person would be {found.body_height_m:.4g} m tall; {cause}{_other_units(factor)}"
     )
 
@@ -173,9 +173,9 @@ def _upright_notes(points_m: np.ndarray, up: str) -> list[str]:
 
 
 def _check_agreement(capture: Capture, found: Measure, settings: CalibrationSettings) -> None:
-    """CaptureError if no set of cameras agrees on the person."""
+    """InputError if no set of cameras agrees on the person."""
     if min(found.cost_px, *found.cost_without_px.values(), np.inf) > REJECT_FACTOR * settings.max_residual_px:
-        raise CaptureError(
+        raise InputError(
             f"{capture.name}: the cameras do not see one person (keypoints off by {found.cost_px:.0f} px) and no known "
             "mistake explains it; check which files belong to which camera, or calibrate again"
         )

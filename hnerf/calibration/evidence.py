@@ -18,7 +18,7 @@ NO_MATCHES = "no overlap: no matches"
 
 
 @dataclasses.dataclass(frozen=True)
-class Witnesses:
+class Evidence:
     """The evidence, gathered once, by which any pose of the training cameras can be judged.
 
     keypoints (C, frames, 25, 3) of the subject in `capture`; outlines: None if there are no masks; boards: what
@@ -32,10 +32,10 @@ class Witnesses:
     boards: dict[str, Any] | None
 
     @staticmethod
-    def of(capture: Capture, keypoints: np.ndarray) -> "Witnesses":
+    def of(capture: Capture, keypoints: np.ndarray) -> "Evidence":
         """With what the pictures show beside the keypoints."""
         outlines, matches = Outlines.of(capture), Matches.of(capture)
-        return Witnesses(capture, keypoints, outlines, matches, board_witness(capture))
+        return Evidence(capture, keypoints, outlines, matches, board_witness(capture))
 
     def plain(self, cameras: Sequence[Camera], found: Measure) -> dict[str, Any]:
         """What each witness says of each of these cameras, in pixels; `found`: what `measure` says of them."""

@@ -10,14 +10,14 @@ from typing import Any
 import cv2
 
 from hnerf.calibration.diagnosis import Measure
-from hnerf.calibration.evidence import Witnesses
+from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.picture import draw_cameras
 from hnerf.calibration.sheet import draw_witnesses
 from hnerf.calibration.synchronise import Timing
 from hnerf.capture.capture import Capture
 from hnerf.capture.formats.easymocap import write_easymocap
 from hnerf.capture.lens import pinhole
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 SEVERITY = ("ok", "refined", "suspect", "rejected")
@@ -64,7 +64,7 @@ class CalibrationReport:
     outlines_px: dict[str, float]
     notes: tuple[str, ...]
     up: str
-    witnesses: Witnesses | None
+    witnesses: Evidence | None
 
     @property
     def verdict(self) -> str:
@@ -130,7 +130,7 @@ def load_cameras(out: Path, capture: Capture) -> Capture:
     gone. The capture may have fewer cameras than were calibrated."""
     intri, extri = (cv2.FileStorage(str(out / name), cv2.FILE_STORAGE_READ) for name in ("intri.yml", "extri.yml"))
     if not (intri.isOpened() and extri.isOpened()):
-        raise CaptureError(f"{out}: intri.yml or extri.yml cannot be read; run the calibration stage again")
+        raise InputError(f"{out}: intri.yml or extri.yml cannot be read; run the calibration stage again")
     names = intri.getNode("names")
     kept = [name for i in range(names.size()) if (name := names.at(i).string()) in capture.cameras]
     cameras = {

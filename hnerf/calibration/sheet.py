@@ -10,7 +10,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from hnerf.calibration.diagnosis import Measure
-from hnerf.calibration.evidence import NO_MATCHES, Witnesses
+from hnerf.calibration.evidence import NO_MATCHES, Evidence
 from hnerf.capture.keypoint_sets import FEET, LIMBS
 from hnerf.geometry.camera import Camera
 
@@ -21,7 +21,7 @@ MARGIN = 0.12  # of the person's size
 PANEL_INCHES = 4.2
 
 
-def draw_witnesses(path: Path, witnesses: Witnesses, cameras: Sequence[Camera], found: Measure) -> None:
+def draw_witnesses(path: Path, witnesses: Evidence, cameras: Sequence[Camera], found: Measure) -> None:
     """Write the sheet as PNG, a row a camera; `found`: what `measure` says of these cameras."""
     capture, outlines = witnesses.capture, witnesses.outlines
     instant = outlines.instants[len(outlines.instants) // 2] if outlines else len(capture.frames) // 2
@@ -34,8 +34,8 @@ def draw_witnesses(path: Path, witnesses: Witnesses, cameras: Sequence[Camera], 
         marks = _draw_keypoints(row[0], camera, detected, found.points_m[instant])
         _draw_outline(row[1], cameras, camera, witnesses)
         _draw_matches(row[2], cameras, camera, witnesses)
-        told = f"{camera.name}: keypoints, median {found.median_px[camera.name]:.1f} px"
-        row[0].set_title(f"{told}, 95 % below {found.p95_px[camera.name]:.1f} px", fontsize=10)
+        message = f"{camera.name}: keypoints, median {found.median_px[camera.name]:.1f} px"
+        row[0].set_title(f"{message}, 95 % below {found.p95_px[camera.name]:.1f} px", fontsize=10)
         for axes in row[:2]:
             _zoom(axes, detected[detected[:, 2] > 0, :2])
     figure.colorbar(marks, ax=panels, shrink=0.6 / len(cameras), aspect=20, label="px", extend="max")
@@ -51,7 +51,7 @@ def _draw_keypoints(axes: Axes, camera: Camera, detected: np.ndarray, points_m: 
     return _scatter(axes, detected[seen, :2], np.linalg.norm(uv[seen] - detected[seen, :2], axis=-1), 26)
 
 
-def _draw_outline(axes: Axes, cameras: Sequence[Camera], camera: Camera, witnesses: Witnesses) -> None:
+def _draw_outline(axes: Axes, cameras: Sequence[Camera], camera: Camera, witnesses: Evidence) -> None:
     """Points of the outline, coloured by how far their rays miss the person as the others see it."""
     axes.set_title(f"{camera.name}: no outline", fontsize=10)
     outlines = witnesses.outlines
@@ -64,20 +64,20 @@ def _draw_outline(axes: Axes, cameras: Sequence[Camera], camera: Camera, witness
     residuals_px = outlines.residuals_px(cameras)[camera.name]
     if len(residuals_px) == 0:  # no other camera has one at the same instants
         return
-    told = f"mean {residuals_px.mean():.2f} px, 95 % below {np.percentile(residuals_px, 95):.1f} px"
-    axes.set_title(f"{camera.name}: outline, {told}", fontsize=10)
+    message = f"mean {residuals_px.mean():.2f} px, 95 % below {np.percentile(residuals_px, 95):.1f} px"
+    axes.set_title(f"{camera.name}: outline, {message}", fontsize=10)
     _scatter(axes, outline.points_px, outlines.at(middle).residuals_px(cameras)[camera.name], 14)
 
 
-def _draw_matches(axes: Axes, cameras: Sequence[Camera], camera: Camera, witnesses: Witnesses) -> None:
+def _draw_matches(axes: Axes, cameras: Sequence[Camera], camera: Camera, witnesses: Evidence) -> None:
     """Matches with other cameras, coloured by their distance from the epipolar constraint."""
-    told = []
+    message = []
     for pair, residuals_px in witnesses.matches.residuals_px(cameras).items():
         if camera.name in pair:
             side = pair.index(camera.name)
             _scatter(axes, witnesses.matches.by_pair[pair][:, side], residuals_px, 14)
-            told.append(f"{len(residuals_px)} with {pair[1 - side]}, median {np.median(residuals_px):.1f} px")
-    axes.set_title(f"{camera.name}: " + (f"matches, {'; '.join(told)}" if told else NO_MATCHES), fontsize=10)
+            message.append(f"{len(residuals_px)} with {pair[1 - side]}, median {np.median(residuals_px):.1f} px")
+    axes.set_title(f"{camera.name}: " + (f"matches, {'; '.join(message)}" if message else NO_MATCHES), fontsize=10)
 
 
 def _scatter(axes: Axes, points_px: np.ndarray, residuals_px: np.ndarray, size: float) -> PathCollection:

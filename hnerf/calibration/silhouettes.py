@@ -35,7 +35,7 @@ log = logging.getLogger("hnerf.calibration")
 
 
 @dataclasses.dataclass(frozen=True)
-class Outline:
+class MaskOutline:
     """One mask: points_px (n, 2) on its outline, distance_px (H, W) to it, negative inside; `centre_px` (2,),
     `size_px` of its box."""
 
@@ -45,7 +45,7 @@ class Outline:
     size_px: float
 
     @staticmethod
-    def around(mask: np.ndarray) -> "Outline | None":
+    def around(mask: np.ndarray) -> "MaskOutline | None":
         """Of the largest part of a mask (H, W) bool, its holes filled; None if it is empty.
 
         Where the image's border cuts the person off there is no outline.
@@ -66,7 +66,7 @@ class Outline:
         rows, columns = np.nonzero(whole)
         size_px = float(np.hypot(np.ptp(columns), np.ptp(rows)))
         points = points[evenly_spaced(range(len(points)), POINTS)]
-        return Outline(points, distance_px, np.array([columns.mean(), rows.mean()]), size_px)
+        return MaskOutline(points, distance_px, np.array([columns.mean(), rows.mean()]), size_px)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Outlines:
     instants: their indices in `capture.frames`.
     """
 
-    by_camera: Mapping[str, Sequence[Outline | None]]
+    by_camera: Mapping[str, Sequence[MaskOutline | None]]
     instants: tuple[int, ...]
 
     @staticmethod
@@ -125,7 +125,7 @@ class Outlines:
         return {name: np.concatenate(rows) if rows else np.zeros(0) for name, rows in residuals.items()}
 
 
-def _whereabouts(seen: Sequence[tuple[Camera, Outline]]) -> tuple[np.ndarray, float]:
+def _whereabouts(seen: Sequence[tuple[Camera, MaskOutline]]) -> tuple[np.ndarray, float]:
     """The point nearest to the rays through the middles of the masks, (3,), and the person's size about it."""
     origins, directions = zip(*(camera.rays(outline.centre_px) for camera, outline in seen), strict=True)
     across = np.stack([np.eye(3) - np.outer(d, d) for d in directions])  # projects onto the plane across the ray
@@ -139,8 +139,8 @@ def _whereabouts(seen: Sequence[tuple[Camera, Outline]]) -> tuple[np.ndarray, fl
 
 def _missed_by_px(
     camera: Camera,
-    outline: Outline,
-    others: Sequence[tuple[Camera, Outline]],
+    outline: MaskOutline,
+    others: Sequence[tuple[Camera, MaskOutline]],
     centre_m: np.ndarray,
     reach_m: float,
 ) -> np.ndarray:
@@ -159,7 +159,7 @@ def _missed_by_px(
     return closer_px.min(1).clip(0)
 
 
-def _outside_px(seen: Sequence[tuple[Camera, Outline]], points_m: np.ndarray) -> np.ndarray:
+def _outside_px(seen: Sequence[tuple[Camera, MaskOutline]], points_m: np.ndarray) -> np.ndarray:
     """How far points (n, S, 3) lie outside the mask that denies them most, (n, S) pixels, negative in the hull.
 
     Beyond an image's edge the nearest edge pixel speaks: where the edge cuts the person off, he may go on.
@@ -174,14 +174,14 @@ def _outside_px(seen: Sequence[tuple[Camera, Outline]], points_m: np.ndarray) ->
     return worst
 
 
-def _outlines(capture: Capture, name: str, keypoints: np.ndarray, shown: Sequence[int]) -> list[Outline | None]:
+def _outlines(capture: Capture, name: str, keypoints: np.ndarray, shown: Sequence[int]) -> list[MaskOutline | None]:
     """One camera's outlines at the frames of these indices; keypoints (frames, 25, 3) of the subject."""
     outlines = []
     for i, mask in zip(shown, _masks(capture, name, shown), strict=True):
         xy = keypoints[i, keypoints[i, :, 2] > 0, :2].round().astype(int)
         xy = xy[((xy >= 0) & (xy < mask.shape[::-1])).all(1)]
         covered = mask[xy[:, 1], xy[:, 0]].mean() if len(xy) else 0.0
-        outlines.append(Outline.around(mask) if covered >= COVERED else None)
+        outlines.append(MaskOutline.around(mask) if covered >= COVERED else None)
     return outlines
 
 

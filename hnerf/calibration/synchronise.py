@@ -16,7 +16,7 @@ from hnerf.calibration.diagnosis import TRIM, trimmed_cost_px, trimmed_mean
 from hnerf.capture.capture import Capture
 from hnerf.capture.timing import resample, usual_step
 from hnerf.config import CalibrationSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import triangulate
 
@@ -117,7 +117,7 @@ def put_in_step(
 ) -> tuple[Capture, dict[str, float], list[str]]:
     """The capture with the offsets that `synchronise` found (the very same without any), costs tried, and notes.
 
-    Raises CaptureError where more than half of the frames would be lost or shown by pictures more than a frame away,
+    Raises InputError where more than half of the frames would be lost or shown by pictures more than a frame away,
     since what was ingested lacks the moments that the offsets ask for; it says what to cut.
     """
     offsets, held_out_px, notes = synchronise(cameras, keypoints, capture.frames, settings)
@@ -129,7 +129,7 @@ def put_in_step(
     farthest = max(off_frames, key=lambda name: abs(off_frames[name]))
     too_far = abs(off_frames[farthest]) > FARTHEST * capture.frame_step
     if 2 * len(lost) > len(capture.frames) or not in_step.train_frames or too_far:
-        raise CaptureError(f"{capture.name}: {_what_to_cut(capture.train_cameras, offsets)}")
+        raise InputError(f"{capture.name}: {_what_to_cut(capture.train_cameras, offsets)}")
     if in_step.frame_step != capture.frame_step:
         what = (
             f"frames between were not taken: pictures of camera {farthest} are {off_frames[farthest]:+.2f} frames off"

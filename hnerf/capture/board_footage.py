@@ -24,13 +24,13 @@ from hnerf.capture.safe_io import (
     VIDEO_SUFFIXES,
     check_camera_name,
     files_in,
-    inside,
     numbered,
+    path_in_capture,
     read_text,
     read_toml,
 )
 from hnerf.config import validated
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 MAX_FRAMES = 200  # of each camera in which the board is looked for, evenly strided
 BOARDS_FILE = "boards.npz"
@@ -131,18 +131,18 @@ class BoardCorners:
 
 
 def normalised_corners(footage: BoardFootage, normalisers: dict[str, Normaliser]) -> BoardCorners:
-    """The corners that a capture's cameras saw, in the pixels of the linear cameras; CaptureError if they recorded the
+    """The corners that a capture's cameras saw, in the pixels of the linear cameras; InputError if they recorded the
     board at another size."""
     names = tuple(name for name in footage.corners_px if name in normalisers)
     if not names:
-        raise CaptureError(
+        raise InputError(
             f"{footage.path}: shows cameras {', '.join(footage.corners_px)}, none of them recorded here; rename them"
         )
     corners_px = []
     for name in names:
         size_px, recorded_px = footage.sizes_px[name], normalisers[name].recorded_size_px
         if size_px != recorded_px:
-            raise CaptureError(
+            raise InputError(
                 f"{footage.path / name}: is {size_px[0]} x {size_px[1]} px, but the recording of that camera is "
                 f"{recorded_px[0]} x {recorded_px[1]}; film the board at the same size or take its footage out"
             )
@@ -163,8 +163,8 @@ def load_board_corners(root: Path) -> BoardCorners | None:
 
 
 def read_board(folder: Path) -> Board | None:
-    """The board that the folder describes, None if it describes none; CaptureError on a bad description."""
-    notes, charuco = inside(folder, "capture.toml"), inside(folder, "charuco.toml")
+    """The board that the folder describes, None if it describes none; InputError on a bad description."""
+    notes, charuco = path_in_capture(folder, "capture.toml"), path_in_capture(folder, "charuco.toml")
     source, table = notes, (read_toml(notes) if notes.exists() else {}).get("board")
     if table is None:
         if not charuco.exists():
@@ -172,7 +172,7 @@ def read_board(folder: Path) -> Board | None:
         source, table = charuco, _from_caliscope(charuco)
     board = validated(Board, table, f"{source}: board")
     if board.dictionary is None and (board.columns + board.rows) % 2 == 0:
-        raise CaptureError(
+        raise InputError(
             f"{source}: a checkerboard of {board.columns} x {board.rows} squares looks the same upside down; "
             "use one with an odd and an even number of squares, or a ChArUco board"
         )
@@ -188,10 +188,10 @@ def read_board_footage(
 
     Of long footage every so many frames are looked at, frame `wanted` among them if there is one.
     Of extrinsic footage, all cameras' pictures of one frame number are taken to be of one moment; videos are numbered
-    by `timestamps.csv` (Caliscope's) if that is there. CaptureError on files that cannot be read or do not match,
+    by `timestamps.csv` (Caliscope's) if that is there. InputError on files that cannot be read or do not match,
     or where there is no frame `wanted`.
     """
-    path = inside(folder, "calibration", part)
+    path = path_in_capture(folder, "calibration", part)
     footage, board = _footage(folder, part), read_board(folder)
     if footage and board is None:
         log.info("%s: not used, no charuco.toml and no [board] in capture.toml says what board it shows", path)
@@ -200,7 +200,7 @@ def read_board_footage(
     numbers = _frame_numbers(path, footage, synchronised=part == "extrinsic")
     frames = tuple(sorted({number for of_camera in numbers.values() for number in of_camera}))
     if wanted is not None and wanted not in frames:
-        raise CaptureError(f"{path}: has no frame {wanted}; name one of {frames[0]} to {frames[-1]}")
+        raise InputError(f"{path}: has no frame {wanted}; name one of {frames[0]} to {frames[-1]}")
     step = math.ceil(len(frames) / MAX_FRAMES)
     frames = frames[0 if wanted is None else frames.index(wanted) % step :: step]
     corners_px, sizes_px = {}, {}
@@ -223,12 +223,12 @@ def _corners(
         shape_px = picture.rgb.shape[1], picture.rgb.shape[0]
         size_px = size_px or shape_px
         if size_px != shape_px:
-            raise CaptureError(
+            raise InputError(
                 f"{picture.file}: is {shape_px[0]} x {shape_px[1]} px, unlike the pictures before; use one size"
             )
         corners_px[wanted[picture.frame]] = detector.corners_px(picture.rgb)
     if size_px is None:
-        raise CaptureError(f"{pictures.path}: none of its frames is among those looked at; give all cameras the same")
+        raise InputError(f"{pictures.path}: none of its frames is among those looked at; give all cameras the same")
     return corners_px, size_px
 
 
@@ -241,10 +241,10 @@ def _charuco(board: Board) -> cv2.aruco.CharucoBoard:
 def _check_markers(source: Path, board: Board) -> None:
     known = getattr(cv2.aruco, board.dictionary or "", None)
     if not isinstance(known, int):
-        raise CaptureError(f"{source}: board: dictionary {board.dictionary}: not one of OpenCV's; correct it")
+        raise InputError(f"{source}: board: dictionary {board.dictionary}: not one of OpenCV's; correct it")
     have = len(cv2.aruco.getPredefinedDictionary(known).bytesList)
     if have < board.columns * board.rows // 2:
-        raise CaptureError(f"{source}: board: {board.dictionary} has only {have} markers; correct rows and columns")
+        raise InputError(f"{source}: board: {board.dictionary} has only {have} markers; correct rows and columns")
 
 
 def _from_caliscope(path: Path) -> dict[str, Any]:
@@ -264,42 +264,42 @@ def _from_caliscope(path: Path) -> dict[str, Any]:
             "inverted": table["inverted"],
         }
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-        raise CaptureError(f"{path}: board: {error} is missing or no number; write it again with Caliscope") from None
+        raise InputError(f"{path}: board: {error} is missing or no number; write it again with Caliscope") from None
 
 
 def _footage(folder: Path, part: str) -> dict[str, Footage]:
     """By camera, in the order of their names."""
-    root = inside(folder, "calibration", part)
+    root = path_in_capture(folder, "calibration", part)
     found: dict[str, Footage] = {}
     for path in sorted(root.iterdir()) if root.is_dir() else []:
         if path.name.startswith(".") or (path.is_file() and path.suffix.lower() not in VIDEO_SUFFIXES):
             continue
-        path = inside(folder, "calibration", part, path.name)
+        path = path_in_capture(folder, "calibration", part, path.name)
         name = check_camera_name(path.stem if path.is_file() else path.name, path)
         if name in found:
-            raise CaptureError(f"{path}: camera {name} has a video and a folder of images; keep one of them")
+            raise InputError(f"{path}: camera {name} has a video and a folder of images; keep one of them")
         if path.is_file():
             found[name] = Video.open(path)
             continue
         files = files_in(folder, "calibration", part, path.name, suffixes=IMAGE_SUFFIXES)
         if not files:
-            raise CaptureError(f"{path}: no JPEG or PNG images; add them or remove the folder")
+            raise InputError(f"{path}: no JPEG or PNG images; add them or remove the folder")
         found[name] = ImageFolder(path, numbered(files, "images"))
     return found
 
 
 def _frame_numbers(root: Path, footage: dict[str, Footage], synchronised: bool) -> dict[str, tuple[int, ...]]:
     """For each camera the common number of each of its frames."""
-    stamps = inside(root, "timestamps.csv")
+    stamps = path_in_capture(root, "timestamps.csv")
     if not synchronised or not stamps.exists():
         videos = [pictures for pictures in footage.values() if isinstance(pictures, Video)]
         if synchronised and len({len(video.frames) for video in videos}) > 1:
-            raise CaptureError(f"{root}: the videos differ in length; cut them to the same frames")
+            raise InputError(f"{root}: the videos differ in length; cut them to the same frames")
         return {name: pictures.frames for name, pictures in footage.items()}
     numbers = _sync_indices(stamps)
     for name, pictures in footage.items():
         if len(numbers.get(name, ())) != len(pictures.frames):
-            raise CaptureError(
+            raise InputError(
                 f"{stamps}: {len(numbers.get(name, ()))} rows of {name}, but {len(pictures.frames)} frames in "
                 f"{pictures.path}; export both again, or remove the table if all cameras have the same frames"
             )
@@ -312,7 +312,7 @@ def _sync_indices(path: Path) -> dict[str, tuple[int, ...]]:
     for row in csv.DictReader(read_text(path).splitlines()):
         index, camera = row.get("sync_index") or "", row.get("cam_id") or row.get("port") or ""
         if not (re.fullmatch(r"[0-9]{1,9}", index) and re.fullmatch(r"[0-9]{1,4}", camera)):
-            raise CaptureError(f"{path}: a row has no whole sync_index and cam_id; export it again or remove it")
+            raise InputError(f"{path}: a row has no whole sync_index and cam_id; export it again or remove it")
         found.setdefault(f"cam_{camera}", []).append(int(index))
     return {name: tuple(sorted(indices)) for name, indices in found.items()}
 

@@ -17,7 +17,7 @@ import numpy as np
 from hnerf.capture.bars import Area
 from hnerf.capture.given_poses import GivenPoses
 from hnerf.capture.timing import nearest_frame, resample, usual_step
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 JPEG_OPTIONS = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
@@ -73,7 +73,7 @@ class Capture:
             return None
         mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         if mask is None:
-            raise CaptureError(f"{path}: not a readable image; write it again or delete it")
+            raise InputError(f"{path}: not a readable image; write it again or delete it")
         return mask > 127
 
     def keypoints(self, camera: str) -> np.ndarray | None:
@@ -158,18 +158,18 @@ class Capture:
 
 
 def read_rgb(path: Path) -> np.ndarray:
-    """(H, W, 3) uint8 RGB from an image file; CaptureError if it cannot be read."""
+    """(H, W, 3) uint8 RGB from an image file; InputError if it cannot be read."""
     bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if bgr is None:
-        raise CaptureError(f"{path}: not a readable image; export it again as JPEG or PNG")
+        raise InputError(f"{path}: not a readable image; export it again as JPEG or PNG")
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
 def read_rgba(path: Path) -> np.ndarray:
-    """(H, W, 4) uint8, as `write_image` wrote it; CaptureError if it cannot be read or has no alpha."""
+    """(H, W, 4) uint8, as `write_image` wrote it; InputError if it cannot be read or has no alpha."""
     bgra = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if bgra is None or bgra.shape[2:] != (4,):
-        raise CaptureError(f"{path}: no readable image with an alpha channel; make it again")
+        raise InputError(f"{path}: no readable image with an alpha channel; make it again")
     return cv2.cvtColor(bgra, cv2.COLOR_BGRA2RGBA)
 
 
@@ -186,5 +186,5 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
 def _only(folder: Path, stem: str) -> Path:
     found = sorted(folder.glob(f"{stem}.*"))
     if not found:
-        raise CaptureError(f"{folder}/{stem}.*: image missing; every camera needs every frame")
+        raise InputError(f"{folder}/{stem}.*: image missing; every camera needs every frame")
     return found[0]

@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 
 from hnerf.capture.safe_io import check_image_size, read_image
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 # What is wrong with a video is told in one line of ours.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 
-class Picture(NamedTuple):
+class VideoFrame(NamedTuple):
     """One frame: RGB (H, W, 3) uint8, and the image file that holds exactly it, if there is one."""
 
     frame: int
@@ -38,10 +38,10 @@ class ImageFolder:
         """Frame numbers, ascending."""
         return tuple(sorted(self.files))
 
-    def read(self, wanted: Iterable[int]) -> Iterator[Picture]:
-        """The wanted frames in ascending order; CaptureError if one cannot be read."""
+    def read(self, wanted: Iterable[int]) -> Iterator[VideoFrame]:
+        """The wanted frames in ascending order; InputError if one cannot be read."""
         for frame in sorted(wanted):
-            yield Picture(frame, read_image(self.files[frame]), self.files[frame])
+            yield VideoFrame(frame, read_image(self.files[frame]), self.files[frame])
 
 
 @dataclass(frozen=True)
@@ -61,22 +61,22 @@ class Video:
         while stream.grab():
             count += 1
         if count == 0 or count != declared:
-            raise CaptureError(
+            raise InputError(
                 f"{path}: {declared} frames declared, {count} could be read; export it again whole, as H.264"
             )
         return Video(path, tuple(range(count)), stream.get(cv2.CAP_PROP_FPS) or None)
 
-    def read(self, wanted: Iterable[int]) -> Iterator[Picture]:
-        """The wanted frames in ascending order; CaptureError if one cannot be read."""
+    def read(self, wanted: Iterable[int]) -> Iterator[VideoFrame]:
+        """The wanted frames in ascending order; InputError if one cannot be read."""
         stream, position = _open_stream(self.path), 0
         for frame in sorted(wanted):
             while position < frame and stream.grab():
                 position += 1
             ok, bgr = stream.read()
             if not ok:
-                raise CaptureError(f"{self.path}: frame {frame} cannot be read; export the video again as H.264")
+                raise InputError(f"{self.path}: frame {frame} cannot be read; export the video again as H.264")
             position += 1
-            yield Picture(frame, cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), None)
+            yield VideoFrame(frame, cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), None)
 
 
 Footage = ImageFolder | Video
@@ -84,8 +84,8 @@ Footage = ImageFolder | Video
 
 def _open_stream(path: Path) -> cv2.VideoCapture:
     if not path.is_file():
-        raise CaptureError(f"{path}: video missing; every calibrated camera needs one")
+        raise InputError(f"{path}: video missing; every calibrated camera needs one")
     stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not stream.isOpened():
-        raise CaptureError(f"{path}: not a readable video; export it again as H.264")
+        raise InputError(f"{path}: not a readable video; export it again as H.264")
     return stream

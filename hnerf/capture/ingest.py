@@ -9,7 +9,7 @@ import numpy as np
 from hnerf.capture.bars import Area, fitted, picture_area
 from hnerf.capture.board_footage import normalised_corners, read_board_footage
 from hnerf.capture.capture import Capture
-from hnerf.capture.footage import Footage, Picture
+from hnerf.capture.footage import Footage, VideoFrame
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.colmap import Colmap
 from hnerf.capture.formats.easymocap import EasyMocap
@@ -20,12 +20,12 @@ from hnerf.capture.formats.zjumocap import ZjuMocap
 from hnerf.capture.keypoint_files import read_openpose, read_results
 from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
 from hnerf.capture.lens import Lens
-from hnerf.capture.manifest import CameraSplit, capture_name, chosen_cameras, chosen_frames, read_notes
+from hnerf.capture.manifest import CameraSplit, capture_name, chosen_cameras, chosen_frames, read_manifest
 from hnerf.capture.normalise import Normaliser
 from hnerf.capture.safe_io import JSON_SUFFIXES, file_named, read_image
 from hnerf.capture.timing import usual_step
 from hnerf.config import CaptureSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
 
 DEFAULT_FPS = 30.0
@@ -50,10 +50,10 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
     """Read a capture folder (any of LAYOUTS) and write it normalised into `out`.
 
     Images are undistorted, and shrunk to `settings.max_side_px`; keypoints and masks with them. Where `capture.toml`
-    names no frames, those before anybody is detected and after are left out. CaptureError, one line that names the
+    names no frames, those before anybody is detected and after are left out. InputError, one line that names the
     file, on anything missing, unreadable, contradictory or unsafe.
     """
-    layout, notes = recognise(folder), read_notes(folder)
+    layout, notes = recognise(folder), read_manifest(folder)
     subject = capture_name(folder, notes)
     lenses = layout.lenses()
     cameras = chosen_cameras(folder, notes, list(lenses), layout.training_cameras())
@@ -73,7 +73,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
         _write_keypoints({name: found[rows] for name, found in people.items()}, notes.keypoints, normalisers, out)
     poses = layout.given_poses(wanted)
     if poses and not poses.known.any():
-        raise CaptureError(f"{folder}: its poses are of none of these frames; choose others, or take the poses out")
+        raise InputError(f"{folder}: its poses are of none of these frames; choose others, or take the poses out")
     if poses:
         poses.save(out / "poses.npz")
     boards = read_board_footage(folder, "extrinsic")
@@ -104,19 +104,19 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
 
 
 def recorded_cameras(folder: Path) -> CameraSplit:
-    """Which cameras of a capture folder are for training and which for testing; CaptureError as `ingest`."""
+    """Which cameras of a capture folder are for training and which for testing; InputError as `ingest`."""
     layout = recognise(folder)
-    return chosen_cameras(folder, read_notes(folder), list(layout.lenses()), layout.training_cameras())
+    return chosen_cameras(folder, read_manifest(folder), list(layout.lenses()), layout.training_cameras())
 
 
 def recognise(folder: Path) -> Layout:
-    """The folder's layout; CaptureError if it is none that is known."""
+    """The folder's layout; InputError if it is none that is known."""
     if not folder.is_dir():
-        raise CaptureError(f"{folder}: no such folder; give the folder of a capture")
+        raise InputError(f"{folder}: no such folder; give the folder of a capture")
     for layout in LAYOUTS:
         if layout.recognises(folder):
             return layout(folder)
-    raise CaptureError(
+    raise InputError(
         f"{folder}: none of EasyMocap (intri.yml, extri.yml, images/), Pose2Sim (calibration/, videos/), COLMAP "
         "(sparse/), Caliscope (camera_array.toml), aniposelib (calibration.toml), ZJU-MoCap (annots.npy) and "
         "PeopleSnapshot (camera.pkl); see docs/formats.md"
@@ -128,12 +128,12 @@ def _common_frames(footage: dict[str, Footage]) -> tuple[int, ...]:
     for _, other in others:
         if other.frames != first.frames:
             numbers = "other numbers" if len(other.frames) == len(first.frames) else f"{len(first.frames)}"
-            raise CaptureError(
+            raise InputError(
                 f"{other.path}: {len(other.frames)} frames, but camera {first_name} has {numbers}; "
                 "give all cameras the same frames"
             )
         if first.fps and other.fps and abs(other.fps - first.fps) > RATE_TOLERANCE * first.fps:
-            raise CaptureError(
+            raise InputError(
                 f"{other.path}: {other.fps:.4g} frames a second, but {first.path} has {first.fps:.4g}; "
                 "export all videos at the same rate"
             )
@@ -193,7 +193,7 @@ def _write_pixels(
 def _lens_as_recorded(lens: Lens, footage: Footage, frames: tuple[int, ...]) -> tuple[Lens, Area | None]:
     """The lens for the recorded size, and where in it the calibrated picture lies if black bars prove that.
 
-    Without a proof the lens stays as it is; CaptureError if the sizes are then too far apart.
+    Without a proof the lens stays as it is; InputError if the sizes are then too far apart.
     """
     first = next(footage.read(frames[:1]))
     recorded_px = (first.rgb.shape[1], first.rgb.shape[0])
@@ -205,7 +205,7 @@ def _lens_as_recorded(lens: Lens, footage: Footage, frames: tuple[int, ...]) -> 
     if matched:
         return matched, area
     if any(abs(r - c) > SIZE_TOLERANCE * c for r, c in zip(recorded_px, lens.size_px, strict=True)):
-        raise CaptureError(
+        raise InputError(
             f"{first.file or footage.path}: is {recorded_px[0]} x {recorded_px[1]} px, but camera {lens.name} was "
             f"calibrated at {lens.size_px[0]} x {lens.size_px[1]}; export the footage at that size or calibrate again"
         )
@@ -215,20 +215,20 @@ def _lens_as_recorded(lens: Lens, footage: Footage, frames: tuple[int, ...]) -> 
 def _per_frame(
     files: dict[int, Path | Stored], wanted: tuple[int, ...], recorded: tuple[int, ...], what: str
 ) -> dict[int, Path | Stored]:
-    """The files of the wanted frames, in their order; CaptureError if there is not one for every recorded frame."""
+    """The files of the wanted frames, in their order; InputError if there is not one for every recorded frame."""
     some = next(iter(files.values()))
     place = some.path if isinstance(some, Stored) else some.parent
     if len(files) != len(recorded):
-        raise CaptureError(f"{place}: {len(files)} {what} for {len(recorded)} frames; give one a frame")
+        raise InputError(f"{place}: {len(files)} {what} for {len(recorded)} frames; give one a frame")
     for frame in wanted:
         if frame not in files:
-            raise CaptureError(f"{place}: {what} of frame {frame} missing; give one a frame")
+            raise InputError(f"{place}: {what} of frame {frame} missing; give one a frame")
     return {frame: files[frame] for frame in wanted}
 
 
 def _detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | None:
     """(frames, most people, K, 3) as detected, absent people zero: of the layout's files, else of a list of results in
-    keypoints/<camera>.json; None where there is neither. CaptureError where they are not in the pictures' pixels."""
+    keypoints/<camera>.json; None where there is neither. InputError where they are not in the pictures' pixels."""
     recorded = footage.frames
     files = layout.keypoint_files(camera)
     results = file_named(layout.folder, camera, "keypoints", suffixes=JSON_SUFFIXES)
@@ -246,22 +246,22 @@ def _detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | N
         if len(points) == 0:
             continue
         if points.shape[1] != count:
-            raise CaptureError(f"{path}: {points.shape[1]} keypoints a person where others have {count}; detect again")
+            raise InputError(f"{path}: {points.shape[1]} keypoints a person where others have {count}; detect again")
         row[: len(points)] = points
     place = paths[0] if len(set(paths)) == 1 else paths[0].parent
     _check_in_pixels(place, stacked[stacked[..., 2] > 0][:, :2], next(footage.read(recorded[:1])))
     return stacked
 
 
-def _check_in_pixels(place: Path, points: np.ndarray, picture: Picture) -> None:
-    """CaptureError if keypoints (n, 2), all of a camera's, cannot be in the pixels of its pictures."""
+def _check_in_pixels(place: Path, points: np.ndarray, picture: VideoFrame) -> None:
+    """InputError if keypoints (n, 2), all of a camera's, cannot be in the pixels of its pictures."""
     size_px = np.array(picture.rgb.shape[1::-1])
     if not len(points):
         return
     outside = ((points < 0) | (points > size_px)).any(-1).mean()
     if outside > MOST_OUTSIDE or points.max() <= 1:
         spans = " and ".join(f"{low:.4g} to {high:.4g}" for low, high in zip(points.min(0), points.max(0), strict=True))
-        raise CaptureError(
+        raise InputError(
             f"{place}: keypoints from {spans} are not in the pixels of pictures of {size_px[0]} x {size_px[1]}; "
             "detect them in these pictures, or scale them"
         )

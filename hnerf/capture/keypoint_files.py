@@ -9,7 +9,7 @@ import numpy as np
 
 from hnerf.capture.keypoint_sets import COUNTS, KNOWN
 from hnerf.capture.safe_io import read_json
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 MAX_PEOPLE = 64
 
@@ -17,27 +17,27 @@ MAX_PEOPLE = 64
 def read_openpose(path: Path) -> np.ndarray:
     """(people, K, 3) x_px, y_px, confidence in the file's order, K a known number of points, or 0 without people.
 
-    CaptureError if it is no such file."""
+    InputError if it is no such file."""
     try:
         people = _few(path, read_json(path)["people"])
         return _people(path, [person["pose_keypoints_2d"] for person in people])
     except (KeyError, TypeError):
-        raise CaptureError(f"{path}: no list of people with pose_keypoints_2d; detect them again") from None
+        raise InputError(f"{path}: no list of people with pose_keypoints_2d; detect them again") from None
 
 
 def read_results(path: Path, frames: Iterable[int]) -> list[np.ndarray]:
     """As `read_openpose`, for each of the frames: of a list of {image_id, keypoints, score}, as MMPose, RTMPose and
     AlphaPose write for a whole recording. image_id: the frame's number, or an image name that ends in it. Frames that
-    it leaves out show nobody. CaptureError if it is no such file, or is of other frames."""
+    it leaves out show nobody. InputError if it is no such file, or is of other frames."""
     try:
         people: dict[int, list[Any]] = {}
         for result in read_json(path):
             people.setdefault(_frame(result["image_id"]), []).append(result["keypoints"])
     except (KeyError, TypeError, ValueError):
-        raise CaptureError(f"{path}: no list of image_id and keypoints; write COCO results again") from None
+        raise InputError(f"{path}: no list of image_id and keypoints; write COCO results again") from None
     frames = tuple(frames)
     if strange := sorted(set(people).difference(frames)):
-        raise CaptureError(
+        raise InputError(
             f"{path}: image_id {strange[0]} is none of the recording's frames {frames[0]} to {frames[-1]}; "
             "number them as the pictures are, videos from 0"
         )
@@ -54,7 +54,7 @@ def _frame(image_id: object) -> int:
 
 def _few(path: Path, people: list[Any]) -> list[Any]:
     if len(people) > MAX_PEOPLE:
-        raise CaptureError(f"{path}: {len(people)} people in an image; keep at most {MAX_PEOPLE}")
+        raise InputError(f"{path}: {len(people)} people in an image; keep at most {MAX_PEOPLE}")
     return people
 
 
@@ -65,10 +65,10 @@ def _people(path: Path, triples: list[Any]) -> np.ndarray:
     try:
         points = np.array(triples, dtype=np.float64).reshape(len(triples), -1, 3)
     except (OverflowError, TypeError, ValueError):
-        raise CaptureError(f"{path}: keypoints are not triples of numbers, as many a person; detect again") from None
+        raise InputError(f"{path}: keypoints are not triples of numbers, as many a person; detect again") from None
     if points.shape[1] not in COUNTS:
-        raise CaptureError(f"{path}: {points.shape[1]} keypoints a person; sets that are read: {KNOWN}")
+        raise InputError(f"{path}: {points.shape[1]} keypoints a person; sets that are read: {KNOWN}")
     if not np.isfinite(points).all():
-        raise CaptureError(f"{path}: a keypoint is NaN or infinite; detect them again")
+        raise InputError(f"{path}: a keypoint is NaN or infinite; detect them again")
     points[..., 2] = points[..., 2].clip(0, 1)  # some detectors exceed 1, and COCO's own annotations reach 2
     return points

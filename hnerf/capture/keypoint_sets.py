@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 LIMBS = ((1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7), (8, 9), (9, 10), (10, 11), (8, 12), (12, 13), (13, 14),
          (1, 8), (0, 1))  # fmt: skip
@@ -52,7 +52,7 @@ def to_body_25(detections: dict[str, np.ndarray], named: KeypointSetName | None)
     """BODY_25 keypoints (frames, people, 25, 3) by camera, of detections (frames, people, K, 3) x_px, y_px, confidence.
 
     `named` holds for all cameras; without it the number of points tells the set, and for 25, which two sets have, where
-    point 8 lies. K is 0 where nobody was detected. Raises CaptureError where `named` has another number of points.
+    point 8 lies. K is 0 where nobody was detected. Raises InputError where `named` has another number of points.
     """
     of_25 = [points.reshape(-1, 25, 3) for points in detections.values() if points.shape[-2] == 25]
     if of_25 and not named and not is_body_25(np.concatenate(of_25)):
@@ -68,7 +68,7 @@ def to_body_25(detections: dict[str, np.ndarray], named: KeypointSetName | None)
             continue
         chosen = SETS[named] if named else by_count[count]
         if chosen.points != count:
-            raise CaptureError(
+            raise InputError(
                 f'capture.toml: keypoints = "{named}" has {chosen.points} points, but camera {camera} has {count}; '
                 "correct it"
             )

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from hnerf.capture.safe_io import check_camera_name, check_image_size
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 MIN_FOCAL_PX = 1.0
@@ -35,9 +35,9 @@ def pinhole(camera: Camera) -> Lens:
 
 
 def known_size(lens: Lens) -> tuple[int, int]:
-    """The (width, height) that a file to be written has to say; CaptureError where it is not known."""
+    """The (width, height) that a file to be written has to say; InputError where it is not known."""
     if lens.size_px is None:
-        raise CaptureError(f"intri.yml: camera {lens.name} has no size; add W_{lens.name} and H_{lens.name}")
+        raise InputError(f"intri.yml: camera {lens.name} has no size; add W_{lens.name} and H_{lens.name}")
     return lens.size_px
 
 
@@ -50,7 +50,7 @@ def checked_lens(
     t_m: np.ndarray,
     size_px: tuple[float, float] | None,
 ) -> Lens:
-    """A Lens from numbers of any shape; CaptureError naming file and camera if they make no camera.
+    """A Lens from numbers of any shape; InputError naming file and camera if they make no camera.
 
     sources: the files of the intrinsics and of the extrinsics. R: a matrix or a rotation vector (Rodrigues).
     """
@@ -63,13 +63,13 @@ def checked_lens(
         (extrinsics, "T", t_m, (3,)),
     ):
         if value.size not in sizes:
-            raise CaptureError(f"{source}: camera {camera}: {label} has {value.size} numbers; calibrate again")
+            raise InputError(f"{source}: camera {camera}: {label} has {value.size} numbers; calibrate again")
         if not np.isfinite(value).all():
-            raise CaptureError(f"{source}: camera {camera}: {label} holds a NaN or infinity; calibrate again")
+            raise InputError(f"{source}: camera {camera}: {label} holds a NaN or infinity; calibrate again")
     K, R = K.reshape(3, 3), cv2.Rodrigues(R.ravel())[0] if R.size == 3 else R.reshape(3, 3)
     if K[0, 0] < MIN_FOCAL_PX or K[1, 1] < MIN_FOCAL_PX or K[1, 0] != 0 or K[2].tolist() != [0, 0, 1]:
-        raise CaptureError(f"{intrinsics}: camera {camera}: K is not a matrix of intrinsics in pixels; calibrate again")
+        raise InputError(f"{intrinsics}: camera {camera}: K is not a matrix of intrinsics in pixels; calibrate again")
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-        raise CaptureError(f"{extrinsics}: camera {camera}: R is not a rotation; calibrate again")
+        raise InputError(f"{extrinsics}: camera {camera}: R is not a rotation; calibrate again")
     size = check_image_size(intrinsics, *size_px) if size_px else None
     return Lens(camera, K, distortion.ravel(), R, t_m.ravel(), size)

@@ -19,9 +19,9 @@ from pydantic import (
 )
 
 from hnerf.capture.keypoint_sets import KeypointSetName
-from hnerf.capture.safe_io import inside, read_toml
+from hnerf.capture.safe_io import path_in_capture, read_toml
 from hnerf.config import validated
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 log = logging.getLogger("hnerf.capture")
 
@@ -49,7 +49,7 @@ class FrameSplit(_Table):
     novel_pose: list[FrameNumber] = []
 
 
-class Notes(_Table):
+class CaptureManifest(_Table):
     """`capture.toml`. Descriptive keys (subject, licence, ...) are anyone's own; those below have a meaning."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
@@ -76,31 +76,31 @@ class Notes(_Table):
         return {"m": 1.0, "mm": 1e-3}[self.units] if isinstance(self.units, str) else self.units
 
 
-def read_notes(folder: Path) -> Notes:
-    """The folder's `capture.toml`, or the defaults without one; CaptureError on a bad key or value."""
-    path = inside(folder, "capture.toml")
+def read_manifest(folder: Path) -> CaptureManifest:
+    """The folder's `capture.toml`, or the defaults without one; InputError on a bad key or value."""
+    path = path_in_capture(folder, "capture.toml")
     if not path.exists():
-        return Notes()
-    tree, known = read_toml(path), [*Notes.model_fields, "board"]
+        return CaptureManifest()
+    tree, known = read_toml(path), [*CaptureManifest.model_fields, "board"]
     for key in sorted(set(tree).difference(known)):
         if meant := difflib.get_close_matches(key.lower(), known, 1, TYPING_ERROR):
-            raise CaptureError(f"{path}: {key} has no meaning; did you mean {meant[0]}? Else call it something else")
-    return validated(Notes, tree, path)
+            raise InputError(f"{path}: {key} has no meaning; did you mean {meant[0]}? Else call it something else")
+    return validated(CaptureManifest, tree, path)
 
 
-def capture_name(folder: Path, notes: Notes) -> str:
-    """What the subject is called; it becomes a folder name, so CaptureError if it cannot be one."""
+def capture_name(folder: Path, notes: CaptureManifest) -> str:
+    """What the subject is called; it becomes a folder name, so InputError if it cannot be one."""
     name = unicodedata.normalize("NFC", folder.resolve().name if notes.name is None else notes.name)  # macOS: NFD
     if not re.fullmatch(r"\w[\w .()-]{0,127}", name):
-        raise CaptureError(f"{folder / 'capture.toml'}: name {name!r}: use letters, digits, '_', '-', '.' and spaces")
+        raise InputError(f"{folder / 'capture.toml'}: name {name!r}: use letters, digits, '_', '-', '.' and spaces")
     if len(name.encode()) > MAX_NAME_BYTES:
-        raise CaptureError(f"{folder / 'capture.toml'}: name of {len(name.encode())} bytes; keep to {MAX_NAME_BYTES}")
+        raise InputError(f"{folder / 'capture.toml'}: name of {len(name.encode())} bytes; keep to {MAX_NAME_BYTES}")
     return name
 
 
-def chosen_cameras(folder: Path, notes: Notes, calibrated: list[str], published: list[str]) -> CameraSplit:
+def chosen_cameras(folder: Path, notes: CaptureManifest, calibrated: list[str], published: list[str]) -> CameraSplit:
     """The cameras that `capture.toml` names, else the published ones for training and the rest for testing, else all
-    for training; CaptureError on one unknown or named twice."""
+    for training; InputError on one unknown or named twice."""
     if notes.cameras is None:
         train = published or calibrated
         return CameraSplit(train=train, test=[name for name in calibrated if name not in train])
@@ -109,13 +109,13 @@ def chosen_cameras(folder: Path, notes: Notes, calibrated: list[str], published:
 
 
 def chosen_frames(
-    folder: Path, notes: Notes, recorded: tuple[int, ...], novel_pose_share: float, max_frames: int
+    folder: Path, notes: CaptureManifest, recorded: tuple[int, ...], novel_pose_share: float, max_frames: int
 ) -> FrameSplit:
     """The frames that `capture.toml` names, else the first of the recorded ones for training and a last share for novel
     poses, evenly strided so that at most `max_frames` are for training.
 
     Neighbouring frames of a long recording are nearly the same picture, while fitting and training pay for each.
-    CaptureError on a frame that is not recorded or is named twice.
+    InputError on a frame that is not recorded or is named twice.
     """
     if notes.frames is None:
         novel = recorded[len(recorded) - int(novel_pose_share * len(recorded)) :]
@@ -134,6 +134,6 @@ def _check(folder: Path, what: str, named: list, known: Collection, where: str) 
     path, known_set = folder / "capture.toml", set(known)
     for item in named:
         if item not in known_set:
-            raise CaptureError(f"{path}: {what} {item} is not in {where}; correct [{what}s]")
+            raise InputError(f"{path}: {what} {item} is not in {where}; correct [{what}s]")
     if len(set(named)) < len(named):
-        raise CaptureError(f"{path}: a {what} is named twice; correct [{what}s]")
+        raise InputError(f"{path}: a {what} is named twice; correct [{what}s]")

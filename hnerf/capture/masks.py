@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,7 @@ class Masks:
         png = np.frombuffer(self.encoded[camera, frame], np.uint8)
         mask = cv2.imdecode(png, cv2.IMREAD_GRAYSCALE)
         if mask is None:
-            raise CaptureError(
-                f"masks/{camera}/{frame:06d}.png: not a readable image; run the segmentation stage again"
-            )
+            raise InputError(f"masks/{camera}/{frame:06d}.png: not a readable image; run the segmentation stage again")
         return mask > 127
 
     def save(self, out: Path) -> None:

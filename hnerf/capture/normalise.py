@@ -9,7 +9,7 @@ import numpy as np
 
 from hnerf.capture.capture import write_image
 from hnerf.capture.lens import Lens
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 MOST_LABELS = 64  # different levels; a mask of more has soft edges
@@ -94,7 +94,7 @@ class Normaliser:
     def _check_size(self, pixels: np.ndarray, source: Path) -> None:
         height_px, width_px = pixels.shape[:2]
         if (width_px, height_px) != self.recorded_size_px:
-            raise CaptureError(
+            raise InputError(
                 f"{source}: is {width_px} x {height_px} px, but camera {self.lens.name} records "
                 f"{self.recorded_size_px[0]} x {self.recorded_size_px[1]}; give all its pictures one size"
             )

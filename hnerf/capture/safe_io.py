@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageOps
 
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 MAX_IMAGE_PIXELS = 64_000_000
 MAX_TEXT_BYTES = 16_000_000
@@ -26,34 +26,38 @@ _ARGUMENTS = ("file", "allow_pickle")  # of np.savez, which takes keypoints by c
 
 
 def check_camera_name(name: object, source: Path) -> str:
-    """`name` if it can be a folder's name and an array's in a .npz; CaptureError naming `source` otherwise (separators,
+    """`name` if it can be a folder's name and an array's in a .npz; InputError naming `source` otherwise (separators,
     dots, wildcards)."""
     if not isinstance(name, str) or not _CAMERA_NAME.fullmatch(name):
-        raise CaptureError(f"{source}: camera name {name!r}: use letters, digits, '_', '-', spaces and ()")
+        raise InputError(f"{source}: camera name {name!r}: use letters, digits, '_', '-', spaces and ()")
     if name in _ARGUMENTS:
-        raise CaptureError(f"{source}: a camera cannot be called {name!r}; rename it")
+        raise InputError(f"{source}: a camera cannot be called {name!r}; rename it")
     return name
 
 
-def inside(root: Path, *parts: str) -> Path:
-    """root/parts, which need not exist; CaptureError if it leaves the capture folder or passes through a link."""
+def path_in_capture(root: Path, *parts: str) -> Path:
+    """root/parts, which need not exist; InputError if it leaves the capture folder or passes through a link."""
     path = root
     for part in parts:
         path = path / part
         if part in ("", ".", "..") or Path(part).name != part:
-            raise CaptureError(f"{path}: the name leaves the capture folder; rename it")
+            raise InputError(f"{path}: the name leaves the capture folder; rename it")
         if path.is_symlink():
-            raise CaptureError(f"{path}: is a symbolic link; put the file itself into the capture folder")
+            raise InputError(f"{path}: is a symbolic link; put the file itself into the capture folder")
     return path
 
 
 def files_in(root: Path, *parts: str, suffixes: tuple[str, ...] = ()) -> list[Path]:
     """The files of a folder inside the capture, sorted by name; empty if there is no such folder. suffixes: in lower
     case, those to keep, however they are written; none keeps all."""
-    folder = inside(root, *parts)
+    folder = path_in_capture(root, *parts)
     if not folder.is_dir():
         return []
-    paths = (inside(root, *parts, found.name) for found in sorted(folder.iterdir()) if not found.name.startswith("."))
+    paths = (
+        path_in_capture(root, *parts, found.name)
+        for found in sorted(folder.iterdir())
+        if not found.name.startswith(".")
+    )
     return [path for path in paths if path.is_file() and (not suffixes or path.suffix.lower() in suffixes)]
 
 
@@ -61,78 +65,78 @@ def file_named(root: Path, stem: str, *parts: str, suffixes: tuple[str, ...]) ->
     """The file called `stem` with one of these suffixes, as `files_in` has them, in a folder inside the capture; where
     there is none, the path that it would have with the first of them."""
     found = [path for path in files_in(root, *parts, suffixes=suffixes) if path.stem == stem]
-    return found[0] if found else inside(root, *parts, stem + suffixes[0])
+    return found[0] if found else path_in_capture(root, *parts, stem + suffixes[0])
 
 
 def numbered(paths: list[Path], what: str) -> dict[int, Path]:
-    """Files by the frame number that their name starts with; CaptureError on a name without one, or one twice."""
+    """Files by the frame number that their name starts with; InputError on a name without one, or one twice."""
     by_frame: dict[int, Path] = {}
     for path in paths:
         found = re.fullmatch(r"([0-9]{1,9})(?:_keypoints)?", path.stem)
         if not found:
-            raise CaptureError(f"{path}: {what} are named by frame, like 000000{path.suffix}; rename or remove it")
+            raise InputError(f"{path}: {what} are named by frame, like 000000{path.suffix}; rename or remove it")
         frame = int(found[1])
         if frame in by_frame:
-            raise CaptureError(f"{path}: frame {frame} is also {by_frame[frame].name}; keep one of them")
+            raise InputError(f"{path}: frame {frame} is also {by_frame[frame].name}; keep one of them")
         by_frame[frame] = path
     return by_frame
 
 
 def read_bytes(path: Path, max_bytes: int) -> bytes:
-    """A file's content; CaptureError if it is missing or too large."""
+    """A file's content; InputError if it is missing or too large."""
     try:
         size = path.stat().st_size
         if size > max_bytes:
-            raise CaptureError(f"{path}: {size} bytes are too many for such a file; export it again")
+            raise InputError(f"{path}: {size} bytes are too many for such a file; export it again")
         return path.read_bytes()
     except OSError as error:
-        raise CaptureError(f"{path}: cannot be read ({error.strerror}); add it to the capture folder") from None
+        raise InputError(f"{path}: cannot be read ({error.strerror}); add it to the capture folder") from None
 
 
 def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """A small UTF-8 text file, which may begin with a mark that says so; CaptureError if it is missing, empty, too
+    """A small UTF-8 text file, which may begin with a mark that says so; InputError if it is missing, empty, too
     large, or not text (a pickle, an archive)."""
     try:
         text = read_bytes(path, max_bytes).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise CaptureError(f"{path}: is not UTF-8 text (a pickle, or another encoding?); save it as UTF-8") from None
+        raise InputError(f"{path}: is not UTF-8 text (a pickle, or another encoding?); save it as UTF-8") from None
     if not text.strip():
-        raise CaptureError(f"{path}: is empty; export it again")
+        raise InputError(f"{path}: is empty; export it again")
     return text
 
 
 def read_json(path: Path) -> Any:
-    """A JSON file; CaptureError as `read_text`, or if it is not JSON."""
+    """A JSON file; InputError as `read_text`, or if it is not JSON."""
     try:
         return json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
-        raise CaptureError(f"{path}: is not JSON ({error}); export it again") from None
+        raise InputError(f"{path}: is not JSON ({error}); export it again") from None
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """A TOML file; CaptureError as `read_text`, or if it is not TOML."""
+    """A TOML file; InputError as `read_text`, or if it is not TOML."""
     try:
         return tomllib.loads(read_text(path))
     except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise CaptureError(f"{path}: is not TOML ({error}); correct it") from None
+        raise InputError(f"{path}: is not TOML ({error}); correct it") from None
 
 
 def check_image_size(path: Path, width_px: float, height_px: float) -> tuple[int, int]:
-    """The declared (width, height) if sane, before anything is allocated for it; CaptureError otherwise."""
+    """The declared (width, height) if sane, before anything is allocated for it; InputError otherwise."""
     if not (width_px >= 1 and height_px >= 1 and width_px * height_px <= MAX_IMAGE_PIXELS):
         limit = MAX_IMAGE_PIXELS // 1_000_000
-        raise CaptureError(f"{path}: declares {width_px:g} x {height_px:g} px; give 1 to {limit} million pixels")
+        raise InputError(f"{path}: declares {width_px:g} x {height_px:g} px; give 1 to {limit} million pixels")
     return int(width_px), int(height_px)
 
 
 def read_image(path: Path) -> np.ndarray:
-    """(H, W, 3) uint8 RGB, upright; CaptureError if it is not a whole 8-bit JPEG or PNG of a sane size."""
+    """(H, W, 3) uint8 RGB, upright; InputError if it is not a whole 8-bit JPEG or PNG of a sane size."""
     try:
         with Image.open(path, formats=["JPEG", "PNG"]) as image:
             check_image_size(path, *image.size)
             if image.mode not in _IMAGE_MODES:
-                raise CaptureError(f"{path}: pixels are {image.mode}; export it again with 8 bits a channel")
+                raise InputError(f"{path}: pixels are {image.mode}; export it again with 8 bits a channel")
             return np.array(ImageOps.exif_transpose(image).convert("RGB"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
-        raise CaptureError(f"{path}: not a readable image ({reason}); export it again as JPEG or PNG") from None
+        raise InputError(f"{path}: not a readable image ({reason}); export it again as JPEG or PNG") from None

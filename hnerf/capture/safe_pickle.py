@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse
 
 from hnerf.capture.safe_io import read_bytes
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 MAX_BYTES = 1_000_000_000  # the largest SMPL-X model has half of that
 _KINDS = re.compile(r"[biufOSU?][0-9]*")
@@ -24,7 +24,7 @@ _KINDS = re.compile(r"[biufOSU?][0-9]*")
 
 def read_pickle(path: Path) -> Any:
     """Plain data of a pickle file (text of Python 2 as latin-1); sparse matrices become scipy's CSC arrays, chumpy's
-    become numpy's. CaptureError if it is missing, too large or damaged, or names anything else."""
+    become numpy's. InputError if it is missing, too large or damaged, or names anything else."""
     return _plain_data(path, io.BytesIO(read_bytes(path, MAX_BYTES)))
 
 
@@ -36,9 +36,9 @@ def read_pickled_npy(path: Path) -> Any:
         read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = read_header(stream)
     except ValueError:
-        raise CaptureError(f"{path}: is no .npy file; export it again") from None
+        raise InputError(f"{path}: is no .npy file; export it again") from None
     if shape != () or dtype.kind != "O":
-        raise CaptureError(f"{path}: holds no dictionary; export it again")
+        raise InputError(f"{path}: holds no dictionary; export it again")
     return _plain_data(path, stream).item()
 
 
@@ -47,7 +47,7 @@ def _plain_data(path: Path, stream: io.BytesIO) -> Any:
         return _plain(_Unpickler(stream, encoding="latin1").load(), {})
     except Exception as error:  # a damaged pickle can raise nearly anything
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise CaptureError(f"{path}: not a pickle of plain data ({reason}); convert it to .npz") from None
+        raise InputError(f"{path}: not a pickle of plain data ({reason}); convert it to .npz") from None
 
 
 class _StandIn:

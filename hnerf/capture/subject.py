@@ -5,7 +5,7 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from hnerf.capture.capture import Capture
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import confidence_of, solve_points
 
@@ -22,17 +22,17 @@ def subject_keypoints(capture: Capture) -> dict[str, np.ndarray]:
     Where several people are detected, the subject is whom most cameras agree on (two-view triangulation predicts where
     each camera must see the person), weighted by size, confidence and nearness to the image's centre, and followed
     through time (Viterbi). Confidence is 0 where the person is not detected. Test cameras are never read.
-    Raises CaptureError where no frame shows a person in two cameras (in one, if there is only one).
+    Raises InputError where no frame shows a person in two cameras (in one, if there is only one).
     """
     names = capture.train_cameras
     detections = {name: capture.keypoints(name) for name in names}
     for name, found in detections.items():
         if found is None:
-            raise CaptureError(f"{capture.name}: camera {name}: no keypoints; run a keypoint detector on its images")
+            raise InputError(f"{capture.name}: camera {name}: no keypoints; run a keypoint detector on its images")
     people = [np.nan_to_num(found).astype(np.float64) for found in detections.values() if found is not None]
     seen = np.array([(p[..., 2] > 0).any((1, 2)) for p in people])  # (cameras, frames)
     if not (seen.sum(0) >= min(2, len(names))).any():
-        raise CaptureError(f"{capture.name}: no person found in any frame by enough cameras; check the keypoint files")
+        raise InputError(f"{capture.name}: no person found in any frame by enough cameras; check the keypoint files")
     if all(p.shape[1] == 1 for p in people):
         return {name: p[:, 0] for name, p in zip(names, people, strict=True)}
     cameras = [capture.cameras[name] for name in names]

@@ -10,15 +10,15 @@ import numpy as np
 
 from hnerf.capture.board_footage import BOARDS_FILE
 from hnerf.capture.capture import Capture
-from hnerf.errors import CaptureError, NotPossibleError
+from hnerf.errors import InputError, NotApplicableError
 
 T = TypeVar("T")
 
 
 def require_several_cameras(capture: Capture) -> None:
-    """NotPossibleError where one camera alone differs from no other."""
+    """NotApplicableError where one camera alone differs from no other."""
     if len(capture.train_cameras) < 2:
-        raise NotPossibleError(f"{capture.name}: has one training camera; there is none to differ from")
+        raise NotApplicableError(f"{capture.name}: has one training camera; there is none to differ from")
 
 
 def subset(
@@ -31,7 +31,7 @@ def subset(
     """Write another normalised capture into `out` with only these training cameras and frames; None keeps all.
 
     capture: as ingested, its cameras in step. Test cameras stay. Frames keep their numbers, so that ground truth is
-    found by them. CaptureError if a camera or frame is not one of the capture's, or nothing is left to train on.
+    found by them. InputError if a camera or frame is not one of the capture's, or nothing is left to train on.
     """
     train_cameras = chosen(capture, "training camera", cameras, capture.train_cameras)
     kept = dataclasses.replace(
@@ -43,7 +43,7 @@ def subset(
         novel_pose_frames=chosen(capture, "novel-pose frame", novel_pose_frames, capture.novel_pose_frames),
     )
     if not kept.train_cameras or not kept.train_frames:
-        raise CaptureError(f"{capture.name}: no training camera or frame would be left; keep one of each")
+        raise InputError(f"{capture.name}: no training camera or frame would be left; keep one of each")
     write_arrays(capture, kept)
     copy_files(capture.root, out, {Path(BOARDS_FILE).stem})
     for name in kept.cameras:
@@ -90,10 +90,10 @@ def copy_files(source: Path, target: Path, stems: Collection[str]) -> None:
 
 
 def chosen(capture: Capture, what: str, wanted: tuple[T, ...] | None, there_are: tuple[T, ...]) -> tuple[T, ...]:
-    """Those of a capture's that are wanted, in its order, None for all; CaptureError for one that it has not."""
+    """Those of a capture's that are wanted, in its order, None for all; InputError for one that it has not."""
     if wanted is None:
         return there_are
     for one in wanted:
         if one not in there_are:
-            raise CaptureError(f"{capture.name}: no {what} {one}; there are {', '.join(map(str, there_are))}")
+            raise InputError(f"{capture.name}: no {what} {one}; there are {', '.join(map(str, there_are))}")
     return tuple(one for one in there_are if one in wanted)

@@ -17,7 +17,7 @@ from hnerf.geometry.mesh_queries import Surface
 
 
 @dataclass(frozen=True)
-class Picture:
+class GalleryPicture:
     """A captioned picture as a data: address."""
 
     caption: str
@@ -30,7 +30,7 @@ class Row:
 
     title: str
     note: str
-    pictures: list[Picture]
+    pictures: list[GalleryPicture]
 
 
 @dataclass(frozen=True)
@@ -108,5 +108,5 @@ def _body_mesh(body: BodyFit, frame: int) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices_m.numpy(), body.rig.faces.numpy(), process=False)
 
 
-def _captioned(row: list[tuple[str, np.ndarray]]) -> list[Picture]:
-    return [Picture(caption, pictures.data_uri(picture)) for caption, picture in row]
+def _captioned(row: list[tuple[str, np.ndarray]]) -> list[GalleryPicture]:
+    return [GalleryPicture(caption, pictures.data_uri(picture)) for caption, picture in row]

@@ -11,8 +11,8 @@ import trimesh
 from hnerf.capture.capture import Capture
 from hnerf.capture.lens import Lens
 from hnerf.capture.normalise import Normaliser
-from hnerf.capture.safe_io import NO_ARRAYS, inside, read_image
-from hnerf.errors import CaptureError
+from hnerf.capture.safe_io import NO_ARRAYS, path_in_capture, read_image
+from hnerf.errors import InputError
 
 ON_BLACK = "ground_truth/on_black"
 MASKED_IMAGE = "image x ground-truth mask"
@@ -82,10 +82,10 @@ class GroundTruth:
                 raise ValueError("a face names no vertex, or a vertex is not finite")
             return {int(f): trimesh.Trimesh(v, faces, process=False) for f, v in zip(frames, vertices, strict=True)}
         except (*NO_ARRAYS, KeyError, IndexError) as error:
-            raise CaptureError(f"{path}: no true surfaces to read ({error}); write it again or delete it") from None
+            raise InputError(f"{path}: no true surfaces to read ({error}); write it again or delete it") from None
 
     def _path(self, *parts: str) -> Path:
-        return inside(self.folder, "ground_truth", *parts)
+        return path_in_capture(self.folder, "ground_truth", *parts)
 
     def _mask_path(self, camera: str, frame: int) -> Path:
         return self._path("masks", camera, f"{self.capture.recorded(camera, frame):06d}.png")

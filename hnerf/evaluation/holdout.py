@@ -14,7 +14,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.config import EvaluationSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.evaluation.columns import shown_as, why_not_shown
 from hnerf.evaluation.images import render, score_split, scored_views, unscored
 from hnerf.evaluation.views import PRIMARY
@@ -51,14 +51,14 @@ class OwnMasks:
 def cameras_left_out(train: Sequence[str], test: Sequence[str], holdout: str | None) -> tuple[str, ...]:
     """The training cameras that `evaluation.holdout` names; none where test cameras score the capture.
 
-    CaptureError, one line, for one that is not there, or where fewer than LEAST_CAMERAS would be left.
+    InputError, one line, for one that is not there, or where fewer than LEAST_CAMERAS would be left.
     """
     if holdout is None or test:
         return ()
     if holdout != EACH and holdout not in train:
-        raise CaptureError(f"evaluation.holdout={holdout}: no such training camera; there are {', '.join(train)}")
+        raise InputError(f"evaluation.holdout={holdout}: no such training camera; there are {', '.join(train)}")
     if len(train) <= LEAST_CAMERAS:
-        raise CaptureError(
+        raise InputError(
             f"evaluation.holdout={holdout}: of {len(train)} training cameras fewer than {LEAST_CAMERAS} would be left; "
             "take the setting out"
         )

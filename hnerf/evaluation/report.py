@@ -14,7 +14,7 @@ import trimesh
 from hnerf.capture.capture import read_rgba
 from hnerf.config import EvaluationSettings
 from hnerf.evaluation import charts
-from hnerf.evaluation.galleries import Gallery, Picture, surface_row, view_row
+from hnerf.evaluation.galleries import Gallery, GalleryPicture, surface_row, view_row
 from hnerf.evaluation.ground_truth import MASKED_IMAGE, GroundTruth
 from hnerf.evaluation.images import TUNED_ON
 from hnerf.evaluation.inputs import EvaluationInputs
@@ -220,21 +220,21 @@ def surface_gallery(inputs: EvaluationInputs, true_meshes: dict[int, trimesh.Tri
     return Gallery("Surface", "The zero surface of the signed distance, without colour.", rows)
 
 
-def training_charts(history_path: Path, out: Path) -> list[Picture]:
+def training_charts(history_path: Path, out: Path) -> list[GalleryPicture]:
     """Losses and held-out quality over training time, as far as the history has them."""
     history = [json.loads(line) for line in history_path.read_text().splitlines()] if history_path.exists() else []
     drawn = {
         "Losses": (out / "losses.png", charts.loss_chart(history, out / "losses.png")),
         "Held-out quality": (out / "quality.png", charts.quality_chart(history, out / "quality.png")),
     }
-    return [Picture(title, png_uri(path)) for title, (path, exists) in drawn.items() if exists]
+    return [GalleryPicture(title, png_uri(path)) for title, (path, exists) in drawn.items() if exists]
 
 
-def frame_charts(found: dict[str, Any], out: Path) -> list[Picture]:
+def frame_charts(found: dict[str, Any], out: Path) -> list[GalleryPicture]:
     """PSNR frame by frame of every split that was scored."""
     paths = {split: out / f"psnr_{split}.png" for split in SPLITS}
     scored = [split for split in SPLITS if charts.frame_chart(found[split]["per_image"], paths[split])]
-    return [Picture(f"{SPLIT_TITLES[split]}, frame by frame", png_uri(paths[split])) for split in scored]
+    return [GalleryPicture(f"{SPLIT_TITLES[split]}, frame by frame", png_uri(paths[split])) for split in scored]
 
 
 def png_uri(path: Path) -> str:

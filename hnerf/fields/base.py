@@ -83,7 +83,7 @@ class Field(nn.Module, ABC):
         seen."""
         return torch.full((len(frame),), self.samples, device=frame.device)
 
-    def look(
+    def render_rays(
         self,
         bodies: PosedBodies,
         region: Any,
@@ -99,7 +99,7 @@ class Field(nn.Module, ABC):
         for count in needed[needed > 0].unique().tolist():
             pick = torch.nonzero(needed == count)[:, 0]
             rays = (origins_m[pick], directions[pick], frame[pick])
-            still = Draws.still(len(pick), count, frame.device)
+            still = Draws.deterministic(len(pick), count, frame.device)
             samples, depths = self.sample(bodies, region, *rays, conditions, still)
             weights = weights_from_alpha(samples.in_box * samples.alpha)
             cover = weights.sum(1, keepdim=True)

@@ -19,17 +19,17 @@ Batch = TypeVar("Batch", bound="DataclassInstance")
 @dataclass(frozen=True)
 class Conditions:
     """By body row: pose (n, 3 free) the free joints' angles; root (n, 12) the rows of T, translation in scene units;
-    moment (n,) the row of the fit whose pose it is, -1 for a pose that no frame has."""
+    frame_row (n,) the row of the fit whose pose it is, -1 for a pose that no frame has."""
 
     pose: Tensor
     root: Tensor
-    moment: Tensor
+    frame_row: Tensor
 
     @staticmethod
-    def of(rig: Rig, theta: Tensor, root: Tensor, moment: Tensor, scene_m: float) -> "Conditions":
+    def of(rig: Rig, theta: Tensor, root: Tensor, frame_row: Tensor, scene_m: float) -> "Conditions":
         """theta (n, J, 3), root (n, 4, 4); scene_m: metres in a scene unit."""
         scaled = torch.cat([root[:, :3, :3], root[:, :3, 3:] / scene_m], -1)
-        return Conditions(theta[:, rig.free].flatten(1), scaled.flatten(1), moment)
+        return Conditions(theta[:, rig.free].flatten(1), scaled.flatten(1), frame_row)
 
     def noisy(self, sigma: float, generator: torch.Generator) -> "Conditions":
         """With Gaussian noise on theta and T, so that networks do not learn poses by heart (paper, section 4)."""
@@ -65,13 +65,13 @@ class Draws:
         return dataclasses.replace(self, beyond=beyond)
 
     @staticmethod
-    def still(rays: int, samples: int, device: torch.device) -> "Draws":
+    def deterministic(rays: int, samples: int, device: torch.device) -> "Draws":
         """For a rendering: every sample in the middle of its stratum, black beyond."""
         middle = torch.full((rays, samples), 0.5, device=device)
         return Draws(middle, torch.zeros(rays, 3, device=device), middle)
 
 
-def own_share(batch: Batch, rank: int, world_size: int) -> Batch:
+def shard(batch: Batch, rank: int, world_size: int) -> Batch:
     """This rank's rays of a joint batch, a dataclass whose tensors all have the rays first: those that follow each
     other, so that a share has few frames."""
     own = {f.name: getattr(batch, f.name) for f in dataclasses.fields(batch)}

@@ -31,10 +31,10 @@ class FrameDeformation(nn.Module):
         self.register_buffer("normals", vertex_normals(vertices_m, faces), persistent=False)
         self.displacement = nn.Parameter(torch.zeros(frames + 1, nodes, 3))
 
-    def forward(self, described: Descriptor, moment: Tensor) -> tuple[Tensor, Tensor]:
-        """How far the surface next to described points is displaced in the frames of rows `moment` (N,), -1 for none:
-        (N, 3), and along its normal (N,); canonical metres."""
-        present, own = occurring(moment, len(self.displacement))
+    def forward(self, described: Descriptor, frame_row: Tensor) -> tuple[Tensor, Tensor]:
+        """How far the surface next to described points is displaced in the frames of rows `frame_row` (N,), -1 for
+        none: (N, 3), and along its normal (N,); canonical metres."""
+        present, own = occurring(frame_row, len(self.displacement))
         table = self._of_vertices(present).flatten(0, 1)
         found = blended(table, own[:, None] * len(self.shares) + described.corners, described.barycentric)
         return found[:, :3], found[:, 3]
@@ -47,9 +47,9 @@ class FrameDeformation(nn.Module):
         self.displacement[others] = self.displacement[rows].mean(0)
 
     @torch.no_grad()
-    def outwards(self, moment: Tensor) -> Tensor:
-        """How far vertices go along their normals in the frames of rows `moment` (n,), -1 for none, (n, V)."""
-        return self._of_vertices(moment)[..., 3]
+    def outwards(self, frame_row: Tensor) -> Tensor:
+        """How far vertices go along their normals in the frames of rows `frame_row` (n,), -1 for none, (n, V)."""
+        return self._of_vertices(frame_row)[..., 3]
 
     def _of_vertices(self, rows: Tensor) -> Tensor:
         """Of some rows of `displacement`, and how far that is along the vertices' normals: (n, V, 4)."""

@@ -76,7 +76,7 @@ class FastField(Field):
         """Where rays are sampled: the shell around bodies as they stand now, where their frames displace it to."""
         outwards_m = bodies.vertices_m.new_zeros(len(bodies.vertices_m), 1)
         if self.deformation is not None:
-            outwards_m = self.deformation.outwards(conditions.moment)
+            outwards_m = self.deformation.outwards(conditions.frame_row)
         s, least_m = self.settings, self.settings.shell_cell_m
         outer_m = (self.outer_m + outwards_m).clamp(least_m, s.outer_m)
         inner_m = (self.inner_m - outwards_m).clamp(least_m, s.inner_m)
@@ -142,7 +142,7 @@ class FastField(Field):
         points = origins_m[hit, None] + directions[hit, None] * depths[hit][..., None]
         row = frame[hit].repeat_interleave(depths.shape[1])
         skin = bodies.describe(points.flatten(0, 1), row, self.reach_m, correction)
-        described, moved = self._deformed(skin, conditions.moment[row])
+        described, moved = self._deformed(skin, conditions.frame_row[row])
         pose = conditions.pose.index_select(0, row)
         d = torch.where(described.near, described.d, self.reach_m).view(len(hit), depths.shape[1])
         residual = torch.where(described.near, self._residual(described, pose), 0.0).view_as(d)
@@ -183,11 +183,11 @@ class FastField(Field):
         enough = torch.searchsorted(steps.to(needed), needed).clamp(max=len(SAMPLES) - 1)
         return torch.where(needed > 0, steps[enough], 0)
 
-    def _deformed(self, described: Descriptor, moment: Tensor) -> tuple[Descriptor, Tensor | None]:
-        """Descriptors (N,) on the body as the frames of rows `moment` (N,) deform it, and the displacements (N, 3)."""
+    def _deformed(self, described: Descriptor, frame_row: Tensor) -> tuple[Descriptor, Tensor | None]:
+        """Descriptors (N,) on the body as the frames of rows `frame_row` (N,) deform it, and displacements (N, 3)."""
         if self.deformation is None:
             return described, None
-        moved, outwards = self.deformation(described, moment)
+        moved, outwards = self.deformation(described, frame_row)
         return dataclasses.replace(described, y=described.y - moved, d=described.d - outwards), moved
 
     def _residual(self, described: Descriptor, pose: Tensor) -> Tensor:
@@ -224,13 +224,13 @@ class FastField(Field):
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """d_hat (N,) at points (N, 3) around the first body; beyond reach the body's own distance stands alone."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
-        described, _ = self._deformed(bodies.describe(points_m, row, FAR_M, exact_sign=True), conditions.moment[row])
+        described, _ = self._deformed(bodies.describe(points_m, row, FAR_M, exact_sign=True), conditions.frame_row[row])
         return described.d + self._residual(described, conditions.pose[row])
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """c (N, 3) at points around the first body; this field does not depend on the viewing direction."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
-        described, _ = self._deformed(bodies.describe(points_m, row, FAR_M), conditions.moment[row])
+        described, _ = self._deformed(bodies.describe(points_m, row, FAR_M), conditions.frame_row[row])
         return self.field.colour(described.y, described.d, described.normal, conditions.pose[row])
 
 

@@ -18,7 +18,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.given_poses import JOINTS, GivenPoses
 from hnerf.capture.safe_io import NO_ARRAYS
 from hnerf.config import FitSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 AMASS_WIDTHS = (72, 156, 165)  # numbers a pose of SMPL, SMPL-H and SMPL-X; the first 22 joints are the same
 AMASS_RATES = ("mocap_framerate", "mocap_frame_rate")
@@ -40,7 +40,7 @@ def read_motion(path: Path, frames: str = ":") -> Motion:
     """Frames (see `select`) of another subject, by its folder with capture and training or fit, or of an AMASS .npz.
 
     AMASS poses are SMPL's, told to the joints of anny's average body; fingers and toes stay at rest.
-    Raises CaptureError where there is no motion, or not these frames.
+    Raises InputError where there is no motion, or not these frames.
     """
     if path.is_dir():
         return _subject_motion(path, frames)
@@ -55,15 +55,15 @@ def read_motion(path: Path, frames: str = ":") -> Motion:
 def select(frames: tuple[int, ...], wanted: str, source: Path) -> tuple[int, ...]:
     """Those of some frame numbers that `wanted` names: "12", or "FIRST:END:STEP" with END left out, like a slice.
 
-    Raises CaptureError, naming the source, where there is none.
+    Raises InputError, naming the source, where there is none.
     """
     if not re.fullmatch(r"\d+|\d*:\d*(:[1-9]\d*)?", wanted):
-        raise CaptureError(f"frames {wanted}: give a number like 12, or FIRST:END:STEP like 0:24:2")
+        raise InputError(f"frames {wanted}: give a number like 12, or FIRST:END:STEP like 0:24:2")
     parts = [int(part) if part else None for part in wanted.split(":")]
     numbers = range(*slice(*parts).indices(max(frames) + 1)) if ":" in wanted else range(int(wanted), int(wanted) + 1)
     chosen = tuple(frame for frame in frames if frame in numbers)
     if not chosen:
-        raise CaptureError(f"{source}: no frames {wanted}; it has {min(frames)} to {max(frames)}")
+        raise InputError(f"{source}: no frames {wanted}; it has {min(frames)} to {max(frames)}")
     return chosen
 
 
@@ -78,14 +78,14 @@ def adopted(own: BodyFit, motion: Motion, up: str) -> BodyFit:
 
     The motion's middle comes where that of `own` is, and its floor, the lowest point of all its frames, onto the
     lowest point of `own`; in each frame the lowest point of this body is as high above the floor as that of the body
-    that the motion came with. `up`: the vertical axis of the world of `own`. Raises CaptureError where a joint is
+    that the motion came with. `up`: the vertical axis of the world of `own`. Raises InputError where a joint is
     missing.
     """
     other, names = motion.body, motion.body.rig.joint_names
     theta = torch.zeros(len(other.frames), len(own.rig.joint_names), 3)
     for j in own.rig.free.nonzero()[:, 0].tolist():
         if own.rig.joint_names[j] not in names:
-            raise CaptureError(f"motion: has no joint {own.rig.joint_names[j]}; take one fitted with this body model")
+            raise InputError(f"motion: has no joint {own.rig.joint_names[j]}; take one fitted with this body model")
         theta[:, j] = other.theta[:, names.index(own.rig.joint_names[j])]
     turn = torch.eye(4)
     turn[:3, :3] = _upright(motion.up, up)
@@ -144,7 +144,7 @@ def _upright(from_up: str, to_up: str) -> Tensor:
 def _subject_motion(folder: Path, frames: str) -> Motion:
     found = [folder / stage for stage in ("training", "fit") if (folder / stage / "body.npz").is_file()]
     if not found or not (folder / "capture" / "capture.json").is_file():
-        raise CaptureError(f"{folder}: holds no fitted body; give <store>/subjects/<name> or an AMASS .npz")
+        raise InputError(f"{folder}: holds no fitted body; give <store>/subjects/<name> or an AMASS .npz")
     body, capture = BodyFit.load(found[0]), Capture.load(folder / "capture")
     return Motion(rows(body, select(body.frames, frames, folder)), capture.fps, capture.up)
 
@@ -156,16 +156,16 @@ def _read_amass(path: Path) -> tuple[GivenPoses, float]:
         with np.load(path, allow_pickle=False) as stored:
             found = {key: np.asarray(stored[key], np.float64) for key in keys if key in stored}
     except NO_ARRAYS:
-        raise CaptureError(f"{path}: is no .npz of plain arrays; give an AMASS file or a subject's folder") from None
+        raise InputError(f"{path}: is no .npz of plain arrays; give an AMASS file or a subject's folder") from None
     poses, trans = found.get("poses", np.zeros(0)), found.get("trans", np.zeros(0))
     known = poses.ndim == 2 and poses.shape[1] in AMASS_WIDTHS and trans.shape == (len(poses), 3) and len(poses) > 0
     if not known or not (np.isfinite(poses).all() and np.isfinite(trans).all()):
-        raise CaptureError(f"{path}: poses {poses.shape}, trans {trans.shape} are not AMASS's (n, 156) and (n, 3)")
+        raise InputError(f"{path}: poses {poses.shape}, trans {trans.shape} are not AMASS's (n, 156) and (n, 3)")
     given = dataclasses.replace(GivenPoses.unknown(len(poses)), theta=np.zeros((len(poses), JOINTS, 3)))
     given.theta[:, :BODY_JOINTS] = poses[:, : 3 * BODY_JOINTS].reshape(-1, BODY_JOINTS, 3)
     given.root[:] = np.eye(4)
     given.root[:, :3, 3] = trans
     rate = next((found[key] for key in AMASS_RATES if key in found), np.array(DEFAULT_FPS))
     if rate.size != 1 or not 0 < rate.item() <= MAX_FPS:
-        raise CaptureError(f"{path}: {rate.tolist()} frames per second; correct {AMASS_RATES[0]}")
+        raise InputError(f"{path}: {rate.tolist()} frames per second; correct {AMASS_RATES[0]}")
     return given, rate.item()

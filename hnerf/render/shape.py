@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.render.motion import lifted, lowest_points_m
 
 FOLDED_SHARE = 0.005  # of the triangles that may turn over before a shape is refused; half a per cent is not seen
@@ -21,21 +21,21 @@ AS_THICK = "neck", "wrist", "foot"  # in names of joints whose parts, with all b
 def with_values(rig: Rig, changes: Mapping[str, float]) -> Rig:
     """The rig with these amounts added to shape values of these names, to first order around the fitted shape.
 
-    Raises CaptureError for a value that the rig has not, and where the skin would fold over.
+    Raises InputError for a value that the rig has not, and where the skin would fold over.
     """
     beta = rig.beta.clone()
     for name, change in changes.items():
         if name not in rig.beta_names:
-            raise CaptureError(f"shape {name}: this body's values are {', '.join(rig.beta_names)}")
+            raise InputError(f"shape {name}: this body's values are {', '.join(rig.beta_names)}")
         beta[rig.beta_names.index(name)] += change
-    told = ", ".join(f"{name} {change:+.2f}" for name, change in changes.items())
-    return _unfolded(rig.reshaped(beta), rig, f"shape {told}")
+    message = ", ".join(f"{name} {change:+.2f}" for name, change in changes.items())
+    return _unfolded(rig.reshaped(beta), rig, f"shape {message}")
 
 
 def with_volume(rig: Rig, change: float) -> Rig:
     """The rig with another volume at rest: -0.4 is 40 % less. Trunk and limbs get thicker or thinner about their bones.
 
-    Raises CaptureError where the change is out of reach, and where the skin would fold over.
+    Raises InputError where the change is out of reach, and where the skin would fold over.
     """
     wanted_m3, outwards_m = (1 + change) * volume_m3(rig), outwards(rig)
 
@@ -45,10 +45,10 @@ def with_volume(rig: Rig, change: float) -> Rig:
     def missing_m3(share: float) -> float:
         return volume_m3(thicker(share)) - wanted_m3
 
-    told = f"volume {100 * change:+.0f} %"
+    message = f"volume {100 * change:+.0f} %"
     if not missing_m3(THICKER[0]) < 0 < missing_m3(THICKER[1]):
-        raise CaptureError(f"{told}: out of this body's reach; ask for a smaller change")
-    return _unfolded(thicker(brentq(missing_m3, *THICKER, xtol=1e-4)), rig, told)
+        raise InputError(f"{message}: out of this body's reach; ask for a smaller change")
+    return _unfolded(thicker(brentq(missing_m3, *THICKER, xtol=1e-4)), rig, message)
 
 
 def outwards(rig: Rig) -> Tensor:
@@ -80,12 +80,12 @@ def worn_by(rig: Rig, body: BodyFit, up: str) -> BodyFit:
     return lifted(BodyFit(rig, body.frames, body.theta, body.root), lowest_points_m(body, up), up)
 
 
-def _unfolded(shaped: Rig, rig: Rig, told: str) -> Rig:
-    """`shaped`; CaptureError, after `told`, if too much of its skin has turned over."""
+def _unfolded(shaped: Rig, rig: Rig, message: str) -> Rig:
+    """`shaped`; InputError, after `message`, if too much of its skin has turned over."""
     upright = (_normals(shaped) * _normals(rig)).sum(1) >= 0  # not so where a value is not a number
     folded = float((~upright).float().mean())
     if folded > FOLDED_SHARE:
-        raise CaptureError(f"{told}: folds {100 * folded:.1f} % of the skin over; ask for a smaller change")
+        raise InputError(f"{message}: folds {100 * folded:.1f} % of the skin over; ask for a smaller change")
     return shaped
 
 

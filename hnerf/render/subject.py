@@ -14,8 +14,8 @@ from hnerf.body.rig import pose_vertices
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.capture.timing import usual_step
-from hnerf.errors import CaptureError
-from hnerf.files import new_folder
+from hnerf.errors import InputError
+from hnerf.files import atomic_folder
 from hnerf.geometry.camera import Camera
 from hnerf.render.motion import Motion, adopted, between, read_motion, rows, select
 from hnerf.render.pictures import Shot, write_pictures
@@ -28,7 +28,7 @@ MIN_SIZE_PX, MAX_SIZE_PX = 2, 8000  # a square video of either can still be read
 
 
 @dataclass(frozen=True)
-class Wish:
+class RenderOptions:
     """What to show; the defaults turn round the person through all fitted frames.
 
     camera: a recorded camera's name; path: a file or folder of cameras to fly along (`read_path`); neither: an orbit
@@ -51,76 +51,76 @@ class Wish:
     pictures: int | None = None
 
 
-def render_subject(subject: Path, wish: Wish, out: Path) -> int:
+def render_subject(subject: Path, options: RenderOptions, out: Path) -> int:
     """Write what is wished of a subject (<store>/subjects/<name>) into the new folder `out`; how many pictures.
 
-    See `write_pictures` for the files. Raises CaptureError for a wish that cannot be met.
+    See `write_pictures` for the files. Raises InputError for a options that cannot be met.
     """
-    with new_folder(out) as partial:
-        capture = _checked(subject, wish)
-        motion = _motion(subject, wish, capture)
-        cameras = _cameras(wish, capture, motion.body)
+    with atomic_folder(out) as partial:
+        capture = _checked(subject, options)
+        motion = _motion(subject, options, capture)
+        cameras = _cameras(options, capture, motion.body)
         shots: list[Shot] = list(zip(cameras, itertools.cycle(motion.body.frames), strict=False))
         avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
-        write_pictures(avatar.on_body(motion.body), shots, wish.what, motion.fps, partial)
+        write_pictures(avatar.on_body(motion.body), shots, options.what, motion.fps, partial)
     return len(shots)
 
 
-def _checked(subject: Path, wish: Wish) -> Capture:
-    """The subject's capture through its calibrated cameras; CaptureError for what is plainly wrong."""
+def _checked(subject: Path, options: RenderOptions) -> Capture:
+    """The subject's capture through its calibrated cameras; InputError for what is plainly wrong."""
     for file in ("capture/capture.json", "calibration/intri.yml", "training/model.safetensors"):
         if not (subject / file).is_file():
-            raise CaptureError(f"{subject / file}: missing; give <store>/subjects/<name> of a finished `hnerf run`")
-    unknown = [kind for kind in wish.what if kind not in KINDS]
-    if unknown or not wish.what:
-        raise CaptureError(f"what {','.join(unknown)}: choose from {', '.join(KINDS)}")
-    if (wish.camera or wish.path) and (wish.radius_m is not None or wish.height_m is not None):
-        raise CaptureError("--radius and --height are an orbit's; leave them out, or --camera and --path")
-    if wish.pictures is not None and wish.pictures < 1:
-        raise CaptureError(f"{wish.pictures} pictures: give 1 or more")
+            raise InputError(f"{subject / file}: missing; give <store>/subjects/<name> of a finished `hnerf run`")
+    unknown = [kind for kind in options.what if kind not in KINDS]
+    if unknown or not options.what:
+        raise InputError(f"what {','.join(unknown)}: choose from {', '.join(KINDS)}")
+    if (options.camera or options.path) and (options.radius_m is not None or options.height_m is not None):
+        raise InputError("--radius and --height are an orbit's; leave them out, or --camera and --path")
+    if options.pictures is not None and options.pictures < 1:
+        raise InputError(f"{options.pictures} pictures: give 1 or more")
     return load_cameras(subject / "calibration", Capture.load(subject / "capture"))
 
 
-def _motion(subject: Path, wish: Wish, capture: Capture) -> Motion:
+def _motion(subject: Path, options: RenderOptions, capture: Capture) -> Motion:
     """The poses to show, on the body to show."""
     own = BodyFit.load(subject / "training")
-    if wish.motion is None:
-        motion = Motion(rows(own, select(own.frames, wish.frames, subject)), capture.fps, capture.up)
+    if options.motion is None:
+        motion = Motion(rows(own, select(own.frames, options.frames, subject)), capture.fps, capture.up)
     else:
-        motion = read_motion(wish.motion, wish.frames)
+        motion = read_motion(options.motion, options.frames)
         motion = dataclasses.replace(motion, body=adopted(own, motion, capture.up), up=capture.up)
     body = motion.body
     fps = motion.fps / usual_step(body.frames)
-    if wish.between is not None:
-        for frame in wish.between:
-            select(body.frames, str(frame), wish.motion or subject)
-        body, fps = between(body, *wish.between, wish.pictures or ORBIT_PICTURES), motion.fps
-    if wish.shape or wish.volume is not None:
-        rig = with_values(own.rig, wish.shape)
-        body = worn_by(rig if wish.volume is None else with_volume(rig, wish.volume), body, capture.up)
+    if options.between is not None:
+        for frame in options.between:
+            select(body.frames, str(frame), options.motion or subject)
+        body, fps = between(body, *options.between, options.pictures or ORBIT_PICTURES), motion.fps
+    if options.shape or options.volume is not None:
+        rig = with_values(own.rig, options.shape)
+        body = worn_by(rig if options.volume is None else with_volume(rig, options.volume), body, capture.up)
     return Motion(body, fps, capture.up)
 
 
-def _cameras(wish: Wish, capture: Capture, body: BodyFit) -> list[Camera]:
+def _cameras(options: RenderOptions, capture: Capture, body: BodyFit) -> list[Camera]:
     """One camera a picture."""
     recorded = [capture.cameras[name] for name in capture.train_cameras]
     poses = len(body.frames) if len(body.frames) > 1 else None
-    if wish.camera is not None:
-        if wish.camera not in capture.cameras:
-            raise CaptureError(f"camera {wish.camera}: the recording has {', '.join(capture.cameras)}")
-        found = [capture.cameras[wish.camera]] * (wish.pictures or poses or 1)
-    elif wish.path is not None:
-        keys = read_path(wish.path, capture.recorded_sizes_px[recorded[0].name])
-        found = along(keys, wish.pictures or poses or len(keys))
+    if options.camera is not None:
+        if options.camera not in capture.cameras:
+            raise InputError(f"camera {options.camera}: the recording has {', '.join(capture.cameras)}")
+        found = [capture.cameras[options.camera]] * (options.pictures or poses or 1)
+    elif options.path is not None:
+        keys = read_path(options.path, capture.recorded_sizes_px[recorded[0].name])
+        found = along(keys, options.pictures or poses or len(keys))
     else:
-        count = wish.pictures or poses or ORBIT_PICTURES
-        found = orbit(recorded, _middle_m(body), count, capture.up, wish.radius_m, wish.height_m)
-    if wish.camera is None:  # made after a recorded one, but not exposed as it is
+        count = options.pictures or poses or ORBIT_PICTURES
+        found = orbit(recorded, _middle_m(body), count, capture.up, options.radius_m, options.height_m)
+    if options.camera is None:  # made after a recorded one, but not exposed as it is
         found = [dataclasses.replace(camera, name="") for camera in found]
-    found = found if wish.size_px is None else [_sized(camera, wish.size_px) for camera in found]
+    found = found if options.size_px is None else [_sized(camera, options.size_px) for camera in found]
     width_px, height_px = found[0].width_px, found[0].height_px  # of all
     if min(width_px, height_px) < MIN_SIZE_PX or max(width_px, height_px) > MAX_SIZE_PX:
-        raise CaptureError(f"pictures of {width_px} x {height_px} px: a side has {MIN_SIZE_PX} to {MAX_SIZE_PX}")
+        raise InputError(f"pictures of {width_px} x {height_px} px: a side has {MIN_SIZE_PX} to {MAX_SIZE_PX}")
     return found
 
 

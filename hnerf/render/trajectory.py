@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from hnerf.capture.ingest import recognise
 from hnerf.capture.lens import Lens, checked_lens
-from hnerf.capture.manifest import read_notes
+from hnerf.capture.manifest import read_manifest
 from hnerf.capture.safe_io import read_json
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera, look_at
 
 
@@ -28,7 +28,7 @@ def orbit(
 
     The first has the lens and the bearing of cameras[0]. radius_m: horizontal distance from the target; height_m: over
     the target, along the world's axis `up`; by default the mean of `cameras` each.
-    Raises CaptureError where the circle has no radius.
+    Raises InputError where the circle has no radius.
     """
     vertical = "xyz".index(up)
     axis = np.eye(3)[vertical]
@@ -38,7 +38,7 @@ def orbit(
     height_m = float(offsets_m[:, vertical].mean()) if height_m is None else height_m
     length_m = np.linalg.norm(level_m[0])
     if not (radius_m > 0 and length_m > 0 and np.isfinite([radius_m, height_m]).all()):
-        raise CaptureError(f"orbit of radius {radius_m:g} m, height {height_m:g} m: no circle; give a radius above 0")
+        raise InputError(f"orbit of radius {radius_m:g} m, height {height_m:g} m: no circle; give a radius above 0")
     ahead = level_m[0] / length_m
     aside = np.cross(axis, ahead)
     turns = 2 * np.pi * np.arange(count) / count
@@ -69,10 +69,10 @@ def read_path(path: Path, size_px: tuple[int, int]) -> list[Camera]:
     conventions), or a folder in any layout that captures are read from.
 
     size_px: (width, height) of images where the file does not say. Lens distortion is left out.
-    Raises CaptureError where the file holds no cameras, or cameras of several sizes.
+    Raises InputError where the file holds no cameras, or cameras of several sizes.
     """
     if path.is_dir():
-        lenses, metres_per_unit = list(recognise(path).lenses().values()), read_notes(path).metres_per_unit
+        lenses, metres_per_unit = list(recognise(path).lenses().values()), read_manifest(path).metres_per_unit
     else:
         lenses, metres_per_unit = _json_lenses(path), 1.0
     cameras = [
@@ -80,7 +80,7 @@ def read_path(path: Path, size_px: tuple[int, int]) -> list[Camera]:
     ]
     sizes = {(camera.width_px, camera.height_px) for camera in cameras}
     if len(sizes) != 1:
-        raise CaptureError(f"{path}: cameras of {len(sizes)} image sizes; a path needs one or more cameras of one size")
+        raise InputError(f"{path}: cameras of {len(sizes)} image sizes; a path needs one or more cameras of one size")
     return cameras
 
 
@@ -100,6 +100,6 @@ def _json_lenses(path: Path) -> list[Lens]:
             for k, entry in enumerate(entries)
         ]
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise CaptureError(
+        raise InputError(
             f"{path}: not a list of cameras ({error}); each needs K (3x3), R (3x3), t_m (3), size_px (2)"
         ) from None

@@ -8,10 +8,10 @@ import numpy as np
 
 from hnerf.capture.capture import Capture
 from hnerf.config import SegmentationSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.segmentation.cut import components_within, cut
-from hnerf.segmentation.difference import difference, levelled, masked_median, noise_level, surroundings
+from hnerf.segmentation.difference import difference, exposure_corrected, masked_median, noise_level, surroundings
 from hnerf.segmentation.learned import Network
 from hnerf.segmentation.prior import Prior, window_around
 
@@ -39,10 +39,10 @@ class Given:
     name: str = "given"
 
     def mask(self, frame: int, prior: Prior) -> np.ndarray:
-        """The given mask, or what of it is the subject. Raises CaptureError where it is missing."""
+        """The given mask, or what of it is the subject. Raises InputError where it is missing."""
         mask = self.capture.given_mask(self.camera, frame)
         if mask is None:
-            raise CaptureError(
+            raise InputError(
                 f"masks/{self.camera}/{frame:06d}.png: mask missing; give a mask for every frame or for none"
             )
         subject = components_within(mask, prior.reach)
@@ -99,7 +99,7 @@ class AgainstBackground:
         if not prior.reach.any():
             return mask
         free = surroundings(prior, self.known)
-        plate = levelled(self.plate, image, free)
+        plate = exposure_corrected(self.plate, image, free)
         noise, is_median = noise_level(image, plate, free), self.name == MEDIAN
         found = difference(image[window], plate[window], noise, self.settings, shadowed=is_median)
         mask[window] = cut(image[window], found, prior.cropped(window), self.known[window])
@@ -112,7 +112,7 @@ def choose_backend(
 ) -> Backend:  # fmt: skip
     """Given masks first, then the user's network, then a clean plate, then the background around a `fitted` body.
 
-    priors: in the order of the capture's frames. Raises CaptureError where none is possible.
+    priors: in the order of the capture's frames. Raises InputError where none is possible.
     """
     if any(capture.given_mask(camera, frame) is not None for frame in capture.frames):
         return Given(capture, camera)
@@ -122,7 +122,7 @@ def choose_backend(
     if plate is not None:
         return AgainstBackground.of_plate(capture, camera, plate, settings)
     if not fitted:
-        raise CaptureError(
+        raise InputError(
             f"{capture.name}: camera {camera} has neither masks nor a plate (background/{camera}.jpg); fit a body first"
         )
     return AgainstBackground.of_median(capture, camera, priors, MEDIAN_FRAMES, settings)

@@ -42,7 +42,7 @@ def surroundings(prior: Prior, known: np.ndarray) -> np.ndarray:
     return ~prior.body & known
 
 
-def levelled(plate: np.ndarray, image: np.ndarray, free: np.ndarray) -> np.ndarray:
+def exposure_corrected(plate: np.ndarray, image: np.ndarray, free: np.ndarray) -> np.ndarray:
     """The plate as bright and as tinted as the image is where it shows background, `free` (H, W): cameras that expose
     by themselves do so anew when a person comes in. As it is where they are alike."""
     if not free.any():

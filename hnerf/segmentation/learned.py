@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 TOLERANCE = 1e-3  # a probability may be outside [0, 1] by so much
 
@@ -18,30 +18,30 @@ class Network:
     """
 
     def __init__(self, path: Path) -> None:
-        """Raises CaptureError where the file or ONNX Runtime is missing, or where the file is no such network."""
+        """Raises InputError where the file or ONNX Runtime is missing, or where the file is no such network."""
         if not path.is_file():
-            raise CaptureError(f"segmentation.model: {path}: no such file; name an ONNX file, or leave it out")
+            raise InputError(f"segmentation.model: {path}: no such file; name an ONNX file, or leave it out")
         try:
             import onnxruntime
         except ImportError:
-            raise CaptureError(
+            raise InputError(
                 f"segmentation.model: {path}: needs ONNX Runtime; install hnerf-pipeline[learned], or leave it out"
             ) from None
         self.path = path
         try:
             self.session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
         except Exception as error:  # ONNX Runtime's own exceptions have no common base
-            raise CaptureError(f"{path}: not a network that ONNX Runtime can run: {error}") from None
+            raise InputError(f"{path}: not a network that ONNX Runtime can run: {error}") from None
         inputs = self.session.get_inputs()
         shape = inputs[0].shape
         if len(inputs) != 1 or len(shape) != 4 or 3 not in (shape[1], shape[3]) or inputs[0].type != "tensor(float)":
-            raise CaptureError(f"{path}: needs one float input (1, 3, H, W) or (1, H, W, 3); it has {shape}")
+            raise InputError(f"{path}: needs one float input (1, 3, H, W) or (1, H, W, 3); it has {shape}")
         self.channels_first = shape[1] == 3
         height, width = shape[2:] if self.channels_first else shape[1:3]
         self.size_px = (width, height) if isinstance(width, int) and isinstance(height, int) else None
 
     def probability(self, image: np.ndarray) -> np.ndarray:
-        """(H, W) float32 in [0, 1] of an image (H, W, 3) uint8 RGB. Raises CaptureError where it is none."""
+        """(H, W) float32 in [0, 1] of an image (H, W, 3) uint8 RGB. Raises InputError where it is none."""
         pixels = image if self.size_px is None else cv2.resize(image, self.size_px, interpolation=cv2.INTER_AREA)
         values = pixels.astype(np.float32)[None] / 255
         if self.channels_first:
@@ -50,12 +50,10 @@ class Network:
             outputs = self.session.run(None, {self.session.get_inputs()[0].name: values})
         except Exception as error:  # as above
             reason = " ".join(str(error).split())
-            raise CaptureError(
-                f"{self.path}: does not run on {values.shape}: {reason}; export it for any size"
-            ) from None
+            raise InputError(f"{self.path}: does not run on {values.shape}: {reason}; export it for any size") from None
         found = np.squeeze(outputs[0])
         if found.ndim != 2 or found.min() < -TOLERANCE or found.max() > 1 + TOLERANCE:
-            raise CaptureError(
+            raise InputError(
                 f"{self.path}: its first output must be one map of probabilities; it is {found.shape}, "
                 f"from {found.min():.3g} to {found.max():.3g}"
             )

@@ -10,11 +10,11 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks, encode
 from hnerf.config import SegmentationSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.segmentation.backends import choose_backend
 from hnerf.segmentation.learned import Network
 from hnerf.segmentation.prior import Prior, body_priors, keypoint_priors
-from hnerf.segmentation.verdicts import Verdict, judge, jumps
+from hnerf.segmentation.verdicts import MaskVerdict, judge, jumps
 
 log = logging.getLogger("hnerf.segmentation")
 
@@ -24,7 +24,7 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
 
     A camera with given masks keeps them; the user's network comes next, then a clean plate; else `body` is needed, to
     find the background from pixels that it does not reach. Only the subject is kept where there are several people.
-    A mask that cannot be right is left out and named in the report; a camera with no other raises CaptureError.
+    A mask that cannot be right is left out and named in the report; a camera with no other raises InputError.
     """
     priors = keypoint_priors(capture, settings) if body is None else body_priors(capture, body, settings)
     network = None if settings.model is None else Network(settings.model)
@@ -44,7 +44,7 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
     return Masks(encoded, {"cameras": cameras})
 
 
-def _findings(capture: Capture, camera: str, verdicts: list[Verdict], priors: list[Prior]) -> dict[str, Any]:
+def _findings(capture: Capture, camera: str, verdicts: list[MaskVerdict], priors: list[Prior]) -> dict[str, Any]:
     """Plain values: the median area, and the frames dropped or noted, each with its reason."""
     sudden = jumps(capture.frames, verdicts, [int(prior.body.sum()) for prior in priors])
     judged = {
@@ -53,7 +53,7 @@ def _findings(capture: Capture, camera: str, verdicts: list[Verdict], priors: li
     }
     dropped = [{"frame": frame, "reason": v.fault} for frame, v in judged.items() if v.fault]
     if len(dropped) == len(judged):
-        raise CaptureError(
+        raise InputError(
             f"{capture.name}: camera {camera}: no mask is usable (frame {dropped[0]['frame']}: "
             f"{dropped[0]['reason']}); check its clean plate, its given masks and its calibration, or leave it out"
         )

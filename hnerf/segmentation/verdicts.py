@@ -15,7 +15,7 @@ NEIGHBOURS = 4  # nearest frames, at most so many usual steps away, whose median
 
 
 @dataclass(frozen=True)
-class Verdict:
+class MaskVerdict:
     """fault: why the mask is dropped, or None; note: what is remarkable about it, or None; area_px."""
 
     fault: str | None
@@ -23,7 +23,7 @@ class Verdict:
     area_px: int
 
 
-def judge(mask: np.ndarray, prior: Prior) -> Verdict:
+def judge(mask: np.ndarray, prior: Prior) -> MaskVerdict:
     """One mask (H, W) bool by itself."""
     area_px, expected_px = int(mask.sum()), int(prior.core.sum())
     sides = [edge.any() for edge in (mask[0], mask[-1], mask[:, 0], mask[:, -1])]
@@ -37,10 +37,10 @@ def judge(mask: np.ndarray, prior: Prior) -> Verdict:
     elif prior.reach.any() and mask[prior.reach].sum() < LEAST_WITHIN * area_px:
         fault = "the mask is mostly not the person"
     named = [side for side, cut in zip(("top", "bottom", "left", "right"), sides, strict=True) if cut]
-    return Verdict(fault, f"cut off by the image's border ({', '.join(named)})" if named else None, area_px)
+    return MaskVerdict(fault, f"cut off by the image's border ({', '.join(named)})" if named else None, area_px)
 
 
-def jumps(frames: tuple[int, ...], verdicts: list[Verdict], expected_px: list[int]) -> dict[int, str]:
+def jumps(frames: tuple[int, ...], verdicts: list[MaskVerdict], expected_px: list[int]) -> dict[int, str]:
     """Sudden changes of area that the prior does not explain, by frame.
 
     A mask's area is held against the median of its neighbours in time, and so is its ratio to what the prior covers

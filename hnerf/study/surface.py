@@ -9,7 +9,7 @@ from torch import Tensor
 from hnerf.avatar.avatar import Avatar
 from hnerf.avatar.surface import surface_in_pose
 from hnerf.body.rig import pose_vertices
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 CELLS = 128  # on the longest side: enough to see a hole of a finger's width
 # Of the body's own. Clothes and hair add up to a half of its volume; what is worn over the head or held, some height. A
@@ -43,7 +43,7 @@ def check_pose(avatar: Avatar, theta: Tensor, root: Tensor) -> SurfaceCheck:
     """Judge the avatar's surface in a pose theta (J, 3), root (4, 4)."""
     try:
         mesh = surface_in_pose(avatar, theta, root, CELLS)
-    except CaptureError as error:
+    except InputError as error:
         return SurfaceCheck(str(error))
     body_m = pose_vertices(avatar.body.rig, theta, root)
     return check_surface(mesh, body_m.cpu().numpy(), avatar.body.rig.faces.cpu().numpy())

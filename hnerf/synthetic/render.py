@@ -135,7 +135,7 @@ def floor_shadow(caster: Caster, centre_m: np.ndarray, lights: tuple[np.ndarray,
 
 
 @dataclass(frozen=True)
-class View:
+class RoomView:
     """A camera's empty room: plate (H, W, 3) in [0, 1], and what each pixel's centre ray meets, room_m (H, W, 3)."""
 
     camera: Camera
@@ -143,7 +143,7 @@ class View:
     room_m: np.ndarray
 
     @staticmethod
-    def of(camera: Camera) -> "View":
+    def of(camera: Camera) -> "RoomView":
         """Render the room with the same supersampling as the person."""
         pixels = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), -1).reshape(-1, 2)
         plate = np.zeros((len(pixels), 3))
@@ -153,7 +153,7 @@ class View:
             if not offset.any():
                 centre_hit = hit
         shape = (camera.height_px, camera.width_px, 3)
-        return View(camera, plate.clip(0, 1).reshape(shape), centre_hit.reshape(shape))
+        return RoomView(camera, plate.clip(0, 1).reshape(shape), centre_hit.reshape(shape))
 
     def shadowed(self, shadow: np.ndarray, centre_m: np.ndarray) -> np.ndarray:
         """The plate with a person's shadow (see `floor_shadow`) on the floor, (H, W, 3)."""

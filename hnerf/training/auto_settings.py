@@ -13,7 +13,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.config import FastFieldSettings, TrainingSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.silhouette import silhouette
 
@@ -45,10 +45,10 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class Scene:
+class SceneStatistics:
     """What was recorded, as far as it decides sizes. footprint_m: of a pixel on the body, median over cameras;
     outside_m, inside_m: how far masks reach out of the fitted body and stay inside it, 99 % of their outlines; side_m:
-    longest of the rest body; spread_rad: of the free joints, mean; person_px: pixels of the person in all training
+    longest of the rest body; std_rad: of the free joints, mean; person_px: pixels of the person in all training
     images."""
 
     cameras: int
@@ -57,11 +57,11 @@ class Scene:
     outside_m: float
     inside_m: float
     side_m: float
-    spread_rad: float
+    std_rad: float
     person_px: int
 
     @staticmethod
-    def of(capture: Capture, masks: Masks, body: BodyFit) -> "Scene":
+    def of(capture: Capture, masks: Masks, body: BodyFit) -> "SceneStatistics":
         """Looks at some masks of every training camera."""
         vertices_m, faces = body.vertices_m().numpy(), body.rig.faces.numpy()
         footprints_m, outlines_m, images, areas_px = [], [], 0, []
@@ -76,23 +76,23 @@ class Scene:
                 outlines_m.append(footprints_m[-1] * _beyond_px(mask, covered))
                 areas_px.append(mask.sum())
         if not sum(map(len, outlines_m)):
-            raise CaptureError(f"{capture.name}: no mask shows the person; see the report of the segmentation")
+            raise InputError(f"{capture.name}: no mask shows the person; see the report of the segmentation")
         inside_m, outside_m = np.percentile(np.concatenate(outlines_m), [1, 99])
         rows = [body.index(frame) for frame in capture.train_frames]
         angles = body.theta[rows][:, body.rig.free]
-        return Scene(
+        return SceneStatistics(
             cameras=len(capture.train_cameras),
             frames=len(capture.train_frames),
             footprint_m=float(np.median(footprints_m)),
             outside_m=float(max(outside_m, 0)),
             inside_m=float(max(-inside_m, 0)),
             side_m=float((body.rig.vertices_m.amax(0) - body.rig.vertices_m.amin(0)).max()),
-            spread_rad=float((angles - angles.mean(0)).square().sum(-1).mean(0).sqrt().mean()),
+            std_rad=float((angles - angles.mean(0)).square().sum(-1).mean(0).sqrt().mean()),
             person_px=round(images * float(np.mean(areas_px))),
         )
 
 
-def decide(scene: Scene, settings: TrainingSettings) -> tuple[TrainingSettings, dict[str, Decision]]:
+def decide(scene: SceneStatistics, settings: TrainingSettings) -> tuple[TrainingSettings, dict[str, Decision]]:
     """The settings with all that was open decided, and each decision by its setting's name."""
     wanted = _field(scene, settings.fast) if settings.machinery == "fast" else {}
     made = {name: decision for name, decision in wanted.items() if not getattr(settings.fast, name)}
@@ -105,15 +105,15 @@ def decide(scene: Scene, settings: TrainingSettings) -> tuple[TrainingSettings, 
     return settings.model_copy(update={"fast": fast} | update), decisions | whole
 
 
-def _field(scene: Scene, given: FastFieldSettings) -> dict[str, Decision]:
-    posed = scene.frames > 1 and scene.spread_rad >= ONE_POSTURE_RAD
+def _field(scene: SceneStatistics, given: FastFieldSettings) -> dict[str, Decision]:
+    posed = scene.frames > 1 and scene.std_rad >= ONE_POSTURE_RAD
     cell_m = max(scene.footprint_m, ALIGNMENT_M if posed else FINEST_M)
     sample_m = min(SAMPLE_CELLS * cell_m, LONGEST_SAMPLE_M)
     align = f"poses align to {_mm(ALIGNMENT_M)}" if posed else "there is one posture"
     finest = f"a pixel covers {_mm(scene.footprint_m)}, {align}: cells of {_mm(cell_m)}"
     outer_m, inner_m = (_thickness_m(reach_m) for reach_m in (scene.outside_m, scene.inside_m))
     outer_m, inner_m = given.outer_m or outer_m, given.inner_m or inner_m
-    still = scene.spread_rad < STILL_RAD
+    still = scene.std_rad < STILL_RAD
     colour_cells = given.colour_cells or _ladder(COARSEST_CELLS["colour"], scene.side_m / cell_m, COLOUR_LEVELS)
     return {
         "outer_m": Decision(outer_m, f"masks reach {_mm(scene.outside_m)} out of the fitted body, and room"),
@@ -129,14 +129,14 @@ def _field(scene: Scene, given: FastFieldSettings) -> dict[str, Decision]:
         ),
         "pose_width": Decision(
             1 if still else POSE_WIDTH,
-            f"joints spread {np.rad2deg(scene.spread_rad):.1f} degrees over {scene.frames} frames"
+            f"joints spread {np.rad2deg(scene.std_rad):.1f} degrees over {scene.frames} frames"
             + (": too little to learn from" if still else ""),
         ),
         "nodes": _nodes(scene, given),
     }
 
 
-def _nodes(scene: Scene, given: FastFieldSettings) -> Decision:
+def _nodes(scene: SceneStatistics, given: FastFieldSettings) -> Decision:
     if not given.deformation_learning_rate:
         return Decision(0, "no learning rate for them")
     if scene.frames == 1:
@@ -146,14 +146,14 @@ def _nodes(scene: Scene, given: FastFieldSettings) -> Decision:
     return Decision(NODES, f"skinning does not move the clothes of {scene.frames} frames alike")
 
 
-def _one_posture(scene: Scene, settings: TrainingSettings) -> Decision:
-    fitted = f"fitted joints spread {np.rad2deg(scene.spread_rad):.2f} degrees over {scene.frames} frames"
+def _one_posture(scene: SceneStatistics, settings: TrainingSettings) -> Decision:
+    fitted = f"fitted joints spread {np.rad2deg(scene.std_rad):.2f} degrees over {scene.frames} frames"
     if settings.machinery != "fast" or scene.frames == 1:
         return Decision(False, "each frame has its own pose")
-    return Decision(scene.spread_rad < ONE_POSTURE_RAD, fitted)
+    return Decision(scene.std_rad < ONE_POSTURE_RAD, fitted)
 
 
-def _steps(scene: Scene, settings: TrainingSettings) -> Decision:
+def _steps(scene: SceneStatistics, settings: TrainingSettings) -> Decision:
     rays = settings.frames_per_step * settings.rays_per_frame
     wanted = LOOKS * scene.person_px / rays
     reason = f"{scene.person_px} pixels of the person at {rays} rays a step ask for {wanted:.0f}"

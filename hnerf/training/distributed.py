@@ -8,7 +8,7 @@ import torch.distributed as dist
 
 
 @dataclass(frozen=True)
-class Processes:
+class Distributed:
     """This process among its fellows, as torchrun started them; alone without torchrun."""
 
     rank: int
@@ -16,7 +16,7 @@ class Processes:
     device: torch.device
 
     @staticmethod
-    def join() -> "Processes":
+    def join() -> "Distributed":
         """Join the group that torchrun's environment describes: NCCL with one GPU a rank, else gloo on the CPU."""
         rank, world_size = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
         cuda = torch.cuda.is_available()
@@ -25,9 +25,9 @@ class Processes:
             torch.cuda.set_device(device)
         if world_size > 1 and not dist.is_initialized():
             dist.init_process_group("nccl" if cuda else "gloo")
-        return Processes(rank, world_size, device)
+        return Distributed(rank, world_size, device)
 
-    def greatest(self, value: float) -> float:
+    def all_max(self, value: float) -> float:
         """Of all processes' values."""
         if self.world_size == 1:
             return value
@@ -35,12 +35,12 @@ class Processes:
         dist.all_reduce(found, dist.ReduceOp.MAX)
         return float(found)
 
-    def wait(self) -> None:
+    def barrier(self) -> None:
         """For each other."""
         if self.world_size > 1:
             dist.barrier()
 
     @property
-    def leads(self) -> bool:
+    def is_main(self) -> bool:
         """Whether this process writes files and logs."""
         return self.rank == 0

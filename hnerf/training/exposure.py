@@ -48,11 +48,13 @@ def camera_gains(capture: Capture, masks: Masks, body: BodyFit) -> tuple[Gains, 
     if (np.abs(logs - usual)[known].max(1) < TELLING).mean() > MOST:
         logs = logs - usual
     furthest = float(np.abs(logs).max())
-    told = f"seeing the same places of the body, cameras differ from what is usual by {np.expm1(furthest):.0%} at most"
+    message = (
+        f"seeing the same places of the body, cameras differ from what is usual by {np.expm1(furthest):.0%} at most"
+    )
     if furthest < TELLING:
-        return {}, Decision(1.0, f"{told}: no more than shading may" if logs.any() else "no two cameras to compare")
+        return {}, Decision(1.0, f"{message}: no more than shading may" if logs.any() else "no two cameras to compare")
     gains = {name: (float(r), float(g), float(b)) for name, (r, g, b) in zip(names, np.exp(logs), strict=True)}
-    return gains, Decision(tuple(round(float(np.mean(g)), 3) for g in gains.values()), told)
+    return gains, Decision(tuple(round(float(np.mean(g)), 3) for g in gains.values()), message)
 
 
 def solve_gains(cameras: int, pairs: dict[tuple[int, int], np.ndarray]) -> np.ndarray:

@@ -15,7 +15,7 @@ from hnerf.capture.masks import Masks
 from hnerf.geometry.reach import Reached
 from hnerf.segmentation.edge import shaded_plate
 from hnerf.segmentation.prior import window_around
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import Pixels
 
 EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel may mix person and surroundings
@@ -43,7 +43,7 @@ def gather_pixels(
     reached: Reached | None,
     gains: Gains,
     folder: Path,
-    processes: Processes,
+    processes: Distributed,
 ) -> Pixels:
     """Pixels of the training cameras in `frames` that are reached from the fitted body, or on the mask; none where the
     mask was dropped. reached None: all pixels, without plates, for a field with a background of its own.
@@ -53,14 +53,14 @@ def gather_pixels(
     gives way to what is more urgent where they are not asked for. They have no name by the time this returns: the disk
     has their room again when the last process ends, however it ends.
     """
-    if processes.leads:
+    if processes.is_main:
         folder.mkdir(parents=True, exist_ok=True)
         _remove(folder)  # what a killed process left
         _write_pixels(capture, masks, body, frames, reached, gains, folder)
-    processes.wait()
+    processes.barrier()
     columns: dict[str, Any] = {name: _mapped(folder / f"{name}{SUFFIX}", *kind) for name, kind in COLUMNS.items()}
-    processes.wait()
-    if processes.leads:
+    processes.barrier()
+    if processes.is_main:
         _remove(folder)
     cameras = [capture.cameras[name] for name in capture.train_cameras]
     return Pixels(

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from hnerf.fields.conditions import Conditions, Draws, own_share
+from hnerf.fields.conditions import Conditions, Draws, shard
 from hnerf.training.auto_settings import Decision
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import Rays
-from hnerf.training.step import Stage
+from hnerf.training.step import PosedScene
 
 HALVES = 2  # of a batch, side by side on a CPU: operations are too small to share cores; two sums have one order only
 USABLE = 0.8  # of what is free: allocators lose some, and rays differ
@@ -38,11 +38,11 @@ class Parts:
     def backward(
         self,
         module: nn.Module,
-        stage: Stage,
+        scene: PosedScene,
         rays: Rays,
         conditions: Conditions,
         draws: Draws,
-        processes: Processes,
+        processes: Distributed,
     ) -> dict[str, Tensor]:
         """Add the gradients of this process's share of a joint batch to the parameters'; the losses by name.
 
@@ -53,11 +53,11 @@ class Parts:
 
         def of_part(part: int) -> dict[str, Tensor]:
             mine = processes.rank * n + part, world_size * n
-            own = own_share(rays, *mine)
+            own = shard(rays, *mine)
             weight = world_size * len(own.frame) / len(rays.frame)
             waiting = module if part < n - 1 and isinstance(module, DistributedDataParallel) else None
             with waiting.no_sync() if waiting else nullcontext():
-                terms = module(stage, own, conditions, own_share(draws, *mine))
+                terms = module(scene, own, conditions, shard(draws, *mine))
                 (weight * torch.stack(list(terms.values())).sum()).backward()
             return {name: weight * term.detach() for name, term in terms.items()}
 
@@ -66,7 +66,7 @@ class Parts:
 
 
 def decide_parts(
-    rays: int, memory_gib: float | None, attempt: Callable[[int], tuple[int, Tensor]], processes: Processes
+    rays: int, memory_gib: float | None, attempt: Callable[[int], tuple[int, Tensor]], processes: Distributed
 ) -> tuple[Parts, Decision]:
     """In how many parts each process takes so many rays a step, and why.
 
@@ -80,7 +80,7 @@ def decide_parts(
     each = max(1.0, (most - least) / (more - few))
     room = USABLE * _free_bytes(processes) if memory_gib is None else memory_gib * GIB
     most_rays = max(1.0, (room - least) / each + few)
-    count = int(processes.greatest(min(math.ceil(share / most_rays), max(1, share // 2))))
+    count = int(processes.all_max(min(math.ceil(share / most_rays), max(1, share // 2))))
     reason = "there is room for a step's rays"  # without figures, so that identical runs record the same
     if memory_gib or count > 1:
         needed_gib = (least + (share - few) * each) / GIB
@@ -112,12 +112,12 @@ def _peak_bytes(attempt: Callable[[int], tuple[int, Tensor]], about: int, device
     return rays, PEAK * sum(storage.nbytes() for storage in saved.values())
 
 
-def _free_bytes(processes: Processes) -> float:
+def _free_bytes(processes: Distributed) -> float:
     """On a GPU of one's own, or this process's share of the machine's; all one could ask for where nobody tells."""
     device = processes.device
     if device.type == "cuda":
         kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         return torch.cuda.mem_get_info(device)[0] + kept
-    told = MEMINFO.read_text().splitlines() if MEMINFO.exists() else []
-    free = [1024 * int(line.split()[1]) for line in told if line.startswith("MemAvailable:")]
+    message = MEMINFO.read_text().splitlines() if MEMINFO.exists() else []
+    free = [1024 * int(line.split()[1]) for line in message if line.startswith("MemAvailable:")]
     return free[0] / processes.world_size if free else sys.maxsize

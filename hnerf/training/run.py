@@ -16,8 +16,8 @@ from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.config import TrainingSettings
-from hnerf.errors import CaptureError, one_line
-from hnerf.training.distributed import Processes
+from hnerf.errors import InputError, one_line
+from hnerf.training.distributed import Distributed
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import train
 
@@ -32,12 +32,12 @@ def main() -> int:
     parser.add_argument("out", type=Path)
     a = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
-    processes = Processes.join()
+    processes = Distributed.join()
     try:
         capture = load_cameras(a.calibration, Capture.load(a.capture))
         settings = TrainingSettings.model_validate_json(a.settings)
         train(capture, Masks.load(a.masks), BodyFit.load(a.fit), settings, a.out, processes)
-    except CaptureError as error:
+    except InputError as error:
         print(error, file=sys.stderr)
         return 2
     except TrainingError as error:

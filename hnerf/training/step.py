@@ -11,7 +11,7 @@ from hnerf.config import TrainingSettings
 from hnerf.fields.base import Field
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.training import losses
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import Rays
 
 
@@ -20,7 +20,7 @@ class TrainingError(RuntimeError):
 
 
 @dataclass
-class Stage:
+class PosedScene:
     """What stands still within a step: the posed bodies and where their rays are sampled."""
 
     bodies: PosedBodies
@@ -34,11 +34,11 @@ class Objective(nn.Module):
         super().__init__()
         self.field, self.correction, self.settings = field, correction, settings
 
-    def forward(self, stage: Stage, rays: Rays, conditions: Conditions, draws: Draws) -> dict[str, Tensor]:
+    def forward(self, scene: PosedScene, rays: Rays, conditions: Conditions, draws: Draws) -> dict[str, Tensor]:
         """The weighted losses by name; their sum is minimised."""
-        target, draws = aim(rays, draws, self.field.own_background)
+        target, draws = make_target(rays, draws, self.field.own_background)
         samples, _ = self.field.sample(
-            stage.bodies, stage.region, rays.origins_m, rays.directions, rays.frame, conditions, draws, self.correction
+            scene.bodies, scene.region, rays.origins_m, rays.directions, rays.frame, conditions, draws, self.correction
         )
         s = self.settings.losses
         terms = {
@@ -56,7 +56,7 @@ class Objective(nn.Module):
         return {name: getattr(s, name) * term() for name, term in terms.items() if getattr(s, name)}
 
 
-def aim(rays: Rays, draws: Draws, own_background: bool) -> tuple[losses.Target, Draws]:
+def make_target(rays: Rays, draws: Draws, own_background: bool) -> tuple[losses.Target, Draws]:
     """What rays should look like, and what lies beyond their samples.
 
     A field with a background of its own aims at the photograph. One without is composited over the clean plate, so that
@@ -74,12 +74,12 @@ def aim(rays: Rays, draws: Draws, own_background: bool) -> tuple[losses.Target, 
     return losses.Target(colour, person, (~rays.edge).float()), draws
 
 
-def not_finite(terms: dict[str, Tensor], gradients: list[Tensor], step: int, processes: Processes) -> str | None:
+def not_finite(terms: dict[str, Tensor], gradients: list[Tensor], step: int, processes: Distributed) -> str | None:
     """None where all is finite in all processes, so that they go on or skip together; else which losses or gradients
     are not. A device is asked once."""
     values = torch.stack([value.detach() for value in terms.values()] + [g.sum() for g in gradients])
     finite = values.isfinite().tolist()
-    if not processes.greatest(float(not all(finite))):
+    if not processes.all_max(float(not all(finite))):
         return None
     if all(finite):
         return f"step {step}: not finite in another process"

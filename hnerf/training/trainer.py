@@ -23,17 +23,17 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.config import TrainingSettings
-from hnerf.fields.conditions import Conditions, Draws, joined, own_share
+from hnerf.fields.conditions import Conditions, Draws, joined, shard
 from hnerf.fields.samples import RaySamples
-from hnerf.training.auto_settings import Scene, decide
+from hnerf.training.auto_settings import SceneStatistics, decide
 from hnerf.training.checkpoint import load_checkpoint, save_checkpoint
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.exposure import camera_gains
 from hnerf.training.gather import gather_pixels
 from hnerf.training.losses import pixel
 from hnerf.training.parts import decide_parts
 from hnerf.training.pixels import AT_EDGES, Rays
-from hnerf.training.step import Objective, Stage, TrainingError, not_finite
+from hnerf.training.step import Objective, PosedScene, TrainingError, not_finite
 
 logger = logging.getLogger("hnerf.training")
 
@@ -53,10 +53,16 @@ class Trainer:
     """All state of one training; `run` goes from wherever the checkpoint left it to the end."""
 
     def __init__(
-        self, capture: Capture, masks: Masks, body: BodyFit, settings: TrainingSettings, out: Path, processes: Processes
+        self,
+        capture: Capture,
+        masks: Masks,
+        body: BodyFit,
+        settings: TrainingSettings,
+        out: Path,
+        processes: Distributed,
     ):
         began = time.monotonic()
-        self.settings, self.decisions = decide(Scene.of(capture, masks, body), settings)
+        self.settings, self.decisions = decide(SceneStatistics.of(capture, masks, body), settings)
         settings, self.out, self.processes = self.settings, out, processes
         device = processes.device
         torch.manual_seed(settings.seed)
@@ -81,7 +87,7 @@ class Trainer:
         self.step, self.skipped, self.seconds = 0, 0, 0.0
         self.field_steps, self.field_seconds = settings.steps, 0.0  # fewer steps where the time is up before
         self.history: list[dict[str, Any]] = []
-        self._stand(bodies)
+        self._set_poses(bodies)
         rays = settings.frames_per_step * settings.rays_per_frame
         self.parts, self.decisions["parts"] = decide_parts(rays, settings.memory_gib, self._attempt, processes)
         self._resume()
@@ -101,11 +107,11 @@ class Trainer:
         rate = self.settings.pose_learning_rate
         return [*self.field.parameter_groups(), {"params": list(self.objective.correction.parameters()), "lr": rate}]
 
-    def _stand(self, bodies: PosedBodies) -> None:
+    def _set_poses(self, bodies: PosedBodies) -> None:
         """Take the bodies as they stand now for the coming steps."""
-        moment = torch.arange(len(bodies.theta), device=bodies.theta.device)
-        self.conditions = Conditions.of(bodies.rig, bodies.theta, bodies.root, moment, self.settings.paper.scene_m)
-        self.stage = Stage(bodies, self.field.region(bodies, self.conditions))
+        frame_rows = torch.arange(len(bodies.theta), device=bodies.theta.device)
+        self.conditions = Conditions.of(bodies.rig, bodies.theta, bodies.root, frame_rows, self.settings.paper.scene_m)
+        self.scene = PosedScene(bodies, self.field.region(bodies, self.conditions))
 
     def run(self) -> dict[str, Any]:
         """Train to the end, write the subject's files and return the report."""
@@ -121,7 +127,7 @@ class Trainer:
                 self.optimizer.state.clear()  # its momentum would carry on the training poses
             terms = self._optimise(module)
             self.step += 1
-            self.seconds = self.processes.greatest(time.monotonic() - started)  # one clock, as rates follow it
+            self.seconds = self.processes.all_max(time.monotonic() - started)  # one clock, as rates follow it
             if self.step < self.field_steps and self.settings.seconds and self.seconds >= self.settings.seconds:
                 self.field_steps = self.step
             if self.step == self.field_steps:
@@ -132,41 +138,41 @@ class Trainer:
             if absorb_due or snapshot_due or checkpoint_due:  # who resumes finds the bodies where they stood
                 self._absorb()
             if snapshot_due:
-                if self.processes.leads:
+                if self.processes.is_main:
                     self._save(self.out / "snapshots" / f"{snapshots_s[0]:g}")
                 snapshots_s.pop(0)
-                self.processes.wait()
+                self.processes.barrier()
                 started = time.monotonic() - self.seconds  # watching takes no time
             if self.step % LOG_STEPS == 0 or self.step in (1, self.field_steps, self.steps):
                 self._record(terms)
-                if time.monotonic() - last_log > 5 and self.processes.leads:
+                if time.monotonic() - last_log > 5 and self.processes.is_main:
                     last_log = time.monotonic()
-                    told = _in_words(self.history[-1])
-                    logger.info("step %d of %d, %.0f s: %s", self.step, self.steps, self.seconds, told)
-            if checkpoint_due and self.processes.leads:
+                    message = _in_words(self.history[-1])
+                    logger.info("step %d of %d, %.0f s: %s", self.step, self.steps, self.seconds, message)
+            if checkpoint_due and self.processes.is_main:
                 save_checkpoint(self.out, self._state())
-        if self.processes.leads:
+        if self.processes.is_main:
             (self.out / "history.jsonl").write_text("".join(json.dumps(row) + "\n" for row in self.history))
         self._require_surface()
-        return self._finish() if self.processes.leads else {}
+        return self._finish() if self.processes.is_main else {}
 
     def _absorb(self) -> None:
-        self.stage.bodies.absorb(self.objective.correction, self.train_rows if self.settings.one_posture else None)
+        self.scene.bodies.absorb(self.objective.correction, self.train_rows if self.settings.one_posture else None)
         if self.step <= self.field_steps:
             self._learn_for_all()
-            self.field.tighten(self.stage.bodies.rig, self.conditions.pose[self.train_rows[::POSES_APART]])
-        self._stand(self.stage.bodies)
+            self.field.tighten(self.scene.bodies.rig, self.conditions.pose[self.train_rows[::POSES_APART]])
+        self._set_poses(self.scene.bodies)
 
     def _learn_for_all(self) -> None:
         """What training frames have in common holds for all poses: in one posture that is the posture itself."""
-        rows, bodies = self.train_rows, self.stage.bodies
+        rows, bodies = self.train_rows, self.scene.bodies
         self.field.learn_for_all(rows)
         if not self.field.common_rest or self.settings.one_posture or len(rows) < 2:
             return
         theta, root = bodies.theta.clone(), bodies.root.clone()
         fitted, tuned = ((t[rows], r[rows]) for t, r in ((self.body.theta, self.body.root), (theta, root)))
         rig, theta[rows], root[rows] = with_common_rest(bodies.rig, fitted, tuned)
-        bodies.stand(rig, theta, root)
+        bodies.set_poses(rig, theta, root)
 
     def _freeze_field(self) -> None:
         """What belongs to novel frames is fitted to the finished field, so that it never learns from their pixels."""
@@ -186,7 +192,7 @@ class Trainer:
         conditions = self.conditions.noisy(s.noise, self.generator)
         self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
-        terms = self.parts.backward(module, self.stage, rays, conditions, draws, self.processes)
+        terms = self.parts.backward(module, self.scene, rays, conditions, draws, self.processes)
         self.field.step_taken()
         if self.step >= self.field_steps:  # what pulls all frames back to the fit is not for frames that are finished
             for pose in (self.objective.correction.turn, self.objective.correction.move_m):
@@ -214,7 +220,7 @@ class Trainer:
         rows, noise = self.train_rows[: self.settings.frames_per_step][:ATTEMPTED_FRAMES], self.settings.noise
         rays = self.pixels.draw(rows, about // len(rows), generator, self.at_edges)
         draws = Draws.random(len(rays.frame), self.field.samples_in_training(1.0), noise, generator)
-        terms = self.objective(self.stage, rays, self.conditions.noisy(noise, generator), draws)
+        terms = self.objective(self.scene, rays, self.conditions.noisy(noise, generator), draws)
         return len(rays.frame), torch.stack(list(terms.values())).sum()
 
     def _done(self) -> float:
@@ -252,10 +258,10 @@ class Trainer:
         generator = torch.Generator(self.processes.device).manual_seed(self.settings.seed)
         rays = self.pixels.draw(rows, HELD_OUT_RAYS // len(rows) + 1, generator)
         parts, found = math.ceil(len(rays.frame) / self.parts.most_rays), []
-        for own in (own_share(rays, part, parts) for part in range(parts)):
-            draws = Draws.still(len(own.frame), count, self.processes.device)
+        for own in (shard(rays, part, parts) for part in range(parts)):
+            draws = Draws.deterministic(len(own.frame), count, self.processes.device)
             where = own.origins_m, own.directions, own.frame
-            found.append(self.field.sample(self.stage.bodies, self.stage.region, *where, self.conditions, draws)[0])
+            found.append(self.field.sample(self.scene.bodies, self.scene.region, *where, self.conditions, draws)[0])
         return rays, joined(found)
 
     def _require_surface(self) -> None:
@@ -273,7 +279,7 @@ class Trainer:
             raise TrainingError(f"the surface fills the box (covers {around:.0%} of the surroundings): check the masks")
 
     def _state(self) -> dict[str, Any]:
-        bodies = self.stage.bodies
+        bodies = self.scene.bodies
         return {
             "step": self.step,
             "skipped": self.skipped,
@@ -300,8 +306,10 @@ class Trainer:
         self.generator.set_state(state["generator"].cpu())
         self.history = json.loads(state["history"])
         rig = dataclasses.replace(self.body.rig, **state["rig"])
-        self.stage.bodies.stand(rig, state["theta"], state["root"])  # from the fit, as they did: bit by bit the same
-        self._stand(self.stage.bodies)
+        self.scene.bodies.set_poses(
+            rig, state["theta"], state["root"]
+        )  # from the fit, as they did: bit by bit the same
+        self._set_poses(self.scene.bodies)
         if self.step > self.field_steps:
             self._freeze_field()
         logger.info("resumed at step %d", self.step)
@@ -309,7 +317,7 @@ class Trainer:
     def _save(self, folder: Path) -> None:
         """What `load_avatar` reads: field, settings and fine-tuned body."""
         folder.mkdir(parents=True, exist_ok=True)
-        bodies = self.stage.bodies
+        bodies = self.scene.bodies
         BodyFit(bodies.rig, self.body.frames, bodies.theta, bodies.root).to("cpu").save(folder)
         write_field(self.field, folder / "model.safetensors")
         decisions = {name: dataclasses.asdict(decision) for name, decision in self.decisions.items()}
@@ -349,7 +357,7 @@ def train(
     body: BodyFit,
     settings: TrainingSettings,
     out: Path,
-    processes: Processes | None = None,
+    processes: Distributed | None = None,
 ) -> dict[str, Any]:
     """Train the subject into `out`, from its checkpoint where there is one; the report as a dict.
 
@@ -357,15 +365,15 @@ def train(
     `remove_checkpoint` is for the caller.
     Raises TrainingError where the surface collapses or the losses stay non-finite.
     """
-    return Trainer(capture, masks, body, settings, out, processes or Processes.join()).run()
+    return Trainer(capture, masks, body, settings, out, processes or Distributed.join()).run()
 
 
 def _in_words(row: dict[str, Any]) -> str:
     """A row of the history for who waits: losses that are not zero, and PSNR on unseen frames where there is any."""
-    told = [f"{name} {value:.2g}" for name, value in row["losses"].items() if value]
+    message = [f"{name} {value:.2g}" for name, value in row["losses"].items() if value]
     if "held_out" in row:
-        told.append(f"{row['held_out']['psnr']:.1f} dB on unseen frames")
-    return ", ".join(told)
+        message.append(f"{row['held_out']['psnr']:.1f} dB on unseen frames")
+    return ", ".join(message)
 
 
 def _device_name(device: torch.device) -> str:

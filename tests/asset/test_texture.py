@@ -43,7 +43,7 @@ def test_colours_are_read_on_the_fields_own_surface() -> None:
             return super().colour(points_m, directions, theta, root)
 
     body = bending_body()
-    clothes = upright_column(0.175, 0.2, 1.4)  # 1.5 cm outside the field's surface; its caps are far inside
+    clothes = upright_column(0.175, 0.2, 1.4)  # 1.5 cm outside the field's surface; its caps are far path_in_capture
     layout = unwrap(clothes.vertices, clothes.faces, 64)
     posed = dataclasses.replace(body, rig=dressed_rig(body.rig, clothes))
     bake(Recording(body), posed, layout, 64)

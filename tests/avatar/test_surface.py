@@ -5,7 +5,7 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from hnerf.avatar.surface import extract_surface
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 LOWER_M, UPPER_M = torch.tensor([-0.5, -0.6, -1.0]), torch.tensor([0.5, 0.6, 1.0])
 
@@ -52,5 +52,5 @@ def test_only_the_largest_component_stays() -> None:
     [(10.0, "everything is outside"), (-10.0, "everything is inside"), (-0.2, "fills its box"), (np.nan, "not finite")],
 )
 def test_a_field_without_a_closed_surface_is_refused(offset_m: float, message: str) -> None:
-    with pytest.raises(CaptureError, match=message):
+    with pytest.raises(InputError, match=message):
         extract_surface(lambda p: sphere(p) + offset_m, LOWER_M, UPPER_M, 32)

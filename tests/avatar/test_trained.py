@@ -13,7 +13,7 @@ from hnerf.avatar.model_file import write_field
 from hnerf.avatar.trained import build_field, load_avatar
 from hnerf.body.canonical import PosedBodies
 from hnerf.config import TrainingSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.fields.paper import PaperField
 from tests.training.scene import TINY, record
 
@@ -37,7 +37,7 @@ def subject(tmp_path: Path) -> Path:
 )
 def test_other_settings_are_refused(subject: Path, stored: dict[str, object]):
     (subject / "settings.json").write_text(json.dumps(stored))
-    with pytest.raises(CaptureError, match=r"settings\.json: of another version; train the subject again$"):
+    with pytest.raises(InputError, match=r"settings\.json: of another version; train the subject again$"):
         load_avatar(subject)
 
 
@@ -45,7 +45,7 @@ def test_a_field_without_its_body_is_refused(subject: Path):
     path = subject / "model.safetensors"
     load_avatar(subject)
     save_file({name: tensor for name, tensor in load_file(path).items() if name != "canonical_m"}, path)
-    with pytest.raises(CaptureError, match=r"model\.safetensors: of another version; train the subject again$"):
+    with pytest.raises(InputError, match=r"model\.safetensors: of another version; train the subject again$"):
         load_avatar(subject)
 
 
@@ -61,7 +61,7 @@ def test_the_more_samples_rays_have_the_fewer_are_rendered_at_once(subject: Path
     """Eight a ray, and room for 2048."""
     capture, _, body = record(subject / "capture")
     avatar, at_once = load_avatar(subject), []
-    look = avatar.field.look
+    look = avatar.field.render_rays
 
     def counted(bodies: PosedBodies, region: object, origins_m: Tensor, *rest: Any) -> Tensor:
         at_once.append(len(origins_m))

@@ -13,13 +13,13 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.config import TrainingSettings
 from hnerf.geometry.camera import Camera
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.trainer import train
 from tests.body.boxes import box_rig
 from tests.training.scene import SIZE_PX, KnownMasks, _write, look_at
 
 MIDDLE_M, RADIUS_M = np.full(3, 0.5), 0.35
-ALONE = Processes(0, 1, torch.device("cpu"))
+ALONE = Distributed(0, 1, torch.device("cpu"))
 RING = tuple("01234567")  # every 45 degrees
 
 

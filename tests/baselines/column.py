@@ -14,7 +14,7 @@ from hnerf.body.rig import pose_vertices
 from hnerf.capture.capture import Capture
 from hnerf.config import TrainingSettings
 from hnerf.evaluation.geometry import score_geometry
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.trainer import train
 from tests.body.boxes import box_rig
 from tests.training.scene import record
@@ -54,7 +54,7 @@ def learn(folder: Path, settings: TrainingSettings, bends_rad: tuple[float, floa
     """Train on the column bent as in the first two frames; the third is a novel pose."""
     capture, masks, body = record(folder / "capture", bends_rad)
     (folder / "out").mkdir()
-    train(capture, masks, body, settings, folder / "out", Processes(0, 1, torch.device("cpu")))
+    train(capture, masks, body, settings, folder / "out", Distributed(0, 1, torch.device("cpu")))
     return Learned(capture, body, load_avatar(folder / "out"))
 
 

@@ -7,7 +7,7 @@ from torch import Tensor
 from hnerf.avatar.trained import build_field
 from hnerf.baselines.idr import SdfNetwork, intersection, trace
 from hnerf.config import load_settings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tests.baselines.ball import RADIUS_M, RING, body, inner_psnr, psnr, radii_m, trained
 
 SMALL = [
@@ -117,7 +117,7 @@ def test_starts_as_a_sphere() -> None:
 
 
 def test_more_than_one_moment_is_refused() -> None:
-    with pytest.raises(CaptureError, match="IDR models one moment"):
+    with pytest.raises(InputError, match="IDR models one moment"):
         build_field(load_settings("idr").training, body(), static=False)
 
 

@@ -12,7 +12,7 @@ from hnerf.baselines.box import BAND_M, SURFACE_DENSITY_PER_M
 from hnerf.baselines.nerf import NerfField
 from hnerf.body.canonical import PosedBodies
 from hnerf.config import load_settings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.samples import RaySamples
 from hnerf.fields.shell import Boxes
@@ -65,7 +65,7 @@ def look(field: NerfField, jitter: Draws) -> tuple[RaySamples, Tensor]:
 def test_both_colours_by_hand(fog: NerfField) -> None:
     """Strata of 2 m / 24 with their samples at the start: both networks see the whole 2 m. Fine 0.75 (1 - e^-4) + e^-4,
     coarse 0.25 (1 - e^-1) + e^-1; the ray that misses the box sees white."""
-    still = Draws.still(2, 24, torch.device("cpu"))
+    still = Draws.deterministic(2, 24, torch.device("cpu"))
     zero = torch.zeros(2, 24)
     samples, depths = look(fog, dataclasses.replace(still, jitter=zero, finer=zero))
     assert samples.alpha.shape == depths.shape == (2, 72)
@@ -85,7 +85,7 @@ def test_fine_samples_crowd_where_the_coarse_network_saw_something(fog: NerfFiel
             return 1e4 * (point[..., 0] > 0.5).float(), torch.zeros_like(point)  # x > 1 m
 
     fog.coarse = Wall(0, 0)
-    _, depths = look(fog, Draws.still(2, 24, torch.device("cpu")))
+    _, depths = look(fog, Draws.deterministic(2, 24, torch.device("cpu")))
     first = 4 + 1 / 24  # the first coarse sample behind the wall's face
     assert ((depths[0, 24:] - first).abs() <= 1 / 24 + 1e-4).sum() >= 24
 
@@ -111,7 +111,7 @@ def test_distance_to_a_box_by_hand() -> None:
 
 
 def test_more_than_one_moment_is_refused() -> None:
-    with pytest.raises(CaptureError, match="NeRF models one moment"):
+    with pytest.raises(InputError, match="NeRF models one moment"):
         build_field(load_settings("nerf").training, body(), static=False)
 
 

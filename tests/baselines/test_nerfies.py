@@ -115,7 +115,7 @@ def look(field: NerfiesField, training: bool) -> RaySamples:
     bodies = PosedBodies(fit.rig, fit.theta, fit.root, field.canonical_m)
     conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.arange(3), 2.5)
     origins, directions = torch.tensor([[0.5, 0.4, 5.0]]), torch.tensor([[0.0, 0.0, -1.0]])
-    still = Draws.still(1, field.samples, torch.device("cpu"))
+    still = Draws.deterministic(1, field.samples, torch.device("cpu"))
     draws = Draws.random(1, field.samples, 0.0, torch.Generator().manual_seed(0)) if training else still
     row = torch.zeros(1, dtype=torch.long)
     return field.sample(bodies, field.region(bodies, conditions), origins, directions, row, conditions, draws)[0]

@@ -41,7 +41,7 @@ def posed(field: NeuralBodyField, root: torch.Tensor | None = None) -> tuple[Pos
 def look(field: NeuralBodyField, region: Surroundings, rows: list[int]) -> torch.Tensor:
     """Colour of two rays' samples in these rows."""
     bodies, conditions = posed(field)
-    draws = Draws.still(2, field.samples, torch.device("cpu"))
+    draws = Draws.deterministic(2, field.samples, torch.device("cpu"))
     return field.sample(bodies, region, *DOWN, torch.tensor(rows), conditions, draws)[0].colour
 
 

@@ -7,14 +7,14 @@ import torch
 
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.body_model import body_model
-from hnerf.body.fit import fit_body, problem_of, unflipped
+from hnerf.body.fit import fit_body, problem_of, resolve_depth_flips
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.keypoint_fit import Likely, Problem, levenberg_marquardt, metres_per_pixel
+from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel
 from hnerf.body.observations import observe, runs
 from hnerf.body.pose_prior import Smoothness
 from hnerf.body.rig import Rig, joint_transforms
 from hnerf.config import FitSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tests.body.recorded_body import Silhouettes, moving_body, record, ring_camera
 from tests.body.test_articulation import random_pose
 from tests.body.two_bone import two_bone_rig
@@ -67,9 +67,9 @@ def test_neighbours_outvote_an_arm_mirrored_in_depth(tmp_path: Path) -> None:
         return float((where[0] - where[1]).norm())
 
     assert off_m(mirrored) > 0.5  # descent alone stays there
-    mended = unflipped(problem, mirrored, runs(capture))
+    mended = resolve_depth_flips(problem, mirrored, runs(capture))
     assert off_m(mended) < 0.02
-    assert unflipped(problem, mended, runs(capture)).theta.sub(mended.theta).abs().max() < 0.02
+    assert resolve_depth_flips(problem, mended, runs(capture)).theta.sub(mended.theta).abs().max() < 0.02
 
 
 @pytest.mark.parametrize("cameras", [("0",), ("0", "1", "2", "3")])
@@ -101,10 +101,10 @@ def test_a_person_seen_by_too_few_cameras_is_bad_input(tmp_path: Path) -> None:
         keypoints = dict(stored)
     keypoints["1"][1:, ..., 2] = 0
     np.savez(tmp_path / "keypoints.npz", **keypoints)
-    with pytest.raises(CaptureError, match=r"keypoints.npz: head and trunk .* in only 1 of 3 frames"):
+    with pytest.raises(InputError, match=r"keypoints.npz: head and trunk .* in only 1 of 3 frames"):
         fit_body(capture, None, FitSettings())
     (tmp_path / "keypoints.npz").unlink()
-    with pytest.raises(CaptureError, match=r"no keypoints"):
+    with pytest.raises(InputError, match=r"no keypoints"):
         fit_body(capture, None, FitSettings())
 
 
@@ -128,7 +128,7 @@ def test_the_normal_equations_hold_the_gradient_of_the_cost(tmp_path: Path) -> N
         return replace(rig, beta=beta, vertices_m=vertices_m, joints_m=joints_m)
 
     pose, one = random_pose(rig, 3), torch.ones(1, dtype=torch.float64)
-    likely = Likely(0.02, 0.5, 0.02, 2.0, 0.1, 0 * one, one, -9 * one, 9 * one)
+    likely = FitPriors(0.02, 0.5, 0.02, 2.0, 0.1, 0 * one, one, -9 * one, 9 * one)
     rough = Smoothness([(0, 1, 2)], 25.0, np.full(25, 1e9))
     problem = Problem(seen, metres_per_pixel(seen.cameras, pose), likely, rough, reshape)
     generator = torch.Generator().manual_seed(0)

@@ -10,12 +10,12 @@ from hnerf.body.anny import anny_rig
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.balance import Balance, centre_of_mass_over_feet
 from hnerf.body.body_model import body_model
-from hnerf.body.fit import as_still_as_seen, problem_of
+from hnerf.body.fit import hold_single_posture, problem_of
 from hnerf.body.keypoint_fit import Problem, levenberg_marquardt
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.observations import observe, runs
 from hnerf.body.pose_prior import Smoothness
-from hnerf.body.posture_prior import Habit, turning
+from hnerf.body.posture_prior import PosturePrior, turning
 from hnerf.body.rig import rotation_from_axis_angle
 from hnerf.config import FitSettings
 from tests.body.recorded_body import moving_body, record, ring_camera
@@ -38,7 +38,7 @@ def turned(yaw: list[float], bend: list[float]) -> Pose:
 
 def habit_of(pose: Pose) -> tuple[float, NormalEquations]:
     articulation = Articulation(pose.rig)
-    habit = Habit.of_one_view([list(range(len(pose.theta)))], pose, CAMERA)
+    habit = PosturePrior.of_one_view([list(range(len(pose.theta)))], pose, CAMERA)
     equations = NormalEquations(len(pose.theta), articulation.unknowns, habit.unknowns(articulation))
     return habit.add(equations, articulation, pose), equations
 
@@ -85,7 +85,7 @@ def test_who_stands_still_is_held_to_it() -> None:
     most."""
     degrees, groups = torch.tensor([30.0, 35.0, 40.0, 0.0, 0.0, 15.0]).double(), [[0, 1, 2], [3, 4, 5]]
     pose = turned([0.0, 2.0, 4.0] * 2, degrees.deg2rad().tolist())
-    habit = Habit.of_one_view(groups, pose, CAMERA)
+    habit = PosturePrior.of_one_view(groups, pose, CAMERA)
     torch.testing.assert_close(habit.learned(pose).spread[[0, 3], 0].rad2deg(), torch.tensor([5 / 1.54, 2.0]).double())
     wild = turned([0.0, 2.0, 4.0] * 2, (3 * degrees).deg2rad().tolist())
     torch.testing.assert_close(habit.learned(wild).spread[[0, 3], 0].rad2deg(), torch.tensor([7.0, 2.0]).double())
@@ -94,7 +94,7 @@ def test_who_stands_still_is_held_to_it() -> None:
 def test_only_wrists_have_a_habit_that_several_cameras_need() -> None:
     """5 degrees off the median in one frame of three cost 0.5 / (1 + 1/4) at a wrist, and nothing at an elbow."""
     articulation = Articulation(anny_rig().to(dtype=torch.float64))
-    habit, names = Habit.of_hands(3, articulation), articulation.rig.joint_names
+    habit, names = PosturePrior.of_hands(3, articulation), articulation.rig.joint_names
     for name, cost in (("wrist.L", 0.4), ("lowerarm01.R", 0.0)):
         pose = random_pose(articulation.rig, 3)
         pose = replace(pose, theta=torch.zeros_like(pose.theta))
@@ -129,23 +129,23 @@ def test_who_turns_in_one_posture_is_held_to_it(sway_deg: float, held: bool, tmp
     """Within a thousandth of a radian; arms that swing by 10 degrees keep doing so."""
     problem, begin = turning_person(tmp_path, sway_deg)
     problem = replace(problem, balance=Balance(up=2))
-    habit = Habit.of_one_view([list(range(8))], begin, problem.seen.cameras[0])
+    habit = PosturePrior.of_one_view([list(range(8))], begin, problem.seen.cameras[0])
     first = levenberg_marquardt(replace(problem, habit=habit), begin, problem.in_images, 30)
-    pose, kept = as_still_as_seen(problem, first, habit)
+    pose, kept = hold_single_posture(problem, first, habit)
     arms = pose.theta[:, [begin.rig.joint_names.index(bone) for bone in ARMS]]
-    spread_rad = (arms - arms.mean(0)).norm(dim=-1).mean()
-    assert (spread_rad < 1e-3) if held else (spread_rad > math.radians(5))
+    std_rad = (arms - arms.mean(0)).norm(dim=-1).mean()
+    assert (std_rad < 1e-3) if held else (std_rad > math.radians(5))
     assert math.isclose(kept.spread.rad2deg().max(), 0.1, rel_tol=1e-9) == held
 
 
 def test_one_posture_is_told_from_all_sides_only() -> None:
     """Three sides are, two views square to each other (trust 0.29) are not; the spread there stays."""
     pose = turned([0.0, 2.0, 4.0, 0.0, math.pi / 2], [0.0] * 5)
-    habit = Habit.of_one_view([[0, 1, 2], [3, 4]], pose, CAMERA)
+    habit = PosturePrior.of_one_view([[0, 1, 2], [3, 4]], pose, CAMERA)
     still = habit.of_one_posture()
     assert still is not None
     torch.testing.assert_close(still.spread[[0, 3], 0].rad2deg(), torch.tensor([0.1, 7.0]).double())
-    assert Habit.of_one_view([[0, 1], [2, 3, 4]], turned([0.0] * 5, [0.0] * 5), CAMERA).of_one_posture() is None
+    assert PosturePrior.of_one_view([[0, 1], [2, 3, 4]], turned([0.0] * 5, [0.0] * 5), CAMERA).of_one_posture() is None
 
 
 def test_a_person_who_turns_before_one_camera_neither_leans_nor_sways(tmp_path: Path) -> None:
@@ -158,13 +158,13 @@ def test_a_person_who_turns_before_one_camera_neither_leans_nor_sways(tmp_path: 
         x, _, _ = articulation.jacobian(articulation.keypoints(), articulation.pose(pose))
         return torch.einsum("k,nkc->nc", centre_of_mass_over_feet(), x)[:, :2]
 
-    def lean_and_sway(balance: Balance | None, habit: Habit | None) -> tuple[float, float]:
+    def lean_and_sway(balance: Balance | None, habit: PosturePrior | None) -> tuple[float, float]:
         pose = levenberg_marquardt(replace(problem, balance=balance, habit=habit), begin, problem.in_images, 30)
         turns = pose.theta[:, arms]
         lean_m = (over_feet(pose) - over_feet(begin)).norm(dim=-1).mean()
         return float(lean_m), float((turns - turns.mean(0)).norm(dim=-1).mean())
 
-    habit = Habit.of_one_view([list(range(8))], begin, problem.seen.cameras[0])
+    habit = PosturePrior.of_one_view([list(range(8))], begin, problem.seen.cameras[0])
     lean_m, sway = lean_and_sway(None, None)
     mended_lean_m, mended_sway = lean_and_sway(Balance(up=2), habit)
     assert mended_lean_m < 0.7 * lean_m and mended_sway < 0.5 * sway

@@ -15,7 +15,7 @@ from hnerf.body.rig import joint_transforms, pose_vertices
 from hnerf.body.smpl import read_smpl
 from hnerf.capture.given_poses import GivenPoses
 from hnerf.config import FitSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tests.body.made_up_smpl import LEFT_ELBOW, PARENTS, made_up_smpl, write_smpl
 from tests.body.recorded_body import record, ring_camera
 
@@ -158,6 +158,6 @@ def test_what_is_no_model_is_refused(case: str, tmp_path: Path) -> None:
     path = tmp_path / "m.npz"
     path.write_bytes(b"")
     damage(path)
-    with pytest.raises(CaptureError, match=names) as refusal:
+    with pytest.raises(InputError, match=names) as refusal:
         body_model(FitSettings(body_model=path))
     assert "m.npz" in str(refusal.value)

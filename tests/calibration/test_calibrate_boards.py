@@ -17,7 +17,7 @@ from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.lens import Lens
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import look_at, turned, write_capture
 from tests.shared_data import shared_capture
@@ -107,7 +107,7 @@ def test_a_pose_needs_six_corners_in_two_rows() -> None:
 def test_unlinked_cameras_are_refused() -> None:
     corners_px = seen(rig(), {})
     corners_px[2, 2:] = np.nan  # c shares two frames
-    with pytest.raises(CaptureError, match="camera c: shares fewer than 3 frames"):
+    with pytest.raises(InputError, match="camera c: shares fewer than 3 frames"):
         solve_rig(rig(), BOARD.corners_m, corners_px)
 
 
@@ -185,7 +185,7 @@ def test_close_footage_gives_the_intrinsics(tmp_path: Path, monkeypatch: pytest.
     assert calibration.lenses["a"].K[0, 0] == pytest.approx(900, rel=0.005)
     assert calibration.intrinsics["a"].startswith("from intrinsic/: 20 pictures")
     read["intrinsic"] = footage("intrinsic", close_up(0.7)[:9])
-    with pytest.raises(CaptureError, match="intrinsic/a: does not fix the intrinsics"):
+    with pytest.raises(InputError, match="intrinsic/a: does not fix the intrinsics"):
         calibrate_from_boards(tmp_path)
 
 
@@ -244,7 +244,7 @@ def test_the_floor_is_the_board_that_lies_on_it(tmp_path: Path, monkeypatch: pyt
     for camera, lens in zip(cameras, calibration.lenses.values(), strict=True):
         assert -lens.R.T @ lens.t_m == pytest.approx(camera.centre_m - flat[1], abs=0.005)
     assert compare_pairs(cameras, calibration.fit.cameras)["a-c"]["turned_deg"] < 0.1
-    with pytest.raises(CaptureError, match="no board in frame 7"):
+    with pytest.raises(InputError, match="no board in frame 7"):
         calibrate_from_boards(tmp_path, ground_frame=7)
     calibration.save(tmp_path / "out")
     written = EasyMocap(tmp_path / "out").lenses()
@@ -257,7 +257,7 @@ def test_a_board_that_is_found_nowhere_is_hardly_that_board(tmp_path: Path, monk
     found["a"][2:] = np.nan
     footage = BoardFootage(tmp_path, BOARD, tuple(range(9)), 1, found, dict.fromkeys("ab", (1000, 1000)))
     monkeypatch.setattr(calibration_boards, "read_board_footage", lambda *_: footage)
-    with pytest.raises(CaptureError, match="this board was found in 2 of 18 pictures; check its columns"):
+    with pytest.raises(InputError, match="this board was found in 2 of 18 pictures; check its columns"):
         calibrate_from_boards(tmp_path)
 
 

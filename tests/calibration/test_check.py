@@ -13,7 +13,7 @@ from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.config import CalibrationSettings, CaptureSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import STANDING_M, detections, ring, turned, walk_m, write_capture
 from tests.shared_data import shared_capture
@@ -157,7 +157,7 @@ def test_when_all_are_stale_the_world_stays(tmp_path: Path) -> None:
 def test_each_wrong_convention_is_named(tmp_path: Path, cause: str) -> None:
     make: dict[str, Mistake] = dict(MISTAKES)  # all but one undo themselves
     make["T is the camera's centre"] = lambda c: dataclasses.replace(c, t_m=c.centre_m)
-    with pytest.raises(CaptureError) as caught:
+    with pytest.raises(InputError) as caught:
         check_calibration(recorded_with(tmp_path, make[cause]), SETTINGS)
     assert cause in str(caught.value)
     assert " or " not in str(caught.value)
@@ -169,7 +169,7 @@ def test_each_wrong_convention_is_named(tmp_path: Path, cause: str) -> None:
 def test_intrinsics_of_another_picture_size_are_named(tmp_path: Path, count: int, ratio: float) -> None:
     """Units are not blamed, though the person would be 0.4 to 8.5 m tall."""
     wrong = recorded_with(tmp_path, lambda c: dataclasses.replace(c, K=np.diag([ratio, ratio, 1]) @ c.K), count=count)
-    with pytest.raises(CaptureError, match=r"pictures of different sizes \(K times [0-9.]+ would fit\)") as caught:
+    with pytest.raises(InputError, match=r"pictures of different sizes \(K times [0-9.]+ would fit\)") as caught:
         check_calibration(wrong, SETTINGS)
     assert float(str(caught.value).split("times ")[1].split()[0]) == pytest.approx(1 / ratio, rel=0.02)
 
@@ -190,7 +190,7 @@ def test_a_wrong_convention_in_one_camera_is_named(tmp_path: Path) -> None:
 
 
 def test_millimetres_are_named(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match=r"1793 m tall; .* millimetres; in capture.toml multiply units .* by 0.001$"):
+    with pytest.raises(InputError, match=r"1793 m tall; .* millimetres; in capture.toml multiply units .* by 0.001$"):
         check_calibration(
             recorded_with(tmp_path, lambda c: dataclasses.replace(c, t_m=1000 * c.t_m), noise_px=0), SETTINGS
         )
@@ -198,7 +198,7 @@ def test_millimetres_are_named(tmp_path: Path) -> None:
 
 def test_metres_declared_as_millimetres_are_not_taken_for_one_place(tmp_path: Path) -> None:
     tiny = recorded_with(tmp_path, lambda c: dataclasses.replace(c, t_m=0.001 * c.t_m), noise_px=0)
-    with pytest.raises(CaptureError, match=r"metres declared as millimetres; .* by 1000$"):
+    with pytest.raises(InputError, match=r"metres declared as millimetres; .* by 1000$"):
         check_calibration(tiny, SETTINGS)
 
 
@@ -215,7 +215,7 @@ def test_swapped_files_fit_no_convention(tmp_path: Path) -> None:
     shuffled = [
         dataclasses.replace(cameras[1], name="c0"), dataclasses.replace(cameras[0], name="c1"), *cameras[2:]
     ]  # fmt: skip
-    with pytest.raises(CaptureError, match="no known mistake explains it"):
+    with pytest.raises(InputError, match="no known mistake explains it"):
         check_calibration(write_capture(tmp_path, shuffled, detections(cameras, 1)), SETTINGS)
 
 
@@ -223,7 +223,7 @@ def test_cameras_at_one_place_are_named(tmp_path: Path) -> None:
     def moved(camera: Camera) -> Camera:
         return dataclasses.replace(ring(4)[1], name=camera.name)
 
-    with pytest.raises(CaptureError, match="c0 and c1 stand at one place"):
+    with pytest.raises(InputError, match="c0 and c1 stand at one place"):
         check_calibration(recorded_with(tmp_path, moved, only=0), SETTINGS)
 
 
@@ -231,7 +231,7 @@ def test_a_camera_that_never_shows_the_person_is_named(tmp_path: Path) -> None:
     cameras = ring(4)
     seen = detections(cameras, noise_px=1)
     seen["c2"] = 0 * seen["c2"]
-    with pytest.raises(CaptureError, match="camera c2 never shows the person"):
+    with pytest.raises(InputError, match="camera c2 never shows the person"):
         check_calibration(write_capture(tmp_path, cameras, seen), SETTINGS)
 
 

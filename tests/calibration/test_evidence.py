@@ -10,7 +10,7 @@ import pytest
 
 from hnerf.calibration.check import check_calibration
 from hnerf.calibration.diagnosis import measure
-from hnerf.calibration.evidence import Witnesses
+from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.report import load_cameras
 from hnerf.calibration.sheet import draw_witnesses
@@ -54,7 +54,7 @@ def test_matches_of_a_pair_speak_for_both_cameras(wave: Capture, tmp_path: Path)
     matched = np.stack([camera.project(point_m)[0] for camera in cameras[:2]], 1)
     matched[0, 0, 1] += 3
     outlines = Outlines({"01": [None], "02": [None]}, (0,))
-    witnesses = Witnesses(wave, keypoints, outlines, Matches({("01", "02"): matched}, wave.frames[0]), None)
+    witnesses = Evidence(wave, keypoints, outlines, Matches({("01", "02"): matched}, wave.frames[0]), None)
     said = witnesses.plain(cameras, measure(cameras, keypoints))
     assert said["matches"]["01"] == said["matches"]["02"] == said["match_pairs"]["01 and 02"]
     assert said["matches"]["01"]["count"] == 1 and 1 < said["matches"]["01"]["median_px"] < 3
@@ -66,7 +66,7 @@ def test_matches_of_a_pair_speak_for_both_cameras(wave: Capture, tmp_path: Path)
 def test_without_masks_the_report_says_so(wave: Capture) -> None:
     cameras = [wave.cameras[name] for name in wave.train_cameras]
     keypoints = np.stack([subject_keypoints(wave)[name] for name in wave.train_cameras])
-    said = Witnesses(wave, keypoints, None, Matches({}, 0), None).plain(cameras, measure(cameras, keypoints))
+    said = Evidence(wave, keypoints, None, Matches({}, 0), None).plain(cameras, measure(cameras, keypoints))
     assert said["silhouettes"].startswith("none: ") and said["match_pairs"] == "no overlap: no matches"
 
 

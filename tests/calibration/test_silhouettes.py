@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hnerf.calibration.silhouettes import Outline, Outlines
+from hnerf.calibration.silhouettes import MaskOutline, Outlines
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
@@ -27,7 +27,7 @@ def mask(camera: Camera, corners_m: np.ndarray = CORNERS_M) -> np.ndarray:
 
 
 def outlines(cameras: list[Camera], corners_m: np.ndarray = CORNERS_M) -> Outlines:
-    return Outlines({camera.name: [Outline.around(mask(camera, corners_m))] for camera in cameras}, (0,))
+    return Outlines({camera.name: [MaskOutline.around(mask(camera, corners_m))] for camera in cameras}, (0,))
 
 
 def test_distance_and_points_by_hand() -> None:
@@ -35,7 +35,7 @@ def test_distance_and_points_by_hand() -> None:
     square[5:15, 10:20] = True
     square[8:10, 12:14] = False  # a hole and a speck are faults of the mask
     square[0, 0] = True
-    found = Outline.around(square)
+    found = MaskOutline.around(square)
     assert found is not None
     assert found.distance_px[10, 25] == 5.5 and found.distance_px[10, 15] == -4.5 and found.distance_px[9, 13] < 0
     # The edge lies half a pixel outside the centres of the first and last pixels inside.
@@ -44,12 +44,12 @@ def test_distance_and_points_by_hand() -> None:
 
 
 def test_no_outline_where_the_image_ends() -> None:
-    assert Outline.around(np.zeros((20, 30), bool)) is None
+    assert MaskOutline.around(np.zeros((20, 30), bool)) is None
     cut_off = np.zeros((20, 30), bool)
     cut_off[10:, 5:15] = True
-    found = Outline.around(cut_off)
+    found = MaskOutline.around(cut_off)
     assert found is not None and found.points_px[:, 1].max() < 18
-    assert Outline.around(np.ones((20, 30), bool)) is None  # the camera stands too near to see any edge
+    assert MaskOutline.around(np.ones((20, 30), bool)) is None  # the camera stands too near to see any edge
 
 
 def test_a_true_rig_costs_nothing() -> None:

@@ -10,7 +10,7 @@ from hnerf.calibration.report import load_cameras
 from hnerf.calibration.synchronise import measure_timing, put_in_step, synchronise
 from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tests.calibration.synthetic import STANDING_M, ring, turned, write_capture
 
 SETTINGS = CalibrationSettings()
@@ -107,7 +107,7 @@ def test_the_report_corrects_and_says_so(tmp_path: Path, no_pictures: None) -> N
 def test_strided_frames_say_what_to_cut(tmp_path: Path, no_pictures: None) -> None:
     strided = recorded({"c0": -2.0, "c1": 0.0}, frames=4 * FRAMES)[:, ::4]
     capture = capture_of(tmp_path, strided, frames=tuple(range(0, 4 * FRAMES, 4)))
-    with pytest.raises(CaptureError) as caught:
+    with pytest.raises(InputError) as caught:
         check_calibration(capture, SETTINGS)
     assert "camera c0 by -2." in str(caught.value)
     assert "2 from camera c1, 2 from camera c2, 2 from camera c3" in str(caught.value)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hnerf.capture.subject import subject_keypoints
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import triangulate
 from tests.calibration.synthetic import detections, ring, walk_m, write_capture
@@ -122,5 +122,5 @@ def test_test_cameras_are_never_read(tmp_path: Path) -> None:
 def test_nobody_is_an_error(tmp_path: Path) -> None:
     cameras = ring(3)
     seen = {name: k * [1, 1, name == "c0"] for name, k in detections(cameras, 1).items()}
-    with pytest.raises(CaptureError, match="no person"):
+    with pytest.raises(InputError, match="no person"):
         subject_keypoints(write_capture(tmp_path, cameras, seen))

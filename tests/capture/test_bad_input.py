@@ -11,7 +11,7 @@ import pytest
 
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tests.capture import recordings as rec
 
 
@@ -197,7 +197,7 @@ def _cut_video(path: Path) -> None:
 
 
 def _refused(folder: Path, tmp_path: Path, names: str) -> None:
-    with pytest.raises(CaptureError) as refusal:
+    with pytest.raises(InputError) as refusal:
         ingest(folder, CaptureSettings(), tmp_path / "out")
     message = str(refusal.value)
     assert names in message and "\n" not in message and len(message) < 400

@@ -11,7 +11,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.capture.lens import Lens
 from hnerf.config import CaptureSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tests.capture.recordings import WIDTH, picture, write_easymocap, write_png
 
 LENS = Lens(
@@ -83,5 +83,5 @@ def test_a_size_that_bars_do_not_explain_is_refused(tmp_path: Path) -> None:
     folder = write_easymocap(tmp_path / "in")
     for path in sorted((folder / "images" / "01").iterdir()):
         write_png(path, np.pad(picture("01", int(path.stem)), ((20, 20), (0, 9), (0, 0)), mode="wrap"))
-    with pytest.raises(CaptureError, match=r"000000.png: is 33 x 56 px, but camera 01 was calibrated at 24 x 16"):
+    with pytest.raises(InputError, match=r"000000.png: is 33 x 56 px, but camera 01 was calibrated at 24 x 16"):
         ingest(folder, CaptureSettings(), tmp_path / "out")

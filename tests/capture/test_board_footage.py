@@ -12,7 +12,7 @@ from hnerf.capture.board_footage import Board, Detector, load_board_corners, rea
 from hnerf.capture.footage import Video
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tests.capture import recordings as rec
 
 CHARUCO = """
@@ -80,7 +80,7 @@ def test_capture_toml_describes_a_board_too(tmp_path: Path) -> None:
 )
 def test_bad_descriptions_are_refused(table: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "capture.toml").write_text(f"[board]\n{table}\n")
-    with pytest.raises(CaptureError, match="capture.toml.*" + message):
+    with pytest.raises(InputError, match="capture.toml.*" + message):
         read_board(tmp_path)
 
 
@@ -121,7 +121,7 @@ def test_dropped_frames_are_placed_by_the_table(tmp_path: Path) -> None:
     assert np.isfinite(footage.corners_px["cam_0"]).all((1, 2)).tolist() == [False, False, True]
     assert np.isnan(footage.corners_px["cam_1"]).all()
     (root / "timestamps.csv").write_text("\n".join(rows[:-1]))
-    with pytest.raises(CaptureError, match=r"timestamps\.csv: 1 rows of cam_0, but 2 frames"):
+    with pytest.raises(InputError, match=r"timestamps\.csv: 1 rows of cam_0, but 2 frames"):
         read_board_footage(tmp_path, "extrinsic")
 
 
@@ -139,7 +139,7 @@ def test_videos_of_other_lengths_are_refused(tmp_path: Path) -> None:
     (tmp_path / "charuco.toml").write_text(CHARUCO)
     for camera, count in {"cam_0": 3, "cam_1": 4}.items():
         rec.write_video(tmp_path / "calibration" / "extrinsic" / f"{camera}.mp4", count)
-    with pytest.raises(CaptureError, match="videos differ in length"):
+    with pytest.raises(InputError, match="videos differ in length"):
         read_board_footage(tmp_path, "extrinsic")
     assert read_board_footage(tmp_path, "intrinsic") is None
 
@@ -149,14 +149,14 @@ def test_links_in_the_footage_are_refused(tmp_path: Path) -> None:
     (tmp_path / "capture" / "calibration" / "extrinsic").mkdir(parents=True)
     (tmp_path / "capture" / "calibration" / "extrinsic" / "cam_0").symlink_to(tmp_path / "secret")
     (tmp_path / "capture" / "charuco.toml").write_text(CHARUCO)
-    with pytest.raises(CaptureError, match="cam_0: is a symbolic link"):
+    with pytest.raises(InputError, match="cam_0: is a symbolic link"):
         read_board_footage(tmp_path / "capture", "extrinsic")
 
 
 def test_a_wanted_frame_that_is_not_there_is_refused(tmp_path: Path) -> None:
     (tmp_path / "charuco.toml").write_text(CHARUCO)
     rec.write_video(tmp_path / "calibration" / "extrinsic" / "cam_0.mp4", 3)
-    with pytest.raises(CaptureError, match="extrinsic: has no frame 3; name one of 0 to 2"):
+    with pytest.raises(InputError, match="extrinsic: has no frame 3; name one of 0 to 2"):
         read_board_footage(tmp_path, "extrinsic", 3)
 
 

@@ -19,7 +19,7 @@ from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.ingest import ingest, recognise
 from hnerf.capture.lens import Lens
 from hnerf.config import CaptureSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tests.capture import recordings as rec
 
 CAMERAS_TXT = "# Camera list\n1 SIMPLE_RADIAL 640 480 500 320 240 0.1\n2 PINHOLE 24 16 20 21 12 8\n"
@@ -79,7 +79,7 @@ def test_hostile_colmap_models_are_refused(name: str, at: int, value: bytes, tmp
     data = bytearray(path.read_bytes())
     data[at : at + len(value)] = value
     path.write_bytes(data)
-    with pytest.raises(CaptureError, match=name):
+    with pytest.raises(InputError, match=name):
         Colmap(tmp_path).lenses()
 
 
@@ -96,7 +96,7 @@ def test_colmap_models_that_make_no_cameras_are_refused(old: str, new: str, mess
     path = write_model(tmp_path) / "sparse" / "0" / "images.txt"
     assert old in IMAGES_TXT
     path.write_text(IMAGES_TXT.replace(old, new))
-    with pytest.raises(CaptureError, match=message):
+    with pytest.raises(InputError, match=message):
         Colmap(tmp_path).lenses()
 
 
@@ -119,7 +119,7 @@ def test_what_is_written_reads_back(layout: str, reader: type[Layout], tmp_path:
 
 @pytest.mark.parametrize("layout", ["colmap", "caliscope", "aniposelib"])
 def test_files_that_must_say_a_size_are_not_written_without(layout: str, tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match="camera cam_3 has no size; add W_cam_3 and H_cam_3"):
+    with pytest.raises(InputError, match="camera cam_3 has no size; add W_cam_3 and H_cam_3"):
         write_cameras(tmp_path, [LENSES[0], dataclasses.replace(LENSES[1], size_px=None)], layout)
     assert list(tmp_path.iterdir()) == []
 
@@ -159,10 +159,10 @@ def test_caliscope_cameras_that_are_ignored_stay_away(tmp_path: Path) -> None:
     assert list(recognise(tmp_path).lenses()) == ["cam_3", "cam_4"]
     for name in ("../3", "cam 3 "):  # OpenCV, which keeps the cameras that are used, drops a blank at the end
         (tmp_path / "camera_array.toml").write_text(text.replace("cam_id = 3", f'cam_id = "{name}"'))
-        with pytest.raises(CaptureError, match="camera name"):
+        with pytest.raises(InputError, match="camera name"):
             recognise(tmp_path).lenses()
     (tmp_path / "camera_array.toml").write_text("cameras = [1]\n")
-    with pytest.raises(CaptureError, match="no tables"):
+    with pytest.raises(InputError, match="no tables"):
         recognise(tmp_path).lenses()
 
 

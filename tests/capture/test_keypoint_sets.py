@@ -10,7 +10,7 @@ from hnerf.capture.ingest import ingest
 from hnerf.capture.keypoint_files import read_openpose, read_results
 from hnerf.capture.keypoint_sets import SETS, KeypointSetName, is_body_25, to_body_25
 from hnerf.config import CaptureSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tests.capture import recordings as rec
 
 
@@ -79,13 +79,13 @@ def test_a_camera_that_sees_nobody_has_no_confidence() -> None:
 
 
 def test_a_named_set_of_another_size_is_bad_input() -> None:
-    with pytest.raises(CaptureError, match=r'keypoints = "halpe_26" has 26 points, but camera 01 has 17'):
+    with pytest.raises(InputError, match=r'keypoints = "halpe_26" has 26 points, but camera 01 has 17'):
         converted(17, "halpe_26")
 
 
 def test_an_unknown_number_of_points_names_the_known_sets(tmp_path: Path) -> None:
     rec.write_keypoints(tmp_path / "a.json", [points(19)])
-    with pytest.raises(CaptureError, match=r"a\.json: 19 keypoints a person; .* coco_17 \(17\), .* halpe_26 \(26\)"):
+    with pytest.raises(InputError, match=r"a\.json: 19 keypoints a person; .* coco_17 \(17\), .* halpe_26 \(26\)"):
         read_openpose(tmp_path / "a.json")
 
 
@@ -102,10 +102,10 @@ def test_lists_of_results_are_read_by_frame(tmp_path: Path) -> None:
     two, three, four = read_results(tmp_path / "01.json", (2, 3, 4))
     assert np.allclose(two, points(17)[None]) and len(three) == 0
     assert four.shape == (2, 17, 3) and (four[1, :, 2] == 1).all()
-    with pytest.raises(CaptureError, match=r"01\.json: image_id 4 is none of the recording's frames 1 to 3"):
+    with pytest.raises(InputError, match=r"01\.json: image_id 4 is none of the recording's frames 1 to 3"):
         read_results(tmp_path / "01.json", (1, 2, 3))
     (tmp_path / "01.json").write_text(json.dumps([{"image_id": "cover", "keypoints": []}]))
-    with pytest.raises(CaptureError, match=r"01\.json: no list of image_id"):
+    with pytest.raises(InputError, match=r"01\.json: no list of image_id"):
         read_results(tmp_path / "01.json", (0,))
 
 

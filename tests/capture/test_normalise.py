@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from hnerf.capture.lens import Lens
-from hnerf.capture.manifest import Notes, capture_name
+from hnerf.capture.manifest import CaptureManifest, capture_name
 from hnerf.capture.normalise import Normaliser
 
 
@@ -25,4 +25,4 @@ def test_keypoints_near_the_edge_are_undistorted_exactly() -> None:
 
 def test_a_folder_named_on_a_mac_has_the_same_name() -> None:
     composed, decomposed = "J\u00fcrgen", "Ju\u0308rgen"
-    assert capture_name(Path("/recordings") / decomposed, Notes()) == composed
+    assert capture_name(Path("/recordings") / decomposed, CaptureManifest()) == composed

@@ -10,7 +10,7 @@ import pytest
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tests.capture import recordings as rec
 
 
@@ -72,7 +72,7 @@ def test_given_poses_are_aligned_from_the_end(capture: Capture) -> None:
 
 def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
     def refused(names: str) -> None:
-        with pytest.raises(CaptureError, match=names):
+        with pytest.raises(InputError, match=names):
             ingest(folder, CaptureSettings(), tmp_path / "out")
 
     with h5py.File(folder / "reconstructed_poses.hdf5", "r+") as file:

@@ -10,7 +10,7 @@ import pytest
 import scipy.sparse
 
 from hnerf.capture.safe_pickle import read_pickle, read_pickled_npy
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 DATA: dict[str, Any] = {
     "K": [np.arange(9.0).reshape(3, 3), np.asfortranarray(np.arange(6, dtype=np.float32).reshape(2, 3))],
@@ -70,7 +70,7 @@ def test_chumpy_arrays_become_plain(tmp_path: Path) -> None:
     (tmp_path / "a.pkl").write_bytes(b"\x80\x02" + stored)
     assert read_pickle(tmp_path / "a.pkl").tolist() == [3.0, 4.0]
     (tmp_path / "a.pkl").write_bytes(b"\x80\x02" + stored.replace(b"chumpy.ch\nCh", b"chumpy.reordering\nSelect"))
-    with pytest.raises(CaptureError, match=r"a\.pkl: .* names chumpy.reordering.Select\); convert it to \.npz"):
+    with pytest.raises(InputError, match=r"a\.pkl: .* names chumpy.reordering.Select\); convert it to \.npz"):
         read_pickle(tmp_path / "a.pkl")
 
 
@@ -78,7 +78,7 @@ def test_npy_files_of_one_dictionary(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", {"poses": np.ones((1, 72))}, allow_pickle=True)  # type: ignore[arg-type]
     assert read_pickled_npy(tmp_path / "a.npy")["poses"].shape == (1, 72)
     np.save(tmp_path / "b.npy", np.ones(3))
-    with pytest.raises(CaptureError, match=r"b\.npy: holds no dictionary"):
+    with pytest.raises(InputError, match=r"b\.npy: holds no dictionary"):
         read_pickled_npy(tmp_path / "b.npy")
 
 
@@ -106,7 +106,7 @@ BAD = {
 def test_what_is_no_plain_data_is_refused(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.pkl").write_bytes(BAD[case])
-    with pytest.raises(CaptureError, match=r"a\.pkl: not a pickle of plain data"):
+    with pytest.raises(InputError, match=r"a\.pkl: not a pickle of plain data"):
         read_pickle(tmp_path / "a.pkl")
     assert not (tmp_path / "pickle-was-loaded").exists()
 

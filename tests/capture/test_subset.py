@@ -4,7 +4,7 @@ import pytest
 
 from hnerf.capture.capture import Capture
 from hnerf.capture.subset import subset
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tests.study.recording import write_recording
 
 
@@ -35,9 +35,9 @@ def test_none_keeps_everything(tmp_path: Path) -> None:
 
 def test_what_is_not_there_is_refused(tmp_path: Path) -> None:
     capture = write_recording(tmp_path / "all")
-    with pytest.raises(CaptureError, match="ada: no training camera 03; there are 01, 02"):
+    with pytest.raises(InputError, match="ada: no training camera 03; there are 01, 02"):
         subset(capture, tmp_path / "a", ("03",), None, None)
-    with pytest.raises(CaptureError, match="ada: no training frame 8; there are 2, 4, 6"):
+    with pytest.raises(InputError, match="ada: no training frame 8; there are 2, 4, 6"):
         subset(capture, tmp_path / "b", None, (8,), None)
-    with pytest.raises(CaptureError, match="no training camera or frame would be left"):
+    with pytest.raises(InputError, match="no training camera or frame would be left"):
         subset(capture, tmp_path / "c", None, (), None)

@@ -8,7 +8,7 @@ import pytest
 
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tests.capture import recordings as rec
 
 CAMERAS = ("Camera_B1", "Camera_B2")
@@ -84,7 +84,7 @@ def test_the_published_cameras_are_for_training(tmp_path: Path) -> None:
 
 def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
     def refused(names: str) -> None:
-        with pytest.raises(CaptureError, match=names):
+        with pytest.raises(InputError, match=names):
             ingest(folder, CaptureSettings(), tmp_path / "out")
 
     write_parameters(folder / "params" / "1.npy", np.zeros(10))

@@ -282,7 +282,7 @@ def test_report_has_every_section_and_loads_nothing(scored: Scored) -> None:
     text = (scored[0] / "subject" / "evaluation" / "report.html").read_text()
     page = _Page(text)
     galleries = ["Training views", "New views", "New poses", "Surface"]
-    assert page.headings == ["Summary", *galleries, "Training", "Findings", "Cost", "Notes"]
+    assert page.headings == ["Summary", *galleries, "Training", "Findings", "Cost", "CaptureManifest"]
     assert all(address.startswith(("data:image/", "#")) for address in page.loaded)
     assert not page.tags & {"script", "link", "iframe", "object"}
     assert "://" not in text and "@import" not in text and not re.search(r"url\(", text)

@@ -7,7 +7,7 @@ import pytest
 
 from hnerf.capture.lens import Lens
 from hnerf.capture.normalise import Normaliser
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.evaluation.ground_truth import GroundTruth
 from tests.evaluation.ball import PHOTOGRAPHED, centre_m, seen, write_ball_capture, write_ball_truth
 
@@ -80,7 +80,7 @@ def test_a_mask_that_nobody_drew_is_not_there(truth: GroundTruth) -> None:
 def test_a_missing_mask_is_named(truth: GroundTruth) -> None:
     path = truth.folder / "ground_truth" / "masks" / "c" / "000001.png"
     path.unlink()
-    with pytest.raises(CaptureError, match=r"000001\.png"):
+    with pytest.raises(InputError, match=r"000001\.png"):
         truth.mask("c", 1)
 
 
@@ -88,7 +88,7 @@ def test_a_missing_mask_is_named(truth: GroundTruth) -> None:
 def test_faces_without_vertices_are_refused(truth: GroundTruth, faces: list[list[int]]) -> None:
     path = truth.folder / "ground_truth" / "meshes.npz"
     np.savez(path, faces=np.array(faces), vertices=np.zeros((1, 3, 3)), frames=np.array([0]))
-    with pytest.raises(CaptureError, match=r"meshes\.npz: no true surfaces to read \(a face names no vertex"):
+    with pytest.raises(InputError, match=r"meshes\.npz: no true surfaces to read \(a face names no vertex"):
         truth.meshes()
 
 
@@ -98,12 +98,12 @@ def test_more_than_fits_in_memory_is_refused(truth: GroundTruth, monkeypatch: py
 
     np.savez(truth.folder / "ground_truth" / "meshes.npz", faces=np.zeros((1, 3), int))
     monkeypatch.setattr(np.lib.format, "read_array", full)
-    with pytest.raises(CaptureError, match=r"meshes\.npz: no true surfaces to read \(Unable to allocate"):
+    with pytest.raises(InputError, match=r"meshes\.npz: no true surfaces to read \(Unable to allocate"):
         truth.meshes()
 
 
 def test_a_pickle_is_refused(truth: GroundTruth) -> None:
     path = truth.folder / "ground_truth" / "meshes.npz"
     np.savez(path, faces=np.array([{}], dtype=object), vertices=np.zeros((1, 3, 3)), frames=np.array([0]))
-    with pytest.raises(CaptureError, match=r"meshes\.npz"):
+    with pytest.raises(InputError, match=r"meshes\.npz"):
         truth.meshes()

@@ -12,7 +12,7 @@ import pytest
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks, encode
 from hnerf.config import EvaluationSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.evaluation.evaluate import evaluate
 from hnerf.evaluation.holdout import LABEL, cameras_left_out, gathered, score_held_out
 from hnerf.evaluation.metrics import mask_box
@@ -123,7 +123,7 @@ def test_the_report_has_a_row_for_each_camera(tmp_path: Path) -> None:
     ],
 )
 def test_cameras_that_cannot_be_left_out_are_refused(train: tuple[str, ...], holdout: str, message: str) -> None:
-    with pytest.raises(CaptureError, match=message):
+    with pytest.raises(InputError, match=message):
         cameras_left_out(train, (), holdout)
 
 

@@ -7,7 +7,7 @@ import torch
 
 from hnerf.avatar.avatar import Rendering
 from hnerf.capture.capture import read_rgb, read_rgba, write_image
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.evaluation.images import rgba
 
 
@@ -25,5 +25,5 @@ def test_renderings_are_colour_over_black_and_coverage(tmp_path: Path) -> None:
 
 def test_a_picture_without_coverage_is_no_rendering(tmp_path: Path) -> None:
     write_image(tmp_path / "a.png", np.zeros((2, 2, 3), np.uint8))
-    with pytest.raises(CaptureError, match=r"a\.png: no readable image with an alpha channel"):
+    with pytest.raises(InputError, match=r"a\.png: no readable image with an alpha channel"):
         read_rgba(tmp_path / "a.png")

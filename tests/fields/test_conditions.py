@@ -50,6 +50,6 @@ def test_draws_of_a_step() -> None:
 
 def test_a_rendering_draws_nothing() -> None:
     """Samples in the middle of their strata, black beyond, no noise and no regularisation."""
-    still = Draws.still(2, 3, torch.device("cpu"))
+    still = Draws.deterministic(2, 3, torch.device("cpu"))
     assert (still.jitter == 0.5).all() and (still.finer == 0.5).all() and not still.beyond.any()
     assert still.view is None and still.probe is None

@@ -58,7 +58,7 @@ def test_a_tight_shell_shows_the_same_picture():
     field = field_of(1000.0)
     origins = torch.tensor([[0.5, 0.4, 3.0], [0.31, 0.62, 3.0], [0.1, 0.8, 3.0]])
     directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3)
-    frame, draws = torch.zeros(3, dtype=torch.long), Draws.still(3, SETTINGS.samples, torch.device("cpu"))
+    frame, draws = torch.zeros(3, dtype=torch.long), Draws.deterministic(3, SETTINGS.samples, torch.device("cpu"))
 
     def coverage() -> torch.Tensor:
         samples, _ = field.sample(
@@ -80,7 +80,7 @@ def test_rays_that_miss_the_shell_see_nothing_and_change_nothing():
     directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3)
 
     def sampled(pick: list[int]) -> list[torch.Tensor]:
-        draws = Draws.still(len(pick), SETTINGS.samples, torch.device("cpu"))
+        draws = Draws.deterministic(len(pick), SETTINGS.samples, torch.device("cpu"))
         frame = torch.zeros(len(pick), dtype=torch.long)
         found, _ = field.sample(
             bodies, field.region(bodies, conditions), origins[pick], directions[pick], frame, conditions, draws
@@ -135,7 +135,7 @@ def test_a_rendered_ray_ends_at_the_solid_core_where_the_surface_lies_deeper():
     rays = origins, directions, torch.zeros(2, dtype=torch.long)
     region = field.region(bodies, conditions)
     count = int(field.samples_needed(region, *rays)[0])
-    draws = Draws.still(2, count, torch.device("cpu"))
+    draws = Draws.deterministic(2, count, torch.device("cpu"))
     with torch.no_grad():
         samples, depths = field.sample(bodies, region, *rays, conditions, draws)
         seen = field.look(bodies, region, *rays, conditions)
@@ -243,7 +243,7 @@ def test_a_pixel_pulls_at_its_body_as_its_colour_changes_when_the_body_moves():
         torch.nn.init.normal_(grid)
     direction = torch.nn.functional.normalize(torch.tensor([[0.4, 0.3, -1.0]]), dim=-1)
     rays = (torch.tensor([[0.5, 0.4, 0.5]]) - 2 * direction, direction, torch.zeros(1, dtype=torch.long))
-    draws = Draws.still(1, SETTINGS.samples, torch.device("cpu"))
+    draws = Draws.deterministic(1, SETTINGS.samples, torch.device("cpu"))
 
     def colour(move_m: torch.Tensor) -> torch.Tensor:
         moved = {"move_m": move_m[None], "turn": correction.turn, "shape": correction.shape}

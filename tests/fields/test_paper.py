@@ -22,7 +22,7 @@ from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.paper import PaperField
 from hnerf.fields.samples import RaySamples
 from hnerf.training.pixels import Rays
-from hnerf.training.step import Objective, Stage
+from hnerf.training.step import Objective, PosedScene
 from tests.body.boxes import box_rig
 
 RIG = box_rig()
@@ -221,7 +221,7 @@ def test_each_loss_of_a_ray() -> None:
     correction.absorbed_move_m[1, 1] = 4.0  # of two frames
     rays = Rays(*RAY, torch.ones(1, 3), torch.tensor([True]), torch.tensor([False]), None)
     objective = Objective(field, correction, load_settings("paper").training)
-    terms = objective(Stage(standing, field.region(standing, conditions)), rays, conditions, DRAWS)
+    terms = objective(PosedScene(standing, field.region(standing, conditions)), rays, conditions, DRAWS)
 
     def sigmoid(x: float) -> float:
         return 1 / (1 + math.exp(-x))

@@ -19,7 +19,7 @@ def seen(field: PaperField, root_condition: Tensor) -> tuple[Tensor, Tensor]:
     moment = torch.zeros(1, dtype=torch.long)
     conditions = Conditions(Conditions.of(RIG, bodies.theta, bodies.root, moment, 2.5).pose, root_condition, moment)
     origin, direction = torch.tensor([[0.5, 0.4, 2.4]]), torch.tensor([[0.0, 0.0, -1.0]])
-    draws = Draws.still(1, field.samples, torch.device("cpu"))
+    draws = Draws.deterministic(1, field.samples, torch.device("cpu"))
     samples, _ = field.sample(
         bodies, field.region(bodies, conditions), origin, direction, torch.zeros(1, dtype=torch.long), conditions, draws
     )

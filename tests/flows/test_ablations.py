@@ -12,7 +12,7 @@ from flows import run_page, train_subject
 from flows.ablations import ablate, as_markdown, choose
 from flows.cli import main
 from hnerf.config import TrainingSettings, load_settings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.evaluation.images import unscored
 from hnerf.study.benchmark import results
 from tasks.launcher import LostWorkerError
@@ -125,7 +125,7 @@ def test_an_override_counts_as_the_preset_but_not_against_the_ablation() -> None
 
 def test_unknown_names_are_refused() -> None:
     with pytest.raises(
-        CaptureError, match="--only no-hair: no such ablation; there are no-blend, no-deformation, no-eikonal"
+        InputError, match="--only no-hair: no such ablation; there are no-blend, no-deformation, no-eikonal"
     ):
         choose(load_settings("fast"), ["no-hair"])
 
@@ -201,7 +201,7 @@ def test_a_surface_that_cannot_be_meshed_fails_its_row_alone(
 
     def evaluate(*inputs: Any) -> Any:
         if stages[-1].losses.residual == 0:
-            raise CaptureError("signed distance field: no surface in its box")
+            raise InputError("signed distance field: no surface in its box")
         return good(*inputs)
 
     monkeypatch.setattr(module, "evaluate", evaluate)

@@ -13,7 +13,7 @@ from flows import run_page, train_subject
 from flows.benchmark import benchmark
 from flows.cli import main
 from hnerf.config import TrainingSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.files import picture, with_pictures
 from hnerf.study.benchmark import publish as publish_module
 from hnerf.study.benchmark.plan import ScoringSettings
@@ -51,16 +51,16 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
     asked = Stages()
     asked.fails = {}
 
-    def train(shelf: Any, recording: Any, *others: Any) -> Any:
+    def train(store: Any, recording: Any, *others: Any) -> Any:
         settings = others[-1]
         asked.append((recording.title, settings))
         if settings.machinery in asked.fails:
             raise asked.fails[settings.machinery]
         return SimpleNamespace(machinery=settings.machinery)
 
-    def score_training(shelf: Any, truth: Any, recording: Any, calibration: Any, body: Any, model: Any, _: Any) -> Any:
+    def score_training(store: Any, truth: Any, recording: Any, calibration: Any, body: Any, model: Any, _: Any) -> Any:
         assert body == "body"
-        folder = shelf.root / "scoring" / model.machinery
+        folder = store.root / "scoring" / model.machinery
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "scores.json").write_text(json.dumps(scores(PSNR[model.machinery], 1.0, "") | {"pictures": []}))
         return SimpleNamespace(root=folder)
@@ -125,10 +125,10 @@ def test_trainings_get_longer_until_they_gain_nothing_or_time_or_steps_are_over(
         (tmp_path / "scores.json").write_text(json.dumps({"training": {"field_seconds": seconds}, "curve": [point]}))
         return SimpleNamespace(root=tmp_path)
 
-    def train(shelf: Any, recording: Any, *others: Any) -> Any:
+    def train(store: Any, recording: Any, *others: Any) -> Any:
         if others[-1].machinery == "nerf" and others[-1].seconds == 10.0:
-            raise CaptureError("the surface is empty")
-        return good(shelf, recording, *others)
+            raise InputError("the surface is empty")
+        return good(store, recording, *others)
 
     good = module.train
     monkeypatch.setattr(module, "train", train)
@@ -148,7 +148,7 @@ def test_trainings_get_longer_until_they_gain_nothing_or_time_or_steps_are_over(
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("error", [RuntimeError("rank 0\nthe surface is empty"), CaptureError("the surface is empty")])
+@pytest.mark.parametrize("error", [RuntimeError("rank 0\nthe surface is empty"), InputError("the surface is empty")])
 def test_a_method_that_fails_says_so_and_the_rest_go_on(
     stages: Stages, study: str, tmp_path: Path, error: Exception
 ) -> None:
@@ -263,10 +263,10 @@ def test_scores_are_found_again_until_what_is_scored_or_how_changes(
     monkeypatch.setattr(tasks_module, "scene", lambda *_: None)
     truth = Source(root=tmp_path, name="ada", digest="1")
     recording, calibration, body, model = (Artifact(stage=s, root=tmp_path / s, files={}) for s in "abdc")
-    shelf = Store(tmp_path / "store")
+    store = Store(tmp_path / "store")
 
     def run(truth: Source, settings: ScoringSettings) -> Artifact:
-        return tasks_module.score_training(shelf, truth, recording, calibration, body, model, settings)
+        return tasks_module.score_training(store, truth, recording, calibration, body, model, settings)
 
     first = run(truth, ScoringSettings())
     assert run(truth, ScoringSettings()) == first

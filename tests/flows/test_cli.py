@@ -16,7 +16,7 @@ from tests.shared_data import shared_capture
     ("arguments", "message"),
     [
         (["run", "absent"], "absent: no such folder"),
-        (["check", "absent"], "absent: no such folder"),
+        (["check-cameras", "absent"], "absent: no such folder"),
         (["run", "absent", "--preset", "best"], "best: no such preset or file; presets are "),
         (["run", "absent", "--set", "training.stepz=1"], "hnerf: --set training.stepz=1: training.stepz: Extra"),
         (["run", "absent", "--set", "training.noise=.inf"], "training.noise: Input should be a finite number"),
@@ -68,7 +68,7 @@ def test_a_store_that_cannot_be_made_is_one_line_and_exit_code_2(
     (tmp_path / "ada").mkdir()
     (tmp_path / "plain").touch()
     for store, why in ((tmp_path / "plain" / "x", "Not a directory"), (tmp_path / ("x" * 300), "File name too long")):
-        assert main(["check", str(tmp_path / "ada"), "--store", str(store)]) == 2
+        assert main(["check-cameras", str(tmp_path / "ada"), "--store", str(store)]) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"hnerf: {store}") and why in line
 
@@ -98,10 +98,13 @@ def test_a_full_disk_is_one_line_and_exit_code_1(
 
 def test_cameras_are_not_written_over_the_recordings_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "ada").mkdir()
-    for command in (["cameras", str(tmp_path / "ada"), "--format", "easymocap"], ["calibrate", str(tmp_path / "ada")]):
+    for command in (
+        ["export-cameras", str(tmp_path / "ada"), "--format", "easymocap"],
+        ["calibrate", str(tmp_path / "ada")],
+    ):
         assert main([*command, "--out", str(tmp_path / "ada")]) == 2
         assert "exists; give the name of a new folder" in capsys.readouterr().err
-    assert main(["cameras", str(tmp_path / "ada"), "--format", "colmap", "--out", str(tmp_path / "new")]) == 2
+    assert main(["export-cameras", str(tmp_path / "ada"), "--format", "colmap", "--out", str(tmp_path / "new")]) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["ada"]
 
 
@@ -115,7 +118,7 @@ def test_unreadable_capture_leaves_nothing_half_written(tmp_path: Path, capsys: 
 
 def test_check_prints_every_camera_and_the_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capture = shared_capture("valid-wave")
-    assert main(["check", str(capture), "--store", str(tmp_path)]) == 0
+    assert main(["check-cameras", str(capture), "--store", str(tmp_path)]) == 0
     lines = capsys.readouterr().out.splitlines()
     table = lines[next(i for i, line in enumerate(lines) if line.startswith("camera ")) :]
     report = json.loads(next(tmp_path.glob("calibration/*/report.json")).read_text())

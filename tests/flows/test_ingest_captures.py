@@ -8,7 +8,7 @@ import pytest
 
 from flows import ingest_captures as module
 from flows.ingest_captures import ingest_captures
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tasks.source import read_capture
 
 
@@ -94,7 +94,7 @@ def test_a_capture_that_cannot_be_read_is_said_and_the_others_go_on(
 ) -> None:
     def unreadable(capture: Path) -> Any:
         if capture.name == "ada":
-            raise CaptureError("0.jpg: cannot be read; make it readable")
+            raise InputError("0.jpg: cannot be read; make it readable")
         return read_capture(capture)
 
     with monkeypatch.context() as broken:

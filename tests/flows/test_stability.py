@@ -12,7 +12,7 @@ from flows import run_page, train_subject
 from flows import stability as module
 from flows.cli import main
 from flows.stability import stability
-from hnerf.errors import CaptureError, NotPossibleError
+from hnerf.errors import InputError, NotApplicableError
 from tasks.launcher import LostWorkerError
 
 STUDY = """
@@ -45,7 +45,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
 
     def calibrate(_: Any, recording: Any, __: Any) -> Any:
         if recording.name == "image_noise 40":
-            raise CaptureError("ada: cameras see no person")
+            raise InputError("ada: cameras see no person")
         return made("cameras")
 
     def train(_: Any, recording: Any, cameras: Any, masks: Any, body: Any, settings: Any) -> Any:
@@ -169,7 +169,7 @@ def test_what_a_capture_does_not_allow_is_left_out_and_no_verdict(
     stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def degrade_masks(*_: Any) -> Any:
-        raise NotPossibleError("ada: has no keypoints")
+        raise NotApplicableError("ada: has no keypoints")
 
     monkeypatch.setattr(module, "degrade_masks", degrade_masks)
     found = study(tmp_path, only=["mask_eroded"])
@@ -208,7 +208,7 @@ def test_a_method_that_cannot_take_the_capture_at_all_is_tried_once_a_seed(
     stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def train(*_: Any) -> Any:
-        raise CaptureError("NeRF models one moment; choose one frame")
+        raise InputError("NeRF models one moment; choose one frame")
 
     monkeypatch.setattr(module, "train", train)
     runs = study(tmp_path)["runs"]
@@ -256,7 +256,7 @@ def test_bad_input_in_evaluation_is_failure(
     stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def evaluate(*_: Any) -> Any:
-        raise CaptureError("signed distance field: no surface in its box")
+        raise InputError("signed distance field: no surface in its box")
 
     monkeypatch.setattr(module, "evaluate", evaluate)
     assert {r["verdict"] for r in study(tmp_path, only=["pose_noise"])["runs"]} == {"failed"}

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import joint_transforms
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.render.motion import Motion, adopted, between, lowest_points_m, read_motion, rows, select
 from tests.asset.figure import bending_body, capture, column_rig
 
@@ -55,7 +55,7 @@ def test_another_motion_stands_where_this_body_stood(up: str) -> None:
 def test_a_motion_without_a_joint_that_turns_is_refused() -> None:
     other = bending_body()
     other = dataclasses.replace(other, rig=dataclasses.replace(other.rig, joint_names=("root", "tail")))
-    with pytest.raises(CaptureError, match=r"no joint upper\.L"):
+    with pytest.raises(InputError, match=r"no joint upper\.L"):
         adopted(bending_body(), Motion(other, 10.0, "z"), "z")
 
 
@@ -92,7 +92,7 @@ def test_frames_are_chosen_by_number(wanted: str, chosen: tuple[int, ...]) -> No
 
 @pytest.mark.parametrize(("wanted", "message"), [("6", "ada: no frames 6; it has 3 to 8"), ("a:b", "FIRST:END:STEP")])
 def test_frames_that_are_not_there_are_refused(wanted: str, message: str) -> None:
-    with pytest.raises(CaptureError, match=message):
+    with pytest.raises(InputError, match=message):
         select((3, 4, 5, 8), wanted, Path("ada"))
 
 
@@ -144,7 +144,7 @@ def test_amass_poses_turn_the_likes_of_smpls_joints(tmp_path: Path) -> None:
 )
 def test_what_is_no_motion_is_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "walk.npz", **arrays)  # type: ignore[arg-type]
-    with pytest.raises(CaptureError, match=f"walk.npz: .*{message}"):
+    with pytest.raises(InputError, match=f"walk.npz: .*{message}"):
         read_motion(tmp_path / "walk.npz")
 
 
@@ -152,10 +152,10 @@ def test_half_a_file_is_no_motion(tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "walk.npz", poses=np.zeros((2, 156)), trans=np.zeros((2, 3)))
     whole = (tmp_path / "walk.npz").read_bytes()
     (tmp_path / "walk.npz").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(CaptureError, match=r"walk\.npz: is no \.npz of plain arrays"):
+    with pytest.raises(InputError, match=r"walk\.npz: is no \.npz of plain arrays"):
         read_motion(tmp_path / "walk.npz")
 
 
 def test_a_folder_without_a_fit_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match="holds no fitted body"):
+    with pytest.raises(InputError, match="holds no fitted body"):
         read_motion(tmp_path)

@@ -7,7 +7,7 @@ import torch
 
 from hnerf.body.anny import ADULT, BETA_NAMES, anny_rig
 from hnerf.body.rig import Rig
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.render.motion import lowest_points_m
 from hnerf.render.shape import outwards, volume_m3, with_values, with_volume, worn_by
 from tests.asset.figure import bending_body, column_rig
@@ -69,7 +69,7 @@ def test_whole_bodies_lose_and_gain_volume_without_folds(gender: float) -> None:
 
 @pytest.mark.parametrize("change", [20.0, -1.2, math.nan])
 def test_a_volume_out_of_reach_is_refused(change: float) -> None:
-    with pytest.raises(CaptureError, match="out of this body's reach"):
+    with pytest.raises(InputError, match="out of this body's reach"):
         with_volume(bone_rig("upper"), change)
 
 
@@ -82,12 +82,12 @@ def test_values_are_added_by_name() -> None:
 
 def test_a_shape_that_turns_its_skin_inside_out_is_refused() -> None:
     for change in (-2.0, math.nan):
-        with pytest.raises(CaptureError, match=re.escape(f"weight {change:+.2f}: folds ")):
+        with pytest.raises(InputError, match=re.escape(f"weight {change:+.2f}: folds ")):
             with_values(changeable_rig(), {"weight": change})
 
 
 def test_an_unknown_value_is_refused_with_those_that_there_are() -> None:
-    with pytest.raises(CaptureError, match="fat: this body's values are weight, length"):
+    with pytest.raises(InputError, match="fat: this body's values are weight, length"):
         with_values(changeable_rig(), {"fat": 1.0})
 
 

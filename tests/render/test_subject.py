@@ -19,7 +19,7 @@ from hnerf.capture.footage import Video
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.lens import Lens
 from hnerf.render.motion import between
-from hnerf.render.subject import Wish, _cameras
+from hnerf.render.subject import RenderOptions, _cameras
 from tests.training.scene import TINY, record
 
 
@@ -69,8 +69,8 @@ def test_a_recorded_camera_shows_every_fitted_frame(subject: Path, tmp_path: Pat
 def test_a_frame_shown_alone_keeps_its_deformation_and_no_other_pose_has_one(subject: Path, tmp_path: Path) -> None:
     """Frames 1 and 2 stand 15 cm to either side of their poses, 1.4 pixels; halfway between them is neither."""
     wishes = {"alone": ["--frames", "1"], "between": ["--between", "1", "2", "--pictures", "3"]}
-    for name, wish in wishes.items():
-        view = ["--camera", "0", "--what", "colour", *wish]
+    for name, options in wishes.items():
+        view = ["--camera", "0", "--what", "colour", *options]
         assert main(["render", str(subject), "--out", str(tmp_path / name), *view]) == 0
     avatar = load_avatar(subject / "training")
     camera = Capture.load(subject / "capture").cameras["0"]
@@ -89,8 +89,8 @@ def test_a_frame_shown_alone_keeps_its_deformation_and_no_other_pose_has_one(sub
 
 def test_an_orbit_round_one_pose_has_the_size_and_number_asked_for(subject: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    wish = ["--frames", "1", "--pictures", "4", "--size", "48", "--what", "mask"]
-    assert main(["render", str(subject), "--out", str(out), *wish]) == 0
+    options = ["--frames", "1", "--pictures", "4", "--size", "48", "--what", "mask"]
+    assert main(["render", str(subject), "--out", str(out), *options]) == 0
     masks = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted((out / "mask").iterdir())]
     assert [mask.shape for mask in masks] == [(48, 48)] * 4
     for mask in masks:
@@ -105,31 +105,41 @@ def test_a_path_without_sizes_has_that_of_the_recording(subject: Path, tmp_path:
     lens = Lens("a", capture.cameras["2"].K, np.zeros(5), capture.cameras["2"].R, capture.cameras["2"].t_m, None)
     write_cameras(tmp_path / "path", [lens], "easymocap")
     shrunk = dataclasses.replace(capture, recorded_sizes_px=dict.fromkeys(capture.cameras, (500, 300)))
-    (found,) = _cameras(Wish(path=tmp_path / "path", pictures=1), shrunk, BodyFit.load(subject / "training"))
+    (found,) = _cameras(RenderOptions(path=tmp_path / "path", pictures=1), shrunk, BodyFit.load(subject / "training"))
     assert (found.width_px, found.height_px) == (500, 300)
 
 
 def test_cameras_that_did_not_record_have_no_exposure_of_their_own(subject: Path) -> None:
     """An orbit is made after the first camera, and a path's may be called like any: neither has its gain."""
     capture, body = Capture.load(subject / "capture"), BodyFit.load(subject / "training")
-    assert not {camera.name for camera in _cameras(Wish(), capture, body)} & set(capture.cameras)
-    along_recorded = _cameras(Wish(path=subject / "calibration"), capture, body)
+    assert not {camera.name for camera in _cameras(RenderOptions(), capture, body)} & set(capture.cameras)
+    along_recorded = _cameras(RenderOptions(path=subject / "calibration"), capture, body)
     assert not {camera.name for camera in along_recorded} & set(capture.cameras)
-    assert {camera.name for camera in _cameras(Wish(camera="2"), capture, body)} == {"2"}
+    assert {camera.name for camera in _cameras(RenderOptions(camera="2"), capture, body)} == {"2"}
 
 
 def test_interpolation_and_another_motion(subject: Path, tmp_path: Path) -> None:
-    wish = ["--between", "0", "2", "--pictures", "5", "--motion", str(subject), "--path", str(subject / "calibration")]
-    assert main(["render", str(subject), "--out", str(tmp_path / "out"), "--what", "depth", *wish]) == 0
+    options = [
+        "--between",
+        "0",
+        "2",
+        "--pictures",
+        "5",
+        "--motion",
+        str(subject),
+        "--path",
+        str(subject / "calibration"),
+    ]
+    assert main(["render", str(subject), "--out", str(tmp_path / "out"), "--what", "depth", *options]) == 0
     assert len(numbers(tmp_path / "out", "depth")) == 5
 
 
 def test_a_taller_body_reaches_higher_in_the_picture(subject: Path, tmp_path: Path) -> None:
     tops = []
-    for name, wish in (("as_fitted", []), ("taller", ["--shape", "height=+0.4"])):
+    for name, options in (("as_fitted", []), ("taller", ["--shape", "height=+0.4"])):
         out = tmp_path / name
         view = ["--camera", "0", "--frames", "0", "--what", "mask"]
-        assert main(["render", str(subject), "--out", str(out), *view, *wish]) == 0
+        assert main(["render", str(subject), "--out", str(out), *view, *options]) == 0
         mask = cv2.imread(str(out / "mask" / "000000.png"), cv2.IMREAD_GRAYSCALE)
         tops.append(int(np.nonzero(mask.max(1) > 127)[0].min()))
     # 38.4 px focal length, 4 m away: 40 cm are about 4 pixels.
@@ -137,7 +147,7 @@ def test_a_taller_body_reaches_higher_in_the_picture(subject: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("wish", "message"),
+    ("options", "message"),
     [
         (["--camera", "9"], "camera 9: the recording has 0, 1, 2, 3"),
         (["--what", "colour,xray"], "what xray: choose from colour, depth, normals, mask, mesh"),
@@ -154,9 +164,9 @@ def test_a_taller_body_reaches_higher_in_the_picture(subject: Path, tmp_path: Pa
     ],
 )
 def test_a_wish_that_cannot_be_met_is_one_line(
-    wish: list[str], message: str, subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str], message: str, subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["render", str(subject), "--out", str(tmp_path / "out"), *wish]) == 2
+    assert main(["render", str(subject), "--out", str(tmp_path / "out"), *options]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
     assert list(tmp_path.iterdir()) == []

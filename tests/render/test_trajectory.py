@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.lens import Lens
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from hnerf.render.trajectory import along, orbit, read_path
 
@@ -51,7 +51,7 @@ def test_an_orbit_where_y_is_up_is_level_in_x_and_z() -> None:
 
 @pytest.mark.parametrize(("radius_m", "height_m"), [(0.0, 1.0), (np.inf, 1.0), (1.0, np.nan)])
 def test_an_orbit_that_is_no_circle_is_refused(radius_m: float, height_m: float) -> None:
-    with pytest.raises(CaptureError, match="no circle"):
+    with pytest.raises(InputError, match="no circle"):
         orbit([camera_at((4, 2, 5))], TARGET_M, 4, "z", radius_m, height_m)
 
 
@@ -100,5 +100,5 @@ def test_a_path_is_read_from_a_folder_of_cameras_in_its_own_unit(tmp_path: Path)
 )
 def test_what_is_no_path_is_refused(content: object, message: str, tmp_path: Path) -> None:
     (tmp_path / "path.json").write_text(json.dumps(content))
-    with pytest.raises(CaptureError, match=f"path.json.*{message}"):
+    with pytest.raises(InputError, match=f"path.json.*{message}"):
         read_path(tmp_path / "path.json", (1, 1))

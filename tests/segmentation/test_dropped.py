@@ -7,11 +7,11 @@ import torch
 from hnerf.body.fit import _outlines, _silhouette_iou
 from hnerf.capture.masks import Masks, encode
 from hnerf.geometry.reach import everywhere
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.gather import gather_pixels
 from tests.training.scene import record
 
-ALONE = Processes(0, 1, torch.device("cpu"))
+ALONE = Distributed(0, 1, torch.device("cpu"))
 
 
 def test_fit_and_training_do_without(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from hnerf.config import SegmentationSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.segmentation.learned import Network
 from hnerf.segmentation.segment import segment
 from tests.segmentation.scene import PERSON_RGB, write_scene
@@ -59,17 +59,17 @@ def test_the_subject_among_what_the_network_finds(tmp_path: Path) -> None:
 
 
 def test_a_missing_file_and_a_missing_package_say_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(CaptureError, match=r"nowhere\.onnx: no such file"):
+    with pytest.raises(InputError, match=r"nowhere\.onnx: no such file"):
         Network(tmp_path / "nowhere.onnx")
     path = write_network(tmp_path / "n.onnx", [1, 3, "H", "W"])
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(CaptureError, match=r"install hnerf-pipeline\[learned\]"):
+    with pytest.raises(InputError, match=r"install hnerf-pipeline\[learned\]"):
         Network(path)
 
 
 def test_files_that_are_no_such_network(tmp_path: Path) -> None:
     (tmp_path / "text.onnx").write_text("not a network")
-    with pytest.raises(CaptureError, match="not a network that ONNX Runtime can run"):
+    with pytest.raises(InputError, match="not a network that ONNX Runtime can run"):
         Network(tmp_path / "text.onnx")
     weights = helper.make_tensor("weights", TensorProto.FLOAT, [1], [1.0])
     node = helper.make_node("Mul", ["image", "weights"], ["person"])
@@ -79,7 +79,7 @@ def test_files_that_are_no_such_network(tmp_path: Path) -> None:
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
     (tmp_path / "flat.onnx").write_bytes(model.SerializeToString())
-    with pytest.raises(CaptureError, match="needs one float input"):
+    with pytest.raises(InputError, match="needs one float input"):
         Network(tmp_path / "flat.onnx")
 
 
@@ -93,5 +93,5 @@ def test_a_network_that_loads_but_does_not_run(tmp_path: Path) -> None:
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
     (tmp_path / "fixed.onnx").write_bytes(model.SerializeToString())
-    with pytest.raises(CaptureError, match=r"fixed\.onnx: does not run on \(1, 3, 10, 20\): [^\n]*any size$"):
+    with pytest.raises(InputError, match=r"fixed\.onnx: does not run on \(1, 3, 10, 20\): [^\n]*any size$"):
         Network(tmp_path / "fixed.onnx").probability(np.zeros((10, 20, 3), np.uint8))

@@ -10,9 +10,9 @@ import torch
 from hnerf.capture.ingest import ingest
 from hnerf.capture.masks import Masks, encode, movement_px
 from hnerf.config import CaptureSettings, SegmentationSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.segmentation.cut import components_within
-from hnerf.segmentation.difference import difference, levelled, masked_median, noise_level, surroundings
+from hnerf.segmentation.difference import difference, exposure_corrected, masked_median, noise_level, surroundings
 from hnerf.segmentation.edge import settle_edge
 from hnerf.segmentation.prior import Prior
 from hnerf.segmentation.segment import segment
@@ -50,10 +50,10 @@ def test_noise_and_exposure_are_those_of_the_background_by_hand() -> None:
     body[:, :20] = True
     free = surroundings(Prior(body, body, body, body, 8.0), np.ones_like(body))
     assert free.tolist() == (~body).tolist()
-    bright = levelled(plate, image, free)
+    bright = exposure_corrected(plate, image, free)
     assert np.unique(bright).tolist() == [150]
     assert noise_level(image, bright, free) == pytest.approx(1.4826 * 2 + 0.5)
-    assert levelled(image, image, free) is image
+    assert exposure_corrected(image, image, free) is image
     assert noise_level(image, bright, body) == pytest.approx(1.4826 * 120 + 0.5)  # most is free: all of it, 150 and 30
 
 
@@ -64,7 +64,7 @@ def test_background_is_looked_for_ever_nearer_to_the_person() -> None:
     assert surroundings(Prior(narrow, narrow, narrow, wide, 8.0), known).tolist() == (~narrow).tolist()
     known[0] = False
     assert surroundings(Prior(narrow, narrow, wide, wide, 8.0), known).sum() == 10
-    assert levelled(np.zeros((10, 10, 3), np.uint8), np.ones((10, 10, 3), np.uint8), ~wide).max() == 0
+    assert exposure_corrected(np.zeros((10, 10, 3), np.uint8), np.ones((10, 10, 3), np.uint8), ~wide).max() == 0
 
 
 def test_only_a_median_may_hold_shadows_itself() -> None:
@@ -164,7 +164,7 @@ def test_a_bad_mask_is_dropped_and_named(tmp_path: Path, spoil, word: str) -> No
 def test_a_camera_without_a_good_mask_is_an_error(tmp_path: Path) -> None:
     capture, truth = write_scene(tmp_path)
     write_masks(capture, {view: ~mask for view, mask in truth.items()})
-    with pytest.raises(CaptureError, match=r"camera c0: no mask is usable.*inverted"):
+    with pytest.raises(InputError, match=r"camera c0: no mask is usable.*inverted"):
         segment(capture, None, SETTINGS)
 
 
@@ -187,7 +187,7 @@ def test_a_missing_given_mask_names_the_file(tmp_path: Path) -> None:
     capture, truth = write_scene(tmp_path)
     del truth["c0", 2]
     write_masks(capture, truth)
-    with pytest.raises(CaptureError, match=r"masks/c0/000002\.png"):
+    with pytest.raises(InputError, match=r"masks/c0/000002\.png"):
         segment(capture, None, SETTINGS)
 
 
@@ -195,13 +195,13 @@ def test_a_plate_that_shows_the_person_is_an_error(tmp_path: Path) -> None:
     # The only image is the plate itself.
     capture, _ = write_scene(tmp_path, moves_m=0)
     (tmp_path / "background" / "c0.png").write_bytes((tmp_path / "images" / "c0" / "000000.png").read_bytes())
-    with pytest.raises(CaptureError, match="no person in the mask"):
+    with pytest.raises(InputError, match="no person in the mask"):
         segment(only_frames(capture, 1), None, SETTINGS)
 
 
 def test_neither_masks_nor_plate_asks_for_a_body(tmp_path: Path) -> None:
     capture, _ = write_scene(tmp_path, plate=False)
-    with pytest.raises(CaptureError, match="fit a body first"):
+    with pytest.raises(InputError, match="fit a body first"):
         segment(capture, None, SETTINGS)
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from hnerf.segmentation.prior import Prior
-from hnerf.segmentation.verdicts import Verdict, judge, jumps
+from hnerf.segmentation.verdicts import MaskVerdict, judge, jumps
 
 BODY = np.zeros((20, 20), bool)
 BODY[4:16, 8:12] = True  # 48 px
@@ -10,7 +10,7 @@ PRIOR = Prior(BODY, BODY, BODY, BODY, 12.0)
 
 
 def test_a_good_mask() -> None:
-    assert judge(BODY, PRIOR) == Verdict(None, None, 48)
+    assert judge(BODY, PRIOR) == MaskVerdict(None, None, 48)
 
 
 def test_empty_inverted_and_astray() -> None:
@@ -49,5 +49,5 @@ def test_jumps_need_both_neighbours_and_prior(stride: int) -> None:
     frames = tuple(stride * frame for frame in (0, 1, 2, 3, 4, 5, 6, 7, 8, 20))
     areas = [100, 100, 200, 100, 100, 100, 200, 100, 100, 300]
     expected = [50, 50, 50, 50, 50, 50, 100, 50, 50, 50]
-    found = jumps(frames, [Verdict(None, None, area) for area in areas], expected)
+    found = jumps(frames, [MaskVerdict(None, None, area) for area in areas], expected)
     assert found == {2 * stride: "area jumps from 100 to 200 px"}

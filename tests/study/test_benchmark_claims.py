@@ -4,7 +4,7 @@ from typing import Any, get_args
 
 import pytest
 
-from hnerf.study.benchmark.claims import CHECKS, told
+from hnerf.study.benchmark.claims import CHECKS, claim_lines
 from hnerf.study.benchmark.plan import Claim
 from tests.study.test_benchmark_results import scores
 
@@ -36,7 +36,7 @@ def made_up(check: str, **changes: Any) -> dict[str, Any]:
 
 
 def verdict(result: dict[str, Any]) -> str:
-    (line,) = told(result)
+    (line,) = claim_lines(result)
     return line.removeprefix("- The paper: “It works.” Seen here: ")
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from hnerf.config import load_settings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.study.benchmark.plan import STUDIES, Study, Variant, load_study, snapshot_times_s
 
 RECORDED: Any = SimpleNamespace(name="ada", train_cameras=("a", "b", "c", "d"), train_frames=(0, 2, 4, 6, 8))
@@ -56,7 +56,7 @@ def test_methods_of_ready_studies_have_valid_settings() -> None:
     ],
 )
 def test_bad_studies_are_refused_by_key(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(CaptureError, match=message):
+    with pytest.raises(InputError, match=message):
         load_study(write(tmp_path, text))
 
 
@@ -69,7 +69,7 @@ def test_wide_methods_are_the_small_ones_but_for_their_networks() -> None:
 
 
 def test_unknown_studies_are_refused() -> None:
-    with pytest.raises(CaptureError, match="speed: no such study or file; studies are cameras, dynamic"):
+    with pytest.raises(InputError, match="speed: no such study or file; studies are cameras, dynamic"):
         load_study("speed")
 
 
@@ -81,16 +81,16 @@ def test_parts_by_number_and_by_name() -> None:
 
 
 def test_more_than_was_recorded_is_refused() -> None:
-    with pytest.raises(CaptureError, match="the capture has 4 training cameras, not 8"):
+    with pytest.raises(InputError, match="the capture has 4 training cameras, not 8"):
         Variant(cameras=8).parts(RECORDED)
-    with pytest.raises(CaptureError, match="the capture has 5 training frames, not 6"):
+    with pytest.raises(InputError, match="the capture has 5 training frames, not 6"):
         Variant(frames=6).parts(RECORDED)
 
 
 def test_names_that_were_not_recorded_are_refused() -> None:
-    with pytest.raises(CaptureError, match="ada: no training camera e; there are a, b, c, d"):
+    with pytest.raises(InputError, match="ada: no training camera e; there are a, b, c, d"):
         Variant(cameras=("a", "e")).parts(RECORDED)
-    with pytest.raises(CaptureError, match="ada: no training frame 3; there are 0, 2, 4, 6, 8"):
+    with pytest.raises(InputError, match="ada: no training frame 3; there are 0, 2, 4, 6, 8"):
         Variant(frames=(3,)).parts(RECORDED)
 
 

@@ -19,7 +19,7 @@ from hnerf.evaluation.metrics import mask_box
 from hnerf.evaluation.views import View
 from hnerf.study.benchmark import scoring
 from hnerf.study.benchmark.plan import ScoringSettings
-from hnerf.study.benchmark.scoring import Scene, frame_seconds, score, score_at, score_end, write_pictures
+from hnerf.study.benchmark.scoring import ScoringScene, frame_seconds, score, score_at, score_end, write_pictures
 from tests.evaluation.ball import (
     PHOTOGRAPHED,
     RADIUS_M,
@@ -78,9 +78,9 @@ def scored(
         return score(scene(capture), training, settings, out)
 
 
-def scene(capture: Capture) -> Scene:
+def scene(capture: Capture) -> ScoringScene:
     """What the ball is scored against."""
-    return Scene(capture, ball_fit(), GroundTruth(capture.root, capture), "cpu")
+    return ScoringScene(capture, ball_fit(), GroundTruth(capture.root, capture), "cpu")
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.study.degradations import clothing as worn
-from hnerf.study.degradations.clothing import Worn, long_hair, put_on, skirt
+from hnerf.study.degradations.clothing import Worn, add_clothing, long_hair, skirt
 from tests.body.boxes import box_rig
 from tests.study.recording import FRAMES, SIZE_PX, write_recording
 
@@ -94,7 +94,7 @@ def dressed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Capture, G
     root = torch.eye(4).repeat(len(FRAMES), 1, 1)
     root[:, :3, 3] = torch.tensor([-2.0, -0.5, 0.5])
     body = BodyFit(box_rig(), FRAMES, torch.zeros(len(FRAMES), 2, 3), root)
-    put_on("column", 0.25, np.random.default_rng(0), good, body, GroundTruth(good.root, good), tmp_path / "bad")
+    add_clothing("column", 0.25, np.random.default_rng(0), good, body, GroundTruth(good.root, good), tmp_path / "bad")
     bad = Capture.load(tmp_path / "bad")
     return bad, GroundTruth(bad.root, bad)
 

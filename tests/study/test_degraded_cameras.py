@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hnerf.capture.capture import Capture
-from hnerf.errors import CaptureError, NotPossibleError
+from hnerf.errors import InputError, NotApplicableError
 from hnerf.study.degradations.catalogue import KINDS, Degradation, check_strengths, degrade_capture
 from tests.study.recording import FRAMES, write_recording
 
@@ -27,7 +27,7 @@ def test_cameras_and_frames_that_are_left(tmp_path: Path) -> None:
 
 
 def test_what_there_is_already_cannot_be_left(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match="ada: has only 2 training cameras; leave fewer than that"):
+    with pytest.raises(InputError, match="ada: has only 2 training cameras; leave fewer than that"):
         degraded(tmp_path, "cameras_left", 2)
 
 
@@ -36,7 +36,7 @@ def test_one_camera_alone_differs_from_none(tmp_path: Path, kind: str) -> None:
     """It would turn, delay or darken the world, which scores would hold against the avatar."""
     capture = write_recording(tmp_path / "good")
     alone = replace(capture, train_cameras=capture.train_cameras[:1])
-    with pytest.raises(NotPossibleError, match="ada: has one training camera; there is none to differ from"):
+    with pytest.raises(NotApplicableError, match="ada: has one training camera; there is none to differ from"):
         degrade_capture(alone, Degradation(kind=kind, strength=1.0, seed=0), tmp_path / "bad")
 
 
@@ -74,7 +74,7 @@ def test_a_late_camera_has_no_mask_where_it_had_none_before(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("frames", [0.4, 5])
 def test_a_delay_that_no_frame_shows_cannot_be_tried(tmp_path: Path, frames: float) -> None:
-    with pytest.raises(NotPossibleError, match=f"ada: has 5 frames; none can be {frames:g} late"):
+    with pytest.raises(NotApplicableError, match=f"ada: has 5 frames; none can be {frames:g} late"):
         degraded(tmp_path, "camera_out_of_step", frames)
 
 
@@ -87,7 +87,7 @@ def test_seeds_differ_and_repeat(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("strengths", [(), (1.0, 3.0, 2.0), (1.0, 1.0), (0.0, 1.0), (float("nan"),), (float("inf"),)])
 def test_strengths_go_one_way(strengths: tuple[float, ...]) -> None:
-    with pytest.raises(CaptureError, match="mask_holes: give numbers between 0 and 100 that rise, the mildest first"):
+    with pytest.raises(InputError, match="mask_holes: give numbers between 0 and 100 that rise, the mildest first"):
         check_strengths("mask_holes", strengths)
 
 
@@ -107,7 +107,7 @@ def test_strengths_go_one_way(strengths: tuple[float, ...]) -> None:
     ],
 )
 def test_each_kind_has_its_way_and_bounds(kind: str, strengths: tuple[float, ...], told: str) -> None:
-    with pytest.raises(CaptureError, match=f"degradation {kind}: give {told}, the mildest first"):
+    with pytest.raises(InputError, match=f"degradation {kind}: give {told}, the mildest first"):
         check_strengths(kind, strengths)
 
 
@@ -122,5 +122,5 @@ def test_kinds_are_told_apart_by_their_labels() -> None:
 
 
 def test_unknown_degradations_are_refused() -> None:
-    with pytest.raises(CaptureError, match="degradation hair: no such thing; there are cameras_left, "):
+    with pytest.raises(InputError, match="degradation hair: no such thing; there are cameras_left, "):
         check_strengths("hair", (1.0,))

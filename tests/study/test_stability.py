@@ -8,7 +8,7 @@ import cv2
 import pytest
 
 from hnerf.config import load_settings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.study.benchmark.plan import Part
 from hnerf.study.degradations.catalogue import KINDS
 from hnerf.study.stability.charts import SHADES, curve_chart, matrix_chart
@@ -77,15 +77,15 @@ def test_the_quick_study_tries_the_two_milder_strengths_and_says_what_it_left_ou
 )
 def test_bad_studies_are_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(text)
-    with pytest.raises(CaptureError, match=message) as told:
+    with pytest.raises(InputError, match=message) as told:
         load_stability(str(tmp_path / "mine.yaml"))
     assert "\n" not in str(told.value)
 
 
 def test_unknown_studies_and_degradations_are_refused() -> None:
-    with pytest.raises(CaptureError, match="slow: no such study or file; studies are brief, fast, full, methods, "):
+    with pytest.raises(InputError, match="slow: no such study or file; studies are brief, fast, full, methods, "):
         load_stability("slow")
-    with pytest.raises(CaptureError, match="--only hats: not in this study; it has cameras_left, "):
+    with pytest.raises(InputError, match="--only hats: not in this study; it has cameras_left, "):
         load_stability("quick").only(["hats"])
     assert list(load_stability("quick").only(["pose_noise"]).degradations) == ["pose_noise"]
 

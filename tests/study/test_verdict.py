@@ -1,6 +1,6 @@
 import pytest
 
-from hnerf.study.stability.verdict import Verdict, judge, near_border
+from hnerf.study.stability.verdict import RunVerdict, judge, near_border
 
 GOOD = {"psnr": 30.0, "chamfer_mm": 6.0, "empty_psnr": 18.0}
 
@@ -36,8 +36,8 @@ def test_half_of_what_a_good_run_has_above_an_empty_picture_is_failure() -> None
 def test_what_loses_most_of_little_is_failure_though_it_lose_less_than_a_decibel() -> None:
     """17.5 dB where an empty picture has 16: 0.9 dB less is more than half of it, 0.7 dB less is not."""
     little = {"psnr": 17.5, "chamfer_mm": None, "empty_psnr": 16.0}
-    assert judge(little | {"psnr": 16.6}, little, []) == Verdict("failed", "0.9 dB of PSNR lost")
-    assert judge(little | {"psnr": 16.8}, little, []) == Verdict("ok")
+    assert judge(little | {"psnr": 16.6}, little, []) == RunVerdict("failed", "0.9 dB of PSNR lost")
+    assert judge(little | {"psnr": 16.8}, little, []) == RunVerdict("ok")
 
 
 def test_a_good_run_is_judged_too() -> None:
@@ -46,14 +46,14 @@ def test_a_good_run_is_judged_too() -> None:
 
 
 def test_a_surface_that_is_no_persons_is_failure_whatever_the_scores() -> None:
-    assert judge(GOOD, GOOD, ["no surface", "a hole"]) == Verdict("failed", "no surface")
+    assert judge(GOOD, GOOD, ["no surface", "a hole"]) == RunVerdict("failed", "no surface")
     unknown = {"psnr": None, "chamfer_mm": None}
-    assert judge(unknown, unknown, ["no surface"]) == Verdict("failed", "no surface")
+    assert judge(unknown, unknown, ["no surface"]) == RunVerdict("failed", "no surface")
 
 
 def test_surfaces_alone_are_judged_where_nothing_is_to_be_compared() -> None:
-    assert judge(None, {}, []) == Verdict("ok")
-    assert judge(None, {}, ["no surface"]) == Verdict("failed", "no surface")
+    assert judge(None, {}, []) == RunVerdict("ok")
+    assert judge(None, {}, ["no surface"]) == RunVerdict("failed", "no surface")
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from hnerf.config import CaptureSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tasks.source import Source
 from tasks.stage import stage
 from tasks.store import Artifact
@@ -30,7 +30,7 @@ def flaky(out: Path, source: Source) -> dict[str, float]:
     """Fails once with the error that the source names."""
     _count(out)
     if len(calls(out.parent.parent)) == 1:
-        error = {"io": OSError("disk"), "bad": CaptureError("a.jpg: bad"), "gone": FileNotFoundError("a.jpg")}
+        error = {"io": OSError("disk"), "bad": InputError("a.jpg: bad"), "gone": FileNotFoundError("a.jpg")}
         raise error[(source.root / "text").read_text()]
     return {}
 

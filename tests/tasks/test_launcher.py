@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tasks.launcher import GaveUpError, LostWorkerError, run_ranks
 
 RANKS = "tests.tasks.ranks"
@@ -52,7 +52,7 @@ def test_files_where_the_user_stands_are_no_modules(tmp_path: Path, monkeypatch:
 @pytest.mark.parametrize(
     ("mode", "error", "message"),
     [
-        ("bad", CaptureError, r"^a\.jpg: bad; write it again$"),
+        ("bad", InputError, r"^a\.jpg: bad; write it again$"),
         ("stuck", GaveUpError, "^no surface: check the masks$"),
         ("full", OSError, r"^\[Errno 28\] No space left on device: 'b\.pt'$"),
         ("raise", RuntimeError, r"rank 1 ended with exit code 1(.|\n)*ValueError: boom in rank one$"),

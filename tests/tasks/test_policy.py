@@ -6,7 +6,7 @@ import pytest
 from prefect.states import Failed
 
 from hnerf.config import CaptureSettings, FitSettings, Section, SegmentationSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tasks.launcher import LostWorkerError
 from tasks.policy import is_transient, stage_key
 from tasks.source import Source
@@ -104,7 +104,7 @@ def test_key_in_numbers() -> None:
         (OSError(errno.ENAMETOOLONG, "File name too long"), False),
         (OSError(errno.ELOOP, "Too many levels of symbolic links"), False),
         (OSError(errno.ENOTEMPTY, "Directory not empty"), False),
-        (CaptureError("a.jpg: bad"), False),
+        (InputError("a.jpg: bad"), False),
         (ValueError("bug"), False),
     ],
 )

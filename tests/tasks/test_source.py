@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tasks import source as module
 from tasks.source import read_capture
 
@@ -79,7 +79,7 @@ def test_a_name_that_is_not_utf_8_counts_by_its_bytes(folder: Path) -> None:
 
 
 def test_a_folder_whose_name_is_not_utf_8_is_bad_input(folder: Path) -> None:
-    with pytest.raises(CaptureError, match="jos�: the folder's name is not UTF-8; rename it"):
+    with pytest.raises(InputError, match="jos�: the folder's name is not UTF-8; rename it"):
         read_capture(folder.rename(folder.with_name(os.fsdecode(b"jos\xe9"))))
 
 
@@ -87,21 +87,21 @@ def test_what_cannot_be_read_is_bad_input(folder: Path, monkeypatch: pytest.Monk
     def refused(*_: object) -> str:
         raise PermissionError(13, "Permission denied", "images")
 
-    with monkeypatch.context() as locked, pytest.raises(CaptureError, match=r"0\.jpg: cannot be read \(Permission"):
+    with monkeypatch.context() as locked, pytest.raises(InputError, match=r"0\.jpg: cannot be read \(Permission"):
         locked.setattr(module, "sha256_of", refused)
         read_capture(folder)
     monkeypatch.setattr(os, "scandir", refused)
-    with pytest.raises(CaptureError, match=r"images: cannot be read \(Permission denied\); make it readable"):
+    with pytest.raises(InputError, match=r"images: cannot be read \(Permission denied\); make it readable"):
         read_capture(folder)
 
 
 def test_a_store_in_the_capture_is_bad_input(folder: Path) -> None:
     """Its files would change the capture's digest, so that nothing would be found again."""
     read_capture(folder, folder.parent / "store")
-    with pytest.raises(CaptureError, match="store: lies in the capture's folder; give --store another place"):
+    with pytest.raises(InputError, match="store: lies in the capture's folder; give --store another place"):
         read_capture(folder, folder / "store")
 
 
 def test_missing_folder_is_bad_input(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match="no such folder"):
+    with pytest.raises(InputError, match="no such folder"):
         read_capture(tmp_path / "absent")

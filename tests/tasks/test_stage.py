@@ -7,7 +7,7 @@ from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterId
 from prefect.context import FlowRunContext
 
 from hnerf.config import CaptureSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tasks.source import Source, read_capture
 from tasks.store import Store
 from tests.tasks.fakes import calls, copy, double, flaky
@@ -96,7 +96,7 @@ def one_flaky(store: Path, source: Source) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "error", "attempts"), [("io", None, 2), ("bad", CaptureError, 1), ("gone", FileNotFoundError, 1)]
+    ("fault", "error", "attempts"), [("io", None, 2), ("bad", InputError, 1), ("gone", FileNotFoundError, 1)]
 )
 def test_only_transient_faults_are_tried_again(
     prefect_api: str,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from tasks.store import Store, require_whole
 
 # Not forked: a child would inherit Prefect's threads half-way.
@@ -26,8 +26,8 @@ def never(out: Path) -> dict[str, float]:
 
 
 def test_artifact_is_recorded_with_digests_and_found_again(tmp_path: Path) -> None:
-    made = Store(tmp_path).obtain("fit", "k", write_abc)
-    found = Store(tmp_path).obtain("fit", "k", never)
+    made = Store(tmp_path).get_or_compute("fit", "k", write_abc)
+    found = Store(tmp_path).get_or_compute("fit", "k", never)
     assert found == made
     assert made.root == tmp_path / "fit" / "k"
     assert {name: (file.sha256, file.size_bytes) for name, file in made.files.items()} == {"deep/letters": (ABC, 3)}
@@ -35,21 +35,21 @@ def test_artifact_is_recorded_with_digests_and_found_again(tmp_path: Path) -> No
 
 
 def test_digest_is_of_names_and_bytes_only(tmp_path: Path) -> None:
-    first = Store(tmp_path / "a").obtain("fit", "k", write_abc)
-    second = Store(tmp_path / "b").obtain("fit", "other", lambda out: write_abc(out) and {})
+    first = Store(tmp_path / "a").get_or_compute("fit", "k", write_abc)
+    second = Store(tmp_path / "b").get_or_compute("fit", "other", lambda out: write_abc(out) and {})
     renamed = first.model_copy(update={"files": {"deep/lettres": first.files["deep/letters"]}})
     assert first.digest == second.digest
     assert first.digest != renamed.digest
 
 
-@pytest.mark.parametrize("error", [RuntimeError("crash"), KeyboardInterrupt(), CaptureError("a.jpg: bad")])
+@pytest.mark.parametrize("error", [RuntimeError("crash"), KeyboardInterrupt(), InputError("a.jpg: bad")])
 def test_half_written_artifact_is_not_seen(tmp_path: Path, error: BaseException) -> None:
     def half(out: Path) -> dict[str, float]:
         write_abc(out)
         raise error
 
     with pytest.raises(type(error)):
-        Store(tmp_path).obtain("fit", "k", half)
+        Store(tmp_path).get_or_compute("fit", "k", half)
     assert Store(tmp_path).find("fit", "k") is None
     assert [path.name for path in (tmp_path / "fit").iterdir()] == ["k.lock"]
 
@@ -60,9 +60,11 @@ def test_resumable_stage_goes_on_where_it_was(tmp_path: Path) -> None:
         raise OSError("worker lost")
 
     with pytest.raises(OSError, match="worker lost"):
-        Store(tmp_path).obtain("training", "k", interrupted, resumable=True)
+        Store(tmp_path).get_or_compute("training", "k", interrupted, resumable=True)
     assert (tmp_path / "training" / "k.partial" / "deep" / "letters").exists()
-    artifact = Store(tmp_path).obtain("training", "k", lambda out: {"resumed": (out / "deep").exists()}, resumable=True)
+    artifact = Store(tmp_path).get_or_compute(
+        "training", "k", lambda out: {"resumed": (out / "deep").exists()}, resumable=True
+    )
     assert artifact.metrics == {"resumed": 1.0}
     assert list(artifact.files) == ["deep/letters"]
 
@@ -70,10 +72,10 @@ def test_resumable_stage_goes_on_where_it_was(tmp_path: Path) -> None:
 @pytest.mark.parametrize("victim", ["k/deep/letters", "k.json"])
 @pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_text("abd")])
 def test_damaged_or_deleted_artifact_is_made_again(tmp_path: Path, victim: str, damage) -> None:  # type: ignore[no-untyped-def]
-    made = Store(tmp_path).obtain("fit", "k", write_abc)
+    made = Store(tmp_path).get_or_compute("fit", "k", write_abc)
     damage(tmp_path / "fit" / victim)
     assert Store(tmp_path).find("fit", "k") is None
-    assert Store(tmp_path).obtain("fit", "k", write_abc) == made
+    assert Store(tmp_path).get_or_compute("fit", "k", write_abc) == made
     assert Store(tmp_path).find("fit", "k") == made
 
 
@@ -81,7 +83,7 @@ def test_directory_without_record_is_not_an_artifact(tmp_path: Path) -> None:
     """What a crash between the rename and the record leaves."""
     (tmp_path / "fit" / "k").mkdir(parents=True)
     (tmp_path / "fit" / "k" / "stale").write_text("x")
-    assert list(Store(tmp_path).obtain("fit", "k", write_abc).files) == ["deep/letters"]
+    assert list(Store(tmp_path).get_or_compute("fit", "k", write_abc).files) == ["deep/letters"]
     assert not (tmp_path / "fit" / "k" / "stale").exists()
 
 
@@ -92,7 +94,7 @@ def slow_work(root: Path) -> None:
         time.sleep(0.5)
         return write_abc(out)
 
-    Store(root).obtain("fit", "k", write)
+    Store(root).get_or_compute("fit", "k", write)
 
 
 def test_two_processes_at_once_do_the_work_once(tmp_path: Path) -> None:
@@ -111,7 +113,7 @@ def hang(root: Path) -> None:
         time.sleep(60)
         return {}
 
-    Store(root).obtain("fit", "k", write)
+    Store(root).get_or_compute("fit", "k", write)
 
 
 def test_sigkill_leaves_no_lock_and_no_artifact(tmp_path: Path) -> None:
@@ -124,14 +126,14 @@ def test_sigkill_leaves_no_lock_and_no_artifact(tmp_path: Path) -> None:
     process.join()
     assert Store(tmp_path).find("fit", "k") is None
     began = time.monotonic()
-    Store(tmp_path).obtain("fit", "k", write_abc)
+    Store(tmp_path).get_or_compute("fit", "k", write_abc)
     assert time.monotonic() - began < 5
 
 
 def test_view_points_at_the_latest(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for key in ("first", "second"):
-        store.show("ada", store.obtain("fit", key, write_abc))
+        store.link_latest("ada", store.get_or_compute("fit", key, write_abc))
     link = tmp_path / "subjects" / "ada" / "fit"
     assert os.readlink(link) == "../../fit/second"
     assert (link / "deep" / "letters").read_text() == "abc"
@@ -141,27 +143,27 @@ def test_view_points_at_the_latest(tmp_path: Path) -> None:
 def test_view_never_mixes_what_was_made_from_other_things(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for stage in ("fit", "training", "asset"):
-        store.show("ada", store.obtain(stage, "old", write_abc))
-    store.show("ada", store.obtain("training", "old", write_abc))  # the same again
+        store.link_latest("ada", store.get_or_compute(stage, "old", write_abc))
+    store.link_latest("ada", store.get_or_compute("training", "old", write_abc))  # the same again
     assert {path.name for path in (tmp_path / "subjects" / "ada").iterdir()} == {"fit", "training", "asset"}
-    store.show("ada", store.obtain("fit", "new", write_abc))
+    store.link_latest("ada", store.get_or_compute("fit", "new", write_abc))
     assert [path.name for path in (tmp_path / "subjects" / "ada").iterdir()] == ["fit"]
 
 
 @pytest.mark.parametrize("name", ["", "..", "../../home", "a/b"])
 def test_view_stays_within_the_store(tmp_path: Path, name: str) -> None:
     store = Store(tmp_path)
-    artifact = store.obtain("fit", "k", write_abc)
-    with pytest.raises(CaptureError, match=r"capture\.toml: name"):
-        store.show(name, artifact)
+    artifact = store.get_or_compute("fit", "k", write_abc)
+    with pytest.raises(InputError, match=r"capture\.toml: name"):
+        store.link_latest(name, artifact)
 
 
 def test_a_subject_whose_artifact_was_damaged_is_refused(tmp_path: Path) -> None:
-    shelf = Store(tmp_path)
-    made = shelf.show("ada", shelf.obtain("fit", "k", write_abc))
+    store = Store(tmp_path)
+    made = store.link_latest("ada", store.get_or_compute("fit", "k", write_abc))
     require_whole(tmp_path / "subjects" / "ada")
     (made.root / "deep" / "letters").write_text("abd")
-    with pytest.raises(CaptureError, match="fit/k: damaged; give the same `hnerf run` again"):
+    with pytest.raises(InputError, match="fit/k: damaged; give the same `hnerf run` again"):
         require_whole(tmp_path / "subjects" / "ada")
 
 

@@ -23,7 +23,7 @@ def store(tmp_path: Path) -> Store:
 
 
 def recording(store: Store) -> Artifact:
-    return store.obtain("capture", "ada", lambda out: {"cameras": len(write_recording(out).cameras)})
+    return store.get_or_compute("capture", "ada", lambda out: {"cameras": len(write_recording(out).cameras)})
 
 
 def body(store: Store) -> Artifact:
@@ -34,7 +34,7 @@ def body(store: Store) -> Artifact:
         (out / "report.json").write_text("{}")
         return {}
 
-    return store.obtain("fit", "ada", write)
+    return store.get_or_compute("fit", "ada", write)
 
 
 def test_what_is_chosen_is_part_of_a_subsets_key(store: Store) -> None:
@@ -73,7 +73,7 @@ def test_a_surface_that_touches_itself_stays_closed(store: Store) -> None:
         both.export(out / "meshes" / "000002.ply")
         return {}
 
-    checked = check_meshes(store, store.obtain("evaluation", "twin", write), body(store))
+    checked = check_meshes(store, store.get_or_compute("evaluation", "twin", write), body(store))
     found = json.loads((checked.root / "surface.json").read_text())["000002"]
     assert found["fault"] is None
     assert (found["volume"], found["length"]) == pytest.approx((1.01, 1.1), rel=1e-4)
@@ -86,7 +86,7 @@ def test_meshes_are_judged_by_the_body_of_their_frame(store: Store) -> None:
             trimesh.creation.box((side_m,) * 3).export(out / "meshes" / f"{frame:06d}.ply")
         return {}
 
-    checked = check_meshes(store, store.obtain("evaluation", "ada", write), body(store))
+    checked = check_meshes(store, store.get_or_compute("evaluation", "ada", write), body(store))
     found = json.loads((checked.root / "surface.json").read_text())
     assert found["000002"]["fault"] is None
     assert found["000004"]["fault"] == "surface has 0.12 of the body's volume"

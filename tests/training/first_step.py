@@ -11,13 +11,13 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 from hnerf.config import LossSettings, TrainingSettings
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.parts import Parts
 from hnerf.training.trainer import Trainer
 from tests.training.scene import TINY, record
 
 
-def untrained(folder: Path, machinery: str, processes: Processes, memory_gib: float | None = None) -> Trainer:
+def untrained(folder: Path, machinery: str, processes: Distributed, memory_gib: float | None = None) -> Trainer:
     """With all losses, and something to deform; its steps find gradients and move nothing."""
     losses = LossSettings(elastic=0.1 if machinery == "fast" else 0.0)
     changes = {"machinery": machinery, "losses": losses, "memory_gib": memory_gib}
@@ -38,12 +38,12 @@ def gradients(trainer: Trainer, module: torch.nn.Module) -> dict[str, Tensor]:
 def main(folder: Path, machinery: str, parts: int) -> None:
     """Leave the gradients of a step, and how many steps each rank skips where one has a loss that is not finite."""
     torch.set_num_threads(1)
-    processes = Processes.join()
+    processes = Distributed.join()
     trainer = untrained(folder, machinery, processes)
     trainer.parts = Parts(parts, False, 1e9)
     module = DistributedDataParallel(trainer.objective, find_unused_parameters=True)
     found = gradients(trainer, module)
-    if processes.leads:
+    if processes.is_main:
         torch.save(found, folder / "gradients.pt")
     assert trainer.skipped == 0
     forward, odd = trainer.objective.forward, torch.tensor(float("nan") if processes.rank else 0.0)

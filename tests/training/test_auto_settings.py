@@ -6,22 +6,22 @@ import numpy as np
 import pytest
 
 from hnerf.config import TrainingSettings
-from hnerf.training.auto_settings import Scene, decide
+from hnerf.training.auto_settings import SceneStatistics, decide
 from tests.training.scene import record
 
-SCENE = Scene(
+SCENE = SceneStatistics(
     cameras=4,
     frames=24,
     footprint_m=0.02,
     outside_m=0.035,
     inside_m=0.005,
     side_m=1.92,
-    spread_rad=0.3,
+    std_rad=0.3,
     person_px=4_000_000,
 )
 
 
-def decided(scene: Scene, **given: object) -> tuple[TrainingSettings, dict]:
+def decided(scene: SceneStatistics, **given: object) -> tuple[TrainingSettings, dict]:
     settings = TrainingSettings.model_validate({"frames_per_step": 10, "rays_per_frame": 250} | given)
     return decide(scene, settings)
 
@@ -46,7 +46,7 @@ def test_no_finer_than_frames_align():
     assert fast.geometry_cells[-1] == 128
 
 
-@pytest.mark.parametrize("still", [{"frames": 1}, {"spread_rad": 0.001}])
+@pytest.mark.parametrize("still", [{"frames": 1}, {"std_rad": 0.001}])
 def test_one_posture_is_as_fine_as_its_pixels(still: dict):
     """Down to 8 mm: 240 cells on 1.92 m, 160 for geometry, a sample each 4.8 mm: 2.4 x 8 cm / 4.8 mm = 40."""
     for footprint_m in (0.008, 0.001):
@@ -75,11 +75,11 @@ def test_what_is_given_stands():
 
 
 @pytest.mark.parametrize(
-    ("machinery", "spread_rad", "one"), [("fast", 0.001, True), ("fast", 0.003, False), ("paper", 0.001, False)]
+    ("machinery", "std_rad", "one"), [("fast", 0.001, True), ("fast", 0.003, False), ("paper", 0.001, False)]
 )
-def test_frames_that_were_fitted_with_one_posture_keep_one(machinery: str, spread_rad: float, one: bool):
+def test_frames_that_were_fitted_with_one_posture_keep_one(machinery: str, std_rad: float, one: bool):
     """The published method gives each frame its own; so does what is given."""
-    scene = SCENE.__class__(**{**vars(SCENE), "spread_rad": spread_rad})
+    scene = SCENE.__class__(**{**vars(SCENE), "std_rad": std_rad})
     assert decided(scene, machinery=machinery)[0].one_posture is one
     assert decided(scene, one_posture=not one)[0].one_posture is not one
 
@@ -102,7 +102,7 @@ def test_one_camera_needs_time_to_find_how_deep_bodies_stand(cameras: int, frame
 
 
 def test_one_pose_teaches_nothing_about_poses():
-    settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "spread_rad": 0.01}))
+    settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "std_rad": 0.01}))
     assert settings.fast.pose_width == 1
     assert decisions["fast.pose_width"].reason.endswith("too little to learn from")
 
@@ -120,12 +120,12 @@ def test_a_scene_as_it_is_measured(tmp_path: Path):
     whose outline is its outermost pixels: half a pixel to one and a half inside. One joint of two is free and bends by
     0 and 0.2 rad in the two training frames: 0.1 from their mean."""
     capture, masks, body = record(tmp_path / "capture")
-    scene = Scene.of(capture, masks, body)
+    scene = SceneStatistics.of(capture, masks, body)
     assert (scene.cameras, scene.frames) == (4, 2)
     assert scene.footprint_m == pytest.approx(0.105, abs=0.003)
     assert scene.outside_m == 0.0
     assert 0.09 < scene.inside_m < 0.2
     assert scene.side_m == pytest.approx(2.0)
-    assert scene.spread_rad == pytest.approx(0.1)
+    assert scene.std_rad == pytest.approx(0.1)
     areas = [masks.get(c, f).sum() for c in capture.train_cameras for f in capture.train_frames]
     assert scene.person_px == pytest.approx(np.sum(areas), rel=0.01)

@@ -9,7 +9,7 @@ from torch import nn
 from hnerf.fields.base import Field
 from hnerf.fields.fast import FastField
 from hnerf.fields.paper import PaperField
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import LEAST_COVERAGE, Trainer
 from tests.training.scene import TINY, record
@@ -20,7 +20,7 @@ FAR = 10.0  # units of the residual's last layer: metres away in either machiner
 def trainer_of(folder: Path, machinery: str) -> Trainer:
     """One that takes two steps."""
     settings = TINY.model_copy(update={"machinery": machinery, "steps": 2, "novel_pose_steps": 0})
-    return Trainer(*record(folder / "capture"), settings, folder, Processes(0, 1, torch.device("cpu")))
+    return Trainer(*record(folder / "capture"), settings, folder, Distributed(0, 1, torch.device("cpu")))
 
 
 def move_surface(field: Field, outwards: float) -> None:

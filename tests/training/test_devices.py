@@ -12,7 +12,7 @@ from hnerf.avatar.surface import surface_in_pose
 from hnerf.avatar.trained import load_avatar
 from hnerf.render.pictures import depth_image, normal_image
 from hnerf.training import trainer as trainer_module
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.trainer import train
 from tests.training.pretended_gpu import pretended_gpu
 from tests.training.scene import TINY, record
@@ -32,7 +32,7 @@ def test_trains_loads_and_renders_on_one_device(tmp_path: Path, monkeypatch: pyt
         capture = replace(capture, train_frames=capture.train_frames[:1])
     gpu = nullcontext(torch.device("cuda", 0)) if WITH_GPU else pretended_gpu(monkeypatch)
     with gpu as device:
-        train(capture, masks, body, TINY.model_copy(update=changes), tmp_path, Processes(0, 1, device))
+        train(capture, masks, body, TINY.model_copy(update=changes), tmp_path, Distributed(0, 1, device))
         avatar = load_avatar(tmp_path, device)
         theta, root = avatar.body.theta[0], avatar.body.root[0]
         shown = avatar.render(camera, theta, root)

@@ -13,12 +13,12 @@ import trimesh
 from hnerf.avatar.trained import TrainedAvatar, build_field
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.geometry.reach import everywhere
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.exposure import _in_sight, camera_gains, solve_gains
 from hnerf.training.gather import gather_pixels
 from tests.training.scene import TINY, KnownMasks, look_at, record
 
-ALONE = Processes(0, 1, torch.device("cpu"))
+ALONE = Distributed(0, 1, torch.device("cpu"))
 BALL = trimesh.creation.icosphere(subdivisions=5)  # 10242 vertices 1 m around the origin
 RING = {name: look_at(name, 4.0 * np.array([x, y, 0]), np.zeros(3)).resized(128, 128)
         for name, x, y in [("a", 1, 0), ("b", 0, 1), ("c", -1, 0), ("d", 0, -1)]}  # fmt: skip
@@ -108,14 +108,14 @@ def test_what_is_hidden_is_not_in_sight() -> None:
 def test_pixels_are_levelled_by_their_cameras(tmp_path: Path) -> None:
     capture, masks, body = record(tmp_path)
     gains = {"0": (2.0, 1.0, 0.5)} | dict.fromkeys(capture.train_cameras[1:], (1.0, 1.0, 1.0))
-    pixels, levelled = (
+    pixels, exposure_corrected = (
         gather_pixels(capture, masks, body, body.frames, everywhere, by, tmp_path, ALONE) for by in ({}, gains)
     )
     first = pixels.where(torch.arange(len(pixels.person)))[0] == 0
-    assert levelled.colour[first & pixels.person].unique(dim=0).tolist() == [[100, 50, 100]]  # of 200, 50, 50
-    assert pixels.plate is not None and levelled.plate is not None
-    assert levelled.plate[first].unique(dim=0).tolist() == [[64, 128, 255]]  # of 128
-    assert torch.equal(levelled.colour[~first], pixels.colour[~first])
+    assert exposure_corrected.colour[first & pixels.person].unique(dim=0).tolist() == [[100, 50, 100]]  # of 200, 50, 50
+    assert pixels.plate is not None and exposure_corrected.plate is not None
+    assert exposure_corrected.plate[first].unique(dim=0).tolist() == [[64, 128, 255]]  # of 128
+    assert torch.equal(exposure_corrected.colour[~first], pixels.colour[~first])
 
 
 def test_a_training_camera_shows_what_its_gain_makes_of_it(tmp_path: Path) -> None:

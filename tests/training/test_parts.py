@@ -9,13 +9,13 @@ from torch import Tensor, nn
 from hnerf.fields.conditions import Draws
 from hnerf.training import parts as parts_module
 from hnerf.training import trainer as trainer_module
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.parts import GIB, PEAK, USABLE, Parts, decide_parts
 from hnerf.training.pixels import Rays
 from tests.training.first_step import gradients, untrained
 
 CPU = torch.device("cpu")
-ALONE = Processes(0, 1, CPU)
+ALONE = Distributed(0, 1, CPU)
 
 
 class Scale(nn.Module):
@@ -25,7 +25,7 @@ class Scale(nn.Module):
         super().__init__()
         self.w = nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
 
-    def forward(self, stage: object, rays: Rays, conditions: object, draws: Draws) -> dict[str, Tensor]:
+    def forward(self, scene: object, rays: Rays, conditions: object, draws: Draws) -> dict[str, Tensor]:
         """`mean` and `increment`."""
         assert len(draws.jitter) == len(rays.frame) > 0
         return {"mean": (self.w * rays.origins_m[:, 0]).mean(), "increment": 3 * self.w}
@@ -46,7 +46,7 @@ def test_parts_of_unequal_size_add_up_to_the_joint_batch(
     for rank in range(world_size):
         module = Scale()
         terms = Parts(count, side_by_side, 7).backward(
-            module, None, rays, None, Draws.still(7, 1, CPU), Processes(rank, world_size, CPU)
+            module, None, rays, None, Draws.deterministic(7, 1, CPU), Distributed(rank, world_size, CPU)
         )
         means.append(terms["mean"].item())
         slopes.append(module.w.grad.item())
@@ -67,9 +67,9 @@ def test_parts_follow_from_the_memory_that_a_ray_needs(
 ) -> None:
     """8 KiB a ray and 8000 bytes beside them, in room for 100 rays and a half, given or free."""
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
-    monkeypatch.setattr(Processes, "greatest", lambda self, value: value)
+    monkeypatch.setattr(Distributed, "greatest", lambda self, value: value)
     room = PEAK * (8000 + 8192 * 100.5)
-    processes = Processes(0, world_size, CPU)
+    processes = Distributed(0, world_size, CPU)
     made, decision = decide_parts(rays, room / GIB, attempted, processes)
     assert made.count == decision.value == parts
     assert made.most_rays == pytest.approx(100.5, abs=0.01)

@@ -9,13 +9,13 @@ import torch
 
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.reach import Reached, everywhere, within_box, within_reach
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.gather import gather_pixels
 from hnerf.training.pixels import Pixels
 from tests.training.scene import record
 
 AHEAD = Camera("ahead", np.diag([50.0, 50.0, 1.0]), np.eye(3), np.zeros(3), 60, 40)
-ALONE = Processes(0, 1, torch.device("cpu"))
+ALONE = Distributed(0, 1, torch.device("cpu"))
 REACHED = functools.partial(within_reach, reach_m=0.2)
 
 

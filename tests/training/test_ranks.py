@@ -12,20 +12,20 @@ import torch
 
 from hnerf.training import trainer as trainer_module
 from hnerf.training.checkpoint import NAME
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.trainer import train
 from tests.training.first_step import gradients, untrained
 from tests.training.scene import TINY, record
 
-ALONE = Processes(0, 1, torch.device("cpu"))
+ALONE = Distributed(0, 1, torch.device("cpu"))
 KILLED = """
 import os, signal, sys, torch
 from pathlib import Path
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.trainer import Trainer
 from tests.training.scene import TINY, record
 torch.set_num_threads(1)
-root, optimise, p = Path(sys.argv[1]), Trainer._optimise, Processes.join()
+root, optimise, p = Path(sys.argv[1]), Trainer._optimise, Distributed.join()
 
 def killed_at_eight(self, module):
     if self.step == 8 and p.rank == 1:

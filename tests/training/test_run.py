@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.training import run
 from hnerf.training.step import TrainingError
 
@@ -13,7 +13,7 @@ from hnerf.training.step import TrainingError
 @pytest.mark.parametrize(
     ("error", "code", "told"),
     [
-        (CaptureError("a.npz: is cut short"), 2, "a.npz: is cut short"),
+        (InputError("a.npz: is cut short"), 2, "a.npz: is cut short"),
         (TrainingError("empty"), 3, "empty"),
         (OSError(28, "No space left", Path("b.pt")), 4, '[28, "No space left", "b.pt"]'),
         (OSError("c.png: cannot be written"), 4, '[null, "c.png: cannot be written", null]'),
@@ -26,7 +26,7 @@ def test_what_is_told_is_the_last_line_and_an_exit_code(
         raise error
 
     monkeypatch.setattr(sys, "argv", ["run", "capture", "cameras", "masks", "fit", "{}", "out"])
-    monkeypatch.setattr(run.Processes, "join", lambda: None)
+    monkeypatch.setattr(run.Distributed, "join", lambda: None)
     monkeypatch.setattr(run.Capture, "load", fails)
     assert run.main() == code
     assert capsys.readouterr().err == f"{told}\n"

@@ -12,7 +12,7 @@ from hnerf.config import LossSettings, TrainingSettings
 from hnerf.fields.conditions import Draws
 from hnerf.training import losses
 from hnerf.training.pixels import Rays
-from hnerf.training.step import Objective, aim
+from hnerf.training.step import Objective, make_target
 from tests.training.test_losses import SAMPLES, TARGET
 
 BEYOND, SEEN, PLATE = torch.rand(3, 4, 3, generator=torch.Generator().manual_seed(0))
@@ -24,7 +24,7 @@ def aimed(plate: Tensor | None, own_background: bool = False) -> tuple[losses.Ta
     """Of pixels inside the person, on both sides of the outline, and in the surroundings."""
     none = torch.zeros(4, 3)
     rays = Rays(none, none, torch.zeros(4, dtype=torch.long), SEEN, PERSON, EDGE, plate)
-    return aim(rays, Draws(none, BEYOND, none), own_background)
+    return make_target(rays, Draws(none, BEYOND, none), own_background)
 
 
 @pytest.mark.parametrize("plate", [None, PLATE])

@@ -13,16 +13,16 @@ from safetensors.torch import load_file, save_file
 
 from hnerf.avatar.trained import load_avatar
 from hnerf.config import TrainingSettings, load_settings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.training import trainer as trainer_module
 from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import Pixels, Rays
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import Trainer, train
 from tests.training.scene import FRAMES, TINY, record
 
-ALONE = Processes(0, 1, torch.device("cpu"))
+ALONE = Distributed(0, 1, torch.device("cpu"))
 
 
 def with_changes(**changes: object) -> TrainingSettings:
@@ -171,7 +171,7 @@ def test_a_model_of_another_version_is_refused(tmp_path: Path):
     Trainer(capture, masks, body, with_changes(steps=1, novel_pose_steps=0), tmp_path, ALONE).run()
     tensors = load_file(tmp_path / "model.safetensors")
     save_file({name: t for name, t in tensors.items() if name != "outer_m"}, tmp_path / "model.safetensors")
-    with pytest.raises(CaptureError, match=r"model.safetensors: of another version; train the subject again"):
+    with pytest.raises(InputError, match=r"model.safetensors: of another version; train the subject again"):
         load_avatar(tmp_path)
 
 
@@ -231,7 +231,7 @@ def test_what_all_poses_changed_alike_is_the_rest_bodys(tmp_path: Path, machiner
     settings = with_changes(machinery=machinery, pose_learning_rate=0.01, novel_pose_steps=0)
     trainer = Trainer(capture, masks, body, settings, tmp_path, ALONE)
     trainer.run()
-    tuned, rows = trainer.stage.bodies, trainer.train_rows
+    tuned, rows = trainer.scene.bodies, trainer.train_rows
     turn = tuned.theta[rows] - body.theta[rows]
     assert turn.abs().max() > 1e-3
     assert (turn.mean(0).abs().max() < 1e-4) == common

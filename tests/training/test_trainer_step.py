@@ -11,9 +11,9 @@ from hnerf.config import TrainingSettings
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.training import trainer as trainer_module
 from hnerf.training.auto_settings import Decision
-from hnerf.training.distributed import Processes
+from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import Rays
-from hnerf.training.step import Stage
+from hnerf.training.step import PosedScene
 from hnerf.training.trainer import Trainer
 from tests.training.scene import TINY, record
 
@@ -27,7 +27,7 @@ class Listener(torch.nn.Module):
         super().__init__()
         self.trainer, self.parts = trainer, []
 
-    def forward(self, stage: Stage, rays: Rays, conditions: Conditions, draws: Draws) -> dict[str, Tensor]:
+    def forward(self, scene: PosedScene, rays: Rays, conditions: Conditions, draws: Draws) -> dict[str, Tensor]:
         self.parts.append((rays, conditions, draws))
         return {"nothing": sum(p.sum() for p in self.trainer.objective.parameters() if p.requires_grad) * 0.0}
 
@@ -38,7 +38,7 @@ class Listener(torch.nn.Module):
 
 def trainer_of(folder: Path, **changes: Any) -> Trainer:
     settings = TrainingSettings.model_validate(TINY.model_dump() | changes)
-    return Trainer(*record(folder / "capture"), settings, folder, Processes(0, 1, torch.device("cpu")))
+    return Trainer(*record(folder / "capture"), settings, folder, Distributed(0, 1, torch.device("cpu")))
 
 
 def handed_over(trainer: Trainer) -> Listener:
@@ -125,7 +125,7 @@ def test_the_shell_is_tightened_with_the_bodies_until_the_field_is_finished(tmp_
     """From 20 cm: untrained, the surface is the skin, whose logistic of 100 a metre has settled 5 cm from it; 1.2 cm
     are left as room. The region that rays are sampled in is the new one."""
     trainer = trainer_of(tmp_path, absorb_steps=1)
-    cells = (trainer.stage.region.cells == 1).sum()
+    cells = (trainer.scene.region.cells == 1).sum()
     trainer.step = trainer.field_steps + 1
     trainer._absorb()
     assert trainer.field.outer_m.max().item() == pytest.approx(0.2)
@@ -133,7 +133,7 @@ def test_the_shell_is_tightened_with_the_bodies_until_the_field_is_finished(tmp_
     trainer._absorb()
     assert trainer.field.outer_m.max().item() == pytest.approx(0.062, abs=0.004)
     assert trainer.field.inner_m.max().item() == pytest.approx(0.062, abs=0.004)
-    assert (trainer.stage.region.cells == 1).sum() < 0.7 * cells
+    assert (trainer.scene.region.cells == 1).sum() < 0.7 * cells
 
 
 @MACHINERIES
@@ -153,4 +153,4 @@ def test_bodies_take_up_what_was_learned_of_them(tmp_path: Path, machinery: str)
     moved_m = [0.01 * (1 - common), -0.01 * common, 0]
     assert (2.5 * (after.root - before.root)[:, 11]).tolist() == pytest.approx(moved_m, abs=1e-5)
     assert not any(p.any() for p in trainer.objective.correction.parameters())
-    assert trainer.stage.bodies.root[0, :3, 3].tolist() == pytest.approx([0, 0, moved_m[0]], abs=1e-5)
+    assert trainer.scene.bodies.root[0, :3, 3].tolist() == pytest.approx([0, 0, moved_m[0]], abs=1e-5)

@@ -29,7 +29,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.ingest import recognise
 from hnerf.capture.lens import Lens
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 MAX_TILT_DEG = 75.0  # beyond, a board is too slanted to be read
@@ -77,11 +77,11 @@ def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> Boar
 
     Intrinsics come from calibration/intrinsic/, else from the folder's calibration files, else from
     calibration/extrinsic/ itself. The world is the first camera, or the board as it lies in frame `ground_frame` (Z up,
-    origin at its top left corner). CaptureError where the footage does not hold what is needed.
+    origin at its top left corner). InputError where the footage does not hold what is needed.
     """
     footage = read_board_footage(folder, "extrinsic", ground_frame)
     if footage is None:
-        raise CaptureError(
+        raise InputError(
             f"{folder / 'calibration' / 'extrinsic'}: no board footage, or no charuco.toml and no [board] in "
             "capture.toml to describe the board; see docs/formats.md"
         )
@@ -149,11 +149,11 @@ def visible_and_found(fit: BoardFit, corners_m: np.ndarray) -> tuple[np.ndarray,
 
 
 def _check_board_found(footage: BoardFootage) -> None:
-    """CaptureError where no camera sees enough of the board to be linked: it is hardly the board that is described."""
+    """InputError where no camera sees enough of the board to be linked: it is hardly the board that is described."""
     corners_px = np.stack(list(footage.corners_px.values()))
     found = whole_enough(footage.board.corners_m, np.isfinite(corners_px[..., 0]))
     if found.sum(1).max() < MIN_SHARED:
-        raise CaptureError(
+        raise InputError(
             f"{footage.path}: this board was found in {found.sum()} of {found.size} pictures; check its columns, rows, "
             "dictionary and inverted in charuco.toml or capture.toml"
         )
@@ -172,13 +172,13 @@ def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], d
         elif found.believed:
             lenses[name], words[name] = found.believed, f"from {source.path.name}/: {found.certainty}"
         else:
-            raise CaptureError(
+            raise InputError(
                 f"{source.path / name}: does not fix the intrinsics ({found.certainty}); film the board closer, "
                 "tilted and in all corners of the picture, or give intrinsics"
             )
         known_px = lenses[name].size_px or size_px
         if known_px != size_px:
-            raise CaptureError(
+            raise InputError(
                 f"{footage.path / name}: is {size_px[0]} x {size_px[1]} px, but its intrinsics are for {known_px[0]} x "
                 f"{known_px[1]}; use one size"
             )
@@ -197,7 +197,7 @@ def _on_ground(fit: BoardFit, footage: BoardFootage, ground_frame: int) -> Board
     """The rig in the world whose origin and floor are the board in one frame. The board's z is down: turned about x."""
     index = footage.frames.index(ground_frame) if ground_frame in footage.frames else -1
     if index < 0 or not np.isfinite(fit.residuals_px[:, index]).any():
-        raise CaptureError(f"{footage.path}: no board in frame {ground_frame}; name a frame in which it lies flat")
+        raise InputError(f"{footage.path}: no board in frame {ground_frame}; name a frame in which it lies flat")
     to_ground = np.diag([1.0, -1.0, -1.0]) @ fit.boards.R[index].T
     origin_m = fit.boards.t_m[index]
     cameras = [dataclasses.replace(c, R=c.R @ to_ground.T, t_m=c.R @ origin_m + c.t_m) for c in fit.cameras]

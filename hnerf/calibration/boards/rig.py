@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from hnerf.calibration.boards.bundle import BoardFit, Poses, adjust
 from hnerf.capture.lens import Lens
 from hnerf.capture.normalise import UNDISTORTED
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 MIN_CORNERS = 6  # that a picture must show to be used: the pose of a plane from 12 numbers
@@ -59,11 +59,11 @@ def solve_rig(
     """Poses of cameras of which only the intrinsics are known, the first being the world.
 
     corners_m (N, 3); corners_px (C, F, N, 2) undistorted, NaN where not seen, of `flat_only`, in every `frame_step`-th
-    frame of the footage. CaptureError if the board does not link them.
+    frame of the footage. InputError if the board does not link them.
     """
     alone = ", ".join(cameras[i].name for i in set(range(len(cameras))).difference(linked(corners_px)))
     if alone:
-        raise CaptureError(
+        raise InputError(
             f"calibration/extrinsic: camera {alone}: shares fewer than {MIN_SHARED} frames of the board with the other "
             "cameras; film it where two cameras see it at once"
         )

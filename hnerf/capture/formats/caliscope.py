@@ -14,8 +14,8 @@ import numpy as np
 from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.formats.pose2sim import lens_from_table
 from hnerf.capture.lens import Lens, known_size
-from hnerf.capture.safe_io import inside, read_toml
-from hnerf.errors import CaptureError
+from hnerf.capture.safe_io import path_in_capture, read_toml
+from hnerf.errors import InputError
 
 FILES = ("camera_array.toml", "calibration.toml")
 
@@ -30,18 +30,18 @@ class Caliscope(EasyMocap):
 
     def lenses(self) -> dict[str, Lens]:
         """Every camera that the file calibrates and does not ignore."""
-        caliscope = inside(self.folder, "camera_array.toml")
-        path = caliscope if caliscope.exists() else inside(self.folder, "calibration.toml")
+        caliscope = path_in_capture(self.folder, "camera_array.toml")
+        path = caliscope if caliscope.exists() else path_in_capture(self.folder, "calibration.toml")
         tables = _caliscope_tables(path) if path == caliscope else _aniposelib_tables(path)
         lenses = [lens_from_table(path, key, table) for key, table in tables.items()]
         if not lenses:
-            raise CaptureError(f"{path}: calibrates no camera; calibrate again")
+            raise InputError(f"{path}: calibrates no camera; calibrate again")
         return {lens.name: lens for lens in lenses}
 
 
 def write_caliscope(out: Path, lenses: Sequence[Lens]) -> None:
     """`camera_array.toml`; cameras are numbered in their order, unless all are called cam_<number> already (without
-    leading zeros, which are no numbers in TOML). CaptureError on a lens without size."""
+    leading zeros, which are no numbers in TOML). InputError on a lens without size."""
     numbers = [lens.name.removeprefix("cam_") for lens in lenses]
     if not all(re.fullmatch("cam_(0|[1-9][0-9]*)", lens.name) for lens in lenses):
         numbers = [str(i) for i in range(len(lenses))]
@@ -54,7 +54,7 @@ def write_caliscope(out: Path, lenses: Sequence[Lens]) -> None:
 
 
 def write_aniposelib(out: Path, lenses: Sequence[Lens]) -> None:
-    """`calibration.toml`, in metres; Pose2Sim reads it as `Calib.toml`, too. CaptureError on a lens without size."""
+    """`calibration.toml`, in metres; Pose2Sim reads it as `Calib.toml`, too. InputError on a lens without size."""
     tables = (
         f'[cam_{i}]\nname = "{lens.name}"\n{_numbers(lens)}rotation = {cv2.Rodrigues(lens.R)[0].ravel().tolist()}\n'
         for i, lens in enumerate(lenses)
@@ -71,7 +71,7 @@ def _numbers(lens: Lens) -> str:
 def _caliscope_tables(path: Path) -> dict[str, dict[str, Any]]:
     cameras = read_toml(path).get("cameras")
     if not isinstance(cameras, dict) or not all(isinstance(table, dict) for table in cameras.values()):
-        raise CaptureError(f"{path}: no tables [cameras.<number>]; calibrate again with Caliscope")
+        raise InputError(f"{path}: no tables [cameras.<number>]; calibrate again with Caliscope")
     return {
         key: table | {"name": f"cam_{table.get('cam_id', table.get('port', key))}"}
         for key, table in cameras.items()

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.lens import Lens, checked_lens, known_size
-from hnerf.capture.safe_io import check_camera_name, inside, read_bytes, read_text
-from hnerf.errors import CaptureError
+from hnerf.capture.safe_io import check_camera_name, path_in_capture, read_bytes, read_text
+from hnerf.errors import InputError
 
 PIXEL_CENTRE = 0.5  # COLMAP's; here a pixel's centre is at its integer coordinates
 MAX_BYTES = 256_000_000
@@ -67,18 +67,18 @@ class Colmap(EasyMocap):
         lenses: dict[str, Lens] = {}
         for shot in shots:
             if shot.camera_id not in optics_of:
-                raise CaptureError(f"{images}: image {shot.name}: camera {shot.camera_id} is not in {cameras}")
+                raise InputError(f"{images}: image {shot.name}: camera {shot.camera_id} is not in {cameras}")
             lens = _lens((cameras, images), shot, optics_of[shot.camera_id])
             if lens.name in lenses:
-                raise CaptureError(f"{images}: several images of camera {lens.name}; keep the images of one moment")
+                raise InputError(f"{images}: several images of camera {lens.name}; keep the images of one moment")
             lenses[lens.name] = lens
         if not lenses:
-            raise CaptureError(f"{images}: holds no image; reconstruct again")
+            raise InputError(f"{images}: holds no image; reconstruct again")
         return lenses
 
 
 def write_colmap(out: Path, lenses: Sequence[Lens]) -> None:
-    """`sparse/0` as text, an image `<camera>/000000.jpg` a camera, no points; CaptureError on a lens without size."""
+    """`sparse/0` as text, an image `<camera>/000000.jpg` a camera, no points; InputError on a lens without size."""
     model = pycolmap.Reconstruction()
     for number, lens in enumerate(lenses, start=1):
         name, parameters = _colmap_parameters(lens)
@@ -110,12 +110,12 @@ def _lens(sources: tuple[Path, Path], shot: _Shot, optics: _Optics) -> Lens:
     for value, place in zip(optics.parameters, places, strict=True):
         values[list(place)] = value
     if values[9:].any():
-        raise CaptureError(f"{sources[0]}: camera {shot.camera_id}: k4 to k6 are not read; undistort its images first")
+        raise InputError(f"{sources[0]}: camera {shot.camera_id}: k4 to k6 are not read; undistort its images first")
     fx, fy, cx, cy = values[:4]
     quaternion = np.array(shot.pose[:4])
     norm = np.linalg.norm(quaternion)
     if not 0.5 < norm < 2:
-        raise CaptureError(f"{sources[1]}: image {shot.name}: its quaternion is none; reconstruct again")
+        raise InputError(f"{sources[1]}: image {shot.name}: its quaternion is none; reconstruct again")
     return checked_lens(
         sources=sources,
         name=check_camera_name(PurePosixPath(shot.name.split("/")[0]).stem, sources[1]),
@@ -131,10 +131,10 @@ def _model_file(folder: Path, stem: str) -> Path:
     """The binary file, else the text, in sparse/0, else in sparse."""
     for parts in (("sparse", "0"), ("sparse",)):
         for suffix in (".bin", ".txt"):
-            path = inside(folder, *parts, stem + suffix)
+            path = path_in_capture(folder, *parts, stem + suffix)
             if path.is_file():
                 return path
-    raise CaptureError(f"{folder / 'sparse' / '0'}: no {stem}.bin or {stem}.txt; export the model again")
+    raise InputError(f"{folder / 'sparse' / '0'}: no {stem}.bin or {stem}.txt; export the model again")
 
 
 def _parsed(path: Path, parsers: dict[str, Callable[[Path], Parsed]]) -> Parsed:
@@ -142,7 +142,7 @@ def _parsed(path: Path, parsers: dict[str, Callable[[Path], Parsed]]) -> Parsed:
         return parsers[path.suffix](path)
     except (IndexError, KeyError, OverflowError, TypeError, ValueError, struct.error):
         known = ", ".join(MODELS)
-        raise CaptureError(f"{path}: no model of COLMAP's, or of other cameras than {known}; export it again") from None
+        raise InputError(f"{path}: no model of COLMAP's, or of other cameras than {known}; export it again") from None
 
 
 def _optics_from_text(path: Path) -> dict[int, _Optics]:

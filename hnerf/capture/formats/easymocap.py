@@ -18,11 +18,11 @@ from hnerf.capture.safe_io import (
     VIDEO_SUFFIXES,
     file_named,
     files_in,
-    inside,
     numbered,
+    path_in_capture,
     read_text,
 )
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 MAX_CALIBRATION_BYTES = 1_000_000
 
@@ -38,8 +38,8 @@ class EasyMocap(Layout):
 
     def lenses(self) -> dict[str, Lens]:
         """Every camera that intri.yml names."""
-        intri = _CalibrationFile(inside(self.folder, "intri.yml"))
-        extri = _CalibrationFile(inside(self.folder, "extri.yml"))
+        intri = _CalibrationFile(path_in_capture(self.folder, "intri.yml"))
+        extri = _CalibrationFile(path_in_capture(self.folder, "extri.yml"))
         lenses = (_lens(name, intri, extri) for name in intri.names())
         return {lens.name: lens for lens in lenses}
 
@@ -50,7 +50,7 @@ class EasyMocap(Layout):
             return ImageFolder(self.folder / "images" / camera, numbered(files, "images"))
         video = file_named(self.folder, camera, "videos", suffixes=VIDEO_SUFFIXES)
         if not video.exists():
-            raise CaptureError(
+            raise InputError(
                 f"{self.folder / 'images' / camera}: no JPEG or PNG images, and no {video}; "
                 "add them or take the camera out of the calibration"
             )
@@ -107,19 +107,19 @@ class _CalibrationFile:
         except (yaml.YAMLError, RecursionError, ValueError):
             self.tree = None
         if not isinstance(self.tree, dict):
-            raise CaptureError(f"{path}: not an OpenCV YAML file; export it again with EasyMocap")
+            raise InputError(f"{path}: not an OpenCV YAML file; export it again with EasyMocap")
 
     def names(self) -> list[object]:
         names = self.tree.get("names")
         if not isinstance(names, list) or not names:
-            raise CaptureError(f"{self.path}: lists no cameras under 'names'; export it again with EasyMocap")
+            raise InputError(f"{self.path}: lists no cameras under 'names'; export it again with EasyMocap")
         return names
 
     def number(self, key: str) -> float | None:
         try:
             return float(self.tree[key]) if key in self.tree else None
         except (TypeError, ValueError):
-            raise CaptureError(f"{self.path}: {key} is no number; calibrate again") from None
+            raise InputError(f"{self.path}: {key} is no number; calibrate again") from None
 
     def matrix(self, *keys: str) -> np.ndarray | None:
         """The first of these keys that is there, as float64."""
@@ -130,12 +130,12 @@ class _CalibrationFile:
             node = self.tree[found[0]]
             return np.array([float(value) for value in node["data"]]).reshape(int(node["rows"]), int(node["cols"]))
         except (KeyError, TypeError, ValueError):
-            raise CaptureError(f"{self.path}: {found[0]} is no matrix of finite numbers; calibrate again") from None
+            raise InputError(f"{self.path}: {found[0]} is no matrix of finite numbers; calibrate again") from None
 
     def required(self, *keys: str) -> np.ndarray:
         found = self.matrix(*keys)
         if found is None:
-            raise CaptureError(f"{self.path}: {' or '.join(keys)} is missing; calibrate that camera, or take it out")
+            raise InputError(f"{self.path}: {' or '.join(keys)} is missing; calibrate that camera, or take it out")
         return found
 
 

@@ -42,7 +42,7 @@ class Layout(ABC):
 
     @abstractmethod
     def footage(self, camera: str) -> Footage:
-        """Its pictures; CaptureError if there are none."""
+        """Its pictures; InputError if there are none."""
 
     def training_cameras(self) -> list[str]:
         """Those that the recording's own publication trains on, the rest being for testing; empty: all of them."""

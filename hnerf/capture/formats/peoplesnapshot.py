@@ -15,9 +15,9 @@ from hnerf.capture.footage import Footage, Video
 from hnerf.capture.formats.layout import Layout, Stored
 from hnerf.capture.given_poses import JOINTS, GivenPoses
 from hnerf.capture.lens import Lens, checked_lens
-from hnerf.capture.safe_io import MAX_IMAGE_PIXELS, VIDEO_SUFFIXES, files_in, inside
+from hnerf.capture.safe_io import MAX_IMAGE_PIXELS, VIDEO_SUFFIXES, files_in, path_in_capture
 from hnerf.capture.safe_pickle import read_pickle
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 CAMERA = "camera"
 SEEN_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # its world is the camera's: x right, y down, z ahead
@@ -35,7 +35,7 @@ class PeopleSnapshot(Layout):
 
     def lenses(self) -> dict[str, Lens]:
         """The one camera."""
-        path = inside(self.folder, "camera.pkl")
+        path = path_in_capture(self.folder, "camera.pkl")
         stored = read_pickle(path)
         try:
             focal, centre, distortion, turn, shift = (
@@ -45,19 +45,19 @@ class PeopleSnapshot(Layout):
             R = cv2.Rodrigues(turn)[0] @ SEEN_FROM_Z_UP
             size_px = float(stored["width"]), float(stored["height"])
         except (IndexError, KeyError, TypeError, ValueError, cv2.error):
-            raise CaptureError(f"{path}: camera_f, _c, _k, _rt, _t, width or height is missing; get it again") from None
+            raise InputError(f"{path}: camera_f, _c, _k, _rt, _t, width or height is missing; get it again") from None
         return {CAMERA: checked_lens((path, path), CAMERA, K, distortion, R, shift, size_px)}
 
     def footage(self, camera: str) -> Footage:
         """The one video, which bears the subject's name."""
         videos = files_in(self.folder, suffixes=VIDEO_SUFFIXES)
         if len(videos) != 1:
-            raise CaptureError(f"{self.folder}: {len(videos)} videos .mp4; leave exactly one")
+            raise InputError(f"{self.folder}: {len(videos)} videos .mp4; leave exactly one")
         return Video.open(videos[0])
 
     def keypoint_files(self, camera: str) -> dict[int, Path | Stored]:
         """keypoints.hdf5: keypoints (N, 54), OpenPose's COCO model."""
-        path = inside(self.folder, "keypoints.hdf5")
+        path = path_in_capture(self.folder, "keypoints.hdf5")
         if not path.exists():
             return {}
         count = len(_array(path, "keypoints", (3 * COCO_POINTS,)))
@@ -65,23 +65,23 @@ class PeopleSnapshot(Layout):
 
     def mask_files(self, camera: str) -> dict[int, Path | Stored]:
         """masks.hdf5: masks (N, H, W), 0 outside the person."""
-        path = inside(self.folder, "masks.hdf5")
+        path = path_in_capture(self.folder, "masks.hdf5")
         return {i: Stored(path, partial(_mask, path, i)) for i in range(_count(path, "masks"))} if path.exists() else {}
 
     def given_poses(self, frames: tuple[int, ...]) -> GivenPoses | None:
         """reconstructed_poses.hdf5: pose (N, 72), trans (N, 3), betas (10); where there are more poses than masks, the
         last belong together. A frame that is all zero was never reconstructed."""
-        path = inside(self.folder, "reconstructed_poses.hdf5")
+        path = path_in_capture(self.folder, "reconstructed_poses.hdf5")
         if not path.exists():
             return None
         turns, moves_m = _array(path, "pose", (3 * JOINTS,)), _array(path, "trans", (3,))
         if len(turns) != len(moves_m):
-            raise CaptureError(f"{path}: {len(turns)} poses, {len(moves_m)} translations; get it again")
-        masks = inside(self.folder, "masks.hdf5")
+            raise InputError(f"{path}: {len(turns)} poses, {len(moves_m)} translations; get it again")
+        masks = path_in_capture(self.folder, "masks.hdf5")
         first = len(turns) - _count(masks, "masks") if masks.exists() else 0
         poses, betas = GivenPoses.unknown(len(frames)), _array(path, "betas", ())
         if len(betas) < len(poses.betas):
-            raise CaptureError(f"{path}: {len(betas)} betas are not SMPL's; get it again")
+            raise InputError(f"{path}: {len(betas)} betas are not SMPL's; get it again")
         poses.betas[:] = betas[: len(poses.betas)]
         for i, frame in enumerate(frames):
             row = frame + first
@@ -93,12 +93,12 @@ class PeopleSnapshot(Layout):
 
 
 def _array(path: Path, name: str, row_shape: tuple[int, ...]) -> np.ndarray:
-    """All of a small dataset of rows, float64; CaptureError unless it is of finite numbers."""
+    """All of a small dataset of rows, float64; InputError unless it is of finite numbers."""
     with _opened(path) as file:
         data = _dataset(path, file, name)
         found = data[()].astype(np.float64) if data.size <= MAX_IMAGE_PIXELS else np.zeros(())
     if found.ndim != 1 + len(row_shape) or found.shape[1:] != row_shape or not np.isfinite(found).all():
-        raise CaptureError(f"{path}: {name} is not (N, {', '.join(map(str, row_shape))}) finite numbers; get it again")
+        raise InputError(f"{path}: {name} is not (N, {', '.join(map(str, row_shape))}) finite numbers; get it again")
     return found
 
 
@@ -115,7 +115,7 @@ def _mask(path: Path, row: int) -> np.ndarray:
     with _opened(path) as file:
         data = _dataset(path, file, "masks")
         if data.ndim != 3 or math.prod(data.shape[1:]) > MAX_IMAGE_PIXELS:
-            raise CaptureError(f"{path}: masks are no images (N, H, W); get it again")
+            raise InputError(f"{path}: masks are no images (N, H, W); get it again")
         return np.where(data[row] != 0, 255, 0).astype(np.uint8)
 
 
@@ -125,14 +125,14 @@ def _opened(path: Path) -> Iterator[h5py.File]:
         with h5py.File(path, "r") as file:
             yield file
     except (OSError, RuntimeError):
-        raise CaptureError(f"{path}: not a readable HDF5 file; get it again") from None
+        raise InputError(f"{path}: not a readable HDF5 file; get it again") from None
 
 
 def _dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
     """A dataset of numbers that lies in this very file, in chunks of a sane size."""
     data = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
     if not isinstance(data, h5py.Dataset) or data.ndim == 0 or data.dtype.kind not in "biuf":
-        raise CaptureError(f"{path}: has no array of numbers called {name}; get it again")
+        raise InputError(f"{path}: has no array of numbers called {name}; get it again")
     if data.is_virtual or data.external or math.prod(data.chunks or (1,)) > MAX_IMAGE_PIXELS:
-        raise CaptureError(f"{path}: {name} lies in other files, or in huge chunks; write it again")
+        raise InputError(f"{path}: {name} lies in other files, or in huge chunks; write it again")
     return data

@@ -11,7 +11,7 @@ from hnerf.capture.footage import Footage, Video
 from hnerf.capture.formats.layout import Layout, Stored
 from hnerf.capture.lens import Lens, checked_lens
 from hnerf.capture.safe_io import JSON_SUFFIXES, VIDEO_SUFFIXES, file_named, files_in, read_toml
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,10 @@ class Pose2Sim(Layout):
         """Every camera of the one calibration file."""
         files = [p for p in files_in(self.folder, "calibration") if p.match("Calib*.toml")]
         if len(files) != 1:
-            raise CaptureError(f"{self.folder / 'calibration'}: {len(files)} files Calib*.toml; leave exactly one")
+            raise InputError(f"{self.folder / 'calibration'}: {len(files)} files Calib*.toml; leave exactly one")
         tables = {key: table for key, table in read_toml(files[0]).items() if key != "metadata"}
         if not tables:
-            raise CaptureError(f"{files[0]}: calibrates no camera; calibrate again")
+            raise InputError(f"{files[0]}: calibrates no camera; calibrate again")
         lenses = (lens_from_table(files[0], key, table) for key, table in tables.items())
         return {lens.name: lens for lens in lenses}
 
@@ -52,10 +52,10 @@ def _numbers_as_such(path: Path) -> list[str | int]:
 
 
 def lens_from_table(source: Path, key: str, table: Any) -> Lens:
-    """One camera's table, of the keys that aniposelib, Pose2Sim and Caliscope share; CaptureError if it is none."""
+    """One camera's table, of the keys that aniposelib, Pose2Sim and Caliscope share; InputError if it is none."""
     try:
         if table.get("fisheye", False):
-            raise CaptureError(f"{source}: camera {key}: fisheye lenses are not read; undistort its video first")
+            raise InputError(f"{source}: camera {key}: fisheye lenses are not read; undistort its video first")
         width_px, height_px = table["size"]
         return checked_lens(
             sources=(source, source),
@@ -67,4 +67,4 @@ def lens_from_table(source: Path, key: str, table: Any) -> Lens:
             size_px=(float(width_px), float(height_px)),
         )
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-        raise CaptureError(f"{source}: camera {key}: {error} is missing or no number; calibrate again") from None
+        raise InputError(f"{source}: camera {key}: {error} is missing or no number; calibrate again") from None

@@ -12,9 +12,9 @@ from hnerf.capture.footage import Footage, ImageFolder
 from hnerf.capture.formats.layout import Layout, Stored
 from hnerf.capture.given_poses import JOINTS, GivenPoses
 from hnerf.capture.lens import Lens, checked_lens
-from hnerf.capture.safe_io import inside
+from hnerf.capture.safe_io import path_in_capture
 from hnerf.capture.safe_pickle import read_pickled_npy
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 
 # NeuralBody's configs train on these of ZJU-MoCap's 21 to 23 cameras, and on all but the last of Human3.6M's 4.
 TRAINING_CAMERAS = {4: (0, 1, 2)} | dict.fromkeys((21, 22, 23), (0, 6, 12, 18))
@@ -33,7 +33,7 @@ class ZjuMocap(Layout):
     @property
     def source(self) -> Path:
         """The file that lists cameras and images."""
-        return inside(self.folder, "annots.npy")
+        return path_in_capture(self.folder, "annots.npy")
 
     @cached_property
     def images(self) -> dict[str, dict[int, PurePosixPath]]:
@@ -44,9 +44,9 @@ class ZjuMocap(Layout):
             frames = [_frame(row[0]) for row in rows]
             columns = list(zip(*rows, strict=True))
         except (IndexError, KeyError, TypeError, ValueError):
-            raise CaptureError(f"{self.source}: 'ims' lists no images, as many a frame; prepare it again") from None
+            raise InputError(f"{self.source}: 'ims' lists no images, as many a frame; prepare it again") from None
         if len(set(names)) < len(names) or len(set(frames)) < len(frames):
-            raise CaptureError(f"{self.source}: two images of one camera and frame; prepare it again")
+            raise InputError(f"{self.source}: two images of one camera and frame; prepare it again")
         return {name: dict(zip(frames, paths, strict=True)) for name, paths in zip(names, columns, strict=True)}
 
     @cached_property
@@ -61,7 +61,7 @@ class ZjuMocap(Layout):
                 cameras = self._annotations["cams"]
                 K, D, R, T = (np.asarray(cameras[key][i], dtype=np.float64) for key in "KDRT")
             except (IndexError, KeyError, TypeError, ValueError):
-                raise CaptureError(f"{self.source}: camera {name}: K, D, R or T is missing; prepare it again") from None
+                raise InputError(f"{self.source}: camera {name}: K, D, R or T is missing; prepare it again") from None
             lens = checked_lens((self.source, self.source), name, K, D, R, T * METRES_PER_UNIT, None)
             lenses[lens.name] = lens
         return lenses
@@ -73,27 +73,29 @@ class ZjuMocap(Layout):
 
     def footage(self, camera: str) -> Footage:
         """The images that annots.npy lists."""
-        files = {frame: inside(self.folder, *path.parts) for frame, path in self.images[camera].items()}
+        files = {frame: path_in_capture(self.folder, *path.parts) for frame, path in self.images[camera].items()}
         return ImageFolder(next(iter(files.values())).parent, files)
 
     def mask_files(self, camera: str) -> dict[int, Path | Stored]:
         """mask_cihp/<image>.png, or mask/: part labels, 0 outside the person."""
         for name in ("mask_cihp", "mask"):
-            if inside(self.folder, name).is_dir():
+            if path_in_capture(self.folder, name).is_dir():
                 paths = self.images[camera].items()
-                return {frame: inside(self.folder, name, *path.with_suffix(".png").parts) for frame, path in paths}
+                return {
+                    frame: path_in_capture(self.folder, name, *path.with_suffix(".png").parts) for frame, path in paths
+                }
         return {}
 
     def given_poses(self, frames: tuple[int, ...]) -> GivenPoses | None:
         """new_params/<frame>.npy, or params/: SMPL's poses (72, of which the first 3 are zero, or 69), Rh, Th, shapes;
         a vertex is R(Rh) SMPL(poses, shapes) + Th."""
-        folders = [name for name in ("new_params", "params") if inside(self.folder, name).is_dir()]
+        folders = [name for name in ("new_params", "params") if path_in_capture(self.folder, name).is_dir()]
         if not folders:
             return None
         poses = GivenPoses.unknown(len(frames))
         betas = []
         for i, frame in enumerate(frames):
-            path = inside(self.folder, folders[0], f"{frame}.npy")
+            path = path_in_capture(self.folder, folders[0], f"{frame}.npy")
             if path.exists():
                 turns, poses.root[i], shape = _parameters(path)
                 poses.theta[i].flat[-len(turns) :] = turns
@@ -118,7 +120,7 @@ def _parameters(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         placed = np.eye(4)
         placed[:3, :3], placed[:3, 3] = cv2.Rodrigues(rotation)[0], translation
     except (KeyError, TypeError, ValueError, cv2.error):
-        raise CaptureError(f"{path}: no poses, Rh, Th and shapes of SMPL; remove it or fit again") from None
+        raise InputError(f"{path}: no poses, Rh, Th and shapes of SMPL; remove it or fit again") from None
     if len(turns) not in (3 * JOINTS, 3 * JOINTS - 3) or len(shape) < 10:
-        raise CaptureError(f"{path}: {len(turns)} turns and {len(shape)} shape values are not SMPL's; remove it")
+        raise InputError(f"{path}: {len(turns)} turns and {len(shape)} shape values are not SMPL's; remove it")
     return turns, placed, shape[:10]

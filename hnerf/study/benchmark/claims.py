@@ -21,7 +21,7 @@ WEAK = 0.5  # correlation below which nothing is said to depend
 NO_SURFACE = 0.1  # IoU
 
 
-def told(result: Result) -> list[str]:
+def claim_lines(result: Result) -> list[str]:
     """A line of Markdown for each claim of the study: whether it is seen in the figures, and which these are."""
     lines = []
     for claim in result["claims"]:

@@ -8,7 +8,7 @@ from pydantic import Field, PositiveInt, model_validator
 from hnerf.capture.capture import Capture
 from hnerf.capture.subset import chosen
 from hnerf.config import CONFIGS, H_NERF, Section, Settings, load_settings, named_file, read_yaml, validated
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.study.benchmark.convergence import FIRST_S
 
@@ -27,7 +27,7 @@ class Part(Section):
     def parts(self, capture: Capture) -> tuple[tuple[str, ...] | None, tuple[int, ...] | None, tuple[int, ...] | None]:
         """Training cameras, training frames and novel-pose frames to keep, None for all.
 
-        Fewer cameras are taken at equal steps of the capture's order, frames evenly spread over time. CaptureError if
+        Fewer cameras are taken at equal steps of the capture's order, frames evenly spread over time. InputError if
         the capture has not as many, or not one of that name.
         """
         cameras, frames = self.cameras, self.frames
@@ -128,15 +128,13 @@ class Study(Section):
 
 
 def load_study(name: str) -> Study:
-    """A study by its name or its file's path; CaptureError with one line if there is none or a key is not allowed."""
+    """A study by its name or its file's path; InputError with one line if there is none or a key is not allowed."""
     path = named_file(name, STUDIES, "study", "studies")
     study = validated(Study, read_yaml(path), path)
     for title, variant in study.variants.items():
         for method in variant.methods:
             if method not in study.methods:
-                raise CaptureError(
-                    f"{path}: variants.{title}: no method {method}; there are {', '.join(study.methods)}"
-                )
+                raise InputError(f"{path}: variants.{title}: no method {method}; there are {', '.join(study.methods)}")
     return study
 
 
@@ -149,5 +147,5 @@ def snapshot_times_s(seconds: float | None, count: int) -> tuple[float, ...]:
 
 def _at_least(count: int, items: Sequence, what: str) -> Sequence:
     if len(items) < count:
-        raise CaptureError(f"the capture has {len(items)} {what}, not {count}")
+        raise InputError(f"the capture has {len(items)} {what}, not {count}")
     return items

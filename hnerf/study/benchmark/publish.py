@@ -8,7 +8,7 @@ from typing import Any
 from hnerf.capture.capture import read_rgb
 from hnerf.files import replace_text
 from hnerf.study.benchmark import charts, results
-from hnerf.study.benchmark.claims import told
+from hnerf.study.benchmark.claims import claim_lines
 
 PSNR, CHAMFER = "held-out PSNR, dB", "Chamfer distance"
 ANGLE = "angle from the nearest training camera, degrees"
@@ -28,7 +28,7 @@ def publish(result: dict[str, Any], store: Path) -> Path:
     drawn = draw(result, store, table)
     replace_text(table.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
     replace_text(table.with_suffix(".csv"), results.as_csv(result))
-    replace_text(table, results.as_markdown(result, [path.name for path in drawn], told(result)))
+    replace_text(table, results.as_markdown(result, [path.name for path in drawn], claim_lines(result)))
     return table
 
 
@@ -81,6 +81,6 @@ def picture_rows(title: str, variant: Mapping[str, Any], store: Path) -> list[tu
         for k, view in enumerate(scores["pictures"]):
             heading = f"{title}: frame {view['frame']}, camera {view['camera']}"
             row = found.setdefault(heading, [("truth", read_rgb(folder / f"{k}-truth.png"))])
-            told = f"{name}, {psnr[view['camera'], view['frame']]:.1f} dB"
-            row.append((told, read_rgb(folder / f"{k}-render.png")))
+            message = f"{name}, {psnr[view['camera'], view['frame']]:.1f} dB"
+            row.append((message, read_rgb(folder / f"{k}-render.png")))
     return list(found.items())

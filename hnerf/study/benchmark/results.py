@@ -170,8 +170,8 @@ def _variant_lines(variant: Mapping[str, Any]) -> list[str]:
         of_each = " / ".join(shown(values[0] if values else None, "{:.2f}") for values in known)
         lines.append(line([title, of_each, *[""] * (len(titles) - 2)]))
     lines += _timeline(variant)
-    told = [f"- {', '.join(names)}: {reason}" for reason, names in missing.items()]
-    return [*lines, *(["", *told] if told else [])]
+    message = [f"- {', '.join(names)}: {reason}" for reason, names in missing.items()]
+    return [*lines, *(["", *message] if message else [])]
 
 
 def cell(scores: Mapping[str, Any], key: str, form: str) -> str:

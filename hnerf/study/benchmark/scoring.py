@@ -14,7 +14,7 @@ from hnerf.avatar.avatar import Avatar
 from hnerf.avatar.trained import load_avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture, read_rgb, write_image
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.evaluation.columns import shown_as, why_not_shown
 from hnerf.evaluation.evaluate import LPIPS, PROTOCOL, mesh_frames, score_meshes
 from hnerf.evaluation.ground_truth import GroundTruth
@@ -42,7 +42,7 @@ HOW = (
 
 
 @dataclass(frozen=True)
-class Scene:
+class ScoringScene:
     """What scoring needs besides a training: the capture with calibrated cameras, the body as fitted before training,
     and the truth where there is one."""
 
@@ -52,7 +52,7 @@ class Scene:
     device: str
 
 
-def score(scene: Scene, training: Path, settings: ScoringSettings, out: Path) -> dict[str, Any]:
+def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: Path) -> dict[str, Any]:
     """Write `scores.json`, renderings and meshes into `out`; what scores.json holds.
 
     training: the folder that training left. A figure that cannot be had is null, and a reason stands beside it.
@@ -82,7 +82,7 @@ def score(scene: Scene, training: Path, settings: ScoringSettings, out: Path) ->
     return found
 
 
-def score_end(scene: Scene, training: Path, settings: ScoringSettings, out: Path) -> dict[str, Any]:
+def score_end(scene: ScoringScene, training: Path, settings: ScoringSettings, out: Path) -> dict[str, Any]:
     """Write `scores.json` with what training reported and the last point of its curve alone; what it holds."""
     avatar, split = load_avatar(training, scene.device), settings.split
     scored = scene.capture.test_cameras and not why_not_shown(split, training)
@@ -93,7 +93,7 @@ def score_end(scene: Scene, training: Path, settings: ScoringSettings, out: Path
 
 
 def curve(
-    scene: Scene, split: str, training: Path, finished: Avatar, settings: ScoringSettings, out: Path
+    scene: ScoringScene, split: str, training: Path, finished: Avatar, settings: ScoringSettings, out: Path
 ) -> list[dict[str, Any]]:
     """Seconds of training and figures of every snapshot, and last of the finished field, in the order of time."""
     end_s = json.loads((training / "report.json").read_text())["field_seconds"]
@@ -111,7 +111,9 @@ def curve(
     return rows
 
 
-def score_at(scene: Scene, avatar: Avatar, split: str, images: int | None, meshes: int, out: Path) -> dict[str, Any]:
+def score_at(
+    scene: ScoringScene, avatar: Avatar, split: str, images: int | None, meshes: int, out: Path
+) -> dict[str, Any]:
     """A split's figures in the form of evaluation, of its avatar and at most as many images and surfaces of which the
     truth is known; None is all."""
     views = all_views(scene.capture, split)
@@ -127,11 +129,11 @@ def score_at(scene: Scene, avatar: Avatar, split: str, images: int | None, meshe
     frames = [f for f in mesh_frames(split_frames(scene.capture, split), true_meshes, meshes) if f in true_meshes]
     try:
         return found | score_meshes(avatar, frames, true_meshes, out)
-    except CaptureError as error:  # a result of young or failed models, not a fault of the study
+    except InputError as error:  # a result of young or failed models, not a fault of the study
         return found | {"geometry": None, "geometry_reason": str(error)}
 
 
-def write_pictures(scene: Scene, split: str, per_image: list[dict[str, Any]], out: Path) -> list[dict[str, Any]]:
+def write_pictures(scene: ScoringScene, split: str, per_image: list[dict[str, Any]], out: Path) -> list[dict[str, Any]]:
     """Write a few scored renderings and the truth, cut to the person, as `pictures/<k>-{render,truth}.png`; which."""
     chosen = [{key: row[key] for key in ("camera", "frame")} for row in evenly_spaced(per_image, PICTURES)]
     for k, row in enumerate(chosen):

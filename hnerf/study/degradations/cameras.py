@@ -17,18 +17,18 @@ from hnerf.capture.subset import (
     write_arrays,
     write_keypoints,
 )
-from hnerf.errors import NotPossibleError
+from hnerf.errors import NotApplicableError
 
 T = TypeVar("T")
 
 
 def leave_cameras(capture: Capture, count: float, rng: np.random.Generator, out: Path) -> None:
-    """Keep `count` training cameras, drawn at random; CaptureError if there are no more than that."""
+    """Keep `count` training cameras, drawn at random; InputError if there are no more than that."""
     subset(capture, out, _drawn(capture.name, "cameras", capture.train_cameras, count, rng), None, None)
 
 
 def leave_frames(capture: Capture, count: float, rng: np.random.Generator, out: Path) -> None:
-    """Keep `count` training frames, drawn at random; CaptureError if there are no more than that."""
+    """Keep `count` training frames, drawn at random; InputError if there are no more than that."""
     subset(capture, out, None, _drawn(capture.name, "frames", capture.train_frames, count, rng), None)
 
 
@@ -46,7 +46,7 @@ def put_out_of_step(capture: Capture, frames: float, rng: np.random.Generator, o
     """One training camera, at random, shows at each frame what it saw that many frames before; its first picture stands
     still until then."""
     if not 1 <= round(frames) < len(capture.frames):
-        raise NotPossibleError(f"{capture.name}: has {len(capture.frames)} frames; none can be {frames:g} late")
+        raise NotApplicableError(f"{capture.name}: has {len(capture.frames)} frames; none can be {frames:g} late")
     require_several_cameras(capture)
     late = str(rng.choice(capture.train_cameras))
     kept = dataclasses.replace(capture, root=out)
@@ -68,6 +68,6 @@ def put_out_of_step(capture: Capture, frames: float, rng: np.random.Generator, o
 
 def _drawn(name: str, what: str, there_are: tuple[T, ...], count: float, rng: np.random.Generator) -> tuple[T, ...]:
     if count >= len(there_are):
-        raise NotPossibleError(f"{name}: has only {len(there_are)} training {what}; leave fewer than that")
+        raise NotApplicableError(f"{name}: has only {len(there_are)} training {what}; leave fewer than that")
     rows = np.sort(rng.permutation(len(there_are))[: round(count)])
     return tuple(there_are[row] for row in rows)

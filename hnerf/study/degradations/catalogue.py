@@ -13,7 +13,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.config import Section, TrainingSettings
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.study.degradations import cameras as degraded_rig
 from hnerf.study.degradations import clothing as worn
@@ -88,7 +88,7 @@ def degrade_capture(capture: Capture, degradation: Degradation, out: Path) -> No
 
 def dress(capture: Capture, body: BodyFit, truth: GroundTruth, degradation: Degradation, out: Path) -> None:
     """Write the capture and what is known of it with clothes or hair that no body model expresses, into `out`."""
-    worn.put_on(degradation.kind, degradation.strength, degradation.rng, capture, body, truth, out)
+    worn.add_clothing(degradation.kind, degradation.strength, degradation.rng, capture, body, truth, out)
 
 
 def degrade_masks(masks: Masks, capture: Capture, degradation: Degradation) -> Masks:
@@ -113,16 +113,16 @@ def degrade_settings(settings: TrainingSettings, degradation: Degradation) -> Tr
 
 
 def check_strengths(name: str, strengths: tuple[float, ...]) -> None:
-    """CaptureError unless the degradation is known and its strengths go its way, the mildest first."""
+    """InputError unless the degradation is known and its strengths go its way, the mildest first."""
     if name not in KINDS:
-        raise CaptureError(f"degradation {name}: no such thing; there are {', '.join(KINDS)}")
+        raise InputError(f"degradation {name}: no such thing; there are {', '.join(KINDS)}")
     kind = KINDS[name]
     (low, high), way = sorted((kind.none, kind.most)), 1 if kind.none < kind.most else -1
     onwards = all(way * a < way * b for a, b in itertools.pairwise((kind.none, *strengths)))
     valid = all(0 < s < math.inf and low <= s <= high and not (kind.whole and s % 1) for s in strengths)
     if not (strengths and onwards and valid):
         what = f"{'whole ' * kind.whole}numbers between {low:g} and {high:g} that {'rise' if way > 0 else 'fall'}"
-        raise CaptureError(f"degradation {name}: give {what}, the mildest first")
+        raise InputError(f"degradation {name}: give {what}, the mildest first")
 
 
 def _change(degradation: Degradation) -> Callable[..., Any]:

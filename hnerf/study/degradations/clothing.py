@@ -130,7 +130,7 @@ def long_hair(keypoints_m: np.ndarray, up: np.ndarray, length_m: float, rng: Rng
 WORN: dict[str, Callable[[np.ndarray, np.ndarray, float, Rng], Worn]] = {"skirt": skirt, "long_hair": long_hair}
 
 
-def put_on(
+def add_clothing(
     kind: str, strength: float, rng: Rng, capture: Capture, body: BodyFit, truth: GroundTruth, out: Path
 ) -> None:
     """Write the capture into `out`, every picture and given mask with what is WORN, and under `ground_truth/` what was

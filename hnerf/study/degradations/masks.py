@@ -8,7 +8,7 @@ import numpy as np
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks, encode
 from hnerf.capture.subject import subject_keypoints
-from hnerf.errors import NotPossibleError
+from hnerf.errors import NotApplicableError
 
 LIMBS = ((3, 4), (6, 7), (10, 11), (13, 14))  # BODY_25: elbow to wrist, knee to ankle; right, left
 BEYOND = 0.5  # of a limb's length: where hand or foot ends
@@ -36,10 +36,10 @@ def pierce(masks: Masks, capture: Capture, percent: float, rng: np.random.Genera
 def cut_limb(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
     """Take a forearm with its hand, or a lower leg with its foot, away from this share of the masks, at random.
 
-    CaptureError where nothing was detected, since keypoints tell where limbs are.
+    InputError where nothing was detected, since keypoints tell where limbs are.
     """
     if not capture.has_keypoints:
-        raise NotPossibleError(f"{capture.name}: has no keypoints; they tell where limbs are")
+        raise NotApplicableError(f"{capture.name}: has no keypoints; they tell where limbs are")
     keypoints = subject_keypoints(capture)
 
     def cut(camera: str, frame: int, mask: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from hnerf.capture.capture import Capture
 from hnerf.capture.subject import subject_keypoints
 from hnerf.capture.subset import read_keypoints, write_keypoints
-from hnerf.errors import NotPossibleError
+from hnerf.errors import NotApplicableError
 from hnerf.geometry.camera import Camera
 from hnerf.study.degradations.images import rewrite
 
@@ -21,7 +21,7 @@ def put_in_front(capture: Capture, width_m: float, rng: np.random.Generator, out
     """A grey square pillar, on the way to a training camera at random, hides what lies behind it: in every training
     camera that it stands in front of the person for, in the clean plates, too; keypoints behind it are not detected.
 
-    Cameras that would see it behind or beside the person do not show it. CaptureError if nobody knows where he stands.
+    Cameras that would see it behind or beside the person do not show it. InputError if nobody knows where he stands.
     """
     person_m = person_middle(capture)
     up = np.eye(3)["xyz".index(capture.up)]
@@ -40,7 +40,7 @@ def put_in_front(capture: Capture, width_m: float, rng: np.random.Generator, out
 def person_middle(capture: Capture) -> np.ndarray:
     """The point (3,) nearest to all rays through the middle of the person's keypoints, over all frames."""
     if not capture.has_keypoints or len(capture.train_cameras) < 2:
-        raise NotPossibleError(
+        raise NotApplicableError(
             f"{capture.name}: nobody knows where the person stands; needs keypoints from two cameras"
         )
     left, right = np.zeros((3, 3)), np.zeros(3)

@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import Field, NonNegativeInt
 
 from hnerf.config import CONFIGS, Section, named_file, read_yaml, validated
-from hnerf.errors import CaptureError
+from hnerf.errors import InputError
 from hnerf.study.benchmark.plan import Part
 from hnerf.study.degradations.catalogue import KINDS, check_strengths
 
@@ -27,10 +27,10 @@ class Stability(Section):
     degradations: Annotated[dict[str, tuple[float, ...]], Field(min_length=1)]
 
     def only(self, names: Collection[str]) -> "Stability":
-        """The study of these degradations only, of all where there are no names; CaptureError for one it has not."""
+        """The study of these degradations only, of all where there are no names; InputError for one it has not."""
         for name in names:
             if name not in self.degradations:
-                raise CaptureError(f"--only {name}: not in this study; it has {', '.join(self.degradations)}")
+                raise InputError(f"--only {name}: not in this study; it has {', '.join(self.degradations)}")
         chosen = {name: values for name, values in self.degradations.items() if not names or name in names}
         return self.model_copy(update={"degradations": chosen})
 
@@ -53,12 +53,12 @@ class Stability(Section):
 
 
 def load_stability(study: str) -> Stability:
-    """A study by its name under `configs/stability/` or its file's path; CaptureError, one line, on what is wrong."""
+    """A study by its name under `configs/stability/` or its file's path; InputError, one line, on what is wrong."""
     path = named_file(study, STUDIES, "study", "studies")
     found = validated(Stability, read_yaml(path), path)
     for kind, strengths in found.degradations.items():
         try:
             check_strengths(kind, strengths)
-        except CaptureError as error:
-            raise CaptureError(f"{path}: {error}") from None
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
     return found

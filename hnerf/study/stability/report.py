@@ -67,10 +67,10 @@ def how_far(result: Row, method: str, kind: str) -> str:
     strengths = result["plan"]["degradations"][kind]
     runs = [(f"{s:g}", run["verdict"]) for s in strengths if (run := worst(result, method, kind, s))]
     held = [strength for strength, _ in itertools.takewhile(lambda run: run[1] == "ok", runs)]
-    told = [f"holds to {held[-1]}"] if held else []
+    message = [f"holds to {held[-1]}"] if held else []
     for words in (("degraded",), BROKEN):
-        told += [f"{verdict} at {strength}" for strength, verdict in runs if verdict in words][:1]
-    return ", ".join(told) or ("unscored" if runs else "-")
+        message += [f"{verdict} at {strength}" for strength, verdict in runs if verdict in words][:1]
+    return ", ".join(message) or ("unscored" if runs else "-")
 
 
 def as_markdown(result: Row, charts: Sequence[str]) -> str:

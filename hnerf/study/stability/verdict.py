@@ -16,7 +16,7 @@ NEAR = 0.2  # share of a border, of what may be lost, within which another seed 
 
 
 @dataclass(frozen=True)
-class Verdict:
+class RunVerdict:
     """reason: one line, empty where it is ok."""
 
     word: Word
@@ -25,19 +25,19 @@ class Verdict:
 
 def judge(
     scores: dict[str, Any] | None, reference: dict[str, Any], faults: list[str], leniency: float = 1.0
-) -> Verdict:
+) -> RunVerdict:
     """`scores` and `reference` hold psnr (dB) and chamfer_mm of the same images and surfaces, degraded and not, or None
     where there is no truth, `reference` also empty_psnr, of an empty picture; `scores` is None where surfaces alone are
     judged. faults: what is wrong with surfaces, which is failure whatever the scores. leniency: share of what may be
     lost, in dB and in distance, that may be lost here."""
     if faults:
-        return Verdict("failed", faults[0])
+        return RunVerdict("failed", faults[0])
     if scores is None:
-        return Verdict("ok")
+        return RunVerdict("ok")
     words: list[tuple[Word, str]] = []
     if None not in (scores["psnr"], reference["psnr"]):
         if scores["psnr"] <= reference["empty_psnr"]:
-            return Verdict("failed", "pictures are no better than empty ones")
+            return RunVerdict("failed", "pictures are no better than empty ones")
         lost_db, above_db = reference["psnr"] - scores["psnr"], reference["psnr"] - reference["empty_psnr"]
         failed_db = min(FAILED_DB, FAILED_SHARE * above_db)
         words.append((_word(lost_db, leniency * DEGRADED_DB, leniency * failed_db), f"{lost_db:.1f} dB of PSNR lost"))
@@ -46,9 +46,9 @@ def judge(
         borders = (1 + leniency * (border - 1) for border in (DEGRADED_RATIO, FAILED_RATIO))
         words.append((_word(ratio, *borders), f"Chamfer distance times {ratio:.2f}"))
     if not words:
-        return Verdict("unscored", "no image or surface is scored in both runs")
+        return RunVerdict("unscored", "no image or surface is scored in both runs")
     worst = max((word for word, _ in words), key=WORST_LAST.index)
-    return Verdict(worst, "; ".join(reason for word, reason in words if word == worst and word != "ok"))
+    return RunVerdict(worst, "; ".join(reason for word, reason in words if word == worst and word != "ok"))
 
 
 def near_border(scores: dict[str, Any] | None, reference: dict[str, Any], faults: list[str]) -> bool:
