@@ -73,7 +73,8 @@ def run(capture: Path, preset: str, changes: tuple[str, ...], store: Path) -> Pa
     """Return the subject's folder after a whole run; the asset of so short a training may be refused."""
     command = ["run", str(capture), "--preset", preset, "--store", str(store)]
     call(*command, *(f"--set={change}" for change in changes), may_fail=True)
-    return store / "subjects" / capture.name
+    (subject,) = (store / "subjects").iterdir()
+    return subject
 
 
 def call(*arguments: str, may_fail: bool = False) -> None:
