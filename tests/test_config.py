@@ -59,8 +59,8 @@ def test_what_is_not_allowed_is_refused_by_file_and_key(tmp_path: Path, text: st
         (b"training: [100", "is not YAML "),
         (b"title: \xe9t\xe9", "is not YAML "),
         (b"title: 2026-13-01", "is not YAML "),
-        (b"- training", "holds no keys and values"),
-        (b"fast", "holds no keys and values"),
+        (b"- training", "does not hold keys and values"),
+        (b"fast", "does not hold keys and values"),
     ],
 )
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ def _anny(settings: FitSettings) -> BodyModel:
     def rig(beta: Tensor | None) -> Rig:
         return anny_rig(beta).to(dtype=torch.float64)
 
-    spread = [settings.phenotype_std] * len(PHENOTYPES) + [settings.local_change_spread] * len(LOCAL_CHANGES)
+    spread = [settings.phenotype_std] * len(PHENOTYPES) + [settings.local_change_std] * len(LOCAL_CHANGES)
     mean, spreads, low, high = (torch.tensor(v, dtype=torch.float64) for v in (ADULT, spread, BETA_LOW, BETA_HIGH))
     details = torch.arange(len(ADULT)) >= len(PHENOTYPES)
     rest = rig(None)

@@ -10,7 +10,7 @@ import warp as wp
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from hnerf.geometry.camera import Camera
-from hnerf.geometry.rays import RayHits, cast, vectors
+from hnerf.geometry.rays import RayHits, cast, to_vec3_array
 from hnerf.synthetic.appearance import person_colour, room_colour
 
 wp.config.log_level = wp.LOG_ERROR
@@ -38,7 +38,7 @@ class Caster:
 
     def __init__(self, vertices_m: np.ndarray, faces: np.ndarray) -> None:
         corners = wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
-        self.mesh = wp.Mesh(vectors(vertices_m, "cpu"), corners)
+        self.mesh = wp.Mesh(to_vec3_array(vertices_m, "cpu"), corners)
 
     def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> RayHits:
         """First hits of rays from one origin (3,) along unit directions (N, 3)."""
@@ -47,7 +47,7 @@ class Caster:
     def visibility(self, points_m: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """(N, K): 1 where a point (N, 3) sees infinity along a direction (K, 3), else 0."""
         visible = wp.zeros((len(points_m), len(directions)), dtype=wp.float32, device="cpu")
-        inputs = [self.mesh.id, vectors(points_m, "cpu"), vectors(directions, "cpu"), visible]
+        inputs = [self.mesh.id, to_vec3_array(points_m, "cpu"), to_vec3_array(directions, "cpu"), visible]
         wp.launch(_lit, visible.shape, inputs, device="cpu")
         return visible.numpy()
 

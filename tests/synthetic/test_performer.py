@@ -14,19 +14,19 @@ from pydantic import ValidationError
 from hnerf.body.anny import anny_rig
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
-from hnerf.config import CaptureSettings, PerformerSettings
-from hnerf.synthetic import write_performer
+from hnerf.config import CaptureSettings, SyntheticSettings
+from hnerf.synthetic import write_synthetic_capture
 from hnerf.synthetic.dressed import Dressed
 from hnerf.synthetic.render import Caster, dome_lights, floor_shadow, irradiance
 from hnerf.synthetic.write import camera_names, ring_of_cameras
 
-TINY = PerformerSettings(size_px=64, train_frames=3, novel_pose_frames=1)
+TINY = SyntheticSettings(size_px=64, train_frames=3, novel_pose_frames=1)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("performer") / "performer"
-    write_performer(path, TINY)
+    write_synthetic_capture(path, TINY)
     return path
 
 
@@ -42,7 +42,7 @@ def test_it_is_read_like_any_capture(capture: Capture) -> None:
 
 
 def test_same_seed_same_bytes(folder: Path, tmp_path: Path) -> None:
-    write_performer(tmp_path, PerformerSettings(size_px=64, train_frames=1, novel_pose_frames=0))
+    write_synthetic_capture(tmp_path, SyntheticSettings(size_px=64, train_frames=1, novel_pose_frames=0))
     for name in ("images/05/000000.jpg", "openpose/02/000000_keypoints.json", "ground_truth/masks/01/000000.png"):
         digests = [hashlib.sha256((root / name).read_bytes()).hexdigest() for root in (folder, tmp_path)]
         assert digests[0] == digests[1]
@@ -52,16 +52,16 @@ def test_the_ring_by_hand() -> None:
     """32 cameras are 11.25 degrees apart; of 16 test cameras each stands half-way, in every second gap."""
 
     def angles_deg(**settings: int) -> list[float]:
-        centres = [camera.centre_m for camera in ring_of_cameras(PerformerSettings(**settings))]
+        centres = [camera.centre_m for camera in ring_of_cameras(SyntheticSettings(**settings))]
         return [float(np.degrees(np.arctan2(y, x)) % 360) for x, y, _ in centres]
 
     assert angles_deg() == pytest.approx([0, 90, 180, 270, 45, 225])
     many = angles_deg(train_cameras=32, test_cameras=16)
     assert many[:3] == pytest.approx([0, 11.25, 22.5]) and many[32:35] == pytest.approx([5.625, 28.125, 50.625])
     assert len(many) == 48
-    assert camera_names(PerformerSettings(train_cameras=3, test_cameras=1)) == (["01", "02", "03"], ["04"])
+    assert camera_names(SyntheticSettings(train_cameras=3, test_cameras=1)) == (["01", "02", "03"], ["04"])
     with pytest.raises(ValidationError, match="one at most between two training cameras"):
-        PerformerSettings(train_cameras=1)
+        SyntheticSettings(train_cameras=1)
 
 
 def test_joints_lie_inside_the_masks(folder: Path, capture: Capture) -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from hnerf.geometry.camera import Camera
-from hnerf.geometry.reach import Reached, everywhere, within_box, within_reach
+from hnerf.geometry.reach import ReachablePixels, everywhere, within_box, within_reach
 from hnerf.training.distributed import Distributed
 from hnerf.training.gather import gather_pixels
 from hnerf.training.pixels import Pixels
@@ -65,7 +65,7 @@ def test_where_a_pixel_lies_follows_from_its_image() -> None:
 
 
 @pytest.mark.parametrize("reached", [REACHED, None])
-def test_pixels_show_what_the_images_do(tmp_path: Path, reached: Reached | None) -> None:
+def test_pixels_show_what_the_images_do(tmp_path: Path, reached: ReachablePixels | None) -> None:
     """Whole images where nothing says what is reached, then without plates."""
     capture, masks, body = record(tmp_path)
     out = tmp_path / "out"
