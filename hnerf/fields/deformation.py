@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hnerf.body.canonical import Descriptor, blended, occurring
+from hnerf.body.canonical import Descriptor, distinct_rows, weighted_sum
 from hnerf.body.descriptor import vertex_normals
 
 TINY = 1e-9
@@ -34,9 +34,9 @@ class FrameDeformation(nn.Module):
     def forward(self, described: Descriptor, frame_row: Tensor) -> tuple[Tensor, Tensor]:
         """How far the surface next to described points is displaced in the frames of rows `frame_row` (N,), -1 for
         none: (N, 3), and along its normal (N,); canonical metres."""
-        present, own = occurring(frame_row, len(self.displacement))
+        present, own = distinct_rows(frame_row, len(self.displacement))
         table = self._of_vertices(present).flatten(0, 1)
-        found = blended(table, own[:, None] * len(self.shares) + described.corners, described.barycentric)
+        found = weighted_sum(table, own[:, None] * len(self.shares) + described.corners, described.barycentric)
         return found[:, :3], found[:, 3]
 
     @torch.no_grad()

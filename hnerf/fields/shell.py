@@ -10,7 +10,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from hnerf.body.canonical import blended
+from hnerf.body.canonical import weighted_sum
 
 EMPTY, SHELL, SOLID = 0, 1, 2
 SLACK = 3**0.5 / 2  # half a diagonal of a cell, in cells
@@ -42,7 +42,7 @@ class ShellGrid:
         cells = np.full((len(sizes), *sizes.amax(0).tolist()), EMPTY, np.uint8)
 
         def fill(row: int) -> None:
-            index = ((blended(vertices_m[row], corners, weights) - lower[row]) / cell_m).long()
+            index = ((weighted_sum(vertices_m[row], corners, weights) - lower[row]) / cell_m).long()
             thickness = (side[row][corners].amax(-1) / cell_m for side in (outer_m, inner_m))
             size, *surface = (t.cpu().numpy() for t in (sizes[row], index, *thickness))
             cells[row][tuple(map(slice, size))] = _cells_around(size, *surface)

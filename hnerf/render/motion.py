@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hnerf.body.body_model import body_model
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.given_start import given_start
+from hnerf.body.given_start import initial_pose_from_given
 from hnerf.body.rig import joint_transforms, pose_vertices
 from hnerf.capture.capture import Capture
 from hnerf.capture.given_poses import JOINTS, GivenPoses
@@ -47,7 +47,7 @@ def read_motion(path: Path, frames: str = ":") -> Motion:
     given, fps = _read_amass(path)
     chosen = list(select(tuple(range(len(given.theta))), frames, path))
     given = dataclasses.replace(given, theta=given.theta[chosen], root=given.root[chosen])
-    pose = given_start(given, body_model(FitSettings()))
+    pose = initial_pose_from_given(given, body_model(FitSettings()))
     rig = pose.rig.to(dtype=torch.float32)
     return Motion(BodyFit(rig, tuple(chosen), pose.theta.float(), pose.root.float()), fps, "z")
 
