@@ -8,7 +8,7 @@ from torch import Tensor
 
 from hnerf.capture.capture import Capture
 from hnerf.capture.subject import subject_keypoints
-from hnerf.capture.timing import usual_step
+from hnerf.capture.timing import median_step
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import triangulate
 
@@ -41,7 +41,7 @@ def observe(capture: Capture) -> Observations:
 def runs(capture: Capture) -> list[tuple[int, ...]]:
     """Return the frames in runs that follow each other in time: a step in the numbers other than the median one, or a
     change of split, starts a new run."""
-    novel, step = set(capture.novel_pose_frames), usual_step(capture.frames)
+    novel, step = set(capture.novel_pose_frames), median_step(capture.frames)
     found: list[list[int]] = []
     for frame in capture.frames:
         if found and frame == found[-1][-1] + step and (frame in novel) == (found[-1][-1] in novel):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.normal_equations import NormalEquations
-from hnerf.capture.timing import usual_step
+from hnerf.capture.timing import median_step
 
 # Standard deviations from rest in degrees: flexion, twist, sideways; chosen wide, to span everyday movement.
 STD_DEG = {
@@ -123,7 +123,7 @@ class Smoothness:
         starts = np.cumsum([0] + [len(run) for run in runs])
         triples = [np.arange(a, a + len(run) - 2) for a, run in zip(starts, runs, strict=False)]
         self.first = np.concatenate(triples)  # first row of each three consecutive frames, (T,)
-        self.sigma_m = sigma_mps2 * usual_step([*itertools.chain(*runs)]) ** 2 / fps**2
+        self.sigma_m = sigma_mps2 * median_step([*itertools.chain(*runs)]) ** 2 / fps**2
 
     def add(self, equations: NormalEquations, keypoints_m: Tensor, jacobian: Tensor) -> float:
         """Add the prior to the normal equations and return its cost. keypoints_m (n, 25, 3), jacobian (n, 25, 3, U).

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from hnerf.body.rig import Rig
-from hnerf.capture.safe_io import NO_ARRAYS
+from hnerf.capture.safe_io import ARRAY_FILE_ERRORS
 from hnerf.capture.safe_pickle import read_pickle
 from hnerf.errors import InputError
 
@@ -153,7 +153,7 @@ def _read(path: Path) -> dict[str, Any]:
         try:
             with np.load(path, allow_pickle=False) as archive:
                 found = {key: archive[key] for key in KEYS if key in archive}
-        except NO_ARRAYS:
+        except ARRAY_FILE_ERRORS:
             raise InputError(f"{path}: is not a .npz of plain arrays; convert the model again") from None
     missing = [key for key in KEYS if key not in found]
     if missing:

@@ -14,7 +14,7 @@ import numpy as np
 
 from hnerf.calibration.diagnosis import TRIM, trimmed_cost_px, trimmed_mean
 from hnerf.capture.capture import Capture
-from hnerf.capture.timing import resample, usual_step
+from hnerf.capture.timing import median_step, resample
 from hnerf.config import CalibrationSettings
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
@@ -80,7 +80,7 @@ class _View:
 
     def residuals(self, step: int) -> tuple[np.ndarray, np.ndarray]:
         """Own keypoints of frames so many steps later against the prediction: (F, 25, 2) px, weights (F, 25)."""
-        row, later_by = {frame: i for i, frame in enumerate(self.frames)}, step * usual_step(self.frames)
+        row, later_by = {frame: i for i, frame in enumerate(self.frames)}, step * median_step(self.frames)
         later = [row.get(frame + later_by, -1) for frame in self.frames]
         moved = self.keypoints[later] * (np.array(later) >= 0)[:, None, None]
         known = np.isfinite(self.predicted_px).all(-1)
@@ -125,7 +125,7 @@ def put_in_step(
         return capture, held_out_px, notes
     in_step = capture.synchronised(offsets)
     lost = [frame for frame in capture.frames if frame not in in_step.frames]
-    off_frames = {name: in_step.recorded(name, 0) - offset for name, offset in offsets.items()}
+    off_frames = {name: in_step.recorded_frame(name, 0) - offset for name, offset in offsets.items()}
     farthest = max(off_frames, key=lambda name: abs(off_frames[name]))
     too_far = abs(off_frames[farthest]) > FARTHEST * capture.frame_step
     if 2 * len(lost) > len(capture.frames) or not in_step.train_frames or too_far:
@@ -226,7 +226,7 @@ def _timing(view: _View) -> Timing:
     if len(costs) < 3:
         return Timing.unknown(f"fewer than {MIN_FRAMES} frames in common")
     lowest, *lowest_of_half = (min(costs, key=lambda step: costs[step][part]) for part in range(3))
-    parabola, step = _parabola(view, lowest), usual_step(view.frames)
+    parabola, step = _parabola(view, lowest), median_step(view.frames)
     if np.count_nonzero(parabola.weights) < MIN_FRAMES:
         return Timing.unknown(f"fewer than {MIN_FRAMES} frames with neighbours {step} before and after")
     kept = [np.setdiff1d(every, left_out) for left_out in np.array_split(every, STRETCHES)]

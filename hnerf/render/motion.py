@@ -16,7 +16,7 @@ from hnerf.body.given_start import initial_pose_from_given
 from hnerf.body.rig import joint_transforms, pose_vertices
 from hnerf.capture.capture import Capture
 from hnerf.capture.given_poses import JOINTS, GivenPoses
-from hnerf.capture.safe_io import NO_ARRAYS
+from hnerf.capture.safe_io import ARRAY_FILE_ERRORS
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
 
@@ -155,7 +155,7 @@ def _read_amass(path: Path) -> tuple[GivenPoses, float]:
     try:
         with np.load(path, allow_pickle=False) as stored:
             found = {key: np.asarray(stored[key], np.float64) for key in keys if key in stored}
-    except NO_ARRAYS:
+    except ARRAY_FILE_ERRORS:
         raise InputError(f"{path}: is no .npz of plain arrays; give an AMASS file or a subject's folder") from None
     poses, trans = found.get("poses", np.zeros(0)), found.get("trans", np.zeros(0))
     known = poses.ndim == 2 and poses.shape[1] in AMASS_WIDTHS and trans.shape == (len(poses), 3) and len(poses) > 0

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hnerf.capture.timing import usual_step
+from hnerf.capture.timing import median_step
 from hnerf.segmentation.prior import Prior
 
 LEAST_AREA = 0.1  # of the prior's core: less is no person
@@ -50,7 +50,7 @@ def jumps(frames: tuple[int, ...], verdicts: list[MaskVerdict], expected_px: lis
     area_px = np.array([v.area_px for v in verdicts], float)
     ratio = area_px / np.maximum(expected_px, 1)
     usable = np.array([v.fault is None for v in verdicts])
-    reach = NEIGHBOURS * usual_step(frames)
+    reach = NEIGHBOURS * median_step(frames)
     for i, frame in enumerate(frames):
         others = [j for j in range(len(frames)) if j != i and usable[j] and abs(frames[j] - frame) <= reach]
         near = sorted(others, key=lambda j: abs(frames[j] - frame))[:NEIGHBOURS]

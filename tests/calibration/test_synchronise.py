@@ -123,7 +123,7 @@ def test_strided_frames_show_what_is_less_than_a_frame_off(tmp_path: Path, no_pi
     report.save(tmp_path / "out")
     used = load_cameras(tmp_path / "out", capture)
     assert used.frames == capture.frames
-    assert [used.recorded("c0", frame) for frame in used.frames] == list(used.frames)
+    assert [used.recorded_frame("c0", frame) for frame in used.frames] == list(used.frames)
     found, given = used.keypoints("c0"), capture.keypoints("c0")
     assert found is not None and given is not None
     assert np.abs(found[5] - (0.8 * given[5] + 0.2 * given[6])).max() < 2
