@@ -17,7 +17,7 @@ def changes(folder: Path, text: str) -> Path:
 
 
 def test_changes_replace_what_they_name_and_nothing_else(tmp_path: Path) -> None:
-    """At three depths, with a list that is replaced as a whole; all else as the preset has it."""
+    """Values change at three depths, with a list that is replaced as a whole; all others are the preset's."""
     full = load_settings("demo")
     text = "training: {steps: 7, losses: {mask: 0.5}, fast: {colour_cells: [8]}}\nevaluation: {report_rows: 1}"
     found = with_changes(full, changes(tmp_path, text)).model_dump()

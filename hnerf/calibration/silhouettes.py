@@ -19,7 +19,7 @@ from hnerf.capture.subject import subject_keypoints
 from hnerf.config import SegmentationSettings
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
-from hnerf.segmentation.backends import AgainstBackground
+from hnerf.segmentation.backends import BackgroundSubtraction
 from hnerf.segmentation.prior import keypoint_priors
 
 FRAMES = 8  # evenly spread: neighbours say the same again
@@ -194,7 +194,7 @@ def _masks(capture: Capture, name: str, shown: Sequence[int]) -> list[np.ndarray
     ((_, priors),) = keypoint_priors(dataclasses.replace(capture, train_cameras=(name,)), settings)
     plate = capture.background(name)
     if plate is None:
-        backend = AgainstBackground.of_median(capture, name, priors, PLATE_FRAMES, settings)
+        backend = BackgroundSubtraction.from_median(capture, name, priors, PLATE_FRAMES, settings)
     else:
-        backend = AgainstBackground.of_plate(capture, name, plate, settings)
+        backend = BackgroundSubtraction.from_plate(capture, name, plate, settings)
     return [backend.mask(capture.frames[i], priors[i]) for i in shown]

@@ -1,4 +1,4 @@
-"""A synthetic performer: a clothed person walks in a room before calibrated cameras; with exact ground truth."""
+"""A synthetic capture with exact ground truth: a clothed person walks in a room before calibrated cameras."""
 
 from hnerf.synthetic.write import write_synthetic_capture
 

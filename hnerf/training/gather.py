@@ -14,7 +14,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.geometry.reach import ReachablePixels
 from hnerf.segmentation.edge import shaded_plate
-from hnerf.segmentation.prior import window_around
+from hnerf.segmentation.prior import bounding_window
 from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import Pixels
 
@@ -115,7 +115,7 @@ def _write_pixels(
             append("image_camera", [c])
             close("image_starts", len(edges[-1]))
             if with_plates:
-                window = window_around(wanted)
+                window = bounding_window(wanted)
                 shaded = shaded_plate(mask[window], image[window], plates[c][window])[wanted[window]]
                 append("plate", _levelled(shaded.clip(0, 255).round().astype(np.uint8), gain))
         edge = np.concatenate(edges)

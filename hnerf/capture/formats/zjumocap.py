@@ -44,7 +44,7 @@ class ZjuMocap(Layout):
             frames = [_frame(row[0]) for row in rows]
             columns = list(zip(*rows, strict=True))
         except (IndexError, KeyError, TypeError, ValueError):
-            raise InputError(f"{self.source}: 'ims' does not list images, as many for each frame; prepare it again") from None
+            raise InputError(f"{self.source}: 'ims' does not list images, as many a frame; prepare it again") from None
         if len(set(names)) < len(names) or len(set(frames)) < len(frames):
             raise InputError(f"{self.source}: lists two images of one camera and frame; prepare it again")
         return {name: dict(zip(frames, paths, strict=True)) for name, paths in zip(names, columns, strict=True)}
