@@ -12,7 +12,7 @@ OUTSIDE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "LICENSE", "benchmark
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add them under their paths in the repository."""
+    """Add the files of OUTSIDE under their paths in the repository."""
     for pattern in OUTSIDE:
         for path in sorted(ROOT.glob(pattern)):
             files.append(File.generated(config, path.relative_to(ROOT).as_posix(), abs_src_path=str(path)))
@@ -20,7 +20,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Links as they are on the site, where docs/ is the root."""
+    """Rewrite links for the site, where docs/ is the root."""
     if page.file.src_uri in OUTSIDE:
         return re.sub(r"\]\(docs/", "](", markdown)
     return re.sub(r"\]\(\.\./(?=README|CONTRIBUTING|CHANGELOG|benchmarks/)", "](", markdown)

@@ -14,7 +14,7 @@ ANSWER = re.compile(r"`([\w/]+\.py)`, `(\w+)`")
 
 
 def anchors(page: Path) -> set[str]:
-    """What headings are linked by."""
+    """Return the anchors of a page's headings."""
     headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 

@@ -28,7 +28,7 @@ def example(name: str) -> ModuleType:
 
 @pytest.fixture(scope="module")
 def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What examples/train.py leaves."""
+    """Return the folder that examples/train.py wrote."""
     out = tmp_path_factory.mktemp("examples") / "person"
     example("train").main(out, SMALL, [*FEW, *COARSE, "fit.contour_steps=1"])
     return out
@@ -51,7 +51,7 @@ def test_a_path_goes_through_the_recorded_cameras(subject: Path, tmp_path: Path)
 
 
 def _overlap(a: np.ndarray, b: np.ndarray) -> float:
-    """IoU of what two pictures cover."""
+    """Return the IoU of what two pictures cover."""
     inside_a, inside_b = a[..., 3] > 127, b[..., 3] > 127
     return float((inside_a & inside_b).sum() / max(1, (inside_a | inside_b).sum()))
 
