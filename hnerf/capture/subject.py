@@ -1,4 +1,4 @@
-"""Choice of the subject among detected people: whom the cameras agree on, followed through time."""
+"""Choice of the subject among detected people: the person on whom the cameras agree, followed through time."""
 
 from itertools import combinations, pairwise
 

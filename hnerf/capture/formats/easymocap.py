@@ -121,7 +121,7 @@ class _CalibrationFile:
         return names
 
     def number(self, key: str) -> float | None:
-        """Return a number, or None if the key is missing. Raises InputError if it is none."""
+        """Return a number, or None if the key is missing. Raises InputError if the value is not a number."""
         try:
             return float(self.tree[key]) if key in self.tree else None
         except (TypeError, ValueError):

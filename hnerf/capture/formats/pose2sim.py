@@ -53,7 +53,7 @@ def _natural_order(path: Path) -> list[str | int]:
 
 def lens_from_table(source: Path, key: str, table: Any) -> Lens:
     """Return the lens in one camera's table, of the keys that aniposelib, Pose2Sim and Caliscope share. Raises
-    InputError if it is none."""
+    InputError if a key is missing or wrong."""
     try:
         if table.get("fisheye", False):
             raise InputError(f"{source}: camera {key}: fisheye lenses are not supported; undistort its video first")
