@@ -29,21 +29,21 @@ def adjust(
     """
     chosen = evenly_spaced(range(keypoints.shape[1]), MAX_FRAMES)
     flat = keypoints[:, chosen].reshape(len(cameras), -1, 3)
-    moving = np.array([camera.name in free for camera in cameras])
-    judges = ~moving if (~moving).sum() >= 2 else np.ones_like(moving)
-    judged = flat.copy()
-    judged[~judges, :, 2] = 0
+    freed = np.array([camera.name in free for camera in cameras])
+    reference = ~freed if (~freed).sum() >= 2 else np.ones_like(freed)
+    reference_keypoints = flat.copy()
+    reference_keypoints[~reference, :, 2] = 0
     adjusted = list(cameras)
     for _ in range(ROUNDS):
         projections = np.stack([camera.projection for camera in adjusted])
-        points_m, _, inliers = triangulate(projections, judged)
+        points_m, _, inliers = triangulate(projections, reference_keypoints)
         residuals_px = reprojection_px(projections, points_m, flat)
-        used = inliers | (~judges[:, None] & (flat[..., 2] > 0) & np.isfinite(residuals_px))
+        used = inliers | (~reference[:, None] & (flat[..., 2] > 0) & np.isfinite(residuals_px))
         if used.sum() < MIN_OBSERVATIONS:
             break
         loss_scale_px = max(LOSS_SCALE_PX, float(np.median(residuals_px[used])))
         adjusted = _bundle_adjust(adjusted, flat, points_m, used, free, focal, loss_scale_px)
-    return align(adjusted, cameras) if moving.all() else adjusted
+    return align(adjusted, cameras) if freed.all() else adjusted
 
 
 def _bundle_adjust(
@@ -75,7 +75,9 @@ def _bundle_adjust(
     options.ceres.loss_function_scale = loss_scale_px
     options.ceres.solver_options.function_tolerance = FUNCTION_TOLERANCE
     pycolmap.create_default_ceres_bundle_adjuster(options, config, scene).solve()
-    return [_solved(scene, i, camera) if camera.name in free else camera for i, camera in enumerate(cameras, start=1)]
+    return [
+        _solved_camera(scene, i, camera) if camera.name in free else camera for i, camera in enumerate(cameras, start=1)
+    ]
 
 
 def _add_image(scene: pycolmap.Reconstruction, number: int, camera: Camera, keypoints_px: np.ndarray) -> None:
@@ -90,7 +92,7 @@ def _add_image(scene: pycolmap.Reconstruction, number: int, camera: Camera, keyp
     scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(camera.R), camera.t_m))
 
 
-def _solved(scene: pycolmap.Reconstruction, number: int, camera: Camera) -> Camera:
+def _solved_camera(scene: pycolmap.Reconstruction, number: int, camera: Camera) -> Camera:
     pose, zoom = scene.image(number).cam_from_world(), scene.camera(number).params[0] / camera.K[0, 0]
     K = camera.K * np.array([[zoom, zoom, 1], [1, zoom, 1], [1, 1, 1]])
     return dataclasses.replace(camera, K=K, R=pose.rotation.matrix(), t_m=np.array(pose.translation))

@@ -11,20 +11,20 @@ from hnerf.calibration.diagnosis import (
     UNITS_M,
     USUAL_HEIGHT_M,
     Measure,
-    explain,
+    convention_mistake,
     gross_limit_px,
+    likely_unit,
     measure,
     median_height_px,
     size_ratio,
     undo_mistake,
-    unit_of,
 )
 from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.monocular import ground_reasons, intrinsics_reasons
 from hnerf.calibration.refine import refine
 from hnerf.calibration.report import CalibrationReport, CameraVerdict
 from hnerf.calibration.sizes import size_reasons
-from hnerf.calibration.synchronise import Timing, measure_timing, put_in_step
+from hnerf.calibration.synchronise import Timing, measure_timing, synchronise_capture
 from hnerf.capture.capture import Capture
 from hnerf.capture.subject import subject_keypoints
 from hnerf.config import CalibrationSettings
@@ -33,7 +33,9 @@ from hnerf.geometry.camera import Camera
 
 COINCIDENT_M = 0.005
 COMMON_HEIGHT_M = (1.4, 2.05)  # of adults; others are children, or in another unit
-UPRIGHT = 0.5  # mean cosine between the trunk and up, below which somebody lies or bends all the time, or up is not up
+MIN_UPRIGHT_COSINE = (
+    0.5  # mean cosine between the trunk and up, below which somebody lies or bends all the time, or up is not up
+)
 RESIDUAL_SHARE = 0.014  # of the person's height: 5 px of 357
 REJECT_FACTOR = 2.0  # times `max_residual_px`: a camera so far off, that no refinement brought back, is not used
 
@@ -49,22 +51,22 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
     given = [capture.cameras[name] for name in capture.train_cameras]
     if len(given) == 1:
         return _monocular(capture, keypoints[0])
-    settings = _for_size(settings, median_height_px(keypoints))
+    settings = _scale_residual_limit(settings, median_height_px(keypoints))
     before = measure(given, keypoints)
     _check_convention(capture, given, keypoints, before)
     cameras, mistakes = undo_mistake(given, keypoints)
     _check_height(capture, measure(cameras, keypoints) if mistakes else before)
-    in_step, held_out_px, notes = put_in_step(capture, cameras, keypoints, settings)
-    keypoints = keypoints if in_step is capture else _keypoints(in_step)
-    witnesses = Evidence.of(in_step, keypoints)
-    refinement = refine(in_step, cameras, keypoints, witnesses.outlines, witnesses.matches, settings)
+    synchronised, held_out_px, notes = synchronise_capture(capture, cameras, keypoints, settings)
+    keypoints = keypoints if synchronised is capture else _keypoints(synchronised)
+    evidence = Evidence.of(synchronised, keypoints)
+    refinement = refine(synchronised, cameras, keypoints, evidence.outlines, evidence.matches, settings)
     used = refinement.cameras
     after = measure(used, keypoints)
     _check_agreement(capture, after, settings)
-    timing = measure_timing(used, keypoints, in_step.frames)
+    timing = measure_timing(used, keypoints, synchronised.frames)
     verdicts = {}
     for old, new in zip(given, used, strict=True):
-        name, offset = old.name, in_step.frame_offsets.get(old.name, 0.0)
+        name, offset = old.name, synchronised.frame_offsets.get(old.name, 0.0)
         reasons = size_reasons(capture, name) + intrinsics_reasons(old) + _fit_reasons(name, before, settings)
         reasons += [f"{mistakes[name]}: undone"] if name in mistakes else []
         reasons += [_timing_reason(offset, timing[name]), *_change_reasons(old, new), refinement.reasons[name]]
@@ -84,7 +86,7 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
         refinement.outlines_px,
         tuple(notes),
         capture.up,
-        witnesses,
+        evidence,
     )
 
 
@@ -99,7 +101,7 @@ def _keypoints(capture: Capture) -> np.ndarray:
     return np.stack([found[name] for name in capture.train_cameras])
 
 
-def _for_size(settings: CalibrationSettings, height_px: float) -> CalibrationSettings:
+def _scale_residual_limit(settings: CalibrationSettings, height_px: float) -> CalibrationSettings:
     """Residuals that a person of this height may leave: what detectors err grows with him."""
     return settings.model_copy(update={"max_residual_px": max(settings.max_residual_px, RESIDUAL_SHARE * height_px)})
 
@@ -113,7 +115,7 @@ def _check_convention(capture: Capture, cameras: Sequence[Camera], keypoints: np
     """
     if found.cost_px > gross_limit_px(keypoints):
         off = f"{capture.name}: keypoints are off by {found.cost_px:.0f} px"
-        if cause := explain(cameras, keypoints):
+        if cause := convention_mistake(cameras, keypoints):
             raise InputError(
                 f"{off} because {cause}; write world to camera, x_camera = R x_world + T, y down, z forward"
             )
@@ -123,7 +125,7 @@ def _check_convention(capture: Capture, cameras: Sequence[Camera], keypoints: np
                 "fit); give both in the pixels of these pictures"
             )
     for a, b in combinations(cameras, 2):
-        if np.linalg.norm(a.centre_m - b.centre_m) < COINCIDENT_M and not unit_of(found.body_height_m):
+        if np.linalg.norm(a.centre_m - b.centre_m) < COINCIDENT_M and not likely_unit(found.body_height_m):
             raise InputError(
                 f"{capture.name}: cameras {a.name} and {b.name} stand at one place; give each its own extrinsics"
             )
@@ -134,11 +136,11 @@ def _check_height(capture: Capture, found: Measure) -> None:
     low, high = BODY_HEIGHT_M
     if low <= found.body_height_m <= high or np.isnan(found.body_height_m):
         return
-    unit = unit_of(found.body_height_m)
+    unit = likely_unit(found.body_height_m)
     cause = f"the translations look like {unit}; " if unit else ""
     factor = UNITS_M[unit] if unit else USUAL_HEIGHT_M / found.body_height_m
     raise InputError(
-        f"{capture.name}: the person would be {found.body_height_m:.4g} m tall; {cause}{_other_units(factor)}"
+        f"{capture.name}: the person would be {found.body_height_m:.4g} m tall; {cause}{_unit_advice(factor)}"
     )
 
 
@@ -147,11 +149,11 @@ def _height_notes(height_m: float) -> list[str]:
     low, high = COMMON_HEIGHT_M
     if np.isnan(height_m):
         return []
-    doubt = f": if that is wrong, {_other_units(USUAL_HEIGHT_M / height_m)}" if not low <= height_m <= high else ""
+    doubt = f": if that is wrong, {_unit_advice(USUAL_HEIGHT_M / height_m)}" if not low <= height_m <= high else ""
     return [f"the person is {height_m:.2f} m tall{doubt}"]
 
 
-def _other_units(factor: float) -> str:
+def _unit_advice(factor: float) -> str:
     return f'in capture.toml multiply units ("m" is 1, "mm" 0.001) by {factor:.4g}'
 
 
@@ -162,7 +164,7 @@ def _upright_notes(points_m: np.ndarray, up: str) -> list[str]:
     if not len(trunk_m):
         return []
     mean = (trunk_m / np.linalg.norm(trunk_m, axis=1, keepdims=True)).mean(0)
-    if mean["xyz".index(up)] > UPRIGHT:
+    if mean["xyz".index(up)] > MIN_UPRIGHT_COSINE:
         return []
     axis = int(np.abs(mean).argmax())
     found = f"{'-' if mean[axis] < 0 else '+'}{'xyz'[axis]}"

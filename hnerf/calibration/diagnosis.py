@@ -29,7 +29,7 @@ MISTAKES: dict[str, Callable[[Camera], Camera]] = {  # what was done, and what u
         c, R=np.diag([1, -1, -1]) @ c.R, t_m=np.diag([1, -1, -1]) @ c.t_m
     ),
 }
-MISTAKES_OF_ONE: dict[str, Callable[[Camera], Camera]] = {  # in all cameras they only scale the world
+SINGLE_CAMERA_MISTAKES: dict[str, Callable[[Camera], Camera]] = {  # in all cameras they only scale the world
     f"T is in {unit}": lambda c, metres=metres: dataclasses.replace(c, t_m=metres * c.t_m)  # type: ignore[misc]
     for unit, metres in UNITS_M.items()
 }
@@ -122,7 +122,7 @@ def body_height_m(points_m: np.ndarray) -> float:
     return chain / CHAIN_SHARE_OF_STATURE
 
 
-def unit_of(height: float) -> str | None:
+def likely_unit(height: float) -> str | None:
     """The unit in which a body of this height, out of range in metres, would be a person; None if there is none."""
     heights_m = {unit: height * metres for unit, metres in UNITS_M.items()}
     possible = [unit for unit, metres in heights_m.items() if BODY_HEIGHT_M[0] <= metres <= BODY_HEIGHT_M[1]]
@@ -140,7 +140,7 @@ def median_height_px(keypoints: np.ndarray) -> float:
     return float(np.median(heights[heights > 0]))
 
 
-def explain(cameras: Sequence[Camera], keypoints: np.ndarray) -> str | None:
+def convention_mistake(cameras: Sequence[Camera], keypoints: np.ndarray) -> str | None:
     """The mistakes of convention that, undone in all cameras, make the calibration fit keypoints (C, frames, 25, 3),
     joined by "or" where the views cannot tell them apart; None if none does."""
     flat, limit_px = keypoints.reshape(len(cameras), -1, 3), gross_limit_px(keypoints)
@@ -157,13 +157,13 @@ def size_ratio(cameras: Sequence[Camera], keypoints: np.ndarray) -> float | None
     flat, limit_px = keypoints.reshape(len(cameras), -1, 3), gross_limit_px(keypoints)
     if len(cameras) < 3 or min(cost_without_each_px(cameras, flat).values()) <= limit_px:
         return None
-    costs_px = [trimmed_cost_px([_of_other_size(c, ratio) for c in cameras], flat) for ratio in SIZE_RATIOS]
+    costs_px = [trimmed_cost_px([_scale_intrinsics(c, ratio) for c in cameras], flat) for ratio in SIZE_RATIOS]
     best = int(np.argmin(costs_px))
     ratio = float(SIZE_RATIOS[best])
     return ratio if costs_px[best] <= limit_px and max(ratio, 1 / ratio) > OTHER_SIZE else None
 
 
-def _of_other_size(camera: Camera, ratio: float) -> Camera:
+def _scale_intrinsics(camera: Camera, ratio: float) -> Camera:
     return dataclasses.replace(camera, K=np.diag([ratio, ratio, 1]) @ camera.K)
 
 
@@ -177,7 +177,7 @@ def undo_mistake(cameras: list[Camera], keypoints: np.ndarray) -> tuple[list[Cam
     undone = {
         (i, cause): [*cameras[:i], undo(cameras[i]), *cameras[i + 1 :]]
         for i in gross
-        for cause, undo in (MISTAKES | MISTAKES_OF_ONE).items()
+        for cause, undo in (MISTAKES | SINGLE_CAMERA_MISTAKES).items()
     }
     medians_px = {what: _medians_px(repaired, flat) for what, repaired in undone.items()}
     costs_px = {what: medians.sum() for what, medians in medians_px.items() if medians.max() <= limit_px}

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hnerf.calibration.boards.calibrate import board_witness
+from hnerf.calibration.boards.calibrate import board_evidence
 from hnerf.calibration.diagnosis import Measure
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.silhouettes import Outlines
@@ -35,9 +35,9 @@ class Evidence:
     def of(capture: Capture, keypoints: np.ndarray) -> "Evidence":
         """With what the pictures show beside the keypoints."""
         outlines, matches = Outlines.of(capture), Matches.of(capture)
-        return Evidence(capture, keypoints, outlines, matches, board_witness(capture))
+        return Evidence(capture, keypoints, outlines, matches, board_evidence(capture))
 
-    def plain(self, cameras: Sequence[Camera], found: Measure) -> dict[str, Any]:
+    def summarise(self, cameras: Sequence[Camera], found: Measure) -> dict[str, Any]:
         """What each witness says of each of these cameras, in pixels; `found`: what `measure` says of them."""
         outlines_px = self.outlines.residuals_px(cameras) if self.outlines else {}
         matches_px = self.matches.residuals_px(cameras)

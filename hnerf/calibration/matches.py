@@ -40,7 +40,10 @@ class Matches:
         matcher = pycolmap.FeatureMatcher.create(pycolmap.FeatureMatchingOptions(use_gpu=False))
         grey = {name: cv2.cvtColor(capture.image(name, frame), cv2.COLOR_RGB2GRAY) for name in names}
         features = {name: extractor.extract_from_uint8_array(image) for name, image in grey.items()}
-        verified = {(a, b): _verified(_matched(matcher, features[a], features[b])) for a, b in combinations(names, 2)}
+        verified = {
+            (a, b): _verified_matches(_match_features(matcher, features[a], features[b]))
+            for a, b in combinations(names, 2)
+        }
         return Matches({pair: matched for pair, matched in verified.items() if len(matched)}, frame)
 
     def residuals_px(self, cameras: Sequence[Camera]) -> dict[tuple[str, str], np.ndarray]:
@@ -68,7 +71,7 @@ def sampson_px(F: np.ndarray, matched: np.ndarray) -> np.ndarray:
     return np.abs((x[:, 1] * in_b).sum(1)) / gradient
 
 
-def _matched(
+def _match_features(
     matcher: pycolmap.FeatureMatcher,
     a: tuple[pycolmap.FeatureKeypoints, pycolmap.FeatureDescriptors],
     b: tuple[pycolmap.FeatureKeypoints, pycolmap.FeatureDescriptors],
@@ -80,7 +83,7 @@ def _matched(
     return np.stack([np.reshape(in_a, (-1, 2)), np.reshape(in_b, (-1, 2))], 1) - 0.5  # centres at integers
 
 
-def _verified(matched: np.ndarray) -> np.ndarray:
+def _verified_matches(matched: np.ndarray) -> np.ndarray:
     """Those of (n, 2, 2) that a fundamental matrix explains; none if it explains too few."""
     if len(matched) < MIN_MATCHES:
         return matched[:0]

@@ -5,8 +5,8 @@ import numpy as np
 from hnerf.geometry.camera import Camera
 
 FIELD_OF_VIEW_DEG = (10.0, 120.0)  # of the longer side: beyond lies no lens that people are filmed with
-MIDDLE = 1 / 3  # of the image's sides: the principal point of an uncropped picture lies inside
-SQUARE = 0.1  # by how much pixels may differ from square
+PRINCIPAL_POINT_RANGE = 1 / 3  # of the image's sides: the principal point of an uncropped picture lies inside
+MAX_ASPECT_ERROR = 0.1  # by how much pixels may differ from square
 STANDING_M = (1.2, 2.1)
 NOSE, SOLES = 0, (19, 21, 22, 24)  # of BODY_25: big toes and heels
 NOSE_SHARE = 0.92  # of an adult's stature (Winter 2009, figure 4.1: eyes at 0.936)
@@ -21,12 +21,12 @@ def intrinsics_reasons(camera: Camera) -> list[str]:
     reasons = []
     if not FIELD_OF_VIEW_DEG[0] <= field_deg <= FIELD_OF_VIEW_DEG[1]:
         reasons.append(f"field of view {field_deg:.0f} degrees: focal length and image size do not belong together")
-    if (np.abs(centre - 0.5) > MIDDLE / 2).any():
+    if (np.abs(centre - 0.5) > PRINCIPAL_POINT_RANGE / 2).any():
         reasons.append(
             f"principal point at {100 * centre[0]:.0f} % of the width and {100 * centre[1]:.0f} % of the height: "
             "intrinsics of another picture size, or of a cropped picture"
         )
-    if abs(focal_px[0] / focal_px[1] - 1) > SQUARE:
+    if abs(focal_px[0] / focal_px[1] - 1) > MAX_ASPECT_ERROR:
         reasons.append(f"pixels {focal_px[1] / focal_px[0]:.2f} times as wide as high: the picture is stretched")
     return reasons
 

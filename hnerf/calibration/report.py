@@ -12,7 +12,7 @@ import cv2
 from hnerf.calibration.diagnosis import Measure
 from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.picture import draw_cameras
-from hnerf.calibration.sheet import draw_witnesses
+from hnerf.calibration.sheet import draw_evidence
 from hnerf.calibration.synchronise import Timing
 from hnerf.capture.capture import Capture
 from hnerf.capture.formats.easymocap import write_easymocap
@@ -37,7 +37,7 @@ class CameraVerdict:
     timing: Timing
     reasons: tuple[str, ...]
 
-    def plain(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """As JSON has it."""
         timing = self.timing
         offset = {
@@ -64,7 +64,7 @@ class CalibrationReport:
     outlines_px: dict[str, float]
     notes: tuple[str, ...]
     up: str
-    witnesses: Evidence | None
+    evidence: Evidence | None
 
     @property
     def verdict(self) -> str:
@@ -77,17 +77,17 @@ class CalibrationReport:
         out.mkdir(parents=True, exist_ok=True)
         rejected = {name for name, v in self.verdicts.items() if v.status == "rejected"}
         write_easymocap(out, [pinhole(camera) for name, camera in self.cameras.items() if name not in rejected])
-        (out / "report.json").write_text(json.dumps(_finite(self._plain()), indent=1, allow_nan=False))
+        (out / "report.json").write_text(json.dumps(_finite(self._to_dict()), indent=1, allow_nan=False))
         status = {name: self.verdicts[name].status if name in self.verdicts else "unjudged" for name in self.cameras}
         draw_cameras(out / "cameras.png", list(self.cameras.values()), status, self.up, self.before, self.after)
-        if self.witnesses and self.after:
+        if self.evidence and self.after:
             used = [self.cameras[name] for name in self.verdicts]
-            draw_witnesses(out / "witnesses.png", self.witnesses, used, self.after)
+            draw_evidence(out / "witnesses.png", self.evidence, used, self.after)
 
-    def _plain(self) -> dict[str, Any]:
+    def _to_dict(self) -> dict[str, Any]:
         return {
             "verdict": self.verdict,
-            "cameras": {name: v.plain() for name, v in self.verdicts.items()},
+            "cameras": {name: v.to_dict() for name, v in self.verdicts.items()},
             "unjudged_cameras": [name for name in self.cameras if name not in self.verdicts],
             "body_height_m": self.after and self.after.body_height_m,
             "trimmed_cost_px": {
@@ -101,18 +101,18 @@ class CalibrationReport:
             "held_out_cost_px": self.held_out_px,
             "outlines_cost_px": self.outlines_px,
             "notes": self.notes,
-            "witnesses": self._heard(),
+            "witnesses": self._evidence_to_dict(),
         }
 
-    def _heard(self) -> dict[str, Any]:
+    def _evidence_to_dict(self) -> dict[str, Any]:
         """What the witnesses say of the cameras as given and as used; nothing of one camera."""
-        if self.witnesses is None or self.before is None or self.after is None:
+        if self.evidence is None or self.before is None or self.after is None:
             return {}
-        given = self.witnesses.capture.cameras
+        given = self.evidence.capture.cameras
         return {
-            "as_given": self.witnesses.plain([given[name] for name in self.verdicts], self.before),
-            "as_used": self.witnesses.plain([self.cameras[name] for name in self.verdicts], self.after),
-            "board_footage": self.witnesses.boards or "none: the recording has no calibration/ footage of a board",
+            "as_given": self.evidence.summarise([given[name] for name in self.verdicts], self.before),
+            "as_used": self.evidence.summarise([self.cameras[name] for name in self.verdicts], self.after),
+            "board_footage": self.evidence.boards or "none: the recording has no calibration/ footage of a board",
         }
 
 

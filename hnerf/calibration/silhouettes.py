@@ -26,10 +26,10 @@ FRAMES = 8  # evenly spread: neighbours say the same again
 PLATE_FRAMES = 24  # from which the background is made where there is no clean plate
 POINTS = 64  # of the outline in each image
 COARSE, FINE = 64, 17  # samples along a ray, and again between the neighbours of the best
-ROOM = 1.5  # times the person's size: how far along a ray the person is looked for
+SEARCH_RANGE = 1.5  # times the person's size: how far along a ray the person is looked for
 TRIM = 0.98  # share of the residuals that count; the rest are faults of the masks
-COVERED = 0.6  # of the person's keypoints: a mask with fewer of them is not the person's
-DENIED_PX = 1e4  # behind a camera that sees the person
+MIN_KEYPOINTS_INSIDE = 0.6  # of the person's keypoints: a mask with fewer of them is not the person's
+BEHIND_CAMERA_PX = 1e4  # behind a camera that sees the person
 
 log = logging.getLogger("hnerf.calibration")
 
@@ -118,14 +118,14 @@ class Outlines:
             seen = [(camera, outline) for camera, outline in at_once if outline is not None]
             if len(seen) < 2:
                 continue
-            centre_m, reach_m = _whereabouts(seen)
+            centre_m, reach_m = _locate_person(seen)
             for i, (camera, outline) in enumerate(seen):
                 others = seen[:i] + seen[i + 1 :]
-                residuals[camera.name].append(_missed_by_px(camera, outline, others, centre_m, reach_m))
+                residuals[camera.name].append(_hull_distances_px(camera, outline, others, centre_m, reach_m))
         return {name: np.concatenate(rows) if rows else np.zeros(0) for name, rows in residuals.items()}
 
 
-def _whereabouts(seen: Sequence[tuple[Camera, MaskOutline]]) -> tuple[np.ndarray, float]:
+def _locate_person(seen: Sequence[tuple[Camera, MaskOutline]]) -> tuple[np.ndarray, float]:
     """The point nearest to the rays through the middles of the masks, (3,), and the person's size about it."""
     origins, directions = zip(*(camera.rays(outline.centre_px) for camera, outline in seen), strict=True)
     across = np.stack([np.eye(3) - np.outer(d, d) for d in directions])  # projects onto the plane across the ray
@@ -134,10 +134,10 @@ def _whereabouts(seen: Sequence[tuple[Camera, MaskOutline]]) -> tuple[np.ndarray
     sizes_m = [
         outline.size_px / camera.K[1, 1] * float(np.linalg.norm(centre_m - camera.centre_m)) for camera, outline in seen
     ]
-    return centre_m, ROOM * float(np.median(sizes_m))
+    return centre_m, SEARCH_RANGE * float(np.median(sizes_m))
 
 
-def _missed_by_px(
+def _hull_distances_px(
     camera: Camera,
     outline: MaskOutline,
     others: Sequence[tuple[Camera, MaskOutline]],
@@ -167,10 +167,10 @@ def _outside_px(seen: Sequence[tuple[Camera, MaskOutline]], points_m: np.ndarray
     worst = np.full(points_m.shape[:2], -np.inf)
     for camera, outline in seen:
         uv, depth_m = camera.project(points_m)
-        at = np.nan_to_num(uv).clip(-DENIED_PX, DENIED_PX).astype(np.float32)
+        at = np.nan_to_num(uv).clip(-BEHIND_CAMERA_PX, BEHIND_CAMERA_PX).astype(np.float32)
         x, y = cv2.split(at)
         far_px = cv2.remap(outline.distance_px, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        worst = np.maximum(worst, np.where(depth_m > 0, far_px, DENIED_PX))
+        worst = np.maximum(worst, np.where(depth_m > 0, far_px, BEHIND_CAMERA_PX))
     return worst
 
 
@@ -181,7 +181,7 @@ def _outlines(capture: Capture, name: str, keypoints: np.ndarray, shown: Sequenc
         xy = keypoints[i, keypoints[i, :, 2] > 0, :2].round().astype(int)
         xy = xy[((xy >= 0) & (xy < mask.shape[::-1])).all(1)]
         covered = mask[xy[:, 1], xy[:, 0]].mean() if len(xy) else 0.0
-        outlines.append(MaskOutline.around(mask) if covered >= COVERED else None)
+        outlines.append(MaskOutline.around(mask) if covered >= MIN_KEYPOINTS_INSIDE else None)
     return outlines
 
 

@@ -22,15 +22,18 @@ from hnerf.geometry.triangulation import triangulate
 
 MAX_STEPS = 10  # shifts that are looked at, either way, in steps between the capture's frames
 MIN_FRAMES = 8  # that a shifted camera must share with the others, at the best shift and on either side of it
-STRETCHES = 12  # of frames, each left out once
-POSSIBLE, CERTAIN = 2.0, 5.0  # standard errors that an offset must exceed to be suspected, and to be believed
-LEAST_OFFSET = 0.1  # frames: less is within what the parabola can tell
-FARTHEST = 1.2  # recorded frames between an instant and the picture that shows it
-OBSERVABLE_STEPS = 0.5  # standard error up to which an offset says something
-CLEAR_BEND = 2.0  # standard errors by which one step must raise the distances
-REWEIGHTED = 5  # rounds of iteratively re-weighted least squares
-OUTLIER = 3.0  # times the scale of the residuals
-LEAST_SCALE_PX = 0.5
+JACKKNIFE_BLOCKS = 12  # of frames, each left out once
+SUSPECTED_SIGMAS, CERTAIN_SIGMAS = (
+    2.0,
+    5.0,
+)  # standard errors that an offset must exceed to be suspected, and to be believed
+MIN_OFFSET_FRAMES = 0.1  # frames: less is within what the parabola can tell
+MAX_DISTANCE_FRAMES = 1.2  # recorded frames between an instant and the picture that shows it
+MAX_ERROR_STEPS = 0.5  # standard error up to which an offset says something
+MIN_CURVATURE_SIGMAS = 2.0  # standard errors by which one step must raise the distances
+IRLS_ROUNDS = 5  # rounds of iteratively re-weighted least squares
+OUTLIER_SCALES = 3.0  # times the scale of the residuals
+MIN_SCALE_PX = 0.5
 
 log = logging.getLogger("hnerf.calibration")
 
@@ -45,7 +48,7 @@ class Timing:
 
     offset_frames: float
     error_frames: float
-    by_half: tuple[float, float]
+    half_offsets: tuple[float, float]
     reason: str
 
     @staticmethod
@@ -54,17 +57,17 @@ class Timing:
         return Timing(np.nan, np.nan, (0.0, 0.0), reason)
 
     @property
-    def possible(self) -> bool:
+    def suspected(self) -> bool:
         """Whether the camera may be out of step."""
-        return abs(self.offset_frames) > max(LEAST_OFFSET, POSSIBLE * self.error_frames)
+        return abs(self.offset_frames) > max(MIN_OFFSET_FRAMES, SUSPECTED_SIGMAS * self.error_frames)
 
     @property
     def certain(self) -> bool:
         """Whether the camera is out of step: far beyond the error, and each half of the frames gains by the other's
         offset (a parabola is lower at x than at 0 if x lies between 0 and twice its vertex)."""
-        a, b = self.by_half
+        a, b = self.half_offsets
         agree = a * b > 0 and abs(a) < 2 * abs(b) < 4 * abs(a)
-        far = abs(self.offset_frames) > max(LEAST_OFFSET, CERTAIN * self.error_frames)
+        far = abs(self.offset_frames) > max(MIN_OFFSET_FRAMES, CERTAIN_SIGMAS * self.error_frames)
         return not self.reason and agree and far
 
 
@@ -76,7 +79,7 @@ class _View:
     frames: Sequence[int]
     keypoints: np.ndarray
     predicted_px: np.ndarray
-    by_pose: np.ndarray
+    pose_jacobian: np.ndarray
 
     def residuals(self, step: int) -> tuple[np.ndarray, np.ndarray]:
         """Own keypoints of frames so many steps later against the prediction: (F, 25, 2) px, weights (F, 25)."""
@@ -98,10 +101,10 @@ class _Parabola:
     def vertex(self, frames: np.ndarray) -> float:
         """Where it is lowest, in steps, from these frames alone; no further than the outer shifts."""
         before, at, after = self.squares[:, frames].sum(1)
-        bend = before - 2 * at + after
-        return self.middle + (float(np.clip((before - after) / (2 * bend), -1, 1)) if bend > 0 else 0.0)
+        curvature = before - 2 * at + after
+        return self.middle + (float(np.clip((before - after) / (2 * curvature), -1, 1)) if curvature > 0 else 0.0)
 
-    def bend_px2(self, frames: np.ndarray) -> float:
+    def curvature_px2(self, frames: np.ndarray) -> float:
         """By how much one step raises the mean square distance, from these frames alone."""
         before, at, after = self.squares[:, frames].sum(1)
         return float((before - 2 * at + after) / 2 / self.weights[frames].sum().clip(1e-9))
@@ -112,7 +115,7 @@ class _Parabola:
         return float(np.sqrt(self.squares[1].sum() / self.weights.sum().clip(1e-9)))
 
 
-def put_in_step(
+def synchronise_capture(
     capture: Capture, cameras: Sequence[Camera], keypoints: np.ndarray, settings: CalibrationSettings
 ) -> tuple[Capture, dict[str, float], list[str]]:
     """The capture with the offsets that `synchronise` found (the very same without any), costs tried, and notes.
@@ -123,24 +126,24 @@ def put_in_step(
     offsets, held_out_px, notes = synchronise(cameras, keypoints, capture.frames, settings)
     if not offsets:
         return capture, held_out_px, notes
-    in_step = capture.synchronised(offsets)
-    lost = [frame for frame in capture.frames if frame not in in_step.frames]
-    off_frames = {name: in_step.recorded(name, 0) - offset for name, offset in offsets.items()}
+    synchronised = capture.synchronised(offsets)
+    lost = [frame for frame in capture.frames if frame not in synchronised.frames]
+    off_frames = {name: synchronised.recorded(name, 0) - offset for name, offset in offsets.items()}
     farthest = max(off_frames, key=lambda name: abs(off_frames[name]))
-    too_far = abs(off_frames[farthest]) > FARTHEST * capture.frame_step
-    if 2 * len(lost) > len(capture.frames) or not in_step.train_frames or too_far:
-        raise InputError(f"{capture.name}: {_what_to_cut(capture.train_cameras, offsets)}")
-    if in_step.frame_step != capture.frame_step:
+    too_far = abs(off_frames[farthest]) > MAX_DISTANCE_FRAMES * capture.frame_step
+    if 2 * len(lost) > len(capture.frames) or not synchronised.train_frames or too_far:
+        raise InputError(f"{capture.name}: {_cut_advice(capture.train_cameras, offsets)}")
+    if synchronised.frame_step != capture.frame_step:
         what = (
             f"frames between were not taken: pictures of camera {farthest} are {off_frames[farthest]:+.2f} frames off"
         )
         notes = [*notes, what]
     if lost:
         notes = [*notes, f"{len(lost)} frames dropped that not every camera recorded: {', '.join(map(str, lost))}"]
-    return in_step, held_out_px, notes
+    return synchronised, held_out_px, notes
 
 
-def _what_to_cut(cameras: Sequence[str], offsets: dict[str, float]) -> str:
+def _cut_advice(cameras: Sequence[str], offsets: dict[str, float]) -> str:
     late = ", ".join(f"camera {name} by {offset:+.2f} frames" for name, offset in offsets.items())
     earliest = min(offsets.get(name, 0.0) for name in cameras)
     cuts = {name: round(offsets.get(name, 0.0) - earliest) for name in cameras}
@@ -162,17 +165,19 @@ def synchronise(
     offsets: dict[str, float] = {}
     held_out_px: dict[str, float] = {}
     for _ in cameras:
-        shifted = _shifted(cameras, keypoints, frames, offsets)
+        shifted = _shift_keypoints(cameras, keypoints, frames, offsets)
         found = measure_timing(cameras, shifted, frames)
         if not any(timing.certain for timing in found.values()):
             break
         as_is_px = _halves_cost_px(cameras, [shifted, shifted])
         held_out_px.setdefault("not synchronised", as_is_px)
         tried = {}
-        for name in (name for name, timing in found.items() if timing.possible):
+        for name in (name for name, timing in found.items() if timing.suspected):
             so_far = offsets.get(name, 0.0)
-            by_other_half = [offsets | {name: so_far + half} for half in reversed(found[name].by_half)]
-            tried[name] = _halves_cost_px(cameras, [_shifted(cameras, keypoints, frames, o) for o in by_other_half])
+            by_other_half = [offsets | {name: so_far + half} for half in reversed(found[name].half_offsets)]
+            tried[name] = _halves_cost_px(
+                cameras, [_shift_keypoints(cameras, keypoints, frames, o) for o in by_other_half]
+            )
             what = f"camera {name} shifted by {so_far + found[name].offset_frames:+.2f} frames"
             held_out_px[what] = tried[name]
             log.info("tried: %s: %.2f px", what, tried[name])
@@ -184,9 +189,9 @@ def synchronise(
             return {}, held_out_px, [doubt]
         offsets[best] = offsets.get(best, 0.0) + found[best].offset_frames
     for name in offsets:  # measured while others were still out of step
-        timing = measure_timing(cameras, _shifted(cameras, keypoints, frames, offsets), frames)[name]
+        timing = measure_timing(cameras, _shift_keypoints(cameras, keypoints, frames, offsets), frames)[name]
         offsets[name] += 0.0 if timing.reason else timing.offset_frames
-    return _against_the_steadiest(offsets, len(cameras)), held_out_px, []
+    return _relative_to_least_shifted(offsets, len(cameras)), held_out_px, []
 
 
 def measure_timing(cameras: Sequence[Camera], keypoints: np.ndarray, frames: Sequence[int]) -> dict[str, Timing]:
@@ -196,13 +201,13 @@ def measure_timing(cameras: Sequence[Camera], keypoints: np.ndarray, frames: Seq
     return {camera.name: _timing(_view(cameras, keypoints, i, frames)) for i, camera in enumerate(cameras)}
 
 
-def _against_the_steadiest(offsets: dict[str, float], cameras: int) -> dict[str, float]:
+def _relative_to_least_shifted(offsets: dict[str, float], cameras: int) -> dict[str, float]:
     """Only differences in time can be known: where every camera was shifted, the least shifted one keeps its time."""
     common = min(offsets.values(), key=abs) if len(offsets) == cameras else 0.0
-    return {name: offset - common for name, offset in offsets.items() if abs(offset - common) >= LEAST_OFFSET}
+    return {name: offset - common for name, offset in offsets.items() if abs(offset - common) >= MIN_OFFSET_FRAMES}
 
 
-def _shifted(
+def _shift_keypoints(
     cameras: Sequence[Camera], keypoints: np.ndarray, frames: Sequence[int], offsets: dict[str, float]
 ) -> np.ndarray:
     """Keypoints (C, frames, 25, 3) as these offsets would have them."""
@@ -229,13 +234,16 @@ def _timing(view: _View) -> Timing:
     parabola, step = _parabola(view, lowest), usual_step(view.frames)
     if np.count_nonzero(parabola.weights) < MIN_FRAMES:
         return Timing.unknown(f"fewer than {MIN_FRAMES} frames with neighbours {step} before and after")
-    kept = [np.setdiff1d(every, left_out) for left_out in np.array_split(every, STRETCHES)]
+    kept = [np.setdiff1d(every, left_out) for left_out in np.array_split(every, JACKKNIFE_BLOCKS)]
     error = _jackknife_error([parabola.vertex(k) for k in kept])
-    bend_px2, bend_error_px2 = parabola.bend_px2(every), _jackknife_error([parabola.bend_px2(k) for k in kept])
+    curvature_px2, curvature_error_px2 = (
+        parabola.curvature_px2(every),
+        _jackknife_error([parabola.curvature_px2(k) for k in kept]),
+    )
     reason = ""
-    if bend_px2 < CLEAR_BEND * bend_error_px2 or error > OBSERVABLE_STEPS:
+    if curvature_px2 < MIN_CURVATURE_SIGMAS * curvature_error_px2 or error > MAX_ERROR_STEPS:
         reason = (
-            f"too little motion: one frame moves keypoints by {np.sqrt(max(bend_px2, 0)) / step:.2f} px more than a "
+            f"too little motion: one frame moves keypoints by {np.sqrt(max(curvature_px2, 0)) / step:.2f} px more than a "
             f"turn or move of the camera would, against {parabola.noise_px:.1f} px of noise"
         )
     elif max(abs(half - lowest) for half in lowest_of_half) > 1:
@@ -257,12 +265,12 @@ def _view(cameras: Sequence[Camera], keypoints: np.ndarray, index: int, frames: 
     points_m = triangulate(projections, keypoints[others].reshape(len(others), -1, 3))[0]
     predicted_px, depth_m = cameras[index].project(points_m)
     predicted_px[~(depth_m > 0)] = np.nan
-    by_pose = np.nan_to_num(_by_pose(cameras[index], points_m))
+    pose_jacobian = np.nan_to_num(_pose_jacobian(cameras[index], points_m))
     shape = keypoints.shape[1:3]
-    return _View(frames, keypoints[index], predicted_px.reshape(*shape, 2), by_pose.reshape(*shape, 2, 6))
+    return _View(frames, keypoints[index], predicted_px.reshape(*shape, 2), pose_jacobian.reshape(*shape, 2, 6))
 
 
-def _by_pose(camera: Camera, points_m: np.ndarray) -> np.ndarray:
+def _pose_jacobian(camera: Camera, points_m: np.ndarray) -> np.ndarray:
     """Derivatives of pixels by a small turn and a small move in the camera's axes, (K, 2, 6), for points (K, 3):
     x' = x + w cross x + t, and the pinhole's (Hartley and Zisserman, appendix 6)."""
     x, y, z = np.moveaxis(points_m @ camera.R.T + camera.t_m, -1, 0)
@@ -279,7 +287,9 @@ def _cost_by_step(view: _View, parts: Sequence[np.ndarray]) -> dict[int, list[fl
     for step in range(-MAX_STEPS, MAX_STEPS + 1):
         residuals, weights = view.residuals(step)
         if np.count_nonzero(weights.any(1)) >= enough:
-            unexplained = _unexplained(residuals, view.by_pose, _robust(residuals, view.by_pose, weights))
+            unexplained = _remove_pose_effect(
+                residuals, view.pose_jacobian, _robust_weights(residuals, view.pose_jacobian, weights)
+            )
             distances = np.where(weights > 0, np.linalg.norm(unexplained, axis=-1), np.nan)
             costs[step] = [trimmed_mean(distances[part], TRIM) for part in parts]
     return costs
@@ -292,28 +302,28 @@ def _parabola(view: _View, middle: int) -> _Parabola:
     """
     three = [view.residuals(middle + step) for step in (-1, 0, 1)]
     shared = np.all([weights > 0 for _, weights in three], axis=0)
-    robust = _robust(three[1][0], view.by_pose, three[1][1] * shared)
-    residuals = [_unexplained(residuals, view.by_pose, robust) for residuals, _ in three]
+    robust = _robust_weights(three[1][0], view.pose_jacobian, three[1][1] * shared)
+    residuals = [_remove_pose_effect(residuals, view.pose_jacobian, robust) for residuals, _ in three]
     distances = np.linalg.norm(residuals[1], axis=-1)
-    scale_px = max(LEAST_SCALE_PX, OUTLIER / 2 * float(np.median(distances[shared])) if shared.any() else 0.0)
+    scale_px = max(MIN_SCALE_PX, OUTLIER_SCALES / 2 * float(np.median(distances[shared])) if shared.any() else 0.0)
     moved_px = np.linalg.norm(residuals[2] - residuals[0], axis=-1) / 2
-    used = three[1][1] * shared * (distances < OUTLIER * scale_px) / (1 + (moved_px / scale_px) ** 2)
+    used = three[1][1] * shared * (distances < OUTLIER_SCALES * scale_px) / (1 + (moved_px / scale_px) ** 2)
     squares = np.stack([(used[..., None] * r**2).sum((1, 2)) for r in residuals])
     return _Parabola(middle, squares, used.sum(1))
 
 
-def _robust(residuals: np.ndarray, by_pose: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def _robust_weights(residuals: np.ndarray, pose_jacobian: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Weights (F, 25) that fade (Cauchy) with the distance that no turn or move of the camera explains."""
     robust = weights
-    for _ in range(REWEIGHTED):
-        distances = np.linalg.norm(_unexplained(residuals, by_pose, robust), axis=-1)
-        scale_px = max(LEAST_SCALE_PX, OUTLIER / 2 * float(np.median(distances[weights > 0])))
+    for _ in range(IRLS_ROUNDS):
+        distances = np.linalg.norm(_remove_pose_effect(residuals, pose_jacobian, robust), axis=-1)
+        scale_px = max(MIN_SCALE_PX, OUTLIER_SCALES / 2 * float(np.median(distances[weights > 0])))
         robust = weights / (1 + (distances / scale_px) ** 2)
     return robust
 
 
-def _unexplained(residuals: np.ndarray, by_pose: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def _remove_pose_effect(residuals: np.ndarray, pose_jacobian: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Residuals (F, 25, 2) less what the camera's pose explains of them (weighted least squares)."""
     root = np.sqrt(weights)[..., None]
-    A, b = (root[..., None] * by_pose).reshape(-1, 6), (root * residuals).reshape(-1)
-    return residuals - by_pose @ np.linalg.lstsq(A.T @ A, A.T @ b, rcond=None)[0]
+    A, b = (root[..., None] * pose_jacobian).reshape(-1, 6), (root * residuals).reshape(-1)
+    return residuals - pose_jacobian @ np.linalg.lstsq(A.T @ A, A.T @ b, rcond=None)[0]

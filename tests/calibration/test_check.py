@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.check import check_calibration
-from hnerf.calibration.diagnosis import MISTAKES, body_height_m, cost_without_each_px, size_ratio, unit_of
+from hnerf.calibration.diagnosis import MISTAKES, body_height_m, cost_without_each_px, likely_unit, size_ratio
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
@@ -45,10 +45,10 @@ def test_body_height_by_hand() -> None:
 
 
 def test_units_by_hand() -> None:
-    assert unit_of(1790) == "millimetres"
-    assert unit_of(179) == "centimetres"
-    assert unit_of(70.5) == "inches"
-    assert unit_of(5) is None
+    assert likely_unit(1790) == "millimetres"
+    assert likely_unit(179) == "centimetres"
+    assert likely_unit(70.5) == "inches"
+    assert likely_unit(5) is None
 
 
 def test_a_good_calibration_is_left_alone(tmp_path: Path) -> None:

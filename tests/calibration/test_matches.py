@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hnerf.calibration.matches import Matches, _verified, fundamental, sampson_px
+from hnerf.calibration.matches import Matches, _verified_matches, fundamental, sampson_px
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
@@ -39,10 +39,10 @@ def test_true_cameras_agree_and_a_turned_one_shows() -> None:
 
 def test_verification_does_not_ask_the_calibration() -> None:
     wrong = np.random.default_rng(1).uniform(0, 1000, (60, 2, 2))
-    kept = _verified(np.concatenate([seen(), wrong]))
+    kept = _verified_matches(np.concatenate([seen(), wrong]))
     assert 200 <= len(kept) < 210
-    assert len(_verified(wrong)) == 0
-    assert len(_verified(seen(10))) == 0
+    assert len(_verified_matches(wrong)) == 0
+    assert len(_verified_matches(seen(10))) == 0
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.check import check_calibration
-from hnerf.calibration.diagnosis import MISTAKES, MISTAKES_OF_ONE, undo_mistake
+from hnerf.calibration.diagnosis import MISTAKES, SINGLE_CAMERA_MISTAKES, undo_mistake
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.refine import Refinement, refine
 from hnerf.config import CalibrationSettings
@@ -113,7 +113,7 @@ def test_two_cameras_are_never_judged_one_by_one(tmp_path: Path) -> None:
     assert set(found.reasons.values()) == {"pose kept: it takes two others to judge one camera"}
 
 
-@pytest.mark.parametrize("cause", [*MISTAKES, *MISTAKES_OF_ONE])
+@pytest.mark.parametrize("cause", [*MISTAKES, *SINGLE_CAMERA_MISTAKES])
 def test_one_cameras_mistake_is_undone(cause: str) -> None:
     make = dict(MISTAKES)
     make["T is the camera's centre"] = lambda c: dataclasses.replace(c, t_m=c.centre_m)

@@ -7,7 +7,7 @@ import pytest
 from hnerf.calibration import synchronise as synchronise_module
 from hnerf.calibration.check import check_calibration
 from hnerf.calibration.report import load_cameras
-from hnerf.calibration.synchronise import measure_timing, put_in_step, synchronise
+from hnerf.calibration.synchronise import measure_timing, synchronise, synchronise_capture
 from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
 from hnerf.errors import InputError
@@ -136,8 +136,8 @@ def test_numbers_with_gaps_count_in_recorded_frames(
     numbers = tuple(range(0, 5 * FRAMES, 5))
     capture = dataclasses.replace(capture_of(tmp_path, recorded({}), frames=numbers), frame_step=5)
     monkeypatch.setattr(synchronise_module, "synchronise", lambda *_: ({"c1": 2.0}, {}, []))
-    in_step, _, notes = put_in_step(capture, ring(4), recorded({}), SETTINGS)
-    assert in_step.frames == numbers
+    synchronised, _, notes = synchronise_capture(capture, ring(4), recorded({}), SETTINGS)
+    assert synchronised.frames == numbers
     assert not notes
 
 

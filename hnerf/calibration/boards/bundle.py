@@ -106,7 +106,7 @@ class _Problem:
         self.observed_px = corners_px[self.camera, self.frame][self.picture, self.corner]
         self.K = np.stack([camera.K for camera in cameras])
         count, frames = corners_px.shape[:2]
-        self.before, self.after = _neighbours(self.seen.any((0, 2)))
+        self.before, self.after = _adjacent_frames(self.seen.any((0, 2)))
         self.offsets = slice(6 * (count + frames), 6 * (count + frames) + len(self.camera))
         self.size = self.offsets.stop
 
@@ -153,14 +153,14 @@ class _Problem:
 
     def _project(self, R: np.ndarray, t_m: np.ndarray, boards: Poses, offsets: np.ndarray) -> np.ndarray:
         """(pictures, N, 2) pixels of all corners."""
-        board_R, board_t_m = self._moved(boards, offsets)
+        board_R, board_t_m = self._boards_at_picture_time(boards, offsets)
         own = R[self.camera]
         to_camera, shift_m = own @ board_R, (own @ board_t_m[..., None])[..., 0] + t_m[self.camera]
         x = np.einsum("pij,nj->pni", to_camera, self.corners_m) + shift_m[:, None]
         uv = np.einsum("pij,pnj->pni", self.K[self.camera], x)
         return uv[..., :2] / uv[..., 2:]
 
-    def _moved(self, boards: Poses, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _boards_at_picture_time(self, boards: Poses, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Each picture's board at the picture's own time: the parabola through its frame and the two beside it, in
         translation and in the rotation vector away from its frame. A frame that is missing mirrors the other one."""
         frame, s = self.frame, offsets[:, None] / self.frame_step
@@ -177,7 +177,7 @@ class _Problem:
         return boards.R[frame] @ _exp(paths[0]), boards.t_m[frame] + paths[1]
 
 
-def _neighbours(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _adjacent_frames(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The frame before and the frame after each one; itself where that one is missing. seen: (F,) bool."""
     own = np.arange(len(seen))
     before, after = np.maximum(own - 1, 0), np.minimum(own + 1, len(seen) - 1)

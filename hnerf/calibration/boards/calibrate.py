@@ -17,12 +17,12 @@ from hnerf.calibration.boards.rig import (
     MIN_CORNERS,
     MIN_SHARED,
     compare_pairs,
-    flat_only,
-    linked,
+    fixes_pose,
+    largest_linked_group,
+    planar_corners,
     solve_boards,
     solve_rig,
-    undistorted,
-    whole_enough,
+    undistort_corners,
 )
 from hnerf.capture.board_footage import BoardFootage, load_board_corners, read_board_footage
 from hnerf.capture.capture import Capture
@@ -88,17 +88,17 @@ def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> Boar
     _check_board_found(footage)
     lenses, intrinsics = _intrinsics(folder, footage)
     corners_m = footage.board.corners_m
-    corners_px = np.stack([undistorted(footage.corners_px[name], lens) for name, lens in lenses.items()])
+    corners_px = np.stack([undistort_corners(footage.corners_px[name], lens) for name, lens in lenses.items()])
     cameras = [Camera(n, lens.K, np.eye(3), np.zeros(3), *footage.sizes_px[n]) for n, lens in lenses.items()]
     log.info("adjusting %d cameras to %d corners", len(cameras), int(np.isfinite(corners_px[..., 0]).sum()))
-    fit = solve_rig(cameras, corners_m, flat_only(corners_m, corners_px), footage.frame_step)
+    fit = solve_rig(cameras, corners_m, planar_corners(corners_m, corners_px), footage.frame_step)
     if ground_frame is not None:
         fit = _on_ground(fit, footage, ground_frame)
     lenses = {c.name: dataclasses.replace(lenses[c.name], R=c.R, t_m=c.t_m) for c in fit.cameras}
     return BoardCalibration(lenses, intrinsics, corners_m, corners_px, fit)
 
 
-def board_witness(capture: Capture) -> dict[str, Any] | None:
+def board_evidence(capture: Capture) -> dict[str, Any] | None:
     """What board footage says about a capture's cameras; None where the recording has none.
 
     "cameras": per camera the corners' distances (px) from the board that all cameras agree on, with the cameras as
@@ -110,8 +110,8 @@ def board_witness(capture: Capture) -> dict[str, Any] | None:
         return None
     known = [i for i, name in enumerate(stored.cameras) if name in capture.cameras]
     cameras, corners_px = [capture.cameras[stored.cameras[i]] for i in known], stored.corners_px[known]
-    corners_px = flat_only(stored.corners_m, corners_px)
-    chosen = linked(corners_px)
+    corners_px = planar_corners(stored.corners_m, corners_px)
+    chosen = largest_linked_group(corners_px)
     names = [camera.name for camera in cameras]
     if len(chosen) < 2:
         return {"frames": corners_px.shape[1], "cameras": {}, "pairs": {}, "unlinked_cameras": names}
@@ -151,7 +151,7 @@ def visible_and_found(fit: BoardFit, corners_m: np.ndarray) -> tuple[np.ndarray,
 def _check_board_found(footage: BoardFootage) -> None:
     """InputError where no camera sees enough of the board to be linked: it is hardly the board that is described."""
     corners_px = np.stack(list(footage.corners_px.values()))
-    found = whole_enough(footage.board.corners_m, np.isfinite(corners_px[..., 0]))
+    found = fixes_pose(footage.board.corners_m, np.isfinite(corners_px[..., 0]))
     if found.sum(1).max() < MIN_SHARED:
         raise InputError(
             f"{footage.path}: this board was found in {found.sum()} of {found.size} pictures; check its columns, rows, "
@@ -169,8 +169,8 @@ def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], d
         found = estimate_lens(name, source.board.corners_m, source.corners_px[name], source.sizes_px[name])
         if source is footage and name in given:
             lenses[name], words[name] = given[name], f"given; {_compared(found, given[name])}"
-        elif found.believed:
-            lenses[name], words[name] = found.believed, f"from {source.path.name}/: {found.certainty}"
+        elif found.reliable_lens:
+            lenses[name], words[name] = found.reliable_lens, f"from {source.path.name}/: {found.certainty}"
         else:
             raise InputError(
                 f"{source.path / name}: does not fix the intrinsics ({found.certainty}); film the board closer, "
@@ -187,9 +187,9 @@ def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], d
 
 
 def _compared(found: LensEstimate, given: Lens) -> str:
-    if found.believed is None:
+    if found.reliable_lens is None:
         return f"not verified by the footage ({found.certainty})"
-    differs = 100 * (found.believed.K[0, 0] / given.K[0, 0] - 1)
+    differs = 100 * (found.reliable_lens.K[0, 0] / given.K[0, 0] - 1)
     return f"the footage's own focal length differs by {differs:+.1f} % ({found.certainty})"
 
 

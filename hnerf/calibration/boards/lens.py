@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from hnerf.calibration.boards.rig import whole_enough
+from hnerf.calibration.boards.rig import fixes_pose
 from hnerf.capture.lens import Lens
 from hnerf.evenly_spaced import evenly_spaced
 
@@ -13,7 +13,7 @@ MAX_PICTURES = 40  # evenly chosen
 MIN_PICTURES = 10
 MIN_TILTED = 5  # of the pictures: boards parallel to the image say nothing about the focal length, nor does its spread
 TILT_DEG = 15.0
-MAX_FOCAL_SPREAD = 0.01  # standard deviation of an estimated focal length that is still believed, relative
+MAX_FOCAL_STD = 0.01  # standard deviation of an estimated focal length that is still believed, relative
 
 
 @dataclass(frozen=True)
@@ -24,19 +24,19 @@ class LensEstimate:
     pictures: int
     lens: Lens | None = None
     tilted: int = 0
-    focal_spread: float = np.inf
+    focal_std: float = np.inf
 
     @property
-    def believed(self) -> Lens | None:
+    def reliable_lens(self) -> Lens | None:
         """The lens if the pictures fix it."""
-        return self.lens if self.focal_spread <= MAX_FOCAL_SPREAD and self.tilted >= MIN_TILTED else None
+        return self.lens if self.focal_std <= MAX_FOCAL_STD and self.tilted >= MIN_TILTED else None
 
     @property
     def certainty(self) -> str:
         """In words."""
         if self.lens is None:
             return f"{self.pictures} pictures of the board where {MIN_PICTURES} are needed"
-        known = f"focal length known to {100 * self.focal_spread:.1f} %"
+        known = f"focal length known to {100 * self.focal_std:.1f} %"
         return f"{self.pictures} pictures of the board, {self.tilted} of them tilted, {known}"
 
 
@@ -46,7 +46,7 @@ def estimate_lens(name: str, corners_m: np.ndarray, corners_px: np.ndarray, size
     The standard deviation is that of the least squares (cv2.calibrateCameraExtended).
     """
     chosen = evenly_spaced(
-        np.flatnonzero(whole_enough(corners_m, np.isfinite(corners_px[..., 0]))).tolist(), MAX_PICTURES
+        np.flatnonzero(fixes_pose(corners_m, np.isfinite(corners_px[..., 0]))).tolist(), MAX_PICTURES
     )
     if len(chosen) < MIN_PICTURES:
         return LensEstimate(len(chosen))
