@@ -1,4 +1,4 @@
-"""The third witness: points of the picture itself, background and person, that two cameras see (SIFT)."""
+"""Image matches: SIFT correspondences between cameras, on the background and on the person."""
 
 import dataclasses
 import logging
@@ -17,22 +17,23 @@ MIN_MATCHES = 15  # and a share: a fundamental matrix fits some wrong matches by
 MIN_INLIERS = 0.3
 
 log = logging.getLogger("hnerf.calibration")
-pycolmap.logging.minloglevel = 1  # warnings; not which device SIFT takes
+pycolmap.logging.minloglevel = 1  # warnings only: SIFT otherwise logs which device it uses
 
 
 @dataclasses.dataclass(frozen=True)
 class Matches:
-    """Verified matches by pair of cameras that overlap: (n, 2, 2) pixels, in the first and in the second camera; in
-    images of this frame."""
+    """Verified matches by pair of overlapping cameras: (n, 2, 2) pixels, in the first and in the second camera, in the
+    images of one frame."""
 
     by_pair: dict[tuple[str, str], np.ndarray]
     frame: int
 
     @staticmethod
     def of(capture: Capture) -> "Matches":
-        """Of the training cameras at one instant; no pairs where cameras stand too far apart, which is no fault.
+        """Match the training cameras' images of one frame. Cameras too far apart to match have no pair, which is no
+        fault.
 
-        A pair is verified by a fundamental matrix of its own and not by the calibration, which is on trial.
+        A pair is verified by a fundamental matrix of its own, not by the calibration, which is what is being checked.
         """
         names, frame = capture.train_cameras, capture.frames[len(capture.frames) // 2]
         log.info("SIFT in %d cameras", len(names))
@@ -47,7 +48,7 @@ class Matches:
         return Matches({pair: matched for pair, matched in verified.items() if len(matched)}, frame)
 
     def residuals_px(self, cameras: Sequence[Camera]) -> dict[tuple[str, str], np.ndarray]:
-        """Sampson distances of each pair's matches under these cameras, (n,) pixels."""
+        """Return the Sampson distances of each pair's matches under these cameras, (n,) pixels."""
         named = {camera.name: camera for camera in cameras}
         return {
             (a, b): sampson_px(fundamental(named[a], named[b]), matched)
@@ -57,14 +58,15 @@ class Matches:
 
 
 def fundamental(a: Camera, b: Camera) -> np.ndarray:
-    """F with x_b^T F x_a = 0 (Hartley and Zisserman 2004, eq. 9.1), (3, 3)."""
+    """Return the fundamental matrix F (3, 3) with x_b^T F x_a = 0 (Hartley and Zisserman 2004, eq. 9.1)."""
     R = b.R @ a.R.T
     x, y, z = b.t_m - R @ a.t_m
     return np.linalg.inv(b.K).T @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R @ np.linalg.inv(a.K)
 
 
 def sampson_px(F: np.ndarray, matched: np.ndarray) -> np.ndarray:
-    """First-order distance of matches (n, 2, 2) to the epipolar constraint, (n,) (ibid., eq. 11.9, its root)."""
+    """Return the first-order distance of matches (n, 2, 2) to the epipolar constraint, (n,) (ibid., root of eq.
+    11.9)."""
     x = np.concatenate([matched, np.ones_like(matched[..., :1])], -1)
     in_b, in_a = x[:, 0] @ F.T, x[:, 1] @ F
     gradient = np.sqrt((in_b[:, :2] ** 2).sum(1) + (in_a[:, :2] ** 2).sum(1))
@@ -76,7 +78,7 @@ def _match_features(
     a: tuple[pycolmap.FeatureKeypoints, pycolmap.FeatureDescriptors],
     b: tuple[pycolmap.FeatureKeypoints, pycolmap.FeatureDescriptors],
 ) -> np.ndarray:
-    """(n, 2, 2) pixels."""
+    """Return the matches of two images' features, (n, 2, 2) pixels."""
     rows = matcher.match(*a, *b)
     in_a = [(a[0][int(i)].x, a[0][int(i)].y) for i, _ in rows]
     in_b = [(b[0][int(j)].x, b[0][int(j)].y) for _, j in rows]
@@ -84,7 +86,7 @@ def _match_features(
 
 
 def _verified_matches(matched: np.ndarray) -> np.ndarray:
-    """Those of (n, 2, 2) that a fundamental matrix explains; none if it explains too few."""
+    """Return those matches of (n, 2, 2) that a fundamental matrix explains; none if it explains too few."""
     if len(matched) < MIN_MATCHES:
         return matched[:0]
     ransac = pycolmap.RANSACOptions(max_error=INLIER_PX, random_seed=0)

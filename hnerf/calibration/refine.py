@@ -1,4 +1,5 @@
-"""Refinement of cameras, taken only where frames and joints that took no part prove it right, and pictures agree."""
+"""Refinement of cameras, accepted only where held-out frames and joints prove it and the images do not contradict
+it."""
 
 import logging
 from collections.abc import Sequence
@@ -15,16 +16,16 @@ from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
 from hnerf.geometry.camera import Camera
 
-OUTLINE_NOISE, OUTLINE_NOISE_PX = 0.05, 0.05  # a share, and pixels, by which outlines may fit worse by chance
-MATCH_NOISE_PX = 0.5  # by which matches of a pair of cameras may
+OUTLINE_NOISE, OUTLINE_NOISE_PX = 0.05, 0.05  # by which share, or how many pixels, outlines may fit worse by chance
+MATCH_NOISE_PX = 0.5  # by which the matches of two cameras may fit worse by chance
 
 log = logging.getLogger("hnerf.calibration")
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """Cameras to use; costs in px of everything tried, on held-out frames and of outlines; why, per camera and for the
-    rig."""
+    """Result of a refinement: the cameras to use, the costs in pixels of everything tried (on held-out frames, and of
+    outlines), and the reasons, per camera and for the rig."""
 
     cameras: list[Camera]
     held_out_px: dict[str, float]
@@ -35,7 +36,7 @@ class Refinement:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """Cameras as they could be used, what was done to which of them, and what held-out frames cost with them."""
+    """Candidate cameras, what was changed by camera name, and their cost on held-out frames."""
 
     cameras: list[Camera]
     changes: dict[str, str]
@@ -50,10 +51,12 @@ def refine(
     matches: Matches,
     settings: CalibrationSettings,
 ) -> Refinement:
-    """Adjust the cameras that do not fit the others; the very `cameras` are returned unless held-out frames gain.
+    """Adjust the cameras that do not fit the others. The given `cameras` themselves are returned unless held-out frames
+    improve.
 
-    Camera by camera, the others fixed; all at once where that asks for more than one, or leaves residuals too large.
-    What matches between two cameras contradict is not taken. keypoints (C, frames, 25, 3).
+    Cameras are freed one by one with the others fixed; all are freed together if more than one needs it or residuals
+    stay too large. A change that the image matches of two cameras contradict is not accepted. keypoints (C, frames, 25,
+    3).
     """
     cost_factor = 1 - settings.min_improvement
     held_out_px = {"as given": held_out_cost_px(cameras, keypoints, ())}
@@ -81,9 +84,10 @@ def refine(
 def _refine_one_by_one(
     cameras: list[Camera], keypoints: np.ndarray, matches: Matches, cost_factor: float, held_out_px: dict[str, float]
 ) -> tuple[_Candidate, dict[str, str]]:
-    """Free the camera that lets held-out frames gain most, then one more, until two are left or none gains enough.
+    """Free the camera that improves held-out frames most, then one more, until two fixed cameras are left or none
+    improves enough.
 
-    Adds to `held_out_px` what everything cost; returns with the outcome why the other cameras stay as they are.
+    Adds the cost of everything tried to `held_out_px`; also returns the reasons why the other cameras stay as they are.
     """
     kept = {camera.name: "pose kept: it takes two others to judge one camera" for camera in cameras}
     cost_px, changes, zoomed = held_out_px["as given"], dict[str, str](), tuple[str, ...]()
@@ -111,7 +115,7 @@ def _refine_one_by_one(
 
 
 def _refine_together(cameras: list[Camera], keypoints: np.ndarray, held_out_px: dict[str, float]) -> _Candidate:
-    """All poses free; adds to `held_out_px` what that cost."""
+    """Refine all poses together and add the cost to `held_out_px`."""
     log.info("trying: all poses refined")
     everyone = tuple(camera.name for camera in cameras)
     cost_px = held_out_px["all poses refined"] = held_out_cost_px(cameras, keypoints, everyone)
@@ -120,7 +124,7 @@ def _refine_together(cameras: list[Camera], keypoints: np.ndarray, held_out_px: 
 
 
 def _contradiction(matches: Matches, given: list[Camera], refined: list[Camera]) -> str:
-    """Which pair's matches say that the refinement is wrong; empty where none does."""
+    """Return which pair's matches contradict the refinement, in words; empty if none does."""
     before_px, after_px = matches.residuals_px(given), matches.residuals_px(refined)
     for (a, b), px in after_px.items():
         was_px, is_px = float(np.median(before_px[a, b])), float(np.median(px))
@@ -136,7 +140,8 @@ def _from_to(before_px: float, after_px: float) -> str:
 def _judge_by_outlines(
     outlines: Outlines | None, given: list[Camera], refined: list[Camera]
 ) -> tuple[dict[str, float], str]:
-    """What the person's outlines cost before and after, and why that forbids the refinement, else nothing."""
+    """Return the cost of the person's outlines before and after, and why it rules out the refinement (empty if it does
+    not)."""
     if outlines is None:
         return {}, ""
     costs_px = {"as given": outlines.cost_px(given), "refined": outlines.cost_px(refined)}
@@ -154,7 +159,8 @@ def _refine_for_size(
     must_beat_px: float,
     held_out_px: dict[str, float],
 ) -> tuple[list[Camera], list[str]]:
-    """Intrinsics that explain recorded sizes that black bars do not, if held-out frames prove them.
+    """Return intrinsics that explain a recorded image size other than the calibrated one without black bars, if
+    held-out frames prove them.
 
     Adds the costs of what was tried to `held_out_px`.
     """
@@ -176,10 +182,11 @@ def _refine_for_size(
 def held_out_cost_px(
     cameras: Sequence[Camera], keypoints: np.ndarray, free: Sequence[str], focal: Sequence[str] = ()
 ) -> float:
-    """Trimmed cost of keypoints (C, frames, 25, 3), each part judged with cameras that were adjusted to another part.
+    """Return the trimmed cost of keypoints (C, frames, 25, 3), each part judged with cameras adjusted to the other
+    part.
 
-    The parts share neither frames nor joints: what a detector gets wrong about one joint, in frame after frame, does
-    not prove a camera wrong. One frame alone is parted by its joints.
+    The parts share neither frames nor joints: a detector's systematic error on one joint must not count as proof that a
+    camera is wrong. A single frame is split by joints.
     """
     first, second = np.array_split(keypoints, 2, axis=1) if keypoints.shape[1] > 1 else (keypoints, keypoints)
     costs = []

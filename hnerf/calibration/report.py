@@ -1,4 +1,4 @@
-"""What was found out about the cameras: in numbers, in words, as a picture, and as the cameras to use."""
+"""Calibration report: numbers, reasons in words, plots, and the cameras to use."""
 
 import dataclasses
 import json
@@ -25,8 +25,9 @@ SEVERITY = ("ok", "refined", "suspect", "rejected")
 
 @dataclass(frozen=True)
 class CameraVerdict:
-    """status: one of SEVERITY; residuals in pixels, None with one camera only; frame_offset: as corrected, the frame of
-    this camera at the others' frame 0; timing: the offset as measured; reasons in words."""
+    """Verdict on one camera. status: one of SEVERITY; residuals in pixels, None with one camera; frame_offset: the
+    corrected offset, the frame of this camera at the others' frame 0; timing: the offset as measured; reasons: in
+    words."""
 
     status: str
     median_px: float | None
@@ -38,7 +39,7 @@ class CameraVerdict:
     reasons: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Return the verdict as plain types for JSON."""
         timing = self.timing
         offset = {
             "observable": not timing.reason,
@@ -51,10 +52,13 @@ class CameraVerdict:
 
 @dataclass(frozen=True)
 class CalibrationReport:
-    """cameras: as used from here on, test cameras too; verdicts: of the training cameras. before, after: None with one
-    training camera. held_out_px, outlines_px: what each correction that was tried cost on held-out frames and by the
-    person's outlines. notes: what concerns the whole rig, and the checks that could not be made. witnesses: None with
-    one training camera."""
+    """Result of the calibration check.
+
+    cameras: those to use from here on, test cameras included; verdicts: of the training cameras; before, after: None
+    with one training camera; held_out_px, outlines_px: cost of each correction that was tried, on held-out frames and
+    by the person's outlines; notes: about the whole rig, and checks that could not be made; evidence: None with one
+    training camera.
+    """
 
     cameras: dict[str, Camera]
     verdicts: dict[str, CameraVerdict]
@@ -68,12 +72,12 @@ class CalibrationReport:
 
     @property
     def verdict(self) -> str:
-        """The gravest status among the training cameras."""
+        """The most severe status among the training cameras."""
         return max((v.status for v in self.verdicts.values()), key=SEVERITY.index)
 
     def save(self, out: Path) -> None:
-        """Write `intri.yml`, `extri.yml` (EasyMocap, without rejected cameras), `report.json`, `cameras.png`, and where
-        there are witnesses, `witnesses.png`."""
+        """Write `intri.yml` and `extri.yml` (EasyMocap, without rejected cameras), `report.json`, `cameras.png`, and
+        `witnesses.png` if there is evidence."""
         out.mkdir(parents=True, exist_ok=True)
         rejected = {name for name, v in self.verdicts.items() if v.status == "rejected"}
         write_easymocap(out, [pinhole(camera) for name, camera in self.cameras.items() if name not in rejected])
@@ -105,7 +109,7 @@ class CalibrationReport:
         }
 
     def _evidence_to_dict(self) -> dict[str, Any]:
-        """What the witnesses say of the cameras as given and as used; nothing of one camera."""
+        """Return the evidence about the cameras as given and as used; empty with one camera."""
         if self.evidence is None or self.before is None or self.after is None:
             return {}
         given = self.evidence.capture.cameras
@@ -117,7 +121,7 @@ class CalibrationReport:
 
 
 def _finite(tree: Any) -> Any:
-    """The same without NaN and infinity, which JSON does not know: null."""
+    """Return the tree with NaN and infinity replaced by None, because JSON has neither."""
     if isinstance(tree, dict):
         return {key: _finite(value) for key, value in tree.items()}
     if isinstance(tree, list | tuple):
@@ -126,8 +130,8 @@ def _finite(tree: Any) -> Any:
 
 
 def load_cameras(out: Path, capture: Capture) -> Capture:
-    """The capture seen through those of its cameras that `save` wrote, and in step; rejected training cameras are
-    gone. The capture may have fewer cameras than were calibrated."""
+    """Return the capture with the cameras that `save` wrote, synchronised and without rejected training cameras. The
+    capture may have fewer cameras than were calibrated. Raises InputError if the camera files cannot be read."""
     intri, extri = (cv2.FileStorage(str(out / name), cv2.FILE_STORAGE_READ) for name in ("intri.yml", "extri.yml"))
     if not (intri.isOpened() and extri.isOpened()):
         raise InputError(f"{out}: intri.yml or extri.yml cannot be read; run the calibration stage again")

@@ -1,4 +1,4 @@
-"""The witnesses as a picture: for each camera what keypoints, outlines and matches look like under the cameras used."""
+"""Contact sheet of the evidence: keypoints, outlines and matches of each camera under the cameras used."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,15 +14,15 @@ from hnerf.calibration.evidence import NO_MATCHES, Evidence
 from hnerf.capture.keypoint_sets import FEET, LIMBS
 from hnerf.geometry.camera import Camera
 
-SCALE_PX = Normalize(0, 10)  # residuals, from green to red
+SCALE_PX = Normalize(0, 10)  # range of residuals, from green to red
 COLOURS = "RdYlGn_r"
-BRIGHTNESS = 0.55  # light left in the photographs, so that the marks stand out
+BRIGHTNESS = 0.55  # of the photographs, darkened so that the marks stand out
 MARGIN = 0.12  # of the person's size
 PANEL_INCHES = 4.2
 
 
 def draw_evidence(path: Path, evidence: Evidence, cameras: Sequence[Camera], found: Measure) -> None:
-    """Write the sheet as PNG, a row a camera; `found`: what `measure` says of these cameras."""
+    """Write the sheet as PNG, one row per camera. found: what `measure` returns for these cameras."""
     capture, outlines = evidence.capture, evidence.outlines
     instant = outlines.instants[len(outlines.instants) // 2] if outlines else len(capture.frames) // 2
     figure = Figure(figsize=(3 * PANEL_INCHES + 1, PANEL_INCHES * len(cameras) + 0.6), layout="constrained")
@@ -43,7 +43,8 @@ def draw_evidence(path: Path, evidence: Evidence, cameras: Sequence[Camera], fou
 
 
 def _draw_keypoints(axes: Axes, camera: Camera, detected: np.ndarray, points_m: np.ndarray) -> PathCollection:
-    """Detections (25, 3) as discs, coloured by how far the person's joints (25, 3), as lines, lie from them."""
+    """Draw detections (25, 3) as discs, coloured by their distance from the person's projected joints (25, 3), which
+    are drawn as lines."""
     uv, _ = camera.project(points_m)
     for a, b in LIMBS + FEET:
         axes.plot(*uv[[a, b]].T, color="white", linewidth=1)
@@ -52,7 +53,7 @@ def _draw_keypoints(axes: Axes, camera: Camera, detected: np.ndarray, points_m: 
 
 
 def _draw_outline(axes: Axes, cameras: Sequence[Camera], camera: Camera, evidence: Evidence) -> None:
-    """Points of the outline, coloured by how far their rays miss the person as the others see it."""
+    """Draw points of the outline, coloured by how far their rays miss the visual hull of the other cameras."""
     axes.set_title(f"{camera.name}: no outline", fontsize=10)
     outlines = evidence.outlines
     if outlines is None or camera.name not in outlines.by_camera:
@@ -70,7 +71,7 @@ def _draw_outline(axes: Axes, cameras: Sequence[Camera], camera: Camera, evidenc
 
 
 def _draw_matches(axes: Axes, cameras: Sequence[Camera], camera: Camera, evidence: Evidence) -> None:
-    """Matches with other cameras, coloured by their distance from the epipolar constraint."""
+    """Draw matches with other cameras, coloured by their distance from the epipolar constraint."""
     message = []
     for pair, residuals_px in evidence.matches.residuals_px(cameras).items():
         if camera.name in pair:
@@ -88,7 +89,7 @@ def _scatter(axes: Axes, points_px: np.ndarray, residuals_px: np.ndarray, size: 
 
 
 def _zoom(axes: Axes, points_px: np.ndarray) -> None:
-    """A square window around the person, (n, 2)."""
+    """Set a square window around the person's points (n, 2)."""
     if len(points_px) == 0:
         return
     low, high = points_px.min(0), points_px.max(0)

@@ -1,4 +1,4 @@
-"""Where the recorded size is not the calibrated one: what an encoder may have done to the picture."""
+"""Image sizes: what an encoder may have done where the recorded size is not the calibrated one."""
 
 import dataclasses
 from collections.abc import Callable
@@ -12,7 +12,7 @@ SizeChange = Callable[[Camera, tuple[int, int], tuple[int, int]], Camera]
 
 
 def _crop_or_pad(share: float) -> SizeChange:
-    """Cropped or padded, this share of the difference on the left and at the top."""
+    """Return the change of cropping or padding, with this share of the size difference on the left and at the top."""
 
     def change(camera: Camera, calibrated_px: tuple[int, int], recorded_px: tuple[int, int]) -> Camera:
         per_recorded = camera.width_px / recorded_px[0]
@@ -45,13 +45,14 @@ SIZE_CHANGES: dict[
 
 
 def size_unexplained(capture: Capture, name: str) -> bool:
-    """Whether a camera recorded another size than it was calibrated at, and no black bars say what was done."""
+    """Return whether a camera recorded another size than it was calibrated at, and no black bars show what was done."""
     other = capture.calibrated_sizes_px[name] != capture.recorded_sizes_px[name]
     return other and name not in capture.picture_areas_px
 
 
 def size_reasons(capture: Capture, name: str) -> list[str]:
-    """What is known of a recorded size other than the calibrated one, in words; none where they are the same."""
+    """Return, in words, what is known about a recorded size other than the calibrated one; empty if they are the
+    same."""
     calibrated, recorded = capture.calibrated_sizes_px[name], capture.recorded_sizes_px[name]
     if calibrated == recorded:
         return []

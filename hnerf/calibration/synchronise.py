@@ -1,9 +1,10 @@
-"""Were the cameras in step? The offset in time of each camera against the others, to a fraction of a frame.
+"""Synchronisation: the time offset of each camera against the others, to a fraction of a frame.
 
-The other cameras place the keypoints in space; the camera's own keypoints of earlier and later frames are held against
-them. What a small turn or move of the camera would explain is taken out first, so that a stale pose does not pass for
-an offset. The mean square distance over whole-frame shifts is a parabola near its lowest point: its vertex is the
-offset, its bend says how well motion shows it, and leaving out stretches of frames says how certain it is.
+The other cameras triangulate the keypoints; the camera's own keypoints of earlier and later frames are compared with
+their projections. What a small rotation or translation of the camera would explain is removed first, so that a stale
+pose is not taken for an offset. The mean square distance over whole-frame shifts is a parabola near its minimum: its
+vertex is the offset, its curvature says how well the motion determines it, and a jackknife over blocks of frames gives
+the standard error.
 """
 
 import logging
@@ -20,18 +21,18 @@ from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import triangulate
 
-MAX_STEPS = 10  # shifts that are looked at, either way, in steps between the capture's frames
-MIN_FRAMES = 8  # that a shifted camera must share with the others, at the best shift and on either side of it
-JACKKNIFE_BLOCKS = 12  # of frames, each left out once
+MAX_STEPS = 10  # greatest shift tried either way, in steps between the capture's frames
+MIN_FRAMES = 8  # that a shifted camera must share with the others, at the best shift and its two neighbours
+JACKKNIFE_BLOCKS = 12  # of consecutive frames, each left out once
 SUSPECTED_SIGMAS, CERTAIN_SIGMAS = (
     2.0,
     5.0,
-)  # standard errors that an offset must exceed to be suspected, and to be believed
-MIN_OFFSET_FRAMES = 0.1  # frames: less is within what the parabola can tell
-MAX_DISTANCE_FRAMES = 1.2  # recorded frames between an instant and the picture that shows it
-MAX_ERROR_STEPS = 0.5  # standard error up to which an offset says something
-MIN_CURVATURE_SIGMAS = 2.0  # standard errors by which one step must raise the distances
-IRLS_ROUNDS = 5  # rounds of iteratively re-weighted least squares
+)  # standard errors beyond which an offset counts
+MIN_OFFSET_FRAMES = 0.1  # smaller offsets are below the resolution of the parabola fit
+MAX_DISTANCE_FRAMES = 1.2  # between an instant and the recorded image that shows it
+MAX_ERROR_STEPS = 0.5  # standard error; beyond it an offset is not observable
+MIN_CURVATURE_SIGMAS = 2.0  # standard errors by which the curvature must exceed 0
+IRLS_ROUNDS = 5  # of iteratively re-weighted least squares
 OUTLIER_SCALES = 3.0  # times the scale of the residuals
 MIN_SCALE_PX = 0.5
 
@@ -40,9 +41,9 @@ log = logging.getLogger("hnerf.calibration")
 
 @dataclass(frozen=True)
 class Timing:
-    """A camera's offset as measured: it recorded the others' frame f in its own frame f + offset_frames.
+    """A camera's measured time offset: it recorded the others' frame f in its own frame f + offset_frames.
 
-    error_frames: standard error; both NaN where it was not measured; by_half: from either half of the frames alone;
+    error_frames: standard error; both are NaN if not measured. half_offsets: from each half of the frames alone.
     reason: why the offset is not observable, else empty.
     """
 
@@ -53,7 +54,7 @@ class Timing:
 
     @staticmethod
     def unknown(reason: str) -> "Timing":
-        """Not measured at all."""
+        """Return a timing that was not measured."""
         return Timing(np.nan, np.nan, (0.0, 0.0), reason)
 
     @property
@@ -63,8 +64,8 @@ class Timing:
 
     @property
     def certain(self) -> bool:
-        """Whether the camera is out of step: far beyond the error, and each half of the frames gains by the other's
-        offset (a parabola is lower at x than at 0 if x lies between 0 and twice its vertex)."""
+        """Whether the camera is out of step: the offset is far beyond its error, and each half of the frames gains by
+        the other half's offset (a parabola is lower at x than at 0 if x lies between 0 and twice its vertex)."""
         a, b = self.half_offsets
         agree = a * b > 0 and abs(a) < 2 * abs(b) < 4 * abs(a)
         far = abs(self.offset_frames) > max(MIN_OFFSET_FRAMES, CERTAIN_SIGMAS * self.error_frames)
@@ -73,8 +74,8 @@ class Timing:
 
 @dataclass(frozen=True)
 class _View:
-    """One camera's keypoints (F, 25, 3) and, where the other cameras place them: predicted_px (F, 25, 2), NaN where
-    they do not, and their derivatives by the camera's pose (F, 25, 2, 6)."""
+    """One camera's keypoints (F, 25, 3) and the other cameras' prediction of them: predicted_px (F, 25, 2), NaN where
+    they cannot triangulate, and its derivative by the camera's pose, pose_jacobian (F, 25, 2, 6)."""
 
     frames: Sequence[int]
     keypoints: np.ndarray
@@ -82,7 +83,8 @@ class _View:
     pose_jacobian: np.ndarray
 
     def residuals(self, step: int) -> tuple[np.ndarray, np.ndarray]:
-        """Own keypoints of frames so many steps later against the prediction: (F, 25, 2) px, weights (F, 25)."""
+        """Return the camera's keypoints `step` frames later minus the prediction, (F, 25, 2) px, and their weights (F,
+        25)."""
         row, later_by = {frame: i for i, frame in enumerate(self.frames)}, step * usual_step(self.frames)
         later = [row.get(frame + later_by, -1) for frame in self.frames]
         moved = self.keypoints[later] * (np.array(later) >= 0)[:, None, None]
@@ -92,20 +94,20 @@ class _View:
 
 @dataclass(frozen=True)
 class _Parabola:
-    """Weighted squares of distances (3, F) in px^2 at three neighbouring shifts, in steps, and their weights (F,)."""
+    """Weighted square distances (3, F) in px^2 at three neighbouring shifts, in steps, and their weights (F,)."""
 
     middle: int
     squares: np.ndarray
     weights: np.ndarray
 
     def vertex(self, frames: np.ndarray) -> float:
-        """Where it is lowest, in steps, from these frames alone; no further than the outer shifts."""
+        """Return the shift of the minimum in steps, from these frames alone, clamped to the outer shifts."""
         before, at, after = self.squares[:, frames].sum(1)
         curvature = before - 2 * at + after
         return self.middle + (float(np.clip((before - after) / (2 * curvature), -1, 1)) if curvature > 0 else 0.0)
 
     def curvature_px2(self, frames: np.ndarray) -> float:
-        """By how much one step raises the mean square distance, from these frames alone."""
+        """Return by how much a shift of one step raises the mean square distance, from these frames alone."""
         before, at, after = self.squares[:, frames].sum(1)
         return float((before - 2 * at + after) / 2 / self.weights[frames].sum().clip(1e-9))
 
@@ -118,10 +120,11 @@ class _Parabola:
 def synchronise_capture(
     capture: Capture, cameras: Sequence[Camera], keypoints: np.ndarray, settings: CalibrationSettings
 ) -> tuple[Capture, dict[str, float], list[str]]:
-    """The capture with the offsets that `synchronise` found (the very same without any), costs tried, and notes.
+    """Return the capture with the offsets that `synchronise` found (the same object if none), the costs tried, and
+    notes.
 
-    Raises InputError where more than half of the frames would be lost or shown by pictures more than a frame away,
-    since what was ingested lacks the moments that the offsets ask for; it says what to cut.
+    Raises InputError, saying what to cut, if more than half of the frames would be lost or would show images more than
+    a frame away: the ingested images then lack the instants that the offsets ask for.
     """
     offsets, held_out_px, notes = synchronise(cameras, keypoints, capture.frames, settings)
     if not offsets:
@@ -135,7 +138,8 @@ def synchronise_capture(
         raise InputError(f"{capture.name}: {_cut_advice(capture.train_cameras, offsets)}")
     if synchronised.frame_step != capture.frame_step:
         what = (
-            f"frames between were not taken: pictures of camera {farthest} are {off_frames[farthest]:+.2f} frames off"
+            f"frames in between were not ingested: images of camera {farthest} are "
+            f"{off_frames[farthest]:+.2f} frames off"
         )
         notes = [*notes, what]
     if lost:
@@ -157,10 +161,10 @@ def _cut_advice(cameras: Sequence[str], offsets: dict[str, float]) -> str:
 def synchronise(
     cameras: Sequence[Camera], keypoints: np.ndarray, frames: Sequence[int], settings: CalibrationSettings
 ) -> tuple[dict[str, float], dict[str, float], list[str]]:
-    """Offsets in frames of the cameras out of step, held-out costs of everything tried, and notes.
+    """Return the offsets in frames of the cameras out of step, the held-out costs of everything tried, and notes.
 
-    One camera after the other: the one whose shift lets all agree best; taken only if its offset is certain and
-    held-out frames gain. keypoints (C, frames, 25, 3).
+    Cameras are taken one after the other, first the one whose shift improves agreement most; a shift is accepted only
+    if its offset is certain and held-out frames improve. keypoints (C, frames, 25, 3).
     """
     offsets: dict[str, float] = {}
     held_out_px: dict[str, float] = {}
@@ -195,14 +199,16 @@ def synchronise(
 
 
 def measure_timing(cameras: Sequence[Camera], keypoints: np.ndarray, frames: Sequence[int]) -> dict[str, Timing]:
-    """Each camera's offset against the others. keypoints (C, frames, 25, 3); frames as recorded, in order."""
+    """Measure each camera's time offset against the others. keypoints (C, frames, 25, 3); frames as recorded, in
+    order."""
     if len(cameras) < 3:
         return {camera.name: Timing.unknown("it takes two other cameras to place keypoints") for camera in cameras}
     return {camera.name: _timing(_view(cameras, keypoints, i, frames)) for i, camera in enumerate(cameras)}
 
 
 def _relative_to_least_shifted(offsets: dict[str, float], cameras: int) -> dict[str, float]:
-    """Only differences in time can be known: where every camera was shifted, the least shifted one keeps its time."""
+    """Return the offsets relative to the least shifted camera if every camera was shifted, because only time
+    differences are observable; drop negligible ones."""
     common = min(offsets.values(), key=abs) if len(offsets) == cameras else 0.0
     return {name: offset - common for name, offset in offsets.items() if abs(offset - common) >= MIN_OFFSET_FRAMES}
 
@@ -210,21 +216,21 @@ def _relative_to_least_shifted(offsets: dict[str, float], cameras: int) -> dict[
 def _shift_keypoints(
     cameras: Sequence[Camera], keypoints: np.ndarray, frames: Sequence[int], offsets: dict[str, float]
 ) -> np.ndarray:
-    """Keypoints (C, frames, 25, 3) as these offsets would have them."""
+    """Return keypoints (C, frames, 25, 3) resampled at these time offsets."""
     instants = [np.asarray(frames) + offsets.get(camera.name, 0.0) for camera in cameras]
     return np.stack([resample(k[:, None], frames, t)[:, 0] for k, t in zip(keypoints, instants, strict=True)])
 
 
 def _halves_cost_px(cameras: Sequence[Camera], keypoints: Sequence[np.ndarray]) -> float:
-    """Mean of the trimmed costs of the first half of the frames of the first keypoints (C, frames, 25, 3), and of the
-    second half of the second."""
+    """Return the mean of two trimmed costs: of the first keypoints (C, frames, 25, 3) on the first half of the frames,
+    and of the second on the second half."""
     halves = [np.array_split(k, 2, axis=1)[half] for half, k in enumerate(keypoints)]
     return float(np.mean([trimmed_cost_px(cameras, half.reshape(len(cameras), -1, 3)) for half in halves]))
 
 
 def _timing(view: _View) -> Timing:
-    """The offset of one camera; its error by the jackknife over stretches of frames (Efron and Tibshirani 1993,
-    chapter 11)."""
+    """Return the time offset of one camera; its error is by the jackknife over blocks of frames (Efron and Tibshirani
+    1993, chapter 11)."""
     every = np.arange(len(view.frames))
     halves = np.array_split(every, 2)
     costs = _cost_by_step(view, [every, *halves])
@@ -243,8 +249,8 @@ def _timing(view: _View) -> Timing:
     reason = ""
     if curvature_px2 < MIN_CURVATURE_SIGMAS * curvature_error_px2 or error > MAX_ERROR_STEPS:
         reason = (
-            f"too little motion: one frame moves keypoints by {np.sqrt(max(curvature_px2, 0)) / step:.2f} px more than a "
-            f"turn or move of the camera would, against {parabola.noise_px:.1f} px of noise"
+            f"too little motion: one frame moves keypoints by {np.sqrt(max(curvature_px2, 0)) / step:.2f} px more than "
+            f"a turn or move of the camera would, against {parabola.noise_px:.1f} px of noise"
         )
     elif max(abs(half - lowest) for half in lowest_of_half) > 1:
         reason = f"the halves of the frames disagree: {' and '.join(f'{step * half:+d}' for half in lowest_of_half)}"
@@ -271,8 +277,8 @@ def _view(cameras: Sequence[Camera], keypoints: np.ndarray, index: int, frames: 
 
 
 def _pose_jacobian(camera: Camera, points_m: np.ndarray) -> np.ndarray:
-    """Derivatives of pixels by a small turn and a small move in the camera's axes, (K, 2, 6), for points (K, 3):
-    x' = x + w cross x + t, and the pinhole's (Hartley and Zisserman, appendix 6)."""
+    """Return the derivatives (K, 2, 6) of the pixels of points (K, 3) by a small rotation and translation in the camera
+    frame: x' = x + w cross x + t, and the pinhole projection (Hartley and Zisserman, appendix 6)."""
     x, y, z = np.moveaxis(points_m @ camera.R.T + camera.t_m, -1, 0)
     zero = np.zeros_like(z)
     by_move = np.stack([np.stack([1 / z, zero, -x / z**2], -1), np.stack([zero, 1 / z, -y / z**2], -1)], -2)
@@ -282,7 +288,8 @@ def _pose_jacobian(camera: Camera, points_m: np.ndarray) -> np.ndarray:
 
 
 def _cost_by_step(view: _View, parts: Sequence[np.ndarray]) -> dict[int, list[float]]:
-    """Trimmed distances in px, in each part of the frames, at every shift that leaves enough to compare."""
+    """Return trimmed distances in px for each part of the frames, at every shift that leaves enough frames to
+    compare."""
     enough, costs = max(MIN_FRAMES, len(view.frames) // 2), {}
     for step in range(-MAX_STEPS, MAX_STEPS + 1):
         residuals, weights = view.residuals(step)
@@ -296,9 +303,10 @@ def _cost_by_step(view: _View, parts: Sequence[np.ndarray]) -> dict[int, list[fl
 
 
 def _parabola(view: _View, middle: int) -> _Parabola:
-    """The same observations at three shifts, outliers judged at the middle one.
+    """Return the distances of the same observations at three shifts, with outliers determined at the middle one.
 
-    What moves far in a step weighs less, so that a jump (a cut in the recording) cannot outweigh the rest.
+    Keypoints that move far within a step get less weight, so that a jump (a cut in the recording) cannot outweigh the
+    rest.
     """
     three = [view.residuals(middle + step) for step in (-1, 0, 1)]
     shared = np.all([weights > 0 for _, weights in three], axis=0)
@@ -313,7 +321,7 @@ def _parabola(view: _View, middle: int) -> _Parabola:
 
 
 def _robust_weights(residuals: np.ndarray, pose_jacobian: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Weights (F, 25) that fade (Cauchy) with the distance that no turn or move of the camera explains."""
+    """Return Cauchy weights (F, 25) of the residuals that no rotation or translation of the camera explains."""
     robust = weights
     for _ in range(IRLS_ROUNDS):
         distances = np.linalg.norm(_remove_pose_effect(residuals, pose_jacobian, robust), axis=-1)
@@ -323,7 +331,8 @@ def _robust_weights(residuals: np.ndarray, pose_jacobian: np.ndarray, weights: n
 
 
 def _remove_pose_effect(residuals: np.ndarray, pose_jacobian: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Residuals (F, 25, 2) less what the camera's pose explains of them (weighted least squares)."""
+    """Return residuals (F, 25, 2) without the part that a change of the camera's pose explains (weighted least
+    squares)."""
     root = np.sqrt(weights)[..., None]
     A, b = (root[..., None] * pose_jacobian).reshape(-1, 6), (root * residuals).reshape(-1)
     return residuals - pose_jacobian @ np.linalg.lstsq(A.T @ A, A.T @ b, rcond=None)[0]

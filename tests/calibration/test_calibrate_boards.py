@@ -1,4 +1,4 @@
-"""Cameras from a board: known cameras around a board on a known path, and the real footage."""
+"""Board calibration: known cameras around a board on a known path, and real footage."""
 
 import dataclasses
 from pathlib import Path
@@ -36,14 +36,15 @@ NOISE_PX = 0.1
 
 
 def rig() -> list[Camera]:
-    """Three cameras 1.5 m from the board's path, 30 degrees apart, in a world that is none of theirs."""
+    """Return three cameras 1.5 m from the board's path, 30 degrees apart, none of them at the world's origin."""
     target = np.array([0, 0, 1.0])
     centres = [[1.5 * np.sin(a), -1.5 * np.cos(a), 1.2] for a in np.deg2rad([-30, 0, 30])]
     return [look_at(name, np.array(c), target) for name, c in zip("abc", centres, strict=True)]
 
 
 def board_at(time: float) -> tuple[np.ndarray, np.ndarray]:
-    """World from board at a time in frames: a board that faces the cameras, swings, and goes along a circle."""
+    """Return the world-from-board pose at a time in frames: the board faces the cameras, swings, and moves along a
+    circle."""
     facing = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x right, y down, z away from the cameras
     swing = cv2.Rodrigues(np.array([0.5 * np.sin(0.3 * time), 0.4 * np.cos(0.2 * time), 0.1 * time]))[0]
     t_m = np.array([0.25 * np.cos(0.25 * time), 0.2 * np.sin(0.4 * time), 1 + 0.25 * np.sin(0.25 * time)])
@@ -51,7 +52,7 @@ def board_at(time: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def seen(cameras: list[Camera], lags: dict[str, float]) -> np.ndarray:
-    """(C, F, N, 2) with noise; a camera with a lag pictures every moment that much later."""
+    """Return corners (C, F, N, 2) with noise; a camera with a lag takes every image that much later."""
     corners_px = np.zeros((len(cameras), FRAMES, len(BOARD.corners_m), 2))
     for i, camera in enumerate(cameras):
         for f in range(FRAMES):
@@ -89,7 +90,7 @@ def test_cameras_and_their_lag_are_found() -> None:
 
 
 def test_offsets_count_frames_of_the_footage() -> None:
-    """Every second frame: what lies 0.4 of the pictures' distance apart is 0.8 frames."""
+    """With every second frame, a lag of 0.4 of the distance between images is 0.8 frames."""
     cameras = rig()
     fit = solve_rig(cameras, BOARD.corners_m, planar_corners(BOARD.corners_m, seen(cameras, {"b": LAG})), frame_step=2)
     lag = np.nanmedian(fit.offsets_frames[1] - fit.offsets_frames[0])
@@ -148,7 +149,7 @@ def test_board_evidence_names_the_camera_that_moved(tmp_path: Path) -> None:
 
 
 def test_visible_means_facing_inside_and_found_by_another() -> None:
-    """The board shows its back in frame 1, nobody but c finds it in frame 2, and it is far above all in frame 3."""
+    """The board shows its back in frame 1, only c finds it in frame 2, and it is far above every image in frame 3."""
     cameras = rig()
     R, t_m = board_at(0)
     boards = Poses(np.stack([R, R @ np.diag([-1.0, 1, -1]), R, R]), np.stack([t_m, t_m, t_m, t_m + np.eye(3)[2] * 5]))
@@ -162,7 +163,8 @@ def test_visible_means_facing_inside_and_found_by_another() -> None:
 
 
 def close_up(tilt: float) -> np.ndarray:
-    """(20, N, 2) corners that a lens of 900 px and k1 = -0.2 sees, the board turned by up to `tilt` about each axis."""
+    """Return corners (20, N, 2) seen by a lens of 900 px and k1 = -0.2, the board turned by up to `tilt` about each
+    axis."""
     K, distortion = np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0])
     rng = np.random.default_rng(1)
     poses = [(rng.uniform(-tilt, tilt, 3), rng.uniform([-0.3, -0.2, 0.6], [0.1, 0.05, 0.6])) for _ in range(20)]
@@ -171,7 +173,7 @@ def close_up(tilt: float) -> np.ndarray:
 
 
 def test_a_lens_is_believed_only_if_the_pictures_fix_it() -> None:
-    """Boards that all face the camera say nothing about the focal length, and nine are too few."""
+    """Boards that all face the camera say nothing about the focal length, and nine images are too few."""
     tilted, facing, few = (
         estimate_lens("a", BOARD.corners_m, corners_px, (1280, 720))
         for corners_px in (close_up(0.7), close_up(0.0), close_up(0.7)[:9])
@@ -226,7 +228,7 @@ def test_undistortion_of_a_wide_lens_comes_back_in_the_corners() -> None:
 
 
 def test_the_floor_is_the_board_that_lies_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the last frame the board lies flat under cameras that look down on it: their heights are what z says."""
+    """In the last frame the board lies flat under cameras that look down on it, so z must be their height."""
     cameras = rig()
     corners_px = seen(cameras, {})
     flat = np.diag([1.0, -1, -1]), np.array([-0.1, 0.1, 0.8])  # z down, at the height of 0.8 m

@@ -1,4 +1,4 @@
-"""All three witnesses on a rendered capture whose calibration was spoilt."""
+"""All three kinds of evidence on a rendered capture with a spoilt calibration."""
 
 import dataclasses
 import json

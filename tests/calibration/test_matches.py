@@ -11,14 +11,14 @@ from tests.shared_data import shared_capture
 
 
 def pair() -> tuple[Camera, Camera]:
-    """Two cameras of 1000 px focal length, 30 degrees apart."""
+    """Return two cameras of 1000 px focal length, 30 degrees apart."""
     target_m = np.array([0, 0, 1.0])
     centre_m = 4 * np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0]) + target_m
     return look_at("a", np.array([4.0, 0, 1]), target_m), look_at("b", centre_m, target_m)
 
 
 def seen(count: int = 200) -> np.ndarray:
-    """(n, 2, 2): points of a cube of 2 m in both cameras."""
+    """Return points (n, 2, 2) of a cube of 2 m in both cameras."""
     points_m = np.random.default_rng(0).uniform([-1, -1, 0], [1, 1, 2], (count, 3))
     return np.stack([camera.project(points_m)[0] for camera in pair()], 1)
 

@@ -13,7 +13,7 @@ from tests.calibration.synthetic import detections, ring, write_capture
 
 @pytest.fixture
 def narrow(tmp_path: Path) -> Capture:
-    """c1 was calibrated at 1080 x 1000 and recorded at 1000 x 1000."""
+    """Return a capture whose camera c1 was calibrated at 1080 x 1000 and recorded at 1000 x 1000."""
     cameras = ring(4)
     capture = write_capture(tmp_path, cameras, detections(cameras, 1))
     return dataclasses.replace(capture, calibrated_sizes_px=capture.calibrated_sizes_px | {"c1": (1080, 1000)})

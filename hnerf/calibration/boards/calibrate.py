@@ -1,4 +1,4 @@
-"""Cameras from footage of a calibration board, and what such footage says about cameras that are given."""
+"""Calibration from footage of a board, and the evidence of such footage about given cameras."""
 
 import dataclasses
 import json
@@ -32,7 +32,7 @@ from hnerf.capture.lens import Lens
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
-MAX_TILT_DEG = 75.0  # beyond, a board is too slanted to be read
+MAX_TILT_DEG = 75.0  # a board tilted further is too slanted to be detected
 CALIBRATION_FILES = ("intri.yml", "camera_array.toml", "calibration.toml", "sparse", "calibration/Calib*.toml")
 
 log = logging.getLogger("hnerf.calibration")
@@ -40,8 +40,8 @@ log = logging.getLogger("hnerf.calibration")
 
 @dataclass(frozen=True)
 class BoardCalibration:
-    """lenses: as recorded, with distortion; intrinsics: where each came from, in words; corners_m (N, 3); corners_px
-    (C, F, N, 2): all that was found, undistorted, of which `fit` has the used ones."""
+    """Result of a board calibration. lenses: with distortion, as recorded; intrinsics: their source, in words;
+    corners_m (N, 3); corners_px (C, F, N, 2): all detected corners, undistorted; `fit` holds those used."""
 
     lenses: dict[str, Lens]
     intrinsics: dict[str, str]
@@ -50,7 +50,7 @@ class BoardCalibration:
     fit: BoardFit
 
     def report(self) -> dict[str, Any]:
-        """What `report.json` holds. Residuals in undistorted pixels, offsets in frames of the footage."""
+        """Return the content of `report.json`. Residuals in undistorted pixels, offsets in frames of the footage."""
         visible, found = visible_and_found(self.fit, self.corners_m)
         cameras = {
             camera.name: _figures(self.fit, i)
@@ -73,11 +73,11 @@ class BoardCalibration:
 
 
 def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> BoardCalibration:
-    """Cameras from the board footage in a folder's `calibration/`.
+    """Calibrate the cameras from the board footage in a folder's `calibration/`.
 
     Intrinsics come from calibration/intrinsic/, else from the folder's calibration files, else from
     calibration/extrinsic/ itself. The world is the first camera, or the board as it lies in frame `ground_frame` (Z up,
-    origin at its top left corner). InputError where the footage does not hold what is needed.
+    origin at its top left corner). Raises InputError if the footage lacks what is needed.
     """
     footage = read_board_footage(folder, "extrinsic", ground_frame)
     if footage is None:
@@ -99,10 +99,10 @@ def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> Boar
 
 
 def board_evidence(capture: Capture) -> dict[str, Any] | None:
-    """What board footage says about a capture's cameras; None where the recording has none.
+    """Return what board footage says about a capture's cameras; None if the recording has none.
 
     "cameras": per camera the corners' distances (px) from the board that all cameras agree on, with the cameras as
-    given, and as `footage_rms_px` with those that the footage itself gives. "pairs": `compare_pairs` of the two.
+    given, and as `footage_rms_px` with those estimated from the footage itself. "pairs": `compare_pairs` of the two.
     "unlinked_cameras": those that never see the board together with the others, about which nothing is known.
     """
     stored = load_board_corners(capture.root)
@@ -130,10 +130,11 @@ def board_evidence(capture: Capture) -> dict[str, Any] | None:
 
 
 def visible_and_found(fit: BoardFit, corners_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(C, F) bool twice: where a camera must be able to see the board, and where it was found, whole enough both times.
+    """Return two masks (C, F) bool: where a camera must see the board, and where the board was found with enough
+    corners to fix its pose.
 
-    Visible: another camera found it, and placed as the fit has it, at least MIN_CORNERS corners fall into this camera's
-    picture and the board faces it within MAX_TILT_DEG. Hands and heads in the way are not known: such pictures count.
+    Visible: another camera found it and, placed as the fit has it, at least MIN_CORNERS corners fall into this camera's
+    image and the board faces it within MAX_TILT_DEG. Occlusion is not known, so occluded images count as visible.
     """
     found = np.isfinite(fit.residuals_px[..., 0]).sum(-1) >= MIN_CORNERS
     corners = np.einsum("fij,nj->fni", fit.boards.R, corners_m) + fit.boards.t_m[:, None]
@@ -149,7 +150,8 @@ def visible_and_found(fit: BoardFit, corners_m: np.ndarray) -> tuple[np.ndarray,
 
 
 def _check_board_found(footage: BoardFootage) -> None:
-    """InputError where no camera sees enough of the board to be linked: it is hardly the board that is described."""
+    """Raise InputError if no camera sees enough of the board to be linked: the footage probably shows another board
+    than described."""
     corners_px = np.stack(list(footage.corners_px.values()))
     found = fixes_pose(footage.board.corners_m, np.isfinite(corners_px[..., 0]))
     if found.sum(1).max() < MIN_SHARED:
@@ -160,7 +162,7 @@ def _check_board_found(footage: BoardFootage) -> None:
 
 
 def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], dict[str, str]]:
-    """Of every camera in the extrinsic footage, and where they come from in words."""
+    """Return the lens of every camera in the extrinsic footage, and where it comes from, in words."""
     close = read_board_footage(folder, "intrinsic")
     given = recognise(folder).lenses() if any(any(folder.glob(name)) for name in CALIBRATION_FILES) else {}
     lenses, words = {}, {}
@@ -194,7 +196,8 @@ def _compared(found: LensEstimate, given: Lens) -> str:
 
 
 def _on_ground(fit: BoardFit, footage: BoardFootage, ground_frame: int) -> BoardFit:
-    """The rig in the world whose origin and floor are the board in one frame. The board's z is down: turned about x."""
+    """Return the rig in the world whose origin and floor are the board in one frame. The board's z points down, so it
+    is turned about x."""
     index = footage.frames.index(ground_frame) if ground_frame in footage.frames else -1
     if index < 0 or not np.isfinite(fit.residuals_px[:, index]).any():
         raise InputError(f"{footage.path}: no board in frame {ground_frame}; name a frame in which it lies flat")
@@ -206,7 +209,7 @@ def _on_ground(fit: BoardFit, footage: BoardFootage, ground_frame: int) -> Board
 
 
 def _figures(fit: BoardFit, camera: int) -> dict[str, Any]:
-    """What one camera's corners say."""
+    """Return the statistics of one camera's corners."""
     error_px, offsets = fit.error_px(camera), fit.offsets_frames[camera]
     offsets = offsets[np.isfinite(offsets)]
     at = np.quantile(offsets, [0.05, 0.5, 0.95]).tolist() if len(offsets) else None
