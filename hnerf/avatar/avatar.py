@@ -32,7 +32,7 @@ class Avatar(Protocol):
         """The same person without what was learned of single frames only, as it looks in a pose that no frame has."""
         ...
 
-    def on_body(self, body: BodyFit) -> "Avatar":
+    def with_body(self, body: BodyFit) -> "Avatar":
         """The same person with another body under the clothes, other poses, or both; the rig keeps its topology."""
         ...
 

@@ -12,8 +12,11 @@ from torch import Tensor, nn
 from hnerf.errors import InputError
 from hnerf.fields.encoding import FeatureGrids
 
-STEP, STEPS = ".step", ".steps"  # what becomes of a grid: a unit, and how many of it each feature is, a node's together
-MOST = 127  # of them
+STEP_SUFFIX, STEPS_SUFFIX = (
+    ".step",
+    ".steps",
+)  # what becomes of a grid: a unit, and how many of it each feature is, a node's together
+MAX_STEPS = 127  # of them
 
 
 def write_field(field: nn.Module, path: Path) -> None:
@@ -21,30 +24,30 @@ def write_field(field: nn.Module, path: Path) -> None:
     tensors = {name: value.detach().cpu().contiguous() for name, value in field.state_dict().items()}
     for name in _grids(field):
         features = tensors.pop(name)[0].movedim(0, -1)
-        step = (features.abs().max() / MOST).clamp(min=torch.finfo(features.dtype).tiny)
+        step = (features.abs().max() / MAX_STEPS).clamp(min=torch.finfo(features.dtype).tiny)
         steps = (features / step).round().to(torch.int8).contiguous()
         packed = bytearray(zlib.compress(steps.numpy().tobytes()))
-        tensors |= {name + STEP: step, name + STEPS: torch.frombuffer(packed, dtype=torch.uint8)}
+        tensors |= {name + STEP_SUFFIX: step, name + STEPS_SUFFIX: torch.frombuffer(packed, dtype=torch.uint8)}
     path.write_bytes(save(tensors))  # as its own writer tells a full disk by no OSError
 
 
-def fill_field(field: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
+def load_field(field: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
     """Give the field what tensors read from `path` say; InputError if another version of it was written there."""
     tensors = dict(tensors)
     try:
         for name in _grids(field):
             _, channels, *nodes = field.get_parameter(name).shape
-            packed, step = (tensors.pop(name + part) for part in (STEPS, STEP))
+            packed, step = (tensors.pop(name + part) for part in (STEPS_SUFFIX, STEP_SUFFIX))
             room = channels * math.prod(nodes) + 1  # whatever the file pretends to hold
             steps = zlib.decompressobj().decompress(packed.cpu().numpy().tobytes(), room)
             features = torch.frombuffer(bytearray(steps), dtype=torch.int8).view(*nodes, channels).movedim(-1, 0)
             tensors[name] = features[None].to(step) * step
         field.load_state_dict(tensors)
     except (KeyError, RuntimeError, ValueError, zlib.error):
-        raise other_version(path) from None
+        raise version_error(path) from None
 
 
-def other_version(path: Path) -> InputError:
+def version_error(path: Path) -> InputError:
     """The error of a file that another version of the library wrote."""
     return InputError(f"{path}: of another version; train the subject again")
 

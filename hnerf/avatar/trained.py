@@ -13,7 +13,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from hnerf.avatar.avatar import Rendering
-from hnerf.avatar.model_file import fill_field, other_version
+from hnerf.avatar.model_file import load_field, version_error
 from hnerf.baselines.idr import IdrField
 from hnerf.baselines.nerf import NerfField
 from hnerf.baselines.nerfies import NerfiesField
@@ -30,9 +30,9 @@ from hnerf.geometry.camera import Camera
 
 Gains = dict[str, tuple[float, float, float]]
 
-RAYS_AT_ONCE = 16384
-SAMPLES_AT_ONCE = 1 << 20  # coarse ones, of fields that take many on a ray: a network keeps some KiB for each
-POINTS_AT_ONCE = 1 << 17
+RAYS_PER_BATCH = 16384
+SAMPLES_PER_BATCH = 1 << 20  # coarse ones, of fields that take many on a ray: a network keeps some KiB for each
+POINTS_PER_BATCH = 1 << 17
 
 
 def build_field(settings: TrainingSettings, body: BodyFit, static: bool) -> Field:
@@ -69,11 +69,11 @@ class TrainedAvatar:
         bodies, conditions = self._pose(theta, root)
         region: Any = self.field.region(bodies, conditions)
         device = bodies.vertices_m.device
-        y, x = np.nonzero(self.field.reached(camera, bodies.vertices_m[0].cpu().numpy()))
+        y, x = np.nonzero(self.field.visible_pixels(camera, bodies.vertices_m[0].cpu().numpy()))
         origins, directions = camera.rays(np.stack([x, y], 1).astype(np.float64))
         flat = torch.zeros(camera.height_px * camera.width_px, 5, device=device)
         index = torch.from_numpy(y * camera.width_px + x).to(device)
-        count = max(1, min(RAYS_AT_ONCE, SAMPLES_AT_ONCE // self.field.samples))
+        count = max(1, min(RAYS_PER_BATCH, SAMPLES_PER_BATCH // self.field.samples))
         for start in range(0, len(x), count):
             part = slice(start, start + count)
             o, d = (torch.from_numpy(np.ascontiguousarray(a[part])).float().to(device) for a in (origins, directions))
@@ -88,7 +88,7 @@ class TrainedAvatar:
         none = dataclasses.replace(self.learned, theta=self.learned.theta[:0], root=self.learned.root[:0], frames=())
         return dataclasses.replace(self, learned=none)
 
-    def on_body(self, body: BodyFit) -> "TrainedAvatar":
+    def with_body(self, body: BodyFit) -> "TrainedAvatar":
         """The avatar with another body under its clothes, other poses, or both; the rig keeps its topology."""
         return dataclasses.replace(self, body=body.to(self.body.theta.device))
 
@@ -96,14 +96,14 @@ class TrainedAvatar:
     def signed_distance(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
         """d_hat at world points (N, 3), (N,) metres."""
         bodies, conditions = self._pose(theta, root)
-        parts = points_m.split(POINTS_AT_ONCE)
+        parts = points_m.split(POINTS_PER_BATCH)
         return torch.cat([self.field.signed_distance(bodies, part, conditions) for part in parts])
 
     @torch.no_grad()
     def colour(self, points_m: Tensor, directions: Tensor, theta: Tensor, root: Tensor) -> Tensor:
         """Radiance at world points (N, 3) along unit directions (N, 3), (N, 3)."""
         bodies, conditions = self._pose(theta, root)
-        parts = zip(points_m.split(POINTS_AT_ONCE), directions.split(POINTS_AT_ONCE), strict=True)
+        parts = zip(points_m.split(POINTS_PER_BATCH), directions.split(POINTS_PER_BATCH), strict=True)
         return torch.cat([self.field.colour(bodies, x, v, conditions) for x, v in parts])
 
     def _pose(self, theta: Tensor, root: Tensor) -> tuple[PosedBodies, Conditions]:
@@ -125,10 +125,10 @@ def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvat
     path = folder / "model.safetensors"
     tensors = load_file(path, device=str(device))
     if "canonical_m" not in tensors:
-        raise other_version(path)
+        raise version_error(path)
     before_tuning = dataclasses.replace(body, rig=dataclasses.replace(body.rig, vertices_m=tensors["canonical_m"]))
     field = build_field(settings, before_tuning, static).to(device)
-    fill_field(field, tensors, path)
+    load_field(field, tensors, path)
     return TrainedAvatar(field.eval(), body, settings.paper.scene_m, body, gains)
 
 
@@ -139,4 +139,4 @@ def _stored_settings(path: Path) -> tuple[TrainingSettings, bool, Gains]:
         gains = {name: tuple(gain) for name, gain in stored.get("gains", {}).items()}
         return TrainingSettings.model_validate(stored["training"]), stored["static"], gains
     except (KeyError, ValidationError):
-        raise other_version(path) from None
+        raise version_error(path) from None

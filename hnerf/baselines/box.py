@@ -57,13 +57,13 @@ class BoxField(Field):
         """alpha (R, K) of densities at depths (R, K); the last sample reaches to the box's end (R,)."""
         return alpha_from_density(density, torch.diff(depths_m, dim=1, append=far_m[:, None]) / self.scale_m)
 
-    def read_off(self, density: Tensor) -> Tensor:
+    def pseudo_distance(self, density: Tensor) -> Tensor:
         """BAND_M (sigma_h - sigma) / (sigma_h + sigma): zero where the density is sigma_h, negative where it is more,
         within BAND_M. Its sign and its zero set mean something; its size does not."""
         threshold = SURFACE_DENSITY_PER_M * self.scale_m
         return BAND_M * (threshold - density) / (threshold + density)
 
 
-def along(origins_m: Tensor, directions: Tensor, depths_m: Tensor) -> Tensor:
+def points_on_rays(origins_m: Tensor, directions: Tensor, depths_m: Tensor) -> Tensor:
     """Points (..., 3) at depths (...) of rays (..., 3)."""
     return origins_m + directions * depths_m[..., None]

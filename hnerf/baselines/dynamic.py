@@ -21,12 +21,12 @@ class DynamicField(BoxField):
 
     def code(self, conditions: Conditions) -> Tensor:
         """By body row, (n, code_width)."""
-        nobody = torch.zeros_like(self.codes[:1])
-        return torch.cat([self.codes, nobody])[conditions.frame_row]  # -1 is the last row
+        unseen = torch.zeros_like(self.codes[:1])
+        return torch.cat([self.codes, unseen])[conditions.frame_row]  # -1 is the last row
 
-    def seen(self, density: Tensor, colour: Tensor, depths_m: Tensor, far_m: Tensor, **more: Any) -> RaySamples:
+    def to_samples(self, density: Tensor, colour: Tensor, depths_m: Tensor, far_m: Tensor, **extra: Any) -> RaySamples:
         """Density (R, K) and colour (R, K, 3) at depths (R, K) as samples; the last one reaches to the box's end."""
-        alpha, d = self.opacity(density, depths_m, far_m), self.read_off(density)
+        alpha, d = self.opacity(density, depths_m, far_m), self.pseudo_distance(density)
         return RaySamples(
             alpha=alpha,
             alpha_dot=alpha,
@@ -36,5 +36,5 @@ class DynamicField(BoxField):
             d=d,
             residual=torch.zeros_like(d),
             gradient_norm=d.new_zeros(0),
-            **more,
+            **extra,
         )

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import along
+from hnerf.baselines.box import points_on_rays
 from hnerf.baselines.static import StaticField
 from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.fit_result import BodyFit
@@ -12,7 +12,7 @@ from hnerf.fields.compositing import weights_from_alpha
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.encoding import positional_encoding
 from hnerf.fields.mlp import SkipMLP
-from hnerf.fields.paper import resample
+from hnerf.fields.paper import sample_pdf
 from hnerf.fields.samples import RaySamples
 from hnerf.fields.shell import Boxes, stratified
 
@@ -71,11 +71,11 @@ class NerfField(StaticField):
         """As Field.sample: `samples` of the coarse network, then twice as many of the fine one (K = 3 x samples)."""
         near, far = region.interval(origins_m, directions, frame)
         first = stratified(near, far, draws.jitter)
-        first_alpha, first_density, first_colour = self._look(self.coarse, origins_m, directions, first, far)
-        drawn = resample(first, near, far, weights_from_alpha(first_alpha.detach()), draws.finer)
+        first_alpha, first_density, first_colour = self._evaluate(self.coarse, origins_m, directions, first, far)
+        drawn = sample_pdf(first, near, far, weights_from_alpha(first_alpha.detach()), draws.fine)
         every = torch.cat([first, drawn], 1).sort(1).values
-        alpha, density, colour = self._look(self.fine, origins_m, directions, every, far)
-        d = self.read_off(torch.cat([first_density, density], 1))
+        alpha, density, colour = self._evaluate(self.fine, origins_m, directions, every, far)
+        d = self.pseudo_distance(torch.cat([first_density, density], 1))
         samples = RaySamples(
             alpha=torch.cat([torch.zeros_like(first_alpha), alpha], 1),
             alpha_dot=torch.cat([first_alpha, torch.zeros_like(alpha)], 1),
@@ -85,21 +85,21 @@ class NerfField(StaticField):
             d=d,
             residual=torch.zeros_like(d),
             gradient_norm=d.new_zeros(0),
-            beyond=draws.beyond,
+            background=draws.background,
         )
         return samples, torch.cat([first, every], 1)
 
-    def _look(
+    def _evaluate(
         self, network: NerfNetwork, origins_m: Tensor, directions: Tensor, depths_m: Tensor, far_m: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """alpha, density (R, K) and colour (R, K, 3) at depths (R, K); the last sample reaches to the box's end."""
-        points = self.scaled(along(origins_m[:, None], directions[:, None], depths_m))
+        points = self.scaled(points_on_rays(origins_m[:, None], directions[:, None], depths_m))
         density, colour = network(points, directions[:, None].expand_as(points))
         return self.opacity(density, depths_m, far_m), density, colour
 
     def distance(self, points_m: Tensor) -> Tensor:
         """Of the fine network's surface of density sigma_h, bounded by BAND_M."""
-        return self.read_off(self.fine(self.scaled(points_m), torch.zeros_like(points_m))[0])
+        return self.pseudo_distance(self.fine(self.scaled(points_m), torch.zeros_like(points_m))[0])
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """c (N, 3) of the fine network at points (N, 3) seen along directions (N, 3)."""

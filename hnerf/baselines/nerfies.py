@@ -6,7 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import along
+from hnerf.baselines.box import points_on_rays
 from hnerf.baselines.dynamic import DynamicField
 from hnerf.baselines.nerf import NerfNetwork
 from hnerf.body.canonical import PoseCorrection, PosedBodies
@@ -17,14 +17,14 @@ from hnerf.fields.compositing import weights_from_alpha
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.encoding import positional_encoding
 from hnerf.fields.mlp import SkipMLP
-from hnerf.fields.paper import resample
+from hnerf.fields.paper import sample_pdf
 from hnerf.fields.samples import RaySamples
 from hnerf.fields.shell import Boxes, stratified
 
 OCTAVES, LAYERS = 6, 6  # of the deformation
-STILL = 1e-5  # spread of its last layer at the start: nothing is deformed
+INITIAL_SCREW_RANGE = 1e-5  # spread of its last layer at the start: nothing is deformed
 ROBUST_SCALE = 0.03  # c of the elastic energy
-LEAST_STRETCH = 1e-6  # keeps its logarithm finite
+MIN_SINGULAR_VALUE = 1e-6  # keeps its logarithm finite
 
 
 class Deformation(nn.Module):
@@ -34,7 +34,7 @@ class Deformation(nn.Module):
         super().__init__()
         self.trunk = SkipMLP(3 * (1 + 2 * OCTAVES) + code_width, width, LAYERS)
         self.screw = nn.Linear(width, 6)
-        nn.init.uniform_(self.screw.weight, -STILL, STILL)
+        nn.init.uniform_(self.screw.weight, -INITIAL_SCREW_RANGE, INITIAL_SCREW_RANGE)
         nn.init.zeros_(self.screw.bias)
 
     def forward(self, points: Tensor, code: Tensor, octaves: Tensor) -> Tensor:
@@ -85,27 +85,27 @@ class NerfiesField(DynamicField):
         near, far = region.interval(origins_m, directions, frame)
         first = stratified(near, far, draws.jitter)
 
-        def look(depths_m: Tensor) -> RaySamples:
-            points = along(origins_m[:, None], directions[:, None], depths_m)
+        def evaluate(depths_m: Tensor) -> RaySamples:
+            points = points_on_rays(origins_m[:, None], directions[:, None], depths_m)
             code = self.code(conditions)[frame][:, None].expand(-1, depths_m.shape[1], -1)
             template = self._deform(self.scaled(points).flatten(0, 1), code.flatten(0, 1)).view_as(points)
             density, colour = self.template(template, directions[:, None].expand_as(points))
-            return self.seen(density, colour, depths_m, far, beyond=draws.beyond)
+            return self.to_samples(density, colour, depths_m, far, background=draws.background)
 
         with torch.no_grad():
-            drawn = resample(first, near, far, weights_from_alpha(look(first).alpha), draws.finer)
+            drawn = sample_pdf(first, near, far, weights_from_alpha(evaluate(first).alpha), draws.fine)
         depths = torch.cat([first, drawn], 1).sort(1).values
-        samples = look(depths)
+        samples = evaluate(depths)
         if draws.probe is None:
             return samples, depths
         weights = weights_from_alpha(samples.alpha.detach())
-        pick = choose(weights, draws.probe)
-        points = along(origins_m, directions, depths.gather(1, pick[:, None])[:, 0])
+        pick = sample_index(weights, draws.probe)
+        points = points_on_rays(origins_m, directions, depths.gather(1, pick[:, None])[:, 0])
         code = self.code(conditions)[frame]
         change = jacobian(lambda x: self._deform(x, code), self.scaled(points))
         return dataclasses.replace(samples, elastic=weights.sum(1) * elastic_energy(change)), depths
 
-    def step_taken(self) -> None:
+    def on_step_end(self) -> None:
         """Counts for annealing."""
         self.steps_taken += 1
 
@@ -115,14 +115,14 @@ class NerfiesField(DynamicField):
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """Of the surface of density sigma_h (NerfField's) at the first body's moment; its box cuts and closes it."""
-        density = self._ask(points_m, torch.zeros_like(points_m), conditions)[0]
-        return torch.maximum(self.read_off(density), self.box(bodies).signed_distance(points_m))
+        density = self._evaluate(points_m, torch.zeros_like(points_m), conditions)[0]
+        return torch.maximum(self.pseudo_distance(density), self.box(bodies).signed_distance(points_m))
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """c (N, 3) at points (N, 3) of the first body's moment seen along directions (N, 3)."""
-        return self._ask(points_m, directions, conditions)[1]
+        return self._evaluate(points_m, directions, conditions)[1]
 
-    def _ask(self, points_m: Tensor, directions: Tensor, conditions: Conditions) -> tuple[Tensor, Tensor]:
+    def _evaluate(self, points_m: Tensor, directions: Tensor, conditions: Conditions) -> tuple[Tensor, Tensor]:
         code = self.code(conditions)[:1].expand(len(points_m), -1)
         return self.template(self._deform(self.scaled(points_m), code), directions)
 
@@ -161,12 +161,12 @@ def jacobian(function: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
 def elastic_energy(change: Tensor) -> Tensor:
     """rho(|log Sigma|_F) (N,) of Jacobians (N, 3, 3) with singular values Sigma; rho(x) = 2 (x/c)^2 / ((x/c)^2 + 4)
     (equations 3 and 4)."""
-    stretch = torch.linalg.svdvals(change).clamp(min=LEAST_STRETCH)
+    stretch = torch.linalg.svdvals(change).clamp(min=MIN_SINGULAR_VALUE)
     strain = (stretch.log() / ROBUST_SCALE).square().sum(-1)
     return 2 * strain / (strain + 4)
 
 
-def choose(weights: Tensor, uniform: Tensor) -> Tensor:
+def sample_index(weights: Tensor, uniform: Tensor) -> Tensor:
     """An index (R,) into each row of weights (R, K), as likely as its weight; uniform (R,) in [0, 1)."""
     cumulative = weights.cumsum(1)
     wanted = uniform[:, None] * cumulative[:, -1:]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import along
+from hnerf.baselines.box import points_on_rays
 from hnerf.baselines.dynamic import DynamicField
 from hnerf.baselines.nerf import DENSITY_GAIN
 from hnerf.baselines.voxels import Voxels
@@ -21,11 +21,11 @@ from hnerf.fields.shell import Boxes, stratified
 LEVELS = 5  # the finest takes the codes, the four others are read (section 3.2 of the paper)
 POSITION_OCTAVES, VIEW_OCTAVES = 10, 4
 APPEARANCE_WIDTH = 16  # of a frame's code
-CODE_SPREAD = 0.1  # of the vertices' codes at the start
+INITIAL_CODE_STD = 0.1  # of the vertices' codes at the start
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class NeuralBodyRegion:
     """By body row: box, root (n, 4, 4), voxels around the body in its root frame, and the codes diffused over them at
     the levels that are read; None in training, where they change with every step."""
 
@@ -63,10 +63,10 @@ class Diffusion(nn.Module):
         """codes (V, C): (N + 1, channels) at each level that is read, the last row zero."""
         total = codes.new_zeros(len(voxels.count) + 1, codes.shape[1]).index_add(0, voxels.vertex, codes)
         values = total / torch.cat([voxels.count, voxels.count.new_ones(1)])[:, None]
-        values = self.first(values, voxels.levels[0].beside)
+        values = self.first(values, voxels.levels[0].neighbours)
         found = []
         for level, coarser, beside in zip(voxels.levels[1:], self.coarser, self.beside, strict=True):
-            values = beside(coarser(values, level.below), level.beside)
+            values = beside(coarser(values, level.finer_neighbours), level.neighbours)
             found.append(values)
         return found
 
@@ -90,7 +90,7 @@ class NeuralBodyField(DynamicField):
         super().__init__(body, settings.samples, settings.learning_rate, APPEARANCE_WIDTH)
         self.settings = settings
         width, features = settings.width, settings.channels * (LEVELS - 1)
-        self.vertex_codes = nn.Parameter(CODE_SPREAD * torch.randn(len(body.rig.vertices_m), settings.code_width))
+        self.vertex_codes = nn.Parameter(INITIAL_CODE_STD * torch.randn(len(body.rig.vertices_m), settings.code_width))
         self.diffusion = Diffusion(settings.code_width, settings.channels)
         self.trunk = nn.Sequential(
             nn.Linear(features, width),
@@ -106,17 +106,17 @@ class NeuralBodyField(DynamicField):
             nn.Linear(width + APPEARANCE_WIDTH + encoded, width), nn.SiLU(), nn.Linear(width, 3), nn.Sigmoid()
         )
 
-    def region(self, bodies: PosedBodies, conditions: Conditions) -> Surroundings:
+    def region(self, bodies: PosedBodies, conditions: Conditions) -> NeuralBodyRegion:
         """Box and voxels of each body; where the field no longer learns, what the convolutions make of them."""
-        local_m = _into_root(bodies.vertices_m, bodies.root)
+        local_m = _to_root_frame(bodies.vertices_m, bodies.root)
         voxels = [Voxels.around(points_m, self.settings.voxel_m, LEVELS) for points_m in local_m]
         diffused = None if self.training else [self.diffusion(self.vertex_codes, v) for v in voxels]
-        return Surroundings(self.box(bodies), bodies.root, voxels, diffused)
+        return NeuralBodyRegion(self.box(bodies), bodies.root, voxels, diffused)
 
     def sample(
         self,
         bodies: PosedBodies,
-        region: Surroundings,
+        region: NeuralBodyRegion,
         origins_m: Tensor,
         directions: Tensor,
         frame: Tensor,
@@ -127,23 +127,23 @@ class NeuralBodyField(DynamicField):
         """As Field.sample, at `samples` depths in the body's box."""
         near, far = region.box.interval(origins_m, directions, frame)
         depths = stratified(near, far, draws.jitter)
-        points = along(origins_m[:, None], directions[:, None], depths).flatten(0, 1)
+        points = points_on_rays(origins_m[:, None], directions[:, None], depths).flatten(0, 1)
         row, view = (x.repeat_interleave(self.samples, 0) for x in (frame, directions))
         features = self.trunk(self._features(region, points, row))
         density = self._density(features).view_as(depths)
         colour = self._colour(features, points, view, row, conditions).view(*depths.shape, 3)
-        return self.seen(density, colour, depths, far, beyond=draws.beyond), depths
+        return self.to_samples(density, colour, depths, far, background=draws.background), depths
 
-    def _features(self, region: Surroundings, points_m: Tensor, row: Tensor) -> Tensor:
+    def _features(self, region: NeuralBodyRegion, points_m: Tensor, row: Tensor) -> Tensor:
         """What the diffused codes say at points (N, 3) around bodies of rows (N,), all levels side by side."""
         found = points_m.new_zeros(len(points_m), self.settings.channels * (LEVELS - 1))
         for body in row.unique().tolist():
             voxels = region.voxels[body]
             diffused = region.diffused[body] if region.diffused else self.diffusion(self.vertex_codes, voxels)
             pick = torch.nonzero(row == body)[:, 0]
-            local_m = _into_root(points_m[pick][None], region.root[body][None])[0]
+            local_m = _to_root_frame(points_m[pick][None], region.root[body][None])[0]
             read = [
-                level.read(values, voxels.coordinates(local_m, k))
+                level.interpolate(values, voxels.coordinates(local_m, k))
                 for k, (level, values) in enumerate(zip(voxels.levels[1:], diffused, strict=True), 1)
             ]
             found = found.index_copy(0, pick, torch.cat(read, 1))
@@ -162,7 +162,7 @@ class NeuralBodyField(DynamicField):
         region = self.region(bodies, conditions)
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         density = self._density(self.trunk(self._features(region, points_m, row)))
-        return torch.maximum(self.read_off(density), region.box.signed_distance(points_m))
+        return torch.maximum(self.pseudo_distance(density), region.box.signed_distance(points_m))
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """c (N, 3) at points around the first body seen along directions (N, 3)."""
@@ -171,6 +171,6 @@ class NeuralBodyField(DynamicField):
         return self._colour(features, points_m, directions, row, conditions)
 
 
-def _into_root(points_m: Tensor, root: Tensor) -> Tensor:
+def _to_root_frame(points_m: Tensor, root: Tensor) -> Tensor:
     """World points (n, N, 3) in the frames of roots (n, 4, 4), world from body."""
     return (points_m - root[:, None, :3, 3]) @ root[:, :3, :3]

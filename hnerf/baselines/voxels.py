@@ -25,8 +25,8 @@ class Level:
     """
 
     rows: Tensor
-    beside: Tensor
-    below: Tensor
+    neighbours: Tensor
+    finer_neighbours: Tensor
 
     @staticmethod
     def of(coordinates: Tensor, finer: "Level | None") -> "Level":
@@ -37,12 +37,12 @@ class Level:
             len(coordinates), dtype=torch.int32, device=coordinates.device
         )
         stencil = STENCIL.to(coordinates.device)
-        below = stencil.new_zeros(0, len(stencil), dtype=torch.int32)
+        finer_neighbours = stencil.new_zeros(0, len(stencil), dtype=torch.int32)
         if finer is not None:
-            below = _look_up(finer.rows, 2 * coordinates[:, None] + stencil)
-        return Level(rows, _look_up(rows, coordinates[:, None] + stencil), below)
+            finer_neighbours = _look_up(finer.rows, 2 * coordinates[:, None] + stencil)
+        return Level(rows, _look_up(rows, coordinates[:, None] + stencil), finer_neighbours)
 
-    def read(self, values: Tensor, at: Tensor) -> Tensor:
+    def interpolate(self, values: Tensor, at: Tensor) -> Tensor:
         """Values (N + 1, C), the last of them zero, trilinearly at whole and broken coordinates (P, 3): (P, C); zero
         where no active voxel is near."""
         limit = torch.tensor(self.rows.shape, device=at.device) - 2 * PAD

@@ -26,7 +26,7 @@ class Field(nn.Module, ABC):
     names and those of the mask; common_rest: whether the rest body takes what training changes in all poses alike.
     """
 
-    own_background: ClassVar[bool] = False
+    models_background: ClassVar[bool] = False
     common_rest: ClassVar[bool] = False
     whole_images: bool = False
     canonical_m: Tensor
@@ -41,10 +41,10 @@ class Field(nn.Module, ABC):
     def tighten(self, rig: Rig, pose: Tensor) -> None:
         """Make that region no larger than what can be seen in some poses (n, P)."""
 
-    def learn_for_all(self, rows: Tensor) -> None:
+    def average_over_frames(self, rows: Tensor) -> None:
         """Give poses of which nothing is known what the frames of some rows (n,) have in common."""
 
-    def reached(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
+    def visible_pixels(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
         """(H, W) bool: pixels that can show anything where the body's vertices are (V, 3)."""
         return within_box(camera, vertices_m, self.margin_m)
 
@@ -71,11 +71,11 @@ class Field(nn.Module, ABC):
     ) -> tuple[RaySamples, Tensor]:
         """Radiance and distance along rays (R, 3) of body rows (R,); also depths (R, K) in metres."""
 
-    def samples_in_training(self, done: float) -> int:
+    def training_samples(self, progress: float) -> int:
         """Random numbers that a ray needs when so much of the training, 0 to 1, is over."""
         return self.samples
 
-    def step_taken(self) -> None:
+    def on_step_end(self) -> None:
         """Said once after each step of the training, in however many parts it was made."""
 
     def samples_needed(self, region: Any, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
@@ -95,17 +95,17 @@ class Field(nn.Module, ABC):
         """The person alone along rays (R, 3) of body rows (R,), from b alpha (docs/method.md, "Evaluation protocol"):
         colour over black, coverage, and depth in metres, 0 where nothing is, (R, 5)."""
         needed = self.samples_needed(region, origins_m, directions, frame)
-        seen = origins_m.new_zeros(len(frame), 5)
+        rendered = origins_m.new_zeros(len(frame), 5)
         for count in needed[needed > 0].unique().tolist():
             pick = torch.nonzero(needed == count)[:, 0]
             rays = (origins_m[pick], directions[pick], frame[pick])
-            still = Draws.deterministic(len(pick), count, frame.device)
-            samples, depths = self.sample(bodies, region, *rays, conditions, still)
+            draws = Draws.deterministic(len(pick), count, frame.device)
+            samples, depths = self.sample(bodies, region, *rays, conditions, draws)
             weights = weights_from_alpha(samples.in_box * samples.alpha)
             cover = weights.sum(1, keepdim=True)
             depth = (weights * depths).sum(1, keepdim=True) / cover.clamp(min=1e-6)
-            seen[pick] = torch.cat([composite(weights, samples.colour), cover, depth * (cover > 0)], 1)
-        return seen
+            rendered[pick] = torch.cat([composite(weights, samples.colour), cover, depth * (cover > 0)], 1)
+        return rendered
 
     def coverage(self, samples: RaySamples) -> Tensor:
         """How far what the field has learned covers rays, (R,)."""

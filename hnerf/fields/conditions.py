@@ -31,7 +31,7 @@ class Conditions:
         scaled = torch.cat([root[:, :3, :3], root[:, :3, 3:] / scene_m], -1)
         return Conditions(theta[:, rig.free].flatten(1), scaled.flatten(1), frame_row)
 
-    def noisy(self, sigma: float, generator: torch.Generator) -> "Conditions":
+    def with_noise(self, sigma: float, generator: torch.Generator) -> "Conditions":
         """With Gaussian noise on theta and T, so that networks do not learn poses by heart (paper, section 4)."""
         device = self.pose.device
         pose, root = (sigma * torch.randn(c.shape, generator=generator, device=device) for c in (self.pose, self.root))
@@ -45,8 +45,8 @@ class Draws:
     directions. None where a rendering needs none."""
 
     jitter: Tensor
-    beyond: Tensor
-    finer: Tensor
+    background: Tensor
+    fine: Tensor
     probe: Tensor | None = None
     view: Tensor | None = None
 
@@ -54,15 +54,15 @@ class Draws:
     def random(rays: int, samples: int, view_sigma: float, generator: torch.Generator) -> "Draws":
         """For one training step, on the generator's device."""
         device = generator.device
-        jitter, finer = (torch.rand(rays, samples, generator=generator, device=device) for _ in range(2))
-        beyond = torch.rand(rays, 3, generator=generator, device=device)
+        jitter, fine = (torch.rand(rays, samples, generator=generator, device=device) for _ in range(2))
+        background = torch.rand(rays, 3, generator=generator, device=device)
         probe = torch.rand(rays, generator=generator, device=device)
         view = view_sigma * torch.randn(rays, 3, generator=generator, device=device)
-        return Draws(jitter, beyond, finer, probe, view)
+        return Draws(jitter, background, fine, probe, view)
 
-    def over(self, beyond: Tensor) -> "Draws":
+    def with_background(self, background: Tensor) -> "Draws":
         """The same numbers, with another colour behind the rays."""
-        return dataclasses.replace(self, beyond=beyond)
+        return dataclasses.replace(self, background=background)
 
     @staticmethod
     def deterministic(rays: int, samples: int, device: torch.device) -> "Draws":
@@ -74,13 +74,13 @@ class Draws:
 def shard(batch: Batch, rank: int, world_size: int) -> Batch:
     """This rank's rays of a joint batch, a dataclass whose tensors all have the rays first: those that follow each
     other, so that a share has few frames."""
-    own = {f.name: getattr(batch, f.name) for f in dataclasses.fields(batch)}
+    values = {f.name: getattr(batch, f.name) for f in dataclasses.fields(batch)}
     return dataclasses.replace(
-        batch, **{k: v if v is None else v.tensor_split(world_size)[rank] for k, v in own.items()}
+        batch, **{k: v if v is None else v.tensor_split(world_size)[rank] for k, v in values.items()}
     )
 
 
-def joined(batches: Sequence[Batch]) -> Batch:
+def concatenate(batches: Sequence[Batch]) -> Batch:
     """Shares of a batch, one after another."""
-    own = {f.name: [getattr(batch, f.name) for batch in batches] for f in dataclasses.fields(batches[0])}
-    return dataclasses.replace(batches[0], **{k: None if v[0] is None else torch.cat(v) for k, v in own.items()})
+    values = {f.name: [getattr(batch, f.name) for batch in batches] for f in dataclasses.fields(batches[0])}
+    return dataclasses.replace(batches[0], **{k: None if v[0] is None else torch.cat(v) for k, v in values.items()})

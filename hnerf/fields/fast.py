@@ -16,23 +16,29 @@ from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.deformation import FrameDeformation
 from hnerf.fields.grids import CanonicalField
 from hnerf.fields.samples import RaySamples
-from hnerf.fields.shell import ShellGrid, lattice
+from hnerf.fields.shell import ShellGrid, surface_points
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.reach import within_reach
 
 INITIAL_SHARPNESS_PER_M = 100.0  # of the logistic that makes opacity of distance
 GRADIENT_STEP_M = 0.005
-SETTLED = 5.0  # where the logistic of density is 1 or 0 within 1 %
-GRID_ROOM_M = 0.01  # between shell and the end of the grids
-ROOM_M = 0.012  # for what the surface still moves, and what poses that were not asked about do to it
+SATURATED_LOGIT = 5.0  # where the logistic of density is 1 or 0 within 1 %
+GRID_MARGIN_M = 0.01  # between shell and the end of the grids
+SHELL_MARGIN_M = 0.012  # for what the surface still moves, and what poses that were not asked about do to it
 TIGHTEN_STEP_M = 0.004
 ELASTIC_M = 0.01  # a displacement whose elastic energy is 1
 SPACING_M = 0.012  # between the samples of a rendering; twice as many gain 0.05 dB on valid-wave for twice the time
-SAMPLES = (6, 12, 18, 24, 36, 64)  # of which a ray gets the first that is enough, or the last
-COARSE = 0.75  # of the training has half the samples: as accurate on three captures, in three quarters of the time
-JOINED_M = 0.03  # between neighbours on a ray, in the canonical volume: farther apart, they lie on different limbs
-GRAZING_M = 1e-4  # of descent from a sample to the next, below which the way to the surface has no useful derivative
-NEGLIGIBLE = 1e-3  # a sample of less weight gets no colour
+SAMPLE_COUNTS = (6, 12, 18, 24, 36, 64)  # of which a ray gets the first that is enough, or the last
+HALF_SAMPLES_UNTIL = (
+    0.75  # of the training has half the samples: as accurate on three captures, in three quarters of the time
+)
+MAX_NEIGHBOUR_DISTANCE_M = (
+    0.03  # between neighbours on a ray, in the canonical volume: farther apart, they lie on different limbs
+)
+MIN_DESCENT_M = (
+    1e-4  # of descent from a sample to the next, below which the way to the surface has no useful derivative
+)
+MIN_COLOUR_WEIGHT = 1e-3  # a sample of less weight gets no colour
 
 
 class FastField(Field):
@@ -52,10 +58,10 @@ class FastField(Field):
         self.register_buffer("canonical_m", rig.vertices_m.clone())
         for name in ("outer_m", "inner_m"):
             self.register_buffer(name, torch.full((len(rig.vertices_m),), getattr(settings, name)))
-        corners, weights = lattice(rig.vertices_m, rig.faces, settings.shell_cell_m)
+        corners, weights = surface_points(rig.vertices_m, rig.faces, settings.shell_cell_m)
         self.register_buffer("corners", corners, persistent=False)
         self.register_buffer("weights", weights, persistent=False)
-        beyond_m = settings.outer_m + GRID_ROOM_M
+        beyond_m = settings.outer_m + GRID_MARGIN_M
         lower_m, upper_m = rig.vertices_m.amin(0) - beyond_m, rig.vertices_m.amax(0) + beyond_m
         self.field = CanonicalField(lower_m, upper_m, settings, 3 * int(rig.free.sum()))
         self.deformation = (
@@ -68,7 +74,7 @@ class FastField(Field):
         """How far from the body a sample can lie: the shell and the slack of its cells."""
         return max(self.settings.outer_m, self.settings.inner_m) + 2 * self.settings.shell_cell_m
 
-    def reached(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
+    def visible_pixels(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
         """Pixels whose rays pass through the shell."""
         return within_reach(camera, vertices_m, self.settings.outer_m + self.settings.shell_cell_m)
 
@@ -76,7 +82,7 @@ class FastField(Field):
         """Where rays are sampled: the shell around bodies as they stand now, where their frames displace it to."""
         outwards_m = bodies.vertices_m.new_zeros(len(bodies.vertices_m), 1)
         if self.deformation is not None:
-            outwards_m = self.deformation.outwards(conditions.frame_row)
+            outwards_m = self.deformation.normal_displacement(conditions.frame_row)
         s, least_m = self.settings, self.settings.shell_cell_m
         outer_m = (self.outer_m + outwards_m).clamp(least_m, s.outer_m)
         inner_m = (self.inner_m - outwards_m).clamp(least_m, s.inner_m)
@@ -91,23 +97,23 @@ class FastField(Field):
         bodies = PosedBodies(rig, rest, torch.eye(4, device=rest.device)[None], self.canonical_m)
         normals = vertex_normals(bodies.vertices_m[0], rig.faces)
         only = torch.zeros(len(normals), dtype=torch.long, device=rest.device)
-        settled_m = SETTLED / self.log_sharpness.exp()
-        reached_m = {1: torch.zeros_like(self.outer_m), -1: torch.zeros_like(self.inner_m)}
+        settled_m = SATURATED_LOGIT / self.log_sharpness.exp()
+        extent_m = {1: torch.zeros_like(self.outer_m), -1: torch.zeros_like(self.inner_m)}
         for depth_m in torch.arange(-s.inner_m, s.outer_m, TIGHTEN_STEP_M).tolist():
             described = bodies.describe(bodies.vertices_m[0] + depth_m * normals, only, self.reach_m)
             seen = torch.zeros_like(described.near)
             for row in pose:
                 d_hat = described.d + self._residual(described, row.expand(len(normals), -1))
                 seen |= described.near & (d_hat.abs() < settled_m)
-            for side, reached in reached_m.items():
-                reached.scatter_reduce_(0, described.vertex[seen], side * described.d[seen], "amax")
+            for side, extent in extent_m.items():
+                extent.scatter_reduce_(0, described.vertex[seen], side * described.d[seen], "amax")
         for side, thickness_m in ((1, self.outer_m), (-1, self.inner_m)):
-            thickness_m.copy_((reached_m[side] + ROOM_M).minimum(thickness_m))
+            thickness_m.copy_((extent_m[side] + SHELL_MARGIN_M).minimum(thickness_m))
 
-    def learn_for_all(self, rows: Tensor) -> None:
+    def average_over_frames(self, rows: Tensor) -> None:
         """The mean deformation."""
         if self.deformation is not None:
-            self.deformation.learn_for_all(rows)
+            self.deformation.average_over_frames(rows)
 
     def parameter_groups(self) -> list[dict]:
         """Adam groups; feature grids bear a larger rate than networks."""
@@ -149,8 +155,8 @@ class FastField(Field):
         alpha_dot = alpha_from_sdf(d + residual, self.log_sharpness.exp())
         end = torch.where(core[hit, None], 1.0, alpha_dot[:, -1:])  # nothing shines through, if the surface lies deeper
         alpha = torch.cat([alpha_dot[:, :-1], end], 1)
-        visible = weights_from_alpha(alpha.detach()).flatten() > NEGLIGIBLE
-        colour = self._colour(at_surface(described, d + residual), pose, visible)
+        visible = weights_from_alpha(alpha.detach()).flatten() > MIN_COLOUR_WEIGHT
+        colour = self._colour(move_to_surface(described, d + residual), pose, visible)
         norms = d.new_zeros(0)
         if draws.probe is not None:
             norms = self._gradient_norms(described, skin, pose, draws.probe[hit], depths.shape[1])
@@ -165,30 +171,30 @@ class FastField(Field):
         alpha, alpha_dot, residual = (everywhere(values, 0.0) for values in (alpha, alpha_dot, residual))
         colour = everywhere(colour.view(len(hit), depths.shape[1], 3), 0.0)
         d, in_box = everywhere(d, self.reach_m), everywhere(torch.ones_like(d), 0.0)
-        samples = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, draws.beyond, elastic)
+        samples = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, draws.background, elastic)
         return samples, depths
 
     def coverage(self, samples: RaySamples) -> Tensor:
         """By the surface, not by the core that ends rays behind it; rays that begin inside it are covered, too."""
         return occupancy(samples.d_hat, self.log_sharpness.exp()).amax(1)
 
-    def samples_in_training(self, done: float) -> int:
+    def training_samples(self, progress: float) -> int:
         """Half of them first in either phase, while surface or novel poses are not where they will be."""
-        return self.samples if done >= COARSE else -(-self.samples // 2)
+        return self.samples if progress >= HALF_SAMPLES_UNTIL else -(-self.samples // 2)
 
     def samples_needed(self, region: ShellGrid, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
         """As many as a ray's way through the shell asks for."""
-        needed = region.path_m(origins_m, directions, frame) / SPACING_M
-        steps = torch.tensor(SAMPLES, device=frame.device)
-        enough = torch.searchsorted(steps.to(needed), needed).clamp(max=len(SAMPLES) - 1)
+        needed = region.path_length_m(origins_m, directions, frame) / SPACING_M
+        steps = torch.tensor(SAMPLE_COUNTS, device=frame.device)
+        enough = torch.searchsorted(steps.to(needed), needed).clamp(max=len(SAMPLE_COUNTS) - 1)
         return torch.where(needed > 0, steps[enough], 0)
 
     def _deformed(self, described: Descriptor, frame_row: Tensor) -> tuple[Descriptor, Tensor | None]:
         """Descriptors (N,) on the body as the frames of rows `frame_row` (N,) deform it, and displacements (N, 3)."""
         if self.deformation is None:
             return described, None
-        moved, outwards = self.deformation(described, frame_row)
-        return dataclasses.replace(described, y=described.y - moved, d=described.d - outwards), moved
+        moved, normal_displacement = self.deformation(described, frame_row)
+        return dataclasses.replace(described, y=described.y - moved, d=described.d - normal_displacement), moved
 
     def _residual(self, described: Descriptor, pose: Tensor) -> Tensor:
         """dd (N,) in the shell; 0 beyond it and deeper inside, where no ray asks and the body's d is enough."""
@@ -234,7 +240,7 @@ class FastField(Field):
         return self.field.colour(described.y, described.d, described.normal, conditions.pose[row])
 
 
-def at_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:
+def move_to_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:
     """Samples (R K,) of rays moved on to where d_hat (R, K), linear from each to the next, is zero or nearest to it.
 
     A sample's opacity is that of the way to the next one, its colour that of the surface which makes it opaque. Left
@@ -246,8 +252,8 @@ def at_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:
         t.unflatten(0, d_hat.shape) for t in (described.y, described.d, described.normal, described.near)
     )
     ahead, after = d_hat[:, :-1], d_hat[:, 1:]
-    joined = near[:, :-1] & near[:, 1:] & ((y[:, 1:] - y[:, :-1]).norm(dim=-1) < JOINED_M)
-    descent_m = (ahead - after).clamp(min=GRAZING_M)
+    joined = near[:, :-1] & near[:, 1:] & ((y[:, 1:] - y[:, :-1]).norm(dim=-1) < MAX_NEIGHBOUR_DISTANCE_M)
+    descent_m = (ahead - after).clamp(min=MIN_DESCENT_M)
     share = torch.where(joined & (ahead > after), ahead / descent_m, 0.0).clamp(0, 1)[..., None]
 
     def moved(values: Tensor) -> Tensor:

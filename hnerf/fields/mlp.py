@@ -31,7 +31,7 @@ class SkipMLP(nn.Module):
         sizes[self.middle] += inputs
         self.layers = nn.ModuleList(nn.Linear(size, width) for size in sizes)
 
-    def start_as_he(self) -> None:
+    def init_kaiming(self) -> None:
         """Draw weights as He et al. (2015) do, biases zero: torch's own start leaves the output of eight layers nearly
         constant over space."""
         for layer in self.layers:
@@ -62,7 +62,7 @@ class RadianceMLP(nn.Module):
         self.view_octaves = view_octaves
         encoded = point_inputs * (1 + 2 * self.OCTAVES)
         self.trunk = SkipMLP(encoded + pose_inputs, 256, 8, bf16=bf16)
-        self.trunk.start_as_he()
+        self.trunk.init_kaiming()
         self.density = nn.Linear(256, 1)
         seen = root_inputs + 3 * (1 + 2 * view_octaves)
         self.colour = nn.Sequential(nn.Linear(256 + seen, 128), nn.SiLU(), nn.Linear(128, 3))

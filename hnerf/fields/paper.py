@@ -24,7 +24,7 @@ OUTSIDE_DISTANCE = 1.0  # the constant d of a point outside the person's box
 class PaperField(Field):
     """F and DH; dynamic: on (s, d) and theta; static (one frame): on x itself, unconditioned."""
 
-    own_background = True
+    models_background = True
     centre_m: Tensor
 
     def __init__(self, rig: Rig, root: Tensor, settings: PaperFieldSettings, static: bool):
@@ -35,9 +35,9 @@ class PaperField(Field):
         self.samples, self.gamma = settings.samples, settings.gamma
         self.register_buffer("canonical_m", rig.vertices_m.clone())
         self.register_buffer("centre_m", root[:, :3, 3].mean(0))
-        turn = 12 if settings.root_condition else 0
-        point, pose, self.turn = (3, 0, 0) if static else (4, 3 * int(rig.free.sum()), turn)
-        self.radiance = RadianceMLP(point, pose, self.turn, settings.view_octaves, settings.bf16)
+        root_inputs = 12 if settings.root_condition else 0
+        point, pose, self.root_inputs = (3, 0, 0) if static else (4, 3 * int(rig.free.sum()), root_inputs)
+        self.radiance = RadianceMLP(point, pose, self.root_inputs, settings.view_octaves, settings.bf16)
         self.residual = ResidualMLP(point, pose, settings.bf16)
 
     def region(self, bodies: PosedBodies, conditions: Conditions) -> Boxes:
@@ -69,9 +69,11 @@ class PaperField(Field):
         view = directions if draws.view is None else directions + draws.view
         depths = coarse
         with torch.no_grad():
-            rough = self._evaluate(bodies, region, origins_m, directions, view, frame, conditions, coarse, draws, None)
-            finer = resample(coarse, near, far, weights_from_alpha(rough.alpha), draws.finer)
-            depths = torch.cat([coarse, finer], 1).sort(1).values
+            coarse_samples = self._evaluate(
+                bodies, region, origins_m, directions, view, frame, conditions, coarse, draws, None
+            )
+            fine = sample_pdf(coarse, near, far, weights_from_alpha(coarse_samples.alpha), draws.fine)
+            depths = torch.cat([coarse, fine], 1).sort(1).values
         out = self._evaluate(bodies, region, origins_m, directions, view, frame, conditions, depths, draws, correction)
         return out, depths
 
@@ -119,7 +121,7 @@ class PaperField(Field):
             d=d,
             residual=residual,
             gradient_norm=norms,
-            beyond=torch.zeros_like(draws.beyond),
+            background=torch.zeros_like(draws.background),
         )
 
     def _scaled(self, points_m: Tensor) -> Tensor:
@@ -141,8 +143,8 @@ class PaperField(Field):
         outside = torch.cat([scaled, torch.full_like(scaled[:, :1], OUTSIDE_DISTANCE)], -1)
         inner = torch.cat([described.s, described.d[:, None]], -1) / self.settings.scene_m
         pose = torch.zeros_like(conditions.pose[row]).index_copy(0, pick, conditions.pose[row[pick]])
-        turn = conditions.root[:, : self.turn]
-        root = torch.zeros_like(turn[row]).index_copy(0, pick, turn[row[pick]])
+        root_inputs = conditions.root[:, : self.root_inputs]
+        root = torch.zeros_like(root_inputs[row]).index_copy(0, pick, root_inputs[row[pick]])
         return self.radiance(outside.index_copy(0, pick, inner), pose, root, view)
 
     def coverage(self, samples: RaySamples) -> Tensor:
@@ -164,7 +166,7 @@ class PaperField(Field):
         )[1]
 
 
-def resample(middles: Tensor, near: Tensor, far: Tensor, weights: Tensor, uniform: Tensor) -> Tensor:
+def sample_pdf(middles: Tensor, near: Tensor, far: Tensor, weights: Tensor, uniform: Tensor) -> Tensor:
     """Depths (R, K) drawn from piecewise constant weights (R, K) (Mildenhall et al. 2020, section 5.2).
 
     middles (R, K): the samples that the weights belong to; their cells meet half-way. uniform (R, K) in [0, 1): strata.

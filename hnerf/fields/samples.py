@@ -20,7 +20,7 @@ class RaySamples:
     d: Tensor
     residual: Tensor
     gradient_norm: Tensor
-    beyond: Tensor
+    background: Tensor
     elastic: Tensor | None = None
 
     @property

@@ -45,13 +45,13 @@ class ShellGrid:
             index = ((blended(vertices_m[row], corners, weights) - lower[row]) / cell_m).long()
             thickness = (side[row][corners].amax(-1) / cell_m for side in (outer_m, inner_m))
             size, *surface = (t.cpu().numpy() for t in (sizes[row], index, *thickness))
-            cells[row][tuple(map(slice, size))] = _cells_around(size, *surface)
+            cells[row][tuple(map(slice, size))] = _classify_cells(size, *surface)
 
         with ThreadPoolExecutor(torch.get_num_threads()) as threads:  # a frame a thread, which bounds memory
             list(threads.map(fill, range(len(cells))))
         return ShellGrid(torch.from_numpy(cells).to(vertices_m.device), lower, cell_m)
 
-    def look_up(self, origins_m: Tensor, directions: Tensor, depths_m: Tensor, frame: Tensor) -> Tensor:
+    def cell_states(self, origins_m: Tensor, directions: Tensor, depths_m: Tensor, frame: Tensor) -> Tensor:
         """State of the cells at depths (R, K) along rays (R, 3) in frames (R,): (R, K) uint8. Beyond the grid it is
         that of its outermost cells, which are EMPTY."""
         origins, directions = (origins_m - self.lower_m[frame]) / self.cell_m, directions / self.cell_m
@@ -75,7 +75,7 @@ class ShellGrid:
         inside = wanted - cumulative.gather(1, upper - 1)
         return edges.gather(1, upper - 1) + inside * self.cell_m, cumulative[:, -1] > 0, ends
 
-    def path_m(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
+    def path_length_m(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
         """How long the ways are over which `sample_rays` spreads the samples, (R,) metres."""
         return self.cell_m * self._march(origins_m, directions, frame)[1][:, -1]
 
@@ -87,14 +87,14 @@ class ShellGrid:
         bins = max(1, math.ceil(float((far - near).max()) / self.cell_m))
         edges = near[:, None] + self.cell_m * torch.arange(bins + 1, device=near.device)  # whatever the other rays
         middles = (edges[:, 1:] + edges[:, :-1]) / 2
-        state = self.look_up(origins_m, directions, middles, frame)
-        reached = state.cummax(1).values  # EMPTY < SHELL < SOLID
-        weight = ((state == SHELL) & (reached < SOLID)).float()
+        state = self.cell_states(origins_m, directions, middles, frame)
+        deepest = state.cummax(1).values  # EMPTY < SHELL < SOLID
+        weight = ((state == SHELL) & (deepest < SOLID)).float()
         cumulative = torch.cat([torch.zeros_like(near)[:, None], weight.cumsum(1)], 1)
-        return edges, cumulative, reached[:, -1] == SOLID
+        return edges, cumulative, deepest[:, -1] == SOLID
 
 
-def lattice(vertices_m: Tensor, faces: Tensor, spacing_m: float) -> tuple[Tensor, Tensor]:
+def surface_points(vertices_m: Tensor, faces: Tensor, spacing_m: float) -> tuple[Tensor, Tensor]:
     """Points on a surface, vertices among them, no farther apart along edges than `spacing_m`: corner indices (P, 3)
     and barycentric weights (P, 3), which hold in any pose."""
     corners_m = vertices_m[faces]
@@ -111,7 +111,7 @@ def lattice(vertices_m: Tensor, faces: Tensor, spacing_m: float) -> tuple[Tensor
     return torch.cat(corners), torch.cat(weights)
 
 
-def _cells_around(size: np.ndarray, points: np.ndarray, outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
+def _classify_cells(size: np.ndarray, points: np.ndarray, outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
     """States of a frame's cells around points in cells (V, 3) with thicknesses (V,), all in cells."""
     at = tuple(points.T)
     surface = np.zeros(size, bool)
@@ -122,13 +122,13 @@ def _cells_around(size: np.ndarray, points: np.ndarray, outer: np.ndarray, inner
     cells = np.where(inside, np.uint8(SOLID), np.uint8(EMPTY))
     band = np.nonzero(distance <= max(outer.max(), inner.max()) + SLACK)
     next_to = tuple(nearest[:, *band])
-    outer, inner = (_greatest_nearby(size, at, thickness)[next_to] for thickness in (outer, inner))
+    outer, inner = (_local_max(size, at, thickness)[next_to] for thickness in (outer, inner))
     within = distance[band] <= np.where(inside[band], inner, outer) + SLACK
     cells[tuple(axis[within] for axis in band)] = SHELL
     return cells
 
 
-def _greatest_nearby(size: np.ndarray, at: tuple[np.ndarray, ...], values: np.ndarray) -> np.ndarray:
+def _local_max(size: np.ndarray, at: tuple[np.ndarray, ...], values: np.ndarray) -> np.ndarray:
     """Greatest of the values that fall into a cell or its neighbours, an array of this size."""
     greatest = np.zeros(size, np.float32)
     np.maximum.at(greatest, at, values)
@@ -153,8 +153,8 @@ class Boxes:
 
     def signed_distance(self, points_m: Tensor) -> Tensor:
         """Of points (N, 3) to the first box, (N,) metres, negative inside."""
-        beyond = torch.maximum(self.lower_m[0] - points_m, points_m - self.upper_m[0])
-        return beyond.clamp(min=0).norm(dim=-1) + beyond.amax(-1).clamp(max=0)
+        outside_m = torch.maximum(self.lower_m[0] - points_m, points_m - self.upper_m[0])
+        return outside_m.clamp(min=0).norm(dim=-1) + outside_m.amax(-1).clamp(max=0)
 
 
 def box_interval(origins_m: Tensor, directions: Tensor, lower_m: Tensor, upper_m: Tensor) -> tuple[Tensor, Tensor]:

@@ -26,7 +26,7 @@ COLUMNS = {
     "edge_starts": (torch.int64, 1),
     "image_starts": (torch.int64, 1),
     "image_camera": (torch.int64, 1),
-    "place": (torch.int32, 1),
+    "pixel_index": (torch.int32, 1),
     "colour": (torch.uint8, 3),
     "plate": (torch.uint8, 3),
     "person": (torch.bool, 1),
@@ -40,7 +40,7 @@ def gather_pixels(
     masks: Masks,
     body: BodyFit,
     frames: tuple[int, ...],
-    reached: Reached | None,
+    visible_pixels: Reached | None,
     gains: Gains,
     folder: Path,
     processes: Distributed,
@@ -56,7 +56,7 @@ def gather_pixels(
     if processes.is_main:
         folder.mkdir(parents=True, exist_ok=True)
         _remove(folder)  # what a killed process left
-        _write_pixels(capture, masks, body, frames, reached, gains, folder)
+        _write_pixels(capture, masks, body, frames, visible_pixels, gains, folder)
     processes.barrier()
     columns: dict[str, Any] = {name: _mapped(folder / f"{name}{SUFFIX}", *kind) for name, kind in COLUMNS.items()}
     processes.barrier()
@@ -76,15 +76,15 @@ def _write_pixels(
     masks: Masks,
     body: BodyFit,
     frames: tuple[int, ...],
-    reached: Reached | None,
+    visible_pixels: Reached | None,
     gains: Gains,
     folder: Path,
 ) -> None:
     """The columns of Pixels, a file each, frame by frame."""
     cameras = [capture.cameras[name] for name in capture.train_cameras]
-    found = [capture.background(camera.name) for camera in cameras] if reached else []
+    found = [capture.background(camera.name) for camera in cameras] if visible_pixels else []
     plates = [plate for plate in found if plate is not None]
-    with_plates = reached is not None and len(plates) == len(cameras)
+    with_plates = visible_pixels is not None and len(plates) == len(cameras)
     vertices_m = body.vertices_m().numpy()
     ends = {"starts": 0, "edge_starts": 0, "image_starts": 0}
 
@@ -104,11 +104,15 @@ def _write_pixels(
             if (camera.name, frame) not in masks:
                 continue
             image, mask = capture.image(camera.name, frame), masks.get(camera.name, frame)
-            wanted = np.ones_like(mask) if reached is None else reached(camera, vertices_m[body.index(frame)]) | mask
+            wanted = (
+                np.ones_like(mask)
+                if visible_pixels is None
+                else visible_pixels(camera, vertices_m[body.index(frame)]) | mask
+            )
             gain = gains.get(camera.name)
-            if reached:
-                append("place", np.flatnonzero(wanted))
-            append("colour", _levelled(image[wanted], gain))
+            if visible_pixels:
+                append("pixel_index", np.flatnonzero(wanted))
+            append("colour", _exposure_corrected(image[wanted], gain))
             append("person", mask[wanted])
             edges.append(_edge(mask)[wanted])
             append("edge", edges[-1])
@@ -117,7 +121,7 @@ def _write_pixels(
             if with_plates:
                 window = window_around(wanted)
                 shaded = shaded_plate(mask[window], image[window], plates[c][window])[wanted[window]]
-                append("plate", _levelled(shaded.clip(0, 255).round().astype(np.uint8), gain))
+                append("plate", _exposure_corrected(shaded.clip(0, 255).round().astype(np.uint8), gain))
         edge = np.concatenate(edges)
         mixed = np.flatnonzero(edge) if edge.any() else np.arange(len(edge))
         append("edges", ends["starts"] + mixed)
@@ -125,7 +129,7 @@ def _write_pixels(
         close("starts", len(edge))
 
 
-def _levelled(shown: np.ndarray, gain: tuple[float, float, float] | None) -> np.ndarray:
+def _exposure_corrected(shown: np.ndarray, gain: tuple[float, float, float] | None) -> np.ndarray:
     """Colours (P, 3) uint8 as a camera of gain 1 would show them."""
     return shown if gain is None else (shown / np.array(gain, np.float32)).round().clip(0, 255).astype(np.uint8)
 

@@ -25,27 +25,27 @@ class Target:
     weight: Tensor
 
 
-def pixel(alpha: Tensor, samples: RaySamples) -> Tensor:
+def pixel_colour(alpha: Tensor, samples: RaySamples) -> Tensor:
     """Composited colour (R, 3) for one choice of opacity, over what lies beyond."""
     weights = weights_from_alpha(alpha)
-    return composite(weights, samples.colour) + (1 - weights.sum(1, keepdim=True)) * samples.beyond
+    return composite(weights, samples.colour) + (1 - weights.sum(1, keepdim=True)) * samples.background
 
 
 def reconstruction(samples: RaySamples, target: Target) -> Tensor:
     """rec: |C_gt - C|_1."""
-    return (target.weight * (target.colour - pixel(samples.alpha, samples)).abs().sum(1)).mean()
+    return (target.weight * (target.colour - pixel_colour(samples.alpha, samples)).abs().sum(1)).mean()
 
 
 def mask(samples: RaySamples, target: Target) -> Tensor:
     """mask: |M (C_gt - C~)|_1, C~ composited with b alpha."""
-    error = (target.colour - pixel(samples.in_box * samples.alpha, samples)).abs().sum(1)
+    error = (target.colour - pixel_colour(samples.in_box * samples.alpha, samples)).abs().sum(1)
     return (target.weight * target.person * error).mean()
 
 
 def blend(samples: RaySamples, target: Target, eta: float) -> Tensor:
     """blend: |M (C_gt - C^)|_1 + eta |(1 - M)(C_gt - C^)|_1, C^ composited with b alpha_dot + (1 - b) alpha."""
     alpha = samples.in_box * samples.alpha_dot + (1 - samples.in_box) * samples.alpha
-    error = (target.colour - pixel(alpha, samples)).abs().sum(1)
+    error = (target.colour - pixel_colour(alpha, samples)).abs().sum(1)
     return (target.weight * (target.person + eta * (1 - target.person)) * error).mean()
 
 

@@ -17,10 +17,14 @@ from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import Rays
 from hnerf.training.step import PosedScene
 
-HALVES = 2  # of a batch, side by side on a CPU: operations are too small to share cores; two sums have one order only
-USABLE = 0.8  # of what is free: allocators lose some, and rays differ
-PEAK = 1.3  # of a step on a CPU in times what it saves for its gradients: 1.26 to 1.29 by hand, for `fast` and `paper`
-FEW, MORE = 32, 64  # rays that are tried
+CPU_PARTS = (
+    2  # of a batch, side by side on a CPU: operations are too small to share cores; two sums have one order only
+)
+USABLE_SHARE = 0.8  # of what is free: allocators lose some, and rays differ
+PEAK_FACTOR = (
+    1.3  # of a step on a CPU in times what it saves for its gradients: 1.26 to 1.29 by hand, for `fast` and `paper`
+)
+FEW_RAYS, MORE_RAYS = 32, 64  # rays that are tried
 GIB = 2**30
 MEMINFO = Path("/proc/meminfo")
 
@@ -53,11 +57,11 @@ class Parts:
 
         def of_part(part: int) -> dict[str, Tensor]:
             mine = processes.rank * n + part, world_size * n
-            own = shard(rays, *mine)
-            weight = world_size * len(own.frame) / len(rays.frame)
+            part_rays = shard(rays, *mine)
+            weight = world_size * len(part_rays.frame) / len(rays.frame)
             waiting = module if part < n - 1 and isinstance(module, DistributedDataParallel) else None
             with waiting.no_sync() if waiting else nullcontext():
-                terms = module(scene, own, conditions, shard(draws, *mine))
+                terms = module(scene, part_rays, conditions, shard(draws, *mine))
                 (weight * torch.stack(list(terms.values())).sum()).backward()
             return {name: weight * term.detach() for name, term in terms.items()}
 
@@ -66,7 +70,7 @@ class Parts:
 
 
 def decide_parts(
-    rays: int, memory_gib: float | None, attempt: Callable[[int], tuple[int, Tensor]], processes: Distributed
+    rays: int, memory_gib: float | None, trial_loss: Callable[[int], tuple[int, Tensor]], processes: Distributed
 ) -> tuple[Parts, Decision]:
     """In how many parts each process takes so many rays a step, and why.
 
@@ -75,10 +79,10 @@ def decide_parts(
     """
     device, share = processes.device, math.ceil(rays / processes.world_size)
     if device.type == "cuda":
-        _peak_bytes(attempt, FEW, device)  # what libraries allocate once
-    (few, least), (more, most) = (_peak_bytes(attempt, about, device) for about in (FEW, MORE))
+        _peak_bytes(trial_loss, FEW_RAYS, device)  # what libraries allocate once
+    (few, least), (more, most) = (_peak_bytes(trial_loss, about, device) for about in (FEW_RAYS, MORE_RAYS))
     each = max(1.0, (most - least) / (more - few))
-    room = USABLE * _free_bytes(processes) if memory_gib is None else memory_gib * GIB
+    room = USABLE_SHARE * _free_bytes(processes) if memory_gib is None else memory_gib * GIB
     most_rays = max(1.0, (room - least) / each + few)
     count = int(processes.all_max(min(math.ceil(share / most_rays), max(1, share // 2))))
     reason = "there is room for a step's rays"  # without figures, so that identical runs record the same
@@ -87,17 +91,17 @@ def decide_parts(
         reason = f"a ray needs {each / 2**20:.2f} MiB, {share} rays {needed_gib:.2f} GiB, of {room / GIB:.1f} GiB"
     side_by_side = count == 1 and device.type == "cpu" and processes.world_size == 1 and torch.get_num_threads() > 1
     if side_by_side:
-        count, reason = HALVES, f"{reason}, side by side in threads"
+        count, reason = CPU_PARTS, f"{reason}, side by side in threads"
     return Parts(count, side_by_side, most_rays), Decision(count, reason)
 
 
-def _peak_bytes(attempt: Callable[[int], tuple[int, Tensor]], about: int, device: torch.device) -> tuple[int, float]:
+def _peak_bytes(trial_loss: Callable[[int], tuple[int, Tensor]], about: int, device: torch.device) -> tuple[int, float]:
     """Rays of a small batch and what a step of them needs at its peak: as allocated on a GPU; on a CPU, where nobody
     counts, in proportion to what it saves for its gradients."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
         before = torch.cuda.memory_allocated(device)
-        rays, loss = attempt(about)
+        rays, loss = trial_loss(about)
         loss.backward()
         return rays, torch.cuda.max_memory_allocated(device) - before
     saved = {}
@@ -108,8 +112,8 @@ def _peak_bytes(attempt: Callable[[int], tuple[int, Tensor]], about: int, device
         return tensor
 
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        rays, _ = attempt(about)
-    return rays, PEAK * sum(storage.nbytes() for storage in saved.values())
+        rays, _ = trial_loss(about)
+    return rays, PEAK_FACTOR * sum(storage.nbytes() for storage in saved.values())
 
 
 def _free_bytes(processes: Distributed) -> float:

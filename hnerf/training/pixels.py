@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-AT_EDGES = 1 / 3  # of the rays: half of the error is there, most of it in hands and feet, which are little else
+EDGE_SHARE = 1 / 3  # of the rays: half of the error is there, most of it in hands and feet, which are little else
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Pixels:
     edge_starts: Tensor
     image_starts: Tensor
     image_camera: Tensor
-    place: Tensor | None
+    pixel_index: Tensor | None
     colour: Tensor
     plate: Tensor | None
     person: Tensor
@@ -44,15 +44,17 @@ class Pixels:
     rays_from_px: Tensor
     centres_m: Tensor
 
-    def draw(self, frames: Tensor, rays_per_frame: int, generator: torch.Generator, at_edges: float = AT_EDGES) -> Rays:
+    def draw(
+        self, frames: Tensor, rays_per_frame: int, generator: torch.Generator, edge_share: float = EDGE_SHARE
+    ) -> Rays:
         """`rays_per_frame` pixels of each of the frames (rows), a share of them at edges, drawn with replacement; on
         the device of the frames and the generator."""
         shape = len(frames), rays_per_frame
         unit = torch.rand(shape, generator=generator, dtype=torch.float64, device=frames.device).cpu()
-        rows, count = frames.cpu(), round(at_edges * rays_per_frame)
+        rows, count = frames.cpu(), round(edge_share * rays_per_frame)
         mixed = self.edges[_within(self.edge_starts, rows, unit[:, :count])]
         pick = torch.cat([mixed, _within(self.starts, rows, unit[:, count:])], 1).flatten()
-        origins_m, directions = self.rays(*self.where(pick))
+        origins_m, directions = self.rays(*self.cameras_and_xy(pick))
         device = frames.device
         return Rays(
             origins_m.to(device),
@@ -64,13 +66,13 @@ class Pixels:
             None if self.plate is None else (self.plate[pick] / 255).to(device),
         )
 
-    def where(self, pick: Tensor) -> tuple[Tensor, Tensor]:
+    def cameras_and_xy(self, pick: Tensor) -> tuple[Tensor, Tensor]:
         """Cameras (R,) and coordinates xy_px (R, 2) of some pixels (R,)."""
         image = torch.searchsorted(self.image_starts, pick, right=True) - 1
-        place = pick - self.image_starts[image] if self.place is None else self.place[pick]
+        pixel_index = pick - self.image_starts[image] if self.pixel_index is None else self.pixel_index[pick]
         camera = self.image_camera[image]
         width_px = self.widths_px[camera]
-        return camera, torch.stack([place % width_px, place // width_px], 1)
+        return camera, torch.stack([pixel_index % width_px, pixel_index // width_px], 1)
 
     def rays(self, camera: Tensor, xy_px: Tensor) -> tuple[Tensor, Tensor]:
         """Origins and unit directions (R, 3) of pixels (R, 2) of cameras (R,)."""

@@ -36,7 +36,7 @@ class Objective(nn.Module):
 
     def forward(self, scene: PosedScene, rays: Rays, conditions: Conditions, draws: Draws) -> dict[str, Tensor]:
         """The weighted losses by name; their sum is minimised."""
-        target, draws = make_target(rays, draws, self.field.own_background)
+        target, draws = make_target(rays, draws, self.field.models_background)
         samples, _ = self.field.sample(
             scene.bodies, scene.region, rays.origins_m, rays.directions, rays.frame, conditions, draws, self.correction
         )
@@ -56,7 +56,7 @@ class Objective(nn.Module):
         return {name: getattr(s, name) * term() for name, term in terms.items() if getattr(s, name)}
 
 
-def make_target(rays: Rays, draws: Draws, own_background: bool) -> tuple[losses.Target, Draws]:
+def make_target(rays: Rays, draws: Draws, models_background: bool) -> tuple[losses.Target, Draws]:
     """What rays should look like, and what lies beyond their samples.
 
     A field with a background of its own aims at the photograph. One without is composited over the clean plate, so that
@@ -65,12 +65,12 @@ def make_target(rays: Rays, draws: Draws, own_background: bool) -> tuple[losses.
     """
     person = rays.person.float()
     everywhere = torch.ones_like(person)
-    if own_background:
+    if models_background:
         return losses.Target(rays.colour, person, everywhere), draws
     if rays.plate is not None:
         colour = torch.where((rays.person | rays.edge)[:, None], rays.colour, rays.plate)
-        return losses.Target(colour, person, everywhere), draws.over(rays.plate)
-    colour = torch.where(rays.person[:, None], rays.colour, draws.beyond)
+        return losses.Target(colour, person, everywhere), draws.with_background(rays.plate)
+    colour = torch.where(rays.person[:, None], rays.colour, draws.background)
     return losses.Target(colour, person, (~rays.edge).float()), draws
 
 

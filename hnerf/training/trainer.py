@@ -23,16 +23,16 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.config import TrainingSettings
-from hnerf.fields.conditions import Conditions, Draws, joined, shard
+from hnerf.fields.conditions import Conditions, Draws, concatenate, shard
 from hnerf.fields.samples import RaySamples
 from hnerf.training.auto_settings import SceneStatistics, decide
 from hnerf.training.checkpoint import load_checkpoint, save_checkpoint
 from hnerf.training.distributed import Distributed
 from hnerf.training.exposure import camera_gains
 from hnerf.training.gather import gather_pixels
-from hnerf.training.losses import pixel
+from hnerf.training.losses import pixel_colour
 from hnerf.training.parts import decide_parts
-from hnerf.training.pixels import AT_EDGES, Rays
+from hnerf.training.pixels import EDGE_SHARE, Rays
 from hnerf.training.step import Objective, PosedScene, TrainingError, not_finite
 
 logger = logging.getLogger("hnerf.training")
@@ -41,12 +41,14 @@ WARM_UP_STEPS = 20
 FINAL_LEARNING_RATE = 0.1  # share of the first that is left at the end
 SKIPS_ALLOWED = 2  # in a row; one more non-finite step stops the run
 HELD_OUT_RAYS = 2048
-LEAST_COVERAGE = 0.1  # of the person's pixels; below it the surface has collapsed
-MOST_AROUND = 0.8  # of the surroundings; above it the surface fills the box
-LOOKS_A_RAY = 64  # at least, through a whole scene: valid-wave's body covers 38 % by 16, 59 % by 64, 64 % by 256
+MIN_PERSON_COVERAGE = 0.1  # of the person's pixels; below it the surface has collapsed
+MAX_BACKGROUND_COVERAGE = 0.8  # of the surroundings; above it the surface fills the box
+MIN_SAMPLES_PER_RAY = (
+    64  # at least, through a whole scene: valid-wave's body covers 38 % by 16, 59 % by 64, 64 % by 256
+)
 LOG_STEPS = 25
-ATTEMPTED_FRAMES = 8  # at most, to see what memory rays need
-POSES_APART = 6  # training poses between those that say how thick the shell must be
+TRIAL_FRAMES = 8  # at most, to see what memory rays need
+POSE_STRIDE = 6  # training poses between those that say how thick the shell must be
 
 
 class Trainer:
@@ -61,7 +63,7 @@ class Trainer:
         out: Path,
         processes: Distributed,
     ):
-        began = time.monotonic()
+        started_at = time.monotonic()
         self.settings, self.decisions = decide(SceneStatistics.of(capture, masks, body), settings)
         settings, self.out, self.processes = self.settings, out, processes
         device = processes.device
@@ -76,9 +78,9 @@ class Trainer:
         self.first_rates = [group["lr"] for group in self.optimizer.param_groups]
         self.gains, self.decisions["gains"] = camera_gains(capture, masks, body)
         logger.info("gathering pixels")
-        reached = None if self.field.whole_images else self.field.reached
-        self.pixels = gather_pixels(capture, masks, body, body.frames, reached, self.gains, out, processes)
-        self.at_edges = 0.0 if self.field.own_background else AT_EDGES  # the paper draws from all pixels alike
+        visible_pixels = None if self.field.whole_images else self.field.visible_pixels
+        self.pixels = gather_pixels(capture, masks, body, body.frames, visible_pixels, self.gains, out, processes)
+        self.edge_share = 0.0 if self.field.models_background else EDGE_SHARE  # the paper draws from all pixels alike
         seen = self.pixels.starts.diff() > 0  # not where a frame's masks were all dropped
         rows = {frame: row for row, frame in enumerate(body.frames) if seen[row]}
         self.train_rows = torch.tensor([rows[f] for f in capture.train_frames if f in rows], device=device)
@@ -89,9 +91,9 @@ class Trainer:
         self.history: list[dict[str, Any]] = []
         self._set_poses(bodies)
         rays = settings.frames_per_step * settings.rays_per_frame
-        self.parts, self.decisions["parts"] = decide_parts(rays, settings.memory_gib, self._attempt, processes)
+        self.parts, self.decisions["parts"] = decide_parts(rays, settings.memory_gib, self._trial_loss, processes)
         self._resume()
-        self.setup_seconds = time.monotonic() - began
+        self.setup_seconds = time.monotonic() - started_at
 
     @property
     def steps(self) -> int:
@@ -147,7 +149,7 @@ class Trainer:
                 self._record(terms)
                 if time.monotonic() - last_log > 5 and self.processes.is_main:
                     last_log = time.monotonic()
-                    message = _in_words(self.history[-1])
+                    message = _progress_message(self.history[-1])
                     logger.info("step %d of %d, %.0f s: %s", self.step, self.steps, self.seconds, message)
             if checkpoint_due and self.processes.is_main:
                 save_checkpoint(self.out, self._state())
@@ -159,14 +161,14 @@ class Trainer:
     def _absorb(self) -> None:
         self.scene.bodies.absorb(self.objective.correction, self.train_rows if self.settings.one_posture else None)
         if self.step <= self.field_steps:
-            self._learn_for_all()
-            self.field.tighten(self.scene.bodies.rig, self.conditions.pose[self.train_rows[::POSES_APART]])
+            self._average_over_frames()
+            self.field.tighten(self.scene.bodies.rig, self.conditions.pose[self.train_rows[::POSE_STRIDE]])
         self._set_poses(self.scene.bodies)
 
-    def _learn_for_all(self) -> None:
+    def _average_over_frames(self) -> None:
         """What training frames have in common holds for all poses: in one posture that is the posture itself."""
         rows, bodies = self.train_rows, self.scene.bodies
-        self.field.learn_for_all(rows)
+        self.field.average_over_frames(rows)
         if not self.field.common_rest or self.settings.one_posture or len(rows) < 2:
             return
         theta, root = bodies.theta.clone(), bodies.root.clone()
@@ -186,14 +188,14 @@ class Trainer:
         rows = self.train_rows if self.step < self.field_steps else self.novel_rows
         pick = torch.randperm(len(rows), generator=self.generator, device=rows.device)[: s.frames_per_step]
         count = s.frames_per_step * s.rays_per_frame // len(pick)
-        rays = self.pixels.draw(rows[pick], count, self.generator, self.at_edges)
-        samples = self.field.samples_in_training(self._done())
+        rays = self.pixels.draw(rows[pick], count, self.generator, self.edge_share)
+        samples = self.field.training_samples(self._progress())
         draws = Draws.random(len(rays.frame), samples, s.noise, self.generator)
-        conditions = self.conditions.noisy(s.noise, self.generator)
+        conditions = self.conditions.with_noise(s.noise, self.generator)
         self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
         terms = self.parts.backward(module, self.scene, rays, conditions, draws, self.processes)
-        self.field.step_taken()
+        self.field.on_step_end()
         if self.step >= self.field_steps:  # what pulls all frames back to the fit is not for frames that are finished
             for pose in (self.objective.correction.turn, self.objective.correction.move_m):
                 if pose.grad is not None:
@@ -213,17 +215,17 @@ class Trainer:
                 )
         return terms
 
-    def _attempt(self, about: int) -> tuple[int, Tensor]:
+    def _trial_loss(self, about: int) -> tuple[int, Tensor]:
         """The number of rays, about so many, and the loss of a batch as at the end of the training; takes no random
         number that the training would."""
         generator = torch.Generator(self.processes.device).manual_seed(self.settings.seed)
-        rows, noise = self.train_rows[: self.settings.frames_per_step][:ATTEMPTED_FRAMES], self.settings.noise
-        rays = self.pixels.draw(rows, about // len(rows), generator, self.at_edges)
-        draws = Draws.random(len(rays.frame), self.field.samples_in_training(1.0), noise, generator)
-        terms = self.objective(self.scene, rays, self.conditions.noisy(noise, generator), draws)
+        rows, noise = self.train_rows[: self.settings.frames_per_step][:TRIAL_FRAMES], self.settings.noise
+        rays = self.pixels.draw(rows, about // len(rows), generator, self.edge_share)
+        draws = Draws.random(len(rays.frame), self.field.training_samples(1.0), noise, generator)
+        terms = self.objective(self.scene, rays, self.conditions.with_noise(noise, generator), draws)
         return len(rays.frame), torch.stack(list(terms.values())).sum()
 
-    def _done(self) -> float:
+    def _progress(self) -> float:
         """How much of the phase is over."""
         s = self.settings
         if self.step < self.field_steps:
@@ -232,7 +234,7 @@ class Trainer:
 
     def _set_rates(self) -> None:
         phase_step = self.step if self.step < self.field_steps else self.step - self.field_steps
-        factor = FINAL_LEARNING_RATE ** self._done() * min(1.0, (phase_step + 1) / WARM_UP_STEPS)
+        factor = FINAL_LEARNING_RATE ** self._progress() * min(1.0, (phase_step + 1) / WARM_UP_STEPS)
         for group, rate in zip(self.optimizer.param_groups, self.first_rates, strict=True):
             group["lr"] = rate * factor
 
@@ -246,36 +248,36 @@ class Trainer:
     @torch.no_grad()
     def _held_out_psnr(self) -> float:
         """PSNR on person pixels of novel-pose frames in training cameras, which the field is not trained on."""
-        rays, samples = self._look(self.novel_rows, self.field.samples)
-        mixed = rays.edge & (not self.field.own_background)  # with what only such a field knows
-        error = (pixel(samples.in_box * samples.alpha, samples) - rays.colour)[rays.person & ~mixed]
+        rays, samples = self._sample_fixed_rays(self.novel_rows, self.field.samples)
+        mixed = rays.edge & (not self.field.models_background)  # with what only such a field knows
+        error = (pixel_colour(samples.in_box * samples.alpha, samples) - rays.colour)[rays.person & ~mixed]
         return float(-10 * torch.log10((error**2).mean()))
 
     @torch.no_grad()
-    def _look(self, rows: Tensor, count: int) -> tuple[Rays, RaySamples]:
+    def _sample_fixed_rays(self, rows: Tensor, count: int) -> tuple[Rays, RaySamples]:
         """Rays at some frames, the same ones each time, and what the model samples on them for a rendering, so many
         random numbers a ray."""
         generator = torch.Generator(self.processes.device).manual_seed(self.settings.seed)
         rays = self.pixels.draw(rows, HELD_OUT_RAYS // len(rows) + 1, generator)
         parts, found = math.ceil(len(rays.frame) / self.parts.most_rays), []
-        for own in (shard(rays, part, parts) for part in range(parts)):
-            draws = Draws.deterministic(len(own.frame), count, self.processes.device)
-            where = own.origins_m, own.directions, own.frame
+        for part in (shard(rays, k, parts) for k in range(parts)):
+            draws = Draws.deterministic(len(part.frame), count, self.processes.device)
+            where = part.origins_m, part.directions, part.frame
             found.append(self.field.sample(self.scene.bodies, self.scene.region, *where, self.conditions, draws)[0])
-        return rays, joined(found)
+        return rays, concatenate(found)
 
     def _require_surface(self) -> None:
         """TrainingError where the surface is empty or fills the box: of the surroundings, rays that pass the box are
         asked, away from outlines unless pixels are so large that there are no others."""
-        count = max(self.field.samples, LOOKS_A_RAY) if self.field.own_background else self.field.samples
-        rays, samples = self._look(self.train_rows, count)
+        count = max(self.field.samples, MIN_SAMPLES_PER_RAY) if self.field.models_background else self.field.samples
+        rays, samples = self._sample_fixed_rays(self.train_rows, count)
         coverage = self.field.coverage(samples)
         beside = ~rays.person & (samples.in_box > 0).any(1)
         clear = beside & ~rays.edge
         person, around = coverage[rays.person].mean(), coverage[clear if clear.any() else beside].mean()
-        if not person >= LEAST_COVERAGE:  # nor where it is not a number
+        if not person >= MIN_PERSON_COVERAGE:  # nor where it is not a number
             raise TrainingError(f"the surface is empty (covers {person:.0%} of the person): check masks and body fit")
-        if around > MOST_AROUND:
+        if around > MAX_BACKGROUND_COVERAGE:
             raise TrainingError(f"the surface fills the box (covers {around:.0%} of the surroundings): check the masks")
 
     def _state(self) -> dict[str, Any]:
@@ -368,7 +370,7 @@ def train(
     return Trainer(capture, masks, body, settings, out, processes or Distributed.join()).run()
 
 
-def _in_words(row: dict[str, Any]) -> str:
+def _progress_message(row: dict[str, Any]) -> str:
     """A row of the history for who waits: losses that are not zero, and PSNR on unseen frames where there is any."""
     message = [f"{name} {value:.2g}" for name, value in row["losses"].items() if value]
     if "held_out" in row:

@@ -6,7 +6,7 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
-from hnerf.avatar.model_file import fill_field, write_field
+from hnerf.avatar.model_file import load_field, write_field
 from hnerf.errors import InputError
 from hnerf.fields.encoding import FeatureGrids
 
@@ -22,7 +22,7 @@ def small_field(cells: int = 4) -> nn.Module:
 def written_and_read(learned: nn.Module, path: Path) -> nn.Module:
     read = small_field()
     write_field(learned, path)
-    fill_field(read, load_file(path), path)
+    load_field(read, load_file(path), path)
     return read
 
 
@@ -61,7 +61,7 @@ def test_what_lacks_a_part_is_of_another_version(tmp_path: Path, name: str):
     stored = load_file(path)
     del stored[name]
     with pytest.raises(InputError, match=r"model.safetensors: of another version; train the subject again"):
-        fill_field(small_field(), stored, path)
+        load_field(small_field(), stored, path)
 
 
 @pytest.mark.parametrize("cells", [2, 8])
@@ -69,7 +69,7 @@ def test_a_grid_of_another_size_is_of_another_version(tmp_path: Path, cells: int
     path = tmp_path / "model.safetensors"
     write_field(small_field(cells), path)
     with pytest.raises(InputError, match=r"of another version"):
-        fill_field(small_field(), load_file(path), path)
+        load_field(small_field(), load_file(path), path)
 
 
 def test_a_damaged_grid_is_of_another_version(tmp_path: Path):
@@ -78,4 +78,4 @@ def test_a_damaged_grid_is_of_another_version(tmp_path: Path):
     stored = load_file(path)
     stored["grids.levels.0.steps"] = torch.from_numpy(np.arange(20, dtype=np.uint8))
     with pytest.raises(InputError, match=r"of another version"):
-        fill_field(small_field(), stored, path)
+        load_field(small_field(), stored, path)

@@ -27,10 +27,10 @@ def render(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """The ball as a camera sees it: colour (H, W, 3) in [0, 255], black elsewhere; mask (H, W)."""
     y, x = np.mgrid[:SIZE_PX, :SIZE_PX]
     origins, directions = camera.rays(np.stack([x.ravel(), y.ravel()], 1).astype(np.float64))
-    along = ((MIDDLE_M - origins) * directions).sum(1)
-    beside_sq = ((MIDDLE_M - origins) ** 2).sum(1) - along**2
+    points_on_rays = ((MIDDLE_M - origins) * directions).sum(1)
+    beside_sq = ((MIDDLE_M - origins) ** 2).sum(1) - points_on_rays**2
     mask = beside_sq < RADIUS_M**2
-    depth = along - np.sqrt(np.maximum(RADIUS_M**2 - beside_sq, 0))
+    depth = points_on_rays - np.sqrt(np.maximum(RADIUS_M**2 - beside_sq, 0))
     normal = (origins + depth[:, None] * directions - MIDDLE_M) / RADIUS_M
     colour = np.where(mask[:, None], 127.5 + 100 * normal, 0)
     return colour.reshape(SIZE_PX, SIZE_PX, 3), mask.reshape(SIZE_PX, SIZE_PX)

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from hnerf.avatar.trained import build_field
-from hnerf.baselines.idr import SdfNetwork, intersection, trace
+from hnerf.baselines.idr import SdfNetwork, intersection, trace_surface
 from hnerf.config import load_settings
 from hnerf.errors import InputError
 from tests.baselines.ball import RADIUS_M, RING, body, inner_psnr, psnr, radii_m, trained
@@ -27,9 +27,9 @@ def sphere(points: Tensor) -> Tensor:
 def traced(distance, origins: Tensor, directions: Tensor, samples: int = 16) -> tuple[Tensor, Tensor]:
     """Traced between depths 0 and 8."""
     near, far = torch.zeros(len(origins)).to(origins), torch.full((len(origins),), 8.0).to(origins)
-    tried = torch.linspace(0, 8, samples).to(origins).expand(len(origins), -1)
-    values = distance(origins[:, None] + directions[:, None] * tried[..., None])
-    return trace(distance, origins, directions, near, far, tried, values)
+    probe_depths = torch.linspace(0, 8, samples).to(origins).expand(len(origins), -1)
+    values = distance(origins[:, None] + directions[:, None] * probe_depths[..., None])
+    return trace_surface(distance, origins, directions, near, far, probe_depths, values)
 
 
 def test_rays_meet_the_unit_sphere_where_geometry_says() -> None:

@@ -58,7 +58,7 @@ def look(field: NerfField, jitter: Draws) -> tuple[RaySamples, Tensor]:
     conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.zeros(1, dtype=torch.long), 2.5)
     origins = torch.tensor([[-3.0, 0.5, 0.5], [-3.0, 5.0, 0.5]])
     directions, frame = torch.tensor([[1.0, 0, 0]]).repeat(2, 1), torch.zeros(2, dtype=torch.long)
-    draws = dataclasses.replace(jitter, beyond=torch.ones(2, 3))
+    draws = dataclasses.replace(jitter, background=torch.ones(2, 3))
     return field.sample(bodies, field.region(bodies, conditions), origins, directions, frame, conditions, draws)
 
 
@@ -67,7 +67,7 @@ def test_both_colours_by_hand(fog: NerfField) -> None:
     coarse 0.25 (1 - e^-1) + e^-1; the ray that misses the box sees white."""
     still = Draws.deterministic(2, 24, torch.device("cpu"))
     zero = torch.zeros(2, 24)
-    samples, depths = look(fog, dataclasses.replace(still, jitter=zero, finer=zero))
+    samples, depths = look(fog, dataclasses.replace(still, jitter=zero, fine=zero))
     assert samples.alpha.shape == depths.shape == (2, 72)
     target = Target(torch.zeros(2, 3), torch.ones(2), torch.ones(2))
     fine, coarse = 0.75 + 0.25 * math.exp(-4), 0.25 + 0.75 * math.exp(-1)
@@ -128,10 +128,10 @@ def test_all_that_the_box_can_show_is_trained_on_and_drawn(fog: NerfField, tmp_p
     away sees in the middle what is inside the box, and in the corner what is not."""
     camera = record(tmp_path)[0].cameras["0"]
     vertices_m = body().vertices_m()[0].numpy()
-    assert fog.reached(camera, vertices_m).all()
+    assert fog.visible_pixels(camera, vertices_m).all()
     away = dataclasses.replace(camera, t_m=camera.t_m + np.array([0, 0, 10.0]))
-    reached = fog.reached(away, vertices_m)
-    assert reached[len(reached) // 2, reached.shape[1] // 2] and not reached[0, 0]
+    visible_pixels = fog.visible_pixels(away, vertices_m)
+    assert visible_pixels[len(visible_pixels) // 2, visible_pixels.shape[1] // 2] and not visible_pixels[0, 0]
 
 
 def test_two_opposite_views_say_nothing_of_the_view_between(tmp_path: Path) -> None:

@@ -9,9 +9,9 @@ from hnerf.baselines.nerfies import (
     Deformation,
     NerfiesField,
     annealed,
-    choose,
     elastic_energy,
     jacobian,
+    sample_index,
     screw_motion,
 )
 from hnerf.body.canonical import PosedBodies
@@ -99,8 +99,8 @@ def test_jacobian_of_the_deformation_in_double() -> None:
 def test_samples_are_chosen_by_weight() -> None:
     """Weights 1, 0, 3: the first quarter of draws takes the first, the rest the last; no weight, the last."""
     weights = torch.tensor([[1.0, 0.0, 3.0]]).repeat(4, 1)
-    assert choose(weights, torch.tensor([0.0, 0.24, 0.26, 0.999])).tolist() == [0, 0, 2, 2]
-    assert choose(torch.zeros(1, 3), torch.tensor([0.5])).tolist() == [2]
+    assert sample_index(weights, torch.tensor([0.0, 0.24, 0.26, 0.999])).tolist() == [0, 0, 2, 2]
+    assert sample_index(torch.zeros(1, 3), torch.tensor([0.5])).tolist() == [2]
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def field() -> NerfiesField:
     return NerfiesField(three_poses(), load_settings("nerfies", SMALL).training.nerfies)
 
 
-def look(field: NerfiesField, training: bool) -> RaySamples:
+def evaluate(field: NerfiesField, training: bool) -> RaySamples:
     """One ray from above through the upright column."""
     fit = three_poses()
     bodies = PosedBodies(fit.rig, fit.theta, fit.root, field.canonical_m)
@@ -123,10 +123,10 @@ def look(field: NerfiesField, training: bool) -> RaySamples:
 
 def test_steps_of_the_training_count_and_looking_does_not(field: NerfiesField) -> None:
     """A step may look twice, with one half of its rays each."""
-    assert look(field, training=False).elastic is None
-    assert look(field, training=True).elastic is not None
+    assert evaluate(field, training=False).elastic is None
+    assert evaluate(field, training=True).elastic is not None
     assert field.steps_taken == 0
-    field.step_taken()
+    field.on_step_end()
     assert field.state_dict()["steps_taken"] == 1
 
 
@@ -135,9 +135,9 @@ def test_what_stands_still_or_turns_as_a_whole_costs_nothing_and_what_swells_doe
     with torch.no_grad():
         field.deformation.screw.bias.copy_(torch.tensor([0.4, -0.2, 0.7, 0.1, 0.0, -0.3]))
         field.deformation.screw.weight.zero_()
-    rigid = look(field, training=True).elastic
+    rigid = evaluate(field, training=True).elastic
     torch.nn.init.normal_(field.deformation.screw.weight)
-    swollen = look(field, training=True).elastic
+    swollen = evaluate(field, training=True).elastic
     assert rigid is not None and swollen is not None
     assert rigid.item() < 1e-6 and swollen.item() > 1e-2
 

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from hnerf.baselines.neural_body import NeuralBodyField, Surroundings
+from hnerf.baselines.neural_body import NeuralBodyField, NeuralBodyRegion
 from hnerf.body.canonical import PosedBodies
 from hnerf.config import load_settings
 from hnerf.fields.conditions import Conditions, Draws
@@ -38,7 +38,7 @@ def posed(field: NeuralBodyField, root: torch.Tensor | None = None) -> tuple[Pos
     return bodies, Conditions.of(fit.rig, theta, root, moment, 2.5)
 
 
-def look(field: NeuralBodyField, region: Surroundings, rows: list[int]) -> torch.Tensor:
+def look(field: NeuralBodyField, region: NeuralBodyRegion, rows: list[int]) -> torch.Tensor:
     """Colour of two rays' samples in these rows."""
     bodies, conditions = posed(field)
     draws = Draws.deterministic(2, field.samples, torch.device("cpu"))

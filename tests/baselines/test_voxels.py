@@ -43,7 +43,7 @@ def test_agrees_with_dense_convolution_where_voxels_are_active() -> None:
     sparse, kernel = convolution(3, 2)
     level = Level.of(coordinates, None)
     wanted = torch.nn.functional.conv3d(dense(coordinates, values, SIZE), kernel, padding=1).relu()
-    found = sparse(padded(values), level.beside)
+    found = sparse(padded(values), level.neighbours)
     torch.testing.assert_close(found[:-1], wanted[0][:, *coordinates.T].T, atol=1e-6, rtol=1e-5)
     assert not found[-1].any()
 
@@ -60,7 +60,7 @@ def test_stride_two_agrees_with_dense_convolution() -> None:
     met = torch.nn.functional.max_pool3d(active.float()[None], 3, stride=2, padding=1)[0] > 0
     there = coordinates_of(coarse)
     assert sorted(map(tuple, there.tolist())) == sorted(map(tuple, torch.nonzero(met).tolist()))
-    found = sparse(padded(by_row), coarse.below)[:-1]
+    found = sparse(padded(by_row), coarse.finer_neighbours)[:-1]
     torch.testing.assert_close(found, wanted[0][:, *there.T].T, atol=1e-6, rtol=1e-5)
 
 
@@ -73,7 +73,7 @@ def test_reads_as_a_dense_grid_does() -> None:
     wanted = torch.nn.functional.grid_sample(
         dense(coordinates, values, SIZE), unit, align_corners=True, padding_mode="zeros"
     )
-    found = Level.of(coordinates, None).read(padded(values), at)
+    found = Level.of(coordinates, None).interpolate(padded(values), at)
     torch.testing.assert_close(found, wanted[0, :, 0, 0].T, atol=1e-5, rtol=1e-5)
 
 

@@ -119,7 +119,7 @@ def test_strided_frames_show_what_is_less_than_a_frame_off(tmp_path: Path, no_pi
     capture = capture_of(tmp_path / "in", strided, frames=tuple(range(0, 4 * FRAMES, 4)))
     report = check_calibration(capture, SETTINGS)
     assert report.verdicts["c0"].frame_offset == pytest.approx(0.8, abs=0.1)
-    assert any("pictures of camera c0 are -0.8" in note for note in report.notes)
+    assert any("images of camera c0 are -0.8" in note for note in report.notes)
     report.save(tmp_path / "out")
     used = load_cameras(tmp_path / "out", capture)
     assert used.frames == capture.frames

@@ -27,13 +27,13 @@ def spread(noise: Tensor) -> None:
 def test_noise_on_pose_and_root() -> None:
     """Gaussian, of its own in each number of each frame; the frame stays what it is."""
     given = Conditions(torch.full((2000, 3), 0.7), torch.full((2000, 12), -0.3), torch.arange(2000))
-    noisy = given.noisy(0.1, torch.Generator().manual_seed(0))
+    noisy = given.with_noise(0.1, torch.Generator().manual_seed(0))
     both = torch.cat([noisy.pose - given.pose, noisy.root - given.root], 1)
     spread(both)
     apart = torch.corrcoef(both.T) - torch.eye(15)
     assert apart.abs().max() < 0.1
     assert 0.002 < (both.abs() > 0.3).float().mean() < 0.0035  # of a Gaussian 0.0027 lie beyond three deviations
-    assert torch.equal(noisy.moment, given.moment)
+    assert torch.equal(noisy.frame_row, given.frame_row)
 
 
 def test_draws_of_a_step() -> None:
@@ -41,7 +41,7 @@ def test_draws_of_a_step() -> None:
     draws = Draws.random(2000, 3, 0.1, torch.Generator().manual_seed(0))
     assert draws.view is not None and draws.probe is not None
     spread(draws.view)
-    uniform = torch.cat([draws.jitter, draws.finer, draws.beyond, draws.probe[:, None]], 1)
+    uniform = torch.cat([draws.jitter, draws.fine, draws.background, draws.probe[:, None]], 1)
     assert uniform.shape == (2000, 10) and uniform.min() >= 0 and uniform.max() < 1
     assert (uniform.mean(0) - 0.5).abs().max() < 0.03 and (uniform.std(0) - 12**-0.5).abs().max() < 0.02
     apart = torch.corrcoef(torch.cat([uniform, draws.view], 1).T) - torch.eye(13)
@@ -51,5 +51,5 @@ def test_draws_of_a_step() -> None:
 def test_a_rendering_draws_nothing() -> None:
     """Samples in the middle of their strata, black beyond, no noise and no regularisation."""
     still = Draws.deterministic(2, 3, torch.device("cpu"))
-    assert (still.jitter == 0.5).all() and (still.finer == 0.5).all() and not still.beyond.any()
+    assert (still.jitter == 0.5).all() and (still.fine == 0.5).all() and not still.background.any()
     assert still.view is None and still.probe is None

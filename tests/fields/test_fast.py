@@ -10,8 +10,16 @@ from hnerf.body.canonical import Descriptor, PosedBodies
 from hnerf.config import FastFieldSettings
 from hnerf.fields.base import Field
 from hnerf.fields.conditions import Conditions, Draws
-from hnerf.fields.fast import ROOM_M, SAMPLES, SETTLED, SPACING_M, TIGHTEN_STEP_M, FastField, at_surface
-from hnerf.training.losses import pixel
+from hnerf.fields.fast import (
+    SAMPLE_COUNTS,
+    SATURATED_LOGIT,
+    SHELL_MARGIN_M,
+    SPACING_M,
+    TIGHTEN_STEP_M,
+    FastField,
+    move_to_surface,
+)
+from hnerf.training.losses import pixel_colour
 from tests.body.boxes import box_rig
 
 RIG = box_rig(splits=3)
@@ -45,10 +53,10 @@ def test_the_shell_is_tightened_to_where_the_opacity_changes():
     sharp, soft = field_of(1000.0), field_of(10.0)
     for field in (sharp, soft):
         field.tighten(RIG, conditions.pose)
-    seen_m = SETTLED / 1000
+    seen_m = SATURATED_LOGIT / 1000
     for thickness in (sharp.outer_m, sharp.inner_m):
-        assert (thickness <= seen_m + ROOM_M + 1e-6).all()
-        assert thickness.max().item() == pytest.approx(seen_m + ROOM_M, abs=TIGHTEN_STEP_M)
+        assert (thickness <= seen_m + SHELL_MARGIN_M + 1e-6).all()
+        assert thickness.max().item() == pytest.approx(seen_m + SHELL_MARGIN_M, abs=TIGHTEN_STEP_M)
     assert soft.outer_m.max().item() == pytest.approx(SETTINGS.outer_m)
     assert soft.inner_m.max().item() == pytest.approx(SETTINGS.inner_m)
 
@@ -106,8 +114,8 @@ def test_a_picture_with_as_many_samples_as_the_way_asks_for_is_that_of_many(monk
     directions = torch.tensor([[0.0, 0.0, -1.0], [0.0, -0.02, -1.0], [0.05, 0.1, -1.0], [0.0, 0.0, -1.0]])
     directions = torch.nn.functional.normalize(directions, dim=-1)
     rays = (bodies, field.region(bodies, conditions), origins, directions, torch.zeros(4, dtype=torch.long), conditions)
-    needed = field.region(bodies, conditions).path_m(*rays[2:5]) / SPACING_M
-    assert len({sum(float(n) > count for count in SAMPLES) for n in needed}) >= 3
+    needed = field.region(bodies, conditions).path_length_m(*rays[2:5]) / SPACING_M
+    assert len({sum(float(n) > count for count in SAMPLE_COUNTS) for n in needed}) >= 3
     found = field.look(*rays)
     monkeypatch.setattr(FastField, "samples_needed", Field.samples_needed)
     expected = field.look(*rays)
@@ -185,7 +193,7 @@ def test_the_shell_moves_with_the_surface_of_a_frame():
 def test_training_begins_with_half_the_samples():
     """Of 32 samples 16 for three quarters of the steps, then all; a rendering has what it asks for."""
     field = FastField(RIG, SETTINGS, 1)
-    assert [field.samples_in_training(done) for done in (0.0, 0.74, 0.75, 1.0)] == [16, 16, 32, 32]
+    assert [field.training_samples(done) for done in (0.0, 0.74, 0.75, 1.0)] == [16, 16, 32, 32]
 
 
 def on_a_ray(depth_m: list[float], near: list[bool]) -> Descriptor:
@@ -199,7 +207,7 @@ def test_colours_are_those_of_the_surface_between_two_samples():
     """Heights 12, 6, -2, -8 mm above the skin, and a surface 1 mm above it: the second sample moves 5 / 8 of the way to
     the third, the first as near as the second one; those behind stay."""
     described = on_a_ray([0.012, 0.006, -0.002, -0.008], [True] * 4)
-    moved = at_surface(described, described.d[None] - 0.001)
+    moved = move_to_surface(described, described.d[None] - 0.001)
     expected = torch.tensor([0.006, 0.001, -0.002, -0.008])
     assert torch.allclose(moved.d, expected, atol=1e-7)
     assert torch.allclose(moved.y[:, 2], expected, atol=1e-7)
@@ -209,7 +217,7 @@ def test_colours_are_those_of_the_surface_between_two_samples():
 def test_samples_stay_where_the_next_one_is_out_of_reach_or_on_another_limb():
     described = on_a_ray([0.005, -0.005, 0.005, -0.005], [True, False, True, True])
     described.y[3, 0] = 0.1
-    moved = at_surface(described, described.d[None])
+    moved = move_to_surface(described, described.d[None])
     assert torch.equal(moved.d, described.d)
     assert torch.equal(moved.y, described.y)
 
@@ -220,17 +228,17 @@ def test_a_surface_is_met_at_the_same_point_when_its_body_moves_along_the_ray():
     later in x."""
     x, height = torch.tensor([[0.0, 0.004], [0.003, -0.001]], dtype=torch.double)
 
-    def met_at(along: torch.Tensor, down: torch.Tensor) -> torch.Tensor:
-        d = height + along + down
-        y = torch.stack([x - along, torch.zeros_like(x), d], 1)
+    def met_at(points_on_rays: torch.Tensor, down: torch.Tensor) -> torch.Tensor:
+        d = height + points_on_rays + down
+        y = torch.stack([x - points_on_rays, torch.zeros_like(x), d], 1)
         described = dataclasses.replace(on_a_ray([0.0, 0.0], [True] * 2), d=d, y=y, normal=y)
-        return at_surface(described, d[None]).y[0]
+        return move_to_surface(described, d[None]).y[0]
 
     still = torch.zeros((), dtype=torch.double, requires_grad=True)
     skin = torch.tensor([0.003, 0.0, 0.0], dtype=torch.double)
     torch.testing.assert_close(met_at(still, still), skin, atol=1e-12, rtol=0)
-    along, down = torch.autograd.functional.jacobian(met_at, (still, still))
-    torch.testing.assert_close(along, torch.zeros_like(skin), atol=1e-9, rtol=0)
+    points_on_rays, down = torch.autograd.functional.jacobian(met_at, (still, still))
+    torch.testing.assert_close(points_on_rays, torch.zeros_like(skin), atol=1e-9, rtol=0)
     torch.testing.assert_close(down, torch.tensor([1.0, 0.0, 0.0], dtype=torch.double), atol=1e-9, rtol=0)
     assert torch.autograd.gradcheck(met_at, (still, still), eps=1e-7)
 
@@ -249,7 +257,7 @@ def test_a_pixel_pulls_at_its_body_as_its_colour_changes_when_the_body_moves():
         moved = {"move_m": move_m[None], "turn": correction.turn, "shape": correction.shape}
         where = (bodies, field.region(bodies, conditions), *rays)
         samples, _ = field.sample(*where, conditions, draws, SimpleNamespace(**moved))
-        return pixel(samples.alpha, samples)[0]
+        return pixel_colour(samples.alpha, samples)[0]
 
     step_m = 1e-4
     steps = [(colour(step_m * axis) - colour(-step_m * axis)) / (2 * step_m) for axis in torch.eye(3)]
@@ -261,11 +269,11 @@ def test_a_pixel_pulls_at_its_body_as_its_colour_changes_when_the_body_moves():
 def test_a_ray_that_grazes_the_surface_has_finite_gradients():
     described = on_a_ray([0.001, 0.001, 0.0, 0.0], [True] * 4)
     d_hat = described.d[None].requires_grad_()
-    at_surface(described, d_hat).y.sum().backward()
+    move_to_surface(described, d_hat).y.sum().backward()
     assert d_hat.grad is not None
     assert torch.isfinite(d_hat.grad).all()
 
 
 def test_samples_stay_where_the_surface_is_left():
     described = on_a_ray([0.001, 0.004, 0.004, 0.009], [True] * 4)
-    assert torch.equal(at_surface(described, described.d[None]).d, described.d)
+    assert torch.equal(move_to_surface(described, described.d[None]).d, described.d)

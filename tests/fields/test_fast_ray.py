@@ -49,7 +49,7 @@ def sampled(field: FastField, probe: float | None = None) -> RaySamples:
     conditions = Conditions.of(RIG, THETA, ROOT, torch.arange(2), 2.5)
     draws = Draws(torch.full((1, 12), 0.5), torch.rand(1, 3), torch.zeros(1, 12))
     if probe is not None:
-        draws = Draws(draws.jitter, draws.beyond, draws.finer, torch.tensor([probe]))
+        draws = Draws(draws.jitter, draws.background, draws.fine, torch.tensor([probe]))
     return field.sample(bodies, field.region(bodies, conditions), *RAY, conditions, draws, bodies.correction())[0]
 
 

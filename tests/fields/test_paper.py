@@ -187,7 +187,7 @@ def test_density_counts_per_scene_unit(static: bool) -> None:
     ways_m = [0.2, 0.3, 0.7, 0.1, 0.9, 0.7, 0.3]
     same(samples.alpha, rows([[1 - 0.5**way for way in ways_m] + [1.0]]))
     same(samples.density, torch.full((1, 8), 2 * math.log(2)))
-    assert not samples.beyond.any()
+    assert not samples.background.any()
 
 
 @pytest.mark.parametrize(

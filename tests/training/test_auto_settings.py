@@ -47,10 +47,10 @@ def test_no_finer_than_frames_align():
 
 
 @pytest.mark.parametrize("still", [{"frames": 1}, {"std_rad": 0.001}])
-def test_one_posture_is_as_fine_as_its_pixels(still: dict):
+def test_one_posture_is_as_fine_as_its_pixels(nearly_static: dict):
     """Down to 8 mm: 240 cells on 1.92 m, 160 for geometry, a sample each 4.8 mm: 2.4 x 8 cm / 4.8 mm = 40."""
     for footprint_m in (0.008, 0.001):
-        settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": footprint_m, **still}))
+        settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": footprint_m, **nearly_static}))
         assert (settings.fast.colour_cells[-1], settings.fast.geometry_cells[-1]) == (240, 160)
         assert settings.fast.samples == 40
         assert "there is one posture: cells of 8.0 mm" in decisions["fast.colour_cells"].reason

@@ -11,7 +11,7 @@ from hnerf.fields.fast import FastField
 from hnerf.fields.paper import PaperField
 from hnerf.training.distributed import Distributed
 from hnerf.training.step import TrainingError
-from hnerf.training.trainer import LEAST_COVERAGE, Trainer
+from hnerf.training.trainer import MIN_PERSON_COVERAGE, Trainer
 from tests.training.scene import TINY, record
 
 FAR = 10.0  # units of the residual's last layer: metres away in either machinery
@@ -23,12 +23,12 @@ def trainer_of(folder: Path, machinery: str) -> Trainer:
     return Trainer(*record(folder / "capture"), settings, folder, Distributed(0, 1, torch.device("cpu")))
 
 
-def move_surface(field: Field, outwards: float) -> None:
+def move_surface(field: Field, normal_displacement: float) -> None:
     """Add so much to the distance that the field's network takes from the body's."""
     assert isinstance(field, PaperField | FastField)
     last = field.residual.residual if isinstance(field, PaperField) else field.field.geometry[-1]
     assert isinstance(last, nn.Linear)
-    last.bias.data.sub_(outwards)
+    last.bias.data.sub_(normal_displacement)
 
 
 @pytest.mark.parametrize("machinery", ["fast", "paper"])
@@ -40,8 +40,8 @@ def test_a_surface_between_the_samples_of_a_training_is_no_collapse(tmp_path: Pa
     """Two samples a ray, across 5 m, hardly ever fall into the column."""
     trainer = trainer_of(tmp_path, "paper")
     trainer.field.samples = 2
-    rays, samples = trainer._look(trainer.train_rows, 2)
-    assert trainer.field.coverage(samples)[rays.person].mean() < LEAST_COVERAGE
+    rays, samples = trainer._sample_fixed_rays(trainer.train_rows, 2)
+    assert trainer.field.coverage(samples)[rays.person].mean() < MIN_PERSON_COVERAGE
     trainer._require_surface()
 
 
@@ -53,9 +53,9 @@ def test_a_surface_between_the_samples_of_a_training_is_no_collapse(tmp_path: Pa
         (FAR, r"surface fills the box \(covers 100% of the surroundings\): check the masks"),
     ],
 )
-def test_a_collapsed_surface_is_an_error(tmp_path: Path, machinery: str, outwards: float, message: str):
+def test_a_collapsed_surface_is_an_error(tmp_path: Path, machinery: str, normal_displacement: float, message: str):
     trainer = trainer_of(tmp_path, machinery)
-    move_surface(trainer.field, outwards)
+    move_surface(trainer.field, normal_displacement)
     with pytest.raises(TrainingError, match=message):
         trainer.run()
 

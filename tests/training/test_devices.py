@@ -22,7 +22,7 @@ WITH_GPU = torch.cuda.is_available()
 
 @pytest.mark.parametrize("machinery", ["fast", "paper", "nerf", "idr", "nerfies"])
 def test_trains_loads_and_renders_on_one_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, machinery: str):
-    monkeypatch.setattr(trainer_module, "LEAST_COVERAGE", 0.0)
+    monkeypatch.setattr(trainer_module, "MIN_PERSON_COVERAGE", 0.0)
     capture, masks, body = record(tmp_path / "capture")
     camera = capture.cameras[capture.train_cameras[0]]
     changes = {"machinery": machinery, "one_posture": False, "steps": 2, "novel_pose_steps": 1}

@@ -14,7 +14,7 @@ from hnerf.avatar.trained import TrainedAvatar, build_field
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.geometry.reach import everywhere
 from hnerf.training.distributed import Distributed
-from hnerf.training.exposure import _in_sight, camera_gains, solve_gains
+from hnerf.training.exposure import _visible_vertices, camera_gains, solve_gains
 from hnerf.training.gather import gather_pixels
 from tests.training.scene import TINY, KnownMasks, look_at, record
 
@@ -29,9 +29,9 @@ def photograph(name: str, gain: tuple[float, ...]) -> np.ndarray:
     camera = RING[name]
     y, x = np.mgrid[:128, :128]
     origin, directions = camera.rays(np.stack([x, y], -1).reshape(-1, 2).astype(float))
-    along = -(origin * directions).sum(1)
-    missed2 = (origin**2).sum(1) - along**2
-    hit_m = origin + (along - np.sqrt((1 - missed2).clip(0)))[:, None] * directions
+    points_on_rays = -(origin * directions).sum(1)
+    missed2 = (origin**2).sum(1) - points_on_rays**2
+    hit_m = origin + (points_on_rays - np.sqrt((1 - missed2).clip(0)))[:, None] * directions
     level = np.where(missed2 < 1, 100 + 40 * hit_m[:, 2], 128)
     return (level[:, None] * gain).round().reshape(128, 128, 3).astype(np.uint8)
 
@@ -95,23 +95,23 @@ def test_nothing_is_changed_where_shading_may_be_the_cause_or_nobody_compares() 
 def test_what_is_hidden_is_not_in_sight() -> None:
     """A ball of a quarter of the size between camera a and the other one hides the middle of it."""
     small = trimesh.creation.icosphere(subdivisions=4, radius=0.25).apply_translation([2, 0, 0])
-    seen, _ = _in_sight(RING["a"], Surface(trimesh.util.concatenate([BALL, small])))
+    seen, _ = _visible_vertices(RING["a"], Surface(trimesh.util.concatenate([BALL, small])))
     places = BALL.vertices[seen[: len(BALL.vertices)]]
     assert len(places) > 100
     assert (np.hypot(places[:, 1], places[:, 2]) / (4 - places[:, 0]) > 0.12).all()  # beside the small one's cone
     assert seen[len(BALL.vertices) :].any()
     turned = np.diag([-1.0, 1, -1])
     away = dataclasses.replace(RING["a"], R=turned @ RING["a"].R, t_m=turned @ RING["a"].t_m)
-    assert not _in_sight(away, Surface(BALL))[0].any()  # it is behind the camera
+    assert not _visible_vertices(away, Surface(BALL))[0].any()  # it is behind the camera
 
 
-def test_pixels_are_levelled_by_their_cameras(tmp_path: Path) -> None:
+def test_pixels_are_corrected_by_the_gains_of_their_cameras(tmp_path: Path) -> None:
     capture, masks, body = record(tmp_path)
     gains = {"0": (2.0, 1.0, 0.5)} | dict.fromkeys(capture.train_cameras[1:], (1.0, 1.0, 1.0))
     pixels, exposure_corrected = (
         gather_pixels(capture, masks, body, body.frames, everywhere, by, tmp_path, ALONE) for by in ({}, gains)
     )
-    first = pixels.where(torch.arange(len(pixels.person)))[0] == 0
+    first = pixels.cameras_and_xy(torch.arange(len(pixels.person)))[0] == 0
     assert exposure_corrected.colour[first & pixels.person].unique(dim=0).tolist() == [[100, 50, 100]]  # of 200, 50, 50
     assert pixels.plate is not None and exposure_corrected.plate is not None
     assert exposure_corrected.plate[first].unique(dim=0).tolist() == [[64, 128, 255]]  # of 128

@@ -23,7 +23,7 @@ SAMPLES = RaySamples(
     d=torch.tensor([[0.05, 0.01], [0.10, 0.20]]),
     residual=torch.tensor([[-0.02, -0.03], [0.04, -0.05]]),
     gradient_norm=torch.tensor([1.5, 0.8]),
-    beyond=torch.tensor([BLACK, BLACK]),
+    background=torch.tensor([BLACK, BLACK]),
     elastic=torch.tensor([0.2]),
 )
 TARGET = Target(colour=torch.tensor([RED, BLACK]), person=torch.tensor([1.0, 0.0]), weight=torch.ones(2))

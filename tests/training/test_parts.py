@@ -10,7 +10,7 @@ from hnerf.fields.conditions import Draws
 from hnerf.training import parts as parts_module
 from hnerf.training import trainer as trainer_module
 from hnerf.training.distributed import Distributed
-from hnerf.training.parts import GIB, PEAK, USABLE, Parts, decide_parts
+from hnerf.training.parts import GIB, PEAK_FACTOR, USABLE_SHARE, Parts, decide_parts
 from hnerf.training.pixels import Rays
 from tests.training.first_step import gradients, untrained
 
@@ -67,14 +67,14 @@ def test_parts_follow_from_the_memory_that_a_ray_needs(
 ) -> None:
     """8 KiB a ray and 8000 bytes beside them, in room for 100 rays and a half, given or free."""
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
-    monkeypatch.setattr(Distributed, "greatest", lambda self, value: value)
-    room = PEAK * (8000 + 8192 * 100.5)
+    monkeypatch.setattr(Distributed, "all_max", lambda self, value: value)
+    room = PEAK_FACTOR * (8000 + 8192 * 100.5)
     processes = Distributed(0, world_size, CPU)
     made, decision = decide_parts(rays, room / GIB, attempted, processes)
     assert made.count == decision.value == parts
     assert made.most_rays == pytest.approx(100.5, abs=0.01)
     assert decision.reason.startswith("a ray needs 0.01 MiB")
-    monkeypatch.setattr(parts_module, "_free_bytes", lambda processes: room / USABLE)
+    monkeypatch.setattr(parts_module, "_free_bytes", lambda processes: room / USABLE_SHARE)
     assert decide_parts(rays, None, attempted, processes)[0].count == parts
 
 
@@ -83,7 +83,7 @@ def test_what_fits_is_taken_in_halves_side_by_side_on_a_cpu(monkeypatch: pytest.
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     made, decision = decide_parts(100, 1.0, attempted, ALONE)
     assert made.count == decision.value == 2 and made.pool is not None
-    made, _ = decide_parts(100, PEAK * (8000 + 8192 * 50.5) / GIB, attempted, ALONE)
+    made, _ = decide_parts(100, PEAK_FACTOR * (8000 + 8192 * 50.5) / GIB, attempted, ALONE)
     assert made.count == 2 and made.pool is None
 
 
@@ -94,7 +94,7 @@ def test_memory_changes_the_number_of_parts_and_not_the_gradients(
     """128 rays of a MB each in 50 MB: 43, 43 and 42. What is looked at meanwhile is split likewise."""
     monkeypatch.setattr(trainer_module, "HELD_OUT_RAYS", 300)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
-    monkeypatch.setattr(parts_module, "_peak_bytes", lambda attempt, about, device: (about, 1e6 * about))
+    monkeypatch.setattr(parts_module, "_peak_bytes", lambda trial_loss, about, device: (about, 1e6 * about))
     found = []
     for memory_gib, count in ((None, 1), (50e6 / GIB, 3)):
         trainer = untrained(tmp_path, machinery, ALONE, memory_gib=memory_gib)

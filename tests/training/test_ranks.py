@@ -65,7 +65,7 @@ def test_one_process_goes_on_where_two_were_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """From the checkpoint at step six to the end, as well as one process does from the start."""
-    monkeypatch.setattr(trainer_module, "LEAST_COVERAGE", 0.0)
+    monkeypatch.setattr(trainer_module, "MIN_PERSON_COVERAGE", 0.0)
     killed, whole = tmp_path / "killed", tmp_path / "whole"
     killed.mkdir(), whole.mkdir()
     (tmp_path / "rank.py").write_text(KILLED)

@@ -32,7 +32,7 @@ def with_changes(**changes: object) -> TrainingSettings:
 @pytest.fixture(autouse=True)
 def any_surface(monkeypatch: pytest.MonkeyPatch) -> None:
     """A dozen steps leave no surface worth judging; tests of the judgement set their own bar."""
-    monkeypatch.setattr(trainer_module, "LEAST_COVERAGE", 0.0)
+    monkeypatch.setattr(trainer_module, "MIN_PERSON_COVERAGE", 0.0)
 
 
 @pytest.mark.parametrize("machinery", ["fast", "paper"])
@@ -291,9 +291,10 @@ def test_a_gradient_that_is_not_finite_skips_the_step(tmp_path: Path, monkeypatc
 
 def test_progress_is_told_in_words():
     row = {"step": 25, "seconds": 7.0, "losses": {"reconstruction": 0.1234, "elastic": 0.0}}
-    assert trainer_module._in_words(row) == "reconstruction 0.12"
+    assert trainer_module._progress_message(row) == "reconstruction 0.12"
     assert (
-        trainer_module._in_words(row | {"held_out": {"psnr": 17.06}}) == "reconstruction 0.12, 17.1 dB on unseen frames"
+        trainer_module._progress_message(row | {"held_out": {"psnr": 17.06}})
+        == "reconstruction 0.12, 17.1 dB on unseen frames"
     )
 
 
@@ -340,10 +341,10 @@ def test_a_field_with_its_own_background_learns_from_every_pixel(tmp_path: Path)
     scene = record(tmp_path)
     height, width = scene[0].image("0", 0).shape[:2]
     images = len(scene[0].train_cameras) * len(scene[2].frames)
-    for machinery, whole, at_edges in (("paper", True, 0.0), ("fast", False, 1 / 3)):
+    for machinery, whole, edge_share in (("paper", True, 0.0), ("fast", False, 1 / 3)):
         trainer = Trainer(*scene, with_changes(machinery=machinery), tmp_path / "out", ALONE)
         assert (len(trainer.pixels.edge) == images * height * width) == whole
-        assert trainer.at_edges == pytest.approx(at_edges)
+        assert trainer.edge_share == pytest.approx(edge_share)
 
 
 def test_a_step_has_as_many_rays_however_few_the_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -109,7 +109,7 @@ def test_rates_rise_for_20_steps_and_fall_to_a_tenth(tmp_path: Path) -> None:
             assert rates == pytest.approx([factor * rate for rate in trainer.first_rates])
 
 
-def test_cameras_are_levelled_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exposure_is_corrected_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Camera 2 shows red twice as bright as the others do: the person is (200, 50, 50) before a plate of 128."""
     gains = dict.fromkeys("0123", (1.0, 1.0, 1.0)) | {"2": (2.0, 1.0, 1.0)}
     monkeypatch.setattr(trainer_module, "camera_gains", lambda *inputs: (gains, Decision(2.0, "twice as bright")))
