@@ -1,7 +1,7 @@
-"""H-NeRF as published: F and DH of the paper, whole rays, background included.
+"""H-NeRF as published: the networks F and DH, whole rays, background included.
 
-Distances are in scene units (metres / scene_m) inside the networks and losses, metres outside. One network F serves the
-coarse and the fine samples; the fine ones are drawn from the coarse weights without a gradient, and the losses see
+Distances are in scene units (metres / scene_m) inside the networks and losses, in metres outside. One network F serves
+the coarse and the fine samples; the fine ones are drawn from the coarse weights without a gradient, and the losses see
 both.
 """
 
@@ -22,13 +22,13 @@ OUTSIDE_DISTANCE = 1.0  # the constant d of a point outside the person's box
 
 
 class PaperField(Field):
-    """F and DH; dynamic: on (s, d) and theta; static (one frame): on x itself, unconditioned."""
+    """F and DH. Dynamic: conditioned on (s, d) and theta. Static (one frame): on x itself, unconditioned."""
 
     models_background = True
     centre_m: Tensor
 
     def __init__(self, rig: Rig, root: Tensor, settings: PaperFieldSettings, static: bool):
-        """root (n, 4, 4): the training poses, which the scene is centred on."""
+        """Build an untrained field. root (n, 4, 4): the training poses, on which the scene is centred."""
         super().__init__()
         self.settings, self.static = settings, static
         self.whole_images = settings.rays == "image"
@@ -41,11 +41,11 @@ class PaperField(Field):
         self.residual = ResidualMLP(point, pose, settings.bf16)
 
     def region(self, bodies: PosedBodies, conditions: Conditions) -> Boxes:
-        """Box B of each pose: the body's extent and a margin."""
+        """Return the box B of each pose: the body's extent and a margin."""
         return Boxes.around(bodies.vertices_m, self.margin_m)
 
     def parameter_groups(self) -> list[dict]:
-        """Adam groups."""
+        """Return parameter groups for Adam."""
         return [{"params": list(self.parameters()), "lr": self.settings.learning_rate}]
 
     def sample(
@@ -59,7 +59,7 @@ class PaperField(Field):
         draws: Draws,
         correction: PoseCorrection | None = None,
     ) -> tuple[RaySamples, Tensor]:
-        """As FastField.sample, over coarse and fine samples together (K = 2 x samples)."""
+        """Evaluate rays as Field.sample does, at coarse and fine samples together (K = 2 x samples)."""
         half_m, inner = self.settings.scene_m, self.settings.box_samples
         near, far = box_interval(origins_m, directions, self.centre_m - half_m, self.centre_m + half_m)
         coarse = stratified(near, far, draws.jitter[:, inner:])
@@ -136,7 +136,8 @@ class PaperField(Field):
     def _radiance(
         self, points_m: Tensor, described: Descriptor, pick: Tensor, row: Tensor, view: Tensor, conditions: Conditions
     ) -> tuple[Tensor, Tensor]:
-        """Outside the box the input is x with a constant distance, and neither pose nor root counts."""
+        """Return density and colour. Outside the box the input is x with a constant distance, and neither pose nor root
+        counts."""
         scaled = self._scaled(points_m)
         if self.static:
             return self.radiance(scaled, conditions.pose[row, :0], conditions.root[row, :0], view)
@@ -148,17 +149,17 @@ class PaperField(Field):
         return self.radiance(outside.index_copy(0, pick, inner), pose, root, view)
 
     def coverage(self, samples: RaySamples) -> Tensor:
-        """By the SDF: its greatest occupancy along a ray, which is what the loss `seg` compares with the mask."""
+        """Return the greatest occupancy of the SDF along each ray, which the loss `seg` compares with the mask."""
         return (samples.in_box * samples.alpha_dot).amax(1)
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
-        """d_hat (N,) metres at points (N, 3) around the first body."""
+        """Return d_hat (N,) in metres at points (N, 3) around the first body."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         described = bodies.describe(points_m, row, FAR_M, exact_sign=True)
         return described.d + self.settings.scene_m * self._residual(points_m, described, row, conditions)
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
-        """c (N, 3) at points around the first body seen along directions (N, 3)."""
+        """Return c (N, 3) at points around the first body, seen along directions (N, 3)."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         described = bodies.describe(points_m, row, FAR_M)
         return self._radiance(
@@ -167,9 +168,11 @@ class PaperField(Field):
 
 
 def sample_pdf(middles: Tensor, near: Tensor, far: Tensor, weights: Tensor, uniform: Tensor) -> Tensor:
-    """Depths (R, K) drawn from piecewise constant weights (R, K) (Mildenhall et al. 2020, section 5.2).
+    """Draw depths (R, K) from piecewise constant weights (R, K) by inverse transform sampling (Mildenhall et al. 2020,
+    section 5.2).
 
-    middles (R, K): the samples that the weights belong to; their cells meet half-way. uniform (R, K) in [0, 1): strata.
+    middles (R, K): the samples of these weights; their cells meet half-way between samples. uniform (R, K) in [0, 1):
+    position in each stratum.
     """
     edges = torch.cat([near[:, None], (middles[:, 1:] + middles[:, :-1]) / 2, far[:, None]], 1)
     cumulative = torch.cat([torch.zeros_like(near)[:, None], (weights + 1e-5).cumsum(1)], 1)

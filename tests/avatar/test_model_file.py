@@ -60,7 +60,7 @@ def test_what_lacks_a_part_is_of_another_version(tmp_path: Path, name: str):
     write_field(small_field(), path)
     stored = load_file(path)
     del stored[name]
-    with pytest.raises(InputError, match=r"model.safetensors: of another version; train the subject again"):
+    with pytest.raises(InputError, match=r"model.safetensors: written by another version; train the subject again"):
         load_field(small_field(), stored, path)
 
 
@@ -68,7 +68,7 @@ def test_what_lacks_a_part_is_of_another_version(tmp_path: Path, name: str):
 def test_a_grid_of_another_size_is_of_another_version(tmp_path: Path, cells: int):
     path = tmp_path / "model.safetensors"
     write_field(small_field(cells), path)
-    with pytest.raises(InputError, match=r"of another version"):
+    with pytest.raises(InputError, match=r"written by another version"):
         load_field(small_field(), load_file(path), path)
 
 
@@ -77,5 +77,5 @@ def test_a_damaged_grid_is_of_another_version(tmp_path: Path):
     write_field(small_field(), path)
     stored = load_file(path)
     stored["grids.levels.0.steps"] = torch.from_numpy(np.arange(20, dtype=np.uint8))
-    with pytest.raises(InputError, match=r"of another version"):
+    with pytest.raises(InputError, match=r"written by another version"):
         load_field(small_field(), stored, path)

@@ -37,7 +37,7 @@ def subject(tmp_path: Path) -> Path:
 )
 def test_other_settings_are_refused(subject: Path, stored: dict[str, object]):
     (subject / "settings.json").write_text(json.dumps(stored))
-    with pytest.raises(InputError, match=r"settings\.json: of another version; train the subject again$"):
+    with pytest.raises(InputError, match=r"settings\.json: written by another version; train the subject again$"):
         load_avatar(subject)
 
 
@@ -45,7 +45,7 @@ def test_a_field_without_its_body_is_refused(subject: Path):
     path = subject / "model.safetensors"
     load_avatar(subject)
     save_file({name: tensor for name, tensor in load_file(path).items() if name != "canonical_m"}, path)
-    with pytest.raises(InputError, match=r"model\.safetensors: of another version; train the subject again$"):
+    with pytest.raises(InputError, match=r"model\.safetensors: written by another version; train the subject again$"):
         load_avatar(subject)
 
 

@@ -46,7 +46,7 @@ def test_no_finer_than_frames_align():
     assert fast.geometry_cells[-1] == 128
 
 
-@pytest.mark.parametrize("still", [{"frames": 1}, {"std_rad": 0.001}])
+@pytest.mark.parametrize("nearly_static", [{"frames": 1}, {"std_rad": 0.001}])
 def test_one_posture_is_as_fine_as_its_pixels(nearly_static: dict):
     """Down to 8 mm: 240 cells on 1.92 m, 160 for geometry, a sample each 4.8 mm: 2.4 x 8 cm / 4.8 mm = 40."""
     for footprint_m in (0.008, 0.001):

@@ -23,12 +23,12 @@ def trainer_of(folder: Path, machinery: str) -> Trainer:
     return Trainer(*record(folder / "capture"), settings, folder, Distributed(0, 1, torch.device("cpu")))
 
 
-def move_surface(field: Field, normal_displacement: float) -> None:
+def move_surface(field: Field, outwards: float) -> None:
     """Add so much to the distance that the field's network takes from the body's."""
     assert isinstance(field, PaperField | FastField)
     last = field.residual.residual if isinstance(field, PaperField) else field.field.geometry[-1]
     assert isinstance(last, nn.Linear)
-    last.bias.data.sub_(normal_displacement)
+    last.bias.data.sub_(outwards)
 
 
 @pytest.mark.parametrize("machinery", ["fast", "paper"])
@@ -53,9 +53,9 @@ def test_a_surface_between_the_samples_of_a_training_is_no_collapse(tmp_path: Pa
         (FAR, r"surface fills the box \(covers 100% of the surroundings\): check the masks"),
     ],
 )
-def test_a_collapsed_surface_is_an_error(tmp_path: Path, machinery: str, normal_displacement: float, message: str):
+def test_a_collapsed_surface_is_an_error(tmp_path: Path, machinery: str, outwards: float, message: str):
     trainer = trainer_of(tmp_path, machinery)
-    move_surface(trainer.field, normal_displacement)
+    move_surface(trainer.field, outwards)
     with pytest.raises(TrainingError, match=message):
         trainer.run()
 

@@ -64,7 +64,7 @@ def test_where_a_pixel_lies_follows_from_its_image() -> None:
     assert xy_px.tolist() == [[1, 1], [2, 1], [2, 0]]
 
 
-@pytest.mark.parametrize("reached", [REACHED, None])
+@pytest.mark.parametrize("visible_pixels", [REACHED, None])
 def test_pixels_show_what_the_images_do(tmp_path: Path, visible_pixels: Reached | None) -> None:
     """Whole images where nothing says what is reached, then without plates."""
     capture, masks, body = record(tmp_path)

@@ -171,7 +171,7 @@ def test_a_model_of_another_version_is_refused(tmp_path: Path):
     Trainer(capture, masks, body, with_changes(steps=1, novel_pose_steps=0), tmp_path, ALONE).run()
     tensors = load_file(tmp_path / "model.safetensors")
     save_file({name: t for name, t in tensors.items() if name != "outer_m"}, tmp_path / "model.safetensors")
-    with pytest.raises(InputError, match=r"model.safetensors: of another version; train the subject again"):
+    with pytest.raises(InputError, match=r"model.safetensors: written by another version; train the subject again"):
         load_avatar(tmp_path)
 
 
