@@ -1,7 +1,7 @@
-"""The scene decides the size: what a capture's pixels, masks and poses ask of the fast machinery, and no more.
+"""Automatic settings of the fast field and of training, from the capture's pixels, masks and poses.
 
-A setting of 0, or no cells, is open; what a preset or an override names stands. `benchmarks/budget.py` measures what
-twice and half as much are worth.
+A setting of 0, or without cells, is open; what a preset or an override sets is kept. `benchmarks/budget.py` measures
+the effect of doubling and halving the settings.
 """
 
 from dataclasses import dataclass
@@ -17,28 +17,28 @@ from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.silhouette import silhouette
 
-ALIGNMENT_M = 0.01  # to which surfaces of different poses lie on each other; what is finer blurs, whatever the cells
-FINEST_M = 0.008  # cells of one posture: with 6 mm Adam takes three times as long for each step as with these
-COLOUR_LEVELS, GEOMETRY_LEVELS = 4, 3  # of the grids, from the coarsest to the finest in equal ratios
+ALIGNMENT_M = 0.01  # accuracy to which poses align; finer detail blurs, whatever the cells
+FINEST_M = 0.008  # least cell size for one posture; with 6 mm, an Adam step takes three times as long
+COLOUR_LEVELS, GEOMETRY_LEVELS = 4, 3  # of the grids, in a geometric series
 COARSEST_CELLS = {"colour": 24, "geometry": 16}
-GEOMETRY_COARSER = 1.5  # times than colour: fingers and folds are larger than prints
-MEAN_PATH = 2.4  # of a ray through the shell, in thicknesses of it, in the mean over rays that meet a person
-SAMPLE_CELLS, MAX_SAMPLE_M = 0.6, 0.006  # between samples: smoother and nearer surfaces than with one each cell
-SHELL_MARGIN_M = 0.015  # beyond where masks reach, for poses that are still wrong
+GEOMETRY_COARSER = 1.5  # times coarser than colour: fingers and folds are larger than prints
+MEAN_PATH = 2.4  # length of a ray's path through the shell in thicknesses, mean over rays that hit the person
+SAMPLE_CELLS, MAX_SAMPLE_M = 0.6, 0.006  # sample spacing: smoother and more accurate than one per cell
+SHELL_MARGIN_M = 0.015  # beyond the extent of the masks, for poses that are still inaccurate
 MIN_THICKNESS_M, MAX_THICKNESS_M = 0.03, 0.15
-MASKS_PER_CAMERA = 6  # are looked at
-MIN_POSE_STD_RAD = 0.05  # spread of joints below which nothing can be learned from their angles
-ONE_POSTURE_RAD = 0.002  # spread of joints as the fit leaves it where it found one posture in all frames
+MASKS_PER_CAMERA = 6  # that are measured
+MIN_POSE_STD_RAD = 0.05  # below it, nothing can be learned from joint angles
+ONE_POSTURE_RAD = 0.002  # std_rad below which the fit found one posture in all frames
 POSE_WIDTH = 8
-NODES = 128  # about 12 cm apart: what they cannot follow, such as a collar, is the canonical surface's own
-DRAWS_PER_PIXEL = 1.5  # how often a person's pixel is drawn in the mean
+NODES = 128  # about 12 cm apart; finer detail, such as a collar, is left to the canonical surface
+DRAWS_PER_PIXEL = 1.5  # how often a pixel of the person is drawn on average
 MIN_STEPS, MAX_STEPS = 600, 4000
-STEPS_PER_FRAME = 540  # that see it, until its body stands as deep as one camera can tell; half as many lose 0.7 dB
+STEPS_PER_FRAME = 540  # with its rays, until its body's depth converges with one camera; half as many lose 0.7 dB
 
 
 @dataclass(frozen=True)
 class Decision:
-    """A setting's value and why it is that."""
+    """Value of an automatic setting, and its reason."""
 
     value: int | float | tuple[float, ...]
     reason: str
@@ -46,10 +46,12 @@ class Decision:
 
 @dataclass(frozen=True)
 class SceneStatistics:
-    """What was recorded, as far as it decides sizes. footprint_m: of a pixel on the body, median over cameras;
-    outside_m, inside_m: how far masks reach out of the fitted body and stay inside it, 99 % of their outlines; side_m:
-    longest of the rest body; std_rad: of the free joints, mean; person_px: pixels of the person in all training
-    images."""
+    """Statistics of the capture that determine settings.
+
+    footprint_m: size of a pixel on the body, median over cameras. outside_m, inside_m: how far masks extend outside the
+    fitted body and stay inside it, for 99 % of their outlines. side_m: longest side of the rest body. std_rad: standard
+    deviation of the free joints, mean. person_px: pixels of the person in all training images.
+    """
 
     cameras: int
     frames: int
@@ -62,7 +64,8 @@ class SceneStatistics:
 
     @staticmethod
     def of(capture: Capture, masks: Masks, body: BodyFit) -> "SceneStatistics":
-        """Looks at some masks of every training camera."""
+        """Measure the statistics, with some masks of every training camera. Raises InputError if no mask shows the
+        person."""
         vertices_m, faces = body.vertices_m().numpy(), body.rig.faces.numpy()
         footprints_m, outlines_m, images, areas_px = [], [], 0, []
         for camera in (capture.cameras[name] for name in capture.train_cameras):
@@ -93,7 +96,7 @@ class SceneStatistics:
 
 
 def decide(scene: SceneStatistics, settings: TrainingSettings) -> tuple[TrainingSettings, dict[str, Decision]]:
-    """The settings with all that was open decided, and each decision by its setting's name."""
+    """Return the settings with all open ones decided, and each decision by the setting's name."""
     wanted = _field_decisions(scene, settings.fast) if settings.machinery == "fast" else {}
     open_decisions = {name: decision for name, decision in wanted.items() if not getattr(settings.fast, name)}
     fast = settings.fast.model_copy(update={name: decision.value for name, decision in open_decisions.items()})
@@ -166,7 +169,7 @@ def _steps(scene: SceneStatistics, settings: TrainingSettings) -> Decision:
 
 
 def _outline_distance_px(mask: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """Distance of a mask's outline from the body's silhouette, (P,), negative inside it."""
+    """Return the distances (P,) of a mask's outline from the body's silhouette, negative inside it."""
     outline = mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
     normal_displacement = cv2.distanceTransform((~covered).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     inwards = cv2.distanceTransform(covered.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
@@ -178,7 +181,7 @@ def _thickness_m(reach_m: float) -> float:
 
 
 def _level_cells(coarsest: int, finest: float, levels: int) -> tuple[int, ...]:
-    """Cells of each level along the longest side; one level where the finest is no finer than the coarsest."""
+    """Return the cells of each level along the longest side; one level if the finest is no finer than the coarsest."""
     if finest <= coarsest:
         return (max(2, round(finest)),)
     return tuple(int(n) for n in np.geomspace(coarsest, finest, levels).round())

@@ -1,4 +1,5 @@
-"""How differently the cameras are exposed: gains a camera and channel, by what two of them see of the same places."""
+"""Exposure differences between cameras: gains per camera and channel, from what pairs of cameras see of the same body
+points."""
 
 from itertools import combinations
 
@@ -14,23 +15,22 @@ from hnerf.geometry.camera import Camera
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.training.auto_settings import Decision
 
-MAX_FRAMES = 8  # frames that are looked at
-MIN_FACING_COSINE = 0.4  # least cosine between a place's normal and its direction to the camera
-MIN_LEVEL, MAX_LEVEL = 15, 245  # of 255: beyond, a level is cut off or noise
-MIN_SHARED_VERTICES = 100  # that two cameras share, for their ratio to count
-MAJORITY = 0.5  # of the cameras
-MIN_LOG_GAIN = (
-    0.1  # of a gain's logarithm: shading, and bodies fitted a little wrong, leave 0.03 of cameras exposed alike
-)
+MAX_FRAMES = 8  # that are compared, evenly spaced
+MIN_FACING_COSINE = 0.4  # between a vertex's normal and its direction to the camera
+MIN_LEVEL, MAX_LEVEL = 15, 245  # of 255; levels outside are noise or clipped
+MIN_SHARED_VERTICES = 100  # of two cameras, for their ratio to count
+MAJORITY = 0.5  # share of the cameras
+MIN_LOG_GAIN = 0.1  # shading and small errors of the fit leave 0.03 for cameras exposed alike
 
 
 def camera_gains(capture: Capture, masks: Masks, body: BodyFit) -> tuple[Gains, Decision]:
-    """Gains (R, G, B) of the training cameras, and why (their means over channels); none where cameras are exposed
-    alike. Those of most cameras are 1 where most agree, else the geometric mean of all is; a camera that shares no
-    places with another is taken for a usual one.
+    """Return the gains (R, G, B) of the training cameras and the reason (with their means over channels); no gains if
+    the cameras are exposed alike.
 
-    Cameras a and b show the same place of the body brighter or darker by median ratios r_ab over places and frames;
-    log g_b - log g_a = log r_ab is solved for all pairs by least squares, weighted by their numbers of places.
+    Where most cameras agree, their gain is 1, else the geometric mean of all is. A camera that shares no points with
+    another takes the median gain. Cameras a and b show the same body points brighter or darker by a median ratio r_ab
+    over points and frames; log g_b - log g_a = log r_ab is solved for all pairs by least squares, weighted by their
+    numbers of points.
     """
     names = capture.train_cameras
     ratios: dict[tuple[int, int], list[np.ndarray]] = {pair: [] for pair in combinations(range(len(names)), 2)}
@@ -51,7 +51,7 @@ def camera_gains(capture: Capture, masks: Masks, body: BodyFit) -> tuple[Gains, 
         logs = logs - usual
     furthest = float(np.abs(logs).max())
     message = (
-        f"seeing the same places of the body, cameras differ from what is usual by {np.expm1(furthest):.0%} at most"
+        f"on the same points of the body, cameras differ from the median exposure by {np.expm1(furthest):.0%} at most"
     )
     if furthest < MIN_LOG_GAIN:
         return {}, Decision(1.0, f"{message}: no more than shading may" if logs.any() else "no two cameras to compare")
@@ -60,7 +60,8 @@ def camera_gains(capture: Capture, masks: Masks, body: BodyFit) -> tuple[Gains, 
 
 
 def solve_gains(cameras: int, pairs: dict[tuple[int, int], np.ndarray]) -> np.ndarray:
-    """Logarithms of gains (C, 3), of mean 0 among cameras that pairs connect, from logarithms of ratios (n, 3) each."""
+    """Return logarithms of gains (C, 3), with mean 0 over connected cameras, from the logarithms of ratios (n, 3) of
+    each pair."""
     rows, wanted = np.zeros((len(pairs), cameras)), np.zeros((len(pairs), 3))
     for k, ((a, b), found) in enumerate(pairs.items()):
         weight = np.sqrt(len(found))
@@ -69,7 +70,8 @@ def solve_gains(cameras: int, pairs: dict[tuple[int, int], np.ndarray]) -> np.nd
 
 
 def _vertex_colours(capture: Capture, masks: Masks, surface: Surface, name: str, frame: int) -> np.ndarray:
-    """What a camera shows at the body's vertices, (V, 3) of 255; NaN where they are hidden, or say nothing."""
+    """Return a camera's colours at the body's vertices, (V, 3) of 255; NaN where a vertex is hidden or its colour
+    unusable."""
     levels = np.full(surface.mesh.vertices.shape, np.nan)
     if (name, frame) not in masks:
         return levels
@@ -83,7 +85,7 @@ def _vertex_colours(capture: Capture, masks: Masks, surface: Surface, name: str,
 
 
 def _visible_vertices(camera: Camera, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """(V,) bool: vertices that face the camera and that nothing hides; the pixels (n, 2) of these."""
+    """Return which vertices face the camera unoccluded, (V,) bool, and their pixels (n, 2)."""
     mesh = surface.mesh
     away = camera.centre_m - mesh.vertices
     away /= np.linalg.norm(away, axis=1, keepdims=True)
