@@ -27,7 +27,7 @@ class FrameDeformation(nn.Module):
         chosen = farthest_points(vertices_m.double().cpu().numpy(), nodes)  # double: all devices choose the same
         squared = torch.cdist(vertices_m, vertices_m[chosen]).square()  # (V, nodes)
         width_squared = OVERLAP**2 * squared.amin(1).max().clamp(min=TINY)
-        self.register_buffer("shares", torch.softmax(-squared / width_squared, 1), persistent=False)
+        self.register_buffer("node_weights", torch.softmax(-squared / width_squared, 1), persistent=False)
         self.register_buffer("normals", vertex_normals(vertices_m, faces), persistent=False)
         self.displacement = nn.Parameter(torch.zeros(frames + 1, nodes, 3))
 

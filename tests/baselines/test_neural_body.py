@@ -89,7 +89,7 @@ def test_appearance_is_the_frames_own_and_zero_for_novel_poses(field: NeuralBody
     points, view = torch.rand(50, 3), DOWN[1][:1].expand(50, 3)
 
     def colour(moment: int) -> torch.Tensor:
-        as_if = dataclasses.replace(conditions, moment=torch.tensor([moment, 1, 2]))
+        as_if = dataclasses.replace(conditions, frame_row=torch.tensor([moment, 1, 2]))
         return field.colour(bodies, points, view, as_if)
 
     torch.testing.assert_close(colour(-1), colour(1))

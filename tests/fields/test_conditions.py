@@ -15,7 +15,7 @@ def test_conditions_by_hand() -> None:
     found = Conditions.of(two_bone_rig(), theta, root, torch.tensor([5]), 2.0)
     assert found.pose.tolist() == [[3, 4, 5]]
     assert found.root.tolist() == [[0, -1, 0, 0.5, 1, 0, 0, 1, 0, 0, 1, 1.5]]
-    assert found.moment.tolist() == [5]
+    assert found.frame_row.tolist() == [5]
 
 
 def spread(noise: Tensor) -> None:

@@ -116,9 +116,9 @@ def test_a_picture_with_as_many_samples_as_the_way_asks_for_is_that_of_many(monk
     rays = (bodies, field.region(bodies, conditions), origins, directions, torch.zeros(4, dtype=torch.long), conditions)
     needed = field.region(bodies, conditions).path_length_m(*rays[2:5]) / SPACING_M
     assert len({sum(float(n) > count for count in SAMPLE_COUNTS) for n in needed}) >= 3
-    found = field.look(*rays)
+    found = field.render_rays(*rays)
     monkeypatch.setattr(FastField, "samples_needed", Field.samples_needed)
-    expected = field.look(*rays)
+    expected = field.render_rays(*rays)
     torch.testing.assert_close(found, expected, atol=0.02, rtol=0)
     assert (found[:3, 3] > 0.5).all() and not found[3].any()
 
@@ -146,7 +146,7 @@ def test_a_rendered_ray_ends_at_the_solid_core_where_the_surface_lies_deeper():
     draws = Draws.deterministic(2, count, torch.device("cpu"))
     with torch.no_grad():
         samples, depths = field.sample(bodies, region, *rays, conditions, draws)
-        seen = field.look(bodies, region, *rays, conditions)
+        seen = field.render_rays(bodies, region, *rays, conditions)
     assert samples.d_hat.min() > 0.02 and field.coverage(samples).max() < 0.01
     assert seen[0, 3] == pytest.approx(1) and seen[0, 4] == pytest.approx(depths[0, -1].item(), abs=1e-4)
     torch.testing.assert_close(seen[0, :3], samples.colour[0, -1], atol=1e-3, rtol=0)
@@ -161,7 +161,7 @@ def test_a_shell_deeper_than_high_finds_the_surface_at_its_bottom():
     field.tighten(RIG, conditions.pose)
     ray = torch.tensor([[0.5, 0.5, 3.0]]), -torch.eye(3)[[2]], torch.zeros(1, dtype=torch.long)
     with torch.no_grad():
-        seen = field.look(bodies, field.region(bodies, conditions), *ray, conditions)[0]
+        seen = field.render_rays(bodies, field.region(bodies, conditions), *ray, conditions)[0]
     top_m = 3 - bodies.vertices_m[0, :, 2].max().item()
     assert seen[3] == pytest.approx(1, abs=0.01) and seen[4].item() - top_m == pytest.approx(0.07, abs=0.01)
 
