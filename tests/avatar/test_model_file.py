@@ -12,7 +12,7 @@ from hnerf.fields.encoding import FeatureGrids
 
 
 def small_field(cells: int = 4) -> nn.Module:
-    """A grid of 2 x 3 x 5 nodes (x, y, z) with two features, or a finer one, and a number."""
+    """Return a field with a grid of 2 x 3 x 5 nodes (x, y, z) with two features, or a finer one, and a number."""
     field = nn.Module()
     field.grids = FeatureGrids(torch.zeros(3), torch.tensor([1.0, 2.0, 4.0]), (cells,), 2)
     field.sharpness = nn.Parameter(torch.tensor(1 / 3))
@@ -27,7 +27,7 @@ def written_and_read(learned: nn.Module, path: Path) -> nn.Module:
 
 
 def test_a_grid_is_stored_in_steps_of_a_127th_of_its_greatest_feature(tmp_path: Path):
-    """-12.7 makes the step 0.1, of which 3.14 is 31 and 0.04 none; the number beside the grid stays as it is."""
+    """-12.7 makes the step 0.1, so 3.14 is 31 steps and 0.04 none; the number beside the grid stays as it is."""
     learned = small_field()
     learned.grids.levels[0].data[0, 1, 3, 2, 1] = -12.7
     learned.grids.levels[0].data[0, 0, 0, 0, 0] = 3.14
@@ -45,7 +45,7 @@ def test_a_grid_that_has_learned_nothing_comes_back_empty(tmp_path: Path):
 
 
 def test_nodes_that_nothing_was_learned_of_take_no_room(tmp_path: Path):
-    """41 x 21 x 11 nodes of 2 features, of which a tenth has random values: less than 3 bytes a node of those."""
+    """A tenth of 41 x 21 x 11 nodes of 2 features has random values: less than 3 bytes per node of those."""
     learned, path = small_field(cells=40), tmp_path / "model.safetensors"
     nodes = learned.grids.levels[0].data
     nodes[:, :, :4] = torch.rand(nodes[:, :, :4].shape, generator=torch.Generator().manual_seed(0))

@@ -1,4 +1,4 @@
-"""Subjects that nobody has trained: what other versions left, how they are built and shown."""
+"""Untrained subjects: files of other versions, construction and rendering."""
 
 import json
 from pathlib import Path
@@ -58,7 +58,7 @@ def test_both_networks_of_the_paper_multiply_as_the_settings_say(tmp_path: Path,
 
 
 def test_the_more_samples_rays_have_the_fewer_are_rendered_at_once(subject: Path, monkeypatch: pytest.MonkeyPatch):
-    """Eight a ray, and room for 2048."""
+    """Eight samples per ray, and a limit of 2048 samples."""
     capture, _, body = record(subject / "capture")
     avatar, at_once = load_avatar(subject), []
     look = avatar.field.render_rays

@@ -7,7 +7,7 @@ SIZE = 7
 
 
 def scattered() -> tuple[torch.Tensor, torch.Tensor]:
-    """A tenth of a grid of 7 x 7 x 7 active: their coordinates (N, 3), the grid (7, 7, 7) bool."""
+    """Return a grid of 7 x 7 x 7 with a tenth of it active: coordinates (N, 3), grid (7, 7, 7) bool."""
     active = torch.rand(SIZE, SIZE, SIZE, generator=torch.Generator().manual_seed(0)) < 0.1
     active[0, 0, 0] = active[-1, -1, -1] = True  # so that coordinates start at 0 and end at 6
     return torch.nonzero(active), active
@@ -20,13 +20,13 @@ def dense(coordinates: torch.Tensor, values: torch.Tensor, size: int) -> torch.T
 
 
 def coordinates_of(level: Level) -> torch.Tensor:
-    """(N, 3), by row."""
+    """Return the coordinates (N, 3) by row."""
     at = torch.nonzero(level.rows < level.rows.max())
     return (at - 2)[level.rows[tuple(at.T)].argsort()]
 
 
 def convolution(inputs: int, outputs: int) -> tuple[SparseConvolution, torch.Tensor]:
-    """Not normalised; and its kernel as torch's own convolution wants it."""
+    """Return a sparse convolution without normalisation, and its kernel in the layout of torch's own."""
     torch.manual_seed(0)
     sparse = SparseConvolution(inputs, outputs)
     sparse.norm = torch.nn.Identity()
@@ -49,7 +49,7 @@ def test_agrees_with_dense_convolution_where_voxels_are_active() -> None:
 
 
 def test_stride_two_agrees_with_dense_convolution() -> None:
-    """Also in which voxels are active: those whose stencil meets an active one."""
+    """The active voxels agree, too: those whose stencil contains an active one."""
     coordinates, active = scattered()
     values = torch.randn(len(coordinates), 3)
     finest = Voxels.around(coordinates.float(), 1.0, 2)
@@ -65,7 +65,7 @@ def test_stride_two_agrees_with_dense_convolution() -> None:
 
 
 def test_reads_as_a_dense_grid_does() -> None:
-    """Trilinearly, between active and empty voxels, zero beyond the grid and far from it."""
+    """Interpolation is trilinear between active and empty voxels, zero outside the grid and far from it."""
     coordinates, _ = scattered()
     values = torch.randn(len(coordinates), 4)
     at = torch.rand(500, 3) * (SIZE + 6) - 3

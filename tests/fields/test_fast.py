@@ -1,4 +1,4 @@
-"""The fast field's shell: tightened to what can be seen, and rays that miss it are asked nothing."""
+"""Shell of the fast field: it is tightened to what is visible, and rays that miss it are not evaluated."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -48,7 +48,7 @@ def field_of(sharpness_per_m: float) -> FastField:
 
 
 def test_the_shell_is_tightened_to_where_the_opacity_changes():
-    """Untrained, d_hat is d: a logistic of 1000 per metre has settled 5 mm from the skin, one of 10 nowhere."""
+    """Untrained, d_hat is d: a logistic of 1000 per metre saturates 5 mm from the skin, one of 10 nowhere."""
     _, conditions = standing()
     sharp, soft = field_of(1000.0), field_of(10.0)
     for field in (sharp, soft):
@@ -81,7 +81,7 @@ def test_a_tight_shell_shows_the_same_picture():
 
 
 def test_rays_that_miss_the_shell_see_nothing_and_change_nothing():
-    """The middle one of three passes 1 m beside the box; the others are as if it were not there."""
+    """The middle one of three rays passes 1 m beside the box; the results of the others do not depend on it."""
     bodies, conditions = standing()
     field = field_of(100.0)
     origins = torch.tensor([[0.5, 0.5, 3.0], [2.0, 0.5, 3.0], [0.4, 0.6, 3.0]])
@@ -107,7 +107,8 @@ def test_rays_that_miss_the_shell_see_nothing_and_change_nothing():
 
 
 def test_a_picture_with_as_many_samples_as_the_way_asks_for_is_that_of_many(monkeypatch: pytest.MonkeyPatch):
-    """Straight and slanted rays, whose ways through the shell differ, and one that misses; beside 32 samples each."""
+    """Straight and slanted rays with different path lengths in the shell, and one that misses it, agree with 32 samples
+    each."""
     bodies, conditions = standing()
     field = field_of(200.0)
     origins = torch.tensor([[0.5, 0.4, 3.0], [0.02, 0.9, 3.0], [0.5, 0.1, 3.0], [2.0, 0.5, 3.0]])
@@ -124,7 +125,7 @@ def test_a_picture_with_as_many_samples_as_the_way_asks_for_is_that_of_many(monk
 
 
 def deeper_by(distance_m: float, settings: FastFieldSettings = SETTINGS) -> FastField:
-    """A field whose surface lies deeper than the body everywhere in the shell."""
+    """Return a field whose surface lies deeper than the body everywhere in the shell."""
     torch.manual_seed(0)
     field = FastField(RIG, settings, 1)
     field.log_sharpness.data.fill_(500.0).log_()
@@ -135,8 +136,9 @@ def deeper_by(distance_m: float, settings: FastFieldSettings = SETTINGS) -> Fast
 
 
 def test_a_rendered_ray_ends_at_the_solid_core_where_the_surface_lies_deeper():
-    """Of a surface 10 cm inside the body, in a shell 3 cm deep, no sample sees anything: a ray through the middle is
-    opaque all the same, at its last sample and in that sample's colour, and one that grazes the shell sees nothing."""
+    """The surface lies 10 cm inside the body, the shell is 3 cm deep, so no sample sees the surface. A ray through the
+    middle is opaque all the same, at its last sample and in that sample's colour; a ray that grazes the shell sees
+    nothing."""
     bodies, conditions = standing()
     field = deeper_by(0.1)
     origins, directions = torch.tensor([[0.5, 0.5, 3.0], [-0.05, 0.5, 3.0]]), -torch.eye(3)[[2, 2]]
@@ -154,7 +156,8 @@ def test_a_rendered_ray_ends_at_the_solid_core_where_the_surface_lies_deeper():
 
 
 def test_a_shell_deeper_than_high_finds_the_surface_at_its_bottom():
-    """3 cm outside, 10 cm inside, and a surface 7 cm inside the body: farther from the skin than the shell is high."""
+    """The shell reaches 3 cm out and 10 cm in; the surface lies 7 cm inside the body, farther from the skin than the
+    outer thickness."""
     settings = SETTINGS.model_copy(update={"outer_m": 0.03, "inner_m": 0.1, "shell_cell_m": 0.015})
     bodies, conditions = standing()
     field = deeper_by(0.07, settings)
@@ -167,8 +170,8 @@ def test_a_shell_deeper_than_high_finds_the_surface_at_its_bottom():
 
 
 def test_the_shell_moves_with_the_surface_of_a_frame():
-    """Of a frame that lies 2 cm higher the shell is 2 cm higher; of one that lies 6 cm higher its upper end goes no
-    farther than the setting of 7 cm, 5 cm above where it was."""
+    """For a frame displaced by 2 cm the shell is 2 cm higher; for one displaced by 6 cm its upper end stops at the
+    setting of 7 cm, 5 cm above where it was."""
     settings = SETTINGS.model_copy(update={"nodes": 1, "shell_cell_m": 0.01, "inner_m": 0.1})
     field = FastField(RIG, settings, 2)
     assert field.deformation is not None
@@ -179,7 +182,7 @@ def test_the_shell_moves_with_the_surface_of_a_frame():
     ray = torch.tensor([[0.5, 0.5, 3.0]]), -torch.eye(3)[[2]], torch.zeros(1, dtype=torch.long)
 
     def ends(moment: int) -> torch.Tensor:
-        """Depths of the first and the last sample on a ray from above."""
+        """Return the depths of the first and the last sample on a ray from above."""
         moments = Conditions.of(RIG, bodies.theta, bodies.root, torch.tensor([moment]), 2.5)
         depths, _, core = field.region(bodies, moments).sample_rays(*ray, torch.full((1, 64), 0.5))
         assert core.all()
@@ -191,21 +194,21 @@ def test_the_shell_moves_with_the_surface_of_a_frame():
 
 
 def test_training_begins_with_half_the_samples():
-    """Of 32 samples 16 for three quarters of the steps, then all; a rendering has what it asks for."""
+    """With 32 samples, three quarters of the steps use 16, the rest all; rendering uses what a ray needs."""
     field = FastField(RIG, SETTINGS, 1)
     assert [field.training_samples(done) for done in (0.0, 0.74, 0.75, 1.0)] == [16, 16, 32, 32]
 
 
 def on_a_ray(depth_m: list[float], near: list[bool]) -> Descriptor:
-    """Descriptors of one ray's samples at some heights above the skin z = 0, which it meets head-on."""
+    """Return descriptors of one ray's samples at given heights above the skin z = 0, which it meets perpendicularly."""
     d, zero = torch.tensor(depth_m), torch.zeros(len(depth_m))
     y, normal = torch.stack([zero, zero, d], 1), torch.stack([d, zero, zero], 1)  # a normal that tells samples apart
     return Descriptor(d, y, y, normal, torch.tensor(near), torch.zeros(len(d), 3).long(), torch.zeros(len(d), 3))
 
 
 def test_colours_are_those_of_the_surface_between_two_samples():
-    """Heights 12, 6, -2, -8 mm above the skin, and a surface 1 mm above it: the second sample moves 5 / 8 of the way to
-    the third, the first as near as the second one; those behind stay."""
+    """Samples at 12, 6, -2, -8 mm above the skin, the surface at 1 mm: the second sample moves 5 / 8 of the way to the
+    third, the first moves to the second; those behind the surface stay."""
     described = on_a_ray([0.012, 0.006, -0.002, -0.008], [True] * 4)
     moved = move_to_surface(described, described.d[None] - 0.001)
     expected = torch.tensor([0.006, 0.001, -0.002, -0.008])

@@ -1,4 +1,4 @@
-"""The first step of a training by any number of processes; as a script, by those that torchrun starts.
+"""First step of a training with any number of processes; as a script, for the processes that torchrun starts.
 
 usage: python -m tests.training.first_step FOLDER MACHINERY PARTS
 """
@@ -18,7 +18,7 @@ from tests.training.scene import TINY, record
 
 
 def untrained(folder: Path, machinery: str, processes: Distributed, memory_gib: float | None = None) -> Trainer:
-    """With all losses, and something to deform; its steps find gradients and move nothing."""
+    """Return a trainer with all losses and a deformation, whose steps compute gradients but change nothing."""
     losses = LossSettings(elastic=0.1 if machinery == "fast" else 0.0)
     changes = {"machinery": machinery, "losses": losses, "memory_gib": memory_gib}
     settings = TrainingSettings.model_validate(TINY.model_dump() | changes)
@@ -30,13 +30,13 @@ def untrained(folder: Path, machinery: str, processes: Distributed, memory_gib: 
 
 
 def gradients(trainer: Trainer, module: torch.nn.Module) -> dict[str, Tensor]:
-    """Of a step, by parameter."""
+    """Return the gradients of one step by parameter."""
     trainer._optimise(module)
     return {name: q.grad.clone() for name, q in trainer.objective.named_parameters() if q.grad is not None}
 
 
 def main(folder: Path, machinery: str, parts: int) -> None:
-    """Leave the gradients of a step, and how many steps each rank skips where one has a loss that is not finite."""
+    """Write the gradients of a step, and how many steps each rank skips where one rank's loss is not finite."""
     torch.set_num_threads(1)
     processes = Distributed.join()
     trainer = untrained(folder, machinery, processes)

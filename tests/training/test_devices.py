@@ -1,5 +1,5 @@
-"""Tensors of two devices never meet, from the body to a picture; on a GPU where there is one, else on one that is
-pretended."""
+"""Devices: tensors of two devices never meet, from the body to an image; on a GPU if there is one, else on a simulated
+one."""
 
 from contextlib import nullcontext
 from dataclasses import replace

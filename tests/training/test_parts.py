@@ -1,4 +1,4 @@
-"""A batch in parts has the gradients of the whole, and as many parts as memory asks for."""
+"""Gradient accumulation: parts of a batch have the gradients of the whole, and their number follows from the memory."""
 
 from pathlib import Path
 
@@ -26,7 +26,7 @@ class Scale(nn.Module):
         self.w = nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
 
     def forward(self, scene: object, rays: Rays, conditions: object, draws: Draws) -> dict[str, Tensor]:
-        """`mean` and `increment`."""
+        """Return `mean` and `increment`."""
         assert len(draws.jitter) == len(rays.frame) > 0
         return {"mean": (self.w * rays.origins_m[:, 0]).mean(), "increment": 3 * self.w}
 
@@ -55,7 +55,7 @@ def test_parts_of_unequal_size_add_up_to_the_joint_batch(
 
 
 def attempted(about: int) -> tuple[int, Tensor]:
-    """A loss of rays that saves 1024 doubles for each, and 1000 for all."""
+    """Return a loss of rays that saves 1024 doubles for each, and 1000 for all."""
     learned = torch.ones((), dtype=torch.float64, requires_grad=True)
     both = [learned * torch.ones(n, dtype=torch.float64) for n in (1024 * about, 1000)]
     return about, both[0].sum() + both[1].sum()
@@ -65,7 +65,7 @@ def attempted(about: int) -> tuple[int, Tensor]:
 def test_parts_follow_from_the_memory_that_a_ray_needs(
     monkeypatch: pytest.MonkeyPatch, rays: int, world_size: int, parts: int
 ) -> None:
-    """8 KiB a ray and 8000 bytes beside them, in room for 100 rays and a half, given or free."""
+    """A ray needs 8 KiB, a batch 8000 bytes more; the memory, given or free, has room for 100 and a half rays."""
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
     monkeypatch.setattr(Distributed, "all_max", lambda self, value: value)
     room = PEAK_FACTOR * (8000 + 8192 * 100.5)
@@ -79,7 +79,7 @@ def test_parts_follow_from_the_memory_that_a_ray_needs(
 
 
 def test_what_fits_is_taken_in_halves_side_by_side_on_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where there are threads for them; what does not fit comes one part after another."""
+    """Two halves run side by side if there are threads; what does not fit runs one part after another."""
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     made, decision = decide_parts(100, 1.0, attempted, ALONE)
     assert made.count == decision.value == 2 and made.pool is not None
@@ -91,7 +91,7 @@ def test_what_fits_is_taken_in_halves_side_by_side_on_a_cpu(monkeypatch: pytest.
 def test_memory_changes_the_number_of_parts_and_not_the_gradients(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, machinery: str
 ) -> None:
-    """128 rays of a MB each in 50 MB: 43, 43 and 42. What is looked at meanwhile is split likewise."""
+    """128 rays of 1 MB each in 50 MB: 43, 43 and 42. Evaluation during training is split likewise."""
     monkeypatch.setattr(trainer_module, "HELD_OUT_RAYS", 300)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
     monkeypatch.setattr(parts_module, "_peak_bytes", lambda trial_loss, about, device: (about, 1e6 * about))

@@ -20,7 +20,7 @@ REACHED = functools.partial(within_reach, reach_m=0.2)
 
 
 def test_a_third_of_the_rays_is_drawn_at_edges():
-    """Two frames of four and two pixels; the first pixel of the one is at an edge, and none of the other."""
+    """Two frames of four and two pixels; one frame has its first pixel at an edge, the other none."""
     number = torch.arange(6)
     edge = torch.tensor([True] + [False] * 5)
     pixels = Pixels(
@@ -48,7 +48,7 @@ def test_a_third_of_the_rays_is_drawn_at_edges():
 
 
 def test_where_a_pixel_lies_follows_from_its_image() -> None:
-    """Images of 3 x 2, 2 x 2 and again 3 x 2 pixels of cameras 0, 1 and 0, first whole, then of the last one two."""
+    """Images of 3 x 2, 2 x 2 and 3 x 2 pixels of cameras 0, 1 and 0, first whole, then only some pixels."""
     none = torch.zeros(0)
     names = ("starts", "edges", "edge_starts", "colour", "plate", "person", "edge", "rays_from_px", "centres_m")
     like = dict.fromkeys(names, none)
@@ -66,7 +66,7 @@ def test_where_a_pixel_lies_follows_from_its_image() -> None:
 
 @pytest.mark.parametrize("visible_pixels", [REACHED, None])
 def test_pixels_show_what_the_images_do(tmp_path: Path, visible_pixels: Reached | None) -> None:
-    """Whole images where nothing says what is reached, then without plates."""
+    """Without a visibility function, images are whole and have no plates."""
     capture, masks, body = record(tmp_path)
     out = tmp_path / "out"
     out.mkdir()
@@ -106,7 +106,7 @@ def test_a_frame_without_edges_offers_all_its_pixels(tmp_path: Path):
 
 
 def test_a_body_inside_the_image_reaches_a_disc_around_each_vertex():
-    """20 cm at 2 m and 50 px focal length are 5 px."""
+    """A reach of 20 cm at 2 m with 50 px focal length is 5 px."""
     xy = np.random.default_rng(0).integers([8, 8], [52, 32], (30, 2))
     visible_pixels = within_reach(AHEAD, np.hstack([xy / 25, np.full((30, 1), 2.0)]), 0.2)
     y, x = np.mgrid[:40, :60]
@@ -122,15 +122,15 @@ def test_a_body_beside_the_image_reaches_into_it():
 
 
 def test_an_arm_towards_the_camera_reaches_as_far_as_it_is_large():
-    """20 cm at 1 m are 10 px, though most of the body is at 2 m, where they are 5."""
+    """20 cm are 10 px at 1 m, although most of the body is at 2 m, where they are 5 px."""
     arm, body = np.tile([[20 / 50, 20 / 50, 1.0]], (3, 1)), np.tile([[50 / 25, 20 / 25, 2.0]], (20, 1))
     visible_pixels = within_reach(AHEAD, np.vstack([arm, body]), 0.2)
     assert np.flatnonzero(visible_pixels[20]).tolist() == [*range(10, 31), *range(40, 60)]
 
 
 def test_a_box_is_met_within_the_outline_of_its_corners():
-    """With its margin 2 to 4 m away: the near side spans columns 5 to 35 and rows 5 to 25, the far one 2.5 to 17.5 and
-    2.5 to 12.5, and their upper edges are joined by a line through (26.5, 3.75)."""
+    """With its margin the box lies 2 to 4 m away: the near side spans columns 5 to 35 and rows 5 to 25, the far one 2.5
+    to 17.5 and 2.5 to 12.5, and their upper edges are joined by a line through (26.5, 3.75)."""
     met = within_box(AHEAD, np.array([[0.4, 0.4, 2.2], [1.2, 0.8, 3.8]]), 0.2)
     y, x = np.array([(3, 3), (5, 35), (25, 5), (25, 35), (15, 20), (4, 27)]).T
     assert met[y, x].all()
@@ -150,7 +150,8 @@ def test_a_box_beside_the_image_is_not_met():
 
 @pytest.mark.parametrize("depths_m", [(-1.0, -2.0), (-1.0, -1.0, 2.0), (1e-6, 1e-6)])
 def test_a_body_behind_or_at_the_camera(depths_m: tuple[float, ...]):
-    """Nothing is reached behind it, all is from where it stands; who stands astride reaches as far as what is ahead."""
+    """A body behind the camera reaches no pixel, one around it all; of a body on both sides only the part in front
+    counts."""
     vertices_m = np.array([[0.4 * depth, 0.4 * depth, depth] for depth in depths_m])
     visible_pixels = within_reach(AHEAD, vertices_m, 0.2)
     assert visible_pixels[20, 20] == (depths_m[-1] > 0)

@@ -1,4 +1,4 @@
-"""What a step aims at, and which numbers each of its losses is given."""
+"""Targets of a step, and the inputs of each of its losses."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -21,7 +21,7 @@ EDGE = torch.tensor([False, True, True, False])
 
 
 def aimed(plate: Tensor | None, models_background: bool = False) -> tuple[losses.Target, Draws]:
-    """Of pixels inside the person, on both sides of the outline, and in the surroundings."""
+    """Return target and draws for pixels inside the person, on both sides of the outline, and in the background."""
     none = torch.zeros(4, 3)
     rays = Rays(none, none, torch.zeros(4, dtype=torch.long), SEEN, PERSON, EDGE, plate)
     return make_target(rays, Draws(none, BEYOND, none), models_background)
@@ -37,7 +37,7 @@ def test_a_field_with_a_background_aims_at_the_photograph(plate: Tensor | None) 
 
 
 def test_over_a_clean_plate_every_pixel_counts() -> None:
-    """The outline's as photographed, for they mix person and plate; the surroundings are the plate."""
+    """Outline pixels, which mix person and plate, keep the photographed colour; background pixels take the plate's."""
     target, draws = aimed(PLATE)
     assert torch.equal(target.colour, torch.cat([SEEN[:3], PLATE[3:]]))
     assert target.weight.tolist() == [1, 1, 1, 1]
@@ -54,7 +54,7 @@ def test_without_a_plate_surroundings_are_random_and_the_outline_is_left_out() -
 
 
 def test_each_loss_is_given_its_own_numbers() -> None:
-    """The rays of test_losses through a field whose gamma is 80: each of its ten figures, times its weight."""
+    """The rays of test_losses through a field whose gamma is 80 give each of its ten values, times its weight."""
     s = LossSettings(
         **{"reconstruction": 2, "mask": 3, "blend": 5, "geometry": 7, "segmentation": 11, "eikonal": 13},
         **{"residual": 17, "fit": 19, "increment": 23, "elastic": 29, "eta": 0.25},
