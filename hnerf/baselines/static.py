@@ -26,4 +26,4 @@ class StaticField(BoxField):
 def require_one_moment(static: bool, method: str) -> None:
     """Raise InputError if there is more than one training frame."""
     if not static:
-        raise InputError(f"{method} models one moment; choose a single training frame, or another machinery")
+        raise InputError(f"{method} models one moment; choose a single training frame, or another field")

@@ -176,7 +176,7 @@ def _is_cuda(device: Any) -> bool:
 
 
 def _on_cpu(x: Any) -> bool:
-    """Return whether a tensor may meet any device: a CPU scalar without dimensions."""
+    """Return whether x is a CPU tensor that may not meet CUDA tensors; one without dimensions may meet any device."""
     return isinstance(x, Tensor) and not isinstance(x, OnCuda) and not x.is_meta and x.dim() > 0
 
 
