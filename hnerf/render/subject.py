@@ -62,7 +62,7 @@ def render_subject(subject: Path, options: RenderOptions, out: Path) -> int:
         cameras = _cameras(options, capture, motion.body)
         shots: list[Shot] = list(zip(cameras, itertools.cycle(motion.body.frames), strict=False))
         avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
-        write_pictures(avatar.on_body(motion.body), shots, options.what, motion.fps, partial)
+        write_pictures(avatar.with_body(motion.body), shots, options.what, motion.fps, partial)
     return len(shots)
 
 
