@@ -36,7 +36,7 @@ def test_locked_joints_ride_on_their_ancestor() -> None:
     assert articulation.joints.tolist() == [0, 1] and articulation.unknowns == 9
     expected = [[1.0, 0], [0.5, 0.5], [0, 1], [0, 1], [0, 1]]
     assert articulation.vertex_weights.tolist() == expected
-    assert articulation.below.tolist() == [[1, 1], [0, 1]]
+    assert articulation.subtree.tolist() == [[1, 1], [0, 1]]
 
 
 def test_left_jacobian_turns_a_change_of_the_vector_into_a_rotation() -> None:
