@@ -51,7 +51,7 @@ def camera_gains(capture: Capture, masks: Masks, body: BodyFit) -> tuple[Gains, 
         logs = logs - usual
     furthest = float(np.abs(logs).max())
     message = (
-        f"on the same points of the body, cameras differ from the median exposure by {np.expm1(furthest):.0%} at most"
+        f"on the same points of the body, cameras differ from the usual exposure by {np.expm1(furthest):.0%} at most"
     )
     if furthest < MIN_LOG_GAIN:
         return {}, Decision(1.0, f"{message}: no more than shading may" if logs.any() else "no two cameras to compare")

@@ -70,7 +70,7 @@ def test_gains_of_cameras_that_see_the_same_ball() -> None:
     mean = np.exp(np.mean([np.log(gain) for gain in true.values()], 0))
     for name, gain in true.items():
         assert found[name] == pytest.approx(tuple(gain / mean), rel=0.01)
-    assert "differ from what is usual by 27%" in decision.reason  # red of a: (1.2 x 1.1 / 0.8^3)^(1/4) = 1.267
+    assert "differ from the usual exposure by 27%" in decision.reason  # red of a: (1.2 x 1.1 / 0.8^3)^(1/4) = 1.267
 
 
 def test_most_cameras_that_agree_stay_as_they_are() -> None:
@@ -78,7 +78,7 @@ def test_most_cameras_that_agree_stay_as_they_are() -> None:
     found, decision = measured({"a": (1, 1, 1), "b": (1, 1, 1), "c": (1, 1, 1), "d": (1.5, 1.5, 1.5)})
     for name, gain in (("a", 1), ("b", 1), ("c", 1), ("d", 1.5)):
         assert found[name] == pytest.approx((gain,) * 3, rel=0.01)
-    assert "differ from what is usual by 50%" in decision.reason
+    assert "differ from the usual exposure by 50%" in decision.reason
 
 
 def test_a_camera_that_nobody_compares_is_taken_for_a_usual_one() -> None:
