@@ -58,7 +58,7 @@ def build_field(settings: FieldSettings, body: BodyFit, static: bool) -> Field:
     Raises InputError if the field models one moment and there are more frames.
     """
     if not (static or settings.models_motion):
-        raise InputError(f"{settings.kind} models one moment; choose a single training frame, or another method")
+        raise InputError(f"{settings.no_new_poses}; choose a single training frame, or another method")
     return FIELDS[type(settings)].build(body, settings, static)
 
 

@@ -113,7 +113,7 @@ def test_distance_to_a_box_by_hand() -> None:
 
 def test_more_than_one_moment_is_refused() -> None:
     with pytest.raises(InputError, match="NeRF models one moment"):
-        build_field(load_settings("nerf").training, body(), static=False)
+        build_field(load_settings("nerf").training.field, body(), static=False)
 
 
 def test_overfits_the_ball(tmp_path: Path) -> None:
