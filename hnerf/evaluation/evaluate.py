@@ -23,6 +23,7 @@ from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.report import write_report
 from hnerf.evaluation.views import POSED, PRIMARY, SPLITS, TRACKED, TRAINING_VIEW, all_views, some_views, split_frames
 from hnerf.evenly_spaced import evenly_spaced
+from hnerf.progress import tracked
 
 log = logging.getLogger("hnerf.evaluation")
 
@@ -92,7 +93,7 @@ def score_meshes(
     with a reason."""
     (out / "meshes").mkdir(exist_ok=True)
     scores = []
-    for frame in frames:
+    for frame in tracked(frames, "meshes", len(frames)):
         mesh = posed_surface(avatar, frame)
         mesh.export(out / "meshes" / f"{frame:06d}.ply")
         if frame in true_meshes:

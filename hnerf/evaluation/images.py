@@ -1,7 +1,6 @@
 """Images of a split: which, rendered, and scored."""
 
 import dataclasses
-import logging
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,10 +14,8 @@ from hnerf.capture.capture import Capture, read_rgba, write_image
 from hnerf.evaluation import metrics
 from hnerf.evaluation.ground_truth import Truth
 from hnerf.evaluation.views import NEW_POSES, View, all_views, some_views
+from hnerf.progress import tracked
 
-log = logging.getLogger("hnerf.evaluation")
-
-LOG_EVERY_S = 10.0
 MEANS = ("psnr", "ssim", "mask_iou", "empty_psnr", "one_colour_psnr")  # over a split's images
 TUNED_ON = (
     "the capture has no test camera, and training cameras saw these frames when their poses were fitted; "
@@ -43,8 +40,7 @@ def render(avatars: Mapping[str, Avatar], capture: Capture, views: list[View], o
     """Write every view as its split's avatar looks in the poses of its `body`: 8-bit RGBA, colour over black and
     coverage. Returns the median seconds of one image, without writing it."""
     seconds: list[float] = []
-    next_log = time.perf_counter() + LOG_EVERY_S
-    for view in views:
+    for view in tracked(views, "rendering", len(views)):
         started = time.perf_counter()
         body = avatars[view.split].body
         k = body.index(view.frame)
@@ -52,9 +48,6 @@ def render(avatars: Mapping[str, Avatar], capture: Capture, views: list[View], o
             pixels = rgba(avatars[view.split].render(capture.cameras[view.camera], body.theta[k], body.root[k]))
         seconds.append(time.perf_counter() - started)
         write_image(view.path(out), pixels)
-        if time.perf_counter() > next_log:
-            log.info("rendered %d of %d images", len(seconds), len(views))
-            next_log = time.perf_counter() + LOG_EVERY_S
     return float(np.median(seconds))
 
 
