@@ -24,11 +24,12 @@ def work() -> None:
 def test_a_terminal_has_a_bar_that_goes_when_the_work_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(sys, "stdout", screen := Screen())
+    handlers = list(logging.getLogger("hnerf").handlers)
     work()
     assert "rendering" in screen.getvalue() and "50%" in screen.getvalue()
     assert "hnerf.stage: training: [1/2]\n" in screen.getvalue()
     assert screen.getvalue().rstrip().endswith("\x1b[2K\x1b[?25h")  # the bar's line is erased
-    assert not log.isEnabledFor(logging.DEBUG) and logging.getLogger("hnerf").handlers == []
+    assert not log.isEnabledFor(logging.DEBUG) and logging.getLogger("hnerf").handlers == handlers
 
 
 def test_elsewhere_there_are_lines_alone(monkeypatch: pytest.MonkeyPatch) -> None:
