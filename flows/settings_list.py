@@ -15,16 +15,19 @@ BOUNDS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 FIELD = re.compile(r"^    (\w+): .*?  # (.+)$", re.MULTILINE)
 
 
-def settings_list(settings: Section, prefix: str = "") -> Iterator[str]:
-    """Yield a line for each setting, `key=value  type  description`, those of nested sections under their own keys."""
+def settings_list(settings: Section, prefix: str = "", kinds: str = "") -> Iterator[str]:
+    """Yield a line for each setting, `key=value  type  description`, those of nested sections under their own keys.
+    kinds: which there are, of a section that is of one kind of several."""
     about = dict(FIELD.findall("\n".join(inspect.getsource(kind) for kind in _sections(type(settings)))))
     for name, field in type(settings).model_fields.items():
         value = getattr(settings, name)
         if isinstance(value, Section):
-            yield from settings_list(value, f"{prefix}{name}.")
+            sections = get_args(field.annotation) if field.discriminator else ()
+            others = " | ".join(section.model_fields["kind"].default for section in sections)
+            yield from settings_list(value, f"{prefix}{name}.", others)
         else:
             assigned = f"{prefix}{name}={json.dumps(value, default=str)}"
-            yield f"{assigned:<45} {_type(field):<20} {about.get(name, '')}".rstrip()
+            yield f"{assigned:<45} {kinds if name == 'kind' else _type(field):<20} {about.get(name, '')}".rstrip()
 
 
 def _sections(kind: type[Section]) -> list[type]:

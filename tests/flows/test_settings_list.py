@@ -12,6 +12,7 @@ def test_a_line_has_key_value_type_bounds_and_comment(capsys: pytest.CaptureFixt
     assert found["capture.max_side_px"] == ("capture.max_side_px=1024 int >= 16 longer images are shrunk at the door")
     assert found["calibration.min_improvement"].startswith("calibration.min_improvement=0.02 float >= 0 < 1 share")
     assert found["segmentation.model"].startswith("segmentation.model=null Path | null ONNX file")
+    assert found["training.field.kind"].startswith('training.field.kind="paper" fast | paper | nerf | ')
     assert found["training.losses.geometry_roles"].startswith(
         'training.losses.geometry_roles="surface_leads" surface_leads | print whether'
     )

@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from hnerf.avatar.trained import load_avatar
-from hnerf.config import load_settings
+from hnerf.config import TrainingSettings, load_settings
 from hnerf.errors import InputError
 from hnerf.training import trainer as trainer_module
 from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
