@@ -236,7 +236,7 @@ class Trainer:
 
     def _report_progress(self) -> None:
         """Report steps of both phases; as many of the field's as its time says where that runs out before."""
-        done = self._done() * self.field_steps if self.step < self.field_steps else self.step
+        done = self._progress() * self.field_steps if self.step < self.field_steps else self.step
         report("training", done, self.steps)
 
     def _set_rates(self) -> None:
