@@ -3,9 +3,8 @@ import numpy as np
 from hnerf.geometry.camera import Camera
 
 QUARTER = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])  # world y is the camera's x, world x its -y
-CAMERA = Camera(
-    "1", np.array([[100.0, 0, 50], [0, 200, 40], [0, 0, 1]]), QUARTER, np.array([1.0, 2.0, 3.0]), width_px=8, height_px=6
-)
+K = np.array([[100.0, 0, 50], [0, 200, 40], [0, 0, 1]])
+CAMERA = Camera("1", K, QUARTER, np.array([1.0, 2.0, 3.0]), width_px=8, height_px=6)
 
 
 def test_a_point_and_its_ray_by_hand() -> None:

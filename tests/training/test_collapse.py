@@ -9,12 +9,19 @@ from torch import nn
 from hnerf.fields.base import Field
 from hnerf.fields.fast import FastField
 from hnerf.fields.paper import PaperField
+from hnerf.training import trainer as trainer_module
 from hnerf.training.distributed import Distributed
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import LEAST_COVERAGE, Trainer
 from tests.training.scene import TINY, record
 
 FAR = 10.0  # units of the residual's last layer: metres away in either machinery
+
+
+@pytest.fixture(autouse=True)
+def few_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An eighth of the rays tells empty from full."""
+    monkeypatch.setattr(trainer_module, "HELD_OUT_RAYS", 256)
 
 
 def trainer_of(folder: Path, machinery: str) -> Trainer:
