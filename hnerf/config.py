@@ -5,7 +5,7 @@ A preset is a YAML file under `configs/`; `load_settings("fast", ["training.seco
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
@@ -80,10 +80,24 @@ class FitSettings(Section):
     contour_steps: int = Field(default=10, ge=1)
 
 
-class FastFieldSettings(Section):
-    """The fast machinery: shell, grids and small networks. What is 0, or has no cells, the scene decides
+class FieldSettings(Section):
+    """What all fields have. tunes_poses: H-NeRF's fine-tune poses and shape, compared methods take them as fitted;
+    models_motion: a field without it needs a single training frame; no_new_poses: why it cannot show a pose that it was
+    not trained on, empty where it can."""
+
+    tunes_poses: ClassVar[bool] = False
+    models_motion: ClassVar[bool] = True
+    no_new_poses: ClassVar[str] = ""
+    kind: str
+    scene_m: float = Field(default=2.5, gt=0)  # half the scene's edge: the unit of sigma_h, gamma and of the root's T
+
+
+class FastFieldSettings(FieldSettings):
+    """The fast field: shell, grids and small networks. What is 0, or has no cells, the scene decides
     (hnerf/training/auto_settings.py)."""
 
+    tunes_poses: ClassVar[bool] = True
+    kind: Literal["fast"] = "fast"
     outer_m: float = Field(default=0.0, ge=0)  # the shell's thickness outside the body
     inner_m: float = Field(default=0.0, ge=0)  # and inside
     shell_cell_m: float = Field(default=0.015, gt=0)
@@ -99,10 +113,11 @@ class FastFieldSettings(Section):
     deformation_learning_rate: float = Field(default=1e-3, ge=0)  # metres; 0: frames do not deform the body
 
 
-class PaperFieldSettings(Section):
-    """The paper's machinery; distances inside it are in scene units."""
+class PaperFieldSettings(FieldSettings):
+    """The paper's field; distances inside it are in scene units."""
 
-    scene_m: float = Field(default=2.5, gt=0)  # half the scene's edge, the unit of sigma_h and gamma
+    tunes_poses: ClassVar[bool] = True
+    kind: Literal["paper"] = "paper"
     samples: int = Field(default=256, ge=2)  # coarse, and as many fine
     box_samples: int = Field(default=0, ge=0)  # of the coarse ones, within the person's box alone
     rays: Literal["image", "box"] = "image"  # train on all pixels, or on those whose rays meet the person's box
@@ -119,25 +134,32 @@ class PaperFieldSettings(Section):
         return self
 
 
-class NerfSettings(Section):
+class NerfSettings(FieldSettings):
     """NeRF, a compared method (hnerf/baselines/nerf.py)."""
 
+    models_motion: ClassVar[bool] = False
+    no_new_poses: ClassVar[str] = "NeRF models one moment"
+    kind: Literal["nerf"] = "nerf"
     samples: int = Field(default=24, ge=2)  # coarse, and as many fine
     width: int = Field(default=64, ge=2)
     learning_rate: float = Field(default=5e-3, gt=0)
 
 
-class IdrSettings(Section):
+class IdrSettings(FieldSettings):
     """IDR, a compared method (hnerf/baselines/idr.py)."""
 
+    models_motion: ClassVar[bool] = False
+    no_new_poses: ClassVar[str] = "IDR models one moment"
+    kind: Literal["idr"] = "idr"
     samples: int = Field(default=32, ge=3)  # a ray, to find its least distance
     width: int = Field(default=64, ge=2)
     learning_rate: float = Field(default=1e-3, gt=0)
 
 
-class NeuralBodySettings(Section):
+class NeuralBodySettings(FieldSettings):
     """NeuralBody, a compared method (hnerf/baselines/neural_body.py)."""
 
+    kind: Literal["neural_body"] = "neural_body"
     samples: int = Field(default=32, ge=2)
     voxel_m: float = Field(default=0.015, gt=0)
     code_width: int = Field(default=16, ge=1)  # of a vertex
@@ -146,9 +168,11 @@ class NeuralBodySettings(Section):
     learning_rate: float = Field(default=5e-3, gt=0)
 
 
-class NerfiesSettings(Section):
+class NerfiesSettings(FieldSettings):
     """Nerfies, a compared method (hnerf/baselines/nerfies.py)."""
 
+    no_new_poses: ClassVar[str] = "Nerfies has no pose to set: it replays the moments it was trained on"
+    kind: Literal["nerfies"] = "nerfies"
     samples: int = Field(default=24, ge=2)  # coarse, and as many fine
     width: int = Field(default=64, ge=2)  # of the template
     deformation_width: int = Field(default=64, ge=2)
@@ -179,17 +203,13 @@ class LossSettings(Section):
     density_steepness: float = Field(default=0.02, gt=0)  # lambda; docs/method.md says why
 
 
-H_NERF = ("fast", "paper")  # machineries; the others are compared methods
+AnyFieldSettings = (
+    FastFieldSettings | PaperFieldSettings | NerfSettings | IdrSettings | NeuralBodySettings | NerfiesSettings
+)
 
 
 class TrainingSettings(Section):
-    machinery: Literal["fast", "paper", "nerf", "idr", "neural_body", "nerfies"] = "fast"
-    fast: FastFieldSettings = FastFieldSettings()
-    paper: PaperFieldSettings = PaperFieldSettings()
-    nerf: NerfSettings = NerfSettings()
-    idr: IdrSettings = IdrSettings()
-    neural_body: NeuralBodySettings = NeuralBodySettings()
-    nerfies: NerfiesSettings = NerfiesSettings()
+    field: AnyFieldSettings = Field(default=FastFieldSettings(), discriminator="kind")
     losses: LossSettings = LossSettings()
     steps: int = Field(default=0, ge=0)  # 0: the scene decides
     seconds: float | None = Field(default=None, gt=0)  # at which the field's training ends if its steps have not
@@ -207,9 +227,9 @@ class TrainingSettings(Section):
     seed: int = Field(default=0, ge=0)
 
     @model_validator(mode="after")
-    def _only_h_nerf_tunes_poses(self) -> Self:
-        if self.pose_learning_rate and self.machinery not in H_NERF:
-            raise ValueError(f"{self.machinery} does not tune poses: set pose_learning_rate to 0")
+    def _compared_methods_tune_no_poses(self) -> Self:
+        if self.pose_learning_rate and not self.field.tunes_poses:
+            raise ValueError(f"{self.field.kind} does not tune poses: set pose_learning_rate to 0")
         return self
 
 
@@ -245,7 +265,14 @@ def load_settings(preset: str, overrides: Sequence[str] = ()) -> Settings:
     Raises InputError with one line if the preset is unknown or no YAML, or a key or value is not allowed.
     """
     path = named_file(preset, CONFIGS, "preset", "presets")
-    return overridden(validated(Settings, read_yaml(path), path), overrides)
+    return overridden(validated(Settings, preset_tree(path), path), overrides)
+
+
+def preset_tree(path: Path) -> dict[str, Any]:
+    """Return what a preset's file holds, put over the preset under configs/ that it names as `based_on`, if any."""
+    tree = read_yaml(path)
+    base = tree.pop("based_on", None)
+    return tree if base is None else _merged(read_yaml(named_file(str(base), CONFIGS, "preset", "presets")), tree)
 
 
 def overridden(settings: S, overrides: Sequence[str]) -> S:
@@ -255,13 +282,10 @@ def overridden(settings: S, overrides: Sequence[str]) -> S:
         key, equals, value = override.partition("=")
         if not equals:
             raise InputError(f"--set {override}: write it as section.name=value")
-        *sections, leaf = key.split(".")
-        node = tree
-        for section in sections:
-            node = node.setdefault(section, {})
-            if not isinstance(node, dict):
-                raise InputError(f"--set {override}: {section} is not a section")
-        node[leaf] = _parsed(value, f"--set {override}")
+        change = _parsed(value, f"--set {override}")
+        for part in reversed(key.split(".")):
+            change = {part: change}
+        tree = _merged(tree, change)
     message = " ".join(f"--set {override}" for override in overrides)
     return validated(type(settings), tree, message) if overrides else settings
 
@@ -275,11 +299,14 @@ def with_changes(settings: Settings, path: Path) -> Settings:
 
 
 def _merged(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """A tree with the leaves of another put in."""
+    """Return a tree with the leaves of another put in; what gets another `kind` keeps nothing of the kind before."""
     merged = dict(tree)
     for name, value in changes.items():
-        both = isinstance(tree.get(name), dict) and isinstance(value, dict)
-        merged[name] = _merged(tree[name], value) if both else value
+        before = tree.get(name)
+        if isinstance(before, dict) and isinstance(value, dict) and value.get("kind") in (None, before.get("kind")):
+            merged[name] = _merged(before, value)
+        else:
+            merged[name] = value
     return merged
 
 
@@ -314,4 +341,6 @@ def validated(kind: type[S], tree: Any, source: Path | str) -> S:
         return kind.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
-        raise InputError(f"{source}: {'.'.join(map(str, first['loc']))}: {first['msg']}; correct it") from None
+        steps = zip(("", *first["loc"]), first["loc"], strict=False)
+        key = ".".join(str(part) for before, part in steps if before != "field")  # the kind of field is no key
+        raise InputError(f"{source}: {key}: {first['msg']}; correct it") from None

@@ -1,4 +1,4 @@
-"""What every trained model offers to evaluation and export, whatever its machinery."""
+"""What every trained model offers to evaluation and export, whatever its field."""
 
 from dataclasses import dataclass
 from typing import Protocol

@@ -18,10 +18,19 @@ from hnerf.baselines.idr import IdrField
 from hnerf.baselines.nerf import NerfField
 from hnerf.baselines.nerfies import NerfiesField
 from hnerf.baselines.neural_body import NeuralBodyField
-from hnerf.baselines.static import require_one_moment
 from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
-from hnerf.config import TrainingSettings
+from hnerf.config import (
+    FastFieldSettings,
+    FieldSettings,
+    IdrSettings,
+    NerfiesSettings,
+    NerfSettings,
+    NeuralBodySettings,
+    PaperFieldSettings,
+    TrainingSettings,
+)
+from hnerf.errors import InputError
 from hnerf.fields.base import Field
 from hnerf.fields.conditions import Conditions
 from hnerf.fields.fast import FastField
@@ -33,23 +42,21 @@ Gains = dict[str, tuple[float, float, float]]
 RAYS_AT_ONCE = 16384
 SAMPLES_AT_ONCE = 1 << 20  # coarse ones, of fields that take many on a ray: a network keeps some KiB for each
 POINTS_AT_ONCE = 1 << 17
+FIELDS: dict[type[FieldSettings], type[Field]] = {
+    FastFieldSettings: FastField,
+    PaperFieldSettings: PaperField,
+    NerfSettings: NerfField,
+    IdrSettings: IdrField,
+    NeuralBodySettings: NeuralBodyField,
+    NerfiesSettings: NerfiesField,
+}
 
 
-def build_field(settings: TrainingSettings, body: BodyFit, static: bool) -> Field:
+def build_field(settings: FieldSettings, body: BodyFit, static: bool) -> Field:
     """An untrained field around the fitted body; static: the capture has one training frame."""
-    if settings.machinery == "fast":
-        return FastField(body.rig, settings.fast, len(body.frames))
-    if settings.machinery == "nerf":
-        require_one_moment(static, "NeRF")
-        return NerfField(body, settings.nerf)
-    if settings.machinery == "idr":
-        require_one_moment(static, "IDR")
-        return IdrField(body, settings.idr)
-    if settings.machinery == "neural_body":
-        return NeuralBodyField(body, settings.neural_body)
-    if settings.machinery == "nerfies":
-        return NerfiesField(body, settings.nerfies)
-    return PaperField(body.rig, body.root, settings.paper, static)
+    if not (static or settings.models_motion):
+        raise InputError(f"{settings.kind} models one moment; choose a single training frame, or another method")
+    return FIELDS[type(settings)].build(body, settings, static)
 
 
 @dataclass(frozen=True)
@@ -127,9 +134,9 @@ def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvat
     if "canonical_m" not in tensors:
         raise other_version(path)
     before_tuning = dataclasses.replace(body, rig=dataclasses.replace(body.rig, vertices_m=tensors["canonical_m"]))
-    field = build_field(settings, before_tuning, static).to(device)
+    field = build_field(settings.field, before_tuning, static).to(device)
     fill_field(field, tensors, path)
-    return TrainedAvatar(field.eval(), body, settings.paper.scene_m, body, gains)
+    return TrainedAvatar(field.eval(), body, settings.field.scene_m, body, gains)
 
 
 def _stored_settings(path: Path) -> tuple[TrainingSettings, bool, Gains]:

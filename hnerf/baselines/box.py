@@ -1,6 +1,6 @@
 """What all compared methods share: rays are sampled in the person's box, and in its coordinates."""
 
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -27,6 +27,11 @@ class BoxField(Field):
 
     centre_m: Tensor
     scale_m: Tensor
+
+    @classmethod
+    def build(cls, body: BodyFit, settings: Any, static: bool) -> Self:
+        """Return an untrained field; those that model one moment are never given more."""
+        return cls(body, settings)  # type: ignore[call-arg]  # as all that derive from this are constructed
 
     def __init__(self, body: BodyFit, samples: int, learning_rate: float):
         super().__init__()

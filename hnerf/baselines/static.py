@@ -7,7 +7,6 @@ from torch import Tensor
 
 from hnerf.baselines.box import BoxField
 from hnerf.body.canonical import PosedBodies
-from hnerf.errors import InputError
 from hnerf.fields.conditions import Conditions
 
 
@@ -21,9 +20,3 @@ class StaticField(BoxField):
     @abstractmethod
     def distance(self, points_m: Tensor) -> Tensor:
         """The network's own signed distance (N,) metres, at points (N, 3) of the box."""
-
-
-def require_one_moment(static: bool, method: str) -> None:
-    """InputError where there is more than one training frame."""
-    if not static:
-        raise InputError(f"{method} models one moment; choose a single training frame, or another machinery")

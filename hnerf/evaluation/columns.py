@@ -6,14 +6,8 @@ from pathlib import Path
 
 from hnerf.avatar.avatar import Avatar
 from hnerf.body.fit_result import BodyFit
+from hnerf.config import TrainingSettings
 from hnerf.evaluation.views import ANIMATED, NEW_POSES, POSED, TRACKED
-
-ONE_MOMENT = "models one moment"
-NO_NOVEL_POSES = {
-    "nerf": f"NeRF {ONE_MOMENT}",
-    "idr": f"IDR {ONE_MOMENT}",
-    "nerfies": "Nerfies has no pose to set: it replays the moments it was trained on",
-}
 
 
 def shown_as(split: str, avatar: Avatar, fitted: BodyFit) -> Avatar:
@@ -35,7 +29,7 @@ def why_not_shown(split: str, training: Path) -> str | None:
     if reason or split not in (POSED, TRACKED):
         return reason
     settings = json.loads((training / "settings.json").read_text())["training"]
-    steps, nodes = settings["novel_pose_steps"], settings[settings["machinery"]].get("nodes", 0)
+    steps, nodes = settings["novel_pose_steps"], settings["field"].get("nodes", 0)
     if split == POSED and not (steps and settings["pose_learning_rate"]):
         return "no pose of these frames was tuned"
     if split == TRACKED and not (steps and nodes):
@@ -46,7 +40,7 @@ def why_not_shown(split: str, training: Path) -> str | None:
 def why_no_novel_poses(training: Path) -> str | None:
     """Why what training left in a folder cannot show poses that it was not trained on; None if it can."""
     stored = json.loads((training / "settings.json").read_text())
-    machinery: str = stored["training"]["machinery"]
-    if machinery == "paper" and stored["static"]:
-        return f"H-NeRF's static network {ONE_MOMENT}"
-    return NO_NOVEL_POSES.get(machinery)
+    field = TrainingSettings.model_validate(stored["training"]).field
+    if field.kind == "paper" and stored["static"]:
+        return "H-NeRF's static network models one moment"
+    return field.no_new_poses or None

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from hnerf.body.canonical import PoseCorrection, PosedBodies
+from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
 from hnerf.fields.compositing import composite, weights_from_alpha
 from hnerf.fields.conditions import Conditions, Draws
@@ -33,6 +34,11 @@ class Field(nn.Module, ABC):
     samples: int
     gamma: float = 80.0  # a metre: the paper's 200 in a scene of 2.5 m
     margin_m: float = 0.1
+
+    @classmethod
+    @abstractmethod
+    def build(cls, body: BodyFit, settings: Any, static: bool) -> "Field":
+        """Return an untrained field around a fitted body; static: the capture has one training frame."""
 
     @abstractmethod
     def region(self, bodies: PosedBodies, conditions: Conditions) -> Any:

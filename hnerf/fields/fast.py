@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from hnerf.body.canonical import FAR_M, Descriptor, PoseCorrection, PosedBodies
 from hnerf.body.descriptor import vertex_normals
+from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
 from hnerf.config import FastFieldSettings
 from hnerf.fields.base import Field
@@ -43,6 +44,11 @@ class FastField(Field):
     inner_m: Tensor
     corners: Tensor
     weights: Tensor
+
+    @classmethod
+    def build(cls, body: BodyFit, settings: FastFieldSettings, static: bool) -> "FastField":
+        """Return an untrained field; one training frame or many make no difference."""
+        return cls(body.rig, settings, len(body.frames))
 
     def __init__(self, rig: Rig, settings: FastFieldSettings, frames: int):
         """frames: rows of the fit that the field is trained with."""

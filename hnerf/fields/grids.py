@@ -1,4 +1,4 @@
-"""The fast machinery of F and DH: feature grids over the canonical shell and small networks (docs/method.md)."""
+"""The fast form of F and DH: feature grids over the canonical shell and small networks (docs/method.md)."""
 
 import torch
 from torch import Tensor, nn

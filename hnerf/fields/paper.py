@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from hnerf.body.canonical import FAR_M, Descriptor, PoseCorrection, PosedBodies
+from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
 from hnerf.config import PaperFieldSettings
 from hnerf.fields.base import Field
@@ -26,6 +27,11 @@ class PaperField(Field):
 
     own_background = True
     centre_m: Tensor
+
+    @classmethod
+    def build(cls, body: BodyFit, settings: PaperFieldSettings, static: bool) -> "PaperField":
+        """Return an untrained field, in the paper's static form where there is one training frame."""
+        return cls(body.rig, body.root, settings, static)
 
     def __init__(self, rig: Rig, root: Tensor, settings: PaperFieldSettings, static: bool):
         """root (n, 4, 4): the training poses, which the scene is centred on."""

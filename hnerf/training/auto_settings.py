@@ -1,4 +1,4 @@
-"""The scene decides the size: what a capture's pixels, masks and poses ask of the fast machinery, and no more.
+"""The scene decides the size: what a capture's pixels, masks and poses ask of the fast field, and no more.
 
 A setting of 0, or no cells, is open; what a preset or an override names stands. `benchmarks/budget.py` measures what
 twice and half as much are worth.
@@ -94,15 +94,15 @@ class SceneStatistics:
 
 def decide(scene: SceneStatistics, settings: TrainingSettings) -> tuple[TrainingSettings, dict[str, Decision]]:
     """The settings with all that was open decided, and each decision by its setting's name."""
-    wanted = _field(scene, settings.fast) if settings.machinery == "fast" else {}
-    made = {name: decision for name, decision in wanted.items() if not getattr(settings.fast, name)}
-    fast = settings.fast.model_copy(update={name: decision.value for name, decision in made.items()})
-    decisions = {f"fast.{name}": decision for name, decision in made.items()}
+    wanted = _field(scene, settings.field) if isinstance(settings.field, FastFieldSettings) else {}
+    made = {name: decision for name, decision in wanted.items() if not getattr(settings.field, name)}
+    field = settings.field.model_copy(update={name: decision.value for name, decision in made.items()})
+    decisions = {f"field.{name}": decision for name, decision in made.items()}
     whole = {"steps": _steps(scene, settings)} if not settings.steps else {}
     if settings.one_posture is None:
         whole["one_posture"] = _one_posture(scene, settings)
     update = {name: decision.value for name, decision in whole.items()}
-    return settings.model_copy(update={"fast": fast} | update), decisions | whole
+    return settings.model_copy(update={"field": field} | update), decisions | whole
 
 
 def _field(scene: SceneStatistics, given: FastFieldSettings) -> dict[str, Decision]:
@@ -148,7 +148,7 @@ def _nodes(scene: SceneStatistics, given: FastFieldSettings) -> Decision:
 
 def _one_posture(scene: SceneStatistics, settings: TrainingSettings) -> Decision:
     fitted = f"fitted joints spread {np.rad2deg(scene.std_rad):.2f} degrees over {scene.frames} frames"
-    if settings.machinery != "fast" or scene.frames == 1:
+    if settings.field.kind != "fast" or scene.frames == 1:
         return Decision(False, "each frame has its own pose")
     return Decision(scene.std_rad < ONE_POSTURE_RAD, fitted)
 

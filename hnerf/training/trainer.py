@@ -69,7 +69,7 @@ class Trainer:
         self.generator = torch.Generator(device).manual_seed(settings.seed)
         self.static = len(capture.train_frames) == 1
         self.body = body.to(device)
-        self.field = build_field(settings, self.body, self.static).to(device)
+        self.field = build_field(settings.field, self.body, self.static).to(device)
         bodies = PosedBodies(self.body.rig, self.body.theta, self.body.root, self.field.canonical_m)
         self.objective = Objective(self.field, bodies.correction(), settings)
         self.optimizer = torch.optim.Adam(self._parameter_groups(), betas=(0.9, 0.99), eps=1e-12, fused=True)
@@ -110,7 +110,7 @@ class Trainer:
     def _set_poses(self, bodies: PosedBodies) -> None:
         """Take the bodies as they stand now for the coming steps."""
         frame_rows = torch.arange(len(bodies.theta), device=bodies.theta.device)
-        self.conditions = Conditions.of(bodies.rig, bodies.theta, bodies.root, frame_rows, self.settings.paper.scene_m)
+        self.conditions = Conditions.of(bodies.rig, bodies.theta, bodies.root, frame_rows, self.settings.field.scene_m)
         self.scene = PosedScene(bodies, self.field.region(bodies, self.conditions))
 
     def run(self) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from tests.training.scene import TINY, record
 def subject(tmp_path: Path) -> Path:
     body = record(tmp_path / "capture")[2]
     body.save(tmp_path)
-    write_field(build_field(TINY, body, False), tmp_path / "model.safetensors")
+    write_field(build_field(TINY.field, body, False), tmp_path / "model.safetensors")
     (tmp_path / "settings.json").write_text(json.dumps({"static": False, "training": TINY.model_dump()}))
     return tmp_path
 
@@ -51,7 +51,7 @@ def test_a_field_without_its_body_is_refused(subject: Path):
 
 @pytest.mark.parametrize("bf16", [False, True])
 def test_both_networks_of_the_paper_multiply_as_the_settings_say(tmp_path: Path, bf16: bool) -> None:
-    changes = {"machinery": "paper", "paper": {"bf16": bf16}}
+    changes = {"field": {"kind": "paper", "bf16": bf16}}
     field = build_field(TrainingSettings.model_validate(changes), record(tmp_path)[2], False)
     assert isinstance(field, PaperField)
     assert field.radiance.trunk.bf16 is field.residual.trunk.bf16 is bf16

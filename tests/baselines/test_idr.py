@@ -13,8 +13,8 @@ from tests.baselines.ball import RADIUS_M, RING, body, inner_psnr, psnr, radii_m
 SMALL = [
     "training.steps=300",
     "training.rays_per_frame=256",
-    "training.idr.width=32",
-    "training.idr.samples=16",
+    "training.field.width=32",
+    "training.field.samples=16",
 ]
 AXES = torch.cat([torch.eye(3), -torch.eye(3)])
 

@@ -22,9 +22,9 @@ from tests.baselines.ball import RING, body, inner_psnr, psnr, record, trained
 SMALL = [
     "training.steps=250",
     "training.rays_per_frame=256",
-    "training.nerf.width=32",
-    "training.nerf.samples=16",
-    "training.nerf.learning_rate=0.01",
+    "training.field.width=32",
+    "training.field.samples=16",
+    "training.field.learning_rate=0.01",
 ]
 
 
@@ -46,7 +46,7 @@ class Roomy(NerfField):
 @pytest.fixture
 def fog() -> NerfField:
     """The unit box with 0.5 m around it, whose half edge is 1 m; a thin dark coarse fog and a dense bright fine one."""
-    field = Roomy(body(), load_settings("nerf").training.nerf)
+    field = Roomy(body(), load_settings("nerf").training.field)
     field.coarse, field.fine = Fog(0.5, 0.25), Fog(2.0, 0.75)
     return field
 

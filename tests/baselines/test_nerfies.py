@@ -24,10 +24,10 @@ from tests.baselines.column import Learned, learn, three_poses
 SMALL = [
     "training.steps=140",
     "training.rays_per_frame=96",
-    "training.nerfies.samples=12",
-    "training.nerfies.width=32",
-    "training.nerfies.anneal_steps=50",
-    "training.nerfies.learning_rate=0.01",
+    "training.field.samples=12",
+    "training.field.width=32",
+    "training.field.anneal_steps=50",
+    "training.field.learning_rate=0.01",
 ]
 
 
@@ -106,7 +106,7 @@ def test_samples_are_chosen_by_weight() -> None:
 @pytest.fixture
 def field() -> NerfiesField:
     torch.manual_seed(0)
-    return NerfiesField(three_poses(), load_settings("nerfies", SMALL).training.nerfies)
+    return NerfiesField(three_poses(), load_settings("nerfies", SMALL).training.field)
 
 
 def look(field: NerfiesField, training: bool) -> RaySamples:

@@ -13,11 +13,11 @@ from tests.baselines.column import learn, three_poses
 SMALL = [
     "training.steps=120",
     "training.rays_per_frame=96",
-    "training.neural_body.voxel_m=0.0613",  # no fraction of the column's edges, so that no vertex lies between voxels
-    "training.neural_body.samples=16",
-    "training.neural_body.channels=8",
-    "training.neural_body.width=32",
-    "training.neural_body.learning_rate=0.01",
+    "training.field.voxel_m=0.0613",  # no fraction of the column's edges, so that no vertex lies between voxels
+    "training.field.samples=16",
+    "training.field.channels=8",
+    "training.field.width=32",
+    "training.field.learning_rate=0.01",
 ]
 DOWN = torch.tensor([[0.5, 0.5, 5.0], [0.4, 0.6, 5.0]]), torch.tensor([[0.0, 0.0, -1.0]]).expand(2, 3)
 
@@ -25,7 +25,7 @@ DOWN = torch.tensor([[0.5, 0.5, 5.0], [0.4, 0.6, 5.0]]), torch.tensor([[0.0, 0.0
 @pytest.fixture
 def field() -> NeuralBodyField:
     torch.manual_seed(0)
-    return NeuralBodyField(three_poses(), load_settings("neural-body", SMALL).training.neural_body)
+    return NeuralBodyField(three_poses(), load_settings("neural-body", SMALL).training.field)
 
 
 def posed(field: NeuralBodyField, root: torch.Tensor | None = None) -> tuple[PosedBodies, Conditions]:

@@ -183,7 +183,7 @@ def test_a_colmap_capture_is_ingested_with_its_scale(tmp_path: Path) -> None:
 def test_the_command_line_converts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_model(tmp_path / "model")
     (folder / "capture.toml").write_text('units = "mm"\n')
-    assert main(["cameras", str(folder), "--format", "aniposelib", "--out", str(tmp_path / "out")]) == 0
+    assert main(["export-cameras", str(folder), "--format", "aniposelib", "--out", str(tmp_path / "out")]) == 0
     assert Caliscope(tmp_path / "out").lenses()["01"].t_m.tolist() == pytest.approx([0.001, 0.002, 0.003])
     assert main(["calibrate", str(folder), "--out", str(tmp_path / "none")]) == 2
     assert "no board footage" in capsys.readouterr().err and not (tmp_path / "none").exists()

@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -135,11 +136,11 @@ def tuned(fit: BodyFit) -> BodyFit:
     return replace(fit, root=root)
 
 
-def write_settings(training: Path, machinery: str = "fast", nodes: int = 8, steps: int = 80) -> None:
+def write_settings(training: Path, kind: str = "fast", nodes: int = 8, steps: int = 80) -> None:
     """What training says of itself, as far as columns of new poses go by it."""
-    fast = machinery == "fast"
-    settings = {"machinery": machinery, "pose_learning_rate": 5e-4 * fast, "novel_pose_steps": steps}
-    settings |= {machinery: {"nodes": nodes} if fast else {}}
+    fast = kind == "fast"
+    settings: dict[str, Any] = {"pose_learning_rate": 5e-4 * fast, "novel_pose_steps": steps}
+    settings |= {"field": {"kind": kind} | ({"nodes": nodes} if fast else {})}
     (training / "settings.json").write_text(json.dumps({"static": False, "training": settings}))
 
 

@@ -214,13 +214,13 @@ def test_the_report_shows_all_three_side_by_side(scored: Scored) -> None:
     assert "not trained on, in poses as fitted before training" in text
 
 
-def evaluated(base: Path, test_cameras: tuple[str, ...], truth: bool, machinery: str) -> tuple[Path, dict[str, Any]]:
+def evaluated(base: Path, test_cameras: tuple[str, ...], truth: bool, kind: str) -> tuple[Path, dict[str, Any]]:
     """Where the evaluation of a ball lies, and what it found; without a report."""
     capture = write_ball_capture(base / "capture", "ball", test_cameras)
     if truth:
         write_ball_truth(capture, RADIUS_M)
     inputs = ball_inputs(capture, base / "stages")
-    write_settings(inputs.training_folder, machinery)
+    write_settings(inputs.training_folder, kind)
     out = base / "evaluation"
     out.mkdir()
     with pytest.MonkeyPatch.context() as patch:
@@ -284,7 +284,7 @@ def test_report_has_every_section_and_loads_nothing(scored: Scored) -> None:
     text = (scored[0] / "subject" / "evaluation" / "report.html").read_text()
     page = _Page(text)
     galleries = ["Training views", "New views", "New poses", "Surface"]
-    assert page.headings == ["Summary", *galleries, "Training", "Findings", "Cost", "CaptureManifest"]
+    assert page.headings == ["Summary", *galleries, "Training", "Findings", "Cost", "Notes"]
     assert all(address.startswith(("data:image/", "#")) for address in page.loaded)
     assert not page.tags & {"script", "link", "iframe", "object"}
     assert "://" not in text and "@import" not in text and not re.search(r"url\(", text)

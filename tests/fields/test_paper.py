@@ -245,7 +245,7 @@ def test_each_loss_of_a_ray() -> None:
 def test_numbers_of_the_paper() -> None:
     """Section 4 and the supplement's parameters."""
     training = load_settings("paper").training
-    paper, losses = training.paper, training.losses
+    paper, losses = training.field, training.losses
     assert (paper.samples, paper.gamma, paper.learning_rate, paper.scene_m) == (256, 200, 1e-3, 2.5)
     assert (training.steps, training.frames_per_step * training.rays_per_frame, training.noise) == (10_000, 4096, 0.1)
     assert losses.density_threshold == 50

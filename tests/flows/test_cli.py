@@ -20,7 +20,7 @@ from tests.shared_data import shared_capture
         (["run", "absent", "--preset", "best"], "best: no such preset or file; presets are "),
         (["run", "absent", "--set", "training.stepz=1"], "hnerf: --set training.stepz=1: training.stepz: Extra"),
         (["run", "absent", "--set", "training.noise=.inf"], "training.noise: Input should be a finite number"),
-        (["run", "absent", "--set", "training.fast.colour_cells=[8,-3]"], "training.fast.colour_cells.1"),
+        (["run", "absent", "--set", "training.field.colour_cells=[8,-3]"], "training.field.colour_cells.1"),
         (["synth", "."], "exists; give the name of a new folder"),
         (["synth", "ring", "--set", "cameras=32"], "hnerf: --set cameras=32: cameras: Extra"),
     ],

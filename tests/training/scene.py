@@ -18,19 +18,23 @@ from tests.body.boxes import box_rig
 SIZE_PX = 32
 FRAMES = (0, 1, 2)
 
+TINY_FIELDS = {
+    "fast": {
+        "kind": "fast",
+        "samples": 8,
+        "geometry_cells": [4],
+        "colour_cells": [4],
+        "width": 8,
+        "pose_width": 8,
+        "outer_m": 0.2,
+        "inner_m": 0.1,
+        "shell_cell_m": 0.05,
+    },
+    "paper": {"kind": "paper", "samples": 4},
+}
 TINY = TrainingSettings.model_validate(
     {
-        "fast": {
-            "samples": 8,
-            "geometry_cells": [4],
-            "colour_cells": [4],
-            "width": 8,
-            "pose_width": 8,
-            "outer_m": 0.2,
-            "inner_m": 0.1,
-            "shell_cell_m": 0.05,
-        },
-        "paper": {"samples": 4},
+        "field": TINY_FIELDS["fast"],
         "losses": {"mask": 0, "blend": 0, "geometry": 0, "fit": 0, "increment": 0},
         "steps": 12,
         "novel_pose_steps": 4,
@@ -40,6 +44,13 @@ TINY = TrainingSettings.model_validate(
         "checkpoint_steps": 6,
     }
 )
+
+
+def tiny(kind: str = "fast", **changes: object) -> TrainingSettings:
+    """Return the smallest settings of a kind of field, with changes."""
+    return TrainingSettings.model_validate(
+        TINY.model_dump() | {"field": TINY_FIELDS.get(kind, {"kind": kind})} | changes
+    )
 
 
 class KnownMasks:

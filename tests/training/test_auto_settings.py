@@ -31,17 +31,17 @@ def test_sizes_by_hand():
     16. Masks reach 3.5 cm out and 0.5 cm in, with 1.5 cm of room: 5 cm and, at least, 3 cm; 2.4 x 8 cm / 6 mm = 32
     samples. Four million pixels at 2500 a step, each looked at one and a half times: 2400 steps."""
     settings, decisions = decided(SCENE)
-    fast = settings.fast
+    fast = settings.field
     assert fast.colour_cells == (24, 38, 60, 96)
     assert fast.geometry_cells == (16, 32, 64)
     assert (fast.outer_m, fast.inner_m, fast.samples) == (0.05, 0.03, 32)
     assert (fast.pose_width, settings.steps) == (8, 2400)
-    assert decisions["fast.samples"].reason == "one each 6.0 mm of a ray through a shell of 80.0 mm"
+    assert decisions["field.samples"].reason == "one each 6.0 mm of a ray through a shell of 80.0 mm"
 
 
 def test_no_finer_than_frames_align():
     """Pixels of 1 mm would ask for 1920 cells; frames align to 1 cm."""
-    fast = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": 0.001}))[0].fast
+    fast = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": 0.001}))[0].field
     assert fast.colour_cells[-1] == 192
     assert fast.geometry_cells[-1] == 128
 
@@ -51,36 +51,36 @@ def test_one_posture_is_as_fine_as_its_pixels(still: dict):
     """Down to 8 mm: 240 cells on 1.92 m, 160 for geometry, a sample each 4.8 mm: 2.4 x 8 cm / 4.8 mm = 40."""
     for footprint_m in (0.008, 0.001):
         settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": footprint_m, **still}))
-        assert (settings.fast.colour_cells[-1], settings.fast.geometry_cells[-1]) == (240, 160)
-        assert settings.fast.samples == 40
-        assert "there is one posture: cells of 8.0 mm" in decisions["fast.colour_cells"].reason
+        assert (settings.field.colour_cells[-1], settings.field.geometry_cells[-1]) == (240, 160)
+        assert settings.field.samples == 40
+        assert "there is one posture: cells of 8.0 mm" in decisions["field.colour_cells"].reason
 
 
 def test_geometry_follows_the_colours_cells_that_are_given():
     """128 / 1.5 = 85, whatever the pixels ask for."""
-    assert decided(SCENE, fast={"colour_cells": [24, 128]})[0].fast.geometry_cells[-1] == 85
+    assert decided(SCENE, field={"kind": "fast", "colour_cells": [24, 128]})[0].field.geometry_cells[-1] == 85
 
 
 def test_what_is_given_stands():
-    settings, decisions = decided(SCENE, steps=7, fast={"samples": 5, "outer_m": 0.2})
-    assert (settings.steps, settings.fast.samples, settings.fast.outer_m) == (7, 5, 0.2)
+    settings, decisions = decided(SCENE, steps=7, field={"kind": "fast", "samples": 5, "outer_m": 0.2})
+    assert (settings.steps, settings.field.samples, settings.field.outer_m) == (7, 5, 0.2)
     assert set(decisions) == {
-        "fast.inner_m",
-        "fast.colour_cells",
-        "fast.geometry_cells",
-        "fast.pose_width",
-        "fast.nodes",
+        "field.inner_m",
+        "field.colour_cells",
+        "field.geometry_cells",
+        "field.pose_width",
+        "field.nodes",
         "one_posture",
     }
 
 
 @pytest.mark.parametrize(
-    ("machinery", "std_rad", "one"), [("fast", 0.001, True), ("fast", 0.003, False), ("paper", 0.001, False)]
+    ("kind", "std_rad", "one"), [("fast", 0.001, True), ("fast", 0.003, False), ("paper", 0.001, False)]
 )
-def test_frames_that_were_fitted_with_one_posture_keep_one(machinery: str, std_rad: float, one: bool):
+def test_frames_that_were_fitted_with_one_posture_keep_one(kind: str, std_rad: float, one: bool):
     """The published method gives each frame its own; so does what is given."""
     scene = SCENE.__class__(**{**vars(SCENE), "std_rad": std_rad})
-    assert decided(scene, machinery=machinery)[0].one_posture is one
+    assert decided(scene, field={"kind": kind})[0].one_posture is one
     assert decided(scene, one_posture=not one)[0].one_posture is not one
 
 
@@ -103,8 +103,8 @@ def test_one_camera_needs_time_to_find_how_deep_bodies_stand(cameras: int, frame
 
 def test_one_pose_teaches_nothing_about_poses():
     settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "std_rad": 0.01}))
-    assert settings.fast.pose_width == 1
-    assert decisions["fast.pose_width"].reason.endswith("too little to learn from")
+    assert settings.field.pose_width == 1
+    assert decisions["field.pose_width"].reason.endswith("too little to learn from")
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_one_pose_teaches_nothing_about_poses():
 )
 def test_a_single_frame_or_camera_does_not_deform_the_body(cameras: int, frames: int, rate: float, nodes: int):
     scene = SCENE.__class__(**{**vars(SCENE), "cameras": cameras, "frames": frames})
-    assert decided(scene, fast={"deformation_learning_rate": rate})[0].fast.nodes == nodes
+    assert decided(scene, field={"kind": "fast", "deformation_learning_rate": rate})[0].field.nodes == nodes
 
 
 def test_a_scene_as_it_is_measured(tmp_path: Path):

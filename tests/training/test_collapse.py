@@ -13,9 +13,9 @@ from hnerf.training import trainer as trainer_module
 from hnerf.training.distributed import Distributed
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import LEAST_COVERAGE, Trainer
-from tests.training.scene import TINY, record
+from tests.training.scene import record, tiny
 
-FAR = 10.0  # units of the residual's last layer: metres away in either machinery
+FAR = 10.0  # units of the residual's last layer: metres away in either field
 
 
 @pytest.fixture(autouse=True)
@@ -24,9 +24,9 @@ def few_looks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trainer_module, "HELD_OUT_RAYS", 256)
 
 
-def trainer_of(folder: Path, machinery: str) -> Trainer:
+def trainer_of(folder: Path, kind: str) -> Trainer:
     """One that takes two steps."""
-    settings = TINY.model_copy(update={"machinery": machinery, "steps": 2, "novel_pose_steps": 0})
+    settings = tiny(kind, steps=2, novel_pose_steps=0)
     return Trainer(*record(folder / "capture"), settings, folder, Distributed(0, 1, torch.device("cpu")))
 
 
@@ -38,9 +38,9 @@ def move_surface(field: Field, outwards: float) -> None:
     last.bias.data.sub_(outwards)
 
 
-@pytest.mark.parametrize("machinery", ["fast", "paper"])
-def test_the_body_itself_is_a_surface(tmp_path: Path, machinery: str):
-    trainer_of(tmp_path, machinery).run()
+@pytest.mark.parametrize("kind", ["fast", "paper"])
+def test_the_body_itself_is_a_surface(tmp_path: Path, kind: str):
+    trainer_of(tmp_path, kind).run()
 
 
 def test_a_surface_between_the_samples_of_a_training_is_no_collapse(tmp_path: Path):
@@ -52,7 +52,7 @@ def test_a_surface_between_the_samples_of_a_training_is_no_collapse(tmp_path: Pa
     trainer._require_surface()
 
 
-@pytest.mark.parametrize("machinery", ["fast", "paper"])
+@pytest.mark.parametrize("kind", ["fast", "paper"])
 @pytest.mark.parametrize(
     ("outwards", "message"),
     [
@@ -60,8 +60,8 @@ def test_a_surface_between_the_samples_of_a_training_is_no_collapse(tmp_path: Pa
         (FAR, r"surface fills the box \(covers 100% of the surroundings\): check the masks"),
     ],
 )
-def test_a_collapsed_surface_is_an_error(tmp_path: Path, machinery: str, outwards: float, message: str):
-    trainer = trainer_of(tmp_path, machinery)
+def test_a_collapsed_surface_is_an_error(tmp_path: Path, kind: str, outwards: float, message: str):
+    trainer = trainer_of(tmp_path, kind)
     move_surface(trainer.field, outwards)
     with pytest.raises(TrainingError, match=message):
         trainer.run()

@@ -120,7 +120,7 @@ def test_pixels_are_levelled_by_their_cameras(tmp_path: Path) -> None:
 
 def test_a_training_camera_shows_what_its_gain_makes_of_it(tmp_path: Path) -> None:
     capture, _, body = record(tmp_path)
-    avatar = TrainedAvatar(build_field(TINY, body, False), body, 1.0, body, {"0": (0.5, 1.0, 2.0)})
+    avatar = TrainedAvatar(build_field(TINY.field, body, False), body, 1.0, body, {"0": (0.5, 1.0, 2.0)})
     plain = TrainedAvatar(avatar.field, body, 1.0, body)
     for name, gain in (("0", (0.5, 1.0, 2.0)), ("1", (1.0, 1.0, 1.0))):
         shown, expected = (a.render(capture.cameras[name], body.theta[0], body.root[0]).rgb for a in (avatar, plain))

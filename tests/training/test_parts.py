@@ -87,9 +87,9 @@ def test_what_fits_is_taken_in_halves_side_by_side_on_a_cpu(monkeypatch: pytest.
     assert made.count == 2 and made.pool is None
 
 
-@pytest.mark.parametrize("machinery", ["fast", "paper"])
+@pytest.mark.parametrize("kind", ["fast", "paper"])
 def test_memory_changes_the_number_of_parts_and_not_the_gradients(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, machinery: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     """128 rays of a MB each in 50 MB: 43, 43 and 42. What is looked at meanwhile is split likewise."""
     monkeypatch.setattr(trainer_module, "HELD_OUT_RAYS", 300)
@@ -97,7 +97,7 @@ def test_memory_changes_the_number_of_parts_and_not_the_gradients(
     monkeypatch.setattr(parts_module, "_peak_bytes", lambda attempt, about, device: (about, 1e6 * about))
     found = []
     for memory_gib, count in ((None, 1), (50e6 / GIB, 3)):
-        trainer = untrained(tmp_path, machinery, ALONE, memory_gib=memory_gib)
+        trainer = untrained(tmp_path, kind, ALONE, memory_gib=memory_gib)
         assert trainer.parts.count == count
         found.append(gradients(trainer, trainer.objective) | {"psnr": torch.tensor(trainer._held_out_psnr())})
     assert found[0].keys() == found[1].keys()

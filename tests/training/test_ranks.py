@@ -44,17 +44,17 @@ def launched(ranks: int, program: list[str]) -> int:
     return subprocess.run([*launcher, *program], env=environment).returncode
 
 
-@pytest.mark.parametrize("machinery", ["fast", "paper"])
-def test_two_ranks_in_three_parts_have_the_gradients_of_one_batch(tmp_path: Path, machinery: str) -> None:
+@pytest.mark.parametrize("kind", ["fast", "paper"])
+def test_two_ranks_in_three_parts_have_the_gradients_of_one_batch(tmp_path: Path, kind: str) -> None:
     """Two gloo processes with half the 128 rays each, in parts of 22 and 21: the gradients are those of one process
     with all rays. Both skip a step whose loss is not finite in one of them alone."""
-    alone = untrained(tmp_path / "one", machinery, ALONE)
+    alone = untrained(tmp_path / "one", kind, ALONE)
     one, root = gradients(alone, alone.objective), tmp_path / "two"
     root.mkdir()
-    assert launched(2, ["-m", "tests.training.first_step", f"{root}", machinery, "3"]) == 0
+    assert launched(2, ["-m", "tests.training.first_step", f"{root}", kind, "3"]) == 0
     two = torch.load(root / "gradients.pt", weights_only=True)
     assert one.keys() == two.keys()
-    for learned in ("correction", "deformation") if machinery == "fast" else ("correction", "radiance"):
+    for learned in ("correction", "deformation") if kind == "fast" else ("correction", "radiance"):
         assert any(g.abs().max() > 0 for name, g in one.items() if learned in name)
     for name, gradient in one.items():
         torch.testing.assert_close(two[name], gradient, atol=1e-6, rtol=1e-4, msg=lambda m, n=name: f"{n}: {m}")

@@ -7,7 +7,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from hnerf.config import TrainingSettings
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.training import trainer as trainer_module
 from hnerf.training.auto_settings import Decision
@@ -15,9 +14,9 @@ from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import Rays
 from hnerf.training.step import PosedScene
 from hnerf.training.trainer import Trainer
-from tests.training.scene import TINY, record
+from tests.training.scene import TINY, record, tiny
 
-MACHINERIES = pytest.mark.parametrize("machinery", ["fast", "paper"])
+H_NERF = pytest.mark.parametrize("kind", ["fast", "paper"])
 
 
 class Listener(torch.nn.Module):
@@ -37,8 +36,7 @@ class Listener(torch.nn.Module):
 
 
 def trainer_of(folder: Path, **changes: Any) -> Trainer:
-    settings = TrainingSettings.model_validate(TINY.model_dump() | changes)
-    return Trainer(*record(folder / "capture"), settings, folder, Distributed(0, 1, torch.device("cpu")))
+    return Trainer(*record(folder / "capture"), tiny(**changes), folder, Distributed(0, 1, torch.device("cpu")))
 
 
 def handed_over(trainer: Trainer) -> Listener:
@@ -47,10 +45,10 @@ def handed_over(trainer: Trainer) -> Listener:
     return listener
 
 
-@MACHINERIES
-def test_noise_reaches_the_networks(tmp_path: Path, machinery: str) -> None:
+@H_NERF
+def test_noise_reaches_the_networks(tmp_path: Path, kind: str) -> None:
     """Of 0.1 on theta, T and v: root mean squares over the 9, 36 and 384 numbers that are drawn."""
-    trainer = trainer_of(tmp_path, machinery=machinery)
+    trainer = trainer_of(tmp_path, kind=kind)
     listener = handed_over(trainer)
     for _, conditions, _ in listener.parts:
         for noise, least, most in (
@@ -136,12 +134,12 @@ def test_the_shell_is_tightened_with_the_bodies_until_the_field_is_finished(tmp_
     assert (trainer.scene.region.cells == 1).sum() < 0.7 * cells
 
 
-@MACHINERIES
-def test_bodies_take_up_what_was_learned_of_them(tmp_path: Path, machinery: str) -> None:
+@H_NERF
+def test_bodies_take_up_what_was_learned_of_them(tmp_path: Path, kind: str) -> None:
     """A bend of 0.1 and a move of 1 cm: then the networks are told so, and the correction is none. What both training
     frames have in common of it, half, `fast` gives to the rest body; the novel frame is told of neither."""
-    common = 0.5 if machinery == "fast" else 0.0
-    trainer = trainer_of(tmp_path, machinery=machinery)
+    common = 0.5 if kind == "fast" else 0.0
+    trainer = trainer_of(tmp_path, kind=kind)
     before = trainer.conditions
     with torch.no_grad():
         trainer.objective.correction.turn[1, 0, 1] = 0.1

@@ -7,7 +7,7 @@ from pydantic import Field, PositiveInt, model_validator
 
 from hnerf.capture.capture import Capture
 from hnerf.capture.subset import chosen
-from hnerf.config import CONFIGS, H_NERF, Section, Settings, load_settings, named_file, read_yaml, validated
+from hnerf.config import CONFIGS, Section, Settings, load_settings, named_file, read_yaml, validated
 from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.study.benchmark.convergence import FIRST_S
@@ -110,7 +110,7 @@ class Study(Section):
         in its time is the question."""
         settings, seconds = load_settings(method), seconds or self.seconds
         training = {"seconds": seconds, "snapshots_s": snapshot_times_s(seconds, self.snapshots)}
-        if seconds and settings.training.machinery not in H_NERF:
+        if seconds and not settings.training.field.tunes_poses:
             training["steps"] = UNTIL_TIME_IS_UP
         return settings.model_copy(update={"training": settings.training.model_copy(update=training)})
 
