@@ -14,20 +14,20 @@ from hnerf.body.fit import fit_body
 from hnerf.calibration.check import check_calibration
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.ingest import ingest
-from hnerf.config import PerformerSettings, load_settings
+from hnerf.config import SyntheticSettings, load_settings
 from hnerf.segmentation.segment import segment
-from hnerf.synthetic import write_performer
+from hnerf.synthetic import write_synthetic_capture
 from hnerf.training.trainer import train
 
 
-def main(out: Path, performer: PerformerSettings, overrides: Sequence[str] = ()) -> float:
+def main(out: Path, performer: SyntheticSettings, overrides: Sequence[str] = ()) -> float:
     """Write the recording, run every stage up to training into `out`, and return the seconds that training took."""
     settings = load_settings("demo", overrides)
     folders = {stage: out / stage for stage in ("capture", "calibration", "segmentation", "fit", "training")}
     for folder in folders.values():
         folder.mkdir(parents=True)
 
-    write_performer(out / "performer", performer)
+    write_synthetic_capture(out / "performer", performer)
     capture = ingest(out / "performer", settings.capture, folders["capture"])
     check_calibration(capture, settings.calibration).save(folders["calibration"])
     capture = load_cameras(folders["calibration"], capture)  # the same pictures through the cameras to use from here on
@@ -39,4 +39,4 @@ def main(out: Path, performer: PerformerSettings, overrides: Sequence[str] = ())
 
 
 if __name__ == "__main__":
-    print(f"trained in {main(Path(sys.argv[1]), PerformerSettings()):.0f} s")
+    print(f"trained in {main(Path(sys.argv[1]), SyntheticSettings()):.0f} s")

@@ -12,7 +12,7 @@ from flows.train_subject import prepared
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
 from hnerf.errors import InputError, one_line
-from hnerf.files import with_pictures
+from hnerf.files import embed_images
 from hnerf.study.benchmark.convergence import flat, limits_s
 from hnerf.study.benchmark.plan import Study, Variant, load_study
 from hnerf.study.benchmark.publish import publish
@@ -57,7 +57,7 @@ def benchmark(
                 result, artifact_store.root
             )  # not before, so that what an earlier call found stands until then
     table = table or publish(result, artifact_store.root)  # where every variant is left out
-    publish_markdown(with_pictures(table), "benchmark", f"Speed against accuracy: {table.stem}")
+    publish_markdown(embed_images(table), "benchmark", f"Speed against accuracy: {table.stem}")
     return table
 
 

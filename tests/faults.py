@@ -54,8 +54,7 @@ BY_CAMERA, BY_TRIANGULATION = "tests/geometry/test_camera.py", "tests/calibratio
 BY_FILES, BY_USD = "tests/capture/test_camera_files.py", "tests/asset/test_usd.py"
 BY_METRICS, BY_POLICY = "tests/evaluation/test_metrics.py", "tests/tasks/test_policy.py"
 BY_INGEST, BY_STORE = "tests/capture/test_ingest.py", "tests/tasks/test_store.py"
-BY_REFINE, BY_TIMING = "tests/calibration/test_refine.py", "tests/capture/test_timing.py"
-BY_GLB = "tests/asset/test_glb.py"
+BY_TIMING, BY_GLB = "tests/capture/test_timing.py", "tests/asset/test_glb.py"
 
 
 @dataclass(frozen=True)
@@ -79,9 +78,10 @@ FAULTS = (
           "(d_in + residual_in).sum()", BY_PAPER),
     Fault("paper-outside-distance", PAPER, "OUTSIDE_DISTANCE = 1.0", "OUTSIDE_DISTANCE = 0.3", BY_PAPER),
     Fault("paper-pose-outside", PAPER, "torch.zeros_like(conditions.pose[row])", "conditions.pose[row]", BY_PAPER),
-    Fault("paper-root-outside", PAPER, "torch.zeros_like(turn[row])", "turn[row]", BY_PAPER),
-    Fault("paper-importance", PAPER, "resample(coarse, near, far, weights_from_alpha(rough.alpha), draws.finer)",
-          "stratified(near, far, draws.finer)", BY_PAPER),
+    Fault("paper-root-outside", PAPER, "torch.zeros_like(root_inputs[row])", "root_inputs[row]", BY_PAPER),
+    Fault("paper-importance", PAPER,
+          "sample_pdf(coarse, near, far, weights_from_alpha(coarse_samples.alpha), draws.fine)",
+          "stratified(near, far, draws.fine)", BY_PAPER),
     Fault("paper-fine-cells", PAPER, "(middles[:, 1:] + middles[:, :-1]) / 2", "middles[:, 1:]", BY_PAPER),
     Fault("paper-fine-gradient", PAPER, "with torch.no_grad():", "with torch.enable_grad():", BY_PAPER),
     Fault("paper-centre", PAPER, "(points_m - self.centre_m) / self", "points_m / self", BY_PAPER),
@@ -111,12 +111,12 @@ FAULTS = (
     # the losses
     Fault("reconstruction-weight", LOSSES, "(target.weight * (target.colour", "((target.colour", BY_LOSSES),
     Fault("mask-swapped", LOSSES, "target.person * error", "(1 - target.person) * error", BY_LOSSES),
-    Fault("mask-box", LOSSES, "pixel(samples.in_box * samples.alpha, samples)", "pixel(samples.alpha, samples)",
-          BY_LOSSES),
+    Fault("mask-box", LOSSES, "pixel_colour(samples.in_box * samples.alpha, samples)",
+          "pixel_colour(samples.alpha, samples)", BY_LOSSES),
     Fault("blend-eta", LOSSES, "eta * (1 - target.person)", "(1 - target.person)", BY_LOSSES),
     Fault("blend-outside", LOSSES, " + (1 - samples.in_box) * samples.alpha", "", BY_LOSSES),
     Fault("paper-box-samples", PAPER, "stratified(entry, leave, ", "stratified(near, far, ", BY_PAPER),
-    Fault("paper-start", MLP, "        self.trunk.start_as_he()\n", "", BY_MLP),
+    Fault("paper-start", MLP, "        self.trunk.init_kaiming()\n", "", BY_MLP),
     Fault("paper-view-octaves", MLP, "encoding(view, self", "encoding(0 * view, self", BY_MLP),
     Fault("geometry-moves-the-surface", LOSSES, "occupied.detach()", "occupied", BY_LOSSES),
     Fault("geometry-roles", LOSSES, 'if roles == "print"', 'if roles != "print"', BY_LOSSES),
@@ -133,7 +133,7 @@ FAULTS = (
     Fault("fast-edge-pixels", STEP, "(~rays.edge).float()), draws", "everywhere), draws", BY_STEP),
     Fault("plate-ignored", STEP, "if rays.plate is not None:", "if False:", BY_STEP),
     Fault("plate-at-outline", STEP, "(rays.person | rays.edge)[:, None]", "rays.person[:, None]", BY_STEP),
-    Fault("background-black", STEP, "rays.colour, draws.beyond)", "rays.colour, 0 * draws.beyond)", BY_STEP),
+    Fault("background-black", STEP, "rays.colour, draws.background)", "rays.colour, 0 * draws.background)", BY_STEP),
     # what the networks of `fast` are asked
     Fault("fast-colour-normal", CANONICAL, "positional_encoding(normal, 1)", "positional_encoding(0 * normal, 1)",
           BY_CANONICAL),
@@ -144,22 +144,23 @@ FAULTS = (
     Fault("fast-difference-step", FAST, "GRADIENT_STEP_M = 0.005", "GRADIENT_STEP_M = 0.03", BY_RAY),
     Fault("fast-eikonal-body", FAST, "y, d = described.y[pick].detach(),", "y, d = described.y[pick],", BY_RAY),
     Fault("fast-elastic-unit", FAST, "(moved / ELASTIC_M)", "moved", BY_RAY),
-    Fault("fast-colour-place", FAST, "self._colour(at_surface(described, d + residual),", "self._colour(described,",
-          BY_RAY),
+    Fault("fast-colour-place", FAST, "self._colour(move_to_surface(described, d + residual),",
+          "self._colour(described,", BY_RAY),
     Fault("fast-core", FAST, "torch.where(core[hit, None], 1.0, alpha_dot[:, -1:])", "alpha_dot[:, -1:]", BY_FAST),
     Fault("fast-tighten-sides", FAST, "side * described.d[seen]", "-side * described.d[seen]", BY_TIGHTEN),
     Fault("fast-tighten-poses", FAST, "seen |= described.near", "seen = described.near", BY_TIGHTEN),
     # what the trainer hands to a step
-    Fault("trainer-noise", TRAINER, "self.conditions.noisy(s.noise, self.generator)", "self.conditions", BY_TRAINER),
+    Fault("trainer-noise", TRAINER, "self.conditions.with_noise(s.noise, self.generator)", "self.conditions",
+          BY_TRAINER),
     Fault("trainer-view-noise", TRAINER, "samples, s.noise, self.generator)", "samples, 0.0, self.generator)",
           BY_TRAINER),
-    Fault("fast-levelling", TRAINER, "reached, self.gains, out", "reached, {}, out", BY_TRAINER),
-    Fault("levelling-inverse", GATHER, "shown / np.array(gain", "shown * np.array(gain", BY_EXPOSURE),
+    Fault("exposure-gains", TRAINER, "visible_pixels, self.gains, out", "visible_pixels, {}, out", BY_TRAINER),
+    Fault("exposure-inverse", GATHER, "shown / np.array(gain", "shown * np.array(gain", BY_EXPOSURE),
     Fault("trainer-novel-frames", TRAINER, "rows = self.train_rows if self.step",
           "rows = torch.cat([self.train_rows, self.novel_rows]) if self.step", BY_TRAINER),
     Fault("trainer-field-goes-on", TRAINER, "self.field.requires_grad_(False)", "pass", BY_TRAINER),
     Fault("trainer-poses-go-on", TRAINER, "pose.grad[self.train_rows] = 0.0", "pass", BY_TRAINER),
-    Fault("trainer-decay", TRAINER, "FINAL_LEARNING_RATE ** self._done() * ", "", BY_TRAINER),
+    Fault("trainer-decay", TRAINER, "FINAL_LEARNING_RATE ** self._progress() * ", "", BY_TRAINER),
     Fault("trainer-tighten", TRAINER, "if self.step <= self.field_steps:", "if False:", BY_TRAINER),
     Fault("checkpoint-optimizer", TRAINER, 'self.optimizer.load_state_dict(state["optimizer"])', "pass",
           "tests/training/test_trainer.py"),
@@ -177,7 +178,8 @@ FAULTS = (
           "tests/geometry/test_silhouette.py"),
     Fault("boards-transposed", BOARDS, "R = b[0] @ a[0].T", "R = b[0] @ a[0]",
           "tests/calibration/test_calibrate_boards.py"),
-    Fault("bundle-transposed", BUNDLE, "old.R.T @ new.R for", "new.R.T @ old.R for", BY_REFINE),
+    Fault("bundle-transposed", BUNDLE, "old.R.T @ new.R for", "new.R.T @ old.R for",
+          "tests/calibration/test_bundle.py"),
     Fault("turning-jacobian", ARTICULATION, "+ first * cross + second", "- first * cross + second",
           "tests/body/test_articulation.py"),
     # what comes in

@@ -18,7 +18,7 @@ def changes(folder: Path, text: str) -> Path:
 
 
 def test_changes_replace_what_they_name_and_nothing_else(tmp_path: Path) -> None:
-    """At three depths, with a list that is replaced as a whole; all else as the preset has it."""
+    """Values change at three depths, with a list that is replaced as a whole; all others are the preset's."""
     full = load_settings("demo")
     text = "training: {steps: 7, losses: {mask: 0.5}, field: {colour_cells: [8]}}\nevaluation: {report_rows: 1}"
     found = with_changes(full, changes(tmp_path, text)).model_dump()
@@ -60,8 +60,8 @@ def test_what_is_not_allowed_is_refused_by_file_and_key(tmp_path: Path, text: st
         (b"training: [100", "is not YAML "),
         (b"title: \xe9t\xe9", "is not YAML "),
         (b"title: 2026-13-01", "is not YAML "),
-        (b"- training", "holds no keys and values"),
-        (b"fast", "holds no keys and values"),
+        (b"- training", "does not hold keys and values"),
+        (b"fast", "does not hold keys and values"),
     ],
 )
 @pytest.mark.parametrize(

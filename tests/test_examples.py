@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from hnerf.capture.capture import read_rgba
-from hnerf.config import PerformerSettings
+from hnerf.config import SyntheticSettings
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 MOST_LINES = 50
-SMALL = PerformerSettings(size_px=48, train_cameras=3, test_cameras=0, train_frames=2, novel_pose_frames=0)
+SMALL = SyntheticSettings(size_px=48, train_cameras=3, test_cameras=0, train_frames=2, novel_pose_frames=0)
 FEW = ("training.steps=4", "training.rays_per_frame=32")
 COARSE = ("training.fast.samples=8", "training.fast.colour_cells=[16]", "training.fast.geometry_cells=[16]")
 

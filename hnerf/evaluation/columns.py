@@ -19,7 +19,7 @@ def shown_as(split: str, avatar: Avatar, fitted: BodyFit) -> Avatar:
     if split == ANIMATED:
         device = avatar.body.theta.device
         poses = BodyFit(avatar.body.rig, fitted.frames, fitted.theta.to(device), fitted.root.to(device))
-        return avatar.without_frames().on_body(poses)
+        return avatar.without_frames().with_body(poses)
     return avatar.without_frames() if split == POSED else avatar
 
 

@@ -1,4 +1,4 @@
-"""Subjects that nobody has trained: what other versions left, how they are built and shown."""
+"""Untrained subjects: files of other versions, construction and rendering."""
 
 import json
 from pathlib import Path
@@ -37,7 +37,7 @@ def subject(tmp_path: Path) -> Path:
 )
 def test_other_settings_are_refused(subject: Path, stored: dict[str, object]):
     (subject / "settings.json").write_text(json.dumps(stored))
-    with pytest.raises(InputError, match=r"settings\.json: of another version; train the subject again$"):
+    with pytest.raises(InputError, match=r"settings\.json: written by another version; train the subject again$"):
         load_avatar(subject)
 
 
@@ -45,7 +45,7 @@ def test_a_field_without_its_body_is_refused(subject: Path):
     path = subject / "model.safetensors"
     load_avatar(subject)
     save_file({name: tensor for name, tensor in load_file(path).items() if name != "canonical_m"}, path)
-    with pytest.raises(InputError, match=r"model\.safetensors: of another version; train the subject again$"):
+    with pytest.raises(InputError, match=r"model\.safetensors: written by another version; train the subject again$"):
         load_avatar(subject)
 
 
@@ -58,7 +58,7 @@ def test_both_networks_of_the_paper_multiply_as_the_settings_say(tmp_path: Path,
 
 
 def test_the_more_samples_rays_have_the_fewer_are_rendered_at_once(subject: Path, monkeypatch: pytest.MonkeyPatch):
-    """Eight a ray, and room for 2048."""
+    """Eight samples per ray, and a limit of 2048 samples."""
     capture, _, body = record(subject / "capture")
     avatar, at_once = load_avatar(subject), []
     look = avatar.field.render_rays
@@ -67,7 +67,7 @@ def test_the_more_samples_rays_have_the_fewer_are_rendered_at_once(subject: Path
         at_once.append(len(origins_m))
         return look(bodies, region, origins_m, *rest)
 
-    monkeypatch.setattr(avatar.field, "look", counted)
-    monkeypatch.setattr(model, "SAMPLES_AT_ONCE", 2048)
+    monkeypatch.setattr(avatar.field, "render_rays", counted)
+    monkeypatch.setattr(model, "SAMPLES_PER_BATCH", 2048)
     avatar.render(capture.cameras["0"], body.theta[0], body.root[0])
     assert len(at_once) > 1 and set(at_once[:-1]) == {256} and at_once[-1] <= 256

@@ -7,7 +7,7 @@ import pytest
 from hnerf.capture.subject import subject_keypoints
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
-from hnerf.geometry.triangulation import triangulate
+from hnerf.geometry.triangulation import solve_points, triangulate
 from tests.calibration.synthetic import detections, ring, walk_m, write_capture
 
 
@@ -32,6 +32,16 @@ def test_residual_by_hand() -> None:
     points_m, residuals_px, _ = triangulate(projections, keypoints)
     np.testing.assert_allclose(residuals_px, 1, atol=1e-3)
     np.testing.assert_allclose(points_m[0], [0.5, 0.2, 2], atol=4e-3)
+
+
+def test_a_near_camera_counts_by_its_pixels_wherever_the_world_begins() -> None:
+    """Cameras 1 m and 4 m before the point put it at x = 0 and x = 17 mm, a third one at its side fixes the depth:
+    least squares in pixels weigh the two by 1 and 1/16, so x = 17 / 16 / (1 + 1 / 16) = 1 mm."""
+    aside = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])  # looks along x
+    poses = [(np.eye(3), [0.0, 0, 9]), (np.eye(3), [0.0, 0, 6]), (aside, [-1.0, 0, 10])]
+    projections = np.stack([np.diag([100.0, 100, 1]) @ R @ np.c_[np.eye(3), -np.array(centre)] for R, centre in poses])
+    keypoints = np.array([[[0, 0, 1]], [[100 * 0.017 / 4, 0, 1]], [[0, 0, 1]]])
+    np.testing.assert_allclose(solve_points(projections, keypoints, np.ones((3, 1))), [[0.001, 0, 10]], atol=2e-4)
 
 
 def test_an_outlier_view_is_left_out_and_its_residual_told() -> None:
@@ -65,7 +75,8 @@ def test_noise_averages_out() -> None:
 
 
 def two_people(cameras: list[Camera]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """The subject in every camera; a bystander 1.5 m behind, larger confidence, in two; order swapped now and then."""
+    """Return the subject in every camera and a bystander 1.5 m behind, with larger confidence, in two; their order
+    changes now and then."""
     subject = detections(cameras, noise_px=1)
     both = {}
     for i, camera in enumerate(cameras):
@@ -88,8 +99,8 @@ def test_the_subject_is_whom_all_cameras_see(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("stride", "missed"), [(1, slice(4, 7)), (5, slice(0))])
 @pytest.mark.parametrize("cameras", [1, 3, 4])
 def test_nobody_else_is_taken_for_the_subject(tmp_path: Path, cameras: int, stride: int, missed: slice) -> None:
-    """He walks 13 % of his height from frame to frame, or half of it. Somebody stands some metres
-    off; the first camera misses the subject for three frames."""
+    """The subject walks 13 % of his height from frame to frame, or half of it; a bystander is some metres away; the
+    first camera misses the subject for three frames."""
     rig, order = ring(cameras), stride * np.arange(12) % 12
     both, expected = {}, {}
     for camera in rig:

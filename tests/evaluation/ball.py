@@ -38,7 +38,7 @@ class BallAvatar:
     def without_frames(self) -> "BallAvatar":
         return replace(self, frames_darken_by=0)
 
-    def on_body(self, body: BodyFit) -> "BallAvatar":
+    def with_body(self, body: BodyFit) -> "BallAvatar":
         return replace(self, body=body)
 
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:

@@ -14,7 +14,7 @@ from flows.benchmark import benchmark
 from flows.cli import main
 from hnerf.config import TrainingSettings
 from hnerf.errors import InputError
-from hnerf.files import picture, with_pictures
+from hnerf.files import embed_images, markdown_image
 from hnerf.study.benchmark import publish as publish_module
 from hnerf.study.benchmark.plan import ScoringSettings
 from tasks import benchmark as tasks_module
@@ -245,8 +245,8 @@ def test_the_flow_runs_page_shows_the_charts_themselves(
 
 def test_charts_are_found_whatever_the_captures_name(tmp_path: Path) -> None:
     (tmp_path / "Ada (2) b-toys.png").write_bytes(b"chart")
-    (tmp_path / "Ada (2) b-toys.md").write_text(f"# Toys\n\n{picture('Ada (2) b-toys.png')}\n")
-    shown = with_pictures(tmp_path / "Ada (2) b-toys.md")
+    (tmp_path / "Ada (2) b-toys.md").write_text(f"# Toys\n\n{markdown_image('Ada (2) b-toys.png')}\n")
+    shown = embed_images(tmp_path / "Ada (2) b-toys.md")
     assert shown == "# Toys\n\n![Ada (2) b-toys.png](data:image/png;base64,Y2hhcnQ=)\n"
 
 

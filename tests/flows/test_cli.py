@@ -7,7 +7,7 @@ import pytest
 from flows import cli
 from flows.cli import main
 from hnerf.asset.validation import InvalidAsset
-from hnerf.config import PerformerSettings
+from hnerf.config import SyntheticSettings
 from tasks.launcher import GaveUpError
 from tests.shared_data import shared_capture
 
@@ -129,11 +129,11 @@ def test_check_prints_every_camera_and_the_verdict(tmp_path: Path, capsys: pytes
 
 
 def test_synth_takes_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    written: list[PerformerSettings] = []
-    monkeypatch.setattr(cli, "write_performer", lambda out, settings: written.append(settings))
+    written: list[SyntheticSettings] = []
+    monkeypatch.setattr(cli, "write_synthetic_capture", lambda out, settings: written.append(settings))
     assert main(["synth", str(tmp_path / "ring"), "--set", "train_cameras=32", "--set", "train_frames=1"]) == 0
     assert main(["synth", str(tmp_path / "ada")]) == 0
-    assert written == [PerformerSettings(train_cameras=32, train_frames=1), PerformerSettings()]
+    assert written == [SyntheticSettings(train_cameras=32, train_frames=1), SyntheticSettings()]
 
 
 def test_synth_writes_whole_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,7 +141,7 @@ def test_synth_writes_whole_or_nothing(tmp_path: Path, monkeypatch: pytest.Monke
         (out / "half").touch()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "write_performer", interrupted)
+    monkeypatch.setattr(cli, "write_synthetic_capture", interrupted)
     with pytest.raises(KeyboardInterrupt):
         main(["synth", str(tmp_path / "ada")])
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""The first step of a training by any number of processes; as a script, by those that torchrun starts.
+"""First step of a training with any number of processes; as a script, for the processes that torchrun starts.
 
 usage: python -m tests.training.first_step FOLDER MACHINERY PARTS
 """
@@ -18,7 +18,7 @@ from tests.training.scene import record, tiny
 
 
 def untrained(folder: Path, kind: str, processes: Distributed, memory_gib: float | None = None) -> Trainer:
-    """With all losses, and something to deform; its steps find gradients and move nothing."""
+    """Return a trainer with all losses and a deformation, whose steps compute gradients but change nothing."""
     losses = LossSettings(elastic=0.1 if kind == "fast" else 0.0)
     settings = tiny(kind, losses=losses, memory_gib=memory_gib)
     trainer = Trainer(*record(folder / f"capture{processes.rank}"), settings, folder, processes)
@@ -29,13 +29,13 @@ def untrained(folder: Path, kind: str, processes: Distributed, memory_gib: float
 
 
 def gradients(trainer: Trainer, module: torch.nn.Module) -> dict[str, Tensor]:
-    """Of a step, by parameter."""
+    """Return the gradients of one step by parameter."""
     trainer._optimise(module)
     return {name: q.grad.clone() for name, q in trainer.objective.named_parameters() if q.grad is not None}
 
 
 def main(folder: Path, kind: str, parts: int) -> None:
-    """Leave the gradients of a step, and how many steps each rank skips where one has a loss that is not finite."""
+    """Write the gradients of a step, and how many steps each rank skips where one rank's loss is not finite."""
     torch.set_num_threads(1)
     processes = Distributed.join()
     trainer = untrained(folder, kind, processes)

@@ -1,4 +1,4 @@
-"""A surface that is empty or fills the box ends a training with an error; the bar is the one that users have."""
+"""Collapse: a surface that is empty or fills the box ends training with an error, at the thresholds that users have."""
 
 from pathlib import Path
 
@@ -12,8 +12,8 @@ from hnerf.fields.paper import PaperField
 from hnerf.training import trainer as trainer_module
 from hnerf.training.distributed import Distributed
 from hnerf.training.step import TrainingError
-from hnerf.training.trainer import LEAST_COVERAGE, Trainer
-from tests.training.scene import record, tiny
+from hnerf.training.trainer import MIN_PERSON_COVERAGE, Trainer
+from tests.training.scene import TINY, record
 
 FAR = 10.0  # units of the residual's last layer: metres away in either field
 
@@ -25,13 +25,13 @@ def few_looks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def trainer_of(folder: Path, kind: str) -> Trainer:
-    """One that takes two steps."""
-    settings = tiny(kind, steps=2, novel_pose_steps=0)
+    """Return a trainer that takes two steps."""
+    settings = TINY.model_copy(update={"kind": kind, "steps": 2, "novel_pose_steps": 0})
     return Trainer(*record(folder / "capture"), settings, folder, Distributed(0, 1, torch.device("cpu")))
 
 
 def move_surface(field: Field, outwards: float) -> None:
-    """Add so much to the distance that the field's network takes from the body's."""
+    """Add an offset to the distance that the field's network adds to the body's."""
     assert isinstance(field, PaperField | FastField)
     last = field.residual.residual if isinstance(field, PaperField) else field.field.geometry[-1]
     assert isinstance(last, nn.Linear)
@@ -44,11 +44,11 @@ def test_the_body_itself_is_a_surface(tmp_path: Path, kind: str):
 
 
 def test_a_surface_between_the_samples_of_a_training_is_no_collapse(tmp_path: Path):
-    """Two samples a ray, across 5 m, hardly ever fall into the column."""
+    """Two samples per ray, across 5 m, hardly ever fall into the column."""
     trainer = trainer_of(tmp_path, "paper")
     trainer.field.samples = 2
-    rays, samples = trainer._look(trainer.train_rows, 2)
-    assert trainer.field.coverage(samples)[rays.person].mean() < LEAST_COVERAGE
+    rays, samples = trainer._sample_fixed_rays(trainer.train_rows, 2)
+    assert trainer.field.coverage(samples)[rays.person].mean() < MIN_PERSON_COVERAGE
     trainer._require_surface()
 
 

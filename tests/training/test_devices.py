@@ -1,5 +1,5 @@
-"""Tensors of two devices never meet, from the body to a picture; on a GPU where there is one, else on one that is
-pretended."""
+"""Devices: tensors of two devices never meet, from the body to an image; on a GPU if there is one, else on a simulated
+one."""
 
 from contextlib import nullcontext
 from dataclasses import replace
@@ -22,7 +22,7 @@ WITH_GPU = torch.cuda.is_available()
 
 @pytest.mark.parametrize("kind", ["fast", "paper", "nerf", "idr", "nerfies"])
 def test_trains_loads_and_renders_on_one_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str):
-    monkeypatch.setattr(trainer_module, "LEAST_COVERAGE", 0.0)
+    monkeypatch.setattr(trainer_module, "MIN_PERSON_COVERAGE", 0.0)
     capture, masks, body = record(tmp_path / "capture")
     camera = capture.cameras[capture.train_cameras[0]]
     changes: dict[str, object] = {"one_posture": False, "steps": 2, "novel_pose_steps": 1}

@@ -1,4 +1,4 @@
-"""Trainings by two processes."""
+"""Training with two processes."""
 
 import json
 import logging
@@ -38,7 +38,7 @@ Trainer(*record(root / f"capture{p.rank}"), TINY, root, p).run()
 
 
 def launched(ranks: int, program: list[str]) -> int:
-    """The exit status of torchrun with so many processes of the program."""
+    """Return the exit status of torchrun with this number of processes of the program."""
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
     return subprocess.run([*launcher, *program], env=environment).returncode
@@ -64,8 +64,8 @@ def test_two_ranks_in_three_parts_have_the_gradients_of_one_batch(tmp_path: Path
 def test_one_process_goes_on_where_two_were_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """From the checkpoint at step six to the end, as well as one process does from the start."""
-    monkeypatch.setattr(trainer_module, "LEAST_COVERAGE", 0.0)
+    """It continues from the checkpoint at step six to the end, with the accuracy of one process from the start."""
+    monkeypatch.setattr(trainer_module, "MIN_PERSON_COVERAGE", 0.0)
     killed, whole = tmp_path / "killed", tmp_path / "whole"
     killed.mkdir(), whole.mkdir()
     (tmp_path / "rank.py").write_text(KILLED)

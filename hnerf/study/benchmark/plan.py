@@ -6,7 +6,7 @@ from typing import Literal, Self
 from pydantic import Field, PositiveInt, model_validator
 
 from hnerf.capture.capture import Capture
-from hnerf.capture.subset import chosen
+from hnerf.capture.subset import select
 from hnerf.config import CONFIGS, Section, Settings, load_settings, named_file, read_yaml, validated
 from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
@@ -35,11 +35,11 @@ class Part(Section):
             there_are = _at_least(cameras, capture.train_cameras, "training cameras")
             cameras = tuple(there_are[k * len(there_are) // cameras] for k in range(cameras))
         elif cameras is not None:
-            cameras = chosen(capture, "training camera", cameras, capture.train_cameras)
+            cameras = select(capture, "training camera", cameras, capture.train_cameras)
         if isinstance(frames, int):
             frames = tuple(evenly_spaced(_at_least(frames, capture.train_frames, "training frames"), frames))
         elif frames is not None:
-            frames = chosen(capture, "training frame", frames, capture.train_frames)
+            frames = select(capture, "training frame", frames, capture.train_frames)
         return cameras, frames, None if self.novel_poses else ()
 
 
