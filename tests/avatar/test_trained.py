@@ -52,7 +52,7 @@ def test_a_field_without_its_body_is_refused(subject: Path):
 @pytest.mark.parametrize("bf16", [False, True])
 def test_both_networks_of_the_paper_multiply_as_the_settings_say(tmp_path: Path, bf16: bool) -> None:
     changes = {"field": {"kind": "paper", "bf16": bf16}}
-    field = build_field(TrainingSettings.model_validate(changes), record(tmp_path)[2], False)
+    field = build_field(TrainingSettings.model_validate(changes).field, record(tmp_path)[2], False)
     assert isinstance(field, PaperField)
     assert field.radiance.trunk.bf16 is field.residual.trunk.bf16 is bf16
 

@@ -119,7 +119,7 @@ def test_starts_as_a_sphere() -> None:
 
 def test_more_than_one_moment_is_refused() -> None:
     with pytest.raises(InputError, match="IDR models one moment"):
-        build_field(load_settings("idr").training, body(), static=False)
+        build_field(load_settings("idr").training.field, body(), static=False)
 
 
 def test_overfits_the_ball(tmp_path: Path) -> None:
