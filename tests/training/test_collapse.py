@@ -13,7 +13,7 @@ from hnerf.training import trainer as trainer_module
 from hnerf.training.distributed import Distributed
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import MIN_PERSON_COVERAGE, Trainer
-from tests.training.scene import TINY, record
+from tests.training.scene import record, tiny
 
 FAR = 10.0  # units of the residual's last layer: metres away in either field
 
@@ -26,7 +26,7 @@ def few_looks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def trainer_of(folder: Path, kind: str) -> Trainer:
     """Return a trainer that takes two steps."""
-    settings = TINY.model_copy(update={"kind": kind, "steps": 2, "novel_pose_steps": 0})
+    settings = tiny(kind, steps=2, novel_pose_steps=0)
     return Trainer(*record(folder / "capture"), settings, folder, Distributed(0, 1, torch.device("cpu")))
 
 
