@@ -14,7 +14,7 @@ from typing import Any
 from flows.ablations import ablate
 from flows.benchmark import benchmark
 from flows.stability import stability
-from flows.train_subject import train_subject
+from flows.train_subject import train_subject, with_keypoints
 from hnerf.asset.validation import InvalidAsset
 from hnerf.calibration.boards.calibrate import calibrate_from_boards
 from hnerf.capture.formats.export import WRITERS, write_cameras
@@ -23,6 +23,7 @@ from hnerf.capture.manifest import read_manifest
 from hnerf.config import PerformerSettings, load_settings, overridden
 from hnerf.errors import InputError
 from hnerf.files import atomic_folder
+from hnerf.models import fetch_models
 from hnerf.render.subject import KINDS, RenderOptions, render_subject
 from hnerf.synthetic import write_performer
 from tasks.calibration import calibrate
@@ -126,6 +127,9 @@ def _parser() -> argparse.ArgumentParser:
         "--set", dest="overrides", action="append", default=[], metavar="a=b", help="such as train_cameras=32"
     )
     synth.set_defaults(command=lambda o: _synth(o.out, o.overrides))
+
+    models = commands.add_parser("models", help="fetch the networks that others trained; needed once")
+    models.set_defaults(command=lambda o: _models())
 
     demo = commands.add_parser("demo", help=f"synth and run in ./{DEMO}, in minutes")
     demo.set_defaults(command=lambda o: _demo())
@@ -241,7 +245,7 @@ def _check(capture: Path, preset: str, store: Path) -> None:
     settings = load_settings(preset)
     artifact_store = Store(store.resolve())
     source, _ = read_capture(capture, store)
-    recording = ingest(artifact_store, source, settings.capture)
+    recording = with_keypoints(artifact_store, ingest(artifact_store, source, settings.capture), settings)
     calibration = calibrate(artifact_store, recording, settings.calibration)
     print("\n".join(_table(json.loads((calibration.root / "report.json").read_text()))))
     print(f"picture: {calibration.root / 'cameras.png'}")
@@ -281,6 +285,10 @@ def _synth(out: Path, overrides: Sequence[str] = ()) -> None:
     settings = overridden(PerformerSettings(), overrides)
     with atomic_folder(out) as partial:
         write_performer(partial, settings)
+
+
+def _models() -> None:
+    print(f"networks: {fetch_models()}")
 
 
 def _demo() -> None:

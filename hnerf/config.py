@@ -46,6 +46,11 @@ class PerformerSettings(Section):
         return self
 
 
+class DetectionSettings(Section):
+    source: Literal["recording", "network", "both"] | None = None  # None: the recording's own keypoints if it has any
+    size: Literal["heavy", "full", "lite"] = "heavy"  # of the landmark network
+
+
 class CalibrationSettings(Section):
     max_residual_px: float = Field(default=5.0, gt=0)  # median a camera may show, more of a person taller than 357 px
     min_improvement: float = Field(default=0.02, ge=0, lt=1)  # share by which held-out frames must gain to accept it
@@ -231,6 +236,7 @@ class Settings(Section):
     """One section a stage; a stage's cache key depends on its own section only."""
 
     capture: CaptureSettings = CaptureSettings()
+    detection: DetectionSettings = DetectionSettings()
     calibration: CalibrationSettings = CalibrationSettings()
     segmentation: SegmentationSettings = SegmentationSettings()
     fit: FitSettings = FitSettings()

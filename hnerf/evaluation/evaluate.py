@@ -20,6 +20,7 @@ from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.holdout import LABEL, gathered
 from hnerf.evaluation.images import render, score_split, scored_views, unscored
 from hnerf.evaluation.inputs import EvaluationInputs
+from hnerf.evaluation.lpips import lpips_availability
 from hnerf.evaluation.report import write_report
 from hnerf.evaluation.views import POSED, PRIMARY, SPLITS, TRACKED, TRAINING_VIEW, all_views, some_views, split_frames
 from hnerf.evenly_spaced import evenly_spaced
@@ -41,7 +42,6 @@ PROTOCOL = (
     "distance in mm; normal consistency: mean |cos| at nearest points; IoU by winding number on a "
     f"{geometry.OCCUPANCY_NODES}^3 grid."
 )
-LPIPS = "not available: the AlexNet weights it needs come with no package, and none are fetched at run time"
 
 
 def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) -> dict[str, Any]:
@@ -61,7 +61,7 @@ def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) 
     wanted = dict.fromkeys(itertools.chain(*shown, *(views[split] for split in views if split not in to_look_at)))
     image_seconds = render(avatars, capture, list(wanted), out)
     rendered = time.perf_counter()
-    found: dict[str, Any] = {"protocol": PROTOCOL, "lpips": LPIPS, "seconds_per_image": image_seconds}
+    found: dict[str, Any] = {"protocol": PROTOCOL, "lpips": lpips_availability(), "seconds_per_image": image_seconds}
     found |= {split: score_split(capture, split, views[split], truth, out) for split in views}
     found |= {split: unscored(why) for split, why in lacking.items()}
     true_meshes = {} if truth is None else truth.meshes()
