@@ -74,7 +74,7 @@ class Lpips:
 
 def _weights(layer: dict[str, Any]) -> tuple[torch.Tensor, torch.Tensor | None]:
     """Kernel and bias of a layer, kernels stored as (height, width, in, out)."""
-    kernel = torch.from_numpy(np.ascontiguousarray(layer["kernel"].transpose(3, 2, 0, 1), np.float32))
+    kernel = torch.from_numpy(np.array(layer["kernel"].transpose(3, 2, 0, 1), np.float32, order="C"))
     return kernel, torch.from_numpy(np.array(layer["bias"], np.float32)) if "bias" in layer else None
 
 
