@@ -29,11 +29,12 @@ log = logging.getLogger("hnerf.evaluation")
 
 PROTOCOL = (
     "Images: PSNR, SSIM (Gaussian window of 11 px, sigma 1.5) of 8-bit images over black, data range 1, inside the box "
-    "of the true mask padded by 20 px; mask IoU of pixels that are covered by more than a half. Mean over images, all "
-    "from test cameras: without one, none is scored. novel_view: training frames. New poses are of frames that the "
-    "field was not trained on, in three columns: novel_pose (animated), in poses as fitted from the training cameras "
-    "before training, nothing tuned, no deformation of a frame's own; novel_pose_posed, in poses tuned on the training "
-    "cameras; novel_pose_tracked, with these frames' deformations, too. All methods get the same fitted poses. "
+    "of the true mask padded by 20 px, and LPIPS (0.1, AlexNet) there; mask IoU of pixels that are covered by more "
+    "than a half. Mean over images, all from test cameras: without one, none is scored. novel_view: training frames. "
+    "New poses are of frames that the field was not trained on, in three columns: novel_pose (animated), in poses as "
+    "fitted from the training cameras before training, nothing tuned, no deformation of a frame's own; "
+    "novel_pose_posed, in poses tuned on the training cameras; novel_pose_tracked, with these frames' deformations, "
+    "too. All methods get the same fitted poses. "
     f"holdout: {LABEL}; new poses animated. "
     "Geometry, of novel_view and novel_pose: zero surface of the signed distance by marching cubes, "
     f"{POSED_CELLS} cells on the longest side; {geometry.SAMPLES} samples a surface before those that cannot be seen "
