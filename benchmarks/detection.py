@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 from provenance import SHARED, provenance, sentence, table, write_result
 
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import PERSON, Capture
 from hnerf.capture.ingest import ingest
 from hnerf.capture.subject import subject_keypoints
 from hnerf.config import CaptureSettings, DetectionSettings
-from hnerf.detection.detect import MASKS, detect
+from hnerf.detection.detect import detect
 from hnerf.geometry.triangulation import triangulate
 
 REAL, RENDERED = "pose2sim-balance", ("valid-walk", "valid-wave")
@@ -88,7 +88,7 @@ def score_truth(folder: Path, capture: Capture) -> dict[str, Any]:
     keypoints = limb_keypoints(capture)
     errors_px = np.where(keypoints[..., 2] > 0, np.linalg.norm(keypoints[..., :2] - true_px, axis=-1), np.nan)
     found = _percentiles(errors_px, keypoints)
-    if (capture.root / MASKS).is_dir():
+    if (capture.root / PERSON).is_dir():
         found["mask_iou"] = round(float(np.mean(list(_ious(folder, capture)))), 4)
     return found
 
@@ -100,7 +100,7 @@ def _ious(folder: Path, capture: Capture) -> list[float]:
             name = Path(camera) / f"{frame:06d}.png"
             mask, true = (
                 cv2.imread(str(place / name), cv2.IMREAD_GRAYSCALE) > 127
-                for place in (capture.root / MASKS, folder / "ground_truth" / "masks")
+                for place in (capture.root / PERSON, folder / "ground_truth" / "masks")
             )
             ious.append(float((mask & true).sum() / (mask | true).sum()))
     return ious

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hnerf.capture.capture import Capture, write_image
+from hnerf.capture.capture import PERSON, Capture, write_image
 from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
 from hnerf.capture.subset import read_keypoints, write_keypoints
 from hnerf.config import DetectionSettings
@@ -25,7 +25,7 @@ from hnerf.errors import InputError
 from hnerf.models import POSE_DETECTOR, model_file
 
 KEYPOINTS: KeypointSetName = "blazepose_33"
-LANDMARKS, MASKS = "landmarks", "person"  # folders: <camera>.npz; <camera>/<frame>.png, 255 times the probability
+LANDMARKS = "landmarks"  # folder: <camera>.npz
 PROGRESS_S = 10.0
 
 log = logging.getLogger("hnerf.detection")
@@ -78,7 +78,7 @@ def _find_people(capture: Capture, size: str, out: Path) -> None:
                     pool.shutdown(wait=False, cancel_futures=True)
                 job.result()
             for job in jobs:
-                images = len(list((out / MASKS / jobs[job]).glob("*.png")))
+                images = len(list((out / PERSON / jobs[job]).glob("*.png")))
                 if job in done or (job in running and images):
                     log.info("camera %s: %d of %d images", jobs[job], images, len(capture.frames))
 
@@ -92,7 +92,7 @@ def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> None:
     everybody = []
     for frame, people in zip(capture.frames, track(images, PersonDetector(), LandmarkNetwork(size)), strict=True):
         everybody.append(people)
-        write_image(out / MASKS / camera / f"{frame:06d}.png", _soft_mask(people, capture, camera))
+        write_image(out / PERSON / camera / f"{frame:06d}.png", _soft_mask(people, capture, camera))
     path = out / LANDMARKS / f"{camera}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_suffix(".partial")

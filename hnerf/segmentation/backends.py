@@ -15,7 +15,8 @@ from hnerf.segmentation.difference import difference, exposure_corrected, masked
 from hnerf.segmentation.learned import Network
 from hnerf.segmentation.prior import Prior, window_around
 
-CLEAN_PLATE, MEDIAN = "clean plate", "median around the fitted body"
+CLEAN_PLATE = "clean plate"
+AROUND_BODY, AROUND_DETECTED = "median around the fitted body", "median around the detected person"
 MEDIAN_FRAMES = 60  # evenly chosen, for the background without a plate
 
 
@@ -84,13 +85,14 @@ class AgainstBackground:
 
     @staticmethod
     def of_median(
-        capture: Capture, camera: str, priors: Sequence[Prior], count: int, settings: SegmentationSettings
-    ) -> "AgainstBackground":
+        capture: Capture, camera: str, priors: Sequence[Prior], count: int, settings: SegmentationSettings,
+        name: str = AROUND_BODY,
+    ) -> "AgainstBackground":  # fmt: skip
         """The background from at most `count` frames, where the priors, in the order of the frames, leave it free."""
         chosen = evenly_spaced(range(len(priors)), count)
         images = [capture.image(camera, capture.frames[i]) for i in chosen]
         plate, known = masked_median(images, [priors[i] for i in chosen])
-        return AgainstBackground(capture, camera, plate, known, settings, MEDIAN)
+        return AgainstBackground(capture, camera, plate, known, settings, name)
 
     def mask(self, frame: int, prior: Prior) -> np.ndarray:
         """Cut out of the window within reach."""
@@ -100,7 +102,7 @@ class AgainstBackground:
             return mask
         free = surroundings(prior, self.known)
         plate = exposure_corrected(self.plate, image, free)
-        noise, is_median = noise_level(image, plate, free), self.name == MEDIAN
+        noise, is_median = noise_level(image, plate, free), self.name != CLEAN_PLATE
         found = difference(image[window], plate[window], noise, self.settings, shadowed=is_median)
         mask[window] = cut(image[window], found, prior.cropped(window), self.known[window])
         return mask
@@ -110,7 +112,8 @@ def choose_backend(
     capture: Capture, camera: str, priors: list[Prior], fitted: bool, network: Network | None,
     settings: SegmentationSettings,
 ) -> Backend:  # fmt: skip
-    """Given masks first, then the user's network, then a clean plate, then the background around a `fitted` body.
+    """Given masks first, then the user's network, then a clean plate, then the background around a
+    `fitted` body or a detected person.
 
     priors: in the order of the capture's frames. Raises InputError where none is possible.
     """
@@ -121,8 +124,9 @@ def choose_backend(
     plate = capture.background(camera)
     if plate is not None:
         return AgainstBackground.of_plate(capture, camera, plate, settings)
-    if not fitted:
+    if not fitted and not capture.was_looked_at:
         raise InputError(
             f"{capture.name}: camera {camera} has neither masks nor a plate (background/{camera}.jpg); fit a body first"
         )
-    return AgainstBackground.of_median(capture, camera, priors, MEDIAN_FRAMES, settings)
+    around = AROUND_BODY if fitted else AROUND_DETECTED
+    return AgainstBackground.of_median(capture, camera, priors, MEDIAN_FRAMES, settings, around)

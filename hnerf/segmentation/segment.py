@@ -13,7 +13,7 @@ from hnerf.config import SegmentationSettings
 from hnerf.errors import InputError
 from hnerf.segmentation.backends import choose_backend
 from hnerf.segmentation.learned import Network
-from hnerf.segmentation.prior import Prior, body_priors, keypoint_priors
+from hnerf.segmentation.prior import Prior, body_priors, keypoint_priors, network_priors
 from hnerf.segmentation.verdicts import MaskVerdict, judge, jumps
 
 log = logging.getLogger("hnerf.segmentation")
@@ -22,11 +22,15 @@ log = logging.getLogger("hnerf.segmentation")
 def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettings) -> Masks:
     """Masks for all training cameras and `capture.frames`.
 
-    A camera with given masks keeps them; the user's network comes next, then a clean plate; else `body` is needed, to
-    find the background from pixels that it does not reach. Only the subject is kept where there are several people.
-    A mask that cannot be right is left out and named in the report; a camera with no other raises InputError.
+    A camera with given masks keeps them; the user's network comes next, then a clean plate; else `body` is needed, or
+    what detection took for a person, to find the background from pixels that it does not reach. Only the subject is
+    kept where there are several people. A mask that cannot be right is left out and named in the report; a camera with
+    no other raises InputError.
     """
-    priors = keypoint_priors(capture, settings) if body is None else body_priors(capture, body, settings)
+    if body is not None:
+        priors = body_priors(capture, body, settings)
+    else:
+        priors = (network_priors if capture.was_looked_at else keypoint_priors)(capture, settings)
     network = None if settings.model is None else Network(settings.model)
     encoded: dict[tuple[str, int], bytes] = {}
     cameras: dict[str, Any] = {}
