@@ -13,7 +13,7 @@ from typing import Any
 from prefect import flow
 
 from flows.run_page import publish_markdown
-from flows.train_subject import prepared
+from flows.train_subject import prepared, with_keypoints
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, Settings, load_settings, read_yaml, with_changes
 from hnerf.errors import InputError, one_line
@@ -87,7 +87,7 @@ def choose(full: Settings, only: Sequence[str]) -> tuple[dict[str, Settings], di
 
 def measure(store: Store, source: Source, truth: Source, settings: Settings) -> dict[str, Any]:
     """A row's figures: scores of every split, seconds and device of its training; {"error": one line} if one fails."""
-    stages = prepared(store, ingest(store, source, settings.capture), settings)
+    stages = prepared(store, with_keypoints(store, ingest(store, source, settings.capture), settings), settings)
     try:
         model = train(store, *stages, settings.training)
         report = evaluate(store, truth, *stages, model, settings.evaluation)

@@ -8,7 +8,7 @@ from typing import Any
 from prefect import flow
 
 from flows.run_page import publish_markdown
-from flows.train_subject import prepared
+from flows.train_subject import prepared, with_keypoints
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
 from hnerf.errors import InputError, one_line
@@ -82,7 +82,7 @@ def measure(store: Store, source: Source, truth: Source, variant: Variant, plan:
     """A method's scores on a variant, and the folder of their files in the store; {"error": one line} if it fails."""
     try:
         settings, more = plan.settings(method), dict[str, Any]()
-        recording = ingest(store, source, settings.capture)
+        recording = with_keypoints(store, ingest(store, source, settings.capture), settings)
         parts = variant.parts(Capture.load(recording.root))
         if parts != (None, None, None):
             recording = subset_capture(store, recording, *parts)

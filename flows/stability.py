@@ -11,7 +11,7 @@ import numpy as np
 from prefect import flow
 
 from flows.run_page import publish_markdown
-from flows.train_subject import prepared
+from flows.train_subject import prepared, with_keypoints
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
 from hnerf.errors import InputError, NotApplicableError, one_line
@@ -128,7 +128,7 @@ def _runs_of_seed(
 
 def recorded(store: Store, source: Source, plan: Stability, settings: Settings) -> Artifact:
     """The recording, or that part of it which stands for all."""
-    recording = ingest(store, source, settings.capture)
+    recording = with_keypoints(store, ingest(store, source, settings.capture), settings)
     parts = plan.part.parts(Capture.load(recording.root))
     return recording if parts == (None, None, None) else subset_capture(store, recording, *parts)
 

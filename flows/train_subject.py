@@ -12,6 +12,7 @@ from hnerf.evaluation.holdout import cameras_left_out
 from tasks.asset import export
 from tasks.calibration import calibrate, calibrated
 from tasks.capture import ingest, subset_capture
+from tasks.detection import detect, needs_detection
 from tasks.evaluation import evaluate, evaluate_held_out
 from tasks.fit import fit
 from tasks.segmentation import needs_body, segment, settled
@@ -34,12 +35,13 @@ def train_subject(
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
     if settings.evaluation.holdout:
-        recorded = recorded_cameras(source.root)
-        cameras_left_out(recorded.train, recorded.test, settings.evaluation.holdout)  # refused before any work
+        cameras = recorded_cameras(source.root)
+        cameras_left_out(cameras.train, cameras.test, settings.evaluation.holdout)  # refused before any work
 
-    recording = ingest(artifact_store, source, settings.capture)
-    subject = Capture.load(recording.root).name
-    artifact_store.link_latest(subject, recording)
+    recorded = ingest(artifact_store, source, settings.capture)
+    subject = Capture.load(recorded.root).name
+    artifact_store.link_latest(subject, recorded)
+    recording = artifact_store.link_latest(subject, with_keypoints(artifact_store, recorded, settings))
     calibration = artifact_store.link_latest(subject, calibrate(artifact_store, recording, settings.calibration))
     left_out = left_out_cameras(recording, calibration, settings)
     masks = artifact_store.link_latest(subject, find_masks(artifact_store, recording, calibration, settings))
@@ -51,10 +53,16 @@ def train_subject(
     report = evaluate(artifact_store, truth, recording, calibration, masks, body, model, settings.evaluation, held_out)
     artifact_store.link_latest(subject, report)
     asset = export(artifact_store, recording, calibration, model, settings.asset)
-    for artifact in (recording, calibration, masks, body, model, report, asset):
+    for artifact in (recorded, recording, calibration, masks, body, model, report, asset):
         artifact_store.link_latest(subject, artifact)  # again: another run of this name may have come between
     publish_markdown(_figures(subject, report, asset), "result", f"What came of {subject}")
     return artifact_store.subject_folder(subject)
+
+
+def with_keypoints(store: Store, recorded: Artifact, settings: Settings) -> Artifact:
+    """The recording as it came, or with what a network found in it."""
+    wanted = needs_detection(recorded, settings.detection)
+    return detect(store, recorded, settings.detection) if wanted else recorded
 
 
 def prepared(store: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact, Artifact, Artifact]:

@@ -44,8 +44,9 @@ def settled(segmentation: Artifact, settings: SegmentationSettings) -> bool:
 
 def needs_body(recording: Artifact, settings: SegmentationSettings) -> bool:
     """Whether segmentation has to be shown where the body is: a camera has neither masks nor a clean plate, and there
-    is no learned model; or nothing was detected."""
+    is no learned model and no network that detected people; or nothing was detected."""
     capture = Capture.load(recording.root)
     first = capture.train_frames[0]
     unmasked = (capture.background(c) is None and capture.given_mask(c, first) is None for c in capture.train_cameras)
-    return not capture.has_keypoints or (settings.model is None and any(unmasked))
+    told = settings.model is not None or capture.was_looked_at
+    return not capture.has_keypoints or (not told and any(unmasked))

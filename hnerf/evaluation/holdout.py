@@ -16,13 +16,13 @@ from hnerf.capture.masks import Masks
 from hnerf.config import EvaluationSettings
 from hnerf.errors import InputError
 from hnerf.evaluation.columns import shown_as, why_not_shown
-from hnerf.evaluation.images import render, score_split, scored_views, unscored
+from hnerf.evaluation.images import mean_of, render, score_split, scored_views, unscored
 from hnerf.evaluation.views import PRIMARY
 
 EACH = "each"
 LEAST_CAMERAS = 2  # left to train on
 SCORES = "holdout.json"
-FIGURES = ("psnr", "ssim", "mask_iou")
+FIGURES = ("psnr", "ssim", "mask_iou", "lpips")
 LABEL = "photographs under the capture's own masks, camera left out of fit and training"
 NOT_ASKED = "no field was trained without a camera, as `hnerf run --set evaluation.holdout=each` does, for each in turn"
 
@@ -102,10 +102,5 @@ def gathered(capture: Capture, folders: Sequence[Path]) -> dict[str, Any]:
         reason = "the capture has test cameras, which score it" if capture.test_cameras else NOT_ASKED
         return {"holdout": None, "holdout_reason": reason}
     cameras = {found.pop("camera"): found for found in (json.loads((f / SCORES).read_text()) for f in folders)}
-    mean = {split: {key: _mean([c[split][key] for c in cameras.values()]) for key in FIGURES} for split in PRIMARY}
+    mean = {split: {key: mean_of([c[split][key] for c in cameras.values()]) for key in FIGURES} for split in PRIMARY}
     return {"holdout": {"what": LABEL, "cameras": cameras, "mean": mean}}
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
