@@ -27,7 +27,7 @@ def settings_list(settings: Section, prefix: str = "", kinds: str = "") -> Itera
             yield from settings_list(value, f"{prefix}{name}.", others)
         else:
             assigned = f"{prefix}{name}={json.dumps(value, default=str)}"
-            yield f"{assigned:<45} {kinds if name == 'kind' else _type(field):<20} {about.get(name, '')}".rstrip()
+            yield f"{assigned:<45}  {kinds if name == 'kind' else _type(field):<20}  {about.get(name, '')}".rstrip()
 
 
 def _sections(kind: type[Section]) -> list[type]:

@@ -235,7 +235,7 @@ class Trainer:
         return (self.step - self.field_steps) / s.novel_pose_steps
 
     def _report_progress(self) -> None:
-        """Report steps of both phases; as many of the field's as its time says where that runs out before."""
+        """Report the steps done of both phases, or as many as the time used stands for if that is more."""
         done = self._progress() * self.field_steps if self.step < self.field_steps else self.step
         report("training", done, self.steps)
 
