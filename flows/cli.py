@@ -23,7 +23,7 @@ from hnerf.capture.manifest import read_manifest
 from hnerf.config import PerformerSettings, load_settings, overridden
 from hnerf.errors import InputError
 from hnerf.files import atomic_folder
-from hnerf.render.subject import KINDS, RenderOptions, render_subject
+from hnerf.render.subject import OUTPUT_KINDS, RenderOptions, render_subject
 from hnerf.synthetic import write_performer
 from tasks.calibration import calibrate
 from tasks.capture import ingest
@@ -182,7 +182,9 @@ def _add_stability(command: argparse.ArgumentParser) -> None:
 def _add_render(render: argparse.ArgumentParser) -> None:
     render.add_argument("subject", type=Path, help="<store>/subjects/<name>, as `run` left it")
     render.add_argument("--out", type=Path, default=Path("pictures"), help="the folder to write (default: pictures)")
-    render.add_argument("--what", default="colour", metavar="LIST", help=f"of {','.join(KINDS)} (default: colour)")
+    render.add_argument(
+        "--what", default="colour", metavar="LIST", help=f"of {','.join(OUTPUT_KINDS)} (default: colour)"
+    )
     view = render.add_mutually_exclusive_group()
     view.add_argument("--camera", help="a recorded camera's name (default: an orbit)")
     view.add_argument("--path", type=Path, help="a JSON list of cameras, or a folder of them, to fly along")
