@@ -18,7 +18,7 @@ from provenance import table
 from registry import Result
 
 from hnerf.files import replace_text
-from hnerf.study.machine import in_words
+from hnerf.study.machine import describe_machine
 
 MODULE = re.compile(r"[a-z]\w*(\.\w+)+")  # started by name, as the ranks of a training are
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
@@ -91,7 +91,9 @@ def save_record(root: Path, name: str, record: dict[str, Any]) -> None:
     replace_text(path, json.dumps(dict(sorted(records.items())), indent=1) + "\n")
     rows = [["result", "seconds", "commit", "date", "machine", "load"]]
     for made, r in sorted(records.items()):
-        rows.append([made, shown_seconds(r), r["commit"], r["date"], in_words(r["machine"]), f"{r['load']:.1f}"])
+        rows.append(
+            [made, shown_seconds(r), r["commit"], r["date"], describe_machine(r["machine"]), f"{r['load']:.1f}"]
+        )
     lines = ["# Where results come from", "", "Made by `benchmarks/all.py`; see docs/results.md.", "", *table(rows), ""]
     replace_text(path.with_suffix(".md"), "\n".join(lines))
 

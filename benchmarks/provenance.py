@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import hnerf
-from hnerf.study.machine import in_words, machine
+from hnerf.study.machine import describe_machine, machine
 from hnerf.tables import head, line
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -28,7 +28,7 @@ def provenance() -> dict[str, Any]:
 
 def sentence(result: dict[str, Any]) -> str:
     """The same as one line of Markdown."""
-    return f"{in_words(result['machine'])}; commit {result['commit']}; {result['date']}."
+    return f"{describe_machine(result['machine'])}; commit {result['commit']}; {result['date']}."
 
 
 def write_result(name: str, result: dict[str, Any], markdown: str) -> None:

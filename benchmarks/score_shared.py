@@ -19,7 +19,7 @@ from typing import Any
 
 from provenance import ROOT, SHARED, provenance, sentence, table, write_result
 
-from hnerf.evaluation.views import NEW_POSES
+from hnerf.evaluation.views import NOVEL_POSE_SPLITS
 from tasks.launcher import end_with_parent
 
 SCORE_RUN = SHARED / "accept" / "score_run.py"
@@ -122,7 +122,7 @@ def _columns_table(captures: dict[str, Any]) -> list[str]:
     for name, figures in captures.items():
         if "error" not in figures:
             own = figures["own_metrics"]
-            rows.append([name, *(_in_a_cell(own[column]) for column in NEW_POSES)])
+            rows.append([name, *(_in_a_cell(own[column]) for column in NOVEL_POSE_SPLITS)])
     return table(rows)
 
 

@@ -15,7 +15,7 @@ from flows.train_subject import prepared
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
 from hnerf.errors import InputError, NotApplicableError, one_line
-from hnerf.evaluation.columns import why_no_novel_poses
+from hnerf.evaluation.columns import reason_without_novel_poses
 from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, TRACKED
 from hnerf.files import replace_text, with_pictures
 from hnerf.study.degradations.catalogue import KINDS, Degradation, degrade_settings
@@ -218,7 +218,7 @@ def measure(
     there is one, of novel poses, animated, or of training poses where the capture as recorded or the method has no
     others. Of extreme poses faults alone. A fit that was made worse is trained on; novel poses are shown as the good
     one has them."""
-    no_poses = why_no_novel_poses(model.root)
+    no_poses = reason_without_novel_poses(model.root)
     if degradation and KINDS[degradation.kind].place == "poses":
         if no_poses:
             raise NotApplicableError(no_poses)

@@ -8,7 +8,7 @@ from flows.run_page import publish_markdown
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import recorded_cameras
 from hnerf.config import Settings, load_settings
-from hnerf.evaluation.holdout import cameras_left_out
+from hnerf.evaluation.holdout import held_out_cameras
 from tasks.asset import export
 from tasks.calibration import calibrate, calibrated
 from tasks.capture import ingest, subset_capture
@@ -35,7 +35,7 @@ def train_subject(
     source, truth = read_capture(capture, store)
     if settings.evaluation.holdout:
         recorded = recorded_cameras(source.root)
-        cameras_left_out(recorded.train, recorded.test, settings.evaluation.holdout)  # refused before any work
+        held_out_cameras(recorded.train, recorded.test, settings.evaluation.holdout)  # refused before any work
 
     recording = ingest(artifact_store, source, settings.capture)
     subject = Capture.load(recording.root).name
@@ -75,7 +75,7 @@ def left_out_cameras(recording: Artifact, calibration: Artifact, settings: Setti
     if settings.evaluation.holdout is None:
         return ()
     used = calibrated(recording, calibration)
-    return cameras_left_out(used.train_cameras, used.test_cameras, settings.evaluation.holdout)
+    return held_out_cameras(used.train_cameras, used.test_cameras, settings.evaluation.holdout)
 
 
 def without(

@@ -70,9 +70,8 @@ def rasterise(layout: UvLayout, texture_px: int) -> Texels:
     p = np.stack([column, row], 1)
     weights = np.stack([_cross(b - p, c - p), _cross(c - p, a - p), _cross(a - p, b - p)], 1)
     area = weights.sum(1, keepdims=True)
-    inside = (
-        np.clip(weights / np.where(area == 0, 1, area), 0, None) + 1e-9
-    )  # the centre of a texel that a face touches may lie outside it
+    # The centre of a texel that a face touches may lie outside it.
+    inside = np.clip(weights / np.where(area == 0, 1, area), 0, None) + 1e-9
     barycentric = torch.from_numpy(inside / inside.sum(1, keepdims=True)).float()
     return Texels(torch.from_numpy(row), torch.from_numpy(column), torch.from_numpy(face).long(), barycentric)
 

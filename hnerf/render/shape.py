@@ -15,11 +15,8 @@ from hnerf.render.motion import lowest_points_m, set_lowest_points
 
 MAX_FOLDED_SHARE = 0.005  # of the triangles; half a per cent turned over is not visible
 THICKNESS_RANGE = -0.9, 2.0  # allowed change of thickness, as a share of the distance from bone to skin
-UNSCALED_PARTS = (
-    "neck",
-    "wrist",
-    "foot",
-)  # parts of names of joints whose skin, and that of all joints below, stays as it is: head, hands, feet
+# Head, hands and feet: the skin of joints whose names contain these, and of all joints below, keeps its thickness.
+UNSCALED_PARTS = "neck", "wrist", "foot"
 
 
 def with_shape_values(rig: Rig, changes: Mapping[str, float]) -> Rig:

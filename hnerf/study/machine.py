@@ -24,7 +24,7 @@ def machine() -> dict[str, Any]:
     }
 
 
-def in_words(found: dict[str, Any]) -> str:
+def describe_machine(found: dict[str, Any]) -> str:
     """The same as part of a sentence."""
     cores, gpu = f"{found['threads']} of {found['cores']} cores", found["gpu"] or "no GPU"
     return f"{found['cpu']}, {cores}, {gpu}, torch {found['torch']}, Python {found['python']}"

@@ -14,8 +14,8 @@ from hnerf.errors import InputError
 CELLS = 128  # on the longest side: enough to see a hole of a finger's width
 # Of the body's own. Clothes and hair add up to a half of its volume; what is worn over the head or held, some height. A
 # person without legs loses a third of the volume and half of the length; a shell or a limb alone, more.
-VOLUMES = 0.7, 1.8
-LENGTHS = 0.8, 1.25
+VOLUME_RANGE = 0.7, 1.8
+LENGTH_RANGE = 0.8, 1.25
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ def check_surface(mesh: trimesh.Trimesh, body_m: np.ndarray, faces: np.ndarray) 
     body = trimesh.Trimesh(body_m, faces, process=False)
     volume, length = float(mesh.volume / body.volume), float(mesh.extents.max() / body.extents.max())
     fault = None if mesh.is_watertight else "surface is not watertight"
-    for name, value, (low, high) in (("volume", volume, VOLUMES), ("length", length, LENGTHS)):
+    for name, value, (low, high) in (("volume", volume, VOLUME_RANGE), ("length", length, LENGTH_RANGE)):
         if not low <= value <= high:
             fault = fault or f"surface has {value:.2f} of the body's {name}"
     return SurfaceCheck(fault, volume, length)

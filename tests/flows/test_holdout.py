@@ -115,7 +115,7 @@ def test_without_the_setting_nothing_is_left_out(calls: list[dict[str, Any]], tm
     ("holdout", "notes", "message"),
     [
         ("cam9", "name = 'ada'", "evaluation.holdout=cam9: no such training camera; there are 01, 02, 03"),
-        ("each", "[cameras]\ntrain = ['01', '02']\n", "of 2 training cameras fewer than 2 would be left"),
+        ("each", "[cameras]\ntrain = ['01', '02']\n", "fewer than 2 of the 2 training cameras would be left"),
     ],
 )
 def test_what_cannot_be_left_out_is_told_before_any_work(

@@ -17,7 +17,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.footage import Video
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.lens import Lens
-from hnerf.render.motion import between
+from hnerf.render.motion import interpolate_poses
 from hnerf.render.subject import RenderOptions, _cameras
 from tests.training.scene import TINY, record
 
@@ -74,7 +74,7 @@ def test_a_frame_shown_alone_keeps_its_deformation_and_no_other_pose_has_one(sub
         assert main(["render", str(subject), "--out", str(tmp_path / name), *view]) == 0
     avatar = load_avatar(subject / "training")
     camera = Capture.load(subject / "capture").cameras["0"]
-    halfway = between(avatar.body, 1, 2, 3)
+    halfway = interpolate_poses(avatar.body, 1, 2, 3)
     expected = {
         "alone/colour/000000.png": avatar.render(camera, avatar.body.theta[1], avatar.body.root[1]),
         "between/colour/000001.png": avatar.without_frames().render(camera, halfway.theta[1], halfway.root[1]),

@@ -38,8 +38,8 @@ def split(psnr: float) -> dict[str, Any]:
         {"camera": "c", "frame": f, "psnr": psnr + f, "view_angle_deg": 40.0 + f, "pose_distance_deg": 3.0}
         for f in (0, 2)
     ]
-    floors = {"empty_psnr": 18.0, "one_colour_psnr": 25.0}
-    return {"n": 2, "psnr": psnr, "ssim": 0.9, "mask_iou": 0.95, "per_image": rows, "geometry": GEOMETRY} | floors
+    trivial_psnr = {"empty_psnr": 18.0, "one_colour_psnr": 25.0}
+    return {"n": 2, "psnr": psnr, "ssim": 0.9, "mask_iou": 0.95, "per_image": rows, "geometry": GEOMETRY} | trivial_psnr
 
 
 def scores(psnr: float, frame_s: float, folder: str) -> dict[str, Any]:

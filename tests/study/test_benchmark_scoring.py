@@ -12,7 +12,7 @@ import torch
 
 from hnerf.avatar.avatar import Rendering
 from hnerf.capture.capture import Capture
-from hnerf.evaluation.columns import why_no_novel_poses
+from hnerf.evaluation.columns import reason_without_novel_poses
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.images import render
 from hnerf.evaluation.metrics import mask_box
@@ -186,7 +186,7 @@ def test_who_has_no_novel_poses(tmp_path: Path) -> None:
     def reason(machinery: str, static: bool) -> str | None:
         stored = {"static": static, "training": {"machinery": machinery}}
         (tmp_path / "settings.json").write_text(json.dumps(stored))
-        return why_no_novel_poses(tmp_path)
+        return reason_without_novel_poses(tmp_path)
 
     assert [reason(name, False) for name in ("fast", "paper", "neural_body")] == [None] * 3
     assert reason("fast", True) is None

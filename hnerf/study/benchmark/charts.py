@@ -35,7 +35,7 @@ class Speed:
     curves: Curves
     ends: Mapping[str, str]
     points: Mapping[str, Point]
-    floors: Mapping[str, float]
+    trivial_psnr: Mapping[str, float]
 
     def __bool__(self) -> bool:
         return bool(self.curves or self.points)
@@ -67,7 +67,7 @@ def speed_chart(
         for panel in (left, right):
             panel.set_xscale("log")
         lines(left, row.curves, looks, row.ends)
-        for name, height in row.floors.items():
+        for name, height in row.trivial_psnr.items():
             left.axhline(height, color=INK, linewidth=0.8, linestyle=(0, (1, 2)), zorder=1)
             left.annotate(
                 name, (0.01, height), (0, 3), ("axes fraction", "data"), "offset points", fontsize=8, color=INK

@@ -42,7 +42,7 @@ def draw(result: Mapping[str, Any], store: Path, table: Path) -> list[Path]:
             results.psnr_curves(variant),
             results.ends(variant),
             results.frame_points(variant),
-            results.floors(variant),
+            results.trivial_psnr(variant),
         )
         for title, variant in variants.items()
     }

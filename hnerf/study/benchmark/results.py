@@ -13,11 +13,11 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, PRIMARY, TRACKED
+from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, PRIMARY_SPLITS, TRACKED
 from hnerf.files import picture
 from hnerf.study.benchmark.convergence import HOW
 from hnerf.study.benchmark.curves import Point, seconds_to, value_at
-from hnerf.study.machine import in_words
+from hnerf.study.machine import describe_machine
 from hnerf.tables import head, line, pick, shown
 
 SPLITS = {
@@ -47,7 +47,7 @@ NEAR_BEST_DB = 1.0
 BINS = 6  # of the distance from training
 AFTER_S = {60.0: "60 s", 600.0: "10 min", 3600.0: "1 h"}
 ENDS = {"flat": "flat", "limit": "out of time", "steps": "its steps are done"}  # why a method has no longer training
-FLOORS = {"one_colour_psnr": "one colour in the true outline", "empty_psnr": "an empty picture"}
+TRIVIAL_PICTURES = {"one_colour_psnr": "one colour in the true outline", "empty_psnr": "an empty picture"}
 
 
 def scored(variant: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -73,10 +73,10 @@ def frame_points(variant: Mapping[str, Any]) -> dict[str, Point]:
     return {name: (seconds, psnr) for name, (seconds, psnr) in points.items() if psnr is not None}
 
 
-def floors(variant: Mapping[str, Any]) -> dict[str, float]:
+def trivial_psnr(variant: Mapping[str, Any]) -> dict[str, float]:
     """PSNR, over the images of the curves, of what needs no method; nothing where no image could be scored."""
     ends = [scores["curve"][-1] for scores in scored(variant).values() if scores["curve"]]
-    return {title: end[key] for end in ends[:1] for key, title in FLOORS.items() if end["psnr"] is not None}
+    return {title: end[key] for end in ends[:1] for key, title in TRIVIAL_PICTURES.items() if end["psnr"] is not None}
 
 
 def heading(title: str, variant: Mapping[str, Any]) -> str:
@@ -123,7 +123,7 @@ def near_best_seconds(variant: Mapping[str, Any]) -> dict[str, float | None]:
 
 def caption(result: Mapping[str, Any]) -> str:
     """What was measured, and on which machines."""
-    machines = sorted({in_words(s["machine"]) for v in result["variants"].values() for s in scored(v).values()})
+    machines = sorted({describe_machine(s["machine"]) for v in result["variants"].values() for s in scored(v).values()})
     limit = f"{result['seconds']:g} s for each field" if result["seconds"] else "training to each preset's own end"
     limit = f"{HOW}; {result['seconds']:g} s at most" if result["until_flat"] else limit
     return f"{result['subject']}, study {result['study']}: {limit}; on {'; on '.join(machines) or 'no machine yet'}."
@@ -165,7 +165,7 @@ def _variant_lines(variant: Mapping[str, Any]) -> list[str]:
         if scores["trained_on"] != {key: variant[key] for key in scores["trained_on"]}:
             fewer = "trained on {cameras} cameras and {frames} frames: calibration left the others out"
             missing.setdefault(fewer.format(**scores["trained_on"]), []).append(name)
-    for key, title in FLOORS.items() if scored(variant) else ():
+    for key, title in TRIVIAL_PICTURES.items() if scored(variant) else ():
         known = [[v for m in scored(variant).values() if (v := m[s][key]) is not None] for s in SPLITS]
         of_each = " / ".join(shown(values[0] if values else None, "{:.2f}") for values in known)
         lines.append(line([title, of_each, *[""] * (len(titles) - 2)]))
@@ -181,7 +181,7 @@ def cell(scores: Mapping[str, Any], key: str, form: str) -> str:
 
 def splits_of(key: str) -> tuple[str, ...]:
     """The splits that have a figure of COLUMNS: the primary ones have surfaces."""
-    return PRIMARY if key.startswith("geometry.") else tuple(SPLITS)
+    return PRIMARY_SPLITS if key.startswith("geometry.") else tuple(SPLITS)
 
 
 def _timeline(variant: Mapping[str, Any]) -> list[str]:
@@ -221,7 +221,7 @@ def as_csv(result: Mapping[str, Any]) -> str:
 def reasons(scores: Mapping[str, Any]) -> Iterator[str]:
     """Why splits lack figures; where no new pose has any, that is told once."""
     for split, name in SPLITS.items():
-        if "reason" in scores[split] and (split in PRIMARY or "reason" not in scores[ANIMATED]):
+        if "reason" in scores[split] and (split in PRIMARY_SPLITS or "reason" not in scores[ANIMATED]):
             yield f"no images of {name}: {scores[split]['reason']}"
         elif "geometry_reason" in scores[split] and "reason" not in scores[split]:
             yield f"no surfaces of {name}: {scores[split]['geometry_reason']}"

@@ -15,12 +15,12 @@ from hnerf.avatar.trained import load_avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture, read_rgb, write_image
 from hnerf.errors import InputError
-from hnerf.evaluation.columns import shown_as, why_not_shown
+from hnerf.evaluation.columns import avatar_for_split, reason_unavailable
 from hnerf.evaluation.evaluate import LPIPS, PROTOCOL, mesh_frames, score_meshes
 from hnerf.evaluation.ground_truth import GroundTruth
-from hnerf.evaluation.images import known_views, render, score_split, unscored
+from hnerf.evaluation.images import render, score_split, unscored, views_with_mask
 from hnerf.evaluation.pictures import crop, frame_person
-from hnerf.evaluation.views import PRIMARY, SPLITS, View, all_views, split_frames
+from hnerf.evaluation.views import PRIMARY_SPLITS, SPLITS, View, all_views, split_frames
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
 from hnerf.study.benchmark.plan import ScoringSettings
@@ -58,7 +58,7 @@ def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: P
     training: the folder that training left. A figure that cannot be had is null, and a reason stands beside it.
     """
     avatar, split = load_avatar(training, scene.device), settings.split
-    lacking = {name: why for name in SPLITS if (why := why_not_shown(name, training))}
+    lacking = {name: why for name in SPLITS if (why := reason_unavailable(name, training))}
     found: dict[str, Any] = {"machine": machine(), "protocol": f"{PROTOCOL} {HOW}", "lpips": LPIPS}
     found["split"], found["training"] = split, json.loads((training / "report.json").read_text())
     scored = scene.capture.test_cameras and split not in lacking
@@ -66,10 +66,10 @@ def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: P
     for name in SPLITS:
         if name in lacking:
             found[name] = unscored(lacking[name])
-            if name in PRIMARY:
+            if name in PRIMARY_SPLITS:
                 found[name] |= {"geometry": None, "geometry_reason": lacking[name]}
             continue
-        column = shown_as(name, avatar, scene.fitted)
+        column = avatar_for_split(name, avatar, scene.fitted)
         found[name] = score_at(scene, column, name, settings.images, settings.meshes, out)
         add_nearness(scene.capture, column, name, found[name])
     found["pictures"] = write_pictures(scene, split, found[split]["per_image"], out)
@@ -85,7 +85,7 @@ def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: P
 def score_end(scene: ScoringScene, training: Path, settings: ScoringSettings, out: Path) -> dict[str, Any]:
     """Write `scores.json` with what training reported and the last point of its curve alone; what it holds."""
     avatar, split = load_avatar(training, scene.device), settings.split
-    scored = scene.capture.test_cameras and not why_not_shown(split, training)
+    scored = scene.capture.test_cameras and not reason_unavailable(split, training)
     rows = curve(scene, split, training, avatar, settings, out) if scored else []
     found = {"training": json.loads((training / "report.json").read_text()), "curve": rows[-1:]}
     (out / "scores.json").write_text(json.dumps(found, indent=1))
@@ -103,7 +103,7 @@ def curve(
     for seconds, avatar in [*models, (end_s, finished)]:
         folder = out / "snapshots" / f"{seconds:g}"
         folder.mkdir(parents=True)
-        column = shown_as(split, avatar, scene.fitted)
+        column = avatar_for_split(split, avatar, scene.fitted)
         figures = score_at(scene, column, split, settings.snapshot_images, settings.snapshot_meshes, folder)
         del figures["per_image"]
         rows.append({"seconds": seconds} | figures)
@@ -117,11 +117,11 @@ def score_at(
     """A split's figures in the form of evaluation, of its avatar and at most as many images and surfaces of which the
     truth is known; None is all."""
     views = all_views(scene.capture, split)
-    views = evenly_spaced(known_views(views, scene.truth) or views, images or len(views))
+    views = evenly_spaced(views_with_mask(views, scene.truth) or views, images or len(views))
     if views and scene.capture.test_cameras:
         render({split: avatar}, scene.capture, views, out)
     found = score_split(scene.capture, split, views, scene.truth, out)
-    if split not in PRIMARY:
+    if split not in PRIMARY_SPLITS:
         return found
     if not meshes:
         return found | {"geometry": None, "geometry_reason": "the study asks for no surface here"}

@@ -18,7 +18,7 @@ from hnerf.study.stability.verdict import (
     FAILED_SHARE,
     WORST_LAST,
 )
-from hnerf.study.surface import LENGTHS, VOLUMES
+from hnerf.study.surface import LENGTH_RANGE, VOLUME_RANGE
 from hnerf.tables import head, line, shown
 
 REFERENCE = "as recorded"
@@ -27,7 +27,7 @@ LEGEND = (
     f"a Chamfer distance of at most {DEGRADED_RATIO:g} times that. **degraded**: worse. **failed**: over {FAILED_DB:g} "
     f"dB, or {FAILED_SHARE:g} of what that run has above an empty picture, or {FAILED_RATIO:g} times the distance; "
     "pictures no better than empty ones, a crash, no surface, one that is not watertight or not of the body's size "
-    f"(volume {VOLUMES[0]:g} to {VOLUMES[1]:g}, length {LENGTHS[0]:g} to {LENGTHS[1]:g} of it). **refused**: an "
+    f"(volume {VOLUME_RANGE[0]:g} to {VOLUME_RANGE[1]:g}, length {LENGTH_RANGE[0]:g} to {LENGTH_RANGE[1]:g} of it). **refused**: an "
     "earlier stage or the training said what is wrong with the input. **unscored**: nothing is known to be true of the "
     "images and surfaces that both runs show, so that neither good nor bad can be told; extreme poses are judged by "
     "surfaces alone. Novel poses from test cameras are scored, which no degradation touches, but that they and the "
