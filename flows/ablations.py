@@ -119,13 +119,13 @@ def as_markdown(result: dict[str, Any]) -> str:
     with_overrides = f" with {', '.join(result['overrides'])}" if result["overrides"] else ""
     titles = ["", *(title for title, _ in COLUMNS.values()), "training, s", "on"]
     lines = [f"# Ablations of {result['subject']}, preset `{result['preset']}`{with_overrides}", ""]
-    lines += [results.CELL, ""]
+    lines += [results.CELL_LEGEND, ""]
     lines += head(titles)
     lines += [line([name, *_cells(row)]) for name, row in result["rows"].items()]
     if result["left_out"]:
         lines += ["", "Left out:", "", *(f"- {name}: {reason}" for name, reason in result["left_out"].items())]
     found = [row for row in result["rows"].values() if "error" not in row]
-    reasons = {reason: None for row in found for reason in results.reasons(row)}
+    reasons = {reason: None for row in found for reason in results.missing_figures(row)}
     lines += ["", *(f"- {reason}" for reason in reasons)] if reasons else []
     protocols = {row["protocol"] for row in found}
     return "\n".join([*lines, "", *sorted(protocols), ""])

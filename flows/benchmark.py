@@ -13,8 +13,8 @@ from hnerf.capture.capture import Capture
 from hnerf.config import Settings
 from hnerf.errors import InputError, one_line
 from hnerf.files import with_pictures
-from hnerf.study.benchmark.convergence import flat, limits_s
-from hnerf.study.benchmark.plan import Study, Variant, load_study
+from hnerf.study.benchmark.convergence import is_flat, training_limits_s
+from hnerf.study.benchmark.plan import BenchmarkStudy, Variant, load_study
 from hnerf.study.benchmark.publish import publish
 from tasks.benchmark import score_end_of_training, score_training
 from tasks.calibration import calibrated
@@ -42,7 +42,7 @@ def benchmark(
     of every training, instead of the study's. A method that fails says why and the rest go on; a worker that was killed
     ends the flow, and the same call goes on in the training that it was in.
     """
-    plan = load_study(study).narrowed(methods or [], seconds)
+    plan = load_study(study).restricted_to(methods or [], seconds)
     capture_settings = [plan.settings(name).capture for name in plan.methods]  # presets that are wrong say so first
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
@@ -61,7 +61,7 @@ def benchmark(
     return table
 
 
-def blank(plan: Study, study: str, recorded: Capture) -> dict[str, Any]:
+def blank(plan: BenchmarkStudy, study: str, recorded: Capture) -> dict[str, Any]:
     """A result without figures, in the form of hnerf/study/benchmark/results.py."""
     described = plan.model_dump(include={"title", "notes", "claims", "seconds", "until_flat", "sweep", "methods"})
     variants = {title: describe(variant, recorded) for title, variant in plan.variants.items()}
@@ -71,19 +71,21 @@ def blank(plan: Study, study: str, recorded: Capture) -> dict[str, Any]:
 def describe(variant: Variant, recorded: Capture) -> dict[str, Any]:
     """How many cameras and frames a variant trains on; why it is left out where the capture has not as many."""
     try:
-        cameras, frames, _ = variant.parts(recorded)
+        cameras, frames, _ = variant.select(recorded)
     except InputError as error:
         return {"left_out": str(error)}
     counts = {"cameras": len(cameras or recorded.train_cameras), "frames": len(frames or recorded.train_frames)}
     return counts | {"methods": {}}
 
 
-def measure(store: Store, source: Source, truth: Source, variant: Variant, plan: Study, method: str) -> dict[str, Any]:
+def measure(
+    store: Store, source: Source, truth: Source, variant: Variant, plan: BenchmarkStudy, method: str
+) -> dict[str, Any]:
     """A method's scores on a variant, and the folder of their files in the store; {"error": one line} if it fails."""
     try:
         settings, more = plan.settings(method), dict[str, Any]()
         recording = ingest(store, source, settings.capture)
-        parts = variant.parts(Capture.load(recording.root))
+        parts = variant.select(Capture.load(recording.root))
         if parts != (None, None, None):
             recording = subset_capture(store, recording, *parts)
         stages = prepared(store, recording, settings)
@@ -104,14 +106,18 @@ def measure(store: Store, source: Source, truth: Source, variant: Variant, plan:
 
 
 def until_flat(
-    store: Store, truth: Source, stages: tuple[Artifact, Artifact, Artifact, Artifact], plan: Study, method: str
+    store: Store,
+    truth: Source,
+    stages: tuple[Artifact, Artifact, Artifact, Artifact],
+    plan: BenchmarkStudy,
+    method: str,
 ) -> tuple[Settings, dict[str, Any]]:
     """Settings of the last of longer and longer trainings; the curve of all, and why there are no longer ones. One that
     fails has no point: it may be too young for a surface."""
     assert plan.seconds is not None
     recording, calibration, _, body = stages
     points: list[dict[str, Any]] = []
-    for limit_s in limits_s(plan.seconds):
+    for limit_s in training_limits_s(plan.seconds):
         settings, ended = plan.settings(method, limit_s), "limit"
         try:
             model = train(store, *stages, settings.training)
@@ -125,7 +131,7 @@ def until_flat(
         points += found["curve"]
         if found["training"]["field_seconds"] < limit_s:
             ended = "steps"
-        elif flat([(row["seconds"], row["psnr"]) for row in points if row["psnr"] is not None]):
+        elif is_flat([(row["seconds"], row["psnr"]) for row in points if row["psnr"] is not None]):
             ended = "flat"
         if ended != "limit":
             break

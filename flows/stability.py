@@ -20,7 +20,7 @@ from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, TRACKED
 from hnerf.files import replace_text, with_pictures
 from hnerf.study.degradations.catalogue import KINDS, Degradation, degrade_settings
 from hnerf.study.stability.charts import curve_chart, matrix_chart
-from hnerf.study.stability.plan import Stability, load_stability
+from hnerf.study.stability.plan import StabilityStudy, load_stability
 from hnerf.study.stability.report import REFERENCE, as_markdown
 from hnerf.study.stability.verdict import BROKEN, RunVerdict, judge, near_border
 from tasks.capture import ingest, subset_capture
@@ -29,7 +29,14 @@ from tasks.fit import fit
 from tasks.policy import is_retryable
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
-from tasks.study import check_meshes, degrade_capture, degrade_fit, degrade_masks, dress, show_in_extreme_poses
+from tasks.study import (
+    check_meshes,
+    degrade_capture,
+    degrade_clothing,
+    degrade_fit,
+    degrade_masks,
+    show_in_extreme_poses,
+)
 from tasks.training import train
 
 log = logging.getLogger("hnerf.stability")
@@ -54,7 +61,7 @@ def stability(
     degradations, whose table's name ends in "-part". A failure is a result and the rest go on; a worker that was killed
     (LostWorkerError) ends the command, and the same command goes on from there.
     """
-    plan = load_stability(study).only(only)
+    plan = load_stability(study).restricted_to(only)
     plan = plan.model_copy(update={"methods": tuple(methods)}) if methods else plan
     presets = {name: load_settings(name, plan.overrides) for name in plan.methods}
     artifact_store = Store(store.resolve())
@@ -84,7 +91,7 @@ def stability(
 
 
 def _runs(
-    store: Store, source: Source, truth: Source, plan: Stability, presets: dict[str, Settings]
+    store: Store, source: Source, truth: Source, plan: StabilityStudy, presets: dict[str, Settings]
 ) -> Iterator[Figures]:
     """Every run's row: its method, degradation and verdict, and figures where there are any; or {"left_out": what and
     why}."""
@@ -126,10 +133,10 @@ def _runs_of_seed(
         yield row | {"kind": kind, "strength": strength} | judged(found, good)
 
 
-def recorded(store: Store, source: Source, plan: Stability, settings: Settings) -> Artifact:
+def recorded(store: Store, source: Source, plan: StabilityStudy, settings: Settings) -> Artifact:
     """The recording, or that part of it which stands for all."""
     recording = ingest(store, source, settings.capture)
-    parts = plan.part.parts(Capture.load(recording.root))
+    parts = plan.part.select(Capture.load(recording.root))
     return recording if parts == (None, None, None) else subset_capture(store, recording, *parts)
 
 
@@ -147,7 +154,7 @@ def judged(found: Figures, good: Figures) -> Figures:
         verdict = judge(row, reference, found["faults"])
         near = near_border(row, reference, found["faults"])
         row |= {"reference": reference, "protocol": found["protocol"], "seconds": found["seconds"]}
-    return row | {"verdict": verdict.word, "reason": verdict.reason, "near_border": near}
+    return row | {"verdict": verdict.verdict, "reason": verdict.reason, "near_border": near}
 
 
 def in_common(one: Figures, other: Figures) -> Figures:
@@ -170,7 +177,7 @@ def attempt(
     try:
         stages = prepare(store, recording, truth, settings, degradation)
         training = settings.training
-        if degradation and KINDS[degradation.kind].place == "settings":
+        if degradation and KINDS[degradation.kind].target == "settings":
             training = degrade_settings(training, degradation)
         model = train(store, *stages, training)
         at_bad_input = "failed"
@@ -190,17 +197,17 @@ def prepare(
     store: Store, recording: Artifact, truth: Source, settings: Settings, degradation: Degradation | None
 ) -> tuple[Artifact, Artifact, Artifact, Artifact]:
     """Capture, calibration, masks and body, made worse at the degradation's place."""
-    place = KINDS[degradation.kind].place if degradation else None
-    if degradation and place == "capture":
+    target = KINDS[degradation.kind].target if degradation else None
+    if degradation and target == "capture":
         recording = degrade_capture(store, recording, degradation)
     recording, calibration, masks, body = prepared(store, recording, settings)
-    if degradation and place == "worn":
-        recording = dress(store, truth, recording, calibration, body, degradation)
+    if degradation and target == "clothing":
+        recording = degrade_clothing(store, truth, recording, calibration, body, degradation)
         return prepared(store, recording, settings)
-    if degradation and place == "masks":
+    if degradation and target == "masks":
         masks = degrade_masks(store, recording, calibration, masks, degradation)
         body = fit(store, recording, calibration, masks, settings.fit)
-    if degradation and place == "fit":
+    if degradation and target == "fit":
         body = degrade_fit(store, body, degradation)
     return recording, calibration, masks, body
 
@@ -219,15 +226,15 @@ def measure(
     others. Of extreme poses faults alone. A fit that was made worse is trained on; novel poses are shown as the good
     one has them."""
     no_poses = reason_without_novel_poses(model.root)
-    if degradation and KINDS[degradation.kind].place == "poses":
+    if degradation and KINDS[degradation.kind].target == "poses":
         if no_poses:
             raise NotApplicableError(no_poses)
         return {"faults": _faults(show_in_extreme_poses(store, model, degradation))}
     *_, good_body = prepare(store, recording, truth, settings, None)
-    if degradation and KINDS[degradation.kind].place == "worn":
+    if degradation and KINDS[degradation.kind].target == "clothing":
         _, truth = read_capture(stages[0].root)
     recorded, calibration, masks, body = stages
-    if degradation and KINDS[degradation.kind].place == "fit":
+    if degradation and KINDS[degradation.kind].target == "fit":
         body = good_body
     report = evaluate(store, truth, recorded, calibration, masks, body, model, settings.evaluation)
     metrics = json.loads((report.root / "metrics.json").read_text())

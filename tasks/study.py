@@ -13,9 +13,9 @@ from hnerf.capture.masks import Masks
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.study.degradations.catalogue import Degradation
 from hnerf.study.degradations.catalogue import degrade_capture as write_degraded
+from hnerf.study.degradations.catalogue import degrade_clothing as write_dressed
 from hnerf.study.degradations.catalogue import degrade_fit as disturbed
 from hnerf.study.degradations.catalogue import degrade_masks as degraded
-from hnerf.study.degradations.catalogue import dress as write_dressed
 from hnerf.study.degradations.fit import extreme_poses
 from hnerf.study.surface import SurfaceCheck, check_pose, check_surface
 from tasks.calibration import calibrated
@@ -35,7 +35,7 @@ def degrade_capture(out: Path, recording: Artifact, degradation: Degradation) ->
 
 
 @stage("study-worn", version="1")
-def dress(
+def degrade_clothing(
     out: Path, truth: Source, recording: Artifact, calibration: Artifact, body: Artifact, degradation: Degradation
 ) -> dict[str, float]:
     """A capture whose person wears more than was recorded, and under `ground_truth/` what is known to be true of it."""

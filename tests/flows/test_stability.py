@@ -75,7 +75,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
     def degrade(*inputs: Any) -> Any:
         return made(f"{inputs[-1].kind} {inputs[-1].strength:g}")
 
-    def dress(_: Any, truth: Any, recording: Any, cameras: Any, body: Any, degradation: Any) -> Any:
+    def degrade_clothing(_: Any, truth: Any, recording: Any, cameras: Any, body: Any, degradation: Any) -> Any:
         assert (truth, recording.name, body.name) == ("true", "capture", "body")
         return degrade(degradation)
 
@@ -97,7 +97,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
         "degrade_capture": degrade,
         "degrade_masks": degrade,
         "degrade_fit": degrade,
-        "dress": dress,
+        "dress": degrade_clothing,
         "check_meshes": lambda *_: made("surfaces", surface={"000001": {"fault": None}}),
         "show_in_extreme_poses": show,
     }
@@ -249,7 +249,7 @@ def test_a_part_stands_for_the_capture(
     (tmp_path / "mine.yaml").write_text(STUDY.replace("seeds: [0, 1]", f"seeds: [0]\n{part}"))
     found = study(tmp_path, only=["pose_noise"])
     assert [(s["recording"], s["body"]) for s in stages] == [("moment", "body"), ("moment", "pose_noise 2")]
-    assert "the capture beyond a part of it: frames 1, novel_poses False" in found["left_out"]
+    assert "the capture outside this part: frames 1, novel_poses False" in found["left_out"]
 
 
 def test_bad_input_in_evaluation_is_failure(

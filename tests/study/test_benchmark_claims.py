@@ -1,4 +1,4 @@
-"""Claims looked for in a result that was made up: H-NeRF and one other, from two and from four cameras."""
+"""Claims checked on a synthetic result: H-NeRF and one other, from two and from four cameras."""
 
 from typing import Any, get_args
 
@@ -10,7 +10,7 @@ from tests.study.test_benchmark_results import scores
 
 
 def of_method(psnr: float, chamfer: float, iou: float, cameras: int, slope: float) -> dict[str, Any]:
-    """Scores whose images lose `slope` dB a degree of angle; novel poses lose it a degree of pose."""
+    """Return scores whose images lose `slope` dB a degree of angle; novel poses lose it a degree of pose."""
     found = scores(psnr, 1.0, "") | {"trained_on": {"cameras": cameras, "frames": 1}}
     rows = [
         {"view_angle_deg": x, "pose_distance_deg": x, "psnr": psnr + offset - slope * x}
@@ -23,7 +23,7 @@ def of_method(psnr: float, chamfer: float, iou: float, cameras: int, slope: floa
 
 
 def made_up(check: str, **changes: Any) -> dict[str, Any]:
-    """fast: 28 to 30 dB, 0.2 to 0.1; nerf: 20 to 26 dB, 0.9 to 0.5."""
+    """Return a result. fast: 28 to 30 dB, 0.2 to 0.1; nerf: 20 to 26 dB, 0.9 to 0.5."""
     fast = {2: (28.0, 0.2, 0.9), 4: (30.0, 0.1, 0.9)} | changes.get("fast", {})
     nerf = {2: (20.0, 0.9, 0.05), 4: (26.0, 0.5, 0.05)} | changes.get("nerf", {})
     slope = changes.get("slope", 0.1)
@@ -65,7 +65,7 @@ def test_the_first_method_is_ahead() -> None:
 
 
 def test_quality_falls_with_the_angle_and_who_is_ahead_at_each() -> None:
-    """Six bins of 15 degrees: the first and the last hold one image each."""
+    """Use six bins of 15 degrees, of which the first and the last hold one image each."""
     found = verdict(made_up("falls_with_angle"))
     assert found.startswith(
         "yes: 4 cameras: fast 30.0 dB at 0°, 21.0 at 90°; 4 cameras: nerf 26.0 dB at 0°, 17.0 at 90°"
@@ -78,7 +78,7 @@ def test_quality_falls_with_the_angle_and_who_is_ahead_at_each() -> None:
 
 @pytest.mark.parametrize(("slope", "seen"), [(0.0, "yes: 4 cameras: correlation -0.32 over 4 images"), (0.1, "no: ")])
 def test_new_poses_do_not_depend_on_how_far_they_are(slope: float, seen: str) -> None:
-    """Without a slope: deviations of x -45, -15, 15, 45 and of y 0, 1, -1, 0: -30 / sqrt(4500 x 2)."""
+    """Without a slope, deviations of x are -45, -15, 15, 45 and of y 0, 1, -1, 0: -30 / sqrt(4500 x 2)."""
     assert verdict(made_up("no_trend_with_pose", slope=slope)).startswith(seen)
 
 
