@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from provenance import RESULTS, SHARED, provenance, sentence, table, write_result
 
-from flows.benchmark import trained
+from flows.benchmark import train_recording
 from hnerf.config import Settings, TrainingSettings, load_settings
 from hnerf.study.benchmark.plan import ScoringSettings
 from tasks.benchmark import score_training
@@ -64,7 +64,7 @@ def train_and_score(folder: Path, store: Store, settings: Settings) -> tuple[Tra
     """The training's settings with everything decided; its scores, with the decisions among them."""
     source, truth = read_capture(folder)
     recording = ingest(store, source, settings.capture)
-    calibration, body, model = trained(store, recording, settings)
+    calibration, body, model = train_recording(store, recording, settings)
     scores = score_training(store, truth, recording, calibration, body, model, SCORING)
     stored = json.loads((model.root / "settings.json").read_text())
     found = json.loads((scores.root / "scores.json").read_text())

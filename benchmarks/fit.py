@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 from provenance import SHARED, provenance, sentence, table, write_result
 
-from flows.train_subject import prepared
+from flows.train_subject import prepare_training
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import load_settings
 from hnerf.geometry.silhouette import silhouette
-from tasks.calibration import calibrated
+from tasks.calibration import calibrated_capture
 from tasks.capture import ingest
 from tasks.source import read_capture
 from tasks.store import Store
@@ -60,8 +60,8 @@ def measure(folder: Path, store: Store) -> dict[str, Any]:
     """Figures of a capture's fit against its ground truth."""
     settings = load_settings("fast")
     source, _ = read_capture(folder)
-    recording, calibration, _, made = prepared(store, ingest(store, source, settings.capture), settings)
-    capture, fit = calibrated(recording, calibration), BodyFit.load(made.root)
+    recording, calibration, _, made = prepare_training(store, ingest(store, source, settings.capture), settings)
+    capture, fit = calibrated_capture(recording, calibration), BodyFit.load(made.root)
     with tempfile.TemporaryDirectory() as subject:
         (Path(subject) / "fit").symlink_to(made.root)
         joints = runpy.run_path(str(SHARED / "accept" / "score_run.py"))["joints"](Path(subject), folder)

@@ -17,18 +17,18 @@ from typing import Any
 from matplotlib.figure import Figure
 from provenance import RESULTS, SHARED, provenance, sentence, table, write_result
 
-from flows.train_subject import find_masks
+from flows.train_subject import segment_subject
 from hnerf.capture.capture import Capture
 from hnerf.config import load_settings
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.study.degradations.catalogue import Degradation
-from tasks.calibration import calibrate, calibrated
+from tasks.calibration import calibrate, calibrated_capture
 from tasks.capture import ingest, subset_capture
 from tasks.fit import fit
 from tasks.source import read_capture
 from tasks.store import Artifact, Store
 from tasks.study import degrade_capture
-from tasks.training import train, trained
+from tasks.training import load_trained_avatar, train
 
 STEPS = 60
 AXES = {"frames": (6, 12, 24), "cameras": (1, 2, 4), "pixels": (0.25, 1.0, 4.0)}  # pixels: in times the recorded
@@ -88,10 +88,10 @@ def measure(store: Store, recording: Artifact) -> dict[str, float]:
         return found
 
     calibration = timed("calibration", lambda: calibrate(store, recording, settings.calibration))
-    masks = timed("segmentation", lambda: find_masks(store, recording, calibration, settings))
-    body = timed("fit", lambda: fit(store, recording, calibration, masks, settings.fit))
-    model = timed("training", lambda: train(store, recording, calibration, masks, body, settings.training))
-    avatar, capture = trained(model), calibrated(recording, calibration)
+    segmentation = timed("segmentation", lambda: segment_subject(store, recording, calibration, settings))
+    body = timed("fit", lambda: fit(store, recording, calibration, segmentation, settings.fit))
+    training = timed("training", lambda: train(store, recording, calibration, segmentation, body, settings.training))
+    avatar, capture = load_trained_avatar(training), calibrated_capture(recording, calibration)
     camera = capture.cameras[capture.train_cameras[0]]
     avatar.render(camera, avatar.body.theta[0], avatar.body.root[0])
     timed("one image", lambda: avatar.render(camera, avatar.body.theta[0], avatar.body.root[0]))

@@ -27,10 +27,10 @@ from hnerf.render.subject import OUTPUT_KINDS, RenderOptions, render_subject
 from hnerf.synthetic import write_performer
 from tasks.calibration import calibrate
 from tasks.capture import ingest
-from tasks.launcher import GaveUpError
+from tasks.launcher import RankFailedError
 from tasks.policy import is_permanent
 from tasks.source import read_capture
-from tasks.store import Store, require_whole
+from tasks.store import Store, require_intact
 
 DEMO = Path("demo")
 FAILED, BAD_INPUT = 1, 2
@@ -46,7 +46,7 @@ def main(argv: list[str] | None = None) -> int:
             options.command(options)
     except InputError as error:
         return _fail(error, BAD_INPUT)
-    except (GaveUpError, InvalidAsset) as error:
+    except (RankFailedError, InvalidAsset) as error:
         return _fail(error, FAILED)
     except OSError as error:
         if error.errno in NO_ROOM:
@@ -203,7 +203,7 @@ def _add_render(render: argparse.ArgumentParser) -> None:
 def _render(options: argparse.Namespace) -> None:
     for subject in (options.subject, options.motion):
         if subject and subject.is_dir():
-            require_whole(subject)
+            require_intact(subject)
     wish = RenderOptions(
         camera=options.camera,
         path=options.path,

@@ -8,7 +8,7 @@ from flows import cli
 from flows.cli import main
 from hnerf.asset.validation import InvalidAsset
 from hnerf.config import PerformerSettings
-from tasks.launcher import GaveUpError
+from tasks.launcher import RankFailedError
 from tests.shared_data import shared_capture
 
 
@@ -44,7 +44,7 @@ def test_a_training_that_cannot_go_on_is_one_line_and_exit_code_1(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def train(*_: object) -> None:
-        raise GaveUpError("the surface is empty: check masks and body fit")
+        raise RankFailedError("the surface is empty: check masks and body fit")
 
     monkeypatch.setattr(cli.train_subject, "fn", train)
     assert main(["run", "ada"]) == 1
