@@ -30,8 +30,8 @@ def with_shape_values(rig: Rig, changes: Mapping[str, float]) -> Rig:
         if name not in rig.beta_names:
             raise InputError(f"shape {name}: this body's values are {', '.join(rig.beta_names)}")
         beta[rig.beta_names.index(name)] += change
-    message = ", ".join(f"{name} {change:+.2f}" for name, change in changes.items())
-    return _require_unfolded(rig.reshaped(beta), rig, f"shape {message}")
+    title = ", ".join(f"{name} {change:+.2f}" for name, change in changes.items())
+    return _require_unfolded(rig.reshaped(beta), rig, f"shape {title}")
 
 
 def with_volume(rig: Rig, change: float) -> Rig:
@@ -48,10 +48,10 @@ def with_volume(rig: Rig, change: float) -> Rig:
     def missing_m3(share: float) -> float:
         return volume_m3(thicker(share)) - wanted_m3
 
-    message = f"volume {100 * change:+.0f} %"
+    title = f"volume {100 * change:+.0f} %"
     if not missing_m3(THICKNESS_RANGE[0]) < 0 < missing_m3(THICKNESS_RANGE[1]):
-        raise InputError(f"{message}: cannot be reached with this body; ask for a smaller change")
-    return _require_unfolded(thicker(brentq(missing_m3, *THICKNESS_RANGE, xtol=1e-4)), rig, message)
+        raise InputError(f"{title}: cannot be reached with this body; ask for a smaller change")
+    return _require_unfolded(thicker(brentq(missing_m3, *THICKNESS_RANGE, xtol=1e-4)), rig, title)
 
 
 def offsets_from_bones_m(rig: Rig) -> Tensor:
@@ -84,12 +84,12 @@ def transfer_poses(rig: Rig, body: BodyFit, up: str) -> BodyFit:
     return set_lowest_points(BodyFit(rig, body.frames, body.theta, body.root), lowest_points_m(body, up), up)
 
 
-def _require_unfolded(shaped: Rig, rig: Rig, message: str) -> Rig:
-    """Return `shaped`; raise InputError, starting with `message`, if too many of its triangles have turned over."""
+def _require_unfolded(shaped: Rig, rig: Rig, title: str) -> Rig:
+    """Return `shaped`; raise InputError, starting with `title`, if too many of its triangles have turned over."""
     upright = (_normals(shaped) * _normals(rig)).sum(1) >= 0  # False where a value is NaN
     folded = float((~upright).float().mean())
     if folded > MAX_FOLDED_SHARE:
-        raise InputError(f"{message}: folds {100 * folded:.1f} % of the skin over; ask for a smaller change")
+        raise InputError(f"{title}: folds {100 * folded:.1f} % of the skin over; ask for a smaller change")
     return shaped
 
 

@@ -180,8 +180,8 @@ def test_new_poses_are_not_scored_of_what_has_none(stages: list[TrainingSettings
     rows = json.loads(table.with_suffix(".json").read_text())["rows"]
     assert rows["full"]["novel_pose"]["reason"] == "H-NeRF's static network models one moment"
     assert "| full | 0.02 / - / - / - |" in table.read_text()
-    told = "no images of animated new poses: H-NeRF's static network models one moment"
-    assert table.read_text().count("H-NeRF's static network") == table.read_text().count(f"- {told}\n") == 1
+    expected = "no images of animated new poses: H-NeRF's static network models one moment"
+    assert table.read_text().count("H-NeRF's static network") == table.read_text().count(f"- {expected}\n") == 1
 
 
 def test_the_flow_runs_page_shows_the_table(

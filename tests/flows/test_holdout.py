@@ -130,8 +130,8 @@ def test_what_cannot_be_left_out_is_told_before_any_work(
     (tmp_path / "ada" / "capture.toml").write_text(notes)
     options = ["--store", str(tmp_path / "store"), "--set", f"evaluation.holdout={holdout}"]
     assert main(["run", str(tmp_path / "ada"), *options]) == 2
-    told = capsys.readouterr().err
-    assert message in told and told.count("\n") == 1
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
     assert calls == []
 
 

@@ -340,8 +340,8 @@ def test_a_run_to_compare_with_that_fails_is_kept_and_ends_its_seed(
     torn = torn_surface(tmp_path / "torn")
     monkeypatch.setattr(module, "check_meshes", lambda *_: torn)
     table = study(tmp_path, only=["pose_noise"])
-    told = [(r["kind"], r["seed"], r["verdict"], r["reason"]) for r in table["runs"]]
-    assert told == [("as recorded", seed, "failed", "surface is not watertight") for seed in (0, 1)]
+    rows = [(r["kind"], r["seed"], r["verdict"], r["reason"]) for r in table["runs"]]
+    assert rows == [("as recorded", seed, "failed", "surface is not watertight") for seed in (0, 1)]
     text = (tmp_path / "store" / "stability" / "ada-mine-part.md").read_text()
     assert "| pose noise, ° a joint | failed at 2 |" in text
 
@@ -353,8 +353,8 @@ def test_what_has_no_new_poses_is_judged_on_new_views(stages: list[dict[str, Any
         "methods: [nerfies, paper]\nseeds: [0]\ndegradations: {frames_left: [2, 1], extreme_poses: [45]}"
     )
     found = study(tmp_path)
-    told = [(r["method"], r["kind"], r["strength"], r["verdict"], r.get("psnr")) for r in found["runs"]]
-    assert told == [
+    rows = [(r["method"], r["kind"], r["strength"], r["verdict"], r.get("psnr")) for r in found["runs"]]
+    assert rows == [
         ("nerfies", "as recorded", None, "ok", 40.0),
         ("nerfies", "frames_left", 2, "ok", 40.0),
         ("nerfies", "frames_left", 1, "ok", 40.0),

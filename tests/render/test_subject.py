@@ -68,8 +68,8 @@ def test_a_recorded_camera_shows_every_fitted_frame(subject: Path, tmp_path: Pat
 def test_a_frame_shown_alone_keeps_its_deformation_and_no_other_pose_has_one(subject: Path, tmp_path: Path) -> None:
     """Displace frames 1 and 2 by 15 cm, 1.4 pixels, to either side of their poses; a pose halfway between is not
     displaced."""
-    wishes = {"alone": ["--frames", "1"], "between": ["--between", "1", "2", "--pictures", "3"]}
-    for name, options in wishes.items():
+    arguments = {"alone": ["--frames", "1"], "between": ["--between", "1", "2", "--pictures", "3"]}
+    for name, options in arguments.items():
         view = ["--camera", "0", "--what", "colour", *options]
         assert main(["render", str(subject), "--out", str(tmp_path / name), *view]) == 0
     avatar = load_avatar(subject / "training")

@@ -12,7 +12,7 @@ def test_times_double_up_to_the_longest() -> None:
 
 
 @pytest.mark.parametrize(
-    ("curve", "told"),
+    ("curve", "expected"),
     [
         ([(320.0, 20.0), (640.0, 20.09)], True),
         ([(320.0, 20.0), (640.0, 20.11)], False),
@@ -25,6 +25,6 @@ def test_times_double_up_to_the_longest() -> None:
     ],
 )
 def test_a_curve_is_flat_where_its_last_third_gains_less_than_a_tenth_of_a_decibel(
-    curve: list[tuple[float, float]], told: bool
+    curve: list[tuple[float, float]], expected: bool
 ) -> None:
-    assert is_flat(curve) == told
+    assert is_flat(curve) == expected

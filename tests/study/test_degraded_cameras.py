@@ -93,7 +93,7 @@ def test_strengths_go_one_way(strengths: tuple[float, ...]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "strengths", "told"),
+    ("kind", "strengths", "expected"),
     [
         ("cameras_left", (1, 2, 3), "whole numbers between 1 and inf that fall"),
         ("cameras_left", (0.5,), "whole numbers between 1 and inf that fall"),
@@ -107,8 +107,8 @@ def test_strengths_go_one_way(strengths: tuple[float, ...]) -> None:
         ("mask_limb", (50, 120), "numbers between 0 and 100 that rise"),
     ],
 )
-def test_each_kind_has_its_way_and_bounds(kind: str, strengths: tuple[float, ...], told: str) -> None:
-    with pytest.raises(InputError, match=f"degradation {kind}: give {told}, the mildest first"):
+def test_each_kind_has_its_way_and_bounds(kind: str, strengths: tuple[float, ...], expected: str) -> None:
+    with pytest.raises(InputError, match=f"degradation {kind}: give {expected}, the mildest first"):
         check_strengths(kind, strengths)
 
 

@@ -77,9 +77,9 @@ def test_the_quick_study_tries_the_two_milder_strengths_and_says_what_it_left_ou
 )
 def test_bad_studies_are_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(text)
-    with pytest.raises(InputError, match=message) as told:
+    with pytest.raises(InputError, match=message) as raised:
         load_stability(str(tmp_path / "mine.yaml"))
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(raised.value)
 
 
 def test_unknown_studies_and_degradations_are_refused() -> None:

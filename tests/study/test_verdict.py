@@ -6,7 +6,7 @@ GOOD = {"psnr": 30.0, "chamfer_mm": 6.0, "empty_psnr": 18.0}
 
 
 @pytest.mark.parametrize(
-    ("psnr", "chamfer_mm", "told"),
+    ("psnr", "chamfer_mm", "expected"),
     [
         (29.0, 7.5, "ok"),
         (31.0, 5.0, "ok"),
@@ -21,9 +21,9 @@ GOOD = {"psnr": 30.0, "chamfer_mm": 6.0, "empty_psnr": 18.0}
         (None, None, "unscored: no image or surface is scored in both runs"),
     ],
 )
-def test_the_worse_of_both_figures_counts(psnr: float | None, chamfer_mm: float | None, told: str) -> None:
+def test_the_worse_of_both_figures_counts(psnr: float | None, chamfer_mm: float | None, expected: str) -> None:
     verdict = judge({"psnr": psnr, "chamfer_mm": chamfer_mm}, GOOD, [])
-    assert ": ".join(filter(None, (verdict.verdict, verdict.reason))) == told
+    assert ": ".join(filter(None, (verdict.verdict, verdict.reason))) == expected
 
 
 def test_half_of_what_a_good_run_has_above_an_empty_picture_is_failure() -> None:

@@ -81,6 +81,6 @@ def picture_rows(title: str, variant: Mapping[str, Any], store: Path) -> list[tu
         for k, view in enumerate(scores["pictures"]):
             heading = f"{title}: frame {view['frame']}, camera {view['camera']}"
             row = found.setdefault(heading, [("truth", read_rgb(folder / f"{k}-truth.png"))])
-            message = f"{name}, {psnr[view['camera'], view['frame']]:.1f} dB"
-            row.append((message, read_rgb(folder / f"{k}-render.png")))
+            caption = f"{name}, {psnr[view['camera'], view['frame']]:.1f} dB"
+            row.append((caption, read_rgb(folder / f"{k}-render.png")))
     return list(found.items())

@@ -58,16 +58,16 @@ def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: P
     training: the training's folder. A score that is not available is null, with a reason beside it.
     """
     avatar, split = load_avatar(training, scene.device), settings.split
-    lacking = {name: why for name in SPLITS if (why := reason_unavailable(name, training))}
+    unavailable = {name: why for name in SPLITS if (why := reason_unavailable(name, training))}
     found: dict[str, Any] = {"machine": machine(), "protocol": f"{PROTOCOL} {SCORING_PROTOCOL}", "lpips": LPIPS}
     found["split"], found["training"] = split, json.loads((training / "report.json").read_text())
-    scored = scene.capture.test_cameras and split not in lacking
+    scored = scene.capture.test_cameras and split not in unavailable
     found["curve"] = curve(scene, split, training, avatar, settings, out) if scored else []
     for name in SPLITS:
-        if name in lacking:
-            found[name] = unscored(lacking[name])
+        if name in unavailable:
+            found[name] = unscored(unavailable[name])
             if name in PRIMARY_SPLITS:
-                found[name] |= {"geometry": None, "geometry_reason": lacking[name]}
+                found[name] |= {"geometry": None, "geometry_reason": unavailable[name]}
             continue
         column = avatar_for_split(name, avatar, scene.fitted)
         found[name] = score_views(scene, column, name, settings.images, settings.meshes, out)

@@ -67,10 +67,10 @@ def tolerated_strength(result: Row, method: str, kind: str) -> str:
     strengths = result["plan"]["degradations"][kind]
     runs = [(f"{s:g}", run["verdict"]) for s in strengths if (run := worst_run(result, method, kind, s))]
     held = [strength for strength, _ in itertools.takewhile(lambda run: run[1] == "ok", runs)]
-    message = [f"holds to {held[-1]}"] if held else []
-    for words in (("degraded",), BROKEN):
-        message += [f"{verdict} at {strength}" for strength, verdict in runs if verdict in words][:1]
-    return ", ".join(message) or ("unscored" if runs else "-")
+    parts = [f"holds to {held[-1]}"] if held else []
+    for verdicts in (("degraded",), BROKEN):
+        parts += [f"{verdict} at {strength}" for strength, verdict in runs if verdict in verdicts][:1]
+    return ", ".join(parts) or ("unscored" if runs else "-")
 
 
 def as_markdown(result: Row, charts: Sequence[str]) -> str:
