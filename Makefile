@@ -1,11 +1,11 @@
-# make install | test | demo.  pip's own environment variables choose another index, for example for CUDA wheels.
+# make install | test | demo | docs.  pip's own environment variables choose another index, for example for CUDA wheels.
 export DO_NOT_TRACK := 1
 
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: install test demo
+.PHONY: install test demo docs
 
 install: $(INSTALLED)
 
@@ -23,3 +23,7 @@ test: $(INSTALLED)
 
 demo: $(INSTALLED)
 	$(BIN)/hnerf demo
+
+docs: $(INSTALLED)
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	$(BIN)/mkdocs build --strict

@@ -73,14 +73,14 @@ def train_and_score(folder: Path, store: Store, settings: Settings) -> tuple[Tra
 
 def resized(training: TrainingSettings, factor: float) -> TrainingSettings:
     """Return the settings with so many times the cells, samples a ray, and nodes that deform the body."""
-    fast, side = training.fast, float(np.cbrt(factor))
+    field, side = training.field, float(np.cbrt(factor))
     changes = {
-        "colour_cells": tuple(round(side * n) for n in fast.colour_cells),
-        "geometry_cells": tuple(round(side * n) for n in fast.geometry_cells),
-        "samples": round(factor * fast.samples),
-        "nodes": round(factor * fast.nodes),
+        "colour_cells": tuple(round(side * n) for n in field.colour_cells),
+        "geometry_cells": tuple(round(side * n) for n in field.geometry_cells),
+        "samples": round(factor * field.samples),
+        "nodes": round(factor * field.nodes),
     }
-    return training.model_copy(update={"fast": fast.model_copy(update=changes)})
+    return training.model_copy(update={"field": field.model_copy(update=changes)})
 
 
 def figures(found: dict[str, Any]) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.capture.masks import Masks, movement_px
 from hnerf.config import CaptureSettings, FitSettings, SegmentationSettings
-from hnerf.segmentation.prior import window_around
+from hnerf.segmentation.prior import bounding_window
 from hnerf.segmentation.segment import segment
 
 CAPTURES = ("valid-walk", "valid-turn-mono", "valid-wave")
@@ -144,7 +144,7 @@ def worst_frames(folder: Path, capture: Capture, masks: Masks) -> np.ndarray:
         mask, true = masks.get(*view), truth(folder, *view)
         picture = (0.6 * capture.image(*view)).astype(np.uint8)
         picture[mask & ~true], picture[true & ~mask] = (255, 0, 0), (0, 255, 255)
-        cell = picture[window_around(mask | true)]
+        cell = picture[bounding_window(mask | true)]
         cells.append(cv2.resize(cell, None, fx=500 / len(cell), fy=500 / len(cell), interpolation=cv2.INTER_NEAREST))
     return np.hstack(cells)
 

@@ -8,18 +8,18 @@ import json
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from prefect import flow
 
 from flows.run_page import publish_markdown
 from flows.train_subject import prepare_training
 from hnerf.capture.capture import Capture
-from hnerf.config import CONFIGS, Settings, TrainingSettings, load_settings, with_changes
+from hnerf.config import CONFIGS, Settings, load_settings, read_yaml, with_changes
 from hnerf.errors import InputError, one_line
 from hnerf.files import replace_text
 from hnerf.study.benchmark import results
-from hnerf.tables import head, line
+from hnerf.tables import head, line, pick
 from tasks.capture import ingest
 from tasks.evaluation import evaluate
 from tasks.policy import is_retryable
@@ -31,7 +31,6 @@ log = logging.getLogger("hnerf.ablations")
 
 ABLATIONS = CONFIGS / "ablations"
 FULL = "full"
-MACHINERIES = get_args(TrainingSettings.model_fields["machinery"].annotation)  # a section of settings each
 COLUMNS = results.COLUMNS | {"psnr": ("PSNR", "{:.2f}")}
 
 
@@ -76,24 +75,14 @@ def choose(full: Settings, only: Sequence[str]) -> tuple[dict[str, Settings], di
         raise InputError(f"--only {unknown[0]}: no such ablation; there are {', '.join(known)}")
     rows, left_out = {FULL: full}, {}
     for name in only or known:
-        settings = with_changes(full, known[name])
-        reason = why_pointless(full, settings)
-        if reason:
-            left_out[name] = reason
+        kind = pick(read_yaml(known[name]), "training.field.kind")
+        if kind not in (None, full.training.field.kind):
+            left_out[name] = f"the {full.training.field.kind} field has no such part"
+        elif (settings := with_changes(full, known[name])) == full:
+            left_out[name] = "off already"
         else:
             rows[name] = settings
     return rows, left_out
-
-
-def why_pointless(full: Settings, ablated: Settings) -> str | None:
-    """Return why an ablation would train the same avatar again; None if it would not."""
-    if ablated == full:
-        return "off already"
-    machinery = full.training.machinery
-    idle = {name: getattr(full.training, name) for name in MACHINERIES if name != machinery}
-    if ablated.model_copy(update={"training": ablated.training.model_copy(update=idle)}) == full:
-        return f"the {machinery} machinery has no such part"
-    return None
 
 
 def measure(store: Store, source: Source, truth: Source, settings: Settings) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from flows.train_subject import prepare_training
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
 from hnerf.errors import InputError, one_line
-from hnerf.files import with_pictures
+from hnerf.files import embed_images
 from hnerf.study.benchmark.convergence import is_flat, training_limits_s
 from hnerf.study.benchmark.plan import BenchmarkStudy, Variant, load_study
 from hnerf.study.benchmark.publish import publish
@@ -55,7 +55,7 @@ def benchmark(
             entry["methods"][name] = measure(artifact_store, source, truth, variant, plan, name)
             table = publish(result, artifact_store.root)  # an earlier call's files stand until the first result
     table = table or publish(result, artifact_store.root)  # if every variant is left out
-    publish_markdown(with_pictures(table), "benchmark", f"Speed against accuracy: {table.stem}")
+    publish_markdown(embed_images(table), "benchmark", f"Speed against accuracy: {table.stem}")
     return table
 
 

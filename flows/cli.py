@@ -20,11 +20,11 @@ from hnerf.calibration.boards.calibrate import calibrate_from_boards
 from hnerf.capture.formats.export import WRITERS, write_cameras
 from hnerf.capture.ingest import recognise
 from hnerf.capture.manifest import read_manifest
-from hnerf.config import PerformerSettings, load_settings, overridden
+from hnerf.config import SyntheticSettings, load_settings, overridden
 from hnerf.errors import InputError
 from hnerf.files import atomic_folder
 from hnerf.render.subject import OUTPUT_KINDS, RenderOptions, render_subject
-from hnerf.synthetic import write_performer
+from hnerf.synthetic import write_synthetic_capture
 from tasks.calibration import calibrate
 from tasks.capture import ingest
 from tasks.launcher import RankFailedError
@@ -280,9 +280,9 @@ def _cameras(folder: Path, layout: str, out: Path) -> None:
 
 
 def _synth(out: Path, overrides: Sequence[str] = ()) -> None:
-    settings = overridden(PerformerSettings(), overrides)
+    settings = overridden(SyntheticSettings(), overrides)
     with atomic_folder(out) as partial:
-        write_performer(partial, settings)
+        write_synthetic_capture(partial, settings)
 
 
 def _demo() -> None:

@@ -17,7 +17,7 @@ from hnerf.config import Settings, load_settings
 from hnerf.errors import InputError, NotApplicableError, one_line
 from hnerf.evaluation.columns import reason_without_novel_poses
 from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, TRACKED
-from hnerf.files import replace_text, with_pictures
+from hnerf.files import embed_images, replace_text
 from hnerf.study.degradations.catalogue import KINDS, Degradation, degrade_settings
 from hnerf.study.stability.charts import curve_chart, matrix_chart
 from hnerf.study.stability.plan import StabilityStudy, load_stability
@@ -86,7 +86,7 @@ def stability(
                 _write_table(result, _draw_charts(result, table), table)
         raise
     _write_table(result, _draw_charts(result, table), table)
-    publish_markdown(with_pictures(table), "stability", f"Where methods break on {subject}")
+    publish_markdown(embed_images(table), "stability", f"Where methods break on {subject}")
     return table
 
 

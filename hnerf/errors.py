@@ -1,14 +1,15 @@
-"""The one error that bad input raises."""
+"""Exceptions that bad input raises."""
 
 
 class InputError(Exception):
-    """Bad input. The message is one line that names the file and says what to do; it is never retried."""
+    """Bad input. The message is one line that names the file and says what to do; such a failure is never retried."""
 
 
 class NotApplicableError(InputError):
-    """What was asked for cannot be tried on this capture; nothing is wrong with either."""
+    """A request that this capture does not allow, such as comparing cameras where there is only one; neither is at
+    fault."""
 
 
 def one_line(error: Exception) -> str:
-    """An error's last line, or its kind where it says nothing."""
+    """Return the last line of an error's message, or the name of its class if the message is empty."""
     return str(error).splitlines()[-1] if str(error) else type(error).__name__

@@ -1,10 +1,11 @@
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from hnerf.config import load_settings, with_changes
+from hnerf.config import NerfSettings, load_settings, with_changes
 from hnerf.errors import InputError
 from hnerf.study.benchmark.plan import load_study
 from hnerf.study.stability.plan import load_stability
@@ -17,14 +18,14 @@ def changes(folder: Path, text: str) -> Path:
 
 
 def test_changes_replace_what_they_name_and_nothing_else(tmp_path: Path) -> None:
-    """At three depths, with a list that is replaced as a whole; all else as the preset has it."""
+    """Values change at three depths, with a list that is replaced as a whole; all others are the preset's."""
     full = load_settings("demo")
-    text = "training: {steps: 7, losses: {mask: 0.5}, fast: {colour_cells: [8]}}\nevaluation: {report_rows: 1}"
+    text = "training: {steps: 7, losses: {mask: 0.5}, field: {colour_cells: [8]}}\nevaluation: {report_rows: 1}"
     found = with_changes(full, changes(tmp_path, text)).model_dump()
     expected = full.model_dump()
     expected["training"]["steps"] = 7
     expected["training"]["losses"]["mask"] = 0.5
-    expected["training"]["fast"]["colour_cells"] = (8,)
+    expected["training"]["field"]["colour_cells"] = (8,)
     expected["evaluation"]["report_rows"] = 1
     assert found == expected
 
@@ -44,7 +45,7 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("asset: {faces: -1}", "asset.faces"),
         ("asset: {texture_px: -1}", "asset.texture_px"),
         ("asset: {texture_poses: 0}", "asset.texture_poses"),
-        ("training: {machinery: nerf}", "training: Value error, nerf does not tune poses"),
+        ("training: {field: {kind: nerf}}", "training: Value error, nerf does not tune poses"),
     ],
 )
 def test_what_is_not_allowed_is_refused_by_file_and_key(tmp_path: Path, text: str, named: str) -> None:
@@ -59,8 +60,8 @@ def test_what_is_not_allowed_is_refused_by_file_and_key(tmp_path: Path, text: st
         (b"training: [100", "is not YAML "),
         (b"title: \xe9t\xe9", "is not YAML "),
         (b"title: 2026-13-01", "is not YAML "),
-        (b"- training", "holds no keys and values"),
-        (b"fast", "holds no keys and values"),
+        (b"- training", "does not hold keys and values"),
+        (b"fast", "does not hold keys and values"),
     ],
 )
 @pytest.mark.parametrize(
@@ -84,3 +85,31 @@ def test_files_that_are_no_tables_are_one_line(
 def test_an_override_that_is_no_yaml_is_one_line() -> None:
     with pytest.raises(InputError, match=r"^--set training\.steps=\[100: is not YAML [^\n]*; correct it$"):
         load_settings("fast", ["training.steps=[100"])
+
+
+def test_a_preset_builds_on_another(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("based_on: nerf\ntraining: {field: {width: 5}}")
+    nerf, mine = load_settings("nerf").training, load_settings(str(path)).training
+    assert (nerf.field.width, mine.field.width) == (64, 5)
+    assert mine.model_copy(update={"field": nerf.field}) == nerf
+    path.write_text("based_on: absent")
+    with pytest.raises(InputError, match=r"^absent: no such preset or file"):
+        load_settings(str(path))
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("training.field.colour_cells=[8,-3]", "training.field.colour_cells.1: "),
+        ("training.field.kind=cube", "training.field: "),
+    ],
+)
+def test_a_fields_errors_name_the_key_as_it_is_set(override: str, message: str) -> None:
+    with pytest.raises(InputError, match=rf"^--set [^ ]*: {re.escape(message)}"):
+        load_settings("fast", [override])
+
+
+def test_another_kind_of_field_keeps_nothing_of_the_kind_before() -> None:
+    changed = load_settings("demo", ["training.pose_learning_rate=0", "training.field.kind=nerf"]).training
+    assert changed.field == NerfSettings()

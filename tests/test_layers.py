@@ -15,7 +15,7 @@ FLOORS = (*FOUNDATION, "geometry", "capture", "body", "synthetic", "segmentation
 
 
 def imported(path: Path) -> Iterator[str]:
-    """Names of the modules, or of what is taken from them, that a file imports."""
+    """Yield the names of the modules, or of what is taken from them, that a file imports."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

@@ -1,4 +1,4 @@
-"""Lines of Markdown tables, by hand."""
+"""Markdown tables, by hand."""
 
 from hnerf.tables import head, line, pick, shown
 

@@ -1,4 +1,4 @@
-"""What every trained model offers to evaluation and export, whatever its machinery."""
+"""Interface of a trained person to evaluation and export, whatever its field."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -11,7 +11,7 @@ from hnerf.geometry.camera import Camera
 
 @dataclass(frozen=True)
 class Rendering:
-    """One image over black. rgb (H, W, 3) in [0, 1] premultiplied by alpha (H, W); depth_m (H, W), 0 where alpha is
+    """One image over black: rgb (H, W, 3) in [0, 1], premultiplied by alpha (H, W); depth_m (H, W), 0 where alpha is
     0."""
 
     rgb: Tensor
@@ -20,30 +20,31 @@ class Rendering:
 
 
 class Avatar(Protocol):
-    """A trained person: `body` holds the fine-tuned rig, shape and poses of every fitted frame.
+    """A trained person; `body` holds the fine-tuned rig, shape and poses of every fitted frame.
 
-    theta (J, 3) radians and root (4, 4) world from body set the pose; any pose will do, not only fitted ones.
+    theta (J, 3) in radians and root (4, 4), world from body, set the pose, which need not be a fitted one.
     """
 
     @property
     def body(self) -> BodyFit: ...
 
     def without_frames(self) -> "Avatar":
-        """The same person without what was learned of single frames only, as it looks in a pose that no frame has."""
+        """Return the same person without what was learned for single frames, as it looks in a pose of no frame."""
         ...
 
-    def on_body(self, body: BodyFit) -> "Avatar":
-        """The same person with another body under the clothes, other poses, or both; the rig keeps its topology."""
+    def with_body(self, body: BodyFit) -> "Avatar":
+        """Return the same person with another body under the clothes, other poses, or both; the rig keeps its
+        topology."""
         ...
 
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
-        """Colour, coverage and depth of the person alone; colour as a training camera of this name is exposed."""
+        """Render colour, coverage and depth of the person alone, exposed as the training camera of this name."""
         ...
 
     def signed_distance(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
-        """d_hat at world points (N, 3): metres to the clothed surface, negative inside, (N,)."""
+        """Return d_hat (N,) at world points (N, 3): metres to the clothed surface, negative inside."""
         ...
 
     def colour(self, points_m: Tensor, directions: Tensor, theta: Tensor, root: Tensor) -> Tensor:
-        """Radiance at world points (N, 3) seen along unit directions (N, 3), in [0, 1], (N, 3)."""
+        """Return the radiance (N, 3) in [0, 1] at world points (N, 3) seen along unit directions (N, 3)."""
         ...

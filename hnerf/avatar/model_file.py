@@ -1,5 +1,5 @@
-"""A trained field on disk, no larger than what it learned: grids in 8 bits a feature, deflated, so that nodes that no
-ray has touched, which are zero, take no room."""
+"""Storage of a trained field: feature grids in 8 bits per feature, deflated, so that nodes that no ray has touched,
+which are zero, take no space."""
 
 import math
 import zlib
@@ -12,41 +12,44 @@ from torch import Tensor, nn
 from hnerf.errors import InputError
 from hnerf.fields.encoding import FeatureGrids
 
-STEP, STEPS = ".step", ".steps"  # what becomes of a grid: a unit, and how many of it each feature is, a node's together
-MOST = 127  # of them
+STEP_SUFFIX, STEPS_SUFFIX = (
+    ".step",
+    ".steps",
+)  # of a grid's quantisation step and its features in steps
+MAX_STEPS = 127  # of a feature, either sign
 
 
 def write_field(field: nn.Module, path: Path) -> None:
-    """All that the field has learned, as safetensors."""
+    """Write all that the field has learned, as safetensors."""
     tensors = {name: value.detach().cpu().contiguous() for name, value in field.state_dict().items()}
     for name in _grids(field):
         features = tensors.pop(name)[0].movedim(0, -1)
-        step = (features.abs().max() / MOST).clamp(min=torch.finfo(features.dtype).tiny)
+        step = (features.abs().max() / MAX_STEPS).clamp(min=torch.finfo(features.dtype).tiny)
         steps = (features / step).round().to(torch.int8).contiguous()
         packed = bytearray(zlib.compress(steps.numpy().tobytes()))
-        tensors |= {name + STEP: step, name + STEPS: torch.frombuffer(packed, dtype=torch.uint8)}
-    path.write_bytes(save(tensors))  # as its own writer tells a full disk by no OSError
+        tensors |= {name + STEP_SUFFIX: step, name + STEPS_SUFFIX: torch.frombuffer(packed, dtype=torch.uint8)}
+    path.write_bytes(save(tensors))  # safetensors' own writer raises no OSError on a full disk
 
 
-def fill_field(field: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
-    """Give the field what tensors read from `path` say; InputError if another version of it was written there."""
+def load_field(field: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
+    """Load the field's state from tensors read from `path`. Raises InputError if another version wrote the file."""
     tensors = dict(tensors)
     try:
         for name in _grids(field):
             _, channels, *nodes = field.get_parameter(name).shape
-            packed, step = (tensors.pop(name + part) for part in (STEPS, STEP))
-            room = channels * math.prod(nodes) + 1  # whatever the file pretends to hold
+            packed, step = (tensors.pop(name + part) for part in (STEPS_SUFFIX, STEP_SUFFIX))
+            room = channels * math.prod(nodes) + 1  # bounds memory, whatever size the file claims
             steps = zlib.decompressobj().decompress(packed.cpu().numpy().tobytes(), room)
             features = torch.frombuffer(bytearray(steps), dtype=torch.int8).view(*nodes, channels).movedim(-1, 0)
             tensors[name] = features[None].to(step) * step
         field.load_state_dict(tensors)
     except (KeyError, RuntimeError, ValueError, zlib.error):
-        raise other_version(path) from None
+        raise version_error(path) from None
 
 
-def other_version(path: Path) -> InputError:
-    """The error of a file that another version of the library wrote."""
-    return InputError(f"{path}: of another version; train the subject again")
+def version_error(path: Path) -> InputError:
+    """Return the error for a file that another version of the library wrote."""
+    return InputError(f"{path}: written by another version; train the subject again")
 
 
 def _grids(field: nn.Module) -> list[str]:

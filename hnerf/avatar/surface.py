@@ -14,22 +14,22 @@ from hnerf.avatar.avatar import Avatar
 from hnerf.body.rig import pose_vertices
 from hnerf.errors import InputError
 
-SLOPE_BOUND = 2.0  # |gradient| that skipping empty space allows for; a true distance has 1
-COARSEST_STRIDE = 9  # nodes; refined by threes, so that a coarse node is the centre of the block it stands for
+SLOPE_BOUND = 2.0  # greatest |gradient| assumed when empty space is skipped; a true distance has 1
+COARSEST_STRIDE = 9  # nodes; divided by three per level, so that a coarse node is the centre of its block
 POSED_CELLS = 256  # on the longest side of the box
 POSED_MARGIN_M = 0.2  # around the naked body: hair, shoes, loose clothes
 
 
 def posed_surface(avatar: Avatar, frame: int) -> trimesh.Trimesh:
-    """The zero surface of the avatar's signed distance in a frame's pose, in world metres (single precision)."""
+    """Extract the surface of the avatar in a frame's pose, in world metres (single precision)."""
     k = avatar.body.index(frame)
     mesh = surface_in_pose(avatar, avatar.body.theta[k], avatar.body.root[k], POSED_CELLS)
     return trimesh.Trimesh(mesh.vertices.astype(np.float32), mesh.faces, process=False)
 
 
 def surface_in_pose(avatar: Avatar, theta: Tensor, root: Tensor, cells: int) -> trimesh.Trimesh:
-    """The zero surface in a pose theta (J, 3), root (4, 4), in world metres; cells on the longest side of a box around
-    the body. Raises InputError as `extract_surface` does."""
+    """Extract the surface in a pose theta (J, 3), root (4, 4), in world metres; cells: along the longest side of a box
+    around the body. Raises InputError as `extract_surface` does."""
     body_m = pose_vertices(avatar.body.rig, theta, root)
     lower_m, upper_m = body_m.amin(0) - POSED_MARGIN_M, body_m.amax(0) + POSED_MARGIN_M
     with torch.no_grad():
@@ -39,11 +39,11 @@ def surface_in_pose(avatar: Avatar, theta: Tensor, root: Tensor, cells: int) -> 
 def extract_surface(
     signed_distance: Callable[[Tensor], Tensor], lower_m: Tensor, upper_m: Tensor, cells: int
 ) -> trimesh.Trimesh:
-    """Largest closed component of the zero surface inside a box, by marching cubes; faces turn outwards.
+    """Extract the largest closed component of the zero surface in a box by marching cubes; faces are oriented outwards.
 
-    signed_distance: points (N, 3) in metres, on the device of `lower_m`, to metres (N,), negative inside.
-    lower_m, upper_m (3,): the box; cells: how many on its longest side, cubic.
-    Raises InputError if the field has no surface in the box, or one that the box cuts.
+    signed_distance: maps points (N, 3) in metres, on the device of `lower_m`, to metres (N,), negative inside. lower_m,
+    upper_m (3,): the box; cells: cubic cells along its longest side. Raises InputError if the field has no surface in
+    the box, or one that the box cuts.
     """
     step_m = float((upper_m - lower_m).max()) / cells
     nodes = [math.ceil(float(side_m) / step_m - 1e-4) + 1 for side_m in upper_m - lower_m]
@@ -64,9 +64,10 @@ def extract_surface(
 def _sample_near_surface(
     signed_distance: Callable[[Tensor], Tensor], lower_m: Tensor, step_m: float, nodes: list[int]
 ) -> Tensor:
-    """Distances on a grid of `nodes`, exact near the surface; elsewhere the distance at the middle of the block around.
+    """Return distances on a grid of `nodes`, exact near the surface; elsewhere the distance at the centre of the
+    surrounding block.
 
-    A block whose middle is further from the surface than its corners, times SLOPE_BOUND, cannot meet the surface.
+    A block cannot meet the surface if its centre is farther from the surface than from its corners, times SLOPE_BOUND.
     """
     stride = COARSEST_STRIDE
     shape = [math.ceil(n / stride) for n in nodes]
@@ -88,7 +89,7 @@ def _sample_near_surface(
 
 
 def _largest_component(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Leaves the connected part with the largest area."""
+    """Keep the connected component with the largest area and return the mesh."""
     part = trimesh.graph.connected_component_labels(mesh.edges, len(mesh.vertices))[mesh.faces[:, 0]]
     mesh.update_faces(part == np.bincount(part, mesh.area_faces).argmax())
     mesh.remove_unreferenced_vertices()

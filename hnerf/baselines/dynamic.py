@@ -1,4 +1,4 @@
-"""What NeuralBody and Nerfies share: a density, and a learned code of each frame."""
+"""Common base of NeuralBody and Nerfies: a density field and a learned code per frame."""
 
 from typing import Any
 
@@ -12,21 +12,22 @@ from hnerf.fields.samples import RaySamples
 
 
 class DynamicField(BoxField):
-    """Codes start at zero and stay there where a frame is not trained on; a pose that no frame has
-    (Conditions.frame_row = -1) takes zero."""
+    """Field with a code per frame. Codes start at zero and stay zero for frames that are not trained on; a pose of no
+    frame (Conditions.frame_row = -1) takes the zero code."""
 
     def __init__(self, body: BodyFit, samples: int, learning_rate: float, code_width: int):
         super().__init__(body, samples, learning_rate)
         self.codes = nn.Parameter(torch.zeros(len(body.frames), code_width))
 
     def code(self, conditions: Conditions) -> Tensor:
-        """By body row, (n, code_width)."""
-        nobody = torch.zeros_like(self.codes[:1])
-        return torch.cat([self.codes, nobody])[conditions.frame_row]  # -1 is the last row
+        """Return the codes by body row, (n, code_width)."""
+        unseen = torch.zeros_like(self.codes[:1])
+        return torch.cat([self.codes, unseen])[conditions.frame_row]  # -1 is the last row
 
-    def seen(self, density: Tensor, colour: Tensor, depths_m: Tensor, far_m: Tensor, **more: Any) -> RaySamples:
-        """Density (R, K) and colour (R, K, 3) at depths (R, K) as samples; the last one reaches to the box's end."""
-        alpha, d = self.opacity(density, depths_m, far_m), self.read_off(density)
+    def to_samples(self, density: Tensor, colour: Tensor, depths_m: Tensor, far_m: Tensor, **extra: Any) -> RaySamples:
+        """Build samples from density (R, K) and colour (R, K, 3) at depths (R, K); the last sample extends to the end
+        of the box."""
+        alpha, d = self.opacity(density, depths_m, far_m), self.pseudo_distance(density)
         return RaySamples(
             alpha=alpha,
             alpha_dot=alpha,
@@ -36,5 +37,5 @@ class DynamicField(BoxField):
             d=d,
             residual=torch.zeros_like(d),
             gradient_norm=d.new_zeros(0),
-            **more,
+            **extra,
         )

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import along
+from hnerf.baselines.box import points_on_rays
 from hnerf.baselines.static import StaticField
 from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.fit_result import BodyFit
@@ -22,27 +22,27 @@ from hnerf.fields.shell import Boxes, stratified
 LAYERS, COLOUR_LAYERS = 8, 4
 POSITION_OCTAVES, VIEW_OCTAVES = 6, 4
 SOFTPLUS_SHARPNESS = 100.0
-INITIAL_RADIUS = 0.75  # of the first sphere, over half the box's shortest side
+INITIAL_RADIUS = 0.75  # of the initial sphere, in halves of the box's shortest side
 TRACE_STEPS, SECANT_STEPS = 10, 8
-DEEP = 10.0  # over the sharpness: the distance inside that the mask loss takes for certain
+INSIDE_LOGIT = 10.0  # gamma times a depth inside at which the mask loss is practically zero
 CONVERGED_M = 1e-4
-LEAST_SLOPE = 0.05  # of the distance along a ray that meets its surface; keeps grazing rays' gradients finite
+MIN_SLOPE = 0.05  # of the distance along a ray at the surface; keeps the gradients of grazing rays finite
 
 
 class SdfNetwork(nn.Module):
-    """gamma(x) -> (f, z): the signed distance and a feature, the last hidden layer."""
+    """gamma(x) -> (f, z): the signed distance, and the last hidden layer as a feature."""
 
     def __init__(self, width: int, radius: float):
         super().__init__()
         self.trunk = SkipMLP(3 * (1 + 2 * POSITION_OCTAVES), width, LAYERS, nn.Softplus(SOFTPLUS_SHARPNESS))
         self.head = nn.Linear(width, 1)
-        self._become_a_sphere(width, radius)
+        self._init_sphere(width, radius)
 
     @torch.no_grad()
-    def _become_a_sphere(self, width: int, radius: float) -> None:
-        """f(x) = |x| - radius, roughly: the geometric initialisation of Atzmon and Lipman 2020 (SAL), theorem 1, with
-        the sines and cosines unheard and the second input too. The bias is what makes f vanish on that sphere on
-        average: -radius is the limit for ReLU and wide layers, where softplus does not lift every unit."""
+    def _init_sphere(self, width: int, radius: float) -> None:
+        """Initialise f(x) to about |x| - radius: the geometric initialisation of Atzmon and Lipman 2020 (SAL), theorem
+        1, with zero weights for sines, cosines and the skip input. The bias makes f vanish on that sphere on average:
+        -radius is the limit for ReLU and wide layers, where softplus does not raise every unit."""
         for k, layer in enumerate(self.trunk.layers):
             assert isinstance(layer, nn.Linear)
             nn.init.zeros_(layer.bias)
@@ -54,23 +54,26 @@ class SdfNetwork(nn.Module):
         nn.init.constant_(self.head.bias, -float(self(sphere)[0].mean()))
 
     def forward(self, point: Tensor) -> tuple[Tensor, Tensor]:
-        """point (..., 3): f (...), z (..., width)."""
+        """Map point (..., 3) to f (...) and z (..., width)."""
         z = self.trunk(positional_encoding(point, POSITION_OCTAVES))
         return self.head(z)[..., 0], z
 
 
 class IdrField(StaticField):
-    """Static; a signed distance field whose surface is met by sphere tracing and moves with the colours' gradients.
+    """Static field: a signed distance whose surface is found by sphere tracing and moves with the gradients of the
+    colours.
 
-    `sample` gives one sample a ray (K = 1): the point of the surface, with alpha 1 where the ray meets it and 0 where
-    it does not, coloured by the rendering network on (x, n, v, z). Its distance `d` is not the one at that point (it is
-    0) but the least along the ray, which is what the mask loss asks for, or where the ray meets the surface one deep
-    inside, with its slope: the loss then asks nothing of rays that rightly meet it, all of others. So IDR's masked
-    colour loss is `mask`, its mask loss is `segmentation`, and its eikonal loss, at points drawn in the box, `eikonal`.
+    `sample` returns one sample per ray (K = 1): the surface point, with alpha 1 where the ray hits the surface and 0
+    where it misses, coloured by the rendering network on (x, n, v, z). Its `d` is not the distance at that point (which
+    is 0). Where the ray misses, it is the least distance along the ray, as the mask loss requires; where it hits, a
+    constant deep inside with the gradient of the distance. The loss is then zero for rays that rightly hit the surface,
+    and not for the others. So IDR's masked colour loss is `mask`, its mask loss is `segmentation`, and its eikonal
+    loss, at points drawn in the box, is `eikonal`.
 
-    Simplified: the mask loss has one sharpness instead of five that grow; no bidirectional tracing, the samples of the
-    mask loss say whether tracing overshot; smaller networks without weight normalisation (512 wide there); no camera is
-    learned. Renders have hard outlines, as in the paper: a ray meets the surface or does not.
+    Simplified: the mask loss has one sharpness instead of five increasing ones; tracing is not bidirectional, the
+    samples of the mask loss show whether it overshot; networks are smaller and without weight normalisation (512 wide
+    in the paper); no camera is learned. Renders have hard silhouettes, as in the paper: a ray hits the surface or
+    misses it.
     """
 
     gamma = 50.0  # a metre: sharpness of the mask loss
@@ -95,102 +98,107 @@ class IdrField(StaticField):
         draws: Draws,
         correction: PoseCorrection | None = None,
     ) -> tuple[RaySamples, Tensor]:
-        """As Field.sample, with one sample a ray."""
+        """Evaluate rays as Field.sample does, with one sample per ray."""
         near, far = region.interval(origins_m, directions, frame)
         with torch.no_grad():
-            tried = stratified(near, far, draws.jitter)
-            distances = self.distance(along(origins_m[:, None], directions[:, None], tried))
-            met, hit = trace(self.distance, origins_m, directions, near, far, tried, distances)
+            probe_depths = stratified(near, far, draws.jitter)
+            distances = self.distance(points_on_rays(origins_m[:, None], directions[:, None], probe_depths))
+            surface_depths, hit = trace_surface(
+                self.distance, origins_m, directions, near, far, probe_depths, distances
+            )
             least, at = distances.min(1)
-            nearest = torch.where(hit & (least > 0), met, tried.gather(1, at[:, None])[:, 0])
-        d = self.distance(along(origins_m, directions, nearest))[:, None]
-        d = torch.where(hit[:, None], d - d.detach() - DEEP / self.gamma, d)
+            nearest = torch.where(hit & (least > 0), surface_depths, probe_depths.gather(1, at[:, None])[:, 0])
+        d = self.distance(points_on_rays(origins_m, directions, nearest))[:, None]
+        d = torch.where(hit[:, None], d - d.detach() - INSIDE_LOGIT / self.gamma, d)
         pick = torch.nonzero(hit)[:, 0]
-        seen = self._surface_colour(origins_m[pick], directions[pick], met[pick])
+        seen = self._surface_colour(origins_m[pick], directions[pick], surface_depths[pick])
         norms = d.new_zeros(0)
         if draws.probe is not None:
             lower, upper = region.lower_m[frame], region.upper_m[frame]
-            norms = self._evaluate(lower + (upper - lower) * draws.finer[:, :3])[1].norm(dim=-1)
+            norms = self._evaluate(lower + (upper - lower) * draws.fine[:, :3])[1].norm(dim=-1)
         alpha = hit[:, None].to(d)
         colour = torch.zeros_like(origins_m).index_copy(0, pick, seen)[:, None]
         inside = torch.ones_like(d)
-        return RaySamples(alpha, alpha, inside, colour, None, d, torch.zeros_like(d), norms, draws.beyond), met[:, None]
+        return RaySamples(
+            alpha, alpha, inside, colour, None, d, torch.zeros_like(d), norms, draws.background
+        ), surface_depths[:, None]
 
     def distance(self, points_m: Tensor) -> Tensor:
-        """f (...) metres at points (..., 3)."""
+        """Return f (...) in metres at points (..., 3)."""
         return self.scale_m * self.geometry(self.scaled(points_m))[0]
 
     def _evaluate(self, points_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """f (N,) metres, its gradient (N, 3) and z (N, width); with a graph behind all three if gradients are on."""
-        learns = torch.is_grad_enabled()
+        """Return f (N,) in metres, its gradient (N, 3) and z (N, width), with an autograd graph if gradients are
+        enabled."""
+        with_graph = torch.is_grad_enabled()
         with torch.enable_grad():
             points_m = points_m if points_m.requires_grad else points_m.detach().requires_grad_()
             f, z = self.geometry(self.scaled(points_m))
             f = self.scale_m * f
-            (gradient,) = torch.autograd.grad(f.sum(), points_m, create_graph=learns)
-        return (f, gradient, z) if learns else (f.detach(), gradient, z.detach())
+            (gradient,) = torch.autograd.grad(f.sum(), points_m, create_graph=with_graph)
+        return (f, gradient, z) if with_graph else (f.detach(), gradient, z.detach())
 
     def _surface_colour(self, origins_m: Tensor, directions: Tensor, depths_m: Tensor) -> Tensor:
-        """c (N, 3) where rays meet the surface; the point moves with the network's parameters."""
-        points = along(origins_m, directions, depths_m)
+        """Return c (N, 3) where rays hit the surface; the point moves with the network's parameters."""
+        points = points_on_rays(origins_m, directions, depths_m)
         if torch.is_grad_enabled():
             f, gradient, _ = self._evaluate(points)
             points = intersection(points, directions, f, gradient)
         return self._radiance(points, directions)
 
     def _radiance(self, points_m: Tensor, directions: Tensor) -> Tensor:
-        """The rendering network on (x, n, v, z)."""
+        """Evaluate the rendering network on (x, n, v, z)."""
         _, gradient, z = self._evaluate(points_m)
         normal = nn.functional.normalize(gradient, dim=-1)
         view = positional_encoding(directions, VIEW_OCTAVES)
         return self.rendering(torch.cat([self.scaled(points_m), normal, view, z], -1))
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
-        """c (N, 3) at points (N, 3) seen along directions (N, 3)."""
+        """Return c (N, 3) at points (N, 3) seen along directions (N, 3)."""
         return self._radiance(points_m, directions)
 
 
 def intersection(points_m: Tensor, directions: Tensor, distance: Tensor, gradient: Tensor) -> Tensor:
-    """x^ = x0 - v f(x0; theta) / (grad f(x0; theta0) . v0) (equation 3): the points x0 (N, 3) themselves, with the
-    derivative of the true intersection by theta. distance (N,) with its graph, gradient (N, 3); v (N, 3)."""
-    slope = (gradient.detach() * directions).sum(-1).clamp(max=-LEAST_SLOPE)
+    """Return the points x0 (N, 3) with the derivative of the true intersection by theta: x^ = x0 - v f(x0; theta) /
+    (grad f(x0; theta0) . v0) (equation 3). distance f (N,) with its graph, gradient (N, 3), directions v (N, 3)."""
+    slope = (gradient.detach() * directions).sum(-1).clamp(max=-MIN_SLOPE)
     return points_m - directions * ((distance - distance.detach()) / slope)[:, None]
 
 
-def trace(
+def trace_surface(
     distance: Callable[[Tensor], Tensor],
     origins_m: Tensor,
     directions: Tensor,
     near: Tensor,
     far: Tensor,
-    tried: Tensor,
+    probe_depths: Tensor,
     distances: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Where rays (R, 3) first enter the surface between near and far (R,): depths (R,), far where they do not, and (R,)
-    bool whether they do.
+    """Find where rays (R, 3) first enter the surface between near and far (R,): depths (R,), far where they miss, and
+    (R,) bool whether they hit.
 
-    Sphere tracing, and the secant method where it did not converge or went past a crossing that distances (R, K) at
-    sorted depths `tried` (R, K) betray (section 3 and the supplement's ray tracing).
+    Uses sphere tracing, and the secant method where it did not converge or passed a crossing that distances (R, K) at
+    sorted depths `probe_depths` (R, K) reveal (section 3 and the supplement's ray tracing).
     """
-    met, hit = _march(distance, origins_m, directions, near, far)
+    surface_depths, hit = _sphere_trace(distance, origins_m, directions, near, far)
     enters = (distances[:, :-1] > 0) & (distances[:, 1:] <= 0)
     first = enters.int().argmax(1, keepdim=True)
-    overshot = enters.any(1) & ~(hit & (met <= tried.gather(1, first + 1)[:, 0]))
+    overshot = enters.any(1) & ~(hit & (surface_depths <= probe_depths.gather(1, first + 1)[:, 0]))
     pick = torch.nonzero(overshot)[:, 0]
-    start, end = (tried.gather(1, first + k)[pick, 0] for k in (0, 1))
+    start, end = (probe_depths.gather(1, first + k)[pick, 0] for k in (0, 1))
     above, below = (distances.gather(1, first + k)[pick, 0] for k in (0, 1))
     refined = _secant(distance, origins_m[pick], directions[pick], start, end, above, below)
-    return torch.where(hit, met, far).index_copy(0, pick, refined), hit | overshot
+    return torch.where(hit, surface_depths, far).index_copy(0, pick, refined), hit | overshot
 
 
-def _march(
+def _sphere_trace(
     distance: Callable[[Tensor], Tensor], origins_m: Tensor, directions: Tensor, near: Tensor, far: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Sphere tracing from near: depths (R,), and whether they ended on the surface."""
+    """Trace spheres from near; return depths (R,), and whether they ended on the surface."""
     depths, hit, moving = near.clone(), torch.zeros_like(near, dtype=torch.bool), near < far
     for _ in range(TRACE_STEPS):
         pick = torch.nonzero(moving)[:, 0]
-        step = distance(along(origins_m[pick], directions[pick], depths[pick]))
+        step = distance(points_on_rays(origins_m[pick], directions[pick], depths[pick]))
         depths[pick] += step
         within = (depths[pick] >= near[pick]) & (depths[pick] <= far[pick])
         hit[pick] = within & (step.abs() <= CONVERGED_M)
@@ -207,10 +215,10 @@ def _secant(
     above: Tensor,
     below: Tensor,
 ) -> Tensor:
-    """The root between depths start and end (N,), where the distance is `above` > 0 and `below` <= 0."""
+    """Return the root between depths start and end (N,), where the distance is `above` > 0 and `below` <= 0."""
     for _ in range(SECANT_STEPS):
         middle = start + above / (above - below) * (end - start)
-        value = distance(along(origins_m, directions, middle))
+        value = distance(points_on_rays(origins_m, directions, middle))
         outside = value > 0
         start, above = torch.where(outside, middle, start), torch.where(outside, value, above)
         end, below = torch.where(outside, end, middle), torch.where(outside, below, value)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import along
+from hnerf.baselines.box import points_on_rays
 from hnerf.baselines.static import StaticField
 from hnerf.body.canonical import PoseCorrection, PosedBodies
 from hnerf.body.fit_result import BodyFit
@@ -12,13 +12,13 @@ from hnerf.fields.compositing import weights_from_alpha
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.encoding import positional_encoding
 from hnerf.fields.mlp import SkipMLP
-from hnerf.fields.paper import resample
+from hnerf.fields.paper import sample_pdf
 from hnerf.fields.samples import RaySamples
 from hnerf.fields.shell import Boxes, stratified
 
 LAYERS = 8
 POSITION_OCTAVES, VIEW_OCTAVES = 10, 4
-DENSITY_GAIN = 10.0  # densities of an opaque surface are tens to hundreds: so that they are within reach of few steps
+DENSITY_GAIN = 10.0  # an opaque surface has densities of tens to hundreds, which few steps could not reach otherwise
 
 
 class NerfNetwork(nn.Module):
@@ -32,7 +32,8 @@ class NerfNetwork(nn.Module):
         self.colour = nn.Sequential(nn.Linear(width + view, width // 2), nn.SiLU(), nn.Linear(width // 2, 3))
 
     def forward(self, point: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
-        """point in [-1, 1], view, (..., 3) each: density (...) per unit of point's coordinates, colour (..., 3)."""
+        """Map point in [-1, 1] and view, (..., 3) each, to density (...) per unit of the point's coordinates and colour
+        (..., 3)."""
         features = self.trunk(positional_encoding(point, POSITION_OCTAVES))
         density = nn.functional.softplus(DENSITY_GAIN * self.density(features)[..., 0])
         encoded = positional_encoding(view, VIEW_OCTAVES)
@@ -40,17 +41,18 @@ class NerfNetwork(nn.Module):
 
 
 class NerfField(StaticField):
-    """Static; a coarse and a fine network, hierarchical sampling, colour that depends on the view, no body but its box.
+    """Static field: a coarse and a fine network, hierarchical sampling, view-dependent colour; of the body only its
+    box.
 
-    The first samples of a ray are the coarse network's; their opacity is `alpha_dot`, that of the fine network's
-    samples `alpha`, each zero where the other's samples are. So the loss `reconstruction` is that of the fine colour,
+    The first samples of a ray belong to the coarse network; their opacity is `alpha_dot`, that of the fine network's
+    samples is `alpha`, each zero at the samples of the other. So the loss `reconstruction` is that of the fine colour,
     and `blend` with eta = 1 that of the coarse one: the two terms of the paper's equation 6.
 
     Simplified: both terms are absolute errors, as for all compared methods, not squared ones; as many fine samples as
-    coarse ones (64 and 128 there); smaller networks, so that minutes on two CPU cores mean something (8 layers as
-    published, `width` 256 there); Swish as in H-NeRF instead of ReLU, which took several times as many steps to leave
-    an empty box; softplus instead of ReLU for the density, which cannot die; rays end with the person's box, behind
-    which the plate stands.
+    coarse ones (64 and 128 in the paper); smaller networks, so that minutes on two CPU cores are meaningful (8 layers
+    as published, `width` 256 in the paper); Swish as in H-NeRF instead of ReLU, which took several times as many steps
+    to leave an empty box; softplus instead of ReLU for the density, which cannot die; rays end with the person's box,
+    in front of the clean plate.
     """
 
     def __init__(self, body: BodyFit, settings: NerfSettings):
@@ -68,14 +70,15 @@ class NerfField(StaticField):
         draws: Draws,
         correction: PoseCorrection | None = None,
     ) -> tuple[RaySamples, Tensor]:
-        """As Field.sample: `samples` of the coarse network, then twice as many of the fine one (K = 3 x samples)."""
+        """Evaluate rays as Field.sample does: `samples` of the coarse network, then twice as many of the fine one (K =
+        3 x samples)."""
         near, far = region.interval(origins_m, directions, frame)
         first = stratified(near, far, draws.jitter)
-        first_alpha, first_density, first_colour = self._look(self.coarse, origins_m, directions, first, far)
-        drawn = resample(first, near, far, weights_from_alpha(first_alpha.detach()), draws.finer)
+        first_alpha, first_density, first_colour = self._evaluate(self.coarse, origins_m, directions, first, far)
+        drawn = sample_pdf(first, near, far, weights_from_alpha(first_alpha.detach()), draws.fine)
         every = torch.cat([first, drawn], 1).sort(1).values
-        alpha, density, colour = self._look(self.fine, origins_m, directions, every, far)
-        d = self.read_off(torch.cat([first_density, density], 1))
+        alpha, density, colour = self._evaluate(self.fine, origins_m, directions, every, far)
+        d = self.pseudo_distance(torch.cat([first_density, density], 1))
         samples = RaySamples(
             alpha=torch.cat([torch.zeros_like(first_alpha), alpha], 1),
             alpha_dot=torch.cat([first_alpha, torch.zeros_like(alpha)], 1),
@@ -85,22 +88,23 @@ class NerfField(StaticField):
             d=d,
             residual=torch.zeros_like(d),
             gradient_norm=d.new_zeros(0),
-            beyond=draws.beyond,
+            background=draws.background,
         )
         return samples, torch.cat([first, every], 1)
 
-    def _look(
+    def _evaluate(
         self, network: NerfNetwork, origins_m: Tensor, directions: Tensor, depths_m: Tensor, far_m: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """alpha, density (R, K) and colour (R, K, 3) at depths (R, K); the last sample reaches to the box's end."""
-        points = self.scaled(along(origins_m[:, None], directions[:, None], depths_m))
+        """Return alpha, density (R, K) and colour (R, K, 3) at depths (R, K); the last sample extends to the end of the
+        box."""
+        points = self.scaled(points_on_rays(origins_m[:, None], directions[:, None], depths_m))
         density, colour = network(points, directions[:, None].expand_as(points))
         return self.opacity(density, depths_m, far_m), density, colour
 
     def distance(self, points_m: Tensor) -> Tensor:
-        """Of the fine network's surface of density sigma_h, bounded by BAND_M."""
-        return self.read_off(self.fine(self.scaled(points_m), torch.zeros_like(points_m))[0])
+        """Return the pseudo-distance (N,) to the fine network's surface of density sigma_h, bounded by BAND_M."""
+        return self.pseudo_distance(self.fine(self.scaled(points_m), torch.zeros_like(points_m))[0])
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
-        """c (N, 3) of the fine network at points (N, 3) seen along directions (N, 3)."""
+        """Return c (N, 3) of the fine network at points (N, 3) seen along directions (N, 3)."""
         return self.fine(self.scaled(points_m), directions)[1]

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import along
+from hnerf.baselines.box import points_on_rays
 from hnerf.baselines.dynamic import DynamicField
 from hnerf.baselines.nerf import NerfNetwork
 from hnerf.body.canonical import PoseCorrection, PosedBodies
@@ -17,14 +17,14 @@ from hnerf.fields.compositing import weights_from_alpha
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.encoding import positional_encoding
 from hnerf.fields.mlp import SkipMLP
-from hnerf.fields.paper import resample
+from hnerf.fields.paper import sample_pdf
 from hnerf.fields.samples import RaySamples
 from hnerf.fields.shell import Boxes, stratified
 
-OCTAVES, LAYERS = 6, 6  # of the deformation
-STILL = 1e-5  # spread of its last layer at the start: nothing is deformed
+OCTAVES, LAYERS = 6, 6  # of the deformation network
+INITIAL_SCREW_RANGE = 1e-5  # of the last layer's uniform initialisation: almost no deformation
 ROBUST_SCALE = 0.03  # c of the elastic energy
-LEAST_STRETCH = 1e-6  # keeps its logarithm finite
+MIN_SINGULAR_VALUE = 1e-6  # keeps the logarithm finite
 
 
 class Deformation(nn.Module):
@@ -34,11 +34,12 @@ class Deformation(nn.Module):
         super().__init__()
         self.trunk = SkipMLP(3 * (1 + 2 * OCTAVES) + code_width, width, LAYERS)
         self.screw = nn.Linear(width, 6)
-        nn.init.uniform_(self.screw.weight, -STILL, STILL)
+        nn.init.uniform_(self.screw.weight, -INITIAL_SCREW_RANGE, INITIAL_SCREW_RANGE)
         nn.init.zeros_(self.screw.bias)
 
     def forward(self, points: Tensor, code: Tensor, octaves: Tensor) -> Tensor:
-        """points (N, 3) in the field's coordinates, code (N, C), octaves () that count so far: (N, 3)."""
+        """Deform points (N, 3) in the field's coordinates by code (N, C): (N, 3). octaves (): how many are annealed in
+        so far."""
         encoded = annealed(positional_encoding(points, OCTAVES), octaves)
         turn, move = self.screw(self.trunk(torch.cat([encoded, code], 1))).split(3, 1)
         rotation, translation = screw_motion(turn, move)
@@ -46,17 +47,18 @@ class Deformation(nn.Module):
 
 
 class NerfiesField(DynamicField):
-    """Dynamic; every frame's code deforms the space of its moment into one template, a NeRF. No body but its box.
+    """Dynamic field: each frame's code deforms the space of its instant into one template, a NeRF; of the body only its
+    box.
 
-    It has no pose to set. A pose that no frame has (Conditions.frame_row = -1), and a frame that was not trained on,
-    take the code zero: the template as the deformation of that code leaves it, the same whatever the pose, cut by the
-    pose's box. Where that box is elsewhere there is little or nothing.
+    It has no pose control. A pose of no frame (Conditions.frame_row = -1) and a frame that was not trained on take the
+    zero code: the template as this code deforms it, the same for every pose, cut by the pose's box. Where that box is
+    elsewhere there is little or nothing.
 
     Simplified: one template network serves coarse and fine samples, and only the fine pass is trained, as H-NeRF does
-    it; networks and numbers of samples are smaller, so that minutes on two CPU cores mean something; no appearance
-    codes, as the captures' cameras keep their exposure; no points of the background that are told to stand still, as
-    the background comes from the clean plate; the elastic energy, which is weighted by what a sample adds to its pixel,
-    is estimated at one sample a ray drawn by that weight. Activations and the mean absolute colour error are those of
+    it; networks and numbers of samples are smaller, so that minutes on two CPU cores are meaningful; no appearance
+    codes, because the captures' cameras keep their exposure; no regularisation of static background points, because the
+    background comes from the clean plate; the elastic energy, weighted by a sample's contribution to its pixel, is
+    estimated at one sample per ray drawn by that weight. Activations and the mean absolute colour error are those of
     NerfField.
     """
 
@@ -80,33 +82,33 @@ class NerfiesField(DynamicField):
         draws: Draws,
         correction: PoseCorrection | None = None,
     ) -> tuple[RaySamples, Tensor]:
-        """As Field.sample, over coarse and fine samples together (K = 2 x samples). A call with draws.probe, as in
-        training, has an elastic energy."""
+        """Evaluate rays as Field.sample does, at coarse and fine samples together (K = 2 x samples). With draws.probe,
+        as in training, the samples include an elastic energy."""
         near, far = region.interval(origins_m, directions, frame)
         first = stratified(near, far, draws.jitter)
 
-        def look(depths_m: Tensor) -> RaySamples:
-            points = along(origins_m[:, None], directions[:, None], depths_m)
+        def evaluate(depths_m: Tensor) -> RaySamples:
+            points = points_on_rays(origins_m[:, None], directions[:, None], depths_m)
             code = self.code(conditions)[frame][:, None].expand(-1, depths_m.shape[1], -1)
             template = self._deform(self.scaled(points).flatten(0, 1), code.flatten(0, 1)).view_as(points)
             density, colour = self.template(template, directions[:, None].expand_as(points))
-            return self.seen(density, colour, depths_m, far, beyond=draws.beyond)
+            return self.to_samples(density, colour, depths_m, far, background=draws.background)
 
         with torch.no_grad():
-            drawn = resample(first, near, far, weights_from_alpha(look(first).alpha), draws.finer)
+            drawn = sample_pdf(first, near, far, weights_from_alpha(evaluate(first).alpha), draws.fine)
         depths = torch.cat([first, drawn], 1).sort(1).values
-        samples = look(depths)
+        samples = evaluate(depths)
         if draws.probe is None:
             return samples, depths
         weights = weights_from_alpha(samples.alpha.detach())
-        pick = choose(weights, draws.probe)
-        points = along(origins_m, directions, depths.gather(1, pick[:, None])[:, 0])
+        pick = sample_index(weights, draws.probe)
+        points = points_on_rays(origins_m, directions, depths.gather(1, pick[:, None])[:, 0])
         code = self.code(conditions)[frame]
         change = jacobian(lambda x: self._deform(x, code), self.scaled(points))
         return dataclasses.replace(samples, elastic=weights.sum(1) * elastic_energy(change)), depths
 
-    def step_taken(self) -> None:
-        """Counts for annealing."""
+    def on_step_end(self) -> None:
+        """Count steps for annealing."""
         self.steps_taken += 1
 
     def _deform(self, points: Tensor, code: Tensor) -> Tensor:
@@ -114,21 +116,23 @@ class NerfiesField(DynamicField):
         return self.deformation(points, code, octaves)
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
-        """Of the surface of density sigma_h (NerfField's) at the first body's moment; its box cuts and closes it."""
-        density = self._ask(points_m, torch.zeros_like(points_m), conditions)[0]
-        return torch.maximum(self.read_off(density), self.box(bodies).signed_distance(points_m))
+        """Return the pseudo-distance (N,) to the surface of density sigma_h (as NerfField) at the first body's instant,
+        cut and closed by its box."""
+        density = self._evaluate(points_m, torch.zeros_like(points_m), conditions)[0]
+        return torch.maximum(self.pseudo_distance(density), self.box(bodies).signed_distance(points_m))
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
-        """c (N, 3) at points (N, 3) of the first body's moment seen along directions (N, 3)."""
-        return self._ask(points_m, directions, conditions)[1]
+        """Return c (N, 3) at points (N, 3) at the first body's instant, seen along directions (N, 3)."""
+        return self._evaluate(points_m, directions, conditions)[1]
 
-    def _ask(self, points_m: Tensor, directions: Tensor, conditions: Conditions) -> tuple[Tensor, Tensor]:
+    def _evaluate(self, points_m: Tensor, directions: Tensor, conditions: Conditions) -> tuple[Tensor, Tensor]:
         code = self.code(conditions)[:1].expand(len(points_m), -1)
         return self.template(self._deform(self.scaled(points_m), code), directions)
 
 
 def screw_motion(turn: Tensor, move: Tensor) -> tuple[Tensor, Tensor]:
-    """Exponential of screws (..., 3) and (..., 3): rotation (..., 3, 3), translation (..., 3) (equations 8 to 10).
+    """Return the exponential of screws (..., 3) and (..., 3): rotation (..., 3, 3), translation (..., 3) (equations 8
+    to 10).
 
     The translation is G move, G = I + (1 - cos a) / a^2 [turn] + (a - sin a) / a^3 [turn]^2 with the angle a = |turn|.
     """
@@ -143,8 +147,8 @@ def screw_motion(turn: Tensor, move: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def annealed(encoded: Tensor, octaves: Tensor) -> Tensor:
-    """A positional encoding (N, 3 (1 + 2 m)) of which only so many octaves count, the next one in part (equation 6):
-    octave j by (1 - cos(pi clamp(octaves - j, 0, 1))) / 2."""
+    """Weight a positional encoding (N, 3 (1 + 2 m)) by octave (equation 6): octave j by (1 - cos(pi clamp(octaves - j,
+    0, 1))) / 2."""
     count = (encoded.shape[1] // 3 - 1) // 2
     share = (octaves - torch.arange(count, device=encoded.device)).clamp(0, 1)
     weight = ((1 - (torch.pi * share).cos()) / 2).repeat_interleave(3)
@@ -152,22 +156,24 @@ def annealed(encoded: Tensor, octaves: Tensor) -> Tensor:
 
 
 def jacobian(function: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
-    """d f_i / d x_j (N, 3, 3) of a function of each point (N, 3) alone, itself differentiable."""
+    """Return d f_i / d x_j (N, 3, 3), itself differentiable, of a function that maps each point (N, 3)
+    independently."""
     points = points.detach().requires_grad_()
     moved = function(points)
     return torch.stack([torch.autograd.grad(moved[:, k].sum(), points, create_graph=True)[0] for k in range(3)], 1)
 
 
 def elastic_energy(change: Tensor) -> Tensor:
-    """rho(|log Sigma|_F) (N,) of Jacobians (N, 3, 3) with singular values Sigma; rho(x) = 2 (x/c)^2 / ((x/c)^2 + 4)
-    (equations 3 and 4)."""
-    stretch = torch.linalg.svdvals(change).clamp(min=LEAST_STRETCH)
+    """Return rho(|log Sigma|_F) (N,) of Jacobians (N, 3, 3) with singular values Sigma; rho(x) = 2 (x/c)^2 / ((x/c)^2 +
+    4) (equations 3 and 4)."""
+    stretch = torch.linalg.svdvals(change).clamp(min=MIN_SINGULAR_VALUE)
     strain = (stretch.log() / ROBUST_SCALE).square().sum(-1)
     return 2 * strain / (strain + 4)
 
 
-def choose(weights: Tensor, uniform: Tensor) -> Tensor:
-    """An index (R,) into each row of weights (R, K), as likely as its weight; uniform (R,) in [0, 1)."""
+def sample_index(weights: Tensor, uniform: Tensor) -> Tensor:
+    """Draw an index (R,) into each row of weights (R, K) with probabilities proportional to them; uniform (R,) in [0,
+    1)."""
     cumulative = weights.cumsum(1)
     wanted = uniform[:, None] * cumulative[:, -1:]
     return torch.searchsorted(cumulative, wanted, right=True)[:, 0].clamp(max=weights.shape[1] - 1)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import along
+from hnerf.baselines.box import points_on_rays
 from hnerf.baselines.dynamic import DynamicField
 from hnerf.baselines.nerf import DENSITY_GAIN
 from hnerf.baselines.voxels import Voxels
@@ -18,16 +18,16 @@ from hnerf.fields.encoding import positional_encoding
 from hnerf.fields.samples import RaySamples
 from hnerf.fields.shell import Boxes, stratified
 
-LEVELS = 5  # the finest takes the codes, the four others are read (section 3.2 of the paper)
+LEVELS = 5  # the finest takes the codes, the other four give the features (section 3.2 of the paper)
 POSITION_OCTAVES, VIEW_OCTAVES = 10, 4
-APPEARANCE_WIDTH = 16  # of a frame's code
-CODE_SPREAD = 0.1  # of the vertices' codes at the start
+APPEARANCE_WIDTH = 16  # width of a frame's code
+INITIAL_CODE_STD = 0.1  # of the vertices' codes
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """By body row: box, root (n, 4, 4), voxels around the body in its root frame, and the codes diffused over them at
-    the levels that are read; None in training, where they change with every step."""
+class NeuralBodyRegion:
+    """Region by body row: box, root (n, 4, 4), voxels around the body in its root frame, and the codes diffused over
+    them at the levels that are read; diffused is None in training, where it changes with every step."""
 
     box: Boxes
     root: Tensor
@@ -36,7 +36,7 @@ class Surroundings:
 
 
 class SparseConvolution(nn.Module):
-    """3 x 3 x 3 over active voxels, with normalisation and ReLU."""
+    """3 x 3 x 3 convolution over active voxels, with normalisation and ReLU."""
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
@@ -44,13 +44,14 @@ class SparseConvolution(nn.Module):
         self.norm = nn.LayerNorm(outputs)
 
     def forward(self, values: Tensor, rows: Tensor) -> Tensor:
-        """values (N + 1, inputs) and rows (M, 27) of stencils: (M + 1, outputs), the last row zero as of values."""
+        """Convolve values (N + 1, inputs) at stencils rows (M, 27): (M + 1, outputs). The last row of input and output
+        is zero."""
         found = self.norm(self.linear(nn.functional.embedding(rows, values).flatten(1))).relu()
         return torch.cat([found, torch.zeros_like(found[:1])])
 
 
 class Diffusion(nn.Module):
-    """Codes of vertices to features around the body, at LEVELS - 1 resolutions."""
+    """Diffusion of vertex codes to features around the body, at LEVELS - 1 resolutions."""
 
     def __init__(self, code_width: int, channels: int):
         super().__init__()
@@ -60,37 +61,37 @@ class Diffusion(nn.Module):
         self.beside = nn.ModuleList(SparseConvolution(channels, channels) for _ in inputs)
 
     def forward(self, codes: Tensor, voxels: Voxels) -> list[Tensor]:
-        """codes (V, C): (N + 1, channels) at each level that is read, the last row zero."""
+        """Diffuse codes (V, C): (N + 1, channels) at each level that is read, the last row zero."""
         total = codes.new_zeros(len(voxels.count) + 1, codes.shape[1]).index_add(0, voxels.vertex, codes)
         values = total / torch.cat([voxels.count, voxels.count.new_ones(1)])[:, None]
-        values = self.first(values, voxels.levels[0].beside)
+        values = self.first(values, voxels.levels[0].neighbours)
         found = []
         for level, coarser, beside in zip(voxels.levels[1:], self.coarser, self.beside, strict=True):
-            values = beside(coarser(values, level.below), level.beside)
+            values = beside(coarser(values, level.finer_neighbours), level.neighbours)
             found.append(values)
         return found
 
 
 class NeuralBodyField(DynamicField):
-    """Dynamic; a code on every vertex of the body, diffused by sparse convolutions in the root frame of the posed body;
-    density from what they say at a point, colour also from the view, the position in the world and a code of the
-    frame's appearance, which is zero for poses that were not trained.
+    """Dynamic field: a code on every vertex of the body, diffused by sparse convolutions in the root frame of the posed
+    body. Density depends on the diffused codes at a point; colour also on the view, the world position, and a code of
+    the frame's appearance, which is zero for poses that were not trained.
 
-    Simplified: voxels of `voxel_m` (5 mm there), one convolution between those of stride 2 where there are two or
-    three, fewer channels, narrower networks, and fewer samples (64 there), so that minutes on two CPU cores mean
-    something; layers are normalised by voxel, not by batch, so that a frame looks the same whatever is trained beside
-    it; Swish instead of ReLU and softplus for the density as in NerfField; the mean absolute colour error as for all
-    compared methods, not the squared one; codes of a voxel's vertices are averaged.
+    Simplified: voxels of `voxel_m` (5 mm in the paper), one convolution between those of stride 2 where the paper has
+    two or three, fewer channels, narrower networks and fewer samples (64 in the paper), so that minutes on two CPU
+    cores are meaningful; layers are normalised by voxel, not by batch, so that a frame does not depend on what is
+    trained beside it; Swish instead of ReLU, and softplus for the density, as in NerfField; the mean absolute colour
+    error as for all compared methods, not the squared one; codes of a voxel's vertices are averaged.
 
-    `region` of a field in evaluation mode runs the convolutions; each `sample` of one in training runs them once for
-    each frame that it is asked about.
+    In evaluation mode `region` runs the convolutions; in training each `sample` runs them once for every frame in its
+    batch.
     """
 
     def __init__(self, body: BodyFit, settings: NeuralBodySettings):
         super().__init__(body, settings.samples, settings.learning_rate, APPEARANCE_WIDTH)
         self.settings = settings
         width, features = settings.width, settings.channels * (LEVELS - 1)
-        self.vertex_codes = nn.Parameter(CODE_SPREAD * torch.randn(len(body.rig.vertices_m), settings.code_width))
+        self.vertex_codes = nn.Parameter(INITIAL_CODE_STD * torch.randn(len(body.rig.vertices_m), settings.code_width))
         self.diffusion = Diffusion(settings.code_width, settings.channels)
         self.trunk = nn.Sequential(
             nn.Linear(features, width),
@@ -106,17 +107,17 @@ class NeuralBodyField(DynamicField):
             nn.Linear(width + APPEARANCE_WIDTH + encoded, width), nn.SiLU(), nn.Linear(width, 3), nn.Sigmoid()
         )
 
-    def region(self, bodies: PosedBodies, conditions: Conditions) -> Surroundings:
-        """Box and voxels of each body; where the field no longer learns, what the convolutions make of them."""
-        local_m = _into_root(bodies.vertices_m, bodies.root)
+    def region(self, bodies: PosedBodies, conditions: Conditions) -> NeuralBodyRegion:
+        """Return box and voxels of each body and, in evaluation mode, the diffused codes."""
+        local_m = _to_root_frame(bodies.vertices_m, bodies.root)
         voxels = [Voxels.around(points_m, self.settings.voxel_m, LEVELS) for points_m in local_m]
         diffused = None if self.training else [self.diffusion(self.vertex_codes, v) for v in voxels]
-        return Surroundings(self.box(bodies), bodies.root, voxels, diffused)
+        return NeuralBodyRegion(self.box(bodies), bodies.root, voxels, diffused)
 
     def sample(
         self,
         bodies: PosedBodies,
-        region: Surroundings,
+        region: NeuralBodyRegion,
         origins_m: Tensor,
         directions: Tensor,
         frame: Tensor,
@@ -124,26 +125,26 @@ class NeuralBodyField(DynamicField):
         draws: Draws,
         correction: PoseCorrection | None = None,
     ) -> tuple[RaySamples, Tensor]:
-        """As Field.sample, at `samples` depths in the body's box."""
+        """Evaluate rays as Field.sample does, at `samples` depths in the body's box."""
         near, far = region.box.interval(origins_m, directions, frame)
         depths = stratified(near, far, draws.jitter)
-        points = along(origins_m[:, None], directions[:, None], depths).flatten(0, 1)
+        points = points_on_rays(origins_m[:, None], directions[:, None], depths).flatten(0, 1)
         row, view = (x.repeat_interleave(self.samples, 0) for x in (frame, directions))
         features = self.trunk(self._features(region, points, row))
         density = self._density(features).view_as(depths)
         colour = self._colour(features, points, view, row, conditions).view(*depths.shape, 3)
-        return self.seen(density, colour, depths, far, beyond=draws.beyond), depths
+        return self.to_samples(density, colour, depths, far, background=draws.background), depths
 
-    def _features(self, region: Surroundings, points_m: Tensor, row: Tensor) -> Tensor:
-        """What the diffused codes say at points (N, 3) around bodies of rows (N,), all levels side by side."""
+    def _features(self, region: NeuralBodyRegion, points_m: Tensor, row: Tensor) -> Tensor:
+        """Return the diffused codes at points (N, 3) around bodies of rows (N,), concatenated over all levels."""
         found = points_m.new_zeros(len(points_m), self.settings.channels * (LEVELS - 1))
         for body in row.unique().tolist():
             voxels = region.voxels[body]
             diffused = region.diffused[body] if region.diffused else self.diffusion(self.vertex_codes, voxels)
             pick = torch.nonzero(row == body)[:, 0]
-            local_m = _into_root(points_m[pick][None], region.root[body][None])[0]
+            local_m = _to_root_frame(points_m[pick][None], region.root[body][None])[0]
             read = [
-                level.read(values, voxels.coordinates(local_m, k))
+                level.interpolate(values, voxels.coordinates(local_m, k))
                 for k, (level, values) in enumerate(zip(voxels.levels[1:], diffused, strict=True), 1)
             ]
             found = found.index_copy(0, pick, torch.cat(read, 1))
@@ -158,19 +159,20 @@ class NeuralBodyField(DynamicField):
         return self.radiance(torch.cat(inputs, 1))
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
-        """Of the surface of density sigma_h (NerfField's) around the first body; the box cuts and closes it."""
+        """Return the pseudo-distance (N,) to the surface of density sigma_h (as NerfField) around the first body, cut
+        and closed by the box."""
         region = self.region(bodies, conditions)
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         density = self._density(self.trunk(self._features(region, points_m, row)))
-        return torch.maximum(self.read_off(density), region.box.signed_distance(points_m))
+        return torch.maximum(self.pseudo_distance(density), region.box.signed_distance(points_m))
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
-        """c (N, 3) at points around the first body seen along directions (N, 3)."""
+        """Return c (N, 3) at points around the first body, seen along directions (N, 3)."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         features = self.trunk(self._features(self.region(bodies, conditions), points_m, row))
         return self._colour(features, points_m, directions, row, conditions)
 
 
-def _into_root(points_m: Tensor, root: Tensor) -> Tensor:
-    """World points (n, N, 3) in the frames of roots (n, 4, 4), world from body."""
+def _to_root_frame(points_m: Tensor, root: Tensor) -> Tensor:
+    """Transform world points (n, N, 3) to the frames of roots (n, 4, 4), world from body."""
     return (points_m - root[:, None, :3, 3]) @ root[:, :3, :3]

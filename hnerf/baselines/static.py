@@ -1,4 +1,4 @@
-"""What NeRF and IDR share: they model one moment, in the world."""
+"""Common base of NeRF and IDR: a static scene in world coordinates."""
 
 from abc import abstractmethod
 
@@ -7,23 +7,16 @@ from torch import Tensor
 
 from hnerf.baselines.box import BoxField
 from hnerf.body.canonical import PosedBodies
-from hnerf.errors import InputError
 from hnerf.fields.conditions import Conditions
 
 
 class StaticField(BoxField):
-    """The box is all that it learns of the fitted body."""
+    """Field of a static scene; of the fitted body it uses only the box."""
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
-        """Of what is inside the box of the first body, (N,) metres at points (N, 3); the box cuts and closes it."""
+        """Return the signed distance (N,) in metres at points (N, 3), cut and closed by the box of the first body."""
         return torch.maximum(self.distance(points_m), self.box(bodies).signed_distance(points_m))
 
     @abstractmethod
     def distance(self, points_m: Tensor) -> Tensor:
-        """The network's own signed distance (N,) metres, at points (N, 3) of the box."""
-
-
-def require_one_moment(static: bool, method: str) -> None:
-    """InputError where there is more than one training frame."""
-    if not static:
-        raise InputError(f"{method} models one moment; choose a single training frame, or another machinery")
+        """Return the network's own signed distance (N,) in metres at points (N, 3) in the box."""

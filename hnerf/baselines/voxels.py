@@ -1,8 +1,8 @@
-"""Sparse voxels around a body, and where each one's neighbours lie: convolutions over them are gathers and products.
+"""Sparse voxels around a body with their neighbours' rows, so that convolutions are gathers and matrix products.
 
-A voxel is named by whole coordinates (N, 3), and stands for the point at that many voxel edges from the lower corner.
-The next coarser level has every second coordinate; a voxel is active there if its 3 x 3 x 3 stencil below meets an
-active one (the stride-2 sparse convolution of Graham et al. 2018).
+A voxel has integer coordinates (N, 3) and stands for the point at that many voxel edges from the lower corner. The next
+coarser level has every second coordinate; a voxel is active there if its 3 x 3 x 3 stencil on the finer level contains
+an active one (the stride-2 sparse convolution of Graham et al. 2018).
 """
 
 from dataclasses import dataclass
@@ -13,40 +13,41 @@ from torch.nn.functional import embedding_bag
 
 PAD = 2  # empty coordinates all around, so that no stencil leaves the grid
 STENCIL = torch.cartesian_prod(*[torch.arange(-1, 2)] * 3)  # 27 offsets
-CORNERS = torch.cartesian_prod(*[torch.arange(2)] * 3)  # of a cell, or below and above the half of a coordinate
+CORNERS = torch.cartesian_prod(*[torch.arange(2)] * 3)  # of a cell; also the roundings of a halved coordinate
 
 
 @dataclass(frozen=True)
 class Level:
-    """The active voxels of one resolution, N of them; row N stands for an empty one.
+    """Active voxels of one resolution, N of them; row N stands for an empty one.
 
-    rows (X, Y, Z) int32: the row at each coordinate, padded; beside (N, 27) int32: rows of the stencil; below (N, 27)
-    int32: rows of the finer level's stencil around the same point, empty at the finest level.
+    rows (X, Y, Z) int32: the row at each coordinate, padded; neighbours (N, 27) int32: rows of the stencil;
+    finer_neighbours (N, 27) int32: rows of the finer level's stencil around the same point, without entries at the
+    finest level.
     """
 
     rows: Tensor
-    beside: Tensor
-    below: Tensor
+    neighbours: Tensor
+    finer_neighbours: Tensor
 
     @staticmethod
     def of(coordinates: Tensor, finer: "Level | None") -> "Level":
-        """Of unique coordinates (N, 3) from 0."""
+        """Build the level of unique coordinates (N, 3) that start at 0."""
         size = (coordinates.amax(0) + 1 + 2 * PAD).tolist()
         rows = torch.full(size, len(coordinates), dtype=torch.int32, device=coordinates.device)
         rows[tuple((coordinates + PAD).T)] = torch.arange(
             len(coordinates), dtype=torch.int32, device=coordinates.device
         )
         stencil = STENCIL.to(coordinates.device)
-        below = stencil.new_zeros(0, len(stencil), dtype=torch.int32)
+        finer_neighbours = stencil.new_zeros(0, len(stencil), dtype=torch.int32)
         if finer is not None:
-            below = _look_up(finer.rows, 2 * coordinates[:, None] + stencil)
-        return Level(rows, _look_up(rows, coordinates[:, None] + stencil), below)
+            finer_neighbours = _look_up(finer.rows, 2 * coordinates[:, None] + stencil)
+        return Level(rows, _look_up(rows, coordinates[:, None] + stencil), finer_neighbours)
 
-    def read(self, values: Tensor, at: Tensor) -> Tensor:
-        """Values (N + 1, C), the last of them zero, trilinearly at whole and broken coordinates (P, 3): (P, C); zero
-        where no active voxel is near."""
+    def interpolate(self, values: Tensor, at: Tensor) -> Tensor:
+        """Interpolate values (N + 1, C), the last of them zero, trilinearly at fractional coordinates (P, 3): (P, C);
+        zero where no active voxel is near."""
         limit = torch.tensor(self.rows.shape, device=at.device) - 2 * PAD
-        at = at.clamp(min=-1).minimum(limit)  # beyond it all is empty
+        at = at.clamp(min=-1).minimum(limit)  # everything outside is empty
         first = at.floor()
         corners = CORNERS.to(at.device)
         share = at - first
@@ -56,8 +57,8 @@ class Level:
 
 
 def _unique(coordinates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Unique coordinates of (P, 3) from 0, which of them each is (P,), and how often they occur; by whole numbers,
-    since torch's unique of rows takes tens of times as long."""
+    """Return the unique coordinates of (P, 3), which start at 0, the index into them (P,), and how often each occurs.
+    Integer keys are used because torch's unique of rows is tens of times slower."""
     size = (coordinates.amax(0) + 1).tolist()
     key = (coordinates[:, 0] * size[1] + coordinates[:, 1]) * size[2] + coordinates[:, 2]
     found, inverse, count = key.unique(return_inverse=True, return_counts=True)
@@ -65,15 +66,15 @@ def _unique(coordinates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _look_up(rows: Tensor, coordinates: Tensor) -> Tensor:
-    """Rows at coordinates (..., 3)."""
+    """Return the rows at coordinates (..., 3)."""
     x, y, z = (coordinates + PAD).unbind(-1)
     return rows[x, y, z]
 
 
 @dataclass(frozen=True)
 class Voxels:
-    """Several levels around points, from fine to coarse; vertex (V,): the finest level's row of each point, count (N,):
-    how many points it has. lower_m (3,); edge_m: of the finest voxels."""
+    """Voxel levels around points, from fine to coarse. vertex (V,): row in the finest level of each point; count (N,):
+    number of points of each row; lower_m (3,): lower corner; edge_m: edge of the finest voxels."""
 
     lower_m: Tensor
     edge_m: float
@@ -83,7 +84,7 @@ class Voxels:
 
     @staticmethod
     def around(points_m: Tensor, edge_m: float, levels: int) -> "Voxels":
-        """Of points (V, 3): each makes the voxel active that is nearest to it."""
+        """Build the levels around points (V, 3): each point activates its nearest voxel."""
         lower_m = points_m.amin(0)
         nearest = ((points_m - lower_m) / edge_m).round().long()
         coordinates, vertex, count = _unique(nearest)
@@ -95,5 +96,5 @@ class Voxels:
         return Voxels(lower_m, edge_m, vertex, count, tuple(found))
 
     def coordinates(self, points_m: Tensor, level: int) -> Tensor:
-        """Whole and broken coordinates of points (P, 3) at one of the levels."""
+        """Return the fractional coordinates of points (P, 3) at a level."""
         return (points_m - self.lower_m) / (self.edge_m * 2**level)

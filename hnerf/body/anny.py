@@ -1,4 +1,4 @@
-"""anny (Apache-2.0 code, CC0 data) as a Rig: one watertight part, no eyes, no tongue."""
+"""The body model anny (Apache-2.0 code, CC0 data) as a Rig: one watertight part, without eyes and tongue."""
 
 import dataclasses
 import functools
@@ -9,12 +9,12 @@ from torch import Tensor
 
 from hnerf.body.rig import Rig
 
-if TYPE_CHECKING:  # imported where it is used: it takes seconds, which commands without a body need not wait
+if TYPE_CHECKING:  # imported where it is used: that takes seconds, which commands without a body save
     import anny
 
 PHENOTYPES = ("gender", "age", "muscle", "weight", "height", "proportions")
 
-# anny's local changes that fit limbs, trunk and head to a person whom no phenotype describes; sides move together.
+# anny's local changes of limbs, trunk and head, for what phenotypes cannot express; both sides change together.
 LOCAL_CHANGES = (
     "measure-upperarm-length",
     "measure-lowerarm-length",
@@ -40,7 +40,7 @@ LOCAL_CHANGES = (
     "l-hand-scale+r-hand-scale",
 )
 BETA_NAMES = PHENOTYPES + LOCAL_CHANGES
-ADULT = (0.5, 0.72, 0.5, 0.5, 0.5, 0.5) + (0.0,) * len(LOCAL_CHANGES)  # age 0.5 is a teenager of 1.63 m
+ADULT = (0.5, 0.72, 0.5, 0.5, 0.5, 0.5) + (0.0,) * len(LOCAL_CHANGES)  # at age 0.5 anny is a teenager of 1.63 m
 BETA_LOW = (0.0,) * len(PHENOTYPES) + (-1.0,) * len(LOCAL_CHANGES)
 BETA_HIGH = (1.0,) * len(BETA_NAMES)
 
@@ -62,7 +62,7 @@ BODY_25 = (
 
 @functools.cache
 def _model() -> "anny.Anny":
-    """The body model; the first construction on a machine takes about a minute and is cached on disk by anny."""
+    """Load the body model; the first construction on a machine takes about a minute and is cached on disk by anny."""
     import anny
     from anny.models.model_data import TopologyConfig
 
@@ -73,8 +73,10 @@ def _model() -> "anny.Anny":
 
 
 def anny_rig(beta: Tensor | None = None) -> Rig:
-    """The rig linearised at shape values (28,), in the order of BETA_NAMES: phenotypes in [0, 1], then local changes in
-    [-1, 1] (held to these ranges); an average adult by default. float32."""
+    """Return the rig linearised at shape values (28,), an average adult's by default; float32.
+
+    Shape values are in the order of BETA_NAMES: phenotypes, held to [0, 1], then local changes, held to [-1, 1].
+    """
     beta = torch.tensor(ADULT) if beta is None else beta
     beta = beta.detach().to(torch.float64).clamp(torch.tensor(BETA_LOW), torch.tensor(BETA_HIGH))
     average = _average()
@@ -94,7 +96,7 @@ def anny_rig(beta: Tensor | None = None) -> Rig:
 
 @functools.cache
 def _average() -> Rig:
-    """Everything that shape leaves alone, with anny's template for a body. float32."""
+    """Return a rig of anny's template body, with everything that does not depend on the shape; float32."""
     model = _model()
     joint_names = tuple(model.bone_labels)
     return Rig(
@@ -116,9 +118,12 @@ def _average() -> Rig:
 
 @functools.cache
 def _shapes() -> Tensor:
-    """Displacements of vertices and joints, (rows, 3 (V + J)) metres: phenotype blend shapes, then local changes.
+    """Return displacements of vertices and joints, (rows, 3 (V + J)) metres: phenotype blend shapes, then local
+    changes.
 
-    Of each change anny has a shape for more and another for less; half their difference is linear, without a kink."""
+    anny has one blend shape to increase each local measure and another to decrease it; half their difference is linear,
+    without a kink at zero.
+    """
     labels = _model().local_change_labels
     shapes = torch.cat([_model().blendshapes, _model().bone_heads_blendshapes], 1).flatten(1)
     phenotypes, local = shapes[: -2 * len(labels)], shapes[-2 * len(labels) :]
@@ -128,7 +133,7 @@ def _shapes() -> Tensor:
 
 
 def _coefficients(beta: Tensor) -> Tensor:
-    """Coefficients (rows,) of `_shapes` at shape values (28,); piecewise multilinear in the phenotypes."""
+    """Return coefficients (rows,) of `_shapes` at shape values (28,); piecewise multilinear in the phenotypes."""
     phenotypes, local = beta.split([len(PHENOTYPES), len(LOCAL_CHANGES)])
     unchanged = beta.new_zeros(1, len(_model().local_change_labels))
     rows = _model()._get_phenotype_blendshape_coefficients(phenotypes[None], unchanged, beta.new_zeros(1, 0))[0]
@@ -136,7 +141,7 @@ def _coefficients(beta: Tensor) -> Tensor:
 
 
 def _keypoint_weights(model: "anny.Anny") -> Tensor:
-    """BODY_25 regression weights (25, V). Eyes lose their removed eyeball vertices, so rows are normalised again."""
+    """Return BODY_25 regression weights (25, V). The removed eyeballs had weights too, so rows are normalised again."""
     from anny.paths import get_anny_root_dir
 
     path = get_anny_root_dir() / "data" / "keypoints" / "coco.pth"

@@ -4,8 +4,8 @@ Locked joints follow their nearest free ancestor rigidly, so a rig of a hundred 
 move. A point's world position is linear in their transforms and in the shape: x = sum_m R_m (a_m - w_m q_m) + w_m p_m
 with rest joint q_m, posed joint p_m, and a_m the point's rest position times its weight w_m on joint m.
 
-Unknowns of a frame, in this order: the root joint's displacement (3) in metres, a rotation about it (3) in world axes,
-then the change of axis-angle (3) of every other moving joint.
+The unknowns of a frame, in this order: the root joint's displacement (3) in metres, a rotation about it (3) in world
+axes, then the change of axis-angle (3) of every other moving joint.
 """
 
 from dataclasses import dataclass, replace
@@ -18,9 +18,12 @@ from hnerf.body.rig import Rig, joint_transforms, posed_joint_basis, rotation_fr
 
 @dataclass(frozen=True)
 class Pose:
-    """What a fit looks for. rig: linearised at the shape, its `beta` (B,); theta (n, J, 3) radians, zero at locked
-    joints and the root; root (n, 4, 4) world from body, metres; offsets_m (25, 3): where the detector sees a keypoint
-    on the resting body, less where the body model has it."""
+    """The state that a fit optimises: the shape, the poses of n frames, and keypoint offsets.
+
+    rig: linearised at the shape, its `beta` (B,); theta (n, J, 3) radians, zero at locked joints and the root; root (n,
+    4, 4) world from body, metres; offsets_m (25, 3): where the detector sees each keypoint on the rest body, minus
+    where the body model has it.
+    """
 
     rig: Rig
     theta: Tensor
@@ -30,8 +33,8 @@ class Pose:
 
 @dataclass(frozen=True)
 class Points:
-    """P points on the resting body: weights (P, M); rest_m (P, M, 3) and basis_m (P, M, 3, B) already times the
-    weight."""
+    """P points on the rest body: weights (P, M) on the moving joints; rest_m (P, M, 3) and basis_m (P, M, 3, B),
+    position and shape basis already multiplied by the weight."""
 
     weights: Tensor
     rest_m: Tensor
@@ -40,8 +43,8 @@ class Points:
 
 @dataclass(frozen=True)
 class PosedJoints:
-    """Moving joints in the world: rotations (n, M, 3, 3), positions_m (n, M, 3), axes (n, M, 3, 3) whose columns are
-    the world rotation vectors of the joint's three unknowns, shape_m (n, M, 3, B) displacement per unit of beta."""
+    """Moving joints in the world: rotations (n, M, 3, 3); positions_m (n, M, 3); axes (n, M, 3, 3), whose columns are
+    the world rotation vectors of the joint's three unknowns; shape_m (n, M, 3, B), displacement per unit of beta."""
 
     rotations: Tensor
     positions_m: Tensor
@@ -57,25 +60,25 @@ class Articulation:
         moves = rig.free.clone()
         moves[0] = True
         self.joints = moves.nonzero()[:, 0]
-        carrier = torch.zeros(len(moves), dtype=torch.long)  # index of the moving joint that carries each joint
+        carrier = torch.zeros(len(moves), dtype=torch.long)  # index of the moving joint that each joint follows
         slot = moves.cumsum(0) - 1
         for j, parent in enumerate(rig.parents.tolist()):
             carrier[j] = slot[j] if moves[j] else carrier[parent]
         self.parents = carrier[rig.parents[self.joints].clamp(min=0)]
         count = len(self.joints)
-        self.below = torch.eye(count, dtype=rig.vertices_m.dtype)  # below[j, m] = 1 if turning j moves m
+        self.subtree = torch.eye(count, dtype=rig.vertices_m.dtype)  # below[j, m] = 1 if turning j moves m
         for m in range(1, count):
-            self.below[:, m] += self.below[:, self.parents[m]]
+            self.subtree[:, m] += self.subtree[:, self.parents[m]]
         self.vertex_weights = torch.zeros(len(rig.vertices_m), count, dtype=rig.vertices_m.dtype)
         self.vertex_weights.scatter_add_(1, carrier[rig.skin_joints], rig.skin_weights)
         self.rest_m, self.rest_basis_m = rig.joints_m[self.joints], rig.joint_basis[:, self.joints].permute(1, 2, 0)
         self.unknowns = 3 + 3 * count
 
     def keypoints(self) -> Points:
-        """The 25 BODY_25 keypoints."""
+        """Return the 25 BODY_25 keypoints as points on the rest body."""
         rows, count = self.rig.keypoint_weights, len(self.joints)
         used = (rows != 0).any(0)
-        split = (rows[:, None, used] * self.vertex_weights[used].T).flatten(0, 1)  # (25 M, V used), most rows empty
+        split = (rows[:, None, used] * self.vertex_weights[used].T).flatten(0, 1)  # (25 M, V used), most rows zero
         carried = (split != 0).any(1)
         columns = torch.cat([self.rig.vertices_m[None], self.rig.shape_basis])[:, used].transpose(0, 1).flatten(1)
         sums = torch.zeros(len(split), columns.shape[1], dtype=rows.dtype)
@@ -84,7 +87,7 @@ class Articulation:
         return Points(split.sum(1).unflatten(0, (-1, count)), sums[..., 0], sums[..., 1:])
 
     def pose(self, pose: Pose) -> PosedJoints:
-        """Place the moving joints."""
+        """Place the moving joints in the world."""
         world = joint_transforms(self.rig, pose.theta, pose.root)
         rotations, positions = world[:, self.joints, :3, :3], world[:, self.joints, :3, 3]
         above = rotations[:, self.parents]
@@ -94,50 +97,53 @@ class Articulation:
         return PosedJoints(rotations, positions, axes, shape)
 
     def surface(self, joints: PosedJoints, frame: int) -> Tensor:
-        """Every vertex in one frame, (V, 3) world."""
+        """Return every vertex in one frame, (V, 3) world."""
         rotations = joints.rotations[frame]
         moved = joints.positions_m[frame] - (rotations @ self.rest_m[..., None])[..., 0]
         blended = self.vertex_weights @ torch.cat([rotations.flatten(1), moved], 1)
         return (blended[:, :9].unflatten(1, (3, 3)) @ self.rig.vertices_m[..., None])[..., 0] + blended[:, 9:]
 
     def jacobian(self, points: Points, joints: PosedJoints) -> tuple[Tensor, Tensor, Tensor]:
-        """Positions (n, P, 3), and their derivatives by the frame's unknowns (n, P, 3, U) and by beta (n, P, 3, B)."""
-        carried = self._carried(points, joints)
-        moved = torch.einsum("jm,npmd->npjd", self.below, carried)
-        lever = moved - torch.einsum("jm,pm->pj", self.below, points.weights)[..., None] * joints.positions_m[:, None]
+        """Return positions (n, P, 3), and their derivatives by the frame's unknowns (n, P, 3, U) and by beta (n, P, 3,
+        B)."""
+        carried = self._weighted_positions(points, joints)
+        moved = torch.einsum("jm,npmd->npjd", self.subtree, carried)
+        lever = moved - torch.einsum("jm,pm->pj", self.subtree, points.weights)[..., None] * joints.positions_m[:, None]
         axes = joints.axes.transpose(-1, -2)[:, None]  # (n, 1, M, 3 unknowns, 3)
-        turn = torch.linalg.cross(axes, lever[..., None, :].expand(*lever.shape[:-1], 3, 3))
+        by_rotation = torch.linalg.cross(axes, lever[..., None, :].expand(*lever.shape[:-1], 3, 3))
         position = carried.sum(2)
-        shift = torch.eye(3, dtype=turn.dtype).expand(*position.shape, 3)
-        frame = torch.cat([shift, turn.flatten(2, 3).transpose(-1, -2)], -1)
+        shift = torch.eye(3, dtype=by_rotation.dtype).expand(*position.shape, 3)
+        frame = torch.cat([shift, by_rotation.flatten(2, 3).transpose(-1, -2)], -1)
         rest_basis = points.basis_m - points.weights[..., None, None] * self.rest_basis_m
         shape = torch.einsum("nmcd,pmdb->npcb", joints.rotations, rest_basis)
         shape += torch.einsum("pm,nmcb->npcb", points.weights, joints.shape_m)
         return position, frame, shape
 
-    def along(self, ids: Tensor, directions: Tensor, joints: PosedJoints, frame: int) -> tuple[Tensor, Tensor]:
-        """Derivatives of some vertices' positions, ids (P,), along directions (P, 3): by a frame's unknowns (P, U),
-        and by beta (P, B). The same as `jacobian`, contracted early."""
+    def directional_jacobian(
+        self, ids: Tensor, directions: Tensor, joints: PosedJoints, frame: int
+    ) -> tuple[Tensor, Tensor]:
+        """Return derivatives of the positions of vertices `ids` (P,) along directions (P, 3): by the frame's unknowns
+        (P, U), and by beta (P, B). Equal to `jacobian` times the directions, without forming it."""
         weights, rest = self.vertex_weights[ids], self.rig.vertices_m[ids, None] - self.rest_m
         rotations, positions = joints.rotations[frame], joints.positions_m[frame]
         carried = weights[..., None] * (torch.einsum("mcd,pmd->pmc", rotations, rest) + positions)
-        lever = torch.einsum("jm,pmd->pjd", self.below, carried) - (weights @ self.below.T)[..., None] * positions
+        lever = torch.einsum("jm,pmd->pjd", self.subtree, carried) - (weights @ self.subtree.T)[..., None] * positions
         torque = torch.linalg.cross(lever, directions[:, None].expand_as(lever))
-        turn = torch.einsum("pmc,mcu->pmu", torque, joints.axes[frame]).flatten(1)
+        by_rotation = torch.einsum("pmc,mcu->pmu", torque, joints.axes[frame]).flatten(1)
         pulled = weights[..., None] * torch.einsum("pc,mcd->pmd", directions, rotations)
         shape = torch.einsum("pd,bpd->pb", pulled.sum(1), self.rig.shape_basis[:, ids])
         shape -= pulled.flatten(1) @ self.rest_basis_m.flatten(0, 1)
         shape += (weights[..., None] * directions[:, None]).flatten(1) @ joints.shape_m[frame].flatten(0, 1)
-        return torch.cat([directions, turn], 1), shape
+        return torch.cat([directions, by_rotation], 1), shape
 
-    def _carried(self, points: Points, joints: PosedJoints) -> Tensor:
-        """Each joint's share of each point, (n, P, M, 3)."""
+    def _weighted_positions(self, points: Points, joints: PosedJoints) -> Tensor:
+        """Return each point as every moving joint would carry it alone, times the joint's weight, (n, P, M, 3)."""
         rest = points.rest_m - points.weights[..., None] * self.rest_m
         turned = torch.einsum("nmcd,pmd->npmc", joints.rotations, rest)
         return turned + points.weights[..., None] * joints.positions_m[:, None]
 
-    def moved(self, pose: Pose, step: Tensor) -> Pose:
-        """The pose after a step (n, U) of the frames' unknowns."""
+    def apply_step(self, pose: Pose, step: Tensor) -> Pose:
+        """Return the pose after a step (n, U) of the frames' unknowns."""
         theta = pose.theta.clone()
         theta[:, self.joints[1:]] += step[:, 6:].unflatten(-1, (-1, 3))
         rotation = rotation_from_axis_angle(step[:, 3:6]) @ pose.root[:, :3, :3]
@@ -148,12 +154,13 @@ class Articulation:
 
 
 def with_offsets(points: Points, offsets_m: Tensor) -> Points:
-    """Keypoints moved on the resting body by offsets_m (P, 3)."""
+    """Return keypoints displaced on the rest body by offsets_m (P, 3)."""
     return replace(points, rest_m=points.rest_m + points.weights[..., None] * offsets_m[:, None])
 
 
 def left_jacobian(axis_angle: Tensor) -> Tensor:
-    """(..., 3) to (..., 3, 3): J with R(v + dv) = R(J dv) R(v) to first order.
+    """Return the left Jacobian of SO(3) at rotation vectors (..., 3): J (..., 3, 3) with R(v + dv) = R(J dv) R(v) to
+    first order.
 
     J = I + (1 - cos a)/a^2 [v] + (a - sin a)/a^3 [v]^2 (Barfoot 2017, eq. 7.37).
     """

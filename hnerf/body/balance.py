@@ -1,5 +1,8 @@
-"""Where a person's weight is: one image hardly tells a body that leans towards its camera from an upright one that is
-smaller. Several cameras see this, so it is asked of one camera only."""
+"""A prior that keeps the centre of mass above the feet.
+
+One image hardly distinguishes a body that leans towards the camera from an upright one that is smaller. Several cameras
+see the difference, so the prior is used with one camera only.
+"""
 
 import torch
 from torch import Tensor
@@ -8,19 +11,20 @@ from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.robust import geman_mcclure
 
 BALANCE_M = 0.05
-FADES_M = 0.15  # from where the pull fades: a step or a jump
+OUTLIER_M = 0.15  # distance of a step or a jump, which is let go
 
-# Shares of the body's mass (Winter 2009, table 4.1), half at either end of a segment, arms at the elbows: BODY_25
-# keypoint and share.
+# Shares of the body's mass (Winter 2009, table 4.1) by BODY_25 keypoint: half at either end of a segment, that of an
+# arm at its elbow.
 TRUNK = {1: 0.289, 8: 0.289}  # head and trunk: neck and middle of the hips
 ARMS = {3: 0.05, 6: 0.05}  # elbows
 THIGHS = {9: 0.05, 12: 0.05, 10: 0.05, 13: 0.05}  # hips and knees
 SHANKS = {10: 0.0305, 13: 0.0305, 11: 0.0305, 14: 0.0305}  # knees and ankles, with the feet
-SUPPORT = {11: 0.5, 14: 0.5}  # ankles: where keypoints put the trunk's middle line, it stands above them
+SUPPORT = {11: 0.5, 14: 0.5}  # ankles: as seen by keypoints, the trunk stands above them
 
 
 def centre_of_mass_over_feet() -> Tensor:
-    """Coefficients (25,) of the keypoints, which sum to 0: the centre of mass less the middle of the ankles."""
+    """Return coefficients (25,) of the keypoints, which sum to 0, that give the centre of mass minus the midpoint of
+    the ankles."""
     shares = torch.zeros(25, dtype=torch.float64)
     for segment in (TRUNK, ARMS, THIGHS, SHANKS):
         for keypoint, share in segment.items():
@@ -32,21 +36,23 @@ def centre_of_mass_over_feet() -> Tensor:
 
 
 class Balance:
-    """The centre of mass is above the middle of the ankles, give or take 5 cm either way, except when it is not:
-    Geman-McClure lets a step or a jump go."""
+    """A prior on the horizontal distance of the centre of mass from the midpoint of the ankles, with a standard
+    deviation of 5 cm in either direction; Geman-McClure weights let a step or a jump go."""
 
     def __init__(self, up: int) -> None:
-        """up: index of the world's vertical axis."""
+        """Prepare the prior; `up` is the index of the world's vertical axis."""
         self.level = [axis for axis in range(3) if axis != up]
         self.shares = centre_of_mass_over_feet()
 
     def add(self, equations: NormalEquations, keypoints_m: Tensor, jacobian: Tensor) -> float:
-        """keypoints_m (n, 25, 3), jacobian (n, 25, 3, U); returns the cost. Shared unknowns are left alone: nobody
-        keeps the balance by another shape."""
+        """Add the prior to the normal equations and return its cost. keypoints_m (n, 25, 3), jacobian (n, 25, 3, U).
+
+        Shared unknowns are left alone: a change of shape does not keep anybody's balance.
+        """
         off, by_frame = (
             torch.einsum("k,nkc...->nc...", self.shares, t)[:, self.level] for t in (keypoints_m, jacobian)
         )
-        weight, cost = geman_mcclure(off.square().sum(-1), BALANCE_M, FADES_M)
+        weight, cost = geman_mcclure(off.square().sum(-1), BALANCE_M, OUTLIER_M)
         weighted = weight[:, None, None] * by_frame
         equations.frame[0] += (weighted.mT @ by_frame).numpy()
         equations.frame_gradient += torch.einsum("ncu,nc->nu", weighted, off).numpy()

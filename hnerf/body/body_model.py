@@ -1,4 +1,4 @@
-"""The body models a fit can use, each as a rig for any shape and what is known of shapes beforehand."""
+"""The body models that a fit can use: a rig for any shape, and a prior on shapes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from hnerf.body.anny import ADULT, BETA_HIGH, BETA_LOW, LOCAL_CHANGES, PHENOTYPES, anny_rig
 from hnerf.body.rig import Rig
-from hnerf.body.smpl import BETAS, T_POSE_BONES, read_smpl, rest_turns
+from hnerf.body.smpl import BETAS, T_POSE_BONES, read_smpl, rest_rotations
 from hnerf.config import FitSettings
 
 SMPL_BETA_LIMIT = 5.0  # standard deviations
@@ -17,26 +17,26 @@ SMPL_BETA_LIMIT = 5.0  # standard deviations
 
 @dataclass(frozen=True)
 class BodyModel:
-    """`rig(beta or None)`: float64, linearised at a shape, the mean one for None. Shapes are likely to be at `mean`,
-    with standard deviations `spread`, and never below `low` or above `high`; `details` (bool): values of which
-    keypoints alone say little; all (B,).
+    """A body model and its shape prior.
 
-    Where SMPL's own parameters are given: `rest_turns` (J, 3, 3) from SMPL's T pose to the rig's rest pose, body frame;
-    `is_smpl`: betas too are the rig's own.
+    `rig(beta)`: float64, linearised at a shape, at the mean one for None. The prior on beta is a Gaussian with `mean`
+    and `std`, truncated at `low` and `high`; `details` (bool) marks values that keypoints alone hardly determine; all
+    (B,). `rest_rotations` (J, 3, 3): from SMPL's T pose to the rig's rest pose, body frame, for poses given as SMPL's
+    parameters; `is_smpl`: whether given betas are the rig's own, too.
     """
 
     rig: Callable[[Tensor | None], Rig]
     mean: Tensor
-    spread: Tensor
+    std: Tensor
     low: Tensor
     high: Tensor
     details: Tensor
-    rest_turns: Tensor
+    rest_rotations: Tensor
     is_smpl: bool
 
 
 def body_model(settings: FitSettings) -> BodyModel:
-    """The model that the settings name. Raises InputError where its file is missing or is none that is known."""
+    """Return the model that the settings name. Raises InputError where its file is missing or of no known model."""
     return _anny(settings) if settings.body_model == "anny" else _smpl(settings)
 
 
@@ -44,12 +44,12 @@ def _anny(settings: FitSettings) -> BodyModel:
     def rig(beta: Tensor | None) -> Rig:
         return anny_rig(beta).to(dtype=torch.float64)
 
-    spread = [settings.phenotype_std] * len(PHENOTYPES) + [settings.local_change_spread] * len(LOCAL_CHANGES)
-    mean, spreads, low, high = (torch.tensor(v, dtype=torch.float64) for v in (ADULT, spread, BETA_LOW, BETA_HIGH))
+    std = [settings.phenotype_std] * len(PHENOTYPES) + [settings.local_change_std] * len(LOCAL_CHANGES)
+    mean, stds, low, high = (torch.tensor(v, dtype=torch.float64) for v in (ADULT, std, BETA_LOW, BETA_HIGH))
     details = torch.arange(len(ADULT)) >= len(PHENOTYPES)
     rest = rig(None)
-    turns = rest_turns(rest.joint_names, rest.parents.tolist(), T_POSE_BONES)
-    return BodyModel(rig, mean, spreads, low, high, details, turns, is_smpl=False)
+    rotations = rest_rotations(rest.joint_names, rest.parents.tolist(), T_POSE_BONES)
+    return BodyModel(rig, mean, stds, low, high, details, rotations, is_smpl=False)
 
 
 def _smpl(settings: FitSettings) -> BodyModel:
@@ -60,4 +60,4 @@ def _smpl(settings: FitSettings) -> BodyModel:
 
     zero, one = torch.zeros(BETAS, dtype=torch.float64), torch.ones(BETAS, dtype=torch.float64)
     limit = SMPL_BETA_LIMIT * one
-    return BodyModel(rig, zero, one, -limit, limit, zero.bool(), smpl.rest_turns, is_smpl=True)
+    return BodyModel(rig, zero, one, -limit, limit, zero.bool(), smpl.rest_rotations, is_smpl=True)

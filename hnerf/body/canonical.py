@@ -1,4 +1,4 @@
-"""World points seen from the canonical body: (d, s) of the paper, and y = s + L^-1 (x - p).
+"""World points relative to the canonical body: (d, s) of the paper, and y = s + L^-1 (x - p).
 
 p is the closest point on the posed body, s the same point on the rest body, and L the blended linear part of the
 skinning there, so y equals s + d n(s) where the skin moves rigidly, and stays continuous across edges where n(s) does
@@ -22,15 +22,16 @@ from hnerf.body.rig import (
     vertex_transforms,
 )
 
-ON_EDGE = 1e-5  # a barycentric weight below it is none
-FAR_M = 10.0  # as a reach: farther than any point that is asked about
+ON_EDGE = 1e-5  # barycentric weights below it count as zero
+FAR_M = 10.0  # a reach beyond any point that is queried
 
 
 @dataclass(frozen=True)
 class Descriptor:
-    """d (N,) metres, negative inside; s (N, 3) on the rest body; y (N, 3) canonical position; normal (N, 3) of the rest
-    body at s, turned into the world; near (N,) bool: within reach (the rest is meaningless where it is False); corners
-    (N, 3) of the closest triangle, barycentric (N, 3) of the closest point in it."""
+    """What the body prior says of N points: d (N,) metres, negative inside; s (N, 3) on the rest body; y (N, 3)
+    canonical position; normal (N, 3) of the rest body at s, rotated into the world; near (N,) bool: within reach (the
+    rest is meaningless where it is False); corners (N, 3): vertices of the closest triangle; barycentric (N, 3) of the
+    closest point in it."""
 
     d: Tensor
     s: Tensor
@@ -42,18 +43,18 @@ class Descriptor:
 
     @property
     def vertex(self) -> Tensor:
-        """The closest corner of the closest triangle, (N,)."""
+        """Return the corner of the closest triangle that is nearest to the closest point, (N,)."""
         return nearest_corner(self.corners, self.barycentric)
 
 
 class PoseCorrection(nn.Module):
-    """Small changes of pose and shape, learned while the body meshes stand still (Delta theta_t, Delta beta of the
+    """Small changes of pose and shape, learned while the body meshes stay fixed (Delta theta_t, Delta beta of the
     paper).
 
-    Free joints and the root of each frame turn by small world-axes twists (n, free + 1, 3), the root also moves (n,
-    3), and the shape changes for all frames (B,). A twist moves a point by its joint's share of the point's skin
-    weights: the linearisation of skinning for one bone, blended between bones. `PosedBodies.absorb` turns it into
-    theta, T and beta.
+    Each frame has small twists in world axes of the free joints and the root, (n, free + 1, 3), and a displacement of
+    the root, (n, 3); the shape changes for all frames, (B,). A twist moves a point by its joint's share of the point's
+    skin weights: the linearisation of skinning for one bone, blended between bones. `PosedBodies.absorb` turns the
+    correction into theta, T and beta.
     """
 
     absorbed_turn: Tensor
@@ -69,7 +70,7 @@ class PoseCorrection(nn.Module):
             self.register_buffer(f"absorbed_{name}", torch.zeros_like(parameter.data))
 
     def totals(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(turn, move_m, shape) since the fit, what was absorbed included."""
+        """Return (turn, move_m, shape) since the fit, including what was absorbed."""
         return (
             self.turn + self.absorbed_turn,
             self.move_m + self.absorbed_move_m,
@@ -78,11 +79,11 @@ class PoseCorrection(nn.Module):
 
 
 class PosedBodies:
-    """The body in several poses: closest points, descriptors and their sensitivity to pose and shape."""
+    """The body in several poses: closest points, descriptors, and their derivatives by pose and shape."""
 
     def __init__(self, rig: Rig, theta: Tensor, root: Tensor, canonical_m: Tensor):
-        """theta (n, J, 3), root (n, 4, 4); canonical_m (V, 3): the rest body that s and y refer to, whatever the
-        shape."""
+        """Pose the rig: theta (n, J, 3), root (n, 4, 4). canonical_m (V, 3): the rest body that s and y refer to,
+        whatever the shape."""
         self.rig = rig
         self._canonical_m = canonical_m
         self._free = torch.nonzero(rig.free)[:, 0]
@@ -91,10 +92,10 @@ class PosedBodies:
         self._meshes = BodyMeshes(self.vertices_m, rig.faces)
 
     def set_poses(self, rig: Rig, theta: Tensor, root: Tensor) -> None:
-        """Take other poses and another shape, nearby."""
+        """Replace the poses and the shape by similar ones."""
         self.rig = rig
         self._pose(theta, root)
-        self._meshes.move(self.vertices_m)
+        self._meshes.refit(self.vertices_m)
 
     def _pose(self, theta: Tensor, root: Tensor) -> None:
         self.theta, self.root = theta.detach(), root.detach()
@@ -104,16 +105,16 @@ class PosedBodies:
         self._linear = posed[..., :3].contiguous()
         self._inverse = torch.linalg.inv(self._linear).contiguous()
         self.vertices_m = (self._linear @ rig.vertices_m[..., None])[..., 0] + posed[..., 3]
-        self._carried = self._shape_carries()
+        self._joint_shape = self._joint_shape_motion()
 
-    def _shape_carries(self) -> Tensor:
-        """(n J, 3 B): how a unit of each shape moves what each joint carries rigidly, beyond turning the rest body's
-        own change: the joint's way in the world less that in the rest body, turned."""
+    def _joint_shape_motion(self) -> Tensor:
+        """Return how a unit of each shape moves what each joint carries rigidly, (n J, 3 B) metres: the joint's
+        displacement in the world minus its rotated displacement in the rest body."""
         turned = self._joints[..., :3, :3] @ self.rig.joint_basis.permute(1, 2, 0)
         return (posed_joint_basis(self.rig, self._joints, self.root) - turned).flatten(2).flatten(0, 1)
 
     def correction(self) -> PoseCorrection:
-        """A correction of zero for these frames."""
+        """Return a correction of zero for these frames."""
         return PoseCorrection(len(self.theta), len(self._free), len(self.rig.beta)).to(self.rig.vertices_m.device)
 
     def describe(
@@ -124,14 +125,14 @@ class PosedBodies:
         correction: PoseCorrection | None = None,
         exact_sign: bool = False,
     ) -> Descriptor:
-        """Descriptors of world points (N, 3) in the bodies of rows `frame` (N,); gradients flow to points and
-        correction."""
+        """Return descriptors of world points (N, 3) relative to the bodies of rows `frame` (N,); gradients flow to the
+        points and the correction."""
         found = self._meshes.closest_points(points_m, frame, reach_m, exact_sign)
         corners = self.rig.faces.index_select(0, found.face.clamp(min=0))  # (N, 3)
         posed = frame.long()[:, None] * len(self.rig.vertices_m) + corners
-        p = blended(self.vertices_m.flatten(0, 1), posed, found.barycentric)
-        s = blended(self._canonical_m, corners, found.barycentric)
-        inverse = blended(self._inverse.flatten(0, 1).flatten(1), posed, found.barycentric).unflatten(-1, (3, 3))
+        p = weighted_sum(self.vertices_m.flatten(0, 1), posed, found.barycentric)
+        s = weighted_sum(self._canonical_m, corners, found.barycentric)
+        inverse = weighted_sum(self._inverse.flatten(0, 1).flatten(1), posed, found.barycentric).unflatten(-1, (3, 3))
         offset = points_m.detach() - p
         distance = offset.norm(dim=-1)
         normal = found.sign[:, None] * offset / distance.clamp(min=1e-9)[:, None]
@@ -140,14 +141,14 @@ class PosedBodies:
             nearest = nearest_corner(corners, found.barycentric)
             moved = moved - self._displacement(points_m.detach(), frame, nearest, correction)
         y = s + (inverse @ (offset + moved)[..., None])[..., 0]
-        if moved.requires_grad:  # nothing else follows: renderings need not ask along what
-            s = s + (inverse @ self._along(posed, found.barycentric, normal, moved)[..., None])[..., 0]
+        if moved.requires_grad:  # only gradients need it, so renderings save it
+            s = s + (inverse @ self._closest_point_motion(posed, found.barycentric, normal, moved)[..., None])[..., 0]
         d = found.sign * distance + (normal * moved).sum(-1)
         return Descriptor(d, s, y, normal, found.face >= 0, corners, found.barycentric)
 
-    def _along(self, posed: Tensor, barycentric: Tensor, normal: Tensor, moved: Tensor) -> Tensor:
-        """How the closest point follows a point that moves by `moved` (N, 3): along the face that it lies on, along the
-        edge if it lies on one, and not at all if it is a corner. posed (N, 3): rows of the posed vertices."""
+    def _closest_point_motion(self, posed: Tensor, barycentric: Tensor, normal: Tensor, moved: Tensor) -> Tensor:
+        """Return how the closest point follows when its point moves by `moved` (N, 3): along the face it lies on, along
+        the edge if it lies on one, not at all if it is a vertex. posed (N, 3): rows of the posed vertices."""
         on_face = moved - normal * (normal * moved).sum(-1, keepdim=True)
         away = barycentric < ON_EDGE
         cornered = torch.nonzero(away.any(1))[:, 0]
@@ -160,26 +161,29 @@ class PosedBodies:
         return on_face.index_copy(0, cornered, on_edge)
 
     def _displacement(self, points_m: Tensor, frame: Tensor, nearest: Tensor, correction: PoseCorrection) -> Tensor:
-        """How far the correction carries the body at each point with its nearest vertex (N,): (N, 3)."""
+        """Return how far the correction carries the body at each point, whose nearest vertex is `nearest` (N,): (N, 3)
+        metres."""
         frame = frame.long()
         share = self._subtree_weights.index_select(0, nearest)  # (N, free + 1)
         pivots = torch.cat([self._joints[:, self._free, :3, 3], self._joints[:, :1, :3, 3]], 1)  # (n, free + 1, 3)
         twists = torch.cat([correction.turn, -torch.linalg.cross(correction.turn, pivots)], -1)  # (n, free + 1, 6)
-        present, own = occurring(frame, len(twists))
+        present, own = distinct_rows(frame, len(twists))
         everywhere = (share @ twists[present].transpose(0, 1).flatten(1)).unflatten(1, (len(present), 6))
-        twist = everywhere.gather(1, own[:, None, None].expand(-1, 1, 6))[:, 0]  # one product beats a gather a point
+        twist = everywhere.gather(1, own[:, None, None].expand(-1, 1, 6))[
+            :, 0
+        ]  # one matrix product is faster than gathering for each point
         moved = torch.linalg.cross(twist[:, :3], points_m) + twist[:, 3:] + correction.move_m.index_select(0, frame)
         bulge = torch.einsum("b,bvd->vd", correction.shape, self.rig.shape_basis).index_select(0, nearest)
         linear = self._linear.flatten(0, 1).index_select(0, frame * len(self.rig.vertices_m) + nearest)
-        carried = (self._carried.unflatten(1, (3, -1)) @ correction.shape).contiguous()
+        carried = (self._joint_shape.unflatten(1, (3, -1)) @ correction.shape).contiguous()
         joints = frame[:, None] * len(self.rig.joints_m) + self.rig.skin_joints.index_select(0, nearest)
         moved = moved + (linear @ bulge[..., None])[..., 0]
-        return moved + blended(carried, joints, self.rig.skin_weights.index_select(0, nearest))
+        return moved + weighted_sum(carried, joints, self.rig.skin_weights.index_select(0, nearest))
 
     @torch.no_grad()
-    def absorb(self, correction: PoseCorrection, alike: Tensor | None = None) -> None:
-        """Move the bodies by the correction, exactly through the kinematic chain, and set it to zero. Rows `alike` are
-        one posture: their joints turn as they do in the mean."""
+    def absorb(self, correction: PoseCorrection, same_posture: Tensor | None = None) -> None:
+        """Move the bodies by the correction, exactly through the kinematic chain, and set it to zero. Rows
+        `same_posture` share one posture: their joints get the mean rotation."""
         rig, free = self.rig, self._free
         rotations = rotation_from_axis_angle(self.theta)
         above = self._joints[:, rig.parents[free].clamp(min=0), :3, :3]
@@ -188,10 +192,10 @@ class PosedBodies:
         )
         theta, root = self.theta.clone(), self.root.clone()
         theta[:, free] = axis_angle_from_rotation(turned)
-        if alike is not None:
-            theta[alike] = theta[alike].mean(0)
+        if same_posture is not None:
+            theta[same_posture] = theta[same_posture].mean(0)
             own = above @ rotation_from_axis_angle(theta[:, free]) @ (above @ rotations[:, free]).transpose(-1, -2)
-            correction.turn[alike, :-1] = axis_angle_from_rotation(own)[alike]  # what they did turn
+            correction.turn[same_posture, :-1] = axis_angle_from_rotation(own)[same_posture]  # by how much they turned
         turn, pivot = rotation_from_axis_angle(correction.turn[:, -1]), self._joints[:, 0, :3, 3]
         root[:, :3, :3] = turn @ root[:, :3, :3]
         root[:, :3, 3] = (turn @ (root[:, :3, 3] - pivot)[..., None])[..., 0] + pivot + correction.move_m
@@ -202,18 +206,20 @@ class PosedBodies:
 
 
 def nearest_corner(corners: Tensor, barycentric: Tensor) -> Tensor:
-    """Of corners (N, 3) the one (N,) whose barycentric weight is greatest."""
+    """Return the one of corners (N, 3) whose barycentric weight is greatest, (N,)."""
     return corners.gather(1, barycentric.argmax(1, keepdim=True))[:, 0]
 
 
-def blended(values: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor:
-    """Rows (V, D) at K corners (N, K), weighted and summed (N, D), in one pass; gradients flow to the rows alone."""
-    found: Tensor = _Blend.apply(values, corners, barycentric.to(values))
+def weighted_sum(values: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor:
+    """Return weighted sums (N, D) of rows of values (V, D): corners (N, K) name the rows, barycentric (N, K) their
+    weights. One pass; gradients flow to the values only."""
+    found: Tensor = _WeightedSum.apply(values, corners, barycentric.to(values))
     return found
 
 
-class _Blend(torch.autograd.Function):
-    """`embedding_bag`, whose own gradient sorts the corners, which takes four times as long on a CPU."""
+class _WeightedSum(torch.autograd.Function):
+    """`embedding_bag` with a gradient of its own: the built-in one sorts the corners and takes four times as long on a
+    CPU."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, corners: Tensor, weights: Tensor) -> Tensor:
@@ -229,21 +235,22 @@ class _Blend(torch.autograd.Function):
         return total, None, None
 
 
-def occurring(rows: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Which of `count` rows occur among `rows` (N,), and where each of these is among them, (N,); without a sort."""
+def distinct_rows(rows: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return which of `count` rows occur among `rows` (N,), and the position of each of `rows` among them, (N,);
+    without sorting."""
     occurs = torch.zeros(count, dtype=torch.bool, device=rows.device)
     occurs[rows] = True
     return occurs.nonzero()[:, 0], (occurs.cumsum(0) - 1)[rows]
 
 
 def axis_angle_from_rotation(rotation: Tensor) -> Tensor:
-    """(..., 3, 3) to (..., 3) axis-angle in radians, up to a half turn; without a gradient."""
+    """Return the axis-angle (..., 3) in radians of rotations (..., 3, 3), at most a half turn; without a gradient."""
     turns = Rotation.from_matrix(rotation.detach().cpu().double().reshape(-1, 3, 3).numpy()).as_rotvec()
     return torch.from_numpy(turns).to(rotation).view(rotation.shape[:-1])
 
 
 def _subtree_weights(rig: Rig, free: Tensor) -> Tensor:
-    """(V, free + 1): the skin weight that each free joint carries with all below it; the last column is the root's,
+    """Return the skin weight of each free joint with all its descendants, (V, free + 1); the last column is the root's,
     1."""
     dense = rig.dense_weights.clone()
     for joint in range(len(rig.joints_m) - 1, 0, -1):

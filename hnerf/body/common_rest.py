@@ -1,5 +1,8 @@
-"""What a change of poses has in common in all frames belongs to the rest body: then a pose that no frame has gets it,
-too."""
+"""The mean change of the poses moved into the rest body.
+
+What training changes alike in the poses of all frames is a property of the body; in its rest pose it also shows in
+poses that no frame has.
+"""
 
 import dataclasses
 
@@ -13,11 +16,12 @@ from hnerf.body.rig import Rig, joint_transforms, pose_vertices, rotation_from_a
 def with_common_rest(
     rig: Rig, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]
 ) -> tuple[Rig, Tensor, Tensor]:
-    """The rig that rests as all frames have turned and moved in the mean, and the poses that put it where it stands
-    after; poses before now show it turned and moved like that.
+    """Return a rig whose rest pose includes the mean change of all poses, and the poses that then reproduce `after`;
+    with it, poses `before` show the body turned and moved by that mean change.
 
-    before, after: theta (n, J, 3) and root (n, 4, 4). Joints and what is rigid on one are where they were; what is
-    blended between joints differs by the square of the mean turn. The shape's basis, which would turn likewise, stays.
+    before, after: theta (n, J, 3) and root (n, 4, 4). Joints, and points that are rigid on one, stay where they were;
+    points blended between joints differ by the square of the mean turn. The shape basis, which would turn likewise, is
+    kept.
     """
     theta, root = _mean_change(before, after)
     resting = joint_transforms(rig, theta, root)
@@ -35,8 +39,8 @@ def with_common_rest(
 
 
 def _mean_change(before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """The mean over frames of how joints turn, (J, 3) in their own axes, and of how the body turns and moves in its
-    own frame, (4, 4)."""
+    """Return the mean over frames of how joints turn, (J, 3) in their own axes, and of how the body moves in its own
+    frame, (4, 4)."""
     turned = rotation_from_axis_angle(before[0]).mT @ rotation_from_axis_angle(after[0])
     moved = torch.linalg.inv(before[1]) @ after[1]
     root = moved.mean(0)

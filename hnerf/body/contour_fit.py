@@ -1,9 +1,9 @@
-"""The body's outline against the mask's, camera by camera.
+"""Fit of the body's outline to the masks' outlines, camera by camera.
 
-Two kinds of match, both point to line (Chen and Medioni 1992, in the image): every point of the mask's contour pulls
-the nearest rim vertex of the projected body, and every rim vertex outside the mask is pushed back in. A body belongs
-inside its clothes, so the second is strict and the first is loose and fades: cloth and hair stand away from the skin. A
-limb far outside a mask, which the mask lacks, pushes no harder than one that sticks out a little (Huber 1964).
+There are two kinds of match, both point to line (Chen and Medioni 1992, in the image): every point of the mask's
+contour pulls the nearest rim vertex of the projected body, and every rim vertex outside the mask is pushed back in. A
+body belongs inside its clothes, so the second is strict, while the first is loose and robust: cloth and hair stand away
+from the skin. Where a mask lacks a limb, vertices far outside push no harder than those a little outside (Huber 1964).
 """
 
 import logging
@@ -26,19 +26,20 @@ from hnerf.geometry.silhouette import silhouette
 
 log = logging.getLogger("hnerf.fit")
 
-MASK_BLUR_PX = 0.7  # takes the stairs off a mask's edge
-FACING = 0.35  # |cosine| between normal and view below which a vertex is on the rim
-RIM_DEPTH_PX = 2.5  # pixels from the border of the body's silhouette
-SAME_WAY = 0.5  # cosine between the outlines' normals above which points may match
-GROUND_M = 0.01  # how near the ground the lowest vertex of a frame is
-NO_GROUND_M = 0.15  # and from which distance there is no reason to believe so
-HUBER = 1.345  # spreads from which what sticks out of a mask pushes no harder; 95 % as good as least squares on noise
-DAMPING = 1e-4  # more would hold back depth and scale, which the outlines of one camera hardly tell
+MASK_BLUR_PX = 0.7  # smooths the pixel steps of a mask's edge
+MAX_RIM_COSINE = 0.35  # |cosine| between normal and view below which a vertex is on the rim
+RIM_DEPTH_PX = 2.5  # of rim vertices from the border of the body's silhouette
+MIN_NORMAL_COSINE = 0.5  # between the outlines' normals above which points may match
+GROUND_STD_M = 0.01  # of the lowest vertex of a frame above the ground
+GROUND_OUTLIER_M = 0.15  # distance of a body that does not stand on the ground
+HUBER = 1.345  # standard deviations beyond which residuals push no harder; 95 % efficient on Gaussian noise
+DAMPING = 1e-4  # more would hold back depth and scale, which one camera's outlines hardly determine
 
 
 @dataclass(frozen=True)
 class Outline:
-    """A mask's edge: points (N, 2) px, outward normals (N, 2), and its signed distance (H, W) px, negative inside."""
+    """The edge of a mask: points (N, 2) px, outward normals (N, 2), and the mask's signed distance (H, W) px, negative
+    inside."""
 
     points_px: np.ndarray
     normals: np.ndarray
@@ -46,7 +47,7 @@ class Outline:
 
 
 @dataclass(frozen=True)
-class Rows:
+class ContourResiduals:
     """Linear residuals of one frame: residual_m + gradient . (movement of vertex), with weights in 1 / m^2."""
 
     vertices: np.ndarray
@@ -56,7 +57,7 @@ class Rows:
 
 
 def outline(mask: np.ndarray, spacing_px: float) -> Outline:
-    """The edge of a mask (H, W) bool, sampled about every spacing_px."""
+    """Return the edge of a mask (H, W) bool, sampled about every spacing_px."""
     soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), MASK_BLUR_PX)
     lines = [_resampled(line, spacing_px) for line in find_contours(soft, 0.5)]  # (row, column)
     points = np.concatenate(lines) if lines else np.zeros((0, 2))
@@ -68,7 +69,7 @@ def outline(mask: np.ndarray, spacing_px: float) -> Outline:
 
 
 def _resampled(line: np.ndarray, spacing_px: float) -> np.ndarray:
-    """Points at even spacing along a polyline (N, 2)."""
+    """Return points at even spacing along a polyline (N, 2)."""
     along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     at = np.arange(0, along[-1], spacing_px)
     return np.stack([np.interp(at, along, line[:, k]) for k in range(2)], 1)
@@ -77,35 +78,36 @@ def _resampled(line: np.ndarray, spacing_px: float) -> np.ndarray:
 def match(
     camera: Camera, edge: Outline, scale_m: float, vertices_m: np.ndarray, normals: np.ndarray, faces: np.ndarray,
     settings: FitSettings,
-) -> Rows:  # fmt: skip
-    """Rows of one camera and frame. scale_m: metres a pixel spans; vertices_m and normals (V, 3)."""
-    rim, uv, by_x, flat = rim_in_image(camera, vertices_m, normals, faces)
-    pairs = [_cover(edge, uv, flat), _contain(edge, uv, settings.spacing_m / scale_m)]
+) -> ContourResiduals:  # fmt: skip
+    """Return the residuals of one camera and frame. scale_m: metres a pixel spans; vertices_m and normals (V, 3)."""
+    rim, uv, by_x, normals_2d = rim_in_image(camera, vertices_m, normals, faces)
+    pairs = [_cover(edge, uv, normals_2d), _contain(edge, uv, settings.spacing_m / scale_m)]
     ids, direction, residual_px = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
     gradient = np.einsum("ri,ric->rc", direction, by_x[ids]) * scale_m
     residual_m = residual_px * scale_m
     ids = rim[ids]
     loose = settings.outside_m**-2 / (1 + (residual_m / settings.clothing_m) ** 2) ** 2  # Geman-McClure
     strict = settings.inside_m**-2 * np.minimum(1, HUBER * settings.inside_m / np.abs(residual_m).clip(1e-9))
-    return Rows(ids, gradient, residual_m, np.where(residual_m > 0, strict, loose))
+    return ContourResiduals(ids, gradient, residual_m, np.where(residual_m > 0, strict, loose))
 
 
 def rim_in_image(
     camera: Camera, vertices_m: np.ndarray, normals: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the vertices (N,) on the body's outline, where they are seen (N, 2) px, by how much that changes with
-    their place (N, 2, 3) px a metre, and their unit normals in the image (N, 2)."""
+    """Return the vertices (N,) on the body's outline, their pixels (N, 2), the derivative of these by the vertices (N,
+    2, 3) px per metre, and the unit normals in the image (N, 2)."""
     rim = _rim(camera, vertices_m, normals, faces)
     uv, by_x = (t.numpy() for t in project(camera, torch.from_numpy(vertices_m[rim])))
-    flat = normals[rim] @ camera.R[:2].T
-    flat /= np.linalg.norm(flat, axis=1, keepdims=True).clip(1e-9)
-    return rim, uv, by_x, flat
+    normals_2d = normals[rim] @ camera.R[:2].T
+    normals_2d /= np.linalg.norm(normals_2d, axis=1, keepdims=True).clip(1e-9)
+    return rim, uv, by_x, normals_2d
 
 
 def _rim(camera: Camera, vertices_m: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Vertices (N,) on the body's outline in the image: seen edge-on, and near the border of its silhouette."""
+    """Return the vertices (N,) on the body's outline in the image: seen edge-on, and near the border of its
+    silhouette."""
     view = vertices_m - camera.centre_m
-    edge_on = np.abs((view * normals).sum(1)) < FACING * np.linalg.norm(view, axis=1)
+    edge_on = np.abs((view * normals).sum(1)) < MAX_RIM_COSINE * np.linalg.norm(view, axis=1)
     rim = np.flatnonzero(edge_on)
     covered = silhouette(camera, vertices_m, faces).astype(np.uint8)
     depth_px = cv2.distanceTransform(np.pad(covered, 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
@@ -114,18 +116,19 @@ def _rim(camera: Camera, vertices_m: np.ndarray, normals: np.ndarray, faces: np.
 
 
 def _cover(edge: Outline, rim_px: np.ndarray, rim_normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mask contour to nearest rim vertex: its index, the direction (N, 2), the signed distance px (negative: too
-    small)."""
+    """Match points of the mask's contour to the nearest rim vertex: its index, the direction (N, 2), the signed
+    distance px (negative: the body is too small)."""
     if len(rim_px) == 0 or len(edge.points_px) == 0:
         return np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)
     nearest = cKDTree(rim_px).query(edge.points_px)[1]
     signed = ((rim_px[nearest] - edge.points_px) * edge.normals).sum(1)
-    keep = ((rim_normals[nearest] * edge.normals).sum(1) > SAME_WAY) & (signed < 0)
+    keep = ((rim_normals[nearest] * edge.normals).sum(1) > MIN_NORMAL_COSINE) & (signed < 0)
     return nearest[keep], edge.normals[keep], signed[keep]
 
 
 def _contain(edge: Outline, rim_px: np.ndarray, spacing_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rim vertices outside the mask, thinned to one a cell: index, direction (N, 2), distance px (positive)."""
+    """Match rim vertices outside the mask, at most one in a cell, to its edge: index, direction (N, 2), distance px
+    (positive)."""
     height, width = edge.distance_px.shape
     seen = np.flatnonzero(((rim_px >= 0) & (rim_px <= (width - 1, height - 1))).all(1))
     column, row = np.floor(rim_px[seen] / spacing_px).astype(np.int64).T
@@ -145,29 +148,33 @@ def _contain(edge: Outline, rim_px: np.ndarray, spacing_px: float) -> tuple[np.n
     return first[out], slope[out], distance[out]
 
 
-def refine(problem: Problem, pose: Pose, edges: list[list[Outline | None]], settings: FitSettings, up: int) -> Pose:
-    """Gauss-Newton steps on outlines and keypoints, matched anew before each. edges: by frame and camera, None without
-    a mask; up: the world's vertical axis, used with one camera only."""
+def refine_with_outlines(
+    problem: Problem, pose: Pose, edges: list[list[Outline | None]], settings: FitSettings, up: int
+) -> Pose:
+    """Refine a pose by Gauss-Newton steps on outlines and keypoints, with matches made anew before each step.
+
+    edges: by frame and camera, None without a mask; up: the world's vertical axis, used with one camera only.
+    """
     faces = pose.rig.faces.numpy()
     for step in range(settings.contour_steps):
         articulation = Articulation(pose.rig)
         joints = articulation.pose(pose)
-        _, equations = problem.assemble(pose, problem.in_images)
+        _, equations = problem.assemble(pose, problem.image_term)
         residuals = []
         for t, row in enumerate(edges):
             vertices_m = articulation.surface(joints, t).numpy()
             normals = normals_of(vertices_m, faces)
             found = [
                 match(camera, edge, float(scale_m[t]), vertices_m, normals, faces, settings)
-                for camera, scale_m, edge in zip(problem.seen.cameras, problem.scale_m, row, strict=True)
+                for camera, scale_m, edge in zip(problem.observations.cameras, problem.scale_m, row, strict=True)
                 if edge is not None
             ]
             if len(row) == 1:
-                found.append(_standing(vertices_m, up))
+                found.append(_ground_contact(vertices_m, up))
             for rows in found:
-                add_rows(equations, articulation, joints, t, rows)
+                add_residuals(equations, articulation, joints, t, rows)
                 residuals.append(rows.residual_m)
-        pose = problem.moved(pose, equations, DAMPING)
+        pose = problem.apply_step(pose, equations, DAMPING)
         error_mm = 1e3 * np.concatenate([np.zeros(0), *residuals])
         log.info(
             "outlines, step %d of %d: %.1f mm rms", step + 1, settings.contour_steps, np.sqrt((error_mm**2).mean())
@@ -175,21 +182,24 @@ def refine(problem: Problem, pose: Pose, edges: list[list[Outline | None]], sett
     return pose
 
 
-def _standing(vertices_m: np.ndarray, up: int) -> Rows:
-    """The lowest vertex stands on the ground at height 0, where calibrations usually put it: with one camera this tells
-    the depth. Geman-McClure lets it go where the body floats or the world's origin lies elsewhere."""
+def _ground_contact(vertices_m: np.ndarray, up: int) -> ContourResiduals:
+    """Return the residual of the lowest vertex against the ground at height 0, where calibrations usually put it: with
+    one camera this determines the depth.
+
+    Geman-McClure weights let it go where the body is in the air or the world's origin lies elsewhere.
+    """
     lowest = int(vertices_m[:, up].argmin())
     height_m = vertices_m[lowest, up]
-    weight = GROUND_M**-2 / (1 + (height_m / NO_GROUND_M) ** 2) ** 2
-    return Rows(np.array([lowest]), np.eye(3)[[up]], np.array([height_m]), np.array([weight]))
+    weight = GROUND_STD_M**-2 / (1 + (height_m / GROUND_OUTLIER_M) ** 2) ** 2
+    return ContourResiduals(np.array([lowest]), np.eye(3)[[up]], np.array([height_m]), np.array([weight]))
 
 
-def add_rows(
-    equations: NormalEquations, articulation: Articulation, joints: PosedJoints, frame: int, rows: Rows
+def add_residuals(
+    equations: NormalEquations, articulation: Articulation, joints: PosedJoints, frame: int, rows: ContourResiduals
 ) -> None:
-    """Add a frame's rows to the normal equations."""
+    """Add a frame's residuals to the normal equations."""
     ids, directions = torch.from_numpy(rows.vertices), torch.from_numpy(rows.gradient)
-    j, s = (part.numpy() for part in articulation.along(ids, directions, joints, frame))
+    j, s = (part.numpy() for part in articulation.directional_jacobian(ids, directions, joints, frame))
     shape = slice(0, s.shape[1])
     weighted_j, weighted_s = j * rows.weight[:, None], s * rows.weight[:, None]
     equations.frame[0][frame] += weighted_j.T @ j

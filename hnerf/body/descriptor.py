@@ -1,9 +1,9 @@
 """The body prior H: (x, theta, T, beta) -> (d, s), computed from posed body meshes.
 
-Two forms find the closest point: `BodyMeshes.closest_points` (warp's bounding-volume hierarchy; CPU and CUDA) and
-`closest_points_reference` (every triangle, plain torch), which tests compare it to. The reference signs by the
-winding number. So does the fast form if asked to be exact; else only where the surface's normal leaves doubt, which
-is four times faster, and wrong only inside a body that intersects itself, near the part of its surface that is buried
+Two implementations find the closest point: `BodyMeshes.closest_points` (warp's bounding-volume hierarchy; CPU and CUDA)
+and `closest_points_reference` (every triangle, plain torch), which tests compare it to. The reference takes the sign
+from the winding number. The fast one does so if asked to be exact, else only where the surface normal leaves doubt:
+four times faster, and wrong only inside a body that intersects itself, near the part of its surface that is buried
 there.
 """
 
@@ -23,8 +23,8 @@ NEVER_SURE = 2.0
 
 @dataclass(frozen=True)
 class ClosestPoints:
-    """face (N,) long, -1 where nothing is within reach; barycentric (N, 3) of the closest point; sign (N,): -1
-    inside."""
+    """Closest surface points: face (N,) long, -1 where nothing is within reach; barycentric (N, 3) of the closest
+    point; sign (N,), -1 inside."""
 
     face: Tensor
     barycentric: Tensor
@@ -66,28 +66,27 @@ def _closest_kernel(
 
 
 class BodyMeshes:
-    """Posed copies of one body, one a frame, ready for closest-point queries."""
+    """Posed copies of one body, one a frame, prepared for closest-point queries."""
 
     def __init__(self, vertices_m: Tensor, faces: Tensor):
-        """vertices_m (n, V, 3), faces (F, 3)."""
+        """Build the hierarchies of vertices_m (n, V, 3) with faces (F, 3)."""
         wp.init()
         self._threads = ThreadPoolExecutor(torch.get_num_threads())
         self._device = wp.device_from_torch(vertices_m.device)
         self._faces = faces
         indices = wp.from_torch(faces.to(torch.int32).flatten().contiguous())
         self._meshes = [
-            wp.Mesh(points=points, indices=indices, support_winding_number=True) for points in self._at(vertices_m)
+            wp.Mesh(points=points, indices=indices, support_winding_number=True) for points in self._to_warp(vertices_m)
         ]
         self._ids = wp.array([m.id for m in self._meshes], dtype=wp.uint64, device=self._device)
 
-    def move(self, vertices_m: Tensor) -> None:
-        """Replace the vertices (n, V, 3) of every copy, by others nearby: the hierarchies are refitted, not built
-        again."""
-        for mesh, points in zip(self._meshes, self._at(vertices_m), strict=True):
+    def refit(self, vertices_m: Tensor) -> None:
+        """Replace the vertices (n, V, 3) by similar ones; the hierarchies are refitted, not rebuilt."""
+        for mesh, points in zip(self._meshes, self._to_warp(vertices_m), strict=True):
             mesh.points = points
 
-    def _at(self, vertices_m: Tensor) -> list[wp.array]:
-        """Each copy's vertices for warp, which keeps no others of its own; their normals for the sign."""
+    def _to_warp(self, vertices_m: Tensor) -> list[wp.array]:
+        """Return each copy's vertices for warp, which does not copy them, and compute their normals for the sign."""
         vertices_m = vertices_m.detach().float().contiguous()
         self._normals = vertex_normals(vertices_m, self._faces)
         return [wp.from_torch(v, dtype=wp.vec3) for v in vertices_m]
@@ -95,7 +94,8 @@ class BodyMeshes:
     def closest_points(
         self, points_m: Tensor, mesh_index: Tensor, reach_m: float, exact_sign: bool = False
     ) -> ClosestPoints:
-        """Closest surface point of mesh `mesh_index` (N,) to each of `points_m` (N, 3), if within `reach_m`."""
+        """Return the closest surface point of mesh `mesh_index` (N,) to each of `points_m` (N, 3), if within
+        `reach_m`."""
         n, device = len(points_m), points_m.device
         mesh_index, points_m = mesh_index.to(torch.int32).contiguous(), points_m.detach().float().contiguous()
         face = torch.empty(n, dtype=torch.int32, device=device)
@@ -131,8 +131,8 @@ class BodyMeshes:
 
 
 def closest_points_reference(points_m: Tensor, vertices_m: Tensor, faces: Tensor, reach_m: float) -> ClosestPoints:
-    """The same for one mesh (V, 3), by trying every triangle (Ericson, Real-Time Collision Detection, 5.1.5) and
-    summing solid angles (van Oosterom and Strackee 1983) for the sign. Memory grows with points x faces."""
+    """Return the closest points of one mesh (V, 3) by trying every triangle (Ericson, Real-Time Collision Detection,
+    5.1.5), with signs by summed solid angles (van Oosterom and Strackee 1983). Memory grows with points x faces."""
     a, b, c = vertices_m[faces][None].unbind(2)  # (1, F, 3) each
     barycentric = _triangle_barycentric(points_m[:, None], a, b, c)  # (N, F, 3)
     closest = (barycentric[..., None] * torch.stack([a, b, c], 2)).sum(-2)
@@ -145,7 +145,8 @@ def closest_points_reference(points_m: Tensor, vertices_m: Tensor, faces: Tensor
 
 
 def solid_angle(x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """Signed solid angle of triangles (..., 3) seen from x (..., 3): 4 pi in total inside a closed outward surface."""
+    """Return the signed solid angle of triangles (..., 3) seen from x (..., 3): 4 pi in total inside a closed surface
+    with outward faces."""
     a, b, c = a - x, b - x, c - x
     la, lb, lc = a.norm(dim=-1), b.norm(dim=-1), c.norm(dim=-1)
     numerator = (a * torch.linalg.cross(b, c)).sum(-1)
@@ -154,7 +155,7 @@ def solid_angle(x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 
 
 def _triangle_barycentric(x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """Barycentric coordinates of the point of each triangle closest to x, (..., 3)."""
+    """Return barycentric coordinates of the point of each triangle closest to x, (..., 3)."""
 
     def edge(p: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
         t = (((x - p) * (q - p)).sum(-1) / ((q - p) ** 2).sum(-1).clamp(min=1e-20)).clamp(0, 1)
@@ -178,7 +179,7 @@ def _triangle_barycentric(x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 
 
 def vertex_normals(vertices_m: Tensor, faces: Tensor) -> Tensor:
-    """Area-weighted unit normals of meshes (..., V, 3)."""
+    """Return area-weighted unit normals of meshes (..., V, 3)."""
     a, b, c = (vertices_m[..., faces[:, k], :] for k in range(3))
     normals = torch.zeros_like(vertices_m)
     for k in range(3):
@@ -187,5 +188,5 @@ def vertex_normals(vertices_m: Tensor, faces: Tensor) -> Tensor:
 
 
 def normals_of(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The same of NumPy arrays."""
+    """Return `vertex_normals` of NumPy arrays."""
     return vertex_normals(torch.from_numpy(vertices_m), torch.from_numpy(faces)).numpy()

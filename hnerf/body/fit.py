@@ -16,10 +16,10 @@ from torch import Tensor
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.balance import Balance
 from hnerf.body.body_model import BodyModel, body_model
-from hnerf.body.clothed_fit import refine_clothed
-from hnerf.body.contour_fit import Outline, outline, refine
+from hnerf.body.clothed_fit import refine_with_clothing
+from hnerf.body.contour_fit import Outline, outline, refine_with_outlines
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.given_start import given_start, seen_on, told_of
+from hnerf.body.given_start import given_poses_note, initial_pose_from_given, observations_of_pose
 from hnerf.body.initial_root import root_from_image, root_from_space
 from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel, project
 from hnerf.body.observations import Observations, observe, runs
@@ -33,70 +33,83 @@ from hnerf.geometry.silhouette import silhouette
 
 log = logging.getLogger("hnerf.fit")
 
-# How much harder each BODY_25 keypoint accelerates than the trunk.
-LIVELINESS = np.array([2, 1, 1, 2, 3, 1, 2, 3, 1, 1, 2, 3, 1, 2, 3, 2, 2, 2, 2, 4, 4, 4, 4, 4, 4])
-NEIGHBOURS = 5  # frames that vote on which way a limb bends in depth
-KEYPOINT_STEPS = 30  # Levenberg-Marquardt steps at most; it stops by itself
-HELD = 0.1  # of its spread: keypoints alone say little of proportions, and at first nothing of a detector's habits
-ONE_POSTURE_COSTS = 1.5  # times; noise of keypoints alone 1.1 to 1.3, joints that sway by a degree 1.4, by two 2.0
-POOR_IOU, POOR_KEYPOINT_M = 0.75, 0.06  # beyond which a frame is flagged
+# Standard deviation of each BODY_25 keypoint's acceleration, relative to the trunk's.
+ACCELERATION_SCALE = np.array([2, 1, 1, 2, 3, 1, 2, 3, 1, 1, 2, 3, 1, 2, 3, 2, 2, 2, 2, 4, 4, 4, 4, 4, 4])
+MEDIAN_FRAMES = 5  # frames that vote on which way a limb bends in depth
+KEYPOINT_STEPS = 30  # Levenberg-Marquardt steps at most; it usually converges before
+# Factor on standard deviations: keypoints alone say little about proportions, and at first nothing about where the
+# detector places keypoints on the body.
+TIGHT_STD = 0.1
+# Ratio to the cost of a pose a frame: 1.1 to 1.3 by keypoint noise alone, 1.4 if joints sway by a degree, 2.0 by two.
+MAX_SINGLE_POSTURE_COST = 1.5
+POOR_IOU, POOR_KEYPOINT_M = 0.75, 0.06  # a frame that is worse than either is flagged
 
 
 def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tuple[BodyFit, dict[str, Any]]:
-    """The body in every frame of a capture, from training cameras only; without masks, from keypoints alone.
+    """Fit the body in every frame of a capture, from training cameras only; without masks, from keypoints alone.
 
     Returns the fit and a plain report: seconds by stage, the shape, and for each frame the median keypoint residual in
-    px and the silhouette's IoU with the masks (None without), with the frames where these are poor. Raises
-    InputError where keypoints are missing or the person is seen by too few cameras in too many frames.
+    px and the silhouette's IoU with the masks (None without), with the frames where these are poor. Raises InputError
+    where keypoints are missing or the person is seen by too few cameras in too many frames.
     """
-    with threadpool_limits(1):  # so small are the tensors that threads cost more than they give
+    with threadpool_limits(1):  # tensors are so small that threads cost more time than they save
         seconds: dict[str, float] = {}
         model, given = body_model(settings), capture.given_poses()
-        begin = given_start(given, model) if given else None
-        seen = observe(capture) if capture.has_keypoints or begin is None else seen_on(begin, capture)
-        smoothness = Smoothness(runs(capture), capture.fps, settings.acceleration_mps2 * LIVELINESS)
+        given_pose = initial_pose_from_given(given, model) if given else None
+        observations = (
+            observe(capture)
+            if capture.has_keypoints or given_pose is None
+            else observations_of_pose(given_pose, capture)
+        )
+        smoothness = Smoothness(runs(capture), capture.fps, settings.acceleration_mps2 * ACCELERATION_SCALE)
         up = "xyz".index(capture.up)
-        balance = Balance(up) if len(seen.cameras) == 1 else None
+        balance = Balance(up) if len(observations.cameras) == 1 else None
         with _timed(seconds, "start"):
-            pose = begin or start(capture, seen, model)
-        if len(seen.cameras) > 1:
+            pose = given_pose or initial_pose(capture, observations, model)
+        if len(observations.cameras) > 1:
             with _timed(seconds, "keypoints in space"):
-                problem = problem_of(model, pose, seen, smoothness, settings, offsets=HELD, proportions=HELD)
-                pose = levenberg_marquardt(problem, pose, problem.in_space, KEYPOINT_STEPS)
+                problem = make_problem(
+                    model, pose, observations, smoothness, settings, offsets=TIGHT_STD, proportions=TIGHT_STD
+                )
+                pose = levenberg_marquardt(problem, pose, problem.space_term, KEYPOINT_STEPS)
         with _timed(seconds, "keypoints in images"):
-            problem = problem_of(model, pose, seen, smoothness, settings, offsets=1, proportions=HELD)
+            problem = make_problem(model, pose, observations, smoothness, settings, offsets=1, proportions=TIGHT_STD)
             problem = replace(problem, balance=balance)
-            pose = levenberg_marquardt(problem, pose, problem.in_images, KEYPOINT_STEPS)
+            pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
             if balance:
-                habit = PosturePrior.of_one_view(_by_split(capture), pose, seen.cameras[0])
-                pose = resolve_depth_flips(replace(problem, habit=habit), pose, runs(capture))
-                pose, habit = hold_single_posture(problem, pose, habit)
+                posture_prior = PosturePrior.of_single_view(_by_split(capture), pose, observations.cameras[0])
+                pose = resolve_depth_flips(replace(problem, posture_prior=posture_prior), pose, runs(capture))
+                pose, posture_prior = hold_single_posture(problem, pose, posture_prior)
             else:
-                habit = PosturePrior.of_hands(len(pose.root), Articulation(pose.rig))
+                posture_prior = PosturePrior.of_wrists(len(pose.root), Articulation(pose.rig))
         if masks is not None:
             with _timed(seconds, "outlines"):
-                problem = problem_of(model, pose, seen, smoothness, settings, offsets=1, proportions=1)
-                problem = replace(problem, balance=balance, habit=habit)
+                problem = make_problem(model, pose, observations, smoothness, settings, offsets=1, proportions=1)
+                problem = replace(problem, balance=balance, posture_prior=posture_prior)
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
-                pose = refine(problem, pose, edges, settings, up)
+                pose = refine_with_outlines(problem, pose, edges, settings, up)
             with _timed(seconds, "clothes"):
-                pose = refine_clothed(problem, pose, edges)
+                pose = refine_with_clothing(problem, pose, edges)
         fit = BodyFit(pose.rig.to(dtype=torch.float32), capture.frames, pose.theta.float(), pose.root.float())
-        report = _report(capture, masks, seen, pose, fit, seconds)
-        return fit, report | ({"given_poses": told_of(model, capture)} if begin else {})
+        report = _report(capture, masks, observations, pose, fit, seconds)
+        return fit, report | ({"given_poses": given_poses_note(model, capture)} if given_pose else {})
 
 
-def start(capture: Capture, seen: Observations, model: BodyModel) -> Pose:
-    """The likeliest pose of an average body, placed by head and trunk, in space or in the image of a single camera;
-    frames where that fails stand as their nearest neighbour does."""
+def initial_pose(capture: Capture, observations: Observations, model: BodyModel) -> Pose:
+    """Return the most likely pose of an average body, placed by head and trunk: in space, or in the image of a single
+    camera.
+
+    A frame where that fails takes the placement of the nearest frame where it does not. Raises InputError where it
+    fails in most frames.
+    """
     rig = model.rig(None)
     articulation = Articulation(rig)
     rest_m = (rig.keypoint_weights @ rig.vertices_m).numpy()
-    if len(seen.cameras) > 1:
-        roots = [root_from_space(rest_m, points_m) for points_m in seen.space_m.numpy()]
+    if len(observations.cameras) > 1:
+        roots = [root_from_space(rest_m, points_m) for points_m in observations.space_m.numpy()]
     else:
-        views = torch.cat([seen.pixels[0], seen.confidence[0, ..., None]], -1).numpy()
-        roots = [root_from_image(seen.cameras[0], rest_m, keypoints) for keypoints in views]
+        views = torch.cat([observations.pixels[0], observations.confidence[0, ..., None]], -1).numpy()
+        roots = [root_from_image(observations.cameras[0], rest_m, keypoints) for keypoints in views]
     placed = {t: root for t, root in enumerate(roots) if root is not None}
     if len(placed) < len(roots) / 2:
         raise InputError(
@@ -105,64 +118,72 @@ def start(capture: Capture, seen: Observations, model: BodyModel) -> Pose:
         )
     nearest = [placed[min(placed, key=lambda known: abs(known - t))] for t in range(len(roots))]
     theta = torch.zeros(len(roots), len(rig.joints_m), 3, dtype=torch.float64)
-    theta[:, articulation.joints[1:]] = PosePrior(articulation).likely()
+    theta[:, articulation.joints[1:]] = PosePrior(articulation).mean_pose()
     return Pose(rig, theta, torch.from_numpy(np.stack(nearest)), torch.zeros(25, 3, dtype=torch.float64))
 
 
-def resolve_depth_flips(problem: Problem, pose: Pose, follow: list[tuple[int, ...]]) -> Pose:
-    """One view shows a bent limb and its mirror image in depth alike; a few frames that fell for the mirror image are
-    outvoted by their neighbours. `follow`: frames in order, by run. Without the vote where nothing is gained."""
-    pose = levenberg_marquardt(problem, pose, problem.in_images, KEYPOINT_STEPS)
-    parts = np.split(pose.theta.numpy(), np.cumsum([len(run) for run in follow])[:-1])
-    theta = np.concatenate([median_filter(part, (NEIGHBOURS, 1, 1), mode="nearest") for part in parts])
+def resolve_depth_flips(problem: Problem, pose: Pose, runs_of_frames: list[tuple[int, ...]]) -> Pose:
+    """Resolve limbs that are mirrored in depth: one view shows a bent limb and its mirror image alike.
+
+    A few frames in which the fit took the mirror image are outvoted by their neighbours (median filter), and the fit
+    repeated; the first result is kept where the cost does not fall. `runs_of_frames`: frames in order, by run.
+    """
+    pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
+    parts = np.split(pose.theta.numpy(), np.cumsum([len(run) for run in runs_of_frames])[:-1])
+    theta = np.concatenate([median_filter(part, (MEDIAN_FRAMES, 1, 1), mode="nearest") for part in parts])
     again = replace(pose, theta=torch.from_numpy(theta))
-    again = levenberg_marquardt(problem, again, problem.in_images, KEYPOINT_STEPS)
-    before, after = (problem.assemble(p, problem.in_images)[0] for p in (pose, again))
+    again = levenberg_marquardt(problem, again, problem.image_term, KEYPOINT_STEPS)
+    before, after = (problem.assemble(p, problem.image_term)[0] for p in (pose, again))
     return again if after < before else pose
 
 
-def hold_single_posture(problem: Problem, pose: Pose, habit: PosturePrior) -> tuple[Pose, PosturePrior]:
-    """Who turns before the only camera in one posture is held to it, so that all frames tell together how deep a limb
-    lies; otherwise each joint keeps the spread it has. One posture it is where the keypoints, and all that is likely
-    beside the habit, agree with it nearly as well as with a pose a frame."""
-    learned = habit.learned(pose)
-    still = learned.of_one_posture()
-    if still is None:
+def hold_single_posture(problem: Problem, pose: Pose, posture_prior: PosturePrior) -> tuple[Pose, PosturePrior]:
+    """Hold a person who turns before the only camera to a single posture, if there is one; return the pose and the
+    prior to go on with.
+
+    With a single posture all frames together determine the depth of each limb. It is accepted where keypoints and the
+    other priors agree with it nearly as well as with a pose a frame; otherwise each joint keeps the standard deviation
+    that it has.
+    """
+    learned = posture_prior.with_learned_std(pose)
+    single = learned.as_single_posture()
+    if single is None:
         return pose, learned
-    held = levenberg_marquardt(replace(problem, habit=still), pose, problem.in_images, KEYPOINT_STEPS)
-    free_cost, held_cost = (problem.assemble(p, problem.in_images)[0] for p in (pose, held))
+    held = levenberg_marquardt(replace(problem, posture_prior=single), pose, problem.image_term, KEYPOINT_STEPS)
+    free_cost, held_cost = (problem.assemble(p, problem.image_term)[0] for p in (pose, held))
     log.info("one posture in all frames costs %.2f times what a pose a frame does", held_cost / free_cost)
-    return (held, still) if held_cost < ONE_POSTURE_COSTS * free_cost else (pose, learned)
+    return (held, single) if held_cost < MAX_SINGLE_POSTURE_COST * free_cost else (pose, learned)
 
 
-def problem_of(
-    model: BodyModel, pose: Pose, seen: Observations, smoothness: Smoothness, settings: FitSettings, offsets: float,
-    proportions: float,
+def make_problem(
+    model: BodyModel, pose: Pose, observations: Observations, smoothness: Smoothness, settings: FitSettings,
+    offsets: float, proportions: float,
 ) -> Problem:  # fmt: skip
-    """`offsets` and `proportions` scale the spread of the keypoint offsets and of the shape's details."""
-    likely = FitPriors(
+    """Return the least-squares problem at a pose; `offsets` and `proportions` scale the standard deviations of the
+    keypoint offsets and of the shape's details."""
+    priors = FitPriors(
         settings.keypoint_m,
         settings.keypoint_outlier_m,
         settings.offset_m * offsets,
         settings.stature_m,
         settings.stature_std_m,
         model.mean,
-        torch.where(model.details, proportions * model.spread, model.spread),
+        torch.where(model.details, proportions * model.std, model.std),
         model.low,
         model.high,
     )
-    return Problem(seen, metres_per_pixel(seen.cameras, pose), likely, smoothness, model.rig)
+    return Problem(observations, metres_per_pixel(observations.cameras, pose), priors, smoothness, model.rig)
 
 
 def _by_split(capture: Capture) -> list[list[int]]:
-    """Rows of the training frames, and of those of novel poses."""
+    """Return the rows of the training frames, and those of the novel-pose frames, without empty groups."""
     novel = set(capture.novel_pose_frames)
     rows = [[t for t, frame in enumerate(capture.frames) if (frame in novel) == wanted] for wanted in (False, True)]
     return [group for group in rows if group]
 
 
 def _outlines(capture: Capture, masks: Masks, scale_m: Tensor, spacing_m: float) -> list[list[Outline | None]]:
-    """By frame and training camera; None where a mask was dropped or is empty."""
+    """Return the masks' outlines by frame and training camera; None where a mask was dropped or is empty."""
     edges: list[list[Outline | None]] = []
     for t, frame in enumerate(capture.frames):
         found = [masks.get(name, frame) if (name, frame) in masks else None for name in capture.train_cameras]
@@ -173,11 +194,16 @@ def _outlines(capture: Capture, masks: Masks, scale_m: Tensor, spacing_m: float)
 
 
 def _report(
-    capture: Capture, masks: Masks | None, seen: Observations, pose: Pose, fit: BodyFit, seconds: dict[str, float]
+    capture: Capture,
+    masks: Masks | None,
+    observations: Observations,
+    pose: Pose,
+    fit: BodyFit,
+    seconds: dict[str, float],
 ) -> dict[str, Any]:
-    """Plain values that say how good the fit is."""
-    residual_px = _keypoint_residuals_px(seen, fit)
-    residual_m = residual_px * metres_per_pixel(seen.cameras, pose).mean(0).numpy()
+    """Return plain values that say how good the fit is."""
+    residual_px = _keypoint_residuals_px(observations, fit)
+    residual_m = residual_px * metres_per_pixel(observations.cameras, pose).mean(0).numpy()
     iou = None if masks is None else _silhouette_iou(capture, masks, fit)
     poor = residual_m > POOR_KEYPOINT_M
     if iou is not None:
@@ -198,16 +224,17 @@ def _report(
     }
 
 
-def _keypoint_residuals_px(seen: Observations, fit: BodyFit) -> np.ndarray:
-    """Median over cameras and keypoints, (n,); NaN where nothing was detected."""
+def _keypoint_residuals_px(observations: Observations, fit: BodyFit) -> np.ndarray:
+    """Return the median over cameras and keypoints, (n,); NaN where nothing was detected."""
     keypoints = torch.einsum("kv,nvd->nkd", fit.rig.keypoint_weights, fit.vertices_m()).double()
-    off = torch.stack([project(camera, keypoints)[0] for camera in seen.cameras]) - seen.pixels
-    distance = torch.where(seen.confidence > 0, off.norm(dim=-1), torch.nan)
+    off = torch.stack([project(camera, keypoints)[0] for camera in observations.cameras]) - observations.pixels
+    distance = torch.where(observations.confidence > 0, off.norm(dim=-1), torch.nan)
     return distance.transpose(0, 1).flatten(1).nanmedian(1).values.numpy()
 
 
 def _silhouette_iou(capture: Capture, masks: Masks, fit: BodyFit) -> list[float | None]:
-    """Mean over training cameras of the naked body's IoU with the masks, by frame; None where all were dropped."""
+    """Return the mean over training cameras of the naked body's IoU with the masks, by frame; None where all were
+    dropped."""
     faces = fit.rig.faces.numpy()
     means: list[float | None] = []
     for frame, vertices_m in zip(fit.frames, fit.vertices_m().numpy(), strict=True):
@@ -221,6 +248,7 @@ def _silhouette_iou(capture: Capture, masks: Masks, fit: BodyFit) -> list[float 
 
 @contextmanager
 def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    """Log and store the seconds that a stage takes."""
     began = time.monotonic()
     yield
     seconds[stage] = round(time.monotonic() - began, 2)

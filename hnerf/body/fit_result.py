@@ -12,8 +12,8 @@ from hnerf.body.rig import Rig, joint_transforms, pose_vertices
 
 @dataclass(frozen=True)
 class BodyFit:
-    """rig: linearised at the fitted shape (its `beta`). frames: (n,). theta (n, J, 3) radians, zero at locked joints
-    and at the root joint; root (n, 4, 4) world from body, metres."""
+    """A fitted body: rig, linearised at the fitted shape (its `beta`); frames (n,); theta (n, J, 3) radians, zero at
+    locked joints and at the root joint; root (n, 4, 4) world from body, metres."""
 
     rig: Rig
     frames: tuple[int, ...]
@@ -21,15 +21,15 @@ class BodyFit:
     root: Tensor
 
     def index(self, frame: int) -> int:
-        """Row of a capture's frame."""
+        """Return the row of a capture's frame."""
         return self.frames.index(frame)
 
     def to(self, device: torch.device | str) -> "BodyFit":
-        """The same fit on another device."""
+        """Return the same fit on another device."""
         return BodyFit(self.rig.to(device), self.frames, self.theta.to(device), self.root.to(device))
 
     def vertices_m(self) -> Tensor:
-        """(n, V, 3) posed vertices in the world."""
+        """Return the posed vertices in the world, (n, V, 3)."""
         return pose_vertices(self.rig, self.theta, self.root)
 
     def save(self, folder: Path) -> None:

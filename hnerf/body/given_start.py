@@ -1,4 +1,4 @@
-"""Poses that somebody else fitted, as the start of a fit; and as keypoints, where a recording has none."""
+"""Poses that come with a recording, as the start of a fit, and as keypoints where the recording has none."""
 
 import torch
 from torch import Tensor
@@ -14,15 +14,18 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.given_poses import GivenPoses
 
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)  # of JOINTS
-# Of the mean SMPL body, rounded; anny has no joint there.
+# Of the mean SMPL body, rounded; anny has no joint at the pelvis.
 PELVIS_M = (0.0, -0.23, 0.03)  # in SMPL's axes
 PELVIS_ABOVE_HIPS_M = 0.09
-CONFIDENCE = 0.5  # of a keypoint on a given body, next to one that was detected
+CONFIDENCE = 0.5  # of a keypoint on a given body; that of a detected one is at most 1
 
 
-def given_start(given: GivenPoses, model: BodyModel) -> Pose:
-    """The given poses in the turns of the model's own joints: exactly for SMPL, whose shape comes along; by the likes
-    of SMPL's joints, on the average body, for others. Frames without a pose stand as their nearest neighbour does."""
+def initial_pose_from_given(given: GivenPoses, model: BodyModel) -> Pose:
+    """Return given SMPL poses as poses of the model: exactly for SMPL, with the given shape; for other models on the
+    average body, by the joints that correspond to SMPL's.
+
+    Frames without a pose take that of their nearest neighbour.
+    """
     known = given.known.nonzero()[0]
     nearest = torch.tensor([min(known, key=lambda other: abs(int(other) - t)) for t in range(len(given.theta))])
     rig = model.rig(torch.from_numpy(given.betas) if model.is_smpl else None)
@@ -33,14 +36,14 @@ def given_start(given: GivenPoses, model: BodyModel) -> Pose:
         if name in LOCKED:
             continue
         own = rig.joint_names.index(name)
-        above, below = (model.rest_turns[rig.joint_names.index(JOINTS[PARENTS[j]])], model.rest_turns[own])
+        above, below = (model.rest_rotations[rig.joint_names.index(JOINTS[PARENTS[j]])], model.rest_rotations[own])
         turn = BODY_FROM_SMPL @ turns[:, j] @ BODY_FROM_SMPL.T
         theta[:, own] = axis_angle_from_rotation(above @ turn @ below.T)
     return Pose(rig, theta, _root(rig, turns[:, 0], placed, model.is_smpl), torch.zeros(25, 3, dtype=torch.float64))
 
 
 def _root(rig: Rig, pelvis_turns: Tensor, placed: Tensor, is_smpl: bool) -> Tensor:
-    """World from body (n, 4, 4): SMPL turns about its pelvis (n, 3, 3) before it is placed (n, 4, 4)."""
+    """Return world from body (n, 4, 4): SMPL turns about its pelvis (n, 3, 3) before it is placed (n, 4, 4)."""
     if is_smpl:
         pelvis_m = rig.joints_m[0]
         smpl_pelvis_m = BODY_FROM_SMPL.T @ pelvis_m
@@ -54,14 +57,14 @@ def _root(rig: Rig, pelvis_turns: Tensor, placed: Tensor, is_smpl: bool) -> Tens
     return root
 
 
-def told_of(model: BodyModel, capture: Capture) -> str:
-    """What a report says of given poses."""
-    how = "used as the start" if model.is_smpl else "are SMPL's: used as the start, by the likes of its joints"
-    return how if capture.has_keypoints else f"{how}, and in place of keypoints, of which there are none"
+def given_poses_note(model: BodyModel, capture: Capture) -> str:
+    """Return what the report says about given poses."""
+    how = "used as the start" if model.is_smpl else "are SMPL's: used as the start, by corresponding joints"
+    return how if capture.has_keypoints else f"{how}, and in place of keypoints, which are missing"
 
 
-def seen_on(pose: Pose, capture: Capture) -> Observations:
-    """The pose's own keypoints, as the training cameras would see them."""
+def observations_of_pose(pose: Pose, capture: Capture) -> Observations:
+    """Return the pose's own keypoints as the training cameras would see them."""
     cameras = tuple(capture.cameras[name] for name in capture.train_cameras)
     points_m = pose.rig.keypoint_weights @ pose_vertices(pose.rig, pose.theta, pose.root)  # (n, 25, 3)
     pixels = torch.stack([project(camera, points_m)[0] for camera in cameras])

@@ -1,4 +1,4 @@
-"""Pose and shape from keypoints: in space where they triangulate, then in the images."""
+"""Fit of pose and shape to keypoints: in space where they triangulate, then in the images."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,13 +17,14 @@ from hnerf.body.rig import Rig
 from hnerf.body.robust import geman_mcclure
 from hnerf.geometry.camera import Camera
 
-ROOT, UNSEEN = np.arange(6), 1e-6  # information on a root of which nothing else is known: it stays where it was put
-NEAR_M = 0.1  # nothing nearer is in a camera's picture
+ROOT = np.arange(6)  # the root's unknowns among those of a frame
+ROOT_INFORMATION = 1e-6  # keeps a root where it is if nothing else is known of it
+NEAR_M = 0.1  # least depth: nothing nearer is in a camera's picture
 
 
 @dataclass(frozen=True)
 class FitPriors:
-    """Known before looking: standard deviations in metres; the shape's mean, spread and range, each (B,)."""
+    """Priors of a fit: standard deviations in metres; mean, standard deviation and range of the shape, each (B,)."""
 
     keypoint_m: float
     keypoint_outlier_m: float
@@ -31,42 +32,43 @@ class FitPriors:
     stature_m: float
     stature_std_m: float
     beta_mean: Tensor
-    beta_spread: Tensor
+    beta_std: Tensor
     beta_low: Tensor
     beta_high: Tensor
 
 
-Information = tuple[
-    Tensor, Tensor, float
-]  # of each keypoint: matrices (n, 25, 3, 3), gradients (n, 25, 3), and the cost
+DataTerm = tuple[Tensor, Tensor, float]  # of each keypoint: matrices (n, 25, 3, 3), gradients (n, 25, 3), and the cost
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What was seen and what is likely; assembles the normal equations at a pose. Shared unknowns: beta (B,), then the
-    offsets (75,), then what is usual by the habit. scale_m (C, n) metres a pixel spans at the person: held fixed, or
-    coming nearer would pay. balance: with one camera only; habit: None as long as no posture is known."""
+    """The least-squares problem of a fit: observations and priors, from which it assembles normal equations at a pose.
 
-    seen: Observations
+    Shared unknowns: beta (B,), then the keypoint offsets (75,), then the median turns of the posture prior. scale_m (C,
+    n): metres a pixel spans at the person, held fixed, since residuals would otherwise shrink as the body comes nearer.
+    balance: with one camera only; posture_prior: None as long as no posture is known.
+    """
+
+    observations: Observations
     scale_m: Tensor
-    likely: FitPriors
+    priors: FitPriors
     smoothness: Smoothness
     reshape: Callable[[Tensor], Rig]
     balance: Balance | None = None
-    habit: PosturePrior | None = None
+    posture_prior: PosturePrior | None = None
 
-    def assemble(self, pose: Pose, inform: Callable[[Tensor], Information]) -> tuple[float, NormalEquations]:
-        """Cost and normal equations of the keypoints, as `inform` weighs them, and of all that is likely."""
+    def assemble(self, pose: Pose, data_term: Callable[[Tensor], DataTerm]) -> tuple[float, NormalEquations]:
+        """Return the cost and the normal equations of the keypoints, weighted by `data_term`, and of all priors."""
         articulation = Articulation(pose.rig)
         points = with_offsets(articulation.keypoints(), pose.offsets_m)
         joints = articulation.pose(pose)
         x, by_frame, by_shape = articulation.jacobian(points, joints)
         by_shared = torch.cat([by_shape, _offset_jacobian(points, joints.rotations)], -1)
-        matrix, pull, cost = inform(x)
+        matrix, pull, cost = data_term(x)
         own = by_shared.shape[-1]
-        habits = self.habit.unknowns(articulation) if self.habit else 0
-        equations = NormalEquations(len(x), articulation.unknowns, own + habits)
-        equations.frame[0][:, ROOT, ROOT] += UNSEEN
+        posture_unknowns = self.posture_prior.unknowns(articulation) if self.posture_prior else 0
+        equations = NormalEquations(len(x), articulation.unknowns, own + posture_unknowns)
+        equations.frame[0][:, ROOT, ROOT] += ROOT_INFORMATION
         weighted = (matrix @ by_frame).flatten(1, 2)
         frame, shared, gradient = by_frame.flatten(1, 2), by_shared.flatten(1, 2), pull.flatten(1)[..., None]
         equations.frame[0] += (frame.mT @ weighted).numpy()
@@ -79,19 +81,20 @@ class Problem:
         cost += self.smoothness.add(equations, x, by_frame)
         if self.balance:
             cost += self.balance.add(equations, x, by_frame)
-        if self.habit:
-            cost += self.habit.add(equations, articulation, pose)
+        if self.posture_prior:
+            cost += self.posture_prior.add(equations, articulation, pose)
         return cost, equations
 
     def _add_shape_prior(self, equations: NormalEquations, pose: Pose) -> float:
-        """Gaussians on the shape, on the keypoints' offsets, and on the stature, which monocular depth hangs on."""
-        likely, rig = self.likely, pose.rig
+        """Add Gaussians on the shape, on the keypoint offsets, and on the stature, which determines monocular depth;
+        return the cost."""
+        priors, rig = self.priors, pose.rig
         offsets = pose.offsets_m.flatten()
-        values = torch.cat([rig.beta - likely.beta_mean, offsets])
-        precision = torch.cat([likely.beta_spread, torch.full_like(offsets, likely.offset_m)]) ** -2
+        values = torch.cat([rig.beta - priors.beta_mean, offsets])
+        precision = torch.cat([priors.beta_std, torch.full_like(offsets, priors.offset_m)]) ** -2
         top, bottom = rig.vertices_m[:, 2].argmax(), rig.vertices_m[:, 2].argmin()
-        excess = float(rig.vertices_m[top, 2] - rig.vertices_m[bottom, 2] - likely.stature_m) / likely.stature_std_m
-        by_beta = ((rig.shape_basis[:, top, 2] - rig.shape_basis[:, bottom, 2]) / likely.stature_std_m).numpy()
+        excess = float(rig.vertices_m[top, 2] - rig.vertices_m[bottom, 2] - priors.stature_m) / priors.stature_std_m
+        by_beta = ((rig.shape_basis[:, top, 2] - rig.shape_basis[:, bottom, 2]) / priors.stature_std_m).numpy()
         shape = slice(0, len(by_beta))
         at = np.arange(len(values))
         equations.shared[at, at] += precision.numpy()
@@ -100,19 +103,21 @@ class Problem:
         equations.shared_gradient[shape] += excess * by_beta
         return 0.5 * float((precision * values**2).sum()) + 0.5 * excess**2
 
-    def in_space(self, x: Tensor) -> Information:
-        """Information of triangulated keypoints; robust as in `in_images`."""
-        known = self.seen.space_m.isfinite().all(-1)
-        residual = torch.where(known[..., None], x - self.seen.space_m.nan_to_num(), 0.0)
+    def space_term(self, x: Tensor) -> DataTerm:
+        """Return the data term of triangulated keypoints; robust as in `image_term`."""
+        known = self.observations.space_m.isfinite().all(-1)
+        residual = torch.where(known[..., None], x - self.observations.space_m.nan_to_num(), 0.0)
         weight, cost = self._robust(residual.square().sum(-1), known.to(x.dtype))
         eye = torch.eye(3, dtype=x.dtype)
         return weight[..., None, None] * eye, weight[..., None] * residual, cost
 
-    def in_images(self, x: Tensor) -> Information:
-        """Information of reprojected keypoints, their pixels turned into metres."""
+    def image_term(self, x: Tensor) -> DataTerm:
+        """Return the data term of reprojected keypoints, with pixel residuals converted to metres."""
         matrix = torch.zeros(*x.shape, 3, dtype=x.dtype)
         pull, cost = torch.zeros_like(x), 0.0
-        views = zip(self.seen.cameras, self.scale_m, self.seen.pixels, self.seen.confidence, strict=True)
+        views = zip(
+            self.observations.cameras, self.scale_m, self.observations.pixels, self.observations.confidence, strict=True
+        )
         for camera, scale_m, pixels, confidence in views:
             uv, by_x = project(camera, x)
             residual = (uv - pixels) * scale_m[:, None, None]
@@ -124,29 +129,29 @@ class Problem:
         return matrix, pull, cost
 
     def _robust(self, squared: Tensor, trust: Tensor) -> tuple[Tensor, float]:
-        """Weights, and the cost."""
-        weight, cost = geman_mcclure(squared, self.likely.keypoint_m, self.likely.keypoint_outlier_m)
+        """Return Geman-McClure weights of squared residuals, times their trust, and the cost."""
+        weight, cost = geman_mcclure(squared, self.priors.keypoint_m, self.priors.keypoint_outlier_m)
         return trust * weight, float((trust * cost).sum())
 
-    def moved(self, pose: Pose, equations: NormalEquations, damping: float) -> Pose:
-        """The pose after a damped Gauss-Newton step, its rig linearised anew."""
+    def apply_step(self, pose: Pose, equations: NormalEquations, damping: float) -> Pose:
+        """Return the pose after a damped Gauss-Newton step, its rig linearised anew."""
         beta = pose.rig.beta
         unbounded = torch.full((len(equations.shared) - len(beta),), torch.inf)
-        low = torch.cat([self.likely.beta_low - beta, -unbounded]).numpy()
-        high = torch.cat([self.likely.beta_high - beta, unbounded]).numpy()
+        low = torch.cat([self.priors.beta_low - beta, -unbounded]).numpy()
+        high = torch.cat([self.priors.beta_high - beta, unbounded]).numpy()
         frame, shared = (torch.from_numpy(part) for part in equations.step(damping, low, high))
         change, offsets, _ = shared.tensor_split([len(beta), len(beta) + pose.offsets_m.numel()])
-        moved = Articulation(pose.rig).moved(pose, frame)
+        moved = Articulation(pose.rig).apply_step(pose, frame)
         return replace(moved, rig=self.reshape(beta + change), offsets_m=pose.offsets_m + offsets.reshape(-1, 3))
 
 
-def levenberg_marquardt(problem: Problem, pose: Pose, inform: Callable[[Tensor], Information], steps: int) -> Pose:
-    """Minimise until a nearly undamped step lowers the cost by a thousandth or so (Marquardt 1963)."""
+def levenberg_marquardt(problem: Problem, pose: Pose, data_term: Callable[[Tensor], DataTerm], steps: int) -> Pose:
+    """Minimise until a nearly undamped step lowers the cost by less than about a thousandth (Marquardt 1963)."""
     damping = 1e-2
-    cost, equations = problem.assemble(pose, inform)
+    cost, equations = problem.assemble(pose, data_term)
     for _ in range(steps):
-        trial = problem.moved(pose, equations, damping)
-        trial_cost, trial_equations = problem.assemble(trial, inform)
+        trial = problem.apply_step(pose, equations, damping)
+        trial_cost, trial_equations = problem.assemble(trial, data_term)
         if trial_cost >= cost:
             damping *= 5
             continue
@@ -159,7 +164,7 @@ def levenberg_marquardt(problem: Problem, pose: Pose, inform: Callable[[Tensor],
 
 
 def project(camera: Camera, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels (..., 2) and their derivative by the world position (..., 2, 3)."""
+    """Return pixels (..., 2) of world points, and their derivative by the points (..., 2, 3)."""
     projection = torch.from_numpy(camera.projection)
     h = x @ projection[:, :3].T + projection[:, 3]
     depth = h[..., 2:].clamp(min=NEAR_M)
@@ -168,7 +173,7 @@ def project(camera: Camera, x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def metres_per_pixel(cameras: tuple[Camera, ...], pose: Pose) -> Tensor:
-    """What a pixel spans at the body's root, (C, n)."""
+    """Return what a pixel spans at the body's root, (C, n) metres."""
     centre = pose.root @ torch.cat([pose.rig.joints_m[0], torch.ones(1, dtype=pose.root.dtype)])
     depth = [centre[:, :3] @ torch.from_numpy(c.R[2]) + float(c.t_m[2]) for c in cameras]
     return torch.stack(
@@ -177,7 +182,7 @@ def metres_per_pixel(cameras: tuple[Camera, ...], pose: Pose) -> Tensor:
 
 
 def _offset_jacobian(points: Points, rotations: Tensor) -> Tensor:
-    """(n, 25, 3, 75): how each keypoint moves with its own offset on the resting body."""
+    """Return how each keypoint moves with its own offset on the rest body, (n, 25, 3, 75)."""
     turned = torch.einsum("km,nmcd->nkcd", points.weights, rotations)
     count = len(points.weights)
     out = torch.zeros(*turned.shape[:3], count, 3, dtype=turned.dtype)

@@ -17,13 +17,13 @@ class NormalEquations:
         self.shared = np.zeros((shared, shared))
         self.frame_gradient = np.zeros((frames, unknowns))
         self.shared_gradient = np.zeros(shared)
-        self.coupling_diagonal = np.zeros((frames, unknowns))  # what smoothness in time adds to the diagonal
+        self.coupling_diagonal = np.zeros((frames, unknowns))  # added to the diagonal by smoothness in time
 
     def step(self, damping: float, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Solve for the step of the frames (n, U) and of the shared unknowns (S,), these kept between low and high
+        """Solve for the step of the frames (n, U) and of the shared unknowns (S,), which stay between low and high
         (S,).
 
-        `damping` times the diagonal, less what couples frames, is added (Marquardt 1963): damping the coupling too
+        `damping` times the diagonal, without what couples frames, is added (Marquardt 1963): damping the coupling too
         would hold back movement that all frames share. Shared unknowns that would leave their bounds are held at them,
         and the rest solved again.
         """
@@ -37,7 +37,7 @@ class NormalEquations:
         return (-solved[:, 0] - solved[:, 1:] @ shared).reshape(frames, unknowns), shared
 
     def _banded(self, damping: float) -> np.ndarray:
-        """Lower band storage of the frames' block matrix, as scipy.linalg wants it: band[i - j, j] = H[i, j]."""
+        """Return the lower band storage of the frames' block matrix for scipy.linalg: band[i - j, j] = H[i, j]."""
         frames, unknowns = self.frame_gradient.shape
         band = np.zeros((3 * unknowns, frames * unknowns))
         column = np.arange(unknowns)

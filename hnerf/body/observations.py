@@ -1,4 +1,4 @@
-"""The subject's keypoints as a fit needs them."""
+"""The subject's keypoints in the form that a fit needs."""
 
 from dataclasses import dataclass
 
@@ -8,15 +8,15 @@ from torch import Tensor
 
 from hnerf.capture.capture import Capture
 from hnerf.capture.subject import subject_keypoints
-from hnerf.capture.timing import usual_step
+from hnerf.capture.timing import median_step
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import triangulate
 
 
 @dataclass(frozen=True)
 class Observations:
-    """pixels (C, n, 25, 2) and confidence (C, n, 25) of the training cameras, float64; space_m (n, 25, 3), NaN where
-    fewer than two of them agree."""
+    """Observed keypoints: pixels (C, n, 25, 2) and confidence (C, n, 25) of the training cameras, float64; space_m (n,
+    25, 3), triangulated, NaN where fewer than two cameras agree."""
 
     cameras: tuple[Camera, ...]
     pixels: Tensor
@@ -25,7 +25,7 @@ class Observations:
 
 
 def observe(capture: Capture) -> Observations:
-    """Keypoints of every frame, from training cameras only. Raises InputError where the capture has none."""
+    """Return the keypoints of every frame, from training cameras only. Raises InputError where the capture has none."""
     people = subject_keypoints(capture)
     cameras = tuple(capture.cameras[name] for name in capture.train_cameras)
     keypoints = np.stack([people[camera.name] for camera in cameras])
@@ -39,9 +39,9 @@ def observe(capture: Capture) -> Observations:
 
 
 def runs(capture: Capture) -> list[tuple[int, ...]]:
-    """Frames that follow each other in time: a step in the numbers other than the usual one, or another split, starts
-    a new run."""
-    novel, step = set(capture.novel_pose_frames), usual_step(capture.frames)
+    """Return the frames in runs that follow each other in time: a step in the numbers other than the median one, or a
+    change of split, starts a new run."""
+    novel, step = set(capture.novel_pose_frames), median_step(capture.frames)
     found: list[list[int]] = []
     for frame in capture.frames:
         if found and frame == found[-1][-1] + step and (frame in novel) == (found[-1][-1] in novel):

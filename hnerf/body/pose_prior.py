@@ -1,6 +1,6 @@
-"""What a human pose is likely to be: how far each joint turns from rest, and where hinges stop.
+"""Priors on human poses: how far each joint turns from rest, where hinges stop, and smoothness in time.
 
-A joint's rotation vector is read along three axes of the resting body: flexion, twist about the bone, and sideways.
+A joint's rotation vector is measured along three axes of the rest body: flexion, twist about the bone, and sideways.
 """
 
 import itertools
@@ -12,10 +12,10 @@ from torch import Tensor
 
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.normal_equations import NormalEquations
-from hnerf.capture.timing import usual_step
+from hnerf.capture.timing import median_step
 
-# Standard deviations from rest in degrees: flexion, twist, sideways; chosen wide, as what everyday movement spans.
-SPREAD_DEG = {
+# Standard deviations from rest in degrees: flexion, twist, sideways; chosen wide, to span everyday movement.
+STD_DEG = {
     "upperleg01": (45, 20, 25),
     "lowerleg01": (60, 6, 4),
     "foot": (20, 10, 12),
@@ -29,19 +29,19 @@ SPREAD_DEG = {
     "neck01": (15, 15, 10),
     "head": (15, 15, 10),
 }
-OTHER_SPREAD_DEG = (30, 30, 30)
-HINGES = ("lowerleg01", "lowerarm01")  # from straight to folded
+OTHER_STD_DEG = (30, 30, 30)
+HINGES = ("lowerleg01", "lowerarm01")  # joints that bend from straight to folded
 FOLDED_DEG = 150.0
-FLEXION_DEG = {"upperarm01": (-170, 45), "upperleg01": (-130, 40)}  # forwards, backwards, from rest
+FLEXION_DEG = {"upperarm01": (-170, 45), "upperleg01": (-130, 40)}  # limits forwards and backwards, from rest
 MEAN_FLEXION_DEG = {"upperarm01": -10.0}  # arms are carried in front of the body
-LIMIT_SIGMA_DEG = 2.0
+LIMIT_STD_DEG = 2.0
 
 DIFFERENCE = (1.0, -2.0, 1.0)
-SUDDEN_SIGMAS = 3.0
+OUTLIER_SIGMAS = 3.0
 
 
 class PosePrior:
-    """Gaussian about the rest pose on every axis of every free joint, and one-sided limits on the hinges."""
+    """A Gaussian about the rest pose on every axis of every free joint, and one-sided limits on flexion."""
 
     def __init__(self, articulation: Articulation) -> None:
         self.articulation = articulation
@@ -50,8 +50,8 @@ class PosePrior:
         bones = _bone_directions(articulation)
         self.axes = torch.stack([_axes(bones[int(articulation.parents[m + 1])], bones[m + 1], name in HINGES)
                                  for m, name in enumerate(names)])  # fmt: skip
-        spread = torch.tensor([SPREAD_DEG.get(name, OTHER_SPREAD_DEG) for name in names], dtype=bones.dtype)
-        self.sigma = torch.deg2rad(spread)
+        std = torch.tensor([STD_DEG.get(name, OTHER_STD_DEG) for name in names], dtype=bones.dtype)
+        self.sigma = torch.deg2rad(std)
         bend = torch.stack([_angle(bones[int(articulation.parents[m + 1])], bones[m + 1]) for m in range(len(names))])
         hinge = torch.tensor([name in HINGES for name in names])
         span = torch.deg2rad(torch.tensor([FLEXION_DEG.get(name, (-180, 180)) for name in names], dtype=bones.dtype))
@@ -60,18 +60,18 @@ class PosePrior:
         self.mean = torch.zeros_like(self.sigma)
         self.mean[:, 0] = torch.deg2rad(torch.tensor([MEAN_FLEXION_DEG.get(name, 0.0) for name in names]))
 
-    def likely(self) -> Tensor:
-        """The likeliest turns of the free joints, (M - 1, 3) axis-angle."""
+    def mean_pose(self) -> Tensor:
+        """Return the most likely turns of the free joints, (M - 1, 3) axis-angle."""
         return torch.einsum("mac,ma->mc", self.axes, self.mean)
 
     def add(self, equations: NormalEquations, pose: Pose) -> float:
-        """Add to the normal equations; returns the cost."""
+        """Add the prior to the normal equations and return its cost."""
         local = torch.einsum("mac,nmc->nma", self.axes, pose.theta[:, self.articulation.joints[1:]])
         weight = (self.sigma**-2).expand_as(local).clone()
         off = local - self.mean
         pull = weight * off
         excess = local[..., 0] - local[..., 0].clamp(self.low, self.high)
-        limit = math.radians(LIMIT_SIGMA_DEG) ** -2
+        limit = math.radians(LIMIT_STD_DEG) ** -2
         pull[..., 0] += limit * excess
         weight[..., 0] += limit * (excess != 0)
         gradient = torch.einsum("mac,nma->nmc", self.axes, pull)
@@ -84,7 +84,8 @@ class PosePrior:
 
 
 def _bone_directions(articulation: Articulation) -> Tensor:
-    """Unit direction (M, 3) of each moving joint's bone at rest: to its moving children, or to what it carries."""
+    """Return the unit direction (M, 3) of each moving joint's bone at rest: to its only moving child, or to the centre
+    of the vertices it carries."""
     heads = articulation.rest_m
     directions = []
     for m in range(len(heads)):
@@ -96,7 +97,8 @@ def _bone_directions(articulation: Articulation) -> Tensor:
 
 
 def _axes(above: Tensor, bone: Tensor, hinge: bool) -> Tensor:
-    """Rows: flexion, twist, sideways. A hinge flexes in the plane of its two bones, other joints about left-right."""
+    """Return the axes of a joint, rows flexion, twist, sideways. A hinge flexes in the plane of its two bones, other
+    joints about the left-right axis."""
     flexion = torch.linalg.cross(above, bone) if hinge else torch.tensor([1.0, 0, 0], dtype=bone.dtype)
     flexion = flexion - (flexion @ bone) * bone
     flexion = flexion / flexion.norm()
@@ -104,32 +106,38 @@ def _axes(above: Tensor, bone: Tensor, hinge: bool) -> Tensor:
 
 
 def _angle(a: Tensor, b: Tensor) -> Tensor:
+    """Return the angle between two unit vectors in radians."""
     return torch.arccos((a @ b).clamp(-1, 1))
 
 
 class Smoothness:
-    """Keypoints accelerate little between neighbouring frames (zero velocity would hold back real movement), except
-    when they do: Geman-McClure lets a sudden movement or a cut go. It is not applied across gaps in the frames."""
+    """A prior on the acceleration of keypoints between neighbouring frames (zero velocity would hold back real
+    movement).
+
+    Geman-McClure weights let a sudden movement or a cut go. It does not act across gaps in the frames.
+    """
 
     def __init__(self, runs: list[tuple[int, ...]], fps: float, sigma_mps2: np.ndarray) -> None:
-        """runs: frames that follow each other, one usual step apart; fps: of frame numbers; sigma_mps2 (25,): standard
-        deviations."""
+        """Prepare the prior. runs: frames that follow each other, one median step apart; fps: of frame numbers;
+        sigma_mps2 (25,): standard deviations."""
         starts = np.cumsum([0] + [len(run) for run in runs])
         triples = [np.arange(a, a + len(run) - 2) for a, run in zip(starts, runs, strict=False)]
-        self.first = np.concatenate(triples)  # of each three frames, (T,)
-        self.sigma_m = sigma_mps2 * usual_step([*itertools.chain(*runs)]) ** 2 / fps**2
+        self.first = np.concatenate(triples)  # first row of each three consecutive frames, (T,)
+        self.sigma_m = sigma_mps2 * median_step([*itertools.chain(*runs)]) ** 2 / fps**2
 
     def add(self, equations: NormalEquations, keypoints_m: Tensor, jacobian: Tensor) -> float:
-        """keypoints_m (n, 25, 3), jacobian (n, 25, 3, U); returns the cost. The shape's part in an acceleration is
-        nil, so shared unknowns are left alone."""
+        """Add the prior to the normal equations and return its cost. keypoints_m (n, 25, 3), jacobian (n, 25, 3, U).
+
+        The contribution of the shape to an acceleration is negligible, so shared unknowns are left alone.
+        """
         if len(self.first) == 0:
             return 0.0
         x, j = keypoints_m.numpy(), jacobian.flatten(1, 2).numpy()
         at = [self.first + i for i in range(3)]
         second = x[at[0]] - 2 * x[at[1]] + x[at[2]]  # (T, 25, 3)
         squared = (second**2).sum(-1) / self.sigma_m**2
-        fade = 1 + squared / SUDDEN_SIGMAS**2
-        weight = np.repeat((self.sigma_m * fade) ** -2, 3, axis=1)  # (T, 75)
+        falloff = 1 + squared / OUTLIER_SIGMAS**2
+        weight = np.repeat((self.sigma_m * falloff) ** -2, 3, axis=1)  # (T, 75)
         pull = weight * second.reshape(len(second), -1)
         before = np.einsum("nuu->nu", equations.frame[0]).copy()
         for i, a in enumerate(DIFFERENCE):
@@ -138,4 +146,4 @@ class Smoothness:
             for k in range(3 - i):
                 equations.frame[k][at[i]] += DIFFERENCE[i + k] * weighted @ j[at[i + k]]
         equations.coupling_diagonal += np.einsum("nuu->nu", equations.frame[0]) - before
-        return 0.5 * float((squared / fade).sum())
+        return 0.5 * float((squared / falloff).sum())

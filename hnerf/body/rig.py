@@ -1,7 +1,7 @@
 """The body as plain tensors: linear blend skinning of one linearised shape space.
 
-All that fitting, training and export need of a body model. anny, SMPL and SMPL-X become a Rig once; after that no
-body-model package is used. The body frame is the model's own: metres, anny's Z up, facing -Y.
+This is all that fitting, training and export need of a body model. anny, SMPL and SMPL-X are converted to a Rig once;
+after that no body-model package is used. The body frame is the model's own: metres, anny's Z up, facing -Y.
 
 Rotations are axis-angle, about a joint's rest position, in axes parallel to the body frame in the rest pose (as in
 SMPL, Loper et al. 2015), so every rest orientation is the identity.
@@ -21,12 +21,12 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Rig:
-    """Rest body at shape `beta`, and how it moves.
+    """A rest body at shape `beta`, with its joints, skinning and keypoints.
 
     vertices_m (V, 3), faces (F, 3) long, joints_m (J, 3), parents (J,) long with -1 at the root and parents before
-    children, shape_basis (B, V, 3) and joint_basis (B, J, 3): metres per unit of beta around `beta` (B,).
-    skin_joints (V, K) long, skin_weights (V, K) summing to 1. free (J,) bool: joints that may turn. keypoint_weights
-    (25, V): BODY_25 keypoints from the vertices.
+    children, shape_basis (B, V, 3) and joint_basis (B, J, 3): metres per unit of beta around `beta` (B,). skin_joints
+    (V, K) long, skin_weights (V, K) summing to 1. free (J,) bool: joints that may turn. keypoint_weights (25, V):
+    BODY_25 keypoints from the vertices.
     """
 
     vertices_m: Tensor
@@ -45,7 +45,7 @@ class Rig:
 
     @cached_property
     def levels(self) -> list[Tensor]:
-        """The root, its children, theirs, and so on: joints (k,) of each."""
+        """Return the joints by depth in the tree: the root, its children, theirs, and so on, (k,) each."""
         depth = [0]
         for parent in self.parents.tolist()[1:]:
             depth.append(depth[parent] + 1)
@@ -54,12 +54,12 @@ class Rig:
 
     @cached_property
     def dense_weights(self) -> Tensor:
-        """Skin weights of all joints (V, J)."""
+        """Return the skin weights of all joints, (V, J)."""
         dense = self.skin_weights.new_zeros(len(self.skin_weights), len(self.joints_m))
         return dense.scatter_add_(1, self.skin_joints, self.skin_weights)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "Rig":
-        """The same rig on another device; `dtype` changes the floating tensors only."""
+        """Return the same rig on another device; `dtype` changes the floating tensors only."""
         changed: dict[str, Any] = {}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
@@ -68,18 +68,18 @@ class Rig:
         return dataclasses.replace(self, **changed)
 
     def shaped(self, beta: Tensor) -> tuple[Tensor, Tensor]:
-        """Rest vertices (V, 3) and joints (J, 3) at another shape (B,), to first order around `self.beta`."""
+        """Return rest vertices (V, 3) and joints (J, 3) at another shape (B,), to first order around `self.beta`."""
         delta = beta - self.beta
         vertices_m = self.vertices_m + torch.einsum("b,bvd->vd", delta, self.shape_basis)
         return vertices_m, self.joints_m + torch.einsum("b,bjd->jd", delta, self.joint_basis)
 
     def reshaped(self, beta: Tensor) -> "Rig":
-        """The rig moved to another shape (B,), along the same basis."""
+        """Return the rig at another shape (B,), along the same basis."""
         vertices_m, joints_m = self.shaped(beta)
         return dataclasses.replace(self, vertices_m=vertices_m, joints_m=joints_m, beta=beta)
 
     def save(self, path: Path) -> None:
-        """Write an .npz without pickles."""
+        """Write the rig as .npz without pickles."""
         arrays: dict[str, Any] = {f.name: np.asarray(getattr(self, f.name)) for f in dataclasses.fields(self)}
         np.savez(path, **arrays)
 
@@ -97,7 +97,8 @@ class Rig:
 
 
 def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
-    """(..., 3) axis-angle in radians to (..., 3, 3); Rodrigues' formula, with finite gradients at zero."""
+    """Return rotations (..., 3, 3) of axis-angle (..., 3) in radians, by Rodrigues' formula with finite gradients at
+    zero."""
     angle_squared = (axis_angle * axis_angle).sum(-1)[..., None, None]
     small = angle_squared < 1e-8
     safe = torch.where(small, torch.ones_like(angle_squared), angle_squared)
@@ -111,54 +112,54 @@ def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
 
 
 def joint_transforms(rig: Rig, theta: Tensor, root: Tensor) -> Tensor:
-    """World transform of every joint, (..., J, 4, 4).
+    """Return the world transform of every joint, (..., J, 4, 4).
 
     theta (..., J, 3) radians; root (..., 4, 4) world from body (T in docs/method.md).
     """
-    rotations, offsets = rotation_from_axis_angle(theta), _from_above(rig, rig.joints_m)
+    rotations, offsets = rotation_from_axis_angle(theta), _relative_to_parent(rig, rig.joints_m)
     top = torch.cat([rotations, offsets[..., None].expand(*rotations.shape[:-1], 1)], -1)
     bottom = torch.tensor([0, 0, 0, 1], dtype=top.dtype, device=top.device).expand(*top.shape[:-2], 1, 4)
     own = torch.cat([top, bottom], -2)
     first = root[..., None, :, :] @ own[..., :1, :, :]
-    return _downwards(rig, first, lambda above, joints: above @ own[..., joints, :, :])
+    return _along_chain(rig, first, lambda above, joints: above @ own[..., joints, :, :])
 
 
 def posed_joint_basis(rig: Rig, world: Tensor, root: Tensor) -> Tensor:
-    """How a unit of each shape moves the posed joints, (n, J, 3, B) metres. world (n, J, 4, 4): `joint_transforms`;
-    root (n, 4, 4)."""
-    offsets = _from_above(rig, rig.joint_basis.transpose(0, 1)).transpose(1, 2)  # (J, 3, B)
+    """Return how a unit of each shape moves the posed joints, (n, J, 3, B) metres. world (n, J, 4, 4):
+    `joint_transforms`; root (n, 4, 4)."""
+    offsets = _relative_to_parent(rig, rig.joint_basis.transpose(0, 1)).transpose(1, 2)  # (J, 3, B)
     turned = world[:, rig.parents.clamp(min=0), :3, :3] @ offsets
     first = root[:, None, :3, :3] @ offsets[:1]
-    return _downwards(rig, first, lambda above, joints: above + turned[:, joints])
+    return _along_chain(rig, first, lambda above, joints: above + turned[:, joints])
 
 
 def skinning_transforms(world: Tensor, joints_m: Tensor) -> Tensor:
-    """World from rest pose for a point rigidly on each joint, (..., J, 4, 4): G_j [I | -joint_j]. world: G, of
+    """Return world from rest pose for a point rigidly on each joint, (..., J, 4, 4): G_j [I | -joint_j]. world: G, of
     `joint_transforms`; joints_m (J, 3) at rest."""
     moved = world[..., :3, 3] - (world[..., :3, :3] @ joints_m[..., None])[..., 0]
     return torch.cat([torch.cat([world[..., :3, :3], moved[..., None]], -1), world[..., 3:, :]], -2)
 
 
 def pose_vertices(rig: Rig, theta: Tensor, root: Tensor) -> Tensor:
-    """Posed vertices in the world, (..., V, 3) metres. theta (..., J, 3), root (..., 4, 4)."""
+    """Return posed vertices in the world, (..., V, 3) metres. theta (..., J, 3), root (..., 4, 4)."""
     transforms = vertex_transforms(rig, skinning_transforms(joint_transforms(rig, theta, root), rig.joints_m))
     return (transforms[..., :3, :3] @ rig.vertices_m[..., None])[..., 0] + transforms[..., :3, 3]
 
 
 def vertex_transforms(rig: Rig, transforms: Tensor) -> Tensor:
-    """Blend joint transforms (..., J, 4, 4) to vertices: (..., V, 3, 4), world from rest pose."""
+    """Blend joint transforms (..., J, 4, 4) by skin weights: (..., V, 3, 4), world from rest pose."""
     top = transforms[..., :3, :].flatten(-2)  # (..., J, 12)
     return (rig.dense_weights @ top).unflatten(-1, (3, 4))
 
 
-def _from_above(rig: Rig, values: Tensor) -> Tensor:
-    """Values (J, ...) of joints less those of the joints above them; the root's own."""
+def _relative_to_parent(rig: Rig, values: Tensor) -> Tensor:
+    """Return values (J, ...) of joints minus those of their parents; the root's are kept."""
     return torch.cat([values[:1], values[1:] - values[rig.parents[1:]]])
 
 
-def _downwards(rig: Rig, first: Tensor, step: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """Values of all joints (..., J, a, b) from the root's (..., 1, a, b), level by level: step(values of the joints
-    above, joints (k,))."""
+def _along_chain(rig: Rig, first: Tensor, step: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """Return values of all joints (..., J, a, b), computed from the root's (..., 1, a, b) level by level: step(values
+    of the parents, joints (k,))."""
     values, before = [first], rig.levels[0]
     for joints in rig.levels[1:]:
         values.append(step(values[-1][..., torch.searchsorted(before, rig.parents[joints]), :, :], joints))

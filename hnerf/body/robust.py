@@ -1,11 +1,13 @@
-"""Least squares that let go of what is far off."""
+"""Robust least squares."""
 
 from torch import Tensor
 
 
-def geman_mcclure(squared: Tensor, sigma: float | Tensor, fades_at: float) -> tuple[Tensor, Tensor]:
-    """Geman-McClure (1987): weights of the re-weighted least squares for squared residuals, and the costs, each of
-    their shape. A residual well below `fades_at` costs half its square over sigma^2, one far beyond nearly
-    fades_at^2 / (2 sigma^2)."""
-    fade = 1 + squared / fades_at**2
-    return (sigma * fade) ** -2, 0.5 * squared / sigma**2 / fade
+def geman_mcclure(squared: Tensor, sigma: float | Tensor, outlier: float) -> tuple[Tensor, Tensor]:
+    """Return Geman-McClure (1987) weights of re-weighted least squares for squared residuals, and the costs, each of
+    their shape.
+
+    A residual well below `outlier` costs half its square over sigma^2, one far beyond nearly outlier^2 / (2 sigma^2).
+    """
+    falloff = 1 + squared / outlier**2
+    return (sigma * falloff) ** -2, 0.5 * squared / sigma**2 / falloff

@@ -1,10 +1,11 @@
 """SMPL (Loper et al. 2015), SMPL-H (Romero et al. 2017) and SMPL-X (Pavlakos et al. 2019) as a Rig, from a model file
 that the user has; none is shipped.
 
-Joints that anny has too bear anny's names, so that pose priors and exports know them. The rest pose is anny's as well,
-arms and knees a little bent, because priors, hinges and starts of fits are told from there: SMPL's T pose would leave
-hinges without an axis. Pose blend shapes (`posedirs`) act on that rest pose once; beyond it the rig has none, so bent
-joints are less full than SMPL's own. Fingers, toes, jaw and eyes are locked. Expressions are left out.
+Joints that anny has too take anny's names, so that pose priors and exports know them. The rest pose is also anny's,
+arms and knees a little bent, because pose priors, hinges and the start of a fit refer to it: SMPL's T pose would leave
+hinges without an axis. Pose blend shapes (`posedirs`) are evaluated once, for that rest pose; in other poses the rig
+has none, so bent joints are less full than SMPL's own. Fingers, toes, jaw and eyes are locked. Expressions are left
+out.
 """
 
 from dataclasses import dataclass
@@ -17,16 +18,16 @@ import torch
 from torch import Tensor
 
 from hnerf.body.rig import Rig
-from hnerf.capture.safe_io import NO_ARRAYS
+from hnerf.capture.safe_io import ARRAY_FILE_ERRORS
 from hnerf.capture.safe_pickle import read_pickle
 from hnerf.errors import InputError
 
 BETAS = 10
 BODY_FROM_SMPL = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)  # Y up, facing +Z; see rig.py
 KEYS = ("v_template", "f", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table")
-SKINNED = 8  # joints a vertex
+SKINNED = 8  # joints that a vertex may follow
 
-# SMPL's joints 0 to 21, common to all its kin, by the names of anny's joints in the same place.
+# SMPL's joints 0 to 21, which all its variants share, by the names of anny's joints in the same place.
 JOINTS = (
     "root", "upperleg01.L", "upperleg01.R", "spine05", "lowerleg01.L", "lowerleg01.R", "spine03", "foot.L", "foot.R",
     "spine01", "toes.L", "toes.R", "neck01", "clavicle.L", "clavicle.R", "head", "upperarm01.L", "upperarm01.R",
@@ -56,28 +57,28 @@ T_POSE_BONES = {
 }
 BONE_ENDS = {"upperarm01": "lowerarm01", "lowerarm01": "wrist", "upperleg01": "lowerleg01", "lowerleg01": "foot"}
 
-# BODY_25 by joints, whose mean counts, or by the vertex on the skin: numbers of vertices of SMPL's and SMPL-H's mesh,
-# and of SMPL-X's, as the smplx package's vertex_ids gives them.
+# BODY_25 keypoints as the mean of joints, or as a vertex on the skin: its index in SMPL's and SMPL-H's mesh, and in
+# SMPL-X's, as in the smplx package's vertex_ids.
 BODY_25: tuple[tuple[str, ...] | tuple[int, int], ...] = (
     (332, 9120), ("upperarm01.L", "upperarm01.R"), ("upperarm01.R",), ("lowerarm01.R",), ("wrist.R",),
     ("upperarm01.L",), ("lowerarm01.L",), ("wrist.L",), ("upperleg01.L", "upperleg01.R"), ("upperleg01.R",),
     ("lowerleg01.R",), ("foot.R",), ("upperleg01.L",), ("lowerleg01.L",), ("foot.L",), (6260, 9929), (2800, 9448),
     (4071, 616), (583, 6), (3216, 5770), (3226, 5780), (3387, 8846), (6617, 8463), (6624, 8474), (6787, 8635),
 )  # fmt: skip
-MESHES = {6890: 0, 10475: 1}  # vertices, and which number of such a pair
+MESHES = {6890: 0, 10475: 1}  # by number of vertices: which index of such a pair
 
 
 @dataclass(frozen=True)
 class Smpl:
-    """rig: at betas 0, float64; rest_turns (J, 3, 3): each bone's rotation from SMPL's T pose to the rig's rest pose,
-    body frame."""
+    """An SMPL model: rig at betas 0, float64; rest_rotations (J, 3, 3): each bone's rotation from SMPL's T pose to the
+    rig's rest pose, body frame."""
 
     rig: Rig
-    rest_turns: Tensor
+    rest_rotations: Tensor
 
 
 def read_smpl(path: Path) -> Smpl:
-    """The model in a .npz or .pkl file. Raises InputError where the file is missing or holds no SMPL, SMPL-H or
+    """Read the model in a .npz or .pkl file. Raises InputError where the file is missing or holds no SMPL, SMPL-H or
     SMPL-X model."""
     data = _checked(path, _read(path))
     weights, regressor = data["weights"], data["J_regressor"]
@@ -87,11 +88,13 @@ def read_smpl(path: Path) -> Smpl:
     vertices_m = torch.cat([data["v_template"][None], data["shapedirs"][..., :BETAS].permute(2, 0, 1)])
     vertices_m = vertices_m @ BODY_FROM_SMPL.T  # (1 + 10, V, 3): template, then shapes
     joints_m = regressor @ vertices_m
-    turns = rest_turns(names, parents, _bones(names, joints_m[0]))
-    vertices_m[0] += _pose_blend_shape(data["posedirs"], turns, parents)
-    vertices_m, joints_m = _reposed(vertices_m, joints_m, weights, turns, parents)
+    rotations = rest_rotations(names, parents, _bones(names, joints_m[0]))
+    vertices_m[0] += _pose_blend_shape(data["posedirs"], rotations, parents)
+    vertices_m, joints_m = _reposed(vertices_m, joints_m, weights, rotations, parents)
 
-    kept = torch.tensor([not name.startswith("eye") for name in names])[weights.argmax(1)]  # eyeballs are parts apart
+    kept = torch.tensor([not name.startswith("eye") for name in names])[
+        weights.argmax(1)
+    ]  # eyeballs are separate parts
     place = kept.cumsum(0) - 1
     faces = data["f"].long()
     faces = place[faces[kept[faces].all(1)]]
@@ -112,26 +115,27 @@ def read_smpl(path: Path) -> Smpl:
         free=torch.tensor([name in JOINTS and name not in LOCKED for name in names]),
         keypoint_weights=keypoint_weights,
     )
-    return Smpl(rig, turns)
+    return Smpl(rig, rotations)
 
 
-def rest_turns(names: tuple[str, ...], parents: list[int], t_pose: dict[str, Tensor]) -> Tensor:
-    """Each bone's rotation (J, 3, 3) from SMPL's T pose, with these bone directions by joint, to anny's rest pose, body
-    frame: limbs take the shortest way, feet and trunk stay, all else goes along."""
-    turns: list[Tensor] = []
+def rest_rotations(names: tuple[str, ...], parents: list[int], t_pose: dict[str, Tensor]) -> Tensor:
+    """Return each bone's rotation (J, 3, 3) from SMPL's T pose, with bone directions t_pose by joint, to anny's rest
+    pose, body frame: limbs rotate by the shortest way, feet and trunk do not, all other bones follow their parent."""
+    rotations: list[Tensor] = []
     for name, parent in zip(names, parents, strict=True):
-        above = turns[parent] if parent >= 0 else torch.eye(3, dtype=torch.float64)
+        above = rotations[parent] if parent >= 0 else torch.eye(3, dtype=torch.float64)
         limb, _, side = name.partition(".")
         if limb in REST_BONES:
             mirror = torch.tensor([1.0 if side == "L" else -1.0, 1, 1], dtype=torch.float64)
             target = torch.tensor(REST_BONES[limb], dtype=torch.float64) * mirror
-            above = _shortest_turn(above @ t_pose[name], target) @ above
-        turns.append(torch.eye(3, dtype=torch.float64) if limb == "foot" else above)
-    return torch.stack(turns)
+            above = _shortest_rotation(above @ t_pose[name], target) @ above
+        rotations.append(torch.eye(3, dtype=torch.float64) if limb == "foot" else above)
+    return torch.stack(rotations)
 
 
-def _shortest_turn(a: Tensor, b: Tensor) -> Tensor:
-    """Rotation (3, 3) of direction a into b, not opposite, about their common normal (Rodrigues)."""
+def _shortest_rotation(a: Tensor, b: Tensor) -> Tensor:
+    """Return the rotation (3, 3) of direction a into b, which is not opposite, about their common normal
+    (Rodrigues)."""
     a, b = a / a.norm(), b / b.norm()
     x, y, z = torch.linalg.cross(a, b).tolist()
     cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=a.dtype)
@@ -139,7 +143,7 @@ def _shortest_turn(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """The arrays of KEYS; sparse ones made dense."""
+    """Read the arrays of KEYS from a file; sparse ones become dense."""
     if not path.is_file():
         raise InputError(f"{path}: no such body model; give the path of an SMPL, SMPL-H or SMPL-X file, or anny")
     if path.suffix == ".pkl":
@@ -149,8 +153,8 @@ def _read(path: Path) -> dict[str, Any]:
         try:
             with np.load(path, allow_pickle=False) as archive:
                 found = {key: archive[key] for key in KEYS if key in archive}
-        except NO_ARRAYS:
-            raise InputError(f"{path}: is no .npz of plain arrays; convert the model again") from None
+        except ARRAY_FILE_ERRORS:
+            raise InputError(f"{path}: is not a .npz of plain arrays; convert the model again") from None
     missing = [key for key in KEYS if key not in found]
     if missing:
         raise InputError(f"{path}: no {', '.join(missing)}; give an SMPL, SMPL-H or SMPL-X model")
@@ -158,14 +162,15 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _checked(path: Path, data: dict[str, Any]) -> dict[str, Tensor]:
-    """As float64 tensors; InputError unless all shapes are those of a known model, and all numbers finite."""
+    """Return the arrays as float64 tensors. Raises InputError unless all shapes are those of a known model and all
+    numbers finite."""
     try:
         arrays = {key: torch.from_numpy(np.array(data[key], dtype=np.float64)) for key in KEYS}
     except (TypeError, ValueError):
-        raise InputError(f"{path}: holds more than arrays of numbers; convert the model again") from None
+        raise InputError(f"{path}: holds other data than arrays of numbers; convert the model again") from None
     vertices, joints = len(arrays["v_template"]), len(arrays["J_regressor"])
     if vertices not in MESHES or joints not in FURTHER_JOINTS:
-        raise InputError(f"{path}: {vertices} vertices and {joints} joints are no SMPL, SMPL-H or SMPL-X model")
+        raise InputError(f"{path}: {vertices} vertices and {joints} joints are not those of SMPL, SMPL-H or SMPL-X")
     shapes: dict[str, tuple[int, ...]] = {
         "v_template": (vertices, 3),
         "posedirs": (vertices, 3, 9 * (joints - 1)),
@@ -181,39 +186,40 @@ def _checked(path: Path, data: dict[str, Any]) -> dict[str, Tensor]:
     faces = arrays["f"]
     wrong += [] if faces.shape[1:] == (3,) and faces.min() >= 0 and faces.max() < vertices else ["f"]
     if wrong or arrays["shapedirs"].shape[2] < BETAS:
-        raise InputError(f"{path}: {(wrong or ['shapedirs'])[0]} is not that of such a model; convert it again")
+        raise InputError(f"{path}: {(wrong or ['shapedirs'])[0]} is not that of an SMPL model; convert it again")
     return arrays
 
 
 def _bones(names: tuple[str, ...], joints_m: Tensor) -> dict[str, Tensor]:
-    """Direction of each limb's bone."""
+    """Return the direction of each limb's bone."""
     ends = {f"{bone}.{side}": f"{end}.{side}" for bone, end in BONE_ENDS.items() for side in "LR"}
     return {bone: joints_m[names.index(end)] - joints_m[names.index(bone)] for bone, end in ends.items()}
 
 
-def _pose_blend_shape(posedirs: Tensor, turns: Tensor, parents: list[int]) -> Tensor:
-    """Displacement (V, 3), body frame, that the model's pose blend shapes give the rest pose (Loper et al. 2015, eq.
-    9)."""
-    local = turns[parents[1:]].mT @ turns[1:]
+def _pose_blend_shape(posedirs: Tensor, rotations: Tensor, parents: list[int]) -> Tensor:
+    """Return the displacement (V, 3), body frame, that the model's pose blend shapes give the rest pose (Loper et al.
+    2015, eq. 9)."""
+    local = rotations[parents[1:]].mT @ rotations[1:]
     feature = BODY_FROM_SMPL.T @ local @ BODY_FROM_SMPL - torch.eye(3, dtype=local.dtype)
     return (posedirs @ feature.flatten()) @ BODY_FROM_SMPL.T
 
 
 def _reposed(
-    vertices_m: Tensor, joints_m: Tensor, weights: Tensor, turns: Tensor, parents: list[int]
+    vertices_m: Tensor, joints_m: Tensor, weights: Tensor, rotations: Tensor, parents: list[int]
 ) -> tuple[Tensor, Tensor]:
-    """Template and shapes (S, V, 3), (S, J, 3) skinned into the rest pose, which is linear in both."""
+    """Return template and shapes (S, V, 3) and their joints (S, J, 3) skinned into the rest pose, which is linear in
+    both."""
     placed = [joints_m[:, 0]]
     for j, parent in enumerate(parents[1:], 1):
-        placed.append(placed[parent] + (joints_m[:, j] - joints_m[:, parent]) @ turns[parent].T)
+        placed.append(placed[parent] + (joints_m[:, j] - joints_m[:, parent]) @ rotations[parent].T)
     rest_m = torch.stack(placed, 1)
-    shift = rest_m - (turns @ joints_m[..., None])[..., 0]
-    blended = (weights @ turns.flatten(1)).unflatten(1, (3, 3))
+    shift = rest_m - (rotations @ joints_m[..., None])[..., 0]
+    blended = (weights @ rotations.flatten(1)).unflatten(1, (3, 3))
     return (blended @ vertices_m[..., None])[..., 0] + weights @ shift, rest_m
 
 
 def _keypoint_weights(names: tuple[str, ...], regressor: Tensor, mesh: int) -> Tensor:
-    """BODY_25 regression weights (25, V)."""
+    """Return BODY_25 regression weights (25, V)."""
     rows = torch.zeros(25, regressor.shape[1], dtype=regressor.dtype)
     for row, source in zip(rows, BODY_25, strict=True):
         if isinstance(source[0], int):
@@ -224,7 +230,8 @@ def _keypoint_weights(names: tuple[str, ...], regressor: Tensor, mesh: int) -> T
 
 
 def _moved_off(weights: Tensor, vertices_m: Tensor, kept: Tensor) -> Tensor:
-    """(25, kept V): what vertices that are not kept weigh goes to the nearest ones that are."""
+    """Return weights (25, kept V) in which the weight of each vertex that is not kept goes to the nearest one that
+    is."""
     for v in ((weights != 0).any(0) & ~kept).nonzero()[:, 0].tolist():
         distance = (vertices_m - vertices_m[v]).norm(dim=1).where(kept, torch.inf)
         weights[:, distance.argmin()] += weights[:, v]

@@ -11,39 +11,40 @@ from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import reprojection_px, triangulate
 
-ROUNDS = 3  # triangulate, adjust, and again with the better cameras
-LOSS_SCALE_PX = 2.0  # about a detector's noise
-MIN_OBSERVATIONS = 50  # with fewer, the cameras have drifted apart: there is nothing to adjust to
+ROUNDS = 3  # of triangulation and adjustment, each with the cameras of the one before
+LOSS_SCALE_PX = 2.0  # about the noise of a keypoint detector
+MIN_OBSERVATIONS = 50  # fewer mean that the cameras do not agree on any points to adjust to
 FUNCTION_TOLERANCE = 1e-6  # relative change of the cost at which a solve ends
-MAX_FRAMES = 100  # a hundred poses, evenly chosen, hold a camera firmly
+MAX_FRAMES = 100  # evenly spaced; a hundred body poses determine a camera well
 
 
 def adjust(
     cameras: Sequence[Camera], keypoints: np.ndarray, free: Sequence[str], focal: Sequence[str] = ()
 ) -> list[Camera]:
-    """Cameras with the poses of those named in `free`, and the focal lengths of those in `focal`, adjusted to keypoints
-    (C, frames, K, 3). The pixels' aspect stays.
+    """Return the cameras with adjusted poses (those named in `free`) and focal lengths (those named in `focal`), fitted
+    to keypoints (C, frames, K, 3). The pixel aspect ratio stays.
 
-    Where two others are fixed, they alone place the points, and every keypoint of a free camera counts, far off
-    as it may be. Where all are free, the rig is moved as a whole, and scaled, to the old cameras: the world stays.
+    Where at least two other cameras are fixed, they alone triangulate the points, and every keypoint of a free camera
+    counts, however far off. Where all cameras are free, the adjusted rig is aligned to the given cameras by a
+    similarity transform, so that the world frame stays.
     """
     chosen = evenly_spaced(range(keypoints.shape[1]), MAX_FRAMES)
     flat = keypoints[:, chosen].reshape(len(cameras), -1, 3)
-    moving = np.array([camera.name in free for camera in cameras])
-    judges = ~moving if (~moving).sum() >= 2 else np.ones_like(moving)
-    judged = flat.copy()
-    judged[~judges, :, 2] = 0
+    freed = np.array([camera.name in free for camera in cameras])
+    reference = ~freed if (~freed).sum() >= 2 else np.ones_like(freed)
+    reference_keypoints = flat.copy()
+    reference_keypoints[~reference, :, 2] = 0
     adjusted = list(cameras)
     for _ in range(ROUNDS):
         projections = np.stack([camera.projection for camera in adjusted])
-        points_m, _, inliers = triangulate(projections, judged)
+        points_m, _, inliers = triangulate(projections, reference_keypoints)
         residuals_px = reprojection_px(projections, points_m, flat)
-        used = inliers | (~judges[:, None] & (flat[..., 2] > 0) & np.isfinite(residuals_px))
+        used = inliers | (~reference[:, None] & (flat[..., 2] > 0) & np.isfinite(residuals_px))
         if used.sum() < MIN_OBSERVATIONS:
             break
         loss_scale_px = max(LOSS_SCALE_PX, float(np.median(residuals_px[used])))
         adjusted = _bundle_adjust(adjusted, flat, points_m, used, free, focal, loss_scale_px)
-    return align(adjusted, cameras) if moving.all() else adjusted
+    return align(adjusted, cameras) if freed.all() else adjusted
 
 
 def _bundle_adjust(
@@ -55,7 +56,7 @@ def _bundle_adjust(
     focal: Sequence[str],
     loss_scale_px: float,
 ) -> list[Camera]:
-    """One solve over the used observations (C, K): every (frame, joint) a point, one image per camera."""
+    """Solve once over the used observations (C, K): each (frame, joint) is a point, each camera one image."""
     scene = pycolmap.Reconstruction()
     config = pycolmap.BundleAdjustmentConfig()
     for i, camera in enumerate(cameras, start=1):
@@ -75,11 +76,13 @@ def _bundle_adjust(
     options.ceres.loss_function_scale = loss_scale_px
     options.ceres.solver_options.function_tolerance = FUNCTION_TOLERANCE
     pycolmap.create_default_ceres_bundle_adjuster(options, config, scene).solve()
-    return [_solved(scene, i, camera) if camera.name in free else camera for i, camera in enumerate(cameras, start=1)]
+    return [
+        _solved_camera(scene, i, camera) if camera.name in free else camera for i, camera in enumerate(cameras, start=1)
+    ]
 
 
 def _add_image(scene: pycolmap.Reconstruction, number: int, camera: Camera, keypoints_px: np.ndarray) -> None:
-    """A camera with one focal length: y is scaled by the pixels' aspect fx / fy."""
+    """Add a camera with one focal length to the scene; y is scaled by the pixel aspect ratio fx / fy."""
     aspect = np.array([1, camera.K[0, 0] / camera.K[1, 1]])
     fx, cx, cy = camera.K[0, 0], camera.K[0, 2], camera.K[1, 2] * aspect[1]
     size = {"width": camera.width_px, "height": camera.height_px}
@@ -90,17 +93,17 @@ def _add_image(scene: pycolmap.Reconstruction, number: int, camera: Camera, keyp
     scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(camera.R), camera.t_m))
 
 
-def _solved(scene: pycolmap.Reconstruction, number: int, camera: Camera) -> Camera:
+def _solved_camera(scene: pycolmap.Reconstruction, number: int, camera: Camera) -> Camera:
     pose, zoom = scene.image(number).cam_from_world(), scene.camera(number).params[0] / camera.K[0, 0]
     K = camera.K * np.array([[zoom, zoom, 1], [1, zoom, 1], [1, 1, 1]])
     return dataclasses.replace(camera, K=K, R=pose.rotation.matrix(), t_m=np.array(pose.translation))
 
 
 def align(cameras: Sequence[Camera], to: Sequence[Camera]) -> list[Camera]:
-    """The rig moved as a whole, turned and scaled, so that it lies nearest to another pose of the same cameras.
+    """Return the rig after the similarity transform that brings it closest to another estimate of the same cameras.
 
-    World rotation: chordal mean of R_to^T R (Hartley et al. 2013, Rotation Averaging, section 5); scale and shift:
-    least squares on the centres.
+    The world rotation is the chordal mean of R_to^T R (Hartley et al. 2013, Rotation Averaging, section 5); scale and
+    translation are least squares on the camera centres.
     """
     turns = Rotation.from_matrix(np.stack([old.R.T @ new.R for new, old in zip(cameras, to, strict=True)]))
     world = turns.mean().as_matrix()

@@ -1,4 +1,4 @@
-"""Can these cameras be trusted? Checks that stop, measures that are reported, and refinement where needed."""
+"""Check of the given cameras: errors that stop the run, measurements for the report, and refinement where needed."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -11,20 +11,20 @@ from hnerf.calibration.diagnosis import (
     UNITS_M,
     USUAL_HEIGHT_M,
     Measure,
-    explain,
+    convention_mistake,
     gross_limit_px,
+    likely_unit,
     measure,
     median_height_px,
     size_ratio,
     undo_mistake,
-    unit_of,
 )
 from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.monocular import ground_reasons, intrinsics_reasons
 from hnerf.calibration.refine import refine
 from hnerf.calibration.report import CalibrationReport, CameraVerdict
 from hnerf.calibration.sizes import size_reasons
-from hnerf.calibration.synchronise import Timing, measure_timing, put_in_step
+from hnerf.calibration.synchronise import Timing, measure_timing, synchronise_capture
 from hnerf.capture.capture import Capture
 from hnerf.capture.subject import subject_keypoints
 from hnerf.config import CalibrationSettings
@@ -32,16 +32,17 @@ from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 COINCIDENT_M = 0.005
-COMMON_HEIGHT_M = (1.4, 2.05)  # of adults; others are children, or in another unit
-UPRIGHT = 0.5  # mean cosine between the trunk and up, below which somebody lies or bends all the time, or up is not up
-RESIDUAL_SHARE = 0.014  # of the person's height: 5 px of 357
-REJECT_FACTOR = 2.0  # times `max_residual_px`: a camera so far off, that no refinement brought back, is not used
+COMMON_HEIGHT_M = (1.4, 2.05)  # of adults; outside, the person is a child or the unit is wrong
+MIN_UPRIGHT_COSINE = 0.5  # mean cosine between trunk and up; below it the person lies or bends, or `up` is wrong
+RESIDUAL_SHARE = 0.014  # of the person's height in pixels: 5 px of 357 px
+REJECT_FACTOR = 2.0  # times `max_residual_px`: a camera that is still further off after refinement is not used
 
 
 def check_calibration(capture: Capture, settings: CalibrationSettings) -> CalibrationReport:
-    """Judge the training cameras by the subject's keypoints; undo, synchronise and refine what held-out frames prove.
+    """Judge the training cameras by the subject's keypoints. Undo mistakes, synchronise and refine where held-out
+    frames prove an improvement.
 
-    Raises InputError, naming the likely cause, on a calibration that no person can have been seen with.
+    Raises InputError, naming the likely cause, if no person can have been recorded with this calibration.
     """
     if not capture.has_keypoints and capture.given_poses():
         return _unchecked(capture)
@@ -49,22 +50,22 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
     given = [capture.cameras[name] for name in capture.train_cameras]
     if len(given) == 1:
         return _monocular(capture, keypoints[0])
-    settings = _for_size(settings, median_height_px(keypoints))
+    settings = _scale_residual_limit(settings, median_height_px(keypoints))
     before = measure(given, keypoints)
     _check_convention(capture, given, keypoints, before)
     cameras, mistakes = undo_mistake(given, keypoints)
     _check_height(capture, measure(cameras, keypoints) if mistakes else before)
-    in_step, held_out_px, notes = put_in_step(capture, cameras, keypoints, settings)
-    keypoints = keypoints if in_step is capture else _keypoints(in_step)
-    witnesses = Evidence.of(in_step, keypoints)
-    refinement = refine(in_step, cameras, keypoints, witnesses.outlines, witnesses.matches, settings)
+    synchronised, held_out_px, notes = synchronise_capture(capture, cameras, keypoints, settings)
+    keypoints = keypoints if synchronised is capture else _keypoints(synchronised)
+    evidence = Evidence.of(synchronised, keypoints)
+    refinement = refine(synchronised, cameras, keypoints, evidence.outlines, evidence.matches, settings)
     used = refinement.cameras
     after = measure(used, keypoints)
     _check_agreement(capture, after, settings)
-    timing = measure_timing(used, keypoints, in_step.frames)
+    timing = measure_timing(used, keypoints, synchronised.frames)
     verdicts = {}
     for old, new in zip(given, used, strict=True):
-        name, offset = old.name, in_step.frame_offsets.get(old.name, 0.0)
+        name, offset = old.name, synchronised.frame_offsets.get(old.name, 0.0)
         reasons = size_reasons(capture, name) + intrinsics_reasons(old) + _fit_reasons(name, before, settings)
         reasons += [f"{mistakes[name]}: undone"] if name in mistakes else []
         reasons += [_timing_reason(offset, timing[name]), *_change_reasons(old, new), refinement.reasons[name]]
@@ -84,12 +85,13 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
         refinement.outlines_px,
         tuple(notes),
         capture.up,
-        witnesses,
+        evidence,
     )
 
 
 def _keypoints(capture: Capture) -> np.ndarray:
-    """The subject's keypoints in the training cameras, (C, frames, 25, 3); InputError where a camera has none."""
+    """Return the subject's keypoints in the training cameras, (C, frames, 25, 3). Raises InputError if a camera has
+    none."""
     found = subject_keypoints(capture)
     for name, seen in found.items():
         if not (seen[..., 2] > 0).any():
@@ -99,81 +101,83 @@ def _keypoints(capture: Capture) -> np.ndarray:
     return np.stack([found[name] for name in capture.train_cameras])
 
 
-def _for_size(settings: CalibrationSettings, height_px: float) -> CalibrationSettings:
-    """Residuals that a person of this height may leave: what detectors err grows with him."""
+def _scale_residual_limit(settings: CalibrationSettings, height_px: float) -> CalibrationSettings:
+    """Return the settings with a residual limit for a person of this height: detector errors grow with the person's
+    size in pixels."""
     return settings.model_copy(update={"max_residual_px": max(settings.max_residual_px, RESIDUAL_SHARE * height_px)})
 
 
 def _check_convention(capture: Capture, cameras: Sequence[Camera], keypoints: np.ndarray, found: Measure) -> None:
-    """InputError if the rig as a whole follows another convention or is of pictures of another size, or two cameras
-    stand at one place.
+    """Raise InputError if the whole rig follows another convention, its intrinsics are for another image size, or two
+    cameras share a position.
 
-    Conventions come first: the centres of an inverted ring of cameras coincide. In a wrong unit all are near, which is
-    for `_check_height` to say.
+    Conventions are checked first, because the centres of an inverted ring of cameras coincide. In a wrong unit all
+    centres are close to each other, which is left to `_check_height`.
     """
     if found.cost_px > gross_limit_px(keypoints):
         off = f"{capture.name}: keypoints are off by {found.cost_px:.0f} px"
-        if cause := explain(cameras, keypoints):
+        if cause := convention_mistake(cameras, keypoints):
             raise InputError(
                 f"{off} because {cause}; write world to camera, x_camera = R x_world + T, y down, z forward"
             )
         if ratio := size_ratio(cameras, keypoints):
             raise InputError(
-                f"{off} because intrinsics and keypoints are of pictures of different sizes (K times {ratio:.2f} would "
-                "fit); give both in the pixels of these pictures"
+                f"{off} because intrinsics and keypoints are for images of different sizes (K times {ratio:.2f} would "
+                "fit); give both in the pixels of these images"
             )
     for a, b in combinations(cameras, 2):
-        if np.linalg.norm(a.centre_m - b.centre_m) < COINCIDENT_M and not unit_of(found.body_height_m):
+        if np.linalg.norm(a.centre_m - b.centre_m) < COINCIDENT_M and not likely_unit(found.body_height_m):
             raise InputError(
                 f"{capture.name}: cameras {a.name} and {b.name} stand at one place; give each its own extrinsics"
             )
 
 
 def _check_height(capture: Capture, found: Measure) -> None:
-    """InputError if the person would be a giant or a dwarf, naming the unit that makes him one of us."""
+    """Raise InputError if the person's height is impossible, naming the unit in which it would be plausible."""
     low, high = BODY_HEIGHT_M
     if low <= found.body_height_m <= high or np.isnan(found.body_height_m):
         return
-    unit = unit_of(found.body_height_m)
+    unit = likely_unit(found.body_height_m)
     cause = f"the translations look like {unit}; " if unit else ""
     factor = UNITS_M[unit] if unit else USUAL_HEIGHT_M / found.body_height_m
     raise InputError(
-        f"{capture.name}: the person would be {found.body_height_m:.4g} m tall; {cause}{_other_units(factor)}"
+        f"{capture.name}: the person would be {found.body_height_m:.4g} m tall; {cause}{_unit_advice(factor)}"
     )
 
 
 def _height_notes(height_m: float) -> list[str]:
-    """How tall the person is, and what to do if that is not so."""
+    """Return a note on the person's height and, where it is unusual, on what to do if it is wrong."""
     low, high = COMMON_HEIGHT_M
     if np.isnan(height_m):
         return []
-    doubt = f": if that is wrong, {_other_units(USUAL_HEIGHT_M / height_m)}" if not low <= height_m <= high else ""
+    doubt = f": if that is wrong, {_unit_advice(USUAL_HEIGHT_M / height_m)}" if not low <= height_m <= high else ""
     return [f"the person is {height_m:.2f} m tall{doubt}"]
 
 
-def _other_units(factor: float) -> str:
+def _unit_advice(factor: float) -> str:
     return f'in capture.toml multiply units ("m" is 1, "mm" 0.001) by {factor:.4g}'
 
 
 def _upright_notes(points_m: np.ndarray, up: str) -> list[str]:
-    """What is odd about the trunk's direction, mid-hip to neck of points (frames, 25, 3), against the world's `up`."""
+    """Return a note if the trunk, from mid-hip to neck of points (frames, 25, 3), does not point along the world's
+    `up`."""
     trunk_m = points_m[:, 1] - points_m[:, 8]
     trunk_m = trunk_m[np.isfinite(trunk_m).all(1)]
     if not len(trunk_m):
         return []
     mean = (trunk_m / np.linalg.norm(trunk_m, axis=1, keepdims=True)).mean(0)
-    if mean["xyz".index(up)] > UPRIGHT:
+    if mean["xyz".index(up)] > MIN_UPRIGHT_COSINE:
         return []
     axis = int(np.abs(mean).argmax())
     found = f"{'-' if mean[axis] < 0 else '+'}{'xyz'[axis]}"
     return [
-        f"from hips to neck is {found} mostly, not up (+{up}): unless the person lies or bends, set up in capture.toml "
-        "(y or z), or calibrate again with a world that stands upright"
+        f"the trunk mostly points along {found}, not up (+{up}): unless the person lies or bends, set up in "
+        "capture.toml (y or z), or calibrate again with a world that stands upright"
     ]
 
 
 def _check_agreement(capture: Capture, found: Measure, settings: CalibrationSettings) -> None:
-    """InputError if no set of cameras agrees on the person."""
+    """Raise InputError if no set of cameras agrees on the person."""
     if min(found.cost_px, *found.cost_without_px.values(), np.inf) > REJECT_FACTOR * settings.max_residual_px:
         raise InputError(
             f"{capture.name}: the cameras do not see one person (keypoints off by {found.cost_px:.0f} px) and no known "
@@ -183,7 +187,7 @@ def _check_agreement(capture: Capture, found: Measure, settings: CalibrationSett
 
 
 def _fit_reasons(name: str, before: Measure, settings: CalibrationSettings) -> list[str]:
-    """What is wrong with a camera as given."""
+    """Return, in words, what is wrong with a camera as given."""
     reasons = []
     if before.median_px[name] > settings.max_residual_px:
         reasons.append(
@@ -196,7 +200,8 @@ def _fit_reasons(name: str, before: Measure, settings: CalibrationSettings) -> l
 
 
 def _timing_reason(offset_frames: float, left: Timing) -> str:
-    """What is known about a camera's offset in time: as corrected, and as measured after that."""
+    """Return, in words, what is known about a camera's time offset: as corrected, and as measured after the
+    correction."""
     if offset_frames:
         return f"out of step by {offset_frames:+.2f} +- {left.error_frames:.2f} frames: corrected"
     if left.reason:
@@ -205,7 +210,7 @@ def _timing_reason(offset_frames: float, left: Timing) -> str:
 
 
 def _change_reasons(old: Camera, new: Camera) -> list[str]:
-    """By how much a camera was changed."""
+    """Return, in words, by how much a camera was changed."""
     if new is old:
         return []
     turned_deg = np.rad2deg(np.linalg.norm(cv2.Rodrigues(new.R @ old.R.T)[0]))
@@ -225,7 +230,7 @@ def _verdict(
     reasons: list[str],
     settings: CalibrationSettings,
 ) -> CameraVerdict:
-    """One training camera's; worse than `status` where its residuals are still too large."""
+    """Return one training camera's verdict; it is worse than `status` where the residuals are still too large."""
     if after.median_px[name] > settings.max_residual_px:
         status = "suspect"
         reasons = [*reasons, f"as used, median residual is still {after.median_px[name]:.1f} px"]
@@ -245,7 +250,8 @@ def _verdict(
 
 
 def _unchecked(capture: Capture) -> CalibrationReport:
-    """Poses are given, but nothing was detected that could speak for or against the cameras they were fitted with."""
+    """Return the report of a recording with given body poses and no keypoints: nothing was detected that could check
+    the cameras."""
     notes = ("not checked: the recording has no keypoints; cameras are used as given, with the poses given for them",)
     verdicts = {
         name: CameraVerdict(
@@ -257,7 +263,7 @@ def _unchecked(capture: Capture) -> CalibrationReport:
 
 
 def _monocular(capture: Capture, keypoints: np.ndarray) -> CalibrationReport:
-    """One camera: nothing to triangulate with. keypoints (frames, 25, 3)."""
+    """Return the report of a single camera, where nothing can be triangulated. keypoints (frames, 25, 3)."""
     name = capture.train_cameras[0]
     shown = int((keypoints[..., 2] > 0).any(1).sum())
     notes = (

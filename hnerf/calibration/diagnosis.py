@@ -1,4 +1,5 @@
-"""What keypoints say about a calibration: residuals, the camera that does not fit, the mistake that explains it all."""
+"""Residuals of keypoints under a calibration, the camera that does not fit the others, and the convention mistake that
+explains large residuals."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -9,19 +10,19 @@ from hnerf.capture.subject import person_heights_px
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import reprojection_px, triangulate
 
-TRIM = 0.8  # share of the residuals that count; the rest are detector errors
+TRIM = 0.8  # share of the residuals that count; the rest are taken for detector errors
 BODY_HEIGHT_M = (0.5, 2.3)
 USUAL_HEIGHT_M = 1.7
 UNITS_M = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "metres declared as millimetres": 1e3}
 GROSS_SHARE = 0.05  # of the person's height in the image: beyond this a calibration is wrong, not stale
-MISFIT_SHARE = 0.8  # the camera without which the trimmed cost falls under this share does not fit the others
+MISFIT_SHARE = 0.8  # a camera is a misfit if the trimmed cost without it falls below this share
 MISFIT_SHARE_OF_THREE = 0.6  # two cameras left agree more easily
 
 # BODY_25: ankle-knee, knee-hip, hips-neck and neck-nose make 0.87 of an adult's stature (Winter 2009, figure 4.1).
 LIMB_CHAIN = (((11, 10), (14, 13)), ((10, 9), (13, 12)), ((8, 1),), ((1, 0),))
 CHAIN_SHARE_OF_STATURE = 0.87
 
-MISTAKES: dict[str, Callable[[Camera], Camera]] = {  # what was done, and what undoes it
+MISTAKES: dict[str, Callable[[Camera], Camera]] = {  # by the mistake: the function that undoes it
     "the extrinsics are camera to world (inverted)": lambda c: dataclasses.replace(c, R=c.R.T, t_m=-c.R.T @ c.t_m),
     "R is transposed": lambda c: dataclasses.replace(c, R=c.R.T),
     "T is the camera's centre": lambda c: dataclasses.replace(c, t_m=-c.R @ c.t_m),
@@ -29,19 +30,22 @@ MISTAKES: dict[str, Callable[[Camera], Camera]] = {  # what was done, and what u
         c, R=np.diag([1, -1, -1]) @ c.R, t_m=np.diag([1, -1, -1]) @ c.t_m
     ),
 }
-MISTAKES_OF_ONE: dict[str, Callable[[Camera], Camera]] = {  # in all cameras they only scale the world
+SINGLE_CAMERA_MISTAKES: dict[
+    str, Callable[[Camera], Camera]
+] = {  # made in all cameras, they would only scale the world
     f"T is in {unit}": lambda c, metres=metres: dataclasses.replace(c, t_m=metres * c.t_m)  # type: ignore[misc]
     for unit, metres in UNITS_M.items()
 }
 
-SIZE_RATIOS = np.geomspace(1 / 5, 5, 161)  # of pictures; within 2 % of each other
-OTHER_SIZE = 1.2  # times as large or small: nearer to 1, a refined K may be as good
+SIZE_RATIOS = np.geomspace(1 / 5, 5, 161)  # of image sizes, in steps of 2 %
+OTHER_SIZE = 1.2  # least factor either way: closer to 1, a refined K may be as good
 
 
 @dataclasses.dataclass(frozen=True)
 class Measure:
-    """How well cameras agree on the subject. Per camera by name: median_px, p95_px (robust triangulation), and
-    cost_without_px (the others' trimmed cost; empty with fewer than three cameras). points_m (frames, 25, 3)."""
+    """Agreement of the cameras on the subject. Per camera by name: median_px, p95_px (robust triangulation) and
+    cost_without_px, the trimmed cost of the other cameras (empty with fewer than three cameras). points_m (frames, 25,
+    3)."""
 
     median_px: dict[str, float]
     p95_px: dict[str, float]
@@ -52,18 +56,21 @@ class Measure:
 
     @property
     def misfit(self) -> str | None:
-        """The camera whose removal lowers the trimmed cost most, if the others agree far better without it."""
+        """The camera whose removal lowers the trimmed cost most, if the others agree far better without it; else
+        None."""
         share = MISFIT_SHARE_OF_THREE if len(self.cost_without_px) == 3 else MISFIT_SHARE
         worst = min(self.cost_without_px, key=self.cost_without_px.__getitem__, default=None)
         return worst if worst and self.cost_without_px[worst] < share * self.cost_px else None
 
 
 def measure(cameras: Sequence[Camera], keypoints: np.ndarray) -> Measure:
-    """Residuals of keypoints (C, frames, 25, 3) under these cameras; two cameras at least."""
+    """Measure the residuals of keypoints (C, frames, 25, 3) under at least two cameras."""
     flat = keypoints.reshape(len(cameras), -1, 3)
     points_m, residuals_px, _ = triangulate(np.stack([camera.projection for camera in cameras]), flat)
     points_m = points_m.reshape(*keypoints.shape[1:3], 3)
-    off_px = max(float(np.hypot(camera.width_px, camera.height_px)) for camera in cameras)  # where nothing is in front
+    off_px = max(
+        float(np.hypot(camera.width_px, camera.height_px)) for camera in cameras
+    )  # where no point is in front of the camera
     found = {camera.name: row[np.isfinite(row)] for camera, row in zip(cameras, residuals_px, strict=True)}
     return Measure(
         median_px={name: float(np.median(row)) if len(row) else off_px for name, row in found.items()},
@@ -76,11 +83,11 @@ def measure(cameras: Sequence[Camera], keypoints: np.ndarray) -> Measure:
 
 
 def trimmed_cost_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> float:
-    """Mean over cameras of the mean of the lowest four fifths of the distances of its keypoints (C, K, 3) to points
-    solved from all their views.
+    """Return the mean over cameras of the trimmed mean (lowest four fifths) of the reprojection errors of keypoints (C,
+    K, 3).
 
-    No view is left out of the points, nor a camera trimmed away as a whole: none can hide. Behind a camera that sees
-    it, a point costs that image's diagonal.
+    Points are triangulated from all views: no view is rejected and no camera is trimmed away as a whole, so that none
+    can hide. A point behind a camera that sees it costs the diagonal of that camera's image.
     """
     projections = np.stack([camera.projection for camera in cameras])
     seen = keypoints[..., 2] > 0
@@ -93,15 +100,16 @@ def trimmed_cost_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> float:
 
 
 def trimmed_mean(values: np.ndarray, share: float) -> float:
-    """Mean of the lowest share of the finite values; infinite where there are none."""
+    """Return the mean of the lowest `share` of the finite values; infinity if there are none."""
     ordered = np.sort(values[np.isfinite(values)])
     return float(ordered[: max(1, int(share * len(ordered)))].mean()) if len(ordered) else np.inf
 
 
 def cost_without_each_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> dict[str, float]:
-    """Trimmed cost of the other cameras when one is left out, by that one's name; needs three cameras.
+    """Return the trimmed cost of the other cameras when one is left out, by the name of that one; needs three cameras.
 
-    A point in n views leaves 2n - 3 degrees of freedom in 2n residuals: the costs are scaled to what all would show.
+    A point in n views leaves 2n - 3 degrees of freedom in 2n residuals; the costs are scaled to what all cameras would
+    show.
     """
     count = len(cameras)
     scale = np.sqrt((2 * count - 3) / (2 * count)) / np.sqrt((2 * count - 5) / (2 * count - 2))
@@ -113,8 +121,8 @@ def cost_without_each_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> di
 
 
 def body_height_m(points_m: np.ndarray) -> float:
-    """Stature from triangulated BODY_25 keypoints (frames, 25, 3): medians of limb lengths, whatever the pose. NaN if a
-    limb is never seen."""
+    """Return the stature from triangulated BODY_25 keypoints (frames, 25, 3), as a sum of median limb lengths, whatever
+    the pose; NaN if a limb is never seen."""
     chain = 0.0
     for bones in LIMB_CHAIN:
         lengths = np.concatenate([np.linalg.norm(points_m[:, a] - points_m[:, b], axis=-1) for a, b in bones])
@@ -122,27 +130,27 @@ def body_height_m(points_m: np.ndarray) -> float:
     return chain / CHAIN_SHARE_OF_STATURE
 
 
-def unit_of(height: float) -> str | None:
-    """The unit in which a body of this height, out of range in metres, would be a person; None if there is none."""
+def likely_unit(height: float) -> str | None:
+    """Return the unit in which a height that is impossible in metres would be a person's; None if there is none."""
     heights_m = {unit: height * metres for unit, metres in UNITS_M.items()}
     possible = [unit for unit, metres in heights_m.items() if BODY_HEIGHT_M[0] <= metres <= BODY_HEIGHT_M[1]]
     return min(possible, key=lambda unit: abs(np.log(heights_m[unit] / USUAL_HEIGHT_M)), default=None)
 
 
 def gross_limit_px(keypoints: np.ndarray) -> float:
-    """The trimmed cost beyond which a calibration is wrong rather than stale. keypoints (C, frames, 25, 3)."""
+    """Return the trimmed cost beyond which a calibration is wrong rather than stale. keypoints (C, frames, 25, 3)."""
     return GROSS_SHARE * median_height_px(keypoints)
 
 
 def median_height_px(keypoints: np.ndarray) -> float:
-    """Of the person, over all pictures. keypoints (C, frames, 25, 3)."""
+    """Return the person's median height over all images. keypoints (C, frames, 25, 3)."""
     heights = person_heights_px(keypoints.reshape(-1, 25, 3))
     return float(np.median(heights[heights > 0]))
 
 
-def explain(cameras: Sequence[Camera], keypoints: np.ndarray) -> str | None:
-    """The mistakes of convention that, undone in all cameras, make the calibration fit keypoints (C, frames, 25, 3),
-    joined by "or" where the views cannot tell them apart; None if none does."""
+def convention_mistake(cameras: Sequence[Camera], keypoints: np.ndarray) -> str | None:
+    """Return the convention mistakes that, undone in all cameras, make the calibration fit keypoints (C, frames, 25,
+    3), joined by "or" where the views cannot tell them apart; None if none does."""
     flat, limit_px = keypoints.reshape(len(cameras), -1, 3), gross_limit_px(keypoints)
     explaining = [
         cause for cause, undo in MISTAKES.items() if trimmed_cost_px([undo(c) for c in cameras], flat) <= limit_px
@@ -151,25 +159,28 @@ def explain(cameras: Sequence[Camera], keypoints: np.ndarray) -> str | None:
 
 
 def size_ratio(cameras: Sequence[Camera], keypoints: np.ndarray) -> float | None:
-    """How many times as large all K would have to be, those of pictures of another size, for the calibration to fit
-    keypoints (C, frames, 25, 3); None if that is near 1 or none fits, and where one camera may be to blame: of three
-    or more if the others agree, of two always."""
+    """Return the factor for all K, calibrated at another image size, that makes the calibration fit keypoints (C,
+    frames, 25, 3).
+
+    None if the factor is close to 1, if none fits, or if a single camera may be to blame: with three or more cameras if
+    the others agree without it, with two cameras always.
+    """
     flat, limit_px = keypoints.reshape(len(cameras), -1, 3), gross_limit_px(keypoints)
     if len(cameras) < 3 or min(cost_without_each_px(cameras, flat).values()) <= limit_px:
         return None
-    costs_px = [trimmed_cost_px([_of_other_size(c, ratio) for c in cameras], flat) for ratio in SIZE_RATIOS]
+    costs_px = [trimmed_cost_px([_scale_intrinsics(c, ratio) for c in cameras], flat) for ratio in SIZE_RATIOS]
     best = int(np.argmin(costs_px))
     ratio = float(SIZE_RATIOS[best])
     return ratio if costs_px[best] <= limit_px and max(ratio, 1 / ratio) > OTHER_SIZE else None
 
 
-def _of_other_size(camera: Camera, ratio: float) -> Camera:
+def _scale_intrinsics(camera: Camera, ratio: float) -> Camera:
     return dataclasses.replace(camera, K=np.diag([ratio, ratio, 1]) @ camera.K)
 
 
 def undo_mistake(cameras: list[Camera], keypoints: np.ndarray) -> tuple[list[Camera], dict[str, str]]:
-    """The cameras with one's mistake undone, and that mistake by the camera's name, where this alone makes a grossly
-    wrong camera fit keypoints (C, frames, 25, 3). Two mistakes that come to the same are joined by "or"."""
+    """Return the cameras with one camera's mistake undone, and that mistake by the camera's name, if this alone makes a
+    grossly wrong camera fit keypoints (C, frames, 25, 3). Mistakes with the same effect are joined by "or"."""
     flat, limit_px = keypoints.reshape(len(cameras), -1, 3), gross_limit_px(keypoints)
     gross = np.flatnonzero(_medians_px(cameras, flat) > limit_px)
     if len(cameras) < 3 or len(gross) == 0:
@@ -177,7 +188,7 @@ def undo_mistake(cameras: list[Camera], keypoints: np.ndarray) -> tuple[list[Cam
     undone = {
         (i, cause): [*cameras[:i], undo(cameras[i]), *cameras[i + 1 :]]
         for i in gross
-        for cause, undo in (MISTAKES | MISTAKES_OF_ONE).items()
+        for cause, undo in (MISTAKES | SINGLE_CAMERA_MISTAKES).items()
     }
     medians_px = {what: _medians_px(repaired, flat) for what, repaired in undone.items()}
     costs_px = {what: medians.sum() for what, medians in medians_px.items() if medians.max() <= limit_px}
@@ -189,8 +200,8 @@ def undo_mistake(cameras: list[Camera], keypoints: np.ndarray) -> tuple[list[Cam
 
 
 def _medians_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> np.ndarray:
-    """Median residual of each camera (C,) against robustly triangulated keypoints (C, K, 3); infinitely far are points
-    behind it."""
+    """Return the median residual (C,) of each camera against robustly triangulated keypoints (C, K, 3); points behind a
+    camera count as infinitely far."""
     points_m, residuals_px, _ = triangulate(np.stack([camera.projection for camera in cameras]), keypoints)
     judged = (keypoints[..., 2] > 0) & np.isfinite(points_m).all(1)
     off_px = np.where(np.isfinite(residuals_px), residuals_px, np.inf)

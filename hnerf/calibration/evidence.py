@@ -1,4 +1,4 @@
-"""What keypoints, outlines and the picture itself say of each camera, side by side."""
+"""Evidence about each camera: residuals of keypoints, silhouettes and image matches, side by side."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hnerf.calibration.boards.calibrate import board_witness
+from hnerf.calibration.boards.calibrate import board_evidence
 from hnerf.calibration.diagnosis import Measure
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.silhouettes import Outlines
@@ -19,10 +19,10 @@ NO_MATCHES = "no overlap: no matches"
 
 @dataclasses.dataclass(frozen=True)
 class Evidence:
-    """The evidence, gathered once, by which any pose of the training cameras can be judged.
+    """Evidence by which any poses of the training cameras can be judged, collected once.
 
-    keypoints (C, frames, 25, 3) of the subject in `capture`; outlines: None if there are no masks; boards: what
-    `board_witness` says of the cameras as given, None without footage of a calibration board.
+    keypoints (C, frames, 25, 3) of the subject in `capture`. outlines: None if there are no masks. boards: the result
+    of `board_evidence` for the cameras as given, None without footage of a calibration board.
     """
 
     capture: Capture
@@ -33,12 +33,13 @@ class Evidence:
 
     @staticmethod
     def of(capture: Capture, keypoints: np.ndarray) -> "Evidence":
-        """With what the pictures show beside the keypoints."""
+        """Collect the evidence of a capture: the given keypoints, and what its images show."""
         outlines, matches = Outlines.of(capture), Matches.of(capture)
-        return Evidence(capture, keypoints, outlines, matches, board_witness(capture))
+        return Evidence(capture, keypoints, outlines, matches, board_evidence(capture))
 
-    def plain(self, cameras: Sequence[Camera], found: Measure) -> dict[str, Any]:
-        """What each witness says of each of these cameras, in pixels; `found`: what `measure` says of them."""
+    def summarise(self, cameras: Sequence[Camera], found: Measure) -> dict[str, Any]:
+        """Return the residuals in pixels of each kind of evidence for each of these cameras. found: what `measure`
+        returns for them."""
         outlines_px = self.outlines.residuals_px(cameras) if self.outlines else {}
         matches_px = self.matches.residuals_px(cameras)
         names = [camera.name for camera in cameras]
@@ -60,7 +61,8 @@ def _keypoints(name: str, found: Measure) -> dict[str, Any]:
 
 
 def _silhouettes(residuals_px: np.ndarray) -> dict[str, Any]:
-    """Most rays pass through the middle of the others' hull, so mean and tail tell more than the median."""
+    """Summarise the residuals of one camera's outline. Most rays pass through the middle of the other cameras' visual
+    hull, so mean and tail say more than the median."""
     if len(residuals_px) == 0:
         return {"rays": 0}
     return {

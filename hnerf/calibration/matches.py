@@ -1,4 +1,4 @@
-"""The third witness: points of the picture itself, background and person, that two cameras see (SIFT)."""
+"""Image matches: SIFT correspondences between cameras, on the background and on the person."""
 
 import dataclasses
 import logging
@@ -17,22 +17,23 @@ MIN_MATCHES = 15  # and a share: a fundamental matrix fits some wrong matches by
 MIN_INLIERS = 0.3
 
 log = logging.getLogger("hnerf.calibration")
-pycolmap.logging.minloglevel = 1  # warnings; not which device SIFT takes
+pycolmap.logging.minloglevel = 1  # warnings only: SIFT otherwise logs which device it uses
 
 
 @dataclasses.dataclass(frozen=True)
 class Matches:
-    """Verified matches by pair of cameras that overlap: (n, 2, 2) pixels, in the first and in the second camera; in
-    images of this frame."""
+    """Verified matches by pair of overlapping cameras: (n, 2, 2) pixels, in the first and in the second camera, in the
+    images of one frame."""
 
     by_pair: dict[tuple[str, str], np.ndarray]
     frame: int
 
     @staticmethod
     def of(capture: Capture) -> "Matches":
-        """Of the training cameras at one instant; no pairs where cameras stand too far apart, which is no fault.
+        """Match the training cameras' images of one frame. Cameras too far apart to match have no pair, which is no
+        fault.
 
-        A pair is verified by a fundamental matrix of its own and not by the calibration, which is on trial.
+        A pair is verified by a fundamental matrix of its own, not by the calibration, which is what is being checked.
         """
         names, frame = capture.train_cameras, capture.frames[len(capture.frames) // 2]
         log.info("SIFT in %d cameras", len(names))
@@ -40,11 +41,14 @@ class Matches:
         matcher = pycolmap.FeatureMatcher.create(pycolmap.FeatureMatchingOptions(use_gpu=False))
         grey = {name: cv2.cvtColor(capture.image(name, frame), cv2.COLOR_RGB2GRAY) for name in names}
         features = {name: extractor.extract_from_uint8_array(image) for name, image in grey.items()}
-        verified = {(a, b): _verified(_matched(matcher, features[a], features[b])) for a, b in combinations(names, 2)}
+        verified = {
+            (a, b): _verified_matches(_match_features(matcher, features[a], features[b]))
+            for a, b in combinations(names, 2)
+        }
         return Matches({pair: matched for pair, matched in verified.items() if len(matched)}, frame)
 
     def residuals_px(self, cameras: Sequence[Camera]) -> dict[tuple[str, str], np.ndarray]:
-        """Sampson distances of each pair's matches under these cameras, (n,) pixels."""
+        """Return the Sampson distances of each pair's matches under these cameras, (n,) pixels."""
         named = {camera.name: camera for camera in cameras}
         return {
             (a, b): sampson_px(fundamental(named[a], named[b]), matched)
@@ -54,34 +58,35 @@ class Matches:
 
 
 def fundamental(a: Camera, b: Camera) -> np.ndarray:
-    """F with x_b^T F x_a = 0 (Hartley and Zisserman 2004, eq. 9.1), (3, 3)."""
+    """Return the fundamental matrix F (3, 3) with x_b^T F x_a = 0 (Hartley and Zisserman 2004, eq. 9.1)."""
     R = b.R @ a.R.T
     x, y, z = b.t_m - R @ a.t_m
     return np.linalg.inv(b.K).T @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R @ np.linalg.inv(a.K)
 
 
 def sampson_px(F: np.ndarray, matched: np.ndarray) -> np.ndarray:
-    """First-order distance of matches (n, 2, 2) to the epipolar constraint, (n,) (ibid., eq. 11.9, its root)."""
+    """Return the first-order distance of matches (n, 2, 2) to the epipolar constraint, (n,) (ibid., root of eq.
+    11.9)."""
     x = np.concatenate([matched, np.ones_like(matched[..., :1])], -1)
     in_b, in_a = x[:, 0] @ F.T, x[:, 1] @ F
     gradient = np.sqrt((in_b[:, :2] ** 2).sum(1) + (in_a[:, :2] ** 2).sum(1))
     return np.abs((x[:, 1] * in_b).sum(1)) / gradient
 
 
-def _matched(
+def _match_features(
     matcher: pycolmap.FeatureMatcher,
     a: tuple[pycolmap.FeatureKeypoints, pycolmap.FeatureDescriptors],
     b: tuple[pycolmap.FeatureKeypoints, pycolmap.FeatureDescriptors],
 ) -> np.ndarray:
-    """(n, 2, 2) pixels."""
+    """Return the matches of two images' features, (n, 2, 2) pixels."""
     rows = matcher.match(*a, *b)
     in_a = [(a[0][int(i)].x, a[0][int(i)].y) for i, _ in rows]
     in_b = [(b[0][int(j)].x, b[0][int(j)].y) for _, j in rows]
     return np.stack([np.reshape(in_a, (-1, 2)), np.reshape(in_b, (-1, 2))], 1) - 0.5  # centres at integers
 
 
-def _verified(matched: np.ndarray) -> np.ndarray:
-    """Those of (n, 2, 2) that a fundamental matrix explains; none if it explains too few."""
+def _verified_matches(matched: np.ndarray) -> np.ndarray:
+    """Return those matches of (n, 2, 2) that a fundamental matrix explains; none if it explains too few."""
     if len(matched) < MIN_MATCHES:
         return matched[:0]
     ransac = pycolmap.RANSACOptions(max_error=INLIER_PX, random_seed=0)

@@ -1,19 +1,21 @@
-"""What can be said of a camera that no other camera checks: its intrinsics, the ground, and the person's size on it."""
+"""Checks of a single camera: its intrinsics, the ground, and the person's height above it."""
 
 import numpy as np
 
 from hnerf.geometry.camera import Camera
 
-FIELD_OF_VIEW_DEG = (10.0, 120.0)  # of the longer side: beyond lies no lens that people are filmed with
-MIDDLE = 1 / 3  # of the image's sides: the principal point of an uncropped picture lies inside
-SQUARE = 0.1  # by how much pixels may differ from square
+FIELD_OF_VIEW_DEG = (10.0, 120.0)  # of the longer side; people are not filmed with lenses beyond this range
+PRINCIPAL_POINT_RANGE = (
+    1 / 3
+)  # of the image's sides: width of the central range in which an uncropped image has its principal point
+MAX_ASPECT_ERROR = 0.1  # of the pixel aspect ratio from 1
 STANDING_M = (1.2, 2.1)
 NOSE, SOLES = 0, (19, 21, 22, 24)  # of BODY_25: big toes and heels
 NOSE_SHARE = 0.92  # of an adult's stature (Winter 2009, figure 4.1: eyes at 0.936)
 
 
 def intrinsics_reasons(camera: Camera) -> list[str]:
-    """What is odd about a camera's intrinsics, in words."""
+    """Return, in words, what is unusual about a camera's intrinsics."""
     focal_px = np.array([camera.K[0, 0], camera.K[1, 1]])
     size_px = np.array([camera.width_px, camera.height_px])
     centre = (camera.K[:2, 2] + 0.5) / size_px
@@ -21,18 +23,18 @@ def intrinsics_reasons(camera: Camera) -> list[str]:
     reasons = []
     if not FIELD_OF_VIEW_DEG[0] <= field_deg <= FIELD_OF_VIEW_DEG[1]:
         reasons.append(f"field of view {field_deg:.0f} degrees: focal length and image size do not belong together")
-    if (np.abs(centre - 0.5) > MIDDLE / 2).any():
+    if (np.abs(centre - 0.5) > PRINCIPAL_POINT_RANGE / 2).any():
         reasons.append(
             f"principal point at {100 * centre[0]:.0f} % of the width and {100 * centre[1]:.0f} % of the height: "
-            "intrinsics of another picture size, or of a cropped picture"
+            "intrinsics of another image size, or of a cropped image"
         )
-    if abs(focal_px[0] / focal_px[1] - 1) > SQUARE:
+    if abs(focal_px[0] / focal_px[1] - 1) > MAX_ASPECT_ERROR:
         reasons.append(f"pixels {focal_px[1] / focal_px[0]:.2f} times as wide as high: the picture is stretched")
     return reasons
 
 
 def ground_reasons(camera: Camera, keypoints: np.ndarray, up: str) -> list[str]:
-    """Whether world height 0 can be the ground under a person seen as keypoints (frames, 25, 3), in words."""
+    """Return, in words, whether world height 0 can be the ground under a person seen as keypoints (frames, 25, 3)."""
     stature_m = stature_on_ground_m(camera, keypoints, up)
     if np.isnan(stature_m):
         return ["world height 0 is not the ground: the camera never sees the person's feet and nose above it"]
@@ -46,10 +48,11 @@ def ground_reasons(camera: Camera, keypoints: np.ndarray, up: str) -> list[str]:
 
 
 def stature_on_ground_m(camera: Camera, keypoints: np.ndarray, up: str) -> float:
-    """Median over frames of the height at which the nose is seen above the standing foot, as a stature; NaN if never.
+    """Return the person's stature if they stand on height 0: the median over frames of the nose's height above the
+    standing foot, divided by NOSE_SHARE; NaN if never seen.
 
-    The standing foot is where a ray to a toe or heel meets height 0 nearest to the camera: those of a lifted foot meet
-    it farther off. keypoints (frames, 25, 3).
+    The standing foot is where a ray to a toe or heel meets height 0 closest to the camera: rays to a lifted foot meet
+    it farther away. keypoints (frames, 25, 3).
     """
     vertical = "xyz".index(up)
     origin = camera.centre_m

@@ -1,4 +1,4 @@
-"""The calibration as a picture: cameras and person from above and from the side, and residuals."""
+"""Plot of the calibration: cameras and person from above and from the side, and residuals."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +24,7 @@ def draw_cameras(
     before: Measure | None,
     after: Measure | None,
 ) -> None:
-    """Write the picture as PNG. `status` by camera; `before`, `after`: what `measure` found, None with one camera."""
+    """Write the plot as PNG. status: by camera name; before, after: what `measure` returned, None with one camera."""
     figure = Figure(figsize=(16, 5.5), layout="constrained")
     above, side, bars = figure.subplots(1, 3)
     vertical = "xyz".index(up)
@@ -48,7 +48,7 @@ def draw_cameras(
 def _draw_scene(
     axes: Axes, cameras: Sequence[Camera], status: dict[str, str], person: np.ndarray, shown: tuple[int, int]
 ) -> None:
-    """Frusta and the person's limbs (frames, 25, 2) in one plane of the world."""
+    """Draw camera frusta and the person's limbs (frames, 25, 2), projected onto one plane of the world."""
     for pose in person[:: max(1, len(person) // SHOWN_FRAMES)]:
         for a, b in LIMBS + FEET:
             axes.plot(*pose[[a, b]].T, color="0.3", linewidth=0.8)

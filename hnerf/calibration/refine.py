@@ -1,4 +1,5 @@
-"""Refinement of cameras, taken only where frames and joints that took no part prove it right, and pictures agree."""
+"""Refinement of cameras, accepted only where held-out frames and joints prove it and the images do not contradict
+it."""
 
 import logging
 from collections.abc import Sequence
@@ -10,21 +11,21 @@ from hnerf.calibration.bundle import adjust
 from hnerf.calibration.diagnosis import measure, trimmed_cost_px
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.silhouettes import Outlines
-from hnerf.calibration.sizes import CHANGES, unexplained
+from hnerf.calibration.sizes import SIZE_CHANGES, size_unexplained
 from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
 from hnerf.geometry.camera import Camera
 
-OUTLINE_NOISE, OUTLINE_NOISE_PX = 0.05, 0.05  # a share, and pixels, by which outlines may fit worse by chance
-MATCH_NOISE_PX = 0.5  # by which matches of a pair of cameras may
+OUTLINE_NOISE, OUTLINE_NOISE_PX = 0.05, 0.05  # by which share, or how many pixels, outlines may fit worse by chance
+MATCH_NOISE_PX = 0.5  # by which the matches of two cameras may fit worse by chance
 
 log = logging.getLogger("hnerf.calibration")
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """Cameras to use; costs in px of everything tried, on held-out frames and of outlines; why, per camera and for the
-    rig."""
+    """Result of a refinement: the cameras to use, the costs in pixels of everything tried (on held-out frames, and of
+    outlines), and the reasons, per camera and for the rig."""
 
     cameras: list[Camera]
     held_out_px: dict[str, float]
@@ -35,10 +36,10 @@ class Refinement:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """Cameras as they could be used, what was done to which of them, and what held-out frames cost with them."""
+    """Candidate cameras, what was changed by camera name, and their cost on held-out frames."""
 
     cameras: list[Camera]
-    done: dict[str, str]
+    changes: dict[str, str]
     cost_px: float
 
 
@@ -50,101 +51,107 @@ def refine(
     matches: Matches,
     settings: CalibrationSettings,
 ) -> Refinement:
-    """Adjust the cameras that do not fit the others; the very `cameras` are returned unless held-out frames gain.
+    """Adjust the cameras that do not fit the others. The given `cameras` themselves are returned unless held-out frames
+    improve.
 
-    Camera by camera, the others fixed; all at once where that asks for more than one, or leaves residuals too large.
-    What matches between two cameras contradict is not taken. keypoints (C, frames, 25, 3).
+    Cameras are freed one by one with the others fixed; all are freed together if more than one needs it or residuals
+    stay too large. A change that the image matches of two cameras contradict is not accepted. keypoints (C, frames, 25,
+    3).
     """
-    keep = 1 - settings.min_improvement
+    cost_factor = 1 - settings.min_improvement
     held_out_px = {"as given": held_out_cost_px(cameras, keypoints, ())}
-    chosen, kept = _one_by_one(cameras, keypoints, matches, keep, held_out_px)
+    chosen, kept = _refine_one_by_one(cameras, keypoints, matches, cost_factor, held_out_px)
     too_large = max(measure(chosen.cameras, keypoints).median_px.values()) > settings.max_residual_px
-    if len(chosen.done) > 1 or too_large:
-        together = _all_at_once(cameras, keypoints, held_out_px)
-        better = together.cost_px < keep * chosen.cost_px
+    if len(chosen.changes) > 1 or too_large:
+        together = _refine_together(cameras, keypoints, held_out_px)
+        better = together.cost_px < cost_factor * chosen.cost_px
         chosen = together if better and not _contradiction(matches, cameras, together.cameras) else chosen
-    if not chosen.done:
+    if not chosen.changes:
         notes = ["refinement did not improve held-out frames: the cameras are used as given"] if too_large else []
         return Refinement(cameras, held_out_px, {}, kept, notes)
-    free = tuple(chosen.done)
-    refined, notes = _resized(capture, chosen.cameras, keypoints, free, keep * chosen.cost_px, held_out_px)
+    free = tuple(chosen.changes)
+    refined, notes = _refine_for_size(
+        capture, chosen.cameras, keypoints, free, cost_factor * chosen.cost_px, held_out_px
+    )
     if refined is not chosen.cameras:
         refined = adjust(refined, keypoints, free)
     outlines_px, refusal = _judge_by_outlines(outlines, cameras, refined)
     if refusal:
         return Refinement(cameras, held_out_px, outlines_px, kept, [refusal])
-    return Refinement(refined, held_out_px, outlines_px, kept | chosen.done, notes)
+    return Refinement(refined, held_out_px, outlines_px, kept | chosen.changes, notes)
 
 
-def _one_by_one(
-    cameras: list[Camera], keypoints: np.ndarray, matches: Matches, keep: float, held_out_px: dict[str, float]
+def _refine_one_by_one(
+    cameras: list[Camera], keypoints: np.ndarray, matches: Matches, cost_factor: float, held_out_px: dict[str, float]
 ) -> tuple[_Candidate, dict[str, str]]:
-    """Free the camera that lets held-out frames gain most, then one more, until two are left or none gains enough.
+    """Free the camera that improves held-out frames most, then one more, until two fixed cameras are left or none
+    improves enough.
 
-    Adds to `held_out_px` what everything cost; returns with the outcome why the other cameras stay as they are.
+    Adds the cost of everything tried to `held_out_px`; also returns the reasons why the other cameras stay as they are.
     """
     kept = {camera.name: "pose kept: it takes two others to judge one camera" for camera in cameras}
-    cost_px, done, zoomed = held_out_px["as given"], dict[str, str](), tuple[str, ...]()
+    cost_px, changes, zoomed = held_out_px["as given"], dict[str, str](), tuple[str, ...]()
     for _ in cameras[2:]:
         tried = {}
-        for name in (camera.name for camera in cameras if camera.name not in done):
-            what = f"pose of {' and '.join([*done, name])} refined"
+        for name in (camera.name for camera in cameras if camera.name not in changes):
+            what = f"pose of {' and '.join([*changes, name])} refined"
             log.info("trying: %s", what)
-            tried[name] = held_out_px[what] = held_out_cost_px(cameras, keypoints, (*done, name), zoomed)
-            kept[name] = f"pose kept: refining it takes held-out frames {_gain(cost_px, tried[name])}"
-            if against := _contradiction(matches, cameras, adjust(cameras, keypoints, (*done, name), zoomed)):
+            tried[name] = held_out_px[what] = held_out_cost_px(cameras, keypoints, (*changes, name), zoomed)
+            kept[name] = f"pose kept: refining it takes held-out frames {_from_to(cost_px, tried[name])}"
+            if against := _contradiction(matches, cameras, adjust(cameras, keypoints, (*changes, name), zoomed)):
                 kept[name] += f", but {against}"
                 del tried[name]
         name = min(tried, key=tried.__getitem__, default="")
-        if not name or tried[name] >= keep * cost_px:
+        if not name or tried[name] >= cost_factor * cost_px:
             break
-        what = f"pose of {' and '.join([*done, name])} and focal length of {name} refined"
-        held_out_px[what] = held_out_cost_px(cameras, keypoints, (*done, name), (*zoomed, name))
-        focal = held_out_px[what] < keep * tried[name]
+        what = f"pose of {' and '.join([*changes, name])} and focal length of {name} refined"
+        held_out_px[what] = held_out_cost_px(cameras, keypoints, (*changes, name), (*zoomed, name))
+        focal = held_out_px[what] < cost_factor * tried[name]
         gained_px = held_out_px[what] if focal else tried[name]
-        done[name] = f"pose {'and focal length ' * focal}refined: held-out frames go {_gain(cost_px, gained_px)}"
+        changes[name] = f"pose {'and focal length ' * focal}refined: held-out frames go {_from_to(cost_px, gained_px)}"
         cost_px, zoomed = gained_px, (*zoomed, name) if focal else zoomed
-    adjusted = adjust(cameras, keypoints, tuple(done), zoomed) if done else cameras
-    return _Candidate(adjusted, done, cost_px), kept
+    adjusted = adjust(cameras, keypoints, tuple(changes), zoomed) if changes else cameras
+    return _Candidate(adjusted, changes, cost_px), kept
 
 
-def _all_at_once(cameras: list[Camera], keypoints: np.ndarray, held_out_px: dict[str, float]) -> _Candidate:
-    """All poses free; adds to `held_out_px` what that cost."""
+def _refine_together(cameras: list[Camera], keypoints: np.ndarray, held_out_px: dict[str, float]) -> _Candidate:
+    """Refine all poses together and add the cost to `held_out_px`."""
     log.info("trying: all poses refined")
     everyone = tuple(camera.name for camera in cameras)
     cost_px = held_out_px["all poses refined"] = held_out_cost_px(cameras, keypoints, everyone)
-    done = f"refined with all others: held-out frames go {_gain(held_out_px['as given'], cost_px)}"
-    return _Candidate(adjust(cameras, keypoints, everyone), dict.fromkeys(everyone, done), cost_px)
+    changes = f"refined with all others: held-out frames go {_from_to(held_out_px['as given'], cost_px)}"
+    return _Candidate(adjust(cameras, keypoints, everyone), dict.fromkeys(everyone, changes), cost_px)
 
 
 def _contradiction(matches: Matches, given: list[Camera], refined: list[Camera]) -> str:
-    """Which pair's matches say that the refinement is wrong; empty where none does."""
+    """Return which pair's matches contradict the refinement, in words; empty if none does."""
     before_px, after_px = matches.residuals_px(given), matches.residuals_px(refined)
     for (a, b), px in after_px.items():
         was_px, is_px = float(np.median(before_px[a, b])), float(np.median(px))
         if is_px > was_px + MATCH_NOISE_PX:
-            return f"matches of {a} and {b} go {_gain(was_px, is_px)}"
+            return f"matches of {a} and {b} go {_from_to(was_px, is_px)}"
     return ""
 
 
-def _gain(before_px: float, after_px: float) -> str:
+def _from_to(before_px: float, after_px: float) -> str:
     return f"from {before_px:.2f} to {after_px:.2f} px"
 
 
 def _judge_by_outlines(
     outlines: Outlines | None, given: list[Camera], refined: list[Camera]
 ) -> tuple[dict[str, float], str]:
-    """What the person's outlines cost before and after, and why that forbids the refinement, else nothing."""
+    """Return the cost of the person's outlines before and after, and why it rules out the refinement (empty if it does
+    not)."""
     if outlines is None:
         return {}, ""
     costs_px = {"as given": outlines.cost_px(given), "refined": outlines.cost_px(refined)}
     if costs_px["refined"] <= costs_px["as given"] + max(OUTLINE_NOISE_PX, OUTLINE_NOISE * costs_px["as given"]):
         return costs_px, ""
-    worse = _gain(costs_px["as given"], costs_px["refined"])
+    worse = _from_to(costs_px["as given"], costs_px["refined"])
     return costs_px, f"refinement refused: keypoints gain by it, but the person's outlines fit worse, {worse}"
 
 
-def _resized(
+def _refine_for_size(
     capture: Capture,
     cameras: list[Camera],
     keypoints: np.ndarray,
@@ -152,16 +159,17 @@ def _resized(
     must_beat_px: float,
     held_out_px: dict[str, float],
 ) -> tuple[list[Camera], list[str]]:
-    """Intrinsics that explain recorded sizes that black bars do not, if held-out frames prove them.
+    """Return intrinsics that explain a recorded image size other than the calibrated one without black bars, if
+    held-out frames prove them.
 
     Adds the costs of what was tried to `held_out_px`.
     """
-    doubtful = [c.name for c in cameras if unexplained(capture, c.name)]
+    doubtful = [c.name for c in cameras if size_unexplained(capture, c.name)]
     if not doubtful:
         return cameras, []
     sizes = {name: (capture.calibrated_sizes_px[name], capture.recorded_sizes_px[name]) for name in doubtful}
     tried = {}
-    for what, change in CHANGES.items():
+    for what, change in SIZE_CHANGES.items():
         log.info("trying: pictures were %s", what)
         tried[what] = [change(c, *sizes[c.name]) if c.name in sizes else c for c in cameras]
         held_out_px[f"and pictures {what}"] = held_out_cost_px(tried[what], keypoints, free)
@@ -174,10 +182,11 @@ def _resized(
 def held_out_cost_px(
     cameras: Sequence[Camera], keypoints: np.ndarray, free: Sequence[str], focal: Sequence[str] = ()
 ) -> float:
-    """Trimmed cost of keypoints (C, frames, 25, 3), each part judged with cameras that were adjusted to another part.
+    """Return the trimmed cost of keypoints (C, frames, 25, 3), each part judged with cameras adjusted to the other
+    part.
 
-    The parts share neither frames nor joints: what a detector gets wrong about one joint, in frame after frame, does
-    not prove a camera wrong. One frame alone is parted by its joints.
+    The parts share neither frames nor joints: a detector's systematic error on one joint must not count as proof that a
+    camera is wrong. A single frame is split by joints.
     """
     first, second = np.array_split(keypoints, 2, axis=1) if keypoints.shape[1] > 1 else (keypoints, keypoints)
     costs = []

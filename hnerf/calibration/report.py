@@ -1,4 +1,4 @@
-"""What was found out about the cameras: in numbers, in words, as a picture, and as the cameras to use."""
+"""Calibration report: numbers, reasons in words, plots, and the cameras to use."""
 
 import dataclasses
 import json
@@ -12,7 +12,7 @@ import cv2
 from hnerf.calibration.diagnosis import Measure
 from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.picture import draw_cameras
-from hnerf.calibration.sheet import draw_witnesses
+from hnerf.calibration.sheet import draw_evidence
 from hnerf.calibration.synchronise import Timing
 from hnerf.capture.capture import Capture
 from hnerf.capture.formats.easymocap import write_easymocap
@@ -25,8 +25,9 @@ SEVERITY = ("ok", "refined", "suspect", "rejected")
 
 @dataclass(frozen=True)
 class CameraVerdict:
-    """status: one of SEVERITY; residuals in pixels, None with one camera only; frame_offset: as corrected, the frame of
-    this camera at the others' frame 0; timing: the offset as measured; reasons in words."""
+    """Verdict on one camera. status: one of SEVERITY; residuals in pixels, None with one camera; frame_offset: the
+    corrected offset, the frame of this camera at the others' frame 0; timing: the offset as measured; reasons: in
+    words."""
 
     status: str
     median_px: float | None
@@ -37,8 +38,8 @@ class CameraVerdict:
     timing: Timing
     reasons: tuple[str, ...]
 
-    def plain(self) -> dict[str, Any]:
-        """As JSON has it."""
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict as plain types for JSON."""
         timing = self.timing
         offset = {
             "observable": not timing.reason,
@@ -51,10 +52,13 @@ class CameraVerdict:
 
 @dataclass(frozen=True)
 class CalibrationReport:
-    """cameras: as used from here on, test cameras too; verdicts: of the training cameras. before, after: None with one
-    training camera. held_out_px, outlines_px: what each correction that was tried cost on held-out frames and by the
-    person's outlines. notes: what concerns the whole rig, and the checks that could not be made. witnesses: None with
-    one training camera."""
+    """Result of the calibration check.
+
+    cameras: those to use from here on, test cameras included; verdicts: of the training cameras; before, after: None
+    with one training camera; held_out_px, outlines_px: cost of each correction that was tried, on held-out frames and
+    by the person's outlines; notes: about the whole rig, and checks that could not be made; evidence: None with one
+    training camera.
+    """
 
     cameras: dict[str, Camera]
     verdicts: dict[str, CameraVerdict]
@@ -64,30 +68,30 @@ class CalibrationReport:
     outlines_px: dict[str, float]
     notes: tuple[str, ...]
     up: str
-    witnesses: Evidence | None
+    evidence: Evidence | None
 
     @property
     def verdict(self) -> str:
-        """The gravest status among the training cameras."""
+        """The most severe status among the training cameras."""
         return max((v.status for v in self.verdicts.values()), key=SEVERITY.index)
 
     def save(self, out: Path) -> None:
-        """Write `intri.yml`, `extri.yml` (EasyMocap, without rejected cameras), `report.json`, `cameras.png`, and where
-        there are witnesses, `witnesses.png`."""
+        """Write `intri.yml` and `extri.yml` (EasyMocap, without rejected cameras), `report.json`, `cameras.png`, and
+        `witnesses.png` if there is evidence."""
         out.mkdir(parents=True, exist_ok=True)
         rejected = {name for name, v in self.verdicts.items() if v.status == "rejected"}
         write_easymocap(out, [pinhole(camera) for name, camera in self.cameras.items() if name not in rejected])
-        (out / "report.json").write_text(json.dumps(_finite(self._plain()), indent=1, allow_nan=False))
+        (out / "report.json").write_text(json.dumps(_finite(self._to_dict()), indent=1, allow_nan=False))
         status = {name: self.verdicts[name].status if name in self.verdicts else "unjudged" for name in self.cameras}
         draw_cameras(out / "cameras.png", list(self.cameras.values()), status, self.up, self.before, self.after)
-        if self.witnesses and self.after:
+        if self.evidence and self.after:
             used = [self.cameras[name] for name in self.verdicts]
-            draw_witnesses(out / "witnesses.png", self.witnesses, used, self.after)
+            draw_evidence(out / "witnesses.png", self.evidence, used, self.after)
 
-    def _plain(self) -> dict[str, Any]:
+    def _to_dict(self) -> dict[str, Any]:
         return {
             "verdict": self.verdict,
-            "cameras": {name: v.plain() for name, v in self.verdicts.items()},
+            "cameras": {name: v.to_dict() for name, v in self.verdicts.items()},
             "unjudged_cameras": [name for name in self.cameras if name not in self.verdicts],
             "body_height_m": self.after and self.after.body_height_m,
             "trimmed_cost_px": {
@@ -101,23 +105,23 @@ class CalibrationReport:
             "held_out_cost_px": self.held_out_px,
             "outlines_cost_px": self.outlines_px,
             "notes": self.notes,
-            "witnesses": self._heard(),
+            "witnesses": self._evidence_to_dict(),
         }
 
-    def _heard(self) -> dict[str, Any]:
-        """What the witnesses say of the cameras as given and as used; nothing of one camera."""
-        if self.witnesses is None or self.before is None or self.after is None:
+    def _evidence_to_dict(self) -> dict[str, Any]:
+        """Return the evidence about the cameras as given and as used; empty with one camera."""
+        if self.evidence is None or self.before is None or self.after is None:
             return {}
-        given = self.witnesses.capture.cameras
+        given = self.evidence.capture.cameras
         return {
-            "as_given": self.witnesses.plain([given[name] for name in self.verdicts], self.before),
-            "as_used": self.witnesses.plain([self.cameras[name] for name in self.verdicts], self.after),
-            "board_footage": self.witnesses.boards or "none: the recording has no calibration/ footage of a board",
+            "as_given": self.evidence.summarise([given[name] for name in self.verdicts], self.before),
+            "as_used": self.evidence.summarise([self.cameras[name] for name in self.verdicts], self.after),
+            "board_footage": self.evidence.boards or "none: the recording has no calibration/ footage of a board",
         }
 
 
 def _finite(tree: Any) -> Any:
-    """The same without NaN and infinity, which JSON does not know: null."""
+    """Return the tree with NaN and infinity replaced by None, because JSON has neither."""
     if isinstance(tree, dict):
         return {key: _finite(value) for key, value in tree.items()}
     if isinstance(tree, list | tuple):
@@ -126,8 +130,8 @@ def _finite(tree: Any) -> Any:
 
 
 def load_cameras(out: Path, capture: Capture) -> Capture:
-    """The capture seen through those of its cameras that `save` wrote, and in step; rejected training cameras are
-    gone. The capture may have fewer cameras than were calibrated."""
+    """Return the capture with the cameras that `save` wrote, synchronised and without rejected training cameras. The
+    capture may have fewer cameras than were calibrated. Raises InputError if the camera files cannot be read."""
     intri, extri = (cv2.FileStorage(str(out / name), cv2.FILE_STORAGE_READ) for name in ("intri.yml", "extri.yml"))
     if not (intri.isOpened() and extri.isOpened()):
         raise InputError(f"{out}: intri.yml or extri.yml cannot be read; run the calibration stage again")

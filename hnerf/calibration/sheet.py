@@ -1,4 +1,4 @@
-"""The witnesses as a picture: for each camera what keypoints, outlines and matches look like under the cameras used."""
+"""Contact sheet of the evidence: keypoints, outlines and matches of each camera under the cameras used."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,26 +14,26 @@ from hnerf.calibration.evidence import NO_MATCHES, Evidence
 from hnerf.capture.keypoint_sets import FEET, LIMBS
 from hnerf.geometry.camera import Camera
 
-SCALE_PX = Normalize(0, 10)  # residuals, from green to red
+SCALE_PX = Normalize(0, 10)  # range of residuals, from green to red
 COLOURS = "RdYlGn_r"
-DIMMED = 0.55  # light left in the photographs, so that the marks stand out
+BRIGHTNESS = 0.55  # of the photographs, darkened so that the marks stand out
 MARGIN = 0.12  # of the person's size
 PANEL_INCHES = 4.2
 
 
-def draw_witnesses(path: Path, witnesses: Evidence, cameras: Sequence[Camera], found: Measure) -> None:
-    """Write the sheet as PNG, a row a camera; `found`: what `measure` says of these cameras."""
-    capture, outlines = witnesses.capture, witnesses.outlines
+def draw_evidence(path: Path, evidence: Evidence, cameras: Sequence[Camera], found: Measure) -> None:
+    """Write the sheet as PNG, one row per camera. found: what `measure` returns for these cameras."""
+    capture, outlines = evidence.capture, evidence.outlines
     instant = outlines.instants[len(outlines.instants) // 2] if outlines else len(capture.frames) // 2
     figure = Figure(figsize=(3 * PANEL_INCHES + 1, PANEL_INCHES * len(cameras) + 0.6), layout="constrained")
     panels = figure.subplots(len(cameras), 3, squeeze=False)
-    for row, camera, detected in zip(panels, cameras, witnesses.keypoints[:, instant], strict=True):
-        for axes, frame in zip(row, [*[capture.frames[instant]] * 2, witnesses.matches.frame], strict=True):
-            axes.imshow((DIMMED * capture.image(camera.name, frame)).astype(np.uint8))
+    for row, camera, detected in zip(panels, cameras, evidence.keypoints[:, instant], strict=True):
+        for axes, frame in zip(row, [*[capture.frames[instant]] * 2, evidence.matches.frame], strict=True):
+            axes.imshow((BRIGHTNESS * capture.image(camera.name, frame)).astype(np.uint8))
             axes.set_axis_off()
         marks = _draw_keypoints(row[0], camera, detected, found.points_m[instant])
-        _draw_outline(row[1], cameras, camera, witnesses)
-        _draw_matches(row[2], cameras, camera, witnesses)
+        _draw_outline(row[1], cameras, camera, evidence)
+        _draw_matches(row[2], cameras, camera, evidence)
         message = f"{camera.name}: keypoints, median {found.median_px[camera.name]:.1f} px"
         row[0].set_title(f"{message}, 95 % below {found.p95_px[camera.name]:.1f} px", fontsize=10)
         for axes in row[:2]:
@@ -43,7 +43,8 @@ def draw_witnesses(path: Path, witnesses: Evidence, cameras: Sequence[Camera], f
 
 
 def _draw_keypoints(axes: Axes, camera: Camera, detected: np.ndarray, points_m: np.ndarray) -> PathCollection:
-    """Detections (25, 3) as discs, coloured by how far the person's joints (25, 3), as lines, lie from them."""
+    """Draw detections (25, 3) as discs, coloured by their distance from the person's projected joints (25, 3), which
+    are drawn as lines."""
     uv, _ = camera.project(points_m)
     for a, b in LIMBS + FEET:
         axes.plot(*uv[[a, b]].T, color="white", linewidth=1)
@@ -51,10 +52,10 @@ def _draw_keypoints(axes: Axes, camera: Camera, detected: np.ndarray, points_m: 
     return _scatter(axes, detected[seen, :2], np.linalg.norm(uv[seen] - detected[seen, :2], axis=-1), 26)
 
 
-def _draw_outline(axes: Axes, cameras: Sequence[Camera], camera: Camera, witnesses: Evidence) -> None:
-    """Points of the outline, coloured by how far their rays miss the person as the others see it."""
+def _draw_outline(axes: Axes, cameras: Sequence[Camera], camera: Camera, evidence: Evidence) -> None:
+    """Draw points of the outline, coloured by how far their rays miss the visual hull of the other cameras."""
     axes.set_title(f"{camera.name}: no outline", fontsize=10)
-    outlines = witnesses.outlines
+    outlines = evidence.outlines
     if outlines is None or camera.name not in outlines.by_camera:
         return
     middle = len(outlines.instants) // 2
@@ -69,13 +70,13 @@ def _draw_outline(axes: Axes, cameras: Sequence[Camera], camera: Camera, witness
     _scatter(axes, outline.points_px, outlines.at(middle).residuals_px(cameras)[camera.name], 14)
 
 
-def _draw_matches(axes: Axes, cameras: Sequence[Camera], camera: Camera, witnesses: Evidence) -> None:
-    """Matches with other cameras, coloured by their distance from the epipolar constraint."""
+def _draw_matches(axes: Axes, cameras: Sequence[Camera], camera: Camera, evidence: Evidence) -> None:
+    """Draw matches with other cameras, coloured by their distance from the epipolar constraint."""
     message = []
-    for pair, residuals_px in witnesses.matches.residuals_px(cameras).items():
+    for pair, residuals_px in evidence.matches.residuals_px(cameras).items():
         if camera.name in pair:
             side = pair.index(camera.name)
-            _scatter(axes, witnesses.matches.by_pair[pair][:, side], residuals_px, 14)
+            _scatter(axes, evidence.matches.by_pair[pair][:, side], residuals_px, 14)
             message.append(f"{len(residuals_px)} with {pair[1 - side]}, median {np.median(residuals_px):.1f} px")
     axes.set_title(f"{camera.name}: " + (f"matches, {'; '.join(message)}" if message else NO_MATCHES), fontsize=10)
 
@@ -88,7 +89,7 @@ def _scatter(axes: Axes, points_px: np.ndarray, residuals_px: np.ndarray, size: 
 
 
 def _zoom(axes: Axes, points_px: np.ndarray) -> None:
-    """A square window around the person, (n, 2)."""
+    """Set a square window around the person's points (n, 2)."""
     if len(points_px) == 0:
         return
     low, high = points_px.min(0), points_px.max(0)

@@ -1,8 +1,8 @@
-"""The second witness: do the outlines of the person in all cameras belong to one body?
+"""Silhouette consistency: whether the person's outlines in all cameras belong to one body.
 
 A pixel on the outline of one mask is where a ray touches the person. Somewhere along that ray must be a point that no
-other camera sees outside its own mask: a point of the visual hull (Laurentini 1994). How far the best point of the ray
-lies outside, in pixels of the camera that denies it, is the residual. It knows nothing of keypoints or their bias.
+other camera sees outside its own mask: a point of the visual hull (Laurentini 1994). The residual is how far the best
+point of the ray lies outside, in pixels of the camera that excludes it. It does not depend on keypoints or their bias.
 """
 
 import dataclasses
@@ -19,25 +19,25 @@ from hnerf.capture.subject import subject_keypoints
 from hnerf.config import SegmentationSettings
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
-from hnerf.segmentation.backends import AgainstBackground
+from hnerf.segmentation.backends import BackgroundSubtraction
 from hnerf.segmentation.prior import keypoint_priors
 
-FRAMES = 8  # evenly spread: neighbours say the same again
-PLATE_FRAMES = 24  # from which the background is made where there is no clean plate
-POINTS = 64  # of the outline in each image
+FRAMES = 8  # evenly spaced: neighbouring frames add nothing
+PLATE_FRAMES = 24  # from which the background is estimated if there is no clean plate
+POINTS = 64  # on the outline in each image
 COARSE, FINE = 64, 17  # samples along a ray, and again between the neighbours of the best
-ROOM = 1.5  # times the person's size: how far along a ray the person is looked for
-TRIM = 0.98  # share of the residuals that count; the rest are faults of the masks
-COVERED = 0.6  # of the person's keypoints: a mask with fewer of them is not the person's
-DENIED_PX = 1e4  # behind a camera that sees the person
+SEARCH_RANGE = 1.5  # times the person's size: length of each ray that is searched, either way
+TRIM = 0.98  # share of the residuals that count; the rest are taken for mask errors
+MIN_KEYPOINTS_INSIDE = 0.6  # share of the person's keypoints; a mask that holds fewer is not the person's
+BEHIND_CAMERA_PX = 1e4  # the residual of a point behind a camera that sees the person
 
 log = logging.getLogger("hnerf.calibration")
 
 
 @dataclasses.dataclass(frozen=True)
 class MaskOutline:
-    """One mask: points_px (n, 2) on its outline, distance_px (H, W) to it, negative inside; `centre_px` (2,),
-    `size_px` of its box."""
+    """Outline of one mask: points_px (n, 2) on it, distance_px (H, W) to it, negative inside; centre_px (2,) of the
+    mask; size_px, the diagonal of its bounding box."""
 
     points_px: np.ndarray
     distance_px: np.ndarray
@@ -46,9 +46,9 @@ class MaskOutline:
 
     @staticmethod
     def around(mask: np.ndarray) -> "MaskOutline | None":
-        """Of the largest part of a mask (H, W) bool, its holes filled; None if it is empty.
+        """Return the outline of the largest component of a mask (H, W) bool with its holes filled; None if it is empty.
 
-        Where the image's border cuts the person off there is no outline.
+        Where the image border cuts the person off there are no outline points.
         """
         parts, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         if not parts:
@@ -71,7 +71,7 @@ class MaskOutline:
 
 @dataclasses.dataclass(frozen=True)
 class Outlines:
-    """Outlines of the person by camera, one an instant; None where a camera has no mask then.
+    """Outlines of the person by camera, one per instant; None where a camera has no mask then.
 
     instants: their indices in `capture.frames`.
     """
@@ -81,10 +81,11 @@ class Outlines:
 
     @staticmethod
     def of(capture: Capture) -> "Outlines | None":
-        """Of the training cameras at a few instants, from given masks, clean plates, or a median of the images.
+        """Return the outlines of the training cameras at a few instants, from given masks, clean plates or a median of
+        the images.
 
-        The masks use each camera's own keypoints only, so that a wrong calibration cannot spoil them. None where fewer
-        than two cameras have a usable mask.
+        The masks use each camera's own keypoints only, so that a wrong calibration cannot spoil them. Returns None if
+        fewer than two cameras have a usable mask.
         """
         found = subject_keypoints(capture)
         everyone = np.all([(seen[..., 2] > 0).any(1) for seen in found.values()], axis=0)
@@ -95,21 +96,21 @@ class Outlines:
         return Outlines(usable, tuple(shown)) if len(usable) > 1 else None
 
     def at(self, position: int) -> "Outlines":
-        """One instant alone, by its position in `instants`."""
+        """Return the outlines of one instant, by its position in `instants`."""
         return Outlines({name: [row[position]] for name, row in self.by_camera.items()}, (self.instants[position],))
 
     def cost_px(self, cameras: Sequence[Camera]) -> float:
-        """Mean of the lowest 98 % of all residuals under these cameras, two of them at least.
+        """Return the mean of the lowest 98 % of all residuals under at least two cameras.
 
-        Most rays pass through the middle of the hull and cannot miss it: with exact masks a true rig costs almost
-        nothing, and one whose camera is a degree off a few tenths of a pixel.
+        Most rays pass through the middle of the hull and cannot miss it: with exact masks a correct rig costs almost
+        nothing, and one with a camera turned by a degree a few tenths of a pixel.
         """
         return trimmed_mean(np.concatenate(list(self.residuals_px(cameras).values())), TRIM)
 
     def residuals_px(self, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
-        """Per camera how far the rays of its outline miss the person as the other cameras see it, (n,) pixels >= 0.
+        """Return, per camera, how far the rays of its outline miss the other cameras' visual hull, (n,) pixels >= 0.
 
-        Cameras without outlines take no part; neither do instants at which fewer than two cameras have one.
+        Cameras without outlines are left out, as are instants at which fewer than two cameras have one.
         """
         known = [camera for camera in cameras if camera.name in self.by_camera]
         residuals: dict[str, list[np.ndarray]] = {camera.name: [] for camera in known}
@@ -118,15 +119,16 @@ class Outlines:
             seen = [(camera, outline) for camera, outline in at_once if outline is not None]
             if len(seen) < 2:
                 continue
-            centre_m, reach_m = _whereabouts(seen)
+            centre_m, reach_m = _locate_person(seen)
             for i, (camera, outline) in enumerate(seen):
                 others = seen[:i] + seen[i + 1 :]
-                residuals[camera.name].append(_missed_by_px(camera, outline, others, centre_m, reach_m))
+                residuals[camera.name].append(_hull_distances_px(camera, outline, others, centre_m, reach_m))
         return {name: np.concatenate(rows) if rows else np.zeros(0) for name, rows in residuals.items()}
 
 
-def _whereabouts(seen: Sequence[tuple[Camera, MaskOutline]]) -> tuple[np.ndarray, float]:
-    """The point nearest to the rays through the middles of the masks, (3,), and the person's size about it."""
+def _locate_person(seen: Sequence[tuple[Camera, MaskOutline]]) -> tuple[np.ndarray, float]:
+    """Return the point (3,) closest to the rays through the centres of the masks, and the person's size around it in
+    metres."""
     origins, directions = zip(*(camera.rays(outline.centre_px) for camera, outline in seen), strict=True)
     across = np.stack([np.eye(3) - np.outer(d, d) for d in directions])  # projects onto the plane across the ray
     towards = np.einsum("cij,cj->i", across, np.stack(origins))
@@ -134,19 +136,20 @@ def _whereabouts(seen: Sequence[tuple[Camera, MaskOutline]]) -> tuple[np.ndarray
     sizes_m = [
         outline.size_px / camera.K[1, 1] * float(np.linalg.norm(centre_m - camera.centre_m)) for camera, outline in seen
     ]
-    return centre_m, ROOM * float(np.median(sizes_m))
+    return centre_m, SEARCH_RANGE * float(np.median(sizes_m))
 
 
-def _missed_by_px(
+def _hull_distances_px(
     camera: Camera,
     outline: MaskOutline,
     others: Sequence[tuple[Camera, MaskOutline]],
     centre_m: np.ndarray,
     reach_m: float,
 ) -> np.ndarray:
-    """For each outline point the least distance at which its ray passes the hull of the others, (n,) pixels >= 0.
+    """Return the least distance at which each outline point's ray passes the hull of the other cameras, (n,) pixels >=
+    0.
 
-    The ray is searched within `reach_m` of its point nearest to the centre.
+    Each ray is searched within `reach_m` of its point closest to the centre.
     """
     origins, directions = camera.rays(outline.points_px)
     nearest_m = ((centre_m - origins) * directions).sum(-1, keepdims=True)
@@ -160,33 +163,34 @@ def _missed_by_px(
 
 
 def _outside_px(seen: Sequence[tuple[Camera, MaskOutline]], points_m: np.ndarray) -> np.ndarray:
-    """How far points (n, S, 3) lie outside the mask that denies them most, (n, S) pixels, negative in the hull.
+    """Return how far points (n, S, 3) lie outside the mask that excludes them most, (n, S) pixels, negative inside the
+    hull.
 
-    Beyond an image's edge the nearest edge pixel speaks: where the edge cuts the person off, he may go on.
+    Beyond the image border the nearest border pixel counts: where the border cuts the person off, the person may go on.
     """
     worst = np.full(points_m.shape[:2], -np.inf)
     for camera, outline in seen:
         uv, depth_m = camera.project(points_m)
-        at = np.nan_to_num(uv).clip(-DENIED_PX, DENIED_PX).astype(np.float32)
+        at = np.nan_to_num(uv).clip(-BEHIND_CAMERA_PX, BEHIND_CAMERA_PX).astype(np.float32)
         x, y = cv2.split(at)
         far_px = cv2.remap(outline.distance_px, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        worst = np.maximum(worst, np.where(depth_m > 0, far_px, DENIED_PX))
+        worst = np.maximum(worst, np.where(depth_m > 0, far_px, BEHIND_CAMERA_PX))
     return worst
 
 
 def _outlines(capture: Capture, name: str, keypoints: np.ndarray, shown: Sequence[int]) -> list[MaskOutline | None]:
-    """One camera's outlines at the frames of these indices; keypoints (frames, 25, 3) of the subject."""
+    """Return one camera's outlines at the frames of these indices; keypoints (frames, 25, 3) of the subject."""
     outlines = []
     for i, mask in zip(shown, _masks(capture, name, shown), strict=True):
         xy = keypoints[i, keypoints[i, :, 2] > 0, :2].round().astype(int)
         xy = xy[((xy >= 0) & (xy < mask.shape[::-1])).all(1)]
         covered = mask[xy[:, 1], xy[:, 0]].mean() if len(xy) else 0.0
-        outlines.append(MaskOutline.around(mask) if covered >= COVERED else None)
+        outlines.append(MaskOutline.around(mask) if covered >= MIN_KEYPOINTS_INSIDE else None)
     return outlines
 
 
 def _masks(capture: Capture, name: str, shown: Sequence[int]) -> list[np.ndarray]:
-    """The person's masks in one camera at the frames of these indices, (H, W) bool."""
+    """Return the person's masks in one camera at the frames of these indices, (H, W) bool each."""
     given = [capture.given_mask(name, capture.frames[i]) for i in shown]
     if all(mask is not None for mask in given):
         return [mask for mask in given if mask is not None]
@@ -194,7 +198,7 @@ def _masks(capture: Capture, name: str, shown: Sequence[int]) -> list[np.ndarray
     ((_, priors),) = keypoint_priors(dataclasses.replace(capture, train_cameras=(name,)), settings)
     plate = capture.background(name)
     if plate is None:
-        backend = AgainstBackground.of_median(capture, name, priors, PLATE_FRAMES, settings)
+        backend = BackgroundSubtraction.from_median(capture, name, priors, PLATE_FRAMES, settings)
     else:
-        backend = AgainstBackground.of_plate(capture, name, plate, settings)
+        backend = BackgroundSubtraction.from_plate(capture, name, plate, settings)
     return [backend.mask(capture.frames[i], priors[i]) for i in shown]

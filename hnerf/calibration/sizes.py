@@ -1,4 +1,4 @@
-"""Where the recorded size is not the calibrated one: what an encoder may have done to the picture."""
+"""Image sizes: what an encoder may have done where the recorded size is not the calibrated one."""
 
 import dataclasses
 from collections.abc import Callable
@@ -8,11 +8,11 @@ import numpy as np
 from hnerf.capture.capture import Capture
 from hnerf.geometry.camera import Camera
 
-Change = Callable[[Camera, tuple[int, int], tuple[int, int]], Camera]
+SizeChange = Callable[[Camera, tuple[int, int], tuple[int, int]], Camera]
 
 
-def _shifted(share: float) -> Change:
-    """Cropped or padded, this share of the difference on the left and at the top."""
+def _crop_or_pad(share: float) -> SizeChange:
+    """Return the change of cropping or padding, with this share of the size difference on the left and at the top."""
 
     def change(camera: Camera, calibrated_px: tuple[int, int], recorded_px: tuple[int, int]) -> Camera:
         per_recorded = camera.width_px / recorded_px[0]
@@ -22,39 +22,42 @@ def _shifted(share: float) -> Change:
     return change
 
 
-def _stretched(camera: Camera, calibrated_px: tuple[int, int], recorded_px: tuple[int, int]) -> Camera:
+def _stretch(camera: Camera, calibrated_px: tuple[int, int], recorded_px: tuple[int, int]) -> Camera:
     sx, sy = (r / c for r, c in zip(recorded_px, calibrated_px, strict=True))
     return dataclasses.replace(camera, K=np.diag([sx, sy, 1]) @ camera.K)
 
 
-def _scaled_and_padded(camera: Camera, calibrated_px: tuple[int, int], recorded_px: tuple[int, int]) -> Camera:
+def _scale_and_pad(camera: Camera, calibrated_px: tuple[int, int], recorded_px: tuple[int, int]) -> Camera:
     scale = min(r / c for r, c in zip(recorded_px, calibrated_px, strict=True))
     per_recorded = camera.width_px / recorded_px[0]
     dx, dy = (per_recorded * (r - scale * c) / 2 for r, c in zip(recorded_px, calibrated_px, strict=True))
     return dataclasses.replace(camera, K=np.array([[scale, 0, dx], [0, scale, dy], [0, 0, 1]]) @ camera.K)
 
 
-CHANGES: dict[str, Change] = {  # none: cropped or padded on the right and at the bottom, which leaves K as it is
-    "cropped or padded evenly": _shifted(0.5),
-    "cropped or padded on the left or at the top": _shifted(1.0),
-    "stretched": _stretched,
-    "scaled and padded evenly": _scaled_and_padded,
+SIZE_CHANGES: dict[
+    str, SizeChange
+] = {  # none: cropped or padded on the right and at the bottom, which leaves K as it is
+    "cropped or padded evenly": _crop_or_pad(0.5),
+    "cropped or padded on the left or at the top": _crop_or_pad(1.0),
+    "stretched": _stretch,
+    "scaled and padded evenly": _scale_and_pad,
 }
 
 
-def unexplained(capture: Capture, name: str) -> bool:
-    """Whether a camera recorded another size than it was calibrated at, and no black bars say what was done."""
+def size_unexplained(capture: Capture, name: str) -> bool:
+    """Return whether a camera recorded another size than it was calibrated at, and no black bars show what was done."""
     other = capture.calibrated_sizes_px[name] != capture.recorded_sizes_px[name]
     return other and name not in capture.picture_areas_px
 
 
 def size_reasons(capture: Capture, name: str) -> list[str]:
-    """What is known of a recorded size other than the calibrated one, in words; none where they are the same."""
+    """Return, in words, what is known about a recorded size other than the calibrated one; empty if they are the
+    same."""
     calibrated, recorded = capture.calibrated_sizes_px[name], capture.recorded_sizes_px[name]
     if calibrated == recorded:
         return []
     sizes = f"calibrated at {calibrated[0]}x{calibrated[1]}, recorded at {recorded[0]}x{recorded[1]}"
-    if unexplained(capture, name):
+    if size_unexplained(capture, name):
         return [f"{sizes}: no black bars prove what was done to the picture"]
     area = capture.picture_areas_px[name]
     return [

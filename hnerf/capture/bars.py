@@ -1,4 +1,4 @@
-"""Black bars: where, within a recorded picture, the calibrated one lies."""
+"""Black bars: where the calibrated picture lies within a recorded one."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -8,15 +8,16 @@ import numpy as np
 
 from hnerf.capture.lens import Lens
 
-DARK = 16.0  # grey levels: nine tenths of a bar's row are below
-LIT = 40.0  # grey levels: the median of the picture beside a bar is above, or its edge cannot be seen
-WIDEST = 0.4  # of the picture's side, for each of two bars
-RISE_PX = 3  # within which a bar must give way to the picture; an encoder blurs the edge over two
-ASPECT_PX = 1.0  # by which the picture's height may differ from what its width says
+DARK = 16.0  # grey level: nine tenths of each row of a bar are below it
+LIT = 40.0  # grey level: the median of the picture beside a bar must be above it, so that the edge shows
+MAX_BAR_SHARE = 0.4  # of the picture's side, for each of its two bars
+RISE_PX = 3  # width of the step from a bar to the picture at most; an encoder blurs it over two
+ASPECT_PX = 1.0  # by which the picture's height may differ from what its width implies
 
 
 class Area(NamedTuple):
-    """A rectangle of an image in pixels from the image's top left corner, half a pixel before the first centre."""
+    """A rectangle of an image in pixels, measured from the image's top left corner, half a pixel before the first pixel
+    centre."""
 
     left: float
     top: float
@@ -25,9 +26,9 @@ class Area(NamedTuple):
 
 
 def picture_area(pictures: Sequence[np.ndarray]) -> Area:
-    """The part of (H, W, 3) uint8 frames of one camera that is not black bars, to a fraction of a pixel.
+    """Return the part of one camera's frames (H, W, 3) uint8 that is not black bars, to a fraction of a pixel.
 
-    A bar is dark in all frames and ends sharply; what fades into the dark is picture.
+    A bar is dark in all frames and ends sharply; a picture that fades into the dark has none.
     """
     grey = np.median([picture.mean(-1) for picture in pictures], axis=0)
     top, bottom = _bar_px(grey), _bar_px(grey[::-1])
@@ -36,11 +37,12 @@ def picture_area(pictures: Sequence[np.ndarray]) -> Area:
     return Area(left, top, width - left - right, height - top - bottom)
 
 
-def fitted(lens: Lens, area: Area, recorded_px: tuple[int, int]) -> Lens | None:
-    """The lens of a camera whose picture was scaled into `area` of the recorded one; None where nothing proves that.
+def lens_for_area(lens: Lens, area: Area, recorded_px: tuple[int, int]) -> Lens | None:
+    """Return the lens of a camera whose picture was scaled into `area` of the recorded one; None where nothing proves
+    that.
 
-    Proof are bars, and within them the calibrated aspect to a pixel. Distortion coefficients are in units of the focal
-    length, and stay.
+    The proof is bars, and between them the calibrated aspect ratio to a pixel. Distortion coefficients are in units of
+    the focal length and do not change.
     """
     assert lens.size_px is not None
     sx, sy = area.width / lens.size_px[0], area.height / lens.size_px[1]
@@ -51,8 +53,9 @@ def fitted(lens: Lens, area: Area, recorded_px: tuple[int, int]) -> Lens | None:
 
 
 def _bar_px(grey: np.ndarray) -> float:
-    """Height of the bar at the top of a picture (H, W), 0 if there is none: up to where half the light is reached."""
-    limit = int(WIDEST * len(grey))
+    """Return the height of the bar at the top of a picture (H, W), up to where half the light is reached; 0 without a
+    bar."""
+    limit = int(MAX_BAR_SHARE * len(grey))
     bright = np.flatnonzero(np.percentile(grey[:limit], 90, axis=1) >= DARK)
     if len(bright) == 0 or bright[0] == 0:
         return 0.0

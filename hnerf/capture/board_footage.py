@@ -1,4 +1,4 @@
-"""Footage of a calibration board: what the board is, and where its corners are seen.
+"""Footage of a calibration board: the board's description, and its corners in the images.
 
 `calibration/extrinsic/` and `calibration/intrinsic/` hold a video `<camera>.mp4` or a folder of images `<camera>/` per
 camera; `charuco.toml` (Caliscope's keys) or a table `[board]` in `capture.toml` describes the board.
@@ -32,7 +32,7 @@ from hnerf.capture.safe_io import (
 from hnerf.config import validated
 from hnerf.errors import InputError
 
-MAX_FRAMES = 200  # of each camera in which the board is looked for, evenly strided
+MAX_FRAMES = 200  # of each camera in which the board is searched, evenly strided
 BOARDS_FILE = "boards.npz"
 METRES = {"inch": 0.0254, "cm": 0.01}
 
@@ -40,9 +40,9 @@ log = logging.getLogger("hnerf.capture")
 
 
 class Board(BaseModel):
-    """A flat board of squares; without a dictionary of markers a plain checkerboard.
+    """A flat board of squares: ChArUco, or a plain checkerboard where there is no dictionary of markers.
 
-    `marker_share`: of a square's side; `inverted`: printed white on black.
+    `marker_share`: side of a marker relative to a square's; `inverted`: printed white on black.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
@@ -56,13 +56,13 @@ class Board(BaseModel):
 
     @property
     def corners_m(self) -> np.ndarray:
-        """(N, 3) inner corners row by row: x right, y down, z into the board, from the board's top left corner."""
+        """Return the inner corners row by row, (N, 3): x right, y down, z into the board, from its top left corner."""
         y, x = np.mgrid[1 : self.rows, 1 : self.columns]
         return self.square_m * np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
 
 
-class Detector:
-    """Looks for one board in pictures."""
+class BoardDetector:
+    """Detector of one board in images."""
 
     def __init__(self, board: Board) -> None:
         self.board = board
@@ -73,7 +73,7 @@ class Detector:
             self.charuco = cv2.aruco.CharucoDetector(_charuco(board), parameters)
 
     def corners_px(self, rgb: np.ndarray) -> np.ndarray:
-        """(N, 2) of the board's corners in an RGB picture, NaN where not seen."""
+        """Return the board's corners in an RGB image, (N, 2), NaN where not seen."""
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
         if self.board.inverted:
             grey = 255 - grey
@@ -88,7 +88,7 @@ class Detector:
         return corners_px
 
     def _checkerboard(self, grey: np.ndarray) -> np.ndarray:
-        """All corners or none, the same one first whichever way the board is held.
+        """Return all corners or none, beginning with the same corner whichever way the board is held.
 
         `read_board` admits only boards whose first and last square differ in colour: the black one is the first.
         """
@@ -104,8 +104,8 @@ class Detector:
 
 @dataclass(frozen=True)
 class BoardFootage:
-    """corners_px: per camera (frames, N, 2) as recorded, NaN where not seen, in the order of `frames`, which are every
-    `frame_step`-th."""
+    """Corners in the footage of a board. corners_px: per camera (frames, N, 2) as recorded, NaN where not seen, in the
+    order of `frames`, which are every `frame_step`-th of the footage."""
 
     path: Path
     board: Board
@@ -117,8 +117,8 @@ class BoardFootage:
 
 @dataclass(frozen=True)
 class BoardCorners:
-    """`boards.npz` of a normalised capture: corners_m (N, 3) on the board; corners_px (C, F, N, 2) in the linear
-    cameras' pixels, NaN where not seen, in every `frame_step`-th frame of the footage."""
+    """Corners of a board in a normalised capture, kept as `boards.npz`: corners_m (N, 3) on the board; corners_px (C,
+    F, N, 2) in the linear cameras' pixels, NaN where not seen, in every `frame_step`-th frame of the footage."""
 
     cameras: tuple[str, ...]
     corners_m: np.ndarray
@@ -131,8 +131,8 @@ class BoardCorners:
 
 
 def normalised_corners(footage: BoardFootage, normalisers: dict[str, Normaliser]) -> BoardCorners:
-    """The corners that a capture's cameras saw, in the pixels of the linear cameras; InputError if they recorded the
-    board at another size."""
+    """Return the corners that a capture's cameras saw, in the pixels of the linear cameras. Raises InputError if a
+    camera recorded the board at another size."""
     names = tuple(name for name in footage.corners_px if name in normalisers)
     if not names:
         raise InputError(
@@ -153,7 +153,7 @@ def normalised_corners(footage: BoardFootage, normalisers: dict[str, Normaliser]
 
 
 def load_board_corners(root: Path) -> BoardCorners | None:
-    """What a normalised capture says about a board; None where the recording has no footage of one."""
+    """Load the board corners of a normalised capture; None where the recording has no footage of a board."""
     if not (root / BOARDS_FILE).exists():
         return None
     with np.load(root / BOARDS_FILE, allow_pickle=False) as stored:
@@ -163,9 +163,9 @@ def load_board_corners(root: Path) -> BoardCorners | None:
 
 
 def read_board(folder: Path) -> Board | None:
-    """The board that the folder describes, None if it describes none; InputError on a bad description."""
-    notes, charuco = path_in_capture(folder, "capture.toml"), path_in_capture(folder, "charuco.toml")
-    source, table = notes, (read_toml(notes) if notes.exists() else {}).get("board")
+    """Read the description of the board in a folder; None if there is none. Raises InputError on a bad one."""
+    manifest, charuco = path_in_capture(folder, "capture.toml"), path_in_capture(folder, "charuco.toml")
+    source, table = manifest, (read_toml(manifest) if manifest.exists() else {}).get("board")
     if table is None:
         if not charuco.exists():
             return None
@@ -184,17 +184,18 @@ def read_board(folder: Path) -> Board | None:
 def read_board_footage(
     folder: Path, part: Literal["extrinsic", "intrinsic"], wanted: int | None = None
 ) -> BoardFootage | None:
-    """The corners in the footage of calibration/<part>/; None where there is no footage or no board is described.
+    """Return the corners in the footage of calibration/<part>/; None where there is no footage or no board is
+    described.
 
-    Of long footage every so many frames are looked at, frame `wanted` among them if there is one.
-    Of extrinsic footage, all cameras' pictures of one frame number are taken to be of one moment; videos are numbered
-    by `timestamps.csv` (Caliscope's) if that is there. InputError on files that cannot be read or do not match,
-    or where there is no frame `wanted`.
+    In long footage only every n-th frame is examined, including frame `wanted` if it is given. In extrinsic footage all
+    cameras' images of one frame number are assumed to be simultaneous; videos are numbered by Caliscope's
+    `timestamps.csv` if there is one. Raises InputError on files that cannot be read or do not match, or where there is
+    no frame `wanted`.
     """
     path = path_in_capture(folder, "calibration", part)
     footage, board = _footage(folder, part), read_board(folder)
     if footage and board is None:
-        log.info("%s: not used, no charuco.toml and no [board] in capture.toml says what board it shows", path)
+        log.info("%s: not used, as neither charuco.toml nor [board] in capture.toml describes the board", path)
     if not footage or board is None:
         return None
     numbers = _frame_numbers(path, footage, synchronised=part == "extrinsic")
@@ -214,8 +215,9 @@ def read_board_footage(
 def _corners(
     board: Board, pictures: Footage, numbers: tuple[int, ...], frames: tuple[int, ...]
 ) -> tuple[np.ndarray, tuple[int, int]]:
-    """(frames, N, 2) of one camera, and its pictures' size. numbers: the common ones of its own frames."""
-    detector, size_px = Detector(board), None
+    """Return the corners of one camera, (frames, N, 2), and the size of its images. numbers: the common frame numbers
+    of its own frames."""
+    detector, size_px = BoardDetector(board), None
     corners_px = np.full((len(frames), len(board.corners_m), 2), np.nan)
     row = {frame: i for i, frame in enumerate(frames)}
     wanted = {own: row[number] for number, own in zip(numbers, pictures.frames, strict=True) if number in row}
@@ -228,17 +230,19 @@ def _corners(
             )
         corners_px[wanted[picture.frame]] = detector.corners_px(picture.rgb)
     if size_px is None:
-        raise InputError(f"{pictures.path}: none of its frames is among those looked at; give all cameras the same")
+        raise InputError(f"{pictures.path}: none of its frames is examined; give all cameras the same frames")
     return corners_px, size_px
 
 
 def _charuco(board: Board) -> cv2.aruco.CharucoBoard:
+    """Return the board for OpenCV."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary or ""))
     size = (board.columns, board.rows)
     return cv2.aruco.CharucoBoard(size, board.square_m, board.marker_share * board.square_m, dictionary)
 
 
 def _check_markers(source: Path, board: Board) -> None:
+    """Raise InputError unless OpenCV has the dictionary, with enough markers for the board."""
     known = getattr(cv2.aruco, board.dictionary or "", None)
     if not isinstance(known, int):
         raise InputError(f"{source}: board: dictionary {board.dictionary}: not one of OpenCV's; correct it")
@@ -248,7 +252,7 @@ def _check_markers(source: Path, board: Board) -> None:
 
 
 def _from_caliscope(path: Path) -> dict[str, Any]:
-    """Caliscope's charuco.toml in our terms: the size measured on the print comes before that of the page."""
+    """Convert Caliscope's charuco.toml to keys of `Board`; a size measured on the print overrides that of the page."""
     table = read_toml(path)
     try:
         square_m = 0.01 * float(table.get("square_size_override_cm") or 0)
@@ -264,11 +268,11 @@ def _from_caliscope(path: Path) -> dict[str, Any]:
             "inverted": table["inverted"],
         }
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-        raise InputError(f"{path}: board: {error} is missing or no number; write it again with Caliscope") from None
+        raise InputError(f"{path}: board: {error} is missing or not a number; write it again with Caliscope") from None
 
 
 def _footage(folder: Path, part: str) -> dict[str, Footage]:
-    """By camera, in the order of their names."""
+    """Return the footage by camera, in the order of the cameras' names."""
     root = path_in_capture(folder, "calibration", part)
     found: dict[str, Footage] = {}
     for path in sorted(root.iterdir()) if root.is_dir() else []:
@@ -289,7 +293,7 @@ def _footage(folder: Path, part: str) -> dict[str, Footage]:
 
 
 def _frame_numbers(root: Path, footage: dict[str, Footage], synchronised: bool) -> dict[str, tuple[int, ...]]:
-    """For each camera the common number of each of its frames."""
+    """Return for each camera the common number of each of its frames."""
     stamps = path_in_capture(root, "timestamps.csv")
     if not synchronised or not stamps.exists():
         videos = [pictures for pictures in footage.values() if isinstance(pictures, Video)]
@@ -307,18 +311,19 @@ def _frame_numbers(root: Path, footage: dict[str, Footage], synchronised: bool) 
 
 
 def _sync_indices(path: Path) -> dict[str, tuple[int, ...]]:
-    """Caliscope's table: a row for every frame of every camera, `sync_index` common to those of one moment."""
+    """Read Caliscope's table: a row for every frame of every camera, with a `sync_index` that simultaneous frames
+    share."""
     found: dict[str, list[int]] = {}
     for row in csv.DictReader(read_text(path).splitlines()):
         index, camera = row.get("sync_index") or "", row.get("cam_id") or row.get("port") or ""
         if not (re.fullmatch(r"[0-9]{1,9}", index) and re.fullmatch(r"[0-9]{1,4}", camera)):
-            raise InputError(f"{path}: a row has no whole sync_index and cam_id; export it again or remove it")
+            raise InputError(f"{path}: a row lacks a whole-numbered sync_index or cam_id; export it again or remove it")
         found.setdefault(f"cam_{camera}", []).append(int(index))
     return {name: tuple(sorted(indices)) for name, indices in found.items()}
 
 
 def _brightness(grey: np.ndarray, square_px: np.ndarray) -> float:
-    """Mean grey level inside the square between (2, 2, 2) corners, half its side about its middle."""
+    """Return the mean grey level in the middle half of the square between (2, 2, 2) corners."""
     middle = square_px.mean((0, 1))
     inner = (middle + 0.5 * (square_px - middle)).reshape(4, 2)[[0, 1, 3, 2]]
     mask = np.zeros_like(grey)

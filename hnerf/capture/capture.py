@@ -1,4 +1,4 @@
-"""What was recorded: the normalised capture that every later stage reads.
+"""The normalised capture that every later stage reads.
 
 A normalised capture is a folder with `capture.json`, `images/<camera>/<frame:06d>.<ext>` (undistorted), and where the
 recording has them `background/<camera>.<ext>` (clean plates), `masks/<camera>/<frame:06d>.png`, `keypoints.npz` and
@@ -16,7 +16,7 @@ import numpy as np
 
 from hnerf.capture.bars import Area
 from hnerf.capture.given_poses import GivenPoses
-from hnerf.capture.timing import nearest_frame, resample, usual_step
+from hnerf.capture.timing import median_step, nearest_frame, resample
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
@@ -25,14 +25,14 @@ JPEG_OPTIONS = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 
 
 @dataclass(frozen=True)
 class Capture:
-    """Cameras, frames, splits and where the pixels lie. Test cameras are for scoring only.
+    """A normalised capture: cameras, frames, splits and where the images lie. Test cameras are for scoring only.
 
-    `calibrated_sizes_px`: per camera the (width, height) that the calibration was made at, before any normalisation;
-    `recorded_sizes_px`: the (width, height) of the files as recorded; `picture_areas_px`: where in the recorded picture
-    black bars prove the calibrated one to lie, for which K was changed at the door. `up`: "z" or "y", the world's
-    vertical axis. `frame_offsets`: of cameras out of step (hnerf.capture.timing); `stored_frames`: what the files hold,
-    where frames were dropped since; `frame_step`: how far the numbers of the recording lie apart. `recorded_lenses`: K
-    and distortion of the files as recorded, of cameras that were undistorted.
+    `calibrated_sizes_px`: per camera the (width, height) at which the calibration was made; `recorded_sizes_px`: the
+    (width, height) of the recorded files; `picture_areas_px`: where black bars prove that the calibrated picture lies
+    within the recorded one, which changed K on ingestion. `up`: "z" or "y", the world's vertical axis. `frame_offsets`:
+    of cameras that are not synchronised (hnerf.capture.timing); `stored_frames`: the frames in the files, where some
+    were dropped since; `frame_step`: the distance of frame numbers in the recording. `recorded_lenses`: K and
+    distortion of the recorded files, of cameras that were undistorted.
     """
 
     name: str
@@ -54,21 +54,22 @@ class Capture:
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """Every frame that a pose is wanted for."""
+        """Return every frame for which a pose is needed, ascending."""
         return tuple(sorted(set(self.train_frames) | set(self.novel_pose_frames)))
 
     def image(self, camera: str, frame: int) -> np.ndarray:
-        """(H, W, 3) uint8 RGB, of the recorded frame nearest in time."""
-        return read_rgb(_only(self.root / "images" / camera, f"{self.recorded(camera, frame):06d}"))
+        """Read the image recorded nearest in time to a frame, (H, W, 3) uint8 RGB."""
+        return read_rgb(_image_path(self.root / "images" / camera, f"{self.recorded_frame(camera, frame):06d}"))
 
     def background(self, camera: str) -> np.ndarray | None:
-        """Clean plate, (H, W, 3) uint8 RGB, or None where the recording has none."""
+        """Read the clean plate, (H, W, 3) uint8 RGB; None where the recording has none."""
         found = list((self.root / "background").glob(f"{camera}.*"))
         return read_rgb(found[0]) if found else None
 
     def given_mask(self, camera: str, frame: int) -> np.ndarray | None:
-        """(H, W) bool, True on the person, of the recorded frame nearest in time; None where there is none."""
-        path = self.root / "masks" / camera / f"{self.recorded(camera, frame):06d}.png"
+        """Read the given mask recorded nearest in time to a frame, (H, W) bool, True on the person; None where there is
+        none."""
+        path = self.root / "masks" / camera / f"{self.recorded_frame(camera, frame):06d}.png"
         if not path.exists():
             return None
         mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -77,9 +78,10 @@ class Capture:
         return mask > 127
 
     def keypoints(self, camera: str) -> np.ndarray | None:
-        """(frames, people, 25, 3) BODY_25 x_px, y_px, confidence in the order of `frames`; all 0 where absent.
+        """Return BODY_25 keypoints (frames, people, 25, 3) x_px, y_px, confidence in the order of `frames`; all 0 where
+        absent.
 
-        Between recorded frames where the camera is out of step.
+        They are interpolated between recorded frames where the camera is not synchronised.
         """
         path = self.root / "keypoints.npz"
         if not path.exists():
@@ -92,11 +94,12 @@ class Capture:
 
     @property
     def has_keypoints(self) -> bool:
-        """Whether anything was detected in this recording."""
+        """Return whether any keypoints were detected in this recording."""
         return (self.root / "keypoints.npz").exists()
 
     def given_poses(self) -> GivenPoses | None:
-        """Somebody else's fit of a body model, a row for each of `frames`, or None where the recording has none."""
+        """Return the poses of a body model that come with the recording, a row for each of `frames`; None where there
+        are none."""
         path = self.root / "poses.npz"
         if not path.exists():
             return None
@@ -105,14 +108,17 @@ class Capture:
         return dataclasses.replace(poses, theta=poses.theta[rows], root=poses.root[rows])
 
     def with_cameras(self, cameras: dict[str, Camera]) -> "Capture":
-        """The same recording seen through other (refined) cameras."""
+        """Return the same recording seen through other (refined) cameras."""
         return dataclasses.replace(self, cameras=cameras)
 
     def synchronised(self, frame_offsets: dict[str, float]) -> "Capture":
-        """The same recording with these cameras' offsets; frames are dropped that one of them did not record. Where
-        those would be most, since frames between were not taken at the door, the nearest that were taken stand in."""
+        """Return the same recording with these frame offsets, without frames that one of the cameras did not record.
+
+        Where that would drop most frames, because those between were not ingested, the nearest ingested ones are used
+        instead.
+        """
         stored = self.stored_frames or self.frames
-        for step in (self.frame_step, usual_step(stored)):
+        for step in (self.frame_step, median_step(stored)):
             kept = {f for f in stored if all(nearest_frame(f, o, step) in stored for o in frame_offsets.values())}
             if 2 * len(kept) >= len(stored):
                 break
@@ -125,8 +131,8 @@ class Capture:
             stored_frames=stored,
         )
 
-    def recorded(self, camera: str, frame: int) -> int:
-        """The number of a camera's recorded frame nearest in time to a frame."""
+    def recorded_frame(self, camera: str, frame: int) -> int:
+        """Return the number of the camera's recorded frame that is nearest in time to a frame."""
         return nearest_frame(frame, self.frame_offsets.get(camera, 0.0), self.frame_step)
 
     def save(self) -> None:
@@ -158,7 +164,7 @@ class Capture:
 
 
 def read_rgb(path: Path) -> np.ndarray:
-    """(H, W, 3) uint8 RGB from an image file; InputError if it cannot be read."""
+    """Read an image file as (H, W, 3) uint8 RGB. Raises InputError if it cannot be read."""
     bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if bgr is None:
         raise InputError(f"{path}: not a readable image; export it again as JPEG or PNG")
@@ -166,7 +172,8 @@ def read_rgb(path: Path) -> np.ndarray:
 
 
 def read_rgba(path: Path) -> np.ndarray:
-    """(H, W, 4) uint8, as `write_image` wrote it; InputError if it cannot be read or has no alpha."""
+    """Read an image file that `write_image` wrote as (H, W, 4) uint8. Raises InputError if it cannot be read or has no
+    alpha."""
     bgra = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if bgra is None or bgra.shape[2:] != (4,):
         raise InputError(f"{path}: no readable image with an alpha channel; make it again")
@@ -174,8 +181,8 @@ def read_rgba(path: Path) -> np.ndarray:
 
 
 def write_image(path: Path, pixels: np.ndarray) -> None:
-    """An image, grey (H, W), RGB (H, W, 3) or RGBA (H, W, 4), in the format that the name says, in a folder that need
-    not be there yet: JPEG without chroma subsampling. OSError if it cannot be written."""
+    """Write an image, grey (H, W), RGB (H, W, 3) or RGBA (H, W, 4), in the format of the file's suffix; its folder is
+    made if need be. JPEG is written without chroma subsampling. Raises OSError if the file cannot be written."""
     path.parent.mkdir(parents=True, exist_ok=True)
     colour = pixels.ndim == 3
     as_stored = np.concatenate([pixels[..., 2::-1], pixels[..., 3:]], -1) if colour else np.ascontiguousarray(pixels)
@@ -183,7 +190,8 @@ def write_image(path: Path, pixels: np.ndarray) -> None:
         raise OSError(f"{path}: cannot be written; is the disk full?")
 
 
-def _only(folder: Path, stem: str) -> Path:
+def _image_path(folder: Path, stem: str) -> Path:
+    """Return the only file of this stem in a folder. Raises InputError if there is none."""
     found = sorted(folder.glob(f"{stem}.*"))
     if not found:
         raise InputError(f"{folder}/{stem}.*: image missing; every camera needs every frame")

@@ -1,4 +1,4 @@
-"""The pictures of one camera as recorded: a folder of images, or a video."""
+"""The images of one camera as recorded: a folder of image files, or a video."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -12,13 +12,13 @@ import numpy as np
 from hnerf.capture.safe_io import check_image_size, read_image
 from hnerf.errors import InputError
 
-# What is wrong with a video is told in one line of ours.
+# Our own message, one line, replaces what OpenCV and FFmpeg would print about a bad video.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 
 class VideoFrame(NamedTuple):
-    """One frame: RGB (H, W, 3) uint8, and the image file that holds exactly it, if there is one."""
+    """One frame: RGB (H, W, 3) uint8, and the image file that holds exactly these pixels, if there is one."""
 
     frame: int
     rgb: np.ndarray
@@ -27,7 +27,7 @@ class VideoFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class ImageFolder:
-    """Image files by frame number."""
+    """Image files of one camera by frame number."""
 
     path: Path
     files: dict[int, Path]
@@ -35,18 +35,18 @@ class ImageFolder:
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """Frame numbers, ascending."""
+        """Return the frame numbers, ascending."""
         return tuple(sorted(self.files))
 
     def read(self, wanted: Iterable[int]) -> Iterator[VideoFrame]:
-        """The wanted frames in ascending order; InputError if one cannot be read."""
+        """Yield the wanted frames in ascending order. Raises InputError if one cannot be read."""
         for frame in sorted(wanted):
             yield VideoFrame(frame, read_image(self.files[frame]), self.files[frame])
 
 
 @dataclass(frozen=True)
 class Video:
-    """A video file whose every frame could be decoded, numbered from 0."""
+    """A video file whose every frame can be decoded, numbered from 0."""
 
     path: Path
     frames: tuple[int, ...]
@@ -54,7 +54,8 @@ class Video:
 
     @staticmethod
     def open(path: Path) -> "Video":
-        """Count the frames by decoding: a header proves nothing (a codec may be missing, a file cut short)."""
+        """Open a video and count its frames by decoding: its header is no proof (a codec may be missing, the file cut
+        short)."""
         stream = _open_stream(path)
         check_image_size(path, stream.get(cv2.CAP_PROP_FRAME_WIDTH), stream.get(cv2.CAP_PROP_FRAME_HEIGHT))
         declared, count = int(stream.get(cv2.CAP_PROP_FRAME_COUNT)), 0
@@ -67,7 +68,7 @@ class Video:
         return Video(path, tuple(range(count)), stream.get(cv2.CAP_PROP_FPS) or None)
 
     def read(self, wanted: Iterable[int]) -> Iterator[VideoFrame]:
-        """The wanted frames in ascending order; InputError if one cannot be read."""
+        """Yield the wanted frames in ascending order. Raises InputError if one cannot be read."""
         stream, position = _open_stream(self.path), 0
         for frame in sorted(wanted):
             while position < frame and stream.grab():

@@ -1,4 +1,4 @@
-"""A body's poses as somebody else fitted them: what ZJU-MoCap and PeopleSnapshot come with."""
+"""Poses of a body model that come with a recording, as in ZJU-MoCap and PeopleSnapshot."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ JOINTS, BETAS = 24, 10  # of SMPL
 
 @dataclass(frozen=True)
 class GivenPoses:
-    """SMPL's own parameters, a row for each of a capture's frames, NaN where a frame has none: a vertex in the world is
-    root @ SMPL(theta, betas).
+    """SMPL parameters, a row for each of a capture's frames, NaN where a frame has none: a vertex in the world is root
+    @ SMPL(theta, betas).
 
     theta (n, 24, 3) axis-angle in SMPL's axes, the pelvis's turn first; root (n, 4, 4) metres, applied after the model
     turned about its pelvis; betas (10,).
@@ -24,12 +24,12 @@ class GivenPoses:
 
     @staticmethod
     def unknown(frames: int) -> "GivenPoses":
-        """Rows to fill, NaN, and the mean shape."""
+        """Return rows of NaN to fill, and the mean shape."""
         return GivenPoses(np.full((frames, JOINTS, 3), np.nan), np.full((frames, 4, 4), np.nan), np.zeros(BETAS))
 
     @property
     def known(self) -> np.ndarray:
-        """(n,) bool: frames that have a pose."""
+        """Return which frames have a pose, (n,) bool."""
         return np.isfinite(self.theta).all((1, 2)) & np.isfinite(self.root).all((1, 2))
 
     def save(self, path: Path) -> None:

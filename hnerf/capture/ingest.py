@@ -1,4 +1,4 @@
-"""The door: a capture folder in any known layout becomes one normalised capture."""
+"""Ingestion: a capture folder in any known layout becomes one normalised capture."""
 
 import dataclasses
 import logging
@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from hnerf.capture.bars import Area, fitted, picture_area
+from hnerf.capture.bars import Area, lens_for_area, picture_area
 from hnerf.capture.board_footage import normalised_corners, read_board_footage
 from hnerf.capture.capture import Capture
 from hnerf.capture.footage import Footage, VideoFrame
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.colmap import Colmap
 from hnerf.capture.formats.easymocap import EasyMocap
-from hnerf.capture.formats.layout import Layout, Stored
+from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.formats.peoplesnapshot import PeopleSnapshot
 from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.formats.zjumocap import ZjuMocap
@@ -23,16 +23,16 @@ from hnerf.capture.lens import Lens
 from hnerf.capture.manifest import CameraSplit, capture_name, chosen_cameras, chosen_frames, read_manifest
 from hnerf.capture.normalise import Normaliser
 from hnerf.capture.safe_io import JSON_SUFFIXES, file_named, read_image
-from hnerf.capture.timing import usual_step
+from hnerf.capture.timing import median_step
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
 
 DEFAULT_FPS = 30.0
-# Padding and cropping by encoders moves sizes by a few pixels; the calibration stage judges what it did to the cameras.
+# Encoders pad and crop by a few pixels; the calibration stage judges what that does to the cameras.
 SIZE_TOLERANCE = 0.02
 RATE_TOLERANCE = 0.01
-MOST_OUTSIDE = 0.5  # share of keypoints outside of their pictures: detectors guess some that are cut off
+MAX_OUTSIDE_SHARE = 0.5  # of keypoints outside their images: detectors guess some that are cut off
 LAYOUTS: tuple[type[Layout], ...] = (
     ZjuMocap,
     PeopleSnapshot,
@@ -41,39 +41,39 @@ LAYOUTS: tuple[type[Layout], ...] = (
     EasyMocap,
     Pose2Sim,
 )  # the first that recognises a folder
-BAR_FRAMES = 5  # evenly spread, in which black bars are looked for
+BAR_FRAMES = 5  # evenly spaced, in which black bars are searched
 
 log = logging.getLogger("hnerf.capture")
 
 
 def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
-    """Read a capture folder (any of LAYOUTS) and write it normalised into `out`.
+    """Read a capture folder (in any of LAYOUTS) and write it normalised into `out`.
 
-    Images are undistorted, and shrunk to `settings.max_side_px`; keypoints and masks with them. Where `capture.toml`
-    names no frames, those before anybody is detected and after are left out. InputError, one line that names the
-    file, on anything missing, unreadable, contradictory or unsafe.
+    Images are undistorted, and shrunk to `settings.max_side_px`, with their keypoints and masks. Where `capture.toml`
+    names no frames, those before the first and after the last detected person are left out. Raises InputError, one line
+    that names the file, on anything missing, unreadable, contradictory or unsafe.
     """
-    layout, notes = recognise(folder), read_manifest(folder)
-    subject = capture_name(folder, notes)
+    layout, manifest = recognise(folder), read_manifest(folder)
+    subject = capture_name(folder, manifest)
     lenses = layout.lenses()
-    cameras = chosen_cameras(folder, notes, list(lenses), layout.training_cameras())
+    cameras = chosen_cameras(folder, manifest, list(lenses), layout.training_cameras())
     footage = {name: layout.footage(name) for name in cameras.train + cameras.test}
     recorded = _common_frames(footage)
     detected = {name: _detections(layout, name, pictures) for name, pictures in footage.items()}
     people = {name: found for name, found in detected.items() if found is not None}
     seen = [people[name] for name in cameras.train if name in people]
-    there = recorded if notes.frames else _while_somebody_is_there(seen, recorded)
-    frames = chosen_frames(folder, notes, there, layout.novel_pose_share, settings.max_frames)
+    occupied = recorded if manifest.frames else _frames_with_people(seen, recorded)
+    frames = chosen_frames(folder, manifest, occupied, layout.novel_pose_share, settings.max_frames)
     wanted = tuple(sorted(frames.train + frames.novel_pose))
 
     out.mkdir(parents=True, exist_ok=True)
     normalisers, areas = _write_cameras(layout, lenses, footage, wanted, settings, out)
     if people:
         rows = np.searchsorted(recorded, wanted)
-        _write_keypoints({name: found[rows] for name, found in people.items()}, notes.keypoints, normalisers, out)
+        _write_keypoints({name: found[rows] for name, found in people.items()}, manifest.keypoints, normalisers, out)
     poses = layout.given_poses(wanted)
     if poses and not poses.known.any():
-        raise InputError(f"{folder}: its poses are of none of these frames; choose others, or take the poses out")
+        raise InputError(f"{folder}: none of the chosen frames has a given pose; choose others, or remove the poses")
     if poses:
         poses.save(out / "poses.npz")
     boards = read_board_footage(folder, "extrinsic")
@@ -84,19 +84,19 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
         name=subject,
         root=out,
         cameras={
-            name: dataclasses.replace(n.camera, t_m=n.camera.t_m * notes.metres_per_unit)
+            name: dataclasses.replace(n.camera, t_m=n.camera.t_m * manifest.metres_per_unit)
             for name, n in normalisers.items()
         },
         train_cameras=tuple(cameras.train),
         test_cameras=tuple(cameras.test),
         train_frames=tuple(frames.train),
         novel_pose_frames=tuple(frames.novel_pose),
-        fps=notes.fps or next(iter(footage.values())).fps or DEFAULT_FPS,
-        up=notes.up,
+        fps=manifest.fps or next(iter(footage.values())).fps or DEFAULT_FPS,
+        up=manifest.up,
         calibrated_sizes_px={name: lenses[name].size_px or n.recorded_size_px for name, n in normalisers.items()},
         recorded_sizes_px={name: n.recorded_size_px for name, n in normalisers.items()},
         picture_areas_px=areas,
-        frame_step=usual_step(recorded),
+        frame_step=median_step(recorded),
         recorded_lenses={c: (n.lens.K.tolist(), n.lens.distortion.tolist()) for c, n in normalisers.items() if n.maps},
     )
     capture.save()
@@ -104,26 +104,28 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
 
 
 def recorded_cameras(folder: Path) -> CameraSplit:
-    """Which cameras of a capture folder are for training and which for testing; InputError as `ingest`."""
+    """Return which cameras of a capture folder are for training and which for testing. Raises InputError as `ingest`
+    does."""
     layout = recognise(folder)
     return chosen_cameras(folder, read_manifest(folder), list(layout.lenses()), layout.training_cameras())
 
 
 def recognise(folder: Path) -> Layout:
-    """The folder's layout; InputError if it is none that is known."""
+    """Return the folder's layout. Raises InputError if it is none of LAYOUTS."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the folder of a capture")
     for layout in LAYOUTS:
         if layout.recognises(folder):
             return layout(folder)
     raise InputError(
-        f"{folder}: none of EasyMocap (intri.yml, extri.yml, images/), Pose2Sim (calibration/, videos/), COLMAP "
+        f"{folder}: is none of EasyMocap (intri.yml, extri.yml, images/), Pose2Sim (calibration/, videos/), COLMAP "
         "(sparse/), Caliscope (camera_array.toml), aniposelib (calibration.toml), ZJU-MoCap (annots.npy) and "
         "PeopleSnapshot (camera.pkl); see docs/formats.md"
     )
 
 
 def _common_frames(footage: dict[str, Footage]) -> tuple[int, ...]:
+    """Return the frames of all cameras. Raises InputError where cameras differ in frames or frame rate."""
     (first_name, first), *others = footage.items()
     for _, other in others:
         if other.frames != first.frames:
@@ -144,7 +146,8 @@ def _write_cameras(
     layout: Layout, lenses: dict[str, Lens], footage: dict[str, Footage], frames: tuple[int, ...],
     settings: CaptureSettings, out: Path,
 ) -> tuple[dict[str, Normaliser], dict[str, Area]]:  # fmt: skip
-    """Pixels of every camera: what was done to them, and of those with proven black bars where their picture lies."""
+    """Write the images of every camera; return how they were normalised, and where black bars prove that the calibrated
+    picture lies."""
     normalisers: dict[str, Normaliser] = {}
     areas: dict[str, Area] = {}
     for name, recording in footage.items():
@@ -158,7 +161,7 @@ def _write_cameras(
 def _write_keypoints(
     people: dict[str, np.ndarray], named: KeypointSetName | None, normalisers: dict[str, Normaliser], out: Path
 ) -> None:
-    """People by camera, (frames, people, K, 3) as detected."""
+    """Write the keypoints of people by camera, detected as (frames, people, K, 3)."""
     found = to_body_25(people, named)
     keypoints = {name: normalisers[name].keypoints(points) for name, points in found.items()}
     np.savez_compressed(out / "keypoints.npz", **keypoints)  # type: ignore[arg-type]
@@ -167,7 +170,7 @@ def _write_keypoints(
 def _write_pixels(
     layout: Layout, lens: Lens, footage: Footage, frames: tuple[int, ...], settings: CaptureSettings, out: Path
 ) -> Normaliser:
-    """Images, masks and clean plate of one camera, all of the first image's size."""
+    """Write images, masks and clean plate of one camera, all of the first image's size."""
     normaliser: Normaliser | None = None
     masks = layout.mask_files(lens.name)
     mask_paths = _per_frame(masks, frames, footage.frames, "masks") if masks else {}
@@ -180,8 +183,8 @@ def _write_pixels(
         normaliser.write_image(picture.rgb, source, picture.file, out / "images" / lens.name / stem)
         if picture.frame in mask_paths:
             mask = mask_paths[picture.frame]
-            recorded = mask.read() if isinstance(mask, Stored) else read_image(mask).max(-1)
-            path = mask.path if isinstance(mask, Stored) else mask
+            recorded = mask.read() if isinstance(mask, StoredFrame) else read_image(mask).max(-1)
+            path = mask.path if isinstance(mask, StoredFrame) else mask
             normaliser.write_mask(recorded, path, out / "masks" / lens.name / f"{stem}.png")
     assert normaliser is not None  # a split has at least one training frame
     plate = layout.plate_file(lens.name)
@@ -191,9 +194,9 @@ def _write_pixels(
 
 
 def _lens_as_recorded(lens: Lens, footage: Footage, frames: tuple[int, ...]) -> tuple[Lens, Area | None]:
-    """The lens for the recorded size, and where in it the calibrated picture lies if black bars prove that.
+    """Return the lens for the recorded size, and where the calibrated picture lies in it if black bars prove that.
 
-    Without a proof the lens stays as it is; InputError if the sizes are then too far apart.
+    Without such a proof the lens is unchanged. Raises InputError if the sizes then differ too much.
     """
     first = next(footage.read(frames[:1]))
     recorded_px = (first.rgb.shape[1], first.rgb.shape[0])
@@ -201,9 +204,9 @@ def _lens_as_recorded(lens: Lens, footage: Footage, frames: tuple[int, ...]) -> 
         return lens, None
     chosen = set(evenly_spaced(frames, BAR_FRAMES))
     area = picture_area([p.rgb for p in footage.read(chosen) if p.rgb.shape == first.rgb.shape])
-    matched = fitted(lens, area, recorded_px)
-    if matched:
-        return matched, area
+    matched_lens = lens_for_area(lens, area, recorded_px)
+    if matched_lens:
+        return matched_lens, area
     if any(abs(r - c) > SIZE_TOLERANCE * c for r, c in zip(recorded_px, lens.size_px, strict=True)):
         raise InputError(
             f"{first.file or footage.path}: is {recorded_px[0]} x {recorded_px[1]} px, but camera {lens.name} was "
@@ -213,29 +216,33 @@ def _lens_as_recorded(lens: Lens, footage: Footage, frames: tuple[int, ...]) -> 
 
 
 def _per_frame(
-    files: dict[int, Path | Stored], wanted: tuple[int, ...], recorded: tuple[int, ...], what: str
-) -> dict[int, Path | Stored]:
-    """The files of the wanted frames, in their order; InputError if there is not one for every recorded frame."""
+    files: dict[int, Path | StoredFrame], wanted: tuple[int, ...], recorded: tuple[int, ...], what: str
+) -> dict[int, Path | StoredFrame]:
+    """Return the files of the wanted frames, in their order. Raises InputError if there is not one for every recorded
+    frame."""
     some = next(iter(files.values()))
-    place = some.path if isinstance(some, Stored) else some.parent
+    place = some.path if isinstance(some, StoredFrame) else some.parent
     if len(files) != len(recorded):
-        raise InputError(f"{place}: {len(files)} {what} for {len(recorded)} frames; give one a frame")
+        raise InputError(f"{place}: {len(files)} {what} for {len(recorded)} frames; give one for each")
     for frame in wanted:
         if frame not in files:
-            raise InputError(f"{place}: {what} of frame {frame} missing; give one a frame")
+            raise InputError(f"{place}: {what} of frame {frame} missing; give one for each frame")
     return {frame: files[frame] for frame in wanted}
 
 
 def _detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | None:
-    """(frames, most people, K, 3) as detected, absent people zero: of the layout's files, else of a list of results in
-    keypoints/<camera>.json; None where there is neither. InputError where they are not in the pictures' pixels."""
+    """Return detected keypoints (frames, most people, K, 3), absent people zero; None where there are none.
+
+    They come from the layout's own files, else from a list of results in keypoints/<camera>.json. Raises InputError
+    where they are not in the pixels of the images.
+    """
     recorded = footage.frames
     files = layout.keypoint_files(camera)
     results = file_named(layout.folder, camera, "keypoints", suffixes=JSON_SUFFIXES)
     if files:
         chosen = _per_frame(files, recorded, recorded, "keypoints").values()
-        paths = [file.path if isinstance(file, Stored) else file for file in chosen]
-        people = [file.read() if isinstance(file, Stored) else read_openpose(file) for file in chosen]
+        paths = [file.path if isinstance(file, StoredFrame) else file for file in chosen]
+        people = [file.read() if isinstance(file, StoredFrame) else read_openpose(file) for file in chosen]
     elif results.is_file():
         paths, people = [results] * len(recorded), read_results(results, recorded)
     else:
@@ -254,12 +261,12 @@ def _detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | N
 
 
 def _check_in_pixels(place: Path, points: np.ndarray, picture: VideoFrame) -> None:
-    """InputError if keypoints (n, 2), all of a camera's, cannot be in the pixels of its pictures."""
+    """Raise InputError if all keypoints (n, 2) of a camera cannot be in the pixels of its images."""
     size_px = np.array(picture.rgb.shape[1::-1])
     if not len(points):
         return
     outside = ((points < 0) | (points > size_px)).any(-1).mean()
-    if outside > MOST_OUTSIDE or points.max() <= 1:
+    if outside > MAX_OUTSIDE_SHARE or points.max() <= 1:
         spans = " and ".join(f"{low:.4g} to {high:.4g}" for low, high in zip(points.min(0), points.max(0), strict=True))
         raise InputError(
             f"{place}: keypoints from {spans} are not in the pixels of pictures of {size_px[0]} x {size_px[1]}; "
@@ -267,9 +274,9 @@ def _check_in_pixels(place: Path, points: np.ndarray, picture: VideoFrame) -> No
         )
 
 
-def _while_somebody_is_there(people: list[np.ndarray], frames: tuple[int, ...]) -> tuple[int, ...]:
-    """The frames from the first to the last in which any camera, (frames, people, K, 3), saw anybody: before and after
-    there is no pose to find. All frames where nobody was ever seen, which is for the calibration stage to say."""
+def _frames_with_people(people: list[np.ndarray], frames: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the frames from the first to the last in which any camera, (frames, people, K, 3), saw anybody: others
+    have no pose to find. All frames where nobody was ever seen, which the calibration stage reports."""
     seen = np.flatnonzero(np.any([(found[..., 2] > 0).any((1, 2)) for found in people], axis=0))
     if not people or not len(seen):
         return frames

@@ -15,20 +15,22 @@ MAX_PEOPLE = 64
 
 
 def read_openpose(path: Path) -> np.ndarray:
-    """(people, K, 3) x_px, y_px, confidence in the file's order, K a known number of points, or 0 without people.
-
-    InputError if it is no such file."""
+    """Read an OpenPose file: (people, K, 3) x_px, y_px, confidence in the file's order, K a known number of points, or
+    0 without people. Raises InputError if it is no such file."""
     try:
-        people = _few(path, read_json(path)["people"])
+        people = _check_count(path, read_json(path)["people"])
         return _people(path, [person["pose_keypoints_2d"] for person in people])
     except (KeyError, TypeError):
         raise InputError(f"{path}: no list of people with pose_keypoints_2d; detect them again") from None
 
 
 def read_results(path: Path, frames: Iterable[int]) -> list[np.ndarray]:
-    """As `read_openpose`, for each of the frames: of a list of {image_id, keypoints, score}, as MMPose, RTMPose and
-    AlphaPose write for a whole recording. image_id: the frame's number, or an image name that ends in it. Frames that
-    it leaves out show nobody. InputError if it is no such file, or is of other frames."""
+    """Read a list of {image_id, keypoints, score}, as MMPose, RTMPose and AlphaPose write for a whole recording; return
+    people for each of the frames as `read_openpose` does.
+
+    image_id: the frame's number, or an image name that ends in it. Frames that are not listed show nobody. Raises
+    InputError if it is no such file, or is of other frames.
+    """
     try:
         people: dict[int, list[Any]] = {}
         for result in read_json(path):
@@ -41,33 +43,35 @@ def read_results(path: Path, frames: Iterable[int]) -> list[np.ndarray]:
             f"{path}: image_id {strange[0]} is none of the recording's frames {frames[0]} to {frames[-1]}; "
             "number them as the pictures are, videos from 0"
         )
-    return [_people(path, _few(path, people.get(frame, []))) for frame in frames]
+    return [_people(path, _check_count(path, people.get(frame, []))) for frame in frames]
 
 
 def _frame(image_id: object) -> int:
-    """12, "12.jpg" and "walk_000012.png" are frame 12; ValueError if it has no number."""
+    """Return the frame number that ends an image_id: 12, "12.jpg" and "walk_000012.png" are frame 12. Raises ValueError
+    if there is none."""
     found = re.search(r"([0-9]{1,9})(\.\w+)?$", str(image_id))
     if not found:
         raise ValueError(image_id)
     return int(found[1])
 
 
-def _few(path: Path, people: list[Any]) -> list[Any]:
+def _check_count(path: Path, people: list[Any]) -> list[Any]:
+    """Return the people of one image. Raises InputError if there are too many."""
     if len(people) > MAX_PEOPLE:
         raise InputError(f"{path}: {len(people)} people in an image; keep at most {MAX_PEOPLE}")
     return people
 
 
 def _people(path: Path, triples: list[Any]) -> np.ndarray:
-    """Flat x, y, confidence lists of one image, checked."""
+    """Convert flat x, y, confidence lists of one image to an array. Raises InputError if they are not keypoints."""
     if not triples:
         return np.zeros((0, 0, 3))
     try:
         points = np.array(triples, dtype=np.float64).reshape(len(triples), -1, 3)
     except (OverflowError, TypeError, ValueError):
-        raise InputError(f"{path}: keypoints are not triples of numbers, as many a person; detect again") from None
+        raise InputError(f"{path}: keypoints are not triples of numbers, as many per person; detect again") from None
     if points.shape[1] not in COUNTS:
-        raise InputError(f"{path}: {points.shape[1]} keypoints a person; sets that are read: {KNOWN}")
+        raise InputError(f"{path}: {points.shape[1]} keypoints a person; known sets are {KNOWN}")
     if not np.isfinite(points).all():
         raise InputError(f"{path}: a keypoint is NaN or infinite; detect them again")
     points[..., 2] = points[..., 2].clip(0, 1)  # some detectors exceed 1, and COCO's own annotations reach 2

@@ -1,7 +1,8 @@
-"""The keypoint sets that detectors write, and how each becomes OpenPose's BODY_25, the only one past the door.
+"""The keypoint sets that detectors write, and their conversion to OpenPose's BODY_25, the only one used after
+ingestion.
 
-BODY_25's neck is the middle of the shoulders and its mid-hip that of the hips, and so they are made here from any set
-that lacks them. A set's own neck (BODY_25B, Halpe) is the base of the skull and is left out.
+BODY_25's neck is the midpoint of the shoulders and its mid-hip that of the hips; both are computed so for any set that
+lacks them. The neck that a set has itself (BODY_25B, Halpe) is the base of the skull and is left out.
 """
 
 from typing import Literal, NamedTuple
@@ -18,14 +19,16 @@ KeypointSetName = Literal["coco_17", "coco_18", "body_25", "body_25b", "halpe_26
 
 
 class KeypointSet(NamedTuple):
-    """points: of a person; rows (25): those whose mean is each BODY_25 keypoint, none where the set has no such."""
+    """One keypoint set. points: how many a person has; rows (25): the points whose mean is each BODY_25 keypoint, none
+    where the set lacks it."""
 
     points: int
     rows: tuple[tuple[int, ...], ...]
 
 
-# COCO's 17 (Lin et al. 2014: nose, then left and right eye, ear, shoulder, elbow, wrist, hip, knee, ankle) open all
-# sets but OpenPose's older two. BODY_25's nose to left ear; feet follow: left big toe, small toe, heel, then the right.
+# All sets but OpenPose's older two begin with COCO's 17 (Lin et al. 2014: nose, then left and right eye, ear, shoulder,
+# elbow, wrist, hip, knee, ankle). Here are BODY_25's nose to left ear from those; the feet follow: left big toe, small
+# toe, heel, then the right.
 _COCO = (
     (0,), (5, 6), (6,), (8,), (10,), (5,), (7,), (9,), (11, 12), (12,), (14,), (16,), (11,), (13,), (15,),
     (2,), (1,), (4,), (3,),
@@ -49,10 +52,12 @@ COUNTS = {known.points for known in SETS.values()}
 
 
 def to_body_25(detections: dict[str, np.ndarray], named: KeypointSetName | None) -> dict[str, np.ndarray]:
-    """BODY_25 keypoints (frames, people, 25, 3) by camera, of detections (frames, people, K, 3) x_px, y_px, confidence.
+    """Convert detections (frames, people, K, 3) x_px, y_px, confidence by camera to BODY_25 keypoints (frames, people,
+    25, 3).
 
-    `named` holds for all cameras; without it the number of points tells the set, and for 25, which two sets have, where
-    point 8 lies. K is 0 where nobody was detected. Raises InputError where `named` has another number of points.
+    `named` is the set of all cameras; without it the set is known from the number of points, and for 25, which two sets
+    have, from where point 8 lies. K is 0 where nobody was detected. Raises InputError where `named` has another number
+    of points.
     """
     of_25 = [points.reshape(-1, 25, 3) for points in detections.values() if points.shape[-2] == 25]
     if of_25 and not named and not is_body_25(np.concatenate(of_25)):
@@ -77,7 +82,8 @@ def to_body_25(detections: dict[str, np.ndarray], named: KeypointSetName | None)
 
 
 def _combined(points: np.ndarray, known: KeypointSet) -> np.ndarray:
-    """(..., K, 3) to (..., 25, 3). A mean of two points has the lower confidence, and is absent if either is."""
+    """Return BODY_25 keypoints (..., 25, 3) of points (..., K, 3). A mean of two points has the lower confidence, and
+    is absent if either is."""
     combined = np.zeros((*points.shape[:-2], 25, 3))
     for k, rows in enumerate(known.rows):
         if rows:
@@ -87,10 +93,12 @@ def _combined(points: np.ndarray, known: KeypointSet) -> np.ndarray:
 
 
 def is_body_25(keypoints: np.ndarray) -> bool:
-    """Whether (..., 25, 3) detections are in BODY_25's order rather than BODY_25B's; true where nothing tells.
+    """Return whether (..., 25, 3) detections are in BODY_25's order rather than BODY_25B's; True where they do not show
+    it.
 
     BODY_25's points 8, 9, 12 are mid-hip, right and left hip, so 8 lies midway; BODY_25B's are right elbow, left wrist,
-    right hip. Judged by the median over all detections, against the distance from point 0 (nose in both) to the hips.
+    right hip. Decided by the median over all detections, relative to the distance from point 0 (nose in both) to the
+    hips.
     """
     seen = keypoints[(keypoints[..., [0, 8, 9, 12], 2] > 0).all(-1)][..., :2]
     if len(seen) == 0:

@@ -1,4 +1,4 @@
-"""A camera as calibrated, with its lens distortion: what stands in a calibration file."""
+"""A camera as calibrated, with its lens distortion: the content of a calibration file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,8 @@ MIN_FOCAL_PX = 1.0
 
 @dataclass(frozen=True)
 class Lens:
-    """K (3, 3) pixels; distortion (4,) or (5,): OpenCV's k1 k2 p1 p2 [k3]; R (3, 3), t_m (3,) world to camera.
+    """A calibrated camera with lens distortion: K (3, 3) pixels; distortion (4,) or (5,), OpenCV's k1 k2 p1 p2 [k3]; R
+    (3, 3), t_m (3,) world to camera.
 
     `size_px` is the (width, height) that was calibrated, None where the file does not say.
     """
@@ -29,13 +30,13 @@ class Lens:
 
 
 def pinhole(camera: Camera) -> Lens:
-    """A camera of undistorted images, as a file describes it."""
+    """Return a camera of undistorted images as a lens without distortion."""
     size_px = (camera.width_px, camera.height_px)
     return Lens(camera.name, camera.K, np.zeros(5), camera.R, camera.t_m, size_px)
 
 
 def known_size(lens: Lens) -> tuple[int, int]:
-    """The (width, height) that a file to be written has to say; InputError where it is not known."""
+    """Return the (width, height) that a file to be written must state. Raises InputError where it is not known."""
     if lens.size_px is None:
         raise InputError(f"intri.yml: camera {lens.name} has no size; add W_{lens.name} and H_{lens.name}")
     return lens.size_px
@@ -50,7 +51,7 @@ def checked_lens(
     t_m: np.ndarray,
     size_px: tuple[float, float] | None,
 ) -> Lens:
-    """A Lens from numbers of any shape; InputError naming file and camera if they make no camera.
+    """Return a Lens from numbers of any shape. Raises InputError naming file and camera if they are not a camera.
 
     sources: the files of the intrinsics and of the extrinsics. R: a matrix or a rotation vector (Rodrigues).
     """

@@ -1,4 +1,4 @@
-"""`capture.toml`: what a layout does not say itself, and which cameras and frames are for what."""
+"""`capture.toml`: what a layout does not state itself, and the splits of cameras and frames."""
 
 import difflib
 import logging
@@ -25,8 +25,8 @@ from hnerf.errors import InputError
 
 log = logging.getLogger("hnerf.capture")
 
-TYPING_ERROR = 0.8  # likeness (difflib's) of an unknown key to a known one, from which on it is taken for a mistake
-MAX_NAME_BYTES = 200  # file systems take 255, for names that are made of it too
+MIN_KEY_SIMILARITY = 0.8  # of an unknown key to a known one (difflib) that makes it a typing error
+MAX_NAME_BYTES = 200  # file systems allow 255, also for longer names made from it
 
 FrameNumber = Annotated[int, Field(ge=0, le=999_999_999)]
 
@@ -36,21 +36,21 @@ class _Table(BaseModel):
 
 
 class CameraSplit(_Table):
-    """Test cameras are for scoring only."""
+    """Cameras for training and for testing. Test cameras are for scoring only."""
 
     train: list[str] = Field(min_length=1)
     test: list[str] = []
 
 
 class FrameSplit(_Table):
-    """Novel-pose frames are fitted but not trained on."""
+    """Frames for training and of novel poses. Novel-pose frames are fitted but not trained on."""
 
     train: list[FrameNumber] = Field(min_length=1)
     novel_pose: list[FrameNumber] = []
 
 
 class CaptureManifest(_Table):
-    """`capture.toml`. Descriptive keys (subject, licence, ...) are anyone's own; those below have a meaning."""
+    """The content of `capture.toml`. Descriptive keys (subject, licence, ...) are free; those below have a meaning."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
 
@@ -72,25 +72,25 @@ class CaptureManifest(_Table):
 
     @property
     def metres_per_unit(self) -> float:
-        """The calibration's unit of length."""
+        """Return how many metres the calibration's unit of length has."""
         return {"m": 1.0, "mm": 1e-3}[self.units] if isinstance(self.units, str) else self.units
 
 
 def read_manifest(folder: Path) -> CaptureManifest:
-    """The folder's `capture.toml`, or the defaults without one; InputError on a bad key or value."""
+    """Read the folder's `capture.toml`, or return the defaults without one. Raises InputError on a bad key or value."""
     path = path_in_capture(folder, "capture.toml")
     if not path.exists():
         return CaptureManifest()
     tree, known = read_toml(path), [*CaptureManifest.model_fields, "board"]
     for key in sorted(set(tree).difference(known)):
-        if meant := difflib.get_close_matches(key.lower(), known, 1, TYPING_ERROR):
-            raise InputError(f"{path}: {key} has no meaning; did you mean {meant[0]}? Else call it something else")
+        if meant := difflib.get_close_matches(key.lower(), known, 1, MIN_KEY_SIMILARITY):
+            raise InputError(f"{path}: {key} has no meaning; did you mean {meant[0]}? If not, rename it")
     return validated(CaptureManifest, tree, path)
 
 
-def capture_name(folder: Path, notes: CaptureManifest) -> str:
-    """What the subject is called; it becomes a folder name, so InputError if it cannot be one."""
-    name = unicodedata.normalize("NFC", folder.resolve().name if notes.name is None else notes.name)  # macOS: NFD
+def capture_name(folder: Path, manifest: CaptureManifest) -> str:
+    """Return the name of the subject. It becomes a folder name; raises InputError if it cannot be one."""
+    name = unicodedata.normalize("NFC", folder.resolve().name if manifest.name is None else manifest.name)  # macOS: NFD
     if not re.fullmatch(r"\w[\w .()-]{0,127}", name):
         raise InputError(f"{folder / 'capture.toml'}: name {name!r}: use letters, digits, '_', '-', '.' and spaces")
     if len(name.encode()) > MAX_NAME_BYTES:
@@ -98,26 +98,26 @@ def capture_name(folder: Path, notes: CaptureManifest) -> str:
     return name
 
 
-def chosen_cameras(folder: Path, notes: CaptureManifest, calibrated: list[str], published: list[str]) -> CameraSplit:
-    """The cameras that `capture.toml` names, else the published ones for training and the rest for testing, else all
-    for training; InputError on one unknown or named twice."""
-    if notes.cameras is None:
+def chosen_cameras(folder: Path, manifest: CaptureManifest, calibrated: list[str], published: list[str]) -> CameraSplit:
+    """Return the cameras that `capture.toml` names, else the published ones for training and the rest for testing, else
+    all for training. Raises InputError on one that is unknown or named twice."""
+    if manifest.cameras is None:
         train = published or calibrated
         return CameraSplit(train=train, test=[name for name in calibrated if name not in train])
-    _check(folder, "camera", notes.cameras.train + notes.cameras.test, calibrated, "the calibration")
-    return notes.cameras
+    _check(folder, "camera", manifest.cameras.train + manifest.cameras.test, calibrated, "the calibration")
+    return manifest.cameras
 
 
 def chosen_frames(
-    folder: Path, notes: CaptureManifest, recorded: tuple[int, ...], novel_pose_share: float, max_frames: int
+    folder: Path, manifest: CaptureManifest, recorded: tuple[int, ...], novel_pose_share: float, max_frames: int
 ) -> FrameSplit:
-    """The frames that `capture.toml` names, else the first of the recorded ones for training and a last share for novel
-    poses, evenly strided so that at most `max_frames` are for training.
+    """Return the frames that `capture.toml` names, else the first of the recorded ones for training and a last share
+    for novel poses, evenly strided so that at most `max_frames` are for training.
 
-    Neighbouring frames of a long recording are nearly the same picture, while fitting and training pay for each.
-    InputError on a frame that is not recorded or is named twice.
+    Neighbouring frames of a long recording are nearly the same picture, while each costs time to fit and train on.
+    Raises InputError on a frame that is not recorded or is named twice.
     """
-    if notes.frames is None:
+    if manifest.frames is None:
         novel = recorded[len(recorded) - int(novel_pose_share * len(recorded)) :]
         train = recorded[: len(recorded) - len(novel)]
         stride = math.ceil(len(train) / max_frames)
@@ -126,11 +126,12 @@ def chosen_frames(
             taken = len(split.train) + len(split.novel_pose)
             log.info("%d of %d frames taken, one in %d; name others in capture.toml", taken, len(recorded), stride)
         return split
-    _check(folder, "frame", notes.frames.train + notes.frames.novel_pose, recorded, "the recording")
-    return notes.frames
+    _check(folder, "frame", manifest.frames.train + manifest.frames.novel_pose, recorded, "the recording")
+    return manifest.frames
 
 
 def _check(folder: Path, what: str, named: list, known: Collection, where: str) -> None:
+    """Raise InputError if a named camera or frame is unknown, or is named twice."""
     path, known_set = folder / "capture.toml", set(known)
     for item in named:
         if item not in known_set:

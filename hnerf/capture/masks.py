@@ -1,4 +1,4 @@
-"""The person's masks of a capture, held as PNG so that many fit in memory."""
+"""Masks of the person in a capture, kept as PNG so that many fit in memory."""
 
 import json
 from dataclasses import dataclass
@@ -13,17 +13,18 @@ from hnerf.errors import InputError
 
 @dataclass(frozen=True)
 class Masks:
-    """encoded: by (camera, frame), PNG bytes of 0/255, without the masks that were dropped; report: plain values."""
+    """Masks of a capture. encoded: by (camera, frame), PNG bytes of 0/255, without the masks that were dropped; report:
+    plain values."""
 
     encoded: dict[tuple[str, int], bytes]
     report: dict[str, Any]
 
     def __contains__(self, view: tuple[str, int]) -> bool:
-        """Whether this (camera, frame) has a mask that can be trusted."""
+        """Return whether this (camera, frame) has a mask that can be trusted."""
         return view in self.encoded
 
     def get(self, camera: str, frame: int) -> np.ndarray:
-        """(H, W) bool, True on the person."""
+        """Return a mask, (H, W) bool, True on the person."""
         png = np.frombuffer(self.encoded[camera, frame], np.uint8)
         mask = cv2.imdecode(png, cv2.IMREAD_GRAYSCALE)
         if mask is None:
@@ -47,18 +48,18 @@ class Masks:
 
 
 def encode(mask: np.ndarray) -> bytes:
-    """(H, W) bool to PNG bytes of 0/255."""
+    """Encode a mask (H, W) bool as PNG bytes of 0/255."""
     return cv2.imencode(".png", np.where(mask, 255, 0).astype(np.uint8))[1].tobytes()
 
 
 def movement_px(before: Masks, after: Masks) -> float:
-    """Mean over the views that both have of the mean distance from the edge after to the edge before."""
+    """Return the mean, over the views that both have, of the mean distance from the edges after to the edges before."""
     moved = [_edge_distance_px(before.get(*view), after.get(*view)) for view in after.encoded if view in before]
     return float(np.mean(moved)) if moved else float("inf")
 
 
 def _edge_distance_px(before: np.ndarray, after: np.ndarray) -> float:
-    """Mean distance in pixels of the edge of one mask (H, W) bool to that of another."""
+    """Return the mean distance in pixels from the edge of mask `after`, (H, W) bool, to that of mask `before`."""
     edges = [m & ~cv2.erode(m.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool) for m in (before, after)]
     away_px = cv2.distanceTransform((~edges[0]).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return float(away_px[edges[1]].mean())

@@ -1,4 +1,4 @@
-"""From one camera's recorded pixels to those of a linear camera of bounded size."""
+"""Conversion of one camera's recorded pixels to those of a linear camera of bounded size."""
 
 import shutil
 from dataclasses import dataclass
@@ -12,16 +12,19 @@ from hnerf.capture.lens import Lens
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
-MOST_LABELS = 64  # different levels; a mask of more has soft edges
+MAX_LABELS = 64  # levels of a mask of labels; a mask of more has soft edges
 
-UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-3)  # OpenCV's own 5 rounds miss by pixels
+# OpenCV's default of 5 iterations is off by pixels.
+UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-3)
 
 
 @dataclass(frozen=True)
 class Normaliser:
-    """`camera` is the linear one, at the size that is written. `maps`: cv2.remap's tables, None without distortion.
+    """The conversion of one camera's pixels. `camera` is the linear one, at the size that is written. `maps`:
+    cv2.remap's tables, None without distortion.
 
-    The linear camera keeps the calibrated K; what undistortion has no pixel for repeats the nearest edge pixel.
+    The linear camera keeps the calibrated K; where undistortion has no source pixel, the nearest edge pixel is
+    repeated.
     """
 
     lens: Lens
@@ -31,7 +34,7 @@ class Normaliser:
 
     @staticmethod
     def create(lens: Lens, recorded_size_px: tuple[int, int], max_side_px: int) -> "Normaliser":
-        """For images of (width, height) pixels, shrunk until the longest side is at most `max_side_px`."""
+        """Return the conversion of images of (width, height) pixels, shrunk so that no side exceeds `max_side_px`."""
         width_px, height_px = recorded_size_px
         camera = Camera(lens.name, lens.K, lens.R, lens.t_m, width_px, height_px)
         scale = max_side_px / max(recorded_size_px)
@@ -44,16 +47,16 @@ class Normaliser:
 
     @property
     def changes_pixels(self) -> bool:
-        """Whether there is anything to undistort or to shrink."""
+        """Return whether there is anything to undistort or to shrink."""
         return self.maps is not None or self.size_px != self.recorded_size_px
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """(width, height) of what is written."""
+        """Return the (width, height) of what is written."""
         return self.camera.width_px, self.camera.height_px
 
     def pixels(self, recorded: np.ndarray) -> np.ndarray:
-        """(H, W) or (H, W, 3) uint8 as recorded, undistorted and shrunk."""
+        """Return recorded pixels (H, W) or (H, W, 3) uint8 undistorted and shrunk."""
         if self.maps is not None:
             recorded = cv2.remap(recorded, *self.maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         if self.size_px != self.recorded_size_px:
@@ -61,7 +64,8 @@ class Normaliser:
         return recorded
 
     def keypoints(self, recorded: np.ndarray) -> np.ndarray:
-        """(..., 25, 3) x_px, y_px, confidence as recorded to the linear camera; points of no confidence become zero."""
+        """Convert recorded keypoints (..., 25, 3) x_px, y_px, confidence to the linear camera; points without
+        confidence become zero."""
         xy = recorded[..., :2].reshape(-1, 1, 2)
         if self.maps is not None:
             xy = cv2.undistortPoints(xy, self.lens.K, self.lens.distortion, P=self.lens.K, criteria=UNDISTORTED)
@@ -70,10 +74,10 @@ class Normaliser:
         return np.concatenate([xy, recorded[..., 2:]], -1) * (recorded[..., 2:] > 0)
 
     def write_image(self, rgb: np.ndarray, source: Path, verbatim: Path | None, target: Path) -> None:
-        """Write to `target` plus a suffix: the file itself where it already holds exactly these pixels.
+        """Write an image to `target` plus a suffix.
 
-        Else JPEG of quality 95 without chroma subsampling: its error is far below that of the resampling, and at a
-        fifth of a PNG's size.
+        The file itself is copied where it already holds exactly these pixels. Otherwise a JPEG of quality 95 without
+        chroma subsampling is written: its error is far below that of the resampling, at a fifth of a PNG's size.
         """
         self._check_size(rgb, source)
         if verbatim and not self.changes_pixels:
@@ -83,15 +87,18 @@ class Normaliser:
             write_image(target.with_name(f"{target.name}.jpg"), self.pixels(rgb))
 
     def write_mask(self, recorded: np.ndarray, source: Path, target: Path) -> None:
-        """A mask (H, W) uint8 from file `source` as 0/255 PNG. The person is anything but black; in a matte, and in a
-        JPEG, where edges ring, anything light."""
+        """Write a mask (H, W) uint8 from file `source` as 0/255 PNG.
+
+        The person is any level but black; in a matte, and in a JPEG, whose edges ring, any light level.
+        """
         self._check_size(recorded, source)
-        soft = source.suffix.lower() in (".jpg", ".jpeg") or len(np.unique(recorded)) > MOST_LABELS
+        soft = source.suffix.lower() in (".jpg", ".jpeg") or len(np.unique(recorded)) > MAX_LABELS
         black = 127 if soft else 0
         person = self.pixels(np.where(recorded > black, 255, 0).astype(np.uint8)) > 127
         write_image(target, np.where(person, 255, 0).astype(np.uint8))
 
     def _check_size(self, pixels: np.ndarray, source: Path) -> None:
+        """Raise InputError unless pixels have the recorded size."""
         height_px, width_px = pixels.shape[:2]
         if (width_px, height_px) != self.recorded_size_px:
             raise InputError(

@@ -1,4 +1,4 @@
-"""Opening files that strangers made: inside the capture folder, no links, bounded sizes, no pickles."""
+"""Safe reading of untrusted files: inside the capture folder, no links, bounded sizes, no pickles."""
 
 import json
 import re
@@ -15,19 +15,21 @@ from hnerf.errors import InputError
 
 MAX_IMAGE_PIXELS = 64_000_000
 MAX_TEXT_BYTES = 16_000_000
-# What reading arrays from a file raises that is no whole .npz of plain arrays.
-NO_ARRAYS = (AttributeError, EOFError, MemoryError, OSError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
+# Exceptions on reading arrays from a file that is not a complete .npz of plain arrays.
+ARRAY_FILE_ERRORS = (
+    AttributeError, EOFError, MemoryError, OSError, TypeError, ValueError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 VIDEO_SUFFIXES = (".mp4",)
 JSON_SUFFIXES = (".json",)
 _IMAGE_MODES = ("1", "L", "LA", "P", "RGB", "RGBA")  # 8 bits a channel: others would be clipped
-_CAMERA_NAME = re.compile(r"\w([\w ()-]{0,62}[\w()-])?")  # becomes a folder name, and a glob without wildcards
-_ARGUMENTS = ("file", "allow_pickle")  # of np.savez, which takes keypoints by camera name
+_CAMERA_NAME = re.compile(r"\w([\w ()-]{0,62}[\w()-])?")  # is used as a folder name, and in a glob without wildcards
+_ARGUMENTS = ("file", "allow_pickle")  # of np.savez, which is given keypoints with camera names as keywords
 
 
 def check_camera_name(name: object, source: Path) -> str:
-    """`name` if it can be a folder's name and an array's in a .npz; InputError naming `source` otherwise (separators,
-    dots, wildcards)."""
+    """Return `name` if it can be the name of a folder and of an array in a .npz. Raises InputError naming `source`
+    otherwise (separators, dots, wildcards)."""
     if not isinstance(name, str) or not _CAMERA_NAME.fullmatch(name):
         raise InputError(f"{source}: camera name {name!r}: use letters, digits, '_', '-', spaces and ()")
     if name in _ARGUMENTS:
@@ -36,7 +38,8 @@ def check_camera_name(name: object, source: Path) -> str:
 
 
 def path_in_capture(root: Path, *parts: str) -> Path:
-    """root/parts, which need not exist; InputError if it leaves the capture folder or passes through a link."""
+    """Return root/parts, which need not exist. Raises InputError if it leaves the capture folder or passes through a
+    link."""
     path = root
     for part in parts:
         path = path / part
@@ -48,8 +51,8 @@ def path_in_capture(root: Path, *parts: str) -> Path:
 
 
 def files_in(root: Path, *parts: str, suffixes: tuple[str, ...] = ()) -> list[Path]:
-    """The files of a folder inside the capture, sorted by name; empty if there is no such folder. suffixes: in lower
-    case, those to keep, however they are written; none keeps all."""
+    """Return the files of a folder inside the capture, sorted by name; an empty list if there is no such folder.
+    suffixes: those to keep, in lower case, in whichever case files have them; none keeps all."""
     folder = path_in_capture(root, *parts)
     if not folder.is_dir():
         return []
@@ -62,14 +65,15 @@ def files_in(root: Path, *parts: str, suffixes: tuple[str, ...] = ()) -> list[Pa
 
 
 def file_named(root: Path, stem: str, *parts: str, suffixes: tuple[str, ...]) -> Path:
-    """The file called `stem` with one of these suffixes, as `files_in` has them, in a folder inside the capture; where
-    there is none, the path that it would have with the first of them."""
+    """Return the file called `stem` with one of these suffixes, matched as in `files_in`, in a folder inside the
+    capture; where there is none, the path that it would have with the first suffix."""
     found = [path for path in files_in(root, *parts, suffixes=suffixes) if path.stem == stem]
     return found[0] if found else path_in_capture(root, *parts, stem + suffixes[0])
 
 
 def numbered(paths: list[Path], what: str) -> dict[int, Path]:
-    """Files by the frame number that their name starts with; InputError on a name without one, or one twice."""
+    """Return files by the frame number that their name starts with. Raises InputError on a name without a number, or if
+    two files have the same."""
     by_frame: dict[int, Path] = {}
     for path in paths:
         found = re.fullmatch(r"([0-9]{1,9})(?:_keypoints)?", path.stem)
@@ -83,7 +87,7 @@ def numbered(paths: list[Path], what: str) -> dict[int, Path]:
 
 
 def read_bytes(path: Path, max_bytes: int) -> bytes:
-    """A file's content; InputError if it is missing or too large."""
+    """Read a file's content. Raises InputError if it is missing or too large."""
     try:
         size = path.stat().st_size
         if size > max_bytes:
@@ -94,7 +98,7 @@ def read_bytes(path: Path, max_bytes: int) -> bytes:
 
 
 def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """A small UTF-8 text file, which may begin with a mark that says so; InputError if it is missing, empty, too
+    """Read a small UTF-8 text file, with or without a byte order mark. Raises InputError if it is missing, empty, too
     large, or not text (a pickle, an archive)."""
     try:
         text = read_bytes(path, max_bytes).decode("utf-8-sig")
@@ -106,7 +110,7 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """A JSON file; InputError as `read_text`, or if it is not JSON."""
+    """Read a JSON file. Raises InputError as `read_text` does, or if it is not JSON."""
     try:
         return json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
@@ -114,7 +118,7 @@ def read_json(path: Path) -> Any:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """A TOML file; InputError as `read_text`, or if it is not TOML."""
+    """Read a TOML file. Raises InputError as `read_text` does, or if it is not TOML."""
     try:
         return tomllib.loads(read_text(path))
     except (tomllib.TOMLDecodeError, RecursionError) as error:
@@ -122,7 +126,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def check_image_size(path: Path, width_px: float, height_px: float) -> tuple[int, int]:
-    """The declared (width, height) if sane, before anything is allocated for it; InputError otherwise."""
+    """Return the declared (width, height) if sane, before anything is allocated for it. Raises InputError otherwise."""
     if not (width_px >= 1 and height_px >= 1 and width_px * height_px <= MAX_IMAGE_PIXELS):
         limit = MAX_IMAGE_PIXELS // 1_000_000
         raise InputError(f"{path}: declares {width_px:g} x {height_px:g} px; give 1 to {limit} million pixels")
@@ -130,7 +134,8 @@ def check_image_size(path: Path, width_px: float, height_px: float) -> tuple[int
 
 
 def read_image(path: Path) -> np.ndarray:
-    """(H, W, 3) uint8 RGB, upright; InputError if it is not a whole 8-bit JPEG or PNG of a sane size."""
+    """Read an image, upright, as (H, W, 3) uint8 RGB. Raises InputError if it is not a whole 8-bit JPEG or PNG of a
+    sane size."""
     try:
         with Image.open(path, formats=["JPEG", "PNG"]) as image:
             check_image_size(path, *image.size)

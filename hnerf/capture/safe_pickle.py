@@ -1,8 +1,8 @@
-"""Pickles of plain data (numbers, text, dicts, lists, numpy arrays), read without running anything that they name.
+"""Pickles of plain data (numbers, text, dicts, lists, numpy arrays), read without executing anything that they name.
 
-Old captures and body models come as pickles, and unpickling runs whatever a stranger wrote. Here every class that a
-pickle may name is one of the stand-ins below, which only hold what they are given; all others are refused. Arrays are
-made afterwards, from bytes of the length that their shape declares.
+Old captures and body models come as pickles, and unpickling executes whatever their author wrote. Here every class that
+a pickle may name is replaced by one of the stand-ins below, which only hold what they are given; all others are
+refused. Arrays are made afterwards, from bytes of the length that their shape declares.
 """
 
 import io
@@ -19,17 +19,17 @@ from hnerf.capture.safe_io import read_bytes
 from hnerf.errors import InputError
 
 MAX_BYTES = 1_000_000_000  # the largest SMPL-X model has half of that
-_KINDS = re.compile(r"[biufOSU?][0-9]*")
+_DTYPES = re.compile(r"[biufOSU?][0-9]*")
 
 
 def read_pickle(path: Path) -> Any:
-    """Plain data of a pickle file (text of Python 2 as latin-1); sparse matrices become scipy's CSC arrays, chumpy's
-    become numpy's. InputError if it is missing, too large or damaged, or names anything else."""
+    """Read plain data from a pickle file (text of Python 2 as latin-1); sparse matrices become scipy's CSC arrays,
+    chumpy's arrays numpy's. Raises InputError if the file is missing, too large or damaged, or names anything else."""
     return _plain_data(path, io.BytesIO(read_bytes(path, MAX_BYTES)))
 
 
 def read_pickled_npy(path: Path) -> Any:
-    """As `read_pickle`, what `numpy.save` makes of one Python object."""
+    """Read the one Python object of a file that `numpy.save` wrote, as `read_pickle` does."""
     stream = io.BytesIO(read_bytes(path, MAX_BYTES))
     try:
         version = np.lib.format.read_magic(stream)
@@ -43,6 +43,7 @@ def read_pickled_npy(path: Path) -> Any:
 
 
 def _plain_data(path: Path, stream: io.BytesIO) -> Any:
+    """Unpickle plain data. Raises InputError if the stream holds anything else."""
     try:
         return _plain(_Unpickler(stream, encoding="latin1").load(), {})
     except Exception as error:  # a damaged pickle can raise nearly anything
@@ -51,7 +52,7 @@ def _plain_data(path: Path, stream: io.BytesIO) -> Any:
 
 
 class _StandIn:
-    """Holds what a pickle gives an object: the arguments of its making, and its state."""
+    """A stand-in for an object in a pickle: it holds the constructor's arguments and the state."""
 
     state: Any = None
 
@@ -62,21 +63,22 @@ class _StandIn:
         self.state = state
 
     def plain(self, done: dict[int, Any]) -> Any:
+        """Return the plain data that the object stands for; `done` as in `_plain`."""
         raise pickle.UnpicklingError(f"{type(self).__name__} is no data")
 
 
 class _Dtype(_StandIn):
-    """numpy.dtype(code, align, copy), state (version, byte order, ...): numbers, text, or Python objects."""
+    """A numpy.dtype(code, align, copy) with state (version, byte order, ...): numbers, text, or Python objects."""
 
     def plain(self, done: dict[int, Any]) -> Any:
         code, order = str(self.arguments[0]), str(self.state[1]) if self.state else "|"
-        if not _KINDS.fullmatch(code) or order not in "<>|=":
+        if not _DTYPES.fullmatch(code) or order not in "<>|=":
             raise pickle.UnpicklingError(f"an array of type {code}")
         return np.dtype(code).newbyteorder(order)  # type: ignore[arg-type]
 
 
 class _Array(_StandIn):
-    """numpy.ndarray, state (version, shape, dtype, column-major, bytes or list of objects)."""
+    """A numpy.ndarray with state (version, shape, dtype, column-major, bytes or list of objects)."""
 
     def plain(self, done: dict[int, Any]) -> Any:
         _, shape, kind, column_major, data = self.state
@@ -93,7 +95,7 @@ class _Array(_StandIn):
 
 
 class _Scalar(_StandIn):
-    """numpy.core.multiarray.scalar(dtype, bytes)."""
+    """A numpy.core.multiarray.scalar(dtype, bytes)."""
 
     def plain(self, done: dict[int, Any]) -> Any:
         dtype, data = self.arguments
@@ -101,7 +103,7 @@ class _Scalar(_StandIn):
 
 
 class _Sparse(_StandIn):
-    """scipy.sparse.csc_matrix, its attributes."""
+    """A scipy.sparse.csc_matrix with its attributes as state."""
 
     def plain(self, done: dict[int, Any]) -> Any:
         parts = _plain(self.state, done)
@@ -112,21 +114,22 @@ class _Sparse(_StandIn):
 
 
 class _Chumpy(_StandIn):
-    """chumpy.Ch, an array of a package that is no longer kept: its value is the attribute x."""
+    """A chumpy.Ch, an array of a package that is no longer maintained: its value is the attribute x."""
 
     def plain(self, done: dict[int, Any]) -> Any:
         return np.asarray(_plain(self.state["x"], done))
 
 
 def _reconstructed(kind: Any, *_: Any) -> _StandIn:
-    """numpy's _reconstruct(class, shape, type) and copyreg's _reconstructor(class, base, state): the state follows."""
+    """Create a stand-in as numpy's _reconstruct(class, shape, type) and copyreg's _reconstructor(class, base, state)
+    would; its state follows."""
     if not (isinstance(kind, type) and issubclass(kind, _StandIn)):
         raise pickle.UnpicklingError("a class of an unknown kind")
     return kind()
 
 
 def _encoded(text: str, encoding: str) -> bytes:
-    """_codecs.encode, by which Python 3 writes bytes for Python 2."""
+    """Encode text as _codecs.encode does, by which Python 3 writes bytes for Python 2."""
     return text.encode("latin1")
 
 
@@ -147,7 +150,7 @@ _ALLOWED: dict[tuple[str, str], Any] = {
 }
 
 
-class _Unpickler(pickle._Unpickler):  # in Python: the one in C allocates whatever a pickle's memo index says
+class _Unpickler(pickle._Unpickler):  # in Python: the one in C allocates as much as a pickle's memo index says
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _ALLOWED:
             raise pickle.UnpicklingError(f"it names {module}.{name}")
@@ -158,12 +161,12 @@ class _Unpickler(pickle._Unpickler):  # in Python: the one in C allocates whatev
 
 
 def _plain(value: Any, done: dict[int, Any]) -> Any:
-    """`value` with its stand-ins turned into what they stand for; done: by identity, so that what a pickle holds many
-    times over is made once."""
+    """Return `value` with its stand-ins replaced by what they stand for. done: results by identity, so that an object
+    that occurs many times is converted once."""
     if not isinstance(value, _StandIn | dict | list | tuple):
         return value
     if id(value) not in done:
-        done[id(value)] = None  # what holds itself is cut off there
+        done[id(value)] = None  # cuts off data that contains itself
         if isinstance(value, _StandIn):
             done[id(value)] = value.plain(done)
         elif isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""From detected keypoints to points in space: robust triangulation, and which detected person is the subject."""
+"""Choice of the subject among detected people: the person on whom the cameras agree, followed through time."""
 
 from itertools import combinations, pairwise
 
@@ -9,19 +9,19 @@ from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import confidence_of, solve_points
 
-AGREEMENT_REACH = 0.15  # of a person's height in the image: where a detection stops supporting a hypothesis
-UNEXPLAINED = 0.1  # weight of a detection that the other cameras do not support: a camera may be badly calibrated
-CANDIDATES = 8  # combinations of people kept a frame
-JUMP_COST = 4.0  # of one camera's best score, for moving by the person's own height between frames
-USUAL_JUMPS = 2.0  # times the median movement between frames, which cost nothing
+AGREEMENT_REACH = 0.15  # of a person's height in the image: beyond it a keypoint does not support a hypothesis
+UNSUPPORTED_WEIGHT = 0.1  # of a detection without support from other cameras: one may be badly calibrated
+CANDIDATES = 8  # combinations of people kept in each frame
+JUMP_COST = 4.0  # in best scores of one camera, for moving by the person's own height between frames
+FREE_JUMPS = 2.0  # in median movements between frames: jumps up to this cost nothing
 
 
 def subject_keypoints(capture: Capture) -> dict[str, np.ndarray]:
-    """The subject's keypoints in every training camera, (frames, 25, 3) in the order of `capture.frames`.
+    """Return the subject's keypoints in every training camera, (frames, 25, 3) in the order of `capture.frames`.
 
-    Where several people are detected, the subject is whom most cameras agree on (two-view triangulation predicts where
-    each camera must see the person), weighted by size, confidence and nearness to the image's centre, and followed
-    through time (Viterbi). Confidence is 0 where the person is not detected. Test cameras are never read.
+    Where several people are detected, the subject is the person on whom most cameras agree (two-view triangulation
+    predicts where each camera must see the person), weighted by size, confidence and nearness to the image's centre,
+    and followed through time (Viterbi). Confidence is 0 where the person is not detected. Test cameras are never read.
     Raises InputError where no frame shows a person in two cameras (in one, if there is only one).
     """
     names = capture.train_cameras
@@ -36,7 +36,8 @@ def subject_keypoints(capture: Capture) -> dict[str, np.ndarray]:
     if all(p.shape[1] == 1 for p in people):
         return {name: p[:, 0] for name, p in zip(names, people, strict=True)}
     cameras = [capture.cameras[name] for name in names]
-    choice = _follow([_frame_candidates(cameras, [p[i] for p in people]) for i in range(len(capture.frames))], people)
+    candidates = [_frame_candidates(cameras, [p[i] for p in people]) for i in range(len(capture.frames))]
+    choice = _most_probable_sequence(candidates, people)
     chosen = {}
     for c, name in enumerate(names):
         chosen[name] = people[c][np.arange(len(choice)), choice[:, c]] * (choice[:, c] >= 0)[:, None, None]
@@ -44,8 +45,8 @@ def subject_keypoints(capture: Capture) -> dict[str, np.ndarray]:
 
 
 def _frame_candidates(cameras: list[Camera], people: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """The best combinations of people in one frame: indices (n, C), -1 for nobody, and their scores (n,), the best one
-    first; with and without those whom no other camera sees where they are.
+    """Return the best combinations of people in one frame: indices (n, C), -1 for nobody, and their scores (n,), the
+    best first; with and without people whom no other camera supports.
 
     people: per camera (P, 25, 3). The score is the mean over cameras of prominence times agreement.
     """
@@ -58,7 +59,7 @@ def _frame_candidates(cameras: list[Camera], people: list[np.ndarray]) -> tuple[
     for c, agreement in enumerate(agreements):
         if not prominence[c].any():
             continue
-        value = (UNEXPLAINED + agreement) * prominence[c]
+        value = (UNSUPPORTED_WEIGHT + agreement) * prominence[c]
         picks[:, c] = value.argmax(1)
         scores[:, c] = value.max(1) / len(cameras)
         supported[:, c] = np.take_along_axis(agreement, picks[:, c : c + 1], 1)[:, 0] > 0
@@ -71,8 +72,8 @@ def _frame_candidates(cameras: list[Camera], people: list[np.ndarray]) -> tuple[
 
 
 def _agreements(cameras: list[Camera], people: list[np.ndarray]) -> list[np.ndarray]:
-    """How well each hypothesis (a person in one camera being a person in another) explains each person: per camera
-    (n, P), from 0 to 1."""
+    """Return how well each hypothesis (a person in one camera is a certain person in another) explains each person: per
+    camera (n, P), from 0 to 1."""
     projections = np.stack([camera.projection for camera in cameras])
     shown = [found[found[..., 2].any(1)] for found in people]
     hypotheses_m = [np.zeros((0, 25, 3))]
@@ -89,7 +90,8 @@ def _agreements(cameras: list[Camera], people: list[np.ndarray]) -> list[np.ndar
 
 
 def _support(camera: Camera, points_m: np.ndarray, people: np.ndarray) -> np.ndarray:
-    """(n, P): confidence-weighted share of the keypoints of people (P, 25, 3) that points (n, 25, 3) project onto."""
+    """Return the confidence-weighted share of the keypoints of people (P, 25, 3) onto which points (n, 25, 3) project,
+    (n, P)."""
     uv, depth_m = camera.project(points_m)
     height_px = person_heights_px(people).clip(1)
     distance = np.linalg.norm(uv[:, None] - people[None, ..., :2], axis=-1) / height_px[:, None]
@@ -99,7 +101,7 @@ def _support(camera: Camera, points_m: np.ndarray, people: np.ndarray) -> np.nda
 
 
 def person_heights_px(people: np.ndarray) -> np.ndarray:
-    """Largest side of each person's keypoint box, (P,)."""
+    """Return the larger side of each person's keypoint box, (P,)."""
     visible = people[..., 2:] > 0
     low = np.where(visible, people[..., :2], np.inf).min(-2)
     high = np.where(visible, people[..., :2], -np.inf).max(-2)
@@ -107,7 +109,7 @@ def person_heights_px(people: np.ndarray) -> np.ndarray:
 
 
 def _prominence(camera: Camera, people: np.ndarray) -> np.ndarray:
-    """Size x confidence x centrality of each person, (P,), from 0 to 1."""
+    """Return size x confidence x centrality of each person, (P,), from 0 to 1."""
     size_px = np.array([camera.width_px, camera.height_px])
     weight = people[..., 2:]
     centre = (people[..., :2] * weight).sum(-2) / weight.sum(-2).clip(1e-9)
@@ -116,15 +118,15 @@ def _prominence(camera: Camera, people: np.ndarray) -> np.ndarray:
     return height * people[..., 2].mean(-1).clip(0, 1) * np.exp(-2 * off_centre**2)
 
 
-def _follow(candidates: list[tuple[np.ndarray, np.ndarray]], people: list[np.ndarray]) -> np.ndarray:
-    """The most probable sequence of combinations, (frames, C): Viterbi with a cost for jumping in the image, by more
-    than is usual here. Who is not seen is where he was seen last."""
-    shown = [_shown([p[i] for p in people], picks) for i, (picks, _) in enumerate(candidates)]
+def _most_probable_sequence(candidates: list[tuple[np.ndarray, np.ndarray]], people: list[np.ndarray]) -> np.ndarray:
+    """Return the most probable sequence of combinations, (frames, C): Viterbi with a cost for jumps in the image beyond
+    what is typical of the recording. A person who is not seen stays where he was last seen."""
+    shown = [_picked_keypoints([p[i] for p in people], picks) for i, (picks, _) in enumerate(candidates)]
     best = [[one[:1] for one in frame] for frame in shown]
-    usual = USUAL_JUMPS * float(np.median([_jump(a, b)[0, 0] for a, b in pairwise(best)])) if len(best) > 1 else 0.0
+    free_jump = FREE_JUMPS * float(np.median([_jump(a, b)[0, 0] for a, b in pairwise(best)])) if len(best) > 1 else 0.0
     last, total, back = shown[0], candidates[0][1], []
     for now, (picks, score) in zip(shown[1:], candidates[1:], strict=True):
-        best_before = total[:, None] - JUMP_COST * _jump(last, now, usual)
+        best_before = total[:, None] - JUMP_COST * _jump(last, now, free_jump)
         back.append(best_before.argmax(0))
         total = best_before.max(0) + score
         seen = (picks >= 0).T[..., None, None]
@@ -135,18 +137,18 @@ def _follow(candidates: list[tuple[np.ndarray, np.ndarray]], people: list[np.nda
     return np.stack([picks[k] for (picks, _), k in zip(candidates, reversed(path), strict=True)])
 
 
-def _shown(people: list[np.ndarray], picks: np.ndarray) -> list[np.ndarray]:
-    """Per camera the keypoints (n, 25, 3) of the picked people of one frame, 0 for nobody."""
+def _picked_keypoints(people: list[np.ndarray], picks: np.ndarray) -> list[np.ndarray]:
+    """Return per camera the keypoints (n, 25, 3) of the picked people of one frame, 0 for nobody."""
     return [np.where((pick >= 0)[:, None, None], found[pick], 0.0) for found, pick in zip(people, picks.T, strict=True)]
 
 
-def _jump(before: list[np.ndarray], now: list[np.ndarray], usual: float = 0.0) -> np.ndarray:
-    """Mean over cameras of the movement beyond `usual` in person heights, at most 1 a camera, from each of people
-    (n, 25, 3) to each of others (m, 25, 3): (n, m)."""
+def _jump(before: list[np.ndarray], now: list[np.ndarray], free_jump: float = 0.0) -> np.ndarray:
+    """Return the movement beyond `free_jump` in person heights, at most 1 per camera, averaged over cameras, from each
+    of people (n, 25, 3) to each of others (m, 25, 3): (n, m)."""
     jumps = np.zeros((len(before[0]), len(now[0])))
     for was, is_now in zip(before, now, strict=True):
         a, b = was[:, None], is_now[None]
         both = np.minimum(a[..., 2], b[..., 2])
         distance = np.linalg.norm(a[..., :2] - b[..., :2], axis=-1) / person_heights_px(b).clip(1)[..., None]
-        jumps += (((distance - usual).clip(0, 1) * both).sum(-1) / both.sum(-1).clip(1e-9)) / len(before)
+        jumps += (((distance - free_jump).clip(0, 1) * both).sum(-1) / both.sum(-1).clip(1e-9)) / len(before)
     return jumps

@@ -1,4 +1,4 @@
-"""A smaller capture from a capture: fewer training cameras, fewer frames."""
+"""Subsets of a capture: fewer training cameras, fewer frames."""
 
 import dataclasses
 import shutil
@@ -16,9 +16,9 @@ T = TypeVar("T")
 
 
 def require_several_cameras(capture: Capture) -> None:
-    """NotApplicableError where one camera alone differs from no other."""
+    """Raise NotApplicableError if the capture has a single training camera, which cannot differ from others."""
     if len(capture.train_cameras) < 2:
-        raise NotApplicableError(f"{capture.name}: has one training camera; there is none to differ from")
+        raise NotApplicableError(f"{capture.name}: has only one training camera; this needs several")
 
 
 def subset(
@@ -30,17 +30,18 @@ def subset(
 ) -> None:
     """Write another normalised capture into `out` with only these training cameras and frames; None keeps all.
 
-    capture: as ingested, its cameras in step. Test cameras stay. Frames keep their numbers, so that ground truth is
-    found by them. InputError if a camera or frame is not one of the capture's, or nothing is left to train on.
+    capture: as ingested, with synchronised cameras. Test cameras are kept. Frames keep their numbers, so that ground
+    truth can be found by them. Raises InputError if a camera or frame is not one of the capture's, or nothing is left
+    to train on.
     """
-    train_cameras = chosen(capture, "training camera", cameras, capture.train_cameras)
+    train_cameras = select(capture, "training camera", cameras, capture.train_cameras)
     kept = dataclasses.replace(
         capture,
         root=out,
         cameras={name: capture.cameras[name] for name in (*train_cameras, *capture.test_cameras)},
         train_cameras=train_cameras,
-        train_frames=chosen(capture, "training frame", train_frames, capture.train_frames),
-        novel_pose_frames=chosen(capture, "novel-pose frame", novel_pose_frames, capture.novel_pose_frames),
+        train_frames=select(capture, "training frame", train_frames, capture.train_frames),
+        novel_pose_frames=select(capture, "novel-pose frame", novel_pose_frames, capture.novel_pose_frames),
     )
     if not kept.train_cameras or not kept.train_frames:
         raise InputError(f"{capture.name}: no training camera or frame would be left; keep one of each")
@@ -52,7 +53,7 @@ def subset(
 
 
 def write_arrays(capture: Capture, kept: Capture) -> None:
-    """Keypoints and given poses of the frames and cameras that are kept."""
+    """Write keypoints and given poses of the frames and cameras that are kept."""
     rows = np.searchsorted(capture.frames, kept.frames)
     found = read_keypoints(capture)
     write_keypoints(kept.root, {name: found[name][rows] for name in kept.cameras if name in found})
@@ -62,38 +63,39 @@ def write_arrays(capture: Capture, kept: Capture) -> None:
 
 
 def read_keypoints(capture: Capture) -> dict[str, np.ndarray]:
-    """Of every camera in which anyone was detected: (frames, people, 25, 3), px and score."""
+    """Return keypoints (frames, people, 25, 3), px and score, of every camera in which anyone was detected."""
     found = {name: capture.keypoints(name) for name in capture.cameras}
     return {name: people for name, people in found.items() if people is not None}
 
 
 def write_keypoints(root: Path, keypoints: dict[str, np.ndarray]) -> None:
-    """`keypoints.npz`, by camera; none where nothing was detected."""
+    """Write `keypoints.npz`, by camera; no file where nothing was detected."""
     root.mkdir(parents=True, exist_ok=True)
     if keypoints:
         np.savez_compressed(root / "keypoints.npz", **keypoints)  # type: ignore[arg-type]
 
 
 def copy_pixels(capture: Capture, kept: Capture, camera: str) -> None:
-    """One camera's images, clean plate and given masks, file by file as they are."""
+    """Copy one camera's images, clean plate and given masks, file by file, unchanged."""
     for folder in ("images", "masks"):
         copy_files(capture.root / folder / camera, kept.root / folder / camera, {f"{f:06d}" for f in kept.frames})
     copy_files(capture.root / "background", kept.root / "background", {camera})
 
 
 def copy_files(source: Path, target: Path, stems: Collection[str]) -> None:
-    """The files of a folder, if there is one, whose names without suffix are among `stems`."""
+    """Copy the files of a folder, if there is one, whose names without suffix are among `stems`."""
     for path in sorted(source.glob("*")):
         if path.stem in stems:
             target.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, target / path.name)
 
 
-def chosen(capture: Capture, what: str, wanted: tuple[T, ...] | None, there_are: tuple[T, ...]) -> tuple[T, ...]:
-    """Those of a capture's that are wanted, in its order, None for all; InputError for one that it has not."""
+def select(capture: Capture, what: str, wanted: tuple[T, ...] | None, available: tuple[T, ...]) -> tuple[T, ...]:
+    """Return those of the available items that are wanted, in their order, or all for None. Raises InputError for an
+    item that is not available."""
     if wanted is None:
-        return there_are
+        return available
     for one in wanted:
-        if one not in there_are:
-            raise InputError(f"{capture.name}: no {what} {one}; there are {', '.join(map(str, there_are))}")
-    return tuple(one for one in there_are if one in wanted)
+        if one not in available:
+            raise InputError(f"{capture.name}: no {what} {one}; there are {', '.join(map(str, available))}")
+    return tuple(one for one in available if one in wanted)

@@ -1,4 +1,4 @@
-"""Cameras that did not record at the same instants: keypoints between frames, and the frame nearest to an instant.
+"""Cameras that are not synchronised: keypoints between frames, and the frame nearest to an instant.
 
 Instants are counted in recorded frames: camera c with offset o recorded the instant of frame f in its own frame f + o.
 """
@@ -8,24 +8,25 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-SAME_PERSON = 0.3  # of a person's height: how far keypoints may move, on average, from one frame to the next
+MAX_STEP_OF_PERSON = 0.3  # of a person's height: mean movement of keypoints from one frame to the next at most
 
 
 def nearest_frame(frame: int, offset_frames: float, step: int = 1) -> int:
-    """The recorded frame nearest to an instant, where frame numbers are `step` apart."""
+    """Return the recorded frame nearest to an instant, where frame numbers are `step` apart."""
     return frame + step * int(np.floor(offset_frames / step + 0.5))
 
 
-def usual_step(frames: Sequence[int]) -> int:
-    """How far most neighbours among these frames (at least one, in order) lie apart."""
+def median_step(frames: Sequence[int]) -> int:
+    """Return the median distance of neighbours among these frames (at least one, in order)."""
     return int(np.median(np.diff(frames))) if len(frames) > 1 else 1
 
 
 def resample(keypoints: np.ndarray, frames: Sequence[int], instants: np.ndarray) -> np.ndarray:
-    """Keypoints (n, people, K, 3) of recorded frames (n,) at other instants (m,): (m, people, K, 3).
+    """Resample keypoints (n, people, K, 3) of recorded frames (n,) at other instants (m,): (m, people, K, 3).
 
-    Linear between neighbours one usual step apart; elsewhere (where a recording ends or jumps) the frame within half a
-    frame, and nobody without one. A keypoint that only the nearer neighbour shows is taken from there.
+    Interpolates linearly between neighbours one median step apart; elsewhere (where a recording ends or jumps) takes
+    the frame within half a frame, or nobody without one. A keypoint that only the nearer neighbour shows is taken from
+    there.
     """
     recorded = np.asarray(frames)
     after = np.searchsorted(recorded, instants).clip(1, max(1, len(recorded) - 1)) % len(recorded)
@@ -33,7 +34,7 @@ def resample(keypoints: np.ndarray, frames: Sequence[int], instants: np.ndarray)
     gap = (recorded[after] - recorded[before]).clip(1)
     share = ((instants - recorded[before]) / gap).clip(0, 1)
     nearer, farther = np.where(share < 0.5, (before, after), (after, before))
-    between = (share > 0) & (share < 1) & (gap <= usual_step(frames))
+    between = (share > 0) & (share < 1) & (gap <= median_step(frames))
     resampled = keypoints[nearer].copy()
     for i in np.flatnonzero(between):
         resampled[i] = _between(keypoints[nearer[i]], keypoints[farther[i]], max(share[i], 1 - share[i]))
@@ -42,18 +43,19 @@ def resample(keypoints: np.ndarray, frames: Sequence[int], instants: np.ndarray)
 
 
 def _between(near: np.ndarray, far: np.ndarray, weight: float) -> np.ndarray:
-    """People (P, K, 3) between two frames, `weight` of the near one; who is in one frame only stays as he is there."""
+    """Return people (P, K, 3) between two frames, with `weight` for the near one; a person in one frame only stays as
+    in that frame."""
     mixed = near.copy()
-    apart = np.stack([[_moved(a, b) for b in far] for a in near])
-    for a, b in zip(*linear_sum_assignment(apart), strict=True):
+    distances = np.stack([[_distance(a, b) for b in far] for a in near])
+    for a, b in zip(*linear_sum_assignment(distances), strict=True):
         both = (near[a, :, 2:] > 0) & (far[b, :, 2:] > 0)
-        if apart[a, b] < SAME_PERSON:
+        if distances[a, b] < MAX_STEP_OF_PERSON:
             mixed[a] = np.where(both, weight * near[a] + (1 - weight) * far[b], near[a])
     return mixed
 
 
-def _moved(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean distance of two people's common keypoints (K, 3), in heights of the taller; 1 where there is none."""
+def _distance(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the mean distance of two people's common keypoints (K, 3), in heights of the taller; 1 without any."""
     both = (a[:, 2] > 0) & (b[:, 2] > 0)
     if not both.any():
         return 1.0

@@ -6,14 +6,8 @@ from pathlib import Path
 
 from hnerf.avatar.avatar import Avatar
 from hnerf.body.fit_result import BodyFit
+from hnerf.config import TrainingSettings
 from hnerf.evaluation.views import ANIMATED, NOVEL_POSE_SPLITS, POSED, TRACKED
-
-ONE_MOMENT = "models one moment"
-NO_NOVEL_POSES = {
-    "nerf": f"NeRF {ONE_MOMENT}",
-    "idr": f"IDR {ONE_MOMENT}",
-    "nerfies": "Nerfies has no pose to set: it replays the moments it was trained on",
-}
 
 
 def avatar_for_split(split: str, avatar: Avatar, fitted: BodyFit) -> Avatar:
@@ -25,7 +19,7 @@ def avatar_for_split(split: str, avatar: Avatar, fitted: BodyFit) -> Avatar:
     if split == ANIMATED:
         device = avatar.body.theta.device
         poses = BodyFit(avatar.body.rig, fitted.frames, fitted.theta.to(device), fitted.root.to(device))
-        return avatar.without_frames().on_body(poses)
+        return avatar.without_frames().with_body(poses)
     return avatar.without_frames() if split == POSED else avatar
 
 
@@ -35,7 +29,7 @@ def reason_unavailable(split: str, training: Path) -> str | None:
     if reason or split not in (POSED, TRACKED):
         return reason
     settings = json.loads((training / "settings.json").read_text())["training"]
-    steps, nodes = settings["novel_pose_steps"], settings[settings["machinery"]].get("nodes", 0)
+    steps, nodes = settings["novel_pose_steps"], settings["field"].get("nodes", 0)
     if split == POSED and not (steps and settings["pose_learning_rate"]):
         return "no pose of these frames was tuned"
     if split == TRACKED and not (steps and nodes):
@@ -46,7 +40,7 @@ def reason_unavailable(split: str, training: Path) -> str | None:
 def reason_without_novel_poses(training: Path) -> str | None:
     """Return why a trained model, by its folder, cannot show poses that it was not trained on; None if it can."""
     stored = json.loads((training / "settings.json").read_text())
-    machinery: str = stored["training"]["machinery"]
-    if machinery == "paper" and stored["static"]:
-        return f"H-NeRF's static network {ONE_MOMENT}"
-    return NO_NOVEL_POSES.get(machinery)
+    field = TrainingSettings.model_validate(stored["training"]).field
+    if field.kind == "paper" and stored["static"]:
+        return "H-NeRF's static network models one moment"
+    return field.no_new_poses or None

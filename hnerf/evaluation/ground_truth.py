@@ -11,7 +11,7 @@ import trimesh
 from hnerf.capture.capture import Capture
 from hnerf.capture.lens import Lens
 from hnerf.capture.normalise import Normaliser
-from hnerf.capture.safe_io import NO_ARRAYS, path_in_capture, read_image
+from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, path_in_capture, read_image
 from hnerf.errors import InputError
 
 ON_BLACK = "ground_truth/on_black"
@@ -66,7 +66,7 @@ class GroundTruth:
         The source is `on_black/`, whose edge pixels are weighted by coverage, if it has the view; else the photograph
         times the mask.
         """
-        path = self._path("on_black", camera, f"{self.capture.recorded(camera, frame):06d}.jpg")
+        path = self._path("on_black", camera, f"{self.capture.recorded_frame(camera, frame):06d}.jpg")
         if path.exists():
             return self._as_rendered(read_image(path), camera), ON_BLACK
         return self.capture.image(camera, frame) * self.mask(camera, frame)[..., None], MASKED_IMAGE
@@ -82,7 +82,7 @@ class GroundTruth:
             if not (faces.min() >= 0 and faces.max() < vertices.shape[1] and np.isfinite(vertices).all()):
                 raise ValueError("a face index is out of range, or a vertex is not finite")
             return {int(f): trimesh.Trimesh(v, faces, process=False) for f, v in zip(frames, vertices, strict=True)}
-        except (*NO_ARRAYS, KeyError, IndexError) as error:
+        except (*ARRAY_FILE_ERRORS, KeyError, IndexError) as error:
             raise InputError(
                 f"{path}: true surfaces cannot be read ({error}); write the file again or delete it"
             ) from None
@@ -91,7 +91,7 @@ class GroundTruth:
         return path_in_capture(self.folder, "ground_truth", *parts)
 
     def _mask_path(self, camera: str, frame: int) -> Path:
-        return self._path("masks", camera, f"{self.capture.recorded(camera, frame):06d}.png")
+        return self._path("masks", camera, f"{self.capture.recorded_frame(camera, frame):06d}.png")
 
     def _as_rendered(self, image: np.ndarray, camera: str) -> np.ndarray:
         """Undistort and downscale an image as recorded, as ingest does with photographs."""

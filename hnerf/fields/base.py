@@ -1,4 +1,4 @@
-"""What trainer and renderer ask of a field."""
+"""Interface of a field, used by trainer and renderer."""
 
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from hnerf.body.canonical import PoseCorrection, PosedBodies
+from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
 from hnerf.fields.compositing import composite, weights_from_alpha
 from hnerf.fields.conditions import Conditions, Draws
@@ -17,16 +18,16 @@ from hnerf.geometry.reach import within_box
 
 
 class Field(nn.Module, ABC):
-    """H-NeRF's two machineries and the methods it is compared to.
+    """Base class of H-NeRF's two fields and the compared methods.
 
-    canonical_m (V, 3): the rig's canonical vertices, saved with the field; samples: random numbers that a ray needs;
-    gamma: how sharp the outline of the distances that `sample` returns is, a unit of them; margin_m: how far around the
-    body's extent anything can be seen; own_background: whether the field models the photograph's surroundings, or is
-    composited over the clean plate; whole_images: whether training draws from all pixels, or from those that `reached`
-    names and those of the mask; common_rest: whether the rest body takes what training changes in all poses alike.
+    canonical_m (V, 3): the rig's canonical vertices, saved with the field. samples: random numbers needed per ray.
+    gamma: sharpness of the silhouette, per unit of the distances that `sample` returns. margin_m: how far around the
+    body's extent anything can be visible. models_background: the field models the photograph's background, else it is
+    composited over the clean plate. whole_images: training draws from all pixels, else from `visible_pixels` and those
+    of the mask. common_rest: the rest body takes over what training changes in all poses alike.
     """
 
-    own_background: ClassVar[bool] = False
+    models_background: ClassVar[bool] = False
     common_rest: ClassVar[bool] = False
     whole_images: bool = False
     canonical_m: Tensor
@@ -34,27 +35,32 @@ class Field(nn.Module, ABC):
     gamma: float = 80.0  # a metre: the paper's 200 in a scene of 2.5 m
     margin_m: float = 0.1
 
+    @classmethod
+    @abstractmethod
+    def build(cls, body: BodyFit, settings: Any, static: bool) -> "Field":
+        """Return an untrained field around a fitted body; static: the capture has one training frame."""
+
     @abstractmethod
     def region(self, bodies: PosedBodies, conditions: Conditions) -> Any:
-        """Where rays are sampled, by body row."""
+        """Return where rays are sampled, by body row."""
 
     def tighten(self, rig: Rig, pose: Tensor) -> None:
-        """Make that region no larger than what can be seen in some poses (n, P)."""
+        """Shrink the region to what is visible in some poses (n, P)."""
 
-    def learn_for_all(self, rows: Tensor) -> None:
-        """Give poses of which nothing is known what the frames of some rows (n,) have in common."""
+    def average_over_frames(self, rows: Tensor) -> None:
+        """Give poses outside the frames of `rows` (n,) the mean of what was learned for these frames."""
 
-    def reached(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
-        """(H, W) bool: pixels that can show anything where the body's vertices are (V, 3)."""
+    def visible_pixels(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
+        """Return the pixels (H, W) bool that can show anything of a body with vertices (V, 3)."""
         return within_box(camera, vertices_m, self.margin_m)
 
     @abstractmethod
     def parameter_groups(self) -> list[dict[str, Any]]:
-        """Adam groups."""
+        """Return parameter groups for Adam."""
 
     def frame_parameters(self) -> list[nn.Parameter]:
-        """Those of single frames, with frames first: for novel frames they are fitted to the finished field, as poses
-        are."""
+        """Return the parameters of single frames, with frames as first axis; for novel frames they are fitted to the
+        finished field, as poses are."""
         return []
 
     @abstractmethod
@@ -69,18 +75,18 @@ class Field(nn.Module, ABC):
         draws: Draws,
         correction: PoseCorrection | None = None,
     ) -> tuple[RaySamples, Tensor]:
-        """Radiance and distance along rays (R, 3) of body rows (R,); also depths (R, K) in metres."""
+        """Evaluate radiance and distance along rays (R, 3) of body rows (R,); also return depths (R, K) in metres."""
 
-    def samples_in_training(self, done: float) -> int:
-        """Random numbers that a ray needs when so much of the training, 0 to 1, is over."""
+    def training_samples(self, progress: float) -> int:
+        """Return the random numbers needed per ray at a training progress from 0 to 1."""
         return self.samples
 
-    def step_taken(self) -> None:
-        """Said once after each step of the training, in however many parts it was made."""
+    def on_step_end(self) -> None:
+        """Update state after a training step; called once per step, whatever the number of its parts."""
 
     def samples_needed(self, region: Any, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
-        """How many samples a rendering takes along rays (R, 3) of body rows (R,): (R,) long, 0 where nothing can be
-        seen."""
+        """Return the number of samples that rendering takes along rays (R, 3) of body rows (R,): (R,) long, 0 where
+        nothing is visible."""
         return torch.full((len(frame),), self.samples, device=frame.device)
 
     def render_rays(
@@ -92,29 +98,32 @@ class Field(nn.Module, ABC):
         frame: Tensor,
         conditions: Conditions,
     ) -> Tensor:
-        """The person alone along rays (R, 3) of body rows (R,), from b alpha (docs/method.md, "Evaluation protocol"):
-        colour over black, coverage, and depth in metres, 0 where nothing is, (R, 5)."""
+        """Render the person alone along rays (R, 3) of body rows (R,), with opacity b alpha (docs/method.md,
+        "Evaluation protocol").
+
+        Returns (R, 5): colour over black, coverage, and depth in metres, 0 where nothing is hit.
+        """
         needed = self.samples_needed(region, origins_m, directions, frame)
-        seen = origins_m.new_zeros(len(frame), 5)
+        rendered = origins_m.new_zeros(len(frame), 5)
         for count in needed[needed > 0].unique().tolist():
             pick = torch.nonzero(needed == count)[:, 0]
             rays = (origins_m[pick], directions[pick], frame[pick])
-            still = Draws.deterministic(len(pick), count, frame.device)
-            samples, depths = self.sample(bodies, region, *rays, conditions, still)
+            draws = Draws.deterministic(len(pick), count, frame.device)
+            samples, depths = self.sample(bodies, region, *rays, conditions, draws)
             weights = weights_from_alpha(samples.in_box * samples.alpha)
             cover = weights.sum(1, keepdim=True)
             depth = (weights * depths).sum(1, keepdim=True) / cover.clamp(min=1e-6)
-            seen[pick] = torch.cat([composite(weights, samples.colour), cover, depth * (cover > 0)], 1)
-        return seen
+            rendered[pick] = torch.cat([composite(weights, samples.colour), cover, depth * (cover > 0)], 1)
+        return rendered
 
     def coverage(self, samples: RaySamples) -> Tensor:
-        """How far what the field has learned covers rays, (R,)."""
+        """Return how far the learned content covers each ray, (R,)."""
         return 1 - (1 - samples.in_box * samples.alpha).prod(1)
 
     @abstractmethod
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
-        """d_hat (N,) metres at points (N, 3) around the first body, negative inside."""
+        """Return d_hat (N,) in metres at points (N, 3) around the first body, negative inside."""
 
     @abstractmethod
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
-        """c (N, 3) at points (N, 3) around the first body, seen along directions (N, 3)."""
+        """Return the colour c (N, 3) at points (N, 3) around the first body, seen along directions (N, 3)."""

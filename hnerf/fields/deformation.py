@@ -1,66 +1,70 @@
-"""What skinning leaves over: every frame moves the canonical body's surface a little (docs/method.md)."""
+"""Per-frame deformation: what skinning leaves over, as displacements of the canonical surface (docs/method.md)."""
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hnerf.body.canonical import Descriptor, blended, occurring
+from hnerf.body.canonical import Descriptor, distinct_rows, weighted_sum
 from hnerf.body.descriptor import vertex_normals
 
 TINY = 1e-9
-OVERLAP = 0.5  # width of a node's reach, in the greatest distance of a vertex from its node
+OVERLAP = 0.5  # width of a node's Gaussian, in greatest distances of a vertex from its closest node
 
 
 class FrameDeformation(nn.Module):
-    """Displacements of nodes spread over the body, in every frame; vertices follow the nodes around them.
+    """Displacements of nodes on the body in every frame; vertices follow the nodes around them.
 
-    The embedded deformation of Sumner et al. 2007 without its rotations. displacement (frames + 1, nodes, 3) in
-    canonical metres starts at zero; its last row is that of a pose that no frame has.
+    This is the embedded deformation of Sumner et al. 2007 without its rotations. displacement (frames + 1, nodes, 3) in
+    canonical metres starts at zero; its last row is for poses of no frame.
     """
 
-    shares: Tensor
+    node_weights: Tensor
     normals: Tensor
 
     def __init__(self, vertices_m: Tensor, faces: Tensor, nodes: int, frames: int):
-        """vertices_m (V, 3), faces (F, 3): the canonical body."""
+        """Place the nodes on the canonical body, vertices_m (V, 3) and faces (F, 3)."""
         super().__init__()
-        chosen = spread_over(vertices_m.double().cpu().numpy(), nodes)  # the same ones whatever the device
+        chosen = farthest_points(vertices_m.double().cpu().numpy(), nodes)  # double: all devices choose the same
         squared = torch.cdist(vertices_m, vertices_m[chosen]).square()  # (V, nodes)
         width_squared = OVERLAP**2 * squared.amin(1).max().clamp(min=TINY)
-        self.register_buffer("shares", torch.softmax(-squared / width_squared, 1), persistent=False)
+        self.register_buffer("node_weights", torch.softmax(-squared / width_squared, 1), persistent=False)
         self.register_buffer("normals", vertex_normals(vertices_m, faces), persistent=False)
         self.displacement = nn.Parameter(torch.zeros(frames + 1, nodes, 3))
 
     def forward(self, described: Descriptor, frame_row: Tensor) -> tuple[Tensor, Tensor]:
-        """How far the surface next to described points is displaced in the frames of rows `frame_row` (N,), -1 for
-        none: (N, 3), and along its normal (N,); canonical metres."""
-        present, own = occurring(frame_row, len(self.displacement))
-        table = self._of_vertices(present).flatten(0, 1)
-        found = blended(table, own[:, None] * len(self.shares) + described.corners, described.barycentric)
+        """Return the displacement (N, 3) of the surface next to described points, and its component along the normal
+        (N,), in canonical metres. frame_row (N,): rows of the frames, -1 for none."""
+        present, row_index = distinct_rows(frame_row, len(self.displacement))
+        table = self._vertex_displacement(present).flatten(0, 1)
+        found = weighted_sum(
+            table, row_index[:, None] * len(self.node_weights) + described.corners, described.barycentric
+        )
         return found[:, :3], found[:, 3]
 
     @torch.no_grad()
-    def learn_for_all(self, rows: Tensor) -> None:
-        """Displace all but some frames, rows (n,), as these are in the mean."""
+    def average_over_frames(self, rows: Tensor) -> None:
+        """Set the displacement of all other rows to the mean of `rows` (n,)."""
         others = torch.ones(len(self.displacement), dtype=torch.bool, device=rows.device)
         others[rows] = False
         self.displacement[others] = self.displacement[rows].mean(0)
 
     @torch.no_grad()
-    def outwards(self, frame_row: Tensor) -> Tensor:
-        """How far vertices go along their normals in the frames of rows `frame_row` (n,), -1 for none, (n, V)."""
-        return self._of_vertices(frame_row)[..., 3]
+    def normal_displacement(self, frame_row: Tensor) -> Tensor:
+        """Return the displacement of the vertices along their normals in frames `frame_row` (n,), -1 for none: (n,
+        V)."""
+        return self._vertex_displacement(frame_row)[..., 3]
 
-    def _of_vertices(self, rows: Tensor) -> Tensor:
-        """Of some rows of `displacement`, and how far that is along the vertices' normals: (n, V, 4)."""
+    def _vertex_displacement(self, rows: Tensor) -> Tensor:
+        """Return the displacement of the vertices for some rows of `displacement`, and its component along their
+        normals: (n, V, 4)."""
         every_row = self.displacement[rows].transpose(0, 1).flatten(1)  # (nodes, 3 n), for one product of matrices
-        moved = (self.shares @ every_row).unflatten(1, (-1, 3)).transpose(0, 1)
+        moved = (self.node_weights @ every_row).unflatten(1, (-1, 3)).transpose(0, 1)
         return torch.cat([moved, (moved * self.normals).sum(-1, keepdim=True)], -1)
 
 
-def spread_over(points_m: np.ndarray, count: int) -> list[int]:
-    """Indices of points far from each other: the first, then always the one farthest from those chosen before
-    (Gonzalez 1985)."""
+def farthest_points(points_m: np.ndarray, count: int) -> list[int]:
+    """Return indices of points by farthest point sampling: the first, then always the one farthest from those chosen
+    before (Gonzalez 1985)."""
     chosen = [0]
     distance_m = np.linalg.norm(points_m - points_m[0], axis=1)
     while len(chosen) < count:

@@ -1,20 +1,20 @@
-"""Encodings of a position: sines and cosines (Mildenhall et al. 2020) and dense grids of learned features."""
+"""Encodings of a position: sines and cosines (Mildenhall et al. 2020), and dense grids of learned features."""
 
 import torch
 from torch import Tensor, nn
 
 
 def positional_encoding(x: Tensor, octaves: int) -> Tensor:
-    """(..., D) to (..., D + 2 D octaves): x, then sin and cos of 2^k pi x for k = 0 .. octaves - 1."""
+    """Encode (..., D) as (..., D + 2 D octaves): x, then sin and cos of 2^k pi x for k = 0 .. octaves - 1."""
     angles = x[..., None, :] * (torch.pi * 2.0 ** torch.arange(octaves, device=x.device, dtype=x.dtype))[:, None]
     return torch.cat([x, angles.sin().flatten(-2), angles.cos().flatten(-2)], -1)
 
 
 class FeatureGrids(nn.Module):
-    """Dense grids of several resolutions over a box, trilinearly interpolated and concatenated; zero at first, and
-    where nothing was learned.
+    """Dense feature grids of several resolutions over a box, trilinearly interpolated and concatenated; features start
+    at zero and stay zero where nothing is learned.
 
-    cells: cells of each level along the box's longest side; channels: features a level.
+    cells: cells of each level along the box's longest side; channels: features per level.
     """
 
     lower_m: Tensor
@@ -32,7 +32,8 @@ class FeatureGrids(nn.Module):
         self.width = channels * len(cells)
 
     def forward(self, y_m: Tensor) -> Tensor:
-        """(N, 3) canonical metres to (N, width); positions outside the box take the border's features."""
+        """Interpolate features at positions (N, 3) in canonical metres: (N, width). Positions outside the box take the
+        border's features."""
         unit = 2 * (y_m - self.lower_m) / (self.upper_m - self.lower_m) - 1
         at = unit[None, None, None]
         found = [

@@ -1,4 +1,4 @@
-"""The fast avatar: radiance and SDF co-learned on grids over the canonical shell, rendered in the shell alone."""
+"""The fast field: radiance and SDF on feature grids over the canonical shell, rendered in the shell alone."""
 
 import dataclasses
 
@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from hnerf.body.canonical import FAR_M, Descriptor, PoseCorrection, PosedBodies
 from hnerf.body.descriptor import vertex_normals
+from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
 from hnerf.config import FastFieldSettings
 from hnerf.fields.base import Field
@@ -16,27 +17,27 @@ from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.deformation import FrameDeformation
 from hnerf.fields.grids import CanonicalField
 from hnerf.fields.samples import RaySamples
-from hnerf.fields.shell import ShellGrid, lattice
+from hnerf.fields.shell import ShellGrid, surface_points
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.reach import within_reach
 
-INITIAL_SHARPNESS_PER_M = 100.0  # of the logistic that makes opacity of distance
+INITIAL_SHARPNESS_PER_M = 100.0  # of the logistic that turns distance into opacity
 GRADIENT_STEP_M = 0.005
-SETTLED = 5.0  # where the logistic of density is 1 or 0 within 1 %
-GRID_ROOM_M = 0.01  # between shell and the end of the grids
-ROOM_M = 0.012  # for what the surface still moves, and what poses that were not asked about do to it
+SATURATED_LOGIT = 5.0  # argument beyond which the opacity's logistic is within 1 % of 0 or 1
+GRID_MARGIN_M = 0.01  # between the shell and the end of the grids
+SHELL_MARGIN_M = 0.012  # for later movement of the surface, and for poses that were not evaluated
 TIGHTEN_STEP_M = 0.004
-ELASTIC_M = 0.01  # a displacement whose elastic energy is 1
-SPACING_M = 0.012  # between the samples of a rendering; twice as many gain 0.05 dB on valid-wave for twice the time
-SAMPLES = (6, 12, 18, 24, 36, 64)  # of which a ray gets the first that is enough, or the last
-COARSE = 0.75  # of the training has half the samples: as accurate on three captures, in three quarters of the time
-JOINED_M = 0.03  # between neighbours on a ray, in the canonical volume: farther apart, they lie on different limbs
-GRAZING_M = 1e-4  # of descent from a sample to the next, below which the way to the surface has no useful derivative
-NEGLIGIBLE = 1e-3  # a sample of less weight gets no colour
+ELASTIC_M = 0.01  # displacement whose elastic energy is 1
+SPACING_M = 0.012  # between rendered samples; twice as many gain 0.05 dB on valid-wave for twice the time
+SAMPLE_COUNTS = (6, 12, 18, 24, 36, 64)  # a ray gets the smallest sufficient number, or the last
+HALF_SAMPLES_UNTIL = 0.75  # of the training: as accurate on three captures, in three quarters of the time
+MAX_NEIGHBOUR_DISTANCE_M = 0.03  # canonical; neighbours on a ray that are farther apart lie on different limbs
+MIN_DESCENT_M = 1e-4  # of d_hat from one sample to the next; below it the surface position has no useful derivative
+MIN_COLOUR_WEIGHT = 1e-3  # samples of less weight are not coloured
 
 
 class FastField(Field):
-    """Networks, sharpness, the canonical body and its deformation in every frame; no pose of its own."""
+    """Networks, sharpness, the canonical body, and its deformation in every frame; it holds no poses."""
 
     common_rest = True
     outer_m: Tensor
@@ -44,18 +45,23 @@ class FastField(Field):
     corners: Tensor
     weights: Tensor
 
+    @classmethod
+    def build(cls, body: BodyFit, settings: FastFieldSettings, static: bool) -> "FastField":
+        """Return an untrained field; one training frame or many make no difference."""
+        return cls(body.rig, settings, len(body.frames))
+
     def __init__(self, rig: Rig, settings: FastFieldSettings, frames: int):
-        """frames: rows of the fit that the field is trained with."""
+        """Build an untrained field around the rig. frames: number of rows of the body fit."""
         super().__init__()
         self.settings = settings
         self.samples = settings.samples
         self.register_buffer("canonical_m", rig.vertices_m.clone())
         for name in ("outer_m", "inner_m"):
             self.register_buffer(name, torch.full((len(rig.vertices_m),), getattr(settings, name)))
-        corners, weights = lattice(rig.vertices_m, rig.faces, settings.shell_cell_m)
+        corners, weights = surface_points(rig.vertices_m, rig.faces, settings.shell_cell_m)
         self.register_buffer("corners", corners, persistent=False)
         self.register_buffer("weights", weights, persistent=False)
-        beyond_m = settings.outer_m + GRID_ROOM_M
+        beyond_m = settings.outer_m + GRID_MARGIN_M
         lower_m, upper_m = rig.vertices_m.amin(0) - beyond_m, rig.vertices_m.amax(0) + beyond_m
         self.field = CanonicalField(lower_m, upper_m, settings, 3 * int(rig.free.sum()))
         self.deformation = (
@@ -68,15 +74,15 @@ class FastField(Field):
         """How far from the body a sample can lie: the shell and the slack of its cells."""
         return max(self.settings.outer_m, self.settings.inner_m) + 2 * self.settings.shell_cell_m
 
-    def reached(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
-        """Pixels whose rays pass through the shell."""
+    def visible_pixels(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
+        """Return the pixels whose rays pass through the shell."""
         return within_reach(camera, vertices_m, self.settings.outer_m + self.settings.shell_cell_m)
 
     def region(self, bodies: PosedBodies, conditions: Conditions) -> ShellGrid:
-        """Where rays are sampled: the shell around bodies as they stand now, where their frames displace it to."""
+        """Return the shell around the bodies, displaced as their frames deform it."""
         outwards_m = bodies.vertices_m.new_zeros(len(bodies.vertices_m), 1)
         if self.deformation is not None:
-            outwards_m = self.deformation.outwards(conditions.frame_row)
+            outwards_m = self.deformation.normal_displacement(conditions.frame_row)
         s, least_m = self.settings, self.settings.shell_cell_m
         outer_m = (self.outer_m + outwards_m).clamp(least_m, s.outer_m)
         inner_m = (self.inner_m - outwards_m).clamp(least_m, s.inner_m)
@@ -84,33 +90,33 @@ class FastField(Field):
 
     @torch.no_grad()
     def tighten(self, rig: Rig, pose: Tensor) -> None:
-        """Make the shell no thicker than what can be seen: where, in any of some poses (n, P), the opacity's logistic
-        has not yet settled, with some room to move. Nothing outside the old shell is asked, and of no frame's
-        deformation, with which the shell moves."""
+        """Shrink the shell to what is visible: where the opacity's logistic is not yet saturated in any of some poses
+        (n, P), with a margin for movement. Nothing outside the old shell is evaluated, nor any frame's deformation,
+        because the shell moves with it."""
         s, rest = self.settings, torch.zeros(1, len(rig.joints_m), 3, device=self.canonical_m.device)
         bodies = PosedBodies(rig, rest, torch.eye(4, device=rest.device)[None], self.canonical_m)
         normals = vertex_normals(bodies.vertices_m[0], rig.faces)
         only = torch.zeros(len(normals), dtype=torch.long, device=rest.device)
-        settled_m = SETTLED / self.log_sharpness.exp()
-        reached_m = {1: torch.zeros_like(self.outer_m), -1: torch.zeros_like(self.inner_m)}
+        settled_m = SATURATED_LOGIT / self.log_sharpness.exp()
+        extent_m = {1: torch.zeros_like(self.outer_m), -1: torch.zeros_like(self.inner_m)}
         for depth_m in torch.arange(-s.inner_m, s.outer_m, TIGHTEN_STEP_M).tolist():
             described = bodies.describe(bodies.vertices_m[0] + depth_m * normals, only, self.reach_m)
             seen = torch.zeros_like(described.near)
             for row in pose:
                 d_hat = described.d + self._residual(described, row.expand(len(normals), -1))
                 seen |= described.near & (d_hat.abs() < settled_m)
-            for side, reached in reached_m.items():
-                reached.scatter_reduce_(0, described.vertex[seen], side * described.d[seen], "amax")
+            for side, extent in extent_m.items():
+                extent.scatter_reduce_(0, described.vertex[seen], side * described.d[seen], "amax")
         for side, thickness_m in ((1, self.outer_m), (-1, self.inner_m)):
-            thickness_m.copy_((reached_m[side] + ROOM_M).minimum(thickness_m))
+            thickness_m.copy_((extent_m[side] + SHELL_MARGIN_M).minimum(thickness_m))
 
-    def learn_for_all(self, rows: Tensor) -> None:
-        """The mean deformation."""
+    def average_over_frames(self, rows: Tensor) -> None:
+        """Give all other frames the mean deformation of `rows` (n,)."""
         if self.deformation is not None:
-            self.deformation.learn_for_all(rows)
+            self.deformation.average_over_frames(rows)
 
     def parameter_groups(self) -> list[dict]:
-        """Adam groups; feature grids bear a larger rate than networks."""
+        """Return parameter groups for Adam; feature grids take a larger rate than networks."""
         s, networks = self.settings, [*self.field.pose_code.parameters()]
         networks += [*self.field.geometry.parameters(), *self.field.radiance.parameters()]
         grids = [*self.field.geometry_grids.parameters(), *self.field.colour_grids.parameters()]
@@ -122,7 +128,7 @@ class FastField(Field):
         ]
 
     def frame_parameters(self) -> list[nn.Parameter]:
-        """The deformations."""
+        """Return the deformations."""
         return [] if self.deformation is None else [self.deformation.displacement]
 
     def sample(
@@ -136,9 +142,9 @@ class FastField(Field):
         draws: Draws,
         correction: PoseCorrection | None = None,
     ) -> tuple[RaySamples, Tensor]:
-        """Radiance and distance along rays (R, 3) of body rows (R,); also depths (R, K)."""
+        """Evaluate radiance and distance along rays (R, 3) of body rows (R,); also return depths (R, K) in metres."""
         depths, met, core = region.sample_rays(origins_m, directions, frame, draws.jitter)
-        hit = torch.nonzero(met)[:, 0]  # only these rays are asked about; the others see nothing
+        hit = torch.nonzero(met)[:, 0]  # only these rays are evaluated; the others see nothing
         points = origins_m[hit, None] + directions[hit, None] * depths[hit][..., None]
         row = frame[hit].repeat_interleave(depths.shape[1])
         skin = bodies.describe(points.flatten(0, 1), row, self.reach_m, correction)
@@ -147,10 +153,11 @@ class FastField(Field):
         d = torch.where(described.near, described.d, self.reach_m).view(len(hit), depths.shape[1])
         residual = torch.where(described.near, self._residual(described, pose), 0.0).view_as(d)
         alpha_dot = alpha_from_sdf(d + residual, self.log_sharpness.exp())
-        end = torch.where(core[hit, None], 1.0, alpha_dot[:, -1:])  # nothing shines through, if the surface lies deeper
+        # an opaque core: nothing shines through if the surface lies deeper
+        end = torch.where(core[hit, None], 1.0, alpha_dot[:, -1:])
         alpha = torch.cat([alpha_dot[:, :-1], end], 1)
-        visible = weights_from_alpha(alpha.detach()).flatten() > NEGLIGIBLE
-        colour = self._colour(at_surface(described, d + residual), pose, visible)
+        visible = weights_from_alpha(alpha.detach()).flatten() > MIN_COLOUR_WEIGHT
+        colour = self._colour(move_to_surface(described, d + residual), pose, visible)
         norms = d.new_zeros(0)
         if draws.probe is not None:
             norms = self._gradient_norms(described, skin, pose, draws.probe[hit], depths.shape[1])
@@ -165,39 +172,43 @@ class FastField(Field):
         alpha, alpha_dot, residual = (everywhere(values, 0.0) for values in (alpha, alpha_dot, residual))
         colour = everywhere(colour.view(len(hit), depths.shape[1], 3), 0.0)
         d, in_box = everywhere(d, self.reach_m), everywhere(torch.ones_like(d), 0.0)
-        samples = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, draws.beyond, elastic)
+        samples = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, draws.background, elastic)
         return samples, depths
 
     def coverage(self, samples: RaySamples) -> Tensor:
-        """By the surface, not by the core that ends rays behind it; rays that begin inside it are covered, too."""
+        """Return the coverage by the surface, not by the solid core that ends rays behind it; rays that start inside
+        are covered, too."""
         return occupancy(samples.d_hat, self.log_sharpness.exp()).amax(1)
 
-    def samples_in_training(self, done: float) -> int:
-        """Half of them first in either phase, while surface or novel poses are not where they will be."""
-        return self.samples if done >= COARSE else -(-self.samples // 2)
+    def training_samples(self, progress: float) -> int:
+        """Return half of the samples early in each phase, while surface or novel poses are still far from their final
+        state."""
+        return self.samples if progress >= HALF_SAMPLES_UNTIL else -(-self.samples // 2)
 
     def samples_needed(self, region: ShellGrid, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
-        """As many as a ray's way through the shell asks for."""
-        needed = region.path_m(origins_m, directions, frame) / SPACING_M
-        steps = torch.tensor(SAMPLES, device=frame.device)
-        enough = torch.searchsorted(steps.to(needed), needed).clamp(max=len(SAMPLES) - 1)
+        """Return as many samples as the length of a ray's path through the shell requires."""
+        needed = region.path_length_m(origins_m, directions, frame) / SPACING_M
+        steps = torch.tensor(SAMPLE_COUNTS, device=frame.device)
+        enough = torch.searchsorted(steps.to(needed), needed).clamp(max=len(SAMPLE_COUNTS) - 1)
         return torch.where(needed > 0, steps[enough], 0)
 
     def _deformed(self, described: Descriptor, frame_row: Tensor) -> tuple[Descriptor, Tensor | None]:
-        """Descriptors (N,) on the body as the frames of rows `frame_row` (N,) deform it, and displacements (N, 3)."""
+        """Return descriptors (N,) relative to the body as frames `frame_row` (N,) deform it, and the displacements (N,
+        3)."""
         if self.deformation is None:
             return described, None
-        moved, outwards = self.deformation(described, frame_row)
-        return dataclasses.replace(described, y=described.y - moved, d=described.d - outwards), moved
+        moved, normal_displacement = self.deformation(described, frame_row)
+        return dataclasses.replace(described, y=described.y - moved, d=described.d - normal_displacement), moved
 
     def _residual(self, described: Descriptor, pose: Tensor) -> Tensor:
-        """dd (N,) in the shell; 0 beyond it and deeper inside, where no ray asks and the body's d is enough."""
+        """Return dd (N,) in the shell; 0 outside it and deeper inside, where no ray samples and the body's d is
+        enough."""
         s = self.settings
         trained = described.near & (described.d < self.reach_m) & (described.d > -s.inner_m - 2 * s.shell_cell_m)
         return torch.where(trained, self.field.residual(described.y, described.d, pose), 0.0)
 
     def _colour(self, described: Descriptor, pose: Tensor, visible: Tensor) -> Tensor:
-        """Colours (N, 3) of the samples that count, zero elsewhere."""
+        """Return the colours (N, 3) of the visible samples, zero elsewhere."""
         pick = torch.nonzero(visible)[:, 0]
         colour = described.d.new_zeros(len(visible), 3)
         at = (t.index_select(0, pick) for t in (described.y, described.d, described.normal, pose))
@@ -207,47 +218,49 @@ class FastField(Field):
     def _gradient_norms(
         self, described: Descriptor, skin: Descriptor, pose: Tensor, probe: Tensor, samples: int
     ) -> Tensor:
-        """|grad d_hat| in the canonical frame at one of a ray's samples, probe (R,) in [0, 1), by forward differences:
-        the interpolation of a grid has no useful second derivative. skin: descriptors before the deformation, which say
-        where outwards is. Gradients flow to the field alone."""
+        """Return |grad d_hat| in the canonical frame at one sample per ray, probe (R,) in [0, 1), by forward
+        differences, because grid interpolation has no useful second derivative.
+
+        skin: descriptors before the deformation, which give the outward direction. Gradients flow to the field alone.
+        """
         pick = torch.arange(len(probe), device=probe.device) * samples + (probe * samples).long()
         pick = pick[described.near[pick]]
         y, d = described.y[pick].detach(), described.d[pick].detach()
         away = (skin.y - skin.s)[pick].detach() * skin.d[pick].detach().sign()[:, None]
         outward = nn.functional.normalize(away, dim=-1)
-        axes = torch.cat([y.new_zeros(1, 3), torch.eye(3, device=y.device)])  # here, and a step along each axis
+        axes = torch.cat([y.new_zeros(1, 3), torch.eye(3, device=y.device)])  # no step, and one along each axis
         d = d + GRADIENT_STEP_M * axes @ outward.T
         y = y + GRADIENT_STEP_M * axes[:, None]
         found = self.field.residual(y.flatten(0, 1), d.flatten(), pose[pick].repeat(len(axes), 1)).view_as(d)
         return (outward + (found[1:] - found[0]).T / GRADIENT_STEP_M).norm(dim=-1)
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
-        """d_hat (N,) at points (N, 3) around the first body; beyond reach the body's own distance stands alone."""
+        """Return d_hat (N,) at points (N, 3) around the first body; beyond the shell it is the body's own distance."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         described, _ = self._deformed(bodies.describe(points_m, row, FAR_M, exact_sign=True), conditions.frame_row[row])
         return described.d + self._residual(described, conditions.pose[row])
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
-        """c (N, 3) at points around the first body; this field does not depend on the viewing direction."""
+        """Return c (N, 3) at points around the first body; this field does not depend on the viewing direction."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         described, _ = self._deformed(bodies.describe(points_m, row, FAR_M), conditions.frame_row[row])
         return self.field.colour(described.y, described.d, described.normal, conditions.pose[row])
 
 
-def at_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:
-    """Samples (R K,) of rays moved on to where d_hat (R, K), linear from each to the next, is zero or nearest to it.
+def move_to_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:
+    """Move samples (R K,) along their rays to where d_hat (R, K), linear between samples, is zero or closest to it.
 
-    A sample's opacity is that of the way to the next one, its colour that of the surface which makes it opaque. Left
-    where they are: a ray's last sample, and those whose next one is out of reach or on another limb. Gradients flow
-    through the place of the zero, too (as in IDR, Yariv et al. 2020): a body that moves along a ray shows the same
-    point to it, and without that term would be drawn away from or towards its camera.
+    A sample's opacity is that of the path to the next one; its colour is that of the surface that makes it opaque. A
+    ray's last sample stays, as do samples whose successor is out of reach or on another limb. Gradients also flow
+    through the position of the zero (as in IDR, Yariv et al. 2020): a body that moves along a ray shows the same point
+    to it, and without that term it would be drawn towards or away from its camera.
     """
     y, d, normal, near = (
         t.unflatten(0, d_hat.shape) for t in (described.y, described.d, described.normal, described.near)
     )
     ahead, after = d_hat[:, :-1], d_hat[:, 1:]
-    joined = near[:, :-1] & near[:, 1:] & ((y[:, 1:] - y[:, :-1]).norm(dim=-1) < JOINED_M)
-    descent_m = (ahead - after).clamp(min=GRAZING_M)
+    joined = near[:, :-1] & near[:, 1:] & ((y[:, 1:] - y[:, :-1]).norm(dim=-1) < MAX_NEIGHBOUR_DISTANCE_M)
+    descent_m = (ahead - after).clamp(min=MIN_DESCENT_M)
     share = torch.where(joined & (ahead > after), ahead / descent_m, 0.0).clamp(0, 1)[..., None]
 
     def moved(values: Tensor) -> Tensor:

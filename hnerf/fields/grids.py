@@ -1,4 +1,4 @@
-"""The fast machinery of F and DH: feature grids over the canonical shell and small networks (docs/method.md)."""
+"""The networks F and DH of the fast field: feature grids over the canonical shell and small MLPs (docs/method.md)."""
 
 import torch
 from torch import Tensor, nn
@@ -10,8 +10,8 @@ from hnerf.fields.encoding import FeatureGrids, positional_encoding
 class CanonicalField(nn.Module):
     """DH: (y, d, theta) -> dd and F: (y, d, theta, n) -> c over the canonical volume.
 
-    The density of F is the SDF's own opacity (the geometry loss of the paper with lambda at its limit), so F is a
-    colour here. n is the body's normal in the world: it carries the root transform T's effect on shading.
+    The density of F is the SDF's own opacity (the limit of large lambda in the paper's geometry loss), so F is a colour
+    here. n is the body's normal in the world; it carries the effect of the root transform T on shading.
     """
 
     def __init__(self, lower_m: Tensor, upper_m: Tensor, settings: FastFieldSettings, pose_inputs: int):
@@ -37,12 +37,12 @@ class CanonicalField(nn.Module):
         return [features, d[:, None] / self.unit_m, self.pose_code(pose)]
 
     def residual(self, y_m: Tensor, d_m: Tensor, pose: Tensor) -> Tensor:
-        """dd (N,) metres at y (N, 3), d (N,), pose (N, P); zero at the start of training."""
+        """Return dd (N,) in metres at y (N, 3), d (N,) and pose (N, P); zero at the start of training."""
         features = self.geometry_grids(y_m)
         return self.unit_m * self.geometry(torch.cat(self._inputs(features, d_m, pose), -1))[:, 0]
 
     def colour(self, y_m: Tensor, d_m: Tensor, normal: Tensor, pose: Tensor) -> Tensor:
-        """c (N, 3) in [0, 1]."""
+        """Return c (N, 3) in [0, 1]."""
         features = self.colour_grids(y_m)
         inputs = self._inputs(features, d_m, pose)
         return torch.sigmoid(self.radiance(torch.cat([*inputs, positional_encoding(normal, 1)], -1)))

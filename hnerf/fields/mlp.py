@@ -1,4 +1,5 @@
-"""The networks of the paper: F, eight layers of 256, and DH, six of 128; Swish, a skip connection to the middle."""
+"""The networks of the paper: F with eight layers of 256, DH with six of 128; Swish, with a skip connection to the
+middle."""
 
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -10,10 +11,9 @@ from hnerf.fields.encoding import positional_encoding
 
 
 class SkipMLP(nn.Module):
-    """`layers` linear layers of `width`, Swish unless said otherwise; the input is fed again into the middle one.
+    """MLP of `layers` linear layers of `width`, with Swish by default; the input is fed again into the middle layer.
 
-    bf16: multiply, and keep what lies between the layers, in bfloat16, for half the memory and less time on processors
-    that can.
+    bf16: compute and store activations in bfloat16, for half the memory and less time on processors that support it.
     """
 
     def __init__(
@@ -31,8 +31,8 @@ class SkipMLP(nn.Module):
         sizes[self.middle] += inputs
         self.layers = nn.ModuleList(nn.Linear(size, width) for size in sizes)
 
-    def start_as_he(self) -> None:
-        """Draw weights as He et al. (2015) do, biases zero: torch's own start leaves the output of eight layers nearly
+    def init_kaiming(self) -> None:
+        """Initialise weights as He et al. (2015), biases zero: torch's default leaves the output of eight layers nearly
         constant over space."""
         for layer in self.layers:
             assert isinstance(layer, nn.Linear)
@@ -40,9 +40,9 @@ class SkipMLP(nn.Module):
             nn.init.zeros_(layer.bias)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(N, inputs) to (N, width)."""
+        """Map (N, inputs) to (N, width)."""
         h, kind = x, x.device.type
-        # not cached: threads share the cache, where one without gradients would leave weights cast for all
+        # no cache: threads share it, and a thread without gradients would leave its cast weights to the others
         with torch.autocast(kind, torch.bfloat16, cache_enabled=False) if self.bf16 else nullcontext():
             for k, layer in enumerate(self.layers):
                 h = self.activation(layer(torch.cat([h, x], -1) if k == self.middle else h))
@@ -50,7 +50,7 @@ class SkipMLP(nn.Module):
 
 
 class RadianceMLP(nn.Module):
-    """F: (PE8(s, d), theta, T, v) -> (sigma, c). Density sees theta alone; colour also T and v, encoded with
+    """F: (PE8(s, d), theta, T, v) -> (sigma, c). Density depends on theta only; colour also on T and v, encoded with
     `view_octaves`."""
 
     OCTAVES = 8
@@ -62,14 +62,14 @@ class RadianceMLP(nn.Module):
         self.view_octaves = view_octaves
         encoded = point_inputs * (1 + 2 * self.OCTAVES)
         self.trunk = SkipMLP(encoded + pose_inputs, 256, 8, bf16=bf16)
-        self.trunk.start_as_he()
+        self.trunk.init_kaiming()
         self.density = nn.Linear(256, 1)
         seen = root_inputs + 3 * (1 + 2 * view_octaves)
         self.colour = nn.Sequential(nn.Linear(256 + seen, 128), nn.SiLU(), nn.Linear(128, 3))
 
     def forward(self, point: Tensor, pose: Tensor, root: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
-        """point (N, D) in scene units, pose (N, P), root (N, Q), view (N, 3): density (N,) per scene unit, colour (N,
-        3)."""
+        """Map point (N, D) in scene units, pose (N, P), root (N, Q) and view (N, 3) to density (N,) per scene unit and
+        colour (N, 3)."""
         features = self.trunk(torch.cat([positional_encoding(point, self.OCTAVES), pose], -1))
         density = nn.functional.softplus(self.density(features)[:, 0])
         seen = positional_encoding(view, self.view_octaves)
@@ -89,5 +89,5 @@ class ResidualMLP(nn.Module):
         nn.init.zeros_(self.residual.bias)
 
     def forward(self, point: Tensor, pose: Tensor) -> Tensor:
-        """point (N, D), pose (N, P): dd (N,) in scene units."""
+        """Map point (N, D) and pose (N, P) to dd (N,) in scene units."""
         return self.residual(self.trunk(torch.cat([positional_encoding(point, self.OCTAVES), pose], -1)))[:, 0]

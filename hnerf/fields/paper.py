@@ -1,7 +1,7 @@
-"""H-NeRF as published: F and DH of the paper, whole rays, background included.
+"""H-NeRF as published: the networks F and DH, whole rays, background included.
 
-Distances are in scene units (metres / scene_m) inside the networks and losses, metres outside. One network F serves the
-coarse and the fine samples; the fine ones are drawn from the coarse weights without a gradient, and the losses see
+Distances are in scene units (metres / scene_m) inside the networks and losses, in metres outside. One network F serves
+the coarse and the fine samples; the fine ones are drawn from the coarse weights without a gradient, and the losses see
 both.
 """
 
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from hnerf.body.canonical import FAR_M, Descriptor, PoseCorrection, PosedBodies
+from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
 from hnerf.config import PaperFieldSettings
 from hnerf.fields.base import Field
@@ -22,30 +23,35 @@ OUTSIDE_DISTANCE = 1.0  # the constant d of a point outside the person's box
 
 
 class PaperField(Field):
-    """F and DH; dynamic: on (s, d) and theta; static (one frame): on x itself, unconditioned."""
+    """F and DH. Dynamic: conditioned on (s, d) and theta. Static (one frame): on x itself, unconditioned."""
 
-    own_background = True
+    models_background = True
     centre_m: Tensor
 
+    @classmethod
+    def build(cls, body: BodyFit, settings: PaperFieldSettings, static: bool) -> "PaperField":
+        """Return an untrained field, in the paper's static form where there is one training frame."""
+        return cls(body.rig, body.root, settings, static)
+
     def __init__(self, rig: Rig, root: Tensor, settings: PaperFieldSettings, static: bool):
-        """root (n, 4, 4): the training poses, which the scene is centred on."""
+        """Build an untrained field. root (n, 4, 4): the training poses, on which the scene is centred."""
         super().__init__()
         self.settings, self.static = settings, static
         self.whole_images = settings.rays == "image"
         self.samples, self.gamma = settings.samples, settings.gamma
         self.register_buffer("canonical_m", rig.vertices_m.clone())
         self.register_buffer("centre_m", root[:, :3, 3].mean(0))
-        turn = 12 if settings.root_condition else 0
-        point, pose, self.turn = (3, 0, 0) if static else (4, 3 * int(rig.free.sum()), turn)
-        self.radiance = RadianceMLP(point, pose, self.turn, settings.view_octaves, settings.bf16)
+        root_inputs = 12 if settings.root_condition else 0
+        point, pose, self.root_inputs = (3, 0, 0) if static else (4, 3 * int(rig.free.sum()), root_inputs)
+        self.radiance = RadianceMLP(point, pose, self.root_inputs, settings.view_octaves, settings.bf16)
         self.residual = ResidualMLP(point, pose, settings.bf16)
 
     def region(self, bodies: PosedBodies, conditions: Conditions) -> Boxes:
-        """Box B of each pose: the body's extent and a margin."""
+        """Return the box B of each pose: the body's extent and a margin."""
         return Boxes.around(bodies.vertices_m, self.margin_m)
 
     def parameter_groups(self) -> list[dict]:
-        """Adam groups."""
+        """Return parameter groups for Adam."""
         return [{"params": list(self.parameters()), "lr": self.settings.learning_rate}]
 
     def sample(
@@ -59,7 +65,7 @@ class PaperField(Field):
         draws: Draws,
         correction: PoseCorrection | None = None,
     ) -> tuple[RaySamples, Tensor]:
-        """As FastField.sample, over coarse and fine samples together (K = 2 x samples)."""
+        """Evaluate rays as Field.sample does, at coarse and fine samples together (K = 2 x samples)."""
         half_m, inner = self.settings.scene_m, self.settings.box_samples
         near, far = box_interval(origins_m, directions, self.centre_m - half_m, self.centre_m + half_m)
         coarse = stratified(near, far, draws.jitter[:, inner:])
@@ -69,9 +75,11 @@ class PaperField(Field):
         view = directions if draws.view is None else directions + draws.view
         depths = coarse
         with torch.no_grad():
-            rough = self._evaluate(bodies, region, origins_m, directions, view, frame, conditions, coarse, draws, None)
-            finer = resample(coarse, near, far, weights_from_alpha(rough.alpha), draws.finer)
-            depths = torch.cat([coarse, finer], 1).sort(1).values
+            coarse_samples = self._evaluate(
+                bodies, region, origins_m, directions, view, frame, conditions, coarse, draws, None
+            )
+            fine = sample_pdf(coarse, near, far, weights_from_alpha(coarse_samples.alpha), draws.fine)
+            depths = torch.cat([coarse, fine], 1).sort(1).values
         out = self._evaluate(bodies, region, origins_m, directions, view, frame, conditions, depths, draws, correction)
         return out, depths
 
@@ -119,7 +127,7 @@ class PaperField(Field):
             d=d,
             residual=residual,
             gradient_norm=norms,
-            beyond=torch.zeros_like(draws.beyond),
+            background=torch.zeros_like(draws.background),
         )
 
     def _scaled(self, points_m: Tensor) -> Tensor:
@@ -134,29 +142,30 @@ class PaperField(Field):
     def _radiance(
         self, points_m: Tensor, described: Descriptor, pick: Tensor, row: Tensor, view: Tensor, conditions: Conditions
     ) -> tuple[Tensor, Tensor]:
-        """Outside the box the input is x with a constant distance, and neither pose nor root counts."""
+        """Return density and colour. Outside the box the input is x with a constant distance, and neither pose nor root
+        counts."""
         scaled = self._scaled(points_m)
         if self.static:
             return self.radiance(scaled, conditions.pose[row, :0], conditions.root[row, :0], view)
         outside = torch.cat([scaled, torch.full_like(scaled[:, :1], OUTSIDE_DISTANCE)], -1)
         inner = torch.cat([described.s, described.d[:, None]], -1) / self.settings.scene_m
         pose = torch.zeros_like(conditions.pose[row]).index_copy(0, pick, conditions.pose[row[pick]])
-        turn = conditions.root[:, : self.turn]
-        root = torch.zeros_like(turn[row]).index_copy(0, pick, turn[row[pick]])
+        root_inputs = conditions.root[:, : self.root_inputs]
+        root = torch.zeros_like(root_inputs[row]).index_copy(0, pick, root_inputs[row[pick]])
         return self.radiance(outside.index_copy(0, pick, inner), pose, root, view)
 
     def coverage(self, samples: RaySamples) -> Tensor:
-        """By the SDF: its greatest occupancy along a ray, which is what the loss `seg` compares with the mask."""
+        """Return the greatest occupancy of the SDF along each ray, which the loss `seg` compares with the mask."""
         return (samples.in_box * samples.alpha_dot).amax(1)
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
-        """d_hat (N,) metres at points (N, 3) around the first body."""
+        """Return d_hat (N,) in metres at points (N, 3) around the first body."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         described = bodies.describe(points_m, row, FAR_M, exact_sign=True)
         return described.d + self.settings.scene_m * self._residual(points_m, described, row, conditions)
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
-        """c (N, 3) at points around the first body seen along directions (N, 3)."""
+        """Return c (N, 3) at points around the first body, seen along directions (N, 3)."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         described = bodies.describe(points_m, row, FAR_M)
         return self._radiance(
@@ -164,10 +173,12 @@ class PaperField(Field):
         )[1]
 
 
-def resample(middles: Tensor, near: Tensor, far: Tensor, weights: Tensor, uniform: Tensor) -> Tensor:
-    """Depths (R, K) drawn from piecewise constant weights (R, K) (Mildenhall et al. 2020, section 5.2).
+def sample_pdf(middles: Tensor, near: Tensor, far: Tensor, weights: Tensor, uniform: Tensor) -> Tensor:
+    """Draw depths (R, K) from piecewise constant weights (R, K) by inverse transform sampling (Mildenhall et al. 2020,
+    section 5.2).
 
-    middles (R, K): the samples that the weights belong to; their cells meet half-way. uniform (R, K) in [0, 1): strata.
+    middles (R, K): the samples of these weights; their cells meet half-way between samples. uniform (R, K) in [0, 1):
+    position in each stratum.
     """
     edges = torch.cat([near[:, None], (middles[:, 1:] + middles[:, :-1]) / 2, far[:, None]], 1)
     cumulative = torch.cat([torch.zeros_like(near)[:, None], (weights + 1e-5).cumsum(1)], 1)

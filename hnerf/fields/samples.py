@@ -1,4 +1,4 @@
-"""What a field says of a batch of rays."""
+"""Samples of a field along a batch of rays."""
 
 from dataclasses import dataclass
 
@@ -7,10 +7,13 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class RaySamples:
-    """What a model says of a batch of rays. (R, K) each: alpha of the radiance field, alpha_dot of the SDF, in_box b,
-    d of the body, residual dd, gradient_norm |grad d_hat| (or a subset of samples, any shape); colour (R, K, 3);
-    density (R, K) or None where the SDF itself is the density; beyond (R, 3): the colour behind the samples;
-    elastic: energy of a deformation on rays that it knows of, or None where nothing is deformed."""
+    """A field evaluated along a batch of rays.
+
+    (R, K) each: alpha of the radiance field, alpha_dot of the SDF, in_box b, d of the body, residual dd. gradient_norm:
+    |grad d_hat| at some or all samples, any shape. colour (R, K, 3). density (R, K), None where the SDF itself is the
+    density. background (R, 3): the colour behind the samples. elastic: deformation energy of the rays that have one,
+    None without a deformation.
+    """
 
     alpha: Tensor
     alpha_dot: Tensor
@@ -20,10 +23,10 @@ class RaySamples:
     d: Tensor
     residual: Tensor
     gradient_norm: Tensor
-    beyond: Tensor
+    background: Tensor
     elastic: Tensor | None = None
 
     @property
     def d_hat(self) -> Tensor:
-        """Signed distance to the clothed person."""
+        """Signed distance to the clothed person, (R, K)."""
         return self.d + self.residual

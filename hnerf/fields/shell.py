@@ -1,5 +1,5 @@
-"""Where the person can be: one voxel grid a frame that says empty, shell or solid, with rays sampled in the shell
-alone; or, for the published methods, a box."""
+"""Sampling regions: per frame a voxel grid of empty, shell and solid cells, with rays sampled in the shell alone; or,
+for the published methods, a box."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -10,7 +10,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from hnerf.body.canonical import blended
+from hnerf.body.canonical import weighted_sum
 
 EMPTY, SHELL, SOLID = 0, 1, 2
 SLACK = 3**0.5 / 2  # half a diagonal of a cell, in cells
@@ -18,8 +18,8 @@ SLACK = 3**0.5 / 2  # half a diagonal of a cell, in cells
 
 @dataclass(frozen=True)
 class ShellGrid:
-    """cells (n, X, Y, Z) uint8 of EMPTY, SHELL, SOLID; lower_m (n, 3) corner of each frame's grid; cell_m: edge
-    length."""
+    """Voxel grid around each body. cells (n, X, Y, Z) uint8 of EMPTY, SHELL, SOLID; lower_m (n, 3): corner of each
+    frame's grid; cell_m: edge length."""
 
     cells: Tensor
     lower_m: Tensor
@@ -29,11 +29,11 @@ class ShellGrid:
     def around(
         vertices_m: Tensor, outer_m: Tensor, inner_m: Tensor, points: tuple[Tensor, Tensor], cell_m: float
     ) -> "ShellGrid":
-        """The shell around closed surfaces, from their vertices (n, V, 3) with the shell's own thickness outside and
-        inside at each, (n, V) metres, and dense points on them, as `lattice` gives them.
+        """Build the shell around closed surfaces with vertices (n, V, 3); outer_m, inner_m (n, V): thickness in metres
+        outside and inside; points: dense surface points, as `surface_points` returns them.
 
-        Distances are between the centres of cells, half a diagonal is added to them: the shell is up to a cell thicker
-        than asked, seldom thinner. A cell takes the greatest thickness in the neighbourhood of its nearest point.
+        Distances are between cell centres and half a diagonal is added, so the shell is up to a cell thicker than
+        asked, seldom thinner. A cell takes the greatest thickness near its closest surface point.
         """
         corners, weights = points
         margin_m = float(outer_m.max()) + 2 * cell_m
@@ -42,18 +42,18 @@ class ShellGrid:
         cells = np.full((len(sizes), *sizes.amax(0).tolist()), EMPTY, np.uint8)
 
         def fill(row: int) -> None:
-            index = ((blended(vertices_m[row], corners, weights) - lower[row]) / cell_m).long()
+            index = ((weighted_sum(vertices_m[row], corners, weights) - lower[row]) / cell_m).long()
             thickness = (side[row][corners].amax(-1) / cell_m for side in (outer_m, inner_m))
             size, *surface = (t.cpu().numpy() for t in (sizes[row], index, *thickness))
-            cells[row][tuple(map(slice, size))] = _cells_around(size, *surface)
+            cells[row][tuple(map(slice, size))] = _classify_cells(size, *surface)
 
-        with ThreadPoolExecutor(torch.get_num_threads()) as threads:  # a frame a thread, which bounds memory
+        with ThreadPoolExecutor(torch.get_num_threads()) as threads:  # one frame per thread, which bounds memory
             list(threads.map(fill, range(len(cells))))
         return ShellGrid(torch.from_numpy(cells).to(vertices_m.device), lower, cell_m)
 
-    def look_up(self, origins_m: Tensor, directions: Tensor, depths_m: Tensor, frame: Tensor) -> Tensor:
-        """State of the cells at depths (R, K) along rays (R, 3) in frames (R,): (R, K) uint8. Beyond the grid it is
-        that of its outermost cells, which are EMPTY."""
+    def cell_states(self, origins_m: Tensor, directions: Tensor, depths_m: Tensor, frame: Tensor) -> Tensor:
+        """Return the state of the cells at depths (R, K) along rays (R, 3) in frames (R,): (R, K) uint8. Outside the
+        grid it is that of the outermost cells, which are EMPTY."""
         origins, directions = (origins_m - self.lower_m[frame]) / self.cell_m, directions / self.cell_m
         flat = frame[:, None].to(torch.int32 if self.cells.numel() < 2**31 else torch.int64)
         for axis, size in enumerate(self.cells.shape[1:]):
@@ -64,9 +64,9 @@ class ShellGrid:
     def sample_rays(
         self, origins_m: Tensor, directions: Tensor, frame: Tensor, jitter: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Depths (R, K) in metres, sorted, spread evenly over the shell up to the first solid cell; and (R,) bool:
-        whether the ray meets the shell at all, and whether a solid cell ends it. jitter (R, K) in [0, 1): where each
-        sample lies in its stratum."""
+        """Return sorted depths (R, K) in metres, evenly distributed over the shell up to the first solid cell; and two
+        masks (R,) bool: whether the ray meets the shell, and whether a solid cell ends it. jitter (R, K) in [0, 1):
+        position in each stratum."""
         edges, cumulative, ends = self._march(origins_m, directions, frame)
         samples = jitter.shape[1]
         strata = torch.arange(samples, device=edges.device, dtype=edges.dtype)
@@ -75,28 +75,28 @@ class ShellGrid:
         inside = wanted - cumulative.gather(1, upper - 1)
         return edges.gather(1, upper - 1) + inside * self.cell_m, cumulative[:, -1] > 0, ends
 
-    def path_m(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
-        """How long the ways are over which `sample_rays` spreads the samples, (R,) metres."""
+    def path_length_m(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
+        """Return the path length (R,) in metres over which `sample_rays` distributes the samples."""
         return self.cell_m * self._march(origins_m, directions, frame)[1][:, -1]
 
     def _march(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Depths (R, B + 1) of equal steps through the grid, how many of the steps before each are in the shell and in
-        front of the first solid cell, (R, B + 1), and whether there is a solid cell, (R,) bool."""
+        """Return depths (R, B + 1) of equal steps through the grid; the number of steps before each that are in the
+        shell and before the first solid cell, (R, B + 1); and whether there is a solid cell, (R,) bool."""
         size_m = self.cell_m * torch.tensor(self.cells.shape[1:], device=origins_m.device)
         near, far = box_interval(origins_m, directions, self.lower_m[frame], self.lower_m[frame] + size_m)
         bins = max(1, math.ceil(float((far - near).max()) / self.cell_m))
-        edges = near[:, None] + self.cell_m * torch.arange(bins + 1, device=near.device)  # whatever the other rays
+        edges = near[:, None] + self.cell_m * torch.arange(bins + 1, device=near.device)  # the same for any batch
         middles = (edges[:, 1:] + edges[:, :-1]) / 2
-        state = self.look_up(origins_m, directions, middles, frame)
-        reached = state.cummax(1).values  # EMPTY < SHELL < SOLID
-        weight = ((state == SHELL) & (reached < SOLID)).float()
+        state = self.cell_states(origins_m, directions, middles, frame)
+        deepest = state.cummax(1).values  # EMPTY < SHELL < SOLID
+        weight = ((state == SHELL) & (deepest < SOLID)).float()
         cumulative = torch.cat([torch.zeros_like(near)[:, None], weight.cumsum(1)], 1)
-        return edges, cumulative, reached[:, -1] == SOLID
+        return edges, cumulative, deepest[:, -1] == SOLID
 
 
-def lattice(vertices_m: Tensor, faces: Tensor, spacing_m: float) -> tuple[Tensor, Tensor]:
-    """Points on a surface, vertices among them, no farther apart along edges than `spacing_m`: corner indices (P, 3)
-    and barycentric weights (P, 3), which hold in any pose."""
+def surface_points(vertices_m: Tensor, faces: Tensor, spacing_m: float) -> tuple[Tensor, Tensor]:
+    """Return points on a surface, vertices included, at most `spacing_m` apart along edges: corner indices (P, 3) and
+    barycentric weights (P, 3), valid in any pose."""
     corners_m = vertices_m[faces]
     longest_m = (corners_m - corners_m.roll(1, 1)).norm(dim=-1).amax(1)
     parts = (longest_m / spacing_m).ceil().long().clamp(min=1)
@@ -111,25 +111,25 @@ def lattice(vertices_m: Tensor, faces: Tensor, spacing_m: float) -> tuple[Tensor
     return torch.cat(corners), torch.cat(weights)
 
 
-def _cells_around(size: np.ndarray, points: np.ndarray, outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
-    """States of a frame's cells around points in cells (V, 3) with thicknesses (V,), all in cells."""
+def _classify_cells(size: np.ndarray, points: np.ndarray, outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
+    """Return the states of a frame's cells around surface points (V, 3) with thicknesses (V,), all in cells."""
     at = tuple(points.T)
     surface = np.zeros(size, bool)
     surface[at] = True
     distance, nearest = ndimage.distance_transform_edt(~surface, return_indices=True)
-    away, _ = ndimage.label(distance > 1)  # a cell thicker, so that no gap lets it leak
+    away, _ = ndimage.label(distance > 1)  # one cell thicker, so that the inside has no leaks
     inside = away != away[0, 0, 0]
     cells = np.where(inside, np.uint8(SOLID), np.uint8(EMPTY))
     band = np.nonzero(distance <= max(outer.max(), inner.max()) + SLACK)
     next_to = tuple(nearest[:, *band])
-    outer, inner = (_greatest_nearby(size, at, thickness)[next_to] for thickness in (outer, inner))
+    outer, inner = (_local_max(size, at, thickness)[next_to] for thickness in (outer, inner))
     within = distance[band] <= np.where(inside[band], inner, outer) + SLACK
     cells[tuple(axis[within] for axis in band)] = SHELL
     return cells
 
 
-def _greatest_nearby(size: np.ndarray, at: tuple[np.ndarray, ...], values: np.ndarray) -> np.ndarray:
-    """Greatest of the values that fall into a cell or its neighbours, an array of this size."""
+def _local_max(size: np.ndarray, at: tuple[np.ndarray, ...], values: np.ndarray) -> np.ndarray:
+    """Return an array of this size with the greatest value in each cell and its neighbours."""
     greatest = np.zeros(size, np.float32)
     np.maximum.at(greatest, at, values)
     return ndimage.maximum_filter(greatest, 3)
@@ -137,28 +137,30 @@ def _greatest_nearby(size: np.ndarray, at: tuple[np.ndarray, ...], values: np.nd
 
 @dataclass(frozen=True)
 class Boxes:
-    """The person's box by body row: lower_m, upper_m (n, 3)."""
+    """Bounding box of the person by body row: lower_m, upper_m (n, 3)."""
 
     lower_m: Tensor
     upper_m: Tensor
 
     @staticmethod
     def around(vertices_m: Tensor, margin_m: float) -> "Boxes":
-        """The extent of bodies (n, V, 3) and a margin."""
+        """Return the extents of bodies (n, V, 3), enlarged by a margin."""
         return Boxes(vertices_m.amin(1) - margin_m, vertices_m.amax(1) + margin_m)
 
     def interval(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
-        """Entry and exit depths (R,) of rays (R, 3) in the boxes of body rows (R,); equal where the box is missed."""
+        """Return entry and exit depths (R,) of rays (R, 3) in the boxes of body rows (R,); equal where the box is
+        missed."""
         return box_interval(origins_m, directions, self.lower_m[frame], self.upper_m[frame])
 
     def signed_distance(self, points_m: Tensor) -> Tensor:
-        """Of points (N, 3) to the first box, (N,) metres, negative inside."""
-        beyond = torch.maximum(self.lower_m[0] - points_m, points_m - self.upper_m[0])
-        return beyond.clamp(min=0).norm(dim=-1) + beyond.amax(-1).clamp(max=0)
+        """Return the signed distance (N,) in metres of points (N, 3) to the first box, negative inside."""
+        outside_m = torch.maximum(self.lower_m[0] - points_m, points_m - self.upper_m[0])
+        return outside_m.clamp(min=0).norm(dim=-1) + outside_m.amax(-1).clamp(max=0)
 
 
 def box_interval(origins_m: Tensor, directions: Tensor, lower_m: Tensor, upper_m: Tensor) -> tuple[Tensor, Tensor]:
-    """Entry and exit depths (R,) of rays in axis-aligned boxes (R, 3); equal where the box is missed (slab method)."""
+    """Return entry and exit depths (R,) of rays in axis-aligned boxes (R, 3) by the slab method; equal where the box is
+    missed."""
     inverse = 1 / torch.where(directions.abs() < 1e-9, torch.full_like(directions, 1e-9), directions)
     a, b = (lower_m - origins_m) * inverse, (upper_m - origins_m) * inverse
     near = torch.minimum(a, b).amax(-1).clamp(min=0)
@@ -166,6 +168,7 @@ def box_interval(origins_m: Tensor, directions: Tensor, lower_m: Tensor, upper_m
 
 
 def stratified(near: Tensor, far: Tensor, jitter: Tensor) -> Tensor:
-    """Depths (R, K), one in each of K equal parts of [near, far] (R,), at jitter (R, K) in [0, 1) of its part."""
+    """Return depths (R, K), one in each of K equal parts of [near, far] (R,), at position jitter (R, K) in [0, 1) of
+    its part."""
     strata = torch.arange(jitter.shape[1], device=near.device)
     return near[:, None] + (far - near)[:, None] * (strata + jitter) / jitter.shape[1]

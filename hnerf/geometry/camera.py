@@ -1,7 +1,7 @@
-"""A calibrated pinhole camera, and nothing about file formats.
+"""Calibrated pinhole cameras, independent of file formats.
 
 Conventions, used everywhere past the capture adapters: x_camera = R x_world + t, metres, OpenCV axes (x right, y down,
-z forward), pixel centres at integer coordinates, linear model (images are undistorted at the door).
+z forward), pixel centres at integer coordinates, linear model (images are undistorted when they are ingested).
 """
 
 import dataclasses
@@ -12,7 +12,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics in pixels, extrinsics world to camera in metres.
+    """A calibrated pinhole camera: intrinsics in pixels, extrinsics from world to camera in metres.
 
     K: (3, 3) float64; R: (3, 3) float64 rotation; t_m: (3,) float64; width_px, height_px: image size.
     """
@@ -26,21 +26,22 @@ class Camera:
 
     @property
     def centre_m(self) -> np.ndarray:
-        """Camera centre in the world, (3,)."""
+        """Return the camera centre in the world, (3,)."""
         return -self.R.T @ self.t_m
 
     @property
     def forward(self) -> np.ndarray:
-        """Unit viewing direction in the world, (3,)."""
+        """Return the unit viewing direction in the world, (3,)."""
         return self.R[2]
 
     @property
     def projection(self) -> np.ndarray:
-        """P = K [R | t], (3, 4)."""
+        """Return the projection matrix P = K [R | t], (3, 4)."""
         return self.K @ np.hstack([self.R, self.t_m[:, None]])
 
     def project(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """World points (..., 3) to pixels (..., 2) and depths (...,) in metres; depth <= 0 is behind the camera."""
+        """Project world points (..., 3) to pixels (..., 2) and depths (...,) in metres; a depth <= 0 lies behind the
+        camera."""
         x = points_m @ self.R.T + self.t_m
         depth_m = x[..., 2]
         uv = x @ self.K.T
@@ -48,22 +49,23 @@ class Camera:
             return uv[..., :2] / uv[..., 2:], depth_m
 
     def rays(self, pixels_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (..., 2) as (x, y) to ray origins and unit directions in the world, both (..., 3)."""
+        """Return the rays through pixels (..., 2), given as (x, y): origins and unit directions in the world, both
+        (..., 3)."""
         homogeneous = np.concatenate([pixels_px, np.ones_like(pixels_px[..., :1])], axis=-1)
         directions = homogeneous @ np.linalg.inv(self.K).T @ self.R
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         return np.broadcast_to(self.centre_m, directions.shape), directions
 
     def resized(self, width_px: int, height_px: int) -> "Camera":
-        """The same camera with its image resampled to another size (pixel centres at integers)."""
+        """Return this camera with its image resampled to another size (pixel centres at integers)."""
         sx, sy = width_px / self.width_px, height_px / self.height_px
         K = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]]) @ self.K
         return Camera(self.name, K, self.R, self.t_m, width_px, height_px)
 
 
 def look_at(like: Camera, centre_m: np.ndarray, target_m: np.ndarray, up: np.ndarray) -> Camera:
-    """The camera `like`, moved to `centre_m` and turned to see `target_m` in the middle of its image; `up` (3,) is
-    upwards in the image."""
+    """Return the camera `like` moved to `centre_m` and rotated so that `target_m` is at the centre of its image; `up`
+    (3,) points upwards in the image."""
     forward = (target_m - centre_m) / np.linalg.norm(target_m - centre_m)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)

@@ -1,4 +1,4 @@
-"""Closest points, sides and ray hits of a triangle mesh, by warp's bounding-volume hierarchy."""
+"""Queries of a triangle mesh by warp's bounding-volume hierarchy: closest points, inside or outside, and ray hits."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -6,13 +6,13 @@ import numpy as np
 import trimesh
 import warp as wp
 
-from hnerf.geometry.rays import RayHits, cast, vectors
+from hnerf.geometry.rays import RayHits, cast, to_vec3_array
 
 wp.config.log_level = wp.LOG_ERROR
 
 REACH_M = 10.0
-RAY_START_M = 2.0e-3  # escape rays start this far off their surface, so that they do not meet it at once
-BLOCKS = (8, 4, 2, 1)  # nodes on a side of the blocks of `Surface.occupancy`
+RAY_START_M = 2.0e-3  # escape rays start this far off the surface, so that they do not hit it at once
+BLOCKS = (8, 4, 2, 1)  # nodes along a side of the blocks that `Surface.occupancy` tests
 
 
 @wp.kernel
@@ -53,51 +53,57 @@ def _escape_kernel(
 
 
 class Surface:
-    """A mesh ready for queries. Points and directions are (N, 3), metres."""
+    """A triangle mesh prepared for queries. Points and directions are (N, 3), metres."""
 
     def __init__(self, mesh: trimesh.Trimesh):
         self.mesh = mesh
         self._warp_mesh = wp.Mesh(
-            points=vectors(mesh.vertices),
+            points=to_vec3_array(mesh.vertices),
             indices=wp.array(np.asarray(mesh.faces, np.int32).ravel(), dtype=int),
             support_winding_number=True,
         )
 
     def closest(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distance to the surface in metres (N,) and the face nearest (N,)."""
+        """Return the distance in metres from each point to the surface, (N,), and the nearest face, (N,)."""
         n = len(points_m)
         distance, face = wp.zeros(n, dtype=float), wp.zeros(n, dtype=int)
-        wp.launch(_closest_kernel, n, [self._warp_mesh.id, vectors(points_m), distance, face])
+        wp.launch(_closest_kernel, n, [self._warp_mesh.id, to_vec3_array(points_m), distance, face])
         return distance.numpy(), face.numpy()
 
     def inside(self, points_m: np.ndarray) -> np.ndarray:
-        """Whether the winding number is over one half, (N,) bool (Jacobson et al. 2013)."""
+        """Return whether each point is inside the mesh, (N,) bool: its winding number is over one half (Jacobson et al.
+        2013)."""
         inside = wp.zeros(len(points_m), dtype=int)
-        wp.launch(_inside_kernel, len(points_m), [self._warp_mesh.id, vectors(points_m), inside])
+        wp.launch(_inside_kernel, len(points_m), [self._warp_mesh.id, to_vec3_array(points_m), inside])
         return inside.numpy() > 0
 
     def escapes(self, points_m: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Whether a ray along any of the directions (K, 3) leaves a point without meeting the surface, (N,) bool."""
+        """Return whether a ray along any of the directions (K, 3) leaves each point without meeting the surface, (N,)
+        bool."""
         escapes = wp.zeros(len(points_m), dtype=int)
-        wp.launch(_escape_kernel, len(points_m), [self._warp_mesh.id, vectors(points_m), vectors(directions), escapes])
+        wp.launch(
+            _escape_kernel,
+            len(points_m),
+            [self._warp_mesh.id, to_vec3_array(points_m), to_vec3_array(directions), escapes],
+        )
         return escapes.numpy() > 0
 
     def cast(self, origins_m: np.ndarray, directions: np.ndarray) -> RayHits:
-        """First hits of rays, from an origin each or from one (3,)."""
+        """Return the first hits of rays; origins_m is (N, 3), or (3,) if all rays share one."""
         return cast(self._warp_mesh, origins_m, directions)
 
     def near(self, points_m: np.ndarray, reach_m: float) -> np.ndarray:
-        """Whether the surface comes within reach of a point, (N,) bool."""
+        """Return whether the surface comes within `reach_m` of each point, (N,) bool."""
         near = wp.zeros(len(points_m), dtype=int)
-        wp.launch(_near_kernel, len(points_m), [self._warp_mesh.id, vectors(points_m), reach_m, near])
+        wp.launch(_near_kernel, len(points_m), [self._warp_mesh.id, to_vec3_array(points_m), reach_m, near])
         return near.numpy() > 0
 
     def occupancy(self, lower_m: np.ndarray, upper_m: np.ndarray, nodes: int) -> np.ndarray:
-        """`inside` at the nodes^3 grid points of a box, bool; nodes is a multiple of the coarsest block.
+        """Return `inside` at the nodes^3 grid points of a box, bool. `nodes` is a multiple of the coarsest block.
 
-        A block whose corners are nearer to its middle than the surface is lies on its middle's side; others are split.
-        (An open mesh also changes sides away from its surface, where the winding number closes it over a hole: a block
-        there is decided by its middle.)
+        A block is decided by its centre if no part of the surface is as near to the centre as the block's corners are;
+        other blocks are split. (The inside of an open mesh also changes away from its surface, where the winding number
+        closes a hole; a block there is decided by its centre.)
         """
         step_m = (upper_m - lower_m) / (nodes - 1)
         occupied = np.zeros((nodes,) * 3, bool)
@@ -112,5 +118,5 @@ class Surface:
 
 
 def _cube(side: int) -> np.ndarray:
-    """The integer points of [0, side)^3, (side^3, 3)."""
+    """Return the integer points of [0, side)^3, (side^3, 3)."""
     return np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Where rays meet a mesh, by warp's bounding-volume hierarchy."""
+"""Ray casting on triangle meshes by warp's bounding-volume hierarchy."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -32,28 +32,30 @@ def _cast_kernel(
 
 @dataclass(frozen=True)
 class RayHits:
-    """face (N,), -1 where a ray meets nothing; barycentric (N, 3) and distance_m (N,) of the hit."""
+    """The first hits of N rays: face (N,), -1 where a ray meets nothing; barycentric (N, 3) and distance_m (N,) of the
+    hit."""
 
     face: np.ndarray
     barycentric: np.ndarray
     distance_m: np.ndarray
 
     def interpolate(self, per_vertex: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """Values at vertices (V, C) to values at those rays that hit, (M, C)."""
-        met = self.face >= 0
-        return np.einsum("nk,nkc->nc", self.barycentric[met], per_vertex[faces[self.face[met]]])
+        """Interpolate values at vertices (V, C) at the hits, for those rays that hit: (M, C)."""
+        hit = self.face >= 0
+        return np.einsum("nk,nkc->nc", self.barycentric[hit], per_vertex[faces[self.face[hit]]])
 
 
 def cast(mesh: wp.Mesh, origins_m: np.ndarray, directions: np.ndarray) -> RayHits:
-    """First hits of rays along unit directions (N, 3), from an origin each or from one (3,), on the mesh's device."""
+    """Return the first hits of rays along unit directions (N, 3), computed on the mesh's device; origins_m is (N, 3),
+    or (3,) if all rays share one."""
     n, device = len(directions), mesh.device
     face, distance = wp.zeros(n, dtype=int, device=device), wp.zeros(n, dtype=float, device=device)
     barycentric = wp.zeros(n, dtype=wp.vec3, device=device)
-    rays = [vectors(rows, device) for rows in (np.broadcast_to(origins_m, directions.shape), directions)]
+    rays = [to_vec3_array(rows, device) for rows in (np.broadcast_to(origins_m, directions.shape), directions)]
     wp.launch(_cast_kernel, n, [mesh.id, *rays, face, barycentric, distance], device=device)
     return RayHits(face.numpy(), barycentric.numpy(), distance.numpy())
 
 
-def vectors(rows: np.ndarray, device: wp.Device | str | None = None) -> wp.array:
-    """(N, 3) for warp."""
+def to_vec3_array(rows: np.ndarray, device: wp.Device | str | None = None) -> wp.array:
+    """Convert rows (N, 3) to a warp array of vec3."""
     return wp.array(np.ascontiguousarray(rows, np.float32), dtype=wp.vec3, device=device)

@@ -1,4 +1,4 @@
-"""Which pixels of a camera can show anything of a body."""
+"""Pixels of a camera in which a posed body, with a margin, can be seen."""
 
 import itertools
 from collections.abc import Callable
@@ -8,20 +8,20 @@ import numpy as np
 
 from hnerf.geometry.camera import Camera
 
-NEAREST_PERCENT = 1  # of the vertices: a finger alone does not widen the reach of all others
-FARTHEST_PX = 1e5  # from the image's corner: more is not asked of what fills polygons
-Reached = Callable[[Camera, np.ndarray], np.ndarray]
-"""Which pixels (H, W) of a camera can show anything of a body with vertices (V, 3)."""
+NEAREST_PERCENT = 1  # percentile of vertex depths that sets the radius: one finger does not widen all discs
+FARTHEST_PX = 1e5  # corners are clipped to it, as OpenCV fills polygons of small integers
+ReachablePixels = Callable[[Camera, np.ndarray], np.ndarray]
+"""Returns which pixels (H, W) of a camera can show any part of a body with vertices (V, 3)."""
 
 
 def everywhere(camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
-    """(H, W) bool: all pixels."""
+    """Return all pixels of the camera, (H, W) bool: nothing is excluded."""
     return np.ones((camera.height_px, camera.width_px), bool)
 
 
 def within_box(camera: Camera, vertices_m: np.ndarray, margin_m: float) -> np.ndarray:
-    """(H, W) bool: pixels whose rays meet the extent of the body (V, 3) and a margin; all where that lies about the
-    camera."""
+    """Return the pixels, (H, W) bool, whose rays meet the bounding box of the body (V, 3) with a margin; all pixels if
+    part of the box lies behind the camera."""
     lower_m, upper_m = vertices_m.min(0) - margin_m, vertices_m.max(0) + margin_m
     corners_px, depth_m = camera.project(np.array(list(itertools.product(*zip(lower_m, upper_m, strict=True)))))
     if depth_m.min() <= 0:
@@ -32,8 +32,11 @@ def within_box(camera: Camera, vertices_m: np.ndarray, margin_m: float) -> np.nd
 
 
 def within_reach(camera: Camera, vertices_m: np.ndarray, reach_m: float) -> np.ndarray:
-    """(H, W) bool: pixels whose rays pass within about `reach_m` of the body; its vertices before the camera, in the
-    image or beside it, each a disc of the radius that the nearest ones need."""
+    """Return the pixels, (H, W) bool, whose rays pass within about `reach_m` of the body (V, 3).
+
+    Each vertex in front of the camera, in the image or beside it, covers a disc of the radius that the nearest vertices
+    need.
+    """
     size_px = np.array([camera.width_px, camera.height_px])
     xy, depth_m = camera.project(vertices_m)
     xy, depth_m = xy[depth_m > 0], depth_m[depth_m > 0]
@@ -45,5 +48,5 @@ def within_reach(camera: Camera, vertices_m: np.ndarray, reach_m: float) -> np.n
     x, y = xy[((xy >= 0) & (xy < size_px + 2 * radius)).all(1)].astype(int).T
     outside = np.ones(size_px[::-1] + 2 * radius, np.uint8)
     outside[y, x] = 0
-    apart_px = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return apart_px[radius:-radius, radius:-radius] <= radius
+    distance_px = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return distance_px[radius:-radius, radius:-radius] <= radius

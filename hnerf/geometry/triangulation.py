@@ -1,23 +1,24 @@
-"""Points in space from their images, with outlier views left out."""
+"""Robust triangulation of points seen by several cameras, and reprojection errors."""
 
 from itertools import combinations
 
 import numpy as np
 
-CHUNK = 1 << 14  # points triangulated at once, which bounds memory
+CHUNK = 1 << 14  # points triangulated at once, to bound memory
 MIN_INLIER_PX = 3.0
-SINGULAR = 1e-12  # of the normal equations' trace: parallel rays meet far away instead of nowhere
+DAMPING = 1e-12  # of the normal equations' trace: keeps them solvable for parallel rays, which then meet far away
 
 
 def triangulate(
     projections: np.ndarray, keypoints: np.ndarray, inlier_px: float | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points in space from their images, with outlier views left out.
+    """Triangulate points from several views, leaving outlier views out.
 
-    projections (C, 3, 4); keypoints (C, K, 3) x_px, y_px, confidence (0: unseen). The pair of views whose linear
-    solution lies nearest to all views (confidence-weighted L1) decides which views are inliers; these are solved
-    together by the iteratively re-weighted linear method (Hartley and Sturm 1997). `inlier_px` defaults to 4 times the
-    median distance of the views that took no part in a pair's solution: it grows with noise and calibration error.
+    projections (C, 3, 4); keypoints (C, K, 3) x_px, y_px, confidence (0: unseen). For each point, every pair of views
+    is solved linearly; the solution nearest to all views (confidence-weighted L1) decides which views are inliers. The
+    inliers are then solved together by the iteratively re-weighted linear method (Hartley and Sturm 1997). `inlier_px`
+    defaults to 4 times the median distance of the views that took no part in a pair's solution: it grows with noise and
+    calibration error.
 
     Returns points_m (K, 3), NaN with fewer than two inlier views; residuals_px (C, K), NaN where unseen or without a
     point; inliers (C, K) bool.
@@ -29,8 +30,8 @@ def triangulate(
     in_pair = np.concatenate([members for _, members in best], 1) if best else confidence > 0
     distances = reprojection_px(projections, pair_points, keypoints)
     if inlier_px is None:
-        witnesses = distances[(confidence > 0) & ~in_pair & np.isfinite(distances)]
-        inlier_px = max(MIN_INLIER_PX, 4 * float(np.median(witnesses))) if witnesses.size else np.inf
+        third_views_px = distances[(confidence > 0) & ~in_pair & np.isfinite(distances)]
+        inlier_px = max(MIN_INLIER_PX, 4 * float(np.median(third_views_px))) if third_views_px.size else np.inf
     inliers = (confidence > 0) & (distances < inlier_px)
     points_m = solve_points(projections, keypoints, confidence * inliers)
     residuals_px = reprojection_px(projections, points_m, keypoints)
@@ -42,11 +43,13 @@ def triangulate(
 
 
 def confidence_of(keypoints: np.ndarray) -> np.ndarray:
+    """Return the confidence of keypoints (..., 3), shape (...,); 0 where any of the three numbers is not finite."""
     return np.where(np.isfinite(keypoints).all(-1), keypoints[..., 2], 0.0)
 
 
 def _best_pair(projections: np.ndarray, keypoints: np.ndarray, confidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Per point the two-view solution nearest to all views: (K, 3), and the members of the pair (C, K) bool."""
+    """Return for each point the two-view solution nearest to all views, (K, 3), and which views made it, (C, K)
+    bool."""
     cameras, count = confidence.shape
     best_cost = np.full(count, np.inf)
     points_m = np.full((count, 3), np.nan)
@@ -55,17 +58,18 @@ def _best_pair(projections: np.ndarray, keypoints: np.ndarray, confidence: np.nd
         in_pair = np.zeros((cameras, 1), bool)
         in_pair[both] = True
         candidate_m = solve_points(projections[both], keypoints[both], confidence[both])
-        far = reprojection_px(projections, candidate_m, keypoints)
-        cost = np.where(confidence > 0, confidence * np.nan_to_num(far, nan=1e6), 0).sum(0)
+        distance_px = reprojection_px(projections, candidate_m, keypoints)
+        cost = np.where(confidence > 0, confidence * np.nan_to_num(distance_px, nan=1e6), 0).sum(0)
         better = (confidence[both] > 0).all(0) & (cost < best_cost)
         best_cost[better], points_m[better], members[:, better] = cost[better], candidate_m[better], in_pair
     return points_m, members
 
 
 def solve_points(projections: np.ndarray, keypoints: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Weighted linear triangulation (K, 3), re-weighted once by depth to minimise pixels; NaN under two views.
+    """Triangulate linearly with weights (C, K), re-weighted once by depth so that pixel distances are minimised.
 
-    Hartley and Sturm 1997, section 5.2, "Iterative-LS": inhomogeneous normal equations, the same wherever the origin.
+    Returns (K, 3), NaN with fewer than two views. Hartley and Sturm 1997, section 5.2, "Iterative-LS": inhomogeneous
+    normal equations, which do not depend on where the origin is.
     """
     rows = projections[:, None, 2:] * np.nan_to_num(keypoints)[..., :2, None] - projections[:, None, :2]  # (C, K, 2, 4)
     focal = np.linalg.norm(projections[:, :2, :3], axis=-1).mean(1)
@@ -75,7 +79,7 @@ def solve_points(projections: np.ndarray, keypoints: np.ndarray, weights: np.nda
     points_m = np.full((keypoints.shape[1], 3), np.nan)
     for _ in range(2):
         normal = np.einsum("ckab,ck->kab", outer, scale**2)[enough]
-        damping = SINGULAR * np.trace(normal[:, :3, :3], axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        damping = DAMPING * np.trace(normal[:, :3, :3], axis1=1, axis2=2)[:, None, None] * np.eye(3)
         points_m[enough] = -np.linalg.solve(normal[:, :3, :3] + damping, normal[:, :3, 3:])[..., 0]
         depth = np.abs(projections[:, 2, :3] @ points_m.T + projections[:, 2, 3:])
         scale = np.where(enough, np.sqrt(weights.clip(0)) / depth.clip(1e-9), 0)
@@ -83,7 +87,7 @@ def solve_points(projections: np.ndarray, keypoints: np.ndarray, weights: np.nda
 
 
 def reprojection_px(projections: np.ndarray, points_m: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
-    """Distance of points (K, 3) to keypoints (C, K, 3) in the image, (C, K); NaN behind a camera."""
+    """Return the image distance of points (K, 3) to keypoints (C, K, 3), (C, K); NaN behind a camera."""
     x = np.einsum("cij,kj->cki", projections, np.concatenate([points_m, np.ones_like(points_m[:, :1])], 1))
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.linalg.norm(x[..., :2] / x[..., 2:] - keypoints[..., :2], axis=-1)

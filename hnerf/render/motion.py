@@ -12,11 +12,11 @@ from torch import Tensor
 
 from hnerf.body.body_model import body_model
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.given_start import given_start
+from hnerf.body.given_start import initial_pose_from_given
 from hnerf.body.rig import joint_transforms, pose_vertices
 from hnerf.capture.capture import Capture
 from hnerf.capture.given_poses import JOINTS, GivenPoses
-from hnerf.capture.safe_io import NO_ARRAYS
+from hnerf.capture.safe_io import ARRAY_FILE_ERRORS
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
 
@@ -49,7 +49,7 @@ def read_motion(path: Path, frames: str = ":") -> Motion:
     given, fps = _read_amass(path)
     chosen = list(select_frames(tuple(range(len(given.theta))), frames, path))
     given = dataclasses.replace(given, theta=given.theta[chosen], root=given.root[chosen])
-    pose = given_start(given, body_model(FitSettings()))
+    pose = initial_pose_from_given(given, body_model(FitSettings()))
     rig = pose.rig.to(dtype=torch.float32)
     return Motion(BodyFit(rig, tuple(chosen), pose.theta.float(), pose.root.float()), fps, "z")
 
@@ -164,7 +164,7 @@ def _read_amass(path: Path) -> tuple[GivenPoses, float]:
     try:
         with np.load(path, allow_pickle=False) as stored:
             found = {key: np.asarray(stored[key], np.float64) for key in keys if key in stored}
-    except NO_ARRAYS:
+    except ARRAY_FILE_ERRORS:
         raise InputError(f"{path}: not an .npz of plain arrays; give an AMASS file or a subject's folder") from None
     poses, trans = found.get("poses", np.zeros(0)), found.get("trans", np.zeros(0))
     known = poses.ndim == 2 and poses.shape[1] in AMASS_WIDTHS and trans.shape == (len(poses), 3) and len(poses) > 0

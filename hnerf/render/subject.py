@@ -13,7 +13,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import pose_vertices
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
-from hnerf.capture.timing import usual_step
+from hnerf.capture.timing import median_step
 from hnerf.errors import InputError
 from hnerf.files import atomic_folder
 from hnerf.geometry.camera import Camera
@@ -63,7 +63,7 @@ def render_subject(subject: Path, options: RenderOptions, out: Path) -> int:
         cameras = _cameras(options, capture, motion.body)
         shots: list[Shot] = list(zip(cameras, itertools.cycle(motion.body.frames), strict=False))
         avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
-        write_pictures(avatar.on_body(motion.body), shots, options.what, motion.fps, partial)
+        write_pictures(avatar.with_body(motion.body), shots, options.what, motion.fps, partial)
     return len(shots)
 
 
@@ -92,7 +92,7 @@ def _motion(subject: Path, options: RenderOptions, capture: Capture) -> Motion:
         motion = read_motion(options.motion, options.frames)
         motion = dataclasses.replace(motion, body=retarget(own, motion, capture.up), up=capture.up)
     body = motion.body
-    fps = motion.fps / usual_step(body.frames)
+    fps = motion.fps / median_step(body.frames)
     if options.between is not None:
         for frame in options.between:
             select_frames(body.frames, str(frame), options.motion or subject)

@@ -1,4 +1,4 @@
-"""Four ways to a mask, behind one interface: given, learned, against a clean plate, against a median over time."""
+"""Four sources of masks behind one interface: given, learned, against a clean plate, against a median over time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,35 +11,36 @@ from hnerf.config import SegmentationSettings
 from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.segmentation.cut import components_within, cut
-from hnerf.segmentation.difference import difference, exposure_corrected, masked_median, noise_level, surroundings
+from hnerf.segmentation.difference import difference, exposure_corrected, masked_median, noise_level, visible_background
 from hnerf.segmentation.learned import Network
-from hnerf.segmentation.prior import Prior, window_around
+from hnerf.segmentation.prior import Prior, bounding_window
 
 CLEAN_PLATE, MEDIAN = "clean plate", "median around the fitted body"
-MEDIAN_FRAMES = 60  # evenly chosen, for the background without a plate
+MEDIAN_FRAMES = 60  # at most, evenly spaced, for the background without a plate
 
 
 class Backend(Protocol):
-    """Masks of one camera of a capture. `name` is for the report."""
+    """A source of masks for one camera of a capture. `name` is for the report."""
 
     @property
     def name(self) -> str: ...
 
     def mask(self, frame: int, prior: Prior) -> np.ndarray:
-        """(H, W) bool, True on the person whom the prior describes."""
+        """Return the mask of the person whom the prior describes, (H, W) bool."""
         ...
 
 
 @dataclass(frozen=True)
 class Given:
-    """Masks that came with the recording; other people in them go."""
+    """Masks that came with the recording; other people in them are removed."""
 
     capture: Capture
     camera: str
     name: str = "given"
 
     def mask(self, frame: int, prior: Prior) -> np.ndarray:
-        """The given mask, or what of it is the subject. Raises InputError where it is missing."""
+        """Return the given mask, reduced to the subject where the prior finds it. Raises InputError where it is
+        missing."""
         mask = self.capture.given_mask(self.camera, frame)
         if mask is None:
             raise InputError(
@@ -51,7 +52,7 @@ class Given:
 
 @dataclass(frozen=True)
 class Learned:
-    """A network's probability map, as far as it is the subject."""
+    """The probability map of a network, reduced to the subject."""
 
     capture: Capture
     camera: str
@@ -59,13 +60,13 @@ class Learned:
     name: str = "learned model"
 
     def mask(self, frame: int, prior: Prior) -> np.ndarray:
-        """Where the person is likelier than not, within reach."""
+        """Return where the probability of a person is at least one half, within reach of the prior."""
         likely = self.network.probability(self.capture.image(self.camera, frame)) >= 0.5
         return components_within(likely & prior.reach, prior.reach)
 
 
 @dataclass(frozen=True)
-class AgainstBackground:
+class BackgroundSubtraction:
     """Difference to a plate, (H, W, 3) uint8 RGB, where it is `known`, (H, W) bool; then GrabCut."""
 
     capture: Capture
@@ -76,29 +77,30 @@ class AgainstBackground:
     name: str
 
     @staticmethod
-    def of_plate(
+    def from_plate(
         capture: Capture, camera: str, plate: np.ndarray, settings: SegmentationSettings
-    ) -> "AgainstBackground":
-        """A clean plate is known everywhere."""
-        return AgainstBackground(capture, camera, plate, np.ones(plate.shape[:2], bool), settings, CLEAN_PLATE)
+    ) -> "BackgroundSubtraction":
+        """Use a clean plate, which is known everywhere."""
+        return BackgroundSubtraction(capture, camera, plate, np.ones(plate.shape[:2], bool), settings, CLEAN_PLATE)
 
     @staticmethod
-    def of_median(
+    def from_median(
         capture: Capture, camera: str, priors: Sequence[Prior], count: int, settings: SegmentationSettings
-    ) -> "AgainstBackground":
-        """The background from at most `count` frames, where the priors, in the order of the frames, leave it free."""
+    ) -> "BackgroundSubtraction":
+        """Use the median over at most `count` frames, each where its prior leaves the background free; priors are in
+        the order of the frames."""
         chosen = evenly_spaced(range(len(priors)), count)
         images = [capture.image(camera, capture.frames[i]) for i in chosen]
         plate, known = masked_median(images, [priors[i] for i in chosen])
-        return AgainstBackground(capture, camera, plate, known, settings, MEDIAN)
+        return BackgroundSubtraction(capture, camera, plate, known, settings, MEDIAN)
 
     def mask(self, frame: int, prior: Prior) -> np.ndarray:
-        """Cut out of the window within reach."""
-        image, window = self.capture.image(self.camera, frame), window_around(prior.reach)
+        """Return the mask cut out of the window within reach of the prior."""
+        image, window = self.capture.image(self.camera, frame), bounding_window(prior.reach)
         mask = np.zeros(image.shape[:2], bool)
         if not prior.reach.any():
             return mask
-        free = surroundings(prior, self.known)
+        free = visible_background(prior, self.known)
         plate = exposure_corrected(self.plate, image, free)
         noise, is_median = noise_level(image, plate, free), self.name == MEDIAN
         found = difference(image[window], plate[window], noise, self.settings, shadowed=is_median)
@@ -110,7 +112,8 @@ def choose_backend(
     capture: Capture, camera: str, priors: list[Prior], fitted: bool, network: Network | None,
     settings: SegmentationSettings,
 ) -> Backend:  # fmt: skip
-    """Given masks first, then the user's network, then a clean plate, then the background around a `fitted` body.
+    """Return the first possible source of masks: given masks, the user's network, a clean plate, then the background
+    around a `fitted` body.
 
     priors: in the order of the capture's frames. Raises InputError where none is possible.
     """
@@ -120,9 +123,9 @@ def choose_backend(
         return Learned(capture, camera, network)
     plate = capture.background(camera)
     if plate is not None:
-        return AgainstBackground.of_plate(capture, camera, plate, settings)
+        return BackgroundSubtraction.from_plate(capture, camera, plate, settings)
     if not fitted:
         raise InputError(
             f"{capture.name}: camera {camera} has neither masks nor a plate (background/{camera}.jpg); fit a body first"
         )
-    return AgainstBackground.of_median(capture, camera, priors, MEDIAN_FRAMES, settings)
+    return BackgroundSubtraction.from_median(capture, camera, priors, MEDIAN_FRAMES, settings)

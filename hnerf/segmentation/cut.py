@@ -1,45 +1,47 @@
-"""From a difference and a prior to a mask: smoothed odds, GrabCut where they are unsure, then matting at the edge."""
+"""From a difference and a prior to a mask: smoothed log odds, GrabCut where they are unsure, matting at the
+edge."""
 
 import cv2
 import numpy as np
 
 from hnerf.segmentation.difference import Difference
-from hnerf.segmentation.edge import settle_edge
-from hnerf.segmentation.prior import Prior, disc, window_around
+from hnerf.segmentation.edge import refine_edge
+from hnerf.segmentation.prior import Prior, bounding_window, disc
 
-BODY_ODDS, CORE_ODDS = 1.0, 2.0  # logarithms: what the prior adds on the body, and again on its core
-UNKNOWN_ODDS = -2.0  # off the body, where there is nothing to compare with
-MOST_ODDS = 4.0  # of one pixel: models of noise and shadow are not better than that
-SURE_ODDS = 2.0  # beyond which GrabCut has to agree
-SMOOTH_PX, SMOOTH_GREY = 2, 7.0  # the guided filter's window, and the step in the picture that it keeps
+BODY_LOG_ODDS, CORE_LOG_ODDS = 1.0, 2.0  # added by the prior on the body, and again on its core
+UNKNOWN_LOG_ODDS = -2.0  # off the body, where the plate is unknown
+MAX_LOG_ODDS = 4.0  # of one pixel: the models of noise and shadow are no more certain
+SURE_LOG_ODDS = 2.0  # beyond which GrabCut may not change the label
+SMOOTH_PX, SMOOTH_GREY = 2, 7.0  # the guided filter's window, and the step in the image that it keeps
 SPECK_SHARE = 0.001  # of the mask's area: smaller parts are noise
-BAND_PX = 4  # around the likely person, where GrabCut may find more of it
+BAND_PX = 4  # around the likely person, where GrabCut may add to it
 
 
 def cut(image: np.ndarray, found: Difference, prior: Prior, known: np.ndarray) -> np.ndarray:
-    """Mask of the person, (H, W) bool, in an RGB image. `known` (H, W) bool: where the plate behind `found` is one.
+    """Return the mask of the person, (H, W) bool, in an RGB image. `known` (H, W) bool: where the plate behind `found`
+    is valid.
 
-    The odds, with those of the prior, are averaged by a guided filter (cost-volume filtering, Rhemann et al. 2011) and
-    label what is sure. GrabCut (Rother et al. 2004) decides the rest on the picture of differences, from which the
+    The log odds, with those of the prior, are averaged by a guided filter (cost-volume filtering, Rhemann et al. 2011)
+    and label what is sure. GrabCut (Rother et al. 2004) decides the rest on the contrast image, from which the
     background's texture has gone.
     """
-    odds = np.where(known, found.odds.clip(-MOST_ODDS, MOST_ODDS), UNKNOWN_ODDS * ~prior.body)
-    odds = odds + BODY_ODDS * prior.body + CORE_ODDS * prior.core
-    odds = cv2.ximgproc.guidedFilter(found.apart, odds.astype(np.float32), SMOOTH_PX, SMOOTH_GREY**2)
-    likely = components_within((odds > 0) & prior.reach, prior.reach)
+    log_odds = np.where(known, found.log_odds.clip(-MAX_LOG_ODDS, MAX_LOG_ODDS), UNKNOWN_LOG_ODDS * ~prior.body)
+    log_odds = log_odds + BODY_LOG_ODDS * prior.body + CORE_LOG_ODDS * prior.core
+    log_odds = cv2.ximgproc.guidedFilter(found.contrast, log_odds.astype(np.float32), SMOOTH_PX, SMOOTH_GREY**2)
+    likely = components_within((log_odds > 0) & prior.reach, prior.reach)
     if not likely.any():
         return likely
-    labels = np.where(odds > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    labels = np.where(log_odds > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     around = cv2.dilate(likely.astype(np.uint8), disc(BAND_PX)).astype(bool) | (~known & prior.near)
-    labels[(odds < -SURE_ODDS) | ~around | ~prior.reach] = cv2.GC_BGD
-    labels[cv2.erode((odds > SURE_ODDS).astype(np.uint8), disc(1)).astype(bool) & prior.reach] = cv2.GC_FGD
-    labels = _grab_cut(found.apart, labels)
+    labels[(log_odds < -SURE_LOG_ODDS) | ~around | ~prior.reach] = cv2.GC_BGD
+    labels[cv2.erode((log_odds > SURE_LOG_ODDS).astype(np.uint8), disc(1)).astype(bool) & prior.reach] = cv2.GC_FGD
+    labels = _grab_cut(found.contrast, labels)
     mask = components_within((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD), prior.reach)
-    return settle_edge(_without_specks(mask), image, found.plate)
+    return refine_edge(_without_specks(mask), image, found.plate)
 
 
 def _without_specks(mask: np.ndarray) -> np.ndarray:
-    """A mask without its smallest parts."""
+    """Return a mask without its smallest parts."""
     _, parts, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     large = stats[:, cv2.CC_STAT_AREA] >= SPECK_SHARE * mask.sum()
     large[0] = False
@@ -47,12 +49,13 @@ def _without_specks(mask: np.ndarray) -> np.ndarray:
 
 
 def _grab_cut(picture: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Labels after GrabCut, which sees a tight window: its model of the background is of what surrounds the person."""
-    window = window_around(labels != cv2.GC_BGD)
+    """Return labels after GrabCut on a tight window, so that its background model describes what surrounds the
+    person."""
+    window = bounding_window(labels != cv2.GC_BGD)
     inside = np.ascontiguousarray(labels[window])
     if not np.isin(inside, (cv2.GC_BGD, cv2.GC_PR_BGD)).any() or not np.isin(inside, (cv2.GC_FGD, cv2.GC_PR_FGD)).any():
         return labels
-    cv2.setRNGSeed(0)  # its colour models start from k-means
+    cv2.setRNGSeed(0)  # for k-means, by which its colour models start
     background, person = np.zeros((1, 65)), np.zeros((1, 65))
     pixels = np.ascontiguousarray(picture[window])
     cv2.grabCut(pixels, inside, (0, 0, 0, 0), background, person, 1, cv2.GC_INIT_WITH_MASK)
@@ -62,7 +65,7 @@ def _grab_cut(picture: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def components_within(mask: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """The connected parts of a mask that lie at least half within reach: the subject, not other people."""
+    """Return the connected parts of a mask that lie at least half within reach: the subject, not other people."""
     count, parts = cv2.connectedComponents(mask.astype(np.uint8))
     area = np.bincount(parts.ravel(), minlength=count)
     inside = np.bincount(parts[reach], minlength=count)

@@ -8,106 +8,112 @@ import numpy as np
 from hnerf.config import SegmentationSettings
 from hnerf.segmentation.prior import Prior
 
-DARK = 6.0  # grey levels added before the logarithm: below it sensors and JPEG tell little
+LOG_OFFSET = 6.0  # grey levels added before the logarithm: below them sensors and JPEG carry little information
 RATIO_NOISE = 0.01  # of log ratios, beyond the pixel's own noise: JPEG, rounding of the plate
-SHADOW_TINT = 0.02  # change of log chroma per log brightness: gamma and stray light tint deep shadows a little
-SHADOW_SHARE = 0.1  # of the background near a person, before looking
-EDGE_OF_SHADOW = 0.1  # log brightness over which a shadow beyond the darkest becomes impossible
-PERSON_BRIGHTNESS, PERSON_CHROMA = 0.6, 0.25  # spread of a person's log ratio to what is behind
+SHADOW_TINT = 0.02  # log chroma per log brightness: gamma and stray light tint deep shadows a little
+SHADOW_SHARE = 0.1  # prior share of the background near a person
+EDGE_OF_SHADOW = 0.1  # log brightness over which the density of shadows darker than the darkest falls off
+PERSON_BRIGHTNESS, PERSON_CHROMA = 0.6, 0.25  # std of a person's log ratio to the background
 NOISE_FACTOR = 0.8  # the robust estimate of noise counts JPEG's blocks twice
 ROUNDING = 0.5  # grey levels
-MOST, ENOUGH = 0.5, 0.02  # of an image, to tell noise and exposure by
-EACH = 15  # pixel is enough for a median
-ALIKE = 0.02  # of exposures: noise and JPEG feign as much
-APART_GAIN, APART_FLOOR = 16.0, 16.0  # of the picture of differences, which cameras' square-root noise makes even
-PAINT_PX = 3  # from which a pixel never seen takes its colour
-HIDDEN = 256  # sorts behind every grey level
+MOSTLY_FREE, MIN_FREE = 0.5, 0.02  # shares of an image, for noise and exposure
+PIXEL_STRIDE = 15  # every 15th pixel is enough for a median
+MIN_GAIN = 0.02  # difference of exposures from one; noise and JPEG look like as much
+CONTRAST_GAIN, CONTRAST_FLOOR = 16.0, 16.0  # of the contrast image, which evens out cameras' square-root noise
+INPAINT_RADIUS_PX = 3  # of pixels that are never seen
+HIDDEN_LEVEL = 256  # sorts after every grey level
 
 
 @dataclass(frozen=True)
 class Difference:
-    """odds: (H, W) float32, logarithm of the odds of person against background, shadows included. apart: (H, W, 3)
-    uint8, the difference as a picture, grey where nothing changed. plate: (H, W, 3) uint8 RGB, as compared to."""
+    """The comparison of an image with a plate. log_odds: (H, W) float32, of person against background, shadows
+    included; contrast: (H, W, 3) uint8, the difference as an image, grey where nothing changed; plate: (H, W, 3) uint8
+    RGB, as compared."""
 
-    odds: np.ndarray
-    apart: np.ndarray
+    log_odds: np.ndarray
+    contrast: np.ndarray
     plate: np.ndarray
 
 
-def surroundings(prior: Prior, known: np.ndarray) -> np.ndarray:
-    """(H, W) bool: where background is seen and `known`, as far from the person as there is enough of it."""
+def visible_background(prior: Prior, known: np.ndarray) -> np.ndarray:
+    """Return where background is visible and `known`, (H, W) bool: as far from the person as enough of it remains."""
     for free in (~prior.reach & known, ~prior.near & known):
-        if free.mean() > ENOUGH:
+        if free.mean() > MIN_FREE:
             return free
     return ~prior.body & known
 
 
 def exposure_corrected(plate: np.ndarray, image: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """The plate as bright and as tinted as the image is where it shows background, `free` (H, W): cameras that expose
-    by themselves do so anew when a person comes in. As it is where they are alike."""
+    """Return the plate with the brightness and tint that the image has on visible background, `free` (H, W).
+
+    Automatic exposure changes when a person comes in. The plate is returned unchanged where the gains are near one.
+    """
     if not free.any():
         return plate
-    gains = np.median((image[free][::EACH] + DARK) / (plate[free][::EACH] + DARK), 0)
-    if np.abs(gains - 1).max() < ALIKE:
+    gains = np.median((image[free][::PIXEL_STRIDE] + LOG_OFFSET) / (plate[free][::PIXEL_STRIDE] + LOG_OFFSET), 0)
+    if np.abs(gains - 1).max() < MIN_GAIN:
         return plate
-    return ((plate + DARK) * gains - DARK).round().clip(0, 255).astype(np.uint8)
+    return ((plate + LOG_OFFSET) * gains - LOG_OFFSET).round().clip(0, 255).astype(np.uint8)
 
 
 def noise_level(image: np.ndarray, plate: np.ndarray, free: np.ndarray) -> float:
-    """Standard deviation of their difference where both show background, `free` (H, W); grey levels. In all of a
-    picture most of which is free: what shadows change is then in the noise, and not taken for the person."""
-    free = np.ones_like(free) if free.mean() > MOST else free
-    apart = image[free][::EACH].astype(np.float32) - plate[free][::EACH]
-    return (1.4826 * float(np.median(np.abs(apart))) if len(apart) else 0.0) + ROUNDING
+    """Return the standard deviation, in grey levels, of image minus plate where both show background, `free` (H, W).
+
+    All of the image is used if most of it is free: then what shadows change counts as noise, and not as the person.
+    """
+    free = np.ones_like(free) if free.mean() > MOSTLY_FREE else free
+    contrast = image[free][::PIXEL_STRIDE].astype(np.float32) - plate[free][::PIXEL_STRIDE]
+    return (1.4826 * float(np.median(np.abs(contrast))) if len(contrast) else 0.0) + ROUNDING
 
 
 def difference(
     image: np.ndarray, plate: np.ndarray, noise: float, settings: SegmentationSettings, shadowed: bool = False
 ) -> Difference:
-    """Compare (H, W, 3) uint8 RGB images. `shadowed`: the plate, a median over time, may hold shadows itself.
+    """Compare images (H, W, 3) uint8 RGB. `shadowed`: the plate, a median over time, may contain shadows itself.
 
-    The logarithm of their ratio splits into brightness and chroma. Unchanged background has neither; a shadow takes
-    brightness away and leaves chroma nearly alone (Horprasert et al. 1999, in logarithms); a person may have any.
+    The logarithm of their ratio splits into brightness and chroma. Unchanged background has neither; a shadow lowers
+    the brightness and hardly changes the chroma (Horprasert et al. 1999, in logarithms); a person may have any.
     """
-    lit, unlit = image.astype(np.float32) + DARK, plate.astype(np.float32) + DARK
+    lit, unlit = image.astype(np.float32) + LOG_OFFSET, plate.astype(np.float32) + LOG_OFFSET
     ratio = np.log(lit / unlit)
     brightness = ratio.mean(-1)
     chroma = ((ratio - brightness[..., None]) ** 2).sum(-1)
     noise_variance = (NOISE_FACTOR * noise / unlit.min(-1)) ** 2 + RATIO_NOISE**2
-    unchanged = _normal(3 * brightness**2, noise_variance, 1) + _normal(chroma, noise_variance, 2)
+    unchanged = _log_gaussian(3 * brightness**2, noise_variance, 1) + _log_gaussian(chroma, noise_variance, 2)
     tint = noise_variance + settings.shadow_chroma**2 + (SHADOW_TINT * np.minimum(brightness, 0)) ** 2
     darkest = float(np.log(settings.darkest_shadow))
-    shadow = _even(brightness, darkest, -darkest if shadowed else 0.0) + _normal(chroma, tint, 2)
+    shadow = _log_uniform(brightness, darkest, -darkest if shadowed else 0.0) + _log_gaussian(chroma, tint, 2)
     background = np.logaddexp(np.log(1 - SHADOW_SHARE) + unchanged, np.log(SHADOW_SHARE) + shadow)
-    person = _normal(3 * brightness**2, 3 * PERSON_BRIGHTNESS**2, 1) + _normal(chroma, PERSON_CHROMA**2, 2)
-    apart = APART_GAIN * (image.astype(np.float32) - plate) / np.sqrt(plate + APART_FLOOR)
-    picture = (128 + apart).clip(0, 255).round().astype(np.uint8)
+    person = _log_gaussian(3 * brightness**2, 3 * PERSON_BRIGHTNESS**2, 1) + _log_gaussian(chroma, PERSON_CHROMA**2, 2)
+    contrast = CONTRAST_GAIN * (image.astype(np.float32) - plate) / np.sqrt(plate + CONTRAST_FLOOR)
+    picture = (128 + contrast).clip(0, 255).round().astype(np.uint8)
     return Difference((person - background).astype(np.float32), picture, plate)
 
 
-def _normal(squared: np.ndarray, variance: np.ndarray | float, dimensions: int) -> np.ndarray:
-    """Logarithm of the normal density at this squared distance."""
+def _log_gaussian(squared: np.ndarray, variance: np.ndarray | float, dimensions: int) -> np.ndarray:
+    """Return the logarithm of the Gaussian density at a squared distance."""
     return -0.5 * squared / variance - 0.5 * dimensions * np.log(2 * np.pi * variance)
 
 
-def _even(brightness: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Logarithm of a density of log brightness that is even from low to high, soft at both ends."""
+def _log_uniform(brightness: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Return the logarithm of a density of log brightness that is uniform from low to high, with soft ends."""
     beyond = (np.maximum(low - brightness, 0) + np.maximum(brightness - high, 0)) / EDGE_OF_SHADOW
     return -0.5 * beyond**2 - np.log(np.sqrt(3) * (high - low))
 
 
 def masked_median(images: list[np.ndarray], priors: list[Prior]) -> tuple[np.ndarray, np.ndarray]:
-    """The background of a fixed camera without a clean plate: (H, W, 3) uint8 RGB, and (H, W) bool where it is known.
+    """Return the background of a fixed camera without a clean plate, (H, W, 3) uint8 RGB, and where it is known, (H, W)
+    bool.
 
-    The median over time of each pixel in the frames in which the person is not near it; where there is no such frame,
-    painted in from around (Telea 2004).
+    It is each pixel's median over the frames in which the person is not near; where there is no such frame, it is
+    inpainted (Telea 2004).
     """
     hidden = np.stack([prior.near for prior in priors])
     seen = (~hidden).sum(0)
     plate = np.empty_like(images[0])
     for row in range(plate.shape[0]):  # row by row bounds the memory
         values = np.stack([image[row] for image in images]).astype(np.int16)
-        values[hidden[:, row]] = HIDDEN
+        values[hidden[:, row]] = HIDDEN_LEVEL
         middle = np.sort(values, axis=0)[seen[row] // 2, np.arange(plate.shape[1])]
         plate[row] = middle.clip(0, 255)
-    return cv2.inpaint(plate, (seen == 0).astype(np.uint8), PAINT_PX, cv2.INPAINT_TELEA), seen > 0
+    return cv2.inpaint(plate, (seen == 0).astype(np.uint8), INPAINT_RADIUS_PX, cv2.INPAINT_TELEA), seen > 0

@@ -1,4 +1,4 @@
-"""A segmentation network from an ONNX file of the user's own, through ONNX Runtime."""
+"""A segmentation network from a user's own ONNX file, run by ONNX Runtime."""
 
 from pathlib import Path
 
@@ -11,14 +11,15 @@ TOLERANCE = 1e-3  # a probability may be outside [0, 1] by so much
 
 
 class Network:
-    """A network with one image input and, first among its outputs, a map of the person's probability.
+    """A network with one image input and, as its first output, a map of the person's probability.
 
     The input is RGB in [0, 1], float32, (1, 3, H, W) or (1, H, W, 3) as the file says; where the file fixes H and W,
     images are resized to it. The output may have leading or trailing axes of length 1.
     """
 
     def __init__(self, path: Path) -> None:
-        """Raises InputError where the file or ONNX Runtime is missing, or where the file is no such network."""
+        """Load a network. Raises InputError where the file or ONNX Runtime is missing, or where the file is no such
+        network."""
         if not path.is_file():
             raise InputError(f"segmentation.model: {path}: no such file; name an ONNX file, or leave it out")
         try:
@@ -41,7 +42,8 @@ class Network:
         self.size_px = (width, height) if isinstance(width, int) and isinstance(height, int) else None
 
     def probability(self, image: np.ndarray) -> np.ndarray:
-        """(H, W) float32 in [0, 1] of an image (H, W, 3) uint8 RGB. Raises InputError where it is none."""
+        """Return the probability of the person, (H, W) float32 in [0, 1], in an image (H, W, 3) uint8 RGB. Raises
+        InputError where the output is not one."""
         pixels = image if self.size_px is None else cv2.resize(image, self.size_px, interpolation=cv2.INTER_AREA)
         values = pixels.astype(np.float32)[None] / 255
         if self.channels_first:

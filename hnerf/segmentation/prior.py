@@ -1,4 +1,4 @@
-"""Where in an image the subject can be, from keypoints or from a fitted body."""
+"""Priors on where in an image the subject is, from keypoints or from a fitted body."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,27 +16,27 @@ from hnerf.geometry.silhouette import silhouette
 from hnerf.geometry.triangulation import triangulate
 
 TRUNK = (2, 5, 12, 9)
-THICK = ((1, 8), (9, 10), (12, 13))  # trunk seen from the side, and thighs: twice as thick as other limbs
+THICK = ((1, 8), (9, 10), (12, 13))  # drawn twice as thick as other limbs: trunk seen from the side, and thighs
 CORE_SHARE = 0.02  # of the person's height: half the width of a limb that is surely body
 MARGIN_PX = 12  # of background around the person
-NEAR_SHARE = 0.03  # of the person's height: how wrong a body fitted to keypoints alone may lie
-SOLE_SHARE = 0.06  # of the person's height: how far a shoe may go on below the lowest keypoint
-UPRIGHT = 0.7  # cosine between the image's and the world's vertical from which down is down
+NEAR_SHARE = 0.03  # of the person's height: error of a body fitted to keypoints alone
+SOLE_SHARE = 0.06  # of the person's height: extent of a shoe below the lowest keypoint
+UPRIGHT = 0.7  # least cosine between the image's and the world's vertical in an upright image
 HEAD_SHARE = 0.45  # of the distance from neck to nose: radius of the head about a point a little above the nose
-FAR = 5  # widths or heights of the image, beyond which nothing is drawn
+FAR = 5  # in longer sides of the image, beyond which nothing is drawn
 FACE = (15, 16, 17, 18)
-SHOULDERS, HIP_WIDTH = (2, 5), 0.8  # of the shoulders', for hips that are not seen
+SHOULDERS, HIP_WIDTH = (2, 5), 0.8  # of the shoulders' width, for hips that are not seen
 LEGS = ((9, 10, 11, (22, 23, 24)), (12, 13, 14, (19, 20, 21)))  # hip, knee, ankle, foot
-NOSE_ABOVE_NECK, THIGH = 0.45, 0.8  # of the distance from neck to mid-hip, along which what is not seen is likely
-FOOT_SHARE = 0.1  # of the person's height: how far a foot that is not seen may go on around its ankle
+NOSE_ABOVE_NECK, THIGH = 0.45, 0.8  # of the distance from neck to mid-hip, to place what is not seen
+FOOT_SHARE = 0.1  # of the person's height: extent of an unseen foot around its ankle
 
 
 @dataclass(frozen=True)
 class Prior:
     """What is known of the person in one image before looking at it; height_px of the person.
 
-    (H, W) bool, each within the next: `core`, surely the person; `body`, as fitted; `near`, what a body fitted a little
-    wrong may cover; `reach`, where clothes and hair must end.
+    (H, W) bool, each within the next: `core`, surely the person; `body`, as fitted; `near`, what a slightly wrong body
+    may cover; `reach`, the farthest extent of clothes and hair.
     """
 
     core: np.ndarray
@@ -47,51 +47,52 @@ class Prior:
 
     @staticmethod
     def around(
-        core: np.ndarray, body: np.ndarray, likely: np.ndarray, height_px: float, reach: float, upright: bool = False
+        core: np.ndarray, body: np.ndarray, completed: np.ndarray, height_px: float, reach: float, upright: bool = False
     ) -> "Prior":
-        """Grown from where the body is, seen or likely, (H, W) bool; reach in heights of the person.
+        """Return the prior grown around where the body is, seen or completed, (H, W) bool; reach in heights of the
+        person.
 
-        In an upright image what hangs much below the lowest part of the body is its reflection.
+        In an upright image, whatever is far below the lowest part of the body is its reflection.
         """
-        away_px = cv2.distanceTransform(np.where(likely, 0, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+        away_px = cv2.distanceTransform(np.where(completed, 0, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
         within = away_px <= reach * height_px
-        if upright and likely.any():
-            within[int(np.flatnonzero(likely.any(1))[-1] + SOLE_SHARE * height_px) + 1 :] = False
+        if upright and completed.any():
+            within[int(np.flatnonzero(completed.any(1))[-1] + SOLE_SHARE * height_px) + 1 :] = False
         return Prior(core, body, within & (away_px <= NEAR_SHARE * height_px), within, height_px)
 
     def cropped(self, window: tuple[slice, slice]) -> "Prior":
-        """The same within a window of the image."""
+        """Return the same prior within a window of the image."""
         return Prior(self.core[window], self.body[window], self.near[window], self.reach[window], self.height_px)
 
 
 def keypoint_priors(capture: Capture, settings: SegmentationSettings) -> Iterator[tuple[str, list[Prior]]]:
-    """Stick figures, of one training camera after the other, in the order of `capture.frames`."""
-    for name, sticks in _sticks(capture):
+    """Yield each training camera with the priors of its stick figures, in the order of `capture.frames`."""
+    for name, figures in _stick_figures(capture):
         rest = settings.reach, _is_upright(capture, name)
-        yield name, [Prior.around(s.core, s.body, s.likely, s.height_px, *rest) for s in sticks]
+        yield name, [Prior.around(s.core, s.body, s.completed, s.height_px, *rest) for s in figures]
 
 
 def body_priors(capture: Capture, body: BodyFit, settings: SegmentationSettings) -> Iterator[tuple[str, list[Prior]]]:
-    """The fitted body together with the stick figure, which a poor fit may have left, of one training camera after the
-    other."""
+    """Yield each training camera with the priors of the fitted body together with the stick figure, which a poor fit
+    may miss."""
     vertices_m, faces = body.vertices_m().numpy(), body.rig.faces.numpy()
-    for name, sticks in _sticks(capture, body):
+    for name, figures in _stick_figures(capture, body):
         priors, upright = [], _is_upright(capture, name)
-        for frame, stick in zip(capture.frames, sticks, strict=True):
+        for frame, figure in zip(capture.frames, figures, strict=True):
             covered = silhouette(capture.cameras[name], vertices_m[body.index(frame)], faces)
-            core = cv2.erode(covered.astype(np.uint8), disc(CORE_SHARE * stick.height_px)).astype(bool)
-            covered |= stick.body
-            priors.append(Prior.around(core, covered, covered, stick.height_px, settings.reach / 2, upright))
+            core = cv2.erode(covered.astype(np.uint8), disc(CORE_SHARE * figure.height_px)).astype(bool)
+            covered |= figure.body
+            priors.append(Prior.around(core, covered, covered, figure.height_px, settings.reach / 2, upright))
         yield name, priors
 
 
 def _is_upright(capture: Capture, camera: str) -> bool:
-    """Whether the image's rows go down as the world does."""
+    """Return whether the image's rows run downwards in the world."""
     return bool(-capture.cameras[camera].R[1, "xyz".index(capture.up)] > UPRIGHT)
 
 
-def window_around(region: np.ndarray) -> tuple[slice, slice]:
-    """Rows and columns of the True pixels of (H, W) with a margin of background; empty if there are none."""
+def bounding_window(region: np.ndarray) -> tuple[slice, slice]:
+    """Return rows and columns of the True pixels of (H, W) with a margin of background; empty if there are none."""
     rows, columns = np.flatnonzero(region.any(1)), np.flatnonzero(region.any(0))
     if len(rows) == 0:
         return slice(0), slice(0)
@@ -102,17 +103,17 @@ def window_around(region: np.ndarray) -> tuple[slice, slice]:
 
 
 def disc(radius_px: float) -> np.ndarray:
-    """Structuring element of this radius, at least 1 px."""
+    """Return the structuring element of this radius, at least 1 px."""
     side = 2 * max(1, round(radius_px)) + 1
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
 
 
 def _consistent_keypoints(capture: Capture, body: BodyFit | None) -> dict[str, np.ndarray]:
-    """(frames, 25, 2) pixels a camera; NaN for a keypoint that is never seen.
+    """Return keypoints (frames, 25, 2) in pixels by camera; NaN for a keypoint that is never seen.
 
-    Triangulated and projected where several cameras see the person, so that a detector's outliers are gone; gaps in
-    time are interpolated; what no two cameras ever see together is left as each has it. The body's own where the
-    recording has none.
+    They are triangulated and projected where several cameras see the person, which removes a detector's outliers; gaps
+    in time are interpolated; what no two cameras ever see together is left as each has it. Where the recording has no
+    keypoints, they are the body's own.
     """
     if body is not None and not capture.has_keypoints:
         points_m = (body.rig.keypoint_weights @ body.vertices_m()).numpy()
@@ -130,14 +131,15 @@ def _consistent_keypoints(capture: Capture, body: BodyFit | None) -> dict[str, n
 
 
 def _interpolated(tracks: np.ndarray) -> np.ndarray:
-    """(frames, 25, D) with NaN gaps filled linearly in time: in the mid-hip's own place, in all others' from it."""
+    """Return tracks (frames, 25, D) with NaN gaps filled linearly in time: the mid-hip's absolute position, all others'
+    relative to it."""
     hip = _filled(tracks[:, 8:9])
     origin = hip if np.isfinite(hip).all() else np.zeros_like(hip)
     return origin + _filled(tracks - origin)
 
 
 def _filled(tracks: np.ndarray) -> np.ndarray:
-    """(frames, ...) with NaN gaps filled linearly in time."""
+    """Return tracks (frames, ...) with NaN gaps filled linearly in time."""
     filled = tracks.copy()
     at = np.arange(len(tracks))
     for track in filled.reshape(len(tracks), -1).T:
@@ -147,62 +149,65 @@ def _filled(tracks: np.ndarray) -> np.ndarray:
     return filled
 
 
-def _likely(pose_px: np.ndarray) -> np.ndarray:
-    """A pose (25, 2) with head, hips and legs where they are likely in line with each other, if they are not seen."""
-    likely = pose_px.copy()
+def _completed_pose(pose_px: np.ndarray) -> np.ndarray:
+    """Return a pose (25, 2) in which head, hips and legs that are not seen are placed where they are likely, in line
+    with the others."""
+    completed = pose_px.copy()
 
     def fill(joint: int, at_px: np.ndarray) -> None:
-        if not np.isfinite(likely[joint]).all():
-            likely[joint] = at_px
+        if not np.isfinite(completed[joint]).all():
+            completed[joint] = at_px
 
     face = [k for k in FACE if np.isfinite(pose_px[k]).all()]
     if face:
         fill(0, pose_px[face].mean(0))
-    fill(8, pose_px[1] + (pose_px[1] - likely[0]) / NOSE_ABOVE_NECK)
-    trunk_px = likely[8] - pose_px[1]
+    fill(8, pose_px[1] + (pose_px[1] - completed[0]) / NOSE_ABOVE_NECK)
+    trunk_px = completed[8] - pose_px[1]
     fill(0, pose_px[1] - NOSE_ABOVE_NECK * trunk_px)
     for shoulder, (hip, knee, ankle, _) in zip(SHOULDERS, LEGS, strict=True):
-        fill(hip, likely[8] + HIP_WIDTH * (pose_px[shoulder] - pose_px[1]))
-        fill(hip, likely[8])
-        fill(knee, likely[hip] + THIGH * trunk_px)
-        fill(ankle, 2 * likely[knee] - likely[hip])
-    return likely
+        fill(hip, completed[8] + HIP_WIDTH * (pose_px[shoulder] - pose_px[1]))
+        fill(hip, completed[8])
+        fill(knee, completed[hip] + THIGH * trunk_px)
+        fill(ankle, 2 * completed[knee] - completed[hip])
+    return completed
 
 
 @dataclass(frozen=True)
-class _Stick:
-    """A drawn stick figure, (H, W) bool: core without the feet, where shadows touch the person; body with them; likely
-    also with what no keypoint shows."""
+class _StickFigure:
+    """A drawn stick figure, (H, W) bool: core, without the feet, where shadows touch the person; body, with the feet;
+    completed, also with what no keypoint shows."""
 
     core: np.ndarray
     body: np.ndarray
-    likely: np.ndarray
+    completed: np.ndarray
     height_px: float
 
 
-def _sticks(capture: Capture, body: BodyFit | None = None) -> Iterator[tuple[str, list[_Stick]]]:
-    """Per training camera the stick figures of `capture.frames`."""
+def _stick_figures(capture: Capture, body: BodyFit | None = None) -> Iterator[tuple[str, list[_StickFigure]]]:
+    """Yield each training camera with the stick figures of `capture.frames`."""
     for name, poses_px in _consistent_keypoints(capture, body).items():
-        yield name, [_stick(capture.cameras[name], pose_px) for pose_px in poses_px]
+        yield name, [_stick_figure(capture.cameras[name], pose_px) for pose_px in poses_px]
 
 
-def _stick(camera: Camera, pose_px: np.ndarray) -> _Stick:
-    """pose_px (25, 2), NaN where nothing is known; cut off far outside the image, as drawing takes small integers."""
+def _stick_figure(camera: Camera, pose_px: np.ndarray) -> _StickFigure:
+    """Draw the stick figure of pose_px (25, 2), NaN where nothing is known; clipped far outside the image, as drawing
+    takes small integers."""
     far_px = FAR * max(camera.width_px, camera.height_px)
     pose_px = pose_px.clip(-far_px, far_px)
-    whole_px = _likely(pose_px)
+    whole_px = _completed_pose(pose_px)
     known = np.isfinite(whole_px).all(-1, keepdims=True)
     height_px = float(person_heights_px(np.concatenate([np.nan_to_num(whole_px), known], -1)))
     core, body = _drawn(camera, pose_px, height_px)
-    likely = _drawn(camera, whole_px, height_px)[1].astype(np.uint8)
+    completed = _drawn(camera, whole_px, height_px)[1].astype(np.uint8)
     for _, _, ankle, foot in LEGS:
         if known[ankle] and not np.isfinite(pose_px[list(foot)]).any():
-            cv2.circle(likely, _pixel(whole_px[ankle]), round(FOOT_SHARE * height_px), 1, cv2.FILLED)
-    return _Stick(core, body, body | likely.astype(bool), height_px)
+            cv2.circle(completed, _pixel(whole_px[ankle]), round(FOOT_SHARE * height_px), 1, cv2.FILLED)
+    return _StickFigure(core, body, body | completed.astype(bool), height_px)
 
 
 def _drawn(camera: Camera, pose_px: np.ndarray, height_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Limbs as thick lines, trunk as a polygon, head as a disc, (H, W) bool: without feet and with them."""
+    """Draw limbs as thick lines, the trunk as a polygon, the head as a disc, (H, W) bool: without feet and with
+    them."""
     seen = np.isfinite(pose_px).all(-1)
     image = np.zeros((camera.height_px, camera.width_px), np.uint8)
     width_px = max(1, round(2 * CORE_SHARE * height_px))
@@ -224,5 +229,6 @@ def _drawn(camera: Camera, pose_px: np.ndarray, height_px: float) -> tuple[np.nd
 
 
 def _pixel(at_px: np.ndarray) -> tuple[int, int]:
+    """Return the nearest pixel as integers."""
     x, y = at_px.round().astype(int).tolist()
     return x, y

@@ -14,17 +14,17 @@ from hnerf.errors import InputError
 from hnerf.segmentation.backends import choose_backend
 from hnerf.segmentation.learned import Network
 from hnerf.segmentation.prior import Prior, body_priors, keypoint_priors
-from hnerf.segmentation.verdicts import MaskVerdict, judge, jumps
+from hnerf.segmentation.verdicts import MaskVerdict, area_jumps, judge_mask
 
 log = logging.getLogger("hnerf.segmentation")
 
 
 def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettings) -> Masks:
-    """Masks for all training cameras and `capture.frames`.
+    """Return masks for all training cameras and `capture.frames`.
 
-    A camera with given masks keeps them; the user's network comes next, then a clean plate; else `body` is needed, to
-    find the background from pixels that it does not reach. Only the subject is kept where there are several people.
-    A mask that cannot be right is left out and named in the report; a camera with no other raises InputError.
+    A camera with given masks keeps them; the user's network comes next, then a clean plate; otherwise `body` is needed,
+    to find the background in pixels that it does not reach. Only the subject is kept where there are several people. A
+    mask that cannot be right is dropped and named in the report. Raises InputError if no mask of a camera is left.
     """
     priors = keypoint_priors(capture, settings) if body is None else body_priors(capture, body, settings)
     network = None if settings.model is None else Network(settings.model)
@@ -36,7 +36,7 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
         verdicts = []
         for frame, prior in zip(capture.frames, own, strict=True):
             mask = backend.mask(frame, prior)
-            verdicts.append(judge(mask, prior))
+            verdicts.append(judge_mask(mask, prior))
             encoded[name, frame] = encode(mask)
         cameras[name] = {"backend": backend.name} | _findings(capture, name, verdicts, own)
         for row in cameras[name]["dropped"]:
@@ -45,8 +45,8 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
 
 
 def _findings(capture: Capture, camera: str, verdicts: list[MaskVerdict], priors: list[Prior]) -> dict[str, Any]:
-    """Plain values: the median area, and the frames dropped or noted, each with its reason."""
-    sudden = jumps(capture.frames, verdicts, [int(prior.body.sum()) for prior in priors])
+    """Return plain values: the median area, and the frames dropped or noted, each with its reason."""
+    sudden = area_jumps(capture.frames, verdicts, [int(prior.body.sum()) for prior in priors])
     judged = {
         frame: dataclasses.replace(verdict, fault=verdict.fault or sudden.get(frame))
         for frame, verdict in zip(capture.frames, verdicts, strict=True)

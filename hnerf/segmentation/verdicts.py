@@ -1,62 +1,63 @@
-"""Which masks can be trusted: each is held against the prior and against its neighbours in time."""
+"""Checks of masks against the prior and against their neighbours in time."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from hnerf.capture.timing import usual_step
+from hnerf.capture.timing import median_step
 from hnerf.segmentation.prior import Prior
 
-LEAST_AREA = 0.1  # of the prior's core: less is no person
-LEAST_COVERED = 0.5  # of the core
-LEAST_WITHIN = 0.5  # of the mask, of where the person can be
-JUMP = 1.3  # ratio of areas between neighbours in time
-NEIGHBOURS = 4  # nearest frames, at most so many usual steps away, whose median area a mask is held against
+MIN_AREA = 0.1  # of the prior's core; less is no person
+MIN_COVERED = 0.5  # of the core
+MIN_WITHIN = 0.5  # of the mask, within where the person can be
+MAX_AREA_RATIO = 1.3  # ratio of areas between neighbours in time
+NEIGHBOURS = 4  # nearest frames, at most so many median steps away, with whose median area a mask is compared
 
 
 @dataclass(frozen=True)
 class MaskVerdict:
-    """fault: why the mask is dropped, or None; note: what is remarkable about it, or None; area_px."""
+    """The result of checking one mask. fault: why the mask is dropped, or None; note: what is remarkable about it, or
+    None; area_px."""
 
     fault: str | None
     note: str | None
     area_px: int
 
 
-def judge(mask: np.ndarray, prior: Prior) -> MaskVerdict:
-    """One mask (H, W) bool by itself."""
+def judge_mask(mask: np.ndarray, prior: Prior) -> MaskVerdict:
+    """Check one mask (H, W) bool by itself."""
     area_px, expected_px = int(mask.sum()), int(prior.core.sum())
     sides = [edge.any() for edge in (mask[0], mask[-1], mask[:, 0], mask[:, -1])]
     fault = None
-    if area_px == 0 or area_px < LEAST_AREA * expected_px:
+    if area_px == 0 or area_px < MIN_AREA * expected_px:
         fault = "no person in the mask"
-    elif all(sides) and mask.mean() > 0.5 and (expected_px == 0 or mask[prior.core].mean() < LEAST_COVERED):
+    elif all(sides) and mask.mean() > 0.5 and (expected_px == 0 or mask[prior.core].mean() < MIN_COVERED):
         fault = "the mask is inverted (255 must be on the person)"
-    elif expected_px and mask[prior.core].mean() < LEAST_COVERED:
+    elif expected_px and mask[prior.core].mean() < MIN_COVERED:
         fault = "the mask misses the person"
-    elif prior.reach.any() and mask[prior.reach].sum() < LEAST_WITHIN * area_px:
+    elif prior.reach.any() and mask[prior.reach].sum() < MIN_WITHIN * area_px:
         fault = "the mask is mostly not the person"
     named = [side for side, cut in zip(("top", "bottom", "left", "right"), sides, strict=True) if cut]
     return MaskVerdict(fault, f"cut off by the image's border ({', '.join(named)})" if named else None, area_px)
 
 
-def jumps(frames: tuple[int, ...], verdicts: list[MaskVerdict], expected_px: list[int]) -> dict[int, str]:
-    """Sudden changes of area that the prior does not explain, by frame.
+def area_jumps(frames: tuple[int, ...], verdicts: list[MaskVerdict], expected_px: list[int]) -> dict[int, str]:
+    """Return sudden changes of area that the prior does not explain, by frame.
 
-    A mask's area is held against the median of its neighbours in time, and so is its ratio to what the prior covers
-    (`expected_px`, a frame): someone who turns changes the first, a mask that tears or leaks changes both.
+    A mask's area is compared with the median of its neighbours in time, and so is its ratio to what the prior covers
+    (`expected_px`, one a frame): a person who turns changes the first, a mask with a hole or a leak changes both.
     """
     found = {}
     area_px = np.array([v.area_px for v in verdicts], float)
     ratio = area_px / np.maximum(expected_px, 1)
     usable = np.array([v.fault is None for v in verdicts])
-    reach = NEIGHBOURS * usual_step(frames)
+    reach = NEIGHBOURS * median_step(frames)
     for i, frame in enumerate(frames):
         others = [j for j in range(len(frames)) if j != i and usable[j] and abs(frames[j] - frame) <= reach]
         near = sorted(others, key=lambda j: abs(frames[j] - frame))[:NEIGHBOURS]
         if not usable[i] or len(near) < NEIGHBOURS:
             continue
         changes = [max(x[i], 1) / np.median(x[near]).clip(1e-9) for x in (area_px, ratio * 1e3)]
-        if all(max(c, 1 / c) > JUMP for c in changes):
+        if all(max(c, 1 / c) > MAX_AREA_RATIO for c in changes):
             found[frame] = f"area jumps from {np.median(area_px[near]):.0f} to {area_px[i]:.0f} px"
     return found

@@ -1,5 +1,5 @@
-"""A synthetic performer: a clothed person walks in a room before calibrated cameras; with exact ground truth."""
+"""A synthetic capture with exact ground truth: a clothed person walks in a room before calibrated cameras."""
 
-from hnerf.synthetic.write import write_performer
+from hnerf.synthetic.write import write_synthetic_capture
 
-__all__ = ["write_performer"]
+__all__ = ["write_synthetic_capture"]

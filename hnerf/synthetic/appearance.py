@@ -1,4 +1,4 @@
-"""Colours: what the clothes, the face and the room look like."""
+"""Colours of the clothes, the face and the room."""
 
 import numpy as np
 
@@ -10,15 +10,15 @@ FACE = (15, 16, 0)  # BODY_25: right eye, left eye, nose
 
 
 def person_colour(face_m: np.ndarray, rest_m: np.ndarray, depths_m: np.ndarray) -> np.ndarray:
-    """Albedo (N, 3) at points of the naked rest body (N, 3), given how deep each lies in each garment (N, 5).
+    """Return albedo (N, 3) at points of the naked rest body (N, 3), given how deep each lies in each garment (N, 5).
 
     face_m (3, 3): the rest body's keypoints FACE.
     """
-    worn = depths_m.argmax(1)
+    garment_index = depths_m.argmax(1)
     painters = {"shirt": _shirt, "trousers": _trousers, "shoes": _shoes, "hair": _hair}
     colour = np.empty_like(rest_m)
     for index, garment in enumerate(GARMENTS):
-        here = worn == index
+        here = garment_index == index
         if garment == "skin":
             colour[here] = _skin(face_m, rest_m[here])
         else:
@@ -27,6 +27,7 @@ def person_colour(face_m: np.ndarray, rest_m: np.ndarray, depths_m: np.ndarray) 
 
 
 def _skin(face_m: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Return the colours of skin, lips, eyes and brows."""
     right_eye, left_eye, nose = face_m
     blotches = 1 + 0.03 * np.sin(31 * p[:, 0] + 17 * p[:, 1] + 23 * p[:, 2])
     colour = blotches[:, None] * [0.80, 0.60, 0.49]
@@ -41,7 +42,7 @@ def _skin(face_m: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def _shirt(p: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
-    """A check of three colours, a lighter hem, a round emblem on the chest and a number's bar on the back."""
+    """Paint a check of three colours, a lighter hem, a round emblem on the chest and a bar on the back."""
     x, y, z = p.T
     colour = np.tile([0.16, 0.46, 0.52], (len(p), 1))
     colour[(np.mod(z, 0.11) < 0.035) | (np.mod(x + 0.0175, 0.11) < 0.035)] = (0.93, 0.87, 0.70)
@@ -55,7 +56,7 @@ def _shirt(p: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
 
 
 def _trousers(p: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
-    """Denim, faded at the thighs, with a seam along the outside and a patch on one knee."""
+    """Paint denim, faded at the thighs, with a seam along the outside and a patch on one knee."""
     x, y, z = p.T
     fade = np.exp(-(((z + 0.10) / 0.16) ** 2)) * (y < 0)
     weave = 0.04 * np.sin(47 * x + 3 * np.sin(41 * z)) * np.sin(53 * z + 29 * y)
@@ -68,24 +69,26 @@ def _trousers(p: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
 
 
 def _shoes(p: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
+    """Paint shoes with light soles."""
     colour = np.tile([0.70, 0.16, 0.14], (len(p), 1))
     colour[depth_m > 0.085] = (0.92, 0.91, 0.88)  # soles
     return colour
 
 
 def _hair(p: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
+    """Paint strands of hair."""
     strands = 0.5 + 0.5 * np.sin(95 * np.arctan2(p[:, 0], -p[:, 1] - 0.05) + 6 * np.sin(40 * p[:, 2]))
     return np.array([0.20, 0.12, 0.07]) + strands[:, None] * [0.20, 0.13, 0.07]
 
 
 def _ellipse(p: np.ndarray, centre: np.ndarray, radii_m: tuple[float, float]) -> np.ndarray:
-    """Whether points of the face lie in an upright ellipse seen from the front."""
+    """Return whether points of the face lie in an upright ellipse seen from the front."""
     across, up = (p[:, 0] - centre[0]) / radii_m[0], (p[:, 2] - centre[2]) / radii_m[1]
     return (across**2 + up**2 < 1) & (np.abs(p[:, 1] - centre[1]) < 0.05)
 
 
 def room_colour(origin_m: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What rays (N, 3) from inside the room see: lit colours (N, 3), and hit points (N, 3)."""
+    """Return what rays (N, 3) from inside the room see: lit colours (N, 3), and hit points (N, 3)."""
     low = np.array([-ROOM_HALF_SIDE_M, -ROOM_HALF_SIDE_M, 0.0])
     high = np.array([ROOM_HALF_SIDE_M, ROOM_HALF_SIDE_M, ROOM_HEIGHT_M])
     with np.errstate(divide="ignore"):
@@ -99,7 +102,7 @@ def room_colour(origin_m: np.ndarray, directions: np.ndarray) -> tuple[np.ndarra
 
 
 def _floor_or_ceiling(hit: np.ndarray) -> np.ndarray:
-    """Planks of two browns with dark joints; a white ceiling."""
+    """Paint planks of two browns with dark joints, and a white ceiling."""
     x, y, z = hit.T
     plank = np.floor(y / 0.18)
     shade = np.mod(np.sin(plank * 12.9898 + np.floor(x / 1.4 + 0.37 * plank) * 78.233) * 43758.5453, 1)
@@ -109,7 +112,7 @@ def _floor_or_ceiling(hit: np.ndarray) -> np.ndarray:
 
 
 def _wall(hit: np.ndarray, axis: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Four walls of their own tint, a darker wainscot, a rail, wide stripes and one framed picture each."""
+    """Paint four walls, each with its own tint, a darker wainscot, a rail, wide stripes and one framed picture."""
     across, z = np.where(axis == 0, hit[:, 1], hit[:, 0]), hit[:, 2]
     facing = np.take_along_axis(directions, np.minimum(axis, 1)[:, None], 1)[:, 0] > 0
     tints = np.array([[0.74, 0.70, 0.60], [0.62, 0.70, 0.66], [0.72, 0.64, 0.62], [0.62, 0.66, 0.74]])

@@ -1,18 +1,18 @@
-"""Keypoints as a detector would find them: noisy, unsure where the body hides them, now and then wrong."""
+"""Simulated keypoint detections: noisy, unsure where the body hides them, and sometimes wrong."""
 
 import numpy as np
 
 from hnerf.geometry.camera import Camera
-from hnerf.synthetic.render import Caster
+from hnerf.synthetic.render import RayCaster
 
 NOISE_OF_WIDTH = 1.5 / 256  # 1.5 px in an image of 256: a detector's error scales with the person
 HIDDEN_NOISE = 3.0  # times as much where the body itself hides a keypoint
-HIDDEN_BEHIND_M = 0.20  # further behind the surface than a visible joint lies under skin and cloth
+HIDDEN_BEHIND_M = 0.20  # behind the surface; visible joints lie less deep under skin and cloth
 OUTLIERS, OUTLIER_OF_WIDTH = 0.02, 0.16
 
 
-def detect(keypoints_m: np.ndarray, camera: Camera, caster: Caster, rng: np.random.Generator) -> np.ndarray:
-    """(25, 3) x_px, y_px, confidence of world keypoints (25, 3); zero where the image does not reach."""
+def detect(keypoints_m: np.ndarray, camera: Camera, caster: RayCaster, rng: np.random.Generator) -> np.ndarray:
+    """Return detections (25, 3) x_px, y_px, confidence of world keypoints (25, 3); zero for those outside the image."""
     exact_px, _ = camera.project(keypoints_m)
     towards = keypoints_m - camera.centre_m
     distance_m = np.linalg.norm(towards, axis=1)

@@ -1,7 +1,7 @@
 """A body in a loose shirt, trousers, shoes and hair, all as one closed surface that the body model cannot express.
 
 Clothes are grown from the rest body: their vertices are smoothed (which bridges armpits and creases), pushed out along
-smoothed normals, folded, and follow smoothed skin weights, so that cloth does not move like skin.
+smoothed normals, folded, and given smoothed skin weights, so that cloth does not move like skin.
 """
 
 from dataclasses import dataclass
@@ -22,17 +22,18 @@ WAIST_ABOVE_HIPS_M = 0.12
 
 
 @dataclass(frozen=True)
-class Dressed:
-    """rest_m (V, 3): the naked refined rest body, on which colours are painted. worn_m (V, 3): smoothed under cloth.
+class DressedBody:
+    """A clothed rest body. rest_m (V, 3): the naked refined rest body, on which colours are painted. clothed_m (V, 3):
+    smoothed under cloth.
 
-    faces (F, 3); edges (E, 2): body vertices whose middles were added; weights (V, J): dense skin weights.
-    depths_m (V, 5): metres inside each garment's outline in the order of GARMENTS, negative outside; skin is 0, so that
-    the deepest garment is the one worn. outward (V, 3): smoothed normals. fold_phases (8,): where the folds lie.
+    faces (F, 3); edges (E, 2): body vertices whose midpoints were added; weights (V, J): dense skin weights. depths_m
+    (V, 5): metres inside each garment's outline in the order of GARMENTS, negative outside; skin is 0, so that the
+    deepest garment is the visible one. outward (V, 3): smoothed normals. fold_phases (8,): where the folds lie.
     """
 
     rig: Rig
     rest_m: np.ndarray
-    worn_m: np.ndarray
+    clothed_m: np.ndarray
     faces: np.ndarray
     edges: np.ndarray
     weights: np.ndarray
@@ -41,7 +42,7 @@ class Dressed:
     fold_phases: np.ndarray
 
     @staticmethod
-    def on(rig: Rig, rng: np.random.Generator) -> "Dressed":
+    def dress(rig: Rig, rng: np.random.Generator) -> "DressedBody":
         """Dress a rest body; `rng` chooses where the folds lie."""
         body_m, body_faces = rig.vertices_m.double().numpy(), rig.faces.numpy()
         weights = rig.dense_weights.double().numpy()
@@ -54,14 +55,14 @@ class Dressed:
         for _ in range(SMOOTHING_STEPS // 3):
             outward = average @ outward
         outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
-        # Smoothing shrinks limbs, but cloth lies outside the skin; not so shoes, which would get toes.
+        # Smoothing shrinks limbs, but cloth lies outside the skin. Shoes stay smoothed, or they would have toes.
         inward_m = np.minimum(np.einsum("va,va->v", smooth_m - body_m, outward), 0) * (depths_m[:, 3] < 0)
         smooth_m = smooth_m - inward_m[:, None] * outward
         edges, faces = _split_edges(body_faces, len(body_m))
-        return Dressed(
+        return DressedBody(
             rig=rig,
             rest_m=midpoints(body_m, edges),
-            worn_m=midpoints(body_m + loose * (smooth_m - body_m), edges),
+            clothed_m=midpoints(body_m + loose * (smooth_m - body_m), edges),
             faces=faces,
             edges=edges,
             weights=midpoints(weights + loose * (smooth_weights - weights), edges),
@@ -71,16 +72,17 @@ class Dressed:
         )
 
     def posed_m(self, theta: Tensor, root: Tensor, gait_phase: float) -> np.ndarray:
-        """(V, 3) world vertices. theta (J, 3), root (4, 4); the gait's phase in radians moves the folds and the hem."""
+        """Return world vertices (V, 3). theta (J, 3), root (4, 4); the gait's phase in radians moves the folds and the
+        hem."""
         transforms = (
             skinning_transforms(joint_transforms(self.rig, theta, root), self.rig.joints_m)[:, :3].double().numpy()
         )
         blended = np.einsum("vj,jab->vab", self.weights, transforms, optimize=True)
-        worn_m = self.worn_m + self._cloth_offset_m(gait_phase)
-        return np.einsum("vab,vb->va", blended[:, :, :3], worn_m) + blended[:, :, 3]
+        clothed_m = self.clothed_m + self._cloth_offset_m(gait_phase)
+        return np.einsum("vab,vb->va", blended[:, :, :3], clothed_m) + blended[:, :, 3]
 
     def _cloth_offset_m(self, gait_phase: float) -> np.ndarray:
-        """(V, 3) from the smoothed body to the cloth, in the rest pose."""
+        """Return the offset (V, 3) from the smoothed body to the cloth, in the rest pose."""
         shirt, trousers, shoes, hair = (self.depths_m[:, i] for i in range(1, 5))
         x, y, z = (self.rest_m - _joint(self.rig, "upperleg01.L") * [0, 1, 1]).T
         p = self.fold_phases
@@ -104,12 +106,14 @@ class Dressed:
 
 
 def midpoints(per_vertex: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Values at body vertices (V, ...) to values at the refined vertices: those, then the middles of edges (E, 2)."""
+    """Return values at the refined vertices from values at body vertices (V, ...): those, then the means of edges (E,
+    2)."""
     return np.concatenate([per_vertex, per_vertex[edges].mean(1)])
 
 
 def _garment_depths(rig: Rig, rest_m: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(V, 5) metres inside each garment's outline; see Dressed. The rest pose is anny's: upright, arms a little out."""
+    """Return metres inside each garment's outline, (V, 5); see DressedBody. The rest pose is anny's: upright, arms a
+    little out."""
     hips, neck, head = (_joint(rig, name) for name in ("upperleg01.L", "neck01", "head"))
     ankle_z = _joint(rig, "foot.L")[2]
     x, y, z = rest_m.T
@@ -132,21 +136,23 @@ ARM_PARTS = ("upperarm", "lowerarm", "wrist", "finger", "metacarpal")
 
 
 def _joint(rig: Rig, name: str) -> np.ndarray:
+    """Return the rest position of a joint."""
     return rig.joints_m[rig.joint_names.index(name)].double().numpy()
 
 
 def _smoothstep(x: np.ndarray) -> np.ndarray:
+    """Return the smooth step from 0 at 0 to 1 at 1."""
     x = np.clip(x, 0, 1)
     return x * x * (3 - 2 * x)
 
 
 def _edge(depth_m: np.ndarray) -> np.ndarray:
-    """0 outside a garment, 1 from 12 mm inside its edge on: cloth ends in a ledge."""
+    """Return 0 outside a garment and 1 from 12 mm inside its edge on: cloth ends in a ledge."""
     return _smoothstep(depth_m / 0.012)
 
 
 def _averaging(faces: np.ndarray, count: int) -> sparse.csr_array:
-    """(V, V) mean of a vertex and its neighbours."""
+    """Return the matrix (V, V) that takes the mean of a vertex and its neighbours."""
     rows = np.concatenate([faces[:, [0, 1, 2]].ravel(), np.arange(count)])
     columns = np.concatenate([faces[:, [1, 2, 0]].ravel(), np.arange(count)])
     adjacency = sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
@@ -154,7 +160,8 @@ def _averaging(faces: np.ndarray, count: int) -> sparse.csr_array:
 
 
 def _split_edges(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Edges (E, 2) and the faces (4F, 3) that result from a new vertex, count + e, in the middle of each edge e."""
+    """Return edges (E, 2) and the faces (4F, 3) that result from a new vertex, count + e, in the middle of each edge
+    e."""
     directed = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2)
     edges, which = np.unique(directed, axis=0, return_inverse=True)
     (a, b, c), (ab, bc, ca) = faces.T, count + which.reshape(-1, 3).T

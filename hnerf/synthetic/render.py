@@ -10,19 +10,19 @@ import warp as wp
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from hnerf.geometry.camera import Camera
-from hnerf.geometry.rays import RayHits, cast, vectors
+from hnerf.geometry.rays import RayHits, cast, to_vec3_array
 from hnerf.synthetic.appearance import person_colour, room_colour
 
 wp.config.log_level = wp.LOG_ERROR
 
-SUPERSAMPLES = 3  # a side; odd, so that one ray goes through the pixel's centre
+SUPERSAMPLES = 3  # per side; odd, so that one ray goes through the pixel's centre
 KEY_DIRECTION = np.array([0.5, -0.6, 0.75])  # to the brightest part of the dome
 LIGHTS, BRIGHTNESS = 20, 1.25
 SHADOW_HALF_SIDE_M, SHADOW_CELLS = 1.6, 80
 
 
 @wp.kernel
-def _lit(
+def _visibility_kernel(
     mesh: wp.uint64,
     points: wp.array(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
@@ -33,32 +33,36 @@ def _lit(
         visible[i, k] = 1.0
 
 
-class Caster:
-    """A mesh that rays can be cast at, on the CPU."""
+class RayCaster:
+    """Ray casting against a mesh on the CPU."""
 
     def __init__(self, vertices_m: np.ndarray, faces: np.ndarray) -> None:
         corners = wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
-        self.mesh = wp.Mesh(vectors(vertices_m, "cpu"), corners)
+        self.mesh = wp.Mesh(to_vec3_array(vertices_m, "cpu"), corners)
 
     def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> RayHits:
-        """First hits of rays from one origin (3,) along unit directions (N, 3)."""
+        """Return the first hits of rays from one origin (3,) along unit directions (N, 3)."""
         return cast(self.mesh, origin_m, directions)
 
     def visibility(self, points_m: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(N, K): 1 where a point (N, 3) sees infinity along a direction (K, 3), else 0."""
+        """Return 1 where a point (N, 3) sees infinity along a direction (K, 3), else 0: (N, K)."""
         visible = wp.zeros((len(points_m), len(directions)), dtype=wp.float32, device="cpu")
-        inputs = [self.mesh.id, vectors(points_m, "cpu"), vectors(directions, "cpu"), visible]
-        wp.launch(_lit, visible.shape, inputs, device="cpu")
+        inputs = [self.mesh.id, to_vec3_array(points_m, "cpu"), to_vec3_array(directions, "cpu"), visible]
+        wp.launch(_visibility_kernel, visible.shape, inputs, device="cpu")
         return visible.numpy()
 
 
 def dome_lights() -> tuple[np.ndarray, np.ndarray]:
-    """Directions (K, 3) spread over the dome (a Fibonacci spiral) and their strength (K,), brightest near the key.
+    """Return directions (K, 3) spread over the dome (a Fibonacci spiral) and their strength (K,), brightest near
+    KEY_DIRECTION.
 
-    Scaled so that an unshadowed upward surface has irradiance BRIGHTNESS.
+    They are scaled so that an unshadowed upward surface has irradiance BRIGHTNESS.
     """
     k = np.arange(LIGHTS) + 0.5
-    up, around = 1 - 1.25 * k / LIGHTS, np.pi * (1 + np.sqrt(5)) * k  # a little light comes from below, off the floor
+    up, around = (
+        1 - 1.25 * k / LIGHTS,
+        np.pi * (1 + np.sqrt(5)) * k,
+    )  # a little light comes from below, reflected by the floor
     flat = np.sqrt(1 - up**2)
     directions = np.stack([flat * np.cos(around), flat * np.sin(around), up], -1)
     key = np.clip(directions @ KEY_DIRECTION / np.linalg.norm(KEY_DIRECTION), 0, 1)
@@ -67,13 +71,13 @@ def dome_lights() -> tuple[np.ndarray, np.ndarray]:
 
 
 def irradiance(normals: np.ndarray, visible: np.ndarray, lights: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """(N,) sum over lights of strength x cosine x visibility (N, K), for normals (N, 3)."""
+    """Return the sum over lights of strength x cosine x visibility (N, K), for normals (N, 3): (N,)."""
     directions, strength = lights
     return (np.clip(normals @ directions.T, 0, None) * visible) @ strength
 
 
-class Lit(Protocol):
-    """What `render_person` draws: something that rays are cast at, and its colours in [0, 1] at those that hit."""
+class Renderable(Protocol):
+    """A surface for `render_person`: rays can be cast at it, and it has colours in [0, 1] at the hits."""
 
     @property
     def vertices_m(self) -> np.ndarray: ...
@@ -84,27 +88,29 @@ class Lit(Protocol):
 
 
 @dataclass(frozen=True)
-class Painted:
-    """A posed, lit person. looks (V, 9): what `person_colour` needs (3 rest_m, 5 depths_m), and the arriving light."""
+class ShadedPerson:
+    """A posed, lit person. vertex_attributes (V, 9): what `person_colour` needs (3 rest_m, 5 depths_m), and the
+    arriving light."""
 
     vertices_m: np.ndarray
     faces: np.ndarray
-    caster: Caster
-    looks: np.ndarray
+    caster: RayCaster
+    vertex_attributes: np.ndarray
     face_m: np.ndarray
 
     def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> RayHits:
-        """First hits of rays from one origin (3,) along unit directions (N, 3)."""
+        """Return the first hits of rays from one origin (3,) along unit directions (N, 3)."""
         return self.caster.cast(origin_m, directions)
 
     def colours(self, hits: RayHits) -> np.ndarray:
-        """Lit colours in [0, 1] of those rays that hit, (M, 3)."""
-        values = hits.interpolate(self.looks, self.faces)
+        """Return lit colours in [0, 1] of those rays that hit, (M, 3)."""
+        values = hits.interpolate(self.vertex_attributes, self.faces)
         return (person_colour(self.face_m, values[:, :3], values[:, 3:-1]) * values[:, -1:]).clip(0, 1)
 
 
-def render_person(person: Lit, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Over black, edge pixels weighted by coverage, (H, W, 3); coverage (H, W); whether the centre ray hits (H, W)."""
+def render_person(person: Renderable, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Render a person over black, edge pixels weighted by coverage, (H, W, 3), with coverage (H, W), and whether the
+    centre ray hits, (H, W) bool."""
     rgb = np.zeros((camera.height_px, camera.width_px, 3))
     coverage, mask = np.zeros(rgb.shape[:2]), np.zeros(rgb.shape[:2], bool)
     seen_px, _ = camera.project(person.vertices_m)
@@ -123,8 +129,8 @@ def render_person(person: Lit, camera: Camera) -> tuple[np.ndarray, np.ndarray, 
     return rgb, coverage, mask
 
 
-def floor_shadow(caster: Caster, centre_m: np.ndarray, lights: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Share of the floor's light that arrives around a point, on a grid (cells, cells) over x and y."""
+def floor_shadow(caster: RayCaster, centre_m: np.ndarray, lights: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Return the share of the floor's light that arrives around a point, on a grid (cells, cells) over x and y."""
     line = np.linspace(-SHADOW_HALF_SIDE_M, SHADOW_HALF_SIDE_M, SHADOW_CELLS)
     x, y = np.meshgrid(line, line, indexing="ij")
     points = np.stack([x + centre_m[0], y + centre_m[1], np.full_like(x, 1e-3)], -1).reshape(-1, 3)
@@ -136,7 +142,8 @@ def floor_shadow(caster: Caster, centre_m: np.ndarray, lights: tuple[np.ndarray,
 
 @dataclass(frozen=True)
 class RoomView:
-    """A camera's empty room: plate (H, W, 3) in [0, 1], and what each pixel's centre ray meets, room_m (H, W, 3)."""
+    """A camera's empty room: plate (H, W, 3) in [0, 1], and the point that each pixel's centre ray meets, room_m (H, W,
+    3)."""
 
     camera: Camera
     plate: np.ndarray
@@ -156,7 +163,7 @@ class RoomView:
         return RoomView(camera, plate.clip(0, 1).reshape(shape), centre_hit.reshape(shape))
 
     def shadowed(self, shadow: np.ndarray, centre_m: np.ndarray) -> np.ndarray:
-        """The plate with a person's shadow (see `floor_shadow`) on the floor, (H, W, 3)."""
+        """Return the plate with a person's shadow (see `floor_shadow`) on the floor, (H, W, 3)."""
         cells_per_m = (SHADOW_CELLS - 1) / (2 * SHADOW_HALF_SIDE_M)
         cells = (self.room_m[..., :2] - centre_m[:2] + SHADOW_HALF_SIDE_M) * cells_per_m
         arriving = map_coordinates(shadow, np.moveaxis(cells, -1, 0), order=1, mode="nearest")
@@ -164,6 +171,6 @@ class RoomView:
 
 
 def subpixel_offsets_px() -> np.ndarray:
-    """(SUPERSAMPLES^2, 2) sample positions around a pixel's centre."""
+    """Return sample positions around a pixel's centre, (SUPERSAMPLES^2, 2)."""
     line = (np.arange(SUPERSAMPLES) - SUPERSAMPLES // 2) / SUPERSAMPLES
     return np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""A walk on a small circle, written down as sines: no recorded motion is needed."""
+"""A walk on a small circle, composed of sines, so that no recorded motion is needed."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,8 @@ CIRCLE_RADIUS_M = 0.2
 
 @dataclass(frozen=True)
 class WalkPose:
-    """theta (J, 3) radians and root (4, 4) world from body, as in Rig; `gait_phase` in radians."""
+    """One pose of the walk: theta (J, 3) radians and root (4, 4) world from body, as in Rig; `gait_phase` in
+    radians."""
 
     theta: Tensor
     root: Tensor
@@ -24,7 +25,8 @@ class WalkPose:
 
 
 def walk_pose(rig: Rig, time_s: float, waving: float) -> WalkPose:
-    """The pose at a time. `waving` 0 is a plain walk; 1 raises the left hand, bends the right arm and leans forward.
+    """Return the pose at a time. `waving` 0 is a plain walk; 1 raises the left hand, bends the right arm and leans
+    forward.
 
     In the body frame (Z up, facing -Y, left is +X) a turn about +X swings a hanging limb backwards.
     """
@@ -40,6 +42,7 @@ def walk_pose(rig: Rig, time_s: float, waving: float) -> WalkPose:
 
 
 def _joint_rotations(phase: float, waving: float) -> dict[str, Rotation]:
+    """Return the rotation of each joint that moves, by name."""
     rotations = {
         "spine03": _about(x=4 + 10 * waving, z=4 * np.sin(phase)),
         "spine01": _about(y=2 * np.cos(phase), z=4 * np.sin(phase)),
@@ -62,5 +65,5 @@ def _joint_rotations(phase: float, waving: float) -> dict[str, Rotation]:
 
 
 def _about(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Rotation:
-    """A turn by degrees about the body frame's axes: first y, then x, then z."""
+    """Return a rotation by degrees about the body frame's axes: first y, then x, then z."""
     return Rotation.from_euler("yxz", [y, x, z], degrees=True)

@@ -1,7 +1,7 @@
-"""The scene decides the size: what a capture's pixels, masks and poses ask of the fast machinery, and no more.
+"""Automatic settings of the fast field and of training, from the capture's pixels, masks and poses.
 
-A setting of 0, or no cells, is open; what a preset or an override names stands. `benchmarks/budget.py` measures what
-twice and half as much are worth.
+A setting of 0, or without cells, is open; what a preset or an override sets is kept. `benchmarks/budget.py` measures
+the effect of doubling and halving the settings.
 """
 
 from dataclasses import dataclass
@@ -17,28 +17,28 @@ from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.silhouette import silhouette
 
-ALIGNMENT_M = 0.01  # to which surfaces of different poses lie on each other; what is finer blurs, whatever the cells
-FINEST_M = 0.008  # cells of one posture: with 6 mm Adam takes three times as long for each step as with these
-COLOUR_LEVELS, GEOMETRY_LEVELS = 4, 3  # of the grids, from the coarsest to the finest in equal ratios
+ALIGNMENT_M = 0.01  # accuracy to which poses align; finer detail blurs, whatever the cells
+FINEST_M = 0.008  # least cell size for one posture; with 6 mm, an Adam step takes three times as long
+COLOUR_LEVELS, GEOMETRY_LEVELS = 4, 3  # of the grids, in a geometric series
 COARSEST_CELLS = {"colour": 24, "geometry": 16}
-GEOMETRY_COARSER = 1.5  # times than colour: fingers and folds are larger than prints
-PATH = 2.4  # of a ray through the shell, in thicknesses of it, in the mean over rays that meet a person
-SAMPLE_CELLS, LONGEST_SAMPLE_M = 0.6, 0.006  # between samples: smoother and nearer surfaces than with one each cell
-ROOM_M = 0.015  # beyond where masks reach, for poses that are still wrong
-THINNEST_M, THICKEST_M = 0.03, 0.15
-MASKS_A_CAMERA = 6  # are looked at
-STILL_RAD = 0.05  # spread of joints below which nothing can be learned from their angles
-ONE_POSTURE_RAD = 0.002  # spread of joints as the fit leaves it where it found one posture in all frames
+GEOMETRY_COARSER = 1.5  # times coarser than colour: fingers and folds are larger than prints
+MEAN_PATH = 2.4  # length of a ray's path through the shell in thicknesses, mean over rays that hit the person
+SAMPLE_CELLS, MAX_SAMPLE_M = 0.6, 0.006  # sample spacing: smoother and more accurate than one per cell
+SHELL_MARGIN_M = 0.015  # beyond the extent of the masks, for poses that are still inaccurate
+MIN_THICKNESS_M, MAX_THICKNESS_M = 0.03, 0.15
+MASKS_PER_CAMERA = 6  # that are measured
+MIN_POSE_STD_RAD = 0.05  # below it, nothing can be learned from joint angles
+ONE_POSTURE_RAD = 0.002  # std_rad below which the fit found one posture in all frames
 POSE_WIDTH = 8
-NODES = 128  # about 12 cm apart: what they cannot follow, such as a collar, is the canonical surface's own
-LOOKS = 1.5  # how often a person's pixel is drawn in the mean
-LEAST_STEPS, MOST_STEPS = 600, 4000
-STEPS_A_FRAME = 540  # that see it, until its body stands as deep as one camera can tell; half as many lose 0.7 dB
+NODES = 128  # about 12 cm apart; finer detail, such as a collar, is left to the canonical surface
+DRAWS_PER_PIXEL = 1.5  # how often a pixel of the person is drawn on average
+MIN_STEPS, MAX_STEPS = 600, 4000
+STEPS_PER_FRAME = 540  # with its rays, until its body's depth converges with one camera; half as many lose 0.7 dB
 
 
 @dataclass(frozen=True)
 class Decision:
-    """A setting's value and why it is that."""
+    """Value of an automatic setting, and its reason."""
 
     value: int | float | tuple[float, ...]
     reason: str
@@ -46,10 +46,12 @@ class Decision:
 
 @dataclass(frozen=True)
 class SceneStatistics:
-    """What was recorded, as far as it decides sizes. footprint_m: of a pixel on the body, median over cameras;
-    outside_m, inside_m: how far masks reach out of the fitted body and stay inside it, 99 % of their outlines; side_m:
-    longest of the rest body; std_rad: of the free joints, mean; person_px: pixels of the person in all training
-    images."""
+    """Statistics of the capture that determine settings.
+
+    footprint_m: size of a pixel on the body, median over cameras. outside_m, inside_m: how far masks extend outside the
+    fitted body and stay inside it, for 99 % of their outlines. side_m: longest side of the rest body. std_rad: standard
+    deviation of the free joints, mean. person_px: pixels of the person in all training images.
+    """
 
     cameras: int
     frames: int
@@ -62,18 +64,19 @@ class SceneStatistics:
 
     @staticmethod
     def of(capture: Capture, masks: Masks, body: BodyFit) -> "SceneStatistics":
-        """Looks at some masks of every training camera."""
+        """Measure the statistics, with some masks of every training camera. Raises InputError if no mask shows the
+        person."""
         vertices_m, faces = body.vertices_m().numpy(), body.rig.faces.numpy()
         footprints_m, outlines_m, images, areas_px = [], [], 0, []
         for camera in (capture.cameras[name] for name in capture.train_cameras):
             kept = [frame for frame in capture.train_frames if (camera.name, frame) in masks]
             images += len(kept)
-            for frame in evenly_spaced(kept, MASKS_A_CAMERA):
+            for frame in evenly_spaced(kept, MASKS_PER_CAMERA):
                 points_m = vertices_m[body.index(frame)]
                 footprints_m.append(float(np.median(camera.project(points_m)[1])) / camera.K[0, 0])
                 covered = silhouette(camera, points_m, faces)
                 mask = masks.get(camera.name, frame)
-                outlines_m.append(footprints_m[-1] * _beyond_px(mask, covered))
+                outlines_m.append(footprints_m[-1] * _outline_distance_px(mask, covered))
                 areas_px.append(mask.sum())
         if not sum(map(len, outlines_m)):
             raise InputError(f"{capture.name}: no mask shows the person; see the report of the segmentation")
@@ -93,44 +96,44 @@ class SceneStatistics:
 
 
 def decide(scene: SceneStatistics, settings: TrainingSettings) -> tuple[TrainingSettings, dict[str, Decision]]:
-    """The settings with all that was open decided, and each decision by its setting's name."""
-    wanted = _field(scene, settings.fast) if settings.machinery == "fast" else {}
-    made = {name: decision for name, decision in wanted.items() if not getattr(settings.fast, name)}
-    fast = settings.fast.model_copy(update={name: decision.value for name, decision in made.items()})
-    decisions = {f"fast.{name}": decision for name, decision in made.items()}
-    whole = {"steps": _steps(scene, settings)} if not settings.steps else {}
+    """Return the settings with all open ones decided, and each decision by the setting's name."""
+    wanted = _field_decisions(scene, settings.field) if isinstance(settings.field, FastFieldSettings) else {}
+    open_decisions = {name: decision for name, decision in wanted.items() if not getattr(settings.field, name)}
+    field = settings.field.model_copy(update={name: decision.value for name, decision in open_decisions.items()})
+    decisions = {f"field.{name}": decision for name, decision in open_decisions.items()}
+    other_decisions = {"steps": _steps(scene, settings)} if not settings.steps else {}
     if settings.one_posture is None:
-        whole["one_posture"] = _one_posture(scene, settings)
-    update = {name: decision.value for name, decision in whole.items()}
-    return settings.model_copy(update={"fast": fast} | update), decisions | whole
+        other_decisions["one_posture"] = _one_posture(scene, settings)
+    update = {name: decision.value for name, decision in other_decisions.items()}
+    return settings.model_copy(update={"field": field} | update), decisions | other_decisions
 
 
-def _field(scene: SceneStatistics, given: FastFieldSettings) -> dict[str, Decision]:
+def _field_decisions(scene: SceneStatistics, given: FastFieldSettings) -> dict[str, Decision]:
     posed = scene.frames > 1 and scene.std_rad >= ONE_POSTURE_RAD
     cell_m = max(scene.footprint_m, ALIGNMENT_M if posed else FINEST_M)
-    sample_m = min(SAMPLE_CELLS * cell_m, LONGEST_SAMPLE_M)
+    sample_m = min(SAMPLE_CELLS * cell_m, MAX_SAMPLE_M)
     align = f"poses align to {_mm(ALIGNMENT_M)}" if posed else "there is one posture"
     finest = f"a pixel covers {_mm(scene.footprint_m)}, {align}: cells of {_mm(cell_m)}"
     outer_m, inner_m = (_thickness_m(reach_m) for reach_m in (scene.outside_m, scene.inside_m))
     outer_m, inner_m = given.outer_m or outer_m, given.inner_m or inner_m
-    still = scene.std_rad < STILL_RAD
-    colour_cells = given.colour_cells or _ladder(COARSEST_CELLS["colour"], scene.side_m / cell_m, COLOUR_LEVELS)
+    nearly_static = scene.std_rad < MIN_POSE_STD_RAD
+    colour_cells = given.colour_cells or _level_cells(COARSEST_CELLS["colour"], scene.side_m / cell_m, COLOUR_LEVELS)
     return {
         "outer_m": Decision(outer_m, f"masks reach {_mm(scene.outside_m)} out of the fitted body, and room"),
         "inner_m": Decision(inner_m, f"masks stay {_mm(scene.inside_m)} inside the fitted body, and room"),
         "samples": Decision(
-            max(8, round(PATH * (outer_m + inner_m) / sample_m)),
+            max(8, round(MEAN_PATH * (outer_m + inner_m) / sample_m)),
             f"one each {_mm(sample_m)} of a ray through a shell of {_mm(outer_m + inner_m)}",
         ),
         "colour_cells": Decision(colour_cells, finest),
         "geometry_cells": Decision(
-            _ladder(COARSEST_CELLS["geometry"], colour_cells[-1] / GEOMETRY_COARSER, GEOMETRY_LEVELS),
+            _level_cells(COARSEST_CELLS["geometry"], colour_cells[-1] / GEOMETRY_COARSER, GEOMETRY_LEVELS),
             f"{GEOMETRY_COARSER} times coarser than colour",
         ),
         "pose_width": Decision(
-            1 if still else POSE_WIDTH,
+            1 if nearly_static else POSE_WIDTH,
             f"joints spread {np.rad2deg(scene.std_rad):.1f} degrees over {scene.frames} frames"
-            + (": too little to learn from" if still else ""),
+            + (": too little to learn from" if nearly_static else ""),
         ),
         "nodes": _nodes(scene, given),
     }
@@ -148,37 +151,37 @@ def _nodes(scene: SceneStatistics, given: FastFieldSettings) -> Decision:
 
 def _one_posture(scene: SceneStatistics, settings: TrainingSettings) -> Decision:
     fitted = f"fitted joints spread {np.rad2deg(scene.std_rad):.2f} degrees over {scene.frames} frames"
-    if settings.machinery != "fast" or scene.frames == 1:
+    if settings.field.kind != "fast" or scene.frames == 1:
         return Decision(False, "each frame has its own pose")
     return Decision(scene.std_rad < ONE_POSTURE_RAD, fitted)
 
 
 def _steps(scene: SceneStatistics, settings: TrainingSettings) -> Decision:
     rays = settings.frames_per_step * settings.rays_per_frame
-    wanted = LOOKS * scene.person_px / rays
+    wanted = DRAWS_PER_PIXEL * scene.person_px / rays
     reason = f"{scene.person_px} pixels of the person at {rays} rays a step ask for {wanted:.0f}"
     if scene.cameras == 1 and scene.frames > 1 and settings.pose_learning_rate:
-        depths = STEPS_A_FRAME * scene.frames / settings.frames_per_step
+        depths = STEPS_PER_FRAME * scene.frames / settings.frames_per_step
         wanted = max(wanted, depths)
         reason += f", the depths of {scene.frames} bodies in one camera for {depths:.0f}"
-    steps = int(np.clip(round(wanted, -1), LEAST_STEPS, MOST_STEPS))
-    return Decision(steps, f"{reason}; never fewer than {LEAST_STEPS} or more than {MOST_STEPS}")
+    steps = int(np.clip(round(wanted, -1), MIN_STEPS, MAX_STEPS))
+    return Decision(steps, f"{reason}; never fewer than {MIN_STEPS} or more than {MAX_STEPS}")
 
 
-def _beyond_px(mask: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """Distance of a mask's outline from the body's silhouette, (P,), negative inside it."""
+def _outline_distance_px(mask: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """Return the distances (P,) of a mask's outline from the body's silhouette, negative inside it."""
     outline = mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
-    outwards = cv2.distanceTransform((~covered).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    normal_displacement = cv2.distanceTransform((~covered).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     inwards = cv2.distanceTransform(covered.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return (outwards - inwards)[outline]
+    return (normal_displacement - inwards)[outline]
 
 
 def _thickness_m(reach_m: float) -> float:
-    return round(float(np.clip(reach_m + ROOM_M, THINNEST_M, THICKEST_M)), 3)
+    return round(float(np.clip(reach_m + SHELL_MARGIN_M, MIN_THICKNESS_M, MAX_THICKNESS_M)), 3)
 
 
-def _ladder(coarsest: int, finest: float, levels: int) -> tuple[int, ...]:
-    """Cells of each level along the longest side; one level where the finest is no finer than the coarsest."""
+def _level_cells(coarsest: int, finest: float, levels: int) -> tuple[int, ...]:
+    """Return the cells of each level along the longest side; one level if the finest is no finer than the coarsest."""
     if finest <= coarsest:
         return (max(2, round(finest)),)
     return tuple(int(n) for n in np.geomspace(coarsest, finest, levels).round())

@@ -1,4 +1,4 @@
-"""The processes that train one subject together: rank, world size and device."""
+"""Processes that train one subject together: rank, world size and device."""
 
 import os
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import torch.distributed as dist
 
 @dataclass(frozen=True)
 class Distributed:
-    """This process among its fellows, as torchrun started them; alone without torchrun."""
+    """This process in its group as started by torchrun; a group of one without torchrun."""
 
     rank: int
     world_size: int
@@ -17,7 +17,7 @@ class Distributed:
 
     @staticmethod
     def join() -> "Distributed":
-        """Join the group that torchrun's environment describes: NCCL with one GPU a rank, else gloo on the CPU."""
+        """Join the group that torchrun's environment describes: NCCL with one GPU per rank, else gloo on the CPU."""
         rank, world_size = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
         cuda = torch.cuda.is_available()
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0))) if cuda else torch.device("cpu")
@@ -28,7 +28,7 @@ class Distributed:
         return Distributed(rank, world_size, device)
 
     def all_max(self, value: float) -> float:
-        """Of all processes' values."""
+        """Return the greatest value of all processes."""
         if self.world_size == 1:
             return value
         found = torch.tensor(value, dtype=torch.float64, device=self.device)
@@ -36,7 +36,7 @@ class Distributed:
         return float(found)
 
     def barrier(self) -> None:
-        """For each other."""
+        """Block until every process has reached this call."""
         if self.world_size > 1:
             dist.barrier()
 

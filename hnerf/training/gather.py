@@ -1,4 +1,4 @@
-"""The pixels of a training, gathered by one process and held once a machine, whatever the number of processes."""
+"""The training pixels, gathered by one process and held once per machine, whatever the number of processes."""
 
 from pathlib import Path
 from typing import Any
@@ -12,21 +12,21 @@ from hnerf.avatar.trained import Gains
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
-from hnerf.geometry.reach import Reached
+from hnerf.geometry.reach import ReachablePixels
 from hnerf.segmentation.edge import shaded_plate
-from hnerf.segmentation.prior import window_around
+from hnerf.segmentation.prior import bounding_window
 from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import Pixels
 
-EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel may mix person and surroundings
-SUFFIX = ".pixels"  # of the files that hold columns of Pixels, of these kinds and widths
+EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel may mix person and background
+SUFFIX = ".pixels"  # of the files that hold the columns of Pixels; COLUMNS: their types and widths
 COLUMNS = {
     "starts": (torch.int64, 1),
     "edges": (torch.int64, 1),
     "edge_starts": (torch.int64, 1),
     "image_starts": (torch.int64, 1),
     "image_camera": (torch.int64, 1),
-    "place": (torch.int32, 1),
+    "pixel_index": (torch.int32, 1),
     "colour": (torch.uint8, 3),
     "plate": (torch.uint8, 3),
     "person": (torch.bool, 1),
@@ -40,23 +40,23 @@ def gather_pixels(
     masks: Masks,
     body: BodyFit,
     frames: tuple[int, ...],
-    reached: Reached | None,
+    visible_pixels: ReachablePixels | None,
     gains: Gains,
     folder: Path,
     processes: Distributed,
 ) -> Pixels:
-    """Pixels of the training cameras in `frames` that are reached from the fitted body, or on the mask; none where the
-    mask was dropped. reached None: all pixels, without plates, for a field with a background of its own.
+    """Gather the training cameras' pixels in `frames` that can show the fitted body or lie on the mask; none where the
+    mask was dropped. visible_pixels None: all pixels, without plates, for a field that models the background.
 
-    Colours and plates are as cameras would show them that were exposed alike: by the gains of their cameras, if any.
-    One process gathers, image by image, into files in `folder`; all map them, so that the machine holds them once, and
-    gives way to what is more urgent where they are not asked for. They have no name by the time this returns: the disk
-    has their room again when the last process ends, however it ends.
+    Colours and plates are divided by the gains of their cameras, if any, as if all were exposed alike. One process
+    gathers, image by image, into files in `folder`; all processes map them, so that the machine holds them once and may
+    page them out. The files are unlinked by the time this returns: their space is freed when the last process ends,
+    however it ends.
     """
     if processes.is_main:
         folder.mkdir(parents=True, exist_ok=True)
         _remove(folder)  # what a killed process left
-        _write_pixels(capture, masks, body, frames, reached, gains, folder)
+        _write_pixels(capture, masks, body, frames, visible_pixels, gains, folder)
     processes.barrier()
     columns: dict[str, Any] = {name: _mapped(folder / f"{name}{SUFFIX}", *kind) for name, kind in COLUMNS.items()}
     processes.barrier()
@@ -76,15 +76,15 @@ def _write_pixels(
     masks: Masks,
     body: BodyFit,
     frames: tuple[int, ...],
-    reached: Reached | None,
+    visible_pixels: ReachablePixels | None,
     gains: Gains,
     folder: Path,
 ) -> None:
-    """The columns of Pixels, a file each, frame by frame."""
+    """Write the columns of Pixels, one file each, frame by frame."""
     cameras = [capture.cameras[name] for name in capture.train_cameras]
-    found = [capture.background(camera.name) for camera in cameras] if reached else []
+    found = [capture.background(camera.name) for camera in cameras] if visible_pixels else []
     plates = [plate for plate in found if plate is not None]
-    with_plates = reached is not None and len(plates) == len(cameras)
+    with_plates = visible_pixels is not None and len(plates) == len(cameras)
     vertices_m = body.vertices_m().numpy()
     ends = {"starts": 0, "edge_starts": 0, "image_starts": 0}
 
@@ -104,20 +104,24 @@ def _write_pixels(
             if (camera.name, frame) not in masks:
                 continue
             image, mask = capture.image(camera.name, frame), masks.get(camera.name, frame)
-            wanted = np.ones_like(mask) if reached is None else reached(camera, vertices_m[body.index(frame)]) | mask
+            wanted = (
+                np.ones_like(mask)
+                if visible_pixels is None
+                else visible_pixels(camera, vertices_m[body.index(frame)]) | mask
+            )
             gain = gains.get(camera.name)
-            if reached:
-                append("place", np.flatnonzero(wanted))
-            append("colour", _levelled(image[wanted], gain))
+            if visible_pixels:
+                append("pixel_index", np.flatnonzero(wanted))
+            append("colour", _exposure_corrected(image[wanted], gain))
             append("person", mask[wanted])
             edges.append(_edge(mask)[wanted])
             append("edge", edges[-1])
             append("image_camera", [c])
             close("image_starts", len(edges[-1]))
             if with_plates:
-                window = window_around(wanted)
+                window = bounding_window(wanted)
                 shaded = shaded_plate(mask[window], image[window], plates[c][window])[wanted[window]]
-                append("plate", _levelled(shaded.clip(0, 255).round().astype(np.uint8), gain))
+                append("plate", _exposure_corrected(shaded.clip(0, 255).round().astype(np.uint8), gain))
         edge = np.concatenate(edges)
         mixed = np.flatnonzero(edge) if edge.any() else np.arange(len(edge))
         append("edges", ends["starts"] + mixed)
@@ -125,13 +129,13 @@ def _write_pixels(
         close("starts", len(edge))
 
 
-def _levelled(shown: np.ndarray, gain: tuple[float, float, float] | None) -> np.ndarray:
-    """Colours (P, 3) uint8 as a camera of gain 1 would show them."""
+def _exposure_corrected(shown: np.ndarray, gain: tuple[float, float, float] | None) -> np.ndarray:
+    """Return colours (P, 3) uint8 as a camera of gain 1 would show them."""
     return shown if gain is None else (shown / np.array(gain, np.float32)).round().clip(0, 255).astype(np.uint8)
 
 
 def _mapped(path: Path, kind: torch.dtype, width: int) -> Tensor | None:
-    """What the file holds, (N,) or (N, width), in memory that processes share; None where there is no file."""
+    """Map a file as a tensor, (N,) or (N, width), in memory that processes share; None if there is no file."""
     if not path.exists():
         return None
     flat = torch.from_file(str(path), False, path.stat().st_size // kind.itemsize, dtype=kind)

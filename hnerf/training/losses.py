@@ -18,42 +18,43 @@ EPSILON = 1e-6  # keeps logarithms finite
 
 @dataclass(frozen=True)
 class Target:
-    """colour (R, 3) observed; person M (R,) float; weight (R,): 0 leaves a ray out of the colour losses."""
+    """Target of a batch. colour (R, 3) observed; person M (R,) float; weight (R,): 0 excludes a ray from the colour
+    losses."""
 
     colour: Tensor
     person: Tensor
     weight: Tensor
 
 
-def pixel(alpha: Tensor, samples: RaySamples) -> Tensor:
-    """Composited colour (R, 3) for one choice of opacity, over what lies beyond."""
+def pixel_colour(alpha: Tensor, samples: RaySamples) -> Tensor:
+    """Return the composited colour (R, 3) for one choice of opacity, over the background."""
     weights = weights_from_alpha(alpha)
-    return composite(weights, samples.colour) + (1 - weights.sum(1, keepdim=True)) * samples.beyond
+    return composite(weights, samples.colour) + (1 - weights.sum(1, keepdim=True)) * samples.background
 
 
 def reconstruction(samples: RaySamples, target: Target) -> Tensor:
-    """rec: |C_gt - C|_1."""
-    return (target.weight * (target.colour - pixel(samples.alpha, samples)).abs().sum(1)).mean()
+    """Return rec: |C_gt - C|_1."""
+    return (target.weight * (target.colour - pixel_colour(samples.alpha, samples)).abs().sum(1)).mean()
 
 
 def mask(samples: RaySamples, target: Target) -> Tensor:
-    """mask: |M (C_gt - C~)|_1, C~ composited with b alpha."""
-    error = (target.colour - pixel(samples.in_box * samples.alpha, samples)).abs().sum(1)
+    """Return mask: |M (C_gt - C~)|_1, C~ composited with b alpha."""
+    error = (target.colour - pixel_colour(samples.in_box * samples.alpha, samples)).abs().sum(1)
     return (target.weight * target.person * error).mean()
 
 
 def blend(samples: RaySamples, target: Target, eta: float) -> Tensor:
-    """blend: |M (C_gt - C^)|_1 + eta |(1 - M)(C_gt - C^)|_1, C^ composited with b alpha_dot + (1 - b) alpha."""
+    """Return blend: |M (C_gt - C^)|_1 + eta |(1 - M)(C_gt - C^)|_1, C^ composited with b alpha_dot + (1 - b) alpha."""
     alpha = samples.in_box * samples.alpha_dot + (1 - samples.in_box) * samples.alpha
-    error = (target.colour - pixel(alpha, samples)).abs().sum(1)
+    error = (target.colour - pixel_colour(alpha, samples)).abs().sum(1)
     return (target.weight * (target.person + eta * (1 - target.person)) * error).mean()
 
 
 def geometry(samples: RaySamples, threshold: float, steepness: float, roles: GeometryRoles) -> Tensor:
-    """geom: sum_i b_i BCE(sigmoid(lambda (sigma_i - sigma_h)), alpha_dot_i); 0 where the SDF is the density.
+    """Return geom: sum_i b_i BCE(sigmoid(lambda (sigma_i - sigma_h)), alpha_dot_i); 0 where the SDF is the density.
 
-    roles: "print" takes the density for the label, as the paper's seg has the label first, and moves both; with
-    "surface_leads" the density follows alpha_dot, which is held (docs/method.md, "The nine losses").
+    roles: "print" takes the density as the label, because the paper's seg has the label first, and moves both; with
+    "surface_leads" the density follows alpha_dot, which gets no gradient (docs/method.md, "The nine losses").
     """
     if samples.density is None:
         return samples.d.new_zeros(())
@@ -63,36 +64,36 @@ def geometry(samples: RaySamples, threshold: float, steepness: float, roles: Geo
 
 
 def segmentation(distance: Tensor, target: Target, sharpness: float) -> Tensor:
-    """seg, fit: BCE(M, sigmoid(-gamma min_i d_i)) for distances (R, K): d_hat for seg, the body's own d for fit. From
-    the logit, so that a person's pixel pulls a body however far it is."""
+    """Return seg or fit: BCE(M, sigmoid(-gamma min_i d_i)) of distances (R, K): d_hat for seg, the body's d for fit. It
+    is computed from the logit, so that a person's pixel attracts a body however far away."""
     logit = -sharpness * distance.amin(1)
     return (softplus(logit) - target.person * logit).mean()
 
 
 def _cross_entropy(predicted: Tensor, target: Tensor) -> Tensor:
-    """BCE of probabilities inside (0, 1). Lets a NaN through, which torch's own refuses, so that the step can be
-    skipped."""
+    """Return the BCE of probabilities inside (0, 1). NaN passes through, where torch's own function raises, so that the
+    step can be skipped."""
     return -(target * predicted.log() + (1 - target) * (1 - predicted).log())
 
 
 def eikonal(samples: RaySamples) -> Tensor:
-    """eik: sum_i b_i (|grad_x d_hat| - 1)^2, given the norms inside the box."""
+    """Return eik: sum_i b_i (|grad_x d_hat| - 1)^2, given the norms inside the box."""
     return ((samples.gradient_norm - 1) ** 2).sum() / len(samples.d)
 
 
 def residual(samples: RaySamples) -> Tensor:
-    """reg: |relu(dd)|_1: clothing lies outside the skin, where d_hat < d."""
+    """Return reg: |relu(dd)|_1. Clothing lies outside the skin, where d_hat < d."""
     return relu(samples.residual).sum(1).mean()
 
 
 def increment(correction: PoseCorrection) -> Tensor:
-    """inc: |dbeta|_2 + mean_t |dtheta_t|_2."""
+    """Return inc: |dbeta|_2 + mean_t |dtheta_t|_2."""
     turn, move_m, shape = correction.totals()
     return _norm(shape) + _norm(torch.cat([turn.flatten(1), move_m], 1)).mean()
 
 
 def elastic(samples: RaySamples) -> Tensor:
-    """Elastic energy of a deformation, mean over rays; nothing where nothing is deformed."""
+    """Return the elastic energy of the deformation, mean over rays; 0 without a deformation."""
     energy = samples.d.new_zeros(1) if samples.elastic is None else samples.elastic
     return energy.sum() / len(samples.d)
 

@@ -1,4 +1,5 @@
-"""The rays of a step in parts, as many as memory asks for: their gradients add up to those of one joint batch."""
+"""Gradient accumulation: the rays of a step in as many parts as memory requires; their gradients add up to those of the
+joint batch."""
 
 import math
 import sys
@@ -17,16 +18,16 @@ from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import Rays
 from hnerf.training.step import PosedScene
 
-HALVES = 2  # of a batch, side by side on a CPU: operations are too small to share cores; two sums have one order only
-USABLE = 0.8  # of what is free: allocators lose some, and rays differ
-PEAK = 1.3  # of a step on a CPU in times what it saves for its gradients: 1.26 to 1.29 by hand, for `fast` and `paper`
-FEW, MORE = 32, 64  # rays that are tried
+CPU_PARTS = 2  # side by side on a CPU, because operations are too small to share cores; a sum of two is deterministic
+USABLE_SHARE = 0.8  # of the free memory, for fragmentation and differences between rays
+PEAK_FACTOR = 1.3  # CPU peak relative to tensors saved for gradients: 1.26 to 1.29 by hand (`fast`, `paper`)
+FEW_RAYS, MORE_RAYS = 32, 64  # of the trial batches
 GIB = 2**30
 MEMINFO = Path("/proc/meminfo")
 
 
 class Parts:
-    """Of a process's rays: `count`, side by side in threads of their own or one after another; most_rays: that fit
+    """Parts of a process's rays: `count` of them, side by side in threads or one after another. most_rays: how many fit
     into memory at once."""
 
     def __init__(self, count: int, side_by_side: bool, most_rays: float):
@@ -44,20 +45,21 @@ class Parts:
         draws: Draws,
         processes: Distributed,
     ) -> dict[str, Tensor]:
-        """Add the gradients of this process's share of a joint batch to the parameters'; the losses by name.
+        """Add the gradients of this process's share of a joint batch to the parameters' gradients; return the losses by
+        name.
 
-        Losses are means over rays, or do not depend on them: with parts weighted by their rays, either add up to what
-        the joint batch has. `module` takes the mean over processes, with the last part.
+        Losses are means over rays, or do not depend on them: weighted by their rays, the parts add up to the joint
+        batch. `module` averages over processes with the last part.
         """
         n, world_size = self.count, processes.world_size
 
         def of_part(part: int) -> dict[str, Tensor]:
             mine = processes.rank * n + part, world_size * n
-            own = shard(rays, *mine)
-            weight = world_size * len(own.frame) / len(rays.frame)
+            part_rays = shard(rays, *mine)
+            weight = world_size * len(part_rays.frame) / len(rays.frame)
             waiting = module if part < n - 1 and isinstance(module, DistributedDataParallel) else None
             with waiting.no_sync() if waiting else nullcontext():
-                terms = module(scene, own, conditions, shard(draws, *mine))
+                terms = module(scene, part_rays, conditions, shard(draws, *mine))
                 (weight * torch.stack(list(terms.values())).sum()).backward()
             return {name: weight * term.detach() for name, term in terms.items()}
 
@@ -66,54 +68,54 @@ class Parts:
 
 
 def decide_parts(
-    rays: int, memory_gib: float | None, attempt: Callable[[int], tuple[int, Tensor]], processes: Distributed
+    rays: int, memory_gib: float | None, trial_loss: Callable[[int], tuple[int, Tensor]], processes: Distributed
 ) -> tuple[Parts, Decision]:
-    """In how many parts each process takes so many rays a step, and why.
+    """Decide into how many parts each process divides `rays` per step; return the parts and the reason.
 
-    memory_gib: for them; None: what is free. attempt: the number of rays and the loss of a batch of about so many. What
-    two small ones need is measured: what they differ by is the rays', the rest is there once.
+    memory_gib: memory for them; None: what is free. trial_loss: maps an approximate number of rays to the number and
+    loss of a trial batch. Two small batches are measured: their difference is due to the rays, the rest is a constant.
     """
     device, share = processes.device, math.ceil(rays / processes.world_size)
     if device.type == "cuda":
-        _peak_bytes(attempt, FEW, device)  # what libraries allocate once
-    (few, least), (more, most) = (_peak_bytes(attempt, about, device) for about in (FEW, MORE))
+        _peak_bytes(trial_loss, FEW_RAYS, device)  # what libraries allocate once
+    (few, least), (more, most) = (_peak_bytes(trial_loss, about, device) for about in (FEW_RAYS, MORE_RAYS))
     each = max(1.0, (most - least) / (more - few))
-    room = USABLE * _free_bytes(processes) if memory_gib is None else memory_gib * GIB
+    room = USABLE_SHARE * _free_bytes(processes) if memory_gib is None else memory_gib * GIB
     most_rays = max(1.0, (room - least) / each + few)
     count = int(processes.all_max(min(math.ceil(share / most_rays), max(1, share // 2))))
-    reason = "there is room for a step's rays"  # without figures, so that identical runs record the same
+    reason = "there is room for a step's rays"  # without figures, so that identical runs record the same reason
     if memory_gib or count > 1:
         needed_gib = (least + (share - few) * each) / GIB
         reason = f"a ray needs {each / 2**20:.2f} MiB, {share} rays {needed_gib:.2f} GiB, of {room / GIB:.1f} GiB"
     side_by_side = count == 1 and device.type == "cpu" and processes.world_size == 1 and torch.get_num_threads() > 1
     if side_by_side:
-        count, reason = HALVES, f"{reason}, side by side in threads"
+        count, reason = CPU_PARTS, f"{reason}, side by side in threads"
     return Parts(count, side_by_side, most_rays), Decision(count, reason)
 
 
-def _peak_bytes(attempt: Callable[[int], tuple[int, Tensor]], about: int, device: torch.device) -> tuple[int, float]:
-    """Rays of a small batch and what a step of them needs at its peak: as allocated on a GPU; on a CPU, where nobody
-    counts, in proportion to what it saves for its gradients."""
+def _peak_bytes(trial_loss: Callable[[int], tuple[int, Tensor]], about: int, device: torch.device) -> tuple[int, float]:
+    """Return the number of rays of a small batch, and the peak memory of a step with them: as allocated on a GPU; on a
+    CPU, which has no such counter, in proportion to the tensors saved for gradients."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
         before = torch.cuda.memory_allocated(device)
-        rays, loss = attempt(about)
+        rays, loss = trial_loss(about)
         loss.backward()
         return rays, torch.cuda.max_memory_allocated(device) - before
     saved = {}
 
     def keep(tensor: Tensor) -> Tensor:
         storage = tensor.untyped_storage()
-        saved[storage.data_ptr()] = storage  # kept, so that no other takes its place
+        saved[storage.data_ptr()] = storage  # kept alive, so that its address is not reused
         return tensor
 
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        rays, _ = attempt(about)
-    return rays, PEAK * sum(storage.nbytes() for storage in saved.values())
+        rays, _ = trial_loss(about)
+    return rays, PEAK_FACTOR * sum(storage.nbytes() for storage in saved.values())
 
 
 def _free_bytes(processes: Distributed) -> float:
-    """On a GPU of one's own, or this process's share of the machine's; all one could ask for where nobody tells."""
+    """Return the free memory of this process's GPU, or its share of the machine's; sys.maxsize if that is unknown."""
     device = processes.device
     if device.type == "cuda":
         kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)

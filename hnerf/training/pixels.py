@@ -1,17 +1,18 @@
-"""Every training pixel that the person can reach, ready to be drawn as rays."""
+"""All training pixels that can show the person, ready to be drawn as rays."""
 
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-AT_EDGES = 1 / 3  # of the rays: half of the error is there, most of it in hands and feet, which are little else
+EDGE_SHARE = 1 / 3  # of the rays: half of the error is at edges, mostly in hands and feet, which are little else
 
 
 @dataclass(frozen=True)
 class Rays:
-    """A batch: origins_m, directions (R, 3); frame (R,) row of the body fit; colour (R, 3) in [0, 1]; person (R,) bool;
-    edge (R,) bool: near the mask's outline; plate (R, 3) the clean plate's colour with the shadows on it, or None."""
+    """A batch of rays. origins_m, directions (R, 3); frame (R,): row of the body fit; colour (R, 3) in [0, 1]; person
+    (R,) bool; edge (R,) bool: near the mask's outline; plate (R, 3): the clean plate's colour with the shadows on it,
+    or None."""
 
     origins_m: Tensor
     directions: Tensor
@@ -24,18 +25,20 @@ class Rays:
 
 @dataclass(frozen=True)
 class Pixels:
-    """Pixels of all images, ordered by frame and camera, on the host. starts (n + 1,): each frame's range. edges (E,),
-    edge_starts (n + 1,): indices of those at edges likewise, or of all pixels of a frame that has none there.
-    image_starts (I + 1,): each image's range; image_camera (I,); place (P,) int32: row-major in the image, or None
-    where images are whole. colour, plate (P, 3) uint8; person, edge (P,) bool; widths_px (C,); rays_from_px (C, 3, 3);
-    centres_m (C, 3)."""
+    """Pixels of all images, ordered by frame and camera, in host memory.
+
+    starts (n + 1,): each frame's range. edges (E,), edge_starts (n + 1,): indices of the edge pixels by frame, or of
+    all pixels of a frame without any. image_starts (I + 1,): each image's range; image_camera (I,). pixel_index (P,)
+    int32: row-major in the image, None if images are whole. colour, plate (P, 3) uint8; person, edge (P,) bool.
+    widths_px (C,); rays_from_px (C, 3, 3); centres_m (C, 3).
+    """
 
     starts: Tensor
     edges: Tensor
     edge_starts: Tensor
     image_starts: Tensor
     image_camera: Tensor
-    place: Tensor | None
+    pixel_index: Tensor | None
     colour: Tensor
     plate: Tensor | None
     person: Tensor
@@ -44,15 +47,17 @@ class Pixels:
     rays_from_px: Tensor
     centres_m: Tensor
 
-    def draw(self, frames: Tensor, rays_per_frame: int, generator: torch.Generator, at_edges: float = AT_EDGES) -> Rays:
-        """`rays_per_frame` pixels of each of the frames (rows), a share of them at edges, drawn with replacement; on
-        the device of the frames and the generator."""
+    def draw(
+        self, frames: Tensor, rays_per_frame: int, generator: torch.Generator, edge_share: float = EDGE_SHARE
+    ) -> Rays:
+        """Draw `rays_per_frame` pixels of each of the frames (rows) with replacement, a share `edge_share` of them at
+        edges, to the device of the frames and the generator."""
         shape = len(frames), rays_per_frame
         unit = torch.rand(shape, generator=generator, dtype=torch.float64, device=frames.device).cpu()
-        rows, count = frames.cpu(), round(at_edges * rays_per_frame)
+        rows, count = frames.cpu(), round(edge_share * rays_per_frame)
         mixed = self.edges[_within(self.edge_starts, rows, unit[:, :count])]
         pick = torch.cat([mixed, _within(self.starts, rows, unit[:, count:])], 1).flatten()
-        origins_m, directions = self.rays(*self.where(pick))
+        origins_m, directions = self.rays(*self.cameras_and_xy(pick))
         device = frames.device
         return Rays(
             origins_m.to(device),
@@ -64,22 +69,22 @@ class Pixels:
             None if self.plate is None else (self.plate[pick] / 255).to(device),
         )
 
-    def where(self, pick: Tensor) -> tuple[Tensor, Tensor]:
-        """Cameras (R,) and coordinates xy_px (R, 2) of some pixels (R,)."""
+    def cameras_and_xy(self, pick: Tensor) -> tuple[Tensor, Tensor]:
+        """Return cameras (R,) and coordinates xy_px (R, 2) of pixels (R,)."""
         image = torch.searchsorted(self.image_starts, pick, right=True) - 1
-        place = pick - self.image_starts[image] if self.place is None else self.place[pick]
+        pixel_index = pick - self.image_starts[image] if self.pixel_index is None else self.pixel_index[pick]
         camera = self.image_camera[image]
         width_px = self.widths_px[camera]
-        return camera, torch.stack([place % width_px, place // width_px], 1)
+        return camera, torch.stack([pixel_index % width_px, pixel_index // width_px], 1)
 
     def rays(self, camera: Tensor, xy_px: Tensor) -> tuple[Tensor, Tensor]:
-        """Origins and unit directions (R, 3) of pixels (R, 2) of cameras (R,)."""
+        """Return origins and unit directions (R, 3) of pixels (R, 2) of cameras (R,)."""
         homogeneous = torch.cat([xy_px.float(), torch.ones_like(xy_px[:, :1], dtype=torch.float32)], 1)
         directions = (self.rays_from_px[camera] @ homogeneous[..., None])[..., 0]
         return self.centres_m[camera], torch.nn.functional.normalize(directions, dim=-1)
 
 
 def _within(starts: Tensor, rows: Tensor, unit: Tensor) -> Tensor:
-    """Indices (n, k) in the ranges of some rows (n,), at unit (n, k) in [0, 1) of each."""
+    """Return indices (n, k) in the ranges of rows (n,), at the relative positions unit (n, k) in [0, 1)."""
     first, after = starts[rows, None], starts[rows + 1, None]
     return first + (unit * (after - first)).long()

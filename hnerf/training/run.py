@@ -23,8 +23,8 @@ from hnerf.training.trainer import train
 
 
 def main() -> int:
-    """Exit status 0, or one line on standard error and 2 for bad input, 3 for a training that cannot go on, 4 for input
-    or output that failed, as JSON: errno, what it means, file."""
+    """Train; return 0, or print one line on standard error and return 2 for bad input, 3 for a training that cannot go
+    on, 4 for failed input or output, as JSON: errno, its meaning, file."""
     parser = argparse.ArgumentParser(description=__doc__)
     for name in ("capture", "calibration", "masks", "fit"):
         parser.add_argument(name, type=Path)

@@ -16,27 +16,27 @@ from hnerf.training.pixels import Rays
 
 
 class TrainingError(RuntimeError):
-    """Training cannot go on; the message names the likely cause."""
+    """Training that cannot go on; the message names the likely cause."""
 
 
 @dataclass
 class PosedScene:
-    """What stands still within a step: the posed bodies and where their rays are sampled."""
+    """Posed bodies and the sampling region of their rays, constant within a step."""
 
     bodies: PosedBodies
     region: Any
 
 
 class Objective(nn.Module):
-    """Field and pose correction with their losses; the forward pass is what DistributedDataParallel wraps."""
+    """Field and pose correction with their losses; DistributedDataParallel wraps the forward pass."""
 
     def __init__(self, field: Field, correction: PoseCorrection, settings: TrainingSettings):
         super().__init__()
         self.field, self.correction, self.settings = field, correction, settings
 
     def forward(self, scene: PosedScene, rays: Rays, conditions: Conditions, draws: Draws) -> dict[str, Tensor]:
-        """The weighted losses by name; their sum is minimised."""
-        target, draws = make_target(rays, draws, self.field.own_background)
+        """Return the weighted losses by name; their sum is minimised."""
+        target, draws = make_target(rays, draws, self.field.models_background)
         samples, _ = self.field.sample(
             scene.bodies, scene.region, rays.origins_m, rays.directions, rays.frame, conditions, draws, self.correction
         )
@@ -56,27 +56,27 @@ class Objective(nn.Module):
         return {name: getattr(s, name) * term() for name, term in terms.items() if getattr(s, name)}
 
 
-def make_target(rays: Rays, draws: Draws, own_background: bool) -> tuple[losses.Target, Draws]:
-    """What rays should look like, and what lies beyond their samples.
+def make_target(rays: Rays, draws: Draws, models_background: bool) -> tuple[losses.Target, Draws]:
+    """Return the target of the rays, and the draws with the background behind their samples.
 
-    A field with a background of its own aims at the photograph. One without is composited over the clean plate, so that
-    pixels on the outline, which mix person and plate, count too; where there is no plate, over random colours, with the
-    outline left out.
+    A field that models the background is compared with the photograph. Any other field is composited over the clean
+    plate, so that outline pixels, which mix person and plate, count, too; without a plate it is composited over random
+    colours, and the outline is left out.
     """
     person = rays.person.float()
     everywhere = torch.ones_like(person)
-    if own_background:
+    if models_background:
         return losses.Target(rays.colour, person, everywhere), draws
     if rays.plate is not None:
         colour = torch.where((rays.person | rays.edge)[:, None], rays.colour, rays.plate)
-        return losses.Target(colour, person, everywhere), draws.over(rays.plate)
-    colour = torch.where(rays.person[:, None], rays.colour, draws.beyond)
+        return losses.Target(colour, person, everywhere), draws.with_background(rays.plate)
+    colour = torch.where(rays.person[:, None], rays.colour, draws.background)
     return losses.Target(colour, person, (~rays.edge).float()), draws
 
 
 def not_finite(terms: dict[str, Tensor], gradients: list[Tensor], step: int, processes: Distributed) -> str | None:
-    """None where all is finite in all processes, so that they go on or skip together; else which losses or gradients
-    are not. A device is asked once."""
+    """Return None if all values are finite in all processes, so that they go on or skip together; else name the losses
+    or gradients that are not. Values are read from the device once."""
     values = torch.stack([value.detach() for value in terms.values()] + [g.sum() for g in gradients])
     finite = values.isfinite().tolist()
     if not processes.all_max(float(not all(finite))):

@@ -1,5 +1,5 @@
-"""Training: the field with the poses of the training frames, then what belongs to novel frames, their poses and
-deformations, against the finished field."""
+"""Training: first the field with the poses of the training frames; then the poses and deformations of novel frames,
+against the finished field."""
 
 import dataclasses
 import json
@@ -23,34 +23,34 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.config import TrainingSettings
-from hnerf.fields.conditions import Conditions, Draws, joined, shard
+from hnerf.fields.conditions import Conditions, Draws, concatenate, shard
 from hnerf.fields.samples import RaySamples
 from hnerf.training.auto_settings import SceneStatistics, decide
 from hnerf.training.checkpoint import load_checkpoint, save_checkpoint
 from hnerf.training.distributed import Distributed
 from hnerf.training.exposure import camera_gains
 from hnerf.training.gather import gather_pixels
-from hnerf.training.losses import pixel
+from hnerf.training.losses import pixel_colour
 from hnerf.training.parts import decide_parts
-from hnerf.training.pixels import AT_EDGES, Rays
+from hnerf.training.pixels import EDGE_SHARE, Rays
 from hnerf.training.step import Objective, PosedScene, TrainingError, not_finite
 
 logger = logging.getLogger("hnerf.training")
 
 WARM_UP_STEPS = 20
-FINAL_LEARNING_RATE = 0.1  # share of the first that is left at the end
-SKIPS_ALLOWED = 2  # in a row; one more non-finite step stops the run
+FINAL_LEARNING_RATE = 0.1  # at the end, relative to the first
+SKIPS_ALLOWED = 2  # consecutive; one more non-finite step stops the run
 HELD_OUT_RAYS = 2048
-LEAST_COVERAGE = 0.1  # of the person's pixels; below it the surface has collapsed
-MOST_AROUND = 0.8  # of the surroundings; above it the surface fills the box
-LOOKS_A_RAY = 64  # at least, through a whole scene: valid-wave's body covers 38 % by 16, 59 % by 64, 64 % by 256
+MIN_PERSON_COVERAGE = 0.1  # of the person's pixels; below it the surface has collapsed
+MAX_BACKGROUND_COVERAGE = 0.8  # of the background pixels; above it the surface fills the box
+MIN_SAMPLES_PER_RAY = 64  # through a whole scene: valid-wave's body covers 38 % with 16, 59 % with 64, 64 % with 256
 LOG_STEPS = 25
-ATTEMPTED_FRAMES = 8  # at most, to see what memory rays need
-POSES_APART = 6  # training poses between those that say how thick the shell must be
+TRIAL_FRAMES = 8  # at most, to measure the memory of rays
+POSE_STRIDE = 6  # between the training poses for which the shell is tightened
 
 
 class Trainer:
-    """All state of one training; `run` goes from wherever the checkpoint left it to the end."""
+    """State of one training; `run` continues from the checkpoint to the end."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class Trainer:
         out: Path,
         processes: Distributed,
     ):
-        began = time.monotonic()
+        started_at = time.monotonic()
         self.settings, self.decisions = decide(SceneStatistics.of(capture, masks, body), settings)
         settings, self.out, self.processes = self.settings, out, processes
         device = processes.device
@@ -69,33 +69,33 @@ class Trainer:
         self.generator = torch.Generator(device).manual_seed(settings.seed)
         self.static = len(capture.train_frames) == 1
         self.body = body.to(device)
-        self.field = build_field(settings, self.body, self.static).to(device)
+        self.field = build_field(settings.field, self.body, self.static).to(device)
         bodies = PosedBodies(self.body.rig, self.body.theta, self.body.root, self.field.canonical_m)
         self.objective = Objective(self.field, bodies.correction(), settings)
         self.optimizer = torch.optim.Adam(self._parameter_groups(), betas=(0.9, 0.99), eps=1e-12, fused=True)
         self.first_rates = [group["lr"] for group in self.optimizer.param_groups]
         self.gains, self.decisions["gains"] = camera_gains(capture, masks, body)
         logger.info("gathering pixels")
-        reached = None if self.field.whole_images else self.field.reached
-        self.pixels = gather_pixels(capture, masks, body, body.frames, reached, self.gains, out, processes)
-        self.at_edges = 0.0 if self.field.own_background else AT_EDGES  # the paper draws from all pixels alike
-        seen = self.pixels.starts.diff() > 0  # not where a frame's masks were all dropped
+        visible_pixels = None if self.field.whole_images else self.field.visible_pixels
+        self.pixels = gather_pixels(capture, masks, body, body.frames, visible_pixels, self.gains, out, processes)
+        self.edge_share = 0.0 if self.field.models_background else EDGE_SHARE  # the paper draws uniformly
+        seen = self.pixels.starts.diff() > 0  # False where all masks of a frame were dropped
         rows = {frame: row for row, frame in enumerate(body.frames) if seen[row]}
         self.train_rows = torch.tensor([rows[f] for f in capture.train_frames if f in rows], device=device)
         held_out = [rows[f] for f in capture.novel_pose_frames if f in rows and f not in capture.train_frames]
         self.novel_rows = torch.tensor(held_out, dtype=torch.long, device=device)
         self.step, self.skipped, self.seconds = 0, 0, 0.0
-        self.field_steps, self.field_seconds = settings.steps, 0.0  # fewer steps where the time is up before
+        self.field_steps, self.field_seconds = settings.steps, 0.0  # fewer steps if the time limit comes first
         self.history: list[dict[str, Any]] = []
         self._set_poses(bodies)
         rays = settings.frames_per_step * settings.rays_per_frame
-        self.parts, self.decisions["parts"] = decide_parts(rays, settings.memory_gib, self._attempt, processes)
+        self.parts, self.decisions["parts"] = decide_parts(rays, settings.memory_gib, self._trial_loss, processes)
         self._resume()
-        self.setup_seconds = time.monotonic() - began
+        self.setup_seconds = time.monotonic() - started_at
 
     @property
     def steps(self) -> int:
-        """Of both phases."""
+        """Number of steps of both phases."""
         return self.field_steps + (self.settings.novel_pose_steps if self._novel_frames_learn else 0)
 
     @property
@@ -108,9 +108,9 @@ class Trainer:
         return [*self.field.parameter_groups(), {"params": list(self.objective.correction.parameters()), "lr": rate}]
 
     def _set_poses(self, bodies: PosedBodies) -> None:
-        """Take the bodies as they stand now for the coming steps."""
+        """Use the bodies' current poses for the coming steps."""
         frame_rows = torch.arange(len(bodies.theta), device=bodies.theta.device)
-        self.conditions = Conditions.of(bodies.rig, bodies.theta, bodies.root, frame_rows, self.settings.paper.scene_m)
+        self.conditions = Conditions.of(bodies.rig, bodies.theta, bodies.root, frame_rows, self.settings.field.scene_m)
         self.scene = PosedScene(bodies, self.field.region(bodies, self.conditions))
 
     def run(self) -> dict[str, Any]:
@@ -124,10 +124,10 @@ class Trainer:
         while self.step < self.steps:
             if self.step == self.field_steps:
                 self._freeze_field()
-                self.optimizer.state.clear()  # its momentum would carry on the training poses
+                self.optimizer.state.clear()  # its momentum would keep moving the training poses
             terms = self._optimise(module)
             self.step += 1
-            self.seconds = self.processes.all_max(time.monotonic() - started)  # one clock, as rates follow it
+            self.seconds = self.processes.all_max(time.monotonic() - started)  # one clock: learning rates follow it
             if self.step < self.field_steps and self.settings.seconds and self.seconds >= self.settings.seconds:
                 self.field_steps = self.step
             if self.step == self.field_steps:
@@ -135,19 +135,19 @@ class Trainer:
             snapshot_due = bool(snapshots_s) and self.seconds >= snapshots_s[0]
             checkpoint_due = self.step % self.settings.checkpoint_steps == 0 or self.step == self.steps
             absorb_due = self.step % self.settings.absorb_steps == 0 or self.step in (self.field_steps, self.steps)
-            if absorb_due or snapshot_due or checkpoint_due:  # who resumes finds the bodies where they stood
+            if absorb_due or snapshot_due or checkpoint_due:  # a resumed training finds the same bodies
                 self._absorb()
             if snapshot_due:
                 if self.processes.is_main:
                     self._save(self.out / "snapshots" / f"{snapshots_s[0]:g}")
                 snapshots_s.pop(0)
                 self.processes.barrier()
-                started = time.monotonic() - self.seconds  # watching takes no time
+                started = time.monotonic() - self.seconds  # writing snapshots does not count
             if self.step % LOG_STEPS == 0 or self.step in (1, self.field_steps, self.steps):
                 self._record(terms)
                 if time.monotonic() - last_log > 5 and self.processes.is_main:
                     last_log = time.monotonic()
-                    message = _in_words(self.history[-1])
+                    message = _progress_message(self.history[-1])
                     logger.info("step %d of %d, %.0f s: %s", self.step, self.steps, self.seconds, message)
             if checkpoint_due and self.processes.is_main:
                 save_checkpoint(self.out, self._state())
@@ -159,14 +159,14 @@ class Trainer:
     def _absorb(self) -> None:
         self.scene.bodies.absorb(self.objective.correction, self.train_rows if self.settings.one_posture else None)
         if self.step <= self.field_steps:
-            self._learn_for_all()
-            self.field.tighten(self.scene.bodies.rig, self.conditions.pose[self.train_rows[::POSES_APART]])
+            self._average_over_frames()
+            self.field.tighten(self.scene.bodies.rig, self.conditions.pose[self.train_rows[::POSE_STRIDE]])
         self._set_poses(self.scene.bodies)
 
-    def _learn_for_all(self) -> None:
-        """What training frames have in common holds for all poses: in one posture that is the posture itself."""
+    def _average_over_frames(self) -> None:
+        """Apply what the training frames have in common to all poses; with one posture this is the posture itself."""
         rows, bodies = self.train_rows, self.scene.bodies
-        self.field.learn_for_all(rows)
+        self.field.average_over_frames(rows)
         if not self.field.common_rest or self.settings.one_posture or len(rows) < 2:
             return
         theta, root = bodies.theta.clone(), bodies.root.clone()
@@ -175,7 +175,8 @@ class Trainer:
         bodies.set_poses(rig, theta, root)
 
     def _freeze_field(self) -> None:
-        """What belongs to novel frames is fitted to the finished field, so that it never learns from their pixels."""
+        """Freeze the field; the parameters of novel frames are fitted to it, so that it never learns from their
+        pixels."""
         self.field.requires_grad_(False)
         self.objective.correction.shape.requires_grad_(False)
         for parameter in self.field.frame_parameters():
@@ -186,15 +187,15 @@ class Trainer:
         rows = self.train_rows if self.step < self.field_steps else self.novel_rows
         pick = torch.randperm(len(rows), generator=self.generator, device=rows.device)[: s.frames_per_step]
         count = s.frames_per_step * s.rays_per_frame // len(pick)
-        rays = self.pixels.draw(rows[pick], count, self.generator, self.at_edges)
-        samples = self.field.samples_in_training(self._done())
+        rays = self.pixels.draw(rows[pick], count, self.generator, self.edge_share)
+        samples = self.field.training_samples(self._progress())
         draws = Draws.random(len(rays.frame), samples, s.noise, self.generator)
-        conditions = self.conditions.noisy(s.noise, self.generator)
+        conditions = self.conditions.with_noise(s.noise, self.generator)
         self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
         terms = self.parts.backward(module, self.scene, rays, conditions, draws, self.processes)
-        self.field.step_taken()
-        if self.step >= self.field_steps:  # what pulls all frames back to the fit is not for frames that are finished
+        self.field.on_step_end()
+        if self.step >= self.field_steps:  # the loss that pulls all frames to the fit must not move finished frames
             for pose in (self.objective.correction.turn, self.objective.correction.move_m):
                 if pose.grad is not None:
                     pose.grad[self.train_rows] = 0.0
@@ -213,18 +214,18 @@ class Trainer:
                 )
         return terms
 
-    def _attempt(self, about: int) -> tuple[int, Tensor]:
-        """The number of rays, about so many, and the loss of a batch as at the end of the training; takes no random
-        number that the training would."""
+    def _trial_loss(self, about: int) -> tuple[int, Tensor]:
+        """Return the number of rays, about `about`, and the loss of a batch as at the end of training. The training's
+        random numbers are not consumed."""
         generator = torch.Generator(self.processes.device).manual_seed(self.settings.seed)
-        rows, noise = self.train_rows[: self.settings.frames_per_step][:ATTEMPTED_FRAMES], self.settings.noise
-        rays = self.pixels.draw(rows, about // len(rows), generator, self.at_edges)
-        draws = Draws.random(len(rays.frame), self.field.samples_in_training(1.0), noise, generator)
-        terms = self.objective(self.scene, rays, self.conditions.noisy(noise, generator), draws)
+        rows, noise = self.train_rows[: self.settings.frames_per_step][:TRIAL_FRAMES], self.settings.noise
+        rays = self.pixels.draw(rows, about // len(rows), generator, self.edge_share)
+        draws = Draws.random(len(rays.frame), self.field.training_samples(1.0), noise, generator)
+        terms = self.objective(self.scene, rays, self.conditions.with_noise(noise, generator), draws)
         return len(rays.frame), torch.stack(list(terms.values())).sum()
 
-    def _done(self) -> float:
-        """How much of the phase is over."""
+    def _progress(self) -> float:
+        """Return the progress of the phase, 0 to 1."""
         s = self.settings
         if self.step < self.field_steps:
             return max(self.step / s.steps, self.seconds / s.seconds if s.seconds else 0.0)
@@ -232,7 +233,7 @@ class Trainer:
 
     def _set_rates(self) -> None:
         phase_step = self.step if self.step < self.field_steps else self.step - self.field_steps
-        factor = FINAL_LEARNING_RATE ** self._done() * min(1.0, (phase_step + 1) / WARM_UP_STEPS)
+        factor = FINAL_LEARNING_RATE ** self._progress() * min(1.0, (phase_step + 1) / WARM_UP_STEPS)
         for group, rate in zip(self.optimizer.param_groups, self.first_rates, strict=True):
             group["lr"] = rate * factor
 
@@ -245,37 +246,38 @@ class Trainer:
 
     @torch.no_grad()
     def _held_out_psnr(self) -> float:
-        """PSNR on person pixels of novel-pose frames in training cameras, which the field is not trained on."""
-        rays, samples = self._look(self.novel_rows, self.field.samples)
-        mixed = rays.edge & (not self.field.own_background)  # with what only such a field knows
-        error = (pixel(samples.in_box * samples.alpha, samples) - rays.colour)[rays.person & ~mixed]
+        """Return the PSNR on person pixels of novel-pose frames in training cameras, on which the field is not
+        trained."""
+        rays, samples = self._sample_fixed_rays(self.novel_rows, self.field.samples)
+        mixed = rays.edge & (not self.field.models_background)  # with a background that only such a field models
+        error = (pixel_colour(samples.in_box * samples.alpha, samples) - rays.colour)[rays.person & ~mixed]
         return float(-10 * torch.log10((error**2).mean()))
 
     @torch.no_grad()
-    def _look(self, rows: Tensor, count: int) -> tuple[Rays, RaySamples]:
-        """Rays at some frames, the same ones each time, and what the model samples on them for a rendering, so many
-        random numbers a ray."""
+    def _sample_fixed_rays(self, rows: Tensor, count: int) -> tuple[Rays, RaySamples]:
+        """Return rays at some frames, the same ones on each call, and their samples as for rendering, with `count`
+        random numbers per ray."""
         generator = torch.Generator(self.processes.device).manual_seed(self.settings.seed)
         rays = self.pixels.draw(rows, HELD_OUT_RAYS // len(rows) + 1, generator)
         parts, found = math.ceil(len(rays.frame) / self.parts.most_rays), []
-        for own in (shard(rays, part, parts) for part in range(parts)):
-            draws = Draws.deterministic(len(own.frame), count, self.processes.device)
-            where = own.origins_m, own.directions, own.frame
+        for part in (shard(rays, k, parts) for k in range(parts)):
+            draws = Draws.deterministic(len(part.frame), count, self.processes.device)
+            where = part.origins_m, part.directions, part.frame
             found.append(self.field.sample(self.scene.bodies, self.scene.region, *where, self.conditions, draws)[0])
-        return rays, joined(found)
+        return rays, concatenate(found)
 
     def _require_surface(self) -> None:
-        """TrainingError where the surface is empty or fills the box: of the surroundings, rays that pass the box are
-        asked, away from outlines unless pixels are so large that there are no others."""
-        count = max(self.field.samples, LOOKS_A_RAY) if self.field.own_background else self.field.samples
-        rays, samples = self._look(self.train_rows, count)
+        """Raise TrainingError if the surface is empty or fills the box. Of the background, rays through the box are
+        evaluated, away from outlines unless pixels are so large that there are no others."""
+        count = max(self.field.samples, MIN_SAMPLES_PER_RAY) if self.field.models_background else self.field.samples
+        rays, samples = self._sample_fixed_rays(self.train_rows, count)
         coverage = self.field.coverage(samples)
         beside = ~rays.person & (samples.in_box > 0).any(1)
         clear = beside & ~rays.edge
         person, around = coverage[rays.person].mean(), coverage[clear if clear.any() else beside].mean()
-        if not person >= LEAST_COVERAGE:  # nor where it is not a number
+        if not person >= MIN_PERSON_COVERAGE:  # also true for NaN
             raise TrainingError(f"the surface is empty (covers {person:.0%} of the person): check masks and body fit")
-        if around > MOST_AROUND:
+        if around > MAX_BACKGROUND_COVERAGE:
             raise TrainingError(f"the surface fills the box (covers {around:.0%} of the surroundings): check the masks")
 
     def _state(self) -> dict[str, Any]:
@@ -306,16 +308,15 @@ class Trainer:
         self.generator.set_state(state["generator"].cpu())
         self.history = json.loads(state["history"])
         rig = dataclasses.replace(self.body.rig, **state["rig"])
-        self.scene.bodies.set_poses(
-            rig, state["theta"], state["root"]
-        )  # from the fit, as they did: bit by bit the same
+        # from the fit, as in an uninterrupted training: bit by bit the same
+        self.scene.bodies.set_poses(rig, state["theta"], state["root"])
         self._set_poses(self.scene.bodies)
         if self.step > self.field_steps:
             self._freeze_field()
         logger.info("resumed at step %d", self.step)
 
     def _save(self, folder: Path) -> None:
-        """What `load_avatar` reads: field, settings and fine-tuned body."""
+        """Write what `load_avatar` reads: field, settings and fine-tuned body."""
         folder.mkdir(parents=True, exist_ok=True)
         bodies = self.scene.bodies
         BodyFit(bodies.rig, self.body.frames, bodies.theta, bodies.root).to("cpu").save(folder)
@@ -359,17 +360,17 @@ def train(
     out: Path,
     processes: Distributed | None = None,
 ) -> dict[str, Any]:
-    """Train the subject into `out`, from its checkpoint where there is one; the report as a dict.
+    """Train the subject into `out`, from its checkpoint if there is one; return the report as a dict.
 
-    The last checkpoint stays, so that who is stopped while the files are written need only write them again;
-    `remove_checkpoint` is for the caller.
-    Raises TrainingError where the surface collapses or the losses stay non-finite.
+    The last checkpoint is kept, so that a training stopped while writing its files need only write them again; the
+    caller calls `remove_checkpoint`. Raises TrainingError if the surface collapses or the losses stay non-finite.
     """
     return Trainer(capture, masks, body, settings, out, processes or Distributed.join()).run()
 
 
-def _in_words(row: dict[str, Any]) -> str:
-    """A row of the history for who waits: losses that are not zero, and PSNR on unseen frames where there is any."""
+def _progress_message(row: dict[str, Any]) -> str:
+    """Return a row of the history in words: losses that are not zero, and the PSNR on unseen frames if there are
+    any."""
     message = [f"{name} {value:.2g}" for name, value in row["losses"].items() if value]
     if "held_out" in row:
         message.append(f"{row['held_out']['psnr']:.1f} dB on unseen frames")

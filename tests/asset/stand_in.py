@@ -22,7 +22,7 @@ class StandInAvatar:
     def without_frames(self) -> "StandInAvatar":
         return self
 
-    def on_body(self, body: BodyFit) -> "StandInAvatar":
+    def with_body(self, body: BodyFit) -> "StandInAvatar":
         return StandInAvatar(body)
 
     def signed_distance(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:

@@ -6,13 +6,13 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
-from hnerf.avatar.model_file import fill_field, write_field
+from hnerf.avatar.model_file import load_field, write_field
 from hnerf.errors import InputError
 from hnerf.fields.encoding import FeatureGrids
 
 
 def small_field(cells: int = 4) -> nn.Module:
-    """A grid of 2 x 3 x 5 nodes (x, y, z) with two features, or a finer one, and a number."""
+    """Return a field with a grid of 2 x 3 x 5 nodes (x, y, z) with two features, or a finer one, and a number."""
     field = nn.Module()
     field.grids = FeatureGrids(torch.zeros(3), torch.tensor([1.0, 2.0, 4.0]), (cells,), 2)
     field.sharpness = nn.Parameter(torch.tensor(1 / 3))
@@ -22,12 +22,12 @@ def small_field(cells: int = 4) -> nn.Module:
 def written_and_read(learned: nn.Module, path: Path) -> nn.Module:
     read = small_field()
     write_field(learned, path)
-    fill_field(read, load_file(path), path)
+    load_field(read, load_file(path), path)
     return read
 
 
 def test_a_grid_is_stored_in_steps_of_a_127th_of_its_greatest_feature(tmp_path: Path):
-    """-12.7 makes the step 0.1, of which 3.14 is 31 and 0.04 none; the number beside the grid stays as it is."""
+    """-12.7 makes the step 0.1, so 3.14 is 31 steps and 0.04 none; the number beside the grid stays as it is."""
     learned = small_field()
     learned.grids.levels[0].data[0, 1, 3, 2, 1] = -12.7
     learned.grids.levels[0].data[0, 0, 0, 0, 0] = 3.14
@@ -45,7 +45,7 @@ def test_a_grid_that_has_learned_nothing_comes_back_empty(tmp_path: Path):
 
 
 def test_nodes_that_nothing_was_learned_of_take_no_room(tmp_path: Path):
-    """41 x 21 x 11 nodes of 2 features, of which a tenth has random values: less than 3 bytes a node of those."""
+    """A tenth of 41 x 21 x 11 nodes of 2 features has random values: less than 3 bytes per node of those."""
     learned, path = small_field(cells=40), tmp_path / "model.safetensors"
     nodes = learned.grids.levels[0].data
     nodes[:, :, :4] = torch.rand(nodes[:, :, :4].shape, generator=torch.Generator().manual_seed(0))
@@ -60,16 +60,16 @@ def test_what_lacks_a_part_is_of_another_version(tmp_path: Path, name: str):
     write_field(small_field(), path)
     stored = load_file(path)
     del stored[name]
-    with pytest.raises(InputError, match=r"model.safetensors: of another version; train the subject again"):
-        fill_field(small_field(), stored, path)
+    with pytest.raises(InputError, match=r"model.safetensors: written by another version; train the subject again"):
+        load_field(small_field(), stored, path)
 
 
 @pytest.mark.parametrize("cells", [2, 8])
 def test_a_grid_of_another_size_is_of_another_version(tmp_path: Path, cells: int):
     path = tmp_path / "model.safetensors"
     write_field(small_field(cells), path)
-    with pytest.raises(InputError, match=r"of another version"):
-        fill_field(small_field(), load_file(path), path)
+    with pytest.raises(InputError, match=r"written by another version"):
+        load_field(small_field(), load_file(path), path)
 
 
 def test_a_damaged_grid_is_of_another_version(tmp_path: Path):
@@ -77,5 +77,5 @@ def test_a_damaged_grid_is_of_another_version(tmp_path: Path):
     write_field(small_field(), path)
     stored = load_file(path)
     stored["grids.levels.0.steps"] = torch.from_numpy(np.arange(20, dtype=np.uint8))
-    with pytest.raises(InputError, match=r"of another version"):
-        fill_field(small_field(), stored, path)
+    with pytest.raises(InputError, match=r"written by another version"):
+        load_field(small_field(), stored, path)

@@ -1,4 +1,4 @@
-"""Subjects that nobody has trained: what other versions left, how they are built and shown."""
+"""Untrained subjects: files of other versions, construction and rendering."""
 
 import json
 from pathlib import Path
@@ -22,7 +22,7 @@ from tests.training.scene import TINY, record
 def subject(tmp_path: Path) -> Path:
     body = record(tmp_path / "capture")[2]
     body.save(tmp_path)
-    write_field(build_field(TINY, body, False), tmp_path / "model.safetensors")
+    write_field(build_field(TINY.field, body, False), tmp_path / "model.safetensors")
     (tmp_path / "settings.json").write_text(json.dumps({"static": False, "training": TINY.model_dump()}))
     return tmp_path
 
@@ -37,7 +37,7 @@ def subject(tmp_path: Path) -> Path:
 )
 def test_other_settings_are_refused(subject: Path, stored: dict[str, object]):
     (subject / "settings.json").write_text(json.dumps(stored))
-    with pytest.raises(InputError, match=r"settings\.json: of another version; train the subject again$"):
+    with pytest.raises(InputError, match=r"settings\.json: written by another version; train the subject again$"):
         load_avatar(subject)
 
 
@@ -45,20 +45,20 @@ def test_a_field_without_its_body_is_refused(subject: Path):
     path = subject / "model.safetensors"
     load_avatar(subject)
     save_file({name: tensor for name, tensor in load_file(path).items() if name != "canonical_m"}, path)
-    with pytest.raises(InputError, match=r"model\.safetensors: of another version; train the subject again$"):
+    with pytest.raises(InputError, match=r"model\.safetensors: written by another version; train the subject again$"):
         load_avatar(subject)
 
 
 @pytest.mark.parametrize("bf16", [False, True])
 def test_both_networks_of_the_paper_multiply_as_the_settings_say(tmp_path: Path, bf16: bool) -> None:
-    changes = {"machinery": "paper", "paper": {"bf16": bf16}}
-    field = build_field(TrainingSettings.model_validate(changes), record(tmp_path)[2], False)
+    changes = {"field": {"kind": "paper", "bf16": bf16}}
+    field = build_field(TrainingSettings.model_validate(changes).field, record(tmp_path)[2], False)
     assert isinstance(field, PaperField)
     assert field.radiance.trunk.bf16 is field.residual.trunk.bf16 is bf16
 
 
 def test_the_more_samples_rays_have_the_fewer_are_rendered_at_once(subject: Path, monkeypatch: pytest.MonkeyPatch):
-    """Eight a ray, and room for 2048."""
+    """Eight samples per ray, and a limit of 2048 samples."""
     capture, _, body = record(subject / "capture")
     avatar, at_once = load_avatar(subject), []
     look = avatar.field.render_rays
@@ -67,7 +67,7 @@ def test_the_more_samples_rays_have_the_fewer_are_rendered_at_once(subject: Path
         at_once.append(len(origins_m))
         return look(bodies, region, origins_m, *rest)
 
-    monkeypatch.setattr(avatar.field, "look", counted)
-    monkeypatch.setattr(model, "SAMPLES_AT_ONCE", 2048)
+    monkeypatch.setattr(avatar.field, "render_rays", counted)
+    monkeypatch.setattr(model, "SAMPLES_PER_BATCH", 2048)
     avatar.render(capture.cameras["0"], body.theta[0], body.root[0])
     assert len(at_once) > 1 and set(at_once[:-1]) == {256} and at_once[-1] <= 256

@@ -1,5 +1,5 @@
-"""A recording that a static method can learn in seconds: a ball, coloured by its normal, before a grey plate. The body
-fitted to it is a unit box: nothing but its extent tells about the ball."""
+"""A recording that a static method learns in seconds: a ball, coloured by its normal, before a grey plate. The body
+fitted to it is a unit box, so that only its extent says anything about the ball."""
 
 import dataclasses
 from pathlib import Path
@@ -24,20 +24,20 @@ RING = tuple("01234567")  # every 45 degrees
 
 
 def render(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """The ball as a camera sees it: colour (H, W, 3) in [0, 255], black elsewhere; mask (H, W)."""
+    """Render the ball from a camera: colour (H, W, 3) in [0, 255], black elsewhere; mask (H, W)."""
     y, x = np.mgrid[:SIZE_PX, :SIZE_PX]
     origins, directions = camera.rays(np.stack([x.ravel(), y.ravel()], 1).astype(np.float64))
-    along = ((MIDDLE_M - origins) * directions).sum(1)
-    beside_sq = ((MIDDLE_M - origins) ** 2).sum(1) - along**2
+    points_on_rays = ((MIDDLE_M - origins) * directions).sum(1)
+    beside_sq = ((MIDDLE_M - origins) ** 2).sum(1) - points_on_rays**2
     mask = beside_sq < RADIUS_M**2
-    depth = along - np.sqrt(np.maximum(RADIUS_M**2 - beside_sq, 0))
+    depth = points_on_rays - np.sqrt(np.maximum(RADIUS_M**2 - beside_sq, 0))
     normal = (origins + depth[:, None] * directions - MIDDLE_M) / RADIUS_M
     colour = np.where(mask[:, None], 127.5 + 100 * normal, 0)
     return colour.reshape(SIZE_PX, SIZE_PX, 3), mask.reshape(SIZE_PX, SIZE_PX)
 
 
 def body() -> BodyFit:
-    """The unit box that stands for the ball's body."""
+    """Return the unit box that stands for the ball's body."""
     return BodyFit(box_rig(splits=4), (0,), torch.zeros(1, 2, 3), torch.eye(4)[None])
 
 
@@ -57,7 +57,7 @@ def record(folder: Path) -> tuple[Capture, KnownMasks, BodyFit]:
 
 
 def trained(folder: Path, settings: TrainingSettings, cameras: tuple[str, ...]) -> TrainedAvatar:
-    """What is learned of the ball from some of the ring's cameras."""
+    """Train on the ball from some of the ring's cameras."""
     capture, masks, fit = record(folder / "capture")
     capture = dataclasses.replace(capture, train_cameras=cameras)
     (folder / "out").mkdir()
@@ -66,7 +66,7 @@ def trained(folder: Path, settings: TrainingSettings, cameras: tuple[str, ...]) 
 
 
 def psnr(avatar: TrainedAvatar, folder: Path, name: str) -> float:
-    """Of the whole picture that a camera of the ring sees, over black."""
+    """Return the PSNR of the whole image of a camera of the ring, over black."""
     camera = record(folder / "capture")[0].cameras[name]
     drawn = avatar.render(camera, avatar.body.theta[0], avatar.body.root[0])
     wanted = torch.from_numpy(render(camera)[0] / 255).float()
@@ -74,7 +74,8 @@ def psnr(avatar: TrainedAvatar, folder: Path, name: str) -> float:
 
 
 def inner_psnr(avatar: TrainedAvatar, folder: Path, name: str) -> tuple[float, float]:
-    """Of the ball's colours, two pixels and more inside its outline, and what one colour for all of them is worth."""
+    """Return the PSNR of the ball's colours two or more pixels inside its outline, and that of a single colour for all
+    of them."""
     camera = record(folder / "capture")[0].cameras[name]
     colour, mask = render(camera)
     inside = torch.from_numpy(cv2.erode(mask.astype(np.uint8), np.ones((5, 5))) > 0)
@@ -85,7 +86,7 @@ def inner_psnr(avatar: TrainedAvatar, folder: Path, name: str) -> tuple[float, f
 
 
 def radii_m(avatar: TrainedAvatar, directions: torch.Tensor) -> torch.Tensor:
-    """How far from the ball's middle the outermost surface lies along directions (N, 3), (N,)."""
+    """Return the distance (N,) of the outermost surface from the ball's centre along directions (N, 3)."""
     steps_m = torch.linspace(0, 1, 201)
     points = torch.from_numpy(MIDDLE_M).float() + directions[:, None] * steps_m[:, None]
     inside = avatar.signed_distance(points.flatten(0, 1), avatar.body.theta[0], avatar.body.root[0]).view(-1, 201) < 0

@@ -1,4 +1,5 @@
-"""What a dynamic method learns in seconds of the bending column (tests/training/scene.py): two frames, four cameras."""
+"""Training of a dynamic method, in seconds, on the bending column (tests/training/scene.py): two frames, four
+cameras."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,14 +25,14 @@ CELLS = 48  # of the box in which a surface is looked for, on its longest side
 
 @dataclass(frozen=True)
 class Learned:
-    """A recording and what was learned of its frames 0 and 1."""
+    """A recording and the avatar trained on its frames 0 and 1."""
 
     capture: Capture
     body: BodyFit
     avatar: TrainedAvatar
 
     def psnr(self, frame: int) -> float:
-        """Of the photographs of a frame, drawn over their plate, all cameras together."""
+        """Return the PSNR of a frame's photographs, rendered over their plate, all cameras together."""
         errors = []
         for name, camera in self.capture.cameras.items():
             drawn = self.avatar.render(camera, self.body.theta[frame], self.body.root[frame])
@@ -42,7 +43,7 @@ class Learned:
         return float(-10 * torch.log10(torch.stack(errors).mean()))
 
     def overlap(self, frame: int) -> float:
-        """Of the surface's volume with the column's own in a frame: intersection over union."""
+        """Return the intersection over union of the surface's volume and the column's in a frame."""
         theta, root = self.body.theta[frame], self.body.root[frame]
         vertices_m = pose_vertices(self.body.rig, theta, root).numpy()
         column = trimesh.Trimesh(vertices_m, self.body.rig.faces.numpy(), process=False)
@@ -59,7 +60,7 @@ def learn(folder: Path, settings: TrainingSettings, bends_rad: tuple[float, floa
 
 
 def three_poses() -> BodyFit:
-    """The column upright and bent, as a fit of three frames."""
+    """Return the column upright and bent, as a fit of three frames."""
     theta = torch.zeros(3, 2, 3)
     theta[:, 1, 1] = torch.tensor([0.0, 0.3, 0.6])
     return BodyFit(box_rig(bend_segments=6, splits=2), (0, 1, 2), theta, torch.eye(4).repeat(3, 1, 1))

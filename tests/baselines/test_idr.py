@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from hnerf.avatar.trained import build_field
-from hnerf.baselines.idr import SdfNetwork, intersection, trace
+from hnerf.baselines.idr import SdfNetwork, intersection, trace_surface
 from hnerf.config import load_settings
 from hnerf.errors import InputError
 from tests.baselines.ball import RADIUS_M, RING, body, inner_psnr, psnr, radii_m, trained
@@ -13,28 +13,28 @@ from tests.baselines.ball import RADIUS_M, RING, body, inner_psnr, psnr, radii_m
 SMALL = [
     "training.steps=300",
     "training.rays_per_frame=256",
-    "training.idr.width=32",
-    "training.idr.samples=16",
+    "training.field.width=32",
+    "training.field.samples=16",
 ]
 AXES = torch.cat([torch.eye(3), -torch.eye(3)])
 
 
 def sphere(points: Tensor) -> Tensor:
-    """Signed distance to the unit sphere."""
+    """Return the signed distance to the unit sphere."""
     return points.norm(dim=-1) - 1
 
 
 def traced(distance, origins: Tensor, directions: Tensor, samples: int = 16) -> tuple[Tensor, Tensor]:
-    """Traced between depths 0 and 8."""
+    """Trace between depths 0 and 8."""
     near, far = torch.zeros(len(origins)).to(origins), torch.full((len(origins),), 8.0).to(origins)
-    tried = torch.linspace(0, 8, samples).to(origins).expand(len(origins), -1)
-    values = distance(origins[:, None] + directions[:, None] * tried[..., None])
-    return trace(distance, origins, directions, near, far, tried, values)
+    probe_depths = torch.linspace(0, 8, samples).to(origins).expand(len(origins), -1)
+    values = distance(origins[:, None] + directions[:, None] * probe_depths[..., None])
+    return trace_surface(distance, origins, directions, near, far, probe_depths, values)
 
 
 def test_rays_meet_the_unit_sphere_where_geometry_says() -> None:
-    """From x = -3: through the middle at 2, 0.6 beside it at 3 - 0.8, 1.5 beside it never, and away from it never; from
-    inside the sphere nothing is entered."""
+    """From x = -3: through the middle at 2, 0.6 beside it at 3 - 0.8, never 1.5 beside it or away from it; from inside
+    the sphere no ray enters it."""
     origins = torch.tensor([[-3.0, 0, 0], [-3, 0.6, 0], [-3, 1.5, 0], [-3, 0, 0], [0, 0, 0]])
     directions = torch.tensor([[1.0, 0, 0], [1, 0, 0], [1, 0, 0], [-1, 0, 0], [1, 0, 0]])
     depth, hit = traced(sphere, origins, directions)
@@ -44,15 +44,15 @@ def test_rays_meet_the_unit_sphere_where_geometry_says() -> None:
 
 @pytest.mark.parametrize("slope", [0.05, 2.0])
 def test_the_secant_mends_what_tracing_cannot(slope: float) -> None:
-    """Distances twenty times too small leave tracing on its way; twice too large lead it to the far side. The sampled
-    signs tell the crossing."""
+    """Distances twenty times too small stop tracing early, twice too large ones take it to the far side. The sampled
+    signs reveal the crossing."""
     origins, directions = torch.tensor([[-3.0, 0.0, 0.0]]), torch.tensor([[1.0, 0.0, 0.0]])
     depth, hit = traced(lambda x: slope * sphere(x), origins, directions)
     assert hit.all() and depth.item() == pytest.approx(2.0, abs=1e-3)
 
 
 def test_the_first_of_two_surfaces_is_met() -> None:
-    """Unit spheres at x = 0 and x = 3.5."""
+    """Two unit spheres at x = 0 and x = 3.5."""
     apart = torch.tensor([3.5, 0, 0])
     depth, hit = traced(
         lambda x: torch.minimum(sphere(x), sphere(x - apart)),
@@ -75,7 +75,7 @@ def test_the_intersection_moves_as_the_traced_point_does() -> None:
         return (points - theta[1:]).norm(dim=-1) - theta[0]
 
     def exact(theta: Tensor) -> Tensor:
-        """The nearer root of |o + t v - m|^2 = r^2."""
+        """Return the nearer root of |o + t v - m|^2 = r^2."""
         towards = theta[1:] - origins
         middle = (towards * directions).sum(-1)
         depth = middle - (theta[0] ** 2 - (towards**2).sum(-1) + middle**2).sqrt()
@@ -106,7 +106,7 @@ def test_the_intersection_moves_as_the_traced_point_does() -> None:
 
 
 def test_starts_as_a_sphere() -> None:
-    """From the middle outwards every direction leaves the surface once, on average at the radius."""
+    """From the centre outwards every direction leaves the surface once, on average at the radius."""
     torch.manual_seed(0)
     network = SdfNetwork(64, 0.4)
     directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
@@ -118,11 +118,11 @@ def test_starts_as_a_sphere() -> None:
 
 def test_more_than_one_moment_is_refused() -> None:
     with pytest.raises(InputError, match="IDR models one moment"):
-        build_field(load_settings("idr").training, body(), static=False)
+        build_field(load_settings("idr").training.field, body(), static=False)
 
 
 def test_overfits_the_ball(tmp_path: Path) -> None:
-    """Eight views: 23 dB in a training view, its colours 5 dB beyond what one colour is worth, and along the axes the
+    """With eight views: 23 dB in a training view, its colours 5 dB better than a single colour, and along the axes the
     surface within 4 cm of the ball's 35."""
     avatar = trained(tmp_path, load_settings("idr", SMALL).training, RING)
     assert psnr(avatar, tmp_path, "0") > 23
@@ -132,7 +132,7 @@ def test_overfits_the_ball(tmp_path: Path) -> None:
 
 
 def test_two_opposite_views_say_nothing_of_the_depth_between(tmp_path: Path) -> None:
-    """Cameras on the x axis see the same outline whatever the depth: the picture between loses at least 4 dB."""
+    """Cameras on the x axis see the same outline whatever the depth: a view from between them loses at least 4 dB."""
     avatar = trained(tmp_path, load_settings("idr", SMALL).training, ("0", "4"))
     assert psnr(avatar, tmp_path, "0") > 20
     assert psnr(avatar, tmp_path, "2") < psnr(avatar, tmp_path, "0") - 4

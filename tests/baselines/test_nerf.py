@@ -22,14 +22,14 @@ from tests.baselines.ball import RING, body, inner_psnr, psnr, record, trained
 SMALL = [
     "training.steps=250",
     "training.rays_per_frame=256",
-    "training.nerf.width=32",
-    "training.nerf.samples=16",
-    "training.nerf.learning_rate=0.01",
+    "training.field.width=32",
+    "training.field.samples=16",
+    "training.field.learning_rate=0.01",
 ]
 
 
 class Fog(torch.nn.Module):
-    """A network that says the same everywhere."""
+    """Network with the same output everywhere."""
 
     def __init__(self, density: float, grey: float):
         super().__init__()
@@ -45,20 +45,21 @@ class Roomy(NerfField):
 
 @pytest.fixture
 def fog() -> NerfField:
-    """The unit box with 0.5 m around it, whose half edge is 1 m; a thin dark coarse fog and a dense bright fine one."""
-    field = Roomy(body(), load_settings("nerf").training.nerf)
+    """Return a field over the unit box with a margin of 0.5 m, whose half edge is 1 m; the coarse fog is thin and dark,
+    the fine one dense and bright."""
+    field = Roomy(body(), load_settings("nerf").training.field)
     field.coarse, field.fine = Fog(0.5, 0.25), Fog(2.0, 0.75)
     return field
 
 
 def look(field: NerfField, jitter: Draws) -> tuple[RaySamples, Tensor]:
-    """One ray through the middle of the box, 2 m inside it, before white; another that misses it."""
+    """Render one ray through the middle of the box, 2 m inside it, over white, and another that misses it."""
     fit = body()
     bodies = PosedBodies(fit.rig, fit.theta, fit.root, field.canonical_m)
     conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.zeros(1, dtype=torch.long), 2.5)
     origins = torch.tensor([[-3.0, 0.5, 0.5], [-3.0, 5.0, 0.5]])
     directions, frame = torch.tensor([[1.0, 0, 0]]).repeat(2, 1), torch.zeros(2, dtype=torch.long)
-    draws = dataclasses.replace(jitter, beyond=torch.ones(2, 3))
+    draws = dataclasses.replace(jitter, background=torch.ones(2, 3))
     return field.sample(bodies, field.region(bodies, conditions), origins, directions, frame, conditions, draws)
 
 
@@ -67,7 +68,7 @@ def test_both_colours_by_hand(fog: NerfField) -> None:
     coarse 0.25 (1 - e^-1) + e^-1; the ray that misses the box sees white."""
     still = Draws.deterministic(2, 24, torch.device("cpu"))
     zero = torch.zeros(2, 24)
-    samples, depths = look(fog, dataclasses.replace(still, jitter=zero, finer=zero))
+    samples, depths = look(fog, dataclasses.replace(still, jitter=zero, fine=zero))
     assert samples.alpha.shape == depths.shape == (2, 72)
     target = Target(torch.zeros(2, 3), torch.ones(2), torch.ones(2))
     fine, coarse = 0.75 + 0.25 * math.exp(-4), 0.25 + 0.75 * math.exp(-1)
@@ -77,8 +78,8 @@ def test_both_colours_by_hand(fog: NerfField) -> None:
 
 
 def test_fine_samples_crowd_where_the_coarse_network_saw_something(fog: NerfField) -> None:
-    """A coarse wall from 4 m on, all opaque: the 24 fine samples that are drawn lie in the cell where it begins, which
-    reaches half-way to the samples beside it, 2 m / 24 apart."""
+    """The coarse network sees an opaque wall from 4 m on: the 24 fine samples lie in the cell where it begins, which
+    extends half-way to the samples beside it, 2 m / 24 apart."""
 
     class Wall(Fog):
         def forward(self, point: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
@@ -112,11 +113,11 @@ def test_distance_to_a_box_by_hand() -> None:
 
 def test_more_than_one_moment_is_refused() -> None:
     with pytest.raises(InputError, match="NeRF models one moment"):
-        build_field(load_settings("nerf").training, body(), static=False)
+        build_field(load_settings("nerf").training.field, body(), static=False)
 
 
 def test_overfits_the_ball(tmp_path: Path) -> None:
-    """Eight views: 25 dB in a training view, its colours 5 dB beyond what one colour is worth."""
+    """With eight views: 25 dB in a training view, its colours 5 dB better than a single colour."""
     avatar = trained(tmp_path, load_settings("nerf", SMALL).training, RING)
     assert psnr(avatar, tmp_path, "0") > 25
     colours, one_colour = inner_psnr(avatar, tmp_path, "0")
@@ -124,18 +125,18 @@ def test_overfits_the_ball(tmp_path: Path) -> None:
 
 
 def test_all_that_the_box_can_show_is_trained_on_and_drawn(fog: NerfField, tmp_path: Path) -> None:
-    """A camera 2 m before the middle of a box of 2 m sees its near side, 1 m off, through the whole image; one 12 m
-    away sees in the middle what is inside the box, and in the corner what is not."""
+    """A camera 2 m before the middle of a box of 2 m sees its near side, 1 m away, in the whole image; one 12 m away
+    sees the box in the middle of the image and not in the corner."""
     camera = record(tmp_path)[0].cameras["0"]
     vertices_m = body().vertices_m()[0].numpy()
-    assert fog.reached(camera, vertices_m).all()
+    assert fog.visible_pixels(camera, vertices_m).all()
     away = dataclasses.replace(camera, t_m=camera.t_m + np.array([0, 0, 10.0]))
-    reached = fog.reached(away, vertices_m)
-    assert reached[len(reached) // 2, reached.shape[1] // 2] and not reached[0, 0]
+    visible_pixels = fog.visible_pixels(away, vertices_m)
+    assert visible_pixels[len(visible_pixels) // 2, visible_pixels.shape[1] // 2] and not visible_pixels[0, 0]
 
 
 def test_two_opposite_views_say_nothing_of_the_view_between(tmp_path: Path) -> None:
-    """The networks learn the two pictures, not the ball: from the side at least 6 dB are lost."""
+    """The networks learn the two images, not the ball: a view from the side loses at least 6 dB."""
     avatar = trained(tmp_path, load_settings("nerf", SMALL).training, ("0", "4"))
     assert psnr(avatar, tmp_path, "0") > 20
     assert psnr(avatar, tmp_path, "2") < psnr(avatar, tmp_path, "0") - 6

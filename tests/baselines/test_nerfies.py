@@ -9,9 +9,9 @@ from hnerf.baselines.nerfies import (
     Deformation,
     NerfiesField,
     annealed,
-    choose,
     elastic_energy,
     jacobian,
+    sample_index,
     screw_motion,
 )
 from hnerf.body.canonical import PosedBodies
@@ -24,16 +24,16 @@ from tests.baselines.column import Learned, learn, three_poses
 SMALL = [
     "training.steps=140",
     "training.rays_per_frame=96",
-    "training.nerfies.samples=12",
-    "training.nerfies.width=32",
-    "training.nerfies.anneal_steps=50",
-    "training.nerfies.learning_rate=0.01",
+    "training.field.samples=12",
+    "training.field.width=32",
+    "training.field.anneal_steps=50",
+    "training.field.learning_rate=0.01",
 ]
 
 
 def test_a_quarter_turn_by_hand() -> None:
-    """About z, moving along x as it turns: x goes to y, and the origin round a circle of radius 2 / pi about (0, 2 /
-    pi) to (2 / pi, 2 / pi). Without a turn the move is all."""
+    """A turn about z while moving along x: x goes to y, and the origin along a circle of radius 2 / pi about (0, 2 /
+    pi) to (2 / pi, 2 / pi). Without a turn only the translation is left."""
     quarter = math.pi / 2
     rotation, translation = screw_motion(torch.tensor([0.0, 0.0, quarter]), torch.tensor([1.0, 0.0, 0.5]))
     torch.testing.assert_close(rotation, torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), atol=1e-6, rtol=0)
@@ -97,20 +97,21 @@ def test_jacobian_of_the_deformation_in_double() -> None:
 
 
 def test_samples_are_chosen_by_weight() -> None:
-    """Weights 1, 0, 3: the first quarter of draws takes the first, the rest the last; no weight, the last."""
+    """With weights 1, 0, 3 the first quarter of draws takes the first, the rest the last; without any weight, the
+    last."""
     weights = torch.tensor([[1.0, 0.0, 3.0]]).repeat(4, 1)
-    assert choose(weights, torch.tensor([0.0, 0.24, 0.26, 0.999])).tolist() == [0, 0, 2, 2]
-    assert choose(torch.zeros(1, 3), torch.tensor([0.5])).tolist() == [2]
+    assert sample_index(weights, torch.tensor([0.0, 0.24, 0.26, 0.999])).tolist() == [0, 0, 2, 2]
+    assert sample_index(torch.zeros(1, 3), torch.tensor([0.5])).tolist() == [2]
 
 
 @pytest.fixture
 def field() -> NerfiesField:
     torch.manual_seed(0)
-    return NerfiesField(three_poses(), load_settings("nerfies", SMALL).training.nerfies)
+    return NerfiesField(three_poses(), load_settings("nerfies", SMALL).training.field)
 
 
-def look(field: NerfiesField, training: bool) -> RaySamples:
-    """One ray from above through the upright column."""
+def evaluate(field: NerfiesField, training: bool) -> RaySamples:
+    """Evaluate one ray from above through the upright column."""
     fit = three_poses()
     bodies = PosedBodies(fit.rig, fit.theta, fit.root, field.canonical_m)
     conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.arange(3), 2.5)
@@ -122,11 +123,11 @@ def look(field: NerfiesField, training: bool) -> RaySamples:
 
 
 def test_steps_of_the_training_count_and_looking_does_not(field: NerfiesField) -> None:
-    """A step may look twice, with one half of its rays each."""
-    assert look(field, training=False).elastic is None
-    assert look(field, training=True).elastic is not None
+    """A step may evaluate the field twice, with half of its rays each."""
+    assert evaluate(field, training=False).elastic is None
+    assert evaluate(field, training=True).elastic is not None
     assert field.steps_taken == 0
-    field.step_taken()
+    field.on_step_end()
     assert field.state_dict()["steps_taken"] == 1
 
 
@@ -135,15 +136,15 @@ def test_what_stands_still_or_turns_as_a_whole_costs_nothing_and_what_swells_doe
     with torch.no_grad():
         field.deformation.screw.bias.copy_(torch.tensor([0.4, -0.2, 0.7, 0.1, 0.0, -0.3]))
         field.deformation.screw.weight.zero_()
-    rigid = look(field, training=True).elastic
+    rigid = evaluate(field, training=True).elastic
     torch.nn.init.normal_(field.deformation.screw.weight)
-    swollen = look(field, training=True).elastic
+    swollen = evaluate(field, training=True).elastic
     assert rigid is not None and swollen is not None
     assert rigid.item() < 1e-6 and swollen.item() > 1e-2
 
 
 def test_the_deformation_begins_smooth_and_ends_with_all_octaves(field: NerfiesField) -> None:
-    """A screw that reads the highest octave alone: nothing at first, all of it after anneal_steps."""
+    """A screw that reads only the highest octave is zero at first and complete after anneal_steps."""
     assert field.settings.anneal_steps == 50
     torch.nn.init.normal_(field.deformation.screw.weight)
     points = torch.rand(20, 3)
@@ -156,18 +157,18 @@ def test_the_deformation_begins_smooth_and_ends_with_all_octaves(field: NerfiesF
 
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory: pytest.TempPathFactory) -> Learned:
-    """Of a column that hardly moves; the third frame is bent by 80 degrees."""
+    """Train on a column that hardly moves; the third frame is bent by 80 degrees."""
     return learn(tmp_path_factory.mktemp("still"), load_settings("nerfies", SMALL).training, (0.0, 0.2, 1.4))
 
 
 def test_overfits_two_frames(learned: Learned) -> None:
-    """28 dB in both, after as many steps as were asked for."""
+    """28 dB in both, after the requested number of steps."""
     assert learned.avatar.field.steps_taken == 140
     assert min(learned.psnr(frame) for frame in (0, 1)) > 28
 
 
 def test_a_pose_that_no_frame_has_shows_the_template(learned: Learned) -> None:
-    """Upright as it was trained, though asked to bend: 4 dB worse; the surface is the same for two such poses."""
+    """It is upright as trained, although the pose is bent: 4 dB worse; the surface is the same for two such poses."""
     assert learned.psnr(2) < min(learned.psnr(frame) for frame in (0, 1)) - 4
     one, other = torch.zeros(2, 2, 3)
     one[1, 1], other[1, 1] = 0.3, 0.35
@@ -177,9 +178,9 @@ def test_a_pose_that_no_frame_has_shows_the_template(learned: Learned) -> None:
 
 
 def test_large_articulated_motion_is_beyond_the_deformation(learned: Learned, tmp_path: Path) -> None:
-    """Bent by 115 degrees to either side, the same training leaves even its own two frames 3 dB worse, though nothing
-    but the motion differs (4.7 to 6 over three seeds), and in place of a surface something that shares about half of
-    its volume: .43 to .52, where who hardly moves has .58 to .65."""
+    """Bent by 115 degrees to either side, the same training leaves even its own two frames 3 dB worse, though only the
+    motion differs (4.7 to 6 over three seeds), and a surface that shares about half of the column's volume: .43 to .52,
+    where the column that hardly moves has .58 to .65."""
     bending = learn(tmp_path, load_settings("nerfies", SMALL).training, (-2.0, 2.0, 0.0))
     worse, better = (sum(x.psnr(frame) for frame in (0, 1)) / 2 for x in (bending, learned))
     assert worse < better - 3

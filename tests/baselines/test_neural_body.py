@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from hnerf.baselines.neural_body import NeuralBodyField, Surroundings
+from hnerf.baselines.neural_body import NeuralBodyField, NeuralBodyRegion
 from hnerf.body.canonical import PosedBodies
 from hnerf.config import load_settings
 from hnerf.fields.conditions import Conditions, Draws
@@ -13,11 +13,11 @@ from tests.baselines.column import learn, three_poses
 SMALL = [
     "training.steps=120",
     "training.rays_per_frame=96",
-    "training.neural_body.voxel_m=0.0613",  # no fraction of the column's edges, so that no vertex lies between voxels
-    "training.neural_body.samples=16",
-    "training.neural_body.channels=8",
-    "training.neural_body.width=32",
-    "training.neural_body.learning_rate=0.01",
+    "training.field.voxel_m=0.0613",  # no fraction of the column's edges, so that no vertex lies between voxels
+    "training.field.samples=16",
+    "training.field.channels=8",
+    "training.field.width=32",
+    "training.field.learning_rate=0.01",
 ]
 DOWN = torch.tensor([[0.5, 0.5, 5.0], [0.4, 0.6, 5.0]]), torch.tensor([[0.0, 0.0, -1.0]]).expand(2, 3)
 
@@ -25,11 +25,11 @@ DOWN = torch.tensor([[0.5, 0.5, 5.0], [0.4, 0.6, 5.0]]), torch.tensor([[0.0, 0.0
 @pytest.fixture
 def field() -> NeuralBodyField:
     torch.manual_seed(0)
-    return NeuralBodyField(three_poses(), load_settings("neural-body", SMALL).training.neural_body)
+    return NeuralBodyField(three_poses(), load_settings("neural-body", SMALL).training.field)
 
 
 def posed(field: NeuralBodyField, root: torch.Tensor | None = None) -> tuple[PosedBodies, Conditions]:
-    """The three poses, or the first of them elsewhere, which is no frame's."""
+    """Return the three poses, or the first of them elsewhere, which belongs to no frame."""
     fit = three_poses()
     rows = slice(None) if root is None else slice(1)
     theta, root = fit.theta[rows], fit.root if root is None else root[None]
@@ -38,8 +38,8 @@ def posed(field: NeuralBodyField, root: torch.Tensor | None = None) -> tuple[Pos
     return bodies, Conditions.of(fit.rig, theta, root, moment, 2.5)
 
 
-def look(field: NeuralBodyField, region: Surroundings, rows: list[int]) -> torch.Tensor:
-    """Colour of two rays' samples in these rows."""
+def look(field: NeuralBodyField, region: NeuralBodyRegion, rows: list[int]) -> torch.Tensor:
+    """Return the colour of two rays' samples in these rows."""
     bodies, conditions = posed(field)
     draws = Draws.deterministic(2, field.samples, torch.device("cpu"))
     return field.sample(bodies, region, *DOWN, torch.tensor(rows), conditions, draws)[0].colour
@@ -68,7 +68,7 @@ def test_sees_the_same_in_training_as_in_evaluation(field: NeuralBodyField) -> N
 
 
 def test_density_moves_with_the_root(field: NeuralBodyField) -> None:
-    """A quarter turn about z and a move: the distance read off at the moved points is the same."""
+    """After a quarter turn about z and a translation, the pseudo-distance at the moved points is the same."""
     field.eval()
     root = torch.eye(4)
     root[:2, :2], root[:3, 3] = torch.tensor([[0.0, -1.0], [1.0, 0.0]]), torch.tensor([3.0, -2.0, 0.5])
@@ -82,14 +82,14 @@ def test_density_moves_with_the_root(field: NeuralBodyField) -> None:
 
 
 def test_appearance_is_the_frames_own_and_zero_for_novel_poses(field: NeuralBodyField) -> None:
-    """Frame 0 was trained, frame 1 was not: a novel pose looks as frame 1 does."""
+    """Frame 0 was trained, frame 1 was not: a novel pose looks like frame 1."""
     with torch.no_grad():
         field.codes[0] = 3.0
     bodies, conditions = posed(field)
     points, view = torch.rand(50, 3), DOWN[1][:1].expand(50, 3)
 
     def colour(moment: int) -> torch.Tensor:
-        as_if = dataclasses.replace(conditions, moment=torch.tensor([moment, 1, 2]))
+        as_if = dataclasses.replace(conditions, frame_row=torch.tensor([moment, 1, 2]))
         return field.colour(bodies, points, view, as_if)
 
     torch.testing.assert_close(colour(-1), colour(1))
@@ -97,8 +97,8 @@ def test_appearance_is_the_frames_own_and_zero_for_novel_poses(field: NeuralBody
 
 
 def test_overfits_two_frames_and_loses_the_pose_it_has_not_seen(tmp_path: Path) -> None:
-    """29 dB in both training frames. Bent by 80 degrees, where nothing was trained, it loses 3 dB: the convolutions see
-    stencils they never saw, and no prior of the body tells what they mean."""
+    """29 dB in both training frames. Bent by 80 degrees, an untrained pose, it loses 3 dB: the convolutions see
+    untrained stencils, and there is no prior of the body."""
     learned = learn(tmp_path, load_settings("neural-body", SMALL).training, (0.0, 0.2, 1.4))
     trained = [learned.psnr(frame) for frame in (0, 1)]
     assert min(trained) > 29

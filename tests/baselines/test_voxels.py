@@ -7,7 +7,7 @@ SIZE = 7
 
 
 def scattered() -> tuple[torch.Tensor, torch.Tensor]:
-    """A tenth of a grid of 7 x 7 x 7 active: their coordinates (N, 3), the grid (7, 7, 7) bool."""
+    """Return a grid of 7 x 7 x 7 with a tenth of it active: coordinates (N, 3), grid (7, 7, 7) bool."""
     active = torch.rand(SIZE, SIZE, SIZE, generator=torch.Generator().manual_seed(0)) < 0.1
     active[0, 0, 0] = active[-1, -1, -1] = True  # so that coordinates start at 0 and end at 6
     return torch.nonzero(active), active
@@ -20,13 +20,13 @@ def dense(coordinates: torch.Tensor, values: torch.Tensor, size: int) -> torch.T
 
 
 def coordinates_of(level: Level) -> torch.Tensor:
-    """(N, 3), by row."""
+    """Return the coordinates (N, 3) by row."""
     at = torch.nonzero(level.rows < level.rows.max())
     return (at - 2)[level.rows[tuple(at.T)].argsort()]
 
 
 def convolution(inputs: int, outputs: int) -> tuple[SparseConvolution, torch.Tensor]:
-    """Not normalised; and its kernel as torch's own convolution wants it."""
+    """Return a sparse convolution without normalisation, and its kernel in the layout of torch's own."""
     torch.manual_seed(0)
     sparse = SparseConvolution(inputs, outputs)
     sparse.norm = torch.nn.Identity()
@@ -43,13 +43,13 @@ def test_agrees_with_dense_convolution_where_voxels_are_active() -> None:
     sparse, kernel = convolution(3, 2)
     level = Level.of(coordinates, None)
     wanted = torch.nn.functional.conv3d(dense(coordinates, values, SIZE), kernel, padding=1).relu()
-    found = sparse(padded(values), level.beside)
+    found = sparse(padded(values), level.neighbours)
     torch.testing.assert_close(found[:-1], wanted[0][:, *coordinates.T].T, atol=1e-6, rtol=1e-5)
     assert not found[-1].any()
 
 
 def test_stride_two_agrees_with_dense_convolution() -> None:
-    """Also in which voxels are active: those whose stencil meets an active one."""
+    """The active voxels agree, too: those whose stencil contains an active one."""
     coordinates, active = scattered()
     values = torch.randn(len(coordinates), 3)
     finest = Voxels.around(coordinates.float(), 1.0, 2)
@@ -60,12 +60,12 @@ def test_stride_two_agrees_with_dense_convolution() -> None:
     met = torch.nn.functional.max_pool3d(active.float()[None], 3, stride=2, padding=1)[0] > 0
     there = coordinates_of(coarse)
     assert sorted(map(tuple, there.tolist())) == sorted(map(tuple, torch.nonzero(met).tolist()))
-    found = sparse(padded(by_row), coarse.below)[:-1]
+    found = sparse(padded(by_row), coarse.finer_neighbours)[:-1]
     torch.testing.assert_close(found, wanted[0][:, *there.T].T, atol=1e-6, rtol=1e-5)
 
 
 def test_reads_as_a_dense_grid_does() -> None:
-    """Trilinearly, between active and empty voxels, zero beyond the grid and far from it."""
+    """Interpolation is trilinear between active and empty voxels, zero outside the grid and far from it."""
     coordinates, _ = scattered()
     values = torch.randn(len(coordinates), 4)
     at = torch.rand(500, 3) * (SIZE + 6) - 3
@@ -73,7 +73,7 @@ def test_reads_as_a_dense_grid_does() -> None:
     wanted = torch.nn.functional.grid_sample(
         dense(coordinates, values, SIZE), unit, align_corners=True, padding_mode="zeros"
     )
-    found = Level.of(coordinates, None).read(padded(values), at)
+    found = Level.of(coordinates, None).interpolate(padded(values), at)
     torch.testing.assert_close(found, wanted[0, :, 0, 0].T, atol=1e-5, rtol=1e-5)
 
 

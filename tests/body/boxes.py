@@ -8,14 +8,14 @@ from hnerf.body.rig import Rig
 
 
 def box_vertices(height_m: float = 1.0, levels: int = 1) -> Tensor:
-    """Corners of the unit square at levels + 1 heights, (4 (levels + 1), 3)."""
+    """Return corners of the unit square at levels + 1 heights, (4 (levels + 1), 3)."""
     square = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     heights = torch.linspace(0, height_m, levels + 1)
     return torch.cat([torch.cat([square, z.expand(4, 1)], 1) for z in heights])
 
 
 def box_faces(levels: int = 1) -> Tensor:
-    """Outward triangles of the closed column."""
+    """Return outward triangles of the closed column."""
     faces = [[0, 2, 1], [0, 3, 2]]
     for level in range(levels):
         for k in range(4):
@@ -26,8 +26,8 @@ def box_faces(levels: int = 1) -> Tensor:
 
 
 def box_rig(bend_segments: int = 0, splits: int = 0) -> Rig:
-    """The unit box on one bone, or with `bend_segments` a column of 2 m that bends at 1 m, smoothly from 0.67 to 1.33
-    m. Each of `splits` halves every edge."""
+    """Return the unit box on one bone, or with `bend_segments` a column of 2 m that bends at 1 m, smoothly from 0.67 to
+    1.33 m. Each of `splits` halves every edge."""
     levels, height_m = max(bend_segments, 1), 2.0 if bend_segments else 1.0
     vertices, faces = box_vertices(height_m, levels), box_faces(levels)
     for _ in range(splits):

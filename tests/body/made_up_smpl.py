@@ -31,8 +31,8 @@ LANDMARKS = (
 
 
 def made_up_smpl(kind: str = "smpl", seed: int = 0) -> dict[str, Any]:
-    """The arrays of a model file. Shapes: all larger, longer legs, longer arms, wider hips, then small changes of
-    the limbs. Pose blend shapes: the left elbow's turn lifts vertices on the left forearm."""
+    """Return the arrays of a model file. Shapes: all larger, longer legs, longer arms, wider hips, then small changes
+    of the limbs. Pose blend shapes: the left elbow's turn lifts vertices on the left forearm."""
     joints_m, parents = _skeleton(kind)
     count = {"smpl": 6890, "smplx": 10475}[kind]
     tube = count // len(joints_m)
@@ -74,7 +74,7 @@ def made_up_smpl(kind: str = "smpl", seed: int = 0) -> dict[str, Any]:
 
 
 def write_smpl(path: Path, kind: str = "smpl") -> Path:
-    """The model as .npz, or as .pkl with a sparse regressor as SMPL's own files have it."""
+    """Write the model as .npz, or as .pkl with a sparse regressor as SMPL's own files have it."""
     data = made_up_smpl(kind)
     if path.suffix == ".npz":
         np.savez(path, **data, part2num=np.array({"head": 15}, object))
@@ -85,7 +85,7 @@ def write_smpl(path: Path, kind: str = "smpl") -> Path:
 
 
 def _skeleton(kind: str) -> tuple[np.ndarray, list[int]]:
-    """Hands for SMPL; jaw, eyes and fingers of no length for SMPL-X."""
+    """Return the skeleton: with hands for SMPL; with jaw, eyes and fingers of zero length for SMPL-X."""
     if kind == "smpl":
         more = [(20, (0.08, 0, 0)), (21, (-0.08, 0, 0))]
     else:
@@ -96,7 +96,7 @@ def _skeleton(kind: str) -> tuple[np.ndarray, list[int]]:
 
 
 def _joint_shapes(joints_m: np.ndarray, parents: list[int], random: np.random.Generator) -> np.ndarray:
-    """How each joint moves with each of ten shapes, (J, 3, 10): each bone lengthens by a share."""
+    """Return how each joint moves with each of ten shapes, (J, 3, 10): each bone lengthens by a share."""
     shares = random.normal(0, 0.01, (len(joints_m), 10))
     shares[:, 0] = 0.05
     shares[:, 1] = np.isin(range(len(joints_m)), (4, 5, 7, 8)) * 0.08
@@ -112,7 +112,7 @@ def _joint_shapes(joints_m: np.ndarray, parents: list[int], random: np.random.Ge
 
 
 def _tip(joint: int, start: np.ndarray) -> np.ndarray:
-    """From a last joint to its end."""
+    """Return the vector from a last joint to its end."""
     if joint == 15:
         return np.array([0, 0.2, 0])
     if joint in (10, 11):
@@ -123,7 +123,8 @@ def _tip(joint: int, start: np.ndarray) -> np.ndarray:
 
 
 def _tube(start: np.ndarray, end: np.ndarray, radius_m: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Seven rings, and what is left over at the end: share of the way (N,) and places (N, 3)."""
+    """Return a tube of seven rings, with the remaining vertices at its end: share of the way (N,) and positions (N,
+    3)."""
     around = count // 7
     along = np.minimum(np.arange(count) // around, 6) / 6
     axis = (end - start) / np.linalg.norm(end - start)
@@ -135,7 +136,7 @@ def _tube(start: np.ndarray, end: np.ndarray, radius_m: float, count: int) -> tu
 
 
 def _tube_faces(ids: np.ndarray, around: int) -> np.ndarray:
-    """Quads between rings, halved; outwards."""
+    """Return the outward triangles between rings."""
     a = ids[: 6 * around].reshape(6, around)
     b, c, d = np.roll(a, -1, 1), a + around, np.roll(a, -1, 1) + around
     return np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)])

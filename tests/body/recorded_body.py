@@ -16,7 +16,7 @@ from hnerf.geometry.silhouette import silhouette
 
 @dataclass(frozen=True)
 class Silhouettes:
-    """Masks of the training cameras; another camera's is never asked for."""
+    """Masks of the training cameras; requesting another camera's fails."""
 
     capture: Capture
     body: BodyFit
@@ -31,7 +31,7 @@ class Silhouettes:
 
 
 def ring_camera(name: str, angle: float, size_px: int = 256) -> Camera:
-    """3 m from the origin, 1 m high, looking level at the axis."""
+    """Return a camera 3 m from the origin and 1 m high that looks level at the axis."""
     forward = -np.array([np.cos(angle), np.sin(angle), 0])
     R = np.stack([np.cross(forward, [0, 0, 1]), [0, 0, -1], forward])
     K = np.array([[size_px * 1.1, 0, size_px / 2], [0, size_px * 1.1, size_px / 2], [0, 0, 1]])
@@ -39,7 +39,7 @@ def ring_camera(name: str, angle: float, size_px: int = 256) -> Camera:
 
 
 def moving_body(frames: tuple[int, ...]) -> BodyFit:
-    """A tall, slim person with long shins who swings arms and legs, feet near z = 0."""
+    """Return a tall, slim person with long shins who swings arms and legs, feet near z = 0."""
     beta = torch.tensor(ADULT)
     for name, value in (("height", 0.55), ("weight", 0.4), ("measure-lowerleg-height", 0.3), ("hip-scale-horiz", -0.3)):
         beta[BETA_NAMES.index(name)] = value
@@ -59,7 +59,7 @@ def moving_body(frames: tuple[int, ...]) -> BodyFit:
 
 
 def record(root: Path, body: BodyFit, cameras: dict[str, Camera], train: tuple[str, ...]) -> Capture:
-    """Exact keypoints of all cameras; test cameras get nonsense, which nothing may read."""
+    """Record exact keypoints of all cameras; test cameras get nonsense, which nothing may read."""
     keypoints_m = (body.rig.keypoint_weights @ body.vertices_m()).double().numpy()
     stored = {}
     for name, camera in cameras.items():

@@ -26,7 +26,7 @@ def test_keypoints_lie_where_a_body_25_detector_sees_them() -> None:
 
 
 def test_the_shape_basis_is_the_derivative_of_the_rig() -> None:
-    """Away from the anchors of anny's piecewise shape space, by central differences of 1e-2."""
+    """The basis agrees with central differences of 1e-2, away from the anchors of anny's piecewise shape space."""
     beta = torch.tensor(ADULT) + 0.1
     rig = anny_rig(beta)
     for k in (0, 4, BETA_NAMES.index("measure-upperleg-height"), BETA_NAMES.index("l-foot-scale+r-foot-scale")):

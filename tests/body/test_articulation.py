@@ -20,12 +20,12 @@ def random_pose(rig: Rig, frames: int) -> Pose:
 
 
 def numeric_jacobian(pose: Pose, points: torch.Tensor) -> torch.Tensor:
-    """(n, P, 3, U) of vertices, by central differences through the plain rig."""
+    """Return the derivative (n, P, 3, U) of vertices by central differences through the plain rig."""
     articulation, columns = Articulation(pose.rig), []
     for u in range(articulation.unknowns):
         step = torch.zeros(len(pose.theta), articulation.unknowns, dtype=torch.float64)
         step[:, u] = 1e-5
-        ends = [articulation.moved(pose, sign * step) for sign in (1, -1)]
+        ends = [articulation.apply_step(pose, sign * step) for sign in (1, -1)]
         above, below = (pose_vertices(end.rig, end.theta, end.root)[:, points] for end in ends)
         columns.append((above - below) / 2e-5)
     return torch.stack(columns, -1)
@@ -36,7 +36,7 @@ def test_locked_joints_ride_on_their_ancestor() -> None:
     assert articulation.joints.tolist() == [0, 1] and articulation.unknowns == 9
     expected = [[1.0, 0], [0.5, 0.5], [0, 1], [0, 1], [0, 1]]
     assert articulation.vertex_weights.tolist() == expected
-    assert articulation.below.tolist() == [[1, 1], [0, 1]]
+    assert articulation.subtree.tolist() == [[1, 1], [0, 1]]
 
 
 def test_left_jacobian_turns_a_change_of_the_vector_into_a_rotation() -> None:
@@ -58,7 +58,7 @@ def test_vertices_and_their_derivatives_agree_with_the_plain_rig() -> None:
     numeric = numeric_jacobian(pose, ids)
     torch.testing.assert_close(articulation.surface(joints, 1), vertices[1])
     for axis, direction in enumerate(torch.eye(3, dtype=torch.float64)):
-        rows, shape = articulation.along(ids, direction.expand(len(ids), 3), joints, 1)
+        rows, shape = articulation.directional_jacobian(ids, direction.expand(len(ids), 3), joints, 1)
         torch.testing.assert_close(rows, numeric[1, :, axis], atol=1e-6, rtol=0)
         torch.testing.assert_close(shape.sum(1), by_shape[1, ids, axis], atol=1e-8, rtol=0)
 
@@ -98,5 +98,5 @@ def test_the_root_turns_about_its_joint_and_only_moves_as_told() -> None:
     articulation = Articulation(rig)
     before = articulation.pose(pose).positions_m[0, 0]
     step = torch.tensor([[0.1, 0.2, 0.3, 0.5, -0.4, 0.6, 0, 0, 0]], dtype=torch.float64)
-    after = articulation.pose(articulation.moved(pose, step)).positions_m[0, 0]
+    after = articulation.pose(articulation.apply_step(pose, step)).positions_m[0, 0]
     torch.testing.assert_close(after - before, step[0, :3])

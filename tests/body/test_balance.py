@@ -13,8 +13,8 @@ from tests.body.two_bone import two_bone_rig
 
 
 def test_the_centre_of_mass_is_above_the_feet_of_who_stands_upright() -> None:
-    """Neck .289; a knee bears half a thigh and half a shank and foot, .05 + .0305. The likeliest pose is in balance
-    within half a standard deviation."""
+    """The neck has .289; a knee has half a thigh and half a shank with foot, .05 + .0305. The most likely pose is in
+    balance within half a standard deviation."""
     shares = centre_of_mass_over_feet()
     assert abs(float(shares.sum())) < 1e-12
     np.testing.assert_allclose(shares[[1, 10]], [0.289, 0.0805])
@@ -24,8 +24,8 @@ def test_the_centre_of_mass_is_above_the_feet_of_who_stands_upright() -> None:
 
 
 def test_five_centimetres_off_balance_cost_a_half_less_what_fades() -> None:
-    """Trunk forwards so that the centre of mass moves by 5 cm: 0.5 / (1 + 1/9). Upwards is free; far off, nearly
-    0.5 x 9 are to pay."""
+    """A trunk moved forwards so that the centre of mass moves by 5 cm costs 0.5 / (1 + 1/9). Upwards costs nothing; far
+    off costs nearly 0.5 x 9."""
     balance, x = Balance(up=2), torch.zeros(1, 25, 3, dtype=torch.float64)
     jacobian = torch.zeros(1, 25, 3, 9, dtype=torch.float64)
     for axis, far, cost in ((0, 0.05, 0.45), (1, 0.05, 0.45), (2, 0.05, 0.0), (0, 5.0, 4.5 / (1 + 9e-4))):
@@ -44,7 +44,7 @@ def test_the_gradient_of_balance_is_that_of_its_cost() -> None:
         return Balance(up=1).add(equations, 0.3 * x, 0.3 * by_frame), equations
 
     direction = torch.randn(2, articulation.unknowns, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    ends = [cost_and_equations(articulation.moved(pose, sign * 1e-6 * direction))[0] for sign in (1, -1)]
+    ends = [cost_and_equations(articulation.apply_step(pose, sign * 1e-6 * direction))[0] for sign in (1, -1)]
     slope = (cost_and_equations(pose)[1].frame_gradient * direction.numpy()).sum()
     assert abs(slope) > 1e-3
     np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-6, rtol=1e-6)

@@ -1,4 +1,4 @@
-"""Clothes by hand: on one triangle, on a ball's outline, and on a body that they pull aside."""
+"""Cloth offsets worked out by hand: on one triangle, on a ball's outline, and on a body that they pull aside."""
 
 from pathlib import Path
 
@@ -8,10 +8,10 @@ import torch
 
 from hnerf.body.articulation import Pose
 from hnerf.body.body_model import body_model
-from hnerf.body.clothed_fit import clothes, match, refine_clothed
-from hnerf.body.contour_fit import Outline, Rows, outline
+from hnerf.body.clothed_fit import match_clothed, refine_with_clothing, solve_cloth_offset
+from hnerf.body.contour_fit import ContourResiduals, Outline, outline
 from hnerf.body.descriptor import normals_of
-from hnerf.body.fit import problem_of
+from hnerf.body.fit import make_problem
 from hnerf.body.keypoint_fit import Problem
 from hnerf.body.observations import observe, runs
 from hnerf.body.pose_prior import Smoothness
@@ -27,27 +27,29 @@ RING = {str(k): ring_camera(str(k), 0.3 + k * np.pi / 2) for k in range(4)}
 
 
 def test_neighbours_wear_nearly_the_same() -> None:
-    """Of a triangle one corner is 1 cm too small: (1 + 0.02 + 2 x 2) a - 2 b - 2 b = 0.01 there, and at the two
-    others (0.02 + 2 x 2) b - 2 a - 2 b = 0, so b = a / 1.01 and a = 0.01 / (5.02 - 4 / 1.01)."""
-    rows = Rows(np.array([0]), np.zeros((1, 3)), np.array([-0.01]), np.ones(1))
+    """One corner of a triangle is 1 cm too small: (1 + 0.02 + 2 x 2) a - 2 b - 2 b = 0.01 there, and at the two others
+    (0.02 + 2 x 2) b - 2 a - 2 b = 0, so b = a / 1.01 and a = 0.01 / (5.02 - 4 / 1.01)."""
+    rows = ContourResiduals(np.array([0]), np.zeros((1, 3)), np.array([-0.01]), np.ones(1))
     a = 0.01 / (5.02 - 4 / 1.01)
-    np.testing.assert_allclose(clothes(np.zeros(3), [rows], np.array([[0, 1, 2]])), [a, a / 1.01, a / 1.01])
+    np.testing.assert_allclose(solve_cloth_offset(np.zeros(3), [rows], np.array([[0, 1, 2]])), [a, a / 1.01, a / 1.01])
 
 
 def test_what_is_seen_often_is_worn_as_seen() -> None:
-    """A thousand matches 1 cm off clothes of 2 cm, in two images: 3 cm; inwards, 1 cm."""
+    """A thousand matches 1 cm outside an offset of 2 cm, in two images, give 3 cm; inside, 1 cm."""
     for residual_m, worn_m in ((-0.01, 0.03), (0.01, 0.01)):
-        rows = Rows(np.repeat([0, 1, 2], 500), np.zeros((1500, 3)), np.full(1500, residual_m), np.ones(1500))
-        found = clothes(np.full(3, 0.02), [rows, rows], np.array([[0, 1, 2]]))
+        rows = ContourResiduals(
+            np.repeat([0, 1, 2], 500), np.zeros((1500, 3)), np.full(1500, residual_m), np.ones(1500)
+        )
+        found = solve_cloth_offset(np.full(3, 0.02), [rows, rows], np.array([[0, 1, 2]]))
         np.testing.assert_allclose(found, worn_m, rtol=1e-4)
 
 
 @pytest.mark.parametrize("grow_px", [2, -2])
 def test_outlines_pull_both_ways_alike(grow_px: int) -> None:
-    """A ball 2 px too small or too large: so many pixels off, and a weight of 1 / (1 + (off / 2 cm)^2)^2."""
+    """A ball 2 px too small or too large has residuals of 2 px, with a weight of 1 / (1 + (off / 2 cm)^2)^2."""
     vertices, faces = ball(0.2, 1.0)
     edge = outline(disc(SEEN_PX + grow_px), 1.0)
-    rows = match(ring_camera("a", 0.3), edge, SCALE_M, vertices, normals_of(vertices, faces), faces)
+    rows = match_clothed(ring_camera("a", 0.3), edge, SCALE_M, vertices, normals_of(vertices, faces), faces)
     assert len(rows.vertices) > 0.9 * len(edge.points_px)
     assert np.median(rows.residual_m) == pytest.approx(-grow_px * SCALE_M, abs=SCALE_M)
     np.testing.assert_allclose(rows.weight, (1 + (rows.residual_m / 0.02) ** 2) ** -2)
@@ -56,15 +58,15 @@ def test_outlines_pull_both_ways_alike(grow_px: int) -> None:
 
 
 def test_what_is_too_far_off_matches_nothing() -> None:
-    """5 px of 1.07 cm are more than 4 cm."""
+    """5 px of 1.07 cm each are more than 4 cm."""
     vertices, faces = ball(0.2, 1.0)
     edge = outline(disc(SEEN_PX + 5), 1.0)
-    rows = match(ring_camera("a", 0.3), edge, SCALE_M, vertices, normals_of(vertices, faces), faces)
+    rows = match_clothed(ring_camera("a", 0.3), edge, SCALE_M, vertices, normals_of(vertices, faces), faces)
     assert len(rows.vertices) == 0
 
 
 def clothed_scene(folder: Path, frames: int, cameras: int) -> tuple[Problem, Pose, list[list[Outline | None]]]:
-    """A problem with true keypoints, the true pose, and outlines of a body that wears 2 cm of cloth on its front."""
+    """Return a problem with true keypoints, the true pose, and outlines of a body with 2 cm of cloth on its front."""
     truth, settings = moving_body(tuple(range(frames))), FitSettings()
     names = tuple(str(k) for k in range(cameras))
     capture = record(folder, truth, {name: RING[name] for name in names}, names)
@@ -72,7 +74,7 @@ def clothed_scene(folder: Path, frames: int, cameras: int) -> tuple[Problem, Pos
     nothing = torch.zeros(25, 3, dtype=torch.float64)
     pose = Pose(truth.rig.to(dtype=torch.float64), truth.theta.double(), truth.root.double(), nothing)
     smoothness = Smoothness(runs(capture), capture.fps, np.full(25, 300.0))
-    problem = problem_of(body_model(settings), pose, seen, smoothness, settings, offsets=1, proportions=1)
+    problem = make_problem(body_model(settings), pose, seen, smoothness, settings, offsets=1, proportions=1)
     faces = truth.rig.faces.numpy()
     edges: list[list[Outline | None]] = []
     front = (normals_of(truth.rig.vertices_m.numpy(), faces)[:, 1] < 0)[:, None]
@@ -85,9 +87,9 @@ def clothed_scene(folder: Path, frames: int, cameras: int) -> tuple[Problem, Pos
 
 
 def test_clothes_that_all_frames_wear_hardly_pull_a_body_aside(tmp_path: Path) -> None:
-    """By hand: joints are moved by 9 mm, by 19 where the body is taken to be naked."""
+    """Joints move by 9 mm, and by 19 mm where the body is taken to be naked."""
     problem, pose, edges = clothed_scene(tmp_path, 8, 4)
-    found = refine_clothed(problem, pose, edges)
+    found = refine_with_clothing(problem, pose, edges)
     places = [joint_transforms(p.rig, p.theta, p.root)[:, p.rig.free, :3, 3] for p in (found, pose)]
     assert (places[0] - places[1]).norm(dim=-1).mean() < 0.012
 
@@ -95,4 +97,4 @@ def test_clothes_that_all_frames_wear_hardly_pull_a_body_aside(tmp_path: Path) -
 @pytest.mark.parametrize(("frames", "cameras"), [(8, 1), (7, 2)])
 def test_one_camera_or_few_frames_do_not_tell_clothes(tmp_path: Path, frames: int, cameras: int) -> None:
     problem, pose, edges = clothed_scene(tmp_path, frames, cameras)
-    assert refine_clothed(problem, pose, edges) is pose
+    assert refine_with_clothing(problem, pose, edges) is pose

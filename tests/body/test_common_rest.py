@@ -1,4 +1,4 @@
-"""What all frames have in common goes to the rest body: a column of two bones, by hand."""
+"""The mean change of all frames moves into the rest body: a column of two bones, by hand."""
 
 import math
 
@@ -16,14 +16,14 @@ BEND_RAD = (0.0, 0.4)  # of two frames
 
 
 def bent(angles_rad: tuple[float, ...]) -> Tensor:
-    """theta (n, 2, 3): the upper bone turned about x."""
+    """Return theta (n, 2, 3): the upper bone turned about x."""
     theta = torch.zeros(len(angles_rad), 2, 3)
     theta[:, 1, 0] = torch.tensor(angles_rad)
     return theta
 
 
 def placed(moved_m: Tensor) -> Tensor:
-    """Roots (2, 4, 4) of a body that stands, and of one that has turned to the left by a quarter, each moved along its
+    """Return roots (2, 4, 4) of a body that stands, and of one turned to the left by a quarter, each moved along its
     own axes."""
     root = torch.eye(4).repeat(2, 1, 1)
     root[1, :3, :3] = rotation_from_axis_angle(torch.tensor([0.0, 0.0, math.pi / 2]))
@@ -32,8 +32,8 @@ def placed(moved_m: Tensor) -> Tensor:
 
 
 def test_the_rest_body_turns_as_all_joints_do_in_the_mean() -> None:
-    """By 0.05 and 0.15: rest bends by 0.1, frames keep -0.05 and 0.05 of it. A corner 0.5 m before the joint and 1 m
-    above it turns about the joint."""
+    """Turns of 0.05 and 0.15 bend the rest body by 0.1 and leave -0.05 and 0.05 in the frames. A corner 0.5 m before
+    the joint and 1 m above it turns about the joint."""
     root = placed(torch.zeros(2, 3))
     after = bent((BEND_RAD[0] + TURN - 0.05, BEND_RAD[1] + TURN + 0.05)), root
     rig, theta, stands = with_common_rest(RIG, (bent(BEND_RAD), root), after)
@@ -46,7 +46,7 @@ def test_the_rest_body_turns_as_all_joints_do_in_the_mean() -> None:
 
 
 def test_the_rest_body_moves_as_all_bodies_do_along_their_own_axes() -> None:
-    """1 cm and 3 cm to the left in the mean 2 cm; the second body looks along another axis of the world."""
+    """1 cm and 3 cm to the left are 2 cm in the mean; the second body faces along another axis of the world."""
     left_m = torch.tensor([[0.01, 0.0, 0.0], [0.03, 0.0, 0.0]])
     before, theta = placed(torch.zeros(2, 3)), bent(BEND_RAD)
     rig, own, root = with_common_rest(RIG, (theta, before), (theta, placed(left_m)))
@@ -57,7 +57,7 @@ def test_the_rest_body_moves_as_all_bodies_do_along_their_own_axes() -> None:
 
 
 def test_bodies_stay_where_they_are() -> None:
-    """What one bone carries exactly; between bones by 0.1 rad squared of half a metre at most."""
+    """Vertices of one bone stay exactly; those between bones move by at most 0.1 rad squared of half a metre."""
     generator = torch.Generator().manual_seed(0)
     before = bent(BEND_RAD), placed(torch.zeros(2, 3))
     after = before[0] + 0.0, placed(0.1 * torch.randn(2, 3, generator=generator))

@@ -9,7 +9,7 @@ SETTINGS = FitSettings(inside_m=0.01, outside_m=0.02, clothing_m=0.1, spacing_m=
 
 
 def ball(radius_m: float, height_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of a sphere on the axis."""
+    """Return vertices and faces of a sphere on the axis."""
     rings, around = 24, 48
     polar, turn = np.meshgrid(
         np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, around, endpoint=False), indexing="ij"
@@ -74,7 +74,8 @@ def test_a_body_that_fills_its_mask_is_left_alone() -> None:
 
 
 def test_a_part_that_a_mask_lacks_pushes_no_harder_than_one_that_sticks_out_a_little() -> None:
-    """Half of the mask is gone. From 1.345 spreads of 0.01 m on every vertex outside pushes with 1.345 / 0.01 m."""
+    """Half of the mask is missing. Beyond 1.345 standard deviations of 0.01 m every vertex outside pushes with 1.345 /
+    0.01 m."""
     camera = ring_camera("a", 0.3)
     vertices, faces = ball(0.2, 1.0)
     seen = disc(281.6 * 0.2 / np.sqrt(3**2 - 0.2**2))

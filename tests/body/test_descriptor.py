@@ -1,4 +1,4 @@
-"""The descriptor (d, s): hand-worked on a box, fast form against reference, gradients against finite differences."""
+"""The descriptor (d, s): worked out by hand on a box, fast against reference, gradients against finite differences."""
 
 import dataclasses
 
@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from hnerf.body.anny import anny_rig
-from hnerf.body.canonical import PosedBodies, axis_angle_from_rotation, blended, occurring
+from hnerf.body.canonical import PosedBodies, axis_angle_from_rotation, distinct_rows, weighted_sum
 from hnerf.body.descriptor import BodyMeshes, closest_points_reference, solid_angle
 from hnerf.body.rig import Rig, pose_vertices, rotation_from_axis_angle
 from tests.body.boxes import box_faces, box_rig, box_vertices
@@ -32,7 +32,7 @@ def test_out_of_reach_is_said():
 
 
 def test_solid_angle_of_a_closed_surface():
-    """4 pi from inside, 0 from outside."""
+    """The solid angle is 4 pi from inside and 0 from outside."""
     a, b, c = box_vertices().double()[box_faces()][None].unbind(2)
     inside, outside = torch.tensor([[[0.3, 0.6, 0.2]]]).double(), torch.tensor([[[1.3, 0.6, 0.2]]]).double()
     assert solid_angle(inside, a, b, c).sum().item() == pytest.approx(4 * torch.pi)
@@ -41,7 +41,7 @@ def test_solid_angle_of_a_closed_surface():
 
 @pytest.mark.parametrize("exact", [False, True])
 def test_fast_form_agrees_with_the_reference(exact: bool):
-    """On a posed body, points all around: the same distances, and the same sign at every point."""
+    """Points all around a posed body have the same distances, and the same sign at every point."""
     rig = box_rig(bend_segments=6)
     theta = torch.zeros(1, 2, 3)
     theta[0, 1] = torch.tensor([0.0, 0.7, 0.0])
@@ -64,11 +64,11 @@ def test_fast_form_agrees_with_the_reference(exact: bool):
 
 @pytest.mark.parametrize("exact", [False, True])
 def test_moved_bodies_are_found_where_they_are(exact: bool):
-    """A unit box that is moved to [1, 2] along x: the points of `test_box_by_hand`, moved along, find the same."""
+    """The unit box, moved to [1, 2] along x, gives the same for the points of `test_box_by_hand`, moved along."""
     vertices, away = box_vertices(), torch.tensor([1.0, 0.0, 0.0])
     points = away + torch.tensor([[2.0, 0.5, 0.5], [0.5, 0.5, 0.4]])
     meshes = BodyMeshes(vertices[None], box_faces())
-    meshes.move((vertices + away)[None])
+    meshes.refit((vertices + away)[None])
     found = meshes.closest_points(points, torch.zeros(2, dtype=torch.int32), 5.0, exact)
     closest = ((vertices + away)[box_faces()[found.face]] * found.barycentric[..., None]).sum(1)
     torch.testing.assert_close(closest, torch.tensor([[2.0, 0.5, 0.5], [1.5, 0.5, 0.0]]))
@@ -76,8 +76,8 @@ def test_moved_bodies_are_found_where_they_are(exact: bool):
 
 
 def test_exact_sign_inside_a_body_that_intersects_itself():
-    """Two unit boxes that overlap from x = 0.6 to 1: at x = 0.55 the nearest surface is the second box's buried wall,
-    and the point outside that wall, but inside the first box."""
+    """Two unit boxes overlap from x = 0.6 to 1: at x = 0.55 the nearest surface is the second box's buried wall, and
+    the point is outside that wall, but inside the first box."""
     vertices = torch.cat([box_vertices(), box_vertices() + torch.tensor([0.6, 0.0, 0.0])])
     faces = torch.cat([box_faces(), box_faces() + 8])
     point, row = torch.tensor([[0.55, 0.5, 0.5]]), torch.zeros(1, dtype=torch.int32)
@@ -87,7 +87,7 @@ def test_exact_sign_inside_a_body_that_intersects_itself():
 
 
 def test_canonical_position_undoes_the_pose():
-    """A rigidly turned and moved body: y is the point carried back, d is unchanged."""
+    """For a rigidly turned and moved body y is the point moved back, and d is unchanged."""
     rig = box_rig()
     root = torch.eye(4)
     root[:3, :3] = rotation_from_axis_angle(torch.tensor([0.3, -0.5, 0.8]))
@@ -103,7 +103,8 @@ def test_canonical_position_undoes_the_pose():
 
 @pytest.mark.parametrize("name, index", [("move_m", (0, 2)), ("turn", (0, 1, 0)), ("turn", (0, 0, 1))])
 def test_gradient_to_the_pose(name: str, index: tuple[int, ...]):
-    """dd and dy of the learned correction agree with moving the body for real (absorb) and asking again."""
+    """dd and dy of the learned correction agree with really moving the body (absorb) and describing the points
+    again."""
     step = 1e-3
     rig = box_rig(bend_segments=6)
     theta = torch.zeros(1, 2, 3)
@@ -134,14 +135,15 @@ RIGID_POINTS = [[0.5, 0.4, 2.15], [1.15, 0.5, 1.8], [0.4, -0.1, 1.9], [0.45, 0.6
 
 
 def growing_box() -> Rig:
-    """Whose shape also moves its upper joint."""
+    """Return a box whose shape also moves its upper joint."""
     rig = box_rig(bend_segments=6).to(dtype=torch.float64)
     joint_basis = torch.tensor([[[0.1, 0.0, 0.2], [0.3, -0.2, 0.5]]], dtype=torch.float64)
     return dataclasses.replace(rig, joint_basis=joint_basis)
 
 
 def reference_distance(points: Tensor, turn: Tensor, move: Tensor, beta: Tensor) -> Tensor:
-    """d by every triangle, in double precision, of the column bent by 0.4 rad and then turned, moved and reshaped."""
+    """Return d by every triangle, in double precision, of the column bent by 0.4 rad and then turned, moved and
+    reshaped."""
     rig = growing_box().reshaped(beta)
     theta = torch.zeros(1, 2, 3, dtype=torch.float64)
     theta[0, 1] = axis_angle_from_rotation(rotation_from_axis_angle(turn) @ rotation_from_axis_angle(BENT))
@@ -159,7 +161,7 @@ BENT = torch.tensor([0.4, 0.0, 0.0], dtype=torch.float64)
 @pytest.mark.parametrize("unknown", ["x", "theta", "T", "beta"])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_gradients_agree_with_finite_differences_in_double_precision(unknown: str, axis: int):
-    """To x, theta, T and beta, of the fast form, against central differences of the plain reference."""
+    """Gradients of the fast form by x, theta, T and beta agree with central differences of the plain reference."""
     rig = growing_box()
     theta = torch.zeros(1, 2, 3, dtype=torch.float64)
     theta[0, 1] = BENT
@@ -209,7 +211,7 @@ def test_gradient_to_the_shape():
     ],
 )
 def test_the_closest_point_follows_along_face_and_edge(point: list[float], follows: list[float]):
-    """ds_k / dx_k of a unit box, also against finite differences."""
+    """ds_k / dx_k of a unit box is as worked out, and agrees with finite differences."""
     rig = box_rig()
     bodies = PosedBodies(rig, torch.zeros(1, 2, 3), torch.eye(4)[None], rig.vertices_m)
     x, step, only = torch.tensor([point], requires_grad=True), 1e-2, torch.zeros(1, dtype=torch.int32)
@@ -229,7 +231,7 @@ def test_of_one_posture_what_was_turned_is_kept():
     for second, mean in ((-0.02, 0.0), (0.06, 0.04)):
         with torch.no_grad():
             correction.turn[0, 0, 0], correction.turn[1, 0, 0] = 0.02, second
-        bodies.absorb(correction, alike=torch.arange(2))
+        bodies.absorb(correction, same_posture=torch.arange(2))
         torch.testing.assert_close(bodies.theta[:, 1, 0], torch.full((2,), mean))
         torch.testing.assert_close(correction.totals()[0][:, 0, 0], torch.full((2,), mean))
 
@@ -252,7 +254,7 @@ def test_logarithm_inverts_the_exponential():
 
 
 def test_logarithm_of_a_half_turn():
-    """About z, to either side."""
+    """A half turn about z may have either sign."""
     found = axis_angle_from_rotation(torch.diag(torch.tensor([-1.0, -1.0, 1.0])))
     torch.testing.assert_close(found.abs(), torch.tensor([0.0, 0.0, torch.pi]))
 
@@ -264,8 +266,8 @@ def test_the_rig_of_the_tests_is_closed():
 
 
 def test_a_shape_moves_vertices_as_skinning_does() -> None:
-    """In a bent pose of the whole body, where joints move with the shape: the linear displacement of each vertex is
-    what skinning of the other shape does, to the float's accuracy, as skinning is linear in the shape."""
+    """In a bent pose of the whole body, where joints move with the shape, the linear displacement of each vertex equals
+    that of skinning the other shape, to float accuracy, as skinning is linear in the shape."""
     rig = anny_rig().to(dtype=torch.float64)
     generator = torch.Generator().manual_seed(2)
     theta = torch.randn(1, len(rig.joints_m), 3, generator=generator, dtype=torch.float64) * 0.4 * rig.free[:, None]
@@ -281,20 +283,20 @@ def test_a_shape_moves_vertices_as_skinning_does() -> None:
 
 
 def test_blending_by_hand_and_its_gradient_in_double():
-    """Rows 1 and 2 by a quarter and three quarters, row 0 twice; the gradient to a row is the sum of its shares."""
+    """Rows 1 and 2 count a quarter and three quarters, row 0 twice; the gradient of a row is the sum of its weights."""
     rows = torch.tensor([[1.0, 10.0], [2.0, 20.0], [4.0, 40.0]], dtype=torch.float64, requires_grad=True)
     corners, weights = torch.tensor([[1, 2], [0, 0]]), torch.tensor([[0.25, 0.75], [0.5, 0.5]])
-    mixed = blended(rows, corners, weights)
+    mixed = weighted_sum(rows, corners, weights)
     assert mixed.tolist() == [[3.5, 35.0], [1.0, 10.0]]
     mixed[:, 0].sum().backward()
     assert rows.grad is not None
     assert rows.grad.tolist() == [[1, 0], [0.25, 0], [0.75, 0]]
-    assert torch.autograd.gradcheck(lambda r: blended(r, corners, weights), (rows,))
+    assert torch.autograd.gradcheck(lambda r: weighted_sum(r, corners, weights), (rows,))
 
 
-def test_occurring_rows_are_those_of_unique():
+def test_distinct_rows_are_those_of_unique():
     """Of six rows, 1 and 4 occur; -1 is the last one."""
-    present, own = occurring(torch.tensor([4, 1, 1, 4]), 6)
+    present, own = distinct_rows(torch.tensor([4, 1, 1, 4]), 6)
     assert (present.tolist(), own.tolist()) == ([1, 4], [1, 0, 0, 1])
-    present, own = occurring(torch.tensor([2, -1]), 6)
+    present, own = distinct_rows(torch.tensor([2, -1]), 6)
     assert (present.tolist(), own.tolist()) == ([2, 5], [0, 1])

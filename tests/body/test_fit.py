@@ -7,7 +7,7 @@ import torch
 
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.body_model import body_model
-from hnerf.body.fit import fit_body, problem_of, resolve_depth_flips
+from hnerf.body.fit import fit_body, make_problem, resolve_depth_flips
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel
 from hnerf.body.observations import observe, runs
@@ -23,7 +23,7 @@ RING = {str(k): ring_camera(str(k), 0.3 + k * np.pi / 2) for k in range(4)} | {"
 
 
 def joint_error_m(a: BodyFit, b: BodyFit) -> torch.Tensor:
-    """(n, free joints) distances."""
+    """Return distances (n, free joints)."""
     where = [joint_transforms(body.rig, body.theta, body.root)[..., :3, 3] for body in (a, b)]
     return (where[0] - where[1]).norm(dim=-1)[:, a.rig.free]
 
@@ -55,11 +55,11 @@ def test_neighbours_outvote_an_arm_mirrored_in_depth(tmp_path: Path) -> None:
     smoothness = Smoothness(runs(capture), capture.fps, np.full(25, 30.0))
     nothing = torch.zeros(25, 3, dtype=torch.float64)
     pose = Pose(truth.rig.to(dtype=torch.float64), truth.theta.double(), truth.root.double(), nothing)
-    problem = problem_of(body_model(settings), pose, seen, smoothness, settings, offsets=1, proportions=0.1)
-    pose = levenberg_marquardt(problem, pose, problem.in_images, 30)
+    problem = make_problem(body_model(settings), pose, seen, smoothness, settings, offsets=1, proportions=0.1)
+    pose = levenberg_marquardt(problem, pose, problem.image_term, 30)
     mirrored_theta = pose.theta.clone()
     mirrored_theta[3, truth.rig.joint_names.index("upperarm01.L")] += torch.tensor([0.0, 2.0, 0.0])
-    mirrored = levenberg_marquardt(problem, replace(pose, theta=mirrored_theta), problem.in_images, 30)
+    mirrored = levenberg_marquardt(problem, replace(pose, theta=mirrored_theta), problem.image_term, 30)
     wrist = truth.rig.joint_names.index("wrist.L")
 
     def off_m(found: Pose) -> float:
@@ -119,7 +119,7 @@ def test_frames_of_a_stride_follow_each_other(tmp_path: Path) -> None:
 
 
 def test_the_normal_equations_hold_the_gradient_of_the_cost(tmp_path: Path) -> None:
-    """Along a random direction through poses, shape and offsets, by central differences."""
+    """The gradient along a random direction through poses, shape and offsets agrees with central differences."""
     capture = record(tmp_path, moving_body((0, 1, 2)), RING, ("0", "1"))
     rig, seen = two_bone_rig(), observe(capture)
 
@@ -135,13 +135,13 @@ def test_the_normal_equations_hold_the_gradient_of_the_cost(tmp_path: Path) -> N
     frame, shared = (torch.randn(*shape, generator=generator, dtype=torch.float64) for shape in ((3, 9), (76,)))
     ends = []
     for step in (1e-6, -1e-6):
-        end = Articulation(rig).moved(pose, step * frame)
+        end = Articulation(rig).apply_step(pose, step * frame)
         offsets_m = pose.offsets_m + step * shared[1:].reshape(25, 3)
         ends.append(replace(end, rig=reshape(rig.beta + step * shared[:1]), offsets_m=offsets_m))
-    for inform in (problem.in_space, problem.in_images):
-        _, equations = problem.assemble(pose, inform)
+    for data_term in (problem.space_term, problem.image_term):
+        _, equations = problem.assemble(pose, data_term)
         slope = float((equations.frame_gradient * frame.numpy()).sum() + equations.shared_gradient @ shared.numpy())
-        above, below = (problem.assemble(end, inform)[0] for end in ends)
+        above, below = (problem.assemble(end, data_term)[0] for end in ends)
         np.testing.assert_allclose(
             slope, (above - below) / 2e-6, rtol=5e-3
         )  # the prior's axes, which turn with the shape, are held

@@ -1,4 +1,4 @@
-"""SMPL's poses, given with a recording, as the start of a fit: to a made-up SMPL model, and to anny."""
+"""SMPL poses given with a recording as the start of a fit: of a made-up SMPL model, and of anny."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from hnerf.body.articulation import Pose
 from hnerf.body.body_model import body_model
 from hnerf.body.fit import fit_body
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.given_start import given_start
+from hnerf.body.given_start import initial_pose_from_given
 from hnerf.body.rig import joint_transforms
 from hnerf.calibration.check import check_calibration
 from hnerf.capture.capture import Capture
@@ -33,8 +33,8 @@ def model_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def parameters() -> GivenPoses:
-    """Three frames of somebody who stands, arms down, one forearm and one knee bent, upright in a world whose Z is
-    up; SMPL is Y up."""
+    """Return three frames of somebody who stands, arms down, one forearm and one knee bent, upright in a world whose Z
+    is up; SMPL is Y up."""
     theta = np.zeros((3, 24, 3))
     theta[:, 16], theta[:, 17], theta[:, 18], theta[:, 5] = [0, 0, -1.2], [0, 0, 1.2], [0, -0.7, 0], [0.5, 0, 0]
     theta[:, 16, 2] += (0, 0.2, 0.4)
@@ -48,8 +48,9 @@ def joints_m(body: BodyFit | Pose) -> Tensor:
 
 
 def recorded(model_file: Path, folder: Path, given: GivenPoses) -> tuple[Capture, BodyFit]:
-    """Masks of the made-up person in the pose of `parameters()`, no keypoints, and other poses `given` for it."""
-    pose = given_start(parameters(), body_model(FitSettings(body_model=model_file)))
+    """Record masks of the made-up person in the pose of `parameters()`, no keypoints, and other poses `given` for
+    it."""
+    pose = initial_pose_from_given(parameters(), body_model(FitSettings(body_model=model_file)))
     truth = BodyFit(pose.rig.to(dtype=torch.float32), (0, 1, 2), pose.theta.float(), pose.root.float())
     capture = record(folder, truth, RING, tuple(RING))
     (folder / "keypoints.npz").unlink()
@@ -60,28 +61,28 @@ def recorded(model_file: Path, folder: Path, given: GivenPoses) -> tuple[Capture
 def test_frames_without_a_pose_stand_as_their_nearest_neighbour(model_file: Path) -> None:
     given = parameters()
     given.theta[0], given.root[0] = np.nan, np.nan
-    pose = given_start(given, body_model(FitSettings(body_model=model_file)))
+    pose = initial_pose_from_given(given, body_model(FitSettings(body_model=model_file)))
     assert torch.equal(pose.theta[0], pose.theta[1]) and torch.equal(pose.root[0], pose.root[1])
     assert not torch.equal(pose.theta[1], pose.theta[2])
 
 
 def test_contours_correct_given_poses_where_there_are_no_keypoints(model_file: Path, tmp_path: Path) -> None:
-    """Given 3 cm too far and with the arms 0.15 rad too high."""
+    """The given poses are 3 cm off, with arms 0.15 rad too high."""
     wrong = parameters()
     wrong.root[:, 0, 3] += 0.03
     wrong.theta[:, 16, 2] += 0.15
     wrong.theta[:, 17, 2] -= 0.15
     capture, truth = recorded(model_file, tmp_path, wrong)
     settings = FitSettings(body_model=model_file)
-    begin = given_start(wrong, body_model(settings))
+    begin = initial_pose_from_given(wrong, body_model(settings))
     fit, report = fit_body(capture, Silhouettes(capture, truth), settings)  # type: ignore[arg-type]
     before, after = ((joints_m(body) - joints_m(truth))[:, truth.rig.free].norm(dim=-1) for body in (begin, fit))
     assert float(before.mean()) > 0.03 and float(after.mean()) < 0.008
-    assert report["given_poses"] == "used as the start, and in place of keypoints, of which there are none"
+    assert report["given_poses"] == "used as the start, and in place of keypoints, which are missing"
 
 
 def test_the_stages_before_a_fit_do_without_keypoints(model_file: Path, tmp_path: Path) -> None:
-    """Cameras are used as given, and said to be unchecked; of the given masks only the person is kept."""
+    """Cameras are used as given and reported as unchecked; only the person is kept of the given masks."""
     capture, truth = recorded(model_file, tmp_path, parameters())
     masks = Silhouettes(capture, truth)
     for name in capture.train_cameras:
@@ -100,10 +101,12 @@ def test_the_stages_before_a_fit_do_without_keypoints(model_file: Path, tmp_path
     assert all(np.array_equal(found.get(c, f), masks.get(c, f)) for c in capture.train_cameras for f in capture.frames)
 
 
-def test_anny_takes_the_pose_by_the_likes_of_its_joints(model_file: Path) -> None:
+def test_anny_takes_the_pose_by_corresponding_joints(model_file: Path) -> None:
     """Limbs point within a few degrees the same way (the made-up T pose is a little off the mean one), from the same
     hips."""
-    smpl, anny = (given_start(parameters(), body_model(FitSettings(body_model=m))) for m in (model_file, "anny"))
+    smpl, anny = (
+        initial_pose_from_given(parameters(), body_model(FitSettings(body_model=m))) for m in (model_file, "anny")
+    )
     ways = []
     for pose in (smpl, anny):
         start, end = ([pose.rig.joint_names.index(name) for name in names] for names in (LIMBS, ENDS))
@@ -120,4 +123,4 @@ def test_anny_is_fitted_to_outlines_from_given_poses_alone(model_file: Path, tmp
     fit, report = fit_body(capture, Silhouettes(capture, truth), FitSettings(contour_steps=2))  # type: ignore[arg-type]
     wrists = [joints_m(body)[:, body.rig.joint_names.index("wrist.L")] for body in (fit, truth)]
     assert float((wrists[0] - wrists[1]).norm(dim=-1).max()) < 0.08 and min(report["silhouette_iou"]) > 0.7
-    assert report["given_poses"].startswith("are SMPL's: used as the start, by the likes of its joints")
+    assert report["given_poses"].startswith("are SMPL's: used as the start, by corresponding joints")

@@ -4,7 +4,7 @@ from hnerf.body.normal_equations import NormalEquations
 
 
 def random_problem(frames: int, unknowns: int, shared: int) -> tuple[NormalEquations, np.ndarray, np.ndarray]:
-    """The banded form, the dense matrix and the dense gradient of the same random least squares."""
+    """Return the banded form, the dense matrix and the dense gradient of the same random least squares."""
     generator = np.random.default_rng(0)
     size = frames * unknowns
     jacobian = np.zeros((frames * 40, size + shared))

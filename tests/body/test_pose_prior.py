@@ -16,7 +16,7 @@ def resting(articulation: Articulation) -> Pose:
     joints = len(articulation.rig.joints_m)
     root = torch.eye(4, dtype=torch.float64)[None]
     theta = torch.zeros(1, joints, 3, dtype=torch.float64)
-    theta[:, articulation.joints[1:]] = PosePrior(articulation).likely()
+    theta[:, articulation.joints[1:]] = PosePrior(articulation).mean_pose()
     return Pose(articulation.rig, theta, root, torch.zeros(25, 3, dtype=torch.float64))
 
 
@@ -30,7 +30,7 @@ def test_the_likeliest_pose_costs_nothing() -> None:
 
 
 def test_one_standard_deviation_of_flexion_costs_one_half() -> None:
-    """A foot's flexion is about left-right, square to the foot, with a spread of 20 degrees."""
+    """A foot flexes about the left-right axis, perpendicular to the foot, with a standard deviation of 20 degrees."""
     articulation = Articulation(anny_rig().to(dtype=torch.float64))
     pose, prior = resting(articulation), PosePrior(articulation)
     foot = articulation.joints[1:].tolist().index(articulation.rig.joint_names.index("foot.L"))
@@ -39,7 +39,7 @@ def test_one_standard_deviation_of_flexion_costs_one_half() -> None:
 
 
 def test_knees_do_not_bend_backwards_and_arms_do_not_swing_behind() -> None:
-    """Half the free range forwards is cheap; the same backwards meets the limit of 2 degrees' softness."""
+    """Half the free range forwards is cheap; the same backwards meets the limit, soft by 2 degrees."""
     articulation = Articulation(anny_rig().to(dtype=torch.float64))
     prior = PosePrior(articulation)
     names = [articulation.rig.joint_names[int(j)] for j in articulation.joints[1:]]
@@ -78,7 +78,7 @@ def test_the_gradient_is_that_of_the_cost() -> None:
     equations = NormalEquations(2, articulation.unknowns, 0)
     PosePrior(articulation).add(equations, pose)
     direction = torch.randn(2, articulation.unknowns, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    ends = [cost_of(articulation, articulation.moved(pose, sign * 1e-6 * direction)) for sign in (1, -1)]
+    ends = [cost_of(articulation, articulation.apply_step(pose, sign * 1e-6 * direction)) for sign in (1, -1)]
     np.testing.assert_allclose(
         (equations.frame_gradient * direction.numpy()).sum(), (ends[0] - ends[1]) / 2e-6, rtol=1e-5
     )
@@ -112,7 +112,7 @@ def test_smoothness_does_not_reach_across_runs_of_frames() -> None:
 
 
 def test_smoothness_adds_the_blocks_of_its_own_jacobian() -> None:
-    """Against the dense J^T W J of the second differences, small enough that the robust weight is one."""
+    """The blocks equal the dense J^T W J of the second differences, small enough that the robust weight is one."""
     rig = two_bone_rig()
     articulation, pose = Articulation(rig), random_pose(rig, 4)
     pose = replace(pose, theta=1e-6 * pose.theta, root=torch.eye(4, dtype=torch.float64).repeat(4, 1, 1))

@@ -10,12 +10,12 @@ from hnerf.body.anny import anny_rig
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.balance import Balance, centre_of_mass_over_feet
 from hnerf.body.body_model import body_model
-from hnerf.body.fit import hold_single_posture, problem_of
+from hnerf.body.fit import hold_single_posture, make_problem
 from hnerf.body.keypoint_fit import Problem, levenberg_marquardt
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.observations import observe, runs
 from hnerf.body.pose_prior import Smoothness
-from hnerf.body.posture_prior import PosturePrior, turning
+from hnerf.body.posture_prior import PosturePrior, view_direction_variance
 from hnerf.body.rig import rotation_from_axis_angle
 from hnerf.config import FitSettings
 from tests.body.recorded_body import moving_body, record, ring_camera
@@ -28,7 +28,7 @@ ARMS = [f"{bone}arm01.{side}" for bone in ("upper", "lower") for side in "LR"]
 
 
 def turned(yaw: list[float], bend: list[float]) -> Pose:
-    """Two bones at the origin, turned about z, with bent elbows; radians."""
+    """Return two bones at the origin, turned about z, with bent elbows; radians."""
     pose = random_pose(two_bone_rig(), len(yaw))
     theta, root = torch.zeros_like(pose.theta), torch.eye(4, dtype=torch.float64).repeat(len(yaw), 1, 1)
     theta[:, 1, 0] = torch.tensor(bend, dtype=torch.float64)
@@ -36,42 +36,43 @@ def turned(yaw: list[float], bend: list[float]) -> Pose:
     return replace(pose, theta=theta, root=root)
 
 
-def habit_of(pose: Pose) -> tuple[float, NormalEquations]:
+def posture_cost(pose: Pose) -> tuple[float, NormalEquations]:
+    """Return the cost and the normal equations of a single view's posture prior."""
     articulation = Articulation(pose.rig)
-    habit = PosturePrior.of_one_view([list(range(len(pose.theta)))], pose, CAMERA)
-    equations = NormalEquations(len(pose.theta), articulation.unknowns, habit.unknowns(articulation))
-    return habit.add(equations, articulation, pose), equations
+    posture_prior = PosturePrior.of_single_view([list(range(len(pose.theta)))], pose, CAMERA)
+    equations = NormalEquations(len(pose.theta), articulation.unknowns, posture_prior.unknowns(articulation))
+    return posture_prior.add(equations, articulation, pose), equations
 
 
-def test_a_habit_counts_as_far_as_the_body_turns() -> None:
+def test_a_posture_counts_as_far_as_the_body_turns() -> None:
     """Seen from three sides, 7 degrees off the median in one frame cost 0.5 / (1 + 1/4); seen from one side nothing."""
     bend = [0.5, 0.5 + math.radians(7), 0.5]
     thirds = [0.0, 2 * math.pi / 3, 4 * math.pi / 3]
-    assert math.isclose(habit_of(turned(thirds, bend))[0], 0.4, rel_tol=1e-9)
-    assert abs(habit_of(turned([0.3, 0.3, 0.3], bend))[0]) < 1e-9
+    assert math.isclose(posture_cost(turned(thirds, bend))[0], 0.4, rel_tol=1e-9)
+    assert abs(posture_cost(turned([0.3, 0.3, 0.3], bend))[0]) < 1e-9
 
 
 def test_how_far_a_body_turns_does_not_depend_on_the_cameras_height() -> None:
-    """Two views square to each other: 1 - |(1, 1)| / 2, also from above."""
+    """Two perpendicular views give 1 - |(1, 1)| / 2, also from above."""
     root = turned([0.0, math.pi / 2], [0.0, 0.0]).root
     for camera in (CAMERA, replace(CAMERA, t_m=np.array([0.0, 2.0, 3.0]))):
-        assert math.isclose(turning(root, camera), 1 - math.sqrt(0.5), rel_tol=1e-9)
+        assert math.isclose(view_direction_variance(root, camera), 1 - math.sqrt(0.5), rel_tol=1e-9)
 
 
-def test_the_gradient_of_habit_is_that_of_its_cost() -> None:
-    """Where one frame, not the median one, bends."""
+def test_the_gradient_is_that_of_the_cost() -> None:
+    """One frame, which is not the median one, bends."""
     bend, step = [0.4, 0.5, 0.9], 1e-6
     yaw = [0.0, 2.0, 4.0]
-    ends = [habit_of(turned(yaw, [*bend[:2], bend[2] + sign * step]))[0] for sign in (1, -1)]
-    _, equations = habit_of(turned(yaw, bend))
+    ends = [posture_cost(turned(yaw, [*bend[:2], bend[2] + sign * step]))[0] for sign in (1, -1)]
+    _, equations = posture_cost(turned(yaw, bend))
     np.testing.assert_allclose(equations.frame_gradient[2, 6], (ends[0] - ends[1]) / (2 * step), rtol=1e-6)
     assert equations.frame_gradient[2, 6] > 0.1 and not equations.frame_gradient[:, :6].any()
 
 
-def test_frames_move_together_with_what_is_usual() -> None:
-    """Pulls of 1 / rad^2 ask the elbow of three frames to bend by 0.3: in one step all do, as if there were no habit.
-    Against a habit that stands still they would go 0.3 / (1 + w), w = 1 / (7 degrees)^2 = 67."""
-    _, equations = habit_of(turned([0.0, 2 * math.pi / 3, 4 * math.pi / 3], [0.5, 0.5, 0.5]))
+def test_frames_move_together_with_their_median() -> None:
+    """Pulls of 1 / rad^2 ask the elbow of three frames to bend by 0.3: in one step all do, as if there were no prior.
+    If the median stood still they would go 0.3 / (1 + w), w = 1 / (7 degrees)^2 = 67."""
+    _, equations = posture_cost(turned([0.0, 2 * math.pi / 3, 4 * math.pi / 3], [0.5, 0.5, 0.5]))
     unknowns = np.arange(equations.frame_gradient.shape[1])
     equations.frame[0][:, unknowns, unknowns] += 1.0
     equations.frame_gradient[:, 6] -= 0.3
@@ -81,31 +82,35 @@ def test_frames_move_together_with_what_is_usual() -> None:
 
 
 def test_who_stands_still_is_held_to_it() -> None:
-    """Off the median bend by 0, 5, 10 and 0, 0, 15 degrees: their medians over 1.54, but 2 degrees at least, and 7 at
-    most."""
+    """Deviations of 0, 5, 10 and 0, 0, 15 degrees give their medians over 1.54, but at least 2 and at most 7
+    degrees."""
     degrees, groups = torch.tensor([30.0, 35.0, 40.0, 0.0, 0.0, 15.0]).double(), [[0, 1, 2], [3, 4, 5]]
     pose = turned([0.0, 2.0, 4.0] * 2, degrees.deg2rad().tolist())
-    habit = PosturePrior.of_one_view(groups, pose, CAMERA)
-    torch.testing.assert_close(habit.learned(pose).spread[[0, 3], 0].rad2deg(), torch.tensor([5 / 1.54, 2.0]).double())
+    posture_prior = PosturePrior.of_single_view(groups, pose, CAMERA)
+    torch.testing.assert_close(
+        posture_prior.with_learned_std(pose).std[[0, 3], 0].rad2deg(), torch.tensor([5 / 1.54, 2.0]).double()
+    )
     wild = turned([0.0, 2.0, 4.0] * 2, (3 * degrees).deg2rad().tolist())
-    torch.testing.assert_close(habit.learned(wild).spread[[0, 3], 0].rad2deg(), torch.tensor([7.0, 2.0]).double())
+    torch.testing.assert_close(
+        posture_prior.with_learned_std(wild).std[[0, 3], 0].rad2deg(), torch.tensor([7.0, 2.0]).double()
+    )
 
 
-def test_only_wrists_have_a_habit_that_several_cameras_need() -> None:
+def test_several_cameras_need_a_posture_prior_of_the_wrists_only() -> None:
     """5 degrees off the median in one frame of three cost 0.5 / (1 + 1/4) at a wrist, and nothing at an elbow."""
     articulation = Articulation(anny_rig().to(dtype=torch.float64))
-    habit, names = PosturePrior.of_hands(3, articulation), articulation.rig.joint_names
+    posture_prior, names = PosturePrior.of_wrists(3, articulation), articulation.rig.joint_names
     for name, cost in (("wrist.L", 0.4), ("lowerarm01.R", 0.0)):
         pose = random_pose(articulation.rig, 3)
         pose = replace(pose, theta=torch.zeros_like(pose.theta))
         pose.theta[1, names.index(name), 2] = math.radians(5)
-        equations = NormalEquations(3, articulation.unknowns, habit.unknowns(articulation))
-        assert math.isclose(habit.add(equations, articulation, pose), cost, rel_tol=1e-9, abs_tol=1e-12)
+        equations = NormalEquations(3, articulation.unknowns, posture_prior.unknowns(articulation))
+        assert math.isclose(posture_prior.add(equations, articulation, pose), cost, rel_tol=1e-9, abs_tol=1e-12)
         assert equations.frame_gradient.any() == (cost > 0)
 
 
 def turning_person(folder: Path, sway_deg: float) -> tuple[Problem, Pose]:
-    """One posture from eight sides, but for arms that swing from frame to frame; keypoints 2 px off."""
+    """Record one posture from eight sides, but for arms that swing from frame to frame; keypoints are 2 px off."""
     still, yaw = moving_body((0,)), np.arange(8) * np.pi / 4
     root = still.root.repeat(8, 1, 1)
     root[:, :3, :3] = rotation_from_axis_angle(torch.tensor([[0.0, 0.0, angle] for angle in yaw]))
@@ -121,35 +126,39 @@ def turning_person(folder: Path, sway_deg: float) -> tuple[Problem, Pose]:
     offsets_m = torch.zeros(25, 3, dtype=torch.float64)
     begin = Pose(truth.rig.to(dtype=torch.float64), truth.theta.double(), truth.root.double(), offsets_m)
     smoothness = Smoothness(runs(capture), 10.0, np.full(25, 30.0))
-    return problem_of(body_model(settings), begin, seen, smoothness, settings, 1, 0.1), begin
+    return make_problem(body_model(settings), begin, seen, smoothness, settings, 1, 0.1), begin
 
 
 @pytest.mark.parametrize(("sway_deg", "held"), [(0.0, True), (10.0, False)])
 def test_who_turns_in_one_posture_is_held_to_it(sway_deg: float, held: bool, tmp_path: Path) -> None:
-    """Within a thousandth of a radian; arms that swing by 10 degrees keep doing so."""
+    """The posture is the same within a thousandth of a radian; arms that swing by 10 degrees keep doing so."""
     problem, begin = turning_person(tmp_path, sway_deg)
     problem = replace(problem, balance=Balance(up=2))
-    habit = PosturePrior.of_one_view([list(range(8))], begin, problem.seen.cameras[0])
-    first = levenberg_marquardt(replace(problem, habit=habit), begin, problem.in_images, 30)
-    pose, kept = hold_single_posture(problem, first, habit)
+    posture_prior = PosturePrior.of_single_view([list(range(8))], begin, problem.observations.cameras[0])
+    first = levenberg_marquardt(replace(problem, posture_prior=posture_prior), begin, problem.image_term, 30)
+    pose, kept = hold_single_posture(problem, first, posture_prior)
     arms = pose.theta[:, [begin.rig.joint_names.index(bone) for bone in ARMS]]
     std_rad = (arms - arms.mean(0)).norm(dim=-1).mean()
     assert (std_rad < 1e-3) if held else (std_rad > math.radians(5))
-    assert math.isclose(kept.spread.rad2deg().max(), 0.1, rel_tol=1e-9) == held
+    assert math.isclose(kept.std.rad2deg().max(), 0.1, rel_tol=1e-9) == held
 
 
 def test_one_posture_is_told_from_all_sides_only() -> None:
-    """Three sides are, two views square to each other (trust 0.29) are not; the spread there stays."""
+    """Three sides suffice; two perpendicular views (trust 0.29) do not, and the standard deviation there stays."""
     pose = turned([0.0, 2.0, 4.0, 0.0, math.pi / 2], [0.0] * 5)
-    habit = PosturePrior.of_one_view([[0, 1, 2], [3, 4]], pose, CAMERA)
-    still = habit.of_one_posture()
+    posture_prior = PosturePrior.of_single_view([[0, 1, 2], [3, 4]], pose, CAMERA)
+    still = posture_prior.as_single_posture()
     assert still is not None
-    torch.testing.assert_close(still.spread[[0, 3], 0].rad2deg(), torch.tensor([0.1, 7.0]).double())
-    assert PosturePrior.of_one_view([[0, 1], [2, 3, 4]], turned([0.0] * 5, [0.0] * 5), CAMERA).of_one_posture() is None
+    torch.testing.assert_close(still.std[[0, 3], 0].rad2deg(), torch.tensor([0.1, 7.0]).double())
+    assert (
+        PosturePrior.of_single_view([[0, 1], [2, 3, 4]], turned([0.0] * 5, [0.0] * 5), CAMERA).as_single_posture()
+        is None
+    )
 
 
 def test_a_person_who_turns_before_one_camera_neither_leans_nor_sways(tmp_path: Path) -> None:
-    """One posture from eight sides: arms sway half as much at most, the lean is 0.7 at most."""
+    """Seen in one posture from eight sides, arms sway at most half as much, and the lean is at most 0.7 of that without
+    the priors."""
     problem, begin = turning_person(tmp_path, 0.0)
     arms = [begin.rig.joint_names.index(bone) for bone in ARMS]
 
@@ -158,13 +167,15 @@ def test_a_person_who_turns_before_one_camera_neither_leans_nor_sways(tmp_path: 
         x, _, _ = articulation.jacobian(articulation.keypoints(), articulation.pose(pose))
         return torch.einsum("k,nkc->nc", centre_of_mass_over_feet(), x)[:, :2]
 
-    def lean_and_sway(balance: Balance | None, habit: PosturePrior | None) -> tuple[float, float]:
-        pose = levenberg_marquardt(replace(problem, balance=balance, habit=habit), begin, problem.in_images, 30)
+    def lean_and_sway(balance: Balance | None, posture_prior: PosturePrior | None) -> tuple[float, float]:
+        pose = levenberg_marquardt(
+            replace(problem, balance=balance, posture_prior=posture_prior), begin, problem.image_term, 30
+        )
         turns = pose.theta[:, arms]
         lean_m = (over_feet(pose) - over_feet(begin)).norm(dim=-1).mean()
         return float(lean_m), float((turns - turns.mean(0)).norm(dim=-1).mean())
 
-    habit = PosturePrior.of_one_view([list(range(8))], begin, problem.seen.cameras[0])
+    posture_prior = PosturePrior.of_single_view([list(range(8))], begin, problem.observations.cameras[0])
     lean_m, sway = lean_and_sway(None, None)
-    mended_lean_m, mended_sway = lean_and_sway(Balance(up=2), habit)
+    mended_lean_m, mended_sway = lean_and_sway(Balance(up=2), posture_prior)
     assert mended_lean_m < 0.7 * lean_m and mended_sway < 0.5 * sway

@@ -1,4 +1,4 @@
-"""SMPL's file format as a rig, by a made-up person of tubes; vertices worked out by SMPL's own equations."""
+"""SMPL's file format as a rig, tested on a made-up person of tubes; vertices worked out by SMPL's own equations."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from hnerf.body.body_model import body_model
 from hnerf.body.fit import fit_body
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.given_start import given_start
+from hnerf.body.given_start import initial_pose_from_given
 from hnerf.body.rig import joint_transforms, pose_vertices
 from hnerf.body.smpl import read_smpl
 from hnerf.capture.given_poses import GivenPoses
@@ -28,7 +28,7 @@ def model_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def smpl_vertices(theta: np.ndarray, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """SMPL (Loper et al. 2015, eqs. 2-6) without pose blend shapes: vertices (V, 3) and joints (24, 3), Y up."""
+    """Return SMPL (Loper et al. 2015, eqs. 2-6) without pose blend shapes: vertices (V, 3) and joints (24, 3), Y up."""
     data = made_up_smpl()
     shaped = data["v_template"] + data["shapedirs"] @ betas
     joints = data["J_regressor"] @ shaped
@@ -46,7 +46,7 @@ def smpl_vertices(theta: np.ndarray, betas: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def random_parameters(seed: int = 0) -> GivenPoses:
-    """Two frames: toes and hands, which are locked, unturned."""
+    """Return random poses of two frames, without turns of toes and hands, which are locked."""
     random = np.random.default_rng(seed)
     theta = random.normal(0, 0.4, (2, 24, 3))
     theta[:, [10, 11, 22, 23]] = 0
@@ -56,7 +56,7 @@ def random_parameters(seed: int = 0) -> GivenPoses:
 
 
 def test_the_rig_stands_as_anny_does(model_file: Path) -> None:
-    """Z up, facing -Y, left at +X, arms down and elbows bent forwards; weights and regressors sum to 1."""
+    """Z is up, facing -Y, left at +X, arms down and elbows bent forwards; weights and regressors sum to 1."""
     rig = read_smpl(model_file).rig
     points = (rig.keypoint_weights @ rig.vertices_m).numpy()
     nose, left_wrist, left_elbow, left_shoulder, left_toe, left_heel = (points[k] for k in (0, 7, 6, 5, 19, 21))
@@ -69,9 +69,9 @@ def test_the_rig_stands_as_anny_does(model_file: Path) -> None:
 
 
 def test_given_parameters_put_joints_where_smpl_has_them(model_file: Path) -> None:
-    """Exactly; and vertices where skin is rigid: those of one joint only, less the rest pose's blend shape."""
+    """Joints agree exactly, and so do vertices of a single joint, less the rest pose's blend shape."""
     model, given = body_model(FitSettings(body_model=model_file)), random_parameters()
-    pose = given_start(given, model)
+    pose = initial_pose_from_given(given, model)
     joints = joint_transforms(pose.rig, pose.theta, pose.root)[..., :3, 3].numpy()
     vertices = pose_vertices(pose.rig, pose.theta, pose.root).numpy()
     weights, posedirs = made_up_smpl()["weights"], made_up_smpl()["posedirs"]
@@ -85,14 +85,14 @@ def test_given_parameters_put_joints_where_smpl_has_them(model_file: Path) -> No
 
 
 def test_the_rest_pose_has_its_pose_blend_shape(model_file: Path) -> None:
-    """The made-up one lifts the forearm by 0.1 (R - 1)[0, 0], R the elbow's turn from T to rest in SMPL's axes: seen
-    against a model without it."""
+    """The made-up blend shape lifts the forearm by 0.1 (R - 1)[0, 0], R the elbow's turn from T to rest in SMPL's axes,
+    compared to a model without it."""
     smpl = read_smpl(model_file)
     data = made_up_smpl()
     plain_file = model_file.with_name("plain.npz")
     np.savez(plain_file, **data | {"posedirs": 0 * data["posedirs"]})
     lifted = (smpl.rig.vertices_m - read_smpl(plain_file).rig.vertices_m).norm(dim=1)
-    shoulder, elbow = (smpl.rest_turns[j] for j in (16, 18))
+    shoulder, elbow = (smpl.rest_rotations[j] for j in (16, 18))
     expected = 0.1 * abs(float((shoulder.T @ elbow)[0, 0]) - 1)  # the x axis is common to both frames
     assert expected > 0.01
     forearm = data["posedirs"].any((1, 2)) & (data["weights"].max(1) == 1)
@@ -107,7 +107,7 @@ def test_pickled_and_plain_files_are_one_model(model_file: Path, tmp_path: Path)
 
 
 def test_smplx_loses_its_eyeballs(tmp_path: Path) -> None:
-    """Tubes of 190 vertices an eye, of which the first ring, of 27, is half the head's and stays; the eyes' keypoints
+    """Each eye has a tube of 190 vertices, whose first ring, of 27, is half the head's and stays; the eyes' keypoints
     move to skin nearby."""
     rig = read_smpl(write_smpl(tmp_path / "x.npz", "smplx")).rig
     assert len(rig.vertices_m) == 10475 - 2 * (190 - 27)
@@ -136,13 +136,16 @@ def test_a_fit_to_its_own_keypoints_recovers_pose_and_shape(model_file: Path, tm
 
 BAD = {
     "no file": (lambda f: f.unlink(), "no such body model"),
-    "no archive": (lambda f: f.write_bytes(b"nothing"), "no .npz of plain arrays"),
-    "another mesh": (lambda f: _rewrite(f, v_template=np.zeros((100, 3))), "100 vertices and 24 joints are no SMPL"),
-    "weights of others": (lambda f: _rewrite(f, weights=np.zeros((6890, 3))), "weights is not that of such a model"),
-    "a face too far": (lambda f: _rewrite(f, f=np.array([[0, 1, 6890]])), "f is not that of such a model"),
+    "no archive": (lambda f: f.write_bytes(b"nothing"), "not a .npz of plain arrays"),
+    "another mesh": (
+        lambda f: _rewrite(f, v_template=np.zeros((100, 3))),
+        "100 vertices and 24 joints are not those of SMPL",
+    ),
+    "weights of others": (lambda f: _rewrite(f, weights=np.zeros((6890, 3))), "weights is not that of an SMPL model"),
+    "a face too far": (lambda f: _rewrite(f, f=np.array([[0, 1, 6890]])), "f is not that of an SMPL model"),
     "a child before its parent": (lambda f: _rewrite(f, kintree_table=np.full((2, 24), 23)), "kintree_table is not"),
     "NaN": (lambda f: _rewrite(f, shapedirs=np.full((6890, 3, 10), np.nan)), "shapedirs is not"),
-    "pickled arrays": (lambda f: _rewrite(f, f=np.array([{}], object)), "no .npz of plain arrays"),
+    "pickled arrays": (lambda f: _rewrite(f, f=np.array([{}], object)), "not a .npz of plain arrays"),
     "no shapes": (lambda f: _rewrite(f, shapedirs=None), "no shapedirs; give an SMPL"),
 }
 

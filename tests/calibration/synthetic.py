@@ -1,4 +1,4 @@
-"""A ring of cameras around a walking stick figure: everything about it is known."""
+"""Synthetic captures: a ring of cameras around a walking stick figure, with everything known."""
 
 import dataclasses
 from pathlib import Path
@@ -23,13 +23,14 @@ STANDING_M = np.array([
 
 
 def look_at(name: str, centre_m: np.ndarray, target_m: np.ndarray) -> Camera:
-    """A camera of 1000 x 1000 px and focal length 1000 px, upright."""
+    """Return an upright camera of 1000 x 1000 px and focal length 1000 px."""
     like = Camera(name, np.diag([1000.0, 1000, 1]), np.eye(3), np.zeros(3), SIZE_PX, SIZE_PX)
     return cameras_along.look_at(like, centre_m, target_m, np.array([0, 0, 1]))
 
 
 def ring(count: int) -> list[Camera]:
-    """Cameras 3.5 m around the origin at 1.2 to 1.8 m, unevenly spaced, looking at the middle of the body."""
+    """Return cameras 3.5 m around the origin at 1.2 to 1.8 m height, unevenly spaced, looking at the middle of the
+    body."""
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False) + 0.3 * np.sin(np.arange(count))
     heights = 1.2 + 0.6 * (np.arange(count) % 2)
     return [
@@ -39,7 +40,7 @@ def ring(count: int) -> list[Camera]:
 
 
 def walk_m(frames: int = FRAMES) -> np.ndarray:
-    """(frames, 25, 3): the figure on a small circle, turning, with arms that swing."""
+    """Return joints (frames, 25, 3) of the figure on a small circle, turning, with swinging arms."""
     poses = []
     for angle in np.linspace(0, 2 * np.pi, frames, endpoint=False):
         pose = STANDING_M.copy()
@@ -50,7 +51,7 @@ def walk_m(frames: int = FRAMES) -> np.ndarray:
 
 
 def detections(cameras: list[Camera], noise_px: float, seed: int = 0) -> dict[str, np.ndarray]:
-    """Per camera (frames, 1, 25, 3) keypoints of the walk with Gaussian noise and confidence 0.8."""
+    """Return, per camera, keypoints (frames, 1, 25, 3) of the walk with Gaussian noise and confidence 0.8."""
     rng = np.random.default_rng(seed)
     seen = {}
     for camera in cameras:
@@ -61,7 +62,7 @@ def detections(cameras: list[Camera], noise_px: float, seed: int = 0) -> dict[st
 
 
 def write_capture(root: Path, cameras: list[Camera], seen: dict[str, np.ndarray], up: str = "z") -> Capture:
-    """A capture with keypoints and no images, as the given cameras would have it."""
+    """Write a capture with keypoints and no images, with the given cameras as its calibration."""
     root.mkdir(parents=True, exist_ok=True)
     np.savez(root / "keypoints.npz", **seen)  # type: ignore[arg-type]
     sizes = {camera.name: (SIZE_PX, SIZE_PX) for camera in cameras}
@@ -72,6 +73,6 @@ def write_capture(root: Path, cameras: list[Camera], seen: dict[str, np.ndarray]
 
 
 def turned(camera: Camera, degrees: float, axis: int = 1) -> Camera:
-    """The camera turned about its own centre and one of its own axes."""
+    """Return the camera turned about its own centre and one of its own axes."""
     rotation = cv2.Rodrigues(np.deg2rad(degrees) * np.eye(3)[axis])[0]
     return dataclasses.replace(camera, R=rotation @ camera.R, t_m=rotation @ camera.t_m)

@@ -1,4 +1,4 @@
-"""Cameras from a board: known cameras around a board on a known path, and the real footage."""
+"""Board calibration: known cameras around a board on a known path, and real footage."""
 
 import dataclasses
 from pathlib import Path
@@ -9,9 +9,16 @@ import pytest
 
 from hnerf.calibration.boards import calibrate as calibration_boards
 from hnerf.calibration.boards.bundle import Poses
-from hnerf.calibration.boards.calibrate import board_witness, calibrate_from_boards, visible_and_found
+from hnerf.calibration.boards.calibrate import board_evidence, calibrate_from_boards, visible_and_found
 from hnerf.calibration.boards.lens import estimate_lens
-from hnerf.calibration.boards.rig import compare_pairs, flat_only, solve_boards, solve_rig, undistorted, whole_enough
+from hnerf.calibration.boards.rig import (
+    compare_pairs,
+    fixes_pose,
+    planar_corners,
+    solve_boards,
+    solve_rig,
+    undistort_corners,
+)
 from hnerf.capture.board_footage import Board, BoardCorners, BoardFootage
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.easymocap import EasyMocap
@@ -29,14 +36,15 @@ NOISE_PX = 0.1
 
 
 def rig() -> list[Camera]:
-    """Three cameras 1.5 m from the board's path, 30 degrees apart, in a world that is none of theirs."""
+    """Return three cameras 1.5 m from the board's path, 30 degrees apart, none of them at the world's origin."""
     target = np.array([0, 0, 1.0])
     centres = [[1.5 * np.sin(a), -1.5 * np.cos(a), 1.2] for a in np.deg2rad([-30, 0, 30])]
     return [look_at(name, np.array(c), target) for name, c in zip("abc", centres, strict=True)]
 
 
 def board_at(time: float) -> tuple[np.ndarray, np.ndarray]:
-    """World from board at a time in frames: a board that faces the cameras, swings, and goes along a circle."""
+    """Return the world-from-board pose at a time in frames: the board faces the cameras, swings, and moves along a
+    circle."""
     facing = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x right, y down, z away from the cameras
     swing = cv2.Rodrigues(np.array([0.5 * np.sin(0.3 * time), 0.4 * np.cos(0.2 * time), 0.1 * time]))[0]
     t_m = np.array([0.25 * np.cos(0.25 * time), 0.2 * np.sin(0.4 * time), 1 + 0.25 * np.sin(0.25 * time)])
@@ -44,7 +52,7 @@ def board_at(time: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def seen(cameras: list[Camera], lags: dict[str, float]) -> np.ndarray:
-    """(C, F, N, 2) with noise; a camera with a lag pictures every moment that much later."""
+    """Return corners (C, F, N, 2) with noise; a camera with a lag takes every image that much later."""
     corners_px = np.zeros((len(cameras), FRAMES, len(BOARD.corners_m), 2))
     for i, camera in enumerate(cameras):
         for f in range(FRAMES):
@@ -70,7 +78,7 @@ def test_cameras_and_their_lag_are_found() -> None:
     corners_px = seen(cameras, {"b": LAG})
     corners_px[2, :4] = np.nan
     corners_px[0, 5, 3] += 30.0  # one corner mistaken for another
-    fit = solve_rig(cameras, BOARD.corners_m, flat_only(BOARD.corners_m, corners_px))
+    fit = solve_rig(cameras, BOARD.corners_m, planar_corners(BOARD.corners_m, corners_px))
     for figures in compare_pairs(cameras, fit.cameras).values():
         assert figures["turned_deg"] < 0.3 and figures["moved_cm"] < 0.8  # 4 degrees and 8 cm if b's lag is denied
     # Only differences between cameras can be known: a and c were in step, b later.
@@ -82,9 +90,9 @@ def test_cameras_and_their_lag_are_found() -> None:
 
 
 def test_offsets_count_frames_of_the_footage() -> None:
-    """Every second frame: what lies 0.4 of the pictures' distance apart is 0.8 frames."""
+    """With every second frame, a lag of 0.4 of the distance between images is 0.8 frames."""
     cameras = rig()
-    fit = solve_rig(cameras, BOARD.corners_m, flat_only(BOARD.corners_m, seen(cameras, {"b": LAG})), frame_step=2)
+    fit = solve_rig(cameras, BOARD.corners_m, planar_corners(BOARD.corners_m, seen(cameras, {"b": LAG})), frame_step=2)
     lag = np.nanmedian(fit.offsets_frames[1] - fit.offsets_frames[0])
     assert lag == pytest.approx(2 * LAG, abs=0.1)
     assert max(figures["turned_deg"] for figures in compare_pairs(cameras, fit.cameras).values()) < 0.3
@@ -94,14 +102,14 @@ def test_a_corner_off_its_plane_and_a_picture_of_few_are_dropped() -> None:
     corners_px = seen(rig(), {})[:1, :2]
     corners_px[0, 0, 7] += [3.0, 0]
     corners_px[0, 1, 5:] = np.nan  # five are left
-    kept = np.isfinite(flat_only(BOARD.corners_m, corners_px)[..., 0])
+    kept = np.isfinite(planar_corners(BOARD.corners_m, corners_px)[..., 0])
     assert np.flatnonzero(~kept[0, 0]).tolist() == [7] and not kept[0, 1].any()
 
 
 def test_a_pose_needs_six_corners_in_two_rows() -> None:
     seen = np.zeros((4, 20), bool)  # five columns, four rows
     seen[0, :6] = seen[1, :7] = seen[2, :5] = seen[3, [0, 1, 5, 6, 10]] = True
-    assert whole_enough(BOARD.corners_m, seen).tolist() == [False, True, False, False]
+    assert fixes_pose(BOARD.corners_m, seen).tolist() == [False, True, False, False]
 
 
 def test_unlinked_cameras_are_refused() -> None:
@@ -111,26 +119,26 @@ def test_unlinked_cameras_are_refused() -> None:
         solve_rig(rig(), BOARD.corners_m, corners_px)
 
 
-def test_the_witness_tells_what_it_knows_nothing_about(tmp_path: Path) -> None:
+def test_board_evidence_names_cameras_it_knows_nothing_about(tmp_path: Path) -> None:
     corners_px = seen(rig(), {})
     corners_px[2] = np.nan
     capture = write_capture(tmp_path, rig(), {camera.name: np.zeros((2, 1, 25, 3)) for camera in rig()})
     BoardCorners(("a", "b", "c"), BOARD.corners_m, corners_px, 1).save(capture.root)
-    found = board_witness(capture)
+    found = board_evidence(capture)
     assert found is not None and found["unlinked_cameras"] == ["c"] and list(found["cameras"]) == ["a", "b"]
     BoardCorners(("a",), BOARD.corners_m, corners_px[:1], 1).save(capture.root)
-    found = board_witness(capture)
+    found = board_evidence(capture)
     assert found is not None and found["unlinked_cameras"] == ["a"] and found["cameras"] == {}
 
 
-def test_the_witness_names_the_camera_that_moved(tmp_path: Path) -> None:
+def test_board_evidence_names_the_camera_that_moved(tmp_path: Path) -> None:
     cameras = rig()
     stored = BoardCorners(("a", "b", "c"), BOARD.corners_m, seen(cameras, {}), 1)
     bumped = [cameras[0], turned(cameras[1], 1.0), cameras[2]]
     capture = write_capture(tmp_path / "bumped", bumped, {camera.name: np.zeros((2, 1, 25, 3)) for camera in cameras})
-    assert board_witness(capture) is None
+    assert board_evidence(capture) is None
     stored.save(capture.root)
-    found = board_witness(capture)
+    found = board_evidence(capture)
     assert found is not None
     rms_px = {name: camera["rms_px"] for name, camera in found["cameras"].items()}
     # One degree at a focal length of 1000 px is 17.5 px; the other two agree and hold the board.
@@ -141,7 +149,7 @@ def test_the_witness_names_the_camera_that_moved(tmp_path: Path) -> None:
 
 
 def test_visible_means_facing_inside_and_found_by_another() -> None:
-    """The board shows its back in frame 1, nobody but c finds it in frame 2, and it is far above all in frame 3."""
+    """The board shows its back in frame 1, only c finds it in frame 2, and it is far above every image in frame 3."""
     cameras = rig()
     R, t_m = board_at(0)
     boards = Poses(np.stack([R, R @ np.diag([-1.0, 1, -1]), R, R]), np.stack([t_m, t_m, t_m, t_m + np.eye(3)[2] * 5]))
@@ -155,7 +163,8 @@ def test_visible_means_facing_inside_and_found_by_another() -> None:
 
 
 def close_up(tilt: float) -> np.ndarray:
-    """(20, N, 2) corners that a lens of 900 px and k1 = -0.2 sees, the board turned by up to `tilt` about each axis."""
+    """Return corners (20, N, 2) seen by a lens of 900 px and k1 = -0.2, the board turned by up to `tilt` about each
+    axis."""
     K, distortion = np.array([[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0])
     rng = np.random.default_rng(1)
     poses = [(rng.uniform(-tilt, tilt, 3), rng.uniform([-0.3, -0.2, 0.6], [0.1, 0.05, 0.6])) for _ in range(20)]
@@ -164,14 +173,14 @@ def close_up(tilt: float) -> np.ndarray:
 
 
 def test_a_lens_is_believed_only_if_the_pictures_fix_it() -> None:
-    """Boards that all face the camera say nothing about the focal length, and nine are too few."""
+    """Boards that all face the camera say nothing about the focal length, and nine images are too few."""
     tilted, facing, few = (
         estimate_lens("a", BOARD.corners_m, corners_px, (1280, 720))
         for corners_px in (close_up(0.7), close_up(0.0), close_up(0.7)[:9])
     )
-    assert tilted.believed is not None and tilted.believed.K[0, 0] == pytest.approx(900, rel=0.005)
-    assert tilted.believed.distortion[0] == pytest.approx(-0.2, abs=0.02)
-    assert facing.believed is None and few.believed is None and few.pictures == 9
+    assert tilted.reliable_lens is not None and tilted.reliable_lens.K[0, 0] == pytest.approx(900, rel=0.005)
+    assert tilted.reliable_lens.distortion[0] == pytest.approx(-0.2, abs=0.02)
+    assert facing.reliable_lens is None and few.reliable_lens is None and few.pictures == 9
 
 
 def test_close_footage_gives_the_intrinsics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -205,7 +214,7 @@ def test_undistortion_keeps_what_is_absent_absent() -> None:
     lens = Lens("a", np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), np.array([0.1, 0, 0, 0]), np.eye(3),
                 np.zeros(3), None)  # fmt: skip
     # At radius 1 the lens pictures 1 + 0.1; so pixel 50 + 110 is that of 50 + 100 without distortion.
-    flat = undistorted(np.array([[[160.0, 50], [np.nan, np.nan]]]), lens)
+    flat = undistort_corners(np.array([[[160.0, 50], [np.nan, np.nan]]]), lens)
     assert flat[0, 0].tolist() == pytest.approx([150, 50], abs=0.01) and np.isnan(flat[0, 1]).all()
 
 
@@ -215,11 +224,11 @@ def test_undistortion_of_a_wide_lens_comes_back_in_the_corners() -> None:
     straight = np.array([[100.0, 100], [1800, 60], [960, 540], [200, 1000]])
     directions = np.c_[(straight - (960, 540)) / 1100, np.ones(4)]
     bent = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), lens.K, lens.distortion)[0][:, 0]
-    np.testing.assert_allclose(undistorted(bent, lens), straight, atol=0.01)
+    np.testing.assert_allclose(undistort_corners(bent, lens), straight, atol=0.01)
 
 
 def test_the_floor_is_the_board_that_lies_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the last frame the board lies flat under cameras that look down on it: their heights are what z says."""
+    """In the last frame the board lies flat under cameras that look down on it, so z must be their height."""
     cameras = rig()
     corners_px = seen(cameras, {})
     flat = np.diag([1.0, -1, -1]), np.array([-0.1, 0.1, 0.8])  # z down, at the height of 0.8 m

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.check import check_calibration
-from hnerf.calibration.diagnosis import MISTAKES, body_height_m, cost_without_each_px, size_ratio, unit_of
+from hnerf.calibration.diagnosis import MISTAKES, body_height_m, cost_without_each_px, likely_unit, size_ratio
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
@@ -28,14 +28,14 @@ pytestmark = pytest.mark.usefixtures("no_pictures")
 def recorded_with(
     root: Path, mistake: Mistake, only: int | None = None, count: int = 4, noise_px: float = 2
 ) -> Capture:
-    """A ring that saw the walk, with a mistake in the calibration of one camera or of all."""
+    """Return a ring that recorded the walk, with a mistake in the calibration of one camera or of all."""
     cameras = ring(count)
     wrong = [mistake(camera) if only in (None, i) else camera for i, camera in enumerate(cameras)]
     return write_capture(root, wrong, detections(cameras, noise_px))
 
 
 def true_error_px(camera: Camera, truth: Camera) -> float:
-    """Median distance between both projections of the walk."""
+    """Return the median distance between both cameras' projections of the walk."""
     return float(np.median(np.linalg.norm(camera.project(walk_m())[0] - truth.project(walk_m())[0], axis=-1)))
 
 
@@ -45,10 +45,10 @@ def test_body_height_by_hand() -> None:
 
 
 def test_units_by_hand() -> None:
-    assert unit_of(1790) == "millimetres"
-    assert unit_of(179) == "centimetres"
-    assert unit_of(70.5) == "inches"
-    assert unit_of(5) is None
+    assert likely_unit(1790) == "millimetres"
+    assert likely_unit(179) == "centimetres"
+    assert likely_unit(70.5) == "inches"
+    assert likely_unit(5) is None
 
 
 def test_a_good_calibration_is_left_alone(tmp_path: Path) -> None:
@@ -65,16 +65,16 @@ def test_a_good_calibration_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_world_that_does_not_stand_upright_is_told(tmp_path: Path) -> None:
-    """Turned by a right angle about x: what was up the z axis points down the y axis."""
+    """After a turn by a right angle about x, what pointed along z points along -y."""
     turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # of the world: z to y
     fallen = [dataclasses.replace(camera, R=camera.R @ turn) for camera in ring(4)]
     capture = write_capture(tmp_path / "in", fallen, detections(ring(4), 2))
     *_, note = check_calibration(capture, SETTINGS).notes
-    assert note.startswith("from hips to neck is -y mostly, not up (+z)")
+    assert note.startswith("the trunk mostly points along -y, not up (+z)")
 
 
 def test_without_legs_the_height_is_not_known(tmp_path: Path) -> None:
-    """JSON has no NaN: null, which every reader takes."""
+    """JSON has no NaN: the height is null, which every reader accepts."""
     cameras = ring(4)
     seen = detections(cameras, 2)
     for points in seen.values():
@@ -86,7 +86,7 @@ def test_without_legs_the_height_is_not_known(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("noise_px", "status"), [(10, "suspect"), (20, "rejected")])
 def test_a_camera_of_bad_detections_is_suspect_then_rejected(tmp_path: Path, noise_px: float, status: str) -> None:
-    """No camera explains them: what can be used is used and marked, what cannot is left out from here on."""
+    """No calibration explains bad detections: a usable camera is used and marked, another is left out."""
     cameras = ring(4)
     seen = detections(cameras, 2) | {"c2": detections(cameras, noise_px, seed=1)["c2"]}
     capture = write_capture(tmp_path / "in", cameras, seen)
@@ -98,7 +98,7 @@ def test_a_camera_of_bad_detections_is_suspect_then_rejected(tmp_path: Path, noi
 
 
 def test_cameras_of_any_name_are_read_back(tmp_path: Path) -> None:
-    """Recordings name cameras as they like; OpenCV's own writer refuses brackets and blanks."""
+    """Recordings may use any camera name, but OpenCV's own writer refuses brackets and blanks."""
     cameras = [dataclasses.replace(camera, name=f"Camera ({i})") for i, camera in enumerate(ring(4))]
     capture = write_capture(tmp_path / "in", cameras, detections(cameras, 2))
     check_calibration(capture, SETTINGS).save(tmp_path / "out")
@@ -167,16 +167,16 @@ def test_each_wrong_convention_is_named(tmp_path: Path, cause: str) -> None:
 @pytest.mark.parametrize("count", [3, 4])
 @pytest.mark.parametrize("ratio", [0.25, 0.64, 1.5, 2])
 def test_intrinsics_of_another_picture_size_are_named(tmp_path: Path, count: int, ratio: float) -> None:
-    """Units are not blamed, though the person would be 0.4 to 8.5 m tall."""
+    """The image size is blamed, not the unit, although the person would be 0.4 to 8.5 m tall."""
     wrong = recorded_with(tmp_path, lambda c: dataclasses.replace(c, K=np.diag([ratio, ratio, 1]) @ c.K), count=count)
-    with pytest.raises(InputError, match=r"pictures of different sizes \(K times [0-9.]+ would fit\)") as caught:
+    with pytest.raises(InputError, match=r"images of different sizes \(K times [0-9.]+ would fit\)") as caught:
         check_calibration(wrong, SETTINGS)
     assert float(str(caught.value).split("times ")[1].split()[0]) == pytest.approx(1 / ratio, rel=0.02)
 
 
 @pytest.mark.parametrize("count", [2, 3])
 def test_a_camera_that_is_far_off_is_not_one_of_another_picture_size(count: int) -> None:
-    """Of two cameras, K 0.74 times as large would fit as well."""
+    """With two cameras, scaling K by 0.74 would fit as well."""
     cameras = ring(count)
     seen = np.stack([points[:, 0] for points in detections(cameras, 2).values()])
     assert size_ratio([turned(cameras[0], 20), *cameras[1:]], seen) is None

@@ -1,4 +1,4 @@
-"""All three witnesses on a rendered capture whose calibration was spoilt."""
+"""All three kinds of evidence on a rendered capture with a spoilt calibration."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ from hnerf.calibration.diagnosis import measure
 from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.report import load_cameras
-from hnerf.calibration.sheet import draw_witnesses
+from hnerf.calibration.sheet import draw_evidence
 from hnerf.calibration.silhouettes import Outlines
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
@@ -54,23 +54,23 @@ def test_matches_of_a_pair_speak_for_both_cameras(wave: Capture, tmp_path: Path)
     matched = np.stack([camera.project(point_m)[0] for camera in cameras[:2]], 1)
     matched[0, 0, 1] += 3
     outlines = Outlines({"01": [None], "02": [None]}, (0,))
-    witnesses = Evidence(wave, keypoints, outlines, Matches({("01", "02"): matched}, wave.frames[0]), None)
-    said = witnesses.plain(cameras, measure(cameras, keypoints))
+    evidence = Evidence(wave, keypoints, outlines, Matches({("01", "02"): matched}, wave.frames[0]), None)
+    said = evidence.summarise(cameras, measure(cameras, keypoints))
     assert said["matches"]["01"] == said["matches"]["02"] == said["match_pairs"]["01 and 02"]
     assert said["matches"]["01"]["count"] == 1 and 1 < said["matches"]["01"]["median_px"] < 3
     assert said["silhouettes"] == {"01": {"rays": 0}, "02": {"rays": 0}}
-    draw_witnesses(tmp_path / "sheet.png", witnesses, cameras, measure(cameras, keypoints))
+    draw_evidence(tmp_path / "sheet.png", evidence, cameras, measure(cameras, keypoints))
     assert cv2.imread(str(tmp_path / "sheet.png")) is not None
 
 
 def test_without_masks_the_report_says_so(wave: Capture) -> None:
     cameras = [wave.cameras[name] for name in wave.train_cameras]
     keypoints = np.stack([subject_keypoints(wave)[name] for name in wave.train_cameras])
-    said = Evidence(wave, keypoints, None, Matches({}, 0), None).plain(cameras, measure(cameras, keypoints))
+    said = Evidence(wave, keypoints, None, Matches({}, 0), None).summarise(cameras, measure(cameras, keypoints))
     assert said["silhouettes"].startswith("none: ") and said["match_pairs"] == "no overlap: no matches"
 
 
 def test_one_camera_is_judged_by_the_ground(wave: Capture) -> None:
     report = check_calibration(dataclasses.replace(wave, train_cameras=("01",)), CalibrationSettings())
-    assert report.witnesses is None
+    assert report.evidence is None
     assert any("standing on world height 0 the person is 1.7" in r for r in report.verdicts["01"].reasons)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hnerf.calibration.matches import Matches, _verified, fundamental, sampson_px
+from hnerf.calibration.matches import Matches, _verified_matches, fundamental, sampson_px
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
@@ -11,14 +11,14 @@ from tests.shared_data import shared_capture
 
 
 def pair() -> tuple[Camera, Camera]:
-    """Two cameras of 1000 px focal length, 30 degrees apart."""
+    """Return two cameras of 1000 px focal length, 30 degrees apart."""
     target_m = np.array([0, 0, 1.0])
     centre_m = 4 * np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0]) + target_m
     return look_at("a", np.array([4.0, 0, 1]), target_m), look_at("b", centre_m, target_m)
 
 
 def seen(count: int = 200) -> np.ndarray:
-    """(n, 2, 2): points of a cube of 2 m in both cameras."""
+    """Return points (n, 2, 2) of a cube of 2 m in both cameras."""
     points_m = np.random.default_rng(0).uniform([-1, -1, 0], [1, 1, 2], (count, 3))
     return np.stack([camera.project(points_m)[0] for camera in pair()], 1)
 
@@ -39,10 +39,10 @@ def test_true_cameras_agree_and_a_turned_one_shows() -> None:
 
 def test_verification_does_not_ask_the_calibration() -> None:
     wrong = np.random.default_rng(1).uniform(0, 1000, (60, 2, 2))
-    kept = _verified(np.concatenate([seen(), wrong]))
+    kept = _verified_matches(np.concatenate([seen(), wrong]))
     assert 200 <= len(kept) < 210
-    assert len(_verified(wrong)) == 0
-    assert len(_verified(seen(10))) == 0
+    assert len(_verified_matches(wrong)) == 0
+    assert len(_verified_matches(seen(10))) == 0
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from tests.shared_data import shared_capture
 
 
 def standing() -> np.ndarray:
-    """The walk of the first camera of the ring, without noise."""
+    """Return the walk as the first camera of the ring sees it, without noise."""
     return detections(ring(1), noise_px=0)["c0"][:, 0]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.check import check_calibration
-from hnerf.calibration.diagnosis import MISTAKES, MISTAKES_OF_ONE, undo_mistake
+from hnerf.calibration.diagnosis import MISTAKES, SINGLE_CAMERA_MISTAKES, undo_mistake
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.refine import Refinement, refine
 from hnerf.config import CalibrationSettings
@@ -19,7 +19,7 @@ NO_MATCHES = Matches({}, 0)
 
 
 class OutlinesThat:
-    """A stand-in: the same cost for whatever was refined."""
+    """Stand-in for the outlines: the same cost for any refined cameras."""
 
     def __init__(self, given: Sequence[Camera], given_px: float, refined_px: float) -> None:
         self.given, self.given_px, self.refined_px = given, given_px, refined_px
@@ -55,7 +55,8 @@ def test_outlines_have_a_veto(tmp_path: Path, after_px: float, accepted: bool) -
 
 @pytest.mark.parametrize("as_given", [True, False])
 def test_matches_between_two_cameras_have_a_say(tmp_path: Path, as_given: bool) -> None:
-    """c2 is turned by a degree. Matches that agree with the turned camera keep it; those of the true one let it go."""
+    """c2 is turned by a degree. Matches that agree with the turned camera keep it; those of the true camera let it be
+    refined."""
     given, points_m = with_c2(lambda c: turned(c, 1.0)), walk_m().reshape(-1, 3)[:40]
     seen = [camera.project(points_m)[0] for camera in (given if as_given else ring(4))[1:3]]
     found = refined(tmp_path, given, keypoints_of(), matches=Matches({("c1", "c2"): np.stack(seen, 1)}, 0))
@@ -113,7 +114,7 @@ def test_two_cameras_are_never_judged_one_by_one(tmp_path: Path) -> None:
     assert set(found.reasons.values()) == {"pose kept: it takes two others to judge one camera"}
 
 
-@pytest.mark.parametrize("cause", [*MISTAKES, *MISTAKES_OF_ONE])
+@pytest.mark.parametrize("cause", [*MISTAKES, *SINGLE_CAMERA_MISTAKES])
 def test_one_cameras_mistake_is_undone(cause: str) -> None:
     make = dict(MISTAKES)
     make["T is the camera's centre"] = lambda c: dataclasses.replace(c, t_m=c.centre_m)

@@ -1,4 +1,4 @@
-"""Outlines of a box whose masks are exact: the convex hulls of its corners."""
+"""Outlines of a box with exact masks: the convex hulls of its projected corners."""
 
 import dataclasses
 from itertools import product
@@ -19,7 +19,7 @@ CORNERS_M = np.array(list(product([-0.2, 0.2], [-0.3, 0.3], [0.1, 1.7])))
 
 
 def mask(camera: Camera, corners_m: np.ndarray = CORNERS_M) -> np.ndarray:
-    """Drawn at an eighth of a pixel, so that pixels are inside where their centres are."""
+    """Return the mask, drawn at an eighth of a pixel so that pixels are inside if their centres are."""
     corners_px = (camera.project(corners_m)[0] * 256).round().astype(np.int32)
     drawn = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
     cv2.fillConvexPoly(drawn, cv2.convexHull(corners_px), 1, lineType=cv2.LINE_8, shift=8)

@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hnerf.calibration.refine import _resized
-from hnerf.calibration.sizes import CHANGES, size_reasons, unexplained
+from hnerf.calibration.refine import _refine_for_size
+from hnerf.calibration.sizes import SIZE_CHANGES, size_reasons, size_unexplained
 from hnerf.capture.bars import Area
 from hnerf.capture.capture import Capture
 from tests.calibration.synthetic import detections, ring, write_capture
@@ -13,7 +13,7 @@ from tests.calibration.synthetic import detections, ring, write_capture
 
 @pytest.fixture
 def narrow(tmp_path: Path) -> Capture:
-    """c1 was calibrated at 1080 x 1000 and recorded at 1000 x 1000."""
+    """Return a capture whose camera c1 was calibrated at 1080 x 1000 and recorded at 1000 x 1000."""
     cameras = ring(4)
     capture = write_capture(tmp_path, cameras, detections(cameras, 1))
     return dataclasses.replace(capture, calibrated_sizes_px=capture.calibrated_sizes_px | {"c1": (1080, 1000)})
@@ -26,7 +26,7 @@ def with_bars(narrow: Capture) -> Capture:
 def test_each_change_by_hand() -> None:
     # f = 1000, principal point 499.5, of a picture 80 px wider when calibrated.
     camera = ring(1)[0]
-    changed = {what: change(camera, (1080, 1000), (1000, 1000)).K for what, change in CHANGES.items()}
+    changed = {what: change(camera, (1080, 1000), (1000, 1000)).K for what, change in SIZE_CHANGES.items()}
     assert changed["cropped or padded evenly"][0].tolist() == [1000, 0, 459.5]
     assert changed["cropped or padded on the left or at the top"][0].tolist() == [1000, 0, 419.5]
     assert changed["stretched"][:2, :2].round(1).tolist() == [[925.9, 0], [0, 1000]]
@@ -34,12 +34,12 @@ def test_each_change_by_hand() -> None:
 
 
 def test_bars_explain_a_size(narrow: Capture) -> None:
-    assert [name for name in narrow.cameras if unexplained(narrow, name)] == ["c1"]
+    assert [name for name in narrow.cameras if size_unexplained(narrow, name)] == ["c1"]
     assert size_reasons(narrow, "c0") == []
     assert size_reasons(narrow, "c1") == [
         "calibrated at 1080x1000, recorded at 1000x1000: no black bars prove what was done to the picture"
     ]
-    assert not unexplained(with_bars(narrow), "c1")
+    assert not size_unexplained(with_bars(narrow), "c1")
     assert (
         "scaled by 0.9259 and put 0.0 px from the left and 37.0 px from the top"
         in size_reasons(with_bars(narrow), "c1")[0]
@@ -53,9 +53,9 @@ def test_residuals_choose_only_where_bars_do_not_explain_and_only_with_proof(nar
     K = np.diag([1.08, 1, 1]) @ cameras[1].K
     as_calibrated = [dataclasses.replace(c, K=K) if c.name == "c1" else c for c in cameras]
     costs: dict[str, float] = {}
-    matched, notes = _resized(narrow, as_calibrated, keypoints, ("c1",), 3.0, costs)
+    matched, notes = _refine_for_size(narrow, as_calibrated, keypoints, ("c1",), 3.0, costs)
     np.testing.assert_allclose(matched[1].K, cameras[1].K)
-    assert "were stretched" in notes[0] and len(costs) == len(CHANGES)
-    kept, notes = _resized(narrow, as_calibrated, keypoints, ("c1",), 0.1, {})
+    assert "were stretched" in notes[0] and len(costs) == len(SIZE_CHANGES)
+    kept, notes = _refine_for_size(narrow, as_calibrated, keypoints, ("c1",), 0.1, {})
     assert kept is as_calibrated and "cannot be told" in notes[0]
-    assert _resized(with_bars(narrow), as_calibrated, keypoints, ("c1",), 3.0, {}) == (as_calibrated, [])
+    assert _refine_for_size(with_bars(narrow), as_calibrated, keypoints, ("c1",), 3.0, {}) == (as_calibrated, [])

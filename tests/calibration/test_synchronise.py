@@ -7,7 +7,7 @@ import pytest
 from hnerf.calibration import synchronise as synchronise_module
 from hnerf.calibration.check import check_calibration
 from hnerf.calibration.report import load_cameras
-from hnerf.calibration.synchronise import measure_timing, put_in_step, synchronise
+from hnerf.calibration.synchronise import measure_timing, synchronise, synchronise_capture
 from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
 from hnerf.errors import InputError
@@ -18,9 +18,9 @@ FRAMES = 48
 
 
 def poses_m(instants: np.ndarray) -> np.ndarray:
-    """(n, 25, 3): the figure to and fro, its arms swinging.
+    """Return joints (n, 25, 3) of the figure moving to and fro with swinging arms.
 
-    On a round at an even pace an offset in time would be a turn of the world, as if the camera had been moved.
+    On a circle at constant speed a time offset would look like a rotation of the world, that is, a moved camera.
     """
     poses = np.repeat(STANDING_M[None], len(instants), axis=0)
     poses[:, [3, 4, 6, 7], 0] += 0.2 * np.sin(instants / 5)[:, None] * np.array([1, 1, -1, -1])
@@ -30,8 +30,8 @@ def poses_m(instants: np.ndarray) -> np.ndarray:
 
 
 def recorded(offsets: dict[str, float], frames: int = FRAMES, noise_px: float = 2, speed: float = 1) -> np.ndarray:
-    """(4, frames, 25, 3): what the ring saw. A camera recorded the instant of frame f in its frame f + offset: its
-    frame f shows the instant f - offset."""
+    """Return keypoints (4, frames, 25, 3) recorded by the ring. A camera recorded the instant of frame f in its frame f
+    + offset, so its frame f shows the instant f - offset."""
     rng, seen = np.random.default_rng(1), []
     for camera in ring(4):
         uv = camera.project(poses_m(speed * (np.arange(frames) - offsets.get(camera.name, 0.0))))[0]
@@ -114,16 +114,16 @@ def test_strided_frames_say_what_to_cut(tmp_path: Path, no_pictures: None) -> No
 
 
 def test_strided_frames_show_what_is_less_than_a_frame_off(tmp_path: Path, no_pictures: None) -> None:
-    """Keypoints are put in step; of the frames that were taken, each picture is the nearest to its own instant."""
+    """Keypoints are synchronised; of the ingested frames, each camera shows the image closest to the instant."""
     strided = recorded({"c0": 0.8}, frames=4 * FRAMES, noise_px=0.5, speed=0.5)[:, ::4]
     capture = capture_of(tmp_path / "in", strided, frames=tuple(range(0, 4 * FRAMES, 4)))
     report = check_calibration(capture, SETTINGS)
     assert report.verdicts["c0"].frame_offset == pytest.approx(0.8, abs=0.1)
-    assert any("pictures of camera c0 are -0.8" in note for note in report.notes)
+    assert any("images of camera c0 are -0.8" in note for note in report.notes)
     report.save(tmp_path / "out")
     used = load_cameras(tmp_path / "out", capture)
     assert used.frames == capture.frames
-    assert [used.recorded("c0", frame) for frame in used.frames] == list(used.frames)
+    assert [used.recorded_frame("c0", frame) for frame in used.frames] == list(used.frames)
     found, given = used.keypoints("c0"), capture.keypoints("c0")
     assert found is not None and given is not None
     assert np.abs(found[5] - (0.8 * given[5] + 0.2 * given[6])).max() < 2
@@ -132,12 +132,12 @@ def test_strided_frames_show_what_is_less_than_a_frame_off(tmp_path: Path, no_pi
 def test_numbers_with_gaps_count_in_recorded_frames(
     tmp_path: Path, no_pictures: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of pictures numbered 0, 5, 10, ... one that is 2 numbers late is 0.4 of a picture away from its instant."""
+    """With images numbered 0, 5, 10, ..., an offset of 2 numbers is 0.4 of the distance between images."""
     numbers = tuple(range(0, 5 * FRAMES, 5))
     capture = dataclasses.replace(capture_of(tmp_path, recorded({}), frames=numbers), frame_step=5)
     monkeypatch.setattr(synchronise_module, "synchronise", lambda *_: ({"c1": 2.0}, {}, []))
-    in_step, _, notes = put_in_step(capture, ring(4), recorded({}), SETTINGS)
-    assert in_step.frames == numbers
+    synchronised, _, notes = synchronise_capture(capture, ring(4), recorded({}), SETTINGS)
+    assert synchronised.frames == numbers
     assert not notes
 
 

@@ -65,7 +65,8 @@ def test_noise_averages_out() -> None:
 
 
 def two_people(cameras: list[Camera]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """The subject in every camera; a bystander 1.5 m behind, larger confidence, in two; order swapped now and then."""
+    """Return the subject in every camera and a bystander 1.5 m behind, with larger confidence, in two; their order
+    changes now and then."""
     subject = detections(cameras, noise_px=1)
     both = {}
     for i, camera in enumerate(cameras):
@@ -88,8 +89,8 @@ def test_the_subject_is_whom_all_cameras_see(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("stride", "missed"), [(1, slice(4, 7)), (5, slice(0))])
 @pytest.mark.parametrize("cameras", [1, 3, 4])
 def test_nobody_else_is_taken_for_the_subject(tmp_path: Path, cameras: int, stride: int, missed: slice) -> None:
-    """He walks 13 % of his height from frame to frame, or half of it. Somebody stands some metres
-    off; the first camera misses the subject for three frames."""
+    """The subject walks 13 % of his height from frame to frame, or half of it; a bystander is some metres away; the
+    first camera misses the subject for three frames."""
     rig, order = ring(cameras), stride * np.arange(12) % 12
     both, expected = {}, {}
     for camera in rig:

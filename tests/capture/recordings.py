@@ -16,7 +16,7 @@ TRANSLATIONS_M = {"01": [0.0, 1, 3], "02": [0.0, 1, 3]}
 
 
 def picture(camera: str, frame: int) -> np.ndarray:
-    """(16, 24, 3) uint8 RGB: noise, so that no two are equal."""
+    """Return an image (16, 24, 3) uint8 RGB of noise, so that no two are equal."""
     return np.random.default_rng([int(camera[-2:]), frame]).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
 
 
@@ -32,7 +32,7 @@ def write_keypoints(path: Path, people: list) -> None:
 
 
 def write_calibration(folder: Path, distortion: tuple[float, ...] = (0,) * 5, t_scale: float = 1.0) -> None:
-    """intri.yml and extri.yml for both cameras."""
+    """Write intri.yml and extri.yml for both cameras."""
     intri = cv2.FileStorage(str(folder / "intri.yml"), cv2.FILE_STORAGE_WRITE)
     extri = cv2.FileStorage(str(folder / "extri.yml"), cv2.FILE_STORAGE_WRITE)
     for storage in (intri, extri):
@@ -52,7 +52,7 @@ def write_calibration(folder: Path, distortion: tuple[float, ...] = (0,) * 5, t_
 
 
 def write_easymocap(folder: Path) -> Path:
-    """Two cameras, five frames, PNG images, one person; frame 2 of camera 02 has two people."""
+    """Write two cameras, five frames, PNG images, one person; frame 2 of camera 02 has two people."""
     folder.mkdir()
     write_calibration(folder)
     for camera in CAMERAS:
@@ -65,7 +65,7 @@ def write_easymocap(folder: Path) -> Path:
 
 
 def write_video(path: Path, count: int, size_px: tuple[int, int] = (64, 48), fps: float = 25.0) -> None:
-    """Frame f is grey of value 20 + 20 f."""
+    """Write a video whose frame f is grey of value 20 + 20 f."""
     path.parent.mkdir(parents=True, exist_ok=True)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size_px)
     assert writer.isOpened()
@@ -75,7 +75,7 @@ def write_video(path: Path, count: int, size_px: tuple[int, int] = (64, 48), fps
 
 
 def write_pose2sim(folder: Path) -> Path:
-    """Two cameras, ten frames of 64 x 48 px, calibrated at 64 x 48; nobody detected."""
+    """Write two cameras, ten frames of 64 x 48 px, calibrated at 64 x 48, without detections."""
     tables = []
     for camera in CAMERAS:
         rotation = cv2.Rodrigues(np.array(ROTATIONS[camera]))[0].ravel().tolist()

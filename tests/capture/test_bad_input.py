@@ -1,4 +1,4 @@
-"""Broken recordings are refused with one line that names the file, before anything is made of them."""
+"""Broken recordings are refused with one line that names the file, before anything is written."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from tests.capture import recordings as rec
 
 
 class Bomb:
-    """A pickle that leaves a trace if anyone loads it."""
+    """An object whose pickle leaves a trace if anyone loads it."""
 
     def __reduce__(self) -> tuple:
         return os.system, ("touch pickle-was-loaded",)
@@ -49,7 +49,7 @@ def _link(folder: Path, name: str) -> None:
 
 
 def _huge_png(folder: Path) -> None:
-    """A PNG whose header claims 60000 x 60000 pixels."""
+    """Write a PNG whose header claims 60000 x 60000 pixels."""
     path = folder / "images/02/000003.png"
     data = bytearray(path.read_bytes())
     data[16:24] = (60000).to_bytes(4, "big") * 2
@@ -189,7 +189,7 @@ POSE2SIM = {
 
 
 def _cut_video(path: Path) -> None:
-    """The header still promises ten frames; the data of the later ones is gone."""
+    """Cut a video short: the header still promises ten frames, but the data of the later ones is gone."""
     data = path.read_bytes()
     start = data.index(b"mdat") + 4
     length = int.from_bytes(data[start - 8 : start - 4], "big") - 8

@@ -1,4 +1,4 @@
-"""Black bars, made with known edges."""
+"""Black bars with known edges."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hnerf.capture.bars import Area, fitted, picture_area
+from hnerf.capture.bars import Area, lens_for_area, picture_area
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.capture.lens import Lens
@@ -20,7 +20,7 @@ LENS = Lens(
 
 
 def frames(height: int = 300, width: int = 200) -> list[np.ndarray]:
-    """Three of noise around grey 120."""
+    """Return three frames of noise around grey 120."""
     return [np.random.default_rng(seed).integers(60, 180, (height, width, 3), np.uint8) for seed in range(3)]
 
 
@@ -55,14 +55,14 @@ def test_a_bar_is_dark_in_most_frames() -> None:
 def test_scale_and_offset_by_hand() -> None:
     # Half size, 5 px from the left and 7 from the top: the calibrated picture's middle (99.5, 149.5) in centres is
     # (100, 150) from the corner, so (55, 82) from the new corner and (54.5, 81.5) in centres.
-    lens = fitted(LENS, Area(5, 7, 100, 150), (110, 164))
+    lens = lens_for_area(LENS, Area(5, 7, 100, 150), (110, 164))
     assert lens is not None
     np.testing.assert_allclose(lens.K, np.array([[100, 0, 54.5], [0, 100, 81.5], [0, 0, 1]]))
 
 
 def test_without_bars_or_at_another_aspect_nothing_is_proven() -> None:
-    assert fitted(LENS, Area(0, 0, 100, 150), (100, 150)) is None
-    assert fitted(LENS, Area(5, 0, 100, 152), (110, 152)) is None
+    assert lens_for_area(LENS, Area(0, 0, 100, 150), (100, 150)) is None
+    assert lens_for_area(LENS, Area(5, 0, 100, 152), (110, 152)) is None
 
 
 def test_a_letterboxed_camera_is_matched_at_the_door(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What the board is and where its corners are, worked out by hand."""
+"""Descriptions of boards and the positions of their corners, worked out by hand."""
 
 import re
 import shutil
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hnerf.capture.board_footage import Board, Detector, load_board_corners, read_board, read_board_footage
+from hnerf.capture.board_footage import Board, BoardDetector, load_board_corners, read_board, read_board_footage
 from hnerf.capture.footage import Video
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
@@ -30,7 +30,7 @@ SQUARE_PX = 40
 
 
 def charuco_picture(inverted: bool) -> np.ndarray:
-    """The board above, 160 x 200 px, alone on 320 x 240 px grey, its top left pixel at (60, 20)."""
+    """Return the board above, 160 x 200 px, alone on 320 x 240 px grey, its top left pixel at (60, 20)."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
     drawn = cv2.aruco.CharucoBoard((4, 5), 0.054, 0.0405, dictionary).generateImage((4 * SQUARE_PX, 5 * SQUARE_PX))
     picture = np.full((240, 320), 128, np.uint8)
@@ -39,7 +39,8 @@ def charuco_picture(inverted: bool) -> np.ndarray:
 
 
 def checkerboard_picture(columns: int, rows: int) -> np.ndarray:
-    """Squares of 40 px from pixel (60, 60) on white, the first one black; the margin as wide as one and a half."""
+    """Return squares of 40 px from pixel (60, 60) on white, the first one black, with a margin as wide as one and a
+    half."""
     y, x = np.mgrid[: rows * SQUARE_PX, : columns * SQUARE_PX]
     picture = np.full((rows * SQUARE_PX + 120, columns * SQUARE_PX + 120), 255, np.uint8)
     picture[60:-60, 60:-60] = np.where((x // SQUARE_PX + y // SQUARE_PX) % 2, 255, 0)
@@ -86,18 +87,18 @@ def test_bad_descriptions_are_refused(table: str, message: str, tmp_path: Path) 
 
 @pytest.mark.parametrize("inverted", [False, True])
 def test_charuco_corners_lie_on_the_edges_of_pixels(inverted: bool) -> None:
-    """Between pixels 60 + 40 k - 1 and 60 + 40 k, whose centres are integers: at 59.5 + 40 k."""
+    """Corners lie between pixels 60 + 40 k - 1 and 60 + 40 k, whose centres are integers: at 59.5 + 40 k."""
     board = Board(columns=4, rows=5, square_m=0.054, dictionary="DICT_4X4_1000", inverted=inverted)
-    found = Detector(board).corners_px(charuco_picture(inverted))
+    found = BoardDetector(board).corners_px(charuco_picture(inverted))
     expected = [[59.5 + 40 * x, 19.5 + 40 * y] for y in (1, 2, 3, 4) for x in (1, 2, 3)]
     assert np.abs(found - expected).max() < 0.25
-    assert np.isnan(Detector(board).corners_px(charuco_picture(not inverted))).all()
+    assert np.isnan(BoardDetector(board).corners_px(charuco_picture(not inverted))).all()
 
 
 @pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
 def test_a_checkerboards_first_corner_stays_the_first(quarter_turns: int) -> None:
     picture = checkerboard_picture(6, 5)
-    found = Detector(Board(columns=6, rows=5, square_m=0.1)).corners_px(np.rot90(picture, quarter_turns).copy())
+    found = BoardDetector(Board(columns=6, rows=5, square_m=0.1)).corners_px(np.rot90(picture, quarter_turns).copy())
     grid = np.array([[59.5 + 40 * x, 59.5 + 40 * y] for y in (1, 2, 3, 4) for x in (1, 2, 3, 4, 5)])
     height, width = picture.shape[:2]
     for _ in range(quarter_turns):  # np.rot90 turns counter-clockwise: (x, y) to (y, width - 1 - x)
@@ -107,7 +108,7 @@ def test_a_checkerboards_first_corner_stays_the_first(quarter_turns: int) -> Non
 
 
 def test_dropped_frames_are_placed_by_the_table(tmp_path: Path) -> None:
-    """cam_0 has no picture of moment 11; the board is in its last one, and in no picture of cam_1."""
+    """cam_0 has no image with sync_index 11; the board is in its last image, and in none of cam_1."""
     (tmp_path / "charuco.toml").write_text(CHARUCO)
     root = tmp_path / "calibration" / "extrinsic"
     blank = np.full((240, 320, 3), 128, np.uint8)
@@ -173,7 +174,7 @@ def test_long_footage_is_sampled_evenly(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_ingest_keeps_the_corners_in_the_pixels_it_writes(tmp_path: Path) -> None:
-    """Half the size: x becomes x / 2 - 1 / 4."""
+    """At half the size x becomes x / 2 - 1 / 4."""
     folder = rec.write_easymocap(tmp_path / "ada")
     for name in ("images", "openpose"):
         shutil.rmtree(folder / name)

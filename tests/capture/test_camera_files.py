@@ -1,4 +1,4 @@
-"""Cameras in other tools' files: read, written, and read back; numbers worked out by hand."""
+"""Camera files of other tools, read, written, and read back; numbers worked out by hand."""
 
 import dataclasses
 import struct
@@ -38,7 +38,7 @@ LENSES = [
 
 
 def write_model(folder: Path, binary: bool = False) -> Path:
-    """The model above in sparse/0."""
+    """Write the model above in sparse/0."""
     model = folder / "sparse" / "0"
     model.mkdir(parents=True)
     (model / "cameras.txt").write_text(CAMERAS_TXT)
@@ -88,8 +88,8 @@ def test_hostile_colmap_models_are_refused(name: str, at: int, value: bytes, tmp
     [
         ("02.png", "01/000001.jpg", "several images of camera 01"),
         ("4 2 02.png", "4 5 02.png", "camera 5 is not in"),
-        ("9 1 0 0 0", "9 0 0 0 0", "its quaternion is none"),
-        ("7 0.7", "7 zero", "no model of COLMAP's"),
+        ("9 1 0 0 0", "9 0 0 0 0", "its quaternion is not of unit length"),
+        ("7 0.7", "7 zero", "not a COLMAP model"),
     ],
 )
 def test_colmap_models_that_make_no_cameras_are_refused(old: str, new: str, message: str, tmp_path: Path) -> None:
@@ -131,7 +131,7 @@ def test_caliscope_numbers_have_no_leading_zeros(tmp_path: Path) -> None:
 
 
 def test_colmap_sees_the_same_pixels(tmp_path: Path) -> None:
-    """A point on the axis of K's centre: pixel (319.5, 239.5) here is (320, 240) there."""
+    """A point that projects to pixel (319.5, 239.5) here projects to (320, 240) there."""
     write_cameras(tmp_path, LENSES, "colmap")
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     assert [model.cameras[i].model.name for i in (1, 2, 3)] == ["FULL_OPENCV", "OPENCV", "PINHOLE"]
@@ -183,7 +183,7 @@ def test_a_colmap_capture_is_ingested_with_its_scale(tmp_path: Path) -> None:
 def test_the_command_line_converts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_model(tmp_path / "model")
     (folder / "capture.toml").write_text('units = "mm"\n')
-    assert main(["cameras", str(folder), "--format", "aniposelib", "--out", str(tmp_path / "out")]) == 0
+    assert main(["export-cameras", str(folder), "--format", "aniposelib", "--out", str(tmp_path / "out")]) == 0
     assert Caliscope(tmp_path / "out").lenses()["01"].t_m.tolist() == pytest.approx([0.001, 0.002, 0.003])
     assert main(["calibrate", str(folder), "--out", str(tmp_path / "none")]) == 2
     assert "no board footage" in capsys.readouterr().err and not (tmp_path / "none").exists()

@@ -1,4 +1,4 @@
-"""What comes through the door: pixels, cameras and keypoints of a small recording, worked out by hand."""
+"""Ingestion: pixels, cameras and keypoints of a small recording, worked out by hand."""
 
 import logging
 from pathlib import Path
@@ -97,7 +97,7 @@ def test_how_many_frames_of_a_long_recording_are_taken_is_told(
 def test_frames_before_anybody_walks_in_and_after_are_left_out(
     folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Seen by camera 02 in frames 1 and 3 alone, by camera 01 in none: 0 and 4 go, the gap at 2 stays."""
+    """Camera 02 sees somebody in frames 1 and 3 only, camera 01 in none: 0 and 4 are dropped, the gap at 2 stays."""
     for camera, empty in (("01", rec.FRAMES), ("02", (0, 2, 4))):
         for frame in empty:
             rec.write_keypoints(folder / "openpose" / camera / f"{frame:06d}_keypoints.json", [])
@@ -138,7 +138,7 @@ def test_shrinking_takes_camera_keypoints_and_masks_along(folder: Path, tmp_path
 
 
 def test_masks_in_a_jpeg_do_not_grow(folder: Path, tmp_path: Path) -> None:
-    """Beside an edge a JPEG is hardly ever black."""
+    """Beside an edge, hardly any pixel of a JPEG is exactly black."""
     mask = np.zeros((rec.HEIGHT, rec.WIDTH, 3), np.uint8)
     mask[3:13, 5:19] = 255
     for camera in rec.CAMERAS:
@@ -150,7 +150,7 @@ def test_masks_in_a_jpeg_do_not_grow(folder: Path, tmp_path: Path) -> None:
 
 
 def test_mattes_are_cut_in_the_middle_of_their_edges_and_labels_are_not(folder: Path, tmp_path: Path) -> None:
-    """A ramp of 6 px beside the person, of 256 levels in another corner; labels of 1 are the person."""
+    """A matte has a ramp of 6 px beside the person, and 256 levels in another corner; label 1 is the person."""
     matte, labels = np.zeros((rec.HEIGHT, rec.WIDTH, 3), np.uint8), np.zeros((rec.HEIGHT, rec.WIDTH, 3), np.uint8)
     matte[3:13, 5:19], labels[3:13, 5:19] = 255, 1
     matte[3:13, 19:22] = np.array([190, 120, 60])[:, None]

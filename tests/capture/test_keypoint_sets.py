@@ -1,4 +1,4 @@
-"""Every keypoint set to BODY_25: point i of a set lies at (i, 100 i) with confidence 0.5 + i / 1000."""
+"""Conversion of every keypoint set to BODY_25: point i of a set lies at (i, 100 i) with confidence 0.5 + i / 1000."""
 
 import json
 from pathlib import Path
@@ -15,12 +15,13 @@ from tests.capture import recordings as rec
 
 
 def points(count: int) -> np.ndarray:
+    """Return the points of a set, (count, 3)."""
     i = np.arange(float(count))
     return np.stack([i, 100 * i, 0.5 + i / 1000], -1)
 
 
 def converted(count: int, named: KeypointSetName | None = None) -> np.ndarray:
-    """(25, 3) of one person in one frame."""
+    """Return BODY_25 keypoints (25, 3) of one person in one frame."""
     return to_body_25({"01": points(count)[None, None]}, named)["01"][0, 0]
 
 
@@ -90,7 +91,7 @@ def test_an_unknown_number_of_points_names_the_known_sets(tmp_path: Path) -> Non
 
 
 def test_lists_of_results_are_read_by_frame(tmp_path: Path) -> None:
-    """As AlphaPose (image names) and MMPose (numbers) write them; scores over 1 count as 1."""
+    """Results are as AlphaPose (image names) and MMPose (numbers) write them; scores over 1 count as 1."""
     sure = points(17)
     sure[:, 2] = 3
     results = [

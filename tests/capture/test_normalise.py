@@ -1,4 +1,4 @@
-"""Keypoints of distorted lenses, and names of folders."""
+"""Keypoints of distorted lenses, and names of captures."""
 
 from pathlib import Path
 

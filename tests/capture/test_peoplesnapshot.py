@@ -22,7 +22,8 @@ def write_hdf5(path: Path, **arrays: np.ndarray) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """64 x 48 px; row i of the seven poses holds i, so that frame f has row f + 1; the last was never reconstructed."""
+    """Write a recording of 64 x 48 px; row i of the seven poses holds i, so that frame f has row f + 1; the last was
+    never reconstructed."""
     folder = tmp_path / "female-1"
     rec.write_video(folder / "female-1.mp4", 6)
     camera = {"camera_f": np.array([50.0, 50]), "camera_c": np.array([31.5, 23.5]), "camera_k": np.zeros(5)}
@@ -45,7 +46,7 @@ def capture(folder: Path, tmp_path: Path) -> Capture:
 
 
 def test_the_world_is_turned_upright(capture: Capture) -> None:
-    """What is 2.5 m ahead of the camera, 0.1 m to its right and 0.2 m below lies at (0.1, 2.5, -0.2)."""
+    """A point 2.5 m ahead of the camera, 0.1 m to its right and 0.2 m below lies at (0.1, 2.5, -0.2)."""
     camera = capture.cameras["camera"]
     pixel, depth_m = camera.project(np.array([0.1, 2.5, -0.2]))
     assert pixel == pytest.approx([31.5 + 50 * 0.1 / 2.5, 23.5 + 50 * 0.2 / 2.5]) and depth_m == pytest.approx(2.5)

@@ -1,4 +1,4 @@
-"""The real capture in this layout."""
+"""The real capture in the Pose2Sim layout."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Pickles give plain data, and run nothing."""
+"""Pickles are read as plain data, and nothing in them is executed."""
 
 import os
 import pickle
@@ -23,7 +23,7 @@ DATA: dict[str, Any] = {
 
 
 class Bomb:
-    """Leaves a trace if anyone loads it."""
+    """An object whose pickle leaves a trace if anyone loads it."""
 
     def __reduce__(self) -> tuple:
         return os.system, ("touch pickle-was-loaded",)
@@ -51,8 +51,8 @@ def test_sparse_matrices_come_back(tmp_path: Path, protocol: int) -> None:
 
 
 def test_python_2_wrote_text_as_bytes(tmp_path: Path) -> None:
-    """numpy under Python 2: numpy.core.multiarray, and a string of bytes; 2.0 is 40 00 00 00 00 00 00 00, big end
-    first."""
+    """Under Python 2 numpy names numpy.core.multiarray, and pickles bytes as text; 2.0 is 40 00 00 00 00 00 00 00, big
+    endian."""
     (tmp_path / "a.pkl").write_bytes(
         b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\ntS'b'\ntR"
         b"(I1\n(I1\ntcnumpy\ndtype\n(S'f8'\nI0\nI1\ntR(I3\nS'<'\nNNNI-1\nI-1\nI0\ntbI00\n"
@@ -62,7 +62,8 @@ def test_python_2_wrote_text_as_bytes(tmp_path: Path) -> None:
 
 
 def test_chumpy_arrays_become_plain(tmp_path: Path) -> None:
-    """As its objects are stored: class, then attributes, of which x is the value; without chumpy at hand."""
+    """The objects are built as chumpy's are stored: class, then attributes, of which x is the value; chumpy is not
+    needed."""
     numbers = pickle.dumps(np.array([3.0, 4.0]), 2)[2:-1]  # without its PROTO and STOP
     stored = (
         b"ccopy_reg\n_reconstructor\n(cchumpy.ch\nCh\nc__builtin__\nobject\nNtR(dS'x'\n" + numbers + b"sS'want'\nNsb."
@@ -83,7 +84,7 @@ def test_npy_files_of_one_dictionary(tmp_path: Path) -> None:
 
 
 def _of_a_terabyte() -> bytes:
-    """An array that declares 10^12 numbers and has two."""
+    """Return a pickled array that declares 10^12 numbers and has two."""
     stored = pickle.dumps(np.ones(2), 0)
     assert stored.count(b"I2\n") == 1
     return stored.replace(b"I2\n", b"I1000000000000\n")
@@ -112,7 +113,7 @@ def test_what_is_no_plain_data_is_refused(case: str, tmp_path: Path, monkeypatch
 
 
 def test_what_a_pickle_holds_often_is_made_once(tmp_path: Path) -> None:
-    """Forty lists, each holding the next twice: a million million if each were copied."""
+    """Each of forty lists holds the next twice: 10^12 copies if each were copied."""
     nested: list[Any] = [np.ones(1)]
     for _ in range(40):
         nested = [nested, nested]

@@ -10,7 +10,7 @@ from hnerf.geometry.camera import Camera
 
 
 def people_at(*x_px: float) -> np.ndarray:
-    """(people, 2, 3): two keypoints 100 px apart, one below the other."""
+    """Return people (people, 2, 3) of two keypoints 100 px apart, one below the other."""
     return np.array([[[x, 0, 0.8], [x, 100, 0.8]] for x in x_px])
 
 

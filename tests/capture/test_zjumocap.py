@@ -15,8 +15,8 @@ CAMERAS = ("Camera_B1", "Camera_B2")
 
 
 def write_zju(folder: Path, names: tuple[str, ...] = CAMERAS, frame: str = "{:06d}.jpg") -> Path:
-    """Cameras of recordings.py, translations in mm; in masks the person's left half has label 3; poses of frames 0 and
-    2."""
+    """Write the cameras of recordings.py, translations in mm; in masks the person's left half has label 3; frames 0 and
+    2 have poses."""
     rows = [[f"{name}/" + frame.format(f) for name in names] for f in range(3)]
     for row in rows:
         for path in row:
@@ -37,7 +37,7 @@ def write_zju(folder: Path, names: tuple[str, ...] = CAMERAS, frame: str = "{:06
 
 
 def write_parameters(path: Path, poses: np.ndarray) -> None:
-    """Turned a quarter about the vertical, then moved by (1, 2, 3) m."""
+    """Write a pose turned a quarter about the vertical, then moved by (1, 2, 3) m."""
     path.parent.mkdir(exist_ok=True)
     parameters: Any = {"poses": poses, "Rh": np.array([[0, 0, np.pi / 2]]), "Th": np.array([[1.0, 2, 3]])}
     np.save(path, parameters | {"shapes": np.arange(10.0)[None]}, allow_pickle=True)
@@ -60,7 +60,7 @@ def test_cameras_images_and_masks(folder: Path, tmp_path: Path) -> None:
 
 
 def test_given_poses(folder: Path, tmp_path: Path) -> None:
-    """new_params go before params; frame 1 has none; 69 turns leave out the pelvis."""
+    """new_params override params; frame 1 has none; 69 turns leave out the pelvis."""
     turns = np.arange(72.0) * (np.arange(72) >= 3)
     write_parameters(folder / "new_params" / "0.npy", turns[None])
     write_parameters(folder / "new_params" / "2.npy", turns[3:])
@@ -90,7 +90,7 @@ def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
     write_parameters(folder / "params" / "1.npy", np.zeros(10))
     refused(r"1\.npy: 10 turns and 10 shape values are not SMPL's")
     (folder / "params" / "1.npy").rename(folder / "params" / "9.npy")
-    refused(r"its poses are of none of these frames")
+    refused(r"none of the chosen frames has a given pose")
     (folder / "mask_cihp" / "Camera_B2" / "000001.png").unlink()
     refused(r"mask_cihp/Camera_B2/000001\.png")
     annotations = np.load(folder / "annots.npy", allow_pickle=True).item()
@@ -98,4 +98,4 @@ def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
     np.save(folder / "annots.npy", annotations, allow_pickle=True)
     refused("leaves the capture folder")
     np.save(folder / "annots.npy", {"cams": {}, "ims": []}, allow_pickle=True)  # type: ignore[arg-type]
-    refused(r"annots\.npy: 'ims' lists no images")
+    refused(r"annots\.npy: 'ims' does not list images")

@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -37,7 +38,7 @@ class BallAvatar:
     def without_frames(self) -> "BallAvatar":
         return replace(self, frames_darken_by=0)
 
-    def on_body(self, body: BodyFit) -> "BallAvatar":
+    def with_body(self, body: BodyFit) -> "BallAvatar":
         return replace(self, body=body)
 
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
@@ -135,11 +136,11 @@ def tuned(fit: BodyFit) -> BodyFit:
     return replace(fit, root=root)
 
 
-def write_settings(training: Path, machinery: str = "fast", nodes: int = 8, steps: int = 80) -> None:
+def write_settings(training: Path, kind: str = "fast", nodes: int = 8, steps: int = 80) -> None:
     """Write the parts of training's settings.json on which the columns of novel poses depend."""
-    fast = machinery == "fast"
-    settings = {"machinery": machinery, "pose_learning_rate": 5e-4 * fast, "novel_pose_steps": steps}
-    settings |= {machinery: {"nodes": nodes} if fast else {}}
+    fast = kind == "fast"
+    settings: dict[str, Any] = {"pose_learning_rate": 5e-4 * fast, "novel_pose_steps": steps}
+    settings |= {"field": {"kind": kind} | ({"nodes": nodes} if fast else {})}
     (training / "settings.json").write_text(json.dumps({"static": False, "training": settings}))
 
 

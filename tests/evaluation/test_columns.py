@@ -33,7 +33,7 @@ def test_animated_has_the_trained_shape() -> None:
 
 
 @pytest.mark.parametrize(
-    ("machinery", "nodes", "lacks"),
+    ("kind", "nodes", "lacks"),
     [
         ("fast", 8, []),
         ("fast", 0, ["novel_pose_tracked"]),
@@ -41,8 +41,8 @@ def test_animated_has_the_trained_shape() -> None:
         ("nerf", 0, ["novel_pose", "novel_pose_posed", "novel_pose_tracked"]),
     ],
 )
-def test_what_is_not_tuned_has_no_column(tmp_path: Path, machinery: str, nodes: int, lacks: list[str]) -> None:
-    write_settings(tmp_path, machinery, nodes)
+def test_what_is_not_tuned_has_no_column(tmp_path: Path, kind: str, nodes: int, lacks: list[str]) -> None:
+    write_settings(tmp_path, kind, nodes)
     assert [split for split in SPLITS if reason_unavailable(split, tmp_path)] == lacks
 
 

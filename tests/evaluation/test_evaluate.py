@@ -212,13 +212,13 @@ def test_the_report_shows_all_three_side_by_side(scored: Scored) -> None:
     assert "not trained on, in poses as fitted before training" in text
 
 
-def evaluated(base: Path, test_cameras: tuple[str, ...], truth: bool, machinery: str) -> tuple[Path, dict[str, Any]]:
+def evaluated(base: Path, test_cameras: tuple[str, ...], truth: bool, kind: str) -> tuple[Path, dict[str, Any]]:
     """Evaluate a ball without a report; return the folder and what was found."""
     capture = write_ball_capture(base / "capture", "ball", test_cameras)
     if truth:
         write_ball_truth(capture, RADIUS_M)
     inputs = ball_inputs(capture, base / "stages")
-    write_settings(inputs.training_folder, machinery)
+    write_settings(inputs.training_folder, kind)
     out = base / "evaluation"
     out.mkdir()
     with pytest.MonkeyPatch.context() as patch:
@@ -309,7 +309,7 @@ def test_report_escapes_what_captures_say(scored: Scored, unscored: Scored) -> N
 
 def test_report_without_truth_says_so(unscored: Scored) -> None:
     text = (unscored[0] / "report.html").read_text()
-    assert "the capture has no test camera" in text and "training views are shown instead" in text
+    assert "the capture has no test camera" in text and "the report shows training views instead" in text
     assert 'alt="Ground truth"' not in text and 'alt="Input × mask"' in text
     assert "No history was recorded" in text
 

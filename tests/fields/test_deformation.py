@@ -1,4 +1,4 @@
-"""Deformation of single frames: nodes and their shares by hand, gradients in double precision, a surface that moves."""
+"""Per-frame deformation: nodes and their weights by hand, gradients in double precision, a moving surface."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from torch import nn
 from hnerf.body.canonical import Descriptor, PosedBodies
 from hnerf.config import FastFieldSettings
 from hnerf.fields.conditions import Conditions
-from hnerf.fields.deformation import FrameDeformation, spread_over
+from hnerf.fields.deformation import FrameDeformation, farthest_points
 from hnerf.fields.fast import FastField
 from tests.body.boxes import box_rig
 
@@ -17,7 +17,7 @@ CENTIMETRES = torch.tensor([[0.01, 0.0, 0.0], [0.0, 0.0, 0.02]])
 
 
 def at(corners: list[int], barycentric: list[float]) -> Descriptor:
-    """A point next to a triangle of the box."""
+    """Return the descriptor of a point next to a triangle of the box."""
     nowhere, corner = torch.zeros(1, 3), torch.tensor([corners])
     return Descriptor(
         torch.zeros(1), nowhere, nowhere, nowhere, torch.ones(1).bool(), corner, torch.tensor([barycentric])
@@ -33,7 +33,7 @@ def deformation(nodes: int) -> FrameDeformation:
 def test_nodes_lie_far_from_each_other():
     """On a line, from 0: 10 is farthest, then 4 (4 from 0 and 6 from 10), then 7 (3 from 4 and from 10)."""
     line = np.array([0.0, 1.0, 4.0, 7.0, 10.0])[:, None]
-    assert spread_over(line, 4) == [0, 4, 2, 3]
+    assert farthest_points(line, 4) == [0, 4, 2, 3]
 
 
 def test_all_follow_a_single_node_and_none_where_no_frame_is_meant():
@@ -48,10 +48,10 @@ def test_shares_by_hand():
     from node 0 and sqrt(2) from node 6, follows node 0 with 1 / (1 + exp((1 - 2) / 0.25))."""
     found = FrameDeformation(RIG.vertices_m, RIG.faces, 2, frames=1)
     found.displacement.data[0, 0] = torch.tensor([1.0, 0.0, 0.0])
-    moved, outwards = found(at([1, 1, 1], [0.2, 0.3, 0.5]), torch.tensor([0]))
+    moved, normal_displacement = found(at([1, 1, 1], [0.2, 0.3, 0.5]), torch.tensor([0]))
     share = 1 / (1 + torch.exp(torch.tensor(-1 / 0.25)))
     torch.testing.assert_close(moved, torch.tensor([[share, 0.0, 0.0]]))
-    torch.testing.assert_close(outwards, share * found.normals[1, :1])
+    torch.testing.assert_close(normal_displacement, share * found.normals[1, :1])
 
 
 def test_gradient_in_double():
@@ -66,20 +66,20 @@ def test_gradient_in_double():
 
 
 def test_poses_without_a_frame_of_their_own_are_displaced_as_frames_are_in_the_mean():
-    """Frames 0 and 2 by 1 cm along x and by 2 cm upwards: 0.5 cm and 1 cm for frame 1 and for what no frame has."""
+    """Frames 0 and 2 move by 1 cm along x and by 2 cm upwards: frame 1 and poses of no frame get 0.5 cm and 1 cm."""
     found = FrameDeformation(RIG.vertices_m, RIG.faces, 2, frames=3)
     found.displacement.data[[0, 2]] = CENTIMETRES[:, None]
-    found.learn_for_all(torch.tensor([0, 2]))
+    found.average_over_frames(torch.tensor([0, 2]))
     mean = torch.tensor([0.005, 0.0, 0.01])
     expected = torch.stack([CENTIMETRES[0], mean, CENTIMETRES[1], mean])[:, None].expand(-1, 2, -1)
     torch.testing.assert_close(found.displacement.data, expected)
 
 
 def test_how_far_vertices_go_outwards():
-    """All go 1 cm along x in frame 0: corner 0, at the origin, goes inwards, corner 1, at (1, 0, 0), outwards; in frame
-    1 all go 2 cm up, corner 1 inwards."""
+    """In frame 0 all vertices move 1 cm along x: corner 0, at the origin, inwards, corner 1, at (1, 0, 0), outwards. In
+    frame 1 all move 2 cm up, corner 1 inwards."""
     found = deformation(1)
-    across, up, nowhere = found.outwards(torch.tensor([0, 1, -1]))
+    across, up, nowhere = found.normal_displacement(torch.tensor([0, 1, -1]))
     torch.testing.assert_close(across, 0.01 * found.normals[:, 0])
     assert across[0] < -0.003 and across[1] > 0.003 and up[1] < -0.003
     assert (nowhere == 0).all()
@@ -87,8 +87,8 @@ def test_how_far_vertices_go_outwards():
 
 @pytest.mark.parametrize("moved_m", [[0.0, 0.0, 0.02], [0.015, -0.01, 0.0]])
 def test_a_frame_moves_all_that_the_field_knows(moved_m: list[float]):
-    """A box in frame 1, moved along the normal or across it, shows at x + m what it shows at x in frame 0 and in a
-    pose that no frame has: distance, with a residual of any form, and colour."""
+    """A box displaced by m in frame 1, along the normal or across it, has at x + m the distance (with any residual) and
+    the colour that it has at x in frame 0 and in a pose of no frame."""
     torch.manual_seed(0)
     settings = FastFieldSettings(
         outer_m=0.1, inner_m=0.1, samples=8, geometry_cells=(16,), colour_cells=(16,), pose_width=1, nodes=1

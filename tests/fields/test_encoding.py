@@ -11,7 +11,7 @@ def test_positional_encoding_by_hand():
 
 
 def linear_grid() -> FeatureGrids:
-    """One level over a 1 x 2 x 4 box whose feature is x + 10 y + 100 z at the nodes."""
+    """Return one level over a 1 x 2 x 4 box whose feature is x + 10 y + 100 z at the nodes."""
     grid = FeatureGrids(torch.zeros(3), torch.tensor([1.0, 2.0, 4.0]), (4,), 1)
     z, y, x = torch.meshgrid(torch.arange(5.0), torch.arange(3.0), torch.arange(2.0), indexing="ij")
     with torch.no_grad():

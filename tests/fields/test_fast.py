@@ -1,4 +1,4 @@
-"""The fast field's shell: tightened to what can be seen, and rays that miss it are asked nothing."""
+"""Shell of the fast field: it is tightened to what is visible, and rays that miss it are not evaluated."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -10,8 +10,16 @@ from hnerf.body.canonical import Descriptor, PosedBodies
 from hnerf.config import FastFieldSettings
 from hnerf.fields.base import Field
 from hnerf.fields.conditions import Conditions, Draws
-from hnerf.fields.fast import ROOM_M, SAMPLES, SETTLED, SPACING_M, TIGHTEN_STEP_M, FastField, at_surface
-from hnerf.training.losses import pixel
+from hnerf.fields.fast import (
+    SAMPLE_COUNTS,
+    SATURATED_LOGIT,
+    SHELL_MARGIN_M,
+    SPACING_M,
+    TIGHTEN_STEP_M,
+    FastField,
+    move_to_surface,
+)
+from hnerf.training.losses import pixel_colour
 from tests.body.boxes import box_rig
 
 RIG = box_rig(splits=3)
@@ -40,15 +48,15 @@ def field_of(sharpness_per_m: float) -> FastField:
 
 
 def test_the_shell_is_tightened_to_where_the_opacity_changes():
-    """Untrained, d_hat is d: a logistic of 1000 per metre has settled 5 mm from the skin, one of 10 nowhere."""
+    """Untrained, d_hat is d: a logistic of 1000 per metre saturates 5 mm from the skin, one of 10 nowhere."""
     _, conditions = standing()
     sharp, soft = field_of(1000.0), field_of(10.0)
     for field in (sharp, soft):
         field.tighten(RIG, conditions.pose)
-    seen_m = SETTLED / 1000
+    seen_m = SATURATED_LOGIT / 1000
     for thickness in (sharp.outer_m, sharp.inner_m):
-        assert (thickness <= seen_m + ROOM_M + 1e-6).all()
-        assert thickness.max().item() == pytest.approx(seen_m + ROOM_M, abs=TIGHTEN_STEP_M)
+        assert (thickness <= seen_m + SHELL_MARGIN_M + 1e-6).all()
+        assert thickness.max().item() == pytest.approx(seen_m + SHELL_MARGIN_M, abs=TIGHTEN_STEP_M)
     assert soft.outer_m.max().item() == pytest.approx(SETTINGS.outer_m)
     assert soft.inner_m.max().item() == pytest.approx(SETTINGS.inner_m)
 
@@ -73,7 +81,7 @@ def test_a_tight_shell_shows_the_same_picture():
 
 
 def test_rays_that_miss_the_shell_see_nothing_and_change_nothing():
-    """The middle one of three passes 1 m beside the box; the others are as if it were not there."""
+    """The middle one of three rays passes 1 m beside the box; the results of the others do not depend on it."""
     bodies, conditions = standing()
     field = field_of(100.0)
     origins = torch.tensor([[0.5, 0.5, 3.0], [2.0, 0.5, 3.0], [0.4, 0.6, 3.0]])
@@ -99,24 +107,25 @@ def test_rays_that_miss_the_shell_see_nothing_and_change_nothing():
 
 
 def test_a_picture_with_as_many_samples_as_the_way_asks_for_is_that_of_many(monkeypatch: pytest.MonkeyPatch):
-    """Straight and slanted rays, whose ways through the shell differ, and one that misses; beside 32 samples each."""
+    """Straight and slanted rays with different path lengths in the shell, and one that misses it, agree with 32 samples
+    each."""
     bodies, conditions = standing()
     field = field_of(200.0)
     origins = torch.tensor([[0.5, 0.4, 3.0], [0.02, 0.9, 3.0], [0.5, 0.1, 3.0], [2.0, 0.5, 3.0]])
     directions = torch.tensor([[0.0, 0.0, -1.0], [0.0, -0.02, -1.0], [0.05, 0.1, -1.0], [0.0, 0.0, -1.0]])
     directions = torch.nn.functional.normalize(directions, dim=-1)
     rays = (bodies, field.region(bodies, conditions), origins, directions, torch.zeros(4, dtype=torch.long), conditions)
-    needed = field.region(bodies, conditions).path_m(*rays[2:5]) / SPACING_M
-    assert len({sum(float(n) > count for count in SAMPLES) for n in needed}) >= 3
-    found = field.look(*rays)
+    needed = field.region(bodies, conditions).path_length_m(*rays[2:5]) / SPACING_M
+    assert len({sum(float(n) > count for count in SAMPLE_COUNTS) for n in needed}) >= 3
+    found = field.render_rays(*rays)
     monkeypatch.setattr(FastField, "samples_needed", Field.samples_needed)
-    expected = field.look(*rays)
+    expected = field.render_rays(*rays)
     torch.testing.assert_close(found, expected, atol=0.02, rtol=0)
     assert (found[:3, 3] > 0.5).all() and not found[3].any()
 
 
 def deeper_by(distance_m: float, settings: FastFieldSettings = SETTINGS) -> FastField:
-    """A field whose surface lies deeper than the body everywhere in the shell."""
+    """Return a field whose surface lies deeper than the body everywhere in the shell."""
     torch.manual_seed(0)
     field = FastField(RIG, settings, 1)
     field.log_sharpness.data.fill_(500.0).log_()
@@ -127,8 +136,9 @@ def deeper_by(distance_m: float, settings: FastFieldSettings = SETTINGS) -> Fast
 
 
 def test_a_rendered_ray_ends_at_the_solid_core_where_the_surface_lies_deeper():
-    """Of a surface 10 cm inside the body, in a shell 3 cm deep, no sample sees anything: a ray through the middle is
-    opaque all the same, at its last sample and in that sample's colour, and one that grazes the shell sees nothing."""
+    """The surface lies 10 cm inside the body, the shell is 3 cm deep, so no sample sees the surface. A ray through the
+    middle is opaque all the same, at its last sample and in that sample's colour; a ray that grazes the shell sees
+    nothing."""
     bodies, conditions = standing()
     field = deeper_by(0.1)
     origins, directions = torch.tensor([[0.5, 0.5, 3.0], [-0.05, 0.5, 3.0]]), -torch.eye(3)[[2, 2]]
@@ -138,7 +148,7 @@ def test_a_rendered_ray_ends_at_the_solid_core_where_the_surface_lies_deeper():
     draws = Draws.deterministic(2, count, torch.device("cpu"))
     with torch.no_grad():
         samples, depths = field.sample(bodies, region, *rays, conditions, draws)
-        seen = field.look(bodies, region, *rays, conditions)
+        seen = field.render_rays(bodies, region, *rays, conditions)
     assert samples.d_hat.min() > 0.02 and field.coverage(samples).max() < 0.01
     assert seen[0, 3] == pytest.approx(1) and seen[0, 4] == pytest.approx(depths[0, -1].item(), abs=1e-4)
     torch.testing.assert_close(seen[0, :3], samples.colour[0, -1], atol=1e-3, rtol=0)
@@ -146,21 +156,22 @@ def test_a_rendered_ray_ends_at_the_solid_core_where_the_surface_lies_deeper():
 
 
 def test_a_shell_deeper_than_high_finds_the_surface_at_its_bottom():
-    """3 cm outside, 10 cm inside, and a surface 7 cm inside the body: farther from the skin than the shell is high."""
+    """The shell reaches 3 cm out and 10 cm in; the surface lies 7 cm inside the body, farther from the skin than the
+    outer thickness."""
     settings = SETTINGS.model_copy(update={"outer_m": 0.03, "inner_m": 0.1, "shell_cell_m": 0.015})
     bodies, conditions = standing()
     field = deeper_by(0.07, settings)
     field.tighten(RIG, conditions.pose)
     ray = torch.tensor([[0.5, 0.5, 3.0]]), -torch.eye(3)[[2]], torch.zeros(1, dtype=torch.long)
     with torch.no_grad():
-        seen = field.look(bodies, field.region(bodies, conditions), *ray, conditions)[0]
+        seen = field.render_rays(bodies, field.region(bodies, conditions), *ray, conditions)[0]
     top_m = 3 - bodies.vertices_m[0, :, 2].max().item()
     assert seen[3] == pytest.approx(1, abs=0.01) and seen[4].item() - top_m == pytest.approx(0.07, abs=0.01)
 
 
 def test_the_shell_moves_with_the_surface_of_a_frame():
-    """Of a frame that lies 2 cm higher the shell is 2 cm higher; of one that lies 6 cm higher its upper end goes no
-    farther than the setting of 7 cm, 5 cm above where it was."""
+    """For a frame displaced by 2 cm the shell is 2 cm higher; for one displaced by 6 cm its upper end stops at the
+    setting of 7 cm, 5 cm above where it was."""
     settings = SETTINGS.model_copy(update={"nodes": 1, "shell_cell_m": 0.01, "inner_m": 0.1})
     field = FastField(RIG, settings, 2)
     assert field.deformation is not None
@@ -171,7 +182,7 @@ def test_the_shell_moves_with_the_surface_of_a_frame():
     ray = torch.tensor([[0.5, 0.5, 3.0]]), -torch.eye(3)[[2]], torch.zeros(1, dtype=torch.long)
 
     def ends(moment: int) -> torch.Tensor:
-        """Depths of the first and the last sample on a ray from above."""
+        """Return the depths of the first and the last sample on a ray from above."""
         moments = Conditions.of(RIG, bodies.theta, bodies.root, torch.tensor([moment]), 2.5)
         depths, _, core = field.region(bodies, moments).sample_rays(*ray, torch.full((1, 64), 0.5))
         assert core.all()
@@ -183,23 +194,23 @@ def test_the_shell_moves_with_the_surface_of_a_frame():
 
 
 def test_training_begins_with_half_the_samples():
-    """Of 32 samples 16 for three quarters of the steps, then all; a rendering has what it asks for."""
+    """With 32 samples, three quarters of the steps use 16, the rest all; rendering uses what a ray needs."""
     field = FastField(RIG, SETTINGS, 1)
-    assert [field.samples_in_training(done) for done in (0.0, 0.74, 0.75, 1.0)] == [16, 16, 32, 32]
+    assert [field.training_samples(done) for done in (0.0, 0.74, 0.75, 1.0)] == [16, 16, 32, 32]
 
 
 def on_a_ray(depth_m: list[float], near: list[bool]) -> Descriptor:
-    """Descriptors of one ray's samples at some heights above the skin z = 0, which it meets head-on."""
+    """Return descriptors of one ray's samples at given heights above the skin z = 0, which it meets perpendicularly."""
     d, zero = torch.tensor(depth_m), torch.zeros(len(depth_m))
     y, normal = torch.stack([zero, zero, d], 1), torch.stack([d, zero, zero], 1)  # a normal that tells samples apart
     return Descriptor(d, y, y, normal, torch.tensor(near), torch.zeros(len(d), 3).long(), torch.zeros(len(d), 3))
 
 
 def test_colours_are_those_of_the_surface_between_two_samples():
-    """Heights 12, 6, -2, -8 mm above the skin, and a surface 1 mm above it: the second sample moves 5 / 8 of the way to
-    the third, the first as near as the second one; those behind stay."""
+    """Samples at 12, 6, -2, -8 mm above the skin, the surface at 1 mm: the second sample moves 5 / 8 of the way to the
+    third, the first moves to the second; those behind the surface stay."""
     described = on_a_ray([0.012, 0.006, -0.002, -0.008], [True] * 4)
-    moved = at_surface(described, described.d[None] - 0.001)
+    moved = move_to_surface(described, described.d[None] - 0.001)
     expected = torch.tensor([0.006, 0.001, -0.002, -0.008])
     assert torch.allclose(moved.d, expected, atol=1e-7)
     assert torch.allclose(moved.y[:, 2], expected, atol=1e-7)
@@ -209,7 +220,7 @@ def test_colours_are_those_of_the_surface_between_two_samples():
 def test_samples_stay_where_the_next_one_is_out_of_reach_or_on_another_limb():
     described = on_a_ray([0.005, -0.005, 0.005, -0.005], [True, False, True, True])
     described.y[3, 0] = 0.1
-    moved = at_surface(described, described.d[None])
+    moved = move_to_surface(described, described.d[None])
     assert torch.equal(moved.d, described.d)
     assert torch.equal(moved.y, described.y)
 
@@ -220,17 +231,17 @@ def test_a_surface_is_met_at_the_same_point_when_its_body_moves_along_the_ray():
     later in x."""
     x, height = torch.tensor([[0.0, 0.004], [0.003, -0.001]], dtype=torch.double)
 
-    def met_at(along: torch.Tensor, down: torch.Tensor) -> torch.Tensor:
-        d = height + along + down
-        y = torch.stack([x - along, torch.zeros_like(x), d], 1)
+    def met_at(points_on_rays: torch.Tensor, down: torch.Tensor) -> torch.Tensor:
+        d = height + points_on_rays + down
+        y = torch.stack([x - points_on_rays, torch.zeros_like(x), d], 1)
         described = dataclasses.replace(on_a_ray([0.0, 0.0], [True] * 2), d=d, y=y, normal=y)
-        return at_surface(described, d[None]).y[0]
+        return move_to_surface(described, d[None]).y[0]
 
     still = torch.zeros((), dtype=torch.double, requires_grad=True)
     skin = torch.tensor([0.003, 0.0, 0.0], dtype=torch.double)
     torch.testing.assert_close(met_at(still, still), skin, atol=1e-12, rtol=0)
-    along, down = torch.autograd.functional.jacobian(met_at, (still, still))
-    torch.testing.assert_close(along, torch.zeros_like(skin), atol=1e-9, rtol=0)
+    points_on_rays, down = torch.autograd.functional.jacobian(met_at, (still, still))
+    torch.testing.assert_close(points_on_rays, torch.zeros_like(skin), atol=1e-9, rtol=0)
     torch.testing.assert_close(down, torch.tensor([1.0, 0.0, 0.0], dtype=torch.double), atol=1e-9, rtol=0)
     assert torch.autograd.gradcheck(met_at, (still, still), eps=1e-7)
 
@@ -249,7 +260,7 @@ def test_a_pixel_pulls_at_its_body_as_its_colour_changes_when_the_body_moves():
         moved = {"move_m": move_m[None], "turn": correction.turn, "shape": correction.shape}
         where = (bodies, field.region(bodies, conditions), *rays)
         samples, _ = field.sample(*where, conditions, draws, SimpleNamespace(**moved))
-        return pixel(samples.alpha, samples)[0]
+        return pixel_colour(samples.alpha, samples)[0]
 
     step_m = 1e-4
     steps = [(colour(step_m * axis) - colour(-step_m * axis)) / (2 * step_m) for axis in torch.eye(3)]
@@ -261,11 +272,11 @@ def test_a_pixel_pulls_at_its_body_as_its_colour_changes_when_the_body_moves():
 def test_a_ray_that_grazes_the_surface_has_finite_gradients():
     described = on_a_ray([0.001, 0.001, 0.0, 0.0], [True] * 4)
     d_hat = described.d[None].requires_grad_()
-    at_surface(described, d_hat).y.sum().backward()
+    move_to_surface(described, d_hat).y.sum().backward()
     assert d_hat.grad is not None
     assert torch.isfinite(d_hat.grad).all()
 
 
 def test_samples_stay_where_the_surface_is_left():
     described = on_a_ray([0.001, 0.004, 0.004, 0.009], [True] * 4)
-    assert torch.equal(at_surface(described, described.d[None]).d, described.d)
+    assert torch.equal(move_to_surface(described, described.d[None]).d, described.d)

@@ -1,8 +1,8 @@
-"""One ray through the fast field, its networks replaced by known functions: what they are asked, and how steep the
-distance is that they make.
+"""One ray through the fast field with known functions in place of its networks: the inputs of the networks, and the
+slope of the resulting distance.
 
-The body is the unit box, turned a quarter about z: the ray comes along x and meets its face at x = 1.55 m, where the
-canonical place is (0.4, 1, 0.25) and the canonical normal is y. The shell reaches 6 cm out and 4 cm in.
+The body is the unit box, turned by a quarter about z: the ray comes along x and meets its face at x = 1.55 m, where the
+canonical position is (0.4, 1, 0.25) and the canonical normal is y. The shell reaches 6 cm out and 4 cm in.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ Distance = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def field_of(residual: Distance, nodes: int = 0) -> FastField:
-    """A field with a sharp surface, of which DH is known."""
+    """Return a field with a sharp surface and the given DH."""
     field = FastField(RIG, SETTINGS.model_copy(update={"nodes": nodes}), 2)
     field.log_sharpness.data.fill_(2000.0).log_()
     field.field.residual = residual
@@ -49,7 +49,7 @@ def sampled(field: FastField, probe: float | None = None) -> RaySamples:
     conditions = Conditions.of(RIG, THETA, ROOT, torch.arange(2), 2.5)
     draws = Draws(torch.full((1, 12), 0.5), torch.rand(1, 3), torch.zeros(1, 12))
     if probe is not None:
-        draws = Draws(draws.jitter, draws.beyond, draws.finer, torch.tensor([probe]))
+        draws = Draws(draws.jitter, draws.background, draws.fine, torch.tensor([probe]))
     return field.sample(bodies, field.region(bodies, conditions), *RAY, conditions, draws, bodies.correction())[0]
 
 
@@ -58,7 +58,7 @@ def same(found: Tensor, expected: list[float]) -> None:
 
 
 def test_the_networks_see_the_canonical_place_the_frames_pose_and_the_normal_in_the_world() -> None:
-    """Of a surface 1 cm outside the body. F is asked where the ray meets it, DH at every sample."""
+    """The surface lies 1 cm outside the body. F is evaluated where the ray meets it, DH at every sample."""
     asked: dict[str, tuple[Tensor, ...]] = {}
 
     def residual(*inputs: Tensor) -> Tensor:
@@ -88,28 +88,28 @@ def test_the_networks_see_the_canonical_place_the_frames_pose_and_the_normal_in_
 
 @pytest.mark.parametrize("probe", [OUTERMOST, INNERMOST])
 def test_the_distance_is_as_steep_as_in_the_world(probe: float) -> None:
-    """It rises along the normal by 1 a metre for the body, 0.5 and 0.2 for the residual's second coordinate and
-    distance, and across it by 0.3: the same outside the skin and inside."""
+    """Along the normal it rises by 1 per metre for the body, and by 0.5 and 0.2 for the residual's second coordinate
+    and distance; across it by 0.3; the same outside the skin and inside."""
     samples = sampled(field_of(lambda y, d, pose: 0.3 * y[:, 0] + 0.5 * y[:, 1] + 0.2 * d), probe)
     assert (samples.d[0, int(12 * probe)] > 0.01) == (probe == OUTERMOST)
     same(samples.gradient_norm, [(1.7**2 + 0.3**2) ** 0.5])
 
 
 def test_the_gradient_is_a_forward_difference_over_5_mm() -> None:
-    """Of 40 (y - 1)^2, where y - 1 is d: 80 d + 40 x 0.005."""
+    """The gradient of 40 (y - 1)^2, where y - 1 is d, is 80 d + 40 x 0.005."""
     samples = sampled(field_of(lambda y, d, pose: 40 * (y[:, 1] - 1) ** 2), OUTERMOST)
     same(samples.gradient_norm, [1 + 80 * samples.d[0, 0].item() + 0.2])
 
 
 def test_the_eikonal_loss_moves_no_body() -> None:
-    """It is the field's alone; a rendering does not ask for it."""
+    """Its gradients flow to the field alone; rendering does not compute it."""
     assert not sampled(field_of(lambda y, d, pose: y[:, 0] * d), OUTERMOST).gradient_norm.requires_grad
     assert sampled(field_of(nothing)).gradient_norm.shape == (0,)
 
 
 def test_the_energy_of_a_displacement() -> None:
-    """2 cm along y in the ray's frame, 1 cm of which is the unit: 4 at each sample. The body's surface is met 2 cm
-    earlier."""
+    """A displacement by 2 cm along y in the ray's frame, in units of 1 cm, has energy 4 at each sample. The ray meets
+    the body's surface 2 cm earlier."""
     field = field_of(nothing, nodes=1)
     assert field.deformation is not None
     still = sampled(field)

@@ -1,4 +1,4 @@
-"""What the fast field's two networks are asked at a point, and the units of their answers, by hand."""
+"""Inputs of the fast field's two networks at a point, and the units of their outputs, by hand."""
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ CODE = [0.3, -0.2]  # of this pose: its last number, and less its second one
 
 
 class First(nn.Module):
-    """A network that answers with its first inputs."""
+    """Network that returns its first inputs."""
 
     def __init__(self, outputs: int):
         super().__init__()
@@ -27,7 +27,7 @@ class First(nn.Module):
 
 
 def known_field() -> CanonicalField:
-    """Features are 0.5 and 0.25 of geometry, 2 of colour, wherever it is asked."""
+    """Return a field with features 0.5 and 0.25 of geometry and 2 of colour everywhere."""
     field = CanonicalField(torch.zeros(3), torch.ones(3), SETTINGS, 3)
     levels = [*field.geometry_grids.levels, *field.colour_grids.levels]
     for level, feature in zip(levels, (0.5, 0.25, 2.0), strict=True):
@@ -38,7 +38,7 @@ def known_field() -> CanonicalField:
 
 
 def test_geometry_sees_features_distance_and_pose() -> None:
-    """The distance in units of the shell's height, as its answer is: half of 5 cm."""
+    """Input distance and output are in units of the outer shell thickness: half of 5 cm."""
     field = known_field()
     found = field.residual(Y, D, POSE)
     torch.testing.assert_close(field.geometry.asked, torch.tensor([[0.5, 0.25, -0.2, *CODE]]))
@@ -46,7 +46,7 @@ def test_geometry_sees_features_distance_and_pose() -> None:
 
 
 def test_colour_sees_features_distance_pose_and_normal() -> None:
-    """The normal with one octave: sines of pi, 0 and -pi / 2, cosines of the same."""
+    """The normal is encoded with one octave: sines of pi, 0 and -pi / 2, and their cosines."""
     field = known_field()
     found = field.colour(Y, D, NORMAL, POSE)
     encoded = [1.0, 0, -0.5, 0, 0, -1, -1, 1, 0]
@@ -55,7 +55,7 @@ def test_colour_sees_features_distance_pose_and_normal() -> None:
 
 
 def test_no_network_answers_before_it_is_trained() -> None:
-    """The surface is the body's own; each pose and each place may change both answers."""
+    """The surface starts as the body's own; training may change both outputs at any pose and position."""
     torch.manual_seed(0)
     field = CanonicalField(torch.zeros(3), torch.ones(3), SETTINGS, 3)
     assert field.residual(Y, D, POSE).item() == 0

@@ -4,7 +4,7 @@ from hnerf.fields.mlp import RadianceMLP, ResidualMLP, SkipMLP
 
 
 def test_sizes_of_the_paper():
-    """F: eight layers of 256, the fifth sees the input again; DH: six of 128."""
+    """F has eight layers of 256, the fifth with the input again; DH has six of 128."""
     radiance = RadianceMLP(4, 57, 12)
     inputs = 4 * 17 + 57
     assert [layer.in_features for layer in radiance.trunk.layers] == [
@@ -52,7 +52,8 @@ def test_gradients_in_double():
 
 
 def slopes(network: SkipMLP, points: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Values, their gradients to the points, and those of a loss of either to the parameters, as `eikonal` needs."""
+    """Return values, their gradients by the points, and the gradients of a loss on either by the parameters, as
+    `eikonal` needs."""
     points = points.clone().requires_grad_()
     values = network(points)
     (slope,) = torch.autograd.grad(values.sum(), points, create_graph=True)
@@ -93,7 +94,7 @@ def test_density_differs_over_space_from_the_start():
 
 
 def test_views_are_encoded_where_asked():
-    """(v, sin pi v, cos pi v): nine inputs instead of three; a view of 1 looks like one of -1 but for v itself."""
+    """(v, sin pi v, cos pi v) are nine inputs instead of three; a view of 1 differs from one of -1 in v alone."""
     network = RadianceMLP(4, 3, 12, view_octaves=1)
     assert network.colour[0].in_features == 256 + 12 + 9
     with torch.no_grad():

@@ -1,11 +1,10 @@
-"""One ray through the published field, its networks replaced by known functions: what they are asked, and what becomes
-of their answers.
+"""One ray through the published field with known functions in place of its networks: the inputs of the networks, and
+what their outputs become.
 
-A scene unit is 2 m. The body is the unit box, turned a quarter about z: it stands between x = 1.55 and 2.55 m, its box
-B between 1.45 and 2.65. The ray comes along x from 1 m before the scene, so that x is its depth less 1 m. A fog leaves
-half of the light after each metre: of four coarse samples in the middles of their metres the weights are 1/2, 1/4, 1/8
-and 1/8, and fine ones at .6 of their quarters of these lie at 1.3 and 1.8 m in the first metre, 2.6 m in the second and
-4.2 m in the last.
+A scene unit is 2 m. The body is the unit box, turned by a quarter about z: it lies between x = 1.55 and 2.55 m, its box
+B between 1.45 and 2.65. The ray comes along x from 1 m before the scene, so x is its depth less 1 m. A fog halves the
+light per metre: four coarse samples in the middles of their metres have weights 1/2, 1/4, 1/8 and 1/8, and fine samples
+at .6 of the quarters of these lie at 1.3 and 1.8 m in the first metre, 2.6 m in the second and 4.2 m in the last.
 """
 
 import math
@@ -42,7 +41,7 @@ TURN = [0.0, -1, 0, 1.275, 1, 0, 0, 0, 0, 0, 1, 0]  # the rows of T, its transla
 
 
 class Fog(nn.Module):
-    """F: the same density everywhere, colours painted by where it is asked."""
+    """F with constant density and colours given by the position."""
 
     def __init__(self, paint: Callable[[Tensor], Tensor] = lambda point: point[:, :3]):
         super().__init__()
@@ -55,7 +54,7 @@ class Fog(nn.Module):
 
 
 class Slope(nn.Module):
-    """DH: a tenth of its first input."""
+    """DH that returns a tenth of its first input."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -86,12 +85,12 @@ def rows(values: list[list[float]]) -> Tensor:
 
 
 def outside(dimensions: int) -> Tensor:
-    """The ray's points in scene units, with the constant distance outside B where there are four dimensions."""
+    """Return the ray's points in scene units, with the constant distance outside B where there are four dimensions."""
     return rows([[x, 0.1, 0.375, 1.0][:dimensions] for x in X])
 
 
 def same(found: Tensor, expected: Tensor, atol: float = 2e-4) -> None:
-    """Fine samples lie within 0.1 mm of where they are expected: no cell of theirs is without any weight."""
+    """Compare with a tolerance of 0.1 mm: fine samples deviate because no cell has zero weight."""
     torch.testing.assert_close(found.detach(), expected, atol=atol, rtol=0)
 
 
@@ -103,8 +102,8 @@ def test_fine_samples_lie_where_the_coarse_ones_have_weight(static: bool) -> Non
 
 
 def test_some_coarse_samples_lie_in_the_box_alone() -> None:
-    """Two of four in the middles of the scene's halves, at 2 and 4 m, two of those of B, which is met from 2.45 to
-    3.65 m."""
+    """Two of four samples lie in the middles of the scene's halves, at 2 and 4 m, two in those of B, which the ray
+    crosses from 2.45 to 3.65 m."""
     field = field_of(static=True, box_samples=2)
     sampled(field)
     same(field.radiance.asked[0][0][:, 0], torch.tensor([-0.5, -0.125, 0.175, 0.5]))
@@ -127,8 +126,8 @@ def test_coarse_samples_are_asked_first() -> None:
 
 
 def test_f_sees_the_body_in_its_box_and_the_place_with_a_constant_outside() -> None:
-    """(s, d) in scene units; x - centre in scene units and distance 1; pose and root of the ray's own frame, zero
-    outside."""
+    """Inside: (s, d) in scene units, with pose and root of the ray's frame. Outside: x - centre in scene units,
+    distance 1, and zeros."""
     field = field_of()
     sampled(field)
     point, pose, root, view = field.radiance.asked[-1]
@@ -147,7 +146,7 @@ def test_dh_sees_the_body_and_the_pose() -> None:
 
 
 def test_the_networks_see_the_noise() -> None:
-    """On theta and T within B, on v everywhere."""
+    """There is noise on theta and T within B, and on v everywhere."""
     field, (standing, conditions) = field_of(), bodies()
     noisy = replace(conditions, pose=conditions.pose + 0.01, root=conditions.root + 0.02)
     draws = replace(DRAWS, view=torch.tensor([[0.0, 0.03, -0.04]]))
@@ -168,7 +167,7 @@ def test_f_sees_no_root_where_it_is_no_condition() -> None:
 
 
 def test_the_static_form_sees_the_place_alone() -> None:
-    """Three coordinates in and outside B, neither pose nor root; of DH those in B are asked."""
+    """F sees three coordinates inside and outside B, neither pose nor root; DH is evaluated inside B only."""
     field = field_of(static=True)
     sampled(field)
     point, pose, root, view = field.radiance.asked[-1]
@@ -182,12 +181,12 @@ def test_the_static_form_sees_the_place_alone() -> None:
 
 @pytest.mark.parametrize("static", [False, True])
 def test_density_counts_per_scene_unit(static: bool) -> None:
-    """A metre takes half of the light; behind the last sample nothing is seen."""
+    """A metre halves the light; nothing is visible behind the last sample."""
     samples, _ = sampled(field_of(static))
     ways_m = [0.2, 0.3, 0.7, 0.1, 0.9, 0.7, 0.3]
     same(samples.alpha, rows([[1 - 0.5**way for way in ways_m] + [1.0]]))
     same(samples.density, torch.full((1, 8), 2 * math.log(2)))
-    assert not samples.beyond.any()
+    assert not samples.background.any()
 
 
 @pytest.mark.parametrize(
@@ -197,8 +196,8 @@ def test_density_counts_per_scene_unit(static: bool) -> None:
 def test_distances_are_in_scene_units_and_their_gradient_in_metres(
     static: bool, residual: list[float], norms: list[float]
 ) -> None:
-    """Outside B the body is 1 away and has no residual. From the faces d rises by 1 a metre, along or against x, the
-    residual by a tenth: along the face, as s moves with the point, or in the static form along x."""
+    """Outside B the body is 1 away and has no residual. From the faces d rises by 1 per metre, along or against x, and
+    the residual by a tenth: along the face, because s moves with the point, or in the static form along x."""
     samples, _ = sampled(field_of(static))
     same(samples.in_box, INSIDE[None])
     d, dd = torch.ones(8), torch.zeros(8)
@@ -243,9 +242,9 @@ def test_each_loss_of_a_ray() -> None:
 
 
 def test_numbers_of_the_paper() -> None:
-    """Section 4 and the supplement's parameters."""
+    """The values of section 4 and of the supplement's parameters."""
     training = load_settings("paper").training
-    paper, losses = training.paper, training.losses
+    paper, losses = training.field, training.losses
     assert (paper.samples, paper.gamma, paper.learning_rate, paper.scene_m) == (256, 200, 1e-3, 2.5)
     assert (training.steps, training.frames_per_step * training.rays_per_frame, training.noise) == (10_000, 4096, 0.1)
     assert losses.density_threshold == 50
@@ -256,7 +255,7 @@ def test_numbers_of_the_paper() -> None:
 
 
 def test_what_is_asked_of_a_point_is_what_was_asked_in_training() -> None:
-    """5 cm above the first body, at (0.5, 0.2, 1) of it: d_hat is .05 + 2 x .1 x .25 m."""
+    """5 cm above the first body, at (0.5, 0.2, 1) in its frame, d_hat is .05 + 2 x .1 x .25 m."""
     field, (standing, conditions) = field_of(), bodies()
     point_m, view = torch.tensor([[1.95, 0.6, 0.05]]), torch.tensor([[0.0, 0, -1]])
     same(field.signed_distance(standing, point_m, conditions), torch.tensor([0.1]))

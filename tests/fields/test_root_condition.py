@@ -1,4 +1,4 @@
-"""Whether the paper's colour depends on the root transformation T; its density never does."""
+"""Root condition: whether the paper's colour depends on the root transform T; its density never does."""
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ RIG = box_rig()
 
 
 def seen(field: PaperField, root_condition: Tensor) -> tuple[Tensor, Tensor]:
-    """Density and colour along one ray through the box, for a condition that says where the root is."""
+    """Return density and colour along one ray through the box for given conditions."""
     bodies = PosedBodies(RIG, torch.zeros(1, 2, 3), torch.eye(4)[None], RIG.vertices_m)
     moment = torch.zeros(1, dtype=torch.long)
     conditions = Conditions(Conditions.of(RIG, bodies.theta, bodies.root, moment, 2.5).pose, root_condition, moment)

@@ -1,32 +1,32 @@
 import pytest
 import torch
 
-from hnerf.fields.shell import EMPTY, SHELL, SOLID, ShellGrid, box_interval, lattice
+from hnerf.fields.shell import EMPTY, SHELL, SOLID, ShellGrid, box_interval, surface_points
 from tests.body.boxes import box_faces, box_vertices
 
 
 def sphere(radius_m: float) -> torch.Tensor:
-    """Dense points on a sphere about the origin, (1, N, 3)."""
+    """Return dense points (1, N, 3) on a sphere about the origin."""
     points = torch.randn(40000, 3, generator=torch.Generator().manual_seed(0))
     return radius_m * torch.nn.functional.normalize(points, dim=-1)[None]
 
 
 def around(surface: torch.Tensor, outer: torch.Tensor, inner: torch.Tensor, cell_m: float) -> ShellGrid:
-    """Of surfaces whose vertices are dense: they alone are the points."""
+    """Return the shell around surfaces whose vertices are dense enough to be the only surface points."""
     corners = torch.arange(surface.shape[1])[:, None].expand(-1, 3)
     points = corners, torch.tensor([1.0, 0.0, 0.0]).expand(len(corners), -1)
     return ShellGrid.around(surface, outer, inner, points, cell_m)
 
 
 def even_shell(surface: torch.Tensor, outer_m: float, inner_m: float, cell_m: float) -> ShellGrid:
-    """As thick everywhere."""
+    """Return a shell of the same thickness everywhere."""
     outer, inner = (torch.full(surface.shape[:2], thickness) for thickness in (outer_m, inner_m))
     return around(surface, outer, inner, cell_m)
 
 
 def along_x(grid: ShellGrid, x_m: list[float]) -> list[int]:
-    """States of the first frame's cells on the x axis."""
-    return grid.look_up(torch.zeros(1, 3), torch.eye(3)[:1], torch.tensor([x_m]), torch.zeros(1).long())[0].tolist()
+    """Return the states of the first frame's cells on the x axis."""
+    return grid.cell_states(torch.zeros(1, 3), torch.eye(3)[:1], torch.tensor([x_m]), torch.zeros(1).long())[0].tolist()
 
 
 def test_box_interval_by_hand():
@@ -45,7 +45,7 @@ def test_states_around_a_sphere():
 
 
 def test_the_shell_is_as_thick_as_its_surface_asks():
-    """Thick on the side of x > 0, thin on the other: 8 cm off is shell on one side alone."""
+    """The shell is thick for x > 0 and thin on the other side: a point 8 cm off lies in it on one side only."""
     surface = sphere(0.3)
     outer = torch.where(surface[..., 0] > 0, 0.1, 0.02)
     grid = around(surface, outer, torch.full_like(outer, 0.02), 0.01)
@@ -53,20 +53,21 @@ def test_the_shell_is_as_thick_as_its_surface_asks():
 
 
 def test_every_frame_has_its_own_surface_and_thickness():
-    """A sphere of 0.3 m with a shell of 2 cm, and one of 0.2 m with 8 cm: 5 cm outside either."""
+    """A sphere of 0.3 m with a shell of 2 cm, and one of 0.2 m with 8 cm, checked 5 cm outside."""
     outer = torch.tensor([0.02, 0.08])[:, None].expand(-1, 40000)
     surfaces = torch.cat([sphere(0.3), sphere(0.2)])
     grid = around(surfaces, outer, torch.full_like(outer, 0.04), 0.01)
-    along, frames = torch.tensor([[0.35], [0.25], [0.35], [0.25]]), torch.tensor([0, 1, 1, 0])
-    found = grid.look_up(torch.zeros(4, 3), torch.eye(3)[[0, 0, 0, 0]], along, frames)[:, 0].tolist()
+    points_on_rays, frames = torch.tensor([[0.35], [0.25], [0.35], [0.25]]), torch.tensor([0, 1, 1, 0])
+    found = grid.cell_states(torch.zeros(4, 3), torch.eye(3)[[0, 0, 0, 0]], points_on_rays, frames)[:, 0].tolist()
     assert found == [EMPTY, SHELL, EMPTY, SOLID]
 
 
 def test_between_vertices_a_surface_is_where_its_points_are():
-    """A unit box about the origin, thick at the corners of x > 0: its faces there and opposite, away from corners."""
+    """A unit box about the origin with a thick shell at the corners of x > 0, checked on its faces, away from
+    corners."""
     corners_m = box_vertices() - 0.5
     outer = torch.where(corners_m[None, :, 0] > 0, 0.2, 0.02)
-    points = lattice(corners_m, box_faces(), 0.01)
+    points = surface_points(corners_m, box_faces(), 0.01)
     grid = ShellGrid.around(corners_m[None], outer, torch.full_like(outer, 0.02), points, 0.02)
     assert along_x(grid, [0.5, 0.65, -0.5, -0.65]) == [SHELL, SHELL, SHELL, EMPTY]
 
@@ -74,7 +75,7 @@ def test_between_vertices_a_surface_is_where_its_points_are():
 def test_a_lattice_divides_long_edges():
     """A right triangle with legs of 3: spacing 1.5 cuts its longest edge (4.24) in three, so 10 points in all."""
     vertices = torch.tensor([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
-    corners, weights = lattice(vertices, torch.tensor([[0, 1, 2]]), 1.5)
+    corners, weights = surface_points(vertices, torch.tensor([[0, 1, 2]]), 1.5)
     points = (vertices[corners] * weights[..., None]).sum(1)
     expected = {(x, y, 0) for x in range(4) for y in range(4) if x + y <= 3}
     assert {tuple(p) for p in points.round().int().tolist()} == expected and len(points) == 10
@@ -88,8 +89,8 @@ def test_samples_lie_in_the_shell_before_the_solid():
     origins_m, directions = torch.tensor([[-1.0, 0.0, 0.0], [-1.0, 0.6, 0.0]]), torch.eye(3)[[0, 0]]
     rays = (origins_m, directions, torch.zeros(2, dtype=torch.long))
     depths, met, ended = grid.sample_rays(*rays, torch.full((2, 16), 0.5))
-    path_m = grid.path_m(*rays)
-    assert path_m[0].item() == pytest.approx(0.09, abs=0.03) and path_m[1] == 0
+    path_length_m = grid.path_length_m(*rays)
+    assert path_length_m[0].item() == pytest.approx(0.09, abs=0.03) and path_length_m[1] == 0
     assert met.tolist() == ended.tolist() == [True, False]
     assert (depths[0].diff() > 0).all()
     assert depths[0, 0].item() == pytest.approx(0.65, abs=0.03)

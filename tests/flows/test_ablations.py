@@ -39,14 +39,14 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainingSett
         if settings.losses.eikonal == 0:
             raise LostWorkerError("rank 0 was killed by SIGKILL")
         (tmp_path / "report.json").write_text('{"seconds": 61.7, "device": "abacus", "steps": 3}')
-        stored = {"static": True, "training": {"machinery": settings.machinery}}
+        stored = {"static": True, "training": {"field": {"kind": settings.field.kind}, "pose_learning_rate": 0}}
         (tmp_path / "settings.json").write_text(json.dumps(stored))
         return SimpleNamespace(root=tmp_path)
 
     def evaluate(*inputs: Any) -> Any:
         split = SPLIT | {"psnr": trained[-1].losses.segmentation}
         reason = "H-NeRF's static network models one moment"
-        poses = split if trained[-1].machinery == "fast" else unscored(reason) | {"geometry": None}
+        poses = split if trained[-1].field.kind == "fast" else unscored(reason) | {"geometry": None}
         metrics = {"protocol": "By eye.", "novel_view": split, "seconds": 5.0, "holdout": None}
         metrics |= dict.fromkeys(("novel_pose", "novel_pose_posed", "novel_pose_tracked"), poses)
         (tmp_path / "metrics.json").write_text(json.dumps(metrics))
@@ -68,7 +68,7 @@ def test_the_paper_preset_has_a_row_for_every_loss_and_switch() -> None:
     others = {"no-eta", "no-density_threshold", "no-density_steepness", "no-geometry_roles", "no-elastic"}
     assert next(iter(rows)) == "full"
     assert set(rows) == {"full", "no-opt", "no-root", "no-noise"} | losses - others
-    assert left_out == {"no-deformation": "the paper machinery has no such part"}
+    assert left_out == {"no-deformation": "the paper field has no such part"}
 
 
 def test_rows_differ_from_the_preset_in_one_setting() -> None:
@@ -78,7 +78,7 @@ def test_rows_differ_from_the_preset_in_one_setting() -> None:
     after = {name: dict(_leaves(row.model_dump()).items() - before.items()) for name, row in rows.items()}
     assert after.pop("full") == {}
     assert after.pop("no-opt") == {"training.pose_learning_rate": 0}
-    assert after.pop("no-root") == {"training.paper.root_condition": False}
+    assert after.pop("no-root") == {"training.field.root_condition": False}
     assert after.pop("no-noise") == {"training.noise": 0}
     assert after == {f"no-{name}": {f"training.losses.{name}": 0} for name in (row[3:] for row in after)}
 
@@ -94,7 +94,7 @@ def test_what_is_off_or_unused_is_left_out() -> None:
     rows, left_out = choose(load_settings("fast"), [])
     assert left_out == {
         **dict.fromkeys(["no-blend", "no-fit", "no-geometry", "no-increment", "no-mask"], "off already"),
-        "no-root": "the fast machinery has no such part",
+        "no-root": "the fast field has no such part",
     }
     shown = [
         "full",
@@ -112,8 +112,8 @@ def test_what_is_off_or_unused_is_left_out() -> None:
 @pytest.mark.parametrize("preset", ["nerf", "idr", "neural-body", "nerfies"])
 def test_parts_of_h_nerf_are_left_out_of_other_methods(preset: str) -> None:
     _, left_out = choose(load_settings(preset), ["no-root", "no-deformation"])
-    machinery = preset.replace("-", "_")
-    assert left_out == dict.fromkeys(["no-root", "no-deformation"], f"the {machinery} machinery has no such part")
+    kind = preset.replace("-", "_")
+    assert left_out == dict.fromkeys(["no-root", "no-deformation"], f"the {kind} field has no such part")
 
 
 def test_an_override_counts_as_the_preset_but_not_against_the_ablation() -> None:

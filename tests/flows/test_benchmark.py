@@ -14,7 +14,7 @@ from flows.benchmark import benchmark
 from flows.cli import main
 from hnerf.config import TrainingSettings
 from hnerf.errors import InputError
-from hnerf.files import picture, with_pictures
+from hnerf.files import embed_images, markdown_image
 from hnerf.study.benchmark import publish as publish_module
 from hnerf.study.benchmark.plan import ScoringSettings
 from tasks import benchmark as tasks_module
@@ -54,15 +54,15 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
     def train(store: Any, recording: Any, *others: Any) -> Any:
         settings = others[-1]
         asked.append((recording.title, settings))
-        if settings.machinery in asked.fails:
-            raise asked.fails[settings.machinery]
-        return SimpleNamespace(machinery=settings.machinery)
+        if settings.field.kind in asked.fails:
+            raise asked.fails[settings.field.kind]
+        return SimpleNamespace(kind=settings.field.kind)
 
     def score_training(store: Any, truth: Any, recording: Any, calibration: Any, body: Any, model: Any, _: Any) -> Any:
         assert body == "body"
-        folder = store.root / "scoring" / model.machinery
+        folder = store.root / "scoring" / model.kind
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "scores.json").write_text(json.dumps(scores(PSNR[model.machinery], 1.0, "") | {"pictures": []}))
+        (folder / "scores.json").write_text(json.dumps(scores(PSNR[model.kind], 1.0, "") | {"pictures": []}))
         return SimpleNamespace(root=folder)
 
     for name in ("calibrate", "segment_subject"):
@@ -100,7 +100,7 @@ def test_every_method_of_every_variant_is_trained_alike(stages: Stages, study: s
     table = benchmark.fn(tmp_path, study, store=tmp_path / "store")
     one = str((None, (0,), ()))
     assert [title for title, _ in stages] == ["whole", "whole", one, one, one]
-    assert [settings.machinery for _, settings in stages] == ["fast", "fast", "fast", "fast", "paper"]
+    assert [settings.field.kind for _, settings in stages] == ["fast", "fast", "fast", "fast", "paper"]
     assert {(settings.seconds, settings.snapshots_s) for _, settings in stages} == {(60.0, (15.0, 30.0))}
     assert table == tmp_path / "store" / "benchmark" / "ada-toys.md"
     variants = read(table)["variants"]
@@ -119,14 +119,14 @@ def test_trainings_get_longer_until_they_gain_nothing_or_time_or_steps_are_over(
     psnr = {20.0: 18.0, 40.0: 18.0, 80.0: 20.0, 160.0: 24.0, 320.0: 25.0, 640.0: 25.05}
 
     def score_end(*inputs: Any) -> Any:
-        name, training = stages[-1][1].machinery, stages[-1][1]
+        name, training = stages[-1][1].field.kind, stages[-1][1]
         seconds = min(training.seconds, 30.0) if name == "fast" else training.seconds
         point = {"seconds": seconds, "psnr": 30.0 if name == "fast" else psnr[seconds]}
         (tmp_path / "scores.json").write_text(json.dumps({"training": {"field_seconds": seconds}, "curve": [point]}))
         return SimpleNamespace(root=tmp_path)
 
     def train(store: Any, recording: Any, *others: Any) -> Any:
-        if others[-1].machinery == "nerf" and others[-1].seconds == 10.0:
+        if others[-1].field.kind == "nerf" and others[-1].seconds == 10.0:
             raise InputError("the surface is empty")
         return good(store, recording, *others)
 
@@ -166,7 +166,7 @@ def test_a_method_that_cannot_be_given_its_part_or_scored_fails_alone(
     good = getattr(module, stage)
 
     def broken(*inputs: Any) -> Any:
-        if stages[-1][1].machinery == "fast":
+        if stages[-1][1].field.kind == "fast":
             raise ValueError("the surface is empty")
         return good(*inputs)
 
@@ -245,8 +245,8 @@ def test_the_flow_runs_page_shows_the_charts_themselves(
 
 def test_charts_are_found_whatever_the_captures_name(tmp_path: Path) -> None:
     (tmp_path / "Ada (2) b-toys.png").write_bytes(b"chart")
-    (tmp_path / "Ada (2) b-toys.md").write_text(f"# Toys\n\n{picture('Ada (2) b-toys.png')}\n")
-    shown = with_pictures(tmp_path / "Ada (2) b-toys.md")
+    (tmp_path / "Ada (2) b-toys.md").write_text(f"# Toys\n\n{markdown_image('Ada (2) b-toys.png')}\n")
+    shown = embed_images(tmp_path / "Ada (2) b-toys.md")
     assert shown == "# Toys\n\n![Ada (2) b-toys.png](data:image/png;base64,Y2hhcnQ=)\n"
 
 

@@ -7,7 +7,7 @@ import pytest
 from flows import cli
 from flows.cli import main
 from hnerf.asset.validation import InvalidAsset
-from hnerf.config import PerformerSettings
+from hnerf.config import SyntheticSettings
 from tasks.launcher import RankFailedError
 from tests.shared_data import shared_capture
 
@@ -20,7 +20,7 @@ from tests.shared_data import shared_capture
         (["run", "absent", "--preset", "best"], "best: no such preset or file; presets are "),
         (["run", "absent", "--set", "training.stepz=1"], "hnerf: --set training.stepz=1: training.stepz: Extra"),
         (["run", "absent", "--set", "training.noise=.inf"], "training.noise: Input should be a finite number"),
-        (["run", "absent", "--set", "training.fast.colour_cells=[8,-3]"], "training.fast.colour_cells.1"),
+        (["run", "absent", "--set", "training.field.colour_cells=[8,-3]"], "training.field.colour_cells.1"),
         (["synth", "."], "exists; give the name of a new folder"),
         (["synth", "ring", "--set", "cameras=32"], "hnerf: --set cameras=32: cameras: Extra"),
     ],
@@ -129,11 +129,11 @@ def test_check_prints_every_camera_and_the_verdict(tmp_path: Path, capsys: pytes
 
 
 def test_synth_takes_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    written: list[PerformerSettings] = []
-    monkeypatch.setattr(cli, "write_performer", lambda out, settings: written.append(settings))
+    written: list[SyntheticSettings] = []
+    monkeypatch.setattr(cli, "write_synthetic_capture", lambda out, settings: written.append(settings))
     assert main(["synth", str(tmp_path / "ring"), "--set", "train_cameras=32", "--set", "train_frames=1"]) == 0
     assert main(["synth", str(tmp_path / "ada")]) == 0
-    assert written == [PerformerSettings(train_cameras=32, train_frames=1), PerformerSettings()]
+    assert written == [SyntheticSettings(train_cameras=32, train_frames=1), SyntheticSettings()]
 
 
 def test_synth_writes_whole_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,7 +141,7 @@ def test_synth_writes_whole_or_nothing(tmp_path: Path, monkeypatch: pytest.Monke
         (out / "half").touch()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "write_performer", interrupted)
+    monkeypatch.setattr(cli, "write_synthetic_capture", interrupted)
     with pytest.raises(KeyboardInterrupt):
         main(["synth", str(tmp_path / "ada")])
     assert list(tmp_path.iterdir()) == []

@@ -53,7 +53,10 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
         trained.append({"recording": recording.name, "masks": masks.name, "body": body.name, "settings": settings})
         if masks.name == "mask_eroded 1":
             raise RuntimeError("rank 0 ended with exit code 1\nValueError: empty")
-        stored = {"static": recording.name == "frames_left 1", "training": {"machinery": settings.machinery}}
+        stored = {
+            "static": recording.name == "frames_left 1",
+            "training": {"field": {"kind": settings.field.kind}, "pose_learning_rate": 0},
+        }
         return made(f"model of {recording.name}, {body.name}", report={"seconds": 60.0}, settings=stored)
 
     def evaluate(_: Any, truth: Any, recording: Any, cameras: Any, masks: Any, body: Any, model: Any, __: Any) -> Any:
@@ -202,7 +205,7 @@ def test_each_degradation_is_put_in_at_its_place(stages: list[dict[str, Any]], t
         good,  # extreme poses, the store has this training already
         good,
     ]
-    rates = [s["settings"].fast.network_learning_rate for s in stages if s["settings"].seed == 0]
+    rates = [s["settings"].field.network_learning_rate for s in stages if s["settings"].seed == 0]
     assert rates == pytest.approx([0.01, 0.01, 0.01, 0.01, 0.01, 0.1, 0.01, 0.01])
 
 

@@ -161,7 +161,7 @@ def test_half_a_file_is_no_motion(tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "walk.npz", poses=np.zeros((2, 156)), trans=np.zeros((2, 3)))
     whole = (tmp_path / "walk.npz").read_bytes()
     (tmp_path / "walk.npz").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match=r"walk\.npz: is no \.npz of plain arrays"):
+    with pytest.raises(InputError, match=r"walk\.npz: not an \.npz of plain arrays"):
         read_motion(tmp_path / "walk.npz")
 
 

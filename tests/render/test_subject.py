@@ -36,8 +36,8 @@ def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
     in_step = {name: {"frame_offset": 0} for name in capture.cameras}
     (folder / "calibration" / "report.json").write_text(json.dumps({"cameras": in_step}))
     body.save(folder / "training")
-    settings = TINY.model_copy(update={"fast": TINY.fast.model_copy(update={"nodes": 1})})
-    field = build_field(settings, body, False)
+    settings = TINY.model_copy(update={"field": TINY.field.model_copy(update={"nodes": 1})})
+    field = build_field(settings.field, body, False)
     field.deformation.displacement.data[:3, 0, 0] = torch.tensor([0.0, 0.15, -0.15])  # to either side, frame by frame
     write_field(field, folder / "training" / "model.safetensors")
     stored = {"static": False, "training": settings.model_dump()}

@@ -1,4 +1,4 @@
-"""A synthetic person in one or more views of a textured room, with a soft shadow: the mask is known."""
+"""A synthetic person in one or more views of a textured room, with a soft shadow; the masks are known."""
 
 import dataclasses
 from pathlib import Path
@@ -19,10 +19,8 @@ LIMBS = ((1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7), (8, 9), (9, 10), (10, 1
 def write_scene(
     root: Path, cameras: int = 1, plate: bool = True, moves_m: float = 0.5, stranger_px: int = 0, glossy: bool = False
 ) -> tuple[Capture, dict]:
-    """A capture of a stick person walking across, and the true masks by (camera, frame).
-
-    stranger_px: how far to the left another person stands, 0 for nobody; glossy: whether the floor reflects.
-    """
+    """Write a capture of a stick person walking across; return the true masks by (camera, frame). stranger_px: how far
+    to the left another person stands, 0 for nobody; glossy: whether the floor reflects."""
     rng = np.random.default_rng(0)
     middle = np.array([0, 0, 0.9])
     places = [np.array([3.5 * np.cos(a), 3.5 * np.sin(a), 1.0]) for a in 1.2 * np.arange(cameras)]
@@ -54,7 +52,7 @@ def write_scene(
 
 
 def person(pose_px: np.ndarray) -> np.ndarray:
-    """Thick limbs, trunk and head, (H, W) bool."""
+    """Draw a person with thick limbs, trunk and head, (H, W) bool."""
     image = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
     at = pose_px.round().astype(np.int32)
     for a, b in LIMBS:
@@ -66,7 +64,7 @@ def person(pose_px: np.ndarray) -> np.ndarray:
 
 
 def _mirrored(mask: np.ndarray) -> np.ndarray:
-    """The mask (H, W) bool upside down below its lowest row."""
+    """Return the mask (H, W) bool mirrored at its lowest row."""
     feet = int(np.flatnonzero(mask.any(1))[-1])
     below = np.zeros_like(mask)
     shown = mask[: feet + 1][::-1][: SIZE_PX - feet - 1]
@@ -75,13 +73,13 @@ def _mirrored(mask: np.ndarray) -> np.ndarray:
 
 
 def write_masks(capture: Capture, masks: dict) -> None:
-    """Given masks beside the images."""
+    """Write given masks beside the images."""
     for (camera, frame), mask in masks.items():
         _write(capture.root / "masks" / camera / f"{frame:06d}.png", np.where(mask, 255, 0).astype(np.uint8))
 
 
 def only_frames(capture: Capture, count: int) -> Capture:
-    """The first frames, with their keypoints."""
+    """Keep the first frames, with their keypoints."""
     with np.load(capture.root / "keypoints.npz") as stored:
         np.savez(capture.root / "keypoints.npz", **{name: stored[name][:count] for name in stored.files})
     return dataclasses.replace(capture, train_frames=tuple(range(count)), novel_pose_frames=())

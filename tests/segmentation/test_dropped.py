@@ -1,4 +1,4 @@
-"""What the stages after segmentation make of a mask that was dropped."""
+"""Use of dropped masks by the stages after segmentation."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What is behind the pixels at a mask's edge."""
+"""The background behind the pixels at a mask's edge."""
 
 import numpy as np
 import pytest
@@ -26,8 +26,8 @@ def test_an_unshaded_plate_stays_as_it_is():
 
 
 def test_a_mask_that_ends_within_the_person_shades_nothing():
-    """A grey person before a motley wall: where the mask is 4 px too small, the person is beside it, as bright as no
-    shadow makes the wall. With the right mask the wall is."""
+    """A grey person stands before a varied wall. Where the mask is 4 px too small, the person is just outside it, at a
+    brightness to which no shadow takes the wall; with the right mask the wall is."""
     plate = np.random.default_rng(0).integers(20, 256, (60, 60, 1)).astype(np.uint8).repeat(3, -1)
     person, small = np.zeros((2, 60, 60), bool)
     person[10:50, 10:50], small[14:46, 14:46] = True, True

@@ -1,4 +1,4 @@
-"""A network made here: the person's probability is a step where blue is 0.3 above red."""
+"""Learned segmentation with a network made here: the person's probability is a step where blue is 0.3 above red."""
 
 import sys
 from pathlib import Path
@@ -15,7 +15,7 @@ from tests.segmentation.scene import PERSON_RGB, write_scene
 
 
 def write_network(path: Path, shape: list, gain: float = 50.0) -> Path:
-    """sigmoid(gain * (blue - red - 0.3)) by a convolution of 1 x 1; channels last where `shape` says so."""
+    """Write sigmoid(gain * (blue - red - 0.3)) as a convolution of 1 x 1; channels last where `shape` says so."""
     first = shape[1] == 3
     names = ["image", "planes"] if first else ["turned", "planes"]
     weights = helper.make_tensor("weights", TensorProto.FLOAT, [1, 3, 1, 1], [-gain, 0.0, gain])
@@ -84,7 +84,7 @@ def test_files_that_are_no_such_network(tmp_path: Path) -> None:
 
 
 def test_a_network_that_loads_but_does_not_run(tmp_path: Path) -> None:
-    """It takes any height and width, and then wants 4 x 4 pixels."""
+    """The network accepts any height and width, but then needs 4 x 4 pixels."""
     size = helper.make_tensor("size", TensorProto.INT64, [4], [1, 3, 4, 4])
     node = helper.make_node("Reshape", ["image", "size"], ["person"])
     image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, "H", "W"])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hnerf.config import SegmentationSettings
-from hnerf.segmentation.prior import _interpolated, _likely, keypoint_priors
+from hnerf.segmentation.prior import _completed_pose, _interpolated, keypoint_priors
 from tests.segmentation.scene import write_scene
 
 HEAD, LEGS, FEET = [0, 15, 16, 17, 18], [10, 11, 13, 14, *range(19, 25)], list(range(19, 25))
@@ -44,23 +44,23 @@ def test_head_and_legs_in_line_with_the_trunk_by_hand() -> None:
     # Neck at (50, 20), mid-hip at (50, 40), the left knee seen off that line; nothing else is.
     pose_px = np.full((25, 2), np.nan)
     pose_px[1], pose_px[8], pose_px[12], pose_px[13] = (50, 20), (50, 40), (52, 40), (60, 50)
-    likely = _likely(pose_px)
+    likely = _completed_pose(pose_px)
     assert likely[0].tolist() == [50, 11]  # 0.45 of 20 px above the neck
     assert likely[10].tolist() == [50, 56]  # 0.8 of 20 px below the mid-hip, as no hip is seen
     assert likely[11].tolist() == [50, 72]
     assert likely[14].tolist() == [68, 60]  # as far again as from hip to knee
     assert np.isnan(likely[4]).all()
     pose_px[2] = 45, 20
-    assert _likely(pose_px)[9].tolist() == [46, 40]  # 0.8 of the shoulder's 5 px beside the mid-hip
+    assert _completed_pose(pose_px)[9].tolist() == [46, 40]  # 0.8 of the shoulder's 5 px beside the mid-hip
     pose_px[[17, 18]] = (46, 12), (48, 14)
-    assert _likely(pose_px)[0].tolist() == [47, 13]  # between what is seen of the face
+    assert _completed_pose(pose_px)[0].tolist() == [47, 13]  # between what is seen of the face
 
 
 def test_hips_in_line_with_the_head_by_hand() -> None:
     """The nose is 9 px above the neck at (50, 20): the mid-hip is 9 / 0.45 = 20 px below it."""
     pose_px = np.full((25, 2), np.nan)
     pose_px[0], pose_px[1], pose_px[2], pose_px[5] = (50, 11), (50, 20), (45, 20), (55, 20)
-    likely = _likely(pose_px)
+    likely = _completed_pose(pose_px)
     assert likely[[8, 9, 12]] == pytest.approx(np.array([[50, 40], [46, 40], [54, 40]]))
     assert likely[10] == pytest.approx([46, 56])
 

@@ -12,8 +12,8 @@ from hnerf.capture.masks import Masks, encode, movement_px
 from hnerf.config import CaptureSettings, SegmentationSettings
 from hnerf.errors import InputError
 from hnerf.segmentation.cut import components_within
-from hnerf.segmentation.difference import difference, exposure_corrected, masked_median, noise_level, surroundings
-from hnerf.segmentation.edge import settle_edge
+from hnerf.segmentation.difference import difference, exposure_corrected, masked_median, noise_level, visible_background
+from hnerf.segmentation.edge import refine_edge
 from hnerf.segmentation.prior import Prior
 from hnerf.segmentation.segment import segment
 from tests.segmentation.scene import only_frames, write_masks, write_scene
@@ -33,22 +33,22 @@ def test_a_shadow_is_not_the_person_by_hand() -> None:
     image[10:30, 10:30] = (90, 72, 54)
     image[10:30, 50:70] = (54, 72, 90)
     found = difference(image, plate, noise_level(image, plate, np.ones((40, 80), bool)), SETTINGS)
-    assert (found.odds[12:28, 12:28] < -1).all()
-    assert (found.odds[12:28, 52:68] > 4).all()
-    assert (found.odds[:8] < -4).all()
-    assert (found.apart[:8] == 128).all()
+    assert (found.log_odds[12:28, 12:28] < -1).all()
+    assert (found.log_odds[12:28, 52:68] > 4).all()
+    assert (found.log_odds[:8] < -4).all()
+    assert (found.contrast[:8] == 128).all()
 
 
 def test_noise_and_exposure_are_those_of_the_background_by_hand() -> None:
-    """Two thirds of the picture are the person's. Beside him the plate is 20 % darker, but for a step of 2 levels up
-    and down, once DARK is added to either: 150 + 6 against 124 + 6, give or take 2."""
+    """Two thirds of the image are the person's. Beside him the plate is 20 % darker, but for a step of 2 levels up and
+    down, once LOG_OFFSET is added to either: 150 + 6 against 124 + 6, give or take 2."""
     plate, image = np.full((8, 30, 3), 124, np.uint8), np.full((8, 30, 3), 150, np.uint8)
     image[:, :20] = 30
     image[::2, 20:] += 2
     image[1::2, 20:] -= 2
     body = np.zeros((8, 30), bool)
     body[:, :20] = True
-    free = surroundings(Prior(body, body, body, body, 8.0), np.ones_like(body))
+    free = visible_background(Prior(body, body, body, body, 8.0), np.ones_like(body))
     assert free.tolist() == (~body).tolist()
     bright = exposure_corrected(plate, image, free)
     assert np.unique(bright).tolist() == [150]
@@ -61,9 +61,9 @@ def test_background_is_looked_for_ever_nearer_to_the_person() -> None:
     wide, narrow = np.ones((10, 10), bool), np.zeros((10, 10), bool)
     narrow[2:] = True
     known = np.ones_like(wide)
-    assert surroundings(Prior(narrow, narrow, narrow, wide, 8.0), known).tolist() == (~narrow).tolist()
+    assert visible_background(Prior(narrow, narrow, narrow, wide, 8.0), known).tolist() == (~narrow).tolist()
     known[0] = False
-    assert surroundings(Prior(narrow, narrow, wide, wide, 8.0), known).sum() == 10
+    assert visible_background(Prior(narrow, narrow, wide, wide, 8.0), known).sum() == 10
     assert exposure_corrected(np.zeros((10, 10, 3), np.uint8), np.ones((10, 10, 3), np.uint8), ~wide).max() == 0
 
 
@@ -71,8 +71,8 @@ def test_only_a_median_may_hold_shadows_itself() -> None:
     # The image is 1 / 0.6 as bright as the plate, in all channels.
     plate = np.full((8, 8, 3), (90, 72, 54), np.uint8)
     image = np.full((8, 8, 3), (150, 120, 90), np.uint8)
-    assert (difference(image, plate, 1.0, SETTINGS).odds > 4).all()
-    assert (difference(image, plate, 1.0, SETTINGS, shadowed=True).odds < 0).all()
+    assert (difference(image, plate, 1.0, SETTINGS).log_odds > 4).all()
+    assert (difference(image, plate, 1.0, SETTINGS, shadowed=True).log_odds < 0).all()
 
 
 def test_masked_median_by_hand() -> None:
@@ -97,7 +97,7 @@ def test_an_edge_pixel_is_whose_it_shows_more_of() -> None:
     image[:20, 9], image[20:, 9] = 140, 110
     mask = np.zeros((40, 20), bool)
     mask[:20, 8:], mask[20:, 10:] = True, True
-    settled = settle_edge(mask, image, plate)
+    settled = refine_edge(mask, image, plate)
     assert (settled[2:18].argmax(1) == 9).all()
     assert (settled[22:38].argmax(1) == 10).all()
 

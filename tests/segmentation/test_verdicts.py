@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from hnerf.segmentation.prior import Prior
-from hnerf.segmentation.verdicts import MaskVerdict, judge, jumps
+from hnerf.segmentation.verdicts import MaskVerdict, area_jumps, judge_mask
 
 BODY = np.zeros((20, 20), bool)
 BODY[4:16, 8:12] = True  # 48 px
@@ -10,34 +10,34 @@ PRIOR = Prior(BODY, BODY, BODY, BODY, 12.0)
 
 
 def test_a_good_mask() -> None:
-    assert judge(BODY, PRIOR) == MaskVerdict(None, None, 48)
+    assert judge_mask(BODY, PRIOR) == MaskVerdict(None, None, 48)
 
 
 def test_empty_inverted_and_astray() -> None:
     speck = np.zeros_like(BODY)
     speck[8, 8:12] = True  # 4 px, less than a tenth of 48
-    assert "no person" in str(judge(speck, PRIOR).fault)
-    assert "inverted" in str(judge(~BODY, PRIOR).fault)
-    assert "misses the person" in str(judge(np.roll(BODY, 5, axis=1), PRIOR).fault)
+    assert "no person" in str(judge_mask(speck, PRIOR).fault)
+    assert "inverted" in str(judge_mask(~BODY, PRIOR).fault)
+    assert "misses the person" in str(judge_mask(np.roll(BODY, 5, axis=1), PRIOR).fault)
 
 
 def test_a_mask_of_something_else_too() -> None:
-    """Of 400 px a person can be within 48; of twice as many as his, just half."""
-    assert "mostly not the person" in str(judge(np.ones_like(BODY), PRIOR).fault)
+    """A person can be within 48 of 400 px; in a mask of twice as many pixels as his, just half are within."""
+    assert "mostly not the person" in str(judge_mask(np.ones_like(BODY), PRIOR).fault)
     wide = BODY.copy()
     wide[4:16, 12:16] = True
-    assert judge(wide, PRIOR).fault is None
+    assert judge_mask(wide, PRIOR).fault is None
 
 
 def test_inverted_without_a_prior() -> None:
     nothing = np.zeros_like(BODY)
-    assert "inverted" in str(judge(~BODY, Prior(nothing, nothing, nothing, nothing, 0.0)).fault)
+    assert "inverted" in str(judge_mask(~BODY, Prior(nothing, nothing, nothing, nothing, 0.0)).fault)
 
 
 def test_cut_off_by_the_border_is_noted_only() -> None:
     mask = BODY.copy()
     mask[4:, 8:12] = True
-    verdict = judge(mask, PRIOR)
+    verdict = judge_mask(mask, PRIOR)
     assert verdict.fault is None
     assert verdict.note == "cut off by the image's border (bottom)"
 
@@ -49,5 +49,5 @@ def test_jumps_need_both_neighbours_and_prior(stride: int) -> None:
     frames = tuple(stride * frame for frame in (0, 1, 2, 3, 4, 5, 6, 7, 8, 20))
     areas = [100, 100, 200, 100, 100, 100, 200, 100, 100, 300]
     expected = [50, 50, 50, 50, 50, 50, 100, 50, 50, 50]
-    found = jumps(frames, [MaskVerdict(None, None, area) for area in areas], expected)
+    found = area_jumps(frames, [MaskVerdict(None, None, area) for area in areas], expected)
     assert found == {2 * stride: "area jumps from 100 to 200 px"}

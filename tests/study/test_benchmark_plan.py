@@ -63,9 +63,9 @@ def test_bad_studies_are_refused_by_key(tmp_path: Path, text: str, message: str)
 def test_wide_methods_are_the_small_ones_but_for_their_networks() -> None:
     for name, widths in {"nerf": 256, "idr": 512, "neural-body": 256, "nerfies": 256}.items():
         small, wide = load_settings(name).training, load_settings(f"{name}-wide").training
-        own = getattr(wide, wide.machinery)
+        own = wide.field
         assert own.width == widths
-        assert wide == small.model_copy(update={wide.machinery: own})
+        assert wide == small.model_copy(update={"field": own})
 
 
 def test_unknown_studies_are_refused() -> None:

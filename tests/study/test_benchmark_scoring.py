@@ -56,17 +56,17 @@ class SizedBall(BallAvatar):
 
 
 def scored(
-    base: Path, test_cameras: tuple[str, ...], settings: ScoringSettings = SETTINGS, machinery: str = "fast"
+    base: Path, test_cameras: tuple[str, ...], settings: ScoringSettings = SETTINGS, kind: str = "fast"
 ) -> dict[str, Any]:
     """Score, into `base`/out, a training of 15 s whose field took 12, with snapshots before and after the field's
     end."""
     training = base / "training"
-    stored = {"static": False, "training": {"machinery": machinery}}
+    stored = {"static": False, "training": {"field": {"kind": kind}, "pose_learning_rate": 0}}
     for name, seconds in {"5": 6.5, "10": 10.0, "12": 12.0}.items():  # the first was taken late, after a long step
         folder = training / "snapshots" / name
         folder.mkdir(parents=True)
         (folder / "settings.json").write_text(json.dumps(stored | {"seconds": seconds}))
-    write_settings(training, machinery)
+    write_settings(training, kind)
     report = {"seconds": 15.0, "field_seconds": 12.0, "peak_memory_gib": 1.5, "model_mib": 7.0}
     (training / "report.json").write_text(json.dumps(report))
     capture = write_ball_capture(base / "capture", "ball", test_cameras)
@@ -184,8 +184,8 @@ def test_a_method_without_poses_has_a_reason_instead_of_figures(tmp_path: Path) 
 
 
 def test_who_has_no_novel_poses(tmp_path: Path) -> None:
-    def reason(machinery: str, static: bool) -> str | None:
-        stored = {"static": static, "training": {"machinery": machinery}}
+    def reason(kind: str, static: bool) -> str | None:
+        stored = {"static": static, "training": {"field": {"kind": kind}, "pose_learning_rate": 0}}
         (tmp_path / "settings.json").write_text(json.dumps(stored))
         return reason_without_novel_poses(tmp_path)
 

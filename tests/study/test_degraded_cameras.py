@@ -37,7 +37,7 @@ def test_one_camera_alone_differs_from_none(tmp_path: Path, kind: str) -> None:
     against the avatar."""
     capture = write_recording(tmp_path / "good")
     alone = replace(capture, train_cameras=capture.train_cameras[:1])
-    with pytest.raises(NotApplicableError, match="ada: has one training camera; there is none to differ from"):
+    with pytest.raises(NotApplicableError, match="ada: has only one training camera; this needs several"):
         degrade_capture(alone, Degradation(kind=kind, strength=1.0, seed=0), tmp_path / "bad")
 
 

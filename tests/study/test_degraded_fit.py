@@ -44,9 +44,9 @@ def test_extreme_poses_start_from_recorded_ones(body: BodyFit) -> None:
 def test_learning_rates_and_nothing_else_change() -> None:
     fast = load_settings("fast").training
     changed = degrade_settings(fast, Degradation(kind="learning_rate_up", strength=10, seed=0))
-    assert (changed.fast.grid_learning_rate, changed.fast.network_learning_rate) == pytest.approx((0.5, 0.1))
+    assert (changed.field.grid_learning_rate, changed.field.network_learning_rate) == pytest.approx((0.5, 0.1))
     assert changed.pose_learning_rate == pytest.approx(5e-3)
-    back = {"fast": fast.fast, "pose_learning_rate": fast.pose_learning_rate}
+    back = {"field": fast.field, "pose_learning_rate": fast.pose_learning_rate}
     assert changed.model_copy(update=back) == fast
     paper = degrade_settings(load_settings("paper").training, Degradation(kind="x", strength=0.1, seed=0))
-    assert paper.paper.learning_rate == pytest.approx(1e-4)
+    assert paper.field.learning_rate == pytest.approx(1e-4)

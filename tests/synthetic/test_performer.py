@@ -1,4 +1,4 @@
-"""The performer's truth is true: what its files say fits together, and its clothes are beyond the body model."""
+"""The synthetic capture: its ground truth is consistent, and its clothes are beyond the body model."""
 
 import hashlib
 import json
@@ -14,19 +14,19 @@ from pydantic import ValidationError
 from hnerf.body.anny import anny_rig
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
-from hnerf.config import CaptureSettings, PerformerSettings
-from hnerf.synthetic import write_performer
-from hnerf.synthetic.dressed import Dressed
-from hnerf.synthetic.render import Caster, dome_lights, floor_shadow, irradiance
+from hnerf.config import CaptureSettings, SyntheticSettings
+from hnerf.synthetic import write_synthetic_capture
+from hnerf.synthetic.dressed import DressedBody
+from hnerf.synthetic.render import RayCaster, dome_lights, floor_shadow, irradiance
 from hnerf.synthetic.write import camera_names, ring_of_cameras
 
-TINY = PerformerSettings(size_px=64, train_frames=3, novel_pose_frames=1)
+TINY = SyntheticSettings(size_px=64, train_frames=3, novel_pose_frames=1)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("performer") / "performer"
-    write_performer(path, TINY)
+    write_synthetic_capture(path, TINY)
     return path
 
 
@@ -42,26 +42,26 @@ def test_it_is_read_like_any_capture(capture: Capture) -> None:
 
 
 def test_same_seed_same_bytes(folder: Path, tmp_path: Path) -> None:
-    write_performer(tmp_path, PerformerSettings(size_px=64, train_frames=1, novel_pose_frames=0))
+    write_synthetic_capture(tmp_path, SyntheticSettings(size_px=64, train_frames=1, novel_pose_frames=0))
     for name in ("images/05/000000.jpg", "openpose/02/000000_keypoints.json", "ground_truth/masks/01/000000.png"):
         digests = [hashlib.sha256((root / name).read_bytes()).hexdigest() for root in (folder, tmp_path)]
         assert digests[0] == digests[1]
 
 
 def test_the_ring_by_hand() -> None:
-    """32 cameras are 11.25 degrees apart; of 16 test cameras each stands half-way, in every second gap."""
+    """32 cameras are 11.25 degrees apart; each of 16 test cameras stands half-way, in every second gap."""
 
     def angles_deg(**settings: int) -> list[float]:
-        centres = [camera.centre_m for camera in ring_of_cameras(PerformerSettings(**settings))]
+        centres = [camera.centre_m for camera in ring_of_cameras(SyntheticSettings(**settings))]
         return [float(np.degrees(np.arctan2(y, x)) % 360) for x, y, _ in centres]
 
     assert angles_deg() == pytest.approx([0, 90, 180, 270, 45, 225])
     many = angles_deg(train_cameras=32, test_cameras=16)
     assert many[:3] == pytest.approx([0, 11.25, 22.5]) and many[32:35] == pytest.approx([5.625, 28.125, 50.625])
     assert len(many) == 48
-    assert camera_names(PerformerSettings(train_cameras=3, test_cameras=1)) == (["01", "02", "03"], ["04"])
+    assert camera_names(SyntheticSettings(train_cameras=3, test_cameras=1)) == (["01", "02", "03"], ["04"])
     with pytest.raises(ValidationError, match="one at most between two training cameras"):
-        PerformerSettings(train_cameras=1)
+        SyntheticSettings(train_cameras=1)
 
 
 def test_joints_lie_inside_the_masks(folder: Path, capture: Capture) -> None:
@@ -78,7 +78,7 @@ def test_joints_lie_inside_the_masks(folder: Path, capture: Capture) -> None:
 
 
 def test_image_is_person_over_plate(folder: Path, capture: Capture) -> None:
-    """Inside the mask the photograph is the person; far outside, and off the shadowed floor, it is the plate."""
+    """Inside the mask the photograph shows the person; far outside, and off the shadowed floor, the plate."""
     mask = cv2.imread(str(folder / "ground_truth" / "masks" / "05" / "000002.png"), 0) > 127
     alone = cv2.imread(str(folder / "ground_truth" / "on_black" / "05" / "000002.jpg"))[..., ::-1].astype(float)
     image, plate = capture.image("05", 2).astype(float), capture.background("05")
@@ -115,25 +115,25 @@ def test_meshes_are_closed_and_stand_on_the_floor(folder: Path) -> None:
 
 
 def test_clothes_are_beyond_the_body() -> None:
-    """Shirt, trousers and hair stand centimetres off the skin, hands and face not at all; folds move with the gait."""
+    """Shirt, trousers and hair stand centimetres off the skin, hands and face do not; folds move with the gait."""
     rig = anny_rig()
-    dressed = Dressed.on(rig, np.random.default_rng(0))
+    dressed = DressedBody.dress(rig, np.random.default_rng(0))
     rest = torch.zeros(len(rig.joint_names), 3), torch.eye(4)
-    worn_m = [dressed.posed_m(*rest, gait_phase=phase) for phase in (0.0, 1.5)]
-    away_m = np.linalg.norm(worn_m[0] - dressed.rest_m, axis=1)
+    clothed_m = [dressed.posed_m(*rest, gait_phase=phase) for phase in (0.0, 1.5)]
+    away_m = np.linalg.norm(clothed_m[0] - dressed.rest_m, axis=1)
     depth_m, deepest = dressed.depths_m, dressed.depths_m.argmax(1)
     for garment, least_m in ((1, 0.02), (2, 0.012), (4, 0.015)):
         assert np.median(away_m[deepest == garment]) > least_m
     bare = depth_m[:, 1:].max(1) < -0.01
     assert bare.sum() > 5000 and away_m[bare].max() < 1e-5
-    moved_m = np.linalg.norm(worn_m[1] - worn_m[0], axis=1)
+    moved_m = np.linalg.norm(clothed_m[1] - clothed_m[0], axis=1)
     assert moved_m[deepest == 1].max() > 0.01 and moved_m[bare].max() == 0
 
 
 def test_rays_meet_a_known_square() -> None:
-    """The square z = 1, |x|, |y| <= 1 of two triangles."""
+    """The square z = 1, |x|, |y| <= 1 has two triangles."""
     vertices_m = np.array([[-1.0, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
-    caster = Caster(vertices_m, np.array([[0, 1, 2], [0, 2, 3]]))
+    caster = RayCaster(vertices_m, np.array([[0, 1, 2], [0, 2, 3]]))
     hits = caster.cast(np.array([0.5, -0.25, 3.0]), np.array([[0.0, 0, -1], [0, 0, 1]]))
     assert hits.face.tolist() == [0, -1] and hits.distance_m[0] == pytest.approx(2.0)
     met_m = hits.interpolate(vertices_m, np.array([[0, 1, 2], [0, 2, 3]]))
@@ -147,9 +147,9 @@ def test_light_of_an_open_sky() -> None:
     up, down = np.array([[0.0, 0, 1], [0, 0, -1]])
     bright = irradiance(np.stack([up, down]), np.ones((2, len(lights[1]))), lights)
     assert bright[0] == pytest.approx(1.25) and 0 < bright[1] < 0.3
-    roof = Caster(np.array([[-9.0, -9, 1], [9, -9, 1], [0, 9, 1]]), np.array([[0, 1, 2]]))
+    roof = RayCaster(np.array([[-9.0, -9, 1], [9, -9, 1], [0, 9, 1]]), np.array([[0, 1, 2]]))
     assert floor_shadow(roof, np.zeros(3), lights).min() < 0.2
-    nothing = Caster(np.array([[0.0, 0, -5], [1, 0, -5], [0, 1, -5]]), np.array([[0, 1, 2]]))
+    nothing = RayCaster(np.array([[0.0, 0, -5], [1, 0, -5], [0, 1, -5]]), np.array([[0, 1, 2]]))
     assert floor_shadow(nothing, np.zeros(3), lights).min() == pytest.approx(1.0)
 
 

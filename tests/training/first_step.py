@@ -1,4 +1,4 @@
-"""The first step of a training by any number of processes; as a script, by those that torchrun starts.
+"""First step of a training with any number of processes; as a script, for the processes that torchrun starts.
 
 usage: python -m tests.training.first_step FOLDER MACHINERY PARTS
 """
@@ -10,36 +10,35 @@ import torch
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
-from hnerf.config import LossSettings, TrainingSettings
+from hnerf.config import LossSettings
 from hnerf.training.distributed import Distributed
 from hnerf.training.parts import Parts
 from hnerf.training.trainer import Trainer
-from tests.training.scene import TINY, record
+from tests.training.scene import record, tiny
 
 
-def untrained(folder: Path, machinery: str, processes: Distributed, memory_gib: float | None = None) -> Trainer:
-    """With all losses, and something to deform; its steps find gradients and move nothing."""
-    losses = LossSettings(elastic=0.1 if machinery == "fast" else 0.0)
-    changes = {"machinery": machinery, "losses": losses, "memory_gib": memory_gib}
-    settings = TrainingSettings.model_validate(TINY.model_dump() | changes)
+def untrained(folder: Path, kind: str, processes: Distributed, memory_gib: float | None = None) -> Trainer:
+    """Return a trainer with all losses and a deformation, whose steps compute gradients but change nothing."""
+    losses = LossSettings(elastic=0.1 if kind == "fast" else 0.0)
+    settings = tiny(kind, losses=losses, memory_gib=memory_gib)
     trainer = Trainer(*record(folder / f"capture{processes.rank}"), settings, folder, processes)
-    if machinery == "fast":
+    if kind == "fast":
         trainer.field.deformation.displacement.data[:-1] = 0.01
     trainer.optimizer.step = lambda: None  # type: ignore[method-assign]
     return trainer
 
 
 def gradients(trainer: Trainer, module: torch.nn.Module) -> dict[str, Tensor]:
-    """Of a step, by parameter."""
+    """Return the gradients of one step by parameter."""
     trainer._optimise(module)
     return {name: q.grad.clone() for name, q in trainer.objective.named_parameters() if q.grad is not None}
 
 
-def main(folder: Path, machinery: str, parts: int) -> None:
-    """Leave the gradients of a step, and how many steps each rank skips where one has a loss that is not finite."""
+def main(folder: Path, kind: str, parts: int) -> None:
+    """Write the gradients of a step, and how many steps each rank skips where one rank's loss is not finite."""
     torch.set_num_threads(1)
     processes = Distributed.join()
-    trainer = untrained(folder, machinery, processes)
+    trainer = untrained(folder, kind, processes)
     trainer.parts = Parts(parts, False, 1e9)
     module = DistributedDataParallel(trainer.objective, find_unused_parameters=True)
     found = gradients(trainer, module)

@@ -1,5 +1,5 @@
-"""A GPU that is none: tensors on the CPU that say they are on cuda:0, so that a machine without one tells where tensors
-of two devices meet. The closest points of warp and `embedding_bag` are taken from the CPU."""
+"""A simulated GPU: CPU tensors that claim to be on cuda:0, so that a machine without a GPU detects where tensors of two
+devices meet. Warp's closest points and `embedding_bag` run on the CPU."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,7 +22,7 @@ INDEXING = ("aten.index.", "aten.index_put", "aten._index_put")
 
 
 class OnCuda(Tensor):
-    """Wraps a CPU tensor; every operation that reaches a kernel checks devices as CUDA's would."""
+    """Wrapper of a CPU tensor; every operation that reaches a kernel checks devices as CUDA would."""
 
     inner: Tensor
 
@@ -62,7 +62,7 @@ class OnCuda(Tensor):
 
 
 class Routed(TorchFunctionMode):
-    """Sends what is asked for on CUDA to the CPU and wraps it."""
+    """Mode that redirects what is requested on CUDA to the CPU and wraps it."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs, name = dict(kwargs or {}), getattr(func, "__name__", "")
@@ -86,7 +86,7 @@ class Routed(TorchFunctionMode):
 
 
 class OfCuda(torch.Generator):
-    """A generator that says it is on CUDA."""
+    """Generator that claims to be on CUDA."""
 
     device = CUDA
 
@@ -102,11 +102,11 @@ class Meshes:
         self.inner = BodyMeshes(_unwrapped(vertices_m), _unwrapped(faces))
 
     def move(self, vertices_m: Tensor) -> None:
-        """As `BodyMeshes.move`."""
+        """Move the meshes, as `BodyMeshes.move` does."""
         self.inner.move(_unwrapped(vertices_m))
 
     def closest_points(self, points_m: Tensor, body: Tensor, reach_m: float, exact_sign: bool = False) -> ClosestPoints:
-        """As `BodyMeshes.closest_points`."""
+        """Return closest points, as `BodyMeshes.closest_points` does."""
         assert isinstance(points_m, OnCuda) == isinstance(body, OnCuda), "points and bodies are on two devices"
         asked = [_unwrapped(x.detach()) for x in (points_m, body)]
         found = self.inner.closest_points(*asked, reach_m, exact_sign)
@@ -116,7 +116,7 @@ class Meshes:
 
 @contextmanager
 def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
-    """Its device; trained models are written and read, checkpoints are not."""
+    """Provide the simulated device; trained models are written and read, checkpoints are not."""
     bag, load = torch.nn.functional.embedding_bag, model.load_file
 
     def embedding_bag(corners: Tensor, values: Tensor, *, per_sample_weights: Tensor, mode: str, **_: Any) -> Tensor:
@@ -176,7 +176,7 @@ def _is_cuda(device: Any) -> bool:
 
 
 def _on_cpu(x: Any) -> bool:
-    """A number of no dimension may meet any device."""
+    """Return whether x is a CPU tensor that may not meet CUDA tensors; one without dimensions may meet any device."""
     return isinstance(x, Tensor) and not isinstance(x, OnCuda) and not x.is_meta and x.dim() > 0
 
 

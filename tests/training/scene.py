@@ -18,19 +18,23 @@ from tests.body.boxes import box_rig
 SIZE_PX = 32
 FRAMES = (0, 1, 2)
 
+TINY_FIELDS = {
+    "fast": {
+        "kind": "fast",
+        "samples": 8,
+        "geometry_cells": [4],
+        "colour_cells": [4],
+        "width": 8,
+        "pose_width": 8,
+        "outer_m": 0.2,
+        "inner_m": 0.1,
+        "shell_cell_m": 0.05,
+    },
+    "paper": {"kind": "paper", "samples": 4},
+}
 TINY = TrainingSettings.model_validate(
     {
-        "fast": {
-            "samples": 8,
-            "geometry_cells": [4],
-            "colour_cells": [4],
-            "width": 8,
-            "pose_width": 8,
-            "outer_m": 0.2,
-            "inner_m": 0.1,
-            "shell_cell_m": 0.05,
-        },
-        "paper": {"samples": 4},
+        "field": TINY_FIELDS["fast"],
         "losses": {"mask": 0, "blend": 0, "geometry": 0, "fit": 0, "increment": 0},
         "steps": 12,
         "novel_pose_steps": 4,
@@ -42,6 +46,13 @@ TINY = TrainingSettings.model_validate(
 )
 
 
+def tiny(kind: str = "fast", **changes: object) -> TrainingSettings:
+    """Return the smallest settings of a kind of field, with changes."""
+    return TrainingSettings.model_validate(
+        TINY.model_dump() | {"field": TINY_FIELDS.get(kind, {"kind": kind})} | changes
+    )
+
+
 class KnownMasks:
     """Masks held in memory, by camera and frame."""
 
@@ -49,22 +60,22 @@ class KnownMasks:
         self.masks = masks
 
     def __contains__(self, view: tuple[str, int]) -> bool:
-        """None was dropped but those that are not here."""
+        """Return whether there is a mask; none was dropped but those that are missing here."""
         return view in self.masks
 
     def get(self, camera: str, frame: int) -> np.ndarray:
-        """(H, W) bool."""
+        """Return the mask, (H, W) bool."""
         return self.masks[camera, frame]
 
 
 def look_at(name: str, centre_m: np.ndarray, target_m: np.ndarray) -> Camera:
-    """A camera at `centre_m` that sees `target_m` in the middle, z up."""
+    """Return a camera at `centre_m` with `target_m` in the image centre, z up."""
     like = Camera(name, np.diag([1.2 * SIZE_PX, 1.2 * SIZE_PX, 1]), np.eye(3), np.zeros(3), SIZE_PX, SIZE_PX)
     return cameras_along.look_at(like, centre_m, target_m, np.array([0, 0, 1]))
 
 
 def record(folder: Path, bends_rad: tuple[float, ...] = (0.0, 0.2, 0.4)) -> tuple[Capture, KnownMasks, BodyFit]:
-    """Write the recording to `folder`, bent so far in each frame; frame 2 is a novel pose."""
+    """Write the recording to `folder`, bent by the given angle in each frame; frame 2 is a novel pose."""
     rig = box_rig(bend_segments=6, splits=4)
     theta = torch.zeros(len(FRAMES), 2, 3)
     theta[:, 1, 1] = torch.tensor(bends_rad)

@@ -1,4 +1,4 @@
-"""What a scene asks for, by hand; and how a scene is measured."""
+"""Automatic settings by hand, and the measurement of a scene."""
 
 from pathlib import Path
 
@@ -27,60 +27,60 @@ def decided(scene: SceneStatistics, **given: object) -> tuple[TrainingSettings, 
 
 
 def test_sizes_by_hand():
-    """Pixels of 2 cm: 96 cells on 1.92 m, in steps of 4 ** (1 / 3) from 24; 64 for geometry, in steps of 2 from
-    16. Masks reach 3.5 cm out and 0.5 cm in, with 1.5 cm of room: 5 cm and, at least, 3 cm; 2.4 x 8 cm / 6 mm = 32
-    samples. Four million pixels at 2500 a step, each looked at one and a half times: 2400 steps."""
+    """Pixels of 2 cm give 96 cells on 1.92 m, in steps of 4 ** (1 / 3) from 24; 64 for geometry, in steps of 2 from 16.
+    Masks reach 3.5 cm out and 0.5 cm in, with a margin of 1.5 cm: 5 cm, and the minimum of 3 cm; 2.4 x 8 cm / 6 mm = 32
+    samples. Four million pixels at 2500 per step, each drawn one and a half times: 2400 steps."""
     settings, decisions = decided(SCENE)
-    fast = settings.fast
+    fast = settings.field
     assert fast.colour_cells == (24, 38, 60, 96)
     assert fast.geometry_cells == (16, 32, 64)
     assert (fast.outer_m, fast.inner_m, fast.samples) == (0.05, 0.03, 32)
     assert (fast.pose_width, settings.steps) == (8, 2400)
-    assert decisions["fast.samples"].reason == "one each 6.0 mm of a ray through a shell of 80.0 mm"
+    assert decisions["field.samples"].reason == "one each 6.0 mm of a ray through a shell of 80.0 mm"
 
 
 def test_no_finer_than_frames_align():
-    """Pixels of 1 mm would ask for 1920 cells; frames align to 1 cm."""
-    fast = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": 0.001}))[0].fast
+    """Pixels of 1 mm would give 1920 cells; frames align to 1 cm."""
+    fast = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": 0.001}))[0].field
     assert fast.colour_cells[-1] == 192
     assert fast.geometry_cells[-1] == 128
 
 
-@pytest.mark.parametrize("still", [{"frames": 1}, {"std_rad": 0.001}])
-def test_one_posture_is_as_fine_as_its_pixels(still: dict):
-    """Down to 8 mm: 240 cells on 1.92 m, 160 for geometry, a sample each 4.8 mm: 2.4 x 8 cm / 4.8 mm = 40."""
+@pytest.mark.parametrize("nearly_static", [{"frames": 1}, {"std_rad": 0.001}])
+def test_one_posture_is_as_fine_as_its_pixels(nearly_static: dict):
+    """Cells shrink to 8 mm: 240 on 1.92 m, 160 for geometry, a sample per 4.8 mm: 2.4 x 8 cm / 4.8 mm = 40."""
     for footprint_m in (0.008, 0.001):
-        settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": footprint_m, **still}))
-        assert (settings.fast.colour_cells[-1], settings.fast.geometry_cells[-1]) == (240, 160)
-        assert settings.fast.samples == 40
-        assert "there is one posture: cells of 8.0 mm" in decisions["fast.colour_cells"].reason
+        settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": footprint_m, **nearly_static}))
+        assert (settings.field.colour_cells[-1], settings.field.geometry_cells[-1]) == (240, 160)
+        assert settings.field.samples == 40
+        assert "there is one posture: cells of 8.0 mm" in decisions["field.colour_cells"].reason
 
 
 def test_geometry_follows_the_colours_cells_that_are_given():
-    """128 / 1.5 = 85, whatever the pixels ask for."""
-    assert decided(SCENE, fast={"colour_cells": [24, 128]})[0].fast.geometry_cells[-1] == 85
+    """128 / 1.5 = 85, whatever the pixel size."""
+    assert decided(SCENE, field={"kind": "fast", "colour_cells": [24, 128]})[0].field.geometry_cells[-1] == 85
 
 
 def test_what_is_given_stands():
-    settings, decisions = decided(SCENE, steps=7, fast={"samples": 5, "outer_m": 0.2})
-    assert (settings.steps, settings.fast.samples, settings.fast.outer_m) == (7, 5, 0.2)
+    settings, decisions = decided(SCENE, steps=7, field={"kind": "fast", "samples": 5, "outer_m": 0.2})
+    assert (settings.steps, settings.field.samples, settings.field.outer_m) == (7, 5, 0.2)
     assert set(decisions) == {
-        "fast.inner_m",
-        "fast.colour_cells",
-        "fast.geometry_cells",
-        "fast.pose_width",
-        "fast.nodes",
+        "field.inner_m",
+        "field.colour_cells",
+        "field.geometry_cells",
+        "field.pose_width",
+        "field.nodes",
         "one_posture",
     }
 
 
 @pytest.mark.parametrize(
-    ("machinery", "std_rad", "one"), [("fast", 0.001, True), ("fast", 0.003, False), ("paper", 0.001, False)]
+    ("kind", "std_rad", "one"), [("fast", 0.001, True), ("fast", 0.003, False), ("paper", 0.001, False)]
 )
-def test_frames_that_were_fitted_with_one_posture_keep_one(machinery: str, std_rad: float, one: bool):
-    """The published method gives each frame its own; so does what is given."""
+def test_frames_that_were_fitted_with_one_posture_keep_one(kind: str, std_rad: float, one: bool):
+    """The published method gives each frame its own posture; a given setting is kept."""
     scene = SCENE.__class__(**{**vars(SCENE), "std_rad": std_rad})
-    assert decided(scene, machinery=machinery)[0].one_posture is one
+    assert decided(scene, field={"kind": kind})[0].one_posture is one
     assert decided(scene, one_posture=not one)[0].one_posture is not one
 
 
@@ -94,7 +94,8 @@ def test_steps_have_bounds(person_px: int, steps: int):
     [(1, 40, 5e-4, 2160), (4, 40, 5e-4, 600), (1, 1, 5e-4, 600), (1, 40, 0, 600)],
 )
 def test_one_camera_needs_time_to_find_how_deep_bodies_stand(cameras: int, frames: int, rate: float, steps: int):
-    """540 steps that see each of 40 frames, 10 of them a step: 2160; nothing to find in one frame or in given poses."""
+    """540 steps per frame for 40 frames at 10 frames per step are 2160; one frame or given poses need no depth
+    search."""
     scene = SCENE.__class__(**{**vars(SCENE), "cameras": cameras, "frames": frames, "person_px": 1000})
     settings, decisions = decided(scene, pose_learning_rate=rate)
     assert settings.steps == steps
@@ -103,8 +104,8 @@ def test_one_camera_needs_time_to_find_how_deep_bodies_stand(cameras: int, frame
 
 def test_one_pose_teaches_nothing_about_poses():
     settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "std_rad": 0.01}))
-    assert settings.fast.pose_width == 1
-    assert decisions["fast.pose_width"].reason.endswith("too little to learn from")
+    assert settings.field.pose_width == 1
+    assert decisions["field.pose_width"].reason.endswith("too little to learn from")
 
 
 @pytest.mark.parametrize(
@@ -112,12 +113,12 @@ def test_one_pose_teaches_nothing_about_poses():
 )
 def test_a_single_frame_or_camera_does_not_deform_the_body(cameras: int, frames: int, rate: float, nodes: int):
     scene = SCENE.__class__(**{**vars(SCENE), "cameras": cameras, "frames": frames})
-    assert decided(scene, fast={"deformation_learning_rate": rate})[0].fast.nodes == nodes
+    assert decided(scene, field={"kind": "fast", "deformation_learning_rate": rate})[0].field.nodes == nodes
 
 
 def test_a_scene_as_it_is_measured(tmp_path: Path):
-    """Cameras at 4.03 m with a focal length of 38.4 px: 0.105 m a pixel. The masks are the body's own silhouettes,
-    whose outline is its outermost pixels: half a pixel to one and a half inside. One joint of two is free and bends by
+    """Cameras at 4.03 m with a focal length of 38.4 px: 0.105 m per pixel. The masks are the body's own silhouettes,
+    whose outline is its outermost pixels: half a pixel to one and a half inside. One of two joints is free and bends by
     0 and 0.2 rad in the two training frames: 0.1 from their mean."""
     capture, masks, body = record(tmp_path / "capture")
     scene = SceneStatistics.of(capture, masks, body)

@@ -1,4 +1,4 @@
-"""A surface that is empty or fills the box ends a training with an error; the bar is the one that users have."""
+"""Collapse: a surface that is empty or fills the box ends training with an error, at the thresholds that users have."""
 
 from pathlib import Path
 
@@ -11,41 +11,41 @@ from hnerf.fields.fast import FastField
 from hnerf.fields.paper import PaperField
 from hnerf.training.distributed import Distributed
 from hnerf.training.step import TrainingError
-from hnerf.training.trainer import LEAST_COVERAGE, Trainer
+from hnerf.training.trainer import MIN_PERSON_COVERAGE, Trainer
 from tests.training.scene import TINY, record
 
-FAR = 10.0  # units of the residual's last layer: metres away in either machinery
+FAR = 10.0  # units of the residual's last layer: metres away in either field
 
 
-def trainer_of(folder: Path, machinery: str) -> Trainer:
-    """One that takes two steps."""
-    settings = TINY.model_copy(update={"machinery": machinery, "steps": 2, "novel_pose_steps": 0})
+def trainer_of(folder: Path, kind: str) -> Trainer:
+    """Return a trainer that takes two steps."""
+    settings = TINY.model_copy(update={"kind": kind, "steps": 2, "novel_pose_steps": 0})
     return Trainer(*record(folder / "capture"), settings, folder, Distributed(0, 1, torch.device("cpu")))
 
 
 def move_surface(field: Field, outwards: float) -> None:
-    """Add so much to the distance that the field's network takes from the body's."""
+    """Add an offset to the distance that the field's network adds to the body's."""
     assert isinstance(field, PaperField | FastField)
     last = field.residual.residual if isinstance(field, PaperField) else field.field.geometry[-1]
     assert isinstance(last, nn.Linear)
     last.bias.data.sub_(outwards)
 
 
-@pytest.mark.parametrize("machinery", ["fast", "paper"])
-def test_the_body_itself_is_a_surface(tmp_path: Path, machinery: str):
-    trainer_of(tmp_path, machinery).run()
+@pytest.mark.parametrize("kind", ["fast", "paper"])
+def test_the_body_itself_is_a_surface(tmp_path: Path, kind: str):
+    trainer_of(tmp_path, kind).run()
 
 
 def test_a_surface_between_the_samples_of_a_training_is_no_collapse(tmp_path: Path):
-    """Two samples a ray, across 5 m, hardly ever fall into the column."""
+    """Two samples per ray, across 5 m, hardly ever fall into the column."""
     trainer = trainer_of(tmp_path, "paper")
     trainer.field.samples = 2
-    rays, samples = trainer._look(trainer.train_rows, 2)
-    assert trainer.field.coverage(samples)[rays.person].mean() < LEAST_COVERAGE
+    rays, samples = trainer._sample_fixed_rays(trainer.train_rows, 2)
+    assert trainer.field.coverage(samples)[rays.person].mean() < MIN_PERSON_COVERAGE
     trainer._require_surface()
 
 
-@pytest.mark.parametrize("machinery", ["fast", "paper"])
+@pytest.mark.parametrize("kind", ["fast", "paper"])
 @pytest.mark.parametrize(
     ("outwards", "message"),
     [
@@ -53,8 +53,8 @@ def test_a_surface_between_the_samples_of_a_training_is_no_collapse(tmp_path: Pa
         (FAR, r"surface fills the box \(covers 100% of the surroundings\): check the masks"),
     ],
 )
-def test_a_collapsed_surface_is_an_error(tmp_path: Path, machinery: str, outwards: float, message: str):
-    trainer = trainer_of(tmp_path, machinery)
+def test_a_collapsed_surface_is_an_error(tmp_path: Path, kind: str, outwards: float, message: str):
+    trainer = trainer_of(tmp_path, kind)
     move_surface(trainer.field, outwards)
     with pytest.raises(TrainingError, match=message):
         trainer.run()

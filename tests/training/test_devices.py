@@ -1,5 +1,5 @@
-"""Tensors of two devices never meet, from the body to a picture; on a GPU where there is one, else on one that is
-pretended."""
+"""Devices: tensors of two devices never meet, from the body to an image; on a GPU if there is one, else on a simulated
+one."""
 
 from contextlib import nullcontext
 from dataclasses import replace
@@ -15,29 +15,29 @@ from hnerf.training import trainer as trainer_module
 from hnerf.training.distributed import Distributed
 from hnerf.training.trainer import train
 from tests.training.pretended_gpu import pretended_gpu
-from tests.training.scene import TINY, record
+from tests.training.scene import record, tiny
 
 WITH_GPU = torch.cuda.is_available()
 
 
-@pytest.mark.parametrize("machinery", ["fast", "paper", "nerf", "idr", "nerfies"])
-def test_trains_loads_and_renders_on_one_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, machinery: str):
-    monkeypatch.setattr(trainer_module, "LEAST_COVERAGE", 0.0)
+@pytest.mark.parametrize("kind", ["fast", "paper", "nerf", "idr", "nerfies"])
+def test_trains_loads_and_renders_on_one_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str):
+    monkeypatch.setattr(trainer_module, "MIN_PERSON_COVERAGE", 0.0)
     capture, masks, body = record(tmp_path / "capture")
     camera = capture.cameras[capture.train_cameras[0]]
-    changes = {"machinery": machinery, "one_posture": False, "steps": 2, "novel_pose_steps": 1}
-    if machinery not in ("fast", "paper"):
+    changes: dict[str, object] = {"one_posture": False, "steps": 2, "novel_pose_steps": 1}
+    if kind not in ("fast", "paper"):
         changes["pose_learning_rate"] = 0.0
-    if machinery in ("nerf", "idr"):
+    if kind in ("nerf", "idr"):
         capture = replace(capture, train_frames=capture.train_frames[:1])
     gpu = nullcontext(torch.device("cuda", 0)) if WITH_GPU else pretended_gpu(monkeypatch)
     with gpu as device:
-        train(capture, masks, body, TINY.model_copy(update=changes), tmp_path, Distributed(0, 1, device))
+        train(capture, masks, body, tiny(kind, **changes), tmp_path, Distributed(0, 1, device))
         avatar = load_avatar(tmp_path, device)
         theta, root = avatar.body.theta[0], avatar.body.root[0]
         shown = avatar.render(camera, theta, root)
         assert shown.rgb.device == device
         assert depth_image(shown, camera).shape == normal_image(avatar, shown, camera, theta, root).shape[:2]
-        if machinery == "fast":  # others have no surface yet
+        if kind == "fast":  # others have no surface yet
             assert surface_in_pose(avatar, theta, root, 32).is_watertight
         assert avatar.colour(avatar.body.rig.vertices_m, avatar.body.rig.vertices_m, theta, root).device == device

@@ -1,4 +1,4 @@
-"""What two cameras see of the same places tells how differently they are exposed."""
+"""Camera gains from what two cameras see of the same body points."""
 
 import dataclasses
 from pathlib import Path
@@ -14,7 +14,7 @@ from hnerf.avatar.trained import TrainedAvatar, build_field
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.geometry.reach import everywhere
 from hnerf.training.distributed import Distributed
-from hnerf.training.exposure import _in_sight, camera_gains, solve_gains
+from hnerf.training.exposure import _visible_vertices, camera_gains, solve_gains
 from hnerf.training.gather import gather_pixels
 from tests.training.scene import TINY, KnownMasks, look_at, record
 
@@ -25,13 +25,13 @@ RING = {name: look_at(name, 4.0 * np.array([x, y, 0]), np.zeros(3)).resized(128,
 
 
 def photograph(name: str, gain: tuple[float, ...]) -> np.ndarray:
-    """(128, 128, 3): a ball that is brighter above than below, as a camera of this gain shows it."""
+    """Return the image (128, 128, 3) of a ball, brighter above than below, from a camera of this gain."""
     camera = RING[name]
     y, x = np.mgrid[:128, :128]
     origin, directions = camera.rays(np.stack([x, y], -1).reshape(-1, 2).astype(float))
-    along = -(origin * directions).sum(1)
-    missed2 = (origin**2).sum(1) - along**2
-    hit_m = origin + (along - np.sqrt((1 - missed2).clip(0)))[:, None] * directions
+    points_on_rays = -(origin * directions).sum(1)
+    missed2 = (origin**2).sum(1) - points_on_rays**2
+    hit_m = origin + (points_on_rays - np.sqrt((1 - missed2).clip(0)))[:, None] * directions
     level = np.where(missed2 < 1, 100 + 40 * hit_m[:, 2], 128)
     return (level[:, None] * gain).round().reshape(128, 128, 3).astype(np.uint8)
 
@@ -58,7 +58,8 @@ def test_gains_by_hand() -> None:
 
 
 def test_the_larger_number_of_places_counts_more() -> None:
-    """Three cameras in a ring whose ratios contradict each other by log 0.3: shares as 1 / 300, 1 / 300 and 1 / 100."""
+    """Three cameras in a ring have ratios that contradict each other by log 0.3, which is shared as 1 / 300, 1 / 300
+    and 1 / 100."""
     logs = solve_gains(3, {(0, 1): np.zeros((300, 3)), (1, 2): np.zeros((300, 3)), (0, 2): np.full((100, 3), 0.3)})
     assert logs[2, 0] - logs[0, 0] == pytest.approx(0.3 * (1 / 150) / (1 / 150 + 1 / 100))
 
@@ -69,19 +70,19 @@ def test_gains_of_cameras_that_see_the_same_ball() -> None:
     mean = np.exp(np.mean([np.log(gain) for gain in true.values()], 0))
     for name, gain in true.items():
         assert found[name] == pytest.approx(tuple(gain / mean), rel=0.01)
-    assert "differ from what is usual by 27%" in decision.reason  # red of a: (1.2 x 1.1 / 0.8^3)^(1/4) = 1.267
+    assert "differ from the usual exposure by 27%" in decision.reason  # red of a: (1.2 x 1.1 / 0.8^3)^(1/4) = 1.267
 
 
 def test_most_cameras_that_agree_stay_as_they_are() -> None:
-    """Whoever looks from elsewhere, such as a test camera, is most likely exposed as they are."""
+    """Other cameras, such as test cameras, are most likely exposed as the majority."""
     found, decision = measured({"a": (1, 1, 1), "b": (1, 1, 1), "c": (1, 1, 1), "d": (1.5, 1.5, 1.5)})
     for name, gain in (("a", 1), ("b", 1), ("c", 1), ("d", 1.5)):
         assert found[name] == pytest.approx((gain,) * 3, rel=0.01)
-    assert "differ from what is usual by 50%" in decision.reason
+    assert "differ from the usual exposure by 50%" in decision.reason
 
 
 def test_a_camera_that_nobody_compares_is_taken_for_a_usual_one() -> None:
-    """a and b agree, c is brighter; d has no mask in the frame that is looked at."""
+    """a and b agree, c is brighter; d has no mask in the compared frame."""
     found, _ = measured({"a": (1, 1, 1), "b": (1, 1, 1), "c": (1.3, 1.3, 1.3), "d": (1, 1, 1)}, unmasked="d")
     assert [found[name][0] for name in "abcd"] == pytest.approx([1, 1, 1.3, 1], rel=0.01)
 
@@ -93,25 +94,25 @@ def test_nothing_is_changed_where_shading_may_be_the_cause_or_nobody_compares() 
 
 
 def test_what_is_hidden_is_not_in_sight() -> None:
-    """A ball of a quarter of the size between camera a and the other one hides the middle of it."""
+    """A ball of a quarter of the size between camera a and the other ball hides its middle."""
     small = trimesh.creation.icosphere(subdivisions=4, radius=0.25).apply_translation([2, 0, 0])
-    seen, _ = _in_sight(RING["a"], Surface(trimesh.util.concatenate([BALL, small])))
+    seen, _ = _visible_vertices(RING["a"], Surface(trimesh.util.concatenate([BALL, small])))
     places = BALL.vertices[seen[: len(BALL.vertices)]]
     assert len(places) > 100
     assert (np.hypot(places[:, 1], places[:, 2]) / (4 - places[:, 0]) > 0.12).all()  # beside the small one's cone
     assert seen[len(BALL.vertices) :].any()
     turned = np.diag([-1.0, 1, -1])
     away = dataclasses.replace(RING["a"], R=turned @ RING["a"].R, t_m=turned @ RING["a"].t_m)
-    assert not _in_sight(away, Surface(BALL))[0].any()  # it is behind the camera
+    assert not _visible_vertices(away, Surface(BALL))[0].any()  # it is behind the camera
 
 
-def test_pixels_are_levelled_by_their_cameras(tmp_path: Path) -> None:
+def test_pixels_are_corrected_by_the_gains_of_their_cameras(tmp_path: Path) -> None:
     capture, masks, body = record(tmp_path)
     gains = {"0": (2.0, 1.0, 0.5)} | dict.fromkeys(capture.train_cameras[1:], (1.0, 1.0, 1.0))
     pixels, exposure_corrected = (
         gather_pixels(capture, masks, body, body.frames, everywhere, by, tmp_path, ALONE) for by in ({}, gains)
     )
-    first = pixels.where(torch.arange(len(pixels.person)))[0] == 0
+    first = pixels.cameras_and_xy(torch.arange(len(pixels.person)))[0] == 0
     assert exposure_corrected.colour[first & pixels.person].unique(dim=0).tolist() == [[100, 50, 100]]  # of 200, 50, 50
     assert pixels.plate is not None and exposure_corrected.plate is not None
     assert exposure_corrected.plate[first].unique(dim=0).tolist() == [[64, 128, 255]]  # of 128
@@ -120,7 +121,7 @@ def test_pixels_are_levelled_by_their_cameras(tmp_path: Path) -> None:
 
 def test_a_training_camera_shows_what_its_gain_makes_of_it(tmp_path: Path) -> None:
     capture, _, body = record(tmp_path)
-    avatar = TrainedAvatar(build_field(TINY, body, False), body, 1.0, body, {"0": (0.5, 1.0, 2.0)})
+    avatar = TrainedAvatar(build_field(TINY.field, body, False), body, 1.0, body, {"0": (0.5, 1.0, 2.0)})
     plain = TrainedAvatar(avatar.field, body, 1.0, body)
     for name, gain in (("0", (0.5, 1.0, 2.0)), ("1", (1.0, 1.0, 1.0))):
         shown, expected = (a.render(capture.cameras[name], body.theta[0], body.root[0]).rgb for a in (avatar, plain))

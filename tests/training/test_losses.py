@@ -23,7 +23,7 @@ SAMPLES = RaySamples(
     d=torch.tensor([[0.05, 0.01], [0.10, 0.20]]),
     residual=torch.tensor([[-0.02, -0.03], [0.04, -0.05]]),
     gradient_norm=torch.tensor([1.5, 0.8]),
-    beyond=torch.tensor([BLACK, BLACK]),
+    background=torch.tensor([BLACK, BLACK]),
     elastic=torch.tensor([0.2]),
 )
 TARGET = Target(colour=torch.tensor([RED, BLACK]), person=torch.tensor([1.0, 0.0]), weight=torch.ones(2))
@@ -60,7 +60,7 @@ COUPLED = replace(SAMPLES, alpha_dot=torch.tensor([[0.2, 0.9], [0.1, 0.5]]))
 
 
 def cross_entropies(predicted: tuple[float, ...], labels: tuple[float, ...]) -> float:
-    """Half the sum, which is the mean over two rays."""
+    """Return half the sum, which is the mean over two rays."""
     both = zip(predicted, labels, strict=True)
     return sum(-p * math.log(q) - (1 - p) * math.log(1 - q) for q, p in both) / 2
 
@@ -72,7 +72,7 @@ def test_geometry_in_the_roles_of_the_print():
 
 
 def test_geometry_where_the_surface_leads():
-    """Densities are predictions of the labels 0.2, 0.9 and 0.1, which take no gradient."""
+    """Densities are predictions of the labels 0.2, 0.9 and 0.1, which get no gradient."""
     occupied, density = COUPLED.alpha_dot.clone().requires_grad_(), COUPLED.density.clone().requires_grad_()
     loss = losses.geometry(replace(COUPLED, alpha_dot=occupied, density=density), 50.0, 0.1, "surface_leads")
     assert loss.item() == pytest.approx(cross_entropies(LABELS, (0.2, 0.9, 0.1)), rel=1e-5)
@@ -92,7 +92,7 @@ def test_geometry_vanishes_where_the_sdf_is_the_density():
 
 
 def test_not_a_number_passes_through_the_cross_entropy():
-    """So that the step is skipped with its cause, and no library's error takes its place."""
+    """The step is then skipped with its cause named, instead of an error of the library."""
     broken = torch.full_like(SAMPLES.d, torch.nan)
     assert losses.segmentation(broken, TARGET, 80.0).isnan()
 
@@ -113,7 +113,7 @@ def test_a_pixel_pulls_a_body_however_far():
 
 
 def test_fit_takes_the_body_alone():
-    """min d = 0.01 on the person: outside, -log sigmoid(-0.8)."""
+    """min d = 0.01 on the person, outside the body: -log sigmoid(-0.8)."""
     expected = -math.log(1 / (1 + math.exp(0.8))) - math.log(1 - 1 / (1 + math.exp(8)))
     assert losses.segmentation(SAMPLES.d, TARGET, 80.0).item() == pytest.approx(expected / 2, rel=1e-4)
 
@@ -137,7 +137,7 @@ def test_increment():
 
 
 def test_elastic():
-    """Of two rays, one of which knows of no deformation."""
+    """Two rays, one of them without a deformation."""
     assert losses.elastic(SAMPLES).item() == pytest.approx(0.1)
     assert losses.elastic(replace(SAMPLES, elastic=None)).item() == 0
 
@@ -193,7 +193,7 @@ def test_gradients_of_what_pulls_poses_and_deformations_back_in_double():
 
 
 class Increment(torch.nn.Module):
-    """The loss as a module, so that parameters can be put in."""
+    """The loss as a module, so that parameters can be set."""
 
     def __init__(self, correction: PoseCorrection) -> None:
         super().__init__()

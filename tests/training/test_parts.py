@@ -1,4 +1,4 @@
-"""A batch in parts has the gradients of the whole, and as many parts as memory asks for."""
+"""Gradient accumulation: parts of a batch have the gradients of the whole, and their number follows from the memory."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from hnerf.fields.conditions import Draws
 from hnerf.training import parts as parts_module
 from hnerf.training import trainer as trainer_module
 from hnerf.training.distributed import Distributed
-from hnerf.training.parts import GIB, PEAK, USABLE, Parts, decide_parts
+from hnerf.training.parts import GIB, PEAK_FACTOR, USABLE_SHARE, Parts, decide_parts
 from hnerf.training.pixels import Rays
 from tests.training.first_step import gradients, untrained
 
@@ -26,7 +26,7 @@ class Scale(nn.Module):
         self.w = nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
 
     def forward(self, scene: object, rays: Rays, conditions: object, draws: Draws) -> dict[str, Tensor]:
-        """`mean` and `increment`."""
+        """Return `mean` and `increment`."""
         assert len(draws.jitter) == len(rays.frame) > 0
         return {"mean": (self.w * rays.origins_m[:, 0]).mean(), "increment": 3 * self.w}
 
@@ -55,7 +55,7 @@ def test_parts_of_unequal_size_add_up_to_the_joint_batch(
 
 
 def attempted(about: int) -> tuple[int, Tensor]:
-    """A loss of rays that saves 1024 doubles for each, and 1000 for all."""
+    """Return a loss of rays that saves 1024 doubles for each, and 1000 for all."""
     learned = torch.ones((), dtype=torch.float64, requires_grad=True)
     both = [learned * torch.ones(n, dtype=torch.float64) for n in (1024 * about, 1000)]
     return about, both[0].sum() + both[1].sum()
@@ -65,39 +65,39 @@ def attempted(about: int) -> tuple[int, Tensor]:
 def test_parts_follow_from_the_memory_that_a_ray_needs(
     monkeypatch: pytest.MonkeyPatch, rays: int, world_size: int, parts: int
 ) -> None:
-    """8 KiB a ray and 8000 bytes beside them, in room for 100 rays and a half, given or free."""
+    """A ray needs 8 KiB, a batch 8000 bytes more; the memory, given or free, has room for 100 and a half rays."""
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
-    monkeypatch.setattr(Distributed, "greatest", lambda self, value: value)
-    room = PEAK * (8000 + 8192 * 100.5)
+    monkeypatch.setattr(Distributed, "all_max", lambda self, value: value)
+    room = PEAK_FACTOR * (8000 + 8192 * 100.5)
     processes = Distributed(0, world_size, CPU)
     made, decision = decide_parts(rays, room / GIB, attempted, processes)
     assert made.count == decision.value == parts
     assert made.most_rays == pytest.approx(100.5, abs=0.01)
     assert decision.reason.startswith("a ray needs 0.01 MiB")
-    monkeypatch.setattr(parts_module, "_free_bytes", lambda processes: room / USABLE)
+    monkeypatch.setattr(parts_module, "_free_bytes", lambda processes: room / USABLE_SHARE)
     assert decide_parts(rays, None, attempted, processes)[0].count == parts
 
 
 def test_what_fits_is_taken_in_halves_side_by_side_on_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where there are threads for them; what does not fit comes one part after another."""
+    """Two halves run side by side if there are threads; what does not fit runs one part after another."""
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     made, decision = decide_parts(100, 1.0, attempted, ALONE)
     assert made.count == decision.value == 2 and made.pool is not None
-    made, _ = decide_parts(100, PEAK * (8000 + 8192 * 50.5) / GIB, attempted, ALONE)
+    made, _ = decide_parts(100, PEAK_FACTOR * (8000 + 8192 * 50.5) / GIB, attempted, ALONE)
     assert made.count == 2 and made.pool is None
 
 
-@pytest.mark.parametrize("machinery", ["fast", "paper"])
+@pytest.mark.parametrize("kind", ["fast", "paper"])
 def test_memory_changes_the_number_of_parts_and_not_the_gradients(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, machinery: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    """128 rays of a MB each in 50 MB: 43, 43 and 42. What is looked at meanwhile is split likewise."""
+    """128 rays of 1 MB each in 50 MB: 43, 43 and 42. Evaluation during training is split likewise."""
     monkeypatch.setattr(trainer_module, "HELD_OUT_RAYS", 300)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
-    monkeypatch.setattr(parts_module, "_peak_bytes", lambda attempt, about, device: (about, 1e6 * about))
+    monkeypatch.setattr(parts_module, "_peak_bytes", lambda trial_loss, about, device: (about, 1e6 * about))
     found = []
     for memory_gib, count in ((None, 1), (50e6 / GIB, 3)):
-        trainer = untrained(tmp_path, machinery, ALONE, memory_gib=memory_gib)
+        trainer = untrained(tmp_path, kind, ALONE, memory_gib=memory_gib)
         assert trainer.parts.count == count
         found.append(gradients(trainer, trainer.objective) | {"psnr": torch.tensor(trainer._held_out_psnr())})
     assert found[0].keys() == found[1].keys()

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from hnerf.geometry.camera import Camera
-from hnerf.geometry.reach import Reached, everywhere, within_box, within_reach
+from hnerf.geometry.reach import ReachablePixels, everywhere, within_box, within_reach
 from hnerf.training.distributed import Distributed
 from hnerf.training.gather import gather_pixels
 from hnerf.training.pixels import Pixels
@@ -20,7 +20,7 @@ REACHED = functools.partial(within_reach, reach_m=0.2)
 
 
 def test_a_third_of_the_rays_is_drawn_at_edges():
-    """Two frames of four and two pixels; the first pixel of the one is at an edge, and none of the other."""
+    """Two frames of four and two pixels; one frame has its first pixel at an edge, the other none."""
     number = torch.arange(6)
     edge = torch.tensor([True] + [False] * 5)
     pixels = Pixels(
@@ -29,7 +29,7 @@ def test_a_third_of_the_rays_is_drawn_at_edges():
         edge_starts=torch.tensor([0, 1, 3]),
         image_starts=torch.tensor([0, 4, 6]),
         image_camera=torch.tensor([0, 0]),
-        place=number.int(),
+        pixel_index=number.int(),
         colour=number[:, None].expand(6, 3).to(torch.uint8),
         plate=None,
         person=edge,
@@ -48,42 +48,42 @@ def test_a_third_of_the_rays_is_drawn_at_edges():
 
 
 def test_where_a_pixel_lies_follows_from_its_image() -> None:
-    """Images of 3 x 2, 2 x 2 and again 3 x 2 pixels of cameras 0, 1 and 0, first whole, then of the last one two."""
+    """Images of 3 x 2, 2 x 2 and 3 x 2 pixels of cameras 0, 1 and 0, first whole, then only some pixels."""
     none = torch.zeros(0)
     names = ("starts", "edges", "edge_starts", "colour", "plate", "person", "edge", "rays_from_px", "centres_m")
     like = dict.fromkeys(names, none)
     images = {"image_camera": torch.tensor([0, 1, 0]), "widths_px": torch.tensor([3, 2])}
-    whole = Pixels(image_starts=torch.tensor([0, 6, 10, 16]), place=None, **images, **like)
-    camera, xy_px = whole.where(torch.tensor([0, 5, 6, 9, 10, 14]))
+    whole = Pixels(image_starts=torch.tensor([0, 6, 10, 16]), pixel_index=None, **images, **like)
+    camera, xy_px = whole.cameras_and_xy(torch.tensor([0, 5, 6, 9, 10, 14]))
     assert camera.tolist() == [0, 0, 1, 1, 0, 0]
     assert xy_px.tolist() == [[0, 0], [2, 1], [0, 0], [1, 1], [0, 0], [1, 1]]
-    place = torch.tensor([0, 1, 2, 3, 4, 5, 2], dtype=torch.int32)  # the second image shows nothing of interest
-    some = Pixels(image_starts=torch.tensor([0, 5, 5, 7]), place=place, **images, **like)
-    camera, xy_px = some.where(torch.tensor([4, 5, 6]))
+    pixel_index = torch.tensor([0, 1, 2, 3, 4, 5, 2], dtype=torch.int32)  # the second image shows nothing of interest
+    some = Pixels(image_starts=torch.tensor([0, 5, 5, 7]), pixel_index=pixel_index, **images, **like)
+    camera, xy_px = some.cameras_and_xy(torch.tensor([4, 5, 6]))
     assert camera.tolist() == [0, 0, 0]
     assert xy_px.tolist() == [[1, 1], [2, 1], [2, 0]]
 
 
-@pytest.mark.parametrize("reached", [REACHED, None])
-def test_pixels_show_what_the_images_do(tmp_path: Path, reached: Reached | None) -> None:
-    """Whole images where nothing says what is reached, then without plates."""
+@pytest.mark.parametrize("visible_pixels", [REACHED, None])
+def test_pixels_show_what_the_images_do(tmp_path: Path, visible_pixels: ReachablePixels | None) -> None:
+    """Without a visibility function, images are whole and have no plates."""
     capture, masks, body = record(tmp_path)
     out = tmp_path / "out"
     out.mkdir()
     (out / "plate.pixels").write_bytes(b"of a process that was killed")
-    pixels = gather_pixels(capture, masks, body, body.frames, reached, {}, out, ALONE)
+    pixels = gather_pixels(capture, masks, body, body.frames, visible_pixels, {}, out, ALONE)
     assert not any(out.iterdir())
-    assert (pixels.place is None) == (pixels.plate is None) == (reached is None)
-    camera, xy_px = pixels.where(torch.arange(len(pixels.person)))
+    assert (pixels.pixel_index is None) == (pixels.plate is None) == (visible_pixels is None)
+    camera, xy_px = pixels.cameras_and_xy(torch.arange(len(pixels.person)))
     row = torch.arange(len(body.frames)).repeat_interleave(pixels.starts.diff())
     for c, name in enumerate(capture.train_cameras):
         for r, frame in enumerate(body.frames):
-            own = (camera == c) & (row == r)
-            x, y = xy_px[own].T.numpy()
-            assert len(x) == 32 * 32 if reached is None else 0 < len(x) < 32 * 32
-            assert np.array_equal(pixels.colour[own].numpy(), capture.image(name, frame)[y, x])
-            assert np.array_equal(pixels.person[own].numpy(), masks.get(name, frame)[y, x])
-            assert pixels.edge[own].any()
+            part = (camera == c) & (row == r)
+            x, y = xy_px[part].T.numpy()
+            assert len(x) == 32 * 32 if visible_pixels is None else 0 < len(x) < 32 * 32
+            assert np.array_equal(pixels.colour[part].numpy(), capture.image(name, frame)[y, x])
+            assert np.array_equal(pixels.person[part].numpy(), masks.get(name, frame)[y, x])
+            assert pixels.edge[part].any()
 
 
 def test_edges_are_found_in_every_frame(tmp_path: Path):
@@ -91,9 +91,9 @@ def test_edges_are_found_in_every_frame(tmp_path: Path):
     pixels = gather_pixels(capture, masks, body, body.frames, REACHED, {}, tmp_path, ALONE)
     assert torch.equal(pixels.edges, torch.nonzero(pixels.edge)[:, 0])
     for row in range(len(body.frames)):
-        own = pixels.edges[pixels.edge_starts[row] : pixels.edge_starts[row + 1]]
-        assert len(own)
-        assert ((own >= pixels.starts[row]) & (own < pixels.starts[row + 1])).all()
+        part = pixels.edges[pixels.edge_starts[row] : pixels.edge_starts[row + 1]]
+        assert len(part)
+        assert ((part >= pixels.starts[row]) & (part < pixels.starts[row + 1])).all()
 
 
 def test_a_frame_without_edges_offers_all_its_pixels(tmp_path: Path):
@@ -106,31 +106,31 @@ def test_a_frame_without_edges_offers_all_its_pixels(tmp_path: Path):
 
 
 def test_a_body_inside_the_image_reaches_a_disc_around_each_vertex():
-    """20 cm at 2 m and 50 px focal length are 5 px."""
+    """A reach of 20 cm at 2 m with 50 px focal length is 5 px."""
     xy = np.random.default_rng(0).integers([8, 8], [52, 32], (30, 2))
-    reached = within_reach(AHEAD, np.hstack([xy / 25, np.full((30, 1), 2.0)]), 0.2)
+    visible_pixels = within_reach(AHEAD, np.hstack([xy / 25, np.full((30, 1), 2.0)]), 0.2)
     y, x = np.mgrid[:40, :60]
     squared = (x[..., None] - xy[:, 0]) ** 2 + (y[..., None] - xy[:, 1]) ** 2
-    assert np.array_equal(reached, squared.min(-1) <= 25)
+    assert np.array_equal(visible_pixels, squared.min(-1) <= 25)
 
 
 def test_a_body_beside_the_image_reaches_into_it():
     """A vertex 3 px left of the image, in row 20, is a disc of 5 px: columns 0 to 2 of that row."""
-    reached = within_reach(AHEAD, np.array([[-3 / 25, 20 / 25, 2.0]]), 0.2)
-    assert np.flatnonzero(reached[20]).tolist() == [0, 1, 2]
-    assert reached.any(1).nonzero()[0].tolist() == [16, 17, 18, 19, 20, 21, 22, 23, 24]
+    visible_pixels = within_reach(AHEAD, np.array([[-3 / 25, 20 / 25, 2.0]]), 0.2)
+    assert np.flatnonzero(visible_pixels[20]).tolist() == [0, 1, 2]
+    assert visible_pixels.any(1).nonzero()[0].tolist() == [16, 17, 18, 19, 20, 21, 22, 23, 24]
 
 
 def test_an_arm_towards_the_camera_reaches_as_far_as_it_is_large():
-    """20 cm at 1 m are 10 px, though most of the body is at 2 m, where they are 5."""
+    """20 cm are 10 px at 1 m, although most of the body is at 2 m, where they are 5 px."""
     arm, body = np.tile([[20 / 50, 20 / 50, 1.0]], (3, 1)), np.tile([[50 / 25, 20 / 25, 2.0]], (20, 1))
-    reached = within_reach(AHEAD, np.vstack([arm, body]), 0.2)
-    assert np.flatnonzero(reached[20]).tolist() == [*range(10, 31), *range(40, 60)]
+    visible_pixels = within_reach(AHEAD, np.vstack([arm, body]), 0.2)
+    assert np.flatnonzero(visible_pixels[20]).tolist() == [*range(10, 31), *range(40, 60)]
 
 
 def test_a_box_is_met_within_the_outline_of_its_corners():
-    """With its margin 2 to 4 m away: the near side spans columns 5 to 35 and rows 5 to 25, the far one 2.5 to 17.5 and
-    2.5 to 12.5, and their upper edges are joined by a line through (26.5, 3.75)."""
+    """With its margin the box lies 2 to 4 m away: the near side spans columns 5 to 35 and rows 5 to 25, the far one 2.5
+    to 17.5 and 2.5 to 12.5, and their upper edges are joined by a line through (26.5, 3.75)."""
     met = within_box(AHEAD, np.array([[0.4, 0.4, 2.2], [1.2, 0.8, 3.8]]), 0.2)
     y, x = np.array([(3, 3), (5, 35), (25, 5), (25, 35), (15, 20), (4, 27)]).T
     assert met[y, x].all()
@@ -150,8 +150,9 @@ def test_a_box_beside_the_image_is_not_met():
 
 @pytest.mark.parametrize("depths_m", [(-1.0, -2.0), (-1.0, -1.0, 2.0), (1e-6, 1e-6)])
 def test_a_body_behind_or_at_the_camera(depths_m: tuple[float, ...]):
-    """Nothing is reached behind it, all is from where it stands; who stands astride reaches as far as what is ahead."""
+    """A body behind the camera reaches no pixel, one around it all; of a body on both sides only the part in front
+    counts."""
     vertices_m = np.array([[0.4 * depth, 0.4 * depth, depth] for depth in depths_m])
-    reached = within_reach(AHEAD, vertices_m, 0.2)
-    assert reached[20, 20] == (depths_m[-1] > 0)
-    assert reached.all() == (0 < depths_m[-1] < 1)
+    visible_pixels = within_reach(AHEAD, vertices_m, 0.2)
+    assert visible_pixels[20, 20] == (depths_m[-1] > 0)
+    assert visible_pixels.all() == (0 < depths_m[-1] < 1)

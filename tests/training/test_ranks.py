@@ -1,4 +1,4 @@
-"""Trainings by two processes."""
+"""Training with two processes."""
 
 import json
 import logging
@@ -38,23 +38,23 @@ Trainer(*record(root / f"capture{p.rank}"), TINY, root, p).run()
 
 
 def launched(ranks: int, program: list[str]) -> int:
-    """The exit status of torchrun with so many processes of the program."""
+    """Return the exit status of torchrun with this number of processes of the program."""
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
     return subprocess.run([*launcher, *program], env=environment).returncode
 
 
-@pytest.mark.parametrize("machinery", ["fast", "paper"])
-def test_two_ranks_in_three_parts_have_the_gradients_of_one_batch(tmp_path: Path, machinery: str) -> None:
+@pytest.mark.parametrize("kind", ["fast", "paper"])
+def test_two_ranks_in_three_parts_have_the_gradients_of_one_batch(tmp_path: Path, kind: str) -> None:
     """Two gloo processes with half the 128 rays each, in parts of 22 and 21: the gradients are those of one process
     with all rays. Both skip a step whose loss is not finite in one of them alone."""
-    alone = untrained(tmp_path / "one", machinery, ALONE)
+    alone = untrained(tmp_path / "one", kind, ALONE)
     one, root = gradients(alone, alone.objective), tmp_path / "two"
     root.mkdir()
-    assert launched(2, ["-m", "tests.training.first_step", f"{root}", machinery, "3"]) == 0
+    assert launched(2, ["-m", "tests.training.first_step", f"{root}", kind, "3"]) == 0
     two = torch.load(root / "gradients.pt", weights_only=True)
     assert one.keys() == two.keys()
-    for learned in ("correction", "deformation") if machinery == "fast" else ("correction", "radiance"):
+    for learned in ("correction", "deformation") if kind == "fast" else ("correction", "radiance"):
         assert any(g.abs().max() > 0 for name, g in one.items() if learned in name)
     for name, gradient in one.items():
         torch.testing.assert_close(two[name], gradient, atol=1e-6, rtol=1e-4, msg=lambda m, n=name: f"{n}: {m}")
@@ -64,8 +64,8 @@ def test_two_ranks_in_three_parts_have_the_gradients_of_one_batch(tmp_path: Path
 def test_one_process_goes_on_where_two_were_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """From the checkpoint at step six to the end, as well as one process does from the start."""
-    monkeypatch.setattr(trainer_module, "LEAST_COVERAGE", 0.0)
+    """It continues from the checkpoint at step six to the end, with the accuracy of one process from the start."""
+    monkeypatch.setattr(trainer_module, "MIN_PERSON_COVERAGE", 0.0)
     killed, whole = tmp_path / "killed", tmp_path / "whole"
     killed.mkdir(), whole.mkdir()
     (tmp_path / "rank.py").write_text(KILLED)

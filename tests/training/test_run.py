@@ -1,4 +1,4 @@
-"""How a rank ends."""
+"""Exit statuses of a rank."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a step aims at, and which numbers each of its losses is given."""
+"""Targets of a step, and the inputs of each of its losses."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -20,29 +20,29 @@ PERSON = torch.tensor([True, True, False, False])
 EDGE = torch.tensor([False, True, True, False])
 
 
-def aimed(plate: Tensor | None, own_background: bool = False) -> tuple[losses.Target, Draws]:
-    """Of pixels inside the person, on both sides of the outline, and in the surroundings."""
+def aimed(plate: Tensor | None, models_background: bool = False) -> tuple[losses.Target, Draws]:
+    """Return target and draws for pixels inside the person, on both sides of the outline, and in the background."""
     none = torch.zeros(4, 3)
     rays = Rays(none, none, torch.zeros(4, dtype=torch.long), SEEN, PERSON, EDGE, plate)
-    return make_target(rays, Draws(none, BEYOND, none), own_background)
+    return make_target(rays, Draws(none, BEYOND, none), models_background)
 
 
 @pytest.mark.parametrize("plate", [None, PLATE])
 def test_a_field_with_a_background_aims_at_the_photograph(plate: Tensor | None) -> None:
-    target, draws = aimed(plate, own_background=True)
+    target, draws = aimed(plate, models_background=True)
     assert torch.equal(target.colour, SEEN)
     assert target.weight.tolist() == [1, 1, 1, 1]
     assert target.person.tolist() == [1, 1, 0, 0]
-    assert draws.beyond is BEYOND
+    assert draws.background is BEYOND
 
 
 def test_over_a_clean_plate_every_pixel_counts() -> None:
-    """The outline's as photographed, for they mix person and plate; the surroundings are the plate."""
+    """Outline pixels, which mix person and plate, keep the photographed colour; background pixels take the plate's."""
     target, draws = aimed(PLATE)
     assert torch.equal(target.colour, torch.cat([SEEN[:3], PLATE[3:]]))
     assert target.weight.tolist() == [1, 1, 1, 1]
     assert target.person.tolist() == [1, 1, 0, 0]
-    assert torch.equal(draws.beyond, PLATE)
+    assert torch.equal(draws.background, PLATE)
 
 
 def test_without_a_plate_surroundings_are_random_and_the_outline_is_left_out() -> None:
@@ -50,17 +50,17 @@ def test_without_a_plate_surroundings_are_random_and_the_outline_is_left_out() -
     assert torch.equal(target.colour[[0, 3]], torch.stack([SEEN[0], BEYOND[3]]))
     assert target.weight.tolist() == [1, 0, 0, 1]
     assert target.person.tolist() == [1, 1, 0, 0]
-    assert torch.equal(draws.beyond, BEYOND)
+    assert torch.equal(draws.background, BEYOND)
 
 
 def test_each_loss_is_given_its_own_numbers() -> None:
-    """The rays of test_losses through a field whose gamma is 80: each of its ten figures, times its weight."""
+    """The rays of test_losses through a field whose gamma is 80 give each of its ten values, times its weight."""
     s = LossSettings(
         **{"reconstruction": 2, "mask": 3, "blend": 5, "geometry": 7, "segmentation": 11, "eikonal": 13},
         **{"residual": 17, "fit": 19, "increment": 23, "elastic": 29, "eta": 0.25},
     )
     field: Any = torch.nn.Module()
-    field.own_background, field.gamma = True, 80.0
+    field.models_background, field.gamma = True, 80.0
     field.sample = lambda *inputs: (SAMPLES, None)
     correction = PoseCorrection(frames=2, free_joints=0, shapes=2)
     correction.absorbed_shape.copy_(torch.tensor([3.0, 4.0]))
@@ -85,7 +85,7 @@ def test_each_loss_is_given_its_own_numbers() -> None:
 def test_a_loss_without_weight_is_not_asked() -> None:
     assert LossSettings().elastic == 0
     field: Any = torch.nn.Module()
-    field.own_background, field.gamma = True, 80.0
+    field.models_background, field.gamma = True, 80.0
     field.sample = lambda *inputs: (SAMPLES, None)
     none, stage = torch.zeros(2, 3), SimpleNamespace(bodies=None, region=None)
     rays = Rays(none, none, none, TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)

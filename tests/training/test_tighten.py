@@ -1,4 +1,4 @@
-"""How thick the shell is left on each side of the skin."""
+"""Thickness of the tightened shell on each side of the skin."""
 
 from collections.abc import Callable
 
@@ -20,8 +20,8 @@ STEP_M = 0.004  # at which it is looked for
 
 
 def tightened(residual: Callable[[Tensor, Tensor, Tensor], Tensor], poses: list[float]) -> tuple[Tensor, Tensor]:
-    """Thicknesses outside and inside at the vertices within faces: at edges the nearest point of a normal's ray
-    differs."""
+    """Return the thickness outside and inside at the vertices within faces: at edges the closest point of a normal's
+    ray differs."""
     field = FastField(RIG, SETTINGS, 1)
     field.log_sharpness.data.fill_(1000.0).log_()
     field.field.residual = residual
@@ -43,14 +43,14 @@ def tightened(residual: Callable[[Tensor, Tensor, Tensor], Tensor], poses: list[
 def test_each_side_is_as_thick_as_its_own_surface_asks_for(
     surfaces_m: list[float], outer_m: float, inner_m: float
 ) -> None:
-    """A surface that lies so far outside the skin, in each of some poses."""
+    """The surface lies at a given height above the skin in each of some poses."""
     outer, inner = tightened(lambda y, d, pose: -pose[:, 0], surfaces_m)
     assert ((outer - outer_m).abs() <= STEP_M + 1e-6).all()
     assert ((inner - inner_m).abs() <= STEP_M + 1e-6).all()
 
 
 def test_vertices_are_tightened_each_by_what_is_seen_there() -> None:
-    """4 cm outside above the middle, at the skin below."""
+    """The surface lies 4 cm outside the skin above the middle, at the skin below it."""
     field = FastField(RIG, SETTINGS, 1)
     field.log_sharpness.data.fill_(1000.0).log_()
     field.field.residual = lambda y, d, pose: torch.where(y[:, 2] > 0.5, -0.04, 0.0)

@@ -1,4 +1,4 @@
-"""What the trainer hands to a step: which pixels, with what noise, around which bodies."""
+"""What the trainer passes to a step: which pixels, with what noise, around which bodies."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from hnerf.config import TrainingSettings
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.training import trainer as trainer_module
 from hnerf.training.auto_settings import Decision
@@ -15,13 +14,13 @@ from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import Rays
 from hnerf.training.step import PosedScene
 from hnerf.training.trainer import Trainer
-from tests.training.scene import TINY, record
+from tests.training.scene import TINY, record, tiny
 
-MACHINERIES = pytest.mark.parametrize("machinery", ["fast", "paper"])
+H_NERF = pytest.mark.parametrize("kind", ["fast", "paper"])
 
 
 class Listener(torch.nn.Module):
-    """Stands in for the objective: keeps what it is handed, in however many parts."""
+    """Stand-in for the objective that keeps its arguments, whatever the number of parts."""
 
     def __init__(self, trainer: Trainer):
         super().__init__()
@@ -32,13 +31,12 @@ class Listener(torch.nn.Module):
         return {"nothing": sum(p.sum() for p in self.trainer.objective.parameters() if p.requires_grad) * 0.0}
 
     def all(self, part: int, name: str) -> Tensor:
-        """Of all parts' rays (0) or draws (2) the tensor of this name."""
+        """Return the tensor of this name from the rays (0) or draws (2) of all parts."""
         return torch.cat([getattr(handed[part], name) for handed in self.parts])
 
 
 def trainer_of(folder: Path, **changes: Any) -> Trainer:
-    settings = TrainingSettings.model_validate(TINY.model_dump() | changes)
-    return Trainer(*record(folder / "capture"), settings, folder, Distributed(0, 1, torch.device("cpu")))
+    return Trainer(*record(folder / "capture"), tiny(**changes), folder, Distributed(0, 1, torch.device("cpu")))
 
 
 def handed_over(trainer: Trainer) -> Listener:
@@ -47,10 +45,10 @@ def handed_over(trainer: Trainer) -> Listener:
     return listener
 
 
-@MACHINERIES
-def test_noise_reaches_the_networks(tmp_path: Path, machinery: str) -> None:
-    """Of 0.1 on theta, T and v: root mean squares over the 9, 36 and 384 numbers that are drawn."""
-    trainer = trainer_of(tmp_path, machinery=machinery)
+@H_NERF
+def test_noise_reaches_the_networks(tmp_path: Path, kind: str) -> None:
+    """Noise of 0.1 on theta, T and v: root mean squares over the 9, 36 and 384 numbers drawn."""
+    trainer = trainer_of(tmp_path, kind=kind)
     listener = handed_over(trainer)
     for _, conditions, _ in listener.parts:
         for noise, least, most in (
@@ -73,7 +71,7 @@ def test_no_noise_where_none_is_asked_for(tmp_path: Path) -> None:
 
 
 def test_frames_of_novel_poses_are_not_trained_on(tmp_path: Path) -> None:
-    """Rows 0 and 1 while the field learns, row 2 when it is finished."""
+    """Rows 0 and 1 are drawn while the field learns, row 2 when it is finished."""
     trainer = trainer_of(tmp_path)
     assert handed_over(trainer).all(0, "frame").unique().tolist() == [0, 1]
     trainer.step = trainer.field_steps
@@ -81,7 +79,8 @@ def test_frames_of_novel_poses_are_not_trained_on(tmp_path: Path) -> None:
 
 
 def test_only_what_belongs_to_novel_frames_is_fitted_to_a_finished_field(tmp_path: Path) -> None:
-    """Their pose and displacement: not the field, nor training frames, nor the shape, though a loss pulls at all."""
+    """Only their pose and displacement change: neither the field nor training frames nor the shape, although a loss
+    acts on all."""
     trainer = trainer_of(tmp_path, losses=TINY.losses.model_copy(update={"increment": 1.0}))
     with torch.no_grad():
         for parameter in trainer.objective.correction.parameters():
@@ -109,8 +108,8 @@ def test_rates_rise_for_20_steps_and_fall_to_a_tenth(tmp_path: Path) -> None:
             assert rates == pytest.approx([factor * rate for rate in trainer.first_rates])
 
 
-def test_cameras_are_levelled_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Camera 2 shows red twice as bright as the others do: the person is (200, 50, 50) before a plate of 128."""
+def test_exposure_is_corrected_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Camera 2 shows red twice as bright as the others: the person is (200, 50, 50) before a plate of 128."""
     gains = dict.fromkeys("0123", (1.0, 1.0, 1.0)) | {"2": (2.0, 1.0, 1.0)}
     monkeypatch.setattr(trainer_module, "camera_gains", lambda *inputs: (gains, Decision(2.0, "twice as bright")))
     handed = handed_over(trainer_of(tmp_path, rays_per_frame=512))
@@ -122,8 +121,8 @@ def test_cameras_are_levelled_before_training(tmp_path: Path, monkeypatch: pytes
 
 
 def test_the_shell_is_tightened_with_the_bodies_until_the_field_is_finished(tmp_path: Path) -> None:
-    """From 20 cm: untrained, the surface is the skin, whose logistic of 100 a metre has settled 5 cm from it; 1.2 cm
-    are left as room. The region that rays are sampled in is the new one."""
+    """Starting from 20 cm: untrained, the surface is the skin, whose logistic of 100 per metre saturates 5 cm from it;
+    1.2 cm are left as a margin. Rays are then sampled in the new region."""
     trainer = trainer_of(tmp_path, absorb_steps=1)
     cells = (trainer.scene.region.cells == 1).sum()
     trainer.step = trainer.field_steps + 1
@@ -136,12 +135,12 @@ def test_the_shell_is_tightened_with_the_bodies_until_the_field_is_finished(tmp_
     assert (trainer.scene.region.cells == 1).sum() < 0.7 * cells
 
 
-@MACHINERIES
-def test_bodies_take_up_what_was_learned_of_them(tmp_path: Path, machinery: str) -> None:
-    """A bend of 0.1 and a move of 1 cm: then the networks are told so, and the correction is none. What both training
-    frames have in common of it, half, `fast` gives to the rest body; the novel frame is told of neither."""
-    common = 0.5 if machinery == "fast" else 0.0
-    trainer = trainer_of(tmp_path, machinery=machinery)
+@H_NERF
+def test_bodies_take_up_what_was_learned_of_them(tmp_path: Path, kind: str) -> None:
+    """After a bend of 0.1 and a move of 1 cm are absorbed, the conditions include them and the correction is zero.
+    `fast` gives what both training frames have in common, half, to the rest body; the novel frame gets neither."""
+    common = 0.5 if kind == "fast" else 0.0
+    trainer = trainer_of(tmp_path, kind=kind)
     before = trainer.conditions
     with torch.no_grad():
         trainer.objective.correction.turn[1, 0, 1] = 0.1

@@ -1,8 +1,8 @@
-"""Joint adjustment of cameras, board poses and the moments of the pictures, to the corners of a board that is moved.
+"""Bundle adjustment of cameras, board poses and exposure times to the corners of a moving board.
 
-Cameras without a common shutter picture a moving board at moments that differ by up to a frame, and differ anew in
-every frame; corners are then off by many pixels, always along the board's path. So each picture has a time offset of
-its own, and the board moves between frames as a rigid body. For a board at rest nothing depends on it.
+Cameras without a common shutter see a moving board at times that differ by up to a frame, and differently in every
+frame; corners are then off by many pixels, always along the board's path. So each image has a time offset of its own,
+and the board moves between frames as a rigid body. A board at rest does not depend on the offsets.
 """
 
 import dataclasses
@@ -16,16 +16,16 @@ from scipy.spatial.transform import Rotation
 
 from hnerf.geometry.camera import Camera
 
-LOSS_SCALE_PX = 0.5  # residuals beyond pull linearly, not quadratically (soft L1)
-FRAMES_PER_PX = 0.1  # a picture this much off its time costs as much as a corner one pixel off
+LOSS_SCALE_PX = 0.5  # larger residuals count linearly, not quadratically (soft L1)
+FRAMES_PER_PX = 0.1  # a time offset of this many frames costs as much as a corner one pixel off
 MAX_OFFSET_FRAMES = 1.0  # cameras that start together differ by no more
 MAX_ITERATIONS = 60
-COST_TOLERANCE = 1e-4  # relative; cameras then stand still to a thousandth of a degree
+COST_TOLERANCE = 1e-4  # relative; cameras then change by less than a thousandth of a degree
 
 
 @dataclass(frozen=True)
 class Poses:
-    """A board in the world for each frame: R (F, 3, 3), t_m (F, 3), world from board; identity where not seen."""
+    """Board poses in the world by frame: R (F, 3, 3), t_m (F, 3), world from board; identity where not seen."""
 
     R: np.ndarray
     t_m: np.ndarray
@@ -33,8 +33,9 @@ class Poses:
 
 @dataclass(frozen=True)
 class BoardFit:
-    """seen_px (C, F, N, 2): the corners used, undistorted, NaN where there are none; projected_px: all corners of the
-    pictures that have some. offsets_frames (C, F): when a picture was taken, after its frame's common time."""
+    """Result of the adjustment. seen_px (C, F, N, 2): the corners used, undistorted, NaN where there are none;
+    projected_px: all corners of the images that show some; offsets_frames (C, F): exposure time of an image relative to
+    its frame's common time."""
 
     cameras: list[Camera]
     boards: Poses
@@ -44,11 +45,11 @@ class BoardFit:
 
     @property
     def residuals_px(self) -> np.ndarray:
-        """(C, F, N, 2) projected less seen, NaN where not seen."""
+        """Projected minus seen corners (C, F, N, 2), NaN where not seen."""
         return self.projected_px - self.seen_px
 
     def error_px(self, camera: int | None = None) -> np.ndarray:
-        """Distances of all corners seen by one camera, or by all: (n,)."""
+        """Return the distances (n,) of all corners seen by one camera, or by all."""
         residuals_px = self.residuals_px if camera is None else self.residuals_px[camera]
         found = np.linalg.norm(residuals_px, axis=-1).ravel()
         return found[np.isfinite(found)]
@@ -62,11 +63,11 @@ def adjust(
     moving: Sequence[bool],
     frame_step: int,
 ) -> BoardFit:
-    """Least squares with a robust loss over board poses, time offsets, and the cameras that are `moving`.
+    """Minimise a robust least-squares cost over board poses, time offsets, and the cameras that are `moving`.
 
     corners_m (N, 3) on the board; corners_px (C, F, N, 2) undistorted, NaN where not seen, of every `frame_step`-th
-    frame of the footage, whose frames offsets count.
-    Rotations are updated on the left, R <- exp(w) R (Triggs et al. 2000, Bundle Adjustment, section 2.2).
+    frame of the footage; offsets are in frames of the footage. Rotations are updated on the left, R <- exp(w) R (Triggs
+    et al. 2000, Bundle Adjustment, section 2.2).
     """
     problem = _Problem(cameras, corners_m, corners_px, boards, np.asarray(moving), frame_step)
     start = np.zeros(problem.size)
@@ -87,7 +88,8 @@ def adjust(
 
 
 class _Problem:
-    """Unknowns in one vector: 6 a camera, 6 a frame (rotation, then translation), 1 a picture that shows the board."""
+    """Unknowns in one vector: 6 per camera, 6 per frame (rotation, then translation), 1 per image that shows the
+    board."""
 
     def __init__(
         self,
@@ -106,18 +108,18 @@ class _Problem:
         self.observed_px = corners_px[self.camera, self.frame][self.picture, self.corner]
         self.K = np.stack([camera.K for camera in cameras])
         count, frames = corners_px.shape[:2]
-        self.before, self.after = _neighbours(self.seen.any((0, 2)))
+        self.before, self.after = _adjacent_frames(self.seen.any((0, 2)))
         self.offsets = slice(6 * (count + frames), 6 * (count + frames) + len(self.camera))
         self.size = self.offsets.stop
 
     def residuals(self, x: np.ndarray) -> np.ndarray:
-        """Two a corner in pixels, then one a picture for its time offset."""
+        """Return two residuals per corner in pixels, then one per image for its time offset."""
         R, t_m, boards = self._poses(x)
         uv = self._project(R, t_m, boards, x[self.offsets])[self.picture, self.corner]
         return np.concatenate([(uv - self.observed_px).ravel(), x[self.offsets] / FRAMES_PER_PX])
 
     def sparsity(self) -> csr_matrix:
-        """Which residual depends on which unknown."""
+        """Return which residual depends on which unknown."""
         count, pictures = len(self.cameras), len(self.camera)
         frames = self.frame, self.before[self.frame], self.after[self.frame]
         blocks = np.stack([self.camera, *(count + frame for frame in frames)], -1)
@@ -130,7 +132,7 @@ class _Problem:
         return csr_matrix((np.ones(len(row), bool), (row, column)), shape=(last[-1] + 1, self.size))
 
     def fit(self, x: np.ndarray) -> BoardFit:
-        """The unknowns as cameras, poses and what is left over."""
+        """Return the unknowns as cameras, board poses and residuals."""
         R, t_m, boards = self._poses(x)
         cameras = [
             dataclasses.replace(camera, R=R[i], t_m=t_m[i]) if self.moving[i] else camera
@@ -143,7 +145,7 @@ class _Problem:
         return BoardFit(cameras, boards, self.corners_px, projected_px, offsets_frames)
 
     def _poses(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, Poses]:
-        """R (C, 3, 3) and t_m (C, 3) of the cameras, and the boards."""
+        """Return R (C, 3, 3) and t_m (C, 3) of the cameras, and the board poses."""
         steps = x[: self.offsets.start].reshape(-1, 6)
         of_cameras = steps[: len(self.cameras)] * self.moving[:, None]
         of_boards = steps[len(self.cameras) :]
@@ -152,17 +154,18 @@ class _Problem:
         return R, t_m, Poses(_exp(of_boards[:, :3]) @ self.boards.R, of_boards[:, 3:] + self.boards.t_m)
 
     def _project(self, R: np.ndarray, t_m: np.ndarray, boards: Poses, offsets: np.ndarray) -> np.ndarray:
-        """(pictures, N, 2) pixels of all corners."""
-        board_R, board_t_m = self._moved(boards, offsets)
+        """Return the pixels (images, N, 2) of all corners."""
+        board_R, board_t_m = self._boards_at_picture_time(boards, offsets)
         own = R[self.camera]
         to_camera, shift_m = own @ board_R, (own @ board_t_m[..., None])[..., 0] + t_m[self.camera]
         x = np.einsum("pij,nj->pni", to_camera, self.corners_m) + shift_m[:, None]
         uv = np.einsum("pij,pnj->pni", self.K[self.camera], x)
         return uv[..., :2] / uv[..., 2:]
 
-    def _moved(self, boards: Poses, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Each picture's board at the picture's own time: the parabola through its frame and the two beside it, in
-        translation and in the rotation vector away from its frame. A frame that is missing mirrors the other one."""
+    def _boards_at_picture_time(self, boards: Poses, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return each image's board pose at the image's own time: the parabola through its frame and the two adjacent
+        ones, in translation and in the rotation vector relative to its frame. A missing neighbour mirrors the other
+        one."""
         frame, s = self.frame, offsets[:, None] / self.frame_step
         own = np.arange(len(self.before))
         no_before, no_after = (self.before == own)[:, None], (self.after == own)[:, None]
@@ -177,8 +180,9 @@ class _Problem:
         return boards.R[frame] @ _exp(paths[0]), boards.t_m[frame] + paths[1]
 
 
-def _neighbours(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The frame before and the frame after each one; itself where that one is missing. seen: (F,) bool."""
+def _adjacent_frames(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the frame before and the frame after each one; the frame itself where that one is missing. seen: (F,)
+    bool."""
     own = np.arange(len(seen))
     before, after = np.maximum(own - 1, 0), np.minimum(own + 1, len(seen) - 1)
     return np.where(seen[before], before, own), np.where(seen[after], after, own)

@@ -1,4 +1,4 @@
-"""Cameras from footage of a calibration board, and what such footage says about cameras that are given."""
+"""Calibration from footage of a board, and the evidence of such footage about given cameras."""
 
 import dataclasses
 import json
@@ -17,12 +17,12 @@ from hnerf.calibration.boards.rig import (
     MIN_CORNERS,
     MIN_SHARED,
     compare_pairs,
-    flat_only,
-    linked,
+    fixes_pose,
+    largest_linked_group,
+    planar_corners,
     solve_boards,
     solve_rig,
-    undistorted,
-    whole_enough,
+    undistort_corners,
 )
 from hnerf.capture.board_footage import BoardFootage, load_board_corners, read_board_footage
 from hnerf.capture.capture import Capture
@@ -32,7 +32,7 @@ from hnerf.capture.lens import Lens
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
-MAX_TILT_DEG = 75.0  # beyond, a board is too slanted to be read
+MAX_TILT_DEG = 75.0  # a board tilted further is too slanted to be detected
 CALIBRATION_FILES = ("intri.yml", "camera_array.toml", "calibration.toml", "sparse", "calibration/Calib*.toml")
 
 log = logging.getLogger("hnerf.calibration")
@@ -40,8 +40,8 @@ log = logging.getLogger("hnerf.calibration")
 
 @dataclass(frozen=True)
 class BoardCalibration:
-    """lenses: as recorded, with distortion; intrinsics: where each came from, in words; corners_m (N, 3); corners_px
-    (C, F, N, 2): all that was found, undistorted, of which `fit` has the used ones."""
+    """Result of a board calibration. lenses: with distortion, as recorded; intrinsics: their source, in words;
+    corners_m (N, 3); corners_px (C, F, N, 2): all detected corners, undistorted; `fit` holds those used."""
 
     lenses: dict[str, Lens]
     intrinsics: dict[str, str]
@@ -50,7 +50,7 @@ class BoardCalibration:
     fit: BoardFit
 
     def report(self) -> dict[str, Any]:
-        """What `report.json` holds. Residuals in undistorted pixels, offsets in frames of the footage."""
+        """Return the content of `report.json`. Residuals in undistorted pixels, offsets in frames of the footage."""
         visible, found = visible_and_found(self.fit, self.corners_m)
         cameras = {
             camera.name: _figures(self.fit, i)
@@ -73,11 +73,11 @@ class BoardCalibration:
 
 
 def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> BoardCalibration:
-    """Cameras from the board footage in a folder's `calibration/`.
+    """Calibrate the cameras from the board footage in a folder's `calibration/`.
 
     Intrinsics come from calibration/intrinsic/, else from the folder's calibration files, else from
     calibration/extrinsic/ itself. The world is the first camera, or the board as it lies in frame `ground_frame` (Z up,
-    origin at its top left corner). InputError where the footage does not hold what is needed.
+    origin at its top left corner). Raises InputError if the footage lacks what is needed.
     """
     footage = read_board_footage(folder, "extrinsic", ground_frame)
     if footage is None:
@@ -88,21 +88,21 @@ def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> Boar
     _check_board_found(footage)
     lenses, intrinsics = _intrinsics(folder, footage)
     corners_m = footage.board.corners_m
-    corners_px = np.stack([undistorted(footage.corners_px[name], lens) for name, lens in lenses.items()])
+    corners_px = np.stack([undistort_corners(footage.corners_px[name], lens) for name, lens in lenses.items()])
     cameras = [Camera(n, lens.K, np.eye(3), np.zeros(3), *footage.sizes_px[n]) for n, lens in lenses.items()]
     log.info("adjusting %d cameras to %d corners", len(cameras), int(np.isfinite(corners_px[..., 0]).sum()))
-    fit = solve_rig(cameras, corners_m, flat_only(corners_m, corners_px), footage.frame_step)
+    fit = solve_rig(cameras, corners_m, planar_corners(corners_m, corners_px), footage.frame_step)
     if ground_frame is not None:
         fit = _on_ground(fit, footage, ground_frame)
     lenses = {c.name: dataclasses.replace(lenses[c.name], R=c.R, t_m=c.t_m) for c in fit.cameras}
     return BoardCalibration(lenses, intrinsics, corners_m, corners_px, fit)
 
 
-def board_witness(capture: Capture) -> dict[str, Any] | None:
-    """What board footage says about a capture's cameras; None where the recording has none.
+def board_evidence(capture: Capture) -> dict[str, Any] | None:
+    """Return what board footage says about a capture's cameras; None if the recording has none.
 
     "cameras": per camera the corners' distances (px) from the board that all cameras agree on, with the cameras as
-    given, and as `footage_rms_px` with those that the footage itself gives. "pairs": `compare_pairs` of the two.
+    given, and as `footage_rms_px` with those estimated from the footage itself. "pairs": `compare_pairs` of the two.
     "unlinked_cameras": those that never see the board together with the others, about which nothing is known.
     """
     stored = load_board_corners(capture.root)
@@ -110,8 +110,8 @@ def board_witness(capture: Capture) -> dict[str, Any] | None:
         return None
     known = [i for i, name in enumerate(stored.cameras) if name in capture.cameras]
     cameras, corners_px = [capture.cameras[stored.cameras[i]] for i in known], stored.corners_px[known]
-    corners_px = flat_only(stored.corners_m, corners_px)
-    chosen = linked(corners_px)
+    corners_px = planar_corners(stored.corners_m, corners_px)
+    chosen = largest_linked_group(corners_px)
     names = [camera.name for camera in cameras]
     if len(chosen) < 2:
         return {"frames": corners_px.shape[1], "cameras": {}, "pairs": {}, "unlinked_cameras": names}
@@ -130,10 +130,11 @@ def board_witness(capture: Capture) -> dict[str, Any] | None:
 
 
 def visible_and_found(fit: BoardFit, corners_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(C, F) bool twice: where a camera must be able to see the board, and where it was found, whole enough both times.
+    """Return two masks (C, F) bool: where a camera must see the board, and where the board was found with enough
+    corners to fix its pose.
 
-    Visible: another camera found it, and placed as the fit has it, at least MIN_CORNERS corners fall into this camera's
-    picture and the board faces it within MAX_TILT_DEG. Hands and heads in the way are not known: such pictures count.
+    Visible: another camera found it and, placed as the fit has it, at least MIN_CORNERS corners fall into this camera's
+    image and the board faces it within MAX_TILT_DEG. Occlusion is not known, so occluded images count as visible.
     """
     found = np.isfinite(fit.residuals_px[..., 0]).sum(-1) >= MIN_CORNERS
     corners = np.einsum("fij,nj->fni", fit.boards.R, corners_m) + fit.boards.t_m[:, None]
@@ -149,9 +150,10 @@ def visible_and_found(fit: BoardFit, corners_m: np.ndarray) -> tuple[np.ndarray,
 
 
 def _check_board_found(footage: BoardFootage) -> None:
-    """InputError where no camera sees enough of the board to be linked: it is hardly the board that is described."""
+    """Raise InputError if no camera sees enough of the board to be linked: the footage probably shows another board
+    than described."""
     corners_px = np.stack(list(footage.corners_px.values()))
-    found = whole_enough(footage.board.corners_m, np.isfinite(corners_px[..., 0]))
+    found = fixes_pose(footage.board.corners_m, np.isfinite(corners_px[..., 0]))
     if found.sum(1).max() < MIN_SHARED:
         raise InputError(
             f"{footage.path}: this board was found in {found.sum()} of {found.size} pictures; check its columns, rows, "
@@ -160,7 +162,7 @@ def _check_board_found(footage: BoardFootage) -> None:
 
 
 def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], dict[str, str]]:
-    """Of every camera in the extrinsic footage, and where they come from in words."""
+    """Return the lens of every camera in the extrinsic footage, and where it comes from, in words."""
     close = read_board_footage(folder, "intrinsic")
     given = recognise(folder).lenses() if any(any(folder.glob(name)) for name in CALIBRATION_FILES) else {}
     lenses, words = {}, {}
@@ -169,8 +171,8 @@ def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], d
         found = estimate_lens(name, source.board.corners_m, source.corners_px[name], source.sizes_px[name])
         if source is footage and name in given:
             lenses[name], words[name] = given[name], f"given; {_compared(found, given[name])}"
-        elif found.believed:
-            lenses[name], words[name] = found.believed, f"from {source.path.name}/: {found.certainty}"
+        elif found.reliable_lens:
+            lenses[name], words[name] = found.reliable_lens, f"from {source.path.name}/: {found.certainty}"
         else:
             raise InputError(
                 f"{source.path / name}: does not fix the intrinsics ({found.certainty}); film the board closer, "
@@ -187,14 +189,15 @@ def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], d
 
 
 def _compared(found: LensEstimate, given: Lens) -> str:
-    if found.believed is None:
+    if found.reliable_lens is None:
         return f"not verified by the footage ({found.certainty})"
-    differs = 100 * (found.believed.K[0, 0] / given.K[0, 0] - 1)
+    differs = 100 * (found.reliable_lens.K[0, 0] / given.K[0, 0] - 1)
     return f"the footage's own focal length differs by {differs:+.1f} % ({found.certainty})"
 
 
 def _on_ground(fit: BoardFit, footage: BoardFootage, ground_frame: int) -> BoardFit:
-    """The rig in the world whose origin and floor are the board in one frame. The board's z is down: turned about x."""
+    """Return the rig in the world whose origin and floor are the board in one frame. The board's z points down, so it
+    is turned about x."""
     index = footage.frames.index(ground_frame) if ground_frame in footage.frames else -1
     if index < 0 or not np.isfinite(fit.residuals_px[:, index]).any():
         raise InputError(f"{footage.path}: no board in frame {ground_frame}; name a frame in which it lies flat")
@@ -206,7 +209,7 @@ def _on_ground(fit: BoardFit, footage: BoardFootage, ground_frame: int) -> Board
 
 
 def _figures(fit: BoardFit, camera: int) -> dict[str, Any]:
-    """What one camera's corners say."""
+    """Return the statistics of one camera's corners."""
     error_px, offsets = fit.error_px(camera), fit.offsets_frames[camera]
     offsets = offsets[np.isfinite(offsets)]
     at = np.quantile(offsets, [0.05, 0.5, 0.95]).tolist() if len(offsets) else None

@@ -1,52 +1,53 @@
-"""One camera's intrinsics from pictures of a board, and whether the pictures suffice."""
+"""Intrinsics of one camera from images of a board, and whether the images suffice."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from hnerf.calibration.boards.rig import whole_enough
+from hnerf.calibration.boards.rig import fixes_pose
 from hnerf.capture.lens import Lens
 from hnerf.evenly_spaced import evenly_spaced
 
-MAX_PICTURES = 40  # evenly chosen
+MAX_PICTURES = 40  # evenly spaced
 MIN_PICTURES = 10
-MIN_TILTED = 5  # of the pictures: boards parallel to the image say nothing about the focal length, nor does its spread
+MIN_TILTED = 5  # images; boards parallel to the image plane say nothing about the focal length or its error
 TILT_DEG = 15.0
-MAX_FOCAL_SPREAD = 0.01  # standard deviation of an estimated focal length that is still believed, relative
+MAX_FOCAL_STD = 0.01  # relative standard deviation up to which a focal length is trusted
 
 
 @dataclass(frozen=True)
 class LensEstimate:
-    """pictures: used; lens: None if they are too few; tilted: those of them with the board TILT_DEG or more out of
-    the image plane; focal_spread: the focal length's relative standard deviation."""
+    """Estimated lens. pictures: number of images used; lens: None if they are too few; tilted: how many of them show
+    the board TILT_DEG or more out of the image plane; focal_std: the focal length's relative standard deviation."""
 
     pictures: int
     lens: Lens | None = None
     tilted: int = 0
-    focal_spread: float = np.inf
+    focal_std: float = np.inf
 
     @property
-    def believed(self) -> Lens | None:
-        """The lens if the pictures fix it."""
-        return self.lens if self.focal_spread <= MAX_FOCAL_SPREAD and self.tilted >= MIN_TILTED else None
+    def reliable_lens(self) -> Lens | None:
+        """The lens if the images determine it, else None."""
+        return self.lens if self.focal_std <= MAX_FOCAL_STD and self.tilted >= MIN_TILTED else None
 
     @property
     def certainty(self) -> str:
-        """In words."""
+        """How well the lens is known, in words."""
         if self.lens is None:
             return f"{self.pictures} pictures of the board where {MIN_PICTURES} are needed"
-        known = f"focal length known to {100 * self.focal_spread:.1f} %"
+        known = f"focal length known to {100 * self.focal_std:.1f} %"
         return f"{self.pictures} pictures of the board, {self.tilted} of them tilted, {known}"
 
 
 def estimate_lens(name: str, corners_m: np.ndarray, corners_px: np.ndarray, size_px: tuple[int, int]) -> LensEstimate:
-    """Intrinsics and distortion k1 k2 p1 p2 from corners_px (F, N, 2) as recorded, NaN where not seen (Zhang 2000).
+    """Estimate intrinsics and distortion k1 k2 p1 p2 from corners_px (F, N, 2) as recorded, NaN where not seen (Zhang
+    2000).
 
     The standard deviation is that of the least squares (cv2.calibrateCameraExtended).
     """
     chosen = evenly_spaced(
-        np.flatnonzero(whole_enough(corners_m, np.isfinite(corners_px[..., 0]))).tolist(), MAX_PICTURES
+        np.flatnonzero(fixes_pose(corners_m, np.isfinite(corners_px[..., 0]))).tolist(), MAX_PICTURES
     )
     if len(chosen) < MIN_PICTURES:
         return LensEstimate(len(chosen))

@@ -1,4 +1,4 @@
-"""Board corners as a picture: where each camera found them, and by how much the calibration misses them."""
+"""Plot of board corners: where each camera found them, and the residuals of the calibration."""
 
 from pathlib import Path
 
@@ -7,12 +7,12 @@ from matplotlib.figure import Figure
 
 from hnerf.calibration.boards.bundle import BoardFit
 
-MAGNIFIED = 50  # arrows, against the picture
+MAGNIFIED = 50  # length of the arrows relative to the image
 COLUMNS = 4
 
 
 def draw_boards(path: Path, fit: BoardFit) -> None:
-    """Write one panel a camera as PNG: corners coloured by frame, arrows from seen to projected."""
+    """Write one panel per camera as PNG: corners coloured by frame, arrows from seen to projected."""
     count = len(fit.cameras)
     columns = min(count, COLUMNS)
     rows = -(-count // columns)

@@ -1,4 +1,4 @@
-"""The poses of cameras that see one board: relative poses of pairs, chained, then adjusted together."""
+"""Camera poses from a common board: relative poses of pairs, chained, then adjusted together."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -14,40 +14,43 @@ from hnerf.capture.normalise import UNDISTORTED
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
-MIN_CORNERS = 6  # that a picture must show to be used: the pose of a plane from 12 numbers
-FLATNESS_PX = 1.0  # by which a corner may miss the plane that the others of its picture lie on
+MIN_CORNERS = 6  # that an image must show to be used: 12 numbers for the pose of a plane
+FLATNESS_PX = 1.0  # by which a corner may be off the plane of the others in its image
 MIN_SHARED = 3  # frames in which two cameras must both see the board
-FAR_PX = 100.0  # a camera further off than this must not decide where the board is
+FAR_PX = 100.0  # cap of a corner's error, so that a camera far off does not decide where the board is
 
 Pose = tuple[np.ndarray, np.ndarray]  # R (3, 3), t_m (3,)
 Views = dict[tuple[int, int], Pose]  # camera from board, by (camera, frame)
 
 
-def whole_enough(corners_m: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """(...,) bool: whether the corners seen (..., N) bool fix a pose: enough, and two or more in each of two rows."""
+def fixes_pose(corners_m: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Return (...,) bool: whether the corners seen (..., N) bool determine a pose: enough of them, with two or more in
+    each of two rows."""
     rows = np.unique(corners_m[:, 1])
     in_row = np.stack([seen[..., corners_m[:, 1] == row].sum(-1) for row in rows], -1)
     return (seen.sum(-1) >= MIN_CORNERS) & ((in_row >= 2).sum(-1) >= 2)
 
 
-def flat_only(corners_m: np.ndarray, corners_px: np.ndarray) -> np.ndarray:
-    """(C, F, N, 2) without corners off the plane of their picture's others, nor pictures that are not whole enough.
+def planar_corners(corners_m: np.ndarray, corners_px: np.ndarray) -> np.ndarray:
+    """Return corners (C, F, N, 2) without those off the plane of the others in their image, and without images whose
+    corners no longer determine a pose.
 
-    A board's undistorted corners are a homography of the flat ones, whatever the cameras' poses.
+    The undistorted corners of a board are a homography of the flat ones, whatever the cameras' poses.
     """
     kept = np.full_like(corners_px, np.nan)
-    for picture in zip(*np.nonzero(whole_enough(corners_m, np.isfinite(corners_px[..., 0]))), strict=True):
+    for picture in zip(*np.nonzero(fixes_pose(corners_m, np.isfinite(corners_px[..., 0]))), strict=True):
         seen = np.isfinite(corners_px[picture][:, 0])
         _, inlier = cv2.findHomography(corners_m[seen, :2], corners_px[picture][seen], cv2.RANSAC, FLATNESS_PX)
         flat = seen.copy()
         flat[seen] = inlier is not None and inlier.ravel() > 0
-        if whole_enough(corners_m, flat):
+        if fixes_pose(corners_m, flat):
             kept[picture][flat] = corners_px[picture][flat]
     return kept
 
 
-def linked(corners_px: np.ndarray) -> np.ndarray:
-    """Indices of the most cameras that shared views of the board link. corners_px (C, F, N, 2) of `flat_only`."""
+def largest_linked_group(corners_px: np.ndarray) -> np.ndarray:
+    """Return the indices of the largest group of cameras linked by shared views of the board. corners_px (C, F, N, 2)
+    of `planar_corners`."""
     found = np.isfinite(corners_px[..., 0]).any(-1).astype(int)
     _, group = connected_components(found @ found.T >= MIN_SHARED)
     return np.flatnonzero(group == np.bincount(group, minlength=1).argmax())
@@ -56,19 +59,19 @@ def linked(corners_px: np.ndarray) -> np.ndarray:
 def solve_rig(
     cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np.ndarray, frame_step: int = 1
 ) -> BoardFit:
-    """Poses of cameras of which only the intrinsics are known, the first being the world.
+    """Solve for the poses of cameras with known intrinsics; the first camera is the world.
 
-    corners_m (N, 3); corners_px (C, F, N, 2) undistorted, NaN where not seen, of `flat_only`, in every `frame_step`-th
-    frame of the footage. InputError if the board does not link them.
+    corners_m (N, 3); corners_px (C, F, N, 2) undistorted, NaN where not seen, of `planar_corners`, in every
+    `frame_step`-th frame of the footage. Raises InputError if the board does not link them.
     """
-    alone = ", ".join(cameras[i].name for i in set(range(len(cameras))).difference(linked(corners_px)))
+    alone = ", ".join(cameras[i].name for i in set(range(len(cameras))).difference(largest_linked_group(corners_px)))
     if alone:
         raise InputError(
             f"calibration/extrinsic: camera {alone}: shares fewer than {MIN_SHARED} frames of the board with the other "
             "cameras; film it where two cameras see it at once"
         )
     views = _view_poses(cameras, corners_m, corners_px)
-    cameras = _chained(cameras, views)
+    cameras = _chain_poses(cameras, views)
     boards = _board_poses(cameras, corners_m, corners_px, views)
     return adjust(cameras, corners_m, corners_px, boards, [i > 0 for i in range(len(cameras))], frame_step)
 
@@ -76,17 +79,19 @@ def solve_rig(
 def solve_boards(
     cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np.ndarray, frame_step: int = 1
 ) -> BoardFit:
-    """As `solve_rig`, with cameras that stay as they are."""
+    """Solve as `solve_rig` does, with fixed cameras."""
     boards = _board_poses(cameras, corners_m, corners_px, _view_poses(cameras, corners_m, corners_px))
     return adjust(cameras, corners_m, corners_px, boards, [False] * len(cameras), frame_step)
 
 
 def compare_pairs(cameras: Sequence[Camera], others: Sequence[Camera]) -> dict[str, dict[str, float]]:
-    """How the relative pose of each pair differs between two calibrations of the same cameras: by "a-b", the angle in
-    degrees and the distance between b's two centres as a sees them, in cm."""
+    """Return how the relative pose of each pair differs between two calibrations of the same cameras: by "a-b", the
+    angle in degrees, and the distance in cm between b's two centres in a's frame."""
     pairs = {}
     for i, j in combinations(range(len(cameras)), 2):
-        (R, t_m), (other_R, other_t_m) = (_step(*((c.R, c.t_m) for c in (rig[i], rig[j]))) for rig in (cameras, others))
+        (R, t_m), (other_R, other_t_m) = (
+            _relative_pose(*((c.R, c.t_m) for c in (rig[i], rig[j]))) for rig in (cameras, others)
+        )
         turned_deg = np.rad2deg(np.linalg.norm(cv2.Rodrigues(R @ other_R.T)[0]))
         moved_cm = 100 * np.linalg.norm(R.T @ t_m - other_R.T @ other_t_m)
         pairs[f"{cameras[i].name}-{cameras[j].name}"] = {"turned_deg": float(turned_deg), "moved_cm": float(moved_cm)}
@@ -94,7 +99,7 @@ def compare_pairs(cameras: Sequence[Camera], others: Sequence[Camera]) -> dict[s
 
 
 def _view_poses(cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np.ndarray) -> Views:
-    """Of every picture that `flat_only` left."""
+    """Return the board pose in each image that `planar_corners` kept."""
     poses: Views = {}
     for i, f in zip(*np.nonzero(np.isfinite(corners_px[..., 0]).any(-1)), strict=True):
         seen = np.isfinite(corners_px[i, f, :, 0])
@@ -105,8 +110,9 @@ def _view_poses(cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np
     return poses
 
 
-def _chained(cameras: Sequence[Camera], views: Views) -> list[Camera]:
-    """Poses over the tree of pairs that share most frames; the first camera is the world."""
+def _chain_poses(cameras: Sequence[Camera], views: Views) -> list[Camera]:
+    """Return camera poses chained over the spanning tree of the pairs that share most frames; the first camera is the
+    world."""
     count = len(cameras)
     shared = {(i, j): [f for (k, f) in views if k == i and (j, f) in views] for i, j in combinations(range(count), 2)}
     cost = np.zeros((count, count))
@@ -117,13 +123,14 @@ def _chained(cameras: Sequence[Camera], views: Views) -> list[Camera]:
     for j in order[1:]:
         parent = posed[parents[j]]
         frames = shared[min(j, parents[j]), max(j, parents[j])]
-        R, t_m = _typical([_step(views[parents[j], f], views[j, f]) for f in frames])
+        R, t_m = _robust_pose([_relative_pose(views[parents[j], f], views[j, f]) for f in frames])
         posed[j] = dataclasses.replace(cameras[j], R=R @ parent.R, t_m=R @ parent.t_m + t_m)
     return posed
 
 
-def _typical(steps: list[Pose]) -> Pose:
-    """The rotation nearest to all others in sum (their medoid), and the median translation of the nearer half."""
+def _robust_pose(steps: list[Pose]) -> Pose:
+    """Return the medoid of the rotations (least sum of angles to the others) and the median translation of the half
+    closest to it."""
     R, t_m = np.stack([step[0] for step in steps]), np.stack([step[1] for step in steps])
     cosines = (np.einsum("aij,bij->ab", R, R) - 1) / 2
     angles = np.arccos(np.clip(cosines, -1, 1))
@@ -133,7 +140,8 @@ def _typical(steps: list[Pose]) -> Pose:
 
 
 def _board_poses(cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: np.ndarray, views: Views) -> Poses:
-    """World from board for each frame: of the poses that single cameras see, the one that suits all of them best."""
+    """Return the board pose in the world for each frame: of the poses seen by single cameras, the one that fits all
+    cameras best."""
     frames = corners_px.shape[1]
     R, t_m, best_px = np.tile(np.eye(3), (frames, 1, 1)), np.zeros((frames, 3)), np.full(frames, np.inf)
     for (i, f), (view_R, view_t_m) in views.items():
@@ -147,13 +155,13 @@ def _board_poses(cameras: Sequence[Camera], corners_m: np.ndarray, corners_px: n
     return Poses(R, t_m)
 
 
-def undistorted(corners_px: np.ndarray, lens: Lens) -> np.ndarray:
-    """(..., 2) pixels as recorded to those of the linear camera with the same K; NaN stays."""
+def undistort_corners(corners_px: np.ndarray, lens: Lens) -> np.ndarray:
+    """Map pixels (..., 2) as recorded to those of the pinhole camera with the same K; NaN stays."""
     flat = cv2.undistortPoints(corners_px.reshape(-1, 1, 2), lens.K, lens.distortion, P=lens.K, criteria=UNDISTORTED)
     return flat.reshape(corners_px.shape)
 
 
-def _step(a: Pose, b: Pose) -> Pose:
-    """b from a, where both are given from a third frame."""
+def _relative_pose(a: Pose, b: Pose) -> Pose:
+    """Return b from a, where both are given from a third frame."""
     R = b[0] @ a[0].T
     return R, b[1] - R @ a[1]

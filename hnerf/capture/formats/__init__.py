@@ -1,1 +1,1 @@
-"""One adapter per layout on disk; nothing past `hnerf.capture.ingest` knows about formats."""
+"""Adapters, one for each layout on disk; nothing beyond `hnerf.capture.ingest` knows about formats."""

@@ -1,6 +1,6 @@
 """Calibrations in TOML: Caliscope's `camera_array.toml` and aniposelib's `calibration.toml`, world to camera.
 
-Pictures and all else lie as in the EasyMocap layout. Caliscope names the footage of its camera 0 `cam_0`.
+Images and everything else are laid out as in the EasyMocap layout. Caliscope names the footage of its camera 0 `cam_0`.
 """
 
 import re
@@ -21,15 +21,15 @@ FILES = ("camera_array.toml", "calibration.toml")
 
 
 class Caliscope(EasyMocap):
-    """A folder with camera_array.toml, or calibration.toml; metres in the former, the board's unit in the latter."""
+    """A capture folder with camera_array.toml, in metres, or with calibration.toml, in the board's unit."""
 
     @staticmethod
     def recognises(folder: Path) -> bool:
-        """Whether the folder looks like this layout."""
+        """Return whether the folder looks like this layout."""
         return not (folder / "intri.yml").exists() and any((folder / name).exists() for name in FILES)
 
     def lenses(self) -> dict[str, Lens]:
-        """Every camera that the file calibrates and does not ignore."""
+        """Return every camera that the file calibrates and does not ignore."""
         caliscope = path_in_capture(self.folder, "camera_array.toml")
         path = caliscope if caliscope.exists() else path_in_capture(self.folder, "calibration.toml")
         tables = _caliscope_tables(path) if path == caliscope else _aniposelib_tables(path)
@@ -40,8 +40,8 @@ class Caliscope(EasyMocap):
 
 
 def write_caliscope(out: Path, lenses: Sequence[Lens]) -> None:
-    """`camera_array.toml`; cameras are numbered in their order, unless all are called cam_<number> already (without
-    leading zeros, which are no numbers in TOML). InputError on a lens without size."""
+    """Write `camera_array.toml`. Cameras are numbered in their order, unless all are called cam_<number> already
+    (without leading zeros, which TOML numbers do not have). Raises InputError on a lens without size."""
     numbers = [lens.name.removeprefix("cam_") for lens in lenses]
     if not all(re.fullmatch("cam_(0|[1-9][0-9]*)", lens.name) for lens in lenses):
         numbers = [str(i) for i in range(len(lenses))]
@@ -54,7 +54,8 @@ def write_caliscope(out: Path, lenses: Sequence[Lens]) -> None:
 
 
 def write_aniposelib(out: Path, lenses: Sequence[Lens]) -> None:
-    """`calibration.toml`, in metres; Pose2Sim reads it as `Calib.toml`, too. InputError on a lens without size."""
+    """Write `calibration.toml`, in metres; Pose2Sim reads it as `Calib.toml`, too. Raises InputError on a lens without
+    size."""
     tables = (
         f'[cam_{i}]\nname = "{lens.name}"\n{_numbers(lens)}rotation = {cv2.Rodrigues(lens.R)[0].ravel().tolist()}\n'
         for i, lens in enumerate(lenses)
@@ -63,12 +64,14 @@ def write_aniposelib(out: Path, lenses: Sequence[Lens]) -> None:
 
 
 def _numbers(lens: Lens) -> str:
+    """Return the lines of a camera that both formats share."""
     distortions = np.pad(lens.distortion, (0, 5 - len(lens.distortion))).tolist()
     matrix = f"matrix = {lens.K.tolist()}\ndistortions = {distortions}\n"
     return f"size = {list(known_size(lens))}\n{matrix}fisheye = false\ntranslation = {lens.t_m.tolist()}\n"
 
 
 def _caliscope_tables(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the tables of cameras that are not ignored, with their names."""
     cameras = read_toml(path).get("cameras")
     if not isinstance(cameras, dict) or not all(isinstance(table, dict) for table in cameras.values()):
         raise InputError(f"{path}: no tables [cameras.<number>]; calibrate again with Caliscope")
@@ -80,4 +83,5 @@ def _caliscope_tables(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _aniposelib_tables(path: Path) -> dict[str, Any]:
+    """Return the tables of cameras."""
     return {key: table for key, table in read_toml(path).items() if key != "metadata"}

@@ -1,7 +1,7 @@
 """COLMAP models, `sparse/0/{cameras,images}.{bin,txt}`: world to camera, pixel centres at one half.
 
-Pictures and all else lie as in the EasyMocap layout; a model's image `01.jpg` or `01/000000.jpg` is camera `01`.
-COLMAP's own reader takes the counts in a binary file at their word and fills the memory, so reading is done here.
+Images and everything else are laid out as in the EasyMocap layout; a model's image `01.jpg` or `01/000000.jpg` is
+camera `01`. COLMAP's own reader trusts the counts in a binary file and can fill the memory, so files are parsed here.
 """
 
 import struct
@@ -18,11 +18,11 @@ from hnerf.capture.lens import Lens, checked_lens, known_size
 from hnerf.capture.safe_io import check_camera_name, path_in_capture, read_bytes, read_text
 from hnerf.errors import InputError
 
-PIXEL_CENTRE = 0.5  # COLMAP's; here a pixel's centre is at its integer coordinates
+PIXEL_CENTRE = 0.5  # in COLMAP; here pixel centres have integer coordinates
 MAX_BYTES = 256_000_000
 POINT_BYTES = 24  # x, y, number of the 3-D point
 
-# COLMAP's src/colmap/sensor/models.h: number in binary files, and where its parameters stand among
+# COLMAP's src/colmap/sensor/models.h: number in binary files, and the places of its parameters among
 # fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6 (a single focal length is both fx and fy).
 FX_FY = (0, 1)
 MODELS: dict[str, tuple[int, tuple[tuple[int, ...], ...]]] = {
@@ -46,21 +46,23 @@ class _Shot(NamedTuple):
 
 
 class _Optics(NamedTuple):
+    """One camera of a model: its intrinsics as COLMAP's parameters."""
+
     model: str
     size_px: tuple[int, int]
     parameters: tuple[float, ...]
 
 
 class Colmap(EasyMocap):
-    """A folder with a COLMAP model in sparse/0 (or sparse/); its unit of length is arbitrary."""
+    """A capture folder with a COLMAP model in sparse/0 (or sparse/); its unit of length is arbitrary."""
 
     @staticmethod
     def recognises(folder: Path) -> bool:
-        """Whether the folder looks like this layout."""
+        """Return whether the folder looks like this layout."""
         return (folder / "sparse").is_dir() and not (folder / "intri.yml").exists()
 
     def lenses(self) -> dict[str, Lens]:
-        """One camera for each image of the model."""
+        """Return one camera for each image of the model."""
         cameras, images = _model_file(self.folder, "cameras"), _model_file(self.folder, "images")
         optics_of = _parsed(cameras, {".bin": _optics_from_binary, ".txt": _optics_from_text})
         shots = _parsed(images, {".bin": _shots_from_binary, ".txt": _shots_from_text})
@@ -78,7 +80,8 @@ class Colmap(EasyMocap):
 
 
 def write_colmap(out: Path, lenses: Sequence[Lens]) -> None:
-    """`sparse/0` as text, an image `<camera>/000000.jpg` a camera, no points; InputError on a lens without size."""
+    """Write `sparse/0` as text, with an image `<camera>/000000.jpg` for each camera and no points. Raises InputError on
+    a lens without size."""
     model = pycolmap.Reconstruction()
     for number, lens in enumerate(lenses, start=1):
         name, parameters = _colmap_parameters(lens)
@@ -94,7 +97,7 @@ def write_colmap(out: Path, lenses: Sequence[Lens]) -> None:
 
 
 def _colmap_parameters(lens: Lens) -> tuple[str, list[float]]:
-    """The simplest model that holds the lens, and its parameters."""
+    """Return the simplest model that can express the lens, and its parameters."""
     K, distortion = lens.K, lens.distortion.tolist()
     linear = [K[0, 0], K[1, 1], K[0, 2] + PIXEL_CENTRE, K[1, 2] + PIXEL_CENTRE]
     if not any(distortion):
@@ -105,17 +108,18 @@ def _colmap_parameters(lens: Lens) -> tuple[str, list[float]]:
 
 
 def _lens(sources: tuple[Path, Path], shot: _Shot, optics: _Optics) -> Lens:
+    """Return the lens of one image. Raises InputError if its camera cannot be used."""
     _, places = MODELS[optics.model]
     values = np.zeros(12)
     for value, place in zip(optics.parameters, places, strict=True):
         values[list(place)] = value
     if values[9:].any():
-        raise InputError(f"{sources[0]}: camera {shot.camera_id}: k4 to k6 are not read; undistort its images first")
+        raise InputError(f"{sources[0]}: camera {shot.camera_id}: k4 to k6 are not supported; undistort its images")
     fx, fy, cx, cy = values[:4]
     quaternion = np.array(shot.pose[:4])
     norm = np.linalg.norm(quaternion)
     if not 0.5 < norm < 2:
-        raise InputError(f"{sources[1]}: image {shot.name}: its quaternion is none; reconstruct again")
+        raise InputError(f"{sources[1]}: image {shot.name}: its quaternion is not of unit length; reconstruct again")
     return checked_lens(
         sources=sources,
         name=check_camera_name(PurePosixPath(shot.name.split("/")[0]).stem, sources[1]),
@@ -128,7 +132,7 @@ def _lens(sources: tuple[Path, Path], shot: _Shot, optics: _Optics) -> Lens:
 
 
 def _model_file(folder: Path, stem: str) -> Path:
-    """The binary file, else the text, in sparse/0, else in sparse."""
+    """Return the binary file, else the text file, in sparse/0, else in sparse. Raises InputError if there is none."""
     for parts in (("sparse", "0"), ("sparse",)):
         for suffix in (".bin", ".txt"):
             path = path_in_capture(folder, *parts, stem + suffix)
@@ -138,15 +142,16 @@ def _model_file(folder: Path, stem: str) -> Path:
 
 
 def _parsed(path: Path, parsers: dict[str, Callable[[Path], Parsed]]) -> Parsed:
+    """Parse a file by its suffix. Raises InputError if that fails."""
     try:
         return parsers[path.suffix](path)
     except (IndexError, KeyError, OverflowError, TypeError, ValueError, struct.error):
         known = ", ".join(MODELS)
-        raise InputError(f"{path}: no model of COLMAP's, or of other cameras than {known}; export it again") from None
+        raise InputError(f"{path}: not a COLMAP model, or of other cameras than {known}; export it again") from None
 
 
 def _optics_from_text(path: Path) -> dict[int, _Optics]:
-    """Lines of CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]."""
+    """Parse lines of CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]."""
     rows = [line.split() for line in _lines(path) if line]
     return {
         int(number): _optics(model, int(width_px), int(height_px), tuple(map(float, parameters)))
@@ -155,7 +160,7 @@ def _optics_from_text(path: Path) -> dict[int, _Optics]:
 
 
 def _shots_from_text(path: Path) -> list[_Shot]:
-    """Pairs of lines: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and its points, which may be none."""
+    """Parse pairs of lines: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points, which may be none."""
     shots = []
     for line in _lines(path)[::2]:
         _, *pose, camera_id, name = line.split(maxsplit=9)
@@ -164,12 +169,14 @@ def _shots_from_text(path: Path) -> list[_Shot]:
 
 
 def _lines(path: Path) -> list[str]:
+    """Return the lines that are no comments, without trailing blank ones."""
     text = read_text(path, MAX_BYTES)
     return [line.strip() for line in text.rstrip().split("\n") if not line.startswith("#")]
 
 
 def _optics_from_binary(path: Path) -> dict[int, _Optics]:
-    """uint64 count; of each camera int32 id, int32 model, uint64 width, uint64 height, its parameters in double."""
+    """Parse a uint64 count, then for each camera int32 id, int32 model, uint64 width, uint64 height, its parameters in
+    double."""
     data = read_bytes(path, MAX_BYTES)
     (count,), at = struct.unpack_from("<Q", data), 8
     found: dict[int, _Optics] = {}
@@ -184,8 +191,8 @@ def _optics_from_binary(path: Path) -> dict[int, _Optics]:
 
 
 def _shots_from_binary(path: Path) -> list[_Shot]:
-    """uint64 count; of each image uint32 id, quaternion and translation in double, uint32 camera, its name ending in 0,
-    uint64 number of points, the points."""
+    """Parse a uint64 count, then for each image uint32 id, quaternion and translation in double, uint32 camera, its
+    name ending in 0, uint64 number of points, the points."""
     data = read_bytes(path, MAX_BYTES)
     (count,), at = struct.unpack_from("<Q", data), 8
     shots = []
@@ -199,6 +206,7 @@ def _shots_from_binary(path: Path) -> list[_Shot]:
 
 
 def _optics(model: str, width_px: int, height_px: int, parameters: tuple[float, ...]) -> _Optics:
+    """Return a camera of the model. Raises ValueError if its number of parameters is wrong."""
     if len(parameters) != len(MODELS[model][1]):
         raise ValueError(model)
     return _Optics(model, (width_px, height_px), parameters)

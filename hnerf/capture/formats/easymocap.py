@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from hnerf.capture.footage import Footage, ImageFolder, Video
-from hnerf.capture.formats.layout import Layout, Stored
+from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.lens import Lens, checked_lens
 from hnerf.capture.safe_io import (
     IMAGE_SUFFIXES,
@@ -29,22 +29,22 @@ MAX_CALIBRATION_BYTES = 1_000_000
 
 @dataclass(frozen=True)
 class EasyMocap(Layout):
-    """A folder as EasyMocap's own tools read it (its `read_camera`): world to camera, OpenCV axes."""
+    """A capture folder as EasyMocap's own tools read it (its `read_camera`): world to camera, OpenCV axes."""
 
     @staticmethod
     def recognises(folder: Path) -> bool:
-        """Whether the folder looks like this layout."""
+        """Return whether the folder looks like this layout."""
         return any((folder / name).exists() for name in ("intri.yml", "extri.yml", "images"))
 
     def lenses(self) -> dict[str, Lens]:
-        """Every camera that intri.yml names."""
+        """Return every camera that intri.yml names."""
         intri = _CalibrationFile(path_in_capture(self.folder, "intri.yml"))
         extri = _CalibrationFile(path_in_capture(self.folder, "extri.yml"))
         lenses = (_lens(name, intri, extri) for name in intri.names())
         return {lens.name: lens for lens in lenses}
 
     def footage(self, camera: str) -> Footage:
-        """images/<camera>/, else videos/<camera>.mp4."""
+        """Return images/<camera>/, else videos/<camera>.mp4."""
         files = files_in(self.folder, "images", camera, suffixes=IMAGE_SUFFIXES)
         if files:
             return ImageFolder(self.folder / "images" / camera, numbered(files, "images"))
@@ -56,13 +56,13 @@ class EasyMocap(Layout):
             )
         return Video.open(video)
 
-    def keypoint_files(self, camera: str) -> dict[int, Path | Stored]:
-        """openpose/<camera>/<frame>_keypoints.json."""
+    def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
+        """Return openpose/<camera>/<frame>_keypoints.json by frame."""
         files = files_in(self.folder, "openpose", camera, suffixes=JSON_SUFFIXES)
         return dict(numbered(files, "keypoints"))
 
-    def mask_files(self, camera: str) -> dict[int, Path | Stored]:
-        """masks/<camera>/<frame>.png, or mask/."""
+    def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
+        """Return masks/<camera>/<frame>.png, or mask/, by frame."""
         for name in ("masks", "mask"):
             files = files_in(self.folder, name, camera, suffixes=IMAGE_SUFFIXES)
             if files:
@@ -70,13 +70,13 @@ class EasyMocap(Layout):
         return {}
 
     def plate_file(self, camera: str) -> Path | None:
-        """background/<camera>.jpg or .png."""
+        """Return background/<camera>.jpg or .png."""
         plate = file_named(self.folder, camera, "background", suffixes=IMAGE_SUFFIXES)
         return plate if plate.exists() else None
 
 
 def write_easymocap(out: Path, lenses: Sequence[Lens]) -> None:
-    """`intri.yml` and `extri.yml`. As text: OpenCV's own writer refuses names like `Camera (1)`."""
+    """Write `intri.yml` and `extri.yml`, as text: OpenCV's own writer refuses names like `Camera (1)`."""
     names = "".join(f'   - "{lens.name}"\n' for lens in lenses)
     intri = extri = f"%YAML:1.0\n---\nnames:\n{names}"
     for lens in lenses:
@@ -90,14 +90,18 @@ def write_easymocap(out: Path, lenses: Sequence[Lens]) -> None:
 
 
 def _matrix(key: str, values: np.ndarray) -> str:
+    """Return a matrix in OpenCV's YAML."""
     rows, cols = values.shape
     data = values.astype(np.float64).ravel().tolist()
     return f"{key}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: {data}\n"
 
 
 class _CalibrationFile:
-    """An OpenCV FileStorage in YAML. Read by PyYAML, to strings only: on deep nesting OpenCV's own parser overflows the
-    stack, and it allocates whatever matrix a file declares."""
+    """An OpenCV FileStorage in YAML.
+
+    It is read by PyYAML, to strings only: on deep nesting OpenCV's own parser overflows the stack, and it allocates
+    whatever matrix a file declares.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -110,19 +114,21 @@ class _CalibrationFile:
             raise InputError(f"{path}: not an OpenCV YAML file; export it again with EasyMocap")
 
     def names(self) -> list[object]:
+        """Return the names of the cameras. Raises InputError if there are none."""
         names = self.tree.get("names")
         if not isinstance(names, list) or not names:
             raise InputError(f"{self.path}: lists no cameras under 'names'; export it again with EasyMocap")
         return names
 
     def number(self, key: str) -> float | None:
+        """Return a number, or None if the key is missing. Raises InputError if the value is not a number."""
         try:
             return float(self.tree[key]) if key in self.tree else None
         except (TypeError, ValueError):
-            raise InputError(f"{self.path}: {key} is no number; calibrate again") from None
+            raise InputError(f"{self.path}: {key} is not a number; calibrate again") from None
 
     def matrix(self, *keys: str) -> np.ndarray | None:
-        """The first of these keys that is there, as float64."""
+        """Return the first of these keys that exists, as float64; None if none does."""
         found = [key for key in keys if key in self.tree]
         if not found:
             return None
@@ -130,9 +136,10 @@ class _CalibrationFile:
             node = self.tree[found[0]]
             return np.array([float(value) for value in node["data"]]).reshape(int(node["rows"]), int(node["cols"]))
         except (KeyError, TypeError, ValueError):
-            raise InputError(f"{self.path}: {found[0]} is no matrix of finite numbers; calibrate again") from None
+            raise InputError(f"{self.path}: {found[0]} is not a matrix of finite numbers; calibrate again") from None
 
     def required(self, *keys: str) -> np.ndarray:
+        """Return the first of these keys that exists, as float64. Raises InputError if none does."""
         found = self.matrix(*keys)
         if found is None:
             raise InputError(f"{self.path}: {' or '.join(keys)} is missing; calibrate that camera, or take it out")
@@ -140,6 +147,7 @@ class _CalibrationFile:
 
 
 def _lens(name: object, intri: _CalibrationFile, extri: _CalibrationFile) -> Lens:
+    """Return the lens of one camera."""
     distortion = intri.matrix(f"dist_{name}", f"D_{name}")
     width_px, height_px = intri.number(f"W_{name}"), intri.number(f"H_{name}")
     return checked_lens(

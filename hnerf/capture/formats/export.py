@@ -1,4 +1,4 @@
-"""Cameras written as other tools read them."""
+"""Camera files for other tools."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,6 +17,6 @@ WRITERS: dict[str, Callable[[Path, Sequence[Lens]], None]] = {
 
 
 def write_cameras(out: Path, lenses: Sequence[Lens], layout: str) -> None:
-    """Write cameras (metres) into the folder `out`, made if need be, in a layout of WRITERS."""
+    """Write cameras (metres) in a layout of WRITERS into the folder `out`, which is made if need be."""
     out.mkdir(parents=True, exist_ok=True)
     WRITERS[layout](out, lenses)

@@ -1,4 +1,4 @@
-"""What every layout on disk offers to `ingest`."""
+"""The interface of a layout on disk, as `ingest` uses it."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -13,9 +13,9 @@ from hnerf.capture.given_poses import GivenPoses
 from hnerf.capture.lens import Lens
 
 
-class Stored(NamedTuple):
-    """One frame of a file that holds a whole recording. path: for messages; read: a mask (H, W) uint8, or keypoints
-    (people, K, 3) as `read_openpose` returns them."""
+class StoredFrame(NamedTuple):
+    """One frame of a file that holds a whole recording. path: for messages; read: returns a mask (H, W) uint8, or
+    keypoints (people, K, 3) as `read_openpose` does."""
 
     path: Path
     read: Callable[[], np.ndarray]
@@ -23,9 +23,9 @@ class Stored(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout(ABC):
-    """One capture folder in one layout; what most layouts do not have is left out here.
+    """A capture folder in one layout. Methods for what most layouts lack return nothing by default.
 
-    `novel_pose_share`: of the frames, where no `capture.toml` splits them.
+    `novel_pose_share`: share of the frames for novel poses, where no `capture.toml` splits them.
     """
 
     folder: Path
@@ -34,32 +34,33 @@ class Layout(ABC):
     @staticmethod
     @abstractmethod
     def recognises(folder: Path) -> bool:
-        """Whether the folder looks like this layout."""
+        """Return whether the folder looks like this layout."""
 
     @abstractmethod
     def lenses(self) -> dict[str, Lens]:
-        """Every calibrated camera, translations in the capture's own unit."""
+        """Return every calibrated camera, translations in the capture's own unit."""
 
     @abstractmethod
     def footage(self, camera: str) -> Footage:
-        """Its pictures; InputError if there are none."""
+        """Return a camera's images. Raises InputError if there are none."""
 
     def training_cameras(self) -> list[str]:
-        """Those that the recording's own publication trains on, the rest being for testing; empty: all of them."""
+        """Return the cameras that the recording's own publication trains on, the rest being for testing; an empty list
+        means all."""
         return []
 
-    def keypoint_files(self, camera: str) -> dict[int, Path | Stored]:
-        """OpenPose JSON files, or the like, by frame; empty where nothing was detected for this camera."""
+    def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
+        """Return OpenPose JSON files, or stored frames, by frame; empty where nothing was detected for this camera."""
         return {}
 
-    def mask_files(self, camera: str) -> dict[int, Path | Stored]:
-        """Given person masks by frame; empty where there are none."""
+    def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
+        """Return given person masks by frame; empty where there are none."""
         return {}
 
     def plate_file(self, camera: str) -> Path | None:
-        """Clean plate, or None."""
+        """Return the clean plate, or None."""
         return None
 
     def given_poses(self, frames: tuple[int, ...]) -> GivenPoses | None:
-        """Somebody's fit of a body model, for these frames; None where there is none."""
+        """Return the poses of a body model given for these frames; None where there are none."""
         return None

@@ -1,4 +1,4 @@
-"""PeopleSnapshot: camera.pkl, one video, masks.hdf5, keypoints.hdf5, reconstructed_poses.hdf5."""
+"""The PeopleSnapshot layout: camera.pkl, one video, masks.hdf5, keypoints.hdf5, reconstructed_poses.hdf5."""
 
 import math
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from hnerf.capture.footage import Footage, Video
-from hnerf.capture.formats.layout import Layout, Stored
+from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.given_poses import JOINTS, GivenPoses
 from hnerf.capture.lens import Lens, checked_lens
 from hnerf.capture.safe_io import MAX_IMAGE_PIXELS, VIDEO_SUFFIXES, files_in, path_in_capture
@@ -20,21 +20,21 @@ from hnerf.capture.safe_pickle import read_pickle
 from hnerf.errors import InputError
 
 CAMERA = "camera"
-SEEN_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # its world is the camera's: x right, y down, z ahead
+CAMERA_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # its world: x right, y down, z forward
 COCO_POINTS = 18
 
 
 @dataclass(frozen=True)
 class PeopleSnapshot(Layout):
-    """A subject's folder as its publication's tools read it; turned here so that Z is up."""
+    """A subject's folder as its publication's tools read it; the world is rotated so that Z is up."""
 
     @staticmethod
     def recognises(folder: Path) -> bool:
-        """Whether the folder looks like this layout."""
+        """Return whether the folder looks like this layout."""
         return (folder / "camera.pkl").exists()
 
     def lenses(self) -> dict[str, Lens]:
-        """The one camera."""
+        """Return the one camera."""
         path = path_in_capture(self.folder, "camera.pkl")
         stored = read_pickle(path)
         try:
@@ -42,35 +42,39 @@ class PeopleSnapshot(Layout):
                 np.asarray(stored[f"camera_{key}"], dtype=np.float64) for key in ("f", "c", "k", "rt", "t")
             )
             K = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]])
-            R = cv2.Rodrigues(turn)[0] @ SEEN_FROM_Z_UP
+            R = cv2.Rodrigues(turn)[0] @ CAMERA_FROM_Z_UP
             size_px = float(stored["width"]), float(stored["height"])
         except (IndexError, KeyError, TypeError, ValueError, cv2.error):
             raise InputError(f"{path}: camera_f, _c, _k, _rt, _t, width or height is missing; get it again") from None
         return {CAMERA: checked_lens((path, path), CAMERA, K, distortion, R, shift, size_px)}
 
     def footage(self, camera: str) -> Footage:
-        """The one video, which bears the subject's name."""
+        """Return the one video, which is named after the subject."""
         videos = files_in(self.folder, suffixes=VIDEO_SUFFIXES)
         if len(videos) != 1:
             raise InputError(f"{self.folder}: {len(videos)} videos .mp4; leave exactly one")
         return Video.open(videos[0])
 
-    def keypoint_files(self, camera: str) -> dict[int, Path | Stored]:
-        """keypoints.hdf5: keypoints (N, 54), OpenPose's COCO model."""
+    def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
+        """Return the frames of keypoints.hdf5: keypoints (N, 54), OpenPose's COCO model."""
         path = path_in_capture(self.folder, "keypoints.hdf5")
         if not path.exists():
             return {}
         count = len(_array(path, "keypoints", (3 * COCO_POINTS,)))
-        return {i: Stored(path, partial(_keypoints, path, i)) for i in range(count)}
+        return {i: StoredFrame(path, partial(_keypoints, path, i)) for i in range(count)}
 
-    def mask_files(self, camera: str) -> dict[int, Path | Stored]:
-        """masks.hdf5: masks (N, H, W), 0 outside the person."""
+    def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
+        """Return the frames of masks.hdf5: masks (N, H, W), 0 outside the person."""
         path = path_in_capture(self.folder, "masks.hdf5")
-        return {i: Stored(path, partial(_mask, path, i)) for i in range(_count(path, "masks"))} if path.exists() else {}
+        count = _count(path, "masks") if path.exists() else 0
+        return {i: StoredFrame(path, partial(_mask, path, i)) for i in range(count)}
 
     def given_poses(self, frames: tuple[int, ...]) -> GivenPoses | None:
-        """reconstructed_poses.hdf5: pose (N, 72), trans (N, 3), betas (10); where there are more poses than masks, the
-        last belong together. A frame that is all zero was never reconstructed."""
+        """Return the poses of reconstructed_poses.hdf5: pose (N, 72), trans (N, 3), betas (10).
+
+        Where there are more poses than masks, they are aligned at the end. A frame that is all zero was never
+        reconstructed.
+        """
         path = path_in_capture(self.folder, "reconstructed_poses.hdf5")
         if not path.exists():
             return None
@@ -88,12 +92,12 @@ class PeopleSnapshot(Layout):
             if 0 <= row < len(turns) and (turns[row].any() or moves_m[row].any()):
                 poses.theta[i] = turns[row].reshape(JOINTS, 3)
                 poses.root[i] = np.eye(4)
-                poses.root[i, :3, :3], poses.root[i, :3, 3] = SEEN_FROM_Z_UP.T, SEEN_FROM_Z_UP.T @ moves_m[row]
+                poses.root[i, :3, :3], poses.root[i, :3, 3] = CAMERA_FROM_Z_UP.T, CAMERA_FROM_Z_UP.T @ moves_m[row]
         return poses
 
 
 def _array(path: Path, name: str, row_shape: tuple[int, ...]) -> np.ndarray:
-    """All of a small dataset of rows, float64; InputError unless it is of finite numbers."""
+    """Read all of a small dataset of rows as float64. Raises InputError unless it is of finite numbers."""
     with _opened(path) as file:
         data = _dataset(path, file, name)
         found = data[()].astype(np.float64) if data.size <= MAX_IMAGE_PIXELS else np.zeros(())
@@ -103,24 +107,28 @@ def _array(path: Path, name: str, row_shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _count(path: Path, name: str) -> int:
+    """Return the number of rows of a dataset."""
     with _opened(path) as file:
         return len(_dataset(path, file, name))
 
 
 def _keypoints(path: Path, row: int) -> np.ndarray:
+    """Read the keypoints of one frame, (1, 18, 3)."""
     return _array(path, "keypoints", (3 * COCO_POINTS,))[row].reshape(1, COCO_POINTS, 3)
 
 
 def _mask(path: Path, row: int) -> np.ndarray:
+    """Read the mask of one frame, (H, W) uint8."""
     with _opened(path) as file:
         data = _dataset(path, file, "masks")
         if data.ndim != 3 or math.prod(data.shape[1:]) > MAX_IMAGE_PIXELS:
-            raise InputError(f"{path}: masks are no images (N, H, W); get it again")
+            raise InputError(f"{path}: masks are not images (N, H, W); get it again")
         return np.where(data[row] != 0, 255, 0).astype(np.uint8)
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[h5py.File]:
+    """Open an HDF5 file. Raises InputError if it cannot be read."""
     try:
         with h5py.File(path, "r") as file:
             yield file
@@ -129,7 +137,7 @@ def _opened(path: Path) -> Iterator[h5py.File]:
 
 
 def _dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
-    """A dataset of numbers that lies in this very file, in chunks of a sane size."""
+    """Return a dataset of numbers. Raises InputError unless it lies in this very file, in chunks of a sane size."""
     data = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
     if not isinstance(data, h5py.Dataset) or data.ndim == 0 or data.dtype.kind not in "biuf":
         raise InputError(f"{path}: has no array of numbers called {name}; get it again")

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from hnerf.capture.footage import Footage, Video
-from hnerf.capture.formats.layout import Layout, Stored
+from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.lens import Lens, checked_lens
 from hnerf.capture.safe_io import JSON_SUFFIXES, VIDEO_SUFFIXES, file_named, files_in, read_toml
 from hnerf.errors import InputError
@@ -16,17 +16,17 @@ from hnerf.errors import InputError
 
 @dataclass(frozen=True)
 class Pose2Sim(Layout):
-    """A folder as Pose2Sim's own tools read it: world to camera, metres, Z up."""
+    """A capture folder as Pose2Sim's own tools read it: world to camera, metres, Z up."""
 
-    novel_pose_share: ClassVar[float] = 0.2  # the last fifth: a motion that the training frames do not contain
+    novel_pose_share: ClassVar[float] = 0.2  # the last fifth, whose motion the training frames do not contain
 
     @staticmethod
     def recognises(folder: Path) -> bool:
-        """Whether the folder looks like this layout."""
+        """Return whether the folder looks like this layout."""
         return (folder / "calibration").exists()
 
     def lenses(self) -> dict[str, Lens]:
-        """Every camera of the one calibration file."""
+        """Return every camera of the one calibration file."""
         files = [p for p in files_in(self.folder, "calibration") if p.match("Calib*.toml")]
         if len(files) != 1:
             raise InputError(f"{self.folder / 'calibration'}: {len(files)} files Calib*.toml; leave exactly one")
@@ -37,25 +37,26 @@ class Pose2Sim(Layout):
         return {lens.name: lens for lens in lenses}
 
     def footage(self, camera: str) -> Footage:
-        """videos/<camera>.mp4."""
+        """Return videos/<camera>.mp4."""
         return Video.open(file_named(self.folder, camera, "videos", suffixes=VIDEO_SUFFIXES))
 
-    def keypoint_files(self, camera: str) -> dict[int, Path | Stored]:
-        """pose/<camera>_json/*.json, one a video frame in the order of the numbers in their names."""
-        files = sorted(files_in(self.folder, "pose", f"{camera}_json", suffixes=JSON_SUFFIXES), key=_numbers_as_such)
+    def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
+        """Return pose/<camera>_json/*.json, one for each video frame in the order of the numbers in their names."""
+        files = sorted(files_in(self.folder, "pose", f"{camera}_json", suffixes=JSON_SUFFIXES), key=_natural_order)
         return dict(enumerate(files))
 
 
-def _numbers_as_such(path: Path) -> list[str | int]:
-    """A key that sorts walk_9 before walk_10."""
+def _natural_order(path: Path) -> list[str | int]:
+    """Return a key that sorts walk_9 before walk_10."""
     return [int(part) if part.isdecimal() else part for part in re.split("([0-9]+)", path.stem)]
 
 
 def lens_from_table(source: Path, key: str, table: Any) -> Lens:
-    """One camera's table, of the keys that aniposelib, Pose2Sim and Caliscope share; InputError if it is none."""
+    """Return the lens in one camera's table, of the keys that aniposelib, Pose2Sim and Caliscope share. Raises
+    InputError if a key is missing or wrong."""
     try:
         if table.get("fisheye", False):
-            raise InputError(f"{source}: camera {key}: fisheye lenses are not read; undistort its video first")
+            raise InputError(f"{source}: camera {key}: fisheye lenses are not supported; undistort its video first")
         width_px, height_px = table["size"]
         return checked_lens(
             sources=(source, source),
@@ -67,4 +68,4 @@ def lens_from_table(source: Path, key: str, table: Any) -> Lens:
             size_px=(float(width_px), float(height_px)),
         )
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-        raise InputError(f"{source}: camera {key}: {error} is missing or no number; calibrate again") from None
+        raise InputError(f"{source}: camera {key}: {error} is missing or not a number; calibrate again") from None

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from hnerf.capture.footage import Footage, ImageFolder
-from hnerf.capture.formats.layout import Layout, Stored
+from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.given_poses import JOINTS, GivenPoses
 from hnerf.capture.lens import Lens, checked_lens
 from hnerf.capture.safe_io import path_in_capture
@@ -23,38 +23,39 @@ METRES_PER_UNIT = 1e-3  # of the cameras' translations
 
 @dataclass(frozen=True)
 class ZjuMocap(Layout):
-    """A folder as NeuralBody's own tools read it: world to camera, OpenCV axes, Z up."""
+    """A capture folder as NeuralBody's own tools read it: world to camera, OpenCV axes, Z up."""
 
     @staticmethod
     def recognises(folder: Path) -> bool:
-        """Whether the folder looks like this layout."""
+        """Return whether the folder looks like this layout."""
         return (folder / "annots.npy").exists()
 
     @property
     def source(self) -> Path:
-        """The file that lists cameras and images."""
+        """Return the file that lists cameras and images."""
         return path_in_capture(self.folder, "annots.npy")
 
     @cached_property
     def images(self) -> dict[str, dict[int, PurePosixPath]]:
-        """By camera, which is an image's own folder, and by frame: the images' paths."""
+        """Return the images' paths by camera, named after an image's own folder, and by frame."""
         try:
             rows = [[PurePosixPath(str(path)) for path in row["ims"]] for row in self._annotations["ims"]]
             names = [path.parent.name for path in rows[0]]
             frames = [_frame(row[0]) for row in rows]
             columns = list(zip(*rows, strict=True))
         except (IndexError, KeyError, TypeError, ValueError):
-            raise InputError(f"{self.source}: 'ims' lists no images, as many a frame; prepare it again") from None
+            raise InputError(f"{self.source}: 'ims' does not list images, as many a frame; prepare it again") from None
         if len(set(names)) < len(names) or len(set(frames)) < len(frames):
-            raise InputError(f"{self.source}: two images of one camera and frame; prepare it again")
+            raise InputError(f"{self.source}: lists two images of one camera and frame; prepare it again")
         return {name: dict(zip(frames, paths, strict=True)) for name, paths in zip(names, columns, strict=True)}
 
     @cached_property
     def _annotations(self) -> Any:
+        """Read the content of annots.npy."""
         return read_pickled_npy(self.source)
 
     def lenses(self) -> dict[str, Lens]:
-        """One camera for each of a frame's images."""
+        """Return one camera for each of a frame's images."""
         lenses = {}
         for i, name in enumerate(self.images):
             try:
@@ -67,17 +68,17 @@ class ZjuMocap(Layout):
         return lenses
 
     def training_cameras(self) -> list[str]:
-        """NeuralBody's."""
+        """Return the cameras that NeuralBody trains on."""
         names = list(self.images)
         return [names[i] for i in TRAINING_CAMERAS.get(len(names), ())]
 
     def footage(self, camera: str) -> Footage:
-        """The images that annots.npy lists."""
+        """Return the images that annots.npy lists."""
         files = {frame: path_in_capture(self.folder, *path.parts) for frame, path in self.images[camera].items()}
         return ImageFolder(next(iter(files.values())).parent, files)
 
-    def mask_files(self, camera: str) -> dict[int, Path | Stored]:
-        """mask_cihp/<image>.png, or mask/: part labels, 0 outside the person."""
+    def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
+        """Return mask_cihp/<image>.png, or mask/, by frame: part labels, 0 outside the person."""
         for name in ("mask_cihp", "mask"):
             if path_in_capture(self.folder, name).is_dir():
                 paths = self.images[camera].items()
@@ -87,8 +88,8 @@ class ZjuMocap(Layout):
         return {}
 
     def given_poses(self, frames: tuple[int, ...]) -> GivenPoses | None:
-        """new_params/<frame>.npy, or params/: SMPL's poses (72, of which the first 3 are zero, or 69), Rh, Th, shapes;
-        a vertex is R(Rh) SMPL(poses, shapes) + Th."""
+        """Return the poses of new_params/<frame>.npy, or params/: SMPL's poses (72, of which the first 3 are zero, or
+        69), Rh, Th, shapes; a vertex is R(Rh) SMPL(poses, shapes) + Th."""
         folders = [name for name in ("new_params", "params") if path_in_capture(self.folder, name).is_dir()]
         if not folders:
             return None
@@ -99,19 +100,20 @@ class ZjuMocap(Layout):
             if path.exists():
                 turns, poses.root[i], shape = _parameters(path)
                 poses.theta[i].flat[-len(turns) :] = turns
-                poses.theta[i, 0] = np.nan_to_num(poses.theta[i, 0])  # not among 69
+                poses.theta[i, 0] = np.nan_to_num(poses.theta[i, 0])  # the 69 leave out the pelvis
                 betas.append(shape)
         poses.betas[:] = np.mean(betas, 0) if betas else 0
         return poses
 
 
 def _frame(path: PurePosixPath) -> int:
-    """000012.jpg is frame 12, and so is CoreView_313_Camera_(1)_0012_2019-08-23_16-08-50.592.jpg."""
+    """Return the frame number of an image: 000012.jpg is frame 12, and so is
+    CoreView_313_Camera_(1)_0012_2019-08-23_16-08-50.592.jpg."""
     return int(path.stem if path.stem.isdigit() else path.stem.split("_")[4])
 
 
 def _parameters(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Turns (72,) or (69,), placement (4, 4) in metres, shape (10,)."""
+    """Read the parameters of one frame: turns (72,) or (69,), placement (4, 4) in metres, shape (10,)."""
     try:
         stored = read_pickled_npy(path)
         turns, rotation, translation, shape = (

@@ -6,8 +6,8 @@ from typing import Literal, Self
 from pydantic import Field, PositiveInt, model_validator
 
 from hnerf.capture.capture import Capture
-from hnerf.capture.subset import chosen
-from hnerf.config import CONFIGS, H_NERF, Section, Settings, load_settings, named_file, read_yaml, validated
+from hnerf.capture.subset import select
+from hnerf.config import CONFIGS, Section, Settings, load_settings, named_file, read_yaml, validated
 from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.study.benchmark.convergence import FIRST_S
@@ -35,11 +35,11 @@ class CapturePart(Section):
             available = _at_least(cameras, capture.train_cameras, "training cameras")
             cameras = tuple(available[k * len(available) // cameras] for k in range(cameras))
         elif cameras is not None:
-            cameras = chosen(capture, "training camera", cameras, capture.train_cameras)
+            cameras = select(capture, "training camera", cameras, capture.train_cameras)
         if isinstance(frames, int):
             frames = tuple(evenly_spaced(_at_least(frames, capture.train_frames, "training frames"), frames))
         elif frames is not None:
-            frames = chosen(capture, "training frame", frames, capture.train_frames)
+            frames = select(capture, "training frame", frames, capture.train_frames)
         return cameras, frames, None if self.novel_poses else ()
 
 
@@ -110,7 +110,7 @@ class BenchmarkStudy(Section):
         the question is what it reaches in its time."""
         settings, seconds = load_settings(method), seconds or self.seconds
         training = {"seconds": seconds, "snapshots_s": snapshot_times_s(seconds, self.snapshots)}
-        if seconds and settings.training.machinery not in H_NERF:
+        if seconds and not settings.training.field.tunes_poses:
             training["steps"] = UNLIMITED_STEPS
         return settings.model_copy(update={"training": settings.training.model_copy(update=training)})
 

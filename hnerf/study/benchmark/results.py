@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, PRIMARY_SPLITS, TRACKED
-from hnerf.files import picture
+from hnerf.files import markdown_image
 from hnerf.study.benchmark.convergence import CURVE_PROTOCOL
 from hnerf.study.benchmark.curves import Point, seconds_to_reach, value_at
 from hnerf.study.machine import describe_machine
@@ -136,7 +136,7 @@ def as_markdown(result: Mapping[str, Any], pictures: list[str], claims: list[str
     """Format the whole result for people. pictures: names of files beside the text; claims: lines of claims.py."""
     lines = [f"# {result['title']}: {result['subject']}", "", caption(result), ""]
     lines += [f"- {note}" for note in result["notes"]] + [""] * bool(result["notes"])
-    lines += [f"{picture(name)}\n" for name in pictures] + claims + [""] * bool(claims)
+    lines += [f"{markdown_image(name)}\n" for name in pictures] + claims + [""] * bool(claims)
     lines += [CELL_LEGEND, ""]
     for title, variant in result["variants"].items():
         lines += [f"## {title}", "", *_variant_lines(variant), ""]

@@ -111,11 +111,12 @@ def degrade_fit(body: BodyFit, degradation: Degradation) -> BodyFit:
 
 def degrade_settings(settings: TrainingSettings, degradation: Degradation) -> TrainingSettings:
     """Multiply every learning rate by the strength: of the poses and of the method's own networks and grids."""
-    rates = getattr(settings, settings.machinery).model_dump()
+    rates = settings.field.model_dump()
     own = {name: value * degradation.strength for name, value in rates.items() if name.endswith("learning_rate")}
-    changed = getattr(settings, settings.machinery).model_copy(update=own)
     pose_learning_rate = settings.pose_learning_rate * degradation.strength
-    return settings.model_copy(update={settings.machinery: changed, "pose_learning_rate": pose_learning_rate})
+    return settings.model_copy(
+        update={"field": settings.field.model_copy(update=own), "pose_learning_rate": pose_learning_rate}
+    )
 
 
 def check_strengths(name: str, strengths: tuple[float, ...]) -> None:

@@ -18,7 +18,7 @@ from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.subset import copy_files, write_arrays
 from hnerf.evaluation.ground_truth import ON_BLACK, GroundTruth
 from hnerf.geometry.rays import RayHits
-from hnerf.synthetic.render import Caster, dome_lights, irradiance, render_person
+from hnerf.synthetic.render import RayCaster, dome_lights, irradiance, render_person
 
 Rng = np.random.Generator
 
@@ -75,13 +75,13 @@ class LitGarment:
     vertices_m: np.ndarray
     faces: np.ndarray
     colour: np.ndarray
-    both: Caster
+    both: RayCaster
 
     @staticmethod
     def over_body(garment: Garment, row: int, body_m: np.ndarray, body_faces: np.ndarray, up: str) -> "LitGarment":
         """Return the garment in frame `row`, lit, over the body's vertices body_m (V, 3) of the same frame."""
         vertices_m, faces = garment.vertices_m[row], garment.faces
-        both = Caster(np.concatenate([vertices_m, body_m]), np.concatenate([faces, body_faces + len(vertices_m)]))
+        both = RayCaster(np.concatenate([vertices_m, body_m]), np.concatenate([faces, body_faces + len(vertices_m)]))
         directions, strength = dome_lights()
         if up == "y":
             directions = directions[:, [0, 2, 1]] * [1, 1, -1]

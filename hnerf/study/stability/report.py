@@ -7,7 +7,7 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
-from hnerf.files import picture
+from hnerf.files import markdown_image
 from hnerf.study.degradations.catalogue import KINDS
 from hnerf.study.stability.verdict import (
     BROKEN,
@@ -81,7 +81,7 @@ def as_markdown(result: Row, charts: Sequence[str]) -> str:
     lines += ["## How far each method holds", "", *head(["degradation", *methods])]
     for kind in kinds:
         lines.append(line([KINDS[kind].label, *(tolerated_strength(result, method, kind) for method in methods)]))
-    lines += ["", *map(picture, charts), "", "## Runs", ""]
+    lines += ["", *map(markdown_image, charts), "", "## Runs", ""]
     lines += head(["method", "degradation", "strength", "seed", "verdict", *(title for title, _ in FIGURES.values())])
     lines += [line(_cells(run)) for run in result["runs"]]
     lines += ["", "## Left out", "", *(f"- {reason}" for reason in result["left_out"] or ["nothing"]), ""]

@@ -1,0 +1,50 @@
+"""Add a compared method: NeRF with a voxel grid in place of its two networks, trained by the trainer of all methods.
+
+usage: python examples/add_method.py SUBJECT OUT
+
+SUBJECT: what examples/train.py wrote; its first frame is trained on. For a method that stays, see CONTRIBUTING.md.
+"""
+
+import dataclasses
+import sys
+from pathlib import Path
+from unittest.mock import patch
+
+from torch import nn, ones, stack
+
+from hnerf.baselines.nerf import NerfField
+from hnerf.body.fit_result import BodyFit
+from hnerf.calibration.report import load_cameras
+from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks
+from hnerf.config import NerfSettings, load_settings
+from hnerf.fields.encoding import FeatureGrids
+from hnerf.training import trainer
+
+
+class Voxels(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.grid = FeatureGrids(-ones(3), ones(3), cells=(64,), channels=4)
+
+    def forward(self, point, view):
+        density, *rgb = self.grid(point.reshape(-1, 3)).unflatten(0, point.shape[:-1]).unbind(-1)
+        return 10 * nn.functional.softplus(density), stack(rgb, -1).sigmoid()
+
+
+class VoxelField(NerfField):
+    def __init__(self, body):
+        super().__init__(body, NerfSettings(learning_rate=0.1))
+        self.coarse, self.fine = Voxels(), Voxels()
+
+
+def main(subject, out, overrides=()):
+    capture = load_cameras(subject / "calibration", Capture.load(subject / "capture"))
+    capture = dataclasses.replace(capture, train_frames=capture.train_frames[:1])
+    masks, body = Masks.load(subject / "segmentation"), BodyFit.load(subject / "fit")
+    with patch.object(trainer, "build_field", lambda settings, body, static: VoxelField(body)):
+        return trainer.train(capture, masks, body, load_settings("nerf", overrides).training, out)
+
+
+if __name__ == "__main__":
+    print(main(Path(sys.argv[1]), Path(sys.argv[2])))

@@ -1,0 +1,35 @@
+"""Render a trained person along a path of cameras: from one recorded camera through the others and back to the first.
+
+usage: python examples/render_path.py SUBJECT OUT
+
+SUBJECT is `store/subjects/NAME` of `hnerf run`, or the folder that `examples/train.py` wrote. Writes one RGBA PNG a
+picture: colour over black, and coverage.
+"""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+from hnerf.avatar.trained import load_avatar
+from hnerf.calibration.report import load_cameras
+from hnerf.capture.capture import Capture, write_image
+from hnerf.evaluation.images import rgba
+from hnerf.render.trajectory import interpolate_cameras
+
+
+def main(subject: Path, out: Path, pictures: int = 60, side_px: int = 256) -> None:
+    """Write so many square pictures, in which the person moves through all fitted frames."""
+    capture = load_cameras(subject / "calibration", Capture.load(subject / "capture"))
+    avatar = load_avatar(subject / "training")  # "cuda" as second argument for a GPU
+    recorded = [capture.cameras[name].resized(side_px, side_px) for name in capture.train_cameras]
+    path = interpolate_cameras([*recorded, recorded[0]], pictures)
+    frames = avatar.body.frames
+    for number, camera in enumerate(path):
+        row = number * len(frames) // pictures
+        free = dataclasses.replace(camera, name="")  # not a recorded camera: shown without that camera's exposure
+        rendering = avatar.render(free, avatar.body.theta[row], avatar.body.root[row])
+        write_image(out / f"{number:06d}.png", rgba(rendering))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
