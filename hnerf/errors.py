@@ -10,6 +10,10 @@ class NotApplicableError(InputError):
     fault."""
 
 
+class InvalidAsset(Exception):
+    """A package that must not be handed over. The message names the file and every defect."""
+
+
 def one_line(error: Exception) -> str:
     """Return the last line of an error's message, or the name of its class if the message is empty."""
     return str(error).splitlines()[-1] if str(error) else type(error).__name__

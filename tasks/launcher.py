@@ -14,11 +14,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from hnerf.errors import InputError
+from hnerf.progress import report_relayed
 
 GRACE_S = 40  # torchrun gives its ranks 30 s to end before it kills them
 LAST_LINES = 20  # of a failed rank, in the error
 RANK_LINE = re.compile(r"^\[default\d+\]:")
-FAILURE = re.compile(r"failed \(exitcode: (-?\d+)\) local_rank: (\d+)")
+FAILURE = "failure.json"  # tasks/agent.py: the first failing rank and its exit code
 # Sent from outside; other signals are raised by the process itself and would recur.
 KILLED = (signal.SIGKILL, signal.SIGTERM)
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
@@ -51,8 +52,9 @@ def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
     ends: the kernel signals the caller's death to torchrun, and torchrun's to the ranks.
     """
     with TemporaryDirectory(prefix="hnerf-ranks-") as logs:
-        command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
-        command += ["--tee=3", f"--log-dir={logs}", "-m", "tasks.rank", module, *arguments]
+        command = [sys.executable, "-m", "tasks.agent", f"{logs}/{FAILURE}"]
+        command += ["--standalone", f"--nproc-per-node={processes}", "--tee=3", f"--log-dir={logs}"]
+        command += ["-m", "tasks.rank", module, *arguments]
         agent = subprocess.Popen(
             command,
             stdout=subprocess.PIPE,
@@ -64,12 +66,12 @@ def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
             preexec_fn=partial(end_with_parent, signal.SIGTERM),
         )
         try:
-            failure = _follow(agent, logging.getLogger(module))
+            _follow(agent, logging.getLogger(module))
         except BaseException:
             _stop(agent)
             raise
         if agent.returncode:
-            raise _error(module, Path(logs), agent.returncode, failure)
+            raise _error(module, Path(logs), agent.returncode)
 
 
 def end_with_parent(last: signal.Signals) -> None:
@@ -86,16 +88,14 @@ def _environment(processes: int) -> dict[str, str]:
     return {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "PASSIVE", **os.environ, "PYTHONSAFEPATH": "1"}
 
 
-def _follow(agent: "subprocess.Popen[str]", log: logging.Logger) -> re.Match[str] | None:
-    """Log the ranks' lines until all have ended; return torchrun's report of the first failure, if there was one."""
-    failure = None
+def _follow(agent: "subprocess.Popen[str]", log: logging.Logger) -> None:
+    """Log the ranks' lines until all have ended, and report their progress."""
     assert agent.stdout is not None
     for line in agent.stdout:
-        failure = failure or FAILURE.search(line)
-        level = logging.INFO if RANK_LINE.match(line) else logging.DEBUG
-        log.log(level, "%s", RANK_LINE.sub("", line.rstrip()))
+        text = RANK_LINE.sub("", line.rstrip())
+        if not report_relayed(text):
+            log.log(logging.INFO if RANK_LINE.match(line) else logging.DEBUG, "%s", text)
     agent.wait()
-    return failure
 
 
 def _stop(agent: "subprocess.Popen[str]") -> None:
@@ -108,13 +108,13 @@ def _stop(agent: "subprocess.Popen[str]") -> None:
         agent.wait()
 
 
-def _error(module: str, logs: Path, ended: int, failure: re.Match[str] | None) -> Exception:
+def _error(module: str, logs: Path, ended: int) -> Exception:
     """Build the exception from torchrun's exit code and its report of the first rank that failed."""
     if ended < 0:
         return LostWorkerError(f"{module}: torchrun was killed by {signal.Signals(-ended).name}")
-    if failure is None:
+    if not (logs / FAILURE).exists():
         return RuntimeError(f"{module}: torchrun did not start")
-    code, rank = int(failure[1]), failure[2]
+    rank, code = json.loads((logs / FAILURE).read_text())
     written = [path.read_text(errors="replace") for path in logs.glob(f"*/attempt_0/{rank}/stderr.log")]
     lines = "".join(written).strip().splitlines()[-LAST_LINES:]
     if code in ERROR_BY_EXIT_CODE and lines:

@@ -1,6 +1,7 @@
 """The cached task that every stage is."""
 
 import inspect
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Concatenate, Generic, ParamSpec
@@ -11,6 +12,8 @@ from prefect.tasks import exponential_backoff
 
 from tasks.policy import Input, StorePolicy, is_transient, stage_key
 from tasks.store import Artifact, Store
+
+log = logging.getLogger("hnerf.stage")
 
 P = ParamSpec("P")
 Write = Callable[Concatenate[Path, P], dict[str, float]]
@@ -48,6 +51,7 @@ class Stage(Generic[P]):
         return run(store=store, inputs=dict(inputs.arguments))
 
     def _run(self, store: Store, inputs: dict[str, Input]) -> Artifact:
+        log.info("%s", self.name)
         key = stage_key(self.name, self.version, inputs)
         return store.get_or_compute(self.name, key, lambda out: self.write(out, **inputs), self.resumable)  # type: ignore[call-arg, arg-type]
 

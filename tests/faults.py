@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-COPIED = ("hnerf", "tests", "configs", "pyproject.toml")
+COPIED = ("hnerf", "tasks", "flows", "tests", "configs", "pyproject.toml")
 PYTEST = (sys.executable, "-m", "pytest", "-o", "addopts=", "-x", "-q", "-p", "no:cacheprovider")
 
 PAPER, FAST = "hnerf/fields/paper.py", "hnerf/fields/fast.py"
@@ -32,6 +32,16 @@ COMPOSITING, CANONICAL = "hnerf/fields/compositing.py", "hnerf/fields/grids.py"
 ENCODING, MLP = "hnerf/fields/encoding.py", "hnerf/fields/mlp.py"
 BODIES, PIXELS = "hnerf/body/canonical.py", "hnerf/training/pixels.py"
 GATHER = "hnerf/training/gather.py"
+BOARDS, BUNDLE = "hnerf/calibration/boards/rig.py", "hnerf/calibration/bundle.py"
+CAMERA, TRIANGULATION = "hnerf/geometry/camera.py", "hnerf/geometry/triangulation.py"
+QUERIES, SILHOUETTE = "hnerf/geometry/mesh_queries.py", "hnerf/geometry/silhouette.py"
+COLMAP, ZJUMOCAP = "hnerf/capture/formats/colmap.py", "hnerf/capture/formats/zjumocap.py"
+SAFE_IO, TIMING = "hnerf/capture/safe_io.py", "hnerf/capture/timing.py"
+NORMALISE, MANIFEST = "hnerf/capture/normalise.py", "hnerf/capture/manifest.py"
+STAGING, GLB, USD = "hnerf/asset/staging.py", "hnerf/asset/glb.py", "hnerf/asset/usd.py"
+METRICS, REPORT = "hnerf/evaluation/metrics.py", "hnerf/evaluation/report.py"
+EXPOSURE, ARTICULATION = "hnerf/training/exposure.py", "hnerf/body/articulation.py"
+POLICY, STORE = "tasks/policy.py", "tasks/store.py"
 
 BY_PAPER, BY_LOSSES = "tests/fields/test_paper.py", "tests/training/test_losses.py"
 BY_STEP, BY_CONDITIONS = "tests/training/test_step.py", "tests/fields/test_conditions.py"
@@ -40,6 +50,11 @@ BY_RAY, BY_CANONICAL = "tests/fields/test_fast_ray.py", "tests/fields/test_grids
 BY_FAST, BY_COMPOSITING = "tests/fields/test_fast.py", "tests/fields/test_compositing.py"
 BY_ENCODING, BY_MLP = "tests/fields/test_encoding.py", "tests/fields/test_mlp.py"
 BY_EXPOSURE = "tests/training/test_exposure.py"
+BY_CAMERA, BY_TRIANGULATION = "tests/geometry/test_camera.py", "tests/calibration/test_triangulation.py"
+BY_FILES, BY_USD = "tests/capture/test_camera_files.py", "tests/asset/test_usd.py"
+BY_METRICS, BY_POLICY = "tests/evaluation/test_metrics.py", "tests/tasks/test_policy.py"
+BY_INGEST, BY_STORE = "tests/capture/test_ingest.py", "tests/tasks/test_store.py"
+BY_TIMING, BY_GLB = "tests/capture/test_timing.py", "tests/asset/test_glb.py"
 
 
 @dataclass(frozen=True)
@@ -147,6 +162,50 @@ FAULTS = (
     Fault("trainer-poses-go-on", TRAINER, "pose.grad[self.train_rows] = 0.0", "pass", BY_TRAINER),
     Fault("trainer-decay", TRAINER, "FINAL_LEARNING_RATE ** self._progress() * ", "", BY_TRAINER),
     Fault("trainer-tighten", TRAINER, "if self.step <= self.field_steps:", "if False:", BY_TRAINER),
+    Fault("checkpoint-optimizer", TRAINER, 'self.optimizer.load_state_dict(state["optimizer"])', "pass",
+          "tests/training/test_trainer.py"),
+    Fault("exposure-pair", EXPOSURE, "= (-weight, weight)", "= (weight, weight)", BY_EXPOSURE),
+    # cameras, triangulation, meshes
+    Fault("camera-half-pixel", CAMERA, "[0, sy, (sy - 1) / 2]", "[0, sy, 0]", BY_CAMERA),
+    Fault("camera-rays-transposed", CAMERA, "np.linalg.inv(self.K).T @ self.R", "np.linalg.inv(self.K).T @ self.R.T",
+          BY_CAMERA),
+    Fault("triangulation-depth", TRIANGULATION, "@ points_m.T + projections[:, 2, 3:])",
+          "@ points_m.T - projections[:, 2, 3:])", BY_TRIANGULATION),
+    Fault("triangulation-outlier", TRIANGULATION, "(confidence > 0) & (distances < inlier_px)", "confidence > 0",
+          BY_TRIANGULATION),
+    Fault("mesh-side", QUERIES, "query.sign < 0.0", "query.sign > 0.0", "tests/evaluation/test_geometry.py"),
+    Fault("silhouette-orientation", SILHOUETTE, "or wp.max(wp.max(e, g), h) <= wp.float64(0.0)", "",
+          "tests/geometry/test_silhouette.py"),
+    Fault("boards-transposed", BOARDS, "R = b[0] @ a[0].T", "R = b[0] @ a[0]",
+          "tests/calibration/test_calibrate_boards.py"),
+    Fault("bundle-transposed", BUNDLE, "old.R.T @ new.R for", "new.R.T @ old.R for",
+          "tests/calibration/test_bundle.py"),
+    Fault("turning-jacobian", ARTICULATION, "+ first * cross + second", "- first * cross + second",
+          "tests/body/test_articulation.py"),
+    # what comes in
+    Fault("colmap-pixel-centre", COLMAP, "cx - PIXEL_CENTRE", "cx", BY_FILES),
+    Fault("colmap-distortion", COLMAP, "distortion=values[4:9]", "distortion=values[5:9]", BY_FILES),
+    Fault("zjumocap-unit", ZJUMOCAP, "METRES_PER_UNIT = 1e-3", "METRES_PER_UNIT = 1.0",
+          "tests/capture/test_zjumocap.py"),
+    Fault("normalise-keypoints", NORMALISE, "* scale + (scale - 1) / 2", "* scale", BY_INGEST),
+    Fault("lens-distortion", NORMALISE, "if np.any(lens.distortion):", "if np.any(lens.distortion[2:]):", BY_INGEST),
+    Fault("frames-split", MANIFEST, "train = recorded[: len(recorded) - len(novel)]",
+          "train = recorded[: len(recorded) - len(novel) + 1]", "tests/capture/test_pose2sim.py"),
+    Fault("capture-link", SAFE_IO, "if path.is_symlink():", "if False:", "tests/capture/test_bad_input.py"),
+    Fault("nearest-frame", TIMING, "offset_frames / step + 0.5", "offset_frames / step", BY_TIMING),
+    # what goes out
+    Fault("stage-axis", STAGING, "[0, 0, 1], [0, -1, 0]])", "[0, 0, 1], [0, 1, 0]])", "tests/asset/test_staging.py"),
+    Fault("glb-inverse-bind", GLB, "inverse_bind[:, 3, :3] =", "inverse_bind[:, :3, 3] =", BY_GLB),
+    Fault("glb-time", GLB, "(avatar.frames - avatar.frames[0]) / fps", "avatar.frames / fps", BY_GLB),
+    Fault("usd-quaternion", USD, "Gf.Quatf(w, x, y, z)", "Gf.Quatf(x, y, z, w)", BY_USD),
+    Fault("usd-camera-axis", USD, "np.diag([1, -1, -1])", "np.diag([1, 1, -1])", BY_USD),
+    Fault("report-unescaped", REPORT, "autoescape=True", "autoescape=False", "tests/evaluation/test_evaluate.py"),
+    Fault("psnr-amplitude", METRICS, "-10 * np.log10(", "-20 * np.log10(", BY_METRICS),
+    # what is done again, and what is not
+    Fault("retry-lost-worker", POLICY, "OSError | LostWorkerError)", "OSError)", BY_POLICY),
+    Fault("retry-permanent", POLICY, " and not is_permanent(error)", "", BY_POLICY),
+    Fault("key-ignores-version", POLICY, '"version": version, ', "", BY_POLICY),
+    Fault("store-damage", STORE, " or sha256_of(path) != file.sha256", "", BY_STORE),
 )  # fmt: skip
 
 

@@ -6,11 +6,9 @@ from typing import Any
 import numpy as np
 from pxr import Tf, Usd, UsdGeom, UsdSkel, UsdValidation
 
+from hnerf.errors import InvalidAsset
+
 PLAUSIBLE_SIZE_M = (0.5, 3.0)  # longest side of the box around a person, from lying down to raised arms
-
-
-class InvalidAsset(Exception):
-    """An exported package is invalid and must not be delivered. The message names the file and every defect."""
 
 
 def validate_package(path: Path) -> dict[str, Any]:

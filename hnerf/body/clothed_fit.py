@@ -19,6 +19,7 @@ from hnerf.body.contour_fit import DAMPING, ContourResiduals, Outline, add_resid
 from hnerf.body.descriptor import normals_of
 from hnerf.body.keypoint_fit import Problem
 from hnerf.geometry.camera import Camera
+from hnerf.progress import tracked
 
 log = logging.getLogger("hnerf.fit")
 
@@ -41,7 +42,7 @@ def refine_with_clothing(problem: Problem, pose: Pose, edges: list[list[Outline 
         return pose
     faces = pose.rig.faces.numpy()
     cloth_offset_m = np.zeros(len(pose.rig.vertices_m))
-    for step in range(CLOTHED_STEPS):
+    for step in tracked(range(CLOTHED_STEPS), "clothes", CLOTHED_STEPS):
         articulation = Articulation(pose.rig)
         joints = articulation.pose(pose)
         found = []

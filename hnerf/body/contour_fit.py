@@ -23,6 +23,7 @@ from hnerf.body.normal_equations import NormalEquations
 from hnerf.config import FitSettings
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.silhouette import silhouette
+from hnerf.progress import tracked
 
 log = logging.getLogger("hnerf.fit")
 
@@ -156,7 +157,7 @@ def refine_with_outlines(
     edges: by frame and camera, None without a mask; up: the world's vertical axis, used with one camera only.
     """
     faces = pose.rig.faces.numpy()
-    for step in range(settings.contour_steps):
+    for step in tracked(range(settings.contour_steps), "outlines", settings.contour_steps):
         articulation = Articulation(pose.rig)
         joints = articulation.pose(pose)
         _, equations = problem.assemble(pose, problem.image_term)

@@ -32,6 +32,7 @@ from hnerf.evaluation.views import (
     split_frames,
 )
 from hnerf.evenly_spaced import evenly_spaced
+from hnerf.progress import tracked
 
 log = logging.getLogger("hnerf.evaluation")
 
@@ -102,7 +103,7 @@ def score_meshes(
     null with a reason."""
     (out / "meshes").mkdir(exist_ok=True)
     scores = []
-    for frame in frames:
+    for frame in tracked(frames, "meshes", len(frames)):
         mesh = posed_surface(avatar, frame)
         mesh.export(out / "meshes" / f"{frame:06d}.ply")
         if frame in true_meshes:

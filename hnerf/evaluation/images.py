@@ -1,7 +1,6 @@
 """The images of a split: which there are, their renderings and their scores."""
 
 import dataclasses
-import logging
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,10 +14,8 @@ from hnerf.capture.capture import Capture, read_rgba, write_image
 from hnerf.evaluation import metrics
 from hnerf.evaluation.ground_truth import Truth
 from hnerf.evaluation.views import NOVEL_POSE_SPLITS, View, all_views, sample_views
+from hnerf.progress import tracked
 
-log = logging.getLogger("hnerf.evaluation")
-
-LOG_EVERY_S = 10.0
 MEANS = ("psnr", "ssim", "mask_iou", "empty_psnr", "one_colour_psnr")  # averaged over a split's images
 TUNED_ON = (
     "the capture has no test camera, and training cameras saw these frames when their poses were fitted; "
@@ -43,8 +40,7 @@ def render(avatars: Mapping[str, Avatar], capture: Capture, views: list[View], o
     """Render every view with its split's avatar, in the poses of its `body`, and write it as 8-bit RGBA, colour over
     black and coverage. Return the median seconds an image takes, without writing it."""
     seconds: list[float] = []
-    next_log = time.perf_counter() + LOG_EVERY_S
-    for view in views:
+    for view in tracked(views, "rendering", len(views)):
         started = time.perf_counter()
         body = avatars[view.split].body
         k = body.index(view.frame)
@@ -52,9 +48,6 @@ def render(avatars: Mapping[str, Avatar], capture: Capture, views: list[View], o
             pixels = rgba(avatars[view.split].render(capture.cameras[view.camera], body.theta[k], body.root[k]))
         seconds.append(time.perf_counter() - started)
         write_image(view.path(out), pixels)
-        if time.perf_counter() > next_log:
-            log.info("rendered %d of %d images", len(seconds), len(views))
-            next_log = time.perf_counter() + LOG_EVERY_S
     return float(np.median(seconds))
 
 

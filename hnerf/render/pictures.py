@@ -1,9 +1,7 @@
 """Renderings of an avatar as files: colour, depth, normals, mask and mesh of each shot, and a video of each kind of
 image."""
 
-import logging
 import math
-import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -19,10 +17,8 @@ from hnerf.avatar.surface import posed_surface
 from hnerf.capture.capture import read_rgb, write_image
 from hnerf.capture.footage import Video
 from hnerf.geometry.camera import Camera
+from hnerf.progress import tracked
 
-log = logging.getLogger("hnerf.render")
-
-LOG_EVERY_S = 10.0
 COVERED = 0.5  # alpha from which a pixel has a depth and a normal
 NEAR_GREY, FAR_GREY = 255, 64  # grey levels at the ends of a depth video's range
 NORMAL_STEP_M = 0.003
@@ -40,16 +36,12 @@ def write_pictures(avatar: Avatar, shots: Sequence[Shot], what: Sequence[str], f
     """
     for kind in what:
         (out / kind).mkdir(parents=True)
-    next_log = time.perf_counter() + LOG_EVERY_S
-    for number, shot in enumerate(shots):
+    for number, shot in enumerate(tracked(shots, "rendering", len(shots))):
         images = _render_kinds(avatar, shot, what)
         for kind, image in images.items():
             write_image(out / kind / f"{number:06d}.png", image)
         if "mesh" in what:
             posed_surface(avatar, shot[1]).export(out / "mesh" / f"{number:06d}.ply")
-        if time.perf_counter() > next_log:
-            log.info("rendered %d of %d", number + 1, len(shots))
-            next_log = time.perf_counter() + LOG_EVERY_S
     for kind in [kind for kind in what if kind != "mesh"]:
         read = partial(read_depth_grey, span_mm=depth_span_mm(out / kind)) if kind == "depth" else read_rgb
         write_video(out / kind, fps, out / f"{kind}.mp4", read)

@@ -11,6 +11,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks, encode
 from hnerf.config import SegmentationSettings
 from hnerf.errors import InputError
+from hnerf.progress import tracked
 from hnerf.segmentation.backends import choose_backend
 from hnerf.segmentation.learned import Network
 from hnerf.segmentation.prior import Prior, body_priors, keypoint_priors
@@ -30,7 +31,7 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
     network = None if settings.model is None else Network(settings.model)
     encoded: dict[tuple[str, int], bytes] = {}
     cameras: dict[str, Any] = {}
-    for name, own in priors:
+    for name, own in tracked(priors, "segmentation", len(capture.train_cameras)):
         backend = choose_backend(capture, name, own, body is not None, network, settings)
         log.info("camera %s: %d masks, %s", name, len(capture.frames), backend.name)
         verdicts = []

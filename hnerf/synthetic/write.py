@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import logging
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from hnerf.capture.formats.easymocap import write_easymocap
 from hnerf.capture.lens import pinhole
 from hnerf.config import SyntheticSettings
 from hnerf.geometry.camera import Camera, look_at
+from hnerf.progress import tracked
 from hnerf.synthetic.appearance import FACE
 from hnerf.synthetic.detect import detect
 from hnerf.synthetic.dressed import DressedBody, midpoints
@@ -52,9 +52,6 @@ BODY_25_NAMES = (
 )  # fmt: skip
 
 
-log = logging.getLogger("hnerf.capture")
-
-
 @dataclass(frozen=True)
 class FrameTruth:
     """The ground truth of one frame: the body's keypoints_m (25, 3) and joints_m (J, 3), and the clothed person; world
@@ -82,8 +79,8 @@ def write_synthetic_capture(out: Path, settings: SyntheticSettings) -> None:
     _write_toml(out, settings)
 
     truths = []
-    for frame in range(settings.train_frames + settings.novel_pose_frames):
-        log.info("frame %d of %d", frame + 1, settings.train_frames + settings.novel_pose_frames)
+    count = settings.train_frames + settings.novel_pose_frames
+    for frame in tracked(range(count), "frames", count):
         truth = _frame_truth(dressed, _pose(rig, frame, settings))
         with ThreadPoolExecutor() as pool:
             seeds = ((settings.seed, frame, number) for number in range(len(views)))

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import torch.distributed as dist
 
+from hnerf import progress
 from hnerf.body.fit_result import BodyFit
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
@@ -49,10 +50,12 @@ def main() -> int:
         )
         return 4
     finally:
+        progress.report("training", 1, 1)  # ended, however
         if dist.is_initialized():
             dist.destroy_process_group()
     return 0
 
 
 if __name__ == "__main__":
+    progress.relay()
     sys.exit(main())

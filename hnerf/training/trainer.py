@@ -25,6 +25,7 @@ from hnerf.capture.masks import Masks
 from hnerf.config import TrainingSettings
 from hnerf.fields.conditions import Conditions, Draws, concatenate, shard
 from hnerf.fields.samples import RaySamples
+from hnerf.progress import report
 from hnerf.training.auto_settings import SceneStatistics, decide
 from hnerf.training.checkpoint import load_checkpoint, save_checkpoint
 from hnerf.training.distributed import Distributed
@@ -132,6 +133,8 @@ class Trainer:
                 self.field_steps = self.step
             if self.step == self.field_steps:
                 self.field_seconds = self.seconds
+            if self.processes.is_main:
+                self._report_progress()
             snapshot_due = bool(snapshots_s) and self.seconds >= snapshots_s[0]
             checkpoint_due = self.step % self.settings.checkpoint_steps == 0 or self.step == self.steps
             absorb_due = self.step % self.settings.absorb_steps == 0 or self.step in (self.field_steps, self.steps)
@@ -230,6 +233,11 @@ class Trainer:
         if self.step < self.field_steps:
             return max(self.step / s.steps, self.seconds / s.seconds if s.seconds else 0.0)
         return (self.step - self.field_steps) / s.novel_pose_steps
+
+    def _report_progress(self) -> None:
+        """Report steps of both phases; as many of the field's as its time says where that runs out before."""
+        done = self._progress() * self.field_steps if self.step < self.field_steps else self.step
+        report("training", done, self.steps)
 
     def _set_rates(self) -> None:
         phase_step = self.step if self.step < self.field_steps else self.step - self.field_steps

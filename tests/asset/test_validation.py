@@ -7,7 +7,8 @@ from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
 
 from hnerf.asset.staging import StagedAvatar
 from hnerf.asset.usd import write_cache, write_skinned
-from hnerf.asset.validation import InvalidAsset, data_defects, validate_package
+from hnerf.asset.validation import data_defects, validate_package
+from hnerf.errors import InvalidAsset
 from tests.asset.figure import side_camera
 
 

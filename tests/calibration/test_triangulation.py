@@ -7,7 +7,7 @@ import pytest
 from hnerf.capture.subject import subject_keypoints
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
-from hnerf.geometry.triangulation import triangulate
+from hnerf.geometry.triangulation import solve_points, triangulate
 from tests.calibration.synthetic import detections, ring, walk_m, write_capture
 
 
@@ -32,6 +32,16 @@ def test_residual_by_hand() -> None:
     points_m, residuals_px, _ = triangulate(projections, keypoints)
     np.testing.assert_allclose(residuals_px, 1, atol=1e-3)
     np.testing.assert_allclose(points_m[0], [0.5, 0.2, 2], atol=4e-3)
+
+
+def test_a_near_camera_counts_by_its_pixels_wherever_the_world_begins() -> None:
+    """Cameras 1 m and 4 m before the point put it at x = 0 and x = 17 mm, a third one at its side fixes the depth:
+    least squares in pixels weigh the two by 1 and 1/16, so x = 17 / 16 / (1 + 1 / 16) = 1 mm."""
+    aside = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])  # looks along x
+    poses = [(np.eye(3), [0.0, 0, 9]), (np.eye(3), [0.0, 0, 6]), (aside, [-1.0, 0, 10])]
+    projections = np.stack([np.diag([100.0, 100, 1]) @ R @ np.c_[np.eye(3), -np.array(centre)] for R, centre in poses])
+    keypoints = np.array([[[0, 0, 1]], [[100 * 0.017 / 4, 0, 1]], [[0, 0, 1]]])
+    np.testing.assert_allclose(solve_points(projections, keypoints, np.ones((3, 1))), [[0.001, 0, 10]], atol=2e-4)
 
 
 def test_an_outlier_view_is_left_out_and_its_residual_told() -> None:

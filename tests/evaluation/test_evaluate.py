@@ -92,6 +92,7 @@ def test_image_figures_by_hand(scored: Scored) -> None:
 def test_the_report_may_show_more_images_than_are_scored(tmp_path: Path) -> None:
     capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
     write_ball_truth(capture, RADIUS_M)
+    (capture.root / "ground_truth" / "meshes.npz").unlink()  # surfaces are scored elsewhere
     out = tmp_path / "evaluation"
     out.mkdir()
     settings = EvaluationSettings(max_images=1, max_meshes=1, report_rows=3)
@@ -103,6 +104,7 @@ def test_few_images_are_chosen_among_those_with_a_true_mask(tmp_path: Path) -> N
     """Of frames 0 to 2 expect 1, the only one with a mask, not the first and the last."""
     capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
     write_ball_truth(capture, RADIUS_M)
+    (capture.root / "ground_truth" / "meshes.npz").unlink()  # surfaces are scored elsewhere
     for frame in (0, 2):
         (capture.root / "ground_truth" / "masks" / "c" / f"{frame:06d}.png").unlink()
     out = tmp_path / "evaluation"

@@ -1,13 +1,18 @@
 import errno
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from flows import cli
-from flows.cli import main
-from hnerf.asset.validation import InvalidAsset
+from flows.cli import CAMERA_FORMATS, PICTURES, main
+from flows.train_subject import train_subject
+from hnerf import synthetic
+from hnerf.capture.formats.export import WRITERS
 from hnerf.config import SyntheticSettings
+from hnerf.errors import InvalidAsset
+from hnerf.render.subject import OUTPUT_KINDS
 from tasks.launcher import RankFailedError
 from tests.shared_data import shared_capture
 
@@ -17,6 +22,9 @@ from tests.shared_data import shared_capture
     [
         (["run", "absent"], "absent: no such folder"),
         (["check-cameras", "absent"], "absent: no such folder"),
+        (["stability", "absent"], "absent: no such folder"),
+        (["render", "absent"], "absent: no such folder; give <store>/subjects/<name> of a finished `hnerf run`"),
+        (["calibrate", "absent"], "absent: no such folder"),
         (["run", "absent", "--preset", "best"], "best: no such preset or file; presets are "),
         (["run", "absent", "--set", "training.stepz=1"], "hnerf: --set training.stepz=1: training.stepz: Extra"),
         (["run", "absent", "--set", "training.noise=.inf"], "training.noise: Input should be a finite number"),
@@ -41,24 +49,24 @@ def test_bad_input_is_one_line_and_exit_code_2(
 
 
 def test_a_training_that_cannot_go_on_is_one_line_and_exit_code_1(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def train(*_: object) -> None:
         raise RankFailedError("the surface is empty: check masks and body fit")
 
-    monkeypatch.setattr(cli.train_subject, "fn", train)
-    assert main(["run", "ada"]) == 1
+    monkeypatch.setattr(train_subject, "fn", train)
+    assert main(["run", str(tmp_path)]) == 1
     assert capsys.readouterr().err == "hnerf: the surface is empty: check masks and body fit\n"
 
 
 def test_an_asset_that_is_not_valid_is_one_line_and_exit_code_1(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def train(*_: object) -> None:
         raise InvalidAsset("avatar.usdz: there is no mesh;\nno skeleton")
 
-    monkeypatch.setattr(cli.train_subject, "fn", train)
-    assert main(["run", "ada"]) == 1
+    monkeypatch.setattr(train_subject, "fn", train)
+    assert main(["run", str(tmp_path)]) == 1
     assert capsys.readouterr().err == "hnerf: avatar.usdz: there is no mesh; no skeleton\n"
 
 
@@ -73,25 +81,25 @@ def test_a_store_that_cannot_be_made_is_one_line_and_exit_code_2(
         assert line.startswith(f"hnerf: {store}") and why in line
 
 
-def test_a_fault_that_may_pass_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fault_that_may_pass_keeps_its_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def train(*_: object) -> None:
         raise OSError(errno.EIO, "Input/output error", "a.jpg")
 
-    monkeypatch.setattr(cli.train_subject, "fn", train)
+    monkeypatch.setattr(train_subject, "fn", train)
     with pytest.raises(OSError, match="Input/output error"):
-        main(["run", "ada"])
+        main(["run", str(tmp_path)])
 
 
 def test_a_full_disk_is_one_line_and_exit_code_1(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for error in (OSError("a.png: cannot be written; is the disk full?"), OSError(errno.ENOSPC, "No space left", "b")):
 
         def train(*_: object, error: OSError = error) -> None:
             raise error
 
-        monkeypatch.setattr(cli.train_subject, "fn", train)
-        assert main(["run", "ada"]) == 1
+        monkeypatch.setattr(train_subject, "fn", train)
+        assert main(["run", str(tmp_path)]) == 1
         (line,) = capsys.readouterr().err.splitlines()
         assert line == f"hnerf: {error}; make room and give the same command again"
 
@@ -130,7 +138,7 @@ def test_check_prints_every_camera_and_the_verdict(tmp_path: Path, capsys: pytes
 
 def test_synth_takes_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written: list[SyntheticSettings] = []
-    monkeypatch.setattr(cli, "write_synthetic_capture", lambda out, settings: written.append(settings))
+    monkeypatch.setattr(synthetic, "write_synthetic_capture", lambda out, settings: written.append(settings))
     assert main(["synth", str(tmp_path / "ring"), "--set", "train_cameras=32", "--set", "train_frames=1"]) == 0
     assert main(["synth", str(tmp_path / "ada")]) == 0
     assert written == [SyntheticSettings(train_cameras=32, train_frames=1), SyntheticSettings()]
@@ -141,7 +149,36 @@ def test_synth_writes_whole_or_nothing(tmp_path: Path, monkeypatch: pytest.Monke
         (out / "half").touch()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "write_synthetic_capture", interrupted)
+    monkeypatch.setattr(synthetic, "write_synthetic_capture", interrupted)
     with pytest.raises(KeyboardInterrupt):
         main(["synth", str(tmp_path / "ada")])
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["run", "absent"], ["run"], ["settings"]])
+def test_help_and_refusals_do_without_what_takes_seconds_to_import(arguments: list[str]) -> None:
+    heavy = {"torch", "prefect", "warp", "cv2", "numpy", "scipy", "rich"}
+    code = f"""
+import sys
+from flows.cli import main
+try:
+    main({arguments})
+finally:
+    print(sorted({heavy} & set(sys.modules)))
+"""
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False).stdout
+    assert shown.splitlines()[-1] == "[]"
+
+
+def test_the_first_line_comes_before_what_takes_seconds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(train_subject, "fn", lambda *_: tmp_path)
+    assert main(["run", str(tmp_path)]) == 0
+    first, *_ = capsys.readouterr().out.splitlines()
+    assert first.endswith(f" hnerf: run {tmp_path}")
+
+
+def test_choices_are_those_of_the_library() -> None:
+    assert tuple(WRITERS) == CAMERA_FORMATS
+    assert OUTPUT_KINDS == PICTURES

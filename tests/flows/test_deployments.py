@@ -8,6 +8,7 @@ import pytest
 from prefect import get_client
 from prefect.client.schemas.filters import DeploymentFilter, DeploymentFilterName, FlowFilter, FlowFilterName
 from prefect.client.schemas.objects import FlowRun
+from prefect.deployments import run_deployment
 
 ROOT = Path(__file__).parent.parent.parent
 PATIENCE_S = 60.0
@@ -54,9 +55,10 @@ def test_deployment_run_takes_a_capture(deployed: str) -> None:
 
 @pytest.mark.parametrize(("flow", "what"), [("benchmark", "study"), ("stability", "study"), ("ablate", "preset")])
 def test_studies_are_deployed_too(deployed: str, flow: str, what: str) -> None:
-    prefect(deployed, "deployment", "run", f"{flow}/local", "-p", "capture=/recordings/ada", "-p", f"{what}=mine")
+    parameters = {"capture": "/recordings/ada", what: "mine"}
+    run_deployment(f"{flow}/local", parameters=parameters, timeout=0)
     (run,) = runs_of(flow)
-    assert run.parameters == {"capture": "/recordings/ada", what: "mine"}
+    assert run.parameters == parameters
 
 
 def test_parameters_are_checked_before_there_is_a_run(deployed: str) -> None:

@@ -42,6 +42,12 @@ def test_lines_of_all_ranks_reach_the_log(tmp_path: Path, caplog: pytest.LogCapt
     assert sorted(caplog.messages) == ["rank 0 of 2", "rank 1 of 2"]
 
 
+def test_progress_of_ranks_is_reported_and_not_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.DEBUG, logger="hnerf.progress"):
+        run_ranks(RANKS, ["progress", str(tmp_path)], processes=1)
+    assert [record.progress for record in caplog.records] == [("training", 0, 8)]
+
+
 def test_files_where_the_user_stands_are_no_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("tasks.py", "torch.py"):
         (tmp_path / name).write_text("raise SystemExit(1)")

@@ -9,17 +9,24 @@ from torch import nn
 from hnerf.fields.base import Field
 from hnerf.fields.fast import FastField
 from hnerf.fields.paper import PaperField
+from hnerf.training import trainer as trainer_module
 from hnerf.training.distributed import Distributed
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import MIN_PERSON_COVERAGE, Trainer
-from tests.training.scene import TINY, record
+from tests.training.scene import record, tiny
 
 FAR = 10.0  # units of the residual's last layer: metres away in either field
 
 
+@pytest.fixture(autouse=True)
+def few_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An eighth of the rays tells empty from full."""
+    monkeypatch.setattr(trainer_module, "HELD_OUT_RAYS", 256)
+
+
 def trainer_of(folder: Path, kind: str) -> Trainer:
     """Return a trainer that takes two steps."""
-    settings = TINY.model_copy(update={"kind": kind, "steps": 2, "novel_pose_steps": 0})
+    settings = tiny(kind, steps=2, novel_pose_steps=0)
     return Trainer(*record(folder / "capture"), settings, folder, Distributed(0, 1, torch.device("cpu")))
 
 

@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from hnerf.avatar.trained import load_avatar
-from hnerf.config import load_settings
+from hnerf.config import TrainingSettings, load_settings
 from hnerf.errors import InputError
 from hnerf.training import trainer as trainer_module
 from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
@@ -359,3 +359,13 @@ def test_a_step_has_as_many_rays_however_few_the_frames(tmp_path: Path, monkeypa
         trainer.step = step
         trainer._optimise(trainer.objective)
     assert drawn == [(2, 128), (1, 256)]
+
+
+def test_progress_counts_steps_of_both_phases_and_time_where_that_is_ahead(caplog: pytest.LogCaptureFixture) -> None:
+    trainer = Trainer.__new__(Trainer)
+    trainer.settings = TrainingSettings(steps=10, seconds=20, novel_pose_steps=4)
+    trainer.novel_rows = torch.zeros(1)
+    with caplog.at_level("DEBUG", "hnerf.progress"):
+        for trainer.step, trainer.seconds, trainer.field_steps in ((4, 2, 10), (5, 15, 10), (7, 20, 7), (9, 24, 7)):
+            trainer._report_progress()
+    assert [record.progress[1:] for record in caplog.records] == [(4, 14), (7.5, 14), (7, 11), (9, 11)]

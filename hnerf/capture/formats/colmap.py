@@ -1,7 +1,8 @@
 """COLMAP models, `sparse/0/{cameras,images}.{bin,txt}`: world to camera, pixel centres at one half.
 
 Images and everything else are laid out as in the EasyMocap layout; a model's image `01.jpg` or `01/000000.jpg` is
-camera `01`. COLMAP's own reader trusts the counts in a binary file and can fill the memory, so files are parsed here.
+camera `01`. COLMAP's own reader trusts the counts in a binary file and can fill the memory, and it accepts some
+truncated files or never returns from them, so files are parsed here.
 """
 
 import struct

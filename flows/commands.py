@@ -1,0 +1,174 @@
+"""What each command does with its options; its docstring is its help.
+
+Each imports what it needs itself, so that the others, and help, need not wait for torch and Prefect.
+"""
+
+import argparse
+import dataclasses
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from flows.settings_list import settings_list
+from hnerf.config import SyntheticSettings, load_settings, overridden
+from hnerf.errors import InputError
+from hnerf.files import atomic_folder
+
+DEMO = Path("demo")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Train one person and export the avatar."""
+    _train(options.capture, options.preset, options.store, options.overrides)
+
+
+def settings(options: argparse.Namespace) -> None:
+    """List the settings that --set takes, as the preset has them, with their types and what they mean."""
+    print("\n".join(["hnerf run --set", *settings_list(load_settings(options.preset))]))
+    print("\n".join(["\nhnerf synth --set", *settings_list(SyntheticSettings())]))
+
+
+def demo(options: argparse.Namespace) -> None:
+    """Run `synth` and `run` in ./demo, in minutes."""
+    capture = DEMO / "performer"
+    if not capture.exists():
+        _write_capture(capture, SyntheticSettings())
+    _train(capture, "demo", DEMO / "store", [])
+
+
+def _train(capture: Path, preset: str, store: Path, overrides: list[str]) -> None:
+    from flows.train_subject import train_subject
+
+    folder = train_subject.fn(capture, preset, store, overrides)
+    print(f"report: {folder / 'evaluation' / 'report.html'}")
+    print(f"asset:  {folder / 'asset' / 'avatar.usdz'}")
+
+
+def synth(options: argparse.Namespace) -> None:
+    """Write a synthetic capture with ground truth."""
+    _write_capture(options.out, overridden(SyntheticSettings(), options.overrides))
+
+
+def _write_capture(out: Path, settings: SyntheticSettings) -> None:
+    with atomic_folder(out) as partial:
+        from hnerf.synthetic import write_synthetic_capture
+
+        write_synthetic_capture(partial, settings)
+
+
+def check_cameras(options: argparse.Namespace) -> None:
+    """Read a recording and check its cameras, nothing more."""
+    from tasks.calibration import calibrate
+    from tasks.capture import ingest
+    from tasks.source import read_capture
+    from tasks.store import Store
+
+    settings, store = load_settings(options.preset), Store(options.store.resolve())
+    source, _ = read_capture(options.capture, options.store)
+    recording = ingest(store, source, settings.capture)
+    calibration = calibrate(store, recording, settings.calibration)
+    print("\n".join(_table(json.loads((calibration.root / "report.json").read_text()))))
+    print(f"picture: {calibration.root / 'cameras.png'}")
+
+
+def _table(report: dict[str, Any]) -> Iterator[str]:
+    """Yield the lines of a calibration report for people."""
+    yield f"{'camera':<12} {'status':<9} {'median px':>9} {'95 % px':>9}  remarks"
+    for name, camera in report["cameras"].items():
+        median, p95 = ("-" if px is None else f"{px:.2f}" for px in (camera["median_px"], camera["p95_px"]))
+        remarks = "; ".join(camera["reasons"])
+        yield f"{name:<12} {camera['status']:<9} {median:>9} {p95:>9}  {remarks}".rstrip()
+    for name in report["unjudged_cameras"]:
+        yield f"{name:<12} not judged: a camera for testing"
+    yield from report["notes"]
+    yield f"verdict: {report['verdict']}"
+
+
+def calibrate(options: argparse.Namespace) -> None:
+    """Find the cameras from footage of a calibration board."""
+    with atomic_folder(options.out) as partial:
+        from hnerf.calibration.boards.calibrate import calibrate_from_boards
+
+        found = calibrate_from_boards(options.folder, options.ground_frame)
+        found.save(partial, options.format)
+    print(f"{'camera':<12} {'pictures':>8} {'RMS px':>7}  intrinsics")
+    report = found.report()
+    for name, camera in report["cameras"].items():
+        print(f"{name:<12} {camera['pictures']:>8} {camera['rms_px']:>7.2f}  {camera['intrinsics']}")
+    print(f"all: {report['rms_px']:.2f} px RMS\ncameras: {options.out}\npicture: {options.out / 'boards.png'}")
+
+
+def export_cameras(options: argparse.Namespace) -> None:
+    """Write a recording's cameras as other tools read them."""
+    with atomic_folder(options.out) as partial:
+        from hnerf.capture.formats.export import write_cameras
+        from hnerf.capture.ingest import recognise
+        from hnerf.capture.manifest import read_manifest
+
+        lenses = recognise(options.folder).lenses().values()
+        scale = read_manifest(options.folder).metres_per_unit
+        in_metres = [dataclasses.replace(lens, t_m=scale * lens.t_m) for lens in lenses]
+        write_cameras(partial, in_metres, options.format)
+    print(f"cameras: {options.out}")
+
+
+def benchmark(options: argparse.Namespace) -> None:
+    """Compare methods: accuracy against training and frame time."""
+    from flows.benchmark import benchmark as flow
+
+    table = flow.fn(options.capture, options.study, options.methods, options.seconds, options.store)
+    _show(table)
+    if (chart := table.with_suffix(".png")).exists():
+        print(f"chart: {chart}")
+
+
+def ablate(options: argparse.Namespace) -> None:
+    """Train without each part of the method in turn: a table."""
+    from flows.ablations import ablate as flow
+
+    _show(flow.fn(options.capture, options.preset, options.store, options.overrides, options.only))
+
+
+def stability(options: argparse.Namespace) -> None:
+    """Make a capture worse in many ways: what breaks."""
+    from flows.stability import stability as flow
+
+    _show(flow.fn(options.capture, options.study, options.store, options.methods, options.only))
+
+
+def _show(table: Path) -> None:
+    print(f"{table.read_text()}\ntable: {table}")
+
+
+def render(options: argparse.Namespace) -> None:
+    """Write pictures and videos of a trained person."""
+    from hnerf.render.subject import RenderOptions, render_subject
+    from tasks.store import require_intact
+
+    for subject in (options.subject, options.motion):
+        if subject and subject.is_dir():
+            require_intact(subject)
+    wanted = RenderOptions(
+        camera=options.camera,
+        path=options.path,
+        radius_m=options.radius,
+        height_m=options.height,
+        motion=options.motion,
+        frames=options.frames,
+        between=options.between and tuple(options.between),
+        shape=dict(map(_shape_change, options.shape)),
+        volume=None if options.volume is None else options.volume / 100,
+        what=tuple(dict.fromkeys(options.what.split(","))),
+        size_px=options.size,
+        pictures=options.pictures,
+    )
+    print(f"{render_subject(options.subject, wanted, options.out)} pictures: {options.out}")
+
+
+def _shape_change(text: str) -> tuple[str, float]:
+    name, _, amount = text.partition("=")
+    try:
+        return name, float(amount)
+    except ValueError:
+        raise InputError(f"shape {text}: give a name and what to add, like weight=+0.4") from None

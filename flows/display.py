@@ -1,0 +1,60 @@
+"""What a command shows while it works: the library's log on standard output, with bars of progress on a terminal."""
+
+import logging
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from hnerf.progress import Progress, log
+
+
+@contextmanager
+def display() -> Iterator[None]:
+    """Show the log, in place of Prefect's console handler, which writes to standard error."""
+    logger, level = logging.getLogger("hnerf"), log.level
+    handler = TerminalHandler() if sys.stdout.isatty() else logging.StreamHandler(sys.stdout)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    logger.propagate = False
+    if isinstance(handler, TerminalHandler):
+        log.setLevel(logging.DEBUG)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        handler.close()
+        logger.propagate = True
+        log.setLevel(level)
+
+
+class TerminalHandler(logging.Handler):
+    """Draws a bar with the time left for each work in progress, and prints all other records above the bars."""
+
+    def __init__(self) -> None:
+        from rich import progress  # not where nothing is drawn
+
+        super().__init__()
+        columns = progress.TextColumn("{task.description}"), progress.BarColumn(), progress.TaskProgressColumn()
+        self.bars = progress.Progress(*columns, progress.TimeRemainingColumn(), transient=True)
+        self.shown: dict[str, progress.TaskID] = {}
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Draw or print a record."""
+        at: Progress | None = getattr(record, "progress", None)
+        if at is None:
+            self.bars.console.print(self.format(record), markup=False, highlight=False, soft_wrap=True)
+        elif at.done < at.total:
+            if at.what not in self.shown:
+                self.shown[at.what] = self.bars.add_task(at.what)
+            self.bars.update(self.shown[at.what], completed=at.done, total=at.total)
+            self.bars.start()
+        elif at.what in self.shown:
+            self.bars.remove_task(self.shown.pop(at.what))
+            if not self.shown:
+                self.bars.stop()  # what is printed from here on is not folded to the terminal's width
+
+    def close(self) -> None:
+        """Take the bars away."""
+        self.bars.stop()
+        super().close()

@@ -1,0 +1,55 @@
+"""Settings as a list for people: what --set takes, its type, and the comment beside it in hnerf/config.py."""
+
+import inspect
+import json
+import re
+from collections.abc import Iterator
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+from pydantic.fields import FieldInfo
+
+from hnerf.config import Section
+
+BOUNDS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+FIELD = re.compile(r"^    (\w+): .*?  # (.+)$", re.MULTILINE)
+
+
+def settings_list(settings: Section, prefix: str = "", kinds: str = "") -> Iterator[str]:
+    """Yield a line for each setting, `key=value  type  description`, those of nested sections under their own keys.
+    kinds: which there are, of a section that is of one kind of several."""
+    about = dict(FIELD.findall("\n".join(inspect.getsource(kind) for kind in _sections(type(settings)))))
+    for name, field in type(settings).model_fields.items():
+        value = getattr(settings, name)
+        if isinstance(value, Section):
+            sections = get_args(field.annotation) if field.discriminator else ()
+            others = " | ".join(section.model_fields["kind"].default for section in sections)
+            yield from settings_list(value, f"{prefix}{name}.", others)
+        else:
+            assigned = f"{prefix}{name}={json.dumps(value, default=str)}"
+            yield f"{assigned:<45} {kinds if name == 'kind' else _type(field):<20} {about.get(name, '')}".rstrip()
+
+
+def _sections(kind: type[Section]) -> list[type]:
+    """Return the class and its bases that may have settings, the bases first."""
+    return [base for base in reversed(kind.__mro__) if issubclass(base, Section)]
+
+
+def _type(field: FieldInfo) -> str:
+    bounds = [f"{sign} {getattr(limit, name)}" for limit in field.metadata for name, sign in BOUNDS.items()
+              if hasattr(limit, name)]  # fmt: skip
+    return " ".join([_name(field.annotation), *bounds])
+
+
+def _name(annotation: Any) -> str:
+    """Return a type's name as people read it."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _name(arguments[0])
+    if origin is Literal:
+        return " | ".join(arguments)
+    if origin is tuple:
+        return f"list of {_name(arguments[0])}"
+    if arguments:
+        return " | ".join(map(_name, arguments))
+    return "null" if annotation is NoneType else str(annotation.__name__)

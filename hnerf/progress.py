@@ -1,0 +1,63 @@
+"""How far long work has come: log records at DEBUG, which a display draws and nobody else sees."""
+
+import json
+import logging
+import time
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple, TypeVar
+
+T = TypeVar("T")
+
+log = logging.getLogger("hnerf.progress")
+
+RECORD_SEPARATOR = "\x1e"  # RFC 7464; no line of a log begins with it
+RELAY_EVERY_S = 0.5
+
+
+class Progress(NamedTuple):
+    """What a record carries as its attribute `progress`; the work has ended when all is done."""
+
+    what: str
+    done: float
+    total: float
+
+
+def report(what: str, done: float, total: float) -> None:
+    """Log how much of the work called `what` is done."""
+    log.debug("%s: %g of %g", what, done, total, extra={"progress": Progress(what, done, total)})
+
+
+def tracked(items: Iterable[T], what: str, count: int) -> Iterator[T]:
+    """Yield the items and report, before each, how many are done; and that the work has ended, however it ends."""
+    try:
+        for number, item in enumerate(items):
+            report(what, number, count)
+            yield item
+    finally:
+        report(what, count, count)
+
+
+def relay() -> None:
+    """From here on, write progress as lines on standard output, for the process that started this one."""
+    log.setLevel(logging.DEBUG)
+    log.propagate = False
+    log.addHandler(_Relay())
+
+
+class _Relay(logging.Handler):
+    next_s = 0.0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record that `report` made, unless another was written just before and there is more to come."""
+        progress: Progress = vars(record)["progress"]
+        if time.monotonic() >= self.next_s or progress.done >= progress.total:
+            self.next_s = time.monotonic() + RELAY_EVERY_S
+            print(RECORD_SEPARATOR + json.dumps(progress), flush=True)
+
+
+def report_relayed(line: str) -> bool:
+    """Report what a line says that another process wrote since it called `relay`; return whether it is such a line."""
+    if line.startswith(RECORD_SEPARATOR):
+        report(*json.loads(line.removeprefix(RECORD_SEPARATOR)))
+        return True
+    return False

@@ -1,0 +1,39 @@
+import io
+import logging
+import sys
+
+import pytest
+
+from flows.display import display
+from hnerf.progress import log, report
+
+
+class Screen(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def work() -> None:
+    """Half of something, a line, and the end of it."""
+    with display():
+        report("rendering", 5, 10)
+        logging.getLogger("hnerf.stage").info("training: [1/2]")
+        report("rendering", 10, 10)
+
+
+def test_a_terminal_has_a_bar_that_goes_when_the_work_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys, "stdout", screen := Screen())
+    handlers = list(logging.getLogger("hnerf").handlers)
+    work()
+    assert "rendering" in screen.getvalue() and "50%" in screen.getvalue()
+    assert "hnerf.stage: training: [1/2]\n" in screen.getvalue()
+    assert screen.getvalue().rstrip().endswith("\x1b[2K\x1b[?25h")  # the bar's line is erased
+    assert not log.isEnabledFor(logging.DEBUG) and logging.getLogger("hnerf").handlers == handlers
+
+
+def test_elsewhere_there_are_lines_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdout", file := io.StringIO())
+    work()
+    (line,) = file.getvalue().splitlines()
+    assert line.endswith(" hnerf.stage: training: [1/2]")

@@ -1,0 +1,39 @@
+import logging
+
+import pytest
+
+from hnerf import progress
+
+
+@pytest.fixture
+def reported(caplog: pytest.LogCaptureFixture) -> pytest.LogCaptureFixture:
+    caplog.set_level(logging.DEBUG, progress.log.name)
+    return caplog
+
+
+def test_items_are_reported_before_each_and_at_the_end(reported: pytest.LogCaptureFixture) -> None:
+    assert list(progress.tracked("ab", "letters", 2)) == ["a", "b"]
+    assert [record.progress for record in reported.records] == [("letters", done, 2) for done in (0, 1, 2)]
+
+
+def test_work_that_fails_has_ended(reported: pytest.LogCaptureFixture) -> None:
+    items = progress.tracked("abc", "letters", 3)
+    next(items)
+    with pytest.raises(ValueError, match="broken"):
+        items.throw(ValueError("broken"))
+    assert [record.progress.done for record in reported.records] == [0, 3]
+
+
+def test_another_process_is_reported_as_it_reports_itself(
+    reported: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(progress.log, "handlers", [])
+    monkeypatch.setattr(progress.log, "propagate", True)
+    progress.relay()
+    for done in (1.5, 2, 4):  # the second within half a second of the first
+        progress.report("training", done, 4)
+    progress.log.handlers.clear()
+    progress.log.propagate = True
+    *lines, end = capsys.readouterr().out.split("\n")
+    assert [progress.report_relayed(line) for line in (*lines, end, "step 1 of 4")] == [True, True, False, False]
+    assert [record.progress for record in reported.records] == [("training", 1.5, 4), ("training", 4, 4)]
