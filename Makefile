@@ -14,6 +14,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --constraint constraints.txt torch
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/hnerf models || echo "warning: no networks; what needs them says so (hnerf models)" >&2
 	touch $@
 
 test: $(INSTALLED)

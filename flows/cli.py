@@ -124,6 +124,7 @@ def _parser() -> argparse.ArgumentParser:
     synth = add(commands.synth)
     synth.add_argument("out", type=Path, help="the folder to write")
     _add_overrides(synth, "such as train_cameras=32; `hnerf settings` lists them last")
+    add(commands.models)
     add(commands.demo)
     return parser
 

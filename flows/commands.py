@@ -29,6 +29,13 @@ def settings(options: argparse.Namespace) -> None:
     print("\n".join(["\nhnerf synth --set", *settings_list(SyntheticSettings())]))
 
 
+def models(options: argparse.Namespace) -> None:
+    """Fetch the trained networks that detection and LPIPS use; needed once."""
+    from hnerf.models import fetch_models
+
+    print(f"networks: {fetch_models()}")
+
+
 def demo(options: argparse.Namespace) -> None:
     """Run `synth` and `run` in ./demo, in minutes."""
     capture = DEMO / "performer"
@@ -59,6 +66,7 @@ def _write_capture(out: Path, settings: SyntheticSettings) -> None:
 
 def check_cameras(options: argparse.Namespace) -> None:
     """Read a recording and check its cameras, nothing more."""
+    from flows.train_subject import with_keypoints
     from tasks.calibration import calibrate
     from tasks.capture import ingest
     from tasks.source import read_capture
@@ -66,7 +74,7 @@ def check_cameras(options: argparse.Namespace) -> None:
 
     settings, store = load_settings(options.preset), Store(options.store.resolve())
     source, _ = read_capture(options.capture, options.store)
-    recording = ingest(store, source, settings.capture)
+    recording = with_keypoints(store, ingest(store, source, settings.capture), settings)
     calibration = calibrate(store, recording, settings.calibration)
     print("\n".join(_table(json.loads((calibration.root / "report.json").read_text()))))
     print(f"picture: {calibration.root / 'cameras.png'}")

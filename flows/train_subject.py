@@ -12,6 +12,7 @@ from hnerf.evaluation.holdout import held_out_cameras
 from tasks.asset import export
 from tasks.calibration import calibrate, calibrated_capture
 from tasks.capture import ingest, subset_capture
+from tasks.detection import detect, needs_detection
 from tasks.evaluation import evaluate, evaluate_held_out
 from tasks.fit import fit
 from tasks.segmentation import converged, needs_body, segment
@@ -34,12 +35,13 @@ def train_subject(
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
     if settings.evaluation.holdout:
-        recorded = recorded_cameras(source.root)
-        held_out_cameras(recorded.train, recorded.test, settings.evaluation.holdout)  # refuses before any work is done
+        cameras = recorded_cameras(source.root)
+        held_out_cameras(cameras.train, cameras.test, settings.evaluation.holdout)  # refuses before any work is done
 
-    recording = ingest(artifact_store, source, settings.capture)
-    subject = Capture.load(recording.root).name
-    artifact_store.link_latest(subject, recording)
+    recorded = ingest(artifact_store, source, settings.capture)
+    subject = Capture.load(recorded.root).name
+    artifact_store.link_latest(subject, recorded)
+    recording = artifact_store.link_latest(subject, with_keypoints(artifact_store, recorded, settings))
     calibration = artifact_store.link_latest(subject, calibrate(artifact_store, recording, settings.calibration))
     left_out = calibrated_held_out_cameras(recording, calibration, settings)
     segmentation = artifact_store.link_latest(
@@ -58,10 +60,16 @@ def train_subject(
     )
     artifact_store.link_latest(subject, evaluation)
     asset = export(artifact_store, recording, calibration, training, settings.asset)
-    for artifact in (recording, calibration, segmentation, body, training, evaluation, asset):
+    for artifact in (recorded, recording, calibration, segmentation, body, training, evaluation, asset):
         artifact_store.link_latest(subject, artifact)  # again: another run of this name may have relinked them
     publish_markdown(_figures(subject, evaluation, asset), "result", f"Result for {subject}")
     return artifact_store.subject_folder(subject)
+
+
+def with_keypoints(store: Store, recorded: Artifact, settings: Settings) -> Artifact:
+    """Return the recording, with people detected by a network if it needs that."""
+    wanted = needs_detection(recorded, settings.detection)
+    return detect(store, recorded, settings.detection) if wanted else recorded
 
 
 def prepare_training(

@@ -48,6 +48,11 @@ class SyntheticSettings(Section):
         return self
 
 
+class DetectionSettings(Section):
+    source: Literal["recording", "network", "both"] | None = None  # None: the recording's own keypoints if it has any
+    size: Literal["heavy", "full", "lite"] = "heavy"  # of the landmark network
+
+
 class CalibrationSettings(Section):
     """Settings of the calibration check and of the refinement of cameras."""
 
@@ -269,6 +274,7 @@ class Settings(Section):
     """All settings of a run, one section a stage; a stage's cache key depends on its own section only."""
 
     capture: CaptureSettings = CaptureSettings()
+    detection: DetectionSettings = DetectionSettings()
     calibration: CalibrationSettings = CalibrationSettings()
     segmentation: SegmentationSettings = SegmentationSettings()
     fit: FitSettings = FitSettings()

@@ -1,7 +1,8 @@
 """Prefect tasks, one for each stage, and what they share: artifact store, cache policy, launcher of several processes.
 
-Stages are called capture, calibration, segmentation, fit, training, evaluation and asset throughout. An artifact passed
-on from a stage has the stage's name, except that `recording` is the capture's and `body` the fit's.
+Stages are called capture, detection, calibration, segmentation, fit, training, evaluation and asset throughout. An
+artifact passed on from a stage has the stage's name, except that `recording` is that of capture or detection and `body`
+that of fit.
 """
 
 import logging

@@ -6,6 +6,7 @@ import torch
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.evaluation.ground_truth import GroundTruth
+from hnerf.models import LPIPS_ALEXNET
 from hnerf.study.benchmark.plan import ScoringSettings
 from hnerf.study.benchmark.scoring import ScoringScene, score, score_end
 from tasks.calibration import calibrated_capture
@@ -14,7 +15,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("scoring", version="9")
+@stage("scoring", version="10", networks=(LPIPS_ALEXNET,))
 def score_training(
     out: Path,
     truth: Source,
@@ -30,7 +31,7 @@ def score_training(
     return {} if psnr is None else {"psnr": psnr}
 
 
-@stage("scoring-end", version="1")
+@stage("scoring-end", version="2", networks=(LPIPS_ALEXNET,))
 def score_end_of_training(
     out: Path,
     truth: Source,

@@ -11,6 +11,7 @@ from hnerf.evaluation.evaluate import evaluate as evaluate_avatar
 from hnerf.evaluation.holdout import score_held_out
 from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.views import SPLITS
+from hnerf.models import LPIPS_ALEXNET
 from tasks.calibration import calibrated_capture
 from tasks.source import Source
 from tasks.stage import stage
@@ -18,7 +19,7 @@ from tasks.store import Artifact
 from tasks.training import load_trained_avatar
 
 
-@stage("evaluation", version="10")
+@stage("evaluation", version="11", networks=(LPIPS_ALEXNET,))
 def evaluate(
     out: Path,
     truth: Source,
@@ -50,7 +51,7 @@ def evaluate(
     return _headline(found) | {f"holdout {name}": value for name, value in held_out_mean.items()}
 
 
-@stage("holdout", version="1")
+@stage("holdout", version="2", networks=(LPIPS_ALEXNET,))
 def evaluate_held_out(
     out: Path,
     recording: Artifact,
@@ -69,5 +70,10 @@ def evaluate_held_out(
 
 def _headline(found: Mapping[str, Any]) -> dict[str, float]:
     """Return the mean image scores of each split that has any."""
-    means = {f"{split} {name}": found[split][name] for split in SPLITS if split in found for name in ("psnr", "ssim")}
+    means = {
+        f"{split} {name}": found[split][name]
+        for split in SPLITS
+        if split in found
+        for name in ("psnr", "ssim", "lpips")
+    }
     return {name: value for name, value in means.items() if value is not None}

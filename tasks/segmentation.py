@@ -43,9 +43,10 @@ def converged(segmentation: Artifact, settings: SegmentationSettings) -> bool:
 
 
 def needs_body(recording: Artifact, settings: SegmentationSettings) -> bool:
-    """Return whether segmentation needs a fitted body: some camera has neither masks nor a clean plate, and there is no
-    learned model; or there are no keypoints."""
+    """Return whether segmentation needs a fitted body: some camera has neither masks nor a clean plate, and there is
+    neither a learned model nor a network that detected people; or there are no keypoints."""
     capture = Capture.load(recording.root)
     first = capture.train_frames[0]
     unmasked = (capture.background(c) is None and capture.given_mask(c, first) is None for c in capture.train_cameras)
-    return not capture.has_keypoints or (settings.model is None and any(unmasked))
+    told = settings.model is not None or capture.was_looked_at
+    return not capture.has_keypoints or (not told and any(unmasked))

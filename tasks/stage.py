@@ -10,12 +10,14 @@ from prefect import Task
 from prefect.context import FlowRunContext
 from prefect.tasks import exponential_backoff
 
+from hnerf.models import has_model
 from tasks.policy import Input, StorePolicy, is_transient, stage_key
 from tasks.store import Artifact, Store
 
 log = logging.getLogger("hnerf.stage")
 
 P = ParamSpec("P")
+NETWORKS = "networks"  # beside a stage's own inputs, in its key
 Write = Callable[Concatenate[Path, P], dict[str, float]]
 
 
@@ -26,8 +28,9 @@ class Stage(Generic[P]):
     work through the same store, without a server.
     """
 
-    def __init__(self, write: Write[P], name: str, version: str, resumable: bool):
+    def __init__(self, write: Write[P], name: str, version: str, resumable: bool, networks: tuple[str, ...] = ()):
         self.write, self.name, self.version, self.resumable = write, name, version, resumable
+        self.networks = networks
         self.task: Task[..., Artifact] = Task(
             fn=self._run,
             name=name,
@@ -47,16 +50,25 @@ class Stage(Generic[P]):
         _, *parameters = inspect.signature(self.write).parameters.values()
         inputs = inspect.Signature(parameters).bind(*args, **kwargs)
         inputs.apply_defaults()
+        found: dict[str, Input] = dict(inputs.arguments)
+        if self.networks:
+            found[NETWORKS] = tuple(name for name in self.networks if has_model(name))
         run = self.task if FlowRunContext.get() else self.task.fn
-        return run(store=store, inputs=dict(inputs.arguments))
+        return run(store=store, inputs=found)
 
     def _run(self, store: Store, inputs: dict[str, Input]) -> Artifact:
         log.info("%s", self.name)
         key = stage_key(self.name, self.version, inputs)
-        return store.get_or_compute(self.name, key, lambda out: self.write(out, **inputs), self.resumable)  # type: ignore[call-arg, arg-type]
+        given = {name: value for name, value in inputs.items() if name != NETWORKS}
+        return store.get_or_compute(self.name, key, lambda out: self.write(out, **given), self.resumable)  # type: ignore[call-arg, arg-type]
 
 
-def stage(name: str, version: str, resumable: bool = False) -> Callable[[Write[P]], Stage[P]]:
+def stage(
+    name: str, version: str, resumable: bool = False, networks: tuple[str, ...] = ()
+) -> Callable[[Write[P]], Stage[P]]:
     """Make a function into a Stage (decorator). Artifacts lie under `<store>/<name>/`; raise `version` when the same
-    inputs give another result."""
-    return lambda write: Stage(write, name, version, resumable)
+    inputs give another result.
+
+    networks: files of hnerf.models that the stage uses if they are installed; the key depends on which ones are.
+    """
+    return lambda write: Stage(write, name, version, resumable, networks)

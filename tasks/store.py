@@ -27,7 +27,7 @@ from hnerf.errors import InputError
 log = logging.getLogger("hnerf.store")
 
 # In order: each stage is computed from those before it.
-STAGES = ("capture", "calibration", "segmentation", "fit", "training", "evaluation", "asset")
+STAGES = ("capture", "detection", "calibration", "segmentation", "fit", "training", "evaluation", "asset")
 
 
 class StoredFile(BaseModel):

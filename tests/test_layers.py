@@ -9,9 +9,9 @@ import pytest
 import hnerf
 
 ROOT = Path(hnerf.__file__).parent
-FOUNDATION = ("errors", "evenly_spaced", "tables", "files", "progress", "config")
-FLOORS = (*FOUNDATION, "geometry", "capture", "body", "synthetic", "segmentation", "calibration", "fields", "baselines",
-          "avatar", "training", "render", "evaluation", "asset", "study")  # fmt: skip
+FOUNDATION = ("errors", "evenly_spaced", "tables", "files", "progress", "models", "config")
+FLOORS = (*FOUNDATION, "geometry", "capture", "detection", "body", "synthetic", "segmentation", "calibration", "fields",
+          "baselines", "avatar", "training", "render", "evaluation", "asset", "study")  # fmt: skip
 
 
 def imported(path: Path) -> Iterator[str]:

@@ -2,7 +2,7 @@
 
 A normalised capture is a folder with `capture.json`, `images/<camera>/<frame:06d>.<ext>` (undistorted), and where the
 recording has them `background/<camera>.<ext>` (clean plates), `masks/<camera>/<frame:06d>.png`, `keypoints.npz` and
-`poses.npz`.
+`poses.npz`; where a network looked for people `person/<camera>/<frame:06d>.png`.
 """
 
 import dataclasses
@@ -20,6 +20,7 @@ from hnerf.capture.timing import median_step, nearest_frame, resample
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
+PERSON = "person"  # folder: <camera>/<frame>.png, 255 times the probability
 JPEG_OPTIONS = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
 
@@ -77,6 +78,17 @@ class Capture:
             raise InputError(f"{path}: not a readable image; write it again or delete it")
         return mask > 127
 
+    def likely_person(self, camera: str, frame: int) -> np.ndarray | None:
+        """Return a network's probability that a pixel shows a person, (H, W) float32; None if no network looked. It is
+        that of the recorded frame nearest in time."""
+        path = self.root / PERSON / camera / f"{self.recorded_frame(camera, frame):06d}.png"
+        if not path.exists():
+            return None
+        likely = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if likely is None:
+            raise InputError(f"{path}: not a readable image; detect again")
+        return likely.astype(np.float32) / 255
+
     def keypoints(self, camera: str) -> np.ndarray | None:
         """Return BODY_25 keypoints (frames, people, 25, 3) x_px, y_px, confidence in the order of `frames`; all 0 where
         absent.
@@ -96,6 +108,11 @@ class Capture:
     def has_keypoints(self) -> bool:
         """Return whether any keypoints were detected in this recording."""
         return (self.root / "keypoints.npz").exists()
+
+    @property
+    def was_looked_at(self) -> bool:
+        """Whether a network said of each pixel of the training cameras if it is a person's."""
+        return all((self.root / PERSON / camera).is_dir() for camera in self.train_cameras)
 
     def given_poses(self) -> GivenPoses | None:
         """Return the poses of a body model that come with the recording, a row for each of `frames`; None where there

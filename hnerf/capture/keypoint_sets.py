@@ -15,7 +15,9 @@ LIMBS = ((1, 2), (2, 3), (3, 4), (1, 5), (5, 6), (6, 7), (8, 9), (9, 10), (10, 1
          (1, 8), (0, 1))  # fmt: skip
 FEET = ((11, 24), (11, 22), (14, 21), (14, 19))
 
-KeypointSetName = Literal["coco_17", "coco_18", "body_25", "body_25b", "halpe_26", "coco_wholebody", "halpe_136"]
+KeypointSetName = Literal[
+    "coco_17", "coco_18", "body_25", "body_25b", "halpe_26", "coco_wholebody", "halpe_136", "blazepose_33"
+]
 
 
 class KeypointSet(NamedTuple):
@@ -33,6 +35,11 @@ _COCO = (
     (0,), (5, 6), (6,), (8,), (10,), (5,), (7,), (9,), (11, 12), (12,), (14,), (16,), (11,), (13,), (15,),
     (2,), (1,), (4,), (3,),
 )  # fmt: skip
+# Bazarevsky et al. 2020: nose, eyes and ears, mouth, arms, hands, legs, heels (29, 30), toes (31, 32), left first.
+_BLAZEPOSE = (
+    (0,), (11, 12), (12,), (14,), (16,), (11,), (13,), (15,), (23, 24), (24,), (26,), (28,), (23,), (25,), (27,),
+    (5,), (2,), (8,), (7,), (31,), (), (29,), (32,), (), (30,),
+)  # fmt: skip
 _NO_FEET = ((),) * 6
 _HALPE = (*_COCO, (20,), (22,), (24,), (21,), (23,), (25,))  # Halpe-FullBody: toes and heels in pairs
 
@@ -46,6 +53,7 @@ SETS: dict[KeypointSetName, KeypointSet] = {
     "halpe_26": KeypointSet(26, _HALPE),
     "coco_wholebody": KeypointSet(133, (*_COCO, *((k,) for k in range(17, 23)))),  # Jin et al. 2020; face, hands unused
     "halpe_136": KeypointSet(136, _HALPE),  # Halpe-26, then face and hands
+    "blazepose_33": KeypointSet(33, _BLAZEPOSE),
 }
 KNOWN = ", ".join(f"{name} ({known.points})" for name, known in SETS.items())
 COUNTS = {known.points for known in SETS.values()}

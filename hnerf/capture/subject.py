@@ -28,7 +28,7 @@ def subject_keypoints(capture: Capture) -> dict[str, np.ndarray]:
     detections = {name: capture.keypoints(name) for name in names}
     for name, found in detections.items():
         if found is None:
-            raise InputError(f"{capture.name}: camera {name}: no keypoints; run a keypoint detector on its images")
+            raise InputError(f"{capture.name}: camera {name}: no keypoints; leave detection.source out, or detect some")
     people = [np.nan_to_num(found).astype(np.float64) for found in detections.values() if found is not None]
     seen = np.array([(p[..., 2] > 0).any((1, 2)) for p in people])  # (cameras, frames)
     if not (seen.sum(0) >= min(2, len(names))).any():

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from hnerf.capture.board_footage import BOARDS_FILE
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import PERSON, Capture
 from hnerf.errors import InputError, NotApplicableError
 
 T = TypeVar("T")
@@ -76,8 +76,8 @@ def write_keypoints(root: Path, keypoints: dict[str, np.ndarray]) -> None:
 
 
 def copy_pixels(capture: Capture, kept: Capture, camera: str) -> None:
-    """Copy one camera's images, clean plate and given masks, file by file, unchanged."""
-    for folder in ("images", "masks"):
+    """Copy one camera's images, clean plate, given masks and detected person masks, file by file, unchanged."""
+    for folder in ("images", "masks", PERSON):
         copy_files(capture.root / folder / camera, kept.root / folder / camera, {f"{f:06d}" for f in kept.frames})
     copy_files(capture.root / "background", kept.root / "background", {camera})
 

@@ -16,13 +16,13 @@ from hnerf.capture.masks import Masks
 from hnerf.config import EvaluationSettings
 from hnerf.errors import InputError
 from hnerf.evaluation.columns import avatar_for_split, reason_unavailable
-from hnerf.evaluation.images import render, score_split, scored_views, unscored
+from hnerf.evaluation.images import mean_of, render, score_split, scored_views, unscored
 from hnerf.evaluation.views import PRIMARY_SPLITS
 
 EACH = "each"
 MIN_CAMERAS = 2  # that must remain for training
 SCORES_FILE = "holdout.json"
-FIGURES = ("psnr", "ssim", "mask_iou")
+FIGURES = ("psnr", "ssim", "mask_iou", "lpips")
 LABEL = "photographs under the capture's own masks, camera left out of fit and training"
 NOT_REQUESTED = (
     "no field was trained without a camera; `hnerf run --set evaluation.holdout=each` trains one without each in turn"
@@ -106,11 +106,6 @@ def collect_held_out(capture: Capture, folders: Sequence[Path]) -> dict[str, Any
         return {"holdout": None, "holdout_reason": reason}
     cameras = {found.pop("camera"): found for found in (json.loads((f / SCORES_FILE).read_text()) for f in folders)}
     mean = {
-        split: {key: _mean([c[split][key] for c in cameras.values()]) for key in FIGURES} for split in PRIMARY_SPLITS
+        split: {key: mean_of([c[split][key] for c in cameras.values()]) for key in FIGURES} for split in PRIMARY_SPLITS
     }
     return {"holdout": {"what": LABEL, "cameras": cameras, "mean": mean}}
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None

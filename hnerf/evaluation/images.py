@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from hnerf.evaluation.ground_truth import Truth
 from hnerf.evaluation.views import NOVEL_POSE_SPLITS, View, all_views, sample_views
 from hnerf.progress import tracked
 
-MEANS = ("psnr", "ssim", "mask_iou", "empty_psnr", "one_colour_psnr")  # averaged over a split's images
+MEANS = ("psnr", "ssim", "mask_iou", "lpips", "empty_psnr", "one_colour_psnr")  # averaged over a split's images
 TUNED_ON = (
     "the capture has no test camera, and training cameras saw these frames when their poses were fitted; "
     "evaluation.holdout scores a field that was trained without one of them"
@@ -82,9 +82,15 @@ def score_split(capture: Capture, split: str, views: list[View], truth: Truth | 
         return unscored(
             "no image of this split shows the person" if known else "no image of this split has a mask to score it by"
         )
-    means = {name: float(np.mean([row[name] for row in rows])) for name in MEANS}
+    means = {name: mean_of([row[name] for row in rows]) for name in MEANS}
     without = {"without_mask": len(views) - len(known), "without_person": len(known) - len(rows)}
     return {"n": len(rows)} | means | without | {"reference": " and ".join(sorted(references)), "per_image": rows}
+
+
+def mean_of(values: Sequence[float | None]) -> float | None:
+    """Return the mean of the values that are not None; None if there are none."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
 
 
 def unscored(reason: str) -> dict[str, Any]:

@@ -5,25 +5,30 @@ from dataclasses import dataclass
 import numpy as np
 from skimage.metrics import structural_similarity
 
+from hnerf.evaluation.lpips import lpips
+
 BOX_PADDING_PX = 20
 COVERED_LEVEL = 127  # of 255; a rendered pixel with more coverage counts as person, however dark it is
 
 
 @dataclass(frozen=True)
 class ImageScore:
-    """The scores of one image. psnr in dB; ssim in [-1, 1]; mask_iou: covered pixels against the mask, in [0, 1]."""
+    """The scores of one image. psnr in dB; ssim in [-1, 1]; mask_iou: covered pixels against the mask, in [0, 1];
+    lpips: 0 for equal images, None if its weights are not installed."""
 
     psnr: float
     ssim: float
     mask_iou: float
+    lpips: float | None
 
 
 def score_image(rendered: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> ImageScore:
     """Score a rendering (H, W, 4), over black and its coverage, against a reference (H, W, 3) over black, both uint8;
     mask (H, W) bool, not empty."""
     box = mask_box(mask)
-    a, b = rendered[box][..., :3].astype(np.float32) / 255, reference[box].astype(np.float32) / 255
-    return ImageScore(psnr(a, b), ssim(a, b), mask_iou(rendered[..., 3], mask))
+    shown, true = rendered[box][..., :3], reference[box]
+    a, b = shown.astype(np.float32) / 255, true.astype(np.float32) / 255
+    return ImageScore(psnr(a, b), ssim(a, b), mask_iou(rendered[..., 3], mask), lpips(shown, true))
 
 
 def trivial_psnr(reference: np.ndarray, mask: np.ndarray) -> dict[str, float]:

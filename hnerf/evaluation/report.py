@@ -42,6 +42,7 @@ FIGURES = (  # key in a split's scores, name, unit, format, meaning
     ),
     ("ssim", "SSIM", "", "{:.3f}", "Similarity of local structure: edges, folds, patterns. 1 is identical."),
     ("mask_iou", "Mask IoU", "", "{:.3f}", "Overlap of the rendered person and the true mask. 1 is identical."),
+    ("lpips", "LPIPS", "", "{:.3f}", "Difference by a network trained on human judgement. 0 is identical."),
     ("geometry.chamfer_mm", "Surface distance", "mm", "{:.1f}", "Mean distance between the surface and the true one."),
     ("geometry.chamfer_l2_e3", "Chamfer", "m² × 10⁻³", "{:.3f}", "Mean squared distance; larger errors weigh more."),
     (
@@ -142,7 +143,7 @@ def held_out_rows(found: dict[str, Any]) -> list[list[str]]:
     """Return the cells of a table: a row for each held-out camera, and their mean."""
     if found["holdout"] is None:
         return []
-    forms = {"psnr": "{:.2f}", "ssim": "{:.3f}", "mask_iou": "{:.3f}"}
+    forms = {"psnr": "{:.2f}", "ssim": "{:.3f}", "mask_iou": "{:.3f}", "lpips": "{:.3f}"}
     scores = {f"Camera {name}": by_split for name, by_split in found["holdout"]["cameras"].items()}
     return [
         [name, *(shown(by_split[split][key], form) for split in PRIMARY_SPLITS for key, form in forms.items())]

@@ -15,7 +15,8 @@ from hnerf.segmentation.difference import difference, exposure_corrected, masked
 from hnerf.segmentation.learned import Network
 from hnerf.segmentation.prior import Prior, bounding_window
 
-CLEAN_PLATE, MEDIAN = "clean plate", "median around the fitted body"
+CLEAN_PLATE = "clean plate"
+AROUND_BODY, AROUND_DETECTED = "median around the fitted body", "median around the detected person"
 MEDIAN_FRAMES = 60  # at most, evenly spaced, for the background without a plate
 
 
@@ -85,14 +86,19 @@ class BackgroundSubtraction:
 
     @staticmethod
     def from_median(
-        capture: Capture, camera: str, priors: Sequence[Prior], count: int, settings: SegmentationSettings
+        capture: Capture,
+        camera: str,
+        priors: Sequence[Prior],
+        count: int,
+        settings: SegmentationSettings,
+        name: str = AROUND_BODY,
     ) -> "BackgroundSubtraction":
         """Use the median over at most `count` frames, each where its prior leaves the background free; priors are in
         the order of the frames."""
         chosen = evenly_spaced(range(len(priors)), count)
         images = [capture.image(camera, capture.frames[i]) for i in chosen]
         plate, known = masked_median(images, [priors[i] for i in chosen])
-        return BackgroundSubtraction(capture, camera, plate, known, settings, MEDIAN)
+        return BackgroundSubtraction(capture, camera, plate, known, settings, name)
 
     def mask(self, frame: int, prior: Prior) -> np.ndarray:
         """Return the mask cut out of the window within reach of the prior."""
@@ -102,7 +108,7 @@ class BackgroundSubtraction:
             return mask
         free = visible_background(prior, self.known)
         plate = exposure_corrected(self.plate, image, free)
-        noise, is_median = noise_level(image, plate, free), self.name == MEDIAN
+        noise, is_median = noise_level(image, plate, free), self.name != CLEAN_PLATE
         found = difference(image[window], plate[window], noise, self.settings, shadowed=is_median)
         mask[window] = cut(image[window], found, prior.cropped(window), self.known[window])
         return mask
@@ -113,7 +119,7 @@ def choose_backend(
     settings: SegmentationSettings,
 ) -> Backend:  # fmt: skip
     """Return the first possible source of masks: given masks, the user's network, a clean plate, then the background
-    around a `fitted` body.
+    around a `fitted` body or a detected person.
 
     priors: in the order of the capture's frames. Raises InputError where none is possible.
     """
@@ -124,8 +130,9 @@ def choose_backend(
     plate = capture.background(camera)
     if plate is not None:
         return BackgroundSubtraction.from_plate(capture, camera, plate, settings)
-    if not fitted:
+    if not fitted and not capture.was_looked_at:
         raise InputError(
             f"{capture.name}: camera {camera} has neither masks nor a plate (background/{camera}.jpg); fit a body first"
         )
-    return BackgroundSubtraction.from_median(capture, camera, priors, MEDIAN_FRAMES, settings)
+    around = AROUND_BODY if fitted else AROUND_DETECTED
+    return BackgroundSubtraction.from_median(capture, camera, priors, MEDIAN_FRAMES, settings, around)

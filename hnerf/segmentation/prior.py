@@ -23,6 +23,7 @@ NEAR_SHARE = 0.03  # of the person's height: error of a body fitted to keypoints
 SOLE_SHARE = 0.06  # of the person's height: extent of a shoe below the lowest keypoint
 UPRIGHT = 0.7  # least cosine between the image's and the world's vertical in an upright image
 HEAD_SHARE = 0.45  # of the distance from neck to nose: radius of the head about a point a little above the nose
+LIKELY, SURE = 0.5, 0.9  # probabilities of a network from which a pixel is taken for the person's
 FAR = 5  # in longer sides of the image, beyond which nothing is drawn
 FACE = (15, 16, 17, 18)
 SHOULDERS, HIP_WIDTH = (2, 5), 0.8  # of the shoulders' width, for hips that are not seen
@@ -83,6 +84,25 @@ def body_priors(capture: Capture, body: BodyFit, settings: SegmentationSettings)
             core = cv2.erode(covered.astype(np.uint8), disc(CORE_SHARE * figure.height_px)).astype(bool)
             covered |= figure.body
             priors.append(Prior.around(core, covered, covered, figure.height_px, settings.reach / 2, upright))
+        yield name, priors
+
+
+def network_priors(capture: Capture, settings: SegmentationSettings) -> Iterator[tuple[str, list[Prior]]]:
+    """Yield each training camera with the priors of what a network took for a person, as far as it is the subject,
+    together with the stick figure."""
+    for name, figures in _stick_figures(capture):
+        priors, upright = [], _is_upright(capture, name)
+        for frame, stick in zip(capture.frames, figures, strict=True):
+            likely = capture.likely_person(name, frame)
+            assert likely is not None  # a network looks at every image of a training camera
+            figure = Prior.around(stick.core, stick.body, stick.completed, stick.height_px, settings.reach, upright)
+            covered = (likely > LIKELY) & figure.reach
+            if not covered.any():  # missed in this image
+                priors.append(figure)
+                continue
+            core = cv2.erode((likely > SURE).astype(np.uint8), disc(CORE_SHARE * stick.height_px)).astype(bool)
+            body = covered | stick.core
+            priors.append(Prior.around(core & covered, body, body, stick.height_px, settings.reach / 2, upright))
         yield name, priors
 
 

@@ -14,7 +14,7 @@ from hnerf.errors import InputError
 from hnerf.progress import tracked
 from hnerf.segmentation.backends import choose_backend
 from hnerf.segmentation.learned import Network
-from hnerf.segmentation.prior import Prior, body_priors, keypoint_priors
+from hnerf.segmentation.prior import Prior, body_priors, keypoint_priors, network_priors
 from hnerf.segmentation.verdicts import MaskVerdict, area_jumps, judge_mask
 
 log = logging.getLogger("hnerf.segmentation")
@@ -23,11 +23,15 @@ log = logging.getLogger("hnerf.segmentation")
 def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettings) -> Masks:
     """Return masks for all training cameras and `capture.frames`.
 
-    A camera with given masks keeps them; the user's network comes next, then a clean plate; otherwise `body` is needed,
-    to find the background in pixels that it does not reach. Only the subject is kept where there are several people. A
-    mask that cannot be right is dropped and named in the report. Raises InputError if no mask of a camera is left.
+    A camera with given masks keeps them; the user's network comes next, then a clean plate; otherwise `body`, or the
+    person that detection found, is needed to find the background in pixels that neither reaches. Only the subject is
+    kept where there are several people. A mask that cannot be right is dropped and named in the report. Raises
+    InputError if no mask of a camera is left.
     """
-    priors = keypoint_priors(capture, settings) if body is None else body_priors(capture, body, settings)
+    if body is not None:
+        priors = body_priors(capture, body, settings)
+    else:
+        priors = (network_priors if capture.was_looked_at else keypoint_priors)(capture, settings)
     network = None if settings.model is None else Network(settings.model)
     encoded: dict[tuple[str, int], bytes] = {}
     cameras: dict[str, Any] = {}

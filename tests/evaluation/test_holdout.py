@@ -88,7 +88,7 @@ def test_figures_are_gathered_by_camera_with_their_mean(tmp_path: Path) -> None:
         path = tmp_path / camera
         path.mkdir()
         dbs = {"novel_view": view_db, "novel_pose": pose_db}
-        scores = {split: {"psnr": db, "ssim": 0.5, "mask_iou": None} for split, db in dbs.items()}
+        scores = {split: {"psnr": db, "ssim": 0.5, "mask_iou": None, "lpips": None} for split, db in dbs.items()}
         (path / "holdout.json").write_text(json.dumps({"camera": camera, "trained_on": ["x", "y"]} | scores))
         return path
 
@@ -96,7 +96,7 @@ def test_figures_are_gathered_by_camera_with_their_mean(tmp_path: Path) -> None:
     found = collect_held_out(capture, [folder("a", 20.0, None), folder("b", 23.0, 18.0)])["holdout"]
     assert found["what"] == LABEL
     assert list(found["cameras"]) == ["a", "b"]
-    assert found["mean"]["novel_view"] == {"psnr": 21.5, "ssim": 0.5, "mask_iou": None}
+    assert found["mean"]["novel_view"] == {"psnr": 21.5, "ssim": 0.5, "mask_iou": None, "lpips": None}
     assert found["mean"]["novel_pose"]["psnr"] == 18.0
     with_test_camera = replace(capture, test_cameras=("c",))
     assert "has test cameras" in collect_held_out(with_test_camera, [])["holdout_reason"]

@@ -14,7 +14,7 @@ class Screen(io.StringIO):
 
 
 def work() -> None:
-    """Half of something, a line, and the end of it."""
+    """Report half of some work, log a line, and report the end."""
     with display():
         report("rendering", 5, 10)
         logging.getLogger("hnerf.stage").info("training: [1/2]")

@@ -53,6 +53,7 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any
     for name in ("ingest", "calibrate", "segment", "fit", "train", "evaluate", "evaluate_held_out", "export"):
         monkeypatch.setattr(module, name, spied(getattr(module, name)))
     monkeypatch.setattr(module, "needs_body", lambda *_: True)
+    monkeypatch.setattr(module, "needs_detection", lambda *_: False)
     monkeypatch.setattr(module, "converged", lambda *_: True)
     (tmp_path / "ada").mkdir()
     whole = write_recording(tmp_path / "whole")

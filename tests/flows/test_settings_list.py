@@ -9,15 +9,17 @@ from hnerf.config import Settings, SyntheticSettings, load_settings, overridden
 def test_a_line_has_key_value_type_bounds_and_comment(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["settings", "--preset", "paper"]) == 0
     found = {line.split("=")[0]: " ".join(line.split()) for line in capsys.readouterr().out.splitlines()}
-    assert found["capture.max_side_px"] == ("capture.max_side_px=1024 int >= 16 images with a longer side are shrunk when they are ingested")
+    assert found["capture.max_side_px"] == (
+        "capture.max_side_px=1024 int >= 16 images with a longer side are shrunk when they are ingested"
+    )
     assert found["calibration.min_improvement"].startswith("calibration.min_improvement=0.02 float >= 0 < 1 share")
     assert found["segmentation.model"].startswith("segmentation.model=null Path | null ONNX file")
     assert found["training.field.kind"].startswith('training.field.kind="paper" fast | paper | nerf | ')
     assert found["training.losses.geometry_roles"].startswith(
         'training.losses.geometry_roles="surface_leads" surface_leads | print whether'
     )
-    assert found["training.snapshots_s"].startswith("training.snapshots_s=[] list of float when")
-    assert found["test_cameras"] == "test_cameras=2 int >= 0 half-way between two of those each, evenly spread"
+    assert found["training.snapshots_s"].startswith("training.snapshots_s=[] list of float times")
+    assert found["test_cameras"] == "test_cameras=2 int >= 0 each half-way between two of those, evenly spaced"
 
 
 @pytest.mark.parametrize("settings", [load_settings("fast"), load_settings("paper"), SyntheticSettings()])

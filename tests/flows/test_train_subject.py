@@ -15,7 +15,7 @@ from hnerf.geometry.camera import Camera
 from tasks.stage import Stage
 from tasks.store import Artifact
 
-STAGES = ("ingest", "calibrate", "segment", "fit", "train", "evaluate", "export")
+STAGES = ("ingest", "detect", "calibrate", "segment", "fit", "train", "evaluate", "export")
 
 
 @pytest.fixture
@@ -24,6 +24,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name in STAGES:
         monkeypatch.setattr(module, name, _noting(getattr(module, name)))
     monkeypatch.setattr(module, "needs_body", lambda *_: (tmp_path / "ada" / "bare").exists())
+    monkeypatch.setattr(module, "needs_detection", lambda *_: (tmp_path / "ada" / "undetected").exists())
     (tmp_path / "ada").mkdir()
     return tmp_path / "ada"
 
@@ -53,6 +54,15 @@ def test_every_stage_is_shown_and_given_what_went_before(folder: Path, tmp_path:
     assert given(subject, "training") == ["capture", "calibration", "segmentation", "fit"]
     assert given(subject, "evaluation") == ["capture", "calibration", "segmentation", "fit", "training"]
     assert given(subject, "asset") == ["capture", "calibration", "training"]
+
+
+def test_what_was_detected_takes_the_recordings_place(folder: Path, tmp_path: Path) -> None:
+    (folder / "undetected").touch()
+    subject = train_subject.fn(folder, "demo", tmp_path / "store", [])
+    assert given(subject, "detection") == ["capture"]
+    assert given(subject, "calibration") == ["detection"]
+    assert given(subject, "training") == ["detection", "calibration", "segmentation", "fit"]
+    assert given(subject, "asset") == ["detection", "calibration", "training"]
 
 
 def test_without_masks_or_plates_a_rough_fit_comes_first(

@@ -51,6 +51,14 @@ def write_scene(
     return write_capture(root, views, seen), truth
 
 
+def write_likely(capture: Capture, masks: dict) -> None:
+    """What a network would say of each pixel, blurred by 2 px, and of a poster in a corner."""
+    for (camera, frame), mask in masks.items():
+        likely = cv2.GaussianBlur(np.where(mask, 255.0, 0.0), (0, 0), 2)
+        likely[:40, :30] = 255
+        _write(capture.root / "person" / camera / f"{frame:06d}.png", likely.round().astype(np.uint8))
+
+
 def person(pose_px: np.ndarray) -> np.ndarray:
     """Draw a person with thick limbs, trunk and head, (H, W) bool."""
     image = np.zeros((SIZE_PX, SIZE_PX), np.uint8)

@@ -34,6 +34,6 @@ def test_fit_and_training_do_without(tmp_path: Path) -> None:
     count, all_count = pixels.starts.diff().tolist(), all_pixels.starts.diff().tolist()
     assert count[1] == 0 and count[2] == all_count[2]
     first = slice(0, count[0])
-    camera, all_camera = (p.where(torch.arange(len(p.person)))[0] for p in (pixels, all_pixels))
+    camera, all_camera = (p.cameras_and_xy(torch.arange(len(p.person)))[0] for p in (pixels, all_pixels))
     assert sorted(set(camera[first].tolist())) == [0, 2, 3]
     assert count[0] == int((all_camera[: all_count[0]] != 1).sum())

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from hnerf.config import SegmentationSettings
-from hnerf.segmentation.prior import _completed_pose, _interpolated, keypoint_priors
-from tests.segmentation.scene import write_scene
+from hnerf.segmentation.prior import _completed_pose, _interpolated, keypoint_priors, network_priors
+from tests.segmentation.scene import write_likely, write_scene
 
 HEAD, LEGS, FEET = [0, 15, 16, 17, 18], [10, 11, 13, 14, *range(19, 25)], list(range(19, 25))
 HIPS = [8, 9, 12]
@@ -27,6 +27,24 @@ def test_what_no_keypoint_shows_is_within_reach(tmp_path: Path, cameras: int, un
     priors = dict(keypoint_priors(capture, SegmentationSettings()))
     for (camera, frame), person in truth.items():
         assert priors[camera][frame].reach[person].all()
+
+
+def test_a_networks_mask_says_where_the_subject_is(tmp_path: Path) -> None:
+    """Its body is what is likelier than not of him, not of the poster; its core is surely his; where the network missed
+    him the stick figure speaks."""
+    capture, truth = write_scene(tmp_path, 2)
+    write_likely(capture, truth | {("c0", 3): np.zeros_like(truth["c0", 3])})
+    found = dict(network_priors(capture, SegmentationSettings()))
+    sticks = dict(keypoint_priors(capture, SegmentationSettings()))
+    for (camera, frame), person in truth.items():
+        prior = found[camera][frame]
+        if (camera, frame) == ("c0", 3):
+            assert np.array_equal(prior.body, sticks[camera][frame].body)
+            continue
+        assert (prior.body & person).sum() / (prior.body | person).sum() > 0.9
+        assert (prior.core & ~person).sum() < 0.001 * person.sum() < prior.core.sum() / 200  # a hole that the blur shut
+        assert not prior.reach[:40, :30].any()
+        assert prior.reach.sum() < 0.8 * sticks[camera][frame].reach.sum()
 
 
 def test_a_detection_far_outside_the_image_is_drawn_no_farther_than_that(tmp_path: Path) -> None:

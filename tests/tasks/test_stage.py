@@ -9,6 +9,7 @@ from prefect.context import FlowRunContext
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from tasks.source import Source, read_capture
+from tasks.stage import Stage
 from tasks.store import Store
 from tests.tasks.fakes import calls, copy, double, flaky
 
@@ -48,6 +49,20 @@ def test_other_settings_do_the_work_again_but_equal_content_stops_there(tmp_path
     second = double(store, copy(store, source, CaptureSettings(max_side_px=64)))
     assert calls(tmp_path) == ["copied", "doubled", "copied"]
     assert first == second
+
+
+def test_a_network_that_comes_makes_another_artifact(
+    tmp_path: Path, source: Source, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Expect the same artifact while the network is absent."""
+    monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "networks"))
+    store, scored = Store(tmp_path), Stage(copy.write, "copied", "1", False, networks=("eye.ckpt",))
+    without = scored(store, source, CaptureSettings())
+    assert scored(store, source, CaptureSettings()) == without
+    (tmp_path / "networks").mkdir()
+    (tmp_path / "networks" / "eye.ckpt").touch()
+    assert scored(store, source, CaptureSettings()).root != without.root
+    assert calls(tmp_path) == ["copied", "copied"]
 
 
 def test_prefect_and_plain_calls_share_the_store(prefect_api: str, tmp_path: Path, source: Source) -> None:

@@ -101,9 +101,9 @@ class Meshes:
     def __init__(self, vertices_m: Tensor, faces: Tensor):
         self.inner = BodyMeshes(_unwrapped(vertices_m), _unwrapped(faces))
 
-    def move(self, vertices_m: Tensor) -> None:
-        """Move the meshes, as `BodyMeshes.move` does."""
-        self.inner.move(_unwrapped(vertices_m))
+    def refit(self, vertices_m: Tensor) -> None:
+        """Move the vertices, as `BodyMeshes.refit` does."""
+        self.inner.refit(_unwrapped(vertices_m))
 
     def closest_points(self, points_m: Tensor, body: Tensor, reach_m: float, exact_sign: bool = False) -> ClosestPoints:
         """Return closest points, as `BodyMeshes.closest_points` does."""

@@ -34,6 +34,7 @@ COLUMNS = {  # by key in a split's scores
     "psnr": ("PSNR, dB", "{:.2f}"),
     "ssim": ("SSIM", "{:.3f}"),
     "mask_iou": ("mask IoU", "{:.3f}"),
+    "lpips": ("LPIPS", "{:.3f}"),
     "geometry.chamfer_l2_e3": ("Chamfer x1e-3 m²", "{:.3f}"),
     "geometry.normal_consistency": ("NC", "{:.3f}"),
     "geometry.iou": ("IoU", "{:.3f}"),

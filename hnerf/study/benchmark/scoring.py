@@ -16,9 +16,10 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture, read_rgb, write_image
 from hnerf.errors import InputError
 from hnerf.evaluation.columns import avatar_for_split, reason_unavailable
-from hnerf.evaluation.evaluate import LPIPS, PROTOCOL, mesh_frames, score_meshes
+from hnerf.evaluation.evaluate import PROTOCOL, mesh_frames, score_meshes
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.images import render, score_split, unscored, views_with_mask
+from hnerf.evaluation.lpips import lpips_availability
 from hnerf.evaluation.pictures import crop, frame_person
 from hnerf.evaluation.views import PRIMARY_SPLITS, SPLITS, View, all_views, split_frames
 from hnerf.evenly_spaced import evenly_spaced
@@ -59,7 +60,8 @@ def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: P
     """
     avatar, split = load_avatar(training, scene.device), settings.split
     unavailable = {name: why for name in SPLITS if (why := reason_unavailable(name, training))}
-    found: dict[str, Any] = {"machine": machine(), "protocol": f"{PROTOCOL} {SCORING_PROTOCOL}", "lpips": LPIPS}
+    protocol = f"{PROTOCOL} {SCORING_PROTOCOL}"
+    found: dict[str, Any] = {"machine": machine(), "protocol": protocol, "lpips": lpips_availability()}
     found["split"], found["training"] = split, json.loads((training / "report.json").read_text())
     scored = scene.capture.test_cameras and split not in unavailable
     found["curve"] = curve(scene, split, training, avatar, settings, out) if scored else []

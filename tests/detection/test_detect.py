@@ -1,0 +1,111 @@
+"""A capture without keypoints becomes one with; on the shared capture where the networks are there."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.capture.capture import Capture, read_rgb, write_image
+from hnerf.capture.ingest import ingest
+from hnerf.config import CaptureSettings, DetectionSettings
+from hnerf.detection import detect as module
+from hnerf.detection.detect import detect
+from hnerf.detection.landmarks import Person
+from hnerf.detection.region import Region
+from hnerf.errors import InputError
+from hnerf.models import SHA256, has_model
+from tests.capture.recordings import write_easymocap
+from tests.shared_data import shared_capture
+
+NETWORK, BOTH = DetectionSettings(source="network"), DetectionSettings(source="both")
+LIMBS = [2, 3, 4, 5, 6, 7, 9, 10, 11, 12, 13, 14]
+
+
+class MadeUp:
+    """A network that sees one person, all of him at (5, 4) but his right ankle (28), which is beyond the image."""
+
+    seen = 0
+
+    def __init__(self, *_: str) -> None: ...
+
+    def __call__(self, image: np.ndarray, region: Region | None = None) -> list[Region] | Person:
+        place = Region(np.array([5.0, 4.0]), 8.0, 0.0)
+        if region is None:
+            return [place]
+        MadeUp.seen += 1
+        points = np.tile([5.0, 4.0, 0.5], (33, 1))
+        points[28] = 30, 4, 0.5
+        return Person(points, np.zeros((33, 3)), np.ones((256, 256), np.float32), region, place)
+
+
+@pytest.fixture
+def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Capture:
+    """Of one training camera, 24 x 16 px, five frames, with keypoints of its own of confidence .5; networks made up."""
+    for name in ("PersonDetector", "LandmarkNetwork"):
+        monkeypatch.setattr(module, name, MadeUp)
+    monkeypatch.setattr(module, "model_file", lambda name: None)
+    MadeUp.seen = 0
+    folder = write_easymocap(tmp_path / "folder")
+    (folder / "capture.toml").write_text('[cameras]\ntrain = ["01"]\ntest = ["02"]\n')
+    return ingest(folder, CaptureSettings(), tmp_path / "capture")
+
+
+def test_keypoints_come_from_the_network_and_all_else_from_the_recording(recording: Capture, tmp_path: Path) -> None:
+    report = detect(recording, NETWORK, tmp_path / "out")
+    found = Capture.load(tmp_path / "out")
+    keypoints = found.keypoints("01")
+    assert keypoints is not None and keypoints.shape == (5, 1, 25, 3)
+    assert keypoints[:, 0, 1].tolist() == [[5, 4, 0.5]] * 5
+    assert keypoints[:, 0, [11, 20]].max() == 0  # beyond the image; no small toe
+    assert found.keypoints("02") is None
+    assert np.array_equal(found.image("02", 3), recording.image("02", 3))
+    assert report["cameras"]["01"]["seen"] == 5
+    mask = module.cv2.imread(str(tmp_path / "out" / "person" / "01" / "000002.png"), module.cv2.IMREAD_GRAYSCALE)
+    assert mask.shape == (16, 24) and mask[4, 5] == 255 and mask[15, 23] == 0
+
+
+def test_what_a_recording_has_stays_where_both_are_asked_for(recording: Capture, tmp_path: Path) -> None:
+    detect(recording, BOTH, tmp_path / "out")
+    kept, own = Capture.load(tmp_path / "out").keypoints("01"), recording.keypoints("01")
+    assert kept is not None and own is not None and np.array_equal(kept, own)
+
+
+def test_cameras_that_are_done_are_not_looked_at_again(recording: Capture, tmp_path: Path) -> None:
+    detect(recording, NETWORK, tmp_path / "out")
+    detect(recording, NETWORK, tmp_path / "out")
+    assert MadeUp.seen == 5
+
+
+def test_nobody_is_one_line(recording: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "LandmarkNetwork", lambda size: lambda image, region: None)
+    with pytest.raises(InputError, match="folder: nobody found in any image of the training cameras; "):
+        detect(recording, NETWORK, tmp_path / "out")
+
+
+def test_missing_networks_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "none"))
+    capture = ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture")
+    with pytest.raises(InputError, match=r"pose_detection\.tflite: not there; run `hnerf models`"):
+        detect(capture, NETWORK, tmp_path / "out")
+
+
+def test_joints_are_where_the_truth_has_them(tmp_path: Path) -> None:
+    """A frame of two cameras, each in a process of its own: limb joints within 8 px, of a person of 333 px."""
+    if not all(has_model(name) for name in SHA256):
+        pytest.skip("the networks are not in the cache: `hnerf models` fetches them")
+    source, folder = shared_capture("valid-walk"), tmp_path / "folder"
+    folder.mkdir()
+    for name in ("intri.yml", "extri.yml"):
+        shutil.copyfile(source / name, folder / name)
+    for path in source.glob("images/0[12]/000000.*"):
+        write_image(folder / path.relative_to(source), read_rgb(path))
+    (folder / "capture.toml").write_text('[cameras]\ntrain = ["01", "02"]\n')
+    capture = ingest(folder, CaptureSettings(), tmp_path / "capture")
+    detect(capture, NETWORK, tmp_path / "out")
+    joints_m = np.load(source / "ground_truth" / "joints.npz")["positions"][0, LIMBS]
+    for camera in capture.train_cameras:
+        found = Capture.load(tmp_path / "out").keypoints(camera)
+        assert found is not None
+        true_px, _ = capture.cameras[camera].project(joints_m)
+        assert np.median(np.linalg.norm(found[0, 0, LIMBS, :2] - true_px, axis=-1)) < 8

@@ -1,0 +1,39 @@
+"""Anchors, boxes and who is one person; numbers by hand."""
+
+import numpy as np
+import pytest
+
+from hnerf.detection.person_detector import anchors, decoded, merged
+
+
+def test_anchors_are_the_middles_of_cells_layer_by_layer() -> None:
+    """28^2 x 2 + 14^2 x 2 + 7^2 x 6 = 2254; two in a cell of 1/28; row by row."""
+    at = anchors()
+    assert at.shape == (2254, 2)
+    assert at[0] == pytest.approx([0.5 / 28, 0.5 / 28]) and at[1] == pytest.approx(at[0])
+    assert at[2] == pytest.approx([1.5 / 28, 0.5 / 28])
+    assert at[56] == pytest.approx([0.5 / 28, 1.5 / 28])
+    assert at[1568] == pytest.approx([0.5 / 14, 0.5 / 14])
+    assert at[1960] == pytest.approx([0.5 / 7, 0.5 / 7]) and at[1965] == pytest.approx(at[1960])
+    assert at[2253] == pytest.approx([6.5 / 7, 6.5 / 7])
+
+
+def test_boxes_and_points_are_told_from_anchors() -> None:
+    """22.4 px are a tenth: middle .5 + .1, .5 - .1, sides .2 and .4; first point .5 + .2, .5, last one the anchor's."""
+    raw = np.array([[22.4, -22.4, 44.8, 89.6, 44.8, 0, 0, 0, 0, 0, 0, 0]])
+    box = decoded(raw, np.array([[0.5, 0.5]]))[0]
+    assert box[:2] == pytest.approx(np.array([[0.5, 0.2], [0.7, 0.6]]))
+    assert box[2] == pytest.approx([0.7, 0.5]) and box[5] == pytest.approx([0.5, 0.5])
+
+
+def test_overlapping_boxes_are_averaged_by_score() -> None:
+    """Boxes of side 2 at x = 0 and 0.8: common 1.2 x 2, together 5.6, IoU .43. Scores .9 and .6: 0.8 x .6 / 1.5 = .32.
+    One at 1.2 has .25 with the first, and is another person."""
+
+    def person(x: float) -> np.ndarray:
+        return np.array([[x, 0], [x + 2, 2], *[[x, 1]] * 4])
+
+    people = merged(np.array([person(0.8), person(1.2), person(0)]), np.array([0.6, 0.7, 0.9]))
+    assert [found[0, 0] for found in people] == pytest.approx([0.32, 1.2])
+    assert people[0][2] == pytest.approx([0.32, 1])
+    assert merged(np.zeros((0, 6, 2)), np.zeros(0)) == []

@@ -1,0 +1,61 @@
+"""People are followed from image to image, and looked for anew where they are lost; with networks that are made up."""
+
+import numpy as np
+import pytest
+
+from hnerf.detection.landmarks import Person
+from hnerf.detection.region import Region
+from hnerf.detection.tracker import LOOK_EVERY, track
+
+SIDE_PX = 100.0
+
+
+class Scene:
+    """Images hold the places of people, rows (x, y); a network sees whoever is within half a region's side."""
+
+    def __init__(self) -> None:
+        self.looked, self.landmarked = 0, 0
+
+    def detector(self, image: np.ndarray) -> list[Region]:
+        self.looked += 1
+        return [Region(place + 5, SIDE_PX, 0.0) for place in image]
+
+    def landmarks(self, image: np.ndarray, region: Region) -> Person | None:
+        self.landmarked += 1
+        near = [place for place in image if np.linalg.norm(place - region.centre_px) < SIDE_PX / 2]
+        if not near:
+            return None
+        points = np.tile([*near[0], 1.0], (33, 1))
+        return Person(points, np.zeros((33, 3)), np.zeros((256, 256)), region, Region(near[0], SIDE_PX, 0.0))
+
+
+def places(people: list[Person]) -> list[float]:
+    return [person.points_px[0, 0] for person in people]
+
+
+def test_who_moves_little_is_followed_without_looking_again() -> None:
+    scene, images = Scene(), [np.array([[8.0 * i, 0.0]]) for i in range(LOOK_EVERY)]
+    assert [places(people) for people in track(images, scene.detector, scene.landmarks)] == [
+        [8.0 * i] for i in range(10)
+    ]
+    assert scene.looked == 1 and scene.landmarked == len(images)
+
+
+def test_who_is_lost_is_looked_for() -> None:
+    scene, images = Scene(), [np.array([[0.0, 0.0]]), np.zeros((0, 2)), np.array([[500.0, 0.0]])]
+    assert [places(people) for people in track(images, scene.detector, scene.landmarks)] == [[0.0], [], [500.0]]
+    assert scene.looked == 3
+
+
+def test_who_moves_far_is_looked_at_twice() -> None:
+    """30 px of 100: the second pass, at the place that the first one found, agrees with itself."""
+    scene, images = Scene(), [np.array([[0.0, 0.0]]), np.array([[30.0, 0.0]])]
+    *_, people = track(images, scene.detector, scene.landmarks)
+    assert scene.landmarked == 1 + 2
+    assert people[0].region.centre_px == pytest.approx([30, 0])
+
+
+def test_who_comes_later_is_found_once_and_nobody_twice() -> None:
+    scene, images = Scene(), [np.array([[0.0, 0.0], [300.0, 0.0]][: 1 if i < 3 else 2]) for i in range(LOOK_EVERY + 2)]
+    counts = [len(people) for people in track(images, scene.detector, scene.landmarks)]
+    assert counts == [1] * LOOK_EVERY + [2, 2]

@@ -1,0 +1,37 @@
+"""Conditions under which a network detects people."""
+
+from pathlib import Path
+
+import pytest
+
+from hnerf.capture.ingest import ingest
+from hnerf.config import CaptureSettings, DetectionSettings, SegmentationSettings
+from tasks.detection import needs_detection
+from tasks.segmentation import needs_body
+from tasks.store import Artifact
+from tests.capture.recordings import write_easymocap
+from tests.segmentation.scene import write_likely, write_scene
+
+
+@pytest.mark.parametrize(
+    ("source", "detected", "silent"),
+    [(None, False, True), ("recording", False, False), ("network", True, True), ("both", True, True)],
+)
+def test_a_recording_with_keypoints_and_one_without(
+    tmp_path: Path, source: str | None, detected: bool, silent: bool
+) -> None:
+    ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture")
+    recording = Artifact(stage="capture", root=tmp_path / "capture", files={})
+    settings = DetectionSettings.model_validate({"source": source})
+    assert needs_detection(recording, settings) is detected
+    (tmp_path / "capture" / "keypoints.npz").unlink()
+    assert needs_detection(recording, settings) is silent
+
+
+def test_a_network_that_detected_people_stands_for_a_rough_fit(tmp_path: Path) -> None:
+    capture, truth = write_scene(tmp_path, 1, plate=False)
+    capture.save()
+    recording = Artifact(stage="capture", root=capture.root, files={})
+    assert needs_body(recording, SegmentationSettings())
+    write_likely(capture, truth)
+    assert not needs_body(recording, SegmentationSettings())
