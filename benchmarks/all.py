@@ -1,12 +1,12 @@
-"""Make every committed result again that the present code would make otherwise, and say how long each took.
+"""Make again every committed result that the present code would change, and record how long each took.
 
 usage: python benchmarks/all.py [NAME ...] [--store STORE] [--jobs 1|2] [--list]
 
-NAME is a result's name in benchmarks/registry.py or a pattern of names, such as "stability/*"; without any, all are
-meant. Fresh results are passed over, and so are those whose capture is not in `../shared/data` beside this checkout.
-Refuses, with exit code 2, to measure a checkout with changes. Give the same command again after an interruption: what
-is done is fresh, and what was under way finds its finished trainings in STORE. One that fails is told at the end, with
-exit code 1, and keeps none of the others from being made. `--list` shows the state of each and makes nothing.
+NAME is a result's name in benchmarks/registry.py or a pattern of names, such as "stability/*"; by default all results.
+Results that are fresh are skipped, and so are those whose capture is not in `../shared/data` beside this checkout. Ends
+with exit code 2 if the checkout has uncommitted changes. After an interruption, repeat the same command: finished
+results are fresh, and an unfinished one finds its finished trainings in STORE. A result that fails is reported at the
+end, with exit code 1, and does not stop the others. `--list` shows the state of each result and makes none.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from freshness import code_digest, file_digests, load_records, result_files, save_record, shown_seconds, why_stale
+from freshness import code_digest, file_digests, load_records, result_files, save_record, shown_seconds, stale_reason
 from provenance import ROOT, clean_commit, table
 from registry import REGISTRY, Result
 from stopwatch import Stopwatch
@@ -30,14 +30,14 @@ from hnerf.study.machine import machine
 from tasks.launcher import end_with_parent
 
 FAILED = 1
-LOOK_S = 0.2  # between two looks at what is running
+POLL_S = 0.2  # interval between checks of running programs
 
 
 def main(argv: list[str] | None = None) -> int:
-    """1 if any result could not be made."""
+    """Make or list the chosen results; return 1 if any could not be made."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME")
-    parser.add_argument("--store", type=Path, default=ROOT / "store", help="of trainings and logs (default: store)")
+    parser.add_argument("--store", type=Path, default=ROOT / "store", help="folder of trainings and logs")
     parser.add_argument("--jobs", type=int, choices=(1, 2), default=1, help="programs side by side, one thread each")
     parser.add_argument("--list", action="store_true", help="show which results are fresh, and make none")
     options = parser.parse_args(argv)
@@ -52,22 +52,22 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def listing(root: Path, results: Sequence[Result]) -> list[str]:
-    """A table of results: fresh or why not, and what is recorded of each."""
+    """Return a table of results: fresh or the reason why not, and what is recorded of each."""
     records = load_records(root)
     rows = [["result", "state", "seconds", "code", "commit"]]
     for result in results:
-        why, record = why_stale(root, result, records), records.get(result.name)
+        why, record = stale_reason(root, result, records), records.get(result.name)
         known = [shown_seconds(record), record["digest"][:12], record["commit"]] if record else ["-", "-", "-"]
         rows.append([result.name, f"stale: {why}" if why else "fresh", *known])
     return table(rows)
 
 
 def make(root: Path, results: Sequence[Result], store: Path, jobs: int) -> int:
-    """Make those that are not fresh, in their order, as far as cores are free; 1 if any failed."""
+    """Make those results that are not fresh, in order, as cores are free; return 1 if any failed."""
     clean_commit(root)
     waiting, running, failed = [], list[Job](), dict[str, str]()
     for result in results:
-        passed_over = why_not(root, result, jobs)
+        passed_over = reason_to_skip(root, result, jobs)
         if passed_over:
             print(f"{result.name}: {passed_over}", flush=True)
         else:
@@ -80,14 +80,14 @@ def make(root: Path, results: Sequence[Result], store: Path, jobs: int) -> int:
                 waiting.remove(ready)
                 running.append(Job(root, ready, store))
                 continue
-            time.sleep(LOOK_S)
+            time.sleep(POLL_S)
             for job in [job for job in running if not job.running()]:
                 running.remove(job)
                 fault = job.finish()
                 if fault:
                     failed[job.result.name] = fault
                 print(f"{job.result.name}: {fault or f'{job.watch.seconds:.0f} s'}", flush=True)
-    finally:  # Ctrl-C, a checkout that was changed meanwhile
+    finally:  # after Ctrl-C, or a change of the checkout meanwhile
         for job in running:
             job.stop()
     for name, fault in failed.items():
@@ -95,18 +95,18 @@ def make(root: Path, results: Sequence[Result], store: Path, jobs: int) -> int:
     return FAILED if failed else 0
 
 
-def why_not(root: Path, result: Result, jobs: int) -> str | None:
-    """Why a result is passed over; None if it is to be made."""
-    if why_stale(root, result, load_records(root)) is None:
+def reason_to_skip(root: Path, result: Result, jobs: int) -> str | None:
+    """Return why a result is skipped; None if it is to be made."""
+    if stale_reason(root, result, load_records(root)) is None:
         return "fresh"
     absent = [name for name in result.captures if not (root.parent / "shared" / "data" / name).is_dir()]
     if absent:
         return f"left out: no ../shared/data/{absent[0]}"
-    return "left out: takes both cores; give --jobs 2" if result.threads > jobs else None
+    return "left out: needs both cores; give --jobs 2" if result.threads > jobs else None
 
 
 class Job:
-    """A program under way that makes one result, with what was known when it began."""
+    """A running program that makes one result, with the commit and code digest it started from."""
 
     def __init__(self, root: Path, result: Result, store: Path) -> None:
         self.root, self.result = root, result
@@ -119,7 +119,7 @@ class Job:
             folder.mkdir(parents=True, exist_ok=True)
         state = new / "seconds.json" if "{new}" in used else logs / f"{flat}.json"
         if "{store}" not in used and "{new}" not in used:
-            state.unlink(missing_ok=True)  # nothing is left to go on from
+            state.unlink(missing_ok=True)  # there is nothing to resume from
         self.log, self.watch = logs / f"{flat}.log", Stopwatch(state, self.digest)
         program, *arguments = (argument.format(store=store, new=new) for argument in result.command)
         print(f"{result.name}: under way, {self.log}", flush=True)
@@ -134,26 +134,26 @@ class Job:
             )
 
     def running(self) -> bool:
-        """Whether the program has not ended."""
+        """Return whether the program is still running."""
         if self.watch.tick() or not self.loads:
             self.loads.append(os.getloadavg()[0])
         return self.process.poll() is None
 
     def stop(self) -> None:
-        """End the program, and with it what it has started; its time counts when the same work goes on."""
+        """End the program and what it has started; its time counts when the same work is resumed."""
         self.process.terminate()
         self.process.wait()
         self.watch.save(done=False)
 
     def finish(self) -> str | None:
-        """Record the result of a program that has ended; or say why there is none."""
+        """Record the result of a program that has ended; return why there is none."""
         fault = self._fault()
         self.watch.save(done=fault is None)
         if fault:
             return fault
         for path in result_files(self.root, self.result):
             if path not in self._written():
-                path.unlink()  # of an earlier run, which had more to show
+                path.unlink()  # left by an earlier run with more files
         known = load_records(self.root).get(self.result.name, {"seconds": None})
         record = {
             "digest": self.digest,
@@ -161,7 +161,7 @@ class Job:
             "date": datetime.now(UTC).date().isoformat(),
             "machine": machine() | {"threads": self.result.threads},
             "load": sum(self.loads) / len(self.loads),
-            "seconds": self.watch.seconds if self.watch.whole else known["seconds"],
+            "seconds": self.watch.seconds if self.watch.is_complete else known["seconds"],
             "files": file_digests(self.root, self.result),
         }
         save_record(self.root, self.result.name, record)
@@ -170,11 +170,11 @@ class Job:
     def _fault(self) -> str | None:
         if self.process.returncode:
             lines = self.log.read_text(errors="replace").split("\n")
-            last = next((line for line in reversed(lines) if line.strip()), "no word")
+            last = next((line for line in reversed(lines) if line.strip()), "no output")
             return f"exit code {self.process.returncode}: {last.strip()} ({self.log})"
         if code_digest(self.root, self.result) != self.digest:
             return "its code was changed while it ran"
-        return None if self._written() else f"wrote nothing that is called {' or '.join(self.result.files)}"
+        return None if self._written() else f"wrote no file named {' or '.join(self.result.files)}"
 
     def _written(self) -> list[Path]:
         found = result_files(self.root, self.result)
@@ -182,7 +182,8 @@ class Job:
 
 
 def environment(root: Path, threads: int) -> dict[str, str]:
-    """This checkout's packages before installed ones, and so many threads in whatever computes."""
+    """Return an environment in which this checkout's packages come before installed ones and numeric libraries use so
+    many threads."""
     counted = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(threads))
     return os.environ | counted | {"PYTHONPATH": str(root)}
 

@@ -9,7 +9,7 @@ import time
 from typing import Any
 
 import numpy as np
-from provenance import SHARED, provenance, sentence, table, write_result
+from provenance import SHARED, provenance, provenance_line, table, write_result
 
 from hnerf.calibration.boards.calibrate import calibrate_from_boards
 from hnerf.calibration.boards.rig import compare_pairs, solve_boards, solve_rig
@@ -20,9 +20,9 @@ FOOTAGE = "caliscope-charuco"
 PROTOCOL = (
     "Intrinsics are the shipped ones, not refined. A board counts as found in a picture with at least 6 corners that "
     "lie on one plane to 1 px. It counts as visible where another camera found it and, placed as all cameras have it, "
-    "at least 6 corners fall into the picture and the board faces the camera within 75 degrees; hands in the way are "
-    "not discounted. RMS is over the distances of those corners, in undistorted pixels, with a pose a frame and a time "
-    "offset a picture (the cameras had no common shutter); then with the corners off the plane, too. Held out: cameras "
+    "at least 6 corners fall into the picture and the board faces the camera within 75 degrees; occlusion by hands "
+    "is ignored. RMS is over the distances of those corners, in undistorted pixels, with a pose a frame and a time "
+    "offset a picture (the cameras had no common shutter); then including the corners off the plane. Held out: cameras "
     "from the first half of the frames, held fixed, on the second half. Shipped: the shipped cameras, held fixed, on "
     "all frames."
 )
@@ -62,7 +62,7 @@ def main() -> None:
 
 
 def as_markdown(result: dict[str, Any]) -> str:
-    """The goals, then a table by camera and one by pair."""
+    """Format the goals, a table by camera and one by pair."""
     figures, cameras = result["figures"], result["report"]["cameras"]
     goals = [
         ["", "measured", "goal"],
@@ -83,7 +83,7 @@ def as_markdown(result: dict[str, Any]) -> str:
     by_pair = [["pair", "degrees", "cm"]]
     by_pair += [[name, f"{p['turned_deg']:.2f}", f"{p['moved_cm']:.1f}"] for name, p in result["pairs"].items()]
     intrinsics = [f"- {name}: {camera['intrinsics']}" for name, camera in cameras.items()]
-    head = [f"# Cameras from board footage: `{result['footage']}`", "", sentence(result), ""]
+    head = [f"# Cameras from board footage: `{result['footage']}`", "", provenance_line(result), ""]
     body = [*table(goals), "", *table(by_camera), "", *table(by_pair), "", "## Intrinsics", "", *intrinsics]
     return "\n".join([*head, *body, "", "## Protocol", "", result["protocol"], ""])
 

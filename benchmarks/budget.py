@@ -1,12 +1,11 @@
-"""Whether the scene decides well: what twice and half the decided size, or number of steps, is worth.
+"""Test the automatic settings: train with twice and half the decided model size, or number of steps.
 
 usage: python benchmarks/budget.py STORE [CAPTURE ...]
 
-Trains preset `fast` on shared captures (default: the three rendered ones) as hnerf/training/auto_settings.py decides,
-then with grids of twice and of half the cells' number and as many times the samples a ray and the nodes, then with
-twice and half the steps; everything else stays. Held-out figures by the evaluation's protocol, of a few images. What
-is in STORE is not made again. Writes `benchmarks/results/budget.json` and `.md`, in which other captures stay as they
-are.
+Trains preset `fast` on shared captures (default: the three rendered ones) with the settings that
+hnerf/training/auto_settings.py chooses; then with twice and half the number of grid cells, samples a ray and nodes;
+then with twice and half the steps. Everything else stays. Scores a few held-out images by the evaluation protocol.
+Reuses what is in STORE. Writes `benchmarks/results/budget.json` and `.md`, where other captures keep their results.
 """
 
 import argparse
@@ -15,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from provenance import RESULTS, SHARED, provenance, sentence, table, write_result
+from provenance import RESULTS, SHARED, provenance, provenance_line, table, write_result
 
-from flows.benchmark import trained
+from flows.benchmark import train_recording
 from hnerf.config import Settings, TrainingSettings, load_settings
 from hnerf.study.benchmark.plan import ScoringSettings
 from tasks.benchmark import score_training
@@ -45,7 +44,7 @@ def main() -> None:
 
 
 def measure(folder: Path, store: Store) -> dict[str, Any]:
-    """The decisions for a capture, and figures of each variant."""
+    """Return the automatic settings for a capture with their reasons, and the scores of each variant."""
     settings = load_settings("fast")
     decided, scores = train_and_score(folder, store, settings)
     variants = {DECIDED: scores}
@@ -61,10 +60,11 @@ def measure(folder: Path, store: Store) -> dict[str, Any]:
 
 
 def train_and_score(folder: Path, store: Store, settings: Settings) -> tuple[TrainingSettings, dict[str, Any]]:
-    """The training's settings with everything decided; its scores, with the decisions among them."""
+    """Return the training's settings with all automatic ones filled in, and its scores, including the reasons for
+    them."""
     source, truth = read_capture(folder)
     recording = ingest(store, source, settings.capture)
-    calibration, body, model = trained(store, recording, settings)
+    calibration, body, model = train_recording(store, recording, settings)
     scores = score_training(store, truth, recording, calibration, body, model, SCORING)
     stored = json.loads((model.root / "settings.json").read_text())
     found = json.loads((scores.root / "scores.json").read_text())
@@ -72,7 +72,7 @@ def train_and_score(folder: Path, store: Store, settings: Settings) -> tuple[Tra
 
 
 def resized(training: TrainingSettings, factor: float) -> TrainingSettings:
-    """With so many times the cells, samples a ray, and nodes that deform the body."""
+    """Return the settings with so many times the cells, samples a ray, and nodes that deform the body."""
     field, side = training.field, float(np.cbrt(factor))
     changes = {
         "colour_cells": tuple(round(side * n) for n in field.colour_cells),
@@ -84,7 +84,7 @@ def resized(training: TrainingSettings, factor: float) -> TrainingSettings:
 
 
 def figures(found: dict[str, Any]) -> dict[str, Any]:
-    """What the table shows of a variant's scores."""
+    """Return the scores of a variant that the table shows."""
     report, view, pose = found["training"], found["novel_view"], found["novel_pose"]
     geometry = view["geometry"] or {}
     return {
@@ -99,19 +99,19 @@ def figures(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def as_markdown(captures: dict[str, Any]) -> str:
-    """A section for each capture: decisions with reasons, then variants against what was decided."""
-    lines = ["# The scene decides the size"]
+    """Format a section for each capture: automatic settings with reasons, then variants beside them."""
+    lines = ["# Settings chosen from the scene"]
     for name, found in captures.items():
         decisions = [[key, f"{d['value']}", d["reason"]] for key, d in found["decisions"].items()]
-        lines += ["", f"## {name}", "", sentence(found)]
-        lines += ["", *table([["setting", "decided", "because"], *decisions]), ""]
+        lines += ["", f"## {name}", "", provenance_line(found)]
+        lines += ["", *table([["setting", "value", "reason"], *decisions]), ""]
         titles = ["", "training, s", "model, MiB", "memory, GiB", "256 px frame, s", "PSNR", "animated", "Chamfer"]
         lines += table([titles, *([title, *cells(row)] for title, row in found["variants"].items())])
     return "\n".join([*lines, ""])
 
 
 def cells(row: dict[str, Any]) -> list[str]:
-    """A variant's figures as text."""
+    """Format a variant's scores as table cells."""
     forms = ("{:.0f}", "{:.1f}", "{:.1f}", "{:.2f}", "{:.2f}", "{:.2f}", "{:.3f}")
     return ["-" if v is None else form.format(v) for v, form in zip(row.values(), forms, strict=True)]
 

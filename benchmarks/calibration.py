@@ -1,14 +1,15 @@
-"""Break the cameras of the shared captures in known ways, and see whether the calibration stage says how and mends it.
+"""Break the cameras of the shared captures in known ways, and test whether the calibration stage names the fault and
+repairs it.
 
 usage: python benchmarks/calibration.py [CAPTURE ...] [--trials 100] [--untouched 20]
 
-A trial takes a random run of three quarters of a capture's frames and breaks one camera, or the whole rig; the
-capture's own cameras are the truth. "Named": that camera and no other is changed (of a fault of time or convention:
-with the right offset or cause), or the capture is refused for the right cause. "After": the median distance over the
-body's keypoints, exact ones, between where the cameras that are used see them at the instant that they are used for,
-and where they are; of the worst camera. Untouched trials, every other one with half of the frames drawn at random,
-must change nothing. What the pictures show (outlines and matches) does not depend on the calibration and is gathered
-once a capture. Needs `../shared` beside this checkout. Writes `benchmarks/results/calibration-faults.json` and `.md`.
+A trial takes three quarters of a capture's frames, consecutive from a random start, and breaks one camera or the whole
+rig; the capture's own cameras are the truth. "Named": that camera and no other is changed (for a fault of time or
+convention, with the right offset or cause), or the capture is refused for the right cause. "After": the median distance
+in the image, over the body's exact keypoints, between their projections by the calibrated cameras, at the instants that
+these assume, and the true ones; of the worst camera. Untouched trials, every other one with a random half of the
+frames, must change nothing. Outlines and matches in the images do not depend on the calibration and are computed once a
+capture. Needs `../shared` beside this checkout. Writes `benchmarks/results/calibration-faults.json` and `.md`.
 """
 
 import argparse
@@ -22,7 +23,7 @@ from unittest import mock
 
 import cv2
 import numpy as np
-from provenance import SHARED, provenance, sentence, table, write_result
+from provenance import SHARED, provenance, provenance_line, table, write_result
 
 from hnerf.calibration.check import check_calibration
 from hnerf.calibration.matches import Matches
@@ -42,8 +43,9 @@ MILLIMETRES = "millimetres"
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """How cameras are broken: `change` by a random generator; one of them or, with `rig`, all; `frames` by which its
-    recording starts too late or too early; the `cause` to be named; the share of all trials."""
+    """A way to break cameras. change: applied to a camera with a random generator; rig: to all cameras instead of one;
+    frames: offset by which the camera's recording starts too late or too early; cause: the reason that must be named;
+    share: of all trials."""
 
     share: float
     change: Callable[[Camera, np.random.Generator], Camera] = lambda camera, rng: camera
@@ -127,14 +129,15 @@ def _trials(name: str, trials: int, untouched: int) -> list[dict[str, Any]]:
 
 
 class Trial:
-    """One broken capture, as a folder that links to the images of the whole one, and what becomes of it."""
+    """One trial: a broken capture, as a folder of links to the original images, and its calibration."""
 
     def __init__(self, whole: Capture, truth_m: np.ndarray, fault: Fault, seed: int, folder: Path) -> None:
         rng = np.random.default_rng(seed)
         self.whole, self.truth_m, self.fault, self.folder = whole, truth_m, fault, folder
         self.name = self._camera(whole, fault, seed)
-        self.late = fault.frames * int(rng.choice([-1, 1]))  # this camera's frame f shows the instant f + late
-        margin, count = abs(self.late), int(RUN_SHARE * len(whole.frames))
+        # The broken camera's frame f shows the instant f + delay_frames.
+        self.delay_frames = fault.frames * int(rng.choice([-1, 1]))
+        margin, count = abs(self.delay_frames), int(RUN_SHARE * len(whole.frames))
         first = int(rng.integers(margin, len(whole.frames) - count - margin + 1))
         self.rows = np.arange(first, first + count)
         if fault is UNTOUCHED and seed % 2:
@@ -146,14 +149,15 @@ class Trial:
 
     @staticmethod
     def _camera(whole: Capture, fault: Fault, seed: int) -> str:
-        """Each in turn; one that the fault would not change (its R is symmetric) passes it on to the next."""
+        """Return the camera to break, each in turn; one that the fault would not change (its R is symmetric) is
+        skipped."""
         names, rng = whole.train_cameras, np.random.default_rng(seed)
         broken = {name: fault.change(whole.cameras[name], rng).projection for name in names}
-        hurt = [name for name in names if not np.allclose(broken[name], whole.cameras[name].projection)]
-        return (hurt or names)[seed % len(hurt or names)]
+        changed_names = [name for name in names if not np.allclose(broken[name], whole.cameras[name].projection)]
+        return (changed_names or names)[seed % len(changed_names or names)]
 
     def run(self) -> dict[str, Any]:
-        """What the calibration stage says and leaves."""
+        """Run the calibration stage; return what it reports and the remaining error."""
         capture, started = self._broken(), time.perf_counter()
         try:
             report = check_calibration(capture, CalibrationSettings())
@@ -167,11 +171,11 @@ class Trial:
         changed = {name: verdict.reasons for name, verdict in report.verdicts.items() if verdict.status != "ok"}
         offset = used.frame_offsets.get(self.name, 0.0)
         right = set(changed) == ({self.name} if self.fault is not UNTOUCHED else set()) and not self.fault.rig
-        message = any(self.fault.cause in reason for reason in changed.get(self.name, [""]))
+        cause_named = any(self.fault.cause in reason for reason in changed.get(self.name, [""]))
         return {
             "camera": self.name,
             "seconds": seconds,
-            "named": right and message and abs(offset + self.late) < 0.5,
+            "named": right and cause_named and abs(offset + self.delay_frames) < 0.5,
             "changed": changed,
             "frame_offsets": used.frame_offsets,
             "after_px": self._error_px(used),
@@ -181,7 +185,7 @@ class Trial:
         frames = tuple(self.whole.frames[row] for row in self.rows)
         keypoints = {}
         for name in self.whole.train_cameras:
-            shown = self.rows + (self.late if name == self.name else 0)
+            shown = self.rows + (self.delay_frames if name == self.name else 0)
             found = self.whole.keypoints(name)
             assert found is not None
             keypoints[name] = found[shown]
@@ -197,26 +201,26 @@ class Trial:
     def _error_px(self, used: Capture) -> float:
         medians_px = []
         for name in used.train_cameras:
-            off = used.frame_offsets.get(name, 0.0) + (self.late if name == self.name else 0)
-            shown_m = self._at(np.array(used.frames) + off)
+            off = used.frame_offsets.get(name, 0.0) + (self.delay_frames if name == self.name else 0)
+            shown_m = self._keypoints_at(np.array(used.frames) + off)
             uv, true_uv = (
                 used.cameras[name].project(shown_m)[0],
-                self.whole.cameras[name].project(self._at(used.frames))[0],
+                self.whole.cameras[name].project(self._keypoints_at(used.frames))[0],
             )
             medians_px.append(float(np.median(np.linalg.norm(uv - true_uv, axis=-1))))
         return max(medians_px)
 
-    def _at(self, instants: Any) -> np.ndarray:
-        """The exact keypoints between frames, (n, 25, 3) m."""
+    def _keypoints_at(self, instants: Any) -> np.ndarray:
+        """Interpolate the exact keypoints between frames, (n, 25, 3) m."""
         every = np.arange(len(self.truth_m))
         flat = self.truth_m.reshape(len(every), -1)
         return np.stack([np.interp(instants, every, column) for column in flat.T], -1).reshape(-1, 25, 3)
 
 
 def as_markdown(result: dict[str, Any]) -> str:
-    """One table a capture."""
+    """Format one table a capture."""
     assert __doc__
-    lines = ["# Calibration faults", "", sentence(result), "", __doc__.split("\n\n")[2].split(" Needs ")[0]]
+    lines = ["# Calibration faults", "", provenance_line(result), "", __doc__.split("\n\n")[2].split(" Needs ")[0]]
     for name, found in result["captures"].items():
         trials = found["trials"]
         broken = [t for t in trials if t["fault"] != "nothing"]

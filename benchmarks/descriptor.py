@@ -1,10 +1,10 @@
-"""How many points a second the body descriptor answers, by what is asked of it.
+"""Measure how many points a second the body descriptor handles, by kind of query.
 
 usage: python benchmarks/descriptor.py [--points 100000] [--frames 8]
 
-Points lie within the shell of `fast` around the average body, one resting copy a frame, in random order (rays ask in
-order, which caches like better). Writes
-`benchmarks/results/descriptor.json` and `.md`: medians of five runs after one to warm up.
+Points lie within the shell of `fast` around the average body, one resting copy a frame, in random order (rays query
+points in order, which caches better). Writes `benchmarks/results/descriptor.json` and `.md`: medians of five runs after
+a warm-up run.
 """
 
 import argparse
@@ -13,15 +13,15 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from provenance import provenance, sentence, table, write_result
+from provenance import provenance, provenance_line, table, write_result
 from torch import Tensor
 
 from hnerf.body.anny import anny_rig
 from hnerf.body.canonical import PosedBodies
 from hnerf.body.descriptor import closest_points_reference, vertex_normals
 
-REFERENCE_POINTS = 16  # every triangle against every point: seconds, and memory
-OUTER_M, INNER_M = 0.07, 0.03  # of a shell around the body
+REFERENCE_POINTS = 16  # few: the reference tests every triangle against every point
+OUTER_M, INNER_M = 0.07, 0.03  # extent of the shell outside and inside the body
 RUNS = 5
 
 
@@ -33,14 +33,14 @@ def main() -> None:
     options = parser.parse_args()
     where, rows = provenance(), measure(options.points, options.frames)
     result = where | {"points": options.points, "frames": options.frames, "points_per_s": rows}
-    shown = [["what is asked", "points a second"], *([name, f"{rate:,.0f}"] for name, rate in rows.items())]
-    markdown = "\n".join(["# Body descriptor", "", sentence(result), "", *table(shown), ""])
+    shown = [["query", "points a second"], *([name, f"{rate:,.0f}"] for name, rate in rows.items())]
+    markdown = "\n".join(["# Body descriptor", "", provenance_line(result), "", *table(shown), ""])
     write_result("descriptor", result, markdown)
     print(markdown)
 
 
 def measure(count: int, frames: int) -> dict[str, float]:
-    """Points a second, by what is asked."""
+    """Return points a second, by kind of query."""
     rig = anny_rig()
     theta, root = torch.zeros(frames, len(rig.joints_m), 3), torch.eye(4).expand(frames, 4, 4)
     bodies = PosedBodies(rig, theta, root, rig.vertices_m)
@@ -54,7 +54,7 @@ def measure(count: int, frames: int) -> dict[str, float]:
 
     few = points_m[:REFERENCE_POINTS]
     asked: dict[str, tuple[Callable[[], Any], int]] = {
-        "(d, s, y), sign by normal where it is sure": (lambda: bodies.describe(points_m, frame, reach_m), count),
+        "(d, s, y), sign by normal where unambiguous": (lambda: bodies.describe(points_m, frame, reach_m), count),
         "(d, s, y), sign by winding number": (lambda: bodies.describe(points_m, frame, reach_m, None, True), count),
         "(d, s, y) and gradients to pose and shape": (learning, count),
         "plain reference (closest point alone)": (
@@ -66,7 +66,7 @@ def measure(count: int, frames: int) -> dict[str, float]:
 
 
 def shell_points(vertices_m: Tensor, faces: Tensor, count: int) -> Tensor:
-    """Points (count, 3) evenly spread in depth over the shell."""
+    """Return random points (count, 3), uniform in depth over the shell."""
     generator = torch.Generator().manual_seed(0)
     pick = torch.randint(len(vertices_m), (count,), generator=generator)
     depth_m = torch.rand(count, 1, generator=generator) * (OUTER_M + INNER_M) - INNER_M
@@ -74,7 +74,7 @@ def shell_points(vertices_m: Tensor, faces: Tensor, count: int) -> Tensor:
 
 
 def median_s(work: Callable[[], Any]) -> float:
-    """Seconds of one call."""
+    """Return the median seconds of one call."""
     seconds = []
     for _ in range(RUNS + 1):
         started = time.perf_counter()

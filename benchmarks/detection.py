@@ -1,4 +1,4 @@
-"""Keypoints and masks that the networks find, beside those that came with the shared captures and beside the truth.
+"""Compare the networks' keypoints and masks with those of the shared captures and with the truth.
 
 usage: python benchmarks/detection.py [--sizes heavy,full,lite]
 
@@ -14,7 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from provenance import SHARED, provenance, sentence, table, write_result
+from provenance import SHARED, provenance, provenance_line, table, write_result
 
 from hnerf.capture.capture import PERSON, Capture
 from hnerf.capture.ingest import ingest
@@ -51,7 +51,7 @@ def main() -> None:
 
 
 def measure(folder: Path, sizes: list[str], scratch: Path) -> dict[str, Any]:
-    """Figures of the keypoints that one capture came with, and of each size of the network."""
+    """Score the keypoints that a capture came with, and those of each size of the network."""
     capture = ingest(folder, CaptureSettings(), scratch / "capture")
     score = score_truth if (folder / "ground_truth").is_dir() else score_residuals
     figures = {DELIVERED: score(folder, capture)}
@@ -64,12 +64,12 @@ def measure(folder: Path, sizes: list[str], scratch: Path) -> dict[str, Any]:
 
 
 def limb_keypoints(capture: Capture) -> np.ndarray:
-    """(C, frames, 12, 3) of the subject."""
+    """Return the limb keypoints of the subject, (C, frames, 12, 3)."""
     return np.stack(list(subject_keypoints(capture).values()))[:, :, LIMBS]
 
 
 def score_residuals(folder: Path, capture: Capture) -> dict[str, Any]:
-    """Of keypoints triangulated in the cameras as given."""
+    """Return the residuals of keypoints triangulated with the cameras as given."""
     keypoints = limb_keypoints(capture)
     cameras = [capture.cameras[name] for name in capture.train_cameras]
     projections = np.stack([camera.projection for camera in cameras])
@@ -79,7 +79,8 @@ def score_residuals(folder: Path, capture: Capture) -> dict[str, Any]:
 
 
 def score_truth(folder: Path, capture: Capture) -> dict[str, Any]:
-    """Of keypoints against the true joints; of the network's masks, where there are some, against the true ones."""
+    """Return the errors of keypoints against the true joints, and of the network's masks, if any, against the true
+    ones."""
     stored = np.load(folder / "ground_truth" / "joints.npz")
     joints_m = stored["positions"][: len(capture.frames), LIMBS]
     true_px = np.stack(
@@ -116,14 +117,14 @@ def _percentiles(distances_px: np.ndarray, keypoints: np.ndarray) -> dict[str, A
 
 
 def as_markdown(result: dict[str, Any]) -> str:
-    """A row a capture and source of keypoints."""
+    """Format a row for each capture and source of keypoints."""
     rows = [["capture", "keypoints", "median, px", "90 %, px", "missed", "mask IoU", "ms"]]
     for name, figures in result["captures"].items():
         for source, f in figures.items():
             mask, ms = f.get("mask_iou"), f.get("ms")
             rows.append([name, source, f"{f['median_px']:.2f}", f"{f['p90_px']:.2f}", f"{f['missed']:.2%}",
                          "" if mask is None else f"{mask:.4f}", "" if ms is None else f"{ms:.0f}"])  # fmt: skip
-    return "\n".join(["# Detection", "", sentence(result), "", *table(rows), "", result["protocol"], ""])
+    return "\n".join(["# Detection", "", provenance_line(result), "", *table(rows), "", result["protocol"], ""])
 
 
 if __name__ == "__main__":

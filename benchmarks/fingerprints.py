@@ -29,7 +29,7 @@ HNERF = Path(sys.executable).with_name("hnerf")
 FEW = ("evaluation.max_images=1", "evaluation.max_meshes=1", "evaluation.report_rows=1")
 ASSET = ("asset.grid_cells=96", "asset.faces=4000", "asset.texture_px=256")
 STATIC, DYNAMIC = ("nerf", "idr"), ("neural-body", "nerfies")
-UNSTABLE = re.compile(r"second|_gib|device|machine|commit|path|protocol")  # of the machine or in words
+UNSTABLE = re.compile(r"second|_gib|device|machine|commit|path|protocol")  # depends on the machine or is text
 
 
 def main() -> None:
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def jobs(scratch: Path) -> dict[str, tuple[Path, str, tuple[str, ...]]]:
-    """Capture, preset and changes of each run."""
+    """Return capture, preset and setting changes of each run."""
     moving, still = synthesise(scratch / "moving"), synthesise(scratch / "still", "train_frames=1")
     chosen = {"demo": (moving, "demo", ("asset.texture_px=256",))}
     wave = SHARED / "data" / "valid-wave"
@@ -63,14 +63,14 @@ def jobs(scratch: Path) -> dict[str, tuple[Path, str, tuple[str, ...]]]:
 
 
 def synthesise(folder: Path, *changes: str) -> Path:
-    """Write the embedded performer."""
+    """Write the synthetic capture, unless it exists."""
     if not folder.exists():
         call("synth", str(folder), *(f"--set={change}" for change in changes))
     return folder
 
 
 def run(capture: Path, preset: str, changes: tuple[str, ...], store: Path) -> Path:
-    """Return the subject's folder after a whole run; the asset of so short a training may be refused."""
+    """Run the pipeline; return the subject's folder. The asset of so short a training may be refused."""
     command = ["run", str(capture), "--preset", preset, "--store", str(store)]
     call(*command, *(f"--set={change}" for change in changes), may_fail=True)
     (subject,) = (store / "subjects").iterdir()
@@ -78,7 +78,7 @@ def run(capture: Path, preset: str, changes: tuple[str, ...], store: Path) -> Pa
 
 
 def call(*arguments: str, may_fail: bool = False) -> None:
-    """Run hnerf of this checkout on one thread."""
+    """Run this checkout's hnerf on one thread."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     done = subprocess.run([str(HNERF), *arguments], env=environment, capture_output=True, text=True)
     if done.returncode:
@@ -88,7 +88,7 @@ def call(*arguments: str, may_fail: bool = False) -> None:
 
 
 def fingerprint(subject: Path) -> dict[str, str]:
-    """Return a SHA-256 for each stage that left something."""
+    """Return a SHA-256 for each stage that has output."""
     found = {}
     masks = sorted(subject.glob("segmentation/**/*.png"))
     found["masks"] = digest(cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in masks)

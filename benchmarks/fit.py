@@ -1,10 +1,10 @@
-"""How well the body is fitted to the shared captures, and what it costs.
+"""Measure the accuracy of the body fit on the shared captures, and its cost.
 
 usage: python benchmarks/fit.py STORE [CAPTURE ...]
 
-Fits by preset `fast` (default: the three rendered captures) what STORE does not have. Limb joints are compared by the
-independent program `../shared/accept/score_run.py`; silhouettes of the naked body with the true masks, in every frame
-and training camera. Writes `benchmarks/results/fit.json` and `.md`.
+Fits by preset `fast` (default: the three rendered captures), reusing what is in STORE. Limb joints are compared by the
+independent program `../shared/accept/score_run.py`; silhouettes of the unclothed body with the true masks, in every
+frame and training camera. Writes `benchmarks/results/fit.json` and `.md`.
 """
 
 import argparse
@@ -15,13 +15,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from provenance import SHARED, provenance, sentence, table, write_result
+from provenance import SHARED, provenance, provenance_line, table, write_result
 
-from flows.train_subject import prepared
+from flows.train_subject import prepare_training
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import load_settings
 from hnerf.geometry.silhouette import silhouette
-from tasks.calibration import calibrated
+from tasks.calibration import calibrated_capture
 from tasks.capture import ingest
 from tasks.source import read_capture
 from tasks.store import Store
@@ -32,7 +32,7 @@ COLUMNS = {
     "limb_joint_error_mm": ("limb joints, mm", "{:.1f}"),
     "worst_frame_mm": ("worst frame, mm", "{:.0f}"),
     "iou": ("IoU with the true mask", "{:.3f}"),
-    "outside_share": ("outside it, share of its area", "{:.4f}"),
+    "outside_share": ("outside the mask, share of its area", "{:.4f}"),
     "outside_share_worst": ("worst image", "{:.4f}"),
     "seconds_per_frame": ("s a frame", "{:.2f}"),
 }
@@ -51,17 +51,17 @@ def main() -> None:
     rows += [
         [name, *(form.format(found[key]) for key, (_, form) in COLUMNS.items())] for name, found in captures.items()
     ]
-    markdown = "\n".join(["# Body fit", "", sentence(result), "", *table(rows), ""])
+    markdown = "\n".join(["# Body fit", "", provenance_line(result), "", *table(rows), ""])
     write_result("fit", result, markdown)
     print(markdown)
 
 
 def measure(folder: Path, store: Store) -> dict[str, Any]:
-    """Figures of a capture's fit against its ground truth."""
+    """Score a capture's fit against its ground truth."""
     settings = load_settings("fast")
     source, _ = read_capture(folder)
-    recording, calibration, _, made = prepared(store, ingest(store, source, settings.capture), settings)
-    capture, fit = calibrated(recording, calibration), BodyFit.load(made.root)
+    recording, calibration, _, made = prepare_training(store, ingest(store, source, settings.capture), settings)
+    capture, fit = calibrated_capture(recording, calibration), BodyFit.load(made.root)
     with tempfile.TemporaryDirectory() as subject:
         (Path(subject) / "fit").symlink_to(made.root)
         joints = runpy.run_path(str(SHARED / "accept" / "score_run.py"))["joints"](Path(subject), folder)

@@ -1,4 +1,4 @@
-"""Whether a result is what the present code would make: digests of code, and the record of every result.
+"""Freshness of results: digests of the code that makes them, and the record of every result.
 
 `benchmarks/results/provenance.json` holds, by the result's name, the digest of the code that made it, commit, date,
 machine, its mean load meanwhile, seconds, and the SHA-256 of each of its files; `provenance.md` shows it.
@@ -18,16 +18,16 @@ from provenance import table
 from registry import Result
 
 from hnerf.files import replace_text
-from hnerf.study.machine import in_words
+from hnerf.study.machine import describe_machine
 
-MODULE = re.compile(r"[a-z]\w*(\.\w+)+")  # started by name, as the ranks of a training are
+MODULE = re.compile(r"[a-z]\w*(\.\w+)+")  # modules started by name, like the ranks of a training
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 Records = dict[str, dict[str, Any]]
 
 
 def code_digest(root: Path, result: Result) -> str:
-    """SHA-256 over the command, what its program imports or starts of this checkout, and the settings that it reads;
-    comments, docstrings and formatting do not count."""
+    """Return the SHA-256 over the command, the modules of this checkout that its program imports or starts, and the
+    settings that it reads; comments, docstrings and formatting do not count."""
     parts = [" ".join(result.command)]
     parts += [f"{path.relative_to(root)}\n{_code(path.read_text())[0]}" for path in sources(root, result)]
     for pattern in result.configs:
@@ -38,7 +38,7 @@ def code_digest(root: Path, result: Result) -> str:
 
 
 def sources(root: Path, result: Result) -> list[Path]:
-    """The program, and each module of the checkout that it or one of these imports or names, sorted."""
+    """Return the program, and each module of the checkout that it or one of these imports or names, sorted."""
     found: set[Path] = set()
     waiting = [root / "benchmarks" / result.command[0]]
     waiting += [path for module in result.runs for path in _files(root, module)]
@@ -52,8 +52,8 @@ def sources(root: Path, result: Result) -> list[Path]:
     return sorted(found)
 
 
-def why_stale(root: Path, result: Result, records: Records) -> str | None:
-    """What keeps a result from being fresh, or None."""
+def stale_reason(root: Path, result: Result, records: Records) -> str | None:
+    """Return why a result is not fresh, or None."""
     record = records.get(result.name)
     if record is None:
         return "not recorded"
@@ -61,11 +61,11 @@ def why_stale(root: Path, result: Result, records: Records) -> str | None:
         return "its code has changed"
     digests = file_digests(root, result)
     changed = sorted({name for name, _ in digests.items() ^ record["files"].items()})
-    return f"{changed[0]} is not as it was made" if changed else None
+    return f"{changed[0]} has changed since it was made" if changed else None
 
 
 def file_digests(root: Path, result: Result) -> dict[str, str]:
-    """SHA-256 of each file of the result that is there."""
+    """Return the SHA-256 of each existing file of the result."""
     return {
         str(path.relative_to(root / "benchmarks" / "results")): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in result_files(root, result)
@@ -73,36 +73,38 @@ def file_digests(root: Path, result: Result) -> dict[str, str]:
 
 
 def result_files(root: Path, result: Result) -> list[Path]:
-    """The result's files that are there, sorted."""
+    """Return the existing files of the result, sorted."""
     return sorted({path for pattern in result.files for path in (root / "benchmarks" / "results").glob(pattern)})
 
 
 def load_records(root: Path) -> Records:
-    """By the results' names."""
+    """Return the records by the results' names."""
     path = root / "benchmarks" / "results" / "provenance.json"
     records: Records = json.loads(path.read_text()) if path.exists() else {}
     return records
 
 
 def save_record(root: Path, name: str, record: dict[str, Any]) -> None:
-    """Add to the records or replace there, and show them all."""
+    """Add or replace a record, and rewrite the table of all."""
     records = load_records(root) | {name: record}
     path = root / "benchmarks" / "results" / "provenance.json"
     replace_text(path, json.dumps(dict(sorted(records.items())), indent=1) + "\n")
     rows = [["result", "seconds", "commit", "date", "machine", "load"]]
     for made, r in sorted(records.items()):
-        rows.append([made, shown_seconds(r), r["commit"], r["date"], in_words(r["machine"]), f"{r['load']:.1f}"])
+        rows.append(
+            [made, shown_seconds(r), r["commit"], r["date"], describe_machine(r["machine"]), f"{r['load']:.1f}"]
+        )
     lines = ["# Where results come from", "", "Made by `benchmarks/all.py`; see docs/results.md.", "", *table(rows), ""]
     replace_text(path.with_suffix(".md"), "\n".join(lines))
 
 
 def shown_seconds(record: dict[str, Any]) -> str:
-    """Of the last time that the result was made from nothing."""
+    """Format the seconds of the last time that the result was made from scratch."""
     return "-" if record["seconds"] is None else f"{record['seconds']:.0f}"
 
 
 def _files(base: Path, module: str) -> Iterator[Path]:
-    """The module's file and its packages', as far as they are in the folder."""
+    """Yield the module's file and its packages', as far as they exist in the folder."""
     names = module.split(".")
     for count in range(1, len(names) + 1):
         path = base.joinpath(*names[:count])
@@ -111,7 +113,8 @@ def _files(base: Path, module: str) -> Iterator[Path]:
 
 @cache
 def _code(text: str) -> tuple[str, tuple[str, ...]]:
-    """A module's code without comments and docstrings, and the names of all modules that it may import or start."""
+    """Return a module's code without comments and docstrings, and the names of all modules that it may import or
+    start."""
     tree = ast.parse(text)
     for node in ast.walk(tree):
         if isinstance(node, DOCUMENTED) and ast.get_docstring(node) is not None:

@@ -1,19 +1,19 @@
-"""Which results there are, what makes each, and what it needs."""
+"""Registry of the committed results: what makes each, and what it needs."""
 
 from dataclasses import dataclass
 
 CALIBRATED = ("valid-walk", "valid-wave")
 RENDERED = (*CALIBRATED, "valid-turn-mono")
-FEW = ("evaluation.max_images=12", "evaluation.max_meshes=3")  # a split, where each takes a quarter of a minute
+FEW = ("evaluation.max_images=12", "evaluation.max_meshes=3")  # per split, since each takes a quarter of a minute
 
 
 @dataclass(frozen=True)
 class Result:
-    """Files of one name under benchmarks/results/.
+    """A result: files of one name under benchmarks/results/.
 
     command: a program under benchmarks/ and its arguments, where {store} is the store of all results, and {new} a
-    folder that nobody else uses and no other version of the code, for programs that time the whole of their work;
-    files: patterns under benchmarks/results/; captures: under ../shared/data; configs: patterns under configs/ without
+    folder that no other result and no other version of the code uses, for programs that time all of their work; files:
+    patterns under benchmarks/results/; captures: under ../shared/data; configs: patterns under configs/ without
     ".yaml"; runs: modules that the program starts and does not import; threads: of the program.
     """
 
@@ -29,19 +29,19 @@ class Result:
 def measured(
     name: str, *command: str, captures: tuple[str, ...] = (), configs: tuple[str, ...] = (), threads: int = 1
 ) -> Result:
-    """A JSON file and a table, and the chart that some have."""
+    """Return a result of a JSON file, a table and, for some, a chart."""
     return Result(name, command, (f"{name}.*",), captures, configs, threads=threads)
 
 
 def shared(name: str, capture: str, preset: str = "fast", *changes: str, threads: int = 1) -> Result:
-    """The whole pipeline on one capture, timed."""
+    """Return a result of the whole pipeline on one capture, timed."""
     command = ("score_shared.py", capture, "--preset", preset, "--store", "{new}", "--name", name)
     command += tuple(f"--set={change}" for change in changes)
     return Result(name, command, (f"{name}.*",), (capture,), (preset,), ("flows.train_subject",), threads)
 
 
 def study(kind: str, name: str, *methods: str, store: str = "{store}", threads: int = 1) -> Result:
-    """A benchmark or stability study of valid-wave."""
+    """Return a benchmark or stability study of valid-wave."""
     title, chosen = f"{kind}/valid-wave-{name}", ("--methods", ",".join(methods))
     command = ("studies.py", store, "valid-wave", kind, name, *chosen)
     files = (f"{title}.*", f"{title}-*.png")
@@ -49,7 +49,7 @@ def study(kind: str, name: str, *methods: str, store: str = "{store}", threads: 
 
 
 def ablations(preset: str, *changes: str) -> Result:
-    """The method without each part, on valid-wave."""
+    """Return a study of the method without each part, on valid-wave."""
     command = ("studies.py", "{store}", "valid-wave", "ablations", preset)
     command += tuple(f"--set={change}" for change in changes)
     title = f"ablations/valid-wave-{preset}"

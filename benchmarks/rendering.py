@@ -1,10 +1,10 @@
-"""How long finished subjects take to be rendered, on one core and on all.
+"""Measure the time to render a frame of finished subjects, on one core and on all.
 
 usage: python benchmarks/rendering.py STORE [CAPTURE ...]
 
-The first training pose of each shared capture (default: the three rendered ones), trained by preset `fast` where STORE
-does not have it, is rendered for its first test camera, or training camera where it has no other, as an image whose
-longest side is 256 and 512 px; on a GPU, where there is one. Medians. Run it on an idle machine. Writes
+Renders the first training pose of each shared capture (default: the three rendered ones), trained by preset `fast`
+unless STORE has it, from its first test camera, or first training camera if it has no test camera, as an image whose
+longest side is 256 and 512 px; on a GPU if there is one. Reports medians. Run it on an idle machine. Writes
 `benchmarks/results/rendering.json` and `.md`.
 """
 
@@ -12,7 +12,7 @@ import argparse
 from pathlib import Path
 
 import torch
-from provenance import SHARED, provenance, sentence, table, write_result
+from provenance import SHARED, provenance, provenance_line, table, write_result
 
 from flows.train_subject import train_subject
 from hnerf.avatar.trained import load_avatar
@@ -37,13 +37,13 @@ def main() -> None:
     result["seconds"] = {subject.name: measure(subject, cores) for subject in subjects}
     rows = [["subject", *(f"{side} px, threads: {n}" for side in SIDES_PX for n in cores)]]
     rows += [[name, *(f"{s:.2f} s" for s in found.values())] for name, found in result["seconds"].items()]
-    text = "\n".join(["# Rendering a frame", "", sentence(result), "", *table(rows), ""])
+    text = "\n".join(["# Rendering a frame", "", provenance_line(result), "", *table(rows), ""])
     write_result("rendering", result, text)
     print(text)
 
 
 def measure(subject: Path, cores: list[int]) -> dict[str, float]:
-    """Median seconds by longest side and number of threads."""
+    """Return median seconds by longest side and number of threads."""
     avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
     capture = load_cameras(subject / "calibration", Capture.load(subject / "capture"))
     camera = capture.cameras[(*capture.test_cameras, *capture.train_cameras)[0]]

@@ -1,10 +1,10 @@
-"""Run the pipeline on the shared captures and score what it leaves behind with the independent program beside them.
+"""Run the pipeline on the shared captures and score its output with the independent program beside them.
 
 usage: python benchmarks/score_shared.py [CAPTURE ...] [--preset NAME] [--store DIR] [--set a.b=c] [--name RESULT]
 
 Needs `../shared` beside this checkout (`data/`, `accept/score_run.py`) and the package installed. Writes
-`benchmarks/results/RESULT.json` and `.md`, by default `shared-NAME`. Stages that the store has already are not run
-again, so that for a subject that it has seconds of the whole run mean nothing and are left out.
+`benchmarks/results/RESULT.json` and `.md`, by default `shared-NAME`. Stages that are in the store already are not run
+again; for a subject that the store knows, the time of the whole run is therefore omitted.
 """
 
 import argparse
@@ -17,9 +17,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from provenance import ROOT, SHARED, provenance, sentence, table, write_result
+from provenance import ROOT, SHARED, provenance, provenance_line, table, write_result
 
-from hnerf.evaluation.views import NEW_POSES
+from hnerf.evaluation.views import NOVEL_POSE_SPLITS
 from tasks.launcher import end_with_parent
 
 SCORE_RUN = SHARED / "accept" / "score_run.py"
@@ -34,13 +34,13 @@ GEOMETRY_COLUMNS = {
 
 
 def main() -> int:
-    """1 if any capture failed."""
+    """Score all captures, print and write; return 1 if any failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", nargs="*", default=list(CAPTURES), metavar="CAPTURE")
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--store", type=Path, default=ROOT / "store")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="a.b=c")
-    parser.add_argument("--name", help="of the files of results (default: shared-PRESET)")
+    parser.add_argument("--name", help="name of the result files (default: shared-PRESET)")
     options = parser.parse_args()
     preset = {"preset": options.preset, "overrides": options.overrides}
     result: dict[str, Any] = provenance() | preset | {"captures": {}}
@@ -52,7 +52,7 @@ def main() -> int:
 
 
 def measure(capture: Path, preset: str, store: Path, overrides: list[str]) -> dict[str, Any]:
-    """Run the pipeline on one capture and score it; {"error": its last line} where it fails."""
+    """Run the pipeline on one capture and score it; return {"error": its last line} if it fails."""
     command = [str(Path(sys.executable).with_name("hnerf")), "run", str(capture), "--preset", preset]
     command += ["--store", str(store), *(f"--set={override}" for override in overrides)]
     known, started = (store / "subjects" / capture.name).exists(), time.perf_counter()
@@ -74,7 +74,7 @@ def measure(capture: Path, preset: str, store: Path, overrides: list[str]) -> di
 
 
 def score(subject: Path, capture: Path) -> dict[str, Any] | None:
-    """What the independent program finds; None where the capture has no ground truth."""
+    """Return the scores by the independent program; None if the capture has no ground truth."""
     if not (capture / "ground_truth").is_dir():
         return None
     command = [sys.executable, str(SCORE_RUN), str(subject), str(capture)]
@@ -83,12 +83,12 @@ def score(subject: Path, capture: Path) -> dict[str, Any] | None:
 
 
 def as_markdown(result: dict[str, Any]) -> str:
-    """One table a split, after the machine and before the protocol."""
+    """Format one table a split, after the machine and before the protocol."""
     changes = f" with {', '.join(result['overrides'])}" if result["overrides"] else ""
     lines = [
         f"# Shared captures, preset `{result['preset']}`{changes}",
         "",
-        f"{sentence(result)} Scored by the independent program.",
+        f"{provenance_line(result)} Scored by the independent program.",
     ]
     for split, title in (("novel_view", "Training poses, test cameras"), ("novel_pose", "New poses, animated")):
         lines += ["", f"## {title}", "", *_split_table(result["captures"], split)]
@@ -117,17 +117,17 @@ def _split_table(captures: dict[str, Any], split: str) -> list[str]:
 
 
 def _columns_table(captures: dict[str, Any]) -> list[str]:
-    """PSNR / SSIM / mask IoU of animated, posed and tracked new poses; why there are none."""
+    """Return the table of PSNR / SSIM / mask IoU of animated, posed and tracked poses, or why there are none."""
     rows = [["capture", "animated", "posed", "tracked"]]
     for name, figures in captures.items():
         if "error" not in figures:
             own = figures["own_metrics"]
-            rows.append([name, *(_in_a_cell(own[column]) for column in NEW_POSES)])
+            rows.append([name, *(_image_cell(own[column]) for column in NOVEL_POSE_SPLITS)])
     return table(rows)
 
 
 def _holdout_table(captures: dict[str, Any]) -> list[str]:
-    """PSNR / SSIM / mask IoU of every camera that was left out, and their mean; why there are none."""
+    """Return the table of PSNR / SSIM / mask IoU of every held-out camera, and their mean, or why there are none."""
     rows = [["capture", "camera left out", "training poses", "new poses, animated"]]
     for name, figures in captures.items():
         if "error" in figures:
@@ -137,18 +137,18 @@ def _holdout_table(captures: dict[str, Any]) -> list[str]:
             rows.append([name, "", figures["own_metrics"]["holdout_reason"], ""])
             continue
         for camera, found in (held_out["cameras"] | {"mean": held_out["mean"]}).items():
-            rows.append([name, camera, _in_a_cell(found["novel_view"]), _in_a_cell(found["novel_pose"])])
+            rows.append([name, camera, _image_cell(found["novel_view"]), _image_cell(found["novel_pose"])])
     return table(rows)
 
 
-def _in_a_cell(found: dict[str, Any]) -> str:
+def _image_cell(found: dict[str, Any]) -> str:
     if found["psnr"] is None:
         return str(found.get("reason", ""))
     return " / ".join(form.format(found[key]) for key, (_, form) in IMAGE_COLUMNS.items())
 
 
 def _cost_table(captures: dict[str, Any]) -> list[str]:
-    costs = ["before training, s", "training, s", "of it the field", "on", "one image, s", "whole run, s"]
+    costs = ["setup, s", "training, s", "of that the field, s", "device", "one image, s", "whole run, s"]
     rows = [["capture", "limb joints, mm", *costs]]
     for name, figures in captures.items():
         if "error" not in figures:

@@ -1,11 +1,10 @@
-"""Mask IoU against ground truth and time a frame, on the shared captures, with and without their clean plates.
+"""Measure mask IoU against ground truth and time a frame on the shared captures, with and without clean plates.
 
 usage: python benchmarks/segmentation.py [CAPTURE ...] [--sheet FOLDER]
 
-Needs `../shared/data` beside this checkout. Without a plate, fit and segmentation go round as in the flow. Only
-training cameras are segmented and scored. `--sheet` also writes a picture a capture: false pixels red, missing ones
-cyan, worst
-frames first. Writes `benchmarks/results/segmentation.json` and `.md`.
+Needs `../shared/data` beside this checkout. Without a plate, fit and segmentation alternate as in the flow. Only
+training cameras are segmented and scored. `--sheet` also writes a picture for each capture: false pixels red, missing
+ones cyan, worst frames first. Writes `benchmarks/results/segmentation.json` and `.md`.
 """
 
 import argparse
@@ -19,7 +18,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from provenance import SHARED, provenance, sentence, table, write_result
+from provenance import SHARED, provenance, provenance_line, table, write_result
 
 from hnerf.body.fit import fit_body
 from hnerf.body.fit_result import BodyFit
@@ -31,13 +30,13 @@ from hnerf.segmentation.prior import bounding_window
 from hnerf.segmentation.segment import segment
 
 CAPTURES = ("valid-walk", "valid-turn-mono", "valid-wave")
-WANTED_OF = ("valid-walk", "valid-turn-mono")
-WANTED = {"clean plate": 0.975, "no plate": 0.96}
+GOAL_CAPTURES = ("valid-walk", "valid-turn-mono")
+GOALS = {"clean plate": 0.975, "no plate": 0.96}
 SETTINGS = SegmentationSettings()
-SHOWN = 8  # frames on a sheet
+SHEET_FRAMES = 8
 PROTOCOL = (
     "IoU is the mean over all training views; a dropped mask counts 0. Milliseconds are of the whole segmentation, "
-    "reading of images and priors included, without the body fits between rounds."
+    "including reading of images and priors, without the body fits between rounds."
 )
 
 
@@ -52,17 +51,17 @@ def main() -> None:
     for name in options.captures:
         result["captures"][name] = measure(SHARED / "data" / name, options.sheet)
     means = {
-        kind: float(np.mean([result["captures"][name][kind]["iou"] for name in WANTED_OF]))
-        for kind in WANTED
-        if set(WANTED_OF) <= set(result["captures"])
+        kind: float(np.mean([result["captures"][name][kind]["iou"] for name in GOAL_CAPTURES]))
+        for kind in GOALS
+        if set(GOAL_CAPTURES) <= set(result["captures"])
     }
-    result["mean_iou"] = {"over": WANTED_OF, **means}
+    result["mean_iou"] = {"over": GOAL_CAPTURES, **means}
     write_result("segmentation", result, as_markdown(result))
     print(as_markdown(result))
 
 
 def measure(folder: Path, sheet: Path | None) -> dict[str, Any]:
-    """Figures of one capture, with the plates it has and without them."""
+    """Score one capture, with its clean plates and without them."""
     with tempfile.TemporaryDirectory() as scratch:
         capture = ingest(folder, CaptureSettings(), Path(scratch))
         found = {"clean plate": [_timed_segment(capture, None)]}
@@ -80,20 +79,20 @@ def measure(folder: Path, sheet: Path | None) -> dict[str, Any]:
             }
             if sheet:
                 sheet.mkdir(parents=True, exist_ok=True)
-                picture = worst(folder, capture, masks)
+                picture = worst_frames(folder, capture, masks)
                 cv2.imwrite(str(sheet / f"{folder.name}-{kind.replace(' ', '-')}.png"), picture[..., ::-1])
     return figures
 
 
 def _timed_segment(capture: Capture, body: BodyFit | None) -> tuple[Masks, float]:
-    """Masks, and milliseconds a frame."""
+    """Segment; return the masks and milliseconds a frame."""
     began = time.perf_counter()
     masks = segment(capture, body, SETTINGS)
     return masks, 1e3 * (time.perf_counter() - began) / (len(capture.train_cameras) * len(capture.frames))
 
 
 def _rounds(capture: Capture) -> list[tuple[Masks, float]]:
-    """Fit and segment in turns until the masks stand still, as the flow does."""
+    """Alternate fit and segmentation until the masks converge, as the flow does."""
     rounds: list[tuple[Masks, float]] = []
     while len(rounds) < SETTINGS.rounds:
         body, _ = fit_body(capture, rounds[-1][0] if rounds else None, FitSettings())
@@ -104,7 +103,7 @@ def _rounds(capture: Capture) -> list[tuple[Masks, float]]:
 
 
 def ious(folder: Path, capture: Capture, masks: Masks) -> dict[tuple[str, int], float]:
-    """By training camera and frame."""
+    """Return the IoU of each training camera and frame."""
     found = {}
     for view in ((camera, frame) for camera in capture.train_cameras for frame in capture.frames):
         true = truth(folder, *view)
@@ -114,7 +113,7 @@ def ious(folder: Path, capture: Capture, masks: Masks) -> dict[tuple[str, int], 
 
 
 def score(folder: Path, capture: Capture, masks: Masks) -> dict[str, Any]:
-    """Mean and worst IoU, and what is wrong as shares of the person's area."""
+    """Return mean and worst IoU, and false and missing pixels as shares of the person's area."""
     by_view = ious(folder, capture, masks)
     wrong = []
     for view in masks.encoded:
@@ -131,17 +130,17 @@ def score(folder: Path, capture: Capture, masks: Masks) -> dict[str, Any]:
 
 
 def truth(folder: Path, camera: str, frame: int) -> np.ndarray:
-    """(H, W) bool: the ray through the pixel's centre meets the person."""
+    """Return the true mask, (H, W) bool: True where the ray through the pixel's centre meets the person."""
     image = cv2.imread(str(folder / "ground_truth" / "masks" / camera / f"{frame:06d}.png"), cv2.IMREAD_GRAYSCALE)
     assert image is not None, f"{folder}: no true mask of camera {camera}, frame {frame}"
     return image > 127
 
 
-def worst(folder: Path, capture: Capture, masks: Masks) -> np.ndarray:
-    """The worst frames, cut to the person, side by side, (H, W, 3) uint8 RGB."""
+def worst_frames(folder: Path, capture: Capture, masks: Masks) -> np.ndarray:
+    """Return the worst frames, cropped to the person, side by side, (H, W, 3) uint8 RGB."""
     by_view = ious(folder, capture, masks)
     cells = []
-    for view in sorted(masks.encoded, key=lambda view: by_view[view])[:SHOWN]:
+    for view in sorted(masks.encoded, key=lambda view: by_view[view])[:SHEET_FRAMES]:
         mask, true = masks.get(*view), truth(folder, *view)
         picture = (0.6 * capture.image(*view)).astype(np.uint8)
         picture[mask & ~true], picture[true & ~mask] = (255, 0, 0), (0, 255, 255)
@@ -151,10 +150,10 @@ def worst(folder: Path, capture: Capture, masks: Masks) -> np.ndarray:
 
 
 def as_markdown(result: dict[str, Any]) -> str:
-    """A row a capture and kind, then the means that are wanted."""
+    """Format a row for each capture and kind, then the means that have a goal."""
     rows = [["capture", "", "IoU", "worst", "false", "missing", "dropped", "ms/frame", "IoU by round", "moved, px"]]
     for name, figures in result["captures"].items():
-        for kind in WANTED:
+        for kind in GOALS:
             f = figures[kind]
             rows.append([f"{name} ({figures['size_px'][0]} x {figures['size_px'][1]})", kind, f"{f['iou']:.4f}",
                          f"{f['worst_iou']:.4f}", f"{f['false_share']:.2%}", f"{f['missing_share']:.2%}",
@@ -162,12 +161,12 @@ def as_markdown(result: dict[str, Any]) -> str:
                          " ".join(f"{v:.2f}" for v in f["moved_px"])])  # fmt: skip
     means = result["mean_iou"]
     wanted = [
-        f"Mean over {' and '.join(means['over'])}, {kind}: **{means[kind]:.4f}** (wanted {goal})."
-        for kind, goal in WANTED.items()
+        f"Mean over {' and '.join(means['over'])}, {kind}: **{means[kind]:.4f}** (goal {goal})."
+        for kind, goal in GOALS.items()
         if kind in means
     ]
     return "\n".join(
-        ["# Segmentation", "", sentence(result), "", *table(rows), "", *wanted, "", result["protocol"], ""]
+        ["# Segmentation", "", provenance_line(result), "", *table(rows), "", *wanted, "", result["protocol"], ""]
     )
 
 

@@ -1,4 +1,4 @@
-"""How long a result takes, over interruptions."""
+"""Stopwatch for the time of a result across interruptions."""
 
 import json
 import time
@@ -9,10 +9,10 @@ SAVE_S = 10.0
 
 
 class Stopwatch:
-    """Runs from when it is made, and goes on from where an interrupted run of the same code left its file.
+    """A stopwatch that runs from its creation, and continues from the file of an interrupted run of the same code.
 
-    `whole` is whether `seconds` are of all the work: not where a file says that an earlier run of other code, or one
-    that ended, has left trainings to be found.
+    is_complete: whether `seconds` cover all the work; they do not if, by the file, an earlier run of other code, or one
+    that ended, may have left trainings to reuse.
     """
 
     def __init__(self, path: Path, digest: str) -> None:
@@ -21,17 +21,17 @@ class Stopwatch:
             found = json.loads(path.read_text())
         goes_on = found["digest"] == digest and not found["done"]
         self.path, self.digest = path, digest
-        self.whole = goes_on and found["whole"]
+        self.is_complete = goes_on and found["whole"]
         self.earlier_s = found["seconds"] if goes_on else 0.0
         self.started_s = self.saved_s = time.monotonic()
 
     @property
     def seconds(self) -> float:
-        """So far."""
+        """Return the seconds so far."""
         return self.earlier_s + time.monotonic() - self.started_s
 
     def tick(self) -> bool:
-        """Save now and then, for when this process is killed; returns whether it did."""
+        """Save every few seconds, in case this process is killed; return whether it did."""
         due = time.monotonic() - self.saved_s > SAVE_S
         if due:
             self.save(done=False)
@@ -40,5 +40,5 @@ class Stopwatch:
     def save(self, done: bool) -> None:
         """Write the file."""
         self.saved_s = time.monotonic()
-        state = {"digest": self.digest, "seconds": self.seconds, "whole": self.whole, "done": done}
+        state = {"digest": self.digest, "seconds": self.seconds, "whole": self.is_complete, "done": done}
         self.path.write_text(json.dumps(state))

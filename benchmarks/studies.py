@@ -1,11 +1,11 @@
-"""Studies of speed, accuracy, stability and ablations on a capture, kept where the README finds them.
+"""Run a study of speed and accuracy, stability or ablations on a capture, and keep its tables and charts.
 
 usage: python benchmarks/studies.py STORE CAPTURE benchmark|stability STUDY [--methods a,b] [--seconds S]
        python benchmarks/studies.py STORE CAPTURE ablations PRESET [--methods no-opt,no-noise] [--set a.b=c]
 
 CAPTURE is the name of a shared capture, or a folder.
 
-Runs `hnerf benchmark`, `hnerf stability` or `hnerf ablate` with STORE, in which finished work is found again, and
+Runs `hnerf benchmark`, `hnerf stability` or `hnerf ablate` with STORE, where finished work is reused, and
 copies its tables and charts to `benchmarks/results/<kind>/`. Ablations are scored on a few images.
 """
 
@@ -13,7 +13,7 @@ import argparse
 import shutil
 from pathlib import Path
 
-from provenance import RESULTS, ROOT, SHARED, clean_commit, provenance, sentence
+from provenance import RESULTS, ROOT, SHARED, clean_commit, provenance, provenance_line
 
 from flows.ablations import ablate
 from flows.benchmark import benchmark
@@ -23,7 +23,7 @@ FEW = ["evaluation.max_images=8", "evaluation.max_meshes=2", "evaluation.report_
 
 
 def main() -> None:
-    """Run one study, copy what it wrote and say where it comes from."""
+    """Run one study, copy its files and add their provenance."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("store", type=Path)
     parser.add_argument("capture")
@@ -36,14 +36,14 @@ def main() -> None:
     shared = SHARED / "data" / options.capture
     folder = shared if shared.is_dir() else Path(options.capture)
     methods = [name for name in options.methods.split(",") if name]
-    where = sentence(provenance())
+    where = provenance_line(provenance())
     if options.kind == "benchmark":
         table = benchmark.fn(folder, options.study, methods, options.seconds, options.store)
     elif options.kind == "ablations":
         table = ablate.fn(folder, options.study, options.store, [*FEW, *options.overrides], methods)
     else:
         table = stability.fn(folder, options.study, options.store, methods)
-    clean_commit(ROOT)  # still
+    clean_commit(ROOT)  # refuse if it changed during the study
     kept = RESULTS / options.kind
     kept.mkdir(parents=True, exist_ok=True)
     for path in [*table.parent.glob(f"{table.stem}.*"), *table.parent.glob(f"{table.stem}-*.png")]:

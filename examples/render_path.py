@@ -14,7 +14,7 @@ from hnerf.avatar.trained import load_avatar
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture, write_image
 from hnerf.evaluation.images import rgba
-from hnerf.render.trajectory import along
+from hnerf.render.trajectory import interpolate_cameras
 
 
 def main(subject: Path, out: Path, pictures: int = 60, side_px: int = 256) -> None:
@@ -22,7 +22,7 @@ def main(subject: Path, out: Path, pictures: int = 60, side_px: int = 256) -> No
     capture = load_cameras(subject / "calibration", Capture.load(subject / "capture"))
     avatar = load_avatar(subject / "training")  # "cuda" as second argument for a GPU
     recorded = [capture.cameras[name].resized(side_px, side_px) for name in capture.train_cameras]
-    path = along([*recorded, recorded[0]], pictures)
+    path = interpolate_cameras([*recorded, recorded[0]], pictures)
     frames = avatar.body.frames
     for number, camera in enumerate(path):
         row = number * len(frames) // pictures

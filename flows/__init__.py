@@ -1,4 +1,4 @@
-"""Prefect flows and the command line: what runs in which order, and nothing else."""
+"""Prefect flows and the command line: only the order in which stages run."""
 
 import os
 

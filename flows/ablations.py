@@ -1,7 +1,7 @@
-"""What each part of the method is worth: a training and an evaluation for every file in `configs/ablations/`.
+"""Ablations: a training and an evaluation for every file in `configs/ablations/`.
 
-A file holds the settings in which its row differs from the preset. Stages whose settings it leaves alone are shared by
-all rows, and rows that are finished are found again, both through the store.
+A file holds the settings in which its row differs from the preset. Through the store, stages whose settings it leaves
+alone are shared by all rows, and finished rows are reused.
 """
 
 import json
@@ -13,7 +13,7 @@ from typing import Any
 from prefect import flow
 
 from flows.run_page import publish_markdown
-from flows.train_subject import prepared, with_keypoints
+from flows.train_subject import prepare_training, with_keypoints
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, Settings, load_settings, read_yaml, with_changes
 from hnerf.errors import InputError, one_line
@@ -42,13 +42,13 @@ def ablate(
     overrides: Sequence[str] = (),
     only: Sequence[str] = (),
 ) -> Path:
-    """Run the full method and each ablation; returns the table, `<store>/ablations/<subject>-<preset>.md`, which has a
-    JSON file beside it. Both are written anew after every row.
+    """Run the full method and each ablation; return the table, `<store>/ablations/<subject>-<preset>.md`, which has a
+    JSON file beside it. Both are rewritten after every row.
 
     preset: a name under configs/ or a YAML file; overrides: settings like "training.steps=100", in all rows; only:
-    names of ablations, whose table's name ends in "-part", all where there are none. A row whose training or
-    evaluation fails says why and the rest go on; a worker that was killed (LostWorkerError) ends the command, and the
-    same command goes on from there.
+    names of ablations, all if empty, with which the table's name ends in "-part". A row whose training or evaluation
+    fails says why and the rest go on; a worker that was killed (LostWorkerError) ends the command, and the same command
+    resumes.
     """
     rows, left_out = choose(load_settings(preset, overrides), only)
     artifact_store = Store(store.resolve())
@@ -68,7 +68,7 @@ def ablate(
 
 
 def choose(full: Settings, only: Sequence[str]) -> tuple[dict[str, Settings], dict[str, str]]:
-    """Settings of each row, the full method first, and why the other ablations have none."""
+    """Return the settings of each row, the full method first, and why the other ablations have none."""
     known = {path.stem: path for path in sorted(ABLATIONS.glob("*.yaml"))}
     unknown = sorted(set(only) - set(known))
     if unknown:
@@ -86,35 +86,36 @@ def choose(full: Settings, only: Sequence[str]) -> tuple[dict[str, Settings], di
 
 
 def measure(store: Store, source: Source, truth: Source, settings: Settings) -> dict[str, Any]:
-    """A row's figures: scores of every split, seconds and device of its training; {"error": one line} if one fails."""
-    stages = prepared(store, with_keypoints(store, ingest(store, source, settings.capture), settings), settings)
+    """Return a row: scores of every split, seconds and device of its training; {"error": one line} if one fails."""
+    recording = with_keypoints(store, ingest(store, source, settings.capture), settings)
+    stages = prepare_training(store, recording, settings)
     try:
-        model = train(store, *stages, settings.training)
-        report = evaluate(store, truth, *stages, model, settings.evaluation)
-    except Exception as error:  # what breaks without a part is what the table is after
+        training = train(store, *stages, settings.training)
+        evaluation = evaluate(store, truth, *stages, training, settings.evaluation)
+    except Exception as error:  # that a method breaks without a part is a result
         if is_retryable(error):
             raise  # a full disk, a lost share, a killed worker
         log.warning("%s: %s", type(error).__name__, error)
         return {"error": one_line(error)}
-    metrics = json.loads((report.root / "metrics.json").read_text())
-    trained = json.loads((model.root / "report.json").read_text())
+    metrics = json.loads((evaluation.root / "metrics.json").read_text())
+    trained = json.loads((training.root / "report.json").read_text())
     return {key: trained[key] for key in ("seconds", "device")} | {
         key: metrics[key] for key in ("protocol", *results.SPLITS)
     }
 
 
 def as_markdown(result: dict[str, Any]) -> str:
-    """A row for each run that was made, then the ablations that have none, then how figures were taken."""
+    """Format a row for each run, then the ablations that were left out, then the protocol."""
     with_overrides = f" with {', '.join(result['overrides'])}" if result["overrides"] else ""
     titles = ["", *(title for title, _ in COLUMNS.values()), "training, s", "on"]
     lines = [f"# Ablations of {result['subject']}, preset `{result['preset']}`{with_overrides}", ""]
-    lines += [results.CELL, ""]
+    lines += [results.CELL_LEGEND, ""]
     lines += head(titles)
     lines += [line([name, *_cells(row)]) for name, row in result["rows"].items()]
     if result["left_out"]:
         lines += ["", "Left out:", "", *(f"- {name}: {reason}" for name, reason in result["left_out"].items())]
     found = [row for row in result["rows"].values() if "error" not in row]
-    reasons = {reason: None for row in found for reason in results.reasons(row)}
+    reasons = {reason: None for row in found for reason in results.missing_figures(row)}
     lines += ["", *(f"- {reason}" for reason in reasons)] if reasons else []
     protocols = {row["protocol"] for row in found}
     return "\n".join([*lines, "", *sorted(protocols), ""])

@@ -1,4 +1,4 @@
-"""Speed against accuracy: methods trained on the same data, scored while they train, timed, and charted."""
+"""Benchmark flow: methods trained on the same data, scored while they train, timed, and charted."""
 
 import json
 import logging
@@ -8,16 +8,16 @@ from typing import Any
 from prefect import flow
 
 from flows.run_page import publish_markdown
-from flows.train_subject import prepared, with_keypoints
+from flows.train_subject import prepare_training, with_keypoints
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
 from hnerf.errors import InputError, one_line
 from hnerf.files import embed_images
-from hnerf.study.benchmark.convergence import flat, limits_s
-from hnerf.study.benchmark.plan import Study, Variant, load_study
+from hnerf.study.benchmark.convergence import is_flat, training_limits_s
+from hnerf.study.benchmark.plan import BenchmarkStudy, Variant, load_study
 from hnerf.study.benchmark.publish import publish
 from tasks.benchmark import score_end_of_training, score_training
-from tasks.calibration import calibrated
+from tasks.calibration import calibrated_capture
 from tasks.capture import ingest, subset_capture
 from tasks.policy import is_retryable
 from tasks.source import Source, read_capture
@@ -35,87 +35,92 @@ def benchmark(
     seconds: float | None = None,
     store: Path = Path("store"),
 ) -> Path:
-    """Train and score every method of a study on every variant; returns `<store>/benchmark/<subject>-<study>.md`, which
-    has CSV, JSON and charts beside it, all written anew after every training.
+    """Train and score every method of a study on every variant; return `<store>/benchmark/<subject>-<study>.md`, which
+    has CSV, JSON and charts beside it, all rewritten after every training.
 
     study: a name under configs/benchmark/ or a YAML file; methods: of the study, or presets, instead of all; seconds:
-    of every training, instead of the study's. A method that fails says why and the rest go on; a worker that was killed
-    ends the flow, and the same call goes on in the training that it was in.
+    limit of every training, instead of the study's. A method that fails says why and the rest go on; a worker that was
+    killed ends the flow, and the same call resumes the training that was interrupted.
     """
-    plan = load_study(study).narrowed(methods or [], seconds)
-    capture_settings = [plan.settings(name).capture for name in plan.methods]  # presets that are wrong say so first
+    plan = load_study(study).restricted_to(methods or [], seconds)
+    capture_settings = [plan.settings(name).capture for name in plan.methods]  # invalid presets are refused first
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
     recorded = Capture.load(ingest(artifact_store, source, capture_settings[0]).root)
-    result, table = blank(plan, Path(study).stem, recorded), None
+    result, table = empty_result(plan, Path(study).stem, recorded), None
     for title, entry in result["variants"].items():
         variant = plan.variants[title]
         for name in () if "left_out" in entry else variant.methods or plan.methods:
             log.info("%s: %s", title, name)
             entry["methods"][name] = measure(artifact_store, source, truth, variant, plan, name)
-            table = publish(
-                result, artifact_store.root
-            )  # not before, so that what an earlier call found stands until then
-    table = table or publish(result, artifact_store.root)  # where every variant is left out
+            table = publish(result, artifact_store.root)  # an earlier call's files stand until the first result
+    table = table or publish(result, artifact_store.root)  # if every variant is left out
     publish_markdown(embed_images(table), "benchmark", f"Speed against accuracy: {table.stem}")
     return table
 
 
-def blank(plan: Study, study: str, recorded: Capture) -> dict[str, Any]:
-    """A result without figures, in the form of hnerf/study/benchmark/results.py."""
+def empty_result(plan: BenchmarkStudy, study: str, recorded: Capture) -> dict[str, Any]:
+    """Return a result without scores, in the form of hnerf/study/benchmark/results.py."""
     described = plan.model_dump(include={"title", "notes", "claims", "seconds", "until_flat", "sweep", "methods"})
-    variants = {title: describe(variant, recorded) for title, variant in plan.variants.items()}
+    variants = {title: describe_variant(variant, recorded) for title, variant in plan.variants.items()}
     return {"subject": recorded.name, "study": study} | described | {"variants": variants}
 
 
-def describe(variant: Variant, recorded: Capture) -> dict[str, Any]:
-    """How many cameras and frames a variant trains on; why it is left out where the capture has not as many."""
+def describe_variant(variant: Variant, recorded: Capture) -> dict[str, Any]:
+    """Return how many cameras and frames a variant trains on, or why it is left out if the capture has too few."""
     try:
-        cameras, frames, _ = variant.parts(recorded)
+        cameras, frames, _ = variant.select(recorded)
     except InputError as error:
         return {"left_out": str(error)}
     counts = {"cameras": len(cameras or recorded.train_cameras), "frames": len(frames or recorded.train_frames)}
     return counts | {"methods": {}}
 
 
-def measure(store: Store, source: Source, truth: Source, variant: Variant, plan: Study, method: str) -> dict[str, Any]:
-    """A method's scores on a variant, and the folder of their files in the store; {"error": one line} if it fails."""
+def measure(
+    store: Store, source: Source, truth: Source, variant: Variant, plan: BenchmarkStudy, method: str
+) -> dict[str, Any]:
+    """Return a method's scores on a variant, and the folder of their files in the store; {"error": one line} if it
+    fails."""
     try:
         settings, more = plan.settings(method), dict[str, Any]()
         recording = with_keypoints(store, ingest(store, source, settings.capture), settings)
-        parts = variant.parts(Capture.load(recording.root))
+        parts = variant.select(Capture.load(recording.root))
         if parts != (None, None, None):
             recording = subset_capture(store, recording, *parts)
-        stages = prepared(store, recording, settings)
+        stages = prepare_training(store, recording, settings)
         if plan.until_flat:
-            settings, more = until_flat(store, truth, stages, plan, method)
-        model = train(store, *stages, settings.training)
+            settings, more = train_until_flat(store, truth, stages, plan, method)
+        training = train(store, *stages, settings.training)
         _, calibration, _, body = stages
-        scores = score_training(store, truth, recording, calibration, body, model, plan.scoring)
-    except Exception as error:  # one method's fault, of which the others know nothing
+        scores = score_training(store, truth, recording, calibration, body, training, plan.scoring)
+    except Exception as error:  # one method's failure must not end the others
         if is_retryable(error):
             raise  # a full disk, a lost share, a killed worker
         log.warning("%s: %s", type(error).__name__, error)
         return {"error": one_line(error)}
     found: dict[str, Any] = json.loads((scores.root / "scores.json").read_text())
-    taken = calibrated(recording, stages[1])
+    taken = calibrated_capture(recording, stages[1])
     counts = {"cameras": len(taken.train_cameras), "frames": len(taken.train_frames)}
     return found | more | {"trained_on": counts, "folder": str(scores.root.relative_to(store.root))}
 
 
-def until_flat(
-    store: Store, truth: Source, stages: tuple[Artifact, Artifact, Artifact, Artifact], plan: Study, method: str
+def train_until_flat(
+    store: Store,
+    truth: Source,
+    stages: tuple[Artifact, Artifact, Artifact, Artifact],
+    plan: BenchmarkStudy,
+    method: str,
 ) -> tuple[Settings, dict[str, Any]]:
-    """Settings of the last of longer and longer trainings; the curve of all, and why there are no longer ones. One that
-    fails has no point: it may be too young for a surface."""
+    """Train for longer and longer; return the settings of the last training, and the curve of all and why there are no
+    longer ones. A training that fails has no point: it may be too young for a surface."""
     assert plan.seconds is not None
     recording, calibration, _, body = stages
     points: list[dict[str, Any]] = []
-    for limit_s in limits_s(plan.seconds):
+    for limit_s in training_limits_s(plan.seconds):
         settings, ended = plan.settings(method, limit_s), "limit"
         try:
-            model = train(store, *stages, settings.training)
-            point = score_end_of_training(store, truth, recording, calibration, body, model, plan.scoring)
+            training = train(store, *stages, settings.training)
+            point = score_end_of_training(store, truth, recording, calibration, body, training, plan.scoring)
         except Exception as error:
             if is_retryable(error):
                 raise
@@ -125,15 +130,15 @@ def until_flat(
         points += found["curve"]
         if found["training"]["field_seconds"] < limit_s:
             ended = "steps"
-        elif flat([(row["seconds"], row["psnr"]) for row in points if row["psnr"] is not None]):
+        elif is_flat([(row["seconds"], row["psnr"]) for row in points if row["psnr"] is not None]):
             ended = "flat"
         if ended != "limit":
             break
     return settings, {"curve": points, "ended": ended}
 
 
-def trained(store: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact, Artifact]:
-    """The calibration, the body and the training that a recording comes to."""
-    stages = prepared(store, recording, settings)
+def train_recording(store: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact, Artifact]:
+    """Run all stages on a recording; return calibration, body and training."""
+    stages = prepare_training(store, recording, settings)
     _, calibration, _, body = stages
     return calibration, body, train(store, *stages, settings.training)

@@ -11,7 +11,7 @@ from flows import commands
 from flows.display import display
 from hnerf.config import load_settings
 from hnerf.errors import InputError, InvalidAsset
-from tasks.launcher import GaveUpError
+from tasks.launcher import RankFailedError
 
 FAILED, BAD_INPUT = 1, 2
 NO_ROOM = (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # None: our own, of libraries that do not say why
@@ -39,7 +39,7 @@ def main(argv: list[str] | None = None) -> int:
             options.command(options)
     except InputError as error:
         return _fail(error, BAD_INPUT)
-    except (GaveUpError, InvalidAsset) as error:
+    except (RankFailedError, InvalidAsset) as error:
         return _fail(error, FAILED)
     except OSError as error:
         from tasks.policy import is_permanent  # imports Prefect

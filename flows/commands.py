@@ -152,11 +152,11 @@ def _show(table: Path) -> None:
 def render(options: argparse.Namespace) -> None:
     """Write pictures and videos of a trained person."""
     from hnerf.render.subject import RenderOptions, render_subject
-    from tasks.store import require_whole
+    from tasks.store import require_intact
 
     for subject in (options.subject, options.motion):
         if subject and subject.is_dir():
-            require_whole(subject)
+            require_intact(subject)
     wanted = RenderOptions(
         camera=options.camera,
         path=options.path,

@@ -1,10 +1,10 @@
-"""What a flow shows on its run's page."""
+"""Text on the page of a flow run."""
 
 from prefect.artifacts import create_markdown_artifact
 from prefect.context import FlowRunContext
 
 
 def publish_markdown(markdown: str, key: str, description: str) -> None:
-    """A text, with its pictures inside it, on the page of the flow run; where there is no run, nothing."""
+    """Publish a text, with its pictures embedded, on the page of the flow run; do nothing outside a run."""
     if FlowRunContext.get():
         create_markdown_artifact(markdown, key=key, description=description)

@@ -1,4 +1,4 @@
-"""Where each method breaks: the same capture, made worse in one way at a time."""
+"""Stability flow: the same capture, degraded in one way at a time, to find where each method breaks."""
 
 import contextlib
 import json
@@ -11,16 +11,16 @@ import numpy as np
 from prefect import flow
 
 from flows.run_page import publish_markdown
-from flows.train_subject import prepared, with_keypoints
+from flows.train_subject import prepare_training, with_keypoints
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
 from hnerf.errors import InputError, NotApplicableError, one_line
-from hnerf.evaluation.columns import why_no_novel_poses
+from hnerf.evaluation.columns import reason_without_novel_poses
 from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, TRACKED
 from hnerf.files import embed_images, replace_text
 from hnerf.study.degradations.catalogue import KINDS, Degradation, degrade_settings
 from hnerf.study.stability.charts import curve_chart, matrix_chart
-from hnerf.study.stability.plan import Stability, load_stability
+from hnerf.study.stability.plan import StabilityStudy, load_stability
 from hnerf.study.stability.report import REFERENCE, as_markdown
 from hnerf.study.stability.verdict import BROKEN, RunVerdict, judge, near_border
 from tasks.capture import ingest, subset_capture
@@ -29,7 +29,14 @@ from tasks.fit import fit
 from tasks.policy import is_retryable
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
-from tasks.study import check_meshes, degrade_capture, degrade_fit, degrade_masks, dress, show_in_extreme_poses
+from tasks.study import (
+    check_meshes,
+    degrade_capture,
+    degrade_clothing,
+    degrade_fit,
+    degrade_masks,
+    show_in_extreme_poses,
+)
 from tasks.training import train
 
 log = logging.getLogger("hnerf.stability")
@@ -46,20 +53,20 @@ def stability(
     methods: Sequence[str] = (),
     only: Sequence[str] = (),
 ) -> Path:
-    """Run each method on a capture made worse in every way that a study names; returns the table,
-    `<store>/stability/<subject>-<study>.md`, which has JSON beside it, both written anew after every run, and charts
-    when it ends, however it ends.
+    """Run each method on a capture degraded in every way that a study names; return the table,
+    `<store>/stability/<subject>-<study>.md`, which has JSON beside it, both rewritten after every run, and charts,
+    drawn when the flow ends, even by an error.
 
     study: a name under configs/stability/ or a YAML file; methods: presets in place of the study's; only: names of
-    degradations, whose table's name ends in "-part". A failure is a result and the rest go on; a worker that was killed
-    (LostWorkerError) ends the command, and the same command goes on from there.
+    degradations, with which the table's name ends in "-part". A failure is a result and the rest go on; a worker that
+    was killed (LostWorkerError) ends the command, and the same command resumes.
     """
-    plan = load_stability(study).only(only)
+    plan = load_stability(study).restricted_to(only)
     plan = plan.model_copy(update={"methods": tuple(methods)}) if methods else plan
     presets = {name: load_settings(name, plan.overrides) for name in plan.methods}
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
-    subject = Capture.load(recorded(artifact_store, source, plan, next(iter(presets.values()))).root).name
+    subject = Capture.load(ingest_part(artifact_store, source, plan, next(iter(presets.values()))).root).name
     table = artifact_store.root / "stability" / f"{subject}-{Path(study).stem}{'-part' if only else ''}.md"
     table.parent.mkdir(parents=True, exist_ok=True)
     result: Figures = {"subject": subject, "study": study, "plan": plan.model_dump(mode="json")}
@@ -67,30 +74,30 @@ def stability(
     try:
         for run in _runs(artifact_store, source, truth, plan, presets):
             if "left_out" in run:
-                if run["left_out"] not in result["left_out"]:  # every method and seed says so
+                if run["left_out"] not in result["left_out"]:  # every method and seed yields the same line
                     result["left_out"].append(run["left_out"])
                 continue
             result["protocol"] = run.pop("protocol", None) or result["protocol"]
             result["runs"].append(run)
-            _tell(result, [], table)
-    except BaseException:  # Ctrl-C, too
+            _write_table(result, [], table)
+    except BaseException:  # Ctrl-C as well
         if result["runs"]:
-            with contextlib.suppress(Exception):  # which would hide what ended the study
-                _tell(result, _draw(result, table), table)
+            with contextlib.suppress(Exception):  # an error here would hide the one that ended the study
+                _write_table(result, _draw_charts(result, table), table)
         raise
-    _tell(result, _draw(result, table), table)
+    _write_table(result, _draw_charts(result, table), table)
     publish_markdown(embed_images(table), "stability", f"Where methods break on {subject}")
     return table
 
 
 def _runs(
-    store: Store, source: Source, truth: Source, plan: Stability, presets: dict[str, Settings]
+    store: Store, source: Source, truth: Source, plan: StabilityStudy, presets: dict[str, Settings]
 ) -> Iterator[Figures]:
-    """Every run's row: its method, degradation and verdict, and figures where there are any; or {"left_out": what and
+    """Yield every run's row: its method, degradation and verdict, and scores if there are any; or {"left_out": what and
     why}."""
     tried = [(kind, strength) for kind, strengths in plan.degradations.items() for strength in strengths]
     for method, preset in presets.items():
-        recording = recorded(store, source, plan, preset)
+        recording = ingest_part(store, source, plan, preset)
         near = set()
         for seed in plan.seeds:
             for run in _runs_of_seed(store, recording, truth, method, preset, seed, tried):
@@ -110,12 +117,12 @@ def _runs_of_seed(
     seed: int,
     tried: Sequence[tuple[str, float]],
 ) -> Iterator[Figures]:
-    """The run to compare with, and, unless that broke, a run for each kind and strength."""
+    """Yield the reference run and, unless it is broken, a run for each kind and strength."""
     settings = preset.model_copy(update={"training": preset.training.model_copy(update={"seed": seed})})
     log.info("%s, seed %d, as recorded", method, seed)
     good = attempt(store, recording, truth, settings, None)
     row = {"method": method, "seed": seed}
-    reference = row | {"kind": REFERENCE, "strength": None} | judged(good, good)
+    reference = row | {"kind": REFERENCE, "strength": None} | verdict_row(good, good)
     yield reference
     for kind, strength in tried if reference["verdict"] not in BROKEN else ():
         log.info("%s, seed %d, %s: %g", method, seed, KINDS[kind].label, strength)
@@ -123,19 +130,19 @@ def _runs_of_seed(
         if "left_out" in found:
             yield {"left_out": f"{KINDS[kind].label}, {strength:g}: {found['left_out']}"}
             continue
-        yield row | {"kind": kind, "strength": strength} | judged(found, good)
+        yield row | {"kind": kind, "strength": strength} | verdict_row(found, good)
 
 
-def recorded(store: Store, source: Source, plan: Stability, settings: Settings) -> Artifact:
-    """The recording, or that part of it which stands for all."""
+def ingest_part(store: Store, source: Source, plan: StabilityStudy, settings: Settings) -> Artifact:
+    """Ingest the recording, or that part of it which the study uses."""
     recording = with_keypoints(store, ingest(store, source, settings.capture), settings)
-    parts = plan.part.parts(Capture.load(recording.root))
+    parts = plan.part.select(Capture.load(recording.root))
     return recording if parts == (None, None, None) else subset_capture(store, recording, *parts)
 
 
-def judged(found: Figures, good: Figures) -> Figures:
-    """RunVerdict, whether it is near a border, and means over the images and surfaces that both runs have, None where
-    there are none; those of the good run as "reference"."""
+def verdict_row(found: Figures, good: Figures) -> Figures:
+    """Return a run's verdict, whether it is near a border, and means over the images and surfaces that both runs have,
+    None if there are none; with those of the good run as "reference"."""
     row: Figures = {}
     near = False
     if "error" in found:
@@ -143,15 +150,16 @@ def judged(found: Figures, good: Figures) -> Figures:
     elif "images" not in found:
         verdict = judge(None, {}, found["faults"])
     else:
-        row, reference = in_common(found, good), in_common(good, found)
+        row, reference = means_in_common(found, good), means_in_common(good, found)
         verdict = judge(row, reference, found["faults"])
         near = near_border(row, reference, found["faults"])
         row |= {"reference": reference, "protocol": found["protocol"], "seconds": found["seconds"]}
-    return row | {"verdict": verdict.word, "reason": verdict.reason, "near_border": near}
+    return row | {"verdict": verdict.verdict, "reason": verdict.reason, "near_border": near}
 
 
-def in_common(one: Figures, other: Figures) -> Figures:
-    """Means of one run's figures over the images and surfaces that the other has as well, and how many these are."""
+def means_in_common(one: Figures, other: Figures) -> Figures:
+    """Return the means of one run's scores over the images and surfaces that the other has as well, and their
+    counts."""
     images = [score for view, score in one["images"].items() if view in other["images"]]
     surfaces = [chamfer_mm for frame, chamfer_mm in one["surfaces"].items() if frame in other["surfaces"]]
     known = {key: [s[key] for s in images if s.get(key) is not None] for key in IMAGE_FIGURES}
@@ -163,46 +171,46 @@ def in_common(one: Figures, other: Figures) -> Figures:
 def attempt(
     store: Store, recording: Artifact, truth: Source, settings: Settings, degradation: Degradation | None
 ) -> Figures:
-    """What `measure` found, or {"error": (verdict, reason)}: bad input that was told before or by training is refused,
-    anything else that went wrong has failed; or {"left_out": reason} where the capture does not allow it to be
-    tried."""
+    """Return the result of `measure`, or {"error": (verdict, reason)}: refused if bad input was reported before or
+    by training, failed for any other error; or {"left_out": reason} if the degradation is not applicable to the
+    capture."""
     at_bad_input = "refused"
     try:
-        stages = prepare(store, recording, truth, settings, degradation)
-        training = settings.training
-        if degradation and KINDS[degradation.kind].place == "settings":
-            training = degrade_settings(training, degradation)
-        model = train(store, *stages, training)
+        stages = prepare_degraded(store, recording, truth, settings, degradation)
+        training_settings = settings.training
+        if degradation and KINDS[degradation.kind].target == "settings":
+            training_settings = degrade_settings(training_settings, degradation)
+        training = train(store, *stages, training_settings)
         at_bad_input = "failed"
-        return measure(store, recording, truth, settings, degradation, stages, model)
+        return measure(store, recording, truth, settings, degradation, stages, training)
     except NotApplicableError as error:
         return {"left_out": str(error)}
     except InputError as error:
         return {"error": (at_bad_input, str(error))}
-    except Exception as error:  # whatever breaks is what the study is after
+    except Exception as error:  # any failure is a result of the study
         if is_retryable(error):
             raise  # a full disk, a lost share, a killed worker
         log.warning("%s: %s", type(error).__name__, error)
         return {"error": ("failed", one_line(error))}
 
 
-def prepare(
+def prepare_degraded(
     store: Store, recording: Artifact, truth: Source, settings: Settings, degradation: Degradation | None
 ) -> tuple[Artifact, Artifact, Artifact, Artifact]:
-    """Capture, calibration, masks and body, made worse at the degradation's place."""
-    place = KINDS[degradation.kind].place if degradation else None
-    if degradation and place == "capture":
+    """Return recording, calibration, segmentation and body, degraded at the degradation's target."""
+    target = KINDS[degradation.kind].target if degradation else None
+    if degradation and target == "capture":
         recording = degrade_capture(store, recording, degradation)
-    recording, calibration, masks, body = prepared(store, recording, settings)
-    if degradation and place == "worn":
-        recording = dress(store, truth, recording, calibration, body, degradation)
-        return prepared(store, recording, settings)
-    if degradation and place == "masks":
-        masks = degrade_masks(store, recording, calibration, masks, degradation)
-        body = fit(store, recording, calibration, masks, settings.fit)
-    if degradation and place == "fit":
+    recording, calibration, segmentation, body = prepare_training(store, recording, settings)
+    if degradation and target == "clothing":
+        recording = degrade_clothing(store, truth, recording, calibration, body, degradation)
+        return prepare_training(store, recording, settings)
+    if degradation and target == "masks":
+        segmentation = degrade_masks(store, recording, calibration, segmentation, degradation)
+        body = fit(store, recording, calibration, segmentation, settings.fit)
+    if degradation and target == "fit":
         body = degrade_fit(store, body, degradation)
-    return recording, calibration, masks, body
+    return recording, calibration, segmentation, body
 
 
 def measure(
@@ -212,39 +220,41 @@ def measure(
     settings: Settings,
     degradation: Degradation | None,
     stages: tuple[Artifact, Artifact, Artifact, Artifact],
-    model: Artifact,
+    training: Artifact,
 ) -> Figures:
-    """Faults of surfaces; figures of each image and the Chamfer distance of each surface against the truth, as far as
-    there is one, of novel poses, animated, or of training poses where the capture as recorded or the method has no
-    others. Of extreme poses faults alone. A fit that was made worse is trained on; novel poses are shown as the good
-    one has them."""
-    no_poses = why_no_novel_poses(model.root)
-    if degradation and KINDS[degradation.kind].place == "poses":
+    """Return the faults of surfaces, the scores of each image and the Chamfer distance of each surface that has ground
+    truth.
+
+    Scores are of novel poses, animated, or of training poses if the capture as recorded or the method has no novel
+    ones. Extreme poses have faults only. A degraded fit is used for training; novel poses are shown as in the good fit.
+    """
+    no_poses = reason_without_novel_poses(training.root)
+    if degradation and KINDS[degradation.kind].target == "poses":
         if no_poses:
             raise NotApplicableError(no_poses)
-        return {"faults": _faults(show_in_extreme_poses(store, model, degradation))}
-    *_, good_body = prepare(store, recording, truth, settings, None)
-    if degradation and KINDS[degradation.kind].place == "worn":
+        return {"faults": _faults(show_in_extreme_poses(store, training, degradation))}
+    *_, good_body = prepare_degraded(store, recording, truth, settings, None)
+    if degradation and KINDS[degradation.kind].target == "clothing":
         _, truth = read_capture(stages[0].root)
-    recorded, calibration, masks, body = stages
-    if degradation and KINDS[degradation.kind].place == "fit":
+    recording_used, calibration, segmentation, body = stages
+    if degradation and KINDS[degradation.kind].target == "fit":
         body = good_body
-    report = evaluate(store, truth, recorded, calibration, masks, body, model, settings.evaluation)
-    metrics = json.loads((report.root / "metrics.json").read_text())
+    evaluation = evaluate(store, truth, recording_used, calibration, segmentation, body, training, settings.evaluation)
+    metrics = json.loads((evaluation.root / "metrics.json").read_text())
     novel = Capture.load(recording.root).novel_pose_frames and not no_poses
     split = ANIMATED if novel else NOVEL_VIEW
     surfaces = (metrics[split]["geometry"] or {"per_surface": []})["per_surface"]
     return {
         "images": _images(metrics, split),
         "surfaces": {surface["frame"]: surface["chamfer_mm"] for surface in surfaces},
-        "faults": _faults(check_meshes(store, report, good_body)),
+        "faults": _faults(check_meshes(store, evaluation, good_body)),
         "protocol": metrics["protocol"],
-        "seconds": json.loads((model.root / "report.json").read_text())["seconds"],
+        "seconds": json.loads((training.root / "report.json").read_text())["seconds"],
     }
 
 
 def _images(metrics: Figures, split: str) -> dict[tuple[str, int], Figures]:
-    """Figures of each image by camera and frame; of animated poses also what they have posed and tracked."""
+    """Return the scores of each image by camera and frame; of animated poses also the PSNR posed and tracked."""
     images = {(row["camera"], row["frame"]): dict(row) for row in metrics[split]["per_image"]}
     others = {"posed_psnr": POSED, "tracked_psnr": TRACKED} if split == ANIMATED else {}
     for key, other in others.items():
@@ -254,21 +264,21 @@ def _images(metrics: Figures, split: str) -> dict[tuple[str, int], Figures]:
 
 
 def _faults(checked: Artifact) -> list[str]:
-    """Of all surfaces."""
+    """Return the faults of all surfaces."""
     surfaces = json.loads((checked.root / "surface.json").read_text())
     return [surface["fault"] for surface in surfaces.values() if surface["fault"]]
 
 
-def _tell(result: Figures, charts: list[str], table: Path) -> None:
+def _write_table(result: Figures, charts: list[str], table: Path) -> None:
     replace_text(table.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
     replace_text(table, as_markdown(result, charts))
 
 
-def _draw(result: Figures, table: Path) -> list[str]:
-    """Names of the charts that there is something to draw for."""
+def _draw_charts(result: Figures, table: Path) -> list[str]:
+    """Draw the charts that there is data for; return their file names."""
     paths = {key: table.with_name(f"{table.stem}-{key}.png") for key in ("matrix", "psnr", "chamfer_mm")}
     for path in paths.values():
-        path.unlink(missing_ok=True)  # of an earlier call
+        path.unlink(missing_ok=True)  # left by an earlier call
     matrix_chart(result, paths["matrix"])
     drawn = [key for key in ("psnr", "chamfer_mm") if curve_chart(result, key, paths[key])]
     return [paths[key].name for key in ("matrix", *drawn)]

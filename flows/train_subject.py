@@ -1,4 +1,4 @@
-"""From a capture folder to an avatar."""
+"""Main flow: from a capture folder to an avatar."""
 
 from pathlib import Path
 
@@ -8,14 +8,14 @@ from flows.run_page import publish_markdown
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import recorded_cameras
 from hnerf.config import Settings, load_settings
-from hnerf.evaluation.holdout import cameras_left_out
+from hnerf.evaluation.holdout import held_out_cameras
 from tasks.asset import export
-from tasks.calibration import calibrate, calibrated
+from tasks.calibration import calibrate, calibrated_capture
 from tasks.capture import ingest, subset_capture
 from tasks.detection import detect, needs_detection
 from tasks.evaluation import evaluate, evaluate_held_out
 from tasks.fit import fit
-from tasks.segmentation import needs_body, segment, settled
+from tasks.segmentation import converged, needs_body, segment
 from tasks.source import read_capture
 from tasks.store import Artifact, Store
 from tasks.training import train
@@ -25,96 +25,105 @@ from tasks.training import train
 def train_subject(
     capture: Path, preset: str = "fast", store: Path = Path("store"), overrides: list[str] | None = None
 ) -> Path:
-    """Train one person and export the avatar; returns the folder that links to each stage's result.
+    """Train one person and export the avatar; return the folder that links to each stage's result.
 
     capture: the recording's folder; preset: a name under configs/ or a YAML file; store: where artifacts are kept;
-    overrides: settings like "training.steps=100". Where `evaluation.holdout` names a camera, a second field is trained
-    without it, or one without each camera in turn.
+    overrides: settings like "training.steps=100". If `evaluation.holdout` names a camera, a second field is trained
+    without it; with "each", one without each camera in turn.
     """
     settings = load_settings(preset, overrides or ())
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
     if settings.evaluation.holdout:
         cameras = recorded_cameras(source.root)
-        cameras_left_out(cameras.train, cameras.test, settings.evaluation.holdout)  # refused before any work
+        held_out_cameras(cameras.train, cameras.test, settings.evaluation.holdout)  # refuses before any work is done
 
     recorded = ingest(artifact_store, source, settings.capture)
     subject = Capture.load(recorded.root).name
     artifact_store.link_latest(subject, recorded)
     recording = artifact_store.link_latest(subject, with_keypoints(artifact_store, recorded, settings))
     calibration = artifact_store.link_latest(subject, calibrate(artifact_store, recording, settings.calibration))
-    left_out = left_out_cameras(recording, calibration, settings)
-    masks = artifact_store.link_latest(subject, find_masks(artifact_store, recording, calibration, settings))
-    body = artifact_store.link_latest(subject, fit(artifact_store, recording, calibration, masks, settings.fit))
-    model = artifact_store.link_latest(
-        subject, train(artifact_store, recording, calibration, masks, body, settings.training)
+    left_out = calibrated_held_out_cameras(recording, calibration, settings)
+    segmentation = artifact_store.link_latest(
+        subject, segment_subject(artifact_store, recording, calibration, settings)
     )
-    held_out = tuple(without(camera, artifact_store, recording, calibration, masks, settings) for camera in left_out)
-    report = evaluate(artifact_store, truth, recording, calibration, masks, body, model, settings.evaluation, held_out)
-    artifact_store.link_latest(subject, report)
-    asset = export(artifact_store, recording, calibration, model, settings.asset)
-    for artifact in (recorded, recording, calibration, masks, body, model, report, asset):
-        artifact_store.link_latest(subject, artifact)  # again: another run of this name may have come between
-    publish_markdown(_figures(subject, report, asset), "result", f"What came of {subject}")
+    body = artifact_store.link_latest(subject, fit(artifact_store, recording, calibration, segmentation, settings.fit))
+    training = artifact_store.link_latest(
+        subject, train(artifact_store, recording, calibration, segmentation, body, settings.training)
+    )
+    held_out = tuple(
+        evaluate_without_camera(camera, artifact_store, recording, calibration, segmentation, settings)
+        for camera in left_out
+    )
+    evaluation = evaluate(
+        artifact_store, truth, recording, calibration, segmentation, body, training, settings.evaluation, held_out
+    )
+    artifact_store.link_latest(subject, evaluation)
+    asset = export(artifact_store, recording, calibration, training, settings.asset)
+    for artifact in (recorded, recording, calibration, segmentation, body, training, evaluation, asset):
+        artifact_store.link_latest(subject, artifact)  # again: another run of this name may have relinked them
+    publish_markdown(_figures(subject, evaluation, asset), "result", f"Result for {subject}")
     return artifact_store.subject_folder(subject)
 
 
 def with_keypoints(store: Store, recorded: Artifact, settings: Settings) -> Artifact:
-    """The recording as it came, or with what a network found in it."""
+    """Return the recording, with people detected by a network if it needs that."""
     wanted = needs_detection(recorded, settings.detection)
     return detect(store, recorded, settings.detection) if wanted else recorded
 
 
-def prepared(store: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact, Artifact, Artifact]:
-    """What training and evaluation are given of a recording: itself, calibration, masks and body."""
-    return fitted(store, recording, calibrate(store, recording, settings.calibration), settings)
+def prepare_training(
+    store: Store, recording: Artifact, settings: Settings
+) -> tuple[Artifact, Artifact, Artifact, Artifact]:
+    """Run the stages before training on a recording; return recording, calibration, segmentation and body."""
+    return segment_and_fit(store, recording, calibrate(store, recording, settings.calibration), settings)
 
 
-def fitted(
+def segment_and_fit(
     store: Store, recording: Artifact, calibration: Artifact, settings: Settings
 ) -> tuple[Artifact, Artifact, Artifact, Artifact]:
-    """The same of a recording whose cameras were calibrated."""
-    masks = find_masks(store, recording, calibration, settings)
-    return recording, calibration, masks, fit(store, recording, calibration, masks, settings.fit)
+    """Do the same for a recording whose cameras were calibrated."""
+    segmentation = segment_subject(store, recording, calibration, settings)
+    return recording, calibration, segmentation, fit(store, recording, calibration, segmentation, settings.fit)
 
 
-def left_out_cameras(recording: Artifact, calibration: Artifact, settings: Settings) -> tuple[str, ...]:
-    """Of the cameras that calibration left those that a field is to be trained without."""
+def calibrated_held_out_cameras(recording: Artifact, calibration: Artifact, settings: Settings) -> tuple[str, ...]:
+    """Return the cameras to hold out in turn, among those that calibration kept."""
     if settings.evaluation.holdout is None:
         return ()
-    used = calibrated(recording, calibration)
-    return cameras_left_out(used.train_cameras, used.test_cameras, settings.evaluation.holdout)
+    used = calibrated_capture(recording, calibration)
+    return held_out_cameras(used.train_cameras, used.test_cameras, settings.evaluation.holdout)
 
 
-def without(
-    camera: str, store: Store, recording: Artifact, calibration: Artifact, masks: Artifact, settings: Settings
+def evaluate_without_camera(
+    camera: str, store: Store, recording: Artifact, calibration: Artifact, segmentation: Artifact, settings: Settings
 ) -> Artifact:
-    """Masks, body and field made anew without a camera, scored on it and its `masks`; where cameras stand is known from
-    all of them."""
-    others = tuple(name for name in calibrated(recording, calibration).train_cameras if name != camera)
-    stages = fitted(store, subset_capture(store, recording, others, None, None), calibration, settings)
-    model = train(store, *stages, settings.training)
-    scored = settings.evaluation.model_copy(update={"holdout": camera})  # whether it is one of several or not
-    return evaluate_held_out(store, recording, calibration, masks, stages[-1], model, scored)
+    """Segment, fit and train without a camera, and score the result on that camera under its masks of `segmentation`.
+    The calibration is that of all cameras."""
+    others = tuple(name for name in calibrated_capture(recording, calibration).train_cameras if name != camera)
+    stages = segment_and_fit(store, subset_capture(store, recording, others, None, None), calibration, settings)
+    training = train(store, *stages, settings.training)
+    scored = settings.evaluation.model_copy(update={"holdout": camera})  # also if the setting is "each"
+    return evaluate_held_out(store, recording, calibration, segmentation, stages[-1], training, scored)
 
 
-def find_masks(store: Store, recording: Artifact, calibration: Artifact, settings: Settings) -> Artifact:
-    """Segment; where that needs a body, fit one to keypoints first, and go round until the masks stand still."""
+def segment_subject(store: Store, recording: Artifact, calibration: Artifact, settings: Settings) -> Artifact:
+    """Segment the person. If that needs a body, fit one to keypoints first, and alternate until the masks converge."""
     if not needs_body(recording, settings.segmentation):
         return segment(store, recording, calibration, None, None, settings.segmentation)
-    masks = None
+    segmentation = None
     for _ in range(settings.segmentation.rounds):
-        body = fit(store, recording, calibration, masks, settings.fit)
-        masks = segment(store, recording, calibration, body, masks, settings.segmentation)
-        if settled(masks, settings.segmentation):
+        body = fit(store, recording, calibration, segmentation, settings.fit)
+        segmentation = segment(store, recording, calibration, body, segmentation, settings.segmentation)
+        if converged(segmentation, settings.segmentation):
             break
-    assert masks is not None  # there is a round at least
-    return masks
+    assert segmentation is not None  # there is at least one round
+    return segmentation
 
 
-def _figures(subject: str, report: Artifact, asset: Artifact) -> str:
-    """Figures and places."""
+def _figures(subject: str, evaluation: Artifact, asset: Artifact) -> str:
+    """Format the scores and the paths of report and asset."""
     lines = [f"# {subject}", "", "| figure | value |", "|---|---|"]
-    lines += [f"| {name} | {value:.4g} |" for name, value in report.metrics.items()]
-    lines += ["", f"Report: `{report.root / 'report.html'}`", f"Asset: `{asset.root / 'avatar.usdz'}`"]
+    lines += [f"| {name} | {value:.4g} |" for name, value in evaluation.metrics.items()]
+    lines += ["", f"Report: `{evaluation.root / 'report.html'}`", f"Asset: `{asset.root / 'avatar.usdz'}`"]
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""torchrun, which leaves word of the first rank that failed: python -m tasks.agent FILE TORCHRUN'S ARGUMENTS."""
+"""torchrun, with a report of the first failed rank in a file: python -m tasks.agent FILE TORCHRUN'S ARGUMENTS."""
 
 import json
 import sys

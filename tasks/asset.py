@@ -1,19 +1,19 @@
-"""Stage 7: the rigged, textured, animated avatar."""
+"""The asset stage: the rigged, textured, animated avatar."""
 
 from pathlib import Path
 
 from hnerf.asset.export import export_asset
 from hnerf.config import AssetSettings
-from tasks.calibration import calibrated
+from tasks.calibration import calibrated_capture
 from tasks.stage import stage
 from tasks.store import Artifact
-from tasks.training import trained
+from tasks.training import load_trained_avatar
 
 
 @stage("asset", version="2")
 def export(
     out: Path, recording: Artifact, calibration: Artifact, training: Artifact, settings: AssetSettings
 ) -> dict[str, float]:
-    """USD and glTF files of the trained person."""
-    export_asset(calibrated(recording, calibration), trained(training), settings, out)
+    """Export the trained person to USD and glTF files."""
+    export_asset(calibrated_capture(recording, calibration), load_trained_avatar(training), settings, out)
     return {}

@@ -1,4 +1,4 @@
-"""A benchmark's own stage: scores of a training on the way and at its end, and what an image costs."""
+"""The scoring stages of a benchmark: scores of a training's snapshots and of its end, and rendering times."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.models import LPIPS_ALEXNET
 from hnerf.study.benchmark.plan import ScoringSettings
 from hnerf.study.benchmark.scoring import ScoringScene, score, score_end
-from tasks.calibration import calibrated
+from tasks.calibration import calibrated_capture
 from tasks.source import GROUND_TRUTH, Source
 from tasks.stage import stage
 from tasks.store import Artifact
@@ -25,8 +25,8 @@ def score_training(
     training: Artifact,
     settings: ScoringSettings,
 ) -> dict[str, float]:
-    """Held-out figures of a training's snapshots and of its end; time of a frame."""
-    found = score(scene(truth, recording, calibration, body), training.root, settings, out)
+    """Score a training's snapshots and its end on held-out data, and time the rendering of a frame."""
+    found = score(scoring_scene(truth, recording, calibration, body), training.root, settings, out)
     psnr = found[found["split"]]["psnr"]
     return {} if psnr is None else {"psnr": psnr}
 
@@ -41,13 +41,13 @@ def score_end_of_training(
     training: Artifact,
     settings: ScoringSettings,
 ) -> dict[str, float]:
-    """The last point of a training's curve, no more."""
-    found = score_end(scene(truth, recording, calibration, body), training.root, settings, out)
+    """Score only the last point of a training's curve."""
+    found = score_end(scoring_scene(truth, recording, calibration, body), training.root, settings, out)
     return {"steps": found["training"]["steps"], "seconds": found["training"]["field_seconds"]}
 
 
-def scene(truth: Source, recording: Artifact, calibration: Artifact, body: Artifact) -> ScoringScene:
-    """What trainings on a recording are scored against, on the GPU where there is one."""
-    capture = calibrated(recording, calibration)
+def scoring_scene(truth: Source, recording: Artifact, calibration: Artifact, body: Artifact) -> ScoringScene:
+    """Return what trainings on a recording are scored against, on the GPU if there is one."""
+    capture = calibrated_capture(recording, calibration)
     known = GroundTruth(truth.root, capture) if (truth.root / GROUND_TRUTH).is_dir() else None
     return ScoringScene(capture, BodyFit.load(body.root), known, "cuda" if torch.cuda.is_available() else "cpu")

@@ -1,4 +1,4 @@
-"""Stage 2: which cameras can be trusted."""
+"""The calibration stage: which cameras can be trusted."""
 
 from pathlib import Path
 
@@ -12,13 +12,13 @@ from tasks.store import Artifact
 
 @stage("calibration", version="7")
 def calibrate(out: Path, recording: Artifact, settings: CalibrationSettings) -> dict[str, float]:
-    """Check the cameras against what they saw; leave those to be used from here on."""
+    """Check the cameras against the images, and write those to be used from here on."""
     report = check_calibration(Capture.load(recording.root), settings)
     report.save(out)
     medians_px = [verdict.median_px for verdict in report.verdicts.values() if verdict.median_px is not None]
     return {"worst_median_px": max(medians_px)} if medians_px else {}
 
 
-def calibrated(recording: Artifact, calibration: Artifact) -> Capture:
-    """The recording seen through the cameras that the calibration left."""
+def calibrated_capture(recording: Artifact, calibration: Artifact) -> Capture:
+    """Return the recording with the cameras that calibration kept."""
     return load_cameras(calibration.root, Capture.load(recording.root))

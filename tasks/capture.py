@@ -1,4 +1,4 @@
-"""Stage 1: what was recorded, in one layout."""
+"""The capture stage: a recording in one common layout."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from tasks.store import Artifact
 
 @stage("capture", version="7")
 def ingest(out: Path, source: Source, settings: CaptureSettings) -> dict[str, float]:
-    """Read a recording in whatever layout it has; undistort and normalise it."""
+    """Read a recording in any supported layout; undistort and normalise it."""
     capture = ingest_folder(source.root, settings, out)
     return {"cameras": len(capture.cameras), "frames": len(capture.frames)}
 
@@ -26,7 +26,7 @@ def subset_capture(
     train_frames: tuple[int, ...] | None,
     novel_pose_frames: tuple[int, ...] | None,
 ) -> dict[str, float]:
-    """A capture with only these training cameras and frames; None keeps all. Test cameras stay."""
+    """Write a capture with only these training cameras and frames; None keeps all. Test cameras stay."""
     subset(Capture.load(recording.root), out, cameras, train_frames, novel_pose_frames)
     kept = Capture.load(out)
     return {"cameras": len(kept.cameras), "frames": len(kept.frames)}

@@ -1,4 +1,4 @@
-"""Between stages 1 and 2, where a recording comes without keypoints: people, found by a network."""
+"""The detection stage: people found by a network in recordings without keypoints."""
 
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -13,7 +13,8 @@ from tasks.store import Artifact
 
 @stage("detection", version="1", resumable=True)
 def detect(out: Path, recording: Artifact, settings: DetectionSettings) -> dict[str, float]:
-    """The recording with keypoints of its training cameras; goes on after the cameras that an interrupted run did."""
+    """Write the recording with keypoints of its training cameras; resume after the cameras that an interrupted run
+    finished."""
     try:
         report = detect_people(Capture.load(recording.root), settings, out)
     except BrokenProcessPool as error:
@@ -22,7 +23,8 @@ def detect(out: Path, recording: Artifact, settings: DetectionSettings) -> dict[
 
 
 def needs_detection(recording: Artifact, settings: DetectionSettings) -> bool:
-    """Whether a network is to look for people: it is asked to, or the recording says nothing about any."""
+    """Return whether to run the network: the settings request it, or the recording has neither keypoints nor given
+    poses."""
     capture = Capture.load(recording.root)
     silent = not capture.has_keypoints and capture.given_poses() is None
     return settings.source in ("network", "both") or (settings.source is None and silent)

@@ -1,4 +1,4 @@
-"""Stage 6: how good it is, and what it cost."""
+"""The evaluation stage: the avatar's quality and what it cost."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,11 +12,11 @@ from hnerf.evaluation.holdout import score_held_out
 from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.views import SPLITS
 from hnerf.models import LPIPS_ALEXNET
-from tasks.calibration import calibrated
+from tasks.calibration import calibrated_capture
 from tasks.source import Source
 from tasks.stage import stage
 from tasks.store import Artifact
-from tasks.training import trained
+from tasks.training import load_trained_avatar
 
 
 @stage("evaluation", version="11", networks=(LPIPS_ALEXNET,))
@@ -31,14 +31,14 @@ def evaluate(
     settings: EvaluationSettings,
     held_out: tuple[Artifact, ...] = (),
 ) -> dict[str, float]:
-    """Renderings, meshes and figures by the evaluation protocol of docs/method.md, and a report for people. held_out:
-    what `evaluate_held_out` found, one a camera."""
+    """Write renderings, meshes and scores by the evaluation protocol of docs/method.md, and a report. held_out:
+    artifacts of `evaluate_held_out`, one a camera."""
     inputs = EvaluationInputs(
         capture_folder=truth.root,
-        capture=calibrated(recording, calibration),
+        capture=calibrated_capture(recording, calibration),
         masks=Masks.load(segmentation.root),
         fitted=BodyFit.load(body.root),
-        avatar=trained(training),
+        avatar=load_trained_avatar(training),
         calibration_folder=calibration.root,
         segmentation_folder=segmentation.root,
         fit_folder=body.root,
@@ -61,15 +61,15 @@ def evaluate_held_out(
     training: Artifact,
     settings: EvaluationSettings,
 ) -> dict[str, float]:
-    """Figures of a camera, `settings.holdout`, against its own masks. Recording, calibration and segmentation are with
-    that camera, body and training without it."""
-    capture, masks = calibrated(recording, calibration), Masks.load(segmentation.root)
-    avatar, fitted = trained(training), BodyFit.load(body.root)
+    """Score an avatar on the camera `settings.holdout`, under its own masks. Recording, calibration and segmentation
+    include that camera; body and training were made without it."""
+    capture, masks = calibrated_capture(recording, calibration), Masks.load(segmentation.root)
+    avatar, fitted = load_trained_avatar(training), BodyFit.load(body.root)
     return _headline(score_held_out(capture, masks, avatar, fitted, training.root, settings, out))
 
 
 def _headline(found: Mapping[str, Any]) -> dict[str, float]:
-    """The mean image figures of each split, those that there are."""
+    """Return the mean image scores of each split that has any."""
     means = {
         f"{split} {name}": found[split][name]
         for split in SPLITS

@@ -1,4 +1,4 @@
-"""Run a module in several processes under torchrun, none of which outlives the caller."""
+"""Launcher of a module in several processes under torchrun, none of which outlives the caller."""
 
 import ctypes
 import json
@@ -17,38 +17,39 @@ from hnerf.errors import InputError
 from hnerf.progress import report_relayed
 
 GRACE_S = 40  # torchrun gives its ranks 30 s to end before it kills them
-LAST_LINES = 20
+LAST_LINES = 20  # of a failed rank, in the error
 RANK_LINE = re.compile(r"^\[default\d+\]:")
 FAILURE = "failure.json"  # tasks/agent.py: the first failing rank and its exit code
-KILLED = (signal.SIGKILL, signal.SIGTERM)  # from outside; other signals are the process's own doing, every time
+# Sent from outside; other signals are raised by the process itself and would recur.
+KILLED = (signal.SIGKILL, signal.SIGTERM)
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _libc = ctypes.CDLL(None)
 
 
 class LostWorkerError(RuntimeError):
-    """A rank or torchrun was killed from outside (out of memory, a lost machine): worth another try."""
+    """A rank or torchrun was killed from outside (out of memory, a lost machine); the work can be retried."""
 
 
-class GaveUpError(RuntimeError):
-    """A rank could not go on, for a reason that lies in its work and that the message, one line, tells."""
+class RankFailedError(RuntimeError):
+    """A rank could not go on because of its work; the message, one line, says why. It is not retried."""
 
 
-def _failed_io(message: str) -> OSError:
-    """From JSON: errno, what it means, file; an errno of null where a library did not say."""
+def _os_error(message: str) -> OSError:
+    """Build an OSError from JSON: errno, its meaning, file; errno is null if a library did not report one."""
     number, why, name = json.loads(message)
     return OSError(why) if number is None else OSError(number, why, name)
 
 
-# By exit code: what a rank means that says why it ends in its last line on stderr.
-TOLD: dict[int, Callable[[str], Exception]] = {2: InputError, 3: GaveUpError, 4: _failed_io}
+# Exceptions for exit codes of ranks whose last line on stderr is the reason.
+ERROR_BY_EXIT_CODE: dict[int, Callable[[str], Exception]] = {2: InputError, 3: RankFailedError, 4: _os_error}
 
 
 def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
-    """`python -m module arguments` in `processes` processes; their lines go to its logger as they come.
+    """Run `python -m module arguments` in `processes` processes, and log their lines as they come.
 
-    Raises what TOLD says if a rank ends so, LostWorkerError if one was killed, RuntimeError with the last lines of the
-    first failing rank otherwise. All ranks end with the caller, however he ends: torchrun hears of his death by signal,
-    and takes its ranks along; they hear of torchrun's in the same way.
+    Raises the exception of ERROR_BY_EXIT_CODE if a rank ends with that code, LostWorkerError if one was killed, and
+    otherwise RuntimeError with the last lines of the first failing rank. All ranks end when the caller does, however it
+    ends: the kernel signals the caller's death to torchrun, and torchrun's to the ranks.
     """
     with TemporaryDirectory(prefix="hnerf-ranks-") as logs:
         command = [sys.executable, "-m", "tasks.agent", f"{logs}/{FAILURE}"]
@@ -74,15 +75,15 @@ def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
 
 
 def end_with_parent(last: signal.Signals) -> None:
-    """Have the kernel (Linux) send this process a signal when the one that started it dies."""
+    """Have the kernel (Linux) send this process a signal when its parent dies."""
     if hasattr(_libc, "prctl"):
         _libc.prctl(PR_SET_PDEATHSIG, last)
 
 
 def _environment(processes: int) -> dict[str, str]:
-    """The cores shared out evenly among the ranks, and threads that sleep while they wait, unless the user has said
-    otherwise: threads that spin make a step take many times as long when anything else runs on the machine. Modules are
-    not looked for in the folder that the user stands in, whatever its files are called."""
+    """Return the ranks' environment: the cores divided evenly among them, and threads that sleep while they wait,
+    unless the user has set otherwise. Spinning threads make a step many times slower when anything else runs on the
+    machine. Modules are not imported from the current folder, whatever its files are called."""
     threads = max(1, len(os.sched_getaffinity(0)) // processes)
     return {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "PASSIVE", **os.environ, "PYTHONSAFEPATH": "1"}
 
@@ -108,7 +109,7 @@ def _stop(agent: "subprocess.Popen[str]") -> None:
 
 
 def _error(module: str, logs: Path, ended: int) -> Exception:
-    """What went wrong, from torchrun's exit code and its word on the first rank that failed."""
+    """Build the exception from torchrun's exit code and its report of the first rank that failed."""
     if ended < 0:
         return LostWorkerError(f"{module}: torchrun was killed by {signal.Signals(-ended).name}")
     if not (logs / FAILURE).exists():
@@ -116,8 +117,8 @@ def _error(module: str, logs: Path, ended: int) -> Exception:
     rank, code = json.loads((logs / FAILURE).read_text())
     written = [path.read_text(errors="replace") for path in logs.glob(f"*/attempt_0/{rank}/stderr.log")]
     lines = "".join(written).strip().splitlines()[-LAST_LINES:]
-    if code in TOLD and lines:
-        return TOLD[code](lines[-1])
+    if code in ERROR_BY_EXIT_CODE and lines:
+        return ERROR_BY_EXIT_CODE[code](lines[-1])
     if -code in KILLED:
         return LostWorkerError(f"{module}: rank {rank} was killed by {signal.Signals(-code).name}")
     how = f"crashed with {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"

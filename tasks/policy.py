@@ -1,4 +1,4 @@
-"""When a stage's work need not be done again, and when it is worth trying again."""
+"""Cache and retry policy: when a stage's result can be reused, and when a failed stage is tried again."""
 
 import errno
 import hashlib
@@ -17,22 +17,23 @@ from tasks.launcher import LostWorkerError
 from tasks.source import Source
 from tasks.store import Artifact, Store, sha256_of
 
-LASTING = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
-LASTING_NUMBERS = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTEMPTY)  # which have no class of their own
+PERMANENT_ERRORS = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
+PERMANENT_ERRNOS = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTEMPTY)  # without an exception class
 
 Input = Artifact | Source | Section | tuple[str, ...] | tuple[int, ...] | tuple[Artifact, ...] | None
 
 
 def stage_key(task: str, version: str, inputs: dict[str, Input]) -> str:
-    """Key of a stage's artifact: digest of the task's name and version, its inputs' content and its own settings."""
-    described = {name: _identity(value) for name, value in inputs.items()}
-    text = json.dumps({"task": task, "version": version, "inputs": described}, sort_keys=True, default=_content)
+    """Return the key of a stage's artifact: a digest of the task's name and version, its inputs' content and its own
+    settings."""
+    described = {name: _key_value(value) for name, value in inputs.items()}
+    text = json.dumps({"task": task, "version": version, "inputs": described}, sort_keys=True, default=_file_digest)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def _identity(value: Input | str | int) -> Any:
+def _key_value(value: Input | str | int) -> Any:
     if isinstance(value, tuple):
-        return [_identity(one) for one in value]
+        return [_key_value(one) for one in value]
     if value is None or isinstance(value, str | int):
         return value
     if isinstance(value, Section):
@@ -42,9 +43,9 @@ def _identity(value: Input | str | int) -> Any:
     return value.digest
 
 
-def _content(path: Path) -> str:
-    """A file that a setting names counts by its bytes, wherever it lies, and so do those beside it whose names go on
-    where its name ends, like `seg.onnx.data`: external weights. One that is missing is for the stage to refuse."""
+def _file_digest(path: Path) -> str:
+    """Return the digest of a file that a setting names, wherever it lies, and of files beside it whose names begin with
+    its name, like `seg.onnx.data` (external weights). A missing file counts by its path; the stage refuses it."""
     if not path.is_file():
         return str(path)
     beside = sorted(p for p in path.parent.iterdir() if p.name.startswith(path.name) and p != path and p.is_file())
@@ -52,16 +53,17 @@ def _content(path: Path) -> str:
 
 
 class StorePolicy(CachePolicy):
-    """Prefect's view of the artifact store.
+    """Prefect's cache policy, as a view of the artifact store.
 
-    A task run counts as cached if Prefect's record of it is what the store has. The record of an artifact that was
+    A task run counts as cached if Prefect's record of it agrees with the store. The record of an artifact that was
     damaged, deleted or made anew is dropped here, so that the task runs again.
     """
 
     def compute_key(
         self, task_ctx: TaskRunContext, inputs: dict[str, Any], flow_parameters: dict[str, Any], **kwargs: Any
     ) -> str:
-        """The record's name: the stage's key, told apart by store so that two stores do not share records."""
+        """Return the name of Prefect's record: the stage's key and a digest of the store's path, so that two stores do
+        not share records."""
         store: Store = inputs["store"]
         task = task_ctx.task
         key = stage_key(task.name, str(task.version), inputs["inputs"])
@@ -74,15 +76,15 @@ class StorePolicy(CachePolicy):
 
 
 def is_transient(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
-    """Prefect's retry condition."""
+    """Tell Prefect whether to retry a failed task run."""
     return is_retryable(state.result(raise_on_failure=False))
 
 
 def is_retryable(error: object) -> bool:
-    """Whether a later try may overcome it: input and output that failed, timeouts and lost workers; nothing else."""
+    """Return whether a retry may succeed: after failed input or output, timeouts and lost workers only."""
     return isinstance(error, OSError | LostWorkerError) and not is_permanent(error)
 
 
 def is_permanent(error: Exception) -> bool:
-    """Whether input or output failed for a reason that lies in the path, which no later try overcomes."""
-    return isinstance(error, LASTING) or (isinstance(error, OSError) and error.errno in LASTING_NUMBERS)
+    """Return whether input or output failed for a reason that lies in the path, so that no retry can succeed."""
+    return isinstance(error, PERMANENT_ERRORS) or (isinstance(error, OSError) and error.errno in PERMANENT_ERRNOS)

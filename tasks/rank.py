@@ -1,4 +1,4 @@
-"""One process of several, as the launcher has torchrun start it: python -m tasks.rank MODULE ARGUMENTS."""
+"""One of several processes, as started by the launcher under torchrun: python -m tasks.rank MODULE ARGUMENTS."""
 
 import runpy
 import signal

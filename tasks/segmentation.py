@@ -1,4 +1,4 @@
-"""Stage 3: which pixels are the person."""
+"""The segmentation stage: which pixels are the person."""
 
 from pathlib import Path
 
@@ -7,11 +7,11 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks, movement_px
 from hnerf.config import SegmentationSettings
 from hnerf.segmentation.segment import segment as segment_person
-from tasks.calibration import calibrated
+from tasks.calibration import calibrated_capture
 from tasks.stage import stage
 from tasks.store import Artifact
 
-MOVED = "moved_px"
+EDGE_MOVEMENT = "moved_px"
 
 
 @stage("segmentation", version="7")
@@ -23,28 +23,28 @@ def segment(
     earlier: Artifact | None,
     settings: SegmentationSettings,
 ) -> dict[str, float]:
-    """Masks of the person: given, learned, from clean plates, or else around a rough fit. How far their edges moved
-    since an earlier round, and since the rounds before it, is in the report."""
+    """Write masks of the person: given, learned, from clean plates, or around a rough fit. The report holds how far
+    their edges moved since each earlier round."""
     body = BodyFit.load(rough_fit.root) if rough_fit else None
-    masks = segment_person(calibrated(recording, calibration), body, settings)
+    masks = segment_person(calibrated_capture(recording, calibration), body, settings)
     if earlier is None:
         masks.save(out)
         return {}
     before = Masks.load(earlier.root)
     moved_px = movement_px(before, masks)
-    masks.report[MOVED] = [*before.report.get(MOVED, []), round(moved_px, 3)]
+    masks.report[EDGE_MOVEMENT] = [*before.report.get(EDGE_MOVEMENT, []), round(moved_px, 3)]
     masks.save(out)
-    return {MOVED: moved_px}
+    return {EDGE_MOVEMENT: moved_px}
 
 
-def settled(segmentation: Artifact, settings: SegmentationSettings) -> bool:
-    """Whether this round hardly moved the masks' edges."""
-    return segmentation.metrics.get(MOVED, float("inf")) < settings.still_px
+def converged(segmentation: Artifact, settings: SegmentationSettings) -> bool:
+    """Return whether this round hardly moved the masks' edges."""
+    return segmentation.metrics.get(EDGE_MOVEMENT, float("inf")) < settings.still_px
 
 
 def needs_body(recording: Artifact, settings: SegmentationSettings) -> bool:
-    """Whether segmentation has to be shown where the body is: a camera has neither masks nor a clean plate, and there
-    is no learned model and no network that detected people; or nothing was detected."""
+    """Return whether segmentation needs a fitted body: some camera has neither masks nor a clean plate, and there is
+    neither a learned model nor a network that detected people; or there are no keypoints."""
     capture = Capture.load(recording.root)
     first = capture.train_frames[0]
     unmasked = (capture.background(c) is None and capture.given_mask(c, first) is None for c in capture.train_cameras)

@@ -1,4 +1,4 @@
-"""A capture folder as somebody else wrote it, and the digests of its bytes."""
+"""A capture folder as the user provides it, and digests of its files."""
 
 import hashlib
 import os
@@ -15,8 +15,8 @@ GROUND_TRUTH = "ground_truth"
 
 
 class Source(BaseModel):
-    """Part of the capture folder `root`. `name` is the folder's own; `digest` the SHA-256 of the part's file names and
-    bytes, wherever the folder lies."""
+    """Part of the capture folder `root`. name: the folder's own; digest: SHA-256 of the part's file names and bytes,
+    wherever the folder lies."""
 
     root: Path
     name: str
@@ -24,17 +24,17 @@ class Source(BaseModel):
 
 
 def read_capture(folder: Path, store: Path | None = None) -> tuple[Source, Source]:
-    """What was recorded, and what is known to be true of it: all files but those of `ground_truth/`, and only those.
+    """Return the recording and its ground truth: all files except those of `ground_truth/`, and only those.
 
-    Hidden files do not count. A symbolic link counts as the text it holds: what it points at is either in the folder
-    itself or none of ours. Raises InputError if there is no such folder, a file that cannot be read, or the store
-    lies in the capture, which would be another one after every run.
+    Hidden files do not count. A symbolic link counts by the path it holds: its target is either in the folder itself or
+    not part of it. Raises InputError if there is no such folder, a file cannot be read, or the store lies in the
+    capture, whose digest would then change with every run.
     """
     folder = folder.resolve()
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the capture's folder")
     if store and store.resolve().is_relative_to(folder):
-        raise InputError(f"{store.resolve()}: lies in the capture's folder; give --store another place")
+        raise InputError(f"{store.resolve()}: lies in the capture's folder; give --store another folder")
     shown = os.fsencode(folder).decode(errors="replace")
     if shown != str(folder):
         raise InputError(f"{shown}: the folder's name is not UTF-8; rename it")
@@ -46,8 +46,8 @@ def read_capture(folder: Path, store: Path | None = None) -> tuple[Source, Sourc
 
 
 def capture_files(folder: Path) -> list[Path]:
-    """The files and symbolic links in a capture folder, sorted; no hidden ones, no devices. InputError on a folder
-    that cannot be read."""
+    """Return the files and symbolic links in a capture folder, sorted, without hidden ones and devices. Raises
+    InputError if a folder cannot be read."""
     found = []
     for parent, folders, files in os.walk(folder, onerror=_refuse):
         links = [name for name in folders if (Path(parent) / name).is_symlink()]

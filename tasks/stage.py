@@ -1,4 +1,4 @@
-"""What every stage's task has in common."""
+"""The cached task that every stage is."""
 
 import inspect
 import logging
@@ -24,8 +24,8 @@ Write = Callable[Concatenate[Path, P], dict[str, float]]
 class Stage(Generic[P]):
     """A function `write(out, inputs...)` that fills a folder, made into a cached task.
 
-    Called as `stage(store, inputs...)`: within a flow run it is a Prefect task run; outside it is the same work through
-    the same store, without a server.
+    It is called as `stage(store, inputs...)`: within a flow run it is a Prefect task run; outside one it does the same
+    work through the same store, without a server.
     """
 
     def __init__(self, write: Write[P], name: str, version: str, resumable: bool, networks: tuple[str, ...] = ()):
@@ -66,8 +66,9 @@ class Stage(Generic[P]):
 def stage(
     name: str, version: str, resumable: bool = False, networks: tuple[str, ...] = ()
 ) -> Callable[[Write[P]], Stage[P]]:
-    """Decorator: artifacts lie under `<store>/<name>/`; raise `version` when the same inputs give another result.
+    """Make a function into a Stage (decorator). Artifacts lie under `<store>/<name>/`; raise `version` when the same
+    inputs give another result.
 
-    networks: files of hnerf.models that the stage uses where they are there; the key says which ones were.
+    networks: files of hnerf.models that the stage uses if they are installed; the key depends on which ones are.
     """
     return lambda write: Stage(write, name, version, resumable, networks)

@@ -1,12 +1,12 @@
-"""The artifact store: what a stage made, under the key of what it was made from.
+"""The artifact store: each stage's output under a key that is derived from its inputs.
 
     <store>/<stage>/<key>/          the files, put there by one rename
-    <store>/<stage>/<key>.json      the record: each file's SHA-256 and size, and a few figures
+    <store>/<stage>/<key>.json      the record: each file's SHA-256 and size, and a few metrics
     <store>/<stage>/<key>.partial/  work in progress
-    <store>/<stage>/<key>.lock      held (flock) while somebody works on the key; the kernel lets go when he dies
+    <store>/<stage>/<key>.lock      locked (flock) while a process works on the key; the kernel releases it if that dies
     <store>/subjects/<name>/<stage> -> the latest artifact of a subject
 
-The store alone decides what need not be done again; Prefect's record of a task run is a view of it (tasks/policy.py).
+The store alone decides what can be reused; Prefect's record of a task run is a view of it (tasks/policy.py).
 """
 
 import fcntl
@@ -26,19 +26,19 @@ from hnerf.errors import InputError
 
 log = logging.getLogger("hnerf.store")
 
-# Each is made from those before it.
+# In order: each stage is computed from those before it.
 STAGES = ("capture", "detection", "calibration", "segmentation", "fit", "training", "evaluation", "asset")
 
 
 class StoredFile(BaseModel):
-    """What a file must be for the artifact to be whole."""
+    """The digest and size by which a file of an artifact is checked."""
 
     sha256: str
     size_bytes: int
 
 
 class Artifact(BaseModel):
-    """One stage's finished work. `files` by path relative to `root`; `metrics` are the few figures worth a glance."""
+    """The finished output of one stage. files: by path relative to `root`; metrics: a few headline numbers."""
 
     stage: str
     root: Path
@@ -47,12 +47,12 @@ class Artifact(BaseModel):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the files' names and bytes: what later stages' keys depend on."""
+        """Return the SHA-256 of the files' names and bytes, on which the keys of later stages depend."""
         listing = "".join(f"{file.sha256} {name}\n" for name, file in sorted(self.files.items()))
         return hashlib.sha256(listing.encode()).hexdigest()
 
     def damaged_file(self) -> Path | None:
-        """The first recorded file that is missing or has changed, or None."""
+        """Return the first recorded file that is missing or has changed, or None."""
         for name, file in self.files.items():
             path = self.root / name
             if not path.is_file() or path.stat().st_size != file.size_bytes or sha256_of(path) != file.sha256:
@@ -67,7 +67,7 @@ class Store:
     root: Path
 
     def find(self, stage: str, key: str) -> Artifact | None:
-        """The artifact if it is recorded and whole, else None."""
+        """Return the artifact if it is recorded and intact, else None."""
         record, folder = self._path(stage, key, ".json"), self._path(stage, key)
         try:
             artifact = Artifact.model_validate({"root": folder, **json.loads(record.read_bytes())})
@@ -78,16 +78,16 @@ class Store:
             damaged = record
         if damaged is None:
             return artifact
-        log.warning("%s is damaged or gone: %s will be computed again", damaged, stage)
+        log.warning("%s is damaged or missing: %s will be computed again", damaged, stage)
         return None
 
     def get_or_compute(
         self, stage: str, key: str, write: Callable[[Path], dict[str, float]], resumable: bool = False
     ) -> Artifact:
-        """The artifact, found, or else made by `write(folder)`, which returns its figures.
+        """Return the stored artifact, or compute it by `write(folder)`, which returns its metrics.
 
-        Of several callers at once one does the work and the others wait for it. The folder of a resumable stage
-        outlives a crash, for the next call to go on in; any other starts empty.
+        If several callers want the same artifact, one computes it and the others wait. The folder of a resumable stage
+        survives a crash, and the next call resumes in it; any other starts empty.
         """
         partial = self._path(stage, key, ".partial")
         with self._locked(stage, key):
@@ -106,13 +106,14 @@ class Store:
             return self._commit(stage, key, metrics)
 
     def link_latest(self, subject: str, artifact: Artifact) -> Artifact:
-        """Point `<store>/subjects/<subject>/<stage>` at the artifact; returns it."""
+        """Point `<store>/subjects/<subject>/<stage>` at the artifact; return it."""
         if subject in ("", ".", "..") or "/" in subject:
-            raise InputError(f"capture.toml: name {subject!r} cannot be a folder's name; choose another")
+            raise InputError(f"capture.toml: name {subject!r} cannot be the name of a folder; choose another")
         link = self.subject_folder(subject) / artifact.stage
         link.parent.mkdir(parents=True, exist_ok=True)
         target = os.path.relpath(artifact.root, link.parent)
-        if link.is_symlink() and os.readlink(link) != target:  # what was made from the old one no longer belongs to it
+        # What was computed from an earlier artifact no longer belongs to the subject.
+        if link.is_symlink() and os.readlink(link) != target:
             for stage in STAGES[STAGES.index(artifact.stage) + 1 :]:
                 (link.parent / stage).unlink(missing_ok=True)
         beside = link.with_name(f".{artifact.stage}.{os.getpid()}")
@@ -122,7 +123,7 @@ class Store:
         return artifact
 
     def subject_folder(self, subject: str) -> Path:
-        """Where a subject's latest artifacts are linked."""
+        """Return the folder with links to a subject's latest artifacts."""
         return self.root / "subjects" / subject
 
     def _path(self, stage: str, key: str, suffix: str = "") -> Path:
@@ -136,7 +137,7 @@ class Store:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                log.info("waiting for another run that is working on %s %s", stage, key)
+                log.info("waiting for another process that is working on %s %s", stage, key)
                 fcntl.flock(lock, fcntl.LOCK_EX)
             yield
 
@@ -162,23 +163,23 @@ class Store:
         return artifact
 
 
-def require_whole(subject: Path) -> None:
-    """InputError where an artifact that `<store>/subjects/<name>` links to has changed since it was recorded."""
+def require_intact(subject: Path) -> None:
+    """Raise InputError if an artifact that `<store>/subjects/<name>` links to has changed since it was recorded."""
     for link in sorted(subject.iterdir()):
         root = link.resolve()
         recorded = link.name in STAGES and root.with_name(f"{root.name}.json").is_file()
         if recorded and Store(root.parents[1]).find(link.name, root.name) is None:
-            raise InputError(f"{root}: damaged; give the same `hnerf run` again, which makes it anew")
+            raise InputError(f"{root}: damaged; repeat the same `hnerf run`, which computes it again")
 
 
 def sha256_of(path: Path) -> str:
-    """SHA-256 of a file's bytes, hexadecimal."""
+    """Return the SHA-256 of a file's bytes, hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _flush(path: Path) -> int:
-    """fsync a file or folder; returns its size in bytes."""
+    """Flush a file or folder to disk (fsync); return its size in bytes."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,4 +1,4 @@
-"""Stage 5: the radiance field and the clothed surface."""
+"""The training stage: the radiance field and the clothed surface."""
 
 import json
 from pathlib import Path
@@ -23,7 +23,7 @@ def train(
     body: Artifact,
     settings: TrainingSettings,
 ) -> dict[str, float]:
-    """Train on one GPU a process; goes on from the checkpoint of a run that was interrupted."""
+    """Train on one GPU a process; resume from the checkpoint of an interrupted run."""
     inputs = [str(artifact.root) for artifact in (recording, calibration, segmentation, body)]
     processes = settings.processes or max(1, torch.cuda.device_count())
     run_ranks("hnerf.training.run", [*inputs, settings.model_dump_json(), str(out)], processes)
@@ -32,6 +32,6 @@ def train(
     return {name: report[name] for name in ("steps", "seconds", "peak_memory_gib", "model_mib")}
 
 
-def trained(training: Artifact) -> Avatar:
-    """The trained person, on the GPU where there is one."""
+def load_trained_avatar(training: Artifact) -> Avatar:
+    """Load the trained person, on the GPU if there is one."""
     return load_avatar(training.root, "cuda" if torch.cuda.is_available() else "cpu")

@@ -1,4 +1,4 @@
-"""From a trained avatar to files that any 3-D program opens."""
+"""Export of a trained avatar to files that any 3-D program opens."""
 
 import dataclasses
 import json
@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from hnerf.asset.glb import write_glb
-from hnerf.asset.rig_transfer import dressed_rig
-from hnerf.asset.simplify import simplified
+from hnerf.asset.rig_transfer import clothed_rig
+from hnerf.asset.simplify import simplify
 from hnerf.asset.staging import stage_avatar
 from hnerf.asset.texture import bake, unwrap
 from hnerf.asset.usd import write_cache, write_skinned
@@ -36,19 +36,19 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
     Raises InputError if the field has no surface, InvalidAsset if a package does not pass validation.
     """
     seconds: dict[str, float] = {}
-    avatar = avatar.without_frames()  # one surface and one texture stand for all of them
+    avatar = avatar.without_frames()  # one surface and one texture serve all frames
     with _timed("surface", seconds):
         rest = avatar.body.theta.new_zeros(len(avatar.body.rig.joints_m), 3), torch.eye(4).to(avatar.body.theta)
         dense = surface_in_pose(avatar, *rest, settings.grid_cells)
     with _timed("mesh", seconds):
-        surface = simplified(dense, settings.faces)
+        surface = simplify(dense, settings.faces)
         layout = unwrap(surface.vertices, surface.faces, settings.texture_px)
-        rig = dressed_rig(avatar.body.rig.to("cpu"), surface)
+        rig = clothed_rig(avatar.body.rig.to("cpu"), surface)
     with _timed("texture", seconds):
-        posed = _dressed_body(avatar.body, rig, tuple(evenly_spaced(capture.train_frames, settings.texture_poses)))
+        posed = _clothed_body(avatar.body, rig, tuple(evenly_spaced(capture.train_frames, settings.texture_poses)))
         texture = bake(avatar, posed, layout, settings.texture_px)
     with _timed("files", seconds):
-        staged = stage_avatar(_dressed_body(avatar.body, rig, capture.frames), layout, texture, capture.up)
+        staged = stage_avatar(_clothed_body(avatar.body, rig, capture.frames), layout, texture, capture.up)
         cameras = list(capture.cameras.values())
         write_skinned(out / "avatar.usdz", staged, cameras, capture.fps)
         write_cache(out / "avatar_cache.usdz", staged, cameras, capture.fps)
@@ -75,7 +75,7 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
     return report
 
 
-def _dressed_body(body: BodyFit, rig: Rig, frames: tuple[int, ...]) -> BodyFit:
+def _clothed_body(body: BodyFit, rig: Rig, frames: tuple[int, ...]) -> BodyFit:
     rows = [body.index(frame) for frame in frames]
     return dataclasses.replace(body, rig=rig, frames=frames, theta=body.theta[rows].cpu(), root=body.root[rows].cpu())
 

@@ -1,4 +1,5 @@
-"""glTF binary: the skinned, textured, animated avatar in one file (glTF 2.0 specification, Khronos Group)."""
+"""Writer of glTF binary files: the skinned, textured, animated avatar in one file (glTF 2.0 specification, Khronos
+Group)."""
 
 from pathlib import Path
 
@@ -14,14 +15,14 @@ SHAPES = {(): gltf.SCALAR, (2,): gltf.VEC2, (3,): gltf.VEC3, (4,): gltf.VEC4, (4
 
 
 class GlbWriter:
-    """A glTF document whose numbers all lie in one binary chunk."""
+    """A glTF document whose arrays all lie in one binary chunk."""
 
     def __init__(self) -> None:
         self.document = gltf.GLTF2(scene=0, scenes=[gltf.Scene(nodes=[])], buffers=[gltf.Buffer()])
         self._chunk = bytearray()
 
     def view(self, data: bytes, target: int | None = None) -> int:
-        """Append bytes, aligned to four; index of the buffer view."""
+        """Append bytes, aligned to four; return the index of the buffer view."""
         self._chunk.extend(bytes(-len(self._chunk) % 4))
         self.document.bufferViews.append(
             gltf.BufferView(buffer=0, byteOffset=len(self._chunk), byteLength=len(data), target=target)
@@ -30,7 +31,7 @@ class GlbWriter:
         return len(self.document.bufferViews) - 1
 
     def accessor(self, values: np.ndarray, target: int | None = None) -> int:
-        """Append an array whose first axis counts the elements; index of the accessor."""
+        """Append an array whose first axis counts the elements; return the index of the accessor."""
         flat = values.reshape(len(values), -1)
         self.document.accessors.append(
             gltf.Accessor(
@@ -45,14 +46,15 @@ class GlbWriter:
         return len(self.document.accessors) - 1
 
     def save(self, path: Path) -> None:
-        """Write the file."""
+        """Write the document to a file."""
         self.document.buffers[0].byteLength = len(self._chunk)
         self.document.set_binary_blob(bytes(self._chunk))
         self.document.save_binary(path)
 
 
 def write_glb(path: Path, avatar: StagedAvatar, fps: float) -> None:
-    """`avatar.glb`: joints are nodes 0 to J-1 in the rig's order, the mesh is node J; time 0 is the first frame."""
+    """Write `avatar.glb`: joints are nodes 0 to J-1 in the rig's order, the mesh is node J; time 0 is the first
+    frame."""
     writer = GlbWriter()
     document = writer.document
     _add_joints(document, avatar)
@@ -77,7 +79,7 @@ def _add_joints(document: gltf.GLTF2, avatar: StagedAvatar) -> None:
 
 
 def _primitive(writer: GlbWriter, avatar: StagedAvatar) -> gltf.Primitive:
-    """Vertices are split where the texture has a seam; influences beyond four go into a second set."""
+    """Add the mesh, with vertices split at the texture's seams; skin influences beyond four go into a second set."""
     vertex = np.zeros(len(avatar.uvs), np.int64)
     vertex[avatar.face_uvs] = avatar.faces
     normals = normals_of(avatar.rest_points_m, avatar.faces)
@@ -111,7 +113,7 @@ def _material(writer: GlbWriter, texture: np.ndarray) -> gltf.Material:
 
 
 def _animation(writer: GlbWriter, avatar: StagedAvatar, fps: float) -> gltf.Animation:
-    """Rotations of the joints that turn, and the translation of the root."""
+    """Add the rotations of the joints that turn, and the translation of the root."""
     animation = gltf.Animation(name="Motion", channels=[], samplers=[])
     times = writer.accessor(((avatar.frames - avatar.frames[0]) / fps).astype(np.float32))
 

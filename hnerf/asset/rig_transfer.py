@@ -1,4 +1,4 @@
-"""The body's rig on another surface: the clothed person moves with the body beneath."""
+"""Transfer of the body's rig to the clothed surface, so that it moves with the body beneath."""
 
 import dataclasses
 
@@ -11,14 +11,15 @@ from hnerf.body.rig import Rig
 
 MAX_INFLUENCES = 8
 SMOOTHING_PASSES = 4
-REACH_M = 10.0  # nothing of a person is further from the body than this
+REACH_M = 10.0  # no part of a person is further from the body than this
 
 
-def dressed_rig(rig: Rig, surface: trimesh.Trimesh) -> Rig:
-    """The same joints under a surface in the rest pose. Shape is frozen (no basis left), and it has no keypoints."""
+def clothed_rig(rig: Rig, surface: trimesh.Trimesh) -> Rig:
+    """Return the same joints with another surface in the rest pose. The shape is fixed (no basis), and there are no
+    keypoints."""
     vertices_m = torch.from_numpy(surface.vertices).float()
     faces = torch.from_numpy(surface.faces).long()
-    skin_joints, skin_weights = transfer_skin(rig, vertices_m, faces)
+    skin_joints, skin_weights = transfer_skin_weights(rig, vertices_m, faces)
     return dataclasses.replace(
         rig,
         vertices_m=vertices_m,
@@ -33,11 +34,11 @@ def dressed_rig(rig: Rig, surface: trimesh.Trimesh) -> Rig:
     )
 
 
-def transfer_skin(rig: Rig, vertices_m: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Joints (V, 8) and weights (V, 8) for a surface (V, 3), (F, 3) around the rest body, largest weight first.
+def transfer_skin_weights(rig: Rig, vertices_m: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """Return joints (V, 8) and weights (V, 8) for a surface (V, 3), (F, 3) around the rest body, largest weight first.
 
     Each vertex takes the weights at the closest point of the body, barycentric in its triangle; a few Laplacian passes
-    then soften the jumps where the closest point leaps from one limb to another.
+    then smooth the jumps where the closest point leaps from one limb to another.
     """
     body, only = BodyMeshes(rig.vertices_m[None], rig.faces), torch.zeros(len(vertices_m), dtype=torch.int32)
     found = body.closest_points(vertices_m, only, REACH_M)
@@ -52,7 +53,7 @@ def transfer_skin(rig: Rig, vertices_m: Tensor, faces: Tensor) -> tuple[Tensor, 
 
 
 def _edges(faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Start and end vertex of every edge, in both directions."""
+    """Return the start and end vertex of every edge, in both directions."""
     edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     start, end = torch.cat([edges, edges.flip(1)]).unique(dim=0).unbind(1)
     return start, end

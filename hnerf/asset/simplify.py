@@ -1,11 +1,11 @@
-"""A marching-cubes surface as a clean mesh of a chosen size."""
+"""Repair and decimation of the marching-cubes surface."""
 
 import pymeshlab
 import trimesh
 
 
-def simplified(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
-    """The surface repaired and decimated to at most `faces` triangles (quadrics, Garland and Heckbert 1997)."""
+def simplify(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
+    """Return the surface repaired and decimated to at most `faces` triangles (quadrics, Garland and Heckbert 1997)."""
     meshes = pymeshlab.MeshSet()
     meshes.add_mesh(pymeshlab.Mesh(surface.vertices, surface.faces))
     _repair(meshes)

@@ -1,4 +1,4 @@
-"""The dressed avatar in the axes of asset formats: right-handed, Y up, metres. USD and glTF writers share it."""
+"""The clothed avatar in the axes of asset formats: right-handed, Y up, metres; shared by the USD and glTF writers."""
 
 from dataclasses import dataclass
 
@@ -15,13 +15,13 @@ Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # (x, y, z) to 
 
 @dataclass(frozen=True)
 class StagedAvatar:
-    """Numpy arrays, float64 and int64 unless said otherwise.
+    """The arrays of an avatar ready to be written; numpy, float64 and int64 unless said otherwise.
 
     rest_points_m (V, 3), faces (F, 3), uvs (U, 2) v up, face_uvs (F, 3), skin_joints and skin_weights (V, K): the mesh.
-    joint_names, parents (J,), rest_joints_m (J, 3): the skeleton, whose rest orientations are the identity.
-    frames (n,), translations_m (n, J, 3), quaternions (n, J, 4) as x y z w without sign jumps: the motion, each joint
-    relative to its parent, the root relative to the stage. points_m (n, V, 3) float32: the skinned surface.
-    texture (H, W, 3) uint8 sRGB. stage_from_world (3, 3): a rotation.
+    joint_names, parents (J,), rest_joints_m (J, 3): the skeleton, whose rest orientations are the identity. frames
+    (n,), translations_m (n, J, 3), quaternions (n, J, 4) as x y z w without sign jumps: the motion, each joint relative
+    to its parent, the root relative to the stage. points_m (n, V, 3) float32: the skinned surface. texture (H, W, 3)
+    uint8 sRGB. stage_from_world (3, 3): a rotation.
     """
 
     rest_points_m: np.ndarray
@@ -42,20 +42,20 @@ class StagedAvatar:
 
     @property
     def rest_offsets_m(self) -> np.ndarray:
-        """Rest joints relative to their parents, (J, 3)."""
+        """Return the rest joints relative to their parents, (J, 3)."""
         above = np.where(self.parents[:, None] >= 0, self.rest_joints_m[self.parents], 0)
         return self.rest_joints_m - above
 
 
-def stage_avatar(dressed: BodyFit, layout: UvLayout, texture: np.ndarray, up: str) -> StagedAvatar:
-    """Turn a dressed body (see `dressed_rig`) and its motion to Y up. `up`: the vertical axis of the world, "y" or "z".
+def stage_avatar(clothed: BodyFit, layout: UvLayout, texture: np.ndarray, up: str) -> StagedAvatar:
+    """Turn a clothed body (see `clothed_rig`) and its motion to Y up. `up`: the vertical axis of the world, "y" or "z".
 
     The body frame is Z up whatever the world is. With W stage from world, B stage from body and G_j the world transform
     of joint j, the joint's stage transform is W G_j B^-1, and B G_parent^-1 G_j B^-1 relative to its parent.
     """
-    rig, body = dressed.rig, Y_UP_FROM_Z_UP
+    rig, body = clothed.rig, Y_UP_FROM_Z_UP
     world = stage_from_world(up)
-    transforms = joint_transforms(rig.to(dtype=torch.float64), dressed.theta.double(), dressed.root.double()).numpy()
+    transforms = joint_transforms(rig.to(dtype=torch.float64), clothed.theta.double(), clothed.root.double()).numpy()
     staged = _rotation_4x4(world) @ transforms @ _rotation_4x4(body.T)
     local = staged.copy()
     parents = rig.parents.numpy()
@@ -71,17 +71,17 @@ def stage_avatar(dressed: BodyFit, layout: UvLayout, texture: np.ndarray, up: st
         joint_names=rig.joint_names,
         parents=parents,
         rest_joints_m=rig.joints_m.double().numpy() @ body.T,
-        frames=np.array(dressed.frames),
+        frames=np.array(clothed.frames),
         translations_m=local[..., :3, 3],
         quaternions=_continuous_quaternions(local[..., :3, :3]),
-        points_m=dressed.vertices_m().numpy() @ world.T.astype(np.float32),
+        points_m=clothed.vertices_m().numpy() @ world.T.astype(np.float32),
         texture=texture,
         stage_from_world=world,
     )
 
 
 def stage_from_world(up: str) -> np.ndarray:
-    """Rotation (3, 3) from world axes to Y up."""
+    """Return the rotation (3, 3) from world axes to Y up."""
     return {"z": Y_UP_FROM_Z_UP, "y": np.eye(3)}[up]
 
 
@@ -92,7 +92,8 @@ def _rotation_4x4(rotation: np.ndarray) -> np.ndarray:
 
 
 def _continuous_quaternions(rotations: np.ndarray) -> np.ndarray:
-    """(n, J, 3, 3) to (n, J, 4) as x y z w, each on the same hemisphere as the frame before."""
+    """Convert rotations (n, J, 3, 3) to quaternions (n, J, 4) as x y z w, each on the same hemisphere as in the frame
+    before."""
     quaternions = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(*rotations.shape[:2], 4)
     same_side = (quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True) >= 0
     quaternions[1:] *= np.cumprod(np.where(same_side, 1, -1), axis=0)

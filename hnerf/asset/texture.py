@@ -1,4 +1,4 @@
-"""Texture coordinates, and the radiance field's colours baked into an image."""
+"""Texture coordinates, and the radiance field's colours baked into a texture."""
 
 import ctypes
 import logging
@@ -17,7 +17,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig, pose_vertices
 
 CHART_PADDING_PX = 4
-MAX_STEP_M = 0.03  # skinning is not further off; a longer distance is another limb's
+MAX_STEP_M = 0.03  # skinning error stays below this; a longer distance belongs to another limb
 SUBPIXEL_BITS = 8
 
 log = logging.getLogger("hnerf.asset")
@@ -25,7 +25,8 @@ log = logging.getLogger("hnerf.asset")
 
 @dataclass(frozen=True)
 class UvLayout:
-    """uvs (U, 2) float32 in [0, 1], v up; face_uvs (F, 3) long: rows of uvs for the corners of each face."""
+    """Texture coordinates of a mesh. uvs (U, 2) float32 in [0, 1], v up; face_uvs (F, 3) long: rows of uvs for the
+    corners of each face."""
 
     uvs: np.ndarray
     face_uvs: np.ndarray
@@ -33,7 +34,7 @@ class UvLayout:
 
 @dataclass(frozen=True)
 class Texels:
-    """Covered texels: row, column (N,) from the image's top left, face (N,), barycentric (N, 3)."""
+    """The covered texels of a texture: row, column (N,) from the image's top left, face (N,), barycentric (N, 3)."""
 
     row: Tensor
     column: Tensor
@@ -42,9 +43,10 @@ class Texels:
 
 
 def unwrap(vertices_m: np.ndarray, faces: np.ndarray, texture_px: int) -> UvLayout:
-    """Charts of a mesh (V, 3), (F, 3) packed into one square with room for dilation between them (xatlas)."""
+    """Cut a mesh (V, 3), (F, 3) into charts and pack them into one square with room for dilation between them
+    (xatlas)."""
     atlas = xatlas.Atlas()
-    # Never freed: xatlas' destructor wakes its threads without holding their lock, misses one now and then, and hangs.
+    # Never freed: xatlas' destructor wakes its threads without holding their lock, sometimes misses one, and hangs.
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(atlas))
     atlas.add_mesh(vertices_m.astype(np.float32), faces.astype(np.uint32))
     packing = xatlas.PackOptions()
@@ -57,7 +59,7 @@ def unwrap(vertices_m: np.ndarray, faces: np.ndarray, texture_px: int) -> UvLayo
 
 
 def rasterise(layout: UvLayout, texture_px: int) -> Texels:
-    """The texels that a layout's faces touch; of texels on a border of two faces, the later face has it."""
+    """Return the texels that a layout's faces touch; a texel on the border of two faces belongs to the later face."""
     corners_px = (layout.uvs * (1, -1) + (0, 1))[layout.face_uvs] * texture_px - 0.5  # centres at integers
     face_image = np.full((texture_px, texture_px), -1, np.int32)
     for index, triangle in enumerate(np.round(corners_px * (1 << SUBPIXEL_BITS)).astype(np.int32)):
@@ -68,23 +70,25 @@ def rasterise(layout: UvLayout, texture_px: int) -> Texels:
     p = np.stack([column, row], 1)
     weights = np.stack([_cross(b - p, c - p), _cross(c - p, a - p), _cross(a - p, b - p)], 1)
     area = weights.sum(1, keepdims=True)
-    inside = np.clip(weights / np.where(area == 0, 1, area), 0, None) + 1e-9  # a touched texel's centre may lie outside
+    # The centre of a texel that a face touches may lie outside it.
+    inside = np.clip(weights / np.where(area == 0, 1, area), 0, None) + 1e-9
     barycentric = torch.from_numpy(inside / inside.sum(1, keepdims=True)).float()
     return Texels(torch.from_numpy(row), torch.from_numpy(column), torch.from_numpy(face).long(), barycentric)
 
 
 @torch.no_grad()
-def bake(avatar: Avatar, dressed: BodyFit, layout: UvLayout, texture_px: int) -> np.ndarray:
-    """Square RGB image, uint8: each texel's radiance along the inward normal, the median over the poses of `dressed`.
+def bake(avatar: Avatar, clothed: BodyFit, layout: UvLayout, texture_px: int) -> np.ndarray:
+    """Bake a square RGB texture, uint8: each texel's radiance along the inward normal, the median over the poses of
+    `clothed`.
 
-    Poses of the capture keep the field's conditioning where it was trained; the median drops a pose in which that spot
-    touches another limb. Texels off the charts repeat the nearest chart's border.
+    Poses of the capture keep the field's conditioning within what it was trained on; the median rejects a pose in which
+    that spot touches another limb. Texels off the charts repeat the nearest chart's border.
     """
     texels = rasterise(layout, texture_px)
     seen = []
-    for frame, theta, root in zip(dressed.frames, dressed.theta, dressed.root, strict=True):
+    for frame, theta, root in zip(clothed.frames, clothed.theta, clothed.root, strict=True):
         log.info("texture: %d texels in the pose of frame %d", len(texels.face), frame)
-        seen.append(_colours_in_pose(avatar, dressed.rig, texels, theta, root).numpy())
+        seen.append(_colours_in_pose(avatar, clothed.rig, texels, theta, root).numpy())
     image = np.zeros((texture_px, texture_px, 3), np.uint8)
     covered = np.zeros((texture_px, texture_px), bool)
     row, column = texels.row.numpy(), texels.column.numpy()
@@ -95,12 +99,12 @@ def bake(avatar: Avatar, dressed: BodyFit, layout: UvLayout, texture_px: int) ->
 
 
 def _colours_in_pose(avatar: Avatar, rig: Rig, texels: Texels, theta: Tensor, root: Tensor) -> Tensor:
-    """Radiance at each texel of the surface posed by theta (J, 3) and root (4, 4), (N, 3) on the CPU."""
+    """Return the radiance at each texel of the surface posed by theta (J, 3) and root (4, 4), (N, 3) on the CPU."""
     device = avatar.body.rig.vertices_m.device
     vertices_m, faces = pose_vertices(rig, theta, root).to(device), rig.faces.to(device)
     theta, root = theta.to(device), root.to(device)
     normals = vertex_normals(vertices_m, faces)
-    # Skinning is only near the field's own surface in this pose: one step of Newton's method along the normal.
+    # Skinning only approximates the field's surface in this pose: correct it by a Newton step along the normal.
     height_m = avatar.signed_distance(vertices_m, theta, root).clamp(-MAX_STEP_M, MAX_STEP_M)
     corners, weights = faces[texels.face.to(device)], texels.barycentric.to(device)[..., None]
     points_m = ((vertices_m - height_m[:, None] * normals)[corners] * weights).sum(1)

@@ -1,6 +1,6 @@
-"""USD packages: the skinned avatar, and its surface as a cache of points.
+"""Writer of USD packages: the skinned avatar, and its surface as a cache of points.
 
-Y up, metres, time codes are the capture's frame numbers. Matrices are transposed on the way in (USD has row vectors).
+Y up, metres; time codes are the capture's frame numbers. Matrices are transposed on the way in (USD has row vectors).
 """
 
 import tempfile
@@ -16,12 +16,12 @@ from hnerf.capture.capture import write_image
 from hnerf.geometry.camera import Camera
 
 ROOT = Sdf.Path("/Avatar")
-APERTURE = 0.36  # width of the film gate in tenths of a scene unit: arrives as 36 mm at one metre a unit
+APERTURE = 0.36  # film gate width in tenths of a scene unit, read as 36 mm where a unit is a metre
 TEXTURE_NAME = "texture.png"
 
 
 def write_skinned(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps: float) -> None:
-    """`avatar.usdz`: mesh, skeleton with the captured motion, material, cameras."""
+    """Write `avatar.usdz`: mesh, skeleton with the captured motion, material, cameras."""
     with tempfile.TemporaryDirectory() as folder:
         stage = _new_stage(Path(folder) / "avatar.usdc", avatar, cameras, fps)
         body = UsdSkel.Root.Define(stage, ROOT.AppendChild("Body"))
@@ -37,7 +37,7 @@ def write_skinned(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], f
 
 
 def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps: float) -> None:
-    """`avatar_cache.usdz`: the surface as points in the world at every frame, for programs without skinning."""
+    """Write `avatar_cache.usdz`: the surface as world-space points at every frame, for programs without skinning."""
     with tempfile.TemporaryDirectory() as folder:
         stage = _new_stage(Path(folder) / "avatar_cache.usdc", avatar, cameras, fps)
         mesh = _define_mesh(stage, ROOT.AppendChild("Surface"), avatar)
@@ -50,7 +50,8 @@ def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps
 
 
 def joint_paths(avatar: StagedAvatar) -> list[str]:
-    """Skeleton tokens like "root/pelvis_L": every part a valid identifier (Blender drops bones whose names are not)."""
+    """Return the skeleton's joint tokens, like "root/pelvis_L", every part a valid identifier (Blender drops bones
+    whose names are not)."""
     paths: list[str] = []
     for name, parent in zip(avatar.joint_names, avatar.parents, strict=True):
         paths.append(f"{paths[parent]}/{_identifier(name)}" if parent >= 0 else _identifier(name))
@@ -58,7 +59,7 @@ def joint_paths(avatar: StagedAvatar) -> list[str]:
 
 
 def define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera, stage_from_world: np.ndarray) -> UsdGeom.Camera:
-    """A pinhole camera as USD sees it: looks along -Z, apertures and focal length in tenths of a scene unit.
+    """Define a pinhole camera as USD has it: it looks along -Z, apertures and focal length in tenths of a scene unit.
 
     Pixel centres are at integers here, so the principal point lies (cx + 1/2) / W across the image.
     """
@@ -106,12 +107,12 @@ def _free_name(stage: Usd.Stage, folder: Sdf.Path, name: str) -> str:
 
 
 def _identifier(name: str) -> str:
-    """A valid prim name; MakeValidIdentifier alone would lose a leading digit, and 01 and 11 would be the same."""
+    """Return a valid prim name; MakeValidIdentifier alone would drop a leading digit, so that 01 and 11 would clash."""
     return Tf.MakeValidIdentifier(f"_{name}" if name[:1].isdigit() else name)
 
 
 def _define_mesh(stage: Usd.Stage, path: Sdf.Path, avatar: StagedAvatar) -> UsdGeom.Mesh:
-    """Topology, texture coordinates and material; points, normals and extents are the caller's."""
+    """Define topology, texture coordinates and material; the caller sets points, normals and extents."""
     mesh = UsdGeom.Mesh.Define(stage, path)
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(avatar.faces), 3, np.int32)))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(avatar.faces.astype(np.int32).ravel()))
@@ -125,7 +126,7 @@ def _define_mesh(stage: Usd.Stage, path: Sdf.Path, avatar: StagedAvatar) -> UsdG
 
 
 def _define_material(stage: Usd.Stage) -> UsdShade.Material:
-    """A matte preview surface with the baked texture."""
+    """Define a matte preview surface with the baked texture."""
     material = UsdShade.Material.Define(stage, ROOT.AppendPath("Materials/Captured"))
     UsdGeom.Scope.Define(stage, material.GetPath().GetParentPath())
     reader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("TextureCoordinates"))
@@ -150,7 +151,8 @@ def _define_material(stage: Usd.Stage) -> UsdShade.Material:
 
 
 def _define_skeleton(stage: Usd.Stage, path: Sdf.Path, avatar: StagedAvatar) -> UsdSkel.Skeleton:
-    """Rest transforms relative to parents, bind transforms in the skeleton's space, and the motion."""
+    """Define the skeleton: rest transforms relative to parents, bind transforms in the skeleton's space, and the
+    motion."""
     joints = joint_paths(avatar)
     skeleton = UsdSkel.Skeleton.Define(stage, path)
     skeleton.CreateJointsAttr(joints)

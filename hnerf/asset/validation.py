@@ -1,4 +1,4 @@
-"""Is a USD package fit to hand over? OpenUSD's own validators, and the data errors that they do not look for."""
+"""Validation of USD packages: OpenUSD's own validators, and the data errors that they do not look for."""
 
 from pathlib import Path
 from typing import Any
@@ -8,11 +8,12 @@ from pxr import Tf, Usd, UsdGeom, UsdSkel, UsdValidation
 
 from hnerf.errors import InvalidAsset
 
-PLAUSIBLE_SIZE_M = (0.5, 3.0)  # longest side of the box around a person, lying down or with raised arms included
+PLAUSIBLE_SIZE_M = (0.5, 3.0)  # longest side of the box around a person, from lying down to raised arms
 
 
 def validate_package(path: Path) -> dict[str, Any]:
-    """What OpenUSD's validators report below an error. Raises InvalidAsset on their errors and on `data_defects`."""
+    """Return the warnings and notes of OpenUSD's validators. Raises InvalidAsset on their errors and on
+    `data_defects`."""
     stage = Usd.Stage.Open(str(path))
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     findings: dict[str, list[str]] = {"Error": [], "Warn": [], "Info": []}
@@ -25,7 +26,7 @@ def validate_package(path: Path) -> dict[str, Any]:
 
 
 def data_defects(stage: Usd.Stage) -> list[str]:
-    """One line for each defect in units, meshes, skinning and skeletons; empty if there is none."""
+    """Return one line for each defect in units, meshes, skinning and skeletons."""
     defects = []
     if UsdGeom.GetStageMetersPerUnit(stage) != 1.0:
         defects.append(f"metersPerUnit is {UsdGeom.GetStageMetersPerUnit(stage)}, not 1")
@@ -42,7 +43,7 @@ def data_defects(stage: Usd.Stage) -> list[str]:
             defects += _skeleton_defects(UsdSkel.Skeleton(prim))
         elif prim.IsA(UsdSkel.Animation):
             defects += _animation_defects(UsdSkel.Animation(prim))
-    return defects if found else [*defects, "there is no mesh"]
+    return defects if found else [*defects, "has no mesh"]
 
 
 def _mesh_defects(mesh: UsdGeom.Mesh) -> list[str]:
@@ -59,10 +60,10 @@ def _mesh_defects(mesh: UsdGeom.Mesh) -> list[str]:
             defects.append(f"{name}: face index out of range at time {time}")
         lower, upper = points.min(0), points.max(0)
         if not PLAUSIBLE_SIZE_M[0] <= (upper - lower).max() <= PLAUSIBLE_SIZE_M[1]:
-            defects.append(f"{name}: {(upper - lower).max():.3g} m is no size of a person, at time {time}")
+            defects.append(f"{name}: {(upper - lower).max():.3g} m is not a person's size, at time {time}")
         extent = np.array(mesh.GetExtentAttr().Get(time))
         if extent.shape != (2, 3) or (extent[0] > lower + 1e-5).any() or (extent[1] < upper - 1e-5).any():
-            defects.append(f"{name}: extent does not hold the points at time {time}")
+            defects.append(f"{name}: extent does not contain the points at time {time}")
     return defects + _uv_defects(mesh, corners)
 
 
@@ -94,7 +95,7 @@ def _skin_defects(prim: Usd.Prim) -> list[str]:
     defects = []
     if joints.min() < 0 or joints.max() >= len(skeleton.GetJointsAttr().Get()):
         defects.append(f"{name}: joint index out of range")
-    # Written so that a NaN fails.
+    # Negated conditions, so that NaN fails.
     if not ((weights >= 0).all() and (np.abs(weights.reshape(vertices, influences).sum(1) - 1) < 1e-4).all()):
         defects.append(f"{name}: joint weights are negative, not finite, or do not sum to 1")
     return defects
@@ -110,7 +111,7 @@ def _skeleton_defects(skeleton: UsdSkel.Skeleton) -> list[str]:
     for attribute in (skeleton.GetRestTransformsAttr(), skeleton.GetBindTransformsAttr()):
         transforms = np.array(attribute.Get())
         if len(transforms) != len(joints) or not np.isfinite(transforms).all():
-            defects.append(f"{name}: {attribute.GetName()} is not finite or has not one matrix a joint")
+            defects.append(f"{name}: {attribute.GetName()} is not finite or does not have one matrix per joint")
     return defects
 
 
@@ -121,9 +122,9 @@ def _animation_defects(animation: UsdSkel.Animation) -> list[str]:
         rotations = np.array([(q.GetReal(), *q.GetImaginary()) for q in animation.GetRotationsAttr().Get(time)])
         translations = np.array(animation.GetTranslationsAttr().Get(time))
         if not len(rotations) == len(translations) == joints:
-            defects.append(f"{animation.GetPath()}: not one transform a joint at time {time}")
+            defects.append(f"{animation.GetPath()}: does not have one transform per joint at time {time}")
         elif not (np.isfinite(translations).all() and (np.abs(np.linalg.norm(rotations, axis=1) - 1) < 1e-4).all()):
-            defects.append(f"{animation.GetPath()}: not finite or not unit quaternions at time {time}")
+            defects.append(f"{animation.GetPath()}: quaternions are not finite or not of unit length at time {time}")
     return defects
 
 

@@ -1,4 +1,4 @@
-"""Charts of training and of the scores frame by frame, as PNG files."""
+"""Charts of the training history and of scores by frame, as PNG files."""
 
 from collections import defaultdict
 from pathlib import Path
@@ -15,14 +15,16 @@ Points = list[tuple[float, float]]
 
 
 def loss_chart(history: list[dict[str, Any]], path: Path) -> bool:
-    """Every loss over training time, on a logarithmic scale; False, and no file, where there is none to draw."""
+    """Draw every loss over training time, on a logarithmic scale. Return whether there was one to draw and the file was
+    written."""
     series = _series(history, "losses")
     positive = {name: [(s, v) for s, v in points if v > 0] for name, points in series.items()}
     return _chart(path, {k: v for k, v in positive.items() if v}, "seconds of training", "loss", "log")
 
 
 def quality_chart(history: list[dict[str, Any]], path: Path) -> bool:
-    """Held-out figures over training time, one panel each; False, and no file, where there is none to draw."""
+    """Draw held-out scores over training time, one panel each. Return whether there was one to draw and the file was
+    written."""
     series = _series(history, "held_out")
     if not series:
         return False
@@ -35,7 +37,7 @@ def quality_chart(history: list[dict[str, Any]], path: Path) -> bool:
 
 
 def frame_chart(per_image: list[dict[str, Any]], path: Path) -> bool:
-    """PSNR of every frame, one line a camera; False, and no file, where no image was scored."""
+    """Draw the PSNR of every frame, one line a camera. Return whether an image was scored and the file was written."""
     series: dict[str, Points] = defaultdict(list)
     for score in per_image:
         series[f"camera {score['camera']}"].append((score["frame"], score["psnr"]))
@@ -43,7 +45,7 @@ def frame_chart(per_image: list[dict[str, Any]], path: Path) -> bool:
 
 
 def _series(history: list[dict[str, Any]], key: str) -> dict[str, Points]:
-    """The figures under a key of every record, by name, over seconds."""
+    """Return, by name, the values under a key of every record, over seconds."""
     series: dict[str, Points] = defaultdict(list)
     for record in history:
         for name, value in record.get(key, {}).items():
@@ -80,7 +82,7 @@ def _finish(axes: Axes, x_label: str, y_label: str) -> None:
 
 
 def style(axes: Axes, x_label: str, y_label: str) -> None:
-    """Labels, and the looks that all charts share."""
+    """Set the labels, and the style that all charts share."""
     axes.set_xlabel(x_label, color=INK)
     axes.set_ylabel(y_label, color=INK)
     axes.grid(color=FAINT, linewidth=0.7)

@@ -1,5 +1,5 @@
-"""How each split shows a trained avatar. New poses have three columns, from what an avatar does in any motion to what
-was tuned on the pictures of these very frames."""
+"""Which avatar each split shows. Novel poses have three columns: animated, posed and tracked, which differ in what was
+tuned on the images of these very frames."""
 
 import json
 from pathlib import Path
@@ -7,14 +7,14 @@ from pathlib import Path
 from hnerf.avatar.avatar import Avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import TrainingSettings
-from hnerf.evaluation.views import ANIMATED, NEW_POSES, POSED, TRACKED
+from hnerf.evaluation.views import ANIMATED, NOVEL_POSE_SPLITS, POSED, TRACKED
 
 
-def shown_as(split: str, avatar: Avatar, fitted: BodyFit) -> Avatar:
-    """The avatar whose `body` has the poses of a split.
+def avatar_for_split(split: str, avatar: Avatar, fitted: BodyFit) -> Avatar:
+    """Return the avatar whose `body` has the poses of a split.
 
-    ANIMATED: with the poses of `fitted`, the body before training; POSED: with those that training tuned; both without
-    what was learned of single frames. TRACKED, as all splits of training frames: as training left it.
+    ANIMATED: the poses of `fitted`, the body before training; POSED: the poses that training tuned; both without what
+    was learned for single frames. TRACKED, and all splits of training frames: the avatar as training left it.
     """
     if split == ANIMATED:
         device = avatar.body.theta.device
@@ -23,9 +23,9 @@ def shown_as(split: str, avatar: Avatar, fitted: BodyFit) -> Avatar:
     return avatar.without_frames() if split == POSED else avatar
 
 
-def why_not_shown(split: str, training: Path) -> str | None:
-    """Why what training left in a folder has nothing of its own to show under a split; None if it has."""
-    reason = why_no_novel_poses(training) if split in NEW_POSES else None
+def reason_unavailable(split: str, training: Path) -> str | None:
+    """Return why a trained model, by its folder, has nothing of its own to show for a split; None if it has."""
+    reason = reason_without_novel_poses(training) if split in NOVEL_POSE_SPLITS else None
     if reason or split not in (POSED, TRACKED):
         return reason
     settings = json.loads((training / "settings.json").read_text())["training"]
@@ -37,8 +37,8 @@ def why_not_shown(split: str, training: Path) -> str | None:
     return None
 
 
-def why_no_novel_poses(training: Path) -> str | None:
-    """Why what training left in a folder cannot show poses that it was not trained on; None if it can."""
+def reason_without_novel_poses(training: Path) -> str | None:
+    """Return why a trained model, by its folder, cannot show poses that it was not trained on; None if it can."""
     stored = json.loads((training / "settings.json").read_text())
     field = TrainingSettings.model_validate(stored["training"]).field
     if field.kind == "paper" and stored["static"]:

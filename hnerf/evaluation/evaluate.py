@@ -1,4 +1,4 @@
-"""Render, mesh and score a trained avatar by the evaluation protocol of docs/method.md, and report what was found."""
+"""Evaluation of a trained avatar by the protocol of docs/method.md: renderings, meshes, scores and a report."""
 
 import dataclasses
 import itertools
@@ -15,14 +15,23 @@ from hnerf.avatar.avatar import Avatar
 from hnerf.avatar.surface import POSED_CELLS, posed_surface
 from hnerf.config import EvaluationSettings
 from hnerf.evaluation import geometry
-from hnerf.evaluation.columns import shown_as, why_not_shown
+from hnerf.evaluation.columns import avatar_for_split, reason_unavailable
 from hnerf.evaluation.ground_truth import GroundTruth
-from hnerf.evaluation.holdout import LABEL, gathered
+from hnerf.evaluation.holdout import LABEL, collect_held_out
 from hnerf.evaluation.images import render, score_split, scored_views, unscored
 from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.lpips import lpips_availability
 from hnerf.evaluation.report import write_report
-from hnerf.evaluation.views import POSED, PRIMARY, SPLITS, TRACKED, TRAINING_VIEW, all_views, some_views, split_frames
+from hnerf.evaluation.views import (
+    POSED,
+    PRIMARY_SPLITS,
+    SPLITS,
+    TRACKED,
+    TRAINING_VIEW,
+    all_views,
+    sample_views,
+    split_frames,
+)
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.progress import tracked
 
@@ -47,33 +56,33 @@ PROTOCOL = (
 
 
 def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) -> dict[str, Any]:
-    """Write `renders/`, `meshes/`, `metrics.json`, charts and `report.html` into `out`; what metrics.json holds.
+    """Write `renders/`, `meshes/`, `metrics.json`, charts and `report.html` into `out`; return what metrics.json holds.
 
-    A figure that cannot be had is null, and a reason stands beside it.
+    A score that is not available is null, with a reason beside it.
     """
     started = time.perf_counter()
     capture = inputs.capture
     truth = GroundTruth(inputs.capture_folder, capture) if (inputs.capture_folder / "ground_truth").is_dir() else None
-    lacking = {split: why for split in SPLITS if (why := why_not_shown(split, inputs.training_folder))}
-    there_are = [split for split in (TRAINING_VIEW, *SPLITS) if split not in lacking]
-    avatars = {split: shown_as(split, inputs.avatar, inputs.fitted) for split in there_are}
-    shown = [some_views(all_views(capture, split), settings.report_rows) for split in there_are]
-    views = {split: scored_views(capture, split, truth, settings.max_images) for split in there_are if split in SPLITS}
-    to_look_at = (POSED, TRACKED) if not capture.test_cameras else ()  # as many as are shown do
-    wanted = dict.fromkeys(itertools.chain(*shown, *(views[split] for split in views if split not in to_look_at)))
+    unavailable = {split: why for split in SPLITS if (why := reason_unavailable(split, inputs.training_folder))}
+    available = [split for split in (TRAINING_VIEW, *SPLITS) if split not in unavailable]
+    avatars = {split: avatar_for_split(split, inputs.avatar, inputs.fitted) for split in available}
+    shown = [sample_views(all_views(capture, split), settings.report_rows) for split in available]
+    views = {split: scored_views(capture, split, truth, settings.max_images) for split in available if split in SPLITS}
+    illustrative = (POSED, TRACKED) if not capture.test_cameras else ()  # only those that the report shows
+    wanted = dict.fromkeys(itertools.chain(*shown, *(views[split] for split in views if split not in illustrative)))
     image_seconds = render(avatars, capture, list(wanted), out)
     rendered = time.perf_counter()
     found: dict[str, Any] = {"protocol": PROTOCOL, "lpips": lpips_availability(), "seconds_per_image": image_seconds}
     found |= {split: score_split(capture, split, views[split], truth, out) for split in views}
-    found |= {split: unscored(why) for split, why in lacking.items()}
+    found |= {split: unscored(why) for split, why in unavailable.items()}
     true_meshes = {} if truth is None else truth.meshes()
-    for split in PRIMARY:
-        if split in lacking:
-            found[split] |= {"geometry": None, "geometry_reason": lacking[split]}
+    for split in PRIMARY_SPLITS:
+        if split in unavailable:
+            found[split] |= {"geometry": None, "geometry_reason": unavailable[split]}
             continue
         frames = mesh_frames(split_frames(capture, split), true_meshes, settings.max_meshes)
         found[split] |= score_meshes(avatars[split], frames, true_meshes, out)
-    found |= gathered(capture, inputs.held_out_folders)
+    found |= collect_held_out(capture, inputs.held_out_folders)
     found["seconds"] = {"rendering": rendered - started, "scores and meshes": time.perf_counter() - rendered}
     write_report(inputs, settings, truth, true_meshes, found, out)
     found["seconds"]["all"] = time.perf_counter() - started
@@ -83,15 +92,16 @@ def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) 
 
 
 def mesh_frames(frames: tuple[int, ...], true_meshes: dict[int, trimesh.Trimesh], count: int) -> list[int]:
-    """The frames to mesh: at most `count`, spread over those with a true surface, or over all where none has one."""
+    """Return the frames to mesh: at most `count`, evenly spaced among those with a true surface, or among all if none
+    has one."""
     return evenly_spaced([f for f in frames if f in true_meshes] or frames, count)
 
 
 def score_meshes(
     avatar: Avatar, frames: list[int], true_meshes: dict[int, trimesh.Trimesh], out: Path
 ) -> dict[str, Any]:
-    """Write `meshes/<frame>.ply` of the frames, posed as the avatar's body is; their mean geometry figures, or null
-    with a reason."""
+    """Write `meshes/<frame>.ply` of the frames, posed as the avatar's body is; return their mean geometry scores, or
+    null with a reason."""
     (out / "meshes").mkdir(exist_ok=True)
     scores = []
     for frame in tracked(frames, "meshes", len(frames)):

@@ -1,4 +1,4 @@
-"""Rows of pictures for the report: what a camera saw, what was made of it, and how far it is off."""
+"""Rows of pictures for the report: the photograph, what was reconstructed from it, and the error."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from hnerf.geometry.mesh_queries import Surface
 
 @dataclass(frozen=True)
 class GalleryPicture:
-    """A captioned picture as a data: address."""
+    """A captioned picture as a data URI."""
 
     caption: str
     uri: str
@@ -26,7 +26,7 @@ class GalleryPicture:
 
 @dataclass(frozen=True)
 class Row:
-    """Pictures of one view or frame."""
+    """The pictures of one view or frame."""
 
     title: str
     note: str
@@ -51,10 +51,11 @@ def view_row(
     body: BodyFit | None,
     others: Mapping[str, np.ndarray],
 ) -> Row:
-    """Input, mask, fitted body, rendering, reference, error, and other renderings by caption, cut to the person.
+    """Return a view's row: input, mask, fitted body, rendering, reference, error, and other renderings by caption,
+    cropped to the person.
 
-    Renderings are (H, W, 4), RGB over black and coverage; body None: none is shown. A scored view is compared to the
-    truth; a training view, or one without a truth, to the photograph under its mask.
+    Renderings are (H, W, 4), RGB over black and coverage; with body None no body is shown. A scored view is compared to
+    the truth; a training view, or one without truth, to the photograph under its mask.
     """
     image = inputs.capture.image(view.camera, view.frame)
     mask, reference = _mask_and_reference(view, image, inputs, truth)
@@ -79,7 +80,7 @@ def view_row(
 def _mask_and_reference(
     view: View, image: np.ndarray, inputs: EvaluationInputs, truth: GroundTruth | None
 ) -> tuple[np.ndarray | None, tuple[str, np.ndarray] | None]:
-    """The mask (H, W) bool and the captioned picture to compare with, or None where there is none."""
+    """Return the mask (H, W) bool and the captioned picture to compare with, or None where there is none."""
     if view.split != TRAINING_VIEW and truth is not None and truth.has_mask(view.camera, view.frame):
         return truth.mask(view.camera, view.frame), ("Ground truth", truth.on_black(view.camera, view.frame)[0])
     if (view.camera, view.frame) not in inputs.masks:
@@ -89,7 +90,8 @@ def _mask_and_reference(
 
 
 def surface_row(frame: int, mesh: trimesh.Trimesh, truth: trimesh.Trimesh | None, root: np.ndarray, note: str) -> Row:
-    """A mesh from the person's front and back; beside it the true one and the distance between them. root (4, 4)."""
+    """Return a mesh's row: the mesh from the person's front and back, beside it the true one and the distance between
+    them. root (4, 4)."""
     points_m = mesh.vertices if truth is None else np.concatenate([mesh.vertices, truth.vertices])
     cameras = {side: pictures.portrait_camera(points_m, root, side) for side in ("front", "back")}
     surface = Surface(mesh)
@@ -102,7 +104,7 @@ def surface_row(frame: int, mesh: trimesh.Trimesh, truth: trimesh.Trimesh | None
 
 
 def _body_mesh(body: BodyFit, frame: int) -> trimesh.Trimesh:
-    """The naked body in the pose of a frame."""
+    """Return the unclothed body in the pose of a frame."""
     k = body.index(frame)
     vertices_m = pose_vertices(body.rig, body.theta[k], body.root[k])
     return trimesh.Trimesh(vertices_m.numpy(), body.rig.faces.numpy(), process=False)

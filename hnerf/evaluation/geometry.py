@@ -1,7 +1,7 @@
-"""How far a reconstructed surface lies from the true one.
+"""Scores of a reconstructed surface against the true one: Chamfer distance, normal consistency, and volume overlap.
 
-Chamfer distance sample to surface (not to its samples), normal consistency, and volume overlap. Only what can be seen
-from outside is sampled: clothes hide inner layers that no camera could have told about.
+The Chamfer distance is from samples to the surface (not to its samples). Only what can be seen from outside is sampled:
+clothes hide inner layers that no camera could observe.
 """
 
 from dataclasses import dataclass
@@ -11,17 +11,17 @@ import trimesh
 
 from hnerf.geometry.mesh_queries import Surface
 
-SAMPLES = 40_000  # a surface, before what is hidden drops out
+SAMPLES = 40_000  # per surface, before hidden ones are dropped
 ESCAPE_DIRECTIONS = 48
-OCCUPANCY_NODES = 128  # on each side of the common box
+OCCUPANCY_NODES = 128  # along each side of the common box
 BOX_MARGIN_M = 0.02
 
 
 @dataclass(frozen=True)
 class GeometryScore:
-    """chamfer_l2_e3: mean squared distance of both directions, m^2 x 1e3; chamfer_mm: mean distance;
-    normal_consistency: mean |cos| of the normals at nearest points; iou of the volumes; watertight: whether the
-    prediction is closed."""
+    """The scores of one mesh. chamfer_l2_e3: mean squared distance of both directions, m^2 x 1e3; chamfer_mm: mean
+    distance; normal_consistency: mean |cos| of the normals at nearest points; iou of the volumes; watertight: whether
+    the prediction is closed."""
 
     chamfer_l2_e3: float
     chamfer_mm: float
@@ -56,7 +56,8 @@ def score_geometry(
 
 
 def outer_samples(surface: Surface, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) and face normals (n, 3), n <= count, spread by area over what can be seen from outside."""
+    """Sample points (n, 3) and face normals (n, 3), n <= count, uniformly by area over what can be seen from
+    outside."""
     points_m, faces = trimesh.sample.sample_surface(surface.mesh, count, seed=int(rng.integers(1 << 30)))
     directions = rng.normal(size=(ESCAPE_DIRECTIONS, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -65,6 +66,6 @@ def outer_samples(surface: Surface, count: int, rng: np.random.Generator) -> tup
 
 
 def volume_overlap(a: Surface, b: Surface, lower_m: np.ndarray, upper_m: np.ndarray, nodes: int) -> float:
-    """Intersection over union of two volumes, counted on a common grid of nodes^3 over a box."""
+    """Return the intersection over union of two volumes, counted on a common grid of nodes^3 over a box."""
     in_a, in_b = (surface.occupancy(lower_m, upper_m, nodes) for surface in (a, b))
     return float((in_a & in_b).sum() / max(1, (in_a | in_b).sum()))

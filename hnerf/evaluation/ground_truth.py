@@ -1,4 +1,4 @@
-"""What a capture folder knows about the truth: masks, the person on black, and surfaces, under `ground_truth/`."""
+"""Ground truth of a capture folder: masks, the person on black, and surfaces, under `ground_truth/`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,51 +19,52 @@ MASKED_IMAGE = "image x ground-truth mask"
 
 
 class Truth(Protocol):
-    """What images are scored against."""
+    """Interface of what images are scored against."""
 
     @property
     def has_masks(self) -> bool:
-        """Whether images can be scored."""
+        """Return whether images can be scored at all."""
         ...
 
     def has_mask(self, camera: str, frame: int) -> bool:
-        """Whether this image can be scored."""
+        """Return whether this image can be scored."""
         ...
 
     def mask(self, camera: str, frame: int) -> np.ndarray:
-        """(H, W) bool, True on the person."""
+        """Return the true mask, (H, W) bool, True on the person."""
         ...
 
     def on_black(self, camera: str, frame: int) -> tuple[np.ndarray, str]:
-        """The person alone over black, (H, W, 3) uint8, and where that comes from."""
+        """Return the person alone over black, (H, W, 3) uint8, and the name of its source."""
         ...
 
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """The Truth of an original capture folder's `ground_truth/`; images are of the recorded frame nearest in time, as
-    those of the capture are, and come at the size of its camera."""
+    """The Truth of an original capture folder's `ground_truth/`; images are those of the recorded frame nearest in
+    time, as in the capture, at the size of its camera."""
 
     folder: Path
     capture: Capture
 
     @property
     def has_masks(self) -> bool:
-        """Whether images can be scored."""
+        """Return whether there are true masks."""
         return self._path("masks").is_dir()
 
     def has_mask(self, camera: str, frame: int) -> bool:
-        """Whether this image can be scored: somebody may have drawn a few masks by hand."""
+        """Return whether this image has a true mask: there may be a few drawn by hand."""
         return self._mask_path(camera, frame).exists()
 
     def mask(self, camera: str, frame: int) -> np.ndarray:
-        """(H, W) bool, True on the person."""
+        """Return the true mask, (H, W) bool, True on the person."""
         return self._as_rendered(read_image(self._mask_path(camera, frame))[..., 0], camera) > 127
 
     def on_black(self, camera: str, frame: int) -> tuple[np.ndarray, str]:
-        """The person alone over black, (H, W, 3) uint8, and where that comes from.
+        """Return the person alone over black, (H, W, 3) uint8, and the name of its source.
 
-        `on_black/`, whose edge pixels are weighted by coverage, where it has the view; else the photograph x the mask.
+        The source is `on_black/`, whose edge pixels are weighted by coverage, if it has the view; else the photograph
+        times the mask.
         """
         path = self._path("on_black", camera, f"{self.capture.recorded_frame(camera, frame):06d}.jpg")
         if path.exists():
@@ -71,7 +72,7 @@ class GroundTruth:
         return self.capture.image(camera, frame) * self.mask(camera, frame)[..., None], MASKED_IMAGE
 
     def meshes(self) -> dict[int, trimesh.Trimesh]:
-        """The true surface, in world metres, of every frame that has one."""
+        """Return the true surface, in world metres, of every frame that has one."""
         path = self._path("meshes.npz")
         if not path.exists():
             return {}
@@ -79,10 +80,12 @@ class GroundTruth:
             with np.load(path, allow_pickle=False) as stored:
                 faces, vertices, frames = stored["faces"], stored["vertices"], stored["frames"]
             if not (faces.min() >= 0 and faces.max() < vertices.shape[1] and np.isfinite(vertices).all()):
-                raise ValueError("a face names no vertex, or a vertex is not finite")
+                raise ValueError("a face index is out of range, or a vertex is not finite")
             return {int(f): trimesh.Trimesh(v, faces, process=False) for f, v in zip(frames, vertices, strict=True)}
         except (*ARRAY_FILE_ERRORS, KeyError, IndexError) as error:
-            raise InputError(f"{path}: no true surfaces to read ({error}); write it again or delete it") from None
+            raise InputError(
+                f"{path}: true surfaces cannot be read ({error}); write the file again or delete it"
+            ) from None
 
     def _path(self, *parts: str) -> Path:
         return path_in_capture(self.folder, "ground_truth", *parts)
@@ -91,7 +94,7 @@ class GroundTruth:
         return self._path("masks", camera, f"{self.capture.recorded_frame(camera, frame):06d}.png")
 
     def _as_rendered(self, image: np.ndarray, camera: str) -> np.ndarray:
-        """A picture as recorded, undistorted and shrunk as the photographs were at the door."""
+        """Undistort and downscale an image as recorded, as ingest does with photographs."""
         size = (self.capture.cameras[camera].width_px, self.capture.cameras[camera].height_px)
         recorded_px = self.capture.recorded_sizes_px.get(camera)
         if camera in self.capture.recorded_lenses and image.shape[1::-1] == recorded_px:

@@ -1,4 +1,4 @@
-"""Images of a split: which, rendered, and scored."""
+"""The images of a split: which there are, their renderings and their scores."""
 
 import dataclasses
 import time
@@ -13,10 +13,10 @@ from hnerf.avatar.avatar import Avatar, Rendering
 from hnerf.capture.capture import Capture, read_rgba, write_image
 from hnerf.evaluation import metrics
 from hnerf.evaluation.ground_truth import Truth
-from hnerf.evaluation.views import NEW_POSES, View, all_views, some_views
+from hnerf.evaluation.views import NOVEL_POSE_SPLITS, View, all_views, sample_views
 from hnerf.progress import tracked
 
-MEANS = ("psnr", "ssim", "mask_iou", "lpips", "empty_psnr", "one_colour_psnr")  # over a split's images
+MEANS = ("psnr", "ssim", "mask_iou", "lpips", "empty_psnr", "one_colour_psnr")  # averaged over a split's images
 TUNED_ON = (
     "the capture has no test camera, and training cameras saw these frames when their poses were fitted; "
     "evaluation.holdout scores a field that was trained without one of them"
@@ -24,21 +24,21 @@ TUNED_ON = (
 
 
 def scored_views(capture: Capture, split: str, truth: Truth | None, count: int | None) -> list[View]:
-    """All images of a split, or at most `count` of those whose true mask is known; of all where none is."""
+    """Return all images of a split, or at most `count` of those with a true mask; of all if none has one."""
     views = all_views(capture, split)
     if count is None:
         return views
-    return some_views(known_views(views, truth) or views, count)
+    return sample_views(views_with_mask(views, truth) or views, count)
 
 
-def known_views(views: list[View], truth: Truth | None) -> list[View]:
-    """Those whose true mask is known."""
+def views_with_mask(views: list[View], truth: Truth | None) -> list[View]:
+    """Return the views that have a true mask."""
     return [view for view in views if truth and truth.has_mask(view.camera, view.frame)]
 
 
 def render(avatars: Mapping[str, Avatar], capture: Capture, views: list[View], out: Path) -> float:
-    """Write every view as its split's avatar looks in the poses of its `body`: 8-bit RGBA, colour over black and
-    coverage. Returns the median seconds of one image, without writing it."""
+    """Render every view with its split's avatar, in the poses of its `body`, and write it as 8-bit RGBA, colour over
+    black and coverage. Return the median seconds an image takes, without writing it."""
     seconds: list[float] = []
     for view in tracked(views, "rendering", len(views)):
         started = time.perf_counter()
@@ -52,22 +52,23 @@ def render(avatars: Mapping[str, Avatar], capture: Capture, views: list[View], o
 
 
 def rgba(rendering: Rendering) -> np.ndarray:
-    """(H, W, 4) uint8: colour over black, and coverage."""
+    """Convert a rendering to (H, W, 4) uint8: colour over black, and coverage."""
     both = torch.cat([rendering.rgb, rendering.alpha[..., None]], -1)
     return (both.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def score_split(capture: Capture, split: str, views: list[View], truth: Truth | None, out: Path) -> dict[str, Any]:
-    """Mean image figures of a split's renderings, and each image's; null with a reason where there are none."""
+    """Return the mean image scores of a split's renderings, and those of each image; null with a reason if there are
+    none."""
     if not views:
-        missing = "novel-pose frames" if split in NEW_POSES else "test cameras"
+        missing = "novel-pose frames" if split in NOVEL_POSE_SPLITS else "test cameras"
         return unscored(f"the capture has no {missing}")
     if not capture.test_cameras:
         return unscored(TUNED_ON)
     if truth is None or not truth.has_masks:
         return unscored("the capture has no ground-truth masks")
     rows, references = [], set()
-    known = known_views(views, truth)
+    known = views_with_mask(views, truth)
     for view in known:
         mask = truth.mask(view.camera, view.frame)
         if not mask.any():
@@ -76,7 +77,7 @@ def score_split(capture: Capture, split: str, views: list[View], truth: Truth | 
         score = metrics.score_image(read_rgba(view.path(out)), reference, mask)
         references.add(source)
         row: dict[str, Any] = {"camera": view.camera, "frame": view.frame} | dataclasses.asdict(score)
-        rows.append(row | metrics.floors(reference, mask))
+        rows.append(row | metrics.trivial_psnr(reference, mask))
     if not rows:
         return unscored(
             "no image of this split shows the person" if known else "no image of this split has a mask to score it by"
@@ -87,11 +88,11 @@ def score_split(capture: Capture, split: str, views: list[View], truth: Truth | 
 
 
 def mean_of(values: Sequence[float | None]) -> float | None:
-    """The mean of those that are known; None where none is."""
+    """Return the mean of the values that are not None; None if there are none."""
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
 
 
 def unscored(reason: str) -> dict[str, Any]:
-    """The figures of a split without any."""
+    """Return the scores of a split that has none, and the reason."""
     return {"n": 0, "per_image": []} | dict.fromkeys(MEANS) | {"reason": reason}

@@ -1,4 +1,4 @@
-"""What evaluation is given."""
+"""The inputs of evaluation."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,11 +11,11 @@ from hnerf.capture.masks import Masks
 
 @dataclass(frozen=True)
 class EvaluationInputs:
-    """Everything made before evaluation.
+    """Everything that was made before evaluation.
 
     capture_folder: as recorded, for its ground_truth/; capture: with the calibrated cameras; fitted: the body before
-    training (avatar.body holds the fine-tuned one); the folders hold their stages' report.json; held_out_folders: what
-    `score_held_out` left, one a camera; fit_seconds: of each part of the fit.
+    training (avatar.body holds the fine-tuned one); the folders hold their stages' report.json; held_out_folders:
+    output of `score_held_out`, one a camera; fit_seconds: of each part of the fit.
     """
 
     capture_folder: Path

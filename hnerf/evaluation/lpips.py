@@ -10,15 +10,15 @@ import torch.nn.functional as F
 from hnerf.capture.safe_pickle import read_pickle
 from hnerf.models import LPIPS_ALEXNET, LPIPS_VGG, has_model, model_file
 
-USED = "version 0.1 with AlexNet, in the box of the true mask as SSIM is"
-NOT_THERE = "not available: its weights are not there, and none are fetched at run time; `hnerf models` fetches them"
-LEAST_PX = 64  # smaller images are filled up with black: AlexNet needs 35 px
-MEAN, STD = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of images in [-1, 1]
-TINY = 1e-10  # as the published code has it, in the length of a feature vector
+MEASURED = "version 0.1 with AlexNet, in the box of the true mask as for SSIM"
+NOT_INSTALLED = "not available: its weights are not installed; `hnerf models` downloads them"
+MIN_PX = 64  # smaller images are padded with black: AlexNet needs 35 px
+MEAN, STD = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of RGB in [-1, 1]
+EPSILON = 1e-10  # added to the norm of a feature vector, as in the published code
 
 
 class Convolution(NamedTuple):
-    """A layer with ReLU after it; its features are compared where it is `tapped`."""
+    """A convolution followed by ReLU; its features are compared if it is `tapped`."""
 
     stride: int
     padding: int
@@ -26,7 +26,7 @@ class Convolution(NamedTuple):
 
 
 class Pool(NamedTuple):
-    """Maximum over squares of `size`, every second of them."""
+    """A max pooling over squares of `size`, with stride 2."""
 
     size: int
 
@@ -39,10 +39,10 @@ NETWORKS = {LPIPS_ALEXNET: (ALEXNET, "AlexNet_0"), LPIPS_VGG: (VGG16, "VGG16_0")
 
 
 class Lpips:
-    """The distance as one backbone measures it."""
+    """The LPIPS distance with one backbone."""
 
     def __init__(self, name: str = LPIPS_ALEXNET) -> None:
-        """name: of the weights' file; InputError where it is missing or altered."""
+        """Load the weights file `name`. Raises InputError if it is missing or altered."""
         self.layers, body = NETWORKS[name]
         stored = read_pickle(model_file(name))
         kinds = [layer for layer in self.layers if isinstance(layer, Convolution)]
@@ -50,15 +50,15 @@ class Lpips:
         self.heads = [_weights(stored[f"NetLinLayer_{i}"]["Conv_0"])[0] for i in range(sum(k.tapped for k in kinds))]
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> float:
-        """Distance of two images (H, W, 3) uint8 RGB; 0 where they are equal."""
+        """Return the distance of two images (H, W, 3) uint8 RGB; 0 if they are equal."""
         with torch.no_grad():
             pairs = zip(self._features(a), self._features(b), self.heads, strict=True)
             return sum(float(F.conv2d((p - q) ** 2, head).mean()) for p, q, head in pairs)
 
     def _features(self, image: np.ndarray) -> list[torch.Tensor]:
-        """Features of unit length, (1, C, h, w), of each layer that is compared."""
+        """Return the features (1, C, h, w) of each layer that is compared, normalised to unit length."""
         x = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None] / 127.5 - 1
-        missing = [max(0, LEAST_PX - side) for side in image.shape[1::-1]]
+        missing = [max(0, MIN_PX - side) for side in image.shape[1::-1]]
         x = F.pad(x, (0, missing[0], 0, missing[1]), value=-1.0)
         x = (x - x.new_tensor(MEAN).view(1, 3, 1, 1)) / x.new_tensor(STD).view(1, 3, 1, 1)
         weights, compared = iter(self.weights), []
@@ -68,12 +68,12 @@ class Lpips:
                 continue
             x = F.relu(F.conv2d(x, *next(weights), stride=layer.stride, padding=layer.padding))
             if layer.tapped:
-                compared.append(x / (x.norm(dim=1, keepdim=True) + TINY))
+                compared.append(x / (x.norm(dim=1, keepdim=True) + EPSILON))
         return compared
 
 
 def _weights(layer: dict[str, Any]) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Kernel and bias of a layer, kernels stored as (height, width, in, out)."""
+    """Return kernel and bias of a layer, whose kernel is stored as (height, width, in, out)."""
     kernel = torch.from_numpy(np.array(layer["kernel"].transpose(3, 2, 0, 1), np.float32, order="C"))
     return kernel, torch.from_numpy(np.array(layer["bias"], np.float32)) if "bias" in layer else None
 
@@ -84,10 +84,10 @@ def _alexnet() -> Lpips:
 
 
 def lpips_availability() -> str:
-    """What LPIPS is in results made here and now: how it is measured, or why it is not."""
-    return USED if has_model(LPIPS_ALEXNET) else NOT_THERE
+    """Return how LPIPS is measured on this machine, or why it is not."""
+    return MEASURED if has_model(LPIPS_ALEXNET) else NOT_INSTALLED
 
 
 def lpips(a: np.ndarray, b: np.ndarray) -> float | None:
-    """Distance by AlexNet of two images (H, W, 3) uint8 RGB; None where the weights are not there."""
+    """Return the distance by AlexNet of two images (H, W, 3) uint8 RGB; None if the weights are not installed."""
     return _alexnet()(a, b) if has_model(LPIPS_ALEXNET) else None

@@ -1,4 +1,4 @@
-"""Image figures of the evaluation protocol (docs/method.md): 8-bit images over black, in the person's padded box."""
+"""Image metrics of the evaluation protocol (docs/method.md): 8-bit images over black, in the person's padded box."""
 
 from dataclasses import dataclass
 
@@ -8,13 +8,13 @@ from skimage.metrics import structural_similarity
 from hnerf.evaluation.lpips import lpips
 
 BOX_PADDING_PX = 20
-COVERED_LEVEL = 127  # of 255; a rendered pixel that is covered by more counts as person, however dark it is
+COVERED_LEVEL = 127  # of 255; a rendered pixel with more coverage counts as person, however dark it is
 
 
 @dataclass(frozen=True)
 class ImageScore:
-    """psnr in dB; ssim in [-1, 1]; mask_iou: covered pixels against the mask, in [0, 1]; lpips: 0 where images are
-    equal, None where its weights are not there."""
+    """The scores of one image. psnr in dB; ssim in [-1, 1]; mask_iou: covered pixels against the mask, in [0, 1];
+    lpips: 0 for equal images, None if its weights are not installed."""
 
     psnr: float
     ssim: float
@@ -31,8 +31,8 @@ def score_image(rendered: np.ndarray, reference: np.ndarray, mask: np.ndarray) -
     return ImageScore(psnr(a, b), ssim(a, b), mask_iou(rendered[..., 3], mask), lpips(shown, true))
 
 
-def floors(reference: np.ndarray, mask: np.ndarray) -> dict[str, float]:
-    """PSNR of who knows little: of an empty picture, and of one colour, the person's mean, in the true mask."""
+def trivial_psnr(reference: np.ndarray, mask: np.ndarray) -> dict[str, float]:
+    """Return the PSNR of trivial pictures: a black one, and one colour, the person's mean, inside the true mask."""
     box = mask_box(mask)
     truth = reference[box].astype(np.float32) / 255
     one_colour = mask[box][..., None] * truth[mask[box]].mean(0)
@@ -40,7 +40,8 @@ def floors(reference: np.ndarray, mask: np.ndarray) -> dict[str, float]:
 
 
 def mask_box(mask: np.ndarray) -> tuple[slice, slice]:
-    """Rows and columns of a mask's (H, W) bounding box, padded and cut to the image. The mask is not empty."""
+    """Return rows and columns of the bounding box of a mask (H, W), padded and clipped to the image. The mask is not
+    empty."""
     rows, columns = np.nonzero(mask)
     return (
         slice(max(0, int(rows.min()) - BOX_PADDING_PX), int(rows.max()) + 1 + BOX_PADDING_PX),
@@ -49,12 +50,13 @@ def mask_box(mask: np.ndarray) -> tuple[slice, slice]:
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB of images in [0, 1]; 100 dB where they are equal."""
+    """Return the peak signal-to-noise ratio in dB of images in [0, 1]; 100 dB if they are equal."""
     return float(-10 * np.log10(max(1e-10, ((a - b) ** 2).mean())))
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Structural similarity (Wang et al. 2004) of images (H, W, 3) in [0, 1]: Gaussian window of 11 px, sigma 1.5."""
+    """Return the structural similarity (Wang et al. 2004) of images (H, W, 3) in [0, 1]: Gaussian window of 11 px,
+    sigma 1.5."""
     return float(
         structural_similarity(
             a, b, channel_axis=2, data_range=1, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
@@ -63,7 +65,7 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def mask_iou(coverage: np.ndarray, mask: np.ndarray) -> float:
-    """Intersection over union of the pixels that a rendering covers (H, W) uint8 by more than a half, and a mask (H, W)
-    bool."""
+    """Return the intersection over union of a mask (H, W) bool and the pixels that a rendering covers, (H, W) uint8, by
+    more than a half."""
     covered = coverage > COVERED_LEVEL
     return float((covered & mask).sum() / (covered | mask).sum())

@@ -1,4 +1,4 @@
-"""The report: one HTML file that needs nothing beside it."""
+"""The evaluation report: one self-contained HTML file."""
 
 import base64
 import json
@@ -22,17 +22,17 @@ from hnerf.evaluation.views import (
     ANIMATED,
     NOVEL_VIEW,
     POSED,
-    PRIMARY,
+    PRIMARY_SPLITS,
     SPLITS,
     TRACKED,
     TRAINING_VIEW,
     View,
     all_views,
-    some_views,
+    sample_views,
 )
 from hnerf.tables import pick, shown
 
-FIGURES = (  # where in a split's scores, name, unit, format, what it means
+FIGURES = (  # key in a split's scores, name, unit, format, meaning
     (
         "psnr",
         "PSNR",
@@ -40,17 +40,17 @@ FIGURES = (  # where in a split's scores, name, unit, format, what it means
         "{:.2f}",
         "Pixel error, logarithmic. Higher is better; 3 dB more is half the squared error.",
     ),
-    ("ssim", "SSIM", "", "{:.3f}", "Likeness of local structure: edges, folds, pattern. 1 is identical."),
-    ("mask_iou", "Mask IoU", "", "{:.3f}", "Overlap of what is rendered and the true mask. 1 is identical."),
-    ("lpips", "LPIPS", "", "{:.3f}", "Unlikeness as a network trained on people's judgement sees it. 0 is identical."),
+    ("ssim", "SSIM", "", "{:.3f}", "Similarity of local structure: edges, folds, patterns. 1 is identical."),
+    ("mask_iou", "Mask IoU", "", "{:.3f}", "Overlap of the rendered person and the true mask. 1 is identical."),
+    ("lpips", "LPIPS", "", "{:.3f}", "Difference by a network trained on human judgement. 0 is identical."),
     ("geometry.chamfer_mm", "Surface distance", "mm", "{:.1f}", "Mean distance between the surface and the true one."),
-    ("geometry.chamfer_l2_e3", "Chamfer", "m² × 10⁻³", "{:.3f}", "Mean squared distance; far-off parts weigh more."),
+    ("geometry.chamfer_l2_e3", "Chamfer", "m² × 10⁻³", "{:.3f}", "Mean squared distance; larger errors weigh more."),
     (
         "geometry.normal_consistency",
         "Normal consistency",
         "",
         "{:.3f}",
-        "Agreement of surface directions. 1 is identical.",
+        "Agreement of surface normals. 1 is identical.",
     ),
     ("geometry.iou", "Volume IoU", "", "{:.3f}", "Overlap of the volumes. 1 is identical."),
 )
@@ -60,12 +60,12 @@ SPLIT_TITLES = {
     POSED: "New poses, posed",
     TRACKED: "New poses, tracked",
 }
-COLUMNS = (  # of new poses
-    ("Animated", "poses as they were fitted before training, nothing tuned: what the avatar does in any motion"),
-    ("Posed", "poses tuned on the training cameras' pictures of these frames"),
-    ("Tracked", "poses and each frame's own deformation tuned on them"),
+COLUMNS = (  # of novel poses
+    ("Animated", "poses as fitted before training, nothing tuned: how the avatar looks in any motion"),
+    ("Posed", "poses tuned on the training cameras' images of these frames"),
+    ("Tracked", "both the poses and a deformation of each frame tuned on those images"),
 )
-LONG_LIST = 12
+LONG_LIST = 12  # values; longer lists are shown by their range
 
 
 def write_report(
@@ -86,13 +86,13 @@ def write_report(
         lstrip_blocks=True,
     )
     environment.filters["readable"] = readable
-    environment.tests["rows"] = is_rows
+    environment.tests["rows"] = is_table_rows
     page = environment.get_template("report.html").render(
         capture=inputs.capture,
         size_px=image_sizes(inputs),
         split_titles=SPLIT_TITLES,
         columns=COLUMNS,
-        reasons=reasons(found),
+        reasons=missing_figures(found),
         held_out=held_out_rows(found),
         found=found,
         summary=summary(found),
@@ -100,16 +100,16 @@ def write_report(
         training_charts=training_charts(inputs.training_folder / "history.jsonl", out),
         frame_charts=frame_charts(found, out),
         rig_picture=png_uri(inputs.calibration_folder / "cameras.png"),
-        witness_picture=png_uri(inputs.calibration_folder / "witnesses.png"),
+        evidence_picture=png_uri(inputs.calibration_folder / "witnesses.png"),
         stages=stages,
         costs=costs(stages, found),
-        notes=notes(inputs, found),
+        notes=reading_notes(inputs, found),
     )
     (out / "report.html").write_text(page, encoding="utf-8")
 
 
 def stage_reports(inputs: EvaluationInputs) -> dict[str, dict[str, Any]]:
-    """What each earlier stage said about itself; an empty dict where it left no report."""
+    """Return the report of each earlier stage, an empty dict for one that left none."""
     folders = {
         "Calibration": inputs.calibration_folder,
         "Segmentation": inputs.segmentation_folder,
@@ -124,13 +124,13 @@ def stage_reports(inputs: EvaluationInputs) -> dict[str, dict[str, Any]]:
 
 
 def image_sizes(inputs: EvaluationInputs) -> str:
-    """The distinct image sizes, like "256 × 256"."""
+    """Return the distinct image sizes, like "256 × 256"."""
     sizes = {(camera.width_px, camera.height_px) for camera in inputs.capture.cameras.values()}
     return ", ".join(f"{width} × {height}" for width, height in sorted(sizes))
 
 
 def summary(found: dict[str, Any]) -> list[dict[str, Any]]:
-    """One row a figure: name, unit, meaning, and the value of each split ("–" where there is none)."""
+    """Return one row for each metric: name, unit, meaning, and the value for each split ("–" if there is none)."""
     rows = []
     for key, name, unit, form, meaning in FIGURES:
         values = [pick(found[split], key) for split in SPLITS]
@@ -140,13 +140,13 @@ def summary(found: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def held_out_rows(found: dict[str, Any]) -> list[list[str]]:
-    """Cells of a table: a row for each camera that was left out, and their mean."""
+    """Return the cells of a table: a row for each held-out camera, and their mean."""
     if found["holdout"] is None:
         return []
     forms = {"psnr": "{:.2f}", "ssim": "{:.3f}", "mask_iou": "{:.3f}", "lpips": "{:.3f}"}
     scores = {f"Camera {name}": by_split for name, by_split in found["holdout"]["cameras"].items()}
     return [
-        [name, *(shown(by_split[split][key], form) for split in PRIMARY for key, form in forms.items())]
+        [name, *(shown(by_split[split][key], form) for split in PRIMARY_SPLITS for key, form in forms.items())]
         for name, by_split in (scores | {"Mean": found["holdout"]["mean"]}).items()
     ]
 
@@ -159,58 +159,59 @@ def galleries(
     found: dict[str, Any],
     out: Path,
 ) -> list[Gallery]:
-    """Training views, new views and new poses as far as there are images, cameras left out, then the surfaces."""
+    """Return the galleries of training views, novel views and novel poses that have images, of held-out cameras, and of
+    surfaces."""
     made = []
     for split in (TRAINING_VIEW, NOVEL_VIEW, ANIMATED):
-        views = dict.fromkeys(some_views(all_views(inputs.capture, split), settings.report_rows), "")
+        views = dict.fromkeys(sample_views(all_views(inputs.capture, split), settings.report_rows), "")
         if split in SPLITS and found[split]["per_image"]:
             worst = min(found[split]["per_image"], key=lambda score: score["psnr"])
             views[View(split, worst["camera"], worst["frame"])] = f"the worst of this split, {worst['psnr']:.1f} dB"
         rows = [
             view_row(view, read_rgba(view.path(out)), inputs, truth, note, inputs.fitted, _other_columns(view, out))
             for view, note in views.items()
-            if view.path(out).exists()  # a method that has no new poses shows none
+            if view.path(out).exists()  # a method without novel poses has no renderings of them
         ]
         if rows:
-            made.append(Gallery(*_gallery_words(split, inputs), rows))
+            made.append(Gallery(*_gallery_text(split, inputs), rows))
     if inputs.held_out_folders:
         made.append(held_out_gallery(inputs, found["holdout"]["cameras"]))
     return [*made, surface_gallery(inputs, true_meshes, out)]
 
 
 def _other_columns(view: View, out: Path) -> dict[str, np.ndarray]:
-    """Renderings by caption of the same image in the other columns of new poses that there are."""
+    """Return, by caption, the renderings of the same image in the other columns of novel poses."""
     paths = {name: replace(view, split=split).path(out) for name, split in (("Posed", POSED), ("Tracked", TRACKED))}
     return {name: read_rgba(path) for name, path in paths.items() if view.split == ANIMATED and path.exists()}
 
 
 def held_out_gallery(inputs: EvaluationInputs, cameras: dict[str, Any]) -> Gallery:
-    """The first image of the training frames and of the new poses that each camera left out was scored on."""
+    """Return a gallery of the first scored image of each held-out camera, for training frames and for novel poses."""
     rows = []
     for folder, (camera, scores) in zip(inputs.held_out_folders, cameras.items(), strict=True):
-        for split in PRIMARY:
+        for split in PRIMARY_SPLITS:
             for score in scores[split]["per_image"][:1]:
                 view = View(split, camera, score["frame"])
                 note = f"{SPLIT_TITLES[split].lower()}, {score['psnr']:.1f} dB"
                 rows.append(view_row(view, read_rgba(view.path(folder)), inputs, None, note, None, {}))
-    text = "Cameras that neither the body nor the field shown here was made with, against their own masks."
+    text = "Cameras that were used neither for the body nor for the field shown here, compared under their own masks."
     return Gallery("Cameras left out", text, rows)
 
 
-def _gallery_words(split: str, inputs: EvaluationInputs) -> tuple[str, str]:
+def _gallery_text(split: str, inputs: EvaluationInputs) -> tuple[str, str]:
     if split == TRAINING_VIEW:
-        return "Training views", "What training saw: how well the avatar explains its own data. No test."
+        return "Training views", "Views used in training: how well the avatar reproduces its own data. Not a test."
     if split == "novel_view":
-        return "New views", "Frames that training saw, from cameras that it never saw."
-    frames = "Frames that the field was not trained on, in poses as fitted before training (Render), and tuned on the"
-    frames += " training cameras' pictures of them (Posed), with a deformation of the frame's own, too (Tracked),"
+        return "New views", "Training frames, seen from cameras that were not used in training."
+    frames = "Frames that the field was not trained on, in poses as fitted before training (Render), as tuned on the"
+    frames += " training cameras' images of them (Posed), and with a tuned deformation of each frame as well (Tracked),"
     if inputs.capture.test_cameras:
-        return "New poses", f"{frames} seen from cameras that neither fit nor training ever saw."
-    return "New poses", f"{frames} seen from the training cameras. No test: the capture has no test camera."
+        return "New poses", f"{frames} seen from cameras that were used neither in the fit nor in training."
+    return "New poses", f"{frames} seen from the training cameras. Not a test: the capture has no test camera."
 
 
 def surface_gallery(inputs: EvaluationInputs, true_meshes: dict[int, trimesh.Trimesh], out: Path) -> Gallery:
-    """The first mesh of the training frames and of the novel-pose frames, front and back."""
+    """Return a gallery of the first mesh of the training frames and of the novel-pose frames, front and back."""
     frames = sorted(int(path.stem) for path in (out / "meshes").glob("*.ply"))
     capture, body, rows = inputs.capture, inputs.avatar.body, []
     for members, note in ((capture.train_frames, "training pose"), (capture.novel_pose_frames, "new pose")):
@@ -222,7 +223,7 @@ def surface_gallery(inputs: EvaluationInputs, true_meshes: dict[int, trimesh.Tri
 
 
 def training_charts(history_path: Path, out: Path) -> list[GalleryPicture]:
-    """Losses and held-out quality over training time, as far as the history has them."""
+    """Draw losses and held-out quality over training time, if the history has them."""
     history = [json.loads(line) for line in history_path.read_text().splitlines()] if history_path.exists() else []
     drawn = {
         "Losses": (out / "losses.png", charts.loss_chart(history, out / "losses.png")),
@@ -232,19 +233,19 @@ def training_charts(history_path: Path, out: Path) -> list[GalleryPicture]:
 
 
 def frame_charts(found: dict[str, Any], out: Path) -> list[GalleryPicture]:
-    """PSNR frame by frame of every split that was scored."""
+    """Draw the PSNR by frame of every split that was scored."""
     paths = {split: out / f"psnr_{split}.png" for split in SPLITS}
     scored = [split for split in SPLITS if charts.frame_chart(found[split]["per_image"], paths[split])]
     return [GalleryPicture(f"{SPLIT_TITLES[split]}, frame by frame", png_uri(paths[split])) for split in scored]
 
 
 def png_uri(path: Path) -> str:
-    """A PNG file as a data: address; empty where there is none."""
+    """Return a PNG file as a data URI, or "" if there is no such file."""
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode() if path.exists() else ""
 
 
 def costs(stages: dict[str, dict[str, Any]], found: dict[str, Any]) -> list[tuple[str, str]]:
-    """What it took: seconds of each stage that recorded them, of each part where it did, memory, size, time of one
+    """Return what the run cost: seconds of each stage and its parts where recorded, memory, model size, time of one
     image."""
     rows = []
     for name, report in (stages | {"Evaluation": found}).items():
@@ -257,45 +258,47 @@ def costs(stages: dict[str, dict[str, Any]], found: dict[str, Any]) -> list[tupl
     return rows + [(key.replace("_", " ").capitalize(), readable(training[key])) for key in sizes if key in training]
 
 
-def notes(inputs: EvaluationInputs, found: dict[str, Any]) -> list[str]:
-    """What is missing or must be kept in mind when the figures are read."""
-    lines = [f"LPIPS is {found['lpips']}.", *reasons(found)]
-    for split in PRIMARY:
+def reading_notes(inputs: EvaluationInputs, found: dict[str, Any]) -> list[str]:
+    """Return what is missing from the scores, or must be kept in mind when they are read."""
+    lines = [f"LPIPS is {found['lpips']}.", *missing_figures(found)]
+    for split in PRIMARY_SPLITS:
         scores, title = found[split], SPLIT_TITLES[split]
         if "geometry_reason" in scores:
-            lines.append(f"{title}: no surface figures, since {scores['geometry_reason']}.")
+            lines.append(f"{title}: no surface scores: {scores['geometry_reason']}.")
         if MASKED_IMAGE in scores.get("reference", ""):
-            lines.append(f"{title}: compared to photographs under the true mask, whose edge pixels hold background.")
+            lines.append(f"{title}: compared to photographs under the true mask, whose edge pixels contain background.")
         if scores.get("without_mask"):
             lines.append(f"{title}: {scores['without_mask']} images have no ground-truth mask and are not scored.")
         if scores.get("without_person"):
             lines.append(f"{title}: {scores['without_person']} images do not show the person and are not scored.")
     if not inputs.capture.test_cameras:
-        lines.append("Without a test camera this field is not scored on images; training views are shown instead.")
+        lines.append(
+            "Without a test camera this field is not scored on images; the report shows training views instead."
+        )
     return lines
 
 
-def reasons(found: dict[str, Any]) -> list[str]:
-    """Why there are no image figures, a line for each reason."""
+def missing_figures(found: dict[str, Any]) -> list[str]:
+    """Return one line for each reason why splits have no image scores."""
     by_reason: dict[str, list[str]] = {}
     for split in SPLITS:
         if "reason" in found[split]:
             by_reason.setdefault(found[split]["reason"], []).append(SPLIT_TITLES[split])
-    lines = [f"{'; '.join(titles)}: no image figures, since {reason}." for reason, titles in by_reason.items()]
+    lines = [f"{'; '.join(titles)}: no image scores: {reason}." for reason, titles in by_reason.items()]
     if TUNED_ON in by_reason and found["holdout"] is None:
-        lines.append(f"Cameras left out: no figures, since {found['holdout_reason']}.")
+        lines.append(f"Cameras left out: no scores: {found['holdout_reason']}.")
     return lines
 
 
-def is_rows(value: Any) -> bool:
-    """Whether values are dicts of plain values: rows of a table."""
+def is_table_rows(value: Any) -> bool:
+    """Return whether values are dicts of plain values, which a table can show as rows."""
     if not isinstance(value, Collection) or isinstance(value, str | Mapping) or not value:
         return False
     return all(isinstance(row, dict) and not any(isinstance(cell, dict) for cell in row.values()) for row in value)
 
 
 def readable(value: Any) -> str:
-    """A scalar, or a list of scalars, in few characters."""
+    """Format a scalar, or a list of scalars, in few characters."""
     if value is None:
         return "–"
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""Which images of a capture are rendered, under which split, and where they lie."""
+"""The images of a capture that evaluation renders, by split, and the paths of their renderings."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,9 +8,9 @@ from hnerf.evenly_spaced import evenly_spaced
 
 NOVEL_VIEW = "novel_view"
 ANIMATED, POSED, TRACKED = "novel_pose", "novel_pose_posed", "novel_pose_tracked"  # hnerf/evaluation/columns.py
-NEW_POSES = (ANIMATED, POSED, TRACKED)
-SPLITS = (NOVEL_VIEW, *NEW_POSES)
-PRIMARY = (NOVEL_VIEW, ANIMATED)  # meshed, and what a camera that was left out is scored on
+NOVEL_POSE_SPLITS = (ANIMATED, POSED, TRACKED)
+SPLITS = (NOVEL_VIEW, *NOVEL_POSE_SPLITS)
+PRIMARY_SPLITS = (NOVEL_VIEW, ANIMATED)  # the splits that are meshed, and that held-out cameras are scored on
 TRAINING_VIEW = "training_view"  # shown in the report, never scored
 
 
@@ -23,31 +23,32 @@ class View:
     frame: int
 
     def path(self, out: Path) -> Path:
-        """Its rendering below the evaluation folder."""
+        """Return the path of its rendering below the evaluation folder."""
         return out / "renders" / self.split / self.camera / f"{self.frame:06d}.png"
 
 
 def split_frames(capture: Capture, split: str) -> tuple[int, ...]:
-    """The frames whose poses a split is about; novel_view and the training views are about the training frames."""
-    return capture.novel_pose_frames if split in NEW_POSES else capture.train_frames
+    """Return the frames whose poses a split shows: novel-pose frames, or the training frames for novel_view and
+    training views."""
+    return capture.novel_pose_frames if split in NOVEL_POSE_SPLITS else capture.train_frames
 
 
 def split_cameras(capture: Capture, split: str) -> tuple[str, ...]:
-    """The cameras a split is seen from: test cameras; where there are none, new poses from the training cameras, for
-    people to look at."""
-    if split == TRAINING_VIEW or (split in NEW_POSES and not capture.test_cameras):
+    """Return the cameras of a split: the test cameras. A capture without any shows novel poses from its training
+    cameras, for inspection only."""
+    if split == TRAINING_VIEW or (split in NOVEL_POSE_SPLITS and not capture.test_cameras):
         return capture.train_cameras
     return capture.test_cameras
 
 
 def all_views(capture: Capture, split: str) -> list[View]:
-    """Every image of a split."""
+    """Return every image of a split."""
     return [View(split, c, f) for c in split_cameras(capture, split) for f in split_frames(capture, split)]
 
 
-def some_views(views: list[View], count: int) -> list[View]:
-    """At most `count` of a split's images: frames spread over the recording, the cameras in turn; where there are fewer
-    frames than that, spread over all images."""
+def sample_views(views: list[View], count: int) -> list[View]:
+    """Return at most `count` of a split's images: frames evenly spaced over the recording, the cameras in turn; if
+    there are fewer frames, evenly spaced over all images."""
     frames = sorted({view.frame for view in views})
     if len(frames) < count:
         return evenly_spaced(views, count)

@@ -1,4 +1,4 @@
-"""Poses to show an avatar in: another motion on this body, and what lies between two poses. A motion is a BodyFit."""
+"""Poses to render an avatar in: motions of other subjects or AMASS files, and interpolation between two poses."""
 
 import dataclasses
 import re
@@ -20,7 +20,7 @@ from hnerf.capture.safe_io import ARRAY_FILE_ERRORS
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
 
-AMASS_WIDTHS = (72, 156, 165)  # numbers a pose of SMPL, SMPL-H and SMPL-X; the first 22 joints are the same
+AMASS_WIDTHS = (72, 156, 165)  # pose parameters of SMPL, SMPL-H and SMPL-X, which share their first 22 joints
 AMASS_RATES = ("mocap_framerate", "mocap_frame_rate")
 BODY_JOINTS = 22
 DEFAULT_FPS = 30.0
@@ -29,7 +29,8 @@ MAX_FPS = 10_000.0
 
 @dataclass(frozen=True)
 class Motion:
-    """body: poses on the rig that they were made for; fps: of its frames; up: "y" or "z", its world's vertical axis."""
+    """A motion to show. body: its poses, on the rig that they were made for; fps: frames per second; up: the vertical
+    axis of its world, "y" or "z"."""
 
     body: BodyFit
     fps: float
@@ -37,25 +38,27 @@ class Motion:
 
 
 def read_motion(path: Path, frames: str = ":") -> Motion:
-    """Frames (see `select`) of another subject, by its folder with capture and training or fit, or of an AMASS .npz.
+    """Read a motion: frames (see `select_frames`) of another subject's folder, which holds a capture and a training or
+    fit, or of an AMASS .npz file.
 
-    AMASS poses are SMPL's, told to the joints of anny's average body; fingers and toes stay at rest.
-    Raises InputError where there is no motion, or not these frames.
+    AMASS poses are SMPL's; they are converted to the joints of anny's average body, with fingers and toes at rest.
+    Raises InputError if there is no motion or it lacks these frames.
     """
     if path.is_dir():
         return _subject_motion(path, frames)
     given, fps = _read_amass(path)
-    chosen = list(select(tuple(range(len(given.theta))), frames, path))
+    chosen = list(select_frames(tuple(range(len(given.theta))), frames, path))
     given = dataclasses.replace(given, theta=given.theta[chosen], root=given.root[chosen])
     pose = initial_pose_from_given(given, body_model(FitSettings()))
     rig = pose.rig.to(dtype=torch.float32)
     return Motion(BodyFit(rig, tuple(chosen), pose.theta.float(), pose.root.float()), fps, "z")
 
 
-def select(frames: tuple[int, ...], wanted: str, source: Path) -> tuple[int, ...]:
-    """Those of some frame numbers that `wanted` names: "12", or "FIRST:END:STEP" with END left out, like a slice.
+def select_frames(frames: tuple[int, ...], wanted: str, source: Path) -> tuple[int, ...]:
+    """Return those of `frames` that `wanted` selects: one number like "12", or "FIRST:END:STEP" as in a Python slice,
+    END excluded.
 
-    Raises InputError, naming the source, where there is none.
+    Raises InputError, naming `source`, if the selection is malformed or empty.
     """
     if not re.fullmatch(r"\d+|\d*:\d*(:[1-9]\d*)?", wanted):
         raise InputError(f"frames {wanted}: give a number like 12, or FIRST:END:STEP like 0:24:2")
@@ -67,38 +70,43 @@ def select(frames: tuple[int, ...], wanted: str, source: Path) -> tuple[int, ...
     return chosen
 
 
-def rows(body: BodyFit, frames: tuple[int, ...]) -> BodyFit:
-    """The poses of some frames alone."""
+def select_poses(body: BodyFit, frames: tuple[int, ...]) -> BodyFit:
+    """Return the body with the poses of these frames only."""
     index = [body.index(frame) for frame in frames]
     return dataclasses.replace(body, frames=frames, theta=body.theta[index], root=body.root[index])
 
 
-def adopted(own: BodyFit, motion: Motion, up: str) -> BodyFit:
-    """The motion on the body of `own`: joints of the same names turn alike.
+def retarget(own: BodyFit, motion: Motion, up: str) -> BodyFit:
+    """Return the motion's poses on the rig of `own`, with the rotations of joints matched by name.
 
-    The motion's middle comes where that of `own` is, and its floor, the lowest point of all its frames, onto the
-    lowest point of `own`; in each frame the lowest point of this body is as high above the floor as that of the body
-    that the motion came with. `up`: the vertical axis of the world of `own`. Raises InputError where a joint is
-    missing.
+    The motion is moved so that its mean pelvis position coincides with that of `own`, and its floor, the lowest point
+    of all its frames, with the lowest point of `own`. In each frame the lowest point keeps the height above the floor
+    that it had on the motion's own body. `up`: the vertical axis of the world of `own`. Raises InputError if the motion
+    lacks a joint.
     """
     other, names = motion.body, motion.body.rig.joint_names
     theta = torch.zeros(len(other.frames), len(own.rig.joint_names), 3)
     for j in own.rig.free.nonzero()[:, 0].tolist():
         if own.rig.joint_names[j] not in names:
-            raise InputError(f"motion: has no joint {own.rig.joint_names[j]}; take one fitted with this body model")
+            raise InputError(
+                f"motion: has no joint {own.rig.joint_names[j]}; use one that was fitted with this body model"
+            )
         theta[:, j] = other.theta[:, names.index(own.rig.joint_names[j])]
     turn = torch.eye(4)
-    turn[:3, :3] = _upright(motion.up, up)
+    turn[:3, :3] = _rotation_between_up_axes(motion.up, up)
     placed = BodyFit(own.rig, other.frames, theta, turn @ other.root)
     apart_m = _pelvis_m(own).mean(0) - _pelvis_m(placed).mean(0)
     lowest_m = lowest_points_m(other, motion.up)
-    return lifted(_moved(placed, apart_m), lowest_m - lowest_m.min() + lowest_points_m(own, up).min(), up)
+    return set_lowest_points(
+        _translated(placed, apart_m), lowest_m - lowest_m.min() + lowest_points_m(own, up).min(), up
+    )
 
 
-def between(body: BodyFit, first: int, last: int, count: int) -> BodyFit:
-    """`count` poses from frame `first` to frame `last`, both among them; numbered from 0.
+def interpolate_poses(body: BodyFit, first: int, last: int, count: int) -> BodyFit:
+    """Return `count` poses from frame `first` to frame `last` of the body, both included, numbered from 0.
 
-    Every joint and the root turn evenly about one axis (Shoemake 1985), the root moves on a straight line.
+    Joint and root rotations are interpolated at constant angular velocity (slerp, Shoemake 1985), the root's position
+    linearly.
     """
     a, b = body.index(first), body.index(last)
     share = np.linspace(0, 1, count)
@@ -112,18 +120,18 @@ def between(body: BodyFit, first: int, last: int, count: int) -> BodyFit:
 
 
 def lowest_points_m(body: BodyFit, up: str) -> Tensor:
-    """Height (n,) of each pose's lowest vertex, along the world's axis `up`."""
-    poses = zip(body.theta, body.root, strict=True)  # one at a time: all at once fill the memory
+    """Return the height (n,) of each pose's lowest vertex along the world's axis `up`."""
+    poses = zip(body.theta, body.root, strict=True)  # one at a time: all vertices at once would fill the memory
     return torch.stack([pose_vertices(body.rig, *pose)[:, "xyz".index(up)].min() for pose in poses])
 
 
-def lifted(body: BodyFit, heights_m: Tensor, up: str) -> BodyFit:
-    """The same poses, moved along the axis `up` until their lowest vertices are at `heights_m` (n,)."""
+def set_lowest_points(body: BodyFit, heights_m: Tensor, up: str) -> BodyFit:
+    """Return the same poses, translated along the axis `up` so that their lowest vertices are at `heights_m` (n,)."""
     move_m = (heights_m - lowest_points_m(body, up))[:, None] * torch.eye(3)["xyz".index(up)]
-    return _moved(body, move_m)
+    return _translated(body, move_m)
 
 
-def _moved(body: BodyFit, move_m: Tensor) -> BodyFit:
+def _translated(body: BodyFit, move_m: Tensor) -> BodyFit:
     root = body.root.clone()
     root[:, :3, 3] += move_m
     return dataclasses.replace(body, root=root)
@@ -133,8 +141,8 @@ def _pelvis_m(body: BodyFit) -> Tensor:
     return joint_transforms(body.rig, body.theta, body.root)[:, 0, :3, 3]
 
 
-def _upright(from_up: str, to_up: str) -> Tensor:
-    """Rotation (3, 3) of one world's vertical axis into the other's, about x."""
+def _rotation_between_up_axes(from_up: str, to_up: str) -> Tensor:
+    """Return the rotation (3, 3) about x that takes one world's vertical axis to the other's."""
     quarter = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # y to z
     if from_up == to_up:
         return torch.eye(3)
@@ -146,17 +154,18 @@ def _subject_motion(folder: Path, frames: str) -> Motion:
     if not found or not (folder / "capture" / "capture.json").is_file():
         raise InputError(f"{folder}: holds no fitted body; give <store>/subjects/<name> or an AMASS .npz")
     body, capture = BodyFit.load(found[0]), Capture.load(folder / "capture")
-    return Motion(rows(body, select(body.frames, frames, folder)), capture.fps, capture.up)
+    return Motion(select_poses(body, select_frames(body.frames, frames, folder)), capture.fps, capture.up)
 
 
 def _read_amass(path: Path) -> tuple[GivenPoses, float]:
-    """SMPL's parameters of an AMASS file (Mahmood et al. 2019), with its frames per second; Z is up."""
+    """Read the SMPL parameters of an AMASS file (Mahmood et al. 2019), whose Z axis is up, and its frames per
+    second."""
     keys = ("poses", "trans", *AMASS_RATES)
     try:
         with np.load(path, allow_pickle=False) as stored:
             found = {key: np.asarray(stored[key], np.float64) for key in keys if key in stored}
     except ARRAY_FILE_ERRORS:
-        raise InputError(f"{path}: is no .npz of plain arrays; give an AMASS file or a subject's folder") from None
+        raise InputError(f"{path}: not an .npz of plain arrays; give an AMASS file or a subject's folder") from None
     poses, trans = found.get("poses", np.zeros(0)), found.get("trans", np.zeros(0))
     known = poses.ndim == 2 and poses.shape[1] in AMASS_WIDTHS and trans.shape == (len(poses), 3) and len(poses) > 0
     if not known or not (np.isfinite(poses).all() and np.isfinite(trans).all()):

@@ -1,4 +1,5 @@
-"""What an avatar looks like, written as files: colour, depth, normals, mask and mesh of every shot, and videos."""
+"""Renderings of an avatar as files: colour, depth, normals, mask and mesh of each shot, and a video of each kind of
+image."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -19,24 +20,24 @@ from hnerf.geometry.camera import Camera
 from hnerf.progress import tracked
 
 COVERED = 0.5  # alpha from which a pixel has a depth and a normal
-NEAREST, FARTHEST = 255, 64  # greys of a depth video
+NEAR_GREY, FAR_GREY = 255, 64  # grey levels at the ends of a depth video's range
 NORMAL_STEP_M = 0.003
 TETRAHEDRON = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
-Shot = tuple[Camera, int]  # and the frame of avatar.body whose pose is shown
+Shot = tuple[Camera, int]  # a camera, and the frame of avatar.body whose pose is shown
 
 
 def write_pictures(avatar: Avatar, shots: Sequence[Shot], what: Sequence[str], fps: float, out: Path) -> None:
-    """`<kind>/<number>.png` (`.ply` for mesh) of every shot, for each kind in `what`; and each kind's images
+    """Write `<kind>/<number>.png` (`.ply` for mesh) for every shot and each kind in `what`, and the images of each kind
     as `<kind>.mp4`.
 
-    colour: 8-bit over black. mask: coverage, 0 to 255. depth: 16-bit, millimetres along the viewing axis, 0 where
-    there is nobody. normals: 8-bit, (n + 1) / 2 with x right, y up, z towards the camera, black where there is nobody.
-    mesh: the surface in world metres. The video of depths is grey: `read_depth_grey`.
+    colour: 8-bit over black. mask: coverage, 0 to 255. depth: 16-bit, millimetres along the viewing axis, 0 off the
+    person. normals: 8-bit, (n + 1) / 2 with x right, y up, z towards the camera, black off the person. mesh: the
+    surface in world metres. The depth video is greyscale: see `read_depth_grey`.
     """
     for kind in what:
         (out / kind).mkdir(parents=True)
     for number, shot in enumerate(tracked(shots, "rendering", len(shots))):
-        images = _images(avatar, shot, what)
+        images = _render_kinds(avatar, shot, what)
         for kind, image in images.items():
             write_image(out / kind / f"{number:06d}.png", image)
         if "mesh" in what:
@@ -47,11 +48,11 @@ def write_pictures(avatar: Avatar, shots: Sequence[Shot], what: Sequence[str], f
 
 
 def write_video(folder: Path, fps: float, path: Path, read: Callable[[Path], np.ndarray] = read_rgb) -> None:
-    """The PNG files of a folder, in order, as an MPEG-4 video; `read` gives (H, W, 3) uint8 RGB of each. Raises OSError
-    unless all can be read back."""
+    """Encode the PNG files of a folder, in order, as an MPEG-4 video; `read` loads each as (H, W, 3) uint8 RGB. Raises
+    OSError if not all frames can be read back."""
     files = sorted(folder.glob("*.png"))
     height_px, width_px = read(files[0]).shape[:2]
-    fps = round(fps, max(0, int(math.log10(65535 / fps))))  # MPEG-4 counts time in parts of at most 1/65535 s
+    fps = round(fps, max(0, int(math.log10(65535 / fps))))  # MPEG-4's clock has at most 65535 ticks a second
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width_px, height_px))
     for file in files:
         writer.write(cv2.cvtColor(read(file), cv2.COLOR_RGB2BGR))
@@ -62,24 +63,25 @@ def write_video(folder: Path, fps: float, path: Path, read: Callable[[Path], np.
 
 
 def depth_span_mm(folder: Path) -> tuple[int, int]:
-    """Nearest and farthest millimetre of the person in a folder's depth images; 65535, 0 where there is nobody."""
+    """Return the smallest and largest depth of the person in a folder's depth images, in mm; (65535, 0) if no image
+    shows the person."""
     depths_mm = (np.array(Image.open(file)) for file in folder.glob("*.png"))
     spans_mm = [(d.min(where=d > 0, initial=65535), d.max()) for d in depths_mm]
     return min(int(near) for near, _ in spans_mm), max(int(far) for _, far in spans_mm)
 
 
 def read_depth_grey(path: Path, span_mm: tuple[int, int]) -> np.ndarray:
-    """(H, W, 3) uint8 of a depth image: white at the near end of the span, dark at the far end, linear between, black
-    where there is nobody."""
+    """Read a depth image as greyscale (H, W, 3) uint8: white at the near end of the span, dark at the far end, linear
+    in between, black off the person."""
     depth_mm = np.array(Image.open(path))
     near_mm, far_mm = span_mm
     away = (depth_mm.astype(np.float32) - near_mm) / max(far_mm - near_mm, 1)
-    grey = np.where(depth_mm > 0, NEAREST + (FARTHEST - NEAREST) * away, 0)
+    grey = np.where(depth_mm > 0, NEAR_GREY + (FAR_GREY - NEAR_GREY) * away, 0)
     return grey.round().astype(np.uint8)[..., None].repeat(3, -1)
 
 
 def depth_image(rendering: Rendering, camera: Camera) -> Tensor:
-    """(H, W) uint16 millimetres along the viewing axis, from a rendering's depths along its rays."""
+    """Return depths along the viewing axis, (H, W) uint16 in mm, from a rendering's depths along its rays."""
     _, directions = camera.rays(_pixels(camera))
     ahead = torch.from_numpy(directions @ camera.forward).to(rendering.depth_m)
     return (1000 * rendering.depth_m * ahead * (rendering.alpha > COVERED)).round().clamp(0, 65535).to(torch.uint16)
@@ -87,8 +89,8 @@ def depth_image(rendering: Rendering, camera: Camera) -> Tensor:
 
 @torch.no_grad()
 def normal_image(avatar: Avatar, rendering: Rendering, camera: Camera, theta: Tensor, root: Tensor) -> Tensor:
-    """(H, W, 3) uint8 normals as `write_pictures` tells: the gradient of the signed distance where rays end, by
-    differences at the corners of a tetrahedron."""
+    """Return surface normals as an image (H, W, 3) uint8, encoded as in `write_pictures`: the gradient of the signed
+    distance where rays end, by finite differences at the corners of a tetrahedron."""
     covered = rendering.alpha > COVERED
     origins, directions = (torch.from_numpy(a.copy()).to(rendering.depth_m) for a in camera.rays(_pixels(camera)))
     points_m = origins[covered] + rendering.depth_m[covered][:, None] * directions[covered]
@@ -101,8 +103,8 @@ def normal_image(avatar: Avatar, rendering: Rendering, camera: Camera, theta: Te
     return image
 
 
-def _images(avatar: Avatar, shot: Shot, what: Sequence[str]) -> dict[str, np.ndarray]:
-    """The asked kinds that are images, grey or RGB."""
+def _render_kinds(avatar: Avatar, shot: Shot, what: Sequence[str]) -> dict[str, np.ndarray]:
+    """Render a shot once and return the requested kinds that are images, greyscale or RGB."""
     camera, frame = shot
     row = avatar.body.index(frame)
     theta, root = avatar.body.theta[row], avatar.body.root[row]
@@ -119,5 +121,5 @@ def _images(avatar: Avatar, shot: Shot, what: Sequence[str]) -> dict[str, np.nda
 
 
 def _pixels(camera: Camera) -> np.ndarray:
-    """(H, W, 2) x and y of every pixel."""
+    """Return x and y of every pixel, (H, W, 2)."""
     return np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), -1).astype(np.float64)

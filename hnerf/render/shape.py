@@ -1,4 +1,4 @@
-"""The same avatar on another body: shape values changed, or more or less volume."""
+"""Body shape editing: the avatar's rig with changed shape values or another volume."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -11,52 +11,55 @@ from torch import Tensor
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
 from hnerf.errors import InputError
-from hnerf.render.motion import lifted, lowest_points_m
+from hnerf.render.motion import lowest_points_m, set_lowest_points
 
-FOLDED_SHARE = 0.005  # of the triangles that may turn over before a shape is refused; half a per cent is not seen
-THICKER = -0.9, 2.0  # shares of the way from the bones to the skin that may be added
-AS_THICK = "neck", "wrist", "foot"  # in names of joints whose parts, with all below them, stay: head, hands, feet
+MAX_FOLDED_SHARE = 0.005  # of the triangles; half a per cent turned over is not visible
+THICKNESS_RANGE = -0.9, 2.0  # allowed change of thickness, as a share of the distance from bone to skin
+# Head, hands and feet: the skin of joints whose names contain these, and of all joints below, keeps its thickness.
+UNSCALED_PARTS = "neck", "wrist", "foot"
 
 
-def with_values(rig: Rig, changes: Mapping[str, float]) -> Rig:
-    """The rig with these amounts added to shape values of these names, to first order around the fitted shape.
+def with_shape_values(rig: Rig, changes: Mapping[str, float]) -> Rig:
+    """Return the rig with these amounts added to its shape values of these names, to first order around the fitted
+    shape.
 
-    Raises InputError for a value that the rig has not, and where the skin would fold over.
+    Raises InputError if the rig has no such value, or if the skin would fold over.
     """
     beta = rig.beta.clone()
     for name, change in changes.items():
         if name not in rig.beta_names:
             raise InputError(f"shape {name}: this body's values are {', '.join(rig.beta_names)}")
         beta[rig.beta_names.index(name)] += change
-    message = ", ".join(f"{name} {change:+.2f}" for name, change in changes.items())
-    return _unfolded(rig.reshaped(beta), rig, f"shape {message}")
+    title = ", ".join(f"{name} {change:+.2f}" for name, change in changes.items())
+    return _require_unfolded(rig.reshaped(beta), rig, f"shape {title}")
 
 
 def with_volume(rig: Rig, change: float) -> Rig:
-    """The rig with another volume at rest: -0.4 is 40 % less. Trunk and limbs get thicker or thinner about their bones.
+    """Return the rig with its volume at rest changed by a share: -0.4 is 40 % less. Trunk and limbs get thicker or
+    thinner about their bones.
 
-    Raises InputError where the change is out of reach, and where the skin would fold over.
+    Raises InputError if no thickness gives that volume, or if the skin would fold over.
     """
-    wanted_m3, outwards_m = (1 + change) * volume_m3(rig), outwards(rig)
+    wanted_m3, offsets_m = (1 + change) * volume_m3(rig), offsets_from_bones_m(rig)
 
     def thicker(share: float) -> Rig:
-        return dataclasses.replace(rig, vertices_m=rig.vertices_m + share * outwards_m)
+        return dataclasses.replace(rig, vertices_m=rig.vertices_m + share * offsets_m)
 
     def missing_m3(share: float) -> float:
         return volume_m3(thicker(share)) - wanted_m3
 
-    message = f"volume {100 * change:+.0f} %"
-    if not missing_m3(THICKER[0]) < 0 < missing_m3(THICKER[1]):
-        raise InputError(f"{message}: out of this body's reach; ask for a smaller change")
-    return _unfolded(thicker(brentq(missing_m3, *THICKER, xtol=1e-4)), rig, message)
+    title = f"volume {100 * change:+.0f} %"
+    if not missing_m3(THICKNESS_RANGE[0]) < 0 < missing_m3(THICKNESS_RANGE[1]):
+        raise InputError(f"{title}: cannot be reached with this body; ask for a smaller change")
+    return _require_unfolded(thicker(brentq(missing_m3, *THICKNESS_RANGE, xtol=1e-4)), rig, title)
 
 
-def outwards(rig: Rig) -> Tensor:
-    """(V, 3) metres: from the nearest points of the bones that carry a vertex to it, blended by its skin weights; zero
-    for head, hands and feet. A bone reaches from its joint to the joints below."""
+def offsets_from_bones_m(rig: Rig) -> Tensor:
+    """Return the offset (V, 3) in metres from the nearest points of the bones that carry a vertex to it, blended by its
+    skin weights; zero on head, hands and feet. A bone reaches from its joint to the joint's children."""
     moved_m, parents, stays = torch.zeros_like(rig.vertices_m), rig.parents.tolist(), set()
     for joint, parent in enumerate(parents):
-        if parent in stays or any(part in rig.joint_names[joint] for part in AS_THICK):
+        if parent in stays or any(part in rig.joint_names[joint] for part in UNSCALED_PARTS):
             stays.add(joint)
             continue
         start_m = rig.joints_m[joint]
@@ -71,21 +74,22 @@ def outwards(rig: Rig) -> Tensor:
 
 
 def volume_m3(rig: Rig) -> float:
-    """Volume of the body at rest."""
+    """Return the volume of the body at rest."""
     return float(trimesh.Trimesh(rig.vertices_m.numpy(), rig.faces.numpy(), process=False).volume)
 
 
-def worn_by(rig: Rig, body: BodyFit, up: str) -> BodyFit:
-    """The poses of `body` on a reshaped rig, every lowest point as high as before along the world's axis `up`."""
-    return lifted(BodyFit(rig, body.frames, body.theta, body.root), lowest_points_m(body, up), up)
+def transfer_poses(rig: Rig, body: BodyFit, up: str) -> BodyFit:
+    """Return the poses of `body` on a reshaped rig, each with its lowest point as high as before along the world's axis
+    `up`."""
+    return set_lowest_points(BodyFit(rig, body.frames, body.theta, body.root), lowest_points_m(body, up), up)
 
 
-def _unfolded(shaped: Rig, rig: Rig, message: str) -> Rig:
-    """`shaped`; InputError, after `message`, if too much of its skin has turned over."""
-    upright = (_normals(shaped) * _normals(rig)).sum(1) >= 0  # not so where a value is not a number
+def _require_unfolded(shaped: Rig, rig: Rig, title: str) -> Rig:
+    """Return `shaped`; raise InputError, starting with `title`, if too many of its triangles have turned over."""
+    upright = (_normals(shaped) * _normals(rig)).sum(1) >= 0  # False where a value is NaN
     folded = float((~upright).float().mean())
-    if folded > FOLDED_SHARE:
-        raise InputError(f"{message}: folds {100 * folded:.1f} % of the skin over; ask for a smaller change")
+    if folded > MAX_FOLDED_SHARE:
+        raise InputError(f"{title}: folds {100 * folded:.1f} % of the skin over; ask for a smaller change")
     return shaped
 
 

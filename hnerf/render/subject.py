@@ -1,4 +1,4 @@
-"""A trained subject seen as asked: from where, in which poses, on which body, and what of it."""
+"""Render a trained subject: camera path, poses, body shape and the kinds of image to write."""
 
 import dataclasses
 import itertools
@@ -17,24 +17,25 @@ from hnerf.capture.timing import median_step
 from hnerf.errors import InputError
 from hnerf.files import atomic_folder
 from hnerf.geometry.camera import Camera
-from hnerf.render.motion import Motion, adopted, between, read_motion, rows, select
+from hnerf.render.motion import Motion, interpolate_poses, read_motion, retarget, select_frames, select_poses
 from hnerf.render.pictures import Shot, write_pictures
-from hnerf.render.shape import with_values, with_volume, worn_by
-from hnerf.render.trajectory import along, orbit, read_path
+from hnerf.render.shape import transfer_poses, with_shape_values, with_volume
+from hnerf.render.trajectory import interpolate_cameras, orbit, read_camera_path
 
-KINDS = ("colour", "depth", "normals", "mask", "mesh")
-ORBIT_PICTURES = 60  # of somebody who stands still
-MIN_SIZE_PX, MAX_SIZE_PX = 2, 8000  # a square video of either can still be read back
+OUTPUT_KINDS = ("colour", "depth", "normals", "mask", "mesh")
+ORBIT_PICTURES = 60  # if there is one pose only
+MIN_SIZE_PX, MAX_SIZE_PX = 2, 8000  # square videos of either size can be read back
 
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What to show; the defaults turn round the person through all fitted frames.
+    """Options of a rendering; by default a camera orbits the person through all fitted frames.
 
-    camera: a recorded camera's name; path: a file or folder of cameras to fly along (`read_path`); neither: an orbit
-    of this radius and height over the person's middle, in metres (`orbit`). motion: another subject's folder, or an
-    AMASS file (`read_motion`); frames: which (`select`); between: two frames to interpolate. shape: amounts added to
-    shape values; volume: relative change. what: of KINDS. size_px: the longest side of images. pictures: how many.
+    camera: a recorded camera's name; path: a file or folder of cameras to fly along (`read_camera_path`); with neither,
+    the camera orbits at this radius and at this height above the person's centre, in metres (`orbit`). motion: another
+    subject's folder, or an AMASS file (`read_motion`); frames: which of its frames (`select_frames`); between: two
+    frames to interpolate between. shape: amounts added to shape values; volume: relative change. what: of OUTPUT_KINDS.
+    size_px: the longest side of images. pictures: number of images.
     """
 
     camera: str | None = None
@@ -52,12 +53,12 @@ class RenderOptions:
 
 
 def render_subject(subject: Path, options: RenderOptions, out: Path) -> int:
-    """Write what is wished of a subject (<store>/subjects/<name>) into the new folder `out`; how many pictures.
+    """Render a subject (<store>/subjects/<name>) into the new folder `out`; return the number of pictures.
 
-    See `write_pictures` for the files. Raises InputError for a options that cannot be met.
+    See `write_pictures` for the files. Raises InputError for options that cannot be met.
     """
     with atomic_folder(out) as partial:
-        capture = _checked(subject, options)
+        capture = _checked_capture(subject, options)
         motion = _motion(subject, options, capture)
         cameras = _cameras(options, capture, motion.body)
         shots: list[Shot] = list(zip(cameras, itertools.cycle(motion.body.frames), strict=False))
@@ -66,43 +67,44 @@ def render_subject(subject: Path, options: RenderOptions, out: Path) -> int:
     return len(shots)
 
 
-def _checked(subject: Path, options: RenderOptions) -> Capture:
-    """The subject's capture through its calibrated cameras; InputError for what is plainly wrong."""
+def _checked_capture(subject: Path, options: RenderOptions) -> Capture:
+    """Return the subject's capture with its calibrated cameras; raise InputError if files are missing or options are
+    invalid."""
     for file in ("capture/capture.json", "calibration/intri.yml", "training/model.safetensors"):
         if not (subject / file).is_file():
             raise InputError(f"{subject / file}: missing; give <store>/subjects/<name> of a finished `hnerf run`")
-    unknown = [kind for kind in options.what if kind not in KINDS]
+    unknown = [kind for kind in options.what if kind not in OUTPUT_KINDS]
     if unknown or not options.what:
-        raise InputError(f"what {','.join(unknown)}: choose from {', '.join(KINDS)}")
+        raise InputError(f"what {','.join(unknown)}: choose from {', '.join(OUTPUT_KINDS)}")
     if (options.camera or options.path) and (options.radius_m is not None or options.height_m is not None):
-        raise InputError("--radius and --height are an orbit's; leave them out, or --camera and --path")
+        raise InputError("--radius and --height are for an orbit; omit them, or omit --camera and --path")
     if options.pictures is not None and options.pictures < 1:
         raise InputError(f"{options.pictures} pictures: give 1 or more")
     return load_cameras(subject / "calibration", Capture.load(subject / "capture"))
 
 
 def _motion(subject: Path, options: RenderOptions, capture: Capture) -> Motion:
-    """The poses to show, on the body to show."""
+    """Return the poses to show, on the body shape to show."""
     own = BodyFit.load(subject / "training")
     if options.motion is None:
-        motion = Motion(rows(own, select(own.frames, options.frames, subject)), capture.fps, capture.up)
+        motion = Motion(select_poses(own, select_frames(own.frames, options.frames, subject)), capture.fps, capture.up)
     else:
         motion = read_motion(options.motion, options.frames)
-        motion = dataclasses.replace(motion, body=adopted(own, motion, capture.up), up=capture.up)
+        motion = dataclasses.replace(motion, body=retarget(own, motion, capture.up), up=capture.up)
     body = motion.body
     fps = motion.fps / median_step(body.frames)
     if options.between is not None:
         for frame in options.between:
-            select(body.frames, str(frame), options.motion or subject)
-        body, fps = between(body, *options.between, options.pictures or ORBIT_PICTURES), motion.fps
+            select_frames(body.frames, str(frame), options.motion or subject)
+        body, fps = interpolate_poses(body, *options.between, options.pictures or ORBIT_PICTURES), motion.fps
     if options.shape or options.volume is not None:
-        rig = with_values(own.rig, options.shape)
-        body = worn_by(rig if options.volume is None else with_volume(rig, options.volume), body, capture.up)
+        rig = with_shape_values(own.rig, options.shape)
+        body = transfer_poses(rig if options.volume is None else with_volume(rig, options.volume), body, capture.up)
     return Motion(body, fps, capture.up)
 
 
 def _cameras(options: RenderOptions, capture: Capture, body: BodyFit) -> list[Camera]:
-    """One camera a picture."""
+    """Return one camera a picture."""
     recorded = [capture.cameras[name] for name in capture.train_cameras]
     poses = len(body.frames) if len(body.frames) > 1 else None
     if options.camera is not None:
@@ -110,28 +112,28 @@ def _cameras(options: RenderOptions, capture: Capture, body: BodyFit) -> list[Ca
             raise InputError(f"camera {options.camera}: the recording has {', '.join(capture.cameras)}")
         found = [capture.cameras[options.camera]] * (options.pictures or poses or 1)
     elif options.path is not None:
-        keys = read_path(options.path, capture.recorded_sizes_px[recorded[0].name])
-        found = along(keys, options.pictures or poses or len(keys))
+        keys = read_camera_path(options.path, capture.recorded_sizes_px[recorded[0].name])
+        found = interpolate_cameras(keys, options.pictures or poses or len(keys))
     else:
         count = options.pictures or poses or ORBIT_PICTURES
         found = orbit(recorded, _middle_m(body), count, capture.up, options.radius_m, options.height_m)
-    if options.camera is None:  # made after a recorded one, but not exposed as it is
+    if options.camera is None:  # derived from recorded cameras, but without their exposure
         found = [dataclasses.replace(camera, name="") for camera in found]
-    found = found if options.size_px is None else [_sized(camera, options.size_px) for camera in found]
-    width_px, height_px = found[0].width_px, found[0].height_px  # of all
+    found = found if options.size_px is None else [_resized(camera, options.size_px) for camera in found]
+    width_px, height_px = found[0].width_px, found[0].height_px  # the same for all cameras
     if min(width_px, height_px) < MIN_SIZE_PX or max(width_px, height_px) > MAX_SIZE_PX:
-        raise InputError(f"pictures of {width_px} x {height_px} px: a side has {MIN_SIZE_PX} to {MAX_SIZE_PX}")
+        raise InputError(f"pictures of {width_px} x {height_px} px: each side must have {MIN_SIZE_PX} to {MAX_SIZE_PX}")
     return found
 
 
 def _middle_m(body: BodyFit) -> np.ndarray:
-    """Middle (3,) of the box around all poses, world."""
+    """Return the centre (3,) of the box around all poses, in the world."""
     poses = (pose_vertices(body.rig, *pose) for pose in zip(body.theta, body.root, strict=True))
     corners_m = torch.stack([torch.stack([vertices_m.amin(0), vertices_m.amax(0)]) for vertices_m in poses])
     return (corners_m[:, 0].amin(0) + corners_m[:, 1].amax(0)).double().numpy() / 2
 
 
-def _sized(camera: Camera, size_px: int) -> Camera:
-    """The same view with `size_px` on its longest side."""
+def _resized(camera: Camera, size_px: int) -> Camera:
+    """Return the same view with `size_px` on its longest side."""
     scale = size_px / max(camera.width_px, camera.height_px)
     return camera.resized(max(1, round(scale * camera.width_px)), max(1, round(scale * camera.height_px)))

@@ -1,4 +1,4 @@
-"""Cameras that no recording had: on a circle round the person, or along a path between given cameras."""
+"""Camera trajectories: a circle around the person, or a smooth path through given cameras."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -24,11 +24,12 @@ def orbit(
     radius_m: float | None = None,
     height_m: float | None = None,
 ) -> list[Camera]:
-    """`count` cameras on a full level circle, counter-clockwise from above, that look at `target_m` (3,) world.
+    """Return `count` cameras on a full horizontal circle, counter-clockwise from above, that look at `target_m` (3,) in
+    the world.
 
-    The first has the lens and the bearing of cameras[0]. radius_m: horizontal distance from the target; height_m: over
-    the target, along the world's axis `up`; by default the mean of `cameras` each.
-    Raises InputError where the circle has no radius.
+    The first has the intrinsics and the bearing of cameras[0]. radius_m: horizontal distance from the target; height_m:
+    above the target, along the world's axis `up`; each defaults to the mean over `cameras`. Raises InputError if the
+    radius is not positive.
     """
     vertical = "xyz".index(up)
     axis = np.eye(3)[vertical]
@@ -38,7 +39,7 @@ def orbit(
     height_m = float(offsets_m[:, vertical].mean()) if height_m is None else height_m
     length_m = np.linalg.norm(level_m[0])
     if not (radius_m > 0 and length_m > 0 and np.isfinite([radius_m, height_m]).all()):
-        raise InputError(f"orbit of radius {radius_m:g} m, height {height_m:g} m: no circle; give a radius above 0")
+        raise InputError(f"orbit of radius {radius_m:g} m, height {height_m:g} m: not a circle; give a radius above 0")
     ahead = level_m[0] / length_m
     aside = np.cross(axis, ahead)
     turns = 2 * np.pi * np.arange(count) / count
@@ -46,11 +47,11 @@ def orbit(
     return [look_at(cameras[0], target_m + radius_m * b + height_m * axis, target_m, axis) for b in bearings]
 
 
-def along(cameras: Sequence[Camera], count: int) -> list[Camera]:
-    """`count` cameras from the first to the last through all others, at even steps of their number.
+def interpolate_cameras(cameras: Sequence[Camera], count: int) -> list[Camera]:
+    """Return `count` cameras from the first to the last through all others, at equal steps of the camera index.
 
     Centres run on a cubic spline, rotations on one with continuous angular acceleration (scipy's RotationSpline), K
-    changes evenly. All images have the first's size.
+    changes linearly. All images have the first camera's size.
     """
     if len(cameras) == 1:
         return list(cameras) * count
@@ -64,12 +65,12 @@ def along(cameras: Sequence[Camera], count: int) -> list[Camera]:
     ]
 
 
-def read_path(path: Path, size_px: tuple[int, int]) -> list[Camera]:
-    """The cameras of a path, in the file's order: a JSON list of {"K", "R", "t_m", "size_px"} (hnerf.geometry.camera's
-    conventions), or a folder in any layout that captures are read from.
+def read_camera_path(path: Path, size_px: tuple[int, int]) -> list[Camera]:
+    """Read the cameras of a path, in the file's order: a JSON list of {"K", "R", "t_m", "size_px"} (conventions of
+    hnerf.geometry.camera), or a folder in any layout that captures are read from.
 
-    size_px: (width, height) of images where the file does not say. Lens distortion is left out.
-    Raises InputError where the file holds no cameras, or cameras of several sizes.
+    size_px: (width, height) of images where the file does not say. Lens distortion is ignored. Raises InputError if
+    there are no cameras, or cameras of several image sizes.
     """
     if path.is_dir():
         lenses, metres_per_unit = list(recognise(path).lenses().values()), read_manifest(path).metres_per_unit
@@ -80,7 +81,9 @@ def read_path(path: Path, size_px: tuple[int, int]) -> list[Camera]:
     ]
     sizes = {(camera.width_px, camera.height_px) for camera in cameras}
     if len(sizes) != 1:
-        raise InputError(f"{path}: cameras of {len(sizes)} image sizes; a path needs one or more cameras of one size")
+        raise InputError(
+            f"{path}: has cameras of {len(sizes)} image sizes; a path needs one or more cameras, all of one size"
+        )
     return cameras
 
 

@@ -1,4 +1,4 @@
-"""The machine that figures were taken on."""
+"""The machine that measurements were taken on."""
 
 import os
 import platform
@@ -9,8 +9,8 @@ import torch
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores and how many of them torch uses, GPU (None where there is none), and the versions that speed
-    depends on."""
+    """Return the processor, its cores and how many of them torch uses, the GPU (None without one), and the versions
+    that speed depends on."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
@@ -24,7 +24,7 @@ def machine() -> dict[str, Any]:
     }
 
 
-def in_words(found: dict[str, Any]) -> str:
-    """The same as part of a sentence."""
+def describe_machine(found: dict[str, Any]) -> str:
+    """Describe a result of `machine` as part of a sentence."""
     cores, gpu = f"{found['threads']} of {found['cores']} cores", found["gpu"] or "no GPU"
     return f"{found['cpu']}, {cores}, {gpu}, torch {found['torch']}, Python {found['python']}"

@@ -1,4 +1,4 @@
-"""Whether a reconstructed surface is a person's: closed, and as large as the body in it."""
+"""Check of a reconstructed surface: whether it is closed and about as large as the body in it."""
 
 from dataclasses import dataclass
 
@@ -11,17 +11,17 @@ from hnerf.avatar.surface import surface_in_pose
 from hnerf.body.rig import pose_vertices
 from hnerf.errors import InputError
 
-CELLS = 128  # on the longest side: enough to see a hole of a finger's width
-# Of the body's own. Clothes and hair add up to a half of its volume; what is worn over the head or held, some height. A
-# person without legs loses a third of the volume and half of the length; a shell or a limb alone, more.
-VOLUMES = 0.7, 1.8
-LENGTHS = 0.8, 1.25
+CELLS = 128  # on the longest side: enough to resolve a hole of a finger's width
+# Shares of the body's own. Clothes and hair add up to half of its volume; hats or held objects add some height. A
+# person without legs loses a third of the volume and half of the length; a mere shell or limb loses more.
+VOLUME_RANGE = 0.7, 1.8
+LENGTH_RANGE = 0.8, 1.25
 
 
 @dataclass(frozen=True)
 class SurfaceCheck:
-    """fault: what is wrong with a surface in one line, None if nothing; volume and length (the longest side of the box
-    around it) as shares of the body's, None where there is no surface."""
+    """The result of a check. fault: what is wrong with the surface, in one line, None if nothing; volume and length
+    (the longest side of the bounding box) as shares of the body's, None if there is no surface."""
 
     fault: str | None
     volume: float | None = None
@@ -29,18 +29,18 @@ class SurfaceCheck:
 
 
 def check_surface(mesh: trimesh.Trimesh, body_m: np.ndarray, faces: np.ndarray) -> SurfaceCheck:
-    """Judge a surface, the largest component that was found, by the posed body: vertices (V, 3) and faces (F, 3)."""
+    """Compare a surface, its largest component, with the posed body: vertices (V, 3) and faces (F, 3)."""
     body = trimesh.Trimesh(body_m, faces, process=False)
     volume, length = float(mesh.volume / body.volume), float(mesh.extents.max() / body.extents.max())
     fault = None if mesh.is_watertight else "surface is not watertight"
-    for name, value, (low, high) in (("volume", volume, VOLUMES), ("length", length, LENGTHS)):
+    for name, value, (low, high) in (("volume", volume, VOLUME_RANGE), ("length", length, LENGTH_RANGE)):
         if not low <= value <= high:
             fault = fault or f"surface has {value:.2f} of the body's {name}"
     return SurfaceCheck(fault, volume, length)
 
 
 def check_pose(avatar: Avatar, theta: Tensor, root: Tensor) -> SurfaceCheck:
-    """Judge the avatar's surface in a pose theta (J, 3), root (4, 4)."""
+    """Check the avatar's surface in a pose theta (J, 3), root (4, 4)."""
     try:
         mesh = surface_in_pose(avatar, theta, root, CELLS)
     except InputError as error:

@@ -16,7 +16,8 @@ FRAMES = (3, 4, 5, 8)  # with a gap
 
 
 def column_rig() -> Rig:
-    """Radius 15 cm, z from 0 to 1.6 m; joints at z = 0 and z = 0.8; the upper's weight rises from z = 0.7 to 0.9."""
+    """Return a column of radius 15 cm, z from 0 to 1.6 m; joints at z = 0 and z = 0.8; the upper's weight rises from z
+    = 0.7 to 0.9."""
     column = upright_column(0.15, 0.0, 1.6)
     vertices_m = torch.from_numpy(column.vertices).float()
     upper = upper_weight(vertices_m[:, 2])
@@ -38,18 +39,18 @@ def column_rig() -> Rig:
 
 
 def upright_column(radius_m: float, bottom_m: float, top_m: float) -> trimesh.Trimesh:
-    """A closed column around the z axis, in sixteen storeys of 24 sides."""
+    """Return a closed column around the z axis, in sixteen storeys of 24 sides."""
     rings = [[radius_m, z] for z in np.linspace(bottom_m, top_m, 17)]
     return trimesh.creation.revolve([[0, bottom_m], *rings, [0, top_m]], sections=24)
 
 
 def upper_weight(z_m: torch.Tensor) -> torch.Tensor:
-    """The upper bone's skin weight at a height."""
+    """Return the upper bone's skin weight at a height."""
     return ((z_m - 0.7) / 0.2).clamp(0, 1)
 
 
 def bending_body() -> BodyFit:
-    """The column bends at its joint about x and turns about z while it moves along x."""
+    """Return a fit in which the column bends at its joint about x and turns about z while it moves along x."""
     theta, root = torch.zeros(len(FRAMES), 2, 3), torch.eye(4).repeat(len(FRAMES), 1, 1)
     for row, frame in enumerate(FRAMES):
         theta[row, 1, 0] = 0.1 * frame
@@ -60,13 +61,13 @@ def bending_body() -> BodyFit:
 
 
 def side_camera() -> Camera:
-    """3 m from the origin along -y of the world, looking along +y; the image's right is +x."""
+    """Return a camera 3 m from the origin along -y of the world, looking along +y; the image's right is +x."""
     R = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     K = np.array([[500.0, 0, 300], [0, 400, 200], [0, 0, 1]])
     return Camera("01", K, R, -R @ np.array([0, -3.0, 1.0]), 640, 480)
 
 
 def capture() -> Capture:
-    """One camera, three training frames and one novel pose; no pixels."""
+    """Return a capture of one camera, three training frames and one novel pose, without pixels."""
     cameras = {"01": side_camera()}
     return Capture("column", Path(), cameras, ("01",), (), FRAMES[:3], FRAMES[3:], 10.0, "z", {}, {})

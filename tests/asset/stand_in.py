@@ -1,4 +1,4 @@
-"""An avatar without a network: the body grown by a centimetre, coloured by where a point lies on the rest body."""
+"""An avatar without a network: the body grown by a centimetre, coloured by position on the rest body."""
 
 from dataclasses import dataclass
 
@@ -46,6 +46,6 @@ class StandInAvatar:
 
 
 def rest_colour(rest_m: Tensor) -> Tensor:
-    """Red and green grow with x and y; blue has stripes 20 cm high."""
+    """Return a colour whose red and green grow with x and y; blue has stripes 20 cm high."""
     stripes = (torch.sin(rest_m[:, 2] * torch.pi / 0.2) > 0).float()
     return torch.stack([rest_m[:, 0] + 0.5, rest_m[:, 1] + 0.5, 0.2 + 0.6 * stripes], 1).clamp(0, 1)

@@ -10,7 +10,7 @@ from tests.asset.figure import FRAMES
 
 
 def accessor(document: pygltflib.GLTF2, index: int) -> np.ndarray:
-    """The float32 numbers of an accessor."""
+    """Return the float32 numbers of an accessor."""
     item = document.accessors[index]
     view = document.bufferViews[item.bufferView]
     data = document.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]

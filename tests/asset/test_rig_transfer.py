@@ -3,7 +3,7 @@ import dataclasses
 import torch
 import trimesh
 
-from hnerf.asset.rig_transfer import transfer_skin
+from hnerf.asset.rig_transfer import transfer_skin_weights
 from tests.asset.figure import column_rig, upper_weight
 
 
@@ -11,7 +11,7 @@ def test_weights_follow_the_closest_point_of_the_body() -> None:
     rig = column_rig()
     sleeve = trimesh.creation.cylinder(0.18, segment=[[0, 0, 0.1], [0, 0, 1.5]], sections=48).subdivide_to_size(0.04)
     vertices_m, faces = torch.from_numpy(sleeve.vertices).float(), torch.from_numpy(sleeve.faces).long()
-    joints, weights = transfer_skin(rig, vertices_m, faces)
+    joints, weights = transfer_skin_weights(rig, vertices_m, faces)
     upper = torch.where(joints == 1, weights, 0.0).sum(1)
     torch.testing.assert_close(weights.sum(1), torch.ones(len(weights)))
     z_m = vertices_m[:, 2]
@@ -31,6 +31,6 @@ def test_at_most_eight_influences_largest_first() -> None:
         skin_joints=torch.arange(10).repeat(vertices, 1),
         skin_weights=(parts / parts.sum()).repeat(vertices, 1),
     )
-    joints, weights = transfer_skin(ten, rig.vertices_m, rig.faces)
+    joints, weights = transfer_skin_weights(ten, rig.vertices_m, rig.faces)
     assert joints[0].tolist() == [9, 8, 7, 6, 5, 4, 3, 2]
     torch.testing.assert_close(weights[0], torch.arange(10.0, 2.0, -1) / 52)  # 10 + 9 + ... + 3 = 52

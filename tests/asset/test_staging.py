@@ -19,7 +19,7 @@ def test_z_up_becomes_y_up() -> None:
 
 
 def test_joints_by_hand() -> None:
-    """A root that stands at (1, 2, 3) and faces another way; the upper joint bends 90 degrees about the body's x."""
+    """Place the root at (1, 2, 3), turned; the upper joint bends 90 degrees about the body's x."""
     theta = torch.tensor([[[0.0, 0, 0], [torch.pi / 2, 0, 0]]])
     root = torch.eye(4)[None].clone()
     root[0, :3, 3] = torch.tensor([1.0, 2, 3])

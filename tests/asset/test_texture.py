@@ -5,7 +5,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from hnerf.asset.rig_transfer import dressed_rig
+from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.texture import UvLayout, bake, rasterise, unwrap
 from tests.asset.figure import bending_body, upright_column
 from tests.asset.stand_in import StandInAvatar, rest_colour
@@ -43,9 +43,9 @@ def test_colours_are_read_on_the_fields_own_surface() -> None:
             return super().colour(points_m, directions, theta, root)
 
     body = bending_body()
-    clothes = upright_column(0.175, 0.2, 1.4)  # 1.5 cm outside the field's surface; its caps are far path_in_capture
+    clothes = upright_column(0.175, 0.2, 1.4)  # 1.5 cm outside the field's surface; its caps are far inside
     layout = unwrap(clothes.vertices, clothes.faces, 64)
-    posed = dataclasses.replace(body, rig=dressed_rig(body.rig, clothes))
+    posed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
     bake(Recording(body), posed, layout, 64)
     assert len(read_m) == len(body.frames)
     for distance_m in read_m:
@@ -56,7 +56,7 @@ def test_baked_colours_are_those_of_the_point_on_the_rest_body() -> None:
     body = bending_body()
     clothes = upright_column(0.16, 0.0, 1.6)
     layout = unwrap(clothes.vertices, clothes.faces, 256)
-    rig = dressed_rig(body.rig, clothes)
+    rig = clothed_rig(body.rig, clothes)
     image = bake(StandInAvatar(body), dataclasses.replace(body, rig=rig), layout, 256)
     middle_uv = layout.uvs[layout.face_uvs].mean(1)
     pixel = image[((1 - middle_uv[:, 1]) * 256).astype(int), (middle_uv[:, 0] * 256).astype(int)]

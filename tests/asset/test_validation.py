@@ -83,12 +83,12 @@ def stretched_quaternion(stage: Usd.Stage) -> None:
         (point_not_a_number, "points are not finite"),
         (face_out_of_range, "face index out of range"),
         (centimetres, "metersPerUnit is 0.01"),
-        (giant, "no size of a person"),
-        (no_extent, "extent does not hold the points"),
+        (giant, "not a person's size"),
+        (no_extent, "extent does not contain the points"),
         (uv_outside, "outside [0, 1]"),
         (uvs_missing, "texture coordinates for"),
         (dotted_joint, "joint names are not identifiers"),
-        (stretched_quaternion, "not unit quaternions"),
+        (stretched_quaternion, "quaternions are not finite or not of unit length"),
     ],
 )
 def test_each_defect_is_named(stage: Usd.Stage, damage: Callable[[Usd.Stage], None], message: str) -> None:
@@ -108,7 +108,7 @@ def test_what_we_write_passes_every_validator(staged: StagedAvatar, tmp_path: Pa
 
 
 def test_an_error_of_usd_itself_raises(stage: Usd.Stage, tmp_path: Path) -> None:
-    """A loose layer whose texture is not beside it."""
+    """Give a loose layer without its texture beside it."""
     stage.GetRootLayer().Export(str(tmp_path / "loose.usdc"))
     with pytest.raises(InvalidAsset, match=r"loose\.usdc"):
         validate_package(tmp_path / "loose.usdc")

@@ -1,4 +1,4 @@
-"""A made-up checkout whose programs write a line, and results that they make."""
+"""A fake checkout whose programs write a line, and results that they make."""
 
 import subprocess
 from pathlib import Path
@@ -54,15 +54,15 @@ class Checkout:
         subprocess.run(["git", "-C", str(self.root), *arguments], check=True)
 
     def calls(self) -> list[str]:
-        """Names of the results that programs were called for, in order."""
+        """Return the names of the results that programs were called for, in order."""
         path = self.store / "calls"
         return path.read_text().split() if path.exists() else []
 
     def text(self, name: str) -> str:
-        """What a program wrote."""
+        """Return what a program wrote."""
         return (self.root / "benchmarks" / "results" / f"{name}.md").read_text()
 
 
 def made(name: str, program: str = "program.py", **more: object) -> Result:
-    """A result NAME.md of a program that is given the name and the store."""
+    """Return a result NAME.md of a program that is given the name and the store."""
     return Result(name, (program, name, "{store}"), (f"{name}.md",), **more)  # type: ignore[arg-type]

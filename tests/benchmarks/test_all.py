@@ -1,4 +1,4 @@
-"""Results are made once, in order, over interruptions and failures; programs and checkouts are made up."""
+"""Results are made once, in order, despite interruptions and failures; programs and checkouts are fake."""
 
 import json
 import time
@@ -28,7 +28,7 @@ def checkout(tmp_path: Path) -> Checkout:
 
 
 def before_writing(checkout: Checkout, lines: str) -> None:
-    """Have the program do something after it has said that it was called."""
+    """Have the program run a statement after it has recorded its call."""
     checkout.write("benchmarks/program.py", PROGRAM.replace("results =", f"{lines}\nresults ="))
     checkout.commit()
 
@@ -127,15 +127,15 @@ def test_files_that_are_no_longer_written_go_and_none_is_a_failure(
     assert not (checkout.root / "benchmarks" / "results" / "one-old.md").exists()
     nothing = type(both)("nothing", ("program.py", "else", "{store}"), ("nothing.md",))
     assert make(checkout.root, [nothing], checkout.store, 1) == 1
-    assert "wrote nothing that is called nothing.md" in capsys.readouterr().err
+    assert "wrote no file named nothing.md" in capsys.readouterr().err
 
 
 def test_absent_captures_and_cores_leave_a_result_out(checkout: Checkout, capsys: pytest.CaptureFixture[str]) -> None:
     far, wide = made("far", captures=("absent",)), made("wide", threads=2)
     assert make(checkout.root, [far, wide], checkout.store, 1) == 0
     assert checkout.calls() == []
-    told = capsys.readouterr().out.splitlines()
-    assert told == ["far: left out: no ../shared/data/absent", "wide: left out: takes both cores; give --jobs 2"]
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == ["far: left out: no ../shared/data/absent", "wide: left out: needs both cores; give --jobs 2"]
     (checkout.root.parent / "shared" / "data" / "absent").mkdir(parents=True)
     assert make(checkout.root, [far, wide], checkout.store, 2) == 0
     assert checkout.calls() == ["far", "wide"]

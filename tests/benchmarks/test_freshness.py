@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from freshness import code_digest, sources, why_stale
+from freshness import code_digest, sources, stale_reason
 from provenance import RESULTS, ROOT
 from registry import REGISTRY
 
@@ -96,12 +96,12 @@ def test_a_result_is_stale_where_its_files_are_not_as_they_were_made(
     checkout.write("benchmarks/results/one.md", "1")
     digest = code_digest(checkout.root, ONE)
     records = {"one": {"digest": digest, "files": {"one.md": sha256_of_1}}}
-    assert why_stale(checkout.root, ONE, {}) == "not recorded"
-    assert why_stale(checkout.root, ONE, records) is None
+    assert stale_reason(checkout.root, ONE, {}) == "not recorded"
+    assert stale_reason(checkout.root, ONE, records) is None
     harm(checkout.root / "benchmarks" / "results" / "one.md")
-    assert why_stale(checkout.root, ONE, records) == "one.md is not as it was made"
+    assert stale_reason(checkout.root, ONE, records) == "one.md has changed since it was made"
     checkout.write("hnerf/far.py", "NUMBER = 2\n")
-    assert why_stale(checkout.root, ONE, records) == "its code has changed"
+    assert stale_reason(checkout.root, ONE, records) == "its code has changed"
 
 
 sha256_of_1 = "6b86b273ff34fce19d6b804eff5a3f5747ada4eaa22f1d49c01e52ddb7875b4b"  # printf 1 | sha256sum

@@ -1,4 +1,4 @@
-"""Results are made from clean checkouts alone."""
+"""Results are made from clean checkouts only."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ def test_a_checkout_with_changes_is_refused(tmp_path: Path, name: str, capsys: p
         provenance.clean_commit(checkout.root)
     assert ended.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert f"{name} not as in commit" in line
+    assert f"uncommitted changes in {name} since" in line
     checkout.commit()
     assert len(provenance.clean_commit(checkout.root)) == 12
 

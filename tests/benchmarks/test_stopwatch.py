@@ -1,4 +1,4 @@
-"""Seconds of work over interruptions, with a clock that is set by hand."""
+"""Seconds of work across interruptions, with a clock that is set by hand."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from stopwatch import Stopwatch
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The time, as the only item."""
+    """Return the time, as the only item."""
     now = [100.0]
     monkeypatch.setattr(stopwatch.time, "monotonic", lambda: now[0])
     return now
@@ -22,7 +22,7 @@ def test_an_interrupted_run_of_the_same_code_goes_on(tmp_path: Path, clock: list
     clock[0] = 500.0
     second = Stopwatch(tmp_path / "state.json", "a")
     clock[0] = 512.0
-    assert (second.seconds, second.whole) == (42.0, True)
+    assert (second.seconds, second.is_complete) == (42.0, True)
 
 
 def test_a_killed_run_has_lost_ten_seconds_at_most(tmp_path: Path, clock: list[float]) -> None:
@@ -41,7 +41,7 @@ def test_what_other_code_or_a_finished_run_left_is_not_timed(
     first.save(done)
     second = Stopwatch(tmp_path / "state.json", digest)
     clock[0] = 135.0
-    assert (second.seconds, second.whole) == (5.0, False)
+    assert (second.seconds, second.is_complete) == (5.0, False)
     second.save(done=False)
     third = Stopwatch(tmp_path / "state.json", digest)
-    assert (third.seconds, third.whole) == (5.0, False)
+    assert (third.seconds, third.is_complete) == (5.0, False)

@@ -1,4 +1,4 @@
-"""A made-up subject: a ball that a stand-in avatar shows in one colour, before cameras that look at it from around."""
+"""A synthetic subject: a ball that a stand-in avatar shows in one colour, seen by cameras around it."""
 
 import json
 from dataclasses import dataclass, replace
@@ -21,15 +21,15 @@ from hnerf.geometry.camera import Camera
 
 RADIUS_M = 0.1
 SIZE_PX = 64
-FRAMES = (0, 1, 2, 3)  # the last for new poses
+FRAMES = (0, 1, 2, 3)  # the last is the novel pose
 NOVEL = (3,)
 RENDERED, PHOTOGRAPHED = 102, 153  # grey levels, of 255
-TUNED_M = 0.02  # by which training lifted the body of the new frame: two pixels
+TUNED_M = 0.02  # by which training raised the body of the novel frame: two pixels
 
 
 @dataclass(frozen=True)
 class BallAvatar:
-    """The ball in grey; its distance is exact. Frames have it darker by what they know of themselves."""
+    """The avatar of a grey ball with exact distances. What is learned for single frames darkens it."""
 
     body: BodyFit
     grey: float = RENDERED
@@ -54,12 +54,12 @@ class BallAvatar:
 
 
 def centre_m(frame: int) -> np.ndarray:
-    """Where the ball is in a frame."""
+    """Return the ball's centre in a frame."""
     return np.array([0.01 * frame, 0.0, 1.0])
 
 
 def seen(camera: Camera, middle_m: np.ndarray) -> np.ndarray:
-    """(H, W) bool: the pixels whose rays meet the ball."""
+    """Return the pixels whose rays meet the ball, (H, W) bool."""
     pixels = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), -1)
     origins, directions = camera.rays(pixels.astype(np.float64))
     offset = np.cross(middle_m - origins, directions)
@@ -67,7 +67,7 @@ def seen(camera: Camera, middle_m: np.ndarray) -> np.ndarray:
 
 
 def ball_camera(name: str, turn_deg: float) -> Camera:
-    """A camera 0.75 m off, at the ball's height, that looks at (0, 0, 1)."""
+    """Return a camera 0.75 m off, at the ball's height, that looks at (0, 0, 1)."""
     angle = np.deg2rad(turn_deg)
     forward = np.array([-np.cos(angle), -np.sin(angle), 0])
     down = np.array([0, 0, -1.0])
@@ -77,7 +77,7 @@ def ball_camera(name: str, turn_deg: float) -> Camera:
 
 
 def ball_fit() -> BodyFit:
-    """The ball as a body of one joint."""
+    """Return the ball as a body of one joint."""
     ball = trimesh.creation.icosphere(3, RADIUS_M)
     count = len(ball.vertices)
     rig = Rig(
@@ -101,7 +101,7 @@ def ball_fit() -> BodyFit:
 
 
 def write_ball_capture(folder: Path, name: str, test_cameras: tuple[str, ...]) -> Capture:
-    """A ball photographed by "a", "b" and the test cameras, before grey, and `capture.toml` as recordings have it."""
+    """Write a ball on grey photographed by "a", "b" and the test cameras, and `capture.toml` as recordings have it."""
     names = ("a", "b", *test_cameras)
     cameras = {n: ball_camera(n, 80.0 * k) for k, n in enumerate(names)}
     sizes = dict.fromkeys(names, (SIZE_PX, SIZE_PX))
@@ -118,7 +118,7 @@ def write_ball_capture(folder: Path, name: str, test_cameras: tuple[str, ...]) -
 
 
 def write_ball_truth(capture: Capture, radius_m: float) -> None:
-    """`ground_truth/` with exact masks of every view, and a true surface of another radius for frame 0."""
+    """Write `ground_truth/` with exact masks of every view, and a true surface of another radius for frame 0."""
     for camera in capture.cameras.values():
         for frame in FRAMES:
             mask = seen(camera, centre_m(frame)).astype(np.uint8) * 255
@@ -130,14 +130,14 @@ def write_ball_truth(capture: Capture, radius_m: float) -> None:
 
 
 def tuned(fit: BodyFit) -> BodyFit:
-    """The fit with the new frame's body lifted."""
+    """Return the fit with the body of the novel frame raised."""
     root = fit.root.clone()
     root[FRAMES.index(NOVEL[0]), 2, 3] += TUNED_M
     return replace(fit, root=root)
 
 
 def write_settings(training: Path, kind: str = "fast", nodes: int = 8, steps: int = 80) -> None:
-    """What training says of itself, as far as columns of new poses go by it."""
+    """Write the parts of training's settings.json on which the columns of novel poses depend."""
     fast = kind == "fast"
     settings: dict[str, Any] = {"pose_learning_rate": 5e-4 * fast, "novel_pose_steps": steps}
     settings |= {"field": {"kind": kind} | ({"nodes": nodes} if fast else {})}
@@ -145,7 +145,7 @@ def write_settings(training: Path, kind: str = "fast", nodes: int = 8, steps: in
 
 
 def ball_inputs(capture: Capture, stages: Path) -> EvaluationInputs:
-    """Everything before evaluation; `stages` has a folder of each earlier stage."""
+    """Return all inputs of evaluation; `stages` has a folder for each earlier stage."""
     fit = ball_fit()
     folders = {f"{name}_folder": stages / name for name in ("calibration", "segmentation", "fit", "training")}
     for folder in folders.values():

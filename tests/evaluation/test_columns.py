@@ -3,13 +3,14 @@ from pathlib import Path
 
 import pytest
 
-from hnerf.evaluation.columns import shown_as, why_not_shown
+from hnerf.evaluation.columns import avatar_for_split, reason_unavailable
 from hnerf.evaluation.views import SPLITS
 from tests.evaluation.ball import BallAvatar, ball_fit, tuned, write_settings
 
 
 def test_animated_knows_neither_tuned_poses_nor_frames() -> None:
-    """The field's grey tells whether it was asked as one of its frames, the place which pose it was given."""
+    """Read from the field's grey whether it was queried for one of its frames, and from the ball's place which pose it
+    was given."""
     fit = ball_fit()
     avatar = BallAvatar(tuned(fit), 100, frames_darken_by=51)
     k, fitted_m, tuned_m = fit.index(3), fit.root[3, 2, 3].item(), avatar.body.root[3, 2, 3].item()
@@ -20,7 +21,7 @@ def test_animated_knows_neither_tuned_poses_nor_frames() -> None:
         ("novel_pose_posed", tuned_m, 0),
         ("novel_pose_tracked", tuned_m, 51),
     ):
-        shown = shown_as(split, avatar, fit)
+        shown = avatar_for_split(split, avatar, fit)
         assert isinstance(shown, BallAvatar)
         assert (shown.body.root[k, 2, 3].item(), shown.frames_darken_by) == (place_m, darker), split
 
@@ -28,7 +29,7 @@ def test_animated_knows_neither_tuned_poses_nor_frames() -> None:
 def test_animated_has_the_trained_shape() -> None:
     fit = ball_fit()
     rig = replace(fit.rig, vertices_m=1.1 * fit.rig.vertices_m)
-    assert shown_as("novel_pose", BallAvatar(replace(fit, rig=rig)), fit).body.rig is rig
+    assert avatar_for_split("novel_pose", BallAvatar(replace(fit, rig=rig)), fit).body.rig is rig
 
 
 @pytest.mark.parametrize(
@@ -42,9 +43,12 @@ def test_animated_has_the_trained_shape() -> None:
 )
 def test_what_is_not_tuned_has_no_column(tmp_path: Path, kind: str, nodes: int, lacks: list[str]) -> None:
     write_settings(tmp_path, kind, nodes)
-    assert [split for split in SPLITS if why_not_shown(split, tmp_path)] == lacks
+    assert [split for split in SPLITS if reason_unavailable(split, tmp_path)] == lacks
 
 
 def test_frames_that_were_not_tuned_have_no_column_of_their_own(tmp_path: Path) -> None:
     write_settings(tmp_path, "fast", steps=0)
-    assert [split for split in SPLITS if why_not_shown(split, tmp_path)] == ["novel_pose_posed", "novel_pose_tracked"]
+    assert [split for split in SPLITS if reason_unavailable(split, tmp_path)] == [
+        "novel_pose_posed",
+        "novel_pose_tracked",
+    ]

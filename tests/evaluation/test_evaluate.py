@@ -1,4 +1,4 @@
-"""The whole of evaluation on a made-up subject whose figures are known, and against the independent scoring program."""
+"""The whole evaluation on a synthetic subject with known scores, and against the independent scoring program."""
 
 import dataclasses
 import json
@@ -47,7 +47,7 @@ HOSTILE = "<script>alert(1)</script>"
 
 @pytest.fixture(scope="module")
 def scored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
-    """A subject with ground truth and one test camera: its evaluation lies beside its capture."""
+    """Evaluate a subject with ground truth and one test camera; its evaluation lies beside its capture."""
     base = tmp_path_factory.mktemp("scored")
     capture = write_ball_capture(base / "capture", "ball", ("c",))
     write_ball_truth(capture, RADIUS_M + GAP_M)
@@ -66,7 +66,7 @@ def scored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
 
 @pytest.fixture(scope="module")
 def unscored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
-    """A subject without ground truth and without test cameras, whose name is markup."""
+    """Evaluate a subject without ground truth and without test cameras, whose name is markup."""
     base = tmp_path_factory.mktemp("unscored")
     inputs = ball_inputs(write_ball_capture(base / "capture", HOSTILE, ()), base / "stages")
     out = base / "evaluation"
@@ -101,7 +101,7 @@ def test_the_report_may_show_more_images_than_are_scored(tmp_path: Path) -> None
 
 
 def test_few_images_are_chosen_among_those_with_a_true_mask(tmp_path: Path) -> None:
-    """Of frames 0 to 2 the first and the last would be taken, but only 1 has a mask."""
+    """Of frames 0 to 2 expect 1, the only one with a mask, not the first and the last."""
     capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
     write_ball_truth(capture, RADIUS_M)
     (capture.root / "ground_truth" / "meshes.npz").unlink()  # surfaces are scored elsewhere
@@ -158,7 +158,7 @@ def test_figures_agree_with_the_independent_program(scored: Scored) -> None:
 
 
 def test_a_rendering_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
-    """A folder has its name."""
+    """Put a folder where a rendering should go."""
     view = View("novel_view", "c", 1)
     view.path(tmp_path).mkdir(parents=True)
     with pytest.raises(OSError, match=r"000001\.png: cannot be written"):
@@ -186,8 +186,8 @@ def test_without_test_cameras_no_training_image_is_a_new_view(unscored: Scored) 
 
 
 def test_new_poses_are_shown_as_fitted_as_tuned_and_as_tracked(scored: Scored) -> None:
-    """Without what frames know the ball has the photograph's grey, so that the fit, where the truth is, is perfect;
-    what was tuned is two pixels too high, what was tracked is darker as well."""
+    """Expect a perfect score as fitted, since without per-frame changes the ball has the photograph's grey and the fit
+    is true; tuned poses are two pixels too high, tracked ones are darker as well."""
     out, found = scored[0] / "subject" / "evaluation", scored[1]
     true = seen(TEST_CAMERA, centre_m(3))
     lifted = seen(TEST_CAMERA, centre_m(3) + np.array([0, 0, TUNED_M]))
@@ -215,7 +215,7 @@ def test_the_report_shows_all_three_side_by_side(scored: Scored) -> None:
 
 
 def evaluated(base: Path, test_cameras: tuple[str, ...], truth: bool, kind: str) -> tuple[Path, dict[str, Any]]:
-    """Where the evaluation of a ball lies, and what it found; without a report."""
+    """Evaluate a ball without a report; return the folder and what was found."""
     capture = write_ball_capture(base / "capture", "ball", test_cameras)
     if truth:
         write_ball_truth(capture, RADIUS_M)
@@ -233,7 +233,7 @@ def test_a_method_that_tunes_nothing_has_one_column(tmp_path: Path) -> None:
     assert found["novel_pose_posed"]["reason"] == "no pose of these frames was tuned"
     assert found["novel_pose_tracked"]["reason"] == "these frames have no deformation of their own"
     assert sorted(p.name for p in (out / "renders").iterdir()) == ["novel_pose", "novel_view", "training_view"]
-    for split in ("novel_view", "novel_pose"):  # test cameras alone are no truth
+    for split in ("novel_view", "novel_pose"):  # test cameras without ground truth
         assert "no ground-truth masks" in found[split]["reason"]
 
 
@@ -246,20 +246,20 @@ def test_a_method_without_poses_shows_no_new_ones(tmp_path: Path) -> None:
 
 
 def test_nothing_is_scored_on_pixels_of_training_cameras(tmp_path: Path) -> None:
-    """Though the truth of every image is known."""
+    """Give the truth of every image."""
     out, found = evaluated(tmp_path, (), True, "fast")
     for split in ("novel_view", "novel_pose", "novel_pose_posed", "novel_pose_tracked"):
         assert (found[split]["n"], found[split]["psnr"], found[split]["per_image"]) == (0, None, [])
     assert "evaluation.holdout" in found["novel_pose"]["reason"]
     assert found["holdout"] is None and "evaluation.holdout=each" in found["holdout_reason"]
     rendered = sorted((out / "renders" / "novel_pose").rglob("*.png"))
-    assert [p.parent.name for p in rendered] == ["a", "b"]  # to look at
+    assert [p.parent.name for p in rendered] == ["a", "b"]  # for inspection
     assert len(list((out / "renders" / "novel_pose_tracked").rglob("*.png"))) == 1  # what the report shows
     assert found["novel_view"]["geometry"]["n"] == 1  # no pixels are needed
 
 
 class _Page(HTMLParser):
-    """Headings, and everything that a browser would load or run."""
+    """Collect headings, and everything that a browser would load or run."""
 
     def __init__(self, text: str):
         super().__init__()
@@ -311,7 +311,7 @@ def test_report_escapes_what_captures_say(scored: Scored, unscored: Scored) -> N
 
 def test_report_without_truth_says_so(unscored: Scored) -> None:
     text = (unscored[0] / "report.html").read_text()
-    assert "the capture has no test camera" in text and "training views are shown instead" in text
+    assert "the capture has no test camera" in text and "the report shows training views instead" in text
     assert 'alt="Ground truth"' not in text and 'alt="Input × mask"' in text
     assert "No history was recorded" in text
 

@@ -7,7 +7,7 @@ from hnerf.geometry.mesh_queries import Surface
 
 
 def plane(height_m: float = 0.0, tilt_deg: float = 0.0) -> trimesh.Trimesh:
-    """A square of 1 m at a height, turned about the x axis."""
+    """Return a square of 1 m at a height, turned about the x axis."""
     corners = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
     turned = corners @ trimesh.transformations.rotation_matrix(np.deg2rad(tilt_deg), [1, 0, 0])[:3, :3].T
     return trimesh.Trimesh(turned + np.array([0, 0, height_m]), [[0, 1, 2], [0, 2, 3]], process=False)

@@ -35,7 +35,8 @@ def test_on_black_comes_first_and_at_the_camera_size(truth: GroundTruth) -> None
 
 
 def test_a_mask_of_the_recording_is_shrunk_by_area(truth: GroundTruth) -> None:
-    """Columns 5 and up of 256: of the four that make column 1 three are the person's, the first of them is not."""
+    """Mask columns 5 and up of 256: of the four columns that become column 1, three are the person's and the first is
+    not."""
     mask = np.zeros((256, 256), np.uint8)
     mask[:, 5:] = 255
     cv2.imwrite(str(truth.folder / "ground_truth" / "masks" / "c" / "000001.png"), mask)
@@ -43,7 +44,7 @@ def test_a_mask_of_the_recording_is_shrunk_by_area(truth: GroundTruth) -> None:
 
 
 def test_truth_is_of_the_instant_of_the_photograph(truth: GroundTruth) -> None:
-    """Camera c recorded the instant of frame 1 in its frame 2."""
+    """Let camera c record the instant of frame 1 in its frame 2."""
     in_step = replace(truth, capture=truth.capture.synchronised({"c": 1.0}))
     expected = seen(truth.capture.cameras["c"], centre_m(2))
     assert np.array_equal(in_step.mask("c", 1), expected)
@@ -55,7 +56,7 @@ def test_truth_is_of_the_instant_of_the_photograph(truth: GroundTruth) -> None:
 
 
 def test_truth_is_undistorted_as_photographs_are(truth: GroundTruth) -> None:
-    """By the Normaliser, which photographs go through at the door; a distorted lens moves the outline."""
+    """Compare with the Normaliser that ingest uses on photographs; lens distortion moves the outline."""
     camera = truth.capture.cameras["c"]
     size_px = (camera.width_px, camera.height_px)
     distortion = np.array([0.0, 0.0, 0.5, 0.5])
@@ -88,7 +89,7 @@ def test_a_missing_mask_is_named(truth: GroundTruth) -> None:
 def test_faces_without_vertices_are_refused(truth: GroundTruth, faces: list[list[int]]) -> None:
     path = truth.folder / "ground_truth" / "meshes.npz"
     np.savez(path, faces=np.array(faces), vertices=np.zeros((1, 3, 3)), frames=np.array([0]))
-    with pytest.raises(InputError, match=r"meshes\.npz: no true surfaces to read \(a face names no vertex"):
+    with pytest.raises(InputError, match=r"meshes\.npz: true surfaces cannot be read \(a face index is out of range"):
         truth.meshes()
 
 
@@ -98,7 +99,7 @@ def test_more_than_fits_in_memory_is_refused(truth: GroundTruth, monkeypatch: py
 
     np.savez(truth.folder / "ground_truth" / "meshes.npz", faces=np.zeros((1, 3), int))
     monkeypatch.setattr(np.lib.format, "read_array", full)
-    with pytest.raises(InputError, match=r"meshes\.npz: no true surfaces to read \(Unable to allocate"):
+    with pytest.raises(InputError, match=r"meshes\.npz: true surfaces cannot be read \(Unable to allocate"):
         truth.meshes()
 
 

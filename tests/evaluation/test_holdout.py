@@ -1,4 +1,4 @@
-"""Cameras left out, on a ball before three of them."""
+"""Held-out cameras, on a ball seen by three of them."""
 
 import json
 from dataclasses import replace
@@ -14,7 +14,7 @@ from hnerf.capture.masks import Masks, encode
 from hnerf.config import EvaluationSettings
 from hnerf.errors import InputError
 from hnerf.evaluation.evaluate import evaluate
-from hnerf.evaluation.holdout import LABEL, cameras_left_out, gathered, score_held_out
+from hnerf.evaluation.holdout import LABEL, collect_held_out, held_out_cameras, score_held_out
 from hnerf.evaluation.metrics import mask_box
 from tests.evaluation.ball import (
     FRAMES,
@@ -35,20 +35,20 @@ CAMERAS = ("a", "b", "c")
 
 
 def three_cameras(folder: Path) -> Capture:
-    """All for training."""
+    """Return a capture whose three cameras all train."""
     capture = write_ball_capture(folder, "ball", ("c",))
     return replace(capture, train_cameras=CAMERAS, test_cameras=())
 
 
 def own_mask(capture: Capture, camera: str, frame: int) -> np.ndarray:
-    """The ball without its left half."""
+    """Return the mask of the ball without its left half."""
     mask = seen(capture.cameras[camera], centre_m(frame))
     mask[:, : mask.shape[1] // 2] = False
     return mask
 
 
 def held_out(base: Path, capture: Capture, camera: str) -> tuple[Path, dict[str, Any]]:
-    """Where the scores of a camera lie that a training went without, and what they are; frame 1 has no mask."""
+    """Score a camera that training did not use; return the folder and the scores. Frame 1 has no mask."""
     masks = {(n, f): encode(own_mask(capture, n, f)) for n in CAMERAS for f in FRAMES if f != 1}
     training, out = base / "training", base / camera
     for folder in (training, out):
@@ -61,14 +61,14 @@ def held_out(base: Path, capture: Capture, camera: str) -> tuple[Path, dict[str,
 
 
 def psnr_db(capture: Capture, camera: str, frame: int, grey: int) -> float:
-    """Of the whole ball in a grey against the photograph's own half."""
+    """Return the PSNR of the whole ball in a grey against half of it in the photograph's."""
     mask, whole = own_mask(capture, camera, frame), seen(capture.cameras[camera], centre_m(frame))
     error = (whole * grey / 255.0 - mask * PHOTOGRAPHED / 255.0)[mask_box(mask)]
     return float(-10 * np.log10((error**2).mean()))
 
 
 def test_a_camera_left_out_is_scored_on_its_photographs_under_its_own_masks(tmp_path: Path) -> None:
-    """Though there is a truth that says otherwise; training frames as trained, new poses animated."""
+    """Give a truth that says otherwise; expect training frames as trained, novel poses animated."""
     capture = three_cameras(tmp_path / "capture")
     write_ball_truth(capture, 0.1)
     out, found = held_out(tmp_path, capture, "b")
@@ -93,13 +93,13 @@ def test_figures_are_gathered_by_camera_with_their_mean(tmp_path: Path) -> None:
         return path
 
     capture = three_cameras(tmp_path / "capture")
-    found = gathered(capture, [folder("a", 20.0, None), folder("b", 23.0, 18.0)])["holdout"]
+    found = collect_held_out(capture, [folder("a", 20.0, None), folder("b", 23.0, 18.0)])["holdout"]
     assert found["what"] == LABEL
     assert list(found["cameras"]) == ["a", "b"]
     assert found["mean"]["novel_view"] == {"psnr": 21.5, "ssim": 0.5, "mask_iou": None, "lpips": None}
     assert found["mean"]["novel_pose"]["psnr"] == 18.0
     with_test_camera = replace(capture, test_cameras=("c",))
-    assert "has test cameras" in gathered(with_test_camera, [])["holdout_reason"]
+    assert "has test cameras" in collect_held_out(with_test_camera, [])["holdout_reason"]
 
 
 def test_the_report_has_a_row_for_each_camera(tmp_path: Path) -> None:
@@ -118,17 +118,17 @@ def test_the_report_has_a_row_for_each_camera(tmp_path: Path) -> None:
     ("train", "holdout", "message"),
     [
         (CAMERAS, "d", "evaluation.holdout=d: no such training camera; there are a, b, c"),
-        (("a", "b"), "a", "evaluation.holdout=a: of 2 training cameras fewer than 2 would be left"),
-        (("a", "b"), "each", "evaluation.holdout=each: of 2 training cameras fewer than 2 would be left"),
+        (("a", "b"), "a", "evaluation.holdout=a: fewer than 2 of the 2 training cameras would be left"),
+        (("a", "b"), "each", "evaluation.holdout=each: fewer than 2 of the 2 training cameras would be left"),
     ],
 )
 def test_cameras_that_cannot_be_left_out_are_refused(train: tuple[str, ...], holdout: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        cameras_left_out(train, (), holdout)
+        held_out_cameras(train, (), holdout)
 
 
 def test_cameras_are_left_out_one_by_one_or_in_turn() -> None:
-    assert cameras_left_out(CAMERAS, (), None) == ()
-    assert cameras_left_out(CAMERAS, (), "b") == ("b",)
-    assert cameras_left_out(CAMERAS, (), "each") == CAMERAS
-    assert cameras_left_out(("a", "b"), ("t",), "each") == ()  # test cameras score the capture
+    assert held_out_cameras(CAMERAS, (), None) == ()
+    assert held_out_cameras(CAMERAS, (), "b") == ("b",)
+    assert held_out_cameras(CAMERAS, (), "each") == CAMERAS
+    assert held_out_cameras(("a", "b"), ("t",), "each") == ()  # test cameras score the capture

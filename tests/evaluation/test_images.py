@@ -12,7 +12,7 @@ from hnerf.evaluation.images import rgba
 
 
 def test_renderings_are_colour_over_black_and_coverage(tmp_path: Path) -> None:
-    """A pixel that red covers by a half, and one of black hair; who knows nothing of alpha sees them over black."""
+    """Store a pixel half covered by red and one of black hair; a viewer that ignores alpha shows them over black."""
     alpha = torch.tensor([[0.5, 1.0]])
     picture = rgba(Rendering(torch.tensor([[[0.5, 0.0, 0.0], [0.0, 0.0, 0.0]]]), alpha, alpha))
     assert picture.tolist() == [[[128, 0, 0, 128], [0, 0, 0, 255]]]

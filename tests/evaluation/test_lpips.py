@@ -1,4 +1,4 @@
-"""LPIPS, with weights that are worked out by hand, and with the published ones where they are there."""
+"""LPIPS with weights worked out by hand, and with the published ones if they are installed."""
 
 import hashlib
 import pickle
@@ -9,7 +9,7 @@ import pytest
 
 from hnerf import models
 from hnerf.evaluation import lpips as module
-from hnerf.evaluation.lpips import NOT_THERE, USED, Lpips, lpips, lpips_availability
+from hnerf.evaluation.lpips import MEASURED, NOT_INSTALLED, Lpips, lpips, lpips_availability
 from hnerf.evaluation.metrics import score_image
 from hnerf.models import LPIPS_ALEXNET, LPIPS_VGG, has_model
 
@@ -18,7 +18,7 @@ BLACK, WHITE = (np.full((64, 64, 3), level, np.uint8) for level in (0, 255))
 
 @pytest.fixture
 def by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Weights of two channels: of the first layer red at the middle pixel, and 1; of the others 1. Its head is
+    """Return weights of two channels: in the first layer red at the middle pixel, and 1; in the others 1. Its head is
     (2, 3)."""
     sizes = [(11, 3), (5, 2), (3, 1), (3, 1), (3, 1)]
     layers = {f"Conv_{i}": {"kernel": np.zeros((k, k, c, 1)), "bias": np.ones(1)} for i, (k, c) in enumerate(sizes)}
@@ -41,7 +41,7 @@ def test_distance_by_hand(by_hand: None) -> None:
 
 
 def test_small_images_are_filled_up_with_black(by_hand: None) -> None:
-    """Of 15 x 15 places, at pixels 3, 7, ..., 59, 4 x 4 lie in an image of 16 px."""
+    """Of 15 x 15 positions, at pixels 3, 7, ..., 59, 4 x 4 lie in an image of 16 px."""
     small = Lpips()(WHITE[:16, :16], BLACK[:16, :16])
     assert small == pytest.approx(2.727262 * 16 / 225, abs=1e-6)
 
@@ -49,7 +49,7 @@ def test_small_images_are_filled_up_with_black(by_hand: None) -> None:
 def test_without_weights_it_is_null_and_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path))
     assert lpips(WHITE, BLACK) is None
-    assert lpips_availability() == NOT_THERE
+    assert lpips_availability() == NOT_INSTALLED
     rendered = np.concatenate([WHITE, WHITE[..., :1]], -1)
     assert score_image(rendered, WHITE, np.ones((64, 64), bool)).lpips is None
 
@@ -60,13 +60,13 @@ def test_weights_that_come_are_used(by_hand: None) -> None:
     score = score_image(rendered, BLACK, np.ones((64, 64), bool))
     module._alexnet.cache_clear()
     assert score.lpips == pytest.approx(2.727262, abs=1e-5)
-    assert lpips_availability() == USED
+    assert lpips_availability() == MEASURED
 
 
 @pytest.mark.parametrize(("name", "distance"), [(LPIPS_ALEXNET, 0.01470), (LPIPS_VGG, 0.03150)])
 def test_published_weights_agree_with_another_implementation(name: str, distance: float) -> None:
-    """Of noise, and noise on it; found with weights and layers written down apart from these, which give .7219 and
-    .1376 for the example pairs that are published with .722 and .138."""
+    """Compare noise, and noise added to it, with values from independently written weights and layers, which give .7219
+    and .1376 for the example pairs that are published with .722 and .138."""
     if not has_model(name):
         pytest.skip(f"{name} is not in the cache: `hnerf models` fetches it")
     rng = np.random.default_rng(0)

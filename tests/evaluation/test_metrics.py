@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hnerf.evaluation.metrics import floors, mask_box, mask_iou, psnr, score_image, ssim
+from hnerf.evaluation.metrics import mask_box, mask_iou, psnr, score_image, ssim, trivial_psnr
 
 
 def test_psnr_of_a_constant_error() -> None:
@@ -35,7 +35,7 @@ def test_mask_iou_counts_pixels_covered_by_more_than_a_half() -> None:
 
 
 def test_black_hair_on_black_counts() -> None:
-    """Of a head of 4 pixels the upper two are hair, black in picture and rendering; by brightness they are lost."""
+    """Draw a head of 4 pixels, the upper two black hair in image and rendering, which brightness would miss."""
     mask = np.zeros((16, 16), bool)
     mask[2:4, 2:4] = True
     reference = np.zeros((16, 16, 3), np.uint8)
@@ -47,12 +47,12 @@ def test_black_hair_on_black_counts() -> None:
 
 
 def test_floors_of_a_person_of_two_greys() -> None:
-    """Of 4 pixels in a box of 42 x 42: 0.2 and 0.4, two each; their mean 0.3 is 0.1 off everywhere in the mask."""
+    """Take 4 pixels in a box of 42 x 42: 0.2 and 0.4, two each; their mean 0.3 is 0.1 off everywhere in the mask."""
     reference = np.zeros((100, 100, 3), np.uint8)
     mask = np.zeros((100, 100), bool)
     mask[50:52, 50:52] = True
     reference[50, 50:52], reference[51, 50:52] = 51, 102
-    found = floors(reference, mask)
+    found = trivial_psnr(reference, mask)
     assert found["empty_psnr"] == pytest.approx(-10 * np.log10((2 * 0.2**2 + 2 * 0.4**2) / 42**2), abs=1e-4)
     assert found["one_colour_psnr"] == pytest.approx(-10 * np.log10(4 * 0.1**2 / 42**2), abs=1e-4)
 

@@ -2,7 +2,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from hnerf.evaluation.report import costs, is_rows, notes, readable, stage_reports, summary
+from hnerf.evaluation.report import costs, is_table_rows, readable, reading_notes, stage_reports, summary
 from tests.evaluation.ball import ball_inputs, write_ball_capture
 
 
@@ -20,11 +20,11 @@ def test_readable_values() -> None:
 
 
 def test_dicts_of_plain_values_are_rows_of_a_table() -> None:
-    assert is_rows([{"a": 1}, {"b": [2]}])
-    assert is_rows({"x": {"a": 1}}.values())
-    assert not is_rows({"x": {"a": {"b": 1}}}.values())
+    assert is_table_rows([{"a": 1}, {"b": [2]}])
+    assert is_table_rows({"x": {"a": 1}}.values())
+    assert not is_table_rows({"x": {"a": {"b": 1}}}.values())
     others: list[Any] = [[], "text", 1, None, [1], {"a": {}}]
-    assert not any(is_rows(value) for value in others)
+    assert not any(is_table_rows(value) for value in others)
 
 
 def test_summary_shows_a_dash_where_there_is_no_figure() -> None:
@@ -63,12 +63,12 @@ def test_seconds_of_the_fit_are_among_the_costs(tmp_path: Path) -> None:
 def test_notes_say_what_was_left_out_and_what_was_compared_to(tmp_path: Path) -> None:
     inputs = ball_inputs(write_ball_capture(tmp_path / "capture", "ball", ("c",)), tmp_path / "stages")
     view = {"reference": "image x ground-truth mask", "without_mask": 3, "without_person": 2}
-    rain = {f"novel_pose{column}": {"reason": "of rain"} for column in ("", "_posed", "_tracked")}
+    rain = {f"novel_pose{column}": {"reason": "rain"} for column in ("", "_posed", "_tracked")}
     found = {"lpips": "not available: no weights", "novel_view": view} | rain
-    assert notes(inputs, found) == [
+    assert reading_notes(inputs, found) == [
         "LPIPS is not available: no weights.",
-        "New poses, animated; New poses, posed; New poses, tracked: no image figures, since of rain.",
-        "New views: compared to photographs under the true mask, whose edge pixels hold background.",
+        "New poses, animated; New poses, posed; New poses, tracked: no image scores: rain.",
+        "New views: compared to photographs under the true mask, whose edge pixels contain background.",
         "New views: 3 images have no ground-truth mask and are not scored.",
         "New views: 2 images do not show the person and are not scored.",
     ]

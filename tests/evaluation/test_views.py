@@ -1,6 +1,6 @@
 from pathlib import Path
 
-from hnerf.evaluation.views import TRAINING_VIEW, View, all_views, some_views
+from hnerf.evaluation.views import TRAINING_VIEW, View, all_views, sample_views
 from hnerf.evenly_spaced import evenly_spaced
 from tests.evaluation.ball import write_ball_capture
 
@@ -20,24 +20,24 @@ def test_splits_without_test_cameras(tmp_path: Path) -> None:
 
 def test_shown_views_take_the_cameras_in_turn(tmp_path: Path) -> None:
     capture = write_ball_capture(tmp_path, "ball", ("c",))
-    shown = some_views(all_views(capture, TRAINING_VIEW), 3)
+    shown = sample_views(all_views(capture, TRAINING_VIEW), 3)
     assert [(v.camera, v.frame) for v in shown] == [("a", 0), ("b", 1), ("a", 2)]
 
 
 def test_one_frame_is_shown_from_several_cameras(tmp_path: Path) -> None:
-    """The ball's novel frames are one; three test cameras see it."""
+    """Take the ball's only novel frame, which three test cameras see."""
     capture = write_ball_capture(tmp_path, "ball", ("c", "d", "e"))
     poses, views = all_views(capture, "novel_pose"), all_views(capture, "novel_view")
-    assert [v.camera for v in some_views(poses, 3)] == ["c", "d", "e"]
-    assert [v.camera for v in some_views(poses, 2)] == ["c", "e"]
-    assert [(v.camera, v.frame) for v in some_views(views, 3)] == [("c", 0), ("d", 1), ("e", 2)]
-    assert some_views([], 3) == []
+    assert [v.camera for v in sample_views(poses, 3)] == ["c", "d", "e"]
+    assert [v.camera for v in sample_views(poses, 2)] == ["c", "e"]
+    assert [(v.camera, v.frame) for v in sample_views(views, 3)] == [("c", 0), ("d", 1), ("e", 2)]
+    assert sample_views([], 3) == []
 
 
 def test_some_of_a_few_views_are_spread_over_their_frames() -> None:
-    """Camera c has frames 1 and 2, camera d 0 and 1; the second of three frames is the second camera's turn."""
+    """Give camera c frames 1 and 2, camera d 0 and 1; at the second of three frames it is the second camera's turn."""
     views = [View("novel_view", c, f) for c, f in (("c", 1), ("c", 2), ("d", 0), ("d", 1))]
-    assert [(v.camera, v.frame) for v in some_views(views, 3)] == [("d", 0), ("d", 1), ("c", 2)]
+    assert [(v.camera, v.frame) for v in sample_views(views, 3)] == [("d", 0), ("d", 1), ("c", 2)]
 
 
 def test_spread_keeps_both_ends() -> None:

@@ -1,4 +1,4 @@
-"""Which ablations are worth a row, and the table from figures that were made up."""
+"""Selection of ablations, and the table from made-up scores."""
 
 import json
 from pathlib import Path
@@ -28,7 +28,7 @@ SPLIT = {
 
 @pytest.fixture
 def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainingSettings]:
-    """Every stage replaced; the list gathers the training settings of each row. Training fails without noise and loses
+    """Replace every stage; the list collects the training settings of each row. Training fails without noise and loses
     its worker without the eikonal loss; evaluation finds as many dB as the segmentation loss weighs."""
     trained: list[TrainingSettings] = []
 
@@ -53,7 +53,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainingSett
         (tmp_path / "metrics.json").write_text(json.dumps(metrics))
         return SimpleNamespace(root=tmp_path)
 
-    for name in ("calibrate", "find_masks", "fit"):
+    for name in ("calibrate", "segment_subject", "fit"):
         monkeypatch.setattr(train_subject, name, lambda *_: None)
     monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path))
     monkeypatch.setattr(module, "with_keypoints", lambda store, recording, settings: recording)
@@ -148,7 +148,7 @@ def test_the_table_by_hand() -> None:
     assert as_markdown(result).splitlines() == [
         "# Ablations of ada, preset `fast` with training.steps=7",
         "",
-        results.CELL,
+        results.CELL_LEGEND,
         "",
         "|  | PSNR | SSIM | mask IoU | LPIPS | Chamfer x1e-3 m² | NC | IoU | training, s | on |",
         "|---|---|---|---|---|---|---|---|---|---|",
@@ -177,13 +177,13 @@ def test_a_row_that_fails_says_so_and_the_rest_go_on(stages: list[TrainingSettin
 
 
 def test_new_poses_are_not_scored_of_what_has_none(stages: list[TrainingSettings], tmp_path: Path) -> None:
-    """The paper's method on one moment."""
+    """Run the paper's method on one frame."""
     table = ablate.fn(tmp_path, "paper", tmp_path / "store", [], ["no-segmentation"])
     rows = json.loads(table.with_suffix(".json").read_text())["rows"]
     assert rows["full"]["novel_pose"]["reason"] == "H-NeRF's static network models one moment"
     assert "| full | 0.02 / - / - / - |" in table.read_text()
-    told = "no images of animated new poses: H-NeRF's static network models one moment"
-    assert table.read_text().count("H-NeRF's static network") == table.read_text().count(f"- {told}\n") == 1
+    expected = "no images of animated new poses: H-NeRF's static network models one moment"
+    assert table.read_text().count("H-NeRF's static network") == table.read_text().count(f"- {expected}\n") == 1
 
 
 def test_the_flow_runs_page_shows_the_table(

@@ -1,4 +1,4 @@
-"""The flow with stages that cost nothing, and its own stage's place in the store."""
+"""The benchmark flow with fake stages, and its own stage's place in the store."""
 
 import base64
 import json
@@ -40,14 +40,14 @@ PSNR = {"fast": 30.0, "paper": 20.0}
 
 
 class Stages(list[tuple[str, TrainingSettings]]):
-    """The trainings that were asked for: of which recording, with which settings; `fails` by kind of field."""
+    """The trainings that were requested: recording and settings of each; `fails` by field kind."""
 
     fails: dict[str, Exception]
 
 
 @pytest.fixture
 def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
-    """Every stage replaced."""
+    """Replace every stage."""
     asked = Stages()
     asked.fails = {}
 
@@ -65,14 +65,14 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
         (folder / "scores.json").write_text(json.dumps(scores(PSNR[model.kind], 1.0, "") | {"pictures": []}))
         return SimpleNamespace(root=folder)
 
-    for name in ("calibrate", "find_masks"):
+    for name in ("calibrate", "segment_subject"):
         monkeypatch.setattr(train_subject, name, lambda *_: None)
     monkeypatch.setattr(train_subject, "fit", lambda *_: "body")
     monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path, title="whole"))
     monkeypatch.setattr(module, "with_keypoints", lambda store, recording, settings: recording)
     monkeypatch.setattr(module, "subset_capture", lambda _, recording, *parts: SimpleNamespace(title=str(parts)))
     monkeypatch.setattr(module, "read_capture", lambda *_: (None, None))
-    monkeypatch.setattr(module, "calibrated", lambda *_: RECORDED)
+    monkeypatch.setattr(module, "calibrated_capture", lambda *_: RECORDED)
     monkeypatch.setattr(module.Capture, "load", lambda _: RECORDED)
     monkeypatch.setattr(module, "train", train)
     monkeypatch.setattr(module, "score_training", score_training)
@@ -81,8 +81,8 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No charts, which take a second each time."""
-    monkeypatch.setattr(publish_module, "draw", lambda *_: [])
+    """Draw no charts, which take a second each time."""
+    monkeypatch.setattr(publish_module, "draw_charts", lambda *_: [])
 
 
 @pytest.fixture
@@ -116,7 +116,7 @@ def test_every_method_of_every_variant_is_trained_alike(stages: Stages, study: s
 def test_trainings_get_longer_until_they_gain_nothing_or_time_or_steps_are_over(
     stages: Stages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """fast has steps for 30 s; demo, made NeRF, is flat at 640 s and too young for a surface at 10 s."""
+    """Let fast have steps for 30 s; demo, made NeRF, is flat at 640 s and too young for a surface at 10 s."""
     psnr = {20.0: 18.0, 40.0: 18.0, 80.0: 20.0, 160.0: 24.0, 320.0: 25.0, 640.0: 25.05}
 
     def score_end(*inputs: Any) -> Any:
@@ -261,7 +261,7 @@ def test_scores_are_found_again_until_what_is_scored_or_how_changes(
         return scores(30.0, 1.0, "")
 
     monkeypatch.setattr(tasks_module, "score", score)
-    monkeypatch.setattr(tasks_module, "scene", lambda *_: None)
+    monkeypatch.setattr(tasks_module, "scoring_scene", lambda *_: None)
     truth = Source(root=tmp_path, name="ada", digest="1")
     recording, calibration, body, model = (Artifact(stage=s, root=tmp_path / s, files={}) for s in "abdc")
     store = Store(tmp_path / "store")

@@ -12,8 +12,8 @@ from hnerf import synthetic
 from hnerf.capture.formats.export import WRITERS
 from hnerf.config import SyntheticSettings
 from hnerf.errors import InvalidAsset
-from hnerf.render.subject import KINDS
-from tasks.launcher import GaveUpError
+from hnerf.render.subject import OUTPUT_KINDS
+from tasks.launcher import RankFailedError
 from tests.shared_data import shared_capture
 
 
@@ -52,7 +52,7 @@ def test_a_training_that_cannot_go_on_is_one_line_and_exit_code_1(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def train(*_: object) -> None:
-        raise GaveUpError("the surface is empty: check masks and body fit")
+        raise RankFailedError("the surface is empty: check masks and body fit")
 
     monkeypatch.setattr(train_subject, "fn", train)
     assert main(["run", str(tmp_path)]) == 1
@@ -181,4 +181,4 @@ def test_the_first_line_comes_before_what_takes_seconds(
 
 def test_choices_are_those_of_the_library() -> None:
     assert tuple(WRITERS) == CAMERA_FORMATS
-    assert KINDS == PICTURES
+    assert OUTPUT_KINDS == PICTURES

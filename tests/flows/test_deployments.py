@@ -24,7 +24,7 @@ def prefect(api: str, *arguments: str) -> str:
 
 @pytest.fixture(scope="module")
 def deployed(prefect_api: str) -> str:
-    """The API of a server with the deployments of prefect.yaml."""
+    """Return the API of a server with the deployments of prefect.yaml."""
     prefect(prefect_api, "work-pool", "create", "local", "--type", "process")
     prefect(prefect_api, "deploy", "--all")
     return prefect_api

@@ -1,4 +1,4 @@
-"""Fields trained without a camera: what reaches their fit and training, and what comes of it."""
+"""Fields trained without a camera: the inputs of their fit and training, and their scores."""
 
 import dataclasses
 import inspect
@@ -14,7 +14,7 @@ from flows.train_subject import train_subject
 from hnerf.capture.capture import Capture
 from hnerf.capture.formats.easymocap import write_easymocap
 from hnerf.capture.lens import pinhole
-from tasks.calibration import calibrated
+from tasks.calibration import calibrated_capture
 from tasks.stage import Stage
 from tasks.store import Artifact
 from tests.study.recording import ROTATIONS, write_recording
@@ -24,13 +24,14 @@ HELD_OUT = ["evaluation.holdout=each"]
 
 
 def write_three(out: Path) -> None:
-    """The recording by hand, with all its cameras for training."""
+    """Write the recording by hand, with all its cameras for training."""
     dataclasses.replace(write_recording(out), train_cameras=CAMERAS, test_cameras=()).save()
 
 
 @pytest.fixture
 def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """Every call of a stage that did work: its name and inputs. Only the stage that takes cameras out is itself."""
+    """Record every call of a stage that did work: its name and inputs. Only the stage that takes cameras out is
+    real."""
     made: list[dict[str, Any]] = []
 
     def spied(stage: Stage[Any]) -> Stage[Any]:
@@ -53,7 +54,7 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any
         monkeypatch.setattr(module, name, spied(getattr(module, name)))
     monkeypatch.setattr(module, "needs_body", lambda *_: True)
     monkeypatch.setattr(module, "needs_detection", lambda *_: False)
-    monkeypatch.setattr(module, "settled", lambda *_: True)
+    monkeypatch.setattr(module, "converged", lambda *_: True)
     (tmp_path / "ada").mkdir()
     whole = write_recording(tmp_path / "whole")
     write_easymocap(tmp_path / "ada", [pinhole(camera) for camera in whole.cameras.values()])
@@ -69,10 +70,10 @@ def test_a_camera_left_out_never_reaches_fit_masks_or_training(calls: list[dict[
     train_subject.fn(tmp_path / "ada", "demo", tmp_path / "store", ["evaluation.holdout='02'"])
     for stage, times in (("segmentation", 2), ("fit", 4), ("training", 2)):  # once with all cameras, once without
         assert len(of(calls, stage)) == times
-        without = [call for call in of(calls, stage) if call["recording"].stage == "subset"]
-        assert len(without) == times // 2
-        for call in without:
-            assert calibrated(call["recording"], call["calibration"]).train_cameras == ("01", "03")
+        evaluate_without_camera = [call for call in of(calls, stage) if call["recording"].stage == "subset"]
+        assert len(evaluate_without_camera) == times // 2
+        for call in evaluate_without_camera:
+            assert calibrated_capture(call["recording"], call["calibration"]).train_cameras == ("01", "03")
             root = call["recording"].root
             assert not [path for path in root.rglob("*") if "02" in path.relative_to(root).parts or path.stem == "02"]
             assert Capture.load(root).keypoints("02") is None
@@ -116,7 +117,7 @@ def test_without_the_setting_nothing_is_left_out(calls: list[dict[str, Any]], tm
     ("holdout", "notes", "message"),
     [
         ("cam9", "name = 'ada'", "evaluation.holdout=cam9: no such training camera; there are 01, 02, 03"),
-        ("each", "[cameras]\ntrain = ['01', '02']\n", "of 2 training cameras fewer than 2 would be left"),
+        ("each", "[cameras]\ntrain = ['01', '02']\n", "fewer than 2 of the 2 training cameras would be left"),
     ],
 )
 def test_what_cannot_be_left_out_is_told_before_any_work(
@@ -130,8 +131,8 @@ def test_what_cannot_be_left_out_is_told_before_any_work(
     (tmp_path / "ada" / "capture.toml").write_text(notes)
     options = ["--store", str(tmp_path / "store"), "--set", f"evaluation.holdout={holdout}"]
     assert main(["run", str(tmp_path / "ada"), *options]) == 2
-    told = capsys.readouterr().err
-    assert message in told and told.count("\n") == 1
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
     assert calls == []
 
 
@@ -139,9 +140,9 @@ def test_what_calibration_rejects_cannot_be_left_out(
     calls: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def without_03(recording: Artifact, calibration: Artifact) -> Capture:
-        return dataclasses.replace(calibrated(recording, calibration), train_cameras=("01", "02"))
+        return dataclasses.replace(calibrated_capture(recording, calibration), train_cameras=("01", "02"))
 
-    monkeypatch.setattr(module, "calibrated", without_03)
+    monkeypatch.setattr(module, "calibrated_capture", without_03)
     assert main(["run", str(tmp_path / "ada"), "--store", str(tmp_path / "store"), "--set", HELD_OUT[0]]) == 2
-    assert "of 2 training cameras" in capsys.readouterr().err
+    assert "fewer than 2 of the 2 training cameras" in capsys.readouterr().err
     assert of(calls, "fit") == []

@@ -22,7 +22,7 @@ def watched(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def runs(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """What was asked of the deployment; no server."""
+    """Record the deployment's runs, without a server."""
     asked: list[dict[str, Any]] = []
 
     def run_deployment(name: str, parameters: dict[str, Any], **options: Any) -> SimpleNamespace:
@@ -57,7 +57,8 @@ def test_a_copy_or_a_new_name_is_the_same_capture(watched: Path, runs: list[dict
 
 
 def test_a_store_that_was_deleted_trains_again(watched: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Prefect starts nothing for a key it knows: a look that was cut short has the same again, a new store another."""
+    """Prefect starts nothing for a key that it knows: an interrupted call uses the same key again, a new store
+    another."""
     keys: list[str] = []
 
     def run_deployment(*_: Any, idempotency_key: str, **__: Any) -> SimpleNamespace:

@@ -1,4 +1,4 @@
-"""Which stages are given what was made worse, and what becomes of runs that break; stages are made up."""
+"""The stages that get degraded inputs, and the verdicts on runs that break; stages are fake."""
 
 import base64
 import json
@@ -30,10 +30,11 @@ degradations:
 
 @pytest.fixture
 def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """Every stage replaced by one that names its input; the list gathers each training's inputs.
+    """Replace every stage by one that names its input; the list collects each training's inputs.
 
     Noise of 40 is refused by calibration; eroded masks crash the training; pose noise loses 2 dB; the surface breaks in
-    poses of 60 degrees."""
+    poses of 60 degrees.
+    """
     trained: list[dict[str, Any]] = []
 
     def made(name: str, **files: Any) -> Any:
@@ -78,7 +79,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
     def degrade(*inputs: Any) -> Any:
         return made(f"{inputs[-1].kind} {inputs[-1].strength:g}")
 
-    def dress(_: Any, truth: Any, recording: Any, cameras: Any, body: Any, degradation: Any) -> Any:
+    def degrade_clothing(_: Any, truth: Any, recording: Any, cameras: Any, body: Any, degradation: Any) -> Any:
         assert (truth, recording.name, body.name) == ("true", "capture", "body")
         return degrade(degradation)
 
@@ -94,19 +95,19 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
         "ingest": lambda *_: made("capture"),
         "with_keypoints": lambda store, recording, settings: recording,
         "calibrate": calibrate,
-        "find_masks": lambda *_: made("masks"),
+        "segment_subject": lambda *_: made("masks"),
         "fit": lambda *_: made("body"),
         "train": train,
         "evaluate": evaluate,
         "degrade_capture": degrade,
         "degrade_masks": degrade,
         "degrade_fit": degrade,
-        "dress": dress,
+        "degrade_clothing": degrade_clothing,
         "check_meshes": lambda *_: made("surfaces", surface={"000001": {"fault": None}}),
         "show_in_extreme_poses": show,
     }
     for name, stage in replaced.items():
-        for place in (module, train_subject):  # which `prepared` is of
+        for place in (module, train_subject):  # which `prepare_training` is of
             if hasattr(place, name):
                 monkeypatch.setattr(place, name, stage)
     capture = SimpleNamespace(name="ada", test_cameras=("c",), novel_pose_frames=(1, 3, 4))
@@ -116,7 +117,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
 
 
 def study(tmp_path: Path, **options: Any) -> dict[str, Any]:
-    """What the study of this file finds."""
+    """Run the study of this file; return its result."""
     table = stability.fn(tmp_path, str(tmp_path / "mine.yaml"), tmp_path / "store", **options)
     part = "-part" if options.get("only") else ""
     assert table == tmp_path / "store" / "stability" / f"ada-mine{part}.md"
@@ -146,7 +147,8 @@ def test_every_run_has_a_verdict(stages: list[dict[str, Any]], tmp_path: Path) -
 def test_runs_are_compared_by_the_images_and_surfaces_that_both_have(
     stages: list[dict[str, Any]], tmp_path: Path
 ) -> None:
-    """Of the noisy run frame 1 alone, in which both have 32 dB and 6 mm; the good run's mean of both is 30."""
+    """Compare the noisy run in frame 1 only, where both have 32 dB and 6 mm; the good run's mean of both frames is
+    30."""
     good, noisy = study(tmp_path, only=["image_noise"])["runs"][:2]
     assert (good["psnr"], good["images"], good["chamfer_mm"], good["surfaces"]) == (30.0, 2, 6.0, 1)
     assert (noisy["psnr"], noisy["images"], noisy["chamfer_mm"], noisy["surfaces"]) == (32.0, 1, 6.0, 1)
@@ -253,7 +255,7 @@ def test_a_part_stands_for_the_capture(
     (tmp_path / "mine.yaml").write_text(STUDY.replace("seeds: [0, 1]", f"seeds: [0]\n{part}"))
     found = study(tmp_path, only=["pose_noise"])
     assert [(s["recording"], s["body"]) for s in stages] == [("moment", "body"), ("moment", "pose_noise 2")]
-    assert "the capture beyond a part of it: frames 1, novel_poses False" in found["left_out"]
+    assert "the capture outside this part: frames 1, novel_poses False" in found["left_out"]
 
 
 def test_bad_input_in_evaluation_is_failure(
@@ -322,7 +324,7 @@ def test_a_study_of_few_degradations_leaves_the_whole_one_as_it_was(
 
 
 def test_charts_of_an_earlier_call_go(stages: list[dict[str, Any]], tmp_path: Path) -> None:
-    """Poses of which nothing but the surface is judged have no curves."""
+    """Run poses that are judged by surfaces alone, which have no curves."""
     study(tmp_path, only=["pose_noise"])
     study(tmp_path, only=["extreme_poses"])
     charts = {path.name for path in (tmp_path / "store" / "stability").glob("*.png")}
@@ -330,7 +332,7 @@ def test_charts_of_an_earlier_call_go(stages: list[dict[str, Any]], tmp_path: Pa
 
 
 def torn_surface(root: Path) -> SimpleNamespace:
-    """What a check of meshes finds of a surface that is not closed."""
+    """Return what a check of meshes finds for a surface that is not closed."""
     root.mkdir()
     (root / "surface.json").write_text(json.dumps({"000001": {"fault": "surface is not watertight"}}))
     return SimpleNamespace(root=root)
@@ -342,20 +344,21 @@ def test_a_run_to_compare_with_that_fails_is_kept_and_ends_its_seed(
     torn = torn_surface(tmp_path / "torn")
     monkeypatch.setattr(module, "check_meshes", lambda *_: torn)
     table = study(tmp_path, only=["pose_noise"])
-    told = [(r["kind"], r["seed"], r["verdict"], r["reason"]) for r in table["runs"]]
-    assert told == [("as recorded", seed, "failed", "surface is not watertight") for seed in (0, 1)]
+    rows = [(r["kind"], r["seed"], r["verdict"], r["reason"]) for r in table["runs"]]
+    assert rows == [("as recorded", seed, "failed", "surface is not watertight") for seed in (0, 1)]
     text = (tmp_path / "store" / "stability" / "ada-mine-part.md").read_text()
     assert "| pose noise, ° a joint | failed at 2 |" in text
 
 
 def test_what_has_no_new_poses_is_judged_on_new_views(stages: list[dict[str, Any]], tmp_path: Path) -> None:
-    """Nerfies has none at all; the paper's method has none of one frame, and then nothing in common with the others."""
+    """Nerfies has no novel poses at all; the paper's method has none with one frame, and then nothing in common with
+    the others."""
     (tmp_path / "mine.yaml").write_text(
         "methods: [nerfies, paper]\nseeds: [0]\ndegradations: {frames_left: [2, 1], extreme_poses: [45]}"
     )
     found = study(tmp_path)
-    told = [(r["method"], r["kind"], r["strength"], r["verdict"], r.get("psnr")) for r in found["runs"]]
-    assert told == [
+    rows = [(r["method"], r["kind"], r["strength"], r["verdict"], r.get("psnr")) for r in found["runs"]]
+    assert rows == [
         ("nerfies", "as recorded", None, "ok", 40.0),
         ("nerfies", "frames_left", 2, "ok", 40.0),
         ("nerfies", "frames_left", 1, "ok", 40.0),

@@ -1,4 +1,4 @@
-"""The order of the flow, with stages that only leave a note of what they were given."""
+"""The order of the flow, with fake stages that record what they were given."""
 
 import inspect
 import json
@@ -20,7 +20,7 @@ STAGES = ("ingest", "detect", "calibrate", "segment", "fit", "train", "evaluate"
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A capture folder, with every stage of the flow replaced."""
+    """Write a capture folder and replace every stage of the flow."""
     for name in STAGES:
         monkeypatch.setattr(module, name, _noting(getattr(module, name)))
     monkeypatch.setattr(module, "needs_body", lambda *_: (tmp_path / "ada" / "bare").exists())
@@ -30,7 +30,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def _noting(stage: Stage[Any]) -> Stage[Any]:
-    """A stage of the same name and inputs that writes down which artifacts it was given."""
+    """Return a stage of the same name and inputs that writes down which artifacts it was given."""
 
     def write(out: Path, **inputs: Any) -> dict[str, float]:
         (out / "given.json").write_text(json.dumps([v.stage for v in inputs.values() if isinstance(v, Artifact)]))
@@ -69,7 +69,7 @@ def test_without_masks_or_plates_a_rough_fit_comes_first(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (folder / "bare").touch()
-    monkeypatch.setattr(module, "settled", lambda *_: True)
+    monkeypatch.setattr(module, "converged", lambda *_: True)
     subject = train_subject.fn(folder, "demo", tmp_path / "store", [])
     assert given(subject, "segmentation") == ["capture", "calibration", "fit"]
     assert given(subject, "fit") == ["capture", "calibration", "segmentation"]
@@ -81,7 +81,7 @@ def test_fit_and_segmentation_go_round_until_the_masks_stand_still(
 ) -> None:
     (folder / "bare").touch()
     answers = iter([False, True])
-    monkeypatch.setattr(module, "settled", lambda *_: next(answers))
+    monkeypatch.setattr(module, "converged", lambda *_: next(answers))
     subject = train_subject.fn(folder, "demo", tmp_path / "store", [])
     assert given(subject, "segmentation") == ["capture", "calibration", "fit", "segmentation"]
     assert next(answers, None) is None
@@ -91,6 +91,6 @@ def test_fit_and_segmentation_go_round_until_the_masks_stand_still(
 def test_rounds_are_bounded(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder / "bare").touch()
     asked = []
-    monkeypatch.setattr(module, "settled", lambda *_: bool(asked.append(1)))
+    monkeypatch.setattr(module, "converged", lambda *_: bool(asked.append(1)))
     train_subject.fn(folder, "demo", tmp_path / "store", ["segmentation.rounds=2"])
     assert len(asked) == 2

@@ -10,12 +10,21 @@ from scipy.spatial.transform import Rotation
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import joint_transforms
 from hnerf.errors import InputError
-from hnerf.render.motion import Motion, adopted, between, lowest_points_m, read_motion, rows, select
+from hnerf.render.motion import (
+    Motion,
+    interpolate_poses,
+    lowest_points_m,
+    read_motion,
+    retarget,
+    select_frames,
+    select_poses,
+)
 from tests.asset.figure import bending_body, capture, column_rig
 
 
 def giant() -> BodyFit:
-    """A body twice as large, its joints in another order, that stands bent at x = 10 and then jumps 30 cm at x = 11."""
+    """Return a body twice as large, its joints in another order, that stands bent at x = 10 and then jumps 30 cm at x =
+    11."""
     rig = column_rig()
     rig = dataclasses.replace(rig, vertices_m=2 * rig.vertices_m, joints_m=2 * rig.joints_m)
     extra = torch.tensor([[0.0, 0, 3]])
@@ -43,7 +52,7 @@ def in_y_up(body: BodyFit) -> BodyFit:
 def test_another_motion_stands_where_this_body_stood(up: str) -> None:
     own = bending_body()  # its lowest point is at 0.5 m, its root joint at x = 0.5 in the mean, and y = 2
     motion = Motion(giant() if up == "z" else in_y_up(giant()), 10.0, up)
-    found = adopted(own, motion, "z")
+    found = retarget(own, motion, "z")
     torch.testing.assert_close(found.theta[:, 1], torch.tensor([[0.1, 0, 0], [0.2, 0, 0]]))
     assert found.theta[:, 0].count_nonzero() == 0
     torch.testing.assert_close(lowest_points_m(found, "z"), torch.tensor([0.5, 0.8]))
@@ -56,7 +65,7 @@ def test_a_motion_without_a_joint_that_turns_is_refused() -> None:
     other = bending_body()
     other = dataclasses.replace(other, rig=dataclasses.replace(other.rig, joint_names=("root", "tail")))
     with pytest.raises(InputError, match=r"no joint upper\.L"):
-        adopted(bending_body(), Motion(other, 10.0, "z"), "z")
+        retarget(bending_body(), Motion(other, 10.0, "z"), "z")
 
 
 def test_half_way_between_two_poses_is_half_the_turn() -> None:
@@ -65,7 +74,7 @@ def test_half_way_between_two_poses_is_half_the_turn() -> None:
     body.root[:2, :3, 3] = torch.tensor([[0.0, 0, 0], [2, 4, 6]])
     body.root[0, :3, :3] = torch.eye(3)
     body.root[1, :3, :3] = torch.from_numpy(Rotation.from_euler("z", 90, degrees=True).as_matrix())
-    found = between(body, 3, 4, 3)
+    found = interpolate_poses(body, 3, 4, 3)
     assert found.frames == (0, 1, 2)
     expected = torch.tensor([[0.0, 0, 0], [math.pi / 4, 0, 0], [math.pi / 2, 0, 0]])
     torch.testing.assert_close(found.theta[:, 1], expected)
@@ -78,7 +87,7 @@ def test_half_way_between_two_poses_is_half_the_turn() -> None:
 def test_the_turn_between_two_poses_goes_the_short_way() -> None:
     body = bending_body()
     body.theta[0, 1], body.theta[1, 1] = torch.tensor([0.0, 0, 3.0]), torch.tensor([0.0, 0, -3.0])
-    middle = between(body, 3, 4, 3).theta[1, 1]
+    middle = interpolate_poses(body, 3, 4, 3).theta[1, 1]
     assert middle.norm() == pytest.approx(math.pi, abs=1e-5)  # over half a turn, not back through zero
 
 
@@ -87,18 +96,18 @@ def test_the_turn_between_two_poses_goes_the_short_way() -> None:
     [(":", (3, 4, 5, 8)), ("4", (4,)), ("4:8", (4, 5)), ("::2", (4, 8)), ("3:9:5", (3, 8)), ("5:", (5, 8))],
 )
 def test_frames_are_chosen_by_number(wanted: str, chosen: tuple[int, ...]) -> None:
-    assert select((3, 4, 5, 8), wanted, Path("ada")) == chosen
+    assert select_frames((3, 4, 5, 8), wanted, Path("ada")) == chosen
 
 
 @pytest.mark.parametrize(("wanted", "message"), [("6", "ada: no frames 6; it has 3 to 8"), ("a:b", "FIRST:END:STEP")])
 def test_frames_that_are_not_there_are_refused(wanted: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        select((3, 4, 5, 8), wanted, Path("ada"))
+        select_frames((3, 4, 5, 8), wanted, Path("ada"))
 
 
 def test_rows_are_found_by_frame() -> None:
     body = bending_body()
-    torch.testing.assert_close(rows(body, (5, 8)).theta, body.theta[2:])
+    torch.testing.assert_close(select_poses(body, (5, 8)).theta, body.theta[2:])
 
 
 def test_the_fit_of_another_subject_is_read_with_its_rate(tmp_path: Path) -> None:
@@ -152,7 +161,7 @@ def test_half_a_file_is_no_motion(tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "walk.npz", poses=np.zeros((2, 156)), trans=np.zeros((2, 3)))
     whole = (tmp_path / "walk.npz").read_bytes()
     (tmp_path / "walk.npz").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match=r"walk\.npz: is no \.npz of plain arrays"):
+    with pytest.raises(InputError, match=r"walk\.npz: not an \.npz of plain arrays"):
         read_motion(tmp_path / "walk.npz")
 
 

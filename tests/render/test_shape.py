@@ -9,13 +9,13 @@ from hnerf.body.anny import ADULT, BETA_NAMES, anny_rig
 from hnerf.body.rig import Rig
 from hnerf.errors import InputError
 from hnerf.render.motion import lowest_points_m
-from hnerf.render.shape import outwards, volume_m3, with_values, with_volume, worn_by
+from hnerf.render.shape import offsets_from_bones_m, transfer_poses, volume_m3, with_shape_values, with_volume
 from tests.asset.figure import bending_body, column_rig
 
 
 def changeable_rig() -> Rig:
-    """The column: "weight" widens it by its radius a unit, so that volume goes with (1 + weight) squared; "length"
-    stretches it away from z = 0.8 by its length a unit."""
+    """Return the column with two shape values: "weight" widens it by its radius a unit, so that volume goes with (1 +
+    weight) squared; "length" stretches it away from z = 0.8 by its length a unit."""
     rig = column_rig()
     weight = rig.vertices_m * torch.tensor([1.0, 1, 0])
     length = (rig.vertices_m - torch.tensor([0, 0, 0.8])) * torch.tensor([0.0, 0, 1])
@@ -29,7 +29,7 @@ def changeable_rig() -> Rig:
 
 
 def bone_rig(upper: str) -> Rig:
-    """The column with bones along its whole axis."""
+    """Return the column with bones along its whole axis."""
     joints_m = torch.tensor([[0.0, 0, 0], [0, 0, 0.8], [0, 0, 1.6]])
     changes = {"joints_m": joints_m, "joint_names": ("root", upper, "tip"), "parents": torch.tensor([-1, 0, 1])}
     return dataclasses.replace(changeable_rig(), **changes)
@@ -37,7 +37,7 @@ def bone_rig(upper: str) -> Rig:
 
 @pytest.mark.parametrize("change", [0.44, -0.51, 0.0])
 def test_volume_changes_as_asked(change: float) -> None:
-    """A column's volume goes with its radius squared, and its ends stay where they are."""
+    """Expect the radius to go with the root of the column's volume, and its ends to stay."""
     rig = bone_rig("upper")
     found = with_volume(rig, change)
     radius = math.sqrt(1 + change)
@@ -46,10 +46,10 @@ def test_volume_changes_as_asked(change: float) -> None:
 
 
 def test_head_hands_and_feet_stay_as_thick_as_they_are() -> None:
-    """Skin of the neck's bone, above z = 0.9, stays; below z = 0.7 all of it goes away from the axis."""
+    """Expect skin of the neck's bone, above z = 0.9, to stay; below z = 0.7 all of it moves away from the axis."""
     rig = bone_rig("neck01")
     z = rig.vertices_m[:, 2]
-    away_m = outwards(rig)
+    away_m = offsets_from_bones_m(rig)
     assert not away_m[z > 0.91].any()
     lower = z < 0.69
     torch.testing.assert_close(away_m[lower], rig.vertices_m[lower] * torch.tensor([1.0, 1, 0]))
@@ -69,13 +69,13 @@ def test_whole_bodies_lose_and_gain_volume_without_folds(gender: float) -> None:
 
 @pytest.mark.parametrize("change", [20.0, -1.2, math.nan])
 def test_a_volume_out_of_reach_is_refused(change: float) -> None:
-    with pytest.raises(InputError, match="out of this body's reach"):
+    with pytest.raises(InputError, match="cannot be reached with this body"):
         with_volume(bone_rig("upper"), change)
 
 
 def test_values_are_added_by_name() -> None:
     rig = changeable_rig()
-    found = with_values(rig, {"length": 0.5})
+    found = with_shape_values(rig, {"length": 0.5})
     torch.testing.assert_close(found.beta, torch.tensor([0.3, 1.1]))
     assert found.vertices_m[:, 2].aminmax() == (pytest.approx(-0.4), pytest.approx(2.0))
 
@@ -83,16 +83,16 @@ def test_values_are_added_by_name() -> None:
 def test_a_shape_that_turns_its_skin_inside_out_is_refused() -> None:
     for change in (-2.0, math.nan):
         with pytest.raises(InputError, match=re.escape(f"weight {change:+.2f}: folds ")):
-            with_values(changeable_rig(), {"weight": change})
+            with_shape_values(changeable_rig(), {"weight": change})
 
 
 def test_an_unknown_value_is_refused_with_those_that_there_are() -> None:
     with pytest.raises(InputError, match="fat: this body's values are weight, length"):
-        with_values(changeable_rig(), {"fat": 1.0})
+        with_shape_values(changeable_rig(), {"fat": 1.0})
 
 
 def test_another_shape_stands_on_the_same_floor() -> None:
     body = dataclasses.replace(bending_body(), rig=changeable_rig())
-    longer = worn_by(with_values(body.rig, {"length": 0.5}), body, "z")
+    longer = transfer_poses(with_shape_values(body.rig, {"length": 0.5}), body, "z")
     torch.testing.assert_close(lowest_points_m(longer, "z"), torch.full((4,), 0.5))
     torch.testing.assert_close(longer.root[:, :2], body.root[:, :2])

@@ -1,5 +1,4 @@
-"""`hnerf render` on a subject that was never trained: a column whose field is as it was made, but for frames that
-deform it."""
+"""`hnerf render` on an untrained subject: a column whose field is as initialised, except for frames that deform it."""
 
 import dataclasses
 import json
@@ -18,14 +17,14 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.footage import Video
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.lens import Lens
-from hnerf.render.motion import between
+from hnerf.render.motion import interpolate_poses
 from hnerf.render.subject import RenderOptions, _cameras
 from tests.training.scene import TINY, record
 
 
 @pytest.fixture(scope="module")
 def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A column 2 m high that four cameras see 4 m off, in frames 0 to 2."""
+    """Write a column 2 m high that four cameras see from 4 m, in frames 0 to 2."""
     folder = tmp_path_factory.mktemp("subjects") / "column"
     for stage in ("capture", "calibration", "training"):
         (folder / stage).mkdir(parents=True)
@@ -67,14 +66,15 @@ def test_a_recorded_camera_shows_every_fitted_frame(subject: Path, tmp_path: Pat
 
 
 def test_a_frame_shown_alone_keeps_its_deformation_and_no_other_pose_has_one(subject: Path, tmp_path: Path) -> None:
-    """Frames 1 and 2 stand 15 cm to either side of their poses, 1.4 pixels; halfway between them is neither."""
-    wishes = {"alone": ["--frames", "1"], "between": ["--between", "1", "2", "--pictures", "3"]}
-    for name, options in wishes.items():
+    """Displace frames 1 and 2 by 15 cm, 1.4 pixels, to either side of their poses; a pose halfway between is not
+    displaced."""
+    arguments = {"alone": ["--frames", "1"], "between": ["--between", "1", "2", "--pictures", "3"]}
+    for name, options in arguments.items():
         view = ["--camera", "0", "--what", "colour", *options]
         assert main(["render", str(subject), "--out", str(tmp_path / name), *view]) == 0
     avatar = load_avatar(subject / "training")
     camera = Capture.load(subject / "capture").cameras["0"]
-    halfway = between(avatar.body, 1, 2, 3)
+    halfway = interpolate_poses(avatar.body, 1, 2, 3)
     expected = {
         "alone/colour/000000.png": avatar.render(camera, avatar.body.theta[1], avatar.body.root[1]),
         "between/colour/000001.png": avatar.without_frames().render(camera, halfway.theta[1], halfway.root[1]),
@@ -100,7 +100,7 @@ def test_an_orbit_round_one_pose_has_the_size_and_number_asked_for(subject: Path
 
 
 def test_a_path_without_sizes_has_that_of_the_recording(subject: Path, tmp_path: Path) -> None:
-    """Its intrinsics are of the pictures as recorded, not as they were shrunk at the door."""
+    """Expect intrinsics of the images as recorded, not as downscaled by ingest."""
     capture = Capture.load(subject / "capture")
     lens = Lens("a", capture.cameras["2"].K, np.zeros(5), capture.cameras["2"].R, capture.cameras["2"].t_m, None)
     write_cameras(tmp_path / "path", [lens], "easymocap")
@@ -110,7 +110,7 @@ def test_a_path_without_sizes_has_that_of_the_recording(subject: Path, tmp_path:
 
 
 def test_cameras_that_did_not_record_have_no_exposure_of_their_own(subject: Path) -> None:
-    """An orbit is made after the first camera, and a path's may be called like any: neither has its gain."""
+    """Expect no exposure gain, though an orbit copies the first camera and a path's cameras may have any name."""
     capture, body = Capture.load(subject / "capture"), BodyFit.load(subject / "training")
     assert not {camera.name for camera in _cameras(RenderOptions(), capture, body)} & set(capture.cameras)
     along_recorded = _cameras(RenderOptions(path=subject / "calibration"), capture, body)
@@ -151,15 +151,15 @@ def test_a_taller_body_reaches_higher_in_the_picture(subject: Path, tmp_path: Pa
     [
         (["--camera", "9"], "camera 9: the recording has 0, 1, 2, 3"),
         (["--what", "colour,xray"], "what xray: choose from colour, depth, normals, mask, mesh"),
-        (["--size", "0"], "pictures of 1 x 1 px: a side has 2 to 8000"),
-        (["--camera", "0", "--height", "1"], "--radius and --height are an orbit's"),
+        (["--size", "0"], "pictures of 1 x 1 px: each side must have 2 to 8000"),
+        (["--camera", "0", "--height", "1"], "--radius and --height are for an orbit"),
         (["--pictures", "0"], "0 pictures"),
         (["--frames", "7"], "no frames 7; it has 0 to 2"),
         (["--between", "0", "7"], "no frames 7; it has 0 to 2"),
-        (["--motion", "absent.npz"], "absent.npz: is no .npz"),
+        (["--motion", "absent.npz"], "absent.npz: not an .npz"),
         (["--path", "absent.json"], "absent.json: cannot be read"),
         (["--shape", "height"], "shape height: give a name and what to add"),
-        (["--volume", "-100"], "volume -100 %: out of this body's reach"),
+        (["--volume", "-100"], "volume -100 %: cannot be reached with this body"),
         (["--radius", "-1"], "radius"),
     ],
 )

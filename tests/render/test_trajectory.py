@@ -10,13 +10,13 @@ from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.lens import Lens
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
-from hnerf.render.trajectory import along, orbit, read_path
+from hnerf.render.trajectory import interpolate_cameras, orbit, read_camera_path
 
 TARGET_M = np.array([1.0, 2, 1])
 
 
 def camera_at(centre_m: tuple[float, float, float], yaw_deg: float = 0.0) -> Camera:
-    """Level, looking along +y where the yaw is zero; Z is up."""
+    """Return a level camera that looks along +y where the yaw is zero; Z is up."""
     level = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     R = level @ Rotation.from_euler("z", -yaw_deg, degrees=True).as_matrix()
     K = np.array([[500.0, 0, 90], [0, 400, 50], [0, 0, 1]])
@@ -51,14 +51,14 @@ def test_an_orbit_where_y_is_up_is_level_in_x_and_z() -> None:
 
 @pytest.mark.parametrize(("radius_m", "height_m"), [(0.0, 1.0), (np.inf, 1.0), (1.0, np.nan)])
 def test_an_orbit_that_is_no_circle_is_refused(radius_m: float, height_m: float) -> None:
-    with pytest.raises(InputError, match="no circle"):
+    with pytest.raises(InputError, match="not a circle"):
         orbit([camera_at((4, 2, 5))], TARGET_M, 4, "z", radius_m, height_m)
 
 
 def test_a_path_passes_its_cameras_and_halves_the_turn_between_two() -> None:
     first, last = camera_at((0, 0, 1)), camera_at((2, 4, 3), yaw_deg=90)
     last = dataclasses.replace(last, K=last.K * [[2, 1, 1], [1, 1, 1], [1, 1, 1]])
-    start, middle, end = along([first, last], 3)
+    start, middle, end = interpolate_cameras([first, last], 3)
     for given, found in ((first, start), (last, end)):
         np.testing.assert_allclose(found.projection, given.projection, atol=1e-9)
     np.testing.assert_allclose(middle.centre_m, [1, 2, 2])
@@ -68,13 +68,13 @@ def test_a_path_passes_its_cameras_and_halves_the_turn_between_two() -> None:
 
 def test_a_path_of_one_camera_stands_still() -> None:
     camera = camera_at((0, 0, 1))
-    assert [found is camera for found in along([camera], 3)] == [True] * 3
+    assert [found is camera for found in interpolate_cameras([camera], 3)] == [True] * 3
 
 
 def test_a_path_is_read_from_json(tmp_path: Path) -> None:
     given = [camera_at((0, 0, 1)), camera_at((2, 4, 3), yaw_deg=30)]
     (tmp_path / "path.json").write_text(json.dumps([plain(camera) for camera in given]))
-    for found, camera in zip(read_path(tmp_path / "path.json", (1, 1)), given, strict=True):
+    for found, camera in zip(read_camera_path(tmp_path / "path.json", (1, 1)), given, strict=True):
         np.testing.assert_allclose(found.projection, camera.projection)
         assert (found.width_px, found.height_px) == (200, 101)
 
@@ -83,7 +83,7 @@ def test_a_path_is_read_from_a_folder_of_cameras_in_its_own_unit(tmp_path: Path)
     camera = camera_at((2, 4, 3))
     write_cameras(tmp_path, [Lens("a", camera.K, np.zeros(5), camera.R, 1000 * camera.t_m, None)], "easymocap")
     (tmp_path / "capture.toml").write_text("units = 'mm'")
-    (found,) = read_path(tmp_path, (200, 101))
+    (found,) = read_camera_path(tmp_path, (200, 101))
     np.testing.assert_allclose(found.centre_m, [2, 4, 3])
     assert (found.width_px, found.height_px) == (200, 101)
 
@@ -101,4 +101,4 @@ def test_a_path_is_read_from_a_folder_of_cameras_in_its_own_unit(tmp_path: Path)
 def test_what_is_no_path_is_refused(content: object, message: str, tmp_path: Path) -> None:
     (tmp_path / "path.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=f"path.json.*{message}"):
-        read_path(tmp_path / "path.json", (1, 1))
+        read_camera_path(tmp_path / "path.json", (1, 1))

@@ -1,4 +1,4 @@
-"""A normalised capture made by hand: two training cameras and a test camera, five frames."""
+"""A small synthetic capture, normalised: two training cameras and a test camera, five frames."""
 
 from pathlib import Path
 
@@ -20,8 +20,8 @@ ROTATIONS = {
 
 
 def write_recording(folder: Path) -> Capture:
-    """Images of value 100 + frame, plates of 50, masks of the middle 8 x 8 px; keypoints 1 at (frame, 5), sure; the
-    rest of them in the image's middle. Cameras 01 and 02 train."""
+    """Write images of value 100 + frame, plates of 50, masks of the middle 8 x 8 px; keypoint 1 at (frame, 5),
+    confident, the others in the image's middle. Cameras 01 and 02 train."""
     sizes = dict.fromkeys(ROTATIONS, (SIZE_PX, SIZE_PX))
     cameras = {name: Camera(name, K, R, np.array([0.0, 1, 4]), SIZE_PX, SIZE_PX) for name, R in ROTATIONS.items()}
     capture = Capture("ada", folder, cameras, ("01", "02"), ("03",), FRAMES[:3], FRAMES[3:], 10.0, "z", sizes, sizes)
@@ -41,6 +41,6 @@ def write_recording(folder: Path) -> Capture:
 
 
 def write(path: Path, pixels: np.ndarray) -> None:
-    """One PNG."""
+    """Write one PNG."""
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), pixels.astype(np.uint8))

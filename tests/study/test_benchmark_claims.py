@@ -1,4 +1,4 @@
-"""Claims looked for in a result that was made up: H-NeRF and one other, from two and from four cameras."""
+"""Claims checked on a synthetic result: H-NeRF and one other, from two and from four cameras."""
 
 from typing import Any, get_args
 
@@ -10,7 +10,7 @@ from tests.study.test_benchmark_results import scores
 
 
 def of_method(psnr: float, chamfer: float, iou: float, cameras: int, slope: float) -> dict[str, Any]:
-    """Scores whose images lose `slope` dB a degree of angle; novel poses lose it a degree of pose."""
+    """Return scores whose images lose `slope` dB a degree of angle; novel poses lose it a degree of pose."""
     found = scores(psnr, 1.0, "") | {"trained_on": {"cameras": cameras, "frames": 1}}
     rows = [
         {"view_angle_deg": x, "pose_distance_deg": x, "psnr": psnr + offset - slope * x}
@@ -22,8 +22,8 @@ def of_method(psnr: float, chamfer: float, iou: float, cameras: int, slope: floa
     return found
 
 
-def made_up(check: str, **changes: Any) -> dict[str, Any]:
-    """fast: 28 to 30 dB, 0.2 to 0.1; nerf: 20 to 26 dB, 0.9 to 0.5."""
+def synthetic_result(check: str, **changes: Any) -> dict[str, Any]:
+    """Return a result. fast: 28 to 30 dB, 0.2 to 0.1; nerf: 20 to 26 dB, 0.9 to 0.5."""
     fast = {2: (28.0, 0.2, 0.9), 4: (30.0, 0.1, 0.9)} | changes.get("fast", {})
     nerf = {2: (20.0, 0.9, 0.05), 4: (26.0, 0.5, 0.05)} | changes.get("nerf", {})
     slope = changes.get("slope", 0.1)
@@ -45,47 +45,52 @@ def test_every_check_that_a_study_may_name_is_there() -> None:
 
 
 def test_more_is_better() -> None:
-    assert verdict(made_up("more_is_better")) == (
+    assert verdict(synthetic_result("more_is_better")) == (
         "yes: fast 28.0 dB to 30.0 dB; nerf 20.0 dB to 26.0 dB; "
         "fast Chamfer 0.20 to Chamfer 0.10; nerf Chamfer 0.90 to Chamfer 0.50."
     )
-    assert verdict(made_up("more_is_better", nerf={4: (26.0, 1.0, 0.05)})).startswith("no: ")
+    assert verdict(synthetic_result("more_is_better", nerf={4: (26.0, 1.0, 0.05)})).startswith("no: ")
 
 
 def test_the_first_method_loses_least() -> None:
-    assert verdict(made_up("loses_least")) == (
+    assert verdict(synthetic_result("loses_least")) == (
         "yes: fast loses 2.0 dB, nerf 6.0 dB; fast loses Chamfer 0.10, nerf Chamfer 0.40."
     )
-    assert verdict(made_up("loses_least", fast={2: (23.0, 0.2, 0.9)})).startswith("no: fast loses 7.0 dB")
+    assert verdict(synthetic_result("loses_least", fast={2: (23.0, 0.2, 0.9)})).startswith("no: fast loses 7.0 dB")
 
 
 def test_the_first_method_is_ahead() -> None:
-    assert verdict(made_up("ahead")).startswith("yes: 4 cameras: fast 30.0 dB, nerf 26.0 dB; 4 cameras: fast Chamfer")
-    assert verdict(made_up("ahead", nerf={2: (20.0, 0.1, 0.0)})).startswith("no: ")
+    assert verdict(synthetic_result("ahead")).startswith(
+        "yes: 4 cameras: fast 30.0 dB, nerf 26.0 dB; 4 cameras: fast Chamfer"
+    )
+    assert verdict(synthetic_result("ahead", nerf={2: (20.0, 0.1, 0.0)})).startswith("no: ")
 
 
 def test_quality_falls_with_the_angle_and_who_is_ahead_at_each() -> None:
-    """Six bins of 15 degrees: the first and the last hold one image each."""
-    found = verdict(made_up("falls_with_angle"))
+    """Use six bins of 15 degrees, of which the first and the last hold one image each."""
+    found = verdict(synthetic_result("falls_with_angle"))
     assert found.startswith(
         "yes: 4 cameras: fast 30.0 dB at 0°, 21.0 at 90°; 4 cameras: nerf 26.0 dB at 0°, 17.0 at 90°"
     )
-    assert verdict(made_up("falls_with_angle", slope=-0.1)).startswith("no: ")
-    ahead = verdict(made_up("ahead_at_every_angle"))
+    assert verdict(synthetic_result("falls_with_angle", slope=-0.1)).startswith("no: ")
+    ahead = verdict(synthetic_result("ahead_at_every_angle"))
     assert ahead == "yes: 4 cameras: +4.0 to +4.0 dB to nerf; 2 cameras: +8.0 to +8.0 dB to nerf."
-    assert verdict(made_up("ahead_at_every_angle", nerf={4: (31.0, 0.5, 0.05)})).startswith("no: ")
+    assert verdict(synthetic_result("ahead_at_every_angle", nerf={4: (31.0, 0.5, 0.05)})).startswith("no: ")
 
 
 @pytest.mark.parametrize(("slope", "seen"), [(0.0, "yes: 4 cameras: correlation -0.32 over 4 images"), (0.1, "no: ")])
 def test_new_poses_do_not_depend_on_how_far_they_are(slope: float, seen: str) -> None:
-    """Without a slope: deviations of x -45, -15, 15, 45 and of y 0, 1, -1, 0: -30 / sqrt(4500 x 2)."""
-    assert verdict(made_up("no_trend_with_pose", slope=slope)).startswith(seen)
+    """Without a slope, deviations of x are -45, -15, 15, 45 and of y 0, 1, -1, 0: -30 / sqrt(4500 x 2)."""
+    assert verdict(synthetic_result("no_trend_with_pose", slope=slope)).startswith(seen)
 
 
 def test_others_have_no_surface() -> None:
-    assert verdict(made_up("others_have_no_surface")) == "yes: 4 cameras: nerf IoU 0.05; 2 cameras: nerf IoU 0.05."
-    assert verdict(made_up("others_have_no_surface", nerf={2: (20.0, 0.9, 0.3)})).startswith("no: ")
+    assert (
+        verdict(synthetic_result("others_have_no_surface"))
+        == "yes: 4 cameras: nerf IoU 0.05; 2 cameras: nerf IoU 0.05."
+    )
+    assert verdict(synthetic_result("others_have_no_surface", nerf={2: (20.0, 0.9, 0.3)})).startswith("no: ")
 
 
 def test_without_figures_nothing_is_said() -> None:
-    assert verdict(made_up("ahead") | {"variants": {"8 cameras": {"left_out": "too few"}}}) == "no figures."
+    assert verdict(synthetic_result("ahead") | {"variants": {"8 cameras": {"left_out": "too few"}}}) == "no figures."

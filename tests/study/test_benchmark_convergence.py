@@ -1,18 +1,18 @@
-"""When a curve is flat, by hand."""
+"""Flat curves, worked out by hand."""
 
 import pytest
 
-from hnerf.study.benchmark.convergence import flat, limits_s
+from hnerf.study.benchmark.convergence import is_flat, training_limits_s
 
 
 def test_times_double_up_to_the_longest() -> None:
-    assert limits_s(10.0) == [10.0]
-    assert limits_s(45.0) == [10.0, 20.0, 40.0]
-    assert limits_s(10_800.0)[-3:] == [2560.0, 5120.0, 10_240.0]
+    assert training_limits_s(10.0) == [10.0]
+    assert training_limits_s(45.0) == [10.0, 20.0, 40.0]
+    assert training_limits_s(10_800.0)[-3:] == [2560.0, 5120.0, 10_240.0]
 
 
 @pytest.mark.parametrize(
-    ("curve", "told"),
+    ("curve", "expected"),
     [
         ([(320.0, 20.0), (640.0, 20.09)], True),
         ([(320.0, 20.0), (640.0, 20.11)], False),
@@ -25,6 +25,6 @@ def test_times_double_up_to_the_longest() -> None:
     ],
 )
 def test_a_curve_is_flat_where_its_last_third_gains_less_than_a_tenth_of_a_decibel(
-    curve: list[tuple[float, float]], told: bool
+    curve: list[tuple[float, float]], expected: bool
 ) -> None:
-    assert flat(curve) == told
+    assert is_flat(curve) == expected

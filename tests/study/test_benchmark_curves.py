@@ -1,8 +1,8 @@
-"""Fronts and crossings worked out by hand."""
+"""Pareto fronts and crossings worked out by hand."""
 
 import pytest
 
-from hnerf.study.benchmark.curves import bin_edges, binned, pareto_front, seconds_to, value_at
+from hnerf.study.benchmark.curves import bin_edges, bin_means, pareto_front, seconds_to_reach, value_at
 
 
 def test_the_front_is_what_nothing_beats_cheapest_first() -> None:
@@ -23,16 +23,16 @@ def test_equal_points_are_on_the_front_both() -> None:
 def test_a_level_is_reached_between_points_in_log_time() -> None:
     # 20 dB at 10 s, 24 dB at 1000 s: half the rise at the geometric mean of the times, a quarter at 10 * 100^(1/4)
     curve = [(10.0, 20.0), (1000.0, 24.0)]
-    assert seconds_to(curve, 22.0) == pytest.approx(100.0)
-    assert seconds_to(curve, 21.0) == pytest.approx(31.6228, rel=1e-5)
-    assert seconds_to(curve, 24.0) == pytest.approx(1000.0)
+    assert seconds_to_reach(curve, 22.0) == pytest.approx(100.0)
+    assert seconds_to_reach(curve, 21.0) == pytest.approx(31.6228, rel=1e-5)
+    assert seconds_to_reach(curve, 24.0) == pytest.approx(1000.0)
 
 
 def test_a_level_below_the_first_point_is_reached_there_and_one_above_all_never() -> None:
     curve = [(10.0, 20.0), (20.0, 25.0), (40.0, 23.0)]
-    assert seconds_to(curve, 15.0) == 10.0
-    assert seconds_to(curve, 25.5) is None
-    assert seconds_to([], 1.0) is None
+    assert seconds_to_reach(curve, 15.0) == 10.0
+    assert seconds_to_reach(curve, 25.5) is None
+    assert seconds_to_reach([], 1.0) is None
 
 
 def test_a_curve_between_its_points_before_and_after() -> None:
@@ -45,7 +45,7 @@ def test_a_curve_between_its_points_before_and_after() -> None:
 def test_bins_are_equally_wide_and_empty_ones_are_left_out() -> None:
     points = [(9.0, 8.0), (0.0, 2.0), (1.0, 6.0), (2.0, 4.0)]
     assert bin_edges([points[:2], points[2:]], 3) == [0.0, 3.0, 6.0, 9.0]
-    assert binned(points, [0.0, 3.0, 6.0, 9.0]) == [(1.0, 4.0, 3), (9.0, 8.0, 1)]
-    assert binned([(3.0, 1.0)], [0.0, 3.0, 6.0]) == [(3.0, 1.0, 1)]  # an edge is the next bin's
-    assert binned(points[:1], bin_edges([points[:1]], 5)) == [(9.0, 8.0, 1)]
+    assert bin_means(points, [0.0, 3.0, 6.0, 9.0]) == [(1.0, 4.0, 3), (9.0, 8.0, 1)]
+    assert bin_means([(3.0, 1.0)], [0.0, 3.0, 6.0]) == [(3.0, 1.0, 1)]  # an edge is the next bin's
+    assert bin_means(points[:1], bin_edges([points[:1]], 5)) == [(9.0, 8.0, 1)]
     assert bin_edges([], 3) == []

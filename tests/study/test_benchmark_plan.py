@@ -8,7 +8,7 @@ import pytest
 
 from hnerf.config import load_settings
 from hnerf.errors import InputError
-from hnerf.study.benchmark.plan import STUDIES, Study, Variant, load_study, snapshot_times_s
+from hnerf.study.benchmark.plan import STUDIES, BenchmarkStudy, Variant, load_study, snapshot_times_s
 
 RECORDED: Any = SimpleNamespace(name="ada", train_cameras=("a", "b", "c", "d"), train_frames=(0, 2, 4, 6, 8))
 
@@ -48,10 +48,10 @@ def test_methods_of_ready_studies_have_valid_settings() -> None:
         ("title: t\nmethods: [a]\nvariants: {all: {}}\nspeed: 3", "speed: Extra inputs"),
         ("title: t\nmethods: [a]\nvariants: {all: {views: 3}}", "variants.all.views: Extra inputs"),
         ("title: t\nmethods: [a]\nvariants: {all: {methods: [b]}}", "variants.all: no method b; there"),
-        ("title: t\nmethods: [a]\nvariants: {a: {}}\nuntil_flat: true\nsnapshots: 0", "until_flat: asks for"),
-        ("title: t\nmethods: [a]\nvariants: {a: {}}\nuntil_flat: true\nseconds: 60", "until_flat: asks for"),
+        ("title: t\nmethods: [a]\nvariants: {a: {}}\nuntil_flat: true\nsnapshots: 0", "until_flat: requires"),
+        ("title: t\nmethods: [a]\nvariants: {a: {}}\nuntil_flat: true\nseconds: 60", "until_flat: requires"),
         ("title: t\nmethods: [a]\nvariants: {}", "variants: Dictionary should have at least 1"),
-        ("title: t\nmethods: [a]\nvariants: {a: {}}\nclaims: [{says: a, check: more_is_better}]", "asks for a sweep"),
+        ("title: t\nmethods: [a]\nvariants: {a: {}}\nclaims: [{says: a, check: more_is_better}]", "requires a sweep"),
         ("title: t\nmethods: [a]\nvariants: {a: {}}\nclaims: [{says: a, check: faith}]", "claims.0.check: Input"),
     ],
 )
@@ -74,24 +74,24 @@ def test_unknown_studies_are_refused() -> None:
 
 
 def test_parts_by_number_and_by_name() -> None:
-    assert Variant().parts(RECORDED) == (None, None, None)
-    assert Variant(cameras=2, frames=3, novel_poses=False).parts(RECORDED) == (("a", "c"), (0, 4, 8), ())
-    assert Variant(cameras=3, frames=1).parts(RECORDED) == (("a", "b", "c"), (0,), None)
-    assert Variant(cameras=("d",), frames=(2,)).parts(RECORDED) == (("d",), (2,), None)
+    assert Variant().select(RECORDED) == (None, None, None)
+    assert Variant(cameras=2, frames=3, novel_poses=False).select(RECORDED) == (("a", "c"), (0, 4, 8), ())
+    assert Variant(cameras=3, frames=1).select(RECORDED) == (("a", "b", "c"), (0,), None)
+    assert Variant(cameras=("d",), frames=(2,)).select(RECORDED) == (("d",), (2,), None)
 
 
 def test_more_than_was_recorded_is_refused() -> None:
     with pytest.raises(InputError, match="the capture has 4 training cameras, not 8"):
-        Variant(cameras=8).parts(RECORDED)
+        Variant(cameras=8).select(RECORDED)
     with pytest.raises(InputError, match="the capture has 5 training frames, not 6"):
-        Variant(frames=6).parts(RECORDED)
+        Variant(frames=6).select(RECORDED)
 
 
 def test_names_that_were_not_recorded_are_refused() -> None:
     with pytest.raises(InputError, match="ada: no training camera e; there are a, b, c, d"):
-        Variant(cameras=("a", "e")).parts(RECORDED)
+        Variant(cameras=("a", "e")).select(RECORDED)
     with pytest.raises(InputError, match="ada: no training frame 3; there are 0, 2, 4, 6, 8"):
-        Variant(frames=(3,)).parts(RECORDED)
+        Variant(frames=(3,)).select(RECORDED)
 
 
 def test_snapshots_halve_the_limit_or_double_from_a_quarter_minute() -> None:
@@ -101,16 +101,16 @@ def test_snapshots_halve_the_limit_or_double_from_a_quarter_minute() -> None:
 
 
 def test_narrowing_keeps_methods_where_they_were_and_tries_presets_everywhere() -> None:
-    study = Study(
+    study = BenchmarkStudy(
         title="t",
         seconds=60,
         methods=("a", "b"),
         variants={"all": Variant(methods=("b",)), "one": Variant(frames=1)},
     )
-    assert study.narrowed([], None) == study.model_copy(
+    assert study.restricted_to([], None) == study.model_copy(
         update={"variants": {"all": Variant(methods=("b",)), "one": Variant(frames=1, methods=("a", "b"))}}
     )
-    narrowed = study.narrowed(["a", "demo"], 5.0)
+    narrowed = study.restricted_to(["a", "demo"], 5.0)
     assert narrowed.methods == ("a", "demo")
     assert {title: variant.methods for title, variant in narrowed.variants.items()} == {
         "all": ("demo",),

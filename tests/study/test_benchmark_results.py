@@ -1,4 +1,4 @@
-"""Tables and charts of a result that was made up."""
+"""Tables and charts of a synthetic result."""
 
 import csv
 import io
@@ -15,17 +15,17 @@ from hnerf.evaluation.images import unscored
 from hnerf.study.benchmark import charts
 from hnerf.study.benchmark.publish import picture_rows, publish
 from hnerf.study.benchmark.results import (
-    CELL,
+    CELL_LEGEND,
     as_csv,
     as_markdown,
     caption,
-    clouds,
-    ends,
+    end_reasons,
     frame_points,
     heading,
     near_best_seconds,
+    scatter_points,
+    smallest_timed_px,
     sweep_curves,
-    timed_px,
 )
 
 MACHINE = {"cpu": "Abacus", "cores": 2, "threads": 1, "gpu": None, "torch": "2", "python": "3"}
@@ -38,7 +38,7 @@ def split(psnr: float) -> dict[str, Any]:
         {"camera": "c", "frame": f, "psnr": psnr + f, "view_angle_deg": 40.0 + f, "pose_distance_deg": 3.0}
         for f in (0, 2)
     ]
-    floors = {"empty_psnr": 18.0, "one_colour_psnr": 25.0}
+    trivial_psnr = {"empty_psnr": 18.0, "one_colour_psnr": 25.0}
     return {
         "n": 2,
         "psnr": psnr,
@@ -47,7 +47,7 @@ def split(psnr: float) -> dict[str, Any]:
         "lpips": 0.04,
         "per_image": rows,
         "geometry": GEOMETRY,
-    } | floors
+    } | trivial_psnr
 
 
 def scores(psnr: float, frame_s: float, folder: str) -> dict[str, Any]:
@@ -110,7 +110,7 @@ def test_the_markdown_by_hand() -> None:
         "",
         "- A claim.",
         "",
-        CELL,
+        CELL_LEGEND,
         "",
         "## 4 cameras",
         "",
@@ -139,7 +139,7 @@ def test_the_markdown_by_hand() -> None:
 
 
 def test_what_methods_had_on_the_way_and_why_they_ended() -> None:
-    """nerf from 22 dB at 10 s to 26 at 1000: at 600 s 22 + 2 lg 60. idr was never scored."""
+    """Expect nerf, from 22 dB at 10 s to 26 at 1000, to have 22 + 2 lg 60 at 600 s. idr was never scored."""
     flat = result(until_flat=True)
     methods = flat["variants"]["4 cameras"]["methods"]
     methods["fast"] |= {"ended": "steps", "curve": [{"seconds": 20.0, "psnr": 31.0}, {"seconds": 40.0, "psnr": 30.0}]}
@@ -154,12 +154,12 @@ def test_what_methods_had_on_the_way_and_why_they_ended() -> None:
     methods["nerf"]["ended"] = "limit"
     assert "| nerf | 23.56 | 25.56 | - | 26.00 | 26.00 (1000 s) | 1000 s, out of time |" in as_markdown(flat, [], [])
     methods["nerf"]["ended"] = "flat"
-    assert ends(flat["variants"]["4 cameras"]) == {"fast": "its steps are done", "nerf": "flat"}
+    assert end_reasons(flat["variants"]["4 cameras"]) == {"fast": "its steps are done", "nerf": "flat"}
     assert "each from the start" in caption(flat) and "60 s at most" in caption(flat)
 
 
 def test_new_poses_have_three_columns_and_surfaces_one() -> None:
-    """The compared method tunes nothing."""
+    """Let the compared method tune nothing."""
     several = result()
     methods = several["variants"]["4 cameras"]["methods"]
     columns = {"novel_pose": 27.0, "novel_pose_posed": 28.0, "novel_pose_tracked": 29.0}
@@ -201,13 +201,17 @@ def test_the_csv_has_a_row_for_each_method_of_each_variant() -> None:
 def test_what_charts_show() -> None:
     variants = result()["variants"]
     assert heading("4 cameras", variants["4 cameras"]) == "4 cameras, new views"
-    assert timed_px(result()) == "256"
+    assert smallest_timed_px(result()) == "256"
     assert frame_points(variants["4 cameras"]) == {"fast": (0.5, 30.0), "nerf": (2.0, 26.0)}
     assert sweep_curves(result()) == {"fast": [(2, 28.0), (4, 30.0)], "nerf": [(4, 26.0)]}
-    assert clouds(variants["2 cameras"], "novel_view", "view_angle_deg") == {"fast": [(40.0, 28.0), (42.0, 30.0)]}
+    assert scatter_points(variants["2 cameras"], "novel_view", "view_angle_deg") == {
+        "fast": [(40.0, 28.0), (42.0, 30.0)]
+    }
     assert sweep_curves(result(), "geometry.chamfer_l2_e3")["fast"] == [(2, 0.05), (4, 0.05)]
-    surfaces = clouds(variants["2 cameras"], "novel_view", "pose_distance_deg", "chamfer_mm")
-    assert surfaces == {"fast": [(3.0, 5.0)]} and not clouds(variants["2 cameras"], "novel_pose", "view_angle_deg")
+    surfaces = scatter_points(variants["2 cameras"], "novel_view", "pose_distance_deg", "chamfer_mm")
+    assert surfaces == {"fast": [(3.0, 5.0)]} and not scatter_points(
+        variants["2 cameras"], "novel_pose", "view_angle_deg"
+    )
     # from 26 dB at 10 s to 30 dB at 1000 s: 29 dB after three quarters of the way in log time
     near = near_best_seconds(variants["4 cameras"])
     assert near == {"fast": pytest.approx(10 * 100**0.75), "nerf": None}
@@ -219,7 +223,7 @@ def test_captions_name_limit_and_machine() -> None:
 
 
 def write_pictures(store: Path) -> None:
-    """What the methods pictured."""
+    """Write the pictures of each method."""
     for name, grey in (("f", 200), ("n", 90)):
         for kind in ("render", "truth"):
             path = store / "scoring" / name / "pictures" / f"0-{kind}.png"
@@ -268,7 +272,7 @@ def test_methods_differ_in_line_and_marker_so_that_grey_prints_do() -> None:
 def test_ends_with_a_reason_are_marked_and_named() -> None:
     _, axes = charts._figure(1, 1)
     curves = {"a": [(10.0, 20.0), (20.0, 30.0)], "b": [(10.0, 21.0), (40.0, 25.0)]}
-    charts.lines(axes[0][0], curves, charts.styles(curves), {"a": "flat"})
+    charts.draw_curves(axes[0][0], curves, charts.styles(curves), {"a": "flat"})
     assert {text.get_text() for text in axes[0][0].texts} == {"a: flat", "b"}
     bars = [line for line in axes[0][0].lines if line.get_marker() == "|"]
     assert [line.get_xydata().tolist() for line in bars] == [[[20.0, 30.0]]]
@@ -277,7 +281,7 @@ def test_ends_with_a_reason_are_marked_and_named() -> None:
 def test_names_at_line_ends_do_not_lie_upon_each_other() -> None:
     figure, axes = charts._figure(1, 1)
     curves = {"a": [(1.0, 20.0), (10.0, 30.0)], "b": [(1.0, 21.0), (10.0, 30.1)], "c": [(1.0, 10.0), (10.0, 15.0)]}
-    charts.lines(axes[0][0], curves, charts.styles(curves))
+    charts.draw_curves(axes[0][0], curves, charts.styles(curves))
     figure.canvas.draw()
     boxes = sorted((text.get_window_extent() for text in axes[0][0].texts), key=lambda box: box.y0)
     assert len(boxes) == 3

@@ -1,4 +1,4 @@
-"""Scores of a made-up training, whose models are grey balls of known colours."""
+"""Scores of a synthetic training, whose models are grey balls of known colours."""
 
 import json
 import re
@@ -12,14 +12,14 @@ import torch
 
 from hnerf.avatar.avatar import Rendering
 from hnerf.capture.capture import Capture
-from hnerf.evaluation.columns import why_no_novel_poses
+from hnerf.evaluation.columns import reason_without_novel_poses
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.images import render
 from hnerf.evaluation.metrics import mask_box
 from hnerf.evaluation.views import View
 from hnerf.study.benchmark import scoring
 from hnerf.study.benchmark.plan import ScoringSettings
-from hnerf.study.benchmark.scoring import ScoringScene, frame_seconds, score, score_at, score_end, write_pictures
+from hnerf.study.benchmark.scoring import ScoringScene, frame_seconds, score, score_end, score_views, write_pictures
 from tests.evaluation.ball import (
     PHOTOGRAPHED,
     RADIUS_M,
@@ -46,7 +46,7 @@ SETTINGS = ScoringSettings(meshes=1, snapshot_images=2, snapshot_meshes=0, frame
 
 @dataclass(frozen=True)
 class SizedBall(BallAvatar):
-    """The ball; every rendering's size is noted."""
+    """A ball that records the size of every rendering."""
 
     sizes: list[tuple[int, int]] = field(default_factory=list)
 
@@ -58,7 +58,7 @@ class SizedBall(BallAvatar):
 def scored(
     base: Path, test_cameras: tuple[str, ...], settings: ScoringSettings = SETTINGS, kind: str = "fast"
 ) -> dict[str, Any]:
-    """Scores, in `base`/out, of a training of 15 s whose field had 12, with snapshots before and after the field's
+    """Score, into `base`/out, a training of 15 s whose field took 12, with snapshots before and after the field's
     end."""
     training = base / "training"
     stored = {"static": False, "training": {"field": {"kind": kind}, "pose_learning_rate": 0}}
@@ -79,13 +79,13 @@ def scored(
 
 
 def scene(capture: Capture) -> ScoringScene:
-    """What the ball is scored against."""
+    """Return what the ball is scored against."""
     return ScoringScene(capture, ball_fit(), GroundTruth(capture.root, capture), "cpu")
 
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where everything lies of a capture with one test camera."""
+    """Return the folder of a capture with one test camera and its scores."""
     folder = tmp_path_factory.mktemp("scored")
     scored(folder, ("c",))
     return folder
@@ -93,13 +93,13 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def found(base: Path) -> dict[str, Any]:
-    """Its scores."""
+    """Return the scores of `base`."""
     read: dict[str, Any] = json.loads((base / "out" / "scores.json").read_text())
     return read
 
 
 def psnr_db(grey: float, camera: str, frame: int) -> float:
-    """Of a ball in this grey: only its own pixels are off, all by the same."""
+    """Return the PSNR of a ball in this grey, where only its own pixels are wrong, all by the same amount."""
     mask = seen(ball_camera(camera, {"a": 0.0, "c": 160.0}[camera]), centre_m(frame))
     return -10 * np.log10(mask[mask_box(mask)].mean() * ((PHOTOGRAPHED - round(grey)) / 255) ** 2)
 
@@ -110,7 +110,7 @@ def test_the_curve_is_of_snapshots_when_they_were_taken_and_of_the_end_of_the_fi
     for row, grey in zip(found["curve"], (51, 76.5, 102), strict=True):
         assert row["n"] == 2
         assert row["psnr"] == pytest.approx(np.mean([psnr_db(grey, "c", f) for f in (0, 2)]), abs=1e-3)
-        assert row["geometry_reason"] == "the study asks for no surface here"
+        assert row["geometry_reason"] == "the study requests no surface here"
     assert found["novel_view"]["psnr"] == pytest.approx(np.mean([psnr_db(102, "c", f) for f in (0, 1, 2)]), abs=1e-3)
     assert found["novel_view"]["geometry"]["chamfer_mm"] == pytest.approx(1e3 * GAP_M, rel=0.02)
     assert found["training"]["model_mib"] == 7.0
@@ -127,7 +127,8 @@ def test_of_a_longer_training_the_end_alone_is_scored(base: Path, found: dict[st
 
 
 def test_curves_of_new_poses_are_animated_and_end_with_the_field(tmp_path: Path) -> None:
-    """They need no fitting to the finished field. Training lifted the new frame's body by two pixels."""
+    """Score curves without fitting poses to the finished field. Training raised the novel frame's body by two
+    pixels."""
     found = scored(tmp_path, ("c",), SETTINGS.model_copy(update={"split": "novel_pose"}))
     assert [row["seconds"] for row in found["curve"]] == [6.5, 10.0, 12.0]
     for row, grey in zip(found["curve"], (51, 76.5, 102), strict=True):
@@ -186,7 +187,7 @@ def test_who_has_no_novel_poses(tmp_path: Path) -> None:
     def reason(kind: str, static: bool) -> str | None:
         stored = {"static": static, "training": {"field": {"kind": kind}, "pose_learning_rate": 0}}
         (tmp_path / "settings.json").write_text(json.dumps(stored))
-        return why_no_novel_poses(tmp_path)
+        return reason_without_novel_poses(tmp_path)
 
     assert [reason(name, False) for name in ("fast", "paper", "neural_body")] == [None] * 3
     assert reason("fast", True) is None
@@ -195,12 +196,12 @@ def test_who_has_no_novel_poses(tmp_path: Path) -> None:
 
 
 def test_images_are_chosen_of_those_whose_truth_is_known(tmp_path: Path) -> None:
-    """Of three frames the middle one alone has a mask, and one image is asked for."""
+    """Ask for one image of three frames, of which only the middle one has a mask."""
     capture = write_ball_capture(tmp_path, "ball", ("c",))
     write_ball_truth(capture, RADIUS_M)
     for frame in (0, 2):
         (tmp_path / "ground_truth" / "masks" / "c" / f"{frame:06d}.png").unlink()
-    found = score_at(scene(capture), BallAvatar(ball_fit()), "novel_view", 1, 0, tmp_path)
+    found = score_views(scene(capture), BallAvatar(ball_fit()), "novel_view", 1, 0, tmp_path)
     assert [row["frame"] for row in found["per_image"]] == [1]
 
 

@@ -9,8 +9,8 @@ import trimesh
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.evaluation.ground_truth import GroundTruth
-from hnerf.study.degradations import clothing as worn
-from hnerf.study.degradations.clothing import Worn, add_clothing, long_hair, skirt
+from hnerf.study.degradations import clothing
+from hnerf.study.degradations.clothing import Garment, add_clothing, long_hair, skirt
 from tests.body.boxes import box_rig
 from tests.study.recording import FRAMES, SIZE_PX, write_recording
 
@@ -18,27 +18,28 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def standing() -> np.ndarray:
-    """Keypoints (2, 25, 3) of somebody who faces -y in two frames: hips 20 cm apart at 1 m, knees 30 cm at 0.5 m, ears
-    16 cm at 1.6 m, the nose before them."""
+    """Return keypoints (2, 25, 3) of a person who faces -y in two frames: hips 20 cm apart at 1 m, knees 30 cm at 0.5
+    m, ears 16 cm at 1.6 m, the nose before them."""
     keypoints_m = np.zeros((2, 25, 3))
     for name, x, y, z in (
         ("R_HIP", -0.1, 0, 1.0), ("L_HIP", 0.1, 0, 1.0), ("R_KNEE", -0.15, 0, 0.5), ("L_KNEE", 0.15, 0, 0.5),
         ("R_EAR", -0.08, 0, 1.6), ("L_EAR", 0.08, 0, 1.6), ("NOSE", 0, -0.1, 1.6),
     ):  # fmt: skip
-        keypoints_m[:, getattr(worn, name)] = x, y, z
+        keypoints_m[:, getattr(clothing, name)] = x, y, z
     return keypoints_m
 
 
 def test_a_skirt_hangs_from_the_hips_to_the_knees_and_its_folds_move() -> None:
-    """Waist 20 cm, the distance of the hips, around (0, 0, 1); hem 10 + 10 cm, give or take folds of 3 cm, off the line
-    between the knees at 0.5 m, of which tanh 2 of either half are reached to the left and the right."""
+    """Expect a waist of 20 cm, the distance of the hips, around (0, 0, 1), and a hem of 10 + 10 cm, plus or minus folds
+    of 3 cm, off the line between the knees at 0.5 m, of which it reaches tanh 2 of either half to the left and the
+    right."""
     made = skirt(standing(), UP, 0.1, np.random.default_rng(0))
     first = made.vertices_m[0]
-    rings_m = first[:-2].reshape(worn.ALONG, worn.AROUND, 3)
+    rings_m = first[:-2].reshape(clothing.RINGS, clothing.RING_VERTICES, 3)
     assert rings_m[0, :, 2] == pytest.approx(1.0)
     assert rings_m[-1, :, 2] == pytest.approx(0.5)
     assert np.linalg.norm(rings_m[0, :, :2], axis=-1) == pytest.approx(0.2)
-    left, back, right, front = rings_m[-1, :: worn.AROUND // 4]
+    left, back, right, front = rings_m[-1, :: clothing.RING_VERTICES // 4]
     fold_m = back[1] - 0.2  # the same one at every eighth of a turn
     assert 0 < abs(fold_m) < 0.03
     assert (back[0], front[0], front[1]) == pytest.approx((0, 0, -0.2 - fold_m))
@@ -47,10 +48,10 @@ def test_a_skirt_hangs_from_the_hips_to_the_knees_and_its_folds_move() -> None:
 
 
 def test_what_is_worn_is_a_closed_surface_with_its_inside_inside() -> None:
-    """Around knees that touch, a skirt that does not flare is a cone from 0.2 to 0.1 m over 0.5 m, less 0.16 % for
-    having 64 corners."""
+    """Around knees that touch, a skirt without flare is a cone from 0.2 to 0.1 m over 0.5 m, less 0.16 % for having 64
+    corners."""
     keypoints_m = standing()
-    keypoints_m[:, [worn.R_KNEE, worn.L_KNEE], 0] = 0
+    keypoints_m[:, [clothing.R_KNEE, clothing.L_KNEE], 0] = 0
     made = skirt(keypoints_m, UP, 1e-9, np.random.default_rng(0))
     mesh = trimesh.Trimesh(made.vertices_m[0], made.faces, process=False)
     assert mesh.is_watertight
@@ -59,10 +60,10 @@ def test_what_is_worn_is_a_closed_surface_with_its_inside_inside() -> None:
 
 
 def test_hair_hangs_behind_the_head() -> None:
-    """40 cm from the ears down, its middle 0.55 x 16 cm behind them and 0.15 x 40 cm more at its end, 0.35 x 16 cm
-    thick to either side."""
+    """Expect 40 cm from the ears down, its middle 0.55 x 16 cm behind them and 0.15 x 40 cm more at its end, 0.35 x 16
+    cm thick to either side."""
     made = long_hair(standing(), UP, 0.4, np.random.default_rng(0))
-    rings_m = made.vertices_m[0][:-2].reshape(worn.ALONG, worn.AROUND, 3)
+    rings_m = made.vertices_m[0][:-2].reshape(clothing.RINGS, clothing.RING_VERTICES, 3)
     assert (rings_m[0, 0, 2], rings_m[-1, 0, 2]) == pytest.approx((1.6, 1.2))
     assert (rings_m[0, :, 1].min(), rings_m[0, :, 1].max()) == pytest.approx((0.032, 0.144))
     assert rings_m[-1, :, 1].mean() == pytest.approx(0.148)
@@ -72,18 +73,19 @@ def test_hair_hangs_behind_the_head() -> None:
     assert mesh.volume > 0
 
 
-def column(keypoints_m: np.ndarray, up: np.ndarray, half_m: float, rng: np.random.Generator) -> Worn:
-    """Upright around (0, 0), from 1.5 to 0.5 m."""
-    rings_m = np.zeros((len(keypoints_m), worn.ALONG, worn.AROUND, 3))
-    rings_m[..., 2] = np.linspace(1.5, 0.5, worn.ALONG)[:, None]
-    rings_m[..., :2] = half_m * np.concatenate([np.cos(worn.ANGLES), np.sin(worn.ANGLES)], 1)
-    return Worn.tube(rings_m, np.ones((2, 3)))
+def column(keypoints_m: np.ndarray, up: np.ndarray, half_m: float, rng: np.random.Generator) -> Garment:
+    """Return an upright tube around (0, 0), from 1.5 to 0.5 m."""
+    rings_m = np.zeros((len(keypoints_m), clothing.RINGS, clothing.RING_VERTICES, 3))
+    rings_m[..., 2] = np.linspace(1.5, 0.5, clothing.RINGS)[:, None]
+    rings_m[..., :2] = half_m * np.concatenate([np.cos(clothing.ANGLES), np.sin(clothing.ANGLES)], 1)
+    return Garment.tube(rings_m, np.ones((2, 3)))
 
 
 def dressed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Capture, GroundTruth]:
-    """tests/study/recording.py's capture, in which a body of 1 m³ stands before camera 01 and hides a column 0.5 m
-    thick; its truth knows the middle 2 x 2 px of camera 03, and a triangle in frame 2."""
-    monkeypatch.setitem(worn.WORN, "column", column)
+    """Draw clothing into the capture of tests/study/recording.py, in which a body of 1 m³ stands before camera 01
+    and hides a column 0.5 m thick; the truth is known for the middle 2 x 2 px of camera 03, and is a triangle in
+    frame 2."""
+    monkeypatch.setitem(clothing.GARMENTS, "column", column)
     good = write_recording(tmp_path / "good")
     folder = good.root / "ground_truth"
     mask = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
@@ -100,8 +102,8 @@ def dressed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Capture, G
 
 
 def test_what_is_worn_is_seen_where_the_body_does_not_hide_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """1 m high and 0.5 m wide, 4 m from a camera of 16 px focal length: about 4 x 2 px around the middle; nearest, at
-    3.75 m, half a metre is 2.13 px."""
+    """A column 1 m high and 0.5 m wide, 4 m from a camera of 16 px focal length, is about 4 x 2 px around the middle;
+    where it is nearest, at 3.75 m, half a metre is 2.13 px."""
     bad, _ = dressed(tmp_path, monkeypatch)
     changed = {name: np.abs(bad.image(name, 2).astype(int) - 102).max(-1) > 40 for name in bad.cameras}
     assert not changed["01"].any()
@@ -122,5 +124,5 @@ def test_the_truth_wears_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert np.abs(on_black.astype(int) - bad.image("03", 2)).max(-1)[6:10, 7:9].max() <= 3  # twice through JPEG
     assert on_black[:2].max() <= 5  # nothing but what JPEG adds
     (mesh,) = truth.meshes().values()
-    assert len(mesh.vertices) == worn.ALONG * worn.AROUND + 2 + 3
+    assert len(mesh.vertices) == clothing.RINGS * clothing.RING_VERTICES + 2 + 3
     assert mesh.vertices[mesh.faces[-1]] == pytest.approx(np.eye(3))

@@ -11,7 +11,7 @@ from tests.study.recording import FRAMES, write_recording
 
 
 def degraded(tmp_path: Path, kind: str, strength: float, seed: int = 0) -> Capture:
-    """The recording of tests/study/recording.py, degraded and read again."""
+    """Degrade the recording of tests/study/recording.py and load it."""
     capture = write_recording(tmp_path / "good")
     degrade_capture(capture, Degradation(kind=kind, strength=strength, seed=seed), tmp_path / "bad")
     return Capture.load(tmp_path / "bad")
@@ -27,13 +27,14 @@ def test_cameras_and_frames_that_are_left(tmp_path: Path) -> None:
 
 
 def test_what_there_is_already_cannot_be_left(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="ada: has only 2 training cameras; leave fewer than that"):
+    with pytest.raises(InputError, match="ada: has only 2 training cameras; keep fewer than that"):
         degraded(tmp_path, "cameras_left", 2)
 
 
 @pytest.mark.parametrize("kind", ["camera_turned", "camera_out_of_step", "exposure"])
 def test_one_camera_alone_differs_from_none(tmp_path: Path, kind: str) -> None:
-    """It would turn, delay or darken the world, which scores would hold against the avatar."""
+    """Refuse to rotate, delay or darken the only camera: it would change the world itself, and scores would count that
+    against the avatar."""
     capture = write_recording(tmp_path / "good")
     alone = replace(capture, train_cameras=capture.train_cameras[:1])
     with pytest.raises(NotApplicableError, match="ada: has only one training camera; this needs several"):
@@ -74,7 +75,7 @@ def test_a_late_camera_has_no_mask_where_it_had_none_before(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("frames", [0.4, 5])
 def test_a_delay_that_no_frame_shows_cannot_be_tried(tmp_path: Path, frames: float) -> None:
-    with pytest.raises(NotApplicableError, match=f"ada: has 5 frames; none can be {frames:g} late"):
+    with pytest.raises(NotApplicableError, match=f"ada: has 5 frames; none can be delayed by {frames:g}"):
         degraded(tmp_path, "camera_out_of_step", frames)
 
 
@@ -92,7 +93,7 @@ def test_strengths_go_one_way(strengths: tuple[float, ...]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "strengths", "told"),
+    ("kind", "strengths", "expected"),
     [
         ("cameras_left", (1, 2, 3), "whole numbers between 1 and inf that fall"),
         ("cameras_left", (0.5,), "whole numbers between 1 and inf that fall"),
@@ -106,8 +107,8 @@ def test_strengths_go_one_way(strengths: tuple[float, ...]) -> None:
         ("mask_limb", (50, 120), "numbers between 0 and 100 that rise"),
     ],
 )
-def test_each_kind_has_its_way_and_bounds(kind: str, strengths: tuple[float, ...], told: str) -> None:
-    with pytest.raises(InputError, match=f"degradation {kind}: give {told}, the mildest first"):
+def test_each_kind_has_its_way_and_bounds(kind: str, strengths: tuple[float, ...], expected: str) -> None:
+    with pytest.raises(InputError, match=f"degradation {kind}: give {expected}, the mildest first"):
         check_strengths(kind, strengths)
 
 
@@ -122,5 +123,5 @@ def test_kinds_are_told_apart_by_their_labels() -> None:
 
 
 def test_unknown_degradations_are_refused() -> None:
-    with pytest.raises(InputError, match="degradation hair: no such thing; there are cameras_left, "):
+    with pytest.raises(InputError, match="degradation hair: no such degradation; there are cameras_left, "):
         check_strengths("hair", (1.0,))

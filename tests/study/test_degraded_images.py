@@ -55,7 +55,7 @@ def test_half_size(tmp_path: Path) -> None:
 
 
 def test_the_person_stands_where_rays_meet(tmp_path: Path) -> None:
-    """Keypoints' mean is 0.1 px or so off the images' middle, where both axes cross at (0, 0, 1)."""
+    """Expect (0, 0, 1), where both axes cross: the keypoints' mean is 0.1 px or so off the images' middle."""
     assert person_middle(write_recording(tmp_path)) == pytest.approx([0, 0, 1], abs=0.1)
 
 
@@ -67,8 +67,8 @@ def test_the_pillar_stands_on_the_way_to_the_camera(tmp_path: Path) -> None:
 
 
 def test_a_pillar_hides_pixels_masks_and_keypoints_of_the_camera_behind_it(tmp_path: Path) -> None:
-    """Nearest at 2.15 m from a camera of 16 px focal length, 0.5 m are 3.7 px; the other camera sees it 1.35 m to the
-    left of the person and not in front of him."""
+    """At 2.15 m from a camera of 16 px focal length, where it is nearest, 0.5 m are 3.7 px; the other camera sees it
+    1.35 m to the left of the person and not in front of them."""
     bad = degraded(tmp_path, "occluder", 0.5)
     grey = {name: (bad.image(name, 2).astype(int).max(-1) < 99).sum(0) for name in bad.cameras}  # rows a column
     behind = [name for name, columns in grey.items() if columns.any()]

@@ -13,14 +13,14 @@ BOX = slice(20, 60), slice(30, 70)  # 40 x 40
 
 
 def masks() -> Masks:
-    """One box in frames 2 and 4 of camera 01."""
+    """Return masks of one box in frames 2 and 4 of camera 01."""
     mask = np.zeros((SIZE_PX, SIZE_PX), bool)
     mask[BOX] = True
     return Masks({("01", frame): encode(mask) for frame in (2, 4)}, {"cameras": {}})
 
 
 def changed(tmp_path: Path, kind: str, strength: float) -> list[np.ndarray]:
-    """The masks, degraded."""
+    """Return the degraded masks."""
     capture = write_recording(tmp_path)
     bad = degrade_masks(masks(), capture, Degradation(kind=kind, strength=strength, seed=0))
     assert list(bad.encoded) == [("01", 2), ("01", 4)]
@@ -46,7 +46,8 @@ def test_holes_take_their_share_and_no_more_than_a_disc_over(tmp_path: Path) -> 
 
 
 def test_a_limb_is_cut_off_around_its_bone(tmp_path: Path) -> None:
-    """All limbs' keypoints at the same two places: from (40, 40) to (50, 40), on to (55, 40), 8 px thick."""
+    """Put all limbs' keypoints at the same two places: expect a cut from (40, 40) to (50, 40), on to (55, 40), 8 px
+    thick."""
     capture = write_recording(tmp_path)
     people = np.zeros((5, 1, 25, 3))
     people[:, 0, [3, 6, 10, 13]] = 40, 40, 1

@@ -1,4 +1,4 @@
-"""The studies as they are kept, and tables and charts from runs that were made up."""
+"""The committed studies, and tables and charts of synthetic runs."""
 
 import itertools
 from pathlib import Path
@@ -9,11 +9,11 @@ import pytest
 
 from hnerf.config import load_settings
 from hnerf.errors import InputError
-from hnerf.study.benchmark.plan import Part
+from hnerf.study.benchmark.plan import CapturePart
 from hnerf.study.degradations.catalogue import KINDS
 from hnerf.study.stability.charts import SHADES, curve_chart, matrix_chart
-from hnerf.study.stability.plan import Stability, load_stability
-from hnerf.study.stability.report import as_markdown, how_far
+from hnerf.study.stability.plan import StabilityStudy, load_stability
+from hnerf.study.stability.report import as_markdown, tolerated_strength
 
 
 def test_the_full_study_tries_everything_at_four_or_five_strengths_and_three_seeds() -> None:
@@ -37,17 +37,17 @@ def test_studies_of_other_methods_and_of_full_training() -> None:
     assert (fast.methods, fast.degradations) == (("fast",), full.degradations)
     assert (*fast.seeds, *fast.border_seeds) == full.seeds
     assert not [override for override in fast.overrides if override.startswith("training")]
-    assert "2 of 3 seeds, but where a verdict is near its border" in fast.left_out()
+    assert "2 of 3 seeds, except where a verdict is near a border" in fast.left_out()
     milder = {name: strengths[:2] for name, strengths in full.degradations.items()}
     moving, still = load_stability("methods"), load_stability("one-moment")
     assert moving.degradations == milder
     assert still.degradations == {k: v for k, v in milder.items() if k not in ("frames_left", "camera_out_of_step")}
-    assert still.part == Part(frames=1, novel_poses=False)
+    assert still.part == CapturePart(frames=1, novel_poses=False)
     assert {*moving.methods, *still.methods} == {"fast", "neural-body", "nerfies", "nerf", "idr"}
     published = load_stability("published")
     assert published.methods == ("paper-small", "neural-body")
     assert published.degradations == {name: milder[name] for name in published.degradations}
-    assert {KINDS[name].place for name in published.degradations} == {"capture", "masks", "fit", "poses"}
+    assert {KINDS[name].target for name in published.degradations} == {"capture", "masks", "fit", "poses"}
     for study in (fast, moving, still, published):
         for method in study.methods:
             load_settings(method, list(study.overrides))
@@ -60,8 +60,8 @@ def test_the_quick_study_tries_the_two_milder_strengths_and_says_what_it_left_ou
         load_settings(method, list(quick.overrides))
     left_out = quick.left_out()
     assert "`paper` as a method" in left_out
-    assert "2 of 3 seeds: no spread is known from so few" in left_out
-    assert "what the preset says: `training.steps=100` instead" in left_out
+    assert "2 of 3 seeds: too few to know the variance" in left_out
+    assert "the preset's own value: `training.steps=100` instead" in left_out
     assert "one camera turned, °: 2, 3" in left_out
     assert "blur, % of image width: 0.25, 0.5, 1, 2" in left_out
 
@@ -71,27 +71,27 @@ def test_the_quick_study_tries_the_two_milder_strengths_and_says_what_it_left_ou
     [
         ("methods: [fast]\nseeds: [0]\ndegradations: {mask_holes: [5]}\nspeed: 3", "speed: Extra inputs"),
         ("methods: []\nseeds: [0]\ndegradations: {}", "methods: "),
-        ("methods: [fast]\nseeds: [0]\ndegradations: {hats: [5]}", "degradation hats: no such thing"),
+        ("methods: [fast]\nseeds: [0]\ndegradations: {hats: [5]}", "degradation hats: no such degradation"),
         ("methods: [fast]\nseeds: [0]\ndegradations: {mask_holes: [5, 2, 3]}", "the mildest first"),
     ],
 )
 def test_bad_studies_are_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(text)
-    with pytest.raises(InputError, match=message) as told:
+    with pytest.raises(InputError, match=message) as raised:
         load_stability(str(tmp_path / "mine.yaml"))
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(raised.value)
 
 
 def test_unknown_studies_and_degradations_are_refused() -> None:
     with pytest.raises(InputError, match="slow: no such study or file; studies are brief, fast, full, methods, "):
         load_stability("slow")
     with pytest.raises(InputError, match="--only hats: not in this study; it has cameras_left, "):
-        load_stability("quick").only(["hats"])
-    assert list(load_stability("quick").only(["pose_noise"]).degradations) == ["pose_noise"]
+        load_stability("quick").restricted_to(["hats"])
+    assert list(load_stability("quick").restricted_to(["pose_noise"]).degradations) == ["pose_noise"]
 
 
 def run(method: str, kind: str, strength: float | None, seed: int, verdict: str, psnr: float | None) -> dict[str, Any]:
-    """A row; one without figures where there is no PSNR and the verdict is not good."""
+    """Return a row, without scores if there is no PSNR and the verdict is not good."""
     row = {"method": method, "kind": kind, "strength": strength, "seed": seed, "verdict": verdict, "reason": ""}
     if verdict in ("ok", "degraded"):
         good = {"psnr": 30.0 + seed, "ssim": 0.9, "chamfer_mm": 6.0 - seed}
@@ -102,7 +102,7 @@ def run(method: str, kind: str, strength: float | None, seed: int, verdict: str,
 RESULT = {
     "subject": "ada",
     "study": "mine",
-    "plan": Stability(
+    "plan": StabilityStudy(
         methods=("fast", "nerf"),
         seeds=(0, 1),
         degradations={"pose_noise": (1, 2, 5), "mask_holes": (5, 10)},
@@ -122,41 +122,41 @@ RESULT = {
 
 
 def test_a_method_holds_as_far_as_its_worst_seed_is_ok() -> None:
-    assert how_far(RESULT, "fast", "pose_noise") == "holds to 1, failed at 2"
-    assert how_far(RESULT, "fast", "mask_holes") == "holds to 5"
-    assert how_far(RESULT, "nerf", "mask_holes") == "refused at 5"
+    assert tolerated_strength(RESULT, "fast", "pose_noise") == "holds to 1, failed at 2"
+    assert tolerated_strength(RESULT, "fast", "mask_holes") == "holds to 5"
+    assert tolerated_strength(RESULT, "nerf", "mask_holes") == "refused at 5"
 
 
 def test_what_is_degraded_does_not_hold_though_a_stronger_one_is_ok() -> None:
     words = {1: "degraded", 2: "ok", 5: "failed"}
     rows = [run("fast", "pose_noise", s, 0, word, 30.0) for s, word in words.items()]
     result = RESULT | {"runs": [run("fast", "as recorded", None, 0, "ok", 30.0), *rows]}
-    assert how_far(result, "fast", "pose_noise") == "degraded at 1, failed at 5"
+    assert tolerated_strength(result, "fast", "pose_noise") == "degraded at 1, failed at 5"
     rows[0] = run("fast", "pose_noise", 1, 0, "ok", 30.0)
     rows[1] = run("fast", "pose_noise", 2, 0, "degraded", 28.0)
-    assert how_far(result | {"runs": rows}, "fast", "pose_noise") == "holds to 1, degraded at 2, failed at 5"
+    assert tolerated_strength(result | {"runs": rows}, "fast", "pose_noise") == "holds to 1, degraded at 2, failed at 5"
 
 
 def test_a_seed_without_a_good_run_says_nothing_of_the_others() -> None:
-    """Seed 1 cannot take the capture as recorded; seed 0 holds."""
+    """Let seed 1 refuse the capture as recorded while seed 0 holds."""
     rows = [run("fast", "as recorded", None, 0, "ok", 30.0), run("fast", "as recorded", None, 1, "failed", None)]
     result = RESULT | {"runs": [*rows, run("fast", "pose_noise", 1, 0, "ok", 30.0)]}
-    assert how_far(result, "fast", "pose_noise") == "holds to 1"
-    assert how_far(result, "fast", "mask_holes") == "-"
+    assert tolerated_strength(result, "fast", "pose_noise") == "holds to 1"
+    assert tolerated_strength(result, "fast", "mask_holes") == "-"
 
 
 def test_nothing_is_said_to_hold_of_which_nothing_is_known() -> None:
     good = run("fast", "as recorded", None, 0, "unscored", None)
     unknown = RESULT | {"runs": [good, run("fast", "pose_noise", 1, 0, "unscored", None)]}
-    assert how_far(unknown, "fast", "pose_noise") == "unscored"
+    assert tolerated_strength(unknown, "fast", "pose_noise") == "unscored"
     partly = RESULT | {"runs": [*RESULT["runs"][:4], run("fast", "pose_noise", 2, 0, "unscored", None)]}  # type: ignore[index]
-    assert how_far(partly, "fast", "pose_noise") == "holds to 1"
+    assert tolerated_strength(partly, "fast", "pose_noise") == "holds to 1"
 
 
 def test_a_failed_run_to_compare_with_stands_for_all() -> None:
-    """It has figures, too: pictures that are no better than empty ones."""
+    """Give it scores as well: pictures that are no better than empty ones."""
     failed = run("fast", "as recorded", None, 0, "ok", 10.0) | {"verdict": "failed"}
-    assert how_far(RESULT | {"runs": [failed]}, "fast", "pose_noise") == "failed at 1"
+    assert tolerated_strength(RESULT | {"runs": [failed]}, "fast", "pose_noise") == "failed at 1"
 
 
 def test_the_tables_by_hand() -> None:

@@ -20,8 +20,8 @@ def test_the_angle_is_that_to_the_nearest_camera() -> None:
 
 
 def test_a_pose_is_as_far_as_its_free_joints_turn_to_the_nearest_pose_wherever_the_body_stands() -> None:
-    """Two free joints. Frame 12 turns one by 90 degrees from frame 10 and 60 from frame 11, whose other joint is the
-    same: 30 in the mean. In frame 14 it is 90 degrees about x against 90 about y: 120 degrees between (a third of a
+    """Turn two free joints. Frame 12 turns one by 90 degrees from frame 10 and 60 from frame 11, whose other joint is
+    the same: 30 in the mean. In frame 14 it is 90 degrees about x against 90 about y: 120 degrees between (a third of a
     turn about the cube's diagonal), and 90 from frame 10: 45 in the mean."""
     rig = dataclasses.replace(box_rig(), free=torch.tensor([True, True]))
     theta = torch.zeros(5, 2, 3)

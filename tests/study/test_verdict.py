@@ -6,7 +6,7 @@ GOOD = {"psnr": 30.0, "chamfer_mm": 6.0, "empty_psnr": 18.0}
 
 
 @pytest.mark.parametrize(
-    ("psnr", "chamfer_mm", "told"),
+    ("psnr", "chamfer_mm", "expected"),
     [
         (29.0, 7.5, "ok"),
         (31.0, 5.0, "ok"),
@@ -21,20 +21,21 @@ GOOD = {"psnr": 30.0, "chamfer_mm": 6.0, "empty_psnr": 18.0}
         (None, None, "unscored: no image or surface is scored in both runs"),
     ],
 )
-def test_the_worse_of_both_figures_counts(psnr: float | None, chamfer_mm: float | None, told: str) -> None:
+def test_the_worse_of_both_figures_counts(psnr: float | None, chamfer_mm: float | None, expected: str) -> None:
     verdict = judge({"psnr": psnr, "chamfer_mm": chamfer_mm}, GOOD, [])
-    assert ": ".join(filter(None, (verdict.word, verdict.reason))) == told
+    assert ": ".join(filter(None, (verdict.verdict, verdict.reason))) == expected
 
 
 def test_half_of_what_a_good_run_has_above_an_empty_picture_is_failure() -> None:
-    """20 dB where an empty picture has 16."""
+    """Compare with 20 dB where an empty picture has 16."""
     poor = {"psnr": 20.0, "chamfer_mm": None, "empty_psnr": 16.0}
-    assert judge(poor | {"psnr": 18.1}, poor, []).word == "degraded"
-    assert judge(poor | {"psnr": 17.9}, poor, []).word == "failed"
+    assert judge(poor | {"psnr": 18.1}, poor, []).verdict == "degraded"
+    assert judge(poor | {"psnr": 17.9}, poor, []).verdict == "failed"
 
 
 def test_what_loses_most_of_little_is_failure_though_it_lose_less_than_a_decibel() -> None:
-    """17.5 dB where an empty picture has 16: 0.9 dB less is more than half of it, 0.7 dB less is not."""
+    """Compare with 17.5 dB where an empty picture has 16: 0.9 dB less is more than half of the difference, 0.7 dB less
+    is not."""
     little = {"psnr": 17.5, "chamfer_mm": None, "empty_psnr": 16.0}
     assert judge(little | {"psnr": 16.6}, little, []) == RunVerdict("failed", "0.9 dB of PSNR lost")
     assert judge(little | {"psnr": 16.8}, little, []) == RunVerdict("ok")
@@ -42,7 +43,7 @@ def test_what_loses_most_of_little_is_failure_though_it_lose_less_than_a_decibel
 
 def test_a_good_run_is_judged_too() -> None:
     worthless = {"psnr": 15.0, "chamfer_mm": None, "empty_psnr": 16.0}
-    assert judge(worthless, worthless, []).word == "failed"
+    assert judge(worthless, worthless, []).verdict == "failed"
 
 
 def test_a_surface_that_is_no_persons_is_failure_whatever_the_scores() -> None:

@@ -1,4 +1,4 @@
-"""Stages that cost nothing, which count their calls in the file `calls` beside the store."""
+"""Fake stages, which record their calls in the file `calls` beside the store."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from tasks.store import Artifact
 
 @stage("copied", version="1")
 def copy(out: Path, source: Source, settings: CaptureSettings) -> dict[str, float]:
-    """The source's text in capitals."""
+    """Write the source's text in capitals."""
     _count(out)
     (out / "text").write_text((source.root / "text").read_text().upper())
     return {}
@@ -19,7 +19,7 @@ def copy(out: Path, source: Source, settings: CaptureSettings) -> dict[str, floa
 
 @stage("doubled", version="1")
 def double(out: Path, copied: Artifact) -> dict[str, float]:
-    """The text twice."""
+    """Write the text twice."""
     _count(out)
     (out / "text").write_text(2 * (copied.root / "text").read_text())
     return {}
@@ -27,7 +27,7 @@ def double(out: Path, copied: Artifact) -> dict[str, float]:
 
 @stage("flaky", version="1")
 def flaky(out: Path, source: Source) -> dict[str, float]:
-    """Fails once with the error that the source names."""
+    """Fail once with the error that the source names."""
     _count(out)
     if len(calls(out.parent.parent)) == 1:
         error = {"io": OSError("disk"), "bad": InputError("a.jpg: bad"), "gone": FileNotFoundError("a.jpg")}
@@ -36,7 +36,7 @@ def flaky(out: Path, source: Source) -> dict[str, float]:
 
 
 def calls(store: Path) -> list[str]:
-    """Names of the stages that did work, in order."""
+    """Return the names of the stages that did work, in order."""
     counted = store / "calls"
     return counted.read_text().split() if counted.exists() else []
 

@@ -10,7 +10,7 @@ from hnerf.progress import relay, report
 
 
 def main(mode: str, folder: Path) -> None:
-    """Leave a file named after the process's id, then behave as told."""
+    """Leave a file named after the process's id, then behave as MODE says."""
     rank = int(os.environ["RANK"])
     (folder / str(os.getpid())).touch()
     if rank == 1 and mode == "bad":

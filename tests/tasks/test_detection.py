@@ -1,4 +1,4 @@
-"""When a network looks for people."""
+"""Conditions under which a network detects people."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What a fitted body becomes in the store; the fit is made up."""
+"""The artifact of a fitted body, with a fake fit."""
 
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from tasks.store import Artifact, Store
 
 
 class Body:
-    """Of one file."""
+    """A fake body of one file."""
 
     def save(self, out: Path) -> None:
         (out / "body.npz").write_bytes(b"body")
@@ -20,7 +20,7 @@ class Body:
 def test_the_same_body_made_again_is_the_same_artifact_however_long_it_took(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "calibrated", lambda *_: None)
+    monkeypatch.setattr(module, "calibrated_capture", lambda *_: None)
     given = Artifact(stage="capture", root=tmp_path, files={})
 
     def made(store: str, seconds: float) -> Artifact:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from hnerf.errors import InputError
-from tasks.launcher import GaveUpError, LostWorkerError, run_ranks
+from tasks.launcher import LostWorkerError, RankFailedError, run_ranks
 
 RANKS = "tests.tasks.ranks"
 PATIENCE_S = 60.0
@@ -19,12 +19,12 @@ PATIENCE_S = 60.0
 
 @pytest.fixture(autouse=True)
 def ranks_find_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tests are not installed."""
+    """Put the tests, which are not installed, on the ranks' path."""
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
 
 
 def still_running(folder: Path) -> list[int]:
-    """Process ids of the ranks that have begun and not ended."""
+    """Return the process ids of the ranks that have begun and not ended."""
     ids = [int(path.name) for path in folder.iterdir()]
     return [i for i in ids if Path(f"/proc/{i}/stat").exists() and b") Z" not in Path(f"/proc/{i}/stat").read_bytes()]
 
@@ -59,7 +59,7 @@ def test_files_where_the_user_stands_are_no_modules(tmp_path: Path, monkeypatch:
     ("mode", "error", "message"),
     [
         ("bad", InputError, r"^a\.jpg: bad; write it again$"),
-        ("stuck", GaveUpError, "^no surface: check the masks$"),
+        ("stuck", RankFailedError, "^no surface: check the masks$"),
         ("full", OSError, r"^\[Errno 28\] No space left on device: 'b\.pt'$"),
         ("raise", RuntimeError, r"rank 1 ended with exit code 1(.|\n)*ValueError: boom in rank one$"),
         ("killed", LostWorkerError, "rank 1 was killed by SIGKILL"),

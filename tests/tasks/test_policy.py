@@ -84,8 +84,8 @@ class Shape(Section):
 
 
 def test_key_in_numbers() -> None:
-    """SHA-256, first 32 digits, of {"inputs": {"settings": {"width": 3}}, "task": "fit", "version": "1"}: a change of
-    this number makes every store in the world compute everything again."""
+    """Expect the first 32 digits of the SHA-256 of {"inputs": {"settings": {"width": 3}}, "task": "fit", "version":
+    "1"}: a change of this number makes every existing store compute everything again."""
     assert stage_key("fit", "1", {"settings": Shape()}) == "b8a992a905319034c4fab500077a8ef6"
 
 

@@ -96,9 +96,9 @@ def test_what_cannot_be_read_is_bad_input(folder: Path, monkeypatch: pytest.Monk
 
 
 def test_a_store_in_the_capture_is_bad_input(folder: Path) -> None:
-    """Its files would change the capture's digest, so that nothing would be found again."""
+    """Its files would change the capture's digest, so that no artifact would be found again."""
     read_capture(folder, folder.parent / "store")
-    with pytest.raises(InputError, match="store: lies in the capture's folder; give --store another place"):
+    with pytest.raises(InputError, match="store: lies in the capture's folder; give --store another folder"):
         read_capture(folder, folder / "store")
 
 

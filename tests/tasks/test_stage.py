@@ -23,14 +23,14 @@ def source(tmp_path: Path) -> Source:
 
 @flow
 def chain(store: Path, source: Source) -> tuple[str, str]:
-    """Both fakes; the text, and the flow run's id."""
+    """Run both fakes in a flow; return the text and the flow run's id."""
     doubled = double(Store(store), copy(Store(store), source, CaptureSettings()))
     context = FlowRunContext.get()
     return (doubled.root / "text").read_text(), str(context.flow_run.id) if context and context.flow_run else ""
 
 
 def states(flow_run_id: str) -> list[str]:
-    """State names of a flow run's tasks, in order."""
+    """Return the state names of a flow run's tasks, in order."""
     chosen = FlowRunFilter(id=FlowRunFilterId(any_=[flow_run_id]))
     with get_client(sync_client=True) as client:
         runs = client.read_task_runs(flow_run_filter=chosen)
@@ -54,7 +54,7 @@ def test_other_settings_do_the_work_again_but_equal_content_stops_there(tmp_path
 def test_a_network_that_comes_makes_another_artifact(
     tmp_path: Path, source: Source, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And one that is still absent the same."""
+    """Expect the same artifact while the network is absent."""
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "networks"))
     store, scored = Store(tmp_path), Stage(copy.write, "copied", "1", False, networks=("eye.ckpt",))
     without = scored(store, source, CaptureSettings())
@@ -106,7 +106,7 @@ def test_stores_do_not_share_prefect_records(prefect_api: str, tmp_path: Path, s
 
 @flow
 def one_flaky(store: Path, source: Source) -> None:
-    """A stage that fails once."""
+    """Run a stage that fails once."""
     flaky(Store(store), source)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hnerf.errors import InputError
-from tasks.store import Store, require_whole
+from tasks.store import Store, require_intact
 
 # Not forked: a child would inherit Prefect's threads half-way.
 SPAWN = multiprocessing.get_context("spawn")
@@ -80,7 +80,7 @@ def test_damaged_or_deleted_artifact_is_made_again(tmp_path: Path, victim: str, 
 
 
 def test_directory_without_record_is_not_an_artifact(tmp_path: Path) -> None:
-    """What a crash between the rename and the record leaves."""
+    """Leave what a crash between the rename and the record leaves."""
     (tmp_path / "fit" / "k").mkdir(parents=True)
     (tmp_path / "fit" / "k" / "stale").write_text("x")
     assert list(Store(tmp_path).get_or_compute("fit", "k", write_abc).files) == ["deep/letters"]
@@ -161,12 +161,12 @@ def test_view_stays_within_the_store(tmp_path: Path, name: str) -> None:
 def test_a_subject_whose_artifact_was_damaged_is_refused(tmp_path: Path) -> None:
     store = Store(tmp_path)
     made = store.link_latest("ada", store.get_or_compute("fit", "k", write_abc))
-    require_whole(tmp_path / "subjects" / "ada")
+    require_intact(tmp_path / "subjects" / "ada")
     (made.root / "deep" / "letters").write_text("abd")
-    with pytest.raises(InputError, match="fit/k: damaged; give the same `hnerf run` again"):
-        require_whole(tmp_path / "subjects" / "ada")
+    with pytest.raises(InputError, match="fit/k: damaged; repeat the same `hnerf run`"):
+        require_intact(tmp_path / "subjects" / "ada")
 
 
 def test_a_subject_that_was_copied_out_of_its_store_is_not_known_to_be_damaged(tmp_path: Path) -> None:
     (tmp_path / "ada" / "fit").mkdir(parents=True)
-    require_whole(tmp_path / "ada")
+    require_intact(tmp_path / "ada")

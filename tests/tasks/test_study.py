@@ -1,4 +1,4 @@
-"""Stages of studies through a store, on a capture made by hand."""
+"""Stages of studies through a store, on a small synthetic capture."""
 
 import json
 from pathlib import Path
@@ -27,7 +27,7 @@ def recording(store: Store) -> Artifact:
 
 
 def body(store: Store) -> Artifact:
-    """The unit box in frames 2 and 4."""
+    """Return the unit box in frames 2 and 4."""
 
     def write(out: Path) -> dict[str, float]:
         BodyFit(box_rig(), (2, 4), torch.zeros(2, 2, 3), torch.eye(4).repeat(2, 1, 1)).save(out)
@@ -64,7 +64,7 @@ def test_a_degraded_fit_is_a_fit_with_the_good_ones_report(store: Store) -> None
 
 
 def test_a_surface_that_touches_itself_stays_closed(store: Store) -> None:
-    """Two boxes with an edge at the same place, whose vertices are their own."""
+    """Check two boxes with coincident edges, each with vertices of its own."""
 
     def write(out: Path) -> dict[str, float]:
         (out / "meshes").mkdir()

@@ -1,4 +1,4 @@
-"""What a training leaves in the store; the ranks are made up."""
+"""The artifact of a training, with fake ranks."""
 
 from pathlib import Path
 

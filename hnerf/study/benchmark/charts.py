@@ -1,4 +1,5 @@
-"""A benchmark's charts, which tell methods apart by line, marker and name, so that grey prints do, too."""
+"""Charts of a benchmark. Methods differ in line style, marker and name as well as colour, so that they can be told
+apart in greyscale."""
 
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,68 +13,69 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from hnerf.evaluation.charts import COLOURS, INK, style
-from hnerf.study.benchmark.curves import Point, bin_edges, binned, pareto_front
+from hnerf.study.benchmark.curves import Point, bin_edges, bin_means, pareto_front
 
 LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 3)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 PANEL_INCHES = (6.2, 3.5)
-PANEL_POINTS = 190  # of those, from the lowest to the highest value that an axis shows
-LABEL_GAP = 0.07  # of a panel's height, between names at line ends
-ABOVE_LINE = 7.0  # points of type
-CAPTION_LETTERS = 13  # on an inch
+PANEL_HEIGHT_PT = 190  # points of type from the lowest to the highest value of an axis
+LABEL_GAP = 0.07  # of a panel's height, between labels at line ends
+LABEL_LIFT_PT = 7.0
+CHARACTERS_PER_INCH = 13
 
 Curves = Mapping[str, Sequence[Point]]
 Style = dict[str, Any]
-NO_ENDS: Mapping[str, str] = {}
+NO_REASONS: Mapping[str, str] = {}
 
 
 @dataclass(frozen=True)
-class Speed:
-    """What a row of the speed chart shows, by method: curves (training seconds, accuracy), why they end where that is
-    known, points (time of a frame, accuracy); and the accuracy of what needs no training, by title."""
+class SpeedRow:
+    """One row of the speed chart, by method: curves (training seconds, accuracy), the reasons why they end if known,
+    points (seconds a frame, accuracy); and the PSNR of trivial pictures, by title."""
 
     curves: Curves
-    ends: Mapping[str, str]
+    end_reasons: Mapping[str, str]
     points: Mapping[str, Point]
-    floors: Mapping[str, float]
+    trivial_psnr: Mapping[str, float]
 
     def __bool__(self) -> bool:
         return bool(self.curves or self.points)
 
 
 def styles(methods: Iterable[str]) -> dict[str, Style]:
-    """A look for each method, the same in every chart of a study."""
-    looks = zip(cycle(COLOURS), cycle(LINES), cycle(MARKERS), strict=False)
+    """Return a plot style for each method, the same in every chart of a study."""
+    method_styles = zip(cycle(COLOURS), cycle(LINES), cycle(MARKERS), strict=False)
     return {
         name: {"color": colour, "linestyle": line, "marker": marker}
-        for name, (colour, line, marker) in zip(methods, looks, strict=False)
+        for name, (colour, line, marker) in zip(methods, method_styles, strict=False)
     }
 
 
 def speed_chart(
-    rows: Mapping[str, Speed],
-    looks: Mapping[str, Style],
+    rows: Mapping[str, SpeedRow],
+    method_styles: Mapping[str, Style],
     labels: tuple[str, str, str],
     caption: str,
     path: Path,
 ) -> None:
-    """A row for each title: accuracy over training seconds, above the accuracy of what needs no training, and over the
-    time of a frame with its Pareto front. A curve whose end has a reason is named with it.
+    """Draw a row for each title: accuracy over training seconds, with the accuracy of trivial pictures as lines, and
+    accuracy over seconds a frame with its Pareto front. The reason why a curve ends, if there is one, is written beside
+    its name.
 
-    labels: of training time, time of a frame, accuracy.
+    labels: of training time, seconds a frame, accuracy.
     """
     figure, axes = _figure(len(rows), 2)
     for (left, right), (title, row) in zip(axes, rows.items(), strict=True):
         for panel in (left, right):
             panel.set_xscale("log")
-        lines(left, row.curves, looks, row.ends)
-        for name, height in row.floors.items():
+        draw_curves(left, row.curves, method_styles, row.end_reasons)
+        for name, height in row.trivial_psnr.items():
             left.axhline(height, color=INK, linewidth=0.8, linestyle=(0, (1, 2)), zorder=1)
             left.annotate(
                 name, (0.01, height), (0, 3), ("axes fraction", "data"), "offset points", fontsize=8, color=INK
             )
         _decorate(left, title, labels[0], labels[2])
-        front(right, row.points, looks)
+        draw_pareto_front(right, row.points, method_styles)
         _decorate(right, title, labels[1], labels[2])
         for panel in (left, right):
             _plain_numbers(panel)
@@ -81,14 +83,14 @@ def speed_chart(
 
 
 def sweep_chart(
-    panels: Sequence[tuple[str, Curves]], looks: Mapping[str, Style], x_label: str, caption: str, path: Path
+    panels: Sequence[tuple[str, Curves]], method_styles: Mapping[str, Style], x_label: str, caption: str, path: Path
 ) -> None:
-    """A panel for each (label, curves): a figure of the finished models over what the variants of a study differ in,
-    each step of it as wide as the number grows by."""
+    """Draw a panel for each (label, curves): a score of the finished models over the number of cameras or frames in
+    which the variants of a study differ, on a logarithmic axis."""
     figure, axes = _figure(1, len(panels))
     for panel, (y_label, curves) in zip(axes[0], panels, strict=True):
         panel.set_xscale("log")
-        lines(panel, curves, looks)
+        draw_curves(panel, curves, method_styles)
         _decorate(panel, "", x_label, y_label)
         places = sorted({x for points in curves.values() for x, _ in points})
         panel.set_xticks(places, [f"{x:g}" for x in places])
@@ -96,24 +98,29 @@ def sweep_chart(
     _save(figure, caption, path)
 
 
-def nearness_chart(
+def training_distance_chart(
     panels: Sequence[tuple[str, Sequence[str], Curves]],
-    looks: Mapping[str, Style],
+    method_styles: Mapping[str, Style],
     bins: int,
     caption: str,
     path: Path,
 ) -> None:
-    """A panel for each (title, labels of x and y, points by method): every image or surface as a mark, means of bins of
-    equal width as a line, and how many there are in a bin."""
+    """Draw a panel for each (title, labels of x and y, points by method): a mark for every image or surface, a line
+    through the means of bins of equal width, and the number of points in each bin."""
     figure, axes = _figure(-(-len(panels) // 2), min(2, len(panels)))
     slots = [panel for row in axes for panel in row]
     for panel, (title, labels, clouds) in zip(slots, panels, strict=False):
         edges = bin_edges(clouds.values(), bins)
-        means = {name: binned(points, edges) for name, points in clouds.items()}
+        means = {name: bin_means(points, edges) for name, points in clouds.items()}
         for name, points in clouds.items():
-            look = looks[name] | {"linestyle": "none", "markersize": 3.5, "alpha": 0.35, "markeredgewidth": 0}
-            panel.plot(*zip(*points, strict=True), **look)
-        lines(panel, {name: [(x, y) for x, y, _ in found] for name, found in means.items()}, looks)
+            method_style = method_styles[name] | {
+                "linestyle": "none",
+                "markersize": 3.5,
+                "alpha": 0.35,
+                "markeredgewidth": 0,
+            }
+            panel.plot(*zip(*points, strict=True), **method_style)
+        draw_curves(panel, {name: [(x, y) for x, y, _ in found] for name, found in means.items()}, method_styles)
         for x, _, count in max(means.values(), key=len):
             panel.annotate(f"n = {count}", (x, 0.01), xycoords=panel.get_xaxis_transform(), ha="center", fontsize=7)
         _decorate(panel, title, *labels)
@@ -123,7 +130,8 @@ def nearness_chart(
 
 
 def picture_grid(rows: Sequence[tuple[str, Sequence[tuple[str, Any]]]], caption: str, path: Path) -> None:
-    """Pictures (H, W, 3) uint8 of each row side by side, each under its name, the row's title before the first."""
+    """Draw the pictures (H, W, 3) uint8 of each row side by side, each under its name, with the row's title before the
+    first."""
     columns = max(len(pictures) for _, pictures in rows)
     figure = Figure(figsize=(2.0 * columns + 0.4, 2.9 * len(rows) + 0.5), dpi=150, layout="constrained")
     axes = figure.subplots(len(rows), columns, squeeze=False)
@@ -139,25 +147,27 @@ def picture_grid(rows: Sequence[tuple[str, Sequence[tuple[str, Any]]]], caption:
     _save(figure, caption, path)
 
 
-def lines(axes: Axes, curves: Curves, looks: Mapping[str, Style], ends: Mapping[str, str] = NO_ENDS) -> None:
-    """A line a method, its name at the line's end; where there is a reason why it ends, the reason beside the name and
-    a large mark with a bar."""
+def draw_curves(
+    axes: Axes, curves: Curves, method_styles: Mapping[str, Style], end_reasons: Mapping[str, str] = NO_REASONS
+) -> None:
+    """Draw a line a method with its name at the end; if there is a reason why it ends, write it beside the name and end
+    the line with a large marker and a bar."""
     drawn = {name: points for name, points in curves.items() if points}
     for name, points in drawn.items():
-        axes.plot(*zip(*points, strict=True), linewidth=1.7, markersize=5, **looks[name])
-        if name in ends:
+        axes.plot(*zip(*points, strict=True), linewidth=1.7, markersize=5, **method_styles[name])
+        if name in end_reasons:
             axes.plot(*points[-1], "|", color=INK, markersize=22, markeredgewidth=1.6, zorder=3)
-            axes.plot(*points[-1], **looks[name] | {"markersize": 9, "markeredgecolor": INK, "zorder": 4})
-    _name({name: points[-1] for name, points in drawn.items()}, axes, looks, ends=ends)
+            axes.plot(*points[-1], **method_styles[name] | {"markersize": 9, "markeredgecolor": INK, "zorder": 4})
+    _label_points({name: points[-1] for name, points in drawn.items()}, axes, method_styles, end_reasons=end_reasons)
 
 
-def front(axes: Axes, points: Mapping[str, Point], looks: Mapping[str, Style]) -> None:
-    """A mark a method, and the front: what lies right of it and below is beaten in both time and accuracy.
-    Nothing where there is no point."""
+def draw_pareto_front(axes: Axes, points: Mapping[str, Point], method_styles: Mapping[str, Style]) -> None:
+    """Draw a mark a method and the Pareto front: any point to the right of it and below is beaten in both time and
+    accuracy. Draw nothing if there are no points."""
     if not points:
         return
     for name, point in points.items():
-        axes.plot(*point, **looks[name] | {"linestyle": "none", "markersize": 8})
+        axes.plot(*point, **method_styles[name] | {"linestyle": "none", "markersize": 8})
     (_, right), (bottom, _) = axes.get_xlim(), axes.get_ylim()
     best = [points[name] for name in pareto_front(points)]
     corners = [(best[0][0], bottom), *best, (right, best[-1][1])]
@@ -172,33 +182,33 @@ def front(axes: Axes, points: Mapping[str, Point], looks: Mapping[str, Style]) -
         scalex=False,
         scaley=False,
     )
-    _name(points, axes, looks, ABOVE_LINE)
+    _label_points(points, axes, method_styles, LABEL_LIFT_PT)
     axes.legend(loc="best", frameon=False, fontsize=8, labelcolor=INK)
 
 
-def _name(
+def _label_points(
     places: Mapping[str, Point],
     axes: Axes,
-    looks: Mapping[str, Style],
+    method_styles: Mapping[str, Style],
     lift: float = 0.0,
-    ends: Mapping[str, str] = NO_ENDS,
+    end_reasons: Mapping[str, str] = NO_REASONS,
 ) -> None:
-    """Names right of their places, each with its end's reason, lifted by points of type, and more where they would lie
-    upon each other."""
+    """Write names to the right of their points, each with its end's reason, raised by `lift` points of type and further
+    where labels would overlap."""
     low, high = axes.get_ylim()
     free = low
     for name, (x, y) in sorted(places.items(), key=lambda place: place[1][1]):
         height = max(y, free)
         free = height + LABEL_GAP * (high - low)
-        shift = (9, lift + (height - y) / (high - low) * PANEL_POINTS)
+        shift = (9, lift + (height - y) / (high - low) * PANEL_HEIGHT_PT)
         axes.annotate(
-            f"{name}: {ends[name]}" if name in ends else name,
+            f"{name}: {end_reasons[name]}" if name in end_reasons else name,
             (x, y),
             shift,
             textcoords="offset points",
             va="center",
             fontsize=9,
-            color=looks[name]["color"],
+            color=method_styles[name]["color"],
             annotation_clip=False,
         )
 
@@ -218,7 +228,8 @@ def _decorate(axes: Axes, title: str, x_label: str, y_label: str) -> None:
 
 
 def _plain_numbers(axes: Axes) -> None:
-    """A logarithmic x axis with plain numbers at 1, 2, 3, 5 and 7 of every decade, at 1 and 3 where there are many."""
+    """Format a logarithmic x axis with plain numbers at 1, 2, 3, 5 and 7 of every decade, or at 1 and 3 if there are
+    many decades."""
     low, high = axes.get_xlim()
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0, 7.0) if high < 100 * low else (1.0, 3.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
@@ -226,5 +237,5 @@ def _plain_numbers(axes: Axes) -> None:
 
 
 def _save(figure: Figure, caption: str, path: Path) -> None:
-    figure.supxlabel(textwrap.fill(caption, int(CAPTION_LETTERS * figure.get_figwidth())), fontsize=8, color=INK)
+    figure.supxlabel(textwrap.fill(caption, int(CHARACTERS_PER_INCH * figure.get_figwidth())), fontsize=8, color=INK)
     figure.savefig(path, facecolor="white")

@@ -1,4 +1,4 @@
-"""Whether a result shows what the paper says."""
+"""Checks of the paper's claims against a benchmark's result."""
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping
@@ -6,23 +6,25 @@ from typing import Any
 
 import numpy as np
 
-from hnerf.study.benchmark.curves import bin_edges, binned
-from hnerf.study.benchmark.results import BINS, clouds, scored, sweep_curves
+from hnerf.study.benchmark.curves import bin_edges, bin_means
+from hnerf.study.benchmark.results import BINS, scatter_points, scored_methods, sweep_curves
 from hnerf.tables import pick
 
 Result = Mapping[str, Any]
-Finding = tuple[bool, str]  # whether a figure is as the paper says, and the figure in words
+Finding = tuple[bool, str]  # whether a score supports the claim, and the score in words
 
+# Format, and the sign of better: -1 where less is better.
 FIGURES = {
     "psnr": ("{:.1f} dB", 1),
     "geometry.chamfer_l2_e3": ("Chamfer {:.2f}", -1),
-}  # how it is told; -1: less is better
-WEAK = 0.5  # correlation below which nothing is said to depend
-NO_SURFACE = 0.1  # IoU
+}
+WEAK = 0.5  # correlation below which there is no trend
+NO_SURFACE = 0.1  # IoU below which a mesh is no surface of the person
 
 
 def claim_lines(result: Result) -> list[str]:
-    """A line of Markdown for each claim of the study: whether it is seen in the figures, and which these are."""
+    """Return a line of Markdown for each claim of the study: whether the scores support it, and which scores these
+    are."""
     lines = []
     for claim in result["claims"]:
         findings = list(CHECKS[claim["check"]](result))
@@ -35,7 +37,7 @@ def claim_lines(result: Result) -> list[str]:
 
 
 def more_is_better(result: Result) -> Iterator[Finding]:
-    """Of every method: the figures with the most cameras or frames are better than with the fewest."""
+    """Check, for every method, that scores with the most cameras or frames are better than with the fewest."""
     for key, (form, sign) in FIGURES.items():
         for name, curve in sweep_curves(result, key).items():
             (_, few), (_, many) = curve[0], curve[-1]
@@ -44,7 +46,7 @@ def more_is_better(result: Result) -> Iterator[Finding]:
 
 
 def loses_least(result: Result) -> Iterator[Finding]:
-    """From the most cameras or frames to the fewest, the first method loses less than each other."""
+    """Check that from the most cameras or frames to the fewest the first method loses less than each other."""
     for key, (form, sign) in FIGURES.items():
         lost = {name: sign * (c[-1][1] - c[0][1]) for name, c in sweep_curves(result, key).items() if len(c) > 1}
         first = result["methods"][0]
@@ -54,10 +56,10 @@ def loses_least(result: Result) -> Iterator[Finding]:
 
 
 def ahead(result: Result) -> Iterator[Finding]:
-    """In every variant the first method's figures are better than each other's."""
+    """Check that in every variant the first method's scores are better than each other's."""
     for title, variant in result["variants"].items():
         for key, (form, sign) in FIGURES.items():
-            values = {name: pick(scores[scores["split"]], key) for name, scores in scored(variant).items()}
+            values = {name: pick(scores[scores["split"]], key) for name, scores in scored_methods(variant).items()}
             known: dict[str, float] = {name: value for name, value in values.items() if value is not None}
             own = known.pop(result["methods"][0], None)
             if own is None or not known:
@@ -68,7 +70,7 @@ def ahead(result: Result) -> Iterator[Finding]:
 
 
 def falls_with_angle(result: Result) -> Iterator[Finding]:
-    """Of every method: images farthest in angle from training cameras are worse than the nearest."""
+    """Check, for every method, that images farthest in angle from training cameras are worse than the nearest."""
     for title, by_method in _angles(result):
         for name, bins in by_method.items():
             (near, at_near, _), (far, at_far, _) = bins[0], bins[-1]
@@ -78,7 +80,7 @@ def falls_with_angle(result: Result) -> Iterator[Finding]:
 
 
 def ahead_at_every_angle(result: Result) -> Iterator[Finding]:
-    """In every bin of angles the first method is better than each other."""
+    """Check that in every bin of angles the first method is better than each other."""
     for title, by_method in _angles(result):
         own = by_method.pop(result["methods"][0], [])
         for name, bins in by_method.items() if own else ():
@@ -87,18 +89,18 @@ def ahead_at_every_angle(result: Result) -> Iterator[Finding]:
 
 
 def no_trend_with_pose(result: Result) -> Iterator[Finding]:
-    """The first method's images of new poses do not depend on how far these are from training's."""
+    """Check that the first method's images of novel poses do not depend on their distance from the training poses."""
     for title, variant in result["variants"].items():
-        points = clouds(variant, "novel_pose", "pose_distance_deg").get(result["methods"][0], [])
+        points = scatter_points(variant, "novel_pose", "pose_distance_deg").get(result["methods"][0], [])
         if len({x for x, _ in points}) > 2:
             r = float(np.corrcoef(np.array(points).T)[0, 1])
             yield abs(r) < WEAK, f"{title}: correlation {r:+.2f} over {len(points)} images"
 
 
 def others_have_no_surface(result: Result) -> Iterator[Finding]:
-    """Of no method but the first the surface covers the person's volume."""
+    """Check that no method but the first has a surface that covers the person's volume."""
     for title, variant in result["variants"].items():
-        for name, scores in itertools.islice(scored(variant).items(), 1, None):
+        for name, scores in itertools.islice(scored_methods(variant).items(), 1, None):
             iou = pick(scores[scores["split"]], "geometry.iou") or 0.0
             yield iou < NO_SURFACE, f"{title}: {name} IoU {iou:.2f}"
 
@@ -118,8 +120,8 @@ CHECKS: dict[str, Callable[[Result], Iterator[Finding]]] = {
 
 
 def _angles(result: Result) -> Iterator[tuple[str, dict[str, list[tuple[float, float, int]]]]]:
-    """Of each variant: by method, mean angle, mean PSNR and count of every bin of view angles."""
+    """Yield, for each variant, the mean angle, mean PSNR and count of every bin of view angles, by method."""
     for title, variant in result["variants"].items():
-        found = clouds(variant, "novel_view", "view_angle_deg")
+        found = scatter_points(variant, "novel_view", "view_angle_deg")
         edges = bin_edges(found.values(), BINS)
-        yield title, {name: binned(points, edges) for name, points in found.items()}
+        yield title, {name: bin_means(points, edges) for name, points in found.items()}

@@ -1,4 +1,4 @@
-"""Accuracy against cost: what dominates what, and when a level is reached."""
+"""Curves of accuracy against cost: Pareto front, time to reach a level, and bin means."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -9,8 +9,8 @@ Point = tuple[float, float]
 
 
 def pareto_front(points: Mapping[str, Point]) -> list[str]:
-    """Names of the points (cost, accuracy) that no other beats: none is at most as dear and at least as accurate, and
-    better in one of the two. Cheapest first."""
+    """Return the names of the points (cost, accuracy) that no other dominates, cheapest first: none costs at most as
+    much and is at least as accurate, and better in one of the two."""
     front = [
         name
         for name, (cost, accuracy) in points.items()
@@ -19,9 +19,10 @@ def pareto_front(points: Mapping[str, Point]) -> list[str]:
     return sorted(front, key=lambda name: points[name])
 
 
-def seconds_to(curve: Sequence[Point], level: float) -> float | None:
-    """When a curve of (seconds, figure) first reaches a level, linear in log seconds between its points; None if it
-    never does. A curve that starts above the level reaches it at its first point: nothing is known of before."""
+def seconds_to_reach(curve: Sequence[Point], level: float) -> float | None:
+    """Return when a curve of (seconds, score) first reaches a level, linear in log seconds between its points; None
+    if it never does. A curve that starts above the level reaches it at its first point: nothing is known of earlier
+    times."""
     for (s, v), (t, w) in zip(((0.0, -math.inf), *curve), curve, strict=False):
         if w >= level:
             if not math.isfinite(v):
@@ -31,8 +32,8 @@ def seconds_to(curve: Sequence[Point], level: float) -> float | None:
 
 
 def value_at(curve: Sequence[Point], seconds: float) -> float | None:
-    """A curve of (seconds, figure) at a time, linear in log seconds between its points and level after the last; None
-    before the first."""
+    """Return a curve of (seconds, score) at a time, linear in log seconds between its points and constant after the
+    last; None before the first."""
     if not curve or seconds < curve[0][0]:
         return None
     times, values = zip(*curve, strict=True)
@@ -40,13 +41,15 @@ def value_at(curve: Sequence[Point], seconds: float) -> float | None:
 
 
 def bin_edges(clouds: Iterable[Sequence[Point]], bins: int) -> list[float]:
-    """Equal steps from the least to the greatest x of all points, bins + 1 edges; none where there are no points."""
+    """Return bins + 1 equally spaced edges from the smallest to the largest x of all points; none if there are no
+    points."""
     x = [x for points in clouds for x, _ in points]
     return np.linspace(min(x), max(x), bins + 1).tolist() if x else []
 
 
-def binned(points: Sequence[Point], edges: Sequence[float]) -> list[tuple[float, float, int]]:
-    """Mean x, mean y and number of the points between two edges, of bins that have any; the last edge is inside."""
+def bin_means(points: Sequence[Point], edges: Sequence[float]) -> list[tuple[float, float, int]]:
+    """Return mean x, mean y and number of the points between each two edges, for bins that have any; the last edge is
+    included."""
     found = np.array(points)
     place = np.digitize(found[:, 0], edges[1:-1])
     parts = [found[place == k] for k in range(len(edges) - 1)]

@@ -1,4 +1,4 @@
-"""What a benchmark compares: methods on parts of a capture, as a YAML file under `configs/benchmark/` says."""
+"""Plan of a benchmark: methods on parts of a capture, read from a YAML file under `configs/benchmark/`."""
 
 from collections.abc import Sequence
 from typing import Literal, Self
@@ -13,27 +13,27 @@ from hnerf.evenly_spaced import evenly_spaced
 from hnerf.study.benchmark.convergence import FIRST_S
 
 STUDIES = CONFIGS / "benchmark"
-UNTIL_TIME_IS_UP = 1_000_000  # steps
-FIRST_SNAPSHOT_S = 15.0  # where a training has no limit that could be halved
+UNLIMITED_STEPS = 1_000_000
+FIRST_SNAPSHOT_S = 15.0  # for trainings without a time limit to halve
 
 
-class Part(Section):
-    """Part of a capture. cameras, frames: of training, how many of them or which; None is all."""
+class CapturePart(Section):
+    """Part of a capture. cameras, frames: of training, either how many or which; None is all."""
 
     cameras: PositiveInt | tuple[str, ...] | None = None
     frames: PositiveInt | tuple[int, ...] | None = None
     novel_poses: bool = True
 
-    def parts(self, capture: Capture) -> tuple[tuple[str, ...] | None, tuple[int, ...] | None, tuple[int, ...] | None]:
-        """Training cameras, training frames and novel-pose frames to keep, None for all.
+    def select(self, capture: Capture) -> tuple[tuple[str, ...] | None, tuple[int, ...] | None, tuple[int, ...] | None]:
+        """Return the training cameras, training frames and novel-pose frames to keep, None for all.
 
-        Fewer cameras are taken at equal steps of the capture's order, frames evenly spread over time. InputError if
-        the capture has not as many, or not one of that name.
+        Fewer cameras are taken at equal steps of the capture's order, frames evenly spaced over time. Raises InputError
+        if the capture has fewer, or none of that name.
         """
         cameras, frames = self.cameras, self.frames
         if isinstance(cameras, int):
-            there_are = _at_least(cameras, capture.train_cameras, "training cameras")
-            cameras = tuple(there_are[k * len(there_are) // cameras] for k in range(cameras))
+            available = _at_least(cameras, capture.train_cameras, "training cameras")
+            cameras = tuple(available[k * len(available) // cameras] for k in range(cameras))
         elif cameras is not None:
             cameras = select(capture, "training camera", cameras, capture.train_cameras)
         if isinstance(frames, int):
@@ -43,14 +43,14 @@ class Part(Section):
         return cameras, frames, None if self.novel_poses else ()
 
 
-class Variant(Part):
-    """Part of a capture, and the methods of the study that are tried on it; none is all."""
+class Variant(CapturePart):
+    """Part of a capture, and the methods of the study that are run on it; all if none are named."""
 
     methods: tuple[str, ...] = ()
 
 
 class Claim(Section):
-    """What the paper says in its words, and which figures tell whether it is seen here (claims.py)."""
+    """A claim of the paper, quoted, and the check that tests it on the result (claims.py)."""
 
     says: str
     check: Literal[
@@ -65,28 +65,28 @@ class Claim(Section):
 
 
 class ScoringSettings(Section):
-    """How much of what is held out is rendered and meshed. split: of curves and charts."""
+    """How many held-out images are rendered and how many surfaces meshed. split: of curves and charts."""
 
     split: Literal["novel_view", "novel_pose"] = "novel_view"
-    images: int | None = Field(default=None, ge=1)  # a split, of the finished model; None: all
-    meshes: int = Field(default=2, ge=1)  # a split
+    images: int | None = Field(default=None, ge=1)  # per split, of the finished model; None: all
+    meshes: int = Field(default=2, ge=1)  # per split
     snapshot_images: int = Field(default=4, ge=1)
     snapshot_meshes: int = Field(default=1, ge=0)
-    frame_sizes_px: tuple[PositiveInt, ...] = Field(default=(256, 512), min_length=1)  # longest sides, of timed images
+    frame_sizes_px: tuple[PositiveInt, ...] = Field(default=(256, 512), min_length=1)  # longest sides of timed images
 
 
-class Study(Section):
-    """A benchmark. methods: presets, that of H-NeRF first; seconds: of every training, None to each preset's own end;
-    snapshots: how many are scored before it; until_flat: instead of them longer and longer trainings up to `seconds`
-    (hnerf/study/benchmark/convergence.py)."""
+class BenchmarkStudy(Section):
+    """A benchmark. methods: presets, that of H-NeRF first; seconds: limit of every training, None for each preset's own
+    end; snapshots: how many are scored before it; until_flat: instead of them, longer and longer trainings up to
+    `seconds` (hnerf/study/benchmark/convergence.py)."""
 
     title: str
-    notes: tuple[str, ...] = ()  # what a reader has to know, such as what is left out
+    notes: tuple[str, ...] = ()  # for the reader, such as what is left out
     claims: tuple[Claim, ...] = ()
     seconds: float | None = Field(default=None, gt=0)
     snapshots: int = Field(default=4, ge=0, le=12)
     until_flat: bool = False
-    sweep: Literal["cameras", "frames"] | None = None  # what the variants differ in, for a chart of its own
+    sweep: Literal["cameras", "frames"] | None = None  # in what the variants differ, for a chart of its own
     methods: tuple[str, ...] = Field(min_length=1)
     variants: dict[str, Variant] = Field(min_length=1)
     scoring: ScoringSettings = ScoringSettings()
@@ -95,28 +95,28 @@ class Study(Section):
     def _claims_of_a_sweep_have_one(self) -> Self:
         for claim in self.claims:
             if claim.check in ("more_is_better", "loses_least") and not self.sweep:
-                raise ValueError(f"claims: {claim.check} asks for a sweep")
+                raise ValueError(f"claims: {claim.check} requires a sweep")
         return self
 
     @model_validator(mode="after")
     def _flat_within_a_time(self) -> Self:
         if self.until_flat and (self.seconds is None or self.seconds < FIRST_S or self.snapshots):
-            raise ValueError(f"until_flat: asks for `snapshots: 0` and a longest training, `seconds` of {FIRST_S:g} up")
+            raise ValueError(f"until_flat: requires `snapshots: 0` and `seconds` of at least {FIRST_S:g}")
         return self
 
     def settings(self, method: str, seconds: float | None = None) -> Settings:
-        """All stages' settings; training stops after `seconds`, of the study where they are None, and is saved on the
-        way. Steps that are written down end H-NeRF alone: they are how long it needs, but what a compared method can do
-        in its time is the question."""
+        """Return the settings of all stages; training stops after `seconds`, by default the study's, and saves
+        snapshots on the way. The steps of the preset end H-NeRF only, being how long it needs; for a compared method
+        the question is what it reaches in its time."""
         settings, seconds = load_settings(method), seconds or self.seconds
         training = {"seconds": seconds, "snapshots_s": snapshot_times_s(seconds, self.snapshots)}
         if seconds and not settings.training.field.tunes_poses:
-            training["steps"] = UNTIL_TIME_IS_UP
+            training["steps"] = UNLIMITED_STEPS
         return settings.model_copy(update={"training": settings.training.model_copy(update=training)})
 
-    def narrowed(self, names: Sequence[str], seconds: float | None) -> "Study":
-        """The study of these methods alone and this time limit; one that it does not have is tried on every variant.
-        Where there are no names it keeps its methods, and where there is no limit, its own."""
+    def restricted_to(self, names: Sequence[str], seconds: float | None) -> "BenchmarkStudy":
+        """Return the study with these methods only and this time limit; a method that it does not have is run on every
+        variant. Without names it keeps its methods, and without a limit its own."""
         methods = tuple(names) or self.methods
         variants = {}
         for title, variant in self.variants.items():
@@ -127,10 +127,11 @@ class Study(Section):
         return self.model_copy(update=changes)
 
 
-def load_study(name: str) -> Study:
-    """A study by its name or its file's path; InputError with one line if there is none or a key is not allowed."""
+def load_study(name: str) -> BenchmarkStudy:
+    """Load a study by its name or its file's path. Raises InputError, one line, if there is none or a key is not
+    allowed."""
     path = named_file(name, STUDIES, "study", "studies")
-    study = validated(Study, read_yaml(path), path)
+    study = validated(BenchmarkStudy, read_yaml(path), path)
     for title, variant in study.variants.items():
         for method in variant.methods:
             if method not in study.methods:
@@ -139,7 +140,7 @@ def load_study(name: str) -> Study:
 
 
 def snapshot_times_s(seconds: float | None, count: int) -> tuple[float, ...]:
-    """The time limit halved `count` times over, in ascending order; without a limit, doublings of 15 s."""
+    """Return the time limit halved `count` times over, in ascending order; without a limit, doublings of 15 s."""
     if seconds is None:
         return tuple(FIRST_SNAPSHOT_S * 2**k for k in range(count))
     return tuple(seconds / 2**k for k in range(count, 0, -1))

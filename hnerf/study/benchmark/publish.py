@@ -1,4 +1,4 @@
-"""The files of a benchmark's result: JSON, CSV, Markdown, and charts beside them."""
+"""Files of a benchmark's result: JSON, CSV, Markdown, and charts beside them."""
 
 import json
 from collections.abc import Mapping
@@ -13,55 +13,55 @@ from hnerf.study.benchmark.claims import claim_lines
 PSNR, CHAMFER = "held-out PSNR, dB", "Chamfer distance"
 ANGLE = "angle from the nearest training camera, degrees"
 POSE = "angle from the nearest training pose, degrees a joint"
-NEARNESS = (  # distance from training, split, figure, labels of both
+TRAINING_DISTANCE_PANELS = (  # distance, split, score, labels of distance and score
     ("view_angle_deg", "novel_view", "psnr", ANGLE, f"{PSNR} (an image)"),
     ("pose_distance_deg", "novel_pose", "psnr", POSE, f"{PSNR} (an image)"),
     ("pose_distance_deg", "novel_pose", "chamfer_mm", POSE, f"{CHAMFER} (a surface), mm"),
 )
-SWEPT = {"psnr": PSNR, "geometry.chamfer_l2_e3": f"{CHAMFER}, 1e-3 m²"}
+SWEEP_FIGURES = {"psnr": PSNR, "geometry.chamfer_l2_e3": f"{CHAMFER}, 1e-3 m²"}
 
 
 def publish(result: dict[str, Any], store: Path) -> Path:
-    """Write `<store>/benchmark/<subject>-<study>.{md,csv,json}` and its PNGs anew; the Markdown file's path."""
+    """Write `<store>/benchmark/<subject>-<study>.{md,csv,json}` and its PNGs anew; return the Markdown file's path."""
     table = store / "benchmark" / f"{result['subject']}-{result['study']}.md"
     table.parent.mkdir(parents=True, exist_ok=True)
-    drawn = draw(result, store, table)
+    drawn = draw_charts(result, store, table)
     replace_text(table.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
     replace_text(table.with_suffix(".csv"), results.as_csv(result))
     replace_text(table, results.as_markdown(result, [path.name for path in drawn], claim_lines(result)))
     return table
 
 
-def draw(result: Mapping[str, Any], store: Path, table: Path) -> list[Path]:
-    """Every chart that the result has figures for; their paths."""
-    looks, caption, variants = charts.styles(result["methods"]), results.caption(result), result["variants"]
+def draw_charts(result: Mapping[str, Any], store: Path, table: Path) -> list[Path]:
+    """Draw every chart that the result has scores for; return their paths."""
+    method_styles, caption, variants = charts.styles(result["methods"]), results.caption(result), result["variants"]
     paths = {name: table.with_name(f"{table.stem}{name}.png") for name in ("", "-sweep", "-nearness", "-pictures")}
     drawn = []
     panels = {
-        title: charts.Speed(
+        title: charts.SpeedRow(
             results.psnr_curves(variant),
-            results.ends(variant),
+            results.end_reasons(variant),
             results.frame_points(variant),
-            results.floors(variant),
+            results.trivial_psnr(variant),
         )
         for title, variant in variants.items()
     }
     if rows := {results.heading(title, variants[title]): row for title, row in panels.items() if row}:
-        frame = f"time of a frame of {results.timed_px(result)} px, s (log scale)"
-        charts.speed_chart(rows, looks, ("training, s (log scale)", frame, PSNR), caption, paths[""])
+        frame = f"time of a frame of {results.smallest_timed_px(result)} px, s (log scale)"
+        charts.speed_chart(rows, method_styles, ("training, s (log scale)", frame, PSNR), caption, paths[""])
         drawn.append(paths[""])
-    swept = {key: results.sweep_curves(result, key) for key in SWEPT} if result["sweep"] else {}
-    if panels_of_sweep := [(SWEPT[key], curves) for key, curves in swept.items() if curves]:
-        charts.sweep_chart(panels_of_sweep, looks, f"training {result['sweep']}", caption, paths["-sweep"])
+    swept = {key: results.sweep_curves(result, key) for key in SWEEP_FIGURES} if result["sweep"] else {}
+    if panels_of_sweep := [(SWEEP_FIGURES[key], curves) for key, curves in swept.items() if curves]:
+        charts.sweep_chart(panels_of_sweep, method_styles, f"training {result['sweep']}", caption, paths["-sweep"])
         drawn.append(paths["-sweep"])
     near = [
         (f"{title}, {results.SPLITS[split]}", labels, clouds)
         for title, variant in variants.items()
-        for x, split, y, *labels in NEARNESS
-        if (clouds := results.clouds(variant, split, x, y))
+        for x, split, y, *labels in TRAINING_DISTANCE_PANELS
+        if (clouds := results.scatter_points(variant, split, x, y))
     ]
     if near:
-        charts.nearness_chart(near, looks, results.BINS, caption, paths["-nearness"])
+        charts.training_distance_chart(near, method_styles, results.BINS, caption, paths["-nearness"])
         drawn.append(paths["-nearness"])
     pictures = [row for title, variant in variants.items() for row in picture_rows(title, variant, store)]
     if pictures:
@@ -73,14 +73,14 @@ def draw(result: Mapping[str, Any], store: Path, table: Path) -> list[Path]:
 
 
 def picture_rows(title: str, variant: Mapping[str, Any], store: Path) -> list[tuple[str, list[tuple[str, Any]]]]:
-    """Of each pictured image: the truth, and the rendering of each method that pictured it, with its PSNR."""
+    """Return a row for each pictured image: the truth, and the rendering of each method that has one, with its PSNR."""
     found: dict[str, list[tuple[str, Any]]] = {}
-    for name, scores in results.scored(variant).items():
+    for name, scores in results.scored_methods(variant).items():
         folder = store / scores["folder"] / "pictures"
         psnr = {(row["camera"], row["frame"]): row["psnr"] for row in scores[scores["split"]]["per_image"]}
         for k, view in enumerate(scores["pictures"]):
             heading = f"{title}: frame {view['frame']}, camera {view['camera']}"
             row = found.setdefault(heading, [("truth", read_rgb(folder / f"{k}-truth.png"))])
-            message = f"{name}, {psnr[view['camera'], view['frame']]:.1f} dB"
-            row.append((message, read_rgb(folder / f"{k}-render.png")))
+            caption = f"{name}, {psnr[view['camera'], view['frame']]:.1f} dB"
+            row.append((caption, read_rgb(folder / f"{k}-render.png")))
     return list(found.items())

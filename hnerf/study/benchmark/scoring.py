@@ -1,4 +1,4 @@
-"""What a training was worth: its snapshots and its end scored on what was held out, images timed."""
+"""Scores of a training: its snapshots and its end scored on held-out images and surfaces, and rendering times."""
 
 import json
 import logging
@@ -15,13 +15,13 @@ from hnerf.avatar.trained import load_avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture, read_rgb, write_image
 from hnerf.errors import InputError
-from hnerf.evaluation.columns import shown_as, why_not_shown
+from hnerf.evaluation.columns import avatar_for_split, reason_unavailable
 from hnerf.evaluation.evaluate import PROTOCOL, mesh_frames, score_meshes
 from hnerf.evaluation.ground_truth import GroundTruth
-from hnerf.evaluation.images import known_views, render, score_split, unscored
+from hnerf.evaluation.images import render, score_split, unscored, views_with_mask
 from hnerf.evaluation.lpips import lpips_availability
 from hnerf.evaluation.pictures import crop, frame_person
-from hnerf.evaluation.views import PRIMARY, SPLITS, View, all_views, split_frames
+from hnerf.evaluation.views import PRIMARY_SPLITS, SPLITS, View, all_views, split_frames
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
 from hnerf.study.benchmark.plan import ScoringSettings
@@ -32,20 +32,20 @@ log = logging.getLogger("hnerf.study")
 
 PICTURES = 2
 REPEATS = 3
-LONG_S = 10.0  # an image that takes as long is timed once
-HOW = (
-    "Training seconds: the trainer's own clock, without reading the capture. Curves: fewer images and surfaces than "
+SLOW_S = 10.0  # an image that takes this long is timed once
+SCORING_PROTOCOL = (
+    "Training seconds: the trainer's own clock, without reading the capture. Curves: fewer images and surfaces than in "
     "tables, the same ones at every point and for all methods, new poses animated; the last point is the finished "
     "field. "
-    f"Time of a frame: median of {REPEATS} renderings of a whole image, of one where it takes over {LONG_S:.0f} s. "
-    "Peak memory: on a CPU that of the training process, all libraries included; on a GPU what tensors took."
+    f"Time of a frame: median of {REPEATS} renderings of a whole image, of one if it takes over {SLOW_S:.0f} s. "
+    "Peak memory: on a CPU that of the training process, including all libraries; on a GPU that of tensors."
 )
 
 
 @dataclass(frozen=True)
 class ScoringScene:
-    """What scoring needs besides a training: the capture with calibrated cameras, the body as fitted before training,
-    and the truth where there is one."""
+    """What trainings are scored against: the capture with calibrated cameras, the body as fitted before training, and
+    the truth, if any."""
 
     capture: Capture
     fitted: BodyFit
@@ -54,25 +54,26 @@ class ScoringScene:
 
 
 def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: Path) -> dict[str, Any]:
-    """Write `scores.json`, renderings and meshes into `out`; what scores.json holds.
+    """Write `scores.json`, renderings and meshes into `out`; return what scores.json holds.
 
-    training: the folder that training left. A figure that cannot be had is null, and a reason stands beside it.
+    training: the training's folder. A score that is not available is null, with a reason beside it.
     """
     avatar, split = load_avatar(training, scene.device), settings.split
-    lacking = {name: why for name in SPLITS if (why := why_not_shown(name, training))}
-    found: dict[str, Any] = {"machine": machine(), "protocol": f"{PROTOCOL} {HOW}", "lpips": lpips_availability()}
+    unavailable = {name: why for name in SPLITS if (why := reason_unavailable(name, training))}
+    protocol = f"{PROTOCOL} {SCORING_PROTOCOL}"
+    found: dict[str, Any] = {"machine": machine(), "protocol": protocol, "lpips": lpips_availability()}
     found["split"], found["training"] = split, json.loads((training / "report.json").read_text())
-    scored = scene.capture.test_cameras and split not in lacking
+    scored = scene.capture.test_cameras and split not in unavailable
     found["curve"] = curve(scene, split, training, avatar, settings, out) if scored else []
     for name in SPLITS:
-        if name in lacking:
-            found[name] = unscored(lacking[name])
-            if name in PRIMARY:
-                found[name] |= {"geometry": None, "geometry_reason": lacking[name]}
+        if name in unavailable:
+            found[name] = unscored(unavailable[name])
+            if name in PRIMARY_SPLITS:
+                found[name] |= {"geometry": None, "geometry_reason": unavailable[name]}
             continue
-        column = shown_as(name, avatar, scene.fitted)
-        found[name] = score_at(scene, column, name, settings.images, settings.meshes, out)
-        add_nearness(scene.capture, column, name, found[name])
+        column = avatar_for_split(name, avatar, scene.fitted)
+        found[name] = score_views(scene, column, name, settings.images, settings.meshes, out)
+        add_training_distances(scene.capture, column, name, found[name])
     found["pictures"] = write_pictures(scene, split, found[split]["per_image"], out)
     camera = next(iter(scene.capture.cameras.values()))
     found["frame_seconds"] = {
@@ -84,9 +85,9 @@ def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: P
 
 
 def score_end(scene: ScoringScene, training: Path, settings: ScoringSettings, out: Path) -> dict[str, Any]:
-    """Write `scores.json` with what training reported and the last point of its curve alone; what it holds."""
+    """Write `scores.json` with training's report and only the last point of its curve; return what it holds."""
     avatar, split = load_avatar(training, scene.device), settings.split
-    scored = scene.capture.test_cameras and not why_not_shown(split, training)
+    scored = scene.capture.test_cameras and not reason_unavailable(split, training)
     rows = curve(scene, split, training, avatar, settings, out) if scored else []
     found = {"training": json.loads((training / "report.json").read_text()), "curve": rows[-1:]}
     (out / "scores.json").write_text(json.dumps(found, indent=1))
@@ -96,7 +97,7 @@ def score_end(scene: ScoringScene, training: Path, settings: ScoringSettings, ou
 def curve(
     scene: ScoringScene, split: str, training: Path, finished: Avatar, settings: ScoringSettings, out: Path
 ) -> list[dict[str, Any]]:
-    """Seconds of training and figures of every snapshot, and last of the finished field, in the order of time."""
+    """Return training seconds and scores of every snapshot, and last of the finished field, in order of time."""
     end_s = json.loads((training / "report.json").read_text())["field_seconds"]
     taken = {json.loads((f / "settings.json").read_text())["seconds"]: f for f in (training / "snapshots").glob("*")}
     models = [(s, load_avatar(taken[s], scene.device)) for s in sorted(taken) if s < end_s]
@@ -104,41 +105,42 @@ def curve(
     for seconds, avatar in [*models, (end_s, finished)]:
         folder = out / "snapshots" / f"{seconds:g}"
         folder.mkdir(parents=True)
-        column = shown_as(split, avatar, scene.fitted)
-        figures = score_at(scene, column, split, settings.snapshot_images, settings.snapshot_meshes, folder)
+        column = avatar_for_split(split, avatar, scene.fitted)
+        figures = score_views(scene, column, split, settings.snapshot_images, settings.snapshot_meshes, folder)
         del figures["per_image"]
         rows.append({"seconds": seconds} | figures)
         log.info("after %.0f s: %s dB", seconds, figures["psnr"])
     return rows
 
 
-def score_at(
+def score_views(
     scene: ScoringScene, avatar: Avatar, split: str, images: int | None, meshes: int, out: Path
 ) -> dict[str, Any]:
-    """A split's figures in the form of evaluation, of its avatar and at most as many images and surfaces of which the
-    truth is known; None is all."""
+    """Score a split's avatar on at most so many images and surfaces, among those with truth, in the format of
+    evaluation; None is all."""
     views = all_views(scene.capture, split)
-    views = evenly_spaced(known_views(views, scene.truth) or views, images or len(views))
+    views = evenly_spaced(views_with_mask(views, scene.truth) or views, images or len(views))
     if views and scene.capture.test_cameras:
         render({split: avatar}, scene.capture, views, out)
     found = score_split(scene.capture, split, views, scene.truth, out)
-    if split not in PRIMARY:
+    if split not in PRIMARY_SPLITS:
         return found
     if not meshes:
-        return found | {"geometry": None, "geometry_reason": "the study asks for no surface here"}
+        return found | {"geometry": None, "geometry_reason": "the study requests no surface here"}
     true_meshes = scene.truth.meshes() if scene.truth else {}
     frames = [f for f in mesh_frames(split_frames(scene.capture, split), true_meshes, meshes) if f in true_meshes]
     try:
         return found | score_meshes(avatar, frames, true_meshes, out)
-    except InputError as error:  # a result of young or failed models, not a fault of the study
+    except InputError as error:  # young or failed models may have no surface, which is a result
         return found | {"geometry": None, "geometry_reason": str(error)}
 
 
 def write_pictures(scene: ScoringScene, split: str, per_image: list[dict[str, Any]], out: Path) -> list[dict[str, Any]]:
-    """Write a few scored renderings and the truth, cut to the person, as `pictures/<k>-{render,truth}.png`; which."""
+    """Write a few scored renderings and the truth, cropped to the person, as `pictures/<k>-{render,truth}.png`; return
+    which."""
     chosen = [{key: row[key] for key in ("camera", "frame")} for row in evenly_spaced(per_image, PICTURES)]
     for k, row in enumerate(chosen):
-        assert scene.truth is not None  # something was scored
+        assert scene.truth is not None  # since images were scored
         box = frame_person(scene.truth.mask(**row))
         both = {"render": read_rgb(View(split, **row).path(out)), "truth": scene.truth.on_black(**row)[0]}
         for name, picture in both.items():
@@ -146,8 +148,8 @@ def write_pictures(scene: ScoringScene, split: str, per_image: list[dict[str, An
     return chosen
 
 
-def add_nearness(capture: Capture, avatar: Avatar, split: str, found: dict[str, Any]) -> None:
-    """Put beside each image's and surface's figures how far its view and its pose are from those of training."""
+def add_training_distances(capture: Capture, avatar: Avatar, split: str, found: dict[str, Any]) -> None:
+    """Add to each image's and surface's scores the distance of its view and its pose from those of training."""
     apart_deg = pose_distances_deg(avatar.body, split_frames(capture, split), capture.train_frames)
     vertices_m = avatar.body.vertices_m().cpu().numpy()
     middles_m = (vertices_m.min(1) + vertices_m.max(1)) / 2
@@ -160,12 +162,12 @@ def add_nearness(capture: Capture, avatar: Avatar, split: str, found: dict[str, 
 
 
 def frame_seconds(avatar: Avatar, camera: Camera, frame: int, side_px: int) -> float:
-    """Median seconds of rendering a fitted pose to an image of this longest side."""
+    """Return the median seconds of rendering a fitted pose to an image with this longest side."""
     scale = side_px / max(camera.width_px, camera.height_px)
     resized = camera.resized(round(camera.width_px * scale), round(camera.height_px * scale))
     k = avatar.body.index(frame)
     seconds: list[float] = []
-    while not seconds or (len(seconds) < REPEATS and seconds[0] < LONG_S):
+    while not seconds or (len(seconds) < REPEATS and seconds[0] < SLOW_S):
         started = time.perf_counter()
         with torch.no_grad():
             avatar.render(resized, avatar.body.theta[k], avatar.body.root[k]).rgb.cpu()

@@ -1,4 +1,4 @@
-"""How far a held-out image is from what was trained on."""
+"""Distance of held-out images from the training data, in view angle and in pose."""
 
 from collections.abc import Iterable
 
@@ -10,18 +10,18 @@ from hnerf.geometry.camera import Camera
 
 
 def view_angle_deg(camera: Camera, others: Iterable[Camera], middle_m: np.ndarray) -> float:
-    """Angle at a point (3,) in the world between a camera and the nearest in angle of others."""
+    """Return the angle at a world point (3,) between a camera and the nearest in angle of others."""
     towards = _unit(camera.centre_m - middle_m)
     cosines = [towards @ _unit(other.centre_m - middle_m) for other in others]
     return float(np.rad2deg(np.arccos(np.clip(max(cosines), -1, 1))))
 
 
 def pose_distances_deg(body: BodyFit, frames: Iterable[int], others: Iterable[int]) -> dict[int, float]:
-    """For each frame, how far its pose is from the nearest of other frames: the mean over free joints of the angle of
-    the rotation between, so that walking or turning as a whole is no distance."""
+    """Return, for each frame, the distance of its pose from the nearest of other frames: the mean over free joints of
+    the angle of the relative rotation. Walking or turning as a whole adds nothing."""
     turns = rotation_from_axis_angle(body.theta[:, body.rig.free].double()).cpu()
     known = turns[[body.index(frame) for frame in others]]
-    # |A - B| of two rotations is sqrt(8) sin of half the angle between.
+    # |A - B| of two rotations is sqrt(8) times the sine of half the angle between them.
     halves = {f: (known - turns[body.index(f)]).flatten(2).norm(dim=-1) / 8**0.5 for f in frames}
     angles_deg = {f: (2 * sine.clamp(max=1).asin()).rad2deg() for f, sine in halves.items()}
     return {f: float(angle_deg.sum(1).min()) / max(1, turns.shape[1]) for f, angle_deg in angles_deg.items()}

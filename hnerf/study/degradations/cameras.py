@@ -1,4 +1,4 @@
-"""A capture with fewer cameras or frames, or with one camera that points elsewhere or lags."""
+"""Degradations of the camera rig: fewer cameras or frames, one camera rotated, or one camera delayed."""
 
 import dataclasses
 import shutil
@@ -22,18 +22,18 @@ from hnerf.errors import NotApplicableError
 T = TypeVar("T")
 
 
-def leave_cameras(capture: Capture, count: float, rng: np.random.Generator, out: Path) -> None:
-    """Keep `count` training cameras, drawn at random; InputError if there are no more than that."""
-    subset(capture, out, _drawn(capture.name, "cameras", capture.train_cameras, count, rng), None, None)
+def keep_cameras(capture: Capture, count: float, rng: np.random.Generator, out: Path) -> None:
+    """Keep `count` training cameras, drawn at random. Raises NotApplicableError if there are no more than that."""
+    subset(capture, out, _random_subset(capture.name, "cameras", capture.train_cameras, count, rng), None, None)
 
 
-def leave_frames(capture: Capture, count: float, rng: np.random.Generator, out: Path) -> None:
-    """Keep `count` training frames, drawn at random; InputError if there are no more than that."""
-    subset(capture, out, None, _drawn(capture.name, "frames", capture.train_frames, count, rng), None)
+def keep_frames(capture: Capture, count: float, rng: np.random.Generator, out: Path) -> None:
+    """Keep `count` training frames, drawn at random. Raises NotApplicableError if there are no more than that."""
+    subset(capture, out, None, _random_subset(capture.name, "frames", capture.train_frames, count, rng), None)
 
 
-def turn_camera(capture: Capture, angle_deg: float, rng: np.random.Generator, out: Path) -> None:
-    """One training camera's extrinsics turned about its centre and an axis at random; its images stay."""
+def rotate_camera(capture: Capture, angle_deg: float, rng: np.random.Generator, out: Path) -> None:
+    """Rotate one training camera's extrinsics about its centre and a random axis; its images stay."""
     require_several_cameras(capture)
     camera = capture.cameras[str(rng.choice(capture.train_cameras))]
     axis = rng.normal(size=3)
@@ -42,11 +42,11 @@ def turn_camera(capture: Capture, angle_deg: float, rng: np.random.Generator, ou
     subset(capture.with_cameras(capture.cameras | {camera.name: turned}), out, None, None, None)
 
 
-def put_out_of_step(capture: Capture, frames: float, rng: np.random.Generator, out: Path) -> None:
-    """One training camera, at random, shows at each frame what it saw that many frames before; its first picture stands
-    still until then."""
+def delay_camera(capture: Capture, frames: float, rng: np.random.Generator, out: Path) -> None:
+    """Delay one random training camera: at each frame it shows its image of that many frames before, and until then its
+    first image."""
     if not 1 <= round(frames) < len(capture.frames):
-        raise NotApplicableError(f"{capture.name}: has {len(capture.frames)} frames; none can be {frames:g} late")
+        raise NotApplicableError(f"{capture.name}: has {len(capture.frames)} frames; none can be delayed by {frames:g}")
     require_several_cameras(capture)
     late = str(rng.choice(capture.train_cameras))
     kept = dataclasses.replace(capture, root=out)
@@ -66,8 +66,10 @@ def put_out_of_step(capture: Capture, frames: float, rng: np.random.Generator, o
     kept.save()
 
 
-def _drawn(name: str, what: str, there_are: tuple[T, ...], count: float, rng: np.random.Generator) -> tuple[T, ...]:
-    if count >= len(there_are):
-        raise NotApplicableError(f"{name}: has only {len(there_are)} training {what}; leave fewer than that")
-    rows = np.sort(rng.permutation(len(there_are))[: round(count)])
-    return tuple(there_are[row] for row in rows)
+def _random_subset(
+    name: str, what: str, available: tuple[T, ...], count: float, rng: np.random.Generator
+) -> tuple[T, ...]:
+    if count >= len(available):
+        raise NotApplicableError(f"{name}: has only {len(available)} training {what}; keep fewer than that")
+    rows = np.sort(rng.permutation(len(available))[: round(count)])
+    return tuple(available[row] for row in rows)

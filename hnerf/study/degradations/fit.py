@@ -1,4 +1,4 @@
-"""Bodies that were fitted wrongly, and poses that nobody recorded."""
+"""Degradations of the body fit, and poses far from the recorded ones."""
 
 import dataclasses
 import math
@@ -10,13 +10,14 @@ from torch import Tensor
 from hnerf.body.fit_result import BodyFit
 
 
-def disturb_poses(body: BodyFit, angle_deg: float, rng: np.random.Generator) -> BodyFit:
-    """Every free joint of every frame turned at random; `angle_deg` is the root mean square of what is added."""
-    return dataclasses.replace(body, theta=body.theta + _turns(body, len(body.frames), angle_deg, rng))
+def add_pose_noise(body: BodyFit, angle_deg: float, rng: np.random.Generator) -> BodyFit:
+    """Rotate every free joint of every frame at random; `angle_deg` is the root mean square of the added rotations."""
+    return dataclasses.replace(body, theta=body.theta + _rotation_noise(body, len(body.frames), angle_deg, rng))
 
 
 def change_shape(body: BodyFit, distance_mm: float, rng: np.random.Generator) -> BodyFit:
-    """Every shape value moved at random, so far that resting vertices move by `distance_mm` (root mean square)."""
+    """Move the shape values in a random direction, so far that resting vertices move by `distance_mm` (root mean
+    square)."""
     rig = body.rig
     direction = torch.from_numpy(rng.normal(size=len(rig.beta))).to(rig.beta)
     moved_m = rig.shaped(rig.beta + direction)[0] - rig.vertices_m
@@ -25,16 +26,16 @@ def change_shape(body: BodyFit, distance_mm: float, rng: np.random.Generator) ->
 
 
 def extreme_poses(body: BodyFit, angle_deg: float, count: int, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Poses far from those of the body's frames: theta (count, J, 3) and root (count, 4, 4).
+    """Return poses far from those of the body's frames: theta (count, J, 3) and root (count, 4, 4).
 
-    Frames drawn at random, every free joint turned at random by `angle_deg` (root mean square).
+    Frames are drawn at random, and every free joint is rotated at random by `angle_deg` (root mean square).
     """
     rows = torch.from_numpy(rng.integers(len(body.frames), size=count))
-    return body.theta[rows] + _turns(body, count, angle_deg, rng), body.root[rows]
+    return body.theta[rows] + _rotation_noise(body, count, angle_deg, rng), body.root[rows]
 
 
-def _turns(body: BodyFit, count: int, angle_deg: float, rng: np.random.Generator) -> Tensor:
-    """(count, J, 3) radians, zero at the root joint and where joints are locked."""
+def _rotation_noise(body: BodyFit, count: int, angle_deg: float, rng: np.random.Generator) -> Tensor:
+    """Return random rotation vectors (count, J, 3) in radians, zero at the root joint and at locked joints."""
     turns = rng.normal(0, math.radians(angle_deg) / math.sqrt(3), (count, *body.theta.shape[1:]))
     moves = body.rig.free & (body.rig.parents >= 0)
     return torch.from_numpy(turns).to(body.theta) * moves[:, None]

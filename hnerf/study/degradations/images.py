@@ -1,6 +1,6 @@
-"""A capture whose training cameras took worse pictures. Test cameras stay as they are, so that scores compare.
+"""Degradations of the training cameras' images. Test cameras stay as they are, so that scores can be compared.
 
-Clean plates are worse in the same way, since the same camera took them; keypoints stay, unless pixels move.
+Clean plates are degraded likewise, since the same camera took them; keypoints stay, unless pixels move.
 """
 
 import dataclasses
@@ -24,25 +24,26 @@ PixelChange = Callable[[str, np.ndarray], np.ndarray]
 
 
 def add_noise(capture: Capture, levels: float, rng: np.random.Generator, out: Path) -> None:
-    """Gaussian noise of this standard deviation in levels of 255, another one in every picture."""
-    rewrite(capture, out, lambda _, rgb: _to_8_bit(rgb + rng.normal(0, levels, rgb.shape)))
+    """Add Gaussian noise of this standard deviation, in levels of 255, independently to every image."""
+    rewrite_images(capture, out, lambda _, rgb: _to_8_bit(rgb + rng.normal(0, levels, rgb.shape)))
 
 
 def blur(capture: Capture, percent: float, rng: np.random.Generator, out: Path) -> None:
-    """Gaussian blur whose standard deviation is this share of the image's width."""
-    rewrite(capture, out, lambda _, rgb: cv2.GaussianBlur(rgb, (0, 0), percent / 100 * rgb.shape[1]))
+    """Blur images by a Gaussian whose standard deviation is this percentage of their width."""
+    rewrite_images(capture, out, lambda _, rgb: cv2.GaussianBlur(rgb, (0, 0), percent / 100 * rgb.shape[1]))
 
 
-def expose_differently(capture: Capture, stops: float, rng: np.random.Generator, out: Path) -> None:
-    """Gains from 2^-stops to 2^stops, evenly shared out among the training cameras in an order at random."""
+def vary_exposure(capture: Capture, stops: float, rng: np.random.Generator, out: Path) -> None:
+    """Multiply training cameras' images by gains from 2^-stops to 2^stops, evenly spaced in stops and assigned at
+    random."""
     require_several_cameras(capture)
     names = rng.permutation(capture.train_cameras)
     gains = dict(zip(names.tolist(), 2 ** np.linspace(-stops, stops, len(names)), strict=True))
-    rewrite(capture, out, lambda camera, rgb: _to_8_bit(rgb * gains[camera]))
+    rewrite_images(capture, out, lambda camera, rgb: _to_8_bit(rgb * gains[camera]))
 
 
 def resize(capture: Capture, scale: float, rng: np.random.Generator, out: Path) -> None:
-    """Training cameras of another size, their keypoints and given masks with them. Board footage is left out."""
+    """Resize training cameras' images, keypoints and given masks by a factor. Board footage is omitted."""
     cameras = {name: capture.cameras[name] for name in capture.train_cameras}
     small = {name: c.resized(*(max(1, round(scale * px)) for px in (c.width_px, c.height_px)))
              for name, c in cameras.items()}  # fmt: skip
@@ -50,16 +51,19 @@ def resize(capture: Capture, scale: float, rng: np.random.Generator, out: Path) 
     def resized(camera: str, pixels: np.ndarray) -> np.ndarray:
         return _resized(pixels, small[camera])
 
-    rewrite(capture.with_cameras(capture.cameras | small), out, resized, resized)
+    rewrite_images(capture.with_cameras(capture.cameras | small), out, resized, resized)
     keypoints = read_keypoints(capture)
     for name in set(keypoints) & set(small):
-        keypoints[name] = _moved(keypoints[name], cameras[name], small[name])
+        keypoints[name] = _scaled_keypoints(keypoints[name], cameras[name], small[name])
     write_keypoints(out, keypoints)
 
 
-def rewrite(capture: Capture, out: Path, change: PixelChange, change_mask: PixelChange = lambda _, mask: mask) -> None:
-    """Copy a capture, every image and clean plate of its training cameras changed by `change(camera, (H, W, 3) uint8)`,
-    every given mask by `change_mask(camera, (H, W) uint8 of 0 and 255)`. Images are JPEG as at the door."""
+def rewrite_images(
+    capture: Capture, out: Path, change: PixelChange, change_mask: PixelChange = lambda _, mask: mask
+) -> None:
+    """Copy a capture, changing every image and clean plate of its training cameras by `change(camera, (H, W, 3)
+    uint8)`, and every given mask by `change_mask(camera, (H, W) uint8 of 0 and 255)`. Images are JPEG, as written by
+    ingest."""
     kept = dataclasses.replace(capture, root=out)
     write_arrays(capture, kept)
     for name in capture.test_cameras:
@@ -83,8 +87,8 @@ def _resized(pixels: np.ndarray, camera: Camera) -> np.ndarray:
     return cv2.resize(pixels, size_px, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
 
 
-def _moved(keypoints: np.ndarray, old: Camera, new: Camera) -> np.ndarray:
-    """Keypoints (..., 3) in another size's pixels, centres at integers; those of no confidence stay zero."""
+def _scaled_keypoints(keypoints: np.ndarray, old: Camera, new: Camera) -> np.ndarray:
+    """Scale keypoints (..., 3) to another image size, pixel centres at integers; those of zero confidence stay zero."""
     scale = np.array([new.width_px / old.width_px, new.height_px / old.height_px])
     xy = keypoints[..., :2] * scale + (scale - 1) / 2
     return np.concatenate([xy, keypoints[..., 2:]], -1) * (keypoints[..., 2:] > 0)

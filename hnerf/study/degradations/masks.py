@@ -1,4 +1,4 @@
-"""Masks that are too small, too large, full of holes, or lack a limb."""
+"""Degradations of masks: too small, too large, with holes, or without a limb."""
 
 from collections.abc import Callable
 
@@ -11,35 +11,35 @@ from hnerf.capture.subject import subject_keypoints
 from hnerf.errors import NotApplicableError
 
 LIMBS = ((3, 4), (6, 7), (10, 11), (13, 14))  # BODY_25: elbow to wrist, knee to ankle; right, left
-BEYOND = 0.5  # of a limb's length: where hand or foot ends
-THICKNESS = 0.8  # of a limb's length
+BEYOND = 0.5  # of a limb's length: where the hand or foot ends
+THICKNESS = 0.8  # of what is cut, as a share of a limb's length
 HOLE_RADIUS = 0.1  # of the square root of a mask's area
 
 MaskChange = Callable[[str, int, np.ndarray], np.ndarray]
 
 
 def erode(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
-    """Take away what lies within this share of the image's width of the edge, inside."""
+    """Remove the mask's pixels within this percentage of the image's width of its edge."""
     return _changed(masks, lambda _, __, mask: _edge_distance_px(mask) > percent / 100 * mask.shape[1])
 
 
 def dilate(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
-    """Add what lies within this share of the image's width of the person."""
+    """Add the pixels within this percentage of the image's width of the person."""
     return _changed(masks, lambda _, __, mask: _edge_distance_px(~mask) <= percent / 100 * mask.shape[1])
 
 
-def pierce(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
-    """Take away discs at random places until this share of each mask is gone."""
-    return _changed(masks, lambda _, __, mask: _pierced(mask, percent / 100, rng))
+def cut_holes(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
+    """Remove discs at random places until this percentage of each mask is gone."""
+    return _changed(masks, lambda _, __, mask: _with_holes(mask, percent / 100, rng))
 
 
 def cut_limb(masks: Masks, capture: Capture, percent: float, rng: np.random.Generator) -> Masks:
-    """Take a forearm with its hand, or a lower leg with its foot, away from this share of the masks, at random.
+    """Remove a forearm with its hand, or a lower leg with its foot, from this percentage of the masks, at random.
 
-    InputError where nothing was detected, since keypoints tell where limbs are.
+    Raises NotApplicableError if there are no keypoints, which tell where limbs are.
     """
     if not capture.has_keypoints:
-        raise NotApplicableError(f"{capture.name}: has no keypoints; they tell where limbs are")
+        raise NotApplicableError(f"{capture.name}: has no keypoints, which locate the limbs")
     keypoints = subject_keypoints(capture)
 
     def cut(camera: str, frame: int, mask: np.ndarray) -> np.ndarray:
@@ -56,11 +56,11 @@ def _changed(masks: Masks, change: MaskChange) -> Masks:
 
 
 def _edge_distance_px(mask: np.ndarray) -> np.ndarray:
-    """(H, W): distance of each pixel of a mask to the nearest that is not in it, 0 outside."""
+    """Return the distance of each pixel of a mask to the nearest outside it, (H, W); 0 outside."""
     return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
-def _pierced(mask: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
+def _with_holes(mask: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
     left, pixels = mask.astype(np.uint8), np.argwhere(mask)
     radius_px = max(1, round(HOLE_RADIUS * len(pixels) ** 0.5))
     while left.sum() > (1 - share) * len(pixels):
@@ -70,7 +70,8 @@ def _pierced(mask: np.ndarray, share: float, rng: np.random.Generator) -> np.nda
 
 
 def _limb(person: np.ndarray, limb: tuple[int, int], shape: tuple[int, ...]) -> np.ndarray:
-    """(H, W) bool: around a limb's bone and beyond its end, of a person's keypoints (25, 3); empty where not seen."""
+    """Return the pixels around a limb's bone and beyond its end, (H, W) bool, from a person's keypoints (25, 3); none
+    if it was not detected."""
     covered = np.zeros(shape, np.uint8)
     start, end = person[limb[0]], person[limb[1]]
     if start[2] > 0 and end[2] > 0:

@@ -1,4 +1,4 @@
-"""A capture with a pillar between the person and a camera."""
+"""Degradation by an occluder: a pillar between the person and a camera."""
 
 from pathlib import Path
 
@@ -10,24 +10,26 @@ from hnerf.capture.subject import subject_keypoints
 from hnerf.capture.subset import read_keypoints, write_keypoints
 from hnerf.errors import NotApplicableError
 from hnerf.geometry.camera import Camera
-from hnerf.study.degradations.images import rewrite
+from hnerf.study.degradations.images import rewrite_images
 
-WAY = 0.4  # of the way from the person to the camera
+DISTANCE_SHARE = 0.4  # of the distance from the person to the camera
 HALF_HEIGHT_M = 1.2
 GREY = np.array([96, 96, 96], np.uint8)
 
 
-def put_in_front(capture: Capture, width_m: float, rng: np.random.Generator, out: Path) -> None:
-    """A grey square pillar, on the way to a training camera at random, hides what lies behind it: in every training
-    camera that it stands in front of the person for, in the clean plates, too; keypoints behind it are not detected.
+def add_pillar(capture: Capture, width_m: float, rng: np.random.Generator, out: Path) -> None:
+    """Put a grey square pillar between the person and a random training camera. It hides what lies behind it in every
+    training camera that it stands in front of the person for, in the clean plates as well; keypoints behind it are not
+    detected.
 
-    Cameras that would see it behind or beside the person do not show it. InputError if nobody knows where he stands.
+    Cameras that would see it behind or beside the person do not show it. Raises NotApplicableError if the person's
+    position is unknown.
     """
     person_m = person_middle(capture)
     up = np.eye(3)["xyz".index(capture.up)]
     corners_m = pillar(person_m, capture.cameras[str(rng.choice(capture.train_cameras))], up, width_m)
     hidden = {name: _hidden(capture.cameras[name], corners_m, person_m) for name in capture.train_cameras}
-    rewrite(
+    rewrite_images(
         capture,
         out,
         lambda camera, rgb: np.where(hidden[camera][..., None], GREY, rgb),
@@ -38,11 +40,9 @@ def put_in_front(capture: Capture, width_m: float, rng: np.random.Generator, out
 
 
 def person_middle(capture: Capture) -> np.ndarray:
-    """The point (3,) nearest to all rays through the middle of the person's keypoints, over all frames."""
+    """Return the point (3,) nearest to all rays through the middle of the person's keypoints, over all frames."""
     if not capture.has_keypoints or len(capture.train_cameras) < 2:
-        raise NotApplicableError(
-            f"{capture.name}: nobody knows where the person stands; needs keypoints from two cameras"
-        )
+        raise NotApplicableError(f"{capture.name}: the person's position is unknown; needs keypoints from two cameras")
     left, right = np.zeros((3, 3)), np.zeros(3)
     for name, seen in subject_keypoints(capture).items():
         found = seen[seen[..., 2] > 0]
@@ -54,10 +54,10 @@ def person_middle(capture: Capture) -> np.ndarray:
 
 
 def pillar(person_m: np.ndarray, camera: Camera, up: np.ndarray, width_m: float) -> np.ndarray:
-    """Corners (8, 3) of an upright square pillar that faces the camera."""
+    """Return the corners (8, 3) of an upright square pillar that faces the camera."""
     towards = camera.centre_m - person_m
     towards -= up * (up @ towards)
-    middle_m = person_m + WAY * towards
+    middle_m = person_m + DISTANCE_SHARE * towards
     towards /= np.linalg.norm(towards)
     axes = np.stack([towards, np.cross(up, towards), up]) * np.array([[width_m / 2], [width_m / 2], [HALF_HEIGHT_M]])
     signs = np.stack(np.meshgrid(*[(-1, 1)] * 3), -1).reshape(8, 3)
@@ -65,7 +65,8 @@ def pillar(person_m: np.ndarray, camera: Camera, up: np.ndarray, width_m: float)
 
 
 def _hidden(camera: Camera, corners_m: np.ndarray, person_m: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels that the pillar covers, none where it is not wholly between the camera and the person."""
+    """Return the pixels that the pillar covers, (H, W) bool; none unless it is wholly between the camera and the
+    person."""
     hidden = np.zeros((camera.height_px, camera.width_px), np.uint8)
     px, depth_m = camera.project(corners_m)
     if depth_m.min() > 0 and depth_m.max() < camera.project(person_m)[1]:
@@ -74,7 +75,7 @@ def _hidden(camera: Camera, corners_m: np.ndarray, person_m: np.ndarray) -> np.n
 
 
 def _without(keypoints: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """Keypoints (..., 3), zero on hidden pixels (H, W)."""
+    """Return keypoints (..., 3), set to zero on hidden pixels (H, W)."""
     height_px, width_px = hidden.shape
     x, y = (keypoints[..., k].round().astype(int).clip(0, size - 1) for k, size in enumerate((width_px, height_px)))
     return keypoints * ~hidden[y, x][..., None]

@@ -1,4 +1,4 @@
-"""Charts of a stability study, as PNG files that can be read in black and white."""
+"""Charts of a stability study, as PNG files that are readable in greyscale."""
 
 import math
 from pathlib import Path
@@ -12,20 +12,20 @@ from matplotlib.patches import Patch, Rectangle
 from hnerf.evaluation.charts import FAINT, INK, style
 from hnerf.study.benchmark.charts import Style, styles
 from hnerf.study.degradations.catalogue import KINDS
-from hnerf.study.stability.report import REFERENCE, Row, worst
+from hnerf.study.stability.report import REFERENCE, Row, worst_run
 
 SHADES = {"ok": "#e8f1ec", "degraded": "#f2c877", "refused": "#9dbbdc", "failed": "#a3293d", "unscored": "#949494"}
 LETTERS = {"ok": "o", "degraded": "D", "refused": "R", "failed": "F", "unscored": "?"}
 LABELS = {"psnr": "PSNR, dB", "chamfer_mm": "Chamfer distance, mm"}
-CAPTION = "line: mean over seeds; band: range; dotted: as recorded, over the same; cross: a seed without a figure"
-COLUMNS = 4  # of panels
-CELL, GAP = (0.52, 0.42), 0.4  # of the matrix in inches; between methods, in cells
+CAPTION = "line: mean over seeds; band: range; dotted: reference, same images or surfaces; cross: no score"
+COLUMNS = 4  # of panels, at most
+CELL, GAP = (0.52, 0.42), 0.4  # size of a matrix cell in inches; gap between methods in cells
 LEFT, BOTTOM, LEGEND = 2.7, 0.4, 6.2  # inches
 
 
 def matrix_chart(result: Row, path: Path) -> None:
-    """A row a degradation and a block of columns a method, a letter and shade for each strength, the mildest on the
-    left; the worst verdict over seeds counts."""
+    """Draw a row for each degradation and a block of columns for each method: a letter and shade for each strength, the
+    mildest on the left, for the worst verdict over seeds."""
     methods, kinds = result["plan"]["methods"], result["plan"]["degradations"]
     wide = max(map(len, kinds.values()))
     across, down = len(methods) * (wide + GAP) - GAP, len(kinds) + 0.6  # in cells
@@ -37,7 +37,7 @@ def matrix_chart(result: Row, path: Path) -> None:
         axes.text(left + wide / 2, -0.25, method, ha="center", fontsize=10, fontweight="bold", color=INK)
         for row, (kind, strengths) in enumerate(kinds.items()):
             for k, strength in enumerate(strengths):
-                _cell(axes, left + k, row, strength, worst(result, method, kind, strength))
+                _cell(axes, left + k, row, strength, worst_run(result, method, kind, strength))
     axes.set_xlim(0, across)
     axes.set_ylim(len(kinds), -0.6)
     axes.set_yticks(np.arange(len(kinds)) + 0.5, [KINDS[kind].label for kind in kinds], color=INK, fontsize=9)
@@ -50,9 +50,9 @@ def matrix_chart(result: Row, path: Path) -> None:
 
 
 def curve_chart(result: Row, key: str, path: Path) -> bool:
-    """A panel for each degradation: a figure of every method over strength, from the capture as recorded; line the mean
-    and band the range over seeds, dotted what the reference has over the same images or surfaces, a cross where a seed
-    has no figure. False, and no file, where there is none."""
+    """Draw a panel for each degradation: a score of every method over strength, starting from the capture as recorded.
+    Lines are means and bands ranges over seeds; the dotted line is the reference over the same images or surfaces; a
+    cross marks a seed without a score. Return whether there was a score to draw and the file was written."""
     measured = {run["kind"] for run in result["runs"] if run.get(key) is not None} - {REFERENCE}
     kinds = {kind: strengths for kind, strengths in result["plan"]["degradations"].items() if kind in measured}
     if not kinds:
@@ -65,8 +65,8 @@ def curve_chart(result: Row, key: str, path: Path) -> bool:
     for axes in grid.flat[len(kinds) :]:
         axes.set_visible(False)
     for axes, (kind, strengths) in zip(grid.flat, kinds.items(), strict=False):
-        for k, (method, look) in enumerate(styles(result["plan"]["methods"]).items()):
-            _curve(axes, [r for r in result["runs"] if r["method"] == method], kind, strengths, key, look, k)
+        for k, (method, method_style) in enumerate(styles(result["plan"]["methods"]).items()):
+            _curve(axes, [r for r in result["runs"] if r["method"] == method], kind, strengths, key, method_style, k)
         axes.set_xticks(range(len(strengths) + 1), ["none", *(f"{s:g}" for s in strengths)])
         axes.set_xlim(-0.3, len(strengths) + 0.3)
         style(axes, KINDS[kind].label, "")
@@ -88,24 +88,26 @@ def _cell(axes: Axes, x: float, y: float, strength: float, run: Row | None) -> N
     axes.text(x + 0.5, y + 0.74, f"{strength:g}", ha="center", va="center", fontsize=6.5, color=ink)
 
 
-def _curve(axes: Axes, runs: list[Row], kind: str, strengths: list[float], key: str, look: Style, k: int) -> None:
-    """One method's line in a panel; k counts methods."""
+def _curve(
+    axes: Axes, runs: list[Row], kind: str, strengths: list[float], key: str, method_style: Style, k: int
+) -> None:
+    """Draw one method's line in a panel; k is the method's index."""
     by_place = [[r for r in runs if r["kind"] == REFERENCE]]
     by_place += [[r for r in runs if r["kind"] == kind and r["strength"] == strength] for strength in strengths]
     values: list[Any] = [[r[key] for r in place if r.get(key) is not None] for place in by_place]
     good: list[Any] = [[r["reference"][key] for r in place if r.get(key) is not None] for place in by_place]
     x = [place for place, found in enumerate(values) if found]
-    axes.plot(x, [np.mean(good[place]) for place in x], ":", color=look["color"], linewidth=1.0)
+    axes.plot(x, [np.mean(good[place]) for place in x], ":", color=method_style["color"], linewidth=1.0)
     means, lows, highs = ([f(values[place]) for place in x] for f in (np.mean, min, max))
-    axes.plot(x, means, linewidth=1.6, markersize=4, label=runs[0]["method"] if runs else None, **look)
-    axes.fill_between(x, lows, highs, color=look["color"], alpha=0.2, linewidth=0)
+    axes.plot(x, means, linewidth=1.6, markersize=4, label=runs[0]["method"] if runs else None, **method_style)
+    axes.fill_between(x, lows, highs, color=method_style["color"], alpha=0.2, linewidth=0)
     gone = [place for place, found in enumerate(by_place) if len(found) > len(values[place])]
     bottom = axes.get_xaxis_transform()
     axes.plot(
         [x + 0.15 * k for x in gone],
         [0.04] * len(gone),
         "x",
-        color=look["color"],
+        color=method_style["color"],
         markersize=7,
         markeredgewidth=2,
         transform=bottom,

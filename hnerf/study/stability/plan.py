@@ -1,4 +1,4 @@
-"""What a stability study tries: a YAML file under `configs/stability/`."""
+"""Plan of a stability study, read from a YAML file under `configs/stability/`."""
 
 from collections.abc import Collection
 from typing import Annotated
@@ -7,27 +7,28 @@ from pydantic import Field, NonNegativeInt
 
 from hnerf.config import CONFIGS, Section, named_file, read_yaml, validated
 from hnerf.errors import InputError
-from hnerf.study.benchmark.plan import Part
+from hnerf.study.benchmark.plan import CapturePart
 from hnerf.study.degradations.catalogue import KINDS, check_strengths
 
 STUDIES = CONFIGS / "stability"
 FULL = "full"
 
 
-class Stability(Section):
-    """Presets, seeds of degradations and training, settings changed in all runs, and each degradation's strengths, the
-    mildest first. border_seeds: further seeds, of what is near the border of two verdicts by those before; part: of the
-    capture that stands for all of it."""
+class StabilityStudy(Section):
+    """A stability study: presets, seeds of degradations and training, settings overridden in all runs, and each
+    degradation's strengths, the mildest first. border_seeds: further seeds for degradations whose verdict is near a
+    border with the seeds before; part: the part of the capture that is used."""
 
     methods: Annotated[tuple[str, ...], Field(min_length=1)]
     seeds: Annotated[tuple[NonNegativeInt, ...], Field(min_length=1)]
     border_seeds: tuple[NonNegativeInt, ...] = ()
-    part: Part = Part()
+    part: CapturePart = CapturePart()
     overrides: tuple[str, ...] = ()
     degradations: Annotated[dict[str, tuple[float, ...]], Field(min_length=1)]
 
-    def only(self, names: Collection[str]) -> "Stability":
-        """The study of these degradations only, of all where there are no names; InputError for one it has not."""
+    def restricted_to(self, names: Collection[str]) -> "StabilityStudy":
+        """Return the study with these degradations only, with all if there are no names. Raises InputError for one that
+        it does not have."""
         for name in names:
             if name not in self.degradations:
                 raise InputError(f"--only {name}: not in this study; it has {', '.join(self.degradations)}")
@@ -35,16 +36,16 @@ class Stability(Section):
         return self.model_copy(update={"degradations": chosen})
 
     def left_out(self) -> list[str]:
-        """What it does not try, in lines for people, against `configs/stability/full.yaml`."""
+        """Return what the study omits compared with `configs/stability/full.yaml`, in lines for people."""
         full = load_stability(FULL)
         lines = [f"`{name}` as a method" for name in full.methods if name not in self.methods]
         seeds = len(full.seeds) - len(self.seeds)
-        but = ", but where a verdict is near its border" if self.border_seeds else ": no spread is known from so few"
+        but = ", except where a verdict is near a border" if self.border_seeds else ": too few to know the variance"
         lines += [f"{seeds} of {len(full.seeds)} seeds{but}"] if seeds > 0 else []
-        if self.part != Part():
+        if self.part != CapturePart():
             kept = self.part.model_dump(exclude_defaults=True).items()
-            lines.append(f"the capture beyond a part of it: {', '.join(f'{key} {value}' for key, value in kept)}")
-        lines += [f"what the preset says: `{override}` instead" for override in self.overrides]
+            lines.append(f"the capture outside this part: {', '.join(f'{key} {value}' for key, value in kept)}")
+        lines += [f"the preset's own value: `{override}` instead" for override in self.overrides]
         for name, strengths in full.degradations.items():
             missing = [f"{s:g}" for s in strengths if s not in self.degradations.get(name, ())]
             if missing:
@@ -52,10 +53,11 @@ class Stability(Section):
         return lines
 
 
-def load_stability(study: str) -> Stability:
-    """A study by its name under `configs/stability/` or its file's path; InputError, one line, on what is wrong."""
+def load_stability(study: str) -> StabilityStudy:
+    """Load a study by its name under `configs/stability/` or its file's path. Raises InputError, one line, if it is
+    invalid."""
     path = named_file(study, STUDIES, "study", "studies")
-    found = validated(Stability, read_yaml(path), path)
+    found = validated(StabilityStudy, read_yaml(path), path)
     for kind, strengths in found.degradations.items():
         try:
             check_strengths(kind, strengths)

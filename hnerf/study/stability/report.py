@@ -1,6 +1,6 @@
 """Tables of a stability study, in Markdown.
 
-Runs are plain rows: method, seed, kind, strength, verdict, reason, and figures where there are any.
+Runs are plain rows: method, seed, kind, strength, verdict, reason, and scores where there are any.
 """
 
 import itertools
@@ -18,29 +18,29 @@ from hnerf.study.stability.verdict import (
     FAILED_SHARE,
     WORST_LAST,
 )
-from hnerf.study.surface import LENGTHS, VOLUMES
+from hnerf.study.surface import LENGTH_RANGE, VOLUME_RANGE
 from hnerf.tables import head, line, shown
 
 REFERENCE = "as recorded"
 LEGEND = (
-    f"**ok**: at most {DEGRADED_DB:g} dB of PSNR lost against the same method and seed on the capture as recorded, and "
-    f"a Chamfer distance of at most {DEGRADED_RATIO:g} times that. **degraded**: worse. **failed**: over {FAILED_DB:g} "
-    f"dB, or {FAILED_SHARE:g} of what that run has above an empty picture, or {FAILED_RATIO:g} times the distance; "
-    "pictures no better than empty ones, a crash, no surface, one that is not watertight or not of the body's size "
-    f"(volume {VOLUMES[0]:g} to {VOLUMES[1]:g}, length {LENGTHS[0]:g} to {LENGTHS[1]:g} of it). **refused**: an "
-    "earlier stage or the training said what is wrong with the input. **unscored**: nothing is known to be true of the "
-    "images and surfaces that both runs show, so that neither good nor bad can be told; extreme poses are judged by "
-    "surfaces alone. Novel poses from test cameras are scored, which no degradation touches, but that they and the "
-    "truth wear the skirt or the hair, too. They are animated: in poses as fitted before training, and where a "
-    "degradation is of the fit itself, as fitted without it; PSNR of the same images posed and tracked stands beside. "
-    "Training poses are scored where the capture or the method has no others. Runs are compared by the images and "
-    "surfaces that both have, and so are the differences in parentheses: a frame that a degradation took away counts "
-    "in neither. Without test cameras images are not compared. A surface is the largest component that meshing finds; "
-    "what floats beside it does not count. A method **holds to** the strongest strength up to which the worst seed of "
-    "every one is ok."
+    f"**ok**: at most {DEGRADED_DB:g} dB less PSNR than the same method and seed on the capture as recorded, and at "
+    f"most {DEGRADED_RATIO:g} times its Chamfer distance. **degraded**: worse than that. **failed**: over "
+    f"{FAILED_DB:g} dB less, or over {FAILED_SHARE:g} of what the reference has above an empty picture, or over "
+    f"{FAILED_RATIO:g} times the distance; pictures no better than empty ones; a crash; no surface, or one that is not"
+    f" watertight or not of the body's size (volume {VOLUME_RANGE[0]:g} to {VOLUME_RANGE[1]:g}, length "
+    f"{LENGTH_RANGE[0]:g} to {LENGTH_RANGE[1]:g} of it). **refused**: an earlier stage or the training reported what "
+    "is wrong with the input. **unscored**: no image or surface with ground truth is in both runs; extreme poses are "
+    "judged by surfaces alone. Scores are of novel poses from test cameras, which no degradation changes, except that"
+    " they and the ground truth also wear the skirt or the hair. Poses are animated, as fitted before training; if "
+    "the degradation is of the fit itself, as fitted without it. Beside them is the PSNR of the same images posed and"
+    " tracked. Training poses are scored if the capture or the method has no novel ones. Runs, and the differences in"
+    " parentheses, are compared over the images and surfaces that both have: a frame that a degradation removes "
+    "counts in neither. Without test cameras images are not compared. A surface is the largest component of the mesh;"
+    " detached parts do not count. A method **holds to** the strongest strength up to which the worst seed is ok at "
+    "every strength."
 )
 
-FIGURES = {  # title and digits of a run's
+FIGURES = {  # title and digits, by key in a run
     "psnr": ("PSNR, dB", 2),
     "posed_psnr": ("posed, dB", 2),
     "tracked_psnr": ("tracked, dB", 2),
@@ -51,9 +51,9 @@ FIGURES = {  # title and digits of a run's
 Row = dict[str, Any]
 
 
-def worst(result: Row, method: str, kind: str, strength: float) -> Row | None:
-    """The worst run over seeds, None where there is none yet. Where no seed has a good run to compare with, these runs
-    stand for all."""
+def worst_run(result: Row, method: str, kind: str, strength: float) -> Row | None:
+    """Return the worst run over seeds, None if there is none yet. If every reference run of the method is broken, the
+    reference runs count as well."""
     found = [r for r in result["runs"] if r["method"] == method and r["kind"] == kind and r["strength"] == strength]
     good = [r for r in result["runs"] if r["method"] == method and r["kind"] == REFERENCE]
     if all(r["verdict"] in BROKEN for r in good):
@@ -61,25 +61,26 @@ def worst(result: Row, method: str, kind: str, strength: float) -> Row | None:
     return max(found, key=lambda r: WORST_LAST.index(r["verdict"]), default=None)
 
 
-def how_far(result: Row, method: str, kind: str) -> str:
-    """The strongest strength up to which the worst seed of each is ok, the first at which it is degraded, and the first
-    at which it fails or is refused, as far as there are such."""
+def tolerated_strength(result: Row, method: str, kind: str) -> str:
+    """Return the strongest strength up to which the worst seed of each is ok, the first at which one is degraded, and
+    the first at which one fails or is refused, if there are such."""
     strengths = result["plan"]["degradations"][kind]
-    runs = [(f"{s:g}", run["verdict"]) for s in strengths if (run := worst(result, method, kind, s))]
+    runs = [(f"{s:g}", run["verdict"]) for s in strengths if (run := worst_run(result, method, kind, s))]
     held = [strength for strength, _ in itertools.takewhile(lambda run: run[1] == "ok", runs)]
-    message = [f"holds to {held[-1]}"] if held else []
-    for words in (("degraded",), BROKEN):
-        message += [f"{verdict} at {strength}" for strength, verdict in runs if verdict in words][:1]
-    return ", ".join(message) or ("unscored" if runs else "-")
+    parts = [f"holds to {held[-1]}"] if held else []
+    for verdicts in (("degraded",), BROKEN):
+        parts += [f"{verdict} at {strength}" for strength, verdict in runs if verdict in verdicts][:1]
+    return ", ".join(parts) or ("unscored" if runs else "-")
 
 
 def as_markdown(result: Row, charts: Sequence[str]) -> str:
-    """How far each method holds, charts, every run, what was left out, and what verdicts mean."""
+    """Format the whole result: how far each method holds, charts, every run, what was left out, and what verdicts
+    mean."""
     methods, kinds = result["plan"]["methods"], result["plan"]["degradations"]
     lines = [f"# Stability of {', '.join(methods)} on {result['subject']}: study `{result['study']}`", "", LEGEND, ""]
     lines += ["## How far each method holds", "", *head(["degradation", *methods])]
     for kind in kinds:
-        lines.append(line([KINDS[kind].label, *(how_far(result, method, kind) for method in methods)]))
+        lines.append(line([KINDS[kind].label, *(tolerated_strength(result, method, kind) for method in methods)]))
     lines += ["", *map(markdown_image, charts), "", "## Runs", ""]
     lines += head(["method", "degradation", "strength", "seed", "verdict", *(title for title, _ in FIGURES.values())])
     lines += [line(_cells(run)) for run in result["runs"]]
@@ -96,7 +97,7 @@ def _cells(run: Row) -> list[str]:
 
 
 def _compared(run: Row, key: str, digits: int) -> str:
-    """A figure and, of a degraded run, how much it differs from the reference over the same images or surfaces."""
+    """Return a score and, for a degraded run, its difference from the reference over the same images or surfaces."""
     value = run.get(key)
     if value is None or run["kind"] == REFERENCE:
         return shown(value, f"{{:.{digits}f}}")
