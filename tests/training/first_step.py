@@ -1,6 +1,6 @@
 """First step of a training with any number of processes; as a script, for the processes that torchrun starts.
 
-usage: python -m tests.training.first_step FOLDER MACHINERY PARTS
+usage: python -m tests.training.first_step FOLDER PARTS
 """
 
 import sys
@@ -34,10 +34,11 @@ def gradients(trainer: Trainer, module: torch.nn.Module) -> dict[str, Tensor]:
     return {name: q.grad.clone() for name, q in trainer.objective.named_parameters() if q.grad is not None}
 
 
-def main(folder: Path, kind: str, parts: int) -> None:
+KINDS = ("fast", "paper")
+
+
+def write_first_step(folder: Path, kind: str, parts: int, processes: Distributed) -> None:
     """Write the gradients of a step, and how many steps each rank skips where one rank's loss is not finite."""
-    torch.set_num_threads(1)
-    processes = Distributed.join()
     trainer = untrained(folder, kind, processes)
     trainer.parts = Parts(parts, False, 1e9)
     module = DistributedDataParallel(trainer.objective, find_unused_parameters=True)
@@ -53,4 +54,7 @@ def main(folder: Path, kind: str, parts: int) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]))
+    torch.set_num_threads(1)
+    joined = Distributed.join()
+    for each in KINDS:
+        write_first_step(Path(sys.argv[1], each), each, int(sys.argv[2]), joined)

@@ -14,7 +14,7 @@ from hnerf.training import trainer as trainer_module
 from hnerf.training.checkpoint import NAME
 from hnerf.training.distributed import Distributed
 from hnerf.training.trainer import train
-from tests.training.first_step import gradients, untrained
+from tests.training.first_step import KINDS, gradients, untrained
 from tests.training.scene import TINY, record
 
 ALONE = Distributed(0, 1, torch.device("cpu"))
@@ -44,14 +44,22 @@ def launched(ranks: int, program: list[str]) -> int:
     return subprocess.run([*launcher, *program], env=environment).returncode
 
 
-@pytest.mark.parametrize("kind", ["fast", "paper"])
-def test_two_ranks_in_three_parts_have_the_gradients_of_one_batch(tmp_path: Path, kind: str) -> None:
+@pytest.fixture(scope="module")
+def two_ranks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder in which two processes left, by kind of field, what `first_step` writes."""
+    folder = tmp_path_factory.mktemp("two")
+    for kind in KINDS:
+        (folder / kind).mkdir()
+    assert launched(2, ["-m", "tests.training.first_step", f"{folder}", "3"]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_two_ranks_in_three_parts_have_the_gradients_of_one_batch(tmp_path: Path, two_ranks: Path, kind: str) -> None:
     """Two gloo processes with half the 128 rays each, in parts of 22 and 21: the gradients are those of one process
     with all rays. Both skip a step whose loss is not finite in one of them alone."""
     alone = untrained(tmp_path / "one", kind, ALONE)
-    one, root = gradients(alone, alone.objective), tmp_path / "two"
-    root.mkdir()
-    assert launched(2, ["-m", "tests.training.first_step", f"{root}", kind, "3"]) == 0
+    one, root = gradients(alone, alone.objective), two_ranks / kind
     two = torch.load(root / "gradients.pt", weights_only=True)
     assert one.keys() == two.keys()
     for learned in ("correction", "deformation") if kind == "fast" else ("correction", "radiance"):
