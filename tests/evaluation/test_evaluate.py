@@ -297,7 +297,8 @@ def test_report_shows_figures_findings_and_charts(scored: Scored) -> None:
     assert '<span class="status rejected">' in text and "9.25" in text
     assert "a processor" in text and "12.5" in text
     assert 'alt="Losses"' in text and 'alt="Held-out quality"' in text
-    assert "LPIPS is not available" in text
+    lpips = found["novel_view"]["lpips"]
+    assert ("LPIPS is not available" if lpips is None else f"{lpips:.3f}") in text
     views, surfaces = ("Input", "Mask", "Fitted body", "Render", "Ground truth", "Error"), ("Surface", "Distance")
     for caption in (*views, *(f"{s}, {side}" for s in surfaces for side in ("front", "back"))):
         assert f'alt="{caption}"' in text, caption
