@@ -23,6 +23,7 @@ WITH_GPU = torch.cuda.is_available()
 @pytest.mark.parametrize("kind", ["fast", "paper", "nerf", "idr", "nerfies"])
 def test_trains_loads_and_renders_on_one_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str):
     monkeypatch.setattr(trainer_module, "MIN_PERSON_COVERAGE", 0.0)
+    monkeypatch.setattr(trainer_module, "HELD_OUT_RAYS", 64)
     capture, masks, body = record(tmp_path / "capture")
     camera = capture.cameras[capture.train_cameras[0]]
     changes: dict[str, object] = {"one_posture": False, "steps": 2, "novel_pose_steps": 1}
