@@ -8,7 +8,7 @@ import numpy as np
 
 from hnerf.capture.capture import Capture
 from hnerf.geometry.camera import Camera
-from hnerf.render import trajectory as cameras_along
+from hnerf.render import trajectory
 
 SIZE_PX = 1000
 FRAMES = 12
@@ -25,7 +25,7 @@ STANDING_M = np.array([
 def look_at(name: str, centre_m: np.ndarray, target_m: np.ndarray) -> Camera:
     """Return an upright camera of 1000 x 1000 px and focal length 1000 px."""
     like = Camera(name, np.diag([1000.0, 1000, 1]), np.eye(3), np.zeros(3), SIZE_PX, SIZE_PX)
-    return cameras_along.look_at(like, centre_m, target_m, np.array([0, 0, 1]))
+    return trajectory.look_at(like, centre_m, target_m, np.array([0, 0, 1]))
 
 
 def ring(count: int) -> list[Camera]:

@@ -12,7 +12,7 @@ from hnerf.capture.capture import Capture
 from hnerf.config import TrainingSettings
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.silhouette import silhouette
-from hnerf.render import trajectory as cameras_along
+from hnerf.render import trajectory
 from tests.body.boxes import box_rig
 
 SIZE_PX = 32
@@ -71,7 +71,7 @@ class KnownMasks:
 def look_at(name: str, centre_m: np.ndarray, target_m: np.ndarray) -> Camera:
     """Return a camera at `centre_m` with `target_m` in the image centre, z up."""
     like = Camera(name, np.diag([1.2 * SIZE_PX, 1.2 * SIZE_PX, 1]), np.eye(3), np.zeros(3), SIZE_PX, SIZE_PX)
-    return cameras_along.look_at(like, centre_m, target_m, np.array([0, 0, 1]))
+    return trajectory.look_at(like, centre_m, target_m, np.array([0, 0, 1]))
 
 
 def record(folder: Path, bends_rad: tuple[float, ...] = (0.0, 0.2, 0.4)) -> tuple[Capture, KnownMasks, BodyFit]:
