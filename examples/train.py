@@ -3,7 +3,7 @@
 usage: python examples/train.py OUT
 
 Leaves `OUT/performer`, the recording, and one folder a stage, named as in `store/subjects/NAME`, so that `hnerf render
-OUT` and the other examples can read them. Takes some two minutes on two cores.
+OUT` and the other examples can read them.
 """
 
 import sys

@@ -82,7 +82,7 @@ def _parser() -> argparse.ArgumentParser:
     preset.add_argument("--preset", default="fast", help="a name under configs/ or a YAML file (default: fast)")
 
     def add(command: Command, *parents: argparse.ArgumentParser) -> argparse.ArgumentParser:
-        """A command is called as its function is, and says what its docstring says."""
+        """Add a command that has its function's name, and its docstring as help."""
         what = command.__doc__
         added = subparsers.add_parser(_name(command), help=what, description=what, parents=parents)
         added.set_defaults(command=command)

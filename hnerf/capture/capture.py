@@ -78,7 +78,7 @@ class Capture:
             raise InputError(f"{path}: not a readable image; write it again or delete it")
         return mask > 127
 
-    def likely_person(self, camera: str, frame: int) -> np.ndarray | None:
+    def person_probability(self, camera: str, frame: int) -> np.ndarray | None:
         """Return a network's probability that a pixel shows a person, (H, W) float32; None if no network looked. It is
         that of the recorded frame nearest in time."""
         path = self.root / PERSON / camera / f"{self.recorded_frame(camera, frame):06d}.png"
@@ -110,8 +110,8 @@ class Capture:
         return (self.root / "keypoints.npz").exists()
 
     @property
-    def was_looked_at(self) -> bool:
-        """Whether a network said of each pixel of the training cameras if it is a person's."""
+    def has_person_masks(self) -> bool:
+        """Return whether there are a network's person masks for all training cameras."""
         return all((self.root / PERSON / camera).is_dir() for camera in self.train_cameras)
 
     def given_poses(self) -> GivenPoses | None:

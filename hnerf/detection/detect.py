@@ -1,7 +1,6 @@
-"""People in every training image of a capture: the same capture with their keypoints, and what else the network saw."""
+"""Detection of people in the training images of a capture: keypoints, landmarks in metres and soft masks."""
 
 import json
-import logging
 import multiprocessing
 import os
 import shutil
@@ -18,24 +17,24 @@ from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
 from hnerf.capture.subset import read_keypoints, write_keypoints
 from hnerf.config import DetectionSettings
 from hnerf.detection.landmarks import POINTS, LandmarkNetwork, Person
-from hnerf.detection.merge import completed, stacked
+from hnerf.detection.merge import fill_missing, pad_people
 from hnerf.detection.person_detector import PersonDetector
 from hnerf.detection.tracker import track
 from hnerf.errors import InputError
 from hnerf.models import POSE_DETECTOR, model_file
+from hnerf.progress import report as report_progress
 
 KEYPOINTS: KeypointSetName = "blazepose_33"
 LANDMARKS = "landmarks"  # folder: <camera>.npz
-PROGRESS_S = 10.0
-
-log = logging.getLogger("hnerf.detection")
+PROGRESS_S = 0.5  # between two counts of the images that are done
 
 
 def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str, Any]:
-    """Write the capture into `out` with keypoints of its training cameras by a network; the report.
+    """Write the capture into `out` with keypoints that a network finds in its training cameras; return the report.
 
-    Cameras go to as many processes as there are cores; one that is in `out` already is not looked at again. Test
-    cameras are never read. InputError where a network is missing or nobody is found in any image.
+    Cameras are distributed over as many processes as there are cores. Cameras whose landmarks are in `out` already are
+    not processed again. Test cameras are never read. Raises InputError if a network is missing, or if nobody is found
+    in any image.
     """
     for name in (POSE_DETECTOR, f"pose_landmark_{settings.size}.tflite"):
         model_file(name)
@@ -50,9 +49,10 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
     keypoints = {name: _inside(points, capture, name) for name, points in keypoints.items()}
     if settings.source == "both":
         own = read_keypoints(capture)
-        keypoints = own | {
-            name: stacked([completed(*pair) for pair in zip(own[name], points, strict=True)]) if name in own else points
+        keypoints |= own | {
+            name: pad_people([fill_missing(*pair) for pair in zip(own[name], points, strict=True)])
             for name, points in keypoints.items()
+            if name in own
         }
     shutil.copytree(capture.root, out, ignore=shutil.ignore_patterns("keypoints.npz"), dirs_exist_ok=True)
     write_keypoints(out, keypoints)
@@ -62,6 +62,7 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
 
 
 def _find_people(capture: Capture, size: str, out: Path) -> None:
+    """Write what `find_in_camera` writes of each camera that has none yet."""
     waiting = [name for name in capture.train_cameras if not (out / LANDMARKS / f"{name}.npz").exists()]
     if len(waiting) < 2:
         for name in waiting:
@@ -77,15 +78,15 @@ def _find_people(capture: Capture, size: str, out: Path) -> None:
                 if job.exception():
                     pool.shutdown(wait=False, cancel_futures=True)
                 job.result()
-            for job in jobs:
-                images = len(list((out / PERSON / jobs[job]).glob("*.png")))
-                if job in done or (job in running and images):
-                    log.info("camera %s: %d of %d images", jobs[job], images, len(capture.frames))
+            images = sum(len(list((out / PERSON / name).glob("*.png"))) for name in jobs.values())
+            report_progress("detection", images, len(jobs) * len(capture.frames))
 
 
 def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> None:
-    """Write one camera's masks, and then `landmarks/<camera>.npz`, whole or not at all: `points_px` (frames, people,
-    33, 3) x, y, confidence; `points_m` (frames, people, 33, 3); `seconds`."""
+    """Write one camera's masks, and then `landmarks/<camera>.npz`, whole or not at all.
+
+    The file holds `points_px` (frames, people, 33, 3): x, y, confidence; `points_m` (frames, people, 33, 3); `seconds`.
+    """
     cv2.setNumThreads(1)
     started = time.perf_counter()
     images = (capture.image(camera, frame) for frame in capture.frames)
@@ -99,15 +100,20 @@ def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> None:
     with beside.open("wb") as file:
         np.savez_compressed(
             file,
-            points_px=stacked([np.array([p.points_px for p in people]).reshape(-1, POINTS, 3) for people in everybody]),
-            points_m=stacked([np.array([p.points_m for p in people]).reshape(-1, POINTS, 3) for people in everybody]),
+            points_px=_by_frame([[person.points_px for person in people] for people in everybody]),
+            points_m=_by_frame([[person.points_m for person in people] for people in everybody]),
             seconds=np.array(time.perf_counter() - started),
         )
     os.replace(beside, path)
 
 
+def _by_frame(points: list[list[np.ndarray]]) -> np.ndarray:
+    """Return each frame's points (33, 3) of a person as one array (frames, people, 33, 3), 0 where nobody is."""
+    return pad_people([np.array(people).reshape(-1, POINTS, 3) for people in points])
+
+
 def _soft_mask(people: list[Person], capture: Capture, camera: str) -> np.ndarray:
-    """(H, W) uint8: 255 times the probability that a pixel is anybody's."""
+    """Return 255 times the probability that a pixel shows a person, (H, W) uint8."""
     size_px = capture.cameras[camera].width_px, capture.cameras[camera].height_px
     likely = np.zeros(size_px[::-1], np.float32)
     for person in people:
@@ -121,14 +127,14 @@ def _load(out: Path, camera: str) -> dict[str, np.ndarray]:
 
 
 def _inside(points: np.ndarray, capture: Capture, camera: str) -> np.ndarray:
-    """Keypoints with those at 0 that the network guessed outside of the image."""
+    """Set keypoints that the network guessed outside the image to 0."""
     size_px = np.array([capture.cameras[camera].width_px, capture.cameras[camera].height_px])
     inside = ((points[..., :2] >= -0.5) & (points[..., :2] <= size_px - 0.5)).all(-1, keepdims=True)
     return points * inside
 
 
 def _summary(people: dict[str, np.ndarray]) -> dict[str, Any]:
-    """For the report: in how many images somebody was found, how many people at most, milliseconds an image."""
+    """Count the images, those with somebody and the most people in one; add the milliseconds an image."""
     seen = np.any(people["points_px"][..., 2] > 0, axis=-1)  # (frames, people)
     ms = 1e3 * float(people["seconds"]) / len(seen)
     return {"images": len(seen), "seen": int(seen.any(1).sum()), "people": int(seen.sum(1).max()), "ms": round(ms, 1)}

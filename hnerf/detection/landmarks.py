@@ -4,17 +4,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hnerf.detection.network import Network, probability
-from hnerf.detection.region import Region, around
+from hnerf.detection.network import Network, sigmoid
+from hnerf.detection.region import Region, region_around
 
 SIZE, POINTS, AUXILIARY = 256, 33, 2  # the auxiliary points, which follow, say where the next region is
-HEAT_WINDOW, LEAST_HEAT = 3, 0.5  # cells on each side of a point, and the heat that one of them must have
-LEAST_PRESENCE = 0.5
+HEAT_WINDOW, MIN_HEAT = 3, 0.5  # cells on each side of a point, and the heat that one of them must have
+MIN_PRESENCE = 0.5
 
 
 class Person(NamedTuple):
-    """points_px: (33, 3) x, y, confidence; points_m: (33, 3) from the middle of the hips, camera axes; mask: (256, 256)
-    probability in the region; region, next: where he was looked for, and is to be in the next image."""
+    """A person found in an image. points_px: (33, 3) x, y, confidence; points_m: (33, 3) from the middle of the hips,
+    in camera axes; mask: (256, 256) probability in `region`, which was searched; next: the region to search next."""
 
     points_px: np.ndarray
     points_m: np.ndarray
@@ -24,30 +24,31 @@ class Person(NamedTuple):
 
 
 class LandmarkNetwork:
-    """The network of one size, and what its outputs mean."""
+    """The landmark network of one size, with its outputs decoded."""
 
     def __init__(self, size: str) -> None:
-        """size: "heavy", "full" or "lite"."""
+        """Load the network of a size: "heavy", "full" or "lite". Raises InputError if its file is missing or
+        altered."""
         self._network = Network(f"pose_landmark_{size}.tflite")
 
     def __call__(self, image: np.ndarray, region: Region) -> Person | None:
-        """Who is in a region of an image (H, W, 3) uint8 RGB; None for nobody."""
+        """Return the person in a region of an image (H, W, 3) uint8 RGB; None if there is nobody."""
         raw, presence, mask, heat, metric = self._network(region.crop(image, SIZE) / 255)
-        if presence[0] < LEAST_PRESENCE:
+        if presence[0] < MIN_PRESENCE:
             return None
         points = raw.reshape(-1, 5).astype(np.float64)
-        places = refined(points[:, :2], probability(heat))
+        places = refine_by_heatmap(points[:, :2], sigmoid(heat))
         from_crop = region.from_crop(SIZE)
         pixels = places @ from_crop[:, :2].T + from_crop[:, 2]
-        confidence = probability(points[:POINTS, 3]) * probability(points[:POINTS, 4])  # visible, and in the image
-        points_m = region.turned(metric.reshape(-1, 3)[:POINTS].astype(np.float64))
+        confidence = sigmoid(points[:POINTS, 3]) * sigmoid(points[:POINTS, 4])  # visible, and in the image
+        points_m = region.to_camera_axes(metric.reshape(-1, 3)[:POINTS].astype(np.float64))
         points_px = np.column_stack([pixels[:POINTS], confidence])
-        following = around(pixels[POINTS], pixels[POINTS + 1])
-        return Person(points_px, points_m, probability(mask[..., 0]).astype(np.float32), region, following)
+        following = region_around(pixels[POINTS], pixels[POINTS + 1])
+        return Person(points_px, points_m, sigmoid(mask[..., 0]).astype(np.float32), region, following)
 
 
-def refined(places: np.ndarray, heat: np.ndarray) -> np.ndarray:
-    """Places (n, 2) in the crop, moved to the mean of the heat (h, w, n) around them where there is enough of it."""
+def refine_by_heatmap(places: np.ndarray, heat: np.ndarray) -> np.ndarray:
+    """Return places (n, 2) in the crop, moved to the mean of the heatmap (h, w, n) around them where it is high."""
     height, width = heat.shape[:2]
     moved = places.copy()
     for k, (x, y) in enumerate(places / SIZE * (width, height)):
@@ -57,7 +58,7 @@ def refined(places: np.ndarray, heat: np.ndarray) -> np.ndarray:
         rows = slice(max(row - HEAT_WINDOW, 0), row + HEAT_WINDOW + 1)
         columns = slice(max(column - HEAT_WINDOW, 0), column + HEAT_WINDOW + 1)
         window = heat[rows, columns, k]
-        if window.max() >= LEAST_HEAT:
+        if window.max() >= MIN_HEAT:
             weights = window / window.sum()
             at = [
                 columns.start + weights.sum(0) @ np.arange(window.shape[1]),

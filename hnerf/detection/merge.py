@@ -1,15 +1,15 @@
-"""A recording's own keypoints, and a network's where it has none."""
+"""Completion of a recording's own keypoints by those of a network."""
 
 import numpy as np
 
 from hnerf.capture.subject import person_heights_px
 
-SAME = 0.15  # of a person's height: median distance of the keypoints of one person, found twice
+MATCH_SHARE = 0.15  # of a person's height: median distance of the keypoints of one person, found twice
 
 
-def completed(own: np.ndarray, network: np.ndarray) -> np.ndarray:
-    """The recording's people (P, 25, 3) of one image, with what they lack of the network's (Q, 25, 3), and the
-    network's people in its place where the recording shows nobody. Pixels and confidence, 0 where absent."""
+def fill_missing(own: np.ndarray, network: np.ndarray) -> np.ndarray:
+    """Return the recording's people (P, 25, 3) in one image, with keypoints that they lack taken from the network's
+    people (Q, 25, 3); the network's people if the recording has nobody. x_px, y_px, confidence; 0 where absent."""
     if not (own[..., 2] > 0).any():
         return network
     filled = own.copy()
@@ -21,8 +21,8 @@ def completed(own: np.ndarray, network: np.ndarray) -> np.ndarray:
 
 
 def _same_person(person: np.ndarray, others: np.ndarray) -> np.ndarray | None:
-    """Whoever of (Q, 25, 3) is nearest to a person (25, 3), if near enough to be the same."""
-    best, nearest = None, SAME * float(person_heights_px(person[None])[0])
+    """Return the one of (Q, 25, 3) that is nearest to a person (25, 3), or None if none is near enough."""
+    best, nearest = None, MATCH_SHARE * float(person_heights_px(person[None])[0])
     for other in others:
         both = (person[:, 2] > 0) & (other[:, 2] > 0)
         if both.any():
@@ -32,8 +32,8 @@ def _same_person(person: np.ndarray, others: np.ndarray) -> np.ndarray | None:
     return best
 
 
-def stacked(people: list[np.ndarray]) -> np.ndarray:
-    """(frames, most people, K, 3) of each frame's (P, K, 3); absent people are 0."""
+def pad_people(people: list[np.ndarray]) -> np.ndarray:
+    """Stack each frame's people (P, K, 3) as (frames, most people, K, 3); absent people are 0."""
     most = max(1, *(len(found) for found in people))
     rows = np.zeros((len(people), most, *people[0].shape[1:]))
     for row, found in zip(rows, people, strict=True):

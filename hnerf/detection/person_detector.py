@@ -1,19 +1,19 @@
-"""BlazePose's detector (Bazarevsky et al. 2020): where there are people in an image, and how they stand."""
+"""BlazePose's person detector (Bazarevsky et al. 2020): an upright region for each person in an image."""
 
 import numpy as np
 
-from hnerf.detection.network import Network, probability
-from hnerf.detection.region import Region, around, whole
+from hnerf.detection.network import Network, sigmoid
+from hnerf.detection.region import Region, image_region, region_around
 from hnerf.models import POSE_DETECTOR
 
 SIZE = 224
 LAYERS = ((28, 2), (14, 2), (7, 6))  # cells on a side, and anchors in each
-LEAST_SCORE = 0.5
-SAME = 0.3  # IoU above which two boxes are of one person
+MIN_SCORE = 0.5
+NMS_IOU = 0.3  # IoU above which two boxes are of one person
 
 
 def anchors() -> np.ndarray:
-    """(2254, 2): middles of the cells that boxes are told from, in shares of the image, row by row."""
+    """Return the anchors of the boxes, (2254, 2): centres of the cells, as shares of the image, row by row."""
     layers = []
     for cells, count in LAYERS:
         middles = (np.arange(cells) + 0.5) / cells
@@ -22,20 +22,22 @@ def anchors() -> np.ndarray:
     return np.concatenate(layers)
 
 
-def decoded(raw: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """(n, 6, 2) in shares of the image: low and high corner, then four points, of the network's (n, 12) box middle,
-    size and points in its pixels from anchors (n, 2)."""
+def decode_boxes(raw: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Decode boxes from the network's output (n, 12): centre, size and four points, in pixels from anchors (n, 2).
+
+    Returns (n, 6, 2), as shares of the image: low corner, high corner and the four points.
+    """
     pairs = raw.reshape(-1, 6, 2) / SIZE
     middle, half = pairs[:, 0] + at, pairs[:, 1] / 2
     return np.concatenate([(middle - half)[:, None], (middle + half)[:, None], pairs[:, 2:] + at[:, None]], 1)
 
 
-def merged(found: np.ndarray, scores: np.ndarray) -> list[np.ndarray]:
-    """One (6, 2) a person, the surest first: the mean, weighted by score, of those that overlap with the best."""
+def weighted_nms(found: np.ndarray, scores: np.ndarray) -> list[np.ndarray]:
+    """Return one box (6, 2) for each person, best score first: the mean, weighted by score, of boxes that overlap."""
     order = np.argsort(-scores, kind="stable")
     people = []
     while len(order):
-        same = _iou(found[order[0], :2], found[order, :2]) > SAME
+        same = _iou(found[order[0], :2], found[order, :2]) > NMS_IOU
         same[0] = True
         people.append(np.average(found[order[same]], axis=0, weights=scores[order[same]]))
         order = order[~same]
@@ -43,24 +45,24 @@ def merged(found: np.ndarray, scores: np.ndarray) -> list[np.ndarray]:
 
 
 def _iou(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Of a box (2, 2), low and high corner, with boxes (n, 2, 2)."""
+    """Return the intersection over union of a box (2, 2), low and high corner, with boxes (n, 2, 2): (n,)."""
     sides = np.minimum(box[1], boxes[:, 1]) - np.maximum(box[0], boxes[:, 0])
     common = sides.clip(0).prod(1)
     return common / ((box[1] - box[0]).prod() + (boxes[:, 1] - boxes[:, 0]).prod(1) - common)
 
 
 class PersonDetector:
-    """The network and what its outputs mean."""
+    """The detector's network, with its outputs decoded."""
 
     def __init__(self) -> None:
         self._network, self._anchors = Network(POSE_DETECTOR), anchors()
 
     def __call__(self, image: np.ndarray) -> list[Region]:
-        """A region for each person in an image (H, W, 3) uint8 RGB, the surest first."""
-        shown = whole(image.shape[1::-1])
+        """Return a region for each person in an image (H, W, 3) uint8 RGB, best score first."""
+        shown = image_region(image.shape[1::-1])
         raw, logits = self._network(shown.crop(image, SIZE) / 127.5 - 1)
-        scores = probability(logits[:, 0])
-        sure = scores >= LEAST_SCORE
+        scores = sigmoid(logits[:, 0])
+        sure = scores >= MIN_SCORE
         from_crop = shown.from_crop(1)
-        people = merged(decoded(raw[sure], self._anchors[sure]), scores[sure])
-        return [around(*(person[2:4] @ from_crop[:, :2].T + from_crop[:, 2])) for person in people]
+        people = weighted_nms(decode_boxes(raw[sure], self._anchors[sure]), scores[sure])
+        return [region_around(*(person[2:4] @ from_crop[:, :2].T + from_crop[:, 2])) for person in people]

@@ -1,4 +1,4 @@
-"""People in the images of one camera, from image to image: found where they were, or else looked for anew."""
+"""Tracking of people through the images of one camera, with detection where the track is lost and at intervals."""
 
 from collections.abc import Callable, Iterable, Iterator
 
@@ -7,28 +7,28 @@ import numpy as np
 from hnerf.detection.landmarks import Person
 from hnerf.detection.region import Region
 
-LOOK_EVERY = 10  # images, for people who came since
-MOST_PASSES = 3  # in an image, as long as each finds the person elsewhere than it looked
+REDETECT_EVERY = 10  # images, for people who came since
+MAX_PASSES = 3  # in an image, as long as each finds the person elsewhere than it looked
 MOVED, GREW = 0.1, 1.2  # in sides of the region, and times its side: what counts as elsewhere
-SAME = 0.25  # of a region's side: middles of two regions that are of one person
+MATCH_SHARE = 0.25  # of a region's side: middles of two regions that are of one person
 
 Detector = Callable[[np.ndarray], list[Region]]
 Landmarks = Callable[[np.ndarray, Region], Person | None]
 
 
 def track(images: Iterable[np.ndarray], detector: Detector, landmarks: Landmarks) -> Iterator[list[Person]]:
-    """The people of each image (H, W, 3) uint8 RGB, in its order."""
+    """Yield the people in each image (H, W, 3) uint8 RGB, in the order of the images."""
     regions: list[Region] = []
     for i, image in enumerate(images):
         people = _located(image, regions, landmarks, [])
-        if not people or i % LOOK_EVERY == 0:
+        if not people or i % REDETECT_EVERY == 0:
             people = _located(image, detector(image), landmarks, people)
         regions = [person.next for person in people]
         yield people
 
 
 def _located(image: np.ndarray, regions: list[Region], landmarks: Landmarks, known: list[Person]) -> list[Person]:
-    """Those known already, and who else is in the regions."""
+    """Return the people known already and those found in the regions besides."""
     people = list(known)
     for region in regions:
         person = None if any(_same(region, other.next) for other in people) else _settled(image, region, landmarks)
@@ -39,7 +39,7 @@ def _located(image: np.ndarray, regions: list[Region], landmarks: Landmarks, kno
 
 def _settled(image: np.ndarray, region: Region, landmarks: Landmarks) -> Person | None:
     person = landmarks(image, region)
-    for _ in range(MOST_PASSES - 1):
+    for _ in range(MAX_PASSES - 1):
         if person is None or not _elsewhere(person.region, person.next):
             break
         person = landmarks(image, person.next)
@@ -52,4 +52,4 @@ def _elsewhere(a: Region, b: Region) -> bool:
 
 
 def _same(a: Region, b: Region) -> bool:
-    return float(np.linalg.norm(b.centre_px - a.centre_px)) < SAME * max(a.side_px, b.side_px)
+    return float(np.linalg.norm(b.centre_px - a.centre_px)) < MATCH_SHARE * max(a.side_px, b.side_px)

@@ -130,7 +130,7 @@ def choose_backend(
     plate = capture.background(camera)
     if plate is not None:
         return BackgroundSubtraction.from_plate(capture, camera, plate, settings)
-    if not fitted and not capture.was_looked_at:
+    if not fitted and not capture.has_person_masks:
         raise InputError(
             f"{capture.name}: camera {camera} has neither masks nor a plate (background/{camera}.jpg); fit a body first"
         )

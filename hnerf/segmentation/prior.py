@@ -93,7 +93,7 @@ def network_priors(capture: Capture, settings: SegmentationSettings) -> Iterator
     for name, figures in _stick_figures(capture):
         priors, upright = [], _is_upright(capture, name)
         for frame, stick in zip(capture.frames, figures, strict=True):
-            likely = capture.likely_person(name, frame)
+            likely = capture.person_probability(name, frame)
             assert likely is not None  # a network looks at every image of a training camera
             figure = Prior.around(stick.core, stick.body, stick.completed, stick.height_px, settings.reach, upright)
             covered = (likely > LIKELY) & figure.reach

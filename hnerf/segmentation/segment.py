@@ -31,7 +31,7 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
     if body is not None:
         priors = body_priors(capture, body, settings)
     else:
-        priors = (network_priors if capture.was_looked_at else keypoint_priors)(capture, settings)
+        priors = (network_priors if capture.has_person_masks else keypoint_priors)(capture, settings)
     network = None if settings.model is None else Network(settings.model)
     encoded: dict[tuple[str, int], bytes] = {}
     cameras: dict[str, Any] = {}

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hnerf.detection.merge import completed, stacked
+from hnerf.detection.merge import fill_missing, pad_people
 
 
 def person(x: float, confidence: float) -> np.ndarray:
@@ -13,7 +13,7 @@ def person(x: float, confidence: float) -> np.ndarray:
 def test_missing_joints_come_from_the_same_person() -> None:
     own = person(0, 0.9)
     own[11] = 0
-    merged = completed(own[None], np.stack([person(40, 0.5), person(10, 0.6)]))
+    merged = fill_missing(own[None], np.stack([person(40, 0.5), person(10, 0.6)]))
     assert merged.shape == (1, 25, 3)
     assert merged[0, 11].tolist() == person(10, 0.6)[11].tolist()
     assert merged[0, 10].tolist() == own[10].tolist()
@@ -23,14 +23,14 @@ def test_people_farther_than_a_share_of_the_height_are_others() -> None:
     """15 px of 100 are the limit."""
     own = person(0, 0.9)
     own[11] = 0
-    assert completed(own[None], person(16, 0.6)[None])[0, 11].tolist() == [0, 0, 0]
+    assert fill_missing(own[None], person(16, 0.6)[None])[0, 11].tolist() == [0, 0, 0]
 
 
 def test_where_the_recording_shows_nobody_the_network_speaks() -> None:
-    assert completed(np.zeros((1, 25, 3)), person(7, 0.6)[None]).tolist() == person(7, 0.6)[None].tolist()
+    assert fill_missing(np.zeros((1, 25, 3)), person(7, 0.6)[None]).tolist() == person(7, 0.6)[None].tolist()
 
 
 def test_frames_have_as_many_rows_as_the_fullest() -> None:
-    rows = stacked([np.zeros((0, 25, 3)), np.ones((2, 25, 3))])
+    rows = pad_people([np.zeros((0, 25, 3)), np.ones((2, 25, 3))])
     assert rows.shape == (2, 2, 25, 3) and rows[0].max() == 0 and rows[1].min() == 1
-    assert stacked([np.zeros((0, 25, 3))]).shape == (1, 1, 25, 3)
+    assert pad_people([np.zeros((0, 25, 3))]).shape == (1, 1, 25, 3)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hnerf.detection.person_detector import anchors, decoded, merged
+from hnerf.detection.person_detector import anchors, decode_boxes, weighted_nms
 
 
 def test_anchors_are_the_middles_of_cells_layer_by_layer() -> None:
@@ -21,7 +21,7 @@ def test_anchors_are_the_middles_of_cells_layer_by_layer() -> None:
 def test_boxes_and_points_are_told_from_anchors() -> None:
     """22.4 px are a tenth: middle .5 + .1, .5 - .1, sides .2 and .4; first point .5 + .2, .5, last one the anchor's."""
     raw = np.array([[22.4, -22.4, 44.8, 89.6, 44.8, 0, 0, 0, 0, 0, 0, 0]])
-    box = decoded(raw, np.array([[0.5, 0.5]]))[0]
+    box = decode_boxes(raw, np.array([[0.5, 0.5]]))[0]
     assert box[:2] == pytest.approx(np.array([[0.5, 0.2], [0.7, 0.6]]))
     assert box[2] == pytest.approx([0.7, 0.5]) and box[5] == pytest.approx([0.5, 0.5])
 
@@ -33,7 +33,7 @@ def test_overlapping_boxes_are_averaged_by_score() -> None:
     def person(x: float) -> np.ndarray:
         return np.array([[x, 0], [x + 2, 2], *[[x, 1]] * 4])
 
-    people = merged(np.array([person(0.8), person(1.2), person(0)]), np.array([0.6, 0.7, 0.9]))
+    people = weighted_nms(np.array([person(0.8), person(1.2), person(0)]), np.array([0.6, 0.7, 0.9]))
     assert [found[0, 0] for found in people] == pytest.approx([0.32, 1.2])
     assert people[0][2] == pytest.approx([0.32, 1])
-    assert merged(np.zeros((0, 6, 2)), np.zeros(0)) == []
+    assert weighted_nms(np.zeros((0, 6, 2)), np.zeros(0)) == []

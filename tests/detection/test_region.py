@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from hnerf.detection.region import Region, around, whole
+from hnerf.detection.region import Region, image_region, region_around
 
 
 def test_a_letterbox_holds_the_whole_image() -> None:
     """40 x 20 px: a square of 40 around (19.5, 9.5). In a crop of 80 its corner is the image's (-0.5, -10.5), and a
     crop pixel is half an image pixel."""
-    shown = whole((40, 20))
+    shown = image_region((40, 20))
     assert shown.centre_px.tolist() == [19.5, 9.5] and shown.side_px == 40
     assert shown.from_crop(80) == pytest.approx(np.array([[0.5, 0, -0.5], [0, 0.5, -10.5]]))
     crop = shown.crop(np.full((20, 40, 3), 200, np.uint8), 40)
@@ -23,7 +23,7 @@ def test_a_turned_region_shows_a_lying_person_upright() -> None:
     region = Region(np.array([10.0, 10.0]), 8.0, math.pi / 2)
     assert region.from_crop(4) == pytest.approx(np.array([[0, -2, 14], [2, 0, 6]]))
     assert region.from_crop(4) @ [4, 1, 1] == pytest.approx([12, 14])
-    assert region.turned(np.array([1.0, 2.0, 3.0])) == pytest.approx([-2, 1, 3])
+    assert region.to_camera_axes(np.array([1.0, 2.0, 3.0])) == pytest.approx([-2, 1, 3])
 
 
 def test_pixels_are_where_the_map_says() -> None:
@@ -43,15 +43,15 @@ def test_large_images_are_averaged_and_stay_in_place() -> None:
     """Stripes of single pixels, at a quarter of the size, are grey, and an edge at x = 31.5 is in the middle."""
     image = np.zeros((64, 64, 3), np.uint8)
     image[:, ::2] = 200
-    assert np.abs(whole((64, 64)).crop(image, 16).astype(int) - 100).max() <= 1
+    assert np.abs(image_region((64, 64)).crop(image, 16).astype(int) - 100).max() <= 1
     image[:, :32], image[:, 32:] = 0, 200
-    crop = whole((64, 64)).crop(image, 16)
+    crop = image_region((64, 64)).crop(image, 16)
     assert (crop[:, :8] == 0).all() and (crop[:, 8:] == 200).all()
 
 
 def test_a_region_from_hips_and_crown() -> None:
     """Hips at (50, 60), the circle's top at (50, 20): 2.5 x 40 px, upright. At (90, 60) the person lies, turned
     clockwise by 90 degrees."""
-    upright, lying = (around(np.array([50.0, 60.0]), np.array(end)) for end in ([50.0, 20.0], [90.0, 60.0]))
+    upright, lying = (region_around(np.array([50.0, 60.0]), np.array(end)) for end in ([50.0, 20.0], [90.0, 60.0]))
     assert upright.side_px == 100 and upright.angle == pytest.approx(0)
     assert lying.side_px == 100 and lying.angle == pytest.approx(math.pi / 2)

@@ -5,7 +5,7 @@ import pytest
 
 from hnerf.detection.landmarks import Person
 from hnerf.detection.region import Region
-from hnerf.detection.tracker import LOOK_EVERY, track
+from hnerf.detection.tracker import REDETECT_EVERY, track
 
 SIDE_PX = 100.0
 
@@ -34,7 +34,7 @@ def places(people: list[Person]) -> list[float]:
 
 
 def test_who_moves_little_is_followed_without_looking_again() -> None:
-    scene, images = Scene(), [np.array([[8.0 * i, 0.0]]) for i in range(LOOK_EVERY)]
+    scene, images = Scene(), [np.array([[8.0 * i, 0.0]]) for i in range(REDETECT_EVERY)]
     assert [places(people) for people in track(images, scene.detector, scene.landmarks)] == [
         [8.0 * i] for i in range(10)
     ]
@@ -56,6 +56,9 @@ def test_who_moves_far_is_looked_at_twice() -> None:
 
 
 def test_who_comes_later_is_found_once_and_nobody_twice() -> None:
-    scene, images = Scene(), [np.array([[0.0, 0.0], [300.0, 0.0]][: 1 if i < 3 else 2]) for i in range(LOOK_EVERY + 2)]
+    scene, images = (
+        Scene(),
+        [np.array([[0.0, 0.0], [300.0, 0.0]][: 1 if i < 3 else 2]) for i in range(REDETECT_EVERY + 2)],
+    )
     counts = [len(people) for people in track(images, scene.detector, scene.landmarks)]
-    assert counts == [1] * LOOK_EVERY + [2, 2]
+    assert counts == [1] * REDETECT_EVERY + [2, 2]
