@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from safetensors.torch import load_file
 from torch import Tensor
 
+from hnerf.avatar.antialiasing import antialiased
 from hnerf.avatar.avatar import Rendering
 from hnerf.avatar.model_file import load_field, version_error
 from hnerf.baselines.idr import IdrField
@@ -79,17 +80,19 @@ class TrainedAvatar:
         bodies, conditions = self._pose(theta, root)
         region: Any = self.field.region(bodies, conditions)
         device = bodies.vertices_m.device
-        y, x = np.nonzero(self.field.visible_pixels(camera, bodies.vertices_m[0].cpu().numpy()))
-        origins, directions = camera.rays(np.stack([x, y], 1).astype(np.float64))
-        flat = torch.zeros(camera.height_px * camera.width_px, 5, device=device)
-        index = torch.from_numpy(y * camera.width_px + x).to(device)
-        count = max(1, min(RAYS_PER_BATCH, SAMPLES_PER_BATCH // self.field.samples))
-        for start in range(0, len(x), count):
-            part = slice(start, start + count)
-            o, d = (torch.from_numpy(np.ascontiguousarray(a[part])).float().to(device) for a in (origins, directions))
-            row = torch.zeros(len(o), dtype=torch.long, device=device)
-            flat[index[part]] = self.field.render_rays(bodies, region, o, d, row, conditions)
-        image = flat.view(camera.height_px, camera.width_px, 5)
+        at_once = max(1, min(RAYS_PER_BATCH, SAMPLES_PER_BATCH // self.field.samples))
+
+        def render_rays_at(points_px: np.ndarray) -> Tensor:
+            rays = (torch.from_numpy(rows.copy()).float() for rows in camera.rays(points_px.astype(np.float64)))
+            seen = [torch.zeros(0, 5, device=device)]
+            for origins_m, directions in zip(*(rows.to(device).split(at_once) for rows in rays), strict=True):
+                if len(origins_m):
+                    row = torch.zeros(len(origins_m), dtype=torch.long, device=device)
+                    seen.append(self.field.render_rays(bodies, region, origins_m, directions, row, conditions))
+            return torch.cat(seen)
+
+        visible = self.field.visible_pixels(camera, bodies.vertices_m[0].cpu().numpy())
+        image = antialiased(render_rays_at, visible)
         gain = torch.tensor(self.gains.get(camera.name, (1.0, 1.0, 1.0)), device=device)
         return Rendering((gain * image[..., :3]).clamp(0, 1), image[..., 3], image[..., 4])
 
