@@ -4,7 +4,6 @@ import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -35,6 +34,7 @@ from hnerf.fields.base import Field
 from hnerf.fields.conditions import Conditions
 from hnerf.fields.fast import FastField
 from hnerf.fields.paper import PaperField
+from hnerf.fields.rays import Rays
 from hnerf.geometry.camera import Camera
 
 Gains = dict[str, tuple[float, float, float]]
@@ -77,7 +77,7 @@ class TrainedAvatar:
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
         """Render colour, coverage and depth of the person alone."""
         bodies, conditions = self._pose(theta, root)
-        region: Any = self.field.region(bodies, conditions)
+        scene = self.field.scene(bodies, conditions)
         device = bodies.vertices_m.device
         y, x = np.nonzero(self.field.visible_pixels(camera, bodies.vertices_m[0].cpu().numpy()))
         origins, directions = camera.rays(np.stack([x, y], 1).astype(np.float64))
@@ -88,7 +88,7 @@ class TrainedAvatar:
             part = slice(start, start + count)
             o, d = (torch.from_numpy(np.ascontiguousarray(a[part])).float().to(device) for a in (origins, directions))
             row = torch.zeros(len(o), dtype=torch.long, device=device)
-            flat[index[part]] = self.field.render_rays(bodies, region, o, d, row, conditions)
+            flat[index[part]] = self.field.render_rays(scene, Rays(o, d, row))
         image = flat.view(camera.height_px, camera.width_px, 5)
         gain = torch.tensor(self.gains.get(camera.name, (1.0, 1.0, 1.0)), device=device)
         return Rendering((gain * image[..., :3]).clamp(0, 1), image[..., 3], image[..., 4])

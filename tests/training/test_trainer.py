@@ -18,7 +18,7 @@ from hnerf.fields import fast as fast_module
 from hnerf.training import trainer as trainer_module
 from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
 from hnerf.training.distributed import Distributed
-from hnerf.training.pixels import Pixels, Rays
+from hnerf.training.pixels import PixelRays, Pixels
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import Trainer, train
 from tests.training.scene import FRAMES, TINY, record, tiny
@@ -351,7 +351,7 @@ def test_a_step_has_as_many_rays_however_few_the_frames(tmp_path: Path, monkeypa
     drawn = []
     draw = Pixels.draw
 
-    def counted(self: Pixels, frames: torch.Tensor, rays_per_frame: int, *others: Any) -> Rays:
+    def counted(self: Pixels, frames: torch.Tensor, rays_per_frame: int, *others: Any) -> PixelRays:
         drawn.append((len(frames), rays_per_frame))
         return draw(self, frames, rays_per_frame, *others)
 
