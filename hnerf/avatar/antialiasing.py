@@ -6,9 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-MIXED_CONTRAST = (
-    0.1  # between neighbours, of colour or coverage; 0.05 gains 0.01 dB for a quarter more rays
-)
+MIXED_CONTRAST = 0.1  # between neighbours, of colour or coverage; 0.05 gains 0.01 dB for a quarter more rays
 QUARTERS_PX = 0.25 * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])  # from a pixel's centre to those of its quarters
 
 

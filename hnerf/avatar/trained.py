@@ -4,7 +4,6 @@ import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -36,6 +35,7 @@ from hnerf.fields.base import Field
 from hnerf.fields.conditions import Conditions
 from hnerf.fields.fast import FastField
 from hnerf.fields.paper import PaperField
+from hnerf.fields.rays import Rays
 from hnerf.geometry.camera import Camera
 
 Gains = dict[str, tuple[float, float, float]]
@@ -78,17 +78,18 @@ class TrainedAvatar:
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
         """Render colour, coverage and depth of the person alone."""
         bodies, conditions = self._pose(theta, root)
-        region: Any = self.field.region(bodies, conditions)
+        scene = self.field.scene(bodies, conditions)
         device = bodies.vertices_m.device
         at_once = max(1, min(RAYS_PER_BATCH, SAMPLES_PER_BATCH // self.field.samples))
 
         def render_rays_at(points_px: np.ndarray) -> Tensor:
-            rays = (torch.from_numpy(rows.copy()).float() for rows in camera.rays(points_px.astype(np.float64)))
+            origins, directions = (rows.astype(np.float32) for rows in camera.rays(points_px.astype(np.float64)))
             seen = [torch.zeros(0, 5, device=device)]
-            for origins_m, directions in zip(*(rows.to(device).split(at_once) for rows in rays), strict=True):
-                if len(origins_m):
-                    row = torch.zeros(len(origins_m), dtype=torch.long, device=device)
-                    seen.append(self.field.render_rays(bodies, region, origins_m, directions, row, conditions))
+            for start in range(0, len(points_px), at_once):
+                part = slice(start, start + at_once)
+                o, d = (torch.from_numpy(rows[part]).to(device) for rows in (origins, directions))
+                row = torch.zeros(len(o), dtype=torch.long, device=device)
+                seen.append(self.field.render_rays(scene, Rays(o, d, row)))
             return torch.cat(seen)
 
         visible = self.field.visible_pixels(camera, bodies.vertices_m[0].cpu().numpy())
