@@ -8,10 +8,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, TypeVar
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
 
 from hnerf.errors import InputError
+from hnerf.strict_yaml import parse_yaml
 
 S = TypeVar("S", bound=BaseModel)
 
@@ -308,7 +308,7 @@ def overridden(settings: S, overrides: Sequence[str]) -> S:
         key, equals, value = override.partition("=")
         if not equals:
             raise InputError(f"--set {override}: write it as section.name=value")
-        change = _parsed(value, f"--set {override}")
+        change = parse_yaml(value, f"--set {override}")
         for part in reversed(key.split(".")):
             change = {part: change}
         tree = _merged(tree, change)
@@ -350,17 +350,10 @@ def named_file(name: str, folder: Path, one: str, many: str) -> Path:
 def read_yaml(path: Path) -> dict[str, Any]:
     """Return the keys and values of a YAML file, an empty dictionary for an empty file. Raises InputError, one line,
     where it holds anything else."""
-    tree = _parsed(path.read_bytes(), str(path))
+    tree = parse_yaml(path.read_bytes(), path)
     if not isinstance(tree, dict | None):
         raise InputError(f"{path}: does not hold keys and values; write lines like `name: value`")
     return tree or {}
-
-
-def _parsed(text: str | bytes, source: str) -> Any:
-    try:
-        return yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date such as 2026-13-01
-        raise InputError(f"{source}: is not YAML ({' '.join(str(error).split())}); correct it") from None
 
 
 def validated(kind: type[S], tree: Any, source: Path | str) -> S:

@@ -1,8 +1,13 @@
 """Exceptions that bad input raises."""
 
+MAX_MESSAGE = 2000  # characters; what a stranger's file says may be longer
+
 
 class InputError(Exception):
     """Bad input. The message is one line that names the file and says what to do; such a failure is never retried."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))
 
 
 class NotApplicableError(InputError):
@@ -12,6 +17,15 @@ class NotApplicableError(InputError):
 
 class InvalidAsset(Exception):
     """A package that must not be handed over. The message names the file and every defect."""
+
+
+def printable(text: str) -> str:
+    """Return text as one line of bounded length that no terminal takes for a command: line breaks become spaces, other
+    control characters their escapes."""
+    line = " ".join(text.splitlines())
+    if len(line) > MAX_MESSAGE:
+        line = f"{line[: MAX_MESSAGE // 2]} ... {line[-MAX_MESSAGE // 2 :]}"
+    return line if line.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
 def one_line(error: Exception) -> str:

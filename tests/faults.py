@@ -54,6 +54,7 @@ BY_CAMERA, BY_TRIANGULATION = "tests/geometry/test_camera.py", "tests/calibratio
 BY_FILES, BY_USD = "tests/capture/test_camera_files.py", "tests/asset/test_usd.py"
 BY_METRICS, BY_POLICY = "tests/evaluation/test_metrics.py", "tests/tasks/test_policy.py"
 BY_INGEST, BY_STORE = "tests/capture/test_ingest.py", "tests/tasks/test_store.py"
+BY_BAD_INPUT = "tests/capture/test_bad_input.py"
 BY_TIMING, BY_GLB = "tests/capture/test_timing.py", "tests/asset/test_glb.py"
 
 
@@ -191,7 +192,8 @@ FAULTS = (
     Fault("lens-distortion", NORMALISE, "if np.any(lens.distortion):", "if np.any(lens.distortion[2:]):", BY_INGEST),
     Fault("frames-split", MANIFEST, "train = recorded[: len(recorded) - len(novel)]",
           "train = recorded[: len(recorded) - len(novel) + 1]", "tests/capture/test_pose2sim.py"),
-    Fault("capture-link", SAFE_IO, "if path.is_symlink():", "if False:", "tests/capture/test_bad_input.py"),
+    Fault("capture-link", SAFE_IO, "if stat.S_ISLNK(mode):", "if False:", BY_BAD_INPUT),
+    Fault("capture-pipe", SAFE_IO, "if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):", "if False:", BY_BAD_INPUT),
     Fault("nearest-frame", TIMING, "offset_frames / step + 0.5", "offset_frames / step", BY_TIMING),
     # what goes out
     Fault("stage-axis", STAGING, "[0, 0, 1], [0, -1, 0]])", "[0, 0, 1], [0, 1, 0]])", "tests/asset/test_staging.py"),

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from hnerf.body.rig import Rig
-from hnerf.capture.safe_io import ARRAY_FILE_ERRORS
-from hnerf.capture.safe_pickle import read_pickle
+from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, read_arrays
+from hnerf.capture.safe_pickle import MAX_BYTES, read_pickle
 from hnerf.errors import InputError
 
 BETAS = 10
@@ -151,8 +151,7 @@ def _read(path: Path) -> dict[str, Any]:
         found = {key: stored[key] for key in KEYS if key in stored} if isinstance(stored, dict) else {}
     else:
         try:
-            with np.load(path, allow_pickle=False) as archive:
-                found = {key: archive[key] for key in KEYS if key in archive}
+            found = read_arrays(path, KEYS, MAX_BYTES)
         except ARRAY_FILE_ERRORS:
             raise InputError(f"{path}: is not a .npz of plain arrays; convert the model again") from None
     missing = [key for key in KEYS if key not in found]

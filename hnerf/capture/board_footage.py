@@ -9,6 +9,7 @@ import dataclasses
 import logging
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +19,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from hnerf.capture.footage import Footage, ImageFolder, Video
+from hnerf.capture.manifest import MAX_BYTES
 from hnerf.capture.normalise import Normaliser
 from hnerf.capture.safe_io import (
     IMAGE_SUFFIXES,
@@ -165,7 +167,7 @@ def load_board_corners(root: Path) -> BoardCorners | None:
 def read_board(folder: Path) -> Board | None:
     """Read the description of the board in a folder; None if there is none. Raises InputError on a bad one."""
     manifest, charuco = path_in_capture(folder, "capture.toml"), path_in_capture(folder, "charuco.toml")
-    source, table = manifest, (read_toml(manifest) if manifest.exists() else {}).get("board")
+    source, table = manifest, (read_toml(manifest, MAX_BYTES) if manifest.exists() else {}).get("board")
     if table is None:
         if not charuco.exists():
             return None
@@ -314,12 +316,20 @@ def _sync_indices(path: Path) -> dict[str, tuple[int, ...]]:
     """Read Caliscope's table: a row for every frame of every camera, with a `sync_index` that simultaneous frames
     share."""
     found: dict[str, list[int]] = {}
-    for row in csv.DictReader(read_text(path).splitlines()):
+    for row in _csv_rows(path):
         index, camera = row.get("sync_index") or "", row.get("cam_id") or row.get("port") or ""
         if not (re.fullmatch(r"[0-9]{1,9}", index) and re.fullmatch(r"[0-9]{1,4}", camera)):
             raise InputError(f"{path}: a row lacks a whole-numbered sync_index or cam_id; export it again or remove it")
         found.setdefault(f"cam_{camera}", []).append(int(index))
     return {name: tuple(sorted(indices)) for name, indices in found.items()}
+
+
+def _csv_rows(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a table. Raises InputError if it is none."""
+    try:
+        yield from csv.DictReader(read_text(path).splitlines())
+    except csv.Error as error:  # such as a field longer than 128 KiB
+        raise InputError(f"{path}: not a table ({error}); export it again or remove it") from None
 
 
 def _brightness(grey: np.ndarray, square_px: np.ndarray) -> float:

@@ -17,6 +17,9 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 
+MIN_FPS, MAX_FPS = 0.01, 10_000.0  # that a recording can have
+
+
 class VideoFrame(NamedTuple):
     """One frame: RGB (H, W, 3) uint8, and the image file that holds exactly these pixels, if there is one."""
 
@@ -65,7 +68,8 @@ class Video:
             raise InputError(
                 f"{path}: {declared} frames declared, {count} could be read; export it again whole, as H.264"
             )
-        return Video(path, tuple(range(count)), stream.get(cv2.CAP_PROP_FPS) or None)
+        fps = stream.get(cv2.CAP_PROP_FPS)
+        return Video(path, tuple(range(count)), fps if MIN_FPS <= fps <= MAX_FPS else None)
 
     def read(self, wanted: Iterable[int]) -> Iterator[VideoFrame]:
         """Yield the wanted frames in ascending order. Raises InputError if one cannot be read."""

@@ -6,7 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
+from hnerf.errors import InputError
+
 JOINTS, BETAS = 24, 10  # of SMPL
+MAX_TURN_RAD, MAX_MOVE_M, MAX_BETA = 1e3, 1e6, 1e2  # beyond them, no fit has converged
+
+
+def check_smpl(path: Path, theta: np.ndarray, moves_m: np.ndarray, betas: np.ndarray) -> None:
+    """Raise InputError naming the file where SMPL parameters are not finite, or larger than any body's."""
+    parts = (("turns", theta, MAX_TURN_RAD), ("translations", moves_m, MAX_MOVE_M), ("shape values", betas, MAX_BETA))
+    for what, values, limit in parts:
+        if not (np.abs(values) <= limit).all():  # also true for NaN
+            raise InputError(f"{path}: {what} of a pose are NaN or beyond {limit:g}; fit it again, or remove it")
 
 
 @dataclass(frozen=True)

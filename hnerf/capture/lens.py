@@ -1,5 +1,6 @@
 """A camera as calibrated, with its lens distortion: the content of a calibration file."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 MIN_FOCAL_PX = 1.0
+MAX_NUMBER = 1e9  # of a calibration; beyond it, later arithmetic overflows
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,16 @@ def known_size(lens: Lens) -> tuple[int, int]:
     return lens.size_px
 
 
+def by_name(lenses: Iterable[Lens], source: Path) -> dict[str, Lens]:
+    """Return lenses by their names. Raises InputError naming `source` where two have the same."""
+    found: dict[str, Lens] = {}
+    for lens in lenses:
+        if lens.name in found:
+            raise InputError(f"{source}: two cameras are called {lens.name}; rename one of them, and its footage")
+        found[lens.name] = lens
+    return found
+
+
 def checked_lens(
     sources: tuple[Path, Path],
     name: object,
@@ -67,6 +79,8 @@ def checked_lens(
             raise InputError(f"{source}: camera {camera}: {label} has {value.size} numbers; calibrate again")
         if not np.isfinite(value).all():
             raise InputError(f"{source}: camera {camera}: {label} holds a NaN or infinity; calibrate again")
+        if np.abs(value).max() > MAX_NUMBER:
+            raise InputError(f"{source}: camera {camera}: {label} holds {np.abs(value).max():.3g}; calibrate again")
     K, R = K.reshape(3, 3), cv2.Rodrigues(R.ravel())[0] if R.size == 3 else R.reshape(3, 3)
     if K[0, 0] < MIN_FOCAL_PX or K[1, 1] < MIN_FOCAL_PX or K[1, 0] != 0 or K[2].tolist() != [0, 0, 1]:
         raise InputError(f"{intrinsics}: camera {camera}: K is not a matrix of intrinsics in pixels; calibrate again")

@@ -18,14 +18,16 @@ from pydantic import (
     field_validator,
 )
 
+from hnerf.capture.footage import MAX_FPS, MIN_FPS
 from hnerf.capture.keypoint_sets import KeypointSetName
-from hnerf.capture.safe_io import path_in_capture, read_toml
+from hnerf.capture.safe_io import path_in_capture, read_toml, shown
 from hnerf.config import validated
 from hnerf.errors import InputError
 
 log = logging.getLogger("hnerf.capture")
 
 MIN_KEY_SIMILARITY = 0.8  # of an unknown key to a known one (difflib) that makes it a typing error
+MAX_BYTES = 65_536
 MAX_NAME_BYTES = 200  # file systems allow 255, also for longer names made from it
 
 FrameNumber = Annotated[int, Field(ge=0, le=999_999_999)]
@@ -55,9 +57,9 @@ class CaptureManifest(_Table):
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
 
     name: str | None = None
-    fps: float | None = Field(default=None, gt=0, le=10_000)
+    fps: float | None = Field(default=None, ge=MIN_FPS, le=MAX_FPS)
     up: Literal["y", "z"] = "z"
-    units: Literal["m", "mm"] | Annotated[float, Field(gt=0, le=1e6)] = "m"
+    units: Literal["m", "mm"] | Annotated[float, Field(ge=1e-6, le=1e6)] = "m"
     keypoints: KeypointSetName | None = None
     cameras: CameraSplit | None = None
     frames: FrameSplit | None = None
@@ -81,10 +83,10 @@ def read_manifest(folder: Path) -> CaptureManifest:
     path = path_in_capture(folder, "capture.toml")
     if not path.exists():
         return CaptureManifest()
-    tree, known = read_toml(path), [*CaptureManifest.model_fields, "board"]
+    tree, known = read_toml(path, MAX_BYTES), [*CaptureManifest.model_fields, "board"]
     for key in sorted(set(tree).difference(known)):
         if meant := difflib.get_close_matches(key.lower(), known, 1, MIN_KEY_SIMILARITY):
-            raise InputError(f"{path}: {key} has no meaning; did you mean {meant[0]}? If not, rename it")
+            raise InputError(f"{path}: {key[:80]} has no meaning; did you mean {meant[0]}? If not, rename it")
     return validated(CaptureManifest, tree, path)
 
 
@@ -92,7 +94,9 @@ def capture_name(folder: Path, manifest: CaptureManifest) -> str:
     """Return the name of the subject. It becomes a folder name; raises InputError if it cannot be one."""
     name = unicodedata.normalize("NFC", folder.resolve().name if manifest.name is None else manifest.name)  # macOS: NFD
     if not re.fullmatch(r"\w[\w .()-]{0,127}", name):
-        raise InputError(f"{folder / 'capture.toml'}: name {name!r}: use letters, digits, '_', '-', '.' and spaces")
+        raise InputError(
+            f"{folder / 'capture.toml'}: name {shown(name)}: use letters, digits, '_', '-', '.' and spaces"
+        )
     if len(name.encode()) > MAX_NAME_BYTES:
         raise InputError(f"{folder / 'capture.toml'}: name of {len(name.encode())} bytes; keep to {MAX_NAME_BYTES}")
     return name
@@ -135,6 +139,6 @@ def _check(folder: Path, what: str, named: list, known: Collection, where: str) 
     path, known_set = folder / "capture.toml", set(known)
     for item in named:
         if item not in known_set:
-            raise InputError(f"{path}: {what} {item} is not in {where}; correct [{what}s]")
+            raise InputError(f"{path}: {what} {str(item)[:80]} is not in {where}; correct [{what}s]")
     if len(set(named)) < len(named):
         raise InputError(f"{path}: a {what} is named twice; correct [{what}s]")

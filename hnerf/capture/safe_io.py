@@ -1,10 +1,14 @@
-"""Safe reading of untrusted files: inside the capture folder, no links, bounded sizes, no pickles."""
+"""Safe reading of untrusted files: inside the capture folder, no links, pipes or devices, bounded sizes, no pickles."""
 
 import json
+import os
 import re
+import stat
+import tokenize
 import tomllib
 import zipfile
 import zlib
+from collections.abc import Container
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +19,21 @@ from hnerf.errors import InputError
 
 MAX_IMAGE_PIXELS = 64_000_000
 MAX_TEXT_BYTES = 16_000_000
-# Exceptions on reading arrays from a file that is not a complete .npz of plain arrays.
+MAX_TOML_BYTES = 500_000
+MAX_KEY_PARTS = 16  # of a dotted key in TOML; tomllib needs memory and time by their square
+# Exceptions on reading arrays from a file that is not a complete .npz of plain arrays; RuntimeError: an encrypted one,
+# or an unknown compression; tokenize.TokenError: a header with an open bracket.
 ARRAY_FILE_ERRORS = (
-    AttributeError, EOFError, MemoryError, OSError, TypeError, ValueError, zipfile.BadZipFile, zlib.error,
+    AttributeError, EOFError, KeyError, MemoryError, OSError, RuntimeError, SyntaxError, TypeError, ValueError,
+    tokenize.TokenError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 VIDEO_SUFFIXES = (".mp4",)
 JSON_SUFFIXES = (".json",)
 _IMAGE_MODES = ("1", "L", "LA", "P", "RGB", "RGBA")  # 8 bits a channel: others would be clipped
 _CAMERA_NAME = re.compile(r"\w([\w ()-]{0,62}[\w()-])?")  # is used as a folder name, and in a glob without wildcards
+_KEY_PART = r"""(?:(?<![\w-])[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_DEEP_KEY = re.compile(rf"{_KEY_PART}(?:[ \t]*\.[ \t]*{_KEY_PART}){{{MAX_KEY_PARTS}}}")
 _ARGUMENTS = ("file", "allow_pickle")  # of np.savez, which is given keypoints with camera names as keywords
 
 
@@ -31,22 +41,35 @@ def check_camera_name(name: object, source: Path) -> str:
     """Return `name` if it can be the name of a folder and of an array in a .npz. Raises InputError naming `source`
     otherwise (separators, dots, wildcards)."""
     if not isinstance(name, str) or not _CAMERA_NAME.fullmatch(name):
-        raise InputError(f"{source}: camera name {name!r}: use letters, digits, '_', '-', spaces and ()")
+        raise InputError(f"{source}: camera name {shown(name)}: use letters, digits, '_', '-', spaces and ()")
     if name in _ARGUMENTS:
         raise InputError(f"{source}: a camera cannot be called {name!r}; rename it")
     return name
 
 
+def shown(value: object) -> str:
+    """Return how a message quotes what a stranger's file says: text, cut short, and nothing of anything else."""
+    return f"{value[:80]!r}{'...' if len(value) > 80 else ''}" if isinstance(value, str) else "that is no text"
+
+
 def path_in_capture(root: Path, *parts: str) -> Path:
-    """Return root/parts, which need not exist. Raises InputError if it leaves the capture folder or passes through a
-    link."""
+    """Return root/parts, which need not exist. Raises InputError if it leaves the capture folder, passes through a
+    link, or is a pipe or a device, which could be waited for without end."""
     path = root
     for part in parts:
         path = path / part
         if part in ("", ".", "..") or Path(part).name != part:
             raise InputError(f"{path}: the name leaves the capture folder; rename it")
-        if path.is_symlink():
+        try:
+            mode = path.lstat().st_mode
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        except (OSError, ValueError) as error:  # a name that is too long or holds a NUL; a folder that may not be read
+            raise InputError(f"{path}: cannot be read ({error}); rename it or make it readable") from None
+        if stat.S_ISLNK(mode):
             raise InputError(f"{path}: is a symbolic link; put the file itself into the capture folder")
+        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+            raise InputError(f"{path}: is a pipe or a device; put a file into the capture folder")
     return path
 
 
@@ -87,14 +110,24 @@ def numbered(paths: list[Path], what: str) -> dict[int, Path]:
 
 
 def read_bytes(path: Path, max_bytes: int) -> bytes:
-    """Read a file's content. Raises InputError if it is missing or too large."""
+    """Read a regular file's content. Raises InputError if it is missing, too large, or a pipe or a device."""
     try:
-        size = path.stat().st_size
-        if size > max_bytes:
-            raise InputError(f"{path}: {size} bytes are too many for such a file; export it again")
-        return path.read_bytes()
+        with open(path, "rb", opener=_without_waiting) as file:
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise InputError(f"{path}: is no regular file; put the file itself there")
+            if status.st_size > max_bytes:
+                raise InputError(f"{path}: {status.st_size} bytes are too many for such a file; export it again")
+            return file.read(max_bytes)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); add it to the capture folder") from None
+    except ValueError:
+        raise InputError(f"{path}: cannot be the name of a file; rename it") from None
+
+
+def _without_waiting(name: str, flags: int) -> int:
+    """Open a file; a pipe without a writer is opened at once."""
+    return os.open(name, flags | os.O_NONBLOCK)
 
 
 def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
@@ -117,12 +150,34 @@ def read_json(path: Path) -> Any:
         raise InputError(f"{path}: is not JSON ({error}); export it again") from None
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file. Raises InputError as `read_text` does, or if it is not TOML."""
+def read_toml(path: Path, max_bytes: int = MAX_TOML_BYTES) -> dict[str, Any]:
+    """Read a TOML file. Raises InputError as `read_text` does, if it is not TOML, or if a key has too many parts."""
+    text = read_text(path, max_bytes)
+    if _DEEP_KEY.search(text):
+        raise InputError(f"{path}: a key has more than {MAX_KEY_PARTS} parts; shorten it")
     try:
-        return tomllib.loads(read_text(path))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # ValueError: a date, or an integer of thousands of digits
         raise InputError(f"{path}: is not TOML ({error}); correct it") from None
+
+
+def read_arrays(path: Path, wanted: Container[str], max_bytes: int) -> dict[str, np.ndarray]:
+    """Read those arrays of an .npz file that are wanted and there. Raises one of ARRAY_FILE_ERRORS if it is not an .npz
+    of plain arrays, InputError if they are larger than `max_bytes`, which a few kilobytes can be unpacked to."""
+    with open(path, "rb", opener=_without_waiting) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise InputError(f"{path}: is no regular file; give the file itself")
+        with zipfile.ZipFile(file) as archive:
+            unpacked_bytes = sum(m.file_size for m in archive.infolist() if m.filename.removesuffix(".npy") in wanted)
+        if unpacked_bytes > max_bytes:
+            limit = max_bytes // 1_000_000
+            raise InputError(f"{path}: unpacks to {unpacked_bytes / 1e6:.0f} MB; at most {limit} MB are read")
+        file.seek(0)
+        with np.load(file, allow_pickle=False) as stored:
+            found = {name: stored[name] for name in stored.files if name in wanted}
+    if not all(isinstance(array, np.ndarray) for array in found.values()):  # a member that is no .npy file: bytes
+        raise ValueError("not arrays")
+    return found
 
 
 def check_image_size(path: Path, width_px: float, height_px: float) -> tuple[int, int]:

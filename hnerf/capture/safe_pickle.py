@@ -9,6 +9,7 @@ import io
 import math
 import pickle
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import scipy.sparse
 from hnerf.capture.safe_io import read_bytes
 from hnerf.errors import InputError
 
+MAX_ITEMS = 10_000_000  # of lists; numbers in arrays do not count
 MAX_BYTES = 1_000_000_000  # the largest SMPL-X model has half of that
 _DTYPES = re.compile(r"[biufOSU?][0-9]*")
 
@@ -35,20 +37,41 @@ def read_pickled_npy(path: Path) -> Any:
         version = np.lib.format.read_magic(stream)
         read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = read_header(stream)
-    except ValueError:
+    except Exception:  # the header is parsed as Python's literals, which raise nearly anything, too
         raise InputError(f"{path}: is no .npy file; export it again") from None
     if shape != () or dtype.kind != "O":
         raise InputError(f"{path}: holds no dictionary; export it again")
-    return _plain_data(path, stream).item()
+    stored = _plain_data(path, stream)
+    if not isinstance(stored, np.ndarray) or stored.shape != ():
+        raise InputError(f"{path}: holds no dictionary; export it again")
+    return stored.item()
 
 
 def _plain_data(path: Path, stream: io.BytesIO) -> Any:
     """Unpickle plain data. Raises InputError if the stream holds anything else."""
     try:
-        return _plain(_Unpickler(stream, encoding="latin1").load(), {})
+        plain = _plain(_Unpickler(stream, encoding="latin1").load(), {})
+        if _size(plain, {}) > MAX_ITEMS:
+            raise pickle.UnpicklingError(f"more than {MAX_ITEMS} items")
+        return plain
     except Exception as error:  # a damaged pickle can raise nearly anything
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: not a pickle of plain data ({reason}); convert it to .npz") from None
+
+
+def _size(value: Any, known: dict[int, int]) -> int:
+    """Return how many items plain data has, where each list counts as often as it occurs: a list that holds one list
+    twice, thirty levels deep, is a billion of them to whatever makes an array of it. known: sizes by identity."""
+    if isinstance(value, np.ndarray) and value.dtype.kind == "O":
+        parts: Iterable[Any] = value.flat
+    elif isinstance(value, dict | list | tuple):
+        parts = value.values() if isinstance(value, dict) else value
+    else:
+        return 1
+    if id(value) not in known:
+        known[id(value)] = 1  # in data that contains itself
+        known[id(value)] = 1 + sum(_size(part, known) for part in parts)
+    return known[id(value)]
 
 
 class _StandIn:

@@ -11,10 +11,11 @@ import trimesh
 from hnerf.capture.capture import Capture
 from hnerf.capture.lens import Lens
 from hnerf.capture.normalise import Normaliser
-from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, path_in_capture, read_image
+from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, path_in_capture, read_arrays, read_image
 from hnerf.errors import InputError
 
 ON_BLACK = "ground_truth/on_black"
+MAX_MESHES_BYTES = 2_000_000_000  # unpacked; 60 frames of a million vertices have 1.4 GB
 MASKED_IMAGE = "image x ground-truth mask"
 
 
@@ -77,12 +78,12 @@ class GroundTruth:
         if not path.exists():
             return {}
         try:
-            with np.load(path, allow_pickle=False) as stored:
-                faces, vertices, frames = stored["faces"], stored["vertices"], stored["frames"]
+            stored = read_arrays(path, ("faces", "vertices", "frames"), MAX_MESHES_BYTES)
+            faces, vertices, frames = stored["faces"], stored["vertices"], stored["frames"]
             if not (faces.min() >= 0 and faces.max() < vertices.shape[1] and np.isfinite(vertices).all()):
                 raise ValueError("a face index is out of range, or a vertex is not finite")
             return {int(f): trimesh.Trimesh(v, faces, process=False) for f, v in zip(frames, vertices, strict=True)}
-        except (*ARRAY_FILE_ERRORS, KeyError, IndexError) as error:
+        except (*ARRAY_FILE_ERRORS, IndexError) as error:
             raise InputError(
                 f"{path}: true surfaces cannot be read ({error}); write the file again or delete it"
             ) from None

@@ -15,8 +15,9 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.body.given_start import initial_pose_from_given
 from hnerf.body.rig import joint_transforms, pose_vertices
 from hnerf.capture.capture import Capture
-from hnerf.capture.given_poses import JOINTS, GivenPoses
-from hnerf.capture.safe_io import ARRAY_FILE_ERRORS
+from hnerf.capture.footage import MAX_FPS, MIN_FPS
+from hnerf.capture.given_poses import JOINTS, GivenPoses, check_smpl
+from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, read_arrays
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
 
@@ -24,7 +25,7 @@ AMASS_WIDTHS = (72, 156, 165)  # pose parameters of SMPL, SMPL-H and SMPL-X, whi
 AMASS_RATES = ("mocap_framerate", "mocap_frame_rate")
 BODY_JOINTS = 22
 DEFAULT_FPS = 30.0
-MAX_FPS = 10_000.0
+MAX_MOTION_BYTES = 256_000_000  # unpacked; half an hour of SMPL-H at 100 poses a second
 
 
 @dataclass(frozen=True)
@@ -162,19 +163,19 @@ def _read_amass(path: Path) -> tuple[GivenPoses, float]:
     second."""
     keys = ("poses", "trans", *AMASS_RATES)
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            found = {key: np.asarray(stored[key], np.float64) for key in keys if key in stored}
+        found = {key: array.astype(np.float64) for key, array in read_arrays(path, keys, MAX_MOTION_BYTES).items()}
     except ARRAY_FILE_ERRORS:
         raise InputError(f"{path}: not an .npz of plain arrays; give an AMASS file or a subject's folder") from None
     poses, trans = found.get("poses", np.zeros(0)), found.get("trans", np.zeros(0))
     known = poses.ndim == 2 and poses.shape[1] in AMASS_WIDTHS and trans.shape == (len(poses), 3) and len(poses) > 0
-    if not known or not (np.isfinite(poses).all() and np.isfinite(trans).all()):
+    if not known:
         raise InputError(f"{path}: poses {poses.shape}, trans {trans.shape} are not AMASS's (n, 156) and (n, 3)")
+    check_smpl(path, poses, trans, np.zeros(0))
     given = dataclasses.replace(GivenPoses.unknown(len(poses)), theta=np.zeros((len(poses), JOINTS, 3)))
     given.theta[:, :BODY_JOINTS] = poses[:, : 3 * BODY_JOINTS].reshape(-1, BODY_JOINTS, 3)
     given.root[:] = np.eye(4)
     given.root[:, :3, 3] = trans
     rate = next((found[key] for key in AMASS_RATES if key in found), np.array(DEFAULT_FPS))
-    if rate.size != 1 or not 0 < rate.item() <= MAX_FPS:
+    if rate.size != 1 or not MIN_FPS <= rate.item() <= MAX_FPS:
         raise InputError(f"{path}: {rate.tolist()} frames per second; correct {AMASS_RATES[0]}")
     return given, rate.item()

@@ -56,6 +56,11 @@ def _huge_png(folder: Path) -> None:
     path.write_bytes(data)
 
 
+def _pipe(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+
+
 def _toml(text: str) -> Callable[[Path], object]:
     return lambda folder: (folder / "capture.toml").write_text(text)
 
@@ -74,6 +79,18 @@ EASYMOCAP = {
     "NaN in T": (lambda f: _edit(f / "extri.yml", "data: [ 0., 1., 3. ]", "data: [ .Nan, 1., 3. ]"), "extri.yml: T_01"),
     "plain nan in K": (lambda f: _edit(f / "intri.yml", "20.", "nan"), "intri.yml: camera 01: K"),
     "K of zero focal length": (lambda f: _edit(f / "intri.yml", "20.", "0."), "intri.yml"),
+    "aliases in intri": (
+        lambda f: _edit(f / "intri.yml", "names:", f"a: &a [{'x,' * 9}]\nb: &b [{'*a,' * 9}]\nnames: [*b]\nc:"),
+        "intri.yml: not an OpenCV YAML file (aliases",
+    ),
+    "key twice in intri": (lambda f: _edit(f / "intri.yml", "names:", "W_01: 12\nnames:"), "there twice"),
+    "names that are lists": (lambda f: _edit(f / "intri.yml", '"01"', '["01"]'), "intri.yml: camera name that is no"),
+    "name that is a terminal's command": (
+        lambda f: _edit(f / "intri.yml", '"01"', f'"\\e[2J{"a" * 500}"'),
+        "intri.yml: camera name '\\x1b[2Jaaaa",
+    ),
+    "camera named twice": (lambda f: _edit(f / "intri.yml", '"02"', '"01"'), "two cameras are called 01"),
+    "T of 1e30": (lambda f: _edit(f / "extri.yml", "data: [ 0., 1., 3. ]", "data: [ 1e30, 1., 3. ]"), "T holds 1e+30"),
     "camera not in extri": (lambda f: _edit(f / "extri.yml", "T_02", "T_03"), "extri.yml: T_02"),
     "matrix of a billion rows": (lambda f: _edit(f / "intri.yml", "rows: 3", "rows: 1000000000"), "intri.yml: K_01"),
     "matrix shorter than declared": (lambda f: _edit(f / "intri.yml", "cols: 3", "cols: 5"), "intri.yml: K_01"),
@@ -138,6 +155,15 @@ EASYMOCAP = {
     "linked image folder": (lambda f: _link(f, "images/01"), "images/01: is a symbolic link"),
     "linked image": (lambda f: _link(f, "images/01/000001.png"), "000001.png: is a symbolic link"),
     "linked calibration": (lambda f: _link(f, "intri.yml"), "intri.yml: is a symbolic link"),
+    "pipe in place of extri": (lambda f: _pipe(f / "extri.yml"), "extri.yml: is a pipe or a device"),
+    "pipe in place of capture.toml": (lambda f: _pipe(f / "capture.toml"), "capture.toml: is a pipe or a device"),
+    "pipe in place of an image": (lambda f: _pipe(f / "images/01/000001.png"), "000001.png: is a pipe or a device"),
+    "toml with a key of many parts": (_toml("a." * 20_000 + "b = 1\n"), "capture.toml: a key has more than 16 parts"),
+    "toml beyond 64 KiB": (_toml("# " + "a" * 70_000), "capture.toml: 70002 bytes are too many"),
+    "toml with an endless integer": (_toml("fps = " + "9" * 5000), "capture.toml: is not TOML (Exceeds the limit"),
+    "toml with a huge integer": (_toml("fps = " + "9" * 4000), "capture.toml: fps"),
+    "toml with next to no frames": (_toml("fps = 1e-300"), "capture.toml: fps"),
+    "toml with next to no units": (_toml("units = 1e-300"), "capture.toml: units"),
     "toml is not TOML": (_toml("name = "), "capture.toml"),
     "toml with an unknown key": (_toml('[cameras]\ntrain = ["01"]\nvalidation = ["02"]\n'), "cameras.validation"),
     "toml with unknown units": (_toml('units = "inch"\n'), "units"),
@@ -167,6 +193,10 @@ POSE2SIM = {
     "camera is no table": (
         lambda f: _edit(f / "calibration/Calib.toml", "[cam01]", "cam03 = 1\n[cam01]"),
         "camera cam03",
+    ),
+    "two cameras of one name": (
+        lambda f: _edit(f / "calibration/Calib.toml", 'name = "cam02"', 'name = "cam01"'),
+        "Calib.toml: two cameras are called cam01",
     ),
     "fisheye": (lambda f: _edit(f / "calibration/Calib.toml", "fisheye = false", "fisheye = true"), "fisheye"),
     "video missing": (lambda f: (f / "videos/cam02.mp4").unlink(), "videos/cam02.mp4"),

@@ -126,6 +126,14 @@ def test_dropped_frames_are_placed_by_the_table(tmp_path: Path) -> None:
         read_board_footage(tmp_path, "extrinsic")
 
 
+def test_a_table_with_an_endless_field_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "charuco.toml").write_text(CHARUCO)
+    rec.write_png(tmp_path / "calibration" / "extrinsic" / "cam_0" / "0.png", np.zeros((8, 8, 3), np.uint8))
+    (tmp_path / "calibration" / "extrinsic" / "timestamps.csv").write_text(f"sync_index,cam_id\n{'1' * 200_000},0\n")
+    with pytest.raises(InputError, match=r"timestamps\.csv: not a table \(field larger"):
+        read_board_footage(tmp_path, "extrinsic")
+
+
 def test_footage_with_a_suffix_in_upper_case_is_not_left_out(tmp_path: Path) -> None:
     (tmp_path / "charuco.toml").write_text(CHARUCO)
     for name in ("cam_0.mp4", "cam_1.MP4"):

@@ -83,12 +83,22 @@ def test_hostile_colmap_models_are_refused(name: str, at: int, value: bytes, tmp
         Colmap(tmp_path).lenses()
 
 
+def test_a_colmap_line_cut_short_is_refused(tmp_path: Path) -> None:
+    """Whatever is left of a line of images.txt: of ten parts, nine or fewer."""
+    path = write_model(tmp_path) / "sparse" / "0" / "images.txt"
+    line = next(line for line in IMAGES_TXT.splitlines() if line.endswith("01/000000.jpg"))
+    for parts in range(1, 10):
+        path.write_text(" ".join(line.split()[:parts]))
+        with pytest.raises(InputError, match=r"images\.txt: not a COLMAP model"):
+            Colmap(tmp_path).lenses()
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ("02.png", "01/000001.jpg", "several images of camera 01"),
         ("4 2 02.png", "4 5 02.png", "camera 5 is not in"),
-        ("9 1 0 0 0", "9 0 0 0 0", "its quaternion is not of unit length"),
+        ("9 1 0 0 0", "9 0 0 0 0", "its quaternion is not of length 1"),
         ("7 0.7", "7 zero", "not a COLMAP model"),
     ],
 )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hnerf.capture.capture import Capture
+from hnerf.capture.formats.peoplesnapshot import PeopleSnapshot
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
@@ -69,6 +70,39 @@ def test_given_poses_are_aligned_from_the_end(capture: Capture) -> None:
     assert given.root[0] @ [0, 0, 0, 1] == pytest.approx([0.1, 2.5, -0.2, 1])
     assert given.root[0] @ [0, 1, 0, 0] == pytest.approx([0, 0, -1, 0])
     assert given.betas.tolist() == list(range(10))
+
+
+@pytest.mark.parametrize("name", ["masks", "keypoints"])
+def test_more_rows_than_frames_are_refused_before_anything_is_made_of_them(
+    name: str, folder: Path, tmp_path: Path
+) -> None:
+    """A few kilobytes declare four thousand million rows: a dictionary of them fills any memory."""
+    with h5py.File(folder / f"{name}.hdf5", "r+") as file:
+        row = file[name].shape[1:]
+        del file[name]
+        file.create_dataset(name, shape=(4_000_000_000, *row), dtype=np.uint8, chunks=(1, *row))
+    with pytest.raises(InputError, match=rf"{name}\.hdf5: 4000000000 {name} for 6 frames"):
+        ingest(folder, CaptureSettings(), tmp_path / "out")
+
+
+def test_any_broken_byte_is_refused_or_harmless(folder: Path, tmp_path: Path) -> None:
+    """HDF5's own reader answers damage with a KeyError, a ValueError or an OSError."""
+    layout, stored = PeopleSnapshot(folder), (folder / "reconstructed_poses.hdf5").read_bytes()
+    refused = 0
+    for at in range(0, len(stored), 97):
+        (folder / "reconstructed_poses.hdf5").write_bytes(stored[:at] + bytes([stored[at] ^ 0xFF]) + stored[at + 1 :])
+        try:
+            layout.given_poses((0, 1))
+        except InputError:
+            refused += 1
+    assert refused > 0
+
+
+def test_poses_beyond_all_bodies_are_refused(folder: Path, tmp_path: Path) -> None:
+    with h5py.File(folder / "reconstructed_poses.hdf5", "r+") as file:
+        file["trans"][2] = 1e30
+    with pytest.raises(InputError, match=r"reconstructed_poses\.hdf5: translations of a pose are NaN or beyond"):
+        ingest(folder, CaptureSettings(), tmp_path / "out")
 
 
 def test_damage_is_named(folder: Path, tmp_path: Path) -> None:

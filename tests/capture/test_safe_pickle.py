@@ -112,13 +112,43 @@ def test_what_is_no_plain_data_is_refused(case: str, tmp_path: Path, monkeypatch
     assert not (tmp_path / "pickle-was-loaded").exists()
 
 
-def test_what_a_pickle_holds_often_is_made_once(tmp_path: Path) -> None:
-    """Each of forty lists holds the next twice: 10^12 copies if each were copied."""
+def nested_twice(levels: int) -> list[Any]:
+    """Return lists of which each holds the next twice: 2^levels leaves."""
     nested: list[Any] = [np.ones(1)]
-    for _ in range(40):
+    for _ in range(levels):
         nested = [nested, nested]
-    found = read_pickle(dumped(tmp_path / "a.pkl", nested))
+    return nested
+
+
+def test_what_a_pickle_holds_often_is_made_once(tmp_path: Path) -> None:
+    found = read_pickle(dumped(tmp_path / "a.pkl", nested_twice(20)))
     assert found[0] is found[1]
+
+
+def test_what_no_array_could_hold_is_refused(tmp_path: Path) -> None:
+    """10^12 numbers, if anyone made an array of it."""
+    with pytest.raises(InputError, match="more than 10000000 items"):
+        read_pickle(dumped(tmp_path / "a.pkl", {"camera_f": nested_twice(40)}))
+
+
+@pytest.mark.parametrize(
+    "header", ["{'descr': '|O', 'fortran_order': False, 'shape': ((", "{'descr': {}, 'x'", "[" * 900]
+)
+def test_a_damaged_header_of_an_npy_file_is_refused(header: str, tmp_path: Path) -> None:
+    text = f"{header:<117}\n".encode()
+    (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text)
+    with pytest.raises(InputError, match=r"a\.npy: is no \.npy file"):
+        read_pickled_npy(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("payload", ["text", ["a"], {"a": 1}, np.array(["a", "b"], object)])
+def test_an_npy_file_of_anything_but_one_object_is_refused(payload: object, tmp_path: Path) -> None:
+    header = b"{'descr': '|O', 'fortran_order': False, 'shape': (), }"
+    header += b" " * (117 - len(header)) + b"\n"
+    magic = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little")
+    (tmp_path / "a.npy").write_bytes(magic + header + pickle.dumps(payload))
+    with pytest.raises(InputError, match="holds no dictionary"):
+        read_pickled_npy(tmp_path / "a.npy")
 
 
 def test_a_huge_memo_index_allocates_nothing(tmp_path: Path) -> None:

@@ -36,11 +36,11 @@ def write_zju(folder: Path, names: tuple[str, ...] = CAMERAS, frame: str = "{:06
     return folder
 
 
-def write_parameters(path: Path, poses: np.ndarray) -> None:
+def write_parameters(path: Path, poses: np.ndarray, **others: Any) -> None:
     """Write a pose turned a quarter about the vertical, then moved by (1, 2, 3) m."""
     path.parent.mkdir(exist_ok=True)
     parameters: Any = {"poses": poses, "Rh": np.array([[0, 0, np.pi / 2]]), "Th": np.array([[1.0, 2, 3]])}
-    np.save(path, parameters | {"shapes": np.arange(10.0)[None]}, allow_pickle=True)
+    np.save(path, parameters | {"shapes": np.arange(10.0)[None]} | others, allow_pickle=True)  # type: ignore[arg-type]
 
 
 @pytest.fixture
@@ -89,6 +89,13 @@ def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
 
     write_parameters(folder / "params" / "1.npy", np.zeros(10))
     refused(r"1\.npy: 10 turns and 10 shape values are not SMPL's")
+    for name, value in (
+        ("shapes", np.full((1, 10), np.nan)),
+        ("Th", np.array([[1e30, 0, 0]])),
+        ("Rh", [[np.inf, 0, 0]]),
+    ):
+        write_parameters(folder / "params" / "1.npy", np.zeros(72), **{name: value})
+        refused(r"1\.npy: .* of a pose are NaN or beyond")
     (folder / "params" / "1.npy").rename(folder / "params" / "9.npy")
     refused(r"none of the chosen frames has a given pose")
     (folder / "mask_cihp" / "Camera_B2" / "000001.png").unlink()

@@ -1,5 +1,7 @@
 import dataclasses
 import math
+import os
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -145,7 +147,8 @@ def test_amass_poses_turn_the_likes_of_smpls_joints(tmp_path: Path) -> None:
     [
         ({"poses": np.zeros((2, 100)), "trans": np.zeros((2, 3))}, "not AMASS's"),
         ({"poses": np.zeros((2, 156)), "trans": np.zeros((3, 3))}, "not AMASS's"),
-        ({"poses": np.full((2, 156), np.nan), "trans": np.zeros((2, 3))}, "not AMASS's"),
+        ({"poses": np.full((2, 156), np.nan), "trans": np.zeros((2, 3))}, "turns of a pose are NaN or beyond"),
+        ({"poses": np.zeros((2, 156)), "trans": np.full((2, 3), 1e30)}, "translations of a pose are NaN or beyond"),
         ({"poses": np.array([None]), "trans": np.zeros((2, 3))}, "plain arrays"),
         ({"poses": np.zeros((2, 72)), "trans": np.zeros((2, 3)), "mocap_framerate": np.array(0)}, "frames per second"),
         ({"poses": np.zeros((2, 72)), "trans": np.zeros((2, 3)), "mocap_framerate": np.ones(2)}, "frames per second"),
@@ -163,6 +166,38 @@ def test_half_a_file_is_no_motion(tmp_path: Path) -> None:
     (tmp_path / "walk.npz").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match=r"walk\.npz: not an \.npz of plain arrays"):
         read_motion(tmp_path / "walk.npz")
+
+
+def test_a_small_file_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> None:
+    with (
+        zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("poses.npy", "w") as file,
+    ):
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (250_000, 156)})
+        for _ in range(312):
+            file.write(bytes(1_000_000))
+    assert (tmp_path / "bomb.npz").stat().st_size < 400_000
+    with pytest.raises(InputError, match=r"bomb\.npz: unpacks to 312 MB; at most 256 MB"):
+        read_motion(tmp_path / "bomb.npz")
+
+
+@pytest.mark.parametrize(("at", "value"), [(6, 1), (8, 99)])
+def test_an_archive_of_another_kind_is_no_motion(at: int, value: int, tmp_path: Path) -> None:
+    """Bytes 6 and 8 of a local file header are its flags (bit 0: encrypted) and its compression; in the directory at
+    the end they lie two further on."""
+    np.savez(tmp_path / "dance.npz", poses=np.zeros((2, 156)), trans=np.zeros((2, 3)))
+    data = bytearray((tmp_path / "dance.npz").read_bytes())
+    for signature, place in ((b"PK\x03\x04", at), (b"PK\x01\x02", at + 2)):
+        data[data.index(signature) + place] = value
+    (tmp_path / "dance.npz").write_bytes(data)
+    with pytest.raises(InputError, match=r"not an \.npz of plain arrays"):
+        read_motion(tmp_path / "dance.npz")
+
+
+def test_a_pipe_is_no_motion(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "dance.npz")
+    with pytest.raises(InputError, match=r"dance\.npz: is no regular file"):
+        read_motion(tmp_path / "dance.npz")
 
 
 def test_a_folder_without_a_fit_is_refused(tmp_path: Path) -> None:

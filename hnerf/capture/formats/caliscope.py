@@ -13,7 +13,7 @@ import numpy as np
 
 from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.formats.pose2sim import lens_from_table
-from hnerf.capture.lens import Lens, known_size
+from hnerf.capture.lens import Lens, by_name, known_size
 from hnerf.capture.safe_io import path_in_capture, read_toml
 from hnerf.errors import InputError
 
@@ -36,7 +36,7 @@ class Caliscope(EasyMocap):
         lenses = [lens_from_table(path, key, table) for key, table in tables.items()]
         if not lenses:
             raise InputError(f"{path}: calibrates no camera; calibrate again")
-        return {lens.name: lens for lens in lenses}
+        return by_name(lenses, path)
 
 
 def write_caliscope(out: Path, lenses: Sequence[Lens]) -> None:

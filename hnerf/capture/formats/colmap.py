@@ -70,7 +70,7 @@ class Colmap(EasyMocap):
         lenses: dict[str, Lens] = {}
         for shot in shots:
             if shot.camera_id not in optics_of:
-                raise InputError(f"{images}: image {shot.name}: camera {shot.camera_id} is not in {cameras}")
+                raise InputError(f"{images}: image {shot.name[:80]}: camera {shot.camera_id} is not in {cameras}")
             lens = _lens((cameras, images), shot, optics_of[shot.camera_id])
             if lens.name in lenses:
                 raise InputError(f"{images}: several images of camera {lens.name}; keep the images of one moment")
@@ -120,7 +120,7 @@ def _lens(sources: tuple[Path, Path], shot: _Shot, optics: _Optics) -> Lens:
     quaternion = np.array(shot.pose[:4])
     norm = np.linalg.norm(quaternion)
     if not 0.5 < norm < 2:
-        raise InputError(f"{sources[1]}: image {shot.name}: its quaternion is not of unit length; reconstruct again")
+        raise InputError(f"{sources[1]}: image {shot.name[:80]}: its quaternion is not of length 1; reconstruct")
     return checked_lens(
         sources=sources,
         name=check_camera_name(PurePosixPath(shot.name.split("/")[0]).stem, sources[1]),
@@ -165,6 +165,8 @@ def _shots_from_text(path: Path) -> list[_Shot]:
     shots = []
     for line in _lines(path)[::2]:
         _, *pose, camera_id, name = line.split(maxsplit=9)
+        if len(pose) != 7:
+            raise ValueError(line)
         shots.append(_Shot(name, tuple(map(float, pose)), int(camera_id)))
     return shots
 

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 
 from hnerf.capture.footage import Footage, ImageFolder, Video
 from hnerf.capture.formats.layout import Layout, StoredFrame
-from hnerf.capture.lens import Lens, checked_lens
+from hnerf.capture.lens import Lens, by_name, checked_lens
 from hnerf.capture.safe_io import (
     IMAGE_SUFFIXES,
     JSON_SUFFIXES,
     VIDEO_SUFFIXES,
+    check_camera_name,
     file_named,
     files_in,
     numbered,
@@ -23,8 +23,9 @@ from hnerf.capture.safe_io import (
     read_text,
 )
 from hnerf.errors import InputError
+from hnerf.strict_yaml import parse_yaml_strings
 
-MAX_CALIBRATION_BYTES = 1_000_000
+MAX_CALIBRATION_BYTES = 500_000
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class EasyMocap(Layout):
         intri = _CalibrationFile(path_in_capture(self.folder, "intri.yml"))
         extri = _CalibrationFile(path_in_capture(self.folder, "extri.yml"))
         lenses = (_lens(name, intri, extri) for name in intri.names())
-        return {lens.name: lens for lens in lenses}
+        return by_name(lenses, intri.path)
 
     def footage(self, camera: str) -> Footage:
         """Return images/<camera>/, else videos/<camera>.mp4."""
@@ -99,26 +100,27 @@ def _matrix(key: str, values: np.ndarray) -> str:
 class _CalibrationFile:
     """An OpenCV FileStorage in YAML.
 
-    It is read by PyYAML, to strings only: on deep nesting OpenCV's own parser overflows the stack, and it allocates
-    whatever matrix a file declares.
+    It is read to strings only: on deep nesting OpenCV's own parser overflows the stack, and it allocates whatever
+    matrix a file declares.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         text = re.sub(r"\A%YAML:\S*", "", read_text(path, MAX_CALIBRATION_BYTES))  # OpenCV's header is not YAML's
         try:
-            self.tree = yaml.load(text, Loader=yaml.BaseLoader)
-        except (yaml.YAMLError, RecursionError, ValueError):
-            self.tree = None
+            self.tree = parse_yaml_strings(text)
+        except ValueError as error:
+            why = " ".join(str(error).split())
+            raise InputError(f"{path}: not an OpenCV YAML file ({why}); export it again with EasyMocap") from None
         if not isinstance(self.tree, dict):
             raise InputError(f"{path}: not an OpenCV YAML file; export it again with EasyMocap")
 
-    def names(self) -> list[object]:
-        """Return the names of the cameras. Raises InputError if there are none."""
+    def names(self) -> list[str]:
+        """Return the names of the cameras. Raises InputError if there are none, or if one cannot be a name."""
         names = self.tree.get("names")
         if not isinstance(names, list) or not names:
             raise InputError(f"{self.path}: lists no cameras under 'names'; export it again with EasyMocap")
-        return names
+        return [check_camera_name(name, self.path) for name in names]
 
     def number(self, key: str) -> float | None:
         """Return a number, or None if the key is missing. Raises InputError if the value is not a number."""
@@ -135,7 +137,7 @@ class _CalibrationFile:
         try:
             node = self.tree[found[0]]
             return np.array([float(value) for value in node["data"]]).reshape(int(node["rows"]), int(node["cols"]))
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, OverflowError, TypeError, ValueError):
             raise InputError(f"{self.path}: {found[0]} is not a matrix of finite numbers; calibrate again") from None
 
     def required(self, *keys: str) -> np.ndarray:
@@ -146,7 +148,7 @@ class _CalibrationFile:
         return found
 
 
-def _lens(name: object, intri: _CalibrationFile, extri: _CalibrationFile) -> Lens:
+def _lens(name: str, intri: _CalibrationFile, extri: _CalibrationFile) -> Lens:
     """Return the lens of one camera."""
     distortion = intri.matrix(f"dist_{name}", f"D_{name}")
     width_px, height_px = intri.number(f"W_{name}"), intri.number(f"H_{name}")

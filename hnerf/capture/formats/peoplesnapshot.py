@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import cv2
@@ -13,7 +13,7 @@ import numpy as np
 
 from hnerf.capture.footage import Footage, Video
 from hnerf.capture.formats.layout import Layout, StoredFrame
-from hnerf.capture.given_poses import JOINTS, GivenPoses
+from hnerf.capture.given_poses import JOINTS, GivenPoses, check_smpl
 from hnerf.capture.lens import Lens, checked_lens
 from hnerf.capture.safe_io import MAX_IMAGE_PIXELS, VIDEO_SUFFIXES, files_in, path_in_capture
 from hnerf.capture.safe_pickle import read_pickle
@@ -22,6 +22,7 @@ from hnerf.errors import InputError
 CAMERA = "camera"
 CAMERA_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # its world: x right, y down, z forward
 COCO_POINTS = 18
+MAX_NUMBERS = 10_000_000  # in an array of keypoints or poses: more than an hour of them
 
 
 @dataclass(frozen=True)
@@ -44,12 +45,16 @@ class PeopleSnapshot(Layout):
             K = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]])
             R = cv2.Rodrigues(turn)[0] @ CAMERA_FROM_Z_UP
             size_px = float(stored["width"]), float(stored["height"])
-        except (IndexError, KeyError, TypeError, ValueError, cv2.error):
+        except (IndexError, KeyError, OverflowError, TypeError, ValueError, cv2.error):
             raise InputError(f"{path}: camera_f, _c, _k, _rt, _t, width or height is missing; get it again") from None
         return {CAMERA: checked_lens((path, path), CAMERA, K, distortion, R, shift, size_px)}
 
     def footage(self, camera: str) -> Footage:
         """Return the one video, which is named after the subject."""
+        return self._video
+
+    @cached_property
+    def _video(self) -> Video:
         videos = files_in(self.folder, suffixes=VIDEO_SUFFIXES)
         if len(videos) != 1:
             raise InputError(f"{self.folder}: {len(videos)} videos .mp4; leave exactly one")
@@ -60,14 +65,22 @@ class PeopleSnapshot(Layout):
         path = path_in_capture(self.folder, "keypoints.hdf5")
         if not path.exists():
             return {}
-        count = len(_array(path, "keypoints", (3 * COCO_POINTS,)))
+        count = self._one_a_frame(path, "keypoints")
         return {i: StoredFrame(path, partial(_keypoints, path, i)) for i in range(count)}
 
     def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
         """Return the frames of masks.hdf5: masks (N, H, W), 0 outside the person."""
         path = path_in_capture(self.folder, "masks.hdf5")
-        count = _count(path, "masks") if path.exists() else 0
+        count = self._one_a_frame(path, "masks") if path.exists() else 0
         return {i: StoredFrame(path, partial(_mask, path, i)) for i in range(count)}
+
+    def _one_a_frame(self, path: Path, name: str) -> int:
+        """Return the number of frames. Raises InputError unless a dataset declares a row for each, before anything is
+        made of what it declares."""
+        declared, count = _count(path, name), len(self._video.frames)
+        if declared != count:
+            raise InputError(f"{path}: {declared} {name} for {count} frames; give one for each")
+        return count
 
     def given_poses(self, frames: tuple[int, ...]) -> GivenPoses | None:
         """Return the poses of reconstructed_poses.hdf5: pose (N, 72), trans (N, 3), betas (10).
@@ -86,6 +99,7 @@ class PeopleSnapshot(Layout):
         poses, betas = GivenPoses.unknown(len(frames)), _array(path, "betas", ())
         if len(betas) < len(poses.betas):
             raise InputError(f"{path}: {len(betas)} betas are not SMPL's; get it again")
+        check_smpl(path, turns, moves_m, betas)
         poses.betas[:] = betas[: len(poses.betas)]
         for i, frame in enumerate(frames):
             row = frame + first
@@ -100,7 +114,7 @@ def _array(path: Path, name: str, row_shape: tuple[int, ...]) -> np.ndarray:
     """Read all of a small dataset of rows as float64. Raises InputError unless it is of finite numbers."""
     with _opened(path) as file:
         data = _dataset(path, file, name)
-        found = data[()].astype(np.float64) if data.size <= MAX_IMAGE_PIXELS else np.zeros(())
+        found = data[()].astype(np.float64) if data.size <= MAX_NUMBERS else np.zeros(())
     if found.ndim != 1 + len(row_shape) or found.shape[1:] != row_shape or not np.isfinite(found).all():
         raise InputError(f"{path}: {name} is not (N, {', '.join(map(str, row_shape))}) finite numbers; get it again")
     return found
@@ -121,7 +135,7 @@ def _mask(path: Path, row: int) -> np.ndarray:
     """Read the mask of one frame, (H, W) uint8."""
     with _opened(path) as file:
         data = _dataset(path, file, "masks")
-        if data.ndim != 3 or math.prod(data.shape[1:]) > MAX_IMAGE_PIXELS:
+        if data.ndim != 3 or data.dtype.itemsize * math.prod(data.shape[1:]) > MAX_IMAGE_PIXELS:
             raise InputError(f"{path}: masks are not images (N, H, W); get it again")
         return np.where(data[row] != 0, 255, 0).astype(np.uint8)
 
@@ -132,7 +146,7 @@ def _opened(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
             yield file
-    except (OSError, RuntimeError):
+    except (KeyError, OSError, OverflowError, RuntimeError, TypeError, ValueError):  # of damage beyond the first bytes
         raise InputError(f"{path}: not a readable HDF5 file; get it again") from None
 
 
@@ -141,6 +155,6 @@ def _dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
     data = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
     if not isinstance(data, h5py.Dataset) or data.ndim == 0 or data.dtype.kind not in "biuf":
         raise InputError(f"{path}: has no array of numbers called {name}; get it again")
-    if data.is_virtual or data.external or math.prod(data.chunks or (1,)) > MAX_IMAGE_PIXELS:
+    if data.is_virtual or data.external or data.dtype.itemsize * math.prod(data.chunks or (1,)) > MAX_IMAGE_PIXELS:
         raise InputError(f"{path}: {name} lies in other files, or in huge chunks; write it again")
     return data

@@ -9,7 +9,7 @@ import numpy as np
 
 from hnerf.capture.footage import Footage, Video
 from hnerf.capture.formats.layout import Layout, StoredFrame
-from hnerf.capture.lens import Lens, checked_lens
+from hnerf.capture.lens import Lens, by_name, checked_lens
 from hnerf.capture.safe_io import JSON_SUFFIXES, VIDEO_SUFFIXES, file_named, files_in, read_toml
 from hnerf.errors import InputError
 
@@ -34,7 +34,7 @@ class Pose2Sim(Layout):
         if not tables:
             raise InputError(f"{files[0]}: calibrates no camera; calibrate again")
         lenses = (lens_from_table(files[0], key, table) for key, table in tables.items())
-        return {lens.name: lens for lens in lenses}
+        return by_name(lenses, files[0])
 
     def footage(self, camera: str) -> Footage:
         """Return videos/<camera>.mp4."""
@@ -56,7 +56,7 @@ def lens_from_table(source: Path, key: str, table: Any) -> Lens:
     InputError if a key is missing or wrong."""
     try:
         if table.get("fisheye", False):
-            raise InputError(f"{source}: camera {key}: fisheye lenses are not supported; undistort its video first")
+            raise InputError(f"{source}: camera {key[:80]}: fisheye lenses are not supported; undistort its video")
         width_px, height_px = table["size"]
         return checked_lens(
             sources=(source, source),
@@ -68,4 +68,4 @@ def lens_from_table(source: Path, key: str, table: Any) -> Lens:
             size_px=(float(width_px), float(height_px)),
         )
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-        raise InputError(f"{source}: camera {key}: {error} is missing or not a number; calibrate again") from None
+        raise InputError(f"{source}: camera {key[:80]}: {error} is missing or not a number; calibrate again") from None

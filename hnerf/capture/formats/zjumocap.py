@@ -10,7 +10,7 @@ import numpy as np
 
 from hnerf.capture.footage import Footage, ImageFolder
 from hnerf.capture.formats.layout import Layout, StoredFrame
-from hnerf.capture.given_poses import JOINTS, GivenPoses
+from hnerf.capture.given_poses import JOINTS, GivenPoses, check_smpl
 from hnerf.capture.lens import Lens, checked_lens
 from hnerf.capture.safe_io import path_in_capture
 from hnerf.capture.safe_pickle import read_pickled_npy
@@ -61,8 +61,10 @@ class ZjuMocap(Layout):
             try:
                 cameras = self._annotations["cams"]
                 K, D, R, T = (np.asarray(cameras[key][i], dtype=np.float64) for key in "KDRT")
-            except (IndexError, KeyError, TypeError, ValueError):
-                raise InputError(f"{self.source}: camera {name}: K, D, R or T is missing; prepare it again") from None
+            except (IndexError, KeyError, OverflowError, TypeError, ValueError):
+                raise InputError(
+                    f"{self.source}: camera {name[:80]}: K, D, R or T is missing; prepare it again"
+                ) from None
             lens = checked_lens((self.source, self.source), name, K, D, R, T * METRES_PER_UNIT, None)
             lenses[lens.name] = lens
         return lenses
@@ -121,8 +123,9 @@ def _parameters(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         )
         placed = np.eye(4)
         placed[:3, :3], placed[:3, 3] = cv2.Rodrigues(rotation)[0], translation
-    except (KeyError, TypeError, ValueError, cv2.error):
+    except (IndexError, KeyError, OverflowError, TypeError, ValueError, cv2.error):
         raise InputError(f"{path}: no poses, Rh, Th and shapes of SMPL; remove it or fit again") from None
     if len(turns) not in (3 * JOINTS, 3 * JOINTS - 3) or len(shape) < 10:
         raise InputError(f"{path}: {len(turns)} turns and {len(shape)} shape values are not SMPL's; remove it")
+    check_smpl(path, np.concatenate([turns, rotation]), translation, shape[:10])
     return turns, placed, shape[:10]
