@@ -33,7 +33,7 @@ def main() -> None:
     result = provenance()
     threads = result["machine"]["threads"]
     cores = [threads] if torch.cuda.is_available() else sorted({1, threads})
-    subjects = [train_subject.fn(SHARED / "data" / name, "fast", options.store) for name in options.captures]
+    subjects = [train_subject.fn(SHARED / "data" / name, "fast", options.store).subject for name in options.captures]
     result["seconds"] = {subject.name: measure(subject, cores) for subject in subjects}
     rows = [["subject", *(f"{side} px, threads: {n}" for side in SIDES_PX for n in cores)]]
     rows += [[name, *(f"{s:.2f} s" for s in found.values())] for name, found in result["seconds"].items()]

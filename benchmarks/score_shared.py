@@ -65,8 +65,7 @@ def measure(capture: Path, preset: str, store: Path, overrides: list[str]) -> di
             lines.append(line.strip())
     if run.returncode:
         return {"error": next((line for line in reversed(lines) if line), f"exit status {run.returncode}")}
-    report = next(line.removeprefix("report:").strip() for line in lines if line.startswith("report:"))
-    subject = Path(report).parent.parent
+    subject = Path(next(line.removeprefix("subject:").strip() for line in lines if line.startswith("subject:")))
     figures: dict[str, Any] = {"run_seconds": None if known else time.perf_counter() - started}
     figures["training"] = json.loads((subject / "training" / "report.json").read_text())
     figures["own_metrics"] = json.loads((subject / "evaluation" / "metrics.json").read_text())

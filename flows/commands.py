@@ -47,9 +47,10 @@ def demo(options: argparse.Namespace) -> None:
 def _train(capture: Path, preset: str, store: Path, overrides: list[str]) -> None:
     from flows.train_subject import train_subject
 
-    folder = train_subject.fn(capture, preset, store, overrides)
-    print(f"report: {folder / 'evaluation' / 'report.html'}")
-    print(f"asset:  {folder / 'asset' / 'avatar.usdz'}")
+    trained = train_subject.fn(capture, preset, store, overrides)
+    print(f"report:  {trained.report}")
+    print(f"asset:   {trained.asset}")
+    print(f"subject: {trained.subject}")
 
 
 def synth(options: argparse.Namespace) -> None:

@@ -16,6 +16,7 @@ from tasks.capture import ingest, subset_capture
 from tasks.detection import detect, needs_detection
 from tasks.evaluation import evaluate, evaluate_held_out
 from tasks.fit import fit
+from tasks.ledger import forget
 from tasks.segmentation import converged, needs_body, segment
 from tasks.source import read_capture
 from tasks.store import Artifact, Store
@@ -31,11 +32,20 @@ class Prepared(NamedTuple):
     body: Artifact
 
 
+class Trained(NamedTuple):
+    """What a run leaves. subject: the folder that links to the latest result of each stage, which may be another run's;
+    report, asset: this run's own files."""
+
+    subject: Path
+    report: Path
+    asset: Path
+
+
 @flow(name="train-subject", flow_run_name="{capture}")
 def train_subject(
     capture: Path, preset: str = "fast", store: Path = Path("store"), overrides: list[str] | None = None
-) -> Path:
-    """Train one person and export the avatar; return the folder that links to each stage's result.
+) -> Trained:
+    """Train one person and export the avatar; return where the results are.
 
     capture: the recording's folder; preset: a name under configs/ or a YAML file; store: where artifacts are kept;
     overrides: settings like "training.steps=100". If `evaluation.holdout` names a camera, a second field is trained
@@ -43,6 +53,8 @@ def train_subject(
     """
     settings = load_settings(preset, overrides or ())
     artifact_store = Store(store.resolve())
+    if not capture.is_dir():
+        forget(artifact_store.root, capture)
     source, truth = read_capture(capture, store)
     if settings.evaluation.holdout:
         cameras = recorded_cameras(source.root)
@@ -50,6 +62,7 @@ def train_subject(
 
     recorded = ingest(artifact_store, source, settings.capture)
     subject = Capture.load(recorded.root).name
+    artifact_store.claim(subject, source.digest, source.root)
     artifact_store.link_latest(subject, recorded)
     recording = artifact_store.link_latest(subject, with_keypoints(artifact_store, recorded, settings))
     calibration = artifact_store.link_latest(subject, calibrate(artifact_store, recording, settings.calibration))
@@ -72,8 +85,11 @@ def train_subject(
     asset = export(artifact_store, recording, calibration, training, settings.asset)
     for artifact in (recorded, recording, calibration, segmentation, body, training, evaluation, asset):
         artifact_store.link_latest(subject, artifact)  # again: another run of this name may have relinked them
-    publish_markdown(_figures(subject, evaluation, asset), "result", f"Result for {subject}")
-    return artifact_store.subject_folder(subject)
+    trained = Trained(
+        artifact_store.subject_folder(subject), evaluation.root / "report.html", asset.root / "avatar.usdz"
+    )
+    publish_markdown(_figures(subject, evaluation, trained), "result", f"Result for {subject}")
+    return trained
 
 
 def with_keypoints(store: Store, recorded: Artifact, settings: Settings) -> Artifact:
@@ -128,9 +144,9 @@ def segment_subject(store: Store, recording: Artifact, calibration: Artifact, se
     return segmentation
 
 
-def _figures(subject: str, evaluation: Artifact, asset: Artifact) -> str:
+def _figures(subject: str, evaluation: Artifact, trained: Trained) -> str:
     """Format the scores and the paths of report and asset."""
     lines = [f"# {subject}", "", "| figure | value |", "|---|---|"]
     lines += [f"| {name} | {value:.4g} |" for name, value in evaluation.metrics.items()]
-    lines += ["", f"Report: `{evaluation.root / 'report.html'}`", f"Asset: `{asset.root / 'avatar.usdz'}`"]
+    lines += ["", f"Report: `{trained.report}`", f"Asset: `{trained.asset}`"]
     return "\n".join(lines)

@@ -36,7 +36,9 @@ def atomic_folder(out: Path) -> Iterator[Path]:
 def replace_text(path: Path, text: str) -> None:
     """Replace a text file atomically: write a temporary file beside it, then rename."""
     beside = path.with_name(f".{path.name}.{os.getpid()}")
-    beside.write_text(text)
+    beside.unlink(missing_ok=True)
+    with beside.open("x") as file:  # never through a link that lies there
+        file.write(text)
     os.replace(beside, path)
 
 

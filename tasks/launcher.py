@@ -1,17 +1,21 @@
 """Launcher of a module in several processes under torchrun, none of which outlives the caller."""
 
 import ctypes
+import fcntl
 import json
 import logging
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, gettempdir
 
 from hnerf.errors import InputError
 from hnerf.progress import report_relayed
@@ -19,6 +23,7 @@ from hnerf.progress import report_relayed
 GRACE_S = 40  # torchrun gives its ranks 30 s to end before it kills them
 LAST_LINES = 20  # of a failed rank, in the error
 RANK_LINE = re.compile(r"^\[default\d+\]:")
+LOGS, LOCK, YOUNG_S = "hnerf-ranks-", "lock", 60.0
 FAILURE = "failure.json"  # tasks/agent.py: the first failing rank and its exit code
 # Sent from outside; other signals are raised by the process itself and would recur.
 KILLED = (signal.SIGKILL, signal.SIGTERM)
@@ -51,7 +56,9 @@ def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
     otherwise RuntimeError with the last lines of the first failing rank. All ranks end when the caller does, however it
     ends: the kernel signals the caller's death to torchrun, and torchrun's to the ranks.
     """
-    with TemporaryDirectory(prefix="hnerf-ranks-") as logs:
+    _remove_left_behind()
+    with TemporaryDirectory(prefix=LOGS) as logs, Path(logs, LOCK).open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the kernel releases it, however this process ends
         command = [sys.executable, "-m", "tasks.agent", f"{logs}/{FAILURE}"]
         command += ["--standalone", f"--nproc-per-node={processes}", "--tee=3", f"--log-dir={logs}"]
         command += ["-m", "tasks.rank", module, *arguments]
@@ -72,6 +79,16 @@ def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
             raise
         if agent.returncode:
             raise _error(module, Path(logs), agent.returncode)
+
+
+def _remove_left_behind() -> None:
+    """Remove the folders of logs whose process was killed. One is in use while its lock is held; a young one may not
+    have been locked yet."""
+    for folder in Path(gettempdir()).glob(f"{LOGS}*"):
+        with suppress(OSError), (folder / LOCK).open("r+") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if time.time() - (folder / LOCK).stat().st_mtime > YOUNG_S:
+                shutil.rmtree(folder)
 
 
 def end_with_parent(last: signal.Signals) -> None:

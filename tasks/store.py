@@ -5,10 +5,12 @@
     <store>/<stage>/<key>.partial/  work in progress
     <store>/<stage>/<key>.lock      locked (flock) while a process works on the key; the kernel releases it if that dies
     <store>/subjects/<name>/<stage> -> the latest artifact of a subject
+    <store>/subjects/<name>/.recording  the digest and the folder of the recording that these are of
 
 The store alone decides what can be reused; Prefect's record of a task run is a view of it (tasks/policy.py).
 """
 
+import errno
 import fcntl
 import hashlib
 import json
@@ -23,10 +25,12 @@ from pathlib import Path
 from pydantic import BaseModel
 
 from hnerf.errors import InputError
+from hnerf.files import replace_text
 
 log = logging.getLogger("hnerf.store")
 
 # In order: each stage is computed from those before it.
+RECORDING = ".recording"  # under subjects/<name>: digest and folder of the recording
 STAGES = ("capture", "detection", "calibration", "segmentation", "fit", "training", "evaluation", "asset")
 
 
@@ -74,7 +78,7 @@ class Store:
             damaged = artifact.damaged_file()
         except FileNotFoundError:
             return None
-        except ValueError:
+        except (RecursionError, TypeError, ValueError):  # TypeError: JSON, but no object
             damaged = record
         if damaged is None:
             return artifact
@@ -87,15 +91,21 @@ class Store:
         """Return the stored artifact, or compute it by `write(folder)`, which returns its metrics.
 
         If several callers want the same artifact, one computes it and the others wait. The folder of a resumable stage
-        survives a crash, and the next call resumes in it; any other starts empty.
+        survives a crash, and the next call resumes in it; any other starts empty. Nothing is written, and links that
+        lie in the way are not followed, where the artifact is there; a store may be read-only.
         """
+        if found := self.find(stage, key):
+            return found
         partial = self._path(stage, key, ".partial")
         with self._locked(stage, key):
             found = self.find(stage, key)
             if found:
                 return found
-            if not resumable:
-                shutil.rmtree(partial, ignore_errors=True)
+            if not resumable or partial.is_symlink():
+                _remove(partial)
+            for path in partial.rglob("*"):
+                if path.is_symlink():
+                    path.unlink()
             partial.mkdir(parents=True, exist_ok=True)
             try:
                 metrics = write(partial)
@@ -110,10 +120,11 @@ class Store:
         if subject in ("", ".", "..") or "/" in subject:
             raise InputError(f"capture.toml: name {subject!r} cannot be the name of a folder; choose another")
         link = self.subject_folder(subject) / artifact.stage
-        link.parent.mkdir(parents=True, exist_ok=True)
         target = os.path.relpath(artifact.root, link.parent)
-        # What was computed from an earlier artifact no longer belongs to the subject.
-        if link.is_symlink() and os.readlink(link) != target:
+        if link.is_symlink() and os.readlink(link) == target:
+            return artifact
+        link.parent.mkdir(parents=True, exist_ok=True)
+        if link.is_symlink():  # what was computed from an earlier artifact no longer belongs to the subject
             for stage in STAGES[STAGES.index(artifact.stage) + 1 :]:
                 (link.parent / stage).unlink(missing_ok=True)
         beside = link.with_name(f".{artifact.stage}.{os.getpid()}")
@@ -121,6 +132,20 @@ class Store:
         beside.symlink_to(target)
         os.replace(beside, link)
         return artifact
+
+    def claim(self, subject: str, digest: str, folder: Path) -> None:
+        """Note which recording the results under a subject's name are of; warn if until now they were of another, in
+        another folder: two recordings of one name replace each other's results."""
+        path, claimed = self.subject_folder(subject) / RECORDING, f"{digest}\n{folder}\n"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        before = path.read_text() if path.is_file() and not path.is_symlink() else claimed
+        if before != claimed and before.splitlines()[1:] != [str(folder)] and not before.startswith(digest):
+            log.warning(
+                "%s showed the results of %s and will show those of %s; give one of them another name in capture.toml",
+                path.parent, " ".join(before.splitlines()[1:]), folder,
+            )  # fmt: skip
+        if before != claimed or not path.exists():
+            replace_text(path, claimed)
 
     def subject_folder(self, subject: str) -> Path:
         """Return the folder with links to a subject's latest artifacts."""
@@ -133,7 +158,7 @@ class Store:
     def _locked(self, stage: str, key: str) -> Iterator[None]:
         path = self._path(stage, key, ".lock")
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("w") as lock:
+        with open(path, "w", opener=_without_following) as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -151,12 +176,14 @@ class Store:
             if path.is_file()
         }
         record.unlink(missing_ok=True)
-        shutil.rmtree(folder, ignore_errors=True)
+        _remove(folder)
         os.replace(partial, folder)
         _flush(folder.parent)
         artifact = Artifact(stage=stage, root=folder, files=files, metrics=metrics)
         beside = self._path(stage, key, ".json.partial")
-        beside.write_text(artifact.model_dump_json(indent=1, exclude={"root"}))
+        beside.unlink(missing_ok=True)
+        with beside.open("x") as file:
+            file.write(artifact.model_dump_json(indent=1, exclude={"root"}))
         _flush(beside)
         os.replace(beside, record)
         _flush(folder.parent)
@@ -176,6 +203,24 @@ def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file's bytes, hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder with all that is in it, or a link in its place, not what that points to."""
+    if folder.is_symlink():
+        folder.unlink()
+    else:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _without_following(name: str, flags: int) -> int:
+    """Open a file of the store. Raises InputError if a link lies in its place."""
+    try:
+        return os.open(name, flags | os.O_NOFOLLOW, 0o666)
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        raise InputError(f"{name}: is a symbolic link; remove it from the store") from None
 
 
 def _flush(path: Path) -> int:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from flows.cli import CAMERA_FORMATS, PICTURES, main
-from flows.train_subject import train_subject
+from flows.train_subject import Trained, train_subject
 from hnerf import synthetic
 from hnerf.capture.formats.export import WRITERS
 from hnerf.config import SyntheticSettings
@@ -173,7 +173,7 @@ finally:
 def test_the_first_line_comes_before_what_takes_seconds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(train_subject, "fn", lambda *_: tmp_path)
+    monkeypatch.setattr(train_subject, "fn", lambda *_: Trained(tmp_path, tmp_path, tmp_path))
     assert main(["run", str(tmp_path)]) == 0
     first, *_ = capsys.readouterr().out.splitlines()
     assert first.endswith(f" hnerf: run {tmp_path}")

@@ -10,6 +10,8 @@ from prefect.client.schemas.filters import DeploymentFilter, DeploymentFilterNam
 from prefect.client.schemas.objects import FlowRun
 from prefect.deployments import run_deployment
 
+from flows.ingest_captures import unfinished_runs
+
 ROOT = Path(__file__).parent.parent.parent
 PATIENCE_S = 60.0
 
@@ -51,6 +53,7 @@ def test_deployment_run_takes_a_capture(deployed: str) -> None:
     prefect(deployed, "deployment", "run", "train-subject/local", "-p", "capture=/recordings/ada")
     (run,) = runs_of("train-subject")
     assert run.parameters == {"capture": "/recordings/ada"}
+    assert unfinished_runs() == 1
 
 
 @pytest.mark.parametrize(("flow", "what"), [("benchmark", "study"), ("stability", "study"), ("ablate", "preset")])

@@ -8,6 +8,7 @@ import pytest
 
 from flows import ingest_captures as module
 from flows.ingest_captures import ingest_captures
+from flows.train_subject import train_subject
 from hnerf.errors import InputError
 from tasks.source import read_capture
 
@@ -30,11 +31,12 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
         return SimpleNamespace(id=f"run-{len(asked)}")
 
     monkeypatch.setattr(module, "run_deployment", run_deployment)
+    monkeypatch.setattr(module, "unfinished_runs", lambda: 0)
     return asked
 
 
-def look(watched: Path, settle_s: float = 0.0) -> list[str]:
-    return ingest_captures.fn(watched, "demo", watched.parent / "store", settle_s)
+def look(watched: Path, settle_s: float = 0.0, max_unfinished: int = 20) -> list[str]:
+    return ingest_captures.fn(watched, "demo", watched.parent / "store", settle_s, max_unfinished)
 
 
 def test_each_capture_is_started_once(watched: Path, runs: list[dict[str, Any]]) -> None:
@@ -66,6 +68,7 @@ def test_a_store_that_was_deleted_trains_again(watched: Path, monkeypatch: pytes
         return SimpleNamespace(id=f"run-{len(keys)}")
 
     monkeypatch.setattr(module, "run_deployment", run_deployment)
+    monkeypatch.setattr(module, "unfinished_runs", lambda: 0)
     look(watched)
     for record in (watched.parent / "store" / "ingested").iterdir():
         if record.name != "id":  # as if the machine had gone down before they were written
@@ -103,6 +106,41 @@ def test_a_capture_that_cannot_be_read_is_said_and_the_others_go_on(
         assert look(watched) == ["bob"]
     assert "0.jpg: cannot be read" in caplog.text
     assert look(watched) == ["ada"]
+
+
+def test_a_folder_renamed_while_its_run_waits_is_trained_under_its_new_name(
+    watched: Path, runs: list[dict[str, Any]]
+) -> None:
+    """The waiting run does not find its folder, and frees what it was started for; the other is not started again."""
+    look(watched)
+    (watched / "ada").rename(watched / "eve")
+    assert look(watched) == []  # whether that run has begun is not known yet
+    with pytest.raises(InputError, match="ada: no such folder"):
+        train_subject.fn(Path(runs[0]["capture"]), "demo", watched.parent / "store")
+    assert look(watched) == ["eve"]
+    assert runs[-1]["capture"] == str(watched / "eve") and look(watched) == []
+
+
+def test_no_more_is_started_than_may_wait(
+    watched: Path, runs: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for i in range(5):
+        shutil.copytree(watched / "ada", watched / f"new{i}")
+        (watched / f"new{i}" / "images" / "0.jpg").write_text(str(i))
+    monkeypatch.setattr(module, "unfinished_runs", lambda: len(runs))
+    assert look(watched, max_unfinished=3) == ["ada", "bob", "new0"]
+    assert look(watched, max_unfinished=3) == []
+    del runs[:2]  # they have ended
+    assert look(watched, max_unfinished=3) == ["new1", "new2"]
+
+
+def test_links_out_of_the_folder_are_not_followed(
+    watched: Path, runs: list[dict[str, Any]], caplog: pytest.LogCaptureFixture
+) -> None:
+    (watched / "ada").rename(watched.parent / "elsewhere")
+    (watched / "ada").symlink_to(watched.parent / "elsewhere")
+    assert look(watched) == ["bob"]
+    assert "ada: is a symbolic link and not followed" in caplog.text
 
 
 def test_names_that_are_not_utf_8_are_captures_too(watched: Path, runs: list[dict[str, Any]]) -> None:

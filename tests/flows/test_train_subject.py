@@ -47,7 +47,7 @@ def given(subject: Path, stage: str) -> list[str]:
 
 
 def test_every_stage_is_shown_and_given_what_went_before(folder: Path, tmp_path: Path) -> None:
-    subject = train_subject.fn(folder, "demo", tmp_path / "store", [])
+    subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject
     assert subject == tmp_path / "store" / "subjects" / "ada"
     assert given(subject, "segmentation") == ["capture", "calibration"]
     assert given(subject, "fit") == ["capture", "calibration", "segmentation"]
@@ -58,7 +58,7 @@ def test_every_stage_is_shown_and_given_what_went_before(folder: Path, tmp_path:
 
 def test_what_was_detected_takes_the_recordings_place(folder: Path, tmp_path: Path) -> None:
     (folder / "undetected").touch()
-    subject = train_subject.fn(folder, "demo", tmp_path / "store", [])
+    subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject
     assert given(subject, "detection") == ["capture"]
     assert given(subject, "calibration") == ["detection"]
     assert given(subject, "training") == ["detection", "calibration", "segmentation", "fit"]
@@ -70,7 +70,7 @@ def test_without_masks_or_plates_a_rough_fit_comes_first(
 ) -> None:
     (folder / "bare").touch()
     monkeypatch.setattr(module, "converged", lambda *_: True)
-    subject = train_subject.fn(folder, "demo", tmp_path / "store", [])
+    subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject
     assert given(subject, "segmentation") == ["capture", "calibration", "fit"]
     assert given(subject, "fit") == ["capture", "calibration", "segmentation"]
     assert len(list((tmp_path / "store" / "fit").glob("*/given.json"))) == 2
@@ -82,7 +82,7 @@ def test_fit_and_segmentation_go_round_until_the_masks_stand_still(
     (folder / "bare").touch()
     answers = iter([False, True])
     monkeypatch.setattr(module, "converged", lambda *_: next(answers))
-    subject = train_subject.fn(folder, "demo", tmp_path / "store", [])
+    subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject
     assert given(subject, "segmentation") == ["capture", "calibration", "fit", "segmentation"]
     assert next(answers, None) is None
     assert len(list((tmp_path / "store" / "segmentation").glob("*/given.json"))) == 2
@@ -94,3 +94,21 @@ def test_rounds_are_bounded(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(module, "converged", lambda *_: bool(asked.append(1)))
     train_subject.fn(folder, "demo", tmp_path / "store", ["segmentation.rounds=2"])
     assert len(asked) == 2
+
+
+def test_a_run_names_its_own_results_whoever_ends_last(folder: Path, tmp_path: Path) -> None:
+    first = train_subject.fn(folder, "demo", tmp_path / "store", [])
+    second = train_subject.fn(folder, "demo", tmp_path / "store", ["evaluation.report_rows=7"])
+    assert first.report != second.report and first.asset == second.asset and first.subject == second.subject
+    assert (second.subject / "evaluation").resolve() == second.report.parent
+    assert (first.report.parent / "given.json").exists()
+
+
+def test_another_recording_of_the_same_name_is_said(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "bare.txt").touch()
+    train_subject.fn(folder, "demo", tmp_path / "store", [])
+    train_subject.fn(tmp_path / "other", "demo", tmp_path / "store", [])
+    assert f"subjects/ada showed the results of {folder} and will show those of {tmp_path}/other" in caplog.text

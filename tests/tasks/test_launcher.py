@@ -1,3 +1,4 @@
+import fcntl
 import logging
 import os
 import re
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from hnerf.errors import InputError
+from tasks import launcher
 from tasks.launcher import LostWorkerError, RankFailedError, run_ranks
 
 RANKS = "tests.tasks.ranks"
@@ -98,3 +100,17 @@ def test_ranks_end_with_torchrun_which_is_worth_another_try(tmp_path: Path) -> N
         with pytest.raises(LostWorkerError, match="torchrun was killed by SIGKILL"):
             launched.result(PATIENCE_S)
     wait_until_running(tmp_path, 0)
+
+
+def test_folders_of_killed_launchers_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One is locked, one was made just now, one is nobody's."""
+    monkeypatch.setattr(launcher, "gettempdir", lambda: str(tmp_path))
+    for name in ("used", "young", "left"):
+        (tmp_path / f"hnerf-ranks-{name}").mkdir()
+        (tmp_path / f"hnerf-ranks-{name}" / "lock").touch()
+    for name in ("used", "left"):
+        os.utime(tmp_path / f"hnerf-ranks-{name}" / "lock", (0, 0))
+    with (tmp_path / "hnerf-ranks-used" / "lock").open() as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        launcher._remove_left_behind()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["hnerf-ranks-used", "hnerf-ranks-young"]

@@ -1,3 +1,4 @@
+import errno
 import multiprocessing
 import os
 import signal
@@ -77,6 +78,75 @@ def test_damaged_or_deleted_artifact_is_made_again(tmp_path: Path, victim: str, 
     assert Store(tmp_path).find("fit", "k") is None
     assert Store(tmp_path).get_or_compute("fit", "k", write_abc) == made
     assert Store(tmp_path).find("fit", "k") == made
+
+
+@pytest.mark.parametrize("text", ["[]", "null", "3", '"text"', "[" * 100_000, '{"stage": "fit", "files": []}'])
+def test_a_record_that_is_none_is_made_again(tmp_path: Path, text: str) -> None:
+    made = Store(tmp_path).get_or_compute("fit", "k", write_abc)
+    (tmp_path / "fit" / "k.json").write_text(text)
+    assert Store(tmp_path).get_or_compute("fit", "k", write_abc) == made
+
+
+def test_links_planted_in_the_store_are_not_followed(tmp_path: Path) -> None:
+    victim, fit = tmp_path / "victim", tmp_path / "store" / "fit"
+    (victim / "deep").mkdir(parents=True)
+    (victim / "letters").write_text("mine")
+    fit.mkdir(parents=True)
+    for name in ("k.partial", "k"):
+        (fit / name).symlink_to(victim)
+    (fit / "k.json.partial").symlink_to(victim / "letters")
+    made = Store(tmp_path / "store").get_or_compute("fit", "k", write_abc, resumable=True)
+    assert made.root.is_dir() and not made.root.is_symlink() and list(made.files) == ["deep/letters"]
+    assert sorted(p.name for p in victim.rglob("*")) == ["deep", "letters"]
+    assert (victim / "letters").read_text() == "mine"
+
+
+def test_a_link_in_work_to_be_resumed_is_removed(tmp_path: Path) -> None:
+    (tmp_path / "victim").write_text("mine")
+    (tmp_path / "training" / "k.partial").mkdir(parents=True)
+    (tmp_path / "training" / "k.partial" / "checkpoint.pt.tmp").symlink_to(tmp_path / "victim")
+
+    def write(out: Path) -> dict[str, float]:
+        (out / "checkpoint.pt.tmp").write_text("theirs")
+        return {}
+
+    Store(tmp_path).get_or_compute("training", "k", write, resumable=True)
+    assert (tmp_path / "victim").read_text() == "mine"
+
+
+def test_a_link_in_place_of_a_lock_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "victim").write_text("mine")
+    (tmp_path / "fit").mkdir()
+    (tmp_path / "fit" / "k.lock").symlink_to(tmp_path / "victim")
+    with pytest.raises(InputError, match=r"k\.lock: is a symbolic link; remove it from the store"):
+        Store(tmp_path).get_or_compute("fit", "k", write_abc)
+    assert (tmp_path / "victim").read_text() == "mine"
+
+
+def test_a_complete_store_may_be_read_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Root may write anywhere, so that whatever writes is made to fail here."""
+    store = Store(tmp_path)
+    made = store.link_latest("ada", store.get_or_compute("fit", "k", write_abc))
+    store.claim("ada", "d", tmp_path / "captures" / "ada")
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    for name in ("replace", "unlink", "symlink", "rename", "open"):
+        monkeypatch.setattr(os, name, refuse)
+    assert store.get_or_compute("fit", "k", never) == made
+    store.claim("ada", "d", tmp_path / "captures" / "ada")
+    assert store.link_latest("ada", made) == made
+
+
+def test_two_recordings_of_one_name_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    store, mine, theirs = Store(tmp_path), tmp_path / "mine" / "ada", tmp_path / "theirs" / "ada"
+    store.claim("ada", "d" * 64, mine)
+    store.claim("ada", "e" * 64, mine)  # the same folder, changed
+    store.claim("ada", "e" * 64, tmp_path / "moved" / "ada")  # the same content, moved
+    assert caplog.text == ""
+    store.claim("ada", "f" * 64, theirs)
+    assert f"subjects/ada showed the results of {tmp_path}/moved/ada and will show those of {theirs}" in caplog.text
 
 
 def test_directory_without_record_is_not_an_artifact(tmp_path: Path) -> None:

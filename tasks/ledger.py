@@ -1,0 +1,66 @@
+"""The ledger of a watched folder: which captures were started, by their content.
+
+<store>/ingested/<digest>         the folder and the flow run of a capture that was started
+<store>/ingested/<digest>.lost    the flow run that found its folder missing; the capture may be started again
+<store>/ingested/seen-<listing>   the digest of a folder with these names, sizes and times, which need not be read
+<store>/ingested/id               random: the same key in another ledger is another run
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from uuid import uuid4
+
+from hnerf.files import replace_text
+
+LOST = ".lost"
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """The ledger of one store."""
+
+    root: Path
+
+    @staticmethod
+    def of(store: Path) -> "Ledger":
+        """Return a store's ledger, which is made if there is none."""
+        root = store.resolve() / "ingested"
+        root.mkdir(parents=True, exist_ok=True)
+        return Ledger(root)
+
+    def knows(self, digest: str) -> bool:
+        """Return whether a capture was started, and not lost since."""
+        return (self.root / digest).exists()
+
+    def seen(self, listing: str) -> bool:
+        """Return whether a folder of this listing was read, and its capture started, before."""
+        path = self.root / listing
+        return path.exists() and self.knows(path.read_text().strip() or "none")
+
+    def note_seen(self, listing: str, digest: str) -> None:
+        """Note the content of a folder of this listing."""
+        replace_text(self.root / listing, digest)
+
+    def note_started(self, digest: str, capture: Path, run: object) -> None:
+        """Note that a capture was started."""
+        replace_text(self.root / digest, f"{capture}\n{run}\n")
+        (self.root / f"{digest}{LOST}").unlink(missing_ok=True)
+
+    def start_key(self, digest: str) -> str:
+        """Return the idempotency key of a capture's run: the same until the start is noted, another after a run was
+        lost and in another ledger, because Prefect returns the finished run of a key that it knows."""
+        identity, lost = self.root / "id", self.root / f"{digest}{LOST}"
+        if not identity.exists():
+            replace_text(identity, uuid4().hex)
+        return f"{identity.read_text()} {digest} {lost.read_text() if lost.exists() else ''}".strip()
+
+
+def forget(store: Path, capture: Path) -> None:
+    """Free the capture that was started from a folder which is no longer there, so that the next look starts it from
+    wherever it lies now."""
+    ledger, missing = store / "ingested", str(capture.absolute())
+    for record in ledger.glob("[0-9a-f]" * 64):
+        folder, _, run = record.read_text().partition("\n")
+        if folder == missing:
+            replace_text(record.with_name(f"{record.name}{LOST}"), run.strip())
+            record.unlink()

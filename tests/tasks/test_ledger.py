@@ -1,0 +1,25 @@
+from pathlib import Path
+
+from tasks.ledger import Ledger, forget
+
+DIGEST, OTHER = "a" * 64, "b" * 64
+
+
+def test_a_capture_that_was_lost_is_free_again_under_another_key(tmp_path: Path) -> None:
+    ledger = Ledger.of(tmp_path)
+    for digest, name in ((DIGEST, "ada"), (OTHER, "bob")):
+        ledger.note_started(digest, tmp_path / name, f"run of {name}")
+        ledger.note_seen(f"seen-{name}", digest)
+    first = ledger.start_key(DIGEST)
+    forget(tmp_path, tmp_path / "ada")
+    assert not ledger.knows(DIGEST) and not ledger.seen("seen-ada")
+    assert ledger.knows(OTHER) and ledger.seen("seen-bob")
+    second = ledger.start_key(DIGEST)
+    assert second == f"{first} run of ada" == ledger.start_key(DIGEST)
+    ledger.note_started(DIGEST, tmp_path / "eve", "second run")
+    assert ledger.seen("seen-ada")
+
+
+def test_a_store_without_a_ledger_has_nothing_to_forget(tmp_path: Path) -> None:
+    forget(tmp_path, tmp_path / "ada")
+    assert list(tmp_path.iterdir()) == []
