@@ -90,6 +90,7 @@ def _table(report: dict[str, Any]) -> Iterator[str]:
         yield f"{name:<12} {camera['status']:<9} {median:>9} {p95:>9}  {remarks}".rstrip()
     for name in report["unjudged_cameras"]:
         yield f"{name:<12} not judged: a camera for testing"
+    yield from report["doubts"]
     yield from report["notes"]
     yield f"verdict: {report['verdict']}"
 

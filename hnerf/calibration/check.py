@@ -1,5 +1,6 @@
 """Check of the given cameras: errors that stop the run, measurements for the report, and refinement where needed."""
 
+import dataclasses
 from collections.abc import Sequence
 from itertools import combinations
 
@@ -19,6 +20,7 @@ from hnerf.calibration.diagnosis import (
     size_ratio,
     undo_mistake,
 )
+from hnerf.calibration.doubts import check_spread, doubts
 from hnerf.calibration.evidence import Evidence
 from hnerf.calibration.monocular import ground_reasons, intrinsics_reasons
 from hnerf.calibration.refine import refine
@@ -33,7 +35,6 @@ from hnerf.geometry.camera import Camera
 
 COINCIDENT_M = 0.005
 COMMON_HEIGHT_M = (1.4, 2.05)  # of adults; outside, the person is a child or the unit is wrong
-MIN_UPRIGHT_COSINE = 0.5  # mean cosine between trunk and up; below it the person lies or bends, or `up` is wrong
 RESIDUAL_SHARE = 0.014  # of the person's height in pixels: 5 px of 357 px
 REJECT_FACTOR = 2.0  # times `max_residual_px`: a camera that is still further off after refinement is not used
 
@@ -47,6 +48,7 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
     if not capture.has_keypoints and capture.given_poses():
         return _unchecked(capture)
     keypoints = _keypoints(capture)
+    check_spread(capture, keypoints)
     given = [capture.cameras[name] for name in capture.train_cameras]
     if len(given) == 1:
         return _monocular(capture, keypoints[0])
@@ -59,7 +61,7 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
     keypoints = keypoints if synchronised is capture else _keypoints(synchronised)
     evidence = Evidence.of(synchronised, keypoints)
     refinement = refine(synchronised, cameras, keypoints, evidence.outlines, evidence.matches, settings)
-    used = refinement.cameras
+    used = [new if new is old else _rounded(new) for old, new in zip(cameras, refinement.cameras, strict=True)]
     after = measure(used, keypoints)
     _check_agreement(capture, after, settings)
     timing = measure_timing(used, keypoints, synchronised.frames)
@@ -75,7 +77,7 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
         raise InputError(f"{capture.name}: fewer than two cameras agree on the person; calibrate again")
     every = capture.cameras | {camera.name: camera for camera in used}
     held_out_px |= refinement.held_out_px
-    notes += [*refinement.notes, *_height_notes(after.body_height_m), *_upright_notes(after.points_m, capture.up)]
+    notes += [*refinement.notes, *_height_notes(after.body_height_m)]
     return CalibrationReport(
         every,
         verdicts,
@@ -86,7 +88,15 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
         tuple(notes),
         capture.up,
         evidence,
+        doubts(synchronised, keypoints, after.points_m),
     )
+
+
+def _rounded(camera: Camera) -> Camera:
+    """Return a refined camera without the digits in which identical runs differ: K to 1e-4 px, R to 1e-7 rad, T to a
+    thousandth of a millimetre."""
+    turn = np.round(cv2.Rodrigues(camera.R)[0], 7)
+    return dataclasses.replace(camera, K=np.round(camera.K, 4), R=cv2.Rodrigues(turn)[0], t_m=np.round(camera.t_m, 6))
 
 
 def _keypoints(capture: Capture) -> np.ndarray:
@@ -156,24 +166,6 @@ def _height_notes(height_m: float) -> list[str]:
 
 def _unit_advice(factor: float) -> str:
     return f'in capture.toml multiply units ("m" is 1, "mm" 0.001) by {factor:.4g}'
-
-
-def _upright_notes(points_m: np.ndarray, up: str) -> list[str]:
-    """Return a note if the trunk, from mid-hip to neck of points (frames, 25, 3), does not point along the world's
-    `up`."""
-    trunk_m = points_m[:, 1] - points_m[:, 8]
-    trunk_m = trunk_m[np.isfinite(trunk_m).all(1)]
-    if not len(trunk_m):
-        return []
-    mean = (trunk_m / np.linalg.norm(trunk_m, axis=1, keepdims=True)).mean(0)
-    if mean["xyz".index(up)] > MIN_UPRIGHT_COSINE:
-        return []
-    axis = int(np.abs(mean).argmax())
-    found = f"{'-' if mean[axis] < 0 else '+'}{'xyz'[axis]}"
-    return [
-        f"the trunk mostly points along {found}, not up (+{up}): unless the person lies or bends, set up in "
-        "capture.toml (y or z), or calibrate again with a world that stands upright"
-    ]
 
 
 def _check_agreement(capture: Capture, found: Measure, settings: CalibrationSettings) -> None:
@@ -273,4 +265,5 @@ def _monocular(capture: Capture, keypoints: np.ndarray) -> CalibrationReport:
     camera = capture.cameras[name]
     reasons = size_reasons(capture, name) + intrinsics_reasons(camera) + ground_reasons(camera, keypoints, capture.up)
     verdict = CameraVerdict("ok", None, None, None, None, 0.0, Timing.unknown("one camera"), tuple(reasons))
-    return CalibrationReport(capture.cameras, {name: verdict}, None, None, {}, {}, notes, capture.up, None)
+    found = doubts(capture, keypoints[None], None)
+    return CalibrationReport(capture.cameras, {name: verdict}, None, None, {}, {}, notes, capture.up, None, found)

@@ -20,6 +20,7 @@ from hnerf.capture.lens import pinhole
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
+DECIMALS = 4  # of pixels, metres, frames and shares: a tenth of a millimetre, far below what is measured
 SEVERITY = ("ok", "refined", "suspect", "rejected")
 
 
@@ -57,7 +58,7 @@ class CalibrationReport:
     cameras: those to use from here on, test cameras included; verdicts: of the training cameras; before, after: None
     with one training camera; held_out_px, outlines_px: cost of each correction that was tried, on held-out frames and
     by the person's outlines; notes: about the whole rig, and checks that could not be made; evidence: None with one
-    training camera.
+    training camera; doubts: what in the recording contradicts it.
     """
 
     cameras: dict[str, Camera]
@@ -69,6 +70,7 @@ class CalibrationReport:
     notes: tuple[str, ...]
     up: str
     evidence: Evidence | None
+    doubts: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -81,7 +83,7 @@ class CalibrationReport:
         out.mkdir(parents=True, exist_ok=True)
         rejected = {name for name, v in self.verdicts.items() if v.status == "rejected"}
         write_easymocap(out, [pinhole(camera) for name, camera in self.cameras.items() if name not in rejected])
-        (out / "report.json").write_text(json.dumps(_finite(self._to_dict()), indent=1, allow_nan=False))
+        (out / "report.json").write_text(json.dumps(_rounded(self._to_dict()), indent=1, allow_nan=False))
         status = {name: self.verdicts[name].status if name in self.verdicts else "unjudged" for name in self.cameras}
         draw_cameras(out / "cameras.png", list(self.cameras.values()), status, self.up, self.before, self.after)
         if self.evidence and self.after:
@@ -91,6 +93,7 @@ class CalibrationReport:
     def _to_dict(self) -> dict[str, Any]:
         return {
             "verdict": self.verdict,
+            "doubts": self.doubts,
             "cameras": {name: v.to_dict() for name, v in self.verdicts.items()},
             "unjudged_cameras": [name for name in self.cameras if name not in self.verdicts],
             "body_height_m": self.after and self.after.body_height_m,
@@ -120,13 +123,16 @@ class CalibrationReport:
         }
 
 
-def _finite(tree: Any) -> Any:
-    """Return the tree with NaN and infinity replaced by None, because JSON has neither."""
+def _rounded(tree: Any) -> Any:
+    """Return the tree with numbers to DECIMALS places, so that identical runs, whose sums differ in the last digits,
+    write identical reports; and with NaN and infinity replaced by None, because JSON has neither."""
     if isinstance(tree, dict):
-        return {key: _finite(value) for key, value in tree.items()}
+        return {key: _rounded(value) for key, value in tree.items()}
     if isinstance(tree, list | tuple):
-        return [_finite(value) for value in tree]
-    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
+        return [_rounded(value) for value in tree]
+    if isinstance(tree, float):
+        return round(tree, DECIMALS) + 0.0 if math.isfinite(tree) else None  # + 0.0: of -0.0
+    return tree
 
 
 def load_cameras(out: Path, capture: Capture) -> Capture:

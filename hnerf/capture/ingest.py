@@ -41,6 +41,7 @@ LAYOUTS: tuple[type[Layout], ...] = (
     EasyMocap,
     Pose2Sim,
 )  # the first that recognises a folder
+BLACK = 8  # grey level that noise and an encoder leave of black
 BAR_FRAMES = 5  # evenly spaced, in which black bars are searched
 
 log = logging.getLogger("hnerf.capture")
@@ -174,11 +175,13 @@ def _write_pixels(
     normaliser: Normaliser | None = None
     masks = layout.mask_files(lens.name)
     mask_paths = _per_frame(masks, frames, footage.frames, "masks") if masks else {}
+    brightest = 0
     for picture in footage.read(frames):
         source = picture.file or footage.path
         if normaliser is None:
             height_px, width_px = picture.rgb.shape[:2]
             normaliser = Normaliser.create(lens, (width_px, height_px), settings.max_side_px)
+        brightest = max(brightest, int(picture.rgb.max()))
         stem = f"{picture.frame:06d}"
         normaliser.write_image(picture.rgb, source, picture.file, out / "images" / lens.name / stem)
         if picture.frame in mask_paths:
@@ -186,6 +189,8 @@ def _write_pixels(
             recorded = mask.read() if isinstance(mask, StoredFrame) else read_image(mask).max(-1)
             path = mask.path if isinstance(mask, StoredFrame) else mask
             normaliser.write_mask(recorded, path, out / "masks" / lens.name / f"{stem}.png")
+    if brightest <= BLACK:
+        raise InputError(f"{footage.path}: all pictures are black; record again, or leave camera {lens.name} out")
     assert normaliser is not None  # a split has at least one training frame
     plate = layout.plate_file(lens.name)
     if plate:

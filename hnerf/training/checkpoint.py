@@ -1,10 +1,15 @@
 """Checkpoints: written to a temporary file and renamed, read without unpickling anything but tensors."""
 
+import logging
 import os
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from hnerf.errors import one_line, printable
+
+log = logging.getLogger("hnerf.training")
 
 NAME = "checkpoint.pt"
 
@@ -28,7 +33,18 @@ def remove_checkpoint(folder: Path) -> None:
         path.unlink()
 
 
-def load_checkpoint(folder: Path, device: torch.device) -> dict[str, Any] | None:
-    """Load the last checkpoint; None if there is none."""
+def load_checkpoint(folder: Path, device: torch.device, key: str) -> dict[str, Any] | None:
+    """Load the last checkpoint of the training with this key; None, with a warning where there is one, if it cannot be
+    read or is of another training. The next write replaces it."""
     path = folder / NAME
-    return torch.load(path, map_location=device, weights_only=True) if path.exists() else None
+    try:
+        state = torch.load(path, map_location=device, weights_only=True)
+    except FileNotFoundError:
+        return None
+    except Exception as error:  # torch and its unpickler answer damage with nearly anything
+        log.warning("%s: cannot be read (%s); the training starts again", path, printable(one_line(error)))
+        return None
+    if not isinstance(state, dict) or state.get("key") != key:
+        log.warning("%s: is of another training; this one starts again", path)
+        return None
+    return state

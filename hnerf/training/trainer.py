@@ -2,6 +2,7 @@
 against the finished field."""
 
 import dataclasses
+import hashlib
 import json
 import logging
 import math
@@ -64,6 +65,7 @@ class Trainer:
         processes: Distributed,
     ):
         started_at = time.monotonic()
+        self.key = _key(capture, masks, body, settings)
         self.settings, self.decisions = decide(SceneStatistics.of(capture, masks, body), settings)
         settings, self.out, self.processes = self.settings, out, processes
         device = processes.device
@@ -291,6 +293,7 @@ class Trainer:
     def _state(self) -> dict[str, Any]:
         bodies = self.scene.bodies
         return {
+            "key": self.key,
             "step": self.step,
             "skipped": self.skipped,
             "seconds": self.seconds,
@@ -306,7 +309,7 @@ class Trainer:
         }
 
     def _resume(self) -> None:
-        state = load_checkpoint(self.out, self.processes.device)
+        state = load_checkpoint(self.out, self.processes.device, self.key)
         if state is None:
             return
         self.step, self.skipped, self.seconds = state["step"], state["skipped"], state["seconds"]
@@ -377,6 +380,20 @@ def train(
     caller calls `remove_checkpoint`. Raises TrainingError if the surface collapses or the losses stay non-finite.
     """
     return Trainer(capture, masks, body, settings, out, processes or Distributed.join()).run()
+
+
+def _key(capture: Capture, masks: Masks, body: BodyFit, settings: TrainingSettings) -> str:
+    """Return a digest of what a training is made from, by which its checkpoint is known; of images, only which there
+    are, because the body was fitted to them."""
+    digest = hashlib.sha256(f"{settings.model_dump_json()} {capture.name} {capture.train_frames}".encode())
+    for camera in capture.cameras.values():
+        digest.update(f"{camera.name} {camera.width_px} {camera.height_px}".encode())
+        for numbers in (camera.K, camera.R, camera.t_m):
+            digest.update(np.ascontiguousarray(numbers, dtype=np.float64).tobytes())
+        digest.update(bytes((camera.name, frame) in masks for frame in capture.frames))
+    for tensor in (body.theta, body.root, body.rig.vertices_m):
+        digest.update(tensor.cpu().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _progress_message(row: dict[str, Any]) -> str:

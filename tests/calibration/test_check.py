@@ -69,8 +69,33 @@ def test_a_world_that_does_not_stand_upright_is_told(tmp_path: Path) -> None:
     turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # of the world: z to y
     fallen = [dataclasses.replace(camera, R=camera.R @ turn) for camera in ring(4)]
     capture = write_capture(tmp_path / "in", fallen, detections(ring(4), 2))
-    *_, note = check_calibration(capture, SETTINGS).notes
-    assert note.startswith("the trunk mostly points along -y, not up (+z)")
+    report = check_calibration(capture, SETTINGS)
+    (doubt,) = report.doubts
+    assert doubt.startswith("the trunk mostly points along -y, not up (+z)")
+    report.save(tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["doubts"] == [doubt]
+
+
+def test_keypoints_on_one_spot_are_refused(tmp_path: Path) -> None:
+    cameras = ring(4)
+    seen = detections(cameras, 2)
+    seen["c1"][..., :2] = seen["c1"][:, :, :1, :2]
+    with pytest.raises(InputError, match=r"camera c1: keypoints of a person lie within 0\.0 px; detect them again"):
+        check_calibration(write_capture(tmp_path, cameras, seen), SETTINGS)
+
+
+def test_runs_that_differ_in_the_last_digits_write_the_same_report(tmp_path: Path) -> None:
+    """Keypoints that differ by 1e-9 px stand for sums in another order. The artifact decides whether later stages are
+    found again, so that its camera files are the same, too."""
+    written = []
+    for name, nudge_px in (("one", 0.0), ("two", 1e-9)):
+        turned_camera = [turned(camera, 1.0) if i == 2 else camera for i, camera in enumerate(ring(4))]
+        seen = {c: points + np.array([nudge_px, -nudge_px, 0]) for c, points in detections(ring(4), 2).items()}
+        capture = write_capture(tmp_path / name, turned_camera, seen)
+        check_calibration(capture, SETTINGS).save(tmp_path / name / "out")
+        files = ("report.json", "intri.yml", "extri.yml")
+        written.append([(tmp_path / name / "out" / file).read_text() for file in files])
+    assert written[0] == written[1] and '"verdict": "refined"' in written[0][0]
 
 
 def test_without_legs_the_height_is_not_known(tmp_path: Path) -> None:

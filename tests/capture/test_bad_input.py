@@ -103,6 +103,10 @@ EASYMOCAP = {
     "frame without a number": (lambda f: (f / "images/01/000001.png").rename(f / "images/01/a.png"), "images/01/a.png"),
     "unreadable image": (lambda f: (f / "images/01/000001.png").write_bytes(b"nothing"), "images/01/000001.png"),
     "image cut short": (lambda f: os.truncate(f / "images/01/000001.png", 700), "images/01/000001.png"),
+    "pictures that are all black": (
+        lambda f: [rec.write_png(p, np.full((16, 24, 3), 5, np.uint8)) for p in (f / "images/02").iterdir()],
+        "images/02: all pictures are black",
+    ),
     "image of enormous size": (_huge_png, "images/02/000003.png"),
     "image of another size": (
         lambda f: rec.write_png(f / "images/01/000002.png", np.zeros((8, 8, 3), np.uint8)),

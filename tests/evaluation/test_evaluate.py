@@ -58,7 +58,8 @@ def scored(tmp_path_factory: pytest.TempPathFactory) -> Scored:
     (inputs.training_folder / "history.jsonl").write_text("\n".join(map(json.dumps, history)))
     (inputs.training_folder / "report.json").write_text(json.dumps({"device": "a processor", "seconds": 12.5}))
     cameras = {"a": {"status": "ok", "median_px": 0.5}, "b": {"status": "rejected", "median_px": 9.25}}
-    (inputs.calibration_folder / "report.json").write_text(json.dumps({"cameras": cameras, "notes": [HOSTILE]}))
+    findings = {"cameras": cameras, "notes": [HOSTILE], "doubts": ["left and right are exchanged"]}
+    (inputs.calibration_folder / "report.json").write_text(json.dumps(findings))
     out = base / "subject" / "evaluation"
     out.mkdir(parents=True)
     return base, evaluate(inputs, EvaluationSettings(max_meshes=1, report_rows=2), out)
@@ -322,3 +323,8 @@ def test_mesh_frames_are_spread_over_those_with_a_truth() -> None:
     assert mesh_frames(tuple(range(24)), truths, 4) == [0, 8, 12, 20]
     assert mesh_frames(tuple(range(24)), {}, 3) == [0, 12, 23]
     assert mesh_frames((1, 2), truths, 4) == [1, 2]
+
+
+def test_doubts_about_the_recording_stand_in_the_first_screen(scored: Scored) -> None:
+    page = (scored[0] / "subject" / "evaluation" / "report.html").read_text()
+    assert "left and right are exchanged" in page.partition("<nav>")[0]

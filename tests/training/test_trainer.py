@@ -1,5 +1,6 @@
 import json
 import math
+import os
 import re
 import resource
 from dataclasses import replace
@@ -301,11 +302,36 @@ def test_progress_is_told_in_words():
 
 
 def test_checkpoint_is_replaced_whole(tmp_path: Path):
-    save_checkpoint(tmp_path, {"step": 1, "x": torch.ones(2)})
-    save_checkpoint(tmp_path, {"step": 2, "x": torch.zeros(2)})
+    save_checkpoint(tmp_path, {"key": "mine", "step": 1, "x": torch.ones(2)})
+    save_checkpoint(tmp_path, {"key": "mine", "step": 2, "x": torch.zeros(2)})
     assert [p.name for p in tmp_path.iterdir()] == [NAME]
-    state = load_checkpoint(tmp_path, torch.device("cpu"))
+    state = load_checkpoint(tmp_path, torch.device("cpu"), "mine")
     assert state is not None and state["step"] == 2
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
+def test_a_damaged_checkpoint_is_discarded_with_a_warning(
+    share: float, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    save_checkpoint(tmp_path, {"key": "mine", "x": torch.ones(1000)})
+    os.truncate(tmp_path / NAME, int(share * (tmp_path / NAME).stat().st_size))
+    assert load_checkpoint(tmp_path, torch.device("cpu"), "mine") is None
+    (warning,) = caplog.messages
+    assert "checkpoint.pt: cannot be read" in warning and "\n" not in warning
+
+
+def test_a_checkpoint_of_another_training_is_discarded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    save_checkpoint(tmp_path, {"key": "theirs", "step": 1})
+    assert load_checkpoint(tmp_path, torch.device("cpu"), "mine") is None
+    assert "checkpoint.pt: is of another training" in caplog.text
+
+
+def test_other_settings_and_poses_are_another_training(tmp_path: Path) -> None:
+    capture, masks, body = record(tmp_path / "capture")
+    moved = replace(body, root=body.root + 1e-3)
+    scenes = [(body, TINY), (body, TINY.model_copy(update={"seed": 1})), (moved, TINY)]
+    keys = {trainer_module._key(capture, masks, used, settings) for used, settings in scenes}
+    assert len(keys) == 3 and trainer_module._key(capture, masks, body, TINY) in keys
 
 
 def test_a_full_disk_is_an_os_error(tmp_path: Path):

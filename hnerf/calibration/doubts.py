@@ -1,0 +1,132 @@
+"""Doubts about a recording that the person in it raises: the cameras may agree on a mistake that all of them share."""
+
+import logging
+
+import numpy as np
+
+from hnerf.capture.capture import Capture
+from hnerf.errors import InputError
+from hnerf.evenly_spaced import evenly_spaced
+
+log = logging.getLogger("hnerf.calibration")
+
+MIN_PERSON_PX = 4.0  # median height of a person at least; smaller, all keypoints are on one spot
+MIN_UPRIGHT_COSINE = 0.5  # mean cosine between trunk and up; below it the person lies or bends, or `up` is wrong
+EXCHANGED_COSINE = -0.3  # median cosine between left as labelled, and left as face and feet show it
+LOOKED_AT = 5  # frames of each camera, evenly spaced, whose keypoints are compared with the person's pixels
+PLATE_DIFFERENCE = 30  # grey levels between image and clean plate that show the person
+MIRRORED_GAIN = 0.3  # share of keypoints that mirroring brings onto the person
+# BODY_25
+NOSE, NECK, MID_HIP, EARS = 0, 1, 8, (17, 18)
+LEFT, RIGHT = (5, 12), (2, 9)  # shoulder, hip
+TOES, HEELS = (19, 22), (21, 24)
+
+
+def check_spread(capture: Capture, keypoints: np.ndarray) -> None:
+    """Raise InputError where all keypoints (C, frames, 25, 3) of a camera's person lie on one spot."""
+    for name, found in zip(capture.train_cameras, keypoints, strict=True):
+        seen = np.where(found[..., 2:] > 0, found[..., :2], np.nan)
+        seen = seen[np.isfinite(seen).any((1, 2))]
+        heights_px = (np.nanmax(seen, 1) - np.nanmin(seen, 1)).max(-1)
+        if len(seen) and np.median(heights_px) < MIN_PERSON_PX:
+            raise InputError(
+                f"{capture.name}: camera {name}: keypoints of a person lie within {np.median(heights_px):.1f} px; "
+                "detect them again"
+            )
+
+
+def doubts(capture: Capture, keypoints: np.ndarray, points_m: np.ndarray | None) -> tuple[str, ...]:
+    """Return in words, and log, what contradicts the recording. keypoints (C, frames, 25, 3) of the training cameras;
+    points_m (frames, 25, 3), None with one camera."""
+    found = mirrored(capture, keypoints)
+    if points_m is not None:
+        found = [*_not_upright(points_m, capture.up), *exchanged_sides(points_m), *found]
+    for line in found:
+        log.warning("%s: %s", capture.name, line)
+    return tuple(found)
+
+
+def _not_upright(points_m: np.ndarray, up: str) -> list[str]:
+    """Return a doubt if the trunk, from mid-hip to neck, does not point along the world's `up`."""
+    trunk_m = points_m[:, NECK] - points_m[:, MID_HIP]
+    trunk_m = trunk_m[np.isfinite(trunk_m).all(1)]
+    if not len(trunk_m):
+        return []
+    mean = (trunk_m / np.linalg.norm(trunk_m, axis=1, keepdims=True)).mean(0)
+    if mean["xyz".index(up)] > MIN_UPRIGHT_COSINE:
+        return []
+    axis = int(np.abs(mean).argmax())
+    found = f"{'-' if mean[axis] < 0 else '+'}{'xyz'[axis]}"
+    return [
+        f"the trunk mostly points along {found}, not up (+{up}): unless the person lies or bends, set up in "
+        "capture.toml (y or z), or calibrate again with a world that stands upright"
+    ]
+
+
+def exchanged_sides(points_m: np.ndarray) -> list[str]:
+    """Return a doubt if what is labelled left lies to the person's right.
+
+    Face and feet show which way is forward whatever the labels are: from the ears' middle to the nose, and from heels
+    to toes. Left is up x forward, with up from mid-hip to neck.
+    """
+    forward = _direction(points_m[:, EARS].mean(1), points_m[:, NOSE])
+    feet = _direction(points_m[:, HEELS].mean(1), points_m[:, TOES].mean(1))
+    forward = np.where(np.isnan(forward), 0, forward) + np.where(np.isnan(feet), 0, feet)
+    up = _direction(points_m[:, MID_HIP], points_m[:, NECK])
+    left = np.cross(up, forward)
+    labelled = _direction(points_m[:, RIGHT].mean(1), points_m[:, LEFT].mean(1))
+    cosine = (labelled * left).sum(1) / np.linalg.norm(left, axis=1).clip(1e-9)
+    cosine = cosine[np.isfinite(cosine) & (np.linalg.norm(left, axis=1) > 0)]
+    if not len(cosine) or np.median(cosine) > EXCHANGED_COSINE:
+        return []
+    return [
+        "left and right are exchanged: by face and feet, the side that keypoints call left is the person's right; "
+        "exchange them in the keypoint files, or detect again in pictures that are not mirrored"
+    ]
+
+
+def _direction(start_m: np.ndarray, end_m: np.ndarray) -> np.ndarray:
+    """Return unit vectors (frames, 3), NaN where an end is not known."""
+    return (end_m - start_m) / np.linalg.norm(end_m - start_m, axis=-1, keepdims=True).clip(1e-9)
+
+
+def mirrored(capture: Capture, keypoints: np.ndarray) -> list[str]:
+    """Return a doubt if keypoints (C, frames, 25, 3) lie on the person only when they are mirrored left to right.
+
+    A ring of cameras cannot tell: mirrored in all of them, a person stands turned about the ring's axis. The person's
+    pixels are those of masks that came with the recording or from a network, else what differs from a clean plate.
+    """
+    on, on_mirrored = [], []
+    for name, found in zip(capture.train_cameras, keypoints, strict=True):
+        rows = range(len(capture.frames))
+        for row in evenly_spaced(tuple(rows), LOOKED_AT):
+            person = _person(capture, name, capture.frames[row])
+            points = found[row][found[row, :, 2] > 0, :2]
+            if person is None or not len(points):
+                continue
+            x, y = points.round().astype(int).T
+            width_px = person.shape[1]
+            inside = (x >= 0) & (x < width_px) & (y >= 0) & (y < len(person))
+            x, y = x[inside], y[inside]
+            on += person[y, x].tolist()
+            on_mirrored += person[y, width_px - 1 - x].tolist()
+    if not on or np.mean(on_mirrored) < np.mean(on) + MIRRORED_GAIN:
+        return []
+    return [
+        f"{np.mean(on):.0%} of the keypoints lie on the person, mirrored left to right {np.mean(on_mirrored):.0%}: "
+        "they belong to mirrored pictures; detect them again in these"
+    ]
+
+
+def _person(capture: Capture, camera: str, frame: int) -> np.ndarray | None:
+    """Return which pixels show the person, (H, W) bool; None where nothing tells."""
+    mask = capture.given_mask(camera, frame)
+    if mask is not None:
+        return mask
+    likely = capture.person_probability(camera, frame)
+    if likely is not None:
+        return likely > 0.5
+    plate = capture.background(camera)
+    if plate is None:
+        return None
+    return np.abs(capture.image(camera, frame).astype(int) - plate).max(-1) > PLATE_DIFFERENCE
