@@ -12,9 +12,11 @@ from prefect.tasks import exponential_backoff
 
 from hnerf.models import has_model
 from tasks.policy import Input, StorePolicy, is_transient, stage_key
+from tasks.quiet import quieten
 from tasks.store import Artifact, Store
 
 log = logging.getLogger("hnerf.stage")
+quieten()
 
 P = ParamSpec("P")
 NETWORKS = "networks"  # beside a stage's own inputs, in its key

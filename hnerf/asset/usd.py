@@ -3,9 +3,11 @@
 Y up, metres; time codes are the capture's frame numbers. Matrices are transposed on the way in (USD has row vectors).
 """
 
+import struct
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, Vt
@@ -18,6 +20,7 @@ from hnerf.geometry.camera import Camera
 ROOT = Sdf.Path("/Avatar")
 APERTURE = 0.36  # film gate width in tenths of a scene unit, read as 36 mm where a unit is a metre
 TEXTURE_NAME = "texture.png"
+FIRST_TIME = bytes([0, 0, 0x21, 0])  # midnight, 1 January 1980, in ZIP's time and date
 
 
 def write_skinned(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps: float) -> None:
@@ -209,6 +212,23 @@ def _package(stage: Usd.Stage, avatar: StagedAvatar, path: Path) -> None:
     write_image(layer.parent / TEXTURE_NAME, avatar.texture)
     if not UsdUtils.CreateNewARKitUsdzPackage(str(layer), str(path)):
         raise OSError(f"{path}: USD could not write the package; is the disk full?")
+    _forget_times(path)
+
+
+def _forget_times(path: Path) -> None:
+    """Set the times of all files in a package to the first that ZIP knows, so that the same avatar is the same bytes.
+
+    APPNOTE.TXT of PKWARE, 4.3.7 and 4.3.12: time and date lie at byte 10 of a local header and at byte 12 of an entry
+    of the directory, whose name, extra field and comment have the lengths at byte 28.
+    """
+    package = bytearray(path.read_bytes())
+    with ZipFile(path) as archive:
+        at, entries = archive.start_dir, archive.infolist()
+    for entry in entries:
+        for place in (entry.header_offset + 10, at + 12):
+            package[place : place + 4] = FIRST_TIME
+        at += 46 + sum(struct.unpack_from("<3H", package, at + 28))
+    path.write_bytes(package)
 
 
 def _vec3f(values: np.ndarray) -> Vt.Vec3fArray:

@@ -1,5 +1,8 @@
 import dataclasses
+import time
+from collections.abc import Callable
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -46,6 +49,20 @@ def with_shapes(mesh: UsdGeom.Mesh, motion: UsdSkel.AnimQuery, frame: int) -> np
         shape = UsdSkel.BlendShape(mesh.GetPrim().GetStage().GetPrimAtPath(path))
         points += weights[name] * np.array(shape.GetOffsetsAttr().Get())
     return points
+
+
+@pytest.mark.parametrize("write", [write_skinned, write_cache])
+def test_the_same_avatar_is_the_same_bytes_at_any_time(
+    write: Callable[..., None], staged: StagedAvatar, tmp_path: Path
+) -> None:
+    """ZIP counts in steps of two seconds."""
+    for name in ("one", "two"):
+        write(tmp_path / f"{name}.usdz", staged, [side_camera()], 10.0)
+        time.sleep(2.0 if name == "one" else 0)
+    assert (tmp_path / "one.usdz").read_bytes() == (tmp_path / "two.usdz").read_bytes()
+    with ZipFile(tmp_path / "one.usdz") as package:
+        assert package.testzip() is None
+        assert {entry.date_time for entry in package.infolist()} == {(1980, 1, 1, 0, 0, 0)}
 
 
 def test_usd_skins_as_we_do(staged: StagedAvatar, tmp_path: Path) -> None:

@@ -1,3 +1,4 @@
+import logging
 import shutil
 from pathlib import Path
 
@@ -8,6 +9,7 @@ from prefect.context import FlowRunContext
 
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
+from tasks.quiet import LOGGERS
 from tasks.source import Source, read_capture
 from tasks.stage import Stage
 from tasks.store import Store
@@ -130,3 +132,23 @@ def test_only_transient_faults_are_tried_again(
     else:
         one_flaky(tmp_path, read_capture(source.root)[0])
     assert calls(tmp_path) == attempts * ["flaky"]
+
+
+def test_a_refusal_is_logged_without_tracebacks(
+    prefect_api: str, tmp_path: Path, source: Source, capfd: pytest.CaptureFixture[str]
+) -> None:
+    lines: list[str] = []
+    handler = logging.Handler()
+    handler.emit = lambda record: lines.append(logging.Formatter().format(record))  # type: ignore[method-assign]
+    (source.root / "text").write_text("bad")
+    loggers = [logging.getLogger(name) for name in LOGGERS]
+    for logger in loggers:
+        logger.addHandler(handler)
+    try:
+        with pytest.raises(InputError):
+            one_flaky(tmp_path, read_capture(source.root)[0])
+    finally:
+        for logger in loggers:
+            logger.removeHandler(handler)
+    assert any("a.jpg: bad" in line for line in lines)
+    assert "Traceback" not in "\n".join(lines) + capfd.readouterr().err
