@@ -342,11 +342,12 @@ def _merged(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 def named_file(name: str, folder: Path, one: str, many: str) -> Path:
     """Return the path of the YAML file of this name in a folder, or else `name` itself as a path. Raises InputError,
     which lists the files of the folder, where there is neither."""
-    path = folder / f"{name}.yaml" if (folder / f"{name}.yaml").exists() else Path(name)
-    if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
-        raise InputError(f"{name}: no such {one} or file; {many} are {known}")
-    return path
+    with suppress(OSError, ValueError):  # of a name that is too long, or holds a NUL
+        for path in (folder / f"{name}.yaml", Path(name)):
+            if path.is_file():
+                return path
+    known = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
+    raise InputError(f"{name[:80]}: no such {one} or file; {many} are {known}")
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -73,6 +73,8 @@ class Store:
     def find(self, stage: str, key: str) -> Artifact | None:
         """Return the artifact if it is recorded and intact, else None."""
         record, folder = self._path(stage, key, ".json"), self._path(stage, key)
+        if not record.is_file():  # nor a pipe or a device, from which reading never ends
+            return None
         try:
             artifact = Artifact.model_validate({"root": folder, **json.loads(record.read_bytes())})
             damaged = artifact.damaged_file()

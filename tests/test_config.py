@@ -115,3 +115,9 @@ def test_errors_in_unions_name_the_key_as_it_is_set(override: str, message: str)
 def test_another_kind_of_field_keeps_nothing_of_the_kind_before() -> None:
     changed = load_settings("demo", ["training.pose_learning_rate=0", "training.field.kind=nerf"]).training
     assert changed.field == NerfSettings()
+
+
+@pytest.mark.parametrize("name", ["a" * 5000, "a\0b", "fa/" * 2000])
+def test_a_name_that_no_file_can_have_is_no_preset(name: str) -> None:
+    with pytest.raises(InputError, match="no such preset or file"):
+        load_settings(name)

@@ -19,6 +19,7 @@ import scipy.sparse
 from hnerf.capture.safe_io import read_bytes
 from hnerf.errors import InputError
 
+MAX_CHARACTER = 0x10FFFF
 MAX_ITEMS = 10_000_000  # of lists; numbers in arrays do not count
 MAX_BYTES = 1_000_000_000  # the largest SMPL-X model has half of that
 _DTYPES = re.compile(r"[biufOSU?][0-9]*")
@@ -107,8 +108,7 @@ class _Array(_StandIn):
         _, shape, kind, column_major, data = self.state
         dtype = _plain(kind, done)
         if dtype.kind != "O":
-            data = data.encode("latin1") if isinstance(data, str) else data
-            flat = np.frombuffer(data, dtype)
+            flat = _from_bytes(data, dtype)
         else:
             flat = np.empty(len(data), object)
             flat[:] = [_plain(item, done) for item in data]
@@ -122,7 +122,7 @@ class _Scalar(_StandIn):
 
     def plain(self, done: dict[int, Any]) -> Any:
         dtype, data = self.arguments
-        return np.frombuffer(data.encode("latin1") if isinstance(data, str) else data, _plain(dtype, done))[0]
+        return _from_bytes(data, _plain(dtype, done))[0]
 
 
 class _Sparse(_StandIn):
@@ -141,6 +141,19 @@ class _Chumpy(_StandIn):
 
     def plain(self, done: dict[int, Any]) -> Any:
         return np.asarray(_plain(self.state["x"], done))
+
+
+def _from_bytes(data: Any, dtype: np.dtype[Any]) -> np.ndarray:
+    """Return an array of the items that bytes, or text of Python 2, hold. numpy trusts characters: Python fails later
+    on those that Unicode does not have."""
+    flat = np.frombuffer(data.encode("latin1") if isinstance(data, str) else data, dtype)
+    if (
+        dtype.kind == "U"
+        and flat.size
+        and flat.view(np.dtype("u4").newbyteorder(dtype.byteorder)).max() > MAX_CHARACTER
+    ):
+        raise pickle.UnpicklingError("characters that Unicode does not have")
+    return flat
 
 
 def _reconstructed(kind: Any, *_: Any) -> _StandIn:

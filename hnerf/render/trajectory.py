@@ -102,7 +102,7 @@ def _json_lenses(path: Path) -> list[Lens]:
             )
             for k, entry in enumerate(entries)
         ]
-    except (KeyError, IndexError, TypeError, ValueError) as error:
+    except (KeyError, IndexError, OverflowError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: not a list of cameras ({error}); each needs K (3x3), R (3x3), t_m (3), size_px (2)"
         ) from None

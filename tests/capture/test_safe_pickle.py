@@ -151,6 +151,14 @@ def test_an_npy_file_of_anything_but_one_object_is_refused(payload: object, tmp_
         read_pickled_npy(tmp_path / "a.npy")
 
 
+def test_characters_that_unicode_does_not_have_are_refused(tmp_path: Path) -> None:
+    data = pickle.dumps(np.array(["abc", "d"]), 2)
+    assert data.count(b"c\x00\x00\x00") == 1
+    (tmp_path / "a.pkl").write_bytes(data.replace(b"c\x00\x00\x00", b"c\x00\x00\x7f"))
+    with pytest.raises(InputError, match="characters that Unicode does not have"):
+        read_pickle(tmp_path / "a.pkl")
+
+
 def test_a_huge_memo_index_allocates_nothing(tmp_path: Path) -> None:
     (tmp_path / "a.pkl").write_bytes(b"\x80\x02]r\xff\xff\xff\x7f.")
     assert read_pickle(tmp_path / "a.pkl") == []

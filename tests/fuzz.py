@@ -1,0 +1,372 @@
+"""Damage small captures of every layout, and other files that strangers hand over, at random, and read them:
+
+    python tests/fuzz.py [--cases 10000] [--seed 0] [--seconds 60]
+    python tests/fuzz.py --case 1234                    # one case again, with its traceback
+
+A case is good if the file is read, or refused by an InputError; in at most two seconds and 500 MB. Anything else is a
+failure: another exception, a crash of the process, a hang. The exit status is 1 if there is one.
+"""
+
+import argparse
+import collections
+import contextlib
+import json
+import logging
+import multiprocessing
+import multiprocessing.connection
+import os
+import pickle
+import random
+import re
+import resource
+import shutil
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import h5py
+import numpy as np
+
+from hnerf.capture.formats.export import write_cameras
+from hnerf.capture.ingest import ingest, recognise
+from hnerf.config import CaptureSettings, load_settings
+from hnerf.errors import InputError
+from hnerf.render.motion import _read_amass
+from hnerf.render.trajectory import read_camera_path
+from tasks.store import Store
+from tests.capture import recordings as rec
+from tests.capture.test_zjumocap import write_parameters, write_zju
+
+MAX_SECONDS, MAX_BYTES, HANG_S = 2.0, 500_000_000, 20.0
+ROOM_BYTES = 3_000_000_000  # more than MAX_BYTES, because most of what libraries map they never use
+START_S = 60.0  # of a process, on a busy machine
+FRAMES = 2
+
+Read = Callable[[Path, Path], object]  # a folder, and an empty one for results
+
+
+@dataclass(frozen=True)
+class Reader:
+    """Something that reads files of strangers. write: makes a sound folder; read: reads it."""
+
+    name: str
+    write: Callable[[Path], object]
+    read: Read
+
+
+def _ingest(folder: Path, out: Path) -> object:
+    return ingest(folder, CaptureSettings(), out)
+
+
+def _easymocap(folder: Path) -> None:
+    """Write what an EasyMocap folder can hold: masks, a plate, keypoints of both kinds, capture.toml."""
+    folder.mkdir()
+    rec.write_calibration(folder, distortion=(0.1, 0, 0, 0, 0))
+    for camera in rec.CAMERAS:
+        for frame in range(FRAMES):
+            stem = f"{frame:06d}"
+            rec.write_png(folder / "images" / camera / f"{stem}.png", rec.picture(camera, frame))
+            rec.write_png(folder / "masks" / camera / f"{stem}.png", np.full((rec.HEIGHT, rec.WIDTH, 3), 255, np.uint8))
+        rec.write_png(folder / "background" / f"{camera}.png", rec.picture(camera, 9))
+    person = np.tile([4.0, 5.0, 0.5], (25, 1))
+    for frame in range(FRAMES):
+        rec.write_keypoints(folder / "openpose" / "01" / f"{frame:06d}_keypoints.json", [person])
+    results = [{"image_id": f, "keypoints": person.ravel().tolist(), "score": 1.0} for f in range(FRAMES)]
+    (folder / "keypoints").mkdir()
+    (folder / "keypoints" / "02.json").write_text(json.dumps(results))
+    (folder / "capture.toml").write_text(
+        'name = "ada"\nfps = 25.0\nup = "z"\nunits = "m"\n[cameras]\ntrain = ["01", "02"]\n[frames]\ntrain = [0, 1]\n'
+    )
+
+
+def _with_cameras(kind: str) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        _easymocap(folder)
+        write_cameras(folder, list(recognise(folder).lenses().values()), kind)
+        for name in ("intri.yml", "extri.yml", "capture.toml"):
+            (folder / name).unlink()
+        if kind == "caliscope":
+            for part in ("images", "masks", "openpose"):
+                for i, camera in enumerate(rec.CAMERAS):
+                    with contextlib.suppress(FileNotFoundError):
+                        (folder / part / camera).rename(folder / part / f"cam_{i}")
+
+    return write
+
+
+def _colmap_binary(folder: Path) -> None:
+    import pycolmap
+
+    _with_cameras("colmap")(folder)
+    model = folder / "sparse" / "0"
+    pycolmap.Reconstruction(str(model)).write_binary(str(model))
+    for path in model.glob("*.txt"):
+        path.unlink()
+
+
+def _boards(folder: Path) -> None:
+    """Write a recording with footage of a board, as Caliscope names it."""
+    _with_cameras("caliscope")(folder)
+    for camera in ("cam_0", "cam_1"):
+        for frame in range(FRAMES):
+            path = folder / "calibration" / "extrinsic" / camera / f"{frame}.png"
+            rec.write_png(path, rec.picture("01", frame))
+    rows = ["sync_index,cam_id,frame_time", *(f"{f},{c},{f}.0" for f in range(FRAMES) for c in range(2))]
+    (folder / "calibration" / "extrinsic" / "timestamps.csv").write_text("\n".join(rows))
+    (folder / "charuco.toml").write_text(
+        'columns = 4\nrows = 5\nboard_height = 10.0\nboard_width = 8.0\ndictionary = "DICT_4X4_50"\nunits = "cm"\n'
+        "aruco_scale = 0.75\nsquare_size_override_cm = 5.4\ninverted = false\n"
+    )
+
+
+def _zju(folder: Path) -> None:
+    folder.mkdir()
+    write_zju(folder)
+    write_parameters(folder / "new_params" / "0.npy", np.zeros(72))
+
+
+def _peoplesnapshot(folder: Path) -> None:
+    folder.mkdir()
+    rec.write_video(folder / "ada.mp4", FRAMES, (32, 32))
+    camera = {"camera_f": np.array([50.0, 50]), "camera_c": np.array([15.5, 15.5]), "camera_k": np.zeros(5)}
+    camera |= {"camera_t": np.zeros(3), "camera_rt": np.zeros(3), "width": 32, "height": 32}
+    (folder / "camera.pkl").write_bytes(pickle.dumps(camera, 2))
+    files = {
+        "masks": {"masks": np.ones((FRAMES, 32, 32), np.uint8)},
+        "keypoints": {"keypoints": np.tile([5.0, 6.0, 0.8], (FRAMES, 18))},
+        "reconstructed_poses": {"pose": np.ones((2, 72)), "trans": np.ones((2, 3)), "betas": np.zeros(10)},
+    }
+    for name, arrays in files.items():
+        with h5py.File(folder / f"{name}.hdf5", "w") as file:
+            for key, array in arrays.items():
+                file.create_dataset(key, data=array, chunks=True, compression="gzip")
+
+
+def _motion(folder: Path) -> None:
+    folder.mkdir()
+    np.savez_compressed(folder / "a.npz", poses=np.ones((3, 156)), trans=np.zeros((3, 3)), mocap_framerate=120.0)
+
+
+def _camera_path(folder: Path) -> None:
+    folder.mkdir()
+    camera = {"K": rec.K, "R": np.eye(3).tolist(), "t_m": [0, 0, 3], "size_px": [24, 16]}
+    (folder / "path.json").write_text(json.dumps([camera, camera]))
+
+
+def _preset(folder: Path) -> None:
+    folder.mkdir()
+    text = "based_on: fast\ntraining:\n  steps: 100\n  field: {samples: 16}\ncapture:\n  max_frames: 10\n"
+    (folder / "mine.yaml").write_text(text)
+
+
+def _store(folder: Path) -> None:
+    Store(folder).get_or_compute("fit", "k", lambda out: {"letters": float((out / "a").write_text("abc"))})
+    (folder / "fit" / "k.lock").unlink()
+
+
+READERS = (
+    Reader("easymocap", _easymocap, _ingest),
+    Reader("pose2sim", rec.write_pose2sim, _ingest),
+    Reader("colmap text", _with_cameras("colmap"), _ingest),
+    Reader("colmap binary", _colmap_binary, _ingest),
+    Reader("caliscope", _boards, _ingest),
+    Reader("aniposelib", _with_cameras("aniposelib"), _ingest),
+    Reader("zju-mocap", _zju, _ingest),
+    Reader("peoplesnapshot", _peoplesnapshot, _ingest),
+    Reader("motion", _motion, lambda folder, out: _read_amass(folder / "a.npz")),
+    Reader("camera path", _camera_path, lambda folder, out: read_camera_path(folder / "path.json", (24, 16))),
+    Reader("preset", _preset, lambda folder, out: load_settings(str(folder / "mine.yaml"))),
+    Reader("store", _store, lambda folder, out: Store(folder).find("fit", "k")),
+)
+
+TOKENS = (
+    b"nan", b"-inf", b"1e308", b"1e-300", b"-1", b"9" * 5000, b"\x00", b"\x1b[2J", b"[", b"]", b"{", b"[" * 3000,
+    b"null", b"true", b"\xff\xff\xff\xff", b"\x00\x00\x00\x80", b"\xff\xfe", b"../", b"&a [*a]", b"!!int", b"a." * 2000,
+    b"\n", b'"', b"'''", b"#", b"<<: ", b"%YAML", b"\xe2\x80\xae", b"a" * 200_000, b"=", b",",
+    b"- ", b": ", b"(", b"1" * 400,
+)  # fmt: skip
+NUMBER = re.compile(rb"-?\d+(\.\d*)?(e[+-]?\d+)?")
+
+
+def damaged(data: bytes, others: list[bytes], rng: random.Random) -> tuple[str, bytes]:
+    """Return what was done to a file's bytes, and the result. others: the bytes of other files."""
+    at, length = rng.randrange(len(data) + 1), rng.choice((1, 2, 4, 8, 64, 1024))
+    token = rng.choice(TOKENS)
+    numbers = [found.span() for found in NUMBER.finditer(data[:20_000])] or [(at, at)]
+    start, end = rng.choice(numbers)
+    flipped = bytearray(data)
+    for _ in range(rng.choice((1, 1, 4, 16)) if data else 0):
+        flipped[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    other = rng.choice(others)
+    return rng.choice((
+        ("bits flipped", bytes(flipped)),
+        ("random bytes", data[:at] + rng.randbytes(length) + data[at + length :]),
+        ("cut short", data[:at]),
+        ("a piece lost", data[:at] + data[at + length :]),
+        ("a piece twice", data[: at + length] + data[at:]),
+        ("token put in", data[:at] + token + data[at:]),
+        ("token in place", data[:at] + token + data[at + len(token) :]),
+        ("another number", data[:start] + token + data[end:]),
+        ("a piece of another file", data[:at] + other[:length] + data[at + length :]),
+        ("another file", other),
+        ("empty", b""),
+    ))  # fmt: skip
+
+
+def replace(path: Path, rng: random.Random) -> str:
+    """Put something that is no file into a file's place; return what was done."""
+    path.unlink()
+    done = rng.choice(("missing", "a folder", "a pipe", "a link", "a device"))
+    if done == "a folder":
+        path.mkdir()
+    elif done == "a pipe":
+        os.mkfifo(path)
+    elif done != "missing":
+        path.symlink_to("/etc/hostname" if done == "a link" else "/dev/zero")
+    return done
+
+
+class Workshop:
+    """Sound folders of all readers, one of which is damaged at a time."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (mapped + ROOM_BYTES,) * 2)  # a MemoryError, not a machine that swaps
+        logging.disable(logging.CRITICAL)
+        for reader in READERS:
+            reader.write(root / reader.name)
+        self.files = {r.name: sorted(p for p in (root / r.name).rglob("*") if p.is_file()) for r in READERS}
+        for reader in READERS:  # sound, they are read
+            reader.read(root / reader.name, root / "out")
+            shutil.rmtree(root / "out", ignore_errors=True)
+        self.content = {path: path.read_bytes() for paths in self.files.values() for path in paths}
+
+    def try_case(self, seed: int, case: int) -> tuple[str, str | None]:
+        """Return what a case was, and its failure in words or None."""
+        rng = random.Random(f"{seed} {case}")
+        reader = READERS[case % len(READERS)]
+        path = rng.choice(self.files[reader.name])
+        if rng.random() < 0.03:
+            done = replace(path, rng)
+        else:
+            done, data = damaged(self.content[path], list(self.content.values()), rng)
+            path.write_bytes(data)
+        what = f"case {case}: {path.relative_to(self.root)}: {done}"
+        out = self.root / "out"
+        before, began = _reset_peak_bytes(), time.perf_counter()
+        failure = None
+        try:
+            reader.read(self.root / reader.name, out)
+        except InputError as error:
+            if "\n" in str(error) or not str(error).isprintable():
+                failure = "the message is not one printable line"
+        except Exception as error:
+            failure = f"{type(error).__name__}: {str(error)[:200]}\n{traceback.format_exc()}"
+        seconds, grown = time.perf_counter() - began, _peak_bytes() - before
+        if seconds > MAX_SECONDS:
+            failure = f"{failure or ''} took {seconds:.1f} s"
+        if grown > MAX_BYTES:
+            failure = f"{failure or ''} took {grown / 1e6:.0f} MB"
+        shutil.rmtree(out, ignore_errors=True)
+        self._mend(path)
+        return what, failure
+
+    def _mend(self, path: Path) -> None:
+        if path.is_dir() and not path.is_symlink():
+            path.rmdir()
+        path.unlink(missing_ok=True)
+        path.write_bytes(self.content[path])
+
+
+def _reset_peak_bytes() -> int:
+    """Forget the peak of this process's memory; return what it has now."""
+    Path("/proc/self/clear_refs").write_text("5")
+    return _peak_bytes()
+
+
+def _peak_bytes() -> int:
+    """Return the peak of this process's memory since it was forgotten."""
+    found = re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())
+    assert found
+    return 1024 * int(found[1])
+
+
+def _work(root: Path, seed: int, cases: range, results: multiprocessing.connection.Connection) -> None:
+    """Try cases, and send each before and after it is tried."""
+    workshop = Workshop(root)
+    for case in cases:
+        results.send((case, None, None))
+        what, failure = workshop.try_case(seed, case)
+        results.send((case, what, failure))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How many cases were tried, and the failures in words."""
+
+    cases: int
+    failures: list[str]
+
+
+def fuzz(cases: int, seed: int = 0, seconds: float = float("inf")) -> Outcome:
+    """Try cases in a process of their own, until there are enough or the time is over. A crash or a hang is a failure
+    of the case that was tried, and the next process begins after it."""
+    began, failures, case, tried = time.monotonic(), [], 0, 0
+    spawn = multiprocessing.get_context("spawn")
+    while case < cases and time.monotonic() - began < seconds:
+        with tempfile.TemporaryDirectory(prefix="hnerf-fuzz-") as root:
+            receive, send = spawn.Pipe(duplex=False)
+            worker = spawn.Process(target=_work, args=(Path(root), seed, range(case, cases), send), daemon=True)
+            worker.start()
+            send.close()
+            try:
+                while time.monotonic() - began < seconds:
+                    if not receive.poll(HANG_S + START_S):
+                        failures.append(f"case {case}: hangs")
+                        break
+                    case, what, failure = receive.recv()
+                    if what:
+                        tried, case = tried + 1, case + 1
+                        failures += [f"{what}: {failure}"] if failure else []
+            except EOFError:
+                worker.join()
+                if worker.exitcode:
+                    failures.append(f"case {case}: the process ended with {worker.exitcode}")
+            if worker.is_alive():
+                worker.kill()
+                worker.join()
+            case += worker.exitcode != 0
+    return Outcome(tried, failures)
+
+
+def main() -> int:
+    """Try what is asked for; the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--cases", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="try no more after this time")
+    parser.add_argument("--case", type=int, help="try this one alone")
+    asked = parser.parse_args()
+    if asked.case is not None:
+        with tempfile.TemporaryDirectory(prefix="hnerf-fuzz-") as root:
+            what, failure = Workshop(Path(root)).try_case(asked.seed, asked.case)
+        print(what, failure or "is good", sep="\n")
+        return 1 if failure else 0
+    began = time.monotonic()
+    found = fuzz(asked.cases, asked.seed, asked.seconds)
+    for failure in found.failures:
+        print(failure, flush=True)
+    kinds = collections.Counter(failure.split(": ")[-1].splitlines()[0][:60] for failure in found.failures)
+    print(f"{found.cases} cases in {time.monotonic() - began:.0f} s, {len(found.failures)} failures", *kinds.items())
+    return 1 if found.failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,45 @@
+"""The fuzz program for a few seconds; and that it sees what it looks for."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from hnerf.errors import InputError
+from tests import fuzz as module
+from tests.fuzz import READERS, Reader, Workshop, fuzz
+
+SECONDS = 15.0
+
+
+def test_damaged_files_are_read_or_refused() -> None:
+    """Otherwise `python tests/fuzz.py --case N` repeats what failed; make it a test of that reader."""
+    found = fuzz(cases=2000, seconds=SECONDS)
+    assert found.failures == []
+    assert found.cases > 10 * len(READERS)
+
+
+def _read(folder: Path, out: Path) -> object:
+    try:
+        found = json.loads((folder / "a.json").read_text())
+    except (OSError, RecursionError, ValueError):
+        raise InputError("a.json: is not JSON") from None
+    if found != [1, 2, 3]:
+        raise KeyError("another list")
+    return found
+
+
+def _write(folder: Path) -> None:
+    folder.mkdir()
+    (folder / "a.json").write_text("[1, 2, 3]")
+
+
+def test_another_exception_is_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another number in the list raises a KeyError; damaged brackets are refused."""
+    monkeypatch.setattr(module, "READERS", (Reader("list", _write, _read),))
+    monkeypatch.setattr(module.resource, "setrlimit", lambda *_: None)
+    monkeypatch.setattr(module.logging, "disable", lambda *_: None)
+    workshop = Workshop(tmp_path)
+    failures = [failure for case in range(100) if (failure := workshop.try_case(0, case)[1])]
+    assert 0 < len(failures) < 100 and all(failure.startswith("KeyError") for failure in failures)
+    assert (tmp_path / "list" / "a.json").read_text() == "[1, 2, 3]"
