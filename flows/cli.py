@@ -92,13 +92,7 @@ def _parser() -> argparse.ArgumentParser:
     add(commands.check_cameras, capture, preset)
     add(commands.settings, preset)
 
-    boards = add(commands.calibrate)
-    boards.add_argument("folder", type=Path, help="a folder with calibration/extrinsic/ and charuco.toml")
-    _add_out(boards, "cameras")
-    boards.add_argument("--format", choices=CAMERA_FORMATS, action="append", default=[], help="write these files, too")
-    boards.add_argument(
-        "--ground-frame", type=_not_negative, metavar="N", help="when the board lies on the floor, at the origin"
-    )
+    _add_calibrate(add(commands.calibrate))
     cameras = add(commands.export_cameras)
     cameras.add_argument("folder", type=Path, help="a recording, or a folder that `calibrate` wrote")
     cameras.add_argument("--format", choices=CAMERA_FORMATS, required=True)
@@ -133,6 +127,26 @@ def _add_overrides(command: argparse.ArgumentParser, what: str) -> None:
     command.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help=what)
 
 
+def _add_calibrate(command: argparse.ArgumentParser) -> None:
+    command.add_argument("folder", type=Path, help="a recording, or a folder with calibration/extrinsic/")
+    command.add_argument(
+        "--from", dest="source", choices=("boards", "person"), default="boards",
+        help="of what: footage of a board (default), or the person in the recording itself",
+    )  # fmt: skip
+    _add_out(command, "cameras")
+    command.add_argument("--format", choices=CAMERA_FORMATS, action="append", default=[], help="write these files, too")
+    boards = command.add_argument_group("from boards")
+    boards.add_argument(
+        "--ground-frame", type=_not_negative, metavar="N", help="when the board lies on the floor, at the origin"
+    )
+    person = command.add_argument_group("from the person")
+    person.add_argument("--height", type=_positive, metavar="M", help="the person's, in metres (default: the mean)")
+    person.add_argument("--lens", type=Path, metavar="FILE", help="intrinsics: intri.yml, or a TOML of cameras")
+    person.add_argument(
+        "--fov", type=_angle, metavar="DEG", help="field of view across the longer side (default: metadata, or found)"
+    )
+
+
 def _add_out(command: argparse.ArgumentParser, default: str) -> None:
     command.add_argument("--out", type=Path, default=Path(default), help=f"the folder to write (default: {default})")
 
@@ -158,7 +172,14 @@ def _not_negative(text: str) -> int:
 def _positive(text: str) -> float:
     value = float(text)
     if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError("give seconds above 0")
+        raise argparse.ArgumentTypeError("give a number above 0")
+    return value
+
+
+def _angle(text: str) -> float:
+    value = float(text)
+    if not 1 <= value <= 170:
+        raise argparse.ArgumentTypeError("give degrees from 1 to 170")
     return value
 
 

@@ -94,7 +94,10 @@ def _table(report: dict[str, Any]) -> Iterator[str]:
 
 
 def calibrate(options: argparse.Namespace) -> None:
-    """Find the cameras from footage of a calibration board."""
+    """Find the cameras from footage of a calibration board, or from the person."""
+    if options.source == "person":
+        _calibrate_from_person(options)
+        return
     with atomic_folder(options.out) as partial:
         from hnerf.calibration.boards.calibrate import calibrate_from_boards
 
@@ -105,6 +108,20 @@ def calibrate(options: argparse.Namespace) -> None:
     for name, camera in report["cameras"].items():
         print(f"{name:<12} {camera['pictures']:>8} {camera['rms_px']:>7.2f}  {camera['intrinsics']}")
     print(f"all: {report['rms_px']:.2f} px RMS\ncameras: {options.out}\npicture: {options.out / 'boards.png'}")
+
+
+def _calibrate_from_person(options: argparse.Namespace) -> None:
+    with atomic_folder(options.out) as partial:
+        from hnerf.calibration.person.recording import calibrate_recording
+
+        found = calibrate_recording(options.folder, options.height, options.lens, options.fov)
+        found.save(partial, options.format)
+    print(f"{'camera':<12} {'median px':>9} {'+- degrees':>10} {'+- cm':>6} {'+- % focal':>10}  intrinsics")
+    for name, camera in found.report()["cameras"].items():
+        off = camera["uncertainty"]
+        figures = f"{off['turn_deg']:>10.2f} {100 * off['move_m']:>6.1f} {100 * off['focal']:>10.1f}"
+        print(f"{name:<12} {camera['median_px']:>9.2f} {figures}  {camera['intrinsics']}")
+    print("\n".join([*found.notes(), f"cameras: {options.out}; copy its files into {options.folder} to use them"]))
 
 
 def export_cameras(options: argparse.Namespace) -> None:

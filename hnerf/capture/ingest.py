@@ -24,6 +24,7 @@ from hnerf.capture.manifest import CameraSplit, capture_name, chosen_cameras, ch
 from hnerf.capture.normalise import Normaliser
 from hnerf.capture.safe_io import JSON_SUFFIXES, file_named, read_image
 from hnerf.capture.timing import median_step
+from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
@@ -46,14 +47,17 @@ BAR_FRAMES = 5  # evenly spaced, in which black bars are searched
 log = logging.getLogger("hnerf.capture")
 
 
-def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
+def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Uncalibrated | None = None) -> Capture:
     """Read a capture folder (in any of LAYOUTS) and write it normalised into `out`.
 
     Images are undistorted, and shrunk to `settings.max_side_px`, with their keypoints and masks. Where `capture.toml`
-    names no frames, those before the first and after the last detected person are left out. Raises InputError, one line
-    that names the file, on anything missing, unreadable, contradictory or unsafe.
+    names no frames, those before the first and after the last detected person are left out. A recording that is
+    `uncalibrated` is read without the poses of its cameras, all of which are then for training. Raises InputError, one
+    line that names the file, on anything missing, unreadable, contradictory or unsafe.
     """
-    layout, manifest = recognise(folder), read_manifest(folder)
+    layout, manifest = uncalibrated or recognise(folder), read_manifest(folder)
+    if uncalibrated:
+        manifest = manifest.model_copy(update={"cameras": None})
     subject = capture_name(folder, manifest)
     lenses = layout.lenses()
     cameras = chosen_cameras(folder, manifest, list(lenses), layout.training_cameras())
@@ -115,13 +119,23 @@ def recognise(folder: Path) -> Layout:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the folder of a capture")
     for layout in LAYOUTS:
-        if layout.recognises(folder):
+        if layout.recognises(folder) and not (layout is EasyMocap and _only_filmed(folder)):
             return layout(folder)
+    if cameras_without_calibration(folder):
+        raise InputError(
+            f"{folder}: no calibration of its cameras (extri.yml or another); "
+            f"`hnerf calibrate {folder} --from person` finds them from the person, --from boards from a board"
+        )
     raise InputError(
         f"{folder}: is none of EasyMocap (intri.yml, extri.yml, images/), Pose2Sim (calibration/, videos/), COLMAP "
         "(sparse/), Caliscope (camera_array.toml), aniposelib (calibration.toml), ZJU-MoCap (annots.npy) and "
         "PeopleSnapshot (camera.pkl); see docs/formats.md"
     )
+
+
+def _only_filmed(folder: Path) -> bool:
+    """Return whether a folder has images of cameras but no file with their poses."""
+    return not (folder / "extri.yml").exists() and bool(cameras_without_calibration(folder))
 
 
 def _common_frames(footage: dict[str, Footage]) -> tuple[int, ...]:
