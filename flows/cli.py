@@ -93,6 +93,7 @@ def _parser() -> argparse.ArgumentParser:
     add(commands.settings, preset)
 
     _add_calibrate(add(commands.calibrate))
+    add(commands.synchronise).add_argument("folder", type=Path, help="a recording whose cameras started apart")
     cameras = add(commands.export_cameras)
     cameras.add_argument("folder", type=Path, help="a recording, or a folder that `calibrate` wrote")
     cameras.add_argument("--format", choices=CAMERA_FORMATS, required=True)

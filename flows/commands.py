@@ -124,6 +124,26 @@ def _calibrate_from_person(options: argparse.Namespace) -> None:
     print("\n".join([*found.notes(), f"cameras: {options.out}; copy its files into {options.folder} to use them"]))
 
 
+def synchronise(options: argparse.Namespace) -> None:
+    """Find when each camera started and how its clock runs; write clocks.toml."""
+    from hnerf.capture.clocks import FILE, write_clocks
+
+    path = options.folder / FILE
+    if path.exists():
+        raise InputError(f"{path}: exists; remove it to synchronise again")
+    from hnerf.calibration.clocks.recording import synchronise_recording
+
+    found, sources = synchronise_recording(options.folder)
+    write_clocks(path, found.clocks)
+    print(f"{'camera':<12} {'offset s':>9} {'+- ms':>6} {'drift ppm':>9}  from")
+    for name, clock in found.clocks.items():
+        error_ms, ppm = 1e3 * found.error_s[name], 1e6 * (clock.rate - 1)
+        print(f"{name:<12} {clock.offset_s:>+9.4f} {error_ms:>6.1f} {ppm:>+9.0f}  {sources[name]}")
+    for (a, b), why in found.refused.items():
+        print(f"{a} and {b} were not compared: {why}")
+    print(f"clocks: {path}")
+
+
 def export_cameras(options: argparse.Namespace) -> None:
     """Write a recording's cameras as other tools read them."""
     with atomic_folder(options.out) as partial:

@@ -9,6 +9,7 @@ import numpy as np
 from hnerf.capture.bars import Area, lens_for_area, picture_area
 from hnerf.capture.board_footage import normalised_corners, read_board_footage
 from hnerf.capture.capture import Capture
+from hnerf.capture.clocks import InStep, in_step, read_clocks
 from hnerf.capture.footage import Footage, VideoFrame
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.colmap import Colmap
@@ -61,9 +62,11 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     subject = capture_name(folder, manifest)
     lenses = layout.lenses()
     cameras = chosen_cameras(folder, manifest, list(lenses), layout.training_cameras())
-    footage = {name: layout.footage(name) for name in cameras.train + cameras.test}
+    filmed = {name: layout.footage(name) for name in cameras.train + cameras.test}
+    clocks = {} if len(filmed) == 1 else read_clocks(folder)
+    footage = in_step(filmed, clocks, manifest.fps or DEFAULT_FPS)
     recorded = _common_frames(footage)
-    detected = {name: _detections(layout, name, pictures) for name, pictures in footage.items()}
+    detected = {name: _detections_in_step(layout, name, pictures) for name, pictures in footage.items()}
     people = {name: found for name, found in detected.items() if found is not None}
     seen = [people[name] for name in cameras.train if name in people]
     occupied = recorded if manifest.frames else _frames_with_people(seen, recorded)
@@ -95,7 +98,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
         test_cameras=tuple(cameras.test),
         train_frames=tuple(frames.train),
         novel_pose_frames=tuple(frames.novel_pose),
-        fps=manifest.fps or next(iter(footage.values())).fps or DEFAULT_FPS,
+        fps=manifest.fps or min((one.fps for one in filmed.values() if one.fps), default=DEFAULT_FPS),
         up=manifest.up,
         calibrated_sizes_px={name: lenses[name].size_px or n.recorded_size_px for name, n in normalisers.items()},
         recorded_sizes_px={name: n.recorded_size_px for name, n in normalisers.items()},
@@ -138,7 +141,7 @@ def _only_filmed(folder: Path) -> bool:
     return not (folder / "extri.yml").exists() and bool(cameras_without_calibration(folder))
 
 
-def _common_frames(footage: dict[str, Footage]) -> tuple[int, ...]:
+def _common_frames(footage: dict[str, Footage | InStep]) -> tuple[int, ...]:
     """Return the frames of all cameras. Raises InputError where cameras differ in frames or frame rate."""
     (first_name, first), *others = footage.items()
     for _, other in others:
@@ -146,18 +149,18 @@ def _common_frames(footage: dict[str, Footage]) -> tuple[int, ...]:
             numbers = "other numbers" if len(other.frames) == len(first.frames) else f"{len(first.frames)}"
             raise InputError(
                 f"{other.path}: {len(other.frames)} frames, but camera {first_name} has {numbers}; "
-                "give all cameras the same frames"
+                "give all cameras the same frames, or run `hnerf synchronise`"
             )
         if first.fps and other.fps and abs(other.fps - first.fps) > RATE_TOLERANCE * first.fps:
             raise InputError(
                 f"{other.path}: {other.fps:.4g} frames a second, but {first.path} has {first.fps:.4g}; "
-                "export all videos at the same rate"
+                "export all videos at the same rate, or run `hnerf synchronise`"
             )
     return first.frames
 
 
 def _write_cameras(
-    layout: Layout, lenses: dict[str, Lens], footage: dict[str, Footage], frames: tuple[int, ...],
+    layout: Layout, lenses: dict[str, Lens], footage: dict[str, Footage | InStep], frames: tuple[int, ...],
     settings: CaptureSettings, out: Path,
 ) -> tuple[dict[str, Normaliser], dict[str, Area]]:  # fmt: skip
     """Write the images of every camera; return how they were normalised, and where black bars prove that the calibrated
@@ -182,12 +185,12 @@ def _write_keypoints(
 
 
 def _write_pixels(
-    layout: Layout, lens: Lens, footage: Footage, frames: tuple[int, ...], settings: CaptureSettings, out: Path
+    layout: Layout, lens: Lens, footage: Footage | InStep, frames: tuple[int, ...], settings: CaptureSettings, out: Path
 ) -> Normaliser:
     """Write images, masks and clean plate of one camera, all of the first image's size."""
     normaliser: Normaliser | None = None
     masks = layout.mask_files(lens.name)
-    mask_paths = _per_frame(masks, frames, footage.frames, "masks") if masks else {}
+    mask_paths = _mask_paths(masks, frames, footage) if masks else {}
     for picture in footage.read(frames):
         source = picture.file or footage.path
         if normaliser is None:
@@ -207,7 +210,18 @@ def _write_pixels(
     return normaliser
 
 
-def _lens_as_recorded(lens: Lens, footage: Footage, frames: tuple[int, ...]) -> tuple[Lens, Area | None]:
+def _mask_paths(
+    masks: dict[int, Path | StoredFrame], frames: tuple[int, ...], footage: Footage | InStep
+) -> dict[int, Path | StoredFrame]:
+    """Return the masks of the wanted frames. Raises InputError if there is not one for every recorded frame."""
+    if not isinstance(footage, InStep):
+        return _per_frame(masks, frames, footage.frames, "masks")
+    recorded = {frame: footage.recorded(frame) for frame in frames}
+    found = _per_frame(masks, tuple(set(recorded.values())), footage.source.frames, "masks")
+    return {frame: found[own] for frame, own in recorded.items()}
+
+
+def _lens_as_recorded(lens: Lens, footage: Footage | InStep, frames: tuple[int, ...]) -> tuple[Lens, Area | None]:
     """Return the lens for the recorded size, and where the calibrated picture lies in it if black bars prove that.
 
     Without such a proof the lens is unchanged. Raises InputError if the sizes then differ too much.
@@ -244,7 +258,15 @@ def _per_frame(
     return {frame: files[frame] for frame in wanted}
 
 
-def _detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | None:
+def _detections_in_step(layout: Layout, camera: str, footage: Footage | InStep) -> np.ndarray | None:
+    """Return what `detections` does, at the instants of all cameras."""
+    if not isinstance(footage, InStep):
+        return detections(layout, camera, footage)
+    found = detections(layout, camera, footage.source)
+    return None if found is None else footage.resampled(found)
+
+
+def detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | None:
     """Return detected keypoints (frames, most people, K, 3), absent people zero; None where there are none.
 
     They come from the layout's own files, else from a list of results in keypoints/<camera>.json. Raises InputError

@@ -43,11 +43,13 @@ def cameras_without_calibration(folder: Path) -> list[str]:
 class Uncalibrated(Layout):
     """A recording of which the poses of the cameras are not known: all cameras stand at the origin.
 
-    lens_file: intrinsics, in `intri.yml` or in a TOML of cameras; fov_deg: of all others, across the longer side.
+    lens_file: intrinsics, in `intri.yml` or in a TOML of cameras; fov_deg: of all others, across the longer side;
+    only: the one camera to read, else all.
     """
 
     lens_file: Path | None = None
     fov_deg: float | None = None
+    only: str | None = None
     calibrated: ClassVar[bool] = False
 
     @staticmethod
@@ -59,7 +61,7 @@ class Uncalibrated(Layout):
     def known_lenses(self) -> dict[str, KnownLens]:
         """Return what is known of each camera's lens: from the lens file, the field of view, the metadata of images or
         videos, in this order, or a guess. Raises InputError where a file cannot be read."""
-        names = cameras_without_calibration(self.folder)
+        names = [name for name in cameras_without_calibration(self.folder) if self.only in (None, name)]
         own = path_in_capture(self.folder, "intri.yml")
         file = self.lens_file or (own if own.exists() else None)
         given = _read_lenses(file) if file else {}
