@@ -47,12 +47,12 @@ PROTOCOL = (
     "Cameras: the training cameras of each capture, from keypoints alone; poses of the delivered calibration are not "
     "read. Lenses known: its intrinsics are; unknown: one focal length is estimated from a guess of .85 of the longer "
     "side. The height is the one that the reference gives the person. Turn and move: of the worst camera, after a "
-    "similarity alignment to the reference, which is the true calibration of the rendered captures, and for "
-    "pose2sim-balance the delivered one as the calibration check refines it. Said: the largest standard error reported. "
-    "Residual: the worst camera's median, and the reference's, in pixels of the capture's images. Up: angle to the "
-    "reference's. Clocks: keypoints of the embedded performer, who walks and then waves, from a ring of four cameras "
-    "with offsets of 0, 37, -11.37 and 20.6 frames of 1/30 s, the last at 25 frames a second; 3 s, noise of 1 % of the "
-    "height; the largest error of five draws, with the cameras' calibration and without."
+    "similarity alignment to the reference, which is the true calibration of the rendered captures, and for pose2sim- "
+    "balance the delivered one as the calibration check refines it. Said: the largest standard error that is "
+    "reported. Residual: the worst camera's median, and the reference's, in pixels of the capture's images. Up: angle "
+    "to the reference's. Clocks: keypoints of the embedded performer, who walks and then waves, from a ring of four "
+    "cameras with offsets of 0, 37, -11.37 and 20.6 frames of 1/30 s, the last at 25 frames a second; 3 s, noise of 1 "
+    "% of the height; the largest error of five draws, with the cameras' calibration and without."
 )
 
 
@@ -178,8 +178,8 @@ def _track(
 
 def as_markdown(result: dict[str, Any]) -> str:
     """Format a row for each capture, source of keypoints and knowledge of lenses."""
-    head = ["capture", "keypoints", "turn, deg", "said", "move, cm", "said", "focal off", "residual, px", "reference, px",
-            "up off, deg", "said", "s"]  # fmt: skip
+    head = ["capture", "keypoints", "turn, deg", "said", "move, cm", "said", "focal off", "residual, px",
+            "reference, px", "up off, deg", "said", "s"]  # fmt: skip
     rows = [head]
     for name, figures in result["captures"].items():
         for what, f in figures.items():
