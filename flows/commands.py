@@ -115,7 +115,7 @@ def _calibrate_from_person(options: argparse.Namespace) -> None:
         from hnerf.calibration.person.recording import calibrate_recording
 
         found = calibrate_recording(options.folder, options.height, options.lens, options.fov)
-        found.save(partial, options.format)
+        found.save(partial, options.format, pose2sim=(options.folder / "pose").is_dir())
     print(f"{'camera':<12} {'median px':>9} {'+- degrees':>10} {'+- cm':>6} {'+- % focal':>10}  intrinsics")
     for name, camera in found.report()["cameras"].items():
         off = camera["uncertainty"]

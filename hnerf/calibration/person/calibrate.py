@@ -89,9 +89,13 @@ class PersonCalibration:
             f"up: from trunk and feet, +- {self.up_sd_deg:.1f} degrees; the ground is at 0, Z is up",
         ]
 
-    def save(self, out: Path, layouts: Sequence[str] = ()) -> None:
-        """Write `intri.yml`, `extri.yml` and `report.json`, and the cameras in further layouts."""
-        for layout in {"easymocap", *layouts}:
+    def save(self, out: Path, layouts: Sequence[str] = (), pose2sim: bool = False) -> None:
+        """Write `report.json` and the cameras, as a capture's folder holds them: in `intri.yml` and `extri.yml`, or,
+        in the layout of Pose2Sim, in `calibration/Calib_person.toml`; and in further layouts."""
+        if pose2sim:
+            write_cameras(out / "calibration", self.lenses, "aniposelib")
+            (out / "calibration" / "calibration.toml").rename(out / "calibration" / "Calib_person.toml")
+        for layout in {*layouts} if pose2sim else {"easymocap", *layouts}:
             write_cameras(out, self.lenses, layout)
         (out / "report.json").write_text(json.dumps(self.report(), indent=1))
 
