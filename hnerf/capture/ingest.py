@@ -8,7 +8,7 @@ import numpy as np
 
 from hnerf.capture.bars import Area, lens_for_area, picture_area
 from hnerf.capture.board_footage import normalised_corners, read_board_footage
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, SubjectPoint
 from hnerf.capture.footage import Footage, VideoFrame
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.colmap import Colmap
@@ -20,7 +20,14 @@ from hnerf.capture.formats.zjumocap import ZjuMocap
 from hnerf.capture.keypoint_files import read_openpose, read_results
 from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
 from hnerf.capture.lens import Lens
-from hnerf.capture.manifest import CameraSplit, capture_name, chosen_cameras, chosen_frames, read_manifest
+from hnerf.capture.manifest import (
+    CameraSplit,
+    CaptureManifest,
+    capture_name,
+    chosen_cameras,
+    chosen_frames,
+    read_manifest,
+)
 from hnerf.capture.normalise import Normaliser
 from hnerf.capture.safe_io import JSON_SUFFIXES, file_named, read_image
 from hnerf.capture.timing import median_step
@@ -97,6 +104,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
         recorded_sizes_px={name: n.recorded_size_px for name, n in normalisers.items()},
         picture_areas_px=areas,
         frame_step=median_step(recorded),
+        subject_point=_subject_point(folder, manifest, {name: normalisers[name] for name in cameras.train}, wanted),
         recorded_lenses={c: (n.lens.K.tolist(), n.lens.distortion.tolist()) for c, n in normalisers.items() if n.maps},
     )
     capture.save()
@@ -122,6 +130,21 @@ def recognise(folder: Path) -> Layout:
         "(sparse/), Caliscope (camera_array.toml), aniposelib (calibration.toml), ZJU-MoCap (annots.npy) and "
         "PeopleSnapshot (camera.pkl); see docs/formats.md"
     )
+
+
+def _subject_point(
+    folder: Path, manifest: CaptureManifest, normalisers: dict[str, Normaliser], frames: tuple[int, ...]
+) -> SubjectPoint | None:
+    """Return the point that names the subject, in pixels of the normalised image of the chosen frame nearest to its
+    own (the first one where it names none). Raises InputError on a camera that is not for training."""
+    point = manifest.subject_point
+    if point is None or not point.camera:
+        return point
+    if point.camera not in normalisers:
+        raise InputError(f"{folder / 'capture.toml'}: subject: there is no training camera {point.camera}; correct it")
+    x, y, _ = normalisers[point.camera].keypoints(np.array([*point.at, 1.0]))
+    frame = min(frames, key=lambda chosen: abs(chosen - point.frame))
+    return SubjectPoint((float(x), float(y)), point.camera, frame)
 
 
 def _common_frames(footage: dict[str, Footage]) -> tuple[int, ...]:
