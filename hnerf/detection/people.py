@@ -30,7 +30,7 @@ def check_subject(capture: Capture, subject: PersonTrack) -> None:
             f"{capture.name}: the person is {tallest_px:.0f} px tall at most, and {MIN_HEIGHT_PX} are needed; record "
             "from nearer by, or raise capture.max_side_px if the recording is larger"
         )
-    if not seen[..., WHOLE].any(0).all(-1).any():
+    if not np.any(seen[..., WHOLE], axis=0).all(-1).any():
         raise InputError(
             f"{capture.name}: the person is always cut off by the images' border; record from farther away, so that "
             "arms and legs are seen whole at least once"
@@ -55,7 +55,7 @@ def keep_subject(
         if own is not None:
             likely = _pasted(found, i, own, size_px)
             for other in shown:
-                likely = likely * (likely >= _pasted(found, i, other, size_px))
+                likely = likely * (likely >= _pasted(found, i, int(other), size_px))
         write_image(out / PERSON / camera / f"{frame:06d}.png", likely.round().astype(np.uint8))
 
 
