@@ -36,12 +36,13 @@ SIZES = ("heavy", "full", "lite")
 LIMBS = [2, 3, 4, 5, 6, 7, 9, 10, 11, 12, 13, 14]
 FRAMES = 16  # of each capture, evenly spaced: more say the same and take minutes
 PROTOCOL = (
-    "Keypoints are the twelve joints of arms and legs in the training cameras and 16 frames, evenly spaced: persons are "
-    "tracked over jumps. pose2sim-balance is looked at as recorded, 1080 x 1920 px. Residual: distance in pixels of the "
-    "recording from a keypoint to the point that the cameras' keypoints are triangulated to, in the cameras as given. "
-    "Error: distance to the true joint, in pixels of the image. Missed: joints without a keypoint. Mask: the network's "
-    "probability above a half against the true mask. Milliseconds are of one core's time for a frame of one camera with "
-    "one person, image read and mask written included, networks loaded before; MiB are the most that this process holds."
+    "Keypoints are the twelve joints of arms and legs in the training cameras and 16 frames, evenly spaced: persons "
+    "are tracked over jumps. pose2sim-balance is looked at as recorded, 1080 x 1920 px. Residual: distance in "
+    "pixels of the recording from a keypoint to the point that the cameras' keypoints are triangulated to, in the "
+    "cameras as given. Error: distance to the true joint, in pixels of the image. Missed: joints without a "
+    "keypoint. Mask: the network's probability above a half against the true mask. Milliseconds are of one core's "
+    "time for a frame of one camera with one person, image read and mask written included, networks loaded before; "
+    "MiB are the most that this process holds."
 )
 
 
@@ -136,7 +137,7 @@ def _ious(folder: Path, capture: Capture) -> list[float]:
                 cv2.imread(str(place / name), cv2.IMREAD_GRAYSCALE) > 127
                 for place in (capture.root / PERSON, folder / "ground_truth" / "masks")
             )
-            ious.append(float((mask & true).sum() / (mask | true).sum()))
+            ious.append(float(np.sum(mask & true) / np.sum(mask | true)))
     return ious
 
 
