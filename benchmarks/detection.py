@@ -10,18 +10,16 @@ import argparse
 import dataclasses
 import logging
 import multiprocessing
-import resource
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from provenance import SHARED, provenance, provenance_line, table, write_result
 
-from hnerf.capture.capture import PERSON, Capture
+from hnerf.capture.capture import PERSON, Capture, read_rgb
 from hnerf.capture.ingest import ingest
 from hnerf.capture.subject import subject_keypoints
 from hnerf.capture.subset import subset
@@ -94,7 +92,13 @@ def cost_of_a_frame(capture: Capture, size: str, out: Path) -> dict[str, float]:
         find_in_camera(looked_at, camera, size, out / str(len(looked_at.frames)))
         times.append(time.process_time() - started)
     ms = 1e3 * (times[1] - times[0]) / (len(capture.frames) - 1)
-    return {"ms": round(ms, 1), "mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)}
+    return {"ms": round(ms, 1), "mib": _peak_mib()}
+
+
+def _peak_mib() -> int:
+    """Return the most memory that this process has held; getrusage would count what its parent held, too."""
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return round(int(status["VmHWM"].split()[0]) / 1024)
 
 
 def limb_keypoints(capture: Capture) -> np.ndarray:
@@ -134,7 +138,7 @@ def _ious(folder: Path, capture: Capture) -> list[float]:
         for frame in capture.frames:
             name = Path(camera) / f"{frame:06d}.png"
             mask, true = (
-                cv2.imread(str(place / name), cv2.IMREAD_GRAYSCALE) > 127
+                read_rgb(place / name)[..., 0] > 127
                 for place in (capture.root / PERSON, folder / "ground_truth" / "masks")
             )
             ious.append(float(np.sum(mask & true) / np.sum(mask | true)))
