@@ -16,6 +16,7 @@ from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.formats.peoplesnapshot import PeopleSnapshot
 from hnerf.capture.formats.pose2sim import Pose2Sim
+from hnerf.capture.formats.videos import Videos
 from hnerf.capture.formats.zjumocap import ZjuMocap
 from hnerf.capture.keypoint_files import read_openpose, read_results
 from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
@@ -29,7 +30,7 @@ from hnerf.capture.manifest import (
     read_manifest,
 )
 from hnerf.capture.normalise import Normaliser
-from hnerf.capture.safe_io import JSON_SUFFIXES, file_named, read_image
+from hnerf.capture.safe_io import JSON_SUFFIXES, VIDEO_SUFFIXES, file_named, read_image
 from hnerf.capture.timing import median_step
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
@@ -47,6 +48,7 @@ LAYOUTS: tuple[type[Layout], ...] = (
     Caliscope,
     EasyMocap,
     Pose2Sim,
+    Videos,
 )  # the first that recognises a folder
 BAR_FRAMES = 5  # evenly spaced, in which black bars are searched
 
@@ -54,7 +56,7 @@ log = logging.getLogger("hnerf.capture")
 
 
 def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
-    """Read a capture folder (in any of LAYOUTS) and write it normalised into `out`.
+    """Read a capture folder (in any of LAYOUTS), or one video, and write it normalised into `out`.
 
     Images are undistorted, and shrunk to `settings.max_side_px`, with their keypoints and masks. Where `capture.toml`
     names no frames, those before the first and after the last detected person are left out. Raises InputError, one line
@@ -119,16 +121,16 @@ def recorded_cameras(folder: Path) -> CameraSplit:
 
 
 def recognise(folder: Path) -> Layout:
-    """Return the folder's layout. Raises InputError if it is none of LAYOUTS."""
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give the folder of a capture")
+    """Return the layout of a folder, or of one video. Raises InputError if it is none of LAYOUTS."""
+    if not folder.exists():
+        raise InputError(f"{folder}: no such folder or video; give the folder of a capture")
     for layout in LAYOUTS:
         if layout.recognises(folder):
             return layout(folder)
     raise InputError(
         f"{folder}: is none of EasyMocap (intri.yml, extri.yml, images/), Pose2Sim (calibration/, videos/), COLMAP "
-        "(sparse/), Caliscope (camera_array.toml), aniposelib (calibration.toml), ZJU-MoCap (annots.npy) and "
-        "PeopleSnapshot (camera.pkl); see docs/formats.md"
+        "(sparse/), Caliscope (camera_array.toml), aniposelib (calibration.toml), ZJU-MoCap (annots.npy), "
+        f"PeopleSnapshot (camera.pkl) and videos ({', '.join(VIDEO_SUFFIXES)}); see docs/formats.md"
     )
 
 

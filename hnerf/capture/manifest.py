@@ -63,6 +63,7 @@ class CaptureManifest(_Table):
     up: Literal["y", "z"] = "z"
     units: Literal["m", "mm"] | Annotated[float, Field(gt=0, le=1e6)] = "m"
     keypoints: KeypointSetName | None = None
+    field_of_view_deg: float | None = Field(default=None, ge=10, le=150)
     cameras: CameraSplit | None = None
     frames: FrameSplit | None = None
     subject: Any = None
@@ -114,7 +115,9 @@ def read_manifest(folder: Path) -> CaptureManifest:
 
 def capture_name(folder: Path, manifest: CaptureManifest) -> str:
     """Return the name of the subject. It becomes a folder name; raises InputError if it cannot be one."""
-    name = unicodedata.normalize("NFC", folder.resolve().name if manifest.name is None else manifest.name)  # macOS: NFD
+    place = folder.resolve()
+    given = (place.stem if place.is_file() else place.name) if manifest.name is None else manifest.name
+    name = unicodedata.normalize("NFC", given)  # macOS: NFD
     if not re.fullmatch(r"\w[\w .()-]{0,127}", name):
         raise InputError(f"{folder / 'capture.toml'}: name {name!r}: use letters, digits, '_', '-', '.' and spaces")
     if len(name.encode()) > MAX_NAME_BYTES:
