@@ -10,6 +10,8 @@ from hnerf.geometry.triangulation import confidence_of, solve_points
 
 AGREEMENT_REACH = 0.15  # of a person's height in the image: beyond it a keypoint does not support a hypothesis
 UNSUPPORTED_WEIGHT = 0.1  # of a detection without support from other cameras: one may be badly calibrated
+MIN_SUPPORT = 0.2  # agreement of the others with a detection, 0.8 for a good one, that is no chance of a few keypoints
+USUALLY = 0.5  # share of a camera's images in which the others support it, from which the rest of them are mistakes
 CANDIDATES = 8  # combinations of people kept in each frame
 JUMP_COST = 4.0  # in best scores of one camera, for moving by the person's own height between frames
 FREE_JUMPS = 2.0  # in median movements between frames: jumps up to this cost nothing
@@ -43,15 +45,23 @@ def follow_people(cameras: list[Camera], people: list[np.ndarray]) -> list[Perso
     frames = len(left[0])
     while len(tracks) < MAX_PEOPLE and any((found[..., 2] > 0).any() for found in left):
         candidates = [_frame_candidates(cameras, [found[i] for found in left]) for i in range(frames)]
-        choice, claim = _most_probable_sequence(candidates, left)
+        choice, supported, claim = _most_probable_sequence(candidates, left)
         if claim <= 0:
             break
+        choice = np.where(supported | (_usually(supported, choice >= 0) < USUALLY), choice, -1)
         at = np.arange(frames)
         picked = np.stack([found[at, k] * (k >= 0)[:, None, None] for found, k in zip(left, choice.T, strict=True)])
         tracks.append(PersonTrack(picked, claim, moves(picked)))
         for found, own in zip(left, picked, strict=True):
             found *= ~_same_place(own[:, None], found)[..., None, None]
     return tracks
+
+
+def _usually(supported: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Return the share of the frames in which a camera sees the person that other cameras support it, (C,); both
+    (frames, C) bool."""
+    share: np.ndarray = (supported & seen).sum(0) / seen.sum(0).clip(1)
+    return share
 
 
 def moves(keypoints: np.ndarray) -> bool:
@@ -77,9 +87,17 @@ def _same_place(person: np.ndarray, others: np.ndarray) -> np.ndarray:
     return (both.sum(-1) > 0) & (distance <= SAME_SHARE * height)
 
 
-def _frame_candidates(cameras: list[Camera], people: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the best combinations of people in one frame: indices (n, C), -1 for nobody, and their scores (n,), the
-    best first; with and without people whom no other camera supports.
+class _Candidates(NamedTuple):
+    """Combinations of people in one frame, the best first. picks (n, C): indices, -1 for nobody; supported (n, C): by
+    other cameras; score (n,)."""
+
+    picks: np.ndarray
+    supported: np.ndarray
+    score: np.ndarray
+
+
+def _frame_candidates(cameras: list[Camera], people: list[np.ndarray]) -> _Candidates:
+    """Return the best combinations of people in one frame, with and without people whom no other camera supports.
 
     people: per camera (P, 25, 3). The score is the mean over cameras of prominence times agreement.
     """
@@ -95,13 +113,14 @@ def _frame_candidates(cameras: list[Camera], people: list[np.ndarray]) -> tuple[
         value = (UNSUPPORTED_WEIGHT + agreement) * prominence[c]
         picks[:, c] = value.argmax(1)
         scores[:, c] = value.max(1) / len(cameras)
-        supported[:, c] = np.take_along_axis(agreement, picks[:, c : c + 1], 1)[:, 0] > 0
-    picks = np.concatenate([picks, np.where(supported, picks, -1), np.full((1, len(cameras)), -1)])
+        supported[:, c] = np.take_along_axis(agreement, picks[:, c : c + 1], 1)[:, 0] > MIN_SUPPORT
+    nobody = np.full((1, len(cameras)), -1)
+    picks = np.concatenate([picks, np.where(supported, picks, -1), nobody])
     total = np.concatenate([scores.sum(1), np.where(supported, scores, 0).sum(1), [0.0]])
     best = np.argsort(-total, kind="stable")
     _, first = np.unique(picks[best], axis=0, return_index=True)
     kept = best[np.sort(first)[:CANDIDATES]]
-    return picks[kept], total[kept]
+    return _Candidates(picks[kept], np.concatenate([supported, supported, nobody >= 0])[kept], total[kept])
 
 
 def _agreements(cameras: list[Camera], people: list[np.ndarray]) -> list[np.ndarray]:
@@ -152,15 +171,16 @@ def _prominence(camera: Camera, people: np.ndarray) -> np.ndarray:
 
 
 def _most_probable_sequence(
-    candidates: list[tuple[np.ndarray, np.ndarray]], people: list[np.ndarray]
-) -> tuple[np.ndarray, float]:
-    """Return the most probable sequence of combinations, (frames, C), and its mean score: Viterbi with a cost for jumps
-    in the image beyond what is typical of the recording. A person who is not seen stays where he was last seen."""
-    shown = [_picked_keypoints([p[i] for p in people], picks) for i, (picks, _) in enumerate(candidates)]
+    candidates: list[_Candidates], people: list[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the most probable sequence of combinations, (frames, C), which of it other cameras support, and its mean
+    score: Viterbi with a cost for jumps in the image beyond what is typical of the recording. A person who is not seen
+    stays where he was last seen."""
+    shown = [_picked_keypoints([p[i] for p in people], found.picks) for i, found in enumerate(candidates)]
     best = [[one[:1] for one in frame] for frame in shown]
     free_jump = FREE_JUMPS * float(np.median([_jump(a, b)[0, 0] for a, b in pairwise(best)])) if len(best) > 1 else 0.0
-    last, total, back = shown[0], candidates[0][1], []
-    for now, (picks, score) in zip(shown[1:], candidates[1:], strict=True):
+    last, total, back = shown[0], candidates[0].score, []
+    for now, (picks, _, score) in zip(shown[1:], candidates[1:], strict=True):
         best_before = total[:, None] - JUMP_COST * _jump(last, now, free_jump)
         back.append(best_before.argmax(0))
         total = best_before.max(0) + score
@@ -169,8 +189,9 @@ def _most_probable_sequence(
     path = [int(total.argmax())]
     for step in reversed(back):
         path.append(int(step[path[-1]]))
-    chosen = [(picks[k], score[k]) for (picks, score), k in zip(candidates, reversed(path), strict=True)]
-    return np.stack([picks for picks, _ in chosen]), float(np.mean([score for _, score in chosen]))
+    on_path = list(zip(candidates, reversed(path), strict=True))
+    picks, supported = (np.stack([found[part][k] for found, k in on_path]) for part in (0, 1))
+    return picks, supported, float(np.mean([found.score[k] for found, k in on_path]))
 
 
 def _picked_keypoints(people: list[np.ndarray], picks: np.ndarray) -> list[np.ndarray]:

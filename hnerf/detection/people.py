@@ -30,7 +30,8 @@ def check_subject(capture: Capture, subject: PersonTrack) -> None:
             f"{capture.name}: the person is {tallest_px:.0f} px tall at most, and {MIN_HEIGHT_PX} are needed; record "
             "from nearer by, or raise capture.max_side_px if the recording is larger"
         )
-    if not np.any(seen[..., WHOLE], axis=0).all(-1).any():
+    by_any_camera: np.ndarray = np.max(seen[..., WHOLE], axis=0)  # (frames, 12)
+    if not by_any_camera.all(-1).any():
         raise InputError(
             f"{capture.name}: the person is always cut off by the images' border; record from farther away, so that "
             "arms and legs are seen whole at least once"
