@@ -34,6 +34,21 @@ class PersonTrack(NamedTuple):
     moves: bool
 
 
+def follow_in_each_camera(cameras: list[Camera], people: list[np.ndarray]) -> list[PersonTrack]:
+    """Return, as one person, whom each camera for itself shows most prominently; `follow_people` where it is not known
+    how cameras stand to each other. An empty list if nobody is seen."""
+    alone = [follow_people([camera], [found]) for camera, found in zip(cameras, people, strict=True)]
+    best = [max(tracks, key=lambda track: (track.moves, track.claim), default=None) for tracks in alone]
+    if not any(best):
+        return []
+    keypoints = np.concatenate([
+        np.zeros((1, len(found), *found.shape[2:])) if track is None else track.keypoints
+        for track, found in zip(best, people, strict=True)
+    ])  # fmt: skip
+    claims = [track.claim if track else 0.0 for track in best]
+    return [PersonTrack(keypoints, float(np.mean(claims)), moves(keypoints))]
+
+
 def follow_people(cameras: list[Camera], people: list[np.ndarray]) -> list[PersonTrack]:
     """Follow the most prominent person through time, then those who are left, at most MAX_PEOPLE.
 

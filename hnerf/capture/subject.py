@@ -4,7 +4,7 @@ names."""
 import numpy as np
 
 from hnerf.capture.capture import Capture, SubjectPoint
-from hnerf.capture.people import PersonTrack, follow_people, moves
+from hnerf.capture.people import PersonTrack, follow_in_each_camera, follow_people, moves
 from hnerf.errors import InputError
 from hnerf.geometry.triangulation import triangulate
 
@@ -26,13 +26,17 @@ def ranked_people(capture: Capture) -> list[PersonTrack]:
 
     The subject is the person that `capture.subject_point` names, else the one with the best claim
     (`hnerf.capture.people`) among those who move: a poster does not. Raises InputError where no frame shows a person in
-    two cameras (in one, if there is only one), nobody is where the point is, or two people have an equal claim.
+    two cameras (in one, if there is only one), nobody is where the point is, or two people have an equal claim. Cameras
+    that all stand at one place are not calibrated yet; then each chooses for itself.
     """
     people = _detected(capture)
     if all(found.shape[1] == 1 for found in people):
         alone = np.stack([found[:, 0] for found in people])
         return [PersonTrack(alone, 1.0, moves(alone))]
-    tracks = follow_people([capture.cameras[name] for name in capture.train_cameras], people)
+    cameras = [capture.cameras[name] for name in capture.train_cameras]
+    centres_m = np.stack([camera.centre_m for camera in cameras])
+    uncalibrated = len(cameras) > 1 and bool((centres_m == centres_m[0]).all())
+    tracks = (follow_in_each_camera if uncalibrated else follow_people)(cameras, people)
     if not tracks:
         raise InputError(f"{capture.name}: no person found in any frame; check the keypoint files")
     if capture.subject_point:

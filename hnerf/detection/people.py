@@ -30,7 +30,7 @@ def check_subject(capture: Capture, subject: PersonTrack) -> None:
             f"{capture.name}: the person is {tallest_px:.0f} px tall at most, and {MIN_HEIGHT_PX} are needed; record "
             "from nearer by, or raise capture.max_side_px if the recording is larger"
         )
-    by_any_camera: np.ndarray = np.max(seen[..., WHOLE], axis=0)  # (frames, 12)
+    by_any_camera = seen[..., WHOLE].any(0)  # (frames, 12)
     if not by_any_camera.all(-1).any():
         raise InputError(
             f"{capture.name}: the person is always cut off by the images' border; record from farther away, so that "
@@ -71,7 +71,7 @@ def people_rows(capture: Capture, people: list[PersonTrack]) -> list[dict[str, A
     """Return plain values of each person, the subject first."""
     rows = []
     for i, person in enumerate(people):
-        seen = (person.keypoints[..., 2] > 0).any(-1)  # (C, frames)
+        seen: np.ndarray = (person.keypoints[..., 2] > 0).any(-1)  # (C, frames)
         heights = person_heights_px(person.keypoints[seen])
         rows.append(
             {

@@ -111,6 +111,15 @@ def test_a_mirror_image_is_not_taken(tmp_path: Path) -> None:
     assert share_right(subject_keypoints(capture), subject) == 1
 
 
+def test_cameras_without_places_choose_each_for_itself(tmp_path: Path) -> None:
+    """All stand at the origin; a stranger, farther from every camera, walks by."""
+    cameras = ring(3)
+    far = np.stack([walking((-2.5, 2), (-2.5, -2)), walking((2, 2.5), (-2, 2.5)), walking((2, -2.5), (-2, -2.5))])
+    capture, (subject, *_) = recorded(tmp_path, cameras, walk_m(FRAMES), *far)
+    nowhere = {c.name: dataclasses.replace(c, R=np.eye(3), t_m=np.zeros(3)) for c in cameras}
+    assert share_right(subject_keypoints(dataclasses.replace(capture, cameras=nowhere)), subject) > 0.9
+
+
 def test_two_who_have_the_same_claim_are_one_line(tmp_path: Path) -> None:
     capture, _ = recorded(tmp_path, ring(1), staying((0, -0.6)), staying((0, 0.6)))
     with pytest.raises(InputError, match=r"equal claim.*at \(\d+, \d+\) and \(\d+, \d+\) in camera c0, frame 0; name"):
