@@ -71,7 +71,7 @@ def people_rows(capture: Capture, people: list[PersonTrack]) -> list[dict[str, A
     """Return plain values of each person, the subject first."""
     rows = []
     for i, person in enumerate(people):
-        seen: np.ndarray = (person.keypoints[..., 2] > 0).any(-1)  # (C, frames)
+        seen = np.asarray((person.keypoints[..., 2] > 0).any(-1))  # (C, frames)
         heights = person_heights_px(person.keypoints[seen])
         rows.append(
             {
