@@ -10,7 +10,7 @@ from hnerf.capture.capture import Capture, SubjectPoint
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
-from tests.capture.recordings import write_easymocap, write_video
+from tests.capture.recordings import write_calibration, write_easymocap, write_video
 
 SETTINGS = CaptureSettings()
 
@@ -60,6 +60,15 @@ def test_several_videos_need_cameras(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_video(tmp_path / "ada" / f"{name}.mp4", 3)
     assert "ada: 2 videos without calibration; add intri.yml" in refused(tmp_path / "ada", tmp_path / "out")
+
+
+def test_videos_beside_their_calibration_are_read(tmp_path: Path) -> None:
+    folder = tmp_path / "ada"
+    folder.mkdir()
+    write_calibration(folder)
+    for name in ("01", "02"):
+        write_video(folder / f"{name}.mp4", 3, (24, 16))
+    assert ingest(folder, SETTINGS, tmp_path / "out").train_cameras == ("01", "02")
 
 
 def test_what_is_no_video(tmp_path: Path) -> None:
