@@ -4,6 +4,7 @@ A preset is a YAML file under `configs/`; `load_settings("fast", ["training.seco
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, TypeVar
 
@@ -369,6 +370,11 @@ def validated(kind: type[S], tree: Any, source: Path | str) -> S:
         return kind.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
-        steps = zip(("", *first["loc"]), first["loc"], strict=False)
-        key = ".".join(str(part) for before, part in steps if before != "field")  # the kind of field is no key
-        raise InputError(f"{source}: {key}: {first['msg']}; correct it") from None
+        key: list[str] = []
+        node = tree
+        for part in first["loc"]:
+            with suppress(LookupError, TypeError):  # kinds of a union are named, too, and are no keys of the tree
+                node = node[part]
+                key.append(str(part))
+        key += [str(part) for part in first["loc"][-1:] if first["type"] == "missing"]
+        raise InputError(f"{source}: {'.'.join(key)}: {first['msg']}; correct it") from None

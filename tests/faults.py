@@ -70,7 +70,7 @@ class Fault:
 
 FAULTS = (
     # what F and DH of the published method are asked, and the units of what they answer
-    Fault("paper-view-noise", PAPER, "else directions + draws.view", "else directions", BY_PAPER),
+    Fault("paper-view-noise", PAPER, "else rays.directions + draws.view", "else rays.directions", BY_PAPER),
     Fault("paper-root-noise", CONDITIONS, "root=self.root + root", "root=self.root", BY_CONDITIONS),
     Fault("paper-theta-noise", CONDITIONS, "pose=self.pose + pose", "pose=self.pose", BY_CONDITIONS),
     Fault("paper-density-unit", PAPER, "+ 1e10) / self.settings.scene_m", "+ 1e10)", BY_PAPER),
@@ -150,7 +150,7 @@ FAULTS = (
     Fault("fast-tighten-sides", FAST, "side * described.d[seen]", "-side * described.d[seen]", BY_TIGHTEN),
     Fault("fast-tighten-poses", FAST, "seen |= described.near", "seen = described.near", BY_TIGHTEN),
     # what the trainer hands to a step
-    Fault("trainer-noise", TRAINER, "self.conditions.with_noise(s.noise, self.generator)", "self.conditions",
+    Fault("trainer-noise", TRAINER, "self.scene.with_noise(s.noise, self.generator)", "self.scene",
           BY_TRAINER),
     Fault("trainer-view-noise", TRAINER, "samples, s.noise, self.generator)", "samples, 0.0, self.generator)",
           BY_TRAINER),
