@@ -268,7 +268,9 @@ class AssetSettings(Section):
     grid_cells: int = Field(default=256, ge=16)  # of marching cubes, on the longest side
     faces: int = Field(default=20_000, ge=100)
     texture_px: int = Field(default=1024, ge=16)
-    texture_poses: int = Field(default=3, ge=1)  # of the capture; each texel takes the median colour over them
+    texture_poses: int = Field(default=3, ge=1)  # of the capture, whose median is the field's colour of a texel
+    photograph_frames: int = Field(default=16, ge=0)  # whose training photographs make the texture; 0: the field alone
+    correctives: int = Field(default=8, ge=0, le=64)  # blend shapes of what frames have beyond skinning
 
 
 class Settings(Section):

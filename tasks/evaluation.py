@@ -68,7 +68,7 @@ def evaluate_held_out(
     return _headline(score_held_out(capture, masks, avatar, fitted, training.root, settings, out))
 
 
-def _headline(found: Mapping[str, Any]) -> dict[str, float]:
+def _headline(found: Mapping[Any, Any]) -> dict[str, float]:
     """Return the mean image scores of each split that has any."""
     means = {
         f"{split} {name}": found[split][name]

@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from hnerf.avatar.antialiasing import antialiased
-from hnerf.avatar.avatar import Rendering
+from hnerf.avatar.avatar import Gains, Rendering
 from hnerf.avatar.model_file import load_field, version_error
 from hnerf.baselines.idr import IdrField
 from hnerf.baselines.nerf import NerfField
@@ -37,8 +37,6 @@ from hnerf.fields.fast import FastField
 from hnerf.fields.paper import PaperField
 from hnerf.fields.rays import Rays
 from hnerf.geometry.camera import Camera
-
-Gains = dict[str, tuple[float, float, float]]
 
 RAYS_PER_BATCH = 16384
 SAMPLES_PER_BATCH = 1 << 20  # coarse ones, for fields with many per ray: a network keeps some KiB for each

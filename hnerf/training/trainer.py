@@ -26,6 +26,7 @@ from hnerf.config import TrainingSettings
 from hnerf.fields.conditions import Conditions, Draws, concatenate, shard
 from hnerf.fields.samples import RaySamples
 from hnerf.progress import report
+from hnerf.results import TrainingReport, write_result
 from hnerf.training.auto_settings import SceneStatistics, decide
 from hnerf.training.checkpoint import load_checkpoint, save_checkpoint
 from hnerf.training.distributed import Distributed
@@ -114,8 +115,8 @@ class Trainer:
         conditions = Conditions.of(bodies.rig, bodies.theta, bodies.root, frame_rows, self.settings.field.scene_m)
         self.scene = self.field.scene(bodies, conditions)
 
-    def run(self) -> dict[str, Any]:
-        """Train to the end, write the subject's files and return the report."""
+    def run(self) -> TrainingReport | None:
+        """Train to the end and write the subject's files; return the report, None in a process that writes none."""
         module: torch.nn.Module = self.objective
         if self.processes.world_size > 1:
             devices = [self.processes.device] if self.processes.device.type == "cuda" else None
@@ -157,7 +158,7 @@ class Trainer:
         if self.processes.is_main:
             (self.out / "history.jsonl").write_text("".join(json.dumps(row) + "\n" for row in self.history))
         self._require_surface()
-        return self._finish() if self.processes.is_main else {}
+        return self._finish() if self.processes.is_main else None
 
     def _absorb(self) -> None:
         self.scene.bodies.absorb(self.objective.correction, self.train_rows if self.settings.one_posture else None)
@@ -337,11 +338,11 @@ class Trainer:
         settings |= {"gains": self.gains, "seconds": self.seconds}
         (folder / "settings.json").write_text(json.dumps(settings, indent=1))
 
-    def _finish(self) -> dict[str, Any]:
+    def _finish(self) -> TrainingReport:
         out = self.out
         self._save(out)
         turn, move_m, _ = self.objective.correction.totals()
-        report = {
+        report: TrainingReport = {
             "device": _device_name(self.processes.device),
             "processes": self.processes.world_size,
             "setup_seconds": self.setup_seconds,
@@ -353,9 +354,11 @@ class Trainer:
             "model_mib": (out / "model.safetensors").stat().st_size / 2**20,
             "mean_turn_deg": float(np.rad2deg(turn.norm(dim=-1).mean().item())),
             "mean_move_mm": float(1e3 * move_m.norm(dim=-1).mean().item()),
-            "decisions": [{"setting": name} | dataclasses.asdict(d) for name, d in self.decisions.items()],
+            "decisions": [
+                {"setting": name, "value": d.value, "reason": d.reason} for name, d in self.decisions.items()
+            ],
         }
-        (out / "report.json").write_text(json.dumps(report, indent=1))
+        write_result(out / "report.json", TrainingReport, report)
         return report
 
 
@@ -366,8 +369,9 @@ def train(
     settings: TrainingSettings,
     out: Path,
     processes: Distributed | None = None,
-) -> dict[str, Any]:
-    """Train the subject into `out`, from its checkpoint if there is one; return the report as a dict.
+) -> TrainingReport | None:
+    """Train the subject into `out`, from its checkpoint if there is one; return the report, None in a process that
+    writes none.
 
     The last checkpoint is kept, so that a training stopped while writing its files need only write them again; the
     caller calls `remove_checkpoint`. Raises TrainingError if the surface collapses or the losses stay non-finite.
