@@ -18,7 +18,7 @@ NO_ROOM = (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # None: our own, of l
 CAMERA_FORMATS = ("easymocap", "caliscope", "aniposelib", "colmap")  # of hnerf.capture.formats.export, which is slow
 PICTURES = ("colour", "depth", "normals", "mask", "mesh")  # of hnerf.render.subject, which imports torch
 FOLDERS = {
-    "capture": "the capture's folder",
+    "capture": "the capture's folder, or one video",
     "folder": "the folder of a capture",
     "subject": "<store>/subjects/<name> of a finished `hnerf run`",
 }  # among a command's options, and what they are
@@ -63,7 +63,7 @@ def _existing(options: argparse.Namespace) -> list[Path]:
         load_settings(options.preset, getattr(options, "overrides", ()))
     given = {what: getattr(options, name) for name, what in FOLDERS.items() if name in options}
     for what, folder in given.items():
-        if not folder.is_dir():
+        if not (folder.is_dir() or (what == FOLDERS["capture"] and folder.is_file())):
             raise InputError(f"{folder}: no such folder; give {what}")
     return list(given.values())
 
@@ -73,11 +73,11 @@ def _name(command: Command) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="hnerf", description="From a folder of calibrated video to an avatar.")
+    parser = argparse.ArgumentParser(prog="hnerf", description="From video of a person to an avatar.")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
 
     capture, preset = (argparse.ArgumentParser(add_help=False) for _ in range(2))
-    capture.add_argument("capture", type=Path, help="the recording's folder")
+    capture.add_argument("capture", type=Path, help="the recording's folder, or one video")
     capture.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
     preset.add_argument("--preset", default="fast", help="a name under configs/ or a YAML file (default: fast)")
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from hnerf.capture.bars import Area, lens_for_area, picture_area
 from hnerf.capture.board_footage import normalised_corners, read_board_footage
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, SubjectPoint
 from hnerf.capture.clocks import InStep, in_step, read_clocks
 from hnerf.capture.footage import Footage, VideoFrame
 from hnerf.capture.formats.caliscope import Caliscope
@@ -17,13 +17,21 @@ from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.formats.peoplesnapshot import PeopleSnapshot
 from hnerf.capture.formats.pose2sim import Pose2Sim
+from hnerf.capture.formats.videos import Videos
 from hnerf.capture.formats.zjumocap import ZjuMocap
 from hnerf.capture.keypoint_files import read_openpose, read_results
 from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
 from hnerf.capture.lens import Lens
-from hnerf.capture.manifest import CameraSplit, capture_name, chosen_cameras, chosen_frames, read_manifest
+from hnerf.capture.manifest import (
+    CameraSplit,
+    CaptureManifest,
+    capture_name,
+    chosen_cameras,
+    chosen_frames,
+    read_manifest,
+)
 from hnerf.capture.normalise import Normaliser
-from hnerf.capture.safe_io import JSON_SUFFIXES, file_named, read_image
+from hnerf.capture.safe_io import JSON_SUFFIXES, VIDEO_SUFFIXES, file_named, read_image
 from hnerf.capture.timing import median_step
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
 from hnerf.config import CaptureSettings
@@ -42,6 +50,7 @@ LAYOUTS: tuple[type[Layout], ...] = (
     Caliscope,
     EasyMocap,
     Pose2Sim,
+    Videos,
 )  # the first that recognises a folder
 BAR_FRAMES = 5  # evenly spaced, in which black bars are searched
 
@@ -49,7 +58,7 @@ log = logging.getLogger("hnerf.capture")
 
 
 def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Uncalibrated | None = None) -> Capture:
-    """Read a capture folder (in any of LAYOUTS) and write it normalised into `out`.
+    """Read a capture folder (in any of LAYOUTS), or one video, and write it normalised into `out`.
 
     Images are undistorted, and shrunk to `settings.max_side_px`, with their keypoints and masks. Where `capture.toml`
     names no frames, those before the first and after the last detected person are left out. A recording that is
@@ -104,6 +113,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
         recorded_sizes_px={name: n.recorded_size_px for name, n in normalisers.items()},
         picture_areas_px=areas,
         frame_step=median_step(recorded),
+        subject_point=_subject_point(folder, manifest, {name: normalisers[name] for name in cameras.train}, wanted),
         recorded_lenses={c: (n.lens.K.tolist(), n.lens.distortion.tolist()) for c, n in normalisers.items() if n.maps},
     )
     capture.save()
@@ -118,9 +128,9 @@ def recorded_cameras(folder: Path) -> CameraSplit:
 
 
 def recognise(folder: Path) -> Layout:
-    """Return the folder's layout. Raises InputError if it is none of LAYOUTS."""
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give the folder of a capture")
+    """Return the layout of a folder, or of one video. Raises InputError if it is none of LAYOUTS."""
+    if not folder.exists():
+        raise InputError(f"{folder}: no such folder or video; give the folder of a capture")
     for layout in LAYOUTS:
         if layout.recognises(folder) and not (layout is EasyMocap and _only_filmed(folder)):
             return layout(folder)
@@ -131,14 +141,29 @@ def recognise(folder: Path) -> Layout:
         )
     raise InputError(
         f"{folder}: is none of EasyMocap (intri.yml, extri.yml, images/), Pose2Sim (calibration/, videos/), COLMAP "
-        "(sparse/), Caliscope (camera_array.toml), aniposelib (calibration.toml), ZJU-MoCap (annots.npy) and "
-        "PeopleSnapshot (camera.pkl); see docs/formats.md"
+        "(sparse/), Caliscope (camera_array.toml), aniposelib (calibration.toml), ZJU-MoCap (annots.npy), "
+        f"PeopleSnapshot (camera.pkl) and videos ({', '.join(VIDEO_SUFFIXES)}); see docs/formats.md"
     )
 
 
 def _only_filmed(folder: Path) -> bool:
     """Return whether a folder has images of cameras but no file with their poses."""
     return not (folder / "extri.yml").exists() and bool(cameras_without_calibration(folder))
+
+
+def _subject_point(
+    folder: Path, manifest: CaptureManifest, normalisers: dict[str, Normaliser], frames: tuple[int, ...]
+) -> SubjectPoint | None:
+    """Return the point that names the subject, in pixels of the normalised image of the chosen frame nearest to its
+    own (the first one where it names none). Raises InputError on a camera that is not for training."""
+    point = manifest.subject_point
+    if point is None or not point.camera:
+        return point
+    if point.camera not in normalisers:
+        raise InputError(f"{folder / 'capture.toml'}: subject: there is no training camera {point.camera}; correct it")
+    x, y, _ = normalisers[point.camera].keypoints(np.array([*point.at, 1.0]))
+    frame = min(frames, key=lambda chosen: abs(chosen - point.frame))
+    return SubjectPoint((float(x), float(y)), point.camera, frame)
 
 
 def _common_frames(footage: dict[str, Footage | InStep]) -> tuple[int, ...]:

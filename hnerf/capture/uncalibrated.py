@@ -67,29 +67,9 @@ class Uncalibrated(Layout):
         given = _read_lenses(file) if file else {}
         if self.lens_file and not set(given).intersection(names):
             raise InputError(f"{file}: has none of the cameras {', '.join(names)}; name them as the recordings are")
-        return {
-            name: KnownLens(given[name], f"from {file.name}") if file and name in given else self._by_angle(name)
-            for name in names
-        }
-
-    def _by_angle(self, name: str) -> KnownLens:
-        """Return a lens without distortion whose field of view is given, in the metadata, or usual."""
-        footage = self.footage(name)
-        first = next(footage.read(footage.frames[:1]))
-        height_px, width_px = first.rgb.shape[:2]
-        longer_px = max(width_px, height_px)
-        equivalent = focal_35mm(first.file or footage.path)
-        if self.fov_deg:
-            focal_px, source = longer_px / 2 / np.tan(np.deg2rad(self.fov_deg) / 2), f"{self.fov_deg:g} degrees given"
-        elif equivalent:
-            focal_px, source = (
-                equivalent / DIAGONAL_35MM * np.hypot(width_px, height_px),
-                f"{equivalent:g} mm, metadata",
-            )
-        else:
-            focal_px, source = USUAL_FOCAL * longer_px, ""
-        K = np.array([[focal_px, 0, (width_px - 1) / 2], [0, focal_px, (height_px - 1) / 2], [0, 0, 1]])
-        return KnownLens(Lens(name, K, np.zeros(4), np.eye(3), np.zeros(3), (width_px, height_px)), source)
+        known = {name: KnownLens(lens, f"from {file.name}") for name, lens in given.items() if file and name in names}
+        others = [name for name in names if name not in known]
+        return known | {name: lens_by_angle(name, self.footage(name), self.fov_deg) for name in others}
 
     def lenses(self) -> dict[str, Lens]:
         """Return the lens of every camera, at the origin."""
@@ -103,6 +83,23 @@ class Uncalibrated(Layout):
     def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
         """Return openpose/<camera>/, else pose/<camera>_json/."""
         return EasyMocap(self.folder).keypoint_files(camera) or Pose2Sim(self.folder).keypoint_files(camera)
+
+
+def lens_by_angle(name: str, footage: Footage, fov_deg: float | None) -> KnownLens:
+    """Return a lens without distortion, at the origin, whose field of view across the longer side is given, in the
+    metadata of the first image or of the video, or usual."""
+    first = next(footage.read(footage.frames[:1]))
+    height_px, width_px = first.rgb.shape[:2]
+    longer_px = max(width_px, height_px)
+    equivalent_mm = focal_35mm(first.file or footage.path)
+    focal_px, source = USUAL_FOCAL * longer_px, ""
+    if fov_deg:
+        focal_px, source = longer_px / 2 / np.tan(np.deg2rad(fov_deg) / 2), f"{fov_deg:g} degrees given"
+    elif equivalent_mm:
+        focal_px = equivalent_mm / DIAGONAL_35MM * np.hypot(width_px, height_px)
+        source = f"{equivalent_mm:g} mm, metadata"
+    K = np.array([[focal_px, 0, (width_px - 1) / 2], [0, focal_px, (height_px - 1) / 2], [0, 0, 1]])
+    return KnownLens(Lens(name, K, np.zeros(4), np.eye(3), np.zeros(3), (width_px, height_px)), source)
 
 
 def _read_lenses(path: Path) -> dict[str, Lens]:

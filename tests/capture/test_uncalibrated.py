@@ -99,11 +99,7 @@ def test_videos_are_cameras_and_are_ingested_without_poses(tmp_path: Path) -> No
     assert capture.cameras["left"].K[0, 0] == pytest.approx(0.85 * 96)
 
 
-@pytest.mark.parametrize("layout", ["images", "videos"])
-def test_a_run_names_the_command_that_calibrates(tmp_path: Path, layout: str) -> None:
-    if layout == "images":
-        write_images(tmp_path, "a")
-    else:
-        write_video(tmp_path / "videos" / "a.mp4")
+def test_a_run_names_the_command_that_calibrates(tmp_path: Path) -> None:
+    write_images(tmp_path, "a")
     with pytest.raises(InputError, match=r"no calibration.*hnerf calibrate .* --from person"):
         recognise(tmp_path)

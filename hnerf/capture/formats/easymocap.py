@@ -44,11 +44,14 @@ class EasyMocap(Layout):
         return {lens.name: lens for lens in lenses}
 
     def footage(self, camera: str) -> Footage:
-        """Return images/<camera>/, else videos/<camera>.mp4."""
+        """Return images/<camera>/, else videos/<camera>.mp4, else <camera>.mp4."""
         files = files_in(self.folder, "images", camera, suffixes=IMAGE_SUFFIXES)
         if files:
             return ImageFolder(self.folder / "images" / camera, numbered(files, "images"))
         video = file_named(self.folder, camera, "videos", suffixes=VIDEO_SUFFIXES)
+        beside = file_named(self.folder, camera, suffixes=VIDEO_SUFFIXES)
+        if not video.exists() and beside.exists():
+            return Video.open(beside)
         if not video.exists():
             raise InputError(
                 f"{self.folder / 'images' / camera}: no JPEG or PNG images, and no {video}; "
