@@ -18,7 +18,7 @@ NO_ROOM = (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # None: our own, of l
 CAMERA_FORMATS = ("easymocap", "caliscope", "aniposelib", "colmap")  # of hnerf.capture.formats.export, which is slow
 PICTURES = ("colour", "depth", "normals", "mask", "mesh")  # of hnerf.render.subject, which imports torch
 FOLDERS = {
-    "capture": "the capture's folder",
+    "capture": "the capture's folder, or one video",
     "folder": "the folder of a capture",
     "subject": "<store>/subjects/<name> of a finished `hnerf run`",
 }  # among a command's options, and what they are
@@ -63,7 +63,7 @@ def _existing(options: argparse.Namespace) -> list[Path]:
         load_settings(options.preset, getattr(options, "overrides", ()))
     given = {what: getattr(options, name) for name, what in FOLDERS.items() if name in options}
     for what, folder in given.items():
-        if not folder.is_dir():
+        if not (folder.is_dir() or (what == FOLDERS["capture"] and folder.is_file())):
             raise InputError(f"{folder}: no such folder; give {what}")
     return list(given.values())
 
@@ -73,11 +73,11 @@ def _name(command: Command) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="hnerf", description="From a folder of calibrated video to an avatar.")
+    parser = argparse.ArgumentParser(prog="hnerf", description="From video of a person to an avatar.")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
 
     capture, preset = (argparse.ArgumentParser(add_help=False) for _ in range(2))
-    capture.add_argument("capture", type=Path, help="the recording's folder")
+    capture.add_argument("capture", type=Path, help="the recording's folder, or one video")
     capture.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
     preset.add_argument("--preset", default="fast", help="a name under configs/ or a YAML file (default: fast)")
 
@@ -92,13 +92,8 @@ def _parser() -> argparse.ArgumentParser:
     add(commands.check_cameras, capture, preset)
     add(commands.settings, preset)
 
-    boards = add(commands.calibrate)
-    boards.add_argument("folder", type=Path, help="a folder with calibration/extrinsic/ and charuco.toml")
-    _add_out(boards, "cameras")
-    boards.add_argument("--format", choices=CAMERA_FORMATS, action="append", default=[], help="write these files, too")
-    boards.add_argument(
-        "--ground-frame", type=_not_negative, metavar="N", help="when the board lies on the floor, at the origin"
-    )
+    _add_calibrate(add(commands.calibrate))
+    add(commands.synchronise).add_argument("folder", type=Path, help="a recording whose cameras started apart")
     cameras = add(commands.export_cameras)
     cameras.add_argument("folder", type=Path, help="a recording, or a folder that `calibrate` wrote")
     cameras.add_argument("--format", choices=CAMERA_FORMATS, required=True)
@@ -133,6 +128,26 @@ def _add_overrides(command: argparse.ArgumentParser, what: str) -> None:
     command.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help=what)
 
 
+def _add_calibrate(command: argparse.ArgumentParser) -> None:
+    command.add_argument("folder", type=Path, help="a recording, or a folder with calibration/extrinsic/")
+    command.add_argument(
+        "--from", dest="source", choices=("boards", "person"), default="boards",
+        help="of what: footage of a board (default), or the person in the recording itself",
+    )  # fmt: skip
+    _add_out(command, "cameras")
+    command.add_argument("--format", choices=CAMERA_FORMATS, action="append", default=[], help="write these files, too")
+    boards = command.add_argument_group("from boards")
+    boards.add_argument(
+        "--ground-frame", type=_not_negative, metavar="N", help="when the board lies on the floor, at the origin"
+    )
+    person = command.add_argument_group("from the person")
+    person.add_argument("--height", type=_positive, metavar="M", help="the person's, in metres (default: the mean)")
+    person.add_argument("--lens", type=Path, metavar="FILE", help="intrinsics: intri.yml, or a TOML of cameras")
+    person.add_argument(
+        "--fov", type=_angle, metavar="DEG", help="field of view across the longer side (default: metadata, or found)"
+    )
+
+
 def _add_out(command: argparse.ArgumentParser, default: str) -> None:
     command.add_argument("--out", type=Path, default=Path(default), help=f"the folder to write (default: {default})")
 
@@ -158,7 +173,14 @@ def _not_negative(text: str) -> int:
 def _positive(text: str) -> float:
     value = float(text)
     if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError("give seconds above 0")
+        raise argparse.ArgumentTypeError("give a number above 0")
+    return value
+
+
+def _angle(text: str) -> float:
+    value = float(text)
+    if not 1 <= value <= 170:
+        raise argparse.ArgumentTypeError("give degrees from 1 to 170")
     return value
 
 

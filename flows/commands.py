@@ -96,7 +96,10 @@ def _table(report: dict[str, Any]) -> Iterator[str]:
 
 
 def calibrate(options: argparse.Namespace) -> None:
-    """Find the cameras from footage of a calibration board."""
+    """Find the cameras from footage of a calibration board, or from the person."""
+    if options.source == "person":
+        _calibrate_from_person(options)
+        return
     with atomic_folder(options.out) as partial:
         from hnerf.calibration.boards.calibrate import calibrate_from_boards
 
@@ -107,6 +110,40 @@ def calibrate(options: argparse.Namespace) -> None:
     for name, camera in report["cameras"].items():
         print(f"{name:<12} {camera['pictures']:>8} {camera['rms_px']:>7.2f}  {camera['intrinsics']}")
     print(f"all: {report['rms_px']:.2f} px RMS\ncameras: {options.out}\npicture: {options.out / 'boards.png'}")
+
+
+def _calibrate_from_person(options: argparse.Namespace) -> None:
+    with atomic_folder(options.out) as partial:
+        from hnerf.calibration.person.recording import calibrate_recording
+
+        found = calibrate_recording(options.folder, options.height, options.lens, options.fov)
+        found.save(partial, options.format, pose2sim=(options.folder / "pose").is_dir())
+    print(f"{'camera':<12} {'median px':>9} {'+- degrees':>10} {'+- cm':>6} {'+- % focal':>10}  intrinsics")
+    for name, camera in found.report()["cameras"].items():
+        off = camera["uncertainty"]
+        figures = f"{off['turn_deg']:>10.2f} {100 * off['move_m']:>6.1f} {100 * off['focal']:>10.1f}"
+        print(f"{name:<12} {camera['median_px']:>9.2f} {figures}  {camera['intrinsics']}")
+    print("\n".join([*found.notes(), f"cameras: {options.out}; copy its files into {options.folder} to use them"]))
+
+
+def synchronise(options: argparse.Namespace) -> None:
+    """Find when each camera started and how its clock runs; write clocks.toml."""
+    from hnerf.capture.clocks import FILE, write_clocks
+
+    path = options.folder / FILE
+    if path.exists():
+        raise InputError(f"{path}: exists; remove it to synchronise again")
+    from hnerf.calibration.clocks.recording import synchronise_recording
+
+    found, sources = synchronise_recording(options.folder)
+    write_clocks(path, found.clocks)
+    print(f"{'camera':<12} {'offset s':>9} {'+- ms':>6} {'drift ppm':>9}  from")
+    for name, clock in found.clocks.items():
+        error_ms, ppm = 1e3 * found.error_s[name], 1e6 * (clock.rate - 1)
+        print(f"{name:<12} {clock.offset_s:>+9.4f} {error_ms:>6.1f} {ppm:>+9.0f}  {sources[name]}")
+    for (a, b), why in found.refused.items():
+        print(f"{a} and {b} were not compared: {why}")
+    print(f"clocks: {path}")
 
 
 def export_cameras(options: argparse.Namespace) -> None:

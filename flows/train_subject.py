@@ -53,7 +53,7 @@ def train_subject(
     """
     settings = load_settings(preset, overrides or ())
     artifact_store = Store(store.resolve())
-    if not capture.is_dir():
+    if not capture.exists():
         forget(artifact_store.root, capture)
     source, truth = read_capture(capture, store)
     if settings.evaluation.holdout:

@@ -56,8 +56,11 @@ class _Relay(logging.Handler):
 
 
 def report_relayed(line: str) -> bool:
-    """Report what a line says that another process wrote since it called `relay`; return whether it is such a line."""
+    """Report what a line says that another process wrote since it called `relay`; return whether it is such a line.
+    What follows in the line is left out: processes and their libraries share one pipe, and do not wait for each other's
+    line ends."""
     if line.startswith(RECORD_SEPARATOR):
-        report(*json.loads(line.removeprefix(RECORD_SEPARATOR)))
+        progress, _ = json.JSONDecoder().raw_decode(line.removeprefix(RECORD_SEPARATOR))
+        report(*progress)
         return True
     return False

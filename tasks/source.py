@@ -24,15 +24,16 @@ class Source(BaseModel):
 
 
 def read_capture(folder: Path, store: Path | None = None) -> tuple[Source, Source]:
-    """Return the recording and its ground truth: all files except those of `ground_truth/`, and only those.
+    """Return the recording and its ground truth: all files except those of `ground_truth/`, and only those. A
+    recording may also be one video, which has no ground truth.
 
     Hidden files do not count. A symbolic link counts by the path it holds: its target is either in the folder itself or
     not part of it. Raises InputError if there is no such folder, a file cannot be read, or the store lies in the
     capture, whose digest would then change with every run.
     """
     folder = folder.resolve()
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give the capture's folder")
+    if not folder.exists():
+        raise InputError(f"{folder}: no such folder or video; give the capture's folder")
     if store and store.resolve().is_relative_to(folder):
         raise InputError(f"{store.resolve()}: lies in the capture's folder; give --store another folder")
     shown = os.fsencode(folder).decode(errors="replace")
@@ -41,13 +42,16 @@ def read_capture(folder: Path, store: Path | None = None) -> tuple[Source, Sourc
     truth = folder / GROUND_TRUTH
     files = capture_files(folder)
     parts = [f for f in files if not f.is_relative_to(truth)], [f for f in files if f.is_relative_to(truth)]
-    recorded, known = (Source(root=folder, name=folder.name, digest=_digest(folder, part)) for part in parts)
+    beside = folder.parent if folder.is_file() else folder
+    recorded, known = (Source(root=folder, name=folder.name, digest=_digest(beside, part)) for part in parts)
     return recorded, known
 
 
 def capture_files(folder: Path) -> list[Path]:
-    """Return the files and symbolic links in a capture folder, sorted, without hidden ones and devices. Raises
-    InputError if a folder cannot be read."""
+    """Return the files and symbolic links in a capture folder, sorted, without hidden ones and devices; a video alone
+    is its own file. Raises InputError if a folder cannot be read."""
+    if folder.is_file():
+        return [folder]
     found = []
     for parent, folders, files in os.walk(folder, onerror=_refuse):
         links = [name for name in folders if (Path(parent) / name).is_symlink()]

@@ -148,6 +148,12 @@ def _peoplesnapshot(folder: Path) -> None:
                 file.create_dataset(key, data=array, chunks=True, compression="gzip")
 
 
+def _videos(folder: Path) -> None:
+    rec.write_video(folder / "ada.mp4", FRAMES, (32, 32))
+    text = 'field_of_view_deg = 60.0\nsubject = "nearest to (10, 20) in ada at frame 1"\nfps = 25\n'
+    (folder / "capture.toml").write_text(text)
+
+
 def _motion(folder: Path) -> None:
     folder.mkdir()
     np.savez_compressed(folder / "a.npz", poses=np.ones((3, 156)), trans=np.zeros((3, 3)), mocap_framerate=120.0)
@@ -179,6 +185,7 @@ READERS = (
     Reader("aniposelib", _with_cameras("aniposelib"), _ingest),
     Reader("zju-mocap", _zju, _ingest),
     Reader("peoplesnapshot", _peoplesnapshot, _ingest),
+    Reader("videos", _videos, _ingest),
     Reader("motion", _motion, lambda folder, out: _read_amass(folder / "a.npz")),
     Reader("camera path", _camera_path, lambda folder, out: read_camera_path(folder / "path.json", (24, 16))),
     Reader("preset", _preset, lambda folder, out: load_settings(str(folder / "mine.yaml"))),

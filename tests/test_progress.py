@@ -37,3 +37,8 @@ def test_another_process_is_reported_as_it_reports_itself(
     *lines, end = capsys.readouterr().out.split("\n")
     assert [progress.report_relayed(line) for line in (*lines, end, "step 1 of 4")] == [True, True, False, False]
     assert [record.progress for record in reported.records] == [("training", 1.5, 4), ("training", 4, 4)]
+
+
+def test_what_another_wrote_into_the_line_is_left_out(reported: pytest.LogCaptureFixture) -> None:
+    assert progress.report_relayed(progress.RECORD_SEPARATOR + '["training", 1, 4]INFO: created')
+    assert [record.progress for record in reported.records] == [("training", 1, 4)]

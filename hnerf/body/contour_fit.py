@@ -157,6 +157,8 @@ def refine_with_outlines(
     edges: by frame and camera, None without a mask; up: the world's vertical axis, used with one camera only.
     """
     faces = pose.rig.faces.numpy()
+    only = problem.observations.cameras[0] if len(problem.observations.cameras) == 1 else None
+    stands_above_ground = only is not None and only.centre_m[up] > GROUND_OUTLIER_M  # else height 0 is not the ground
     for step in tracked(range(settings.contour_steps), "outlines", settings.contour_steps):
         articulation = Articulation(pose.rig)
         joints = articulation.pose(pose)
@@ -170,7 +172,7 @@ def refine_with_outlines(
                 for camera, scale_m, edge in zip(problem.observations.cameras, problem.scale_m, row, strict=True)
                 if edge is not None
             ]
-            if len(row) == 1:
+            if stands_above_ground:
                 found.append(_ground_contact(vertices_m, up))
             for rows in found:
                 add_residuals(equations, articulation, joints, t, rows)

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
@@ -66,19 +67,107 @@ def _bundle_adjust(
             config.set_constant_rig_from_world_pose(i)
         if camera.name not in focal:
             config.set_constant_cam_intrinsics(i)
+    if len(cameras) - len(free) < 2:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    _solve(scene, config, points_m, used, loss_scale_px)
+    return [
+        _solved_camera(scene, i, camera) if camera.name in free else camera for i, camera in enumerate(cameras, start=1)
+    ]
+
+
+def _solve(
+    scene: pycolmap.Reconstruction,
+    config: pycolmap.BundleAdjustmentConfig,
+    points_m: np.ndarray,
+    used: np.ndarray,
+    loss_scale_px: float,
+) -> None:
+    """Add points (K, 3), seen where `used` (C, K) says, to a scene whose images are numbered from 1, and adjust it."""
     for k in np.flatnonzero(used.sum(0) >= 2):
         track = [pycolmap.TrackElement(int(c) + 1, int(k)) for c in np.flatnonzero(used[:, k])]
         scene.add_point3D(points_m[k], pycolmap.Track(track))
-    if len(cameras) - len(free) < 2:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = loss_scale_px
     options.ceres.solver_options.function_tolerance = FUNCTION_TOLERANCE
     pycolmap.create_default_ceres_bundle_adjuster(options, config, scene).solve()
-    return [
-        _solved_camera(scene, i, camera) if camera.name in free else camera for i, camera in enumerate(cameras, start=1)
-    ]
+
+
+def adjust_shared_lens(
+    cameras: Sequence[Camera], keypoints: np.ndarray, unknown: Sequence[str], distorted: bool
+) -> tuple[list[Camera], float]:
+    """Return the cameras with all poses adjusted and the focal lengths of those named in `unknown` multiplied by one
+    factor, and their one distortion term k1 (0 unless `distorted`). The rig is aligned to the given cameras.
+
+    keypoints (C, frames, K, 3). Lenses of one make differ by a percent or two, which is less than a single camera can
+    tell from a step towards the person.
+    """
+    chosen = evenly_spaced(range(keypoints.shape[1]), MAX_FRAMES)
+    flat = keypoints[:, chosen].reshape(len(cameras), -1, 3)
+    shared = np.array([camera.name in unknown for camera in cameras])
+    adjusted, k1 = list(cameras), 0.0
+    for _ in range(ROUNDS):
+        projections = np.stack([camera.projection for camera in adjusted])
+        points_m, residuals_px, used = triangulate(projections, undistort(flat, adjusted, shared, k1))
+        if used.sum() < MIN_OBSERVATIONS:
+            break
+        scale_px = max(LOSS_SCALE_PX, float(np.median(residuals_px[used])))
+        adjusted, k1 = _solve_shared_lens(adjusted, flat, points_m, used, shared, distorted, k1, scale_px)
+    return align(adjusted, cameras), k1
+
+
+def undistort(keypoints: np.ndarray, cameras: Sequence[Camera], shared: np.ndarray, k1: float) -> np.ndarray:
+    """Return keypoints (C, K, 3) without the distortion k1 (OpenCV's) of the cameras in `shared` (C,)."""
+    straight = keypoints.copy()
+    for i, camera in enumerate(cameras):
+        if not (shared[i] and k1):
+            continue
+        seen, K = keypoints[i, :, 2] > 0, camera.K
+        distorted = np.ascontiguousarray(keypoints[i, seen, None, :2])
+        straight[i, seen, :2] = cv2.undistortPoints(distorted, K, np.array([k1, 0, 0, 0]), P=K)[:, 0]
+    return straight
+
+
+def _solve_shared_lens(
+    cameras: Sequence[Camera],
+    keypoints: np.ndarray,
+    points_m: np.ndarray,
+    used: np.ndarray,
+    shared: np.ndarray,
+    distorted: bool,
+    k1: float,
+    loss_scale_px: float,
+) -> tuple[list[Camera], float]:
+    """Solve once over the used observations (C, K). Images of the cameras in `shared` (C,) are moved and scaled to one
+    principal point and focal length, so that they share the lens of one camera."""
+    scene = pycolmap.Reconstruction()
+    config = pycolmap.BundleAdjustmentConfig()
+    focal_px = float(np.median([camera.K[0, 0] for camera in cameras]))
+    model = "SIMPLE_RADIAL" if distorted else "SIMPLE_PINHOLE"
+    params = [focal_px, 0, 0, k1] if distorted else [focal_px, 0, 0]
+    side = max(max(camera.width_px, camera.height_px) for camera in cameras)
+    number = len(cameras) + 1
+    common = pycolmap.Camera(camera_id=number, model=model, params=params, width=side, height=side)
+    scene.add_camera_with_trivial_rig(common)
+    for i, camera in enumerate(cameras, start=1):
+        if shared[i - 1]:
+            points = (keypoints[i - 1, :, :2] - camera.K[:2, 2]) * (focal_px / np.diag(camera.K)[:2])
+            image = pycolmap.Image(camera.name, np.ascontiguousarray(points), number, i)
+            scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(camera.R), camera.t_m))
+        else:
+            _add_image(scene, i, camera, keypoints[i - 1, :, :2])
+            config.set_constant_cam_intrinsics(i)
+        config.add_image(i)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    _solve(scene, config, points_m, used, loss_scale_px)
+    solved = scene.camera(number).params
+    zoom = solved[0] / focal_px
+    found = []
+    for i, camera in enumerate(cameras, start=1):
+        pose = scene.image(i).cam_from_world()
+        K = camera.K * np.array([[zoom, zoom, 1], [1, zoom, 1], [1, 1, 1]]) if shared[i - 1] else camera.K
+        found.append(dataclasses.replace(camera, K=K, R=pose.rotation.matrix(), t_m=np.array(pose.translation)))
+    return found, float(solved[3]) if distorted else 0.0
 
 
 def _add_image(scene: pycolmap.Reconstruction, number: int, camera: Camera, keypoints_px: np.ndarray) -> None:

@@ -22,7 +22,7 @@ from hnerf.calibration.diagnosis import (
 )
 from hnerf.calibration.doubts import check_spread, doubts
 from hnerf.calibration.evidence import Evidence
-from hnerf.calibration.monocular import ground_reasons, intrinsics_reasons
+from hnerf.calibration.monocular import ground_reasons, intrinsics_reasons, raised_above_ground
 from hnerf.calibration.refine import refine
 from hnerf.calibration.report import CalibrationReport, CameraVerdict
 from hnerf.calibration.sizes import size_reasons
@@ -262,8 +262,13 @@ def _monocular(capture: Capture, keypoints: np.ndarray) -> CalibrationReport:
         f"one training camera: the person is seen in {shown} of {len(capture.frames)} frames",
         "not checked with one camera: reprojection, units, body height, direction of extrinsics, leave-one-out",
     )
-    camera = capture.cameras[name]
-    reasons = size_reasons(capture, name) + intrinsics_reasons(camera) + ground_reasons(camera, keypoints, capture.up)
-    verdict = CameraVerdict("ok", None, None, None, None, 0.0, Timing.unknown("one camera"), tuple(reasons))
+    camera, raised = capture.cameras[name], ""
+    if capture.given_poses() is None:  # which are of the given camera
+        camera, raised = raised_above_ground(camera, keypoints, capture.up, USUAL_HEIGHT_M)
+    reasons = size_reasons(capture, name) + intrinsics_reasons(camera)
+    reasons += [raised] if raised else ground_reasons(camera, keypoints, capture.up)
+    status = "refined" if raised else "ok"
+    verdict = CameraVerdict(status, None, None, None, None, 0.0, Timing.unknown("one camera"), tuple(reasons))
+    cameras = capture.cameras | {name: camera}
     found = doubts(capture, keypoints[None], None)
-    return CalibrationReport(capture.cameras, {name: verdict}, None, None, {}, {}, notes, capture.up, None, found)
+    return CalibrationReport(cameras, {name: verdict}, None, None, {}, {}, notes, capture.up, None, found)

@@ -1,5 +1,7 @@
 """Checks of a single camera: its intrinsics, the ground, and the person's height above it."""
 
+import dataclasses
+
 import numpy as np
 
 from hnerf.geometry.camera import Camera
@@ -10,6 +12,7 @@ PRINCIPAL_POINT_RANGE = (
 )  # of the image's sides: width of the central range in which an uncropped image has its principal point
 MAX_ASPECT_ERROR = 0.1  # of the pixel aspect ratio from 1
 STANDING_M = (1.2, 2.1)
+UNMEASURED_M = 1e-6  # height of a camera whose height nobody has measured
 NOSE, SOLES = 0, (19, 21, 22, 24)  # of BODY_25: big toes and heels
 NOSE_SHARE = 0.92  # of an adult's stature (Winter 2009, figure 4.1: eyes at 0.936)
 
@@ -45,6 +48,21 @@ def ground_reasons(camera: Camera, keypoints: np.ndarray, up: str) -> list[str]:
         f"standing on world height 0 the person would be {stature_m:.2f} m tall: height 0 is not the ground, "
         "or the translation is not in metres"
     ]
+
+
+def raised_above_ground(camera: Camera, keypoints: np.ndarray, up: str, stature_m: float) -> tuple[Camera, str]:
+    """Return a camera that stands at height 0, where nobody has measured its height, raised until a person of
+    this stature, seen as keypoints (frames, 25, 3), stands on height 0; and what was done, in words. Any other camera
+    is returned as it is, with no words."""
+    vertical = np.eye(3)["xyz".index(up)]
+    if abs(camera.centre_m @ vertical) > UNMEASURED_M:
+        return camera, ""
+    by_a_metre = dataclasses.replace(camera, t_m=camera.t_m - camera.R @ vertical)
+    height_m = stature_m / stature_on_ground_m(by_a_metre, keypoints, up)
+    if not np.isfinite(height_m):
+        return camera, ""
+    words = f"its height is not known: {height_m:.2f} m if the camera is level and the person {stature_m:.2f} m tall"
+    return dataclasses.replace(camera, t_m=camera.t_m - height_m * camera.R @ vertical), words
 
 
 def stature_on_ground_m(camera: Camera, keypoints: np.ndarray, up: str) -> float:

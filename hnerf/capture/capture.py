@@ -9,7 +9,7 @@ import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,6 +24,15 @@ PERSON = "person"  # folder: <camera>/<frame>.png, 255 times the probability
 JPEG_OPTIONS = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
 
+class SubjectPoint(NamedTuple):
+    """The point by which `capture.toml` names the subject. at (2,): metres on the ground, in the world's two horizontal
+    axes; or pixels of the image of `frame`, if a `camera` is named."""
+
+    at: tuple[float, float]
+    camera: str = ""
+    frame: int = 0
+
+
 @dataclass(frozen=True)
 class Capture:
     """A normalised capture: cameras, frames, splits and where the images lie. Test cameras are for scoring only.
@@ -33,7 +42,7 @@ class Capture:
     within the recorded one, which changed K on ingestion. `up`: "z" or "y", the world's vertical axis. `frame_offsets`:
     of cameras that are not synchronised (hnerf.capture.timing); `stored_frames`: the frames in the files, where some
     were dropped since; `frame_step`: the distance of frame numbers in the recording. `recorded_lenses`: K and
-    distortion of the recorded files, of cameras that were undistorted.
+    distortion of the recorded files, of cameras that were undistorted. `subject_point`: None where nobody is named.
     """
 
     name: str
@@ -52,6 +61,7 @@ class Capture:
     stored_frames: tuple[int, ...] = ()
     frame_step: int = 1
     recorded_lenses: dict[str, tuple[list[list[float]], list[float]]] = dataclasses.field(default_factory=dict)
+    subject_point: SubjectPoint | None = None
 
     @property
     def frames(self) -> tuple[int, ...]:
@@ -177,6 +187,8 @@ class Capture:
         plain["stored_frames"] = tuple(plain.get("stored_frames", ()))
         plain |= {k: {name: tuple(size) for name, size in plain[k].items()} for k in sizes}
         plain["picture_areas_px"] = {name: Area(*area) for name, area in plain.get("picture_areas_px", {}).items()}
+        if point := plain.get("subject_point"):
+            plain["subject_point"] = SubjectPoint(tuple(point[0]), *point[1:])
         return Capture(root=root, cameras=cameras, **plain)
 
 

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -49,11 +50,13 @@ class ImageFolder:
 
 @dataclass(frozen=True)
 class Video:
-    """A video file whose every frame can be decoded, numbered from 0."""
+    """A video file whose every frame can be decoded, numbered from 0; times_s: when each is shown, where the file
+    says."""
 
     path: Path
     frames: tuple[int, ...]
     fps: float | None
+    times_s: tuple[float, ...] = ()
 
     @staticmethod
     def open(path: Path) -> "Video":
@@ -61,15 +64,18 @@ class Video:
         short)."""
         stream = _open_stream(path)
         check_image_size(path, stream.get(cv2.CAP_PROP_FRAME_WIDTH), stream.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        declared, count = int(stream.get(cv2.CAP_PROP_FRAME_COUNT)), 0
+        declared, times_s = int(stream.get(cv2.CAP_PROP_FRAME_COUNT)), list[float]()
         while stream.grab():
-            count += 1
+            times_s.append(stream.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
+        count = len(times_s)
         if count == 0 or count != declared:
             raise InputError(
                 f"{path}: {declared} frames declared, {count} could be read; export it again whole, as H.264"
             )
-        fps = stream.get(cv2.CAP_PROP_FPS)
-        return Video(path, tuple(range(count)), fps if MIN_FPS <= fps <= MAX_FPS else None)
+        ascending = all(a < b for a, b in pairwise(times_s))
+        declared_fps = stream.get(cv2.CAP_PROP_FPS)
+        fps = declared_fps if MIN_FPS <= declared_fps <= MAX_FPS else None
+        return Video(path, tuple(range(count)), fps, tuple(times_s) if ascending else ())
 
     def read(self, wanted: Iterable[int]) -> Iterator[VideoFrame]:
         """Yield the wanted frames in ascending order. Raises InputError if one cannot be read."""

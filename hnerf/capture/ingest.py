@@ -8,7 +8,8 @@ import numpy as np
 
 from hnerf.capture.bars import Area, lens_for_area, picture_area
 from hnerf.capture.board_footage import normalised_corners, read_board_footage
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, SubjectPoint
+from hnerf.capture.clocks import InStep, in_step, read_clocks
 from hnerf.capture.footage import Footage, VideoFrame
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.capture.formats.colmap import Colmap
@@ -16,14 +17,23 @@ from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.formats.peoplesnapshot import PeopleSnapshot
 from hnerf.capture.formats.pose2sim import Pose2Sim
+from hnerf.capture.formats.videos import Videos
 from hnerf.capture.formats.zjumocap import ZjuMocap
 from hnerf.capture.keypoint_files import read_openpose, read_results
 from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
 from hnerf.capture.lens import Lens
-from hnerf.capture.manifest import CameraSplit, capture_name, chosen_cameras, chosen_frames, read_manifest
+from hnerf.capture.manifest import (
+    CameraSplit,
+    CaptureManifest,
+    capture_name,
+    chosen_cameras,
+    chosen_frames,
+    read_manifest,
+)
 from hnerf.capture.normalise import Normaliser
-from hnerf.capture.safe_io import JSON_SUFFIXES, file_named, read_image
+from hnerf.capture.safe_io import JSON_SUFFIXES, VIDEO_SUFFIXES, file_named, read_image
 from hnerf.capture.timing import median_step
+from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
@@ -40,6 +50,7 @@ LAYOUTS: tuple[type[Layout], ...] = (
     Caliscope,
     EasyMocap,
     Pose2Sim,
+    Videos,
 )  # the first that recognises a folder
 BLACK = 8  # grey level that noise and an encoder leave of black
 BAR_FRAMES = 5  # evenly spaced, in which black bars are searched
@@ -47,20 +58,25 @@ BAR_FRAMES = 5  # evenly spaced, in which black bars are searched
 log = logging.getLogger("hnerf.capture")
 
 
-def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
-    """Read a capture folder (in any of LAYOUTS) and write it normalised into `out`.
+def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Uncalibrated | None = None) -> Capture:
+    """Read a capture folder (in any of LAYOUTS), or one video, and write it normalised into `out`.
 
     Images are undistorted, and shrunk to `settings.max_side_px`, with their keypoints and masks. Where `capture.toml`
-    names no frames, those before the first and after the last detected person are left out. Raises InputError, one line
-    that names the file, on anything missing, unreadable, contradictory or unsafe.
+    names no frames, those before the first and after the last detected person are left out. A recording that is
+    `uncalibrated` is read without the poses of its cameras, all of which are then for training. Raises InputError, one
+    line that names the file, on anything missing, unreadable, contradictory or unsafe.
     """
-    layout, manifest = recognise(folder), read_manifest(folder)
+    layout, manifest = uncalibrated or recognise(folder), read_manifest(folder)
+    if uncalibrated:
+        manifest = manifest.model_copy(update={"cameras": None})
     subject = capture_name(folder, manifest)
     lenses = layout.lenses()
     cameras = chosen_cameras(folder, manifest, list(lenses), layout.training_cameras())
-    footage = {name: layout.footage(name) for name in cameras.train + cameras.test}
+    filmed = {name: layout.footage(name) for name in cameras.train + cameras.test}
+    clocks = {} if len(filmed) == 1 else read_clocks(folder)
+    footage = in_step(filmed, clocks, manifest.fps or DEFAULT_FPS)
     recorded = _common_frames(footage)
-    detected = {name: _detections(layout, name, pictures) for name, pictures in footage.items()}
+    detected = {name: _detections_in_step(layout, name, pictures) for name, pictures in footage.items()}
     people = {name: found for name, found in detected.items() if found is not None}
     seen = [people[name] for name in cameras.train if name in people]
     occupied = recorded if manifest.frames else _frames_with_people(seen, recorded)
@@ -92,12 +108,13 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path) -> Capture:
         test_cameras=tuple(cameras.test),
         train_frames=tuple(frames.train),
         novel_pose_frames=tuple(frames.novel_pose),
-        fps=manifest.fps or next(iter(footage.values())).fps or DEFAULT_FPS,
+        fps=manifest.fps or min((one.fps for one in filmed.values() if one.fps), default=DEFAULT_FPS),
         up=manifest.up,
         calibrated_sizes_px={name: lenses[name].size_px or n.recorded_size_px for name, n in normalisers.items()},
         recorded_sizes_px={name: n.recorded_size_px for name, n in normalisers.items()},
         picture_areas_px=areas,
         frame_step=median_step(recorded),
+        subject_point=_subject_point(folder, manifest, {name: normalisers[name] for name in cameras.train}, wanted),
         recorded_lenses={c: (n.lens.K.tolist(), n.lens.distortion.tolist()) for c, n in normalisers.items() if n.maps},
     )
     capture.save()
@@ -112,20 +129,45 @@ def recorded_cameras(folder: Path) -> CameraSplit:
 
 
 def recognise(folder: Path) -> Layout:
-    """Return the folder's layout. Raises InputError if it is none of LAYOUTS."""
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give the folder of a capture")
+    """Return the layout of a folder, or of one video. Raises InputError if it is none of LAYOUTS."""
+    if not folder.exists():
+        raise InputError(f"{folder}: no such folder or video; give the folder of a capture")
     for layout in LAYOUTS:
-        if layout.recognises(folder):
+        if layout.recognises(folder) and not (layout is EasyMocap and _only_filmed(folder)):
             return layout(folder)
+    if cameras_without_calibration(folder):
+        raise InputError(
+            f"{folder}: no calibration of its cameras (extri.yml or another); "
+            f"`hnerf calibrate {folder} --from person` finds them from the person, --from boards from a board"
+        )
     raise InputError(
         f"{folder}: is none of EasyMocap (intri.yml, extri.yml, images/), Pose2Sim (calibration/, videos/), COLMAP "
-        "(sparse/), Caliscope (camera_array.toml), aniposelib (calibration.toml), ZJU-MoCap (annots.npy) and "
-        "PeopleSnapshot (camera.pkl); see docs/formats.md"
+        "(sparse/), Caliscope (camera_array.toml), aniposelib (calibration.toml), ZJU-MoCap (annots.npy), "
+        f"PeopleSnapshot (camera.pkl) and videos ({', '.join(VIDEO_SUFFIXES)}); see docs/formats.md"
     )
 
 
-def _common_frames(footage: dict[str, Footage]) -> tuple[int, ...]:
+def _only_filmed(folder: Path) -> bool:
+    """Return whether a folder has images of cameras but no file with their poses."""
+    return not (folder / "extri.yml").exists() and bool(cameras_without_calibration(folder))
+
+
+def _subject_point(
+    folder: Path, manifest: CaptureManifest, normalisers: dict[str, Normaliser], frames: tuple[int, ...]
+) -> SubjectPoint | None:
+    """Return the point that names the subject, in pixels of the normalised image of the chosen frame nearest to its
+    own (the first one where it names none). Raises InputError on a camera that is not for training."""
+    point = manifest.subject_point
+    if point is None or not point.camera:
+        return point
+    if point.camera not in normalisers:
+        raise InputError(f"{folder / 'capture.toml'}: subject: there is no training camera {point.camera}; correct it")
+    x, y, _ = normalisers[point.camera].keypoints(np.array([*point.at, 1.0]))
+    frame = min(frames, key=lambda chosen: abs(chosen - point.frame))
+    return SubjectPoint((float(x), float(y)), point.camera, frame)
+
+
+def _common_frames(footage: dict[str, Footage | InStep]) -> tuple[int, ...]:
     """Return the frames of all cameras. Raises InputError where cameras differ in frames or frame rate."""
     (first_name, first), *others = footage.items()
     for _, other in others:
@@ -133,18 +175,18 @@ def _common_frames(footage: dict[str, Footage]) -> tuple[int, ...]:
             numbers = "other numbers" if len(other.frames) == len(first.frames) else f"{len(first.frames)}"
             raise InputError(
                 f"{other.path}: {len(other.frames)} frames, but camera {first_name} has {numbers}; "
-                "give all cameras the same frames"
+                "give all cameras the same frames, or run `hnerf synchronise`"
             )
         if first.fps and other.fps and abs(other.fps - first.fps) > RATE_TOLERANCE * first.fps:
             raise InputError(
                 f"{other.path}: {other.fps:.4g} frames a second, but {first.path} has {first.fps:.4g}; "
-                "export all videos at the same rate"
+                "export all videos at the same rate, or run `hnerf synchronise`"
             )
     return first.frames
 
 
 def _write_cameras(
-    layout: Layout, lenses: dict[str, Lens], footage: dict[str, Footage], frames: tuple[int, ...],
+    layout: Layout, lenses: dict[str, Lens], footage: dict[str, Footage | InStep], frames: tuple[int, ...],
     settings: CaptureSettings, out: Path,
 ) -> tuple[dict[str, Normaliser], dict[str, Area]]:  # fmt: skip
     """Write the images of every camera; return how they were normalised, and where black bars prove that the calibrated
@@ -169,12 +211,12 @@ def _write_keypoints(
 
 
 def _write_pixels(
-    layout: Layout, lens: Lens, footage: Footage, frames: tuple[int, ...], settings: CaptureSettings, out: Path
+    layout: Layout, lens: Lens, footage: Footage | InStep, frames: tuple[int, ...], settings: CaptureSettings, out: Path
 ) -> Normaliser:
     """Write images, masks and clean plate of one camera, all of the first image's size."""
     normaliser: Normaliser | None = None
     masks = layout.mask_files(lens.name)
-    mask_paths = _per_frame(masks, frames, footage.frames, "masks") if masks else {}
+    mask_paths = _mask_paths(masks, frames, footage) if masks else {}
     brightest = 0
     for picture in footage.read(frames):
         source = picture.file or footage.path
@@ -198,7 +240,18 @@ def _write_pixels(
     return normaliser
 
 
-def _lens_as_recorded(lens: Lens, footage: Footage, frames: tuple[int, ...]) -> tuple[Lens, Area | None]:
+def _mask_paths(
+    masks: dict[int, Path | StoredFrame], frames: tuple[int, ...], footage: Footage | InStep
+) -> dict[int, Path | StoredFrame]:
+    """Return the masks of the wanted frames. Raises InputError if there is not one for every recorded frame."""
+    if not isinstance(footage, InStep):
+        return _per_frame(masks, frames, footage.frames, "masks")
+    recorded = {frame: footage.recorded(frame) for frame in frames}
+    found = _per_frame(masks, tuple(set(recorded.values())), footage.source.frames, "masks")
+    return {frame: found[own] for frame, own in recorded.items()}
+
+
+def _lens_as_recorded(lens: Lens, footage: Footage | InStep, frames: tuple[int, ...]) -> tuple[Lens, Area | None]:
     """Return the lens for the recorded size, and where the calibrated picture lies in it if black bars prove that.
 
     Without such a proof the lens is unchanged. Raises InputError if the sizes then differ too much.
@@ -235,7 +288,15 @@ def _per_frame(
     return {frame: files[frame] for frame in wanted}
 
 
-def _detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | None:
+def _detections_in_step(layout: Layout, camera: str, footage: Footage | InStep) -> np.ndarray | None:
+    """Return what `detections` does, at the instants of all cameras."""
+    if not isinstance(footage, InStep):
+        return detections(layout, camera, footage)
+    found = detections(layout, camera, footage.source)
+    return None if found is None else footage.resampled(found)
+
+
+def detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | None:
     """Return detected keypoints (frames, most people, K, 3), absent people zero; None where there are none.
 
     They come from the layout's own files, else from a list of results in keypoints/<camera>.json. Raises InputError

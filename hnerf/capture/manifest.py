@@ -18,6 +18,7 @@ from pydantic import (
     field_validator,
 )
 
+from hnerf.capture.capture import SubjectPoint
 from hnerf.capture.footage import MAX_FPS, MIN_FPS
 from hnerf.capture.keypoint_sets import KeypointSetName
 from hnerf.capture.safe_io import path_in_capture, read_toml, shown
@@ -28,6 +29,8 @@ log = logging.getLogger("hnerf.capture")
 
 MIN_KEY_SIMILARITY = 0.8  # of an unknown key to a known one (difflib) that makes it a typing error
 MAX_BYTES = 65_536
+NAMED_BY, NUMBER = "nearest", r"\s*(-?\d+(?:\.\d*)?)\s*"
+SUBJECT = re.compile(rf"nearest to \({NUMBER},{NUMBER}\)(?: in (.+?)(?: at frame (\d{{1,9}}))?)?")
 MAX_NAME_BYTES = 200  # file systems allow 255, also for longer names made from it
 
 FrameNumber = Annotated[int, Field(ge=0, le=999_999_999)]
@@ -52,7 +55,8 @@ class FrameSplit(_Table):
 
 
 class CaptureManifest(_Table):
-    """The content of `capture.toml`. Descriptive keys (subject, licence, ...) are free; those below have a meaning."""
+    """The content of `capture.toml`. Descriptive keys (licence, ...) are free; those below have a meaning. `subject` is
+    descriptive, too, unless it begins with "nearest"."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
 
@@ -61,8 +65,29 @@ class CaptureManifest(_Table):
     up: Literal["y", "z"] = "z"
     units: Literal["m", "mm"] | Annotated[float, Field(ge=1e-6, le=1e6)] = "m"
     keypoints: KeypointSetName | None = None
+    field_of_view_deg: float | None = Field(default=None, ge=10, le=150)
     cameras: CameraSplit | None = None
     frames: FrameSplit | None = None
+    subject: Any = None
+
+    @field_validator("subject")
+    @classmethod
+    def _a_point_that_can_be_read(cls, subject: Any) -> Any:
+        if isinstance(subject, str) and subject.lower().startswith(NAMED_BY) and not SUBJECT.fullmatch(subject):
+            raise ValueError(
+                'write "nearest to (x, y)", metres on the ground, or "nearest to (x, y) in CAMERA at frame N", pixels'
+            )
+        return subject
+
+    @property
+    def subject_point(self) -> SubjectPoint | None:
+        """Return the point by which the subject is named, in recorded pixels or in metres; None where there is none.
+        The frame is -1 where none is given."""
+        named = SUBJECT.fullmatch(self.subject) if isinstance(self.subject, str) else None
+        if not named:
+            return None
+        x, y, camera, frame = named.groups()
+        return SubjectPoint((float(x), float(y)), camera or "", int(frame or -1))
 
     @field_validator("units", mode="wrap")
     @classmethod
@@ -92,7 +117,9 @@ def read_manifest(folder: Path) -> CaptureManifest:
 
 def capture_name(folder: Path, manifest: CaptureManifest) -> str:
     """Return the name of the subject. It becomes a folder name; raises InputError if it cannot be one."""
-    name = unicodedata.normalize("NFC", folder.resolve().name if manifest.name is None else manifest.name)  # macOS: NFD
+    place = folder.resolve()
+    given = (place.stem if place.is_file() else place.name) if manifest.name is None else manifest.name
+    name = unicodedata.normalize("NFC", given)  # macOS: NFD
     if not re.fullmatch(r"\w[\w .()-]{0,127}", name):
         raise InputError(
             f"{folder / 'capture.toml'}: name {shown(name)}: use letters, digits, '_', '-', '.' and spaces"

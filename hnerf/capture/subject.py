@@ -1,154 +1,120 @@
-"""Choice of the subject among detected people: the person on whom the cameras agree, followed through time."""
-
-from itertools import combinations, pairwise
+"""Choice of the subject among detected people: whom most cameras see longest and largest, or whom `capture.toml`
+names."""
 
 import numpy as np
 
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, SubjectPoint
+from hnerf.capture.people import PersonTrack, follow_in_each_camera, follow_people, moves
 from hnerf.errors import InputError
-from hnerf.geometry.camera import Camera
-from hnerf.geometry.triangulation import confidence_of, solve_points
+from hnerf.geometry.triangulation import triangulate
 
-AGREEMENT_REACH = 0.15  # of a person's height in the image: beyond it a keypoint does not support a hypothesis
-UNSUPPORTED_WEIGHT = 0.1  # of a detection without support from other cameras: one may be badly calibrated
-CANDIDATES = 8  # combinations of people kept in each frame
-JUMP_COST = 4.0  # in best scores of one camera, for moving by the person's own height between frames
-FREE_JUMPS = 2.0  # in median movements between frames: jumps up to this cost nothing
+EQUAL_CLAIM = 0.9  # share of the best claim from which another person may as well be meant
+MIDDLE = (1, 8)  # neck and mid-hip: where a person stands
 
 
 def subject_keypoints(capture: Capture) -> dict[str, np.ndarray]:
     """Return the subject's keypoints in every training camera, (frames, 25, 3) in the order of `capture.frames`.
 
-    Where several people are detected, the subject is the person on whom most cameras agree (two-view triangulation
-    predicts where each camera must see the person), weighted by size, confidence and nearness to the image's centre,
-    and followed through time (Viterbi). Confidence is 0 where the person is not detected. Test cameras are never read.
-    Raises InputError where no frame shows a person in two cameras (in one, if there is only one).
+    Confidence is 0 where the person is not detected. Test cameras are never read. Raises InputError as `ranked_people`
+    does.
     """
+    return dict(zip(capture.train_cameras, ranked_people(capture)[0].keypoints, strict=True))
+
+
+def ranked_people(capture: Capture) -> list[PersonTrack]:
+    """Return the people in the training cameras, the subject first.
+
+    The subject is the person that `capture.subject_point` names, else the one with the best claim
+    (`hnerf.capture.people`) among those who move: a poster does not. Raises InputError where no frame shows a person in
+    two cameras (in one, if there is only one), nobody is where the point is, or two people have an equal claim. Cameras
+    that all stand at one place are not calibrated yet; then each chooses for itself.
+    """
+    people = _detected(capture)
+    if all(found.shape[1] == 1 for found in people):
+        alone = np.stack([found[:, 0] for found in people])
+        return [PersonTrack(alone, 1.0, moves(alone))]
+    cameras = [capture.cameras[name] for name in capture.train_cameras]
+    centres_m = np.stack([camera.centre_m for camera in cameras])
+    uncalibrated = len(cameras) > 1 and bool((centres_m == centres_m[0]).all())
+    tracks = (follow_in_each_camera if uncalibrated else follow_people)(cameras, people)
+    if not tracks:
+        raise InputError(f"{capture.name}: no person found in any frame; check the keypoint files")
+    if capture.subject_point:
+        distances = [_distance(capture, capture.subject_point, track) for track in tracks]
+        order = np.argsort(distances, kind="stable")
+        if not np.isfinite(distances[order[0]]):
+            raise InputError(f"{capture.name}: capture.toml: subject: nobody is found there; name another point")
+        return [tracks[i] for i in order]
+    ranked = sorted(tracks, key=lambda track: (track.moves, track.claim), reverse=True)
+    if len(ranked) > 1 and _equal(*ranked[:2]):
+        raise InputError(
+            f"{capture.name}: two people have an equal claim to be the subject, {_place(capture, *ranked[:2])}; name "
+            'one in capture.toml, as subject = "nearest to (x, y) in CAMERA at frame N"'
+        )
+    return ranked
+
+
+def _equal(first: PersonTrack, second: PersonTrack) -> bool:
+    return first.moves == second.moves and second.claim > EQUAL_CLAIM * first.claim
+
+
+def _detected(capture: Capture) -> list[np.ndarray]:
+    """Return the people in each training camera, (frames, P, 25, 3). Raises InputError where too few cameras have
+    some."""
     names = capture.train_cameras
-    detections = {name: capture.keypoints(name) for name in names}
-    for name, found in detections.items():
+    people = []
+    for name in names:
+        found = capture.keypoints(name)
         if found is None:
             raise InputError(f"{capture.name}: camera {name}: no keypoints; leave detection.source out, or detect some")
-    people = [np.nan_to_num(found).astype(np.float64) for found in detections.values() if found is not None]
+        people.append(np.nan_to_num(found).astype(np.float64))
     seen = np.array([(p[..., 2] > 0).any((1, 2)) for p in people])  # (cameras, frames)
     if not (seen.sum(0) >= min(2, len(names))).any():
-        raise InputError(f"{capture.name}: no person found in any frame by enough cameras; check the keypoint files")
-    if all(p.shape[1] == 1 for p in people):
-        return {name: p[:, 0] for name, p in zip(names, people, strict=True)}
-    cameras = [capture.cameras[name] for name in names]
-    candidates = [_frame_candidates(cameras, [p[i] for p in people]) for i in range(len(capture.frames))]
-    choice = _most_probable_sequence(candidates, people)
-    chosen = {}
-    for c, name in enumerate(names):
-        chosen[name] = people[c][np.arange(len(choice)), choice[:, c]] * (choice[:, c] >= 0)[:, None, None]
-    return chosen
+        raise InputError(f"{capture.name}: {_too_few(names, seen)}")
+    return people
 
 
-def _frame_candidates(cameras: list[Camera], people: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the best combinations of people in one frame: indices (n, C), -1 for nobody, and their scores (n,), the
-    best first; with and without people whom no other camera supports.
-
-    people: per camera (P, 25, 3). The score is the mean over cameras of prominence times agreement.
-    """
-    prominence = [_prominence(camera, found) for camera, found in zip(cameras, people, strict=True)]
-    agreements = _agreements(cameras, people) if len(cameras) > 1 else [np.eye(len(people[0]))]
-    if len(agreements[0]) == 0:  # one camera alone shows somebody
-        agreements = [np.zeros((1, len(found))) for found in people]
-    picks = np.full((len(agreements[0]), len(cameras)), -1)
-    scores, supported = np.zeros(picks.shape), np.zeros(picks.shape, bool)
-    for c, agreement in enumerate(agreements):
-        if not prominence[c].any():
-            continue
-        value = (UNSUPPORTED_WEIGHT + agreement) * prominence[c]
-        picks[:, c] = value.argmax(1)
-        scores[:, c] = value.max(1) / len(cameras)
-        supported[:, c] = np.take_along_axis(agreement, picks[:, c : c + 1], 1)[:, 0] > 0
-    picks = np.concatenate([picks, np.where(supported, picks, -1), np.full((1, len(cameras)), -1)])
-    total = np.concatenate([scores.sum(1), np.where(supported, scores, 0).sum(1), [0.0]])
-    best = np.argsort(-total, kind="stable")
-    _, first = np.unique(picks[best], axis=0, return_index=True)
-    kept = best[np.sort(first)[:CANDIDATES]]
-    return picks[kept], total[kept]
-
-
-def _agreements(cameras: list[Camera], people: list[np.ndarray]) -> list[np.ndarray]:
-    """Return how well each hypothesis (a person in one camera is a certain person in another) explains each person: per
-    camera (n, P), from 0 to 1."""
-    projections = np.stack([camera.projection for camera in cameras])
-    shown = [found[found[..., 2].any(1)] for found in people]
-    hypotheses_m = [np.zeros((0, 25, 3))]
-    for a, b in combinations(range(len(cameras)), 2):
-        views = np.stack(
-            [
-                shown[a].repeat(len(shown[b]), axis=0).reshape(-1, 3),
-                np.tile(shown[b], (len(shown[a]), 1, 1)).reshape(-1, 3),
-            ]
+def _too_few(names: tuple[str, ...], seen: np.ndarray) -> str:
+    """Return what is wrong with cameras that see somebody, (C, frames) bool, in no frame together."""
+    by = [name for name, frames in zip(names, seen, strict=True) if frames.any()]
+    if len(by) == 1 and len(names) > 1:
+        return (
+            f"no person found by any camera but {by[0]}, and two must see the person at once; correct the others' "
+            f"keypoints or videos, or train on camera {by[0]} alone ([cameras] in capture.toml)"
         )
-        hypotheses_m.append(solve_points(projections[[a, b]], views, confidence_of(views)).reshape(-1, 25, 3))
-    points_m = np.concatenate(hypotheses_m)
-    return [_support(camera, points_m, found) for camera, found in zip(cameras, people, strict=True)]
+    return "no person found in any frame by enough cameras; check the keypoint files"
 
 
-def _support(camera: Camera, points_m: np.ndarray, people: np.ndarray) -> np.ndarray:
-    """Return the confidence-weighted share of the keypoints of people (P, 25, 3) onto which points (n, 25, 3) project,
-    (n, P)."""
-    uv, depth_m = camera.project(points_m)
-    height_px = person_heights_px(people).clip(1)
-    distance = np.linalg.norm(uv[:, None] - people[None, ..., :2], axis=-1) / height_px[:, None]
-    hit = np.where((depth_m[:, None] > 0) & np.isfinite(distance), 1 - distance / AGREEMENT_REACH, 0).clip(0)
-    weight = people[..., 2]
-    return (hit * weight).sum(-1) / weight.sum(-1).clip(1e-9)
+def _distance(capture: Capture, point: SubjectPoint, person: PersonTrack) -> float:
+    """Return how far a person is from a point: in metres on the ground, or in pixels of a camera; infinite where not
+    seen."""
+    if not point.camera:
+        cameras = [capture.cameras[name] for name in capture.train_cameras]
+        middle = person.keypoints[:, :, MIDDLE].reshape(len(cameras), -1, 3)
+        points_m = triangulate(np.stack([camera.projection for camera in cameras]), middle)[0]
+        ground = points_m[:, ["xyz".index(axis) for axis in "xyz" if axis != capture.up]]
+        known = ground[np.isfinite(ground).all(-1)]
+        return float(np.linalg.norm(np.median(known, axis=0) - point.at)) if len(known) else np.inf
+    if point.camera not in capture.train_cameras:
+        raise InputError(
+            f"{capture.name}: the subject is named in camera {point.camera}, which is left out; name another"
+        )
+    frame = np.abs(np.array(capture.frames) - point.frame).argmin()  # its own may have been left out
+    keypoints = person.keypoints[capture.train_cameras.index(point.camera), frame]
+    seen = keypoints[keypoints[:, 2] > 0, :2]
+    return float(np.linalg.norm(seen - point.at, axis=-1).min()) if len(seen) else np.inf
 
 
-def person_heights_px(people: np.ndarray) -> np.ndarray:
-    """Return the larger side of each person's keypoint box, (P,)."""
-    visible = people[..., 2:] > 0
-    low = np.where(visible, people[..., :2], np.inf).min(-2)
-    high = np.where(visible, people[..., :2], -np.inf).max(-2)
-    return (high - low).max(-1).clip(0)
-
-
-def _prominence(camera: Camera, people: np.ndarray) -> np.ndarray:
-    """Return size x confidence x centrality of each person, (P,), from 0 to 1."""
-    size_px = np.array([camera.width_px, camera.height_px])
-    weight = people[..., 2:]
-    centre = (people[..., :2] * weight).sum(-2) / weight.sum(-2).clip(1e-9)
-    off_centre = np.linalg.norm((centre - size_px / 2) / size_px, axis=-1)
-    height = (person_heights_px(people) / camera.height_px).clip(0, 1)
-    return height * people[..., 2].mean(-1).clip(0, 1) * np.exp(-2 * off_centre**2)
-
-
-def _most_probable_sequence(candidates: list[tuple[np.ndarray, np.ndarray]], people: list[np.ndarray]) -> np.ndarray:
-    """Return the most probable sequence of combinations, (frames, C): Viterbi with a cost for jumps in the image beyond
-    what is typical of the recording. A person who is not seen stays where he was last seen."""
-    shown = [_picked_keypoints([p[i] for p in people], picks) for i, (picks, _) in enumerate(candidates)]
-    best = [[one[:1] for one in frame] for frame in shown]
-    free_jump = FREE_JUMPS * float(np.median([_jump(a, b)[0, 0] for a, b in pairwise(best)])) if len(best) > 1 else 0.0
-    last, total, back = shown[0], candidates[0][1], []
-    for now, (picks, score) in zip(shown[1:], candidates[1:], strict=True):
-        best_before = total[:, None] - JUMP_COST * _jump(last, now, free_jump)
-        back.append(best_before.argmax(0))
-        total = best_before.max(0) + score
-        seen = (picks >= 0).T[..., None, None]
-        last = [np.where(is_seen, new, old[back[-1]]) for is_seen, new, old in zip(seen, now, last, strict=True)]
-    path = [int(total.argmax())]
-    for step in reversed(back):
-        path.append(int(step[path[-1]]))
-    return np.stack([picks[k] for (picks, _), k in zip(candidates, reversed(path), strict=True)])
-
-
-def _picked_keypoints(people: list[np.ndarray], picks: np.ndarray) -> list[np.ndarray]:
-    """Return per camera the keypoints (n, 25, 3) of the picked people of one frame, 0 for nobody."""
-    return [np.where((pick >= 0)[:, None, None], found[pick], 0.0) for found, pick in zip(people, picks.T, strict=True)]
-
-
-def _jump(before: list[np.ndarray], now: list[np.ndarray], free_jump: float = 0.0) -> np.ndarray:
-    """Return the movement beyond `free_jump` in person heights, at most 1 per camera, averaged over cameras, from each
-    of people (n, 25, 3) to each of others (m, 25, 3): (n, m)."""
-    jumps = np.zeros((len(before[0]), len(now[0])))
-    for was, is_now in zip(before, now, strict=True):
-        a, b = was[:, None], is_now[None]
-        both = np.minimum(a[..., 2], b[..., 2])
-        distance = np.linalg.norm(a[..., :2] - b[..., :2], axis=-1) / person_heights_px(b).clip(1)[..., None]
-        jumps += (((distance - free_jump).clip(0, 1) * both).sum(-1) / both.sum(-1).clip(1e-9)) / len(before)
-    return jumps
+def _place(capture: Capture, *people: PersonTrack) -> str:
+    """Return where people are in the first image that shows all of them, in words and recorded pixels."""
+    shown = np.all([(person.keypoints[..., 2] > 0).any(-1) for person in people], axis=0)  # (C, frames)
+    if not shown.any():
+        return "in different images"
+    c, frame = np.argwhere(shown)[0]
+    camera, places = capture.cameras[capture.train_cameras[c]], []
+    scale = np.array(capture.recorded_sizes_px[camera.name]) / (camera.width_px, camera.height_px)
+    for person in people:
+        keypoints = person.keypoints[c, frame]
+        x, y = scale * np.median(keypoints[keypoints[:, 2] > 0, :2], axis=0)
+        places.append(f"({x:.0f}, {y:.0f})")
+    return f"at {' and '.join(places)} in camera {camera.name}, frame {capture.frames[frame]}"

@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import shutil
 import time
+from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,12 @@ import numpy as np
 
 from hnerf.capture.capture import PERSON, Capture, write_image
 from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
+from hnerf.capture.subject import ranked_people
 from hnerf.capture.subset import read_keypoints, write_keypoints
 from hnerf.config import DetectionSettings
-from hnerf.detection.landmarks import POINTS, LandmarkNetwork, Person
+from hnerf.detection.landmarks import POINTS, SIZE, LandmarkNetwork, Person
 from hnerf.detection.merge import fill_missing, pad_people
+from hnerf.detection.people import PICTURE, REPORT, check_subject, draw_people, keep_subject, people_rows
 from hnerf.detection.person_detector import PersonDetector
 from hnerf.detection.tracker import track
 from hnerf.errors import InputError
@@ -33,8 +36,9 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
     """Write the capture into `out` with keypoints that a network finds in its training cameras; return the report.
 
     Cameras are distributed over as many processes as there are cores. Cameras whose landmarks are in `out` already are
-    not processed again. Test cameras are never read. Raises InputError if a network is missing, or if nobody is found
-    in any image.
+    not processed again. Test cameras are never read. Masks are of the subject; keypoints are of all people, among whom
+    `hnerf.capture.subject` chooses. Raises InputError if a network is missing, nobody is found in any image, it is not
+    clear who the subject is, or the subject is too small or always cut off.
     """
     for name in (POSE_DETECTOR, f"pose_landmark_{settings.size}.tflite"):
         model_file(name)
@@ -45,20 +49,32 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
             f"{capture.name}: nobody found in any image of the training cameras; a person must be seen from head to "
             "feet, upright, and be no smaller than a tenth of the image"
         )
-    keypoints = to_body_25({name: people["points_px"] for name, people in found.items()}, KEYPOINTS)
-    keypoints = {name: _inside(points, capture, name) for name, points in keypoints.items()}
-    if settings.source == "both":
-        own = read_keypoints(capture)
-        keypoints |= own | {
-            name: pad_people([fill_missing(*pair) for pair in zip(own[name], points, strict=True)])
-            for name, points in keypoints.items()
-            if name in own
-        }
+    people = to_body_25({name: people["points_px"] for name, people in found.items()}, KEYPOINTS)
+    people = {name: _inside(points, capture, name) for name, points in people.items()}
     shutil.copytree(capture.root, out, ignore=shutil.ignore_patterns("keypoints.npz"), dirs_exist_ok=True)
-    write_keypoints(out, keypoints)
-    report = {"cameras": {name: _summary(people) for name, people in found.items()}}
-    (out / "detection.json").write_text(json.dumps(report, indent=1))
+    write_keypoints(out, _with_own(capture, people) if settings.source == "both" else people)
+    detected = Capture.load(out)
+    ranked = ranked_people(detected)
+    if settings.source != "both":  # a recording's own keypoints may lack what is hidden
+        check_subject(capture, ranked[0])
+    for name, subject in zip(capture.train_cameras, ranked[0].keypoints, strict=True):
+        keep_subject(out, capture, name, subject, people[name], found[name])
+    draw_people(out / PICTURE, detected, ranked)
+    cameras = {name: _summary(people) for name, people in found.items()}
+    report = {"cameras": cameras, "people": people_rows(detected, ranked)}
+    (out / REPORT).write_text(json.dumps(report, indent=1))
     return report
+
+
+def _with_own(capture: Capture, people: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the recording's own people, completed by the network's."""
+    own = read_keypoints(capture)
+    filled = {
+        name: pad_people([fill_missing(*pair) for pair in zip(own[name], points, strict=True)])
+        for name, points in people.items()
+        if name in own
+    }
+    return people | own | filled
 
 
 def _find_people(capture: Capture, size: str, out: Path) -> None:
@@ -85,7 +101,8 @@ def _find_people(capture: Capture, size: str, out: Path) -> None:
 def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> None:
     """Write one camera's masks, and then `landmarks/<camera>.npz`, whole or not at all.
 
-    The file holds `points_px` (frames, people, 33, 3): x, y, confidence; `points_m` (frames, people, 33, 3); `seconds`.
+    The file holds `points_px` (frames, people, 33, 3): x, y, confidence; `points_m` (frames, people, 33, 3); `masks`
+    (frames, people, 256, 256) uint8 in `regions` (frames, people, 4): centre x and y, side, angle; `seconds`.
     """
     cv2.setNumThreads(1)
     started = time.perf_counter()
@@ -100,16 +117,23 @@ def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> None:
     with beside.open("wb") as file:
         np.savez_compressed(
             file,
-            points_px=_by_frame([[person.points_px for person in people] for people in everybody]),
-            points_m=_by_frame([[person.points_m for person in people] for people in everybody]),
+            points_px=_by_frame(everybody, lambda person: person.points_px, (POINTS, 3)),
+            points_m=_by_frame(everybody, lambda person: person.points_m, (POINTS, 3)),
+            masks=_by_frame(everybody, lambda person: _eight_bit(person.mask), (SIZE, SIZE), np.uint8),
+            regions=_by_frame(everybody, lambda person: np.array([*person.region.centre_px, *person.region[1:]]), (4,)),
             seconds=np.array(time.perf_counter() - started),
         )
     os.replace(beside, path)
 
 
-def _by_frame(points: list[list[np.ndarray]]) -> np.ndarray:
-    """Return each frame's points (33, 3) of a person as one array (frames, people, 33, 3), 0 where nobody is."""
-    return pad_people([np.array(people).reshape(-1, POINTS, 3) for people in points])
+def _by_frame(
+    everybody: list[list[Person]],
+    value: Callable[[Person], np.ndarray],
+    shape: tuple[int, ...],
+    dtype: type = np.float64,
+) -> np.ndarray:
+    """Return a value of each person in each frame as one array (frames, people, *shape), 0 where nobody is."""
+    return pad_people([np.array([value(p) for p in people], dtype).reshape(-1, *shape) for people in everybody])
 
 
 def _soft_mask(people: list[Person], capture: Capture, camera: str) -> np.ndarray:
@@ -118,6 +142,10 @@ def _soft_mask(people: list[Person], capture: Capture, camera: str) -> np.ndarra
     likely = np.zeros(size_px[::-1], np.float32)
     for person in people:
         likely = np.maximum(likely, person.region.paste(person.mask, size_px))
+    return _eight_bit(likely)
+
+
+def _eight_bit(likely: np.ndarray) -> np.ndarray:
     return (255 * likely).round().astype(np.uint8)
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hnerf.capture.subject import person_heights_px
+from hnerf.capture.people import person_heights_px
 
 MATCH_SHARE = 0.15  # of a person's height: median distance of the keypoints of one person, found twice
 
@@ -14,28 +14,28 @@ def fill_missing(own: np.ndarray, network: np.ndarray) -> np.ndarray:
         return network
     filled = own.copy()
     for person in filled:
-        other = _same_person(person, network)
+        other = nearest_person(person, network)
         if other is not None:
-            person[:] = np.where(person[:, 2:] > 0, person, other)
+            person[:] = np.where(person[:, 2:] > 0, person, network[other])
     return filled
 
 
-def _same_person(person: np.ndarray, others: np.ndarray) -> np.ndarray | None:
-    """Return the one of (Q, 25, 3) that is nearest to a person (25, 3), or None if none is near enough."""
+def nearest_person(person: np.ndarray, others: np.ndarray) -> int | None:
+    """Return which of (Q, 25, 3) is nearest to a person (25, 3), or None if none is near enough."""
     best, nearest = None, MATCH_SHARE * float(person_heights_px(person[None])[0])
-    for other in others:
+    for i, other in enumerate(others):
         both = (person[:, 2] > 0) & (other[:, 2] > 0)
         if both.any():
             distance = float(np.median(np.linalg.norm(person[both, :2] - other[both, :2], axis=-1)))
             if distance <= nearest:
-                best, nearest = other, distance
+                best, nearest = i, distance
     return best
 
 
 def pad_people(people: list[np.ndarray]) -> np.ndarray:
-    """Stack each frame's people (P, K, 3) as (frames, most people, K, 3); absent people are 0."""
+    """Stack what each frame holds of its people, (P, ...), as (frames, most people, ...); absent people are 0."""
     most = max(1, *(len(found) for found in people))
-    rows = np.zeros((len(people), most, *people[0].shape[1:]))
+    rows = np.zeros((len(people), most, *people[0].shape[1:]), people[0].dtype)
     for row, found in zip(rows, people, strict=True):
         row[: len(found)] = found
     return rows

@@ -1,5 +1,6 @@
 """Tracking of people through the images of one camera, with detection where the track is lost and at intervals."""
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
@@ -8,9 +9,10 @@ from hnerf.detection.landmarks import Person
 from hnerf.detection.region import Region
 
 REDETECT_EVERY = 10  # images, for people who came since
+MISSING_FOR = 30  # images in which somebody who is not tracked any more, behind another perhaps, is looked for in each
 MAX_PASSES = 3  # in an image, as long as each finds the person elsewhere than it looked
 MOVED, GREW = 0.1, 1.2  # in sides of the region, and times its side: what counts as elsewhere
-MATCH_SHARE = 0.25  # of a region's side: middles of two regions that are of one person
+MATCH_SHARE = 0.1  # of a region's side, an eighth of a height: middles of two regions that are of one person
 
 Detector = Callable[[np.ndarray], list[Region]]
 Landmarks = Callable[[np.ndarray, Region], Person | None]
@@ -19,10 +21,12 @@ Landmarks = Callable[[np.ndarray, Region], Person | None]
 def track(images: Iterable[np.ndarray], detector: Detector, landmarks: Landmarks) -> Iterator[list[Person]]:
     """Yield the people in each image (H, W, 3) uint8 RGB, in the order of the images."""
     regions: list[Region] = []
+    counts: deque[int] = deque(maxlen=MISSING_FOR)
     for i, image in enumerate(images):
         people = _located(image, regions, landmarks, [])
-        if not people or i % REDETECT_EVERY == 0:
+        if len(people) < max(counts, default=1) or i % REDETECT_EVERY == 0:
             people = _located(image, detector(image), landmarks, people)
+        counts.append(max(1, len(people)))
         regions = [person.next for person in people]
         yield people
 

@@ -13,6 +13,7 @@ import trimesh
 
 from hnerf.capture.capture import read_rgba
 from hnerf.config import EvaluationSettings
+from hnerf.detection.people import PICTURE, REPORT
 from hnerf.evaluation import charts
 from hnerf.evaluation.galleries import Gallery, GalleryPicture, surface_row, view_row
 from hnerf.evaluation.ground_truth import MASKED_IMAGE, GroundTruth
@@ -100,6 +101,7 @@ def write_report(
         galleries=galleries(inputs, settings, truth, true_meshes, found, out),
         training_charts=training_charts(inputs.training_folder / "history.jsonl", out),
         frame_charts=frame_charts(found, out),
+        people_picture=png_uri(inputs.capture.root / PICTURE),
         rig_picture=png_uri(inputs.calibration_folder / "cameras.png"),
         evidence_picture=png_uri(inputs.calibration_folder / "witnesses.png"),
         stages=stages,
@@ -118,6 +120,8 @@ def stage_reports(inputs: EvaluationInputs) -> dict[str, dict[str, Any]]:
         "Training": inputs.training_folder,
     }
     paths = {name: folder / "report.json" for name, folder in folders.items()}
+    if (detection := inputs.capture.root / REPORT).exists():
+        paths = {"Detection": detection} | paths
     reports = {name: json.loads(path.read_text()) if path.exists() else {} for name, path in paths.items()}
     if inputs.fit_seconds:
         reports["Body fit"] |= {"seconds": inputs.fit_seconds}

@@ -9,7 +9,8 @@ import numpy as np
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.keypoint_sets import FEET, LIMBS
-from hnerf.capture.subject import person_heights_px, subject_keypoints
+from hnerf.capture.people import person_heights_px
+from hnerf.capture.subject import subject_keypoints
 from hnerf.config import SegmentationSettings
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.silhouette import silhouette

@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hnerf.calibration.monocular import ground_reasons, intrinsics_reasons, stature_on_ground_m
+from hnerf.calibration.monocular import ground_reasons, intrinsics_reasons, raised_above_ground, stature_on_ground_m
 from hnerf.capture.ingest import ingest
 from hnerf.capture.subject import subject_keypoints
 from hnerf.config import CaptureSettings
@@ -52,6 +52,17 @@ def test_a_wrong_ground_or_scale_is_flagged() -> None:
     assert "would be 3.5" in ground_reasons(doubled, standing(), "z")[0]
     below = dataclasses.replace(camera, t_m=camera.t_m + camera.R @ [0, 0, 2.0])  # the camera two metres down
     assert "is not the ground" in ground_reasons(below, standing(), "z")[0]
+
+
+def test_a_camera_of_unknown_height_is_raised_above_a_person_of_known_stature() -> None:
+    """The ring's camera is moved down to height 0, and comes back to where it was; what was measured stays."""
+    camera = ring(1)[0]
+    vertical, height_m = np.array([0, 0, 1.0]), camera.centre_m[2]
+    lowered = dataclasses.replace(camera, t_m=camera.t_m + camera.R @ vertical * height_m)
+    raised, words = raised_above_ground(lowered, standing(), "z", stature_on_ground_m(camera, standing(), "z"))
+    np.testing.assert_allclose(raised.centre_m, camera.centre_m, atol=1e-6)
+    assert words.startswith(f"its height is not known: {height_m:.2f} m if")
+    assert raised_above_ground(camera, standing(), "z", 1.7) == (camera, "")
 
 
 def test_the_rendered_performer_stands_on_the_ground(tmp_path_factory: pytest.TempPathFactory) -> None:

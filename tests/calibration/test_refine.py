@@ -9,7 +9,7 @@ import pytest
 from hnerf.calibration.check import check_calibration
 from hnerf.calibration.diagnosis import MISTAKES, SINGLE_CAMERA_MISTAKES, undo_mistake
 from hnerf.calibration.matches import Matches
-from hnerf.calibration.refine import Refinement, refine
+from hnerf.calibration.refine import Refinement, judge_by_outlines, refine
 from hnerf.config import CalibrationSettings
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import FRAMES, detections, ring, turned, walk_m, write_capture
@@ -51,6 +51,14 @@ def test_outlines_have_a_veto(tmp_path: Path, after_px: float, accepted: bool) -
     assert found.outlines_px == {"as given": 0.5, "refined": after_px}
     assert any("outlines fit worse, from 0.50 to 0.60 px" in note for note in found.notes) != accepted
     assert found.reasons["c2"].startswith("pose refined" if accepted else "pose kept")
+
+
+@pytest.mark.parametrize(("after_px", "accepted"), [(0.039, True), (0.06, False)])
+def test_outlines_may_lose_no_larger_share_than_keypoints_gain(after_px: float, accepted: bool) -> None:
+    """Keypoints gain a third; the outlines' cost may rise from .03 to .04 px."""
+    given, changed = ring(4), with_c2(lambda c: turned(c, 1.0))
+    _, refusal = judge_by_outlines(OutlinesThat(given, 0.03, after_px), given, changed, 1 / 3)  # type: ignore[arg-type]
+    assert (refusal == "") == accepted
 
 
 @pytest.mark.parametrize("as_given", [True, False])

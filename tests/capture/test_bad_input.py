@@ -180,6 +180,12 @@ EASYMOCAP = {
     "toml with a camera twice": (_toml('[cameras]\ntrain = ["01"]\ntest = ["01"]\n'), "named twice"),
     "toml with an unknown frame": (_toml("[frames]\ntrain = [0, 5]\n"), "frame 5"),
     "toml without training frames": (_toml("[frames]\ntrain = []\n"), "frames.train"),
+    "toml with a subject that cannot be read": (
+        _toml('subject = "nearest (1, 2)"\n'),
+        'subject: Value error, write "near',
+    ),
+    "toml with a subject in no camera": (_toml('subject = "nearest to (1, 2) in 07"\n'), "no training camera 07"),
+    "toml with an impossible field of view": (_toml("field_of_view_deg = 200\n"), "field_of_view_deg"),
     "toml name leaves the store": (_toml('name = "../../other"\n'), "name '../../other'"),
 }
 

@@ -10,6 +10,7 @@ from hnerf.capture.capture import Capture, read_rgb, write_image
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings, DetectionSettings
 from hnerf.detection import detect as module
+from hnerf.detection import people
 from hnerf.detection.detect import detect
 from hnerf.detection.landmarks import Person
 from hnerf.detection.region import Region
@@ -23,7 +24,7 @@ LIMBS = [2, 3, 4, 5, 6, 7, 9, 10, 11, 12, 13, 14]
 
 
 class MadeUp:
-    """A network that sees one person, all of him at (5, 4) but his right ankle (28), which is beyond the image."""
+    """A network that sees one person, all of him at (5, 4) but his right toe (32), which is beyond the image."""
 
     seen = 0
 
@@ -35,7 +36,7 @@ class MadeUp:
             return [place]
         MadeUp.seen += 1
         points = np.tile([5.0, 4.0, 0.5], (33, 1))
-        points[28] = 30, 4, 0.5
+        points[32] = 30, 4, 0.5
         return Person(points, np.zeros((33, 3)), np.ones((256, 256), np.float32), region, place)
 
 
@@ -45,6 +46,7 @@ def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Capture:
     for name in ("PersonDetector", "LandmarkNetwork"):
         monkeypatch.setattr(module, name, MadeUp)
     monkeypatch.setattr(module, "model_file", lambda name: None)
+    monkeypatch.setattr(people, "MIN_HEIGHT_PX", 0)
     MadeUp.seen = 0
     folder = write_easymocap(tmp_path / "folder")
     (folder / "capture.toml").write_text('[cameras]\ntrain = ["01"]\ntest = ["02"]\n')
@@ -57,7 +59,7 @@ def test_keypoints_come_from_the_network_and_all_else_from_the_recording(recordi
     keypoints = found.keypoints("01")
     assert keypoints is not None and keypoints.shape == (5, 1, 25, 3)
     assert keypoints[:, 0, 1].tolist() == [[5, 4, 0.5]] * 5
-    assert keypoints[:, 0, [11, 20]].max() == 0  # beyond the image; no small toe
+    assert keypoints[:, 0, [22, 20]].max() == 0  # beyond the image; no small toe
     assert found.keypoints("02") is None
     assert np.array_equal(found.image("02", 3), recording.image("02", 3))
     assert report["cameras"]["01"]["seen"] == 5

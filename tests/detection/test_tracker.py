@@ -62,3 +62,11 @@ def test_who_comes_later_is_found_once_and_nobody_twice() -> None:
     )
     counts = [len(people) for people in track(images, scene.detector, scene.landmarks)]
     assert counts == [1] * REDETECT_EVERY + [2, 2]
+
+
+def test_who_is_missing_is_looked_for_in_every_image() -> None:
+    """Two people meet in the second image and part in the third: both are found again at once."""
+    near, apart = np.array([[0.0, 0.0], [60.0, 0.0]]), np.array([[0.0, 0.0], [4.0, 0.0]])
+    scene, images = Scene(), [near, apart, near]
+    counts = [len(people) for people in track(images, scene.detector, scene.landmarks)]
+    assert counts == [2, 1, 2] and scene.looked == 3

@@ -31,6 +31,17 @@ def test_digest_is_of_content_not_place_or_time(folder: Path, tmp_path: Path) ->
     assert read_capture(moved)[0].name == "elsewhere"
 
 
+def test_one_video_is_a_capture(tmp_path: Path) -> None:
+    (tmp_path / "clip.mp4").write_bytes(b"pixels")
+    (tmp_path / "other.mp4").write_bytes(b"of no concern")
+    recorded, truth = read_capture(tmp_path / "clip.mp4")
+    (tmp_path / "other.mp4").unlink()
+    assert read_capture(tmp_path / "clip.mp4") == (recorded, truth)
+    (tmp_path / "clip.mp4").write_bytes(b"others")
+    assert read_capture(tmp_path / "clip.mp4")[0].digest != recorded.digest
+    assert truth.digest == read_capture(tmp_path / "clip.mp4")[1].digest
+
+
 def test_hidden_files_do_not_count(folder: Path) -> None:
     before = digest(folder)
     (folder / ".DS_Store").write_text("x")

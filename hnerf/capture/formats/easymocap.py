@@ -45,11 +45,14 @@ class EasyMocap(Layout):
         return by_name(lenses, intri.path)
 
     def footage(self, camera: str) -> Footage:
-        """Return images/<camera>/, else videos/<camera>.mp4."""
+        """Return images/<camera>/, else videos/<camera>.mp4, else <camera>.mp4."""
         files = files_in(self.folder, "images", camera, suffixes=IMAGE_SUFFIXES)
         if files:
             return ImageFolder(self.folder / "images" / camera, numbered(files, "images"))
         video = file_named(self.folder, camera, "videos", suffixes=VIDEO_SUFFIXES)
+        beside = file_named(self.folder, camera, suffixes=VIDEO_SUFFIXES)
+        if not video.exists() and beside.exists():
+            return Video.open(beside)
         if not video.exists():
             raise InputError(
                 f"{self.folder / 'images' / camera}: no JPEG or PNG images, and no {video}; "
@@ -95,6 +98,13 @@ def _matrix(key: str, values: np.ndarray) -> str:
     rows, cols = values.shape
     data = values.astype(np.float64).ravel().tolist()
     return f"{key}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: {data}\n"
+
+
+def read_intrinsics(path: Path) -> dict[str, Lens]:
+    """Return the lenses of an `intri.yml`, at the origin."""
+    intri = _CalibrationFile(path)
+    lenses = (_lens(name, intri, None) for name in intri.names())
+    return {lens.name: lens for lens in lenses}
 
 
 class _CalibrationFile:
@@ -148,16 +158,16 @@ class _CalibrationFile:
         return found
 
 
-def _lens(name: str, intri: _CalibrationFile, extri: _CalibrationFile) -> Lens:
-    """Return the lens of one camera."""
+def _lens(name: str, intri: _CalibrationFile, extri: _CalibrationFile | None) -> Lens:
+    """Return the lens of one camera; at the origin without a file of extrinsics."""
     distortion = intri.matrix(f"dist_{name}", f"D_{name}")
     width_px, height_px = intri.number(f"W_{name}"), intri.number(f"H_{name}")
     return checked_lens(
-        sources=(intri.path, extri.path),
+        sources=(intri.path, extri.path if extri else intri.path),
         name=name,
         K=intri.required(f"K_{name}"),
         distortion=np.zeros(4) if distortion is None else distortion,
-        R=extri.required(f"R_{name}", f"Rot_{name}"),
-        t_m=extri.required(f"T_{name}"),
+        R=extri.required(f"R_{name}", f"Rot_{name}") if extri else np.eye(3),
+        t_m=extri.required(f"T_{name}") if extri else np.zeros(3),
         size_px=(width_px, height_px) if width_px is not None and height_px is not None else None,
     )

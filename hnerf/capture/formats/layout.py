@@ -26,10 +26,12 @@ class Layout(ABC):
     """A capture folder in one layout. Methods for what most layouts lack return nothing by default.
 
     `novel_pose_share`: share of the frames for novel poses, where no `capture.toml` splits them.
+    `calibrated`: whether the poses of the cameras are known.
     """
 
     folder: Path
     novel_pose_share: ClassVar[float] = 0.0
+    calibrated: ClassVar[bool] = True
 
     @staticmethod
     @abstractmethod

@@ -1,0 +1,82 @@
+"""Synchronisation of the recordings in a capture's folder: keypoints and sound of each camera, and their clocks."""
+
+import tempfile
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from hnerf.calibration.clocks.estimate import Clocks, estimate_clocks
+from hnerf.calibration.clocks.keypoints import Track
+from hnerf.calibration.clocks.sound import read_sound, sound_offset
+from hnerf.capture.capture import Capture
+from hnerf.capture.clocks import frame_times_s
+from hnerf.capture.footage import Footage, Video
+from hnerf.capture.ingest import DEFAULT_FPS, ingest, recognise
+from hnerf.capture.manifest import read_manifest
+from hnerf.capture.subject import subject_keypoints
+from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
+from hnerf.config import CaptureSettings, DetectionSettings
+from hnerf.detection.detect import detect
+from hnerf.errors import InputError
+from hnerf.geometry.camera import Camera
+
+MAX_FRAMES = 20_000  # of a camera: more are not looked at (eleven minutes at 30 frames a second)
+
+
+def synchronise_recording(folder: Path) -> tuple[Clocks, dict[str, str]]:
+    """Return the clocks of the cameras in a folder, and per camera what they come from, in words.
+
+    Each camera is read by itself, with its own frames and times. Where the folder has a calibration, the cameras'
+    geometry tells offsets apart that look alike without. Raises InputError where the recordings do not tell.
+    """
+    names = cameras_without_calibration(folder)
+    if not names:
+        raise InputError(f"{folder}: no images/<camera>/, videos/*.mp4 or *.mp4 to synchronise; add the recordings")
+    fps = read_manifest(folder).fps or DEFAULT_FPS
+    tracks, sounds = dict[str, Track](), dict[str, np.ndarray]()
+    for name in names:
+        footage = Uncalibrated(folder).footage(name)
+        with tempfile.TemporaryDirectory(prefix="hnerf-") as scratch:
+            tracks[name] = _track(folder, name, footage, fps, Path(scratch))
+        sound = read_sound(footage.path) if isinstance(footage, Video) else None
+        if sound is not None:
+            sounds[name] = sound
+    near_s = {}
+    for a, b in combinations(names, 2):
+        found = sound_offset(sounds[a], sounds[b]) if a in sounds and b in sounds else None
+        if found:
+            near_s[a, b] = found.offset_s
+    heard = {name for pair in near_s for name in pair}
+    sources = {name: "keypoints and sound" if name in heard else "keypoints" for name in names}
+    try:
+        return estimate_clocks(tracks, _calibrated(folder, names), near_s), sources
+    except InputError as error:
+        raise InputError(f"{folder}: {error}") from None
+
+
+def _track(folder: Path, name: str, footage: Footage, fps: float, scratch: Path) -> Track:
+    """Return the subject's keypoints in all frames of one camera, in recorded pixels."""
+    alone = Uncalibrated(folder, only=name)
+    settings = CaptureSettings(max_frames=MAX_FRAMES)
+    capture = ingest(folder, settings, scratch / "capture", alone)
+    if not capture.has_keypoints:
+        detect(capture, DetectionSettings(), scratch / "detected")
+        capture = Capture.load(scratch / "detected")
+    keypoints = subject_keypoints(capture)[name]
+    camera, (width_px, height_px) = capture.cameras[name], capture.recorded_sizes_px[name]
+    scale = np.array([width_px / camera.width_px, height_px / camera.height_px])
+    keypoints[..., :2] = keypoints[..., :2] * scale + (scale - 1) / 2
+    rows = np.searchsorted(footage.frames, capture.frames)
+    return Track(frame_times_s(footage, fps)[rows], keypoints)
+
+
+def _calibrated(folder: Path, names: list[str]) -> dict[str, Camera] | None:
+    """Return the cameras of the folder's calibration, if it has one of all cameras."""
+    try:
+        lenses = recognise(folder).lenses()
+    except InputError:
+        return None
+    if set(names).difference(lenses):
+        return None
+    return {name: Camera(name, lens.K, lens.R, lens.t_m, 1, 1) for name, lens in lenses.items()}

@@ -1,0 +1,87 @@
+"""Start offsets from sound: what two microphones heard, correlated."""
+
+import shutil
+import subprocess
+import wave
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hnerf.errors import InputError
+
+RATE_HZ = 16_000  # to which sound is brought: a sample is 2 cm of its way
+BAND_HZ = (200.0, 7_000.0)  # below is hum and wind
+MIN_PEAK = 8.0  # standard deviations of the correlation, that its peak must rise
+RIVAL_S = 0.05  # within which other peaks are echoes of the same offset
+MIN_OVER_RIVAL = 1.3  # times the next peak
+MAX_SECONDS = 7_200.0
+
+
+class SoundOffset(NamedTuple):
+    """offset_s: by how much later b's recording shows a sound than a's does; peak: of the correlation, in its standard
+    deviations."""
+
+    offset_s: float
+    peak: float
+
+
+def sound_offset(a: np.ndarray, b: np.ndarray, rate_hz: int = RATE_HZ) -> SoundOffset | None:
+    """Return the offset of two sound tracks (n,), (m,); None where no peak stands out.
+
+    Generalised cross-correlation with the phase transform (Knapp and Carter 1976): every frequency counts alike, so
+    that the direct sound makes a sharp peak and echoes, which differ between microphones, make lower ones. Sound needs
+    3 ms a metre: microphones at different distances hear it that much apart.
+    """
+    size = 1 << (len(a) + len(b) - 1).bit_length()
+    spectra = [np.fft.rfft(track - track.mean(), size) for track in (a, b)]
+    cross = np.conj(spectra[0]) * spectra[1]
+    frequencies = np.fft.rfftfreq(size, 1 / rate_hz)
+    band = (frequencies >= BAND_HZ[0]) & (frequencies <= BAND_HZ[1])
+    magnitude = np.abs(cross)
+    floor = 1e-3 * magnitude[band].mean() + 1e-30
+    correlation = np.fft.irfft(np.where(band, cross / (magnitude + floor), 0), size)
+    best = int(correlation.argmax())
+    spread = float(correlation.std())
+    away = np.ones(size, bool)
+    away[(best + np.arange(-round(RIVAL_S * rate_hz), round(RIVAL_S * rate_hz) + 1)) % size] = False
+    peak = float(correlation[best])
+    if peak < MIN_PEAK * spread or peak < MIN_OVER_RIVAL * float(correlation[away].max()):
+        return None
+    return SoundOffset((best if best < len(b) else best - size) / rate_hz, peak / spread)
+
+
+def read_sound(path: Path) -> np.ndarray | None:
+    """Return the sound (n,) at RATE_HZ of a video, from the .wav of the same name beside it, else, where the program
+    ffmpeg is installed, from the video itself; None where there is none. Raises InputError on a .wav that cannot be
+    read."""
+    beside = path.with_suffix(".wav")
+    if beside.is_file():
+        return _read_wave(beside)
+    program = shutil.which("ffmpeg")
+    if program is None or not path.is_file():
+        return None
+    command = [program, "-v", "error", "-nostdin", "-i", str(path), "-vn", "-ac", "1", "-ar", str(RATE_HZ),
+               "-t", str(MAX_SECONDS), "-f", "s16le", "-"]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, check=False)
+    return np.frombuffer(done.stdout, "<i2").astype(np.float64) if done.returncode == 0 and done.stdout else None
+
+
+def _read_wave(path: Path) -> np.ndarray:
+    """Return the mean of the channels of a .wav of 16-bit samples, brought to RATE_HZ. Raises InputError if it is
+    none."""
+    try:
+        with wave.open(str(path)) as file:
+            channels, width, rate_hz = file.getnchannels(), file.getsampwidth(), file.getframerate()
+            samples = file.readframes(min(file.getnframes(), int(MAX_SECONDS * rate_hz)))
+    except (EOFError, OSError, wave.Error):
+        raise InputError(f"{path}: not a readable .wav; export it again as 16-bit PCM") from None
+    if width != 2 or rate_hz < 2 * BAND_HZ[0]:
+        raise InputError(f"{path}: {8 * width} bits at {rate_hz} Hz; export it again as 16-bit PCM at 16 kHz or more")
+    sound = np.frombuffer(samples[: len(samples) - len(samples) % (2 * channels)], "<i2").reshape(-1, channels).mean(1)
+    if rate_hz == RATE_HZ:
+        return np.asarray(sound)
+    size = len(sound)
+    wanted = round(size * RATE_HZ / rate_hz)
+    spectrum = np.fft.rfft(sound)[: wanted // 2 + 1]  # band-limited, as in scipy.signal.resample
+    return np.asarray(np.fft.irfft(spectrum, wanted)) * (wanted / max(size, 1))

@@ -1,0 +1,247 @@
+"""Calibration from the person: cameras of a recording without any calibration, from the keypoints of whom it shows."""
+
+import dataclasses
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hnerf.calibration.bundle import adjust, adjust_shared_lens, align, undistort
+from hnerf.calibration.diagnosis import Measure, body_height_m, measure, median_height_px
+from hnerf.calibration.person.lens import LensFit, fit_lenses
+from hnerf.calibration.person.rig import first_poses
+from hnerf.calibration.person.upright import CHAIN_SD, MEAN_STATURE_M, STATURE_SD_M, scale_to, stand_on_ground
+from hnerf.capture.capture import Capture
+from hnerf.capture.formats.export import write_cameras
+from hnerf.capture.lens import Lens
+from hnerf.capture.subject import subject_keypoints
+from hnerf.config import CalibrationSettings
+from hnerf.errors import InputError
+from hnerf.geometry.camera import Camera
+
+PARTS = 5  # of the frames and of the joints: each is left out once
+MIN_MOTION = 0.05  # of the stature: how far parts of the person move, three times a detector's noise
+COLLINEAR = 0.02  # of the rig's length: cameras on one line, which leave a focal length open
+MAX_TURN_SD_DEG, MAX_MOVE_SD = 5.0, 0.1  # beyond which a camera is not determined; a share of its distance
+MAX_RESIDUAL_SHARE = 0.028  # of the person's height in pixels: where the calibration check rejects a camera
+
+log = logging.getLogger("hnerf.calibration")
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Standard errors of a camera: turn_deg of its direction, move_m of its place, focal of its focal length as a
+    share."""
+
+    turn_deg: float
+    move_m: float
+    focal: float
+
+
+@dataclass(frozen=True)
+class PersonCalibration:
+    """Result of a calibration from the person. cameras: of the capture's images, Z up, metres; lenses: as recorded;
+    uncertainty and measured: by camera; scale_sd, up_sd_deg: standard errors of the whole; what: how lenses were
+    found; notes: in words."""
+
+    cameras: list[Camera]
+    lenses: list[Lens]
+    uncertainty: dict[str, Uncertainty]
+    measured: Measure
+    intrinsics: dict[str, str]
+    height_m: float
+    height_given: bool
+    scale_sd: float
+    up_sd_deg: float
+    held_out_px: dict[str, float]
+
+    def report(self) -> dict[str, Any]:
+        """Return the content of `report.json`. Residuals are in pixels of the capture's images."""
+        cameras = {
+            camera.name: {
+                "median_px": self.measured.median_px[camera.name],
+                "p95_px": self.measured.p95_px[camera.name],
+                "focal_px": float(lens.K[0, 0]),
+                "k1": float(lens.distortion[0]),
+                "intrinsics": self.intrinsics[camera.name],
+                "uncertainty": dataclasses.asdict(self.uncertainty[camera.name]),
+            }
+            for camera, lens in zip(self.cameras, self.lenses, strict=True)
+        }
+        whole = {"height_m": self.height_m, "scale_sd": self.scale_sd, "up_sd_deg": self.up_sd_deg}
+        return whole | {
+            "notes": self.notes(),
+            "cost_px": self.measured.cost_px,
+            "held_out_px": self.held_out_px,
+            "cameras": cameras,
+        }
+
+    def notes(self) -> list[str]:
+        """Return what holds for the whole rig, in words."""
+        mean = "" if self.height_given else ", the mean of adults (give --height)"
+        return [
+            f"scale: a person of {self.height_m:.2f} m{mean}, +- {100 * self.scale_sd:.0f} %",
+            f"up: from trunk and feet, +- {self.up_sd_deg:.1f} degrees; the ground is at 0, Z is up",
+        ]
+
+    def save(self, out: Path, layouts: Sequence[str] = (), pose2sim: bool = False) -> None:
+        """Write `report.json` and the cameras, as a capture's folder holds them: in `intri.yml` and `extri.yml`, or,
+        in the layout of Pose2Sim, in `calibration/Calib_person.toml`; and in further layouts."""
+        if pose2sim:
+            write_cameras(out / "calibration", self.lenses, "aniposelib")
+            (out / "calibration" / "calibration.toml").rename(out / "calibration" / "Calib_person.toml")
+        for layout in {*layouts} if pose2sim else {"easymocap", *layouts}:
+            write_cameras(out, self.lenses, layout)
+        (out / "report.json").write_text(json.dumps(self.report(), indent=1))
+
+
+def calibrate_from_person(
+    capture: Capture, unknown_focal: Sequence[str], intrinsics: dict[str, str], height_m: float | None
+) -> PersonCalibration:
+    """Calibrate the training cameras of a capture from its keypoints alone; the poses of its cameras are not read.
+
+    unknown_focal: cameras whose focal length is a guess, to be estimated; intrinsics: where each camera's come from, in
+    words; height_m: the person's, the mean stature if None. Raises InputError where the recording does not determine
+    the cameras.
+    """
+    if len(capture.train_cameras) < 2:
+        raise InputError(f"{capture.name}: one camera cannot be calibrated from the person; film with two or more")
+    min_improvement = CalibrationSettings().min_improvement
+    try:
+        keypoints = _each_alone(capture)
+        start = [capture.cameras[name] for name in capture.train_cameras]
+        rig = first_poses(start, keypoints)
+        agreed = subject_keypoints(capture.with_cameras(capture.cameras | {c.name: c for c in rig}))
+        keypoints = np.stack([agreed[name] for name in capture.train_cameras])
+        fit, held_out_px = fit_lenses(rig, keypoints, unknown_focal, min_improvement)
+        straight = _straight(keypoints, fit, unknown_focal)
+        found = measure(fit.cameras, straight)
+        _check_determined(fit.cameras, found, straight, unknown_focal)
+        height = height_m or MEAN_STATURE_M
+        scaled, points_m = scale_to(fit.cameras, found.points_m, height)
+        cameras, _, up_sd_deg = stand_on_ground(scaled, points_m)
+        uncertainty = _uncertainty(cameras, keypoints, unknown_focal, fit)
+        _check_uncertainty(cameras, uncertainty)
+    except InputError as error:
+        raise InputError(f"{capture.name}: {str(error).removeprefix(f'{capture.name}: ')}") from None
+    return PersonCalibration(
+        cameras=cameras,
+        lenses=[_as_recorded(capture, camera, fit.k1 if camera.name in unknown_focal else 0.0) for camera in cameras],
+        uncertainty=uncertainty,
+        measured=measure(cameras, straight),
+        intrinsics={n: f"{fit.what}, from the person" if n in unknown_focal else intrinsics[n] for n in intrinsics},
+        height_m=height,
+        height_given=height_m is not None,
+        scale_sd=CHAIN_SD if height_m else float(np.hypot(CHAIN_SD, STATURE_SD_M / MEAN_STATURE_M)),
+        up_sd_deg=up_sd_deg,
+        held_out_px=held_out_px,
+    )
+
+
+def _each_alone(capture: Capture) -> np.ndarray:
+    """Return the keypoints (C, frames, 25, 3) of the person whom each camera by itself takes for the subject."""
+    alone = [dataclasses.replace(capture, train_cameras=(name,)) for name in capture.train_cameras]
+    return np.stack([subject_keypoints(one)[one.train_cameras[0]] for one in alone])
+
+
+def _straight(keypoints: np.ndarray, fit: LensFit, unknown: Sequence[str]) -> np.ndarray:
+    """Return keypoints (C, frames, 25, 3) without the distortion that was found."""
+    shared = np.array([camera.name in unknown for camera in fit.cameras])
+    flat = keypoints.reshape(len(keypoints), -1, 3)
+    return undistort(flat, fit.cameras, shared, fit.k1).reshape(keypoints.shape)
+
+
+def _check_determined(
+    cameras: Sequence[Camera], found: Measure, keypoints: np.ndarray, unknown_focal: Sequence[str]
+) -> None:
+    """Raise InputError where the recording cannot determine a rig, whatever it was adjusted to."""
+    worst = max(found.median_px, key=found.median_px.__getitem__)
+    if found.median_px[worst] > MAX_RESIDUAL_SHARE * median_height_px(keypoints):
+        raise InputError(
+            f"camera {worst} does not see the same person at the same time as the others (keypoints off by "
+            f"{found.median_px[worst]:.0f} px); check that all recordings start together, or leave it out"
+        )
+    moved = _motion(found.points_m)
+    if moved < MIN_MOTION:
+        raise InputError(
+            f"the person stands still (moves by {100 * moved:.1f} % of the height): one posture does not "
+            "determine the cameras; let the person walk and turn where all cameras see it"
+        )
+    centres = np.stack([camera.centre_m for camera in cameras])
+    length, width = np.linalg.svd(centres - centres.mean(0))[1][:2]
+    if unknown_focal and width < COLLINEAR * length:
+        raise InputError(
+            "all cameras stand in one line, which leaves their focal length open; give it (--fov or --lens), or place "
+            "a camera elsewhere"
+        )
+
+
+def _motion(points_m: np.ndarray) -> float:
+    """Return how far the parts of a person (frames, 25, 3) that move most move from their median place, as a share of
+    the stature: the median over frames, for the joint at the 90th percentile."""
+    away = np.linalg.norm(points_m - np.nanmedian(points_m, axis=0), axis=-1)
+    seen = np.isfinite(away).any(0)
+    return float(np.percentile(np.nanmedian(away[:, seen], axis=0), 90)) / body_height_m(points_m)
+
+
+def _uncertainty(
+    cameras: Sequence[Camera], keypoints: np.ndarray, unknown: Sequence[str], fit: LensFit
+) -> dict[str, Uncertainty]:
+    """Return the standard errors of the cameras by the jackknife (Efron and Tibshirani 1993, chapter 11): over
+    successive parts of the frames, for noise, and over parts of the joints, for a detector's systematic errors."""
+    by_frames = [np.delete(keypoints, part, axis=1) for part in np.array_split(np.arange(keypoints.shape[1]), PARTS)]
+    by_joints = [np.delete(keypoints, np.arange(part, 25, PARTS), axis=2) for part in range(PARTS)]
+    variances = []
+    for parts in (by_frames, by_joints):
+        rigs = [align(_again(cameras, part, unknown, fit), cameras) for part in parts]
+        offs = np.array([[_difference(new, old) for new, old in zip(rig, cameras, strict=True)] for rig in rigs])
+        variances.append((PARTS - 1) * ((offs - offs.mean(0)) ** 2).mean(0))
+    errors = np.sqrt(sum(variances))
+    return {
+        camera.name: Uncertainty(float(np.rad2deg(np.linalg.norm(e[:3]))), float(np.linalg.norm(e[3:6])), float(e[6]))
+        for camera, e in zip(cameras, errors, strict=True)
+    }
+
+
+def _again(cameras: Sequence[Camera], keypoints: np.ndarray, unknown: Sequence[str], fit: LensFit) -> list[Camera]:
+    """Return the rig adjusted to a part of the keypoints, with the unknowns of the whole."""
+    names = [camera.name for camera in cameras]
+    if not unknown:
+        return adjust(cameras, keypoints, names)
+    if fit.what == "a focal length each":
+        return adjust(cameras, keypoints, names, unknown)
+    return adjust_shared_lens(cameras, keypoints, unknown, fit.k1 != 0)[0]
+
+
+def _difference(new: Camera, old: Camera) -> np.ndarray:
+    """Return the rotation vector, the shift in metres and the relative focal length between two cameras, (7,)."""
+    turn = Rotation.from_matrix(new.R @ old.R.T).as_rotvec()
+    return np.array([*turn, *(new.centre_m - old.centre_m), new.K[0, 0] / old.K[0, 0] - 1])
+
+
+def _check_uncertainty(cameras: Sequence[Camera], uncertainty: dict[str, Uncertainty]) -> None:
+    """Raise InputError naming the worst camera that the keypoints do not determine."""
+    far_m = {camera.name: float(np.linalg.norm(camera.centre_m)) for camera in cameras}
+    worst = max(uncertainty, key=lambda name: uncertainty[name].turn_deg)
+    loosest = max(uncertainty, key=lambda name: uncertainty[name].move_m / far_m[name])
+    if uncertainty[worst].turn_deg > MAX_TURN_SD_DEG or uncertainty[loosest].move_m > MAX_MOVE_SD * far_m[loosest]:
+        name = worst if uncertainty[worst].turn_deg > MAX_TURN_SD_DEG else loosest
+        raise InputError(
+            f"camera {name} is not determined (+- {uncertainty[name].turn_deg:.1f} degrees, "
+            f"{100 * uncertainty[name].move_m:.0f} cm): film longer, with the person walking and turning, or give the "
+            "field of view (--fov)"
+        )
+
+
+def _as_recorded(capture: Capture, camera: Camera, k1: float) -> Lens:
+    """Return a camera of the capture's images as a lens of the recorded files."""
+    width_px, height_px = capture.recorded_sizes_px[camera.name]
+    given = capture.recorded_lenses.get(camera.name)
+    distortion = np.array(given[1]) if given else np.array([k1, 0.0, 0.0, 0.0])
+    K = camera.resized(width_px, height_px).K
+    return Lens(camera.name, K, distortion, camera.R, camera.t_m, (width_px, height_px))

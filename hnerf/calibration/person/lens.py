@@ -1,0 +1,86 @@
+"""Focal length and one term of distortion from the person, as far as held-out keypoints determine them."""
+
+import dataclasses
+import logging
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from hnerf.calibration.bundle import adjust, adjust_shared_lens, undistort
+from hnerf.calibration.diagnosis import trimmed_cost_px
+from hnerf.geometry.camera import Camera
+
+log = logging.getLogger("hnerf.calibration")
+
+
+class LensFit(NamedTuple):
+    """Cameras with the lenses found. k1: OpenCV's, of all of them; what: which unknowns were estimated, in words."""
+
+    cameras: list[Camera]
+    k1: float
+    what: str
+
+
+def fit_lenses(
+    cameras: list[Camera], keypoints: np.ndarray, unknown: Sequence[str], min_improvement: float
+) -> tuple[LensFit, dict[str, float]]:
+    """Return the rig with the focal lengths of the cameras named in `unknown`, and the costs in pixels of what was
+    tried on held-out keypoints.
+
+    One zoom of all unknown lenses is always estimated. Distortion and, then, a focal length for each camera are taken
+    only where held-out frames and joints improve by the share `min_improvement`: with few poses they explain noise, and
+    a wrong focal length moves a camera along its line of sight. keypoints (C, frames, 25, 3).
+    """
+    if not unknown:
+        return LensFit(_posed(cameras, keypoints), 0.0, ""), {}
+    fits: dict[str, Callable[[list[Camera], np.ndarray], LensFit]] = {
+        "one focal length": lambda rig, seen: _shared(rig, seen, unknown, False),
+        "one focal length, one distortion": lambda rig, seen: _shared(rig, seen, unknown, True),
+        "a focal length each": lambda rig, seen: _own(rig, seen, unknown),
+    }
+    costs_px = {what: _held_out_px(cameras, keypoints, unknown, fit) for what, fit in fits.items()}
+    for what, cost_px in costs_px.items():
+        log.info("tried: %s: %.3f px", what, cost_px)
+    chosen = next(iter(fits))
+    for what in list(fits)[1:]:
+        if costs_px[what] < (1 - min_improvement) * costs_px[chosen]:
+            chosen = what
+    return fits[chosen](cameras, keypoints)._replace(what=chosen), costs_px
+
+
+def _posed(cameras: list[Camera], keypoints: np.ndarray) -> list[Camera]:
+    return adjust(cameras, keypoints, [camera.name for camera in cameras])
+
+
+def _shared(cameras: list[Camera], keypoints: np.ndarray, unknown: Sequence[str], distorted: bool) -> LensFit:
+    found, k1 = adjust_shared_lens(cameras, keypoints, unknown, distorted)
+    return LensFit(found, k1, "")
+
+
+def _own(cameras: list[Camera], keypoints: np.ndarray, unknown: Sequence[str]) -> LensFit:
+    start, _ = adjust_shared_lens(cameras, keypoints, unknown, False)
+    return LensFit(adjust(start, keypoints, [camera.name for camera in cameras], unknown), 0.0, "")
+
+
+def _held_out_px(
+    cameras: list[Camera],
+    keypoints: np.ndarray,
+    unknown: Sequence[str],
+    fit: Callable[[list[Camera], np.ndarray], LensFit],
+) -> float:
+    """Return the trimmed cost of keypoints that share neither frames nor joints with those fitted to."""
+    first, second = np.array_split(keypoints, 2, axis=1)
+    costs_px = []
+    for fitted, judged in ((first[:, :, ::2], second[:, :, 1::2]), (second[:, :, 1::2], first[:, :, ::2])):
+        found = fit(cameras, fitted)
+        shared = np.array([camera.name in unknown for camera in cameras])
+        straight = undistort(judged.reshape(len(cameras), -1, 3), found.cameras, shared, found.k1)
+        costs_px.append(trimmed_cost_px(found.cameras, straight))
+    return float(np.mean(costs_px))
+
+
+def with_focal(camera: Camera, focal_px: float) -> Camera:
+    """Return the camera with another focal length and its principal point in the middle of the image."""
+    K = np.array([[focal_px, 0, (camera.width_px - 1) / 2], [0, focal_px, (camera.height_px - 1) / 2], [0, 0, 1.0]])
+    return dataclasses.replace(camera, K=K)

@@ -1,0 +1,38 @@
+"""Calibration from the person in a folder of images or videos: ingestion, keypoints, cameras."""
+
+import tempfile
+from pathlib import Path
+
+from hnerf.calibration.person.calibrate import PersonCalibration, calibrate_from_person
+from hnerf.capture.capture import Capture
+from hnerf.capture.ingest import ingest
+from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
+from hnerf.config import CaptureSettings, DetectionSettings
+from hnerf.detection.detect import detect
+from hnerf.errors import InputError
+
+
+def calibrate_recording(
+    folder: Path, height_m: float | None = None, lens_file: Path | None = None, fov_deg: float | None = None
+) -> PersonCalibration:
+    """Calibrate the cameras of a recording from its own keypoints, or from those of the network where it has none.
+
+    A calibration that the folder may have is not read, but for the intrinsics of its `intri.yml`. Raises InputError
+    where the recording cannot be read or does not determine the cameras.
+    """
+    if not cameras_without_calibration(folder):
+        raise InputError(f"{folder}: no images/<camera>/, videos/*.mp4 or *.mp4 to calibrate from; add the recordings")
+    layout = Uncalibrated(folder, lens_file, fov_deg)
+    with tempfile.TemporaryDirectory(prefix="hnerf-") as scratch:
+        capture = with_keypoints(ingest(folder, CaptureSettings(), Path(scratch) / "capture", layout), Path(scratch))
+        sources = {name: known.source for name, known in layout.known_lenses.items()}
+        unknown = [name for name, source in sources.items() if not source]
+        return calibrate_from_person(capture, unknown, sources, height_m)
+
+
+def with_keypoints(capture: Capture, scratch: Path) -> Capture:
+    """Return the capture, with keypoints of the network if it has none of its own."""
+    if capture.has_keypoints:
+        return capture
+    detect(capture, DetectionSettings(), scratch / "detected")
+    return Capture.load(scratch / "detected")

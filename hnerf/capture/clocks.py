@@ -1,0 +1,154 @@
+"""Cameras that started at other times, record at other rates or whose clocks drift: their footage, in step.
+
+`clocks.toml` in the capture's folder says how each camera's own time follows from that of all:
+t_own = (1 + drift_ppm / 10^6) t + offset_s.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from hnerf.capture.footage import ImageFolder, Video, VideoFrame
+from hnerf.capture.safe_io import path_in_capture, read_toml
+from hnerf.capture.timing import resample
+from hnerf.config import validated
+from hnerf.errors import InputError
+
+FILE = "clocks.toml"
+IRREGULAR = 0.5  # of a frame's duration: by which a video's frames may be off an even rate
+
+
+class Clock(NamedTuple):
+    """A camera's clock: it shows rate t + offset_s at the instant t, in seconds."""
+
+    offset_s: float = 0.0
+    rate: float = 1.0
+
+
+class _ClockTable(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    offset_s: float = 0.0
+    drift_ppm: float = Field(default=0.0, gt=-100_000, lt=100_000)
+
+
+@dataclass(frozen=True)
+class InStep:
+    """Footage of one camera at the instants of all. own: by instant, counted as the frame numbers of the slowest
+    camera, the camera's own frame number, with its fraction."""
+
+    source: ImageFolder | Video
+    own: dict[int, float]
+
+    @property
+    def path(self) -> Path:
+        """Return the path of the footage."""
+        return self.source.path
+
+    @property
+    def fps(self) -> float | None:
+        """Return nothing: the rate of the instants is not that of this file."""
+        return None
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """Return the instants, ascending."""
+        return tuple(sorted(self.own))
+
+    def recorded(self, instant: int) -> int:
+        """Return the camera's own frame that is nearest to an instant."""
+        frames = np.asarray(self.source.frames)
+        return int(frames[np.abs(frames - self.own[instant]).argmin()])
+
+    def read(self, wanted: Iterable[int]) -> Iterator[VideoFrame]:
+        """Yield the images nearest to the wanted instants, in ascending order. Raises InputError as the footage
+        does."""
+        wanted = sorted(wanted)
+        nearest = {instant: self.recorded(instant) for instant in wanted}
+        images = self.source.read(sorted(set(nearest.values())))
+        image = next(images, None)
+        for instant in wanted:
+            while image is not None and image.frame != nearest[instant]:
+                image = next(images, None)
+            assert image is not None  # `read` yields all that it was asked for
+            yield VideoFrame(instant, image.rgb, image.file)
+
+    def resampled(self, people: np.ndarray) -> np.ndarray:
+        """Return keypoints (own frames, people, K, 3) at the instants, interpolated between frames."""
+        return resample(people, self.source.frames, np.array([self.own[instant] for instant in self.frames]))
+
+
+def read_clocks(folder: Path) -> dict[str, Clock]:
+    """Return the clocks of `clocks.toml` by camera; none without that file. Raises InputError on a bad value."""
+    path = path_in_capture(folder, FILE)
+    if not path.exists():
+        return {}
+    tables = {name: validated(_ClockTable, table, path) for name, table in read_toml(path).items()}
+    return {name: Clock(table.offset_s, 1 + 1e-6 * table.drift_ppm) for name, table in tables.items()}
+
+
+def write_clocks(path: Path, clocks: Mapping[str, Clock]) -> None:
+    """Write `clocks.toml`."""
+    tables = (
+        f'["{name}"]\noffset_s = {clock.offset_s:.5f}\ndrift_ppm = {1e6 * (clock.rate - 1):.1f}\n'
+        for name, clock in clocks.items()
+    )
+    path.write_text("# a camera's own time: (1 + drift_ppm / 1e6) t + offset_s\n\n" + "\n".join(tables))
+
+
+def in_step(
+    footage: dict[str, ImageFolder | Video], clocks: Mapping[str, Clock], fps: float
+) -> dict[str, ImageFolder | Video | InStep]:
+    """Return the footage of all cameras at common instants: the frames of the slowest camera that all recorded.
+
+    It is the same footage where there are no clocks and all frames come at an even rate. fps: of images without a rate
+    of their own. Raises InputError where a clock is missing, or the recordings do not overlap.
+    """
+    times_s = {name: frame_times_s(one, fps) for name, one in footage.items()}
+    if not clocks and (len(footage) == 1 or all(_regular(times) for times in times_s.values())):
+        return dict(footage)
+    clocks = clocks or dict.fromkeys(footage, Clock())
+    if missing := sorted(set(footage).difference(clocks)):
+        raise InputError(f"{FILE}: camera {missing[0]} is missing; run `hnerf synchronise` again, or add it")
+    slowest = max(footage, key=lambda name: round(len(times_s[name]) and _step_s(times_s[name]), 4))
+    instants_s = (times_s[slowest] - clocks[slowest].offset_s) / clocks[slowest].rate
+    own = {
+        name: _frames_at(np.asarray(one.frames), times_s[name], clocks[name].rate * instants_s + clocks[name].offset_s)
+        for name, one in footage.items()
+    }
+    shared = np.isfinite(np.stack(list(own.values()))).all(0)
+    if not shared.any():
+        raise InputError(f"{FILE}: by these clocks the recordings of {', '.join(footage)} do not overlap; correct it")
+    numbers = np.asarray(footage[slowest].frames)[shared]
+    return {
+        name: InStep(one, dict(zip(numbers.tolist(), own[name][shared].tolist(), strict=True)))
+        for name, one in footage.items()
+    }
+
+
+def frame_times_s(footage: ImageFolder | Video, fps: float) -> np.ndarray:
+    """Return when each frame was recorded, in seconds on the camera's own clock: as a video says, else at an even
+    rate."""
+    if isinstance(footage, Video) and footage.times_s:
+        return np.asarray(footage.times_s)
+    return np.asarray(footage.frames) / (footage.fps or fps)
+
+
+def _step_s(times_s: np.ndarray) -> float:
+    return float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
+
+
+def _regular(times_s: np.ndarray) -> bool:
+    even = np.linspace(times_s[0], times_s[-1], len(times_s))
+    return bool(np.abs(times_s - even).max() <= IRREGULAR * max(_step_s(times_s), 1e-9))
+
+
+def _frames_at(frames: np.ndarray, times_s: np.ndarray, wanted_s: np.ndarray) -> np.ndarray:
+    """Return the frame numbers with fractions at times; NaN beyond half a frame from either end."""
+    reach_s = _step_s(times_s) / 2
+    found = np.interp(wanted_s, times_s, frames)
+    return np.where((wanted_s >= times_s[0] - reach_s) & (wanted_s <= times_s[-1] + reach_s), found, np.nan)

@@ -1,0 +1,61 @@
+"""Just videos, without calibration: in videos/, beside each other in a folder, or one file."""
+
+import dataclasses
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hnerf.capture.footage import Footage, Video
+from hnerf.capture.formats.layout import Layout
+from hnerf.capture.formats.peoplesnapshot import CAMERA_FROM_Z_UP
+from hnerf.capture.lens import Lens
+from hnerf.capture.manifest import read_manifest
+from hnerf.capture.safe_io import VIDEO_SUFFIXES, check_camera_name, files_in
+from hnerf.capture.uncalibrated import USUAL_FOCAL, lens_by_angle
+from hnerf.errors import InputError
+
+log = logging.getLogger("hnerf.capture")
+
+
+@dataclass(frozen=True)
+class Videos(Layout):
+    """Videos of a person. One needs no calibration: the camera is held level, with the field of view that
+    `capture.toml` states. Several need each other's places."""
+
+    @staticmethod
+    def recognises(folder: Path) -> bool:
+        """Return whether there is a video: the file itself, in the folder, or in its videos/."""
+        return bool(_videos(folder))
+
+    def lenses(self) -> dict[str, Lens]:
+        """Return the one camera: at the origin, with the longer side's field of view, and Z up."""
+        videos = _videos(self.folder)
+        if len(videos) > 1:
+            raise InputError(
+                f"{self.folder}: {len(videos)} videos without calibration; `hnerf calibrate {self.folder} --from "
+                "person` finds their cameras from the person, --from boards from footage of a board"
+            )
+        name = check_camera_name(videos[0].stem, videos[0])
+        stated = read_manifest(self.folder).field_of_view_deg
+        known = lens_by_angle(name, Video(videos[0], (0,), None), stated)
+        if not known.source:
+            log.warning(
+                "%s: no calibration: a camera held level, whose longer side sees %.0f degrees, is assumed; if that is "
+                "wrong, limbs are too deep or too flat: state field_of_view_deg in capture.toml",
+                self.folder,
+                np.rad2deg(2 * np.arctan(0.5 / USUAL_FOCAL)),
+            )
+        return {name: dataclasses.replace(known.lens, R=CAMERA_FROM_Z_UP)}
+
+    def footage(self, camera: str) -> Footage:
+        """Return the camera's video."""
+        return Video.open(next(path for path in _videos(self.folder) if path.stem == camera))
+
+
+def _videos(folder: Path) -> list[Path]:
+    """Return the file itself if it is a video, else the videos in videos/, else those in the folder."""
+    if folder.is_file():
+        return [folder] if folder.suffix.lower() in VIDEO_SUFFIXES else []
+    return files_in(folder, "videos", suffixes=VIDEO_SUFFIXES) or files_in(folder, suffixes=VIDEO_SUFFIXES)

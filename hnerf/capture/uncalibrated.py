@@ -1,0 +1,119 @@
+"""Recordings without a calibration: where their images and keypoints lie, and what is known of their lenses."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from hnerf.capture.footage import Footage, Video
+from hnerf.capture.formats.easymocap import EasyMocap, read_intrinsics
+from hnerf.capture.formats.layout import Layout, StoredFrame
+from hnerf.capture.formats.pose2sim import Pose2Sim, lens_from_table
+from hnerf.capture.lens import Lens
+from hnerf.capture.safe_io import VIDEO_SUFFIXES, check_camera_name, file_named, files_in, path_in_capture, read_toml
+from hnerf.capture.video_metadata import focal_35mm
+from hnerf.errors import InputError
+
+USUAL_FOCAL = 0.85  # of an image's longer side, 61 degrees across it: a phone's main camera as it films
+DIAGONAL_35MM = 43.27  # of a frame of 36 x 24 mm, to which equivalent focal lengths refer
+
+
+class KnownLens(NamedTuple):
+    """A lens before calibration. source: where its focal length comes from, in words, empty if it is a guess."""
+
+    lens: Lens
+    source: str
+
+
+def cameras_without_calibration(folder: Path) -> list[str]:
+    """Return the cameras whose images or videos lie in a folder without poses of cameras: the folders of images/, else
+    the videos of videos/, else those of the folder itself; none where there are none."""
+    images = path_in_capture(folder, "images")
+    if images.is_dir():
+        return [check_camera_name(path.name, path) for path in sorted(images.iterdir()) if path.is_dir()]
+    for place in (("videos",), ()):
+        if videos := files_in(folder, *place, suffixes=VIDEO_SUFFIXES):
+            return [check_camera_name(path.stem, path) for path in videos]
+    return []
+
+
+@dataclass(frozen=True)
+class Uncalibrated(Layout):
+    """A recording of which the poses of the cameras are not known: all cameras stand at the origin.
+
+    lens_file: intrinsics, in `intri.yml` or in a TOML of cameras; fov_deg: of all others, across the longer side;
+    only: the one camera to read, else all.
+    """
+
+    lens_file: Path | None = None
+    fov_deg: float | None = None
+    only: str | None = None
+    calibrated: ClassVar[bool] = False
+
+    @staticmethod
+    def recognises(folder: Path) -> bool:
+        """Return whether the folder holds images or videos of cameras."""
+        return bool(cameras_without_calibration(folder))
+
+    @cached_property
+    def known_lenses(self) -> dict[str, KnownLens]:
+        """Return what is known of each camera's lens: from the lens file, the field of view, the metadata of images or
+        videos, in this order, or a guess. Raises InputError where a file cannot be read."""
+        names = [name for name in cameras_without_calibration(self.folder) if self.only in (None, name)]
+        own = path_in_capture(self.folder, "intri.yml")
+        file = self.lens_file or (own if own.exists() else None)
+        given = _read_lenses(file) if file else {}
+        if self.lens_file and not set(given).intersection(names):
+            raise InputError(f"{file}: has none of the cameras {', '.join(names)}; name them as the recordings are")
+        known = {name: KnownLens(lens, f"from {file.name}") for name, lens in given.items() if file and name in names}
+        others = [name for name in names if name not in known]
+        return known | {name: lens_by_angle(name, self.footage(name), self.fov_deg) for name in others}
+
+    def lenses(self) -> dict[str, Lens]:
+        """Return the lens of every camera, at the origin."""
+        return {name: known.lens for name, known in self.known_lenses.items()}
+
+    def footage(self, camera: str) -> Footage:
+        """Return images/<camera>/, videos/<camera>.mp4 or <camera>.mp4."""
+        beside = file_named(self.folder, camera, suffixes=VIDEO_SUFFIXES)
+        return Video.open(beside) if beside.exists() else EasyMocap(self.folder).footage(camera)
+
+    def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
+        """Return openpose/<camera>/, else pose/<camera>_json/."""
+        return EasyMocap(self.folder).keypoint_files(camera) or Pose2Sim(self.folder).keypoint_files(camera)
+
+
+def lens_by_angle(name: str, footage: Footage, fov_deg: float | None) -> KnownLens:
+    """Return a lens without distortion, at the origin, whose field of view across the longer side is given, in the
+    metadata of the first image or of the video, or usual."""
+    first = next(footage.read(footage.frames[:1]))
+    height_px, width_px = first.rgb.shape[:2]
+    longer_px = max(width_px, height_px)
+    equivalent_mm = focal_35mm(first.file or footage.path)
+    focal_px, source = USUAL_FOCAL * longer_px, ""
+    if fov_deg:
+        focal_px, source = longer_px / 2 / np.tan(np.deg2rad(fov_deg) / 2), f"{fov_deg:g} degrees given"
+    elif equivalent_mm:
+        focal_px = equivalent_mm / DIAGONAL_35MM * np.hypot(width_px, height_px)
+        source = f"{equivalent_mm:g} mm, metadata"
+    K = np.array([[focal_px, 0, (width_px - 1) / 2], [0, focal_px, (height_px - 1) / 2], [0, 0, 1]])
+    return KnownLens(Lens(name, K, np.zeros(4), np.eye(3), np.zeros(3), (width_px, height_px)), source)
+
+
+def _read_lenses(path: Path) -> dict[str, Lens]:
+    """Return the lenses of a file of intrinsics, whose poses, if it has any, are not read."""
+    if path.suffix.lower() in (".yml", ".yaml"):
+        return read_intrinsics(path)
+    tree = read_toml(path)
+    tables = tree.get("cameras", tree)
+    nowhere = {"rotation": [0, 0, 0], "translation": [0, 0, 0]}
+    lenses = [
+        lens_from_table(path, key, {"name": f"cam_{key}"} | table | nowhere)
+        for key, table in (tables.items() if isinstance(tables, dict) else ())
+        if isinstance(table, dict) and "matrix" in table
+    ]
+    if not lenses:
+        raise InputError(f"{path}: no tables of cameras with a matrix; give intri.yml or a TOML as in docs/formats.md")
+    return {lens.name: lens for lens in lenses}

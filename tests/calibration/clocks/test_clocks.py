@@ -1,0 +1,146 @@
+"""Clocks of cameras from keypoints and from sound, against known ones."""
+
+import wave
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.calibration.clocks.estimate import estimate_clocks
+from hnerf.calibration.clocks.keypoints import Track, pair_clock, smoothed
+from hnerf.calibration.clocks.sound import read_sound, sound_offset
+from hnerf.calibration.matches import fundamental
+from hnerf.errors import InputError
+from tests.calibration.synthetic import STANDING_M, ring
+
+FPS = 30.0
+
+
+def wandering_m(instants_s: np.ndarray) -> np.ndarray:
+    """Return joints (n, 25, 3) of a figure that wanders, turns and reaches, never twice in the same way."""
+    waves = np.random.default_rng(3).uniform((0.05, 0), (0.6, 2 * np.pi), (12, 2))
+
+    def slow(k: int) -> np.ndarray:
+        return np.sum([np.sin(2 * np.pi * hz * instants_s + phase) for hz, phase in waves[3 * k : 3 * k + 3]], axis=0)
+
+    points = np.repeat(STANDING_M[None], len(instants_s), axis=0)
+    points[:, [3, 4], 0] += 0.15 * slow(0)[:, None]
+    points[:, [6, 7], 2] += 0.15 * slow(1)[:, None]
+    turn, c, s = slow(2), np.cos(slow(2)), np.sin(slow(2))
+    points[..., 0], points[..., 1] = (
+        c[:, None] * points[..., 0] - s[:, None] * points[..., 1],
+        s[:, None] * points[..., 0] + c[:, None] * points[..., 1],
+    )
+    points[..., :2] += np.stack([0.3 * slow(3), 0.2 * turn], -1)[:, None]
+    return points
+
+
+def filmed(index: int, seconds: float, offset_s: float, drift: float = 0.0, fps: float = FPS) -> Track:
+    """Return what camera `index` of a ring sees; its clock shows (1 + drift) t + offset_s."""
+    own_s = np.arange(int(seconds * fps)) / fps
+    camera = ring(4)[index]
+    uv = camera.project(wandering_m((own_s - offset_s) / (1 + drift)))[0]
+    uv = uv + np.random.default_rng(index).normal(size=uv.shape) * 4  # px, of a person 500 px tall
+    return Track(own_s, np.concatenate([uv, np.full_like(uv[..., :1], 0.8)], -1))
+
+
+def test_offsets_of_any_size_and_fractions_of_a_frame_at_other_rates() -> None:
+    true_s = {"c0": 0.0, "c1": 37 / FPS, "c2": -11.37 / FPS, "c3": 20.6 / FPS}
+    tracks = {
+        name: filmed(i, 4.0, offset, fps=25.0 if i == 3 else FPS) for i, (name, offset) in enumerate(true_s.items())
+    }
+    found = estimate_clocks(tracks)
+    for name, offset in true_s.items():
+        assert found.clocks[name].offset_s == pytest.approx(offset, abs=0.1 / FPS)
+        assert found.clocks[name].rate == 1.0
+
+
+def test_a_drift_of_200_ppm_in_ten_minutes() -> None:
+    found = pair_clock(smoothed(filmed(0, 600, 0.0)), smoothed(filmed(1, 600, 12.34, 2e-4)))
+    assert 1e6 * (found.rate - 1) == pytest.approx(200, abs=10)
+    assert found.offset_s == pytest.approx(12.34, abs=0.1 / FPS)
+
+
+def test_known_cameras_tell_steps_of_an_even_walk_apart() -> None:
+    def walk(index: int, offset_s: float) -> Track:
+        own_s = np.arange(120) / FPS
+        angle = 1.5 * (own_s - offset_s)
+        pose = np.repeat(STANDING_M[None], len(own_s), axis=0)
+        pose[:, [3, 4, 6, 7], 0] += 0.25 * np.sin(5 * (own_s - offset_s))[:, None] * np.array([1, 1, -1, -1])
+        x, y = pose[..., 0].copy(), pose[..., 1] + 0.5
+        c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+        pose[..., 0], pose[..., 1] = c * x - s * y, s * x + c * y
+        uv = ring(4)[index].project(pose)[0] + np.random.default_rng(index).normal(size=(120, 25, 2)) * 4
+        return Track(own_s, np.concatenate([uv, np.full_like(uv[..., :1], 0.8)], -1))
+
+    a, b = smoothed(walk(0, 0.0)), smoothed(walk(1, 0.41))
+    with pytest.raises(InputError, match="walks evenly on"):
+        pair_clock(a, b)  # later by a step, seen from a camera further around: the same pictures
+    found = pair_clock(a, b, fundamental(*ring(4)[:2]))
+    assert found.offset_s == pytest.approx(0.41, abs=0.1 / FPS)
+
+
+def test_smoothing_is_a_parabola_by_hand() -> None:
+    times_s = np.arange(9) / 10
+    keypoints = np.ones((9, 25, 3))
+    keypoints[..., 0] = (10 + 3 * times_s + 2 * times_s**2)[:, None]
+    keypoints[..., 1] = np.arange(25)
+    path = smoothed(Track(times_s, keypoints))
+    place, velocity, known = path.at(np.array([0.42]))
+    x = (place[0, 0, 0] - path.to_unit[0, 2]) / path.to_unit[0, 0]
+    assert known.all() and x == pytest.approx(10 + 3 * 0.42 + 2 * 0.42**2)
+    assert velocity[0, 0, 0] / path.to_unit[0, 0] == pytest.approx(3 + 4 * 0.42)
+
+
+def test_one_camera_and_a_person_who_is_still_are_refused() -> None:
+    with pytest.raises(InputError, match="nothing to be synchronised with"):
+        estimate_clocks({"c0": filmed(0, 4.0, 0.0)})
+    still = {f"c{i}": Track(np.arange(90) / FPS, np.repeat(filmed(i, 3, 0.0).keypoints[:1], 90, 0)) for i in (0, 1)}
+    with pytest.raises(InputError, match="camera c1"):
+        estimate_clocks(still)
+
+
+def heard(rng: np.random.Generator, dry: np.ndarray, delay: int) -> np.ndarray:
+    """Return a dry sound after `delay` samples, with noise and 30 echoes of its own corner of a room, which together
+    are as loud as itself and die down by 60 dB in 0.4 s."""
+    response = np.zeros(4000)
+    response[0] = 1
+    echoes = rng.integers(50, 4000, 30)
+    response[echoes] = rng.normal(size=30) * np.exp(-echoes / 930)
+    response[1:] /= np.linalg.norm(response[1:])
+    wet = np.convolve(dry, response)
+    return np.concatenate([np.zeros(delay), wet]) + rng.normal(size=delay + len(wet)) * 0.1 * dry.std()
+
+
+@pytest.mark.parametrize("kind", ["claps", "speech"])
+def test_sound_with_echoes_within_two_milliseconds(kind: str) -> None:
+    rng = np.random.default_rng(0)
+    dry = rng.normal(size=16_000 * 6)
+    if kind == "claps":
+        starts = rng.integers(0, len(dry) - 2000, 5)
+        dry = sum(np.roll(dry * np.exp(-np.arange(len(dry)) / 80), start) for start in starts)
+    else:  # syllables: noise in bands, three a second
+        dry = np.convolve(dry, np.hanning(9), "same") * np.abs(np.sin(3 * np.pi * np.arange(len(dry)) / 16_000)) ** 3
+    a, b = heard(rng, dry, 1_000), heard(rng, dry, 20_733)
+    found = sound_offset(a, b)
+    assert found is not None and found.offset_s == pytest.approx(19_733 / 16_000, abs=0.002)
+    back = sound_offset(b, a)
+    assert back is not None and back.offset_s == pytest.approx(-19_733 / 16_000, abs=0.002)
+
+
+def test_unrelated_sound_tells_nothing() -> None:
+    rng = np.random.default_rng(1)
+    assert sound_offset(rng.normal(size=50_000), rng.normal(size=60_000)) is None
+
+
+def test_a_wave_file_beside_a_video_is_read_at_any_rate(tmp_path: Path) -> None:
+    tone = (1000 * np.sin(2 * np.pi * 440 * np.arange(48_000) / 48_000)).astype("<i2")
+    with wave.open(str(tmp_path / "a.wav"), "wb") as file:
+        file.setnchannels(2), file.setsampwidth(2), file.setframerate(48_000)
+        file.writeframes(np.repeat(tone, 2).tobytes())
+    sound = read_sound(tmp_path / "a.mp4")
+    assert sound is not None and len(sound) == 16_000
+    assert np.allclose(sound, 1000 * np.sin(2 * np.pi * 440 * np.arange(16_000) / 16_000), atol=2)
+    (tmp_path / "a.wav").write_bytes(b"RIFF")
+    with pytest.raises(InputError, match=r"a\.wav: not a readable"):
+        read_sound(tmp_path / "a.mp4")

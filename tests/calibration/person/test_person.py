@@ -1,0 +1,160 @@
+"""Cameras from the person: rigs, lenses, up and scale against known cameras, and refusals."""
+
+import dataclasses
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hnerf.calibration.bundle import align, undistort
+from hnerf.calibration.person.calibrate import calibrate_from_person
+from hnerf.calibration.person.lens import fit_lenses, with_focal
+from hnerf.calibration.person.rig import first_poses
+from hnerf.calibration.person.upright import scale_to, stand_on_ground
+from hnerf.capture.formats.easymocap import EasyMocap
+from hnerf.errors import InputError
+from hnerf.geometry.camera import Camera
+from tests.calibration.synthetic import STANDING_M, detections, look_at, ring, walk_m, write_capture
+
+STATURE_M = 1.56 / 0.87  # of the figure: its limb chain, over the chain's share of an adult's stature
+
+
+def lost(camera: Camera) -> Camera:
+    """Return the camera without its pose."""
+    return dataclasses.replace(camera, R=np.eye(3), t_m=np.zeros(3))
+
+
+def worst_errors(cameras: list[Camera], truth: list[Camera]) -> tuple[float, float]:
+    """Return the largest turn in degrees and move in metres, after a similarity alignment."""
+    aligned = align(cameras, truth)
+    turns = [np.linalg.norm(cv2.Rodrigues(a.R @ b.R.T)[0]) for a, b in zip(aligned, truth, strict=True)]
+    moves = [np.linalg.norm(a.centre_m - b.centre_m) for a, b in zip(aligned, truth, strict=True)]
+    return float(np.rad2deg(max(turns))), float(max(moves))
+
+
+def seen_by(cameras: list[Camera], noise_px: float) -> np.ndarray:
+    return np.stack([found[:, 0] for found in detections(cameras, noise_px).values()])
+
+
+def test_a_rig_is_found_without_poses() -> None:
+    truth = ring(4)
+    found = first_poses([lost(camera) for camera in truth], seen_by(truth, 0.5))
+    turn_deg, move_m = worst_errors(found, truth)
+    assert turn_deg < 0.1 and move_m < 0.01
+
+
+def test_a_common_focal_length_is_found_from_a_guess_that_is_far_off() -> None:
+    truth = ring(4)
+    keypoints = seen_by(truth, 0.5)
+    guess = [with_focal(lost(camera), 750.0) for camera in truth]
+    fit, _ = fit_lenses(first_poses(guess, keypoints), keypoints, [c.name for c in truth], 0.02)
+    assert fit.what == "one focal length"
+    assert fit.cameras[0].K[0, 0] == pytest.approx(1000, rel=0.01)
+
+
+def test_a_distortion_is_found_where_held_out_keypoints_show_it() -> None:
+    truth = ring(4)
+    keypoints = seen_by(truth, 0.3)
+    for points, camera in zip(keypoints, truth, strict=True):
+        rays = (points[..., :2] - camera.K[:2, 2]) / 1000
+        points[..., :2] = 1000 * rays * (1 - 0.2 * (rays**2).sum(-1, keepdims=True)) + camera.K[:2, 2]
+    names = [camera.name for camera in truth]
+    fit, _ = fit_lenses(first_poses([lost(camera) for camera in truth], keypoints), keypoints, names, 0.02)
+    assert fit.what == "one focal length, one distortion"
+    assert fit.k1 == pytest.approx(-0.2, abs=0.02)
+
+
+def test_undistort_inverts_k1_by_hand() -> None:
+    camera = Camera("a", np.diag([100.0, 100, 1]), np.eye(3), np.zeros(3), 100, 100)
+    seen = np.array([[[100 * 0.5 * (1 + 0.1 * 0.25), 0, 1.0], [7, 7, 0]]])  # x = 0.5, r^2 = 0.25, k1 = 0.1
+    straight = undistort(seen, [camera], np.array([True]), 0.1)
+    assert straight[0, 0, 0] == pytest.approx(50, abs=0.01)
+    assert straight[0, 1].tolist() == [7, 7, 0]
+
+
+def test_scale_is_the_height() -> None:
+    cameras, points = scale_to(ring(3), 2 * walk_m(), STATURE_M)
+    assert np.allclose(points, walk_m(), atol=1e-3)  # the limbs' thickness is left out of 1.56 m
+    assert np.allclose(cameras[0].centre_m, ring(3)[0].centre_m / 2, atol=1e-3)
+
+
+def test_the_ground_lies_below_the_feet_whatever_the_world_was() -> None:
+    tumble = cv2.Rodrigues(np.array([1.0, 2.0, 0.5]))[0]
+    cameras = [
+        dataclasses.replace(c, R=c.R @ tumble.T, t_m=c.t_m - c.R @ tumble.T @ np.array([1.0, 2, 3])) for c in ring(4)
+    ]
+    stood, points_m, _ = stand_on_ground(cameras, walk_m() @ tumble.T + [1, 2, 3])
+    assert np.allclose(points_m[..., 2], walk_m()[..., 2] - 0.02, atol=0.01)  # the toes are 2 cm above the floor
+    assert stood[0].centre_m[0] == pytest.approx(0, abs=1e-9) and stood[0].centre_m[1] < 0
+    assert stood[0].centre_m[2] == pytest.approx(ring(4)[0].centre_m[2] - 0.02, abs=0.02)
+
+
+def test_a_person_who_leans_does_not_tilt_cameras_that_are_level() -> None:
+    lean = cv2.Rodrigues(np.array([0, np.deg2rad(20), 0]))[0]
+    still = np.repeat((STANDING_M @ lean.T)[None], 12, axis=0)
+    stood, _, up_sd_deg = stand_on_ground(ring(4), still)
+    assert max(abs(np.rad2deg(camera.R[0, 2])) for camera in stood) < 3
+    assert up_sd_deg > 2  # what contradicts itself is not certain
+
+
+def test_a_recording_gets_cameras_in_metres_with_an_uncertainty(tmp_path: Path) -> None:
+    truth = ring(4)
+    capture = write_capture(tmp_path, [lost(camera) for camera in truth], detections(truth, 1.0))
+    found = calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), STATURE_M)
+    turn_deg, move_m = worst_errors(found.cameras, truth)
+    assert turn_deg < 0.3 and move_m < 0.02
+    spread = [np.linalg.norm(a.centre_m - b.centre_m) for a, b in pairwise(found.cameras)]
+    true = [np.linalg.norm(a.centre_m - b.centre_m) for a, b in pairwise(truth)]
+    assert np.allclose(spread, true, rtol=0.02)
+    assert all(0 < error.turn_deg < 1 and 0 < error.move_m < 0.05 for error in found.uncertainty.values())
+    found.save(tmp_path / "out")
+    read = EasyMocap(tmp_path / "out").lenses()
+    assert np.allclose(read["c1"].R, found.cameras[1].R)
+
+
+def test_without_a_height_the_mean_is_taken_and_said(tmp_path: Path) -> None:
+    truth = ring(3)
+    capture = write_capture(tmp_path, [lost(camera) for camera in truth], detections(truth, 1.0))
+    found = calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), None)
+    assert found.scale_sd == pytest.approx(np.hypot(0.03, 0.09 / 1.65))
+    assert found.notes()[0] == "scale: a person of 1.65 m, the mean of adults (give --height), +- 6 %"
+
+
+def refusal(tmp_path: Path, cameras: list[Camera], seen: dict[str, np.ndarray], unknown: list[str]) -> str:
+    capture = write_capture(tmp_path, [lost(camera) for camera in cameras], seen)
+    with pytest.raises(InputError) as refused:
+        calibrate_from_person(capture, unknown, dict.fromkeys(capture.cameras, ""), 1.8)
+    return str(refused.value)
+
+
+def test_one_camera_is_refused(tmp_path: Path) -> None:
+    assert "one camera" in refusal(tmp_path, ring(1), detections(ring(1), 1.0), [])
+
+
+def test_a_person_who_stands_still_is_refused(tmp_path: Path) -> None:
+    still = {name: np.repeat(found[:1], 12, axis=0) for name, found in detections(ring(4), 1.0).items()}
+    assert "stands still" in refusal(tmp_path, ring(4), still, [])
+
+
+def test_cameras_in_one_line_of_sight_are_refused(tmp_path: Path) -> None:
+    line = [look_at(f"c{i}", np.array([3 + i, 0.02 * i, 1.2]), np.array([0, 0, 0.9])) for i in range(3)]
+    assert "one direction" in refusal(tmp_path, line, detections(line, 1.0), [])
+
+
+def test_cameras_in_one_line_leave_the_focal_length_open(tmp_path: Path) -> None:
+    line = [look_at(f"c{i}", np.array([3.5, 2.0 * i - 2, 1.2]), np.array([0, 0, 0.9])) for i in range(3)]
+    assert "one line" in refusal(tmp_path, line, detections(line, 1.0), ["c0", "c1", "c2"])
+
+
+def test_too_few_shared_keypoints_are_refused(tmp_path: Path) -> None:
+    seen = detections(ring(3), 1.0)
+    seen["c2"][2:, ..., 2] = 0
+    assert "camera c2 shares 50 keypoints" in refusal(tmp_path, ring(3), seen, [])
+
+
+def test_recordings_of_different_moments_are_refused(tmp_path: Path) -> None:
+    seen = detections(ring(4), 1.0)
+    seen["c1"] = seen["c1"][[5, 2, 9, 0, 11, 7, 1, 10, 4, 8, 3, 6]]
+    assert "camera c1" in refusal(tmp_path, ring(4), seen, [])

@@ -1,0 +1,63 @@
+"""From a folder of pictures and keypoint files to calibration files and clocks, by the commands."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from flows.cli import main
+from hnerf.calibration.bundle import align
+from hnerf.capture.clocks import read_clocks
+from hnerf.capture.formats.easymocap import EasyMocap
+from hnerf.capture.formats.pose2sim import Pose2Sim
+from hnerf.geometry.camera import Camera
+from tests.calibration.clocks.test_clocks import filmed
+from tests.calibration.synthetic import detections, ring
+
+FRAMES = 12
+
+
+def write_recording(folder: Path, keypoints: dict[str, np.ndarray], pose2sim: bool = False) -> Path:
+    """Write grey pictures, and keypoints (frames, 25, 3) in files of OpenPose, by camera."""
+    for name, frames in keypoints.items():
+        place = folder / (f"pose/{name}_json" if pose2sim else f"openpose/{name}")
+        pictures = folder / "images" / name
+        place.mkdir(parents=True), pictures.mkdir(parents=True)
+        grey = Image.new("RGB", (1000, 1000), (90, 90, 90))
+        for frame, points in enumerate(frames):
+            grey.save(pictures / f"{frame:06d}.jpg", quality=20)
+            person = {"pose_keypoints_2d": points.ravel().tolist()}
+            (place / f"{frame:06d}_keypoints.json").write_text(json.dumps({"people": [person]}))
+    return folder
+
+
+@pytest.mark.parametrize("pose2sim", [False, True])
+def test_a_folder_gets_its_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str], pose2sim: bool) -> None:
+    truth = ring(3)
+    seen = {name: found[:, 0] for name, found in detections(truth, 1.0).items()}
+    folder, out = write_recording(tmp_path / "film", seen, pose2sim), tmp_path / "cameras"
+    fov_deg = str(2 * np.rad2deg(np.arctan(0.5)))  # a focal length of 1000 px
+    command = ["calibrate", str(folder), "--from", "person", "--height", "1.8", "--fov", fov_deg, "--out", str(out)]
+    assert main(command) == 0
+    assert "a person of 1.80 m" in capsys.readouterr().out
+    lenses = (Pose2Sim(out) if pose2sim else EasyMocap(out)).lenses()
+    found = align([Camera(c.name, lenses[c.name].K, lenses[c.name].R, lenses[c.name].t_m, 1, 1) for c in truth], truth)
+    assert max(np.linalg.norm(a.centre_m - b.centre_m) for a, b in zip(found, truth, strict=True)) < 0.03
+    assert json.loads((out / "report.json").read_text())["cameras"]["c0"]["uncertainty"]["move_m"] < 0.1
+
+
+def test_a_folder_gets_its_clocks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_recording(tmp_path / "film", {f"c{i}": filmed(i, 3.0, 0.5 * i).keypoints for i in range(2)})
+    assert main(["synchronise", str(folder)]) == 0
+    assert read_clocks(folder)["c1"].offset_s == pytest.approx(0.5, abs=0.1 / 30)
+    assert main(["synchronise", str(folder)]) == 2
+    assert "remove it to synchronise again" in capsys.readouterr().err
+
+
+def test_a_folder_without_recordings_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in (["calibrate", str(tmp_path), "--from", "person", "--out", str(tmp_path / "x")],
+                    ["synchronise", str(tmp_path)]):  # fmt: skip
+        assert main(command) == 2
+        assert "add the recordings" in capsys.readouterr().err

@@ -1,0 +1,57 @@
+"""Small videos with what phones write and OpenCV does not: a rotation, and frames at an uneven rate."""
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+QUARTER_TURN = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30)  # clockwise, of tkhd's matrix
+CONTAINERS = (b"moov", b"trak", b"mdia", b"minf", b"stbl")
+
+
+def write_video(path: Path, levels: list[int], size_px: tuple[int, int] = (96, 64), fps: float = 25) -> None:
+    """Write a video of uniform grey frames; the right half of each is black."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size_px)
+    for level in levels:
+        picture = np.full((size_px[1], size_px[0], 3), level, np.uint8)
+        picture[:, size_px[0] // 2 :] = 0
+        writer.write(picture)
+    writer.release()
+
+
+def rotate(path: Path) -> None:
+    """Let a video be shown turned by 90 degrees clockwise."""
+    _edit(path, b"tkhd", lambda content: content[:40] + QUARTER_TURN + content[76:])
+
+
+def hold_frames(path: Path, first: int, rest: int) -> None:
+    """Let all frames of a video after the first `first` last twice as long; `rest` is their number."""
+
+    def slower(content: bytes) -> bytes:
+        (step,) = struct.unpack(">I", content[12:16])
+        return struct.pack(">IIIIII", 0, 2, first, step, rest, 2 * step)
+
+    _edit(path, b"stts", slower)
+    path.write_bytes(path.read_bytes().replace(b"edts", b"free"))  # the edit list would cut it to its old length
+
+
+def _edit(path: Path, wanted: bytes, change: Callable[[bytes], bytes]) -> None:
+    path.write_bytes(_edited(path.read_bytes(), wanted, change))
+
+
+def _edited(content: bytes, wanted: bytes, change: Callable[[bytes], bytes]) -> bytes:
+    """Return boxes with the content of those of one kind changed; moov comes last, so that no offset moves."""
+    done, at = b"", 0
+    while at < len(content):
+        size, kind = int.from_bytes(content[at : at + 4], "big"), content[at + 4 : at + 8]
+        inner = content[at + 8 : at + size]
+        if kind == wanted:
+            inner = change(inner)
+        elif kind in CONTAINERS:
+            inner = _edited(inner, wanted, change)
+        done += struct.pack(">I", len(inner) + 8) + kind + inner
+        at += size
+    return done

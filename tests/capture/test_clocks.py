@@ -1,0 +1,99 @@
+"""Footage in step: clocks, frame rates, uneven rates, rotation."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.capture.capture import Capture
+from hnerf.capture.clocks import Clock, InStep, in_step, read_clocks, write_clocks
+from hnerf.capture.footage import ImageFolder, Video
+from hnerf.capture.ingest import ingest
+from hnerf.capture.uncalibrated import Uncalibrated
+from hnerf.config import CaptureSettings
+from hnerf.errors import InputError
+from tests.capture.mp4 import hold_frames, rotate, write_video
+
+
+def images(name: str, count: int, fps: float) -> ImageFolder:
+    return ImageFolder(Path(name), {frame: Path(name) / f"{frame}.jpg" for frame in range(count)}, fps)
+
+
+def test_instants_are_the_frames_of_the_slowest_camera_by_hand() -> None:
+    footage = {"a": images("a", 10, 10), "b": images("b", 10, 5)}
+    found = in_step(footage, {"a": Clock(0.25), "b": Clock(0.0)}, 30)
+    # b's frame k shows the instant k / 5 s, when a's clock shows k / 5 + 0.25 s: its frame 2 k + 2.5, up to 9.5.
+    assert isinstance(found["a"], InStep)
+    assert found["a"].own == pytest.approx({0: 2.5, 1: 4.5, 2: 6.5, 3: 8.5})
+    assert found["b"].own == pytest.approx({0: 0, 1: 1, 2: 2, 3: 3})
+
+
+def test_a_drift_moves_later_frames_by_hand() -> None:
+    footage = {"a": images("a", 1001, 10), "b": images("b", 1001, 10)}
+    found = in_step(footage, {"a": Clock(), "b": Clock(0.0, 1.0001)}, 30)
+    assert isinstance(found["b"], InStep)
+    assert found["b"].own[900] == pytest.approx(900.09)  # 90 s x 100 ppm = 9 ms, of frames of 100 ms
+
+
+def test_nothing_changes_without_clocks_at_even_rates() -> None:
+    footage = {"a": images("a", 10, 10), "b": images("b", 10, 10)}
+    assert in_step(footage, {}, 30) == footage
+
+
+def test_recordings_that_do_not_overlap_and_missing_clocks_are_refused() -> None:
+    footage = {"a": images("a", 10, 10), "b": images("b", 10, 10)}
+    with pytest.raises(InputError, match="do not overlap"):
+        in_step(footage, {"a": Clock(), "b": Clock(5.0)}, 30)
+    with pytest.raises(InputError, match="camera b is missing"):
+        in_step(footage, {"a": Clock()}, 30)
+
+
+def test_clocks_are_read_as_written(tmp_path: Path) -> None:
+    clocks = {"left": Clock(), "cam 2": Clock(-1.25, 1.0002)}
+    write_clocks(tmp_path / "clocks.toml", clocks)
+    read = read_clocks(tmp_path)
+    assert list(read) == list(clocks) and np.allclose(list(read.values()), list(clocks.values()))
+    (tmp_path / "clocks.toml").write_text("[a]\noffset = 1.0\n")
+    with pytest.raises(InputError, match=r"clocks\.toml: offset"):
+        read_clocks(tmp_path)
+
+
+def ingested(folder: Path, out: Path) -> Capture:
+    return ingest(folder, CaptureSettings(), out, Uncalibrated(folder))
+
+
+def test_videos_are_ingested_in_step(tmp_path: Path) -> None:
+    folder = tmp_path / "film"
+    write_video(folder / "a.mp4", [10 * k for k in range(20)])
+    write_video(folder / "b.mp4", [10 * k for k in range(15)])
+    with pytest.raises(InputError, match="hnerf synchronise"):
+        ingested(folder, tmp_path / "refused")
+    (folder / "clocks.toml").write_text("[a]\noffset_s = 0.08\n[b]\n")  # two frames later on a's clock
+    capture = ingested(folder, tmp_path / "out")
+    assert capture.frames == tuple(range(2, 17))  # of a, which is as slow as b and comes first
+    levels = [[int(capture.image(name, frame)[20, 20].mean()) for name in "ab"] for frame in (2, 7, 14)]
+    assert np.allclose(levels, [[20, 0], [70, 50], [140, 120]], atol=4.5)
+
+
+def test_frames_at_an_uneven_rate_are_taken_by_their_times(tmp_path: Path) -> None:
+    folder = tmp_path / "film"
+    write_video(folder / "a.mp4", [10 * k for k in range(20)])
+    write_video(folder / "b.mp4", [10 * k for k in range(20)])
+    hold_frames(folder / "b.mp4", 10, 10)
+    times_s = Video.open(folder / "b.mp4").times_s
+    assert np.allclose(times_s[8:13], [0.32, 0.36, 0.40, 0.48, 0.56], atol=1e-3)
+    capture = ingested(folder, tmp_path / "out")
+    level = int(capture.image("b", capture.frames[-1])[20, 20].mean())
+    other = int(capture.image("a", capture.frames[-1])[20, 20].mean())
+    assert abs(level - other) < 60  # by count they would be of one level, and 0.2 s apart
+    last_s = 0.04 * round(other / 10)
+    assert abs(last_s - times_s[round(level / 10)]) <= 0.041  # half of the longer frame duration
+
+
+def test_a_rotation_in_the_metadata_is_honoured(tmp_path: Path) -> None:
+    video = tmp_path / "a.mp4"
+    write_video(video, [200] * 3)
+    rotate(video)
+    upright = next(Video.open(video).read([0])).rgb
+    assert upright.shape[:2] == (96, 64)
+    assert upright[:40].mean() > 150 and upright[56:].mean() < 20  # what was left is above

@@ -1,0 +1,152 @@
+"""Who the subject is, among people whose places are known: passers-by, a poster, a mirror image."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.capture.capture import Capture, SubjectPoint
+from hnerf.capture.subject import ranked_people, subject_keypoints
+from hnerf.errors import InputError
+from hnerf.geometry.camera import Camera
+from tests.calibration.synthetic import STANDING_M, ring, walk_m, write_capture
+
+FRAMES, CONFIDENCE, NOISE_PX = 30, 0.8, 1.0
+
+
+def seen_by(camera: Camera, joints_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return detections (frames, 25, 3) of joints (frames, 25, 3): nobody where most are outside the image."""
+    uv, depth_m = camera.project(joints_m)
+    noisy = uv + rng.normal(size=uv.shape) * NOISE_PX
+    inside = ((noisy >= 0) & (noisy < camera.width_px)).all(-1) & (depth_m > 0)
+    whole = inside.mean(-1, keepdims=True) > 0.5
+    return np.concatenate([noisy, np.full_like(uv[..., :1], CONFIDENCE)], -1) * (inside & whole)[..., None]
+
+
+def recorded(root: Path, cameras: list[Camera], *people_m: np.ndarray) -> tuple[Capture, list[dict[str, np.ndarray]]]:
+    """Write a capture of people, each (frames, 25, 3) metres, whose order differs from image to image; return it, and
+    the detections of each person."""
+    rng = np.random.default_rng(0)
+    each = [{camera.name: seen_by(camera, joints_m, rng) for camera in cameras} for joints_m in people_m]
+    mixed = {}
+    for camera in cameras:
+        together = np.stack([one[camera.name] for one in each], 1)
+        mixed[camera.name] = np.stack([frame[rng.permutation(len(each))] for frame in together])
+    return write_capture(root, cameras, mixed), each
+
+
+def walking(start_m: tuple[float, float], end_m: tuple[float, float]) -> np.ndarray:
+    """Return joints (frames, 25, 3) of somebody who walks in a line, swinging arms and legs."""
+    share = np.linspace(0, 1, FRAMES)[:, None, None]
+    joints_m = np.repeat(STANDING_M[None], FRAMES, 0)
+    swing = 0.2 * np.sin(2 * np.pi * np.arange(FRAMES) / 10)[:, None]
+    joints_m[:, [3, 4, 11], :2] += swing[..., None]  # forwards and sideways: every camera sees it
+    joints_m[:, [6, 7, 14], :2] -= swing[..., None]
+    ends = np.array([[*start_m, 0], [*end_m, 0]])
+    return joints_m + ends[0] + share * (ends[1] - ends[0])
+
+
+def staying(at_m: tuple[float, float]) -> np.ndarray:
+    return walking(at_m, at_m)
+
+
+def share_right(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> float:
+    """Return the share of the images in which the person is, and is the one who was found."""
+    right = [
+        np.array_equal(a, b)
+        for name in expected
+        for a, b in zip(found[name], expected[name], strict=True)
+        if b[:, 2].any()
+    ]
+    return float(np.mean(right))
+
+
+@pytest.mark.parametrize("cameras", [1, 4])
+def test_a_stranger_who_crosses_is_not_taken(cameras: int, tmp_path: Path) -> None:
+    """He comes nearer to some cameras than the subject, and passes at 0.6 m from him."""
+    capture, (subject, _) = recorded(tmp_path, ring(cameras), walk_m(FRAMES), walking((0.5, -2.5), (1.3, 2.5)))
+    assert share_right(subject_keypoints(capture), subject) == 1
+
+
+def test_two_people_who_cross_keep_apart(tmp_path: Path) -> None:
+    """Both walk through the middle, at 0.4 m from each other; the second one comes late and leaves early."""
+    first, second = walking((-1.2, -0.2), (1.2, -0.2)), walking((1.2, 0.2), (-1.2, 0.2))
+    second[:5] = second[-5:] = 100.0  # elsewhere
+    capture, (subject, other) = recorded(tmp_path, ring(4), first, second)
+    people = ranked_people(capture)
+    names = capture.train_cameras
+    assert share_right(dict(zip(names, people[0].keypoints, strict=True)), subject) > 0.97
+    assert share_right(dict(zip(names, people[1].keypoints, strict=True)), other) > 0.9
+
+
+@pytest.mark.parametrize("cameras", [1, 4])
+def test_a_poster_is_not_taken(cameras: int, tmp_path: Path) -> None:
+    """It hangs in the middle, larger than the subject, and never moves."""
+    poster = np.repeat(1.15 * STANDING_M[None], FRAMES, 0)
+    capture, (subject, _) = recorded(tmp_path, ring(cameras), staying((-0.9, 0.3)), poster)
+    assert share_right(subject_keypoints(capture), subject) == 1
+    assert [person.moves for person in ranked_people(capture)] == [True, False]
+
+
+def test_a_poster_alone_is_the_subject(tmp_path: Path) -> None:
+    """Nobody else is there: a person who stands still is one."""
+    capture, (subject, _) = recorded(
+        tmp_path, ring(3), np.repeat(STANDING_M[None], FRAMES, 0), np.full((FRAMES, 25, 3), 100.0)
+    )
+    assert share_right(subject_keypoints(capture), subject) == 1
+
+
+def test_a_mirror_image_is_not_taken(tmp_path: Path) -> None:
+    """One camera sees the subject larger in a mirror that stands before it: no other camera sees anybody there."""
+    cameras = ring(4)
+    capture, (subject,) = recorded(tmp_path, cameras, walk_m(FRAMES))
+    rng = np.random.default_rng(1)
+    towards = cameras[0].centre_m * [0.3, 0.3, 0]
+    mirrored = seen_by(cameras[0], walk_m(FRAMES) * [1, -1, 1] + towards, rng)
+    with np.load(tmp_path / "keypoints.npz") as stored:
+        seen = dict(stored)
+    seen["c0"] = np.stack([mirrored, subject["c0"]], 1)
+    capture = write_capture(tmp_path, cameras, seen)
+    assert share_right(subject_keypoints(capture), subject) == 1
+
+
+def test_cameras_without_places_choose_each_for_itself(tmp_path: Path) -> None:
+    """All stand at the origin; a stranger, farther from every camera, walks by."""
+    cameras = ring(3)
+    far = np.stack([walking((-2.5, 2), (-2.5, -2)), walking((2, 2.5), (-2, 2.5)), walking((2, -2.5), (-2, -2.5))])
+    capture, (subject, *_) = recorded(tmp_path, cameras, walk_m(FRAMES), *far)
+    nowhere = {c.name: dataclasses.replace(c, R=np.eye(3), t_m=np.zeros(3)) for c in cameras}
+    assert share_right(subject_keypoints(dataclasses.replace(capture, cameras=nowhere)), subject) > 0.9
+
+
+def test_two_who_have_the_same_claim_are_one_line(tmp_path: Path) -> None:
+    capture, _ = recorded(tmp_path, ring(1), staying((0, -0.6)), staying((0, 0.6)))
+    with pytest.raises(InputError, match=r"equal claim.*at \(\d+, \d+\) and \(\d+, \d+\) in camera c0, frame 0; name"):
+        subject_keypoints(capture)
+
+
+@pytest.mark.parametrize("chosen", [0, 1])
+def test_who_is_named_is_taken(chosen: int, tmp_path: Path) -> None:
+    """By the ground, and by a point in an image."""
+    cameras = ring(3)
+    people_m = staying((0, -0.6)), staying((0, 0.6))
+    capture, each = recorded(tmp_path, cameras, *people_m)
+    x, y = cameras[1].project(people_m[chosen][7, 1])[0]
+    for point in (SubjectPoint((0.1, (-0.5, 0.5)[chosen])), SubjectPoint((x + 3, y + 9), "c1", 7)):
+        named = dataclasses.replace(capture, subject_point=point)
+        assert share_right(subject_keypoints(named), each[chosen]) == 1
+
+
+def test_nobody_at_the_point_is_one_line(tmp_path: Path) -> None:
+    capture, _ = recorded(tmp_path, ring(1), staying((0, -0.6)), staying((0, 0.6)))
+    with pytest.raises(InputError, match="subject: nobody is found there"):
+        subject_keypoints(dataclasses.replace(capture, subject_point=SubjectPoint((0, 0))))
+
+
+def test_one_of_several_cameras_is_one_line(tmp_path: Path) -> None:
+    cameras = ring(3)
+    rng = np.random.default_rng(0)
+    seen = {c.name: seen_by(c, walk_m(), rng)[:, None] * (c.name == "c1") for c in cameras}
+    with pytest.raises(InputError, match="no person found by any camera but c1"):
+        subject_keypoints(write_capture(tmp_path, cameras, seen))

@@ -1,0 +1,105 @@
+"""Recordings without a calibration: which cameras there are, what is known of their lenses, and what is refused."""
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from hnerf.capture.ingest import ingest, recognise
+from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
+from hnerf.capture.video_metadata import KEY, focal_35mm
+from hnerf.config import CaptureSettings
+from hnerf.errors import InputError
+
+
+def write_images(folder: Path, camera: str, exif: Image.Exif | None = None) -> None:
+    place = folder / "images" / camera
+    place.mkdir(parents=True)
+    for frame in range(2):
+        Image.new("RGB", (200, 100)).save(place / f"{frame:06d}.jpg", exif=exif or Image.Exif())
+
+
+def write_video(path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 25, (64, 96))
+    for _ in range(3):
+        writer.write(np.zeros((96, 64, 3), np.uint8))
+    writer.release()
+
+
+def box(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", 8 + len(content)) + kind + content
+
+
+def test_a_field_of_view_gives_the_focal_length(tmp_path: Path) -> None:
+    write_images(tmp_path, "a")
+    known = Uncalibrated(tmp_path, fov_deg=90).known_lenses["a"]
+    assert np.allclose(known.lens.K, [[100, 0, 99.5], [0, 100, 49.5], [0, 0, 1]])  # half of 200 / tan 45
+    assert known.source == "90 degrees given"
+
+
+def test_without_anything_the_focal_length_is_a_guess(tmp_path: Path) -> None:
+    write_images(tmp_path, "a")
+    known = Uncalibrated(tmp_path).known_lenses["a"]
+    assert known.lens.K[0, 0] == pytest.approx(170) and not known.source
+
+
+def test_exif_gives_the_focal_length(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x8769] = {0xA405: 26}
+    write_images(tmp_path, "a", exif)
+    known = Uncalibrated(tmp_path).known_lenses["a"]
+    assert known.lens.K[0, 0] == pytest.approx(26 / 43.27 * np.hypot(200, 100))
+    assert known.source == "26 mm, metadata"
+
+
+def test_a_videos_metadata_give_the_focal_length(tmp_path: Path) -> None:
+    keys = box(b"keys", struct.pack(">II", 0, 2) + box(b"mdta", b"com.apple.quicktime.make") + box(b"mdta", KEY))
+    item = box(struct.pack(">I", 2), box(b"data", struct.pack(">IIh", 21, 0, 28)))
+    video = tmp_path / "a.mp4"
+    video.write_bytes(box(b"ftyp", b"qt  ") + box(b"moov", box(b"meta", keys + box(b"ilst", item))))
+    assert focal_35mm(video) == 28
+    video.write_bytes(video.read_bytes()[:-1])
+    assert focal_35mm(video) is None
+
+
+@pytest.mark.parametrize("name", ["intri.yml", "lenses.toml"])
+def test_a_lens_file_comes_first(tmp_path: Path, name: str) -> None:
+    write_images(tmp_path, "a")
+    matrix = "K_a: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [150, 0, 99, 0, 150, 49, 0, 0, 1]\n"
+    table = '[a]\nname = "a"\nsize = [200, 100]\nmatrix = [[150, 0, 99], [0, 150, 49], [0, 0, 1]]\n'
+    table += "distortions = [0.1, 0, 0, 0]\n"
+    file = tmp_path / name
+    file.write_text(f"%YAML:1.0\n---\nnames:\n  - a\n{matrix}" if name == "intri.yml" else table)
+    known = Uncalibrated(tmp_path, file, 90).known_lenses["a"]
+    assert known.lens.K[0].tolist() == [150, 0, 99] and known.source == f"from {name}"
+    assert known.lens.t_m.tolist() == [0, 0, 0]
+
+
+def test_a_lens_file_of_other_cameras_is_refused(tmp_path: Path) -> None:
+    write_images(tmp_path, "b")
+    file = tmp_path / "lenses.toml"
+    file.write_text(
+        '[a]\nname = "a"\nsize = [2, 1]\nmatrix = [[15, 0, 9], [0, 15, 9], [0, 0, 1]]\ndistortions = [0, 0, 0, 0]\n'
+    )
+    with pytest.raises(InputError, match="has none of the cameras b"):
+        Uncalibrated(tmp_path, file).lenses()
+
+
+def test_videos_are_cameras_and_are_ingested_without_poses(tmp_path: Path) -> None:
+    folder = tmp_path / "film"
+    write_video(folder / "videos" / "left.mp4")
+    write_video(folder / "videos" / "right.mp4")
+    assert cameras_without_calibration(folder) == ["left", "right"]
+    capture = ingest(folder, CaptureSettings(), tmp_path / "out", Uncalibrated(folder))
+    assert capture.train_cameras == ("left", "right") and len(capture.frames) == 3
+    assert capture.cameras["left"].K[0, 0] == pytest.approx(0.85 * 96)
+
+
+def test_a_run_names_the_command_that_calibrates(tmp_path: Path) -> None:
+    write_images(tmp_path, "a")
+    with pytest.raises(InputError, match=r"no calibration.*hnerf calibrate .* --from person"):
+        recognise(tmp_path)

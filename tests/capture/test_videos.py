@@ -1,0 +1,101 @@
+"""Videos without calibration: one is a capture, several need cameras."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.capture.capture import Capture, SubjectPoint
+from hnerf.capture.ingest import ingest
+from hnerf.config import CaptureSettings
+from hnerf.errors import InputError
+from tests.capture.recordings import write_calibration, write_easymocap, write_video
+
+SETTINGS = CaptureSettings()
+
+
+@pytest.fixture
+def clip(tmp_path: Path) -> Path:
+    write_video(tmp_path / "my clip.mp4", 6)
+    return tmp_path / "my clip.mp4"
+
+
+def test_one_file_is_a_capture(clip: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """64 x 48 px, a focal length of 0.85 of the longer side: 54.4 px."""
+    with caplog.at_level(logging.WARNING):
+        ingest(clip, SETTINGS, tmp_path / "out")
+    found = Capture.load(tmp_path / "out")
+    assert "longer side sees 61 degrees, is assumed" in caplog.text
+    camera = found.cameras["my clip"]
+    assert found.name == "my clip" and found.frames == (0, 1, 2, 3, 4, 5) and not found.has_keypoints
+    np.testing.assert_allclose(camera.K, [[54.4, 0, 31.5], [0, 54.4, 23.5], [0, 0, 1]], atol=1e-3)
+    np.testing.assert_allclose(camera.centre_m, 0)
+    uv, depth_m = camera.project(np.array([[0, 2.0, 0.5]]))  # 2 m ahead, half a metre up: above the middle
+    np.testing.assert_allclose(uv, [[31.5, 23.5 - 54.4 / 4]], atol=1e-3)
+    assert depth_m == 2
+
+
+@pytest.mark.parametrize("place", ["videos/front.MP4", "front.mov", "videos/front.mp4"])
+def test_a_folder_states_the_field_of_view(place: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """90 degrees: the focal length is half the longer side."""
+    folder = tmp_path / "ada"
+    write_video(tmp_path / "clip.mp4", 3, (48, 64))
+    (folder / place).parent.mkdir(parents=True)
+    (tmp_path / "clip.mp4").rename(folder / place)
+    (folder / "capture.toml").write_text("field_of_view_deg = 90\n")
+    capture = ingest(folder, SETTINGS, tmp_path / "out")
+    assert capture.name == "ada" and capture.cameras["front"].K[0, 0] == pytest.approx(32)
+    assert "assumed" not in caplog.text
+
+
+def refused(folder: Path, out: Path) -> str:
+    with pytest.raises(InputError) as refusal:
+        ingest(folder, SETTINGS, out)
+    assert "\n" not in str(refusal.value) and not (out / "capture.json").exists()
+    return str(refusal.value)
+
+
+def test_several_videos_need_cameras(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_video(tmp_path / "ada" / f"{name}.mp4", 3)
+    assert "--from person` finds their cameras" in refused(tmp_path / "ada", tmp_path / "out")
+
+
+def test_videos_beside_their_calibration_are_read(tmp_path: Path) -> None:
+    folder = tmp_path / "ada"
+    folder.mkdir()
+    write_calibration(folder)
+    for name in ("01", "02"):
+        write_video(folder / f"{name}.mp4", 3, (24, 16))
+    assert ingest(folder, SETTINGS, tmp_path / "out").train_cameras == ("01", "02")
+
+
+def test_what_is_no_video(tmp_path: Path) -> None:
+    (tmp_path / "clip.mp4").write_bytes(b"0" * 1000)
+    (tmp_path / "notes.txt").write_text("seen")
+    assert "clip.mp4: not a readable video" in refused(tmp_path / "clip.mp4", tmp_path / "out")
+    assert "notes.txt: is none of" in refused(tmp_path / "notes.txt", tmp_path / "out")
+
+
+def test_more_frames_declared_than_there_are(clip: Path, tmp_path: Path) -> None:
+    data = clip.read_bytes()
+    start = data.index(b"mdat") + 4
+    length = int.from_bytes(data[start - 8 : start - 4], "big") - 8
+    clip.write_bytes(data[: start + length // 2] + bytes(length - length // 2) + data[start + length :])
+    assert "my clip.mp4: 6 frames declared" in refused(clip, tmp_path / "out")
+
+
+def test_the_subject_is_named_in_recorded_pixels(tmp_path: Path) -> None:
+    """Images of 24 x 16 px are halved: (13, 5) becomes (13.5 / 2 - .5, 5.5 / 2 - .5); frame 9 is not there, 4 is."""
+    folder = write_easymocap(tmp_path / "ada")
+    half = CaptureSettings.model_construct(max_side_px=12, max_frames=60)
+    for text, expected in (
+        ("nearest to (13, 5) in 02 at frame 9", SubjectPoint((6.25, 2.25), "02", 4)),
+        ("nearest to (13, 5) in 02", SubjectPoint((6.25, 2.25), "02", 0)),
+        ("nearest to (-0.5, 2)", SubjectPoint((-0.5, 2.0), "", -1)),
+        ("Ada Lovelace", None),
+    ):
+        (folder / "capture.toml").write_text(f'subject = "{text}"\n')
+        ingest(folder, half, tmp_path / "out")
+        assert Capture.load(tmp_path / "out").subject_point == expected

@@ -1,0 +1,94 @@
+"""What becomes of the subject and of others: masks, figures, and who cannot be used."""
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hnerf.capture.capture import Capture, read_rgb, write_image
+from hnerf.capture.people import PersonTrack
+from hnerf.detection.people import check_subject, draw_people, keep_subject, people_rows
+from hnerf.errors import InputError
+from tests.calibration.synthetic import ring, write_capture
+
+SIZE_PX = 100
+
+
+def standing(x: float, height_px: float = 90.0, top: float = 5.0) -> np.ndarray:
+    """Return keypoints (25, 3) on a line from (x, top) downwards."""
+    return np.column_stack([np.full(25, x), np.linspace(top, top + height_px, 25), np.full(25, 0.9)])
+
+
+def track(*images: np.ndarray, moves: bool = True) -> PersonTrack:
+    """Return a person seen by one camera."""
+    return PersonTrack(np.stack(images)[None], 0.5, moves)
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Capture:
+    """Of one camera, 100 x 100 px, two frames; grey images."""
+    camera = dataclasses.replace(ring(1)[0], width_px=SIZE_PX, height_px=SIZE_PX)
+    found = write_capture(tmp_path, [camera], {"c0": np.zeros((2, 1, 25, 3))})
+    for frame in found.frames:
+        write_image(tmp_path / "images" / "c0" / f"{frame:06d}.png", np.full((SIZE_PX, SIZE_PX, 3), 90, np.uint8))
+    return found
+
+
+def test_a_pixel_is_whose_it_is_likelier(capture: Capture, tmp_path: Path) -> None:
+    """Both masks cover the whole image, the other's with 200 of 255 on its right half, the subject's with 150; in the
+    second image the other is alone."""
+    masks = np.zeros((2, 2, 256, 256), np.uint8)
+    masks[:, 0, :, 128:], masks[:, 1] = 200, 150
+    regions = np.tile([49.5, 49.5, 100.0, 0.0], (2, 2, 1))
+    people = np.stack([[standing(75), standing(25)], [standing(75), 0 * standing(25)]])
+    subject = np.stack([standing(25), 0 * standing(25)])
+    keep_subject(tmp_path, capture, "c0", subject, people, {"masks": masks, "regions": regions})
+    first, second = (
+        cv2.imread(str(tmp_path / "person" / "c0" / f"00000{k}.png"), cv2.IMREAD_GRAYSCALE) for k in (0, 1)
+    )
+    assert first is not None and second is not None
+    assert first[50, [10, 45]].tolist() == [150, 150] and first[50, [55, 90]].tolist() == [0, 0]
+    assert second.max() == 0
+
+
+def test_where_the_subject_is_alone_the_mask_stays(capture: Capture, tmp_path: Path) -> None:
+    people, found = np.stack([[standing(25)]] * 2), {"masks": np.zeros((2, 1, 256, 256)), "regions": np.ones((2, 1, 4))}
+    keep_subject(tmp_path, capture, "c0", people[:, 0], people, found)
+    assert not (tmp_path / "person").exists()
+
+
+def test_figures_say_who_was_taken(capture: Capture) -> None:
+    rows = people_rows(
+        capture, [track(standing(25), standing(30)), track(standing(75, 40), 0 * standing(0), moves=False)]
+    )
+    assert rows == [
+        {"person": "subject", "cameras": 1, "images": 2, "height_px": 90.0, "moves": True, "claim": 0.5},
+        {"person": "left 1", "cameras": 1, "images": 1, "height_px": 40.0, "moves": False, "claim": 0.5},
+    ]
+
+
+def test_the_picture_shows_the_subject_green_and_others_red(capture: Capture, tmp_path: Path) -> None:
+    """It is 360 px high: the subject's line at 25 px of 100 is at 90, the other's at 270."""
+    draw_people(
+        tmp_path / "people.png", capture, [track(standing(25), standing(25)), track(standing(75), standing(75))]
+    )
+    picture = read_rgb(tmp_path / "people.png")
+    assert picture.shape == (360, 360, 3)
+    assert picture[180, 90].tolist() == [0, 200, 0] and picture[180, 270].tolist() == [220, 0, 0]
+
+
+def test_who_is_too_small_is_one_line(capture: Capture) -> None:
+    check_subject(capture, track(standing(25, 80), standing(25, 80)))
+    with pytest.raises(InputError, match="ring: the person is 79 px tall at most, and 80 are needed; record"):
+        check_subject(capture, track(standing(25, 79), standing(25, 79)))
+
+
+def test_who_is_always_cut_off_is_one_line(capture: Capture) -> None:
+    """Of the ankles one is seen in the first image, the other in the second, but never both."""
+    left, right = standing(25), standing(25)
+    left[11], right[14] = 0, 0
+    with pytest.raises(InputError, match="ring: the person is always cut off by the images' border; record"):
+        check_subject(capture, track(left, right))
+    check_subject(capture, track(left, standing(25)))
