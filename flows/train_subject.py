@@ -15,6 +15,7 @@ from tasks.capture import ingest, subset_capture
 from tasks.detection import detect, needs_detection
 from tasks.evaluation import evaluate, evaluate_held_out
 from tasks.fit import fit
+from tasks.hands import find_hands, needs_hands
 from tasks.segmentation import converged, needs_body, segment
 from tasks.source import read_capture
 from tasks.store import Artifact, Store
@@ -41,7 +42,8 @@ def train_subject(
     recorded = ingest(artifact_store, source, settings.capture)
     subject = Capture.load(recorded.root).name
     artifact_store.link_latest(subject, recorded)
-    recording = artifact_store.link_latest(subject, with_keypoints(artifact_store, recorded, settings))
+    seen = with_keypoints(artifact_store, recorded, settings)
+    recording = artifact_store.link_latest(subject, with_hands(artifact_store, seen, settings))
     calibration = artifact_store.link_latest(subject, calibrate(artifact_store, recording, settings.calibration))
     left_out = calibrated_held_out_cameras(recording, calibration, settings)
     segmentation = artifact_store.link_latest(
@@ -72,10 +74,16 @@ def with_keypoints(store: Store, recorded: Artifact, settings: Settings) -> Arti
     return detect(store, recorded, settings.detection) if wanted else recorded
 
 
+def with_hands(store: Store, recording: Artifact, settings: Settings) -> Artifact:
+    """Return the recording with points of the subject's hands, if they are wanted and the network is installed."""
+    return find_hands(store, recording) if needs_hands(recording, settings.detection) else recording
+
+
 def prepare_training(
     store: Store, recording: Artifact, settings: Settings
 ) -> tuple[Artifact, Artifact, Artifact, Artifact]:
     """Run the stages before training on a recording; return recording, calibration, segmentation and body."""
+    recording = with_hands(store, recording, settings)
     return segment_and_fit(store, recording, calibrate(store, recording, settings.calibration), settings)
 
 
