@@ -9,7 +9,9 @@ from torch import Tensor
 
 from hnerf.body.articulation import Articulation, Points, Pose, with_offsets
 from hnerf.body.balance import Balance
+from hnerf.body.ground import Ground
 from hnerf.body.hand_points import PalmTerm
+from hnerf.body.limb_depths import LimbDepths
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.observations import Observations
 from hnerf.body.pose_prior import PosePrior, Smoothness
@@ -44,7 +46,8 @@ class Problem:
 
     Shared unknowns: beta (B,), then the keypoint offsets (75,), then the median turns of the posture prior. scale_m (C,
     n): metres a pixel spans at the person, held fixed, since residuals would otherwise shrink as the body comes nearer.
-    balance: with one camera only; posture_prior: None as long as no posture is known; palm: None without hand points.
+    balance, ground: with one camera only; posture_prior: None as long as no posture is known; palm: None without hand
+    points; limb_depths: None without metric landmarks of the only camera.
     """
 
     observations: Observations
@@ -53,8 +56,10 @@ class Problem:
     smoothness: Smoothness
     reshape: Callable[[Tensor], Rig]
     balance: Balance | None = None
+    ground: Ground | None = None
     posture_prior: PosturePrior | None = None
     palm: PalmTerm | None = None
+    limb_depths: LimbDepths | None = None
 
     def assemble(self, pose: Pose, data_term: Callable[[Tensor], DataTerm]) -> tuple[float, NormalEquations]:
         """Return the cost and the normal equations of the keypoints, weighted by `data_term`, and of all priors."""
@@ -73,6 +78,10 @@ class Problem:
         cost += self.smoothness.add(equations, x, by_frame)
         if self.balance:
             cost += self.balance.add(equations, x, by_frame)
+        if self.ground:
+            cost += self.ground.add(equations, pose, x, by_frame, by_shared)
+        if self.limb_depths:
+            cost += self.limb_depths.add(equations, x, by_frame, by_shared)
         if self.palm:
             cost += self.palm.add(equations, articulation, joints)
         if self.posture_prior:

@@ -22,6 +22,7 @@ from hnerf.geometry.camera import Camera
 
 PERSON = "person"  # folder: <camera>/<frame>.png, 255 times the probability
 KEYPOINTS = "keypoints.npz"  # by camera
+LANDMARKS = "landmarks"  # folder: <camera>.npz, of people
 HANDS = "hands.npz"  # by camera: points of the subject's hands, found by a network
 JPEG_OPTIONS = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
@@ -103,6 +104,19 @@ class Capture:
         """Return the subject's left and right hand (frames, 2, 21, 3) in the order of `keypoints`; None where no
         network looked for hands."""
         return self._points(HANDS, camera)
+
+    def landmarks(self, camera: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return a network's landmarks of people (frames, people, 33, 3), in the order of `frames` and each recorded
+        nearest in time: x_px, y_px and confidence; and metres from the middle of the hips along the camera's axes. None
+        where no network looked."""
+        path = self.root / LANDMARKS / f"{camera}.npz"
+        if not path.exists():
+            return None
+        stored = self.stored_frames or self.frames
+        recorded = [self.recorded_frame(camera, frame) for frame in self.frames]
+        rows = np.searchsorted(stored, recorded).clip(max=len(stored) - 1)
+        with np.load(path, allow_pickle=False) as found:
+            return found["points_px"][rows], found["points_m"][rows]
 
     def _points(self, file: str, camera: str) -> np.ndarray | None:
         path = self.root / file

@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hnerf.capture.capture import PERSON, Capture, write_image
+from hnerf.capture.capture import LANDMARKS, PERSON, Capture, write_image
 from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
 from hnerf.capture.subset import read_keypoints, write_keypoints
 from hnerf.config import DetectionSettings
@@ -25,7 +25,6 @@ from hnerf.models import POSE_DETECTOR, model_file
 from hnerf.progress import report as report_progress
 
 KEYPOINTS: KeypointSetName = "blazepose_33"
-LANDMARKS = "landmarks"  # folder: <camera>.npz
 PROGRESS_S = 0.5  # between two counts of the images that are done
 
 
@@ -47,7 +46,7 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
         )
     keypoints = to_body_25({name: people["points_px"] for name, people in found.items()}, KEYPOINTS)
     keypoints = {name: _inside(points, capture, name) for name, points in keypoints.items()}
-    if settings.source == "both":
+    if settings.source != "network":
         own = read_keypoints(capture)
         keypoints |= own | {
             name: pad_people([fill_missing(*pair) for pair in zip(own[name], points, strict=True)])
