@@ -88,10 +88,10 @@ def choose(full: Settings, only: Sequence[str]) -> tuple[dict[str, Settings], di
 def measure(store: Store, source: Source, truth: Source, settings: Settings) -> dict[str, Any]:
     """Return a row: scores of every split, seconds and device of its training; {"error": one line} if one fails."""
     recording = with_keypoints(store, ingest(store, source, settings.capture), settings)
-    stages = prepare_training(store, recording, settings)
+    prepared = prepare_training(store, recording, settings)
     try:
-        training = train(store, *stages, settings.training)
-        evaluation = evaluate(store, truth, *stages, training, settings.evaluation)
+        training = train(store, *prepared, settings.training)
+        evaluation = evaluate(store, truth, *prepared, training, settings.evaluation)
     except Exception as error:  # that a method breaks without a part is a result
         if is_retryable(error):
             raise  # a full disk, a lost share, a killed worker

@@ -8,7 +8,7 @@ from typing import Any
 from prefect import flow
 
 from flows.run_page import publish_markdown
-from flows.train_subject import prepare_training, with_keypoints
+from flows.train_subject import Prepared, prepare_training, with_keypoints
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
 from hnerf.errors import InputError, one_line
@@ -87,39 +87,34 @@ def measure(
         parts = variant.select(Capture.load(recording.root))
         if parts != (None, None, None):
             recording = subset_capture(store, recording, *parts)
-        stages = prepare_training(store, recording, settings)
+        prepared = prepare_training(store, recording, settings)
         if plan.until_flat:
-            settings, more = train_until_flat(store, truth, stages, plan, method)
-        training = train(store, *stages, settings.training)
-        _, calibration, _, body = stages
-        scores = score_training(store, truth, recording, calibration, body, training, plan.scoring)
+            settings, more = train_until_flat(store, truth, prepared, plan, method)
+        training = train(store, *prepared, settings.training)
+        scores = score_training(store, truth, recording, prepared.calibration, prepared.body, training, plan.scoring)
     except Exception as error:  # one method's failure must not end the others
         if is_retryable(error):
             raise  # a full disk, a lost share, a killed worker
         log.warning("%s: %s", type(error).__name__, error)
         return {"error": one_line(error)}
     found: dict[str, Any] = json.loads((scores.root / "scores.json").read_text())
-    taken = calibrated_capture(recording, stages[1])
+    taken = calibrated_capture(recording, prepared.calibration)
     counts = {"cameras": len(taken.train_cameras), "frames": len(taken.train_frames)}
     return found | more | {"trained_on": counts, "folder": str(scores.root.relative_to(store.root))}
 
 
 def train_until_flat(
-    store: Store,
-    truth: Source,
-    stages: tuple[Artifact, Artifact, Artifact, Artifact],
-    plan: BenchmarkStudy,
-    method: str,
+    store: Store, truth: Source, prepared: Prepared, plan: BenchmarkStudy, method: str
 ) -> tuple[Settings, dict[str, Any]]:
     """Train for longer and longer; return the settings of the last training, and the curve of all and why there are no
     longer ones. A training that fails has no point: it may be too young for a surface."""
     assert plan.seconds is not None
-    recording, calibration, _, body = stages
+    recording, calibration, _, body = prepared
     points: list[dict[str, Any]] = []
     for limit_s in training_limits_s(plan.seconds):
         settings, ended = plan.settings(method, limit_s), "limit"
         try:
-            training = train(store, *stages, settings.training)
+            training = train(store, *prepared, settings.training)
             point = score_end_of_training(store, truth, recording, calibration, body, training, plan.scoring)
         except Exception as error:
             if is_retryable(error):
@@ -139,6 +134,5 @@ def train_until_flat(
 
 def train_recording(store: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact, Artifact]:
     """Run all stages on a recording; return calibration, body and training."""
-    stages = prepare_training(store, recording, settings)
-    _, calibration, _, body = stages
-    return calibration, body, train(store, *stages, settings.training)
+    prepared = prepare_training(store, recording, settings)
+    return prepared.calibration, prepared.body, train(store, *prepared, settings.training)

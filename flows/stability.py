@@ -11,7 +11,7 @@ import numpy as np
 from prefect import flow
 
 from flows.run_page import publish_markdown
-from flows.train_subject import prepare_training, with_keypoints
+from flows.train_subject import Prepared, prepare_training, with_keypoints
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
 from hnerf.errors import InputError, NotApplicableError, one_line
@@ -176,13 +176,13 @@ def attempt(
     capture."""
     at_bad_input = "refused"
     try:
-        stages = prepare_degraded(store, recording, truth, settings, degradation)
+        prepared = prepare_degraded(store, recording, truth, settings, degradation)
         training_settings = settings.training
         if degradation and KINDS[degradation.kind].target == "settings":
             training_settings = degrade_settings(training_settings, degradation)
-        training = train(store, *stages, training_settings)
+        training = train(store, *prepared, training_settings)
         at_bad_input = "failed"
-        return measure(store, recording, truth, settings, degradation, stages, training)
+        return measure(store, recording, truth, settings, degradation, prepared, training)
     except NotApplicableError as error:
         return {"left_out": str(error)}
     except InputError as error:
@@ -196,8 +196,8 @@ def attempt(
 
 def prepare_degraded(
     store: Store, recording: Artifact, truth: Source, settings: Settings, degradation: Degradation | None
-) -> tuple[Artifact, Artifact, Artifact, Artifact]:
-    """Return recording, calibration, segmentation and body, degraded at the degradation's target."""
+) -> Prepared:
+    """Run the stages before training, degraded at the degradation's target."""
     target = KINDS[degradation.kind].target if degradation else None
     if degradation and target == "capture":
         recording = degrade_capture(store, recording, degradation)
@@ -210,7 +210,7 @@ def prepare_degraded(
         body = fit(store, recording, calibration, segmentation, settings.fit)
     if degradation and target == "fit":
         body = degrade_fit(store, body, degradation)
-    return recording, calibration, segmentation, body
+    return Prepared(recording, calibration, segmentation, body)
 
 
 def measure(
@@ -219,7 +219,7 @@ def measure(
     truth: Source,
     settings: Settings,
     degradation: Degradation | None,
-    stages: tuple[Artifact, Artifact, Artifact, Artifact],
+    prepared: Prepared,
     training: Artifact,
 ) -> Figures:
     """Return the faults of surfaces, the scores of each image and the Chamfer distance of each surface that has ground
@@ -233,13 +233,12 @@ def measure(
         if no_poses:
             raise NotApplicableError(no_poses)
         return {"faults": _faults(show_in_extreme_poses(store, training, degradation))}
-    *_, good_body = prepare_degraded(store, recording, truth, settings, None)
+    good_body = prepare_degraded(store, recording, truth, settings, None).body
     if degradation and KINDS[degradation.kind].target == "clothing":
-        _, truth = read_capture(stages[0].root)
-    recording_used, calibration, segmentation, body = stages
+        _, truth = read_capture(prepared.recording.root)
     if degradation and KINDS[degradation.kind].target == "fit":
-        body = good_body
-    evaluation = evaluate(store, truth, recording_used, calibration, segmentation, body, training, settings.evaluation)
+        prepared = prepared._replace(body=good_body)
+    evaluation = evaluate(store, truth, *prepared, training, settings.evaluation)
     metrics = json.loads((evaluation.root / "metrics.json").read_text())
     novel = Capture.load(recording.root).novel_pose_frames and not no_poses
     split = ANIMATED if novel else NOVEL_VIEW

@@ -1,6 +1,7 @@
 """Main flow: from a capture folder to an avatar."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 from prefect import flow
 
@@ -20,6 +21,15 @@ from tasks.segmentation import converged, needs_body, segment
 from tasks.source import read_capture
 from tasks.store import Artifact, Store
 from tasks.training import train
+
+
+class Prepared(NamedTuple):
+    """What training and evaluation take from the stages before them, in the order in which these tasks take it."""
+
+    recording: Artifact
+    calibration: Artifact
+    segmentation: Artifact
+    body: Artifact
 
 
 @flow(name="train-subject", flow_run_name="{capture}")
@@ -79,20 +89,17 @@ def with_hands(store: Store, recording: Artifact, settings: Settings) -> Artifac
     return find_hands(store, recording) if needs_hands(recording, settings.detection) else recording
 
 
-def prepare_training(
-    store: Store, recording: Artifact, settings: Settings
-) -> tuple[Artifact, Artifact, Artifact, Artifact]:
-    """Run the stages before training on a recording; return recording, calibration, segmentation and body."""
+def prepare_training(store: Store, recording: Artifact, settings: Settings) -> Prepared:
+    """Run the stages before training on a recording."""
     recording = with_hands(store, recording, settings)
     return segment_and_fit(store, recording, calibrate(store, recording, settings.calibration), settings)
 
 
-def segment_and_fit(
-    store: Store, recording: Artifact, calibration: Artifact, settings: Settings
-) -> tuple[Artifact, Artifact, Artifact, Artifact]:
+def segment_and_fit(store: Store, recording: Artifact, calibration: Artifact, settings: Settings) -> Prepared:
     """Do the same for a recording whose cameras were calibrated."""
     segmentation = segment_subject(store, recording, calibration, settings)
-    return recording, calibration, segmentation, fit(store, recording, calibration, segmentation, settings.fit)
+    body = fit(store, recording, calibration, segmentation, settings.fit)
+    return Prepared(recording, calibration, segmentation, body)
 
 
 def calibrated_held_out_cameras(recording: Artifact, calibration: Artifact, settings: Settings) -> tuple[str, ...]:
@@ -109,10 +116,10 @@ def evaluate_without_camera(
     """Segment, fit and train without a camera, and score the result on that camera under its masks of `segmentation`.
     The calibration is that of all cameras."""
     others = tuple(name for name in calibrated_capture(recording, calibration).train_cameras if name != camera)
-    stages = segment_and_fit(store, subset_capture(store, recording, others, None, None), calibration, settings)
-    training = train(store, *stages, settings.training)
+    prepared = segment_and_fit(store, subset_capture(store, recording, others, None, None), calibration, settings)
+    training = train(store, *prepared, settings.training)
     scored = settings.evaluation.model_copy(update={"holdout": camera})  # also if the setting is "each"
-    return evaluate_held_out(store, recording, calibration, segmentation, stages[-1], training, scored)
+    return evaluate_held_out(store, recording, calibration, segmentation, prepared.body, training, scored)
 
 
 def segment_subject(store: Store, recording: Artifact, calibration: Artifact, settings: Settings) -> Artifact:

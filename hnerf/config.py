@@ -4,6 +4,7 @@ A preset is a YAML file under `configs/`; `load_settings("fast", ["training.seco
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, TypeVar
 
@@ -268,7 +269,9 @@ class AssetSettings(Section):
     grid_cells: int = Field(default=256, ge=16)  # of marching cubes, on the longest side
     faces: int = Field(default=20_000, ge=100)
     texture_px: int = Field(default=1024, ge=16)
-    texture_poses: int = Field(default=3, ge=1)  # of the capture; each texel takes the median colour over them
+    texture_poses: int = Field(default=3, ge=1)  # of the capture, whose median is the field's colour of a texel
+    photograph_frames: int = Field(default=16, ge=0)  # whose training photographs make the texture; 0: the field alone
+    correctives: int = Field(default=8, ge=0, le=64)  # blend shapes of what frames have beyond skinning
 
 
 class Settings(Section):
@@ -370,6 +373,11 @@ def validated(kind: type[S], tree: Any, source: Path | str) -> S:
         return kind.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
-        steps = zip(("", *first["loc"]), first["loc"], strict=False)
-        key = ".".join(str(part) for before, part in steps if before != "field")  # the kind of field is no key
-        raise InputError(f"{source}: {key}: {first['msg']}; correct it") from None
+        key: list[str] = []
+        node = tree
+        for part in first["loc"]:
+            with suppress(LookupError, TypeError):  # kinds of a union are named, too, and are no keys of the tree
+                node = node[part]
+                key.append(str(part))
+        key += [str(part) for part in first["loc"][-1:] if first["type"] == "missing"]
+        raise InputError(f"{source}: {'.'.join(key)}: {first['msg']}; correct it") from None

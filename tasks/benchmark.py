@@ -15,7 +15,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("scoring", version="10", networks=(LPIPS_ALEXNET,))
+@stage("scoring", version="11", networks=(LPIPS_ALEXNET,))
 def score_training(
     out: Path,
     truth: Source,
@@ -31,7 +31,7 @@ def score_training(
     return {} if psnr is None else {"psnr": psnr}
 
 
-@stage("scoring-end", version="2", networks=(LPIPS_ALEXNET,))
+@stage("scoring-end", version="3", networks=(LPIPS_ALEXNET,))
 def score_end_of_training(
     out: Path,
     truth: Source,

@@ -19,7 +19,7 @@ from tasks.store import Artifact
 from tasks.training import load_trained_avatar
 
 
-@stage("evaluation", version="11", networks=(LPIPS_ALEXNET,))
+@stage("evaluation", version="12", networks=(LPIPS_ALEXNET,))
 def evaluate(
     out: Path,
     truth: Source,
@@ -51,7 +51,7 @@ def evaluate(
     return _headline(found) | {f"holdout {name}": value for name, value in held_out_mean.items()}
 
 
-@stage("holdout", version="2", networks=(LPIPS_ALEXNET,))
+@stage("holdout", version="3", networks=(LPIPS_ALEXNET,))
 def evaluate_held_out(
     out: Path,
     recording: Artifact,
@@ -68,7 +68,7 @@ def evaluate_held_out(
     return _headline(score_held_out(capture, masks, avatar, fitted, training.root, settings, out))
 
 
-def _headline(found: Mapping[str, Any]) -> dict[str, float]:
+def _headline(found: Mapping[Any, Any]) -> dict[str, float]:
     """Return the mean image scores of each split that has any."""
     means = {
         f"{split} {name}": found[split][name]

@@ -1,11 +1,11 @@
 """The fit stage: the posed body model."""
 
-import json
 from pathlib import Path
 
 from hnerf.body.fit import fit_body
 from hnerf.capture.masks import Masks
 from hnerf.config import FitSettings
+from hnerf.results import FitReport, write_result
 from tasks.calibration import calibrated_capture
 from tasks.stage import stage
 from tasks.store import Artifact
@@ -19,7 +19,7 @@ def fit(
     each part; no file holds them, so that the same body made again is the same artifact."""
     masks = Masks.load(segmentation.root) if segmentation else None
     body, report = fit_body(calibrated_capture(recording, calibration), masks, settings)
-    seconds: dict[str, float] = report.pop("seconds")
+    seconds = report.pop("seconds")
     body.save(out)
-    (out / "report.json").write_text(json.dumps(report, indent=1))
+    write_result(out / "report.json", FitReport, report)
     return seconds

@@ -1,4 +1,5 @@
-"""Prefect's home is a folder of this test session's own, so that tests neither see nor touch the user's."""
+"""Tensor shapes in annotations are checked; Prefect's home is a folder of this test session's own, so that tests
+neither see nor touch the user's."""
 
 import atexit
 import os
@@ -12,6 +13,11 @@ from collections.abc import Iterator
 
 import httpx
 import pytest
+from jaxtyping import install_import_hook
+
+SHAPED = ["geometry.camera", "geometry.reach", "geometry.triangulation", "fields.compositing", "fields.encoding"]
+SHAPED += ["fields.samples", "training.losses"]
+install_import_hook([f"hnerf.{name}" for name in SHAPED], "beartype.beartype")
 
 # Prefect reads its settings when it is imported.
 _home = tempfile.mkdtemp(prefix="hnerf-prefect-")

@@ -39,6 +39,8 @@ COLMAP, ZJUMOCAP = "hnerf/capture/formats/colmap.py", "hnerf/capture/formats/zju
 SAFE_IO, TIMING = "hnerf/capture/safe_io.py", "hnerf/capture/timing.py"
 NORMALISE, MANIFEST = "hnerf/capture/normalise.py", "hnerf/capture/manifest.py"
 STAGING, GLB, USD = "hnerf/asset/staging.py", "hnerf/asset/glb.py", "hnerf/asset/usd.py"
+ANTIALIASING, CORRECTIVES = "hnerf/avatar/antialiasing.py", "hnerf/asset/correctives.py"
+PHOTOGRAPHS = "hnerf/asset/photographs.py"
 METRICS, REPORT = "hnerf/evaluation/metrics.py", "hnerf/evaluation/report.py"
 EXPOSURE, ARTICULATION = "hnerf/training/exposure.py", "hnerf/body/articulation.py"
 POLICY, STORE = "tasks/policy.py", "tasks/store.py"
@@ -54,6 +56,8 @@ BY_CAMERA, BY_TRIANGULATION = "tests/geometry/test_camera.py", "tests/calibratio
 BY_FILES, BY_USD = "tests/capture/test_camera_files.py", "tests/asset/test_usd.py"
 BY_METRICS, BY_POLICY = "tests/evaluation/test_metrics.py", "tests/tasks/test_policy.py"
 BY_INGEST, BY_STORE = "tests/capture/test_ingest.py", "tests/tasks/test_store.py"
+BY_ANTIALIASING, BY_CORRECTIVES = "tests/avatar/test_antialiasing.py", "tests/asset/test_correctives.py"
+BY_PHOTOGRAPHS = "tests/asset/test_photographs.py"
 BY_TIMING, BY_GLB = "tests/capture/test_timing.py", "tests/asset/test_glb.py"
 
 
@@ -70,7 +74,7 @@ class Fault:
 
 FAULTS = (
     # what F and DH of the published method are asked, and the units of what they answer
-    Fault("paper-view-noise", PAPER, "else directions + draws.view", "else directions", BY_PAPER),
+    Fault("paper-view-noise", PAPER, "else rays.directions + draws.view", "else rays.directions", BY_PAPER),
     Fault("paper-root-noise", CONDITIONS, "root=self.root + root", "root=self.root", BY_CONDITIONS),
     Fault("paper-theta-noise", CONDITIONS, "pose=self.pose + pose", "pose=self.pose", BY_CONDITIONS),
     Fault("paper-density-unit", PAPER, "+ 1e10) / self.settings.scene_m", "+ 1e10)", BY_PAPER),
@@ -150,7 +154,7 @@ FAULTS = (
     Fault("fast-tighten-sides", FAST, "side * described.d[seen]", "-side * described.d[seen]", BY_TIGHTEN),
     Fault("fast-tighten-poses", FAST, "seen |= described.near", "seen = described.near", BY_TIGHTEN),
     # what the trainer hands to a step
-    Fault("trainer-noise", TRAINER, "self.conditions.with_noise(s.noise, self.generator)", "self.conditions",
+    Fault("trainer-noise", TRAINER, "self.scene.with_noise(s.noise, self.generator)", "self.scene",
           BY_TRAINER),
     Fault("trainer-view-noise", TRAINER, "samples, s.noise, self.generator)", "samples, 0.0, self.generator)",
           BY_TRAINER),
@@ -196,6 +200,16 @@ FAULTS = (
     # what goes out
     Fault("stage-axis", STAGING, "[0, 0, 1], [0, -1, 0]])", "[0, 0, 1], [0, 1, 0]])", "tests/asset/test_staging.py"),
     Fault("glb-inverse-bind", GLB, "inverse_bind[:, 3, :3] =", "inverse_bind[:, :3, 3] =", BY_GLB),
+    Fault("antialiasing-offsets", ANTIALIASING, "QUARTERS_PX = 0.25 *", "QUARTERS_PX = 0.0 *", BY_ANTIALIASING),
+    Fault("antialiasing-depth", ANTIALIASING, "image[y, x, :4] = torch", "image[y, x] = torch", BY_ANTIALIASING),
+    Fault("photographs-cosine", PHOTOGRAPHS, "cosine**COSINE_POWER", "cosine", BY_PHOTOGRAPHS),
+    Fault("photographs-hidden", PHOTOGRAPHS, "(distance_m < seen_m[row", "(distance_m > -seen_m[row", BY_PHOTOGRAPHS),
+    Fault("photographs-outline", PHOTOGRAPHS, "inside & ~outline[row, column]", "inside", BY_PHOTOGRAPHS),
+    Fault("photographs-gain", PHOTOGRAPHS, "pixels_px) / gain", "pixels_px) * gain", BY_PHOTOGRAPHS),
+    Fault("correctives-turn", CORRECTIVES, "solve(skinning[..., :3], moved_m)", "solve(skinning[..., :3].mT, moved_m)",
+          BY_CORRECTIVES),
+    Fault("correctives-sign", CORRECTIVES, "-height_m[:, None] *", "height_m[:, None] *", BY_CORRECTIVES),
+    Fault("usd-shape-weights", USD, "frames, avatar.shape_weights", "frames, -avatar.shape_weights", BY_USD),
     Fault("glb-time", GLB, "(avatar.frames - avatar.frames[0]) / fps", "avatar.frames / fps", BY_GLB),
     Fault("usd-quaternion", USD, "Gf.Quatf(w, x, y, z)", "Gf.Quatf(x, y, z, w)", BY_USD),
     Fault("usd-camera-axis", USD, "np.diag([1, -1, -1])", "np.diag([1, 1, -1])", BY_USD),

@@ -103,10 +103,12 @@ def test_a_preset_builds_on_another(tmp_path: Path) -> None:
     [
         ("training.field.colour_cells=[8,-3]", "training.field.colour_cells.1: "),
         ("training.field.kind=cube", "training.field: "),
+        ("training.field={kind: paper, samples: 4, box_samples: 9}", "training.field: "),
+        ("fit.body_model=3", "fit.body_model: "),
     ],
 )
-def test_a_fields_errors_name_the_key_as_it_is_set(override: str, message: str) -> None:
-    with pytest.raises(InputError, match=rf"^--set [^ ]*: {re.escape(message)}"):
+def test_errors_in_unions_name_the_key_as_it_is_set(override: str, message: str) -> None:
+    with pytest.raises(InputError, match=rf"^--set {re.escape(override)}: {re.escape(message)}"):
         load_settings("fast", [override])
 
 

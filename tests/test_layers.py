@@ -9,7 +9,7 @@ import pytest
 import hnerf
 
 ROOT = Path(hnerf.__file__).parent
-FOUNDATION = ("errors", "evenly_spaced", "tables", "files", "progress", "models", "config")
+FOUNDATION = ("errors", "evenly_spaced", "tables", "files", "progress", "models", "config", "results")
 FLOORS = (*FOUNDATION, "geometry", "capture", "detection", "body", "synthetic", "segmentation", "calibration", "fields",
           "baselines", "avatar", "training", "render", "evaluation", "asset", "study")  # fmt: skip
 

@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from hnerf.asset.correctives import Correctives, correctives_of, frame_displacements, with_displacements
 from hnerf.asset.glb import write_glb
+from hnerf.asset.photographs import colours_from_photographs
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.simplify import simplify
 from hnerf.asset.staging import stage_avatar
-from hnerf.asset.texture import bake, unwrap
+from hnerf.asset.texture import field_colours, rasterise, texture_image, unwrap
 from hnerf.asset.usd import write_cache, write_skinned
 from hnerf.asset.validation import validate_package
 from hnerf.avatar.avatar import Avatar
@@ -36,7 +38,7 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
     Raises InputError if the field has no surface, InvalidAsset if a package does not pass validation.
     """
     seconds: dict[str, float] = {}
-    avatar = avatar.without_frames()  # one surface and one texture serve all frames
+    tracked_avatar, avatar = avatar, avatar.without_frames()  # one surface and one texture serve all frames
     with _timed("surface", seconds):
         rest = avatar.body.theta.new_zeros(len(avatar.body.rig.joints_m), 3), torch.eye(4).to(avatar.body.theta)
         dense = surface_in_pose(avatar, *rest, settings.grid_cells)
@@ -44,11 +46,22 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
         surface = simplify(dense, settings.faces)
         layout = unwrap(surface.vertices, surface.faces, settings.texture_px)
         rig = clothed_rig(avatar.body.rig.to("cpu"), surface)
+    clothed = _clothed_body(avatar.body, rig, capture.frames)
+    with _timed("correctives", seconds):
+        displacements_m = frame_displacements(tracked_avatar, clothed)
+        correctives = correctives_of(displacements_m, settings.correctives)
+        surfaces_m = with_displacements(clothed, displacements_m)
     with _timed("texture", seconds):
+        texels = rasterise(layout, settings.texture_px)
         posed = _clothed_body(avatar.body, rig, tuple(evenly_spaced(capture.train_frames, settings.texture_poses)))
-        texture = bake(avatar, posed, layout, settings.texture_px)
+        colours = field_colours(avatar, posed, texels)
+        if settings.photograph_frames:
+            frames = evenly_spaced(capture.train_frames, settings.photograph_frames)
+            photographed = {frame: surfaces_m[clothed.index(frame)] for frame in frames}
+            colours = colours_from_photographs(capture, avatar.gains, photographed, surface.faces, texels, colours)
+        texture = texture_image(texels, colours, settings.texture_px)
     with _timed("files", seconds):
-        staged = stage_avatar(_clothed_body(avatar.body, rig, capture.frames), layout, texture, capture.up)
+        staged = stage_avatar(clothed, surfaces_m, correctives, layout, texture, capture.up)
         cameras = list(capture.cameras.values())
         write_skinned(out / "avatar.usdz", staged, cameras, capture.fps)
         write_cache(out / "avatar_cache.usdz", staged, cameras, capture.fps)
@@ -66,6 +79,7 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
         "texture_px": settings.texture_px,
         "joints": len(rig.joint_names),
         "frames": len(capture.frames),
+        "beyond_skinning_mm": _beyond_skinning_mm(displacements_m, correctives),
         "cameras": len(cameras),
         "bytes": {path.name: path.stat().st_size for path in sorted(out.glob("avatar*"))},
         "seconds": seconds,
@@ -78,6 +92,14 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
 def _clothed_body(body: BodyFit, rig: Rig, frames: tuple[int, ...]) -> BodyFit:
     rows = [body.index(frame) for frame in frames]
     return dataclasses.replace(body, rig=rig, frames=frames, theta=body.theta[rows].cpu(), root=body.root[rows].cpu())
+
+
+def _beyond_skinning_mm(displacements_m: np.ndarray, correctives: Correctives) -> dict[str, float]:
+    """Return the root mean square distance of the frames' surfaces from the skinned one, without and with its
+    correctives."""
+    rebuilt_m = np.einsum("nk,kvd->nvd", correctives.weights, correctives.offsets_m)
+    left_m = {"skinned": displacements_m, "with_correctives": displacements_m - rebuilt_m}
+    return {name: float(1e3 * np.sqrt((m**2).sum(-1).mean())) for name, m in left_m.items()}
 
 
 @contextmanager

@@ -59,7 +59,8 @@ def write_glb(path: Path, avatar: StagedAvatar, fps: float) -> None:
     document = writer.document
     _add_joints(document, avatar)
     document.materials.append(_material(writer, avatar.texture))
-    document.meshes.append(gltf.Mesh(primitives=[_primitive(writer, avatar)]))
+    no_weights = [0.0] * len(avatar.shapes_m)
+    document.meshes.append(gltf.Mesh(primitives=[_primitive(writer, avatar)], weights=no_weights or None))
     inverse_bind = np.tile(np.eye(4, dtype=np.float32), (len(avatar.parents), 1, 1))
     inverse_bind[:, 3, :3] = -avatar.rest_joints_m  # matrices are stored by columns
     joints = list(range(len(avatar.parents)))
@@ -79,7 +80,8 @@ def _add_joints(document: gltf.GLTF2, avatar: StagedAvatar) -> None:
 
 
 def _primitive(writer: GlbWriter, avatar: StagedAvatar) -> gltf.Primitive:
-    """Add the mesh, with vertices split at the texture's seams; skin influences beyond four go into a second set."""
+    """Add the mesh and its correctives, with vertices split at the texture's seams; skin influences beyond four go into
+    a second set."""
     vertex = np.zeros(len(avatar.uvs), np.int64)
     vertex[avatar.face_uvs] = avatar.faces
     normals = normals_of(avatar.rest_points_m, avatar.faces)
@@ -94,7 +96,8 @@ def _primitive(writer: GlbWriter, avatar: StagedAvatar) -> gltf.Primitive:
         setattr(attributes, f"JOINTS_{start // 4}", _vertex_data(writer, joints[:, start : start + 4], np.uint16))
         setattr(attributes, f"WEIGHTS_{start // 4}", _vertex_data(writer, weights[:, start : start + 4], np.float32))
     indices = writer.accessor(avatar.face_uvs.astype(np.uint32).ravel(), gltf.ELEMENT_ARRAY_BUFFER)
-    return gltf.Primitive(attributes=attributes, indices=indices, material=0)
+    targets = [gltf.Attributes(POSITION=_vertex_data(writer, shape[vertex], np.float32)) for shape in avatar.shapes_m]
+    return gltf.Primitive(attributes=attributes, indices=indices, material=0, targets=targets or None)
 
 
 def _vertex_data(writer: GlbWriter, values: np.ndarray, dtype: type) -> int:
@@ -113,7 +116,7 @@ def _material(writer: GlbWriter, texture: np.ndarray) -> gltf.Material:
 
 
 def _animation(writer: GlbWriter, avatar: StagedAvatar, fps: float) -> gltf.Animation:
-    """Add the rotations of the joints that turn, and the translation of the root."""
+    """Add the rotations of the joints that turn, the translation of the root, and the weights of the correctives."""
     animation = gltf.Animation(name="Motion", channels=[], samplers=[])
     times = writer.accessor(((avatar.frames - avatar.frames[0]) / fps).astype(np.float32))
 
@@ -128,4 +131,6 @@ def _animation(writer: GlbWriter, avatar: StagedAvatar, fps: float) -> gltf.Anim
             animate(joint, "translation", avatar.translations_m[:, joint])
         if (np.abs(avatar.quaternions[:, joint, :3]) > 1e-7).any():
             animate(joint, "rotation", avatar.quaternions[:, joint])
+    if len(avatar.shapes_m):
+        animate(len(avatar.parents), "weights", avatar.shape_weights.ravel())
     return animation

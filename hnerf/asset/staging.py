@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from hnerf.asset.correctives import Correctives
 from hnerf.asset.texture import UvLayout
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import joint_transforms
@@ -20,8 +21,9 @@ class StagedAvatar:
     rest_points_m (V, 3), faces (F, 3), uvs (U, 2) v up, face_uvs (F, 3), skin_joints and skin_weights (V, K): the mesh.
     joint_names, parents (J,), rest_joints_m (J, 3): the skeleton, whose rest orientations are the identity. frames
     (n,), translations_m (n, J, 3), quaternions (n, J, 4) as x y z w without sign jumps: the motion, each joint relative
-    to its parent, the root relative to the stage. points_m (n, V, 3) float32: the skinned surface. texture (H, W, 3)
-    uint8 sRGB. stage_from_world (3, 3): a rotation.
+    to its parent, the root relative to the stage. points_m (n, V, 3) float32: the surface of each frame. shapes_m
+    (K, V, 3), shape_weights (n, K) float32: corrective blend shapes, applied before the skin. texture (H, W, 3) uint8
+    sRGB. stage_from_world (3, 3): a rotation.
     """
 
     rest_points_m: np.ndarray
@@ -37,6 +39,8 @@ class StagedAvatar:
     translations_m: np.ndarray
     quaternions: np.ndarray
     points_m: np.ndarray
+    shapes_m: np.ndarray
+    shape_weights: np.ndarray
     texture: np.ndarray
     stage_from_world: np.ndarray
 
@@ -47,8 +51,11 @@ class StagedAvatar:
         return self.rest_joints_m - above
 
 
-def stage_avatar(clothed: BodyFit, layout: UvLayout, texture: np.ndarray, up: str) -> StagedAvatar:
-    """Turn a clothed body (see `clothed_rig`) and its motion to Y up. `up`: the vertical axis of the world, "y" or "z".
+def stage_avatar(
+    clothed: BodyFit, surfaces_m: np.ndarray, correctives: Correctives, layout: UvLayout, texture: np.ndarray, up: str
+) -> StagedAvatar:
+    """Turn a clothed body (see `clothed_rig`) and its motion to Y up. surfaces_m (n, V, 3): its surface in each frame;
+    `up`: the vertical axis of the world, "y" or "z".
 
     The body frame is Z up whatever the world is. With W stage from world, B stage from body and G_j the world transform
     of joint j, the joint's stage transform is W G_j B^-1, and B G_parent^-1 G_j B^-1 relative to its parent.
@@ -74,7 +81,9 @@ def stage_avatar(clothed: BodyFit, layout: UvLayout, texture: np.ndarray, up: st
         frames=np.array(clothed.frames),
         translations_m=local[..., :3, 3],
         quaternions=_continuous_quaternions(local[..., :3, :3]),
-        points_m=clothed.vertices_m().numpy() @ world.T.astype(np.float32),
+        points_m=surfaces_m @ world.T.astype(np.float32),
+        shapes_m=correctives.offsets_m @ body.T.astype(np.float32),
+        shape_weights=correctives.weights,
         texture=texture,
         stage_from_world=world,
     )

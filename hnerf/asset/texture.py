@@ -11,13 +11,13 @@ import xatlas
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
+from hnerf.asset.correctives import step_to_surface
 from hnerf.avatar.avatar import Avatar
 from hnerf.body.descriptor import vertex_normals
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig, pose_vertices
 
 CHART_PADDING_PX = 4
-MAX_STEP_M = 0.03  # skinning error stays below this; a longer distance belongs to another limb
 SUBPIXEL_BITS = 8
 
 log = logging.getLogger("hnerf.asset")
@@ -77,22 +77,27 @@ def rasterise(layout: UvLayout, texture_px: int) -> Texels:
 
 
 @torch.no_grad()
-def bake(avatar: Avatar, clothed: BodyFit, layout: UvLayout, texture_px: int) -> np.ndarray:
-    """Bake a square RGB texture, uint8: each texel's radiance along the inward normal, the median over the poses of
-    `clothed`.
+def field_colours(avatar: Avatar, clothed: BodyFit, texels: Texels) -> np.ndarray:
+    """Return the field's colour at each texel, (N, 3): its radiance along the inward normal, the median over the poses
+    of `clothed`.
 
     Poses of the capture keep the field's conditioning within what it was trained on; the median rejects a pose in which
-    that spot touches another limb. Texels off the charts repeat the nearest chart's border.
+    that spot touches another limb.
     """
-    texels = rasterise(layout, texture_px)
     seen = []
     for frame, theta, root in zip(clothed.frames, clothed.theta, clothed.root, strict=True):
         log.info("texture: %d texels in the pose of frame %d", len(texels.face), frame)
         seen.append(_colours_in_pose(avatar, clothed.rig, texels, theta, root).numpy())
+    return np.median(np.stack(seen), axis=0)
+
+
+def texture_image(texels: Texels, colours: np.ndarray, texture_px: int) -> np.ndarray:
+    """Return a square RGB texture, uint8, of colours (N, 3) in [0, 1]; texels off the charts repeat the nearest chart's
+    border."""
     image = np.zeros((texture_px, texture_px, 3), np.uint8)
     covered = np.zeros((texture_px, texture_px), bool)
     row, column = texels.row.numpy(), texels.column.numpy()
-    image[row, column] = np.round(np.median(np.stack(seen), axis=0).clip(0, 1) * 255)
+    image[row, column] = np.round(colours.clip(0, 1) * 255)
     covered[row, column] = True
     nearest = distance_transform_edt(~covered, return_distances=False, return_indices=True)
     return image[nearest[0], nearest[1]]
@@ -105,7 +110,7 @@ def _colours_in_pose(avatar: Avatar, rig: Rig, texels: Texels, theta: Tensor, ro
     theta, root = theta.to(device), root.to(device)
     normals = vertex_normals(vertices_m, faces)
     # Skinning only approximates the field's surface in this pose: correct it by a Newton step along the normal.
-    height_m = avatar.signed_distance(vertices_m, theta, root).clamp(-MAX_STEP_M, MAX_STEP_M)
+    height_m = step_to_surface(avatar.signed_distance(vertices_m, theta, root))
     corners, weights = faces[texels.face.to(device)], texels.barycentric.to(device)[..., None]
     points_m = ((vertices_m - height_m[:, None] * normals)[corners] * weights).sum(1)
     inward = -torch.nn.functional.normalize((normals[corners] * weights).sum(1), dim=1)

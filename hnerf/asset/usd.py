@@ -33,6 +33,7 @@ def write_skinned(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], f
         mesh.CreateExtentAttr(_extent(avatar.rest_points_m))
         mesh.CreateNormalsAttr(_vec3f(normals_of(avatar.rest_points_m, avatar.faces)))
         _bind_skin(mesh, _define_skeleton(stage, body.GetPath().AppendChild("Skeleton"), avatar), avatar)
+        _bind_shapes(mesh, avatar)
         _package(stage, avatar, path)
 
 
@@ -166,6 +167,10 @@ def _define_skeleton(stage: Usd.Stage, path: Sdf.Path, avatar: StagedAvatar) -> 
     for frame, offsets_m, quaternions in zip(avatar.frames, avatar.translations_m, avatar.quaternions, strict=True):
         translations.Set(_vec3f(offsets_m), float(frame))
         rotations.Set(Vt.QuatfArray([Gf.Quatf(w, x, y, z) for x, y, z, w in quaternions.tolist()]), float(frame))
+    motion.CreateBlendShapesAttr(_shape_names(avatar))
+    weights = motion.CreateBlendShapeWeightsAttr()
+    for frame, values in zip(avatar.frames, avatar.shape_weights, strict=True):
+        weights.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(values, np.float32)), float(frame))
     binding = UsdSkel.BindingAPI.Apply(skeleton.GetPrim())
     binding.CreateAnimationSourceRel().SetTargets([motion.GetPath()])
     return skeleton
@@ -180,6 +185,22 @@ def _bind_skin(mesh: UsdGeom.Mesh, skeleton: UsdSkel.Skeleton, avatar: StagedAva
     indices.Set(Vt.IntArray.FromNumpy(avatar.skin_joints.astype(np.int32).ravel()))
     weights = binding.CreateJointWeightsPrimvar(False, influences)
     weights.Set(Vt.FloatArray.FromNumpy(avatar.skin_weights.astype(np.float32).ravel()))
+
+
+def _bind_shapes(mesh: UsdGeom.Mesh, avatar: StagedAvatar) -> None:
+    """Define the corrective blend shapes below the mesh; the skeleton's motion has their weights."""
+    names, targets = _shape_names(avatar), []
+    for name, offsets_m in zip(names, avatar.shapes_m, strict=True):
+        shape = UsdSkel.BlendShape.Define(mesh.GetPrim().GetStage(), mesh.GetPath().AppendChild(name))
+        shape.CreateOffsetsAttr(_vec3f(offsets_m))
+        targets.append(shape.GetPath())
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    binding.CreateBlendShapesAttr(names)
+    binding.CreateBlendShapeTargetsRel().SetTargets(targets)
+
+
+def _shape_names(avatar: StagedAvatar) -> list[str]:
+    return [f"corrective_{k + 1:02d}" for k in range(len(avatar.shapes_m))]
 
 
 def _package(stage: Usd.Stage, avatar: StagedAvatar, path: Path) -> None:

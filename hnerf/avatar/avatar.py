@@ -8,6 +8,8 @@ from torch import Tensor
 from hnerf.body.fit_result import BodyFit
 from hnerf.geometry.camera import Camera
 
+Gains = dict[str, tuple[float, float, float]]  # exposure of red, green and blue by camera, relative to a gain of 1
+
 
 @dataclass(frozen=True)
 class Rendering:
@@ -27,6 +29,9 @@ class Avatar(Protocol):
 
     @property
     def body(self) -> BodyFit: ...
+
+    @property
+    def gains(self) -> Gains: ...
 
     def without_frames(self) -> "Avatar":
         """Return the same person without what was learned for single frames, as it looks in a pose of no frame."""

@@ -4,7 +4,6 @@ import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +11,8 @@ from pydantic import ValidationError
 from safetensors.torch import load_file
 from torch import Tensor
 
-from hnerf.avatar.avatar import Rendering
+from hnerf.avatar.antialiasing import antialiased
+from hnerf.avatar.avatar import Gains, Rendering
 from hnerf.avatar.model_file import load_field, version_error
 from hnerf.baselines.idr import IdrField
 from hnerf.baselines.nerf import NerfField
@@ -35,9 +35,8 @@ from hnerf.fields.base import Field
 from hnerf.fields.conditions import Conditions
 from hnerf.fields.fast import FastField
 from hnerf.fields.paper import PaperField
+from hnerf.fields.rays import Rays
 from hnerf.geometry.camera import Camera
-
-Gains = dict[str, tuple[float, float, float]]
 
 RAYS_PER_BATCH = 16384
 SAMPLES_PER_BATCH = 1 << 20  # coarse ones, for fields with many per ray: a network keeps some KiB for each
@@ -77,19 +76,22 @@ class TrainedAvatar:
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
         """Render colour, coverage and depth of the person alone."""
         bodies, conditions = self._pose(theta, root)
-        region: Any = self.field.region(bodies, conditions)
+        scene = self.field.scene(bodies, conditions)
         device = bodies.vertices_m.device
-        y, x = np.nonzero(self.field.visible_pixels(camera, bodies.vertices_m[0].cpu().numpy()))
-        origins, directions = camera.rays(np.stack([x, y], 1).astype(np.float64))
-        flat = torch.zeros(camera.height_px * camera.width_px, 5, device=device)
-        index = torch.from_numpy(y * camera.width_px + x).to(device)
-        count = max(1, min(RAYS_PER_BATCH, SAMPLES_PER_BATCH // self.field.samples))
-        for start in range(0, len(x), count):
-            part = slice(start, start + count)
-            o, d = (torch.from_numpy(np.ascontiguousarray(a[part])).float().to(device) for a in (origins, directions))
-            row = torch.zeros(len(o), dtype=torch.long, device=device)
-            flat[index[part]] = self.field.render_rays(bodies, region, o, d, row, conditions)
-        image = flat.view(camera.height_px, camera.width_px, 5)
+        at_once = max(1, min(RAYS_PER_BATCH, SAMPLES_PER_BATCH // self.field.samples))
+
+        def render_rays_at(points_px: np.ndarray) -> Tensor:
+            origins, directions = (rows.astype(np.float32) for rows in camera.rays(points_px.astype(np.float64)))
+            seen = [torch.zeros(0, 5, device=device)]
+            for start in range(0, len(points_px), at_once):
+                part = slice(start, start + at_once)
+                o, d = (torch.from_numpy(rows[part]).to(device) for rows in (origins, directions))
+                row = torch.zeros(len(o), dtype=torch.long, device=device)
+                seen.append(self.field.render_rays(scene, Rays(o, d, row)))
+            return torch.cat(seen)
+
+        visible = self.field.visible_pixels(camera, bodies.vertices_m[0].cpu().numpy())
+        image = antialiased(render_rays_at, visible)
         gain = torch.tensor(self.gains.get(camera.name, (1.0, 1.0, 1.0)), device=device)
         return Rendering((gain * image[..., :3]).clamp(0, 1), image[..., 3], image[..., 4])
 

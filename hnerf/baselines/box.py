@@ -68,8 +68,3 @@ class BoxField(Field):
         larger, within BAND_M. Only its sign and its zero set are meaningful, not its size."""
         threshold = SURFACE_DENSITY_PER_M * self.scale_m
         return BAND_M * (threshold - density) / (threshold + density)
-
-
-def points_on_rays(origins_m: Tensor, directions: Tensor, depths_m: Tensor) -> Tensor:
-    """Return points (..., 3) at depths (...) of rays (..., 3)."""
-    return origins_m + directions * depths_m[..., None]

@@ -8,14 +8,14 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import points_on_rays
 from hnerf.baselines.static import StaticField
-from hnerf.body.canonical import PoseCorrection, PosedBodies
+from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import IdrSettings
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.encoding import positional_encoding
 from hnerf.fields.mlp import SkipMLP
+from hnerf.fields.rays import PosedScene, Rays
 from hnerf.fields.samples import RaySamples
 from hnerf.fields.shell import Boxes, stratified
 
@@ -87,37 +87,25 @@ class IdrField(StaticField):
         layers = [m for a, b in itertools.pairwise(sizes) for m in (nn.Linear(a, b), nn.ReLU())]
         self.rendering = nn.Sequential(*layers, nn.Linear(settings.width, 3), nn.Sigmoid())
 
-    def sample(
-        self,
-        bodies: PosedBodies,
-        region: Boxes,
-        origins_m: Tensor,
-        directions: Tensor,
-        frame: Tensor,
-        conditions: Conditions,
-        draws: Draws,
-        correction: PoseCorrection | None = None,
-    ) -> tuple[RaySamples, Tensor]:
+    def sample(self, scene: PosedScene[Boxes], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:
         """Evaluate rays as Field.sample does, with one sample per ray."""
-        near, far = region.interval(origins_m, directions, frame)
+        near, far = scene.region.interval(rays)
         with torch.no_grad():
             probe_depths = stratified(near, far, draws.jitter)
-            distances = self.distance(points_on_rays(origins_m[:, None], directions[:, None], probe_depths))
-            surface_depths, hit = trace_surface(
-                self.distance, origins_m, directions, near, far, probe_depths, distances
-            )
+            distances = self.distance(rays.points(probe_depths))
+            surface_depths, hit = trace_surface(self.distance, rays, near, far, probe_depths, distances)
             least, at = distances.min(1)
             nearest = torch.where(hit & (least > 0), surface_depths, probe_depths.gather(1, at[:, None])[:, 0])
-        d = self.distance(points_on_rays(origins_m, directions, nearest))[:, None]
+        d = self.distance(rays.points(nearest))[:, None]
         d = torch.where(hit[:, None], d - d.detach() - INSIDE_LOGIT / self.gamma, d)
         pick = torch.nonzero(hit)[:, 0]
-        seen = self._surface_colour(origins_m[pick], directions[pick], surface_depths[pick])
+        seen = self._surface_colour(rays.pick(pick), surface_depths[pick])
         norms = d.new_zeros(0)
         if draws.probe is not None:
-            lower, upper = region.lower_m[frame], region.upper_m[frame]
+            lower, upper = scene.region.lower_m[rays.frame], scene.region.upper_m[rays.frame]
             norms = self._evaluate(lower + (upper - lower) * draws.fine[:, :3])[1].norm(dim=-1)
         alpha = hit[:, None].to(d)
-        colour = torch.zeros_like(origins_m).index_copy(0, pick, seen)[:, None]
+        colour = torch.zeros_like(rays.origins_m).index_copy(0, pick, seen)[:, None]
         inside = torch.ones_like(d)
         return RaySamples(
             alpha, alpha, inside, colour, None, d, torch.zeros_like(d), norms, draws.background
@@ -138,13 +126,13 @@ class IdrField(StaticField):
             (gradient,) = torch.autograd.grad(f.sum(), points_m, create_graph=with_graph)
         return (f, gradient, z) if with_graph else (f.detach(), gradient, z.detach())
 
-    def _surface_colour(self, origins_m: Tensor, directions: Tensor, depths_m: Tensor) -> Tensor:
+    def _surface_colour(self, rays: Rays, depths_m: Tensor) -> Tensor:
         """Return c (N, 3) where rays hit the surface; the point moves with the network's parameters."""
-        points = points_on_rays(origins_m, directions, depths_m)
+        points = rays.points(depths_m)
         if torch.is_grad_enabled():
             f, gradient, _ = self._evaluate(points)
-            points = intersection(points, directions, f, gradient)
-        return self._radiance(points, directions)
+            points = intersection(points, rays.directions, f, gradient)
+        return self._radiance(points, rays.directions)
 
     def _radiance(self, points_m: Tensor, directions: Tensor) -> Tensor:
         """Evaluate the rendering network on (x, n, v, z)."""
@@ -167,38 +155,35 @@ def intersection(points_m: Tensor, directions: Tensor, distance: Tensor, gradien
 
 def trace_surface(
     distance: Callable[[Tensor], Tensor],
-    origins_m: Tensor,
-    directions: Tensor,
+    rays: Rays,
     near: Tensor,
     far: Tensor,
     probe_depths: Tensor,
     distances: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Find where rays (R, 3) first enter the surface between near and far (R,): depths (R,), far where they miss, and
+    """Find where R rays first enter the surface between near and far (R,): depths (R,), far where they miss, and
     (R,) bool whether they hit.
 
     Uses sphere tracing, and the secant method where it did not converge or passed a crossing that distances (R, K) at
     sorted depths `probe_depths` (R, K) reveal (section 3 and the supplement's ray tracing).
     """
-    surface_depths, hit = _sphere_trace(distance, origins_m, directions, near, far)
+    surface_depths, hit = _sphere_trace(distance, rays, near, far)
     enters = (distances[:, :-1] > 0) & (distances[:, 1:] <= 0)
     first = enters.int().argmax(1, keepdim=True)
     overshot = enters.any(1) & ~(hit & (surface_depths <= probe_depths.gather(1, first + 1)[:, 0]))
     pick = torch.nonzero(overshot)[:, 0]
     start, end = (probe_depths.gather(1, first + k)[pick, 0] for k in (0, 1))
     above, below = (distances.gather(1, first + k)[pick, 0] for k in (0, 1))
-    refined = _secant(distance, origins_m[pick], directions[pick], start, end, above, below)
+    refined = _secant(distance, rays.pick(pick), start, end, above, below)
     return torch.where(hit, surface_depths, far).index_copy(0, pick, refined), hit | overshot
 
 
-def _sphere_trace(
-    distance: Callable[[Tensor], Tensor], origins_m: Tensor, directions: Tensor, near: Tensor, far: Tensor
-) -> tuple[Tensor, Tensor]:
+def _sphere_trace(distance: Callable[[Tensor], Tensor], rays: Rays, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
     """Trace spheres from near; return depths (R,), and whether they ended on the surface."""
     depths, hit, moving = near.clone(), torch.zeros_like(near, dtype=torch.bool), near < far
     for _ in range(TRACE_STEPS):
         pick = torch.nonzero(moving)[:, 0]
-        step = distance(points_on_rays(origins_m[pick], directions[pick], depths[pick]))
+        step = distance(rays.pick(pick).points(depths[pick]))
         depths[pick] += step
         within = (depths[pick] >= near[pick]) & (depths[pick] <= far[pick])
         hit[pick] = within & (step.abs() <= CONVERGED_M)
@@ -208,8 +193,7 @@ def _sphere_trace(
 
 def _secant(
     distance: Callable[[Tensor], Tensor],
-    origins_m: Tensor,
-    directions: Tensor,
+    rays: Rays,
     start: Tensor,
     end: Tensor,
     above: Tensor,
@@ -218,7 +202,7 @@ def _secant(
     """Return the root between depths start and end (N,), where the distance is `above` > 0 and `below` <= 0."""
     for _ in range(SECANT_STEPS):
         middle = start + above / (above - below) * (end - start)
-        value = distance(points_on_rays(origins_m, directions, middle))
+        value = distance(rays.points(middle))
         outside = value > 0
         start, above = torch.where(outside, middle, start), torch.where(outside, value, above)
         end, below = torch.where(outside, end, middle), torch.where(outside, below, value)

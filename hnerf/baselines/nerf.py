@@ -3,9 +3,8 @@
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import points_on_rays
 from hnerf.baselines.static import StaticField
-from hnerf.body.canonical import PoseCorrection, PosedBodies
+from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import NerfSettings
 from hnerf.fields.compositing import weights_from_alpha
@@ -13,6 +12,7 @@ from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.encoding import positional_encoding
 from hnerf.fields.mlp import SkipMLP
 from hnerf.fields.paper import sample_pdf
+from hnerf.fields.rays import PosedScene, Rays
 from hnerf.fields.samples import RaySamples
 from hnerf.fields.shell import Boxes, stratified
 
@@ -59,25 +59,15 @@ class NerfField(StaticField):
         super().__init__(body, settings.samples, settings.learning_rate)
         self.coarse, self.fine = NerfNetwork(settings.width), NerfNetwork(settings.width)
 
-    def sample(
-        self,
-        bodies: PosedBodies,
-        region: Boxes,
-        origins_m: Tensor,
-        directions: Tensor,
-        frame: Tensor,
-        conditions: Conditions,
-        draws: Draws,
-        correction: PoseCorrection | None = None,
-    ) -> tuple[RaySamples, Tensor]:
+    def sample(self, scene: PosedScene[Boxes], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:
         """Evaluate rays as Field.sample does: `samples` of the coarse network, then twice as many of the fine one (K =
         3 x samples)."""
-        near, far = region.interval(origins_m, directions, frame)
+        near, far = scene.region.interval(rays)
         first = stratified(near, far, draws.jitter)
-        first_alpha, first_density, first_colour = self._evaluate(self.coarse, origins_m, directions, first, far)
+        first_alpha, first_density, first_colour = self._evaluate(self.coarse, rays, first, far)
         drawn = sample_pdf(first, near, far, weights_from_alpha(first_alpha.detach()), draws.fine)
         every = torch.cat([first, drawn], 1).sort(1).values
-        alpha, density, colour = self._evaluate(self.fine, origins_m, directions, every, far)
+        alpha, density, colour = self._evaluate(self.fine, rays, every, far)
         d = self.pseudo_distance(torch.cat([first_density, density], 1))
         samples = RaySamples(
             alpha=torch.cat([torch.zeros_like(first_alpha), alpha], 1),
@@ -93,12 +83,12 @@ class NerfField(StaticField):
         return samples, torch.cat([first, every], 1)
 
     def _evaluate(
-        self, network: NerfNetwork, origins_m: Tensor, directions: Tensor, depths_m: Tensor, far_m: Tensor
+        self, network: NerfNetwork, rays: Rays, depths_m: Tensor, far_m: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return alpha, density (R, K) and colour (R, K, 3) at depths (R, K); the last sample extends to the end of the
         box."""
-        points = self.scaled(points_on_rays(origins_m[:, None], directions[:, None], depths_m))
-        density, colour = network(points, directions[:, None].expand_as(points))
+        points = self.scaled(rays.points(depths_m))
+        density, colour = network(points, rays.directions[:, None].expand_as(points))
         return self.opacity(density, depths_m, far_m), density, colour
 
     def distance(self, points_m: Tensor) -> Tensor:

@@ -6,10 +6,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import points_on_rays
 from hnerf.baselines.dynamic import DynamicField
 from hnerf.baselines.nerf import NerfNetwork
-from hnerf.body.canonical import PoseCorrection, PosedBodies
+from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import rotation_from_axis_angle
 from hnerf.config import NerfiesSettings
@@ -18,6 +17,7 @@ from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.encoding import positional_encoding
 from hnerf.fields.mlp import SkipMLP
 from hnerf.fields.paper import sample_pdf
+from hnerf.fields.rays import PosedScene, Rays
 from hnerf.fields.samples import RaySamples
 from hnerf.fields.shell import Boxes, stratified
 
@@ -71,27 +71,17 @@ class NerfiesField(DynamicField):
         self.template = NerfNetwork(settings.width)
         self.register_buffer("steps_taken", torch.zeros((), dtype=torch.long))
 
-    def sample(
-        self,
-        bodies: PosedBodies,
-        region: Boxes,
-        origins_m: Tensor,
-        directions: Tensor,
-        frame: Tensor,
-        conditions: Conditions,
-        draws: Draws,
-        correction: PoseCorrection | None = None,
-    ) -> tuple[RaySamples, Tensor]:
+    def sample(self, scene: PosedScene[Boxes], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:
         """Evaluate rays as Field.sample does, at coarse and fine samples together (K = 2 x samples). With draws.probe,
         as in training, the samples include an elastic energy."""
-        near, far = region.interval(origins_m, directions, frame)
+        near, far = scene.region.interval(rays)
         first = stratified(near, far, draws.jitter)
 
         def evaluate(depths_m: Tensor) -> RaySamples:
-            points = points_on_rays(origins_m[:, None], directions[:, None], depths_m)
-            code = self.code(conditions)[frame][:, None].expand(-1, depths_m.shape[1], -1)
+            points = rays.points(depths_m)
+            code = self.code(scene.conditions)[rays.frame][:, None].expand(-1, depths_m.shape[1], -1)
             template = self._deform(self.scaled(points).flatten(0, 1), code.flatten(0, 1)).view_as(points)
-            density, colour = self.template(template, directions[:, None].expand_as(points))
+            density, colour = self.template(template, rays.directions[:, None].expand_as(points))
             return self.to_samples(density, colour, depths_m, far, background=draws.background)
 
         with torch.no_grad():
@@ -102,8 +92,8 @@ class NerfiesField(DynamicField):
             return samples, depths
         weights = weights_from_alpha(samples.alpha.detach())
         pick = sample_index(weights, draws.probe)
-        points = points_on_rays(origins_m, directions, depths.gather(1, pick[:, None])[:, 0])
-        code = self.code(conditions)[frame]
+        points = rays.points(depths.gather(1, pick[:, None])[:, 0])
+        code = self.code(scene.conditions)[rays.frame]
         change = jacobian(lambda x: self._deform(x, code), self.scaled(points))
         return dataclasses.replace(samples, elastic=weights.sum(1) * elastic_energy(change)), depths
 

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import points_on_rays
 from hnerf.baselines.dynamic import DynamicField
 from hnerf.baselines.nerf import DENSITY_GAIN
 from hnerf.baselines.voxels import Voxels
-from hnerf.body.canonical import PoseCorrection, PosedBodies
+from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import NeuralBodySettings
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.encoding import positional_encoding
+from hnerf.fields.rays import PosedScene, Rays
 from hnerf.fields.samples import RaySamples
 from hnerf.fields.shell import Boxes, stratified
 
@@ -114,25 +114,15 @@ class NeuralBodyField(DynamicField):
         diffused = None if self.training else [self.diffusion(self.vertex_codes, v) for v in voxels]
         return NeuralBodyRegion(self.box(bodies), bodies.root, voxels, diffused)
 
-    def sample(
-        self,
-        bodies: PosedBodies,
-        region: NeuralBodyRegion,
-        origins_m: Tensor,
-        directions: Tensor,
-        frame: Tensor,
-        conditions: Conditions,
-        draws: Draws,
-        correction: PoseCorrection | None = None,
-    ) -> tuple[RaySamples, Tensor]:
+    def sample(self, scene: PosedScene[NeuralBodyRegion], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:
         """Evaluate rays as Field.sample does, at `samples` depths in the body's box."""
-        near, far = region.box.interval(origins_m, directions, frame)
+        near, far = scene.region.box.interval(rays)
         depths = stratified(near, far, draws.jitter)
-        points = points_on_rays(origins_m[:, None], directions[:, None], depths).flatten(0, 1)
-        row, view = (x.repeat_interleave(self.samples, 0) for x in (frame, directions))
-        features = self.trunk(self._features(region, points, row))
+        points = rays.points(depths).flatten(0, 1)
+        row, view = (x.repeat_interleave(self.samples, 0) for x in (rays.frame, rays.directions))
+        features = self.trunk(self._features(scene.region, points, row))
         density = self._density(features).view_as(depths)
-        colour = self._colour(features, points, view, row, conditions).view(*depths.shape, 3)
+        colour = self._colour(features, points, view, row, scene.conditions).view(*depths.shape, 3)
         return self.to_samples(density, colour, depths, far, background=draws.background), depths
 
     def _features(self, region: NeuralBodyRegion, points_m: Tensor, row: Tensor) -> Tensor:

@@ -5,7 +5,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -36,6 +35,7 @@ from hnerf.capture.timing import median_step
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
 from hnerf.geometry.silhouette import silhouette
+from hnerf.results import FitReport
 
 log = logging.getLogger("hnerf.fit")
 
@@ -51,12 +51,10 @@ MAX_SINGLE_POSTURE_COST = 1.5
 POOR_IOU, POOR_KEYPOINT_M = 0.75, 0.06  # a frame that is worse than either is flagged
 
 
-def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tuple[BodyFit, dict[str, Any]]:
+def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tuple[BodyFit, FitReport]:
     """Fit the body in every frame of a capture, from training cameras only; without masks, from keypoints alone.
 
-    Returns the fit and a plain report: seconds by stage, the shape, and for each frame the median keypoint residual in
-    px and the silhouette's IoU with the masks (None without), with the frames where these are poor. Raises InputError
-    where keypoints are missing or the person is seen by too few cameras in too many frames.
+    Raises InputError where keypoints are missing or the person is seen by too few cameras in too many frames.
     """
     with threadpool_limits(1):  # tensors are so small that threads cost more time than they save
         seconds: dict[str, float] = {}
@@ -116,7 +114,9 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
                 pose = fit_fingers(pose, palm.views, problem.scale_m, runs(capture), step_s)
         fit = BodyFit(pose.rig.to(dtype=torch.float32), capture.frames, pose.theta.float(), pose.root.float())
         report = _report(capture, masks, observations, pose, fit, seconds)
-        return fit, report | ({"given_poses": given_poses_note(model, capture)} if given_pose else {})
+        if given_pose:
+            report["given_poses"] = given_poses_note(model, capture)
+        return fit, report
 
 
 def initial_pose(capture: Capture, observations: Observations, model: BodyModel) -> Pose:
@@ -224,8 +224,8 @@ def _report(
     pose: Pose,
     fit: BodyFit,
     seconds: dict[str, float],
-) -> dict[str, Any]:
-    """Return plain values that say how good the fit is."""
+) -> FitReport:
+    """Return how good the fit is."""
     residual_px = _keypoint_residuals_px(observations, fit)
     residual_m = residual_px * metres_per_pixel(observations.cameras, pose).mean(0).numpy()
     iou = None if masks is None else _silhouette_iou(capture, masks, fit)

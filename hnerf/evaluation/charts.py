@@ -8,6 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from hnerf.results import ImageScores
+
 COLOURS = ("#1f5fa8", "#e0701a", "#2b8a57", "#b23a48", "#6a4c93", "#8a6d3b", "#11808a", "#9a9a9a", "#d14d9a", "#3d3d3d")
 INK, FAINT = "#25292e", "#d9dde2"
 
@@ -36,7 +38,7 @@ def quality_chart(history: list[dict[str, Any]], path: Path) -> bool:
     return True
 
 
-def frame_chart(per_image: list[dict[str, Any]], path: Path) -> bool:
+def frame_chart(per_image: list[ImageScores], path: Path) -> bool:
     """Draw the PSNR of every frame, one line a camera. Return whether an image was scored and the file was written."""
     series: dict[str, Points] = defaultdict(list)
     for score in per_image:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import json
 import logging
 import time
 from pathlib import Path
@@ -34,6 +33,7 @@ from hnerf.evaluation.views import (
 )
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.progress import tracked
+from hnerf.results import Metrics, write_result
 
 log = logging.getLogger("hnerf.evaluation")
 
@@ -55,7 +55,7 @@ PROTOCOL = (
 )
 
 
-def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) -> dict[str, Any]:
+def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) -> Metrics:
     """Write `renders/`, `meshes/`, `metrics.json`, charts and `report.html` into `out`; return what metrics.json holds.
 
     A score that is not available is null, with a reason beside it.
@@ -72,7 +72,7 @@ def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) 
     wanted = dict.fromkeys(itertools.chain(*shown, *(views[split] for split in views if split not in illustrative)))
     image_seconds = render(avatars, capture, list(wanted), out)
     rendered = time.perf_counter()
-    found: dict[str, Any] = {"protocol": PROTOCOL, "lpips": lpips_availability(), "seconds_per_image": image_seconds}
+    found: Any = {"protocol": PROTOCOL, "lpips": lpips_availability(), "seconds_per_image": image_seconds}
     found |= {split: score_split(capture, split, views[split], truth, out) for split in views}
     found |= {split: unscored(why) for split, why in unavailable.items()}
     true_meshes = {} if truth is None else truth.meshes()
@@ -86,7 +86,7 @@ def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) 
     found["seconds"] = {"rendering": rendered - started, "scores and meshes": time.perf_counter() - rendered}
     write_report(inputs, settings, truth, true_meshes, found, out)
     found["seconds"]["all"] = time.perf_counter() - started
-    (out / "metrics.json").write_text(json.dumps(found, indent=1))
+    write_result(out / "metrics.json", Metrics, found)
     log.info("evaluation took %.0f s, %.0f s of them rendering", found["seconds"]["all"], rendered - started)
     return found
 

@@ -18,6 +18,7 @@ from hnerf.errors import InputError
 from hnerf.evaluation.columns import avatar_for_split, reason_unavailable
 from hnerf.evaluation.images import mean_of, render, score_split, scored_views, unscored
 from hnerf.evaluation.views import PRIMARY_SPLITS
+from hnerf.results import HeldOutCamera, write_result
 
 EACH = "each"
 MIN_CAMERAS = 2  # that must remain for training
@@ -75,7 +76,7 @@ def score_held_out(
     training: Path,
     settings: EvaluationSettings,
     out: Path,
-) -> dict[str, Any]:
+) -> HeldOutCamera:
     """Write `holdout.json`, the scores of the camera `settings.holdout`, and `renders/` into `out`; return what
     holdout.json holds.
 
@@ -87,14 +88,14 @@ def score_held_out(
     others = tuple(name for name in capture.train_cameras if name != camera)
     seen = dataclasses.replace(capture, train_cameras=others, test_cameras=(camera,))
     truth = OwnMasks(seen, masks)
-    found: dict[str, Any] = {"camera": camera, "trained_on": others}
+    found: Any = {"camera": camera, "trained_on": list(others)}
     for split in PRIMARY_SPLITS:
         why = reason_unavailable(split, training)
         views = [] if why else scored_views(seen, split, truth, settings.max_images)
         if views:
             render({split: avatar_for_split(split, avatar, fitted)}, seen, views, out)
         found[split] = unscored(why) if why else score_split(seen, split, views, truth, out)
-    (out / SCORES_FILE).write_text(json.dumps(found, indent=1))
+    write_result(out / SCORES_FILE, HeldOutCamera, found)
     return found
 
 

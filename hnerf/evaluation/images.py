@@ -4,7 +4,7 @@ import dataclasses
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -15,8 +15,9 @@ from hnerf.evaluation import metrics
 from hnerf.evaluation.ground_truth import Truth
 from hnerf.evaluation.views import NOVEL_POSE_SPLITS, View, all_views, sample_views
 from hnerf.progress import tracked
+from hnerf.results import ImageScores, Mean, SplitScores
 
-MEANS = ("psnr", "ssim", "mask_iou", "lpips", "empty_psnr", "one_colour_psnr")  # averaged over a split's images
+MEANS: tuple[Mean, ...] = get_args(Mean)  # averaged over a split's images
 TUNED_ON = (
     "the capture has no test camera, and training cameras saw these frames when their poses were fitted; "
     "evaluation.holdout scores a field that was trained without one of them"
@@ -57,7 +58,7 @@ def rgba(rendering: Rendering) -> np.ndarray:
     return (both.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
-def score_split(capture: Capture, split: str, views: list[View], truth: Truth | None, out: Path) -> dict[str, Any]:
+def score_split(capture: Capture, split: str, views: list[View], truth: Truth | None, out: Path) -> SplitScores:
     """Return the mean image scores of a split's renderings, and those of each image; null with a reason if there are
     none."""
     if not views:
@@ -67,7 +68,8 @@ def score_split(capture: Capture, split: str, views: list[View], truth: Truth | 
         return unscored(TUNED_ON)
     if truth is None or not truth.has_masks:
         return unscored("the capture has no ground-truth masks")
-    rows, references = [], set()
+    rows: list[ImageScores] = []
+    references = set()
     known = views_with_mask(views, truth)
     for view in known:
         mask = truth.mask(view.camera, view.frame)
@@ -76,15 +78,15 @@ def score_split(capture: Capture, split: str, views: list[View], truth: Truth | 
         reference, source = truth.on_black(view.camera, view.frame)
         score = metrics.score_image(read_rgba(view.path(out)), reference, mask)
         references.add(source)
-        row: dict[str, Any] = {"camera": view.camera, "frame": view.frame} | dataclasses.asdict(score)
+        row: Any = {"camera": view.camera, "frame": view.frame} | dataclasses.asdict(score)
         rows.append(row | metrics.trivial_psnr(reference, mask))
     if not rows:
         return unscored(
             "no image of this split shows the person" if known else "no image of this split has a mask to score it by"
         )
-    means = {name: mean_of([row[name] for row in rows]) for name in MEANS}
+    means: Any = {"n": len(rows)} | {name: mean_of([row[name] for row in rows]) for name in MEANS}
     without = {"without_mask": len(views) - len(known), "without_person": len(known) - len(rows)}
-    return {"n": len(rows)} | means | without | {"reference": " and ".join(sorted(references)), "per_image": rows}
+    return means | without | {"reference": " and ".join(sorted(references)), "per_image": rows}
 
 
 def mean_of(values: Sequence[float | None]) -> float | None:
@@ -93,6 +95,7 @@ def mean_of(values: Sequence[float | None]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def unscored(reason: str) -> dict[str, Any]:
+def unscored(reason: str) -> SplitScores:
     """Return the scores of a split that has none, and the reason."""
-    return {"n": 0, "per_image": []} | dict.fromkeys(MEANS) | {"reason": reason}
+    nothing: Any = {"n": 0, "per_image": []}
+    return nothing | dict.fromkeys(MEANS) | {"reason": reason}

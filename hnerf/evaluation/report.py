@@ -30,6 +30,7 @@ from hnerf.evaluation.views import (
     all_views,
     sample_views,
 )
+from hnerf.results import HeldOutCamera, Mean, Metrics, Split
 from hnerf.tables import pick, shown
 
 FIGURES = (  # key in a split's scores, name, unit, format, meaning
@@ -54,7 +55,7 @@ FIGURES = (  # key in a split's scores, name, unit, format, meaning
     ),
     ("geometry.iou", "Volume IoU", "", "{:.3f}", "Overlap of the volumes. 1 is identical."),
 )
-SPLIT_TITLES = {
+SPLIT_TITLES: dict[Split, str] = {
     NOVEL_VIEW: "New views",
     ANIMATED: "New poses, animated",
     POSED: "New poses, posed",
@@ -73,7 +74,7 @@ def write_report(
     settings: EvaluationSettings,
     truth: GroundTruth | None,
     true_meshes: dict[int, trimesh.Trimesh],
-    found: dict[str, Any],
+    found: Metrics,
     out: Path,
 ) -> None:
     """Write `report.html` and its charts into `out`, from the renderings and meshes there and the stages' reports."""
@@ -129,7 +130,7 @@ def image_sizes(inputs: EvaluationInputs) -> str:
     return ", ".join(f"{width} × {height}" for width, height in sorted(sizes))
 
 
-def summary(found: dict[str, Any]) -> list[dict[str, Any]]:
+def summary(found: Metrics) -> list[dict[str, Any]]:
     """Return one row for each metric: name, unit, meaning, and the value for each split ("–" if there is none)."""
     rows = []
     for key, name, unit, form, meaning in FIGURES:
@@ -139,12 +140,12 @@ def summary(found: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def held_out_rows(found: dict[str, Any]) -> list[list[str]]:
+def held_out_rows(found: Metrics) -> list[list[str]]:
     """Return the cells of a table: a row for each held-out camera, and their mean."""
     if found["holdout"] is None:
         return []
-    forms = {"psnr": "{:.2f}", "ssim": "{:.3f}", "mask_iou": "{:.3f}", "lpips": "{:.3f}"}
-    scores = {f"Camera {name}": by_split for name, by_split in found["holdout"]["cameras"].items()}
+    forms: dict[Mean, str] = {"psnr": "{:.2f}", "ssim": "{:.3f}", "mask_iou": "{:.3f}", "lpips": "{:.3f}"}
+    scores: dict[str, Any] = {f"Camera {name}": by_split for name, by_split in found["holdout"]["cameras"].items()}
     return [
         [name, *(shown(by_split[split][key], form) for split in PRIMARY_SPLITS for key, form in forms.items())]
         for name, by_split in (scores | {"Mean": found["holdout"]["mean"]}).items()
@@ -156,7 +157,7 @@ def galleries(
     settings: EvaluationSettings,
     truth: GroundTruth | None,
     true_meshes: dict[int, trimesh.Trimesh],
-    found: dict[str, Any],
+    found: Metrics,
     out: Path,
 ) -> list[Gallery]:
     """Return the galleries of training views, novel views and novel poses that have images, of held-out cameras, and of
@@ -174,7 +175,7 @@ def galleries(
         ]
         if rows:
             made.append(Gallery(*_gallery_text(split, inputs), rows))
-    if inputs.held_out_folders:
+    if found["holdout"]:
         made.append(held_out_gallery(inputs, found["holdout"]["cameras"]))
     return [*made, surface_gallery(inputs, true_meshes, out)]
 
@@ -185,7 +186,7 @@ def _other_columns(view: View, out: Path) -> dict[str, np.ndarray]:
     return {name: read_rgba(path) for name, path in paths.items() if view.split == ANIMATED and path.exists()}
 
 
-def held_out_gallery(inputs: EvaluationInputs, cameras: dict[str, Any]) -> Gallery:
+def held_out_gallery(inputs: EvaluationInputs, cameras: dict[str, HeldOutCamera]) -> Gallery:
     """Return a gallery of the first scored image of each held-out camera, for training frames and for novel poses."""
     rows = []
     for folder, (camera, scores) in zip(inputs.held_out_folders, cameras.items(), strict=True):
@@ -232,7 +233,7 @@ def training_charts(history_path: Path, out: Path) -> list[GalleryPicture]:
     return [GalleryPicture(title, png_uri(path)) for title, (path, exists) in drawn.items() if exists]
 
 
-def frame_charts(found: dict[str, Any], out: Path) -> list[GalleryPicture]:
+def frame_charts(found: Metrics, out: Path) -> list[GalleryPicture]:
     """Draw the PSNR by frame of every split that was scored."""
     paths = {split: out / f"psnr_{split}.png" for split in SPLITS}
     scored = [split for split in SPLITS if charts.frame_chart(found[split]["per_image"], paths[split])]
@@ -244,7 +245,7 @@ def png_uri(path: Path) -> str:
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode() if path.exists() else ""
 
 
-def costs(stages: dict[str, dict[str, Any]], found: dict[str, Any]) -> list[tuple[str, str]]:
+def costs(stages: dict[str, dict[str, Any]], found: Metrics) -> list[tuple[str, str]]:
     """Return what the run cost: seconds of each stage and its parts where recorded, memory, model size, time of one
     image."""
     rows = []
@@ -258,7 +259,7 @@ def costs(stages: dict[str, dict[str, Any]], found: dict[str, Any]) -> list[tupl
     return rows + [(key.replace("_", " ").capitalize(), readable(training[key])) for key in sizes if key in training]
 
 
-def reading_notes(inputs: EvaluationInputs, found: dict[str, Any]) -> list[str]:
+def reading_notes(inputs: EvaluationInputs, found: Metrics) -> list[str]:
     """Return what is missing from the scores, or must be kept in mind when they are read."""
     lines = [f"LPIPS is {found['lpips']}.", *missing_figures(found)]
     for split in PRIMARY_SPLITS:
@@ -278,7 +279,7 @@ def reading_notes(inputs: EvaluationInputs, found: dict[str, Any]) -> list[str]:
     return lines
 
 
-def missing_figures(found: dict[str, Any]) -> list[str]:
+def missing_figures(found: Metrics) -> list[str]:
     """Return one line for each reason why splits have no image scores."""
     by_reason: dict[str, list[str]] = {}
     for split in SPLITS:

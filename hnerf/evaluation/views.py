@@ -2,15 +2,19 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from hnerf.capture.capture import Capture
 from hnerf.evenly_spaced import evenly_spaced
+from hnerf.results import Primary, Split
 
-NOVEL_VIEW = "novel_view"
-ANIMATED, POSED, TRACKED = "novel_pose", "novel_pose_posed", "novel_pose_tracked"  # hnerf/evaluation/columns.py
-NOVEL_POSE_SPLITS = (ANIMATED, POSED, TRACKED)
-SPLITS = (NOVEL_VIEW, *NOVEL_POSE_SPLITS)
-PRIMARY_SPLITS = (NOVEL_VIEW, ANIMATED)  # the splits that are meshed, and that held-out cameras are scored on
+NOVEL_VIEW: Literal["novel_view"] = "novel_view"
+ANIMATED: Literal["novel_pose"] = "novel_pose"  # the columns of hnerf/evaluation/columns.py
+POSED: Literal["novel_pose_posed"] = "novel_pose_posed"
+TRACKED: Literal["novel_pose_tracked"] = "novel_pose_tracked"
+NOVEL_POSE_SPLITS: tuple[Split, ...] = (ANIMATED, POSED, TRACKED)
+SPLITS: tuple[Split, ...] = (NOVEL_VIEW, *NOVEL_POSE_SPLITS)
+PRIMARY_SPLITS: tuple[Primary, ...] = (NOVEL_VIEW, ANIMATED)
 TRAINING_VIEW = "training_view"  # shown in the report, never scored
 
 

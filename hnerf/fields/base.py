@@ -7,11 +7,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hnerf.body.canonical import PoseCorrection, PosedBodies
+from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
 from hnerf.fields.compositing import composite, weights_from_alpha
 from hnerf.fields.conditions import Conditions, Draws
+from hnerf.fields.rays import PosedScene, Rays
 from hnerf.fields.samples import RaySamples
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.reach import within_box
@@ -44,6 +45,10 @@ class Field(nn.Module, ABC):
     def region(self, bodies: PosedBodies, conditions: Conditions) -> Any:
         """Return where rays are sampled, by body row."""
 
+    def scene(self, bodies: PosedBodies, conditions: Conditions) -> PosedScene[Any]:
+        """Return what rays around these bodies are evaluated in."""
+        return PosedScene(bodies, self.region(bodies, conditions), conditions)
+
     def tighten(self, rig: Rig, pose: Tensor) -> None:
         """Shrink the region to what is visible in some poses (n, P)."""
 
@@ -64,18 +69,8 @@ class Field(nn.Module, ABC):
         return []
 
     @abstractmethod
-    def sample(
-        self,
-        bodies: PosedBodies,
-        region: Any,
-        origins_m: Tensor,
-        directions: Tensor,
-        frame: Tensor,
-        conditions: Conditions,
-        draws: Draws,
-        correction: PoseCorrection | None = None,
-    ) -> tuple[RaySamples, Tensor]:
-        """Evaluate radiance and distance along rays (R, 3) of body rows (R,); also return depths (R, K) in metres."""
+    def sample(self, scene: PosedScene[Any], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:
+        """Evaluate radiance and distance along R rays; also return their samples' depths (R, K) in metres."""
 
     def training_samples(self, progress: float) -> int:
         """Return the random numbers needed per ray at a training progress from 0 to 1."""
@@ -84,32 +79,21 @@ class Field(nn.Module, ABC):
     def on_step_end(self) -> None:
         """Update state after a training step; called once per step, whatever the number of its parts."""
 
-    def samples_needed(self, region: Any, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
-        """Return the number of samples that rendering takes along rays (R, 3) of body rows (R,): (R,) long, 0 where
-        nothing is visible."""
-        return torch.full((len(frame),), self.samples, device=frame.device)
+    def samples_needed(self, region: Any, rays: Rays) -> Tensor:
+        """Return the number of samples that rendering takes along R rays: (R,) long, 0 where nothing is visible."""
+        return torch.full((len(rays),), self.samples, device=rays.frame.device)
 
-    def render_rays(
-        self,
-        bodies: PosedBodies,
-        region: Any,
-        origins_m: Tensor,
-        directions: Tensor,
-        frame: Tensor,
-        conditions: Conditions,
-    ) -> Tensor:
-        """Render the person alone along rays (R, 3) of body rows (R,), with opacity b alpha (docs/method.md,
-        "Evaluation protocol").
+    def render_rays(self, scene: PosedScene[Any], rays: Rays) -> Tensor:
+        """Render the person alone along R rays, with opacity b alpha (docs/method.md, "Evaluation protocol").
 
         Returns (R, 5): colour over black, coverage, and depth in metres, 0 where nothing is hit.
         """
-        needed = self.samples_needed(region, origins_m, directions, frame)
-        rendered = origins_m.new_zeros(len(frame), 5)
+        needed = self.samples_needed(scene.region, rays)
+        rendered = rays.origins_m.new_zeros(len(rays), 5)
         for count in needed[needed > 0].unique().tolist():
             pick = torch.nonzero(needed == count)[:, 0]
-            rays = (origins_m[pick], directions[pick], frame[pick])
-            draws = Draws.deterministic(len(pick), count, frame.device)
-            samples, depths = self.sample(bodies, region, *rays, conditions, draws)
+            draws = Draws.deterministic(len(pick), count, rays.frame.device)
+            samples, depths = self.sample(scene, rays.pick(pick), draws)
             weights = weights_from_alpha(samples.in_box * samples.alpha)
             cover = weights.sum(1, keepdim=True)
             depth = (weights * depths).sum(1, keepdim=True) / cover.clamp(min=1e-6)

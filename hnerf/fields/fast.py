@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hnerf.body.canonical import FAR_M, Descriptor, PoseCorrection, PosedBodies
+from hnerf.body.canonical import FAR_M, Descriptor, PosedBodies
 from hnerf.body.descriptor import vertex_normals
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
@@ -16,6 +16,7 @@ from hnerf.fields.compositing import alpha_from_sdf, occupancy, weights_from_alp
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.deformation import FrameDeformation
 from hnerf.fields.grids import CanonicalField
+from hnerf.fields.rays import PosedScene, Rays
 from hnerf.fields.samples import RaySamples
 from hnerf.fields.shell import ShellGrid, surface_points
 from hnerf.geometry.camera import Camera
@@ -131,25 +132,15 @@ class FastField(Field):
         """Return the deformations."""
         return [] if self.deformation is None else [self.deformation.displacement]
 
-    def sample(
-        self,
-        bodies: PosedBodies,
-        region: ShellGrid,
-        origins_m: Tensor,
-        directions: Tensor,
-        frame: Tensor,
-        conditions: Conditions,
-        draws: Draws,
-        correction: PoseCorrection | None = None,
-    ) -> tuple[RaySamples, Tensor]:
-        """Evaluate radiance and distance along rays (R, 3) of body rows (R,); also return depths (R, K) in metres."""
-        depths, met, core = region.sample_rays(origins_m, directions, frame, draws.jitter)
+    def sample(self, scene: PosedScene[ShellGrid], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:
+        """Evaluate rays as Field.sample does, in the shell alone."""
+        depths, met, core = scene.region.sample_rays(rays, draws.jitter)
         hit = torch.nonzero(met)[:, 0]  # only these rays are evaluated; the others see nothing
-        points = origins_m[hit, None] + directions[hit, None] * depths[hit][..., None]
-        row = frame[hit].repeat_interleave(depths.shape[1])
-        skin = bodies.describe(points.flatten(0, 1), row, self.reach_m, correction)
-        described, moved = self._deformed(skin, conditions.frame_row[row])
-        pose = conditions.pose.index_select(0, row)
+        points = rays.pick(hit).points(depths[hit])
+        row = rays.frame[hit].repeat_interleave(depths.shape[1])
+        skin = scene.bodies.describe(points.flatten(0, 1), row, self.reach_m, scene.correction)
+        described, moved = self._deformed(skin, scene.conditions.frame_row[row])
+        pose = scene.conditions.pose.index_select(0, row)
         d = torch.where(described.near, described.d, self.reach_m).view(len(hit), depths.shape[1])
         residual = torch.where(described.near, self._residual(described, pose), 0.0).view_as(d)
         alpha_dot = alpha_from_sdf(d + residual, self.log_sharpness.exp())
@@ -185,10 +176,10 @@ class FastField(Field):
         state."""
         return self.samples if progress >= HALF_SAMPLES_UNTIL else -(-self.samples // 2)
 
-    def samples_needed(self, region: ShellGrid, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
+    def samples_needed(self, region: ShellGrid, rays: Rays) -> Tensor:
         """Return as many samples as the length of a ray's path through the shell requires."""
-        needed = region.path_length_m(origins_m, directions, frame) / SPACING_M
-        steps = torch.tensor(SAMPLE_COUNTS, device=frame.device)
+        needed = region.path_length_m(rays) / SPACING_M
+        steps = torch.tensor(SAMPLE_COUNTS, device=needed.device)
         enough = torch.searchsorted(steps.to(needed), needed).clamp(max=len(SAMPLE_COUNTS) - 1)
         return torch.where(needed > 0, steps[enough], 0)
 

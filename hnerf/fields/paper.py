@@ -5,10 +5,12 @@ the coarse and the fine samples; the fine ones are drawn from the coarse weights
 both.
 """
 
+import dataclasses
+
 import torch
 from torch import Tensor
 
-from hnerf.body.canonical import FAR_M, Descriptor, PoseCorrection, PosedBodies
+from hnerf.body.canonical import FAR_M, Descriptor, PosedBodies
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
 from hnerf.config import PaperFieldSettings
@@ -16,6 +18,7 @@ from hnerf.fields.base import Field
 from hnerf.fields.compositing import alpha_from_density, occupancy, weights_from_alpha
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.mlp import RadianceMLP, ResidualMLP
+from hnerf.fields.rays import PosedScene, Rays
 from hnerf.fields.samples import RaySamples
 from hnerf.fields.shell import Boxes, box_interval, stratified
 
@@ -54,56 +57,29 @@ class PaperField(Field):
         """Return parameter groups for Adam."""
         return [{"params": list(self.parameters()), "lr": self.settings.learning_rate}]
 
-    def sample(
-        self,
-        bodies: PosedBodies,
-        region: Boxes,
-        origins_m: Tensor,
-        directions: Tensor,
-        frame: Tensor,
-        conditions: Conditions,
-        draws: Draws,
-        correction: PoseCorrection | None = None,
-    ) -> tuple[RaySamples, Tensor]:
+    def sample(self, scene: PosedScene[Boxes], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:
         """Evaluate rays as Field.sample does, at coarse and fine samples together (K = 2 x samples)."""
         half_m, inner = self.settings.scene_m, self.settings.box_samples
-        near, far = box_interval(origins_m, directions, self.centre_m - half_m, self.centre_m + half_m)
+        near, far = box_interval(rays, self.centre_m - half_m, self.centre_m + half_m)
         coarse = stratified(near, far, draws.jitter[:, inner:])
         if inner:
-            entry, leave = (t.clamp(near, far) for t in region.interval(origins_m, directions, frame))
+            entry, leave = (t.clamp(near, far) for t in scene.region.interval(rays))
             coarse = torch.cat([coarse, stratified(entry, leave, draws.jitter[:, :inner])], 1).sort(1).values
-        view = directions if draws.view is None else directions + draws.view
-        depths = coarse
         with torch.no_grad():
-            coarse_samples = self._evaluate(
-                bodies, region, origins_m, directions, view, frame, conditions, coarse, draws, None
-            )
+            coarse_samples = self._evaluate(dataclasses.replace(scene, correction=None), rays, draws, coarse)
             fine = sample_pdf(coarse, near, far, weights_from_alpha(coarse_samples.alpha), draws.fine)
             depths = torch.cat([coarse, fine], 1).sort(1).values
-        out = self._evaluate(bodies, region, origins_m, directions, view, frame, conditions, depths, draws, correction)
-        return out, depths
+        return self._evaluate(scene, rays, draws, depths), depths
 
-    def _evaluate(
-        self,
-        bodies: PosedBodies,
-        region: Boxes,
-        origins_m: Tensor,
-        directions: Tensor,
-        view: Tensor,
-        frame: Tensor,
-        conditions: Conditions,
-        depths: Tensor,
-        draws: Draws,
-        correction: PoseCorrection | None,
-    ) -> RaySamples:
-        rays, samples = depths.shape
-        points = (origins_m[:, None] + directions[:, None] * depths[..., None]).flatten(0, 1)
-        row = frame.repeat_interleave(samples)
+    def _evaluate(self, scene: PosedScene[Boxes], rays: Rays, draws: Draws, depths: Tensor) -> RaySamples:
+        region, conditions = scene.region, scene.conditions
+        points = rays.points(depths).flatten(0, 1)
+        row = rays.frame.repeat_interleave(depths.shape[1])
         inside = ((points >= region.lower_m[row]) & (points <= region.upper_m[row])).all(-1)
         train = draws.probe is not None and torch.is_grad_enabled()
         pick = torch.nonzero(inside)[:, 0]
         queried = points[pick].detach().requires_grad_(train)
-        described = bodies.describe(queried, row[pick], FAR_M, correction)
+        described = scene.bodies.describe(queried, row[pick], FAR_M, scene.correction)
         residual_in = self._residual(queried, described, row[pick], conditions)
         d_in = described.d / self.settings.scene_m
         norms = d_in.new_zeros(0)
@@ -114,15 +90,16 @@ class PaperField(Field):
             norms = gradient[0].norm(dim=-1)
         d = points.new_full((len(points),), OUTSIDE_DISTANCE).index_copy(0, pick, d_in)
         residual = torch.zeros_like(d).index_copy(0, pick, residual_in)
-        density, colour = self._radiance(points, described, pick, row, view.repeat_interleave(samples, 0), conditions)
+        view = rays.directions if draws.view is None else rays.directions + draws.view
+        view = view.repeat_interleave(depths.shape[1], 0)
+        density, colour = self._radiance(points, described, pick, row, view, conditions)
         spacing = torch.diff(depths, dim=1, append=depths[:, -1:] + 1e10) / self.settings.scene_m
-        density = density.view(rays, samples)
-        d, residual = d.view(rays, samples), residual.view(rays, samples)
+        density, d, residual = (t.view_as(depths) for t in (density, d, residual))
         return RaySamples(
             alpha=alpha_from_density(density, spacing),
             alpha_dot=occupancy(d + residual, self.gamma),
-            in_box=inside.float().view(rays, samples),
-            colour=colour.view(rays, samples, 3),
+            in_box=inside.float().view_as(depths),
+            colour=colour.view(*depths.shape, 3),
             density=density,
             d=d,
             residual=residual,

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from jaxtyping import Float
 from torch import Tensor
 
 
@@ -9,24 +10,23 @@ from torch import Tensor
 class RaySamples:
     """A field evaluated along a batch of rays.
 
-    (R, K) each: alpha of the radiance field, alpha_dot of the SDF, in_box b, d of the body, residual dd. gradient_norm:
-    |grad d_hat| at some or all samples, any shape. colour (R, K, 3). density (R, K), None where the SDF itself is the
-    density. background (R, 3): the colour behind the samples. elastic: deformation energy of the rays that have one,
-    None without a deformation.
+    alpha of the radiance field, alpha_dot of the SDF, in_box b, d of the body, residual dd. density: None where the SDF
+    itself is the density. gradient_norm: |grad d_hat| at some or all samples. background: the colour behind the
+    samples. elastic: deformation energy of the rays that have one, None without a deformation.
     """
 
-    alpha: Tensor
-    alpha_dot: Tensor
-    in_box: Tensor
-    colour: Tensor
-    density: Tensor | None
-    d: Tensor
-    residual: Tensor
-    gradient_norm: Tensor
-    background: Tensor
-    elastic: Tensor | None = None
+    alpha: Float[Tensor, "R K"]
+    alpha_dot: Float[Tensor, "R K"]
+    in_box: Float[Tensor, "R K"]
+    colour: Float[Tensor, "R K 3"]
+    density: Float[Tensor, "R K"] | None
+    d: Float[Tensor, "R K"]
+    residual: Float[Tensor, "R K"]
+    gradient_norm: Float[Tensor, "..."]
+    background: Float[Tensor, "R 3"]
+    elastic: Float[Tensor, " E"] | None = None
 
     @property
-    def d_hat(self) -> Tensor:
-        """Signed distance to the clothed person, (R, K)."""
+    def d_hat(self) -> Float[Tensor, "R K"]:
+        """Signed distance to the clothed person."""
         return self.d + self.residual

@@ -11,6 +11,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from hnerf.body.canonical import weighted_sum
+from hnerf.fields.rays import Rays
 
 EMPTY, SHELL, SOLID = 0, 1, 2
 SLACK = 3**0.5 / 2  # half a diagonal of a cell, in cells
@@ -51,23 +52,22 @@ class ShellGrid:
             list(threads.map(fill, range(len(cells))))
         return ShellGrid(torch.from_numpy(cells).to(vertices_m.device), lower, cell_m)
 
-    def cell_states(self, origins_m: Tensor, directions: Tensor, depths_m: Tensor, frame: Tensor) -> Tensor:
-        """Return the state of the cells at depths (R, K) along rays (R, 3) in frames (R,): (R, K) uint8. Outside the
-        grid it is that of the outermost cells, which are EMPTY."""
-        origins, directions = (origins_m - self.lower_m[frame]) / self.cell_m, directions / self.cell_m
-        flat = frame[:, None].to(torch.int32 if self.cells.numel() < 2**31 else torch.int64)
+    def cell_states(self, rays: Rays, depths_m: Tensor) -> Tensor:
+        """Return the state of the cells at depths (R, K) along R rays: (R, K) uint8. Outside the grid it is that of the
+        outermost cells, which are EMPTY."""
+        origins = (rays.origins_m - self.lower_m[rays.frame]) / self.cell_m
+        directions = rays.directions / self.cell_m
+        flat = rays.frame[:, None].to(torch.int32 if self.cells.numel() < 2**31 else torch.int64)
         for axis, size in enumerate(self.cells.shape[1:]):
             index = torch.addcmul(origins[:, axis, None], directions[:, axis, None], depths_m)
             flat = flat * size + index.clamp_(0, size - 1).to(flat.dtype)
         return self.cells.flatten().index_select(0, flat.flatten()).view_as(flat)
 
-    def sample_rays(
-        self, origins_m: Tensor, directions: Tensor, frame: Tensor, jitter: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def sample_rays(self, rays: Rays, jitter: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return sorted depths (R, K) in metres, evenly distributed over the shell up to the first solid cell; and two
         masks (R,) bool: whether the ray meets the shell, and whether a solid cell ends it. jitter (R, K) in [0, 1):
         position in each stratum."""
-        edges, cumulative, ends = self._march(origins_m, directions, frame)
+        edges, cumulative, ends = self._march(rays)
         samples = jitter.shape[1]
         strata = torch.arange(samples, device=edges.device, dtype=edges.dtype)
         wanted = (strata + jitter) / samples * cumulative[:, -1:]
@@ -75,19 +75,20 @@ class ShellGrid:
         inside = wanted - cumulative.gather(1, upper - 1)
         return edges.gather(1, upper - 1) + inside * self.cell_m, cumulative[:, -1] > 0, ends
 
-    def path_length_m(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> Tensor:
+    def path_length_m(self, rays: Rays) -> Tensor:
         """Return the path length (R,) in metres over which `sample_rays` distributes the samples."""
-        return self.cell_m * self._march(origins_m, directions, frame)[1][:, -1]
+        return self.cell_m * self._march(rays)[1][:, -1]
 
-    def _march(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _march(self, rays: Rays) -> tuple[Tensor, Tensor, Tensor]:
         """Return depths (R, B + 1) of equal steps through the grid; the number of steps before each that are in the
         shell and before the first solid cell, (R, B + 1); and whether there is a solid cell, (R,) bool."""
-        size_m = self.cell_m * torch.tensor(self.cells.shape[1:], device=origins_m.device)
-        near, far = box_interval(origins_m, directions, self.lower_m[frame], self.lower_m[frame] + size_m)
+        lower_m = self.lower_m[rays.frame]
+        size_m = self.cell_m * torch.tensor(self.cells.shape[1:], device=lower_m.device)
+        near, far = box_interval(rays, lower_m, lower_m + size_m)
         bins = max(1, math.ceil(float((far - near).max()) / self.cell_m))
         edges = near[:, None] + self.cell_m * torch.arange(bins + 1, device=near.device)  # the same for any batch
         middles = (edges[:, 1:] + edges[:, :-1]) / 2
-        state = self.cell_states(origins_m, directions, middles, frame)
+        state = self.cell_states(rays, middles)
         deepest = state.cummax(1).values  # EMPTY < SHELL < SOLID
         weight = ((state == SHELL) & (deepest < SOLID)).float()
         cumulative = torch.cat([torch.zeros_like(near)[:, None], weight.cumsum(1)], 1)
@@ -147,10 +148,9 @@ class Boxes:
         """Return the extents of bodies (n, V, 3), enlarged by a margin."""
         return Boxes(vertices_m.amin(1) - margin_m, vertices_m.amax(1) + margin_m)
 
-    def interval(self, origins_m: Tensor, directions: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
-        """Return entry and exit depths (R,) of rays (R, 3) in the boxes of body rows (R,); equal where the box is
-        missed."""
-        return box_interval(origins_m, directions, self.lower_m[frame], self.upper_m[frame])
+    def interval(self, rays: Rays) -> tuple[Tensor, Tensor]:
+        """Return entry and exit depths (R,) of R rays in the boxes of their bodies; equal where the box is missed."""
+        return box_interval(rays, self.lower_m[rays.frame], self.upper_m[rays.frame])
 
     def signed_distance(self, points_m: Tensor) -> Tensor:
         """Return the signed distance (N,) in metres of points (N, 3) to the first box, negative inside."""
@@ -158,11 +158,11 @@ class Boxes:
         return outside_m.clamp(min=0).norm(dim=-1) + outside_m.amax(-1).clamp(max=0)
 
 
-def box_interval(origins_m: Tensor, directions: Tensor, lower_m: Tensor, upper_m: Tensor) -> tuple[Tensor, Tensor]:
+def box_interval(rays: Rays, lower_m: Tensor, upper_m: Tensor) -> tuple[Tensor, Tensor]:
     """Return entry and exit depths (R,) of rays in axis-aligned boxes (R, 3) by the slab method; equal where the box is
     missed."""
-    inverse = 1 / torch.where(directions.abs() < 1e-9, torch.full_like(directions, 1e-9), directions)
-    a, b = (lower_m - origins_m) * inverse, (upper_m - origins_m) * inverse
+    inverse = 1 / torch.where(rays.directions.abs() < 1e-9, torch.full_like(rays.directions, 1e-9), rays.directions)
+    a, b = (lower_m - rays.origins_m) * inverse, (upper_m - rays.origins_m) * inverse
     near = torch.minimum(a, b).amax(-1).clamp(min=0)
     return near, torch.maximum(torch.maximum(a, b).amin(-1), near)
 

@@ -8,49 +8,48 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 
 @dataclass(frozen=True)
 class Camera:
     """A calibrated pinhole camera: intrinsics in pixels, extrinsics from world to camera in metres.
 
-    K: (3, 3) float64; R: (3, 3) float64 rotation; t_m: (3,) float64; width_px, height_px: image size.
+    R: rotation; width_px, height_px: image size.
     """
 
     name: str
-    K: np.ndarray
-    R: np.ndarray
-    t_m: np.ndarray
+    K: Float[np.ndarray, "3 3"]
+    R: Float[np.ndarray, "3 3"]
+    t_m: Float[np.ndarray, "3"]
     width_px: int
     height_px: int
 
     @property
-    def centre_m(self) -> np.ndarray:
-        """Return the camera centre in the world, (3,)."""
+    def centre_m(self) -> Float[np.ndarray, "3"]:
+        """Return the camera centre in the world."""
         return -self.R.T @ self.t_m
 
     @property
-    def forward(self) -> np.ndarray:
-        """Return the unit viewing direction in the world, (3,)."""
+    def forward(self) -> Float[np.ndarray, "3"]:
+        """Return the unit viewing direction in the world."""
         return self.R[2]
 
     @property
-    def projection(self) -> np.ndarray:
-        """Return the projection matrix P = K [R | t], (3, 4)."""
+    def projection(self) -> Float[np.ndarray, "3 4"]:
+        """Return the projection matrix P = K [R | t]."""
         return self.K @ np.hstack([self.R, self.t_m[:, None]])
 
-    def project(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project world points (..., 3) to pixels (..., 2) and depths (...,) in metres; a depth <= 0 lies behind the
-        camera."""
+    def project(self, points_m: Float[np.ndarray, "*S 3"]) -> tuple[Float[np.ndarray, "*S 2"], Float[np.ndarray, "*S"]]:
+        """Project world points to pixels and depths in metres; a depth <= 0 lies behind the camera."""
         x = points_m @ self.R.T + self.t_m
         depth_m = x[..., 2]
         uv = x @ self.K.T
         with np.errstate(divide="ignore", invalid="ignore"):
             return uv[..., :2] / uv[..., 2:], depth_m
 
-    def rays(self, pixels_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rays through pixels (..., 2), given as (x, y): origins and unit directions in the world, both
-        (..., 3)."""
+    def rays(self, pixels_px: Float[np.ndarray, "*S 2"]) -> tuple[Float[np.ndarray, "*S 3"], Float[np.ndarray, "*S 3"]]:
+        """Return the rays through pixels, given as (x, y): origins and unit directions in the world."""
         homogeneous = np.concatenate([pixels_px, np.ones_like(pixels_px[..., :1])], axis=-1)
         directions = homogeneous @ np.linalg.inv(self.K).T @ self.R
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)

@@ -5,23 +5,24 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float
 
 from hnerf.geometry.camera import Camera
 
 NEAREST_PERCENT = 1  # percentile of vertex depths that sets the radius: one finger does not widen all discs
 FARTHEST_PX = 1e5  # corners are clipped to it, as OpenCV fills polygons of small integers
-ReachablePixels = Callable[[Camera, np.ndarray], np.ndarray]
-"""Returns which pixels (H, W) of a camera can show any part of a body with vertices (V, 3)."""
+ReachablePixels = Callable[[Camera, Float[np.ndarray, "V 3"]], Bool[np.ndarray, "H W"]]
+"""Returns which pixels of a camera can show any part of a body with these vertices."""
 
 
-def everywhere(camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
-    """Return all pixels of the camera, (H, W) bool: nothing is excluded."""
+def everywhere(camera: Camera, vertices_m: Float[np.ndarray, "V 3"]) -> Bool[np.ndarray, "H W"]:
+    """Return all pixels of the camera: nothing is excluded."""
     return np.ones((camera.height_px, camera.width_px), bool)
 
 
-def within_box(camera: Camera, vertices_m: np.ndarray, margin_m: float) -> np.ndarray:
-    """Return the pixels, (H, W) bool, whose rays meet the bounding box of the body (V, 3) with a margin; all pixels if
-    part of the box lies behind the camera."""
+def within_box(camera: Camera, vertices_m: Float[np.ndarray, "V 3"], margin_m: float) -> Bool[np.ndarray, "H W"]:
+    """Return the pixels whose rays meet the bounding box of the body with a margin; all pixels if part of the box lies
+    behind the camera."""
     lower_m, upper_m = vertices_m.min(0) - margin_m, vertices_m.max(0) + margin_m
     corners_px, depth_m = camera.project(np.array(list(itertools.product(*zip(lower_m, upper_m, strict=True)))))
     if depth_m.min() <= 0:
@@ -31,8 +32,8 @@ def within_box(camera: Camera, vertices_m: np.ndarray, margin_m: float) -> np.nd
     return cv2.fillConvexPoly(met, outline, 1) > 0
 
 
-def within_reach(camera: Camera, vertices_m: np.ndarray, reach_m: float) -> np.ndarray:
-    """Return the pixels, (H, W) bool, whose rays pass within about `reach_m` of the body (V, 3).
+def within_reach(camera: Camera, vertices_m: Float[np.ndarray, "V 3"], reach_m: float) -> Bool[np.ndarray, "H W"]:
+    """Return the pixels whose rays pass within about `reach_m` of the body.
 
     Each vertex in front of the camera, in the image or beside it, covers a disc of the radius that the nearest vertices
     need.

@@ -3,6 +3,7 @@
 from itertools import combinations
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 CHUNK = 1 << 14  # points triangulated at once, to bound memory
 MIN_INLIER_PX = 3.0
@@ -10,18 +11,17 @@ DAMPING = 1e-12  # of the normal equations' trace: keeps them solvable for paral
 
 
 def triangulate(
-    projections: np.ndarray, keypoints: np.ndarray, inlier_px: float | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    projections: Float[np.ndarray, "C 3 4"], keypoints: Float[np.ndarray, "C K 3"], inlier_px: float | None = None
+) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "C K"], Bool[np.ndarray, "C K"]]:
     """Triangulate points from several views, leaving outlier views out.
 
-    projections (C, 3, 4); keypoints (C, K, 3) x_px, y_px, confidence (0: unseen). For each point, every pair of views
+    keypoints: x_px, y_px, confidence (0: unseen). For each point, every pair of views
     is solved linearly; the solution nearest to all views (confidence-weighted L1) decides which views are inliers. The
     inliers are then solved together by the iteratively re-weighted linear method (Hartley and Sturm 1997). `inlier_px`
     defaults to 4 times the median distance of the views that took no part in a pair's solution: it grows with noise and
     calibration error.
 
-    Returns points_m (K, 3), NaN with fewer than two inlier views; residuals_px (C, K), NaN where unseen or without a
-    point; inliers (C, K) bool.
+    Returns points_m, NaN with fewer than two inlier views; residuals_px, NaN where unseen or without a point; inliers.
     """
     confidence = confidence_of(keypoints)
     best = [_best_pair(projections, keypoints[:, i : i + CHUNK], confidence[:, i : i + CHUNK])
@@ -42,8 +42,8 @@ def triangulate(
     return points_m, residuals_px, inliers & np.isfinite(residuals_px)
 
 
-def confidence_of(keypoints: np.ndarray) -> np.ndarray:
-    """Return the confidence of keypoints (..., 3), shape (...,); 0 where any of the three numbers is not finite."""
+def confidence_of(keypoints: Float[np.ndarray, "*S 3"]) -> Float[np.ndarray, "*S"]:
+    """Return the confidence of keypoints; 0 where any of the three numbers is not finite."""
     return np.where(np.isfinite(keypoints).all(-1), keypoints[..., 2], 0.0)
 
 
@@ -65,11 +65,13 @@ def _best_pair(projections: np.ndarray, keypoints: np.ndarray, confidence: np.nd
     return points_m, members
 
 
-def solve_points(projections: np.ndarray, keypoints: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Triangulate linearly with weights (C, K), re-weighted once by depth so that pixel distances are minimised.
+def solve_points(
+    projections: Float[np.ndarray, "C 3 4"], keypoints: Float[np.ndarray, "C K 3"], weights: Float[np.ndarray, "C K"]
+) -> Float[np.ndarray, "K 3"]:
+    """Triangulate linearly with weights, re-weighted once by depth so that pixel distances are minimised.
 
-    Returns (K, 3), NaN with fewer than two views. Hartley and Sturm 1997, section 5.2, "Iterative-LS": inhomogeneous
-    normal equations, which do not depend on where the origin is.
+    Returns points in metres, NaN with fewer than two views. Hartley and Sturm 1997, section 5.2, "Iterative-LS":
+    inhomogeneous normal equations, which do not depend on where the origin is.
     """
     rows = projections[:, None, 2:] * np.nan_to_num(keypoints)[..., :2, None] - projections[:, None, :2]  # (C, K, 2, 4)
     focal = np.linalg.norm(projections[:, :2, :3], axis=-1).mean(1)
@@ -86,8 +88,10 @@ def solve_points(projections: np.ndarray, keypoints: np.ndarray, weights: np.nda
     return points_m
 
 
-def reprojection_px(projections: np.ndarray, points_m: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
-    """Return the image distance of points (K, 3) to keypoints (C, K, 3), (C, K); NaN behind a camera."""
+def reprojection_px(
+    projections: Float[np.ndarray, "C 3 4"], points_m: Float[np.ndarray, "K 3"], keypoints: Float[np.ndarray, "C K 3"]
+) -> Float[np.ndarray, "C K"]:
+    """Return the image distance of points to keypoints; NaN behind a camera."""
     x = np.einsum("cij,kj->cki", projections, np.concatenate([points_m, np.ones_like(points_m[:, :1])], 1))
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = np.linalg.norm(x[..., :2] / x[..., 2:] - keypoints[..., :2], axis=-1)

@@ -3,12 +3,13 @@
 import os
 import platform
 from pathlib import Path
-from typing import Any
 
 import torch
 
+from hnerf.results import Machine
 
-def machine() -> dict[str, Any]:
+
+def machine() -> Machine:
     """Return the processor, its cores and how many of them torch uses, the GPU (None without one), and the versions
     that speed depends on."""
     cpuinfo = Path("/proc/cpuinfo")
@@ -24,7 +25,7 @@ def machine() -> dict[str, Any]:
     }
 
 
-def describe_machine(found: dict[str, Any]) -> str:
+def describe_machine(found: Machine) -> str:
     """Describe a result of `machine` as part of a sentence."""
     cores, gpu = f"{found['threads']} of {found['cores']} cores", found["gpu"] or "no GPU"
     return f"{found['cpu']}, {cores}, {gpu}, torch {found['torch']}, Python {found['python']}"

@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 import trimesh
 
-from hnerf.avatar.trained import Gains
+from hnerf.avatar.avatar import Gains
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hnerf.avatar.trained import Gains
+from hnerf.avatar.avatar import Gains
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks

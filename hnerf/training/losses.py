@@ -5,6 +5,7 @@ change the balance; sums over a ray's samples stay sums. The weights in the pres
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import relu, softplus
 
@@ -18,39 +19,38 @@ EPSILON = 1e-6  # keeps logarithms finite
 
 @dataclass(frozen=True)
 class Target:
-    """Target of a batch. colour (R, 3) observed; person M (R,) float; weight (R,): 0 excludes a ray from the colour
-    losses."""
+    """Target of a batch: the observed colour; person M; weight: 0 excludes a ray from the colour losses."""
 
-    colour: Tensor
-    person: Tensor
-    weight: Tensor
+    colour: Float[Tensor, "R 3"]
+    person: Float[Tensor, " R"]
+    weight: Float[Tensor, " R"]
 
 
-def pixel_colour(alpha: Tensor, samples: RaySamples) -> Tensor:
-    """Return the composited colour (R, 3) for one choice of opacity, over the background."""
+def pixel_colour(alpha: Float[Tensor, "R K"], samples: RaySamples) -> Float[Tensor, "R 3"]:
+    """Return the composited colour for one choice of opacity, over the background."""
     weights = weights_from_alpha(alpha)
     return composite(weights, samples.colour) + (1 - weights.sum(1, keepdim=True)) * samples.background
 
 
-def reconstruction(samples: RaySamples, target: Target) -> Tensor:
+def reconstruction(samples: RaySamples, target: Target) -> Float[Tensor, ""]:
     """Return rec: |C_gt - C|_1."""
     return (target.weight * (target.colour - pixel_colour(samples.alpha, samples)).abs().sum(1)).mean()
 
 
-def mask(samples: RaySamples, target: Target) -> Tensor:
+def mask(samples: RaySamples, target: Target) -> Float[Tensor, ""]:
     """Return mask: |M (C_gt - C~)|_1, C~ composited with b alpha."""
     error = (target.colour - pixel_colour(samples.in_box * samples.alpha, samples)).abs().sum(1)
     return (target.weight * target.person * error).mean()
 
 
-def blend(samples: RaySamples, target: Target, eta: float) -> Tensor:
+def blend(samples: RaySamples, target: Target, eta: float) -> Float[Tensor, ""]:
     """Return blend: |M (C_gt - C^)|_1 + eta |(1 - M)(C_gt - C^)|_1, C^ composited with b alpha_dot + (1 - b) alpha."""
     alpha = samples.in_box * samples.alpha_dot + (1 - samples.in_box) * samples.alpha
     error = (target.colour - pixel_colour(alpha, samples)).abs().sum(1)
     return (target.weight * (target.person + eta * (1 - target.person)) * error).mean()
 
 
-def geometry(samples: RaySamples, threshold: float, steepness: float, roles: GeometryRoles) -> Tensor:
+def geometry(samples: RaySamples, threshold: float, steepness: float, roles: GeometryRoles) -> Float[Tensor, ""]:
     """Return geom: sum_i b_i BCE(sigmoid(lambda (sigma_i - sigma_h)), alpha_dot_i); 0 where the SDF is the density.
 
     roles: "print" takes the density as the label, because the paper's seg has the label first, and moves both; with
@@ -63,8 +63,8 @@ def geometry(samples: RaySamples, threshold: float, steepness: float, roles: Geo
     return (samples.in_box * _cross_entropy(predicted.clamp(EPSILON, 1 - EPSILON), label)).sum(1).mean()
 
 
-def segmentation(distance: Tensor, target: Target, sharpness: float) -> Tensor:
-    """Return seg or fit: BCE(M, sigmoid(-gamma min_i d_i)) of distances (R, K): d_hat for seg, the body's d for fit. It
+def segmentation(distance: Float[Tensor, "R K"], target: Target, sharpness: float) -> Float[Tensor, ""]:
+    """Return seg or fit: BCE(M, sigmoid(-gamma min_i d_i)) of distances: d_hat for seg, the body's d for fit. It
     is computed from the logit, so that a person's pixel attracts a body however far away."""
     logit = -sharpness * distance.amin(1)
     return (softplus(logit) - target.person * logit).mean()
@@ -76,23 +76,23 @@ def _cross_entropy(predicted: Tensor, target: Tensor) -> Tensor:
     return -(target * predicted.log() + (1 - target) * (1 - predicted).log())
 
 
-def eikonal(samples: RaySamples) -> Tensor:
+def eikonal(samples: RaySamples) -> Float[Tensor, ""]:
     """Return eik: sum_i b_i (|grad_x d_hat| - 1)^2, given the norms inside the box."""
     return ((samples.gradient_norm - 1) ** 2).sum() / len(samples.d)
 
 
-def residual(samples: RaySamples) -> Tensor:
+def residual(samples: RaySamples) -> Float[Tensor, ""]:
     """Return reg: |relu(dd)|_1. Clothing lies outside the skin, where d_hat < d."""
     return relu(samples.residual).sum(1).mean()
 
 
-def increment(correction: PoseCorrection) -> Tensor:
+def increment(correction: PoseCorrection) -> Float[Tensor, ""]:
     """Return inc: |dbeta|_2 + mean_t |dtheta_t|_2."""
     turn, move_m, shape = correction.totals()
     return _norm(shape) + _norm(torch.cat([turn.flatten(1), move_m], 1)).mean()
 
 
-def elastic(samples: RaySamples) -> Tensor:
+def elastic(samples: RaySamples) -> Float[Tensor, ""]:
     """Return the elastic energy of the deformation, mean over rays; 0 without a deformation."""
     energy = samples.d.new_zeros(1) if samples.elastic is None else samples.elastic
     return energy.sum() / len(samples.d)

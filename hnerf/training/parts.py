@@ -7,16 +7,17 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from hnerf.fields.conditions import Conditions, Draws, shard
+from hnerf.fields.conditions import Draws, shard
+from hnerf.fields.rays import PosedScene
 from hnerf.training.auto_settings import Decision
 from hnerf.training.distributed import Distributed
-from hnerf.training.pixels import Rays
-from hnerf.training.step import PosedScene
+from hnerf.training.pixels import PixelRays
 
 CPU_PARTS = 2  # side by side on a CPU, because operations are too small to share cores; a sum of two is deterministic
 USABLE_SHARE = 0.8  # of the free memory, for fragmentation and differences between rays
@@ -37,13 +38,7 @@ class Parts:
             self.pool = ThreadPoolExecutor(count, "part", torch.set_num_threads, (threads,))
 
     def backward(
-        self,
-        module: nn.Module,
-        scene: PosedScene,
-        rays: Rays,
-        conditions: Conditions,
-        draws: Draws,
-        processes: Distributed,
+        self, module: nn.Module, scene: PosedScene[Any], rays: PixelRays, draws: Draws, processes: Distributed
     ) -> dict[str, Tensor]:
         """Add the gradients of this process's share of a joint batch to the parameters' gradients; return the losses by
         name.
@@ -56,10 +51,10 @@ class Parts:
         def of_part(part: int) -> dict[str, Tensor]:
             mine = processes.rank * n + part, world_size * n
             part_rays = shard(rays, *mine)
-            weight = world_size * len(part_rays.frame) / len(rays.frame)
+            weight = world_size * len(part_rays) / len(rays)
             waiting = module if part < n - 1 and isinstance(module, DistributedDataParallel) else None
             with waiting.no_sync() if waiting else nullcontext():
-                terms = module(scene, part_rays, conditions, shard(draws, *mine))
+                terms = module(scene, part_rays, shard(draws, *mine))
                 (weight * torch.stack(list(terms.values())).sum()).backward()
             return {name: weight * term.detach() for name, term in terms.items()}
 

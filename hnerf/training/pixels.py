@@ -5,18 +5,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from hnerf.fields.rays import Rays
+
 EDGE_SHARE = 1 / 3  # of the rays: half of the error is at edges, mostly in hands and feet, which are little else
 
 
 @dataclass(frozen=True)
-class Rays:
-    """A batch of rays. origins_m, directions (R, 3); frame (R,): row of the body fit; colour (R, 3) in [0, 1]; person
-    (R,) bool; edge (R,) bool: near the mask's outline; plate (R, 3): the clean plate's colour with the shadows on it,
-    or None."""
+class PixelRays(Rays):
+    """Rays of pixels. colour (R, 3) in [0, 1]; person (R,) bool; edge (R,) bool: near the mask's outline; plate (R, 3):
+    the clean plate's colour with the shadows on it, or None."""
 
-    origins_m: Tensor
-    directions: Tensor
-    frame: Tensor
     colour: Tensor
     person: Tensor
     edge: Tensor
@@ -49,7 +47,7 @@ class Pixels:
 
     def draw(
         self, frames: Tensor, rays_per_frame: int, generator: torch.Generator, edge_share: float = EDGE_SHARE
-    ) -> Rays:
+    ) -> PixelRays:
         """Draw `rays_per_frame` pixels of each of the frames (rows) with replacement, a share `edge_share` of them at
         edges, to the device of the frames and the generator."""
         shape = len(frames), rays_per_frame
@@ -59,7 +57,7 @@ class Pixels:
         pick = torch.cat([mixed, _within(self.starts, rows, unit[:, count:])], 1).flatten()
         origins_m, directions = self.rays(*self.cameras_and_xy(pick))
         device = frames.device
-        return Rays(
+        return PixelRays(
             origins_m.to(device),
             directions.to(device),
             frames.repeat_interleave(rays_per_frame),

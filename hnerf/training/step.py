@@ -1,30 +1,23 @@
 """One optimisation step: from a joint batch of rays to the gradients of its losses."""
 
-from dataclasses import dataclass
+import dataclasses
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from hnerf.body.canonical import PoseCorrection, PosedBodies
+from hnerf.body.canonical import PoseCorrection
 from hnerf.config import TrainingSettings
 from hnerf.fields.base import Field
-from hnerf.fields.conditions import Conditions, Draws
+from hnerf.fields.conditions import Draws
+from hnerf.fields.rays import PosedScene
 from hnerf.training import losses
 from hnerf.training.distributed import Distributed
-from hnerf.training.pixels import Rays
+from hnerf.training.pixels import PixelRays
 
 
 class TrainingError(RuntimeError):
     """Training that cannot go on; the message names the likely cause."""
-
-
-@dataclass
-class PosedScene:
-    """Posed bodies and the sampling region of their rays, constant within a step."""
-
-    bodies: PosedBodies
-    region: Any
 
 
 class Objective(nn.Module):
@@ -34,12 +27,10 @@ class Objective(nn.Module):
         super().__init__()
         self.field, self.correction, self.settings = field, correction, settings
 
-    def forward(self, scene: PosedScene, rays: Rays, conditions: Conditions, draws: Draws) -> dict[str, Tensor]:
+    def forward(self, scene: PosedScene[Any], rays: PixelRays, draws: Draws) -> dict[str, Tensor]:
         """Return the weighted losses by name; their sum is minimised."""
         target, draws = make_target(rays, draws, self.field.models_background)
-        samples, _ = self.field.sample(
-            scene.bodies, scene.region, rays.origins_m, rays.directions, rays.frame, conditions, draws, self.correction
-        )
+        samples, _ = self.field.sample(dataclasses.replace(scene, correction=self.correction), rays, draws)
         s = self.settings.losses
         terms = {
             "reconstruction": lambda: losses.reconstruction(samples, target),
@@ -56,7 +47,7 @@ class Objective(nn.Module):
         return {name: getattr(s, name) * term() for name, term in terms.items() if getattr(s, name)}
 
 
-def make_target(rays: Rays, draws: Draws, models_background: bool) -> tuple[losses.Target, Draws]:
+def make_target(rays: PixelRays, draws: Draws, models_background: bool) -> tuple[losses.Target, Draws]:
     """Return the target of the rays, and the draws with the background behind their samples.
 
     A field that models the background is compared with the photograph. Any other field is composited over the clean

@@ -26,6 +26,7 @@ from hnerf.config import TrainingSettings
 from hnerf.fields.conditions import Conditions, Draws, concatenate, shard
 from hnerf.fields.samples import RaySamples
 from hnerf.progress import report
+from hnerf.results import TrainingReport, write_result
 from hnerf.training.auto_settings import SceneStatistics, decide
 from hnerf.training.checkpoint import load_checkpoint, save_checkpoint
 from hnerf.training.distributed import Distributed
@@ -33,8 +34,8 @@ from hnerf.training.exposure import camera_gains
 from hnerf.training.gather import gather_pixels
 from hnerf.training.losses import pixel_colour
 from hnerf.training.parts import decide_parts
-from hnerf.training.pixels import EDGE_SHARE, Rays
-from hnerf.training.step import Objective, PosedScene, TrainingError, not_finite
+from hnerf.training.pixels import EDGE_SHARE, PixelRays
+from hnerf.training.step import Objective, TrainingError, not_finite
 
 logger = logging.getLogger("hnerf.training")
 
@@ -111,11 +112,11 @@ class Trainer:
     def _set_poses(self, bodies: PosedBodies) -> None:
         """Use the bodies' current poses for the coming steps."""
         frame_rows = torch.arange(len(bodies.theta), device=bodies.theta.device)
-        self.conditions = Conditions.of(bodies.rig, bodies.theta, bodies.root, frame_rows, self.settings.field.scene_m)
-        self.scene = PosedScene(bodies, self.field.region(bodies, self.conditions))
+        conditions = Conditions.of(bodies.rig, bodies.theta, bodies.root, frame_rows, self.settings.field.scene_m)
+        self.scene = self.field.scene(bodies, conditions)
 
-    def run(self) -> dict[str, Any]:
-        """Train to the end, write the subject's files and return the report."""
+    def run(self) -> TrainingReport | None:
+        """Train to the end and write the subject's files; return the report, None in a process that writes none."""
         module: torch.nn.Module = self.objective
         if self.processes.world_size > 1:
             devices = [self.processes.device] if self.processes.device.type == "cuda" else None
@@ -157,13 +158,13 @@ class Trainer:
         if self.processes.is_main:
             (self.out / "history.jsonl").write_text("".join(json.dumps(row) + "\n" for row in self.history))
         self._require_surface()
-        return self._finish() if self.processes.is_main else {}
+        return self._finish() if self.processes.is_main else None
 
     def _absorb(self) -> None:
         self.scene.bodies.absorb(self.objective.correction, self.train_rows if self.settings.one_posture else None)
         if self.step <= self.field_steps:
             self._average_over_frames()
-            self.field.tighten(self.scene.bodies.rig, self.conditions.pose[self.train_rows[::POSE_STRIDE]])
+            self.field.tighten(self.scene.bodies.rig, self.scene.conditions.pose[self.train_rows[::POSE_STRIDE]])
         self._set_poses(self.scene.bodies)
 
     def _average_over_frames(self) -> None:
@@ -192,11 +193,11 @@ class Trainer:
         count = s.frames_per_step * s.rays_per_frame // len(pick)
         rays = self.pixels.draw(rows[pick], count, self.generator, self.edge_share)
         samples = self.field.training_samples(self._progress())
-        draws = Draws.random(len(rays.frame), samples, s.noise, self.generator)
-        conditions = self.conditions.with_noise(s.noise, self.generator)
+        draws = Draws.random(len(rays), samples, s.noise, self.generator)
+        scene = self.scene.with_noise(s.noise, self.generator)
         self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
-        terms = self.parts.backward(module, self.scene, rays, conditions, draws, self.processes)
+        terms = self.parts.backward(module, scene, rays, draws, self.processes)
         self.field.on_step_end()
         if self.step >= self.field_steps:  # the loss that pulls all frames to the fit must not move finished frames
             for pose in (self.objective.correction.turn, self.objective.correction.move_m):
@@ -223,9 +224,9 @@ class Trainer:
         generator = torch.Generator(self.processes.device).manual_seed(self.settings.seed)
         rows, noise = self.train_rows[: self.settings.frames_per_step][:TRIAL_FRAMES], self.settings.noise
         rays = self.pixels.draw(rows, about // len(rows), generator, self.edge_share)
-        draws = Draws.random(len(rays.frame), self.field.training_samples(1.0), noise, generator)
-        terms = self.objective(self.scene, rays, self.conditions.with_noise(noise, generator), draws)
-        return len(rays.frame), torch.stack(list(terms.values())).sum()
+        draws = Draws.random(len(rays), self.field.training_samples(1.0), noise, generator)
+        terms = self.objective(self.scene.with_noise(noise, generator), rays, draws)
+        return len(rays), torch.stack(list(terms.values())).sum()
 
     def _progress(self) -> float:
         """Return the progress of the phase, 0 to 1."""
@@ -262,16 +263,15 @@ class Trainer:
         return float(-10 * torch.log10((error**2).mean()))
 
     @torch.no_grad()
-    def _sample_fixed_rays(self, rows: Tensor, count: int) -> tuple[Rays, RaySamples]:
+    def _sample_fixed_rays(self, rows: Tensor, count: int) -> tuple[PixelRays, RaySamples]:
         """Return rays at some frames, the same ones on each call, and their samples as for rendering, with `count`
         random numbers per ray."""
         generator = torch.Generator(self.processes.device).manual_seed(self.settings.seed)
         rays = self.pixels.draw(rows, HELD_OUT_RAYS // len(rows) + 1, generator)
-        parts, found = math.ceil(len(rays.frame) / self.parts.most_rays), []
+        parts, found = math.ceil(len(rays) / self.parts.most_rays), []
         for part in (shard(rays, k, parts) for k in range(parts)):
-            draws = Draws.deterministic(len(part.frame), count, self.processes.device)
-            where = part.origins_m, part.directions, part.frame
-            found.append(self.field.sample(self.scene.bodies, self.scene.region, *where, self.conditions, draws)[0])
+            draws = Draws.deterministic(len(part), count, self.processes.device)
+            found.append(self.field.sample(self.scene, part, draws)[0])
         return rays, concatenate(found)
 
     def _require_surface(self) -> None:
@@ -338,11 +338,11 @@ class Trainer:
         settings |= {"gains": self.gains, "seconds": self.seconds}
         (folder / "settings.json").write_text(json.dumps(settings, indent=1))
 
-    def _finish(self) -> dict[str, Any]:
+    def _finish(self) -> TrainingReport:
         out = self.out
         self._save(out)
         turn, move_m, _ = self.objective.correction.totals()
-        report = {
+        report: TrainingReport = {
             "device": _device_name(self.processes.device),
             "processes": self.processes.world_size,
             "setup_seconds": self.setup_seconds,
@@ -354,9 +354,11 @@ class Trainer:
             "model_mib": (out / "model.safetensors").stat().st_size / 2**20,
             "mean_turn_deg": float(np.rad2deg(turn.norm(dim=-1).mean().item())),
             "mean_move_mm": float(1e3 * move_m.norm(dim=-1).mean().item()),
-            "decisions": [{"setting": name} | dataclasses.asdict(d) for name, d in self.decisions.items()],
+            "decisions": [
+                {"setting": name, "value": d.value, "reason": d.reason} for name, d in self.decisions.items()
+            ],
         }
-        (out / "report.json").write_text(json.dumps(report, indent=1))
+        write_result(out / "report.json", TrainingReport, report)
         return report
 
 
@@ -367,8 +369,9 @@ def train(
     settings: TrainingSettings,
     out: Path,
     processes: Distributed | None = None,
-) -> dict[str, Any]:
-    """Train the subject into `out`, from its checkpoint if there is one; return the report as a dict.
+) -> TrainingReport | None:
+    """Train the subject into `out`, from its checkpoint if there is one; return the report, None in a process that
+    writes none.
 
     The last checkpoint is kept, so that a training stopped while writing its files need only write them again; the
     caller calls `remove_checkpoint`. Raises TrainingError if the surface collapses or the losses stay non-finite.

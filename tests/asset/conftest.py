@@ -3,6 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from hnerf.asset.correctives import correctives_of, with_displacements
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.staging import StagedAvatar, stage_avatar
 from hnerf.asset.texture import unwrap
@@ -11,9 +12,14 @@ from tests.asset.figure import bending_body, upright_column
 
 @pytest.fixture(scope="session")
 def staged() -> StagedAvatar:
-    """Return clothes around the bending column, with a texture of noise."""
+    """Return clothes around the bending column, with two shapes of noise and a texture of noise."""
     body = bending_body()
     clothes = upright_column(0.18, -0.05, 1.65)
     layout = unwrap(clothes.vertices, clothes.faces, 64)
     clothed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
-    return stage_avatar(clothed, layout, np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8), "z")
+    rng = np.random.default_rng(0)
+    shapes_m = rng.normal(scale=0.01, size=(2, len(clothes.vertices), 3))
+    moved_m = np.einsum("nk,kvd->nvd", rng.normal(size=(len(body.frames), 2)), shapes_m).astype(np.float32)
+    texture = rng.integers(0, 255, (64, 64, 3), np.uint8)
+    surfaces_m = with_displacements(clothed, moved_m)
+    return stage_avatar(clothed, surfaces_m, correctives_of(moved_m, 2), layout, texture, "z")

@@ -1,11 +1,11 @@
 """An avatar without a network: the body grown by a centimetre, coloured by position on the rest body."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
-from hnerf.avatar.avatar import Rendering
+from hnerf.avatar.avatar import Gains, Rendering
 from hnerf.body.descriptor import BodyMeshes, ClosestPoints
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import pose_vertices
@@ -18,6 +18,7 @@ CLOTHING_M = 0.01
 class StandInAvatar:
     body: BodyFit
     queries: int = 0
+    gains: Gains = field(default_factory=dict)
 
     def without_frames(self) -> "StandInAvatar":
         return self

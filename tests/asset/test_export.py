@@ -10,7 +10,7 @@ from hnerf.config import AssetSettings
 from tests.asset.figure import bending_body, capture
 from tests.asset.stand_in import CLOTHING_M, StandInAvatar
 
-SMALL = AssetSettings(grid_cells=96, faces=2000, texture_px=128)
+SMALL = AssetSettings(grid_cells=96, faces=2000, texture_px=128, photograph_frames=0, correctives=2)
 
 
 def test_surface_is_the_grown_body() -> None:

@@ -39,8 +39,21 @@ def test_motion_is_in_seconds_from_the_first_frame(staged: StagedAvatar, tmp_pat
         (0, "translation"),
         (0, "rotation"),
         (1, "rotation"),
+        (2, "weights"),
     ]
     np.testing.assert_allclose(accessor(document, animation.samplers[0].input)[:, 0], [0, 0.1, 0.2, 0.5])
     translation = accessor(document, animation.samplers[0].output)
     # World (0.1 frame, 2, 0.5) is stage (0.1 frame, 0.5, -2).
     np.testing.assert_allclose(translation, [[0.1 * f, 0.5, -2] for f in FRAMES], atol=1e-6)
+
+
+def test_correctives_are_morph_targets_with_a_weight_a_frame(staged: StagedAvatar, tmp_path: Path) -> None:
+    write_glb(tmp_path / "avatar.glb", staged, 10.0)
+    document = pygltflib.GLTF2.load(str(tmp_path / "avatar.glb"))
+    (primitive,) = document.meshes[0].primitives
+    vertex = np.zeros(len(staged.uvs), int)
+    vertex[staged.face_uvs] = staged.faces
+    for target, shape_m in zip(primitive.targets, staged.shapes_m, strict=True):
+        np.testing.assert_allclose(accessor(document, target["POSITION"]), shape_m[vertex], atol=1e-7)
+    weights = accessor(document, document.animations[0].samplers[-1].output)
+    np.testing.assert_allclose(weights.reshape(len(FRAMES), 2), staged.shape_weights)

@@ -6,7 +6,7 @@ import trimesh
 from torch import Tensor
 
 from hnerf.asset.rig_transfer import clothed_rig
-from hnerf.asset.texture import UvLayout, bake, rasterise, unwrap
+from hnerf.asset.texture import UvLayout, field_colours, rasterise, texture_image, unwrap
 from tests.asset.figure import bending_body, upright_column
 from tests.asset.stand_in import StandInAvatar, rest_colour
 
@@ -46,7 +46,7 @@ def test_colours_are_read_on_the_fields_own_surface() -> None:
     clothes = upright_column(0.175, 0.2, 1.4)  # 1.5 cm outside the field's surface; its caps are far inside
     layout = unwrap(clothes.vertices, clothes.faces, 64)
     posed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
-    bake(Recording(body), posed, layout, 64)
+    field_colours(Recording(body), posed, rasterise(layout, 64))
     assert len(read_m) == len(body.frames)
     for distance_m in read_m:
         assert distance_m.abs().median() < 0.002
@@ -57,7 +57,9 @@ def test_baked_colours_are_those_of_the_point_on_the_rest_body() -> None:
     clothes = upright_column(0.16, 0.0, 1.6)
     layout = unwrap(clothes.vertices, clothes.faces, 256)
     rig = clothed_rig(body.rig, clothes)
-    image = bake(StandInAvatar(body), dataclasses.replace(body, rig=rig), layout, 256)
+    texels = rasterise(layout, 256)
+    colours = field_colours(StandInAvatar(body), dataclasses.replace(body, rig=rig), texels)
+    image = texture_image(texels, colours, 256)
     middle_uv = layout.uvs[layout.face_uvs].mean(1)
     pixel = image[((1 - middle_uv[:, 1]) * 256).astype(int), (middle_uv[:, 0] * 256).astype(int)]
     middle_m = torch.tensor(clothes.triangles_center).float()

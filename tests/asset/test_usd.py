@@ -36,6 +36,18 @@ def test_camera_projects_where_ours_does() -> None:
     np.testing.assert_allclose(pixel, ours.project(world)[0], atol=1e-4)
 
 
+def with_shapes(mesh: UsdGeom.Mesh, motion: UsdSkel.AnimQuery, frame: int) -> np.ndarray:
+    """Return the points of a mesh at rest with its blend shapes, by the weights of the motion."""
+    weights = dict(zip(motion.GetBlendShapeOrder(), motion.ComputeBlendShapeWeights(frame), strict=True))
+    binding = UsdSkel.BindingAPI(mesh.GetPrim())
+    points = np.array(mesh.GetPointsAttr().Get())
+    targets = binding.GetBlendShapeTargetsRel().GetTargets()
+    for name, path in zip(binding.GetBlendShapesAttr().Get(), targets, strict=True):
+        shape = UsdSkel.BlendShape(mesh.GetPrim().GetStage().GetPrimAtPath(path))
+        points += weights[name] * np.array(shape.GetOffsetsAttr().Get())
+    return points
+
+
 def test_usd_skins_as_we_do(staged: StagedAvatar, tmp_path: Path) -> None:
     write_skinned(tmp_path / "avatar.usdz", staged, [side_camera()], 10.0)
     stage = Usd.Stage.Open(str(tmp_path / "avatar.usdz"))
@@ -47,7 +59,7 @@ def test_usd_skins_as_we_do(staged: StagedAvatar, tmp_path: Path) -> None:
     skeleton = cache.GetSkelQuery(UsdSkel.Skeleton(stage.GetPrimAtPath("/Avatar/Body/Skeleton")))
     assert skeleton.GetAnimQuery().GetJointTransformTimeSamples() == list(FRAMES)
     for frame, expected in zip(FRAMES, staged.points_m, strict=True):
-        points = Vt.Vec3fArray(mesh.GetPointsAttr().Get())
+        points = Vt.Vec3fArray.FromNumpy(with_shapes(mesh, skeleton.GetAnimQuery(), frame))
         assert skinning.ComputeSkinnedPoints(skeleton.ComputeSkinningTransforms(frame), points, frame)
         np.testing.assert_allclose(np.array(points), expected, atol=1e-5)
         extent = np.array(root.GetExtentAttr().Get(frame))

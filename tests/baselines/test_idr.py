@@ -8,6 +8,7 @@ from hnerf.avatar.trained import build_field
 from hnerf.baselines.idr import SdfNetwork, intersection, trace_surface
 from hnerf.config import load_settings
 from hnerf.errors import InputError
+from hnerf.fields.rays import Rays
 from tests.baselines.ball import RADIUS_M, RING, body, inner_psnr, psnr, radii_m, trained
 
 SMALL = [
@@ -29,8 +30,8 @@ def traced(distance, origins: Tensor, directions: Tensor, samples: int = 16) -> 
     """Trace between depths 0 and 8."""
     near, far = torch.zeros(len(origins)).to(origins), torch.full((len(origins),), 8.0).to(origins)
     probe_depths = torch.linspace(0, 8, samples).to(origins).expand(len(origins), -1)
-    values = distance(origins[:, None] + directions[:, None] * probe_depths[..., None])
-    return trace_surface(distance, origins, directions, near, far, probe_depths, values)
+    rays = Rays(origins, directions, torch.zeros(len(origins), dtype=torch.long))
+    return trace_surface(distance, rays, near, far, probe_depths, distance(rays.points(probe_depths)))
 
 
 def test_rays_meet_the_unit_sphere_where_geometry_says() -> None:

@@ -14,6 +14,7 @@ from hnerf.body.canonical import PosedBodies
 from hnerf.config import load_settings
 from hnerf.errors import InputError
 from hnerf.fields.conditions import Conditions, Draws
+from hnerf.fields.rays import Rays
 from hnerf.fields.samples import RaySamples
 from hnerf.fields.shell import Boxes
 from hnerf.training.losses import Target, blend, reconstruction
@@ -59,9 +60,9 @@ def look(field: NerfField, jitter: Draws) -> tuple[RaySamples, Tensor]:
     bodies = PosedBodies(fit.rig, fit.theta, fit.root, field.canonical_m)
     conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.zeros(1, dtype=torch.long), 2.5)
     origins = torch.tensor([[-3.0, 0.5, 0.5], [-3.0, 5.0, 0.5]])
-    directions, frame = torch.tensor([[1.0, 0, 0]]).repeat(2, 1), torch.zeros(2, dtype=torch.long)
+    rays = Rays(origins, torch.tensor([[1.0, 0, 0]]).repeat(2, 1), torch.zeros(2, dtype=torch.long))
     draws = dataclasses.replace(jitter, background=torch.ones(2, 3))
-    return field.sample(bodies, field.region(bodies, conditions), origins, directions, frame, conditions, draws)
+    return field.sample(field.scene(bodies, conditions), rays, draws)
 
 
 def test_both_colours_by_hand(fog: NerfField) -> None:

@@ -18,6 +18,7 @@ from hnerf.body.canonical import PosedBodies
 from hnerf.config import load_settings
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.encoding import positional_encoding
+from hnerf.fields.rays import Rays
 from hnerf.fields.samples import RaySamples
 from tests.baselines.column import Learned, learn, three_poses
 
@@ -115,11 +116,10 @@ def evaluate(field: NerfiesField, training: bool) -> RaySamples:
     fit = three_poses()
     bodies = PosedBodies(fit.rig, fit.theta, fit.root, field.canonical_m)
     conditions = Conditions.of(fit.rig, fit.theta, fit.root, torch.arange(3), 2.5)
-    origins, directions = torch.tensor([[0.5, 0.4, 5.0]]), torch.tensor([[0.0, 0.0, -1.0]])
+    ray = Rays(torch.tensor([[0.5, 0.4, 5.0]]), torch.tensor([[0.0, 0.0, -1.0]]), torch.zeros(1, dtype=torch.long))
     still = Draws.deterministic(1, field.samples, torch.device("cpu"))
     draws = Draws.random(1, field.samples, 0.0, torch.Generator().manual_seed(0)) if training else still
-    row = torch.zeros(1, dtype=torch.long)
-    return field.sample(bodies, field.region(bodies, conditions), origins, directions, row, conditions, draws)[0]
+    return field.sample(field.scene(bodies, conditions), ray, draws)[0]
 
 
 def test_steps_of_the_training_count_and_looking_does_not(field: NerfiesField) -> None:

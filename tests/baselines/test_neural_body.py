@@ -8,6 +8,7 @@ from hnerf.baselines.neural_body import NeuralBodyField, NeuralBodyRegion
 from hnerf.body.canonical import PosedBodies
 from hnerf.config import load_settings
 from hnerf.fields.conditions import Conditions, Draws
+from hnerf.fields.rays import PosedScene, Rays
 from tests.baselines.column import learn, three_poses
 
 SMALL = [
@@ -42,7 +43,8 @@ def look(field: NeuralBodyField, region: NeuralBodyRegion, rows: list[int]) -> t
     """Return the colour of two rays' samples in these rows."""
     bodies, conditions = posed(field)
     draws = Draws.deterministic(2, field.samples, torch.device("cpu"))
-    return field.sample(bodies, region, *DOWN, torch.tensor(rows), conditions, draws)[0].colour
+    rays = Rays(*DOWN, torch.tensor(rows))
+    return field.sample(PosedScene(bodies, region, conditions), rays, draws)[0].colour
 
 
 def test_codes_are_diffused_once_a_frame_in_training_and_once_a_rendering(field: NeuralBodyField) -> None:

@@ -19,6 +19,7 @@ from hnerf.fields.fast import (
     FastField,
     move_to_surface,
 )
+from hnerf.fields.rays import PosedScene, Rays
 from hnerf.training.losses import pixel_colour
 from tests.body.boxes import box_rig
 
@@ -66,13 +67,11 @@ def test_a_tight_shell_shows_the_same_picture():
     field = field_of(1000.0)
     origins = torch.tensor([[0.5, 0.4, 3.0], [0.31, 0.62, 3.0], [0.1, 0.8, 3.0]])
     directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3)
-    frame, draws = torch.zeros(3, dtype=torch.long), Draws.deterministic(3, SETTINGS.samples, torch.device("cpu"))
+    rays = Rays(origins, directions, torch.zeros(3, dtype=torch.long))
+    draws = Draws.deterministic(3, SETTINGS.samples, torch.device("cpu"))
 
     def coverage() -> torch.Tensor:
-        samples, _ = field.sample(
-            bodies, field.region(bodies, conditions), origins, directions, frame, conditions, draws
-        )
-        return field.coverage(samples)
+        return field.coverage(field.sample(field.scene(bodies, conditions), rays, draws)[0])
 
     before = coverage()
     field.tighten(RIG, conditions.pose)
@@ -85,23 +84,20 @@ def test_rays_that_miss_the_shell_see_nothing_and_change_nothing():
     bodies, conditions = standing()
     field = field_of(100.0)
     origins = torch.tensor([[0.5, 0.5, 3.0], [2.0, 0.5, 3.0], [0.4, 0.6, 3.0]])
-    directions = torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3)
+    rays = Rays(origins, torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3), torch.zeros(3, dtype=torch.long))
+    scene = field.scene(bodies, conditions)
 
     def sampled(pick: list[int]) -> list[torch.Tensor]:
         draws = Draws.deterministic(len(pick), SETTINGS.samples, torch.device("cpu"))
-        frame = torch.zeros(len(pick), dtype=torch.long)
-        found, _ = field.sample(
-            bodies, field.region(bodies, conditions), origins[pick], directions[pick], frame, conditions, draws
-        )
+        found, _ = field.sample(scene, rays.pick(torch.tensor(pick)), draws)
         return [found.alpha, found.colour, found.d, found.residual]
 
     alpha, colour, d, residual = sampled([0, 1, 2])
     assert not alpha[1].any() and not colour[1].any() and not residual[1].any()
     assert (d[1] == field.reach_m).all()
     assert not sampled([1])[0].any()
-    where = (bodies, field.region(bodies, conditions), origins[[1]], directions[:1], torch.zeros(1, dtype=torch.long))
     draws = Draws.random(1, 5, 0.0, torch.Generator())
-    assert field.sample(*where, conditions, draws)[0].gradient_norm.shape == (0,)
+    assert field.sample(scene, rays.pick(torch.tensor([1])), draws)[0].gradient_norm.shape == (0,)
     for all_three, alone in zip((alpha, colour, d, residual), sampled([0, 2]), strict=True):
         torch.testing.assert_close(all_three[[0, 2]], alone, atol=1e-6, rtol=0)
 
@@ -114,12 +110,13 @@ def test_a_picture_with_as_many_samples_as_the_way_asks_for_is_that_of_many(monk
     origins = torch.tensor([[0.5, 0.4, 3.0], [0.02, 0.9, 3.0], [0.5, 0.1, 3.0], [2.0, 0.5, 3.0]])
     directions = torch.tensor([[0.0, 0.0, -1.0], [0.0, -0.02, -1.0], [0.05, 0.1, -1.0], [0.0, 0.0, -1.0]])
     directions = torch.nn.functional.normalize(directions, dim=-1)
-    rays = (bodies, field.region(bodies, conditions), origins, directions, torch.zeros(4, dtype=torch.long), conditions)
-    needed = field.region(bodies, conditions).path_length_m(*rays[2:5]) / SPACING_M
+    rays = Rays(origins, directions, torch.zeros(4, dtype=torch.long))
+    scene = field.scene(bodies, conditions)
+    needed = scene.region.path_length_m(rays) / SPACING_M
     assert len({sum(float(n) > count for count in SAMPLE_COUNTS) for n in needed}) >= 3
-    found = field.render_rays(*rays)
+    found = field.render_rays(scene, rays)
     monkeypatch.setattr(FastField, "samples_needed", Field.samples_needed)
-    expected = field.render_rays(*rays)
+    expected = field.render_rays(scene, rays)
     torch.testing.assert_close(found, expected, atol=0.02, rtol=0)
     assert (found[:3, 3] > 0.5).all() and not found[3].any()
 
@@ -142,13 +139,13 @@ def test_a_rendered_ray_ends_at_the_solid_core_where_the_surface_lies_deeper():
     bodies, conditions = standing()
     field = deeper_by(0.1)
     origins, directions = torch.tensor([[0.5, 0.5, 3.0], [-0.05, 0.5, 3.0]]), -torch.eye(3)[[2, 2]]
-    rays = origins, directions, torch.zeros(2, dtype=torch.long)
-    region = field.region(bodies, conditions)
-    count = int(field.samples_needed(region, *rays)[0])
+    rays = Rays(origins, directions, torch.zeros(2, dtype=torch.long))
+    scene = field.scene(bodies, conditions)
+    count = int(field.samples_needed(scene.region, rays)[0])
     draws = Draws.deterministic(2, count, torch.device("cpu"))
     with torch.no_grad():
-        samples, depths = field.sample(bodies, region, *rays, conditions, draws)
-        seen = field.render_rays(bodies, region, *rays, conditions)
+        samples, depths = field.sample(scene, rays, draws)
+        seen = field.render_rays(scene, rays)
     assert samples.d_hat.min() > 0.02 and field.coverage(samples).max() < 0.01
     assert seen[0, 3] == pytest.approx(1) and seen[0, 4] == pytest.approx(depths[0, -1].item(), abs=1e-4)
     torch.testing.assert_close(seen[0, :3], samples.colour[0, -1], atol=1e-3, rtol=0)
@@ -162,9 +159,9 @@ def test_a_shell_deeper_than_high_finds_the_surface_at_its_bottom():
     bodies, conditions = standing()
     field = deeper_by(0.07, settings)
     field.tighten(RIG, conditions.pose)
-    ray = torch.tensor([[0.5, 0.5, 3.0]]), -torch.eye(3)[[2]], torch.zeros(1, dtype=torch.long)
+    ray = Rays(torch.tensor([[0.5, 0.5, 3.0]]), -torch.eye(3)[[2]], torch.zeros(1, dtype=torch.long))
     with torch.no_grad():
-        seen = field.render_rays(bodies, field.region(bodies, conditions), *ray, conditions)[0]
+        seen = field.render_rays(field.scene(bodies, conditions), ray)[0]
     top_m = 3 - bodies.vertices_m[0, :, 2].max().item()
     assert seen[3] == pytest.approx(1, abs=0.01) and seen[4].item() - top_m == pytest.approx(0.07, abs=0.01)
 
@@ -179,12 +176,12 @@ def test_the_shell_moves_with_the_surface_of_a_frame():
     field.inner_m.fill_(0.07)
     field.deformation.displacement.data[:2, 0, 2] = torch.tensor([0.02, 0.06])
     bodies, _ = standing()
-    ray = torch.tensor([[0.5, 0.5, 3.0]]), -torch.eye(3)[[2]], torch.zeros(1, dtype=torch.long)
+    ray = Rays(torch.tensor([[0.5, 0.5, 3.0]]), -torch.eye(3)[[2]], torch.zeros(1, dtype=torch.long))
 
     def ends(moment: int) -> torch.Tensor:
         """Return the depths of the first and the last sample on a ray from above."""
         moments = Conditions.of(RIG, bodies.theta, bodies.root, torch.tensor([moment]), 2.5)
-        depths, _, core = field.region(bodies, moments).sample_rays(*ray, torch.full((1, 64), 0.5))
+        depths, _, core = field.region(bodies, moments).sample_rays(ray, torch.full((1, 64), 0.5))
         assert core.all()
         return depths[0, [0, -1]]
 
@@ -253,13 +250,13 @@ def test_a_pixel_pulls_at_its_body_as_its_colour_changes_when_the_body_moves():
     for grid in field.field.colour_grids.parameters():
         torch.nn.init.normal_(grid)
     direction = torch.nn.functional.normalize(torch.tensor([[0.4, 0.3, -1.0]]), dim=-1)
-    rays = (torch.tensor([[0.5, 0.4, 0.5]]) - 2 * direction, direction, torch.zeros(1, dtype=torch.long))
+    rays = Rays(torch.tensor([[0.5, 0.4, 0.5]]) - 2 * direction, direction, torch.zeros(1, dtype=torch.long))
     draws = Draws.deterministic(1, SETTINGS.samples, torch.device("cpu"))
 
     def colour(move_m: torch.Tensor) -> torch.Tensor:
         moved = {"move_m": move_m[None], "turn": correction.turn, "shape": correction.shape}
-        where = (bodies, field.region(bodies, conditions), *rays)
-        samples, _ = field.sample(*where, conditions, draws, SimpleNamespace(**moved))
+        scene = PosedScene(bodies, field.region(bodies, conditions), conditions, SimpleNamespace(**moved))
+        samples, _ = field.sample(scene, rays, draws)
         return pixel_colour(samples.alpha, samples)[0]
 
     step_m = 1e-4

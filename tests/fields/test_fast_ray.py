@@ -16,6 +16,7 @@ from hnerf.config import FastFieldSettings
 from hnerf.fields.compositing import weights_from_alpha
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.fast import FastField
+from hnerf.fields.rays import PosedScene, Rays
 from hnerf.fields.samples import RaySamples
 from tests.body.boxes import box_rig
 
@@ -26,7 +27,7 @@ ROOT[1, :2] = torch.tensor([[0.0, -1, 0, 2.55], [1, 0, 0, 0]])
 SETTINGS = FastFieldSettings(
     outer_m=0.06, inner_m=0.04, shell_cell_m=0.02, samples=12, geometry_cells=(2,), colour_cells=(2,), pose_width=1
 )
-RAY = torch.tensor([[-1.0, 0.4, 0.25]]), torch.tensor([[1.0, 0, 0]]), torch.tensor([1])
+RAY = Rays(torch.tensor([[-1.0, 0.4, 0.25]]), torch.tensor([[1.0, 0, 0]]), torch.tensor([1]))
 OUTERMOST, INNERMOST = 0.0, 0.99  # of the ray's samples
 
 Distance = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -50,7 +51,8 @@ def sampled(field: FastField, probe: float | None = None) -> RaySamples:
     draws = Draws(torch.full((1, 12), 0.5), torch.rand(1, 3), torch.zeros(1, 12))
     if probe is not None:
         draws = Draws(draws.jitter, draws.background, draws.fine, torch.tensor([probe]))
-    return field.sample(bodies, field.region(bodies, conditions), *RAY, conditions, draws, bodies.correction())[0]
+    scene = PosedScene(bodies, field.region(bodies, conditions), conditions, bodies.correction())
+    return field.sample(scene, RAY, draws)[0]
 
 
 def same(found: Tensor, expected: list[float]) -> None:

@@ -19,9 +19,10 @@ from hnerf.body.canonical import PosedBodies
 from hnerf.config import LossSettings, PaperFieldSettings, load_settings
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.paper import PaperField
+from hnerf.fields.rays import Rays
 from hnerf.fields.samples import RaySamples
-from hnerf.training.pixels import Rays
-from hnerf.training.step import Objective, PosedScene
+from hnerf.training.pixels import PixelRays
+from hnerf.training.step import Objective
 from tests.body.boxes import box_rig
 
 RIG = box_rig()
@@ -30,7 +31,7 @@ ROOT = torch.eye(4).repeat(2, 1, 1)
 ROOT[0, :3, 3] = torch.tensor([1.45, 0.4, -1.0])  # so that the middle of the scene is (2, 0.2, -0.5)
 ROOT[1, :2] = torch.tensor([[0.0, -1, 0, 2.55], [1, 0, 0, 0]])
 SETTINGS = PaperFieldSettings(scene_m=2.0, samples=4)
-RAY = torch.tensor([[-1.0, 0.4, 0.25]]), torch.tensor([[1.0, 0, 0]]), torch.tensor([1])
+RAY = Rays(torch.tensor([[-1.0, 0.4, 0.25]]), torch.tensor([[1.0, 0, 0]]), torch.tensor([1]))
 DRAWS = Draws(torch.full((1, 4), 0.5), torch.ones(1, 3), torch.full((1, 4), 0.6), probe=torch.zeros(1))
 
 DEPTHS_M = [1.3, 1.5, 1.8, 2.5, 2.6, 3.5, 4.2, 4.5]
@@ -76,8 +77,7 @@ def bodies() -> tuple[PosedBodies, Conditions]:
 
 
 def sampled(field: PaperField, draws: Draws = DRAWS) -> tuple[RaySamples, Tensor]:
-    standing, conditions = bodies()
-    return field.sample(standing, field.region(standing, conditions), *RAY, conditions, draws)
+    return field.sample(field.scene(*bodies()), RAY, draws)
 
 
 def rows(values: list[list[float]]) -> Tensor:
@@ -110,9 +110,9 @@ def test_some_coarse_samples_lie_in_the_box_alone() -> None:
 
 
 def test_a_ray_beside_the_box_has_all_its_samples_in_the_scene() -> None:
-    field, (standing, conditions) = field_of(static=True, box_samples=2), bodies()
-    beside = torch.tensor([[-1.0, 1.9, 0.25]]), *RAY[1:]
-    samples, depths = field.sample(standing, field.region(standing, conditions), *beside, conditions, DRAWS)
+    field = field_of(static=True, box_samples=2)
+    beside = replace(RAY, origins_m=torch.tensor([[-1.0, 1.9, 0.25]]))
+    samples, depths = field.sample(field.scene(*bodies()), beside, DRAWS)
     assert samples.in_box.sum() == 0 and samples.alpha.isfinite().all()
     assert (depths.diff() >= 0).all() and depths.min() >= 1 and depths.max() <= 5
 
@@ -150,7 +150,7 @@ def test_the_networks_see_the_noise() -> None:
     field, (standing, conditions) = field_of(), bodies()
     noisy = replace(conditions, pose=conditions.pose + 0.01, root=conditions.root + 0.02)
     draws = replace(DRAWS, view=torch.tensor([[0.0, 0.03, -0.04]]))
-    field.sample(standing, field.region(standing, noisy), *RAY, noisy, draws)
+    field.sample(field.scene(standing, noisy), RAY, draws)
     for _, pose, root, view in field.radiance.asked:
         within = pose.abs().sum(1) > 0
         same(pose[within], rows([[0.11, 0.21, 0.31]]).expand(int(within.sum()), 3))
@@ -218,9 +218,9 @@ def test_each_loss_of_a_ray() -> None:
     correction = standing.correction()
     correction.absorbed_shape.fill_(3.0)
     correction.absorbed_move_m[1, 1] = 4.0  # of two frames
-    rays = Rays(*RAY, torch.ones(1, 3), torch.tensor([True]), torch.tensor([False]), None)
+    rays = PixelRays(*vars(RAY).values(), torch.ones(1, 3), torch.tensor([True]), torch.tensor([False]), None)
     objective = Objective(field, correction, load_settings("paper").training)
-    terms = objective(PosedScene(standing, field.region(standing, conditions)), rays, conditions, DRAWS)
+    terms = objective(field.scene(standing, conditions), rays, DRAWS)
 
     def sigmoid(x: float) -> float:
         return 1 / (1 + math.exp(-x))

@@ -8,6 +8,7 @@ from hnerf.body.canonical import PosedBodies
 from hnerf.config import PaperFieldSettings
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.paper import PaperField
+from hnerf.fields.rays import Rays
 from tests.body.boxes import box_rig
 
 RIG = box_rig()
@@ -18,11 +19,9 @@ def seen(field: PaperField, root_condition: Tensor) -> tuple[Tensor, Tensor]:
     bodies = PosedBodies(RIG, torch.zeros(1, 2, 3), torch.eye(4)[None], RIG.vertices_m)
     moment = torch.zeros(1, dtype=torch.long)
     conditions = Conditions(Conditions.of(RIG, bodies.theta, bodies.root, moment, 2.5).pose, root_condition, moment)
-    origin, direction = torch.tensor([[0.5, 0.4, 2.4]]), torch.tensor([[0.0, 0.0, -1.0]])
+    ray = Rays(torch.tensor([[0.5, 0.4, 2.4]]), torch.tensor([[0.0, 0.0, -1.0]]), torch.zeros(1, dtype=torch.long))
     draws = Draws.deterministic(1, field.samples, torch.device("cpu"))
-    samples, _ = field.sample(
-        bodies, field.region(bodies, conditions), origin, direction, torch.zeros(1, dtype=torch.long), conditions, draws
-    )
+    samples, _ = field.sample(field.scene(bodies, conditions), ray, draws)
     assert samples.in_box.any()
     return samples.density, samples.colour
 

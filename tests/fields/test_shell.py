@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from hnerf.fields.rays import Rays
 from hnerf.fields.shell import EMPTY, SHELL, SOLID, ShellGrid, box_interval, surface_points
 from tests.body.boxes import box_faces, box_vertices
 
@@ -26,15 +27,16 @@ def even_shell(surface: torch.Tensor, outer_m: float, inner_m: float, cell_m: fl
 
 def along_x(grid: ShellGrid, x_m: list[float]) -> list[int]:
     """Return the states of the first frame's cells on the x axis."""
-    return grid.cell_states(torch.zeros(1, 3), torch.eye(3)[:1], torch.tensor([x_m]), torch.zeros(1).long())[0].tolist()
+    axis = Rays(torch.zeros(1, 3), torch.eye(3)[:1], torch.zeros(1).long())
+    return grid.cell_states(axis, torch.tensor([x_m]))[0].tolist()
 
 
 def test_box_interval_by_hand():
     """Along x into [1, 2]: from 1 to 2; a ray that misses has no length."""
     origins = torch.tensor([[0.0, 0.5, 0.5], [0.0, 5.0, 0.5]])
-    directions = torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3)
+    rays = Rays(origins, torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3), torch.zeros(2).long())
     lower, upper = torch.tensor([[1.0, 0.0, 0.0]]).expand(2, 3), torch.tensor([[2.0, 1.0, 1.0]]).expand(2, 3)
-    near, far = box_interval(origins, directions, lower, upper)
+    near, far = box_interval(rays, lower, upper)
     assert (near[0].item(), far[0].item()) == (1.0, 2.0)
     assert near[1] == far[1]
 
@@ -57,8 +59,8 @@ def test_every_frame_has_its_own_surface_and_thickness():
     outer = torch.tensor([0.02, 0.08])[:, None].expand(-1, 40000)
     surfaces = torch.cat([sphere(0.3), sphere(0.2)])
     grid = around(surfaces, outer, torch.full_like(outer, 0.04), 0.01)
-    points_on_rays, frames = torch.tensor([[0.35], [0.25], [0.35], [0.25]]), torch.tensor([0, 1, 1, 0])
-    found = grid.cell_states(torch.zeros(4, 3), torch.eye(3)[[0, 0, 0, 0]], points_on_rays, frames)[:, 0].tolist()
+    rays = Rays(torch.zeros(4, 3), torch.eye(3)[[0, 0, 0, 0]], torch.tensor([0, 1, 1, 0]))
+    found = grid.cell_states(rays, torch.tensor([[0.35], [0.25], [0.35], [0.25]]))[:, 0].tolist()
     assert found == [EMPTY, SHELL, EMPTY, SOLID]
 
 
@@ -87,9 +89,9 @@ def test_samples_lie_in_the_shell_before_the_solid():
     core."""
     grid = even_shell(sphere(0.3), outer_m=0.05, inner_m=0.04, cell_m=0.01)
     origins_m, directions = torch.tensor([[-1.0, 0.0, 0.0], [-1.0, 0.6, 0.0]]), torch.eye(3)[[0, 0]]
-    rays = (origins_m, directions, torch.zeros(2, dtype=torch.long))
-    depths, met, ended = grid.sample_rays(*rays, torch.full((2, 16), 0.5))
-    path_length_m = grid.path_length_m(*rays)
+    rays = Rays(origins_m, directions, torch.zeros(2, dtype=torch.long))
+    depths, met, ended = grid.sample_rays(rays, torch.full((2, 16), 0.5))
+    path_length_m = grid.path_length_m(rays)
     assert path_length_m[0].item() == pytest.approx(0.09, abs=0.03) and path_length_m[1] == 0
     assert met.tolist() == ended.tolist() == [True, False]
     assert (depths[0].diff() > 0).all()
@@ -100,9 +102,8 @@ def test_samples_lie_in_the_shell_before_the_solid():
 def test_a_gap_between_two_shells_is_not_sampled():
     """Beside the solid core a ray crosses the shell twice; nothing is sampled outside it."""
     grid = even_shell(torch.cat([sphere(0.1) - 0.3, sphere(0.1) + 0.3], 1), 0.03, 0.2, 0.01)
-    depths, *_ = grid.sample_rays(
-        torch.full((1, 3), -1.0), torch.full((1, 3), 3**-0.5), torch.zeros(1, dtype=torch.long), torch.rand(1, 64)
-    )
+    diagonal = Rays(torch.full((1, 3), -1.0), torch.full((1, 3), 3**-0.5), torch.zeros(1, dtype=torch.long))
+    depths, *_ = grid.sample_rays(diagonal, torch.rand(1, 64))
     position = (-1 + depths[0] * 3**-0.5)[:, None].expand(-1, 3)
     distance = torch.minimum((position - 0.3).norm(dim=1), (position + 0.3).norm(dim=1))
     assert (distance < 0.1 + 0.03 + 0.03).all()

@@ -1,11 +1,11 @@
 """The artifact of a fitted body, with a fake fit."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from hnerf.config import FitSettings
+from hnerf.results import FitReport
 from tasks import fit as module
 from tasks.store import Artifact, Store
 
@@ -24,7 +24,8 @@ def test_the_same_body_made_again_is_the_same_artifact_however_long_it_took(
     given = Artifact(stage="capture", root=tmp_path, files={})
 
     def made(store: str, seconds: float) -> Artifact:
-        report: dict[str, Any] = {"seconds": {"start": seconds}, "stature_m": 1.8}
+        empty: dict[str, list[float]] = {"keypoint_residual_px": [], "silhouette_iou": [], "keypoint_offsets_m": []}
+        report = FitReport(seconds={"start": seconds}, frames=[], poor_frames=[], stature_m=1.8, beta={}, **empty)
         monkeypatch.setattr(module, "fit_body", lambda *_: (Body(), report))
         return module.fit(Store(tmp_path / store), given, given, None, FitSettings())
 

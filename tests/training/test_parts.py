@@ -11,7 +11,7 @@ from hnerf.training import parts as parts_module
 from hnerf.training import trainer as trainer_module
 from hnerf.training.distributed import Distributed
 from hnerf.training.parts import GIB, PEAK_FACTOR, USABLE_SHARE, Parts, decide_parts
-from hnerf.training.pixels import Rays
+from hnerf.training.pixels import PixelRays
 from tests.training.first_step import gradients, untrained
 
 CPU = torch.device("cpu")
@@ -25,7 +25,7 @@ class Scale(nn.Module):
         super().__init__()
         self.w = nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
 
-    def forward(self, scene: object, rays: Rays, conditions: object, draws: Draws) -> dict[str, Tensor]:
+    def forward(self, scene: object, rays: PixelRays, draws: Draws) -> dict[str, Tensor]:
         """Return `mean` and `increment`."""
         assert len(draws.jitter) == len(rays.frame) > 0
         return {"mean": (self.w * rays.origins_m[:, 0]).mean(), "increment": 3 * self.w}
@@ -41,12 +41,12 @@ def test_parts_of_unequal_size_add_up_to_the_joint_batch(
     6.5, whose mean is 4.33; two processes of three parts have one of two rays and five of one."""
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     x = torch.arange(1.0, 8, dtype=torch.float64)[:, None].expand(7, 3)
-    rays = Rays(x, x, torch.zeros(7, dtype=torch.long), x, x[:, 0] > 0, x[:, 0] > 0, None)
+    rays = PixelRays(x, x, torch.zeros(7, dtype=torch.long), x, x[:, 0] > 0, x[:, 0] > 0, None)
     means, slopes = [], []
     for rank in range(world_size):
         module = Scale()
         terms = Parts(count, side_by_side, 7).backward(
-            module, None, rays, None, Draws.deterministic(7, 1, CPU), Distributed(rank, world_size, CPU)
+            module, None, rays, Draws.deterministic(7, 1, CPU), Distributed(rank, world_size, CPU)
         )
         means.append(terms["mean"].item())
         slopes.append(module.w.grad.item())

@@ -1,6 +1,5 @@
 """Targets of a step, and the inputs of each of its losses."""
 
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -10,8 +9,9 @@ from torch import Tensor
 from hnerf.body.canonical import PoseCorrection
 from hnerf.config import LossSettings, TrainingSettings
 from hnerf.fields.conditions import Draws
+from hnerf.fields.rays import PosedScene
 from hnerf.training import losses
-from hnerf.training.pixels import Rays
+from hnerf.training.pixels import PixelRays
 from hnerf.training.step import Objective, make_target
 from tests.training.test_losses import SAMPLES, TARGET
 
@@ -23,7 +23,7 @@ EDGE = torch.tensor([False, True, True, False])
 def aimed(plate: Tensor | None, models_background: bool = False) -> tuple[losses.Target, Draws]:
     """Return target and draws for pixels inside the person, on both sides of the outline, and in the background."""
     none = torch.zeros(4, 3)
-    rays = Rays(none, none, torch.zeros(4, dtype=torch.long), SEEN, PERSON, EDGE, plate)
+    rays = PixelRays(none, none, torch.zeros(4, dtype=torch.long), SEEN, PERSON, EDGE, plate)
     return make_target(rays, Draws(none, BEYOND, none), models_background)
 
 
@@ -64,9 +64,9 @@ def test_each_loss_is_given_its_own_numbers() -> None:
     field.sample = lambda *inputs: (SAMPLES, None)
     correction = PoseCorrection(frames=2, free_joints=0, shapes=2)
     correction.absorbed_shape.copy_(torch.tensor([3.0, 4.0]))
-    none, stage = torch.zeros(2, 3), SimpleNamespace(bodies=None, region=None)
-    rays = Rays(none, none, none, TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)
-    terms = Objective(field, correction, TrainingSettings(losses=s))(stage, rays, None, Draws(none, none, none))
+    none, scene = torch.zeros(2, 3), PosedScene(None, None, None)
+    rays = PixelRays(none, none, none, TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)
+    terms = Objective(field, correction, TrainingSettings(losses=s))(scene, rays, Draws(none, none, none))
     expected = {
         "reconstruction": 2 * 0.475,
         "mask": 3 * 0.375,
@@ -87,8 +87,8 @@ def test_a_loss_without_weight_is_not_asked() -> None:
     field: Any = torch.nn.Module()
     field.models_background, field.gamma = True, 80.0
     field.sample = lambda *inputs: (SAMPLES, None)
-    none, stage = torch.zeros(2, 3), SimpleNamespace(bodies=None, region=None)
-    rays = Rays(none, none, none, TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)
+    none, scene = torch.zeros(2, 3), PosedScene(None, None, None)
+    rays = PixelRays(none, none, none, TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)
     settings = TrainingSettings(losses=LossSettings(mask=0, geometry=0))
-    terms = Objective(field, PoseCorrection(2, 0, 2), settings)(stage, rays, None, Draws(none, none, none))
+    terms = Objective(field, PoseCorrection(2, 0, 2), settings)(scene, rays, Draws(none, none, none))
     assert not {"mask", "geometry", "elastic"} & terms.keys()

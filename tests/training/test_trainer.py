@@ -11,6 +11,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from hnerf.avatar.antialiasing import mixed_pixels
 from hnerf.avatar.trained import load_avatar
 from hnerf.config import TrainingSettings, load_settings
 from hnerf.errors import InputError
@@ -18,7 +19,7 @@ from hnerf.fields import fast as fast_module
 from hnerf.training import trainer as trainer_module
 from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
 from hnerf.training.distributed import Distributed
-from hnerf.training.pixels import Pixels, Rays
+from hnerf.training.pixels import PixelRays, Pixels
 from hnerf.training.step import TrainingError
 from hnerf.training.trainer import Trainer, train
 from tests.training.scene import FRAMES, TINY, record, tiny
@@ -87,7 +88,8 @@ def test_a_finished_training_that_was_stopped_before_its_files_were_safe_only_wr
 
 
 def test_overfits_the_column(tmp_path: Path):
-    """A few seconds suffice for a render of a training view within 40 dB, in the right place."""
+    """A few seconds suffice for a render of a training view within 40 dB, in the right place. The photograph's outline,
+    unlike a rendering's, is not antialiased; it is left out."""
     capture, masks, body = record(tmp_path / "capture")
     rates = {"network_learning_rate": 0.02, "grid_learning_rate": 0.05}
     fast = TINY.field.model_dump() | rates | {"samples": 32, "outer_m": 0.1}
@@ -98,7 +100,8 @@ def test_overfits_the_column(tmp_path: Path):
     drawn = avatar.render(capture.cameras["0"], avatar.body.theta[0], avatar.body.root[0])
     mask = torch.from_numpy(masks.get("0", 0))
     wanted = torch.from_numpy(capture.image("0", 0)) / 255 * mask[..., None]
-    assert -10 * torch.log10(((drawn.rgb - wanted) ** 2).mean()) > 40
+    away = ~mixed_pixels(mask[..., None].float())
+    assert -10 * torch.log10(((drawn.rgb - wanted)[away] ** 2).mean()) > 40
     assert drawn.depth_m[mask].mean().item() == pytest.approx(3.6, abs=0.4)
 
 
@@ -351,7 +354,7 @@ def test_a_step_has_as_many_rays_however_few_the_frames(tmp_path: Path, monkeypa
     drawn = []
     draw = Pixels.draw
 
-    def counted(self: Pixels, frames: torch.Tensor, rays_per_frame: int, *others: Any) -> Rays:
+    def counted(self: Pixels, frames: torch.Tensor, rays_per_frame: int, *others: Any) -> PixelRays:
         drawn.append((len(frames), rays_per_frame))
         return draw(self, frames, rays_per_frame, *others)
 

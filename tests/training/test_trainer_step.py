@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from hnerf.fields.conditions import Conditions, Draws
+from hnerf.fields.conditions import Draws
+from hnerf.fields.rays import PosedScene
 from hnerf.training import trainer as trainer_module
 from hnerf.training.auto_settings import Decision
 from hnerf.training.distributed import Distributed
-from hnerf.training.pixels import Rays
-from hnerf.training.step import PosedScene
+from hnerf.training.pixels import PixelRays
 from hnerf.training.trainer import Trainer
 from tests.training.scene import TINY, record, tiny
 
@@ -26,8 +26,8 @@ class Listener(torch.nn.Module):
         super().__init__()
         self.trainer, self.parts = trainer, []
 
-    def forward(self, scene: PosedScene, rays: Rays, conditions: Conditions, draws: Draws) -> dict[str, Tensor]:
-        self.parts.append((rays, conditions, draws))
+    def forward(self, scene: PosedScene[Any], rays: PixelRays, draws: Draws) -> dict[str, Tensor]:
+        self.parts.append((rays, scene.conditions, draws))
         return {"nothing": sum(p.sum() for p in self.trainer.objective.parameters() if p.requires_grad) * 0.0}
 
     def all(self, part: int, name: str) -> Tensor:
@@ -52,8 +52,8 @@ def test_noise_reaches_the_networks(tmp_path: Path, kind: str) -> None:
     listener = handed_over(trainer)
     for _, conditions, _ in listener.parts:
         for noise, least, most in (
-            (conditions.pose - trainer.conditions.pose, 0.03, 0.25),
-            (conditions.root - trainer.conditions.root, 0.07, 0.13),
+            (conditions.pose - trainer.scene.conditions.pose, 0.03, 0.25),
+            (conditions.root - trainer.scene.conditions.root, 0.07, 0.13),
         ):
             assert least < noise.square().mean().sqrt() < most
             assert (noise != 0).all()
@@ -65,8 +65,8 @@ def test_no_noise_where_none_is_asked_for(tmp_path: Path) -> None:
     trainer = trainer_of(tmp_path, noise=0.0)
     listener = handed_over(trainer)
     for _, conditions, _ in listener.parts:
-        assert torch.equal(conditions.pose, trainer.conditions.pose)
-        assert torch.equal(conditions.root, trainer.conditions.root)
+        assert torch.equal(conditions.pose, trainer.scene.conditions.pose)
+        assert torch.equal(conditions.root, trainer.scene.conditions.root)
     assert not listener.all(2, "view").any()
 
 
@@ -141,13 +141,13 @@ def test_bodies_take_up_what_was_learned_of_them(tmp_path: Path, kind: str) -> N
     `fast` gives what both training frames have in common, half, to the rest body; the novel frame gets neither."""
     common = 0.5 if kind == "fast" else 0.0
     trainer = trainer_of(tmp_path, kind=kind)
-    before = trainer.conditions
+    before = trainer.scene.conditions
     with torch.no_grad():
         trainer.objective.correction.turn[1, 0, 1] = 0.1
         trainer.objective.correction.move_m[0, 2] = 0.01
     trainer.step = 1
     trainer._absorb()
-    after = trainer.conditions
+    after = trainer.scene.conditions
     assert (after.pose - before.pose)[:, 1].tolist() == pytest.approx([-0.1 * common, 0.1 * (1 - common), 0], abs=1e-6)
     moved_m = [0.01 * (1 - common), -0.01 * common, 0]
     assert (2.5 * (after.root - before.root)[:, 11]).tolist() == pytest.approx(moved_m, abs=1e-5)

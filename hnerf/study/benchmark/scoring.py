@@ -24,6 +24,7 @@ from hnerf.evaluation.pictures import crop, frame_person
 from hnerf.evaluation.views import PRIMARY_SPLITS, SPLITS, View, all_views, split_frames
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
+from hnerf.results import CurvePoint, EndScores, ImageScores, Picture, Scores, SplitScores, write_result
 from hnerf.study.benchmark.plan import ScoringSettings
 from hnerf.study.benchmark.training_distance import pose_distances_deg, view_angle_deg
 from hnerf.study.machine import machine
@@ -53,7 +54,7 @@ class ScoringScene:
     device: str
 
 
-def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: Path) -> dict[str, Any]:
+def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: Path) -> Scores:
     """Write `scores.json`, renderings and meshes into `out`; return what scores.json holds.
 
     training: the training's folder. A score that is not available is null, with a reason beside it.
@@ -61,7 +62,7 @@ def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: P
     avatar, split = load_avatar(training, scene.device), settings.split
     unavailable = {name: why for name in SPLITS if (why := reason_unavailable(name, training))}
     protocol = f"{PROTOCOL} {SCORING_PROTOCOL}"
-    found: dict[str, Any] = {"machine": machine(), "protocol": protocol, "lpips": lpips_availability()}
+    found: Any = {"machine": machine(), "protocol": protocol, "lpips": lpips_availability()}
     found["split"], found["training"] = split, json.loads((training / "report.json").read_text())
     scored = scene.capture.test_cameras and split not in unavailable
     found["curve"] = curve(scene, split, training, avatar, settings, out) if scored else []
@@ -80,33 +81,33 @@ def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: P
         str(side): frame_seconds(avatar, camera, scene.capture.train_frames[0], side)
         for side in settings.frame_sizes_px
     }
-    (out / "scores.json").write_text(json.dumps(found, indent=1))
+    write_result(out / "scores.json", Scores, found)
     return found
 
 
-def score_end(scene: ScoringScene, training: Path, settings: ScoringSettings, out: Path) -> dict[str, Any]:
+def score_end(scene: ScoringScene, training: Path, settings: ScoringSettings, out: Path) -> EndScores:
     """Write `scores.json` with training's report and only the last point of its curve; return what it holds."""
     avatar, split = load_avatar(training, scene.device), settings.split
     scored = scene.capture.test_cameras and not reason_unavailable(split, training)
     rows = curve(scene, split, training, avatar, settings, out) if scored else []
-    found = {"training": json.loads((training / "report.json").read_text()), "curve": rows[-1:]}
-    (out / "scores.json").write_text(json.dumps(found, indent=1))
+    found = EndScores(training=json.loads((training / "report.json").read_text()), curve=rows[-1:])
+    write_result(out / "scores.json", EndScores, found)
     return found
 
 
 def curve(
     scene: ScoringScene, split: str, training: Path, finished: Avatar, settings: ScoringSettings, out: Path
-) -> list[dict[str, Any]]:
+) -> list[CurvePoint]:
     """Return training seconds and scores of every snapshot, and last of the finished field, in order of time."""
     end_s = json.loads((training / "report.json").read_text())["field_seconds"]
     taken = {json.loads((f / "settings.json").read_text())["seconds"]: f for f in (training / "snapshots").glob("*")}
     models = [(s, load_avatar(taken[s], scene.device)) for s in sorted(taken) if s < end_s]
-    rows = []
+    rows: list[CurvePoint] = []
     for seconds, avatar in [*models, (end_s, finished)]:
         folder = out / "snapshots" / f"{seconds:g}"
         folder.mkdir(parents=True)
         column = avatar_for_split(split, avatar, scene.fitted)
-        figures = score_views(scene, column, split, settings.snapshot_images, settings.snapshot_meshes, folder)
+        figures: Any = score_views(scene, column, split, settings.snapshot_images, settings.snapshot_meshes, folder)
         del figures["per_image"]
         rows.append({"seconds": seconds} | figures)
         log.info("after %.0f s: %s dB", seconds, figures["psnr"])
@@ -115,14 +116,14 @@ def curve(
 
 def score_views(
     scene: ScoringScene, avatar: Avatar, split: str, images: int | None, meshes: int, out: Path
-) -> dict[str, Any]:
+) -> SplitScores:
     """Score a split's avatar on at most so many images and surfaces, among those with truth, in the format of
     evaluation; None is all."""
     views = all_views(scene.capture, split)
     views = evenly_spaced(views_with_mask(views, scene.truth) or views, images or len(views))
     if views and scene.capture.test_cameras:
         render({split: avatar}, scene.capture, views, out)
-    found = score_split(scene.capture, split, views, scene.truth, out)
+    found: Any = score_split(scene.capture, split, views, scene.truth, out)
     if split not in PRIMARY_SPLITS:
         return found
     if not meshes:
@@ -135,10 +136,10 @@ def score_views(
         return found | {"geometry": None, "geometry_reason": str(error)}
 
 
-def write_pictures(scene: ScoringScene, split: str, per_image: list[dict[str, Any]], out: Path) -> list[dict[str, Any]]:
+def write_pictures(scene: ScoringScene, split: str, per_image: list[ImageScores], out: Path) -> list[Picture]:
     """Write a few scored renderings and the truth, cropped to the person, as `pictures/<k>-{render,truth}.png`; return
     which."""
-    chosen = [{key: row[key] for key in ("camera", "frame")} for row in evenly_spaced(per_image, PICTURES)]
+    chosen = [Picture(camera=row["camera"], frame=row["frame"]) for row in evenly_spaced(per_image, PICTURES)]
     for k, row in enumerate(chosen):
         assert scene.truth is not None  # since images were scored
         box = frame_person(scene.truth.mask(**row))
@@ -148,7 +149,7 @@ def write_pictures(scene: ScoringScene, split: str, per_image: list[dict[str, An
     return chosen
 
 
-def add_training_distances(capture: Capture, avatar: Avatar, split: str, found: dict[str, Any]) -> None:
+def add_training_distances(capture: Capture, avatar: Avatar, split: str, found: SplitScores) -> None:
     """Add to each image's and surface's scores the distance of its view and its pose from those of training."""
     apart_deg = pose_distances_deg(avatar.body, split_frames(capture, split), capture.train_frames)
     vertices_m = avatar.body.vertices_m().cpu().numpy()
@@ -157,7 +158,8 @@ def add_training_distances(capture: Capture, avatar: Avatar, split: str, found: 
     for row in found["per_image"]:
         middle_m = middles_m[avatar.body.index(row["frame"])]
         row["view_angle_deg"] = view_angle_deg(capture.cameras[row["camera"]], trained, middle_m)
-    for row in [*found["per_image"], *((found.get("geometry") or {}).get("per_surface", ()))]:
+    geometry = found.get("geometry")
+    for row in [*found["per_image"], *(geometry["per_surface"] if geometry else ())]:
         row["pose_distance_deg"] = apart_deg[row["frame"]]
 
 

@@ -1,0 +1,96 @@
+"""A texture from the training photographs: each texel's colour as the cameras saw it, on the surface of each frame."""
+
+from collections.abc import Mapping
+from itertools import product
+
+import cv2
+import numpy as np
+import warp as wp
+from scipy.ndimage import map_coordinates
+
+from hnerf.asset.texture import Texels
+from hnerf.avatar.avatar import Gains
+from hnerf.body.descriptor import normals_of
+from hnerf.capture.capture import Capture
+from hnerf.geometry.camera import Camera
+from hnerf.geometry.rays import cast, to_vec3_array
+from hnerf.progress import tracked
+
+OUTLIER = 0.15  # of a colour in [0, 1]: what differs more from the field is another limb, or a passing shadow
+COSINE_POWER = 4  # of the weight of a view by its angle to the normal
+EDGE_PX = 5  # neighbourhood in which a jump of depth is an outline, whose pixels mix two surfaces
+EDGE_SLOPE = 2.5  # of depth to width, from which a slope counts as a jump; seen so obliquely, it weighs nothing either
+DEPTH_TOLERANCE_M = 0.01
+FAR_M = 1e3  # depth where a ray meets nothing
+FIELD_WEIGHT = 0.05  # of the field's colour; a view along the normal weighs 1
+
+
+def colours_from_photographs(
+    capture: Capture, gains: Gains, surfaces_m: Mapping[int, np.ndarray], faces: np.ndarray, texels: Texels,
+    field_colours: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Return the colour of each texel, (N, 3) in [0, 1], from the training photographs of some frames; the field's own,
+    field_colours (N, 3), where none sees it. surfaces_m: vertices (V, 3) in the world by frame.
+
+    The mean over views, weighted by the fourth power of the cosine to the normal, and less the more a view contradicts
+    the field (Geman-McClure). A view counts for nothing where the surface hides the texel, or near an outline. Colours
+    are divided by the gains of their cameras.
+    """
+    weight = np.full((len(field_colours), 1), FIELD_WEIGHT)
+    total = FIELD_WEIGHT * field_colours
+    views = list(product(surfaces_m, capture.train_cameras))
+    for frame, name in tracked(views, "photographs", len(views)):
+        camera, gain = capture.cameras[name], gains.get(name, (1.0, 1.0, 1.0))
+        index, cosine, pixels_px = visible_texels(camera, surfaces_m[frame], faces, texels)
+        colour = _sampled(capture.image(name, frame), pixels_px) / gain
+        error = np.linalg.norm(colour - field_colours[index], axis=1) / OUTLIER
+        counts = (cosine**COSINE_POWER / (1 + error**2) ** 2)[:, None]
+        weight[index] += counts
+        total[index] += counts * colour
+    return np.clip(total / weight, 0, 1)
+
+
+def visible_texels(
+    camera: Camera, vertices_m: np.ndarray, faces: np.ndarray, texels: Texels
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which texels (M,) a camera sees away from outlines, the cosines of its view to their normals (M,), and
+    their pixels (M, 2)."""
+    normals = normals_of(vertices_m, faces)
+    towards = camera.centre_m - vertices_m
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    facing = ((normals * towards).sum(1) > 0)[faces].any(1)
+    index = np.flatnonzero(facing[texels.face.numpy()])
+    corners, share = faces[texels.face.numpy()[index]], texels.barycentric.numpy()[index, :, None]
+    points_m, normal = ((values[corners] * share).sum(1) for values in (vertices_m, normals))
+    pixels_px, _ = camera.project(points_m)
+    view_m = camera.centre_m - points_m
+    distance_m = np.linalg.norm(view_m, axis=1)
+    cosine = (view_m * normal).sum(1) / (distance_m * np.linalg.norm(normal, axis=1).clip(1e-9))
+    seen_m, outline = _depth(camera, vertices_m, faces)
+    column, row = np.round(pixels_px).astype(int).T
+    inside = (column >= 0) & (row >= 0) & (column < camera.width_px) & (row < camera.height_px) & (cosine > 0)
+    column, row = (np.where(inside, at, 0) for at in (column, row))
+    visible = inside & ~outline[row, column] & (distance_m < seen_m[row, column] + DEPTH_TOLERANCE_M / cosine.clip(0.1))
+    return index[visible], cosine[visible], pixels_px[visible]
+
+
+def _depth(camera: Camera, vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distance (H, W) at which each pixel's ray meets a surface, and where it jumps (H, W) bool."""
+    at_px = camera.project(vertices_m)[0]
+    box_px = np.stack([np.floor(at_px.min(0)) - EDGE_PX, np.ceil(at_px.max(0)) + EDGE_PX + 1])
+    lower, upper = box_px.clip(0, [camera.width_px, camera.height_px]).astype(int)
+    depth_m = np.full((camera.height_px, camera.width_px), FAR_M, np.float32)
+    x, y = np.meshgrid(np.arange(lower[0], upper[0]), np.arange(lower[1], upper[1]))
+    mesh = wp.Mesh(to_vec3_array(vertices_m, "cpu"), wp.array(faces.astype(np.int32).ravel(), dtype=int, device="cpu"))
+    hits = cast(mesh, *camera.rays(np.stack([x.ravel(), y.ravel()], 1).astype(float)))
+    depth_m[y.ravel(), x.ravel()] = np.where(hits.face >= 0, hits.distance_m, FAR_M)
+    window = np.ones((EDGE_PX, EDGE_PX), np.uint8)
+    near_m = cv2.erode(depth_m, window)
+    width_m = (EDGE_PX - 1) * near_m / camera.K[0, 0]
+    return depth_m, cv2.dilate(depth_m, window) - near_m > EDGE_SLOPE * width_m
+
+
+def _sampled(image: np.ndarray, pixels_px: np.ndarray) -> np.ndarray:
+    """Return the colours (M, 3) in [0, 1] at points (M, 2) of an image (H, W, 3) uint8, by bilinear interpolation."""
+    x, y = pixels_px.T
+    return np.stack([map_coordinates(image[..., k] / 255, [y, x], order=1, mode="nearest") for k in range(3)], 1)

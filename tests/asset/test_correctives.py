@@ -1,0 +1,51 @@
+import dataclasses
+
+import numpy as np
+import torch
+
+from hnerf.asset.correctives import correctives_of, frame_displacements, step_to_surface, with_displacements
+from hnerf.asset.rig_transfer import clothed_rig
+from tests.asset.figure import bending_body, upright_column
+from tests.asset.stand_in import StandInAvatar
+
+
+def test_steps_fade_beyond_half_of_the_longest() -> None:
+    steps_m = step_to_surface(torch.tensor([0.01, -0.015, 0.0225, 0.03, 0.2]))
+    torch.testing.assert_close(steps_m, torch.tensor([0.01, -0.015, 0.01125, 0.0, 0.0]))
+
+
+def test_the_skinned_surface_is_moved_onto_the_fields_in_the_rest_pose() -> None:
+    """Clothes of 17 cm around a field of 16: a centimetre inwards on the sides, in every pose, away from the joint."""
+    body, clothes = bending_body(), upright_column(0.17, -0.02, 1.62)
+    clothed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
+    moved_m = frame_displacements(StandInAvatar(body), clothed)
+    rest_m = clothes.vertices
+    sides = (np.abs(rest_m[:, 2] - 0.8) > 0.35) & (rest_m[:, 2] > 0.1) & (rest_m[:, 2] < 1.5)
+    inwards = -0.01 * rest_m[sides] / np.linalg.norm(rest_m[sides, :2], axis=1, keepdims=True) * (1, 1, 0)
+    assert moved_m.shape == (len(body.frames), len(rest_m), 3)
+    for frame in moved_m:
+        np.testing.assert_allclose(frame[sides], inwards, atol=0.0015)
+
+
+def test_displacements_are_turned_by_the_skinning() -> None:
+    body = bending_body()
+    moved_m = np.random.default_rng(0).normal(scale=0.01, size=(4, len(body.rig.vertices_m), 3)).astype(np.float32)
+    surfaces_m = with_displacements(body, moved_m)
+    for row in range(4):
+        rig = dataclasses.replace(body.rig, vertices_m=body.rig.vertices_m + torch.from_numpy(moved_m[row]))
+        np.testing.assert_allclose(surfaces_m[row], dataclasses.replace(body, rig=rig).vertices_m()[row], atol=1e-6)
+
+
+def test_one_shape_holds_displacements_that_are_multiples_of_it() -> None:
+    shape_m = np.array([[0.01, 0, 0], [0, -0.02, 0]])
+    found = correctives_of(np.stack([shape_m, -2 * shape_m, 0 * shape_m]).astype(np.float32), 1)
+    np.testing.assert_allclose(np.abs(found.weights[:, 0]), [0.5, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(found.weights[1, 0] * found.offsets_m[0], -2 * shape_m, atol=1e-7)
+
+
+def test_shapes_leave_the_least_squared_displacement() -> None:
+    """Two orthogonal shapes of 3 and 1 cm; the one that is kept is the larger."""
+    moved_m = np.array([[[0.03, 0, 0]], [[0, 0.01, 0]]], np.float32)
+    found = correctives_of(moved_m, 1)
+    np.testing.assert_allclose(np.einsum("nk,kvd->nvd", found.weights, found.offsets_m)[:, 0, 1], 0, atol=1e-7)
+    assert correctives_of(moved_m, 8).weights.shape == (2, 2)

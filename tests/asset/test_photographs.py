@@ -1,0 +1,110 @@
+"""Textures from photographs: squares before a camera, worked out by hand."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from hnerf.asset.photographs import FIELD_WEIGHT, OUTLIER, colours_from_photographs, visible_texels
+from hnerf.asset.texture import Texels
+from hnerf.geometry.camera import Camera
+
+SIZE_PX = 101
+FACES = np.array([[0, 2, 1], [0, 3, 2]])  # seen from the front, towards -z
+
+
+def camera(name: str = "front", angle: float = 0.0) -> Camera:
+    """Return a camera 2 m from the origin, turned about the vertical, at which a metre spans 50 px."""
+    c, s = np.cos(angle), np.sin(angle)
+    R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
+    return Camera(name, K, R, np.array([0, 0, 2.0]), SIZE_PX, SIZE_PX)
+
+
+def square(half_m: float, z_m: float) -> np.ndarray:
+    """Return the corners of an upright square."""
+    return np.array([[-half_m, -half_m, z_m], [half_m, -half_m, z_m], [half_m, half_m, z_m], [-half_m, half_m, z_m]])
+
+
+def texels_at(face: list[int], barycentric: list[list[float]]) -> Texels:
+    """Return texels on faces."""
+    place = torch.zeros(len(face), dtype=torch.long)
+    return Texels(place, place, torch.tensor(face), torch.tensor(barycentric))
+
+
+MIDDLE = [0.5, 0.5, 0.0]  # of corners 0 and 2: the square's centre
+
+
+def capture(photographs: dict[str, int], cameras: list[Camera]) -> Any:
+    """Return a capture whose photographs are of one grey level each, of 255."""
+    image = {name: np.full((SIZE_PX, SIZE_PX, 3), level, np.uint8) for name, level in photographs.items()}
+    return SimpleNamespace(
+        cameras={c.name: c for c in cameras},
+        train_cameras=tuple(c.name for c in cameras),
+        image=lambda name, frame: image[name],
+    )
+
+
+def test_a_texel_is_seen_where_it_projects() -> None:
+    index, cosine, pixels_px = visible_texels(camera(), square(0.4, 0.0), FACES, texels_at([0], [[0.5, 0.25, 0.25]]))
+    assert index.tolist() == [0]
+    np.testing.assert_allclose(pixels_px, [[50, 40]], atol=1e-4)  # (0, -0.2) m, 50 px a metre
+    np.testing.assert_allclose(cosine, [2 / np.sqrt(4.04)], atol=1e-6)
+
+
+def test_a_square_behind_another_is_hidden_and_one_from_behind_too() -> None:
+    vertices_m = np.concatenate([square(0.4, 0.0), square(0.4, -0.3)])
+    both = np.concatenate([FACES, FACES + 4])
+    index, _, _ = visible_texels(camera(), vertices_m, both, texels_at([0, 2], [MIDDLE, MIDDLE]))
+    assert index.tolist() == [1]
+    index, _, _ = visible_texels(camera(), square(0.4, 0.0), FACES[:, ::-1].copy(), texels_at([0], [MIDDLE]))
+    assert len(index) == 0
+
+
+def test_texels_near_an_outline_are_left_out() -> None:
+    """The square ends at 30 px; the third pixel from there is the first whose neighbourhood has no jump."""
+    at_px = np.array([31.0, 34.0])
+    share = (at_px - 30) / 40  # along the diagonal from corner 0 to corner 2
+    texels = texels_at([0, 0], [[1 - s, s, 0] for s in share.tolist()])
+    index, _, pixels_px = visible_texels(camera(), square(0.4, 0.0), FACES, texels)
+    assert index.tolist() == [1]
+    np.testing.assert_allclose(pixels_px, [[34, 34]], atol=1e-4)
+
+
+def test_colours_are_means_by_the_fourth_power_of_the_cosine() -> None:
+    """Views at 0 and 60 degrees weigh 1 and 1/16, times their agreement with the field's 0.5."""
+    cameras = [camera(), camera("side", np.pi / 3)]
+    found = colours_from_photographs(
+        capture({"front": 130, "side": 125}, cameras),
+        {},
+        {0: square(0.4, 0.0)},
+        FACES,
+        texels_at([0], [MIDDLE]),
+        np.full((1, 3), 0.5),
+    )
+    colours = np.array([0.5, 130 / 255, 125 / 255])
+    agreement = 1 / (1 + 3 * ((colours - 0.5) / OUTLIER) ** 2) ** 2
+    weights = agreement * [FIELD_WEIGHT, 1, 1 / 16]
+    np.testing.assert_allclose(found, (weights @ colours) / weights.sum(), atol=1e-5)
+
+
+def test_gains_are_divided_out_and_unseen_texels_keep_the_fields_colour() -> None:
+    found = colours_from_photographs(
+        capture({"front": 204}, [camera()]),
+        {"front": (2.0, 2.0, 2.0)},
+        {0: np.concatenate([square(0.4, 0.0), square(0.2, 0.5)])},
+        np.concatenate([FACES, FACES + 4]),
+        texels_at([0, 2], [MIDDLE, MIDDLE]),
+        np.array([[0.4, 0.4, 0.4], [0.1, 0.2, 0.3]]),
+    )
+    np.testing.assert_allclose(found, [[0.4, 0.4, 0.4], [0.1, 0.2, 0.3]], atol=1e-6)
+
+
+def test_a_photograph_that_contradicts_the_field_counts_little() -> None:
+    """White against black is sqrt(3) / OUTLIER of an outlier."""
+    args = ({}, {0: square(0.4, 0.0)}, FACES, texels_at([0], [MIDDLE]), np.zeros((1, 3)))
+    vote = 1 / (1 + 3 / OUTLIER**2) ** 2
+    found = colours_from_photographs(capture({"front": 255}, [camera()]), *args)
+    assert found[0, 0] == pytest.approx(vote / (vote + FIELD_WEIGHT), abs=1e-6)
