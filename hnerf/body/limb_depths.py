@@ -67,8 +67,9 @@ def observe_limb_depths(capture: Capture, observations: Observations) -> LimbDep
             depth_m, seen = metres[t, person, :, 2], pixels[t, person, :, 2]
             depths_m[t] = depth_m[ends[:, 1]] - depth_m[ends[:, 0]]
             trust[t] = seen[ends].min(1)
-    camera, seen = observations.cameras[0], keypoints[..., 2:] > 0
-    middle = (keypoints[..., :2] * seen).sum(1) / seen.sum(1).clip(1)
+    camera = observations.cameras[0]
+    shown: np.ndarray = keypoints[..., 2:] > 0
+    middle = (keypoints[..., :2] * shown).sum(1) / shown.sum(1).clip(1)
     rays = np.column_stack([middle, np.ones(len(middle))]) @ np.linalg.inv(camera.K).T @ camera.R
     away = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     return LimbDepths(*(torch.from_numpy(part) for part in (depths_m, trust, away)))
