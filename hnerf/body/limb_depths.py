@@ -66,9 +66,9 @@ def observe_limb_depths(capture: Capture, observations: Observations) -> LimbDep
         if person is not None:
             depth_m, seen = metres[t, person, :, 2], pixels[t, person, :, 2]
             depths_m[t] = depth_m[ends[:, 1]] - depth_m[ends[:, 0]]
-            trust[t] = seen[ends].min(1)
+            trust[t] = np.minimum(seen[ends[:, 0]], seen[ends[:, 1]])
     camera = observations.cameras[0]
-    shown: np.ndarray = keypoints[..., 2:] > 0
+    shown = np.where(keypoints[..., 2:] > 0, 1.0, 0.0)
     middle = (keypoints[..., :2] * shown).sum(1) / shown.sum(1).clip(1)
     rays = np.column_stack([middle, np.ones(len(middle))]) @ np.linalg.inv(camera.K).T @ camera.R
     away = rays / np.linalg.norm(rays, axis=1, keepdims=True)
@@ -79,9 +79,9 @@ def _same_person(subject: np.ndarray, people: np.ndarray) -> int | None:
     """Return which of people (P, K, 3) has the keypoints of the subject (K, 3); None if none is near enough."""
     both = (subject[:, 2] > 0) & (people[..., 2] > 0)
     distance = np.where(both, np.linalg.norm(people[..., :2] - subject[:, :2], axis=-1), np.nan)
-    known = both.any(1)
+    known = np.any(both, axis=1)
     if not known.any():
         return None
-    median = np.where(known, np.nanmedian(np.where(known[:, None], distance, 0), axis=1), np.inf)
+    median = np.where(known, np.nanmedian(np.where(known[..., None], distance, 0), axis=1), np.inf)
     nearest = int(median.argmin())
     return nearest if median[nearest] < SAME_PERSON * float(person_heights_px(subject[None])[0]) else None
