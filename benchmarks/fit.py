@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from provenance import SHARED, provenance, provenance_line, table, write_result
 
-from flows.train_subject import prepare_training
+from flows.train_subject import prepare_training, with_detections
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import load_settings
 from hnerf.geometry.silhouette import silhouette
@@ -60,7 +60,8 @@ def measure(folder: Path, store: Store) -> dict[str, Any]:
     """Score a capture's fit against its ground truth."""
     settings = load_settings("fast")
     source, _ = read_capture(folder)
-    recording, calibration, _, made = prepare_training(store, ingest(store, source, settings.capture), settings)
+    recording = with_detections(store, ingest(store, source, settings.capture), settings)
+    recording, calibration, _, made = prepare_training(store, recording, settings)
     capture, fit = calibrated_capture(recording, calibration), BodyFit.load(made.root)
     with tempfile.TemporaryDirectory() as subject:
         (Path(subject) / "fit").symlink_to(made.root)

@@ -13,7 +13,7 @@ from typing import Any
 from prefect import flow
 
 from flows.run_page import publish_markdown
-from flows.train_subject import prepare_training, with_keypoints
+from flows.train_subject import prepare_training, with_detections
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, Settings, load_settings, read_yaml, with_changes
 from hnerf.errors import InputError, one_line
@@ -87,7 +87,7 @@ def choose(full: Settings, only: Sequence[str]) -> tuple[dict[str, Settings], di
 
 def measure(store: Store, source: Source, truth: Source, settings: Settings) -> dict[str, Any]:
     """Return a row: scores of every split, seconds and device of its training; {"error": one line} if one fails."""
-    recording = with_keypoints(store, ingest(store, source, settings.capture), settings)
+    recording = with_detections(store, ingest(store, source, settings.capture), settings)
     prepared = prepare_training(store, recording, settings)
     try:
         training = train(store, *prepared, settings.training)

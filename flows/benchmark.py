@@ -8,7 +8,7 @@ from typing import Any
 from prefect import flow
 
 from flows.run_page import publish_markdown
-from flows.train_subject import Prepared, prepare_training, with_keypoints
+from flows.train_subject import Prepared, prepare_training, with_detections
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
 from hnerf.errors import InputError, one_line
@@ -83,7 +83,7 @@ def measure(
     fails."""
     try:
         settings, more = plan.settings(method), dict[str, Any]()
-        recording = with_keypoints(store, ingest(store, source, settings.capture), settings)
+        recording = with_detections(store, ingest(store, source, settings.capture), settings)
         parts = variant.select(Capture.load(recording.root))
         if parts != (None, None, None):
             recording = subset_capture(store, recording, *parts)

@@ -67,7 +67,7 @@ def _write_capture(out: Path, settings: SyntheticSettings) -> None:
 
 def check_cameras(options: argparse.Namespace) -> None:
     """Read a recording and check its cameras, nothing more."""
-    from flows.train_subject import with_keypoints
+    from flows.train_subject import with_detections
     from tasks.calibration import calibrate
     from tasks.capture import ingest
     from tasks.source import read_capture
@@ -75,7 +75,7 @@ def check_cameras(options: argparse.Namespace) -> None:
 
     settings, store = load_settings(options.preset), Store(options.store.resolve())
     source, _ = read_capture(options.capture, options.store)
-    recording = with_keypoints(store, ingest(store, source, settings.capture), settings)
+    recording = with_detections(store, ingest(store, source, settings.capture), settings)
     calibration = calibrate(store, recording, settings.calibration)
     print("\n".join(_table(json.loads((calibration.root / "report.json").read_text()))))
     print(f"picture: {calibration.root / 'cameras.png'}")

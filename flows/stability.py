@@ -11,7 +11,7 @@ import numpy as np
 from prefect import flow
 
 from flows.run_page import publish_markdown
-from flows.train_subject import Prepared, prepare_training, with_keypoints
+from flows.train_subject import Prepared, prepare_training, with_detections
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
 from hnerf.errors import InputError, NotApplicableError, one_line
@@ -135,7 +135,7 @@ def _runs_of_seed(
 
 def ingest_part(store: Store, source: Source, plan: StabilityStudy, settings: Settings) -> Artifact:
     """Ingest the recording, or that part of it which the study uses."""
-    recording = with_keypoints(store, ingest(store, source, settings.capture), settings)
+    recording = with_detections(store, ingest(store, source, settings.capture), settings)
     parts = plan.part.select(Capture.load(recording.root))
     return recording if parts == (None, None, None) else subset_capture(store, recording, *parts)
 

@@ -16,6 +16,7 @@ from tasks.capture import ingest, subset_capture
 from tasks.detection import detect, needs_detection
 from tasks.evaluation import evaluate, evaluate_held_out
 from tasks.fit import fit
+from tasks.hands import find_hands, needs_hands
 from tasks.ledger import forget
 from tasks.segmentation import converged, needs_body, segment
 from tasks.source import read_capture
@@ -64,7 +65,7 @@ def train_subject(
     subject = Capture.load(recorded.root).name
     artifact_store.claim(subject, source.digest, source.root)
     artifact_store.link_latest(subject, recorded)
-    recording = artifact_store.link_latest(subject, with_keypoints(artifact_store, recorded, settings))
+    recording = artifact_store.link_latest(subject, with_detections(artifact_store, recorded, settings))
     calibration = artifact_store.link_latest(subject, calibrate(artifact_store, recording, settings.calibration))
     left_out = calibrated_held_out_cameras(recording, calibration, settings)
     segmentation = artifact_store.link_latest(
@@ -92,10 +93,12 @@ def train_subject(
     return trained
 
 
-def with_keypoints(store: Store, recorded: Artifact, settings: Settings) -> Artifact:
-    """Return the recording, with people detected by a network if it needs that."""
+def with_detections(store: Store, recorded: Artifact, settings: Settings) -> Artifact:
+    """Return the recording with people detected by a network if it needs that, and with points of the subject's hands
+    if they are wanted and the network is installed."""
     wanted = needs_detection(recorded, settings.detection)
-    return detect(store, recorded, settings.detection) if wanted else recorded
+    recording = detect(store, recorded, settings.detection) if wanted else recorded
+    return find_hands(store, recording) if needs_hands(recording, settings.detection) else recording
 
 
 def prepare_training(store: Store, recording: Artifact, settings: Settings) -> Prepared:

@@ -6,12 +6,13 @@ from pathlib import Path
 from hnerf.capture.capture import Capture
 from hnerf.config import DetectionSettings
 from hnerf.detection.detect import detect as detect_people
+from hnerf.models import POSE_DETECTOR, has_model
 from tasks.launcher import LostWorkerError
 from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("detection", version="2", resumable=True)
+@stage("detection", version="3", resumable=True)
 def detect(out: Path, recording: Artifact, settings: DetectionSettings) -> dict[str, float]:
     """Write the recording with keypoints of its training cameras; resume after the cameras that an interrupted run
     finished."""
@@ -24,7 +25,9 @@ def detect(out: Path, recording: Artifact, settings: DetectionSettings) -> dict[
 
 def needs_detection(recording: Artifact, settings: DetectionSettings) -> bool:
     """Return whether to run the network: the settings request it, or the recording has neither keypoints nor given
-    poses."""
+    poses, or a single camera, for which the network, if it is installed, sees the depth of limbs."""
     capture = Capture.load(recording.root)
-    silent = not capture.has_keypoints and capture.given_poses() is None
-    return settings.source in ("network", "both") or (settings.source is None and silent)
+    posed = capture.given_poses() is not None
+    flat = len(capture.train_cameras) == 1 and not posed and has_model(POSE_DETECTOR)
+    silent = not capture.has_keypoints and not posed
+    return settings.source in ("network", "both") or (settings.source is None and (silent or flat))

@@ -35,6 +35,7 @@ import numpy as np
 
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.ingest import ingest, recognise
+from hnerf.capture.uncalibrated import Uncalibrated
 from hnerf.config import CaptureSettings, load_settings
 from hnerf.errors import InputError
 from hnerf.render.motion import _read_amass
@@ -154,6 +155,15 @@ def _videos(folder: Path) -> None:
     (folder / "capture.toml").write_text(text)
 
 
+def _uncalibrated(folder: Path) -> None:
+    _easymocap(folder)
+    (folder / "extri.yml").unlink()
+
+
+def _read_uncalibrated(folder: Path, out: Path) -> object:
+    return ingest(folder, CaptureSettings(), out, Uncalibrated(folder))
+
+
 def _motion(folder: Path) -> None:
     folder.mkdir()
     np.savez_compressed(folder / "a.npz", poses=np.ones((3, 156)), trans=np.zeros((3, 3)), mocap_framerate=120.0)
@@ -186,6 +196,7 @@ READERS = (
     Reader("zju-mocap", _zju, _ingest),
     Reader("peoplesnapshot", _peoplesnapshot, _ingest),
     Reader("videos", _videos, _ingest),
+    Reader("uncalibrated", _uncalibrated, _read_uncalibrated),
     Reader("motion", _motion, lambda folder, out: _read_amass(folder / "a.npz")),
     Reader("camera path", _camera_path, lambda folder, out: read_camera_path(folder / "path.json", (24, 16))),
     Reader("preset", _preset, lambda folder, out: load_settings(str(folder / "mine.yaml"))),

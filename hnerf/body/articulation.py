@@ -1,8 +1,9 @@
 """Points carried by the joints that turn, with their analytic Jacobian.
 
 Locked joints follow their nearest free ancestor rigidly, so a rig of a hundred joints reduces to about twenty that
-move. A point's world position is linear in their transforms and in the shape: x = sum_m R_m (a_m - w_m q_m) + w_m p_m
-with rest joint q_m, posed joint p_m, and a_m the point's rest position times its weight w_m on joint m.
+move. Locked joints that have a turn nevertheless, those of fingers, keep it. A point's world position is linear in the
+moving joints' transforms and in the shape: x = sum_m R_m (a_m - w_m q_m) + w_m p_m with rest joint q_m, posed joint
+p_m, and a_m the point's rest position times its weight w_m on joint m.
 
 The unknowns of a frame, in this order: the root joint's displacement (3) in metres, a rotation about it (3) in world
 axes, then the change of axis-angle (3) of every other moving joint.
@@ -13,16 +14,22 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from hnerf.body.rig import Rig, joint_transforms, posed_joint_basis, rotation_from_axis_angle
+from hnerf.body.rig import (
+    Rig,
+    joint_transforms,
+    pose_vertices,
+    posed_joint_basis,
+    rotation_from_axis_angle,
+)
 
 
 @dataclass(frozen=True)
 class Pose:
     """The state that a fit optimises: the shape, the poses of n frames, and keypoint offsets.
 
-    rig: linearised at the shape, its `beta` (B,); theta (n, J, 3) radians, zero at locked joints and the root; root (n,
-    4, 4) world from body, metres; offsets_m (25, 3): where the detector sees each keypoint on the rest body, minus
-    where the body model has it.
+    rig: linearised at the shape, its `beta` (B,); theta (n, J, 3) radians, zero at the root; root (n, 4, 4) world from
+    body, metres; offsets_m (25, 3): where the detector sees each keypoint on the rest body, minus where the body model
+    has it.
     """
 
     rig: Rig
@@ -44,12 +51,17 @@ class Points:
 @dataclass(frozen=True)
 class PosedJoints:
     """Moving joints in the world: rotations (n, M, 3, 3); positions_m (n, M, 3); axes (n, M, 3, 3), whose columns are
-    the world rotation vectors of the joint's three unknowns; shape_m (n, M, 3, B), displacement per unit of beta."""
+    the world rotation vectors of the joint's three unknowns; shape_m (n, M, 3, B), displacement per unit of beta;
+    bent_m (n, K, 3): what turns of locked joints add to the vertices `bent` (K,), by way of
+    the moving joints `bent_by` (K,)."""
 
     rotations: Tensor
     positions_m: Tensor
     axes: Tensor
     shape_m: Tensor
+    bent: Tensor
+    bent_by: Tensor
+    bent_m: Tensor
 
 
 class Articulation:
@@ -60,10 +72,11 @@ class Articulation:
         moves = rig.free.clone()
         moves[0] = True
         self.joints = moves.nonzero()[:, 0]
-        carrier = torch.zeros(len(moves), dtype=torch.long)  # index of the moving joint that each joint follows
+        carrier = torch.zeros(len(moves), dtype=torch.long)
         slot = moves.cumsum(0) - 1
         for j, parent in enumerate(rig.parents.tolist()):
             carrier[j] = slot[j] if moves[j] else carrier[parent]
+        self.carrier = carrier  # index of the moving joint that each joint follows, (J,)
         self.parents = carrier[rig.parents[self.joints].clamp(min=0)]
         count = len(self.joints)
         self.subtree = torch.eye(count, dtype=rig.vertices_m.dtype)  # below[j, m] = 1 if turning j moves m
@@ -94,14 +107,41 @@ class Articulation:
         axes = above @ left_jacobian(pose.theta[:, self.joints])
         axes[:, 0] = torch.eye(3, dtype=axes.dtype)
         shape = posed_joint_basis(self.rig, world, pose.root)[:, self.joints]
-        return PosedJoints(rotations, positions, axes, shape)
+        bent, bent_by = self._bent_vertices(pose.theta)
+        part = replace(
+            self.rig,
+            vertices_m=self.rig.vertices_m[bent],
+            skin_joints=self.rig.skin_joints[bent],
+            skin_weights=self.rig.skin_weights[bent],
+        )
+        bent_m = pose_vertices(part, pose.theta, pose.root) - self._rigid(bent, rotations, positions)
+        return PosedJoints(rotations, positions, axes, shape, bent, bent_by, bent_m)
+
+    def _bent_vertices(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the vertices (K,) on locked joints that have a turn in some frame, or on joints below them, and the
+        moving joints that carry these (K,)."""
+        turned = (theta != 0).any(-1).any(0)
+        turned[self.joints] = False
+        for j, parent in enumerate(self.rig.parents.tolist()):
+            turned[j] |= parent >= 0 and turned[parent]
+        on_turned = turned[self.rig.skin_joints] & (self.rig.skin_weights > 0)
+        bent = on_turned.any(1).nonzero()[:, 0]
+        slot = on_turned[bent].int().argmax(1)
+        return bent, self.carrier[self.rig.skin_joints[bent, slot]]
+
+    def _rigid(self, ids: Tensor, rotations: Tensor, positions_m: Tensor) -> Tensor:
+        """Return vertices `ids` (K,) as the moving joints carry them, (..., K, 3) world: rotations (..., M, 3, 3) and
+        positions_m (..., M, 3) of these."""
+        moved = positions_m - (rotations @ self.rest_m[..., None])[..., 0]
+        blended = self.vertex_weights[ids] @ torch.cat([rotations.flatten(-2), moved], -1)
+        return (blended[..., :9].unflatten(-1, (3, 3)) @ self.rig.vertices_m[ids, :, None])[..., 0] + blended[..., 9:]
 
     def surface(self, joints: PosedJoints, frame: int) -> Tensor:
         """Return every vertex in one frame, (V, 3) world."""
-        rotations = joints.rotations[frame]
-        moved = joints.positions_m[frame] - (rotations @ self.rest_m[..., None])[..., 0]
-        blended = self.vertex_weights @ torch.cat([rotations.flatten(1), moved], 1)
-        return (blended[:, :9].unflatten(1, (3, 3)) @ self.rig.vertices_m[..., None])[..., 0] + blended[:, 9:]
+        everything = torch.arange(len(self.rig.vertices_m))
+        surface = self._rigid(everything, joints.rotations[frame], joints.positions_m[frame])
+        surface[joints.bent] += joints.bent_m[frame]
+        return surface
 
     def jacobian(self, points: Points, joints: PosedJoints) -> tuple[Tensor, Tensor, Tensor]:
         """Return positions (n, P, 3), and their derivatives by the frame's unknowns (n, P, 3, U) and by beta (n, P, 3,
@@ -127,6 +167,9 @@ class Articulation:
         weights, rest = self.vertex_weights[ids], self.rig.vertices_m[ids, None] - self.rest_m
         rotations, positions = joints.rotations[frame], joints.positions_m[frame]
         carried = weights[..., None] * (torch.einsum("mcd,pmd->pmc", rotations, rest) + positions)
+        bent = torch.searchsorted(joints.bent, ids.contiguous()).clamp(max=max(len(joints.bent) - 1, 0))
+        rows = (joints.bent[bent] == ids).nonzero()[:, 0] if len(joints.bent) else ids[:0]
+        carried[rows, joints.bent_by[bent[rows]]] += joints.bent_m[frame, bent[rows]]
         lever = torch.einsum("jm,pmd->pjd", self.subtree, carried) - (weights @ self.subtree.T)[..., None] * positions
         torque = torch.linalg.cross(lever, directions[:, None].expand_as(lever))
         by_rotation = torch.einsum("pmc,mcu->pmu", torque, joints.axes[frame]).flatten(1)

@@ -18,8 +18,9 @@ from skimage.measure import find_contours
 
 from hnerf.body.articulation import Articulation, Pose, PosedJoints
 from hnerf.body.descriptor import normals_of
-from hnerf.body.keypoint_fit import Problem, project
+from hnerf.body.keypoint_fit import Problem
 from hnerf.body.normal_equations import NormalEquations
+from hnerf.body.reprojection import project
 from hnerf.config import FitSettings
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.silhouette import silhouette

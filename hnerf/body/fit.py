@@ -17,15 +17,21 @@ from hnerf.body.balance import Balance
 from hnerf.body.body_model import BodyModel, body_model
 from hnerf.body.clothed_fit import refine_with_clothing
 from hnerf.body.contour_fit import Outline, outline, refine_with_outlines
+from hnerf.body.fingers import fit_fingers
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.given_start import given_poses_note, initial_pose_from_given, observations_of_pose
+from hnerf.body.ground import Ground
+from hnerf.body.hand_points import PalmTerm, has_fingers, observe_hands
 from hnerf.body.initial_root import root_from_image, root_from_space
-from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel, project
+from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel
+from hnerf.body.limb_depths import observe_limb_depths
 from hnerf.body.observations import Observations, observe, runs
 from hnerf.body.pose_prior import PosePrior, Smoothness
 from hnerf.body.posture_prior import PosturePrior
+from hnerf.body.reprojection import project
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
+from hnerf.capture.timing import median_step
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
 from hnerf.geometry.silhouette import silhouette
@@ -62,6 +68,9 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
         smoothness = Smoothness(runs(capture), capture.fps, settings.acceleration_mps2 * ACCELERATION_SCALE)
         up = "xyz".index(capture.up)
         balance = Balance(up) if len(observations.cameras) == 1 else None
+        hands, step_s = observe_hands(capture), median_step(capture.frames) / capture.fps
+        ground = Ground(up) if balance else None
+        limb_depths = observe_limb_depths(capture, observations)
         with _timed(seconds, "start"):
             pose = given_pose or initial_pose(capture, observations, model)
         if len(observations.cameras) > 1:
@@ -72,22 +81,37 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
                 pose = levenberg_marquardt(problem, pose, problem.space_term, KEYPOINT_STEPS)
         with _timed(seconds, "keypoints in images"):
             problem = make_problem(model, pose, observations, smoothness, settings, offsets=1, proportions=TIGHT_STD)
-            problem = replace(problem, balance=balance)
+            problem = replace(problem, balance=balance, ground=ground, limb_depths=limb_depths)
+            palm = PalmTerm(hands, problem.scale_m) if hands and has_fingers(pose.rig) else None
             pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
+            if palm:
+                problem = replace(problem, palm=replace(palm, scale_m=problem.scale_m))
+                pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
             if balance:
                 posture_prior = PosturePrior.of_single_view(_by_split(capture), pose, observations.cameras[0])
                 pose = resolve_depth_flips(replace(problem, posture_prior=posture_prior), pose, runs(capture))
                 pose, posture_prior = hold_single_posture(problem, pose, posture_prior)
             else:
-                posture_prior = PosturePrior.of_wrists(len(pose.root), Articulation(pose.rig))
+                seen = palm.seen() if palm else None
+                posture_prior = PosturePrior.of_wrists(len(pose.root), Articulation(pose.rig), seen)
+        if palm:
+            with _timed(seconds, "fingers"):
+                pose = fit_fingers(pose, palm.views, problem.scale_m, runs(capture), step_s)
         if masks is not None:
             with _timed(seconds, "outlines"):
                 problem = make_problem(model, pose, observations, smoothness, settings, offsets=1, proportions=1)
-                problem = replace(problem, balance=balance, posture_prior=posture_prior)
+                problem = replace(
+                    problem, balance=balance, ground=ground, limb_depths=limb_depths, posture_prior=posture_prior
+                )
+                if palm:
+                    problem = replace(problem, palm=replace(palm, scale_m=problem.scale_m))
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
                 pose = refine_with_outlines(problem, pose, edges, settings, up)
             with _timed(seconds, "clothes"):
                 pose = refine_with_clothing(problem, pose, edges)
+        if palm and masks is not None:
+            with _timed(seconds, "fingers again"):
+                pose = fit_fingers(pose, palm.views, problem.scale_m, runs(capture), step_s)
         fit = BodyFit(pose.rig.to(dtype=torch.float32), capture.frames, pose.theta.float(), pose.root.float())
         report = _report(capture, masks, observations, pose, fit, seconds)
         if given_pose:

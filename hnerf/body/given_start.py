@@ -6,8 +6,8 @@ from torch import Tensor
 from hnerf.body.articulation import Pose
 from hnerf.body.body_model import BodyModel
 from hnerf.body.canonical import axis_angle_from_rotation
-from hnerf.body.keypoint_fit import NEAR_M, project
 from hnerf.body.observations import Observations
+from hnerf.body.reprojection import NEAR_M, project
 from hnerf.body.rig import Rig, pose_vertices, rotation_from_axis_angle
 from hnerf.body.smpl import BODY_FROM_SMPL, JOINTS, LOCKED
 from hnerf.capture.capture import Capture

@@ -9,17 +9,20 @@ from torch import Tensor
 
 from hnerf.body.articulation import Articulation, Points, Pose, with_offsets
 from hnerf.body.balance import Balance
+from hnerf.body.ground import Ground
+from hnerf.body.hand_points import PalmTerm
+from hnerf.body.limb_depths import LimbDepths
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.observations import Observations
 from hnerf.body.pose_prior import PosePrior, Smoothness
 from hnerf.body.posture_prior import PosturePrior
+from hnerf.body.reprojection import NEAR_M, DataTerm, reprojection_term
 from hnerf.body.rig import Rig
 from hnerf.body.robust import geman_mcclure
 from hnerf.geometry.camera import Camera
 
 ROOT = np.arange(6)  # the root's unknowns among those of a frame
 ROOT_INFORMATION = 1e-6  # keeps a root where it is if nothing else is known of it
-NEAR_M = 0.1  # least depth: nothing nearer is in a camera's picture
 
 
 @dataclass(frozen=True)
@@ -37,16 +40,14 @@ class FitPriors:
     beta_high: Tensor
 
 
-DataTerm = tuple[Tensor, Tensor, float]  # of each keypoint: matrices (n, 25, 3, 3), gradients (n, 25, 3), and the cost
-
-
 @dataclass(frozen=True)
 class Problem:
     """The least-squares problem of a fit: observations and priors, from which it assembles normal equations at a pose.
 
     Shared unknowns: beta (B,), then the keypoint offsets (75,), then the median turns of the posture prior. scale_m (C,
     n): metres a pixel spans at the person, held fixed, since residuals would otherwise shrink as the body comes nearer.
-    balance: with one camera only; posture_prior: None as long as no posture is known.
+    balance, ground: with one camera only; posture_prior: None as long as no posture is known; palm: None without hand
+    points; limb_depths: None without metric landmarks of the only camera.
     """
 
     observations: Observations
@@ -55,7 +56,10 @@ class Problem:
     smoothness: Smoothness
     reshape: Callable[[Tensor], Rig]
     balance: Balance | None = None
+    ground: Ground | None = None
     posture_prior: PosturePrior | None = None
+    palm: PalmTerm | None = None
+    limb_depths: LimbDepths | None = None
 
     def assemble(self, pose: Pose, data_term: Callable[[Tensor], DataTerm]) -> tuple[float, NormalEquations]:
         """Return the cost and the normal equations of the keypoints, weighted by `data_term`, and of all priors."""
@@ -65,22 +69,21 @@ class Problem:
         x, by_frame, by_shape = articulation.jacobian(points, joints)
         by_shared = torch.cat([by_shape, _offset_jacobian(points, joints.rotations)], -1)
         matrix, pull, cost = data_term(x)
-        own = by_shared.shape[-1]
         posture_unknowns = self.posture_prior.unknowns(articulation) if self.posture_prior else 0
-        equations = NormalEquations(len(x), articulation.unknowns, own + posture_unknowns)
+        equations = NormalEquations(len(x), articulation.unknowns, by_shared.shape[-1] + posture_unknowns)
         equations.frame[0][:, ROOT, ROOT] += ROOT_INFORMATION
-        weighted = (matrix @ by_frame).flatten(1, 2)
-        frame, shared, gradient = by_frame.flatten(1, 2), by_shared.flatten(1, 2), pull.flatten(1)[..., None]
-        equations.frame[0] += (frame.mT @ weighted).numpy()
-        equations.border[..., :own] += (weighted.mT @ shared).numpy()
-        equations.shared[:own, :own] += ((matrix @ by_shared).flatten(0, 2).mT @ by_shared.flatten(0, 2)).numpy()
-        equations.frame_gradient += (frame.mT @ gradient)[..., 0].numpy()
-        equations.shared_gradient[:own] += (shared.mT @ gradient)[..., 0].sum(0).numpy()
+        equations.add_points(matrix, pull, by_frame, by_shared)
         cost += self._add_shape_prior(equations, pose)
         cost += PosePrior(articulation).add(equations, pose)
         cost += self.smoothness.add(equations, x, by_frame)
         if self.balance:
             cost += self.balance.add(equations, x, by_frame)
+        if self.ground:
+            cost += self.ground.add(equations, pose, x, by_frame, by_shared)
+        if self.limb_depths:
+            cost += self.limb_depths.add(equations, x, by_frame, by_shared)
+        if self.palm:
+            cost += self.palm.add(equations, articulation, joints)
         if self.posture_prior:
             cost += self.posture_prior.add(equations, articulation, pose)
         return cost, equations
@@ -113,20 +116,9 @@ class Problem:
 
     def image_term(self, x: Tensor) -> DataTerm:
         """Return the data term of reprojected keypoints, with pixel residuals converted to metres."""
-        matrix = torch.zeros(*x.shape, 3, dtype=x.dtype)
-        pull, cost = torch.zeros_like(x), 0.0
-        views = zip(
-            self.observations.cameras, self.scale_m, self.observations.pixels, self.observations.confidence, strict=True
+        return reprojection_term(
+            self.observations.views, self.scale_m, x, self.priors.keypoint_m, self.priors.keypoint_outlier_m
         )
-        for camera, scale_m, pixels, confidence in views:
-            uv, by_x = project(camera, x)
-            residual = (uv - pixels) * scale_m[:, None, None]
-            by_x = by_x * scale_m[:, None, None, None]
-            weight, part = self._robust(residual.square().sum(-1), confidence.square())
-            matrix += torch.einsum("nk,nkic,nkid->nkcd", weight, by_x, by_x)
-            pull += torch.einsum("nk,nkic,nki->nkc", weight, by_x, residual)
-            cost += part
-        return matrix, pull, cost
 
     def _robust(self, squared: Tensor, trust: Tensor) -> tuple[Tensor, float]:
         """Return Geman-McClure weights of squared residuals, times their trust, and the cost."""
@@ -161,15 +153,6 @@ def levenberg_marquardt(problem: Problem, pose: Pose, data_term: Callable[[Tenso
         if done:
             break
     return pose
-
-
-def project(camera: Camera, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Return pixels (..., 2) of world points, and their derivative by the points (..., 2, 3)."""
-    projection = torch.from_numpy(camera.projection)
-    h = x @ projection[:, :3].T + projection[:, 3]
-    depth = h[..., 2:].clamp(min=NEAR_M)
-    uv = h[..., :2] / depth
-    return uv, (projection[:2, :3] - uv[..., None] * projection[2, :3]) / depth[..., None]
 
 
 def metres_per_pixel(cameras: tuple[Camera, ...], pose: Pose) -> Tensor:

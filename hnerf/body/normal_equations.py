@@ -6,6 +6,7 @@ step costs time linear in the number of frames (Triggs et al. 1999, section 6: S
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
+from torch import Tensor
 
 
 class NormalEquations:
@@ -19,6 +20,18 @@ class NormalEquations:
         self.shared_gradient = np.zeros(shared)
         self.coupling_diagonal = np.zeros((frames, unknowns))  # added to the diagonal by smoothness in time
 
+    def add_points(self, matrix: Tensor, pull: Tensor, by_frame: Tensor, by_shared: Tensor) -> None:
+        """Add a term of points in space: its matrices (n, K, 3, 3) and gradients (n, K, 3) by the points, and the
+        points' derivatives by the frame's unknowns (n, K, 3, U) and by the first shared ones (n, K, 3, S)."""
+        own = by_shared.shape[-1]
+        weighted = (matrix @ by_frame).flatten(1, 2)
+        frame, shared, gradient = by_frame.flatten(1, 2), by_shared.flatten(1, 2), pull.flatten(1)[..., None]
+        self.frame[0] += (frame.mT @ weighted).numpy()
+        self.border[..., :own] += (weighted.mT @ shared).numpy()
+        self.shared[:own, :own] += ((matrix @ by_shared).flatten(0, 2).mT @ by_shared.flatten(0, 2)).numpy()
+        self.frame_gradient += (frame.mT @ gradient)[..., 0].numpy()
+        self.shared_gradient[:own] += (shared.mT @ gradient)[..., 0].sum(0).numpy()
+
     def step(self, damping: float, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Solve for the step of the frames (n, U) and of the shared unknowns (S,), which stay between low and high
         (S,).
@@ -29,7 +42,7 @@ class NormalEquations:
         """
         frames, unknowns = self.frame_gradient.shape
         factor = (cholesky_banded(self._banded(damping), lower=True, check_finite=False), True)
-        border = self.border.reshape(frames * unknowns, -1)
+        border = self.border.reshape(frames * unknowns, len(self.shared))
         solved = cho_solve_banded(factor, np.column_stack([self.frame_gradient.ravel(), border]), check_finite=False)
         schur = self.shared + damping * np.diag(np.diag(self.shared)) - border.T @ solved[:, 1:]
         gradient = self.shared_gradient - border.T @ solved[:, 0]

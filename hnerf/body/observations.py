@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hnerf.body.reprojection import Views
 from hnerf.capture.capture import Capture
 from hnerf.capture.subject import subject_keypoints
 from hnerf.capture.timing import median_step
@@ -22,6 +23,11 @@ class Observations:
     pixels: Tensor
     confidence: Tensor
     space_m: Tensor
+
+    @property
+    def views(self) -> Views:
+        """Return the keypoints as the cameras see them."""
+        return Views(self.cameras, self.pixels, self.confidence)
 
 
 def observe(capture: Capture) -> Observations:

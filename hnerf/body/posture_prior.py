@@ -37,11 +37,15 @@ class PosturePrior:
     outlier: float
 
     @staticmethod
-    def of_wrists(frames: int, articulation: Articulation) -> "PosturePrior":
-        """Return a prior on the wrists alone, over all frames: no keypoint shows how they turn."""
+    def of_wrists(frames: int, articulation: Articulation, seen: Tensor | None = None) -> "PosturePrior":
+        """Return a prior on the wrists alone, over all frames: no keypoint of the body shows how they turn. seen (n,
+        2): how surely the points of the left and of the right hand do."""
         names = [articulation.rig.joint_names[joint] for joint in articulation.joints[1:].tolist()]
-        trust = torch.tensor([name.startswith("wrist") for name in names], dtype=torch.float64)
-        return PosturePrior.uniform([list(range(frames))], trust.expand(frames, -1), WRIST_STD_DEG, WRIST_OUTLIER_DEG)
+        trust = torch.zeros(frames, len(names), dtype=torch.float64)
+        for hand, side in enumerate("LR"):
+            wrists = [m for m, name in enumerate(names) if name == f"wrist.{side}"]
+            trust[:, wrists] = 1.0 if seen is None else 1 - seen[:, hand, None]
+        return PosturePrior.uniform([list(range(frames))], trust, WRIST_STD_DEG, WRIST_OUTLIER_DEG)
 
     @staticmethod
     def of_single_view(groups: list[list[int]], pose: Pose, camera: Camera) -> "PosturePrior":

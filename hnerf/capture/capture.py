@@ -2,7 +2,7 @@
 
 A normalised capture is a folder with `capture.json`, `images/<camera>/<frame:06d>.<ext>` (undistorted), and where the
 recording has them `background/<camera>.<ext>` (clean plates), `masks/<camera>/<frame:06d>.png`, `keypoints.npz` and
-`poses.npz`; where a network looked for people `person/<camera>/<frame:06d>.png`.
+`poses.npz`; where a network looked for people `person/<camera>/<frame:06d>.png`, and for hands `hands.npz`.
 """
 
 import dataclasses
@@ -21,6 +21,9 @@ from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 PERSON = "person"  # folder: <camera>/<frame>.png, 255 times the probability
+KEYPOINTS = "keypoints.npz"  # by camera
+LANDMARKS = "landmarks"  # folder: <camera>.npz, of people
+HANDS = "hands.npz"  # by camera: points of the subject's hands, found by a network
 JPEG_OPTIONS = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
 
@@ -105,7 +108,28 @@ class Capture:
 
         They are interpolated between recorded frames where the camera is not synchronised.
         """
-        path = self.root / "keypoints.npz"
+        return self._points(KEYPOINTS, camera)
+
+    def hands(self, camera: str) -> np.ndarray | None:
+        """Return the subject's left and right hand (frames, 2, 21, 3) in the order of `keypoints`; None where no
+        network looked for hands."""
+        return self._points(HANDS, camera)
+
+    def landmarks(self, camera: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return a network's landmarks of people (frames, people, 33, 3), in the order of `frames` and each recorded
+        nearest in time: x_px, y_px and confidence; and metres from the middle of the hips along the camera's axes. None
+        where no network looked."""
+        path = self.root / LANDMARKS / f"{camera}.npz"
+        if not path.exists():
+            return None
+        stored = self.stored_frames or self.frames
+        recorded = [self.recorded_frame(camera, frame) for frame in self.frames]
+        rows = np.searchsorted(stored, recorded).clip(max=len(stored) - 1)
+        with np.load(path, allow_pickle=False) as found:
+            return found["points_px"][rows], found["points_m"][rows]
+
+    def _points(self, file: str, camera: str) -> np.ndarray | None:
+        path = self.root / file
         if not path.exists():
             return None
         with np.load(path, allow_pickle=False) as stored:
@@ -117,7 +141,7 @@ class Capture:
     @property
     def has_keypoints(self) -> bool:
         """Return whether any keypoints were detected in this recording."""
-        return (self.root / "keypoints.npz").exists()
+        return (self.root / KEYPOINTS).exists()
 
     @property
     def has_person_masks(self) -> bool:

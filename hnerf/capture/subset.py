@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from hnerf.capture.board_footage import BOARDS_FILE
-from hnerf.capture.capture import PERSON, Capture
+from hnerf.capture.capture import HANDS, KEYPOINTS, PERSON, Capture
 from hnerf.errors import InputError, NotApplicableError
 
 T = TypeVar("T")
@@ -53,10 +53,12 @@ def subset(
 
 
 def write_arrays(capture: Capture, kept: Capture) -> None:
-    """Write keypoints and given poses of the frames and cameras that are kept."""
+    """Write keypoints, hands and given poses of the frames and cameras that are kept."""
     rows = np.searchsorted(capture.frames, kept.frames)
     found = read_keypoints(capture)
     write_keypoints(kept.root, {name: found[name][rows] for name in kept.cameras if name in found})
+    hands = {name: points for name in kept.cameras if (points := capture.hands(name)) is not None}
+    write_points(kept.root / HANDS, {name: points[rows] for name, points in hands.items()})
     poses = capture.given_poses()
     if poses:
         dataclasses.replace(poses, theta=poses.theta[rows], root=poses.root[rows]).save(kept.root / "poses.npz")
@@ -70,9 +72,14 @@ def read_keypoints(capture: Capture) -> dict[str, np.ndarray]:
 
 def write_keypoints(root: Path, keypoints: dict[str, np.ndarray]) -> None:
     """Write `keypoints.npz`, by camera; no file where nothing was detected."""
-    root.mkdir(parents=True, exist_ok=True)
-    if keypoints:
-        np.savez_compressed(root / "keypoints.npz", **keypoints)  # type: ignore[arg-type]
+    write_points(root / KEYPOINTS, keypoints)
+
+
+def write_points(path: Path, points: dict[str, np.ndarray]) -> None:
+    """Write points by camera, and no file where there are none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if points:
+        np.savez_compressed(path, **points)  # type: ignore[arg-type]
 
 
 def copy_pixels(capture: Capture, kept: Capture, camera: str) -> None:

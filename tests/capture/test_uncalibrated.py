@@ -26,7 +26,7 @@ def write_video(path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 25, (64, 96))
     for _ in range(3):
-        writer.write(np.zeros((96, 64, 3), np.uint8))
+        writer.write(np.full((96, 64, 3), 90, np.uint8))
     writer.release()
 
 

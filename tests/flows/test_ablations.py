@@ -56,7 +56,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainingSett
     for name in ("calibrate", "segment_subject", "fit"):
         monkeypatch.setattr(train_subject, name, lambda *_: None)
     monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path))
-    monkeypatch.setattr(module, "with_keypoints", lambda store, recording, settings: recording)
+    monkeypatch.setattr(module, "with_detections", lambda store, recording, settings: recording)
     monkeypatch.setattr(module, "read_capture", lambda *_: (None, None))
     monkeypatch.setattr(module.Capture, "load", lambda _: SimpleNamespace(name="ada"))
     monkeypatch.setattr(module, "train", train)

@@ -69,7 +69,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
         monkeypatch.setattr(train_subject, name, lambda *_: None)
     monkeypatch.setattr(train_subject, "fit", lambda *_: "body")
     monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path, title="whole"))
-    monkeypatch.setattr(module, "with_keypoints", lambda store, recording, settings: recording)
+    monkeypatch.setattr(module, "with_detections", lambda store, recording, settings: recording)
     monkeypatch.setattr(module, "subset_capture", lambda _, recording, *parts: SimpleNamespace(title=str(parts)))
     monkeypatch.setattr(module, "read_capture", lambda *_: (None, None))
     monkeypatch.setattr(module, "calibrated_capture", lambda *_: RECORDED)

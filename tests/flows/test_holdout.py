@@ -54,6 +54,7 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any
         monkeypatch.setattr(module, name, spied(getattr(module, name)))
     monkeypatch.setattr(module, "needs_body", lambda *_: True)
     monkeypatch.setattr(module, "needs_detection", lambda *_: False)
+    monkeypatch.setattr(module, "needs_hands", lambda *_: False)
     monkeypatch.setattr(module, "converged", lambda *_: True)
     (tmp_path / "ada").mkdir()
     whole = write_recording(tmp_path / "whole")

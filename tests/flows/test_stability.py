@@ -93,7 +93,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
     replaced = {
         "read_capture": read_capture,
         "ingest": lambda *_: made("capture"),
-        "with_keypoints": lambda store, recording, settings: recording,
+        "with_detections": lambda store, recording, settings: recording,
         "calibrate": calibrate,
         "segment_subject": lambda *_: made("masks"),
         "fit": lambda *_: made("body"),

@@ -25,6 +25,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         monkeypatch.setattr(module, name, _noting(getattr(module, name)))
     monkeypatch.setattr(module, "needs_body", lambda *_: (tmp_path / "ada" / "bare").exists())
     monkeypatch.setattr(module, "needs_detection", lambda *_: (tmp_path / "ada" / "undetected").exists())
+    monkeypatch.setattr(module, "needs_hands", lambda *_: False)
     (tmp_path / "ada").mkdir()
     return tmp_path / "ada"
 

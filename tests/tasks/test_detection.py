@@ -1,11 +1,14 @@
 """Conditions under which a network detects people."""
 
+import dataclasses
 from pathlib import Path
 
 import pytest
 
+from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings, DetectionSettings, SegmentationSettings
+from hnerf.models import POSE_DETECTOR
 from tasks.detection import needs_detection
 from tasks.segmentation import needs_body
 from tasks.store import Artifact
@@ -17,7 +20,7 @@ from tests.segmentation.scene import write_likely, write_scene
     ("source", "detected", "silent"),
     [(None, False, True), ("recording", False, False), ("network", True, True), ("both", True, True)],
 )
-def test_a_recording_with_keypoints_and_one_without(
+def test_a_recording_with_detections_and_one_without(
     tmp_path: Path, source: str | None, detected: bool, silent: bool
 ) -> None:
     ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture")
@@ -35,3 +38,16 @@ def test_a_network_that_detected_people_stands_for_a_rough_fit(tmp_path: Path) -
     assert needs_body(recording, SegmentationSettings())
     write_likely(capture, truth)
     assert not needs_body(recording, SegmentationSettings())
+
+
+def test_a_single_camera_wants_the_depth_of_limbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HNERF_MODELS", str(tmp_path))
+    capture = Capture.load(ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture").root)
+    dataclasses.replace(capture, train_cameras=capture.train_cameras[:1]).save()
+    recording = Artifact(stage="capture", root=tmp_path / "capture", files={})
+    assert not needs_detection(recording, DetectionSettings())
+    (tmp_path / POSE_DETECTOR).touch()
+    assert needs_detection(recording, DetectionSettings())
+    assert not needs_detection(recording, DetectionSettings(source="recording"))
+    capture.save()
+    assert not needs_detection(recording, DetectionSettings())

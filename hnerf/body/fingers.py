@@ -1,0 +1,133 @@
+"""Fit of the fingers to hand points, with the body held: a relaxed hand where nothing is seen of them."""
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hnerf.body.articulation import Articulation, Pose
+from hnerf.body.hand_points import OUTLIER_M, POINT_STD_M, SIDES, finger_joints, hand_points
+from hnerf.body.normal_equations import NormalEquations
+from hnerf.body.reprojection import Views, reprojection_term
+from hnerf.body.rig import Rig
+
+# By segment, from the palm: flexion of a relaxed hand, and standard deviations of flexion, twist and spread, all in
+# degrees and chosen wide; fingers bend between the limits, from straight. Twist is that of a thumb's first joint.
+RELAXED_DEG = (20.0, 25.0, 15.0)
+STD_DEG = ((25.0, 2.0, 12.0), (25.0, 2.0, 2.0), (15.0, 2.0, 2.0))
+THUMB_RELAXED_DEG = (5.0, 10.0, 10.0)
+THUMB_STD_DEG = ((15.0, 10.0, 15.0), (15.0, 2.0, 5.0), (20.0, 2.0, 2.0))
+LIMITS_DEG = (-10.0, 100.0)
+LIMIT_STD_DEG = 2.0
+RATE_DEG_S = 200.0  # standard deviation of a finger joint's speed: a fist closes in a third of a second
+# Steps, with what counts as an outlier: a fist is a decimetre from a relaxed hand. Then as for the palm.
+STEPS_M, DAMPING = (0.2, 0.2, 0.2, 0.2, *6 * (OUTLIER_M,)), 1e-4
+
+
+@dataclass(frozen=True)
+class FingerPrior:
+    """Priors on the 30 finger joints. axes (30, 3, 3): rows flexion, twist and spread; mean, low and high (30,): of the
+    flexion from rest; std (30, 3); all in radians."""
+
+    axes: Tensor
+    mean: Tensor
+    low: Tensor
+    high: Tensor
+    std: Tensor
+
+    @staticmethod
+    def of(rig: Rig) -> "FingerPrior":
+        """Return the priors for a rig. Angles count from straight fingers: how far these bend at rest is taken off."""
+        axes, bends = [], []
+        for side in SIDES:
+            at = {name: rig.joints_m[rig.joint_names.index(f"{name}.{side}")] for name in ["wrist", *_names()]}
+            normal = torch.linalg.cross(at["finger2-1"] - at["wrist"], at["finger5-1"] - at["wrist"])
+            back = normal if side == "R" else -normal  # of the hand
+            for finger in range(1, 6):
+                chain = [at[f"finger{finger}-{segment}"] for segment in (1, 2, 3)]
+                bones = [chain[0] - at["wrist"], chain[1] - chain[0], chain[2] - chain[1]]
+                bones = [bone / bone.norm() for bone in [*bones, bones[-1]]]
+                for above, bone in itertools.pairwise(bones):
+                    axis = normal if finger == 1 else torch.linalg.cross(bone, back)
+                    axis = axis - (axis @ bone) * bone
+                    axis = axis / axis.norm()
+                    axes.append(torch.stack([axis, bone, torch.linalg.cross(axis, bone)]))
+                    bends.append(torch.linalg.cross(above, bone) @ axis if finger > 1 else bone.new_zeros(()))
+        relaxed = torch.tensor([*THUMB_RELAXED_DEG, *4 * RELAXED_DEG] * 2, dtype=rig.joints_m.dtype)
+        std = torch.tensor([*THUMB_STD_DEG, *4 * STD_DEG] * 2, dtype=relaxed.dtype)
+        bend = torch.stack(bends).asin()
+        low, high = (math.radians(limit) - bend for limit in LIMITS_DEG)
+        return FingerPrior(torch.stack(axes), torch.deg2rad(relaxed) - bend, low, high, torch.deg2rad(std))
+
+    def relaxed(self) -> Tensor:
+        """Return the turns of a relaxed hand, (30, 3) axis-angle."""
+        return self.mean[:, None] * self.axes[:, 0]
+
+    def add(self, equations: NormalEquations, turns: Tensor) -> float:
+        """Add the priors on turns (n, 30, 3) to the normal equations, whose unknowns they are; return the cost."""
+        local = torch.einsum("jac,njc->nja", self.axes, turns)
+        weight = (self.std**-2).expand_as(local).clone()
+        off = local - torch.nn.functional.pad(self.mean[:, None], (0, 2))
+        pull, excess = weight * off, local[..., 0] - local[..., 0].clamp(self.low, self.high)
+        limit = math.radians(LIMIT_STD_DEG) ** -2
+        cost = 0.5 * float((weight * off**2).sum() + limit * (excess**2).sum())
+        pull[..., 0] += limit * excess
+        weight[..., 0] += limit * (excess != 0)
+        blocks = torch.einsum("jac,nja,jad->njcd", self.axes, weight, self.axes)
+        equations.frame_gradient += torch.einsum("jac,nja->njc", self.axes, pull).flatten(1).numpy()
+        for j in range(blocks.shape[1]):
+            at = slice(3 * j, 3 * j + 3)
+            equations.frame[0][:, at, at] += blocks[:, j].numpy()
+        return cost
+
+
+def add_persistence(equations: NormalEquations, turns: Tensor, following: np.ndarray, std: float) -> float:
+    """Add a Gaussian on the change of turns (n, 30, 3) from one frame to the next, and return its cost. following: rows
+    whose next row is the next frame; std: of an angle's change, in radians."""
+    weight = std**-2
+    change = (turns[following + 1] - turns[following]).flatten(1).numpy()
+    at = np.arange(change.shape[1])
+    for rows, sign in ((following, -1), (following + 1, 1)):
+        equations.frame_gradient[rows] += sign * weight * change
+        equations.frame[0][rows[:, None], at, at] += weight
+        equations.coupling_diagonal[rows] += weight
+    equations.frame[1][following[:, None], at, at] -= weight
+    return 0.5 * weight * float((change**2).sum())
+
+
+def fit_fingers(pose: Pose, views: Views, scale_m: Tensor, runs: list[tuple[int, ...]], seconds: float) -> Pose:
+    """Return the pose with fingers fitted to hand points (C, n, 42), everything else held.
+
+    scale_m (C, n): metres a pixel spans; runs: frames that follow each other, `seconds` apart.
+    """
+    rig = pose.rig
+    fingers = [rig.joint_names.index(name) for name in finger_joints()]
+    wrists = [rig.joint_names.index(f"wrist.{side}") for side in SIDES]
+    free = torch.zeros_like(rig.free)
+    free[[*fingers, *wrists]] = True
+    articulation = Articulation(replace(rig, free=free))
+    slots = torch.searchsorted(articulation.joints, torch.tensor(fingers))
+    unknowns = (3 + 3 * slots[:, None] + torch.arange(3)).flatten()
+    points, prior = hand_points(articulation), FingerPrior.of(rig)
+    ends = np.cumsum([len(run) for run in runs])
+    following = np.setdiff1d(np.arange(ends[-1]), ends - 1)
+    theta = pose.theta.clone()
+    if not (theta[:, fingers] != 0).any():
+        theta[:, fingers] = prior.relaxed()
+    for outlier_m in STEPS_M:
+        x, by_frame, _ = articulation.jacobian(points, articulation.pose(replace(pose, theta=theta)))
+        matrix, pull, _ = reprojection_term(views, scale_m, x, POINT_STD_M, outlier_m)
+        equations = NormalEquations(len(theta), len(unknowns), 0)
+        equations.add_points(matrix, pull, by_frame[..., unknowns], x.new_zeros(*x.shape, 0))
+        prior.add(equations, theta[:, fingers])
+        add_persistence(equations, theta[:, fingers], following, math.radians(RATE_DEG_S) * seconds)
+        step, _ = equations.step(DAMPING, np.zeros(0), np.zeros(0))
+        theta[:, fingers] += torch.from_numpy(step).unflatten(-1, (-1, 3))
+    return replace(pose, theta=theta)
+
+
+def _names() -> list[str]:
+    return sorted({name.split(".")[0] for name in finger_joints()})

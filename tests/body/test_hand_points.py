@@ -1,0 +1,74 @@
+import numpy as np
+import torch
+
+from hnerf.body.anny import anny_rig
+from hnerf.body.articulation import Articulation, Pose
+from hnerf.body.hand_points import PALM, PalmTerm, hand_points, has_fingers
+from hnerf.body.normal_equations import NormalEquations
+from hnerf.body.reprojection import Views, project
+from tests.body.recorded_body import ring_camera
+from tests.body.test_articulation import random_pose
+from tests.body.two_bone import two_bone_rig
+
+CAMERAS = tuple(ring_camera(str(k), angle) for k, angle in enumerate((0.3, 1.9)))
+
+
+def body() -> Pose:
+    pose = random_pose(anny_rig().to(dtype=torch.float64), 2)
+    pose.root[:, :3, 3] = 0
+    return pose
+
+
+def views_of(x: torch.Tensor) -> Views:
+    pixels = torch.stack([project(camera, x)[0] for camera in CAMERAS])
+    return Views(CAMERAS, pixels, torch.ones(pixels.shape[:-1], dtype=torch.float64))
+
+
+def test_points_lie_at_the_joints_and_tips_beyond_them() -> None:
+    pose = body()
+    articulation = Articulation(pose.rig)
+    joints = articulation.pose(pose)
+    x, _, by_shape = articulation.jacobian(hand_points(articulation), joints)
+    wrists = [articulation.joints.tolist().index(pose.rig.joint_names.index(f"wrist.{side}")) for side in "LR"]
+    torch.testing.assert_close(x[:, [0, 21]], joints.positions_m[:, wrists])
+    tip_m = (x[:, [4, 8, 12, 16, 20]] - x[:, [3, 7, 11, 15, 19]]).norm(dim=-1)
+    assert (tip_m > 0.015).all() and (tip_m < 0.04).all()
+    moved = pose.rig.beta + 0.1
+    other = Pose(pose.rig.reshaped(moved), pose.theta, pose.root, pose.offsets_m)
+    after = Articulation(other.rig)
+    numeric = (after.jacobian(hand_points(after), after.pose(other))[0] - x) / 0.1
+    torch.testing.assert_close(by_shape.sum(-1), numeric, atol=1e-8, rtol=0)
+    assert has_fingers(pose.rig) and not has_fingers(two_bone_rig())
+
+
+def test_a_palm_beside_its_image_costs_half_a_square_less_what_fades() -> None:
+    """12 points, each 12 mm beside in both cameras, one standard deviation: 12 x 2 x 0.5 / (1 + .04). Fingers off by
+    any distance cost nothing."""
+    pose = body()
+    articulation = Articulation(pose.rig)
+    joints = articulation.pose(pose)
+    views = views_of(articulation.jacobian(hand_points(articulation), joints)[0])
+    views.pixels[..., 0] += 12
+    views.pixels[..., 6, 0] += 500
+    equations = NormalEquations(2, articulation.unknowns, len(pose.rig.beta))
+    cost = PalmTerm(views, torch.full((2, 2), 0.001)).add(equations, articulation, joints)
+    np.testing.assert_allclose(cost, 2 * 12 / 1.04)
+    assert views.confidence[..., PALM].shape[-1] == 6
+
+
+def test_the_gradient_of_the_palm_is_that_of_its_cost() -> None:
+    pose = body()
+    articulation = Articulation(pose.rig)
+    views = views_of(articulation.jacobian(hand_points(articulation), articulation.pose(pose))[0])
+    views.pixels.add_(9 * torch.randn(views.pixels.shape, generator=torch.Generator().manual_seed(3)))
+    term = PalmTerm(views, torch.full((2, 2), 0.002, dtype=torch.float64))
+
+    def cost_and_equations(at: Pose) -> tuple[float, NormalEquations]:
+        equations = NormalEquations(2, articulation.unknowns, len(pose.rig.beta))
+        return term.add(equations, articulation, articulation.pose(at)), equations
+
+    direction = torch.randn(2, articulation.unknowns, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    ends = [cost_and_equations(articulation.apply_step(pose, sign * 1e-6 * direction))[0] for sign in (1, -1)]
+    weights_held = (cost_and_equations(pose)[1].frame_gradient * direction.numpy()).sum()
+    assert abs(weights_held) > 1
+    np.testing.assert_allclose(weights_held, (ends[0] - ends[1]) / 2e-6, rtol=1e-5)

@@ -1,0 +1,75 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hnerf.body.articulation import Articulation, Pose
+from hnerf.body.limb_depths import LIMBS, LimbDepths, observe_limb_depths
+from hnerf.body.normal_equations import NormalEquations
+from hnerf.body.observations import observe
+from hnerf.capture.capture import LANDMARKS
+from tests.body.recorded_body import moving_body, record, ring_camera
+from tests.body.test_articulation import random_pose
+from tests.body.two_bone import two_bone_rig
+
+
+def along_y(frames: int) -> LimbDepths:
+    depth_m, trust = torch.zeros(2, frames, len(LIMBS), dtype=torch.float64)
+    return LimbDepths(depth_m, trust + 1, torch.tensor([[0.0, 1, 0]], dtype=torch.float64).expand(frames, 3))
+
+
+def test_a_forearm_a_decimetre_nearer_than_seen_costs_a_half() -> None:
+    """Less what fades: 0.5 / (1 + 1/9). A half as sure costs half; across the view nothing."""
+    x, jacobian = torch.zeros(1, 25, 3, dtype=torch.float64), torch.zeros(1, 25, 3, 9, dtype=torch.float64)
+    depths = along_y(1)
+    for axis, cost in ((0, 0.0), (1, 0.45), (2, 0.0)):
+        moved = x.clone()
+        moved[0, 4, axis] = -0.1
+        assert depths.add(NormalEquations(1, 9, 9), moved, jacobian, jacobian) == pytest.approx(cost)
+    depths.depth_m[0, LIMBS.index((3, 4))] = -0.1
+    moved[0, 4] = torch.tensor([0, -0.1, 0])
+    assert depths.add(NormalEquations(1, 9, 9), moved, jacobian, jacobian) == pytest.approx(0)
+    depths.trust[:] = 0.5
+    assert depths.add(NormalEquations(1, 9, 9), x, jacobian, jacobian) == pytest.approx(0.225)
+
+
+def test_the_gradient_of_depths_is_that_of_their_cost() -> None:
+    rig = two_bone_rig()
+    articulation, pose, depths = Articulation(rig), random_pose(rig, 2), along_y(2)
+    depths.depth_m[:] = 0.2
+
+    def cost_and_equations(at: Pose) -> tuple[float, NormalEquations]:
+        x, by_frame, by_shape = articulation.jacobian(articulation.keypoints(), articulation.pose(at))
+        equations = NormalEquations(2, articulation.unknowns, by_shape.shape[-1])
+        return depths.add(equations, 0.3 * x, 0.3 * by_frame, 0.3 * by_shape), equations
+
+    direction = torch.randn(2, articulation.unknowns, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    ends = [cost_and_equations(articulation.apply_step(pose, sign * 1e-6 * direction))[0] for sign in (1, -1)]
+    slope = (cost_and_equations(pose)[1].frame_gradient * direction.numpy()).sum()
+    np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-6, rtol=1e-5, atol=1e-8)
+
+
+def test_landmarks_of_the_subject_give_depths(tmp_path: Path) -> None:
+    """Of two people the second is the subject, whose right wrist is 0.3 m nearer than the elbow; the least sure end
+    counts. In the second frame only a stranger is seen."""
+    body, camera = moving_body((0, 1)), ring_camera("1", 0.4)
+    capture = record(tmp_path, body, {"1": camera}, ("1",))
+    observations = observe(capture)
+    assert observe_limb_depths(capture, observations) is None
+    pixels, metres = np.zeros((2, 2, 33, 3)), np.zeros((2, 2, 33, 3))
+    pixels[:, 0] = 5, 5, 0.9
+    from_body = {2: 12, 3: 14, 4: 16, 5: 11, 6: 13, 7: 15, 9: 24, 10: 26, 11: 28, 12: 23, 13: 25, 14: 27}
+    for own, place in from_body.items():
+        pixels[0, 1, place, :2] = observations.pixels[0, 0, own]
+        pixels[0, 1, place, 2] = 0.8
+    pixels[0, 1, 16, 2], metres[0, 1, 16, 2] = 0.6, -0.3
+    (tmp_path / LANDMARKS).mkdir()
+    np.savez(tmp_path / LANDMARKS / "1.npz", points_px=pixels, points_m=metres)
+    depths = observe_limb_depths(capture, observations)
+    assert depths is not None
+    assert float(depths.depth_m[0, LIMBS.index((3, 4))]) == pytest.approx(-0.3)
+    assert float(depths.trust[0, LIMBS.index((3, 4))]) == pytest.approx(0.6)
+    assert float(depths.trust[0, LIMBS.index((12, 13))]) == pytest.approx(0.8) and not depths.trust[1].any()
+    hips = body.vertices_m()[0].numpy().mean(0) - camera.centre_m
+    assert float(depths.away[0] @ torch.from_numpy(hips / np.linalg.norm(hips)).double()) > 0.98

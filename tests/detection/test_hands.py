@@ -1,0 +1,96 @@
+"""Where hands are looked for, and which points are kept; numbers by hand."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.capture.capture import Capture
+from hnerf.capture.ingest import ingest
+from hnerf.config import CaptureSettings
+from hnerf.detection import hands
+from hnerf.detection.hands import HandNetwork, detect_hands, find_hands, forearm_region, hand_region
+from hnerf.detection.region import Region
+from tests.capture.recordings import write_easymocap
+
+IMAGE = np.zeros((400, 400, 3), np.uint8)
+
+
+def flat_hand(wrist: tuple[float, float], confidence: float = 0.9) -> np.ndarray:
+    """Return a hand with fingers up, 40 px from wrist to knuckles, which are 30 px wide; palm points 50 px high."""
+    points = np.tile([*wrist, confidence], (21, 1))
+    for finger, x in zip((1, 5, 9, 13, 17), (-15, -15, 0, 15, 15), strict=True):
+        for segment in range(4):
+            points[finger + segment, :2] += x, -40 - 10 * segment
+    return points
+
+
+def person(left_wrist: tuple[float, float], right_wrist: tuple[float, float]) -> np.ndarray:
+    """Return keypoints of somebody with nose and ankle 300 px apart and elbows 40 px above the wrists."""
+    keypoints = np.zeros((25, 3))
+    keypoints[[0, 11]] = (200, 50, 1), (200, 350, 1)
+    for (x, y), elbow, wrist in ((left_wrist, 6, 7), (right_wrist, 3, 4)):
+        keypoints[[elbow, wrist]] = (x, y - 40, 1), (x, y, 1)
+    return keypoints
+
+
+def test_a_hand_is_looked_for_beyond_the_forearm() -> None:
+    """A forearm 40 px to the right: the middle is 18 px farther, fingers point right; the side is 48 px. One of 10 px
+    of a person of 300 px counts as 30 px long for the side, 36 px."""
+    region = forearm_region(np.array([100.0, 100]), np.array([140.0, 100]), 300.0)
+    assert region.centre_px == pytest.approx([158, 100])
+    assert region.side_px == pytest.approx(48) and region.angle == pytest.approx(math.pi / 2)
+    assert forearm_region(np.array([100.0, 100]), np.array([110.0, 100]), 300.0).side_px == pytest.approx(36)
+
+
+def test_the_next_region_is_around_the_palm() -> None:
+    """Wrist at (0, 0); palm points reach up to 50 px, those of the thumb to 60; so the palm is 60 px high, 30 wide, its
+    middle at (0, -30); the region is twice as large and 6 px farther up."""
+    region = hand_region(flat_hand((0, 0))[:, :2])
+    assert region.side_px == pytest.approx(120) and region.angle == pytest.approx(0)
+    assert region.centre_px == pytest.approx([0, -36])
+    upside_down = hand_region(-flat_hand((0, 0))[:, :2])
+    assert abs(upside_down.angle) == pytest.approx(math.pi) and upside_down.centre_px == pytest.approx([0, 36])
+
+
+def test_points_are_carried_from_the_crop_into_the_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A region of 448 px, 2 px a crop's pixel: (112, 112) is its middle, (0, 0) its corner."""
+    raw = np.full((21, 3), 112.0)
+    raw[4] = 0, 0, 5
+    monkeypatch.setattr(hands, "Network", lambda name: lambda image: [raw.ravel(), np.array([0.7])])
+    points = HandNetwork()(IMAGE, Region(np.array([300.0, 400.0]), 448.0, 0.0))
+    assert points[0] == pytest.approx([300, 400, 0.7]) and points[4] == pytest.approx([76, 176, 0.7])
+
+
+def test_hands_are_kept_by_their_forearms() -> None:
+    """Left first. A hand far from its wrist is dropped, and one whose forearm is not seen is not looked for."""
+    keypoints = person((100, 200), (300, 200))
+    found = find_hands(IMAGE, keypoints, lambda _, region: flat_hand((float(region.centre_px[0]), 205)))  # type: ignore[arg-type]
+    assert found[:, 0, 0] == pytest.approx([100, 300], abs=8) and (found[..., 2] == 0.9).all()
+    keypoints[3, 2] = 0
+    found = find_hands(IMAGE, keypoints, lambda _, region: flat_hand((100, 205)))  # type: ignore[arg-type]
+    assert found[0, 0, 2] == 0.9 and not found[1].any()
+    found = find_hands(IMAGE, keypoints, lambda _, region: flat_hand((165, 205)))  # type: ignore[arg-type]
+    assert not found.any()
+
+
+def test_one_hand_found_twice_is_the_nearer_arms() -> None:
+    found = find_hands(IMAGE, person((190, 200), (210, 200)), lambda _, region: flat_hand((205, 205)))  # type: ignore[arg-type]
+    assert not found[0].any() and found[1, 0, 2] == 0.9
+
+
+def test_hands_lie_with_the_capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture")
+    capture = Capture.load(tmp_path / "capture")
+    nobody = dict.fromkeys(capture.train_cameras, np.zeros((len(capture.frames), 25, 3)))
+    monkeypatch.setattr(hands, "subject_keypoints", lambda recording: nobody)
+    monkeypatch.setattr(hands, "HandNetwork", lambda: None)
+    monkeypatch.setattr(hands, "find_hands", lambda image, keypoints, network: np.full((2, 21, 3), 0.6))
+    assert detect_hands(capture, tmp_path / "out") == dict.fromkeys(capture.train_cameras, 1.0)
+    written = Capture.load(tmp_path / "out")
+    name = capture.train_cameras[0]
+    points, own = written.hands(name), written.keypoints(name)
+    assert points is not None and points.shape == (len(capture.frames), 2, 21, 3) and own is not None
+    np.testing.assert_array_equal(own, capture.keypoints(name))
+    assert capture.hands(name) is None
