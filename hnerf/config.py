@@ -52,7 +52,7 @@ class SyntheticSettings(Section):
 class DetectionSettings(Section):
     source: Literal["recording", "network", "both"] | None = None  # None: see docs/formats.md, Keypoints
     size: Literal["heavy", "full", "lite"] = "heavy"  # of the landmark network
-    hands: Literal["auto", "off"] = "auto"  # auto: find the subject's where networks are installed; 0.04 s an image
+    hands: Literal["auto", "none"] = "auto"  # auto: find the subject's where networks are installed; 0.04 s an image
 
 
 class CalibrationSettings(Section):

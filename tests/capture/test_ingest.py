@@ -195,7 +195,7 @@ def test_padding_within_two_percent_is_let_through_and_reported(folder: Path, tm
     text = (folder / "intri.yml").read_text()
     (folder / "intri.yml").write_text(text.replace("W_01: 24", "W_01: 2400").replace("H_01: 16", "H_01: 1600"))
     for frame in rec.FRAMES:
-        rec.write_png(folder / "images" / "01" / f"{frame:06d}.png", np.zeros((1600, 2352, 3), np.uint8))
+        rec.write_png(folder / "images" / "01" / f"{frame:06d}.png", np.full((1600, 2352, 3), 9, np.uint8))
     capture = ingest(folder, CaptureSettings(max_side_px=1176), tmp_path / "out")
     assert capture.calibrated_sizes_px["01"] == (2400, 1600) and capture.recorded_sizes_px["01"] == (2352, 1600)
     assert (capture.cameras["01"].width_px, capture.cameras["01"].height_px) == (1176, 800)

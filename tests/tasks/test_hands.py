@@ -20,6 +20,6 @@ def test_hands_need_a_network_keypoints_and_leave(tmp_path: Path, monkeypatch: p
     (tmp_path / "models").mkdir()
     (tmp_path / "models" / HAND_LANDMARKS).touch()
     assert needs_hands(recording, DetectionSettings())
-    assert not needs_hands(recording, DetectionSettings(hands="off"))
+    assert not needs_hands(recording, DetectionSettings(hands="none"))
     (tmp_path / "capture" / "keypoints.npz").unlink()
     assert not needs_hands(recording, DetectionSettings())
