@@ -2,7 +2,7 @@
 
 usage: python examples/add_method.py SUBJECT OUT
 
-SUBJECT: what examples/train.py wrote; its first frame is trained on. For a method that stays, see CONTRIBUTING.md.
+SUBJECT: what examples/train.py wrote; its first frame is trained on. For a method to keep, see CONTRIBUTING.md.
 """
 
 import dataclasses
