@@ -114,4 +114,4 @@ def test_wrong_cameras_do_not_change_the_masks(wave: Capture) -> None:
     for name in wave.train_cameras:
         for one, other in zip(a.by_camera[name], b.by_camera[name], strict=True):
             assert one is not None and other is not None
-            np.testing.assert_array_equal(one.distance_px, other.distance_px)
+            np.testing.assert_allclose(one.distance_px, other.distance_px, atol=1e-4)  # OpenCV's last bits vary
