@@ -29,9 +29,9 @@ from hnerf.files import replace_text
 
 log = logging.getLogger("hnerf.store")
 
-# In order: each stage is computed from those before it.
 RECORDING = ".recording"  # under subjects/<name>: digest and folder of the recording
-STAGES = ("capture", "detection", "calibration", "segmentation", "fit", "training", "evaluation", "asset")
+# In order: each stage is computed from those before it.
+STAGES = ("capture", "detection", "hands", "calibration", "segmentation", "fit", "training", "evaluation", "asset")
 
 
 class StoredFile(BaseModel):

@@ -12,10 +12,11 @@ from flows import train_subject as module
 from flows.train_subject import train_subject
 from hnerf.capture.capture import Capture
 from hnerf.geometry.camera import Camera
+from tasks import store
 from tasks.stage import Stage
 from tasks.store import Artifact
 
-STAGES = ("ingest", "detect", "calibrate", "segment", "fit", "train", "evaluate", "export")
+STAGES = ("ingest", "detect", "find_hands", "calibrate", "segment", "fit", "train", "evaluate", "export")
 
 
 @pytest.fixture
@@ -25,7 +26,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         monkeypatch.setattr(module, name, _noting(getattr(module, name)))
     monkeypatch.setattr(module, "needs_body", lambda *_: (tmp_path / "ada" / "bare").exists())
     monkeypatch.setattr(module, "needs_detection", lambda *_: (tmp_path / "ada" / "undetected").exists())
-    monkeypatch.setattr(module, "needs_hands", lambda *_: False)
+    monkeypatch.setattr(module, "needs_hands", lambda *_: (tmp_path / "ada" / "handed").exists())
     (tmp_path / "ada").mkdir()
     return tmp_path / "ada"
 
@@ -64,6 +65,18 @@ def test_what_was_detected_takes_the_recordings_place(folder: Path, tmp_path: Pa
     assert given(subject, "calibration") == ["detection"]
     assert given(subject, "training") == ["detection", "calibration", "segmentation", "fit"]
     assert given(subject, "asset") == ["detection", "calibration", "training"]
+
+
+def test_hands_lie_between_the_recording_and_all_else(folder: Path, tmp_path: Path) -> None:
+    (folder / "handed").touch()
+    subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject
+    assert given(subject, "hands") == ["capture"]
+    assert given(subject, "calibration") == ["hands"]
+    assert given(subject, "training") == ["hands", "calibration", "segmentation", "fit"]
+
+
+def test_the_store_knows_every_stage_that_a_subject_links_to() -> None:
+    assert [getattr(module, name).name for name in STAGES] == list(store.STAGES)
 
 
 def test_without_masks_or_plates_a_rough_fit_comes_first(

@@ -210,6 +210,14 @@ def test_view_points_at_the_latest(tmp_path: Path) -> None:
     assert list(link.parent.iterdir()) == [link]
 
 
+def test_hands_of_another_recording_replace_those_before(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    for stage in ("hands", "fit"):
+        store.link_latest("ada", store.get_or_compute(stage, "old", write_abc))
+    store.link_latest("ada", store.get_or_compute("hands", "new", write_abc))
+    assert [path.name for path in (tmp_path / "subjects" / "ada").iterdir()] == ["hands"]
+
+
 def test_view_never_mixes_what_was_made_from_other_things(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for stage in ("fit", "training", "asset"):
