@@ -40,7 +40,7 @@ SAFE_IO, TIMING = "hnerf/capture/safe_io.py", "hnerf/capture/timing.py"
 NORMALISE, MANIFEST = "hnerf/capture/normalise.py", "hnerf/capture/manifest.py"
 STAGING, GLB, USD = "hnerf/asset/staging.py", "hnerf/asset/glb.py", "hnerf/asset/usd.py"
 ANTIALIASING, CORRECTIVES = "hnerf/avatar/antialiasing.py", "hnerf/asset/correctives.py"
-PHOTOGRAPHS = "hnerf/asset/photographs.py"
+PHOTOGRAPHS, SURFACE = "hnerf/asset/photographs.py", "hnerf/avatar/surface.py"
 METRICS, REPORT = "hnerf/evaluation/metrics.py", "hnerf/evaluation/report.py"
 EXPOSURE, ARTICULATION = "hnerf/training/exposure.py", "hnerf/body/articulation.py"
 POLICY, STORE = "tasks/policy.py", "tasks/store.py"
@@ -218,9 +218,8 @@ FAULTS = (
     Fault("photographs-hidden", PHOTOGRAPHS, "(distance_m < seen_m[row", "(distance_m > -seen_m[row", BY_PHOTOGRAPHS),
     Fault("photographs-outline", PHOTOGRAPHS, "inside & ~outline[row, column]", "inside", BY_PHOTOGRAPHS),
     Fault("photographs-gain", PHOTOGRAPHS, "pixels_px) / gain", "pixels_px) * gain", BY_PHOTOGRAPHS),
-    Fault("correctives-turn", CORRECTIVES, "solve(skinning[..., :3], moved_m)", "solve(skinning[..., :3].mT, moved_m)",
-          BY_CORRECTIVES),
-    Fault("correctives-sign", CORRECTIVES, "-height_m[:, None] *", "height_m[:, None] *", BY_CORRECTIVES),
+    Fault("correctives-turn", CORRECTIVES, "solve(turn, surface_m", "solve(turn.mT, surface_m", BY_CORRECTIVES),
+    Fault("surface-step", SURFACE, "vertices_m - step_to_surface(", "vertices_m + step_to_surface(", BY_CORRECTIVES),
     Fault("usd-shape-weights", USD, "frames, avatar.shape_weights", "frames, -avatar.shape_weights", BY_USD),
     Fault("glb-time", GLB, "(avatar.frames - avatar.frames[0]) / fps", "avatar.frames / fps", BY_GLB),
     Fault("usd-quaternion", USD, "Gf.Quatf(w, x, y, z)", "Gf.Quatf(x, y, z, w)", BY_USD),

@@ -4,15 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from hnerf.avatar.avatar import Avatar
-from hnerf.body.descriptor import vertex_normals
+from hnerf.avatar.surface import move_onto_surface
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.rig import joint_transforms, pose_vertices, skinning_transforms, vertex_transforms
+from hnerf.body.rig import pose_vertices, vertex_skinning
 from hnerf.progress import tracked
-
-MAX_STEP_M = 0.03  # skinning error stays below this; a longer distance belongs to another limb
 
 
 @dataclass(frozen=True)
@@ -25,24 +22,19 @@ class Correctives:
 
 
 @torch.no_grad()
-def frame_displacements(avatar: Avatar, clothed: BodyFit) -> np.ndarray:
-    """Return the displacement in the rest pose, (n, V, 3) float32 metres, that takes the skinned surface of `clothed`
-    onto the avatar's zero surface in each frame: a Newton step along the normal, turned back by the skinning."""
-    rig, device, found = clothed.rig, avatar.body.theta.device, []
+def frame_surfaces(avatar: Avatar, clothed: BodyFit) -> tuple[np.ndarray, np.ndarray]:
+    """Return the skinned surface of `clothed`, moved onto the avatar's zero surface in each frame, (n, V, 3) float32 in
+    the world, and the displacements (n, V, 3) in the rest pose that skinning takes there."""
+    rig, device = clothed.rig, avatar.body.theta.device
+    surfaces_m, displacements_m = [], []
     for theta, root in tracked(zip(clothed.theta, clothed.root, strict=True), "correctives", len(clothed.frames)):
-        vertices_m = pose_vertices(rig, theta, root)
-        world_m, posed = vertices_m.to(device), (theta.to(device), root.to(device))
-        height_m = step_to_surface(avatar.signed_distance(world_m, *posed)).cpu()
-        moved_m = -height_m[:, None] * vertex_normals(vertices_m, rig.faces)
-        skinning = vertex_transforms(rig, skinning_transforms(joint_transforms(rig, theta, root), rig.joints_m))
-        found.append(torch.linalg.solve(skinning[..., :3], moved_m).numpy())
-    return np.stack(found)
-
-
-def step_to_surface(distance_m: Tensor) -> Tensor:
-    """Return the distances (V,) to step back along the normal: all of them up to half of MAX_STEP_M, and less beyond,
-    down to 0 where the zero surface belongs to another limb."""
-    return distance_m * (2 - 2 * distance_m.abs() / MAX_STEP_M).clamp(0, 1)
+        skinned_m = pose_vertices(rig, theta, root)
+        posed = theta.to(device), root.to(device)
+        surface_m = move_onto_surface(avatar, skinned_m.to(device), rig.faces.to(device), *posed)[0].cpu()
+        turn = vertex_skinning(rig, theta, root)[..., :3]
+        surfaces_m.append(surface_m.numpy())
+        displacements_m.append(torch.linalg.solve(turn, surface_m - skinned_m).numpy())
+    return np.stack(surfaces_m), np.stack(displacements_m)
 
 
 def correctives_of(displacements_m: np.ndarray, count: int) -> Correctives:
@@ -58,13 +50,3 @@ def correctives_of(displacements_m: np.ndarray, count: int) -> Correctives:
     greatest = np.abs(weights).max(0).clip(min=1e-9)
     offsets_m = (greatest[:, None] * right[:count]).reshape(count, *displacements_m.shape[1:])
     return Correctives(offsets_m.astype(np.float32), (weights / greatest).astype(np.float32))
-
-
-def with_displacements(clothed: BodyFit, displacements_m: np.ndarray) -> np.ndarray:
-    """Return the skinned surface of each frame with its displacement in the rest pose, (n, V, 3) float32 metres."""
-    rig, posed = clothed.rig, []
-    for theta, root, moved_m in zip(clothed.theta, clothed.root, displacements_m, strict=True):
-        skinning = vertex_transforms(rig, skinning_transforms(joint_transforms(rig, theta, root), rig.joints_m))
-        rest_m = rig.vertices_m + torch.from_numpy(moved_m)
-        posed.append(((skinning[..., :3] @ rest_m[..., None])[..., 0] + skinning[..., 3]).float().numpy())
-    return np.stack(posed)

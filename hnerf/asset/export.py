@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from hnerf.asset.correctives import Correctives, correctives_of, frame_displacements, with_displacements
+from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
 from hnerf.asset.glb import write_glb
 from hnerf.asset.photographs import colours_from_photographs
 from hnerf.asset.rig_transfer import clothed_rig
@@ -48,9 +48,8 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
         rig = clothed_rig(avatar.body.rig.to("cpu"), surface)
     clothed = _clothed_body(avatar.body, rig, capture.frames)
     with _timed("correctives", seconds):
-        displacements_m = frame_displacements(tracked_avatar, clothed)
+        surfaces_m, displacements_m = frame_surfaces(tracked_avatar, clothed)
         correctives = correctives_of(displacements_m, settings.correctives)
-        surfaces_m = with_displacements(clothed, displacements_m)
     with _timed("texture", seconds):
         texels = rasterise(layout, settings.texture_px)
         posed = _clothed_body(avatar.body, rig, tuple(evenly_spaced(capture.train_frames, settings.texture_poses)))

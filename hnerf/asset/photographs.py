@@ -5,7 +5,6 @@ from itertools import product
 
 import cv2
 import numpy as np
-import warp as wp
 from scipy.ndimage import map_coordinates
 
 from hnerf.asset.texture import Texels
@@ -13,7 +12,7 @@ from hnerf.avatar.avatar import Gains
 from hnerf.body.descriptor import normals_of
 from hnerf.capture.capture import Capture
 from hnerf.geometry.camera import Camera
-from hnerf.geometry.rays import cast, to_vec3_array
+from hnerf.geometry.rays import cast, mesh_on_cpu
 from hnerf.progress import tracked
 
 OUTLIER = 0.15  # of a colour in [0, 1]: what differs more from the field is another limb, or a passing shadow
@@ -81,8 +80,7 @@ def _depth(camera: Camera, vertices_m: np.ndarray, faces: np.ndarray) -> tuple[n
     lower, upper = box_px.clip(0, [camera.width_px, camera.height_px]).astype(int)
     depth_m = np.full((camera.height_px, camera.width_px), FAR_M, np.float32)
     x, y = np.meshgrid(np.arange(lower[0], upper[0]), np.arange(lower[1], upper[1]))
-    mesh = wp.Mesh(to_vec3_array(vertices_m, "cpu"), wp.array(faces.astype(np.int32).ravel(), dtype=int, device="cpu"))
-    hits = cast(mesh, *camera.rays(np.stack([x.ravel(), y.ravel()], 1).astype(float)))
+    hits = cast(mesh_on_cpu(vertices_m, faces), *camera.rays(np.stack([x.ravel(), y.ravel()], 1).astype(float)))
     depth_m[y.ravel(), x.ravel()] = np.where(hits.face >= 0, hits.distance_m, FAR_M)
     window = np.ones((EDGE_PX, EDGE_PX), np.uint8)
     near_m = cv2.erode(depth_m, window)

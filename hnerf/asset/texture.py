@@ -11,9 +11,8 @@ import xatlas
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from hnerf.asset.correctives import step_to_surface
 from hnerf.avatar.avatar import Avatar
-from hnerf.body.descriptor import vertex_normals
+from hnerf.avatar.surface import move_onto_surface
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig, pose_vertices
 
@@ -108,11 +107,9 @@ def _colours_in_pose(avatar: Avatar, rig: Rig, texels: Texels, theta: Tensor, ro
     device = avatar.body.rig.vertices_m.device
     vertices_m, faces = pose_vertices(rig, theta, root).to(device), rig.faces.to(device)
     theta, root = theta.to(device), root.to(device)
-    normals = vertex_normals(vertices_m, faces)
-    # Skinning only approximates the field's surface in this pose: correct it by a Newton step along the normal.
-    height_m = step_to_surface(avatar.signed_distance(vertices_m, theta, root))
+    surface_m, normals = move_onto_surface(avatar, vertices_m, faces, theta, root)  # skinning only approximates it
     corners, weights = faces[texels.face.to(device)], texels.barycentric.to(device)[..., None]
-    points_m = ((vertices_m - height_m[:, None] * normals)[corners] * weights).sum(1)
+    points_m = (surface_m[corners] * weights).sum(1)
     inward = -torch.nn.functional.normalize((normals[corners] * weights).sum(1), dim=1)
     return avatar.colour(points_m, inward, theta, root).cpu()
 

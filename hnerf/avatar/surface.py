@@ -1,4 +1,4 @@
-"""The zero surface of a signed distance field as a closed triangle mesh."""
+"""The zero surface of a signed distance field: as a closed triangle mesh, and under a mesh that is near it."""
 
 import itertools
 import math
@@ -11,12 +11,14 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from hnerf.avatar.avatar import Avatar
+from hnerf.body.descriptor import vertex_normals
 from hnerf.body.rig import pose_vertices
 from hnerf.errors import InputError
 
 SLOPE_BOUND = 2.0  # greatest |gradient| assumed when empty space is skipped; a true distance has 1
 COARSEST_STRIDE = 9  # nodes; divided by three per level, so that a coarse node is the centre of its block
 POSED_CELLS = 256  # on the longest side of the box
+MAX_STEP_M = 0.03  # skinning error stays below this; a longer distance belongs to another limb
 POSED_MARGIN_M = 0.2  # around the naked body: hair, shoes, loose clothes
 
 
@@ -34,6 +36,21 @@ def surface_in_pose(avatar: Avatar, theta: Tensor, root: Tensor, cells: int) -> 
     lower_m, upper_m = body_m.amin(0) - POSED_MARGIN_M, body_m.amax(0) + POSED_MARGIN_M
     with torch.no_grad():
         return extract_surface(lambda x: avatar.signed_distance(x, theta, root), lower_m, upper_m, cells)
+
+
+def move_onto_surface(
+    avatar: Avatar, vertices_m: Tensor, faces: Tensor, theta: Tensor, root: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Move the vertices (V, 3) of a surface near the avatar's in a pose onto it, by a Newton step along their normals;
+    return them and the normals (V, 3)."""
+    normals = vertex_normals(vertices_m, faces)
+    return vertices_m - step_to_surface(avatar.signed_distance(vertices_m, theta, root))[:, None] * normals, normals
+
+
+def step_to_surface(distance_m: Tensor) -> Tensor:
+    """Return the distances (V,) to step back along the normal: all of them up to half of MAX_STEP_M, and less beyond,
+    down to 0 where the zero surface belongs to another limb."""
+    return distance_m * (2 - 2 * distance_m.abs() / MAX_STEP_M).clamp(0, 1)
 
 
 def extract_surface(

@@ -73,6 +73,7 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
         limb_depths = observe_limb_depths(capture, observations)
         with _timed(seconds, "start"):
             pose = given_pose or initial_pose(capture, observations, model)
+        palm = PalmTerm(hands) if hands and has_fingers(pose.rig) else None
         if len(observations.cameras) > 1:
             with _timed(seconds, "keypoints in space"):
                 problem = make_problem(
@@ -82,10 +83,9 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
         with _timed(seconds, "keypoints in images"):
             problem = make_problem(model, pose, observations, smoothness, settings, offsets=1, proportions=TIGHT_STD)
             problem = replace(problem, balance=balance, ground=ground, limb_depths=limb_depths)
-            palm = PalmTerm(hands, problem.scale_m) if hands and has_fingers(pose.rig) else None
             pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
             if palm:
-                problem = replace(problem, palm=replace(palm, scale_m=problem.scale_m))
+                problem = replace(problem, palm=palm)
                 pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
             if balance:
                 posture_prior = PosturePrior.of_single_view(_by_split(capture), pose, observations.cameras[0])
@@ -100,11 +100,8 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
         if masks is not None:
             with _timed(seconds, "outlines"):
                 problem = make_problem(model, pose, observations, smoothness, settings, offsets=1, proportions=1)
-                problem = replace(
-                    problem, balance=balance, ground=ground, limb_depths=limb_depths, posture_prior=posture_prior
-                )
-                if palm:
-                    problem = replace(problem, palm=replace(palm, scale_m=problem.scale_m))
+                problem = replace(problem, balance=balance, ground=ground, limb_depths=limb_depths)
+                problem = replace(problem, palm=palm, posture_prior=posture_prior)
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
                 pose = refine_with_outlines(problem, pose, edges, settings, up)
             with _timed(seconds, "clothes"):

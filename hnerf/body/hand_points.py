@@ -67,18 +67,18 @@ def observe_hands(capture: Capture) -> Views | None:
 
 @dataclass(frozen=True)
 class PalmTerm:
-    """Reprojection of wrists and knuckles, which turn with the wrist. views: of all hand points; scale_m (C, n): metres
-    a pixel spans."""
+    """Reprojection of wrists and knuckles, which turn with the wrist. views: of all hand points."""
 
     views: Views
-    scale_m: Tensor
 
-    def add(self, equations: NormalEquations, articulation: Articulation, joints: PosedJoints) -> float:
-        """Add the term to the normal equations and return its cost."""
+    def add(
+        self, equations: NormalEquations, articulation: Articulation, joints: PosedJoints, scale_m: Tensor
+    ) -> float:
+        """Add the term to the normal equations and return its cost. scale_m (C, n): metres a pixel spans."""
         points, rows = hand_points(articulation), [*PALM, *(21 + k for k in PALM)]
         palm = Points(points.weights[rows], points.rest_m[rows], points.basis_m[rows])
         x, by_frame, by_shape = articulation.jacobian(palm, joints)
-        matrix, pull, cost = reprojection_term(self.views.of(rows), self.scale_m, x, POINT_STD_M, OUTLIER_M)
+        matrix, pull, cost = reprojection_term(self.views.of(rows), scale_m, x, POINT_STD_M, OUTLIER_M)
         equations.add_points(matrix, pull, by_frame, by_shape)
         return cost
 

@@ -83,7 +83,7 @@ class Problem:
         if self.limb_depths:
             cost += self.limb_depths.add(equations, x, by_frame, by_shared)
         if self.palm:
-            cost += self.palm.add(equations, articulation, joints)
+            cost += self.palm.add(equations, articulation, joints, self.scale_m)
         if self.posture_prior:
             cost += self.posture_prior.add(equations, articulation, pose)
         return cost, equations

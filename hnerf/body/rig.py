@@ -142,8 +142,13 @@ def skinning_transforms(world: Tensor, joints_m: Tensor) -> Tensor:
 
 def pose_vertices(rig: Rig, theta: Tensor, root: Tensor) -> Tensor:
     """Return posed vertices in the world, (..., V, 3) metres. theta (..., J, 3), root (..., 4, 4)."""
-    transforms = vertex_transforms(rig, skinning_transforms(joint_transforms(rig, theta, root), rig.joints_m))
+    transforms = vertex_skinning(rig, theta, root)
     return (transforms[..., :3, :3] @ rig.vertices_m[..., None])[..., 0] + transforms[..., :3, 3]
+
+
+def vertex_skinning(rig: Rig, theta: Tensor, root: Tensor) -> Tensor:
+    """Return world from rest pose for every vertex, (..., V, 3, 4). theta (..., J, 3), root (..., 4, 4)."""
+    return vertex_transforms(rig, skinning_transforms(joint_transforms(rig, theta, root), rig.joints_m))
 
 
 def vertex_transforms(rig: Rig, transforms: Tensor) -> Tensor:

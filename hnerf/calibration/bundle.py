@@ -71,7 +71,8 @@ def _bundle_adjust(
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     _solve(scene, config, points_m, used, loss_scale_px)
     return [
-        _solved_camera(scene, i, camera) if camera.name in free else camera for i, camera in enumerate(cameras, start=1)
+        _as_solved(scene, i, camera, scene.camera(i).params[0] / camera.K[0, 0]) if camera.name in free else camera
+        for i, camera in enumerate(cameras, start=1)
     ]
 
 
@@ -162,11 +163,8 @@ def _solve_shared_lens(
     _solve(scene, config, points_m, used, loss_scale_px)
     solved = scene.camera(number).params
     zoom = solved[0] / focal_px
-    found = []
-    for i, camera in enumerate(cameras, start=1):
-        pose = scene.image(i).cam_from_world()
-        K = camera.K * np.array([[zoom, zoom, 1], [1, zoom, 1], [1, 1, 1]]) if shared[i - 1] else camera.K
-        found.append(dataclasses.replace(camera, K=K, R=pose.rotation.matrix(), t_m=np.array(pose.translation)))
+    zooms = np.where(shared, zoom, 1.0)
+    found = [_as_solved(scene, i, camera, zooms[i - 1]) for i, camera in enumerate(cameras, start=1)]
     return found, float(solved[3]) if distorted else 0.0
 
 
@@ -182,8 +180,8 @@ def _add_image(scene: pycolmap.Reconstruction, number: int, camera: Camera, keyp
     scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(camera.R), camera.t_m))
 
 
-def _solved_camera(scene: pycolmap.Reconstruction, number: int, camera: Camera) -> Camera:
-    pose, zoom = scene.image(number).cam_from_world(), scene.camera(number).params[0] / camera.K[0, 0]
+def _as_solved(scene: pycolmap.Reconstruction, number: int, camera: Camera, zoom: float) -> Camera:
+    pose = scene.image(number).cam_from_world()
     K = camera.K * np.array([[zoom, zoom, 1], [1, zoom, 1], [1, 1, 1]])
     return dataclasses.replace(camera, K=K, R=pose.rotation.matrix(), t_m=np.array(pose.translation))
 

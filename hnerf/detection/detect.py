@@ -66,6 +66,14 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
     return report
 
 
+def with_keypoints(capture: Capture, out: Path) -> Capture:
+    """Return the capture if it has keypoints, else one in `out` with those of the network."""
+    if capture.has_keypoints:
+        return capture
+    detect(capture, DetectionSettings(), out)
+    return Capture.load(out)
+
+
 def _with_own(capture: Capture, people: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the recording's own people, completed by the network's."""
     own = read_keypoints(capture)

@@ -45,6 +45,12 @@ class RayHits:
         return np.einsum("nk,nkc->nc", self.barycentric[hit], per_vertex[faces[self.face[hit]]])
 
 
+def mesh_on_cpu(vertices_m: np.ndarray, faces: np.ndarray) -> wp.Mesh:
+    """Return a triangle mesh (V, 3), (F, 3) for rays to be cast against on the CPU."""
+    corners = wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
+    return wp.Mesh(to_vec3_array(vertices_m, "cpu"), corners)
+
+
 def cast(mesh: wp.Mesh, origins_m: np.ndarray, directions: np.ndarray) -> RayHits:
     """Return the first hits of rays along unit directions (N, 3), computed on the mesh's device; origins_m is (N, 3),
     or (3,) if all rays share one."""

@@ -10,7 +10,7 @@ import warp as wp
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from hnerf.geometry.camera import Camera
-from hnerf.geometry.rays import RayHits, cast, to_vec3_array
+from hnerf.geometry.rays import RayHits, cast, mesh_on_cpu, to_vec3_array
 from hnerf.synthetic.appearance import person_colour, room_colour
 
 wp.config.log_level = wp.LOG_ERROR
@@ -37,8 +37,7 @@ class RayCaster:
     """Ray casting against a mesh on the CPU."""
 
     def __init__(self, vertices_m: np.ndarray, faces: np.ndarray) -> None:
-        corners = wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
-        self.mesh = wp.Mesh(to_vec3_array(vertices_m, "cpu"), corners)
+        self.mesh = mesh_on_cpu(vertices_m, faces)
 
     def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> RayHits:
         """Return the first hits of rays from one origin (3,) along unit directions (N, 3)."""

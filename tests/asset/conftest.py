@@ -3,11 +3,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hnerf.asset.correctives import correctives_of, with_displacements
+from hnerf.asset.correctives import correctives_of
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.staging import StagedAvatar, stage_avatar
 from hnerf.asset.texture import unwrap
-from tests.asset.figure import bending_body, upright_column
+from tests.asset.figure import bending_body, posed_with_displacements, upright_column
 
 
 @pytest.fixture(scope="session")
@@ -21,5 +21,5 @@ def staged() -> StagedAvatar:
     shapes_m = rng.normal(scale=0.01, size=(2, len(clothes.vertices), 3))
     moved_m = np.einsum("nk,kvd->nvd", rng.normal(size=(len(body.frames), 2)), shapes_m).astype(np.float32)
     texture = rng.integers(0, 255, (64, 64, 3), np.uint8)
-    surfaces_m = with_displacements(clothed, moved_m)
+    surfaces_m = posed_with_displacements(clothed, moved_m)
     return stage_avatar(clothed, surfaces_m, correctives_of(moved_m, 2), layout, texture, "z")

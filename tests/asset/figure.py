@@ -1,5 +1,6 @@
 """A two-bone column 1.6 m tall as a body, small enough to work out by hand."""
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import torch
 import trimesh
 
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.rig import Rig
+from hnerf.body.rig import Rig, pose_vertices
 from hnerf.capture.capture import Capture
 from hnerf.geometry.camera import Camera
 
@@ -58,6 +59,13 @@ def bending_body() -> BodyFit:
         root[row, :2, :2] = torch.tensor([[c, -s], [s, c]])
         root[row, :3, 3] = torch.tensor([0.1 * frame, 2.0, 0.5])
     return BodyFit(column_rig(), FRAMES, theta, root)
+
+
+def posed_with_displacements(clothed: BodyFit, moved_m: np.ndarray) -> np.ndarray:
+    """Return the surfaces (n, V, 3) of a fit whose rest vertices are displaced by moved_m (n, V, 3), frame by frame."""
+    rigs = [dataclasses.replace(clothed.rig, vertices_m=clothed.rig.vertices_m + torch.from_numpy(m)) for m in moved_m]
+    posed = zip(rigs, clothed.theta, clothed.root, strict=True)
+    return np.stack([pose_vertices(rig, theta, root).numpy() for rig, theta, root in posed])
 
 
 def side_camera() -> Camera:

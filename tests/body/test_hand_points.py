@@ -51,7 +51,7 @@ def test_a_palm_beside_its_image_costs_half_a_square_less_what_fades() -> None:
     views.pixels[..., 0] += 12
     views.pixels[..., 6, 0] += 500
     equations = NormalEquations(2, articulation.unknowns, len(pose.rig.beta))
-    cost = PalmTerm(views, torch.full((2, 2), 0.001)).add(equations, articulation, joints)
+    cost = PalmTerm(views).add(equations, articulation, joints, torch.full((2, 2), 0.001))
     np.testing.assert_allclose(cost, 2 * 12 / 1.04)
     assert views.confidence[..., PALM].shape[-1] == 6
 
@@ -61,11 +61,11 @@ def test_the_gradient_of_the_palm_is_that_of_its_cost() -> None:
     articulation = Articulation(pose.rig)
     views = views_of(articulation.jacobian(hand_points(articulation), articulation.pose(pose))[0])
     views.pixels.add_(9 * torch.randn(views.pixels.shape, generator=torch.Generator().manual_seed(3)))
-    term = PalmTerm(views, torch.full((2, 2), 0.002, dtype=torch.float64))
+    scale_m = torch.full((2, 2), 0.002, dtype=torch.float64)
 
     def cost_and_equations(at: Pose) -> tuple[float, NormalEquations]:
         equations = NormalEquations(2, articulation.unknowns, len(pose.rig.beta))
-        return term.add(equations, articulation, articulation.pose(at)), equations
+        return PalmTerm(views).add(equations, articulation, articulation.pose(at), scale_m), equations
 
     direction = torch.randn(2, articulation.unknowns, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     ends = [cost_and_equations(articulation.apply_step(pose, sign * 1e-6 * direction))[0] for sign in (1, -1)]

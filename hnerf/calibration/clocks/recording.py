@@ -9,15 +9,14 @@ import numpy as np
 from hnerf.calibration.clocks.estimate import Clocks, estimate_clocks
 from hnerf.calibration.clocks.keypoints import Track
 from hnerf.calibration.clocks.sound import read_sound, sound_offset
-from hnerf.capture.capture import Capture
 from hnerf.capture.clocks import frame_times_s
 from hnerf.capture.footage import Footage, Video
 from hnerf.capture.ingest import DEFAULT_FPS, ingest, recognise
 from hnerf.capture.manifest import read_manifest
 from hnerf.capture.subject import subject_keypoints
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
-from hnerf.config import CaptureSettings, DetectionSettings
-from hnerf.detection.detect import detect
+from hnerf.config import CaptureSettings
+from hnerf.detection.detect import with_keypoints
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
@@ -59,10 +58,7 @@ def _track(folder: Path, name: str, footage: Footage, fps: float, scratch: Path)
     """Return the subject's keypoints in all frames of one camera, in recorded pixels."""
     alone = Uncalibrated(folder, only=name)
     settings = CaptureSettings(max_frames=MAX_FRAMES)
-    capture = ingest(folder, settings, scratch / "capture", alone)
-    if not capture.has_keypoints:
-        detect(capture, DetectionSettings(), scratch / "detected")
-        capture = Capture.load(scratch / "detected")
+    capture = with_keypoints(ingest(folder, settings, scratch / "capture", alone), scratch / "detected")
     keypoints = subject_keypoints(capture)[name]
     camera, (width_px, height_px) = capture.cameras[name], capture.recorded_sizes_px[name]
     scale = np.array([width_px / camera.width_px, height_px / camera.height_px])

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import resample
 
 from hnerf.errors import InputError
 
@@ -78,10 +79,9 @@ def _read_wave(path: Path) -> np.ndarray:
         raise InputError(f"{path}: not a readable .wav; export it again as 16-bit PCM") from None
     if width != 2 or rate_hz < 2 * BAND_HZ[0]:
         raise InputError(f"{path}: {8 * width} bits at {rate_hz} Hz; export it again as 16-bit PCM at 16 kHz or more")
+    if len(samples) < 2 * channels:
+        raise InputError(f"{path}: holds no sound; export it again, or remove it")
     sound = np.frombuffer(samples[: len(samples) - len(samples) % (2 * channels)], "<i2").reshape(-1, channels).mean(1)
     if rate_hz == RATE_HZ:
         return np.asarray(sound)
-    size = len(sound)
-    wanted = round(size * RATE_HZ / rate_hz)
-    spectrum = np.fft.rfft(sound)[: wanted // 2 + 1]  # band-limited, as in scipy.signal.resample
-    return np.asarray(np.fft.irfft(spectrum, wanted)) * (wanted / max(size, 1))
+    return np.asarray(resample(sound, round(len(sound) * RATE_HZ / rate_hz)))

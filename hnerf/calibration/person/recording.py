@@ -4,11 +4,10 @@ import tempfile
 from pathlib import Path
 
 from hnerf.calibration.person.calibrate import PersonCalibration, calibrate_from_person
-from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
-from hnerf.config import CaptureSettings, DetectionSettings
-from hnerf.detection.detect import detect
+from hnerf.config import CaptureSettings
+from hnerf.detection.detect import with_keypoints
 from hnerf.errors import InputError
 
 
@@ -24,15 +23,8 @@ def calibrate_recording(
         raise InputError(f"{folder}: no images/<camera>/, videos/*.mp4 or *.mp4 to calibrate from; add the recordings")
     layout = Uncalibrated(folder, lens_file, fov_deg)
     with tempfile.TemporaryDirectory(prefix="hnerf-") as scratch:
-        capture = with_keypoints(ingest(folder, CaptureSettings(), Path(scratch) / "capture", layout), Path(scratch))
+        capture = ingest(folder, CaptureSettings(), Path(scratch) / "capture", layout)
+        capture = with_keypoints(capture, Path(scratch) / "detected")
         sources = {name: known.source for name, known in layout.known_lenses.items()}
         unknown = [name for name, source in sources.items() if not source]
         return calibrate_from_person(capture, unknown, sources, height_m)
-
-
-def with_keypoints(capture: Capture, scratch: Path) -> Capture:
-    """Return the capture, with keypoints of the network if it has none of its own."""
-    if capture.has_keypoints:
-        return capture
-    detect(capture, DetectionSettings(), scratch / "detected")
-    return Capture.load(scratch / "detected")

@@ -141,6 +141,10 @@ def test_a_wave_file_beside_a_video_is_read_at_any_rate(tmp_path: Path) -> None:
     sound = read_sound(tmp_path / "a.mp4")
     assert sound is not None and len(sound) == 16_000
     assert np.allclose(sound, 1000 * np.sin(2 * np.pi * 440 * np.arange(16_000) / 16_000), atol=2)
+    with wave.open(str(tmp_path / "a.wav"), "wb") as file:
+        file.setparams((1, 2, 16_000, 0, "NONE", ""))
+    with pytest.raises(InputError, match=r"a\.wav: holds no sound"):
+        read_sound(tmp_path / "a.mp4")
     (tmp_path / "a.wav").write_bytes(b"RIFF")
     with pytest.raises(InputError, match=r"a\.wav: not a readable"):
         read_sound(tmp_path / "a.mp4")
