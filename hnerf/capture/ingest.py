@@ -133,7 +133,7 @@ def recognise(folder: Path) -> Layout:
     if not folder.exists():
         raise InputError(f"{folder}: no such folder or video; give the folder of a capture")
     for layout in LAYOUTS:
-        if layout.recognises(folder) and not (layout is EasyMocap and _only_filmed(folder)):
+        if layout.recognises(folder):
             return layout(folder)
     if cameras_without_calibration(folder):
         raise InputError(
@@ -145,11 +145,6 @@ def recognise(folder: Path) -> Layout:
         "(sparse/), Caliscope (camera_array.toml), aniposelib (calibration.toml), ZJU-MoCap (annots.npy), "
         f"PeopleSnapshot (camera.pkl) and videos ({', '.join(VIDEO_SUFFIXES)}); see docs/formats.md"
     )
-
-
-def _only_filmed(folder: Path) -> bool:
-    """Return whether a folder has images of cameras but no file with their poses."""
-    return not (folder / "extri.yml").exists() and bool(cameras_without_calibration(folder))
 
 
 def _subject_point(

@@ -34,8 +34,8 @@ class EasyMocap(Layout):
 
     @staticmethod
     def recognises(folder: Path) -> bool:
-        """Return whether the folder looks like this layout."""
-        return any((folder / name).exists() for name in ("intri.yml", "extri.yml", "images"))
+        """Return whether the folder has the poses of cameras in this layout."""
+        return (folder / "extri.yml").exists()
 
     def lenses(self) -> dict[str, Lens]:
         """Return every camera that intri.yml names."""
