@@ -10,7 +10,7 @@ from tasks.store import Artifact
 from tasks.training import load_trained_avatar
 
 
-@stage("asset", version="3")
+@stage("asset", version="4")
 def export(
     out: Path, recording: Artifact, calibration: Artifact, training: Artifact, settings: AssetSettings
 ) -> dict[str, float]:

@@ -1,5 +1,6 @@
 """Corrective blend shapes: what the surfaces of frames have beyond skinning, in a few shapes with a weight a frame."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,10 +22,20 @@ class Correctives:
     weights: np.ndarray
 
 
+def as_they_are(displacement_m: np.ndarray) -> np.ndarray:
+    """Return the displacements (V, 3) of every vertex for itself."""
+    return displacement_m
+
+
 @torch.no_grad()
-def frame_surfaces(avatar: Avatar, clothed: BodyFit) -> tuple[np.ndarray, np.ndarray]:
+def frame_surfaces(
+    avatar: Avatar, clothed: BodyFit, settle: Callable[[np.ndarray], np.ndarray] = as_they_are
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the skinned surface of `clothed`, moved onto the avatar's zero surface in each frame, (n, V, 3) float32 in
-    the world, and the displacements (n, V, 3) in the rest pose that skinning takes there."""
+    the world, and the displacements (n, V, 3) in the rest pose that skinning takes there.
+
+    settle: makes displacements (V, 3) in the rest pose agree with each other.
+    """
     rig, device = clothed.rig, avatar.body.theta.device
     surfaces_m, displacements_m = [], []
     for theta, root in tracked(zip(clothed.theta, clothed.root, strict=True), "correctives", len(clothed.frames)):
@@ -32,8 +43,9 @@ def frame_surfaces(avatar: Avatar, clothed: BodyFit) -> tuple[np.ndarray, np.nda
         posed = theta.to(device), root.to(device)
         surface_m = move_onto_surface(avatar, skinned_m.to(device), rig.faces.to(device), *posed)[0].cpu()
         turn = vertex_skinning(rig, theta, root)[..., :3]
-        surfaces_m.append(surface_m.numpy())
-        displacements_m.append(torch.linalg.solve(turn, surface_m - skinned_m).numpy())
+        displacement_m = settle(torch.linalg.solve(turn, surface_m - skinned_m).numpy()).astype(np.float32)
+        surfaces_m.append((skinned_m + (turn @ torch.from_numpy(displacement_m)[..., None])[..., 0]).numpy())
+        displacements_m.append(displacement_m)
     return np.stack(surfaces_m), np.stack(displacements_m)
 
 

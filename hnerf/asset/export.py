@@ -15,10 +15,11 @@ import torch
 from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
 from hnerf.asset.glb import write_glb
 from hnerf.asset.photographs import colours_from_photographs
-from hnerf.asset.rig_transfer import clothed_rig
-from hnerf.asset.simplify import simplify
+from hnerf.asset.registration import crossing_faces
+from hnerf.asset.regions import findings, surface_distances_mm
 from hnerf.asset.staging import stage_avatar
-from hnerf.asset.texture import field_colours, rasterise, texture_image, unwrap
+from hnerf.asset.texture import field_colours, rasterise, texture_image
+from hnerf.asset.topologies import asset_meshes
 from hnerf.asset.usd import write_cache, write_skinned
 from hnerf.asset.validation import validate_package
 from hnerf.avatar.avatar import Avatar
@@ -43,12 +44,14 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
         rest = avatar.body.theta.new_zeros(len(avatar.body.rig.joints_m), 3), torch.eye(4).to(avatar.body.theta)
         dense = surface_in_pose(avatar, *rest, settings.grid_cells)
     with _timed("mesh", seconds):
-        surface = simplify(dense, settings.faces)
-        layout = unwrap(surface.vertices, surface.faces, settings.texture_px)
-        rig = clothed_rig(avatar.body.rig.to("cpu"), surface)
+        meshes = asset_meshes(avatar.body.rig.to("cpu"), dense, settings.faces)
+        mesh = meshes[settings.topology]
+        rig, layout = mesh.rig, mesh.layout(settings.texture_px)
     clothed = _clothed_body(avatar.body, rig, capture.frames)
+    with _timed("distances", seconds):
+        distances_mm = surface_distances_mm(dense, meshes)
     with _timed("correctives", seconds):
-        surfaces_m, displacements_m = frame_surfaces(tracked_avatar, clothed)
+        surfaces_m, displacements_m = frame_surfaces(tracked_avatar, clothed, mesh.settle)
         correctives = correctives_of(displacements_m, settings.correctives)
     with _timed("texture", seconds):
         texels = rasterise(layout, settings.texture_px)
@@ -57,7 +60,7 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
         if settings.photograph_frames:
             frames = evenly_spaced(capture.train_frames, settings.photograph_frames)
             photographed = {frame: surfaces_m[clothed.index(frame)] for frame in frames}
-            colours = colours_from_photographs(capture, avatar.gains, photographed, surface.faces, texels, colours)
+            colours = colours_from_photographs(capture, avatar.gains, photographed, rig.faces.numpy(), texels, colours)
         texture = texture_image(texels, colours, settings.texture_px)
     with _timed("files", seconds):
         staged = stage_avatar(clothed, surfaces_m, correctives, layout, texture, capture.up)
@@ -70,11 +73,15 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
     report = {
         "surface": {"faces": len(dense.faces), "watertight": dense.is_watertight, "volume_l": 1e3 * dense.volume},
         "mesh": {
-            "vertices": len(surface.vertices),
-            "faces": len(surface.faces),
-            "watertight": surface.is_watertight,
+            "topology": settings.topology,
+            "vertices": len(rig.vertices_m),
+            "faces": len(rig.faces),
+            "watertight": mesh.trimesh.is_watertight,
+            "crossing_faces": int(crossing_faces(mesh.trimesh.vertices, mesh.trimesh.faces[: mesh.skin_faces]).sum()),
             "height_m": float(np.ptp(staged.rest_points_m[:, 1])),
         },
+        "to_surface_mm": distances_mm,
+        "findings": findings(distances_mm[settings.topology]) if settings.topology == "registered" else [],
         "texture_px": settings.texture_px,
         "joints": len(rig.joint_names),
         "frames": len(capture.frames),
