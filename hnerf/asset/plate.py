@@ -23,7 +23,7 @@ from hnerf.geometry.mesh_queries import Surface
 GAP_M = 0.025  # wider ones do not close
 NARROWEST_M = 0.001  # gaps count as this wide at least
 GAP_WEIGHT_M = 0.01  # s: a gap of this width is as stiff as a match
-SKIN_WEIGHT = 1e-4  # e, which decides only where nothing else does
+SKIN_WEIGHT = 1e-8  # e, which decides only where nothing else does
 LEAST_COTANGENT = 1e-3  # keeps the Laplacian's weights positive in obtuse triangles
 START_M = 1e-4  # off the surface, from where rays across a gap start
 LEAST_AREA_M2 = 1e-12
