@@ -15,8 +15,8 @@ import torch
 from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
 from hnerf.asset.glb import write_glb
 from hnerf.asset.photographs import colours_from_photographs
-from hnerf.asset.registration import crossing_faces
 from hnerf.asset.regions import findings, surface_distances_mm
+from hnerf.asset.registration import crossing_faces
 from hnerf.asset.staging import stage_avatar
 from hnerf.asset.texture import field_colours, rasterise, texture_image
 from hnerf.asset.topologies import asset_meshes

@@ -62,7 +62,8 @@ class Plate:
 def cotangent_laplacian(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, csr_array]:
     """Return the areas of the vertices, (V,), a third of their faces each, and the Laplacian times them, (V, V), with
     positive diagonal (Pinkall and Polthier 1993)."""
-    n, a, b, c = len(vertices_m), *vertices_m[faces].swapaxes(0, 1)
+    n = len(vertices_m)
+    a, b, c = vertices_m[faces].swapaxes(0, 1)
     twice_m2 = np.linalg.norm(np.cross(b - a, c - a), axis=1).clip(LEAST_AREA_M2)
     area_m2 = np.bincount(faces.ravel(), np.repeat(twice_m2 / 6, 3), n)
     weights = csr_array((n, n))

@@ -12,6 +12,7 @@ from zipfile import ZipFile
 import numpy as np
 from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, Vt
 
+from hnerf.asset.quads import polygon_corners
 from hnerf.asset.staging import StagedAvatar
 from hnerf.body.descriptor import normals_of
 from hnerf.capture.capture import write_image
@@ -118,13 +119,14 @@ def _identifier(name: str) -> str:
 def _define_mesh(stage: Usd.Stage, path: Sdf.Path, avatar: StagedAvatar) -> UsdGeom.Mesh:
     """Define topology, texture coordinates and material; the caller sets points, normals and extents."""
     mesh = UsdGeom.Mesh.Define(stage, path)
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(avatar.faces), 3, np.int32)))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(avatar.faces.astype(np.int32).ravel()))
+    corners = polygon_corners(avatar.faces)
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(corners), corners.shape[1], np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(avatar.faces.ravel()[corners].astype(np.int32).ravel()))
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
     st.Set(Vt.Vec2fArray.FromNumpy(avatar.uvs.astype(np.float32)))
-    st.SetIndices(Vt.IntArray.FromNumpy(avatar.face_uvs.astype(np.int32).ravel()))
+    st.SetIndices(Vt.IntArray.FromNumpy(avatar.face_uvs.ravel()[corners].astype(np.int32).ravel()))
     UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(_define_material(stage))
     return mesh
 

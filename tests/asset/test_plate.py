@@ -3,6 +3,7 @@ import pytest
 import trimesh
 
 from hnerf.asset.plate import GAP_WEIGHT_M, LEAST_COTANGENT, SKIN_WEIGHT, Plate, cotangent_laplacian, facing_pairs
+from tests.asset.figure import twice
 
 ONE_SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
 
@@ -50,8 +51,7 @@ def test_where_nothing_is_trusted_the_plate_goes_on_smoothly() -> None:
 
 
 def two_boxes(gap_m: float) -> trimesh.Trimesh:
-    box = trimesh.creation.box(extents=(0.02, 0.02, 0.02)).subdivide()
-    return trimesh.util.concatenate(box, box.copy().apply_translation([0.02 + gap_m, 0, 0]))
+    return twice(trimesh.creation.box(extents=(0.02, 0.02, 0.02)).subdivide(), (0.02 + gap_m, 0, 0))
 
 
 def test_pairs_across_a_gap() -> None:

@@ -8,7 +8,7 @@ import trimesh
 from hnerf.asset.plate import Plate
 from hnerf.asset.registration import _loosened, crossing_faces, register
 from hnerf.body.base_mesh import BaseMesh, base_mesh
-from tests.asset.figure import column_rig, upright_column
+from tests.asset.figure import column_rig, twice, upright_column
 
 
 def bare(mesh: trimesh.Trimesh) -> BaseMesh:
@@ -41,8 +41,8 @@ def test_hidden_vertices_follow_their_neighbours() -> None:
 
 
 def test_two_fingers_stay_apart_in_a_mitten() -> None:
-    finger = trimesh.creation.capsule(height=0.05, radius=0.008, count=[12, 12]).subdivide_to_size(0.008)
-    fingers = trimesh.util.concatenate(finger, finger.copy().apply_translation([0.019, 0, 0]))  # 3 mm of air between
+    finger = trimesh.creation.capsule(height=0.05, radius=0.008, count=[12, 12]).subdivide()
+    fingers = twice(finger, (0.019, 0, 0))  # 3 mm of air between
     middle_m = [0.0095, 0, 0.025]
     mitten = trimesh.creation.icosphere(subdivisions=4)
     mitten.vertices = mitten.vertices * (0.026, 0.014, 0.045) + middle_m
@@ -58,7 +58,7 @@ def test_two_fingers_stay_apart_in_a_mitten() -> None:
 
 def test_faces_that_cross_are_drawn_apart() -> None:
     box = trimesh.creation.box(extents=(0.02, 0.02, 0.02)).subdivide().subdivide()
-    boxes = trimesh.util.concatenate(box, box.copy().apply_translation([0.0195, 0.001, 0.001]))  # half a mm too near
+    boxes = twice(box, (0.0195, 0.001, 0.001))  # half a millimetre too near
     vertices_m, faces = np.asarray(boxes.vertices), np.asarray(boxes.faces)
     assert crossing_faces(vertices_m, faces).any()
     apart_m, left = _loosened(vertices_m, faces, len(faces), Plate.of(vertices_m, faces))

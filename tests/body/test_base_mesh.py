@@ -3,6 +3,7 @@ import pytest
 import torch
 import trimesh
 
+from hnerf.asset.quads import polygon_corners
 from hnerf.asset.texture import UvLayout, rasterise
 from hnerf.body.anny import ADULT, anny_rig
 from hnerf.body.base_mesh import BaseMesh, base_mesh
@@ -23,6 +24,13 @@ def test_three_closed_parts(shown: BaseMesh) -> None:
     skin = trimesh.Trimesh(mesh.vertices, mesh.faces[: shown.skin_faces], process=False)
     assert len(shown.rig.faces) - shown.skin_faces == 2 * 140
     assert mesh.volume > skin.volume
+
+
+def test_all_faces_are_halves_of_quads_without_a_seam_within(shown: BaseMesh) -> None:
+    assert shown.face_uvs is not None
+    corners = polygon_corners(shown.rig.faces.numpy())
+    assert corners.shape == (len(shown.rig.faces) // 2, 4)
+    np.testing.assert_array_equal(polygon_corners(shown.face_uvs), corners)
 
 
 def test_eyeballs_lie_about_their_joints_and_turn_with_them(shown: BaseMesh) -> None:
