@@ -13,12 +13,13 @@ import numpy as np
 import torch
 
 from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
+from hnerf.asset.field_colours import field_colours
 from hnerf.asset.glb import write_glb
 from hnerf.asset.photographs import colours_from_photographs
 from hnerf.asset.regions import findings, surface_distances_mm
 from hnerf.asset.registration import crossing_faces
 from hnerf.asset.staging import stage_avatar
-from hnerf.asset.texture import field_colours, rasterise, texture_image
+from hnerf.asset.texture import rasterise, texture_image
 from hnerf.asset.topologies import asset_meshes
 from hnerf.asset.usd import write_cache, write_skinned
 from hnerf.asset.validation import validate_package
