@@ -7,8 +7,10 @@ and variants in one layer, as ARKit asks. `avatar_cache.usdz` has the surface as
 
 import struct
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -36,7 +38,6 @@ from hnerf.geometry.camera import Camera
 
 FIRST_TIME = bytes([0, 0, 0x21, 0])  # midnight, 1 January 1980, in ZIP's time and date
 INTERFACE, PAYLOADS = "avatar.usda", "avatar"
-Author = Callable[[Usd.Stage], None]
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Part:
     variant: its set and its name there, if it is one."""
 
     name: str
-    author: Author
+    author: Callable[[Usd.Stage], None]
     fps: float
     variant: tuple[str, str] | None = None
 
@@ -84,7 +85,8 @@ def write_usdz(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps:
     with tempfile.TemporaryDirectory() as folder:
         stage = _new_stage(Path(folder) / "avatar.usdc", avatar, avatar.frames, fps, info)
         for part in _parts(avatar, list(cameras), fps):
-            _in_variant(stage, part, lambda _, part=part: part.author(stage))
+            with _in_variant(stage, part):
+                part.author(stage)
         _select(stage, CAPTURED)
         _package(stage, avatar, path)
 
@@ -106,30 +108,33 @@ def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps
 
 def _parts(avatar: StagedAvatar, cameras: list[Camera], fps: float) -> list[Part]:
     """Return the parts of the package."""
-    parts = [
-        Part("geometry", lambda stage: author_geometry(stage, avatar), fps),
-        Part("look", lambda stage: author_look(stage, SURFACE), fps),
-        Part("cameras", lambda stage: author_cameras(stage, cameras, avatar.stage_from_world), fps),
+    view = partial(author_cameras, cameras=cameras, stage_from_world=avatar.stage_from_world)
+    return [
+        Part("geometry", partial(author_geometry, avatar=avatar), fps),
+        Part("look", partial(author_look, mesh=SURFACE), fps),
+        Part("cameras", view, fps),
+        *(
+            Part(f"rig_{name}", partial(author_rig, name=name, rig=rig), fps, ("rig", name))
+            for name, rig in avatar.rigs.items()
+        ),
+        *(
+            Part(f"motion_{name}", partial(author_motion, name=name, avatar=avatar), motion.fps, ("motion", name))
+            for name, motion in avatar.rigs[FULL].motions.items()
+        ),
     ]
-    for name, rig in avatar.rigs.items():
-        parts.append(Part(f"rig_{name}", lambda stage, n=name, r=rig: author_rig(stage, n, r), fps, ("rig", name)))
-    for name, motion in avatar.rigs[FULL].motions.items():
-        author: Author = lambda stage, n=name: author_motion(stage, n, avatar)  # noqa: E731
-        parts.append(Part(f"motion_{name}", author, motion.fps, ("motion", name)))
-    return parts
 
 
-def _in_variant(stage: Usd.Stage, part: Part, author: Callable[[Usd.Prim], object]) -> None:
-    """Author a part on the root prim, inside its variant if it is one."""
-    root = stage.GetDefaultPrim()
+@contextmanager
+def _in_variant(stage: Usd.Stage, part: Part) -> Iterator[None]:
+    """Author what follows inside the part's variant of the root prim, if it is one."""
     if part.variant is None:
-        author(root)
+        yield
         return
-    variants = root.GetVariantSets().AddVariantSet(part.variant[0])
+    variants = stage.GetDefaultPrim().GetVariantSets().AddVariantSet(part.variant[0])
     variants.AddVariant(part.variant[1])
     variants.SetVariantSelection(part.variant[1])
     with variants.GetVariantEditContext():
-        author(root)
+        yield
 
 
 def _select(stage: Usd.Stage, motion: str) -> None:
@@ -146,7 +151,8 @@ def _write_interface(
     stage = _new_stage(file, avatar, avatar.rigs[FULL].motions[motion].codes, fps, info)
     for part in parts:
         path = f"./{PAYLOADS}/{part.name}.usdc"
-        _in_variant(stage, part, lambda root, path=path: root.GetPayloads().AddPayload(path))
+        with _in_variant(stage, part):
+            stage.GetDefaultPrim().GetPayloads().AddPayload(path)
     _select(stage, motion)
     stage.GetRootLayer().Save()
 

@@ -1,7 +1,7 @@
 """Defects of an asset's structure: what OpenUSD's guidelines ask of the root prim of a component."""
 
 import numpy as np
-from pxr import Kind, Usd, UsdGeom, UsdSkel
+from pxr import Kind, Usd, UsdGeom
 
 INFORMATION = ("identifier", "name", "version", "captureDigest", "licence")
 
@@ -30,9 +30,10 @@ def _extent_defects(root: Usd.Prim) -> list[str]:
     if hint.shape[:1] != (2,) or hint.shape[1:] != (3,) or not np.isfinite(hint).all():
         return [f"{root.GetPath()}: has no extentsHint"]
     for prim in Usd.PrimRange(root):
-        extent = UsdGeom.Boundable(prim).GetExtentAttr() if prim.IsA(UsdGeom.Boundable) else None
-        inside_skeleton = prim.IsA(UsdGeom.Mesh) and prim.HasAPI(UsdSkel.BindingAPI)  # its box is that of the rest pose
-        for time in extent.GetTimeSamples() if extent and not inside_skeleton else ():
+        if not prim.IsA(UsdGeom.Boundable):
+            continue
+        extent = UsdGeom.Boundable(prim).GetExtentAttr()
+        for time in extent.GetTimeSamples():
             lower, upper = np.array(extent.Get(time))
             if (lower < hint[0] - 1e-4).any() or (upper > hint[1] + 1e-4).any():
                 return [f"{root.GetPath()}: extentsHint does not contain {prim.GetPath()} at time {time}"]
