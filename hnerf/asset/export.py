@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from hnerf.asset.bvh_file import write_avatar_bvh
 from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
 from hnerf.asset.glb import write_glb
 from hnerf.asset.package import AssetInfo, write_cache, write_package, write_usdz
@@ -116,6 +117,7 @@ def write_files(out: Path, staged: StagedAvatar, capture: Capture, info: AssetIn
     write_cache(out / "avatar_cache.usdz", staged, cameras, capture.fps, info)
     write_glb(out / "avatar.glb", staged, staged.rigs[FULL])
     write_glb(out / "avatar_game.glb", staged, staged.rigs[GAME])
+    write_avatar_bvh(out / "avatar.bvh", staged)
 
 
 def _retargeted(own: BodyFit, rig: Rig, motion: Motion, up: str) -> BodyFit:
