@@ -39,6 +39,8 @@ COLMAP, ZJUMOCAP = "hnerf/capture/formats/colmap.py", "hnerf/capture/formats/zju
 SAFE_IO, TIMING = "hnerf/capture/safe_io.py", "hnerf/capture/timing.py"
 NORMALISE, MANIFEST = "hnerf/capture/normalise.py", "hnerf/capture/manifest.py"
 STAGING, GLB, USD = "hnerf/asset/staging.py", "hnerf/asset/glb.py", "hnerf/asset/usd.py"
+PLATE, REGISTRATION = "hnerf/asset/plate.py", "hnerf/asset/registration.py"
+FIELD_COLOURS = "hnerf/asset/field_colours.py"
 ANTIALIASING, CORRECTIVES = "hnerf/avatar/antialiasing.py", "hnerf/asset/correctives.py"
 PHOTOGRAPHS, SURFACE = "hnerf/asset/photographs.py", "hnerf/avatar/surface.py"
 METRICS, REPORT = "hnerf/evaluation/metrics.py", "hnerf/evaluation/report.py"
@@ -58,6 +60,8 @@ BY_METRICS, BY_POLICY = "tests/evaluation/test_metrics.py", "tests/tasks/test_po
 BY_INGEST, BY_STORE = "tests/capture/test_ingest.py", "tests/tasks/test_store.py"
 BY_BAD_INPUT = "tests/capture/test_bad_input.py"
 BY_ANTIALIASING, BY_CORRECTIVES = "tests/avatar/test_antialiasing.py", "tests/asset/test_correctives.py"
+BY_PLATE, BY_REGISTRATION = "tests/asset/test_plate.py", "tests/asset/test_registration.py"
+BY_FIELD_COLOURS = "tests/asset/test_field_colours.py"
 BY_PHOTOGRAPHS = "tests/asset/test_photographs.py"
 BY_TIMING, BY_GLB = "tests/capture/test_timing.py", "tests/asset/test_glb.py"
 
@@ -219,6 +223,20 @@ FAULTS = (
     Fault("photographs-outline", PHOTOGRAPHS, "inside & ~outline[row, column]", "inside", BY_PHOTOGRAPHS),
     Fault("photographs-gain", PHOTOGRAPHS, "pixels_px) / gain", "pixels_px) * gain", BY_PHOTOGRAPHS),
     Fault("correctives-turn", CORRECTIVES, "solve(turn, surface_m", "solve(turn.mT, surface_m", BY_CORRECTIVES),
+    Fault("plate-gaps", PLATE, "self.bending + self.gaps", "self.bending", BY_PLATE),
+    Fault("plate-mass", PLATE, "diags_array(1 / area_m2)", "diags_array(1e9 * area_m2)", BY_PLATE),
+    Fault("plate-barycentric", PLATE, "-hits.barycentric[vertex]", "-hits.barycentric[vertex][:, ::-1]", BY_PLATE),
+    Fault("registration-hidden", REGISTRATION, "trust[body.hidden] = 0", "trust[body.hidden] = 1", BY_REGISTRATION),
+    Fault("registration-normals", REGISTRATION, "closest_m, aligned /", "closest_m, 1 /", BY_REGISTRATION),
+    Fault("registration-loosen", REGISTRATION, "= -LOOSEN_M *", "= LOOSEN_M *", BY_REGISTRATION),
+    Fault("quads-order", "hnerf/asset/quads.py", "for k in (1, 2, 0)", "for k in (2, 1, 0)",
+          "tests/asset/test_quads.py"),
+    Fault("eye-size", "hnerf/body/base_mesh.py", "scale = np.sqrt(", "scale = 2 * np.sqrt(",
+          "tests/body/test_base_mesh.py"),
+    Fault("regions-limit", "hnerf/asset/regions.py", "1e3 * surface.closest", "surface.closest",
+          "tests/asset/test_regions.py"),
+    Fault("colours-off-surface", FIELD_COLOURS, "<= OFF_SURFACE_M", "<= 1.0", BY_FIELD_COLOURS),
+    Fault("colours-median", FIELD_COLOURS, "for k in (seen - 1, seen)", "for k in (seen, seen)", BY_FIELD_COLOURS),
     Fault("surface-step", SURFACE, "vertices_m - step_to_surface(", "vertices_m + step_to_surface(", BY_CORRECTIVES),
     Fault("usd-shape-weights", USD, "frames, avatar.shape_weights", "frames, -avatar.shape_weights", BY_USD),
     Fault("glb-time", GLB, "(avatar.frames - avatar.frames[0]) / fps", "avatar.frames / fps", BY_GLB),

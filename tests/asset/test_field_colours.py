@@ -8,7 +8,8 @@ from torch import Tensor
 from hnerf.asset.field_colours import field_colours, filled, median_of_seen
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.texture import Texels, rasterise, texture_image, unwrap
-from tests.asset.figure import bending_body, twice, upright_column
+from hnerf.body.fit_result import BodyFit
+from tests.asset.figure import bending_body, column_rig, twice, upright_column
 from tests.asset.stand_in import StandInAvatar, rest_colour
 
 
@@ -48,6 +49,22 @@ def test_baked_colours_are_those_of_the_point_on_the_rest_body() -> None:
     expected = rest_colour(torch.cat([inward, middle_m[:, 2:]], 1)).numpy()[sides.numpy()]
     assert sides.sum() > 100
     assert np.abs(pixel[sides.numpy()] / 255 - expected).max() < 0.03
+
+
+def test_texels_off_the_fields_surface_take_the_colour_around() -> None:
+    """Clothes 25 cm taller than the body: above its top, the field's colour there would be lighter than any below."""
+
+    class Height(StandInAvatar):
+        def colour(self, points_m: Tensor, directions: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+            return points_m[:, 2:].expand(-1, 3) / 2
+
+    body = BodyFit(column_rig(), (0,), torch.zeros(1, 2, 3), torch.eye(4)[None])
+    clothes = upright_column(0.16, 0.0, 1.85)
+    texels = rasterise(unwrap(clothes.vertices, clothes.faces, 64), 64)
+    colours = field_colours(Height(body), dataclasses.replace(body, rig=clothed_rig(body.rig, clothes)), texels)
+    z_m = clothes.triangles_center[texels.face.numpy(), 2]
+    assert colours[z_m > 1.7].max() < 0.83
+    assert colours[z_m > 1.7].min() > 0.7
 
 
 def test_median_of_what_is_seen() -> None:

@@ -6,8 +6,9 @@ import torch
 import trimesh
 
 from hnerf.asset.plate import Plate
-from hnerf.asset.registration import _loosened, crossing_faces, register
+from hnerf.asset.registration import _loosened, _match, crossing_faces, register
 from hnerf.body.base_mesh import BaseMesh, base_mesh
+from hnerf.geometry.mesh_queries import Surface
 from tests.asset.figure import column_rig, twice, upright_column
 
 
@@ -38,6 +39,18 @@ def test_hidden_vertices_follow_their_neighbours() -> None:
     found = register(dataclasses.replace(body, hidden=hidden), upright_column(0.17, -0.02, 1.62))
     assert (found.trust[hidden] == 0).all()
     np.testing.assert_allclose(np.linalg.norm(found.vertices_m[hidden, :2], axis=1), 0.17, atol=0.003)
+
+
+def test_trust_in_a_match_by_distance_and_normals() -> None:
+    """At the scale a match keeps a quarter of its trust (Geman-McClure); none where the normals are opposite."""
+    inner, outer = upright_column(0.15, 0.0, 1.6), Surface(upright_column(0.17, -0.02, 1.62))
+    scale_m = np.full(len(inner.vertices), 0.02)
+    sides = (np.abs(inner.vertices[:, 2] - 0.8) < 0.5) & (np.linalg.norm(inner.vertices[:, :2], axis=1) > 0.1)
+    closest_m, trust = _match(inner.vertices, inner.faces, outer, scale_m)
+    np.testing.assert_allclose(trust[sides], 0.25, atol=0.01)
+    np.testing.assert_allclose(np.linalg.norm(closest_m[sides, :2], axis=1), 0.17, atol=0.002)
+    _, inside_out = _match(inner.vertices, inner.faces[:, [0, 2, 1]], outer, scale_m)
+    assert (inside_out == 0).all()
 
 
 def test_two_fingers_stay_apart_in_a_mitten() -> None:
