@@ -2,7 +2,7 @@ import itertools
 
 import numpy as np
 
-from hnerf.asset.rigs import without_eyes
+from hnerf.asset.rigs import without_lids
 from hnerf.asset.skinning import Skin, skinned, with_few_influences
 
 
@@ -29,11 +29,16 @@ def test_weights_of_folded_joints_add_up() -> None:
     assert found.influences == 2
 
 
-def test_eyes_move_no_skin() -> None:
-    skin = Skin(np.array([[1, 0], [2, 0]]), np.array([[0.6, 0.4], [0.7, 0.3]]))
-    found = without_eyes(skin, ("head", "eye.L", "eye.R"), np.array([-1, 0, 0]))
-    np.testing.assert_array_equal(found.joints, 0)
-    np.testing.assert_allclose(found.weights, [[1, 0], [1, 0]])
+def test_eyes_move_eyeballs_alone() -> None:
+    """Two lids, and an eyeball or two, of which one alone would leave the face one-eyed."""
+    joints, parents = ("head", "eye.L", "eye.R"), np.array([-1, 0, 0])
+    lids = Skin(np.array([[1, 0], [2, 0]]), np.array([[0.6, 0.4], [0.7, 0.3]]))
+    np.testing.assert_array_equal(without_lids(lids, joints, parents).joints, 0)
+    np.testing.assert_allclose(without_lids(lids, joints, parents).weights, [[1, 0], [1, 0]])
+    for balls, expected in (([1], [0, 0, 0]), ([1, 2], [0, 0, 1, 2])):
+        ends = np.array([[ball, 0] for ball in balls])
+        both = Skin(np.vstack([lids.joints, ends]), np.vstack([lids.weights, [[1.0, 0]] * len(balls)]))
+        np.testing.assert_array_equal(without_lids(both, joints, parents).joints[:, 0], expected)
 
 
 def test_a_joint_that_moves_as_another_is_given_up_without_loss() -> None:
