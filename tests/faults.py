@@ -57,7 +57,7 @@ BY_EXPOSURE = "tests/training/test_exposure.py"
 BY_CAMERA, BY_TRIANGULATION = "tests/geometry/test_camera.py", "tests/calibration/test_triangulation.py"
 BY_FILES, BY_USD = "tests/capture/test_camera_files.py", "tests/asset/test_usd.py"
 BY_PACKAGE, BY_MOTIONS = "tests/asset/test_package.py", "tests/asset/test_motions.py"
-BY_SKINNING, BY_VALIDATION = "tests/asset/test_skinning.py", "tests/asset/test_validation.py"
+BY_SKINNING = "tests/asset/test_skinning.py"
 BY_BVH, BY_BVH_MOTION = "tests/body/test_bvh.py", "tests/render/test_bvh_motion.py"
 BY_METRICS, BY_POLICY = "tests/evaluation/test_metrics.py", "tests/tasks/test_policy.py"
 BY_INGEST, BY_STORE = "tests/capture/test_ingest.py", "tests/tasks/test_store.py"
@@ -226,7 +226,7 @@ FAULTS = (
     Fault("game-negative", SKINNING, "(found >= 0).all(1) & ", "", BY_SKINNING),
     Fault("one-eyeball", RIGS, "not all(points.any() for", "not any(points.any() for", BY_SKINNING),
     Fault("package-twice-scaled", PACKAGE, "_set_rate(layer, part.fps)", "_set_rate(layer, 10.0)", BY_PACKAGE),
-    Fault("package-extents", PACKAGE, "for boxes in avatar.extents_m.values()", "for boxes in ()", BY_VALIDATION),
+    Fault("package-extents", PACKAGE, "for boxes in avatar.extents_m.values()", "for boxes in ()", BY_PACKAGE),
     Fault("correctives-sign", CORRECTIVES, "np.vstack([shapes_m, -shapes_m", "np.vstack([shapes_m, shapes_m",
           BY_CORRECTIVES),
     Fault("bvh-count", BVH, "if frames * width > MAX_NUMBERS:", "if False:", BY_BVH),

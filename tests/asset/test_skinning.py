@@ -1,6 +1,7 @@
 import itertools
 
 import numpy as np
+import pytest
 
 from hnerf.asset.rigs import without_lids
 from hnerf.asset.skinning import Skin, skinned, with_few_influences
@@ -50,20 +51,21 @@ def test_a_joint_that_moves_as_another_is_given_up_without_loss() -> None:
     np.testing.assert_allclose(found.weights, [[0.75, 0.25]], atol=1e-6)
 
 
-def test_the_best_subset_is_found() -> None:
-    """As good as the best of many random weights on any two of four joints."""
-    rng = np.random.default_rng(0)
-    poses = [(moves(*rng.normal(size=(4, 3))), np.zeros((1, 3))) for _ in range(5)]
+@pytest.mark.parametrize("seed", range(8))
+def test_the_best_subset_is_found(seed: int) -> None:
+    """As good as the best of many weights on any two of four joints."""
+    rng = np.random.default_rng(seed)
+    poses = [(moves(*rng.normal(size=(4, 3))), np.zeros((1, 3))) for _ in range(3)]
     skin = Skin(np.array([[0, 1, 2, 3]]), np.array([[0.4, 0.3, 0.2, 0.1]]))
     found = with_few_influences(skin, iter(poses), 2)
-    assert found.influences == 2
+    assert found.influences <= 2
 
     def error(tried: Skin) -> float:
         off = [skinned(pose, tried, at) - skinned(pose, skin, at) for pose, at in poses]
         return float(np.square(off).sum())
 
     pairs = itertools.combinations(range(4), 2)
-    tried = [Skin(np.array([pair]), np.array([[w, 1 - w]])) for pair in pairs for w in np.linspace(0, 1, 101)]
+    tried = [Skin(np.array([pair]), np.array([[w, 1 - w]])) for pair in pairs for w in np.linspace(0, 1, 51)]
     assert error(found) <= min(map(error, tried)) * 1.001
 
 
