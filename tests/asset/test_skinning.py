@@ -51,11 +51,15 @@ def test_a_joint_that_moves_as_another_is_given_up_without_loss() -> None:
     np.testing.assert_allclose(found.weights, [[0.75, 0.25]], atol=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_the_best_subset_is_found(seed: int) -> None:
+RANDOM = [np.random.default_rng(seed).normal(size=(3, 4, 3)) for seed in range(4)]
+# One pose in which the line through the last two joints passes nearest, but outside of them.
+OUTSIDE = np.array([[[3.0, -2, -1], [-2, -3, -3], [-3, 2, 2], [-2, 1, 1]]])
+
+
+@pytest.mark.parametrize("offsets_m", [*RANDOM, OUTSIDE])
+def test_the_best_subset_is_found(offsets_m: np.ndarray) -> None:
     """As good as the best of many weights on any two of four joints."""
-    rng = np.random.default_rng(seed)
-    poses = [(moves(*rng.normal(size=(4, 3))), np.zeros((1, 3))) for _ in range(3)]
+    poses = [(moves(*pose), np.zeros((1, 3))) for pose in offsets_m]
     skin = Skin(np.array([[0, 1, 2, 3]]), np.array([[0.4, 0.3, 0.2, 0.1]]))
     found = with_few_influences(skin, iter(poses), 2)
     assert found.influences <= 2
