@@ -13,6 +13,7 @@ from hnerf.evenly_spaced import evenly_spaced
 
 FULL, GAME = "full", "game"
 GAME_INFLUENCES = 4
+EYEBALL_WEIGHT = 0.99  # of a point on an eyeball
 FITTED_FRAMES = 64  # at most, evenly spaced; more hardly change the weights
 
 
@@ -73,7 +74,7 @@ def stage_rigs(
     """Return both rigs of a body model's rig, whose joints are at rest at joints_m (S, 3). motions: the first is the
     captured one, to which the game rig's weights are fitted; floor_m: the height of the ground in the stage."""
     parents = rig.parents.numpy()
-    skin = without_eyes(Skin(rig.skin_joints.numpy(), rig.skin_weights.double().numpy()), rig.joint_names, parents)
+    skin = without_lids(Skin(rig.skin_joints.numpy(), rig.skin_weights.double().numpy()), rig.joint_names, parents)
     full = full_skeleton(rig.joint_names, parents, joints_m, bones)
     skin = Skin(np.where(skin.weights > 0, skin.joints + 1, 0), skin.weights)  # a root was added before them
     poses = {name: motion.transforms(parents, joints_m) for name, motion in motions.items()}
@@ -86,11 +87,17 @@ def stage_rigs(
     return staged
 
 
-def without_eyes(skin: Skin, joints: tuple[str, ...], parents: np.ndarray) -> Skin:
-    """Return the skin with what follows the eyes given to the head: there are no eyeballs, and the skin around them
-    must not turn with them. `joints`: the body model's names."""
-    eyes = np.array([name.startswith("eye.") for name in joints])
-    return skin.moved_to(np.where(eyes, parents, np.arange(len(joints))))
+def without_lids(skin: Skin, joints: tuple[str, ...], parents: np.ndarray) -> Skin:
+    """Return the skin whose points follow eyes only where they are eyeballs, that is, follow one alone; where either
+    eye has none, no point does. The head takes the others: lids must not turn with the eyes. `joints`: the body
+    model's names."""
+    eyes = [j for j, name in enumerate(joints) if name.startswith("eye.")]
+    at_head = skin.moved_to(np.array([parents[j] if j in eyes else j for j in range(len(joints))]))
+    of_eye = [((skin.joints == eye) & (skin.weights > EYEBALL_WEIGHT)).any(1) for eye in eyes]
+    if not of_eye or not all(points.any() for points in of_eye):
+        return at_head
+    balls = np.any(of_eye, 0)[:, None]
+    return Skin(np.where(balls, skin.joints, at_head.joints), np.where(balls, skin.weights, at_head.weights))
 
 
 def _motions(

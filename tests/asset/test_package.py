@@ -128,6 +128,15 @@ def test_nothing_but_the_interface_is_loaded_without_payloads(package: Path) -> 
     assert len(UsdGeom.ModelAPI(stage.GetDefaultPrim()).GetExtentsHintAttr().Get()) == 2
 
 
+def test_the_hint_has_room_for_every_motion(staged: StagedAvatar, tmp_path: Path) -> None:
+    far = dataclasses.replace(staged, extents_m={name: 100 * boxes for name, boxes in staged.extents_m.items()})
+    write_usdz(tmp_path / "far.usdz", far, [], 10.0, INFO)
+    stage = Usd.Stage.Open(str(tmp_path / "far.usdz"))
+    hint = np.array(UsdGeom.ModelAPI(stage.GetDefaultPrim()).GetExtentsHintAttr().Get())
+    corners = np.concatenate([boxes.reshape(-1, 3) for boxes in far.extents_m.values()])
+    assert (hint[1] >= corners.max(0) - 1e-4).all() and (hint[0] <= corners.min(0) + 1e-4).all()
+
+
 def test_units_and_cameras_names(package: Path) -> None:
     stage = Usd.Stage.Open(str(package / "avatar.usdz"))
     assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1.0)

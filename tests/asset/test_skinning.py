@@ -1,8 +1,9 @@
 import itertools
 
 import numpy as np
+import pytest
 
-from hnerf.asset.rigs import without_eyes
+from hnerf.asset.rigs import without_lids
 from hnerf.asset.skinning import Skin, skinned, with_few_influences
 
 
@@ -29,11 +30,16 @@ def test_weights_of_folded_joints_add_up() -> None:
     assert found.influences == 2
 
 
-def test_eyes_move_no_skin() -> None:
-    skin = Skin(np.array([[1, 0], [2, 0]]), np.array([[0.6, 0.4], [0.7, 0.3]]))
-    found = without_eyes(skin, ("head", "eye.L", "eye.R"), np.array([-1, 0, 0]))
-    np.testing.assert_array_equal(found.joints, 0)
-    np.testing.assert_allclose(found.weights, [[1, 0], [1, 0]])
+def test_eyes_move_eyeballs_alone() -> None:
+    """Two lids, and an eyeball or two, of which one alone would leave the face one-eyed."""
+    joints, parents = ("head", "eye.L", "eye.R"), np.array([-1, 0, 0])
+    lids = Skin(np.array([[1, 0], [2, 0]]), np.array([[0.6, 0.4], [0.7, 0.3]]))
+    np.testing.assert_array_equal(without_lids(lids, joints, parents).joints, 0)
+    np.testing.assert_allclose(without_lids(lids, joints, parents).weights, [[1, 0], [1, 0]])
+    for balls, expected in (([1], [0, 0, 0]), ([1, 2], [0, 0, 1, 2])):
+        ends = np.array([[ball, 0] for ball in balls])
+        both = Skin(np.vstack([lids.joints, ends]), np.vstack([lids.weights, [[1.0, 0]] * len(balls)]))
+        np.testing.assert_array_equal(without_lids(both, joints, parents).joints[:, 0], expected)
 
 
 def test_a_joint_that_moves_as_another_is_given_up_without_loss() -> None:
@@ -45,20 +51,25 @@ def test_a_joint_that_moves_as_another_is_given_up_without_loss() -> None:
     np.testing.assert_allclose(found.weights, [[0.75, 0.25]], atol=1e-6)
 
 
-def test_the_best_subset_is_found() -> None:
-    """As good as the best of many random weights on any two of four joints."""
-    rng = np.random.default_rng(0)
-    poses = [(moves(*rng.normal(size=(4, 3))), np.zeros((1, 3))) for _ in range(5)]
+RANDOM = [np.random.default_rng(seed).normal(size=(3, 4, 3)) for seed in range(4)]
+# One pose in which the line through the last two joints passes nearest, but outside of them.
+OUTSIDE = np.array([[[3.0, -2, -1], [-2, -3, -3], [-3, 2, 2], [-2, 1, 1]]])
+
+
+@pytest.mark.parametrize("offsets_m", [*RANDOM, OUTSIDE])
+def test_the_best_subset_is_found(offsets_m: np.ndarray) -> None:
+    """As good as the best of many weights on any two of four joints."""
+    poses = [(moves(*pose), np.zeros((1, 3))) for pose in offsets_m]
     skin = Skin(np.array([[0, 1, 2, 3]]), np.array([[0.4, 0.3, 0.2, 0.1]]))
     found = with_few_influences(skin, iter(poses), 2)
-    assert found.influences == 2
+    assert found.influences <= 2
 
     def error(tried: Skin) -> float:
         off = [skinned(pose, tried, at) - skinned(pose, skin, at) for pose, at in poses]
         return float(np.square(off).sum())
 
     pairs = itertools.combinations(range(4), 2)
-    tried = [Skin(np.array([pair]), np.array([[w, 1 - w]])) for pair in pairs for w in np.linspace(0, 1, 101)]
+    tried = [Skin(np.array([pair]), np.array([[w, 1 - w]])) for pair in pairs for w in np.linspace(0, 1, 51)]
     assert error(found) <= min(map(error, tried)) * 1.001
 
 
