@@ -21,6 +21,7 @@ from hnerf.asset.staging import stage_avatar
 from hnerf.asset.texture import field_colours, rasterise, texture_image, unwrap
 from hnerf.asset.usd import write_cache, write_skinned
 from hnerf.asset.validation import validate_package
+from hnerf.asset.viewer import write_viewer
 from hnerf.avatar.avatar import Avatar
 from hnerf.avatar.surface import surface_in_pose
 from hnerf.body.fit_result import BodyFit
@@ -33,7 +34,8 @@ log = logging.getLogger("hnerf.asset")
 
 
 def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out: Path) -> dict[str, Any]:
-    """Write `avatar.usdz`, `avatar_cache.usdz`, `avatar.glb` and `report.json` into `out`; returns the report.
+    """Write `avatar.usdz`, `avatar_cache.usdz`, `avatar.glb`, `viewer.html` and `report.json` into `out`; returns the
+    report.
 
     Raises InputError if the field has no surface, InvalidAsset if a package does not pass validation.
     """
@@ -65,6 +67,8 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
         write_skinned(out / "avatar.usdz", staged, cameras, capture.fps)
         write_cache(out / "avatar_cache.usdz", staged, cameras, capture.fps)
         write_glb(out / "avatar.glb", staged, capture.fps)
+    with _timed("viewer", seconds):
+        viewer = write_viewer(out / "viewer.html", out / "avatar.glb", capture, staged.stage_from_world)
     with _timed("validation", seconds):
         validation = {name: validate_package(out / name) for name in ("avatar.usdz", "avatar_cache.usdz")}
     report = {
@@ -80,7 +84,8 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
         "frames": len(capture.frames),
         "beyond_skinning_mm": _beyond_skinning_mm(displacements_m, correctives),
         "cameras": len(cameras),
-        "bytes": {path.name: path.stat().st_size for path in sorted(out.glob("avatar*"))},
+        "viewer": viewer,
+        "bytes": {path.name: path.stat().st_size for path in sorted([*out.glob("avatar*"), *out.glob("viewer.html")])},
         "seconds": seconds,
         "validation": validation,
     }

@@ -1,0 +1,185 @@
+"""The page of the avatar: what is in it, and, where a browser is installed, what it does."""
+
+import base64
+import dataclasses
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from hnerf.asset.glb import write_glb
+from hnerf.asset.staging import StagedAvatar
+from hnerf.asset.viewer import MAX_BYTES, _modules, recording, write_viewer
+from hnerf.capture.capture import Capture
+from hnerf.geometry.mesh_queries import Surface
+from hnerf.models import THREE_SHA256, has_model
+from tests.asset.browser import Page, browser, found_browser
+from tests.asset.figure import FRAMES, capture, side_camera
+
+NEEDS_THREE = pytest.mark.skipif(
+    not all(map(has_model, THREE_SHA256)), reason="three.js is not installed; `hnerf models` fetches it"
+)
+FIRST, LAST = FRAMES[0], FRAMES[-1]
+
+
+@pytest.fixture(scope="module")
+def photographed(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """Return the capture of one camera with grey pictures."""
+    root = tmp_path_factory.mktemp("capture")
+    (root / "images" / "01").mkdir(parents=True)
+    for frame in FRAMES:
+        cv2.imwrite(str(root / "images" / "01" / f"{frame:06d}.png"), np.full((480, 640, 3), 60 + frame, np.uint8))
+    return dataclasses.replace(capture(), root=root)
+
+
+@pytest.fixture(scope="module")
+def viewer(staged: StagedAvatar, photographed: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write the page of an avatar whose joints all come fifth or later in the lists of a vertex."""
+    folder = tmp_path_factory.mktemp("viewer")
+    joints, weights = (np.pad(a, ((0, 0), (4, 0))) for a in (staged.skin_joints, staged.skin_weights))
+    write_glb(folder / "avatar.glb", dataclasses.replace(staged, skin_joints=joints, skin_weights=weights), 10.0)
+    written = write_viewer(folder / "viewer.html", folder / "avatar.glb", photographed, staged.stage_from_world)
+    assert written == "viewer.html"
+    return folder / "viewer.html"
+
+
+@pytest.fixture(scope="module")
+def page(viewer: Path) -> Iterator[Page]:
+    """Open the page in a browser and pause it."""
+    program = found_browser()
+    if program is None:
+        pytest.skip("no Chromium is installed")
+    with browser(program) as opened:
+        opened.open(viewer, 1000, 640)
+        yield opened
+
+
+def test_without_three_there_is_a_reason_and_no_page(
+    staged: StagedAvatar, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))
+    reason = write_viewer(tmp_path / "viewer.html", tmp_path / "avatar.glb", capture(), staged.stage_from_world)
+    assert reason == "no viewer.html: three.js is not installed; `hnerf models` downloads it"
+    assert not list(tmp_path.iterdir())
+
+
+def test_cameras_and_photographs_are_in_the_avatars_world(photographed: Capture, staged: StagedAvatar) -> None:
+    found = recording(photographed, staged.stage_from_world)
+    (camera,) = found["cameras"]
+    # At (0, -3, 1) of a world with z up, looking along +y: at (0, 1, 3) with y up, looking along -z.
+    np.testing.assert_allclose(camera["pose"], [1, 0, 0, 0, 0, 1, 0, 1, 0, 0, 1, 3, 0, 0, 0, 1], atol=1e-12)
+    assert {key: camera[key] for key in ("fx", "fy", "cx", "cy")} == {"fx": 500, "fy": 400, "cx": 300, "cy": 200}
+    assert (found["first_frame"], found["duration_s"]) == (3, 0.5)
+    taken = [(photograph["frame"], photograph["time_s"]) for photograph in camera["photographs"]]
+    assert taken == [(3, 0.0), (4, 0.1), (5, 0.2)]
+    jpeg = base64.b64decode(camera["photographs"][2]["jpeg"].split(",")[1])
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert image.shape == (288, 384, 3)
+    assert abs(int(image[100, 100, 0]) - 65) <= 1
+
+
+@NEEDS_THREE
+def test_every_import_is_in_the_page(viewer: Path) -> None:
+    modules = _modules()
+    for name, source in modules.items():
+        code = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
+        imported = set(re.findall(r"""\bfrom ['"]([^'"]+)['"];$""", code, flags=re.MULTILINE))
+        assert imported <= set(modules), name
+    assert set(re.findall(r"from '(.*)';", modules["three/OrbitControls.js"])) >= {"three"}
+    assert viewer.stat().st_size < MAX_BYTES
+
+
+@NEEDS_THREE
+def test_it_opens_without_a_complaint_or_a_request(page: Page, viewer: Path) -> None:
+    page.evaluate("new Promise(requestAnimationFrame)")
+    assert page.complaints() == []
+    assert page.requests() == [viewer.as_uri()]
+
+
+@NEEDS_THREE
+def test_it_plays_and_pauses(page: Page) -> None:
+    upper = "viewer.avatar.joints[1].matrixWorld.elements.slice()"
+    before = page.evaluate(upper)
+    page.evaluate("viewer.play(true)")
+    page.wait(f"JSON.stringify({upper}) !== JSON.stringify({list(before)})")
+    page.press(" ")
+    assert page.evaluate("viewer.playing") is False
+    assert page.evaluate("document.getElementById('play').textContent") == "Play"
+    page.evaluate("viewer.setTime(0.1)")
+    page.press(".")
+    assert page.evaluate("viewer.avatar.time") == pytest.approx(0.2)
+    assert page.evaluate("document.getElementById('clock').textContent") == "frame 5 · 0.20 s"
+
+
+@NEEDS_THREE
+def test_a_slider_turns_its_joint(page: Page, staged: StagedAvatar) -> None:
+    page.evaluate("viewer.setMotion(viewer.avatar.motions.length)")  # the rest pose
+    upper = "viewer.avatar.joints[1]"
+    page.evaluate(move("#joint", 1, "change"))
+    page.evaluate(move("#turns input", 90, "input"))
+    turned = page.evaluate(f"{upper}.quaternion.toArray()")
+    np.testing.assert_allclose(turned, [math.sqrt(0.5), 0, 0, math.sqrt(0.5)], atol=1e-6)
+    # A point 10 cm above the joint goes 10 cm to its front, +z.
+    point = page.evaluate(f"{upper}.localToWorld({upper}.position.clone().set(0, 0.1, 0)).toArray()")
+    np.testing.assert_allclose(point, staged.rest_joints_m[1] + [0, 0, 0.1], atol=1e-6)
+    page.evaluate("viewer.setTime(0)")
+    assert page.evaluate(f"{upper}.quaternion.toArray()") == turned  # is not added again
+    page.click("#straighten")
+    assert page.evaluate(f"{upper}.quaternion.toArray()") == [0, 0, 0, 1]
+    page.evaluate("viewer.setMotion(0)")
+
+
+@NEEDS_THREE
+def test_a_slider_adds_to_the_weight_of_a_shape(page: Page, staged: StagedAvatar) -> None:
+    page.evaluate("viewer.setTime(0.2)")
+    weights = "viewer.avatar.meshes[0].morphTargetInfluences.slice()"
+    np.testing.assert_allclose(page.evaluate(weights), staged.shape_weights[2], atol=1e-6)
+    page.evaluate(move("#weights input", 0.5, "input"))
+    np.testing.assert_allclose(page.evaluate(weights), staged.shape_weights[2] + [0.5, 0], atol=1e-6)
+    page.evaluate("document.getElementById('unshape').click()")
+    np.testing.assert_allclose(page.evaluate(weights), staged.shape_weights[2], atol=1e-6)
+
+
+@NEEDS_THREE
+def test_a_recorded_camera_shows_the_avatar_where_the_recording_has_it(page: Page, staged: StagedAvatar) -> None:
+    page.evaluate("viewer.setTime(0.19)")
+    page.click("#cameras label:nth-child(2)")
+    assert page.evaluate("viewer.avatar.time") == pytest.approx(0.2)  # of the nearest photograph
+    assert page.evaluate("document.getElementById('caption').textContent") == "Photograph of frame 5"
+    assert page.evaluate("viewer.stage.camera.matrixWorld.elements.slice(12, 15)") == pytest.approx([0, 1, 3])
+    left, top, width, height = page.evaluate(
+        "(({offsetLeft, offsetTop, offsetWidth, offsetHeight}) => [offsetLeft, offsetTop, offsetWidth, offsetHeight])"
+        "(document.getElementById('photograph'))"
+    )
+    assert width / height == pytest.approx(640 / 480, abs=0.01)
+    page.evaluate("viewer.stage.grid.visible = false")
+    shown = page.evaluate("(viewer.stage.render(), document.getElementById('canvas').toDataURL())")
+    canvas = cv2.imdecode(np.frombuffer(base64.b64decode(shown.split(",")[1]), np.uint8), cv2.IMREAD_UNCHANGED)
+    seen = cv2.resize(canvas[top : top + height, left : left + width, 3], (640, 480), interpolation=cv2.INTER_AREA)
+    expected = outline(staged.points_m[2] @ staged.stage_from_world, staged.faces)
+    overlap = ((seen > 127) & expected).sum() / ((seen > 127) | expected).sum()
+    assert overlap > 0.97
+    page.click("#cameras label:nth-child(1)")
+    assert page.evaluate("document.getElementById('photograph').hidden")
+
+
+def outline(world_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return where the side camera sees a surface, (480, 640) bool."""
+    camera = side_camera()
+    pixels = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1)
+    origins, directions = camera.rays(pixels.reshape(-1, 2))
+    hits = Surface(trimesh.Trimesh(world_m, faces, process=False)).cast(origins, directions)
+    return (hits.face >= 0).reshape(480, 640)
+
+
+def move(selector: str, value: float, event: str) -> str:
+    """Return a script that moves the first control of a selector as a user does."""
+    return (
+        f"(control => {{ control.value = {value}; control.dispatchEvent(new Event('{event}')); }})"
+        f"(document.querySelector('{selector}'))"
+    )
