@@ -15,6 +15,7 @@ import torch
 from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
 from hnerf.asset.glb import write_glb
 from hnerf.asset.photographs import colours_from_photographs
+from hnerf.asset.report import write_report
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.simplify import simplify
 from hnerf.asset.staging import stage_avatar
@@ -34,8 +35,8 @@ log = logging.getLogger("hnerf.asset")
 
 
 def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out: Path) -> dict[str, Any]:
-    """Write `avatar.usdz`, `avatar_cache.usdz`, `avatar.glb`, `viewer.html` and `report.json` into `out`; returns the
-    report.
+    """Write `avatar.usdz`, `avatar_cache.usdz`, `avatar.glb`, `viewer.html`, `report.json` and `report.html` into
+    `out`; returns the report.
 
     Raises InputError if the field has no surface, InvalidAsset if a package does not pass validation.
     """
@@ -90,6 +91,8 @@ def export_asset(capture: Capture, avatar: Avatar, settings: AssetSettings, out:
         "validation": validation,
     }
     (out / "report.json").write_text(json.dumps(report, indent=1))
+    shown = capture.train_frames[0]
+    write_report(out / "report.html", capture.name, staged, shown, clothed.root[clothed.index(shown)].numpy(), report)
     return report
 
 

@@ -67,6 +67,7 @@ COLUMNS = (  # of novel poses
     ("Posed", "poses tuned on the training cameras' images of these frames"),
     ("Tracked", "both the poses and a deformation of each frame tuned on those images"),
 )
+TEMPLATES = Path(__file__).parent / "templates"
 LONG_LIST = 12  # values; longer lists are shown by their range
 
 
@@ -80,16 +81,7 @@ def write_report(
 ) -> None:
     """Write `report.html` and its charts into `out`, from the renderings and meshes there and the stages' reports."""
     stages = stage_reports(inputs)
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["readable"] = readable
-    environment.tests["rows"] = is_table_rows
-    page = environment.get_template("report.html").render(
+    page = report_environment().get_template("report.html").render(
         capture=inputs.capture,
         size_px=image_sizes(inputs),
         split_titles=SPLIT_TITLES,
@@ -109,6 +101,20 @@ def write_report(
         notes=reading_notes(inputs, found),
     )
     (out / "report.html").write_text(page, encoding="utf-8")
+
+
+def report_environment(*folders: Path) -> jinja2.Environment:
+    """Return the environment of pages that look like the report; folders: of templates beside the report's own."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader([*folders, TEMPLATES]),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["readable"] = readable
+    environment.tests["rows"] = is_table_rows
+    return environment
 
 
 def stage_reports(inputs: EvaluationInputs) -> dict[str, dict[str, Any]]:

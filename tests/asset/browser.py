@@ -71,10 +71,9 @@ class Page:
             self.call(f"{domain}.enable")
 
     def open(self, path: Path, width: int, height: int) -> None:
-        """Open a file in a window of that size, and wait until its avatar is shown."""
+        """Open a file in a window of that size."""
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
         self.call("Page.navigate", url=path.resolve().as_uri())
-        self.wait("window.viewer !== undefined")
 
     def evaluate(self, expression: str) -> Any:
         """Return the value of an expression of JavaScript, awaited."""
@@ -130,7 +129,7 @@ def browser(program: str) -> Iterator[Page]:
         os.dup2(reads, 3)
         os.dup2(writes, 4)
 
-    with tempfile.TemporaryDirectory() as profile:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         process = subprocess.Popen(
             [program, *OPTIONS, f"--user-data-dir={profile}"],
             preexec_fn=as_three_and_four,
@@ -144,8 +143,10 @@ def browser(program: str) -> Iterator[Page]:
             page = Page(to_browser[1], from_browser[0])
             page.attach()
             yield page
+            page.call("Browser.close")
+            process.wait(LIMIT_S)
         finally:
-            process.terminate()
+            process.kill()
             process.wait(LIMIT_S)
             os.close(to_browser[1])
             page._answers.close()

@@ -50,12 +50,13 @@ def viewer(staged: StagedAvatar, photographed: Capture, tmp_path_factory: pytest
 
 @pytest.fixture(scope="module")
 def page(viewer: Path) -> Iterator[Page]:
-    """Open the page in a browser and pause it."""
+    """Open the page in a browser."""
     program = found_browser()
     if program is None:
         pytest.skip("no Chromium is installed")
     with browser(program) as opened:
         opened.open(viewer, 1000, 640)
+        opened.wait("window.viewer !== undefined")
         yield opened
 
 
