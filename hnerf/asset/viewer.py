@@ -19,7 +19,6 @@ from hnerf.asset.compact_glb import compact_glb
 from hnerf.capture.capture import Capture
 from hnerf.evaluation.pictures import data_uri
 from hnerf.evenly_spaced import evenly_spaced
-from hnerf.files import replace_text
 from hnerf.geometry.camera import Camera
 from hnerf.models import LICENCES, THREE_SHA256, has_model, model_file
 
@@ -30,7 +29,6 @@ CAMERAS, PHOTOGRAPHS = 8, 5  # at most, and of each camera
 PHOTOGRAPH_PX = 384  # longer side
 RELATIVE_IMPORT = re.compile(r"from '\.{1,2}/(?:[\w./]*/)?([\w.]+\.js)'")  # as in three.js
 
-
 log = logging.getLogger("hnerf.asset")
 
 
@@ -38,7 +36,7 @@ def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.n
     """Write the page of an avatar; return its name, or one line that says why there is none, which is logged, too.
 
     stage_from_world (3, 3): from the capture's world to the avatar's. The texture is halved until the page has at most
-    MAX_BYTES.
+    MAX_BYTES; if that does not suffice, a warning is logged.
     """
     if any(not has_model(name) for name in THREE_SHA256):
         reason = f"no {path.name}: three.js is not installed; `hnerf models` downloads it"
@@ -46,9 +44,9 @@ def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.n
         return reason
     parts: dict[str, Any] = {
         "title": capture.name,
-        "style": (PAGE / "viewer.css").read_text(),
-        "boot": (PAGE / "boot.js").read_text(),
-        "licence": (LICENCES / "three.txt").read_text(),
+        "style": (PAGE / "viewer.css").read_text(encoding="utf-8"),
+        "boot": (PAGE / "boot.js").read_text(encoding="utf-8"),
+        "licence": (LICENCES / "three.txt").read_text(encoding="utf-8"),
         "modules": _packed(json.dumps(_modules()).encode()),
         "recording": _packed(json.dumps(recording(capture, stage_from_world)).encode()),
     }
@@ -60,7 +58,9 @@ def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.n
         page = environment.get_template("viewer.html").render(avatar=avatar, **parts)
         if len(page.encode()) <= MAX_BYTES:
             break
-    replace_text(path, page)
+    else:
+        log.warning("%s: over %d MB; its motion is long", path.name, MAX_BYTES // 10**6)
+    path.write_text(page, encoding="utf-8")
     return path.name
 
 
@@ -106,7 +106,8 @@ def _modules() -> dict[str, str]:
     """Return the sources by the names under which they import each other: "three", "three/..." and "viewer/..."."""
     three = {f"three/{name}": model_file(name).read_text(encoding="utf-8") for name in THREE_SHA256}
     three = {name: RELATIVE_IMPORT.sub(r"from 'three/\1'", source) for name, source in three.items()}
-    own = {f"viewer/{path.name}": path.read_text() for path in sorted(PAGE.glob("*.js")) if path.name != "boot.js"}
+    paths = [path for path in sorted(PAGE.glob("*.js")) if path.name != "boot.js"]
+    own = {f"viewer/{path.name}": path.read_text(encoding="utf-8") for path in paths}
     return {"three": three.pop("three/three.module.js")} | three | own
 
 

@@ -1,4 +1,4 @@
-"""Chromium without a window, driven through a pipe by its DevTools protocol: no package beside the browser is needed."""
+"""Chromium without a window, driven through a pipe by its DevTools protocol, so that no package drives it."""
 
 import base64
 import json

@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import gzip
 import math
 import re
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from hnerf.asset.compact_glb import read_glb
 from hnerf.asset.glb import write_glb
 from hnerf.asset.staging import StagedAvatar
 from hnerf.asset.viewer import MAX_BYTES, _modules, recording, write_viewer
@@ -93,6 +95,28 @@ def test_every_import_is_in_the_page(viewer: Path) -> None:
         assert imported <= set(modules), name
     assert set(re.findall(r"from '(.*)';", modules["three/OrbitControls.js"])) >= {"three"}
     assert viewer.stat().st_size < MAX_BYTES
+
+
+@NEEDS_THREE
+def test_a_page_that_is_too_large_gets_a_smaller_texture(
+    viewer: Path,
+    photographed: Capture,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr("hnerf.asset.viewer.MAX_BYTES", viewer.stat().st_size - 1)
+    monkeypatch.setattr("hnerf.asset.viewer.TEXTURES_PX", (64, 16, 8))
+    write_viewer(tmp_path / "viewer.html", viewer.with_name("avatar.glb"), photographed, np.eye(3))
+    packed = re.search(r'id="packed-avatar">(.*?)<', (tmp_path / "viewer.html").read_text())
+    assert packed is not None
+    document, binary = read_glb(gzip.decompress(base64.b64decode(packed[1])))
+    view = document["bufferViews"][document["images"][0]["bufferView"]]
+    jpeg = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    assert cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR).shape == (16, 16, 3)
+    monkeypatch.setattr("hnerf.asset.viewer.MAX_BYTES", 1)
+    write_viewer(tmp_path / "viewer.html", viewer.with_name("avatar.glb"), photographed, np.eye(3))
+    assert "viewer.html: over 0 MB; its motion is long" in caplog.text
 
 
 @NEEDS_THREE

@@ -170,7 +170,7 @@ function connectJoints(viewer) {
     joint.add(axes);
     again();
   };
-  options(find("joint"), avatar.joints.map((joint) => joint.name));
+  options(find("joint"), avatar.joints.map((joint) => joint.userData.name ?? joint.name)); // the loader drops dots
   find("joint").addEventListener("change", choose);
   find("straighten").addEventListener("click", () => {
     for (const turn of avatar.turns.values()) turn.set(0, 0, 0);
