@@ -25,7 +25,7 @@ def compact_glb(glb: bytes, texture_px: int) -> bytes:
         view |= {"byteOffset": len(packed), "byteLength": len(content)}
         packed.extend(content)
     document["buffers"] = [{"byteLength": len(packed)}]
-    return _glb(document, bytes(packed))
+    return as_glb(document, bytes(packed))
 
 
 def read_glb(glb: bytes) -> tuple[dict[str, Any], bytes]:
@@ -34,8 +34,8 @@ def read_glb(glb: bytes) -> tuple[dict[str, Any], bytes]:
     return json.loads(glb[20 : 20 + json_length]), glb[28 + json_length :]
 
 
-def _glb(document: dict[str, Any], binary: bytes) -> bytes:
-    """Return header and chunks; each chunk ends at a multiple of four bytes, JSON in spaces and binary in zeros."""
+def as_glb(document: dict[str, Any], binary: bytes) -> bytes:
+    """Return a binary file; each of its chunks ends at a multiple of four bytes, JSON in spaces and binary in zeros."""
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     binary += bytes(-len(binary) % 4)

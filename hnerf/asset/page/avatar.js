@@ -2,7 +2,7 @@
 
 import * as THREE from "three";
 import { GLTFLoader } from "three/GLTFLoader.js";
-import { jointShares, useAllInfluences } from "viewer/influences.js";
+import { jointShares, posedBox, useAllInfluences } from "viewer/influences.js";
 
 const GROUND_SAMPLES = 6; // instants of a motion at which its lowest point is looked for
 
@@ -89,11 +89,7 @@ export class Avatar {
 
   box() {
     const box = new THREE.Box3();
-    for (const mesh of this.meshes) {
-      if (mesh.isSkinnedMesh) mesh.computeBoundingBox();
-      else mesh.geometry.computeBoundingBox();
-      box.union((mesh.boundingBox ?? mesh.geometry.boundingBox).clone().applyMatrix4(mesh.matrixWorld));
-    }
+    for (const mesh of this.meshes) box.union(mesh.isSkinnedMesh ? posedBox(mesh) : new THREE.Box3().setFromObject(mesh));
     return box;
   }
 

@@ -24,6 +24,26 @@ export function influencesOf(geometry) {
   };
 }
 
+// Returns the box around a posed mesh in the world, with its blend shapes.
+export function posedBox(mesh) {
+  const box = new THREE.Box3();
+  const point = new THREE.Vector3();
+  const moved = new THREE.Vector3();
+  const matrices = mesh.skeleton.bones.map((bone, b) =>
+    bone.matrixWorld.clone().multiply(mesh.skeleton.boneInverses[b]).multiply(mesh.bindMatrix),
+  );
+  const influences = influencesOf(mesh.geometry);
+  for (let vertex = 0; vertex < mesh.geometry.attributes.position.count; vertex++) {
+    THREE.Mesh.prototype.getVertexPosition.call(mesh, vertex, point); // before the skin
+    const sum = new THREE.Vector3();
+    for (const [joint, weight] of influences(vertex)) {
+      if (weight) sum.addScaledVector(moved.copy(point).applyMatrix4(matrices[joint]), weight);
+    }
+    box.expandByPoint(sum);
+  }
+  return box;
+}
+
 // Returns the sum of weights of every joint that moves a vertex.
 export function jointShares(meshes) {
   const sums = new Map();
