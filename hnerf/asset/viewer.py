@@ -70,13 +70,11 @@ def recording(capture: Capture, stage_from_world: np.ndarray) -> dict[str, Any]:
     Instants are seconds from the first frame. `pose`: row by row the camera's place in the avatar's world, with the
     axes of OpenGL (x right, y up, looking along -z).
     """
-    first, last = capture.frames[0], capture.frames[-1]
     names = evenly_spaced(capture.train_cameras, CAMERAS)
     frames = evenly_spaced(capture.train_frames, PHOTOGRAPHS)
     return {
         "fps": capture.fps,
-        "first_frame": first,
-        "duration_s": (last - first) / capture.fps,
+        "first_frame": capture.frames[0],
         "cameras": [
             _camera(capture.cameras[name], stage_from_world)
             | {"photographs": [_photograph(capture, name, frame) for frame in frames]}

@@ -81,7 +81,7 @@ def test_cameras_and_photographs_are_in_the_avatars_world(photographed: Capture,
     # At (0, -3, 1) of a world with z up, looking along +y: at (0, 1, 3) with y up, looking along -z.
     np.testing.assert_allclose(camera["pose"], [1, 0, 0, 0, 0, 1, 0, 1, 0, 0, 1, 3, 0, 0, 0, 1], atol=1e-12)
     assert {key: camera[key] for key in ("fx", "fy", "cx", "cy")} == {"fx": 500, "fy": 400, "cx": 300, "cy": 200}
-    assert (found["first_frame"], found["duration_s"]) == (3, 0.5)
+    assert (found["fps"], found["first_frame"]) == (10, 3)
     taken = [(photograph["frame"], photograph["time_s"]) for photograph in camera["photographs"]]
     assert taken == [(3, 0.0), (4, 0.1), (5, 0.2)]
     jpeg = base64.b64decode(camera["photographs"][2]["jpeg"].split(",")[1])
@@ -201,7 +201,11 @@ def test_a_recorded_camera_shows_the_avatar_where_the_recording_has_it(page: Pag
     page.evaluate("viewer.setTime(0.19)")
     page.click("#cameras label:nth-child(2)")
     assert page.evaluate("viewer.avatar.time") == pytest.approx(0.2)  # of the nearest photograph
-    assert page.evaluate("document.getElementById('caption').textContent") == "Photograph of frame 5"
+    caption = "document.getElementById('caption').textContent"
+    assert page.evaluate(caption) == "Photograph of frame 5"
+    page.evaluate("viewer.setTime(0.26)")
+    assert page.evaluate(caption) == "Photograph of frame 5, another instant than the avatar's"
+    page.evaluate("viewer.setTime(0.2)")
     assert page.evaluate("viewer.stage.camera.matrixWorld.elements.slice(12, 15)") == pytest.approx([0, 1, 3])
     left, top, width, height = page.evaluate(
         "(({offsetLeft, offsetTop, offsetWidth, offsetHeight}) => [offsetLeft, offsetTop, offsetWidth, offsetHeight])"

@@ -18,7 +18,7 @@ export async function main(bytes, recording) {
     stage,
     recording,
     looks: new Looks(avatar.meshes),
-    photographs: new Photographs(find("photograph"), find("caption"), recording),
+    photographs: new Photographs(find("photograph"), find("caption"), recording.fps),
     skeleton: new THREE.SkeletonHelper(avatar.root),
     axes: new THREE.AxesHelper(0.15),
     playing: !matchMedia("(prefers-reduced-motion: reduce)").matches,
@@ -67,7 +67,7 @@ function connectMotion(viewer) {
   viewer.choose = {};
   viewer.setTime = (time) => {
     avatar.pose(time);
-    viewer.photographs.show(time, avatar.duration);
+    viewer.photographs.show(time, avatar.motion === avatar.motions[0]); // the file's first is the recorded one
     showTime(viewer);
     viewer.changed = true;
   };

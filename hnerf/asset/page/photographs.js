@@ -3,11 +3,10 @@
 const SAME_INSTANT = 0.5; // frames between the avatar and the photograph
 
 export class Photographs {
-  constructor(image, caption, { fps, duration_s }) {
+  constructor(image, caption, fps) {
     this.image = image;
     this.caption = caption;
     this.fps = fps;
-    this.duration = duration_s;
     this.camera = null;
   }
 
@@ -29,13 +28,12 @@ export class Photographs {
     return sorted.find((photograph) => direction * (photograph.time_s - time) > 1e-3) ?? sorted[0];
   }
 
-  // Shows the photograph nearest to an instant, pale where it is of another one, or where the motion is not the
-  // recording's.
-  show(time, motionDuration) {
+  // Shows the photograph nearest to an instant, pale where it is of another one, or where the motion is not the recorded
+  // one.
+  show(time, isRecorded) {
     if (!this.camera) return;
     const photograph = this.nearest(time);
-    const recorded = Math.abs(motionDuration - this.duration) < 1 / this.fps;
-    const same = recorded && Math.abs(photograph.time_s - time) * this.fps < SAME_INSTANT;
+    const same = isRecorded && Math.abs(photograph.time_s - time) * this.fps < SAME_INSTANT;
     if (this.shown !== photograph) this.image.src = photograph.jpeg;
     this.shown = photograph;
     this.image.classList.toggle("pale", !same);
