@@ -30,7 +30,7 @@ def settings(options: argparse.Namespace) -> None:
 
 
 def models(options: argparse.Namespace) -> None:
-    """Fetch the trained networks that detection and LPIPS use; needed once."""
+    """Fetch the networks that detection and LPIPS use, and three.js for the viewer; needed once."""
     from hnerf.models import fetch_models
 
     print(f"networks: {fetch_models()}")

@@ -68,6 +68,7 @@ BY_ANTIALIASING, BY_CORRECTIVES = "tests/avatar/test_antialiasing.py", "tests/as
 BY_PLATE, BY_REGISTRATION = "tests/asset/test_plate.py", "tests/asset/test_registration.py"
 BY_FIELD_COLOURS = "tests/asset/test_field_colours.py"
 BY_PHOTOGRAPHS = "tests/asset/test_photographs.py"
+BY_VIEWER, BY_PICTURES = "tests/asset/test_viewer.py", "tests/asset/test_pictures.py"
 BY_TIMING, BY_GLB = "tests/capture/test_timing.py", "tests/asset/test_glb.py"
 
 
@@ -239,6 +240,8 @@ FAULTS = (
           BY_BVH_MOTION),
     Fault("bvh-scale", BVH_MOTION, "scale * hips -", "hips -", BY_BVH_MOTION),
     Fault("glb-inverse-bind", GLB, "np.linalg.inv(rig.skeleton.bind).swap", "rig.skeleton.bind.swap", BY_GLB),
+    Fault("viewer-camera", "hnerf/asset/viewer.py", "np.diag([1, -1, -1])", "np.eye(3)", BY_VIEWER),
+    Fault("texture-upright", "hnerf/asset/pictures.py", "(width_px, -height_px)", "(width_px, height_px)", BY_PICTURES),
     Fault("antialiasing-offsets", ANTIALIASING, "QUARTERS_PX = 0.25 *", "QUARTERS_PX = 0.0 *", BY_ANTIALIASING),
     Fault("antialiasing-depth", ANTIALIASING, "image[y, x, :4] = torch", "image[y, x] = torch", BY_ANTIALIASING),
     Fault("photographs-cosine", PHOTOGRAPHS, "cosine**COSINE_POWER", "cosine", BY_PHOTOGRAPHS),

@@ -20,11 +20,13 @@ from hnerf.asset.package import AssetInfo, write_cache, write_package, write_usd
 from hnerf.asset.photographs import colours_from_photographs
 from hnerf.asset.regions import findings, surface_distances_mm
 from hnerf.asset.registration import crossing_faces
+from hnerf.asset.report import write_report
 from hnerf.asset.rigs import FULL, GAME
 from hnerf.asset.staging import CAPTURED, StagedAvatar, stage_avatar
 from hnerf.asset.texture import rasterise, texture_image
 from hnerf.asset.topologies import asset_meshes
 from hnerf.asset.validation import validate_package
+from hnerf.asset.viewer import write_viewer
 from hnerf.avatar.avatar import Avatar
 from hnerf.avatar.surface import surface_in_pose
 from hnerf.body.fit_result import BodyFit
@@ -47,7 +49,7 @@ def export_asset(
     digest: str = "",
     further: Mapping[str, Motion] | None = None,
 ) -> dict[str, Any]:
-    """Write the USD, glTF and BVH files that docs/asset.md lists, and `report.json`, into `out`; returns the report.
+    """Write the files that docs/asset.md lists into `out`; returns what `report.json` holds.
 
     digest: of the recording, for the asset's information; further: motions by other bodies to add, by name. Raises
     InputError if the field has no surface or a motion lacks a joint, InvalidAsset if a package does not pass
@@ -86,6 +88,8 @@ def export_asset(
             clothed, surfaces_m, correctives, layout, texture, capture.up, capture.fps, settings.bones, added
         )
         write_files(out, staged, capture, AssetInfo(capture.name, settings.version, settings.licence, digest))
+    with _timed("viewer", seconds):
+        viewer = write_viewer(out / "viewer.html", out / "avatar.glb", capture, staged.stage_from_world)
     with _timed("validation", seconds):
         validation = {name: validate_package(out / name) for name in PACKAGES}
     report = {
@@ -109,11 +113,14 @@ def export_asset(
         "frames": len(capture.frames),
         "beyond_skinning_mm": _beyond_skinning_mm(displacements_m, correctives),
         "cameras": len(capture.cameras),
+        "viewer": viewer,
         "bytes": {str(p.relative_to(out)): p.stat().st_size for p in sorted(out.rglob("*")) if p.is_file()},
         "seconds": seconds,
         "validation": validation,
     }
     (out / "report.json").write_text(json.dumps(report, indent=1))
+    shown = capture.train_frames[0]
+    write_report(out / "report.html", capture.name, staged, shown, clothed.root[clothed.index(shown)].numpy(), report)
     return report
 
 

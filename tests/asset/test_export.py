@@ -29,11 +29,17 @@ FILES |= {f"avatar/{name}.usdc" for name in ("geometry", "look", "cameras", "rig
 FILES |= {f"avatar/motion_{name}.usdc" for name in ("captured", "captured_24", "captured_30", "nod")}
 
 
-def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path) -> None:
+def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))  # the capture has no pixels for a viewer
+    monkeypatch.setattr("hnerf.asset.report.TURNS", 2)
     nod = Motion(select_poses(bending_body(), (4, 5)), 25.0, "z")
     report = export_asset(capture(), StandInAvatar(bending_body()), SMALL, tmp_path, "0123", {"nod": nod})
     assert json.loads((tmp_path / "report.json").read_text()) == report
     assert set(report["bytes"]) == FILES
+    assert report["viewer"].startswith("no viewer.html: three.js is not installed")
+    page = (tmp_path / "report.html").read_text()
+    assert report["viewer"] in page and 'href="viewer.html"' not in page
+    assert page.count("<img") == 2 + 4 + 2  # turntable, surface, texture
     assert report["mesh"]["watertight"] and report["mesh"]["faces"] <= 2000
     assert report["mesh"]["height_m"] == pytest.approx(1.62, abs=0.005)
     assert (report["frames"], report["joints"], report["cameras"]) == (4, 3, 1)
