@@ -9,6 +9,7 @@ from pathlib import Path
 
 from flows import commands
 from flows.display import display
+from flows.store_commands import add_store_commands
 from hnerf.config import load_settings
 from hnerf.errors import InputError, InvalidAsset
 from tasks.launcher import RankFailedError
@@ -34,7 +35,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         with display():
             folders = _existing(options)
-            if options.command is not commands.settings:
+            if options.command.__module__ == commands.__name__ and options.command is not commands.settings:
                 log.info("%s", " ".join([_name(options.command), *map(str, folders)]))
             options.command(options)
     except InputError as error:
@@ -116,6 +117,8 @@ def _parser() -> argparse.ArgumentParser:
     stability.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these degradations of the study")
 
     _add_render(add(commands.render))
+    what = "Look into the store, and keep it in order."
+    add_store_commands(subparsers.add_parser("store", help=what, description=what))
     synth = add(commands.synth)
     synth.add_argument("out", type=Path, help="the folder to write")
     _add_overrides(synth, "such as train_cameras=32; `hnerf settings` lists them last")

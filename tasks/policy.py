@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,12 @@ def stage_key(task: str, version: str, inputs: dict[str, Input]) -> str:
     described = {name: _key_value(value) for name, value in inputs.items()}
     text = json.dumps({"task": task, "version": version, "inputs": described}, sort_keys=True, default=_file_digest)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def artifacts_among(inputs: Iterable[Input]) -> list[Artifact]:
+    """Return the artifacts among a stage's inputs."""
+    flat = [one for value in inputs for one in (value if isinstance(value, tuple) else (value,))]
+    return [one for one in flat if isinstance(one, Artifact)]
 
 
 def _key_value(value: Input | str | int) -> Any:

@@ -11,7 +11,7 @@ from prefect.context import FlowRunContext
 from prefect.tasks import exponential_backoff
 
 from hnerf.models import has_model
-from tasks.policy import Input, StorePolicy, is_transient, stage_key
+from tasks.policy import Input, StorePolicy, artifacts_among, is_transient, stage_key
 from tasks.quiet import quieten
 from tasks.store import Artifact, Store
 
@@ -62,7 +62,13 @@ class Stage(Generic[P]):
         log.info("%s", self.name)
         key = stage_key(self.name, self.version, inputs)
         given = {name: value for name, value in inputs.items() if name != NETWORKS}
-        return store.get_or_compute(self.name, key, lambda out: self.write(out, **given), self.resumable)  # type: ignore[call-arg, arg-type]
+        return store.get_or_compute(
+            self.name,
+            key,
+            lambda out: self.write(out, **given),  # type: ignore[call-arg, arg-type]
+            self.resumable,
+            [one.name for one in artifacts_among(given.values())],
+        )
 
 
 def stage(
