@@ -22,6 +22,7 @@ from hnerf.study.benchmark import results
 from hnerf.tables import head, line, pick
 from tasks.capture import ingest
 from tasks.evaluation import evaluate
+from tasks.limits import set_limits
 from tasks.policy import is_retryable
 from tasks.source import Source, read_capture
 from tasks.store import Store
@@ -51,6 +52,7 @@ def ablate(
     resumes.
     """
     rows, left_out = choose(load_settings(preset, overrides), only)
+    set_limits(rows[FULL].limits)
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
     subject = Capture.load(ingest(artifact_store, source, rows[FULL].capture).root).name

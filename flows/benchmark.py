@@ -19,6 +19,7 @@ from hnerf.study.benchmark.publish import publish
 from tasks.benchmark import score_end_of_training, score_training
 from tasks.calibration import calibrated_capture
 from tasks.capture import ingest, subset_capture
+from tasks.limits import set_limits
 from tasks.policy import is_retryable
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
@@ -83,6 +84,7 @@ def measure(
     fails."""
     try:
         settings, more = plan.settings(method), dict[str, Any]()
+        set_limits(settings.limits)
         recording = with_detections(store, ingest(store, source, settings.capture), settings)
         parts = variant.select(Capture.load(recording.root))
         if parts != (None, None, None):

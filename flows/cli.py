@@ -13,6 +13,7 @@ from flows.store_commands import add_store_commands
 from hnerf.config import load_settings
 from hnerf.errors import InputError, InvalidAsset
 from tasks.launcher import RankFailedError
+from tasks.limits import StalledError
 
 FAILED, BAD_INPUT = 1, 2
 NO_ROOM = (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # None: our own, of libraries that do not say why
@@ -40,7 +41,7 @@ def main(argv: list[str] | None = None) -> int:
             options.command(options)
     except InputError as error:
         return _fail(error, BAD_INPUT)
-    except (RankFailedError, InvalidAsset) as error:
+    except (RankFailedError, StalledError, InvalidAsset) as error:
         return _fail(error, FAILED)
     except OSError as error:
         from tasks.policy import is_permanent  # imports Prefect

@@ -26,6 +26,7 @@ from hnerf.study.stability.verdict import BROKEN, RunVerdict, judge, near_border
 from tasks.capture import ingest, subset_capture
 from tasks.evaluation import evaluate
 from tasks.fit import fit
+from tasks.limits import set_limits
 from tasks.policy import is_retryable
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
@@ -119,6 +120,7 @@ def _runs_of_seed(
 ) -> Iterator[Figures]:
     """Yield the reference run and, unless it is broken, a run for each kind and strength."""
     settings = preset.model_copy(update={"training": preset.training.model_copy(update={"seed": seed})})
+    set_limits(settings.limits)
     log.info("%s, seed %d, as recorded", method, seed)
     good = attempt(store, recording, truth, settings, None)
     row = {"method": method, "seed": seed}

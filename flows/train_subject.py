@@ -18,6 +18,7 @@ from tasks.evaluation import evaluate, evaluate_held_out
 from tasks.fit import fit
 from tasks.hands import find_hands, needs_hands
 from tasks.ledger import forget
+from tasks.limits import set_limits
 from tasks.segmentation import converged, needs_body, segment
 from tasks.source import read_capture
 from tasks.store import Artifact, Store
@@ -53,6 +54,7 @@ def train_subject(
     without it; with "each", one without each camera in turn.
     """
     settings = load_settings(preset, overrides or ())
+    set_limits(settings.limits)
     artifact_store = Store(store.resolve())
     if not capture.exists():
         forget(artifact_store.root, capture)

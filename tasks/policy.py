@@ -15,6 +15,7 @@ from prefect.tasks import Task
 
 from hnerf.config import Section
 from tasks.launcher import LostWorkerError
+from tasks.limits import StalledError
 from tasks.source import Source
 from tasks.store import Artifact, Store, sha256_of
 
@@ -88,7 +89,10 @@ def is_transient(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
 
 
 def is_retryable(error: object) -> bool:
-    """Return whether a retry may succeed: after failed input or output, timeouts and lost workers only."""
+    """Return whether a retry may succeed: after failed input or output, timeouts and lost workers only, and where a
+    stage that stood still would go on from a checkpoint."""
+    if isinstance(error, StalledError):
+        return error.retryable
     return isinstance(error, OSError | LostWorkerError) and not is_permanent(error)
 
 
