@@ -3,9 +3,10 @@
 import json
 import logging
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from prefect import flow
+from pydantic import Field
 
 from flows.run_page import publish_markdown
 from flows.train_subject import Prepared, prepare_training, with_detections
@@ -33,15 +34,21 @@ def benchmark(
     capture: Path,
     study: str = "dynamic",
     methods: list[str] | None = None,
-    seconds: float | None = None,
+    seconds: Annotated[float, Field(gt=0)] | None = None,
     store: Path = Path("store"),
 ) -> Path:
     """Train and score every method of a study on every variant; return `<store>/benchmark/<subject>-<study>.md`, which
     has CSV, JSON and charts beside it, all rewritten after every training.
 
-    study: a name under configs/benchmark/ or a YAML file; methods: of the study, or presets, instead of all; seconds:
-    limit of every training, instead of the study's. A method that fails says why and the rest go on; a worker that was
-    killed ends the flow, and the same call resumes the training that was interrupted.
+    A method that fails says why and the rest go on; a worker that was killed ends the flow, and the same call resumes
+    the training that was interrupted.
+
+    Args:
+        capture: The recording's folder, or one video; relative to the repository.
+        study: A name under configs/benchmark/, or a YAML file.
+        methods: Of the study, or presets, instead of all.
+        seconds: Limit of every training, instead of the study's.
+        store: Where results are kept.
     """
     plan = load_study(study).restricted_to(methods or [], seconds)
     capture_settings = [plan.settings(name).capture for name in plan.methods]  # invalid presets are refused first

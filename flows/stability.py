@@ -58,9 +58,15 @@ def stability(
     `<store>/stability/<subject>-<study>.md`, which has JSON beside it, both rewritten after every run, and charts,
     drawn when the flow ends, even by an error.
 
-    study: a name under configs/stability/ or a YAML file; methods: presets in place of the study's; only: names of
-    degradations, with which the table's name ends in "-part". A failure is a result and the rest go on; a worker that
-    was killed (LostWorkerError) ends the command, and the same command resumes.
+    A failure is a result and the rest go on; a worker that was killed (LostWorkerError) ends the command, and the same
+    command resumes.
+
+    Args:
+        capture: The recording's folder, or one video; relative to the repository.
+        study: A name under configs/stability/, or a YAML file.
+        store: Where results are kept.
+        methods: Presets in place of the study's.
+        only: Names of degradations; the table's name then ends in "-part".
     """
     plan = load_stability(study).restricted_to(only)
     plan = plan.model_copy(update={"methods": tuple(methods)}) if methods else plan
