@@ -1,7 +1,10 @@
 import fcntl
 import multiprocessing
 import os
+import re
 import signal
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.synchronize import Event
 from pathlib import Path
 
@@ -122,14 +125,24 @@ def test_work_that_was_resumed_meanwhile_stays(store: Store) -> None:
 
 
 def test_a_lock_that_was_removed_under_a_waiting_process_holds_nobody_apart(store: Store) -> None:
-    """The process that waited takes the lock that lies there now."""
+    """Whoever waited takes the lock that lies there now, so that a third cannot hold another one."""
     path = store.path("fit", f"{1:032x}", ".lock")
-    with store.locked("fit", f"{1:032x}"):
-        old = path.open("w")
-        path.unlink()
-    with store.locked("fit", f"{1:032x}", wait=False):
-        assert not os.path.samestat(path.stat(), os.fstat(old.fileno()))
-    old.close()
+    held = threading.Event()
+
+    def wait_and_hold() -> None:
+        with store.locked("fit", f"{1:032x}"), pytest.raises(BlockingIOError):
+            held.set()
+            with store.locked("fit", f"{1:032x}", wait=False):
+                pass
+
+    with ThreadPoolExecutor() as pool:
+        with store.locked("fit", f"{1:032x}"):
+            waiting = pool.submit(wait_and_hold)
+            awaited = re.compile(rf"-> FLOCK .*:{path.stat().st_ino} ")
+            while not awaited.search(Path("/proc/locks").read_text()):
+                assert not held.wait(0.01)
+            path.unlink()
+        waiting.result(PATIENCE_S)
 
 
 def test_records_without_inputs_keep_what_is_linked(store: Store) -> None:
