@@ -29,6 +29,7 @@ ROOT = Path(__file__).parents[1]
 MARK = "HNERF_SOAK"  # in the environment of every process that is started here
 SIZES = {"size_px": 96, "train_cameras": 4, "test_cameras": 1, "train_frames": 4, "novel_pose_frames": 1}
 PRESET = """based_on: demo
+detection: {hands: none}
 training: {steps: 12, novel_pose_steps: 2}
 evaluation: {max_images: 1, max_meshes: 1, report_rows: 1}
 asset: {grid_cells: 48, faces: 1500, texture_px: 64, texture_poses: 1, photograph_frames: 1, correctives: 0}
@@ -57,6 +58,7 @@ def main() -> int:
         "DO_NOT_TRACK": "1",
         "OMP_NUM_THREADS": "1",
     }
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended"))  # so that nothing is left running
     try:
         figures = soak(scratch, port, mark, options)
     finally:
@@ -123,6 +125,8 @@ def write_captures(folder: Path, count: int) -> list[str]:
     names = [f"person{i:02d}" for i in range(count)]
     for seed, name in enumerate(names):
         write_synthetic_capture(folder / name, SyntheticSettings(seed=seed, **SIZES))
+        manifest = folder / name / "capture.toml"
+        manifest.write_text(manifest.read_text().replace('name = "performer"', f'name = "{name}"'))
     return names
 
 
