@@ -91,7 +91,7 @@ def export(options: argparse.Namespace) -> None:
     """Write a subject's latest results, and all they were computed from, into one file."""
     from tasks.archive import export_subject
 
-    out = options.out or Path(f"{options.name}.hnerf.tar")
+    out = options.out or Path(f"{options.name}.tar")
     manifest = export_subject(_store(options), options.name, out)
     print(f"archive: {out} ({len(manifest.artifacts)} artifacts, {_size(out.stat().st_size)})")
 
@@ -124,7 +124,7 @@ def add_store_commands(store: argparse.ArgumentParser) -> None:
     added["gc"].add_argument(
         "--older", type=duration_s, default="1d", metavar="TIME", help="not used for so long: 30d, 12h (default: 1d)"
     )
-    added["export"].add_argument("--out", type=Path, help="the file to write (default: NAME.hnerf.tar)")
+    added["export"].add_argument("--out", type=Path, help="the file to write (default: NAME.tar)")
     added["import"].add_argument("archive", type=Path, help="a file that `export` wrote")
     for parser in added.values():
         parser.add_argument("--store", type=Path, default=Path("store"), help="where results are (default: store)")

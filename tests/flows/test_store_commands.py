@@ -53,7 +53,7 @@ def test_damage_is_an_error(store: Store, capsys: pytest.CaptureFixture[str]) ->
 def test_out_and_in(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["store", "export", "ada"]) == 0
     assert main(["store", "export", "ada"]) == 2  # nothing is overwritten
-    assert main(["store", "import", "ada.hnerf.tar", "--store", "other"]) == 0
+    assert main(["store", "import", "ada.tar", "--store", "other"]) == 0
     assert main(["store", "verify", "--store", "other"]) == 0
     assert main(["store", "import", "none.tar"]) == 2
     assert main(["store", "list", "--store", "none"]) == 2
