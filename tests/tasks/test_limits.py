@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from prefect import flow
 
 from flows.cli import main
 from hnerf.config import LimitSettings
@@ -85,6 +86,19 @@ def test_a_stage_that_is_ended_leaves_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(StalledError, match=r"^stuck: ended"):
         within(0.1, lambda: stage(Store(tmp_path / "store"), read_capture(tmp_path / "ada")[0]))
     assert [path.suffix for path in (tmp_path / "store" / "stuck").iterdir()] == [".lock"]
+
+
+@flow
+def one_stuck(store: Path, source: Source) -> None:
+    """Run a stage that stands still, with the limits that the flow sets."""
+    set_limits(LimitSettings(stage_s=0.1, image_s=0))
+    Stage(stuck, "stuck", "1", resumable=False)(Store(store), source)
+
+
+def test_limits_hold_in_a_flow_run_and_a_standstill_is_not_tried_again(prefect_api: str, tmp_path: Path) -> None:
+    (tmp_path / "ada").mkdir()
+    with pytest.raises(StalledError, match=r"^stuck: ended"):
+        one_stuck(tmp_path / "store", read_capture(tmp_path / "ada")[0])
 
 
 def test_waiting_for_another_process_is_no_standstill(tmp_path: Path) -> None:
