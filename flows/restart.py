@@ -19,6 +19,8 @@ FLOW, NAME = "train-subject", "local"
 DEPLOYMENT = f"{FLOW}/{NAME}"
 UNFINISHED = (StateType.SCHEDULED, StateType.PENDING, StateType.RUNNING, StateType.PAUSED, StateType.CANCELLING)
 
+AGAIN = "crashed; begun again"
+
 log = logging.getLogger("hnerf.restart")
 
 
@@ -29,16 +31,17 @@ def unfinished_runs() -> int:
 
 def restart_crashed(max_restarts: int) -> int:
     """Put crashed runs of the deployment, those whose machine or process was lost, back into the queue; return how
-    many. Each is begun no more than `max_restarts` times again, because the run itself may be what ends the process."""
+    many. Each is begun no more than `max_restarts` times again, because the run itself may be what ends the process,
+    even before the server counts it as running."""
     restarted = 0
-    for run in _runs(StateType.CRASHED):
-        if run.run_count > max_restarts:
-            continue
-        with get_client(sync_client=True) as client:
-            state: State[None] = Scheduled(message=f"Crashed; begun again, {run.run_count} of {max_restarts} times")
-            client.set_flow_run_state(run.id, state, force=True)
-        log.warning("%s crashed and is begun again, %d of %d times", run.name, run.run_count, max_restarts)
-        restarted += 1
+    with get_client(sync_client=True) as client:
+        for run in _runs(StateType.CRASHED):
+            before = [state.message == AGAIN for state in client.read_flow_run_states(run.id)].count(True)
+            if before < max_restarts:
+                again: State[None] = Scheduled(message=AGAIN)
+                client.set_flow_run_state(run.id, again, force=True)
+                log.warning("%s crashed and is begun again, %d of %d times", run.name, before + 1, max_restarts)
+                restarted += 1
     return restarted
 
 
