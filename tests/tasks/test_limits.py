@@ -137,11 +137,11 @@ limits.GRACE_S = 0.1
 limits.set_limits(LimitSettings(stage_s=0.1, image_s=0))
 with limits.limited("capture", 1, False):
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
-    time.sleep(1000)
+    time.sleep(20)
 """
     started = time.monotonic()
     ended = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert ended.returncode == 1 and "Timeout" in ended.stderr and time.monotonic() - started < 100
+    assert ended.returncode == 1 and "Timeout" in ended.stderr and time.monotonic() - started < 15
 
 
 def test_the_command_says_it_in_one_line(
