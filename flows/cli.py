@@ -9,9 +9,11 @@ from pathlib import Path
 
 from flows import commands
 from flows.display import display
+from flows.store_commands import add_store_commands
 from hnerf.config import load_settings
 from hnerf.errors import InputError, InvalidAsset
 from tasks.launcher import RankFailedError
+from tasks.limits import StalledError
 
 FAILED, BAD_INPUT = 1, 2
 NO_ROOM = (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # None: our own, of libraries that do not say why
@@ -34,12 +36,12 @@ def main(argv: list[str] | None = None) -> int:
     try:
         with display():
             folders = _existing(options)
-            if options.command is not commands.settings:
+            if options.command.__module__ == commands.__name__ and options.command is not commands.settings:
                 log.info("%s", " ".join([_name(options.command), *map(str, folders)]))
             options.command(options)
     except InputError as error:
         return _fail(error, BAD_INPUT)
-    except (RankFailedError, InvalidAsset) as error:
+    except (RankFailedError, StalledError, InvalidAsset) as error:
         return _fail(error, FAILED)
     except OSError as error:
         from tasks.policy import is_permanent  # imports Prefect
@@ -124,6 +126,8 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     _add_out(export, "asset")
     _add_overrides(export, "override a setting of the section `asset`")
+    what = "Look into the store, and keep it in order."
+    add_store_commands(subparsers.add_parser("store", help=what, description=what))
     synth = add(commands.synth)
     synth.add_argument("out", type=Path, help="the folder to write")
     _add_overrides(synth, "such as train_cameras=32; `hnerf settings` lists them last")

@@ -70,10 +70,12 @@ def check_cameras(options: argparse.Namespace) -> None:
     from flows.train_subject import with_detections
     from tasks.calibration import calibrate
     from tasks.capture import ingest
+    from tasks.limits import set_limits
     from tasks.source import read_capture
     from tasks.store import Store
 
     settings, store = load_settings(options.preset), Store(options.store.resolve())
+    set_limits(settings.limits)
     source, _ = read_capture(options.capture, options.store)
     recording = with_detections(store, ingest(store, source, settings.capture), settings)
     calibration = calibrate(store, recording, settings.calibration)

@@ -278,8 +278,15 @@ class AssetSettings(Section):
     licence: str = ""  # of the asset, as its assetInfo says
 
 
+class LimitSettings(Section):
+    """Time limits: how long a stage may make no progress before it is ended. No result depends on them."""
+
+    stage_s: float = Field(default=1800.0, gt=0)  # whatever its size, and
+    image_s: float = Field(default=5.0, ge=0)  # for each image: frames times cameras
+
+
 class Settings(Section):
-    """All settings of a run, one section a stage; a stage's cache key depends on its own section only."""
+    """All settings of a run, one section a stage, whose cache key depends on its own section only; and its limits."""
 
     capture: CaptureSettings = CaptureSettings()
     detection: DetectionSettings = DetectionSettings()
@@ -289,6 +296,7 @@ class Settings(Section):
     training: TrainingSettings = TrainingSettings()
     evaluation: EvaluationSettings = EvaluationSettings()
     asset: AssetSettings = AssetSettings()
+    limits: LimitSettings = LimitSettings()
 
 
 def load_settings(preset: str, overrides: Sequence[str] = ()) -> Settings:

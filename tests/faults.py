@@ -48,6 +48,7 @@ PHOTOGRAPHS, SURFACE = "hnerf/asset/photographs.py", "hnerf/avatar/surface.py"
 METRICS, REPORT = "hnerf/evaluation/metrics.py", "hnerf/evaluation/report.py"
 EXPOSURE, ARTICULATION = "hnerf/training/exposure.py", "hnerf/body/articulation.py"
 POLICY, STORE = "tasks/policy.py", "tasks/store.py"
+INVENTORY, ARCHIVE, LIMITS = "tasks/inventory.py", "tasks/archive.py", "tasks/limits.py"
 
 BY_PAPER, BY_LOSSES = "tests/fields/test_paper.py", "tests/training/test_losses.py"
 BY_STEP, BY_CONDITIONS = "tests/training/test_step.py", "tests/fields/test_conditions.py"
@@ -69,6 +70,8 @@ BY_PLATE, BY_REGISTRATION = "tests/asset/test_plate.py", "tests/asset/test_regis
 BY_FIELD_COLOURS = "tests/asset/test_field_colours.py"
 BY_PHOTOGRAPHS = "tests/asset/test_photographs.py"
 BY_VIEWER, BY_PICTURES = "tests/asset/test_viewer.py", "tests/asset/test_pictures.py"
+BY_GARBAGE, BY_ARCHIVE = "tests/tasks/test_garbage.py", "tests/tasks/test_archive.py"
+BY_LIMITS = "tests/tasks/test_limits.py"
 BY_TIMING, BY_GLB = "tests/capture/test_timing.py", "tests/asset/test_glb.py"
 
 
@@ -281,6 +284,16 @@ FAULTS = (
     Fault("checkpoint-key", "hnerf/training/checkpoint.py", 'or state.get("key") != key', "",
           "tests/training/test_trainer.py"),
     Fault("store-damage", STORE, " or sha256_of(path) != file.sha256", "", BY_STORE),
+    # order in the store, and time limits
+    Fault("gc-inputs", INVENTORY, "waiting += self.stored[name].artifact.inputs", "waiting += ()", BY_GARBAGE),
+    Fault("gc-use", "tasks/garbage.py", "if aside.stat().st_mtime != garbage.used_s:", "if False:", BY_GARBAGE),
+    Fault("gc-pinned", INVENTORY, "roots = pinned(self.store.root)", "roots = set[str]()", BY_GARBAGE),
+    Fault("gc-lock", STORE, "if not _is_at(path, lock.fileno()):", "if False:", BY_GARBAGE),
+    Fault("archive-path", ARCHIVE, 'or ".." in parts or', "or", BY_ARCHIVE),
+    Fault("archive-type", ARCHIVE, "member.type != tarfile.REGTYPE or", "", BY_ARCHIVE),
+    Fault("archive-digest", ARCHIVE, "if seen.hexdigest() != digest:", "if False:", BY_ARCHIVE),
+    Fault("limit-progress", LIMITS, "            arm()\n\n    def end", "            pass\n\n    def end", BY_LIMITS),
+    Fault("limit-end", LIMITS, "exit=True", "exit=False", BY_LIMITS),
 )  # fmt: skip
 
 
