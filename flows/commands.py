@@ -215,6 +215,20 @@ def render(options: argparse.Namespace) -> None:
     print(f"{render_subject(options.subject, wanted, options.out)} pictures: {options.out}")
 
 
+def export(options: argparse.Namespace) -> None:
+    """Write the asset of a trained person again, with other settings or further motions."""
+    from hnerf.asset.subject import export_subject
+    from tasks.store import recording_digest, require_intact
+
+    for folder in (options.subject, *(motion for motion in options.motion if motion.is_dir())):
+        require_intact(folder)
+    settings = load_settings(options.preset, options.overrides).asset
+    digest = recording_digest(options.subject)
+    report = export_subject(options.subject, settings, options.motion, options.out, digest)
+    motions = ", ".join(f"{name} ({m['poses']} poses)" for name, m in report["motions"].items())
+    print(f"motions: {motions}\nasset: {options.out / 'avatar.usda'}")
+
+
 def _shape_change(text: str) -> tuple[str, float]:
     name, _, amount = text.partition("=")
     try:

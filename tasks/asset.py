@@ -10,10 +10,11 @@ from tasks.store import Artifact
 from tasks.training import load_trained_avatar
 
 
-@stage("asset", version="3")
+@stage("asset", version="5")
 def export(
     out: Path, recording: Artifact, calibration: Artifact, training: Artifact, settings: AssetSettings
 ) -> dict[str, float]:
     """Export the trained person to USD and glTF files."""
-    export_asset(calibrated_capture(recording, calibration), load_trained_avatar(training), settings, out)
+    capture = calibrated_capture(recording, calibration)
+    export_asset(capture, load_trained_avatar(training), settings, out, recording.digest)
     return {}

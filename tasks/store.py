@@ -239,6 +239,16 @@ def require_intact(subject: Path) -> None:
             raise InputError(f"{root}: damaged; repeat the same `hnerf run`, which computes it again")
 
 
+def recording_digest(subject: Path) -> str:
+    """Return the digest of the recording that `<store>/subjects/<name>` was trained on; "" where no record says."""
+    for stage in ("hands", "detection", "capture"):  # the last of them that ran
+        root = (subject / stage).resolve()
+        if root.is_dir():
+            found = Store(root.parents[1]).find(stage, root.name)
+            return found.digest if found else ""
+    return ""
+
+
 def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file's bytes, hexadecimal."""
     with path.open("rb") as file:
