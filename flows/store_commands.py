@@ -147,9 +147,10 @@ def _at_least_one(text: str) -> int:
 def _store(options: argparse.Namespace):  # type: ignore[no-untyped-def]
     from tasks.store import Store
 
-    if not options.store.is_dir():
-        raise InputError(f"{options.store}: no such folder; give --store the place of the results")
-    return Store(options.store.resolve())
+    store = Store(options.store.resolve())
+    if not store.exists():
+        raise InputError(f"{options.store}: is no store; give --store the place of the results")
+    return store
 
 
 def _sum(garbage: Iterable) -> int:  # type: ignore[type-arg]

@@ -46,6 +46,8 @@ def read_motion(path: Path, frames: str = ":") -> Motion:
     AMASS poses are SMPL's; they are converted to the joints of anny's average body, with fingers and toes at rest.
     Raises InputError if there is no motion or it lacks these frames.
     """
+    if not path.exists():
+        raise InputError(f"{path}: no such file; give a .bvh, an AMASS .npz, or <store>/subjects/<name>")
     if path.is_dir():
         return _subject_motion(path, frames)
     if path.suffix.lower() == ".bvh":
