@@ -56,9 +56,9 @@ def markdown_image(name: str) -> str:
 def embed_images(table: Path) -> str:
     """Return the text of a Markdown file with the PNG files that `markdown_image` refers to, which lie beside it,
     embedded as data URIs. Raises OSError where one is missing."""
-    return re.sub(r"(?<=\]\()<([^>]+\.png)>", lambda shown: _data_uri(table.with_name(shown[1])), table.read_text())
+    return re.sub(r"(?<=\]\()<([^>]+\.png)>", lambda shown: png_data_uri(table.with_name(shown[1])), table.read_text())
 
 
-def _data_uri(path: Path) -> str:
+def png_data_uri(path: Path) -> str:
     """Return a PNG file as a data URI."""
     return f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}"
