@@ -142,7 +142,7 @@ FAULTS = (
     # what the networks of `fast` are asked
     Fault("fast-colour-normal", CANONICAL, "positional_encoding(normal, 1)", "positional_encoding(0 * normal, 1)",
           BY_CANONICAL),
-    Fault("fast-pose-code", CANONICAL, "self.pose_code(pose)]", "0 * self.pose_code(pose)]", BY_CANONICAL),
+    Fault("fast-pose-code", CANONICAL, "self.pose_code(pose).index", "0 * self.pose_code(pose).index", BY_CANONICAL),
     Fault("fast-residual-unit", CANONICAL, "self.unit_m * self.geometry(", "self.geometry(", BY_CANONICAL),
     Fault("fast-frame", FAST, "conditions.pose.index_select(0, row)", "conditions.pose[0 * row]", BY_RAY),
     Fault("fast-eikonal-inside", FAST, " * skin.d[pick].detach().sign()[:, None]", "", BY_RAY),

@@ -124,9 +124,10 @@ class PosedBodies:
         reach_m: float,
         correction: PoseCorrection | None = None,
         exact_sign: bool = False,
+        s_follows: bool = True,
     ) -> Descriptor:
         """Return descriptors of world points (N, 3) relative to the bodies of rows `frame` (N,); gradients flow to the
-        points and the correction."""
+        points and the correction, through s only if it `s_follows`."""
         found = self._meshes.closest_points(points_m, frame, reach_m, exact_sign)
         corners = self.rig.faces.index_select(0, found.face.clamp(min=0))  # (N, 3)
         posed = frame.long()[:, None] * len(self.rig.vertices_m) + corners
@@ -140,9 +141,9 @@ class PosedBodies:
         if correction is not None:
             nearest = nearest_corner(corners, found.barycentric)
             moved = moved - self._displacement(points_m.detach(), frame, nearest, correction)
-        y = s + (inverse @ (offset + moved)[..., None])[..., 0]
-        if moved.requires_grad:  # only gradients need it, so renderings save it
-            s = s + (inverse @ self._closest_point_motion(posed, found.barycentric, normal, moved)[..., None])[..., 0]
+        y = s + (inverse * (offset + moved)[:, None]).sum(-1)  # many small products of matrices are slower
+        if s_follows and moved.requires_grad:  # only gradients need it
+            s = s + (inverse * self._closest_point_motion(posed, found.barycentric, normal, moved)[:, None]).sum(-1)
         d = found.sign * distance + (normal * moved).sum(-1)
         return Descriptor(d, s, y, normal, found.face >= 0, corners, found.barycentric)
 
@@ -177,7 +178,7 @@ class PosedBodies:
         linear = self._linear.flatten(0, 1).index_select(0, frame * len(self.rig.vertices_m) + nearest)
         carried = (self._joint_shape.unflatten(1, (3, -1)) @ correction.shape).contiguous()
         joints = frame[:, None] * len(self.rig.joints_m) + self.rig.skin_joints.index_select(0, nearest)
-        moved = moved + (linear @ bulge[..., None])[..., 0]
+        moved = moved + (linear * bulge[:, None]).sum(-1)
         return moved + weighted_sum(carried, joints, self.rig.skin_weights.index_select(0, nearest))
 
     @torch.no_grad()

@@ -103,8 +103,8 @@ class FastField(Field):
         for depth_m in torch.arange(-s.inner_m, s.outer_m, TIGHTEN_STEP_M).tolist():
             described = bodies.describe(bodies.vertices_m[0] + depth_m * normals, only, self.reach_m)
             seen = torch.zeros_like(described.near)
-            for row in pose:
-                d_hat = described.d + self._residual(described, row.expand(len(normals), -1))
+            for one in pose.split(1):
+                d_hat = described.d + self._residual(described, one, only)
                 seen |= described.near & (d_hat.abs() < settled_m)
             for side, extent in extent_m.items():
                 extent.scatter_reduce_(0, described.vertex[seen], side * described.d[seen], "amax")
@@ -138,20 +138,20 @@ class FastField(Field):
         hit = torch.nonzero(met)[:, 0]  # only these rays are evaluated; the others see nothing
         points = rays.pick(hit).points(depths[hit])
         row = rays.frame[hit].repeat_interleave(depths.shape[1])
-        skin = scene.bodies.describe(points.flatten(0, 1), row, self.reach_m, scene.correction)
+        skin = scene.bodies.describe(points.flatten(0, 1), row, self.reach_m, scene.correction, s_follows=False)
         described, moved = self._deformed(skin, scene.conditions.frame_row[row])
-        pose = scene.conditions.pose.index_select(0, row)
+        pose = scene.conditions.pose
         d = torch.where(described.near, described.d, self.reach_m).view(len(hit), depths.shape[1])
-        residual = torch.where(described.near, self._residual(described, pose), 0.0).view_as(d)
+        residual = torch.where(described.near, self._residual(described, pose, row), 0.0).view_as(d)
         alpha_dot = alpha_from_sdf(d + residual, self.log_sharpness.exp())
         # an opaque core: nothing shines through if the surface lies deeper
         end = torch.where(core[hit, None], 1.0, alpha_dot[:, -1:])
         alpha = torch.cat([alpha_dot[:, :-1], end], 1)
         visible = weights_from_alpha(alpha.detach()).flatten() > MIN_COLOUR_WEIGHT
-        colour = self._colour(move_to_surface(described, d + residual), pose, visible)
+        colour = self._colour(move_to_surface(described, d + residual), pose, row, visible)
         norms = d.new_zeros(0)
         if draws.probe is not None:
-            norms = self._gradient_norms(described, skin, pose, draws.probe[hit], depths.shape[1])
+            norms = self._gradient_norms(described, skin, pose, row, draws.probe[hit], depths.shape[1])
         elastic = None
         if moved is not None:
             energy = torch.where(described.near, (moved / ELASTIC_M).square().sum(-1), 0.0)
@@ -191,23 +191,23 @@ class FastField(Field):
         moved, normal_displacement = self.deformation(described, frame_row)
         return dataclasses.replace(described, y=described.y - moved, d=described.d - normal_displacement), moved
 
-    def _residual(self, described: Descriptor, pose: Tensor) -> Tensor:
+    def _residual(self, described: Descriptor, pose: Tensor, row: Tensor) -> Tensor:
         """Return dd (N,) in the shell; 0 outside it and deeper inside, where no ray samples and the body's d is
         enough."""
         s = self.settings
         trained = described.near & (described.d < self.reach_m) & (described.d > -s.inner_m - 2 * s.shell_cell_m)
-        return torch.where(trained, self.field.residual(described.y, described.d, pose), 0.0)
+        return torch.where(trained, self.field.residual(described.y, described.d, pose, row), 0.0)
 
-    def _colour(self, described: Descriptor, pose: Tensor, visible: Tensor) -> Tensor:
+    def _colour(self, described: Descriptor, pose: Tensor, row: Tensor, visible: Tensor) -> Tensor:
         """Return the colours (N, 3) of the visible samples, zero elsewhere."""
         pick = torch.nonzero(visible)[:, 0]
         colour = described.d.new_zeros(len(visible), 3)
-        at = (t.index_select(0, pick) for t in (described.y, described.d, described.normal, pose))
-        seen = self.field.colour(*at)
+        y, d, normal, row = (t.index_select(0, pick) for t in (described.y, described.d, described.normal, row))
+        seen = self.field.colour(y, d, normal, pose, row)
         return colour.index_copy(0, pick, seen)
 
     def _gradient_norms(
-        self, described: Descriptor, skin: Descriptor, pose: Tensor, probe: Tensor, samples: int
+        self, described: Descriptor, skin: Descriptor, pose: Tensor, row: Tensor, probe: Tensor, samples: int
     ) -> Tensor:
         """Return |grad d_hat| in the canonical frame at one sample per ray, probe (R,) in [0, 1), by forward
         differences, because grid interpolation has no useful second derivative.
@@ -222,20 +222,20 @@ class FastField(Field):
         axes = torch.cat([y.new_zeros(1, 3), torch.eye(3, device=y.device)])  # no step, and one along each axis
         d = d + GRADIENT_STEP_M * axes @ outward.T
         y = y + GRADIENT_STEP_M * axes[:, None]
-        found = self.field.residual(y.flatten(0, 1), d.flatten(), pose[pick].repeat(len(axes), 1)).view_as(d)
+        found = self.field.residual(y.flatten(0, 1), d.flatten(), pose, row[pick].repeat(len(axes))).view_as(d)
         return (outward + (found[1:] - found[0]).T / GRADIENT_STEP_M).norm(dim=-1)
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """Return d_hat (N,) at points (N, 3) around the first body; beyond the shell it is the body's own distance."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         described, _ = self._deformed(bodies.describe(points_m, row, FAR_M, exact_sign=True), conditions.frame_row[row])
-        return described.d + self._residual(described, conditions.pose[row])
+        return described.d + self._residual(described, conditions.pose, row)
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """Return c (N, 3) at points around the first body; this field does not depend on the viewing direction."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         described, _ = self._deformed(bodies.describe(points_m, row, FAR_M), conditions.frame_row[row])
-        return self.field.colour(described.y, described.d, described.normal, conditions.pose[row])
+        return self.field.colour(described.y, described.d, described.normal, conditions.pose, row)
 
 
 def move_to_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:

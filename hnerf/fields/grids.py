@@ -33,16 +33,17 @@ class CanonicalField(nn.Module):
             nn.Linear(width, 3),
         )
 
-    def _inputs(self, features: Tensor, d: Tensor, pose: Tensor) -> list[Tensor]:
-        return [features, d[:, None] / self.unit_m, self.pose_code(pose)]
+    def _inputs(self, features: Tensor, d: Tensor, pose: Tensor, row: Tensor) -> list[Tensor]:
+        return [features, d[:, None] / self.unit_m, self.pose_code(pose).index_select(0, row)]
 
-    def residual(self, y_m: Tensor, d_m: Tensor, pose: Tensor) -> Tensor:
-        """Return dd (N,) in metres at y (N, 3), d (N,) and pose (N, P); zero at the start of training."""
+    def residual(self, y_m: Tensor, d_m: Tensor, pose: Tensor, row: Tensor) -> Tensor:
+        """Return dd (N,) in metres at y (N, 3) and d (N,), in the pose of `row` (N,) among poses (n, P); zero at the
+        start of training."""
         features = self.geometry_grids(y_m)
-        return self.unit_m * self.geometry(torch.cat(self._inputs(features, d_m, pose), -1))[:, 0]
+        return self.unit_m * self.geometry(torch.cat(self._inputs(features, d_m, pose, row), -1))[:, 0]
 
-    def colour(self, y_m: Tensor, d_m: Tensor, normal: Tensor, pose: Tensor) -> Tensor:
+    def colour(self, y_m: Tensor, d_m: Tensor, normal: Tensor, pose: Tensor, row: Tensor) -> Tensor:
         """Return c (N, 3) in [0, 1]."""
         features = self.colour_grids(y_m)
-        inputs = self._inputs(features, d_m, pose)
+        inputs = self._inputs(features, d_m, pose, row)
         return torch.sigmoid(self.radiance(torch.cat([*inputs, positional_encoding(normal, 1)], -1)))

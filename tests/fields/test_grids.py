@@ -10,8 +10,9 @@ SETTINGS = FastFieldSettings(
     outer_m=0.05, geometry_cells=(1, 2), colour_cells=(1,), channels=1, width=4, pose_width=2, samples=1
 )
 Y, D = torch.tensor([[0.2, 0.3, 0.4]]), torch.tensor([-0.01])
-NORMAL, POSE = torch.tensor([[1.0, 0.0, -0.5]]), torch.tensor([[0.1, 0.2, 0.3]])
-CODE = [0.3, -0.2]  # of this pose: its last number, and less its second one
+NORMAL = torch.tensor([[1.0, 0.0, -0.5]])
+POSE = torch.tensor([[7.0, 8.0, 9.0], [0.1, 0.2, 0.3]]), torch.tensor([1])  # of two rows, and which
+CODE = [0.3, -0.2]  # of this row's pose: its last number, and less its second one
 
 
 class First(nn.Module):
@@ -40,7 +41,7 @@ def known_field() -> CanonicalField:
 def test_geometry_sees_features_distance_and_pose() -> None:
     """Input distance and output are in units of the outer shell thickness: half of 5 cm."""
     field = known_field()
-    found = field.residual(Y, D, POSE)
+    found = field.residual(Y, D, *POSE)
     torch.testing.assert_close(field.geometry.asked, torch.tensor([[0.5, 0.25, -0.2, *CODE]]))
     torch.testing.assert_close(found.detach(), torch.tensor([0.025]))
 
@@ -48,7 +49,7 @@ def test_geometry_sees_features_distance_and_pose() -> None:
 def test_colour_sees_features_distance_pose_and_normal() -> None:
     """The normal is encoded with one octave: sines of pi, 0 and -pi / 2, and their cosines."""
     field = known_field()
-    found = field.colour(Y, D, NORMAL, POSE)
+    found = field.colour(Y, D, NORMAL, *POSE)
     encoded = [1.0, 0, -0.5, 0, 0, -1, -1, 1, 0]
     torch.testing.assert_close(field.radiance.asked, torch.tensor([[2.0, -0.2, *CODE, *encoded]]), atol=1e-6, rtol=0)
     torch.testing.assert_close(found.detach(), torch.sigmoid(torch.tensor([[2.0, -0.2, 0.3]])))
@@ -58,10 +59,11 @@ def test_no_network_answers_before_it_is_trained() -> None:
     """The surface starts as the body's own; training may change both outputs at any pose and position."""
     torch.manual_seed(0)
     field = CanonicalField(torch.zeros(3), torch.ones(3), SETTINGS, 3)
-    assert field.residual(Y, D, POSE).item() == 0
+    assert field.residual(Y, D, *POSE).item() == 0
     nn.init.normal_(field.geometry[-1].weight)
     for level in field.geometry_grids.levels:
         nn.init.normal_(level)
-    here = field.residual(Y, D, POSE)
-    for changed in ((Y + 0.1, D, POSE), (Y, D + 0.01, POSE), (Y, D, POSE + 0.1)):
+    here = field.residual(Y, D, *POSE)
+    poses, row = POSE
+    for changed in ((Y + 0.1, D, *POSE), (Y, D + 0.01, *POSE), (Y, D, poses + 0.1, row)):
         assert (field.residual(*changed) - here).abs() > 1e-6
