@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from hnerf.body.canonical import FAR_M, Descriptor, PosedBodies
-from hnerf.body.descriptor import vertex_normals
+from hnerf.body.descriptor import BodyMeshes, vertex_normals
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
 from hnerf.config import FastFieldSettings
@@ -64,7 +64,13 @@ class FastField(Field):
         self.register_buffer("weights", weights, persistent=False)
         beyond_m = settings.outer_m + GRID_MARGIN_M
         lower_m, upper_m = rig.vertices_m.amin(0) - beyond_m, rig.vertices_m.amax(0) + beyond_m
-        self.field = CanonicalField(lower_m, upper_m, settings, 3 * int(rig.free.sum()))
+        body = BodyMeshes(rig.vertices_m[None], rig.faces)
+
+        def near(points_m: Tensor, beyond_m: float) -> Tensor:
+            only = torch.zeros(len(points_m), dtype=torch.int32, device=points_m.device)
+            return body.closest_points(points_m, only, self.reach_m + GRID_MARGIN_M + beyond_m).face >= 0
+
+        self.field = CanonicalField(lower_m, upper_m, settings, 3 * int(rig.free.sum()), near)
         self.deformation = (
             FrameDeformation(rig.vertices_m, rig.faces, settings.nodes, frames) if settings.nodes else None
         )

@@ -1,10 +1,13 @@
 """The networks F and DH of the fast field: feature grids over the canonical shell and small MLPs (docs/method.md)."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
 from hnerf.config import FastFieldSettings
-from hnerf.fields.encoding import FeatureGrids, positional_encoding
+from hnerf.fields.encoding import positional_encoding
+from hnerf.fields.sparse_grids import SparseGrids
 
 
 class CanonicalField(nn.Module):
@@ -14,12 +17,20 @@ class CanonicalField(nn.Module):
     here. n is the body's normal in the world; it carries the effect of the root transform T on shading.
     """
 
-    def __init__(self, lower_m: Tensor, upper_m: Tensor, settings: FastFieldSettings, pose_inputs: int):
+    def __init__(
+        self,
+        lower_m: Tensor,
+        upper_m: Tensor,
+        settings: FastFieldSettings,
+        pose_inputs: int,
+        near: Callable[[Tensor, float], Tensor],
+    ):
+        """Build untrained networks over a box. near: where anything is to be learned, as SparseGrids takes it."""
         super().__init__()
         width, pose_width, channels = settings.width, settings.pose_width, settings.channels
         self.unit_m = settings.outer_m
-        self.geometry_grids = FeatureGrids(lower_m, upper_m, settings.geometry_cells, channels)
-        self.colour_grids = FeatureGrids(lower_m, upper_m, settings.colour_cells, channels)
+        self.geometry_grids = SparseGrids(lower_m, upper_m, settings.geometry_cells, channels, near)
+        self.colour_grids = SparseGrids(lower_m, upper_m, settings.colour_cells, channels, near)
         self.pose_code = nn.Linear(pose_inputs, pose_width, bias=False)
         last = nn.Linear(width, 1)
         nn.init.zeros_(last.weight)
