@@ -19,7 +19,7 @@ from hnerf.fields.rays import Rays
 wp.config.log_level = wp.LOG_ERROR
 
 EMPTY, SHELL, SOLID = 0, 1, 2
-SLACK = 3**0.5 / 2  # half a diagonal of a cell, in cells
+SLACK = 0.5  # cells: most of a cell then lies in the shell; thicknesses have more room than its corners need
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class ShellGrid:
         """Build the shell around closed surfaces with vertices (n, V, 3); outer_m, inner_m (n, V): thickness in metres
         outside and inside; points: dense surface points, as `surface_points` returns them.
 
-        Each surface point's cell reaches as far as the point is thick; distances are between cell centres and half a
-        diagonal is added, so the shell is up to a cell thicker than asked, seldom thinner.
+        Each surface point's cell reaches as far as the point is thick and half a cell farther, between cell centres, so
+        the shell is up to a cell thicker or thinner than asked.
         """
         wp.init()
         corners, weights = points
