@@ -119,7 +119,7 @@ class FastFieldSettings(FieldSettings):
     kind: Literal["fast"] = "fast"
     outer_m: float = Field(default=0.0, ge=0)  # thickness of the shell outside the body
     inner_m: float = Field(default=0.0, ge=0)  # thickness of the shell inside the body
-    shell_cell_m: float = Field(default=0.01, gt=0)
+    shell_cell_m: float = Field(default=0.015, gt=0)
     samples: int = Field(default=0, ge=0)
     geometry_cells: tuple[PositiveInt, ...] = ()  # of each level, on the box's longest side
     colour_cells: tuple[PositiveInt, ...] = ()
