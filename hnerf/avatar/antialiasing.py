@@ -22,9 +22,9 @@ def antialiased(render_rays_at: Callable[[np.ndarray], Tensor], visible: np.ndar
     image = seen.new_zeros(*visible.shape, 5)
     image[tuple(centres.T[::-1])] = seen
     mixed = _pixels(mixed_pixels(image[..., :4]).cpu().numpy())
-    quarters = [render_rays_at(mixed + offset_px)[:, :4] for offset_px in QUARTERS_PX]
+    quarters = render_rays_at((QUARTERS_PX[:, None] + mixed).reshape(-1, 2))  # in one call, which costs less
     x, y = mixed.T
-    image[y, x, :4] = torch.stack(quarters).mean(0)
+    image[y, x, :4] = quarters.unflatten(0, (len(QUARTERS_PX), -1)).mean(0)[:, :4]
     return image
 
 

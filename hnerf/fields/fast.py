@@ -107,10 +107,11 @@ class FastField(Field):
         settled_m = SATURATED_LOGIT / self.log_sharpness.exp()
         extent_m = {1: torch.zeros_like(self.outer_m), -1: torch.zeros_like(self.inner_m)}
         for depth_m in torch.arange(-s.inner_m, s.outer_m, TIGHTEN_STEP_M).tolist():
-            described = bodies.describe(bodies.vertices_m[0] + depth_m * normals, only, self.reach_m)
+            old = torch.nonzero((-self.inner_m <= depth_m) & (depth_m <= self.outer_m))[:, 0]
+            described = bodies.describe((bodies.vertices_m[0] + depth_m * normals)[old], only[old], self.reach_m)
             seen = torch.zeros_like(described.near)
             for one in pose.split(1):
-                d_hat = described.d + self._residual(described, one, only)
+                d_hat = described.d + self._residual(described, one, only[old])
                 seen |= described.near & (d_hat.abs() < settled_m)
             for side, extent in extent_m.items():
                 extent.scatter_reduce_(0, described.vertex[seen], side * described.d[seen], "amax")
