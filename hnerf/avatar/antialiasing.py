@@ -10,11 +10,15 @@ MIXED_CONTRAST = 0.1  # between neighbours, of colour or coverage; 0.05 gains 0.
 QUARTERS_PX = 0.25 * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])  # from a pixel's centre to those of its quarters
 
 
-def antialiased(render_rays_at: Callable[[np.ndarray], Tensor], visible: np.ndarray) -> Tensor:
+def antialiased(
+    render_rays_at: Callable[[np.ndarray], Tensor],
+    render_beside: Callable[[np.ndarray, np.ndarray], Tensor],
+    visible: np.ndarray,
+) -> Tensor:
     """Return an image (H, W, 5): colour, coverage and depth, 0 outside `visible` (H, W) bool.
 
-    render_rays_at: maps points (N, 2) of the image, (x, y) in pixels, to what their rays see, (N, 5). Of mixed pixels
-    the colour and the coverage are means over four quarters; depth is that of the centre, since a mean of near and far
+    render_rays_at: maps points (N, 2) of the image, (x, y) in pixels, to what their rays see, (N, 5). render_beside:
+    the same for points that are moved by offsets (M, 2) in pixels each, (M, N, 5). Of mixed pixels the colour and the coverage are means over four quarters; depth is that of the centre, since a mean of near and far
     lies on neither surface.
     """
     centres = _pixels(visible)
@@ -22,9 +26,8 @@ def antialiased(render_rays_at: Callable[[np.ndarray], Tensor], visible: np.ndar
     image = seen.new_zeros(*visible.shape, 5)
     image[tuple(centres.T[::-1])] = seen
     mixed = _pixels(mixed_pixels(image[..., :4]).cpu().numpy())
-    quarters = render_rays_at((QUARTERS_PX[:, None] + mixed).reshape(-1, 2))  # in one call, which costs less
     x, y = mixed.T
-    image[y, x, :4] = quarters.unflatten(0, (len(QUARTERS_PX), -1)).mean(0)[:, :4]
+    image[y, x, :4] = render_beside(mixed, QUARTERS_PX).mean(0)[:, :4]
     return image
 
 

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from hnerf.body.descriptor import BodyMeshes
+from hnerf.body.descriptor import BodyMeshes, ClosestPoints
 from hnerf.body.rig import (
     Rig,
     joint_transforms,
@@ -125,10 +125,20 @@ class PosedBodies:
         correction: PoseCorrection | None = None,
         exact_sign: bool = False,
         s_follows: bool = True,
+        beside_m: Tensor | None = None,
     ) -> Descriptor:
         """Return descriptors of world points (N, 3) relative to the bodies of rows `frame` (N,); gradients flow to the
-        points and the correction, through s only if it `s_follows`."""
+        points and the correction, through s only if it `s_follows`.
+
+        beside_m (M, N, 3): return instead those of the points moved by M offsets each, (M N,), to first order: what is
+        closest is looked for once.
+        """
         found = self._meshes.closest_points(points_m, frame, reach_m, exact_sign)
+        moved = points_m - points_m.detach()  # zero, but carries the gradient
+        if beside_m is not None:
+            many = len(beside_m)
+            found = ClosestPoints(*(torch.cat([t] * many) for t in (found.face, found.barycentric, found.sign)))
+            points_m, frame, moved = torch.cat([points_m] * many), torch.cat([frame] * many), beside_m.flatten(0, 1)
         corners = self.rig.faces.index_select(0, found.face.clamp(min=0))  # (N, 3)
         posed = frame.long()[:, None] * len(self.rig.vertices_m) + corners
         p = weighted_sum(self.vertices_m.flatten(0, 1), posed, found.barycentric)
@@ -137,7 +147,6 @@ class PosedBodies:
         offset = points_m.detach() - p
         distance = offset.norm(dim=-1)
         normal = found.sign[:, None] * offset / distance.clamp(min=1e-9)[:, None]
-        moved = points_m - points_m.detach()  # zero, but carries the gradient
         if correction is not None:
             nearest = nearest_corner(corners, found.barycentric)
             moved = moved - self._displacement(points_m.detach(), frame, nearest, correction)

@@ -11,7 +11,7 @@ from hnerf.body.descriptor import BodyMeshes, vertex_normals
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
 from hnerf.config import FastFieldSettings
-from hnerf.fields.base import Field
+from hnerf.fields.base import Field, composited
 from hnerf.fields.compositing import alpha_from_sdf, occupancy, weights_from_alpha
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.deformation import FrameDeformation
@@ -141,15 +141,39 @@ class FastField(Field):
 
     def sample(self, scene: PosedScene[ShellGrid], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:
         """Evaluate rays as Field.sample does, in the shell alone."""
+        return self._sample(scene, rays, draws, None)
+
+    def render_beside(self, scene: PosedScene[ShellGrid], rays: Rays, directions: Tensor) -> Tensor:
+        """Render M rays beside each ray as Field.render_beside does. What is closest to their samples is taken to first
+        order from those of the ray between them: a quarter of a pixel beside, it is the same."""
+        rendered = directions.new_zeros(*directions.shape[:2], 5)
+        for pick, draws in self._by_samples(scene, rays):
+            seen = composited(*self._sample(scene, rays.pick(pick), draws, directions[:, pick]))
+            rendered[:, pick] = seen.unflatten(0, (len(directions), -1))
+        return rendered
+
+    def _sample(
+        self, scene: PosedScene[ShellGrid], rays: Rays, draws: Draws, directions: Tensor | None
+    ) -> tuple[RaySamples, Tensor]:
+        """Evaluate rays, or if there are directions (M, R, 3) the M R rays along them, at the depths of the rays that
+        they are close to."""
         depths, met, core = scene.region.sample_rays(rays, draws.jitter)
         hit = torch.nonzero(met)[:, 0]  # only these rays are evaluated; the others see nothing
-        points = rays.pick(hit).points(depths[hit])
-        row = rays.frame[hit].repeat_interleave(depths.shape[1])
-        skin = scene.bodies.describe(points.flatten(0, 1), row, self.reach_m, scene.correction, s_follows=False)
+        points_m = rays.pick(hit).points(depths[hit]).flatten(0, 1)
+        row, background, beside_m = rays.frame[hit].repeat_interleave(depths.shape[1]), draws.background, None
+        if directions is not None:
+            beside_m = ((directions - rays.directions)[:, hit, None] * depths[hit, :, None]).flatten(1, 2)
+        skin = scene.bodies.describe(points_m, row, self.reach_m, scene.correction, s_follows=False, beside_m=beside_m)
+        if directions is not None:
+            many = len(directions)
+            hit = (hit + len(rays) * torch.arange(many, device=hit.device)[:, None]).flatten()
+            depths, met, core, row, background = (torch.cat([t] * many) for t in (depths, met, core, row, background))
         described, moved = self._deformed(skin, scene.conditions.frame_row[row])
+        near = described.near & (described.d <= self.outer_m[described.vertex])  # cells reach farther than the shell
+        described = dataclasses.replace(described, near=near)
         pose = scene.conditions.pose
         d = torch.where(described.near, described.d, self.reach_m).view(len(hit), depths.shape[1])
-        residual = torch.where(described.near, self._residual(described, pose, row), 0.0).view_as(d)
+        residual = self._residual(described, pose, row).view_as(d)
         alpha_dot = alpha_from_sdf(d + residual, self.log_sharpness.exp())
         # an opaque core: nothing shines through if the surface lies deeper
         end = torch.where(core[hit, None], 1.0, alpha_dot[:, -1:])
@@ -169,8 +193,9 @@ class FastField(Field):
 
         alpha, alpha_dot, residual = (everywhere(values, 0.0) for values in (alpha, alpha_dot, residual))
         colour = everywhere(colour.view(len(hit), depths.shape[1], 3), 0.0)
-        d, in_box = everywhere(d, self.reach_m), everywhere(torch.ones_like(d), 0.0)
-        samples = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, draws.background, elastic)
+        seen = described.near.view_as(d).any(1, keepdim=True)
+        d, in_box = everywhere(d, self.reach_m), everywhere(seen.expand_as(d).float(), 0.0)
+        samples = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, background, elastic)
         return samples, depths
 
     def coverage(self, samples: RaySamples) -> Tensor:
@@ -203,7 +228,9 @@ class FastField(Field):
         enough."""
         s = self.settings
         trained = described.near & (described.d < self.reach_m) & (described.d > -s.inner_m - 2 * s.shell_cell_m)
-        return torch.where(trained, self.field.residual(described.y, described.d, pose, row), 0.0)
+        pick = torch.nonzero(trained)[:, 0]
+        y, d, row = (t.index_select(0, pick) for t in (described.y, described.d, row))
+        return torch.zeros_like(described.d).index_copy(0, pick, self.field.residual(y, d, pose, row))
 
     def _colour(self, described: Descriptor, pose: Tensor, row: Tensor, visible: Tensor) -> Tensor:
         """Return the colours (N, 3) of the visible samples, zero elsewhere."""
