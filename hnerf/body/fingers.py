@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from hnerf.body.articulation import Articulation, Pose
-from hnerf.body.hand_points import OUTLIER_M, POINT_STD_M, SIDES, finger_joints, hand_points
+from hnerf.body.hand_points import OUTLIER_M, POINT_STD_M, SIDES, finger_joints, hand_points, moved_onto_palm
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.reprojection import Views, reprojection_term
 from hnerf.body.rig import Rig
@@ -99,7 +99,7 @@ def add_persistence(equations: NormalEquations, turns: Tensor, following: np.nda
 
 
 def fit_fingers(pose: Pose, views: Views, scale_m: Tensor, runs: list[tuple[int, ...]], seconds: float) -> Pose:
-    """Return the pose with fingers fitted to hand points (C, n, 42), everything else held.
+    """Return the pose with fingers fitted to hand points (C, n, 42) relative to their palm, everything else held.
 
     scale_m (C, n): metres a pixel spans; runs: frames that follow each other, `seconds` apart.
     """
@@ -117,6 +117,7 @@ def fit_fingers(pose: Pose, views: Views, scale_m: Tensor, runs: list[tuple[int,
     theta = pose.theta.clone()
     if not (theta[:, fingers] != 0).any():
         theta[:, fingers] = prior.relaxed()
+    views = moved_onto_palm(views, articulation.jacobian(points, articulation.pose(pose))[0])
     for outlier_m in STEPS_M:
         x, by_frame, _ = articulation.jacobian(points, articulation.pose(replace(pose, theta=theta)))
         matrix, pull, _ = reprojection_term(views, scale_m, x, POINT_STD_M, outlier_m)

@@ -1,4 +1,5 @@
 import fcntl
+import json
 import logging
 import os
 import re
@@ -38,34 +39,27 @@ def wait_until_running(folder: Path, count: int) -> None:
         time.sleep(0.05)
 
 
-def test_lines_of_all_ranks_reach_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.INFO, logger=RANKS):
-        run_ranks(RANKS, ["ok", str(tmp_path)], processes=2)
-    assert sorted(caplog.messages) == ["rank 0 of 2", "rank 1 of 2"]
-
-
-def test_progress_of_ranks_is_reported_and_not_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.DEBUG, logger="hnerf.progress"):
-        run_ranks(RANKS, ["progress", str(tmp_path)], processes=1)
-    assert [record.progress for record in caplog.records] == [("training", 0, 8)]
-
-
-def test_files_where_the_user_stands_are_no_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ranks_log_lines_report_progress_and_import_nothing_from_where_the_user_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Progress is not logged, too."""
     for name in ("tasks.py", "torch.py"):
         (tmp_path / name).write_text("raise SystemExit(1)")
     monkeypatch.chdir(tmp_path)
-    run_ranks(RANKS, ["ok", str(tmp_path)], processes=1)
+    with caplog.at_level(logging.INFO, logger=RANKS), caplog.at_level(logging.DEBUG, logger="hnerf.progress"):
+        run_ranks(RANKS, ["ok", str(tmp_path)], processes=2)
+    lines = [record.message for record in caplog.records if record.name == RANKS]
+    assert sorted(lines) == ["rank 0 of 2", "rank 1 of 2"]
+    progress = [record.progress for record in caplog.records if record.name == "hnerf.progress"]
+    assert sorted(progress) == [("training", 0, 8), ("training", 1, 8)]
 
 
 @pytest.mark.parametrize(
     ("mode", "error", "message"),
     [
         ("bad", InputError, r"^a\.jpg: bad; write it again$"),
-        ("stuck", RankFailedError, "^no surface: check the masks$"),
-        ("full", OSError, r"^\[Errno 28\] No space left on device: 'b\.pt'$"),
         ("raise", RuntimeError, r"rank 1 ended with exit code 1(.|\n)*ValueError: boom in rank one$"),
         ("killed", LostWorkerError, "rank 1 was killed by SIGKILL"),
-        ("crash", RuntimeError, "rank 1 crashed with SIGSEGV"),
     ],
 )
 def test_one_failing_rank_ends_all_with_its_message(
@@ -75,6 +69,27 @@ def test_one_failing_rank_ends_all_with_its_message(
         run_ranks(RANKS, [mode, str(tmp_path)], processes=2)
     assert type(caught.value) is error and re.search(message, str(caught.value))
     assert still_running(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("code", "last_line", "error", "message"),
+    [
+        (2, "a.jpg: bad; write it again", InputError, r"^a\.jpg: bad; write it again$"),
+        (3, "no surface: check the masks", RankFailedError, "^no surface: check the masks$"),
+        (4, '[28, "No space left on device", "b.pt"]', OSError, r"^\[Errno 28\] No space left on device: 'b\.pt'$"),
+        (-signal.SIGTERM, "stopped", LostWorkerError, "^ranks: rank 1 was killed by SIGTERM$"),
+        (-signal.SIGSEGV, "oh", RuntimeError, "^ranks: rank 1 crashed with SIGSEGV\na warning\noh$"),
+    ],
+)
+def test_the_first_failure_of_torchrun_by_exit_code(
+    tmp_path: Path, code: int, last_line: str, error: type[Exception], message: str
+) -> None:
+    (tmp_path / launcher.FAILURE).write_text(json.dumps([1, code]))
+    written = tmp_path / "run" / "attempt_0" / "1" / "stderr.log"
+    written.parent.mkdir(parents=True)
+    written.write_text(f"a warning\n{last_line}\n")
+    found = launcher._error("ranks", tmp_path, 1)
+    assert type(found) is error and re.search(message, str(found))
 
 
 def start_caller(folder: Path) -> "subprocess.Popen[bytes]":
