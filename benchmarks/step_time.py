@@ -48,7 +48,11 @@ def in_turns(checkouts: list[Path], subject: Path, changes: list[str]) -> list[s
     with tempfile.TemporaryFile("w+") as errors:
         running = [
             subprocess.Popen(
-                command, env=environment | {"PYTHONPATH": str(checkout)}, stdout=subprocess.PIPE, stderr=errors, text=True
+                command,
+                env=environment | {"PYTHONPATH": str(checkout)},
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
             )
             for checkout in checkouts
         ]
@@ -83,7 +87,7 @@ def measure(subject: Path, changes: list[str]) -> None:
     from hnerf.config import load_settings
     from hnerf.evaluation.ground_truth import GroundTruth
     from hnerf.evaluation.images import render, score_split
-    from hnerf.evaluation.views import sample_views, all_views
+    from hnerf.evaluation.views import all_views, sample_views
     from hnerf.training.distributed import Distributed
     from hnerf.training.trainer import Trainer
 

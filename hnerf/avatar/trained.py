@@ -81,8 +81,8 @@ class TrainedAvatar:
         at_once = max(1, min(RAYS_PER_BATCH, SAMPLES_PER_BATCH // self.field.samples))
 
         def rays_at(points_px: np.ndarray) -> Rays:
-            rows = (torch.from_numpy(row.astype(np.float32)).to(device) for row in camera.rays(points_px.astype(float)))
-            return Rays(*rows, torch.zeros(len(points_px), dtype=torch.long, device=device))
+            o, d = (torch.from_numpy(row.astype(np.float32)).to(device) for row in camera.rays(points_px.astype(float)))
+            return Rays(o, d, torch.zeros(len(o), dtype=torch.long, device=device))
 
         def render_rays_at(points_px: np.ndarray) -> Tensor:
             seen = [torch.zeros(0, 5, device=device)]

@@ -42,7 +42,7 @@ class SparseGrids(nn.Module):
         size_m = upper_m - lower_m
         sizes, kept = [], []
         for n in cells:
-            count = (size_m / size_m.max() * n).round().int() + 1
+            count = (size_m / size_m.max() * n).round().int().clamp(min=1) + 1
             z, y, x = (torch.linspace(0, 1, int(k), device=size_m.device) for k in count.flip(0))
             nodes = torch.cartesian_prod(z, y, x).flip(1) * size_m + lower_m
             kept.append(near(nodes, float((size_m / (count - 1)).norm())))  # all corners of a cell with samples in it
@@ -81,7 +81,7 @@ class _Interpolation(torch.autograd.Function):
     def forward(ctx: Any, unit: Tensor, features: Tensor, sizes: Tensor, rows: Tensor) -> Tensor:
         ctx.save_for_backward(unit, features, sizes, rows)
         found = features.new_empty(len(unit), len(sizes), features.shape[1])
-        _launch(0, unit, features, sizes, rows, found)
+        _launch(0, unit, features, sizes, rows, [found])
         return found.flatten(1)
 
     @staticmethod
@@ -90,12 +90,20 @@ class _Interpolation(torch.autograd.Function):
         of_features = torch.zeros_like(features)
         of_unit = torch.empty_like(unit) if ctx.needs_input_grad[0] else None
         gradient = gradient.unflatten(1, (len(sizes), -1)).contiguous()
-        _launch(1, unit, features, sizes, rows, gradient, of_features, of_unit)
+        _launch(1, unit, features, sizes, rows, [gradient, of_features], of_unit)
         return of_unit, of_features, None, None
 
 
-def _launch(which: int, unit: Tensor, features: Tensor, sizes: Tensor, rows: Tensor, *more: Tensor | None) -> None:
-    """Run a kernel of `_kernels` over N points; `more` are its arguments beside the common ones."""
+def _launch(
+    which: int,
+    unit: Tensor,
+    features: Tensor,
+    sizes: Tensor,
+    rows: Tensor,
+    nodes: list[Tensor],
+    of_unit: Tensor | None = None,
+) -> None:
+    """Run a kernel of `_kernels` over N points; `nodes` and `of_unit` are its arguments beside the common ones."""
     if not len(unit):
         return
     node = wp.types.vector(length=features.shape[1], dtype=wp.float32)
@@ -107,9 +115,9 @@ def _launch(which: int, unit: Tensor, features: Tensor, sizes: Tensor, rows: Ten
         wp.from_torch(rows),
         wp.from_torch(features.detach(), dtype=node),
     ]
-    for tensor in more:
-        kind = wp.vec3 if tensor is not None and tensor.shape == unit.shape else node
-        arguments.append(None if tensor is None else wp.from_torch(tensor, dtype=kind))
+    arguments += [wp.from_torch(tensor, dtype=node) for tensor in nodes]
+    if which == 1:
+        arguments.append(None if of_unit is None else wp.from_torch(of_unit, dtype=wp.vec3))
     kernel = _kernels(features.shape[1])[which]
     wp.launch(kernel, len(unit), arguments, device=wp.device_from_torch(unit.device))
 
@@ -117,9 +125,8 @@ def _launch(which: int, unit: Tensor, features: Tensor, sizes: Tensor, rows: Ten
 @wp.func
 def _lowest_node(at: wp.vec3, size: wp.vec3i):
     """Return the node with the least coordinates of the cell at fractional coordinates."""
-    return wp.vec3i(
-        wp.min(int(at[0]), size[0] - 2), wp.min(int(at[1]), size[1] - 2), wp.min(int(at[2]), size[2] - 2)
-    )
+    last = size - wp.vec3i(2, 2, 2)
+    return wp.min(wp.vec3i(int(at[0]), int(at[1]), int(at[2])), last)
 
 
 @wp.func
@@ -187,8 +194,8 @@ def _kernels(channels: int) -> tuple[wp.Kernel, wp.Kernel]:
                     node = starts[level] + ((low[2] + k) * size[1] + low[1] + j) * size[0] + low[0]
                     along_z = _share(k, w)
                     along_y = _share(j, v)
-                    before = float(0.0)
-                    after = float(0.0)
+                    before = wp.float32(0.0)
+                    after = wp.float32(0.0)
                     left = rows[node]
                     right = rows[node + 1]
                     if left >= 0:

@@ -19,7 +19,9 @@ ROOM_M = 0.012
 STEP_M = 0.004  # at which it is looked for
 
 
-def tightened(residual: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor], poses: list[float]) -> tuple[Tensor, Tensor]:
+def tightened(
+    residual: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor], poses: list[float]
+) -> tuple[Tensor, Tensor]:
     """Return the thickness outside and inside at the vertices within faces: at edges the closest point of a normal's
     ray differs."""
     field = FastField(RIG, SETTINGS, 1)
