@@ -32,6 +32,8 @@ COMPOSITING, CANONICAL = "hnerf/fields/compositing.py", "hnerf/fields/grids.py"
 ENCODING, MLP = "hnerf/fields/encoding.py", "hnerf/fields/mlp.py"
 BODIES, PIXELS = "hnerf/body/canonical.py", "hnerf/training/pixels.py"
 GATHER = "hnerf/training/gather.py"
+SPARSE, SHELL = "hnerf/fields/sparse_grids.py", "hnerf/fields/shell.py"
+PULL = "hnerf/body/correction_pull.py"
 BOARDS, BUNDLE = "hnerf/calibration/boards/rig.py", "hnerf/calibration/bundle.py"
 CAMERA, TRIANGULATION = "hnerf/geometry/camera.py", "hnerf/geometry/triangulation.py"
 QUERIES, SILHOUETTE = "hnerf/geometry/mesh_queries.py", "hnerf/geometry/silhouette.py"
@@ -52,6 +54,8 @@ BY_RAY, BY_CANONICAL = "tests/fields/test_fast_ray.py", "tests/fields/test_grids
 BY_FAST, BY_COMPOSITING = "tests/fields/test_fast.py", "tests/fields/test_compositing.py"
 BY_ENCODING, BY_MLP = "tests/fields/test_encoding.py", "tests/fields/test_mlp.py"
 BY_EXPOSURE = "tests/training/test_exposure.py"
+BY_SPARSE, BY_SHELL = "tests/fields/test_sparse_grids.py", "tests/fields/test_shell.py"
+BY_PULL, BY_DESCRIPTOR = "tests/body/test_correction_pull.py", "tests/body/test_descriptor.py"
 BY_CAMERA, BY_TRIANGULATION = "tests/geometry/test_camera.py", "tests/calibration/test_triangulation.py"
 BY_FILES, BY_USD = "tests/capture/test_camera_files.py", "tests/asset/test_usd.py"
 BY_METRICS, BY_POLICY = "tests/evaluation/test_metrics.py", "tests/tasks/test_policy.py"
@@ -144,7 +148,15 @@ FAULTS = (
           BY_CANONICAL),
     Fault("fast-pose-code", CANONICAL, "self.pose_code(pose).index", "0 * self.pose_code(pose).index", BY_CANONICAL),
     Fault("fast-residual-unit", CANONICAL, "self.unit_m * self.geometry(", "self.geometry(", BY_CANONICAL),
-    Fault("fast-frame", FAST, "conditions.pose.index_select(0, row)", "conditions.pose[0 * row]", BY_RAY),
+    Fault("fast-frame", FAST, "self._residual(described, pose, row).view_as(d)",
+          "self._residual(described, pose, 0 * row).view_as(d)", BY_RAY),
+    Fault("sparse-grids-slope", SPARSE, "(2.0 * float(j) - 1.0)", "1.0", BY_SPARSE),
+    Fault("sparse-grids-missing", SPARSE, "                    if left >= 0:\n                        total",
+          "                    if left >= 1:\n                        total", BY_SPARSE),
+    Fault("correction-lever", PULL, "part * wp.cross(points[i], g)", "part * wp.cross(g, points[i])", BY_PULL),
+    Fault("shell-inside", SHELL, "inner + SLACK", "outer + SLACK", BY_SHELL),
+    Fault("beside-distance", BODIES, "found.sign * distance + (normal * moved).sum(-1)", "found.sign * distance",
+          BY_DESCRIPTOR),
     Fault("fast-eikonal-inside", FAST, " * skin.d[pick].detach().sign()[:, None]", "", BY_RAY),
     Fault("fast-difference-step", FAST, "GRADIENT_STEP_M = 0.005", "GRADIENT_STEP_M = 0.03", BY_RAY),
     Fault("fast-eikonal-body", FAST, "y, d = described.y[pick].detach(),", "y, d = described.y[pick],", BY_RAY),
