@@ -28,15 +28,15 @@ def decided(scene: SceneStatistics, **given: object) -> tuple[TrainingSettings, 
 
 def test_sizes_by_hand():
     """Pixels of 2 cm give 96 cells on 1.92 m, in steps of 4 ** (1 / 3) from 24; 64 for geometry, in steps of 2 from 16.
-    Masks reach 3.5 cm out and 0.5 cm in, with a margin of 1.5 cm: 5 cm, and the minimum of 3 cm; 2.4 x 8 cm / 8 mm = 24
+    Masks reach 3.5 cm out and 0.5 cm in, with a margin of 1.5 cm: 5 cm, and the minimum of 3 cm; 2.4 x 8 cm / 6 mm = 32
     samples. Four million pixels at 2500 per step, each drawn one and a half times: 2400 steps."""
     settings, decisions = decided(SCENE)
     fast = settings.field
     assert fast.colour_cells == (24, 38, 60, 96)
     assert fast.geometry_cells == (16, 32, 64)
-    assert (fast.outer_m, fast.inner_m, fast.samples) == (0.05, 0.03, 24)
+    assert (fast.outer_m, fast.inner_m, fast.samples) == (0.05, 0.03, 32)
     assert (fast.pose_width, settings.steps) == (8, 2400)
-    assert decisions["field.samples"].reason == "one each 8.0 mm of a ray through a shell of 80.0 mm"
+    assert decisions["field.samples"].reason == "one each 6.0 mm of a ray through a shell of 80.0 mm"
 
 
 def test_no_finer_than_frames_align():
@@ -48,11 +48,11 @@ def test_no_finer_than_frames_align():
 
 @pytest.mark.parametrize("nearly_static", [{"frames": 1}, {"std_rad": 0.001}])
 def test_one_posture_is_as_fine_as_its_pixels(nearly_static: dict):
-    """Cells shrink to 8 mm: 240 on 1.92 m, 160 for geometry, a sample per 6.4 mm: 2.4 x 8 cm / 6.4 mm = 30."""
+    """Cells shrink to 8 mm: 240 on 1.92 m, 160 for geometry, a sample per 4.8 mm: 2.4 x 8 cm / 4.8 mm = 40."""
     for footprint_m in (0.008, 0.001):
         settings, decisions = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": footprint_m, **nearly_static}))
         assert (settings.field.colour_cells[-1], settings.field.geometry_cells[-1]) == (240, 160)
-        assert settings.field.samples == 30
+        assert settings.field.samples == 40
         assert "there is one posture: cells of 8.0 mm" in decisions["field.colour_cells"].reason
 
 
