@@ -1,11 +1,12 @@
-# make install | test | demo | docs.  pip's own environment variables choose another index, for example for CUDA wheels.
+# make install | test | soak | demo | docs.  pip's own environment variables choose another index, for example for CUDA wheels.
 export DO_NOT_TRACK := 1
 
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
+SUBJECTS ?= 6
 
-.PHONY: install test demo docs
+.PHONY: install test soak demo docs
 
 install: $(INSTALLED)
 
@@ -22,6 +23,10 @@ test: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist worksteal
+
+soak: $(INSTALLED)
+	OMP_NUM_THREADS=1 $(BIN)/pytest -m soak
+	$(BIN)/python tests/soak.py --subjects $(SUBJECTS)
 
 demo: $(INSTALLED)
 	$(BIN)/hnerf demo

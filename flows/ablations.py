@@ -22,6 +22,7 @@ from hnerf.study.benchmark import results
 from hnerf.tables import head, line, pick
 from tasks.capture import ingest
 from tasks.evaluation import evaluate
+from tasks.limits import set_limits
 from tasks.policy import is_retryable
 from tasks.source import Source, read_capture
 from tasks.store import Store
@@ -45,12 +46,18 @@ def ablate(
     """Run the full method and each ablation; return the table, `<store>/ablations/<subject>-<preset>.md`, which has a
     JSON file beside it. Both are rewritten after every row.
 
-    preset: a name under configs/ or a YAML file; overrides: settings like "training.steps=100", in all rows; only:
-    names of ablations, all if empty, with which the table's name ends in "-part". A row whose training or evaluation
-    fails says why and the rest go on; a worker that was killed (LostWorkerError) ends the command, and the same command
-    resumes.
+    A row whose training or evaluation fails says why and the rest go on; a worker that was killed (LostWorkerError)
+    ends the command, and the same command resumes.
+
+    Args:
+        capture: The recording's folder, or one video; relative to the repository.
+        preset: A name under configs/, or a YAML file.
+        store: Where results are kept.
+        overrides: Settings that differ from the preset in all rows, like training.steps=100.
+        only: Names of ablations, all if empty; the table's name then ends in "-part".
     """
     rows, left_out = choose(load_settings(preset, overrides), only)
+    set_limits(rows[FULL].limits)
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
     subject = Capture.load(ingest(artifact_store, source, rows[FULL].capture).root).name

@@ -3,9 +3,10 @@
 import json
 import logging
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from prefect import flow
+from pydantic import Field
 
 from flows.run_page import publish_markdown
 from flows.train_subject import Prepared, prepare_training, with_detections
@@ -19,6 +20,7 @@ from hnerf.study.benchmark.publish import publish
 from tasks.benchmark import score_end_of_training, score_training
 from tasks.calibration import calibrated_capture
 from tasks.capture import ingest, subset_capture
+from tasks.limits import set_limits
 from tasks.policy import is_retryable
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
@@ -32,15 +34,21 @@ def benchmark(
     capture: Path,
     study: str = "dynamic",
     methods: list[str] | None = None,
-    seconds: float | None = None,
+    seconds: Annotated[float, Field(gt=0)] | None = None,
     store: Path = Path("store"),
 ) -> Path:
     """Train and score every method of a study on every variant; return `<store>/benchmark/<subject>-<study>.md`, which
     has CSV, JSON and charts beside it, all rewritten after every training.
 
-    study: a name under configs/benchmark/ or a YAML file; methods: of the study, or presets, instead of all; seconds:
-    limit of every training, instead of the study's. A method that fails says why and the rest go on; a worker that was
-    killed ends the flow, and the same call resumes the training that was interrupted.
+    A method that fails says why and the rest go on; a worker that was killed ends the flow, and the same call resumes
+    the training that was interrupted.
+
+    Args:
+        capture: The recording's folder, or one video; relative to the repository.
+        study: A name under configs/benchmark/, or a YAML file.
+        methods: Of the study, or presets, instead of all.
+        seconds: Limit of every training, instead of the study's.
+        store: Where results are kept.
     """
     plan = load_study(study).restricted_to(methods or [], seconds)
     capture_settings = [plan.settings(name).capture for name in plan.methods]  # invalid presets are refused first
@@ -83,6 +91,7 @@ def measure(
     fails."""
     try:
         settings, more = plan.settings(method), dict[str, Any]()
+        set_limits(settings.limits)
         recording = with_detections(store, ingest(store, source, settings.capture), settings)
         parts = variant.select(Capture.load(recording.root))
         if parts != (None, None, None):

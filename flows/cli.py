@@ -9,9 +9,11 @@ from pathlib import Path
 
 from flows import commands
 from flows.display import display
+from flows.store_commands import add_store_commands
 from hnerf.config import load_settings
 from hnerf.errors import InputError, InvalidAsset
 from tasks.launcher import RankFailedError
+from tasks.limits import StalledError
 
 FAILED, BAD_INPUT = 1, 2
 NO_ROOM = (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # None: our own, of libraries that do not say why
@@ -34,12 +36,12 @@ def main(argv: list[str] | None = None) -> int:
     try:
         with display():
             folders = _existing(options)
-            if options.command is not commands.settings:
+            if options.command.__module__ == commands.__name__ and options.command is not commands.settings:
                 log.info("%s", " ".join([_name(options.command), *map(str, folders)]))
             options.command(options)
     except InputError as error:
         return _fail(error, BAD_INPUT)
-    except (RankFailedError, InvalidAsset) as error:
+    except (RankFailedError, StalledError, InvalidAsset) as error:
         return _fail(error, FAILED)
     except OSError as error:
         from tasks.policy import is_permanent  # imports Prefect
@@ -116,6 +118,16 @@ def _parser() -> argparse.ArgumentParser:
     stability.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these degradations of the study")
 
     _add_render(add(commands.render))
+    export = add(commands.export, preset)
+    export.add_argument("subject", type=Path, help="<store>/subjects/<name>, as `run` left it")
+    export.add_argument(
+        "--motion", type=Path, action="append", default=[], metavar="FILE",
+        help="add this motion: a BVH file, an AMASS .npz, or another subject's folder",
+    )  # fmt: skip
+    _add_out(export, "asset")
+    _add_overrides(export, "override a setting of the section `asset`")
+    what = "Look into the store, and keep it in order."
+    add_store_commands(subparsers.add_parser("store", help=what, description=what))
     synth = add(commands.synth)
     synth.add_argument("out", type=Path, help="the folder to write")
     _add_overrides(synth, "such as train_cameras=32; `hnerf settings` lists them last")
@@ -193,7 +205,9 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     view.add_argument("--path", type=Path, help="a JSON list of cameras, or a folder of them, to fly along")
     render.add_argument("--radius", type=float, metavar="M", help="of the orbit (default: the recorded cameras')")
     render.add_argument("--height", type=float, metavar="M", help="of the orbit over the person's middle")
-    render.add_argument("--motion", type=Path, help="another subject's folder, or an AMASS .npz (default: its own)")
+    render.add_argument(
+        "--motion", type=Path, help="another subject's folder, a BVH file, or an AMASS .npz (default: its own)"
+    )
     render.add_argument("--frames", default=":", metavar="A:B:STEP", help="poses to show, or one number (default: all)")
     render.add_argument("--between", type=int, nargs=2, metavar="FRAME", help="interpolate between two frames' poses")
     render.add_argument("--shape", action="append", default=[], metavar="NAME=+X", help="add to a shape value")

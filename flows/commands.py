@@ -30,7 +30,7 @@ def settings(options: argparse.Namespace) -> None:
 
 
 def models(options: argparse.Namespace) -> None:
-    """Fetch the trained networks that detection and LPIPS use; needed once."""
+    """Fetch the networks that detection and LPIPS use, and three.js for the viewer; needed once."""
     from hnerf.models import fetch_models
 
     print(f"networks: {fetch_models()}")
@@ -70,10 +70,12 @@ def check_cameras(options: argparse.Namespace) -> None:
     from flows.train_subject import with_detections
     from tasks.calibration import calibrate
     from tasks.capture import ingest
+    from tasks.limits import set_limits
     from tasks.source import read_capture
     from tasks.store import Store
 
     settings, store = load_settings(options.preset), Store(options.store.resolve())
+    set_limits(settings.limits)
     source, _ = read_capture(options.capture, options.store)
     recording = with_detections(store, ingest(store, source, settings.capture), settings)
     calibration = calibrate(store, recording, settings.calibration)
@@ -211,6 +213,20 @@ def render(options: argparse.Namespace) -> None:
         pictures=options.pictures,
     )
     print(f"{render_subject(options.subject, wanted, options.out)} pictures: {options.out}")
+
+
+def export(options: argparse.Namespace) -> None:
+    """Write the asset of a trained person again, with other settings or further motions."""
+    from hnerf.asset.subject import export_subject
+    from tasks.store import recording_digest, require_intact
+
+    for folder in (options.subject, *(motion for motion in options.motion if motion.is_dir())):
+        require_intact(folder)
+    settings = load_settings(options.preset, options.overrides).asset
+    digest = recording_digest(options.subject)
+    report = export_subject(options.subject, settings, options.motion, options.out, digest)
+    motions = ", ".join(f"{name} ({m['poses']} poses)" for name, m in report["motions"].items())
+    print(f"motions: {motions}\nasset: {options.out / 'avatar.usda'}")
 
 
 def _shape_change(text: str) -> tuple[str, float]:

@@ -3,58 +3,76 @@
 import hashlib
 import logging
 import os
+import shutil
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+from typing import Annotated
 
-from prefect import flow, get_client
-from prefect.client.schemas.filters import (
-    DeploymentFilter,
-    DeploymentFilterName,
-    FlowFilter,
-    FlowFilterName,
-    FlowRunFilter,
-    FlowRunFilterState,
-    FlowRunFilterStateType,
-)
-from prefect.client.schemas.objects import StateType
+from prefect import flow
+from prefect.context import FlowRunContext
 from prefect.deployments import run_deployment
+from prefect.events import emit_event
+from pydantic import Field
 
+from flows.restart import DEPLOYMENT, restart_crashed, unfinished_runs
 from hnerf.errors import InputError
+from tasks import quarantine
 from tasks.ledger import Ledger
-from tasks.source import capture_files, read_capture
+from tasks.source import entries, read_capture
 
-FLOW, NAME = "train-subject", "local"
-DEPLOYMENT = f"{FLOW}/{NAME}"
-UNFINISHED = (StateType.SCHEDULED, StateType.PENDING, StateType.RUNNING, StateType.PAUSED, StateType.CANCELLING)
+DISK_EVENT = "hnerf.disk.nearly-full"  # flows/automations.py tells the operator
 
 log = logging.getLogger("hnerf.ingest_captures")
 
 
 @flow(name="ingest-captures")
 def ingest_captures(
-    folder: Path, preset: str = "fast", store: Path = Path("store"), settle_s: float = 60.0, max_unfinished: int = 20
+    folder: Path,
+    preset: str = "fast",
+    store: Path = Path("store"),
+    settle_s: Annotated[float, Field(ge=0, le=86400)] = 60.0,
+    max_unfinished: Annotated[int, Field(ge=1, le=1000)] = 20,
+    max_restarts: Annotated[int, Field(ge=0, le=20)] = 3,
+    min_free_gib: Annotated[float, Field(ge=0)] = 10.0,
 ) -> list[str]:
-    """Start `train-subject` once for every capture in the subfolders of `folder`; return those started now.
+    """Start `train-subject` once for every capture in the subfolders of a folder; return those started now.
 
-    `folder` is made if it does not exist. A capture is known by its content: moved, renamed or copied, it is not
-    trained again, unless its run found the folder missing. One that was touched less than `settle_s` seconds ago is
-    still being written and waits for the next call, and so does one that cannot be read, which is logged. Nothing more
-    is started while `max_unfinished` runs have not ended: workers ask for all that wait again and again.
+    The folder is made if it does not exist. A capture is known by its content: moved, renamed or copied, it is not
+    trained again, unless its run found the folder missing. One that cannot be read is noted in
+    `<folder>/.refused/<name>.txt`. Runs that crashed are put back into the queue.
+
+    Args:
+        folder: The folder to watch. Each subfolder is a capture.
+        preset: Settings of the runs: a name under configs/, or a YAML file.
+        store: Where results are kept.
+        settle_s: Seconds since the last change in a folder, before which it counts as still being written.
+        max_unfinished: Nothing more is started while this many runs have not ended.
+        max_restarts: How often a run is begun again whose process or machine was lost.
+        min_free_gib: Nothing more is started while the store's disk has less free space than this, in GiB.
     """
     ledger = Ledger.of(store)
     folder.mkdir(parents=True, exist_ok=True)
+    quarantine.clear_removed(folder)
+    if not _has_room(store, min_free_gib):
+        return []
+    restart_crashed(max_restarts)
     started: list[str] = []
     room = max_unfinished
     for capture in _captures(folder.resolve()):
         try:
-            files = capture_files(capture)
-            listing = _listing_digest(files)
-            if not files or _age_s(files) < settle_s or ledger.seen(listing):
+            listing, touched_s = _listing(capture)
+            if not touched_s or time.time() - touched_s < settle_s or ledger.seen(listing):
                 continue
             digest = read_capture(capture)[0].digest
-        except (InputError, OSError) as error:  # OSError: a file was removed meanwhile
+        except FileNotFoundError as error:  # removed meanwhile
             log.error("%s", error)
+            continue
+        except (InputError, OSError) as error:
+            log.error("%s", error)
+            with suppress(OSError):  # a folder that may only be read
+                quarantine.note(capture, f"refused: {error}")
             continue
         if not ledger.knows(digest):
             room = room if started else max_unfinished - unfinished_runs()
@@ -66,20 +84,24 @@ def ingest_captures(
             run = run_deployment(DEPLOYMENT, parameters=parameters, timeout=0, as_subflow=False, idempotency_key=key)
             ledger.note_started(digest, capture, run.id)  # type: ignore[union-attr]
             log.info("started %s for %s", DEPLOYMENT, capture)
+            with suppress(OSError):
+                quarantine.clear(capture)
             started.append(capture.name)
         ledger.note_seen(listing, digest)
     return started
 
 
-def unfinished_runs() -> int:
-    """Return how many runs of the deployment have not ended."""
-    with get_client(sync_client=True) as client:
-        found = client.read_flow_runs(
-            flow_filter=FlowFilter(name=FlowFilterName(any_=[FLOW])),
-            deployment_filter=DeploymentFilter(name=DeploymentFilterName(any_=[NAME])),
-            flow_run_filter=FlowRunFilter(state=FlowRunFilterState(type=FlowRunFilterStateType(any_=list(UNFINISHED)))),
-        )
-    return len(found)
+def _has_room(store: Path, min_free_gib: float) -> bool:
+    """Return whether the store's disk has enough free space; say so, also to the server, if not."""
+    free_gib = shutil.disk_usage(store).free / 2**30
+    if free_gib >= min_free_gib:
+        return True
+    log.warning("%s: %.1f GiB are free, less than %g: nothing is started; see `hnerf store gc`", store.resolve(),
+                free_gib, min_free_gib)  # fmt: skip
+    if FlowRunContext.get():
+        resource = {"prefect.resource.id": f"hnerf.store.{store.resolve()}", "prefect.resource.name": str(store)}
+        emit_event(DISK_EVENT, resource=resource, payload={"free_gib": round(free_gib, 1)})
+    return False
 
 
 def _captures(folder: Path) -> Iterator[Path]:
@@ -93,17 +115,13 @@ def _captures(folder: Path) -> Iterator[Path]:
         yield path
 
 
-def _age_s(files: list[Path]) -> float:
-    """Return the seconds since a file was last written, moved or made; modification times alone may be those of the
-    original."""
-    return time.time() - max(path.lstat().st_ctime for path in files)
-
-
-def _listing_digest(files: list[Path]) -> str:
-    """Return a digest of names, sizes and times, which tells whether a folder was seen before without reading its
-    files."""
-    listing = hashlib.sha256()
-    for path in files:
-        stat = path.lstat()
-        listing.update(os.fsencode(f"{path} {stat.st_size} {stat.st_mtime_ns}\n"))
-    return f"seen-{listing.hexdigest()}"
+def _listing(capture: Path) -> tuple[str, float]:
+    """Return a digest of the names, sizes and times of a folder's files, which tells whether it was seen before without
+    reading them, and when one was last written, moved or made (0 if there is none): modification times alone may be
+    those of the original."""
+    listing, touched_s = hashlib.sha256(), 0.0
+    for entry in sorted(entries(capture), key=lambda entry: entry.path):
+        stat = entry.stat(follow_symlinks=False)
+        listing.update(os.fsencode(f"{entry.path} {stat.st_size} {stat.st_mtime_ns}\n"))
+        touched_s = max(touched_s, stat.st_ctime)
+    return f"seen-{listing.hexdigest()}", touched_s

@@ -1,10 +1,96 @@
-"""Text on the page of a flow run."""
+"""The page of a flow run: texts, pictures, links, and how far long work has come."""
 
-from prefect.artifacts import create_markdown_artifact
+import base64
+import io
+import logging
+import re
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import cast
+from uuid import UUID
+
+from PIL import Image
+from prefect.artifacts import (
+    create_link_artifact,
+    create_markdown_artifact,
+    create_progress_artifact,
+    update_progress_artifact,
+)
 from prefect.context import FlowRunContext
+
+from hnerf.progress import Progress, listening
+
+UPDATE_S = 10.0  # between two updates of one work's progress
+PICTURE_PX = 640  # longest side on the page; the server keeps its bytes in the database
+
+log = logging.getLogger("hnerf.run_page")
 
 
 def publish_markdown(markdown: str, key: str, description: str) -> None:
     """Publish a text, with its pictures embedded, on the page of the flow run; do nothing outside a run."""
     if FlowRunContext.get():
         create_markdown_artifact(markdown, key=key, description=description)
+
+
+def publish_link(path: Path, key: str, description: str) -> None:
+    """Publish a link to a file of this machine; do nothing outside a run."""
+    if FlowRunContext.get():
+        create_link_artifact(path.as_uri(), link_text=str(path), key=key, description=description)
+
+
+def embedded(pictures: Sequence[tuple[str, Path]]) -> str:
+    """Return Markdown that shows captioned image files, shrunk."""
+    return "\n\n".join(f"{caption}\n\n![{caption}]({_uri(path)})" for caption, path in pictures)
+
+
+@contextmanager
+def shown_progress() -> Iterator[None]:
+    """Show on the page of the flow run how far each work has come that is reported inside and takes a while."""
+    if not FlowRunContext.get():
+        yield
+        return
+    with listening(_ProgressPage().show):
+        yield
+
+
+class _ProgressPage:
+    """One progress artifact for each kind of work, updated every UPDATE_S seconds."""
+
+    def __init__(self) -> None:
+        self.artifacts: dict[str, UUID] = {}
+        self.next_s: dict[str, float] = {}
+
+    def show(self, progress: Progress) -> None:
+        """Show a report; one that cannot be shown ends no work."""
+        key, now = slug(progress.what), time.monotonic()
+        ended = progress.done >= progress.total
+        due = now >= self.next_s.setdefault(key, now + UPDATE_S)
+        if not (due or (ended and key in self.artifacts)):
+            return
+        self.next_s[key] = now + UPDATE_S
+        percent = 100.0 * min(1.0, progress.done / progress.total) if progress.total else 100.0
+        try:
+            if key in self.artifacts:
+                update_progress_artifact(self.artifacts[key], percent)
+            else:
+                self.artifacts[key] = cast(UUID, create_progress_artifact(percent, key=key, description=progress.what))
+        except Exception as error:  # the server is away
+            log.debug("progress is not shown: %s", error)
+        if ended:
+            self.artifacts.pop(key, None)
+
+
+def slug(text: str) -> str:
+    """Return a text as the key of an artifact: lower-case letters, digits and dashes."""
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") or "work"
+
+
+def _uri(path: Path) -> str:
+    with Image.open(path) as picture:
+        small = picture.convert("RGB")
+        small.thumbnail((PICTURE_PX, PICTURE_PX))
+    jpeg = io.BytesIO()
+    small.save(jpeg, "JPEG", quality=85)
+    return f"data:image/jpeg;base64,{base64.b64encode(jpeg.getvalue()).decode()}"

@@ -26,6 +26,7 @@ from hnerf.study.stability.verdict import BROKEN, RunVerdict, judge, near_border
 from tasks.capture import ingest, subset_capture
 from tasks.evaluation import evaluate
 from tasks.fit import fit
+from tasks.limits import set_limits
 from tasks.policy import is_retryable
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
@@ -57,9 +58,15 @@ def stability(
     `<store>/stability/<subject>-<study>.md`, which has JSON beside it, both rewritten after every run, and charts,
     drawn when the flow ends, even by an error.
 
-    study: a name under configs/stability/ or a YAML file; methods: presets in place of the study's; only: names of
-    degradations, with which the table's name ends in "-part". A failure is a result and the rest go on; a worker that
-    was killed (LostWorkerError) ends the command, and the same command resumes.
+    A failure is a result and the rest go on; a worker that was killed (LostWorkerError) ends the command, and the same
+    command resumes.
+
+    Args:
+        capture: The recording's folder, or one video; relative to the repository.
+        study: A name under configs/stability/, or a YAML file.
+        store: Where results are kept.
+        methods: Presets in place of the study's.
+        only: Names of degradations; the table's name then ends in "-part".
     """
     plan = load_stability(study).restricted_to(only)
     plan = plan.model_copy(update={"methods": tuple(methods)}) if methods else plan
@@ -119,6 +126,7 @@ def _runs_of_seed(
 ) -> Iterator[Figures]:
     """Yield the reference run and, unless it is broken, a run for each kind and strength."""
     settings = preset.model_copy(update={"training": preset.training.model_copy(update={"seed": seed})})
+    set_limits(settings.limits)
     log.info("%s, seed %d, as recorded", method, seed)
     good = attempt(store, recording, truth, settings, None)
     row = {"method": method, "seed": seed}

@@ -1,14 +1,18 @@
 """Main flow: from a capture folder to an avatar."""
 
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 from prefect import flow
+from prefect.client.schemas.objects import FlowRun, State
 
-from flows.run_page import publish_markdown
+from flows.run_page import embedded, publish_link, publish_markdown, shown_progress
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import recorded_cameras
 from hnerf.config import Settings, load_settings
+from hnerf.errors import InputError, InvalidAsset, one_line, printable
 from hnerf.evaluation.holdout import held_out_cameras
 from tasks.asset import export
 from tasks.calibration import calibrate, calibrated_capture
@@ -17,11 +21,16 @@ from tasks.detection import detect, needs_detection
 from tasks.evaluation import evaluate, evaluate_held_out
 from tasks.fit import fit
 from tasks.hands import find_hands, needs_hands
-from tasks.ledger import forget
+from tasks.launcher import RankFailedError
+from tasks.ledger import forget, was_started
+from tasks.limits import StalledError, set_limits
+from tasks.quarantine import clear, note
 from tasks.segmentation import converged, needs_body, segment
 from tasks.source import read_capture
 from tasks.store import Artifact, Store
 from tasks.training import train
+
+NOTED = (InputError, InvalidAsset, RankFailedError, StalledError)  # whose message says all
 
 
 class Prepared(NamedTuple):
@@ -48,11 +57,23 @@ def train_subject(
 ) -> Trained:
     """Train one person and export the avatar; return where the results are.
 
-    capture: the recording's folder; preset: a name under configs/ or a YAML file; store: where artifacts are kept;
-    overrides: settings like "training.steps=100". If `evaluation.holdout` names a camera, a second field is trained
-    without it; with "each", one without each camera in turn.
+    If `evaluation.holdout` names a camera, a second field is trained without it; with "each", one without each camera
+    in turn.
+
+    Args:
+        capture: The recording's folder, or one video; relative to the repository.
+        preset: A name under configs/ (fast, demo, paper, ...), or a YAML file.
+        store: Where results are kept.
+        overrides: Settings that differ from the preset, like training.steps=2000; `hnerf settings` lists all.
     """
-    settings = load_settings(preset, overrides or ())
+    with shown_progress():
+        return train_avatar(capture, preset, store, overrides or ())
+
+
+def train_avatar(capture: Path, preset: str, store: Path, overrides: Sequence[str]) -> Trained:
+    """Run all stages on a capture, and show what came out on the page of the run."""
+    settings = load_settings(preset, overrides)
+    set_limits(settings.limits)
     artifact_store = Store(store.resolve())
     if not capture.exists():
         forget(artifact_store.root, capture)
@@ -89,8 +110,30 @@ def train_subject(
     trained = Trained(
         artifact_store.subject_folder(subject), evaluation.root / "report.html", asset.root / "avatar.usdz"
     )
-    publish_markdown(_figures(subject, evaluation, trained), "result", f"Result for {subject}")
+    pictures = embedded(_key_pictures(calibration, evaluation))
+    page = f"{_figures(subject, evaluation, training, trained)}\n\n{pictures}\n"
+    publish_markdown(page, "result", f"Result for {subject}")
+    publish_link(trained.report, "report", f"Report on {subject}")
     return trained
+
+
+@train_subject.on_failure
+def note_failure(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
+    """Say why in the folder that is watched, if the capture was started from there."""
+    capture, store = Path(flow_run.parameters["capture"]), Path(flow_run.parameters.get("store", "store"))
+    error = state.result(raise_on_failure=False)
+    if isinstance(error, Exception) and was_started(store, capture):
+        kind = "refused" if isinstance(error, InputError) else "failed"
+        why = str(error) if isinstance(error, NOTED) else f"{type(error).__name__}: {one_line(error)}"
+        with suppress(OSError):  # a folder that may only be read, or is gone
+            note(capture, printable(f"{kind}: {why} (flow run {flow_run.name}, {flow_run.id})"))
+
+
+@train_subject.on_completion
+def clear_note(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
+    """Take back what an earlier run noted."""
+    with suppress(OSError):
+        clear(Path(flow_run.parameters["capture"]))
 
 
 def with_detections(store: Store, recorded: Artifact, settings: Settings) -> Artifact:
@@ -147,9 +190,19 @@ def segment_subject(store: Store, recording: Artifact, calibration: Artifact, se
     return segmentation
 
 
-def _figures(subject: str, evaluation: Artifact, trained: Trained) -> str:
-    """Format the scores and the paths of report and asset."""
+def _key_pictures(calibration: Artifact, evaluation: Artifact) -> list[tuple[str, Path]]:
+    """Return the first rendering of each split, and the cameras, with captions."""
+    renders = evaluation.root / "renders"
+    firsts = [(split.name, min(split.glob("*/*.png"), default=None)) for split in sorted(renders.glob("*"))]
+    shown = [(name.replace("_", " "), path) for name, path in firsts if path]
+    cameras = calibration.root / "cameras.png"
+    return shown + ([("cameras", cameras)] if cameras.is_file() else [])
+
+
+def _figures(subject: str, evaluation: Artifact, training: Artifact, trained: Trained) -> str:
+    """Format the scores, the cost, and the paths of report and asset."""
     lines = [f"# {subject}", "", "| figure | value |", "|---|---|"]
     lines += [f"| {name} | {value:.4g} |" for name, value in evaluation.metrics.items()]
+    lines += [f"| training {name} | {value:.4g} |" for name, value in training.metrics.items()]
     lines += ["", f"Report: `{trained.report}`", f"Asset: `{trained.asset}`"]
     return "\n".join(lines)

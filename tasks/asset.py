@@ -4,16 +4,18 @@ from pathlib import Path
 
 from hnerf.asset.export import export_asset
 from hnerf.config import AssetSettings
+from hnerf.models import THREE_SHA256
 from tasks.calibration import calibrated_capture
 from tasks.stage import stage
 from tasks.store import Artifact
 from tasks.training import load_trained_avatar
 
 
-@stage("asset", version="3")
+@stage("asset", version="6", networks=tuple(THREE_SHA256))
 def export(
     out: Path, recording: Artifact, calibration: Artifact, training: Artifact, settings: AssetSettings
 ) -> dict[str, float]:
     """Export the trained person to USD and glTF files."""
-    export_asset(calibrated_capture(recording, calibration), load_trained_avatar(training), settings, out)
+    capture = calibrated_capture(recording, calibration)
+    export_asset(capture, load_trained_avatar(training), settings, out, recording.digest)
     return {}

@@ -6,6 +6,7 @@
 <store>/ingested/id               random: the same key in another ledger is another run
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from uuid import uuid4
@@ -58,9 +59,19 @@ class Ledger:
 def forget(store: Path, capture: Path) -> None:
     """Free the capture that was started from a folder which is no longer there, so that the next look starts it from
     wherever it lies now."""
-    ledger, missing = store / "ingested", str(capture.absolute())
-    for record in ledger.glob("[0-9a-f]" * 64):
+    missing = str(capture.absolute())
+    for record in list(_records(store)):
         folder, _, run = record.read_text().partition("\n")
         if folder == missing:
             replace_text(record.with_name(f"{record.name}{LOST}"), run.strip())
             record.unlink()
+
+
+def was_started(store: Path, capture: Path) -> bool:
+    """Return whether this folder's run was started from the watched folder."""
+    folder = str(capture.absolute())
+    return any(record.read_text().partition("\n")[0] == folder for record in _records(store))
+
+
+def _records(store: Path) -> Iterator[Path]:
+    return (store / "ingested").glob("[0-9a-f]" * 64)

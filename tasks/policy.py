@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from prefect.tasks import Task
 
 from hnerf.config import Section
 from tasks.launcher import LostWorkerError
+from tasks.limits import StalledError
 from tasks.source import Source
 from tasks.store import Artifact, Store, sha256_of
 
@@ -29,6 +31,12 @@ def stage_key(task: str, version: str, inputs: dict[str, Input]) -> str:
     described = {name: _key_value(value) for name, value in inputs.items()}
     text = json.dumps({"task": task, "version": version, "inputs": described}, sort_keys=True, default=_file_digest)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def artifacts_among(inputs: Iterable[Input]) -> list[Artifact]:
+    """Return the artifacts among a stage's inputs."""
+    flat = [one for value in inputs for one in (value if isinstance(value, tuple) else (value,))]
+    return [one for one in flat if isinstance(one, Artifact)]
 
 
 def _key_value(value: Input | str | int) -> Any:
@@ -81,7 +89,10 @@ def is_transient(task: Task[..., Any], run: TaskRun, state: State[Any]) -> bool:
 
 
 def is_retryable(error: object) -> bool:
-    """Return whether a retry may succeed: after failed input or output, timeouts and lost workers only."""
+    """Return whether a retry may succeed: after failed input or output, timeouts and lost workers only, and where a
+    stage that stood still would go on from a checkpoint."""
+    if isinstance(error, StalledError):
+        return error.retryable
     return isinstance(error, OSError | LostWorkerError) and not is_permanent(error)
 
 

@@ -4,13 +4,14 @@ import logging
 
 from hnerf.errors import InputError
 from tasks.launcher import RankFailedError
+from tasks.limits import StalledError
 
 LOGGERS = ("prefect.task_runs", "prefect.flow_runs", "prefect.engine", "prefect.flow_engine")
 
 
 def without_traceback(record: logging.LogRecord) -> bool:
     """Take the traceback from a record of an error whose message says all (a filter of logging); keep every record."""
-    if record.exc_info and isinstance(record.exc_info[1], InputError | RankFailedError):
+    if record.exc_info and isinstance(record.exc_info[1], InputError | RankFailedError | StalledError):
         record.exc_info = record.exc_text = None
     return True
 

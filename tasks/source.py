@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NoReturn
 
@@ -52,13 +52,20 @@ def capture_files(folder: Path) -> list[Path]:
     is its own file. Raises InputError if a folder cannot be read."""
     if folder.is_file():
         return [folder]
-    found = []
-    for parent, folders, files in os.walk(folder, onerror=_refuse):
-        links = [name for name in folders if (Path(parent) / name).is_symlink()]
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        paths = [Path(parent) / name for name in files + links if not name.startswith(".")]
-        found += [path for path in paths if path.is_symlink() or path.is_file()]
-    return sorted(found)
+    return sorted(Path(entry.path) for entry in entries(folder))
+
+
+def entries(folder: Path | str) -> Iterator["os.DirEntry[str]"]:
+    """Yield the entries of these files, in no order, which know whether they are links without asking again."""
+    try:
+        with os.scandir(folder) as found:
+            visible = [entry for entry in found if not entry.name.startswith(".")]
+            folders = [entry.path for entry in visible if entry.is_dir(follow_symlinks=False)]
+    except OSError as error:
+        _refuse(error)
+    yield from (entry for entry in visible if entry.is_symlink() or entry.is_file(follow_symlinks=False))
+    for path in folders:
+        yield from entries(path)
 
 
 def _digest(folder: Path, files: Iterable[Path]) -> str:

@@ -1,8 +1,9 @@
 """The cached task that every stage is."""
 
 import inspect
+import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Concatenate, Generic, ParamSpec
 
@@ -11,7 +12,8 @@ from prefect.context import FlowRunContext
 from prefect.tasks import exponential_backoff
 
 from hnerf.models import has_model
-from tasks.policy import Input, StorePolicy, is_transient, stage_key
+from tasks.limits import limited
+from tasks.policy import Input, StorePolicy, artifacts_among, is_transient, stage_key
 from tasks.quiet import quieten
 from tasks.store import Artifact, Store
 
@@ -19,6 +21,7 @@ log = logging.getLogger("hnerf.stage")
 quieten()
 
 P = ParamSpec("P")
+CAPTURE = "capture.json"  # of a recording, hnerf/capture/capture.py
 NETWORKS = "networks"  # beside a stage's own inputs, in its key
 Write = Callable[Concatenate[Path, P], dict[str, float]]
 
@@ -62,7 +65,26 @@ class Stage(Generic[P]):
         log.info("%s", self.name)
         key = stage_key(self.name, self.version, inputs)
         given = {name: value for name, value in inputs.items() if name != NETWORKS}
-        return store.get_or_compute(self.name, key, lambda out: self.write(out, **given), self.resumable)  # type: ignore[call-arg, arg-type]
+        return store.get_or_compute(
+            self.name,
+            key,
+            lambda out: self._write_in_time(out, given),
+            self.resumable,
+            [one.name for one in artifacts_among(given.values())],
+        )
+
+    def _write_in_time(self, out: Path, inputs: dict[str, Input]) -> dict[str, float]:
+        with limited(self.name, image_count(inputs.values()), self.resumable):
+            return self.write(out, **inputs)  # type: ignore[call-arg, arg-type]
+
+
+def image_count(inputs: Iterable[Input]) -> int:
+    """Return how many images, frames times cameras, the largest recording among a stage's inputs has; 1 if there is
+    none."""
+    roots = [one.root for one in artifacts_among(inputs) if (one.root / CAPTURE).is_file()]
+    recordings = [json.loads((root / CAPTURE).read_bytes()) for root in roots]
+    counts = [len(one["cameras"]) * len(one["train_frames"] + one["novel_pose_frames"]) for one in recordings]
+    return max(counts, default=1)
 
 
 def stage(

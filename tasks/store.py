@@ -6,6 +6,9 @@
     <store>/<stage>/<key>.lock      locked (flock) while a process works on the key; the kernel releases it if that dies
     <store>/subjects/<name>/<stage> -> the latest artifact of a subject
     <store>/subjects/<name>/.recording  the digest and the folder of the recording that these are of
+    <store>/.running/                which artifacts each running process uses (tasks/pins.py)
+
+The record's time of change is that of its last use (tasks/garbage.py).
 
 The store alone decides what can be reused; Prefect's record of a task run is a view of it (tasks/policy.py).
 """
@@ -17,7 +20,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +29,7 @@ from pydantic import BaseModel
 
 from hnerf.errors import InputError
 from hnerf.files import replace_text
+from tasks.pins import READ_ONLY, pin
 
 log = logging.getLogger("hnerf.store")
 
@@ -42,12 +46,19 @@ class StoredFile(BaseModel):
 
 
 class Artifact(BaseModel):
-    """The finished output of one stage. files: by path relative to `root`; metrics: a few headline numbers."""
+    """The finished output of one stage. files: by path relative to `root`; metrics: a few headline numbers; inputs:
+    `<stage>/<key>` of the artifacts that it was computed from, unknown in records of earlier versions."""
 
     stage: str
     root: Path
     files: dict[str, StoredFile]
     metrics: dict[str, float] = {}
+    inputs: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Return `<stage>/<key>`."""
+        return f"{self.stage}/{self.root.name}"
 
     @property
     def digest(self) -> str:
@@ -71,40 +82,55 @@ class Store:
     root: Path
 
     def find(self, stage: str, key: str) -> Artifact | None:
-        """Return the artifact if it is recorded and intact, else None."""
-        record, folder = self._path(stage, key, ".json"), self._path(stage, key)
+        """Return the artifact if it is recorded and intact, else None. From here on this process uses it."""
+        record = self.path(stage, key, ".json")
         if not record.is_file():  # nor a pipe or a device, from which reading never ends
             return None
+        pin(self.root, f"{stage}/{key}")
         try:
-            artifact = Artifact.model_validate({"root": folder, **json.loads(record.read_bytes())})
-            damaged = artifact.damaged_file()
+            _note_use(record)
+            artifact = self.recorded(stage, key)
         except FileNotFoundError:
             return None
-        except (RecursionError, TypeError, ValueError):  # TypeError: JSON, but no object
-            damaged = record
+        damaged = artifact.damaged_file() if artifact else record
         if damaged is None:
             return artifact
         log.warning("%s is damaged or missing: %s will be computed again", damaged, stage)
         return None
 
+    def recorded(self, stage: str, key: str) -> Artifact | None:
+        """Return the artifact as its record describes it, whose files were not looked at; None if the record cannot be
+        read as one. Raises FileNotFoundError if there is none."""
+        try:
+            described = json.loads(self.path(stage, key, ".json").read_bytes())
+            artifact = Artifact.model_validate({"root": self.path(stage, key), **described})
+        except (RecursionError, TypeError, ValueError):  # TypeError: JSON, but no object
+            return None
+        return artifact if artifact.stage == stage else None
+
     def get_or_compute(
-        self, stage: str, key: str, write: Callable[[Path], dict[str, float]], resumable: bool = False
+        self,
+        stage: str,
+        key: str,
+        write: Callable[[Path], dict[str, float]],
+        resumable: bool = False,
+        inputs: Iterable[str] = (),
     ) -> Artifact:
         """Return the stored artifact, or compute it by `write(folder)`, which returns its metrics.
 
         If several callers want the same artifact, one computes it and the others wait. The folder of a resumable stage
-        survives a crash, and the next call resumes in it; any other starts empty. Nothing is written, and links that
-        lie in the way are not followed, where the artifact is there; a store may be read-only.
+        survives a crash, and the next call resumes in it; any other starts empty. Links that lie in the way are not
+        followed. A store that has the artifact may be read-only. inputs: names of the artifacts that `write` reads.
         """
         if found := self.find(stage, key):
             return found
-        partial = self._path(stage, key, ".partial")
-        with self._locked(stage, key):
+        partial = self.path(stage, key, ".partial")
+        with self.locked(stage, key):
             found = self.find(stage, key)
             if found:
                 return found
             if not resumable or partial.is_symlink():
-                _remove(partial)
+                remove(partial)
             for path in partial.rglob("*"):
                 if path.is_symlink():
                     path.unlink()
@@ -115,7 +141,9 @@ class Store:
                 if not resumable or isinstance(error, InputError):
                     shutil.rmtree(partial)
                 raise
-            return self._commit(stage, key, metrics)
+            pin(self.root, f"{stage}/{key}")
+            return self.commit(Artifact(stage=stage, root=self.path(stage, key), files={}, metrics=metrics,
+                                        inputs=tuple(sorted(set(inputs)))))  # fmt: skip
 
     def link_latest(self, subject: str, artifact: Artifact) -> Artifact:
         """Point `<store>/subjects/<subject>/<stage>` at the artifact; return it."""
@@ -153,23 +181,33 @@ class Store:
         """Return the folder with links to a subject's latest artifacts."""
         return self.root / "subjects" / subject
 
-    def _path(self, stage: str, key: str, suffix: str = "") -> Path:
+    def path(self, stage: str, key: str, suffix: str = "") -> Path:
+        """Return where an artifact lies, or what belongs to it (.json, .partial, .lock)."""
         return self.root / stage / f"{key}{suffix}"
 
     @contextmanager
-    def _locked(self, stage: str, key: str) -> Iterator[None]:
-        path = self._path(stage, key, ".lock")
+    def locked(self, stage: str, key: str, wait: bool = True) -> Iterator[None]:
+        """Hold the lock of a key; raise BlockingIOError instead of waiting for it unless `wait`."""
+        path = self.path(stage, key, ".lock")
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open(path, "w", opener=_without_following) as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                log.info("waiting for another process that is working on %s %s", stage, key)
-                fcntl.flock(lock, fcntl.LOCK_EX)
-            yield
+        while True:
+            with open(path, "w", opener=_without_following) as lock:
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    if not wait:
+                        raise
+                    log.info("waiting for another process that is working on %s %s", stage, key)
+                    fcntl.flock(lock, fcntl.LOCK_EX)
+                if not _is_at(path, lock.fileno()):
+                    continue  # whoever held it has removed it
+                yield
+                return
 
-    def _commit(self, stage: str, key: str, metrics: dict[str, float]) -> Artifact:
-        partial, folder, record = (self._path(stage, key, suffix) for suffix in (".partial", "", ".json"))
+    def commit(self, artifact: Artifact) -> Artifact:
+        """Record the files in the artifact's `.partial` folder, and put them in place; its lock must be held."""
+        stage, key = artifact.stage, artifact.root.name
+        partial, folder, record = (self.path(stage, key, suffix) for suffix in (".partial", "", ".json"))
         paths = sorted(partial.rglob("*"))
         sizes_bytes = {path: _flush(path) for path in [partial, *paths]}
         files = {
@@ -178,11 +216,11 @@ class Store:
             if path.is_file()
         }
         record.unlink(missing_ok=True)
-        _remove(folder)
+        remove(folder)
         os.replace(partial, folder)
         _flush(folder.parent)
-        artifact = Artifact(stage=stage, root=folder, files=files, metrics=metrics)
-        beside = self._path(stage, key, ".json.partial")
+        artifact = artifact.model_copy(update={"files": files})
+        beside = self.path(stage, key, ".json.partial")
         beside.unlink(missing_ok=True)
         with beside.open("x") as file:
             file.write(artifact.model_dump_json(indent=1, exclude={"root"}))
@@ -201,18 +239,45 @@ def require_intact(subject: Path) -> None:
             raise InputError(f"{root}: damaged; repeat the same `hnerf run`, which computes it again")
 
 
+def recording_digest(subject: Path) -> str:
+    """Return the digest of the recording that `<store>/subjects/<name>` was trained on; "" where no record says."""
+    for stage in ("hands", "detection", "capture"):  # the last of them that ran
+        root = (subject / stage).resolve()
+        if root.is_dir():
+            found = Store(root.parents[1]).find(stage, root.name)
+            return found.digest if found else ""
+    return ""
+
+
 def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file's bytes, hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _remove(folder: Path) -> None:
+def remove(folder: Path) -> None:
     """Remove a folder with all that is in it, or a link in its place, not what that points to."""
     if folder.is_symlink():
         folder.unlink()
     else:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _note_use(record: Path) -> None:
+    """Set a record's time of change to now, unless the store may only be read."""
+    try:
+        os.utime(record, follow_symlinks=False)
+    except OSError as error:
+        if error.errno not in READ_ONLY:
+            raise
+
+
+def _is_at(path: Path, descriptor: int) -> bool:
+    """Return whether an open file is the one that lies at a path now."""
+    try:
+        return os.path.samestat(os.stat(path, follow_symlinks=False), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
 
 
 def _without_following(name: str, flags: int) -> int:

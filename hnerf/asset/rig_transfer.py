@@ -15,11 +15,14 @@ REACH_M = 10.0  # no part of a person is further from the body than this
 
 
 def clothed_rig(rig: Rig, surface: trimesh.Trimesh) -> Rig:
-    """Return the same joints with another surface in the rest pose. The shape is fixed (no basis), and there are no
-    keypoints."""
+    """Return the same joints with another surface in the rest pose, whose weights are transferred."""
     vertices_m = torch.from_numpy(surface.vertices).float()
     faces = torch.from_numpy(surface.faces).long()
-    skin_joints, skin_weights = transfer_skin_weights(rig, vertices_m, faces)
+    return with_surface(rig, vertices_m, faces, *transfer_skin_weights(rig, vertices_m, faces))
+
+
+def with_surface(rig: Rig, vertices_m: Tensor, faces: Tensor, skin_joints: Tensor, skin_weights: Tensor) -> Rig:
+    """Return the same joints with another surface. The shape is fixed (no basis), and there are no keypoints."""
     return dataclasses.replace(
         rig,
         vertices_m=vertices_m,
@@ -48,6 +51,11 @@ def transfer_skin_weights(rig: Rig, vertices_m: Tensor, faces: Tensor) -> tuple[
     for _ in range(SMOOTHING_PASSES):
         average = torch.zeros_like(weights).index_add_(0, start, weights[end]) / neighbours
         weights = (weights + average) / 2
+    return strongest(weights)
+
+
+def strongest(weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the joints (V, 8) with the largest of the weights (V, J), largest first, and these, summing to 1."""
     top, joints = weights.topk(min(MAX_INFLUENCES, weights.shape[1]), dim=1)
     return torch.where(top > 0, joints, 0), top / top.sum(1, keepdim=True)
 

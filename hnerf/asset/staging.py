@@ -1,89 +1,93 @@
-"""The clothed avatar in the axes of asset formats: right-handed, Y up, metres; shared by the USD and glTF writers."""
+"""The clothed avatar in the axes of asset formats: right-handed, Y up, metres; shared by all writers."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from scipy.spatial.transform import Rotation
 
 from hnerf.asset.correctives import Correctives
+from hnerf.asset.motions import Y_UP_FROM_Z_UP, Motion, motion_of, resampled
+from hnerf.asset.rigs import FULL, RestSurface, StagedRig, stage_rigs
+from hnerf.asset.skeleton import Bones
 from hnerf.asset.texture import UvLayout
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.rig import joint_transforms
 
-Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # (x, y, z) to (x, z, -y)
+CAPTURED = "captured"  # the motion at the capture's own rate, whose time codes are the capture's frames
+RATES = (24, 30)  # frames a second that it is resampled at, since many importers ignore a file's rate
+REST_POSE = "A"  # of every body model here: arms slanting down
 
 
 @dataclass(frozen=True)
 class StagedAvatar:
     """The arrays of an avatar ready to be written; numpy, float64 and int64 unless said otherwise.
 
-    rest_points_m (V, 3), faces (F, 3), uvs (U, 2) v up, face_uvs (F, 3), skin_joints and skin_weights (V, K): the mesh.
-    joint_names, parents (J,), rest_joints_m (J, 3): the skeleton, whose rest orientations are the identity. frames
-    (n,), translations_m (n, J, 3), quaternions (n, J, 4) as x y z w without sign jumps: the motion, each joint relative
-    to its parent, the root relative to the stage. points_m (n, V, 3) float32: the surface of each frame. shapes_m
-    (K, V, 3), shape_weights (n, K) float32: corrective blend shapes, applied before the skin. texture (H, W, 3) uint8
-    sRGB. stage_from_world (3, 3): a rotation.
+    rest_points_m (V, 3), the soles at height 0; faces (F, 3), uvs (U, 2) v up, face_uvs (F, 3): the mesh. shapes_m (K,
+    V, 3) float32: corrective blend shapes, applied before the skin. rigs: "full", with all joints of the body model,
+    and "game", with few joints and influences. frames (n,): of the capture; points_m (n, V, 3) float32: the surface of
+    each. extents_m: the box (2, 3) at each time code of each motion, (n, 2, 3). texture (H, W, 3) uint8 sRGB.
+    stage_from_world (3, 3): a rotation.
     """
 
     rest_points_m: np.ndarray
     faces: np.ndarray
     uvs: np.ndarray
     face_uvs: np.ndarray
-    skin_joints: np.ndarray
-    skin_weights: np.ndarray
-    joint_names: tuple[str, ...]
-    parents: np.ndarray
-    rest_joints_m: np.ndarray
-    frames: np.ndarray
-    translations_m: np.ndarray
-    quaternions: np.ndarray
-    points_m: np.ndarray
     shapes_m: np.ndarray
-    shape_weights: np.ndarray
+    rigs: dict[str, StagedRig]
+    frames: np.ndarray
+    points_m: np.ndarray
+    extents_m: dict[str, np.ndarray]
     texture: np.ndarray
     stage_from_world: np.ndarray
 
     @property
-    def rest_offsets_m(self) -> np.ndarray:
-        """Return the rest joints relative to their parents, (J, 3)."""
-        above = np.where(self.parents[:, None] >= 0, self.rest_joints_m[self.parents], 0)
-        return self.rest_joints_m - above
+    def rest(self) -> RestSurface:
+        """Return the surface that rigs move."""
+        return RestSurface(self.rest_points_m, self.shapes_m)
+
+    @property
+    def vertex_colours(self) -> np.ndarray:
+        """Return the texture's colour at each vertex, (V, 3) uint8 sRGB."""
+        height, width = self.texture.shape[:2]
+        uv = np.zeros((len(self.rest_points_m), 2))
+        uv[self.faces] = self.uvs[self.face_uvs]
+        column = (uv[:, 0] * width).astype(int).clip(0, width - 1)
+        row = ((1 - uv[:, 1]) * height).astype(int).clip(0, height - 1)
+        return self.texture[row, column]
 
 
 def stage_avatar(
-    clothed: BodyFit, surfaces_m: np.ndarray, correctives: Correctives, layout: UvLayout, texture: np.ndarray, up: str
+    clothed: BodyFit,
+    surfaces_m: np.ndarray,
+    correctives: Correctives,
+    layout: UvLayout,
+    texture: np.ndarray,
+    up: str,
+    fps: float,
+    bones: Bones = "along",
+    further: Mapping[str, tuple[BodyFit, float]] | None = None,
 ) -> StagedAvatar:
-    """Turn a clothed body (see `clothed_rig`) and its motion to Y up. surfaces_m (n, V, 3): its surface in each frame;
-    `up`: the vertical axis of the world, "y" or "z".
-
-    The body frame is Z up whatever the world is. With W stage from world, B stage from body and G_j the world transform
-    of joint j, the joint's stage transform is W G_j B^-1, and B G_parent^-1 G_j B^-1 relative to its parent.
-    """
-    rig, body = clothed.rig, Y_UP_FROM_Z_UP
-    world = stage_from_world(up)
-    transforms = joint_transforms(rig.to(dtype=torch.float64), clothed.theta.double(), clothed.root.double()).numpy()
-    staged = _rotation_4x4(world) @ transforms @ _rotation_4x4(body.T)
-    local = staged.copy()
-    parents = rig.parents.numpy()
-    below = np.nonzero(parents >= 0)[0]
-    local[:, below] = np.linalg.inv(staged[:, parents[below]]) @ staged[:, below]
+    """Turn a clothed body (see `clothed_rig`) and its motion to Y up, with both rigs. surfaces_m (n, V, 3): its surface
+    in each frame; `up`: the vertical axis of the world, "y" or "z"; fps: of the frames; further: motions of the same
+    joints in the same world with their frames a second, by name."""
+    world, rig, body = stage_from_world(up), clothed.rig, Y_UP_FROM_Z_UP
+    rest_m, joints_m = rig.vertices_m.double().numpy() @ body.T, rig.joints_m.double().numpy() @ body.T
+    stands_m = np.array([joints_m[0, 0], rest_m[:, 1].min(), joints_m[0, 2]])
+    rest = RestSurface(rest_m - stands_m, correctives.offsets_m @ body.T.astype(np.float32))
+    points_m = surfaces_m @ world.T.astype(np.float32)
+    motions = _motions(clothed, fps, correctives.weights, further or {}, world)
+    floor_m = float(np.median(points_m[..., 1].min(1)))  # single frames have a foot some centimetres below it
+    rigs = stage_rigs(rig, joints_m - stands_m, rest, motions, floor_m, bones)
     return StagedAvatar(
-        rest_points_m=rig.vertices_m.double().numpy() @ body.T,
+        rest_points_m=rest.points_m,
         faces=rig.faces.numpy(),
         uvs=layout.uvs.astype(np.float64),
         face_uvs=layout.face_uvs,
-        skin_joints=rig.skin_joints.numpy(),
-        skin_weights=rig.skin_weights.double().numpy(),
-        joint_names=rig.joint_names,
-        parents=parents,
-        rest_joints_m=rig.joints_m.double().numpy() @ body.T,
+        shapes_m=rest.shapes_m,
+        rigs=rigs,
         frames=np.array(clothed.frames),
-        translations_m=local[..., :3, 3],
-        quaternions=_continuous_quaternions(local[..., :3, :3]),
-        points_m=surfaces_m @ world.T.astype(np.float32),
-        shapes_m=correctives.offsets_m @ body.T.astype(np.float32),
-        shape_weights=correctives.weights,
+        points_m=points_m,
+        extents_m={name: _boxes(rigs[FULL], name, rest) for name in motions},
         texture=texture,
         stage_from_world=world,
     )
@@ -94,16 +98,16 @@ def stage_from_world(up: str) -> np.ndarray:
     return {"z": Y_UP_FROM_Z_UP, "y": np.eye(3)}[up]
 
 
-def _rotation_4x4(rotation: np.ndarray) -> np.ndarray:
-    full = np.eye(4)
-    full[:3, :3] = rotation
-    return full
+def _motions(
+    clothed: BodyFit, fps: float, weights: np.ndarray, further: Mapping[str, tuple[BodyFit, float]], world: np.ndarray
+) -> dict[str, Motion]:
+    """Return the captured motion, first, that motion at other rates, and further ones without blend shapes."""
+    captured = motion_of(clothed, fps, weights, world)
+    motions = {CAPTURED: captured, **{f"{CAPTURED}_{rate}": resampled(captured, rate) for rate in RATES}}
+    for name, (body, rate) in further.items():
+        motions[name] = motion_of(body, rate, np.zeros((len(body.frames), weights.shape[1]), np.float32), world)
+    return motions
 
 
-def _continuous_quaternions(rotations: np.ndarray) -> np.ndarray:
-    """Convert rotations (n, J, 3, 3) to quaternions (n, J, 4) as x y z w, each on the same hemisphere as in the frame
-    before."""
-    quaternions = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(*rotations.shape[:2], 4)
-    same_side = (quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True) >= 0
-    quaternions[1:] *= np.cumprod(np.where(same_side, 1, -1), axis=0)
-    return quaternions
+def _boxes(rig: StagedRig, motion: str, rest: RestSurface) -> np.ndarray:
+    return np.stack([np.stack([points_m.min(0), points_m.max(0)]) for points_m in rig.surfaces_m(motion, rest)])

@@ -1,7 +1,6 @@
-"""Texture coordinates, and the radiance field's colours baked into a texture."""
+"""Texture coordinates, texels, and the picture made of their colours."""
 
 import ctypes
-import logging
 from dataclasses import dataclass
 
 import cv2
@@ -11,15 +10,8 @@ import xatlas
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from hnerf.avatar.avatar import Avatar
-from hnerf.avatar.surface import move_onto_surface
-from hnerf.body.fit_result import BodyFit
-from hnerf.body.rig import Rig, pose_vertices
-
 CHART_PADDING_PX = 4
 SUBPIXEL_BITS = 8
-
-log = logging.getLogger("hnerf.asset")
 
 
 @dataclass(frozen=True)
@@ -75,21 +67,6 @@ def rasterise(layout: UvLayout, texture_px: int) -> Texels:
     return Texels(torch.from_numpy(row), torch.from_numpy(column), torch.from_numpy(face).long(), barycentric)
 
 
-@torch.no_grad()
-def field_colours(avatar: Avatar, clothed: BodyFit, texels: Texels) -> np.ndarray:
-    """Return the field's colour at each texel, (N, 3): its radiance along the inward normal, the median over the poses
-    of `clothed`.
-
-    Poses of the capture keep the field's conditioning within what it was trained on; the median rejects a pose in which
-    that spot touches another limb.
-    """
-    seen = []
-    for frame, theta, root in zip(clothed.frames, clothed.theta, clothed.root, strict=True):
-        log.info("texture: %d texels in the pose of frame %d", len(texels.face), frame)
-        seen.append(_colours_in_pose(avatar, clothed.rig, texels, theta, root).numpy())
-    return np.median(np.stack(seen), axis=0)
-
-
 def texture_image(texels: Texels, colours: np.ndarray, texture_px: int) -> np.ndarray:
     """Return a square RGB texture, uint8, of colours (N, 3) in [0, 1]; texels off the charts repeat the nearest chart's
     border."""
@@ -100,18 +77,6 @@ def texture_image(texels: Texels, colours: np.ndarray, texture_px: int) -> np.nd
     covered[row, column] = True
     nearest = distance_transform_edt(~covered, return_distances=False, return_indices=True)
     return image[nearest[0], nearest[1]]
-
-
-def _colours_in_pose(avatar: Avatar, rig: Rig, texels: Texels, theta: Tensor, root: Tensor) -> Tensor:
-    """Return the radiance at each texel of the surface posed by theta (J, 3) and root (4, 4), (N, 3) on the CPU."""
-    device = avatar.body.rig.vertices_m.device
-    vertices_m, faces = pose_vertices(rig, theta, root).to(device), rig.faces.to(device)
-    theta, root = theta.to(device), root.to(device)
-    surface_m, normals = move_onto_surface(avatar, vertices_m, faces, theta, root)  # skinning only approximates it
-    corners, weights = faces[texels.face.to(device)], texels.barycentric.to(device)[..., None]
-    points_m = (surface_m[corners] * weights).sum(1)
-    inward = -torch.nn.functional.normalize((normals[corners] * weights).sum(1), dim=1)
-    return avatar.colour(points_m, inward, theta, root).cpu()
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -1,65 +1,136 @@
-"""Writer of USD packages: the skinned avatar, and its surface as a cache of points.
+"""Prims of USD files: geometry, look, rigs, motions and cameras, each at its place below /Avatar.
 
-Y up, metres; time codes are the capture's frame numbers. Matrices are transposed on the way in (USD has row vectors).
+Y up, metres. Matrices are transposed on the way in (USD has row vectors).
 """
 
-import struct
-import tempfile
 from collections.abc import Iterable
-from pathlib import Path
-from zipfile import ZipFile
 
 import numpy as np
-from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, Vt
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
-from hnerf.asset.staging import StagedAvatar
+from hnerf.asset.quads import polygon_corners
+from hnerf.asset.rigs import StagedRig
+from hnerf.asset.skeleton import Skeleton
+from hnerf.asset.staging import REST_POSE, StagedAvatar
 from hnerf.body.descriptor import normals_of
-from hnerf.capture.capture import write_image
+from hnerf.body.skeletons import EQUIVALENTS, SKELETONS
 from hnerf.geometry.camera import Camera
 
 ROOT = Sdf.Path("/Avatar")
+BODY = ROOT.AppendChild("Body")
+SURFACE, SKELETON, MOTION = (BODY.AppendChild(name) for name in ("Surface", "Skeleton", "Motion"))
 APERTURE = 0.36  # film gate width in tenths of a scene unit, read as 36 mm where a unit is a metre
 TEXTURE_NAME = "texture.png"
-FIRST_TIME = bytes([0, 0, 0x21, 0])  # midnight, 1 January 1980, in ZIP's time and date
+REST_NOTE = (
+    f"Rest pose: {REST_POSE}, arms slanting down, elbows and knees a little bent; soles at height 0, facing +Z. The "
+    "root joint stands on the ground below the pelvis; it moves over the ground and turns about the vertical with it."
+)
 
 
-def write_skinned(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps: float) -> None:
-    """Write `avatar.usdz`: mesh, skeleton with the captured motion, material, cameras."""
-    with tempfile.TemporaryDirectory() as folder:
-        stage = _new_stage(Path(folder) / "avatar.usdc", avatar, cameras, fps)
-        body = UsdSkel.Root.Define(stage, ROOT.AppendChild("Body"))
-        extents = body.CreateExtentAttr()
-        for frame, points in zip(avatar.frames, avatar.points_m, strict=True):
-            extents.Set(_extent(points), float(frame))
-        mesh = _define_mesh(stage, body.GetPath().AppendChild("Surface"), avatar)
-        mesh.CreatePointsAttr(_vec3f(avatar.rest_points_m))
-        mesh.CreateExtentAttr(_extent(avatar.rest_points_m))
-        mesh.CreateNormalsAttr(_vec3f(normals_of(avatar.rest_points_m, avatar.faces)))
-        _bind_skin(mesh, _define_skeleton(stage, body.GetPath().AppendChild("Skeleton"), avatar), avatar)
-        _bind_shapes(mesh, avatar)
-        _package(stage, avatar, path)
+def author_geometry(stage: Usd.Stage, avatar: StagedAvatar) -> None:
+    """Define the skinned mesh at rest, with its blend shapes; rigs bind it."""
+    UsdSkel.Root.Define(stage, BODY)
+    mesh = define_mesh(stage, SURFACE, avatar)
+    mesh.CreatePointsAttr(vec3f(avatar.rest_points_m))
+    mesh.CreateExtentAttr(extent(avatar.rest_points_m))
+    mesh.CreateNormalsAttr(vec3f(normals_of(avatar.rest_points_m, avatar.faces)))
+    names, targets = shape_names(avatar), []
+    for name, offsets_m in zip(names, avatar.shapes_m, strict=True):
+        shape = UsdSkel.BlendShape.Define(stage, SURFACE.AppendChild(name))
+        shape.CreateOffsetsAttr(vec3f(offsets_m))
+        targets.append(shape.GetPath())
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1))
+    binding.CreateBlendShapesAttr(names)
+    binding.CreateBlendShapeTargetsRel().SetTargets(targets)
 
 
-def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps: float) -> None:
-    """Write `avatar_cache.usdz`: the surface as world-space points at every frame, for programs without skinning."""
-    with tempfile.TemporaryDirectory() as folder:
-        stage = _new_stage(Path(folder) / "avatar_cache.usdc", avatar, cameras, fps)
-        mesh = _define_mesh(stage, ROOT.AppendChild("Surface"), avatar)
-        points, extents, normals = mesh.CreatePointsAttr(), mesh.CreateExtentAttr(), mesh.CreateNormalsAttr()
-        for frame, posed in zip(avatar.frames, avatar.points_m, strict=True):
-            points.Set(_vec3f(posed), float(frame))
-            extents.Set(_extent(posed), float(frame))
-            normals.Set(_vec3f(normals_of(posed, avatar.faces)), float(frame))
-        _package(stage, avatar, path)
+def author_look(stage: Usd.Stage, mesh: Sdf.Path) -> None:
+    """Define a matte preview surface with the texture, and bind the mesh to it."""
+    material = UsdShade.Material.Define(stage, ROOT.AppendPath("Materials/Captured"))
+    UsdGeom.Scope.Define(stage, material.GetPath().GetParentPath())
+    reader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("TextureCoordinates"))
+    reader.CreateIdAttr("UsdPrimvarReader_float2")
+    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
+    texture = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Texture"))
+    texture.CreateIdAttr("UsdUVTexture")
+    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(TEXTURE_NAME)
+    texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
+    for wrap in ("wrapS", "wrapT"):
+        texture.CreateInput(wrap, Sdf.ValueTypeNames.Token).Set("clamp")
+    coordinates = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+    texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
+    surface = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Surface"))
+    surface.CreateIdAttr("UsdPreviewSurface")
+    surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
+    surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
+    colour = texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
+    surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
+    UsdShade.MaterialBindingAPI.Apply(stage.OverridePrim(mesh)).Bind(material)
 
 
-def joint_paths(avatar: StagedAvatar) -> list[str]:
-    """Return the skeleton's joint tokens, like "root/pelvis_L", every part a valid identifier (Blender drops bones
-    whose names are not)."""
+def author_rig(stage: Usd.Stage, name: str, rig: StagedRig) -> None:
+    """Define a rig: its skeleton, the mesh's skin weights, and which motions are its own."""
+    skeleton = UsdSkel.Skeleton.Define(stage, SKELETON)
+    skeleton.CreateJointsAttr(joint_paths(rig.skeleton))
+    skeleton.CreateJointNamesAttr(rig.skeleton.names)
+    skeleton.CreateRestTransformsAttr(_matrices(rig.skeleton.local(rig.skeleton.bind)))
+    skeleton.CreateBindTransformsAttr(_matrices(rig.skeleton.bind))
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([MOTION.AppendChild(name)])
+    skeleton.GetPrim().SetDocumentation(REST_NOTE)
+    skeleton.GetPrim().SetCustomData({"restPose": REST_POSE, "jointNamesIn": _names_elsewhere(rig.skeleton)})
+
+    binding = UsdSkel.BindingAPI.Apply(stage.OverridePrim(SURFACE))
+    binding.CreateSkeletonRel().SetTargets([SKELETON])
+    influences = rig.skin.joints.shape[1]
+    indices = binding.CreateJointIndicesPrimvar(False, influences)
+    indices.Set(Vt.IntArray.FromNumpy(rig.skin.joints.astype(np.int32).ravel()))
+    weights = binding.CreateJointWeightsPrimvar(False, influences)
+    weights.Set(Vt.FloatArray.FromNumpy(rig.skin.weights.astype(np.float32).ravel()))
+
+
+def author_motion(stage: Usd.Stage, name: str, avatar: StagedAvatar) -> None:
+    """Define a motion for every rig, and the body's extents in it, at the same instants in the stage's time codes."""
+    UsdGeom.Scope.Define(stage, MOTION)
+    boxes = UsdGeom.Boundable(stage.OverridePrim(BODY)).CreateExtentAttr()
+    for rig_name, rig in avatar.rigs.items():
+        motion = rig.motions[name]
+        joints = joint_paths(rig.skeleton)
+        animation = UsdSkel.Animation.Define(stage, MOTION.AppendChild(rig_name))
+        animation.CreateJointsAttr(joints)
+        animation.CreateScalesAttr(Vt.Vec3hArray(len(joints), Gf.Vec3h(1, 1, 1)))
+        animation.CreateBlendShapesAttr(shape_names(avatar))
+        translations, rotations = animation.CreateTranslationsAttr(), animation.CreateRotationsAttr()
+        weights = animation.CreateBlendShapeWeightsAttr()
+        for k, code in enumerate(motion.codes * (stage.GetTimeCodesPerSecond() / motion.fps)):
+            translations.Set(vec3f(motion.translations_m[k]), code)
+            quaternions = [Gf.Quatf(w, x, y, z) for x, y, z, w in motion.quaternions[k].tolist()]
+            rotations.Set(Vt.QuatfArray(quaternions), code)
+            weights.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(motion.shape_weights[k], np.float32)), code)
+            boxes.Set(vec3f(avatar.extents_m[name][k]), code)
+
+
+def author_cameras(stage: Usd.Stage, cameras: Iterable[Camera], stage_from_world: np.ndarray) -> None:
+    """Define the recording's cameras."""
+    folder = UsdGeom.Scope.Define(stage, ROOT.AppendChild("Cameras")).GetPath()
+    for camera in cameras:
+        define_camera(stage, folder.AppendChild(_free_name(stage, folder, camera.name)), camera, stage_from_world)
+
+
+def joint_paths(skeleton: Skeleton) -> list[str]:
+    """Return the skeleton's joint tokens, like "root/pelvis/thigh_L", every part a valid identifier (Blender drops
+    bones whose names are not)."""
     paths: list[str] = []
-    for name, parent in zip(avatar.joint_names, avatar.parents, strict=True):
+    for name, parent in zip(skeleton.names, skeleton.parents, strict=True):
         paths.append(f"{paths[parent]}/{_identifier(name)}" if parent >= 0 else _identifier(name))
     return paths
+
+
+def _names_elsewhere(skeleton: Skeleton) -> dict[str, dict[str, str]]:
+    """Return what other skeletons call the joints, by skeleton and joint."""
+    known = {name: EQUIVALENTS[name] for name in skeleton.names if name in EQUIVALENTS}
+    return {s: {ours: getattr(n, s) for ours, n in known.items() if getattr(n, s)} for s in SKELETONS}
 
 
 def define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera, stage_from_world: np.ndarray) -> UsdGeom.Camera:
@@ -85,24 +156,6 @@ def define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera, stage_from_w
     return prim
 
 
-def _new_stage(file: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps: float) -> Usd.Stage:
-    stage = Usd.Stage.CreateNew(str(file))
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    stage.SetTimeCodesPerSecond(fps)
-    stage.SetFramesPerSecond(fps)
-    stage.SetStartTimeCode(float(avatar.frames[0]))
-    stage.SetEndTimeCode(float(avatar.frames[-1]))
-    root = UsdGeom.Xform.Define(stage, ROOT)
-    Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
-    stage.SetDefaultPrim(root.GetPrim())
-    folder = UsdGeom.Scope.Define(stage, ROOT.AppendChild("Cameras")).GetPath()
-    for camera in cameras:
-        path = folder.AppendChild(_free_name(stage, folder, camera.name))
-        define_camera(stage, path, camera, avatar.stage_from_world)
-    return stage
-
-
 def _free_name(stage: Usd.Stage, folder: Sdf.Path, name: str) -> str:
     identifier = _identifier(name)
     while stage.GetPrimAtPath(folder.AppendChild(identifier)):
@@ -115,129 +168,40 @@ def _identifier(name: str) -> str:
     return Tf.MakeValidIdentifier(f"_{name}" if name[:1].isdigit() else name)
 
 
-def _define_mesh(stage: Usd.Stage, path: Sdf.Path, avatar: StagedAvatar) -> UsdGeom.Mesh:
-    """Define topology, texture coordinates and material; the caller sets points, normals and extents."""
+def define_mesh(stage: Usd.Stage, path: Sdf.Path, avatar: StagedAvatar) -> UsdGeom.Mesh:
+    """Define topology, texture coordinates and display colours; the caller sets points, normals and extents."""
     mesh = UsdGeom.Mesh.Define(stage, path)
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(avatar.faces), 3, np.int32)))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(avatar.faces.astype(np.int32).ravel()))
+    corners = polygon_corners(avatar.faces)
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(corners), corners.shape[1], np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(avatar.faces.ravel()[corners].astype(np.int32).ravel()))
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
     st.Set(Vt.Vec2fArray.FromNumpy(avatar.uvs.astype(np.float32)))
-    st.SetIndices(Vt.IntArray.FromNumpy(avatar.face_uvs.astype(np.int32).ravel()))
-    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(_define_material(stage))
+    st.SetIndices(Vt.IntArray.FromNumpy(avatar.face_uvs.ravel()[corners].astype(np.int32).ravel()))
+    mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(vec3f(_linear(avatar.vertex_colours / 255)))
     return mesh
 
 
-def _define_material(stage: Usd.Stage) -> UsdShade.Material:
-    """Define a matte preview surface with the baked texture."""
-    material = UsdShade.Material.Define(stage, ROOT.AppendPath("Materials/Captured"))
-    UsdGeom.Scope.Define(stage, material.GetPath().GetParentPath())
-    reader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("TextureCoordinates"))
-    reader.CreateIdAttr("UsdPrimvarReader_float2")
-    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
-    texture = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Texture"))
-    texture.CreateIdAttr("UsdUVTexture")
-    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(TEXTURE_NAME)
-    texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
-    for wrap in ("wrapS", "wrapT"):
-        texture.CreateInput(wrap, Sdf.ValueTypeNames.Token).Set("clamp")
-    coordinates = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
-    texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
-    surface = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Surface"))
-    surface.CreateIdAttr("UsdPreviewSurface")
-    surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
-    surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
-    colour = texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
-    surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
-    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
-    return material
-
-
-def _define_skeleton(stage: Usd.Stage, path: Sdf.Path, avatar: StagedAvatar) -> UsdSkel.Skeleton:
-    """Define the skeleton: rest transforms relative to parents, bind transforms in the skeleton's space, and the
-    motion."""
-    joints = joint_paths(avatar)
-    skeleton = UsdSkel.Skeleton.Define(stage, path)
-    skeleton.CreateJointsAttr(joints)
-    skeleton.CreateJointNamesAttr(avatar.joint_names)
-    skeleton.CreateRestTransformsAttr(_translations(avatar.rest_offsets_m))
-    skeleton.CreateBindTransformsAttr(_translations(avatar.rest_joints_m))
-    motion = UsdSkel.Animation.Define(stage, path.AppendChild("Motion"))
-    motion.CreateJointsAttr(joints)
-    motion.CreateScalesAttr(Vt.Vec3hArray(len(joints), Gf.Vec3h(1, 1, 1)))
-    translations, rotations = motion.CreateTranslationsAttr(), motion.CreateRotationsAttr()
-    for frame, offsets_m, quaternions in zip(avatar.frames, avatar.translations_m, avatar.quaternions, strict=True):
-        translations.Set(_vec3f(offsets_m), float(frame))
-        rotations.Set(Vt.QuatfArray([Gf.Quatf(w, x, y, z) for x, y, z, w in quaternions.tolist()]), float(frame))
-    motion.CreateBlendShapesAttr(_shape_names(avatar))
-    weights = motion.CreateBlendShapeWeightsAttr()
-    for frame, values in zip(avatar.frames, avatar.shape_weights, strict=True):
-        weights.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(values, np.float32)), float(frame))
-    binding = UsdSkel.BindingAPI.Apply(skeleton.GetPrim())
-    binding.CreateAnimationSourceRel().SetTargets([motion.GetPath()])
-    return skeleton
-
-
-def _bind_skin(mesh: UsdGeom.Mesh, skeleton: UsdSkel.Skeleton, avatar: StagedAvatar) -> None:
-    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
-    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
-    binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1))
-    influences = avatar.skin_joints.shape[1]
-    indices = binding.CreateJointIndicesPrimvar(False, influences)
-    indices.Set(Vt.IntArray.FromNumpy(avatar.skin_joints.astype(np.int32).ravel()))
-    weights = binding.CreateJointWeightsPrimvar(False, influences)
-    weights.Set(Vt.FloatArray.FromNumpy(avatar.skin_weights.astype(np.float32).ravel()))
-
-
-def _bind_shapes(mesh: UsdGeom.Mesh, avatar: StagedAvatar) -> None:
-    """Define the corrective blend shapes below the mesh; the skeleton's motion has their weights."""
-    names, targets = _shape_names(avatar), []
-    for name, offsets_m in zip(names, avatar.shapes_m, strict=True):
-        shape = UsdSkel.BlendShape.Define(mesh.GetPrim().GetStage(), mesh.GetPath().AppendChild(name))
-        shape.CreateOffsetsAttr(_vec3f(offsets_m))
-        targets.append(shape.GetPath())
-    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
-    binding.CreateBlendShapesAttr(names)
-    binding.CreateBlendShapeTargetsRel().SetTargets(targets)
-
-
-def _shape_names(avatar: StagedAvatar) -> list[str]:
+def shape_names(avatar: StagedAvatar) -> list[str]:
+    """Return the names of the corrective blend shapes."""
     return [f"corrective_{k + 1:02d}" for k in range(len(avatar.shapes_m))]
 
 
-def _package(stage: Usd.Stage, avatar: StagedAvatar, path: Path) -> None:
-    layer = Path(stage.GetRootLayer().realPath)
-    stage.GetRootLayer().Save()
-    write_image(layer.parent / TEXTURE_NAME, avatar.texture)
-    if not UsdUtils.CreateNewARKitUsdzPackage(str(layer), str(path)):
-        raise OSError(f"{path}: USD could not write the package; is the disk full?")
-    _forget_times(path)
-
-
-def _forget_times(path: Path) -> None:
-    """Set the times of all files in a package to the first that ZIP knows, so that the same avatar is the same bytes.
-
-    APPNOTE.TXT of PKWARE, 4.3.7 and 4.3.12: time and date lie at byte 10 of a local header and at byte 12 of an entry
-    of the directory, whose name, extra field and comment have the lengths at byte 28.
-    """
-    package = bytearray(path.read_bytes())
-    with ZipFile(path) as archive:
-        at, entries = archive.start_dir, archive.infolist()
-    for entry in entries:
-        for place in (entry.header_offset + 10, at + 12):
-            package[place : place + 4] = FIRST_TIME
-        at += 46 + sum(struct.unpack_from("<3H", package, at + 28))
-    path.write_bytes(package)
-
-
-def _vec3f(values: np.ndarray) -> Vt.Vec3fArray:
+def vec3f(values: np.ndarray) -> Vt.Vec3fArray:
+    """Return vectors (n, 3) as USD's array."""
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
 
 
-def _extent(points_m: np.ndarray) -> Vt.Vec3fArray:
-    return _vec3f(np.stack([points_m.min(0), points_m.max(0)]))
+def extent(points_m: np.ndarray) -> Vt.Vec3fArray:
+    """Return the box around points (n, 3) as USD's array of two corners."""
+    return vec3f(np.stack([points_m.min(0), points_m.max(0)]))
 
 
-def _translations(offsets_m: np.ndarray) -> Vt.Matrix4dArray:
-    return Vt.Matrix4dArray([Gf.Matrix4d(1).SetTranslate(Gf.Vec3d(*offset)) for offset in offsets_m.tolist()])
+def _linear(encoded: np.ndarray) -> np.ndarray:
+    """Decode sRGB values in [0, 1] (IEC 61966-2-1)."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def _matrices(transforms: np.ndarray) -> Vt.Matrix4dArray:
+    return Vt.Matrix4dArray([Gf.Matrix4d(*transform.T.ravel().tolist()) for transform in transforms])

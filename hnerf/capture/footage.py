@@ -12,12 +12,14 @@ import numpy as np
 
 from hnerf.capture.safe_io import check_image_size, read_image
 from hnerf.errors import InputError
+from hnerf.progress import report
 
 # Our own message, one line, replaces what OpenCV and FFmpeg would print about a bad video.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 
+PROGRESS_FRAMES = 100  # between two reports
 MIN_FPS, MAX_FPS = 0.01, 10_000.0  # that a recording can have
 
 
@@ -65,8 +67,11 @@ class Video:
         stream = _open_stream(path)
         check_image_size(path, stream.get(cv2.CAP_PROP_FRAME_WIDTH), stream.get(cv2.CAP_PROP_FRAME_HEIGHT))
         declared, times_s = int(stream.get(cv2.CAP_PROP_FRAME_COUNT)), list[float]()
-        while stream.grab():
+        while len(times_s) <= declared and stream.grab():
             times_s.append(stream.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
+            if len(times_s) % PROGRESS_FRAMES == 0:
+                report(path.name, len(times_s), declared + 1)
+        report(path.name, 1, 1)
         count = len(times_s)
         if count == 0 or count != declared:
             raise InputError(

@@ -37,6 +37,7 @@ from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
+from hnerf.progress import tracked
 
 DEFAULT_FPS = 30.0
 # Encoders pad and crop by a few pixels; the calibration stage judges what that does to the cameras.
@@ -213,7 +214,7 @@ def _write_pixels(
     masks = layout.mask_files(lens.name)
     mask_paths = _mask_paths(masks, frames, footage) if masks else {}
     brightest = 0
-    for picture in footage.read(frames):
+    for picture in tracked(footage.read(frames), f"camera {lens.name}", len(frames)):
         source = picture.file or footage.path
         if normaliser is None:
             height_px, width_px = picture.rgb.shape[:2]

@@ -80,7 +80,7 @@ def show_mask(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 def overlay_surface(image: np.ndarray, surface: Surface, camera: Camera) -> np.ndarray:
     """Return the image with a surface drawn over it, tinted and outlined."""
-    hits = _cast_pixels(surface, camera)
+    hits = cast_pixels(surface, camera)
     shade = _headlight(surface.mesh, hits, camera)[..., None]
     hit = (hits.face >= 0).reshape(image.shape[:2])
     tinted = np.where(hit[..., None], 0.45 * image + 0.55 * ACCENT * shade, image)
@@ -95,21 +95,21 @@ def error_map(rendered: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 def clay(surface: Surface, camera: Camera) -> np.ndarray:
     """Render the surface as a grey model on white."""
-    fine = _supersampled(camera)
-    hits = _cast_pixels(surface, fine)
-    return _downsampled(DISTANCE_COLOURS[0] * _studio_light(surface.mesh, hits, fine), hits, camera)
+    fine = supersampled(camera)
+    hits = cast_pixels(surface, fine)
+    return downsampled(DISTANCE_COLOURS[0] * studio_light(surface.mesh, hits, fine), hits, camera)
 
 
 def distance_map(surface: Surface, truth: Surface, camera: Camera) -> np.ndarray:
     """Render the surface coloured by its distance to the truth: grey is none, dark red FULL_DISTANCE_M or more."""
-    fine = _supersampled(camera)
-    hits = _cast_pixels(surface, fine)
+    fine = supersampled(camera)
+    hits = cast_pixels(surface, fine)
     met = hits.face >= 0
     distance_m, _ = truth.closest(hits.interpolate(surface.mesh.vertices, surface.mesh.faces))
     steps = np.linspace(0, FULL_DISTANCE_M, len(DISTANCE_COLOURS))
     colours = np.zeros((len(met), 3), np.float32)
     colours[met] = np.stack([np.interp(distance_m, steps, channel) for channel in DISTANCE_COLOURS.T], 1)
-    return _downsampled(colours * _studio_light(surface.mesh, hits, fine), hits, camera)
+    return downsampled(colours * studio_light(surface.mesh, hits, fine), hits, camera)
 
 
 def portrait_camera(points_m: np.ndarray, root: np.ndarray, side: str) -> Camera:
@@ -130,7 +130,7 @@ def portrait_camera(points_m: np.ndarray, root: np.ndarray, side: str) -> Camera
     return Camera(side, K, R, np.array([0, 0, distance_m]) - middle, width_px, height_px)
 
 
-def _cast_pixels(surface: Surface, camera: Camera) -> RayHits:
+def cast_pixels(surface: Surface, camera: Camera) -> RayHits:
     """Return the hits of the rays through a camera's pixels, row by row."""
     pixels = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), -1).reshape(-1, 2)
     return surface.cast(*camera.rays(pixels.astype(np.float64)))
@@ -144,7 +144,7 @@ def _normals(mesh: trimesh.Trimesh, hits: RayHits) -> np.ndarray:
     return normals
 
 
-def _studio_light(mesh: trimesh.Trimesh, hits: RayHits, camera: Camera) -> np.ndarray:
+def studio_light(mesh: trimesh.Trimesh, hits: RayHits, camera: Camera) -> np.ndarray:
     """Return the brightness (N, 1) under a key light, a light at the camera, and ambient light."""
     normals = _normals(mesh, hits) @ camera.R.T
     light = 0.30 + 0.62 * (normals @ KEY_LIGHT).clip(0, 1) + 0.16 * (-normals[:, 2]).clip(0, 1)
@@ -157,11 +157,12 @@ def _headlight(mesh: trimesh.Trimesh, hits: RayHits, camera: Camera) -> np.ndarr
     return (0.35 + 0.65 * facing.clip(0, 1)).reshape(camera.height_px, camera.width_px)
 
 
-def _supersampled(camera: Camera) -> Camera:
+def supersampled(camera: Camera) -> Camera:
+    """Return the camera with SUPERSAMPLING times the pixels along each side, for `downsampled`."""
     return camera.resized(camera.width_px * SUPERSAMPLING, camera.height_px * SUPERSAMPLING)
 
 
-def _downsampled(colours: np.ndarray, hits: RayHits, camera: Camera) -> np.ndarray:
+def downsampled(colours: np.ndarray, hits: RayHits, camera: Camera) -> np.ndarray:
     """Average the colours of supersampled rays (N, 3), 0 to 255, over a white background, to the camera's own size."""
     fine = np.where(hits.face[:, None] >= 0, colours, BACKGROUND).astype(np.float32)
     fine = fine.reshape(camera.height_px * SUPERSAMPLING, camera.width_px * SUPERSAMPLING, 3)

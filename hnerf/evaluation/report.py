@@ -67,6 +67,7 @@ COLUMNS = (  # of novel poses
     ("Posed", "poses tuned on the training cameras' images of these frames"),
     ("Tracked", "both the poses and a deformation of each frame tuned on those images"),
 )
+TEMPLATES = Path(__file__).parent / "templates"
 LONG_LIST = 12  # values; longer lists are shown by their range
 
 
@@ -80,8 +81,36 @@ def write_report(
 ) -> None:
     """Write `report.html` and its charts into `out`, from the renderings and meshes there and the stages' reports."""
     stages = stage_reports(inputs)
+    page = (
+        report_environment()
+        .get_template("report.html")
+        .render(
+            capture=inputs.capture,
+            size_px=image_sizes(inputs),
+            split_titles=SPLIT_TITLES,
+            columns=COLUMNS,
+            reasons=missing_figures(found),
+            held_out=held_out_rows(found),
+            found=found,
+            summary=summary(found),
+            galleries=galleries(inputs, settings, truth, true_meshes, found, out),
+            training_charts=training_charts(inputs.training_folder / "history.jsonl", out),
+            frame_charts=frame_charts(found, out),
+            people_picture=png_uri(inputs.capture.root / PICTURE),
+            rig_picture=png_uri(inputs.calibration_folder / "cameras.png"),
+            evidence_picture=png_uri(inputs.calibration_folder / "witnesses.png"),
+            stages=stages,
+            costs=costs(stages, found),
+            notes=reading_notes(inputs, found),
+        )
+    )
+    (out / "report.html").write_text(page, encoding="utf-8")
+
+
+def report_environment(*folders: Path) -> jinja2.Environment:
+    """Return the environment of pages that look like the report; folders: of templates beside the report's own."""
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
+        loader=jinja2.FileSystemLoader([*folders, TEMPLATES]),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
@@ -89,26 +118,7 @@ def write_report(
     )
     environment.filters["readable"] = readable
     environment.tests["rows"] = is_table_rows
-    page = environment.get_template("report.html").render(
-        capture=inputs.capture,
-        size_px=image_sizes(inputs),
-        split_titles=SPLIT_TITLES,
-        columns=COLUMNS,
-        reasons=missing_figures(found),
-        held_out=held_out_rows(found),
-        found=found,
-        summary=summary(found),
-        galleries=galleries(inputs, settings, truth, true_meshes, found, out),
-        training_charts=training_charts(inputs.training_folder / "history.jsonl", out),
-        frame_charts=frame_charts(found, out),
-        people_picture=png_uri(inputs.capture.root / PICTURE),
-        rig_picture=png_uri(inputs.calibration_folder / "cameras.png"),
-        evidence_picture=png_uri(inputs.calibration_folder / "witnesses.png"),
-        stages=stages,
-        costs=costs(stages, found),
-        notes=reading_notes(inputs, found),
-    )
-    (out / "report.html").write_text(page, encoding="utf-8")
+    return environment
 
 
 def stage_reports(inputs: EvaluationInputs) -> dict[str, dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""Poses to render an avatar in: motions of other subjects or AMASS files, and interpolation between two poses."""
+"""Poses to render an avatar in: motions of other subjects, BVH or AMASS files, and interpolation between two poses."""
 
 import dataclasses
 import re
@@ -20,6 +20,7 @@ from hnerf.capture.given_poses import JOINTS, GivenPoses, check_smpl
 from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, read_arrays
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
+from hnerf.render.bvh_motion import bvh_motion
 
 AMASS_WIDTHS = (72, 156, 165)  # pose parameters of SMPL, SMPL-H and SMPL-X, which share their first 22 joints
 AMASS_RATES = ("mocap_framerate", "mocap_frame_rate")
@@ -40,13 +41,16 @@ class Motion:
 
 def read_motion(path: Path, frames: str = ":") -> Motion:
     """Read a motion: frames (see `select_frames`) of another subject's folder, which holds a capture and a training or
-    fit, or of an AMASS .npz file.
+    fit, of a .bvh file (`bvh_motion`), or of an AMASS .npz file.
 
     AMASS poses are SMPL's; they are converted to the joints of anny's average body, with fingers and toes at rest.
     Raises InputError if there is no motion or it lacks these frames.
     """
     if path.is_dir():
         return _subject_motion(path, frames)
+    if path.suffix.lower() == ".bvh":
+        body, fps = bvh_motion(path)
+        return Motion(select_poses(body, select_frames(body.frames, frames, path)), fps, "y")
     given, fps = _read_amass(path)
     chosen = list(select_frames(tuple(range(len(given.theta))), frames, path))
     given = dataclasses.replace(given, theta=given.theta[chosen], root=given.root[chosen])
@@ -153,7 +157,7 @@ def _rotation_between_up_axes(from_up: str, to_up: str) -> Tensor:
 def _subject_motion(folder: Path, frames: str) -> Motion:
     found = [folder / stage for stage in ("training", "fit") if (folder / stage / "body.npz").is_file()]
     if not found or not (folder / "capture" / "capture.json").is_file():
-        raise InputError(f"{folder}: holds no fitted body; give <store>/subjects/<name> or an AMASS .npz")
+        raise InputError(f"{folder}: holds no fitted body; give <store>/subjects/<name>, a .bvh or an AMASS .npz")
     body, capture = BodyFit.load(found[0]), Capture.load(folder / "capture")
     return Motion(select_poses(body, select_frames(body.frames, frames, folder)), capture.fps, capture.up)
 

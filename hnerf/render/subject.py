@@ -33,9 +33,9 @@ class RenderOptions:
 
     camera: a recorded camera's name; path: a file or folder of cameras to fly along (`read_camera_path`); with neither,
     the camera orbits at this radius and at this height above the person's centre, in metres (`orbit`). motion: another
-    subject's folder, or an AMASS file (`read_motion`); frames: which of its frames (`select_frames`); between: two
-    frames to interpolate between. shape: amounts added to shape values; volume: relative change. what: of OUTPUT_KINDS.
-    size_px: the longest side of images. pictures: number of images.
+    subject's folder, a BVH or an AMASS file (`read_motion`); frames: which of its frames (`select_frames`); between:
+    two frames to interpolate between. shape: amounts added to shape values; volume: relative change. what: of
+    OUTPUT_KINDS. size_px: the longest side of images. pictures: number of images.
     """
 
     camera: str | None = None

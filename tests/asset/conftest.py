@@ -22,4 +22,4 @@ def staged() -> StagedAvatar:
     moved_m = np.einsum("nk,kvd->nvd", rng.normal(size=(len(body.frames), 2)), shapes_m).astype(np.float32)
     texture = rng.integers(0, 255, (64, 64, 3), np.uint8)
     surfaces_m = posed_with_displacements(clothed, moved_m)
-    return stage_avatar(clothed, surfaces_m, correctives_of(moved_m, 2), layout, texture, "z")
+    return stage_avatar(clothed, surfaces_m, correctives_of(moved_m, 2), layout, texture, "z", 10.0)

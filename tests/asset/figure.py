@@ -45,6 +45,12 @@ def upright_column(radius_m: float, bottom_m: float, top_m: float) -> trimesh.Tr
     return trimesh.creation.revolve([[0, bottom_m], *rings, [0, top_m]], sections=24)
 
 
+def twice(mesh: trimesh.Trimesh, apart_m: tuple[float, float, float]) -> trimesh.Trimesh:
+    """Return a mesh and its copy beside it as one mesh."""
+    vertices_m = np.concatenate([mesh.vertices, mesh.vertices + apart_m])
+    return trimesh.Trimesh(vertices_m, np.concatenate([mesh.faces, mesh.faces + len(mesh.vertices)]), process=False)
+
+
 def upper_weight(z_m: torch.Tensor) -> torch.Tensor:
     """Return the upper bone's skin weight at a height."""
     return ((z_m - 0.7) / 0.2).clamp(0, 1)

@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import torch
 
-from hnerf.asset.correctives import correctives_of, frame_surfaces
+from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.avatar.surface import step_to_surface
 from tests.asset.figure import bending_body, posed_with_displacements, upright_column
@@ -36,16 +36,31 @@ def test_displacements_are_turned_by_the_skinning() -> None:
     np.testing.assert_allclose(posed_with_displacements(clothed, moved_m), surfaces_m, atol=1e-6)
 
 
-def test_one_shape_holds_displacements_that_are_multiples_of_it() -> None:
+def rebuilt(found: Correctives) -> np.ndarray:
+    """Return the displacements (n, V, 3) that shapes and weights stand for."""
+    return np.einsum("nk,kvd->nvd", found.weights, found.offsets_m)
+
+
+def test_displacements_that_are_multiples_of_a_shape_by_hand() -> None:
+    """The largest, -2, has weight 1 of its shape; the other sign, 1, is half of the opposite shape, whose greatest
+    weight is then 1."""
     shape_m = np.array([[0.01, 0, 0], [0, -0.02, 0]])
     found = correctives_of(np.stack([shape_m, -2 * shape_m, 0 * shape_m]).astype(np.float32), 1)
-    np.testing.assert_allclose(np.abs(found.weights[:, 0]), [0.5, 1, 0], atol=1e-6)
-    np.testing.assert_allclose(found.weights[1, 0] * found.offsets_m[0], -2 * shape_m, atol=1e-7)
+    np.testing.assert_allclose(found.weights, [[0, 1], [1, 0], [0, 0]], atol=1e-6)
+    np.testing.assert_allclose(found.offsets_m, [-2 * shape_m, shape_m], atol=1e-7)
+
+
+def test_weights_are_from_0_to_1_and_rebuild_all_components() -> None:
+    moved_m = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
+    found = correctives_of(moved_m, 5)
+    assert found.weights.shape == (5, 6)
+    assert (found.weights.min(), found.weights.max()) == (0, 1)
+    np.testing.assert_allclose(rebuilt(found), moved_m, atol=1e-5)
 
 
 def test_shapes_leave_the_least_squared_displacement() -> None:
-    """Two orthogonal shapes of 3 and 1 cm; the one that is kept is the larger."""
+    """Two orthogonal components of 3 and 1 cm; the one that is kept is the larger."""
     moved_m = np.array([[[0.03, 0, 0]], [[0, 0.01, 0]]], np.float32)
-    found = correctives_of(moved_m, 1)
-    np.testing.assert_allclose(np.einsum("nk,kvd->nvd", found.weights, found.offsets_m)[:, 0, 1], 0, atol=1e-7)
-    assert correctives_of(moved_m, 8).weights.shape == (2, 2)
+    np.testing.assert_allclose(rebuilt(correctives_of(moved_m, 1))[:, 0], [[0.03, 0, 0], [0, 0, 0]], atol=1e-7)
+    assert correctives_of(moved_m, 8).weights.shape == (2, 3)
+    assert correctives_of(moved_m, 0).offsets_m.shape == (0, 1, 3)

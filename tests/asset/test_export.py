@@ -3,10 +3,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from pxr import Usd
 
 from hnerf.asset.export import export_asset
 from hnerf.avatar.surface import surface_in_pose
 from hnerf.config import AssetSettings
+from hnerf.render.motion import Motion, select_poses
 from tests.asset.figure import bending_body, capture
 from tests.asset.stand_in import CLOTHING_M, StandInAvatar
 
@@ -21,11 +23,30 @@ def test_surface_is_the_grown_body() -> None:
     assert upper_m == pytest.approx([0.15 + CLOTHING_M, 0.15 + CLOTHING_M, 1.6 + CLOTHING_M], abs=0.002)
 
 
-def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path) -> None:
-    report = export_asset(capture(), StandInAvatar(bending_body()), SMALL, tmp_path)
+FILES = {"avatar.usda", "avatar_24.usda", "avatar_30.usda", "avatar.usdz", "avatar_cache.usdz", "avatar.glb"}
+FILES |= {"avatar_game.glb", "avatar.bvh", "avatar/texture.png"}
+FILES |= {f"avatar/{name}.usdc" for name in ("geometry", "look", "cameras", "rig_full", "rig_game")}
+FILES |= {f"avatar/motion_{name}.usdc" for name in ("captured", "captured_24", "captured_30", "nod")}
+
+
+def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))  # the capture has no pixels for a viewer
+    monkeypatch.setattr("hnerf.asset.report.TURNS", 2)
+    nod = Motion(select_poses(bending_body(), (4, 5)), 25.0, "z")
+    report = export_asset(capture(), StandInAvatar(bending_body()), SMALL, tmp_path, "0123", {"nod": nod})
     assert json.loads((tmp_path / "report.json").read_text()) == report
-    assert set(report["bytes"]) == {"avatar.usdz", "avatar_cache.usdz", "avatar.glb"}
+    assert set(report["bytes"]) == FILES
+    assert report["viewer"].startswith("no viewer.html: three.js is not installed")
+    page = (tmp_path / "report.html").read_text()
+    assert report["viewer"] in page and 'href="viewer.html"' not in page
+    assert page.count("<img") == 2 + 4 + 2  # turntable, surface, texture
     assert report["mesh"]["watertight"] and report["mesh"]["faces"] <= 2000
     assert report["mesh"]["height_m"] == pytest.approx(1.62, abs=0.005)
-    assert (report["frames"], report["joints"], report["cameras"]) == (4, 2, 1)
-    assert report["validation"]["avatar.usdz"]["warnings"] == []
+    assert (report["frames"], report["joints"], report["cameras"]) == (4, 3, 1)
+    assert report["rigs"]["game"]["influences"] == 2 and report["rigs"]["game"]["moved_max_mm"] < 0.01
+    assert report["motions"]["nod"] == {"fps": 25.0, "poses": 2}
+    assert report["motions"]["captured_30"] == {"fps": 30, "poses": 16}
+    for name in ("avatar.usdz", "avatar.usda"):
+        assert (report["validation"][name]["variants"], report["validation"][name]["warnings"]) == (8, [])
+    stage = Usd.Stage.Open(str(tmp_path / "avatar.usda"))
+    assert stage.GetDefaultPrim().GetAssetInfoByKey("captureDigest") == "0123"

@@ -1,59 +1,148 @@
+import json
+import os
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pygltflib
+import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from hnerf.asset.glb import write_glb
 from hnerf.asset.staging import StagedAvatar
 from tests.asset.figure import FRAMES
 
+KHRONOS = """
+const fs = require("fs"), validator = require("gltf-validator");
+validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[1])))
+  .then(report => console.log(JSON.stringify(report.issues)));
+"""
+TYPES = {5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+
+
+@pytest.fixture(scope="module", params=["full", "game"])
+def rig(request: pytest.FixtureRequest) -> str:
+    """Return the name of a rig."""
+    return str(request.param)
+
+
+@pytest.fixture(scope="module")
+def glb(rig: str, staged: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the file of a rig."""
+    path = tmp_path_factory.mktemp("glb") / "avatar.glb"
+    write_glb(path, staged, staged.rigs[rig])
+    return path
+
 
 def accessor(document: pygltflib.GLTF2, index: int) -> np.ndarray:
-    """Return the float32 numbers of an accessor."""
+    """Return the numbers of an accessor."""
     item = document.accessors[index]
     view = document.bufferViews[item.bufferView]
     data = document.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
-    return np.frombuffer(data, np.float32).reshape(item.count, -1)
+    return np.frombuffer(data, TYPES[item.componentType]).reshape(item.count, -1)
 
 
-def test_another_reader_finds_mesh_texture_and_joints(staged: StagedAvatar, tmp_path: Path) -> None:
-    write_glb(tmp_path / "avatar.glb", staged, 10.0)
-    scene = trimesh.load_scene(tmp_path / "avatar.glb")
+def played(document: pygltflib.GLTF2, key: int) -> np.ndarray:
+    """Return the mesh's points (N, 3) at a key of the first animation, as the glTF specification skins them."""
+    nodes = document.nodes
+    place = {n: (np.array(node.translation or [0, 0, 0]), np.array(node.rotation or [0, 0, 0, 1.0]))
+             for n, node in enumerate(nodes)}  # fmt: skip
+    weights = np.array(document.meshes[0].weights)
+    animation = document.animations[0]
+    for channel in animation.channels:
+        output = accessor(document, animation.samplers[channel.sampler].output)
+        node, path = channel.target.node, channel.target.path
+        if path == "weights":
+            weights = output.reshape(-1, len(weights))[key]
+        else:
+            kept = place[node]
+            place[node] = (output[key], kept[1]) if path == "translation" else (kept[0], output[key])
+    world: dict[int, np.ndarray] = {}
+
+    def visit(node: int, above: np.ndarray) -> None:
+        own = np.eye(4)
+        own[:3, :3], own[:3, 3] = Rotation.from_quat(place[node][1]).as_matrix(), place[node][0]
+        world[node] = above @ own
+        for child in nodes[node].children or []:
+            visit(child, world[node])
+
+    for node in document.scenes[0].nodes:
+        visit(node, np.eye(4))
+    (primitive,) = document.meshes[0].primitives
+    points = accessor(document, primitive.attributes.POSITION).astype(float)
+    for weight, target in zip(weights, primitive.targets, strict=True):
+        points = points + weight * accessor(document, target["POSITION"])
+    inverse = accessor(document, document.skins[0].inverseBindMatrices).reshape(-1, 4, 4).swapaxes(1, 2)
+    joints = np.stack([world[j] @ m for j, m in zip(document.skins[0].joints, inverse, strict=True)])
+    moved = np.zeros_like(points)
+    for group in (0, 1):
+        if getattr(primitive.attributes, f"JOINTS_{group}", None) is None:
+            continue
+        index = accessor(document, getattr(primitive.attributes, f"JOINTS_{group}"))
+        share = accessor(document, getattr(primitive.attributes, f"WEIGHTS_{group}"))
+        blended = (share[..., None, None] * joints[index]).sum(1)
+        moved += (blended[:, :3, :3] @ points[..., None])[..., 0] + blended[:, :3, 3]
+    return moved
+
+
+def test_gltf_skins_as_we_do(glb: Path, staged: StagedAvatar) -> None:
+    document = pygltflib.GLTF2.load(str(glb))
+    vertex = np.zeros(len(staged.uvs), int)
+    vertex[staged.face_uvs] = staged.faces
+    for key, expected in enumerate(staged.points_m):
+        np.testing.assert_allclose(played(document, key), expected[vertex], atol=1e-5)
+
+
+def test_another_reader_finds_mesh_texture_and_joints(glb: Path, rig: str, staged: StagedAvatar) -> None:
+    scene = trimesh.load_scene(glb)
     (mesh,) = scene.geometry.values()
     np.testing.assert_allclose(np.asarray(mesh.triangles), staged.rest_points_m[staged.faces], atol=1e-6)
     np.testing.assert_array_equal(np.asarray(mesh.visual.material.baseColorTexture), staged.texture)
     corners = mesh.visual.uv[mesh.faces]  # trimesh turns v up again
     np.testing.assert_allclose(corners, staged.uvs[staged.face_uvs], atol=1e-6)
-    document = pygltflib.GLTF2.load(str(tmp_path / "avatar.glb"))
+    document = pygltflib.GLTF2.load(str(glb))
     inverse_bind = accessor(document, document.skins[0].inverseBindMatrices).reshape(-1, 4, 4).swapaxes(1, 2)
-    for name, matrix in zip(staged.joint_names, inverse_bind, strict=True):
+    for name, matrix in zip(staged.rigs[rig].skeleton.names, inverse_bind, strict=True):
         assert np.abs(matrix @ scene.graph.get(name)[0] - np.eye(4)).max() < 1e-6
 
 
-def test_motion_is_in_seconds_from_the_first_frame(staged: StagedAvatar, tmp_path: Path) -> None:
-    write_glb(tmp_path / "avatar.glb", staged, 10.0)
-    document = pygltflib.GLTF2.load(str(tmp_path / "avatar.glb"))
-    animation = document.animations[0]
+def test_motion_is_in_seconds_from_the_first_frame(glb: Path) -> None:
+    document = pygltflib.GLTF2.load(str(glb))
+    (animation,) = document.animations  # other rates would be the same again
+    assert animation.name == "captured"
     assert [(c.target.node, c.target.path) for c in animation.channels] == [
         (0, "translation"),
         (0, "rotation"),
-        (1, "rotation"),
-        (2, "weights"),
-    ]
+        (1, "translation"),
+        (2, "rotation"),
+        (3, "weights"),
+    ]  # the root turns, so that the pelvis need not
     np.testing.assert_allclose(accessor(document, animation.samplers[0].input)[:, 0], [0, 0.1, 0.2, 0.5])
     translation = accessor(document, animation.samplers[0].output)
-    # World (0.1 frame, 2, 0.5) is stage (0.1 frame, 0.5, -2).
-    np.testing.assert_allclose(translation, [[0.1 * f, 0.5, -2] for f in FRAMES], atol=1e-6)
+    # World (0.1 frame, 2, floor) is stage (0.1 frame, floor, -2).
+    np.testing.assert_allclose(translation[:, [0, 2]], [[0.1 * f, -2] for f in FRAMES], atol=1e-6)
+    assert len(np.unique(translation[:, 1])) == 1
 
 
-def test_correctives_are_morph_targets_with_a_weight_a_frame(staged: StagedAvatar, tmp_path: Path) -> None:
-    write_glb(tmp_path / "avatar.glb", staged, 10.0)
-    document = pygltflib.GLTF2.load(str(tmp_path / "avatar.glb"))
+def test_correctives_are_morph_targets_with_a_weight_a_frame(glb: Path, staged: StagedAvatar) -> None:
+    document = pygltflib.GLTF2.load(str(glb))
     (primitive,) = document.meshes[0].primitives
     vertex = np.zeros(len(staged.uvs), int)
     vertex[staged.face_uvs] = staged.faces
     for target, shape_m in zip(primitive.targets, staged.shapes_m, strict=True):
         np.testing.assert_allclose(accessor(document, target["POSITION"]), shape_m[vertex], atol=1e-7)
     weights = accessor(document, document.animations[0].samplers[-1].output)
-    np.testing.assert_allclose(weights.reshape(len(FRAMES), 2), staged.shape_weights)
+    expected = staged.rigs["full"].motions["captured"].shape_weights
+    np.testing.assert_allclose(weights.reshape(len(FRAMES), -1), expected)
+
+
+def test_the_khronos_validator_finds_nothing(glb: Path) -> None:
+    """Needs `npm install gltf-validator` in a folder above, or one that NODE_PATH names."""
+    node = shutil.which("node")
+    if not node or subprocess.run([node, "-e", "require('gltf-validator')"], capture_output=True).returncode:
+        pytest.skip(f"no npm package gltf-validator (NODE_PATH={os.environ.get('NODE_PATH', '')})")
+    found = subprocess.run([node, "-e", KHRONOS, str(glb)], capture_output=True, text=True, check=True)
+    issues = json.loads(found.stdout)
+    assert (issues["numErrors"], issues["numWarnings"], issues["messages"]) == (0, 0, [])

@@ -8,16 +8,16 @@ from hnerf.asset.correctives import correctives_of
 from hnerf.asset.staging import StagedAvatar, stage_avatar, stage_from_world
 from hnerf.asset.texture import UvLayout
 from hnerf.body.fit_result import BodyFit
-from tests.asset.figure import bending_body, column_rig
+from tests.asset.figure import FRAMES, bending_body, column_rig
 
 LAYOUT = UvLayout(np.zeros((1, 2), np.float32), np.zeros((1, 3), np.int64))
 TEXTURE = np.zeros((4, 4, 3), np.uint8)
 
 
-def staged_without_shapes(clothed: BodyFit, up: str) -> StagedAvatar:
-    """Return a body staged as it is skinned, without correctives."""
+def staged_without_shapes(clothed: BodyFit, up: str = "z") -> StagedAvatar:
+    """Return a body staged as it is skinned, without correctives, at 10 frames a second."""
     none = correctives_of(np.zeros((len(clothed.frames), len(clothed.rig.vertices_m), 3), np.float32), 0)
-    return stage_avatar(clothed, clothed.vertices_m().numpy(), none, LAYOUT, TEXTURE, up)
+    return stage_avatar(clothed, clothed.vertices_m().numpy(), none, LAYOUT, TEXTURE, up, 10.0, "identity")
 
 
 def test_z_up_becomes_y_up() -> None:
@@ -26,19 +26,64 @@ def test_z_up_becomes_y_up() -> None:
 
 
 def test_joints_by_hand() -> None:
-    """Place the root at (1, 2, 3), turned; the upper joint bends 90 degrees about the body's x."""
+    """Place the body at (1, 2, 3) in the world; the upper joint bends 90 degrees about the body's x."""
     theta = torch.tensor([[[0.0, 0, 0], [torch.pi / 2, 0, 0]]])
     root = torch.eye(4)[None].clone()
     root[0, :3, 3] = torch.tensor([1.0, 2, 3])
-    staged = staged_without_shapes(BodyFit(column_rig(), (7,), theta, root), "z")
-    np.testing.assert_allclose(staged.rest_joints_m, [[0.0, 0.0, 0.0], [0.0, 0.8, 0.0]], atol=1e-7)
-    np.testing.assert_allclose(staged.translations_m[0], [[1.0, 3.0, -2.0], [0.0, 0.8, 0.0]], atol=1e-6)
-    np.testing.assert_allclose(staged.quaternions[0, 0], [0, 0, 0, 1], atol=1e-7)
+    staged = staged_without_shapes(BodyFit(column_rig(), (7,), theta, root))
+    full = staged.rigs["full"]
+    assert full.skeleton.names == ("root", "pelvis", "upper_L")
+    np.testing.assert_allclose(full.skeleton.positions_m, [[0, 0, 0], [0, 0, 0], [0, 0.8, 0]], atol=1e-7)
+    motion = full.motions["captured"]
+    # The root stands below the pelvis on the floor, which is the lowest point of all: z = 3, stage y = 3.
+    np.testing.assert_allclose(motion.translations_m[0], [[1, 3, -2], [0, 0, 0], [0, 0.8, 0]], atol=1e-6)
+    np.testing.assert_allclose(motion.quaternions[0, :2], [[0, 0, 0, 1]] * 2, atol=1e-7)
     # x is common to both frames, so the bend stays a quarter turn about +x.
-    np.testing.assert_allclose(staged.quaternions[0, 1], [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-6)
+    np.testing.assert_allclose(motion.quaternions[0, 2], [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-6)
     # The column's top centre (0, 0, 1.6) swings to (0, -0.8, 0.8) in the body: (1, 1.2, 3.8) in the world.
     top = staged.points_m[0][np.argmin(np.linalg.norm(staged.rest_points_m - [0, 1.6, 0], axis=1))]
     np.testing.assert_allclose(top, [1, 3.8, -1.2], atol=1e-5)
+
+
+def test_the_soles_are_on_the_ground_and_the_pelvis_above_the_origin() -> None:
+    body = bending_body()
+    away = torch.tensor([0.3, -0.2, -1.1])
+    rig = dataclasses.replace(body.rig, vertices_m=body.rig.vertices_m + away, joints_m=body.rig.joints_m + away)
+    staged = staged_without_shapes(dataclasses.replace(body, rig=rig))
+    np.testing.assert_allclose(staged.rest_points_m[:, 1].min(), 0, atol=1e-6)
+    np.testing.assert_allclose(staged.rigs["full"].skeleton.positions_m[:2], 0, atol=1e-6)
+
+
+def test_both_rigs_move_the_surface_as_the_body_does(staged: StagedAvatar) -> None:
+    for rig in staged.rigs.values():
+        for found_m, true_m in zip(rig.surfaces_m("captured", staged.rest), staged.points_m, strict=True):
+            np.testing.assert_allclose(found_m, true_m, atol=1e-5)
+
+
+def test_other_rates_are_the_same_motion_at_whole_frames(staged: StagedAvatar) -> None:
+    """Frames 3 to 8 at 10 a second are 0.3 to 0.8 s: codes 8 to 19 of 24, and 9 to 24 of 30, which has every instant of
+    the capture."""
+    motions = staged.rigs["full"].motions
+    np.testing.assert_array_equal(motions["captured"].codes, FRAMES)
+    np.testing.assert_array_equal(motions["captured_24"].codes, np.arange(8, 20))
+    np.testing.assert_array_equal(motions["captured_30"].codes, np.arange(9, 25))
+    surfaces_m = list(staged.rigs["full"].surfaces_m("captured_30", staged.rest))
+    for frame, true_m in zip(FRAMES, staged.points_m, strict=True):
+        np.testing.assert_allclose(surfaces_m[3 * frame - 9], true_m, atol=1e-5)
+
+
+def test_a_vertex_has_the_colour_of_its_texel(staged: StagedAvatar) -> None:
+    """One triangle on a texture of 4 x 4 whose red is the column and green the row from the top."""
+    texture = np.stack([*np.meshgrid(range(4), range(4)), np.zeros((4, 4))], -1).astype(np.uint8)
+    triangle = dataclasses.replace(
+        staged,
+        rest_points_m=np.zeros((3, 3)),
+        faces=np.array([[2, 0, 1]]),
+        uvs=np.array([[0.1, 0.9], [0.9, 0.9], [1.0, 0.0]]),
+        face_uvs=np.array([[0, 1, 2]]),
+        texture=texture,
+    )
+    np.testing.assert_array_equal(triangle.vertex_colours, [[3, 0, 0], [3, 3, 0], [0, 0, 0]])
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
@@ -48,6 +93,10 @@ def test_quaternions_do_not_jump(up: str) -> None:
     root = torch.eye(4).repeat(30, 1, 1)
     root[:, 0, 0], root[:, 0, 1], root[:, 1, 0], root[:, 1, 1] = turns.cos(), -turns.sin(), turns.sin(), turns.cos()
     spin = dataclasses.replace(body, frames=tuple(range(30)), theta=torch.zeros(30, 2, 3), root=root)
-    q = staged_without_shapes(spin, up).quaternions
-    # A step is 4 pi / 29 = 0.433 rad; neighbours differ by half of that on the sphere.
-    np.testing.assert_allclose((q[1:, 0] * q[:-1, 0]).sum(-1), np.cos(0.433 / 2), atol=1e-3)
+    rig = staged_without_shapes(spin, up).rigs["full"]
+    q = rig.motions["captured"].quaternions
+    along = (q[1:] * q[:-1]).sum(-1)
+    assert along.min() > 0.9
+    if up == "z":  # all of it is the root's: 4 pi / 29 = 0.433 rad a step, half of that on the sphere
+        np.testing.assert_allclose(along[:, 0], np.cos(0.433 / 2), atol=1e-3)
+        np.testing.assert_allclose(along[:, 1], 1, atol=1e-9)

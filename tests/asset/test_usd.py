@@ -1,16 +1,10 @@
-import dataclasses
-import time
-from collections.abc import Callable
-from pathlib import Path
-from zipfile import ZipFile
-
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom
 
-from hnerf.asset.staging import StagedAvatar, stage_from_world
-from hnerf.asset.usd import define_camera, write_cache, write_skinned
-from tests.asset.figure import FRAMES, side_camera
+from hnerf.asset.staging import stage_from_world
+from hnerf.asset.usd import define_camera
+from tests.asset.figure import side_camera
 
 
 def test_camera_numbers() -> None:
@@ -37,71 +31,3 @@ def test_camera_projects_where_ours_does() -> None:
     )
     pixel = np.array([(ndc[0] + 1) / 2 * 640 - 0.5, (1 - ndc[1]) / 2 * 480 - 0.5])
     np.testing.assert_allclose(pixel, ours.project(world)[0], atol=1e-4)
-
-
-def with_shapes(mesh: UsdGeom.Mesh, motion: UsdSkel.AnimQuery, frame: int) -> np.ndarray:
-    """Return the points of a mesh at rest with its blend shapes, by the weights of the motion."""
-    weights = dict(zip(motion.GetBlendShapeOrder(), motion.ComputeBlendShapeWeights(frame), strict=True))
-    binding = UsdSkel.BindingAPI(mesh.GetPrim())
-    points = np.array(mesh.GetPointsAttr().Get())
-    targets = binding.GetBlendShapeTargetsRel().GetTargets()
-    for name, path in zip(binding.GetBlendShapesAttr().Get(), targets, strict=True):
-        shape = UsdSkel.BlendShape(mesh.GetPrim().GetStage().GetPrimAtPath(path))
-        points += weights[name] * np.array(shape.GetOffsetsAttr().Get())
-    return points
-
-
-@pytest.mark.parametrize("write", [write_skinned, write_cache])
-def test_the_same_avatar_is_the_same_bytes_at_any_time(
-    write: Callable[..., None], staged: StagedAvatar, tmp_path: Path
-) -> None:
-    """ZIP counts in steps of two seconds."""
-    for name in ("one", "two"):
-        write(tmp_path / f"{name}.usdz", staged, [side_camera()], 10.0)
-        time.sleep(2.0 if name == "one" else 0)
-    assert (tmp_path / "one.usdz").read_bytes() == (tmp_path / "two.usdz").read_bytes()
-    with ZipFile(tmp_path / "one.usdz") as package:
-        assert package.testzip() is None
-        assert {entry.date_time for entry in package.infolist()} == {(1980, 1, 1, 0, 0, 0)}
-
-
-def test_usd_skins_as_we_do(staged: StagedAvatar, tmp_path: Path) -> None:
-    write_skinned(tmp_path / "avatar.usdz", staged, [side_camera()], 10.0)
-    stage = Usd.Stage.Open(str(tmp_path / "avatar.usdz"))
-    root = UsdSkel.Root(stage.GetPrimAtPath("/Avatar/Body"))
-    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/Avatar/Body/Surface"))
-    cache = UsdSkel.Cache()
-    cache.Populate(root, Usd.PrimDefaultPredicate)
-    skinning = cache.GetSkinningQuery(mesh.GetPrim())
-    skeleton = cache.GetSkelQuery(UsdSkel.Skeleton(stage.GetPrimAtPath("/Avatar/Body/Skeleton")))
-    assert skeleton.GetAnimQuery().GetJointTransformTimeSamples() == list(FRAMES)
-    for frame, expected in zip(FRAMES, staged.points_m, strict=True):
-        points = Vt.Vec3fArray.FromNumpy(with_shapes(mesh, skeleton.GetAnimQuery(), frame))
-        assert skinning.ComputeSkinnedPoints(skeleton.ComputeSkinningTransforms(frame), points, frame)
-        np.testing.assert_allclose(np.array(points), expected, atol=1e-5)
-        extent = np.array(root.GetExtentAttr().Get(frame))
-        np.testing.assert_allclose(extent, [expected.min(0), expected.max(0)], atol=1e-5)
-
-
-def test_stage_says_its_units_time_and_names(staged: StagedAvatar, tmp_path: Path) -> None:
-    cameras = [dataclasses.replace(side_camera(), name=name) for name in ("cam 1", "cam.1", "01")]
-    write_skinned(tmp_path / "avatar.usdz", staged, cameras, 12.5)
-    stage = Usd.Stage.Open(str(tmp_path / "avatar.usdz"))
-    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1.0)
-    assert (stage.GetTimeCodesPerSecond(), stage.GetFramesPerSecond()) == (12.5, 12.5)
-    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (3.0, 8.0)
-    prims = stage.GetPrimAtPath("/Avatar/Cameras").GetChildren()
-    assert [p.GetName() for p in prims] == ["cam_1", "cam_1_", "_01"]
-    assert [p.GetDisplayName() for p in prims] == ["cam 1", "cam.1", "01"]
-    skeleton = UsdSkel.Skeleton(stage.GetPrimAtPath("/Avatar/Body/Skeleton"))
-    assert list(skeleton.GetJointsAttr().Get()) == ["root", "root/upper_L"]
-    assert list(skeleton.GetJointNamesAttr().Get()) == ["root", "upper.L"]
-
-
-def test_cache_holds_the_posed_points(staged: StagedAvatar, tmp_path: Path) -> None:
-    write_cache(tmp_path / "avatar_cache.usdz", staged, [], 10.0)
-    stage = Usd.Stage.Open(str(tmp_path / "avatar_cache.usdz"))
-    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/Avatar/Surface"))
-    assert mesh.GetPointsAttr().GetTimeSamples() == list(FRAMES)
-    np.testing.assert_array_equal(np.array(mesh.GetPointsAttr().Get(8)), staged.points_m[3])
-    assert len(mesh.GetFaceVertexIndicesAttr().GetTimeSamples()) == 0

@@ -1,31 +1,56 @@
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
+from hnerf.asset.package import AssetInfo, write_package, write_usdz
 from hnerf.asset.staging import StagedAvatar
-from hnerf.asset.usd import write_cache, write_skinned
 from hnerf.asset.validation import data_defects, validate_package
 from hnerf.errors import InvalidAsset
 from tests.asset.figure import side_camera
 
+INFO = AssetInfo("column", "1", "", "")
+BODY = "/Avatar/Body"
+
+
+@pytest.fixture(scope="module")
+def package(staged: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the package and `avatar.usdz`."""
+    out = tmp_path_factory.mktemp("package")
+    write_package(out, staged, [side_camera()], 10.0, INFO)
+    write_usdz(out / "avatar.usdz", staged, [side_camera()], 10.0, INFO)
+    return out
+
 
 @pytest.fixture
-def stage(staged: StagedAvatar, tmp_path: Path) -> Usd.Stage:
-    write_skinned(tmp_path / "avatar.usdz", staged, [side_camera()], 10.0)
-    return Usd.Stage.Open(str(tmp_path / "avatar.usdz"))
+def stage(package: Path) -> Usd.Stage:
+    """Return a stage whose session layer can be damaged, and the metadata of its root layer."""
+    layer = Sdf.Layer.CreateAnonymous()
+    whole = Sdf.Layer.FindOrOpen(str(package / "avatar.usdz"))
+    layer.TransferContent(whole)
+    return Usd.Stage.Open(layer)
 
 
 def mesh(stage: Usd.Stage) -> UsdGeom.Mesh:
     return UsdGeom.Mesh(stage.GetPrimAtPath("/Avatar/Body/Surface"))
 
 
-def change(attribute: Usd.Attribute, index: int, value: object) -> None:
-    values = attribute.Get()
+def skeleton(stage: Usd.Stage) -> UsdSkel.Skeleton:
+    return UsdSkel.Skeleton(stage.GetPrimAtPath(f"{BODY}/Skeleton"))
+
+
+def motion(stage: Usd.Stage) -> UsdSkel.Animation:
+    return UsdSkel.Animation(stage.GetPrimAtPath(f"{BODY}/Motion/full"))
+
+
+def change(attribute: Usd.Attribute, index: int, value: object, time: float | None = None) -> None:
+    at = Usd.TimeCode.Default() if time is None else Usd.TimeCode(time)
+    values = attribute.Get(at)
     values[index] = value
-    attribute.Set(values)
+    attribute.Set(values, at)
 
 
 def heavy_weight(stage: Usd.Stage) -> None:
@@ -33,7 +58,7 @@ def heavy_weight(stage: Usd.Stage) -> None:
 
 
 def joint_out_of_range(stage: Usd.Stage) -> None:
-    change(UsdSkel.BindingAPI(mesh(stage)).GetJointIndicesAttr(), 0, 2)  # there are two joints
+    change(UsdSkel.BindingAPI(mesh(stage)).GetJointIndicesAttr(), 0, 3)  # there are three joints
 
 
 def point_not_a_number(stage: Usd.Stage) -> None:
@@ -67,12 +92,87 @@ def uvs_missing(stage: Usd.Stage) -> None:
 
 
 def dotted_joint(stage: Usd.Stage) -> None:
-    UsdSkel.Skeleton(stage.GetPrimAtPath("/Avatar/Body/Skeleton")).GetJointsAttr().Set(["root", "root/upper.L"])
+    skeleton(stage).GetJointsAttr().Set(["root", "root/pelvis", "root/pelvis/upper.L"])
 
 
 def stretched_quaternion(stage: Usd.Stage) -> None:
-    rotations = UsdSkel.Animation(stage.GetPrimAtPath("/Avatar/Body/Skeleton/Motion")).GetRotationsAttr()
-    rotations.Set(Vt.QuatfArray([Gf.Quatf(2, 0, 0, 0)] * 2), 5.0)
+    motion(stage).GetRotationsAttr().Set(Vt.QuatfArray([Gf.Quatf(2, 0, 0, 0)] * 3), 5.0)
+
+
+def joint_without_transform(stage: Usd.Stage) -> None:
+    motion(stage).GetRotationsAttr().Set(Vt.QuatfArray([Gf.Quatf(1, 0, 0, 0)] * 2), 5.0)
+
+
+def sheared_bind(stage: Usd.Stage) -> None:
+    change(skeleton(stage).GetBindTransformsAttr(), 2, Gf.Matrix4d(2))
+
+
+def rest_elsewhere(stage: Usd.Stage) -> None:
+    change(skeleton(stage).GetRestTransformsAttr(), 2, Gf.Matrix4d(1))
+
+
+def no_ground_root(stage: Usd.Stage) -> None:
+    skeleton(stage).GetJointsAttr().Set(["hips", "hips/spine", "hips/spine/upper_L"])
+
+
+def nameless_rest_pose(stage: Usd.Stage) -> None:
+    skeleton(stage).GetPrim().SetCustomDataByKey("restPose", "")
+
+
+def floating(stage: Usd.Stage) -> None:
+    points = mesh(stage).GetPointsAttr()
+    points.Set(Vt.Vec3fArray.FromNumpy((np.array(points.Get()) + np.array([0, 0.3, 0])).astype(np.float32)))
+    extent = np.array(mesh(stage).GetExtentAttr().Get()) + np.array([0, 0.3, 0])
+    mesh(stage).GetExtentAttr().Set(Vt.Vec3fArray.FromNumpy(extent.astype(np.float32)))
+
+
+def one_eye(stage: Usd.Stage) -> None:
+    skeleton(stage).GetJointsAttr().Set(["root", "root/pelvis", "root/pelvis/eye_L"])
+
+
+def short_shape(stage: Usd.Stage) -> None:
+    shape = UsdSkel.BlendShape(stage.GetPrimAtPath(f"{BODY}/Surface/corrective_01"))
+    shape.GetOffsetsAttr().Set([Gf.Vec3f(0)] * 5)
+
+
+def shape_without_target(stage: Usd.Stage) -> None:
+    UsdSkel.BindingAPI(mesh(stage)).GetBlendShapesAttr().Set(["smile"])
+
+
+def negative_weight(stage: Usd.Stage) -> None:
+    change(motion(stage).GetBlendShapeWeightsAttr(), 0, -0.5, 5.0)
+
+
+def no_colours(stage: Usd.Stage) -> None:
+    mesh(stage).GetDisplayColorAttr().Set([Gf.Vec3f(1)])
+
+
+def no_kind(stage: Usd.Stage) -> None:
+    Usd.ModelAPI(stage.GetDefaultPrim()).SetKind("assembly")
+
+
+def no_identifier(stage: Usd.Stage) -> None:
+    stage.GetDefaultPrim().ClearAssetInfoByKey("identifier")
+
+
+def small_hint(stage: Usd.Stage) -> None:
+    UsdGeom.ModelAPI(stage.GetDefaultPrim()).SetExtentsHint([Gf.Vec3f(0), Gf.Vec3f(1)])
+
+
+def no_hint(stage: Usd.Stage) -> None:
+    UsdGeom.ModelAPI(stage.GetDefaultPrim()).GetExtentsHintAttr().Block()
+
+
+def two_rates(stage: Usd.Stage) -> None:
+    stage.SetFramesPerSecond(24)
+
+
+def backwards(stage: Usd.Stage) -> None:
+    stage.SetEndTimeCode(-1)
+
+
+def no_default_prim(stage: Usd.Stage) -> None:
+    stage.ClearDefaultPrim()
 
 
 @pytest.mark.parametrize(
@@ -89,26 +189,73 @@ def stretched_quaternion(stage: Usd.Stage) -> None:
         (uvs_missing, "texture coordinates for"),
         (dotted_joint, "joint names are not identifiers"),
         (stretched_quaternion, "quaternions are not finite or not of unit length"),
+        (joint_without_transform, "does not have one transform per joint"),
+        (sheared_bind, "bindTransforms are no rotations"),
+        (rest_elsewhere, "restTransforms do not compose to bindTransforms"),
+        (no_ground_root, "no root on the ground with a pelvis below it"),
+        (nameless_rest_pose, "does not name its rest pose"),
+        (floating, "its lowest point at rest is at height 0.3 m"),
+        (one_eye, "skin follows one eye and not the other"),
+        (short_shape, "corrective_01: offsets are not finite or not one a point"),
+        (shape_without_target, "1 blend shapes but 3 targets"),
+        (negative_weight, "blend shape weights are not one a shape from 0 to 1 at time 5"),
+        (no_colours, "1 display colours for its points"),
+        (no_kind, "kind is assembly, not component"),
+        (no_identifier, "assetInfo has no identifier"),
+        (small_hint, "extentsHint does not contain /Avatar/Body at time"),
+        (no_hint, "has no extentsHint"),
+        (two_rates, "timeCodesPerSecond and framesPerSecond differ"),
+        (backwards, "ends before it starts"),
+        (no_default_prim, "has no default prim"),
     ],
 )
 def test_each_defect_is_named(stage: Usd.Stage, damage: Callable[[Usd.Stage], None], message: str) -> None:
     assert data_defects(stage) == []
-    stage.SetEditTarget(stage.GetSessionLayer() if damage is not centimetres else stage.GetRootLayer())
+    of_root_layer = (centimetres, two_rates, backwards, no_default_prim, no_identifier)
+    stage.SetEditTarget(stage.GetRootLayer() if damage in of_root_layer else stage.GetSessionLayer())
     damage(stage)
     assert message in "; ".join(data_defects(stage))
 
 
-def test_what_we_write_passes_every_validator(staged: StagedAvatar, tmp_path: Path) -> None:
-    write_skinned(tmp_path / "avatar.usdz", staged, [side_camera()], 10.0)
-    write_cache(tmp_path / "avatar_cache.usdz", staged, [side_camera()], 10.0)
-    for name in ("avatar.usdz", "avatar_cache.usdz"):
-        report = validate_package(tmp_path / name)
+def test_a_game_rig_has_few_influences(stage: Usd.Stage) -> None:
+    stage.SetEditTarget(stage.GetSessionLayer())
+    stage.GetDefaultPrim().GetVariantSet("rig").SetVariantSelection("game")
+    assert data_defects(stage) == []
+    binding, points = UsdSkel.BindingAPI(mesh(stage)), len(mesh(stage).GetPointsAttr().Get())
+    binding.CreateJointIndicesPrimvar(False, 5).Set([0, 1, 2, 2, 2] * points)
+    binding.CreateJointWeightsPrimvar(False, 5).Set([0.2] * 5 * points)
+    assert "5 influences; the game rig has at most 4" in "; ".join(data_defects(stage))
+
+
+def test_a_motion_at_another_rate_is_at_its_whole_frames(stage: Usd.Stage) -> None:
+    stage.SetEditTarget(stage.GetSessionLayer())
+    stage.GetDefaultPrim().GetVariantSet("motion").SetVariantSelection("captured_24")
+    assert data_defects(stage) == []
+    stage.SetEditTarget(stage.GetRootLayer())
+    stage.SetTimeCodesPerSecond(12.5)
+    stage.SetFramesPerSecond(12.5)
+    assert "Motion/full: is not sampled at every frame of 24 a second" in "; ".join(data_defects(stage))
+
+
+def test_what_we_write_passes_every_validator(package: Path) -> None:
+    for name in ("avatar.usdz", "avatar.usda", "avatar_24.usda"):
+        report = validate_package(package / name)
+        assert (report["variants"], report["warnings"]) == (6, [])
         assert report["validators"] >= 30
-        assert report["warnings"] == []
 
 
-def test_an_error_of_usd_itself_raises(stage: Usd.Stage, tmp_path: Path) -> None:
+def test_a_defect_in_one_variant_says_in_which(package: Path, tmp_path: Path) -> None:
+    shutil.copytree(package, tmp_path / "copy")
+    motion = Usd.Stage.Open(str(tmp_path / "copy/avatar/motion_captured_30.usdc"))
+    UsdSkel.Animation(motion.GetPrimAtPath(f"{BODY}/Motion/game")).GetBlendShapeWeightsAttr().Set([2.0] * 3, 9.0)
+    motion.GetRootLayer().Save()
+    with pytest.raises(InvalidAsset, match=r"usda: rig=full motion=captured_30: /Avatar/Body/Motion/game: blend shape"):
+        validate_package(tmp_path / "copy/avatar.usda")
+
+
+def test_an_error_of_usd_itself_raises(package: Path, tmp_path: Path) -> None:
     """Give a loose layer without its texture beside it."""
-    stage.GetRootLayer().Export(str(tmp_path / "loose.usdc"))
+    whole = Usd.Stage.Open(str(package / "avatar.usdz"))
+    whole.GetRootLayer().Export(str(tmp_path / "loose.usdc"))
     with pytest.raises(InvalidAsset, match=r"loose\.usdc"):
         validate_package(tmp_path / "loose.usdc")

@@ -260,11 +260,12 @@ def test_nothing_is_scored_on_pixels_of_training_cameras(tmp_path: Path) -> None
 
 
 class _Page(HTMLParser):
-    """Collect headings, and everything that a browser would load or run."""
+    """Collect headings, links, and everything that a browser would load or run."""
 
     def __init__(self, text: str):
         super().__init__()
         self.headings: list[str] = []
+        self.links: list[str] = []
         self.loaded: list[str] = []
         self.tags: set[str] = set()
         self._in_heading = False
@@ -273,7 +274,8 @@ class _Page(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.add(tag)
         self._in_heading = tag == "h2"
-        self.loaded += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data", "poster")]
+        found = [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data", "poster")]
+        (self.links if tag == "a" else self.loaded).extend(found)
 
     def handle_data(self, data: str) -> None:
         if self._in_heading:
@@ -285,8 +287,10 @@ def test_report_has_every_section_and_loads_nothing(scored: Scored) -> None:
     text = (scored[0] / "subject" / "evaluation" / "report.html").read_text()
     page = _Page(text)
     galleries = ["Training views", "New views", "New poses", "Surface"]
-    assert page.headings == ["Summary", *galleries, "Training", "Findings", "Cost", "Notes"]
-    assert all(address.startswith(("data:image/", "#")) for address in page.loaded)
+    assert page.headings == ["Summary", *galleries, "Asset", "Training", "Findings", "Cost", "Notes"]
+    assert all(address.startswith("data:image/") for address in page.loaded)
+    outside = [address for address in page.links if not address.startswith("#")]
+    assert outside == ["../asset/viewer.html", "../asset/report.html"]  # from subjects/<name>/evaluation
     assert not page.tags & {"script", "link", "iframe", "object"}
     assert "://" not in text and "@import" not in text and not re.search(r"url\(", text)
 

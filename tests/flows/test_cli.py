@@ -25,6 +25,11 @@ from tests.shared_data import shared_capture
         (["stability", "absent"], "absent: no such folder"),
         (["render", "absent"], "absent: no such folder; give <store>/subjects/<name> of a finished `hnerf run`"),
         (["calibrate", "absent"], "absent: no such folder"),
+        (["export", "absent"], "absent: no such folder; give <store>/subjects/<name> of a finished `hnerf run`"),
+        (
+            ["export", ".", "--set", "asset.bones=up"],
+            "hnerf: --set asset.bones=up: asset.bones: Input should be 'along'",
+        ),
         (["run", "absent", "--preset", "best"], "best: no such preset or file; presets are "),
         (["run", "absent", "--set", "training.stepz=1"], "hnerf: --set training.stepz=1: training.stepz: Extra"),
         (["run", "absent", "--set", "training.noise=.inf"], "training.noise: Input should be a finite number"),

@@ -9,8 +9,10 @@ from prefect import get_client
 from prefect.client.schemas.filters import DeploymentFilter, DeploymentFilterName, FlowFilter, FlowFilterName
 from prefect.client.schemas.objects import FlowRun
 from prefect.deployments import run_deployment
+from prefect.exceptions import PrefectHTTPStatusError
+from prefect.states import Crashed
 
-from flows.ingest_captures import unfinished_runs
+from flows.restart import restart_crashed, unfinished_runs
 
 ROOT = Path(__file__).parent.parent.parent
 PATIENCE_S = 60.0
@@ -62,6 +64,34 @@ def test_studies_are_deployed_too(deployed: str, flow: str, what: str) -> None:
     run_deployment(f"{flow}/local", parameters=parameters, timeout=0)
     (run,) = runs_of(flow)
     assert run.parameters == parameters
+
+
+def test_forms_of_all_deployments_help_with_every_parameter(deployed: str) -> None:
+    with get_client(sync_client=True) as client:
+        found = {one.entrypoint: one for one in client.read_deployments()}
+    assert len(found) == 5
+    for deployment in found.values():
+        assert deployment.tags and deployment.parameter_openapi_schema
+        for name, parameter in deployment.parameter_openapi_schema["properties"].items():
+            assert parameter.get("description"), f"{deployment.entrypoint}: {name}"
+    watch = found["flows/ingest_captures.py:ingest_captures"].parameter_openapi_schema["properties"]  # type: ignore[index]
+    assert (watch["max_unfinished"]["minimum"], watch["max_unfinished"]["maximum"]) == (1, 1000)
+
+
+def test_values_out_of_range_are_refused_before_there_is_a_run(deployed: str) -> None:
+    with pytest.raises(PrefectHTTPStatusError, match=r"409|422"):
+        run_deployment("ingest-captures/local", parameters={"folder": "captures", "max_unfinished": 0}, timeout=0)
+
+
+def test_a_crashed_run_is_begun_again_a_few_times(deployed: str) -> None:
+    run = run_deployment("train-subject/local", parameters={"capture": "/recordings/bob"}, timeout=0)
+    counts = []
+    with get_client(sync_client=True) as client:
+        for _ in range(4):
+            client.set_flow_run_state(run.id, Crashed(), force=True)  # type: ignore[union-attr]
+            counts.append(restart_crashed(max_restarts=2))
+        assert counts == [1, 1, 0, 0]
+        assert client.read_flow_run(run.id).state_name == "Crashed"  # type: ignore[union-attr]
 
 
 def test_parameters_are_checked_before_there_is_a_run(deployed: str) -> None:

@@ -1,5 +1,6 @@
 import os
 import shutil
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +11,7 @@ from flows import ingest_captures as module
 from flows.ingest_captures import ingest_captures
 from flows.train_subject import train_subject
 from hnerf.errors import InputError
+from tasks import quarantine
 from tasks.source import read_capture
 
 
@@ -32,6 +34,7 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 
     monkeypatch.setattr(module, "run_deployment", run_deployment)
     monkeypatch.setattr(module, "unfinished_runs", lambda: 0)
+    monkeypatch.setattr(module, "restart_crashed", lambda _: 0)
     return asked
 
 
@@ -69,6 +72,7 @@ def test_a_store_that_was_deleted_trains_again(watched: Path, monkeypatch: pytes
 
     monkeypatch.setattr(module, "run_deployment", run_deployment)
     monkeypatch.setattr(module, "unfinished_runs", lambda: 0)
+    monkeypatch.setattr(module, "restart_crashed", lambda _: 0)
     look(watched)
     for record in (watched.parent / "store" / "ingested").iterdir():
         if record.name != "id":  # as if the machine had gone down before they were written
@@ -106,6 +110,76 @@ def test_a_capture_that_cannot_be_read_is_said_and_the_others_go_on(
         assert look(watched) == ["bob"]
     assert "0.jpg: cannot be read" in caplog.text
     assert look(watched) == ["ada"]
+
+
+def test_a_refused_capture_is_noted_until_it_is_changed_or_removed(
+    watched: Path, runs: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The captures themselves stay where they are."""
+    for name in ("ada", "bob"):
+        (watched / name / "images" / "locked").mkdir()
+    noted = watched / ".refused"
+
+    def refuse(path: Path) -> Any:
+        raise InputError(f"{path / 'images' / 'locked'}: cannot be read; make it readable")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(module, "read_capture", refuse)
+        assert look(watched) == []
+        text = (noted / "ada.txt").read_text()
+        assert text.startswith(
+            f"ada: refused: {watched / 'ada' / 'images' / 'locked'}: cannot be read; make it readable"
+        )
+    assert look(watched) == ["ada", "bob"]
+    assert list(noted.iterdir()) == []
+    (noted / "gone.txt").touch()
+    look(watched)
+    assert list(noted.iterdir()) == [] and (watched / "ada" / "images" / "locked").is_dir()
+
+
+def test_notes_are_not_written_through_links(watched: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (watched / ".refused").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OSError, match="is a symbolic link"):
+        quarantine.note(watched / "ada", "refused: x")
+    (watched / ".refused").unlink()
+    quarantine.note(watched / "ada", "refused: x")
+    (watched / ".refused" / "ada.txt").unlink()
+    (watched / ".refused" / "ada.txt").symlink_to(tmp_path / "elsewhere" / "file")
+    quarantine.note(watched / "ada", "refused: y")
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+def test_a_run_that_fails_is_noted_where_it_was_started_from(
+    watched: Path, runs: list[dict[str, Any]], prefect_api: str
+) -> None:
+    store = watched.parent / "store"
+    for expected in ([], ["ada.txt"]):  # before and after it is started from the folder
+        with pytest.raises(InputError):
+            train_subject(watched / "ada", store=store)
+        assert sorted(path.name for path in watched.glob(".refused/*")) == expected
+        look(watched)
+    text = (watched / ".refused" / "ada.txt").read_text()
+    assert text.startswith(f"ada: refused: {watched / 'ada'}: ") and "(flow run " in text
+
+
+def test_nothing_is_started_where_the_disk_is_nearly_full(
+    watched: Path, runs: list[dict[str, Any]], caplog: pytest.LogCaptureFixture
+) -> None:
+    full = ingest_captures.fn(watched, "demo", watched.parent / "store", 0.0, min_free_gib=1e9)
+    assert full == runs == [] and "nothing is started" in caplog.text
+
+
+def test_a_look_at_many_known_folders_is_quick(watched: Path, runs: list[dict[str, Any]]) -> None:
+    """A hundred folders; a thousand take ten times as long (docs/reliability.md)."""
+    for i in range(98):
+        (watched / f"c{i}").mkdir()
+        for j in range(10):
+            (watched / f"c{i}" / f"{j}.jpg").write_text(f"{i} {j}")
+    assert len(look(watched, max_unfinished=1000)) == 100
+    before_s = time.process_time()
+    assert look(watched) == []
+    assert time.process_time() - before_s < 0.5
 
 
 def test_a_folder_renamed_while_its_run_waits_is_trained_under_its_new_name(

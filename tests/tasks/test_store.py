@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hnerf.errors import InputError
-from tasks.store import Store, require_intact
+from tasks.store import Store, recording_digest, require_intact
 
 # Not forked: a child would inherit Prefect's threads half-way.
 SPAWN = multiprocessing.get_context("spawn")
@@ -248,3 +248,13 @@ def test_a_subject_whose_artifact_was_damaged_is_refused(tmp_path: Path) -> None
 def test_a_subject_that_was_copied_out_of_its_store_is_not_known_to_be_damaged(tmp_path: Path) -> None:
     (tmp_path / "ada" / "fit").mkdir(parents=True)
     require_intact(tmp_path / "ada")
+
+
+def test_the_digest_of_the_recording_is_that_of_the_last_stage_that_read_it(tmp_path: Path) -> None:
+    store, folder = Store(tmp_path), tmp_path / "subjects" / "ada"
+    assert recording_digest(folder) == ""
+    for stage in ("capture", "hands"):
+        made = store.link_latest("ada", store.get_or_compute(stage, "k", write_abc))
+        assert recording_digest(folder) == made.digest
+    (tmp_path / "copied" / "capture").mkdir(parents=True)
+    assert recording_digest(tmp_path / "copied") == ""

@@ -1,0 +1,109 @@
+"""What the Prefect server does by itself, and when it tells the operator: python -m flows.automations [--webhook URL].
+
+Without a webhook only lost runs are ended. Given again, the command brings what is there up to date.
+"""
+
+import argparse
+from collections.abc import Iterator
+from datetime import timedelta
+from typing import Any, cast
+from uuid import UUID
+
+from prefect import get_client
+from prefect.automations import AutomationCore, EventTrigger
+from prefect.blocks.webhook import Webhook
+from prefect.client.schemas.objects import StateType
+from prefect.events.actions import CallWebhook, ChangeFlowRunState
+from prefect.events.schemas.automations import Posture
+from prefect.types import SecretDict
+from pydantic import SecretStr
+
+from flows.ingest_captures import DISK_EVENT
+
+SILENCE_S = 150  # five heartbeats of prefect.toml
+BLOCK = "hnerf-operator"
+RUNS = {"prefect.resource.id": "prefect.flow-run.*"}
+
+
+def lost_runs(silence_s: int) -> AutomationCore:
+    """Return the automation that ends runs without a sign of life, whose process and worker were lost together;
+    `ingest-captures` then begins them again."""
+    message = f"no heartbeat for {silence_s} s: its process or its machine was lost"
+    return AutomationCore(
+        name="hnerf: lost runs",
+        description="Runs that were seen alive and then gave no sign of life become Crashed.",
+        trigger=EventTrigger(
+            match=RUNS,  # type: ignore[arg-type]
+            for_each={"prefect.resource.id"},
+            after={"prefect.flow-run.heartbeat"},
+            expect={"prefect.flow-run.*"},
+            posture=Posture.Proactive,
+            within=timedelta(seconds=silence_s),
+        ),
+        actions=[ChangeFlowRunState(name="Crashed", state=StateType.CRASHED, message=message, force=False)],
+    )
+
+
+def notices(block: UUID, pool: str) -> Iterator[AutomationCore]:
+    """Yield the automations that call a webhook, with a JSON object whose `text` is one line."""
+    run = "flow.name ~ ' ' ~ flow_run.name ~ ' is ' ~ flow_run.state.name ~ ': ' ~ (flow_run.state.message or '')"
+    ended = {f"prefect.flow-run.{state}" for state in ("Failed", "Crashed", "TimedOut")}
+    yield _notice("failed runs", "A run failed, crashed or took too long.", RUNS, ended, run, block)
+    late = "flow.name ~ ' ' ~ flow_run.name ~ ' is late: no worker takes it'"
+    yield _notice("late runs", "A run waits for a worker.", RUNS, {"prefect.flow-run.Late"}, late, block)
+    yield _notice(
+        "no worker",
+        "The work pool has no worker any more.",
+        {"prefect.resource.id": "prefect.work-pool.*", "prefect.resource.name": pool},
+        {"prefect.work-pool.not-ready"},
+        f"'work pool {pool} has no worker'",
+        block,
+    )
+    yield _notice(
+        "disk nearly full",
+        "Nothing more is started for lack of space.",
+        {"prefect.resource.id": "hnerf.store.*"},
+        {DISK_EVENT},
+        "'store ' ~ event.resource.name ~ ': ' ~ event.payload.free_gib ~ ' GiB are free; nothing is started'",
+        block,
+    )
+
+
+def _notice(name: str, what: str, match: dict[str, Any], expect: set[str], text: str, block: UUID) -> AutomationCore:
+    trigger = EventTrigger(match=match, for_each={"prefect.resource.id"}, expect=expect, posture=Posture.Reactive)  # type: ignore[arg-type]
+    payload = '{"text": {{ (' + text + ") | tojson }}}"
+    call = CallWebhook(block_document_id=block, payload=payload)
+    return AutomationCore(name=f"hnerf: {name}", description=what, trigger=trigger, actions=[call])
+
+
+def set_up(webhook: str | None, pool: str, silence_s: int) -> list[str]:
+    """Make the automations, or bring those of the same names up to date; return the names."""
+    wanted = [lost_runs(silence_s)]
+    if webhook:
+        headers = SecretDict({"Content-Type": "application/json"})
+        block = Webhook(url=SecretStr(webhook), headers=headers).save(BLOCK, overwrite=True)
+        wanted += notices(cast(UUID, block), pool)
+    with get_client(sync_client=True) as client:
+        for automation in wanted:
+            known = client.read_automations_by_name(automation.name)
+            if known:
+                client.update_automation(known[0].id, automation)
+            else:
+                client.create_automation(automation)
+    return [automation.name for automation in wanted]
+
+
+def main() -> None:
+    """Set up what the command line says."""
+    parser = argparse.ArgumentParser(prog="python -m flows.automations", description=__doc__)
+    parser.add_argument("--webhook", metavar="URL", help="called, with a line of text, when the operator is needed")
+    parser.add_argument("--pool", default="local", help="whose workers are watched (default: local)")
+    parser.add_argument(
+        "--silence", type=int, default=SILENCE_S, metavar="S", help=f"after which a run is lost (default: {SILENCE_S})"
+    )
+    options = parser.parse_args()
+    print("\n".join(set_up(options.webhook, options.pool, options.silence)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,54 @@
+"""Runs of the training deployment: how many have not ended, and those to take up again that crashed."""
+
+import logging
+
+from prefect import get_client
+from prefect.client.schemas.filters import (
+    DeploymentFilter,
+    DeploymentFilterName,
+    FlowFilter,
+    FlowFilterName,
+    FlowRunFilter,
+    FlowRunFilterState,
+    FlowRunFilterStateType,
+)
+from prefect.client.schemas.objects import FlowRun, State, StateType
+from prefect.states import Scheduled
+
+FLOW, NAME = "train-subject", "local"
+DEPLOYMENT = f"{FLOW}/{NAME}"
+UNFINISHED = (StateType.SCHEDULED, StateType.PENDING, StateType.RUNNING, StateType.PAUSED, StateType.CANCELLING)
+
+AGAIN = "crashed; begun again"
+
+log = logging.getLogger("hnerf.restart")
+
+
+def unfinished_runs() -> int:
+    """Return how many runs of the deployment have not ended."""
+    return len(_runs(*UNFINISHED))
+
+
+def restart_crashed(max_restarts: int) -> int:
+    """Put crashed runs of the deployment, those whose machine or process was lost, back into the queue; return how
+    many. Each is begun no more than `max_restarts` times again, because the run itself may be what ends the process,
+    even before the server counts it as running."""
+    restarted = 0
+    with get_client(sync_client=True) as client:
+        for run in _runs(StateType.CRASHED):
+            before = [state.message == AGAIN for state in client.read_flow_run_states(run.id)].count(True)
+            if before < max_restarts:
+                again: State[None] = Scheduled(message=AGAIN)
+                client.set_flow_run_state(run.id, again, force=True)
+                log.warning("%s crashed and is begun again, %d of %d times", run.name, before + 1, max_restarts)
+                restarted += 1
+    return restarted
+
+
+def _runs(*states: StateType) -> list[FlowRun]:
+    with get_client(sync_client=True) as client:
+        return client.read_flow_runs(
+            flow_filter=FlowFilter(name=FlowFilterName(any_=[FLOW])),
+            deployment_filter=DeploymentFilter(name=DeploymentFilterName(any_=[NAME])),
+            flow_run_filter=FlowRunFilter(state=FlowRunFilterState(type=FlowRunFilterStateType(any_=list(states)))),
+        )

@@ -1,0 +1,172 @@
+"""What `hnerf store ...` does: a look into the store, and order in it; each docstring is the command's help."""
+
+import argparse
+import re
+import shutil
+import time
+from argparse import ArgumentTypeError
+from collections.abc import Iterable
+from pathlib import Path
+
+from hnerf.errors import InputError, printable
+
+UNITS_S = {"d": 86400, "h": 3600, "m": 60, "s": 1}
+
+
+def list_(options: argparse.Namespace) -> None:
+    """List the subjects: size, when their results were made, and of which recording."""
+    from tasks.garbage import find_garbage
+    from tasks.inventory import NOBODY, Inventory, recording_of
+
+    inventory = Inventory.of(_store(options))
+    rows = []
+    for subject in sorted(inventory.latest.keys() | {name for names in inventory.owners.values() for name in names}):
+        mine = inventory.of_subject(subject)
+        if mine:
+            recording = recording_of(inventory.store, subject)
+            rows.append((subject, mine, "" if subject in inventory.latest else "no results", recording))
+    if nobodys := [inventory.stored[name] for name, names in inventory.owners.items() if not names]:
+        rows.append((NOBODY, sorted(nobodys, key=lambda one: one.made_s), "nobody's", ""))
+    print(f"{'subject':<24} {'size':>9} {'artifacts':>9}  {'since':<16}  {'latest':<16}  recording")
+    for subject, mine, note, recording in rows:
+        since, latest = _date(mine[0].made_s), _date(mine[-1].made_s)
+        size = _size(sum(one.size_bytes for one in mine))
+        print(f"{printable(subject):<24} {size:>9} {len(mine):>9}  {since}  {latest}  {printable(note or recording)}")
+    total = sum(one.size_bytes for one in inventory.stored.values())
+    free = shutil.disk_usage(inventory.store.root).free
+    garbage = sum(one.size_bytes for one in find_garbage(inventory, 1, 0))
+    print(f"all: {_size(total)}; not needed: {_size(garbage)}; free on this disk: {_size(free)}")
+
+
+def show(options: argparse.Namespace) -> None:
+    """Show a subject's latest artifacts, and the others that it has."""
+    from tasks.inventory import Inventory, recording_of
+
+    inventory = Inventory.of(_store(options))
+    latest = inventory.latest.get(options.name, {})
+    mine = inventory.of_subject(options.name)
+    if not mine:
+        raise InputError(f"{options.name}: no such subject in {options.store}; `hnerf store list` names them")
+    print(f"recording: {printable(recording_of(inventory.store, options.name)) or 'unknown'}")
+    print(f"{'made':<16}  {'used':<16}  {'size':>9} {'files':>6}  latest  artifact")
+    for one in mine:
+        mark = "yes" if one.artifact.name in latest.values() else ""
+        size, count = _size(one.size_bytes), len(one.artifact.files)
+        print(f"{_date(one.made_s)}  {_date(one.used_s)}  {size:>9} {count:>6}  {mark:<6}  {one.artifact.name}")
+
+
+def verify(options: argparse.Namespace) -> None:
+    """Check every file of the store, or of some subjects, against its digest."""
+    from tasks.verify import faults
+
+    found = faults(_store(options), options.names)
+    for fault in found.lines:
+        print(printable(fault))
+    print(f"checked: {found.artifacts} artifacts, {found.files} files, {_size(found.size_bytes)}")
+    if found.lines:
+        raise InputError(f"{options.store}: {len(found.lines)} faults; repeat the `hnerf run` of what is damaged")
+
+
+def gc(options: argparse.Namespace) -> None:
+    """List what no subject's latest results need, and what interrupted work left; remove it with --yes."""
+    from tasks.garbage import collect, find_garbage
+    from tasks.inventory import Inventory
+
+    store = _store(options)
+    inventory = Inventory.of(store)
+    garbage = find_garbage(inventory, options.keep, options.older)
+    for one in garbage:
+        name = f"{one.stage}/{one.key}"
+        owners = ", ".join(sorted(inventory.owners.get(name, ()))) or "-"
+        print(f"{_size(one.size_bytes):>9}  {one.what:<10}  {name}  {printable(owners)}")
+    removed = [one for one in garbage if options.yes and collect(store, one)]
+    total, gone = _size(_sum(garbage)), _size(_sum(removed))
+    if options.yes:
+        print(f"removed: {len(removed)} of {len(garbage)}, {gone}" + _in_use(len(garbage) - len(removed)))
+    else:
+        print(f"not needed: {len(garbage)}, {total}; nothing was removed: give --yes to remove")
+
+
+def export(options: argparse.Namespace) -> None:
+    """Write a subject's latest results, and all they were computed from, into one file."""
+    from tasks.archive import export_subject
+
+    out = options.out or Path(f"{options.name}.tar")
+    manifest = export_subject(_store(options), options.name, out)
+    print(f"archive: {out} ({len(manifest.artifacts)} artifacts, {_size(out.stat().st_size)})")
+
+
+def import_(options: argparse.Namespace) -> None:
+    """Put such a file into a store; take it only from those whose results you trust."""
+    from tasks.archive import import_subject
+    from tasks.store import Store
+
+    manifest = import_subject(Store(options.store.resolve()), options.archive)
+    print(f"subject: {options.store / 'subjects' / manifest.subject} ({len(manifest.artifacts)} artifacts)")
+
+
+def add_store_commands(store: argparse.ArgumentParser) -> None:
+    """Add `list` and the others to the parser of `hnerf store`."""
+    actions = store.add_subparsers(required=True, metavar="ACTION")
+    added = {}
+    for action in (list_, show, verify, gc, export, import_):
+        what = action.__doc__
+        name = action.__name__.strip("_")
+        added[name] = actions.add_parser(name, help=what, description=what)
+        added[name].set_defaults(command=action)
+    for name in ("show", "export"):
+        added[name].add_argument("name", help="the subject's, as `hnerf store list` shows it")
+    added["verify"].add_argument("names", nargs="*", metavar="NAME", help="subjects (default: the whole store)")
+    added["gc"].add_argument("--yes", action="store_true", help="remove; otherwise nothing is changed")
+    added["gc"].add_argument(
+        "--keep", type=_at_least_one, default=1, metavar="N", help="newest results of each subject (default: 1)"
+    )
+    added["gc"].add_argument(
+        "--older", type=duration_s, default="1d", metavar="TIME", help="not used for so long: 30d, 12h (default: 1d)"
+    )
+    added["export"].add_argument("--out", type=Path, help="the file to write (default: NAME.tar)")
+    added["import"].add_argument("archive", type=Path, help="a file that `export` wrote")
+    for parser in added.values():
+        parser.add_argument("--store", type=Path, default=Path("store"), help="where results are (default: store)")
+
+
+def duration_s(text: str) -> float:
+    """Return the seconds of a time like 30d, 12h, 5m or 0."""
+    matched = re.fullmatch(r"(\d{1,6})([dhms]?)", text)
+    if not matched or not (matched[2] or matched[1] == "0"):
+        raise ArgumentTypeError("give a time like 30d, 12h or 0")
+    return float(int(matched[1]) * UNITS_S.get(matched[2], 0))
+
+
+def _at_least_one(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or int(text) < 1:
+        raise ArgumentTypeError("give 1 or more")
+    return int(text)
+
+
+def _store(options: argparse.Namespace):  # type: ignore[no-untyped-def]
+    from tasks.store import Store
+
+    if not options.store.is_dir():
+        raise InputError(f"{options.store}: no such folder; give --store the place of the results")
+    return Store(options.store.resolve())
+
+
+def _sum(garbage: Iterable) -> int:  # type: ignore[type-arg]
+    return sum(one.size_bytes for one in garbage)
+
+
+def _in_use(count: int) -> str:
+    return f"; {count} came into use meanwhile" if count else ""
+
+
+def _date(seconds: float) -> str:
+    return time.strftime("%Y-%m-%d %H:%M", time.localtime(seconds))
+
+
+def _size(size_bytes: float) -> str:
+    for unit in ("B", "kB", "MB", "GB"):
+        if size_bytes < 1000:
+            return f"{size_bytes:.0f} B" if unit == "B" else f"{size_bytes:.1f} {unit}"
+        size_bytes /= 1000
+    return f"{size_bytes:.1f} TB"

@@ -1,0 +1,48 @@
+"""Units of systemd for server and worker, as services of a user: python -m flows.systemd_units FOLDER."""
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+FOREVER = "Restart=always\nRestartSec=10"
+
+
+def units(root: Path) -> dict[str, str]:
+    """Return the text of each unit, for a checkout at `root`, by file name. The worker ends with all its runs; what
+    they had finished is in the store."""
+    folder, prefect = _escaped(root), _escaped(root / ".venv" / "bin" / "prefect")
+    server = f'"{prefect}" server start'
+    worker = f'"{prefect}" worker start --pool local --type process --limit 2 --with-healthcheck'
+    return {
+        "hnerf-server.service": _unit("H-NeRF: Prefect server", "network.target", folder, server),
+        "hnerf-worker.service": _unit("H-NeRF: worker", "hnerf-server.service", folder, worker),
+    }
+
+
+def _unit(what: str, after: str, folder: str, command: str) -> str:
+    wants = f"Wants={after}\n" if after.endswith(".service") else ""
+    return f"""[Unit]
+Description={what}
+After={after}
+{wants}StartLimitIntervalSec=0
+
+[Service]
+WorkingDirectory={folder}
+ExecStart={command}
+{FOREVER}
+TimeoutStopSec=90
+OOMPolicy=continue
+
+[Install]
+WantedBy=default.target
+"""
+
+
+def _escaped(path: Path) -> str:
+    """Return a path in which systemd replaces nothing."""
+    return str(path).replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
+
+
+if __name__ == "__main__":
+    for name, text in units(ROOT).items():
+        (Path(sys.argv[1]) / name).write_text(text)

@@ -1,0 +1,54 @@
+"""A glTF binary file made smaller for a web page: its opaque images as JPEG (glTF 2.0 specification, Khronos Group)."""
+
+import json
+import struct
+from typing import Any
+
+import cv2
+import numpy as np
+
+JPEG_QUALITY = 90
+JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+
+
+def compact_glb(glb: bytes, texture_px: int) -> bytes:
+    """Return the file with each opaque image as JPEG, its longer side at most texture_px; all else is as it was."""
+    document, binary = read_glb(glb)
+    images = {image["bufferView"]: image for image in document.get("images", []) if "bufferView" in image}
+    packed = bytearray()
+    for index, view in enumerate(document["bufferViews"]):
+        start = view.get("byteOffset", 0)
+        content = binary[start : start + view["byteLength"]]
+        if index in images and (jpeg := _jpeg(content, texture_px)):
+            content, images[index]["mimeType"] = jpeg, "image/jpeg"
+        packed.extend(bytes(-len(packed) % 4))
+        view |= {"byteOffset": len(packed), "byteLength": len(content)}
+        packed.extend(content)
+    document["buffers"] = [{"byteLength": len(packed)}]
+    return as_glb(document, bytes(packed))
+
+
+def read_glb(glb: bytes) -> tuple[dict[str, Any], bytes]:
+    """Return a binary file's JSON document and its binary chunk."""
+    (json_length,) = struct.unpack_from("<I", glb, 12)
+    return json.loads(glb[20 : 20 + json_length]), glb[28 + json_length :]
+
+
+def as_glb(document: dict[str, Any], binary: bytes) -> bytes:
+    """Return a binary file; each of its chunks ends at a multiple of four bytes, JSON in spaces and binary in zeros."""
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    binary += bytes(-len(binary) % 4)
+    chunks = struct.pack("<II", len(text), JSON_CHUNK) + text + struct.pack("<II", len(binary), BINARY_CHUNK) + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def _jpeg(content: bytes, texture_px: int) -> bytes | None:
+    """Return an image as JPEG; None if it has more than three channels or cannot be read."""
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 3 or image.shape[2] != 3:
+        return None
+    shrink = texture_px / max(image.shape[:2])
+    if shrink < 1:
+        image = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()

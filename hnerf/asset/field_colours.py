@@ -1,0 +1,86 @@
+"""The field's colour of each texel; where the field shows nothing, such as a finger that it lacks, that of the skin
+around."""
+
+import logging
+
+import numpy as np
+import torch
+from scipy.sparse import csc_array, diags_array
+from scipy.sparse.linalg import splu
+from torch import Tensor
+
+from hnerf.asset.plate import cotangent_laplacian
+from hnerf.asset.texture import Texels
+from hnerf.avatar.avatar import Avatar
+from hnerf.avatar.surface import move_onto_surface
+from hnerf.body.fit_result import BodyFit
+from hnerf.body.rig import Rig, pose_vertices
+
+OFF_SURFACE_M = 0.005  # farther from the field's surface, its colour was not seen by any camera
+PINNED = 1e3  # weight of a known colour against the Laplacian's, which are about 1
+LOOSE = 1e-9  # of the mean colour, for parts without any known one
+
+log = logging.getLogger("hnerf.asset")
+
+
+@torch.no_grad()
+def field_colours(avatar: Avatar, clothed: BodyFit, texels: Texels) -> np.ndarray:
+    """Return the field's colour at each texel, (N, 3): its radiance along the inward normal, the median over the poses
+    of `clothed`.
+
+    Poses of the capture keep the field's conditioning within what it was trained on; the median rejects a pose in which
+    that spot touches another limb. A texel that lies off the field's surface in all poses takes the colour of the mesh
+    around it.
+    """
+    seen = []
+    for frame, theta, root in zip(clothed.frames, clothed.theta, clothed.root, strict=True):
+        log.info("texture: %d texels in the pose of frame %d", len(texels.face), frame)
+        seen.append(_colours_in_pose(avatar, clothed.rig, texels, theta, root).numpy())
+    return filled(median_of_seen(np.stack(seen)), texels, clothed.rig)
+
+
+def median_of_seen(colours: np.ndarray) -> np.ndarray:
+    """Return the median over poses of colours (P, N, 3), without those that are not a number; NaN where all are."""
+    ordered = np.sort(colours, axis=0)  # NaN last
+    seen = (~np.isnan(colours[..., 0])).sum(0)
+    row = np.arange(len(seen))
+    middle = [ordered[(k // 2).clip(0, len(colours) - 1), row] for k in (seen - 1, seen)]
+    median: np.ndarray = np.mean(middle, axis=0)
+    return median
+
+
+def filled(colours: np.ndarray, texels: Texels, rig: Rig) -> np.ndarray:
+    """Return colours (N, 3) with those that are not a number replaced: known ones, taken to the vertices of the mesh,
+    spread over it harmonically (lap c = 0)."""
+    unknown = np.isnan(colours[:, 0])
+    if not unknown.any() or unknown.all():
+        return np.nan_to_num(colours)
+    faces, vertices_m = rig.faces.numpy(), rig.vertices_m.double().numpy()
+    corners, share = faces[texels.face.numpy()], texels.barycentric.double().numpy()
+    at, by = corners[~unknown], share[~unknown]
+    weight = np.bincount(at.ravel(), by.ravel(), len(vertices_m))
+    total = [np.bincount(at.ravel(), (by * c[:, None]).ravel(), len(vertices_m)) for c in colours[~unknown].T]
+    pin = np.where(weight > 0, PINNED, 0)
+    known = np.stack(total, 1) / weight.clip(1e-12)[:, None]
+    matrix = cotangent_laplacian(vertices_m, faces)[1] + diags_array(pin + LOOSE)
+    spread = splu(csc_array(matrix)).solve(pin[:, None] * known + LOOSE * colours[~unknown].mean(0))
+    result = colours.copy()
+    result[unknown] = (spread[corners[unknown]] * share[unknown, :, None]).sum(1)
+    return result
+
+
+def _colours_in_pose(avatar: Avatar, rig: Rig, texels: Texels, theta: Tensor, root: Tensor) -> Tensor:
+    """Return the radiance at each texel of the surface posed by theta (J, 3) and root (4, 4), (N, 3) on the CPU; NaN
+    off the field's surface."""
+    device = avatar.body.rig.vertices_m.device
+    vertices_m, faces = pose_vertices(rig, theta, root).to(device), rig.faces.to(device)
+    theta, root = theta.to(device), root.to(device)
+    surface_m, normals = move_onto_surface(avatar, vertices_m, faces, theta, root)  # skinning only approximates it
+    on_surface = avatar.signed_distance(surface_m, theta, root).abs() <= OFF_SURFACE_M
+    shown = torch.nonzero(on_surface[faces].all(1)[texels.face.to(device)])[:, 0]
+    corners, weights = faces[texels.face.to(device)[shown]], texels.barycentric.to(device)[shown, :, None]
+    points_m = (surface_m[corners] * weights).sum(1)
+    inward = -torch.nn.functional.normalize((normals[corners] * weights).sum(1), dim=1)
+    colours = torch.full((len(texels.face), 3), torch.nan)
+    colours[shown.cpu()] = avatar.colour(points_m, inward, theta, root).cpu()
+    return colours

@@ -1,0 +1,106 @@
+"""Motions of an exported skeleton: the body model's poses in stage axes, resampled and with the root on the ground."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hnerf.body.fit_result import BodyFit
+from hnerf.body.rig import rotation_from_axis_angle
+
+Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # (x, y, z) to (x, z, -y)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Poses of the body model at instants, in stage axes. fps: of the time codes; codes (n,): times fps is seconds.
+
+    turns (n, S, 3, 3): each joint relative to its parent, where orientations at rest are the identity; origins_m (n,
+    3): where the first joint is; shape_weights (n, K): of corrective blend shapes.
+    """
+
+    fps: float
+    codes: np.ndarray
+    turns: np.ndarray
+    origins_m: np.ndarray
+    shape_weights: np.ndarray
+
+    @property
+    def seconds(self) -> np.ndarray:
+        """Return the instants, (n,)."""
+        return self.codes / self.fps
+
+    def transforms(self, parents: np.ndarray, positions_m: np.ndarray) -> np.ndarray:
+        """Return the joints' transforms in the stage, (n, S, 4, 4), for a body at rest at positions_m (S, 3)."""
+        found = np.tile(np.eye(4), (len(self.codes), len(parents), 1, 1))
+        found[:, 0, :3, :3], found[:, 0, :3, 3] = self.turns[:, 0], self.origins_m
+        for j, parent in enumerate(parents[1:], 1):
+            found[:, j, :3, :3] = found[:, parent, :3, :3] @ self.turns[:, j]
+            moved_m = found[:, parent, :3, :3] @ (positions_m[j] - positions_m[parent])
+            found[:, j, :3, 3] = found[:, parent, :3, 3] + moved_m
+        return found
+
+
+def motion_of(body: BodyFit, fps: float, shape_weights: np.ndarray, stage_from_world: np.ndarray) -> Motion:
+    """Return the motion of a body, its frames as time codes.
+
+    The body frame is Z up whatever the world is. With W stage from world, B stage from body and T world from body, the
+    first joint turns by W T R B^-1, and the others by B R B^-1.
+    """
+    root, theta = body.root.double(), body.theta.double()
+    turns = Y_UP_FROM_Z_UP @ rotation_from_axis_angle(theta).numpy() @ Y_UP_FROM_Z_UP.T
+    turns[:, 0] = stage_from_world @ root[:, :3, :3].numpy() @ Y_UP_FROM_Z_UP.T @ turns[:, 0]
+    origins_m = (root[:, :3, :3] @ body.rig.joints_m[0].double() + root[:, :3, 3]).numpy() @ stage_from_world.T
+    return Motion(fps, np.array(body.frames, float), turns, origins_m, shape_weights)
+
+
+def resampled(motion: Motion, fps: float) -> Motion:
+    """Return the motion at the whole time codes of another rate that lie within it; at least one, the nearest.
+
+    Rotations are interpolated at constant angular velocity (slerp, Shoemake 1985), positions and weights linearly.
+    """
+    first, last = motion.seconds[[0, -1]] * fps
+    codes = np.arange(int(np.ceil(first - 1e-6)), int(np.floor(last + 1e-6)) + 1).astype(float)
+    codes = codes if len(codes) else np.array([float(round(first))])
+    at_s = np.clip(codes / fps, *motion.seconds[[0, -1]])
+    before = np.clip(np.searchsorted(motion.seconds, at_s, "right") - 1, 0, max(len(motion.codes) - 2, 0))
+    after = np.minimum(before + 1, len(motion.codes) - 1)
+    span_s = np.maximum(motion.seconds[after] - motion.seconds[before], 1e-9)
+    share = (at_s - motion.seconds[before]) / span_s
+    turns = _slerp(motion.turns[before], motion.turns[after], share)
+    origins_m, weights = (_lerp(v[before], v[after], share) for v in (motion.origins_m, motion.shape_weights))
+    return Motion(fps, codes, turns, origins_m, weights)
+
+
+def ground_transforms(pelvis: np.ndarray, floor_m: float) -> np.ndarray:
+    """Return the root's transforms (n, 4, 4): on the floor below the pelvis (n, 4, 4), turned as it about the vertical.
+
+    That turn is the twist of the pelvis' rotation from rest about Y (swing-twist decomposition, Dobrowolski 2015).
+    """
+    _, y, _, w = Rotation.from_matrix(pelvis[:, :3, :3]).as_quat().T
+    ground = np.tile(np.eye(4), (len(pelvis), 1, 1))
+    ground[:, :3, :3] = Rotation.from_euler("y", 2 * np.arctan2(y, w)[:, None]).as_matrix()
+    ground[:, :3, 3] = np.stack([pelvis[:, 0, 3], np.full(len(pelvis), floor_m), pelvis[:, 2, 3]], 1)
+    return ground
+
+
+def continuous_quaternions(rotations: np.ndarray) -> np.ndarray:
+    """Convert rotations (n, J, 3, 3) to quaternions (n, J, 4) as x y z w, each on the same hemisphere as in the frame
+    before."""
+    quaternions = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_quat().reshape(*rotations.shape[:2], 4)
+    same_side = (quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True) >= 0
+    quaternions[1:] *= np.cumprod(np.where(same_side, 1, -1), axis=0)
+    return quaternions
+
+
+def _slerp(start: np.ndarray, end: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Return rotations (n, J, 3, 3) between two, at shares (n,)."""
+    n, joints = start.shape[:2]
+    first = Rotation.from_matrix(start.reshape(-1, 3, 3))
+    turn = (first.inv() * Rotation.from_matrix(end.reshape(-1, 3, 3))).as_rotvec()
+    part = Rotation.from_rotvec(turn * np.repeat(share, joints)[:, None])
+    return (first * part).as_matrix().reshape(n, joints, 3, 3)
+
+
+def _lerp(start: np.ndarray, end: np.ndarray, share: np.ndarray) -> np.ndarray:
+    return start + share[:, None] * (end - start)

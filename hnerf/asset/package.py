@@ -1,0 +1,218 @@
+"""The USD files of an avatar, laid out as OpenUSD's guidelines for asset structure ask.
+
+`avatar.usda` is the interface: variant sets, asset information, and payloads that lie in `avatar/`. `avatar_24.usda`
+and `avatar_30.usda` show it at these rates, for importers that ignore a file's own. `avatar.usdz` has the same prims
+and variants in one layer, as ARKit asks. `avatar_cache.usdz` has the surface as points at every frame.
+"""
+
+import struct
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from zipfile import ZipFile
+
+import numpy as np
+from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
+
+from hnerf.asset.rigs import FULL
+from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar
+from hnerf.asset.usd import (
+    ROOT,
+    SURFACE,
+    TEXTURE_NAME,
+    author_cameras,
+    author_geometry,
+    author_look,
+    author_motion,
+    author_rig,
+    define_mesh,
+    extent,
+    vec3f,
+)
+from hnerf.body.descriptor import normals_of
+from hnerf.capture.capture import write_image
+from hnerf.geometry.camera import Camera
+
+FIRST_TIME = bytes([0, 0, 0x21, 0])  # midnight, 1 January 1980, in ZIP's time and date
+INTERFACE, PAYLOADS = "avatar.usda", "avatar"
+
+
+@dataclass(frozen=True)
+class AssetInfo:
+    """What the package says about itself. name: of the subject; version, licence: as the user gives them; capture: the
+    digest of the recording."""
+
+    name: str
+    version: str
+    licence: str
+    capture: str
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the package. name: of its payload; author: defines its prims; fps: the rate of its layer's time codes;
+    variant: its set and its name there, if it is one."""
+
+    name: str
+    author: Callable[[Usd.Stage], None]
+    fps: float
+    variant: tuple[str, str] | None = None
+
+
+def write_package(out: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
+    """Write `avatar.usda`, `avatar_24.usda`, `avatar_30.usda` and the folder `avatar/` into `out`."""
+    folder = out / PAYLOADS
+    folder.mkdir()
+    write_image(folder / TEXTURE_NAME, avatar.texture)
+    parts = _parts(avatar, list(cameras), fps)
+    for part in parts:
+        layer = Usd.Stage.CreateNew(str(folder / f"{part.name}.usdc"))
+        _set_axes(layer)
+        _set_rate(layer, part.fps)
+        layer.SetDefaultPrim(layer.OverridePrim(ROOT))
+        part.author(layer)
+        layer.GetRootLayer().Save()
+    _write_interface(out / INTERFACE, parts, avatar, fps, info, CAPTURED)
+    for rate in RATES:
+        _write_interface(out / f"avatar_{rate}.usda", parts, avatar, rate, info, f"{CAPTURED}_{rate}")
+
+
+def write_usdz(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
+    """Write `avatar.usdz`: the same prims and variants as the package in a single layer, and the texture."""
+    with tempfile.TemporaryDirectory() as folder:
+        stage = _new_stage(Path(folder) / "avatar.usdc", avatar, avatar.frames, fps, info)
+        for part in _parts(avatar, list(cameras), fps):
+            with _in_variant(stage, part):
+                part.author(stage)
+        _select(stage, CAPTURED)
+        _package(stage, avatar, path)
+
+
+def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
+    """Write `avatar_cache.usdz`: the surface as world-space points at every frame, for programs without skinning."""
+    with tempfile.TemporaryDirectory() as folder:
+        stage = _new_stage(Path(folder) / "avatar_cache.usdc", avatar, avatar.frames, fps, info)
+        author_cameras(stage, cameras, avatar.stage_from_world)
+        mesh = define_mesh(stage, ROOT.AppendChild("Surface"), avatar)
+        author_look(stage, mesh.GetPath())
+        points, extents, normals = mesh.CreatePointsAttr(), mesh.CreateExtentAttr(), mesh.CreateNormalsAttr()
+        for frame, posed in zip(avatar.frames, avatar.points_m, strict=True):
+            points.Set(vec3f(posed), float(frame))
+            extents.Set(extent(posed), float(frame))
+            normals.Set(vec3f(normals_of(posed, avatar.faces)), float(frame))
+        _package(stage, avatar, path)
+
+
+def _parts(avatar: StagedAvatar, cameras: list[Camera], fps: float) -> list[Part]:
+    """Return the parts of the package."""
+    view = partial(author_cameras, cameras=cameras, stage_from_world=avatar.stage_from_world)
+    return [
+        Part("geometry", partial(author_geometry, avatar=avatar), fps),
+        Part("look", partial(author_look, mesh=SURFACE), fps),
+        Part("cameras", view, fps),
+        *(
+            Part(f"rig_{name}", partial(author_rig, name=name, rig=rig), fps, ("rig", name))
+            for name, rig in avatar.rigs.items()
+        ),
+        *(
+            Part(f"motion_{name}", partial(author_motion, name=name, avatar=avatar), motion.fps, ("motion", name))
+            for name, motion in avatar.rigs[FULL].motions.items()
+        ),
+    ]
+
+
+@contextmanager
+def _in_variant(stage: Usd.Stage, part: Part) -> Iterator[None]:
+    """Author what follows inside the part's variant of the root prim, if it is one."""
+    if part.variant is None:
+        yield
+        return
+    variants = stage.GetDefaultPrim().GetVariantSets().AddVariantSet(part.variant[0])
+    variants.AddVariant(part.variant[1])
+    variants.SetVariantSelection(part.variant[1])
+    with variants.GetVariantEditContext():
+        yield
+
+
+def _select(stage: Usd.Stage, motion: str) -> None:
+    sets = stage.GetDefaultPrim().GetVariantSets()
+    sets.SetSelection("rig", FULL)
+    sets.SetSelection("motion", motion)
+
+
+def _write_interface(
+    file: Path, parts: list[Part], avatar: StagedAvatar, fps: float, info: AssetInfo, motion: str
+) -> None:
+    """Write an interface layer whose time codes have a rate, with that motion selected. It has payloads of its own:
+    time codes that are scaled twice are not whole, and importers that hold samples would be a frame late."""
+    stage = _new_stage(file, avatar, avatar.rigs[FULL].motions[motion].codes, fps, info)
+    for part in parts:
+        path = f"./{PAYLOADS}/{part.name}.usdc"
+        with _in_variant(stage, part):
+            stage.GetDefaultPrim().GetPayloads().AddPayload(path)
+    _select(stage, motion)
+    stage.GetRootLayer().Save()
+
+
+def _new_stage(file: Path, avatar: StagedAvatar, codes: np.ndarray, fps: float, info: AssetInfo) -> Usd.Stage:
+    """Return a stage from the first to the last of time codes, with the root prim and what it says of itself."""
+    stage = Usd.Stage.CreateNew(str(file))
+    _set_axes(stage)
+    _set_rate(stage, fps)
+    stage.SetStartTimeCode(float(codes[0]))
+    stage.SetEndTimeCode(float(codes[-1]))
+    root = UsdGeom.Xform.Define(stage, ROOT).GetPrim()
+    stage.SetDefaultPrim(root)
+    model = Usd.ModelAPI(root)
+    model.SetKind(Kind.Tokens.component)
+    model.SetAssetName(info.name)
+    model.SetAssetIdentifier(Sdf.AssetPath(f"./{INTERFACE}"))
+    model.SetAssetVersion(info.version)
+    for key, value in (("captureDigest", info.capture), ("licence", info.licence)):
+        root.SetAssetInfoByKey(key, value)
+    UsdGeom.ModelAPI.Apply(root).SetExtentsHint(_everywhere(avatar))
+    return stage
+
+
+def _set_axes(stage: Usd.Stage) -> None:
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+
+
+def _set_rate(stage: Usd.Stage, fps: float) -> None:
+    stage.SetTimeCodesPerSecond(fps)
+    stage.SetFramesPerSecond(fps)
+
+
+def _everywhere(avatar: StagedAvatar) -> object:
+    """Return the box around the surface at rest, in all motions and in the cache."""
+    corners = [avatar.rest_points_m, *(boxes.reshape(-1, 3) for boxes in avatar.extents_m.values())]
+    return extent(np.concatenate([*corners, avatar.points_m.reshape(-1, 3)]))
+
+
+def _package(stage: Usd.Stage, avatar: StagedAvatar, path: Path) -> None:
+    layer = Path(stage.GetRootLayer().realPath)
+    stage.GetRootLayer().Save()
+    write_image(layer.parent / TEXTURE_NAME, avatar.texture)
+    if not UsdUtils.CreateNewARKitUsdzPackage(str(layer), str(path)):
+        raise OSError(f"{path}: USD could not write the package; is the disk full?")
+    _forget_times(path)
+
+
+def _forget_times(path: Path) -> None:
+    """Set the times of all files in a package to the first that ZIP knows, so that the same avatar is the same bytes.
+
+    APPNOTE.TXT of PKWARE, 4.3.7 and 4.3.12: time and date lie at byte 10 of a local header and at byte 12 of an entry
+    of the directory, whose name, extra field and comment have the lengths at byte 28.
+    """
+    package = bytearray(path.read_bytes())
+    with ZipFile(path) as archive:
+        at, entries = archive.start_dir, archive.infolist()
+    for entry in entries:
+        for place in (entry.header_offset + 10, at + 12):
+            package[place : place + 4] = FIRST_TIME
+        at += 46 + sum(struct.unpack_from("<3H", package, at + 28))
+    path.write_bytes(package)

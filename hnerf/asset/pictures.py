@@ -1,0 +1,77 @@
+"""Pictures of the asset for its report, drawn from its own arrays: turntable, wireframe, texture; (H, W, 3) uint8
+RGB."""
+
+import cv2
+import numpy as np
+
+from hnerf.asset.staging import StagedAvatar
+from hnerf.evaluation.pictures import cast_pixels, downsampled, portrait_camera, studio_light, supersampled
+from hnerf.geometry.camera import Camera
+from hnerf.geometry.mesh_queries import Surface
+from hnerf.geometry.rays import RayHits
+
+LINE_PX = 0.7  # width of an edge in a wireframe
+PAPER, LINE = np.array([236.0, 233, 228]), np.array([47.0, 111, 181])
+
+
+def turntable_cameras(points_m: np.ndarray, facing: np.ndarray, count: int) -> list[Camera]:
+    """Return level cameras around a person, evenly spaced from the front. points_m (N, 3): the surface, Y up; facing
+    (3,): where the person looks."""
+    heading_rad = np.arctan2(facing[0], facing[2])
+    cameras = []
+    for angle_rad in heading_rad + np.arange(count) * 2 * np.pi / count:
+        c, s = np.cos(angle_rad), np.sin(angle_rad)
+        upright = np.eye(4)  # a body with Z up, facing -Y
+        upright[:3, :3] = np.array([[c, 0, -s], [-s, 0, -c], [0, 1, 0]]).T
+        cameras.append(portrait_camera(points_m, upright, "front"))
+    return cameras
+
+
+def textured(surface: Surface, avatar: StagedAvatar, camera: Camera) -> np.ndarray:
+    """Render a posed surface of the avatar with its texture, without light, on white."""
+    fine = supersampled(camera)
+    hits = cast_pixels(surface, fine)
+    height_px, width_px = avatar.texture.shape[:2]
+    texel_px = np.zeros((len(hits.face), 2), np.float32)  # centres at integers, rows from the top
+    uv = hits.interpolate(avatar.uvs, avatar.face_uvs)
+    texel_px[hits.face >= 0] = uv * (width_px, -height_px) + (-0.5, height_px - 0.5)
+    columns, rows = texel_px.reshape(fine.height_px, fine.width_px, 2).transpose(2, 0, 1)
+    colours = cv2.remap(avatar.texture, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return downsampled(colours.reshape(-1, 3), hits, camera)
+
+
+def wireframe(surface: Surface, camera: Camera) -> np.ndarray:
+    """Render the edges of the surface's faces that a camera sees, on white."""
+    fine = supersampled(camera)
+    hits = cast_pixels(surface, fine)
+    colours = np.zeros((len(hits.face), 3), np.float32)
+    pixel_m = hits.distance_m[hits.face >= 0] / fine.K[0, 0]
+    edge = _to_edge_m(surface, hits) < LINE_PX * pixel_m
+    colours[hits.face >= 0] = np.where(edge[:, None], LINE, PAPER)
+    return downsampled(colours * studio_light(surface.mesh, hits, fine), hits, camera)
+
+
+def _to_edge_m(surface: Surface, hits: RayHits) -> np.ndarray:
+    """Return the distance from each hit to the nearest edge of its face: the least barycentric coordinate times its
+    height."""
+    met = hits.face >= 0
+    corners_m = surface.mesh.vertices[surface.mesh.faces[hits.face[met]]]
+    edges_m = np.linalg.norm(np.roll(corners_m, -1, 1) - np.roll(corners_m, -2, 1), axis=2)  # opposite to each corner
+    heights_m = 2 * surface.mesh.area_faces[hits.face[met]][:, None] / edges_m.clip(1e-9)
+    return (hits.barycentric[met] * heights_m).min(1)
+
+
+def texture_picture(avatar: StagedAvatar, side_px: int) -> np.ndarray:
+    """Return the texture, scaled to a square."""
+    return cv2.resize(avatar.texture, (side_px, side_px), interpolation=cv2.INTER_AREA)
+
+
+def uv_picture(avatar: StagedAvatar, side_px: int) -> np.ndarray:
+    """Draw the faces in the square of texture coordinates, on white."""
+    picture = np.full((side_px, side_px, 3), 255, np.uint8)
+    corners_px = (avatar.uvs * (1, -1) + (0, 1))[avatar.face_uvs] * side_px - 0.5
+    shift = 4  # bits of a pixel
+    fixed = (corners_px * 2**shift).round().astype(np.int32)
+    for triangle in fixed:  # one by one: in one call, overlapping ones would cancel out
+        cv2.fillConvexPoly(picture, triangle, PAPER.tolist(), cv2.LINE_AA, shift)
+    return cv2.polylines(picture, list(fixed), True, LINE.tolist(), 1, cv2.LINE_AA, shift)

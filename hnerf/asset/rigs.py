@@ -1,0 +1,120 @@
+"""The rigs of an exported avatar, "full" and "game", with all its motions."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from hnerf.asset.motions import Motion, continuous_quaternions, ground_transforms
+from hnerf.asset.skeleton import Bones, Skeleton, full_skeleton, game_skeleton
+from hnerf.asset.skinning import Skin, skinned, with_few_influences
+from hnerf.body.rig import Rig
+from hnerf.evenly_spaced import evenly_spaced
+
+FULL, GAME = "full", "game"
+GAME_INFLUENCES = 4
+EYEBALL_WEIGHT = 0.99  # of a point on an eyeball
+FITTED_FRAMES = 64  # at most, evenly spaced; more hardly change the weights
+
+
+@dataclass(frozen=True)
+class RestSurface:
+    """The surface at rest in stage axes: points_m (V, 3), and shapes_m (K, V, 3) added to it by weight."""
+
+    points_m: np.ndarray
+    shapes_m: np.ndarray
+
+    def shaped(self, weights: np.ndarray) -> np.ndarray:
+        """Return the points (V, 3) with blend shapes by their weights (K,)."""
+        return self.points_m + np.tensordot(weights, self.shapes_m, 1)
+
+
+@dataclass(frozen=True)
+class JointMotion:
+    """A motion of one skeleton. fps: of the time codes; codes (n,); translations_m (n, J, 3) and quaternions (n, J, 4)
+    as x y z w without sign jumps, relative to parents; shape_weights (n, K)."""
+
+    fps: float
+    codes: np.ndarray
+    translations_m: np.ndarray
+    quaternions: np.ndarray
+    shape_weights: np.ndarray
+
+
+@dataclass(frozen=True)
+class StagedRig:
+    """A skeleton, the skin that follows it, and its motions by name. stage (n, J, 4, 4), by motion: the transforms of
+    joints in the stage."""
+
+    skeleton: Skeleton
+    skin: Skin
+    motions: dict[str, JointMotion]
+    stage: dict[str, np.ndarray]
+
+    def surfaces_m(self, motion: str, rest: RestSurface) -> Iterator[np.ndarray]:
+        """Yield the surface (V, 3) at each time code of a motion: blend shapes, then the skin."""
+        weights = self.motions[motion].shape_weights
+        for transforms, points_m in posed_frames(self.skeleton, self.stage[motion], rest, weights):
+            yield skinned(transforms, self.skin, points_m)
+
+
+def posed_frames(
+    skeleton: Skeleton, stage: np.ndarray, rest: RestSurface, shape_weights: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the joints' transforms from rest to stage (J, 4, 4) and the points at rest (V, 3) with blend shapes. stage
+    (n, J, 4, 4): the joints in the stage."""
+    inverse = np.linalg.inv(skeleton.bind)
+    for transforms, weights in zip(stage, shape_weights, strict=True):
+        yield transforms @ inverse, rest.shaped(weights)
+
+
+def stage_rigs(
+    rig: Rig, joints_m: np.ndarray, rest: RestSurface, motions: dict[str, Motion], floor_m: float, bones: Bones
+) -> dict[str, StagedRig]:
+    """Return both rigs of a body model's rig, whose joints are at rest at joints_m (S, 3). motions: the first is the
+    captured one, to which the game rig's weights are fitted; floor_m: the height of the ground in the stage."""
+    parents = rig.parents.numpy()
+    skin = without_lids(Skin(rig.skin_joints.numpy(), rig.skin_weights.double().numpy()), rig.joint_names, parents)
+    full = full_skeleton(rig.joint_names, parents, joints_m, bones)
+    skin = Skin(np.where(skin.weights > 0, skin.joints + 1, 0), skin.weights)  # a root was added before them
+    poses = {name: motion.transforms(parents, joints_m) for name, motion in motions.items()}
+    game, taken_by = game_skeleton(full, bones)
+    staged = {
+        name: StagedRig(skeleton, found, *_motions(skeleton, motions, poses, floor_m))
+        for name, skeleton, found in ((FULL, full, skin), (GAME, game, skin.moved_to(taken_by)))
+    }
+    staged[GAME] = _with_game_skin(staged[GAME], next(iter(motions)), rest)
+    return staged
+
+
+def without_lids(skin: Skin, joints: tuple[str, ...], parents: np.ndarray) -> Skin:
+    """Return the skin whose points follow eyes only where they are eyeballs, that is, follow one alone; where either
+    eye has none, no point does. The head takes the others: lids must not turn with the eyes. `joints`: the body
+    model's names."""
+    eyes = [j for j, name in enumerate(joints) if name.startswith("eye.")]
+    at_head = skin.moved_to(np.array([parents[j] if j in eyes else j for j in range(len(joints))]))
+    of_eye = [((skin.joints == eye) & (skin.weights > EYEBALL_WEIGHT)).any(1) for eye in eyes]
+    if not of_eye or not all(points.any() for points in of_eye):
+        return at_head
+    balls = np.any(of_eye, 0)[:, None]
+    return Skin(np.where(balls, skin.joints, at_head.joints), np.where(balls, skin.weights, at_head.weights))
+
+
+def _motions(
+    skeleton: Skeleton, motions: dict[str, Motion], poses: dict[str, np.ndarray], floor_m: float
+) -> tuple[dict[str, JointMotion], dict[str, np.ndarray]]:
+    moving, stage = {}, {}
+    for name, motion in motions.items():
+        stage[name] = skeleton.posed(poses[name], ground_transforms(poses[name][:, 0], floor_m))
+        local = skeleton.local(stage[name])
+        quaternions = continuous_quaternions(local[..., :3, :3])
+        moving[name] = JointMotion(motion.fps, motion.codes, local[..., :3, 3], quaternions, motion.shape_weights)
+    return moving, stage
+
+
+def _with_game_skin(game: StagedRig, captured: str, rest: RestSurface) -> StagedRig:
+    """Return the rig with few influences a point, those that change the captured surfaces least."""
+    chosen = evenly_spaced(range(len(game.stage[captured])), FITTED_FRAMES)
+    weights = game.motions[captured].shape_weights[chosen]
+    poses = posed_frames(game.skeleton, game.stage[captured][chosen], rest, weights)
+    return StagedRig(game.skeleton, with_few_influences(game.skin, poses, GAME_INFLUENCES), game.motions, game.stage)

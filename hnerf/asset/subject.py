@@ -1,0 +1,49 @@
+"""The asset of a finished subject, made again with other settings or further motions."""
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from hnerf.asset.export import export_asset
+from hnerf.asset.staging import CAPTURED
+from hnerf.avatar.trained import load_avatar
+from hnerf.calibration.report import load_cameras
+from hnerf.capture.capture import Capture
+from hnerf.config import AssetSettings
+from hnerf.errors import InputError
+from hnerf.files import atomic_folder
+from hnerf.render.motion import Motion, read_motion
+
+NEEDED = ("capture/capture.json", "calibration/intri.yml", "training/model.safetensors")
+
+
+def export_subject(
+    subject: Path, settings: AssetSettings, motions: Iterable[Path], out: Path, digest: str
+) -> dict[str, Any]:
+    """Export a subject (<store>/subjects/<name>) into the new folder `out`; return the report of `export_asset`.
+
+    motions: files or subjects to add (`read_motion`), named after their files; digest: of the recording. Raises
+    InputError where a file is missing, or a motion cannot be read or has another's name.
+    """
+    with atomic_folder(out) as partial:
+        for file in NEEDED:
+            if not (subject / file).is_file():
+                raise InputError(f"{subject / file}: missing; give <store>/subjects/<name> of a finished `hnerf run`")
+        further = _named(motions)
+        capture = load_cameras(subject / "calibration", Capture.load(subject / "capture"))
+        avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
+        return export_asset(capture, avatar, settings, partial, digest, further)
+
+
+def _named(motions: Iterable[Path]) -> dict[str, Motion]:
+    """Read motions; each is called as its file, with underscores for what a name cannot have."""
+    found: dict[str, Motion] = {}
+    for path in motions:
+        name = re.sub(r"\W+", "_", path.resolve().stem, flags=re.ASCII).strip("_")
+        if not name or name in found or name.startswith(CAPTURED):
+            raise InputError(f"{path}: a motion cannot be called {name!r} here, or another is; rename the file")
+        found[name] = read_motion(path)
+    return found

@@ -1,0 +1,65 @@
+"""The two meshes that an asset can have: the body model's own, registered, and the field's own, captured."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+import trimesh
+
+from hnerf.asset.correctives import as_they_are
+from hnerf.asset.registration import SMOOTHING_M, register
+from hnerf.asset.rig_transfer import clothed_rig, strongest, with_surface
+from hnerf.asset.simplify import simplify
+from hnerf.asset.texture import UvLayout, unwrap
+from hnerf.body.base_mesh import BaseMesh, base_mesh
+from hnerf.body.rig import Rig
+
+
+@dataclass(frozen=True)
+class AssetMesh:
+    """A mesh in the rest pose: its rig; settle: what makes the displacements (V, 3) of single frames agree with each
+    other; skin_faces: how many of the first faces are closed skin; base: the body's mesh that it has the topology of,
+    if any."""
+
+    rig: Rig
+    settle: Callable[[np.ndarray], np.ndarray]
+    skin_faces: int
+    base: BaseMesh | None
+
+    @cached_property
+    def trimesh(self) -> trimesh.Trimesh:
+        """Return all of the mesh."""
+        return trimesh.Trimesh(self.rig.vertices_m.numpy(), self.rig.faces.numpy(), process=False)
+
+    def layout(self, texture_px: int) -> UvLayout:
+        """Return the texture coordinates: the body model's where it has some, else charts of the body at its shape,
+        else of this mesh."""
+        if self.base is None:
+            return unwrap(self.trimesh.vertices, self.trimesh.faces, texture_px)
+        if self.base.uvs is None or self.base.face_uvs is None:
+            return unwrap(self.base.rig.vertices_m.numpy(), self.base.rig.faces.numpy(), texture_px)
+        return UvLayout(self.base.uvs, self.base.face_uvs)
+
+
+def asset_meshes(rig: Rig, dense: trimesh.Trimesh, faces: int) -> dict[str, AssetMesh]:
+    """Return the meshes by the names of `asset.topology`. rig: the body's; dense: the field's surface in the rest pose;
+    faces: at most that many triangles of the captured mesh."""
+    return {"registered": registered_mesh(rig, dense), "captured": captured_mesh(rig, dense, faces)}
+
+
+def registered_mesh(rig: Rig, dense: trimesh.Trimesh) -> AssetMesh:
+    """Return the body model's mesh moved onto the surface, with the body model's strongest joint weights."""
+    base = base_mesh(rig)
+    found = register(base, dense)
+    shown = with_surface(
+        base.rig, torch.from_numpy(found.vertices_m).float(), base.rig.faces, *strongest(base.rig.dense_weights)
+    )
+    return AssetMesh(shown, found.plate.solver(found.trust, SMOOTHING_M[-1]), base.skin_faces, base)
+
+
+def captured_mesh(rig: Rig, dense: trimesh.Trimesh, faces: int) -> AssetMesh:
+    """Return the surface decimated to triangles, with joint weights from the body beneath."""
+    surface = simplify(dense, faces)
+    return AssetMesh(clothed_rig(rig, surface), as_they_are, len(surface.faces), None)

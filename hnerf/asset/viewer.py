@@ -1,0 +1,113 @@
+"""The page on which anyone can turn the avatar: one HTML file that opens offline and asks the network for nothing.
+
+It carries avatar.glb, photographs of the recording, three.js and the modules under `page/`, which do the work.
+"""
+
+import base64
+import gzip
+import json
+import logging
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jinja2
+import numpy as np
+
+from hnerf.asset.compact_glb import compact_glb
+from hnerf.capture.capture import Capture
+from hnerf.evaluation.pictures import data_uri
+from hnerf.evenly_spaced import evenly_spaced
+from hnerf.geometry.camera import Camera
+from hnerf.models import LICENCES, THREE_SHA256, has_model, model_file
+
+PAGE = Path(__file__).parent / "page"
+MAX_BYTES = 8_000_000
+TEXTURES_PX = (8192, 4096, 2048, 1024, 512)  # the first at which the page is small enough
+CAMERAS, PHOTOGRAPHS = 8, 5  # at most, and of each camera
+PHOTOGRAPH_PX = 384  # longer side
+RELATIVE_IMPORT = re.compile(r"from '\.{1,2}/(?:[\w./]*/)?([\w.]+\.js)'")  # as in three.js
+
+log = logging.getLogger("hnerf.asset")
+
+
+def write_viewer(path: Path, glb: Path, capture: Capture, stage_from_world: np.ndarray) -> str:
+    """Write the page of an avatar; return its name, or one line that says why there is none, which is logged, too.
+
+    stage_from_world (3, 3): from the capture's world to the avatar's. The texture is halved until the page has at most
+    MAX_BYTES; if that does not suffice, a warning is logged.
+    """
+    if any(not has_model(name) for name in THREE_SHA256):
+        reason = f"no {path.name}: three.js is not installed; `hnerf models` downloads it"
+        log.warning("%s", reason)
+        return reason
+    parts: dict[str, Any] = {
+        "title": capture.name,
+        "style": (PAGE / "viewer.css").read_text(encoding="utf-8"),
+        "boot": (PAGE / "boot.js").read_text(encoding="utf-8"),
+        "licence": (LICENCES / "three.txt").read_text(encoding="utf-8"),
+        "modules": _packed(json.dumps(_modules()).encode()),
+        "recording": _packed(json.dumps(recording(capture, stage_from_world)).encode()),
+    }
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(PAGE), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    for texture_px in TEXTURES_PX:
+        avatar = _packed(compact_glb(glb.read_bytes(), texture_px))
+        page = environment.get_template("viewer.html").render(avatar=avatar, **parts)
+        if len(page.encode()) <= MAX_BYTES:
+            break
+    else:
+        log.warning("%s: over %d MB; its motion is long", path.name, MAX_BYTES // 10**6)
+    path.write_text(page, encoding="utf-8")
+    return path.name
+
+
+def recording(capture: Capture, stage_from_world: np.ndarray) -> dict[str, Any]:
+    """Return what the page knows of the capture: its time, and training cameras with photographs of training frames.
+
+    Instants are seconds from the first frame. `pose`: row by row the camera's place in the avatar's world, with the
+    axes of OpenGL (x right, y up, looking along -z).
+    """
+    names = evenly_spaced(capture.train_cameras, CAMERAS)
+    frames = evenly_spaced(capture.train_frames, PHOTOGRAPHS)
+    return {
+        "fps": capture.fps,
+        "first_frame": capture.frames[0],
+        "cameras": [
+            _camera(capture.cameras[name], stage_from_world)
+            | {"photographs": [_photograph(capture, name, frame) for frame in frames]}
+            for name in names
+        ],
+    }
+
+
+def _camera(camera: Camera, stage_from_world: np.ndarray) -> dict[str, Any]:
+    pose = np.eye(4)
+    pose[:3, :3] = stage_from_world @ camera.R.T @ np.diag([1, -1, -1])
+    pose[:3, 3] = stage_from_world @ camera.centre_m
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    size = {"width": camera.width_px, "height": camera.height_px}
+    return {"name": camera.name, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **size, "pose": pose.ravel().tolist()}
+
+
+def _photograph(capture: Capture, camera: str, frame: int) -> dict[str, Any]:
+    image = capture.image(camera, frame)
+    shrink = PHOTOGRAPH_PX / max(image.shape[:2])
+    if shrink < 1:
+        image = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    return {"frame": frame, "time_s": (frame - capture.frames[0]) / capture.fps, "jpeg": data_uri(image)}
+
+
+def _modules() -> dict[str, str]:
+    """Return the sources by the names under which they import each other: "three", "three/..." and "viewer/..."."""
+    three = {f"three/{name}": model_file(name).read_text(encoding="utf-8") for name in THREE_SHA256}
+    three = {name: RELATIVE_IMPORT.sub(r"from 'three/\1'", source) for name, source in three.items()}
+    paths = [path for path in sorted(PAGE.glob("*.js")) if path.name != "boot.js"]
+    own = {f"viewer/{path.name}": path.read_text(encoding="utf-8") for path in paths}
+    return {"three": three.pop("three/three.module.js")} | three | own
+
+
+def _packed(content: bytes) -> str:
+    return base64.b64encode(gzip.compress(content, mtime=0)).decode()

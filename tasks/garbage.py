@@ -1,0 +1,118 @@
+"""What a store holds that nobody needs, and its removal beside running flows.
+
+An artifact is needed if a subject's latest results link to it or were computed from it, or if a running process uses
+it. A use is noted twice: in the process's own file (tasks/pins.py), and as the record's time of change. Removal takes a
+record away first, and puts it back if its time has changed since it was read: either a process finds no record, or its
+use is seen here.
+"""
+
+import os
+import re
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from tasks.inventory import KEY, Inventory, in_stages
+from tasks.store import Store, remove
+
+LEFT = re.compile(rf"({KEY.pattern})(\.partial|\.json\.partial|\.lock|)")
+
+
+@dataclass(frozen=True)
+class Garbage:
+    """Something to remove: the artifact of a key, or what is `left` of work on it that was interrupted. used_s: when it
+    was last used or written, in seconds since 1970."""
+
+    stage: str
+    key: str
+    left: tuple[Path, ...]
+    size_bytes: int
+    used_s: float
+
+    @property
+    def what(self) -> str:
+        """Return a word for it."""
+        return "unfinished" if self.left else "artifact"
+
+
+def find_garbage(inventory: Inventory, keep: int, older_s: float) -> list[Garbage]:
+    """Return what the `keep` newest results of no subject need, and what was left by work that was interrupted, as far
+    as nobody has used it for `older_s` seconds."""
+    needed = inventory.needed(keep)
+    found = [
+        Garbage(one.artifact.stage, one.artifact.root.name, (), one.size_bytes, one.used_s)
+        for name, one in inventory.stored.items()
+        if name not in needed
+    ]
+    found += _left_behind(inventory)
+    return [one for one in found if one.used_s <= time.time() - older_s]
+
+
+def collect(store: Store, garbage: Garbage) -> bool:
+    """Remove it; return False, with all in place, if a process works on the key or has used it meanwhile."""
+    try:
+        with store.locked(garbage.stage, garbage.key, wait=False):
+            removed = _remove_left(garbage) if garbage.left else _remove_artifact(store, garbage)
+            if removed and not store.path(garbage.stage, garbage.key, ".json").exists():
+                store.path(garbage.stage, garbage.key, ".lock").unlink()
+            return removed
+    except BlockingIOError:
+        return False
+
+
+def _remove_artifact(store: Store, garbage: Garbage) -> bool:
+    record, aside, folder = (store.path(garbage.stage, garbage.key, end) for end in (".json", ".json.partial", ""))
+    try:
+        os.replace(record, aside)
+    except FileNotFoundError:
+        return False
+    if aside.stat().st_mtime != garbage.used_s:
+        os.replace(aside, record)
+        return False
+    remove(folder)
+    aside.unlink()
+    return True
+
+
+def _remove_left(garbage: Garbage) -> bool:
+    if _written_s(garbage.left) > garbage.used_s:  # resumed, and interrupted again
+        return False
+    for path in garbage.left:
+        if path.is_dir() and not path.is_symlink():
+            remove(path)
+        elif path.suffix != ".lock":  # that one is held, and goes last
+            path.unlink(missing_ok=True)
+    return True
+
+
+def _left_behind(inventory: Inventory) -> Iterator[Garbage]:
+    """Yield, by key, folders without a record, work in progress, and the locks of keys that have nothing else."""
+    left: dict[tuple[str, str], list[Path]] = {}
+    for path in in_stages(inventory.store, "*"):
+        matched = LEFT.fullmatch(path.name)
+        if matched and (matched[2] or not path.with_name(f"{path.name}.json").exists()):
+            left.setdefault((path.parent.name, matched[1]), []).append(path)
+    for (stage, key), paths in left.items():
+        recorded = inventory.store.path(stage, key, ".json").exists()
+        if not (recorded and all(path.suffix == ".lock" for path in paths)):
+            files = [file for path in paths for file in [path, *path.rglob("*")]]
+            yield Garbage(stage, key, tuple(paths), _size_bytes(files), _written_s(tuple(paths)))
+
+
+def _written_s(paths: tuple[Path, ...]) -> float:
+    """Return when any of these files, or a file below these folders, was last written; 0 if none is left."""
+    times = [0.0]
+    for path in [file for one in paths if one.suffix != ".lock" for file in [one, *one.rglob("*")]]:
+        with suppress(FileNotFoundError):
+            times.append(path.lstat().st_mtime)
+    return max(times)
+
+
+def _size_bytes(paths: list[Path]) -> int:
+    total = 0
+    for path in paths:
+        with suppress(FileNotFoundError):
+            total += path.lstat().st_size if path.is_file() and not path.is_symlink() else 0
+    return total

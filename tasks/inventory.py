@@ -1,0 +1,138 @@
+"""What is in a store: its artifacts, whose they are, and what they were computed from."""
+
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from tasks.pins import pinned
+from tasks.store import RECORDING, STAGES, Artifact, Store
+
+KEY = re.compile(r"[0-9a-f]{32}")
+STAGE = re.compile(r"[a-z][a-z-]*")
+NO_STAGES = ("subjects", "ingested")
+RESULTS = STAGES[-2:]  # where runs end
+NOBODY = "-"
+
+
+@dataclass(frozen=True)
+class Stored:
+    """An artifact, and when it was made and last used (seconds since 1970)."""
+
+    artifact: Artifact
+    made_s: float
+    used_s: float
+
+    @property
+    def size_bytes(self) -> int:
+        """Return the size of its files."""
+        return sum(file.size_bytes for file in self.artifact.files.values())
+
+
+@dataclass(frozen=True)
+class Inventory:
+    """The artifacts of a store by name (`<stage>/<key>`), the latest ones of each subject by stage, and the records
+    that cannot be read."""
+
+    store: Store
+    stored: dict[str, Stored]
+    latest: dict[str, dict[str, str]]
+    unreadable: tuple[Path, ...]
+
+    @staticmethod
+    def of(store: Store) -> "Inventory":
+        """Read the records and links of a store, beside which flows may run."""
+        stored, unreadable = {}, []
+        for record in in_stages(store, "*.json"):
+            if not KEY.fullmatch(record.stem) or not record.is_file():
+                continue
+            try:
+                artifact = store.recorded(record.parent.name, record.stem)
+                times = artifact and Stored(artifact, artifact.root.stat().st_mtime, record.stat().st_mtime)
+            except (FileNotFoundError, NotADirectoryError):
+                times = None
+            if times:
+                stored[times.artifact.name] = times
+            elif record.exists():
+                unreadable.append(record)
+        return Inventory(store, stored, _latest(store), tuple(unreadable))
+
+    def with_inputs(self, names: Iterable[str]) -> set[str]:
+        """Return these artifacts and all that they were computed from, as far as it is there and records say so."""
+        found: set[str] = set()
+        waiting = list(names)
+        while waiting:
+            name = waiting.pop()
+            if name in self.stored and name not in found:
+                found.add(name)
+                waiting += self.stored[name].artifact.inputs
+        return found
+
+    @cached_property
+    def owners(self) -> dict[str, set[str]]:
+        """Return the subjects of each artifact: those whose recordings it was computed from, or who link to it."""
+        owners: dict[str, set[str]] = {name: set() for name in self.stored}
+        for subject, links in self.latest.items():
+            for name in self.with_inputs(links.values()):
+                owners[name].add(subject)
+        recorded = {name: _recorded_name(one.artifact) for name, one in self.stored.items()}
+        for name in [name for name, subjects in owners.items() if not subjects]:
+            owners[name] = {recorded[one] for one in self.with_inputs([name])} - {""}
+        return owners
+
+    def of_subject(self, subject: str) -> list[Stored]:
+        """Return a subject's artifacts, in the order in which they were made."""
+        mine = [self.stored[name] for name, subjects in self.owners.items() if subject in subjects]
+        return sorted(mine, key=lambda one: one.made_s)
+
+    def needed(self, keep: int = 1) -> set[str]:
+        """Return the artifacts that the `keep` newest results of every subject need, its links, and what running
+        processes use."""
+        roots = pinned(self.store.root)
+        for subject, links in self.latest.items():
+            roots |= set(links.values())
+            newest = [one.artifact.name for one in self.of_subject(subject)[::-1]]
+            for stage in RESULTS if keep > 1 else ():
+                roots |= set([name for name in newest if name.startswith(f"{stage}/")][:keep])
+        return self.with_inputs(roots)
+
+
+def in_stages(store: Store, pattern: str) -> Iterator[Path]:
+    """Yield what lies in the folders of stages, and nowhere else in the store."""
+    for folder in sorted(store.root.iterdir()):
+        if STAGE.fullmatch(folder.name) and folder.name not in NO_STAGES:
+            yield from sorted(folder.glob(pattern))
+
+
+def recording_of(store: Store, subject: str) -> str:
+    """Return the folder of the recording that a subject's results are of, empty if it is not known."""
+    path = store.subject_folder(subject) / RECORDING
+    if not path.is_file() or path.is_symlink():
+        return ""
+    return " ".join(path.read_text(errors="replace").splitlines()[1:])
+
+
+def _latest(store: Store) -> dict[str, dict[str, str]]:
+    """Return the names of the artifacts that the links of each subject point to."""
+    folders = sorted(path for path in (store.root / "subjects").glob("*") if path.is_dir())
+    return {folder.name: dict(_links(folder)) for folder in folders}
+
+
+def _links(folder: Path) -> Iterator[tuple[str, str]]:
+    for stage in STAGES:
+        link = folder / stage
+        if link.is_symlink():
+            yield stage, f"{stage}/{Path(os.readlink(link)).name}"
+
+
+def _recorded_name(artifact: Artifact) -> str:
+    """Return the name of the person in a recording, empty for the artifacts of other stages."""
+    if artifact.stage != STAGES[0]:
+        return ""
+    try:
+        return str(json.loads((artifact.root / "capture.json").read_bytes())["name"])
+    except (OSError, LookupError, TypeError, ValueError):  # damaged
+        return ""

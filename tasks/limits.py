@@ -1,0 +1,92 @@
+"""Time limits: a stage that makes no progress for its limit is ended, and the reason is said in one line.
+
+An alarm raises StalledError in the main thread, which ends Python code, and code that waits. Code in C that never comes
+back to Python is ended with its whole process by the watchdog of faulthandler, which needs no interpreter and says
+where it stood; a worker then reports the run as crashed.
+"""
+
+import faulthandler
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from types import FrameType
+
+from hnerf.config import LimitSettings
+from hnerf.progress import Progress, listening
+
+GRACE_S = 120.0  # to end ranks, which get 40 s, and to remove files
+REARM_S = 1.0
+_settings: ContextVar[LimitSettings] = ContextVar("limits")
+
+
+class StalledError(RuntimeError):
+    """A stage made no progress for its limit. retryable: it would go on from where it was."""
+
+    def __init__(self, message: str, retryable: bool) -> None:
+        super().__init__(message)
+        self.retryable = retryable
+
+
+def set_limits(settings: LimitSettings) -> None:
+    """Apply these limits to the stages that run from here on in this context."""
+    _settings.set(settings)
+
+
+def limit_s(images: int) -> float:
+    """Return for how long a stage that works on this many images may make no progress."""
+    settings = _settings.get(LimitSettings())
+    return settings.stage_s + settings.image_s * images
+
+
+@contextmanager
+def limited(stage: str, images: int, resumable: bool) -> Iterator[None]:
+    """Raise StalledError in the code inside if it reports no progress for the stage's limit; where that does not end
+    it, end this process. Outside the main thread, where nothing can be raised, only the latter."""
+    patience_s, last = limit_s(images), Progress("", 0, 0)
+    armed_s = time.monotonic()
+
+    def arm() -> None:
+        if threading.current_thread() is threading.main_thread():
+            signal.setitimer(signal.ITIMER_REAL, patience_s)
+        faulthandler.dump_traceback_later(patience_s + GRACE_S, exit=True, file=sys.__stderr__ or 2)
+
+    def rearm(progress: Progress) -> None:
+        nonlocal armed_s, last
+        last = progress
+        if time.monotonic() - armed_s > REARM_S:
+            armed_s = time.monotonic()
+            arm()
+
+    def end(number: int, frame: FrameType | None) -> None:
+        at = f" after {last.done:g} of {last.total:g} {last.what}" if last.what else ""
+        raise StalledError(
+            f"{stage}: ended, no progress for {patience_s:.0f} s{at} (in {_place(frame)}); if the machine is that "
+            "slow, raise limits.stage_s or limits.image_s",
+            resumable,
+        )
+
+    main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGALRM, end) if main else None
+    try:
+        with listening(rearm):
+            arm()
+            yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+        if main:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.signal(signal.SIGALRM, before)
+
+
+def _place(frame: FrameType | None) -> str:
+    """Return module and line of this project's code in which the stage stood."""
+    while frame is not None:
+        name = frame.f_globals.get("__name__", "")
+        if name.split(".")[0] in ("hnerf", "tasks"):
+            return f"{name}, line {frame.f_lineno}"
+        frame = frame.f_back
+    return "a library"

@@ -1,0 +1,52 @@
+"""Which artifacts running processes use, so that none is removed under them.
+
+<store>/.running/<random>  lines `<stage>/<key>`; locked (flock) by a process while it lives, released by the kernel
+"""
+
+import errno
+import fcntl
+import os
+from pathlib import Path
+from typing import IO
+from uuid import uuid4
+
+FOLDER = ".running"
+READ_ONLY = (errno.EROFS, errno.EACCES, errno.EPERM)
+_own: dict[tuple[int, Path], IO[str]] = {}  # of this process and store; open until the process ends
+
+
+def pin(store: Path, name: str) -> None:
+    """Note that this process uses an artifact from here on; nothing is noted in a store that may only be read."""
+    try:
+        file = _own.get((os.getpid(), store)) or _begin(store)
+        file.write(f"{name}\n")
+        file.flush()
+    except OSError as error:
+        if error.errno not in READ_ONLY:
+            raise
+
+
+def pinned(store: Path) -> set[str]:
+    """Return the names of the artifacts that living processes use; remove what dead ones left."""
+    names: set[str] = set()
+    for path in (store / FOLDER).glob("[0-9a-f]*"):
+        with path.open() as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                names |= set(file.read().split())
+            else:
+                path.unlink(missing_ok=True)
+    return names
+
+
+def _begin(store: Path) -> IO[str]:
+    """Open this process's file, which gets its name once it is locked."""
+    name = uuid4().hex
+    beside, path = store / FOLDER / f".{name}", store / FOLDER / name
+    beside.parent.mkdir(exist_ok=True)
+    file = beside.open("x")
+    fcntl.flock(file, fcntl.LOCK_EX)
+    os.replace(beside, path)
+    _own[os.getpid(), store] = file
+    return file

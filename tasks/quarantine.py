@@ -1,0 +1,39 @@
+"""Why captures of a watched folder gave no result: <folder>/.refused/<name>.txt. The captures stay where they are."""
+
+import os
+import time
+from pathlib import Path
+
+from hnerf.files import replace_text
+
+FOLDER = ".refused"
+REMEDY = "Correct the folder: a capture that has changed is tried again by itself. To remove this note, remove it."
+
+
+def note(capture: Path, why: str) -> None:
+    """Say why a capture gave no result."""
+    path = _path(capture)
+    path.parent.mkdir(exist_ok=True)
+    text = f"{capture.name}: {why}\n\n{REMEDY}\n"
+    if path.is_symlink() or not path.is_file() or path.read_text(errors="replace").partition("\n\nSeen ")[0] != text:
+        replace_text(path, f"{text}\n\nSeen {time.strftime('%Y-%m-%d %H:%M:%S %z')}\n")
+
+
+def clear(capture: Path) -> None:
+    """Take back what was said about a capture."""
+    _path(capture).unlink(missing_ok=True)
+
+
+def clear_removed(folder: Path) -> None:
+    """Take back what was said about captures that are no longer in the watched folder."""
+    for path in (folder / FOLDER).glob("*.txt"):
+        if not os.path.lexists(folder / path.name.removesuffix(".txt")):
+            path.unlink(missing_ok=True)
+
+
+def _path(capture: Path) -> Path:
+    """Return the place of the note. Raises OSError if a link leads elsewhere from there."""
+    path = capture.parent / FOLDER / f"{capture.name}.txt"
+    if path.parent.is_symlink():
+        raise NotADirectoryError(f"{path.parent}: is a symbolic link; remove it")
+    return path

@@ -1,0 +1,24 @@
+"""The bending column's glTF file, as the viewer gets it."""
+
+from pathlib import Path
+
+from hnerf.asset.compact_glb import as_glb, read_glb
+from hnerf.asset.glb import write_glb
+from hnerf.asset.rigs import FULL
+from hnerf.asset.staging import StagedAvatar
+
+
+def write_avatar(path: Path, avatar: StagedAvatar) -> None:
+    write_glb(path, avatar, avatar.rigs[FULL])
+
+
+def with_joints_in_second_set(glb: bytes) -> bytes:
+    """Return the file with four influences of weight zero before those of each vertex."""
+    document, binary = read_glb(glb)
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    for name in ("JOINTS", "WEIGHTS"):
+        attributes[f"{name}_1"] = attributes[f"{name}_0"]
+        accessor = document["accessors"][attributes[f"{name}_1"]]
+        attributes[f"{name}_0"] = len(document["accessors"])
+        document["accessors"].append({key: accessor[key] for key in ("componentType", "count", "type")})  # zeros
+    return as_glb(document, binary)

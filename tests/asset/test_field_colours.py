@@ -1,0 +1,98 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from hnerf.asset.field_colours import field_colours, filled, median_of_seen
+from hnerf.asset.rig_transfer import clothed_rig
+from hnerf.asset.texture import Texels, rasterise, texture_image, unwrap
+from hnerf.body.fit_result import BodyFit
+from tests.asset.figure import bending_body, column_rig, twice, upright_column
+from tests.asset.stand_in import StandInAvatar, rest_colour
+
+
+def test_colours_are_read_on_the_fields_own_surface() -> None:
+    read_m = []
+
+    class Recording(StandInAvatar):
+        def colour(self, points_m: Tensor, directions: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+            read_m.append(self.signed_distance(points_m, theta, root))
+            return super().colour(points_m, directions, theta, root)
+
+    body = bending_body()
+    clothes = upright_column(0.175, 0.2, 1.4)  # 1.5 cm outside the field's surface; its caps are far inside
+    layout = unwrap(clothes.vertices, clothes.faces, 64)
+    posed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
+    field_colours(Recording(body), posed, rasterise(layout, 64))
+    assert len(read_m) == len(body.frames)
+    for distance_m in read_m:
+        assert distance_m.abs().median() < 0.002
+
+
+def test_baked_colours_are_those_of_the_point_on_the_rest_body() -> None:
+    body = bending_body()
+    clothes = upright_column(0.16, 0.0, 1.6)
+    layout = unwrap(clothes.vertices, clothes.faces, 256)
+    rig = clothed_rig(body.rig, clothes)
+    texels = rasterise(layout, 256)
+    colours = field_colours(StandInAvatar(body), dataclasses.replace(body, rig=rig), texels)
+    image = texture_image(texels, colours, 256)
+    middle_uv = layout.uvs[layout.face_uvs].mean(1)
+    pixel = image[((1 - middle_uv[:, 1]) * 256).astype(int), (middle_uv[:, 0] * 256).astype(int)]
+    middle_m = torch.tensor(clothes.triangles_center).float()
+    # Between the caps, away from the joint, whose bend shears, and off the stripes' borders. The body is 1 cm beneath.
+    z_m = middle_m[:, 2]
+    sides = (z_m > 0.1) & (z_m < 1.5) & ((z_m - 0.8).abs() > 0.2) & ((z_m % 0.2 - 0.1).abs() < 0.09)
+    inward = middle_m[:, :2] * (0.15 / middle_m[:, :2].norm(dim=1, keepdim=True))
+    expected = rest_colour(torch.cat([inward, middle_m[:, 2:]], 1)).numpy()[sides.numpy()]
+    assert sides.sum() > 100
+    assert np.abs(pixel[sides.numpy()] / 255 - expected).max() < 0.03
+
+
+def test_texels_off_the_fields_surface_take_the_colour_around() -> None:
+    """Clothes 25 cm taller than the body: above its top, the field's colour there would be lighter than any below."""
+
+    class Height(StandInAvatar):
+        def colour(self, points_m: Tensor, directions: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+            return points_m[:, 2:].expand(-1, 3) / 2
+
+    body = BodyFit(column_rig(), (0,), torch.zeros(1, 2, 3), torch.eye(4)[None])
+    clothes = upright_column(0.16, 0.0, 1.85)
+    texels = rasterise(unwrap(clothes.vertices, clothes.faces, 64), 64)
+    colours = field_colours(Height(body), dataclasses.replace(body, rig=clothed_rig(body.rig, clothes)), texels)
+    z_m = clothes.triangles_center[texels.face.numpy(), 2]
+    assert colours[z_m > 1.7].max() < 0.83
+    assert colours[z_m > 1.7].min() > 0.7
+
+
+def test_median_of_what_is_seen() -> None:
+    nan = np.nan
+    poses = np.array([[3.0, nan, nan, nan], [1.0, 4.0, 7.0, nan], [2.0, 1.0, nan, nan]])[..., None] * np.ones(3)
+    np.testing.assert_array_equal(median_of_seen(poses)[:, 0], [2, 2.5, 7, nan])
+
+
+def test_colours_spread_over_the_mesh_where_none_is_known() -> None:
+    """Black below 0.4 m and white above 1.2 m: in between, the harmonic function of a column is linear in height."""
+    column = upright_column(0.15, 0.0, 1.6)
+    rig = clothed_rig(bending_body().rig, column)
+    faces = np.arange(len(column.faces))
+    texels = Texels(*torch.zeros(2, len(faces)).long(), torch.from_numpy(faces), torch.full((len(faces), 3), 1 / 3))
+    z_m = column.triangles_center[:, 2]
+    colours = np.select([z_m < 0.4, z_m > 1.2], [0.0, 1.0], np.nan)[:, None] * np.ones(3)
+    result = filled(colours, texels, rig)
+    between = (z_m > 0.4) & (z_m < 1.2)
+    assert between.sum() > 100
+    assert result[between, 0] == pytest.approx((z_m[between] - 0.4) / 0.8, abs=0.01)
+    np.testing.assert_array_equal(result[~between], colours[~between])
+
+
+def test_a_part_without_any_colour_takes_the_mean() -> None:
+    near = upright_column(0.15, 0.0, 1.6)
+    rig = clothed_rig(bending_body().rig, twice(near, (1.0, 0, 0)))
+    faces = torch.arange(len(rig.faces))
+    texels = Texels(*torch.zeros(2, len(faces)).long(), faces, torch.full((len(faces), 3), 1 / 3))
+    colours = np.full((len(faces), 3), np.nan)
+    colours[: len(near.faces)] = (0.2, 0.4, 0.6)
+    np.testing.assert_allclose(filled(colours, texels, rig), [[0.2, 0.4, 0.6]] * len(faces), atol=1e-6)

@@ -1,0 +1,51 @@
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hnerf.asset.motions import Motion, ground_transforms, resampled
+
+
+def turning(fps: float, codes: list[float], degrees: list[float]) -> Motion:
+    """Return a motion of one joint about x, which moves along y by a metre for each degree."""
+    turns = Rotation.from_euler("x", np.array(degrees)[:, None], degrees=True).as_matrix()[:, None]
+    origins_m = np.array([[0, degree, 0] for degree in degrees], float)
+    return Motion(fps, np.array(codes), turns, origins_m, np.array(degrees)[:, None] / 100)
+
+
+def test_half_way_is_half_the_turn() -> None:
+    """At 10 a second, codes 5 and 6 are 0.5 and 0.6 s: of 30 a second, 15 to 18."""
+    found = resampled(turning(10.0, [5, 6], [10, 70]), 30)
+    np.testing.assert_array_equal(found.codes, [15, 16, 17, 18])
+    angles = Rotation.from_matrix(found.turns[:, 0]).as_euler("xyz", degrees=True)
+    np.testing.assert_allclose(angles[:, 0], [10, 30, 50, 70])
+    np.testing.assert_allclose(found.origins_m[:, 1], [10, 30, 50, 70])
+    np.testing.assert_allclose(found.shape_weights[:, 0], [0.1, 0.3, 0.5, 0.7])
+
+
+def test_only_instants_of_the_motion_are_taken() -> None:
+    """From 0.28 to 0.42 s there are 7, 8, 9 and 10 of 24 a second."""
+    np.testing.assert_array_equal(resampled(turning(50.0, [14, 21], [0, 7]), 24).codes, [7, 8, 9, 10])
+
+
+def test_a_single_pose_is_one_frame() -> None:
+    found = resampled(turning(10.0, [3], [20]), 24)  # 7.2 of 24
+    np.testing.assert_array_equal(found.codes, [7])
+    np.testing.assert_allclose(found.origins_m[:, 1], [20])
+
+
+def test_the_root_follows_way_and_heading_and_not_the_tilt() -> None:
+    """A pelvis that is turned by 50 degrees about the vertical after it was tilted forwards by 20."""
+    heading, tilt = (Rotation.from_euler(axis, angle, degrees=True) for axis, angle in (("y", 50), ("x", 20)))
+    pelvis = np.eye(4)[None].copy()
+    pelvis[0, :3, :3], pelvis[0, :3, 3] = (heading * tilt).as_matrix(), [1, 0.9, -2]
+    found = ground_transforms(pelvis, 0.1)[0]
+    np.testing.assert_allclose(found[:3, 3], [1, 0.1, -2])
+    np.testing.assert_allclose(found[:3, :3], heading.as_matrix(), atol=1e-12)
+
+
+def test_joints_below_move_with_those_above() -> None:
+    """A quarter turn about x takes a joint one metre up to one metre to the front."""
+    motion = turning(1.0, [0], [90])
+    both = Motion(1.0, motion.codes, np.concatenate([motion.turns, np.eye(3)[None, None]], 1), np.zeros((1, 3)),
+                  motion.shape_weights)  # fmt: skip
+    found = both.transforms(np.array([-1, 0]), np.array([[0.0, 0, 0], [0, 1, 0]]))
+    np.testing.assert_allclose(found[0, 1, :3, 3], [0, 0, 1], atol=1e-12)

@@ -1,0 +1,153 @@
+import dataclasses
+import time
+from pathlib import Path
+from zipfile import ZipFile
+
+import numpy as np
+import pytest
+from pxr import Usd, UsdGeom, UsdSkel, Vt
+
+from hnerf.asset.package import AssetInfo, write_cache, write_package, write_usdz
+from hnerf.asset.staging import StagedAvatar
+from hnerf.asset.validation import each_variant
+from tests.asset.figure import FRAMES, side_camera
+
+INFO = AssetInfo("column", "7", "CC0-1.0", "0123abcd")
+
+
+def skinned_points(stage: Usd.Stage, code: float) -> np.ndarray:
+    """Return the points of the mesh at a time code as OpenUSD evaluates them: blend shapes, then UsdSkel's skin."""
+    root = UsdSkel.Root(stage.GetPrimAtPath("/Avatar/Body"))
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/Avatar/Body/Surface"))
+    cache = UsdSkel.Cache()
+    cache.Populate(root, Usd.PrimDefaultPredicate)
+    skeleton = cache.GetSkelQuery(UsdSkel.Skeleton(stage.GetPrimAtPath("/Avatar/Body/Skeleton")))
+    motion = skeleton.GetAnimQuery()
+    weights = dict(zip(motion.GetBlendShapeOrder(), motion.ComputeBlendShapeWeights(code), strict=True))
+    binding, points = UsdSkel.BindingAPI(mesh.GetPrim()), np.array(mesh.GetPointsAttr().Get())
+    targets = binding.GetBlendShapeTargetsRel().GetTargets()
+    for name, path in zip(binding.GetBlendShapesAttr().Get(), targets, strict=True):
+        points += weights[name] * np.array(UsdSkel.BlendShape(stage.GetPrimAtPath(path)).GetOffsetsAttr().Get())
+    moved = Vt.Vec3fArray.FromNumpy(points)
+    skinning = cache.GetSkinningQuery(mesh.GetPrim())
+    assert skinning.ComputeSkinnedPoints(skeleton.ComputeSkinningTransforms(code), moved, code)
+    return np.array(moved)
+
+
+def write_all(out: Path, staged: StagedAvatar) -> None:
+    """Write the package, `avatar.usdz` and `avatar_cache.usdz`, of the column at 10 frames a second."""
+    cameras = [dataclasses.replace(side_camera(), name=name) for name in ("cam 1", "cam.1", "01")]
+    write_package(out, staged, cameras, 10.0, INFO)
+    write_usdz(out / "avatar.usdz", staged, cameras, 10.0, INFO)
+    write_cache(out / "avatar_cache.usdz", staged, cameras, 10.0, INFO)
+
+
+@pytest.fixture(scope="module")
+def package(staged: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with these files."""
+    out = tmp_path_factory.mktemp("package")
+    write_all(out, staged)
+    return out
+
+
+@pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz"])
+def test_usd_skins_as_we_do_in_every_variant(name: str, package: Path, staged: StagedAvatar) -> None:
+    stage = Usd.Stage.Open(str(package / name))
+    root, seen = stage.GetDefaultPrim(), set()
+    for _ in each_variant(stage):
+        rig, motion = (root.GetVariantSet(variants).GetVariantSelection() for variants in ("rig", "motion"))
+        seen.add((rig, motion))
+        moving = staged.rigs[rig].motions[motion]
+        expected = list(staged.rigs[rig].surfaces_m(motion, staged.rest))
+        for k in (0, len(moving.codes) - 1):
+            code = moving.codes[k] * 10 / moving.fps
+            np.testing.assert_allclose(skinned_points(stage, code), expected[k], atol=1e-5)
+            box = UsdSkel.Root(stage.GetPrimAtPath("/Avatar/Body")).GetExtentAttr().Get(code)
+            np.testing.assert_allclose(box, [expected[k].min(0), expected[k].max(0)], atol=1e-5)
+    assert seen == {(rig, motion) for rig in ("full", "game") for motion in ("captured", "captured_24", "captured_30")}
+
+
+@pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz"])
+def test_the_captured_frames_are_the_time_codes(name: str, package: Path, staged: StagedAvatar) -> None:
+    stage = Usd.Stage.Open(str(package / name))
+    assert (stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (10, 3, 8)
+    motion = UsdSkel.Animation(stage.GetPrimAtPath("/Avatar/Body/Motion/full"))
+    assert motion.GetRotationsAttr().GetTimeSamples() == list(FRAMES)
+    for frame, expected in zip(FRAMES, staged.points_m, strict=True):
+        np.testing.assert_allclose(skinned_points(stage, frame), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("rate", [24, 30])
+def test_an_interface_at_another_rate_has_whole_time_codes(rate: int, package: Path, staged: StagedAvatar) -> None:
+    stage = Usd.Stage.Open(str(package / f"avatar_{rate}.usda"))
+    codes = staged.rigs["full"].motions[f"captured_{rate}"].codes
+    assert (stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (
+        rate, codes[0], codes[-1],
+    )  # fmt: skip
+    motion = UsdSkel.Animation(stage.GetPrimAtPath("/Avatar/Body/Motion/full"))
+    assert motion.GetRotationsAttr().GetTimeSamples() == codes.tolist()
+    # 0.5 s, the capture's frame 5, is in the middle of both.
+    np.testing.assert_allclose(skinned_points(stage, rate / 2), staged.points_m[2], atol=1e-5)
+
+
+def test_the_same_avatar_is_the_same_bytes_at_any_time(package: Path, staged: StagedAvatar, tmp_path: Path) -> None:
+    """ZIP counts in steps of two seconds."""
+    time.sleep(max(0.0, (package / "avatar_cache.usdz").stat().st_mtime + 2.0 - time.time()))
+    write_all(tmp_path, staged)
+    written = [path for path in sorted(tmp_path.rglob("*")) if path.is_file()]
+    assert len(written) == 3 + 1 + 3 + 2 + 3 + 2  # interfaces, texture, common parts, rigs, motions, .usdz
+    for path in written:
+        assert path.read_bytes() == (package / path.relative_to(tmp_path)).read_bytes(), path.name
+    with ZipFile(tmp_path / "avatar.usdz") as archive:
+        assert archive.testzip() is None
+        assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+
+
+@pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_24.usda"])
+def test_the_root_prim_says_what_the_asset_is(name: str, package: Path) -> None:
+    stage = Usd.Stage.Open(str(package / name))
+    root, model = stage.GetDefaultPrim(), Usd.ModelAPI(stage.GetDefaultPrim())
+    assert (model.GetKind(), model.GetAssetName(), model.GetAssetVersion()) == ("component", "column", "7")
+    assert model.GetAssetIdentifier().path == "./avatar.usda"
+    assert (root.GetAssetInfoByKey("captureDigest"), root.GetAssetInfoByKey("licence")) == ("0123abcd", "CC0-1.0")
+
+
+def test_the_skeleton_says_its_rest_pose_and_names_elsewhere(package: Path) -> None:
+    stage = Usd.Stage.Open(str(package / "avatar.usda"))
+    skeleton = UsdSkel.Skeleton(stage.GetPrimAtPath("/Avatar/Body/Skeleton"))
+    assert list(skeleton.GetJointsAttr().Get()) == ["root", "root/pelvis", "root/pelvis/upper_L"]
+    assert list(skeleton.GetJointNamesAttr().Get()) == ["root", "pelvis", "upper_L"]
+    data = skeleton.GetPrim().GetCustomData()
+    assert data["restPose"] == "A"
+    assert data["jointNamesIn"]["mixamo"] == {"pelvis": "Hips"}
+
+
+def test_nothing_but_the_interface_is_loaded_without_payloads(package: Path) -> None:
+    stage = Usd.Stage.Open(str(package / "avatar.usda"), Usd.Stage.LoadNone)
+    assert stage.GetDefaultPrim().GetChildren() == []
+    assert len(UsdGeom.ModelAPI(stage.GetDefaultPrim()).GetExtentsHintAttr().Get()) == 2
+
+
+def test_the_hint_has_room_for_every_motion(staged: StagedAvatar, tmp_path: Path) -> None:
+    far = dataclasses.replace(staged, extents_m={name: 100 * boxes for name, boxes in staged.extents_m.items()})
+    write_usdz(tmp_path / "far.usdz", far, [], 10.0, INFO)
+    stage = Usd.Stage.Open(str(tmp_path / "far.usdz"))
+    hint = np.array(UsdGeom.ModelAPI(stage.GetDefaultPrim()).GetExtentsHintAttr().Get())
+    corners = np.concatenate([boxes.reshape(-1, 3) for boxes in far.extents_m.values()])
+    assert (hint[1] >= corners.max(0) - 1e-4).all() and (hint[0] <= corners.min(0) + 1e-4).all()
+
+
+def test_units_and_cameras_names(package: Path) -> None:
+    stage = Usd.Stage.Open(str(package / "avatar.usdz"))
+    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1.0)
+    prims = stage.GetPrimAtPath("/Avatar/Cameras").GetChildren()
+    assert [p.GetName() for p in prims] == ["cam_1", "cam_1_", "_01"]
+    assert [p.GetDisplayName() for p in prims] == ["cam 1", "cam.1", "01"]
+
+
+def test_cache_holds_the_posed_points(package: Path, staged: StagedAvatar) -> None:
+    stage = Usd.Stage.Open(str(package / "avatar_cache.usdz"))
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/Avatar/Surface"))
+    assert mesh.GetPointsAttr().GetTimeSamples() == list(FRAMES)
+    np.testing.assert_array_equal(np.array(mesh.GetPointsAttr().Get(8)), staged.points_m[3])
+    assert len(mesh.GetFaceVertexIndicesAttr().GetTimeSamples()) == 0

@@ -1,0 +1,62 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+
+from hnerf.asset import pictures
+from hnerf.asset.staging import StagedAvatar
+from hnerf.geometry.mesh_queries import Surface
+
+RED, GREEN, BLUE = [255, 0, 0], [0, 255, 0], [0, 0, 255]
+FRONT = np.array([0.0, 0.2, 1.0])  # leaning back
+
+
+@pytest.fixture
+def card(staged: StagedAvatar) -> StagedAvatar:
+    """Return a square card of two faces, 1 m wide, that faces +Z, with a texture of two by two colours."""
+    corners_m = np.array([[-0.5, 0, 0], [0.5, 0, 0], [0.5, 1, 0], [-0.5, 1, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    texture = np.array([[RED, GREEN], [BLUE, [255, 255, 0]]], np.uint8).repeat(32, 0).repeat(32, 1)
+    uvs = corners_m[:, :2] + (0.5, 0)
+    return dataclasses.replace(
+        staged, faces=faces, uvs=uvs, face_uvs=faces, texture=texture, points_m=corners_m[None].astype(np.float32)
+    )
+
+
+def surface_of(card: StagedAvatar) -> Surface:
+    return Surface(trimesh.Trimesh(card.points_m[0], card.faces, process=False))
+
+
+def test_the_texture_is_seen_upright_from_the_front(card: StagedAvatar) -> None:
+    front = pictures.turntable_cameras(card.points_m[0], FRONT, 4)[0]
+    picture = pictures.textured(surface_of(card), card, front)
+    # 300 x 400 px; the card is 282 px wide and as high, in the middle
+    assert picture[100, 60].tolist() == RED
+    assert picture[100, 240].tolist() == GREEN
+    assert picture[300, 60].tolist() == BLUE
+    assert picture[20, 150].tolist() == [255, 255, 255]
+
+
+def test_the_turntable_goes_around_the_person(card: StagedAvatar) -> None:
+    cameras = pictures.turntable_cameras(card.points_m[0], FRONT, 4)
+    directions = [camera.forward.round(6).tolist() for camera in cameras]
+    assert directions == [[0, 0, -1], [-1, 0, 0], [0, 0, 1], [1, 0, 0]]
+    assert all(camera.R[1].round(6).tolist() == [0, -1, 0] for camera in cameras)  # down
+
+
+def test_edges_are_lines_and_faces_are_not(card: StagedAvatar) -> None:
+    front = pictures.turntable_cameras(card.points_m[0], FRONT, 4)[0]
+    picture = pictures.wireframe(surface_of(card), front).astype(int)
+    diagonal, inside = picture[199, 150], picture[150, 100]
+    assert inside.max() - inside.min() < 15  # grey
+    assert diagonal[2] - diagonal[0] > 40  # blue
+    assert np.array_equal(picture[10, 10], [255, 255, 255])
+
+
+def test_the_layout_shows_where_faces_lie_in_the_texture(card: StagedAvatar) -> None:
+    lower = dataclasses.replace(card, uvs=card.uvs * (1, 0.5))
+    layout = pictures.uv_picture(lower, 64)
+    assert layout[10, 32].tolist() == [255, 255, 255]
+    assert layout[60, 40].tolist() == pictures.PAPER.tolist()
+    assert pictures.texture_picture(card, 32)[4, 4].tolist() == RED

@@ -1,0 +1,36 @@
+import pytest
+
+from hnerf.asset.correctives import as_they_are
+from hnerf.asset.regions import LIMIT_MM, findings, region_of, surface_distances_mm
+from hnerf.asset.rig_transfer import clothed_rig
+from hnerf.asset.topologies import AssetMesh
+from tests.asset.figure import column_rig, upright_column
+
+
+@pytest.mark.parametrize(
+    ("joint", "region"),
+    [("neck01", "head"), ("eye.L", "head"), ("clavicle.R", "torso"), ("spine03", "torso"), ("root", "torso"),
+     ("lowerarm02.L", "arms"), ("wrist.R", "hands"), ("finger2-3.L", "hands"), ("metacarpal1.L", "hands"),
+     ("upperleg01.L", "legs"), ("foot.R", "feet"), ("toe5-3.R", "feet"), ("pelvis.L", "torso")],
+)  # fmt: skip
+def test_regions_by_joint(joint: str, region: str) -> None:
+    assert region_of(joint) == region
+
+
+def test_distances_from_the_fields_surface_to_each_mesh() -> None:
+    """A field of 17 cm around meshes of 15 and 16.5 cm; distances to flat sides are a little longer than to circles."""
+    meshes = {}
+    for name, radius_m in (("registered", 0.15), ("captured", 0.165)):
+        surface = upright_column(radius_m, -0.02, 1.62)
+        meshes[name] = AssetMesh(clothed_rig(column_rig(), surface), as_they_are, len(surface.faces), None)
+    found = surface_distances_mm(upright_column(0.17, -0.02, 1.62), meshes)
+    assert found["registered"]["all"]["p95"] == pytest.approx(20, abs=0.3)
+    assert found["captured"]["all"]["p95"] == pytest.approx(5, abs=0.3)
+    assert set(found["registered"]) == {"all", "torso"} or set(found["registered"]) == {"all", "torso", "arms"}
+    assert findings(found["captured"]) == []
+    (line,) = findings(found["registered"])
+    assert line.startswith("torso: ") and "20 mm" in line and "topology=captured" in line
+
+
+def test_a_region_at_the_limit_is_no_finding() -> None:
+    assert findings({"all": {"mean": 50, "p95": 99}, "legs": {"mean": 1.0, "p95": LIMIT_MM}}) == []

@@ -1,0 +1,74 @@
+import numpy as np
+import pytest
+
+from hnerf.asset.skeleton import along_bones, full_skeleton, game_skeleton
+from hnerf.body.anny import anny_rig
+from hnerf.body.rig import Rig
+
+
+@pytest.fixture(scope="module")
+def body() -> Rig:
+    """Return anny's average body."""
+    return anny_rig()
+
+
+def stage_joints(rig: Rig) -> np.ndarray:
+    at = rig.joints_m.double().numpy() @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]).T
+    return at - [0, rig.vertices_m[:, 2].min().item(), at[0, 2]]
+
+
+def test_axes_by_hand() -> None:
+    """An arm to the left, a finger at its end, a foot to the front, and a head."""
+    names = ("root", "upperarm_L", "hand_L", "foot_L", "toe_L", "head")
+    parents = np.array([-1, 0, 1, 0, 3, 0])
+    at = np.array([[0.0, 0, 0], [1, 1, 0], [2, 1, 0], [0.1, 0, 0], [0.1, 0, 0.2], [0, 1.5, 0]])
+    found = along_bones(names, parents, at)
+    np.testing.assert_allclose(found[1], np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]), atol=1e-12)  # y left, z front
+    np.testing.assert_allclose(found[2], found[1])  # the last of a chain goes on
+    np.testing.assert_allclose(found[3], np.array([[-1, 0, 0], [0, 0, 1], [0, 1, 0]]), atol=1e-12)  # y front, z up
+    np.testing.assert_allclose(found[5], np.eye(3), atol=1e-12)  # the head points up
+
+
+def test_bones_point_along_the_body(body: Rig) -> None:
+    skeleton = full_skeleton(body.joint_names, body.parents.numpy(), stage_joints(body), "along")
+    y = dict(zip(skeleton.names, skeleton.rotations[:, :, 1], strict=True))
+    at = dict(zip(skeleton.names, skeleton.positions_m, strict=True))
+    for above, below in (("thigh_twist_L", "calf_L"), ("calf_twist_R", "foot_R"), ("forearm_twist_L", "hand_L"),
+                         ("index_01_R", "index_02_R"), ("spine_04", "spine_05")):  # fmt: skip
+        bone = at[below] - at[above]
+        np.testing.assert_allclose(y[above], bone / np.linalg.norm(bone), atol=1e-6)
+    np.testing.assert_allclose(y["pelvis"], y["spine_01"])  # they coincide
+    assert y["head"] @ [0, 1, 0] > 0.99 and y["eye_L"] @ [0, 0, 1] > 0.99
+    determinants = np.linalg.det(skeleton.rotations)
+    np.testing.assert_allclose(determinants, 1)
+    np.testing.assert_array_equal(skeleton.rotations[0], np.eye(3))
+
+
+def test_identity_bones(body: Rig) -> None:
+    skeleton = full_skeleton(body.joint_names, body.parents.numpy(), stage_joints(body), "identity")
+    np.testing.assert_array_equal(skeleton.rotations, np.tile(np.eye(3), (105, 1, 1)))
+
+
+def test_the_game_skeleton_folds_joints_in_series(body: Rig) -> None:
+    full = full_skeleton(body.joint_names, body.parents.numpy(), stage_joints(body), "along")
+    game, taken_by = game_skeleton(full, "along")
+    assert len(game.names) == 55
+    goes = {name: game.names[taken_by[j]] for j, name in enumerate(full.names)}
+    assert goes["upperarm_twist_L"] == "upperarm_L" and goes["hip_R"] == "pelvis" and goes["spine_04"] == "spine_03"
+    assert goes["ring_metacarpal_L"] == "hand_L" and goes["shoulder_L"] == "clavicle_L" and goes["neck_03"] == "neck_01"
+    assert goes["little_toe_02_R"] == "middle_toe_01_R" and goes["hand_R"] == "hand_R"
+    parent = {name: game.names[p] for name, p in zip(game.names[1:], game.parents[1:], strict=True)}
+    assert parent["thigh_L"] == "pelvis" and parent["calf_L"] == "thigh_L" and parent["forearm_R"] == "upperarm_R"
+    assert (game.parents[1:] < np.arange(1, 55)).all()
+    bone = game.positions_m[game.names.index("calf_L")] - game.positions_m[game.names.index("thigh_L")]
+    np.testing.assert_allclose(
+        game.rotations[game.names.index("thigh_L"), :, 1], bone / np.linalg.norm(bone), atol=1e-6
+    )
+
+
+def test_transforms_relative_to_parents_compose_again(body: Rig) -> None:
+    skeleton = full_skeleton(body.joint_names, body.parents.numpy(), stage_joints(body), "along")
+    local, composed = skeleton.local(skeleton.bind), skeleton.bind.copy()
+    for j, parent in enumerate(skeleton.parents[1:], 1):
+        composed[j] = composed[parent] @ local[j]
+    np.testing.assert_allclose(composed, skeleton.bind, atol=1e-12)

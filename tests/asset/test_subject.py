@@ -1,0 +1,49 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hnerf.asset import subject as exported
+from hnerf.asset.subject import export_subject
+from hnerf.config import AssetSettings
+from hnerf.errors import InputError
+from hnerf.render.motion import Motion
+from tests.asset.figure import bending_body
+
+
+def made(folder: Path) -> Path:
+    """Return a subject's folder with the files that an export reads first, all empty."""
+    for name in exported.NEEDED:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    return folder
+
+
+def test_motions_are_named_after_their_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = Motion(bending_body(), 25.0, "z")
+    given: list[Any] = []
+    monkeypatch.setattr(exported, "read_motion", lambda path: read)
+    monkeypatch.setattr(exported.Capture, "load", lambda folder: folder)
+    monkeypatch.setattr(exported, "load_cameras", lambda folder, capture: "capture")
+    monkeypatch.setattr(exported, "load_avatar", lambda folder, device: "avatar")
+    monkeypatch.setattr(exported, "export_asset", lambda *arguments: given.extend(arguments) or {"frames": 4})
+    motions = [tmp_path / "01 slow-walk.bvh", tmp_path / "ben"]
+    assert export_subject(made(tmp_path / "ada"), AssetSettings(), motions, tmp_path / "out", "01ab") == {"frames": 4}
+    assert given[0] == "capture" and given[4:] == ["01ab", {"01_slow_walk": read, "ben": read}]
+    assert (tmp_path / "out").is_dir()
+
+
+@pytest.mark.parametrize("names", [["a.bvh", "sub/a.npz"], ["captured_24.bvh"], ["!.bvh"]])
+def test_names_that_clash_are_refused(names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exported, "read_motion", lambda path: Motion(bending_body(), 25.0, "z"))
+    with pytest.raises(InputError, match="rename the file"):
+        export_subject(made(tmp_path / "ada"), AssetSettings(), [tmp_path / n for n in names], tmp_path / "out", "")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unfinished_subject_is_refused(tmp_path: Path) -> None:
+    made(tmp_path / "ada")
+    (tmp_path / "ada/training/model.safetensors").unlink()
+    with pytest.raises(InputError, match=r"model\.safetensors: missing; give <store>/subjects/<name>"):
+        export_subject(tmp_path / "ada", AssetSettings(), [], tmp_path / "out", "")
+    assert not (tmp_path / "out").exists()

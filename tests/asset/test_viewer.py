@@ -1,0 +1,240 @@
+"""The page of the avatar: what is in it, and, where a browser is installed, what it does."""
+
+import base64
+import dataclasses
+import gzip
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from hnerf.asset.compact_glb import read_glb
+from hnerf.asset.staging import StagedAvatar
+from hnerf.asset.viewer import MAX_BYTES, _modules, recording, write_viewer
+from hnerf.capture.capture import Capture
+from hnerf.geometry.mesh_queries import Surface
+from hnerf.models import THREE_SHA256, has_model
+from tests.asset.browser import Page, browser, found_browser
+from tests.asset.figure import FRAMES, capture, side_camera
+from tests.asset.pages import with_joints_in_second_set, write_avatar
+
+NEEDS_THREE = pytest.mark.skipif(
+    not all(map(has_model, THREE_SHA256)), reason="three.js is not installed; `hnerf models` fetches it"
+)
+LAST_JOINT = "viewer.avatar.joints.at(-1)"
+PICTURE = "(viewer.stage.render(), document.getElementById('canvas').toDataURL())"
+
+
+@pytest.fixture(scope="module")
+def photographed(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """Return the capture of one camera with grey pictures."""
+    root = tmp_path_factory.mktemp("capture")
+    (root / "images" / "01").mkdir(parents=True)
+    for frame in FRAMES:
+        cv2.imwrite(str(root / "images" / "01" / f"{frame:06d}.png"), np.full((480, 640, 3), 60 + frame, np.uint8))
+    return dataclasses.replace(capture(), root=root)
+
+
+@pytest.fixture(scope="module")
+def viewer(staged: StagedAvatar, photographed: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write the page of an avatar whose vertices are moved by their fifth joint and later ones alone."""
+    folder = tmp_path_factory.mktemp("viewer")
+    glb = folder / "avatar.glb"
+    write_avatar(glb, staged)
+    glb.write_bytes(with_joints_in_second_set(glb.read_bytes()))
+    written = write_viewer(folder / "viewer.html", glb, photographed, staged.stage_from_world)
+    assert written == "viewer.html"
+    return folder / "viewer.html"
+
+
+@pytest.fixture(scope="module")
+def page(viewer: Path) -> Iterator[Page]:
+    """Open the page in a browser."""
+    program = found_browser()
+    if program is None:
+        pytest.skip("no Chromium is installed")
+    with browser(program) as opened:
+        opened.open(viewer, 1000, 640)
+        opened.wait("window.viewer !== undefined")
+        opened.evaluate("document.getElementById('follow').click()")  # it would move the camera between pictures
+        yield opened
+
+
+def test_without_three_there_is_a_reason_and_no_page(
+    staged: StagedAvatar, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))
+    reason = write_viewer(tmp_path / "viewer.html", tmp_path / "avatar.glb", capture(), staged.stage_from_world)
+    assert reason == "no viewer.html: three.js is not installed; `hnerf models` downloads it"
+    assert not list(tmp_path.iterdir())
+
+
+def test_cameras_and_photographs_are_in_the_avatars_world(photographed: Capture, staged: StagedAvatar) -> None:
+    found = recording(photographed, staged.stage_from_world)
+    (camera,) = found["cameras"]
+    # At (0, -3, 1) of a world with z up, looking along +y: at (0, 1, 3) with y up, looking along -z.
+    np.testing.assert_allclose(camera["pose"], [1, 0, 0, 0, 0, 1, 0, 1, 0, 0, 1, 3, 0, 0, 0, 1], atol=1e-12)
+    assert {key: camera[key] for key in ("fx", "fy", "cx", "cy")} == {"fx": 500, "fy": 400, "cx": 300, "cy": 200}
+    assert (found["fps"], found["first_frame"]) == (10, 3)
+    taken = [(photograph["frame"], photograph["time_s"]) for photograph in camera["photographs"]]
+    assert taken == [(3, 0.0), (4, 0.1), (5, 0.2)]
+    jpeg = base64.b64decode(camera["photographs"][2]["jpeg"].split(",")[1])
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    assert image.shape == (288, 384, 3)
+    assert abs(int(image[100, 100, 0]) - 65) <= 1
+
+
+@NEEDS_THREE
+def test_every_import_is_in_the_page(viewer: Path) -> None:
+    modules = _modules()
+    for name, source in modules.items():
+        code = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
+        imported = set(re.findall(r"""\bfrom ['"]([^'"]+)['"];$""", code, flags=re.MULTILINE))
+        assert imported <= set(modules), name
+    assert set(re.findall(r"from '(.*)';", modules["three/OrbitControls.js"])) >= {"three"}
+    assert viewer.stat().st_size < MAX_BYTES
+
+
+@NEEDS_THREE
+def test_a_page_that_is_too_large_gets_a_smaller_texture(
+    viewer: Path,
+    photographed: Capture,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr("hnerf.asset.viewer.MAX_BYTES", viewer.stat().st_size - 1)
+    monkeypatch.setattr("hnerf.asset.viewer.TEXTURES_PX", (64, 16, 8))
+    write_viewer(tmp_path / "viewer.html", viewer.with_name("avatar.glb"), photographed, np.eye(3))
+    packed = re.search(r'id="packed-avatar">(.*?)<', (tmp_path / "viewer.html").read_text())
+    assert packed is not None
+    document, binary = read_glb(gzip.decompress(base64.b64decode(packed[1])))
+    view = document["bufferViews"][document["images"][0]["bufferView"]]
+    jpeg = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    assert cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR).shape == (16, 16, 3)
+    monkeypatch.setattr("hnerf.asset.viewer.MAX_BYTES", 1)
+    write_viewer(tmp_path / "viewer.html", viewer.with_name("avatar.glb"), photographed, np.eye(3))
+    assert "viewer.html: over 0 MB; its motion is long" in caplog.text
+
+
+@NEEDS_THREE
+def test_it_opens_without_a_complaint_or_a_request(page: Page, viewer: Path) -> None:
+    page.evaluate("new Promise(requestAnimationFrame)")
+    assert page.complaints() == []
+    assert page.requests() == [viewer.as_uri()]
+
+
+@NEEDS_THREE
+def test_it_plays_and_pauses(page: Page) -> None:
+    before = page.evaluate(LAST_JOINT + ".matrixWorld.elements.slice()")
+    page.evaluate("viewer.play(true)")
+    page.wait(f"{LAST_JOINT}.matrixWorld.elements.some((value, i) => value !== {before}[i])")
+    page.press(" ")
+    assert page.evaluate("viewer.playing") is False
+    assert page.evaluate("document.getElementById('play').textContent") == "Play"
+    page.evaluate("viewer.setTime(0.1)")
+    page.press(".")
+    assert page.evaluate("viewer.avatar.time") == pytest.approx(0.2)
+    assert page.evaluate("document.getElementById('clock').textContent") == "frame 5 · 0.20 s"
+
+
+@NEEDS_THREE
+def test_a_slider_turns_its_joint_on_top_of_the_motion(page: Page) -> None:
+    page.evaluate("viewer.setTime(0.2)")
+    quaternion = f"{LAST_JOINT}.quaternion.toArray()"
+    before, picture = page.evaluate(quaternion), page.evaluate(PICTURE)
+    page.evaluate(move("#joint", page.evaluate("viewer.avatar.joints.length - 1"), "change"))
+    page.evaluate(move("#turns input", 90, "input"))
+    about_x = Rotation.from_euler("x", 90, degrees=True)
+    expected = (Rotation.from_quat(before) * about_x).as_matrix()
+    for _ in range(2):  # the second time it must not be added again
+        page.evaluate("viewer.setTime(0.2)")
+        turned = Rotation.from_quat(page.evaluate(quaternion)).as_matrix()
+        np.testing.assert_allclose(turned, expected, atol=1e-6)
+    assert page.evaluate(PICTURE) != picture
+    page.click("#straighten")
+    assert page.evaluate(quaternion) == before
+    assert page.evaluate(PICTURE) == picture
+
+
+@NEEDS_THREE
+def test_a_slider_adds_to_the_weight_of_a_shape(page: Page, staged: StagedAvatar) -> None:
+    page.evaluate("viewer.setTime(0.2)")
+    weights = "viewer.avatar.meshes[0].morphTargetInfluences.slice()"
+    before, picture = page.evaluate(weights), page.evaluate(PICTURE)
+    page.evaluate(move("#weights input", 0.5, "input"))
+    np.testing.assert_allclose(page.evaluate(weights), np.add(before, np.eye(len(before))[0] / 2), atol=1e-6)
+    assert page.evaluate(PICTURE) != picture
+    page.evaluate("document.getElementById('unshape').click()")
+    assert page.evaluate(weights) == before
+
+
+@NEEDS_THREE
+def test_the_person_is_framed_from_the_front(page: Page, staged: StagedAvatar) -> None:
+    low, high = page.evaluate("[viewer.bounds.box.min.toArray(), viewer.bounds.box.max.toArray()]")
+    np.testing.assert_allclose([low, high], [staged.points_m[0].min(0), staged.points_m[0].max(0)], atol=1e-5)
+    ground_m = sorted(staged.points_m[..., 1].min(1))
+    x, _, z = page.evaluate("viewer.bounds.forward.toArray()")
+    assert math.atan2(x, z) == pytest.approx(0.8 * FRAMES[0])  # as the root turns about the vertical, from +z
+    assert ground_m[0] - 0.02 < page.evaluate("viewer.bounds.ground") < ground_m[-1] + 0.02
+
+
+@NEEDS_THREE
+def test_the_rest_pose_is_that_of_the_file(page: Page, staged: StagedAvatar) -> None:
+    page.evaluate("viewer.setTime(0.2)")
+    page.evaluate("viewer.setMotion(viewer.avatar.motions.length)")
+    inverse = "viewer.avatar.inverses.get(joint)"
+    moved = f"joint.matrixWorld.clone().multiply({inverse}).elements.map((value, i) => value - (i % 5 === 0))"
+    off = page.evaluate(f"Math.max(...viewer.avatar.joints.flatMap(joint => {moved}).map(Math.abs))")
+    assert off < 1e-6  # no joint moves its vertices
+    page.evaluate("viewer.setMotion(0)")
+
+
+@NEEDS_THREE
+def test_a_recorded_camera_shows_the_avatar_where_the_recording_has_it(page: Page, staged: StagedAvatar) -> None:
+    page.evaluate("viewer.setTime(0.19)")
+    page.click("#cameras label:nth-child(2)")
+    assert page.evaluate("viewer.avatar.time") == pytest.approx(0.2)  # of the nearest photograph
+    caption = "document.getElementById('caption').textContent"
+    assert page.evaluate(caption) == "Photograph of frame 5"
+    page.evaluate("viewer.setTime(0.26)")
+    assert page.evaluate(caption) == "Photograph of frame 5, another instant than the avatar's"
+    page.evaluate("viewer.setTime(0.2)")
+    assert page.evaluate("viewer.stage.camera.matrixWorld.elements.slice(12, 15)") == pytest.approx([0, 1, 3])
+    left, top, width, height = page.evaluate(
+        "(({offsetLeft, offsetTop, offsetWidth, offsetHeight}) => [offsetLeft, offsetTop, offsetWidth, offsetHeight])"
+        "(document.getElementById('photograph'))"
+    )
+    assert width / height == pytest.approx(640 / 480, abs=0.01)
+    page.evaluate("viewer.stage.grid.visible = false")
+    shown = page.evaluate(PICTURE)
+    canvas = cv2.imdecode(np.frombuffer(base64.b64decode(shown.split(",")[1]), np.uint8), cv2.IMREAD_UNCHANGED)
+    seen = cv2.resize(canvas[top : top + height, left : left + width, 3], (640, 480), interpolation=cv2.INTER_AREA)
+    expected = outline(staged.points_m[2] @ staged.stage_from_world, staged.faces)
+    overlap = ((seen > 127) & expected).sum() / ((seen > 127) | expected).sum()
+    assert overlap > 0.97
+    page.click("#cameras label:nth-child(1)")
+    assert page.evaluate("document.getElementById('photograph').hidden")
+
+
+def outline(world_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return where the side camera sees a surface, (480, 640) bool."""
+    camera = side_camera()
+    pixels = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1)
+    origins, directions = camera.rays(pixels.reshape(-1, 2))
+    hits = Surface(trimesh.Trimesh(world_m, faces, process=False)).cast(origins, directions)
+    return (hits.face >= 0).reshape(480, 640)
+
+
+def move(selector: str, value: float, event: str) -> str:
+    """Return a script that moves the first control of a selector as a user does."""
+    return (
+        f"(control => {{ control.value = {value}; control.dispatchEvent(new Event('{event}')); }})"
+        f"(document.querySelector('{selector}'))"
+    )

@@ -1,0 +1,94 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.body import bvh
+from hnerf.body.bvh import Bvh, read_bvh, write_bvh
+from hnerf.errors import InputError
+
+ELBOW = """HIERARCHY
+ROOT Upper arm
+{
+    OFFSET 1 2 3
+    CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+    JOINT Fore
+    {
+        OFFSET 10 0 0
+        CHANNELS 2 Yrotation Zrotation
+        End Site
+        {
+            OFFSET 5 0 0
+        }
+    }
+}
+MOTION
+Frames: 2
+Frame Time: 0.04
+0 0 0 0 0 0 0 0
+4 5 6 90 0 90 0 90
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    (folder / "a.bvh").write_text(text)
+    return folder / "a.bvh"
+
+
+def test_a_pose_by_hand(tmp_path: Path) -> None:
+    """Rz(90) Ry(90) takes x to -z; at the elbow y is x's image under Rz(90)."""
+    file = read_bvh(written(tmp_path, ELBOW))
+    assert (file.names, file.parents.tolist(), file.frame_s) == (("Upper arm", "Fore"), [-1, 0], 0.04)
+    np.testing.assert_allclose(file.rest(), [[1, 2, 3], [11, 2, 3]])
+    turns, at = file.world()
+    np.testing.assert_allclose(at[0], [[0, 0, 0], [10, 0, 0]])  # the root's channels stand for its offset
+    np.testing.assert_allclose(at[1], [[4, 5, 6], [4, 5, -4]], atol=1e-9)
+    # Rz(90) Ry(90): x to -z, y to -x, z to y. After the elbow's Rz(90), its x is that y.
+    np.testing.assert_allclose(turns[1, 1] @ [1, 0, 0], [-1, 0, 0], atol=1e-9)
+
+
+def test_what_is_written_is_read_again(tmp_path: Path) -> None:
+    file = read_bvh(written(tmp_path, ELBOW))
+    fork = Bvh(("a", "b", "c", "d"), np.array([-1, 0, 0, 1]), np.eye(4)[:, :3], 0.1,
+               np.tile(np.eye(4)[:, :3], (2, 1, 1)), file.rotations[:, [0, 1, 1, 0]])  # fmt: skip
+    write_bvh(tmp_path / "b.bvh", fork)
+    again = read_bvh(tmp_path / "b.bvh")
+    assert again.names == ("a", "b", "d", "c")  # depth first
+    order = [0, 1, 3, 2]
+    for found, true in zip(again.world(), fork.world(), strict=True):
+        np.testing.assert_allclose(found, true[:, order], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("HIERARCHY", "SOLID", "line 1: 'SOLID' is not expected here"),
+        ("MOTION", "", "line 17: 'Frames: 2' is not expected here"),
+        ("OFFSET 1 2 3", "OFFSET 1 2", "line 4: OFFSET is not three numbers"),
+        ("OFFSET 1 2 3", "OFFSET 1 2 nan", "line 4: OFFSET is not three numbers"),
+        ("OFFSET 1 2 3", "", "is not expected here"),
+        ("CHANNELS 6", "CHANNELS 60", "line 5: CHANNELS does not list what it counts"),
+        ("2 Yrotation Zrotation", "2 Yrotation Yrotation", "CHANNELS does not list"),
+        ("Yrotation Zrotation", "Yrotation Wrotation", "CHANNELS does not list"),
+        ("JOINT Fore", "ROOT Fore", "line 6: ROOT in the wrong place"),
+        ("Frames: 2", "Frames: 3", "says 3 frames and has 2"),
+        ("Frames: 2", "Frames: 999999999", "999999999 frames of 8 channels are too many"),
+        ("Frames: 2", "Frames: two", "no `Frames:` and `Frame Time:`"),
+        ("Frame Time: 0.04", "", "no `Frames:` and `Frame Time:`"),
+        ("Frame Time: 0.04", "Frame Time: 0", "correct `Frames:` and `Frame Time:`"),
+        ("4 5 6 90", "4 5 6 ninety", "frames are not numbers"),
+        ("4 5 6 90", "4 5 6 nan", "frames are not 8 numbers"),
+        ("4 5 6 90", "4 5 6", "frames are not numbers"),
+    ],
+)
+def test_a_bad_file_is_refused_in_one_line(old: str, new: str, message: str, tmp_path: Path) -> None:
+    path = written(tmp_path, ELBOW.replace(old, new, 1))
+    with pytest.raises(InputError, match=message) as refused:
+        read_bvh(path)
+    assert str(refused.value).startswith(str(path)) and "\n" not in str(refused.value)
+
+
+def test_endless_hierarchies_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bvh, "MAX_JOINTS", 1)
+    with pytest.raises(InputError, match="more than 1 joints"):
+        read_bvh(written(tmp_path, ELBOW))

@@ -1,0 +1,39 @@
+from collections import Counter
+from pathlib import Path
+
+from hnerf.body.anny import _model
+from hnerf.body.skeletons import EQUIVALENTS, SKELETONS, exported_from, exported_name, is_serial, names_table
+
+
+def test_readable_names() -> None:
+    assert exported_name("root") == "pelvis"
+    assert exported_name("upperarm01.L") == "upperarm_L"
+    assert exported_name("lowerleg02.R") == "calf_twist_R"
+    assert exported_name("finger1-2.R") == "thumb_02_R"
+    assert exported_name("metacarpal1.L") == "index_metacarpal_L"
+    assert exported_name("toe5-3.L") == "little_toe_03_L"
+    assert exported_name("jaw") == "jaw"
+
+
+def test_every_joint_of_the_body_has_a_name_of_its_own() -> None:
+    names = [exported_name(name) for name in _model().bone_labels]
+    assert max(Counter(names).values()) == 1 and "root" not in names
+    assert set(EQUIVALENTS) - {"root"} <= set(names)
+    kept = [name for name in names if not is_serial(name)]
+    assert len(kept) == 54  # and the root
+    assert {"pelvis", "spine_03", "hand_L", "pinky_03_R", "middle_toe_01_L", "eye_R"} <= set(kept)
+
+
+def test_names_in_other_skeletons() -> None:
+    forearm = EQUIVALENTS["forearm_R"]
+    assert (forearm.ue5, forearm.mixamo, forearm.humanik) == ("lowerarm_r", "RightForeArm", "RightForeArm")
+    assert (forearm.vrm, forearm.smplx, forearm.cmu) == ("rightLowerArm", "right_elbow", "RightForeArm")
+    assert EQUIVALENTS["thumb_01_L"].vrm == "leftThumbMetacarpal"
+    for skeleton in SKELETONS:
+        theirs = [getattr(names, skeleton) for names in EQUIVALENTS.values() if getattr(names, skeleton)]
+        assert len(theirs) == len(set(theirs)), skeleton
+        assert exported_from(skeleton)[theirs[0]] in EQUIVALENTS
+
+
+def test_the_table_in_the_documentation_is_this_one() -> None:
+    assert names_table() in (Path(__file__).parents[2] / "docs" / "asset.md").read_text()

@@ -1,0 +1,65 @@
+import json
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from typing import Any
+
+import pytest
+from prefect import get_client
+from prefect.events import emit_event
+
+from flows.automations import lost_runs, set_up
+from flows.ingest_captures import DISK_EVENT
+
+PATIENCE_S = 90.0
+
+
+@pytest.fixture
+def called() -> Iterator[tuple[str, list[Any]]]:
+    """Return the address of a webhook, and what it was called with."""
+    heard: list[Any] = []
+
+    class Webhook(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            heard.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+            self.send_response(204)
+            self.end_headers()
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Webhook) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/", heard
+        server.shutdown()
+
+
+def test_the_operator_is_told_once_however_often_it_is_set_up(prefect_api: str, called: tuple[str, list[Any]]) -> None:
+    url, heard = called
+    for _ in range(2):
+        names = set_up(url, "local", 150)
+    with get_client(sync_client=True) as client:
+        known = {one.name: one for one in client.read_automations()}
+        assert len(known) == len(names) == 5 and known.keys() == set(names)
+        deadline = time.monotonic() + PATIENCE_S
+        while not heard and time.monotonic() < deadline:  # the server reads automations now and then
+            resource = {"prefect.resource.id": "hnerf.store./store", "prefect.resource.name": 'the "store"'}
+            emit_event(DISK_EVENT, resource=resource, payload={"free_gib": 1.5})
+            time.sleep(1)
+        for automation in known.values():
+            client.delete_automation(automation.id)
+    assert heard[0] == {"text": 'store the "store": 1.5 GiB are free; nothing is started'}
+
+
+def test_without_a_webhook_only_lost_runs_are_ended(prefect_api: str) -> None:
+    assert set_up(None, "local", 150) == ["hnerf: lost runs"]
+    with get_client(sync_client=True) as client:
+        (automation,) = client.read_automations_by_name("hnerf: lost runs")
+        assert automation.trigger.within.total_seconds() == 150
+        client.delete_automation(automation.id)
+
+
+def test_silence_is_longer_than_some_heartbeats() -> None:
+    trigger = lost_runs(150).trigger
+    assert trigger.after == {"prefect.flow-run.heartbeat"} and trigger.posture == "Proactive"

@@ -1,0 +1,98 @@
+"""The commands that docs/operations.md gives for PostgreSQL, against a server of this test's own: make soak."""
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+
+ROOT = Path(__file__).parents[2]
+BINARIES = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda path: int(path.parent.name))
+PATIENCE_S = 300.0
+
+pytestmark = [
+    pytest.mark.soak,
+    pytest.mark.skipif(not BINARIES, reason="Debian's postgresql is not installed"),
+]
+
+
+def free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+@pytest.fixture
+def cluster() -> Iterator[dict[str, str]]:
+    """Start an empty PostgreSQL; return the environment in which its administrator's commands run."""
+    folder = Path(tempfile.mkdtemp(prefix="hnerf-postgresql-"))  # which the user postgres can reach
+    as_postgres = ["setpriv", "--reuid=postgres", "--regid=postgres", "--clear-groups"] if os.getuid() == 0 else []
+    if as_postgres:
+        shutil.chown(folder, "postgres")
+    port = str(free_port())
+
+    def control(*arguments: str) -> None:
+        command = [*as_postgres, str(BINARIES[-1] / "pg_ctl"), "-D", f"{folder}/data", "-w", *arguments]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=folder)
+
+    control("initdb", "-o", "--auth=trust --username=postgres")
+    control("start", "-l", f"{folder}/log", "-o", f"-p {port} -k {folder} -c listen_addresses=127.0.0.1")
+    path = f"{BINARIES[-1]}:{Path(sys.executable).parent}:{os.environ['PATH']}"
+    try:
+        yield os.environ | {"PGHOST": "127.0.0.1", "PGPORT": port, "PGUSER": "postgres", "PATH": path}
+    finally:
+        control("stop", "-m", "immediate")
+        shutil.rmtree(folder)
+
+
+def shell(command: str, environment: dict[str, str], folder: Path) -> str:
+    done = subprocess.run(command, shell=True, env=environment, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
+    return done.stdout
+
+
+def serve(environment: dict[str, str], folder: Path, commands: list[str]) -> str:
+    """Run commands against a Prefect server on the database; return what they printed."""
+    port = str(free_port())
+    environment = environment | {"PREFECT_API_URL": f"http://127.0.0.1:{port}/api"}
+    start = [sys.executable, "-m", "prefect", "server", "start", "--host", "127.0.0.1", "--port", port, "--no-ui"]
+    server = subprocess.Popen(start, env=environment, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                httpx.get(f"http://127.0.0.1:{port}/api/health", timeout=2).raise_for_status()
+                break
+            except httpx.HTTPError:
+                assert server.poll() is None and time.monotonic() < deadline
+                time.sleep(0.5)
+        return "".join(shell(command, environment, folder) for command in commands)
+    finally:
+        server.terminate()
+        server.wait(timeout=60)
+
+
+def test_set_up_upgrade_backup_and_restore(cluster: dict[str, str], tmp_path: Path) -> None:
+    """A work pool made before the backup is there after the restore, one made later is not."""
+    environment = cluster | {"PREFECT_HOME": str(tmp_path), "PREFECT_SERVER_ANALYTICS_ENABLED": "false"}
+    shell("createuser hnerf && createdb hnerf --owner hnerf", environment, tmp_path)
+    url = f"postgresql+asyncpg://hnerf:PASSWORD@localhost:{cluster['PGPORT']}/hnerf"
+    (tmp_path / ".env").write_text(f"PREFECT_SERVER_DATABASE_CONNECTION_URL={url}\n")
+    shell("prefect server database upgrade --yes", environment, tmp_path)
+    assert "alembic" in shell("psql --tuples-only --command '\\dt' hnerf", environment, tmp_path)
+    pool = "prefect --no-prompt work-pool create {} --type process"
+    serve(environment, tmp_path, [pool.format("before")])
+    shell("pg_dump --format=custom --file=prefect.dump hnerf", environment, tmp_path)
+    serve(environment, tmp_path, [pool.format("after")])
+    restore = "dropdb hnerf && createdb hnerf --owner hnerf && pg_restore --dbname=hnerf prefect.dump"
+    shell(restore, environment, tmp_path)
+    shell("prefect server database upgrade --yes", environment, tmp_path)
+    names = serve(environment, tmp_path, ["prefect work-pool ls"])
+    assert "before" in names and "after" not in names

@@ -1,0 +1,63 @@
+import base64
+import io
+import time
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from prefect import flow, get_client
+from prefect.client.schemas.filters import ArtifactFilter, ArtifactFilterFlowRunId
+from prefect.context import FlowRunContext
+
+from flows import run_page
+from flows.run_page import embedded, publish_link, shown_progress, slug
+from hnerf.progress import report
+
+
+def test_progress_and_links_are_on_the_page_of_the_run(
+    prefect_api: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_page, "UPDATE_S", 0.05)
+
+    @flow
+    def work() -> str:
+        with shown_progress():
+            report("body fit", 0, 8)
+            report("short", 1, 1)
+            for done in (1, 2):
+                time.sleep(0.1)
+                report("body fit", done, 8)
+        report("body fit", 8, 8)  # nobody looks any more
+        publish_link(tmp_path / "report.html", "report", "Report")
+        context = FlowRunContext.get()
+        return str(context.flow_run.id) if context and context.flow_run else ""
+
+    run = work()
+    chosen = ArtifactFilter(flow_run_id=ArtifactFilterFlowRunId(any_=[run]))
+    with get_client(sync_client=True) as client:
+        found = {artifact.key: artifact for artifact in client.read_artifacts(artifact_filter=chosen)}
+    assert found.keys() == {"body-fit", "report"}
+    assert found["body-fit"].type == "progress" and found["body-fit"].data == 25.0
+    assert f"file://{tmp_path}/report.html" in str(found["report"].data)
+
+
+def test_a_server_that_is_away_ends_no_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise ConnectionError("no server")
+
+    monkeypatch.setattr(run_page, "create_progress_artifact", refuse)
+    page = run_page._ProgressPage()
+    page.next_s["fit"] = 0.0
+    page.show(run_page.Progress("fit", 1, 2))
+
+
+def test_pictures_are_shrunk_and_embedded(tmp_path: Path) -> None:
+    Image.new("RGBA", (1280, 320), (255, 0, 0, 255)).save(tmp_path / "a.png")
+    text = embedded([("front", tmp_path / "a.png")])
+    head, _, uri = text.rstrip(")").partition("data:image/jpeg;base64,")
+    assert head == "front\n\n![front]("
+    assert Image.open(io.BytesIO(base64.b64decode(uri))).size == (640, 160)
+
+
+def test_keys_are_letters_digits_and_dashes() -> None:
+    assert [slug(text) for text in ("Body fit", "camera Ä_1", "...")] == ["body-fit", "camera-1", "work"]

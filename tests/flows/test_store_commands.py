@@ -1,0 +1,66 @@
+from argparse import ArgumentTypeError
+from pathlib import Path
+
+import pytest
+
+from flows.cli import main
+from flows.store_commands import duration_s
+from tasks.store import Store
+from tests.tasks.stores import run_of
+
+
+@pytest.fixture
+def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Store:
+    monkeypatch.setattr("tasks.store.pin", lambda *_: None)
+    monkeypatch.chdir(tmp_path)
+    run_of(Store(tmp_path / "store"), "ada", 10)
+    run_of(Store(tmp_path / "store"), "ada", 20)
+    return Store(tmp_path / "store")
+
+
+def test_what_is_there_and_whose(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    store.claim("ada", "a" * 64, Path("/recordings/\x1bada"))
+    assert main(["store", "list"]) == 0
+    _, ada, total = capsys.readouterr().out.splitlines()
+    assert ada.split()[:4] == ["ada", "78", "B", "8"] and ada.endswith("/recordings/\\x1bada")
+    assert total.startswith("all: 78 B; not needed: 39 B; free")  # "abc 10", three more, and a name of 15 bytes; twice
+    assert main(["store", "show", "ada"]) == 0
+    lines = capsys.readouterr().out.splitlines()[2:]
+    assert [line.split()[-1] for line in lines if "yes" in line] == [
+        f"capture/{20:032x}", f"fit/{22:032x}", f"evaluation/{23:032x}"
+    ]  # fmt: skip
+    assert main(["store", "show", "eve"]) == 2
+
+
+def test_nothing_is_removed_without_yes(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["store", "gc", "--older", "1d"]) == 0
+    assert capsys.readouterr().out.endswith("not needed: 4, 39 B; nothing was removed: give --yes to remove\n")
+    assert main(["store", "gc", "--keep", "2", "--yes"]) == 0
+    assert main(["store", "gc", "--older", "999999d", "--yes"]) == 0
+    assert main(["store", "verify"]) == 0
+    assert "checked: 8 artifacts, 10 files, 78 B" in capsys.readouterr().out
+    assert main(["store", "gc", "--yes"]) == 0
+    assert capsys.readouterr().out.endswith("removed: 4 of 4, 39 B\n")
+    assert main(["store", "verify"]) == 0
+
+
+def test_damage_is_an_error(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    next(store.root.glob("fit/*/deep/letters")).unlink()
+    assert main(["store", "verify", "ada"]) == 2
+    assert capsys.readouterr().err.startswith("hnerf: store: 1 faults")
+
+
+def test_out_and_in(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["store", "export", "ada"]) == 0
+    assert main(["store", "export", "ada"]) == 2  # nothing is overwritten
+    assert main(["store", "import", "ada.tar", "--store", "other"]) == 0
+    assert main(["store", "verify", "--store", "other"]) == 0
+    assert main(["store", "import", "none.tar"]) == 2
+    assert main(["store", "list", "--store", "none"]) == 2
+
+
+def test_times() -> None:
+    assert [duration_s(text) for text in ("30d", "12h", "5m", "7s", "0")] == [2592000, 43200, 300, 7, 0]
+    for text in ("30", "d", "-1d", "1w", "1.5d", ""):
+        with pytest.raises(ArgumentTypeError):
+            duration_s(text)

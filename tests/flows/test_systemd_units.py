@@ -1,0 +1,28 @@
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from flows.systemd_units import units
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+def test_systemd_accepts_the_units(tmp_path: Path) -> None:
+    root = tmp_path / "a checkout of 100%"
+    (root / ".venv" / "bin").mkdir(parents=True)
+    (root / ".venv" / "bin" / "prefect").touch(mode=0o755)
+    paths = []
+    for name, text in units(root).items():
+        (tmp_path / name).write_text(text)
+        paths.append(str(tmp_path / name))
+    command = ["systemd-analyze", "verify", "--man=no", *paths]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert str(tmp_path) not in done.stderr, done.stderr  # it complains about units of the machine, too
+    assert "hnerf" not in done.stderr, done.stderr
+
+
+def test_both_come_back_whatever_ends_them() -> None:
+    for text in units(Path("/srv/hnerf")).values():
+        assert "Restart=always" in text and "StartLimitIntervalSec=0" in text
+    assert "Wants=hnerf-server.service" in units(Path("/srv/hnerf"))["hnerf-worker.service"]

@@ -1,0 +1,39 @@
+"""A small store of two people for tests: capture -> fit -> evaluation of each, and what was before."""
+
+import json
+import os
+from pathlib import Path
+
+from tasks.store import Artifact, Store
+
+LONG_AGO_S = 1_600_000_000.0
+
+
+def add(store: Store, stage: str, number: int, *inputs: Artifact, name: str = "") -> Artifact:
+    """Add an artifact whose key is a number, and which is as old as the number says."""
+
+    def write(out: Path) -> dict[str, float]:
+        (out / "deep").mkdir()
+        (out / "deep" / "letters").write_text(f"abc {number}")
+        if name:
+            (out / "capture.json").write_text(json.dumps({"name": name}))
+        return {}
+
+    key = f"{number:032x}"
+    made = store.get_or_compute(stage, key, write, inputs=[one.name for one in inputs])
+    for path in (made.root, store.path(stage, key, ".json")):
+        os.utime(path, (LONG_AGO_S + number,) * 2)
+    return made
+
+
+def run_of(store: Store, subject: str, first: int) -> list[Artifact]:
+    """Add what a run leaves, with keys from `first` on: the rough fit, 1 further, has no link."""
+    capture = store.link_latest(subject, add(store, "capture", first, name=subject))
+    rough = add(store, "fit", first + 1, capture)
+    fit = store.link_latest(subject, add(store, "fit", first + 2, capture, rough))
+    return [capture, rough, fit, store.link_latest(subject, add(store, "evaluation", first + 3, fit))]
+
+
+def names(artifacts: list[Artifact]) -> set[str]:
+    """Return the artifacts' names."""
+    return {one.name for one in artifacts}

@@ -1,0 +1,190 @@
+import io
+import json
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hnerf.errors import InputError
+from tasks import archive as module
+from tasks.archive import MANIFEST, export_subject, import_subject
+from tasks.inventory import Inventory, recording_of
+from tasks.store import Store
+from tasks.verify import faults
+from tests.tasks.stores import names, run_of
+
+
+@pytest.fixture
+def packed(tmp_path: Path) -> Path:
+    """Return the archive of a subject."""
+    store = Store(tmp_path / "from")
+    run_of(store, "ada", 10)
+    run_of(store, "bob", 20)
+    store.claim("ada", "a" * 64, Path("/recordings/ada"))
+    export_subject(store, "ada", tmp_path / "ada.tar")
+    return tmp_path / "ada.tar"
+
+
+def test_a_subject_comes_out_and_in_with_all_it_was_computed_from(packed: Path, tmp_path: Path) -> None:
+    before, store = Store(tmp_path / "from"), Store(tmp_path / "to")
+    for _ in range(2):  # the second time all is there
+        import_subject(store, packed)
+        here, there = Inventory.of(store), Inventory.of(before)
+        assert here.latest == {"ada": there.latest["ada"]}
+        assert here.stored.keys() == {name for name, owners in there.owners.items() if owners == {"ada"}}
+        for name, one in here.stored.items():
+            assert one.artifact.digest == there.stored[name].artifact.digest
+            assert one.artifact.inputs == there.stored[name].artifact.inputs
+        assert recording_of(store, "ada") == "/recordings/ada"
+        assert faults(store).lines == []
+    assert not list(store.root.glob(".import-*"))
+
+
+def test_a_run_beside_it_that_has_some_keeps_them(packed: Path, tmp_path: Path) -> None:
+    store = Store(tmp_path / "to")
+    made = run_of(store, "bob", 10)[1]
+    import_subject(store, packed)
+    assert (made.root / "deep" / "letters").stat().st_nlink == 1
+    assert names([made]) <= Inventory.of(store).stored.keys()
+
+
+def test_a_name_of_another_recording_is_refused(packed: Path, tmp_path: Path) -> None:
+    store = Store(tmp_path / "to")
+    store.claim("ada", "b" * 64, Path("/recordings/another"))
+    with pytest.raises(InputError, match=r"subjects/ada: has the results of another recording"):
+        import_subject(store, packed)
+    assert list(store.root.iterdir()) == [store.root / "subjects"]
+
+
+def test_what_is_damaged_is_not_exported(packed: Path, tmp_path: Path) -> None:
+    store = Store(tmp_path / "from")
+    next(store.root.glob("fit/*/deep/letters")).write_text("abd")
+    with pytest.raises(InputError, match="damaged; repeat"):
+        export_subject(store, "ada", tmp_path / "again.tar")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ada.tar", "from"]
+
+
+def repack(path: Path, members: list[tuple[str, bytes]], **changes: Any) -> None:
+    with tarfile.open(path, "w", format=tarfile.GNU_FORMAT) as archive:
+        for name, content in members:
+            member = tarfile.TarInfo(name)
+            member.size = len(content)
+            for key, value in changes.items():
+                setattr(member, key, value)
+            archive.addfile(member, io.BytesIO(content))
+
+
+def unpacked(path: Path) -> list[tuple[str, bytes]]:
+    with tarfile.open(path) as archive:
+        return [(member.name, archive.extractfile(member).read()) for member in archive]  # type: ignore[union-attr]
+
+
+def nothing_came_of(store: Path) -> bool:
+    return [path.name for path in store.iterdir()] == []
+
+
+NAME = f"fit/{11:032x}"
+
+
+@pytest.mark.parametrize(
+    "path", ["../x", "/x", "a/../../x", "", ".", "a//b", "a/./b", "a\0b", "\ud800", "deep/letters/x", "a" * 2000]
+)
+def test_paths_that_lead_out_are_refused(packed: Path, tmp_path: Path, path: str) -> None:
+    (_, text), *files = unpacked(packed)
+    manifest = json.loads(text)
+    manifest["artifacts"][NAME]["files"][path] = manifest["artifacts"][NAME]["files"]["deep/letters"]
+    repack(packed, [(MANIFEST, json.dumps(manifest).encode()), *files])
+    with pytest.raises(InputError, match="is not a path inside a folder"):
+        import_subject(Store(tmp_path / "to"), packed)
+    assert nothing_came_of(tmp_path / "to")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda m: m.update(subject=".."),
+        lambda m: m.update(subject="a/b"),
+        lambda m: m.update(subject="\x1b[2J"),
+        lambda m: m.update(recording="x\n" * 9),
+        lambda m: m.update(more=1),
+        lambda m: m["latest"].update(fit="fit/none"),
+        lambda m: m["latest"].update({"../x": NAME}),
+        lambda m: m["artifacts"].update({"../fit": m["artifacts"][NAME]}),
+        lambda m: m["artifacts"][NAME].update(inputs=["../x"]),
+        lambda m: m["artifacts"][NAME]["files"]["deep/letters"].update(size_bytes=-1),
+        lambda m: m["artifacts"][NAME]["files"]["deep/letters"].update(sha256="../" * 20),
+        lambda m: m["artifacts"][NAME]["files"]["deep/letters"].update(size_bytes=1 << 60),
+        lambda m: m["artifacts"][NAME]["files"].update(more={"sha256": "0" * 64, "size_bytes": 1}),
+    ],
+)
+def test_a_manifest_that_is_none_is_refused(
+    packed: Path, tmp_path: Path, change: Callable[[dict[str, Any]], None]
+) -> None:
+    (_, text), *files = unpacked(packed)
+    manifest = json.loads(text)
+    change(manifest)
+    repack(packed, [(MANIFEST, json.dumps(manifest).encode()), *files])
+    with pytest.raises(InputError):
+        import_subject(Store(tmp_path / "to"), packed)
+    assert nothing_came_of(tmp_path / "to")
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"type": tarfile.SYMTYPE, "linkname": "/etc"}, "not a plain file"),
+        ({"type": tarfile.LNKTYPE, "linkname": "x"}, "not a plain file"),
+        ({"type": tarfile.FIFOTYPE}, "not a plain file"),
+        ({"type": tarfile.XHDTYPE}, "not a plain file"),
+        ({"name": "../../x"}, "does not name"),
+    ],
+)
+def test_members_other_than_named_files_are_refused(
+    packed: Path, tmp_path: Path, changes: dict[str, Any], why: str
+) -> None:
+    (manifest, text), *files = unpacked(packed)
+    repack(packed, [(manifest, text)])
+    whole = packed.read_bytes()[: -(len(packed.read_bytes()) - 512 * (1 + -(-len(text) // 512)))]
+    repack(packed, files, **changes)
+    packed.write_bytes(whole + packed.read_bytes())
+    with pytest.raises(InputError, match=why):
+        import_subject(Store(tmp_path / "to"), packed)
+    assert nothing_came_of(tmp_path / "to")
+
+
+def test_every_cut_and_other_bytes_are_refused(packed: Path, tmp_path: Path) -> None:
+    whole = packed.read_bytes()
+    end = len(whole.rstrip(b"\0"))
+    for length in [0, 1, *range(100, end, 331)]:
+        packed.write_bytes(whole[:length])
+        with pytest.raises(InputError):
+            import_subject(Store(tmp_path / "to"), packed)
+    packed.write_bytes(whole[: end - 1] + b"?" + whole[end:])
+    with pytest.raises(InputError, match="damaged or cut short"):
+        import_subject(Store(tmp_path / "to"), packed)
+    assert nothing_came_of(tmp_path / "to")
+
+
+def test_what_would_fill_the_disk_is_refused(packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "SPARE_BYTES", 1 << 60)
+    with pytest.raises(InputError, match="make room"):
+        import_subject(Store(tmp_path / "to"), packed)
+
+
+def test_verify_names_what_is_damaged_missing_or_not_of_it(packed: Path, tmp_path: Path) -> None:
+    store = Store(tmp_path / "from")
+    assert faults(store).lines == []
+    assert faults(store, ["ada"]).artifacts == 4
+    letters = sorted(store.root.glob("fit/*/deep/letters"))
+    letters[0].write_text("abd")
+    (letters[1].parent / "more").touch()
+    (store.subject_folder("bob") / "asset").symlink_to(f"../../asset/{99:032x}")
+    store.path("fit", f"{98:032x}", ".json").write_text("[]")
+    found = faults(store)
+    assert [line.rpartition(": ")[2] for line in found.lines] == [
+        "the record cannot be read", "leads nowhere", "damaged or missing", "not of this artifact"
+    ]  # fmt: skip
+    with pytest.raises(InputError, match="no such subject"):
+        faults(store, ["eve"])

@@ -1,0 +1,153 @@
+import fcntl
+import multiprocessing
+import os
+import re
+import signal
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.synchronize import Event
+from pathlib import Path
+
+import pytest
+
+from tasks import garbage as module
+from tasks import pins
+from tasks.garbage import collect, find_garbage
+from tasks.inventory import Inventory
+from tasks.pins import pinned
+from tasks.store import Store
+from tests.tasks.stores import LONG_AGO_S, add, names, run_of
+
+SPAWN = multiprocessing.get_context("spawn")
+PATIENCE_S = 60.0
+
+
+@pytest.fixture
+def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Store:
+    """Return an empty store, whose artifacts do not count as in use by this process."""
+    monkeypatch.setattr("tasks.store.pin", lambda *_: None)
+    return Store(tmp_path)
+
+
+def garbage(store: Store, keep: int = 1, older_s: float = 0.0) -> set[str]:
+    return {f"{one.stage}/{one.key}" for one in find_garbage(Inventory.of(store), keep, older_s)}
+
+
+def test_latest_results_and_what_they_were_computed_from_stay(store: Store) -> None:
+    before, now, other = run_of(store, "ada", 10), run_of(store, "ada", 20), run_of(store, "bob", 30)
+    assert garbage(store) == names(before)
+    for one in find_garbage(Inventory.of(store), 1, 0):
+        assert collect(store, one)
+    assert Inventory.of(store).stored.keys() == names(now + other)
+    assert sorted(path.name for path in (store.root / "capture").iterdir()) == sorted(
+        f"{n:032x}{end}" for n in (20, 30) for end in ("", ".json", ".lock")
+    )
+
+
+def test_more_results_of_each_subject_can_be_kept(store: Store) -> None:
+    first, second = run_of(store, "ada", 10), run_of(store, "ada", 20)
+    run_of(store, "ada", 30)
+    run_of(store, "bob", 40)
+    assert garbage(store, keep=2) == names(first) and garbage(store, keep=1) == names(first + second)
+
+
+def test_what_was_used_lately_stays(store: Store) -> None:
+    before, _ = run_of(store, "ada", 10), run_of(store, "ada", 20)
+    store.find("fit", before[1].root.name)
+    assert garbage(store, older_s=3600) == names(before) - {before[1].name}
+
+
+def test_a_use_between_look_and_removal_saves_it(store: Store) -> None:
+    before, _ = run_of(store, "ada", 10), run_of(store, "ada", 20)
+    found = find_garbage(Inventory.of(store), 1, 0)
+    used = store.find("fit", before[2].root.name)
+    assert used == before[2]
+    assert sorted(collect(store, one) for one in found) == [False, True, True, True]
+    assert store.find("fit", before[2].root.name) == used
+
+
+def use(root: Path, used: Event, done: Event) -> None:
+    Store(root).find("fit", f"{12:032x}")
+    used.set()
+    done.wait(PATIENCE_S)
+
+
+def test_what_a_running_process_uses_stays_until_it_is_killed(store: Store) -> None:
+    before, _ = run_of(store, "ada", 10), run_of(store, "ada", 20)
+    used, done = SPAWN.Event(), SPAWN.Event()
+    process = SPAWN.Process(target=use, args=(store.root, used, done))
+    process.start()
+    assert used.wait(PATIENCE_S)
+    assert pinned(store.root) == {before[2].name}
+    assert garbage(store) == {before[3].name}  # the fit was computed from the others
+    assert process.pid
+    os.kill(process.pid, signal.SIGKILL)
+    process.join(PATIENCE_S)
+    assert garbage(store) == names(before)
+    assert list((store.root / pins.FOLDER).iterdir()) == []
+
+
+def test_unfinished_work_goes_unless_somebody_is_at_it(store: Store) -> None:
+    run_of(store, "ada", 10)
+    fit = store.root / "fit"
+    for number, end in ((90, ".partial"), (91, ".partial"), (92, "")):
+        folder = fit / f"{number:032x}{end}"
+        folder.mkdir()
+        (folder / "half").write_text("ab")
+        for path in (folder / "half", folder):
+            os.utime(path, (LONG_AGO_S,) * 2)
+    (fit / f"{93:032x}.lock").touch()
+    (fit / f"{94:032x}.json.partial").symlink_to(store.root / "subjects")
+    (fit / "notes.txt").touch()
+    with (fit / f"{91:032x}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        found = find_garbage(Inventory.of(store), 1, 0)
+        assert {one.key for one in found} == {f"{n:032x}" for n in (90, 91, 92, 93, 94)}
+        assert {one.key for one in found if not collect(store, one)} == {f"{91:032x}"}
+        lock.flush()
+    left = {path.name for path in fit.iterdir()} - {f"{n:032x}{e}" for n in (11, 12) for e in ("", ".json", ".lock")}
+    assert left == {f"{91:032x}.partial", f"{91:032x}.lock", "notes.txt"}
+    assert (store.root / "subjects" / "ada").is_dir()
+
+
+def test_people_whose_names_look_like_keys_are_no_garbage(store: Store) -> None:
+    run_of(store, "a" * 32, 10)
+    assert garbage(store) == set()
+
+
+def test_work_that_was_resumed_meanwhile_stays(store: Store) -> None:
+    partial = store.root / "fit" / f"{90:032x}.partial"
+    partial.mkdir(parents=True)
+    os.utime(partial, (LONG_AGO_S,) * 2)
+    (one,) = find_garbage(Inventory.of(store), 1, 0)
+    (partial / "checkpoint").touch()
+    assert not collect(store, one) and partial.exists()
+
+
+def test_a_lock_that_was_removed_under_a_waiting_process_holds_nobody_apart(store: Store) -> None:
+    """Whoever waited takes the lock that lies there now, so that a third cannot hold another one."""
+    path = store.path("fit", f"{1:032x}", ".lock")
+    held = threading.Event()
+
+    def wait_and_hold() -> None:
+        with store.locked("fit", f"{1:032x}"), pytest.raises(BlockingIOError):
+            held.set()
+            with store.locked("fit", f"{1:032x}", wait=False):
+                pass
+
+    with ThreadPoolExecutor() as pool:
+        with store.locked("fit", f"{1:032x}"):
+            waiting = pool.submit(wait_and_hold)
+            awaited = re.compile(rf"-> FLOCK .*:{path.stat().st_ino} ")
+            while not awaited.search(Path("/proc/locks").read_text()):
+                assert not held.wait(0.01)
+            path.unlink()
+        waiting.result(PATIENCE_S)
+
+
+def test_records_without_inputs_keep_what_is_linked(store: Store) -> None:
+    made = add(store, "fit", 1)
+    record = store.path("fit", made.root.name, ".json")
+    record.write_text(record.read_text().replace('"inputs":[]', '"earlier":1').replace('"inputs": []', '"earlier":1'))
+    store.link_latest("ada", made)
+    assert garbage(store) == set() and module.LEFT.fullmatch("readme") is None

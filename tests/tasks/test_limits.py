@@ -1,0 +1,155 @@
+import contextvars
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prefect import flow
+
+from flows.cli import main
+from hnerf.config import LimitSettings
+from hnerf.progress import report
+from tasks import limits
+from tasks.launcher import run_ranks
+from tasks.limits import StalledError, limit_s, limited, set_limits
+from tasks.policy import is_retryable
+from tasks.source import Source, read_capture
+from tasks.stage import Stage, image_count
+from tasks.store import Store
+from tests.tasks.stores import add
+
+ROOT = Path(__file__).parents[2]
+
+
+def within(stage_s: float, work: Callable[[], Any], image_s: float = 0.0) -> Any:
+    """Do something with a limit that later tests do not have."""
+
+    def both() -> Any:
+        set_limits(LimitSettings(stage_s=stage_s, image_s=image_s))
+        return work()
+
+    return contextvars.copy_context().run(both)
+
+
+def sleep_in(resumable: bool, with_progress_every_s: float | None = None, duration_s: float = 5.0) -> None:
+    with limited("fit", 1, resumable):
+        end_s = time.monotonic() + duration_s
+        while time.monotonic() < end_s:
+            time.sleep(with_progress_every_s or duration_s)
+            report("outlines", 3, 10)
+
+
+@pytest.mark.parametrize("resumable", [True, False])
+def test_a_stage_without_progress_is_ended_and_its_cause_said(resumable: bool) -> None:
+    with pytest.raises(StalledError, match=r"^fit: ended, no progress for 0 s \(in a library\); if the") as caught:
+        within(0.1, lambda: sleep_in(resumable))
+    assert is_retryable(caught.value) == resumable
+    assert signal.getsignal(signal.SIGALRM) == signal.SIG_DFL and signal.getitimer(signal.ITIMER_REAL) == (0, 0)
+
+
+def test_progress_gives_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "REARM_S", 0.0)
+    within(0.3, lambda: sleep_in(False, with_progress_every_s=0.1, duration_s=0.6))
+
+
+def test_the_last_progress_is_said() -> None:
+    def report_and_sleep() -> None:
+        with limited("fit", 1, resumable=False):
+            report("outlines", 3, 10)
+            time.sleep(5)
+
+    with pytest.raises(StalledError, match="after 3 of 10 outlines"):
+        within(0.1, report_and_sleep)
+
+
+def test_limits_grow_with_the_recording(tmp_path: Path) -> None:
+    """Two cameras and three frames, two of them to train on: 10 s + 6 x 0.5 s."""
+    assert within(10.0, lambda: limit_s(6), image_s=0.5) == 13.0
+    recording = add(Store(tmp_path), "capture", 1)
+    text = '{"cameras": {"a": 1, "b": 2}, "train_frames": [0, 4], "novel_pose_frames": [8]}'
+    (recording.root / "capture.json").write_text(text)
+    assert image_count([recording, None, (recording,)]) == 6 and image_count([None]) == 1
+
+
+def stuck(out: Path, source: Source) -> dict[str, float]:
+    time.sleep(5)
+    return {}
+
+
+def test_a_stage_that_is_ended_leaves_nothing_behind(tmp_path: Path) -> None:
+    (tmp_path / "ada").mkdir()
+    stage = Stage(stuck, "stuck", "1", resumable=False)
+    with pytest.raises(StalledError, match=r"^stuck: ended"):
+        within(0.1, lambda: stage(Store(tmp_path / "store"), read_capture(tmp_path / "ada")[0]))
+    assert [path.suffix for path in (tmp_path / "store" / "stuck").iterdir()] == [".lock"]
+
+
+@flow
+def one_stuck(store: Path, source: Source) -> None:
+    """Run a stage that stands still, with the limits that the flow sets."""
+    set_limits(LimitSettings(stage_s=0.1, image_s=0))
+    Stage(stuck, "stuck", "1", resumable=False)(Store(store), source)
+
+
+def test_limits_hold_in_a_flow_run_and_a_standstill_is_not_tried_again(prefect_api: str, tmp_path: Path) -> None:
+    (tmp_path / "ada").mkdir()
+    with pytest.raises(StalledError, match=r"^stuck: ended"):
+        one_stuck(tmp_path / "store", read_capture(tmp_path / "ada")[0])
+
+
+def test_waiting_for_another_process_is_no_standstill(tmp_path: Path) -> None:
+    """It has a limit of its own."""
+    store, found = Store(tmp_path / "store"), []
+    write = 'lambda out: (print("at it", flush=True), __import__("time").sleep(1)) and {}'
+    code = f"from pathlib import Path; from tasks.store import Store; Store(Path({str(store.root)!r}))"
+    code += f".get_or_compute('fit', 'k', {write})"
+    other = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE)
+    assert other.stdout and other.stdout.readline() == b"at it\n"
+    within(0.1, lambda: found.append(store.get_or_compute("fit", "k", lambda out: pytest.fail("done twice"))))
+    assert found[0].name == "fit/k" and other.wait() == 0
+    other.stdout.close()
+
+
+def test_ranks_that_stand_still_are_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+
+    def wait_for_ranks() -> None:
+        with limited("training", 1, True):
+            run_ranks("tests.tasks.ranks", ["sleep", str(tmp_path)], 1)
+
+    with pytest.raises(StalledError):
+        within(1.5, wait_for_ranks)
+    for path in tmp_path.iterdir():
+        assert not Path(f"/proc/{path.name}").exists()
+
+
+def test_code_that_never_comes_back_ends_its_process() -> None:
+    """It sees no signals."""
+    code = """
+import signal, time
+from hnerf.config import LimitSettings
+from tasks import limits
+limits.GRACE_S = 0.1
+limits.set_limits(LimitSettings(stage_s=0.1, image_s=0))
+with limits.limited("capture", 1, False):
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
+    time.sleep(20)
+"""
+    started = time.monotonic()
+    ended = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1 and "Timeout" in ended.stderr and time.monotonic() - started < 15
+
+
+def test_the_command_says_it_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stalled(*_: Any) -> None:
+        raise StalledError("fit: ended, no progress for 9 s", retryable=False)
+
+    monkeypatch.setattr("flows.commands._train", stalled)
+    assert main(["run", str(tmp_path)]) == 1
+    assert capsys.readouterr().err == "hnerf: fit: ended, no progress for 9 s\n"
