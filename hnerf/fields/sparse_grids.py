@@ -125,7 +125,7 @@ def _launch(
 @wp.func
 def _lowest_node(at: wp.vec3, size: wp.vec3i):
     """Return the node with the least coordinates of the cell at fractional coordinates."""
-    last = size - wp.vec3i(2, 2, 2)
+    last = size - wp.vec3i(2, 2, 2)  # type: ignore[operator]
     return wp.min(wp.vec3i(int(at[0]), int(at[1]), int(at[2])), last)
 
 
