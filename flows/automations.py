@@ -9,18 +9,21 @@ from datetime import timedelta
 from typing import Any, cast
 from uuid import UUID
 
+import httpx
 from prefect import get_client
 from prefect.automations import AutomationCore, EventTrigger
 from prefect.blocks.webhook import Webhook
 from prefect.client.schemas.objects import StateType
 from prefect.events.actions import CallWebhook, ChangeFlowRunState
 from prefect.events.schemas.automations import Posture
+from prefect.settings import PREFECT_API_URL
 from prefect.types import SecretDict
 from pydantic import SecretStr
 
 from flows.ingest_captures import DISK_EVENT
 
 SILENCE_S = 150  # five heartbeats of prefect.toml
+MIN_SILENCE_S = 60
 BLOCK = "hnerf-operator"
 RUNS = {"prefect.resource.id": "prefect.flow-run.*"}
 
@@ -93,7 +96,7 @@ def set_up(webhook: str | None, pool: str, silence_s: int) -> list[str]:
     return [automation.name for automation in wanted]
 
 
-def main() -> None:
+def main(argv: list[str] | None = None) -> None:
     """Set up what the command line says."""
     parser = argparse.ArgumentParser(prog="python -m flows.automations", description=__doc__)
     parser.add_argument("--webhook", metavar="URL", help="called, with a line of text, when the operator is needed")
@@ -101,8 +104,14 @@ def main() -> None:
     parser.add_argument(
         "--silence", type=int, default=SILENCE_S, metavar="S", help=f"after which a run is lost (default: {SILENCE_S})"
     )
-    options = parser.parse_args()
-    print("\n".join(set_up(options.webhook, options.pool, options.silence)))
+    options = parser.parse_args(argv)
+    if options.silence < MIN_SILENCE_S:
+        parser.exit(2, f"--silence {options.silence}: healthy runs would be ended; give {MIN_SILENCE_S} or more\n")
+    try:
+        print("\n".join(set_up(options.webhook, options.pool, options.silence)))
+    except httpx.HTTPError as error:
+        what = type(error).__name__
+        parser.exit(2, f"{PREFECT_API_URL.value()}: {what}; is the server running, and the password in .env right?\n")
 
 
 if __name__ == "__main__":

@@ -25,6 +25,8 @@ FOLDERS = {
     "subject": "<store>/subjects/<name> of a finished `hnerf run`",
 }  # among a command's options, and what they are
 
+MOTIONS = "a BVH file, an AMASS .npz, or another subject's folder"
+
 Command = Callable[[argparse.Namespace], None]
 log = logging.getLogger("hnerf")
 
@@ -67,6 +69,10 @@ def _existing(options: argparse.Namespace) -> list[Path]:
     for what, folder in given.items():
         if not (folder.is_dir() or (what == FOLDERS["capture"] and folder.is_file())):
             raise InputError(f"{folder}: no such folder; give {what}")
+    motions = getattr(options, "motion", None) or []
+    for motion in motions if isinstance(motions, list) else [motions]:
+        if not motion.exists():
+            raise InputError(f"{motion}: no such file; give {MOTIONS}")
     return list(given.values())
 
 
@@ -118,14 +124,7 @@ def _parser() -> argparse.ArgumentParser:
     stability.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these degradations of the study")
 
     _add_render(add(commands.render))
-    export = add(commands.export, preset)
-    export.add_argument("subject", type=Path, help="<store>/subjects/<name>, as `run` left it")
-    export.add_argument(
-        "--motion", type=Path, action="append", default=[], metavar="FILE",
-        help="add this motion: a BVH file, an AMASS .npz, or another subject's folder",
-    )  # fmt: skip
-    _add_out(export, "asset")
-    _add_overrides(export, "override a setting of the section `asset`")
+    _add_export(add(commands.export, preset))
     what = "Look into the store, and keep it in order."
     add_store_commands(subparsers.add_parser("store", help=what, description=what))
     synth = add(commands.synth)
@@ -158,6 +157,16 @@ def _add_calibrate(command: argparse.ArgumentParser) -> None:
     person.add_argument(
         "--fov", type=_angle, metavar="DEG", help="field of view across the longer side (default: metadata, or found)"
     )
+
+
+def _add_export(export: argparse.ArgumentParser) -> None:
+    export.add_argument("subject", type=Path, help="<store>/subjects/<name>, as `run` left it")
+    export.add_argument(
+        "--motion", type=Path, action="append", default=[], metavar="FILE",
+        help=f"add this motion: {MOTIONS}",
+    )  # fmt: skip
+    _add_out(export, "asset")
+    _add_overrides(export, "override a setting of the section `asset`")
 
 
 def _add_out(command: argparse.ArgumentParser, default: str) -> None:
@@ -205,9 +214,7 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     view.add_argument("--path", type=Path, help="a JSON list of cameras, or a folder of them, to fly along")
     render.add_argument("--radius", type=float, metavar="M", help="of the orbit (default: the recorded cameras')")
     render.add_argument("--height", type=float, metavar="M", help="of the orbit over the person's middle")
-    render.add_argument(
-        "--motion", type=Path, help="another subject's folder, a BVH file, or an AMASS .npz (default: its own)"
-    )
+    render.add_argument("--motion", type=Path, metavar="FILE", help=f"{MOTIONS} (default: its own)")
     render.add_argument("--frames", default=":", metavar="A:B:STEP", help="poses to show, or one number (default: all)")
     render.add_argument("--between", type=int, nargs=2, metavar="FRAME", help="interpolate between two frames' poses")
     render.add_argument("--shape", action="append", default=[], metavar="NAME=+X", help="add to a shape value")

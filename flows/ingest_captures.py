@@ -60,20 +60,7 @@ def ingest_captures(
     restart_crashed(max_restarts)
     started: list[str] = []
     room = max_unfinished
-    for capture in _captures(folder.resolve()):
-        try:
-            listing, touched_s = _listing(capture)
-            if not touched_s or time.time() - touched_s < settle_s or ledger.seen(listing):
-                continue
-            digest = read_capture(capture)[0].digest
-        except FileNotFoundError as error:  # removed meanwhile
-            log.error("%s", error)
-            continue
-        except (InputError, OSError) as error:
-            log.error("%s", error)
-            with suppress(OSError):  # a folder that may only be read
-                quarantine.note(capture, f"refused: {error}")
-            continue
+    for capture, listing, digest in _unseen(folder.resolve(), ledger, settle_s):
         if not ledger.knows(digest):
             room = room if started else max_unfinished - unfinished_runs()
             if len(started) >= room:
@@ -102,6 +89,22 @@ def _has_room(store: Path, min_free_gib: float) -> bool:
         resource = {"prefect.resource.id": f"hnerf.store.{store.resolve()}", "prefect.resource.name": str(store)}
         emit_event(DISK_EVENT, resource=resource, payload={"free_gib": round(free_gib, 1)})
     return False
+
+
+def _unseen(folder: Path, ledger: Ledger, settle_s: float) -> Iterator[tuple[Path, str, str]]:
+    """Yield the captures of a folder that are complete and were not seen before, with the digests of their listing and
+    of their content; note why one cannot be read."""
+    for capture in _captures(folder):
+        try:
+            listing, touched_s = _listing(capture)
+            if touched_s and time.time() - touched_s >= settle_s and not ledger.seen(listing):
+                yield capture, listing, read_capture(capture)[0].digest
+        except FileNotFoundError as error:  # removed meanwhile
+            log.error("%s", error)
+        except (InputError, OSError) as error:
+            log.error("%s", error)
+            with suppress(OSError):  # a folder that may only be read
+                quarantine.note(capture, f"refused: {error}")
 
 
 def _captures(folder: Path) -> Iterator[Path]:

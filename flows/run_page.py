@@ -1,7 +1,5 @@
 """The page of a flow run: texts, pictures, links, and how far long work has come."""
 
-import base64
-import io
 import logging
 import re
 import time
@@ -11,7 +9,6 @@ from pathlib import Path
 from typing import cast
 from uuid import UUID
 
-from PIL import Image
 from prefect.artifacts import (
     create_link_artifact,
     create_markdown_artifact,
@@ -20,6 +17,8 @@ from prefect.artifacts import (
 )
 from prefect.context import FlowRunContext
 
+from hnerf.capture.safe_io import read_image
+from hnerf.evaluation.pictures import data_uri, shrunk
 from hnerf.progress import Progress, listening
 
 UPDATE_S = 10.0  # between two updates of one work's progress
@@ -42,7 +41,9 @@ def publish_link(path: Path, key: str, description: str) -> None:
 
 def embedded(pictures: Sequence[tuple[str, Path]]) -> str:
     """Return Markdown that shows captioned image files, shrunk."""
-    return "\n\n".join(f"{caption}\n\n![{caption}]({_uri(path)})" for caption, path in pictures)
+    return "\n\n".join(
+        f"{caption}\n\n![{caption}]({data_uri(shrunk(read_image(path), PICTURE_PX))})" for caption, path in pictures
+    )
 
 
 @contextmanager
@@ -85,12 +86,3 @@ class _ProgressPage:
 def slug(text: str) -> str:
     """Return a text as the key of an artifact: lower-case letters, digits and dashes."""
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") or "work"
-
-
-def _uri(path: Path) -> str:
-    with Image.open(path) as picture:
-        small = picture.convert("RGB")
-        small.thumbnail((PICTURE_PX, PICTURE_PX))
-    jpeg = io.BytesIO()
-    small.save(jpeg, "JPEG", quality=85)
-    return f"data:image/jpeg;base64,{base64.b64encode(jpeg.getvalue()).decode()}"

@@ -7,8 +7,13 @@ import time
 from argparse import ArgumentTypeError
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hnerf.errors import InputError, printable
+
+if TYPE_CHECKING:  # importing Prefect takes seconds, which help need not wait for
+    from tasks.garbage import Garbage
+    from tasks.store import Store
 
 UNITS_S = {"d": 86400, "h": 3600, "m": 60, "s": 1}
 
@@ -144,15 +149,16 @@ def _at_least_one(text: str) -> int:
     return int(text)
 
 
-def _store(options: argparse.Namespace):  # type: ignore[no-untyped-def]
+def _store(options: argparse.Namespace) -> "Store":
     from tasks.store import Store
 
-    if not options.store.is_dir():
-        raise InputError(f"{options.store}: no such folder; give --store the place of the results")
-    return Store(options.store.resolve())
+    store = Store(options.store.resolve())
+    if not store.exists():
+        raise InputError(f"{options.store}: is no store; give --store the place of the results")
+    return store
 
 
-def _sum(garbage: Iterable) -> int:  # type: ignore[type-arg]
+def _sum(garbage: "Iterable[Garbage]") -> int:
     return sum(one.size_bytes for one in garbage)
 
 

@@ -1,6 +1,6 @@
 """Units of systemd for server and worker, as services of a user: python -m flows.systemd_units FOLDER."""
 
-import sys
+import argparse
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -43,6 +43,16 @@ def _escaped(path: Path) -> str:
     return str(path).replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
 
 
-if __name__ == "__main__":
+def main(argv: list[str] | None = None) -> None:
+    """Write the units of this checkout into the folder that the command line names."""
+    parser = argparse.ArgumentParser(prog="python -m flows.systemd_units", description=__doc__)
+    parser.add_argument("folder", type=Path, help="where systemd looks, like ~/.config/systemd/user")
+    folder = parser.parse_args(argv).folder
+    if not folder.is_dir():
+        parser.exit(2, f"{folder}: no such folder; make it first\n")
     for name, text in units(ROOT).items():
-        (Path(sys.argv[1]) / name).write_text(text)
+        (folder / name).write_text(text)
+
+
+if __name__ == "__main__":
+    main()

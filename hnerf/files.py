@@ -19,18 +19,24 @@ def atomic_folder(out: Path) -> Iterator[Path]:
     """
     if out.exists():
         raise InputError(f"{out}: exists; give the name of a new folder")
-    missing = [parent for parent in out.parents if not parent.exists()]
-    out.parent.mkdir(parents=True, exist_ok=True)
+    with made_folder(out.parent), tempfile.TemporaryDirectory(dir=out.parent, prefix=f"{out.name}.partial-") as beside:
+        partial = Path(beside) / out.name  # unlike `beside`, it has the permissions of the umask
+        partial.mkdir()
+        yield partial
+        os.replace(partial, out)
+
+
+@contextmanager
+def made_folder(folder: Path) -> Iterator[None]:
+    """Make a folder and its parents if they are missing; in the end, remove those of them that are still empty."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
     try:
-        with tempfile.TemporaryDirectory(dir=out.parent, prefix=f"{out.name}.partial-") as beside:
-            partial = Path(beside) / out.name  # unlike `beside`, it has the permissions of the umask
-            partial.mkdir()
-            yield partial
-            os.replace(partial, out)
+        yield
     finally:
-        for parent in missing:
-            with suppress(OSError):  # it is not empty once `out` was written
-                parent.rmdir()
+        for path in missing:
+            with suppress(OSError):  # it is not empty
+                path.rmdir()
 
 
 def replace_text(path: Path, text: str) -> None:
@@ -50,9 +56,9 @@ def markdown_image(name: str) -> str:
 def embed_images(table: Path) -> str:
     """Return the text of a Markdown file with the PNG files that `markdown_image` refers to, which lie beside it,
     embedded as data URIs. Raises OSError where one is missing."""
-    return re.sub(r"(?<=\]\()<([^>]+\.png)>", lambda shown: _data_uri(table.with_name(shown[1])), table.read_text())
+    return re.sub(r"(?<=\]\()<([^>]+\.png)>", lambda shown: png_data_uri(table.with_name(shown[1])), table.read_text())
 
 
-def _data_uri(path: Path) -> str:
+def png_data_uri(path: Path) -> str:
     """Return a PNG file as a data URI."""
     return f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}"

@@ -19,6 +19,7 @@ from pydantic import Field, model_validator
 
 from hnerf.config import Section, validated
 from hnerf.errors import InputError
+from hnerf.files import made_folder
 from tasks.inventory import Inventory
 from tasks.store import RECORDING, STAGES, Artifact, Store, remove
 
@@ -126,8 +127,11 @@ def import_subject(store: Store, path: Path) -> Manifest:
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; give an archive of `hnerf store export`")
-    store.root.mkdir(parents=True, exist_ok=True)
-    with path.open("rb") as archive, tempfile.TemporaryDirectory(dir=store.root, prefix=".import-") as scratch:
+    with (
+        made_folder(store.root),
+        path.open("rb") as archive,
+        tempfile.TemporaryDirectory(dir=store.root, prefix=".import-") as scratch,
+    ):
         manifest = _read_manifest(archive, path)
         _check_place(manifest, store, path)
         _unpack(archive, manifest, Path(scratch), path)
@@ -173,9 +177,11 @@ def _read_manifest(archive: IO[bytes], path: Path) -> Manifest:
 
 def _check_place(manifest: Manifest, store: Store, path: Path) -> None:
     """Raise InputError if the files would fill the disk, or the subject's name belongs to another recording."""
-    wanted, free = sum(manifest.sizes_bytes().values()), shutil.disk_usage(store.root).free
+    # Every path counts, and not only every file: each is read to check its digest.
+    wanted = sum(file.size_bytes for one in manifest.artifacts.values() for file in one.files.values())
+    free = shutil.disk_usage(store.root).free
     if wanted > free - SPARE_BYTES:
-        raise InputError(f"{path}: holds {wanted / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; make room")
+        raise InputError(f"{path}: unpacks to {wanted / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; make room")
     here = store.subject_folder(manifest.subject)
     if here.is_dir() and any(here.iterdir()):
         recording = (here / RECORDING).read_text() if _has_recording(store, manifest.subject) else ""

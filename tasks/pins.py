@@ -6,6 +6,8 @@
 import errno
 import fcntl
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 from uuid import uuid4
@@ -17,13 +19,10 @@ _own: dict[tuple[int, Path], IO[str]] = {}  # of this process and store; open un
 
 def pin(store: Path, name: str) -> None:
     """Note that this process uses an artifact from here on; nothing is noted in a store that may only be read."""
-    try:
+    with unless_read_only():
         file = _own.get((os.getpid(), store)) or _begin(store)
         file.write(f"{name}\n")
         file.flush()
-    except OSError as error:
-        if error.errno not in READ_ONLY:
-            raise
 
 
 def pinned(store: Path) -> set[str]:
@@ -36,8 +35,19 @@ def pinned(store: Path) -> set[str]:
             except BlockingIOError:
                 names |= set(file.read().split())
             else:
-                path.unlink(missing_ok=True)
+                with unless_read_only():
+                    path.unlink(missing_ok=True)
     return names
+
+
+@contextmanager
+def unless_read_only() -> Iterator[None]:
+    """Leave out what is done inside in a store that may only be read."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in READ_ONLY:
+            raise
 
 
 def _begin(store: Path) -> IO[str]:

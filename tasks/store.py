@@ -29,7 +29,7 @@ from pydantic import BaseModel
 
 from hnerf.errors import InputError
 from hnerf.files import replace_text
-from tasks.pins import READ_ONLY, pin
+from tasks.pins import pin, unless_read_only
 
 log = logging.getLogger("hnerf.store")
 
@@ -81,6 +81,10 @@ class Store:
 
     root: Path
 
+    def exists(self) -> bool:
+        """Return whether anything was ever stored here: a folder without these is somebody else's."""
+        return any((self.root / name).is_dir() for name in ("subjects", "ingested", STAGES[0]))
+
     def find(self, stage: str, key: str) -> Artifact | None:
         """Return the artifact if it is recorded and intact, else None. From here on this process uses it."""
         record = self.path(stage, key, ".json")
@@ -88,7 +92,8 @@ class Store:
             return None
         pin(self.root, f"{stage}/{key}")
         try:
-            _note_use(record)
+            with unless_read_only():
+                os.utime(record, follow_symlinks=False)
             artifact = self.recorded(stage, key)
         except FileNotFoundError:
             return None
@@ -261,15 +266,6 @@ def remove(folder: Path) -> None:
         folder.unlink()
     else:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _note_use(record: Path) -> None:
-    """Set a record's time of change to now, unless the store may only be read."""
-    try:
-        os.utime(record, follow_symlinks=False)
-    except OSError as error:
-        if error.errno not in READ_ONLY:
-            raise
 
 
 def _is_at(path: Path, descriptor: int) -> bool:

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from hnerf.errors import InputError
-from hnerf.files import atomic_folder
+from hnerf.files import atomic_folder, made_folder
 
 
 def test_it_takes_its_name_when_all_is_written(tmp_path: Path) -> None:
@@ -29,3 +29,10 @@ def test_what_exists_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="ada: exists; give the name of a new folder"), atomic_folder(tmp_path / "ada"):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["ada"]
+
+
+def test_folders_that_stay_empty_go_again_and_others_stay(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    with made_folder(tmp_path / "there"), made_folder(tmp_path / "a" / "b"), made_folder(tmp_path / "c"):
+        (tmp_path / "c" / "new").touch()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["c", "there"]

@@ -17,9 +17,8 @@ def write_avatar_bvh(path: Path, avatar: StagedAvatar) -> None:
     """Write the captured motion at 30 frames a second, on the game skeleton below its pelvis, in centimetres, Y up."""
     rig = avatar.rigs[GAME]
     skeleton, stage = rig.skeleton, rig.stage[f"{CAPTURED}_{RATE}"][:, 1:]
-    turned = stage[..., :3, :3] @ skeleton.rotations[1:].swapaxes(
-        1, 2
-    )  # from rest, as BVH's joints are not turned there
+    # From rest, where BVH's joints are not turned.
+    turned = stage[..., :3, :3] @ skeleton.rotations[1:].swapaxes(1, 2)
     parents = skeleton.parents[1:] - 1
     local, offsets = turned.copy(), CENTIMETRES * skeleton.positions_m[1:]
     local[:, 1:] = turned[:, parents[1:]].swapaxes(2, 3) @ turned[:, 1:]

@@ -7,6 +7,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hnerf.evaluation.pictures import shrunk
+
 JPEG_QUALITY = 90
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
@@ -48,7 +50,4 @@ def _jpeg(content: bytes, texture_px: int) -> bytes | None:
     image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 3 or image.shape[2] != 3:
         return None
-    shrink = texture_px / max(image.shape[:2])
-    if shrink < 1:
-        image = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+    return cv2.imencode(".jpg", shrunk(image, texture_px), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()

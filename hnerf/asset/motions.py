@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import rotation_from_axis_angle
-
-Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # (x, y, z) to (x, z, -y)
+from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 
 
 @dataclass(frozen=True)

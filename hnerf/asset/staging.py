@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from hnerf.asset.correctives import Correctives
-from hnerf.asset.motions import Y_UP_FROM_Z_UP, Motion, motion_of, resampled
+from hnerf.asset.motions import Motion, motion_of, resampled
 from hnerf.asset.rigs import FULL, RestSurface, StagedRig, stage_rigs
 from hnerf.asset.skeleton import Bones
 from hnerf.asset.texture import UvLayout
 from hnerf.body.fit_result import BodyFit
+from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 
 CAPTURED = "captured"  # the motion at the capture's own rate, whose time codes are the capture's frames
 RATES = (24, 30)  # frames a second that it is resampled at, since many importers ignore a file's rate

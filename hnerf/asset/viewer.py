@@ -11,13 +11,12 @@ import re
 from pathlib import Path
 from typing import Any
 
-import cv2
 import jinja2
 import numpy as np
 
 from hnerf.asset.compact_glb import compact_glb
 from hnerf.capture.capture import Capture
-from hnerf.evaluation.pictures import data_uri
+from hnerf.evaluation.pictures import data_uri, shrunk
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
 from hnerf.models import LICENCES, THREE_SHA256, has_model, model_file
@@ -93,10 +92,7 @@ def _camera(camera: Camera, stage_from_world: np.ndarray) -> dict[str, Any]:
 
 
 def _photograph(capture: Capture, camera: str, frame: int) -> dict[str, Any]:
-    image = capture.image(camera, frame)
-    shrink = PHOTOGRAPH_PX / max(image.shape[:2])
-    if shrink < 1:
-        image = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    image = shrunk(capture.image(camera, frame), PHOTOGRAPH_PX)
     return {"frame": frame, "time_s": (frame - capture.frames[0]) / capture.fps, "jpeg": data_uri(image)}
 
 

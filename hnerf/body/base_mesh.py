@@ -14,6 +14,7 @@ import torch
 
 from hnerf.body.anny import BETA_NAMES, anny_model
 from hnerf.body.rig import Rig
+from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 
 EYE_RADIUS_M = 0.02  # around an eyeball's centre, within which the template's vertices line its socket
 EYE_CHART_SCALE = 4.0  # the base mesh gives the eyes 0.05 % of the texture
@@ -80,7 +81,7 @@ def _eyes() -> _Eyes:
     )
     used, faces = np.unique(_triangles(corners), return_inverse=True)
     used_uvs, face_uvs = np.unique(_triangles(uv_corners), return_inverse=True)
-    vertices_m = 0.1 * vertices.numpy()[used] @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    vertices_m = 0.1 * vertices.numpy()[used] @ Y_UP_FROM_Z_UP
     chart = uvs.numpy()[used_uvs]
     middle = (chart.min(0) + chart.max(0)) / 2
     return _Eyes(

@@ -62,10 +62,12 @@ def read_bvh(path: Path) -> Bvh:
     joints, at = _hierarchy(path, lines)
     frames, frame_s, at = _motion_head(path, lines, at)
     width = sum(len(joint.channels) for joint in joints)
-    if frames * width > MAX_NUMBERS:
-        raise InputError(f"{path}: {frames} frames of {width} channels are too many; cut the motion")
+    if not width:
+        raise InputError(f"{path}: no joint has channels; export it again")
+    if frames * max(width, 3 * len(joints)) > MAX_NUMBERS:  # joints without channels need as much memory
+        raise InputError(f"{path}: {frames} frames of {len(joints)} joints are too many; cut the motion")
     rows = [line for line in lines[at:] if line.strip()]
-    if len(rows) < frames or not width:
+    if len(rows) < frames:
         raise InputError(f"{path}: says {frames} frames and has {len(rows)}; export it again")
     try:
         values = np.loadtxt(io.StringIO("\n".join(rows[:frames])), ndmin=2, comments=None)

@@ -30,6 +30,12 @@ def data_uri(picture: np.ndarray) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
 
 
+def shrunk(picture: np.ndarray, longest_px: int) -> np.ndarray:
+    """Return a picture with its longer side at most `longest_px`."""
+    scale = longest_px / max(picture.shape[:2])
+    return cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else picture
+
+
 def frame_person(person: np.ndarray) -> tuple[slice, slice]:
     """Return rows and columns around a person (H, W) bool, as close to a report picture's aspect ratio as the image
     allows."""

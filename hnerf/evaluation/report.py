@@ -1,6 +1,5 @@
 """The evaluation report: one self-contained HTML file."""
 
-import base64
 import json
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
@@ -31,6 +30,7 @@ from hnerf.evaluation.views import (
     all_views,
     sample_views,
 )
+from hnerf.files import png_data_uri
 from hnerf.results import HeldOutCamera, Mean, Metrics, Split
 from hnerf.tables import pick, shown
 
@@ -256,7 +256,7 @@ def frame_charts(found: Metrics, out: Path) -> list[GalleryPicture]:
 
 def png_uri(path: Path) -> str:
     """Return a PNG file as a data URI, or "" if there is no such file."""
-    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode() if path.exists() else ""
+    return png_data_uri(path) if path.exists() else ""
 
 
 def costs(stages: dict[str, dict[str, Any]], found: Metrics) -> list[tuple[str, str]]:

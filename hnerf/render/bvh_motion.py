@@ -14,9 +14,8 @@ from hnerf.body.rig import Rig
 from hnerf.body.skeletons import EQUIVALENTS, PELVIS, SKELETONS, exported_from, exported_name
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
+from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 
-Y_UP_FROM_BODY = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # the body frame is Z up, facing -Y
-Y_UP_FROM_Z_UP = Y_UP_FROM_BODY
 LIMBS = ("thigh", "calf", "foot", "upperarm", "forearm", "hand")
 NEEDED = (PELVIS, *(f"{limb}_{side}" for side in "LR" for limb in LIMBS))
 ENDS = {"upperarm": "forearm", "forearm": "hand", "thigh": "calf", "calf": "foot"}  # of limbs whose rest poses differ
@@ -44,7 +43,7 @@ def retargeted(path: Path, file: Bvh, rig: Rig) -> BodyFit:
     upright = _upright(path, file, joints)
     turns, at = file.world()
     turns, at = upright @ turns @ upright.T, at @ upright.T
-    rest, places = file.rest() @ upright.T, rig.joints_m.double().numpy() @ Y_UP_FROM_BODY.T
+    rest, places = file.rest() @ upright.T, rig.joints_m.double().numpy() @ Y_UP_FROM_Z_UP.T
     own = {exported_name(name): j for j, name in enumerate(rig.joint_names)}
     free = [name for name, j in own.items() if name in joints and (name == PELVIS or rig.free[j])]
     world = {name: turns[:, joints[name]] @ _to_rest_of_file(name, joints, rest, own, places) for name in free}
@@ -54,15 +53,13 @@ def retargeted(path: Path, file: Bvh, rig: Rig) -> BodyFit:
         if name == PELVIS:
             continue
         local = world[_above(rig, own[name], world)].swapaxes(1, 2) @ world[name]
-        body = Y_UP_FROM_BODY.T @ local @ Y_UP_FROM_BODY
+        body = Y_UP_FROM_Z_UP.T @ local @ Y_UP_FROM_Z_UP
         theta[:, own[name]] = Rotation.from_matrix(body).as_rotvec()
 
     root = np.tile(np.eye(4), (len(turns), 1, 1))
-    root[:, :3, :3] = world[PELVIS] @ Y_UP_FROM_BODY
-    hips, hips_m = (
-        at[:, [joints["thigh_L"], joints["thigh_R"]]].mean(1),
-        places[[own["thigh_L"], own["thigh_R"]]].mean(0),
-    )
+    root[:, :3, :3] = world[PELVIS] @ Y_UP_FROM_Z_UP
+    hips = at[:, [joints["thigh_L"], joints["thigh_R"]]].mean(1)
+    hips_m = places[[own["thigh_L"], own["thigh_R"]]].mean(0)
     scale = _leg(places, own) / _leg(rest, joints)
     root[:, :3, 3] = scale * hips - world[PELVIS] @ hips_m
     frames = tuple(range(len(turns)))
@@ -87,8 +84,11 @@ def joints_by_name(path: Path, names: tuple[str, ...]) -> dict[str, int]:
 
 def _upright(path: Path, file: Bvh, joints: dict[str, int]) -> np.ndarray:
     """Return the rotation (3, 3) from the file's axes to Y up with the rest pose facing +Z. Raises InputError where the
-    rest pose does not stand along Y or Z."""
+    rest pose does not stand along Y or Z, or a limb has no direction."""
     rest = file.rest()
+    for start, end in ((f"{start}_{side}", f"{end}_{side}") for start, end in ENDS.items() for side in "LR"):
+        if np.array_equal(rest[joints[start]], rest[joints[end]]):
+            raise InputError(f"{path}: {start} and {end} coincide at rest; export it in a T pose")
     legs = (rest[[joints["thigh_L"], joints["thigh_R"]]] - rest[[joints["foot_L"], joints["foot_R"]]]).mean(0)
     axis = int(np.abs(legs).argmax())
     if axis == 0 or legs[axis] <= 0:
@@ -112,8 +112,8 @@ def _to_rest_of_file(
     if limb not in ENDS or side not in ("L", "R"):
         return np.eye(3)
     start, end = f"{limb}_{side}", f"{ENDS[limb]}_{side}"
-    to, frm = rest[joints[end]] - rest[joints[start]], places[own[end]] - places[own[start]]
-    return np.asarray(Rotation.align_vectors(to[None], frm[None])[0].as_matrix())
+    theirs, ours = rest[joints[end]] - rest[joints[start]], places[own[end]] - places[own[start]]
+    return np.asarray(Rotation.align_vectors(theirs[None], ours[None])[0].as_matrix())
 
 
 def _above(rig: Rig, joint: int, known: dict[str, np.ndarray]) -> str:

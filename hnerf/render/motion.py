@@ -20,6 +20,7 @@ from hnerf.capture.given_poses import JOINTS, GivenPoses, check_smpl
 from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, read_arrays
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
+from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 from hnerf.render.bvh_motion import bvh_motion
 
 AMASS_WIDTHS = (72, 156, 165)  # pose parameters of SMPL, SMPL-H and SMPL-X, which share their first 22 joints
@@ -46,6 +47,8 @@ def read_motion(path: Path, frames: str = ":") -> Motion:
     AMASS poses are SMPL's; they are converted to the joints of anny's average body, with fingers and toes at rest.
     Raises InputError if there is no motion or it lacks these frames.
     """
+    if not path.exists():
+        raise InputError(f"{path}: no such file; give a .bvh, an AMASS .npz, or <store>/subjects/<name>")
     if path.is_dir():
         return _subject_motion(path, frames)
     if path.suffix.lower() == ".bvh":
@@ -148,10 +151,9 @@ def _pelvis_m(body: BodyFit) -> Tensor:
 
 def _rotation_between_up_axes(from_up: str, to_up: str) -> Tensor:
     """Return the rotation (3, 3) about x that takes one world's vertical axis to the other's."""
-    quarter = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # y to z
     if from_up == to_up:
         return torch.eye(3)
-    return quarter if from_up == "y" else quarter.T
+    return torch.from_numpy(Y_UP_FROM_Z_UP.T if from_up == "y" else Y_UP_FROM_Z_UP).float()
 
 
 def _subject_motion(folder: Path, frames: str) -> Motion:

@@ -72,7 +72,7 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
         ("Yrotation Zrotation", "Yrotation Wrotation", "CHANNELS does not list"),
         ("JOINT Fore", "ROOT Fore", "line 6: ROOT in the wrong place"),
         ("Frames: 2", "Frames: 3", "says 3 frames and has 2"),
-        ("Frames: 2", "Frames: 999999999", "999999999 frames of 8 channels are too many"),
+        ("Frames: 2", "Frames: 999999999", "999999999 frames of 2 joints are too many"),
         ("Frames: 2", "Frames: two", "no `Frames:` and `Frame Time:`"),
         ("Frame Time: 0.04", "", "no `Frames:` and `Frame Time:`"),
         ("Frame Time: 0.04", "Frame Time: 0", "correct `Frames:` and `Frame Time:`"),
@@ -86,6 +86,16 @@ def test_a_bad_file_is_refused_in_one_line(old: str, new: str, message: str, tmp
     with pytest.raises(InputError, match=message) as refused:
         read_bvh(path)
     assert str(refused.value).startswith(str(path)) and "\n" not in str(refused.value)
+
+
+def test_joints_without_channels_count_before_room_is_made_for_them(tmp_path: Path) -> None:
+    """A file of 4 MB would need 144 GB: 1000 joints, of which one turns, in 2 million frames."""
+    still = "".join(f"JOINT {number}\n{{\nOFFSET 0 1 0\n}}\n" for number in range(999))
+    text = f"HIERARCHY\nROOT a\n{{\nOFFSET 0 0 0\nCHANNELS 1 Xrotation\n{still}}}\nMOTION\nFrames: 2000000\n"
+    with pytest.raises(InputError, match="2000000 frames of 1000 joints are too many"):
+        read_bvh(written(tmp_path, text + "Frame Time: 0.04\n" + 9 * "0\n"))
+    with pytest.raises(InputError, match="no joint has channels"):
+        read_bvh(written(tmp_path, text.replace("CHANNELS 1 Xrotation\n", "") + "Frame Time: 0.04\n0\n"))
 
 
 def test_endless_hierarchies_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,7 @@
 from collections import Counter
 from pathlib import Path
 
-from hnerf.body.anny import _model
+from hnerf.body.anny import anny_model
 from hnerf.body.skeletons import EQUIVALENTS, SKELETONS, exported_from, exported_name, is_serial, names_table
 
 
@@ -16,7 +16,7 @@ def test_readable_names() -> None:
 
 
 def test_every_joint_of_the_body_has_a_name_of_its_own() -> None:
-    names = [exported_name(name) for name in _model().bone_labels]
+    names = [exported_name(name) for name in anny_model().bone_labels]
     assert max(Counter(names).values()) == 1 and "root" not in names
     assert set(EQUIVALENTS) - {"root"} <= set(names)
     kept = [name for name in names if not is_serial(name)]

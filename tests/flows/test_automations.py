@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 from prefect import get_client
 from prefect.events import emit_event
+from prefect.settings import PREFECT_API_URL, temporary_settings
 
-from flows.automations import lost_runs, set_up
+from flows.automations import lost_runs, main, set_up
 from flows.ingest_captures import DISK_EVENT
 
 PATIENCE_S = 90.0
@@ -63,3 +64,16 @@ def test_without_a_webhook_only_lost_runs_are_ended(prefect_api: str) -> None:
 def test_silence_is_longer_than_some_heartbeats() -> None:
     trigger = lost_runs(150).trigger
     assert trigger.after == {"prefect.flow-run.heartbeat"} and trigger.posture == "Proactive"
+
+
+def test_without_a_server_one_line_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    with temporary_settings({PREFECT_API_URL: "http://127.0.0.1:9/api"}), pytest.raises(SystemExit, match="2"):
+        main([])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("http://127.0.0.1:9/api: ") and "is the server running" in line
+
+
+def test_a_silence_shorter_than_healthy_runs_keep_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["--silence", "30"])
+    assert "give 60 or more" in capsys.readouterr().err

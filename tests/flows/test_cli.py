@@ -26,6 +26,8 @@ from tests.shared_data import shared_capture
         (["render", "absent"], "absent: no such folder; give <store>/subjects/<name> of a finished `hnerf run`"),
         (["calibrate", "absent"], "absent: no such folder"),
         (["export", "absent"], "absent: no such folder; give <store>/subjects/<name> of a finished `hnerf run`"),
+        (["export", ".", "--motion", "a.bvh"], "a.bvh: no such file; give a BVH file, an AMASS .npz, or another"),
+        (["render", ".", "--motion", "a.npz"], "a.npz: no such file; give a BVH file, an AMASS .npz, or another"),
         (
             ["export", ".", "--set", "asset.bones=up"],
             "hnerf: --set asset.bones=up: asset.bones: Input should be 'along'",

@@ -59,6 +59,18 @@ def test_out_and_in(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["store", "list", "--store", "none"]) == 2
 
 
+@pytest.mark.parametrize("command", ["list", "verify", "gc --yes --older 0", "show ada", "export ada"])
+def test_a_folder_that_is_no_store_is_refused(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    thumbnail = tmp_path / "pictures" / "thumbnails" / ("a" * 32)  # is named like an artifact
+    thumbnail.mkdir(parents=True)
+    assert main(["store", *command.split(), "--store", "pictures"]) == 2
+    assert capsys.readouterr().err == "hnerf: pictures: is no store; give --store the place of the results\n"
+    assert thumbnail.is_dir() and not (tmp_path / "ada.tar").exists()
+
+
 def test_times() -> None:
     assert [duration_s(text) for text in ("30d", "12h", "5m", "7s", "0")] == [2592000, 43200, 300, 7, 0]
     for text in ("30", "d", "-1d", "1w", "1.5d", ""):

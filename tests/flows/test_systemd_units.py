@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.systemd_units import units
+from flows.systemd_units import main, units
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
@@ -26,3 +26,11 @@ def test_both_come_back_whatever_ends_them() -> None:
     for text in units(Path("/srv/hnerf")).values():
         assert "Restart=always" in text and "StartLimitIntervalSec=0" in text
     assert "Wants=hnerf-server.service" in units(Path("/srv/hnerf"))["hnerf-worker.service"]
+
+
+def test_they_are_written_into_a_folder_that_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main([str(tmp_path)])
+    assert {path.name for path in tmp_path.iterdir()} == set(units(tmp_path))
+    with pytest.raises(SystemExit, match="2"):
+        main([str(tmp_path / "none")])
+    assert capsys.readouterr().err == f"{tmp_path / 'none'}: no such folder; make it first\n"

@@ -126,6 +126,20 @@ def test_a_rest_pose_that_lies_is_refused(rig: Rig) -> None:
         retargeted(Path("a.bvh"), lying, rig)
 
 
+def test_an_arm_without_length_is_refused(rig: Rig) -> None:
+    """It points nowhere, and could not be aligned."""
+    file = t_pose(1)
+    file.offsets[list(T_POSE).index("hand_R")] = 0
+    with pytest.raises(InputError, match=r"a\.bvh: forearm_R and hand_R coincide at rest; export it in a T pose"):
+        retargeted(Path("a.bvh"), file, rig)
+
+
+def test_a_motion_that_is_not_there_is_said_to_be_missing(tmp_path: Path) -> None:
+    for name in ("walk.bvh", "walk.npz", "ada"):
+        with pytest.raises(InputError, match=rf"{name}: no such file; give a \.bvh"):
+            read_motion(tmp_path / name)
+
+
 def test_motions_are_read_by_their_suffix(tmp_path: Path) -> None:
     write_bvh(tmp_path / "walk.BVH", t_pose(5))
     motion = read_motion(tmp_path / "walk.BVH", "1:4")

@@ -82,7 +82,7 @@ def unpacked(path: Path) -> list[tuple[str, bytes]]:
 
 
 def nothing_came_of(store: Path) -> bool:
-    return [path.name for path in store.iterdir()] == []
+    return not store.exists()
 
 
 NAME = f"fit/{11:032x}"

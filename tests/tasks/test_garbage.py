@@ -1,3 +1,4 @@
+import errno
 import fcntl
 import multiprocessing
 import os
@@ -85,6 +86,19 @@ def test_what_a_running_process_uses_stays_until_it_is_killed(store: Store) -> N
     process.join(PATIENCE_S)
     assert garbage(store) == names(before)
     assert list((store.root / pins.FOLDER).iterdir()) == []
+
+
+def test_a_store_that_may_only_be_read_is_looked_at(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Root may write anywhere, so that removal is made to fail here."""
+    before, _ = run_of(store, "ada", 10), run_of(store, "ada", 20)
+    (store.root / pins.FOLDER).mkdir(exist_ok=True)
+    (store.root / pins.FOLDER / "0dead").write_text(f"{before[0].name}\n")
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(os, "unlink", refuse)
+    assert garbage(store) == names(before)
 
 
 def test_unfinished_work_goes_unless_somebody_is_at_it(store: Store) -> None:

@@ -28,8 +28,14 @@ def ranks_find_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def still_running(folder: Path) -> list[int]:
     """Return the process ids of the ranks that have begun and not ended."""
-    ids = [int(path.name) for path in folder.iterdir()]
-    return [i for i in ids if Path(f"/proc/{i}/stat").exists() and b") Z" not in Path(f"/proc/{i}/stat").read_bytes()]
+    return [i for i in (int(path.name) for path in folder.iterdir()) if runs(i)]
+
+
+def runs(process: int) -> bool:
+    try:
+        return b") Z" not in Path(f"/proc/{process}/stat").read_bytes()
+    except (FileNotFoundError, ProcessLookupError):  # the latter where it ends between open and read
+        return False
 
 
 def wait_until_running(folder: Path, count: int) -> None:
