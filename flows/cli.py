@@ -124,6 +124,7 @@ def _parser() -> argparse.ArgumentParser:
         "--motion", type=Path, action="append", default=[], metavar="FILE",
         help="add this motion: a BVH file, an AMASS .npz, or another subject's folder",
     )  # fmt: skip
+    export.add_argument("--allow-poor", action="store_true", help="accept an asset far below its field, too")
     _add_out(export, "asset")
     _add_overrides(export, "override a setting of the section `asset`")
     what = "Look into the store, and keep it in order."

@@ -16,7 +16,9 @@ import trimesh
 
 from hnerf.asset.baking import baked_texture
 from hnerf.asset.bvh_file import write_avatar_bvh
+from hnerf.asset.comparison import compare_with_field, comparison_figures, require_close
 from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
+from hnerf.asset.extreme_poses import extreme_poses
 from hnerf.asset.figures import beyond_skinning_mm, mesh_figures, motion_figures, rig_figures, surface_figures
 from hnerf.asset.glb import write_glb
 from hnerf.asset.package import AssetInfo, write_cache, write_package, write_usdz
@@ -32,6 +34,7 @@ from hnerf.avatar.avatar import Avatar
 from hnerf.avatar.surface import surface_in_pose
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks
 from hnerf.config import AssetSettings
 from hnerf.render.motion import Motion, retarget, select_poses
 
@@ -57,6 +60,7 @@ class ClothedSurface:
 
 def export_asset(
     capture: Capture,
+    masks: Masks,
     avatar: Avatar,
     settings: AssetSettings,
     out: Path,
@@ -67,7 +71,7 @@ def export_asset(
 
     digest: of the recording, for the asset's information; further: motions by other bodies to add, by name. Raises
     InputError if the field has no surface or a motion lacks a joint, InvalidAsset if a package does not pass
-    validation.
+    validation, or the asset is far below its field (`require_close`).
     """
     seconds: dict[str, float] = {}
     surface = _clothed_surface(capture, avatar, settings, seconds)
@@ -75,14 +79,23 @@ def export_asset(
     layout = surface.mesh.layout(settings.texture_px)
     with _timed("texture", seconds):
         texture = baked_texture(capture, timeless, surface.body, surface.surfaces_m, layout, settings)
-    with _timed("files", seconds):
+    with _timed("staging", seconds):
         staged = _staged(capture, timeless.body, surface, layout, texture, settings, further or {})
+    with _timed("comparison", seconds):
+        compared = compare_with_field(capture, masks, avatar, staged)
+        against_field = comparison_figures(compared)
+    require_close(capture.name, against_field, settings.allow_poor)
+    with _timed("poses", seconds):
+        poses = extreme_poses(staged, surface.mesh.rig, surface.mesh.skin_faces)
+    with _timed("files", seconds):
         write_files(out, staged, capture, AssetInfo(capture.name, settings.version, settings.licence, digest))
     with _timed("viewer", seconds):
         viewer = write_viewer(out / "viewer.html", out / "avatar.glb", capture, staged.stage_from_world)
     with _timed("validation", seconds):
         validation = {name: validate_package(out / name) for name in PACKAGES}
     report = _figures(capture, surface, staged, settings) | {
+        "against_field": against_field,
+        "crossing_share": {pose.name: pose.crossing for pose in poses},
         "viewer": viewer,
         "bytes": {str(p.relative_to(out)): p.stat().st_size for p in sorted(out.rglob("*")) if p.is_file()},
         "seconds": seconds,
@@ -91,7 +104,7 @@ def export_asset(
     (out / "report.json").write_text(json.dumps(report, indent=1))
     shown = capture.train_frames[0]
     root = surface.body.root[surface.body.index(shown)].numpy()
-    write_report(out / "report.html", capture.name, staged, shown, root, report)
+    write_report(out / "report.html", capture.name, staged, shown, root, compared, poses, report)
     return report
 
 
