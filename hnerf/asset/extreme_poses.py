@@ -1,6 +1,7 @@
 """Poses that show how an asset bends: arms up, a deep squat, a fist, a turned head."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,8 +32,8 @@ HEAD = ("head", "neck", "eye")
 
 @dataclass(frozen=True)
 class ExtremePose:
-    """A pose of the asset in stage axes, at rest below the origin of which it turns. points_m (V, 3); shown (V,) bool:
-    the points that a picture frames; crossing: the share of the skin's faces that cross others."""
+    """A pose of the asset. points_m (V, 3), Y up, facing +Z; shown (V,) bool: the points that a picture frames;
+    crossing: the share of the skin's faces that cross others."""
 
     name: str
     points_m: np.ndarray
@@ -59,10 +60,10 @@ def extreme_poses(staged: StagedAvatar, rig: Rig, skin_faces: int) -> list[Extre
     return found
 
 
-def turned(rig: Rig, turns_deg: dict[str, tuple[float, float, float]]) -> Tensor | None:
+def turned(rig: Rig, turns_deg: Mapping[str, tuple[float, float, float]]) -> Tensor | None:
     """Return the pose (J, 3), axis-angle in body axes, of turns in stage axes; None if the rig lacks a joint."""
     mirrored = {f"{name[:-1]}R": (x, -y, -z) for name, (x, y, z) in turns_deg.items() if name.endswith(".L")}
-    both = turns_deg | mirrored
+    both = {**turns_deg, **mirrored}
     if not set(both) <= set(rig.joint_names):
         return None
     theta = torch.zeros(len(rig.joint_names), 3)

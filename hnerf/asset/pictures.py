@@ -40,7 +40,7 @@ def on_black(
     (H, W, 4) uint8, averaged to the size (width, height)."""
     fine = supersampled(camera)
     hits, colours = _textured_rays(surface, avatar, fine)
-    exposed = np.minimum(colours * np.float32(gain), 255)
+    exposed = np.minimum(colours * np.array(gain, np.float32), 255)
     pixels = np.concatenate([exposed, np.full((len(exposed), 1), 255, np.float32)], 1) * (hits.face[:, None] >= 0)
     averaged = cv2.resize(pixels.reshape(fine.height_px, fine.width_px, 4), size_px, interpolation=cv2.INTER_AREA)
     return averaged.round().astype(np.uint8)
