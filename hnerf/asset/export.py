@@ -16,6 +16,7 @@ from hnerf.asset.bvh_file import write_avatar_bvh
 from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
 from hnerf.asset.field_colours import field_colours
 from hnerf.asset.glb import write_glb
+from hnerf.asset.normal_map import normal_map
 from hnerf.asset.package import AssetInfo, write_cache, write_package, write_usdz
 from hnerf.asset.photographs import colours_from_photographs
 from hnerf.asset.regions import findings, surface_distances_mm
@@ -79,13 +80,15 @@ def export_asset(
             photographed = {frame: surfaces_m[clothed.index(frame)] for frame in frames}
             colours = colours_from_photographs(capture, avatar.gains, photographed, rig.faces.numpy(), texels, colours)
         texture = texture_image(texels, colours, settings.texture_px)
+    with _timed("normal map", seconds):
+        normals = normal_map(avatar, mesh, layout, settings.normal_map_px) if settings.normal_map_px else None
     with _timed("files", seconds):
         own = avatar.body.to("cpu")
         added = {
             name: (_retargeted(own, rig, motion, capture.up), motion.fps) for name, motion in (further or {}).items()
         }
         staged = stage_avatar(
-            clothed, surfaces_m, correctives, layout, texture, capture.up, capture.fps, settings.bones, added
+            clothed, surfaces_m, correctives, layout, texture, capture.up, capture.fps, settings.bones, added, normals
         )
         write_files(out, staged, capture, AssetInfo(capture.name, settings.version, settings.licence, digest))
     with _timed("viewer", seconds):
@@ -105,6 +108,7 @@ def export_asset(
         "to_surface_mm": distances_mm,
         "findings": findings(distances_mm[settings.topology]) if settings.topology == "registered" else [],
         "texture_px": settings.texture_px,
+        "normal_map_px": settings.normal_map_px,
         "joints": len(staged.rigs[FULL].skeleton.names),
         "rigs": {name: _rig_figures(staged, name) for name in staged.rigs},
         "motions": {
