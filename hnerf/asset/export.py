@@ -21,6 +21,7 @@ from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
 from hnerf.asset.extreme_poses import extreme_poses
 from hnerf.asset.figures import beyond_skinning_mm, mesh_figures, motion_figures, rig_figures, surface_figures
 from hnerf.asset.glb import write_glb
+from hnerf.asset.normal_map import normal_map
 from hnerf.asset.package import AssetInfo, write_cache, write_package, write_usdz
 from hnerf.asset.regions import findings, surface_distances_mm
 from hnerf.asset.report import write_report
@@ -79,8 +80,11 @@ def export_asset(
     layout = surface.mesh.layout(settings.texture_px)
     with _timed("texture", seconds):
         texture = baked_texture(capture, timeless, surface.body, surface.surfaces_m, layout, settings)
+    with _timed("normal map", seconds):
+        px = settings.normal_map_px
+        normals = normal_map(timeless, surface.mesh, layout, px) if px else None
     with _timed("staging", seconds):
-        staged = _staged(capture, timeless.body, surface, layout, texture, settings, further or {})
+        staged = _staged(capture, timeless.body, surface, layout, texture, normals, settings, further or {})
     with _timed("comparison", seconds):
         compared = compare_with_field(capture, masks, avatar, staged)
         against_field = comparison_figures(compared)
@@ -134,6 +138,7 @@ def _staged(
     surface: ClothedSurface,
     layout: UvLayout,
     texture: np.ndarray,
+    normals: np.ndarray | None,
     settings: AssetSettings,
     further: Mapping[str, Motion],
 ) -> StagedAvatar:
@@ -153,6 +158,7 @@ def _staged(
         capture.fps,
         settings.bones,
         added,
+        normals,
     )
 
 
@@ -167,6 +173,7 @@ def _figures(
         "to_surface_mm": surface.distances_mm,
         "findings": findings(surface.distances_mm[settings.topology]) if registered else [],
         "texture_px": settings.texture_px,
+        "normal_map_px": settings.normal_map_px,
         "joints": len(staged.rigs[FULL].skeleton.names),
         "rigs": {name: rig_figures(staged, name) for name in staged.rigs},
         "motions": motion_figures(staged),

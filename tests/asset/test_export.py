@@ -14,7 +14,7 @@ from hnerf.render.motion import Motion, select_poses
 from tests.asset.figure import bending_body, capture
 from tests.asset.stand_in import CLOTHING_M, StandInAvatar
 
-SMALL = AssetSettings(grid_cells=96, faces=2000, texture_px=128, photograph_frames=0, correctives=2)
+SMALL = AssetSettings(grid_cells=96, faces=2000, texture_px=128, photograph_frames=0, normal_map_px=64, correctives=2)
 
 
 def test_surface_is_the_grown_body() -> None:
@@ -26,7 +26,7 @@ def test_surface_is_the_grown_body() -> None:
 
 
 FILES = {"avatar.usda", "avatar_24.usda", "avatar_30.usda", "avatar.usdz", "avatar_cache.usdz", "avatar.glb"}
-FILES |= {"avatar_game.glb", "avatar.bvh", "avatar/texture.png"}
+FILES |= {"avatar_game.glb", "avatar.bvh", "avatar/texture.png", "avatar/normal_map.png"}
 FILES |= {f"avatar/{name}.usdc" for name in ("geometry", "look", "cameras", "rig_full", "rig_game")}
 FILES |= {f"avatar/motion_{name}.usdc" for name in ("captured", "captured_24", "captured_30", "nod")}
 
