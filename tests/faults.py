@@ -235,7 +235,8 @@ FAULTS = (
           "tests/calibration/test_check.py"),
     Fault("nearest-frame", TIMING, "offset_frames / step + 0.5", "offset_frames / step", BY_TIMING),
     # what goes out
-    Fault("stage-axis", "hnerf/geometry/axes.py", "[0, 0, 1], [0, -1, 0]])", "[0, 0, 1], [0, 1, 0]])", "tests/asset/test_staging.py"),
+    Fault("stage-axis", "hnerf/geometry/axes.py", "[0, 0, 1], [0, -1, 0]])", "[0, 0, 1], [0, 1, 0]])",
+          "tests/asset/test_staging.py"),
     Fault("root-heading", MOTIONS, "2 * np.arctan2(y, w)", "np.arctan2(y, w)", BY_MOTIONS),
     Fault("slerp-share", MOTIONS, "turn * np.repeat(share, joints)", "turn * np.tile(share, joints)", BY_PACKAGE),
     Fault("resampled-start", MOTIONS, "np.ceil(first - 1e-6)", "np.floor(first)", BY_MOTIONS),
