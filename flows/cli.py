@@ -165,6 +165,7 @@ def _add_export(export: argparse.ArgumentParser) -> None:
         "--motion", type=Path, action="append", default=[], metavar="FILE",
         help=f"add this motion: {MOTIONS}",
     )  # fmt: skip
+    export.add_argument("--allow-poor", action="store_true", help="accept an asset far below its field, too")
     _add_out(export, "asset")
     _add_overrides(export, "override a setting of the section `asset`")
 

@@ -222,7 +222,8 @@ def export(options: argparse.Namespace) -> None:
 
     for folder in (options.subject, *(motion for motion in options.motion if motion.is_dir())):
         require_intact(folder)
-    settings = load_settings(options.preset, options.overrides).asset
+    allowed = ["asset.allow_poor=true"] if options.allow_poor else []
+    settings = load_settings(options.preset, options.overrides + allowed).asset
     digest = recording_digest(options.subject)
     report = export_subject(options.subject, settings, options.motion, options.out, digest)
     motions = ", ".join(f"{name} ({m['poses']} poses)" for name, m in report["motions"].items())

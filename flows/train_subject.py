@@ -104,7 +104,7 @@ def train_avatar(capture: Path, preset: str, store: Path, overrides: Sequence[st
         artifact_store, truth, recording, calibration, segmentation, body, training, settings.evaluation, held_out
     )
     artifact_store.link_latest(subject, evaluation)
-    asset = export(artifact_store, recording, calibration, training, settings.asset)
+    asset = export(artifact_store, recording, calibration, segmentation, training, settings.asset)
     for artifact in (recorded, recording, calibration, segmentation, body, training, evaluation, asset):
         artifact_store.link_latest(subject, artifact)  # again: another run of this name may have relinked them
     trained = Trained(

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from hnerf.asset.export import export_asset
+from hnerf.capture.masks import Masks
 from hnerf.config import AssetSettings
 from hnerf.models import THREE_SHA256
 from tasks.calibration import calibrated_capture
@@ -11,11 +12,17 @@ from tasks.store import Artifact
 from tasks.training import load_trained_avatar
 
 
-@stage("asset", version="6", networks=tuple(THREE_SHA256))
+@stage("asset", version="7", networks=tuple(THREE_SHA256))
 def export(
-    out: Path, recording: Artifact, calibration: Artifact, training: Artifact, settings: AssetSettings
+    out: Path,
+    recording: Artifact,
+    calibration: Artifact,
+    segmentation: Artifact,
+    training: Artifact,
+    settings: AssetSettings,
 ) -> dict[str, float]:
     """Export the trained person to USD and glTF files."""
     capture = calibrated_capture(recording, calibration)
-    export_asset(capture, load_trained_avatar(training), settings, out, recording.digest)
+    masks = Masks.load(segmentation.root)
+    export_asset(capture, masks, load_trained_avatar(training), settings, out, recording.digest)
     return {}

@@ -6,43 +6,62 @@ import logging
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 
+from hnerf.asset.baking import baked_texture
 from hnerf.asset.bvh_file import write_avatar_bvh
+from hnerf.asset.comparison import compare_with_field, comparison_figures, require_close
 from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
-from hnerf.asset.field_colours import field_colours
+from hnerf.asset.extreme_poses import extreme_poses
+from hnerf.asset.figures import beyond_skinning_mm, mesh_figures, motion_figures, rig_figures, surface_figures
 from hnerf.asset.glb import write_glb
+from hnerf.asset.normal_map import normal_map
 from hnerf.asset.package import AssetInfo, write_cache, write_package, write_usdz
-from hnerf.asset.photographs import colours_from_photographs
 from hnerf.asset.regions import findings, surface_distances_mm
-from hnerf.asset.registration import crossing_faces
 from hnerf.asset.report import write_report
 from hnerf.asset.rigs import FULL, GAME
-from hnerf.asset.staging import CAPTURED, StagedAvatar, stage_avatar
-from hnerf.asset.texture import rasterise, texture_image
-from hnerf.asset.topologies import asset_meshes
+from hnerf.asset.staging import StagedAvatar, stage_avatar
+from hnerf.asset.texture import UvLayout
+from hnerf.asset.topologies import AssetMesh, asset_meshes
 from hnerf.asset.validation import validate_package
 from hnerf.asset.viewer import write_viewer
 from hnerf.avatar.avatar import Avatar
 from hnerf.avatar.surface import surface_in_pose
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.rig import Rig
 from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks
 from hnerf.config import AssetSettings
-from hnerf.evenly_spaced import evenly_spaced
-from hnerf.render.motion import Motion, retarget
+from hnerf.render.motion import Motion, retarget, select_poses
 
 PACKAGES = ("avatar.usdz", "avatar.usda", "avatar_24.usda", "avatar_30.usda", "avatar_cache.usdz")
 
 log = logging.getLogger("hnerf.asset")
 
 
+@dataclass(frozen=True)
+class ClothedSurface:
+    """The surface of the asset: the field's in the rest pose, `dense`; the meshes made of it by topology, and how far
+    they are from it; of the chosen `mesh`, the body in every frame, its surface in the world, (n, V, 3), what
+    displacements (n, V, 3) take skinning there, and the blend shapes that come close to them."""
+
+    dense: trimesh.Trimesh
+    distances_mm: dict[str, Any]
+    mesh: AssetMesh
+    body: BodyFit
+    surfaces_m: np.ndarray
+    displacements_m: np.ndarray
+    correctives: Correctives
+
+
 def export_asset(
     capture: Capture,
+    masks: Masks,
     avatar: Avatar,
     settings: AssetSettings,
     out: Path,
@@ -53,66 +72,34 @@ def export_asset(
 
     digest: of the recording, for the asset's information; further: motions by other bodies to add, by name. Raises
     InputError if the field has no surface or a motion lacks a joint, InvalidAsset if a package does not pass
-    validation.
+    validation, or the asset is far below its field (`require_close`).
     """
     seconds: dict[str, float] = {}
-    tracked_avatar, avatar = avatar, avatar.without_frames()  # one surface and one texture serve all frames
-    with _timed("surface", seconds):
-        rest = avatar.body.theta.new_zeros(len(avatar.body.rig.joints_m), 3), torch.eye(4).to(avatar.body.theta)
-        dense = surface_in_pose(avatar, *rest, settings.grid_cells)
-    with _timed("mesh", seconds):
-        meshes = asset_meshes(avatar.body.rig.to("cpu"), dense, settings.faces)
-        mesh = meshes[settings.topology]
-        rig, layout = mesh.rig, mesh.layout(settings.texture_px)
-    clothed = _clothed_body(avatar.body, rig, capture.frames)
-    with _timed("distances", seconds):
-        distances_mm = surface_distances_mm(dense, meshes)
-    with _timed("correctives", seconds):
-        surfaces_m, displacements_m = frame_surfaces(tracked_avatar, clothed, mesh.settle)
-        correctives = correctives_of(displacements_m, settings.correctives)
+    surface = _clothed_surface(capture, avatar, settings, seconds)
+    timeless = avatar.without_frames()  # one texture serves all frames
+    layout = surface.mesh.layout(settings.texture_px)
     with _timed("texture", seconds):
-        texels = rasterise(layout, settings.texture_px)
-        posed = _clothed_body(avatar.body, rig, tuple(evenly_spaced(capture.train_frames, settings.texture_poses)))
-        colours = field_colours(avatar, posed, texels)
-        if settings.photograph_frames:
-            frames = evenly_spaced(capture.train_frames, settings.photograph_frames)
-            photographed = {frame: surfaces_m[clothed.index(frame)] for frame in frames}
-            colours = colours_from_photographs(capture, avatar.gains, photographed, rig.faces.numpy(), texels, colours)
-        texture = texture_image(texels, colours, settings.texture_px)
+        texture = baked_texture(capture, timeless, surface.body, surface.surfaces_m, layout, settings)
+    with _timed("normal map", seconds):
+        px = settings.normal_map_px
+        normals = normal_map(timeless, surface.mesh, layout, px) if px else None
+    with _timed("staging", seconds):
+        staged = _staged(capture, timeless.body, surface, layout, texture, normals, settings, further or {})
+    with _timed("comparison", seconds):
+        compared = compare_with_field(capture, masks, avatar, staged)
+        against_field = comparison_figures(compared)
+    require_close(capture.name, against_field, settings.allow_poor)
+    with _timed("poses", seconds):
+        poses = extreme_poses(staged, surface.mesh.rig, surface.mesh.skin_faces)
     with _timed("files", seconds):
-        own = avatar.body.to("cpu")
-        added = {
-            name: (_retargeted(own, rig, motion, capture.up), motion.fps) for name, motion in (further or {}).items()
-        }
-        staged = stage_avatar(
-            clothed, surfaces_m, correctives, layout, texture, capture.up, capture.fps, settings.bones, added
-        )
         write_files(out, staged, capture, AssetInfo(capture.name, settings.version, settings.licence, digest))
     with _timed("viewer", seconds):
         viewer = write_viewer(out / "viewer.html", out / "avatar.glb", capture, staged.stage_from_world)
     with _timed("validation", seconds):
         validation = {name: validate_package(out / name) for name in PACKAGES}
-    report = {
-        "surface": {"faces": len(dense.faces), "watertight": dense.is_watertight, "volume_l": 1e3 * dense.volume},
-        "mesh": {
-            "topology": settings.topology,
-            "vertices": len(rig.vertices_m),
-            "faces": len(rig.faces),
-            "watertight": mesh.trimesh.is_watertight,
-            "crossing_faces": int(crossing_faces(mesh.trimesh.vertices, mesh.trimesh.faces[: mesh.skin_faces]).sum()),
-            "height_m": float(np.ptp(staged.rest_points_m[:, 1])),
-        },
-        "to_surface_mm": distances_mm,
-        "findings": findings(distances_mm[settings.topology]) if settings.topology == "registered" else [],
-        "texture_px": settings.texture_px,
-        "joints": len(staged.rigs[FULL].skeleton.names),
-        "rigs": {name: _rig_figures(staged, name) for name in staged.rigs},
-        "motions": {
-            name: {"fps": motion.fps, "poses": len(motion.codes)} for name, motion in staged.rigs[FULL].motions.items()
-        },
-        "frames": len(capture.frames),
-        "beyond_skinning_mm": _beyond_skinning_mm(displacements_m, correctives),
-        "cameras": len(capture.cameras),
+    report = _figures(capture, surface, staged, settings) | {
+        "against_field": against_field,
+        "crossing_share": {pose.name: pose.crossing for pose in poses},
         "viewer": viewer,
         "bytes": {str(p.relative_to(out)): p.stat().st_size for p in sorted(out.rglob("*")) if p.is_file()},
         "seconds": seconds,
@@ -120,8 +107,80 @@ def export_asset(
     }
     (out / "report.json").write_text(json.dumps(report, indent=1))
     shown = capture.train_frames[0]
-    write_report(out / "report.html", capture.name, staged, shown, clothed.root[clothed.index(shown)].numpy(), report)
+    root = surface.body.root[surface.body.index(shown)].numpy()
+    write_report(out / "report.html", capture.name, staged, shown, root, compared, poses, report)
     return report
+
+
+def _clothed_surface(
+    capture: Capture, avatar: Avatar, settings: AssetSettings, seconds: dict[str, float]
+) -> ClothedSurface:
+    """Mesh the avatar in the rest pose and follow the mesh through the frames; seconds: where steps' times go."""
+    timeless = avatar.without_frames()  # one mesh serves all frames
+    with _timed("surface", seconds):
+        rest = avatar.body.theta.new_zeros(len(avatar.body.rig.joints_m), 3), torch.eye(4).to(avatar.body.theta)
+        dense = surface_in_pose(timeless, *rest, settings.grid_cells)
+    with _timed("mesh", seconds):
+        meshes = asset_meshes(timeless.body.rig.to("cpu"), dense, settings.faces)
+        mesh = meshes[settings.topology]
+    with _timed("distances", seconds):
+        distances_mm = surface_distances_mm(dense, meshes)
+    with _timed("correctives", seconds):
+        body = dataclasses.replace(select_poses(timeless.body, capture.frames).to("cpu"), rig=mesh.rig)
+        surfaces_m, displacements_m = frame_surfaces(avatar, body, mesh.settle)
+        correctives = correctives_of(displacements_m, settings.correctives)
+    return ClothedSurface(dense, distances_mm, mesh, body, surfaces_m, displacements_m, correctives)
+
+
+def _staged(
+    capture: Capture,
+    fitted: BodyFit,
+    surface: ClothedSurface,
+    layout: UvLayout,
+    texture: np.ndarray,
+    normals: np.ndarray | None,
+    settings: AssetSettings,
+    further: Mapping[str, Motion],
+) -> StagedAvatar:
+    """Return the avatar in stage axes, with further motions; fitted: the unclothed body, beside which they are put."""
+    own = fitted.to("cpu")
+    added = {
+        name: (dataclasses.replace(retarget(own, motion, capture.up), rig=surface.mesh.rig), motion.fps)
+        for name, motion in further.items()
+    }
+    return stage_avatar(
+        surface.body,
+        surface.surfaces_m,
+        surface.correctives,
+        layout,
+        texture,
+        capture.up,
+        capture.fps,
+        settings.bones,
+        added,
+        normals,
+    )
+
+
+def _figures(
+    capture: Capture, surface: ClothedSurface, staged: StagedAvatar, settings: AssetSettings
+) -> dict[str, Any]:
+    """Return the figures of the surface, the rigs and the motions."""
+    registered = settings.topology == "registered"
+    return {
+        "surface": surface_figures(surface.dense),
+        "mesh": mesh_figures(settings.topology, surface.mesh, staged),
+        "to_surface_mm": surface.distances_mm,
+        "findings": findings(surface.distances_mm[settings.topology]) if registered else [],
+        "texture_px": settings.texture_px,
+        "normal_map_px": settings.normal_map_px,
+        "joints": len(staged.rigs[FULL].skeleton.names),
+        "rigs": {name: rig_figures(staged, name) for name in staged.rigs},
+        "motions": motion_figures(staged),
+        "frames": len(capture.frames),
+        "beyond_skinning_mm": beyond_skinning_mm(surface.displacements_m, surface.correctives),
+        "cameras": len(capture.cameras),
+    }
 
 
 def write_files(out: Path, staged: StagedAvatar, capture: Capture, info: AssetInfo) -> None:
@@ -133,38 +192,6 @@ def write_files(out: Path, staged: StagedAvatar, capture: Capture, info: AssetIn
     write_glb(out / "avatar.glb", staged, staged.rigs[FULL])
     write_glb(out / "avatar_game.glb", staged, staged.rigs[GAME])
     write_avatar_bvh(out / "avatar.bvh", staged)
-
-
-def _retargeted(own: BodyFit, rig: Rig, motion: Motion, up: str) -> BodyFit:
-    """Return a motion on the clothed rig; `own`: the fitted body, beside whose place the motion is put."""
-    return dataclasses.replace(retarget(own, motion, up), rig=rig)
-
-
-def _rig_figures(staged: StagedAvatar, name: str) -> dict[str, float]:
-    """Return a rig's size, and how far it moves the captured surfaces from where the full rig has them: what 99 % of
-    the points stay below in all frames, and the furthest."""
-    rig, full = staged.rigs[name], staged.rigs[FULL]
-    pairs = zip(rig.surfaces_m(CAPTURED, staged.rest), full.surfaces_m(CAPTURED, staged.rest), strict=True)
-    worst_m = np.max([np.linalg.norm(moved - true, axis=1) for moved, true in pairs], 0)
-    return {
-        "joints": len(rig.skeleton.names),
-        "influences": rig.skin.influences,
-        "moved_p99_mm": float(1e3 * np.percentile(worst_m, 99)),
-        "moved_max_mm": float(1e3 * worst_m.max()),
-    }
-
-
-def _clothed_body(body: BodyFit, rig: Rig, frames: tuple[int, ...]) -> BodyFit:
-    rows = [body.index(frame) for frame in frames]
-    return dataclasses.replace(body, rig=rig, frames=frames, theta=body.theta[rows].cpu(), root=body.root[rows].cpu())
-
-
-def _beyond_skinning_mm(displacements_m: np.ndarray, correctives: Correctives) -> dict[str, float]:
-    """Return the root mean square distance of the frames' surfaces from the skinned one, without and with its
-    correctives."""
-    rebuilt_m = np.einsum("nk,kvd->nvd", correctives.weights, correctives.offsets_m)
-    left_m = {"skinned": displacements_m, "with_correctives": displacements_m - rebuilt_m}
-    return {name: float(1e3 * np.sqrt((m**2).sum(-1).mean())) for name, m in left_m.items()}
 
 
 @contextmanager

@@ -12,6 +12,8 @@ from hnerf.asset.rigs import JointMotion, StagedRig
 from hnerf.asset.skeleton import Skeleton
 from hnerf.asset.skinning import Skin
 from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar
+from hnerf.asset.tangents import uv_tangents
+from hnerf.asset.texture import UvLayout
 from hnerf.body.descriptor import normals_of
 
 COMPONENT_TYPES = {"float32": gltf.FLOAT, "uint16": gltf.UNSIGNED_SHORT, "uint32": gltf.UNSIGNED_INT}
@@ -64,7 +66,7 @@ def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig) -> None:
     writer = GlbWriter()
     document = writer.document
     _add_joints(document, rig.skeleton)
-    document.materials.append(_material(writer, avatar.texture))
+    document.materials.append(_material(writer, avatar))
     no_weights = [0.0] * len(avatar.shapes_m)
     document.meshes.append(gltf.Mesh(primitives=[_primitive(writer, avatar, rig.skin)], weights=no_weights or None))
     inverse_bind = np.linalg.inv(rig.skeleton.bind).swapaxes(1, 2).astype(np.float32)  # stored by columns
@@ -98,6 +100,10 @@ def _primitive(writer: GlbWriter, avatar: StagedAvatar, skin: Skin) -> gltf.Prim
         NORMAL=_vertex_data(writer, normals[vertex], np.float32),
         TEXCOORD_0=_vertex_data(writer, avatar.uvs * (1, -1) + (0, 1), np.float32),  # v runs down in glTF
     )
+    if avatar.normal_map is not None:
+        layout = UvLayout(avatar.uvs, avatar.face_uvs)
+        tangents = uv_tangents(avatar.rest_points_m, normals, avatar.faces, layout)
+        attributes.TANGENT = _vertex_data(writer, tangents, np.float32)
     missing = -skin.joints.shape[1] % 4
     joints, weights = (np.pad(a, ((0, 0), (0, missing)))[vertex] for a in (skin.joints, skin.weights))
     for start in range(0, joints.shape[1], 4):
@@ -112,15 +118,22 @@ def _vertex_data(writer: GlbWriter, values: np.ndarray, dtype: type) -> int:
     return writer.accessor(values.astype(dtype), gltf.ARRAY_BUFFER)
 
 
-def _material(writer: GlbWriter, texture: np.ndarray) -> gltf.Material:
-    _, png = cv2.imencode(".png", cv2.cvtColor(texture, cv2.COLOR_RGB2BGR))
-    writer.document.images.append(gltf.Image(bufferView=writer.view(png.tobytes()), mimeType="image/png"))
+def _material(writer: GlbWriter, avatar: StagedAvatar) -> gltf.Material:
     writer.document.samplers.append(gltf.Sampler(wrapS=gltf.CLAMP_TO_EDGE, wrapT=gltf.CLAMP_TO_EDGE))
-    writer.document.textures.append(gltf.Texture(source=0, sampler=0))
-    matte = gltf.PbrMetallicRoughness(
-        baseColorTexture=gltf.TextureInfo(index=0), metallicFactor=0.0, roughnessFactor=1.0
-    )
-    return gltf.Material(name="Captured", pbrMetallicRoughness=matte)
+    colours = gltf.TextureInfo(index=_add_texture(writer, avatar.texture))
+    matte = gltf.PbrMetallicRoughness(baseColorTexture=colours, metallicFactor=0.0, roughnessFactor=1.0)
+    material = gltf.Material(name="Captured", pbrMetallicRoughness=matte)
+    if avatar.normal_map is not None:
+        material.normalTexture = gltf.NormalMaterialTexture(index=_add_texture(writer, avatar.normal_map))
+    return material
+
+
+def _add_texture(writer: GlbWriter, image: np.ndarray) -> int:
+    """Add an image (H, W, 3) uint8 as PNG; return the index of its texture."""
+    _, png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    writer.document.images.append(gltf.Image(bufferView=writer.view(png.tobytes()), mimeType="image/png"))
+    writer.document.textures.append(gltf.Texture(source=len(writer.document.images) - 1, sampler=0))
+    return len(writer.document.textures) - 1
 
 
 def _animation(writer: GlbWriter, name: str, motion: JointMotion, skeleton: Skeleton) -> gltf.Animation:

@@ -20,6 +20,7 @@ from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
 from hnerf.asset.rigs import FULL
 from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar
 from hnerf.asset.usd import (
+    NORMAL_MAP_NAME,
     ROOT,
     SURFACE,
     TEXTURE_NAME,
@@ -66,7 +67,7 @@ def write_package(out: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fp
     """Write `avatar.usda`, `avatar_24.usda`, `avatar_30.usda` and the folder `avatar/` into `out`."""
     folder = out / PAYLOADS
     folder.mkdir()
-    write_image(folder / TEXTURE_NAME, avatar.texture)
+    _write_images(folder, avatar)
     parts = _parts(avatar, list(cameras), fps)
     for part in parts:
         layer = Usd.Stage.CreateNew(str(folder / f"{part.name}.usdc"))
@@ -97,7 +98,7 @@ def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps
         stage = _new_stage(Path(folder) / "avatar_cache.usdc", avatar, avatar.frames, fps, info)
         author_cameras(stage, cameras, avatar.stage_from_world)
         mesh = define_mesh(stage, ROOT.AppendChild("Surface"), avatar)
-        author_look(stage, mesh.GetPath())
+        author_look(stage, mesh.GetPath(), avatar)
         points, extents, normals = mesh.CreatePointsAttr(), mesh.CreateExtentAttr(), mesh.CreateNormalsAttr()
         for frame, posed in zip(avatar.frames, avatar.points_m, strict=True):
             points.Set(vec3f(posed), float(frame))
@@ -111,7 +112,7 @@ def _parts(avatar: StagedAvatar, cameras: list[Camera], fps: float) -> list[Part
     view = partial(author_cameras, cameras=cameras, stage_from_world=avatar.stage_from_world)
     return [
         Part("geometry", partial(author_geometry, avatar=avatar), fps),
-        Part("look", partial(author_look, mesh=SURFACE), fps),
+        Part("look", partial(author_look, mesh=SURFACE, avatar=avatar), fps),
         Part("cameras", view, fps),
         *(
             Part(f"rig_{name}", partial(author_rig, name=name, rig=rig), fps, ("rig", name))
@@ -196,10 +197,16 @@ def _everywhere(avatar: StagedAvatar) -> object:
 def _package(stage: Usd.Stage, avatar: StagedAvatar, path: Path) -> None:
     layer = Path(stage.GetRootLayer().realPath)
     stage.GetRootLayer().Save()
-    write_image(layer.parent / TEXTURE_NAME, avatar.texture)
+    _write_images(layer.parent, avatar)
     if not UsdUtils.CreateNewARKitUsdzPackage(str(layer), str(path)):
         raise OSError(f"{path}: USD could not write the package; is the disk full?")
     _forget_times(path)
+
+
+def _write_images(folder: Path, avatar: StagedAvatar) -> None:
+    write_image(folder / TEXTURE_NAME, avatar.texture)
+    if avatar.normal_map is not None:
+        write_image(folder / NORMAL_MAP_NAME, avatar.normal_map)
 
 
 def _forget_times(path: Path) -> None:

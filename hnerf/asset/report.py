@@ -6,20 +6,32 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from hnerf.asset.comparison import Compared
+from hnerf.asset.extreme_poses import ExtremePose
 from hnerf.asset.pictures import texture_picture, textured, turntable_cameras, uv_picture, wireframe
+from hnerf.asset.skeleton import FRONT
 from hnerf.asset.staging import StagedAvatar
 from hnerf.evaluation.galleries import GalleryPicture
 from hnerf.evaluation.pictures import clay, data_uri
 from hnerf.evaluation.report import report_environment
+from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.mesh_queries import Surface
 
 TEMPLATES = Path(__file__).parent / "page"
 TURNS = 8  # views of the turntable
+COMPARED = 3  # views beside the field's
 SQUARE_PX = 640  # of the texture and its layout
 
 
 def write_report(
-    path: Path, name: str, avatar: StagedAvatar, frame: int, world_from_body: np.ndarray, figures: dict[str, Any]
+    path: Path,
+    name: str,
+    avatar: StagedAvatar,
+    frame: int,
+    world_from_body: np.ndarray,
+    compared: list[Compared],
+    poses: list[ExtremePose],
+    figures: dict[str, Any],
 ) -> None:
     """Write the page of an avatar called `name`, shown in the pose of a frame. world_from_body (4, 4): the body's place
     in it, Z up and facing -Y; figures: what `report.json` holds."""
@@ -48,10 +60,32 @@ def write_report(
                 _picture("Texture", texture_picture(avatar, SQUARE_PX)),
                 _picture("Layout", uv_picture(avatar, SQUARE_PX)),
             ],
+            against_field=[_beside_field(view) for view in evenly_spaced(compared, COMPARED)],
+            poses=[picture for pose in poses for picture in _extreme(pose, avatar)],
             figures=figures,
         ),
         encoding="utf-8",
     )
+
+
+def _beside_field(view: Compared) -> list[GalleryPicture]:
+    """Return the photograph of a view, and renderings of field and asset with their PSNR."""
+    psnr = {shown: f"{scores['psnr']:.1f} dB" for shown, scores in view.scores.items()}
+    return [
+        _picture(f"Photograph, camera {view.view.camera}, frame {view.view.frame}", view.photograph),
+        _picture(f"Field, {psnr['field']}", view.field[..., :3]),
+        _picture(f"Asset, {psnr['asset']}", view.asset[..., :3]),
+    ]
+
+
+def _extreme(pose: ExtremePose, avatar: StagedAvatar) -> list[GalleryPicture]:
+    """Return a pose in clay and textured."""
+    surface = Surface(trimesh.Trimesh(pose.points_m, avatar.faces, process=False))
+    camera = turntable_cameras(pose.points_m[pose.shown], FRONT, 1)[0]
+    return [
+        _picture(f"{pose.name}: {100 * pose.crossing:.1f} % of faces cross", clay(surface, camera)),
+        _picture(pose.name, textured(surface, avatar, camera)),
+    ]
 
 
 def _picture(caption: str, picture: np.ndarray) -> GalleryPicture:

@@ -1,6 +1,6 @@
 """The rigs of an exported avatar, "full" and "game", with all its motions."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,10 +51,13 @@ class StagedRig:
     motions: dict[str, JointMotion]
     stage: dict[str, np.ndarray]
 
-    def surfaces_m(self, motion: str, rest: RestSurface) -> Iterator[np.ndarray]:
-        """Yield the surface (V, 3) at each time code of a motion: blend shapes, then the skin."""
-        weights = self.motions[motion].shape_weights
-        for transforms, points_m in posed_frames(self.skeleton, self.stage[motion], rest, weights):
+    def surfaces_m(
+        self, motion: str, rest: RestSurface, rows: Sequence[int] | slice = slice(None)
+    ) -> Iterator[np.ndarray]:
+        """Yield the surface (V, 3) at each time code of a motion, or at some rows of these: blend shapes, then the
+        skin."""
+        weights = self.motions[motion].shape_weights[rows]
+        for transforms, points_m in posed_frames(self.skeleton, self.stage[motion][rows], rest, weights):
             yield skinned(transforms, self.skin, points_m)
 
 

@@ -26,7 +26,7 @@ class StagedAvatar:
     V, 3) float32: corrective blend shapes, applied before the skin. rigs: "full", with all joints of the body model,
     and "game", with few joints and influences. frames (n,): of the capture; points_m (n, V, 3) float32: the surface of
     each. extents_m: the box (2, 3) at each time code of each motion, (n, 2, 3). texture (H, W, 3) uint8 sRGB.
-    stage_from_world (3, 3): a rotation.
+    stage_from_world (3, 3): a rotation. normal_map (S, S, 3) uint8, in tangent space, if there is one.
     """
 
     rest_points_m: np.ndarray
@@ -40,6 +40,7 @@ class StagedAvatar:
     extents_m: dict[str, np.ndarray]
     texture: np.ndarray
     stage_from_world: np.ndarray
+    normal_map: np.ndarray | None = None
 
     @property
     def rest(self) -> RestSurface:
@@ -67,6 +68,7 @@ def stage_avatar(
     fps: float,
     bones: Bones = "along",
     further: Mapping[str, tuple[BodyFit, float]] | None = None,
+    normal_map: np.ndarray | None = None,
 ) -> StagedAvatar:
     """Turn a clothed body (see `clothed_rig`) and its motion to Y up, with both rigs. surfaces_m (n, V, 3): its surface
     in each frame; `up`: the vertical axis of the world, "y" or "z"; fps: of the frames; further: motions of the same
@@ -91,6 +93,7 @@ def stage_avatar(
         extents_m={name: _boxes(rigs[FULL], name, rest) for name in motions},
         texture=texture,
         stage_from_world=world,
+        normal_map=normal_map,
     )
 
 

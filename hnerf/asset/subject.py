@@ -12,12 +12,13 @@ from hnerf.asset.staging import CAPTURED
 from hnerf.avatar.trained import load_avatar
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks
 from hnerf.config import AssetSettings
 from hnerf.errors import InputError
 from hnerf.files import atomic_folder
 from hnerf.render.motion import Motion, read_motion
 
-NEEDED = ("capture/capture.json", "calibration/intri.yml", "training/model.safetensors")
+NEEDED = ("capture/capture.json", "calibration/intri.yml", "segmentation/report.json", "training/model.safetensors")
 
 
 def export_subject(
@@ -35,7 +36,8 @@ def export_subject(
         further = _named(motions)
         capture = load_cameras(subject / "calibration", Capture.load(subject / "capture"))
         avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
-        return export_asset(capture, avatar, settings, partial, digest, further)
+        masks = Masks.load(subject / "segmentation")
+        return export_asset(capture, masks, avatar, settings, partial, digest, further)
 
 
 def _named(motions: Iterable[Path]) -> dict[str, Motion]:

@@ -20,7 +20,7 @@ ROOT = Sdf.Path("/Avatar")
 BODY = ROOT.AppendChild("Body")
 SURFACE, SKELETON, MOTION = (BODY.AppendChild(name) for name in ("Surface", "Skeleton", "Motion"))
 APERTURE = 0.36  # film gate width in tenths of a scene unit, read as 36 mm where a unit is a metre
-TEXTURE_NAME = "texture.png"
+TEXTURE_NAME, NORMAL_MAP_NAME = "texture.png", "normal_map.png"
 REST_NOTE = (
     f"Rest pose: {REST_POSE}, arms slanting down, elbows and knees a little bent; soles at height 0, facing +Z. The "
     "root joint stands on the ground below the pelvis; it moves over the ground and turns about the vertical with it."
@@ -45,29 +45,43 @@ def author_geometry(stage: Usd.Stage, avatar: StagedAvatar) -> None:
     binding.CreateBlendShapeTargetsRel().SetTargets(targets)
 
 
-def author_look(stage: Usd.Stage, mesh: Sdf.Path) -> None:
-    """Define a matte preview surface with the texture, and bind the mesh to it."""
+def author_look(stage: Usd.Stage, mesh: Sdf.Path, avatar: StagedAvatar) -> None:
+    """Define a matte preview surface with the texture and the normal map, and bind the mesh to it."""
     material = UsdShade.Material.Define(stage, ROOT.AppendPath("Materials/Captured"))
     UsdGeom.Scope.Define(stage, material.GetPath().GetParentPath())
     reader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("TextureCoordinates"))
     reader.CreateIdAttr("UsdPrimvarReader_float2")
     reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
-    texture = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Texture"))
-    texture.CreateIdAttr("UsdUVTexture")
-    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(TEXTURE_NAME)
-    texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
-    for wrap in ("wrapS", "wrapT"):
-        texture.CreateInput(wrap, Sdf.ValueTypeNames.Token).Set("clamp")
     coordinates = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
-    texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
+    texture = _define_texture(stage, material.GetPath().AppendChild("Texture"), TEXTURE_NAME, "sRGB", coordinates)
     surface = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Surface"))
     surface.CreateIdAttr("UsdPreviewSurface")
     surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
     surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
     colour = texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
     surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
+    if avatar.normal_map is not None:
+        path = material.GetPath().AppendChild("NormalMap")
+        normals = _define_texture(stage, path, NORMAL_MAP_NAME, "raw", coordinates)
+        normals.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
+        normals.CreateInput("bias", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(-1, -1, -1, 0))
+        normal = normals.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
+        surface.CreateInput("normal", Sdf.ValueTypeNames.Normal3f).ConnectToSource(normal)
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
     UsdShade.MaterialBindingAPI.Apply(stage.OverridePrim(mesh)).Bind(material)
+
+
+def _define_texture(
+    stage: Usd.Stage, path: Sdf.Path, file: str, colour_space: str, coordinates: UsdShade.Output
+) -> UsdShade.Shader:
+    texture = UsdShade.Shader.Define(stage, path)
+    texture.CreateIdAttr("UsdUVTexture")
+    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(file)
+    texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set(colour_space)
+    for wrap in ("wrapS", "wrapT"):
+        texture.CreateInput(wrap, Sdf.ValueTypeNames.Token).Set("clamp")
+    texture.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(coordinates)
+    return texture
 
 
 def author_rig(stage: Usd.Stage, name: str, rig: StagedRig) -> None:

@@ -10,21 +10,25 @@ MIXED_CONTRAST = 0.1  # between neighbours, of colour or coverage; 0.05 gains 0.
 QUARTERS_PX = 0.25 * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])  # from a pixel's centre to those of its quarters
 
 
-def antialiased(render_rays_at: Callable[[np.ndarray], Tensor], visible: np.ndarray) -> Tensor:
+def antialiased(
+    render_rays_at: Callable[[np.ndarray], Tensor],
+    render_beside: Callable[[np.ndarray, np.ndarray], Tensor],
+    visible: np.ndarray,
+) -> Tensor:
     """Return an image (H, W, 5): colour, coverage and depth, 0 outside `visible` (H, W) bool.
 
-    render_rays_at: maps points (N, 2) of the image, (x, y) in pixels, to what their rays see, (N, 5). Of mixed pixels
-    the colour and the coverage are means over four quarters; depth is that of the centre, since a mean of near and far
-    lies on neither surface.
+    render_rays_at: maps points (N, 2) of the image, (x, y) in pixels, to what their rays see, (N, 5). render_beside:
+    the same for points that are moved by offsets (M, 2) in pixels each, (M, N, 5). Of mixed pixels the colour and the
+    coverage are means over four quarters; depth is that of the centre, since a mean of near and far lies on neither
+    surface.
     """
     centres = _pixels(visible)
     seen = render_rays_at(centres)
     image = seen.new_zeros(*visible.shape, 5)
     image[tuple(centres.T[::-1])] = seen
     mixed = _pixels(mixed_pixels(image[..., :4]).cpu().numpy())
-    quarters = [render_rays_at(mixed + offset_px)[:, :4] for offset_px in QUARTERS_PX]
     x, y = mixed.T
-    image[y, x, :4] = torch.stack(quarters).mean(0)
+    image[y, x, :4] = render_beside(mixed, QUARTERS_PX).mean(0)[:, :4]
     return image
 
 

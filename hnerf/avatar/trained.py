@@ -80,18 +80,27 @@ class TrainedAvatar:
         device = bodies.vertices_m.device
         at_once = max(1, min(RAYS_PER_BATCH, SAMPLES_PER_BATCH // self.field.samples))
 
+        def rays_at(points_px: np.ndarray) -> Rays:
+            o, d = (torch.from_numpy(row.astype(np.float32)).to(device) for row in camera.rays(points_px.astype(float)))
+            return Rays(o, d, torch.zeros(len(o), dtype=torch.long, device=device))
+
         def render_rays_at(points_px: np.ndarray) -> Tensor:
-            origins, directions = (rows.astype(np.float32) for rows in camera.rays(points_px.astype(np.float64)))
             seen = [torch.zeros(0, 5, device=device)]
             for start in range(0, len(points_px), at_once):
-                part = slice(start, start + at_once)
-                o, d = (torch.from_numpy(rows[part]).to(device) for rows in (origins, directions))
-                row = torch.zeros(len(o), dtype=torch.long, device=device)
-                seen.append(self.field.render_rays(scene, Rays(o, d, row)))
+                seen.append(self.field.render_rays(scene, rays_at(points_px[start : start + at_once])))
             return torch.cat(seen)
 
+        def render_beside(points_px: np.ndarray, offsets_px: np.ndarray) -> Tensor:
+            step = -(-at_once // len(offsets_px))
+            seen = [torch.zeros(len(offsets_px), 0, 5, device=device)]
+            for start in range(0, len(points_px), step):
+                part = points_px[start : start + step]
+                directions = torch.stack([rays_at(part + offset_px).directions for offset_px in offsets_px])
+                seen.append(self.field.render_beside(scene, rays_at(part), directions))
+            return torch.cat(seen, 1)
+
         visible = self.field.visible_pixels(camera, bodies.vertices_m[0].cpu().numpy())
-        image = antialiased(render_rays_at, visible)
+        image = antialiased(render_rays_at, render_beside, visible)
         gain = torch.tensor(self.gains.get(camera.name, (1.0, 1.0, 1.0)), device=device)
         return Rendering((gain * image[..., :3]).clamp(0, 1), image[..., 3], image[..., 4])
 

@@ -12,7 +12,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from hnerf.body.descriptor import BodyMeshes
+from hnerf.body.correction_pull import Displacement
+from hnerf.body.descriptor import BodyMeshes, ClosestPoints
 from hnerf.body.rig import (
     Rig,
     joint_transforms,
@@ -88,6 +89,7 @@ class PosedBodies:
         self._canonical_m = canonical_m
         self._free = torch.nonzero(rig.free)[:, 0]
         self._subtree_weights = _subtree_weights(rig, self._free)
+        self._skin_joints = rig.skin_joints.int()
         self._pose(theta, root)
         self._meshes = BodyMeshes(self.vertices_m, rig.faces)
 
@@ -124,10 +126,21 @@ class PosedBodies:
         reach_m: float,
         correction: PoseCorrection | None = None,
         exact_sign: bool = False,
+        s_follows: bool = True,
+        beside_m: Tensor | None = None,
     ) -> Descriptor:
         """Return descriptors of world points (N, 3) relative to the bodies of rows `frame` (N,); gradients flow to the
-        points and the correction."""
+        points and the correction, through s only if it `s_follows`.
+
+        beside_m (M, N, 3): return instead those of the points moved by M offsets each, (M N,), to first order: what is
+        closest is looked for once.
+        """
         found = self._meshes.closest_points(points_m, frame, reach_m, exact_sign)
+        moved = points_m - points_m.detach()  # zero, but carries the gradient
+        if beside_m is not None:
+            many = len(beside_m)
+            found = ClosestPoints(*(torch.cat([t] * many) for t in (found.face, found.barycentric, found.sign)))
+            points_m, frame, moved = torch.cat([points_m] * many), torch.cat([frame] * many), beside_m.flatten(0, 1)
         corners = self.rig.faces.index_select(0, found.face.clamp(min=0))  # (N, 3)
         posed = frame.long()[:, None] * len(self.rig.vertices_m) + corners
         p = weighted_sum(self.vertices_m.flatten(0, 1), posed, found.barycentric)
@@ -136,13 +149,12 @@ class PosedBodies:
         offset = points_m.detach() - p
         distance = offset.norm(dim=-1)
         normal = found.sign[:, None] * offset / distance.clamp(min=1e-9)[:, None]
-        moved = points_m - points_m.detach()  # zero, but carries the gradient
         if correction is not None:
             nearest = nearest_corner(corners, found.barycentric)
             moved = moved - self._displacement(points_m.detach(), frame, nearest, correction)
-        y = s + (inverse @ (offset + moved)[..., None])[..., 0]
-        if moved.requires_grad:  # only gradients need it, so renderings save it
-            s = s + (inverse @ self._closest_point_motion(posed, found.barycentric, normal, moved)[..., None])[..., 0]
+        y = s + (inverse * (offset + moved)[:, None]).sum(-1)  # many small products of matrices are slower
+        if s_follows and moved.requires_grad:  # only gradients need it
+            s = s + (inverse * self._closest_point_motion(posed, found.barycentric, normal, moved)[:, None]).sum(-1)
         d = found.sign * distance + (normal * moved).sum(-1)
         return Descriptor(d, s, y, normal, found.face >= 0, corners, found.barycentric)
 
@@ -163,22 +175,17 @@ class PosedBodies:
     def _displacement(self, points_m: Tensor, frame: Tensor, nearest: Tensor, correction: PoseCorrection) -> Tensor:
         """Return how far the correction carries the body at each point, whose nearest vertex is `nearest` (N,): (N, 3)
         metres."""
-        frame = frame.long()
-        share = self._subtree_weights.index_select(0, nearest)  # (N, free + 1)
         pivots = torch.cat([self._joints[:, self._free, :3, 3], self._joints[:, :1, :3, 3]], 1)  # (n, free + 1, 3)
-        twists = torch.cat([correction.turn, -torch.linalg.cross(correction.turn, pivots)], -1)  # (n, free + 1, 6)
-        present, own = distinct_rows(frame, len(twists))
-        everywhere = (share @ twists[present].transpose(0, 1).flatten(1)).unflatten(1, (len(present), 6))
-        twist = everywhere.gather(1, own[:, None, None].expand(-1, 1, 6))[
-            :, 0
-        ]  # one matrix product is faster than gathering for each point
-        moved = torch.linalg.cross(twist[:, :3], points_m) + twist[:, 3:] + correction.move_m.index_select(0, frame)
-        bulge = torch.einsum("b,bvd->vd", correction.shape, self.rig.shape_basis).index_select(0, nearest)
-        linear = self._linear.flatten(0, 1).index_select(0, frame * len(self.rig.vertices_m) + nearest)
-        carried = (self._joint_shape.unflatten(1, (3, -1)) @ correction.shape).contiguous()
-        joints = frame[:, None] * len(self.rig.joints_m) + self.rig.skin_joints.index_select(0, nearest)
-        moved = moved + (linear @ bulge[..., None])[..., 0]
-        return moved + weighted_sum(carried, joints, self.rig.skin_weights.index_select(0, nearest))
+        shift = -torch.linalg.cross(correction.turn, pivots)
+        shift = torch.cat([shift[:, :-1], shift[:, -1:] + correction.move_m[:, None]], 1)  # the root carries everything
+        bulge = torch.einsum("b,bvd->vd", correction.shape, self.rig.shape_basis)
+        carried = (self._joint_shape.unflatten(1, (3, -1)) @ correction.shape).unflatten(0, (len(shift), -1))
+        posed = (frame * len(bulge) + nearest).int()
+        bodies = (self._subtree_weights, self._linear.flatten(0, 1), self._skin_joints, self.rig.skin_weights)
+        found: Tensor = Displacement.apply(
+            torch.stack([correction.turn, shift], 2), bulge, carried, points_m, posed, *bodies
+        )
+        return found
 
     @torch.no_grad()
     def absorb(self, correction: PoseCorrection, same_posture: Tensor | None = None) -> None:

@@ -9,6 +9,7 @@ there.
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from threading import Lock
 
 import numpy as np
 import torch
@@ -79,11 +80,20 @@ class BodyMeshes:
             wp.Mesh(points=points, indices=indices, support_winding_number=True) for points in self._to_warp(vertices_m)
         ]
         self._ids = wp.array([m.id for m in self._meshes], dtype=wp.uint64, device=self._device)
+        self._coming: Tensor | None = None
+        self._refitting = Lock()
 
     def refit(self, vertices_m: Tensor) -> None:
-        """Replace the vertices (n, V, 3) by similar ones; the hierarchies are refitted, not rebuilt."""
-        for mesh, points in zip(self._meshes, self._to_warp(vertices_m), strict=True):
-            mesh.points = points
+        """Replace the vertices (n, V, 3) by similar ones; the hierarchies are refitted before the next query, not
+        rebuilt."""
+        self._coming = vertices_m
+
+    def _refit(self) -> None:
+        with self._refitting:  # queries come from several threads
+            if self._coming is not None:
+                for mesh, points in zip(self._meshes, self._to_warp(self._coming), strict=True):
+                    mesh.points = points
+                self._coming = None
 
     def _to_warp(self, vertices_m: Tensor) -> list[wp.array]:
         """Return each copy's vertices for warp, which does not copy them, and compute their normals for the sign."""
@@ -96,6 +106,7 @@ class BodyMeshes:
     ) -> ClosestPoints:
         """Return the closest surface point of mesh `mesh_index` (N,) to each of `points_m` (N, 3), if within
         `reach_m`."""
+        self._refit()
         n, device = len(points_m), points_m.device
         mesh_index, points_m = mesh_index.to(torch.int32).contiguous(), points_m.detach().float().contiguous()
         face = torch.empty(n, dtype=torch.int32, device=device)

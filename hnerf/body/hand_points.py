@@ -8,9 +8,8 @@ from torch import Tensor
 
 from hnerf.body.articulation import Articulation, Points, PosedJoints
 from hnerf.body.normal_equations import NormalEquations
-from hnerf.body.reprojection import Views, project
+from hnerf.body.reprojection import Views, project, reprojection_term
 from hnerf.body.rig import Rig
-from hnerf.body.robust import geman_mcclure
 from hnerf.capture.capture import Capture
 
 SIDES = ("L", "R")
@@ -19,6 +18,8 @@ PALM = [0, 1, 5, 9, 13, 17]  # points that the palm carries: wrist and knuckles
 PALM_ROWS = [*PALM, *(21 + k for k in PALM)]  # of both hands
 # Of a point seen with full confidence: the network is 2.5 px off where a hand is 30 px long, in either direction.
 POINT_STD_M, OUTLIER_M = 0.012, 0.06
+PALM_STD_M = POINT_STD_M * len(PALM) ** 0.5  # the points of a palm are off together, so they count as one
+SEEN = 0.5  # least confidence of a view that counts
 EPSILON = 1e-9
 
 
@@ -63,19 +64,21 @@ def observe_hands(capture: Capture) -> Views | None:
     found = [capture.hands(name) for name in capture.train_cameras]
     if len(found) < 2 or not all(hands is not None for hands in found):
         return None
-    hands = torch.from_numpy(np.stack([h for h in found if h is not None]).astype(np.float64)).flatten(2, 3)
+    hands = torch.from_numpy(np.stack([h for h in found if h is not None]).astype(np.float64))  # (C, n, 2, 21, 3)
     cameras = tuple(capture.cameras[name] for name in capture.train_cameras)
-    return Views(cameras, hands[..., :2], hands[..., 2])
+    confidence = hands[..., 2] * seen_twice(hands[..., 0, 2])[..., None]
+    return Views(cameras, hands[..., :2].flatten(2, 3), confidence.flatten(2, 3))
+
+
+def seen_twice(confidence: Tensor) -> Tensor:
+    """Return which hands (n, 2) two cameras see, by the confidences of their wrists (C, n, 2). A single view hardly
+    distinguishes a palm that leans towards the camera from one that leans away."""
+    return (confidence > SEEN).sum(0) > 1
 
 
 @dataclass(frozen=True)
 class PalmTerm:
-    """Reprojection of wrists and knuckles relative to each other, which shows how the wrist turns. views: of all hand
-    points.
-
-    Where a hand is, keypoints and outlines say: the network places all points of a hand to one side, a different one in
-    each view, and six such points would outvote them.
-    """
+    """Reprojection of wrists and knuckles, which turn with the wrist. views: of all hand points."""
 
     views: Views
 
@@ -83,21 +86,11 @@ class PalmTerm:
         self, equations: NormalEquations, articulation: Articulation, joints: PosedJoints, scale_m: Tensor
     ) -> float:
         """Add the term to the normal equations and return its cost. scale_m (C, n): metres a pixel spans."""
-        points, rows = hand_points(articulation), PALM_ROWS
-        palm = Points(points.weights[rows], points.rest_m[rows], points.basis_m[rows])
+        points = hand_points(articulation)
+        palm = Points(points.weights[PALM_ROWS], points.rest_m[PALM_ROWS], points.basis_m[PALM_ROWS])
         x, by_frame, by_shape = articulation.jacobian(palm, joints)
-        views, cost = self.views.of(rows), 0.0
-        for camera, scale, pixels, confidence in zip(
-            views.cameras, scale_m, views.pixels, views.confidence, strict=True
-        ):
-            uv, by_x = project(camera, x)
-            trust, by_x = confidence.square(), by_x * scale[:, None, None, None]
-            residual = relative_to_palm((uv - pixels) * scale[:, None, None], trust)
-            weight, part = geman_mcclure(residual.square().sum(-1), POINT_STD_M, OUTLIER_M)
-            weight, cost = trust * weight, cost + float((trust * part).sum())
-            matrix = weight[..., None, None] * torch.eye(2, dtype=x.dtype)
-            moves = (relative_to_palm(by_x @ by, trust) for by in (by_frame, by_shape))
-            equations.add_points(matrix, weight[..., None] * residual, *moves)
+        matrix, pull, cost = reprojection_term(self.views.of(PALM_ROWS), scale_m, x, PALM_STD_M, OUTLIER_M)
+        equations.add_points(matrix, pull, by_frame, by_shape)
         return cost
 
     def seen(self) -> Tensor:
@@ -105,23 +98,13 @@ class PalmTerm:
         return self.views.confidence[..., [0, 21]].amax(0)
 
 
-def relative_to_palm(values: Tensor, trust: Tensor) -> Tensor:
-    """Return values (n, 12, ...) of the palm points of both hands less each hand's mean, weighted by trust (n, 12)."""
-    return values - palm_means(values, trust).repeat_interleave(len(PALM), 1)
-
-
 def moved_onto_palm(views: Views, x: Tensor) -> Views:
     """Return the views of hand points moved in each view so that the means of the palms are where those of x (n, 42, 3)
     are."""
-    rows, pixels = PALM_ROWS, []
+    pixels = []
     for camera, seen, confidence in zip(views.cameras, views.pixels, views.confidence, strict=True):
-        off_px = palm_means((project(camera, x)[0] - seen)[:, rows], confidence[:, rows].square())
-        pixels.append(seen + off_px.repeat_interleave(21, 1))
+        off_px = (project(camera, x)[0] - seen)[:, PALM_ROWS].unflatten(1, (2, -1))
+        weight = confidence[:, PALM_ROWS].square().unflatten(1, (2, -1, 1))
+        mean_px = (weight * off_px).sum(2) / weight.sum(2).clamp(min=EPSILON)
+        pixels.append(seen + mean_px.repeat_interleave(21, 1))
     return replace(views, pixels=torch.stack(pixels))
-
-
-def palm_means(values: Tensor, trust: Tensor) -> Tensor:
-    """Return the means (n, 2, ...) of values (n, 12, ...) over each hand's palm points, weighted by trust (n, 12)."""
-    hands, weight = values.unflatten(1, (2, -1)), trust.unflatten(1, (2, -1))
-    weight = weight / weight.sum(2, keepdim=True).clamp(min=EPSILON)
-    return torch.einsum("nhk,nhk...->nh...", weight, hands)

@@ -21,9 +21,8 @@ class NormalEquations:
         self.coupling_diagonal = np.zeros((frames, unknowns))  # added to the diagonal by smoothness in time
 
     def add_points(self, matrix: Tensor, pull: Tensor, by_frame: Tensor, by_shared: Tensor) -> None:
-        """Add a term of points in space (D = 3) or in an image (2): its matrices (n, K, D, D) and gradients (n, K, D)
-        by the points, and the points' derivatives by the frame's unknowns (n, K, D, U) and by the first shared ones (n,
-        K, D, S)."""
+        """Add a term of points in space: its matrices (n, K, 3, 3) and gradients (n, K, 3) by the points, and the
+        points' derivatives by the frame's unknowns (n, K, 3, U) and by the first shared ones (n, K, 3, S)."""
         own = by_shared.shape[-1]
         weighted = (matrix @ by_frame).flatten(1, 2)
         frame, shared, gradient = by_frame.flatten(1, 2), by_shared.flatten(1, 2), pull.flatten(1)[..., None]

@@ -67,11 +67,15 @@ def crop(picture: np.ndarray, box: tuple[slice, slice]) -> np.ndarray:
 
 def cropped_camera(camera: Camera, box: tuple[slice, slice]) -> Camera:
     """Return the camera whose whole image is `crop` of this one's."""
-    rows, columns = box
+    part = camera_of_box(camera, box)
+    return part.resized(*_report_size(part.width_px, part.height_px))
+
+
+def camera_of_box(camera: Camera, box: tuple[slice, slice]) -> Camera:
+    """Return the camera whose whole image is a box, rows and columns, of this one's; slices may end beyond it."""
+    rows, columns = range(camera.height_px)[box[0]], range(camera.width_px)[box[1]]
     K = camera.K - np.array([[0, 0, columns.start], [0, 0, rows.start], [0, 0, 0]])
-    width, height = columns.stop - columns.start, rows.stop - rows.start
-    part = dataclasses.replace(camera, K=K, width_px=width, height_px=height)
-    return part.resized(*_report_size(width, height))
+    return dataclasses.replace(camera, K=K, width_px=len(columns), height_px=len(rows))
 
 
 def _report_size(width: int, height: int) -> tuple[int, int]:

@@ -1,6 +1,7 @@
 """Interface of a field, used by trainer and renderer."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import numpy as np
@@ -88,17 +89,22 @@ class Field(nn.Module, ABC):
 
         Returns (R, 5): colour over black, coverage, and depth in metres, 0 where nothing is hit.
         """
-        needed = self.samples_needed(scene.region, rays)
         rendered = rays.origins_m.new_zeros(len(rays), 5)
+        for pick, draws in self._by_samples(scene, rays):
+            rendered[pick] = composited(*self.sample(scene, rays.pick(pick), draws))
+        return rendered
+
+    def render_beside(self, scene: PosedScene[Any], rays: Rays, directions: Tensor) -> Tensor:
+        """Render M rays beside each of R rays, from the same origins along unit directions (M, R, 3) that are close to
+        theirs, as `render_rays` does: (M, R, 5)."""
+        return torch.stack([self.render_rays(scene, Rays(rays.origins_m, d, rays.frame)) for d in directions])
+
+    def _by_samples(self, scene: PosedScene[Any], rays: Rays) -> Iterator[tuple[Tensor, Draws]]:
+        """Yield the rays that see anything, (N,) long, by the number of their samples, with what they draw."""
+        needed = self.samples_needed(scene.region, rays)
         for count in needed[needed > 0].unique().tolist():
             pick = torch.nonzero(needed == count)[:, 0]
-            draws = Draws.deterministic(len(pick), count, rays.frame.device)
-            samples, depths = self.sample(scene, rays.pick(pick), draws)
-            weights = weights_from_alpha(samples.in_box * samples.alpha)
-            cover = weights.sum(1, keepdim=True)
-            depth = (weights * depths).sum(1, keepdim=True) / cover.clamp(min=1e-6)
-            rendered[pick] = torch.cat([composite(weights, samples.colour), cover, depth * (cover > 0)], 1)
-        return rendered
+            yield pick, Draws.deterministic(len(pick), count, rays.frame.device)
 
     def coverage(self, samples: RaySamples) -> Tensor:
         """Return how far the learned content covers each ray, (R,)."""
@@ -111,3 +117,11 @@ class Field(nn.Module, ABC):
     @abstractmethod
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """Return the colour c (N, 3) at points (N, 3) around the first body, seen along directions (N, 3)."""
+
+
+def composited(samples: RaySamples, depths: Tensor) -> Tensor:
+    """Return what R rays with samples at depths (R, K) see of the person alone, (R, 5), as `Field.render_rays` does."""
+    weights = weights_from_alpha(samples.in_box * samples.alpha)
+    cover = weights.sum(1, keepdim=True)
+    depth = (weights * depths).sum(1, keepdim=True) / cover.clamp(min=1e-6)
+    return torch.cat([composite(weights, samples.colour), cover, depth * (cover > 0)], 1)

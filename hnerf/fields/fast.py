@@ -7,11 +7,11 @@ import torch
 from torch import Tensor, nn
 
 from hnerf.body.canonical import FAR_M, Descriptor, PosedBodies
-from hnerf.body.descriptor import vertex_normals
+from hnerf.body.descriptor import BodyMeshes, vertex_normals
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
 from hnerf.config import FastFieldSettings
-from hnerf.fields.base import Field
+from hnerf.fields.base import Field, composited
 from hnerf.fields.compositing import alpha_from_sdf, occupancy, weights_from_alpha
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.deformation import FrameDeformation
@@ -64,7 +64,13 @@ class FastField(Field):
         self.register_buffer("weights", weights, persistent=False)
         beyond_m = settings.outer_m + GRID_MARGIN_M
         lower_m, upper_m = rig.vertices_m.amin(0) - beyond_m, rig.vertices_m.amax(0) + beyond_m
-        self.field = CanonicalField(lower_m, upper_m, settings, 3 * int(rig.free.sum()))
+        body = BodyMeshes(rig.vertices_m[None], rig.faces)
+
+        def near(points_m: Tensor, beyond_m: float) -> Tensor:
+            only = torch.zeros(len(points_m), dtype=torch.int32, device=points_m.device)
+            return body.closest_points(points_m, only, self.reach_m + GRID_MARGIN_M + beyond_m).face >= 0
+
+        self.field = CanonicalField(lower_m, upper_m, settings, 3 * int(rig.free.sum()), near)
         self.deformation = (
             FrameDeformation(rig.vertices_m, rig.faces, settings.nodes, frames) if settings.nodes else None
         )
@@ -101,10 +107,11 @@ class FastField(Field):
         settled_m = SATURATED_LOGIT / self.log_sharpness.exp()
         extent_m = {1: torch.zeros_like(self.outer_m), -1: torch.zeros_like(self.inner_m)}
         for depth_m in torch.arange(-s.inner_m, s.outer_m, TIGHTEN_STEP_M).tolist():
-            described = bodies.describe(bodies.vertices_m[0] + depth_m * normals, only, self.reach_m)
+            old = torch.nonzero((-self.inner_m <= depth_m) & (depth_m <= self.outer_m))[:, 0]
+            described = bodies.describe((bodies.vertices_m[0] + depth_m * normals)[old], only[old], self.reach_m)
             seen = torch.zeros_like(described.near)
-            for row in pose:
-                d_hat = described.d + self._residual(described, row.expand(len(normals), -1))
+            for one in pose.split(1):
+                d_hat = described.d + self._residual(described, one, only[old])
                 seen |= described.near & (d_hat.abs() < settled_m)
             for side, extent in extent_m.items():
                 extent.scatter_reduce_(0, described.vertex[seen], side * described.d[seen], "amax")
@@ -134,24 +141,48 @@ class FastField(Field):
 
     def sample(self, scene: PosedScene[ShellGrid], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:
         """Evaluate rays as Field.sample does, in the shell alone."""
+        return self._sample(scene, rays, draws, None)
+
+    def render_beside(self, scene: PosedScene[ShellGrid], rays: Rays, directions: Tensor) -> Tensor:
+        """Render M rays beside each ray as Field.render_beside does. What is closest to their samples is taken to first
+        order from those of the ray between them: a quarter of a pixel beside, it is the same."""
+        rendered = directions.new_zeros(*directions.shape[:2], 5)
+        for pick, draws in self._by_samples(scene, rays):
+            seen = composited(*self._sample(scene, rays.pick(pick), draws, directions[:, pick]))
+            rendered[:, pick] = seen.unflatten(0, (len(directions), -1))
+        return rendered
+
+    def _sample(
+        self, scene: PosedScene[ShellGrid], rays: Rays, draws: Draws, directions: Tensor | None
+    ) -> tuple[RaySamples, Tensor]:
+        """Evaluate rays, or if there are directions (M, R, 3) the M R rays along them, at the depths of the rays that
+        they are close to."""
         depths, met, core = scene.region.sample_rays(rays, draws.jitter)
         hit = torch.nonzero(met)[:, 0]  # only these rays are evaluated; the others see nothing
-        points = rays.pick(hit).points(depths[hit])
-        row = rays.frame[hit].repeat_interleave(depths.shape[1])
-        skin = scene.bodies.describe(points.flatten(0, 1), row, self.reach_m, scene.correction)
+        points_m = rays.pick(hit).points(depths[hit]).flatten(0, 1)
+        row, background, beside_m = rays.frame[hit].repeat_interleave(depths.shape[1]), draws.background, None
+        if directions is not None:
+            beside_m = ((directions - rays.directions)[:, hit, None] * depths[hit, :, None]).flatten(1, 2)
+        skin = scene.bodies.describe(points_m, row, self.reach_m, scene.correction, s_follows=False, beside_m=beside_m)
+        if directions is not None:
+            many = len(directions)
+            hit = (hit + len(rays) * torch.arange(many, device=hit.device)[:, None]).flatten()
+            depths, met, core, row, background = (torch.cat([t] * many) for t in (depths, met, core, row, background))
         described, moved = self._deformed(skin, scene.conditions.frame_row[row])
-        pose = scene.conditions.pose.index_select(0, row)
+        near = described.near & (described.d <= self.outer_m[described.vertex])  # cells reach farther than the shell
+        described = dataclasses.replace(described, near=near)
+        pose = scene.conditions.pose
         d = torch.where(described.near, described.d, self.reach_m).view(len(hit), depths.shape[1])
-        residual = torch.where(described.near, self._residual(described, pose), 0.0).view_as(d)
+        residual = self._residual(described, pose, row).view_as(d)
         alpha_dot = alpha_from_sdf(d + residual, self.log_sharpness.exp())
         # an opaque core: nothing shines through if the surface lies deeper
         end = torch.where(core[hit, None], 1.0, alpha_dot[:, -1:])
         alpha = torch.cat([alpha_dot[:, :-1], end], 1)
         visible = weights_from_alpha(alpha.detach()).flatten() > MIN_COLOUR_WEIGHT
-        colour = self._colour(move_to_surface(described, d + residual), pose, visible)
+        colour = self._colour(move_to_surface(described, d + residual), pose, row, visible)
         norms = d.new_zeros(0)
         if draws.probe is not None:
-            norms = self._gradient_norms(described, skin, pose, draws.probe[hit], depths.shape[1])
+            norms = self._gradient_norms(described, skin, pose, row, draws.probe[hit], depths.shape[1])
         elastic = None
         if moved is not None:
             energy = torch.where(described.near, (moved / ELASTIC_M).square().sum(-1), 0.0)
@@ -162,8 +193,9 @@ class FastField(Field):
 
         alpha, alpha_dot, residual = (everywhere(values, 0.0) for values in (alpha, alpha_dot, residual))
         colour = everywhere(colour.view(len(hit), depths.shape[1], 3), 0.0)
-        d, in_box = everywhere(d, self.reach_m), everywhere(torch.ones_like(d), 0.0)
-        samples = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, draws.background, elastic)
+        seen = described.near.view_as(d).any(1, keepdim=True)
+        d, in_box = everywhere(d, self.reach_m), everywhere(seen.expand_as(d).float(), 0.0)
+        samples = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, background, elastic)
         return samples, depths
 
     def coverage(self, samples: RaySamples) -> Tensor:
@@ -191,23 +223,25 @@ class FastField(Field):
         moved, normal_displacement = self.deformation(described, frame_row)
         return dataclasses.replace(described, y=described.y - moved, d=described.d - normal_displacement), moved
 
-    def _residual(self, described: Descriptor, pose: Tensor) -> Tensor:
+    def _residual(self, described: Descriptor, pose: Tensor, row: Tensor) -> Tensor:
         """Return dd (N,) in the shell; 0 outside it and deeper inside, where no ray samples and the body's d is
         enough."""
         s = self.settings
         trained = described.near & (described.d < self.reach_m) & (described.d > -s.inner_m - 2 * s.shell_cell_m)
-        return torch.where(trained, self.field.residual(described.y, described.d, pose), 0.0)
+        pick = torch.nonzero(trained)[:, 0]
+        y, d, row = (t.index_select(0, pick) for t in (described.y, described.d, row))
+        return torch.zeros_like(described.d).index_copy(0, pick, self.field.residual(y, d, pose, row))
 
-    def _colour(self, described: Descriptor, pose: Tensor, visible: Tensor) -> Tensor:
+    def _colour(self, described: Descriptor, pose: Tensor, row: Tensor, visible: Tensor) -> Tensor:
         """Return the colours (N, 3) of the visible samples, zero elsewhere."""
         pick = torch.nonzero(visible)[:, 0]
         colour = described.d.new_zeros(len(visible), 3)
-        at = (t.index_select(0, pick) for t in (described.y, described.d, described.normal, pose))
-        seen = self.field.colour(*at)
+        y, d, normal, row = (t.index_select(0, pick) for t in (described.y, described.d, described.normal, row))
+        seen = self.field.colour(y, d, normal, pose, row)
         return colour.index_copy(0, pick, seen)
 
     def _gradient_norms(
-        self, described: Descriptor, skin: Descriptor, pose: Tensor, probe: Tensor, samples: int
+        self, described: Descriptor, skin: Descriptor, pose: Tensor, row: Tensor, probe: Tensor, samples: int
     ) -> Tensor:
         """Return |grad d_hat| in the canonical frame at one sample per ray, probe (R,) in [0, 1), by forward
         differences, because grid interpolation has no useful second derivative.
@@ -222,20 +256,20 @@ class FastField(Field):
         axes = torch.cat([y.new_zeros(1, 3), torch.eye(3, device=y.device)])  # no step, and one along each axis
         d = d + GRADIENT_STEP_M * axes @ outward.T
         y = y + GRADIENT_STEP_M * axes[:, None]
-        found = self.field.residual(y.flatten(0, 1), d.flatten(), pose[pick].repeat(len(axes), 1)).view_as(d)
+        found = self.field.residual(y.flatten(0, 1), d.flatten(), pose, row[pick].repeat(len(axes))).view_as(d)
         return (outward + (found[1:] - found[0]).T / GRADIENT_STEP_M).norm(dim=-1)
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """Return d_hat (N,) at points (N, 3) around the first body; beyond the shell it is the body's own distance."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         described, _ = self._deformed(bodies.describe(points_m, row, FAR_M, exact_sign=True), conditions.frame_row[row])
-        return described.d + self._residual(described, conditions.pose[row])
+        return described.d + self._residual(described, conditions.pose, row)
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """Return c (N, 3) at points around the first body; this field does not depend on the viewing direction."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         described, _ = self._deformed(bodies.describe(points_m, row, FAR_M), conditions.frame_row[row])
-        return self.field.colour(described.y, described.d, described.normal, conditions.pose[row])
+        return self.field.colour(described.y, described.d, described.normal, conditions.pose, row)
 
 
 def move_to_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:

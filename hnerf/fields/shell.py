@@ -1,20 +1,25 @@
 """Sampling regions: per frame a voxel grid of empty, shell and solid cells, with rays sampled in the shell alone; or,
 for the published methods, a box."""
 
+# mypy: disable-error-code="no-untyped-def"
+
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+import warp as wp
 from scipy import ndimage
 from torch import Tensor
 
 from hnerf.body.canonical import weighted_sum
 from hnerf.fields.rays import Rays
 
+wp.config.log_level = wp.LOG_ERROR
+
 EMPTY, SHELL, SOLID = 0, 1, 2
-SLACK = 3**0.5 / 2  # half a diagonal of a cell, in cells
+SLACK = 0.5  # cells: most of a cell then lies in the shell; thicknesses have more room than its corners need
 
 
 @dataclass(frozen=True)
@@ -33,9 +38,10 @@ class ShellGrid:
         """Build the shell around closed surfaces with vertices (n, V, 3); outer_m, inner_m (n, V): thickness in metres
         outside and inside; points: dense surface points, as `surface_points` returns them.
 
-        Distances are between cell centres and half a diagonal is added, so the shell is up to a cell thicker than
-        asked, seldom thinner. A cell takes the greatest thickness near its closest surface point.
+        Each surface point's cell reaches as far as the point is thick and half a cell farther, between cell centres, so
+        the shell is up to a cell thicker or thinner than asked.
         """
+        wp.init()
         corners, weights = points
         margin_m = float(outer_m.max()) + 2 * cell_m
         lower = vertices_m.amin(1) - margin_m
@@ -45,8 +51,8 @@ class ShellGrid:
         def fill(row: int) -> None:
             index = ((weighted_sum(vertices_m[row], corners, weights) - lower[row]) / cell_m).long()
             thickness = (side[row][corners].amax(-1) / cell_m for side in (outer_m, inner_m))
-            size, *surface = (t.cpu().numpy() for t in (sizes[row], index, *thickness))
-            cells[row][tuple(map(slice, size))] = _classify_cells(size, *surface)
+            size, *surface = (t.cpu() for t in (sizes[row], index, *thickness))
+            cells[row][tuple(map(slice, size))] = _classify_cells(size.tolist(), *surface)
 
         with ThreadPoolExecutor(torch.get_num_threads()) as threads:  # one frame per thread, which bounds memory
             list(threads.map(fill, range(len(cells))))
@@ -112,28 +118,42 @@ def surface_points(vertices_m: Tensor, faces: Tensor, spacing_m: float) -> tuple
     return torch.cat(corners), torch.cat(weights)
 
 
-def _classify_cells(size: np.ndarray, points: np.ndarray, outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
+def _classify_cells(size: list[int], points: Tensor, outer: Tensor, inner: Tensor) -> np.ndarray:
     """Return the states of a frame's cells around surface points (V, 3) with thicknesses (V,), all in cells."""
-    at = tuple(points.T)
-    surface = np.zeros(size, bool)
-    surface[at] = True
-    distance, nearest = ndimage.distance_transform_edt(~surface, return_indices=True)
-    away, _ = ndimage.label(distance > 1)  # one cell thicker, so that the inside has no leaks
+    beside = _within(size, points, torch.ones(len(points)))  # a cell thicker than the surface: the inside has no leaks
+    away, _ = ndimage.label(~beside)
     inside = away != away[0, 0, 0]
     cells = np.where(inside, np.uint8(SOLID), np.uint8(EMPTY))
-    band = np.nonzero(distance <= max(outer.max(), inner.max()) + SLACK)
-    next_to = tuple(nearest[:, *band])
-    outer, inner = (_local_max(size, at, thickness)[next_to] for thickness in (outer, inner))
-    within = distance[band] <= np.where(inside[band], inner, outer) + SLACK
-    cells[tuple(axis[within] for axis in band)] = SHELL
+    cells[np.where(inside, _within(size, points, inner + SLACK), _within(size, points, outer + SLACK))] = SHELL
     return cells
 
 
-def _local_max(size: np.ndarray, at: tuple[np.ndarray, ...], values: np.ndarray) -> np.ndarray:
-    """Return an array of this size with the greatest value in each cell and its neighbours."""
-    greatest = np.zeros(size, np.float32)
-    np.maximum.at(greatest, at, values)
-    return ndimage.maximum_filter(greatest, 3)
+def _within(size: list[int], points: Tensor, reach: Tensor) -> np.ndarray:
+    """Return the cells whose centres are at most as far from that of a point's cell as the point reaches, in an array
+    of this size; points (V, 3), reach (V,)."""
+    index = (points[:, 0] * size[1] + points[:, 1]) * size[2] + points[:, 2]
+    farthest = torch.zeros(math.prod(size)).scatter_reduce_(0, index, reach.float(), "amax")
+    centres = torch.nonzero(farthest)[:, 0]
+    within = torch.zeros(size, dtype=torch.uint8)
+    at = wp.from_torch(torch.stack(torch.unravel_index(centres, size), 1).int(), dtype=wp.vec3i)
+    wp.launch(_fill_balls, len(centres), [at, *map(wp.from_torch, (farthest[centres], within))], device="cpu")
+    return within.bool().numpy()
+
+
+@wp.kernel(enable_backward=False)
+def _fill_balls(centres: wp.array(dtype=wp.vec3i), radii: wp.array(dtype=float), cells: wp.array3d(dtype=wp.uint8)):
+    """Set all cells with centres within `radii` of the centres' own to 1."""
+    i = wp.tid()
+    centre, squared = centres[i], radii[i] * radii[i]
+    reach = int(radii[i])
+    for x in range(wp.max(centre[0] - reach, 0), wp.min(centre[0] + reach + 1, cells.shape[0])):
+        beyond_x = squared - float((x - centre[0]) * (x - centre[0]))
+        for y in range(wp.max(centre[1] - reach, 0), wp.min(centre[1] + reach + 1, cells.shape[1])):
+            beyond_y = beyond_x - float((y - centre[1]) * (y - centre[1]))
+            if beyond_y >= 0.0:
+                depth = int(wp.sqrt(beyond_y))
+                for z in range(wp.max(centre[2] - depth, 0), wp.min(centre[2] + depth + 1, cells.shape[2])):
+                    cells[x, y, z] = wp.uint8(1)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from tests.asset.figure import bending_body, posed_with_displacements, upright_c
 
 @pytest.fixture(scope="session")
 def staged() -> StagedAvatar:
-    """Return clothes around the bending column, with two shapes of noise and a texture of noise."""
+    """Return clothes around the bending column, with two shapes of noise, and a texture and a normal map of noise."""
     body = bending_body()
     clothes = upright_column(0.18, -0.05, 1.65)
     layout = unwrap(clothes.vertices, clothes.faces, 64)
@@ -22,4 +22,6 @@ def staged() -> StagedAvatar:
     moved_m = np.einsum("nk,kvd->nvd", rng.normal(size=(len(body.frames), 2)), shapes_m).astype(np.float32)
     texture = rng.integers(0, 255, (64, 64, 3), np.uint8)
     surfaces_m = posed_with_displacements(clothed, moved_m)
-    return stage_avatar(clothed, surfaces_m, correctives_of(moved_m, 2), layout, texture, "z", 10.0)
+    normals = rng.integers(100, 156, (32, 32, 3), np.uint8)
+    shapes = correctives_of(moved_m, 2)
+    return stage_avatar(clothed, surfaces_m, shapes, layout, texture, "z", 10.0, normal_map=normals)

@@ -7,12 +7,14 @@ from pxr import Usd
 
 from hnerf.asset.export import export_asset
 from hnerf.avatar.surface import surface_in_pose
+from hnerf.capture.masks import Masks
 from hnerf.config import AssetSettings
+from hnerf.errors import InvalidAsset
 from hnerf.render.motion import Motion, select_poses
 from tests.asset.figure import bending_body, capture
 from tests.asset.stand_in import CLOTHING_M, StandInAvatar
 
-SMALL = AssetSettings(grid_cells=96, faces=2000, texture_px=128, photograph_frames=0, correctives=2)
+SMALL = AssetSettings(grid_cells=96, faces=2000, texture_px=128, photograph_frames=0, normal_map_px=64, correctives=2)
 
 
 def test_surface_is_the_grown_body() -> None:
@@ -24,7 +26,7 @@ def test_surface_is_the_grown_body() -> None:
 
 
 FILES = {"avatar.usda", "avatar_24.usda", "avatar_30.usda", "avatar.usdz", "avatar_cache.usdz", "avatar.glb"}
-FILES |= {"avatar_game.glb", "avatar.bvh", "avatar/texture.png"}
+FILES |= {"avatar_game.glb", "avatar.bvh", "avatar/texture.png", "avatar/normal_map.png"}
 FILES |= {f"avatar/{name}.usdc" for name in ("geometry", "look", "cameras", "rig_full", "rig_game")}
 FILES |= {f"avatar/motion_{name}.usdc" for name in ("captured", "captured_24", "captured_30", "nod")}
 
@@ -33,7 +35,9 @@ def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monke
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))  # the capture has no pixels for a viewer
     monkeypatch.setattr("hnerf.asset.report.TURNS", 2)
     nod = Motion(select_poses(bending_body(), (4, 5)), 25.0, "z")
-    report = export_asset(capture(), StandInAvatar(bending_body()), SMALL, tmp_path, "0123", {"nod": nod})
+    report = export_asset(
+        capture(), Masks({}, {}), StandInAvatar(bending_body()), SMALL, tmp_path, "0123", {"nod": nod}
+    )
     assert json.loads((tmp_path / "report.json").read_text()) == report
     assert set(report["bytes"]) == FILES
     assert report["viewer"].startswith("no viewer.html: three.js is not installed")
@@ -48,5 +52,17 @@ def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monke
     assert report["motions"]["captured_30"] == {"fps": 30, "poses": 16}
     for name in ("avatar.usdz", "avatar.usda"):
         assert (report["validation"][name]["variants"], report["validation"][name]["warnings"]) == (8, [])
+    assert report["against_field"]["images"] == 0 and report["crossing_share"] == {}
+    assert "Extreme poses" not in page and "Asset and field" not in page
     stage = Usd.Stage.Open(str(tmp_path / "avatar.usda"))
     assert stage.GetDefaultPrim().GetAssetInfoByKey("captureDigest") == "0123"
+
+
+def test_nothing_is_written_of_an_asset_far_below_its_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scores = {"asset": {"psnr": 20.0}, "field": {"psnr": 30.0}, "below_field": {"psnr": 10.0}}
+    poor = {"images": 2, "cameras": "training", **scores}
+    monkeypatch.setattr("hnerf.asset.export.comparison_figures", lambda compared: poor)
+    tiny = SMALL.model_copy(update={"grid_cells": 32, "texture_px": 32, "faces": 500, "correctives": 0})
+    with pytest.raises(InvalidAsset, match=r"column: the asset is 10\.0 dB below its field"):
+        export_asset(capture(), Masks({}, {}), StandInAvatar(bending_body()), tiny, tmp_path)
+    assert list(tmp_path.iterdir()) == []

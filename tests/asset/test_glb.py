@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import os
 import shutil
@@ -12,6 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from hnerf.asset.glb import write_glb
 from hnerf.asset.staging import StagedAvatar
+from hnerf.asset.tangents import uv_tangents
+from hnerf.asset.texture import UvLayout
+from hnerf.body.descriptor import normals_of
 from tests.asset.figure import FRAMES
 
 KHRONOS = """
@@ -106,6 +110,23 @@ def test_another_reader_finds_mesh_texture_and_joints(glb: Path, rig: str, stage
     inverse_bind = accessor(document, document.skins[0].inverseBindMatrices).reshape(-1, 4, 4).swapaxes(1, 2)
     for name, matrix in zip(staged.rigs[rig].skeleton.names, inverse_bind, strict=True):
         assert np.abs(matrix @ scene.graph.get(name)[0] - np.eye(4)).max() < 1e-6
+
+
+def test_a_normal_map_has_its_tangents(glb: Path, staged: StagedAvatar) -> None:
+    document = pygltflib.GLTF2.load(str(glb))
+    (primitive,) = document.meshes[0].primitives
+    normals = normals_of(staged.rest_points_m, staged.faces)
+    expected = uv_tangents(staged.rest_points_m, normals, staged.faces, UvLayout(staged.uvs, staged.face_uvs))
+    np.testing.assert_allclose(accessor(document, primitive.attributes.TANGENT), expected, atol=1e-6)
+    (mesh,) = trimesh.load_scene(glb).geometry.values()
+    np.testing.assert_array_equal(np.asarray(mesh.visual.material.normalTexture), staged.normal_map)
+
+
+def test_a_normal_map_can_be_left_out(staged: StagedAvatar, tmp_path: Path) -> None:
+    write_glb(tmp_path / "smooth.glb", dataclasses.replace(staged, normal_map=None), staged.rigs["full"])
+    document = pygltflib.GLTF2.load(str(tmp_path / "smooth.glb"))
+    assert document.meshes[0].primitives[0].attributes.TANGENT is None
+    assert document.materials[0].normalTexture is None and len(document.images) == 1
 
 
 def test_motion_is_in_seconds_from_the_first_frame(glb: Path) -> None:

@@ -3,9 +3,10 @@ import time
 from pathlib import Path
 from zipfile import ZipFile
 
+import cv2
 import numpy as np
 import pytest
-from pxr import Usd, UsdGeom, UsdSkel, Vt
+from pxr import Ar, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
 from hnerf.asset.package import AssetInfo, write_cache, write_package, write_usdz
 from hnerf.asset.staging import StagedAvatar
@@ -95,7 +96,7 @@ def test_the_same_avatar_is_the_same_bytes_at_any_time(package: Path, staged: St
     time.sleep(max(0.0, (package / "avatar_cache.usdz").stat().st_mtime + 2.0 - time.time()))
     write_all(tmp_path, staged)
     written = [path for path in sorted(tmp_path.rglob("*")) if path.is_file()]
-    assert len(written) == 3 + 1 + 3 + 2 + 3 + 2  # interfaces, texture, common parts, rigs, motions, .usdz
+    assert len(written) == 3 + 2 + 3 + 2 + 3 + 2  # interfaces, textures, common parts, rigs, motions, .usdz
     for path in written:
         assert path.read_bytes() == (package / path.relative_to(tmp_path)).read_bytes(), path.name
     with ZipFile(tmp_path / "avatar.usdz") as archive:
@@ -135,6 +136,28 @@ def test_the_hint_has_room_for_every_motion(staged: StagedAvatar, tmp_path: Path
     hint = np.array(UsdGeom.ModelAPI(stage.GetDefaultPrim()).GetExtentsHintAttr().Get())
     corners = np.concatenate([boxes.reshape(-1, 3) for boxes in far.extents_m.values()])
     assert (hint[1] >= corners.max(0) - 1e-4).all() and (hint[0] <= corners.min(0) + 1e-4).all()
+
+
+@pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_cache.usdz"])
+def test_the_surface_has_a_texture_and_a_normal_map(name: str, package: Path, staged: StagedAvatar) -> None:
+    stage = Usd.Stage.Open(str(package / name))
+    material = UsdShade.Material(stage.GetPrimAtPath("/Avatar/Materials/Captured"))
+    surface = material.ComputeSurfaceSource()[0]
+    for given, expected, space in (("diffuseColor", staged.texture, "sRGB"), ("normal", staged.normal_map, "raw")):
+        texture = UsdShade.Shader(surface.GetInput(given).GetConnectedSources()[0][0].source.GetPrim())
+        assert texture.GetInput("sourceColorSpace").Get() == space
+        file = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(texture.GetInput("file").Get().resolvedPath))
+        pixels = cv2.imdecode(np.frombuffer(file.GetBuffer(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        np.testing.assert_array_equal(pixels, expected)
+    # Of values from 0 to 1, so that they become components from -1 to 1.
+    assert texture.GetInput("scale").Get() == (2, 2, 2, 1) and texture.GetInput("bias").Get() == (-1, -1, -1, 0)
+
+
+def test_a_normal_map_can_be_left_out(staged: StagedAvatar, tmp_path: Path) -> None:
+    write_usdz(tmp_path / "smooth.usdz", dataclasses.replace(staged, normal_map=None), [], 10.0, INFO)
+    stage = Usd.Stage.Open(str(tmp_path / "smooth.usdz"))
+    surface = UsdShade.Shader(stage.GetPrimAtPath("/Avatar/Materials/Captured/Surface"))
+    assert [given.GetBaseName() for given in surface.GetInputs() if given.HasConnectedSource()] == ["diffuseColor"]
 
 
 def test_units_and_cameras_names(package: Path) -> None:

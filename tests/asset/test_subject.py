@@ -25,11 +25,12 @@ def test_motions_are_named_after_their_files(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(exported, "read_motion", lambda path: read)
     monkeypatch.setattr(exported.Capture, "load", lambda folder: folder)
     monkeypatch.setattr(exported, "load_cameras", lambda folder, capture: "capture")
+    monkeypatch.setattr(exported.Masks, "load", lambda folder: "masks")
     monkeypatch.setattr(exported, "load_avatar", lambda folder, device: "avatar")
     monkeypatch.setattr(exported, "export_asset", lambda *arguments: given.extend(arguments) or {"frames": 4})
     motions = [tmp_path / "01 slow-walk.bvh", tmp_path / "ben"]
     assert export_subject(made(tmp_path / "ada"), AssetSettings(), motions, tmp_path / "out", "01ab") == {"frames": 4}
-    assert given[0] == "capture" and given[4:] == ["01ab", {"01_slow_walk": read, "ben": read}]
+    assert given[0] == "capture" and given[1] == "masks" and given[5:] == ["01ab", {"01_slow_walk": read, "ben": read}]
     assert (tmp_path / "out").is_dir()
 
 

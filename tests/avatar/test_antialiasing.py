@@ -10,7 +10,7 @@ EVERYWHERE = np.ones((3, 5), bool)
 
 
 def edge_at(x_px: float, asked: list[np.ndarray] | None = None):
-    """Return the scene of a white wall, one metre away, right of x_px."""
+    """Return what rays at points, and beside them, see of a white wall, one metre away, right of x_px."""
 
     def seen(points_px: np.ndarray) -> Tensor:
         if asked is not None:
@@ -18,12 +18,15 @@ def edge_at(x_px: float, asked: list[np.ndarray] | None = None):
         covered = torch.from_numpy(points_px[:, 0] > x_px).float()[:, None]
         return covered.expand(-1, 5)
 
-    return seen
+    def beside(points_px: np.ndarray, offsets_px: np.ndarray) -> Tensor:
+        return seen((offsets_px[:, None] + points_px).reshape(-1, 2)).unflatten(0, (len(offsets_px), len(points_px)))
+
+    return seen, beside
 
 
 def test_a_pixel_that_an_edge_halves_is_half_covered():
     """An edge at 2.1 px leaves the right quarters of pixel 2, at 2.25 px, to the wall; its centre is not on it."""
-    image = antialiased(edge_at(2.1), EVERYWHERE)
+    image = antialiased(*edge_at(2.1), EVERYWHERE)
     assert image[1, :, 3].tolist() == [0, 0, 0.5, 1, 1]
     assert image[1, :, 0].tolist() == [0, 0, 0.5, 1, 1]
     assert image[1, :, 4].tolist() == [0, 0, 0, 1, 1]  # the depth of the centre
@@ -31,8 +34,8 @@ def test_a_pixel_that_an_edge_halves_is_half_covered():
 
 def test_rays_are_cast_once_where_neighbours_agree():
     asked: list[np.ndarray] = []
-    antialiased(edge_at(2.1, asked), EVERYWHERE)
-    assert [len(points) for points in asked] == [15, 6, 6, 6, 6]  # of columns 2 and 3
+    antialiased(*edge_at(2.1, asked), EVERYWHERE)
+    assert [len(points) for points in asked] == [15, 24]  # four quarters of columns 2 and 3
     assert asked[1].tolist()[0] == [1.75, -0.25]
 
 
@@ -40,13 +43,13 @@ def test_columns_are_x_and_only_visible_pixels_are_cast():
     visible = np.zeros((3, 5), bool)
     visible[2, 4] = True
     asked: list[np.ndarray] = []
-    image = antialiased(edge_at(-1, asked), visible)
+    image = antialiased(*edge_at(-1, asked), visible)
     assert asked[0].tolist() == [[4, 2]]
     assert image[2, 4, 4] == 1 and image[..., 4].sum() == 1
 
 
 def test_nothing_visible_is_an_empty_image():
-    assert antialiased(edge_at(0), np.zeros((3, 5), bool)).abs().sum() == 0
+    assert antialiased(*edge_at(0), np.zeros((3, 5), bool)).abs().sum() == 0
 
 
 def test_neighbours_differ_in_any_channel_by_more_than_a_tenth():

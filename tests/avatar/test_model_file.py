@@ -8,13 +8,17 @@ from torch import nn
 
 from hnerf.avatar.model_file import load_field, write_field
 from hnerf.errors import InputError
-from hnerf.fields.encoding import FeatureGrids
+from hnerf.fields.sparse_grids import SparseGrids
+
+
+def everywhere(nodes_m: torch.Tensor, beyond_m: float) -> torch.Tensor:
+    return torch.ones(len(nodes_m), dtype=torch.bool)
 
 
 def small_field(cells: int = 4) -> nn.Module:
     """Return a field with a grid of 2 x 3 x 5 nodes (x, y, z) with two features, or a finer one, and a number."""
     field = nn.Module()
-    field.grids = FeatureGrids(torch.zeros(3), torch.tensor([1.0, 2.0, 4.0]), (cells,), 2)
+    field.grids = SparseGrids(torch.zeros(3), torch.tensor([1.0, 2.0, 4.0]), (cells,), 2, everywhere)
     field.sharpness = nn.Parameter(torch.tensor(1 / 3))
     return field
 
@@ -29,29 +33,29 @@ def written_and_read(learned: nn.Module, path: Path) -> nn.Module:
 def test_a_grid_is_stored_in_steps_of_a_127th_of_its_greatest_feature(tmp_path: Path):
     """-12.7 makes the step 0.1, so 3.14 is 31 steps and 0.04 none; the number beside the grid stays as it is."""
     learned = small_field()
-    learned.grids.levels[0].data[0, 1, 3, 2, 1] = -12.7
-    learned.grids.levels[0].data[0, 0, 0, 0, 0] = 3.14
-    learned.grids.levels[0].data[0, 0, 4, 1, 0] = 0.04
+    features = torch.zeros(5, 3, 2, 2)
+    features[3, 2, 1, 1], features[0, 0, 0, 0], features[4, 1, 0, 0] = -12.7, 3.14, 0.04
+    learned.grids.set_levels([features])
     read = written_and_read(learned, tmp_path / "model.safetensors")
-    expected = torch.zeros(1, 2, 5, 3, 2)
-    expected[0, 1, 3, 2, 1], expected[0, 0, 0, 0, 0] = -12.7, 3.1
-    torch.testing.assert_close(read.grids.levels[0].data, expected)
+    features[0, 0, 0, 0], features[4, 1, 0, 0] = 3.1, 0.0
+    torch.testing.assert_close(read.grids.dense_levels(), [features])
     assert read.sharpness == learned.sharpness
 
 
 def test_a_grid_that_has_learned_nothing_comes_back_empty(tmp_path: Path):
     read = written_and_read(small_field(), tmp_path / "model.safetensors")
-    assert read.grids.levels[0].count_nonzero() == 0
+    assert read.grids.features.count_nonzero() == 0
 
 
 def test_nodes_that_nothing_was_learned_of_take_no_room(tmp_path: Path):
     """A tenth of 41 x 21 x 11 nodes of 2 features has random values: less than 3 bytes per node of those."""
     learned, path = small_field(cells=40), tmp_path / "model.safetensors"
-    nodes = learned.grids.levels[0].data
-    nodes[:, :, :4] = torch.rand(nodes[:, :, :4].shape, generator=torch.Generator().manual_seed(0))
+    (nodes,) = learned.grids.dense_levels()
+    nodes[:4] = torch.rand(nodes[:4].shape, generator=torch.Generator().manual_seed(0))
+    learned.grids.set_levels([nodes])
     write_field(learned, path)
-    assert path.stat().st_size < 3 * nodes[0, 0, :4].numel() + 500
-    assert nodes[0, 0].numel() > 5 * nodes[0, 0, :4].numel()
+    assert path.stat().st_size < 3 * nodes[:4, ..., 0].numel() + 500
+    assert nodes.numel() > 5 * nodes[:4].numel()
 
 
 @pytest.mark.parametrize("name", ["grids.levels.0.steps", "grids.levels.0.step", "sharpness"])

@@ -265,6 +265,20 @@ def test_the_rig_of_the_tests_is_closed():
     assert solid_angle(torch.tensor([[[0.5, 0.5, 0.5]]]).double(), a, b, c).sum().item() == pytest.approx(4 * torch.pi)
 
 
+def test_points_beside_are_described_as_if_they_had_been_asked_for() -> None:
+    """Above a face of a turned box, which is flat, the first order is exact."""
+    rig = box_rig()
+    root = torch.eye(4)[None]
+    root[0, :2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
+    bodies = PosedBodies(rig, torch.zeros(1, 2, 3), root, rig.vertices_m)
+    points_m, frame = torch.tensor([[-0.4, 0.6, 1.02], [-0.45, 0.5, 0.98]]), torch.zeros(2, dtype=torch.long)
+    beside_m = torch.tensor([[[0.01, 0.0, 0.005]] * 2, [[0.0, -0.01, 0.0]] * 2])
+    found = bodies.describe(points_m, frame, 0.1, beside_m=beside_m)
+    asked = bodies.describe((points_m + beside_m).flatten(0, 1), frame.repeat(2), 0.1)
+    for name in ("d", "y", "normal"):
+        torch.testing.assert_close(getattr(found, name), getattr(asked, name), atol=1e-5, rtol=0)
+
+
 def test_a_shape_moves_vertices_as_skinning_does() -> None:
     """In a bent pose of the whole body, where joints move with the shape, the linear displacement of each vertex equals
     that of skinning the other shape, to float accuracy, as skinning is linear in the shape."""

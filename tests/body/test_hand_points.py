@@ -1,9 +1,11 @@
+import math
+
 import numpy as np
 import torch
 
 from hnerf.body.anny import anny_rig
 from hnerf.body.articulation import Articulation, Pose
-from hnerf.body.hand_points import PalmTerm, hand_points, has_fingers, moved_onto_palm, relative_to_palm
+from hnerf.body.hand_points import PalmTerm, hand_points, has_fingers, moved_onto_palm, seen_twice
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.reprojection import Views, project
 from tests.body.recorded_body import ring_camera
@@ -41,29 +43,24 @@ def test_points_lie_at_the_joints_and_tips_beyond_them() -> None:
     assert has_fingers(pose.rig) and not has_fingers(two_bone_rig())
 
 
-def test_a_palm_beside_its_image_costs_nothing_and_a_knuckle_beside_the_palm_does() -> None:
-    """The left palm is 20 mm beside in one camera. The right hand's last knuckle is 14.4 mm beside the other points:
-    12 mm, one standard deviation, from the mean of six points, and these 2.4 mm: (0.5 / (1 + .04) + 5 x 0.02 /
-    (1 + .0016)) for each of two cameras and two frames. Fingers off by any distance cost nothing."""
+def test_the_points_of_a_palm_beside_its_image_count_as_one() -> None:
+    """12 points, each 29.4 mm = sqrt(6) x 12 mm beside in both cameras, one standard deviation: 12 x 2 x 0.5 / (1 +
+    (29.4 / 60)^2 = 1.24). Fingers off by any distance cost nothing."""
     pose = body()
     articulation = Articulation(pose.rig)
     joints = articulation.pose(pose)
     views = views_of(articulation.jacobian(hand_points(articulation), joints)[0])
-    views.pixels[0, :, :21, 0] += 20
-    views.pixels[..., 21 + 17, 0] += 14.4
+    views.pixels[..., 0] += 12 * math.sqrt(6)
     views.pixels[..., 6, 0] += 500
     equations = NormalEquations(2, articulation.unknowns, len(pose.rig.beta))
     cost = PalmTerm(views).add(equations, articulation, joints, torch.full((2, 2), 0.001))
-    np.testing.assert_allclose(cost, 4 * (0.5 / 1.04 + 0.1 / 1.0016))
+    np.testing.assert_allclose(cost, 2 * 12 / 1.24)
 
 
-def test_points_that_are_not_trusted_do_not_move_the_mean_of_a_palm() -> None:
-    """Of the left hand two points of 1 and 4 are trusted 1 and 0.5: their mean is 2. No point of the right hand is."""
-    values, trust = torch.zeros(1, 12, 1, dtype=torch.float64), torch.zeros(1, 12, dtype=torch.float64)
-    values[0, :3, 0], trust[0, :2] = torch.tensor([1.0, 4, 9]), torch.tensor([1, 0.5])
-    values[0, 6:] = 7
-    expected = [-1, 2, 7, -2, -2, -2, *6 * [7]]
-    np.testing.assert_allclose(relative_to_palm(values, trust)[0, :, 0], expected)
+def test_a_hand_that_one_camera_sees_is_not_fitted() -> None:
+    """Of three cameras two see the left hand and one the right; in the next frame three and two."""
+    confidence = torch.tensor([[[0.9, 0.9], [0.9, 0.6]], [[0.6, 0.4], [0.7, 0.8]], [[0.1, 0.0], [0.6, 0.5]]])
+    assert seen_twice(confidence).tolist() == [[True, False], [True, True]]
 
 
 def test_hand_points_move_onto_the_palm_of_the_body() -> None:

@@ -98,8 +98,7 @@ def test_a_frame_moves_all_that_the_field_knows(moved_m: list[float]):
     assert field.deformation is not None
     field.deformation.displacement.data[1] = torch.tensor(moved_m)
     nn.init.normal_(field.field.geometry[-1].weight)
-    for level in field.field.geometry_grids.levels:
-        nn.init.normal_(level)
+    nn.init.normal_(field.field.geometry_grids.features)
     theta, root = torch.zeros(1, 2, 3), torch.eye(4)[None]
     bodies = PosedBodies(rig, theta, root, rig.vertices_m)
     points_m = torch.tensor([[0.43, 0.51, 1.03], [0.55, 0.38, 1.01]])

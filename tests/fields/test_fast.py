@@ -166,6 +166,27 @@ def test_a_shell_deeper_than_high_finds_the_surface_at_its_bottom():
     assert seen[3] == pytest.approx(1, abs=0.01) and seen[4].item() - top_m == pytest.approx(0.07, abs=0.01)
 
 
+def test_rays_beside_others_see_what_they_would_see_alone():
+    """A hundredth of a radian beside two rays onto a flat face, whose own colours differ."""
+    bodies, conditions = standing()
+    field = field_of(2000.0)
+    torch.nn.init.normal_(field.field.colour_grids.features, std=30.0)
+    down = torch.tensor([[0.1, 0.0, -1.0], [0.0, 0.0, -1.0]])
+    rays = Rays(
+        torch.tensor([[0.4, 0.4, 2.5], [0.6, 0.5, 2.5]]),
+        torch.nn.functional.normalize(down, dim=1),
+        torch.zeros(2).long(),
+    )
+    beside = torch.tensor([[[0.01, 0.0, 0.0]], [[0.0, 0.01, 0.0]], [[-0.01, 0.0, 0.0]]])
+    directions = torch.nn.functional.normalize(rays.directions + beside, dim=-1)
+    with torch.no_grad():
+        scene = field.scene(bodies, conditions)
+        found, alone = field.render_beside(scene, rays, directions), Field.render_beside(field, scene, rays, directions)
+        between = field.render_rays(scene, rays)
+    torch.testing.assert_close(found, alone, atol=2e-3, rtol=0)
+    assert found[..., 3].min() > 0.99 and (found[..., :3] - between[:, :3]).abs().max() > 0.02
+
+
 def test_the_shell_moves_with_the_surface_of_a_frame():
     """For a frame displaced by 2 cm the shell is 2 cm higher; for one displaced by 6 cm its upper end stops at the
     setting of 7 cm, 5 cm above where it was."""

@@ -28,9 +28,9 @@ SETTINGS = FastFieldSettings(
     outer_m=0.06, inner_m=0.04, shell_cell_m=0.02, samples=12, geometry_cells=(2,), colour_cells=(2,), pose_width=1
 )
 RAY = Rays(torch.tensor([[-1.0, 0.4, 0.25]]), torch.tensor([[1.0, 0, 0]]), torch.tensor([1]))
-OUTERMOST, INNERMOST = 0.0, 0.99  # of the ray's samples
+OUTERMOST, INNERMOST = 0.3, 0.99  # of the ray's samples
 
-Distance = Callable[[Tensor, Tensor, Tensor], Tensor]
+Distance = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 
 
 def field_of(residual: Distance, nodes: int = 0) -> FastField:
@@ -41,7 +41,7 @@ def field_of(residual: Distance, nodes: int = 0) -> FastField:
     return field
 
 
-def nothing(y_m: Tensor, d_m: Tensor, pose: Tensor) -> Tensor:
+def nothing(y_m: Tensor, d_m: Tensor, pose: Tensor, row: Tensor) -> Tensor:
     return torch.zeros_like(d_m)
 
 
@@ -74,38 +74,38 @@ def test_the_networks_see_the_canonical_place_the_frames_pose_and_the_normal_in_
     field = field_of(residual)
     field.field.colour = colour
     samples = sampled(field)
-    place, depth, normal, pose = asked["colour"]
+    place, depth, normal, pose, row = asked["colour"]
     at = int((depth - 0.01).abs().argmin())
     same(place[at], [0.4, 1.01, 0.25])
     same(depth[at], 0.01)
     same(normal[at], [-1.0, 0, 0])
-    same(pose[at], [0.1, 0.2, 0.3])
-    place, depth, pose = asked["residual"]
-    assert torch.equal(depth.detach(), samples.d[0]) and (depth.diff() < 0).all()
+    same(pose[row[at]], [0.1, 0.2, 0.3])
+    place, depth, pose, row = asked["residual"]
+    assert torch.equal(depth.detach(), samples.d[0, -len(depth) :]) and (depth.diff() < 0).all()
     same(place[:, 1], (1 + depth).tolist())
-    same(pose, [[0.1, 0.2, 0.3]] * 12)
+    same(pose[row], [[0.1, 0.2, 0.3]] * len(depth))
     same(samples.colour[0, weights_from_alpha(samples.alpha)[0].argmax()], [0.4, 1.01, 0.25])
-    same(samples.residual, [[-0.01] * 12])
+    same(samples.residual, [[0.0] * (12 - len(depth)) + [-0.01] * len(depth)])  # the first lie beyond the shell
 
 
 @pytest.mark.parametrize("probe", [OUTERMOST, INNERMOST])
 def test_the_distance_is_as_steep_as_in_the_world(probe: float) -> None:
     """Along the normal it rises by 1 per metre for the body, and by 0.5 and 0.2 for the residual's second coordinate
     and distance; across it by 0.3; the same outside the skin and inside."""
-    samples = sampled(field_of(lambda y, d, pose: 0.3 * y[:, 0] + 0.5 * y[:, 1] + 0.2 * d), probe)
+    samples = sampled(field_of(lambda y, d, pose, row: 0.3 * y[:, 0] + 0.5 * y[:, 1] + 0.2 * d), probe)
     assert (samples.d[0, int(12 * probe)] > 0.01) == (probe == OUTERMOST)
     same(samples.gradient_norm, [(1.7**2 + 0.3**2) ** 0.5])
 
 
 def test_the_gradient_is_a_forward_difference_over_5_mm() -> None:
     """The gradient of 40 (y - 1)^2, where y - 1 is d, is 80 d + 40 x 0.005."""
-    samples = sampled(field_of(lambda y, d, pose: 40 * (y[:, 1] - 1) ** 2), OUTERMOST)
-    same(samples.gradient_norm, [1 + 80 * samples.d[0, 0].item() + 0.2])
+    samples = sampled(field_of(lambda y, d, pose, row: 40 * (y[:, 1] - 1) ** 2), OUTERMOST)
+    same(samples.gradient_norm, [1 + 80 * samples.d[0, int(12 * OUTERMOST)].item() + 0.2])
 
 
 def test_the_eikonal_loss_moves_no_body() -> None:
     """Its gradients flow to the field alone; rendering does not compute it."""
-    assert not sampled(field_of(lambda y, d, pose: y[:, 0] * d), OUTERMOST).gradient_norm.requires_grad
+    assert not sampled(field_of(lambda y, d, pose, row: y[:, 0] * d), OUTERMOST).gradient_norm.requires_grad
     assert sampled(field_of(nothing)).gradient_norm.shape == (0,)
 
 

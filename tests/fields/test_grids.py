@@ -10,8 +10,13 @@ SETTINGS = FastFieldSettings(
     outer_m=0.05, geometry_cells=(1, 2), colour_cells=(1,), channels=1, width=4, pose_width=2, samples=1
 )
 Y, D = torch.tensor([[0.2, 0.3, 0.4]]), torch.tensor([-0.01])
-NORMAL, POSE = torch.tensor([[1.0, 0.0, -0.5]]), torch.tensor([[0.1, 0.2, 0.3]])
-CODE = [0.3, -0.2]  # of this pose: its last number, and less its second one
+NORMAL = torch.tensor([[1.0, 0.0, -0.5]])
+POSE = torch.tensor([[7.0, 8.0, 9.0], [0.1, 0.2, 0.3]]), torch.tensor([1])  # of two rows, and which
+CODE = [0.3, -0.2]  # of this row's pose: its last number, and less its second one
+
+
+def everywhere(nodes_m: Tensor, beyond_m: float) -> Tensor:
+    return torch.ones(len(nodes_m), dtype=torch.bool)
 
 
 class First(nn.Module):
@@ -28,10 +33,10 @@ class First(nn.Module):
 
 def known_field() -> CanonicalField:
     """Return a field with features 0.5 and 0.25 of geometry and 2 of colour everywhere."""
-    field = CanonicalField(torch.zeros(3), torch.ones(3), SETTINGS, 3)
-    levels = [*field.geometry_grids.levels, *field.colour_grids.levels]
-    for level, feature in zip(levels, (0.5, 0.25, 2.0), strict=True):
-        level.data.fill_(feature)
+    field = CanonicalField(torch.zeros(3), torch.ones(3), SETTINGS, 3, everywhere)
+    for grids, features in ((field.geometry_grids, (0.5, 0.25)), (field.colour_grids, (2.0,))):
+        levels = zip(grids.dense_levels(), features, strict=True)
+        grids.set_levels([torch.full_like(level, feature) for level, feature in levels])
     field.pose_code.weight.data = torch.tensor([[0.0, 0, 1], [0, -1, 0]])
     field.geometry, field.radiance = First(1), First(3)
     return field
@@ -40,7 +45,7 @@ def known_field() -> CanonicalField:
 def test_geometry_sees_features_distance_and_pose() -> None:
     """Input distance and output are in units of the outer shell thickness: half of 5 cm."""
     field = known_field()
-    found = field.residual(Y, D, POSE)
+    found = field.residual(Y, D, *POSE)
     torch.testing.assert_close(field.geometry.asked, torch.tensor([[0.5, 0.25, -0.2, *CODE]]))
     torch.testing.assert_close(found.detach(), torch.tensor([0.025]))
 
@@ -48,7 +53,7 @@ def test_geometry_sees_features_distance_and_pose() -> None:
 def test_colour_sees_features_distance_pose_and_normal() -> None:
     """The normal is encoded with one octave: sines of pi, 0 and -pi / 2, and their cosines."""
     field = known_field()
-    found = field.colour(Y, D, NORMAL, POSE)
+    found = field.colour(Y, D, NORMAL, *POSE)
     encoded = [1.0, 0, -0.5, 0, 0, -1, -1, 1, 0]
     torch.testing.assert_close(field.radiance.asked, torch.tensor([[2.0, -0.2, *CODE, *encoded]]), atol=1e-6, rtol=0)
     torch.testing.assert_close(found.detach(), torch.sigmoid(torch.tensor([[2.0, -0.2, 0.3]])))
@@ -57,11 +62,11 @@ def test_colour_sees_features_distance_pose_and_normal() -> None:
 def test_no_network_answers_before_it_is_trained() -> None:
     """The surface starts as the body's own; training may change both outputs at any pose and position."""
     torch.manual_seed(0)
-    field = CanonicalField(torch.zeros(3), torch.ones(3), SETTINGS, 3)
-    assert field.residual(Y, D, POSE).item() == 0
+    field = CanonicalField(torch.zeros(3), torch.ones(3), SETTINGS, 3, everywhere)
+    assert field.residual(Y, D, *POSE).item() == 0
     nn.init.normal_(field.geometry[-1].weight)
-    for level in field.geometry_grids.levels:
-        nn.init.normal_(level)
-    here = field.residual(Y, D, POSE)
-    for changed in ((Y + 0.1, D, POSE), (Y, D + 0.01, POSE), (Y, D, POSE + 0.1)):
+    nn.init.normal_(field.geometry_grids.features)
+    here = field.residual(Y, D, *POSE)
+    poses, row = POSE
+    for changed in ((Y + 0.1, D, *POSE), (Y, D + 0.01, *POSE), (Y, D, poses + 0.1, row)):
         assert (field.residual(*changed) - here).abs() > 1e-6

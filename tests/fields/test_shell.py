@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from hnerf.fields.rays import Rays
-from hnerf.fields.shell import EMPTY, SHELL, SOLID, ShellGrid, box_interval, surface_points
+from hnerf.fields.shell import EMPTY, SHELL, SLACK, SOLID, ShellGrid, _classify_cells, box_interval, surface_points
 from tests.body.boxes import box_faces, box_vertices
 
 
@@ -52,6 +52,19 @@ def test_the_shell_is_as_thick_as_its_surface_asks():
     outer = torch.where(surface[..., 0] > 0, 0.1, 0.02)
     grid = around(surface, outer, torch.full_like(outer, 0.02), 0.01)
     assert along_x(grid, [0.38, -0.38, 0.31, -0.31]) == [SHELL, EMPTY, SHELL, SHELL]
+
+
+def test_the_shell_is_all_that_any_surface_point_reaches():
+    """Every cell is tried with every one of 60 points that are not equally thick."""
+    random = torch.Generator().manual_seed(0)
+    points = (torch.rand(60, 3, generator=random) * torch.tensor([6, 7, 8]) + 4).long()
+    outer, inner = 1 + torch.rand(2, 60, generator=random)
+    cells = torch.cartesian_prod(*map(torch.arange, (14, 15, 16)))
+    apart = torch.cdist(cells.float(), points.float())
+    reached = [(apart <= reach + SLACK).any(1).view(14, 15, 16) for reach in (outer, inner)]
+    found = torch.from_numpy(_classify_cells([14, 15, 16], points, outer, inner))
+    assert (found == SHELL)[found != SOLID].equal(reached[0][found != SOLID])
+    assert ((found == SHELL) >= (reached[0] & reached[1])).all() and (found == SHELL).sum() > 500
 
 
 def test_every_frame_has_its_own_surface_and_thickness():

@@ -55,7 +55,7 @@ def test_every_stage_is_shown_and_given_what_went_before(folder: Path, tmp_path:
     assert given(subject, "fit") == ["capture", "calibration", "segmentation"]
     assert given(subject, "training") == ["capture", "calibration", "segmentation", "fit"]
     assert given(subject, "evaluation") == ["capture", "calibration", "segmentation", "fit", "training"]
-    assert given(subject, "asset") == ["capture", "calibration", "training"]
+    assert given(subject, "asset") == ["capture", "calibration", "segmentation", "training"]
 
 
 def test_what_was_detected_takes_the_recordings_place(folder: Path, tmp_path: Path) -> None:
@@ -64,7 +64,7 @@ def test_what_was_detected_takes_the_recordings_place(folder: Path, tmp_path: Pa
     assert given(subject, "detection") == ["capture"]
     assert given(subject, "calibration") == ["detection"]
     assert given(subject, "training") == ["detection", "calibration", "segmentation", "fit"]
-    assert given(subject, "asset") == ["detection", "calibration", "training"]
+    assert given(subject, "asset") == ["detection", "calibration", "segmentation", "training"]
 
 
 def test_hands_lie_between_the_recording_and_all_else(folder: Path, tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """A simulated GPU: CPU tensors that claim to be on cuda:0, so that a machine without a GPU detects where tensors of two
-devices meet. Warp's closest points and `embedding_bag` run on the CPU."""
+devices meet. Warp's kernels and `embedding_bag` run on the CPU."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,9 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 from hnerf.avatar import trained as model
-from hnerf.body import canonical
+from hnerf.body import canonical, correction_pull
 from hnerf.body.descriptor import BodyMeshes, ClosestPoints
+from hnerf.fields import fast, sparse_grids
 from hnerf.training import trainer
 
 CUDA = torch.device("cuda", 0)
@@ -137,11 +138,25 @@ def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
         monkeypatch.setattr(torch.cuda, counted, lambda device: 0)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (1 << 30, 1 << 30))
     monkeypatch.setattr(torch.nn.functional, "embedding_bag", embedding_bag)
-    monkeypatch.setattr(canonical, "BodyMeshes", Meshes)
+    for module in (canonical, fast):
+        monkeypatch.setattr(module, "BodyMeshes", Meshes)
+    for module in (correction_pull, sparse_grids):
+        monkeypatch.setattr(module, "_launch", _on_one_device(module._launch))
     monkeypatch.setattr(model, "load_file", load_file)
     monkeypatch.setattr(trainer, "save_checkpoint", lambda folder, state: None)
     with Routed():
         yield CUDA
+
+
+def _on_one_device(launch: Callable[..., None]) -> Callable[..., None]:
+    """Return a function that runs warp's kernels on tensors of one device, on the CPU."""
+
+    def run(*args: Any) -> None:
+        tensors = [x for x in tree_leaves(args) if isinstance(x, Tensor)]
+        assert len({isinstance(x, OnCuda) for x in tensors}) == 1, "a kernel's tensors are on two devices"
+        launch(*tree_map(lambda x: _unwrapped(x.detach()) if isinstance(x, Tensor) else x, args))
+
+    return run
 
 
 def _require_one_device(name: str, args: Any, tensors: list[Tensor]) -> None:

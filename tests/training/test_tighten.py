@@ -19,7 +19,9 @@ ROOM_M = 0.012
 STEP_M = 0.004  # at which it is looked for
 
 
-def tightened(residual: Callable[[Tensor, Tensor, Tensor], Tensor], poses: list[float]) -> tuple[Tensor, Tensor]:
+def tightened(
+    residual: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor], poses: list[float]
+) -> tuple[Tensor, Tensor]:
     """Return the thickness outside and inside at the vertices within faces: at edges the closest point of a normal's
     ray differs."""
     field = FastField(RIG, SETTINGS, 1)
@@ -44,7 +46,7 @@ def test_each_side_is_as_thick_as_its_own_surface_asks_for(
     surfaces_m: list[float], outer_m: float, inner_m: float
 ) -> None:
     """The surface lies at a given height above the skin in each of some poses."""
-    outer, inner = tightened(lambda y, d, pose: -pose[:, 0], surfaces_m)
+    outer, inner = tightened(lambda y, d, pose, row: -pose[row, 0], surfaces_m)
     assert ((outer - outer_m).abs() <= STEP_M + 1e-6).all()
     assert ((inner - inner_m).abs() <= STEP_M + 1e-6).all()
 
@@ -53,7 +55,7 @@ def test_vertices_are_tightened_each_by_what_is_seen_there() -> None:
     """The surface lies 4 cm outside the skin above the middle, at the skin below it."""
     field = FastField(RIG, SETTINGS, 1)
     field.log_sharpness.data.fill_(1000.0).log_()
-    field.field.residual = lambda y, d, pose: torch.where(y[:, 2] > 0.5, -0.04, 0.0)
+    field.field.residual = lambda y, d, pose, row: torch.where(y[:, 2] > 0.5, -0.04, 0.0)
     field.tighten(RIG, torch.zeros(1, 3))
     x, y, z = RIG.vertices_m.T
     side = ((x - 0.5).abs() == 0.5) & (y > 0.1) & (y < 0.9)

@@ -1,0 +1,57 @@
+"""Figures of the asset for its report."""
+
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from hnerf.asset.correctives import Correctives
+from hnerf.asset.registration import crossing_faces
+from hnerf.asset.rigs import FULL
+from hnerf.asset.staging import CAPTURED, StagedAvatar
+from hnerf.asset.topologies import AssetMesh
+
+
+def surface_figures(dense: trimesh.Trimesh) -> dict[str, Any]:
+    """Return the size of the field's surface."""
+    return {"faces": len(dense.faces), "watertight": dense.is_watertight, "volume_l": 1e3 * dense.volume}
+
+
+def mesh_figures(topology: str, mesh: AssetMesh, staged: StagedAvatar) -> dict[str, Any]:
+    """Return the size of the asset's mesh, of a topology by name, and how many faces of its skin cross others."""
+    skin = mesh.trimesh.faces[: mesh.skin_faces]
+    return {
+        "topology": topology,
+        "vertices": len(mesh.rig.vertices_m),
+        "faces": len(mesh.rig.faces),
+        "watertight": mesh.trimesh.is_watertight,
+        "crossing_faces": int(crossing_faces(mesh.trimesh.vertices, skin).sum()),
+        "height_m": float(np.ptp(staged.rest_points_m[:, 1])),
+    }
+
+
+def rig_figures(staged: StagedAvatar, name: str) -> dict[str, float]:
+    """Return a rig's size, and how far it moves the captured surfaces from where the full rig has them: what 99 % of
+    the points stay below in all frames, and the furthest."""
+    rig, full = staged.rigs[name], staged.rigs[FULL]
+    pairs = zip(rig.surfaces_m(CAPTURED, staged.rest), full.surfaces_m(CAPTURED, staged.rest), strict=True)
+    worst_m = np.max([np.linalg.norm(moved - true, axis=1) for moved, true in pairs], 0)
+    return {
+        "joints": len(rig.skeleton.names),
+        "influences": rig.skin.influences,
+        "moved_p99_mm": float(1e3 * np.percentile(worst_m, 99)),
+        "moved_max_mm": float(1e3 * worst_m.max()),
+    }
+
+
+def motion_figures(staged: StagedAvatar) -> dict[str, dict[str, float]]:
+    """Return the rate and the number of poses of each motion."""
+    return {name: {"fps": motion.fps, "poses": len(motion.codes)} for name, motion in staged.rigs[FULL].motions.items()}
+
+
+def beyond_skinning_mm(displacements_m: np.ndarray, correctives: Correctives) -> dict[str, float]:
+    """Return the root mean square distance of the frames' surfaces from the skinned one, without and with its
+    correctives."""
+    rebuilt_m = np.einsum("nk,kvd->nvd", correctives.weights, correctives.offsets_m)
+    left_m = {"skinned": displacements_m, "with_correctives": displacements_m - rebuilt_m}
+    return {name: float(1e3 * np.sqrt((m**2).sum(-1).mean())) for name, m in left_m.items()}

@@ -1,0 +1,142 @@
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from hnerf.asset import comparison
+from hnerf.asset.comparison import compare_with_field, comparison_figures, require_close
+from hnerf.asset.staging import StagedAvatar
+from hnerf.avatar.avatar import Rendering
+from hnerf.capture.capture import Capture, write_image
+from hnerf.capture.masks import Masks, encode
+from hnerf.errors import InvalidAsset
+from hnerf.geometry.camera import Camera
+from tests.asset.figure import bending_body, capture, side_camera
+from tests.asset.stand_in import StandInAvatar
+
+PERSON = np.array([110, 110, 110])
+WHOLE = (slice(120, 270), slice(250, 400))  # rows and columns of the mask: 150 px wide and high
+
+
+class GreyField(StandInAvatar):
+    """A field that shows one grey wherever a pixel is."""
+
+    level = 90
+
+    def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
+        shape = camera.height_px, camera.width_px
+        return Rendering(torch.full((*shape, 3), self.level / 255), torch.ones(shape), torch.ones(shape))
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Capture:
+    """Return a capture whose photographs are grey all over."""
+    found = dataclasses.replace(capture(), root=tmp_path)
+    for frame in found.train_frames:
+        write_image(tmp_path / f"images/01/{frame:06d}.png", np.full((480, 640, 3), PERSON, np.uint8))
+    return found
+
+
+def square() -> np.ndarray:
+    mask = np.zeros((480, 640), bool)
+    mask[WHOLE] = True
+    return mask
+
+
+def masks_of(frames: tuple[int, ...]) -> Masks:
+    return Masks({("01", frame): encode(square()) for frame in frames}, {})
+
+
+def grey(staged: StagedAvatar, level: int) -> StagedAvatar:
+    return dataclasses.replace(staged, texture=np.full((64, 64, 3), level, np.uint8))
+
+
+def test_the_field_is_scored_under_the_mask_in_its_padded_box(recorded: Capture, staged: StagedAvatar) -> None:
+    (found,) = compare_with_field(recorded, masks_of((4,)), GreyField(bending_body()), grey(staged, 100))
+    assert (found.view.camera, found.view.frame, found.photograph.shape) == ("01", 4, (190, 190, 3))
+    # The field shows 90 all over: 20 too dark on the mask, 90 too bright on the 20 px around it.
+    inside = 150**2 / 190**2
+    error = inside * (20 / 255) ** 2 + (1 - inside) * (90 / 255) ** 2
+    assert found.scores["field"]["psnr"] == pytest.approx(-10 * np.log10(error), abs=1e-3)
+    assert found.scores["field"]["mask_iou"] == pytest.approx(inside)
+
+
+def test_the_asset_is_seen_by_the_camera_in_the_frame_as_that_camera_exposes_it(
+    recorded: Capture, staged: StagedAvatar
+) -> None:
+    avatar = GreyField(bending_body(), gains={"01": (0.5, 1.0, 3.0)})
+    (found,) = compare_with_field(recorded, masks_of((4,)), avatar, grey(staged, 100))
+    points_m = staged.points_m[list(staged.frames).index(4)] @ staged.stage_from_world
+    seen_px, _ = side_camera().project(points_m)
+    covered = np.argwhere(found.asset[..., 3] > 127)[:, ::-1]
+    # One-centimetre noise on single points is 1 px.
+    np.testing.assert_allclose(covered.min(0), seen_px.min(0) - (230, 100), atol=3)  # where the box begins
+    np.testing.assert_allclose(covered.max(0), seen_px.max(0) - (230, 100), atol=3)
+    column, row = covered.mean(0).astype(int)
+    assert found.asset[row, column].tolist() == [50, 100, 255, 255]
+
+
+def test_large_boxes_are_scaled_down(recorded: Capture, staged: StagedAvatar, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(comparison, "LONGEST_PX", 95)
+    (found,) = compare_with_field(recorded, masks_of((4,)), GreyField(bending_body()), grey(staged, 100))
+    assert found.photograph.shape == (95, 95, 3) and found.field.shape == found.asset.shape == (95, 95, 4)
+    assert found.scores["field"]["mask_iou"] == pytest.approx(75**2 / 95**2)
+    # The column, 36 cm by 1.7 m and 5 m away, covers 36 px by 136 px of the photograph.
+    assert (found.asset[..., 3] > 127).sum() == pytest.approx(18 * 68, rel=0.1)
+
+
+def test_test_cameras_with_masks_come_first(recorded: Capture, staged: StagedAvatar) -> None:
+    cameras = recorded.cameras | {"02": dataclasses.replace(side_camera(), name="02")}
+    tested = dataclasses.replace(recorded, cameras=cameras, test_cameras=("02",))
+    masks, avatar = masks_of(recorded.train_frames), GreyField(bending_body())
+    found = compare_with_field(tested, masks, avatar, staged)
+    assert [(c.view.camera, c.view.frame) for c in found] == [("01", frame) for frame in recorded.train_frames]
+    for frame in recorded.train_frames:
+        write_image(tested.root / f"images/02/{frame:06d}.png", np.full((480, 640, 3), 9, np.uint8))
+        write_image(tested.root / f"masks/02/{frame:06d}.png", np.where(square(), 255, 0).astype(np.uint8))
+    found = compare_with_field(tested, masks, avatar, staged)
+    assert [(c.view.camera, c.view.frame) for c in found] == [("02", frame) for frame in recorded.train_frames]
+    assert comparison_figures(found)["cameras"] == "test"
+
+
+def test_without_a_mask_there_is_a_reason_and_no_refusal(recorded: Capture, staged: StagedAvatar) -> None:
+    nobody = Masks({("01", 3): encode(np.zeros((480, 640), bool))}, {})
+    for masks in (nobody, Masks({}, {})):
+        figures = comparison_figures(compare_with_field(recorded, masks, GreyField(bending_body()), staged))
+        assert figures == {"images": 0, "reason": "no image has a mask of the person"}
+        require_close("ada", figures, allow_poor=False)
+
+
+def test_figures_are_means_and_what_the_asset_lacks(recorded: Capture, staged: StagedAvatar) -> None:
+    (one,) = compare_with_field(recorded, masks_of((4,)), GreyField(bending_body()), staged)
+    scored = [
+        dataclasses.replace(one, scores={"asset": {"psnr": a, "ssim": 0.9}, "field": {"psnr": f, "ssim": 0.95}})
+        for a, f in ((20.0, 25.0), (26.0, 29.0))
+    ]
+    found = comparison_figures(scored)
+    assert (found["images"], found["cameras"]) == (2, "training")
+    assert (found["asset"]["psnr"], found["field"]["psnr"], found["below_field"]["psnr"]) == (23.0, 27.0, 4.0)
+    assert found["below_field"]["ssim"] == pytest.approx(0.05)
+    assert found["per_image"][1] == {
+        "camera": "01", "frame": 4, "asset_psnr": 26.0, "asset_ssim": 0.9, "field_psnr": 29.0, "field_ssim": 0.95,
+    }  # fmt: skip
+
+
+def test_an_asset_far_below_its_field_is_refused_in_one_line(caplog: pytest.LogCaptureFixture) -> None:
+    def figures(below_db: float) -> dict[str, Any]:
+        scores = {"asset": {"psnr": 29.5 - below_db}, "field": {"psnr": 29.5}, "below_field": {"psnr": below_db}}
+        return {"images": 6, "cameras": "training", **scores}
+
+    require_close("ada", figures(4.0), allow_poor=False)
+    with pytest.raises(InvalidAsset) as refused:
+        require_close("ada", figures(4.1), allow_poor=False)
+    line = str(refused.value)
+    assert line.startswith("ada: the asset is 4.1 dB below its field (25.4 against 29.5 dB, mean of 6 images from tr")
+    assert "asset.allow_poor=true (`hnerf export --allow-poor`)" in line and "\n" not in line
+    assert not caplog.records
+    require_close("ada", figures(4.1), allow_poor=True)
+    assert "ada: the asset is 4.1 dB below its field" in caplog.text

@@ -1,0 +1,77 @@
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from hnerf.asset.extreme_poses import ARMS_UP, DEEP_SQUAT, TURNED_HEAD, extreme_poses, fist, moved_by, posed_m, turned
+from hnerf.asset.rig_transfer import clothed_rig
+from hnerf.asset.staging import StagedAvatar
+from hnerf.body.anny import anny_rig
+from hnerf.body.rig import Rig, joint_transforms
+from tests.asset.figure import column_rig, upright_column
+
+
+@pytest.fixture(scope="module")
+def body() -> Rig:
+    return anny_rig()
+
+
+def joints_m(rig: Rig, theta: torch.Tensor | None) -> dict[str, np.ndarray]:
+    assert theta is not None
+    at = joint_transforms(rig, theta, torch.eye(4))[:, :3, 3].numpy()
+    return dict(zip(rig.joint_names, at, strict=True))
+
+
+def test_turns_are_about_the_axes_of_the_stage_and_mirrored() -> None:
+    arms = dataclasses.replace(column_rig(), joint_names=("upper.R", "upper.L"))
+    theta = turned(arms, {"upper.L": (0, 0, 90)})  # about the axis to the front, which is -Y of the body
+    assert theta is not None
+    torch.testing.assert_close(theta, torch.tensor([[0, math.pi / 2, 0], [0, -math.pi / 2, 0]]))
+    assert turned(arms, {"lower.L": (0, 0, 90)}) is None
+
+
+def test_the_column_bows_to_the_front(staged: StagedAvatar) -> None:
+    rig = clothed_rig(column_rig(), upright_column(0.18, -0.05, 1.65))
+    upright = posed_m(staged, rig, torch.zeros(2, 3))
+    np.testing.assert_allclose(upright - upright[0], staged.rest_points_m - staged.rest_points_m[0], atol=1e-6)
+    bowed = posed_m(staged, rig, torch.tensor([[0.0, 0, 0], [math.pi / 2, 0, 0]]))
+    top = staged.rest_points_m[:, 1].argmax()  # 85 cm above the joint, which is at 0.85 m
+    np.testing.assert_allclose(bowed[top] - upright[top], [0, -0.85, 0.85], atol=1e-4)
+
+
+def test_a_body_without_these_joints_has_no_such_poses(staged: StagedAvatar) -> None:
+    assert extreme_poses(staged, clothed_rig(column_rig(), upright_column(0.18, -0.05, 1.65)), 0) == []
+
+
+def test_poses_are_what_their_names_say(body: Rig) -> None:
+    """In body axes: Z up, to the front -Y, to the left +X."""
+    up = joints_m(body, turned(body, ARMS_UP))
+    squat = joints_m(body, turned(body, DEEP_SQUAT))
+    for side, sign in (("L", 1), ("R", -1)):
+        assert up[f"wrist.{side}"][2] > up["head"][2] + 0.2 and sign * up[f"wrist.{side}"][0] > 0
+        hip, knee, ankle = (squat[f"{name}.{side}"] for name in ("upperleg01", "lowerleg01", "foot"))
+        assert knee[1] < hip[1] - 0.2 and abs(knee[2] - hip[2]) < 0.25
+        assert ankle[2] < knee[2] - 0.25 and sign * knee[0] > sign * hip[0] + 0.05
+    head = turned(body, TURNED_HEAD)
+    assert head is not None
+    turn = joint_transforms(body, head, torch.eye(4))[body.joint_names.index("head"), :3, :3].numpy()
+    forward = turn @ [0, -1, 0]
+    assert math.degrees(math.atan2(forward[0], -forward[1])) == pytest.approx(70, abs=0.1)  # to the left
+
+
+def test_a_fist_brings_finger_ends_to_the_palm(body: Rig) -> None:
+    open_hand, closed = joints_m(body, torch.zeros(len(body.joint_names), 3)), joints_m(body, fist(body))
+    for side in ("L", "R"):
+        for finger in range(2, 6):
+            before, after = (
+                np.linalg.norm(at[f"finger{finger}-3.{side}"] - at[f"wrist.{side}"]) for at in (open_hand, closed)
+            )
+            assert after < 0.75 * before
+    assert fist(column_rig()) is None
+
+
+def test_vertices_by_the_joint_that_they_follow_most(body: Rig) -> None:
+    hands = body.vertices_m[moved_by(body, ("wrist.L", "metacarpal", "finger")).nonzero()[0]]
+    assert hands[:, 0].abs().min() > 0.3 and len(hands) > 200

@@ -1,0 +1,25 @@
+import torch
+
+from hnerf.body.correction_pull import Displacement, displacement_reference
+
+
+def test_a_correction_carries_points_and_is_pulled_as_in_plain_torch() -> None:
+    """Two frames of a body of 5 vertices, 3 chains of joints and 4 joints, in double precision."""
+    random = torch.Generator().manual_seed(0)
+
+    def rand(*shape: int) -> torch.Tensor:
+        return torch.randn(shape, generator=random, dtype=torch.float64)
+
+    share = rand(5, 3) * torch.tensor([1.0, 0.0, 1.0])
+    joints = torch.randint(4, (5, 2), generator=random).int()
+    posed = torch.tensor([0, 4, 5, 9, 9, 2]).int()
+    bodies = (rand(6, 3), posed, share, rand(10, 3, 3), joints, rand(5, 2))
+    pull, found = rand(6, 3), []
+    learned = [rand(2, 3, 2, 3), rand(5, 3), rand(2, 4, 3)]
+    for displacement in (Displacement.apply, displacement_reference):
+        inputs = [values.clone().requires_grad_() for values in learned]
+        moved = displacement(*inputs, *bodies)
+        moved.backward(pull)
+        found.append([moved.detach(), *(values.grad for values in inputs)])
+    for mine, plain in zip(*found, strict=True):
+        torch.testing.assert_close(mine, plain, atol=1e-12, rtol=1e-12)

@@ -1,0 +1,61 @@
+"""The kept nodes' features, interpolated and differentiated by warp as by the plain grids."""
+
+import torch
+from torch import Tensor
+
+from hnerf.fields.encoding import FeatureGrids
+from hnerf.fields.sparse_grids import SparseGrids
+
+LOWER_M, UPPER_M, CELLS, CHANNELS = torch.zeros(3), torch.tensor([1.0, 2.0, 1.5]), (3, 8), 4
+ON_BORDERS = torch.tensor([[0.0, 0.0, 0.0], [1.0, 2.0, 1.5], [0.5, 7.0, 0.3], [-1.0, 0.2, 1.5]])
+POINTS = torch.cat([torch.rand(200, 3, generator=torch.Generator().manual_seed(1)) * UPPER_M, ON_BORDERS])
+
+
+def everywhere(nodes_m: Tensor, beyond_m: float) -> Tensor:
+    return torch.ones(len(nodes_m), dtype=torch.bool)
+
+
+def low(nodes_m: Tensor, beyond_m: float) -> Tensor:
+    """Return what lies below 0.6 m, and above it by no more than `beyond_m`."""
+    return nodes_m[:, 2] <= 0.6 + beyond_m
+
+
+def both(near=everywhere) -> tuple[SparseGrids, FeatureGrids]:
+    """Return the same random features as sparse and as plain grids; those that the first lacks are zero."""
+    torch.manual_seed(0)
+    sparse = SparseGrids(LOWER_M, UPPER_M, CELLS, CHANNELS, near)
+    torch.nn.init.normal_(sparse.features)
+    plain = FeatureGrids(LOWER_M, UPPER_M, CELLS, CHANNELS)
+    for level, features in zip(plain.levels, sparse.dense_levels(), strict=True):
+        level.data[0] = features.movedim(-1, 0)
+    return sparse, plain
+
+
+def test_interpolation_and_gradients_are_those_of_plain_grids() -> None:
+    """Also at the corners of the box and beyond its faces."""
+    gradient = torch.randn(len(POINTS), len(CELLS) * CHANNELS, generator=torch.Generator().manual_seed(2))
+    found = []
+    for grids in both():
+        points = POINTS.clone().requires_grad_()
+        features = grids(points)
+        features.backward(gradient)
+        levels = [level.grad[0].movedim(0, -1) for level in grids.levels] if isinstance(grids, FeatureGrids) else None
+        if levels is None:
+            grids.features.data = grids.features.grad
+            levels = grids.dense_levels()
+        found.append([features.detach(), points.grad[:-4], *levels])
+    for mine, plain in zip(*found, strict=True):
+        torch.testing.assert_close(mine, plain, atol=2e-5, rtol=1e-4)
+
+
+def test_where_there_are_samples_every_node_is_kept() -> None:
+    """Samples below 0.6 m find what plain grids hold; above it and beyond a cell, features are zero."""
+    sparse, plain = both(low)
+    assert len(sparse.features) < len(sparse.rows)
+    below = POINTS[POINTS[:, 2] < 0.6]
+    torch.testing.assert_close(sparse(below), plain(below), atol=1e-5, rtol=1e-4)
+    assert (sparse(torch.tensor([[0.5, 0.5, 1.45]]))[0, CHANNELS:] == 0).all()
+
+
+def test_no_points_have_no_features() -> None:
+    assert both()[0](POINTS[:0]).shape == (0, len(CELLS) * CHANNELS)
