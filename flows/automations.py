@@ -107,6 +107,8 @@ def main(argv: list[str] | None = None) -> None:
     options = parser.parse_args(argv)
     if options.silence < MIN_SILENCE_S:
         parser.exit(2, f"--silence {options.silence}: healthy runs would be ended; give {MIN_SILENCE_S} or more\n")
+    if not PREFECT_API_URL.value():  # Prefect would begin a server of its own, which ends with this command
+        parser.exit(2, "no server is set; give this command in the folder of prefect.toml, or set PREFECT_API_URL\n")
     try:
         print("\n".join(set_up(options.webhook, options.pool, options.silence)))
     except httpx.HTTPError as error:

@@ -77,3 +77,9 @@ def test_a_silence_shorter_than_healthy_runs_keep_is_refused(capsys: pytest.Capt
     with pytest.raises(SystemExit, match="2"):
         main(["--silence", "30"])
     assert "give 60 or more" in capsys.readouterr().err
+
+
+def test_nothing_is_told_to_a_server_that_would_end_with_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with temporary_settings(restore_defaults={PREFECT_API_URL}), pytest.raises(SystemExit, match="2"):
+        main([])
+    assert capsys.readouterr().err.startswith("no server is set; give this command in the folder of prefect.toml")
