@@ -1,8 +1,10 @@
 import io
 import json
+import shutil
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -171,6 +173,21 @@ def test_what_would_fill_the_disk_is_refused(packed: Path, tmp_path: Path, monke
     monkeypatch.setattr(module, "SPARE_BYTES", 1 << 60)
     with pytest.raises(InputError, match="make room"):
         import_subject(Store(tmp_path / "to"), packed)
+
+
+def test_a_file_under_many_paths_counts_as_often(packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else an archive of a gigabyte could ask for its digest a hundred thousand times."""
+    (_, text), *files = unpacked(packed)
+    manifest = json.loads(text)
+    letters = manifest["artifacts"][NAME]["files"]["deep/letters"]
+    free = module.SPARE_BYTES + 50 * letters["size_bytes"]
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
+    import_subject(Store(tmp_path / "once"), packed)
+    manifest["artifacts"][NAME]["files"] |= {f"again/{number}": letters for number in range(50)}
+    repack(packed, [(MANIFEST, json.dumps(manifest).encode()), *files])
+    with pytest.raises(InputError, match="make room"):
+        import_subject(Store(tmp_path / "to"), packed)
+    assert nothing_came_of(tmp_path / "to")
 
 
 def test_verify_names_what_is_damaged_missing_or_not_of_it(packed: Path, tmp_path: Path) -> None:
