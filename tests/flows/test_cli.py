@@ -10,7 +10,7 @@ from flows.cli import CAMERA_FORMATS, PICTURES, main
 from flows.train_subject import Trained, train_subject
 from hnerf import synthetic
 from hnerf.capture.formats.export import WRITERS
-from hnerf.config import SyntheticSettings
+from hnerf.config import AssetSettings, SyntheticSettings
 from hnerf.errors import InvalidAsset
 from hnerf.render.subject import OUTPUT_KINDS
 from tasks.launcher import RankFailedError
@@ -189,3 +189,20 @@ def test_the_first_line_comes_before_what_takes_seconds(
 def test_choices_are_those_of_the_library() -> None:
     assert tuple(WRITERS) == CAMERA_FORMATS
     assert OUTPUT_KINDS == PICTURES
+
+
+@pytest.mark.parametrize(("flags", "allowed"), [([], False), (["--allow-poor"], True)])
+def test_a_poor_asset_is_accepted_by_flag(
+    flags: list[str], allowed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[AssetSettings] = []
+
+    def export(_subject: Path, settings: AssetSettings, *_: object) -> dict[str, dict[str, object]]:
+        given.append(settings)
+        return {"motions": {}}
+
+    monkeypatch.setattr("hnerf.asset.subject.export_subject", export)
+    monkeypatch.setattr("tasks.store.require_intact", lambda folder: None)
+    monkeypatch.setattr("tasks.store.recording_digest", lambda folder: "01ab")
+    assert main(["export", str(tmp_path), *flags]) == 0
+    assert [settings.allow_poor for settings in given] == [allowed]
