@@ -2,6 +2,7 @@
 cameras."""
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from tests.training.scene import record
 CELLS = 48  # of the box in which a surface is looked for, on its longest side
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Learned:
     """A recording and the avatar trained on its frames 0 and 1."""
 
@@ -31,6 +32,7 @@ class Learned:
     body: BodyFit
     avatar: TrainedAvatar
 
+    @cache  # noqa: B019 the few there are live as long as their tests
     def psnr(self, frame: int) -> float:
         """Return the PSNR of a frame's photographs, rendered over their plate, all cameras together."""
         errors = []

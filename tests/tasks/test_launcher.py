@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -100,7 +101,8 @@ def test_the_first_failure_of_torchrun_by_exit_code(
 
 def start_caller(folder: Path) -> "subprocess.Popen[bytes]":
     code = f"from tasks.launcher import run_ranks; run_ranks({RANKS!r}, ['sleep', {str(folder)!r}], 2)"
-    return subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL)
+    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a shell's background job would ignore it
+    return subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL, preexec_fn=heard)
 
 
 @pytest.mark.parametrize("fatal", [signal.SIGKILL, signal.SIGINT])
