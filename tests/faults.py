@@ -238,7 +238,7 @@ FAULTS = (
     Fault("stage-axis", "hnerf/geometry/axes.py", "[0, 0, 1], [0, -1, 0]])", "[0, 0, 1], [0, 1, 0]])",
           "tests/asset/test_staging.py"),
     Fault("root-heading", MOTIONS, "2 * np.arctan2(y, w)", "np.arctan2(y, w)", BY_MOTIONS),
-    Fault("slerp-share", MOTIONS, "turn * np.repeat(share, joints)", "turn * np.tile(share, joints)", BY_PACKAGE),
+    Fault("slerp-share", MOTIONS, "np.repeat(share, joints)", "np.tile(share, joints)", BY_PACKAGE),
     Fault("resampled-start", MOTIONS, "np.ceil(first - 1e-6)", "np.floor(first)", BY_MOTIONS),
     Fault("bones-front", SKELETON, "UP if _points_to_front(name) else FRONT", "FRONT if _points_to_front(name) else UP",
           "tests/asset/test_skeleton.py"),
