@@ -14,13 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from hnerf.body.rig import (
-    Rig,
-    joint_transforms,
-    pose_vertices,
-    posed_joint_basis,
-    rotation_from_axis_angle,
-)
+from hnerf.body.rig import Rig, joint_transforms, pose_vertices, posed_joint_basis, rotation_from_axis_angle
 
 
 @dataclass(frozen=True)
