@@ -26,20 +26,10 @@ def prefect_server(
     """Run a server, and yield the URL of its API once it answers."""
     port = free_port()
     url = f"http://127.0.0.1:{port}/api"
-    command = [
-        sys.executable,
-        "-m",
-        "prefect",
-        "server",
-        "start",
-        "--host",
-        "127.0.0.1",
-        "--port",
-        str(port),
-        "--no-ui",
-    ]
+    where = ("--host", "127.0.0.1", "--port", str(port))
+    start = [sys.executable, "-m", "prefect", "server", "start", "--no-ui", *where]
     silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen([sys.executable, *start], env=environment, cwd=folder, **silent) as server:
+    with subprocess.Popen(start, env=environment, cwd=folder, **silent) as server:
         try:
             _wait_for(f"{url}/health", patience_s)
             yield url
