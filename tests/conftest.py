@@ -6,9 +6,13 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import pytest
 from jaxtyping import install_import_hook
+
+if TYPE_CHECKING:
+    from hnerf.capture.capture import Capture
 
 SHAPED = ["geometry.camera", "geometry.reach", "geometry.triangulation", "fields.compositing", "fields.encoding"]
 SHAPED += ["fields.samples", "training.losses"]
@@ -18,6 +22,16 @@ install_import_hook([f"hnerf.{name}" for name in SHAPED], "beartype.beartype")
 _home = tempfile.mkdtemp(prefix="hnerf-prefect-")
 atexit.register(shutil.rmtree, _home, ignore_errors=True)
 os.environ |= {"PREFECT_HOME": _home, "PREFECT_SERVER_ANALYTICS_ENABLED": "false", "DO_NOT_TRACK": "1"}
+
+
+@pytest.fixture(scope="session")
+def wave(tmp_path_factory: pytest.TempPathFactory) -> "Capture":
+    """The shared capture valid-wave as ingested, for tests that write nothing into it."""
+    from hnerf.capture.ingest import ingest
+    from hnerf.config import CaptureSettings
+    from tests.shared_data import shared_capture
+
+    return ingest(shared_capture("valid-wave"), CaptureSettings(), tmp_path_factory.mktemp("wave"))
 
 
 @pytest.fixture(scope="session")
