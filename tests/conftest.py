@@ -24,6 +24,11 @@ atexit.register(shutil.rmtree, _home, ignore_errors=True)
 os.environ |= {"PREFECT_HOME": _home, "PREFECT_SERVER_ANALYTICS_ENABLED": "false", "DO_NOT_TRACK": "1"}
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the tests of a Prefect server: then one of two workers has them all, and starts the only one."""
+    items.sort(key=lambda item: "prefect_api" not in getattr(item, "fixturenames", ()))
+
+
 @pytest.fixture(scope="session")
 def wave(tmp_path_factory: pytest.TempPathFactory) -> "Capture":
     """The shared capture valid-wave as ingested, for tests that write nothing into it."""
