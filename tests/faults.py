@@ -159,6 +159,9 @@ FAULTS = (
     # what the networks of `fast` are asked
     Fault("fast-colour-normal", CANONICAL, "positional_encoding(normal, 1)", "positional_encoding(0 * normal, 1)",
           BY_CANONICAL),
+    Fault("fast-body-normal", FAST, "outward + (found[1:] - found[0]).T / GRADIENT_STEP_M", "outward", BY_RAY),
+    Fault("fast-normal-untaught", FAST, "bodies.turn(gradient, row", "bodies.turn(gradient.detach(), row", BY_RAY),
+    Fault("fast-normal-unturned", BODIES, "(linear * directions[:, None]).sum(-1)", "directions", BY_RAY),
     Fault("fast-pose-code", CANONICAL, "self.pose_code(pose).index", "0 * self.pose_code(pose).index", BY_CANONICAL),
     Fault("fast-residual-unit", CANONICAL, "self.unit_m * self.geometry(", "self.geometry(", BY_CANONICAL),
     Fault("fast-frame", FAST, "self._residual(described, pose, row).view_as(d)",
