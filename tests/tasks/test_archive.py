@@ -14,6 +14,7 @@ from tasks import archive as module
 from tasks.archive import MANIFEST, export_subject, import_subject
 from tasks.inventory import Inventory, recording_of
 from tasks.store import Store
+from tasks.verify import faults
 from tests.tasks.stores import names, run_of
 
 
