@@ -76,7 +76,7 @@ def _define_texture(
 ) -> UsdShade.Shader:
     texture = UsdShade.Shader.Define(stage, path)
     texture.CreateIdAttr("UsdUVTexture")
-    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(file)
+    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(f"./{file}")  # without "./" USD searches for it elsewhere
     texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set(colour_space)
     for wrap in ("wrapS", "wrapT"):
         texture.CreateInput(wrap, Sdf.ValueTypeNames.Token).Set("clamp")

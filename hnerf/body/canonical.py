@@ -70,11 +70,7 @@ class PoseCorrection(nn.Module):
 
     def totals(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return (turn, move_m, shape) since the fit, including what was absorbed."""
-        return (
-            self.turn + self.absorbed_turn,
-            self.move_m + self.absorbed_move_m,
-            self.shape + self.absorbed_shape,
-        )
+        return (self.turn + self.absorbed_turn, self.move_m + self.absorbed_move_m, self.shape + self.absorbed_shape)
 
 
 class PosedBodies:

@@ -2,7 +2,7 @@
 explains large residuals."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -103,6 +103,16 @@ def trimmed_mean(values: np.ndarray, share: float) -> float:
     """Return the mean of the lowest `share` of the finite values; infinity if there are none."""
     ordered = np.sort(values[np.isfinite(values)])
     return float(ordered[: max(1, int(share * len(ordered)))].mean()) if len(ordered) else np.inf
+
+
+def held_out_parts(keypoints: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield two parts of keypoints (C, frames, 25, 3), one to fit to and one to judge by, and then the other way round.
+    They share neither frames nor joints: a detector's systematic error on one joint must not count as proof that a
+    camera is wrong. A single frame is split by joints."""
+    first, second = np.array_split(keypoints, 2, axis=1) if keypoints.shape[1] > 1 else (keypoints, keypoints)
+    first, second = first[:, :, ::2], second[:, :, 1::2]
+    yield first, second
+    yield second, first
 
 
 def cost_without_each_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> dict[str, float]:

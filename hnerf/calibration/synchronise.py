@@ -24,10 +24,7 @@ from hnerf.geometry.triangulation import triangulate
 MAX_STEPS = 10  # greatest shift tried either way, in steps between the capture's frames
 MIN_FRAMES = 8  # that a shifted camera must share with the others, at the best shift and its two neighbours
 JACKKNIFE_BLOCKS = 12  # of consecutive frames, each left out once
-SUSPECTED_SIGMAS, CERTAIN_SIGMAS = (
-    2.0,
-    5.0,
-)  # standard errors beyond which an offset counts
+SUSPECTED_SIGMAS, CERTAIN_SIGMAS = (2.0, 5.0)  # standard errors beyond which an offset counts
 MIN_OFFSET_FRAMES = 0.1  # smaller offsets are below the resolution of the parabola fit
 MAX_DISTANCE_FRAMES = 1.2  # between an instant and the recorded image that shows it
 MAX_ERROR_STEPS = 0.5  # standard error; beyond it an offset is not observable

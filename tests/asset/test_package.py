@@ -91,6 +91,15 @@ def test_an_interface_at_another_rate_has_whole_time_codes(rate: int, package: P
     np.testing.assert_allclose(skinned_points(stage, rate / 2), staged.points_m[2], atol=1e-5)
 
 
+def test_packaging_finds_every_file_and_is_silent(
+    staged: StagedAvatar, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write_all(tmp_path, staged)
+    assert capfd.readouterr() == ("", "")
+    with ZipFile(tmp_path / "avatar.usdz") as archive:
+        assert set(archive.namelist()) == {"avatar.usdc", "texture.png", "normal_map.png"}
+
+
 def test_the_same_avatar_is_the_same_bytes_at_any_time(package: Path, staged: StagedAvatar, tmp_path: Path) -> None:
     """ZIP counts in steps of two seconds."""
     time.sleep(max(0.0, (package / "avatar_cache.usdz").stat().st_mtime + 2.0 - time.time()))
