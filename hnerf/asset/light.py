@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 
 ORDER = np.repeat([0, 1, 2], [1, 3, 5])
 REFLECTED = np.array([1, 2 / 3, 1 / 4])[ORDER]  # A
-LEAST_IRRADIANCE = 0.05  # of the greatest: darker, a photograph says little of the albedo
+LEAST_IRRADIANCE = 0.1  # of the greatest: darker, neither photographs nor the estimate say much
 OUTLIER = 0.5  # of the expected colour: what differs more is another surface
 RIDGE = 1e-5  # of the evidence: where the normals of points turn by less than a quarter of a degree, it decides
 ITERATIONS, SETTLED = 30, 1e-4

@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 
 from hnerf.asset.light import Shading
-from hnerf.asset.photographs import COSINE_POWER, sampled
+from hnerf.asset.photographs import COSINE_POWER, EDGE_SLOPE, FAR_M, sampled
 from hnerf.asset.srgb import to_linear
 from hnerf.avatar.avatar import Gains
 from hnerf.body.descriptor import normals_of
@@ -15,6 +15,7 @@ from hnerf.geometry.camera import Camera
 from hnerf.geometry.rays import cast, mesh_on_cpu
 
 HIDDEN_M = 0.01  # in front of a vertex, another surface hides it
+ASIDE_PX = 2  # a vertex beside which the surface ends or jumps is on an outline, whose pixels mix two surfaces
 
 
 def photographed_shading(
@@ -26,8 +27,7 @@ def photographed_shading(
     for frame, name in product(surfaces_m, capture.train_cameras):
         camera, gain = capture.cameras[name], gains.get(name, (1.0, 1.0, 1.0))
         normals = normals_of(surfaces_m[frame], faces)
-        vertex, cosine = visible_vertices(camera, surfaces_m[frame], faces, normals)
-        pixels_px, _ = camera.project(surfaces_m[frame][vertex])
+        vertex, cosine, pixels_px = visible_vertices(camera, surfaces_m[frame], faces, normals)
         colours = to_linear(sampled(capture.image(name, frame), pixels_px) / gain)
         seen.append((vertex, normals[vertex], colours, cosine**COSINE_POWER))
     return Shading(*(np.concatenate(parts) for parts in zip(*seen, strict=True)))
@@ -35,15 +35,23 @@ def photographed_shading(
 
 def visible_vertices(
     camera: Camera, vertices_m: np.ndarray, faces: np.ndarray, normals: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return which vertices (M,) a camera sees, and the cosines of its view to their normals (M,)."""
-    from_camera = vertices_m - camera.centre_m
-    distance_m = np.linalg.norm(from_camera, axis=1)
-    cosine = -(from_camera * normals).sum(1) / distance_m
-    column, row = camera.project(vertices_m)[0].T
-    inside = (column >= 0) & (row >= 0) & (column <= camera.width_px - 1) & (row <= camera.height_px - 1)
-    facing = np.flatnonzero(inside & (cosine > 0))
-    directions = from_camera[facing] / distance_m[facing, None]
-    hits = cast(mesh_on_cpu(vertices_m, faces), camera.centre_m, directions)
-    clear = (hits.face < 0) | (hits.distance_m > distance_m[facing] - HIDDEN_M)
-    return facing[clear], cosine[facing[clear]]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which vertices (M,) a camera sees away from outlines, the cosines of its view to their normals (M,), and
+    their pixels (M, 2)."""
+    view_m = camera.centre_m - vertices_m
+    distance_m = np.linalg.norm(view_m, axis=1)
+    cosine = (view_m * normals).sum(1) / distance_m
+    pixels_px, _ = camera.project(vertices_m)
+    inside = ((pixels_px >= 0) & (pixels_px <= [camera.width_px - 1, camera.height_px - 1])).all(1)
+    vertex = np.flatnonzero(inside & (cosine > 0))
+    mesh = mesh_on_cpu(vertices_m, faces)
+
+    def depth_m(aside_px: tuple[int, int]) -> np.ndarray:
+        hits = cast(mesh, *camera.rays(pixels_px[vertex] + np.array(aside_px)))
+        return np.where(hits.face >= 0, hits.distance_m, FAR_M)
+
+    vertex = vertex[depth_m((0, 0)) > distance_m[vertex] - HIDDEN_M]
+    around_m = np.stack([depth_m(aside) for aside in ((ASIDE_PX, 0), (-ASIDE_PX, 0), (0, ASIDE_PX), (0, -ASIDE_PX))])
+    width_m = 2 * ASIDE_PX * distance_m[vertex] / camera.K[0, 0]
+    vertex = vertex[np.ptp(around_m, 0) < EDGE_SLOPE * width_m]
+    return vertex, cosine[vertex], pixels_px[vertex]
