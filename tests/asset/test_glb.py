@@ -143,8 +143,10 @@ def test_the_albedo_is_another_variant_of_the_material(glb: Path, staged: Staged
         view = document.bufferViews[image.bufferView]
         png = np.frombuffer(document.binary_blob()[view.byteOffset :][: view.byteLength], np.uint8)
         (variant,) = mapping["variants"]
-        shown[names[variant]] = cv2.imdecode(png, cv2.IMREAD_COLOR)[..., ::-1]
-    assert primitive.material == names.index("captured")
+        picture = cv2.imdecode(png, cv2.IMREAD_COLOR)
+        assert picture is not None
+        shown[names[variant]] = picture[..., ::-1]
+    assert primitive.material == names.index("captured") and staged.albedo is not None
     np.testing.assert_array_equal(shown["captured"], staged.texture)
     np.testing.assert_array_equal(shown["albedo"], staged.albedo.texture)
 

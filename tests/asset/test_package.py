@@ -153,7 +153,9 @@ def texture_of(surface: UsdShade.Shader, given: str) -> UsdShade.Shader:
 def pixels(path: Sdf.AssetPath) -> np.ndarray:
     """Return the picture (H, W, 3) in a file of the package."""
     file = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(path.resolvedPath))
-    return cv2.imdecode(np.frombuffer(file.GetBuffer(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    picture = cv2.imdecode(np.frombuffer(file.GetBuffer(), np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    return picture[..., ::-1]
 
 
 @pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_24.usda"])
@@ -166,6 +168,7 @@ def test_the_albedo_look_has_the_light_that_was_taken_out(name: str, package: Pa
     surface, light = bound_surface(stage), UsdLux.DomeLight(stage.GetPrimAtPath("/Avatar/Light"))
     assert surface.GetPath() == "/Avatar/Materials/Albedo/Surface"
     assert not stage.GetPrimAtPath("/Avatar/Materials/Captured")
+    assert staged.albedo is not None
     shown = pixels(texture_of(surface, "diffuseColor").GetInput("file").Get())
     picture, intensity = dome(staged.albedo.light)
     np.testing.assert_array_equal(shown, staged.albedo.texture)

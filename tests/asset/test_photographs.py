@@ -118,7 +118,7 @@ def test_gains_are_divided_out_and_unseen_texels_keep_the_fields_colour() -> Non
 
 def test_a_photograph_that_contradicts_the_field_counts_little() -> None:
     """White against black is sqrt(3) / OUTLIER of an outlier."""
-    args = ({}, {0: square(0.4, 0.0)}, FACES, texels_at([0], [MIDDLE]), np.zeros((1, 3)))
+    white, texels = capture({"front": 255}, [camera()]), texels_at([0], [MIDDLE])
+    found = colours_from_photographs(white, {}, {0: square(0.4, 0.0)}, FACES, texels, np.zeros((1, 3)))
     vote = 1 / (1 + 3 / OUTLIER**2) ** 2
-    found = colours_from_photographs(capture({"front": 255}, [camera()]), *args)
     assert found[0, 0] == pytest.approx(vote / (vote + FIELD_WEIGHT), abs=1e-6)
