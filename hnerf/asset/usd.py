@@ -73,6 +73,7 @@ def _define_material(stage: Usd.Stage, name: str, file: str, mesh: Sdf.Path, ava
     surface.CreateIdAttr("UsdPreviewSurface")
     surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
     surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
+    surface.CreateInput("ior", Sdf.ValueTypeNames.Float).Set(1.0)  # no sheen: what there was is in the colours
     colour = texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
     surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
     if avatar.normal_map is not None:

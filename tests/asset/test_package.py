@@ -173,6 +173,7 @@ def test_the_albedo_look_has_the_light_that_was_taken_out(name: str, package: Pa
     picture, intensity = dome(staged.albedo.light)
     np.testing.assert_array_equal(shown, staged.albedo.texture)
     np.testing.assert_array_equal(pixels(light.GetTextureFileAttr().Get()), picture)
+    assert surface.GetInput("ior").Get() == 1
     assert light.GetIntensityAttr().Get() == pytest.approx(intensity)
     assert picture[0].min() > 100 + picture[-1].max()  # from above in the world, Z up, is above in the stage, Y up
 
