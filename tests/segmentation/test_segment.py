@@ -84,7 +84,7 @@ def test_masked_median_by_hand() -> None:
     for is_hidden in hidden:
         near = np.array([[is_hidden, True]])
         priors.append(Prior(near, near, near, near, 1.0))
-    plate, known = masked_median(images, priors)
+    plate, known = masked_median(images, [prior.near for prior in priors])
     assert plate[0].tolist() == [[30, 30, 30], [30, 30, 30]]
     assert known.tolist() == [[True, False]]
 
