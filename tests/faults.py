@@ -275,7 +275,7 @@ FAULTS = (
     Fault("photographs-cosine", PHOTOGRAPHS, "cosine**COSINE_POWER", "cosine", BY_PHOTOGRAPHS),
     Fault("photographs-hidden", PHOTOGRAPHS, "(distance_m < seen_m[row", "(distance_m > -seen_m[row", BY_PHOTOGRAPHS),
     Fault("light-reflected", LIGHT, "[1, 2 / 3, 1 / 4]", "[1, 2 / 3, 1 / 2]", BY_LIGHT),
-    Fault("light-eliminated", LIGHT, "both -= sums(weight[:, None] * both)", "both -= 0 * sums(both)", BY_LIGHT),
+    Fault("light-ridge", LIGHT, "RIDGE = 1e-5", "RIDGE = 1e-1", BY_LIGHT),
     Fault("light-outliers", LIGHT, "(error / OUTLIER)", "(0 * error)", BY_LIGHT),
     Fault("light-axes", LIGHT, "directions @ rotation.T", "directions @ rotation", BY_LIGHT),
     Fault("light-scale", LIGHT, "coefficients / (basis @ coefficients).max()", "coefficients", BY_LIGHT),

@@ -33,12 +33,13 @@ def test_light_of_any_side_goes_out() -> None:
 
 
 def test_views_weigh_as_their_light() -> None:
-    """Albedos 0.5 in full light and 0.52 in 0.2 of it, beside the field's 0.5, about (0.5 + 0.2 x 0.52 + FIELD_WEIGHT x
-    0.5) / (1.2 + FIELD_WEIGHT): the second contradicts the field by 0.0036 of 0.15, times sqrt(3), which is little."""
-    blend = AlbedoBlend(np.full((1, 3), to_srgb(np.array(0.5))), np.ones(1), ABOVE)
+    """Albedos 0.5 in full light and 0.52 in 0.2 of it, beside the field's 0.5, which it saw in half-light, about (0.5 +
+    0.2 x 0.52 + FIELD_WEIGHT x 0.25) / (1.2 + FIELD_WEIGHT / 2): the second contradicts the field by 0.007 sqrt(3),
+    less than a tenth of 0.15, and counts as a whole to a hundredth."""
+    blend = AlbedoBlend(np.full((1, 3), to_srgb(np.array(0.25))), np.array([0.5]), ABOVE)
     blend.add(seen(UP, np.full((1, 3), to_srgb(np.array(0.5)))))
     blend.add(seen(DOWN, np.full((1, 3), to_srgb(np.array(0.104)))))
-    expected = (0.5 + 0.104 + FIELD_WEIGHT * 0.5) / (1.2 + FIELD_WEIGHT)
+    expected = (0.5 + 0.104 + FIELD_WEIGHT * 0.25) / (1.2 + FIELD_WEIGHT / 2)
     np.testing.assert_allclose(to_linear(blend.colours()), expected, atol=1e-4)
 
 
