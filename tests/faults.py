@@ -47,6 +47,8 @@ SKELETON, MOTIONS, SKINNING = "hnerf/asset/skeleton.py", "hnerf/asset/motions.py
 RIGS, BVH, BVH_MOTION = "hnerf/asset/rigs.py", "hnerf/body/bvh.py", "hnerf/render/bvh_motion.py"
 ANTIALIASING, CORRECTIVES = "hnerf/avatar/antialiasing.py", "hnerf/asset/correctives.py"
 PHOTOGRAPHS, SURFACE = "hnerf/asset/photographs.py", "hnerf/avatar/surface.py"
+LIGHT, SHADING = "hnerf/asset/light.py", "hnerf/asset/shading.py"
+ALBEDO, DOME = "hnerf/asset/albedo.py", "hnerf/asset/dome.py"
 METRICS, REPORT = "hnerf/evaluation/metrics.py", "hnerf/evaluation/report.py"
 EXPOSURE, ARTICULATION = "hnerf/training/exposure.py", "hnerf/body/articulation.py"
 POLICY, STORE = "tasks/policy.py", "tasks/store.py"
@@ -73,6 +75,8 @@ BY_ANTIALIASING, BY_CORRECTIVES = "tests/avatar/test_antialiasing.py", "tests/as
 BY_PLATE, BY_REGISTRATION = "tests/asset/test_plate.py", "tests/asset/test_registration.py"
 BY_FIELD_COLOURS = "tests/asset/test_field_colours.py"
 BY_PHOTOGRAPHS = "tests/asset/test_photographs.py"
+BY_LIGHT, BY_SHADING = "tests/asset/test_light.py", "tests/asset/test_shading.py"
+BY_ALBEDO, BY_DOME = "tests/asset/test_albedo.py", "tests/asset/test_dome.py"
 BY_VIEWER, BY_PICTURES = "tests/asset/test_viewer.py", "tests/asset/test_pictures.py"
 BY_GARBAGE, BY_ARCHIVE = "tests/tasks/test_garbage.py", "tests/tasks/test_archive.py"
 BY_LIMITS = "tests/tasks/test_limits.py"
@@ -266,6 +270,20 @@ FAULTS = (
           "image[y, x] = render_beside(mixed, QUARTERS_PX).mean(0)", BY_ANTIALIASING),
     Fault("photographs-cosine", PHOTOGRAPHS, "cosine**COSINE_POWER", "cosine", BY_PHOTOGRAPHS),
     Fault("photographs-hidden", PHOTOGRAPHS, "(distance_m < seen_m[row", "(distance_m > -seen_m[row", BY_PHOTOGRAPHS),
+    Fault("light-reflected", LIGHT, "[1, 2 / 3, 1 / 4]", "[1, 2 / 3, 1 / 2]", BY_LIGHT),
+    Fault("light-eliminated", LIGHT, "both -= sums(weight[:, None] * both)", "both -= 0 * sums(both)", BY_LIGHT),
+    Fault("light-outliers", LIGHT, "(error / OUTLIER)", "(0 * error)", BY_LIGHT),
+    Fault("light-axes", LIGHT, "directions @ rotation.T", "directions @ rotation", BY_LIGHT),
+    Fault("light-scale", LIGHT, "coefficients / (basis @ coefficients).max()", "coefficients", BY_LIGHT),
+    Fault("shading-linear", SHADING, "to_linear(sampled(", "abs(sampled(", BY_SHADING),
+    Fault("shading-hidden", SHADING, "- HIDDEN_M", "- 10", BY_SHADING),
+    Fault("shading-outline", SHADING, "np.ptp(around_m, 0) < EDGE_SLOPE", "0 < EDGE_SLOPE", BY_SHADING),
+    Fault("albedo-irradiance", ALBEDO, "+= counts * irradiance", "+= counts", BY_ALBEDO),
+    Fault("albedo-vote", ALBEDO, "self._field[seen.index] * irradiance", "self._field[seen.index]", BY_ALBEDO),
+    Fault("albedo-field", ALBEDO, "self._field = seen / field_irradiance[:, None]", "self._field = seen", BY_ALBEDO),
+    Fault("dome-mirrored", DOME, "np.pi * (1 - (np.arange(2 ", "np.pi * (-1 + (np.arange(2 ", BY_DOME),
+    Fault("look-light-in-world", "hnerf/asset/staging.py", "albedo.light.turned(world)", "albedo.light", BY_PACKAGE),
+    Fault("glb-looks", GLB, '{"material": k, "variants": [k]}', '{"material": 0, "variants": [k]}', BY_GLB),
     Fault("photographs-outline", PHOTOGRAPHS, "inside & ~outline[row, column]", "inside", BY_PHOTOGRAPHS),
     Fault("photographs-gain", PHOTOGRAPHS, "pixels_px) / gain", "pixels_px) * gain", BY_PHOTOGRAPHS),
     Fault("correctives-turn", CORRECTIVES, "solve(turn, surface_m", "solve(turn.mT, surface_m", BY_CORRECTIVES),
