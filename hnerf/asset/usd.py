@@ -56,7 +56,7 @@ def author_albedo_look(stage: Usd.Stage, mesh: Sdf.Path, avatar: StagedAvatar, i
     _define_material(stage, "Albedo", ALBEDO_NAME, mesh, avatar)
     light = UsdLux.DomeLight.Define(stage, ROOT.AppendChild("Light"))
     light.CreateIntensityAttr(intensity)
-    light.CreateTextureFileAttr(LIGHT_NAME)
+    light.CreateTextureFileAttr(f"./{LIGHT_NAME}")
     light.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
 
 

@@ -31,13 +31,13 @@ STD_DEG = {
 }
 OTHER_STD_DEG = (30, 30, 30)
 HINGES = ("lowerleg01", "lowerarm01")  # joints that bend from straight to folded
-FOLDED_DEG = 150.0
+FOLDED_DEG = 150.0  # of a hinge, from straight
 FLEXION_DEG = {"upperarm01": (-170, 45), "upperleg01": (-130, 40)}  # limits forwards and backwards, from rest
 MEAN_FLEXION_DEG = {"upperarm01": -10.0}  # arms are carried in front of the body
-LIMIT_STD_DEG = 2.0
+LIMIT_STD_DEG = 2.0  # of a flexion beyond its limits
 
 DIFFERENCE = (1.0, -2.0, 1.0)
-OUTLIER_SIGMAS = 3.0
+OUTLIER_SIGMAS = 3.0  # of an acceleration: a sudden movement or a cut
 
 
 class PosePrior:

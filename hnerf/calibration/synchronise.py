@@ -31,7 +31,7 @@ MAX_ERROR_STEPS = 0.5  # standard error; beyond it an offset is not observable
 MIN_CURVATURE_SIGMAS = 2.0  # standard errors by which the curvature must exceed 0
 IRLS_ROUNDS = 5  # of iteratively re-weighted least squares
 OUTLIER_SCALES = 3.0  # times the scale of the residuals
-MIN_SCALE_PX = 0.5
+MIN_SCALE_PX = 0.5  # of the residuals; no detector is more exact
 
 log = logging.getLogger("hnerf.calibration")
 
@@ -56,13 +56,14 @@ class Timing:
 
     @property
     def suspected(self) -> bool:
-        """Whether the camera may be out of step."""
+        """Return whether the camera may be out of step."""
         return abs(self.offset_frames) > max(MIN_OFFSET_FRAMES, SUSPECTED_SIGMAS * self.error_frames)
 
     @property
     def certain(self) -> bool:
-        """Whether the camera is out of step: the offset is far beyond its error, and each half of the frames gains by
-        the other half's offset (a parabola is lower at x than at 0 if x lies between 0 and twice its vertex)."""
+        """Return whether the camera is out of step: the offset is far beyond its error, and each half of the frames
+        gains by the other half's offset (a parabola is lower at x than at 0 if x lies between 0 and twice its vertex).
+        """
         a, b = self.half_offsets
         agree = a * b > 0 and abs(a) < 2 * abs(b) < 4 * abs(a)
         far = abs(self.offset_frames) > max(MIN_OFFSET_FRAMES, CERTAIN_SIGMAS * self.error_frames)
@@ -110,7 +111,7 @@ class _Parabola:
 
     @property
     def noise_px(self) -> float:
-        """Root mean square distance at the middle shift."""
+        """Return the root mean square distance at the middle shift."""
         return float(np.sqrt(self.squares[1].sum() / self.weights.sum().clip(1e-9)))
 
 

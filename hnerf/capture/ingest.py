@@ -39,10 +39,10 @@ from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.progress import tracked
 
-DEFAULT_FPS = 30.0
+DEFAULT_FPS = 30.0  # of images, whose files state none
 # Encoders pad and crop by a few pixels; the calibration stage judges what that does to the cameras.
 SIZE_TOLERANCE = 0.02
-RATE_TOLERANCE = 0.01
+RATE_TOLERANCE = 0.01  # between frame rates, as a share
 MAX_OUTSIDE_SHARE = 0.5  # of keypoints outside their images: detectors guess some that are cut off
 LAYOUTS: tuple[type[Layout], ...] = (
     ZjuMocap,

@@ -23,7 +23,7 @@ from hnerf.geometry.camera import Camera
 from hnerf.geometry.reach import within_reach
 
 INITIAL_SHARPNESS_PER_M = 100.0  # of the logistic that turns distance into opacity
-GRADIENT_STEP_M = 0.005
+GRADIENT_STEP_M = 0.005  # of forward differences of the signed distance
 SATURATED_LOGIT = 5.0  # argument beyond which the opacity's logistic is within 1 % of 0 or 1
 GRID_MARGIN_M = 0.01  # between the shell and the end of the grids
 SHELL_MARGIN_M = 0.012  # for later movement of the surface, and for poses that were not evaluated
@@ -80,7 +80,7 @@ class FastField(Field):
 
     @property
     def reach_m(self) -> float:
-        """How far from the body a sample can lie: the shell and the slack of its cells."""
+        """Return how far from the body a sample can lie: the shell and the slack of its cells."""
         return max(self.settings.outer_m, self.settings.inner_m) + 2 * self.settings.shell_cell_m
 
     def visible_pixels(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ from hnerf.render.bvh_motion import bvh_motion
 AMASS_WIDTHS = (72, 156, 165)  # pose parameters of SMPL, SMPL-H and SMPL-X, which share their first 22 joints
 AMASS_RATES = ("mocap_framerate", "mocap_frame_rate")
 BODY_JOINTS = 22
-DEFAULT_FPS = 30.0
+DEFAULT_FPS = 30.0  # of AMASS files without a rate
 MAX_MOTION_BYTES = 256_000_000  # unpacked; half an hour of SMPL-H at 100 poses a second
 
 

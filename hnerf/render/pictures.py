@@ -21,7 +21,7 @@ from hnerf.progress import tracked
 
 COVERED = 0.5  # alpha from which a pixel has a depth and a normal
 NEAR_GREY, FAR_GREY = 255, 64  # grey levels at the ends of a depth video's range
-NORMAL_STEP_M = 0.003
+NORMAL_STEP_M = 0.003  # of finite differences of the signed distance
 TETRAHEDRON = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
 Shot = tuple[Camera, int]  # a camera, and the frame of avatar.body whose pose is shown
 

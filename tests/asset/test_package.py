@@ -98,7 +98,7 @@ def test_packaging_finds_every_file_and_is_silent(
     write_all(tmp_path, staged)
     assert capfd.readouterr() == ("", "")
     with ZipFile(tmp_path / "avatar.usdz") as archive:
-        assert set(archive.namelist()) == {"avatar.usdc", "texture.png", "normal_map.png"}
+        assert set(archive.namelist()) == {"avatar.usdc", "texture.png", "albedo.png", "light.png", "normal_map.png"}
 
 
 def test_the_same_avatar_is_the_same_bytes_at_any_time(package: Path, staged: StagedAvatar, tmp_path: Path) -> None:
