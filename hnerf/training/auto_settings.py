@@ -40,7 +40,7 @@ STEPS_PER_FRAME = 540  # with its rays, until its body's depth converges with on
 class Decision:
     """Value of an automatic setting, and its reason."""
 
-    value: int | float | tuple[float, ...]
+    value: int | float | str | tuple[float, ...]
     reason: str
 
 
@@ -136,6 +136,9 @@ def _field_decisions(scene: SceneStatistics, given: FastFieldSettings) -> dict[s
             + (": too little to learn from" if nearly_static else ""),
         ),
         "nodes": _nodes(scene, given),
+        "normals": Decision("body", "one camera does not tell shape from shading")
+        if scene.cameras == 1
+        else Decision("surface", f"{scene.cameras} cameras tell shape from shading"),
     }
 
 
