@@ -50,7 +50,7 @@ PHOTOGRAPHS, SURFACE = "hnerf/asset/photographs.py", "hnerf/avatar/surface.py"
 METRICS, REPORT = "hnerf/evaluation/metrics.py", "hnerf/evaluation/report.py"
 EXPOSURE, ARTICULATION = "hnerf/training/exposure.py", "hnerf/body/articulation.py"
 POLICY, STORE = "tasks/policy.py", "tasks/store.py"
-INVENTORY, ARCHIVE, LIMITS = "tasks/inventory.py", "tasks/archive.py", "tasks/limits.py"
+INVENTORY, PACKED, LIMITS = "tasks/inventory.py", "tasks/packed.py", "tasks/limits.py"
 
 BY_PAPER, BY_LOSSES = "tests/fields/test_paper.py", "tests/training/test_losses.py"
 BY_STEP, BY_CONDITIONS = "tests/training/test_step.py", "tests/fields/test_conditions.py"
@@ -303,9 +303,9 @@ FAULTS = (
     Fault("gc-use", "tasks/garbage.py", "if aside.stat().st_mtime != garbage.used_s:", "if False:", BY_GARBAGE),
     Fault("gc-pinned", INVENTORY, "roots = pinned(self.store.root)", "roots = set[str]()", BY_GARBAGE),
     Fault("gc-lock", STORE, "if not _is_at(path, lock.fileno()):", "if False:", BY_GARBAGE),
-    Fault("archive-path", ARCHIVE, 'or ".." in parts or', "or", BY_ARCHIVE),
-    Fault("archive-type", ARCHIVE, "member.type != tarfile.REGTYPE or", "", BY_ARCHIVE),
-    Fault("archive-digest", ARCHIVE, "if seen.hexdigest() != digest:", "if False:", BY_ARCHIVE),
+    Fault("archive-path", PACKED, 'or ".." in parts or', "or", BY_ARCHIVE),
+    Fault("archive-type", PACKED, "member.type != tarfile.REGTYPE or", "", BY_ARCHIVE),
+    Fault("archive-digest", PACKED, "if seen.hexdigest() != digest:", "if False:", BY_ARCHIVE),
     Fault("limit-progress", LIMITS, "            arm()\n\n    def end", "            pass\n\n    def end", BY_LIMITS),
     Fault("limit-end", LIMITS, "exit=True", "exit=False", BY_LIMITS),
 )  # fmt: skip
