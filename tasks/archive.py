@@ -71,7 +71,7 @@ def import_subject(store: Store, path: Path) -> Manifest:
         tempfile.TemporaryDirectory(dir=store.root, prefix=".import-") as scratch,
     ):
         manifest = read_contents(Manifest, archive, str(path))
-        require_room(manifest, store.root, str(path))
+        require_room(manifest.unpacked_bytes(), store.root, str(path))
         _check_subject(manifest, store)
         unpack(archive, manifest, Path(scratch), str(path))
         for name, one in manifest.artifacts.items():

@@ -74,6 +74,11 @@ class Contents(Section):
         files = [file for artifact in self.artifacts.values() for file in artifact.files.values()]
         return {file.sha256: file.size_bytes for file in files}
 
+    def unpacked_bytes(self) -> int:
+        """Return the size of the unpacked artifacts. Every path counts, and not only every file: each is read to check
+        its digest."""
+        return sum(file.size_bytes for one in self.artifacts.values() for file in one.files.values())
+
 
 Kind = TypeVar("Kind", bound=Contents)
 
@@ -122,13 +127,11 @@ def read_contents(kind: type[Kind], archive: IO[bytes], where: str) -> Kind:
     return validated(kind, tree, where)
 
 
-def require_room(contents: Contents, folder: Path, where: str) -> None:
-    """Raise NoRoomError if the files would fill the disk."""
-    # Every path counts, and not only every file: each is read to check its digest.
-    wanted = sum(file.size_bytes for one in contents.artifacts.values() for file in one.files.values())
+def require_room(wanted_bytes: int, folder: Path, where: str) -> None:
+    """Raise NoRoomError if so many bytes would fill the disk."""
     free = shutil.disk_usage(folder).free
-    if wanted > free - SPARE_BYTES:
-        raise NoRoomError(f"{where}: unpacks to {wanted / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; make room")
+    if wanted_bytes > free - SPARE_BYTES:
+        raise NoRoomError(f"{where}: takes {wanted_bytes / 1e9:.1f} GB, and {free / 1e9:.1f} GB are free; make room")
 
 
 def unpack(archive: IO[bytes], contents: Contents, scratch: Path, where: str) -> None:
