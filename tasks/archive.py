@@ -75,8 +75,9 @@ def import_subject(store: Store, path: Path) -> Manifest:
         _check_subject(manifest, store)
         unpack(archive, manifest, Path(scratch), str(path))
         for name, one in manifest.artifacts.items():
-            with store.locked(*name.split("/")):
-                if not store.find(*name.split("/")):
+            stage, key = name.split("/")
+            with store.locked(stage, key):
+                if not store.find(stage, key):
                     place(store, name, one, Path(scratch))
         if manifest.recording:
             digest, _, folder = manifest.recording.strip().partition("\n")

@@ -51,6 +51,7 @@ METRICS, REPORT = "hnerf/evaluation/metrics.py", "hnerf/evaluation/report.py"
 EXPOSURE, ARTICULATION = "hnerf/training/exposure.py", "hnerf/body/articulation.py"
 POLICY, STORE = "tasks/policy.py", "tasks/store.py"
 INVENTORY, PACKED, LIMITS = "tasks/inventory.py", "tasks/packed.py", "tasks/limits.py"
+BUCKET, LEASE, SHARED = "tasks/bucket.py", "tasks/lease.py", "tasks/shared.py"
 
 BY_PAPER, BY_LOSSES = "tests/fields/test_paper.py", "tests/training/test_losses.py"
 BY_STEP, BY_CONDITIONS = "tests/training/test_step.py", "tests/fields/test_conditions.py"
@@ -75,6 +76,7 @@ BY_FIELD_COLOURS = "tests/asset/test_field_colours.py"
 BY_PHOTOGRAPHS = "tests/asset/test_photographs.py"
 BY_VIEWER, BY_PICTURES = "tests/asset/test_viewer.py", "tests/asset/test_pictures.py"
 BY_GARBAGE, BY_ARCHIVE = "tests/tasks/test_garbage.py", "tests/tasks/test_archive.py"
+BY_BUCKET, BY_LEASE, BY_SHARED = (f"tests/tasks/test_{name}.py" for name in ("bucket", "lease", "shared"))
 BY_LIMITS = "tests/tasks/test_limits.py"
 BY_TIMING, BY_GLB = "tests/capture/test_timing.py", "tests/asset/test_glb.py"
 
@@ -306,6 +308,12 @@ FAULTS = (
     Fault("archive-path", PACKED, 'or ".." in parts or', "or", BY_ARCHIVE),
     Fault("archive-type", PACKED, "member.type != tarfile.REGTYPE or", "", BY_ARCHIVE),
     Fault("archive-digest", PACKED, "if seen.hexdigest() != digest:", "if False:", BY_ARCHIVE),
+    Fault("archive-manifest", PACKED, " or manifest_name(text) != name", "", BY_SHARED),
+    Fault("note-once", BUCKET, 'self.fs.open(self._path(name), "xb")', 'self.fs.open(self._path(name), "wb")', BY_BUCKET),
+    Fault("lease-renewed", LEASE, "if now != text:", "if False:", BY_LEASE),
+    Fault("lease-given-up", LEASE, "if text != FREE and", "if", BY_LEASE),
+    Fault("shared-another", SHARED, "if list(contents.artifacts) != [name]:", "if False:", BY_SHARED),
+    Fault("shared-later", SHARED, "if bucket.size_bytes(_object(name)) is None:", "if False:", BY_SHARED),
     Fault("limit-progress", LIMITS, "            arm()\n\n    def end", "            pass\n\n    def end", BY_LIMITS),
     Fault("limit-end", LIMITS, "exit=True", "exit=False", BY_LIMITS),
 )  # fmt: skip

@@ -23,9 +23,11 @@ KEY = f"{7:032x}"
 OBJECT = f"fit/{KEY}.tar"
 
 
-@pytest.fixture(params=["file", "memory"])
+@pytest.fixture(params=["file", "memory", "s3"])
 def bucket(request: pytest.FixtureRequest, tmp_path: Path) -> Bucket:
     """Return an empty bucket."""
+    if request.param == "s3":
+        return Bucket.at(f"{request.getfixturevalue('s3')}/{tmp_path.name}")
     if request.param == "memory":
         MemoryFileSystem.store.clear()
         MemoryFileSystem().makedirs("/share", exist_ok=True)
