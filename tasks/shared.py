@@ -53,7 +53,7 @@ def _fetch(bucket: Bucket, store: Store, stage: str, key: str) -> Artifact | Non
             return found
         if (size_bytes := bucket.size_bytes(_object(name))) is None:
             return None
-        log.info("fetching %s (%.0f MB)", name, size_bytes / 1e6)
+        log.info("fetching %s (%.1f MB)", name, size_bytes / 1e6)
         require_room(size_bytes, scratch, where)
         try:
             bucket.download(_object(name), scratch / PACKED)

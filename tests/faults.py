@@ -309,7 +309,7 @@ FAULTS = (
     Fault("archive-type", PACKED, "member.type != tarfile.REGTYPE or", "", BY_ARCHIVE),
     Fault("archive-digest", PACKED, "if seen.hexdigest() != digest:", "if False:", BY_ARCHIVE),
     Fault("archive-manifest", PACKED, " or manifest_name(text) != name", "", BY_SHARED),
-    Fault("note-once", BUCKET, 'self.fs.open(self._path(name), "xb")', 'self.fs.open(self._path(name), "wb")', BY_BUCKET),
+    Fault("note-once", BUCKET, '(name), "xb")', '(name), "wb")', BY_BUCKET),
     Fault("lease-renewed", LEASE, "if now != text:", "if False:", BY_LEASE),
     Fault("lease-given-up", LEASE, "if text != FREE and", "if", BY_LEASE),
     Fault("shared-another", SHARED, "if list(contents.artifacts) != [name]:", "if False:", BY_SHARED),
