@@ -33,10 +33,13 @@ def measured(
     return Result(name, command, (f"{name}.*",), captures, configs, threads=threads)
 
 
-def shared(name: str, capture: str, preset: str = "fast", *changes: str, threads: int = 1) -> Result:
-    """Return a result of the whole pipeline on one capture, timed."""
+def shared(
+    name: str, capture: str, preset: str = "fast", *changes: str, without: tuple[str, ...] = (), threads: int = 1
+) -> Result:
+    """Return a result of the whole pipeline on one capture, timed; `without` names folders that the capture lacks."""
     command = ("score_shared.py", capture, "--preset", preset, "--store", "{new}", "--name", name)
     command += tuple(f"--set={change}" for change in changes)
+    command += ("--without", *without) if without else ()
     return Result(name, command, (f"{name}.*",), (capture,), (preset,), ("flows.train_subject",), threads)
 
 
@@ -66,6 +69,7 @@ REGISTRY = (
     measured("fit", "fit.py", "{store}", captures=RENDERED, configs=("fast",)),
     shared("shared-fast-wave", "valid-wave"),
     shared("shared-fast-walk", "valid-walk"),
+    *(shared(f"shared-video-{name}", f"valid-{name}", without=("openpose", "background")) for name in ("wave", "walk")),
     shared("shared-fast-one-camera", "valid-turn-mono"),
     shared("shared-fast-real", "pose2sim-balance"),
     shared("shared-paper-small-wave", "valid-wave", "paper-small", *FEW),

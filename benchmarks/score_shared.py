@@ -1,14 +1,17 @@
 """Run the pipeline on the shared captures and score its output with the independent program beside them.
 
 usage: python benchmarks/score_shared.py [CAPTURE ...] [--preset NAME] [--store DIR] [--set a.b=c] [--name RESULT]
+       [--without FOLDER ...]
 
 Needs `../shared` beside this checkout (`data/`, `accept/score_run.py`) and the package installed. Writes
 `benchmarks/results/RESULT.json` and `.md`, by default `shared-NAME`. Stages that are in the store already are not run
-again; for a subject that the store knows, the time of the whole run is therefore omitted.
+again; for a subject that the store knows, the time of the whole run is therefore omitted. `--without openpose` runs on
+a copy of each capture that lacks this folder.
 """
 
 import argparse
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -40,15 +43,28 @@ def main() -> int:
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--store", type=Path, default=ROOT / "store")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="a.b=c")
+    parser.add_argument("--without", nargs="+", default=[], metavar="FOLDER", help="folders that captures lack")
     parser.add_argument("--name", help="name of the result files (default: shared-PRESET)")
     options = parser.parse_args()
-    preset = {"preset": options.preset, "overrides": options.overrides}
+    preset = {"preset": options.preset, "overrides": options.overrides, "without": options.without}
     result: dict[str, Any] = provenance() | preset | {"captures": {}}
     for name in options.captures:
-        result["captures"][name] = measure(SHARED / "data" / name, options.preset, options.store, options.overrides)
+        capture = lacking(SHARED / "data" / name, options.without, options.store)
+        result["captures"][name] = measure(capture, options.preset, options.store, options.overrides)
         write_result(options.name or f"shared-{options.preset}", result, as_markdown(result))
     print(as_markdown(result))
     return int(any("error" in figures for figures in result["captures"].values()))
+
+
+def lacking(capture: Path, folders: list[str], store: Path) -> Path:
+    """Return the capture, or a copy of it in the store without these folders."""
+    if not folders:
+        return capture
+    absent = [name for name in folders if not (capture / name).is_dir()]
+    if absent:
+        raise SystemExit(f"{capture / absent[0]}: no such folder to leave out")
+    copy = store / "captures" / capture.name
+    return Path(shutil.copytree(capture, copy, ignore=shutil.ignore_patterns(*folders), dirs_exist_ok=True))
 
 
 def measure(capture: Path, preset: str, store: Path, overrides: list[str]) -> dict[str, Any]:
@@ -84,6 +100,7 @@ def score(subject: Path, capture: Path) -> dict[str, Any] | None:
 def as_markdown(result: dict[str, Any]) -> str:
     """Format one table a split, after the machine and before the protocol."""
     changes = f" with {', '.join(result['overrides'])}" if result["overrides"] else ""
+    changes += f" without {', '.join(result['without'])}" if result["without"] else ""
     lines = [
         f"# Shared captures, preset `{result['preset']}`{changes}",
         "",
