@@ -37,10 +37,10 @@ def get_or_compute(bucket: Bucket, store: Store, stage: str, key: str, compute: 
         with leased(bucket, name) as mine:
             if mine:
                 found = _fetch(bucket, store, stage, key)  # another may have finished just before
-                if found is None:
-                    found = compute()
-                    _put(bucket, store, found)
-                return found
+                made = found or compute()
+                if found is None or bucket.size_bytes(_object(name)) is None:
+                    _put(bucket, store, made)
+                return made
     return found
 
 
