@@ -15,12 +15,13 @@ import os
 import random
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from uuid import uuid4
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.machines import MARK, ROOT, Machine, command, marked, process, resident_kib
+from tests.postgresql import BINARIES, cluster, free_port
 
 SIZES = {"size_px": 96, "train_cameras": 4, "test_cameras": 1, "train_frames": 4, "novel_pose_frames": 1}
 PRESET = """based_on: demo
@@ -55,7 +57,6 @@ def main() -> int:
     mark = uuid4().hex
     server_port, bucket_port = free_port(), free_port()
     os.environ |= {
-        MARK: mark,
         "PREFECT_HOME": str(scratch / "prefect"),
         "PREFECT_API_URL": f"http://127.0.0.1:{server_port}/api",
         "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
@@ -69,7 +70,9 @@ def main() -> int:
     }
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended"))  # so that nothing is left running
     try:
-        figures = soak(scratch, server_port, bucket_port, mark, options)
+        with database():
+            os.environ[MARK] = mark
+            figures = soak(scratch, server_port, bucket_port, mark, options)
     finally:
         for pid in marked(mark):
             os.kill(pid, signal.SIGKILL)
@@ -130,6 +133,7 @@ def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: 
     logs = "".join(path.read_text(errors="replace") for path in scratch.glob("worker*.log"))
     return {
         "subjects": len(names),
+        "database": "PostgreSQL" if BINARIES else "SQLite",
         "finished": len(done),
         "seconds": round(seconds),
         "kills": dict(kills),
@@ -140,6 +144,19 @@ def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: 
         "server_mib": [kib // 1024 for kib in memory_kib],
         "faults": faults,
     }
+
+
+@contextmanager
+def database() -> Iterator[None]:
+    """Have the server use a PostgreSQL of its own, where one is installed, in place of SQLite, which two workers of a
+    busy machine make wait for minutes."""
+    if not BINARIES:
+        yield
+        return
+    with cluster() as environment:
+        url = f"postgresql+asyncpg://postgres@127.0.0.1:{environment['PGPORT']}/postgres"
+        os.environ["PREFECT_SERVER_DATABASE_CONNECTION_URL"] = url
+        yield
 
 
 def write_captures(folder: Path, count: int) -> list[str]:
@@ -259,13 +276,6 @@ def wait_for(url: str, patience_s: float = 300.0) -> None:
             if time.monotonic() > deadline_s:
                 raise
             time.sleep(POLL_S)
-
-
-def free_port() -> int:
-    """Return a port on which nobody listens."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 if __name__ == "__main__":
