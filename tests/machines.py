@@ -44,9 +44,13 @@ class Machine:
         disk.mkdir()
         (scratch / "ingested").mkdir(exist_ok=True)
         (disk / "ingested").symlink_to(scratch / "ingested")
+        return Machine._with_disk(scratch, number)
+
+    @staticmethod
+    def _with_disk(scratch: Path, number: int) -> "Machine":
         store = scratch / "store"
         store.mkdir(exist_ok=True)
-        command = (*WITH_DISK, str(disk), str(store), sys.executable, "-m", *WORKER)
+        command = (*WITH_DISK, str(scratch / f"disk{number}"), str(store), sys.executable, "-m", *WORKER)
         return Machine(scratch, number, start(scratch, f"worker{number}", *command, home=f"prefect{number}"))
 
     @property
@@ -63,14 +67,24 @@ class Machine:
         alive = [pid for pid in runs if Path(f"/proc/{pid}").exists()]
         return random.choice(alive) if alive else None
 
+    def restarted(self) -> "Machine":
+        """Start the worker again if it has ended, as systemd does, which first ends what it had started."""
+        if self.worker.poll() is None:
+            return self
+        self._end()
+        return Machine._with_disk(self.scratch, self.number)
+
     def lose(self) -> "Machine":
         """Kill all that runs here, and lose the disk; return the machine that comes in its place."""
-        for pid in [self.worker.pid, *descendants(self.worker.pid)]:
+        self._end()
+        os.replace(self.disk, self.scratch / f"lost-{uuid4().hex}")
+        return Machine.started(self.scratch, self.number)
+
+    def _end(self) -> None:
+        for pid in marked(f"PREFECT_HOME={self.scratch}/prefect{self.number}"):
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         self.worker.wait()
-        os.replace(self.disk, self.scratch / f"lost-{uuid4().hex}")
-        return Machine.started(self.scratch, self.number)
 
 
 def start(scratch: Path, name: str, *command: str, home: str = "prefect") -> "subprocess.Popen[bytes]":
@@ -91,12 +105,12 @@ def process(scratch: Path, name: str, *arguments: str) -> Iterator["subprocess.P
         started.wait(timeout=60)
 
 
-def marked(mark: str) -> list[int]:
-    """Return the processes, other than this one, that were started from here."""
+def marked(variable: str) -> list[int]:
+    """Return the processes, other than this one, in whose environment this stands."""
     found = []
     for path in Path("/proc").glob("[0-9]*/environ"):
         try:
-            if f"{MARK}={mark}".encode() in path.read_bytes() and int(path.parent.name) != os.getpid():
+            if variable.encode() in path.read_bytes().split(b"\0") and int(path.parent.name) != os.getpid():
                 found.append(int(path.parent.name))
         except OSError:
             continue

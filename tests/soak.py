@@ -39,7 +39,7 @@ training: {steps: 12, novel_pose_steps: 2}
 evaluation: {max_images: 1, max_meshes: 1, report_rows: 1}
 asset: {grid_cells: 48, faces: 1500, texture_px: 64, texture_poses: 1, photograph_frames: 1, correctives: 0}
 """
-SILENCE_S, LOOK_S, POLL_S = 90, 30, 1.0
+SILENCE_S, LOOK_S, POLL_S = 90, 30, 2.0
 BUCKET = "soak"
 RESULTS = {"asset": "avatar.usdz", "evaluation": "report.html"}  # a file that each of these stages writes
 MACHINES = 2
@@ -74,7 +74,7 @@ def main() -> int:
             os.environ[MARK] = mark
             figures = soak(scratch, server_port, bucket_port, mark, options)
     finally:
-        for pid in marked(mark):
+        for pid in marked(f"{MARK}={mark}"):
             os.kill(pid, signal.SIGKILL)
     text = json.dumps(figures, indent=1)
     print(text)
@@ -95,6 +95,7 @@ def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: 
     done: dict[str, list[str]] = {}
     generations: dict[str, set[str]] = {}
     kills: Counter[str] = Counter()
+    restarts = 0
     with (
         process(scratch, "s3", "moto.server", "-H", "127.0.0.1", "-p", str(bucket_port)),
         process(scratch, "server", "prefect", "server", "start", *listen) as server,
@@ -106,7 +107,9 @@ def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: 
             time.sleep(POLL_S)
             note_finished(machines, names, done)
             note_generations(generations)
-            at = random.randrange(MACHINES)
+            restarted = [machine.restarted() for machine in machines]
+            restarts += sum(now is not before for now, before in zip(restarted, machines, strict=True))
+            machines, at = restarted, random.randrange(MACHINES)
             if time.monotonic() - killed_s > options.kill_every and (run := machines[at].run()):
                 if kills.total() % 2:
                     machines[at] = machines[at].lose()
@@ -129,7 +132,7 @@ def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: 
         for machine in machines:
             faults += verify(machine.disk)
         faults += verify(fetched(scratch / "third", list(generations)))
-    faults += [f"process {pid} is left: {command(pid)}" for pid in marked(mark)]
+    faults += [f"process {pid} is left: {command(pid)}" for pid in marked(f"{MARK}={mark}")]
     logs = "".join(path.read_text(errors="replace") for path in scratch.glob("worker*.log"))
     return {
         "subjects": len(names),
@@ -137,6 +140,7 @@ def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: 
         "finished": len(done),
         "seconds": round(seconds),
         "kills": dict(kills),
+        "workers_that_ended_by_themselves": restarts,
         "runs": states,
         "artifacts": len(generations),
         "made_twice": sum(len(made) > 1 for made in generations.values()),
