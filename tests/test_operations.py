@@ -102,10 +102,11 @@ def shared_stand_ins(folder: Path) -> dict[str, str]:
     """Copy real captures, which some commands need; return what stands for what."""
     shutil.copytree(SHARED / "pose2sim-balance", folder / "balance")
     shutil.copytree(SHARED / "caliscope-charuco", folder / "boards")
+    shutil.copytree(SHARED / "valid-walk", folder / "apart")
     return {
         "calibrate FOLDER": "calibrate boards --out rig",
         "calibrate CAPTURE": "calibrate balance --out people",
-        "synchronise CAPTURE": "synchronise balance",
+        "synchronise CAPTURE": "synchronise apart",
     }
 
 
