@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 from provenance import RESULTS, SHARED, provenance, provenance_line, table, write_result
 
-from flows.benchmark import train_recording
+from flows.train_subject import prepare_training
 from hnerf.config import Settings, TrainingSettings, load_settings
 from hnerf.study.benchmark.plan import ScoringSettings
 from tasks.benchmark import score_training
 from tasks.capture import ingest
 from tasks.source import read_capture
 from tasks.store import Store
+from tasks.training import train
 
 CAPTURES = ["valid-wave", "valid-walk", "valid-turn-mono"]
 DECIDED = "as decided"
@@ -64,8 +65,9 @@ def train_and_score(folder: Path, store: Store, settings: Settings) -> tuple[Tra
     them."""
     source, truth = read_capture(folder)
     recording = ingest(store, source, settings.capture)
-    calibration, body, model = train_recording(store, recording, settings)
-    scores = score_training(store, truth, recording, calibration, body, model, SCORING)
+    prepared = prepare_training(store, recording, settings)
+    model = train(store, *prepared, settings.training)
+    scores = score_training(store, truth, recording, prepared.calibration, prepared.body, model, SCORING)
     stored = json.loads((model.root / "settings.json").read_text())
     found = json.loads((scores.root / "scores.json").read_text())
     return TrainingSettings.model_validate(stored["training"]), found | {"decisions": stored["decisions"]}

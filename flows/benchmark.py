@@ -23,7 +23,7 @@ from tasks.capture import ingest, subset_capture
 from tasks.limits import set_limits
 from tasks.policy import is_retryable
 from tasks.source import Source, read_capture
-from tasks.store import Artifact, Store
+from tasks.store import Store
 from tasks.training import train
 
 log = logging.getLogger("hnerf.benchmark")
@@ -139,9 +139,3 @@ def train_until_flat(
         if ended != "limit":
             break
     return settings, {"curve": points, "ended": ended}
-
-
-def train_recording(store: Store, recording: Artifact, settings: Settings) -> tuple[Artifact, Artifact, Artifact]:
-    """Run all stages on a recording; return calibration, body and training."""
-    prepared = prepare_training(store, recording, settings)
-    return prepared.calibration, prepared.body, train(store, *prepared, settings.training)

@@ -110,22 +110,9 @@ def _parser() -> argparse.ArgumentParser:
     cameras.add_argument("--format", choices=CAMERA_FORMATS, required=True)
     _add_out(cameras, "cameras")
 
-    benchmark = add(commands.benchmark, capture)
-    _add_study(benchmark, "dynamic", "benchmark")
-    benchmark.add_argument(
-        "--methods", type=_names, metavar="LIST", help="of the study, or presets, instead of all: fast,nerf"
-    )
-    benchmark.add_argument("--seconds", type=_positive, metavar="S", help="of every training, instead of the study's")
-
-    ablations = add(commands.ablate, capture, preset)
-    _add_overrides(ablations, "override a setting in all rows")
-    ablations.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these of configs/ablations/")
-
-    stability = add(commands.stability, capture)
-    _add_study(stability, "full", "stability")
-    stability.add_argument("--methods", type=_names, default=[], metavar="LIST", help="presets")
-    stability.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these degradations of the study")
-
+    _add_benchmark(add(commands.benchmark, capture))
+    _add_ablate(add(commands.ablate, capture, preset))
+    _add_stability(add(commands.stability, capture))
     _add_render(add(commands.render))
     _add_export(add(commands.export, preset))
     what = "Look into the store, and keep it in order."
@@ -182,6 +169,24 @@ def _add_study(command: argparse.ArgumentParser, default: str, folder: str) -> N
     what = f"a name under configs/{folder}/ or a YAML file (default: {default})"
     study.add_argument("--study", default=default, help=what)
     study.add_argument("--quick", dest="study", action="store_const", const="quick", help="the study for 15 minutes")
+
+
+def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
+    _add_study(benchmark, "dynamic", "benchmark")
+    what = "of the study, or presets, instead of all: fast,nerf"
+    benchmark.add_argument("--methods", type=_names, metavar="LIST", help=what)
+    benchmark.add_argument("--seconds", type=_positive, metavar="S", help="of every training, instead of the study's")
+
+
+def _add_ablate(ablations: argparse.ArgumentParser) -> None:
+    _add_overrides(ablations, "override a setting in all rows")
+    ablations.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these of configs/ablations/")
+
+
+def _add_stability(stability: argparse.ArgumentParser) -> None:
+    _add_study(stability, "full", "stability")
+    stability.add_argument("--methods", type=_names, default=[], metavar="LIST", help="presets")
+    stability.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these degradations of the study")
 
 
 def _names(text: str) -> list[str]:

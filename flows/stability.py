@@ -4,6 +4,7 @@ import contextlib
 import json
 import logging
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -107,34 +108,27 @@ def _runs(
         recording = ingest_part(store, source, plan, preset)
         near = set()
         for seed in plan.seeds:
-            for run in _runs_of_seed(store, recording, truth, method, preset, seed, tried):
+            for run in _runs_of_seed(method, Attempt.of_seed(store, recording, truth, preset, seed), tried):
                 if run.get("near_border"):
                     near.add((run["kind"], run["strength"]))
                 yield run
         for seed in plan.border_seeds if near else ():
-            yield from _runs_of_seed(store, recording, truth, method, preset, seed, [at for at in tried if at in near])
+            again = Attempt.of_seed(store, recording, truth, preset, seed)
+            yield from _runs_of_seed(method, again, [at for at in tried if at in near])
 
 
-def _runs_of_seed(
-    store: Store,
-    recording: Artifact,
-    truth: Source,
-    method: str,
-    preset: Settings,
-    seed: int,
-    tried: Sequence[tuple[str, float]],
-) -> Iterator[Figures]:
+def _runs_of_seed(method: str, as_recorded: "Attempt", tried: Sequence[tuple[str, float]]) -> Iterator[Figures]:
     """Yield the reference run and, unless it is broken, a run for each kind and strength."""
-    settings = preset.model_copy(update={"training": preset.training.model_copy(update={"seed": seed})})
-    set_limits(settings.limits)
+    seed = as_recorded.settings.training.seed
+    set_limits(as_recorded.settings.limits)
     log.info("%s, seed %d, as recorded", method, seed)
-    good = attempt(store, recording, truth, settings, None)
+    good = as_recorded.outcome()
     row = {"method": method, "seed": seed}
     reference = row | {"kind": REFERENCE, "strength": None} | verdict_row(good, good)
     yield reference
     for kind, strength in tried if reference["verdict"] not in BROKEN else ():
         log.info("%s, seed %d, %s: %g", method, seed, KINDS[kind].label, strength)
-        found = attempt(store, recording, truth, settings, Degradation(kind=kind, strength=strength, seed=seed))
+        found = replace(as_recorded, degradation=Degradation(kind=kind, strength=strength, seed=seed)).outcome()
         if "left_out" in found:
             yield {"left_out": f"{KINDS[kind].label}, {strength:g}: {found['left_out']}"}
             continue
@@ -176,88 +170,95 @@ def means_in_common(one: Figures, other: Figures) -> Figures:
     return means | {"images": len(images), "surfaces": len(surfaces)}
 
 
-def attempt(
-    store: Store, recording: Artifact, truth: Source, settings: Settings, degradation: Degradation | None
-) -> Figures:
-    """Return the result of `measure`, or {"error": (verdict, reason)}: refused if bad input was reported before or
-    by training, failed for any other error; or {"left_out": reason} if the degradation is not applicable to the
-    capture."""
-    at_bad_input = "refused"
-    try:
-        prepared = prepare_degraded(store, recording, truth, settings, degradation)
-        training_settings = settings.training
-        if degradation and KINDS[degradation.kind].target == "settings":
-            training_settings = degrade_settings(training_settings, degradation)
-        training = train(store, *prepared, training_settings)
-        at_bad_input = "failed"
-        return measure(store, recording, truth, settings, degradation, prepared, training)
-    except NotApplicableError as error:
-        return {"left_out": str(error)}
-    except InputError as error:
-        return {"error": (at_bad_input, str(error))}
-    except Exception as error:  # any failure is a result of the study
-        if is_retryable(error):
-            raise  # a full disk, a lost share, a killed worker
-        log.warning("%s: %s", type(error).__name__, error)
-        return {"error": ("failed", one_line(error))}
+@dataclass(frozen=True)
+class Attempt:
+    """A training on a recording that is degraded in one way; as it was recorded where that is None. truth: the
+    recording's."""
 
+    store: Store
+    recording: Artifact
+    truth: Source
+    settings: Settings
+    degradation: Degradation | None = None
 
-def prepare_degraded(
-    store: Store, recording: Artifact, truth: Source, settings: Settings, degradation: Degradation | None
-) -> Prepared:
-    """Run the stages before training, degraded at the degradation's target."""
-    target = KINDS[degradation.kind].target if degradation else None
-    if degradation and target == "capture":
-        recording = degrade_capture(store, recording, degradation)
-    recording, calibration, segmentation, body = prepare_training(store, recording, settings)
-    if degradation and target == "clothing":
-        recording = degrade_clothing(store, truth, recording, calibration, body, degradation)
-        return prepare_training(store, recording, settings)
-    if degradation and target == "masks":
-        segmentation = degrade_masks(store, recording, calibration, segmentation, degradation)
-        body = fit(store, recording, calibration, segmentation, settings.fit)
-    if degradation and target == "fit":
-        body = degrade_fit(store, body, degradation)
-    return Prepared(recording, calibration, segmentation, body)
+    @staticmethod
+    def of_seed(store: Store, recording: Artifact, truth: Source, preset: Settings, seed: int) -> "Attempt":
+        """Return the training of a preset with a seed of its own on the recording as it is."""
+        training = preset.training.model_copy(update={"seed": seed})
+        return Attempt(store, recording, truth, preset.model_copy(update={"training": training}))
 
+    @property
+    def target(self) -> str | None:
+        """Return what the degradation changes, None without one."""
+        return KINDS[self.degradation.kind].target if self.degradation else None
 
-def measure(
-    store: Store,
-    recording: Artifact,
-    truth: Source,
-    settings: Settings,
-    degradation: Degradation | None,
-    prepared: Prepared,
-    training: Artifact,
-) -> Figures:
-    """Return the faults of surfaces, the scores of each image and the Chamfer distance of each surface that has ground
-    truth.
+    def outcome(self) -> Figures:
+        """Return the result of `measure`, or {"error": (verdict, reason)}: refused if bad input was reported before or
+        by training, failed for any other error; or {"left_out": reason} if the degradation is not applicable to the
+        capture."""
+        at_bad_input = "refused"
+        try:
+            prepared, training_settings = self.prepare(), self.settings.training
+            if self.degradation and self.target == "settings":
+                training_settings = degrade_settings(training_settings, self.degradation)
+            training = train(self.store, *prepared, training_settings)
+            at_bad_input = "failed"
+            return self.measure(prepared, training)
+        except NotApplicableError as error:
+            return {"left_out": str(error)}
+        except InputError as error:
+            return {"error": (at_bad_input, str(error))}
+        except Exception as error:  # any failure is a result of the study
+            if is_retryable(error):
+                raise  # a full disk, a lost share, a killed worker
+            log.warning("%s: %s", type(error).__name__, error)
+            return {"error": ("failed", one_line(error))}
 
-    Scores are of novel poses, animated, or of training poses if the capture as recorded or the method has no novel
-    ones. Extreme poses have faults only. A degraded fit is used for training; novel poses are shown as in the good fit.
-    """
-    no_poses = reason_without_novel_poses(training.root)
-    if degradation and KINDS[degradation.kind].target == "poses":
-        if no_poses:
-            raise NotApplicableError(no_poses)
-        return {"faults": _faults(show_in_extreme_poses(store, training, degradation))}
-    good_body = prepare_degraded(store, recording, truth, settings, None).body
-    if degradation and KINDS[degradation.kind].target == "clothing":
-        _, truth = read_capture(prepared.recording.root)
-    if degradation and KINDS[degradation.kind].target == "fit":
-        prepared = prepared._replace(body=good_body)
-    evaluation = evaluate(store, truth, *prepared, training, settings.evaluation)
-    metrics = json.loads((evaluation.root / "metrics.json").read_text())
-    novel = Capture.load(recording.root).novel_pose_frames and not no_poses
-    split = ANIMATED if novel else NOVEL_VIEW
-    surfaces = (metrics[split]["geometry"] or {"per_surface": []})["per_surface"]
-    return {
-        "images": _images(metrics, split),
-        "surfaces": {surface["frame"]: surface["chamfer_mm"] for surface in surfaces},
-        "faults": _faults(check_meshes(store, evaluation, good_body)),
-        "protocol": metrics["protocol"],
-        "seconds": json.loads((training.root / "report.json").read_text())["seconds"],
-    }
+    def prepare(self) -> Prepared:
+        """Run the stages before training, degraded at the degradation's target."""
+        store, settings, change = self.store, self.settings, self.degradation
+        recording = self.recording
+        if change and self.target == "capture":
+            recording = degrade_capture(store, recording, change)
+        recording, calibration, segmentation, body = prepare_training(store, recording, settings)
+        if change and self.target == "clothing":
+            recording = degrade_clothing(store, self.truth, recording, calibration, body, change)
+            return prepare_training(store, recording, settings)
+        if change and self.target == "masks":
+            segmentation = degrade_masks(store, recording, calibration, segmentation, change)
+            body = fit(store, recording, calibration, segmentation, settings.fit)
+        if change and self.target == "fit":
+            body = degrade_fit(store, body, change)
+        return Prepared(recording, calibration, segmentation, body)
+
+    def measure(self, prepared: Prepared, training: Artifact) -> Figures:
+        """Return the faults of surfaces, the scores of each image and the Chamfer distance of each surface that has
+        ground truth.
+
+        Scores are of novel poses, animated, or of training poses if the capture as recorded or the method has no novel
+        ones. Extreme poses have faults only. A degraded fit is used for training; novel poses are shown as in the good
+        fit.
+        """
+        no_poses = reason_without_novel_poses(training.root)
+        if self.degradation and self.target == "poses":
+            if no_poses:
+                raise NotApplicableError(no_poses)
+            return {"faults": _faults(show_in_extreme_poses(self.store, training, self.degradation))}
+        good_body = replace(self, degradation=None).prepare().body
+        truth = read_capture(prepared.recording.root)[1] if self.target == "clothing" else self.truth
+        shown = prepared._replace(body=good_body) if self.target == "fit" else prepared
+        evaluation = evaluate(self.store, truth, *shown, training, self.settings.evaluation)
+        metrics = json.loads((evaluation.root / "metrics.json").read_text())
+        novel = Capture.load(self.recording.root).novel_pose_frames and not no_poses
+        split = ANIMATED if novel else NOVEL_VIEW
+        surfaces = (metrics[split]["geometry"] or {"per_surface": []})["per_surface"]
+        return {
+            "images": _images(metrics, split),
+            "surfaces": {surface["frame"]: surface["chamfer_mm"] for surface in surfaces},
+            "faults": _faults(check_meshes(self.store, evaluation, good_body)),
+            "protocol": metrics["protocol"],
+            "seconds": json.loads((training.root / "report.json").read_text())["seconds"],
+        }
 
 
 def _images(metrics: Figures, split: str) -> dict[tuple[str, int], Figures]:

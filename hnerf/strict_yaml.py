@@ -6,7 +6,7 @@ import yaml
 
 from hnerf.errors import InputError
 
-MAX_DEPTH = 32
+MAX_DEPTH = 32  # of nested lists and dictionaries
 # What PyYAML raises on tags without their value ("x: !!int", "x: !!timestamp"), beside its own.
 ERRORS = (yaml.YAMLError, AttributeError, ArithmeticError, LookupError, RecursionError, TypeError, ValueError)
 _EVENTS = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # written in C, ten times as fast, where it was built

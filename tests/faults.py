@@ -47,6 +47,8 @@ SKELETON, MOTIONS, SKINNING = "hnerf/asset/skeleton.py", "hnerf/asset/motions.py
 RIGS, BVH, BVH_MOTION = "hnerf/asset/rigs.py", "hnerf/body/bvh.py", "hnerf/render/bvh_motion.py"
 ANTIALIASING, CORRECTIVES = "hnerf/avatar/antialiasing.py", "hnerf/asset/correctives.py"
 PHOTOGRAPHS, SURFACE = "hnerf/asset/photographs.py", "hnerf/avatar/surface.py"
+LIGHT, SHADING = "hnerf/asset/light.py", "hnerf/asset/shading.py"
+ALBEDO, DOME = "hnerf/asset/albedo.py", "hnerf/asset/dome.py"
 METRICS, REPORT = "hnerf/evaluation/metrics.py", "hnerf/evaluation/report.py"
 EXPOSURE, ARTICULATION = "hnerf/training/exposure.py", "hnerf/body/articulation.py"
 POLICY, STORE = "tasks/policy.py", "tasks/store.py"
@@ -62,8 +64,8 @@ BY_ENCODING, BY_MLP = "tests/fields/test_encoding.py", "tests/fields/test_mlp.py
 BY_EXPOSURE = "tests/training/test_exposure.py"
 BY_SPARSE, BY_SHELL = "tests/fields/test_sparse_grids.py", "tests/fields/test_shell.py"
 BY_PULL, BY_DESCRIPTOR = "tests/body/test_correction_pull.py", "tests/body/test_descriptor.py"
-BY_CAMERA, BY_TRIANGULATION = "tests/geometry/test_camera.py", "tests/calibration/test_triangulation.py"
-BY_FILES, BY_USD = "tests/capture/test_camera_files.py", "tests/asset/test_usd.py"
+BY_CAMERA, BY_TRIANGULATION = "tests/geometry/test_camera.py", "tests/geometry/test_triangulation.py"
+BY_FILES, BY_USD = "tests/capture/formats/test_camera_files.py", "tests/asset/test_usd.py"
 BY_PACKAGE, BY_MOTIONS = "tests/asset/test_package.py", "tests/asset/test_motions.py"
 BY_SKINNING = "tests/asset/test_skinning.py"
 BY_BVH, BY_BVH_MOTION = "tests/body/test_bvh.py", "tests/render/test_bvh_motion.py"
@@ -74,6 +76,8 @@ BY_ANTIALIASING, BY_CORRECTIVES = "tests/avatar/test_antialiasing.py", "tests/as
 BY_PLATE, BY_REGISTRATION = "tests/asset/test_plate.py", "tests/asset/test_registration.py"
 BY_FIELD_COLOURS = "tests/asset/test_field_colours.py"
 BY_PHOTOGRAPHS = "tests/asset/test_photographs.py"
+BY_LIGHT, BY_SHADING = "tests/asset/test_light.py", "tests/asset/test_shading.py"
+BY_ALBEDO, BY_DOME = "tests/asset/test_albedo.py", "tests/asset/test_dome.py"
 BY_VIEWER, BY_PICTURES = "tests/asset/test_viewer.py", "tests/asset/test_pictures.py"
 BY_GARBAGE, BY_ARCHIVE = "tests/tasks/test_garbage.py", "tests/tasks/test_archive.py"
 BY_BUCKET, BY_LEASE, BY_SHARED = (f"tests/tasks/test_{name}.py" for name in ("bucket", "lease", "shared"))
@@ -161,6 +165,13 @@ FAULTS = (
     # what the networks of `fast` are asked
     Fault("fast-colour-normal", CANONICAL, "positional_encoding(normal, 1)", "positional_encoding(0 * normal, 1)",
           BY_CANONICAL),
+    Fault("fast-body-normal", FAST, "outward + (found[1:] - found[0]).T / GRADIENT_STEP_M", "outward", BY_RAY),
+    Fault("fast-normal-untaught", FAST, "bodies.turn(gradient, row", "bodies.turn(gradient.detach(), row", BY_RAY),
+    Fault("fast-normal-unturned", BODIES, "(linear * directions[:, None]).sum(-1)", "directions", BY_RAY),
+    Fault("plates-hidden", "hnerf/training/plates.py", "cv2.dilate(mask, disc) > 0", "mask > 0",
+          "tests/training/test_plates.py"),
+    Fault("plates-known", "hnerf/training/gather.py", "plates[c].known | ~edge", "plates[c].known | edge",
+          "tests/training/test_pixels.py"),
     Fault("fast-pose-code", CANONICAL, "self.pose_code(pose).index", "0 * self.pose_code(pose).index", BY_CANONICAL),
     Fault("fast-residual-unit", CANONICAL, "self.unit_m * self.geometry(", "self.geometry(", BY_CANONICAL),
     Fault("fast-frame", FAST, "self._residual(described, pose, row).view_as(d)",
@@ -174,10 +185,10 @@ FAULTS = (
           BY_DESCRIPTOR),
     Fault("fast-eikonal-inside", FAST, " * skin.d[pick].detach().sign()[:, None]", "", BY_RAY),
     Fault("fast-difference-step", FAST, "GRADIENT_STEP_M = 0.005", "GRADIENT_STEP_M = 0.03", BY_RAY),
-    Fault("fast-eikonal-body", FAST, "y, d = described.y[pick].detach(),", "y, d = described.y[pick],", BY_RAY),
+    Fault("fast-eikonal-body", FAST, "y = y.detach() + GRADIENT_STEP_M", "y = y + GRADIENT_STEP_M", BY_RAY),
     Fault("fast-elastic-unit", FAST, "(moved / ELASTIC_M)", "moved", BY_RAY),
-    Fault("fast-colour-place", FAST, "self._colour(move_to_surface(described, d + residual),",
-          "self._colour(described,", BY_RAY),
+    Fault("fast-colour-place", FAST, "self._colour(scene.bodies, move_to_surface(described, d + residual),",
+          "self._colour(scene.bodies, described,", BY_RAY),
     Fault("fast-core", FAST, "torch.where(core[hit, None], 1.0, alpha_dot[:, -1:])", "alpha_dot[:, -1:]", BY_FAST),
     Fault("fast-tighten-sides", FAST, "side * described.d[seen]", "-side * described.d[seen]", BY_TIGHTEN),
     Fault("fast-tighten-poses", FAST, "seen |= described.near", "seen = described.near", BY_TIGHTEN),
@@ -209,7 +220,7 @@ FAULTS = (
     Fault("silhouette-orientation", SILHOUETTE, "or wp.max(wp.max(e, g), h) <= wp.float64(0.0)", "",
           "tests/geometry/test_silhouette.py"),
     Fault("boards-transposed", BOARDS, "R = b[0] @ a[0].T", "R = b[0] @ a[0]",
-          "tests/calibration/test_calibrate_boards.py"),
+          "tests/calibration/boards/test_calibrate.py"),
     Fault("bundle-transposed", BUNDLE, "old.R.T @ new.R for", "new.R.T @ old.R for",
           "tests/calibration/test_bundle.py"),
     Fault("turning-jacobian", ARTICULATION, "+ first * cross + second", "- first * cross + second",
@@ -218,11 +229,11 @@ FAULTS = (
     Fault("colmap-pixel-centre", COLMAP, "cx - PIXEL_CENTRE", "cx", BY_FILES),
     Fault("colmap-distortion", COLMAP, "distortion=values[4:9]", "distortion=values[5:9]", BY_FILES),
     Fault("zjumocap-unit", ZJUMOCAP, "METRES_PER_UNIT = 1e-3", "METRES_PER_UNIT = 1.0",
-          "tests/capture/test_zjumocap.py"),
+          "tests/capture/formats/test_zjumocap.py"),
     Fault("normalise-keypoints", NORMALISE, "* scale + (scale - 1) / 2", "* scale", BY_INGEST),
     Fault("lens-distortion", NORMALISE, "if np.any(lens.distortion):", "if np.any(lens.distortion[2:]):", BY_INGEST),
     Fault("frames-split", MANIFEST, "train = recorded[: len(recorded) - len(novel)]",
-          "train = recorded[: len(recorded) - len(novel) + 1]", "tests/capture/test_pose2sim.py"),
+          "train = recorded[: len(recorded) - len(novel) + 1]", "tests/capture/formats/test_pose2sim.py"),
     Fault("capture-link", SAFE_IO, "if stat.S_ISLNK(mode):", "if False:", BY_BAD_INPUT),
     Fault("capture-pipe", SAFE_IO, "if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):", "if False:", BY_BAD_INPUT),
     Fault("yaml-aliases", "hnerf/strict_yaml.py", "if isinstance(event, yaml.AliasEvent):", "if False:",
@@ -230,7 +241,7 @@ FAULTS = (
     Fault("toml-deep-keys", SAFE_IO, "if _DEEP_KEY.search(text):", "if False:", BY_BAD_INPUT),
     Fault("npz-unpacked-size", SAFE_IO, "if unpacked_bytes > max_bytes:", "if False:", "tests/render/test_motion.py"),
     Fault("smpl-limits", "hnerf/capture/given_poses.py", "if not (np.abs(values) <= limit).all():", "if False:",
-          "tests/capture/test_zjumocap.py"),
+          "tests/capture/formats/test_zjumocap.py"),
     Fault("sides-exchanged", "hnerf/calibration/doubts.py", "np.cross(up, forward)", "np.cross(forward, up)",
           "tests/calibration/test_doubts.py"),
     Fault("calibration-digits", "hnerf/calibration/report.py", "round(tree, DECIMALS)", "round(tree, 15)",
@@ -240,7 +251,7 @@ FAULTS = (
     Fault("stage-axis", "hnerf/geometry/axes.py", "[0, 0, 1], [0, -1, 0]])", "[0, 0, 1], [0, 1, 0]])",
           "tests/asset/test_staging.py"),
     Fault("root-heading", MOTIONS, "2 * np.arctan2(y, w)", "np.arctan2(y, w)", BY_MOTIONS),
-    Fault("slerp-share", MOTIONS, "turn * np.repeat(share, joints)", "turn * np.tile(share, joints)", BY_PACKAGE),
+    Fault("slerp-share", MOTIONS, "np.repeat(share, joints)", "np.tile(share, joints)", BY_PACKAGE),
     Fault("resampled-start", MOTIONS, "np.ceil(first - 1e-6)", "np.floor(first)", BY_MOTIONS),
     Fault("bones-front", SKELETON, "UP if _points_to_front(name) else FRONT", "FRONT if _points_to_front(name) else UP",
           "tests/asset/test_skeleton.py"),
@@ -265,6 +276,20 @@ FAULTS = (
           "image[y, x] = render_beside(mixed, QUARTERS_PX).mean(0)", BY_ANTIALIASING),
     Fault("photographs-cosine", PHOTOGRAPHS, "cosine**COSINE_POWER", "cosine", BY_PHOTOGRAPHS),
     Fault("photographs-hidden", PHOTOGRAPHS, "(distance_m < seen_m[row", "(distance_m > -seen_m[row", BY_PHOTOGRAPHS),
+    Fault("light-reflected", LIGHT, "[1, 2 / 3, 1 / 4]", "[1, 2 / 3, 1 / 2]", BY_LIGHT),
+    Fault("light-ridge", LIGHT, "RIDGE = 1e-5", "RIDGE = 1e-1", BY_LIGHT),
+    Fault("light-outliers", LIGHT, "(error / OUTLIER)", "(0 * error)", BY_LIGHT),
+    Fault("light-axes", LIGHT, "directions @ rotation.T", "directions @ rotation", BY_LIGHT),
+    Fault("light-scale", LIGHT, "coefficients / (basis @ coefficients).max()", "coefficients", BY_LIGHT),
+    Fault("shading-linear", SHADING, "to_linear(sampled(", "abs(sampled(", BY_SHADING),
+    Fault("shading-hidden", SHADING, "- HIDDEN_M", "- 10", BY_SHADING),
+    Fault("shading-outline", SHADING, "np.ptp(around_m, 0) < EDGE_SLOPE", "0 < EDGE_SLOPE", BY_SHADING),
+    Fault("albedo-irradiance", ALBEDO, "+= counts * irradiance", "+= counts", BY_ALBEDO),
+    Fault("albedo-vote", ALBEDO, "self._field[seen.index] * irradiance", "self._field[seen.index]", BY_ALBEDO),
+    Fault("albedo-field", ALBEDO, "self._field = seen / field_irradiance[:, None]", "self._field = seen", BY_ALBEDO),
+    Fault("dome-mirrored", DOME, "np.pi * (1 - (np.arange(2 ", "np.pi * (-1 + (np.arange(2 ", BY_DOME),
+    Fault("look-light-in-world", "hnerf/asset/staging.py", "albedo.light.turned(world)", "albedo.light", BY_PACKAGE),
+    Fault("glb-looks", GLB, '{"material": k, "variants": [k]}', '{"material": 0, "variants": [k]}', BY_GLB),
     Fault("photographs-outline", PHOTOGRAPHS, "inside & ~outline[row, column]", "inside", BY_PHOTOGRAPHS),
     Fault("photographs-gain", PHOTOGRAPHS, "pixels_px) / gain", "pixels_px) * gain", BY_PHOTOGRAPHS),
     Fault("correctives-turn", CORRECTIVES, "solve(turn, surface_m", "solve(turn.mT, surface_m", BY_CORRECTIVES),

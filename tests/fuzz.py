@@ -43,7 +43,7 @@ from hnerf.render.motion import _read_amass
 from hnerf.render.trajectory import read_camera_path
 from tasks.store import Store
 from tests.capture import recordings as rec
-from tests.capture.test_zjumocap import write_parameters, write_zju
+from tests.capture.formats.test_zjumocap import write_parameters, write_zju
 
 MAX_SECONDS, MAX_BYTES, HANG_S = 2.0, 500_000_000, 20.0
 ROOM_BYTES = 3_000_000_000  # more than MAX_BYTES, because most of what libraries map they never use

@@ -30,7 +30,8 @@ from uuid import uuid4
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.machines import MARK, ROOT, Machine, command, marked, process, resident_kib
-from tests.postgresql import BINARIES, cluster, free_port
+from tests.postgresql import BINARIES, cluster
+from tests.prefect_server import free_port
 
 SIZES = {"size_px": 96, "train_cameras": 4, "test_cameras": 1, "train_frames": 4, "novel_pose_frames": 1}
 PRESET = """based_on: demo

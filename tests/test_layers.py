@@ -9,7 +9,18 @@ import pytest
 import hnerf
 
 ROOT = Path(hnerf.__file__).parent
-FOUNDATION = ("errors", "evenly_spaced", "tables", "files", "progress", "models", "strict_yaml", "config", "results")
+FOUNDATION = (
+    "errors",
+    "evenly_spaced",
+    "tables",
+    "files",
+    "progress",
+    "side_by_side",
+    "models",
+    "strict_yaml",
+    "config",
+    "results",
+)
 FLOORS = (*FOUNDATION, "geometry", "capture", "detection", "body", "synthetic", "segmentation", "calibration", "fields",
           "baselines", "avatar", "training", "render", "evaluation", "asset", "study")  # fmt: skip
 

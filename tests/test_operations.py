@@ -4,7 +4,6 @@ import os
 import re
 import shlex
 import shutil
-import socket
 import subprocess
 import sys
 import time
@@ -14,6 +13,8 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+
+from tests.prefect_server import free_port
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared" / "data"
@@ -112,9 +113,7 @@ def shared_stand_ins(folder: Path) -> dict[str, str]:
 
 def environment(folder: Path) -> dict[str, str]:
     """Return the environment of the commands: a server of their own."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     return os.environ | {
         "PREFECT_HOME": str(folder / ".prefect"),
         "PREFECT_SERVER_API_PORT": str(port),

@@ -1,9 +1,13 @@
-"""The asset's texture: the field's colours, and what the training photographs show."""
+"""The asset's textures: the field's colours and what the training photographs show, in the recording's light and
+without it."""
 
 import numpy as np
 
+from hnerf.asset.albedo import Albedo, AlbedoBlend, mean_irradiance
 from hnerf.asset.field_colours import field_colours
-from hnerf.asset.photographs import colours_from_photographs
+from hnerf.asset.light import fit_light
+from hnerf.asset.photographs import CapturedBlend, photographed_texels
+from hnerf.asset.shading import photographed_shading
 from hnerf.asset.texture import UvLayout, rasterise, texture_image
 from hnerf.avatar.avatar import Avatar
 from hnerf.body.fit_result import BodyFit
@@ -13,22 +17,30 @@ from hnerf.evenly_spaced import evenly_spaced
 from hnerf.render.motion import select_poses
 
 
-def baked_texture(
+def baked_textures(
     capture: Capture,
     avatar: Avatar,
     clothed: BodyFit,
     surfaces_m: np.ndarray,
     layout: UvLayout,
     settings: AssetSettings,
-) -> np.ndarray:
-    """Return the texture of the clothed body, (H, W, 3) uint8 sRGB. surfaces_m (n, V, 3): its surface in the world in
-    each frame."""
+) -> tuple[np.ndarray, Albedo | None]:
+    """Return the texture of the clothed body, (H, W, 3) uint8 sRGB, and its albedo, unless it is the field's alone.
+    surfaces_m (n, V, 3): its surface in the world in each frame."""
     texels = rasterise(layout, settings.texture_px)
     posed = select_poses(clothed, tuple(evenly_spaced(capture.train_frames, settings.texture_poses)))
-    colours = field_colours(avatar, posed, texels)
-    if settings.photograph_frames:
-        frames = evenly_spaced(capture.train_frames, settings.photograph_frames)
-        photographed = {frame: surfaces_m[clothed.index(frame)] for frame in frames}
-        faces = clothed.rig.faces.numpy()
-        colours = colours_from_photographs(capture, avatar.gains, photographed, faces, texels, colours)
-    return texture_image(texels, colours, settings.texture_px)
+    field = field_colours(avatar, posed, texels)
+    if not settings.photograph_frames:
+        return texture_image(texels, field, settings.texture_px), None
+    frames = evenly_spaced(capture.train_frames, settings.photograph_frames)
+    photographed = {frame: surfaces_m[clothed.index(frame)] for frame in frames}
+    faces = clothed.rig.faces.numpy()
+    light = fit_light(photographed_shading(capture, avatar.gains, photographed, faces))
+    seen_by_field = [surfaces_m[clothed.index(frame)] for frame in posed.frames]
+    captured = CapturedBlend(field)
+    albedo = AlbedoBlend(field, mean_irradiance(light, seen_by_field, faces, texels), light)
+    for seen in photographed_texels(capture, avatar.gains, photographed, faces, texels):
+        captured.add(seen)
+        albedo.add(seen)
+    texture, delit = (texture_image(texels, blend.colours(), settings.texture_px) for blend in (captured, albedo))
+    return texture, Albedo(delit, light)

@@ -14,12 +14,20 @@ import numpy as np
 import torch
 import trimesh
 
-from hnerf.asset.baking import baked_texture
+from hnerf.asset.albedo import Albedo
+from hnerf.asset.baking import baked_textures
 from hnerf.asset.bvh_file import write_avatar_bvh
 from hnerf.asset.comparison import compare_with_field, comparison_figures, require_close
 from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
 from hnerf.asset.extreme_poses import extreme_poses
-from hnerf.asset.figures import beyond_skinning_mm, mesh_figures, motion_figures, rig_figures, surface_figures
+from hnerf.asset.figures import (
+    beyond_skinning_mm,
+    light_figures,
+    mesh_figures,
+    motion_figures,
+    rig_figures,
+    surface_figures,
+)
 from hnerf.asset.glb import write_glb
 from hnerf.asset.normal_map import normal_map
 from hnerf.asset.package import AssetInfo, write_cache, write_package, write_usdz
@@ -79,12 +87,12 @@ def export_asset(
     timeless = avatar.without_frames()  # one texture serves all frames
     layout = surface.mesh.layout(settings.texture_px)
     with _timed("texture", seconds):
-        texture = baked_texture(capture, timeless, surface.body, surface.surfaces_m, layout, settings)
+        texture, albedo = baked_textures(capture, timeless, surface.body, surface.surfaces_m, layout, settings)
     with _timed("normal map", seconds):
         px = settings.normal_map_px
         normals = normal_map(timeless, surface.mesh, layout, px) if px else None
     with _timed("staging", seconds):
-        staged = _staged(capture, timeless.body, surface, layout, texture, normals, settings, further or {})
+        staged = _staged(capture, timeless.body, surface, layout, texture, albedo, normals, settings, further or {})
     with _timed("comparison", seconds):
         compared = compare_with_field(capture, masks, avatar, staged)
         against_field = comparison_figures(compared)
@@ -138,6 +146,7 @@ def _staged(
     surface: ClothedSurface,
     layout: UvLayout,
     texture: np.ndarray,
+    albedo: Albedo | None,
     normals: np.ndarray | None,
     settings: AssetSettings,
     further: Mapping[str, Motion],
@@ -158,6 +167,7 @@ def _staged(
         capture.fps,
         settings.bones,
         added,
+        albedo,
         normals,
     )
 
@@ -174,6 +184,7 @@ def _figures(
         "findings": findings(surface.distances_mm[settings.topology]) if registered else [],
         "texture_px": settings.texture_px,
         "normal_map_px": settings.normal_map_px,
+        "light": light_figures(staged.albedo.light) if staged.albedo else None,
         "joints": len(staged.rigs[FULL].skeleton.names),
         "rigs": {name: rig_figures(staged, name) for name in staged.rigs},
         "motions": motion_figures(staged),

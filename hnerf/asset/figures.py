@@ -6,6 +6,7 @@ import numpy as np
 import trimesh
 
 from hnerf.asset.correctives import Correctives
+from hnerf.asset.light import Light
 from hnerf.asset.registration import crossing_faces
 from hnerf.asset.rigs import FULL
 from hnerf.asset.staging import CAPTURED, StagedAvatar
@@ -47,6 +48,11 @@ def rig_figures(staged: StagedAvatar, name: str) -> dict[str, float]:
 def motion_figures(staged: StagedAvatar) -> dict[str, dict[str, float]]:
     """Return the rate and the number of poses of each motion."""
     return {name: {"fps": motion.fps, "poses": len(motion.codes)} for name, motion in staged.rigs[FULL].motions.items()}
+
+
+def light_figures(light: Light) -> dict[str, Any]:
+    """Return the light's coefficients in the stage, and how far the normals of points turned to show it."""
+    return {"coefficients": light.coefficients.round(4).tolist(), "normals_turned_deg": light.turn_deg}
 
 
 def beyond_skinning_mm(displacements_m: np.ndarray, correctives: Correctives) -> dict[str, float]:

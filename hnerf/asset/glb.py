@@ -18,6 +18,7 @@ from hnerf.body.descriptor import normals_of
 
 COMPONENT_TYPES = {"float32": gltf.FLOAT, "uint16": gltf.UNSIGNED_SHORT, "uint32": gltf.UNSIGNED_INT}
 RESAMPLED = [f"{CAPTURED}_{rate}" for rate in RATES]  # glTF counts in seconds and does not need them
+VARIANTS = "KHR_materials_variants"
 STILL = 1e-6  # metres or radians by which a joint without a channel may be off
 SHAPES = {(): gltf.SCALAR, (2,): gltf.VEC2, (3,): gltf.VEC3, (4,): gltf.VEC4, (4, 4): gltf.MAT4}
 
@@ -66,9 +67,10 @@ def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig) -> None:
     writer = GlbWriter()
     document = writer.document
     _add_joints(document, rig.skeleton)
-    document.materials.append(_material(writer, avatar))
     no_weights = [0.0] * len(avatar.shapes_m)
-    document.meshes.append(gltf.Mesh(primitives=[_primitive(writer, avatar, rig.skin)], weights=no_weights or None))
+    primitive = _primitive(writer, avatar, rig.skin)
+    _add_materials(writer, avatar, primitive)
+    document.meshes.append(gltf.Mesh(primitives=[primitive], weights=no_weights or None))
     inverse_bind = np.linalg.inv(rig.skeleton.bind).swapaxes(1, 2).astype(np.float32)  # stored by columns
     joints = list(range(len(rig.skeleton.names)))
     document.skins.append(gltf.Skin(inverseBindMatrices=writer.accessor(inverse_bind), joints=joints, skeleton=0))
@@ -118,14 +120,24 @@ def _vertex_data(writer: GlbWriter, values: np.ndarray, dtype: type) -> int:
     return writer.accessor(values.astype(dtype), gltf.ARRAY_BUFFER)
 
 
-def _material(writer: GlbWriter, avatar: StagedAvatar) -> gltf.Material:
-    writer.document.samplers.append(gltf.Sampler(wrapS=gltf.CLAMP_TO_EDGE, wrapT=gltf.CLAMP_TO_EDGE))
-    colours = gltf.TextureInfo(index=_add_texture(writer, avatar.texture))
-    matte = gltf.PbrMetallicRoughness(baseColorTexture=colours, metallicFactor=0.0, roughnessFactor=1.0)
-    material = gltf.Material(name="Captured", pbrMetallicRoughness=matte)
-    if avatar.normal_map is not None:
-        material.normalTexture = gltf.NormalMaterialTexture(index=_add_texture(writer, avatar.normal_map))
-    return material
+def _add_materials(writer: GlbWriter, avatar: StagedAvatar, primitive: gltf.Primitive) -> None:
+    """Add the captured look, which the primitive has, and the albedo, if there is one, as another variant of it."""
+    document = writer.document
+    document.samplers.append(gltf.Sampler(wrapS=gltf.CLAMP_TO_EDGE, wrapT=gltf.CLAMP_TO_EDGE))
+    looks = {"captured": avatar.texture} | ({"albedo": avatar.albedo.texture} if avatar.albedo else {})
+    normals = None if avatar.normal_map is None else _add_texture(writer, avatar.normal_map)
+    for name, texture in looks.items():
+        colours = gltf.TextureInfo(index=_add_texture(writer, texture))
+        matte = gltf.PbrMetallicRoughness(baseColorTexture=colours, metallicFactor=0.0, roughnessFactor=1.0)
+        material = gltf.Material(name=name.capitalize(), pbrMetallicRoughness=matte)
+        if normals is not None:
+            material.normalTexture = gltf.NormalMaterialTexture(index=normals)
+        document.materials.append(material)
+    if len(looks) > 1:
+        document.extensionsUsed = [VARIANTS]
+        document.extensions = {VARIANTS: {"variants": [{"name": name} for name in looks]}}
+        mappings = [{"material": k, "variants": [k]} for k in range(len(looks))]
+        primitive.extensions = {VARIANTS: {"mappings": mappings}}
 
 
 def _add_texture(writer: GlbWriter, image: np.ndarray) -> int:

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import rotation_from_axis_angle
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP
+from hnerf.geometry.rotations import slerp
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def motion_of(body: BodyFit, fps: float, shape_weights: np.ndarray, stage_from_w
 def resampled(motion: Motion, fps: float) -> Motion:
     """Return the motion at the whole time codes of another rate that lie within it; at least one, the nearest.
 
-    Rotations are interpolated at constant angular velocity (slerp, Shoemake 1985), positions and weights linearly.
+    Rotations are interpolated at constant angular velocity, positions and weights linearly.
     """
     first, last = motion.seconds[[0, -1]] * fps
     codes = np.arange(int(np.ceil(first - 1e-6)), int(np.floor(last + 1e-6)) + 1).astype(float)
@@ -66,8 +67,13 @@ def resampled(motion: Motion, fps: float) -> Motion:
     after = np.minimum(before + 1, len(motion.codes) - 1)
     span_s = np.maximum(motion.seconds[after] - motion.seconds[before], 1e-9)
     share = (at_s - motion.seconds[before]) / span_s
-    turns = _slerp(motion.turns[before], motion.turns[after], share)
-    origins_m, weights = (_lerp(v[before], v[after], share) for v in (motion.origins_m, motion.shape_weights))
+    n, joints = len(codes), motion.turns.shape[1]
+    start, end = (Rotation.from_matrix(motion.turns[rows].reshape(-1, 3, 3)) for rows in (before, after))
+    turns = slerp(start, end, np.repeat(share, joints)).as_matrix().reshape(n, joints, 3, 3)
+    origins_m, weights = (
+        values[before] + share[:, None] * (values[after] - values[before])
+        for values in (motion.origins_m, motion.shape_weights)
+    )
     return Motion(fps, codes, turns, origins_m, weights)
 
 
@@ -90,16 +96,3 @@ def continuous_quaternions(rotations: np.ndarray) -> np.ndarray:
     same_side = (quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True) >= 0
     quaternions[1:] *= np.cumprod(np.where(same_side, 1, -1), axis=0)
     return quaternions
-
-
-def _slerp(start: np.ndarray, end: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Return rotations (n, J, 3, 3) between two, at shares (n,)."""
-    n, joints = start.shape[:2]
-    first = Rotation.from_matrix(start.reshape(-1, 3, 3))
-    turn = (first.inv() * Rotation.from_matrix(end.reshape(-1, 3, 3))).as_rotvec()
-    part = Rotation.from_rotvec(turn * np.repeat(share, joints)[:, None])
-    return (first * part).as_matrix().reshape(n, joints, 3, 3)
-
-
-def _lerp(start: np.ndarray, end: np.ndarray, share: np.ndarray) -> np.ndarray:
-    return start + share[:, None] * (end - start)

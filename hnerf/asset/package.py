@@ -17,16 +17,20 @@ from zipfile import ZipFile
 import numpy as np
 from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
 
+from hnerf.asset.dome import dome
 from hnerf.asset.rigs import FULL
 from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar
 from hnerf.asset.usd import (
+    ALBEDO_NAME,
+    LIGHT_NAME,
     NORMAL_MAP_NAME,
     ROOT,
     SURFACE,
     TEXTURE_NAME,
+    author_albedo_look,
     author_cameras,
+    author_captured_look,
     author_geometry,
-    author_look,
     author_motion,
     author_rig,
     define_mesh,
@@ -98,7 +102,7 @@ def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps
         stage = _new_stage(Path(folder) / "avatar_cache.usdc", avatar, avatar.frames, fps, info)
         author_cameras(stage, cameras, avatar.stage_from_world)
         mesh = define_mesh(stage, ROOT.AppendChild("Surface"), avatar)
-        author_look(stage, mesh.GetPath(), avatar)
+        author_captured_look(stage, mesh.GetPath(), avatar)
         points, extents, normals = mesh.CreatePointsAttr(), mesh.CreateExtentAttr(), mesh.CreateNormalsAttr()
         for frame, posed in zip(avatar.frames, avatar.points_m, strict=True):
             points.Set(vec3f(posed), float(frame))
@@ -112,7 +116,7 @@ def _parts(avatar: StagedAvatar, cameras: list[Camera], fps: float) -> list[Part
     view = partial(author_cameras, cameras=cameras, stage_from_world=avatar.stage_from_world)
     return [
         Part("geometry", partial(author_geometry, avatar=avatar), fps),
-        Part("look", partial(author_look, mesh=SURFACE, avatar=avatar), fps),
+        *_looks(avatar, fps),
         Part("cameras", view, fps),
         *(
             Part(f"rig_{name}", partial(author_rig, name=name, rig=rig), fps, ("rig", name))
@@ -123,6 +127,17 @@ def _parts(avatar: StagedAvatar, cameras: list[Camera], fps: float) -> list[Part
             for name, motion in avatar.rigs[FULL].motions.items()
         ),
     ]
+
+
+def _looks(avatar: StagedAvatar, fps: float) -> list[Part]:
+    """Return the look as captured, and, if there is one, that of the albedo with the light."""
+    author = partial(author_captured_look, mesh=SURFACE, avatar=avatar)
+    looks = [Part("look_captured", author, fps, ("look", "captured"))]
+    if avatar.albedo is not None:
+        _, intensity = dome(avatar.albedo.light)
+        author = partial(author_albedo_look, mesh=SURFACE, avatar=avatar, intensity=intensity)
+        looks.append(Part("look_albedo", author, fps, ("look", "albedo")))
+    return looks
 
 
 @contextmanager
@@ -140,6 +155,7 @@ def _in_variant(stage: Usd.Stage, part: Part) -> Iterator[None]:
 
 def _select(stage: Usd.Stage, motion: str) -> None:
     sets = stage.GetDefaultPrim().GetVariantSets()
+    sets.SetSelection("look", "captured")
     sets.SetSelection("rig", FULL)
     sets.SetSelection("motion", motion)
 
@@ -205,6 +221,9 @@ def _package(stage: Usd.Stage, avatar: StagedAvatar, path: Path) -> None:
 
 def _write_images(folder: Path, avatar: StagedAvatar) -> None:
     write_image(folder / TEXTURE_NAME, avatar.texture)
+    if avatar.albedo is not None:
+        write_image(folder / ALBEDO_NAME, avatar.albedo.texture)
+        write_image(folder / LIGHT_NAME, dome(avatar.albedo.light)[0])
     if avatar.normal_map is not None:
         write_image(folder / NORMAL_MAP_NAME, avatar.normal_map)
 

@@ -1,7 +1,7 @@
 """Defects of an asset's structure: what OpenUSD's guidelines ask of the root prim of a component."""
 
 import numpy as np
-from pxr import Kind, Usd, UsdGeom
+from pxr import Kind, Usd, UsdGeom, UsdLux, UsdShade
 
 INFORMATION = ("identifier", "name", "version", "captureDigest", "licence")
 
@@ -21,7 +21,7 @@ def package_defects(stage: Usd.Stage) -> list[str]:
         defects.append("timeCodesPerSecond and framesPerSecond differ")
     if not stage.GetStartTimeCode() <= stage.GetEndTimeCode():
         defects.append("ends before it starts")
-    return defects + _extent_defects(root)
+    return defects + _extent_defects(root) + _look_defects(root)
 
 
 def _extent_defects(root: Usd.Prim) -> list[str]:
@@ -38,3 +38,19 @@ def _extent_defects(root: Usd.Prim) -> list[str]:
             if (lower < hint[0] - 1e-4).any() or (upper > hint[1] + 1e-4).any():
                 return [f"{root.GetPath()}: extentsHint does not contain {prim.GetPath()} at time {time}"]
     return []
+
+
+def _look_defects(root: Usd.Prim) -> list[str]:
+    """Return the defects of the meshes' materials, and of the light that an albedo needs to look as captured."""
+    prims = list(Usd.PrimRange(root))
+    bare = [
+        prim
+        for prim in prims
+        if prim.IsA(UsdGeom.Mesh) and not UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
+    ]
+    defects = [f"{prim.GetPath()}: no material is bound" for prim in bare]
+    if root.GetVariantSet("look").GetVariantSelection() == "albedo":
+        domes = [UsdLux.DomeLight(prim) for prim in prims if prim.IsA(UsdLux.DomeLight)]
+        if not any(dome.GetTextureFileAttr().Get() and dome.GetIntensityAttr().Get() > 0 for dome in domes):
+            defects.append(f"{root.GetPath()}: the albedo has no light with a picture")
+    return defects

@@ -1,6 +1,7 @@
 """A texture from the training photographs: each texel's colour as the cameras saw it, on the surface of each frame."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from itertools import product
 
 import cv2
@@ -24,36 +25,60 @@ FAR_M = 1e3  # depth where a ray meets nothing
 FIELD_WEIGHT = 0.05  # of the field's colour; a view along the normal weighs 1
 
 
-def colours_from_photographs(
-    capture: Capture, gains: Gains, surfaces_m: Mapping[int, np.ndarray], faces: np.ndarray, texels: Texels,
-    field_colours: np.ndarray,
-) -> np.ndarray:  # fmt: skip
-    """Return the colour of each texel, (N, 3) in [0, 1], from the training photographs of some frames; the field's own,
-    field_colours (N, 3), where none sees it. surfaces_m: vertices (V, 3) in the world by frame.
+@dataclass(frozen=True)
+class SeenTexels:
+    """What a photograph shows of texels: index (M,) of these, cosine (M,) of the view to their unit normals (M, 3), and
+    colours (M, 3) in [0, 1], divided by the camera's gains."""
 
-    The mean over views, weighted by the fourth power of the cosine to the normal, and less the more a view contradicts
-    the field (Geman-McClure). A view counts for nothing where the surface hides the texel, or near an outline. Colours
-    are divided by the gains of their cameras.
-    """
-    weight = np.full((len(field_colours), 1), FIELD_WEIGHT)
-    total = FIELD_WEIGHT * field_colours
+    index: np.ndarray
+    cosine: np.ndarray
+    normals: np.ndarray
+    colours: np.ndarray
+
+    def weights(self, expected: np.ndarray) -> np.ndarray:
+        """Return how much each texel counts, (M, 1): the fourth power of the cosine, and less the more its colour
+        contradicts the expected one (M, 3) (Geman-McClure)."""
+        error = np.linalg.norm(self.colours - expected, axis=1) / OUTLIER
+        return (self.cosine**COSINE_POWER / (1 + error**2) ** 2)[:, None]
+
+
+class CapturedBlend:
+    """The mean colour of texels over photographs, weighted by their agreement with the field's colours (N, 3), which
+    count a little everywhere, so that they are what no photograph shows."""
+
+    def __init__(self, field_colours: np.ndarray) -> None:
+        self._field = field_colours
+        self._weight = np.full((len(field_colours), 1), FIELD_WEIGHT)
+        self._total = FIELD_WEIGHT * field_colours
+
+    def add(self, seen: SeenTexels) -> None:
+        """Take in a photograph."""
+        counts = seen.weights(self._field[seen.index])
+        self._weight[seen.index] += counts
+        self._total[seen.index] += counts * seen.colours
+
+    def colours(self) -> np.ndarray:
+        """Return the colours (N, 3) in [0, 1]."""
+        return np.clip(self._total / self._weight, 0, 1)
+
+
+def photographed_texels(
+    capture: Capture, gains: Gains, surfaces_m: Mapping[int, np.ndarray], faces: np.ndarray, texels: Texels
+) -> Iterator[SeenTexels]:
+    """Yield what the training photographs of some frames show of the texels, where the surface does not hide them, away
+    from outlines. surfaces_m: vertices (V, 3) in the world by frame."""
     views = list(product(surfaces_m, capture.train_cameras))
     for frame, name in tracked(views, "photographs", len(views)):
         camera, gain = capture.cameras[name], gains.get(name, (1.0, 1.0, 1.0))
-        index, cosine, pixels_px = visible_texels(camera, surfaces_m[frame], faces, texels)
-        colour = _sampled(capture.image(name, frame), pixels_px) / gain
-        error = np.linalg.norm(colour - field_colours[index], axis=1) / OUTLIER
-        counts = (cosine**COSINE_POWER / (1 + error**2) ** 2)[:, None]
-        weight[index] += counts
-        total[index] += counts * colour
-    return np.clip(total / weight, 0, 1)
+        index, cosine, normals, pixels_px = visible_texels(camera, surfaces_m[frame], faces, texels)
+        yield SeenTexels(index, cosine, normals, sampled(capture.image(name, frame), pixels_px) / gain)
 
 
 def visible_texels(
     camera: Camera, vertices_m: np.ndarray, faces: np.ndarray, texels: Texels
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return which texels (M,) a camera sees away from outlines, the cosines of its view to their normals (M,), and
-    their pixels (M, 2)."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return which texels (M,) a camera sees away from outlines, the cosines of its view to their normals (M,), these
+    unit normals (M, 3), and their pixels (M, 2)."""
     normals = normals_of(vertices_m, faces)
     towards = camera.centre_m - vertices_m
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
@@ -64,13 +89,14 @@ def visible_texels(
     pixels_px, _ = camera.project(points_m)
     view_m = camera.centre_m - points_m
     distance_m = np.linalg.norm(view_m, axis=1)
-    cosine = (view_m * normal).sum(1) / (distance_m * np.linalg.norm(normal, axis=1).clip(1e-9))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-9)
+    cosine = (view_m * normal).sum(1) / distance_m
     seen_m, outline = _depth(camera, vertices_m, faces)
     column, row = np.round(pixels_px).astype(int).T
     inside = (column >= 0) & (row >= 0) & (column < camera.width_px) & (row < camera.height_px) & (cosine > 0)
     column, row = (np.where(inside, at, 0) for at in (column, row))
     visible = inside & ~outline[row, column] & (distance_m < seen_m[row, column] + DEPTH_TOLERANCE_M / cosine.clip(0.1))
-    return index[visible], cosine[visible], pixels_px[visible]
+    return index[visible], cosine[visible], normal[visible], pixels_px[visible]
 
 
 def _depth(camera: Camera, vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +114,7 @@ def _depth(camera: Camera, vertices_m: np.ndarray, faces: np.ndarray) -> tuple[n
     return depth_m, cv2.dilate(depth_m, window) - near_m > EDGE_SLOPE * width_m
 
 
-def _sampled(image: np.ndarray, pixels_px: np.ndarray) -> np.ndarray:
+def sampled(image: np.ndarray, pixels_px: np.ndarray) -> np.ndarray:
     """Return the colours (M, 3) in [0, 1] at points (M, 2) of an image (H, W, 3) uint8, by bilinear interpolation."""
     x, y = pixels_px.T
     return np.stack([map_coordinates(image[..., k] / 255, [y, x], order=1, mode="nearest") for k in range(3)], 1)

@@ -80,9 +80,9 @@ def _to_edge_m(surface: Surface, hits: RayHits) -> np.ndarray:
     return (hits.barycentric[met] * heights_m).min(1)
 
 
-def texture_picture(avatar: StagedAvatar, side_px: int) -> np.ndarray:
-    """Return the texture, scaled to a square."""
-    return cv2.resize(avatar.texture, (side_px, side_px), interpolation=cv2.INTER_AREA)
+def texture_picture(texture: np.ndarray, side_px: int) -> np.ndarray:
+    """Return a texture, scaled to a square."""
+    return cv2.resize(texture, (side_px, side_px), interpolation=cv2.INTER_AREA)
 
 
 def uv_picture(avatar: StagedAvatar, side_px: int) -> np.ndarray:

@@ -3,10 +3,12 @@
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import trimesh
 
 from hnerf.asset.comparison import Compared
+from hnerf.asset.dome import dome
 from hnerf.asset.extreme_poses import ExtremePose
 from hnerf.asset.pictures import texture_picture, textured, turntable_cameras, uv_picture, wireframe
 from hnerf.asset.skeleton import FRONT
@@ -57,8 +59,9 @@ def write_report(
                 _picture("Wireframe, back", wireframe(surface, back)),
             ],
             texture=[
-                _picture("Texture", texture_picture(avatar, SQUARE_PX)),
+                _picture("Texture", texture_picture(avatar.texture, SQUARE_PX)),
                 _picture("Layout", uv_picture(avatar, SQUARE_PX)),
+                *_without_light(avatar),
             ],
             against_field=[_beside_field(view) for view in evenly_spaced(compared, COMPARED)],
             poses=[picture for pose in poses for picture in _extreme(pose, avatar)],
@@ -75,6 +78,17 @@ def _beside_field(view: Compared) -> list[GalleryPicture]:
         _picture(f"Photograph, camera {view.view.camera}, frame {view.view.frame}", view.photograph),
         _picture(f"Field, {psnr['field']}", view.field[..., :3]),
         _picture(f"Asset, {psnr['asset']}", view.asset[..., :3]),
+    ]
+
+
+def _without_light(avatar: StagedAvatar) -> list[GalleryPicture]:
+    """Return the albedo and the light, if there are any."""
+    if avatar.albedo is None:
+        return []
+    light = cv2.resize(dome(avatar.albedo.light)[0], (SQUARE_PX, SQUARE_PX // 2))
+    return [
+        _picture("Albedo", texture_picture(avatar.albedo.texture, SQUARE_PX)),
+        _picture("Estimated light, +Z in the middle, +X left of it", light),
     ]
 
 

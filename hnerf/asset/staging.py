@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hnerf.asset.albedo import Albedo
 from hnerf.asset.correctives import Correctives
 from hnerf.asset.motions import Motion, motion_of, resampled
 from hnerf.asset.rigs import FULL, RestSurface, StagedRig, stage_rigs
@@ -26,7 +27,8 @@ class StagedAvatar:
     V, 3) float32: corrective blend shapes, applied before the skin. rigs: "full", with all joints of the body model,
     and "game", with few joints and influences. frames (n,): of the capture; points_m (n, V, 3) float32: the surface of
     each. extents_m: the box (2, 3) at each time code of each motion, (n, 2, 3). texture (H, W, 3) uint8 sRGB.
-    stage_from_world (3, 3): a rotation. normal_map (S, S, 3) uint8, in tangent space, if there is one.
+    stage_from_world (3, 3): a rotation. albedo, with its light in the stage, and normal_map (S, S, 3) uint8, in tangent
+    space, if there are any.
     """
 
     rest_points_m: np.ndarray
@@ -40,6 +42,7 @@ class StagedAvatar:
     extents_m: dict[str, np.ndarray]
     texture: np.ndarray
     stage_from_world: np.ndarray
+    albedo: Albedo | None = None
     normal_map: np.ndarray | None = None
 
     @property
@@ -68,11 +71,12 @@ def stage_avatar(
     fps: float,
     bones: Bones = "along",
     further: Mapping[str, tuple[BodyFit, float]] | None = None,
+    albedo: Albedo | None = None,
     normal_map: np.ndarray | None = None,
 ) -> StagedAvatar:
     """Turn a clothed body (see `clothed_rig`) and its motion to Y up, with both rigs. surfaces_m (n, V, 3): its surface
     in each frame; `up`: the vertical axis of the world, "y" or "z"; fps: of the frames; further: motions of the same
-    joints in the same world with their frames a second, by name."""
+    joints in the same world with their frames a second, by name; albedo: with its light in the world."""
     world, rig, body = stage_from_world(up), clothed.rig, Y_UP_FROM_Z_UP
     rest_m, joints_m = rig.vertices_m.double().numpy() @ body.T, rig.joints_m.double().numpy() @ body.T
     stands_m = np.array([joints_m[0, 0], rest_m[:, 1].min(), joints_m[0, 2]])
@@ -93,6 +97,7 @@ def stage_avatar(
         extents_m={name: _boxes(rigs[FULL], name, rest) for name in motions},
         texture=texture,
         stage_from_world=world,
+        albedo=None if albedo is None else Albedo(albedo.texture, albedo.light.turned(world)),
         normal_map=normal_map,
     )
 

@@ -6,11 +6,12 @@ Y up, metres. Matrices are transposed on the way in (USD has row vectors).
 from collections.abc import Iterable
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
 from hnerf.asset.quads import polygon_corners
 from hnerf.asset.rigs import StagedRig
 from hnerf.asset.skeleton import Skeleton
+from hnerf.asset.srgb import to_linear
 from hnerf.asset.staging import REST_POSE, StagedAvatar
 from hnerf.body.descriptor import normals_of
 from hnerf.body.skeletons import EQUIVALENTS, SKELETONS
@@ -20,7 +21,7 @@ ROOT = Sdf.Path("/Avatar")
 BODY = ROOT.AppendChild("Body")
 SURFACE, SKELETON, MOTION = (BODY.AppendChild(name) for name in ("Surface", "Skeleton", "Motion"))
 APERTURE = 0.36  # film gate width in tenths of a scene unit, read as 36 mm where a unit is a metre
-TEXTURE_NAME, NORMAL_MAP_NAME = "texture.png", "normal_map.png"
+TEXTURE_NAME, ALBEDO_NAME, LIGHT_NAME, NORMAL_MAP_NAME = "texture.png", "albedo.png", "light.png", "normal_map.png"
 REST_NOTE = (
     f"Rest pose: {REST_POSE}, arms slanting down, elbows and knees a little bent; soles at height 0, facing +Z. The "
     "root joint stands on the ground below the pelvis; it moves over the ground and turns about the vertical with it."
@@ -45,19 +46,34 @@ def author_geometry(stage: Usd.Stage, avatar: StagedAvatar) -> None:
     binding.CreateBlendShapeTargetsRel().SetTargets(targets)
 
 
-def author_look(stage: Usd.Stage, mesh: Sdf.Path, avatar: StagedAvatar) -> None:
-    """Define a matte preview surface with the texture and the normal map, and bind the mesh to it."""
-    material = UsdShade.Material.Define(stage, ROOT.AppendPath("Materials/Captured"))
+def author_captured_look(stage: Usd.Stage, mesh: Sdf.Path, avatar: StagedAvatar) -> None:
+    """Bind the mesh to the texture in the recording's light."""
+    _define_material(stage, "Captured", TEXTURE_NAME, mesh, avatar)
+
+
+def author_albedo_look(stage: Usd.Stage, mesh: Sdf.Path, avatar: StagedAvatar, intensity: float) -> None:
+    """Bind the mesh to the albedo, and define the recording's light: intensity times the picture LIGHT_NAME."""
+    _define_material(stage, "Albedo", ALBEDO_NAME, mesh, avatar)
+    light = UsdLux.DomeLight.Define(stage, ROOT.AppendChild("Light"))
+    light.CreateIntensityAttr(intensity)
+    light.CreateTextureFileAttr(f"./{LIGHT_NAME}")
+    light.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
+
+
+def _define_material(stage: Usd.Stage, name: str, file: str, mesh: Sdf.Path, avatar: StagedAvatar) -> None:
+    """Define a matte preview surface with a texture file and the normal map, and bind the mesh to it."""
+    material = UsdShade.Material.Define(stage, ROOT.AppendPath(f"Materials/{name}"))
     UsdGeom.Scope.Define(stage, material.GetPath().GetParentPath())
     reader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("TextureCoordinates"))
     reader.CreateIdAttr("UsdPrimvarReader_float2")
     reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
     coordinates = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
-    texture = _define_texture(stage, material.GetPath().AppendChild("Texture"), TEXTURE_NAME, "sRGB", coordinates)
+    texture = _define_texture(stage, material.GetPath().AppendChild("Texture"), file, "sRGB", coordinates)
     surface = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Surface"))
     surface.CreateIdAttr("UsdPreviewSurface")
     surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
     surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
+    surface.CreateInput("ior", Sdf.ValueTypeNames.Float).Set(1.0)  # no sheen: what there was is in the colours
     colour = texture.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
     surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
     if avatar.normal_map is not None:
@@ -76,7 +92,7 @@ def _define_texture(
 ) -> UsdShade.Shader:
     texture = UsdShade.Shader.Define(stage, path)
     texture.CreateIdAttr("UsdUVTexture")
-    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(file)
+    texture.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(f"./{file}")  # without "./" USD searches for it elsewhere
     texture.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set(colour_space)
     for wrap in ("wrapS", "wrapT"):
         texture.CreateInput(wrap, Sdf.ValueTypeNames.Token).Set("clamp")
@@ -193,7 +209,7 @@ def define_mesh(stage: Usd.Stage, path: Sdf.Path, avatar: StagedAvatar) -> UsdGe
     st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
     st.Set(Vt.Vec2fArray.FromNumpy(avatar.uvs.astype(np.float32)))
     st.SetIndices(Vt.IntArray.FromNumpy(avatar.face_uvs.ravel()[corners].astype(np.int32).ravel()))
-    mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(vec3f(_linear(avatar.vertex_colours / 255)))
+    mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(vec3f(to_linear(avatar.vertex_colours / 255)))
     return mesh
 
 
@@ -210,11 +226,6 @@ def vec3f(values: np.ndarray) -> Vt.Vec3fArray:
 def extent(points_m: np.ndarray) -> Vt.Vec3fArray:
     """Return the box around points (n, 3) as USD's array of two corners."""
     return vec3f(np.stack([points_m.min(0), points_m.max(0)]))
-
-
-def _linear(encoded: np.ndarray) -> np.ndarray:
-    """Decode sRGB values in [0, 1] (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def _matrices(transforms: np.ndarray) -> Vt.Matrix4dArray:

@@ -11,10 +11,7 @@ from torch import Tensor, nn
 from hnerf.errors import InputError
 from hnerf.fields.sparse_grids import SparseGrids
 
-STEP_SUFFIX, STEPS_SUFFIX = (
-    ".step",
-    ".steps",
-)  # of a grid's quantisation step and its features in steps
+STEP_SUFFIX, STEPS_SUFFIX = (".step", ".steps")  # of a grid's quantisation step and its features in steps
 MAX_STEPS = 127  # of a feature, either sign
 
 

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from safetensors.torch import load_file
 from torch import Tensor
 
+from hnerf import config
 from hnerf.avatar.antialiasing import antialiased
 from hnerf.avatar.avatar import Gains, Rendering
 from hnerf.avatar.model_file import load_field, version_error
@@ -20,16 +21,6 @@ from hnerf.baselines.nerfies import NerfiesField
 from hnerf.baselines.neural_body import NeuralBodyField
 from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
-from hnerf.config import (
-    FastFieldSettings,
-    FieldSettings,
-    IdrSettings,
-    NerfiesSettings,
-    NerfSettings,
-    NeuralBodySettings,
-    PaperFieldSettings,
-    TrainingSettings,
-)
 from hnerf.errors import InputError
 from hnerf.fields.base import Field
 from hnerf.fields.conditions import Conditions
@@ -41,17 +32,17 @@ from hnerf.geometry.camera import Camera
 RAYS_PER_BATCH = 16384
 SAMPLES_PER_BATCH = 1 << 20  # coarse ones, for fields with many per ray: a network keeps some KiB for each
 POINTS_PER_BATCH = 1 << 17
-FIELDS: dict[type[FieldSettings], type[Field]] = {
-    FastFieldSettings: FastField,
-    PaperFieldSettings: PaperField,
-    NerfSettings: NerfField,
-    IdrSettings: IdrField,
-    NeuralBodySettings: NeuralBodyField,
-    NerfiesSettings: NerfiesField,
+FIELDS: dict[type[config.FieldSettings], type[Field]] = {
+    config.FastFieldSettings: FastField,
+    config.PaperFieldSettings: PaperField,
+    config.NerfSettings: NerfField,
+    config.IdrSettings: IdrField,
+    config.NeuralBodySettings: NeuralBodyField,
+    config.NerfiesSettings: NerfiesField,
 }
 
 
-def build_field(settings: FieldSettings, body: BodyFit, static: bool) -> Field:
+def build_field(settings: config.FieldSettings, body: BodyFit, static: bool) -> Field:
     """Return an untrained field around the fitted body; static: the capture has one training frame.
 
     Raises InputError if the field models one moment and there are more frames.
@@ -154,11 +145,11 @@ def load_avatar(folder: Path, device: torch.device | str = "cpu") -> TrainedAvat
     return TrainedAvatar(field.eval(), body, settings.field.scene_m, body, gains)
 
 
-def _stored_settings(path: Path) -> tuple[TrainingSettings, bool, Gains]:
+def _stored_settings(path: Path) -> tuple[config.TrainingSettings, bool, Gains]:
     """Return the training settings of a subject, whether it had one training frame, and the gains of its cameras."""
     stored = json.loads(path.read_text())
     try:
         gains = {name: tuple(gain) for name, gain in stored.get("gains", {}).items()}
-        return TrainingSettings.model_validate(stored["training"]), stored["static"], gains
+        return config.TrainingSettings.model_validate(stored["training"]), stored["static"], gains
     except (KeyError, ValidationError):
         raise version_error(path) from None

@@ -154,12 +154,7 @@ def intersection(points_m: Tensor, directions: Tensor, distance: Tensor, gradien
 
 
 def trace_surface(
-    distance: Callable[[Tensor], Tensor],
-    rays: Rays,
-    near: Tensor,
-    far: Tensor,
-    probe_depths: Tensor,
-    distances: Tensor,
+    distance: Callable[[Tensor], Tensor], rays: Rays, near: Tensor, far: Tensor, probe_depths: Tensor, distances: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Find where R rays first enter the surface between near and far (R,): depths (R,), far where they miss, and
     (R,) bool whether they hit.
@@ -192,12 +187,7 @@ def _sphere_trace(distance: Callable[[Tensor], Tensor], rays: Rays, near: Tensor
 
 
 def _secant(
-    distance: Callable[[Tensor], Tensor],
-    rays: Rays,
-    start: Tensor,
-    end: Tensor,
-    above: Tensor,
-    below: Tensor,
+    distance: Callable[[Tensor], Tensor], rays: Rays, start: Tensor, end: Tensor, above: Tensor, below: Tensor
 ) -> Tensor:
     """Return the root between depths start and end (N,), where the distance is `above` > 0 and `below` <= 0."""
     for _ in range(SECANT_STEPS):

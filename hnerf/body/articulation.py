@@ -14,13 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from hnerf.body.rig import (
-    Rig,
-    joint_transforms,
-    pose_vertices,
-    posed_joint_basis,
-    rotation_from_axis_angle,
-)
+from hnerf.body.rig import Rig, joint_transforms, pose_vertices, posed_joint_basis, rotation_from_axis_angle
 
 
 @dataclass(frozen=True)
@@ -89,15 +83,18 @@ class Articulation:
 
     def keypoints(self) -> Points:
         """Return the 25 BODY_25 keypoints as points on the rest body."""
-        rows, count = self.rig.keypoint_weights, len(self.joints)
-        used = (rows != 0).any(0)
-        split = (rows[:, None, used] * self.vertex_weights[used].T).flatten(0, 1)  # (25 M, V used), most rows zero
-        carried = (split != 0).any(1)
-        columns = torch.cat([self.rig.vertices_m[None], self.rig.shape_basis])[:, used].transpose(0, 1).flatten(1)
-        sums = torch.zeros(len(split), columns.shape[1], dtype=rows.dtype)
-        sums[carried] = split[carried] @ columns
-        sums = sums.unflatten(0, (-1, count)).unflatten(-1, (-1, 3)).transpose(-1, -2)  # (25, M, 3, 1 + B)
-        return Points(split.sum(1).unflatten(0, (-1, count)), sums[..., 0], sums[..., 1:])
+        used = (self.rig.keypoint_weights != 0).any(0)
+        rows, weights = self.rig.keypoint_weights[:, used], self.vertex_weights[used]
+        carried = (rows != 0).float() @ (weights != 0).float() > 0  # (25, M), few of them
+        keypoint, joint = carried.nonzero(as_tuple=True)
+        split = rows[keypoint] * weights.T[joint]  # (carried, V used)
+        columns = torch.cat([self.rig.vertices_m[None, used], self.rig.shape_basis[:, used]]).transpose(0, 1).flatten(1)
+        sums = torch.zeros(*carried.shape, columns.shape[1], dtype=rows.dtype)
+        sums[carried] = split @ columns
+        sums = sums.unflatten(-1, (-1, 3)).transpose(-1, -2)  # (25, M, 3, 1 + B)
+        shares = torch.zeros(carried.shape, dtype=rows.dtype)
+        shares[carried] = split.sum(1)
+        return Points(shares, sums[..., 0], sums[..., 1:])
 
     def pose(self, pose: Pose) -> PosedJoints:
         """Place the moving joints in the world."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.robust import geman_mcclure
 
-BALANCE_M = 0.05
+BALANCE_M = 0.05  # standard deviation
 OUTLIER_M = 0.15  # distance of a step or a jump, which is let go
 
 # Shares of the body's mass (Winter 2009, table 4.1) by BODY_25 keypoint: half at either end of a segment, that of an

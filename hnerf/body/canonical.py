@@ -30,14 +30,12 @@ FAR_M = 10.0  # a reach beyond any point that is queried
 @dataclass(frozen=True)
 class Descriptor:
     """What the body prior says of N points: d (N,) metres, negative inside; s (N, 3) on the rest body; y (N, 3)
-    canonical position; normal (N, 3) of the rest body at s, rotated into the world; near (N,) bool: within reach (the
-    rest is meaningless where it is False); corners (N, 3): vertices of the closest triangle; barycentric (N, 3) of the
-    closest point in it."""
+    canonical position; near (N,) bool: within reach (the rest is meaningless where it is False); corners (N, 3):
+    vertices of the closest triangle; barycentric (N, 3) of the closest point in it."""
 
     d: Tensor
     s: Tensor
     y: Tensor
-    normal: Tensor
     near: Tensor
     corners: Tensor
     barycentric: Tensor
@@ -72,11 +70,7 @@ class PoseCorrection(nn.Module):
 
     def totals(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return (turn, move_m, shape) since the fit, including what was absorbed."""
-        return (
-            self.turn + self.absorbed_turn,
-            self.move_m + self.absorbed_move_m,
-            self.shape + self.absorbed_shape,
-        )
+        return (self.turn + self.absorbed_turn, self.move_m + self.absorbed_move_m, self.shape + self.absorbed_shape)
 
 
 class PosedBodies:
@@ -156,7 +150,14 @@ class PosedBodies:
         if s_follows and moved.requires_grad:  # only gradients need it
             s = s + (inverse * self._closest_point_motion(posed, found.barycentric, normal, moved)[:, None]).sum(-1)
         d = found.sign * distance + (normal * moved).sum(-1)
-        return Descriptor(d, s, y, normal, found.face >= 0, corners, found.barycentric)
+        return Descriptor(d, s, y, found.face >= 0, corners, found.barycentric)
+
+    def turn(self, directions: Tensor, frame: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor:
+        """Return canonical directions (N, 3) as the skinning of rows `frame` (N,) carries them into the world at points
+        in triangles; corners, barycentric (N, 3): as in Descriptor."""
+        posed = frame.long()[:, None] * len(self.rig.vertices_m) + corners
+        linear = weighted_sum(self._linear.flatten(0, 1).flatten(1), posed, barycentric).unflatten(-1, (3, 3))
+        return (linear * directions[:, None]).sum(-1)
 
     def _closest_point_motion(self, posed: Tensor, barycentric: Tensor, normal: Tensor, moved: Tensor) -> Tensor:
         """Return how the closest point follows when its point moves by `moved` (N, 3): along the face it lies on, along

@@ -11,6 +11,7 @@ from torch import Tensor
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.hand_points import OUTLIER_M, POINT_STD_M, SIDES, finger_joints, hand_points, moved_onto_palm
 from hnerf.body.normal_equations import NormalEquations
+from hnerf.body.pose_prior import add_turn_prior
 from hnerf.body.reprojection import Views, reprojection_term
 from hnerf.body.rig import Rig
 
@@ -21,7 +22,6 @@ STD_DEG = ((25.0, 2.0, 12.0), (25.0, 2.0, 2.0), (15.0, 2.0, 2.0))
 THUMB_RELAXED_DEG = (5.0, 10.0, 10.0)
 THUMB_STD_DEG = ((15.0, 10.0, 15.0), (15.0, 2.0, 5.0), (20.0, 2.0, 2.0))
 LIMITS_DEG = (-10.0, 100.0)
-LIMIT_STD_DEG = 2.0
 RATE_DEG_S = 200.0  # standard deviation of a finger joint's speed: a fist closes in a third of a second
 # Steps, with what counts as an outlier: a fist is a decimetre from a relaxed hand. Then as for the palm.
 STEPS_M, DAMPING = (0.2, 0.2, 0.2, 0.2, *6 * (OUTLIER_M,)), 1e-4
@@ -68,20 +68,8 @@ class FingerPrior:
 
     def add(self, equations: NormalEquations, turns: Tensor) -> float:
         """Add the priors on turns (n, 30, 3) to the normal equations, whose unknowns they are; return the cost."""
-        local = torch.einsum("jac,njc->nja", self.axes, turns)
-        weight = (self.std**-2).expand_as(local).clone()
-        off = local - torch.nn.functional.pad(self.mean[:, None], (0, 2))
-        pull, excess = weight * off, local[..., 0] - local[..., 0].clamp(self.low, self.high)
-        limit = math.radians(LIMIT_STD_DEG) ** -2
-        cost = 0.5 * float((weight * off**2).sum() + limit * (excess**2).sum())
-        pull[..., 0] += limit * excess
-        weight[..., 0] += limit * (excess != 0)
-        blocks = torch.einsum("jac,nja,jad->njcd", self.axes, weight, self.axes)
-        equations.frame_gradient += torch.einsum("jac,nja->njc", self.axes, pull).flatten(1).numpy()
-        for j in range(blocks.shape[1]):
-            at = slice(3 * j, 3 * j + 3)
-            equations.frame[0][:, at, at] += blocks[:, j].numpy()
-        return cost
+        mean = torch.nn.functional.pad(self.mean[:, None], (0, 2))
+        return add_turn_prior(equations, 0, self.axes, turns, mean, self.std, self.low, self.high)
 
 
 def add_persistence(equations: NormalEquations, turns: Tensor, following: np.ndarray, std: float) -> float:

@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -66,15 +67,14 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
             else observations_of_pose(given_pose, capture)
         )
         smoothness = Smoothness(runs(capture), capture.fps, settings.acceleration_mps2 * ACCELERATION_SCALE)
-        up = "xyz".index(capture.up)
-        balance = Balance(up) if len(observations.cameras) == 1 else None
+        up, single = "xyz".index(capture.up), len(observations.cameras) == 1
         hands, step_s = observe_hands(capture), median_step(capture.frames) / capture.fps
-        ground = Ground(up) if balance else None
-        limb_depths = observe_limb_depths(capture, observations)
+        terms: dict[str, Any] = {"limb_depths": observe_limb_depths(capture, observations)}
+        terms |= {"balance": Balance(up), "ground": Ground(up)} if single else {}
         with _timed(seconds, "start"):
             pose = given_pose or initial_pose(capture, observations, model)
         palm = PalmTerm(hands) if hands and has_fingers(pose.rig) else None
-        if len(observations.cameras) > 1:
+        if not single:
             with _timed(seconds, "keypoints in space"):
                 problem = make_problem(
                     model, pose, observations, smoothness, settings, offsets=TIGHT_STD, proportions=TIGHT_STD
@@ -82,26 +82,15 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
                 pose = levenberg_marquardt(problem, pose, problem.space_term, KEYPOINT_STEPS)
         with _timed(seconds, "keypoints in images"):
             problem = make_problem(model, pose, observations, smoothness, settings, offsets=1, proportions=TIGHT_STD)
-            problem = replace(problem, balance=balance, ground=ground, limb_depths=limb_depths)
-            pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
-            if palm:
-                problem = replace(problem, palm=palm)
-                pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
-            if balance:
-                posture_prior = PosturePrior.of_single_view(_by_split(capture), pose, observations.cameras[0])
-                pose = resolve_depth_flips(replace(problem, posture_prior=posture_prior), pose, runs(capture))
-                pose, posture_prior = hold_single_posture(problem, pose, posture_prior)
-            else:
-                seen = palm.seen() if palm else None
-                posture_prior = PosturePrior.of_wrists(len(pose.root), Articulation(pose.rig), seen)
+            problem = replace(problem, **terms)
+            pose, posture_prior = _fit_in_images(capture, problem, pose, palm)
         if palm:
             with _timed(seconds, "fingers"):
                 pose = fit_fingers(pose, palm.views, problem.scale_m, runs(capture), step_s)
         if masks is not None:
             with _timed(seconds, "outlines"):
                 problem = make_problem(model, pose, observations, smoothness, settings, offsets=1, proportions=1)
-                problem = replace(problem, balance=balance, ground=ground, limb_depths=limb_depths)
-                problem = replace(problem, palm=palm, posture_prior=posture_prior)
+                problem = replace(problem, palm=palm, posture_prior=posture_prior, **terms)
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
                 pose = refine_with_outlines(problem, pose, edges, settings, up)
             with _timed(seconds, "clothes"):
@@ -114,6 +103,22 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
         if given_pose:
             report["given_poses"] = given_poses_note(model, capture)
         return fit, report
+
+
+def _fit_in_images(capture: Capture, problem: Problem, pose: Pose, palm: PalmTerm | None) -> tuple[Pose, PosturePrior]:
+    """Return the pose fitted to keypoints in the images, then to the palms as well, if hand points are known; and the
+    prior on postures to go on with. With one camera, what a single view leaves open is resolved."""
+    pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
+    if palm:
+        problem = replace(problem, palm=palm)
+        pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
+    cameras = problem.observations.cameras
+    if len(cameras) > 1:
+        seen = palm.seen() if palm else None
+        return pose, PosturePrior.of_wrists(len(pose.root), Articulation(pose.rig), seen)
+    posture_prior = PosturePrior.of_single_view(_by_split(capture), pose, cameras[0])
+    pose = resolve_depth_flips(replace(problem, posture_prior=posture_prior), pose, runs(capture))
+    return hold_single_posture(problem, pose, posture_prior)
 
 
 def initial_pose(capture: Capture, observations: Observations, model: BodyModel) -> Pose:

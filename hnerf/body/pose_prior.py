@@ -31,13 +31,13 @@ STD_DEG = {
 }
 OTHER_STD_DEG = (30, 30, 30)
 HINGES = ("lowerleg01", "lowerarm01")  # joints that bend from straight to folded
-FOLDED_DEG = 150.0
+FOLDED_DEG = 150.0  # of a hinge, from straight
 FLEXION_DEG = {"upperarm01": (-170, 45), "upperleg01": (-130, 40)}  # limits forwards and backwards, from rest
 MEAN_FLEXION_DEG = {"upperarm01": -10.0}  # arms are carried in front of the body
-LIMIT_STD_DEG = 2.0
+LIMIT_STD_DEG = 2.0  # of a flexion beyond its limits
 
 DIFFERENCE = (1.0, -2.0, 1.0)
-OUTLIER_SIGMAS = 3.0
+OUTLIER_SIGMAS = 3.0  # of an acceleration: a sudden movement or a cut
 
 
 class PosePrior:
@@ -66,21 +66,30 @@ class PosePrior:
 
     def add(self, equations: NormalEquations, pose: Pose) -> float:
         """Add the prior to the normal equations and return its cost."""
-        local = torch.einsum("mac,nmc->nma", self.axes, pose.theta[:, self.articulation.joints[1:]])
-        weight = (self.sigma**-2).expand_as(local).clone()
-        off = local - self.mean
-        pull = weight * off
-        excess = local[..., 0] - local[..., 0].clamp(self.low, self.high)
-        limit = math.radians(LIMIT_STD_DEG) ** -2
-        pull[..., 0] += limit * excess
-        weight[..., 0] += limit * (excess != 0)
-        gradient = torch.einsum("mac,nma->nmc", self.axes, pull)
-        blocks = torch.einsum("mac,nma,mad->nmcd", self.axes, weight, self.axes)
-        equations.frame_gradient[:, 6:] += gradient.flatten(1).numpy()
-        for m in range(blocks.shape[1]):
-            at = slice(6 + 3 * m, 9 + 3 * m)
-            equations.frame[0][:, at, at] += blocks[:, m].numpy()
-        return 0.5 * float((off**2 / self.sigma**2).sum() + limit * (excess**2).sum())
+        turns = pose.theta[:, self.articulation.joints[1:]]
+        return add_turn_prior(equations, 6, self.axes, turns, self.mean, self.sigma, self.low, self.high)
+
+
+def add_turn_prior(
+    equations: NormalEquations, first: int, axes: Tensor, turns: Tensor, mean: Tensor, std: Tensor, low: Tensor,
+    high: Tensor,
+) -> float:  # fmt: skip
+    """Add a Gaussian on turns (n, M, 3), the unknowns from `first` on, and one-sided limits on their flexion to the
+    normal equations; return the cost. axes (M, 3, 3): rows flexion, twist, sideways; mean, std (M, 3) about these, and
+    low, high (M,) of the flexion, in radians."""
+    local = torch.einsum("mac,nmc->nma", axes, turns)
+    weight = (std**-2).expand_as(local).clone()
+    off, excess = local - mean, local[..., 0] - local[..., 0].clamp(low, high)
+    pull, limit = weight * off, math.radians(LIMIT_STD_DEG) ** -2
+    pull[..., 0] += limit * excess
+    weight[..., 0] += limit * (excess != 0)
+    blocks = torch.einsum("mac,nma,mad->nmcd", axes, weight, axes)
+    gradient = torch.einsum("mac,nma->nmc", axes, pull)
+    for m in range(len(axes)):
+        at = slice(first + 3 * m, first + 3 * m + 3)
+        equations.frame_gradient[:, at] += gradient[:, m].numpy()
+        equations.frame[0][:, at, at] += blocks[:, m].numpy()
+    return 0.5 * float((off**2 / std**2).sum() + limit * (excess**2).sum())
 
 
 def _bone_directions(articulation: Articulation) -> Tensor:

@@ -113,12 +113,3 @@ def exported_from(skeleton: str) -> dict[str, str]:
     """Return the exported names by the names of another skeleton, one of SKELETONS."""
     named = {getattr(names, skeleton): joint for joint, names in EQUIVALENTS.items()}
     return {theirs: ours for theirs, ours in named.items() if theirs}
-
-
-def names_table() -> str:
-    """Return the table of the middle's and the left side's names in Markdown, as it stands in docs/asset.md."""
-    titles = ("exported", "Unreal Engine 5", "Mixamo", "HumanIK", "VRM", "SMPL-X", "CMU (BVH)")
-    shown = ((joint, names) for joint, names in EQUIVALENTS.items() if not joint.endswith("_R"))
-    rows = [titles, *((joint, *(getattr(names, s) for s in SKELETONS)) for joint, names in shown)]
-    lines = [re.sub(r"\|  (?=\|)", "| ", f"| {' | '.join(row)} |") for row in rows]
-    return "\n".join([lines[0], "|" + "---|" * len(titles), *lines[1:]])

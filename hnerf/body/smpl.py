@@ -21,9 +21,10 @@ from hnerf.body.rig import Rig
 from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, read_arrays
 from hnerf.capture.safe_pickle import MAX_BYTES, read_pickle
 from hnerf.errors import InputError
+from hnerf.geometry.axes import Z_UP_FROM_Y_UP
 
 BETAS = 10
-BODY_FROM_SMPL = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)  # Y up, facing +Z; see rig.py
+BODY_FROM_SMPL = torch.from_numpy(Z_UP_FROM_Y_UP)
 KEYS = ("v_template", "f", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table")
 SKINNED = 8  # joints that a vertex may follow
 

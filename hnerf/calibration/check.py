@@ -33,7 +33,7 @@ from hnerf.config import CalibrationSettings
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
-COINCIDENT_M = 0.005
+COINCIDENT_M = 0.005  # two cameras nearer to each other than this are one, given twice
 COMMON_HEIGHT_M = (1.4, 2.05)  # of adults; outside, the person is a child or the unit is wrong
 RESIDUAL_SHARE = 0.014  # of the person's height in pixels: 5 px of 357 px
 REJECT_FACTOR = 2.0  # times `max_residual_px`: a camera that is still further off after refinement is not used

@@ -2,7 +2,7 @@
 explains large residuals."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from hnerf.geometry.triangulation import reprojection_px, triangulate
 
 TRIM = 0.8  # share of the residuals that count; the rest are taken for detector errors
 BODY_HEIGHT_M = (0.5, 2.3)
-USUAL_HEIGHT_M = 1.7
+USUAL_HEIGHT_M = 1.7  # to advise on units, and to place a camera of unknown height; a body fit has a prior of its own
 UNITS_M = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "metres declared as millimetres": 1e3}
 GROSS_SHARE = 0.05  # of the person's height in the image: beyond this a calibration is wrong, not stale
 MISFIT_SHARE = 0.8  # a camera is a misfit if the trimmed cost without it falls below this share
@@ -56,8 +56,8 @@ class Measure:
 
     @property
     def misfit(self) -> str | None:
-        """The camera whose removal lowers the trimmed cost most, if the others agree far better without it; else
-        None."""
+        """Return the camera whose removal lowers the trimmed cost most, if the others agree far better without it;
+        else None."""
         share = MISFIT_SHARE_OF_THREE if len(self.cost_without_px) == 3 else MISFIT_SHARE
         worst = min(self.cost_without_px, key=self.cost_without_px.__getitem__, default=None)
         return worst if worst and self.cost_without_px[worst] < share * self.cost_px else None
@@ -103,6 +103,16 @@ def trimmed_mean(values: np.ndarray, share: float) -> float:
     """Return the mean of the lowest `share` of the finite values; infinity if there are none."""
     ordered = np.sort(values[np.isfinite(values)])
     return float(ordered[: max(1, int(share * len(ordered)))].mean()) if len(ordered) else np.inf
+
+
+def held_out_parts(keypoints: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield two parts of keypoints (C, frames, 25, 3), one to fit to and one to judge by, and then the other way round.
+    They share neither frames nor joints: a detector's systematic error on one joint must not count as proof that a
+    camera is wrong. A single frame is split by joints."""
+    first, second = np.array_split(keypoints, 2, axis=1) if keypoints.shape[1] > 1 else (keypoints, keypoints)
+    first, second = first[:, :, ::2], second[:, :, 1::2]
+    yield first, second
+    yield second, first
 
 
 def cost_without_each_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> dict[str, float]:

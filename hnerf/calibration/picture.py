@@ -30,10 +30,7 @@ def draw_cameras(
     vertical = "xyz".index(up)
     first, second = (axis for axis in range(3) if axis != vertical)
     points_m = np.zeros((0, 25, 3)) if after is None else after.points_m
-    for axes, across, along, title in (
-        (above, first, second, "from above"),
-        (side, first, vertical, "from the side"),
-    ):
+    for axes, across, along, title in ((above, first, second, "from above"), (side, first, vertical, "from the side")):
         _draw_scene(axes, cameras, status, points_m[..., [across, along]], (across, along))
         axes.set(title=title, xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[along]} (m)")
         axes.set_aspect("equal", adjustable="datalim")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hnerf.calibration.bundle import adjust
-from hnerf.calibration.diagnosis import measure, trimmed_cost_px
+from hnerf.calibration.diagnosis import held_out_parts, measure, trimmed_cost_px
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.silhouettes import Outlines
 from hnerf.calibration.sizes import SIZE_CHANGES, size_unexplained
@@ -188,15 +188,10 @@ def _refine_for_size(
 def held_out_cost_px(
     cameras: Sequence[Camera], keypoints: np.ndarray, free: Sequence[str], focal: Sequence[str] = ()
 ) -> float:
-    """Return the trimmed cost of keypoints (C, frames, 25, 3), each part judged with cameras adjusted to the other
-    part.
-
-    The parts share neither frames nor joints: a detector's systematic error on one joint must not count as proof that a
-    camera is wrong. A single frame is split by joints.
-    """
-    first, second = np.array_split(keypoints, 2, axis=1) if keypoints.shape[1] > 1 else (keypoints, keypoints)
+    """Return the trimmed cost of keypoints (C, frames, 25, 3), each of `held_out_parts` judged with cameras adjusted to
+    the other."""
     costs = []
-    for fitted, judged in ((first[:, :, ::2], second[:, :, 1::2]), (second[:, :, 1::2], first[:, :, ::2])):
+    for fitted, judged in held_out_parts(keypoints):
         adjusted = adjust(cameras, fitted, free, focal) if free else cameras
         costs.append(trimmed_cost_px(adjusted, judged.reshape(len(cameras), -1, 3)))
     return float(np.mean(costs))

@@ -74,7 +74,7 @@ class CalibrationReport:
 
     @property
     def verdict(self) -> str:
-        """The most severe status among the training cameras."""
+        """Return the most severe status among the training cameras."""
         return max((v.status for v in self.verdicts.values()), key=SEVERITY.index)
 
     def save(self, out: Path) -> None:

@@ -24,17 +24,14 @@ from hnerf.geometry.triangulation import triangulate
 MAX_STEPS = 10  # greatest shift tried either way, in steps between the capture's frames
 MIN_FRAMES = 8  # that a shifted camera must share with the others, at the best shift and its two neighbours
 JACKKNIFE_BLOCKS = 12  # of consecutive frames, each left out once
-SUSPECTED_SIGMAS, CERTAIN_SIGMAS = (
-    2.0,
-    5.0,
-)  # standard errors beyond which an offset counts
+SUSPECTED_SIGMAS, CERTAIN_SIGMAS = (2.0, 5.0)  # standard errors beyond which an offset counts
 MIN_OFFSET_FRAMES = 0.1  # smaller offsets are below the resolution of the parabola fit
 MAX_DISTANCE_FRAMES = 1.2  # between an instant and the recorded image that shows it
 MAX_ERROR_STEPS = 0.5  # standard error; beyond it an offset is not observable
 MIN_CURVATURE_SIGMAS = 2.0  # standard errors by which the curvature must exceed 0
 IRLS_ROUNDS = 5  # of iteratively re-weighted least squares
 OUTLIER_SCALES = 3.0  # times the scale of the residuals
-MIN_SCALE_PX = 0.5
+MIN_SCALE_PX = 0.5  # of the residuals; no detector is more exact
 
 log = logging.getLogger("hnerf.calibration")
 
@@ -59,13 +56,14 @@ class Timing:
 
     @property
     def suspected(self) -> bool:
-        """Whether the camera may be out of step."""
+        """Return whether the camera may be out of step."""
         return abs(self.offset_frames) > max(MIN_OFFSET_FRAMES, SUSPECTED_SIGMAS * self.error_frames)
 
     @property
     def certain(self) -> bool:
-        """Whether the camera is out of step: the offset is far beyond its error, and each half of the frames gains by
-        the other half's offset (a parabola is lower at x than at 0 if x lies between 0 and twice its vertex)."""
+        """Return whether the camera is out of step: the offset is far beyond its error, and each half of the frames
+        gains by the other half's offset (a parabola is lower at x than at 0 if x lies between 0 and twice its vertex).
+        """
         a, b = self.half_offsets
         agree = a * b > 0 and abs(a) < 2 * abs(b) < 4 * abs(a)
         far = abs(self.offset_frames) > max(MIN_OFFSET_FRAMES, CERTAIN_SIGMAS * self.error_frames)
@@ -113,7 +111,7 @@ class _Parabola:
 
     @property
     def noise_px(self) -> float:
-        """Root mean square distance at the middle shift."""
+        """Return the root mean square distance at the middle shift."""
         return float(np.sqrt(self.squares[1].sum() / self.weights.sum().clip(1e-9)))
 
 

@@ -18,19 +18,10 @@ import cv2
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from hnerf.capture import safe_io
 from hnerf.capture.footage import Footage, ImageFolder, Video
 from hnerf.capture.manifest import MAX_BYTES
 from hnerf.capture.normalise import Normaliser
-from hnerf.capture.safe_io import (
-    IMAGE_SUFFIXES,
-    VIDEO_SUFFIXES,
-    check_camera_name,
-    files_in,
-    numbered,
-    path_in_capture,
-    read_text,
-    read_toml,
-)
 from hnerf.config import validated
 from hnerf.errors import InputError
 
@@ -166,8 +157,8 @@ def load_board_corners(root: Path) -> BoardCorners | None:
 
 def read_board(folder: Path) -> Board | None:
     """Read the description of the board in a folder; None if there is none. Raises InputError on a bad one."""
-    manifest, charuco = path_in_capture(folder, "capture.toml"), path_in_capture(folder, "charuco.toml")
-    source, table = manifest, (read_toml(manifest, MAX_BYTES) if manifest.exists() else {}).get("board")
+    manifest, charuco = safe_io.path_in_capture(folder, "capture.toml"), safe_io.path_in_capture(folder, "charuco.toml")
+    source, table = manifest, (safe_io.read_toml(manifest, MAX_BYTES) if manifest.exists() else {}).get("board")
     if table is None:
         if not charuco.exists():
             return None
@@ -194,7 +185,7 @@ def read_board_footage(
     `timestamps.csv` if there is one. Raises InputError on files that cannot be read or do not match, or where there is
     no frame `wanted`.
     """
-    path = path_in_capture(folder, "calibration", part)
+    path = safe_io.path_in_capture(folder, "calibration", part)
     footage, board = _footage(folder, part), read_board(folder)
     if footage and board is None:
         log.info("%s: not used, as neither charuco.toml nor [board] in capture.toml describes the board", path)
@@ -255,7 +246,7 @@ def _check_markers(source: Path, board: Board) -> None:
 
 def _from_caliscope(path: Path) -> dict[str, Any]:
     """Convert Caliscope's charuco.toml to keys of `Board`; a size measured on the print overrides that of the page."""
-    table = read_toml(path)
+    table = safe_io.read_toml(path)
     try:
         square_m = 0.01 * float(table.get("square_size_override_cm") or 0)
         if not square_m:
@@ -275,28 +266,28 @@ def _from_caliscope(path: Path) -> dict[str, Any]:
 
 def _footage(folder: Path, part: str) -> dict[str, Footage]:
     """Return the footage by camera, in the order of the cameras' names."""
-    root = path_in_capture(folder, "calibration", part)
+    root = safe_io.path_in_capture(folder, "calibration", part)
     found: dict[str, Footage] = {}
     for path in sorted(root.iterdir()) if root.is_dir() else []:
-        if path.name.startswith(".") or (path.is_file() and path.suffix.lower() not in VIDEO_SUFFIXES):
+        if path.name.startswith(".") or (path.is_file() and path.suffix.lower() not in safe_io.VIDEO_SUFFIXES):
             continue
-        path = path_in_capture(folder, "calibration", part, path.name)
-        name = check_camera_name(path.stem if path.is_file() else path.name, path)
+        path = safe_io.path_in_capture(folder, "calibration", part, path.name)
+        name = safe_io.check_camera_name(path.stem if path.is_file() else path.name, path)
         if name in found:
             raise InputError(f"{path}: camera {name} has a video and a folder of images; keep one of them")
         if path.is_file():
             found[name] = Video.open(path)
             continue
-        files = files_in(folder, "calibration", part, path.name, suffixes=IMAGE_SUFFIXES)
+        files = safe_io.files_in(folder, "calibration", part, path.name, suffixes=safe_io.IMAGE_SUFFIXES)
         if not files:
             raise InputError(f"{path}: no JPEG or PNG images; add them or remove the folder")
-        found[name] = ImageFolder(path, numbered(files, "images"))
+        found[name] = ImageFolder(path, safe_io.numbered(files, "images"))
     return found
 
 
 def _frame_numbers(root: Path, footage: dict[str, Footage], synchronised: bool) -> dict[str, tuple[int, ...]]:
     """Return for each camera the common number of each of its frames."""
-    stamps = path_in_capture(root, "timestamps.csv")
+    stamps = safe_io.path_in_capture(root, "timestamps.csv")
     if not synchronised or not stamps.exists():
         videos = [pictures for pictures in footage.values() if isinstance(pictures, Video)]
         if synchronised and len({len(video.frames) for video in videos}) > 1:
@@ -327,7 +318,7 @@ def _sync_indices(path: Path) -> dict[str, tuple[int, ...]]:
 def _csv_rows(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the rows of a table. Raises InputError if it is none."""
     try:
-        yield from csv.DictReader(read_text(path).splitlines())
+        yield from csv.DictReader(safe_io.read_text(path).splitlines())
     except csv.Error as error:  # such as a field longer than 128 KiB
         raise InputError(f"{path}: not a table ({error}); export it again or remove it") from None
 

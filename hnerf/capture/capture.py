@@ -83,24 +83,21 @@ class Capture:
     def given_mask(self, camera: str, frame: int) -> np.ndarray | None:
         """Read the given mask recorded nearest in time to a frame, (H, W) bool, True on the person; None where there is
         none."""
-        path = self.root / "masks" / camera / f"{self.recorded_frame(camera, frame):06d}.png"
-        if not path.exists():
-            return None
-        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if mask is None:
-            raise InputError(f"{path}: not a readable image; write it again or delete it")
-        return mask > 127
+        mask = self._grey("masks", camera, frame, "write it again or delete it")
+        return None if mask is None else mask > 127
 
     def person_probability(self, camera: str, frame: int) -> np.ndarray | None:
         """Return a network's probability that a pixel shows a person, (H, W) float32; None if no network looked. It is
         that of the recorded frame nearest in time."""
-        path = self.root / PERSON / camera / f"{self.recorded_frame(camera, frame):06d}.png"
-        if not path.exists():
-            return None
-        likely = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if likely is None:
-            raise InputError(f"{path}: not a readable image; detect again")
-        return likely.astype(np.float32) / 255
+        likely = self._grey(PERSON, camera, frame, "detect again")
+        return None if likely is None else likely.astype(np.float32) / 255
+
+    def _grey(self, folder: str, camera: str, frame: int, advice: str) -> np.ndarray | None:
+        path = self.root / folder / camera / f"{self.recorded_frame(camera, frame):06d}.png"
+        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.exists() else None
+        if grey is None and path.exists():
+            raise InputError(f"{path}: not a readable image; {advice}")
+        return grey
 
     def keypoints(self, camera: str) -> np.ndarray | None:
         """Return BODY_25 keypoints (frames, people, 25, 3) x_px, y_px, confidence in the order of `frames`; all 0 where

@@ -1,7 +1,7 @@
 """Ingestion: a capture folder in any known layout becomes one normalised capture."""
 
-import dataclasses
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,10 +39,10 @@ from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.progress import tracked
 
-DEFAULT_FPS = 30.0
+DEFAULT_FPS = 30.0  # of images, whose files state none
 # Encoders pad and crop by a few pixels; the calibration stage judges what that does to the cameras.
 SIZE_TOLERANCE = 0.02
-RATE_TOLERANCE = 0.01
+RATE_TOLERANCE = 0.01  # between frame rates, as a share
 MAX_OUTSIDE_SHARE = 0.5  # of keypoints outside their images: detectors guess some that are cut off
 LAYOUTS: tuple[type[Layout], ...] = (
     ZjuMocap,
@@ -77,8 +77,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     clocks = {} if len(filmed) == 1 else read_clocks(folder)
     footage = in_step(filmed, clocks, manifest.fps or DEFAULT_FPS)
     recorded = _common_frames(footage)
-    detected = {name: _detections_in_step(layout, name, pictures) for name, pictures in footage.items()}
-    people = {name: found for name, found in detected.items() if found is not None}
+    people = _people_in_step(layout, footage)
     seen = [people[name] for name in cameras.train if name in people]
     occupied = recorded if manifest.frames else _frames_with_people(seen, recorded)
     frames = chosen_frames(folder, manifest, occupied, layout.novel_pose_share, settings.max_frames)
@@ -86,25 +85,17 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
 
     out.mkdir(parents=True, exist_ok=True)
     normalisers, areas = _write_cameras(layout, lenses, footage, wanted, settings, out)
-    if people:
-        rows = np.searchsorted(recorded, wanted)
-        _write_keypoints({name: found[rows] for name, found in people.items()}, manifest.keypoints, normalisers, out)
-    poses = layout.given_poses(wanted)
-    if poses and not poses.known.any():
-        raise InputError(f"{folder}: none of the chosen frames has a given pose; choose others, or remove the poses")
-    if poses:
-        poses.save(out / "poses.npz")
-    boards = read_board_footage(folder, "extrinsic")
-    if boards:
+    rows = np.searchsorted(recorded, wanted)
+    _write_keypoints({name: found[rows] for name, found in people.items()}, manifest.keypoints, normalisers, out)
+    _write_given_poses(folder, layout, wanted, out)
+    if boards := read_board_footage(folder, "extrinsic"):
         normalised_corners(boards, normalisers).save(out)
 
+    metres = manifest.metres_per_unit
     capture = Capture(
         name=subject,
         root=out,
-        cameras={
-            name: dataclasses.replace(n.camera, t_m=n.camera.t_m * manifest.metres_per_unit)
-            for name, n in normalisers.items()
-        },
+        cameras={name: replace(n.camera, t_m=n.camera.t_m * metres) for name, n in normalisers.items()},
         train_cameras=tuple(cameras.train),
         test_cameras=tuple(cameras.test),
         train_frames=tuple(frames.train),
@@ -200,10 +191,20 @@ def _write_cameras(
 def _write_keypoints(
     people: dict[str, np.ndarray], named: KeypointSetName | None, normalisers: dict[str, Normaliser], out: Path
 ) -> None:
-    """Write the keypoints of people by camera, detected as (frames, people, K, 3)."""
-    found = to_body_25(people, named)
-    keypoints = {name: normalisers[name].keypoints(points) for name, points in found.items()}
-    np.savez_compressed(out / "keypoints.npz", **keypoints)  # type: ignore[arg-type]
+    """Write the keypoints of people by camera, detected as (frames, people, K, 3); no file where there are none."""
+    if people:
+        found = to_body_25(people, named)
+        keypoints = {name: normalisers[name].keypoints(points) for name, points in found.items()}
+        np.savez_compressed(out / "keypoints.npz", **keypoints)  # type: ignore[arg-type]
+
+
+def _write_given_poses(folder: Path, layout: Layout, frames: tuple[int, ...], out: Path) -> None:
+    """Write the poses that come with these frames, if any do. Raises InputError if they lack all of these frames."""
+    poses = layout.given_poses(frames)
+    if poses and not poses.known.any():
+        raise InputError(f"{folder}: none of the chosen frames has a given pose; choose others, or remove the poses")
+    if poses:
+        poses.save(out / "poses.npz")
 
 
 def _write_pixels(
@@ -284,12 +285,14 @@ def _per_frame(
     return {frame: files[frame] for frame in wanted}
 
 
-def _detections_in_step(layout: Layout, camera: str, footage: Footage | InStep) -> np.ndarray | None:
-    """Return what `detections` does, at the instants of all cameras."""
-    if not isinstance(footage, InStep):
-        return detections(layout, camera, footage)
-    found = detections(layout, camera, footage.source)
-    return None if found is None else footage.resampled(found)
+def _people_in_step(layout: Layout, footage: dict[str, Footage | InStep]) -> dict[str, np.ndarray]:
+    """Return what `detections` finds, by camera, at the instants of all cameras."""
+    people = {}
+    for camera, recording in footage.items():
+        found = detections(layout, camera, recording.source if isinstance(recording, InStep) else recording)
+        if found is not None:
+            people[camera] = recording.resampled(found) if isinstance(recording, InStep) else found
+    return people
 
 
 def detections(layout: Layout, camera: str, footage: Footage) -> np.ndarray | None:

@@ -11,7 +11,7 @@ from hnerf.capture.keypoint_sets import COUNTS, KNOWN
 from hnerf.capture.safe_io import read_json
 from hnerf.errors import InputError
 
-MAX_PEOPLE = 64
+MAX_PEOPLE = 64  # in one image
 
 
 def read_openpose(path: Path) -> np.ndarray:

@@ -11,7 +11,7 @@ from hnerf.capture.safe_io import check_camera_name, check_image_size
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
-MIN_FOCAL_PX = 1.0
+MIN_FOCAL_PX = 1.0  # a smaller focal length is an error of units
 MAX_NUMBER = 1e9  # of a calibration; beyond it, later arithmetic overflows
 
 

@@ -11,7 +11,7 @@ from hnerf.capture.safe_io import VIDEO_SUFFIXES
 EXIF_IFD, EXIF_FOCAL_35MM = 0x8769, 0xA405
 KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
 MAX_METADATA_BYTES = 16_000_000
-NUMBERS = {21: (1, 2, 4), 22: (1, 2, 4), 23: (4,), 24: (8,)}  # QuickTime's well-known types: signed, unsigned, floats
+# Of QuickTime's well-known types 21 (signed), 22 (unsigned), 23 and 24 (floats), by their number of bytes.
 FORMATS = {(21, 1): ">b", (21, 2): ">h", (21, 4): ">i", (22, 1): ">B", (22, 2): ">H", (22, 4): ">I", (23, 4): ">f",
            (24, 8): ">d"}  # fmt: skip
 

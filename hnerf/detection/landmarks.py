@@ -9,7 +9,7 @@ from hnerf.detection.region import Region, region_around
 
 SIZE, POINTS, AUXILIARY = 256, 33, 2  # the auxiliary points, which follow, say where the next region is
 HEAT_WINDOW, MIN_HEAT = 3, 0.5  # cells on each side of a point, and the heat that one of them must have
-MIN_PRESENCE = 0.5
+MIN_PRESENCE = 0.5  # probability that a region shows a person; below it, nobody is there
 
 
 class Person(NamedTuple):

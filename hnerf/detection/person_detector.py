@@ -6,7 +6,7 @@ from hnerf.detection.network import Network, sigmoid
 from hnerf.detection.region import Region, image_region, region_around
 from hnerf.models import POSE_DETECTOR
 
-SIZE = 224
+SIZE = 224  # side of the network's input, px
 LAYERS = ((28, 2), (14, 2), (7, 6))  # cells on a side, and anchors in each
 MIN_SCORE = 0.5
 NMS_IOU = 0.3  # IoU above which two boxes are of one person

@@ -34,6 +34,7 @@ from hnerf.evaluation.views import (
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.progress import tracked
 from hnerf.results import Metrics, write_result
+from hnerf.side_by_side import side_by_side
 
 log = logging.getLogger("hnerf.evaluation")
 
@@ -103,15 +104,20 @@ def score_meshes(
     """Write `meshes/<frame>.ply` of the frames, posed as the avatar's body is; return their mean geometry scores, or
     null with a reason."""
     (out / "meshes").mkdir(exist_ok=True)
-    scores = []
-    for frame in tracked(frames, "meshes", len(frames)):
+
+    def measure(frame: int) -> tuple[int, dict[str, Any] | None]:
         mesh = posed_surface(avatar, frame)
         mesh.export(out / "meshes" / f"{frame:06d}.ply")
-        if frame in true_meshes:
-            rng = np.random.default_rng(0)
-            score = dataclasses.asdict(geometry.score_geometry(mesh, true_meshes[frame], rng))
-            scores.append({"frame": frame} | score)
-        log.info("meshed frame %d: %d faces", frame, len(mesh.faces))
+        if frame not in true_meshes:
+            return len(mesh.faces), None
+        found = geometry.score_geometry(mesh, true_meshes[frame], np.random.default_rng(0))
+        return len(mesh.faces), {"frame": frame} | dataclasses.asdict(found)
+
+    scores = []
+    measured = side_by_side(measure, frames, avatar.body.theta.device)
+    for frame, (faces, score) in zip(frames, tracked(measured, "meshes", len(frames)), strict=True):
+        log.info("meshed frame %d: %d faces", frame, faces)
+        scores += [score] if score else []
     if not scores:
         return {"geometry": None, "geometry_reason": "the capture has no ground-truth surface in these frames"}
     means = {name: float(np.mean([score[name] for score in scores])) for name in scores[0] if name != "frame"}

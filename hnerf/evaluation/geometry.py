@@ -12,9 +12,9 @@ import trimesh
 from hnerf.geometry.mesh_queries import Surface
 
 SAMPLES = 40_000  # per surface, before hidden ones are dropped
-ESCAPE_DIRECTIONS = 48
+ESCAPE_DIRECTIONS = 48  # a sample is seen from outside if a ray along one of them escapes
 OCCUPANCY_NODES = 128  # along each side of the common box
-BOX_MARGIN_M = 0.02
+BOX_MARGIN_M = 0.02  # of the common box around both surfaces
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from hnerf.evaluation.ground_truth import Truth
 from hnerf.evaluation.views import NOVEL_POSE_SPLITS, View, all_views, sample_views
 from hnerf.progress import tracked
 from hnerf.results import ImageScores, Mean, SplitScores
+from hnerf.side_by_side import side_by_side
 
 MEANS: tuple[Mean, ...] = get_args(Mean)  # averaged over a split's images
 TUNED_ON = (
@@ -39,17 +40,20 @@ def views_with_mask(views: list[View], truth: Truth | None) -> list[View]:
 
 def render(avatars: Mapping[str, Avatar], capture: Capture, views: list[View], out: Path) -> float:
     """Render every view with its split's avatar, in the poses of its `body`, and write it as 8-bit RGBA, colour over
-    black and coverage. Return the median seconds an image takes, without writing it."""
-    seconds: list[float] = []
-    for view in tracked(views, "rendering", len(views)):
-        started = time.perf_counter()
+    black and coverage. Return the mean seconds an image takes."""
+
+    def write(view: View) -> None:
         body = avatars[view.split].body
         k = body.index(view.frame)
         with torch.no_grad():
             pixels = rgba(avatars[view.split].render(capture.cameras[view.camera], body.theta[k], body.root[k]))
-        seconds.append(time.perf_counter() - started)
         write_image(view.path(out), pixels)
-    return float(np.median(seconds))
+
+    started = time.perf_counter()
+    device = next(iter(avatars.values())).body.theta.device
+    for _ in tracked(side_by_side(write, views, device), "rendering", len(views)):
+        pass
+    return (time.perf_counter() - started) / max(1, len(views))
 
 
 def rgba(rendering: Rendering) -> np.ndarray:

@@ -142,8 +142,7 @@ def portrait_camera(points_m: np.ndarray, root: np.ndarray, side: str) -> Camera
 
 def cast_pixels(surface: Surface, camera: Camera) -> RayHits:
     """Return the hits of the rays through a camera's pixels, row by row."""
-    pixels = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), -1).reshape(-1, 2)
-    return surface.cast(*camera.rays(pixels.astype(np.float64)))
+    return surface.cast(*camera.rays(camera.pixels_px.reshape(-1, 2)))
 
 
 def _normals(mesh: trimesh.Trimesh, hits: RayHits) -> np.ndarray:

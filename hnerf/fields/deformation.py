@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from hnerf.body.canonical import Descriptor, distinct_rows, weighted_sum
 from hnerf.body.descriptor import vertex_normals
 
-TINY = 1e-9
+TINY = 1e-9  # m^2: where every vertex is a node, too, nodes have a width
 OVERLAP = 0.5  # width of a node's Gaussian, in greatest distances of a vertex from its closest node
 
 

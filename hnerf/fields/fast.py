@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hnerf.body.canonical import FAR_M, Descriptor, PosedBodies
+from hnerf.body.canonical import FAR_M, Descriptor, PosedBodies, weighted_sum
 from hnerf.body.descriptor import BodyMeshes, vertex_normals
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig
@@ -23,7 +23,7 @@ from hnerf.geometry.camera import Camera
 from hnerf.geometry.reach import within_reach
 
 INITIAL_SHARPNESS_PER_M = 100.0  # of the logistic that turns distance into opacity
-GRADIENT_STEP_M = 0.005
+GRADIENT_STEP_M = 0.005  # of forward differences of the signed distance
 SATURATED_LOGIT = 5.0  # argument beyond which the opacity's logistic is within 1 % of 0 or 1
 GRID_MARGIN_M = 0.01  # between the shell and the end of the grids
 SHELL_MARGIN_M = 0.012  # for later movement of the surface, and for poses that were not evaluated
@@ -45,6 +45,7 @@ class FastField(Field):
     inner_m: Tensor
     corners: Tensor
     weights: Tensor
+    rest_normals: Tensor
 
     @classmethod
     def build(cls, body: BodyFit, settings: FastFieldSettings, static: bool) -> "FastField":
@@ -57,6 +58,7 @@ class FastField(Field):
         self.settings = settings
         self.samples = settings.samples
         self.register_buffer("canonical_m", rig.vertices_m.clone())
+        self.register_buffer("rest_normals", vertex_normals(rig.vertices_m, rig.faces), persistent=False)
         for name in ("outer_m", "inner_m"):
             self.register_buffer(name, torch.full((len(rig.vertices_m),), getattr(settings, name)))
         corners, weights = surface_points(rig.vertices_m, rig.faces, settings.shell_cell_m)
@@ -78,7 +80,7 @@ class FastField(Field):
 
     @property
     def reach_m(self) -> float:
-        """How far from the body a sample can lie: the shell and the slack of its cells."""
+        """Return how far from the body a sample can lie: the shell and the slack of its cells."""
         return max(self.settings.outer_m, self.settings.inner_m) + 2 * self.settings.shell_cell_m
 
     def visible_pixels(self, camera: Camera, vertices_m: np.ndarray) -> np.ndarray:
@@ -179,7 +181,7 @@ class FastField(Field):
         end = torch.where(core[hit, None], 1.0, alpha_dot[:, -1:])
         alpha = torch.cat([alpha_dot[:, :-1], end], 1)
         visible = weights_from_alpha(alpha.detach()).flatten() > MIN_COLOUR_WEIGHT
-        colour = self._colour(move_to_surface(described, d + residual), pose, row, visible)
+        colour = self._colour(scene.bodies, move_to_surface(described, d + residual), pose, row, visible)
         norms = d.new_zeros(0)
         if draws.probe is not None:
             norms = self._gradient_norms(described, skin, pose, row, draws.probe[hit], depths.shape[1])
@@ -232,32 +234,38 @@ class FastField(Field):
         y, d, row = (t.index_select(0, pick) for t in (described.y, described.d, row))
         return torch.zeros_like(described.d).index_copy(0, pick, self.field.residual(y, d, pose, row))
 
-    def _colour(self, described: Descriptor, pose: Tensor, row: Tensor, visible: Tensor) -> Tensor:
-        """Return the colours (N, 3) of the visible samples, zero elsewhere."""
+    def _colour(self, bodies: PosedBodies, described: Descriptor, pose: Tensor, row: Tensor, visible: Tensor) -> Tensor:
+        """Return the colours (N, 3) of the visible samples, zero elsewhere. Light falls on the surface's own normal, so
+        that shading shapes the surface, too (as in IDR)."""
         pick = torch.nonzero(visible)[:, 0]
+        y, d, row, corners, barycentric = (
+            t.index_select(0, pick) for t in (described.y, described.d, row, described.corners, described.barycentric)
+        )
+        outward = weighted_sum(self.rest_normals, corners, barycentric)
+        gradient = self._distance_gradient(y, d, outward, pose, row)
+        normal = nn.functional.normalize(bodies.turn(gradient, row, corners, barycentric), dim=-1)
         colour = described.d.new_zeros(len(visible), 3)
-        y, d, normal, row = (t.index_select(0, pick) for t in (described.y, described.d, described.normal, row))
-        seen = self.field.colour(y, d, normal, pose, row)
-        return colour.index_copy(0, pick, seen)
+        return colour.index_copy(0, pick, self.field.colour(y, d, normal, pose, row))
 
     def _gradient_norms(
         self, described: Descriptor, skin: Descriptor, pose: Tensor, row: Tensor, probe: Tensor, samples: int
     ) -> Tensor:
-        """Return |grad d_hat| in the canonical frame at one sample per ray, probe (R,) in [0, 1), by forward
-        differences, because grid interpolation has no useful second derivative.
-
-        skin: descriptors before the deformation, which give the outward direction. Gradients flow to the field alone.
-        """
+        """Return |grad d_hat| in the canonical frame at one sample per ray, probe (R,) in [0, 1). skin: descriptors
+        before the deformation, which give the outward direction."""
         pick = torch.arange(len(probe), device=probe.device) * samples + (probe * samples).long()
         pick = pick[described.near[pick]]
-        y, d = described.y[pick].detach(), described.d[pick].detach()
         away = (skin.y - skin.s)[pick].detach() * skin.d[pick].detach().sign()[:, None]
         outward = nn.functional.normalize(away, dim=-1)
+        return self._distance_gradient(described.y[pick], described.d[pick], outward, pose, row[pick]).norm(dim=-1)
+
+    def _distance_gradient(self, y: Tensor, d: Tensor, outward: Tensor, pose: Tensor, row: Tensor) -> Tensor:
+        """Return the canonical gradient (N, 3) of d_hat, by forward differences, because grid interpolation has no
+        useful second derivative. outward (N, 3): the gradient of d. Gradients flow to the field alone."""
         axes = torch.cat([y.new_zeros(1, 3), torch.eye(3, device=y.device)])  # no step, and one along each axis
-        d = d + GRADIENT_STEP_M * axes @ outward.T
-        y = y + GRADIENT_STEP_M * axes[:, None]
-        found = self.field.residual(y.flatten(0, 1), d.flatten(), pose, row[pick].repeat(len(axes))).view_as(d)
-        return (outward + (found[1:] - found[0]).T / GRADIENT_STEP_M).norm(dim=-1)
+        d = d.detach() + GRADIENT_STEP_M * axes @ outward.T
+        y = y.detach() + GRADIENT_STEP_M * axes[:, None]
+        found = self.field.residual(y.flatten(0, 1), d.flatten(), pose, row.repeat(len(axes))).view_as(d)
+        return outward + (found[1:] - found[0]).T / GRADIENT_STEP_M
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """Return d_hat (N,) at points (N, 3) around the first body; beyond the shell it is the body's own distance."""
@@ -269,7 +277,7 @@ class FastField(Field):
         """Return c (N, 3) at points around the first body; this field does not depend on the viewing direction."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         described, _ = self._deformed(bodies.describe(points_m, row, FAR_M), conditions.frame_row[row])
-        return self.field.colour(described.y, described.d, described.normal, conditions.pose, row)
+        return self._colour(bodies, described, conditions.pose, row, torch.ones_like(described.near))
 
 
 def move_to_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:
@@ -280,9 +288,7 @@ def move_to_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:
     through the position of the zero (as in IDR, Yariv et al. 2020): a body that moves along a ray shows the same point
     to it, and without that term it would be drawn towards or away from its camera.
     """
-    y, d, normal, near = (
-        t.unflatten(0, d_hat.shape) for t in (described.y, described.d, described.normal, described.near)
-    )
+    y, d, near = (t.unflatten(0, d_hat.shape) for t in (described.y, described.d, described.near))
     ahead, after = d_hat[:, :-1], d_hat[:, 1:]
     joined = near[:, :-1] & near[:, 1:] & ((y[:, 1:] - y[:, :-1]).norm(dim=-1) < MAX_NEIGHBOUR_DISTANCE_M)
     descent_m = (ahead - after).clamp(min=MIN_DESCENT_M)
@@ -291,4 +297,4 @@ def move_to_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:
     def moved(values: Tensor) -> Tensor:
         return torch.cat([torch.lerp(values[:, :-1], values[:, 1:], share), values[:, -1:]], 1).flatten(0, 1)
 
-    return dataclasses.replace(described, y=moved(y), d=moved(d[..., None])[:, 0], normal=moved(normal))
+    return dataclasses.replace(described, y=moved(y), d=moved(d[..., None])[:, 0])

@@ -14,7 +14,7 @@ class CanonicalField(nn.Module):
     """DH: (y, d, theta) -> dd and F: (y, d, theta, n) -> c over the canonical volume.
 
     The density of F is the SDF's own opacity (the limit of large lambda in the paper's geometry loss), so F is a colour
-    here. n is the body's normal in the world; it carries the effect of the root transform T on shading.
+    here. n is the surface's normal in the world; it carries the effect of the root transform T on shading.
     """
 
     def __init__(

@@ -28,5 +28,5 @@ class RaySamples:
 
     @property
     def d_hat(self) -> Float[Tensor, "R K"]:
-        """Signed distance to the clothed person."""
+        """Return the signed distance to the clothed person."""
         return self.d + self.residual

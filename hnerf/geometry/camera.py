@@ -55,6 +55,11 @@ class Camera:
         directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
         return np.broadcast_to(self.centre_m, directions.shape), directions
 
+    @property
+    def pixels_px(self) -> Float[np.ndarray, "H W 2"]:
+        """Return the (x, y) of every pixel of the image."""
+        return np.stack(np.meshgrid(np.arange(self.width_px), np.arange(self.height_px)), -1).astype(np.float64)
+
     def resized(self, width_px: int, height_px: int) -> "Camera":
         """Return this camera with its image resampled to another size (pixel centres at integers)."""
         sx, sy = width_px / self.width_px, height_px / self.height_px

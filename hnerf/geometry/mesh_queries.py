@@ -10,7 +10,7 @@ from hnerf.geometry.rays import RayHits, cast, to_vec3_array
 
 wp.config.log_level = wp.LOG_ERROR
 
-REACH_M = 10.0
+REACH_M = 10.0  # beyond any distance that is asked for
 RAY_START_M = 2.0e-3  # escape rays start this far off the surface, so that they do not hit it at once
 BLOCKS = (8, 4, 2, 1)  # nodes along a side of the blocks that `Surface.occupancy` tests
 

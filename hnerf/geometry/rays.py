@@ -9,7 +9,7 @@ import warp as wp
 
 wp.config.log_level = wp.LOG_ERROR
 
-REACH_M = 1.0e3
+REACH_M = 1.0e3  # beyond any surface that a ray can meet
 
 
 @wp.kernel

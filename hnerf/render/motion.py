@@ -21,12 +21,13 @@ from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, read_arrays
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP
+from hnerf.geometry.rotations import slerp
 from hnerf.render.bvh_motion import bvh_motion
 
 AMASS_WIDTHS = (72, 156, 165)  # pose parameters of SMPL, SMPL-H and SMPL-X, which share their first 22 joints
 AMASS_RATES = ("mocap_framerate", "mocap_frame_rate")
 BODY_JOINTS = 22
-DEFAULT_FPS = 30.0
+DEFAULT_FPS = 30.0  # of AMASS files without a rate
 MAX_MOTION_BYTES = 256_000_000  # unpacked; half an hour of SMPL-H at 100 poses a second
 
 
@@ -113,17 +114,15 @@ def retarget(own: BodyFit, motion: Motion, up: str) -> BodyFit:
 def interpolate_poses(body: BodyFit, first: int, last: int, count: int) -> BodyFit:
     """Return `count` poses from frame `first` to frame `last` of the body, both included, numbered from 0.
 
-    Joint and root rotations are interpolated at constant angular velocity (slerp, Shoemake 1985), the root's position
-    linearly.
+    Joint and root rotations are interpolated at constant angular velocity, the root's position linearly.
     """
     a, b = body.index(first), body.index(last)
     share = np.linspace(0, 1, count)
     start, end = (Rotation.from_rotvec(body.theta[k].numpy()) for k in (a, b))
-    theta = np.stack([(start * (start.inv() * end) ** t).as_rotvec() for t in share])
+    theta = np.stack([slerp(start, end, np.full(len(start), t)).as_rotvec() for t in share])
     root = torch.lerp(body.root[a], body.root[b], torch.from_numpy(share).to(body.root)[:, None, None])
-    start, end = (Rotation.from_matrix(body.root[k, :3, :3].numpy()) for k in (a, b))
-    turns = np.stack([(start * (start.inv() * end) ** t).as_matrix() for t in share])
-    root[:, :3, :3] = torch.from_numpy(turns)
+    start, end = (Rotation.from_matrix(body.root[[k] * count, :3, :3].numpy()) for k in (a, b))
+    root[:, :3, :3] = torch.from_numpy(slerp(start, end, share).as_matrix())
     return BodyFit(body.rig, tuple(range(count)), torch.from_numpy(theta).to(body.theta), root)
 
 

@@ -21,7 +21,7 @@ from hnerf.progress import tracked
 
 COVERED = 0.5  # alpha from which a pixel has a depth and a normal
 NEAR_GREY, FAR_GREY = 255, 64  # grey levels at the ends of a depth video's range
-NORMAL_STEP_M = 0.003
+NORMAL_STEP_M = 0.003  # of finite differences of the signed distance
 TETRAHEDRON = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
 Shot = tuple[Camera, int]  # a camera, and the frame of avatar.body whose pose is shown
 
@@ -82,7 +82,7 @@ def read_depth_grey(path: Path, span_mm: tuple[int, int]) -> np.ndarray:
 
 def depth_image(rendering: Rendering, camera: Camera) -> Tensor:
     """Return depths along the viewing axis, (H, W) uint16 in mm, from a rendering's depths along its rays."""
-    _, directions = camera.rays(_pixels(camera))
+    _, directions = camera.rays(camera.pixels_px)
     ahead = torch.from_numpy(directions @ camera.forward).to(rendering.depth_m)
     return (1000 * rendering.depth_m * ahead * (rendering.alpha > COVERED)).round().clamp(0, 65535).to(torch.uint16)
 
@@ -92,7 +92,7 @@ def normal_image(avatar: Avatar, rendering: Rendering, camera: Camera, theta: Te
     """Return surface normals as an image (H, W, 3) uint8, encoded as in `write_pictures`: the gradient of the signed
     distance where rays end, by finite differences at the corners of a tetrahedron."""
     covered = rendering.alpha > COVERED
-    origins, directions = (torch.from_numpy(a.copy()).to(rendering.depth_m) for a in camera.rays(_pixels(camera)))
+    origins, directions = (torch.from_numpy(a.copy()).to(rendering.depth_m) for a in camera.rays(camera.pixels_px))
     points_m = origins[covered] + rendering.depth_m[covered][:, None] * directions[covered]
     corners = torch.tensor(TETRAHEDRON).to(points_m)
     around_m = (points_m + NORMAL_STEP_M * corners[:, None]).flatten(0, 1)  # (4 N, 3)
@@ -118,8 +118,3 @@ def _render_kinds(avatar: Avatar, shot: Shot, what: Sequence[str]) -> dict[str, 
         "normals": lambda: normal_image(avatar, seen, camera, theta, root),
     }
     return {kind: make().cpu().numpy() for kind, make in kinds.items() if kind in what}
-
-
-def _pixels(camera: Camera) -> np.ndarray:
-    """Return x and y of every pixel, (H, W, 2)."""
-    return np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), -1).astype(np.float64)

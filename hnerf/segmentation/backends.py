@@ -97,7 +97,7 @@ class BackgroundSubtraction:
         the order of the frames."""
         chosen = evenly_spaced(range(len(priors)), count)
         images = [capture.image(camera, capture.frames[i]) for i in chosen]
-        plate, known = masked_median(images, [priors[i] for i in chosen])
+        plate, known = masked_median(images, [priors[i].near for i in chosen])
         return BackgroundSubtraction(capture, camera, plate, known, settings, name)
 
     def mask(self, frame: int, prior: Prior) -> np.ndarray:

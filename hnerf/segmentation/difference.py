@@ -101,19 +101,19 @@ def _log_uniform(brightness: np.ndarray, low: float, high: float) -> np.ndarray:
     return -0.5 * beyond**2 - np.log(np.sqrt(3) * (high - low))
 
 
-def masked_median(images: list[np.ndarray], priors: list[Prior]) -> tuple[np.ndarray, np.ndarray]:
+def masked_median(images: list[np.ndarray], hidden: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return the background of a fixed camera without a clean plate, (H, W, 3) uint8 RGB, and where it is known, (H, W)
     bool.
 
-    It is each pixel's median over the frames in which the person is not near; where there is no such frame, it is
-    inpainted (Telea 2004).
+    It is each pixel's median over the frames in which it is not `hidden` (H, W) bool; where there is no such frame, it
+    is inpainted (Telea 2004).
     """
-    hidden = np.stack([prior.near for prior in priors])
-    seen = (~hidden).sum(0)
+    behind = np.stack(hidden)
+    seen = (~behind).sum(0)
     plate = np.empty_like(images[0])
     for row in range(plate.shape[0]):  # row by row bounds the memory
         values = np.stack([image[row] for image in images]).astype(np.int16)
-        values[hidden[:, row]] = HIDDEN_LEVEL
+        values[behind[:, row]] = HIDDEN_LEVEL
         middle = np.sort(values, axis=0)[seen[row] // 2, np.arange(plate.shape[1])]
         plate[row] = middle.clip(0, 255)
     return cv2.inpaint(plate, (seen == 0).astype(np.uint8), INPAINT_RADIUS_PX, cv2.INPAINT_TELEA), seen > 0

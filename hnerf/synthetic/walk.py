@@ -9,7 +9,7 @@ from torch import Tensor
 
 from hnerf.body.rig import Rig
 
-STEP_CYCLE_S = 1.15
+STEP_CYCLE_S = 1.15  # of two steps
 TURN_DEGPS = 80.0
 CIRCLE_RADIUS_M = 0.2
 

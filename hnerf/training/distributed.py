@@ -42,5 +42,5 @@ class Distributed:
 
     @property
     def is_main(self) -> bool:
-        """Whether this process writes files and logs."""
+        """Return whether this process writes files and logs."""
         return self.rank == 0

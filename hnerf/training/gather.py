@@ -17,6 +17,7 @@ from hnerf.segmentation.edge import shaded_plate
 from hnerf.segmentation.prior import bounding_window
 from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import Pixels
+from hnerf.training.plates import plates_of
 
 EDGE_PX = 2  # half-width of the band around a mask's outline in which a pixel may mix person and background
 SUFFIX = ".pixels"  # of the files that hold the columns of Pixels; COLUMNS: their types and widths
@@ -82,51 +83,55 @@ def _write_pixels(
 ) -> None:
     """Write the columns of Pixels, one file each, frame by frame."""
     cameras = [capture.cameras[name] for name in capture.train_cameras]
-    found = [capture.background(camera.name) for camera in cameras] if visible_pixels else []
-    plates = [plate for plate in found if plate is not None]
-    with_plates = visible_pixels is not None and len(plates) == len(cameras)
-    vertices_m = body.vertices_m().numpy()
-    ends = {"starts": 0, "edge_starts": 0, "image_starts": 0}
-
-    def append(name: str, values: Any) -> None:
-        with (folder / f"{name}{SUFFIX}").open("ab") as file:
-            file.write(np.ascontiguousarray(values, NUMPY[COLUMNS[name][0]]).data)
-
-    def close(name: str, count: int) -> None:
-        ends[name] += count
-        append(name, [ends[name]])
-
-    for name in ends:
-        close(name, 0)
+    plates = plates_of(capture, masks, frames) if visible_pixels else None
+    vertices_m, columns = body.vertices_m().numpy(), _Columns(folder)
     for frame in frames:
         edges = [np.zeros(0, bool)]
         for c, camera in enumerate(cameras):
             if (camera.name, frame) not in masks:
                 continue
             image, mask = capture.image(camera.name, frame), masks.get(camera.name, frame)
-            wanted = (
-                np.ones_like(mask)
-                if visible_pixels is None
-                else visible_pixels(camera, vertices_m[body.index(frame)]) | mask
-            )
-            gain = gains.get(camera.name)
+            wanted, edge, gain = np.ones_like(mask), _edge(mask), gains.get(camera.name)
             if visible_pixels:
-                append("pixel_index", np.flatnonzero(wanted))
-            append("colour", _exposure_corrected(image[wanted], gain))
-            append("person", mask[wanted])
-            edges.append(_edge(mask)[wanted])
-            append("edge", edges[-1])
-            append("image_camera", [c])
-            close("image_starts", len(edges[-1]))
-            if with_plates:
+                wanted = visible_pixels(camera, vertices_m[body.index(frame)]) | mask
+                if plates:
+                    wanted &= plates[c].known | ~edge  # of the others the share of the person cannot be told
+                columns.append("pixel_index", np.flatnonzero(wanted))
+            columns.append("colour", _exposure_corrected(image[wanted], gain))
+            columns.append("person", mask[wanted])
+            edges.append(edge[wanted])
+            columns.append("edge", edges[-1])
+            columns.append("image_camera", [c])
+            columns.close("image_starts", len(edges[-1]))
+            if plates:
                 window = bounding_window(wanted)
-                shaded = shaded_plate(mask[window], image[window], plates[c][window])[wanted[window]]
-                append("plate", _exposure_corrected(shaded.clip(0, 255).round().astype(np.uint8), gain))
-        edge = np.concatenate(edges)
-        mixed = np.flatnonzero(edge) if edge.any() else np.arange(len(edge))
-        append("edges", ends["starts"] + mixed)
-        close("edge_starts", len(mixed))
-        close("starts", len(edge))
+                shaded = shaded_plate(mask[window], image[window], plates[c].colour[window])[wanted[window]]
+                columns.append("plate", _exposure_corrected(shaded.clip(0, 255).round().astype(np.uint8), gain))
+        every = np.concatenate(edges)
+        mixed = np.flatnonzero(every) if every.any() else np.arange(len(every))
+        columns.append("edges", columns.ends["starts"] + mixed)
+        columns.close("edge_starts", len(mixed))
+        columns.close("starts", len(every))
+
+
+class _Columns:
+    """The columns of Pixels while their files are written; ends: how many rows the parts so far have, by column of
+    starts."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.ends = folder, {"starts": 0, "edge_starts": 0, "image_starts": 0}
+        for name in self.ends:
+            self.close(name, 0)
+
+    def append(self, name: str, values: Any) -> None:
+        """Write further values to the end of a column."""
+        with (self.folder / f"{name}{SUFFIX}").open("ab") as file:
+            file.write(np.ascontiguousarray(values, NUMPY[COLUMNS[name][0]]).data)
+
+    def close(self, name: str, count: int) -> None:
+        """End a part of `count` rows in a column of starts."""
+        self.ends[name] += count
+        self.append(name, [self.ends[name]])
 
 
 def _exposure_corrected(shown: np.ndarray, gain: tuple[float, float, float] | None) -> np.ndarray:

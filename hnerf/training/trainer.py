@@ -43,7 +43,7 @@ logger = logging.getLogger("hnerf.training")
 WARM_UP_STEPS = 20
 FINAL_LEARNING_RATE = 0.1  # at the end, relative to the first
 SKIPS_ALLOWED = 2  # consecutive; one more non-finite step stops the run
-HELD_OUT_RAYS = 2048
+HELD_OUT_RAYS = 2048  # for the held-out PSNR and the check of the surface
 MIN_PERSON_COVERAGE = 0.1  # of the person's pixels; below it the surface has collapsed
 MAX_BACKGROUND_COVERAGE = 0.8  # of the background pixels; above it the surface fills the box
 MIN_SAMPLES_PER_RAY = 64  # through a whole scene: valid-wave's body covers 38 % with 16, 59 % with 64, 64 % with 256
@@ -99,7 +99,7 @@ class Trainer:
 
     @property
     def steps(self) -> int:
-        """Number of steps of both phases."""
+        """Return the number of steps of both phases."""
         return self.field_steps + (self.settings.novel_pose_steps if self._novel_frames_learn else 0)
 
     @property

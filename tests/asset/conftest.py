@@ -3,7 +3,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from hnerf.asset.albedo import Albedo
 from hnerf.asset.correctives import correctives_of
+from hnerf.asset.light import Light
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.staging import StagedAvatar, stage_avatar
 from hnerf.asset.texture import unwrap
@@ -12,7 +14,8 @@ from tests.asset.figure import bending_body, posed_with_displacements, upright_c
 
 @pytest.fixture(scope="session")
 def staged() -> StagedAvatar:
-    """Return clothes around the bending column, with two shapes of noise, and a texture and a normal map of noise."""
+    """Return clothes around the bending column, with two shapes of noise, textures and a normal map of noise,
+    and light from above."""
     body = bending_body()
     clothes = upright_column(0.18, -0.05, 1.65)
     layout = unwrap(clothes.vertices, clothes.faces, 64)
@@ -24,4 +27,5 @@ def staged() -> StagedAvatar:
     surfaces_m = posed_with_displacements(clothed, moved_m)
     normals = rng.integers(100, 156, (32, 32, 3), np.uint8)
     shapes = correctives_of(moved_m, 2)
-    return stage_avatar(clothed, surfaces_m, shapes, layout, texture, "z", 10.0, normal_map=normals)
+    albedo = Albedo(rng.integers(0, 255, (64, 64, 3), np.uint8), Light(np.array([0.7, 0, 0.26, 0, 0, 0, 0, 0, 0]), 9.0))
+    return stage_avatar(clothed, surfaces_m, shapes, layout, texture, "z", 10.0, albedo=albedo, normal_map=normals)

@@ -27,7 +27,7 @@ def test_surface_is_the_grown_body() -> None:
 
 FILES = {"avatar.usda", "avatar_24.usda", "avatar_30.usda", "avatar.usdz", "avatar_cache.usdz", "avatar.glb"}
 FILES |= {"avatar_game.glb", "avatar.bvh", "avatar/texture.png", "avatar/normal_map.png"}
-FILES |= {f"avatar/{name}.usdc" for name in ("geometry", "look", "cameras", "rig_full", "rig_game")}
+FILES |= {f"avatar/{name}.usdc" for name in ("geometry", "look_captured", "cameras", "rig_full", "rig_game")}
 FILES |= {f"avatar/motion_{name}.usdc" for name in ("captured", "captured_24", "captured_30", "nod")}
 
 
@@ -46,6 +46,7 @@ def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monke
     assert page.count("<img") == 2 + 4 + 2  # turntable, surface, texture
     assert report["mesh"]["watertight"] and report["mesh"]["faces"] <= 2000
     assert report["mesh"]["height_m"] == pytest.approx(1.62, abs=0.005)
+    assert report["light"] is None  # without photographs
     assert (report["frames"], report["joints"], report["cameras"]) == (4, 3, 1)
     assert report["rigs"]["game"]["influences"] == 2 and report["rigs"]["game"]["moved_max_mm"] < 0.01
     assert report["motions"]["nod"] == {"fps": 25.0, "poses": 2}

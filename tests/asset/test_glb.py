@@ -5,13 +5,14 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pygltflib
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from hnerf.asset.glb import write_glb
+from hnerf.asset.glb import VARIANTS, write_glb
 from hnerf.asset.staging import StagedAvatar
 from hnerf.asset.tangents import uv_tangents
 from hnerf.asset.texture import UvLayout
@@ -122,11 +123,32 @@ def test_a_normal_map_has_its_tangents(glb: Path, staged: StagedAvatar) -> None:
     np.testing.assert_array_equal(np.asarray(mesh.visual.material.normalTexture), staged.normal_map)
 
 
-def test_a_normal_map_can_be_left_out(staged: StagedAvatar, tmp_path: Path) -> None:
-    write_glb(tmp_path / "smooth.glb", dataclasses.replace(staged, normal_map=None), staged.rigs["full"])
+def test_a_normal_map_and_an_albedo_can_be_left_out(staged: StagedAvatar, tmp_path: Path) -> None:
+    bare = dataclasses.replace(staged, normal_map=None, albedo=None)
+    write_glb(tmp_path / "smooth.glb", bare, staged.rigs["full"])
     document = pygltflib.GLTF2.load(str(tmp_path / "smooth.glb"))
     assert document.meshes[0].primitives[0].attributes.TANGENT is None
+    assert document.extensionsUsed == [] and len(document.materials) == 1
     assert document.materials[0].normalTexture is None and len(document.images) == 1
+
+
+def test_the_albedo_is_another_variant_of_the_material(glb: Path, staged: StagedAvatar) -> None:
+    document = pygltflib.GLTF2.load(str(glb))
+    names = [variant["name"] for variant in document.extensions[VARIANTS]["variants"]]
+    (primitive,) = document.meshes[0].primitives
+    shown = {}
+    for mapping in primitive.extensions[VARIANTS]["mappings"]:
+        material = document.materials[mapping["material"]]
+        image = document.images[document.textures[material.pbrMetallicRoughness.baseColorTexture.index].source]
+        view = document.bufferViews[image.bufferView]
+        png = np.frombuffer(document.binary_blob()[view.byteOffset :][: view.byteLength], np.uint8)
+        (variant,) = mapping["variants"]
+        picture = cv2.imdecode(png, cv2.IMREAD_COLOR)
+        assert picture is not None
+        shown[names[variant]] = picture[..., ::-1]
+    assert primitive.material == names.index("captured") and staged.albedo is not None
+    np.testing.assert_array_equal(shown["captured"], staged.texture)
+    np.testing.assert_array_equal(shown["albedo"], staged.albedo.texture)
 
 
 def test_motion_is_in_seconds_from_the_first_frame(glb: Path) -> None:

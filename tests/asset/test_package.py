@@ -6,8 +6,9 @@ from zipfile import ZipFile
 import cv2
 import numpy as np
 import pytest
-from pxr import Ar, Usd, UsdGeom, UsdShade, UsdSkel, Vt
+from pxr import Ar, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
+from hnerf.asset.dome import dome
 from hnerf.asset.package import AssetInfo, write_cache, write_package, write_usdz
 from hnerf.asset.staging import StagedAvatar
 from hnerf.asset.validation import each_variant
@@ -91,12 +92,21 @@ def test_an_interface_at_another_rate_has_whole_time_codes(rate: int, package: P
     np.testing.assert_allclose(skinned_points(stage, rate / 2), staged.points_m[2], atol=1e-5)
 
 
+def test_packaging_finds_every_file_and_is_silent(
+    staged: StagedAvatar, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write_all(tmp_path, staged)
+    assert capfd.readouterr() == ("", "")
+    with ZipFile(tmp_path / "avatar.usdz") as archive:
+        assert set(archive.namelist()) == {"avatar.usdc", "texture.png", "albedo.png", "light.png", "normal_map.png"}
+
+
 def test_the_same_avatar_is_the_same_bytes_at_any_time(package: Path, staged: StagedAvatar, tmp_path: Path) -> None:
     """ZIP counts in steps of two seconds."""
     time.sleep(max(0.0, (package / "avatar_cache.usdz").stat().st_mtime + 2.0 - time.time()))
     write_all(tmp_path, staged)
     written = [path for path in sorted(tmp_path.rglob("*")) if path.is_file()]
-    assert len(written) == 3 + 2 + 3 + 2 + 3 + 2  # interfaces, textures, common parts, rigs, motions, .usdz
+    assert len(written) == 3 + 4 + 2 + 2 + 2 + 3 + 2  # interfaces, pictures, common parts, looks, rigs, motions, .usdz
     for path in written:
         assert path.read_bytes() == (package / path.relative_to(tmp_path)).read_bytes(), path.name
     with ZipFile(tmp_path / "avatar.usdz") as archive:
@@ -138,24 +148,63 @@ def test_the_hint_has_room_for_every_motion(staged: StagedAvatar, tmp_path: Path
     assert (hint[1] >= corners.max(0) - 1e-4).all() and (hint[0] <= corners.min(0) + 1e-4).all()
 
 
+def bound_surface(stage: Usd.Stage) -> UsdShade.Shader:
+    """Return the shader that the mesh shows."""
+    mesh = next(prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
+    return UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()[0].ComputeSurfaceSource()[0]
+
+
+def texture_of(surface: UsdShade.Shader, given: str) -> UsdShade.Shader:
+    """Return the texture that an input of a surface is connected to."""
+    return UsdShade.Shader(surface.GetInput(given).GetConnectedSources()[0][0].source.GetPrim())
+
+
+def pixels(path: Sdf.AssetPath) -> np.ndarray:
+    """Return the picture (H, W, 3) in a file of the package."""
+    file = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(path.resolvedPath))
+    picture = cv2.imdecode(np.frombuffer(file.GetBuffer(), np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    return picture[..., ::-1]
+
+
+@pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_24.usda"])
+def test_the_albedo_look_has_the_light_that_was_taken_out(name: str, package: Path, staged: StagedAvatar) -> None:
+    stage = Usd.Stage.Open(str(package / name))
+    look = stage.GetDefaultPrim().GetVariantSet("look")
+    assert (look.GetVariantNames(), look.GetVariantSelection()) == (["albedo", "captured"], "captured")
+    assert not stage.GetPrimAtPath("/Avatar/Light")
+    look.SetVariantSelection("albedo")
+    surface, light = bound_surface(stage), UsdLux.DomeLight(stage.GetPrimAtPath("/Avatar/Light"))
+    assert surface.GetPath() == "/Avatar/Materials/Albedo/Surface"
+    assert not stage.GetPrimAtPath("/Avatar/Materials/Captured")
+    assert staged.albedo is not None
+    shown = pixels(texture_of(surface, "diffuseColor").GetInput("file").Get())
+    picture, intensity = dome(staged.albedo.light)
+    np.testing.assert_array_equal(shown, staged.albedo.texture)
+    np.testing.assert_array_equal(pixels(light.GetTextureFileAttr().Get()), picture)
+    assert surface.GetInput("ior").Get() == 1
+    assert light.GetIntensityAttr().Get() == pytest.approx(intensity)
+    assert picture[0].min() > 100 + picture[-1].max()  # from above in the world, Z up, is above in the stage, Y up
+
+
 @pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_cache.usdz"])
 def test_the_surface_has_a_texture_and_a_normal_map(name: str, package: Path, staged: StagedAvatar) -> None:
     stage = Usd.Stage.Open(str(package / name))
-    material = UsdShade.Material(stage.GetPrimAtPath("/Avatar/Materials/Captured"))
-    surface = material.ComputeSurfaceSource()[0]
+    surface = bound_surface(stage)
+    assert surface.GetPath() == "/Avatar/Materials/Captured/Surface"
     for given, expected, space in (("diffuseColor", staged.texture, "sRGB"), ("normal", staged.normal_map, "raw")):
-        texture = UsdShade.Shader(surface.GetInput(given).GetConnectedSources()[0][0].source.GetPrim())
+        texture = texture_of(surface, given)
         assert texture.GetInput("sourceColorSpace").Get() == space
-        file = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(texture.GetInput("file").Get().resolvedPath))
-        pixels = cv2.imdecode(np.frombuffer(file.GetBuffer(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-        np.testing.assert_array_equal(pixels, expected)
+        np.testing.assert_array_equal(pixels(texture.GetInput("file").Get()), expected)
     # Of values from 0 to 1, so that they become components from -1 to 1.
     assert texture.GetInput("scale").Get() == (2, 2, 2, 1) and texture.GetInput("bias").Get() == (-1, -1, -1, 0)
 
 
-def test_a_normal_map_can_be_left_out(staged: StagedAvatar, tmp_path: Path) -> None:
-    write_usdz(tmp_path / "smooth.usdz", dataclasses.replace(staged, normal_map=None), [], 10.0, INFO)
+def test_a_normal_map_and_an_albedo_can_be_left_out(staged: StagedAvatar, tmp_path: Path) -> None:
+    bare = dataclasses.replace(staged, normal_map=None, albedo=None)
+    write_usdz(tmp_path / "smooth.usdz", bare, [], 10.0, INFO)
     stage = Usd.Stage.Open(str(tmp_path / "smooth.usdz"))
+    assert stage.GetDefaultPrim().GetVariantSet("look").GetVariantNames() == ["captured"]
     surface = UsdShade.Shader(stage.GetPrimAtPath("/Avatar/Materials/Captured/Surface"))
     assert [given.GetBaseName() for given in surface.GetInputs() if given.HasConnectedSource()] == ["diffuseColor"]
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from hnerf.asset.photographs import FIELD_WEIGHT, OUTLIER, colours_from_photographs, visible_texels
+from hnerf.asset.photographs import FIELD_WEIGHT, OUTLIER, CapturedBlend, photographed_texels, visible_texels
 from hnerf.asset.texture import Texels
+from hnerf.avatar.avatar import Gains
 from hnerf.geometry.camera import Camera
 
 SIZE_PX = 101
@@ -47,19 +48,32 @@ def capture(photographs: dict[str, int], cameras: list[Camera]) -> Any:
     )
 
 
+def colours_from_photographs(
+    capture: Any, gains: Gains, surfaces_m: dict[int, np.ndarray], faces: np.ndarray, texels: Texels, field: np.ndarray
+) -> np.ndarray:
+    """Return the blend of all that photographs show of texels."""
+    blend = CapturedBlend(field)
+    for seen in photographed_texels(capture, gains, surfaces_m, faces, texels):
+        blend.add(seen)
+    return blend.colours()
+
+
 def test_a_texel_is_seen_where_it_projects() -> None:
-    index, cosine, pixels_px = visible_texels(camera(), square(0.4, 0.0), FACES, texels_at([0], [[0.5, 0.25, 0.25]]))
+    index, cosine, normals, pixels_px = visible_texels(
+        camera(), square(0.4, 0.0), FACES, texels_at([0], [[0.5, 0.25, 0.25]])
+    )
     assert index.tolist() == [0]
     np.testing.assert_allclose(pixels_px, [[50, 40]], atol=1e-4)  # (0, -0.2) m, 50 px a metre
     np.testing.assert_allclose(cosine, [2 / np.sqrt(4.04)], atol=1e-6)
+    np.testing.assert_allclose(normals, [[0, 0, -1]], atol=1e-6)
 
 
 def test_a_square_behind_another_is_hidden_and_one_from_behind_too() -> None:
     vertices_m = np.concatenate([square(0.4, 0.0), square(0.4, -0.3)])
     both = np.concatenate([FACES, FACES + 4])
-    index, _, _ = visible_texels(camera(), vertices_m, both, texels_at([0, 2], [MIDDLE, MIDDLE]))
+    index, _, _, _ = visible_texels(camera(), vertices_m, both, texels_at([0, 2], [MIDDLE, MIDDLE]))
     assert index.tolist() == [1]
-    index, _, _ = visible_texels(camera(), square(0.4, 0.0), FACES[:, ::-1].copy(), texels_at([0], [MIDDLE]))
+    index, _, _, _ = visible_texels(camera(), square(0.4, 0.0), FACES[:, ::-1].copy(), texels_at([0], [MIDDLE]))
     assert len(index) == 0
 
 
@@ -68,7 +82,7 @@ def test_texels_near_an_outline_are_left_out() -> None:
     at_px = np.array([31.0, 34.0])
     share = (at_px - 30) / 40  # along the diagonal from corner 0 to corner 2
     texels = texels_at([0, 0], [[1 - s, s, 0] for s in share.tolist()])
-    index, _, pixels_px = visible_texels(camera(), square(0.4, 0.0), FACES, texels)
+    index, _, _, pixels_px = visible_texels(camera(), square(0.4, 0.0), FACES, texels)
     assert index.tolist() == [1]
     np.testing.assert_allclose(pixels_px, [[34, 34]], atol=1e-4)
 
@@ -104,7 +118,7 @@ def test_gains_are_divided_out_and_unseen_texels_keep_the_fields_colour() -> Non
 
 def test_a_photograph_that_contradicts_the_field_counts_little() -> None:
     """White against black is sqrt(3) / OUTLIER of an outlier."""
-    args = ({}, {0: square(0.4, 0.0)}, FACES, texels_at([0], [MIDDLE]), np.zeros((1, 3)))
+    white, texels = capture({"front": 255}, [camera()]), texels_at([0], [MIDDLE])
+    found = colours_from_photographs(white, {}, {0: square(0.4, 0.0)}, FACES, texels, np.zeros((1, 3)))
     vote = 1 / (1 + 3 / OUTLIER**2) ** 2
-    found = colours_from_photographs(capture({"front": 255}, [camera()]), *args)
     assert found[0, 0] == pytest.approx(vote / (vote + FIELD_WEIGHT), abs=1e-6)

@@ -59,4 +59,4 @@ def test_the_layout_shows_where_faces_lie_in_the_texture(card: StagedAvatar) -> 
     layout = pictures.uv_picture(lower, 64)
     assert layout[10, 32].tolist() == [255, 255, 255]
     assert layout[60, 40].tolist() == pictures.PAPER.tolist()
-    assert pictures.texture_picture(card, 32)[4, 4].tolist() == RED
+    assert pictures.texture_picture(card.texture, 32)[4, 4].tolist() == RED

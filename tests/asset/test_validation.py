@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
 from hnerf.asset.package import AssetInfo, write_package, write_usdz
 from hnerf.asset.staging import StagedAvatar
@@ -147,6 +147,10 @@ def no_colours(stage: Usd.Stage) -> None:
     mesh(stage).GetDisplayColorAttr().Set([Gf.Vec3f(1)])
 
 
+def no_material(stage: Usd.Stage) -> None:
+    UsdShade.MaterialBindingAPI(mesh(stage)).UnbindDirectBinding()
+
+
 def no_kind(stage: Usd.Stage) -> None:
     Usd.ModelAPI(stage.GetDefaultPrim()).SetKind("assembly")
 
@@ -200,6 +204,7 @@ def no_default_prim(stage: Usd.Stage) -> None:
         (shape_without_target, "1 blend shapes but 3 targets"),
         (negative_weight, "blend shape weights are not one a shape from 0 to 1 at time 5"),
         (no_colours, "1 display colours for its points"),
+        (no_material, "/Avatar/Body/Surface: no material is bound"),
         (no_kind, "kind is assembly, not component"),
         (no_identifier, "assetInfo has no identifier"),
         (small_hint, "extentsHint does not contain /Avatar/Body at time"),
@@ -215,6 +220,14 @@ def test_each_defect_is_named(stage: Usd.Stage, damage: Callable[[Usd.Stage], No
     stage.SetEditTarget(stage.GetRootLayer() if damage in of_root_layer else stage.GetSessionLayer())
     damage(stage)
     assert message in "; ".join(data_defects(stage))
+
+
+def test_an_albedo_needs_its_light(stage: Usd.Stage) -> None:
+    stage.SetEditTarget(stage.GetSessionLayer())
+    stage.GetDefaultPrim().GetVariantSet("look").SetVariantSelection("albedo")
+    assert data_defects(stage) == []
+    UsdLux.DomeLight(stage.GetPrimAtPath("/Avatar/Light")).GetTextureFileAttr().Block()
+    assert data_defects(stage) == ["/Avatar: the albedo has no light with a picture"]
 
 
 def test_a_game_rig_has_few_influences(stage: Usd.Stage) -> None:
@@ -240,7 +253,7 @@ def test_a_motion_at_another_rate_is_at_its_whole_frames(stage: Usd.Stage) -> No
 def test_what_we_write_passes_every_validator(package: Path) -> None:
     for name in ("avatar.usdz", "avatar.usda", "avatar_24.usda"):
         report = validate_package(package / name)
-        assert (report["variants"], report["warnings"]) == (6, [])
+        assert (report["variants"], report["warnings"]) == (12, [])
         assert report["validators"] >= 30
 
 
@@ -249,7 +262,9 @@ def test_a_defect_in_one_variant_says_in_which(package: Path, tmp_path: Path) ->
     motion = Usd.Stage.Open(str(tmp_path / "copy/avatar/motion_captured_30.usdc"))
     UsdSkel.Animation(motion.GetPrimAtPath(f"{BODY}/Motion/game")).GetBlendShapeWeightsAttr().Set([2.0] * 3, 9.0)
     motion.GetRootLayer().Save()
-    with pytest.raises(InvalidAsset, match=r"usda: rig=full motion=captured_30: /Avatar/Body/Motion/game: blend shape"):
+    with pytest.raises(
+        InvalidAsset, match=r"usda: look=albedo rig=full motion=captured_30: /Avatar/Body/Motion/game: blend shape"
+    ):
         validate_package(tmp_path / "copy/avatar.usda")
 
 

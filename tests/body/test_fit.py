@@ -49,7 +49,7 @@ def test_one_camera_finds_the_depth(tmp_path: Path) -> None:
 
 
 def test_neighbours_outvote_an_arm_mirrored_in_depth(tmp_path: Path) -> None:
-    truth, settings = moving_body(tuple(range(5))), FitSettings()
+    truth, settings = moving_body((0, 1, 2)), FitSettings()
     capture = record(tmp_path, truth, RING, ("0",))
     seen = observe(capture)
     smoothness = Smoothness(runs(capture), capture.fps, np.full(25, 30.0))
@@ -58,12 +58,12 @@ def test_neighbours_outvote_an_arm_mirrored_in_depth(tmp_path: Path) -> None:
     problem = make_problem(body_model(settings), pose, seen, smoothness, settings, offsets=1, proportions=0.1)
     pose = levenberg_marquardt(problem, pose, problem.image_term, 30)
     mirrored_theta = pose.theta.clone()
-    mirrored_theta[2, truth.rig.joint_names.index("upperarm01.L")] += torch.tensor([0.0, 2.0, 0.0])
+    mirrored_theta[1, truth.rig.joint_names.index("upperarm01.L")] += torch.tensor([0.0, 2.0, 0.0])
     mirrored = levenberg_marquardt(problem, replace(pose, theta=mirrored_theta), problem.image_term, 30)
     wrist = truth.rig.joint_names.index("wrist.L")
 
     def off_m(found: Pose) -> float:
-        where = [joint_transforms(p.rig, p.theta, p.root)[2, wrist, :3, 3] for p in (found, pose)]
+        where = [joint_transforms(p.rig, p.theta, p.root)[1, wrist, :3, 3] for p in (found, pose)]
         return float((where[0] - where[1]).norm())
 
     assert off_m(mirrored) > 0.5  # descent alone stays there

@@ -11,12 +11,10 @@ from hnerf.calibration.check import check_calibration
 from hnerf.calibration.diagnosis import MISTAKES, body_height_m, cost_without_each_px, likely_unit, size_ratio
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
-from hnerf.capture.ingest import ingest
-from hnerf.config import CalibrationSettings, CaptureSettings
+from hnerf.config import CalibrationSettings
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import STANDING_M, detections, ring, turned, walk_m, write_capture
-from tests.shared_data import shared_capture
 
 SETTINGS = CalibrationSettings()
 Mistake = Callable[[Camera], Camera]
@@ -277,8 +275,7 @@ def test_one_camera_says_what_is_not_checked(tmp_path: Path) -> None:
     assert load_cameras(tmp_path / "out", capture).train_cameras == ("c0",)
 
 
-def test_a_rendered_capture_is_left_alone(tmp_path: Path) -> None:
-    capture = ingest(shared_capture("valid-wave"), CaptureSettings(), tmp_path)
-    report = check_calibration(capture, SETTINGS)
+def test_a_rendered_capture_is_left_alone(wave: Capture) -> None:
+    report = check_calibration(wave, SETTINGS)
     assert report.verdict == "ok"
-    assert all(report.cameras[name] is camera for name, camera in capture.cameras.items())
+    assert all(report.cameras[name] is camera for name, camera in wave.cameras.items())

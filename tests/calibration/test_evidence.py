@@ -6,7 +6,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 
 from hnerf.calibration.check import check_calibration
 from hnerf.calibration.diagnosis import measure
@@ -16,16 +15,9 @@ from hnerf.calibration.report import load_cameras
 from hnerf.calibration.sheet import draw_evidence
 from hnerf.calibration.silhouettes import Outlines
 from hnerf.capture.capture import Capture
-from hnerf.capture.ingest import ingest
 from hnerf.capture.subject import subject_keypoints
-from hnerf.config import CalibrationSettings, CaptureSettings
+from hnerf.config import CalibrationSettings
 from tests.calibration.synthetic import turned
-from tests.shared_data import shared_capture
-
-
-@pytest.fixture(scope="module")
-def wave(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    return ingest(shared_capture("valid-wave"), CaptureSettings(), tmp_path_factory.mktemp("wave"))
 
 
 def test_a_turned_camera_before_and_after(wave: Capture, tmp_path: Path) -> None:

@@ -3,11 +3,8 @@ import pytest
 
 from hnerf.calibration.matches import Matches, _verified_matches, fundamental, sampson_px
 from hnerf.capture.capture import Capture
-from hnerf.capture.ingest import ingest
-from hnerf.config import CaptureSettings
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import look_at, turned
-from tests.shared_data import shared_capture
 
 
 def pair() -> tuple[Camera, Camera]:
@@ -43,11 +40,6 @@ def test_verification_does_not_ask_the_calibration() -> None:
     assert 200 <= len(kept) < 210
     assert len(_verified_matches(wrong)) == 0
     assert len(_verified_matches(seen(10))) == 0
-
-
-@pytest.fixture(scope="module")
-def wave(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    return ingest(shared_capture("valid-wave"), CaptureSettings(), tmp_path_factory.mktemp("wave"))
 
 
 def test_views_a_right_angle_apart_share_no_matches(wave: Capture) -> None:

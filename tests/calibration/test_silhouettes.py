@@ -9,11 +9,8 @@ import pytest
 
 from hnerf.calibration.silhouettes import MaskOutline, Outlines
 from hnerf.capture.capture import Capture
-from hnerf.capture.ingest import ingest
-from hnerf.config import CaptureSettings
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import SIZE_PX, look_at, ring, turned
-from tests.shared_data import shared_capture
 
 CORNERS_M = np.array(list(product([-0.2, 0.2], [-0.3, 0.3], [0.1, 1.7])))
 
@@ -88,11 +85,6 @@ def test_a_camera_without_mask_takes_no_part() -> None:
     residuals_px = partly.residuals_px([*cameras[:3], turned(cameras[3], 20)])
     assert len(residuals_px["c3"]) == 0 and len(residuals_px["c0"]) > 30
     assert max(row.max() for row in residuals_px.values() if len(row)) < 1.5
-
-
-@pytest.fixture(scope="module")
-def wave(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    return ingest(shared_capture("valid-wave"), CaptureSettings(), tmp_path_factory.mktemp("wave"))
 
 
 def test_a_rendered_capture_tells_a_turned_camera(wave: Capture) -> None:

@@ -50,7 +50,7 @@ def test_costs_have_a_row_a_part_of_a_stage() -> None:
         ("Body fit: outlines, seconds", "12.25"),
         ("Training, seconds", "60"),
         ("Evaluation: rendering, seconds", "3.5"),
-        ("One image, seconds (median)", "0.1"),
+        ("One image, seconds (mean)", "0.1"),
     ]
 
 

@@ -19,9 +19,7 @@ CENTIMETRES = torch.tensor([[0.01, 0.0, 0.0], [0.0, 0.0, 0.02]])
 def at(corners: list[int], barycentric: list[float]) -> Descriptor:
     """Return the descriptor of a point next to a triangle of the box."""
     nowhere, corner = torch.zeros(1, 3), torch.tensor([corners])
-    return Descriptor(
-        torch.zeros(1), nowhere, nowhere, nowhere, torch.ones(1).bool(), corner, torch.tensor([barycentric])
-    )
+    return Descriptor(torch.zeros(1), nowhere, nowhere, torch.ones(1).bool(), corner, torch.tensor([barycentric]))
 
 
 def deformation(nodes: int) -> FrameDeformation:

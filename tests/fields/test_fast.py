@@ -220,8 +220,8 @@ def test_training_begins_with_half_the_samples():
 def on_a_ray(depth_m: list[float], near: list[bool]) -> Descriptor:
     """Return descriptors of one ray's samples at given heights above the skin z = 0, which it meets perpendicularly."""
     d, zero = torch.tensor(depth_m), torch.zeros(len(depth_m))
-    y, normal = torch.stack([zero, zero, d], 1), torch.stack([d, zero, zero], 1)  # a normal that tells samples apart
-    return Descriptor(d, y, y, normal, torch.tensor(near), torch.zeros(len(d), 3).long(), torch.zeros(len(d), 3))
+    y = torch.stack([zero, zero, d], 1)
+    return Descriptor(d, y, y, torch.tensor(near), torch.zeros(len(d), 3).long(), torch.zeros(len(d), 3))
 
 
 def test_colours_are_those_of_the_surface_between_two_samples():
@@ -232,7 +232,6 @@ def test_colours_are_those_of_the_surface_between_two_samples():
     expected = torch.tensor([0.006, 0.001, -0.002, -0.008])
     assert torch.allclose(moved.d, expected, atol=1e-7)
     assert torch.allclose(moved.y[:, 2], expected, atol=1e-7)
-    assert torch.allclose(moved.normal[:, 0], expected, atol=1e-7)
 
 
 def test_samples_stay_where_the_next_one_is_out_of_reach_or_on_another_limb():
@@ -252,7 +251,7 @@ def test_a_surface_is_met_at_the_same_point_when_its_body_moves_along_the_ray():
     def met_at(points_on_rays: torch.Tensor, down: torch.Tensor) -> torch.Tensor:
         d = height + points_on_rays + down
         y = torch.stack([x - points_on_rays, torch.zeros_like(x), d], 1)
-        described = dataclasses.replace(on_a_ray([0.0, 0.0], [True] * 2), d=d, y=y, normal=y)
+        described = dataclasses.replace(on_a_ray([0.0, 0.0], [True] * 2), d=d, y=y)
         return move_to_surface(described, d[None]).y[0]
 
     still = torch.zeros((), dtype=torch.double, requires_grad=True)

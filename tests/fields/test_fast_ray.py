@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from hnerf.body.canonical import PosedBodies
+from hnerf.body.rig import Rig
 from hnerf.config import FastFieldSettings
 from hnerf.fields.compositing import weights_from_alpha
 from hnerf.fields.conditions import Conditions, Draws
@@ -21,6 +22,7 @@ from hnerf.fields.samples import RaySamples
 from tests.body.boxes import box_rig
 
 RIG = box_rig()
+FINE_RIG = box_rig(splits=2)  # of whose vertices those around the ray have the face's normal
 THETA = torch.tensor([[[0.0, 0, 0], [-0.4, 0.5, 0.6]], [[0.0, 0, 0], [0.1, 0.2, 0.3]]])
 ROOT = torch.eye(4).repeat(2, 1, 1)
 ROOT[1, :2] = torch.tensor([[0.0, -1, 0, 2.55], [1, 0, 0, 0]])
@@ -33,9 +35,9 @@ OUTERMOST, INNERMOST = 0.3, 0.99  # of the ray's samples
 Distance = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 
 
-def field_of(residual: Distance, nodes: int = 0) -> FastField:
+def field_of(residual: Distance, nodes: int = 0, rig: Rig = RIG) -> FastField:
     """Return a field with a sharp surface and the given DH."""
-    field = FastField(RIG, SETTINGS.model_copy(update={"nodes": nodes}), 2)
+    field = FastField(rig, SETTINGS.model_copy(update={"nodes": nodes}), 2)
     field.log_sharpness.data.fill_(2000.0).log_()
     field.field.residual = residual
     return field
@@ -45,9 +47,9 @@ def nothing(y_m: Tensor, d_m: Tensor, pose: Tensor, row: Tensor) -> Tensor:
     return torch.zeros_like(d_m)
 
 
-def sampled(field: FastField, probe: float | None = None) -> RaySamples:
-    bodies = PosedBodies(RIG, THETA, ROOT, RIG.vertices_m)
-    conditions = Conditions.of(RIG, THETA, ROOT, torch.arange(2), 2.5)
+def sampled(field: FastField, probe: float | None = None, rig: Rig = RIG) -> RaySamples:
+    bodies = PosedBodies(rig, THETA, ROOT, rig.vertices_m)
+    conditions = Conditions.of(rig, THETA, ROOT, torch.arange(2), 2.5)
     draws = Draws(torch.full((1, 12), 0.5), torch.rand(1, 3), torch.zeros(1, 12))
     if probe is not None:
         draws = Draws(draws.jitter, draws.background, draws.fine, torch.tensor([probe]))
@@ -64,16 +66,16 @@ def test_the_networks_see_the_canonical_place_the_frames_pose_and_the_normal_in_
     asked: dict[str, tuple[Tensor, ...]] = {}
 
     def residual(*inputs: Tensor) -> Tensor:
-        asked["residual"] = inputs
+        asked.setdefault("residual", inputs)
         return torch.full_like(inputs[1], -0.01)
 
     def colour(*inputs: Tensor) -> Tensor:
         asked["colour"] = inputs
         return inputs[0]
 
-    field = field_of(residual)
+    field = field_of(residual, rig=FINE_RIG)
     field.field.colour = colour
-    samples = sampled(field)
+    samples = sampled(field, rig=FINE_RIG)
     place, depth, normal, pose, row = asked["colour"]
     at = int((depth - 0.01).abs().argmin())
     same(place[at], [0.4, 1.01, 0.25])
@@ -86,6 +88,17 @@ def test_the_networks_see_the_canonical_place_the_frames_pose_and_the_normal_in_
     same(pose[row], [[0.1, 0.2, 0.3]] * len(depth))
     same(samples.colour[0, weights_from_alpha(samples.alpha)[0].argmax()], [0.4, 1.01, 0.25])
     same(samples.residual, [[0.0] * (12 - len(depth)) + [-0.01] * len(depth)])  # the first lie beyond the shell
+
+
+def test_light_falls_on_the_surface_not_on_the_body() -> None:
+    """The distance rises by 1.5 along y and by 0.3 along x of the rest body, which are -x and y of the world; what the
+    colour's loss asks of the normal reaches the network of the distance."""
+    slope, normals = torch.tensor(0.5, requires_grad=True), []
+    field = field_of(lambda y, d, pose, row: slope * (y[:, 1] - 1) + 0.3 * (y[:, 0] - 0.4), rig=FINE_RIG)
+    field.field.colour = lambda y, d, normal, pose, row: normals.append(normal) or normal
+    sampled(field, rig=FINE_RIG)
+    same(normals[0], [[-1.5 / 2.34**0.5, 0.3 / 2.34**0.5, 0.0]] * len(normals[0]))
+    assert torch.autograd.grad(normals[0][0, 0], slope)[0].item() == pytest.approx(-0.09 / 2.34**1.5, abs=1e-4)
 
 
 @pytest.mark.parametrize("probe", [OUTERMOST, INNERMOST])

@@ -21,7 +21,7 @@ from tasks import benchmark as tasks_module
 from tasks.launcher import LostWorkerError
 from tasks.source import Source
 from tasks.store import Artifact, Store
-from tests.study.test_benchmark_results import scores
+from tests.study.benchmark.test_results import scores
 
 RECORDED = SimpleNamespace(name="ada", train_cameras=("1", "2", "3", "4"), train_frames=(0, 1, 2), test_cameras=("5",))
 STUDY = """

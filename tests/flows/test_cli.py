@@ -144,8 +144,9 @@ def test_unreadable_capture_leaves_nothing_half_written(tmp_path: Path, capsys: 
 
 
 def test_check_prints_every_camera_and_the_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    capture = shared_capture("valid-wave")
-    assert main(["check-cameras", str(capture), "--store", str(tmp_path)]) == 0
+    capture, preset = shared_capture("valid-wave"), tmp_path / "no-hands.yaml"
+    preset.write_text("based_on: fast\ndetection: {hands: none}\n")
+    assert main(["check-cameras", str(capture), "--store", str(tmp_path), "--preset", str(preset)]) == 0
     lines = capsys.readouterr().out.splitlines()
     table = lines[next(i for i, line in enumerate(lines) if line.startswith("camera ")) :]
     report = json.loads(next(tmp_path.glob("calibration/*/report.json")).read_text())

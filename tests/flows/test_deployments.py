@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from prefect import get_client
+from prefect.client.schemas.actions import WorkPoolCreate
 from prefect.client.schemas.filters import DeploymentFilter, DeploymentFilterName, FlowFilter, FlowFilterName
 from prefect.client.schemas.objects import FlowRun
 from prefect.deployments import run_deployment
@@ -30,7 +31,8 @@ def prefect(api: str, *arguments: str) -> str:
 @pytest.fixture(scope="module")
 def deployed(prefect_api: str) -> str:
     """Return the API of a server with the deployments of prefect.yaml."""
-    prefect(prefect_api, "work-pool", "create", "local", "--type", "process")
+    with get_client(sync_client=True) as client:
+        client.create_work_pool(WorkPoolCreate(name="local", type="process"))
     prefect(prefect_api, "deploy", "--all")
     return prefect_api
 
@@ -99,5 +101,6 @@ def test_a_crashed_run_is_begun_again_a_few_times(deployed: str) -> None:
 
 
 def test_parameters_are_checked_before_there_is_a_run(deployed: str) -> None:
-    with pytest.raises(AssertionError, match="overrides"):
-        prefect(deployed, "deployment", "run", "train-subject/local", "-p", "capture=/a", "-p", "overrides=3")
+    with pytest.raises(PrefectHTTPStatusError, match=r"409|422") as refused:
+        run_deployment("train-subject/local", parameters={"capture": "/a", "overrides": 3}, timeout=0)
+    assert "overrides" in refused.value.response.text

@@ -1,18 +1,15 @@
 """The commands that docs/operations.md gives for PostgreSQL, against a server of this test's own: make soak."""
 
 import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import httpx
 import pytest
 
 from tests import postgresql
-from tests.postgresql import BINARIES, free_port
+from tests.postgresql import BINARIES
+from tests.prefect_server import prefect_server
 
-ROOT = Path(__file__).parents[2]
 PATIENCE_S = 300.0
 
 pytestmark = [
@@ -36,23 +33,8 @@ def shell(command: str, environment: dict[str, str], folder: Path) -> str:
 
 def serve(environment: dict[str, str], folder: Path, commands: list[str]) -> str:
     """Run commands against a Prefect server on the database; return what they printed."""
-    port = str(free_port())
-    environment = environment | {"PREFECT_API_URL": f"http://127.0.0.1:{port}/api"}
-    start = [sys.executable, "-m", "prefect", "server", "start", "--host", "127.0.0.1", "--port", port, "--no-ui"]
-    server = subprocess.Popen(start, env=environment, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        deadline = time.monotonic() + PATIENCE_S
-        while True:
-            try:
-                httpx.get(f"http://127.0.0.1:{port}/api/health", timeout=2).raise_for_status()
-                break
-            except httpx.HTTPError:
-                assert server.poll() is None and time.monotonic() < deadline
-                time.sleep(0.5)
-        return "".join(shell(command, environment, folder) for command in commands)
-    finally:
-        server.terminate()
-        server.wait(timeout=60)
+    with prefect_server(PATIENCE_S, environment, folder) as url:
+        return "".join(shell(command, environment | {"PREFECT_API_URL": url}, folder) for command in commands)
 
 
 def test_set_up_upgrade_backup_and_restore(cluster: dict[str, str], tmp_path: Path) -> None:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from hnerf.capture.ingest import ingest
+from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks, encode, movement_px
-from hnerf.config import CaptureSettings, SegmentationSettings
+from hnerf.config import SegmentationSettings
 from hnerf.errors import InputError
 from hnerf.segmentation.cut import components_within
 from hnerf.segmentation.difference import difference, exposure_corrected, masked_median, noise_level, visible_background
@@ -84,7 +84,7 @@ def test_masked_median_by_hand() -> None:
     for is_hidden in hidden:
         near = np.array([[is_hidden, True]])
         priors.append(Prior(near, near, near, near, 1.0))
-    plate, known = masked_median(images, priors)
+    plate, known = masked_median(images, [prior.near for prior in priors])
     assert plate[0].tolist() == [[30, 30, 30], [30, 30, 30]]
     assert known.tolist() == [[True, False]]
 
@@ -215,9 +215,9 @@ def test_without_a_plate_the_background_is_found_around_the_body(tmp_path: Path)
     assert np.mean([iou(masks.get(*view), mask) for view, mask in truth.items()]) >= 0.95
 
 
-def test_rendered_capture_against_ground_truth(tmp_path: Path) -> None:
+def test_rendered_capture_against_ground_truth(wave: Capture) -> None:
     folder = shared_capture("valid-wave")
-    capture = only_frames(ingest(folder, CaptureSettings(), tmp_path), 4)
+    capture = only_frames(wave, 4)
     masks = segment(capture, None, SETTINGS)
     for camera, frame in masks.encoded:
         truth = cv2.imread(str(folder / "ground_truth" / "masks" / camera / f"{frame:06d}.png"), cv2.IMREAD_GRAYSCALE)

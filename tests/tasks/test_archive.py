@@ -194,20 +194,3 @@ def test_a_file_under_many_paths_counts_as_often(packed: Path, tmp_path: Path, m
     with pytest.raises(InputError, match="make room"):
         import_subject(Store(tmp_path / "to"), packed)
     assert nothing_came_of(tmp_path / "to")
-
-
-def test_verify_names_what_is_damaged_missing_or_not_of_it(packed: Path, tmp_path: Path) -> None:
-    store = Store(tmp_path / "from")
-    assert faults(store).lines == []
-    assert faults(store, ["ada"]).artifacts == 4
-    letters = sorted(store.root.glob("fit/*/deep/letters"))
-    letters[0].write_text("abd")
-    (letters[1].parent / "more").touch()
-    (store.subject_folder("bob") / "asset").symlink_to(f"../../asset/{99:032x}")
-    store.path("fit", f"{98:032x}", ".json").write_text("[]")
-    found = faults(store)
-    assert [line.rpartition(": ")[2] for line in found.lines] == [
-        "the record cannot be read", "leads nowhere", "damaged or missing", "not of this artifact"
-    ]  # fmt: skip
-    with pytest.raises(InputError, match="no such subject"):
-        faults(store, ["eve"])

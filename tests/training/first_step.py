@@ -1,9 +1,5 @@
-"""First step of a training with any number of processes; as a script, for the processes that torchrun starts.
+"""First step of a training with any number of processes."""
 
-usage: python -m tests.training.first_step FOLDER PARTS
-"""
-
-import sys
 from pathlib import Path
 
 import torch
@@ -51,10 +47,3 @@ def write_first_step(folder: Path, kind: str, parts: int, processes: Distributed
     finite = gradients(trainer, module)
     assert all(gradient.isfinite().all() for gradient in finite.values())  # so that they tell nothing
     (folder / f"skipped{processes.rank}").write_text(str(trainer.skipped))
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    joined = Distributed.join()
-    for each in KINDS:
-        write_first_step(Path(sys.argv[1], each), each, int(sys.argv[2]), joined)

@@ -11,7 +11,6 @@ import torch
 from hnerf.avatar.surface import surface_in_pose
 from hnerf.avatar.trained import load_avatar
 from hnerf.render.pictures import depth_image, normal_image
-from hnerf.training import trainer as trainer_module
 from hnerf.training.distributed import Distributed
 from hnerf.training.trainer import train
 from tests.training.pretended_gpu import pretended_gpu
@@ -20,10 +19,9 @@ from tests.training.scene import record, tiny
 WITH_GPU = torch.cuda.is_available()
 
 
+@pytest.mark.usefixtures("any_surface")
 @pytest.mark.parametrize("kind", ["fast", "paper", "nerf", "idr", "nerfies"])
 def test_trains_loads_and_renders_on_one_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str):
-    monkeypatch.setattr(trainer_module, "MIN_PERSON_COVERAGE", 0.0)
-    monkeypatch.setattr(trainer_module, "HELD_OUT_RAYS", 64)
     capture, masks, body = record(tmp_path / "capture")
     camera = capture.cameras[capture.train_cameras[0]]
     changes: dict[str, object] = {"one_posture": False, "steps": 2, "novel_pose_steps": 1}

@@ -9,9 +9,11 @@ import torch
 
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.reach import ReachablePixels, everywhere, within_box, within_reach
+from hnerf.training import gather
 from hnerf.training.distributed import Distributed
 from hnerf.training.gather import gather_pixels
 from hnerf.training.pixels import Pixels
+from hnerf.training.plates import plates_of
 from tests.training.scene import record
 
 AHEAD = Camera("ahead", np.diag([50.0, 50.0, 1.0]), np.eye(3), np.zeros(3), 60, 40)
@@ -84,6 +86,20 @@ def test_pixels_show_what_the_images_do(tmp_path: Path, visible_pixels: Reachabl
             assert np.array_equal(pixels.colour[part].numpy(), capture.image(name, frame)[y, x])
             assert np.array_equal(pixels.person[part].numpy(), masks.get(name, frame)[y, x])
             assert pixels.edge[part].any()
+
+
+def test_an_outline_before_an_unknown_background_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of one camera nothing is known: its outlines are gone, its other pixels and the other cameras' outlines are
+    not."""
+    capture, masks, body = record(tmp_path)
+    every = gather_pixels(capture, masks, body, body.frames, REACHED, {}, tmp_path, ALONE)
+    plates = plates_of(capture, masks, body.frames) or []
+    plates[1].known[:] = False
+    monkeypatch.setattr(gather, "plates_of", lambda *_: plates)
+    some = gather_pixels(capture, masks, body, body.frames, REACHED, {}, tmp_path, ALONE)
+    left_out = every.edge & (every.cameras_and_xy(torch.arange(len(every.edge)))[0] == 1)
+    assert left_out.any() and torch.equal(some.colour, every.colour[~left_out])
+    assert torch.equal(some.edges, torch.nonzero(some.edge)[:, 0])
 
 
 def test_edges_are_found_in_every_frame(tmp_path: Path):

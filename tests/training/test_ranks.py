@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from hnerf.training import trainer as trainer_module
 from hnerf.training.checkpoint import NAME
 from hnerf.training.distributed import Distributed
 from hnerf.training.trainer import train
@@ -18,39 +17,19 @@ from tests.training.first_step import KINDS, gradients, untrained
 from tests.training.scene import TINY, record
 
 ALONE = Distributed(0, 1, torch.device("cpu"))
-KILLED = """
-import os, signal, sys, torch
-from pathlib import Path
-from hnerf.training.distributed import Distributed
-from hnerf.training.trainer import Trainer
-from tests.training.scene import TINY, record
-torch.set_num_threads(1)
-root, optimise, p = Path(sys.argv[1]), Trainer._optimise, Distributed.join()
-
-def killed_at_eight(self, module):
-    if self.step == 8 and p.rank == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return optimise(self, module)
-
-Trainer._optimise = killed_at_eight
-Trainer(*record(root / f"capture{p.rank}"), TINY, root, p).run()
-"""
-
-
-def launched(ranks: int, program: list[str]) -> int:
-    """Return the exit status of torchrun with this number of processes of the program."""
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
-    return subprocess.run([*launcher, *program], env=environment).returncode
 
 
 @pytest.fixture(scope="module")
 def two_ranks(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder in which two processes left, by kind of field, what `first_step` writes."""
+    """Return the folder in which two processes left what `two_ranks.py` writes: first steps by kind of field, and a
+    training that was killed, as torchrun says."""
     folder = tmp_path_factory.mktemp("two")
-    for kind in KINDS:
-        (folder / kind).mkdir()
-    assert launched(2, ["-m", "tests.training.first_step", f"{folder}", "3"]) == 0
+    for name in (*KINDS, "killed"):
+        (folder / name).mkdir()
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
+    ended = subprocess.run([*command, "-m", "tests.training.two_ranks", str(folder), "3"], env=environment)
+    assert ended.returncode != 0
     return folder
 
 
@@ -69,15 +48,13 @@ def test_two_ranks_in_three_parts_have_the_gradients_of_one_batch(tmp_path: Path
     assert [(root / f"skipped{rank}").read_text() for rank in (0, 1)] == ["1", "1"]
 
 
+@pytest.mark.usefixtures("any_surface")
 def test_one_process_goes_on_where_two_were_killed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, two_ranks: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """It continues from the checkpoint at step six to the end, with the accuracy of one process from the start."""
-    monkeypatch.setattr(trainer_module, "MIN_PERSON_COVERAGE", 0.0)
-    killed, whole = tmp_path / "killed", tmp_path / "whole"
-    killed.mkdir(), whole.mkdir()
-    (tmp_path / "rank.py").write_text(KILLED)
-    assert launched(2, [f"{tmp_path / 'rank.py'}", f"{killed}"]) != 0
+    killed, whole = two_ranks / "killed", tmp_path / "whole"
+    whole.mkdir()
     assert (killed / NAME).exists() and not (killed / "model.safetensors").exists()
     scene = record(tmp_path / "capture")
     with caplog.at_level(logging.INFO, "hnerf.training"):

@@ -16,7 +16,6 @@ from hnerf.avatar.antialiasing import mixed_pixels
 from hnerf.avatar.trained import load_avatar
 from hnerf.config import TrainingSettings, load_settings
 from hnerf.errors import InputError
-from hnerf.fields import fast as fast_module
 from hnerf.training import trainer as trainer_module
 from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
 from hnerf.training.distributed import Distributed
@@ -28,13 +27,7 @@ from tests.training.scene import FRAMES, TINY, record, tiny
 ALONE = Distributed(0, 1, torch.device("cpu"))
 
 
-@pytest.fixture(autouse=True)
-def any_surface(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Disable the collapse check: a dozen steps leave no surface worth judging; tests of the check set their own
-    threshold. Few rays are rendered for it and for the held-out PSNR, and the shell is tightened in coarse steps."""
-    monkeypatch.setattr(trainer_module, "MIN_PERSON_COVERAGE", 0.0)
-    monkeypatch.setattr(trainer_module, "HELD_OUT_RAYS", 64)
-    monkeypatch.setattr(fast_module, "TIGHTEN_STEP_M", 0.02)
+pytestmark = pytest.mark.usefixtures("any_surface")
 
 
 @pytest.mark.parametrize("kind", ["fast", "paper"])

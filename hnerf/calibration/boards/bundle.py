@@ -45,7 +45,7 @@ class BoardFit:
 
     @property
     def residuals_px(self) -> np.ndarray:
-        """Projected minus seen corners (C, F, N, 2), NaN where not seen."""
+        """Return projected minus seen corners (C, F, N, 2), NaN where not seen."""
         return self.projected_px - self.seen_px
 
     def error_px(self, camera: int | None = None) -> np.ndarray:

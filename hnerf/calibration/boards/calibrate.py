@@ -10,20 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from hnerf.calibration.boards import rig
 from hnerf.calibration.boards.bundle import BoardFit, Poses
 from hnerf.calibration.boards.lens import LensEstimate, estimate_lens
 from hnerf.calibration.boards.picture import draw_boards
-from hnerf.calibration.boards.rig import (
-    MIN_CORNERS,
-    MIN_SHARED,
-    compare_pairs,
-    fixes_pose,
-    largest_linked_group,
-    planar_corners,
-    solve_boards,
-    solve_rig,
-    undistort_corners,
-)
 from hnerf.capture.board_footage import BoardFootage, load_board_corners, read_board_footage
 from hnerf.capture.capture import Capture
 from hnerf.capture.formats.export import write_cameras
@@ -88,10 +78,10 @@ def calibrate_from_boards(folder: Path, ground_frame: int | None = None) -> Boar
     _check_board_found(footage)
     lenses, intrinsics = _intrinsics(folder, footage)
     corners_m = footage.board.corners_m
-    corners_px = np.stack([undistort_corners(footage.corners_px[name], lens) for name, lens in lenses.items()])
+    corners_px = np.stack([rig.undistort_corners(footage.corners_px[name], lens) for name, lens in lenses.items()])
     cameras = [Camera(n, lens.K, np.eye(3), np.zeros(3), *footage.sizes_px[n]) for n, lens in lenses.items()]
     log.info("adjusting %d cameras to %d corners", len(cameras), int(np.isfinite(corners_px[..., 0]).sum()))
-    fit = solve_rig(cameras, corners_m, planar_corners(corners_m, corners_px), footage.frame_step)
+    fit = rig.solve_rig(cameras, corners_m, rig.planar_corners(corners_m, corners_px), footage.frame_step)
     if ground_frame is not None:
         fit = _on_ground(fit, footage, ground_frame)
     lenses = {c.name: dataclasses.replace(lenses[c.name], R=c.R, t_m=c.t_m) for c in fit.cameras}
@@ -110,21 +100,21 @@ def board_evidence(capture: Capture) -> dict[str, Any] | None:
         return None
     known = [i for i, name in enumerate(stored.cameras) if name in capture.cameras]
     cameras, corners_px = [capture.cameras[stored.cameras[i]] for i in known], stored.corners_px[known]
-    corners_px = planar_corners(stored.corners_m, corners_px)
-    chosen = largest_linked_group(corners_px)
+    corners_px = rig.planar_corners(stored.corners_m, corners_px)
+    chosen = rig.largest_linked_group(corners_px)
     names = [camera.name for camera in cameras]
     if len(chosen) < 2:
         return {"frames": corners_px.shape[1], "cameras": {}, "pairs": {}, "unlinked_cameras": names}
     cameras, corners_px = [cameras[i] for i in chosen], corners_px[chosen]
     seen = stored.corners_m, corners_px, stored.frame_step
-    own, given = (solve(cameras, *seen) for solve in (solve_rig, solve_boards))
+    own, given = (solve(cameras, *seen) for solve in (rig.solve_rig, rig.solve_boards))
     figures = {
         camera.name: _figures(given, i) | {"footage_rms_px": _rms(own.error_px(i))} for i, camera in enumerate(cameras)
     }
     return {
         "frames": corners_px.shape[1],
         "cameras": figures,
-        "pairs": compare_pairs(cameras, own.cameras),
+        "pairs": rig.compare_pairs(cameras, own.cameras),
         "unlinked_cameras": [name for i, name in enumerate(names) if i not in chosen],
     }
 
@@ -136,7 +126,7 @@ def visible_and_found(fit: BoardFit, corners_m: np.ndarray) -> tuple[np.ndarray,
     Visible: another camera found it and, placed as the fit has it, at least MIN_CORNERS corners fall into this camera's
     image and the board faces it within MAX_TILT_DEG. Occlusion is not known, so occluded images count as visible.
     """
-    found = np.isfinite(fit.residuals_px[..., 0]).sum(-1) >= MIN_CORNERS
+    found = np.isfinite(fit.residuals_px[..., 0]).sum(-1) >= rig.MIN_CORNERS
     corners = np.einsum("fij,nj->fni", fit.boards.R, corners_m) + fit.boards.t_m[:, None]
     visible = np.zeros_like(found)
     for i, camera in enumerate(fit.cameras):
@@ -145,7 +135,7 @@ def visible_and_found(fit: BoardFit, corners_m: np.ndarray) -> tuple[np.ndarray,
         towards = corners.mean(1) - camera.centre_m
         cosine = (fit.boards.R[..., 2] * towards).sum(-1) / np.linalg.norm(towards, axis=-1)
         by_others = np.delete(found, i, axis=0).any(0)
-        visible[i] = by_others & (inside.sum(-1) >= MIN_CORNERS) & (cosine > np.cos(np.deg2rad(MAX_TILT_DEG)))
+        visible[i] = by_others & (inside.sum(-1) >= rig.MIN_CORNERS) & (cosine > np.cos(np.deg2rad(MAX_TILT_DEG)))
     return visible, found
 
 
@@ -153,8 +143,8 @@ def _check_board_found(footage: BoardFootage) -> None:
     """Raise InputError if no camera sees enough of the board to be linked: the footage probably shows another board
     than described."""
     corners_px = np.stack(list(footage.corners_px.values()))
-    found = fixes_pose(footage.board.corners_m, np.isfinite(corners_px[..., 0]))
-    if found.sum(1).max() < MIN_SHARED:
+    found = rig.fixes_pose(footage.board.corners_m, np.isfinite(corners_px[..., 0]))
+    if found.sum(1).max() < rig.MIN_SHARED:
         raise InputError(
             f"{footage.path}: this board was found in {found.sum()} of {found.size} pictures; check its columns, rows, "
             "dictionary and inverted in charuco.toml or capture.toml"

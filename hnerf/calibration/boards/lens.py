@@ -28,12 +28,12 @@ class LensEstimate:
 
     @property
     def reliable_lens(self) -> Lens | None:
-        """The lens if the images determine it, else None."""
+        """Return the lens if the images determine it, else None."""
         return self.lens if self.focal_std <= MAX_FOCAL_STD and self.tilted >= MIN_TILTED else None
 
     @property
     def certainty(self) -> str:
-        """How well the lens is known, in words."""
+        """Return how well the lens is known, in words."""
         if self.lens is None:
             return f"{self.pictures} pictures of the board where {MIN_PICTURES} are needed"
         known = f"focal length known to {100 * self.focal_std:.1f} %"

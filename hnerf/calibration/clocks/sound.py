@@ -27,8 +27,8 @@ class SoundOffset(NamedTuple):
     peak: float
 
 
-def sound_offset(a: np.ndarray, b: np.ndarray, rate_hz: int = RATE_HZ) -> SoundOffset | None:
-    """Return the offset of two sound tracks (n,), (m,); None where no peak stands out.
+def sound_offset(a: np.ndarray, b: np.ndarray) -> SoundOffset | None:
+    """Return the offset of two sound tracks (n,), (m,) at RATE_HZ; None where no peak stands out.
 
     Generalised cross-correlation with the phase transform (Knapp and Carter 1976): every frequency counts alike, so
     that the direct sound makes a sharp peak and echoes, which differ between microphones, make lower ones. Sound needs
@@ -37,7 +37,7 @@ def sound_offset(a: np.ndarray, b: np.ndarray, rate_hz: int = RATE_HZ) -> SoundO
     size = 1 << (len(a) + len(b) - 1).bit_length()
     spectra = [np.fft.rfft(track - track.mean(), size) for track in (a, b)]
     cross = np.conj(spectra[0]) * spectra[1]
-    frequencies = np.fft.rfftfreq(size, 1 / rate_hz)
+    frequencies = np.fft.rfftfreq(size, 1 / RATE_HZ)
     band = (frequencies >= BAND_HZ[0]) & (frequencies <= BAND_HZ[1])
     magnitude = np.abs(cross)
     floor = 1e-3 * magnitude[band].mean() + 1e-30
@@ -45,11 +45,11 @@ def sound_offset(a: np.ndarray, b: np.ndarray, rate_hz: int = RATE_HZ) -> SoundO
     best = int(correlation.argmax())
     spread = float(correlation.std())
     away = np.ones(size, bool)
-    away[(best + np.arange(-round(RIVAL_S * rate_hz), round(RIVAL_S * rate_hz) + 1)) % size] = False
+    away[(best + np.arange(-round(RIVAL_S * RATE_HZ), round(RIVAL_S * RATE_HZ) + 1)) % size] = False
     peak = float(correlation[best])
     if peak < MIN_PEAK * spread or peak < MIN_OVER_RIVAL * float(correlation[away].max()):
         return None
-    return SoundOffset((best if best < len(b) else best - size) / rate_hz, peak / spread)
+    return SoundOffset((best if best < len(b) else best - size) / RATE_HZ, peak / spread)
 
 
 def read_sound(path: Path) -> np.ndarray | None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hnerf.calibration.bundle import adjust, adjust_shared_lens, undistort
-from hnerf.calibration.diagnosis import trimmed_cost_px
+from hnerf.calibration.diagnosis import held_out_parts, trimmed_cost_px
 from hnerf.geometry.camera import Camera
 
 log = logging.getLogger("hnerf.calibration")
@@ -70,9 +70,8 @@ def _held_out_px(
     fit: Callable[[list[Camera], np.ndarray], LensFit],
 ) -> float:
     """Return the trimmed cost of keypoints that share neither frames nor joints with those fitted to."""
-    first, second = np.array_split(keypoints, 2, axis=1)
     costs_px = []
-    for fitted, judged in ((first[:, :, ::2], second[:, :, 1::2]), (second[:, :, 1::2], first[:, :, ::2])):
+    for fitted, judged in held_out_parts(keypoints):
         found = fit(cameras, fitted)
         shared = np.array([camera.name in unknown for camera in cameras])
         straight = undistort(judged.reshape(len(cameras), -1, 3), found.cameras, shared, found.k1)

@@ -8,20 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from hnerf.capture import safe_io
 from hnerf.capture.footage import Footage, ImageFolder, Video
 from hnerf.capture.formats.layout import Layout, StoredFrame
 from hnerf.capture.lens import Lens, by_name, checked_lens
-from hnerf.capture.safe_io import (
-    IMAGE_SUFFIXES,
-    JSON_SUFFIXES,
-    VIDEO_SUFFIXES,
-    check_camera_name,
-    file_named,
-    files_in,
-    numbered,
-    path_in_capture,
-    read_text,
-)
 from hnerf.errors import InputError
 from hnerf.strict_yaml import parse_yaml_strings
 
@@ -39,18 +29,18 @@ class EasyMocap(Layout):
 
     def lenses(self) -> dict[str, Lens]:
         """Return every camera that intri.yml names."""
-        intri = _CalibrationFile(path_in_capture(self.folder, "intri.yml"))
-        extri = _CalibrationFile(path_in_capture(self.folder, "extri.yml"))
+        intri = _CalibrationFile(safe_io.path_in_capture(self.folder, "intri.yml"))
+        extri = _CalibrationFile(safe_io.path_in_capture(self.folder, "extri.yml"))
         lenses = (_lens(name, intri, extri) for name in intri.names())
         return by_name(lenses, intri.path)
 
     def footage(self, camera: str) -> Footage:
         """Return images/<camera>/, else videos/<camera>.mp4, else <camera>.mp4."""
-        files = files_in(self.folder, "images", camera, suffixes=IMAGE_SUFFIXES)
+        files = safe_io.files_in(self.folder, "images", camera, suffixes=safe_io.IMAGE_SUFFIXES)
         if files:
-            return ImageFolder(self.folder / "images" / camera, numbered(files, "images"))
-        video = file_named(self.folder, camera, "videos", suffixes=VIDEO_SUFFIXES)
-        beside = file_named(self.folder, camera, suffixes=VIDEO_SUFFIXES)
+            return ImageFolder(self.folder / "images" / camera, safe_io.numbered(files, "images"))
+        video = safe_io.file_named(self.folder, camera, "videos", suffixes=safe_io.VIDEO_SUFFIXES)
+        beside = safe_io.file_named(self.folder, camera, suffixes=safe_io.VIDEO_SUFFIXES)
         if not video.exists() and beside.exists():
             return Video.open(beside)
         if not video.exists():
@@ -62,20 +52,20 @@ class EasyMocap(Layout):
 
     def keypoint_files(self, camera: str) -> dict[int, Path | StoredFrame]:
         """Return openpose/<camera>/<frame>_keypoints.json by frame."""
-        files = files_in(self.folder, "openpose", camera, suffixes=JSON_SUFFIXES)
-        return dict(numbered(files, "keypoints"))
+        files = safe_io.files_in(self.folder, "openpose", camera, suffixes=safe_io.JSON_SUFFIXES)
+        return dict(safe_io.numbered(files, "keypoints"))
 
     def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
         """Return masks/<camera>/<frame>.png, or mask/, by frame."""
         for name in ("masks", "mask"):
-            files = files_in(self.folder, name, camera, suffixes=IMAGE_SUFFIXES)
+            files = safe_io.files_in(self.folder, name, camera, suffixes=safe_io.IMAGE_SUFFIXES)
             if files:
-                return dict(numbered(files, "masks"))
+                return dict(safe_io.numbered(files, "masks"))
         return {}
 
     def plate_file(self, camera: str) -> Path | None:
         """Return background/<camera>.jpg or .png."""
-        plate = file_named(self.folder, camera, "background", suffixes=IMAGE_SUFFIXES)
+        plate = safe_io.file_named(self.folder, camera, "background", suffixes=safe_io.IMAGE_SUFFIXES)
         return plate if plate.exists() else None
 
 
@@ -116,7 +106,8 @@ class _CalibrationFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        text = re.sub(r"\A%YAML:\S*", "", read_text(path, MAX_CALIBRATION_BYTES))  # OpenCV's header is not YAML's
+        # OpenCV's header is not YAML's.
+        text = re.sub(r"\A%YAML:\S*", "", safe_io.read_text(path, MAX_CALIBRATION_BYTES))
         try:
             self.tree = parse_yaml_strings(text)
         except ValueError as error:
@@ -130,7 +121,7 @@ class _CalibrationFile:
         names = self.tree.get("names")
         if not isinstance(names, list) or not names:
             raise InputError(f"{self.path}: lists no cameras under 'names'; export it again with EasyMocap")
-        return [check_camera_name(name, self.path) for name in names]
+        return [safe_io.check_camera_name(name, self.path) for name in names]
 
     def number(self, key: str) -> float | None:
         """Return a number, or None if the key is missing. Raises InputError if the value is not a number."""

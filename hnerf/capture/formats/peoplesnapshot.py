@@ -18,9 +18,9 @@ from hnerf.capture.lens import Lens, checked_lens
 from hnerf.capture.safe_io import MAX_IMAGE_PIXELS, VIDEO_SUFFIXES, files_in, path_in_capture
 from hnerf.capture.safe_pickle import read_pickle
 from hnerf.errors import InputError
+from hnerf.geometry.axes import CAMERA_FROM_Z_UP
 
 CAMERA = "camera"
-CAMERA_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # its world: x right, y down, z forward
 COCO_POINTS = 18
 MAX_NUMBERS = 10_000_000  # in an array of keypoints or poses: more than an hour of them
 

@@ -9,12 +9,12 @@ import numpy as np
 
 from hnerf.capture.footage import Footage, Video
 from hnerf.capture.formats.layout import Layout
-from hnerf.capture.formats.peoplesnapshot import CAMERA_FROM_Z_UP
 from hnerf.capture.lens import Lens
 from hnerf.capture.manifest import read_manifest
 from hnerf.capture.safe_io import VIDEO_SUFFIXES, check_camera_name, files_in
 from hnerf.capture.uncalibrated import USUAL_FOCAL, lens_by_angle
 from hnerf.errors import InputError
+from hnerf.geometry.axes import CAMERA_FROM_Z_UP
 
 log = logging.getLogger("hnerf.capture")
 

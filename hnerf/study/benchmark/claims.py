@@ -14,10 +14,7 @@ Result = Mapping[str, Any]
 Finding = tuple[bool, str]  # whether a score supports the claim, and the score in words
 
 # Format, and the sign of better: -1 where less is better.
-FIGURES = {
-    "psnr": ("{:.1f} dB", 1),
-    "geometry.chamfer_l2_e3": ("Chamfer {:.2f}", -1),
-}
+FIGURES = {"psnr": ("{:.1f} dB", 1), "geometry.chamfer_l2_e3": ("Chamfer {:.2f}", -1)}
 WEAK = 0.5  # correlation below which there is no trend
 NO_SURFACE = 0.1  # IoU below which a mesh is no surface of the person
 

@@ -13,7 +13,7 @@ from hnerf.evenly_spaced import evenly_spaced
 from hnerf.study.benchmark.convergence import FIRST_S
 
 STUDIES = CONFIGS / "benchmark"
-UNLIMITED_STEPS = 1_000_000
+UNLIMITED_STEPS = 1_000_000  # the time limit ends a training before
 FIRST_SNAPSHOT_S = 15.0  # for trainings without a time limit to halve
 
 

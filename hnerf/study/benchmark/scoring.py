@@ -31,8 +31,8 @@ from hnerf.study.machine import machine
 
 log = logging.getLogger("hnerf.study")
 
-PICTURES = 2
-REPEATS = 3
+PICTURES = 2  # of each training
+REPEATS = 3  # of a timed rendering, of which the median counts
 SLOW_S = 10.0  # an image that takes this long is timed once
 SCORING_PROTOCOL = (
     "Training seconds: the trainer's own clock, without reading the capture. Curves: fewer images and surfaces than in "

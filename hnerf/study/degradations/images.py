@@ -11,13 +11,7 @@ import cv2
 import numpy as np
 
 from hnerf.capture.capture import Capture, write_image
-from hnerf.capture.subset import (
-    copy_pixels,
-    read_keypoints,
-    require_several_cameras,
-    write_arrays,
-    write_keypoints,
-)
+from hnerf.capture.subset import copy_pixels, read_keypoints, require_several_cameras, write_arrays, write_keypoints
 from hnerf.geometry.camera import Camera
 
 PixelChange = Callable[[str, np.ndarray], np.ndarray]

@@ -13,7 +13,7 @@ from hnerf.geometry.camera import Camera
 from hnerf.study.degradations.images import rewrite_images
 
 DISTANCE_SHARE = 0.4  # of the distance from the person to the camera
-HALF_HEIGHT_M = 1.2
+HALF_HEIGHT_M = 1.2  # taller than a person
 GREY = np.array([96, 96, 96], np.uint8)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from hnerf.study.benchmark.claims import CHECKS, claim_lines
 from hnerf.study.benchmark.plan import Claim
-from tests.study.test_benchmark_results import scores
+from tests.study.benchmark.test_results import scores
 
 
 def of_method(psnr: float, chamfer: float, iou: float, cameras: int, slope: float) -> dict[str, Any]:

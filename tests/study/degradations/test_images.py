@@ -6,8 +6,8 @@ import pytest
 from hnerf.capture.capture import Capture
 from hnerf.study.degradations.images import blur
 from hnerf.study.degradations.occluder import person_middle, pillar
+from tests.study.degradations.test_cameras import degraded
 from tests.study.recording import SIZE_PX, write, write_recording
-from tests.study.test_degraded_cameras import degraded
 
 
 def test_noise_has_its_spread_in_training_cameras_alone(tmp_path: Path) -> None:

@@ -1,0 +1,56 @@
+"""The albedo of texels: photographs' colours, divided by the light at the normals that the texels had in them."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hnerf.asset.light import Light
+from hnerf.asset.photographs import FIELD_WEIGHT, SeenTexels
+from hnerf.asset.srgb import to_linear, to_srgb
+from hnerf.asset.tangents import unit
+from hnerf.asset.texture import Texels
+from hnerf.body.descriptor import normals_of
+
+
+@dataclass(frozen=True)
+class Albedo:
+    """A texture (H, W, 3) uint8 sRGB without the recording's light, and that light."""
+
+    texture: np.ndarray
+    light: Light
+
+
+class AlbedoBlend:
+    """The mean albedo of texels over photographs in linear light, weighted like the captured colours and by the
+    irradiance, since noise weighs less in the light. The field's colours (N, 3), seen at irradiances (N,), count a
+    little everywhere."""
+
+    def __init__(self, field_colours: np.ndarray, field_irradiance: np.ndarray, light: Light) -> None:
+        self._light = light
+        seen = to_linear(field_colours)
+        self._field = seen / field_irradiance[:, None]
+        self._irradiance = FIELD_WEIGHT * field_irradiance[:, None]
+        self._total = FIELD_WEIGHT * seen
+
+    def add(self, seen: SeenTexels) -> None:
+        """Take in a photograph."""
+        irradiance = self._light.irradiance(seen.normals)[:, None]
+        counts = seen.weights(to_srgb(self._field[seen.index] * irradiance))
+        self._irradiance[seen.index] += counts * irradiance
+        self._total[seen.index] += counts * to_linear(seen.colours)
+
+    def colours(self) -> np.ndarray:
+        """Return the albedos (N, 3) as sRGB in [0, 1]."""
+        return to_srgb(np.clip(self._total / self._irradiance, 0, 1))
+
+
+def mean_irradiance(light: Light, surfaces_m: Iterable[np.ndarray], faces: np.ndarray, texels: Texels) -> np.ndarray:
+    """Return the mean irradiance of texels (N,) over some surfaces (V, 3)."""
+    corners, share = faces[texels.face.numpy()], texels.barycentric.numpy()[..., None]
+    found = []
+    for surface_m in surfaces_m:
+        normals = normals_of(surface_m, faces)
+        found.append(light.irradiance(unit((normals[corners] * share).sum(1))))
+    mean: np.ndarray = np.mean(found, 0)
+    return mean

@@ -1,0 +1,24 @@
+"""Work on several images or surfaces at a time: on a CPU their operations are too small to share cores."""
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import torch
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+MOST_AT_ONCE = 4  # each takes up to a GiB
+
+
+def side_by_side(work: Callable[[T], R], items: Iterable[T], device: torch.device) -> Iterator[R]:
+    """Yield work(item) of each item in order: one after another on a GPU, in several threads on a CPU, which divide
+    those of torch among them."""
+    threads = torch.get_num_threads()
+    workers = min(threads, MOST_AT_ONCE) if device.type == "cpu" else 1
+    if workers == 1:
+        yield from map(work, items)
+        return
+    with ThreadPoolExecutor(workers, "beside", torch.set_num_threads, (threads // workers,)) as pool:
+        yield from pool.map(work, items)

@@ -1,0 +1,82 @@
+"""Textures of the bending column from pictures of it: one grey, lit from the left, while it turns."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from hnerf.asset.baking import baked_textures
+from hnerf.asset.light import Light
+from hnerf.asset.srgb import to_linear, to_srgb
+from hnerf.asset.texture import unwrap
+from hnerf.body.descriptor import normals_of
+from hnerf.body.rig import pose_vertices
+from hnerf.capture.capture import Capture
+from hnerf.config import AssetSettings
+from hnerf.geometry.rays import cast, mesh_on_cpu
+from tests.asset import figure
+from tests.asset.stand_in import StandInAvatar
+
+SUN = Light(np.array([0.7, 0, 0, -0.26, 0, 0, 0, 0, 0]), 0.0)  # E = 0.7 - 0.3 x
+GREY = 0.4
+SETTINGS = AssetSettings(texture_px=64, texture_poses=1, photograph_frames=3)
+
+
+@dataclass
+class Grey(StandInAvatar):
+    def colour(self, points_m: Tensor, directions: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+        shown = to_srgb(GREY * SUN.irradiance(-directions.double().numpy()))
+        return torch.from_numpy(np.repeat(shown[:, None], 3, 1)).float()
+
+
+@pytest.fixture(scope="module")
+def pictures() -> dict[int, np.ndarray]:
+    """Return a picture of the column in each frame."""
+    body, camera, found = figure.bending_body(), figure.side_camera(), {}
+    x, y = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
+    for frame, theta, root in zip(body.frames, body.theta, body.root, strict=True):
+        vertices_m, faces = pose_vertices(body.rig, theta, root).double().numpy(), body.rig.faces.numpy()
+        rays = camera.rays(np.stack([x.ravel(), y.ravel()], 1).astype(float))
+        hits = cast(mesh_on_cpu(vertices_m, faces), *rays)
+        normals = hits.interpolate(normals_of(vertices_m, faces), faces)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        light = np.zeros(x.size)
+        light[hits.face >= 0] = to_srgb(GREY * SUN.irradiance(normals))
+        picture = np.round(255 * light).astype(np.uint8).reshape(*x.shape, 1)
+        found[frame] = np.repeat(picture, 3, 2)
+    return found
+
+
+@dataclass(frozen=True)
+class Pictured(Capture):
+    pictures: dict[int, np.ndarray] = dataclasses.field(default_factory=dict)
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        return self.pictures[frame]
+
+
+def test_the_albedo_of_a_grey_column_is_one_grey(pictures: dict[int, np.ndarray]) -> None:
+    """Where it is brightest, E is 1."""
+    body = figure.bending_body()
+    still_m = np.zeros((len(body.frames), *body.rig.vertices_m.shape), np.float32)
+    surfaces_m = figure.posed_with_displacements(body, still_m).astype(float)
+    layout = unwrap(body.rig.vertices_m.numpy(), body.rig.faces.numpy(), 64)
+    capture = Pictured(**vars(figure.capture()), pictures=pictures)
+    texture, albedo = baked_textures(capture, Grey(body), body, surfaces_m, layout, SETTINGS)
+    assert albedo is not None
+    light = albedo.light.coefficients / albedo.light.coefficients[0]
+    np.testing.assert_allclose(light, SUN.coefficients / 0.7, atol=0.03)
+    captured, without = (to_linear(np.percentile(picture, [5, 50, 95]) / 255) for picture in (texture, albedo.texture))
+    assert captured[2] > 2 * captured[0]
+    np.testing.assert_allclose(without, GREY, atol=0.03)
+
+
+def test_there_is_no_albedo_without_photographs() -> None:
+    body = figure.bending_body()
+    layout = unwrap(body.rig.vertices_m.numpy(), body.rig.faces.numpy(), 64)
+    settings = SETTINGS.model_copy(update={"photograph_frames": 0})
+    texture, albedo = baked_textures(figure.capture(), Grey(body), body, np.zeros(0), layout, settings)
+    assert albedo is None and texture.shape == (64, 64, 3)

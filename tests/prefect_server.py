@@ -1,0 +1,49 @@
+"""A Prefect server of the tests' own, with its scheduler (the test harness of Prefect schedules nothing)."""
+
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+
+
+def free_port() -> int:
+    """Return a port of this machine that nobody listens on."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+@contextmanager
+def prefect_server(
+    patience_s: float = 120.0, environment: Mapping[str, str] | None = None, folder: Path | None = None
+) -> Iterator[str]:
+    """Run a server, and yield the URL of its API once it answers."""
+    port = free_port()
+    url = f"http://127.0.0.1:{port}/api"
+    where = ("--host", "127.0.0.1", "--port", str(port))
+    start = [sys.executable, "-m", "prefect", "server", "start", "--no-ui", *where]
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen(start, env=environment, cwd=folder, **silent) as server:
+        try:
+            _wait_for(f"{url}/health", patience_s)
+            yield url
+        finally:
+            server.terminate()
+            server.wait(timeout=60)
+
+
+def _wait_for(url: str, patience_s: float) -> None:
+    deadline = time.monotonic() + patience_s
+    while time.monotonic() < deadline:
+        try:
+            httpx.get(url, timeout=1.0).raise_for_status()
+            return
+        except httpx.HTTPError:
+            time.sleep(0.2)
+    pytest.fail(f"no Prefect server within {patience_s:.0f} s")

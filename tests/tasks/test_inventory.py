@@ -1,0 +1,51 @@
+from pathlib import Path
+
+import pytest
+
+from tasks.inventory import Inventory, recording_of
+from tasks.store import Store
+from tests.tasks.stores import LONG_AGO_S, add, names, run_of
+
+
+@pytest.fixture
+def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Store:
+    """Return an empty store, whose artifacts do not count as in use by this process."""
+    monkeypatch.setattr("tasks.store.pin", lambda *_: None)
+    return Store(tmp_path)
+
+
+def test_an_artifact_is_known_by_size_and_times(store: Store) -> None:
+    made = add(store, "fit", 7)
+    stored = Inventory.of(store).stored[made.name]
+    assert (stored.size_bytes, stored.made_s, stored.used_s) == (5, LONG_AGO_S + 7, LONG_AGO_S + 7)  # "abc 7"
+
+
+def test_inputs_of_inputs_are_found_once(store: Store) -> None:
+    capture, rough, fit, evaluation = run_of(store, "ada", 10)
+    found = Inventory.of(store)
+    assert found.with_inputs([evaluation.name]) == names([capture, rough, fit, evaluation])
+    assert found.with_inputs([rough.name, "fit/gone"]) == names([capture, rough])
+
+
+def test_an_artifact_that_no_link_leads_to_is_its_recording_s(store: Store) -> None:
+    """A degraded fit of ada's, say; bob's results are his own."""
+    capture, *_ = run_of(store, "ada", 10)
+    run_of(store, "bob", 20)
+    degraded = add(store, "study-fit", 30, capture)
+    found = Inventory.of(store)
+    assert found.owners[degraded.name] == {"ada"}
+    assert [one.artifact.name for one in found.of_subject("ada")][-1] == degraded.name  # the last that was made
+    assert degraded.name not in found.needed()
+
+
+def test_a_record_that_is_damaged_is_named(store: Store) -> None:
+    record = store.path("fit", add(store, "fit", 7).root.name, ".json")
+    record.write_text("[")
+    found = Inventory.of(store)
+    assert (found.stored, found.unreadable) == ({}, (record,))
+
+
+def test_the_recording_of_a_subject_is_where_it_was_read(store: Store) -> None:
+    assert recording_of(store, "ada") == ""
+    store.claim("ada", "0123", Path("/recordings/ada"))
+    assert recording_of(store, "ada") == "/recordings/ada"

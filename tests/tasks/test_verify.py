@@ -1,0 +1,42 @@
+from pathlib import Path
+
+import pytest
+
+from hnerf.errors import InputError
+from tasks.store import Store
+from tasks.verify import faults
+from tests.tasks.stores import run_of
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    """Return a store with a run of ada and a run of bob."""
+    store = Store(tmp_path)
+    run_of(store, "ada", 10)
+    run_of(store, "bob", 20)
+    return store
+
+
+def test_a_sound_store_has_no_faults(store: Store) -> None:
+    everything, of_ada = faults(store), faults(store, ["ada"])
+    assert everything.lines == of_ada.lines == []
+    assert (everything.artifacts, of_ada.artifacts) == (8, 4)
+    assert everything.files == 8 + 2  # letters of each, and a capture.json of each person
+    assert of_ada.size_bytes == 4 * len("abc 10") + len('{"name": "ada"}')
+
+
+def test_what_is_damaged_missing_or_not_of_it_is_named(store: Store) -> None:
+    letters = sorted(store.root.glob("fit/*/deep/letters"))
+    letters[0].write_text("abd")
+    (letters[1].parent / "more").touch()
+    (store.subject_folder("bob") / "asset").symlink_to(f"../../asset/{99:032x}")
+    store.path("fit", f"{98:032x}", ".json").write_text("[]")
+    found = faults(store)
+    assert [line.rpartition(": ")[2] for line in found.lines] == [
+        "the record cannot be read", "leads nowhere", "damaged or missing", "not of this artifact"
+    ]  # fmt: skip
+
+
+def test_a_subject_that_is_not_there_is_refused(store: Store) -> None:
+    with pytest.raises(InputError, match="no such subject"):
+        faults(store, ["eve"])
