@@ -46,8 +46,11 @@ def main(argv: list[str] | None = None) -> int:
     except (RankFailedError, StalledError, InvalidAsset) as error:
         return _fail(error, FAILED)
     except OSError as error:
+        from tasks.bucket import BucketError
         from tasks.policy import is_permanent  # imports Prefect
 
+        if isinstance(error, BucketError):
+            return _fail(error, FAILED)
         if error.errno in NO_ROOM:
             return _fail(f"{error}; make room and give the same command again", FAILED)
         if error.filename is None or not is_permanent(error):

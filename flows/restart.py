@@ -1,6 +1,7 @@
 """Runs of the training deployment: how many have not ended, and those to take up again that crashed."""
 
 import logging
+from datetime import UTC, datetime, timedelta
 
 from prefect import get_client
 from prefect.client.schemas import filters
@@ -12,6 +13,9 @@ DEPLOYMENT = f"{FLOW}/{NAME}"
 UNFINISHED = (StateType.SCHEDULED, StateType.PENDING, StateType.RUNNING, StateType.PAUSED, StateType.CANCELLING)
 
 AGAIN = "crashed; begun again"
+# A worker with a limit ends when it is offered a run that it has not let go of, and until then it imports the flow once
+# more, for its hooks: a minute on a busy machine.
+RELEASE = timedelta(minutes=2)
 
 log = logging.getLogger("hnerf.restart")
 
@@ -24,13 +28,13 @@ def unfinished_runs() -> int:
 def restart_crashed(max_restarts: int) -> int:
     """Put crashed runs of the deployment, those whose machine or process was lost, back into the queue; return how
     many. Each is begun no more than `max_restarts` times again, because the run itself may be what ends the process,
-    even before the server counts it as running."""
+    even before the server counts it as running. It begins after RELEASE."""
     restarted = 0
     with get_client(sync_client=True) as client:
         for run in _runs(StateType.CRASHED):
             before = [state.message == AGAIN for state in client.read_flow_run_states(run.id)].count(True)
             if before < max_restarts:
-                again: State[None] = Scheduled(message=AGAIN)
+                again: State[None] = Scheduled(scheduled_time=datetime.now(UTC) + RELEASE, message=AGAIN)
                 client.set_flow_run_state(run.id, again, force=True)
                 log.warning("%s crashed and is begun again, %d of %d times", run.name, before + 1, max_restarts)
                 restarted += 1

@@ -15,6 +15,7 @@ from hnerf.config import Settings, load_settings
 from hnerf.errors import InputError, InvalidAsset, one_line, printable
 from hnerf.evaluation.holdout import held_out_cameras
 from tasks.asset import export
+from tasks.bucket import BucketError
 from tasks.calibration import calibrate, calibrated_capture
 from tasks.capture import ingest, subset_capture
 from tasks.detection import detect, needs_detection
@@ -30,7 +31,7 @@ from tasks.source import read_capture
 from tasks.store import Artifact, Store
 from tasks.training import train
 
-NOTED = (InputError, InvalidAsset, RankFailedError, StalledError)  # whose message says all
+NOTED = (InputError, InvalidAsset, BucketError, RankFailedError, StalledError)  # whose message says all
 
 
 class Prepared(NamedTuple):

@@ -3,6 +3,7 @@
 import logging
 
 from hnerf.errors import InputError
+from tasks.bucket import BucketError
 from tasks.launcher import RankFailedError
 from tasks.limits import StalledError
 
@@ -11,7 +12,7 @@ LOGGERS = ("prefect.task_runs", "prefect.flow_runs", "prefect.engine", "prefect.
 
 def without_traceback(record: logging.LogRecord) -> bool:
     """Take the traceback from a record of an error whose message says all (a filter of logging); keep every record."""
-    if record.exc_info and isinstance(record.exc_info[1], InputError | RankFailedError | StalledError):
+    if record.exc_info and isinstance(record.exc_info[1], InputError | BucketError | RankFailedError | StalledError):
         record.exc_info = record.exc_text = None
     return True
 

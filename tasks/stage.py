@@ -12,9 +12,11 @@ from prefect.context import FlowRunContext
 from prefect.tasks import exponential_backoff
 
 from hnerf.models import has_model
+from tasks.bucket import Bucket
 from tasks.limits import limited
 from tasks.policy import Input, StorePolicy, artifacts_among, is_transient, stage_key
 from tasks.quiet import quieten
+from tasks.shared import get_or_compute
 from tasks.store import Artifact, Store
 
 log = logging.getLogger("hnerf.stage")
@@ -65,13 +67,15 @@ class Stage(Generic[P]):
         log.info("%s", self.name)
         key = stage_key(self.name, self.version, inputs)
         given = {name: value for name, value in inputs.items() if name != NETWORKS}
-        return store.get_or_compute(
-            self.name,
-            key,
-            lambda out: self._write_in_time(out, given),
-            self.resumable,
-            [one.name for one in artifacts_among(given.values())],
-        )
+        names = [one.name for one in artifacts_among(given.values())]
+
+        def compute() -> Artifact:
+            return store.get_or_compute(
+                self.name, key, lambda out: self._write_in_time(out, given), self.resumable, names
+            )
+
+        bucket = Bucket.configured()
+        return get_or_compute(bucket, store, self.name, key, compute) if bucket else compute()
 
     def _write_in_time(self, out: Path, inputs: dict[str, Input]) -> dict[str, float]:
         with limited(self.name, image_count(inputs.values()), self.resumable):

@@ -3,6 +3,7 @@
     <store>/<stage>/<key>/          the files, put there by one rename
     <store>/<stage>/<key>.json      the record: each file's SHA-256 and size, and a few metrics
     <store>/<stage>/<key>.partial/  work in progress
+    <store>/<stage>/<key>.moving/   being fetched from a bucket, or put there (tasks/shared.py)
     <store>/<stage>/<key>.lock      locked (flock) while a process works on the key; the kernel releases it if that dies
     <store>/subjects/<name>/<stage> -> the latest artifact of a subject
     <store>/subjects/<name>/.recording  the digest and the folder of the recording that these are of

@@ -22,6 +22,7 @@ install_import_hook([f"hnerf.{name}" for name in SHAPED], "beartype.beartype")
 _home = tempfile.mkdtemp(prefix="hnerf-prefect-")
 atexit.register(shutil.rmtree, _home, ignore_errors=True)
 os.environ |= {"PREFECT_HOME": _home, "PREFECT_SERVER_ANALYTICS_ENABLED": "false", "DO_NOT_TRACK": "1"}
+os.environ.pop("HNERF_BUCKET", None)  # the user's
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

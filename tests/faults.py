@@ -52,7 +52,8 @@ ALBEDO, DOME = "hnerf/asset/albedo.py", "hnerf/asset/dome.py"
 METRICS, REPORT = "hnerf/evaluation/metrics.py", "hnerf/evaluation/report.py"
 EXPOSURE, ARTICULATION = "hnerf/training/exposure.py", "hnerf/body/articulation.py"
 POLICY, STORE = "tasks/policy.py", "tasks/store.py"
-INVENTORY, ARCHIVE, LIMITS = "tasks/inventory.py", "tasks/archive.py", "tasks/limits.py"
+INVENTORY, PACKED, LIMITS = "tasks/inventory.py", "tasks/packed.py", "tasks/limits.py"
+BUCKET, LEASE, SHARED = "tasks/bucket.py", "tasks/lease.py", "tasks/shared.py"
 
 BY_PAPER, BY_LOSSES = "tests/fields/test_paper.py", "tests/training/test_losses.py"
 BY_STEP, BY_CONDITIONS = "tests/training/test_step.py", "tests/fields/test_conditions.py"
@@ -79,6 +80,7 @@ BY_LIGHT, BY_SHADING = "tests/asset/test_light.py", "tests/asset/test_shading.py
 BY_ALBEDO, BY_DOME = "tests/asset/test_albedo.py", "tests/asset/test_dome.py"
 BY_VIEWER, BY_PICTURES = "tests/asset/test_viewer.py", "tests/asset/test_pictures.py"
 BY_GARBAGE, BY_ARCHIVE = "tests/tasks/test_garbage.py", "tests/tasks/test_archive.py"
+BY_BUCKET, BY_LEASE, BY_SHARED = (f"tests/tasks/test_{name}.py" for name in ("bucket", "lease", "shared"))
 BY_LIMITS = "tests/tasks/test_limits.py"
 BY_TIMING, BY_GLB = "tests/capture/test_timing.py", "tests/asset/test_glb.py"
 
@@ -328,9 +330,15 @@ FAULTS = (
     Fault("gc-use", "tasks/garbage.py", "if aside.stat().st_mtime != garbage.used_s:", "if False:", BY_GARBAGE),
     Fault("gc-pinned", INVENTORY, "roots = pinned(self.store.root)", "roots = set[str]()", BY_GARBAGE),
     Fault("gc-lock", STORE, "if not _is_at(path, lock.fileno()):", "if False:", BY_GARBAGE),
-    Fault("archive-path", ARCHIVE, 'or ".." in parts or', "or", BY_ARCHIVE),
-    Fault("archive-type", ARCHIVE, "member.type != tarfile.REGTYPE or", "", BY_ARCHIVE),
-    Fault("archive-digest", ARCHIVE, "if seen.hexdigest() != digest:", "if False:", BY_ARCHIVE),
+    Fault("archive-path", PACKED, 'or ".." in parts or', "or", BY_ARCHIVE),
+    Fault("archive-type", PACKED, "member.type != tarfile.REGTYPE or", "", BY_ARCHIVE),
+    Fault("archive-digest", PACKED, "if seen.hexdigest() != digest:", "if False:", BY_ARCHIVE),
+    Fault("archive-manifest", PACKED, " or manifest_name(text) != name", "", BY_SHARED),
+    Fault("note-once", BUCKET, '(name), "xb")', '(name), "wb")', BY_BUCKET),
+    Fault("lease-renewed", LEASE, "if now != text:", "if False:", BY_LEASE),
+    Fault("lease-given-up", LEASE, "if text != FREE and", "if", BY_LEASE),
+    Fault("shared-another", SHARED, "if list(contents.artifacts) != [name]:", "if False:", BY_SHARED),
+    Fault("shared-later", SHARED, "if bucket.size_bytes(_object(name)) is None:", "if False:", BY_SHARED),
     Fault("limit-progress", LIMITS, "            arm()\n\n    def end", "            pass\n\n    def end", BY_LIMITS),
     Fault("limit-end", LIMITS, "exit=True", "exit=False", BY_LIMITS),
 )  # fmt: skip

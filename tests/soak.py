@@ -1,10 +1,12 @@
-"""Many small recordings through server, schedule and worker, while processes are killed now and then:
+"""Many small recordings through server, schedule, two workers and a bucket, while processes are killed now and then:
 
     python tests/soak.py [--subjects 6] [--kill-every 120] [--out soak.json]
 
-Everything happens in a folder of its own. Kills alternate: the process of a run, with its worker alive; and the worker
-with all that it has started, as when a machine goes down. In the end every recording must have its asset, every
-artifact must have been made once, the store must verify clean, and no process may be left. The exit status says so.
+Everything happens in a folder of its own. The workers are machines with separate stores (tests/machines.py), which
+share artifacts through moto's server of S3. Kills alternate: the process of a run, with its worker alive; and a machine
+with all that it has started and its disk, in whose place an empty one comes. In the end every recording must have had
+its results, the bucket must hold them, every artifact must have been put there once, stores must verify clean, a third
+machine must get all from the bucket, and no process may be left. The exit status says so.
 """
 
 import argparse
@@ -13,20 +15,24 @@ import os
 import random
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-ROOT = Path(__file__).parents[1]
-MARK = "HNERF_SOAK"  # in the environment of every process that is started here
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from tests.machines import MARK, ROOT, Machine, command, marked, process, resident_kib
+from tests.postgresql import BINARIES, cluster
+from tests.prefect_server import free_port
+
 SIZES = {"size_px": 96, "train_cameras": 4, "test_cameras": 1, "train_frames": 4, "novel_pose_frames": 1}
 PRESET = """based_on: demo
 detection: {hands: none}
@@ -34,7 +40,10 @@ training: {steps: 12, novel_pose_steps: 2}
 evaluation: {max_images: 1, max_meshes: 1, report_rows: 1}
 asset: {grid_cells: 48, faces: 1500, texture_px: 64, texture_poses: 1, photograph_frames: 1, correctives: 0}
 """
-SILENCE_S, LOOK_S, POLL_S = 90, 30, 1.0
+SILENCE_S, LOOK_S, POLL_S = 90, 30, 2.0
+BUCKET = "soak"
+RESULTS = {"asset": "avatar.usdz", "evaluation": "report.html"}  # a file that each of these stages writes
+MACHINES = 2
 
 
 def main() -> int:
@@ -47,22 +56,26 @@ def main() -> int:
     options = parser.parse_args()
     scratch = Path(tempfile.mkdtemp(prefix="hnerf-soak-"))
     mark = uuid4().hex
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    server_port, bucket_port = free_port(), free_port()
     os.environ |= {
-        MARK: mark,
         "PREFECT_HOME": str(scratch / "prefect"),
-        "PREFECT_API_URL": f"http://127.0.0.1:{port}/api",
+        "PREFECT_API_URL": f"http://127.0.0.1:{server_port}/api",
         "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
         "DO_NOT_TRACK": "1",
         "OMP_NUM_THREADS": "1",
+        "HNERF_BUCKET": f"s3://{BUCKET}/shared",
+        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{bucket_port}",
+        "AWS_ACCESS_KEY_ID": "soak",
+        "AWS_SECRET_ACCESS_KEY": "soak",
+        "AWS_DEFAULT_REGION": "us-east-1",
     }
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended"))  # so that nothing is left running
     try:
-        figures = soak(scratch, port, mark, options)
+        with database():
+            os.environ[MARK] = mark
+            figures = soak(scratch, server_port, bucket_port, mark, options)
     finally:
-        for pid in marked(mark):
+        for pid in marked(f"{MARK}={mark}"):
             os.kill(pid, signal.SIGKILL)
     text = json.dumps(figures, indent=1)
     print(text)
@@ -75,46 +88,80 @@ def main() -> int:
     return 0
 
 
-def soak(scratch: Path, port: int, mark: str, options: argparse.Namespace) -> dict[str, Any]:
+def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: argparse.Namespace) -> dict[str, Any]:
     """Train all recordings under fire; return the figures, among which are the faults."""
     names = write_captures(scratch / "captures", options.subjects)
     (scratch / "preset.yaml").write_text(PRESET)
-    store, kills, generations = scratch / "store", list[str](), dict[str, set[int]]()
-    with process(scratch, "server", "server", "start", "--host", "127.0.0.1", "--port", str(port), "--no-ui") as server:
+    listen = ("--host", "127.0.0.1", "--port", str(server_port), "--no-ui")
+    done: dict[str, list[str]] = {}
+    generations: dict[str, set[str]] = {}
+    kills: Counter[str] = Counter()
+    restarts = 0
+    with (
+        process(scratch, "s3", "moto.server", "-H", "127.0.0.1", "-p", str(bucket_port)),
+        process(scratch, "server", "prefect", "server", "start", *listen) as server,
+    ):
         set_up(scratch)
+        machines = [Machine.started(scratch, number) for number in range(MACHINES)]
         started_s, killed_s, memory_kib = time.monotonic(), time.monotonic(), [resident_kib(server.pid)]
-        worker = start(scratch, "worker", "worker", "start", "--pool", "local", "--type", "process")
-        while len(done := finished(store, names)) < len(names) and time.monotonic() - started_s < options.limit:
+        while len(done) < len(names) and time.monotonic() - started_s < options.limit:
             time.sleep(POLL_S)
-            note_generations(store, generations)
-            if time.monotonic() - killed_s > options.kill_every and (run := run_of(worker.pid)):
-                kills.append(kill(run, worker, whole=len(kills) % 2 == 1))
-                if worker.poll() is not None:
-                    worker = start(scratch, "worker", "worker", "start", "--pool", "local", "--type", "process")
+            note_finished(machines, names, done)
+            note_generations(generations)
+            restarted = [machine.restarted() for machine in machines]
+            restarts += sum(now is not before for now, before in zip(restarted, machines, strict=True))
+            machines, at = restarted, random.randrange(MACHINES)
+            if time.monotonic() - killed_s > options.kill_every and (run := machines[at].run()):
+                if kills.total() % 2:
+                    machines[at] = machines[at].lose()
+                else:
+                    os.kill(run, signal.SIGKILL)
+                kills["machine and disk" if kills.total() % 2 else "run"] += 1
                 killed_s = time.monotonic()
         seconds = time.monotonic() - started_s
         wait_until_idle()
         states = run_states()
         memory_kib.append(resident_kib(server.pid))
-        worker.terminate()
-        worker.wait(timeout=120)
-    time.sleep(5)
-    note_generations(store, generations)
-    faults = [f"{name}: no asset" for name in names if name not in done]
-    faults += [f"{name}: made {len(made)} times" for name, made in generations.items() if len(made) > 1]
-    faults += [f"process {pid} is left: {command(pid)}" for pid in marked(mark)]
-    faults += verify(store)
+        for machine in machines:
+            machine.worker.terminate()
+            machine.worker.wait(timeout=120)
+        time.sleep(5)
+        note_generations(generations)
+        faults = [f"{name}: no results" for name in names if name not in done]
+        faults += [f"{name}: not in the bucket" for made in done.values() for name in made if name not in generations]
+        faults += [f"{name}: made {len(made)} times" for name, made in generations.items() if len(made) > 1]
+        for machine in machines:
+            faults += verify(machine.disk)
+        faults += verify(fetched(scratch / "third", list(generations)))
+    faults += [f"process {pid} is left: {command(pid)}" for pid in marked(f"{MARK}={mark}")]
+    logs = "".join(path.read_text(errors="replace") for path in scratch.glob("worker*.log"))
     return {
         "subjects": len(names),
+        "database": "PostgreSQL" if BINARIES else "SQLite",
         "finished": len(done),
         "seconds": round(seconds),
-        "kills": {what: kills.count(what) for what in ("run", "worker and run")},
+        "kills": dict(kills),
+        "workers_that_ended_by_themselves": restarts,
         "runs": states,
         "artifacts": len(generations),
         "made_twice": sum(len(made) > 1 for made in generations.values()),
+        "fetched_by_another_machine": logs.count("hnerf.shared - fetching "),
         "server_mib": [kib // 1024 for kib in memory_kib],
         "faults": faults,
     }
+
+
+@contextmanager
+def database() -> Iterator[None]:
+    """Have the server use a PostgreSQL of its own, where one is installed, in place of SQLite, which two workers of a
+    busy machine make wait for minutes."""
+    if not BINARIES:
+        yield
+        return
+    with cluster() as environment:
+        url = f"postgresql+asyncpg://postgres@127.0.0.1:{environment['PGPORT']}/postgres"
+        os.environ["PREFECT_SERVER_DATABASE_CONNECTION_URL"] = url
+        yield
 
 
 def write_captures(folder: Path, count: int) -> list[str]:
@@ -131,12 +178,15 @@ def write_captures(folder: Path, count: int) -> list[str]:
 
 
 def set_up(scratch: Path) -> None:
-    """Make work pool, deployments, automations, and a schedule that looks into the folder all the time."""
+    """Make bucket, work pool, deployments, automations, and a schedule that looks into the folder all the time."""
+    from fsspec import filesystem
     from prefect import get_client
     from prefect.client.schemas.actions import DeploymentScheduleCreate, DeploymentUpdate
     from prefect.client.schemas.schedules import IntervalSchedule
 
-    wait_for_server()
+    wait_for(f"{os.environ['PREFECT_API_URL']}/health")
+    wait_for(os.environ["AWS_ENDPOINT_URL"])
+    filesystem("s3").mkdir(BUCKET)
     run("prefect", "--no-prompt", "work-pool", "create", "local", "--type", "process")
     run("prefect", "--no-prompt", "deploy", "--all")
     run("flows.automations", "--silence", str(SILENCE_S))
@@ -144,6 +194,8 @@ def set_up(scratch: Path) -> None:
     parameters = {name: str(path) for name, path in places.items()} | {"settle_s": 0, "max_restarts": 20}
     schedule = DeploymentScheduleCreate(schedule=IntervalSchedule(interval=timedelta(seconds=LOOK_S)))
     with get_client(sync_client=True) as client:
+        training = client.read_deployment_by_name("train-subject/local")
+        client.update_deployment(training.id, DeploymentUpdate(concurrency_limit=MACHINES))
         deployment = client.read_deployment_by_name("ingest-captures/local")
         client.update_deployment(deployment.id, DeploymentUpdate(parameters=parameters))
         for known in deployment.schedules:
@@ -151,45 +203,23 @@ def set_up(scratch: Path) -> None:
         client.create_deployment_schedules(deployment.id, [(schedule.schedule, True)])
 
 
-def kill(run: int, worker: "subprocess.Popen[bytes]", whole: bool) -> str:
-    """Kill a run, or its worker with all that it started; return which."""
-    if not whole:
-        os.kill(run, signal.SIGKILL)
-        return "run"
-    everything = [worker.pid, *descendants(worker.pid)]
-    for pid in everything:
-        with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
-    worker.wait()
-    return "worker and run"
+def note_finished(machines: list[Machine], names: list[str], done: dict[str, list[str]]) -> None:
+    """Note the people who have an asset and a report on some machine, and the names of these artifacts."""
+    for name in names:
+        for links in [machine.disk / "subjects" / name for machine in machines]:
+            if name not in done and all((links / stage / file).exists() for stage, file in RESULTS.items()):
+                done[name] = [f"{stage}/{Path(os.readlink(links / stage)).name}" for stage in RESULTS]
 
 
-def run_of(worker: int) -> int | None:
-    """Return the process of some run that the worker started, after a random while in it."""
-    runs = [
-        pid for pid in descendants(worker) if "prefect.flow_engine" in command(pid) or "prefect.engine" in command(pid)
-    ]
-    if not runs:
-        return None
-    time.sleep(random.uniform(0, 20))
-    alive = [pid for pid in runs if Path(f"/proc/{pid}").exists()]
-    return random.choice(alive) if alive else None
+def note_generations(generations: dict[str, set[str]]) -> None:
+    """Note each artifact of the bucket: one that was put there again has another date."""
+    from tasks.bucket import Bucket
 
-
-def note_generations(store: Path, generations: dict[str, set[int]]) -> None:
-    """Note each record that is there: one that was written again is another file."""
-    for record in store.glob("*/*.json"):
-        if len(record.stem) == 32:
-            try:
-                generations.setdefault(f"{record.parent.name}/{record.stem}", set()).add(record.stat().st_ino)
-            except FileNotFoundError:
-                continue
-
-
-def finished(store: Path, names: list[str]) -> set[str]:
-    """Return the people who have an asset and a report."""
-    wanted = ("asset/avatar.usdz", "evaluation/report.html")
-    return {name for name in names if all((store / "subjects" / name / path).exists() for path in wanted)}
+    bucket = Bucket.at(os.environ["HNERF_BUCKET"])
+    for path, one in bucket.fs.find(bucket.root, detail=True).items():
+        if path.endswith(".tar"):
+            name = path.removeprefix(f"{bucket.root}/").removesuffix(".tar")
+            generations.setdefault(name, set()).add(f"{one['ETag']} {one['LastModified']}")
 
 
 def wait_until_idle(patience_s: float = 180.0) -> None:
@@ -211,31 +241,26 @@ def run_states() -> dict[str, int]:
 
 
 def verify(store: Path) -> list[str]:
-    """Return what is wrong in the store, and what interrupted work has left."""
-    from tasks.garbage import find_garbage
-    from tasks.inventory import Inventory
+    """Return what is wrong in a store. What interrupted work left may stay where another machine went on."""
     from tasks.store import Store
     from tasks.verify import faults
 
-    left = [one for one in find_garbage(Inventory.of(Store(store)), 1, 0) if one.left]
-    return faults(Store(store)).lines + [f"{one.stage}/{one.key}: unfinished" for one in left]
+    return faults(Store(store)).lines
 
 
-@contextmanager
-def process(scratch: Path, name: str, *arguments: str) -> Iterator["subprocess.Popen[bytes]"]:
-    """Run a Prefect command as long as the block lasts."""
-    started = start(scratch, name, *arguments)
-    try:
-        yield started
-    finally:
-        started.terminate()
-        started.wait(timeout=60)
+def fetched(store: Path, names: list[str]) -> Path:
+    """Fetch these artifacts into the store of another machine, which must not compute any."""
+    from tasks.bucket import Bucket
+    from tasks.shared import get_or_compute
+    from tasks.store import Artifact, Store
 
+    def refuse() -> Artifact:
+        raise RuntimeError("was to be found in the bucket")
 
-def start(scratch: Path, name: str, *arguments: str) -> "subprocess.Popen[bytes]":
-    """Start a Prefect command whose output goes into a file."""
-    with (scratch / f"{name}.log").open("ab") as log:
-        return subprocess.Popen([sys.executable, "-m", "prefect", *arguments], cwd=ROOT, stdout=log, stderr=log)
+    store.mkdir()
+    for name in names:
+        get_or_compute(Bucket.at(os.environ["HNERF_BUCKET"]), Store(store), *name.split("/"), refuse)
+    return store
 
 
 def run(module: str, *arguments: str) -> None:
@@ -243,59 +268,19 @@ def run(module: str, *arguments: str) -> None:
     subprocess.run([sys.executable, "-m", module, *arguments], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
 
 
-def wait_for_server(patience_s: float = 300.0) -> None:
-    """Wait until the server answers."""
+def wait_for(url: str, patience_s: float = 300.0) -> None:
+    """Wait until a server answers."""
     import httpx
 
     deadline_s = time.monotonic() + patience_s
     while True:
         try:
-            httpx.get(f"{os.environ['PREFECT_API_URL']}/health", timeout=2.0).raise_for_status()
+            httpx.get(url, timeout=2.0).raise_for_status()
             return
         except httpx.HTTPError:
             if time.monotonic() > deadline_s:
                 raise
             time.sleep(POLL_S)
-
-
-def marked(mark: str) -> list[int]:
-    """Return the processes, other than this one, that were started from here."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/environ"):
-        try:
-            if f"{MARK}={mark}".encode() in path.read_bytes() and int(path.parent.name) != os.getpid():
-                found.append(int(path.parent.name))
-        except OSError:
-            continue
-    return found
-
-
-def children(pid: int) -> list[int]:
-    """Return the processes that a process started."""
-    try:
-        text = " ".join(path.read_text() for path in Path(f"/proc/{pid}/task").glob("*/children"))
-    except OSError:
-        return []
-    return [int(child) for child in text.split()]
-
-
-def descendants(pid: int) -> list[int]:
-    """Return a process's children, their children, and so on."""
-    return [one for child in children(pid) for one in (child, *descendants(child))]
-
-
-def command(pid: int) -> str:
-    """Return a process's command line."""
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
-    except OSError:
-        return ""
-
-
-def resident_kib(pid: int) -> int:
-    """Return the memory that a process holds."""
-    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS"))
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from hnerf.capture.formats.export import WRITERS
 from hnerf.config import AssetSettings, SyntheticSettings
 from hnerf.errors import InvalidAsset
 from hnerf.render.subject import OUTPUT_KINDS
+from tasks.bucket import BucketError
 from tasks.launcher import RankFailedError
 from tests.shared_data import shared_capture
 
@@ -109,6 +110,17 @@ def test_a_full_disk_is_one_line_and_exit_code_1(
         assert main(["run", str(tmp_path)]) == 1
         (line,) = capsys.readouterr().err.splitlines()
         assert line == f"hnerf: {error}; make room and give the same command again"
+
+
+def test_a_bucket_that_is_away_is_one_line_and_exit_code_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def train(*_: object) -> None:
+        raise BucketError("s3://x/fit/k.tar: no answer; is the bucket away?")
+
+    monkeypatch.setattr(train_subject, "fn", train)
+    assert main(["run", str(tmp_path)]) == 1
+    assert capsys.readouterr().err == "hnerf: s3://x/fit/k.tar: no answer; is the bucket away?\n"
 
 
 def test_cameras_are_not_written_over_the_recordings_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@ import os
 import subprocess
 import sys
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from prefect.deployments import run_deployment
 from prefect.exceptions import PrefectHTTPStatusError
 from prefect.states import Crashed
 
-from flows.restart import restart_crashed, unfinished_runs
+from flows.restart import RELEASE, restart_crashed, unfinished_runs
 
 ROOT = Path(__file__).parent.parent.parent
 PATIENCE_S = 60.0
@@ -92,6 +93,9 @@ def test_a_crashed_run_is_begun_again_a_few_times(deployed: str) -> None:
         for _ in range(4):
             client.set_flow_run_state(run.id, Crashed(), force=True)  # type: ignore[union-attr]
             counts.append(restart_crashed(max_restarts=2))
+            if counts[-1]:
+                begins = client.read_flow_run(run.id).next_scheduled_start_time  # type: ignore[union-attr]
+                assert begins and begins > datetime.now(UTC) + RELEASE / 2
         assert counts == [1, 1, 0, 0]
         assert client.read_flow_run(run.id).state_name == "Crashed"  # type: ignore[union-attr]
 

@@ -1,19 +1,15 @@
 """The commands that docs/operations.md gives for PostgreSQL, against a server of this test's own: make soak."""
 
-import os
-import shutil
 import subprocess
-import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.prefect_server import free_port, prefect_server
+from tests import postgresql
+from tests.postgresql import BINARIES
+from tests.prefect_server import prefect_server
 
-ROOT = Path(__file__).parents[2]
-BINARIES = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda path: int(path.parent.name))
 PATIENCE_S = 300.0
 
 pytestmark = [
@@ -25,24 +21,8 @@ pytestmark = [
 @pytest.fixture
 def cluster() -> Iterator[dict[str, str]]:
     """Start an empty PostgreSQL; return the environment in which its administrator's commands run."""
-    folder = Path(tempfile.mkdtemp(prefix="hnerf-postgresql-"))  # which the user postgres can reach
-    as_postgres = ["setpriv", "--reuid=postgres", "--regid=postgres", "--clear-groups"] if os.getuid() == 0 else []
-    if as_postgres:
-        shutil.chown(folder, "postgres")
-    port = str(free_port())
-
-    def control(*arguments: str) -> None:
-        command = [*as_postgres, str(BINARIES[-1] / "pg_ctl"), "-D", f"{folder}/data", "-w", *arguments]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=folder)
-
-    control("initdb", "-o", "--auth=trust --username=postgres")
-    control("start", "-l", f"{folder}/log", "-o", f"-p {port} -k {folder} -c listen_addresses=127.0.0.1")
-    path = f"{BINARIES[-1]}:{Path(sys.executable).parent}:{os.environ['PATH']}"
-    try:
-        yield os.environ | {"PGHOST": "127.0.0.1", "PGPORT": port, "PGUSER": "postgres", "PATH": path}
-    finally:
-        control("stop", "-m", "immediate")
-        shutil.rmtree(folder)
+    with postgresql.cluster() as environment:
+        yield environment
 
 
 def shell(command: str, environment: dict[str, str], folder: Path) -> str:

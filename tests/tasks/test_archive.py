@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 
 from hnerf.errors import InputError
-from tasks import archive as module
-from tasks.archive import MANIFEST, export_subject, import_subject
+from tasks import packed as module
+from tasks.archive import export_subject, import_subject
 from tasks.inventory import Inventory, recording_of
+from tasks.packed import manifest_name
 from tasks.store import Store
 from tasks.verify import faults
 from tests.tasks.stores import names, run_of
@@ -83,6 +84,11 @@ def unpacked(path: Path) -> list[tuple[str, bytes]]:
         return [(member.name, archive.extractfile(member).read()) for member in archive]  # type: ignore[union-attr]
 
 
+def member_of(manifest: dict[str, Any]) -> tuple[str, bytes]:
+    text = json.dumps(manifest).encode()
+    return manifest_name(text), text
+
+
 def nothing_came_of(store: Path) -> bool:
     return not store.exists()
 
@@ -97,7 +103,7 @@ def test_paths_that_lead_out_are_refused(packed: Path, tmp_path: Path, path: str
     (_, text), *files = unpacked(packed)
     manifest = json.loads(text)
     manifest["artifacts"][NAME]["files"][path] = manifest["artifacts"][NAME]["files"]["deep/letters"]
-    repack(packed, [(MANIFEST, json.dumps(manifest).encode()), *files])
+    repack(packed, [member_of(manifest), *files])
     with pytest.raises(InputError, match="is not a path inside a folder"):
         import_subject(Store(tmp_path / "to"), packed)
     assert nothing_came_of(tmp_path / "to")
@@ -127,7 +133,7 @@ def test_a_manifest_that_is_none_is_refused(
     (_, text), *files = unpacked(packed)
     manifest = json.loads(text)
     change(manifest)
-    repack(packed, [(MANIFEST, json.dumps(manifest).encode()), *files])
+    repack(packed, [member_of(manifest), *files])
     with pytest.raises(InputError):
         import_subject(Store(tmp_path / "to"), packed)
     assert nothing_came_of(tmp_path / "to")
@@ -184,7 +190,7 @@ def test_a_file_under_many_paths_counts_as_often(packed: Path, tmp_path: Path, m
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
     import_subject(Store(tmp_path / "once"), packed)
     manifest["artifacts"][NAME]["files"] |= {f"again/{number}": letters for number in range(50)}
-    repack(packed, [(MANIFEST, json.dumps(manifest).encode()), *files])
+    repack(packed, [member_of(manifest), *files])
     with pytest.raises(InputError, match="make room"):
         import_subject(Store(tmp_path / "to"), packed)
     assert nothing_came_of(tmp_path / "to")

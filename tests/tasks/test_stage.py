@@ -9,6 +9,7 @@ from prefect.context import FlowRunContext
 
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
+from tasks.bucket import VARIABLE
 from tasks.quiet import LOGGERS
 from tasks.source import Source, read_capture
 from tasks.stage import Stage
@@ -51,6 +52,14 @@ def test_other_settings_do_the_work_again_but_equal_content_stops_there(tmp_path
     second = double(store, copy(store, source, CaptureSettings(max_side_px=64)))
     assert calls(tmp_path) == ["copied", "doubled", "copied"]
     assert first == second
+
+
+def test_machines_with_a_bucket_work_once(tmp_path: Path, source: Source, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "bucket").mkdir()
+    monkeypatch.setenv(VARIABLE, f"file://{tmp_path}/bucket")
+    assert chain.fn(tmp_path / "here", source) == chain.fn(tmp_path / "there", source) == ("ABAB", "")
+    assert calls(tmp_path / "here") == ["copied", "doubled"]
+    assert calls(tmp_path / "there") == []
 
 
 def test_a_network_that_comes_makes_another_artifact(

@@ -1,0 +1,142 @@
+"""A place that many machines share: a folder of any file system that fsspec knows, such as a bucket of S3.
+
+Objects must appear whole or not at all, as in object stores; on a local or mounted disk they are renamed into place.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from uuid import uuid4
+
+from fsspec import AbstractFileSystem
+from fsspec.core import url_to_fs
+from fsspec.implementations.local import LocalFileSystem
+
+from hnerf.errors import InputError, one_line
+
+VARIABLE = "HNERF_BUCKET"
+MAX_NOTE_BYTES = 1000
+
+
+class BucketError(ConnectionError):
+    """The bucket did not answer as it should; a later try may succeed. The message, one line, says why."""
+
+
+@dataclass(frozen=True)
+class Bucket:
+    """A folder of a file system. Names are relative to it. Raises BucketError where the file system fails, InputError
+    where it does not let this user in, FileNotFoundError for what is not there."""
+
+    fs: AbstractFileSystem
+    root: str
+
+    @staticmethod
+    def configured() -> "Bucket | None":
+        """Return the bucket that the environment names, None if it names none. Raises InputError if it is not there."""
+        url = os.environ.get(VARIABLE, "")
+        return Bucket.at(url) if url else None
+
+    @staticmethod
+    def at(url: str) -> "Bucket":
+        """Return the bucket of a URL like s3://bucket/folder or file:///mnt/share, which must be there."""
+        try:
+            # Others write here, too: no listing may be remembered.
+            fs, root = url_to_fs(url, use_listings_cache=False)
+        except ImportError:
+            raise InputError(f"{VARIABLE}: what opens {url} is not installed; for S3, install '.[s3]'") from None
+        except ValueError as error:
+            raise InputError(f"{VARIABLE}: {url}: {one_line(error)}; give a URL like s3://bucket/folder") from None
+        bucket = Bucket(fs, root.rstrip("/"))
+        # What begins with a bucket's name is an object store, where folders need not exist.
+        top = bucket.root if bucket.root.startswith("/") else bucket.root.split("/")[0]
+        with bucket._answering(""):
+            try:
+                fs.info(top)
+            except FileNotFoundError:
+                raise InputError(f"{VARIABLE}: {url}: {top} is not there; make it, or give another URL") from None
+        return bucket
+
+    @property
+    def is_disk(self) -> bool:
+        """Return whether this is a folder of a local or mounted disk."""
+        return isinstance(self.fs, LocalFileSystem)
+
+    def where(self, name: str) -> str:
+        """Return the URL of an object."""
+        return str(self.fs.unstrip_protocol(self._path(name)))
+
+    def size_bytes(self, name: str) -> int | None:
+        """Return the size of an object, None if there is no such object."""
+        with self._answering(name):
+            try:
+                return int(self.fs.info(self._path(name))["size"])
+            except FileNotFoundError:
+                return None
+
+    def download(self, name: str, path: Path) -> None:
+        """Write an object into a file."""
+        with self._answering(name):
+            self.fs.get_file(self._path(name), str(path))
+
+    def upload(self, path: Path, name: str) -> None:
+        """Make or replace an object with a file's bytes."""
+        with self._answering(name):
+            self._make_folder(name)
+            beside = f"{name}.{uuid4().hex}" if self.is_disk else name
+            self.fs.put_file(str(path), self._path(beside))
+            if self.is_disk:
+                os.replace(self._path(beside), self._path(name))
+
+    def create_note(self, name: str, text: bytes) -> bool:
+        """Make a small object; return False if it is there already, which the file system decides for all machines."""
+        with self._answering(name):
+            self._make_folder(name)
+            try:
+                with self.fs.open(self._path(name), "xb") as file:
+                    file.write(text)
+            except FileExistsError:
+                return False
+            return True
+
+    def write_note(self, name: str, text: bytes) -> None:
+        """Make or replace a small object."""
+        with self._answering(name):
+            self.fs.pipe_file(self._path(name), text)
+
+    def read_note(self, name: str) -> bytes | None:
+        """Return the beginning of a small object, None if there is no such object."""
+        with self._answering(name):
+            try:
+                with self.fs.open(self._path(name), "rb") as file:
+                    return bytes(file.read(MAX_NOTE_BYTES))
+            except FileNotFoundError:
+                return None
+
+    def remove(self, name: str) -> None:
+        """Remove an object if it is there."""
+        with self._answering(name):
+            try:
+                self.fs.rm_file(self._path(name))
+            except FileNotFoundError:
+                return
+
+    def _path(self, name: str) -> str:
+        return f"{self.root}/{name}"
+
+    def _make_folder(self, name: str) -> None:
+        if self.is_disk:
+            self.fs.makedirs(self.fs._parent(self._path(name)), exist_ok=True)
+
+    @contextmanager
+    def _answering(self, name: str) -> Iterator[None]:
+        """Turn what goes wrong inside into errors of one line; file systems raise those of many libraries."""
+        try:
+            yield
+        except (FileNotFoundError, InputError):
+            raise
+        except PermissionError as error:
+            raise InputError(f"{self.where(name)}: {one_line(error)}; allow this user to read and write it") from error
+        except Exception as error:
+            raise BucketError(f"{self.where(name)}: {one_line(error)}; is the bucket away?") from error

@@ -1,0 +1,106 @@
+"""Artifacts shared by the stores of many machines through a bucket:
+
+    <bucket>/<stage>/<key>.tar    an artifact as one file (tasks/packed.py)
+
+A store takes from there what it lacks, and puts there what it has made. Whoever may write into the bucket decides what
+results are; nothing in it is run, and nothing leads out of the store.
+"""
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from hnerf.errors import InputError
+from tasks.bucket import Bucket
+from tasks.lease import leased
+from tasks.packed import Contents, NoRoomError, archived, pack, place, read_contents, require_room, unpack
+from tasks.store import Artifact, Store, remove
+
+log = logging.getLogger("hnerf.shared")
+
+PACKED = "packed"
+
+
+def get_or_compute(bucket: Bucket, store: Store, stage: str, key: str, compute: Callable[[], Artifact]) -> Artifact:
+    """Return an artifact of the store; if it is not there, that of the bucket, or else what `compute` puts into the
+    store. It is then in both.
+
+    If several machines want the same, one computes it and the others wait. Raises BucketError if the bucket is away.
+    """
+    name = f"{stage}/{key}"
+    if here := store.find(stage, key):
+        if bucket.size_bytes(_object(name)) is None:
+            _put(bucket, store, here)
+        return here
+    while (found := _fetch(bucket, store, stage, key)) is None:
+        with leased(bucket, name) as mine:
+            if mine:
+                found = _fetch(bucket, store, stage, key)  # another may have finished just before
+                made = found or compute()
+                if found is None or bucket.size_bytes(_object(name)) is None:
+                    _put(bucket, store, made)
+                return made
+    return found
+
+
+def _fetch(bucket: Bucket, store: Store, stage: str, key: str) -> Artifact | None:
+    """Put the bucket's artifact into the store, unless that has it; return None if it is not there, or damaged."""
+    name = f"{stage}/{key}"
+    where = bucket.where(_object(name))
+    with _scratch(store, stage, key) as scratch:
+        if found := store.find(stage, key):
+            return found
+        if (size_bytes := bucket.size_bytes(_object(name))) is None:
+            return None
+        log.info("fetching %s (%.1f MB)", name, size_bytes / 1e6)
+        require_room(size_bytes, scratch, where)
+        try:
+            bucket.download(_object(name), scratch / PACKED)
+        except FileNotFoundError:  # removed meanwhile
+            return None
+        try:
+            contents = _unpacked(scratch, name, where)
+        except NoRoomError:
+            raise
+        except InputError as error:
+            log.warning("%s (%s is computed again)", error, stage)
+            return None
+        place(store, name, contents.artifacts[name], scratch)
+    return store.find(stage, key)
+
+
+def _unpacked(scratch: Path, name: str, where: str) -> Contents:
+    """Unpack an object with the artifact of this name. Raises InputError if it is damaged."""
+    with (scratch / PACKED).open("rb") as archive:
+        contents = read_contents(Contents, archive, where)
+        if list(contents.artifacts) != [name]:
+            raise InputError(f"{where}: holds something else; remove it")
+        require_room(contents.unpacked_bytes(), scratch, where)
+        unpack(archive, contents, scratch, where)
+    return contents
+
+
+def _put(bucket: Bucket, store: Store, artifact: Artifact) -> None:
+    """Put an artifact of the store into the bucket."""
+    log.info("sharing %s", artifact.name)
+    with _scratch(store, artifact.stage, artifact.root.name) as scratch:
+        pack(Contents(artifacts=archived([artifact])), store, scratch / PACKED)
+        bucket.upload(scratch / PACKED, _object(artifact.name))
+
+
+@contextmanager
+def _scratch(store: Store, stage: str, key: str) -> Iterator[Path]:
+    """Make a folder beside the artifact, for as long as the lock of its key is held here."""
+    with store.locked(stage, key):
+        folder = store.path(stage, key, ".moving")
+        remove(folder)
+        folder.mkdir()
+        try:
+            yield folder
+        finally:
+            remove(folder)
+
+
+def _object(name: str) -> str:
+    return f"{name}.tar"

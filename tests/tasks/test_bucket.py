@@ -1,0 +1,69 @@
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from fsspec import filesystem, get_filesystem_class
+
+from hnerf.errors import InputError
+from tasks.bucket import VARIABLE, Bucket, BucketError
+
+
+def test_only_what_is_set_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert Bucket.configured() is None
+    monkeypatch.setenv(VARIABLE, f"file://{tmp_path}/")
+    bucket = Bucket.configured()
+    assert bucket is not None and bucket.where("fit/k.tar") == f"file://{tmp_path}/fit/k.tar"
+
+
+@pytest.mark.parametrize(
+    ("url", "why"),
+    [
+        ("nothing://x", "HNERF_BUCKET: .*nothing.*; give a URL like"),
+        ("file:///no/such/folder", "HNERF_BUCKET: .*/no/such/folder is not there; make it"),
+        ("memory://unmade", "is not there; make it"),
+    ],
+)
+def test_what_cannot_be_opened_is_refused_in_one_line(url: str, why: str) -> None:
+    with pytest.raises(InputError, match=why):
+        Bucket.at(url)
+
+
+def test_objects_are_made_read_replaced_and_removed(tmp_path: Path) -> None:
+    bucket = Bucket.at(f"file://{tmp_path}")
+    (tmp_path / "here").write_text("abc")
+    bucket.upload(tmp_path / "here", "a/b")
+    assert bucket.size_bytes("a/b") == 3
+    bucket.download("a/b", tmp_path / "there")
+    assert (tmp_path / "there").read_text() == "abc"
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["b"]
+    bucket.remove("a/b")
+    bucket.remove("a/b")
+    assert bucket.size_bytes("a/b") is None
+    with pytest.raises(FileNotFoundError):
+        bucket.download("a/b", tmp_path / "there")
+
+
+@pytest.mark.parametrize("kind", ["file", "s3"])
+def test_a_note_is_made_once(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    bucket = Bucket.at(f"file://{tmp_path}" if kind == "file" else request.getfixturevalue("s3"))
+    with ThreadPoolExecutor(8) as pool:
+        assert sum(pool.map(lambda number: bucket.create_note("raced", b"%d" % number), range(8))) == 1
+    assert bucket.read_note("a/n") is None
+    assert bucket.create_note("a/n", b"1")
+    assert not bucket.create_note("a/n", b"2")
+    assert bucket.read_note("a/n") == b"1"
+    bucket.write_note("a/n", b"3" * 2000)
+    assert bucket.read_note("a/n") == b"3" * 1000
+
+
+def test_a_bucket_that_is_away_says_so_in_one_line(s3: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(get_filesystem_class("s3"), "retries", 1)
+    once = {"retries": {"max_attempts": 0}}
+    away = Bucket(filesystem("s3", endpoint_url="http://127.0.0.1:9", config_kwargs=once), "tests/shared")
+    with pytest.raises(BucketError, match=r"^s3://tests/shared/x: Could not connect .*; is the bucket away\?$"):
+        away.size_bytes("x")
+
+
+def test_a_bucket_that_is_not_there_is_not_made(s3: str) -> None:
+    with pytest.raises(InputError, match="s3://none/x: none is not there; make it"):
+        Bucket.at("s3://none/x")

@@ -1,0 +1,189 @@
+import multiprocessing
+import os
+import random
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from fsspec.implementations.memory import MemoryFileSystem
+
+from hnerf.errors import InputError
+from tasks import lease, packed
+from tasks.bucket import Bucket, BucketError
+from tasks.garbage import find_garbage
+from tasks.inventory import Inventory
+from tasks.shared import get_or_compute
+from tasks.store import Artifact, Store
+from tasks.verify import faults
+
+SPAWN = multiprocessing.get_context("spawn")
+KEY = f"{7:032x}"
+OBJECT = f"fit/{KEY}.tar"
+
+
+@pytest.fixture(params=["file", "memory", "s3"])
+def bucket(request: pytest.FixtureRequest, tmp_path: Path) -> Bucket:
+    """Return an empty bucket."""
+    if request.param == "s3":
+        return Bucket.at(f"{request.getfixturevalue('s3')}/{tmp_path.name}")
+    if request.param == "memory":
+        MemoryFileSystem.store.clear()
+        MemoryFileSystem().makedirs("/share", exist_ok=True)
+        return Bucket.at("memory://share")
+    return disk_bucket(tmp_path)
+
+
+def disk_bucket(tmp_path: Path) -> Bucket:
+    (tmp_path / "bucket").mkdir(exist_ok=True)
+    return Bucket.at(f"file://{tmp_path}/bucket")
+
+
+def write(out: Path) -> dict[str, float]:
+    (out / "deep").mkdir(exist_ok=True)
+    (out / "deep" / "letters").write_text("abc")
+    (out / "again").write_text("abc")
+    return {"letters": 3.0}
+
+
+def made(bucket: Bucket, store: Store, work: Callable[[Path], dict[str, float]] = write) -> Artifact:
+    """Return the artifact, which was computed from another."""
+    inputs = [f"capture/{1:032x}"]
+    return get_or_compute(bucket, store, "fit", KEY, lambda: store.get_or_compute("fit", KEY, work, inputs=inputs))
+
+
+def never(out: Path) -> dict[str, float]:
+    raise AssertionError("was to be found in the bucket")
+
+
+def clean(store: Store) -> bool:
+    return not faults(store).lines and not find_garbage(Inventory.of(store), 1, 0)[1:]
+
+
+def test_what_one_machine_made_another_takes(bucket: Bucket, tmp_path: Path) -> None:
+    here, there = Store(tmp_path / "here"), Store(tmp_path / "there")
+    first, second = made(bucket, here), made(bucket, there, never)
+    assert second.root == there.path("fit", KEY)
+    assert second.model_dump(exclude={"root"}) == first.model_dump(exclude={"root"})
+    assert (second.root / "deep" / "letters").read_text() == "abc"
+    assert clean(here) and clean(there)
+    assert bucket.read_note(f"fit/{KEY}.lease.0") is None
+    assert made(bucket, here, never) == first
+
+
+def test_what_was_made_before_is_shared_when_it_is_used(bucket: Bucket, tmp_path: Path) -> None:
+    store = Store(tmp_path / "here")
+    store.get_or_compute("fit", KEY, write)
+    made(bucket, store, never)
+    made(bucket, Store(tmp_path / "there"), never)
+
+
+def damage(bucket: Bucket, change: Callable[[bytes], bytes]) -> None:
+    path = f"{bucket.root}/{OBJECT}"
+    bucket.fs.pipe_file(path, change(bucket.fs.cat_file(path)))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda whole: b"",
+        lambda whole: whole[:700],
+        lambda whole: whole[: whole.index(b"abc")],
+        lambda whole: whole.replace(b"\0abc\0", b"\0abd\0"),
+        lambda whole: whole.replace(b'"letters":3', b'"letters":4'),
+        lambda whole: whole.replace(b"deep/letters", b"../../letter"),
+        lambda whole: b"\x80\x04cposix\nsystem\n" * 99,
+    ],
+)
+def test_a_damaged_object_is_refused_and_made_anew(
+    tmp_path: Path, change: Callable[[bytes], bytes], caplog: pytest.LogCaptureFixture
+) -> None:
+    bucket = disk_bucket(tmp_path)
+    made(bucket, Store(tmp_path / "here"))
+    damage(bucket, change)
+    store = Store(tmp_path / "there")
+    assert made(bucket, store).metrics == {"letters": 3.0}
+    assert f"{OBJECT}: " in caplog.text and "(fit is computed again)" in caplog.text
+    assert clean(store)
+    made(bucket, Store(tmp_path / "third"), never)
+
+
+def test_an_object_in_another_ones_place_is_refused(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bucket = disk_bucket(tmp_path)
+    made(bucket, Store(tmp_path / "here"))
+    other = f"{8:032x}"
+    os.rename(tmp_path / "bucket" / OBJECT, tmp_path / "bucket" / f"fit/{other}.tar")
+    store = Store(tmp_path / "there")
+    found = get_or_compute(bucket, store, "fit", other, lambda: store.get_or_compute("fit", other, lambda out: {}))
+    assert found.files == {} and "holds something else" in caplog.text
+
+
+def test_nothing_is_fetched_that_would_fill_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bucket = disk_bucket(tmp_path)
+    made(bucket, Store(tmp_path / "here"))
+    monkeypatch.setattr(packed, "SPARE_BYTES", 1 << 60)
+    with pytest.raises(InputError, match="make room"):
+        made(bucket, Store(tmp_path / "there"))
+
+
+def test_failed_work_is_left_to_the_next(bucket: Bucket, tmp_path: Path) -> None:
+    def fail(out: Path) -> dict[str, float]:
+        raise RuntimeError("crash")
+
+    with pytest.raises(RuntimeError):
+        made(bucket, Store(tmp_path / "here"), fail)
+    made(bucket, Store(tmp_path / "there"))
+    assert bucket.read_note(f"fit/{KEY}.lease.0") is bucket.read_note(f"fit/{KEY}.lease.1") is None
+
+
+def test_a_result_that_could_not_be_shared_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bucket, store = disk_bucket(tmp_path), Store(tmp_path / "here")
+    with monkeypatch.context() as patch:
+        patch.setattr(type(bucket.fs), "put_file", lambda *_: (_ for _ in ()).throw(TimeoutError("too slow")))
+        with pytest.raises(BucketError, match=r"file://.*tar: too slow; is the bucket away\?$"):
+            made(bucket, store)
+    made(bucket, store, never)
+    made(bucket, Store(tmp_path / "there"), never)
+
+
+def work_in(root: Path, store: str, expiry_s: float) -> None:
+    """Make the artifact, slowly, and leave a line in `<root>/done`; in a process of its own."""
+
+    def slowly(out: Path) -> dict[str, float]:
+        time.sleep(0.3)
+        with (root / "done").open("a") as done:
+            done.write(f"{store}\n")
+        return write(out)
+
+    lease.BEAT_S, lease.EXPIRY_S, lease.LOOK_S = 0.1, expiry_s, 0.05
+    made(disk_bucket(root), Store(root / store), slowly)
+
+
+def test_two_workers_with_separate_stores_work_once(tmp_path: Path) -> None:
+    workers = [SPAWN.Process(target=work_in, args=(tmp_path, name, 5.0)) for name in ("here", "there")]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    assert [worker.exitcode for worker in workers] == [0, 0]
+    assert len((tmp_path / "done").read_text().split()) == 1
+    assert clean(Store(tmp_path / "here")) and clean(Store(tmp_path / "there"))
+    assert [path.name for path in (tmp_path / "bucket" / "fit").iterdir()] == [Path(OBJECT).name]
+
+
+def test_a_worker_killed_at_a_random_moment_loses_nothing(tmp_path: Path) -> None:
+    victim = SPAWN.Process(target=work_in, args=(tmp_path, "here", 0.6))
+    victim.start()
+    deadline_s = time.monotonic() + 60
+    while not (tmp_path / "bucket" / "fit").exists() and time.monotonic() < deadline_s:
+        time.sleep(0.01)
+    time.sleep(random.uniform(0, 0.4))
+    os.kill(victim.pid or 0, signal.SIGKILL)
+    victim.join()
+    rescuer = SPAWN.Process(target=work_in, args=(tmp_path, "there", 0.6))
+    rescuer.start()
+    rescuer.join()
+    assert rescuer.exitcode == 0
+    made(disk_bucket(tmp_path), Store(tmp_path / "third"), never)
+    assert clean(Store(tmp_path / "there"))
