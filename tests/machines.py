@@ -27,6 +27,7 @@ WITH_DISK = (
 WORKER = ("prefect", "worker", "start", "--pool", "local", "--type", "process", "--limit", "2")
 FLOW_RUN = ("prefect.flow_engine", "prefect.engine")
 DELAY_S = 20.0  # before a run is killed, at most
+STOP_S = 90.0  # TimeoutStopSec of flows/systemd_units.py
 
 
 @dataclass
@@ -79,6 +80,13 @@ class Machine:
         self._end()
         os.replace(self.disk, self.scratch / f"lost-{uuid4().hex}")
         return Machine.started(self.scratch, self.number)
+
+    def stop(self) -> None:
+        """Stop the worker as systemd does: with patience, and then with all that it started."""
+        self.worker.terminate()
+        with suppress(subprocess.TimeoutExpired):
+            self.worker.wait(timeout=STOP_S)
+        self._end()
 
     def _end(self) -> None:
         for pid in marked(f"PREFECT_HOME={self.scratch}/prefect{self.number}"):

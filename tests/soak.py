@@ -123,8 +123,7 @@ def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: 
         states = run_states()
         memory_kib.append(resident_kib(server.pid))
         for machine in machines:
-            machine.worker.terminate()
-            machine.worker.wait(timeout=120)
+            machine.stop()
         time.sleep(5)
         note_generations(generations)
         faults = [f"{name}: no results" for name in names if name not in done]
