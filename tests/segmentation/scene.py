@@ -87,7 +87,7 @@ def write_masks(capture: Capture, masks: dict) -> None:
 
 
 def only_frames(capture: Capture, count: int) -> Capture:
-    """Keep the first frames, with their keypoints."""
+    """Keep the first frames; the others lose their keypoints in the folder, too."""
     with np.load(capture.root / "keypoints.npz") as stored:
         np.savez(capture.root / "keypoints.npz", **{name: stored[name][:count] for name in stored.files})
     return dataclasses.replace(capture, train_frames=tuple(range(count)), novel_pose_frames=())
