@@ -88,6 +88,8 @@ class Trainer:
         self.train_rows = torch.tensor([rows[f] for f in capture.train_frames if f in rows], device=device)
         held_out = [rows[f] for f in capture.novel_pose_frames if f in rows and f not in capture.train_frames]
         self.novel_rows = torch.tensor(held_out, dtype=torch.long, device=device)
+        centres_m = [capture.cameras[name].centre_m for name in capture.train_cameras]
+        self.only_centre_m = torch.as_tensor(centres_m[0]).to(self.body.root) if len(centres_m) == 1 else None
         self.step, self.skipped, self.seconds = 0, 0, 0.0
         self.field_steps, self.field_seconds = settings.steps, 0.0  # fewer steps if the time limit comes first
         self.history: list[dict[str, Any]] = []
@@ -165,9 +167,21 @@ class Trainer:
     def _absorb(self) -> None:
         self.scene.bodies.absorb(self.objective.correction, self.train_rows if self.settings.one_posture else None)
         if self.step <= self.field_steps:
+            self._keep_distance()
             self._average_over_frames()
             self.field.tighten(self.scene.bodies.rig, self.scene.conditions.pose[self.train_rows[::POSE_STRIDE]])
         self._set_poses(self.scene.bodies)
+
+    def _keep_distance(self) -> None:
+        """Scale the training frames' roots about the only camera, so that their mean distance from it stays the fit's:
+        that camera sees a larger person who is farther away alike, and training would drift."""
+        if self.only_centre_m is None:
+            return
+        rows, bodies = self.train_rows, self.scene.bodies
+        fitted, tuned = ((r[rows, :3, 3] - self.only_centre_m for r in (self.body.root, bodies.root)))
+        root = bodies.root.clone()
+        root[rows, :3, 3] = self.only_centre_m + tuned * (fitted.norm(dim=-1).mean() / tuned.norm(dim=-1).mean())
+        bodies.set_poses(bodies.rig, bodies.theta, root)
 
     def _average_over_frames(self) -> None:
         """Apply what the training frames have in common to all poses; with one posture this is the posture itself."""
