@@ -34,6 +34,8 @@ RIM_DEPTH_PX = 2.5  # of rim vertices from the border of the body's silhouette
 MIN_NORMAL_COSINE = 0.5  # between the outlines' normals above which points may match
 GROUND_STD_M = 0.01  # of the lowest vertex of a frame above the ground
 GROUND_OUTLIER_M = 0.15  # distance of a body that does not stand on the ground
+MAX_SOLE_M = 0.05  # between the skin and the ground
+UNDERSIDE_M = 0.015  # of vertices above the lowest one that may touch the ground
 HUBER = 1.345  # standard deviations beyond which residuals push no harder; 95 % efficient on Gaussian noise
 DAMPING = 1e-4  # more would hold back depth and scale, which one camera's outlines hardly determine
 
@@ -159,12 +161,13 @@ def refine_with_outlines(
     """
     faces = pose.rig.faces.numpy()
     only = problem.observations.cameras[0] if len(problem.observations.cameras) == 1 else None
-    stands_above_ground = only is not None and only.centre_m[up] > GROUND_OUTLIER_M  # else height 0 is not the ground
+    above_ground = only if only is not None and only.centre_m[up] > GROUND_OUTLIER_M else None  # else 0 is no ground
+    sole_m = 0.0
     for step in tracked(range(settings.contour_steps), "outlines", settings.contour_steps):
         articulation = Articulation(pose.rig)
         joints = articulation.pose(pose)
         _, equations = problem.assemble(pose, problem.image_term)
-        residuals = []
+        residuals, soles_m = [], []
         for t, row in enumerate(edges):
             vertices_m = articulation.surface(joints, t).numpy()
             normals = normals_of(vertices_m, faces)
@@ -173,12 +176,14 @@ def refine_with_outlines(
                 for camera, scale_m, edge in zip(problem.observations.cameras, problem.scale_m, row, strict=True)
                 if edge is not None
             ]
-            if stands_above_ground:
-                found.append(_ground_contact(vertices_m, up))
+            if above_ground:
+                found.append(_ground_contact(vertices_m, up, sole_m))
+                soles_m += [_sole_m(above_ground, e, float(problem.scale_m[0, t]), vertices_m, up) for e in row if e]
             for rows in found:
                 add_residuals(equations, articulation, joints, t, rows)
                 residuals.append(rows.residual_m)
         pose = problem.apply_step(pose, equations, DAMPING)
+        sole_m = float(np.median(soles_m)) if soles_m else 0.0
         error_mm = 1e3 * np.concatenate([np.zeros(0), *residuals])
         log.info(
             "outlines, step %d of %d: %.1f mm rms", step + 1, settings.contour_steps, np.sqrt((error_mm**2).mean())
@@ -186,16 +191,26 @@ def refine_with_outlines(
     return pose
 
 
-def _ground_contact(vertices_m: np.ndarray, up: int) -> ContourResiduals:
-    """Return the residual of the lowest vertex against the ground at height 0, where calibrations usually put it: with
-    one camera this determines the depth.
+def _ground_contact(vertices_m: np.ndarray, up: int, sole_m: float) -> ContourResiduals:
+    """Return the residual of the lowest vertex against a sole on the ground at height 0, where calibrations usually put
+    it: with one camera this determines the depth.
 
     Geman-McClure weights let it go where the body is in the air or the world's origin lies elsewhere.
     """
     lowest = int(vertices_m[:, up].argmin())
-    height_m = vertices_m[lowest, up]
+    height_m = vertices_m[lowest, up] - sole_m
     weight = GROUND_STD_M**-2 / (1 + (height_m / GROUND_OUTLIER_M) ** 2) ** 2
     return ContourResiduals(np.array([lowest]), np.eye(3)[[up]], np.array([height_m]), np.array([weight]))
+
+
+def _sole_m(camera: Camera, edge: Outline, scale_m: float, vertices_m: np.ndarray, up: int) -> float:
+    """Return how far the mask reaches out below the foot, at the vertex that is lowest in the image of those that may
+    touch the ground: shoes stand between it and the skin."""
+    height_m = vertices_m[:, up]
+    pixels = camera.project(vertices_m[height_m < height_m.min() + UNDERSIDE_M])[0]
+    lowest = pixels[(pixels @ -camera.R[:2, up]).argmax()]
+    inside_px = -map_coordinates(edge.distance_px, lowest[::-1, None], order=1, mode="nearest")[0]
+    return float(np.clip(inside_px * scale_m, 0, MAX_SOLE_M))
 
 
 def add_residuals(

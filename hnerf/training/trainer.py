@@ -178,7 +178,7 @@ class Trainer:
         if self.only_centre_m is None:
             return
         rows, bodies = self.train_rows, self.scene.bodies
-        fitted, tuned = ((r[rows, :3, 3] - self.only_centre_m for r in (self.body.root, bodies.root)))
+        fitted, tuned = (r[rows, :3, 3] - self.only_centre_m for r in (self.body.root, bodies.root))
         root = bodies.root.clone()
         root[rows, :3, 3] = self.only_centre_m + tuned * (fitted.norm(dim=-1).mean() / tuned.norm(dim=-1).mean())
         bodies.set_poses(bodies.rig, bodies.theta, root)

@@ -1,6 +1,6 @@
 import numpy as np
 
-from hnerf.body.contour_fit import match, outline
+from hnerf.body.contour_fit import _ground_contact, _sole_m, match, outline
 from hnerf.body.descriptor import normals_of
 from hnerf.config import FitSettings
 from tests.body.recorded_body import ring_camera
@@ -84,3 +84,26 @@ def test_a_part_that_a_mask_lacks_pushes_no_harder_than_one_that_sticks_out_a_li
     out = rows.residual_m > 0.01345
     assert rows.residual_m[out].min() < 0.04 and rows.residual_m[out].max() > 0.18
     np.testing.assert_allclose((rows.weight * rows.residual_m)[out], 134.5)
+
+
+def test_a_sole_is_as_thick_as_the_mask_reaches_below_the_foot() -> None:
+    """A camera 1 m high looks level at the axis 3 m away; 0.3 m lower is 28.16 px below the middle of the image, row
+    156.16. A mask that ends at row 159.5 reaches 3.34 px farther, of 3 / 281.6 m each. A toe higher above the ground
+    than 15 mm does not count, nor does a mask that ends above the foot; a sole is 5 cm thick at most."""
+    camera, scale_m = ring_camera("a", 0.3), 3 / 281.6
+    foot = np.array([[0, 0, 0.7], [0, 0, 0.8], [1.0, 0.3, 0.716]])
+
+    def sole_to(rows: int) -> float:
+        mask = np.zeros((256, 256), bool)
+        mask[20:rows, 20:236] = True
+        return _sole_m(camera, outline(mask, 1.0), scale_m, foot, 2)
+
+    np.testing.assert_allclose(sole_to(160), 3.34 * scale_m, atol=1e-6)
+    np.testing.assert_allclose([sole_to(150), sole_to(200)], [0, 0.05], rtol=1e-6)
+
+
+def test_a_sole_stands_on_the_ground() -> None:
+    """5 cm above the ground with a sole of 2 cm: 3 cm to fall, at 1 / 0.01^2 over (1 + 0.2^2)^2."""
+    rows = _ground_contact(np.array([[0, 0, 0.3], [0, 0.1, 0.05]]), 2, 0.02)
+    assert rows.vertices.tolist() == [1] and rows.gradient.tolist() == [[0, 0, 1]]
+    np.testing.assert_allclose([rows.residual_m[0], rows.weight[0]], [0.03, 1e4 / 1.04**2])

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from hnerf.body import contour_fit
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.body_model import body_model
 from hnerf.body.fit import fit_body, make_problem, resolve_depth_flips
@@ -46,6 +47,16 @@ def test_one_camera_finds_the_depth(tmp_path: Path) -> None:
     capture = record(tmp_path, truth, RING, ("0",))
     fit, _ = fit_body(capture, Silhouettes(capture, truth), FitSettings(contour_steps=6))  # type: ignore[arg-type]
     assert joint_error_m(fit, truth).mean() < 0.06
+    assert fit.vertices_m()[..., 2].min(1).values.mean() < 0.01  # bare feet stand on the ground
+
+
+def test_before_one_camera_somebody_stands_on_his_soles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(contour_fit, "_sole_m", lambda *_: 0.03)
+    truth = moving_body((0, 1, 2, 3))
+    truth.root[:, 2, 3] += 0.03
+    capture = record(tmp_path, truth, RING, ("0",))
+    fit, _ = fit_body(capture, Silhouettes(capture, truth), FitSettings(contour_steps=6))  # type: ignore[arg-type]
+    assert 0.015 < fit.vertices_m()[..., 2].min(1).values.mean() < 0.035
 
 
 def test_neighbours_outvote_an_arm_mirrored_in_depth(tmp_path: Path) -> None:
