@@ -127,7 +127,6 @@ class FastFieldSettings(FieldSettings):
     width: int = Field(default=64, ge=1)
     pose_width: int = Field(default=0, ge=0)
     nodes: int = Field(default=0, ge=0)  # of each frame's deformation graph
-    normals: Literal["", "surface", "body"] = ""  # that colour sees; those of the surface are shaped by it
     grid_learning_rate: float = Field(default=5e-2, gt=0)
     network_learning_rate: float = Field(default=1e-2, gt=0)
     deformation_learning_rate: float = Field(default=1e-3, ge=0)  # metres; 0: frames do not deform the body

@@ -236,14 +236,13 @@ class FastField(Field):
 
     def _colour(self, bodies: PosedBodies, described: Descriptor, pose: Tensor, row: Tensor, visible: Tensor) -> Tensor:
         """Return the colours (N, 3) of the visible samples, zero elsewhere. Light falls on the surface's own normal, so
-        that shading shapes the surface, too (as in IDR), unless the body's normals are set."""
+        that shading shapes the surface, too (as in IDR)."""
         pick = torch.nonzero(visible)[:, 0]
         y, d, row, corners, barycentric = (
             t.index_select(0, pick) for t in (described.y, described.d, row, described.corners, described.barycentric)
         )
-        gradient = weighted_sum(self.rest_normals, corners, barycentric)
-        if self.settings.normals != "body":
-            gradient = self._distance_gradient(y, d, gradient, pose, row)
+        outward = weighted_sum(self.rest_normals, corners, barycentric)
+        gradient = self._distance_gradient(y, d, outward, pose, row)
         normal = nn.functional.normalize(bodies.turn(gradient, row, corners, barycentric), dim=-1)
         colour = described.d.new_zeros(len(visible), 3)
         return colour.index_copy(0, pick, self.field.colour(y, d, normal, pose, row))

@@ -136,9 +136,6 @@ def _field_decisions(scene: SceneStatistics, given: FastFieldSettings) -> dict[s
             + (": too little to learn from" if nearly_static else ""),
         ),
         "nodes": _nodes(scene, given),
-        "normals": Decision("body", "one camera does not tell shape from shading")
-        if scene.cameras == 1
-        else Decision("surface", f"{scene.cameras} cameras tell shape from shading"),
     }
 
 

@@ -101,14 +101,6 @@ def test_light_falls_on_the_surface_not_on_the_body() -> None:
     assert torch.autograd.grad(normals[0][0, 0], slope)[0].item() == pytest.approx(-0.09 / 2.34**1.5, abs=1e-4)
 
 
-def test_or_on_the_body_if_that_is_set() -> None:
-    field, normals = field_of(lambda y, d, pose, row: 0.5 * (y[:, 1] - 1), rig=FINE_RIG), []
-    field.settings = field.settings.model_copy(update={"normals": "body"})
-    field.field.colour = lambda y, d, normal, pose, row: normals.append(normal) or normal
-    sampled(field, rig=FINE_RIG)
-    same(normals[0], [[-1.0, 0.0, 0.0]] * len(normals[0]))
-
-
 @pytest.mark.parametrize("probe", [OUTERMOST, INNERMOST])
 def test_the_distance_is_as_steep_as_in_the_world(probe: float) -> None:
     """Along the normal it rises by 1 per metre for the body, and by 0.5 and 0.2 for the residual's second coordinate

@@ -70,7 +70,6 @@ def test_what_is_given_stands():
         "field.geometry_cells",
         "field.pose_width",
         "field.nodes",
-        "field.normals",
         "one_posture",
     }
 
@@ -131,11 +130,3 @@ def test_a_scene_as_it_is_measured(tmp_path: Path):
     assert scene.std_rad == pytest.approx(0.1)
     areas = [masks.get(c, f).sum() for c in capture.train_cameras for f in capture.train_frames]
     assert scene.person_px == pytest.approx(np.sum(areas), rel=0.01)
-
-
-@pytest.mark.parametrize(
-    ("cameras", "given", "normals"), [(4, "", "surface"), (1, "", "body"), (1, "surface", "surface")]
-)
-def test_shading_shapes_the_surface_where_several_cameras_see_it(cameras: int, given: str, normals: str):
-    scene = SCENE.__class__(**{**vars(SCENE), "cameras": cameras})
-    assert decided(scene, field={"kind": "fast", "normals": given})[0].field.normals == normals
