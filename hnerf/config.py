@@ -216,6 +216,7 @@ class LossSettings(Section):
     fit: float = Field(default=1.0, ge=0)
     increment: float = Field(default=0.02, ge=0)
     elastic: float = Field(default=0.0, ge=0)  # not in the paper: regularises the deformations of `fast` and Nerfies
+    floor: float = Field(default=0.0, ge=0)  # not in the paper; per metre: keeps the surface above the ground
     eta: float = Field(default=1.0, ge=0)  # weight of the surroundings in blend; 0.25 where floor or furniture is near
     density_threshold: float = Field(default=50.0, gt=0)  # sigma_h, per scene unit
     geometry_roles: GeometryRoles = "surface_leads"  # whether geometry moves the density alone, or both
@@ -239,6 +240,7 @@ class TrainingSettings(Section):
     rays_per_frame: int = Field(default=192, ge=1)  # with frames_per_step frames; fewer share these rays
     pose_learning_rate: float = Field(default=5e-4, ge=0)  # 0 keeps the fitted poses and shape
     one_posture: bool | None = None  # in all training frames, so that only the root moves; None: chosen from the scene
+    ground: bool | None = None  # the ground is at height 0; None: chosen from the fitted feet
     absorb_steps: int = Field(default=100, ge=1)  # between exact updates of the posed bodies
     noise: float = Field(default=0.1, ge=0)  # std, on theta, T and v
     checkpoint_steps: int = Field(default=100, ge=1)

@@ -14,7 +14,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("training", version="31", resumable=True)
+@stage("training", version="32", resumable=True)
 def train(
     out: Path,
     recording: Artifact,

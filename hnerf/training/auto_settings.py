@@ -28,6 +28,7 @@ SHELL_MARGIN_M = 0.015  # beyond the extent of the masks, for poses that are sti
 MIN_THICKNESS_M, MAX_THICKNESS_M = 0.03, 0.15
 MASKS_PER_CAMERA = 6  # that are measured
 MIN_POSE_STD_RAD = 0.05  # below it, nothing can be learned from joint angles
+GROUND_M, SUNK_M = 0.03, 0.05  # of the lowest points of bodies from height 0, in the median and at most below it
 ONE_POSTURE_RAD = 0.002  # std_rad below which the fit found one posture in all frames
 POSE_WIDTH = 8
 NODES = 128  # about 12 cm apart; finer detail, such as a collar, is left to the canonical surface
@@ -50,7 +51,8 @@ class SceneStatistics:
 
     footprint_m: size of a pixel on the body, median over cameras. outside_m, inside_m: how far masks extend outside the
     fitted body and stay inside it, for 99 % of their outlines. side_m: longest side of the rest body. std_rad: standard
-    deviation of the free joints, mean. person_px: pixels of the person in all training images.
+    deviation of the free joints, mean. person_px: pixels of the person in all training images. lowest_m: height of each
+    body's lowest point, median and minimum over frames.
     """
 
     cameras: int
@@ -61,6 +63,7 @@ class SceneStatistics:
     side_m: float
     std_rad: float
     person_px: int
+    lowest_m: tuple[float, float]
 
     @staticmethod
     def of(capture: Capture, masks: Masks, body: BodyFit) -> "SceneStatistics":
@@ -82,6 +85,7 @@ class SceneStatistics:
             raise InputError(f"{capture.name}: no mask shows the person; see the report of the segmentation")
         inside_m, outside_m = np.percentile(np.concatenate(outlines_m), [1, 99])
         rows = [body.index(frame) for frame in capture.train_frames]
+        lowest_m = vertices_m[rows, :, "xyz".index(capture.up)].min(1)
         angles = body.theta[rows][:, body.rig.free]
         return SceneStatistics(
             cameras=len(capture.train_cameras),
@@ -92,6 +96,7 @@ class SceneStatistics:
             side_m=float((body.rig.vertices_m.amax(0) - body.rig.vertices_m.amin(0)).max()),
             std_rad=float((angles - angles.mean(0)).square().sum(-1).mean(0).sqrt().mean()),
             person_px=round(images * float(np.mean(areas_px))),
+            lowest_m=(float(np.median(lowest_m)), float(lowest_m.min())),
         )
 
 
@@ -104,6 +109,8 @@ def decide(scene: SceneStatistics, settings: TrainingSettings) -> tuple[Training
     other_decisions = {"steps": _steps(scene, settings)} if not settings.steps else {}
     if settings.one_posture is None:
         other_decisions["one_posture"] = _one_posture(scene, settings)
+    if settings.ground is None:
+        other_decisions["ground"] = _ground(scene)
     update = {name: decision.value for name, decision in other_decisions.items()}
     return settings.model_copy(update={"field": field} | update), decisions | other_decisions
 
@@ -154,6 +161,12 @@ def _one_posture(scene: SceneStatistics, settings: TrainingSettings) -> Decision
     if settings.field.kind != "fast" or scene.frames == 1:
         return Decision(False, "each frame has its own pose")
     return Decision(scene.std_rad < ONE_POSTURE_RAD, fitted)
+
+
+def _ground(scene: SceneStatistics) -> Decision:
+    median_m, lowest_m = scene.lowest_m
+    stand = f"bodies' lowest points are at {_mm(median_m)} in the median, {_mm(lowest_m)} or higher"
+    return Decision(abs(median_m) < GROUND_M and lowest_m > -SUNK_M, stand)
 
 
 def _steps(scene: SceneStatistics, settings: TrainingSettings) -> Decision:

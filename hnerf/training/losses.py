@@ -92,6 +92,12 @@ def increment(correction: PoseCorrection) -> Float[Tensor, ""]:
     return _norm(shape) + _norm(torch.cat([turn.flatten(1), move_m], 1)).mean()
 
 
+def floor(d_hat: Float[Tensor, "R K"], height_m: Float[Tensor, "R K"]) -> Float[Tensor, ""]:
+    """Return floor: sum_i relu(-d_hat_i) over samples below the ground, where nobody is: masks include the shadow under
+    a sole."""
+    return (relu(-d_hat) * (height_m < 0)).sum(1).mean()
+
+
 def elastic(samples: RaySamples) -> Float[Tensor, ""]:
     """Return the elastic energy of the deformation, mean over rays; 0 without a deformation."""
     energy = samples.d.new_zeros(1) if samples.elastic is None else samples.elastic

@@ -23,14 +23,19 @@ class TrainingError(RuntimeError):
 class Objective(nn.Module):
     """Field and pose correction with their losses; DistributedDataParallel wraps the forward pass."""
 
-    def __init__(self, field: Field, correction: PoseCorrection, settings: TrainingSettings):
+    def __init__(
+        self, field: Field, correction: PoseCorrection, settings: TrainingSettings, ground_axis: int | None = None
+    ):
+        """ground_axis: the vertical axis of a world with its ground at 0; None if it is not known where the ground
+        is."""
         super().__init__()
         self.field, self.correction, self.settings = field, correction, settings
+        self.ground_axis = ground_axis
 
     def forward(self, scene: PosedScene[Any], rays: PixelRays, draws: Draws) -> dict[str, Tensor]:
         """Return the weighted losses by name; their sum is minimised."""
         target, draws = make_target(rays, draws, self.field.models_background)
-        samples, _ = self.field.sample(dataclasses.replace(scene, correction=self.correction), rays, draws)
+        samples, depths_m = self.field.sample(dataclasses.replace(scene, correction=self.correction), rays, draws)
         s = self.settings.losses
         terms = {
             "reconstruction": lambda: losses.reconstruction(samples, target),
@@ -44,6 +49,8 @@ class Objective(nn.Module):
             "increment": lambda: losses.increment(self.correction),
             "elastic": lambda: losses.elastic(samples),
         }
+        if self.ground_axis is not None:
+            terms["floor"] = lambda: losses.floor(samples.d_hat, rays.points(depths_m)[..., self.ground_axis])
         return {name: getattr(s, name) * term() for name, term in terms.items() if getattr(s, name)}
 
 

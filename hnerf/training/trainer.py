@@ -75,7 +75,8 @@ class Trainer:
         self.body = body.to(device)
         self.field = build_field(settings.field, self.body, self.static).to(device)
         bodies = PosedBodies(self.body.rig, self.body.theta, self.body.root, self.field.canonical_m)
-        self.objective = Objective(self.field, bodies.correction(), settings)
+        ground_axis = "xyz".index(capture.up) if settings.ground else None
+        self.objective = Objective(self.field, bodies.correction(), settings, ground_axis)
         self.optimizer = torch.optim.Adam(self._parameter_groups(), betas=(0.9, 0.99), eps=1e-12, fused=True)
         self.first_rates = [group["lr"] for group in self.optimizer.param_groups]
         self.gains, self.decisions["gains"] = camera_gains(capture, masks, body)

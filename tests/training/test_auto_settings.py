@@ -18,6 +18,7 @@ SCENE = SceneStatistics(
     side_m=1.92,
     std_rad=0.3,
     person_px=4_000_000,
+    lowest_m=(0.005, -0.02),
 )
 
 
@@ -71,6 +72,7 @@ def test_what_is_given_stands():
         "field.pose_width",
         "field.nodes",
         "one_posture",
+        "ground",
     }
 
 
@@ -116,6 +118,22 @@ def test_a_single_frame_or_camera_does_not_deform_the_body(cameras: int, frames:
     assert decided(scene, field={"kind": "fast", "deformation_learning_rate": rate})[0].field.nodes == nodes
 
 
+@pytest.mark.parametrize(
+    ("lowest_m", "ground"),
+    [
+        ((-0.01, -0.03), True),
+        ((0.028, 0.01), True),
+        ((0.04, 0.01), False),
+        ((-0.04, -0.045), False),
+        ((0, -0.06), False),
+    ],
+)
+def test_the_ground_is_where_feet_stand_if_nobody_stands_lower(lowest_m: tuple[float, float], ground: bool):
+    scene = SCENE.__class__(**{**vars(SCENE), "lowest_m": lowest_m})
+    assert decided(scene)[0].ground is ground
+    assert decided(scene, ground=not ground)[0].ground is not ground
+
+
 def test_a_scene_as_it_is_measured(tmp_path: Path):
     """Cameras at 4.03 m with a focal length of 38.4 px: 0.105 m per pixel. The masks are the body's own silhouettes,
     whose outline is its outermost pixels: half a pixel to one and a half inside. One of two joints is free and bends by
@@ -128,5 +146,6 @@ def test_a_scene_as_it_is_measured(tmp_path: Path):
     assert 0.09 < scene.inside_m < 0.2
     assert scene.side_m == pytest.approx(2.0)
     assert scene.std_rad == pytest.approx(0.1)
+    assert scene.lowest_m == pytest.approx((0.0, 0.0), abs=1e-6)
     areas = [masks.get(c, f).sum() for c in capture.train_cameras for f in capture.train_frames]
     assert scene.person_px == pytest.approx(np.sum(areas), rel=0.01)

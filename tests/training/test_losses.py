@@ -136,6 +136,14 @@ def test_increment():
     assert losses.increment(correction).item() == pytest.approx(7.5)
 
 
+def test_floor():
+    """Below the ground are 2 and 3 cm of the first ray, whose third sample is outside; of the second nothing."""
+    d_hat = torch.tensor([[-0.02, -0.03, 0.5], [-0.04, 0.1, 0.2]], dtype=torch.float64, requires_grad=True)
+    height_m = torch.tensor([[-0.01, -0.02, -0.03], [0.01, -0.01, 0.02]])
+    assert losses.floor(d_hat, height_m).item() == pytest.approx(0.025)
+    assert torch.autograd.gradcheck(lambda d: losses.floor(d, height_m), d_hat)
+
+
 def test_elastic():
     """Two rays, one of them without a deformation."""
     assert losses.elastic(SAMPLES).item() == pytest.approx(0.1)

@@ -82,6 +82,24 @@ def test_each_loss_is_given_its_own_numbers() -> None:
     assert {name: term.item() for name, term in terms.items()} == pytest.approx(expected, rel=1e-5)
 
 
+def test_the_floor_is_asked_about_samples_below_the_ground() -> None:
+    """Rays come down from 1 m along z. The second sample of the first ray lies 10 cm below the ground, and its d_hat is
+    -0.02: a mean of 0.01 over two rays, times 3. Where the ground is unknown there is no floor."""
+    field: Any = torch.nn.Module()
+    field.models_background, field.gamma = True, 80.0
+    field.sample = lambda *inputs: (SAMPLES, torch.tensor([[0.9, 1.1], [0.5, 0.8]]))
+    none, scene = torch.zeros(2, 3), PosedScene(None, None, None)
+    origins_m, down = torch.tensor([[0.0, 0.0, 1.0]] * 2), torch.tensor([[0.0, 0.0, -1.0]] * 2)
+    rays = PixelRays(origins_m, down, none[:, 0], TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)
+    settings = TrainingSettings(losses=LossSettings(floor=3))
+    known, unknown = (
+        Objective(field, PoseCorrection(2, 0, 2), settings, axis)(scene, rays, Draws(none, none, none))
+        for axis in (2, None)
+    )
+    assert known["floor"].item() == pytest.approx(0.03)
+    assert "floor" not in unknown
+
+
 def test_a_loss_without_weight_is_not_asked() -> None:
     assert LossSettings().elastic == 0
     field: Any = torch.nn.Module()
