@@ -209,6 +209,7 @@ FAULTS = (
     Fault("trainer-field-goes-on", TRAINER, "self.field.requires_grad_(False)", "pass", BY_TRAINER),
     Fault("trainer-poses-go-on", TRAINER, "pose.grad[self.train_rows] = 0.0", "pass", BY_TRAINER),
     Fault("trainer-decay", TRAINER, "FINAL_LEARNING_RATE ** self._progress() * ", "", BY_TRAINER),
+    Fault("ground-unknown", TRAINER, "settings, ground_axis)", "settings)", BY_TRAINER),
     Fault("one-camera-drifts", TRAINER, "            self._keep_distance()\n", "", BY_TRAINER),
     Fault("one-camera-farthest", TRAINER, "tuned.norm(dim=-1).mean()", "tuned.norm(dim=-1).max()", BY_TRAINER),
     Fault("one-camera-all", TRAINER, "root[rows, :3, 3] = self", "root[-1] = root[0]; root[rows, :3, 3] = self",

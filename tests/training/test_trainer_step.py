@@ -184,3 +184,8 @@ def test_several_cameras_see_how_far_away_somebody_is(tmp_path: Path) -> None:
     trainer.step = 1
     trainer._absorb()
     assert trainer.scene.bodies.root[0, :3, 3].tolist() == pytest.approx([-1, 0, 0], abs=1e-5)
+
+
+def test_the_recordings_vertical_axis_leads_to_the_ground(tmp_path: Path) -> None:
+    assert trainer_of(tmp_path / "known", ground=True).objective.ground_axis == 2
+    assert trainer_of(tmp_path / "unknown", ground=False).objective.ground_axis is None
