@@ -285,6 +285,8 @@ FAULTS = (
     Fault("antialiasing-depth", ANTIALIASING, "image[y, x, :4] = render_beside(mixed, QUARTERS_PX).mean(0)[:, :4]",
           "image[y, x] = render_beside(mixed, QUARTERS_PX).mean(0)", BY_ANTIALIASING),
     Fault("photographs-cosine", PHOTOGRAPHS, "cosine**COSINE_POWER", "cosine", BY_PHOTOGRAPHS),
+    Fault("photographs-blurred", PHOTOGRAPHS, "colours + change / self._weight", "colours", BY_PHOTOGRAPHS),
+    Fault("photographs-pixel", PHOTOGRAPHS, "y * camera.width_px + x", "x * camera.width_px + y", BY_PHOTOGRAPHS),
     Fault("photographs-hidden", PHOTOGRAPHS, "(distance_m < seen_m[row", "(distance_m > -seen_m[row", BY_PHOTOGRAPHS),
     Fault("light-reflected", LIGHT, "[1, 2 / 3, 1 / 4]", "[1, 2 / 3, 1 / 2]", BY_LIGHT),
     Fault("light-ridge", LIGHT, "RIDGE = 1e-5", "RIDGE = 1e-1", BY_LIGHT),

@@ -5,7 +5,7 @@ import torch
 
 from hnerf.asset.albedo import AlbedoBlend, mean_irradiance
 from hnerf.asset.light import Light
-from hnerf.asset.photographs import FIELD_WEIGHT, SeenTexels
+from hnerf.asset.photographs import FIELD_WEIGHT, SeenTexels, TexelPixels
 from hnerf.asset.srgb import to_linear, to_srgb
 from hnerf.asset.texture import Texels
 
@@ -16,7 +16,9 @@ ALBEDO = np.array([[0.8, 0.4, 0.2]])
 
 def seen(normal: np.ndarray, colours: np.ndarray) -> SeenTexels:
     """Return what a photograph from along the normal shows of the first texel."""
-    return SeenTexels(np.array([0]), np.ones(1), normal[None], colours)
+    return SeenTexels(
+        np.array([0]), np.ones(1), normal[None], colours, TexelPixels(np.array([0]), np.array([0]), colours)
+    )
 
 
 def test_irradiances_by_hand() -> None:

@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from hnerf.asset.photographs import FIELD_WEIGHT, OUTLIER, CapturedBlend, photographed_texels, visible_texels
+from hnerf.asset.photographs import (
+    FIELD_WEIGHT,
+    OUTLIER,
+    CapturedBlend,
+    SeenTexels,
+    TexelPixels,
+    photographed_texels,
+    visible_texels,
+)
 from hnerf.asset.texture import Texels
 from hnerf.avatar.avatar import Gains
 from hnerf.geometry.camera import Camera
@@ -55,7 +63,7 @@ def colours_from_photographs(
     blend = CapturedBlend(field)
     for seen in photographed_texels(capture, gains, surfaces_m, faces, texels):
         blend.add(seen)
-    return blend.colours()
+    return blend.mean()
 
 
 def test_a_texel_is_seen_where_it_projects() -> None:
@@ -122,3 +130,36 @@ def test_a_photograph_that_contradicts_the_field_counts_little() -> None:
     found = colours_from_photographs(white, {}, {0: square(0.4, 0.0)}, FACES, texels, np.zeros((1, 3)))
     vote = 1 / (1 + 3 / OUTLIER**2) ** 2
     assert found[0, 0] == pytest.approx(vote / (vote + FIELD_WEIGHT), abs=1e-6)
+
+
+def test_a_pixel_should_be_the_mean_of_its_texels() -> None:
+    """Three texels lie in a pixel of 0.5 and have a mean of 0.4; one in a pixel of 0.2 has 0.3."""
+    levels = np.array([[0.9], [0.2], [0.3], [0.6], [0.4]]) * [1, 1, 1]
+    pixel, photograph = np.array([0, 1, 0, 0]), np.array([[0.5] * 3, [0.2] * 3])
+    pixels = TexelPixels(np.array([1, 2, 3, 4]), pixel, photograph)
+    np.testing.assert_allclose(pixels.unexplained(levels)[:, 0], [0.1, -0.1, 0.1, 0.1])
+
+
+def test_photographs_that_were_averaged_over_pixels_show_stripes_again() -> None:
+    """Stripes of one texel, 0.3 and 0.5, in pixels of three texels that begin at each of three places: pixels see 0.367
+    or 0.433. Texels are seen in the pixels around them, whose mean has a sixth of the contrast or less."""
+    stripes = np.where(np.arange(60) % 2 == 0, 0.3, 0.5)[:, None] * [1, 1, 1]
+    blend = CapturedBlend(np.full((60, 3), 0.4))
+    for start in range(3):
+        pixel = (np.arange(60) + start) // 3
+        photograph = np.stack([np.bincount(pixel, stripes[:, 0]) / np.bincount(pixel)] * 3, 1)
+        pixels = TexelPixels(np.arange(60), pixel, photograph)
+        blend.add(SeenTexels(np.arange(60), np.ones(60), np.zeros((60, 3)), photograph[pixel], pixels))
+    inside = slice(6, -6)
+    before, after = (np.abs(found - stripes)[inside].mean() for found in (blend.mean(), blend.sharpened()))
+    assert after < 0.85 * before
+
+
+def test_a_texel_lies_in_the_pixel_that_it_projects_to() -> None:
+    """At (50, 40) and (50.2, 40)."""
+    shaded: Any = capture({"front": 0}, [camera()])
+    shaded.image("front", 0)[40, 50] = 200
+    texels = texels_at([0, 0], [[0.5, 0.25, 0.25], [0.495, 0.255, 0.25]])
+    (seen,) = photographed_texels(shaded, {"front": (0.8, 0.8, 0.8)}, {0: square(0.4, 0.0)}, FACES, texels)
+    assert seen.pixels.index.tolist() == [0, 1] and seen.pixels.pixel.tolist() == [0, 0]
+    np.testing.assert_allclose(seen.pixels.colours, [[200 / 255 / 0.8] * 3], rtol=1e-6)
