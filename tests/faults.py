@@ -285,7 +285,7 @@ FAULTS = (
     Fault("antialiasing-depth", ANTIALIASING, "image[y, x, :4] = render_beside(mixed, QUARTERS_PX).mean(0)[:, :4]",
           "image[y, x] = render_beside(mixed, QUARTERS_PX).mean(0)", BY_ANTIALIASING),
     Fault("photographs-cosine", PHOTOGRAPHS, "cosine**COSINE_POWER", "cosine", BY_PHOTOGRAPHS),
-    Fault("photographs-blurred", PHOTOGRAPHS, "colours + change / self._weight", "colours", BY_PHOTOGRAPHS),
+    Fault("photographs-blurred", PHOTOGRAPHS, "colours + change / weight", "colours", BY_PHOTOGRAPHS),
     Fault("photographs-pixel", PHOTOGRAPHS, "y * camera.width_px + x", "x * camera.width_px + y", BY_PHOTOGRAPHS),
     Fault("photographs-hidden", PHOTOGRAPHS, "(distance_m < seen_m[row", "(distance_m > -seen_m[row", BY_PHOTOGRAPHS),
     Fault("light-reflected", LIGHT, "[1, 2 / 3, 1 / 4]", "[1, 2 / 3, 1 / 2]", BY_LIGHT),

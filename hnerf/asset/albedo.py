@@ -1,12 +1,13 @@
 """The albedo of texels: photographs' colours, divided by the light at the normals that the texels had in them."""
 
+import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from hnerf.asset.light import Light
-from hnerf.asset.photographs import FIELD_WEIGHT, SeenTexels
+from hnerf.asset.photographs import FIELD_WEIGHT, BackProjection, SeenTexels
 from hnerf.asset.srgb import to_linear, to_srgb
 from hnerf.asset.tangents import unit
 from hnerf.asset.texture import Texels
@@ -32,6 +33,7 @@ class AlbedoBlend:
         self._field = seen / field_irradiance[:, None]
         self._irradiance = FIELD_WEIGHT * field_irradiance[:, None]
         self._total = FIELD_WEIGHT * seen
+        self._projection = BackProjection()
 
     def add(self, seen: SeenTexels) -> None:
         """Take in a photograph."""
@@ -39,10 +41,12 @@ class AlbedoBlend:
         counts = seen.weights(to_srgb(self._field[seen.index] * irradiance))
         self._irradiance[seen.index] += counts * irradiance
         self._total[seen.index] += counts * to_linear(seen.colours)
+        pixels = dataclasses.replace(seen.pixels, colours=to_linear(seen.pixels.colours))
+        self._projection.add(pixels, counts, irradiance.astype(np.float32))
 
     def colours(self) -> np.ndarray:
         """Return the albedos (N, 3) as sRGB in [0, 1]."""
-        return to_srgb(np.clip(self._total / self._irradiance, 0, 1))
+        return to_srgb(self._projection.sharpened(self._total / self._irradiance, self._irradiance))
 
 
 def mean_irradiance(light: Light, surfaces_m: Iterable[np.ndarray], faces: np.ndarray, texels: Texels) -> np.ndarray:

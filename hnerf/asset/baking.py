@@ -8,7 +8,6 @@ from hnerf.asset.field_colours import field_colours
 from hnerf.asset.light import fit_light
 from hnerf.asset.photographs import CapturedBlend, photographed_texels
 from hnerf.asset.shading import photographed_shading
-from hnerf.asset.srgb import to_linear, to_srgb
 from hnerf.asset.texture import UvLayout, rasterise, texture_image
 from hnerf.avatar.avatar import Avatar
 from hnerf.body.fit_result import BodyFit
@@ -16,8 +15,6 @@ from hnerf.capture.capture import Capture
 from hnerf.config import AssetSettings
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.render.motion import select_poses
-
-MAX_DETAIL = 2.0  # by which sharpening changes a colour in linear light, up or down
 
 
 def baked_textures(
@@ -45,8 +42,5 @@ def baked_textures(
     for seen in photographed_texels(capture, avatar.gains, photographed, faces, texels):
         captured.add(seen)
         albedo.add(seen)
-    mean, sharpened = captured.mean(), captured.sharpened()
-    detail = np.clip(to_linear(sharpened) / to_linear(mean).clip(1e-3), 1 / MAX_DETAIL, MAX_DETAIL)
-    delit = to_srgb((to_linear(albedo.colours()) * detail).clip(0, 1))
-    texture, without_light = (texture_image(texels, colours, settings.texture_px) for colours in (sharpened, delit))
-    return texture, Albedo(without_light, light)
+    texture, delit = (texture_image(texels, blend.colours(), settings.texture_px) for blend in (captured, albedo))
+    return texture, Albedo(delit, light)

@@ -35,12 +35,34 @@ class TexelPixels:
     pixel: np.ndarray
     colours: np.ndarray
 
-    def unexplained(self, colours: np.ndarray) -> np.ndarray:
-        """Return by how much the pixel of each texel differs from the mean of its texels, of colours (N, 3): (M, 3)."""
+    def unexplained(self, shown: np.ndarray) -> np.ndarray:
+        """Return by how much the pixel of each texel differs from the mean of its texels, which show (M, 3)."""
         count = np.bincount(self.pixel)[:, None]
-        total = [np.bincount(self.pixel, colours[self.index, k]) for k in range(3)]
-        difference: np.ndarray = (self.colours - np.stack(total, 1) / count)[self.pixel]
+        total = np.stack([np.bincount(self.pixel, channel) for channel in shown.T], 1)
+        difference: np.ndarray = (self.colours - total / count)[self.pixel]
         return difference
+
+
+class BackProjection:
+    """Iterative back-projection (Irani and Peleg 1991): sharpens a weighted mean over photographs, each of whose pixels
+    has averaged its texels, until the texels, averaged over pixels again, look like the photographs."""
+
+    def __init__(self) -> None:
+        self._views: list[tuple[TexelPixels, np.ndarray, np.ndarray | float]] = []
+
+    def add(self, pixels: TexelPixels, counts: np.ndarray, light: np.ndarray | float = 1.0) -> None:
+        """Take in a photograph: the weights (M, 1) of its texels, and the light (M, 1) by which it shows them."""
+        self._views.append((pixels, counts.astype(np.float32), light))
+
+    def sharpened(self, mean: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Return the mean (N, 3), of total weight (N, 1), sharpened, in [0, 1]."""
+        colours = np.clip(mean, 0, 1)
+        for _ in range(BACK_PROJECTIONS):
+            change = np.zeros_like(colours)
+            for pixels, counts, light in self._views:
+                change[pixels.index] += counts * pixels.unexplained(colours[pixels.index] * light)
+            colours = np.clip(colours + change / weight, 0, 1)
+        return colours
 
 
 @dataclass(frozen=True)
@@ -62,36 +84,25 @@ class SeenTexels:
 
 
 class CapturedBlend:
-    """The mean colour of texels over photographs, weighted by their agreement with the field's colours (N, 3), which
-    count a little everywhere, so that they are what no photograph shows."""
+    """The mean colour of texels over photographs, sharpened, weighted by their agreement with the field's colours (N,
+    3), which count a little everywhere, so that they are what no photograph shows."""
 
     def __init__(self, field_colours: np.ndarray) -> None:
         self._field = field_colours
-        self._seen: list[tuple[TexelPixels, np.ndarray]] = []
         self._weight = np.full((len(field_colours), 1), FIELD_WEIGHT)
         self._total = FIELD_WEIGHT * field_colours
+        self._projection = BackProjection()
 
     def add(self, seen: SeenTexels) -> None:
         """Take in a photograph."""
         counts = seen.weights(self._field[seen.index])
         self._weight[seen.index] += counts
         self._total[seen.index] += counts * seen.colours
-        self._seen.append((seen.pixels, counts.astype(np.float32)))
+        self._projection.add(seen.pixels, counts)
 
-    def mean(self) -> np.ndarray:
-        """Return the mean colours (N, 3) in [0, 1]."""
-        return np.clip(self._total / self._weight, 0, 1)
-
-    def sharpened(self) -> np.ndarray:
-        """Return colours (N, 3) in [0, 1] that, averaged over pixels, look like the photographs: the mean has been
-        averaged already, and would be twice (iterative back-projection, Irani and Peleg 1991)."""
-        colours = self.mean()
-        for _ in range(BACK_PROJECTIONS):
-            change = np.zeros_like(colours)
-            for pixels, counts in self._seen:
-                change[pixels.index] += counts * pixels.unexplained(colours)
-            colours = np.clip(colours + change / self._weight, 0, 1)
-        return colours
+    def colours(self) -> np.ndarray:
+        """Return the colours (N, 3) in [0, 1]."""
+        return self._projection.sharpened(self._total / self._weight, self._weight)
 
 
 def photographed_texels(

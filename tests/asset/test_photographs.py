@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from hnerf.asset import photographs
 from hnerf.asset.photographs import (
     FIELD_WEIGHT,
     OUTLIER,
+    BackProjection,
     CapturedBlend,
-    SeenTexels,
     TexelPixels,
     photographed_texels,
     visible_texels,
@@ -63,7 +64,7 @@ def colours_from_photographs(
     blend = CapturedBlend(field)
     for seen in photographed_texels(capture, gains, surfaces_m, faces, texels):
         blend.add(seen)
-    return blend.mean()
+    return blend.colours()
 
 
 def test_a_texel_is_seen_where_it_projects() -> None:
@@ -95,8 +96,9 @@ def test_texels_near_an_outline_are_left_out() -> None:
     np.testing.assert_allclose(pixels_px, [[34, 34]], atol=1e-4)
 
 
-def test_colours_are_means_by_the_fourth_power_of_the_cosine() -> None:
-    """Views at 0 and 60 degrees weigh 1 and 1/16, times their agreement with the field's 0.5."""
+def test_colours_are_means_by_the_fourth_power_of_the_cosine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views at 0 and 60 degrees weigh 1 and 1/16, times their agreement with the field's 0.5, before sharpening."""
+    monkeypatch.setattr(photographs, "BACK_PROJECTIONS", 0)
     cameras = [camera(), camera("side", np.pi / 3)]
     found = colours_from_photographs(
         capture({"front": 130, "side": 125}, cameras),
@@ -124,8 +126,9 @@ def test_gains_are_divided_out_and_unseen_texels_keep_the_fields_colour() -> Non
     np.testing.assert_allclose(found, [[0.4, 0.4, 0.4], [0.1, 0.2, 0.3]], atol=1e-6)
 
 
-def test_a_photograph_that_contradicts_the_field_counts_little() -> None:
+def test_a_photograph_that_contradicts_the_field_counts_little(monkeypatch: pytest.MonkeyPatch) -> None:
     """White against black is sqrt(3) / OUTLIER of an outlier."""
+    monkeypatch.setattr(photographs, "BACK_PROJECTIONS", 0)
     white, texels = capture({"front": 255}, [camera()]), texels_at([0], [MIDDLE])
     found = colours_from_photographs(white, {}, {0: square(0.4, 0.0)}, FACES, texels, np.zeros((1, 3)))
     vote = 1 / (1 + 3 / OUTLIER**2) ** 2
@@ -134,7 +137,7 @@ def test_a_photograph_that_contradicts_the_field_counts_little() -> None:
 
 def test_a_pixel_should_be_the_mean_of_its_texels() -> None:
     """Three texels lie in a pixel of 0.5 and have a mean of 0.4; one in a pixel of 0.2 has 0.3."""
-    levels = np.array([[0.9], [0.2], [0.3], [0.6], [0.4]]) * [1, 1, 1]
+    levels = np.array([[0.2], [0.3], [0.6], [0.4]]) * [1, 1, 1]
     pixel, photograph = np.array([0, 1, 0, 0]), np.array([[0.5] * 3, [0.2] * 3])
     pixels = TexelPixels(np.array([1, 2, 3, 4]), pixel, photograph)
     np.testing.assert_allclose(pixels.unexplained(levels)[:, 0], [0.1, -0.1, 0.1, 0.1])
@@ -144,15 +147,25 @@ def test_photographs_that_were_averaged_over_pixels_show_stripes_again() -> None
     """Stripes of one texel, 0.3 and 0.5, in pixels of three texels that begin at each of three places: pixels see 0.367
     or 0.433. Texels are seen in the pixels around them, whose mean has a sixth of the contrast or less."""
     stripes = np.where(np.arange(60) % 2 == 0, 0.3, 0.5)[:, None] * [1, 1, 1]
-    blend = CapturedBlend(np.full((60, 3), 0.4))
+    projection, mean = BackProjection(), np.zeros((60, 3))
     for start in range(3):
         pixel = (np.arange(60) + start) // 3
         photograph = np.stack([np.bincount(pixel, stripes[:, 0]) / np.bincount(pixel)] * 3, 1)
-        pixels = TexelPixels(np.arange(60), pixel, photograph)
-        blend.add(SeenTexels(np.arange(60), np.ones(60), np.zeros((60, 3)), photograph[pixel], pixels))
+        projection.add(TexelPixels(np.arange(60), pixel, photograph), np.ones((60, 1)))
+        mean += photograph[pixel] / 3
     inside = slice(6, -6)
-    before, after = (np.abs(found - stripes)[inside].mean() for found in (blend.mean(), blend.sharpened()))
+    sharpened = projection.sharpened(mean, np.full((60, 1), 3.0))
+    before, after = (np.abs(found - stripes)[inside].mean() for found in (mean, sharpened))
     assert after < 0.85 * before
+
+
+def test_what_light_shows_is_divided_by_it() -> None:
+    """One texel of 0.5 in half the light should show 0.35: 0.1 too little, at a weight of 1 of 0.5 in all. It becomes
+    0.7, and stays."""
+    projection = BackProjection()
+    pixels = TexelPixels(np.array([0]), np.array([0]), np.full((1, 3), 0.35))
+    projection.add(pixels, np.ones((1, 1)), np.full((1, 1), 0.5))
+    np.testing.assert_allclose(projection.sharpened(np.full((1, 3), 0.5), np.full((1, 1), 0.5)), 0.7)
 
 
 def test_a_texel_lies_in_the_pixel_that_it_projects_to() -> None:
