@@ -25,20 +25,21 @@ from flows.ingest_captures import DISK_EVENT
 SILENCE_S = 150  # five heartbeats of prefect.toml
 MIN_SILENCE_S = 60
 BLOCK = "hnerf-operator"
+SIGNS_OF_LIFE = {f"prefect.flow-run.{sign}" for sign in ("heartbeat", "Pending", "Submitting", "InfrastructurePending")}
 RUNS = {"prefect.resource.id": "prefect.flow-run.*"}
 
 
 def lost_runs(silence_s: int) -> AutomationCore:
-    """Return the automation that ends runs without a sign of life, whose process and worker were lost together;
-    `ingest-captures` then begins them again."""
-    message = f"no heartbeat for {silence_s} s: its process or its machine was lost"
+    """Return the automation that ends runs without a sign of life, whose process and worker were lost together, at work
+    or while the worker began them; `ingest-captures` then begins them again."""
+    message = f"no sign of life for {silence_s} s: its process or its machine was lost"
     return AutomationCore(
         name="hnerf: lost runs",
         description="Runs that were seen alive and then gave no sign of life become Crashed.",
         trigger=EventTrigger(
             match=RUNS,  # type: ignore[arg-type]
             for_each={"prefect.resource.id"},
-            after={"prefect.flow-run.heartbeat"},
+            after=SIGNS_OF_LIFE,
             expect={"prefect.flow-run.*"},
             posture=Posture.Proactive,
             within=timedelta(seconds=silence_s),

@@ -1,14 +1,15 @@
 import json
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import Any
 
 import pytest
-from prefect import get_client
+from prefect import State, flow, get_client
 from prefect.events import emit_event
 from prefect.settings import PREFECT_API_URL, temporary_settings
+from prefect.states import Pending, Submitting
 
 from flows.automations import lost_runs, main, set_up
 from flows.ingest_captures import DISK_EVENT
@@ -63,7 +64,23 @@ def test_without_a_webhook_only_lost_runs_are_ended(prefect_api: str) -> None:
 
 def test_silence_is_longer_than_some_heartbeats() -> None:
     trigger = lost_runs(150).trigger
-    assert trigger.after == {"prefect.flow-run.heartbeat"} and trigger.posture == "Proactive"
+    assert "prefect.flow-run.heartbeat" in trigger.after and trigger.posture == "Proactive"
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("state", [Pending, Submitting])
+def test_a_run_whose_worker_is_lost_while_it_begins_it_crashes(prefect_api: str, state: Callable[[], State]) -> None:
+    """It has no heartbeat yet, and would be about to begin for ever."""
+    with get_client(sync_client=True) as client:
+        automation = client.create_automation(lost_runs(10))
+        time.sleep(5)  # until the server has read it
+        run = client.create_flow_run(flow(lambda: None, name="begun"))
+        client.set_flow_run_state(run.id, state())
+        deadline = time.monotonic() + PATIENCE_S
+        while not (now := client.read_flow_run(run.id).state).is_crashed() and time.monotonic() < deadline:
+            time.sleep(1)
+        client.delete_automation(automation)
+    assert now.is_crashed() and now.message == "no sign of life for 10 s: its process or its machine was lost"
 
 
 def test_without_a_server_one_line_says_so(capsys: pytest.CaptureFixture[str]) -> None:
