@@ -103,7 +103,8 @@ def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: 
     ):
         set_up(scratch)
         machines = [Machine.started(scratch, number) for number in range(MACHINES)]
-        started_s, killed_s, memory_kib = time.monotonic(), time.monotonic(), [resident_kib(server.pid)]
+        started_s, memory_kib = time.monotonic(), [resident_kib(server.pid)]
+        kill_s = started_s + options.kill_every
         while len(done) < len(names) and time.monotonic() - started_s < options.limit:
             time.sleep(POLL_S)
             note_finished(machines, names, done)
@@ -111,13 +112,15 @@ def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: 
             restarted = [machine.restarted() for machine in machines]
             restarts += sum(now is not before for now, before in zip(restarted, machines, strict=True))
             machines, at = restarted, random.randrange(MACHINES)
-            if time.monotonic() - killed_s > options.kill_every and (run := machines[at].run()):
+            if time.monotonic() < kill_s:
+                continue
+            kill_s = time.monotonic() + options.kill_every * random.uniform(0.5, 1.5)
+            if run := machines[at].run():  # a kill that finds none lapses: it would meet the last run as it begins
                 if kills.total() % 2:
                     machines[at] = machines[at].lose()
                 else:
                     os.kill(run, signal.SIGKILL)
                 kills["machine and disk" if kills.total() % 2 else "run"] += 1
-                killed_s = time.monotonic()
         seconds = time.monotonic() - started_s
         wait_until_idle()
         states = run_states()
