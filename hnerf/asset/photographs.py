@@ -67,14 +67,18 @@ class BackProjection:
 
 @dataclass(frozen=True)
 class SeenTexels:
-    """What a photograph shows of texels: index (M,) of these, cosine (M,) of the view to their unit normals (M, 3),
-    colours (M, 3) in [0, 1], divided by the camera's gains, and the pixels in which they lie."""
+    """What a photograph shows of texels: the pixels in which they lie, cosine (M,) of the view to their unit normals
+    (M, 3), and colours (M, 3) in [0, 1], interpolated between pixels and divided by the camera's gains."""
 
-    index: np.ndarray
+    pixels: TexelPixels
     cosine: np.ndarray
     normals: np.ndarray
     colours: np.ndarray
-    pixels: TexelPixels
+
+    @property
+    def index(self) -> np.ndarray:
+        """Return the index (M,) of the texels."""
+        return self.pixels.index
 
     def weights(self, expected: np.ndarray) -> np.ndarray:
         """Return how much each texel counts, (M, 1): the fourth power of the cosine, and less the more its colour
@@ -119,7 +123,7 @@ def photographed_texels(
         at, pixel = np.unique(y * camera.width_px + x, return_inverse=True)
         colours = (image.reshape(-1, 3)[at] / 255 / gain).astype(np.float32)
         pixels = TexelPixels(index.astype(np.int32), pixel.astype(np.int32), colours)
-        yield SeenTexels(index, cosine, normals, sampled(image, pixels_px) / gain, pixels)
+        yield SeenTexels(pixels, cosine, normals, sampled(image, pixels_px) / gain)
 
 
 def visible_texels(

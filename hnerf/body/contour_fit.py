@@ -161,7 +161,8 @@ def refine_with_outlines(
     """
     faces = pose.rig.faces.numpy()
     only = problem.observations.cameras[0] if len(problem.observations.cameras) == 1 else None
-    above_ground = only if only is not None and only.centre_m[up] > GROUND_OUTLIER_M else None  # else 0 is no ground
+    if only is not None and only.centre_m[up] <= GROUND_OUTLIER_M:
+        only = None  # height 0 is not the ground
     sole_m = 0.0
     for step in tracked(range(settings.contour_steps), "outlines", settings.contour_steps):
         articulation = Articulation(pose.rig)
@@ -176,9 +177,9 @@ def refine_with_outlines(
                 for camera, scale_m, edge in zip(problem.observations.cameras, problem.scale_m, row, strict=True)
                 if edge is not None
             ]
-            if above_ground:
+            if only is not None:
                 found.append(_ground_contact(vertices_m, up, sole_m))
-                soles_m += [_sole_m(above_ground, e, float(problem.scale_m[0, t]), vertices_m, up) for e in row if e]
+                soles_m += [_sole_m(only, e, float(problem.scale_m[0, t]), vertices_m, up) for e in row if e]
             for rows in found:
                 add_residuals(equations, articulation, joints, t, rows)
                 residuals.append(rows.residual_m)

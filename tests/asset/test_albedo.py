@@ -16,9 +16,7 @@ ALBEDO = np.array([[0.8, 0.4, 0.2]])
 
 def seen(normal: np.ndarray, colours: np.ndarray) -> SeenTexels:
     """Return what a photograph from along the normal shows of the first texel."""
-    return SeenTexels(
-        np.array([0]), np.ones(1), normal[None], colours, TexelPixels(np.array([0]), np.array([0]), colours)
-    )
+    return SeenTexels(TexelPixels(np.array([0]), np.array([0]), colours), np.ones(1), normal[None], colours)
 
 
 def test_irradiances_by_hand() -> None:
