@@ -6,6 +6,10 @@ CALIBRATED = ("valid-walk", "valid-wave")
 RENDERED = (*CALIBRATED, "valid-turn-mono")
 FEW = ("evaluation.max_images=12", "evaluation.max_meshes=3")  # per split, since each takes a quarter of a minute
 
+SMALL = "size_px=128"  # for many images of NeRF, each of which takes 18 s at 256 px
+MOMENT = (SMALL, "train_frames=1", "novel_pose_frames=0")
+LONG_WALK = ("train_frames=40", "novel_pose_frames=24")
+
 
 @dataclass(frozen=True)
 class Result:
@@ -43,12 +47,25 @@ def shared(
     return Result(name, command, (f"{name}.*",), (capture,), (preset,), ("flows.train_subject",), threads)
 
 
-def study(kind: str, name: str, *methods: str, store: str = "{store}", threads: int = 1) -> Result:
-    """Return a benchmark or stability study of valid-wave."""
-    title, chosen = f"{kind}/valid-wave-{name}", ("--methods", ",".join(methods))
-    command = ("studies.py", store, "valid-wave", kind, name, *chosen)
+def study(
+    kind: str,
+    name: str,
+    *methods: str,
+    seconds: int | None = None,
+    synth: tuple[str, ...] = (),
+    store: str = "{store}",
+    threads: int = 1,
+) -> Result:
+    """Return a benchmark or stability study of valid-wave, or of the performer in a capture with settings `synth`;
+    seconds: of each training, in place of the study's."""
+    capture = "performer" if synth else "valid-wave"
+    title = f"{kind}/{capture}-{name}"
+    command = ("studies.py", store, capture, kind, name, "--methods", ",".join(methods))
+    command += (f"--seconds={seconds}",) if seconds else ()
+    command += tuple(f"--synth={setting}" for setting in synth)
+    captures = () if synth else (capture,)
     files = (f"{title}.*", f"{title}-*.png")
-    return Result(title, command, files, ("valid-wave",), (f"{kind}/{name}", *methods), threads=threads)
+    return Result(title, command, files, captures, (f"{kind}/{name}", *methods), threads=threads)
 
 
 def ablations(preset: str, *changes: str) -> Result:
@@ -82,6 +99,17 @@ REGISTRY = (
     ablations("paper-small", "training.steps=400", "capture.max_side_px=128", "evaluation.max_images=4"),
     study("benchmark", "static", "fast", "paper-small", "nerf", "idr"),
     study("benchmark", "dynamic", "fast", "neural-body", "nerfies"),
+    study("benchmark", "frames", "fast", "neural-body", seconds=120),
+    study("benchmark", "monocular", "fast"),
+    study("benchmark", "nerfies", "fast", "nerfies", seconds=240),
+    *(
+        study("benchmark", name, "fast", "nerf", "idr", seconds=90, synth=(*MOMENT, *cameras))
+        for name, cameras in (
+            ("cameras", ("train_cameras=32", "test_cameras=8")),
+            ("view-angle", ("train_cameras=64", "test_cameras=64")),
+        )
+    ),
+    study("benchmark", "pose-distance", "fast", "neural-body", seconds=120, synth=(SMALL, *LONG_WALK)),
     measured("budget", "budget.py", "{store}", captures=RENDERED, configs=("fast",)),
     shared("shared-fast-two-threads", "valid-wave", threads=2),
     measured("rendering", "rendering.py", "{store}", captures=RENDERED, configs=("fast",), threads=2),

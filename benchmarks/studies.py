@@ -3,7 +3,8 @@
 usage: python benchmarks/studies.py STORE CAPTURE benchmark|stability STUDY [--methods a,b] [--seconds S]
        python benchmarks/studies.py STORE CAPTURE ablations PRESET [--methods no-opt,no-noise] [--set a.b=c]
 
-CAPTURE is the name of a shared capture, or a folder.
+CAPTURE is the name of a shared capture, a folder, or `performer`, which stands for a synthetic capture with the
+settings `--synth`, written to STORE.
 
 Runs `hnerf benchmark`, `hnerf stability` or `hnerf ablate` with STORE, where finished work is reused, and
 copies its tables and charts to `benchmarks/results/<kind>/`. Ablations are scored on a few images.
@@ -18,6 +19,9 @@ from provenance import RESULTS, ROOT, SHARED, clean_commit, provenance, provenan
 from flows.ablations import ablate
 from flows.benchmark import benchmark
 from flows.stability import stability
+from hnerf.config import SyntheticSettings, overridden
+from hnerf.files import atomic_folder
+from hnerf.synthetic import write_synthetic_capture
 
 FEW = ["evaluation.max_images=8", "evaluation.max_meshes=2", "evaluation.report_rows=1"]
 
@@ -32,9 +36,9 @@ def main() -> None:
     parser.add_argument("--methods", default="")
     parser.add_argument("--seconds", type=float)
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="a.b=c", help="of ablations")
+    parser.add_argument("--synth", action="append", default=[], metavar="a=b", help="of the performer")
     options = parser.parse_args()
-    shared = SHARED / "data" / options.capture
-    folder = shared if shared.is_dir() else Path(options.capture)
+    folder = capture_folder(options.capture, options.synth, options.store)
     methods = [name for name in options.methods.split(",") if name]
     where = provenance_line(provenance())
     if options.kind == "benchmark":
@@ -51,6 +55,18 @@ def main() -> None:
     text = f"{table.read_text()}\nMade by `benchmarks/studies.py`: {where}\n"
     (kept / table.name).write_text(text)
     print(text)
+
+
+def capture_folder(name: str, synth: list[str], store: Path) -> Path:
+    """Return the folder of a capture; the performer's is written if it is not there."""
+    if name != "performer":
+        shared = SHARED / "data" / name
+        return shared if shared.is_dir() else Path(name)
+    folder = store / "synthetic" / ",".join(["performer", *synth])
+    if not folder.exists():
+        with atomic_folder(folder) as partial:
+            write_synthetic_capture(partial, overridden(SyntheticSettings(), synth))
+    return folder
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """Work on several images or surfaces at a time: on a CPU their operations are too small to share cores."""
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 import torch
@@ -14,11 +15,17 @@ MOST_AT_ONCE = 4  # each takes up to a GiB
 
 def side_by_side(work: Callable[[T], R], items: Iterable[T], device: torch.device) -> Iterator[R]:
     """Yield work(item) of each item in order: one after another on a GPU, in several threads on a CPU, which divide
-    those of torch among them."""
+    those of torch among them. What is ready and not yet taken is at most one more than there are threads."""
     threads = torch.get_num_threads()
     workers = min(threads, MOST_AT_ONCE) if device.type == "cpu" else 1
     if workers == 1:
         yield from map(work, items)
         return
     with ThreadPoolExecutor(workers, "beside", torch.set_num_threads, (threads // workers,)) as pool:
-        yield from pool.map(work, items)
+        ahead: deque[Future[R]] = deque()
+        for item in items:
+            ahead.append(pool.submit(work, item))
+            if len(ahead) > workers:
+                yield ahead.popleft().result()
+        while ahead:
+            yield ahead.popleft().result()

@@ -36,3 +36,13 @@ def test_what_fails_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "set_num_threads", lambda _: None)
     with pytest.raises(ZeroDivisionError):
         list(side_by_side(lambda n: 1 // n, [1, 0, 2], CPU))
+
+
+def test_work_waits_until_results_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(torch, "set_num_threads", lambda _: None)
+    begun: list[int] = []
+    results = side_by_side(begun.append, range(100), CPU)
+    next(results)
+    assert len(begun) <= 3
+    results.close()

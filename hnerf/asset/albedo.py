@@ -51,10 +51,6 @@ class AlbedoBlend:
 
 def mean_irradiance(light: Light, surfaces_m: Iterable[np.ndarray], faces: np.ndarray, texels: Texels) -> np.ndarray:
     """Return the mean irradiance of texels (N,) over some surfaces (V, 3)."""
-    corners, share = faces[texels.face.numpy()], texels.barycentric.numpy()[..., None]
-    found = []
-    for surface_m in surfaces_m:
-        normals = normals_of(surface_m, faces)
-        found.append(light.irradiance(unit((normals[corners] * share).sum(1))))
-    mean: np.ndarray = np.mean(found, 0)
+    normals = [unit(texels.interpolate(normals_of(surface_m, faces), faces)) for surface_m in surfaces_m]
+    mean: np.ndarray = np.mean([light.irradiance(of_texels) for of_texels in normals], 0)
     return mean

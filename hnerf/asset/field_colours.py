@@ -65,7 +65,7 @@ def filled(colours: np.ndarray, texels: Texels, rig: Rig) -> np.ndarray:
     matrix = cotangent_laplacian(vertices_m, faces)[1] + diags_array(pin + LOOSE)
     spread = splu(csc_array(matrix)).solve(pin[:, None] * known + LOOSE * colours[~unknown].mean(0))
     result = colours.copy()
-    result[unknown] = (spread[corners[unknown]] * share[unknown, :, None]).sum(1)
+    result[unknown] = texels.interpolate(spread, faces, unknown)
     return result
 
 

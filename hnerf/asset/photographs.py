@@ -15,6 +15,7 @@ from hnerf.capture.capture import Capture
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.rays import cast, mesh_on_cpu
 from hnerf.progress import tracked
+from hnerf.side_by_side import side_by_side
 
 OUTLIER = 0.15  # of a colour in [0, 1]: what differs more from the field is another limb, or a passing shadow
 COSINE_POWER = 4  # of the weight of a view by its angle to the normal
@@ -114,8 +115,9 @@ def photographed_texels(
 ) -> Iterator[SeenTexels]:
     """Yield what the training photographs of some frames show of the texels, where the surface does not hide them, away
     from outlines. surfaces_m: vertices (V, 3) in the world by frame."""
-    views = list(product(surfaces_m, capture.train_cameras))
-    for frame, name in tracked(views, "photographs", len(views)):
+
+    def seen_in(view: tuple[int, str]) -> SeenTexels:
+        frame, name = view
         camera, gain = capture.cameras[name], gains.get(name, (1.0, 1.0, 1.0))
         image = capture.image(name, frame)
         index, cosine, normals, pixels_px = visible_texels(camera, surfaces_m[frame], faces, texels)
@@ -123,7 +125,10 @@ def photographed_texels(
         at, pixel = np.unique(y * camera.width_px + x, return_inverse=True)
         colours = (image.reshape(-1, 3)[at] / 255 / gain).astype(np.float32)
         pixels = TexelPixels(index.astype(np.int32), pixel.astype(np.int32), colours)
-        yield SeenTexels(pixels, cosine, normals, sampled(image, pixels_px) / gain)
+        return SeenTexels(pixels, cosine, normals, sampled(image, pixels_px) / gain)
+
+    views = list(product(surfaces_m, capture.train_cameras))
+    yield from tracked(side_by_side(seen_in, views, texels.face.device), "photographs", len(views))
 
 
 def visible_texels(
@@ -136,8 +141,7 @@ def visible_texels(
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     facing = ((normals * towards).sum(1) > 0)[faces].any(1)
     index = np.flatnonzero(facing[texels.face.numpy()])
-    corners, share = faces[texels.face.numpy()[index]], texels.barycentric.numpy()[index, :, None]
-    points_m, normal = ((values[corners] * share).sum(1) for values in (vertices_m, normals))
+    points_m, normal = (texels.interpolate(values, faces, index) for values in (vertices_m, normals))
     pixels_px, _ = camera.project(points_m)
     view_m = camera.centre_m - points_m
     distance_m = np.linalg.norm(view_m, axis=1)

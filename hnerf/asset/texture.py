@@ -12,6 +12,7 @@ from torch import Tensor
 
 CHART_PADDING_PX = 4
 SUBPIXEL_BITS = 8
+ALL = slice(None)
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,14 @@ class Texels:
     column: Tensor
     face: Tensor
     barycentric: Tensor
+
+    def interpolate(self, per_vertex: np.ndarray, faces: np.ndarray, index: np.ndarray | slice = ALL) -> np.ndarray:
+        """Return values (V, C) of the vertices of faces (F, 3) at the texels of an index, (M, C)."""
+        corners, share = faces[self.face.numpy()[index]].T, self.barycentric.numpy()[index].T[..., None]
+        # A corner at a time takes half the time of all three at once.
+        a, b, c = (per_vertex[at] * by for at, by in zip(corners, share, strict=True))
+        values: np.ndarray = a + b + c
+        return values
 
 
 def unwrap(vertices_m: np.ndarray, faces: np.ndarray, texture_px: int) -> UvLayout:

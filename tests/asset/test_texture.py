@@ -2,7 +2,7 @@ import numpy as np
 import torch
 import trimesh
 
-from hnerf.asset.texture import UvLayout, rasterise, unwrap
+from hnerf.asset.texture import Texels, UvLayout, rasterise, unwrap
 
 
 def test_texels_of_one_triangle() -> None:
@@ -14,6 +14,14 @@ def test_texels_of_one_triangle() -> None:
     # The centre of the bottom left texel lies at u = v = 1/8.
     torch.testing.assert_close(at[3, 0], torch.tensor([0.75, 0.125, 0.125]))
     torch.testing.assert_close(at[3, 2], torch.tensor([0.25, 0.625, 0.125]))
+
+
+def test_values_of_vertices_at_texels() -> None:
+    faces, values = np.array([[0, 1, 2], [2, 1, 3]]), np.array([[0.0, 1], [4, 1], [8, 1], [100, 1]])
+    nowhere = torch.zeros(2, dtype=torch.long)
+    texels = Texels(nowhere, nowhere, torch.tensor([1, 0]), torch.tensor([[0.5, 0.25, 0.25], [0.25, 0.5, 0.25]]))
+    np.testing.assert_array_equal(texels.interpolate(values, faces), [[30, 1], [4, 1]])  # 8/2 + 4/4 + 100/4; 4/2 + 8/4
+    np.testing.assert_array_equal(texels.interpolate(values, faces, np.array([1])), [[4, 1]])
 
 
 def test_unwrap_keeps_faces_and_does_not_overlap_them() -> None:
