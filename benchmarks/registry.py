@@ -96,7 +96,7 @@ REGISTRY = (
     study("stability", "brief", "fast"),
     study("stability", "seeds", "fast"),
     ablations("fast"),
-    ablations("paper-small", "training.steps=400", "capture.max_side_px=128", "evaluation.max_images=4"),
+    ablations("paper-small", "training.steps=200", "capture.max_side_px=128", "evaluation.max_images=4"),
     study("benchmark", "static", "fast", "paper-small", "nerf", "idr"),
     study("benchmark", "dynamic", "fast", "neural-body", "nerfies"),
     study("benchmark", "frames", "fast", "neural-body", seconds=120),

@@ -217,6 +217,7 @@ class LossSettings(Section):
     increment: float = Field(default=0.02, ge=0)
     elastic: float = Field(default=0.0, ge=0)  # not in the paper: regularises the deformations of `fast` and Nerfies
     floor: float = Field(default=0.0, ge=0)  # not in the paper; per metre: keeps the surface above the ground
+    fog: float = Field(default=0.0, ge=0)  # not in the paper: the box is empty beside the person
     eta: float = Field(default=1.0, ge=0)  # weight of the surroundings in blend; 0.25 where floor or furniture is near
     density_threshold: float = Field(default=50.0, gt=0)  # sigma_h, per scene unit
     geometry_roles: GeometryRoles = "surface_leads"  # whether geometry moves the density alone, or both

@@ -43,6 +43,12 @@ def mask(samples: RaySamples, target: Target) -> Float[Tensor, ""]:
     return (target.weight * target.person * error).mean()
 
 
+def fog(samples: RaySamples, target: Target) -> Float[Tensor, ""]:
+    """Return fog: |(1 - M) C~|_1, for fields that model the background, since rec takes fog in the box for it."""
+    shown = pixel_colour(samples.in_box * samples.alpha, samples).sum(1)
+    return (target.weight * (1 - target.person) * shown).mean()
+
+
 def blend(samples: RaySamples, target: Target, eta: float) -> Float[Tensor, ""]:
     """Return blend: |M (C_gt - C^)|_1 + eta |(1 - M)(C_gt - C^)|_1, C^ composited with b alpha_dot + (1 - b) alpha."""
     alpha = samples.in_box * samples.alpha_dot + (1 - samples.in_box) * samples.alpha

@@ -40,6 +40,7 @@ class Objective(nn.Module):
         terms = {
             "reconstruction": lambda: losses.reconstruction(samples, target),
             "mask": lambda: losses.mask(samples, target),
+            "fog": lambda: losses.fog(samples, target),
             "blend": lambda: losses.blend(samples, target, s.eta),
             "geometry": lambda: losses.geometry(samples, s.density_threshold, s.density_steepness, s.geometry_roles),
             "segmentation": lambda: losses.segmentation(samples.d_hat, target, self.field.gamma),

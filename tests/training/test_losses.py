@@ -50,6 +50,12 @@ def test_mask_ignores_what_is_outside_the_box():
     assert losses.mask(outside, TARGET).item() == pytest.approx(0.5 / 2)
 
 
+def test_fog():
+    """C~ of ray 1, which passes beside the person, is (0, 0.2, 0) in the box, black where its fog is outside."""
+    assert losses.fog(replace(SAMPLES, in_box=torch.ones(2, 2)), TARGET).item() == pytest.approx(0.2 / 2)
+    assert losses.fog(SAMPLES, TARGET).item() == 0
+
+
 def test_blend():
     """C^ of ray 0 is green: error 2; of ray 1 (outside the box alpha stands) (0, 0.2, 0): 0.2 eta."""
     assert losses.blend(SAMPLES, TARGET, eta=0.25).item() == pytest.approx((2 + 0.25 * 0.2) / 2)

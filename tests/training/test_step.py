@@ -1,5 +1,6 @@
 """Targets of a step, and the inputs of each of its losses."""
 
+import dataclasses
 from typing import Any
 
 import pytest
@@ -100,8 +101,19 @@ def test_the_floor_is_asked_about_samples_below_the_ground() -> None:
     assert "floor" not in unknown
 
 
+def test_fog_is_asked_about_the_box() -> None:
+    field: Any = torch.nn.Module()
+    field.models_background, field.gamma = True, 80.0
+    field.sample = lambda *inputs: (dataclasses.replace(SAMPLES, in_box=torch.ones(2, 2)), None)
+    none, scene = torch.zeros(2, 3), PosedScene(None, None, None)
+    rays = PixelRays(none, none, none, TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)
+    settings = TrainingSettings(losses=LossSettings(fog=31))
+    terms = Objective(field, PoseCorrection(2, 0, 2), settings)(scene, rays, Draws(none, none, none))
+    assert terms["fog"].item() == pytest.approx(31 * 0.1)
+
+
 def test_a_loss_without_weight_is_not_asked() -> None:
-    assert LossSettings().elastic == 0
+    assert LossSettings().elastic == LossSettings().fog == 0
     field: Any = torch.nn.Module()
     field.models_background, field.gamma = True, 80.0
     field.sample = lambda *inputs: (SAMPLES, None)
@@ -109,4 +121,4 @@ def test_a_loss_without_weight_is_not_asked() -> None:
     rays = PixelRays(none, none, none, TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)
     settings = TrainingSettings(losses=LossSettings(mask=0, geometry=0))
     terms = Objective(field, PoseCorrection(2, 0, 2), settings)(scene, rays, Draws(none, none, none))
-    assert not {"mask", "geometry", "elastic"} & terms.keys()
+    assert not {"mask", "geometry", "elastic", "fog"} & terms.keys()
