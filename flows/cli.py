@@ -69,6 +69,7 @@ def _existing(options: argparse.Namespace) -> list[Path]:
     if "preset" in options:
         load_settings(options.preset, getattr(options, "overrides", ()))
     given = {what: getattr(options, name) for name, what in FOLDERS.items() if name in options}
+    given = {what: place for what, place in given.items() if isinstance(place, Path)}
     for what, folder in given.items():
         if not (folder.is_dir() or (what == FOLDERS["capture"] and folder.is_file())):
             raise InputError(f"{folder}: no such folder; give {what}")
@@ -87,9 +88,10 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="hnerf", description="From video of a person to an avatar.")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    capture, preset = (argparse.ArgumentParser(add_help=False) for _ in range(2))
+    store, preset = (argparse.ArgumentParser(add_help=False) for _ in range(2))
+    store.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
+    capture = argparse.ArgumentParser(add_help=False, parents=[store])
     capture.add_argument("capture", type=Path, help="the recording's folder, or one video")
-    capture.add_argument("--store", type=Path, default=Path("store"), help="where results are kept (default: store)")
     preset.add_argument("--preset", default="fast", help="a name under configs/ or a YAML file (default: fast)")
 
     def add(command: Command, *parents: argparse.ArgumentParser) -> argparse.ArgumentParser:
@@ -99,7 +101,9 @@ def _parser() -> argparse.ArgumentParser:
         added.set_defaults(command=command)
         return added
 
-    _add_overrides(add(commands.run, capture, preset), "override a setting of `hnerf settings`")
+    run = add(commands.run, store, preset)
+    run.add_argument("capture", type=_place, help="the recording's folder or URL, or one video")
+    _add_overrides(run, "override a setting of `hnerf settings`")
     add(commands.check_cameras, capture, preset)
     add(commands.settings, preset)
 
@@ -125,6 +129,11 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _place(text: str) -> Path | str:
+    """Return a path, or a URL as it is."""
+    return text if "://" in text else Path(text)
+
+
 def _add_overrides(command: argparse.ArgumentParser, what: str) -> None:
     command.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help=what)
 
@@ -133,16 +142,19 @@ def _add_calibrate(command: argparse.ArgumentParser) -> None:
     command.add_argument("folder", type=Path, help="a recording, or a folder with calibration/extrinsic/")
     command.add_argument(
         "--from", dest="source", choices=("boards", "person"), default="boards",
-        help="of what: footage of a board (default), or the person in the recording itself",
+        help="what to calibrate from: footage of a board (default), or the person in the recording",
     )  # fmt: skip
     _add_out(command, "cameras")
     command.add_argument("--format", choices=CAMERA_FORMATS, action="append", default=[], help="write these files, too")
     boards = command.add_argument_group("from boards")
     boards.add_argument(
-        "--ground-frame", type=_not_negative, metavar="N", help="when the board lies on the floor, at the origin"
+        "--ground-frame",
+        type=_not_negative,
+        metavar="N",
+        help="the frame whose board lies on the floor, at the origin",
     )
     person = command.add_argument_group("from the person")
-    person.add_argument("--height", type=_positive, metavar="M", help="the person's, in metres (default: the mean)")
+    person.add_argument("--height", type=_positive, metavar="M", help="height of the person (default: the mean)")
     person.add_argument("--lens", type=Path, metavar="FILE", help="intrinsics: intri.yml, or a TOML of cameras")
     person.add_argument(
         "--fov", type=_angle, metavar="DEG", help="field of view across the longer side (default: metadata, or found)"
@@ -173,9 +185,11 @@ def _add_study(command: argparse.ArgumentParser, default: str, folder: str) -> N
 
 def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
     _add_study(benchmark, "dynamic", "benchmark")
-    what = "of the study, or presets, instead of all: fast,nerf"
+    what = "methods to compare, of the study or any presets, like fast,nerf (default: the study's)"
     benchmark.add_argument("--methods", type=_names, metavar="LIST", help=what)
-    benchmark.add_argument("--seconds", type=_positive, metavar="S", help="of every training, instead of the study's")
+    benchmark.add_argument(
+        "--seconds", type=_positive, metavar="S", help="limit of every training (default: the study's)"
+    )
 
 
 def _add_ablate(ablations: argparse.ArgumentParser) -> None:
@@ -185,7 +199,7 @@ def _add_ablate(ablations: argparse.ArgumentParser) -> None:
 
 def _add_stability(stability: argparse.ArgumentParser) -> None:
     _add_study(stability, "full", "stability")
-    stability.add_argument("--methods", type=_names, default=[], metavar="LIST", help="presets")
+    stability.add_argument("--methods", type=_names, default=[], metavar="LIST", help="presets (default: the study's)")
     stability.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these degradations of the study")
 
 
@@ -221,12 +235,12 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     view = render.add_mutually_exclusive_group()
     view.add_argument("--camera", help="a recorded camera's name (default: an orbit)")
     view.add_argument("--path", type=Path, help="a JSON list of cameras, or a folder of them, to fly along")
-    render.add_argument("--radius", type=float, metavar="M", help="of the orbit (default: the recorded cameras')")
-    render.add_argument("--height", type=float, metavar="M", help="of the orbit over the person's middle")
-    render.add_argument("--motion", type=Path, metavar="FILE", help=f"{MOTIONS} (default: its own)")
+    render.add_argument("--radius", type=float, metavar="M", help="radius of the orbit (default: the cameras')")
+    render.add_argument("--height", type=float, metavar="M", help="height of the orbit above the person's middle")
+    render.add_argument("--motion", type=Path, metavar="FILE", help=f"show {MOTIONS} (default: the recording's)")
     render.add_argument("--frames", default=":", metavar="A:B:STEP", help="poses to show, or one number (default: all)")
     render.add_argument("--between", type=int, nargs=2, metavar="FRAME", help="interpolate between two frames' poses")
     render.add_argument("--shape", action="append", default=[], metavar="NAME=+X", help="add to a shape value")
     render.add_argument("--volume", type=float, metavar="PERCENT", help="change of the body's volume, like -40 or 80")
     render.add_argument("--size", type=int, metavar="PX", help="longest side of a picture (default: as recorded)")
-    render.add_argument("--pictures", type=int, metavar="N", help="how many (default: one a pose)")
+    render.add_argument("--pictures", type=int, metavar="N", help="number of pictures (default: one a pose)")

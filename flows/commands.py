@@ -30,7 +30,7 @@ def settings(options: argparse.Namespace) -> None:
 
 
 def models(options: argparse.Namespace) -> None:
-    """Fetch the networks that detection and LPIPS use, and three.js for the viewer; needed once."""
+    """Fetch the networks for people, hands and LPIPS, and three.js for the viewer; needed once."""
     from hnerf.models import fetch_models
 
     print(f"networks: {fetch_models()}")
@@ -44,7 +44,7 @@ def demo(options: argparse.Namespace) -> None:
     _train(capture, "demo", DEMO / "store", [])
 
 
-def _train(capture: Path, preset: str, store: Path, overrides: list[str]) -> None:
+def _train(capture: Path | str, preset: str, store: Path, overrides: list[str]) -> None:
     from flows.train_subject import train_subject
 
     trained = train_subject.fn(capture, preset, store, overrides)
@@ -173,14 +173,14 @@ def benchmark(options: argparse.Namespace) -> None:
 
 
 def ablate(options: argparse.Namespace) -> None:
-    """Train without each part of the method in turn: a table."""
+    """Train without each part of the method in turn, and write a table."""
     from flows.ablations import ablate as flow
 
     _show(flow.fn(options.capture, options.preset, options.store, options.overrides, options.only))
 
 
 def stability(options: argparse.Namespace) -> None:
-    """Make a capture worse in many ways: what breaks."""
+    """Make a capture worse in many ways, and report what breaks."""
     from flows.stability import stability as flow
 
     _show(flow.fn(options.capture, options.study, options.store, options.methods, options.only))

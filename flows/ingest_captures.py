@@ -19,7 +19,9 @@ from pydantic import Field
 from flows.restart import DEPLOYMENT, restart_crashed, unfinished_runs
 from hnerf.errors import InputError
 from tasks import quarantine
+from tasks.bucket import is_remote
 from tasks.ledger import Ledger
+from tasks.remote import remote_captures
 from tasks.source import entries, read_capture
 
 DISK_EVENT = "hnerf.disk.nearly-full"  # flows/automations.py tells the operator
@@ -29,7 +31,7 @@ log = logging.getLogger("hnerf.ingest_captures")
 
 @flow(name="ingest-captures")
 def ingest_captures(
-    folder: Path,
+    folder: Path | str,
     preset: str = "fast",
     store: Path = Path("store"),
     settle_s: Annotated[float, Field(ge=0, le=86400)] = 60.0,
@@ -41,10 +43,10 @@ def ingest_captures(
 
     The folder is made if it does not exist. A capture is known by its content: moved, renamed or copied, it is not
     trained again, unless its run found the folder missing. One that cannot be read is noted in
-    `<folder>/.refused/<name>.txt`. Runs that crashed are put back into the queue.
+    `<folder>/.refused/<name>.txt`, unless it is in a bucket. Runs that crashed are put back into the queue.
 
     Args:
-        folder: The folder to watch. Each subfolder is a capture.
+        folder: The folder to watch, or the URL of one in a bucket. Each subfolder is a capture.
         preset: Settings of the runs: a name under configs/, or a YAML file.
         store: Where results are kept.
         settle_s: Seconds since the last change in a folder, before which it counts as still being written.
@@ -53,14 +55,16 @@ def ingest_captures(
         min_free_gib: Nothing more is started while the store's disk has less free space than this, in GiB.
     """
     ledger = Ledger.of(store)
-    folder.mkdir(parents=True, exist_ok=True)
-    quarantine.clear_removed(folder)
+    if not is_remote(folder):
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        quarantine.clear_removed(folder)
     if not _has_room(store, min_free_gib):
         return []
     restart_crashed(max_restarts)
     started: list[str] = []
     room = max_unfinished
-    for capture, listing, digest in _unseen(folder.resolve(), ledger, settle_s):
+    for capture, listing, digest in _unseen(folder, ledger, settle_s):
         if not ledger.knows(digest):
             room = room if started else max_unfinished - unfinished_runs()
             if len(started) >= room:
@@ -71,9 +75,10 @@ def ingest_captures(
             run = run_deployment(DEPLOYMENT, parameters=parameters, timeout=0, as_subflow=False, idempotency_key=key)
             ledger.note_started(digest, capture, run.id)  # type: ignore[union-attr]
             log.info("started %s for %s", DEPLOYMENT, capture)
-            with suppress(OSError):
-                quarantine.clear(capture)
-            started.append(capture.name)
+            if isinstance(capture, Path):
+                with suppress(OSError):
+                    quarantine.clear(capture)
+            started.append(Path(capture).name)
         ledger.note_seen(listing, digest)
     return started
 
@@ -91,10 +96,13 @@ def _has_room(store: Path, min_free_gib: float) -> bool:
     return False
 
 
-def _unseen(folder: Path, ledger: Ledger, settle_s: float) -> Iterator[tuple[Path, str, str]]:
+def _unseen(folder: Path | str, ledger: Ledger, settle_s: float) -> Iterator[tuple[Path | str, str, str]]:
     """Yield the captures of a folder that are complete and were not seen before, with the digests of their listing and
     of their content; note why one cannot be read."""
-    for capture in _captures(folder):
+    if isinstance(folder, str):
+        yield from _unseen_in_bucket(folder, ledger, settle_s)
+        return
+    for capture in _captures(folder.resolve()):
         try:
             listing, touched_s = _listing(capture)
             if touched_s and time.time() - touched_s >= settle_s and not ledger.seen(listing):
@@ -105,6 +113,14 @@ def _unseen(folder: Path, ledger: Ledger, settle_s: float) -> Iterator[tuple[Pat
             log.error("%s", error)
             with suppress(OSError):  # a folder that may only be read
                 quarantine.note(capture, f"refused: {error}")
+
+
+def _unseen_in_bucket(folder: str, ledger: Ledger, settle_s: float) -> Iterator[tuple[str, str, str]]:
+    """Yield the same of captures in a bucket, whose listing stands for their content."""
+    for capture in remote_captures(folder):
+        listing = f"seen-{capture.digest}"
+        if time.time() - capture.changed_s >= settle_s and not ledger.seen(listing):
+            yield capture.url, listing, capture.digest
 
 
 def _captures(folder: Path) -> Iterator[Path]:

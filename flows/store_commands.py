@@ -102,7 +102,7 @@ def export(options: argparse.Namespace) -> None:
 
 
 def import_(options: argparse.Namespace) -> None:
-    """Put such a file into a store; take it only from those whose results you trust."""
+    """Put an archive that `export` wrote into a store; take it only from people whose results you trust."""
     from tasks.archive import import_subject
     from tasks.store import Store
 

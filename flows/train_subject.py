@@ -15,7 +15,7 @@ from hnerf.config import Settings, load_settings
 from hnerf.errors import InputError, InvalidAsset, one_line, printable
 from hnerf.evaluation.holdout import held_out_cameras
 from tasks.asset import export
-from tasks.bucket import BucketError
+from tasks.bucket import BucketError, is_remote
 from tasks.calibration import calibrate, calibrated_capture
 from tasks.capture import ingest, subset_capture
 from tasks.detection import detect, needs_detection
@@ -26,6 +26,7 @@ from tasks.launcher import RankFailedError
 from tasks.ledger import forget, was_started
 from tasks.limits import StalledError, set_limits
 from tasks.quarantine import clear, note
+from tasks.remote import fetched, remote_capture
 from tasks.segmentation import converged, needs_body, segment
 from tasks.source import read_capture
 from tasks.store import Artifact, Store
@@ -54,7 +55,7 @@ class Trained(NamedTuple):
 
 @flow(name="train-subject", flow_run_name="{capture}")
 def train_subject(
-    capture: Path, preset: str = "fast", store: Path = Path("store"), overrides: list[str] | None = None
+    capture: Path | str, preset: str = "fast", store: Path = Path("store"), overrides: list[str] | None = None
 ) -> Trained:
     """Train one person and export the avatar; return where the results are.
 
@@ -62,7 +63,7 @@ def train_subject(
     in turn.
 
     Args:
-        capture: The recording's folder, or one video; relative to the repository.
+        capture: The recording's folder, or one video; relative to the repository, or a folder's URL in a bucket.
         preset: A name under configs/ (fast, demo, paper, ...), or a YAML file.
         store: Where results are kept.
         overrides: Settings that differ from the preset, like training.steps=2000; `hnerf settings` lists all.
@@ -71,14 +72,12 @@ def train_subject(
         return train_avatar(capture, preset, store, overrides or ())
 
 
-def train_avatar(capture: Path, preset: str, store: Path, overrides: Sequence[str]) -> Trained:
+def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Sequence[str]) -> Trained:
     """Run all stages on a capture, and show what came out on the page of the run."""
     settings = load_settings(preset, overrides)
     set_limits(settings.limits)
     artifact_store = Store(store.resolve())
-    if not capture.exists():
-        forget(artifact_store.root, capture)
-    source, truth = read_capture(capture, store)
+    source, truth = read_capture(local_folder(artifact_store, capture), store)
     if settings.evaluation.holdout:
         cameras = recorded_cameras(source.root)
         held_out_cameras(cameras.train, cameras.test, settings.evaluation.holdout)  # refuses before any work is done
@@ -121,6 +120,8 @@ def train_avatar(capture: Path, preset: str, store: Path, overrides: Sequence[st
 @train_subject.on_failure
 def note_failure(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
     """Say why in the folder that is watched, if the capture was started from there."""
+    if is_remote(flow_run.parameters["capture"]):
+        return
     capture, store = Path(flow_run.parameters["capture"]), Path(flow_run.parameters.get("store", "store"))
     error = state.result(raise_on_failure=False)
     if isinstance(error, Exception) and was_started(store, capture):
@@ -133,8 +134,25 @@ def note_failure(flow: object, flow_run: FlowRun, state: State[Trained]) -> None
 @train_subject.on_completion
 def clear_note(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
     """Take back what an earlier run noted."""
-    with suppress(OSError):
-        clear(Path(flow_run.parameters["capture"]))
+    if not is_remote(flow_run.parameters["capture"]):
+        with suppress(OSError):
+            clear(Path(flow_run.parameters["capture"]))
+
+
+def local_folder(store: Store, capture: Path | str) -> Path:
+    """Return a capture's folder or video; what is in a bucket is fetched. One that is missing may be started again from
+    wherever it lies now."""
+    if not is_remote(capture):
+        folder = Path(capture)
+        if not folder.exists():
+            forget(store.root, folder)
+        return folder
+    try:
+        found = remote_capture(str(capture))
+    except InputError:
+        forget(store.root, str(capture))
+        raise
+    return fetched(store, found)
 
 
 def with_detections(store: Store, recorded: Artifact, settings: Settings) -> Artifact:

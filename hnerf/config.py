@@ -221,7 +221,7 @@ class LossSettings(Section):
     eta: float = Field(default=1.0, ge=0)  # weight of the surroundings in blend; 0.25 where floor or furniture is near
     density_threshold: float = Field(default=50.0, gt=0)  # sigma_h, per scene unit
     geometry_roles: GeometryRoles = "surface_leads"  # whether geometry moves the density alone, or both
-    density_steepness: float = Field(default=0.02, gt=0)  # lambda; docs/method.md says why
+    density_steepness: float = Field(default=0.02, gt=0)  # lambda; docs/findings.md, Published networks, says why
 
 
 AnyFieldSettings = (

@@ -6,7 +6,7 @@ Objects must appear whole or not at all, as in object stores; on a local or moun
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from uuid import uuid4
 
@@ -20,8 +20,27 @@ VARIABLE = "HNERF_BUCKET"
 MAX_NOTE_BYTES = 1000
 
 
+@dataclass(frozen=True)
+class RemoteFile:
+    """A file of a bucket. name: relative to a folder; tag: changes with its content; changed_s: since 1970."""
+
+    name: str
+    size_bytes: int
+    tag: str
+    changed_s: float
+
+    def named(self, name: str) -> "RemoteFile":
+        """Return the same file, named relative to another folder."""
+        return replace(self, name=name)
+
+
 class BucketError(ConnectionError):
     """The bucket did not answer as it should; a later try may succeed. The message, one line, says why."""
+
+
+def is_remote(place: Path | str) -> bool:
+    """Return whether a place is a URL."""
+    return isinstance(place, str) and "://" in place
 
 
 @dataclass(frozen=True)
@@ -36,18 +55,22 @@ class Bucket:
     def configured() -> "Bucket | None":
         """Return the bucket that the environment names, None if it names none. Raises InputError if it is not there."""
         url = os.environ.get(VARIABLE, "")
-        return Bucket.at(url) if url else None
+        try:
+            return Bucket.at(url) if url else None
+        except InputError as error:
+            raise InputError(f"{VARIABLE}: {error}") from None
 
     @staticmethod
     def at(url: str) -> "Bucket":
-        """Return the bucket of a URL like s3://bucket/folder or file:///mnt/share, which must be there."""
+        """Return the bucket of a URL like s3://bucket/folder or file:///mnt/share. Raises InputError where it is not
+        there, or nothing opens it."""
         try:
             # Others write here, too: no listing may be remembered.
             fs, root = url_to_fs(url, use_listings_cache=False)
         except ImportError:
-            raise InputError(f"{VARIABLE}: what opens {url} is not installed; for S3, install '.[s3]'") from None
+            raise InputError(f"what opens {url} is not installed; for S3, install '.[s3]'") from None
         except ValueError as error:
-            raise InputError(f"{VARIABLE}: {url}: {one_line(error)}; give a URL like s3://bucket/folder") from None
+            raise InputError(f"{url}: {one_line(error)}; give a URL like s3://bucket/folder") from None
         bucket = Bucket(fs, root.rstrip("/"))
         # What begins with a bucket's name is an object store, where folders need not exist.
         top = bucket.root if bucket.root.startswith("/") else bucket.root.split("/")[0]
@@ -55,7 +78,7 @@ class Bucket:
             try:
                 fs.info(top)
             except FileNotFoundError:
-                raise InputError(f"{VARIABLE}: {url}: {top} is not there; make it, or give another URL") from None
+                raise InputError(f"{url}: {top} is not there; make it, or give another URL") from None
         return bucket
 
     @property
@@ -74,6 +97,17 @@ class Bucket:
                 return int(self.fs.info(self._path(name))["size"])
             except FileNotFoundError:
                 return None
+
+    def files(self, folder: str) -> Iterator[RemoteFile]:
+        """Yield the files below a folder, sorted, without hidden ones; none where there is no such folder."""
+        root = self._path(folder).rstrip("/")
+        with self._answering(folder):
+            found = self.fs.find(root, detail=True)
+        for path, entry in sorted(found.items()):
+            name, changed = path.removeprefix(f"{root}/"), entry.get("LastModified", entry.get("mtime"))
+            changed_s = changed if isinstance(changed, float) else changed.timestamp()
+            if not any(part.startswith(".") for part in name.split("/")):
+                yield RemoteFile(name, int(entry["size"]), str(entry.get("ETag", changed_s)), changed_s)
 
     def download(self, name: str, path: Path) -> None:
         """Write an object into a file."""
@@ -139,4 +173,4 @@ class Bucket:
         except PermissionError as error:
             raise InputError(f"{self.where(name)}: {one_line(error)}; allow this user to read and write it") from error
         except Exception as error:
-            raise BucketError(f"{self.where(name)}: {one_line(error)}; is the bucket away?") from error
+            raise BucketError(f"{self.where(name)}: {one_line(error)}; can the bucket be reached?") from error

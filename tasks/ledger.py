@@ -42,7 +42,7 @@ class Ledger:
         """Note the content of a folder of this listing."""
         replace_text(self.root / listing, digest)
 
-    def note_started(self, digest: str, capture: Path, run: object) -> None:
+    def note_started(self, digest: str, capture: Path | str, run: object) -> None:
         """Note that a capture was started."""
         replace_text(self.root / digest, f"{capture}\n{run}\n")
         (self.root / f"{digest}{LOST}").unlink(missing_ok=True)
@@ -56,10 +56,10 @@ class Ledger:
         return f"{identity.read_text()} {digest} {lost.read_text() if lost.exists() else ''}".strip()
 
 
-def forget(store: Path, capture: Path) -> None:
-    """Free the capture that was started from a folder which is no longer there, so that the next look starts it from
-    wherever it lies now."""
-    missing = str(capture.absolute())
+def forget(store: Path, capture: Path | str) -> None:
+    """Free the capture that was started from a folder or URL where it is no longer, so that the next look starts it
+    from wherever it lies now."""
+    missing = capture if isinstance(capture, str) else str(capture.absolute())
     for record in list(_records(store)):
         folder, _, run = record.read_text().partition("\n")
         if folder == missing:

@@ -35,9 +35,17 @@ class Stage(Generic[P]):
     work through the same store, without a server.
     """
 
-    def __init__(self, write: Write[P], name: str, version: str, resumable: bool, networks: tuple[str, ...] = ()):
+    def __init__(
+        self,
+        write: Write[P],
+        name: str,
+        version: str,
+        resumable: bool,
+        networks: tuple[str, ...] = (),
+        shared: bool = True,
+    ):
         self.write, self.name, self.version, self.resumable = write, name, version, resumable
-        self.networks = networks
+        self.networks, self.shared = networks, shared
         self.task: Task[..., Artifact] = Task(
             fn=self._run,
             name=name,
@@ -74,7 +82,7 @@ class Stage(Generic[P]):
                 self.name, key, lambda out: self._write_in_time(out, given), self.resumable, names
             )
 
-        bucket = Bucket.configured()
+        bucket = Bucket.configured() if self.shared else None
         return get_or_compute(bucket, store, self.name, key, compute) if bucket else compute()
 
     def _write_in_time(self, out: Path, inputs: dict[str, Input]) -> dict[str, float]:
@@ -92,11 +100,12 @@ def image_count(inputs: Iterable[Input]) -> int:
 
 
 def stage(
-    name: str, version: str, resumable: bool = False, networks: tuple[str, ...] = ()
+    name: str, version: str, resumable: bool = False, networks: tuple[str, ...] = (), shared: bool = True
 ) -> Callable[[Write[P]], Stage[P]]:
     """Make a function into a Stage (decorator). Artifacts lie under `<store>/<name>/`; raise `version` when the same
     inputs give another result.
 
     networks: files of hnerf.models that the stage uses if they are installed; the key depends on which ones are.
+    shared: through the bucket, if there is one.
     """
-    return lambda write: Stage(write, name, version, resumable, networks)
+    return lambda write: Stage(write, name, version, resumable, networks, shared)

@@ -11,7 +11,7 @@ def alpha_from_density(density: Float[Tensor, "R K"], spacing: Float[Tensor, "R 
 
 
 def occupancy(signed_distance: Float[Tensor, "*S"], sharpness: Float[Tensor, ""] | float) -> Float[Tensor, "*S"]:
-    """Return alpha_dot = sigmoid(-gamma d_hat): 1 inside (docs/method.md, "The nine losses")."""
+    """Return alpha_dot = sigmoid(-gamma d_hat): 1 inside (docs/method.md, "Rendering and losses")."""
     return torch.sigmoid(-sharpness * signed_distance)
 
 

@@ -1,5 +1,6 @@
-"""The nine losses of H-NeRF (docs/method.md). Sums over rays are means over rays here, so that a batch's size does not
-change the balance; sums over a ray's samples stay sums. The weights in the presets are the paper's in this form.
+"""The losses (docs/method.md): H-NeRF's nine, and three more. Sums over rays are means over rays here, so that a
+batch's size does not change the balance; sums over a ray's samples stay sums. The weights in the presets are the
+paper's in this form.
 """
 
 from dataclasses import dataclass
@@ -60,7 +61,7 @@ def geometry(samples: RaySamples, threshold: float, steepness: float, roles: Geo
     """Return geom: sum_i b_i BCE(sigmoid(lambda (sigma_i - sigma_h)), alpha_dot_i); 0 where the SDF is the density.
 
     roles: "print" takes the density as the label, because the paper's seg has the label first, and moves both; with
-    "surface_leads" the density follows alpha_dot, which gets no gradient (docs/method.md, "The nine losses").
+    "surface_leads" the density follows alpha_dot, which gets no gradient (docs/findings.md, "Published networks").
     """
     if samples.density is None:
         return samples.d.new_zeros(())

@@ -116,11 +116,11 @@ def test_a_bucket_that_is_away_is_one_line_and_exit_code_1(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def train(*_: object) -> None:
-        raise BucketError("s3://x/fit/k.tar: no answer; is the bucket away?")
+        raise BucketError("s3://x/fit/k.tar: no answer; can the bucket be reached?")
 
     monkeypatch.setattr(train_subject, "fn", train)
     assert main(["run", str(tmp_path)]) == 1
-    assert capsys.readouterr().err == "hnerf: s3://x/fit/k.tar: no answer; is the bucket away?\n"
+    assert capsys.readouterr().err == "hnerf: s3://x/fit/k.tar: no answer; can the bucket be reached?\n"
 
 
 def test_cameras_are_not_written_over_the_recordings_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -189,7 +189,7 @@ def test_a_folder_renamed_while_its_run_waits_is_trained_under_its_new_name(
     look(watched)
     (watched / "ada").rename(watched / "eve")
     assert look(watched) == []  # whether that run has begun is not known yet
-    with pytest.raises(InputError, match="ada: no such folder"):
+    with pytest.raises(InputError, match="captures/ada"):
         train_subject.fn(Path(runs[0]["capture"]), "demo", watched.parent / "store")
     assert look(watched) == ["eve"]
     assert runs[-1]["capture"] == str(watched / "eve") and look(watched) == []
@@ -233,3 +233,27 @@ def test_what_could_not_be_started_is_tried_at_the_next_look(
         with pytest.raises(ConnectionError):
             look(watched)
     assert look(watched) == ["ada", "bob"]
+
+
+def test_captures_in_a_bucket_are_started_by_their_url(watched: Path, runs: list[dict[str, Any]]) -> None:
+    """Copies are known, what is still being written waits, and what changes is another capture."""
+    url = f"file://{watched}"
+    assert ingest_captures.fn(url, "demo", watched.parent / "store", 60.0) == []
+    assert ingest_captures.fn(url, "demo", watched.parent / "store", 0.0) == ["ada", "bob"]
+    assert [run["capture"] for run in runs] == [f"{url}/ada", f"{url}/bob"]
+    shutil.copytree(watched / "ada", watched / "copy of ada")  # with the times of its files
+    assert ingest_captures.fn(url, "demo", watched.parent / "store", 0.0) == []
+    (watched / "ada" / "images" / "0.jpg").write_text("more pixels of ada")
+    assert ingest_captures.fn(url, "demo", watched.parent / "store", 0.0) == ["ada"]
+    assert not (watched / ".refused").exists()
+
+
+def test_a_capture_that_left_the_bucket_is_started_from_where_it_lies(
+    watched: Path, runs: list[dict[str, Any]]
+) -> None:
+    url, store = f"file://{watched}", watched.parent / "store"
+    assert ingest_captures.fn(url, "demo", store, 0.0) == ["ada", "bob"]
+    (watched / "ada").rename(watched / "adele")
+    with pytest.raises(InputError, match="captures/ada"):
+        train_subject.fn(f"{url}/ada", "demo", store)
+    assert ingest_captures.fn(url, "demo", store, 0.0) == ["adele"]

@@ -58,6 +58,14 @@ def test_every_stage_is_shown_and_given_what_went_before(folder: Path, tmp_path:
     assert given(subject, "asset") == ["capture", "calibration", "segmentation", "training"]
 
 
+def test_a_capture_in_a_bucket_is_fetched(folder: Path, tmp_path: Path) -> None:
+    (folder / "intri.yml").write_text("cameras")
+    trained = train_subject.fn(f"file://{folder}", "demo", tmp_path / "store", [])
+    assert given(trained.subject, "fit") == ["capture", "calibration", "segmentation"]
+    (fetched,) = (tmp_path / "store" / "fetched").glob("*/ada/intri.yml")
+    assert str(fetched.parent) in (trained.subject / ".recording").read_text()
+
+
 def test_what_was_detected_takes_the_recordings_place(folder: Path, tmp_path: Path) -> None:
     (folder / "undetected").touch()
     subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject

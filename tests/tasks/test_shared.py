@@ -141,7 +141,7 @@ def test_a_result_that_could_not_be_shared_is_not_lost(tmp_path: Path, monkeypat
     bucket, store = disk_bucket(tmp_path), Store(tmp_path / "here")
     with monkeypatch.context() as patch:
         patch.setattr(type(bucket.fs), "put_file", lambda *_: (_ for _ in ()).throw(TimeoutError("too slow")))
-        with pytest.raises(BucketError, match=r"file://.*tar: too slow; is the bucket away\?$"):
+        with pytest.raises(BucketError, match=r"file://.*tar: too slow; can the bucket be reached\?$"):
             made(bucket, store)
     made(bucket, store, never)
     made(bucket, Store(tmp_path / "there"), never)

@@ -1,4 +1,4 @@
-"""Each of the nine losses on two rays with two samples, by hand."""
+"""Each loss on two rays with two samples, by hand."""
 
 import math
 from dataclasses import replace
