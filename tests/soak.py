@@ -2,7 +2,7 @@
 
     python tests/soak.py [--subjects 6] [--kill-every 120] [--out soak.json]
 
-Everything happens in a folder of its own. The workers are machines with separate stores (tests/machines.py), which
+Recordings lie in the bucket; all else happens in a folder of its own. The workers are machines with separate stores (tests/machines.py), which
 share artifacts through moto's server of S3. Kills alternate: the process of a run, with its worker alive; and a machine
 with all that it has started and its disk, in whose place an empty one comes. In the end every recording must have had
 its results, the bucket must hold them, every artifact must have been put there once, stores must verify clean, a third
@@ -41,7 +41,7 @@ evaluation: {max_images: 1, max_meshes: 1, report_rows: 1}
 asset: {grid_cells: 48, faces: 1500, texture_px: 64, texture_poses: 1, photograph_frames: 1, correctives: 0}
 """
 SILENCE_S, LOOK_S, POLL_S = 90, 30, 2.0
-BUCKET = "soak"
+BUCKET, CAPTURES = "soak", "s3://soak/captures"
 RESULTS = {"asset": "avatar.usdz", "evaluation": "report.html"}  # a file that each of these stages writes
 MACHINES = 2
 
@@ -180,7 +180,8 @@ def write_captures(folder: Path, count: int) -> list[str]:
 
 
 def set_up(scratch: Path) -> None:
-    """Make bucket, work pool, deployments, automations, and a schedule that looks into the folder all the time."""
+    """Put the recordings into a new bucket; make work pool, deployments, automations, and a schedule that looks into the
+    bucket all the time."""
     from fsspec import filesystem
     from prefect import get_client
     from prefect.client.schemas.actions import DeploymentScheduleCreate, DeploymentUpdate
@@ -189,11 +190,12 @@ def set_up(scratch: Path) -> None:
     wait_for(f"{os.environ['PREFECT_API_URL']}/health")
     wait_for(os.environ["AWS_ENDPOINT_URL"])
     filesystem("s3").mkdir(BUCKET)
+    filesystem("s3").put(str(scratch / "captures"), CAPTURES, recursive=True)
     run("prefect", "--no-prompt", "work-pool", "create", "local", "--type", "process")
     run("prefect", "--no-prompt", "deploy", "--all")
     run("flows.automations", "--silence", str(SILENCE_S))
-    places = {"folder": scratch / "captures", "store": scratch / "store", "preset": scratch / "preset.yaml"}
-    parameters = {name: str(path) for name, path in places.items()} | {"settle_s": 0, "max_restarts": 20}
+    places = {"folder": CAPTURES, "store": str(scratch / "store"), "preset": str(scratch / "preset.yaml")}
+    parameters = places | {"settle_s": 0, "max_restarts": 20}
     schedule = DeploymentScheduleCreate(schedule=IntervalSchedule(interval=timedelta(seconds=LOOK_S)))
     with get_client(sync_client=True) as client:
         training = client.read_deployment_by_name("train-subject/local")
