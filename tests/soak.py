@@ -2,11 +2,12 @@
 
     python tests/soak.py [--subjects 6] [--kill-every 120] [--out soak.json]
 
-Recordings lie in the bucket; all else happens in a folder of its own. The workers are machines with separate stores (tests/machines.py), which
-share artifacts through moto's server of S3. Kills alternate: the process of a run, with its worker alive; and a machine
-with all that it has started and its disk, in whose place an empty one comes. In the end every recording must have had
-its results, the bucket must hold them, every artifact must have been put there once, stores must verify clean, a third
-machine must get all from the bucket, and no process may be left. The exit status says so.
+Recordings lie in the bucket; all else happens in a folder of its own. The workers are machines with separate stores
+(tests/machines.py), which share artifacts through moto's server of S3. Kills alternate: the process of a run, with its
+worker alive; and a machine with all that it has started and its disk, in whose place an empty one comes. In the end
+every recording must have had its results, the bucket must hold them, every artifact must have been put there once,
+stores must verify clean, a third machine must get all from the bucket, and no process may be left. The exit status says
+so.
 """
 
 import argparse
@@ -180,8 +181,8 @@ def write_captures(folder: Path, count: int) -> list[str]:
 
 
 def set_up(scratch: Path) -> None:
-    """Put the recordings into a new bucket; make work pool, deployments, automations, and a schedule that looks into the
-    bucket all the time."""
+    """Put the recordings into a new bucket; make work pool, deployments, automations, and a schedule that looks there
+    all the time."""
     from fsspec import filesystem
     from prefect import get_client
     from prefect.client.schemas.actions import DeploymentScheduleCreate, DeploymentUpdate
