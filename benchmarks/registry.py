@@ -6,6 +6,7 @@ CALIBRATED = ("valid-walk", "valid-wave")
 RENDERED = (*CALIBRATED, "valid-turn-mono")
 FEW = ("evaluation.max_images=12", "evaluation.max_meshes=3")  # per split, since each takes a quarter of a minute
 
+PAPERS_ROWS = ("mask", "blend", "geometry", "segmentation", "eikonal", "residual", "opt", "root", "noise")
 SMALL = "size_px=128"  # for many images of NeRF, each of which takes 18 s at 256 px
 MOMENT = (SMALL, "train_frames=1", "novel_pose_frames=0")
 LONG_WALK = ("train_frames=40", "novel_pose_frames=24")
@@ -68,11 +69,12 @@ def study(
     return Result(title, command, files, captures, (f"{kind}/{name}", *methods), threads=threads)
 
 
-def ablations(preset: str, *changes: str) -> Result:
-    """Return a study of the method without each part, on valid-wave."""
+def ablations(preset: str, *changes: str, rows: tuple[str, ...] = ()) -> Result:
+    """Return a study of the method without each part, or without those that rows name, on valid-wave."""
     command = ("studies.py", "{store}", "valid-wave", "ablations", preset)
     command += tuple(f"--set={change}" for change in changes)
-    title = f"ablations/valid-wave-{preset}"
+    command += ("--methods", ",".join(f"no-{row}" for row in rows)) if rows else ()
+    title = f"ablations/valid-wave-{preset}{'-part' if rows else ''}"
     return Result(title, command, (f"{title}.*",), ("valid-wave",), (preset, "ablations/*"))
 
 
@@ -96,7 +98,9 @@ REGISTRY = (
     study("stability", "brief", "fast"),
     study("stability", "seeds", "fast"),
     ablations("fast"),
-    ablations("paper-small", "training.steps=200", "capture.max_side_px=128", "evaluation.max_images=4"),
+    ablations(
+        "paper-small", "training.steps=200", "capture.max_side_px=128", "evaluation.max_images=4", rows=PAPERS_ROWS
+    ),
     study("benchmark", "static", "fast", "paper-small", "nerf", "idr"),
     study("benchmark", "dynamic", "fast", "neural-body", "nerfies"),
     study("benchmark", "frames", "fast", "neural-body", seconds=120),
