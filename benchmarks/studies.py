@@ -58,14 +58,14 @@ def main() -> None:
 
 
 def capture_folder(name: str, synth: list[str], store: Path) -> Path:
-    """Return the folder of a capture; the performer's is written if it is not there."""
+    """Return the folder of a capture; the performer's is written."""
     if name != "performer":
         shared = SHARED / "data" / name
         return shared if shared.is_dir() else Path(name)
     folder = store / "synthetic" / ",".join(["performer", *synth])
-    if not folder.exists():
-        with atomic_folder(folder) as partial:
-            write_synthetic_capture(partial, overridden(SyntheticSettings(), synth))
+    shutil.rmtree(folder, ignore_errors=True)  # written by other code, perhaps
+    with atomic_folder(folder) as partial:
+        write_synthetic_capture(partial, overridden(SyntheticSettings(), synth))
     return folder
 
 

@@ -68,8 +68,7 @@ def _existing(options: argparse.Namespace) -> list[Path]:
     """Return the folders that a command reads; InputError for what is wrong without the imports that take seconds."""
     if "preset" in options:
         load_settings(options.preset, getattr(options, "overrides", ()))
-    given = {what: getattr(options, name) for name, what in FOLDERS.items() if name in options}
-    given = {what: place for what, place in given.items() if isinstance(place, Path)}
+    given = {what: place for name, what in FOLDERS.items() if isinstance(place := getattr(options, name, None), Path)}
     for what, folder in given.items():
         if not (folder.is_dir() or (what == FOLDERS["capture"] and folder.is_file())):
             raise InputError(f"{folder}: no such folder; give {what}")

@@ -19,9 +19,8 @@ from pydantic import Field
 from flows.restart import DEPLOYMENT, restart_crashed, unfinished_runs
 from hnerf.errors import InputError
 from tasks import quarantine
-from tasks.bucket import is_remote
 from tasks.ledger import Ledger
-from tasks.remote import remote_captures
+from tasks.remote import is_remote, local, remote_captures
 from tasks.source import entries, read_capture
 
 DISK_EVENT = "hnerf.disk.nearly-full"  # flows/automations.py tells the operator
@@ -42,21 +41,23 @@ def ingest_captures(
     """Start `train-subject` once for every capture in the subfolders of a folder; return those started now.
 
     The folder is made if it does not exist. A capture is known by its content: moved, renamed or copied, it is not
-    trained again, unless its run found the folder missing. One that cannot be read is noted in
-    `<folder>/.refused/<name>.txt`, unless it is in a bucket. Runs that crashed are put back into the queue.
+    trained again, unless its run found the folder missing. In a bucket, names, sizes and ETags stand for content. One
+    that cannot be read is noted in `<folder>/.refused/<name>.txt`, unless it is in a bucket. Runs that crashed are put
+    back into the queue.
 
     Args:
         folder: The folder to watch, or the URL of one in a bucket. Each subfolder is a capture.
         preset: Settings of the runs: a name under configs/, or a YAML file.
         store: Where results are kept.
-        settle_s: Seconds since the last change in a folder, before which it counts as still being written.
+        settle_s: Seconds since the last change in a folder, before which it counts as still being written; in a bucket,
+            more than the upload of its largest file takes.
         max_unfinished: Nothing more is started while this many runs have not ended.
         max_restarts: How often a run is begun again whose process or machine was lost.
         min_free_gib: Nothing more is started while the store's disk has less free space than this, in GiB.
     """
     ledger = Ledger.of(store)
     if not is_remote(folder):
-        folder = Path(folder)
+        folder = local(folder)
         folder.mkdir(parents=True, exist_ok=True)
         quarantine.clear_removed(folder)
     if not _has_room(store, min_free_gib):
@@ -119,7 +120,7 @@ def _unseen_in_bucket(folder: str, ledger: Ledger, settle_s: float) -> Iterator[
     """Yield the same of captures in a bucket, whose listing stands for their content."""
     for capture in remote_captures(folder):
         listing = f"seen-{capture.digest}"
-        if time.time() - capture.changed_s >= settle_s and not ledger.seen(listing):
+        if not ledger.seen(listing) and ledger.stood_s(listing) >= settle_s:
             yield capture.url, listing, capture.digest
 
 

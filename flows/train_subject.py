@@ -15,7 +15,7 @@ from hnerf.config import Settings, load_settings
 from hnerf.errors import InputError, InvalidAsset, one_line, printable
 from hnerf.evaluation.holdout import held_out_cameras
 from tasks.asset import export
-from tasks.bucket import BucketError, is_remote
+from tasks.bucket import BucketError
 from tasks.calibration import calibrate, calibrated_capture
 from tasks.capture import ingest, subset_capture
 from tasks.detection import detect, needs_detection
@@ -26,7 +26,7 @@ from tasks.launcher import RankFailedError
 from tasks.ledger import forget, was_started
 from tasks.limits import StalledError, set_limits
 from tasks.quarantine import clear, note
-from tasks.remote import fetched, remote_capture
+from tasks.remote import NothingThereError, fetched, is_remote, local, remote_capture
 from tasks.segmentation import converged, needs_body, segment
 from tasks.source import read_capture
 from tasks.store import Artifact, Store
@@ -84,7 +84,7 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
 
     recorded = ingest(artifact_store, source, settings.capture)
     subject = Capture.load(recorded.root).name
-    artifact_store.claim(subject, source.digest, source.root)
+    artifact_store.claim(subject, source.digest, capture if is_remote(capture) else source.root)
     artifact_store.link_latest(subject, recorded)
     recording = artifact_store.link_latest(subject, with_detections(artifact_store, recorded, settings))
     calibration = artifact_store.link_latest(subject, calibrate(artifact_store, recording, settings.calibration))
@@ -122,7 +122,7 @@ def note_failure(flow: object, flow_run: FlowRun, state: State[Trained]) -> None
     """Say why in the folder that is watched, if the capture was started from there."""
     if is_remote(flow_run.parameters["capture"]):
         return
-    capture, store = Path(flow_run.parameters["capture"]), Path(flow_run.parameters.get("store", "store"))
+    capture, store = local(flow_run.parameters["capture"]), Path(flow_run.parameters.get("store", "store"))
     error = state.result(raise_on_failure=False)
     if isinstance(error, Exception) and was_started(store, capture):
         kind = "refused" if isinstance(error, InputError) else "failed"
@@ -136,20 +136,20 @@ def clear_note(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
     """Take back what an earlier run noted."""
     if not is_remote(flow_run.parameters["capture"]):
         with suppress(OSError):
-            clear(Path(flow_run.parameters["capture"]))
+            clear(local(flow_run.parameters["capture"]))
 
 
 def local_folder(store: Store, capture: Path | str) -> Path:
-    """Return a capture's folder or video; what is in a bucket is fetched. One that is missing may be started again from
-    wherever it lies now."""
+    """Return a capture's folder or video; what is in a bucket is fetched. One that cannot be found may be started again
+    from wherever it lies now."""
     if not is_remote(capture):
-        folder = Path(capture)
+        folder = local(capture)
         if not folder.exists():
             forget(store.root, folder)
         return folder
     try:
         found = remote_capture(str(capture))
-    except InputError:
+    except (NothingThereError, BucketError):
         forget(store.root, str(capture))
         raise
     return fetched(store, found)

@@ -6,15 +6,18 @@ Objects must appear whole or not at all, as in object stores; on a local or moun
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import urlsplit
 from uuid import uuid4
 
 from fsspec import AbstractFileSystem
+from fsspec.callbacks import Callback
 from fsspec.core import url_to_fs
 from fsspec.implementations.local import LocalFileSystem
 
 from hnerf.errors import InputError, one_line
+from hnerf.progress import report
 
 VARIABLE = "HNERF_BUCKET"
 MAX_NOTE_BYTES = 1000
@@ -22,25 +25,15 @@ MAX_NOTE_BYTES = 1000
 
 @dataclass(frozen=True)
 class RemoteFile:
-    """A file of a bucket. name: relative to a folder; tag: changes with its content; changed_s: since 1970."""
+    """A file of a bucket. name: relative to a folder; tag: changes with its content."""
 
     name: str
     size_bytes: int
     tag: str
-    changed_s: float
-
-    def named(self, name: str) -> "RemoteFile":
-        """Return the same file, named relative to another folder."""
-        return replace(self, name=name)
 
 
 class BucketError(ConnectionError):
     """The bucket did not answer as it should; a later try may succeed. The message, one line, says why."""
-
-
-def is_remote(place: Path | str) -> bool:
-    """Return whether a place is a URL."""
-    return isinstance(place, str) and "://" in place
 
 
 @dataclass(frozen=True)
@@ -64,6 +57,8 @@ class Bucket:
     def at(url: str) -> "Bucket":
         """Return the bucket of a URL like s3://bucket/folder or file:///mnt/share. Raises InputError where it is not
         there, or nothing opens it."""
+        if urlsplit(url).password or "::" in url:
+            raise InputError("a URL with a password or `::` is refused; give keys by the environment")
         try:
             # Others write here, too: no listing may be remembered.
             fs, root = url_to_fs(url, use_listings_cache=False)
@@ -98,21 +93,31 @@ class Bucket:
             except FileNotFoundError:
                 return None
 
+    def folders(self) -> list[str]:
+        """Return the names of the folders at the top, sorted, without hidden ones."""
+        with self._answering(""):
+            entries = self.fs.ls(self.root, detail=True)
+        names = {one["name"].rstrip("/").removeprefix(f"{self.root}/") for one in entries if one["type"] == "directory"}
+        return sorted(name for name in names if _is_visible(name))
+
     def files(self, folder: str) -> Iterator[RemoteFile]:
-        """Yield the files below a folder, sorted, without hidden ones; none where there is no such folder."""
+        """Yield the files below a folder of an object store, sorted, without hidden ones and markers of folders; none
+        where there is no such folder. Raises InputError where the file system knows no ETags."""
         root = self._path(folder).rstrip("/")
         with self._answering(folder):
             found = self.fs.find(root, detail=True)
         for path, entry in sorted(found.items()):
-            name, changed = path.removeprefix(f"{root}/"), entry.get("LastModified", entry.get("mtime"))
-            changed_s = changed if isinstance(changed, float) else changed.timestamp()
-            if not any(part.startswith(".") for part in name.split("/")):
-                yield RemoteFile(name, int(entry["size"]), str(entry.get("ETag", changed_s)), changed_s)
+            name = path.removeprefix(f"{root}/")
+            if path.startswith(f"{root}/") and _is_visible(name):
+                if "ETag" not in entry:
+                    raise InputError(f"{self.where(name)}: has no ETag; put captures into a bucket of S3")
+                yield RemoteFile(name, int(entry["size"]), entry["ETag"])
 
     def download(self, name: str, path: Path) -> None:
         """Write an object into a file."""
+        progress = Callback(hooks={"": lambda size_bytes, done_bytes: report(name, done_bytes, max(size_bytes, 1))})
         with self._answering(name):
-            self.fs.get_file(self._path(name), str(path))
+            self.fs.get_file(self._path(name), str(path), callback=progress)
 
     def upload(self, path: Path, name: str) -> None:
         """Make or replace an object with a file's bytes."""
@@ -174,3 +179,7 @@ class Bucket:
             raise InputError(f"{self.where(name)}: {one_line(error)}; allow this user to read and write it") from error
         except Exception as error:
             raise BucketError(f"{self.where(name)}: {one_line(error)}; can the bucket be reached?") from error
+
+
+def _is_visible(name: str) -> bool:
+    return all(part and not part.startswith(".") for part in name.split("/"))

@@ -3,9 +3,11 @@
 <store>/ingested/<digest>         the folder and the flow run of a capture that was started
 <store>/ingested/<digest>.lost    the flow run that found its folder missing; the capture may be started again
 <store>/ingested/seen-<listing>   the digest of a folder with these names, sizes and times, which need not be read
+<store>/ingested/new-<listing>    a listing in a bucket that is not started yet, since when it has been the same
 <store>/ingested/id               random: the same key in another ledger is another run
 """
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,9 +40,17 @@ class Ledger:
         path = self.root / listing
         return path.exists() and self.knows(path.read_text().strip() or "none")
 
+    def stood_s(self, listing: str) -> float:
+        """Return for how long a listing has been the same, by this machine's clock: 0 when it is asked about first."""
+        path = self.root / f"new-{listing}"
+        if not path.exists():
+            replace_text(path, "")
+        return time.time() - path.stat().st_mtime
+
     def note_seen(self, listing: str, digest: str) -> None:
         """Note the content of a folder of this listing."""
         replace_text(self.root / listing, digest)
+        (self.root / f"new-{listing}").unlink(missing_ok=True)
 
     def note_started(self, digest: str, capture: Path | str, run: object) -> None:
         """Note that a capture was started."""

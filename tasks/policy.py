@@ -22,7 +22,7 @@ from tasks.store import Artifact, Store, sha256_of
 PERMANENT_ERRORS = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 PERMANENT_ERRNOS = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTEMPTY)  # without an exception class
 
-Input = Artifact | Source | Section | tuple[str, ...] | tuple[int, ...] | tuple[Artifact, ...] | None
+Input = Artifact | Source | Section | str | tuple[str, ...] | tuple[int, ...] | tuple[Artifact, ...] | None
 
 
 def stage_key(task: str, version: str, inputs: dict[str, Input]) -> str:
@@ -39,7 +39,7 @@ def artifacts_among(inputs: Iterable[Input]) -> list[Artifact]:
     return [one for one in flat if isinstance(one, Artifact)]
 
 
-def _key_value(value: Input | str | int) -> Any:
+def _key_value(value: Input | int) -> Any:
     if isinstance(value, tuple):
         return [_key_value(one) for one in value]
     if value is None or isinstance(value, str | int):

@@ -169,7 +169,7 @@ class Store:
         os.replace(beside, link)
         return artifact
 
-    def claim(self, subject: str, digest: str, folder: Path) -> None:
+    def claim(self, subject: str, digest: str, folder: Path | str) -> None:
         """Note which recording the results under a subject's name are of; warn if until now they were of another, in
         another folder: two recordings of one name replace each other's results."""
         path, claimed = self.subject_folder(subject) / RECORDING, f"{digest}\n{folder}\n"

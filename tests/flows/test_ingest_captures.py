@@ -6,12 +6,14 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fsspec import filesystem
 
 from flows import ingest_captures as module
 from flows.ingest_captures import ingest_captures
 from flows.train_subject import train_subject
 from hnerf.errors import InputError
 from tasks import quarantine
+from tasks.bucket import Bucket
 from tasks.source import read_capture
 
 
@@ -235,25 +237,54 @@ def test_what_could_not_be_started_is_tried_at_the_next_look(
     assert look(watched) == ["ada", "bob"]
 
 
-def test_captures_in_a_bucket_are_started_by_their_url(watched: Path, runs: list[dict[str, Any]]) -> None:
-    """Copies are known, what is still being written waits, and what changes is another capture."""
-    url = f"file://{watched}"
-    assert ingest_captures.fn(url, "demo", watched.parent / "store", 60.0) == []
-    assert ingest_captures.fn(url, "demo", watched.parent / "store", 0.0) == ["ada", "bob"]
-    assert [run["capture"] for run in runs] == [f"{url}/ada", f"{url}/bob"]
-    shutil.copytree(watched / "ada", watched / "copy of ada")  # with the times of its files
-    assert ingest_captures.fn(url, "demo", watched.parent / "store", 0.0) == []
-    (watched / "ada" / "images" / "0.jpg").write_text("more pixels of ada")
-    assert ingest_captures.fn(url, "demo", watched.parent / "store", 0.0) == ["ada"]
-    assert not (watched / ".refused").exists()
+@pytest.fixture
+def bucket(s3: str, tmp_path: Path) -> str:
+    """URL of a folder with the captures ada and bob."""
+    url = f"{s3}-{tmp_path.name}"
+    for name in ("ada", "bob"):
+        filesystem("s3").pipe(f"{url}/{name}/a.mp4", name.encode())
+    return url
+
+
+def test_captures_in_a_bucket_are_started_by_their_url(bucket: str, tmp_path: Path, runs: list[dict[str, Any]]) -> None:
+    """A listing must stand still before it is started. Copies are known, and what changes is another capture."""
+    fs, store = filesystem("s3"), tmp_path / "store"
+    assert ingest_captures.fn(bucket, "demo", store, 60.0) == []
+    (waiting, _) = (store / "ingested").glob("new-*")
+    os.utime(waiting, (time.time() - 61,) * 2)
+    assert len(ingest_captures.fn(bucket, "demo", store, 60.0)) == 1
+    assert ingest_captures.fn(bucket, "demo", store, 0.0) == [
+        {"ada": "bob", "bob": "ada"}[Path(runs[0]["capture"]).name]
+    ]
+    assert {run["capture"] for run in runs} == {f"{bucket}/ada", f"{bucket}/bob"}
+    assert not list((store / "ingested").glob("new-*"))
+    fs.copy(f"{bucket}/ada/a.mp4", f"{bucket}/copy of ada/a.mp4")
+    assert ingest_captures.fn(bucket, "demo", store, 0.0) == []
+    fs.pipe(f"{bucket}/ada/a.mp4", b"eve")
+    assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["ada"]
 
 
 def test_a_capture_that_left_the_bucket_is_started_from_where_it_lies(
-    watched: Path, runs: list[dict[str, Any]]
+    bucket: str, tmp_path: Path, runs: list[dict[str, Any]]
 ) -> None:
-    url, store = f"file://{watched}", watched.parent / "store"
-    assert ingest_captures.fn(url, "demo", store, 0.0) == ["ada", "bob"]
-    (watched / "ada").rename(watched / "adele")
-    with pytest.raises(InputError, match="captures/ada"):
-        train_subject.fn(f"{url}/ada", "demo", store)
-    assert ingest_captures.fn(url, "demo", store, 0.0) == ["adele"]
+    store = tmp_path / "store"
+    assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["ada", "bob"]
+    filesystem("s3").mv(f"{bucket}/ada/a.mp4", f"{bucket}/adele/a.mp4")
+    with pytest.raises(InputError, match="ada: no such folder"):
+        train_subject.fn(f"{bucket}/ada", "demo", store)
+    assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["adele"]
+
+
+def test_a_worker_that_is_not_let_in_does_not_start_a_capture_again(
+    bucket: str, tmp_path: Path, runs: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = tmp_path / "store"
+    assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["ada", "bob"]
+
+    def refuse(*_: Any) -> None:
+        raise InputError("403")
+
+    with monkeypatch.context() as patch, pytest.raises(InputError, match="403"):
+        patch.setattr(Bucket, "files", refuse)
+        train_subject.fn(f"{bucket}/ada", "demo", store)
+    assert ingest_captures.fn(bucket, "demo", store, 0.0) == []

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fsspec import filesystem
 
 from flows import train_subject as module
 from flows.train_subject import train_subject
@@ -58,12 +59,13 @@ def test_every_stage_is_shown_and_given_what_went_before(folder: Path, tmp_path:
     assert given(subject, "asset") == ["capture", "calibration", "segmentation", "training"]
 
 
-def test_a_capture_in_a_bucket_is_fetched(folder: Path, tmp_path: Path) -> None:
-    (folder / "intri.yml").write_text("cameras")
-    trained = train_subject.fn(f"file://{folder}", "demo", tmp_path / "store", [])
+def test_a_capture_in_a_bucket_is_fetched(folder: Path, s3: str, tmp_path: Path) -> None:
+    url = f"{s3}-{tmp_path.name}/ada"
+    filesystem("s3").pipe(f"{url}/intri.yml", b"cameras")
+    trained = train_subject.fn(url, "demo", tmp_path / "store", [])
     assert given(trained.subject, "fit") == ["capture", "calibration", "segmentation"]
-    (fetched,) = (tmp_path / "store" / "fetched").glob("*/ada/intri.yml")
-    assert str(fetched.parent) in (trained.subject / ".recording").read_text()
+    assert [path.read_text() for path in (tmp_path / "store" / "fetched").glob("*/ada/intri.yml")] == ["cameras"]
+    assert (trained.subject / ".recording").read_text().splitlines()[1] == url
 
 
 def test_what_was_detected_takes_the_recordings_place(folder: Path, tmp_path: Path) -> None:

@@ -1,28 +1,30 @@
 from pathlib import Path
+from typing import Any
 
-import fsspec
 import pytest
+from fsspec import filesystem
 
 from hnerf.errors import InputError
-from tasks.remote import fetched, remote_capture, remote_captures
+from tasks import remote
+from tasks.bucket import Bucket
+from tasks.remote import NothingThereError, fetched, is_remote, local, remote_capture, remote_captures
 from tasks.store import Store
 
 
-@pytest.fixture(params=["file", "s3"])
-def captures(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+@pytest.fixture
+def captures(s3: str, tmp_path: Path) -> str:
     """URL of a folder with the captures ada and bob, and what does not belong to any."""
-    if request.param == "file":
-        url = f"file://{tmp_path}/captures"
-    else:
-        url = f"{request.getfixturevalue('s3')}-{tmp_path.name}"
+    url = f"{s3}-{tmp_path.name}"
     for name in ("ada/intri.yml", "ada/images/01/0.jpg", "bob/a.mp4", "bob/.hidden", "ada/.part/0.jpg", "note.txt"):
         write(f"{url}/{name}", name)
+    for marker in ("", "ada/", "ada/images/", "empty/", "/stray.txt", "ada//intri.yml", "ada/../up.txt"):
+        write(f"{url}/{marker}", "")
     return url
 
 
 def write(url: str, text: str) -> None:
-    with fsspec.open(url, "w", auto_mkdir=True) as file:
-        file.write(text)
+    bucket, _, key = url.removeprefix("s3://").partition("/")
+    filesystem("s3").call_s3("put_object", Bucket=bucket, Key=key, Body=text.encode())
 
 
 def test_captures_are_the_folders_and_their_files_are_fetched_once(captures: str, tmp_path: Path) -> None:
@@ -40,27 +42,68 @@ def test_captures_are_the_folders_and_their_files_are_fetched_once(captures: str
     assert fetched(store, remote_capture(f"{captures}/ada/")).stat().st_ino == inode
 
 
-def test_what_changes_is_another_capture_and_is_not_fetched_as_the_first(captures: str, tmp_path: Path) -> None:
+def test_what_changes_is_another_capture_even_at_the_same_size(captures: str, tmp_path: Path) -> None:
     before = remote_capture(f"{captures}/bob")
-    write(f"{captures}/bob/a.mp4", "another, longer")
+    write(f"{captures}/bob/a.mp4", "BOB/A.MP4")
     after = remote_capture(f"{captures}/bob")
     assert after.digest != before.digest
-    assert after.changed_s >= before.changed_s > 1.7e9
     with pytest.raises(InputError, match="bob: has changed since it was listed; give the same command again"):
         fetched(Store(tmp_path / "store"), before)
-    assert (fetched(Store(tmp_path / "store"), after) / "a.mp4").read_text() == "another, longer"
+    assert (fetched(Store(tmp_path / "store"), after) / "a.mp4").read_text() == "BOB/A.MP4"
 
 
-def test_where_nothing_is_there_is_no_capture(captures: str) -> None:
-    with pytest.raises(InputError, match=r"nobody: (no such folder|.* is not there)"):
-        remote_capture(f"{captures}/nobody")
+@pytest.mark.parametrize("change", ["replaced", "removed"])
+def test_what_changes_while_it_is_fetched_is_refused(
+    captures: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str
+) -> None:
+    bob = remote_capture(f"{captures}/bob")
+    download = Bucket.download
+
+    def meanwhile(bucket: Bucket, *given: Any) -> None:
+        if change == "removed":
+            filesystem("s3").rm(f"{captures}/bob/a.mp4")
+        else:
+            write(f"{captures}/bob/a.mp4", "BOB/A.MP4")
+        download(bucket, *given)
+
+    monkeypatch.setattr(Bucket, "download", meanwhile)
+    with pytest.raises(InputError, match=r"bob: (has changed since it was listed|no such folder)"):
+        fetched(Store(tmp_path / "store"), bob)
+    assert not list((tmp_path / "store" / "fetched").glob("*.json"))
 
 
-def test_a_name_never_leads_out_of_the_store(captures: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ada = remote_capture(f"{captures}/ada")
-    out = ada.files[0].named("images/../../../out.jpg")
-    monkeypatch.setattr("tasks.bucket.Bucket.files", lambda *_: iter([out]))
-    with pytest.raises(InputError, match=r"'images/\.\./\.\./\.\./out\.jpg' cannot be the name of a file; rename it"):
+@pytest.mark.parametrize("url", ["nobody", "ada/..", "bob/a.mp4", "ada?versionId=1", "empty"])
+def test_where_no_folder_is_there_is_no_capture(captures: str, url: str) -> None:
+    with pytest.raises(NothingThereError, match="no such folder; give the capture's folder"):
+        remote_capture(f"{captures}/{url}")
+
+
+def test_a_file_that_is_also_a_folder_is_refused(captures: str, tmp_path: Path) -> None:
+    write(f"{captures}/ada/images", "a file")
+    with pytest.raises(InputError, match=r"ada/images/01/0\.jpg: is both a file and a folder; rename one"):
         fetched(Store(tmp_path / "store"), remote_capture(f"{captures}/ada"))
-    assert not list(tmp_path.rglob("out.jpg"))
-    assert [path.suffix for path in (tmp_path / "store" / "fetched").iterdir()] == [".lock"]
+
+
+@pytest.mark.parametrize("url", ["ftp://user:secret@host/captures/ada", "s3://tests/a::b"])
+def test_urls_that_would_be_misread_or_tell_a_password_are_refused(url: str) -> None:
+    with pytest.raises(InputError, match=r"^a URL with a password or `::` is refused") as refused:
+        remote_capture(url)
+    assert "secret" not in str(refused.value)
+
+
+def test_a_file_system_without_etags_is_refused(tmp_path: Path) -> None:
+    filesystem("memory").pipe("/bare/ada/a.mp4", b"1")
+    with pytest.raises(InputError, match="has no ETag; put captures into a bucket of S3"):
+        list(remote_captures("memory://bare"))
+
+
+def test_what_is_on_a_disk_is_a_path() -> None:
+    assert [is_remote(place) for place in ("s3://b/ada", "file:///ada", "ada", Path("ada"))] == [True, *[False] * 3]
+    assert [local(place) for place in ("file:///ada", "ada", Path("ada"))] == [Path("/ada"), Path("ada"), Path("ada")]
+
+
+def test_a_long_download_reports_how_far_it_is(captures: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[str, float, float]] = []
+    monkeypatch.setattr("tasks.bucket.report", lambda *given: seen.append(given))
+    remote.fetched(Store(tmp_path / "store"), remote_capture(f"{captures}/bob"))
+    assert seen[-1] == ("a.mp4", 9, 9)
