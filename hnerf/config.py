@@ -256,6 +256,12 @@ class TrainingSettings(Section):
             raise ValueError(f"{self.field.kind} does not tune poses: set pose_learning_rate to 0")
         return self
 
+    @model_validator(mode="after")
+    def _fog_needs_a_background(self) -> Self:
+        if self.losses.fog and self.field.kind != "paper":
+            raise ValueError(f"{self.field.kind} does not model the background: set losses.fog to 0")
+        return self
+
 
 class EvaluationSettings(Section):
     """Settings of the evaluation and its report."""

@@ -46,6 +46,7 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("asset: {texture_px: -1}", "asset.texture_px"),
         ("asset: {texture_poses: 0}", "asset.texture_poses"),
         ("training: {field: {kind: nerf}}", "training: Value error, nerf does not tune poses"),
+        ("training: {losses: {fog: 0.1}}", "training: Value error, fast does not model the background"),
     ],
 )
 def test_what_is_not_allowed_is_refused_by_file_and_key(tmp_path: Path, text: str, named: str) -> None:

@@ -54,6 +54,8 @@ def test_fog():
     """C~ of ray 1, which passes beside the person, is (0, 0.2, 0) in the box, black where its fog is outside."""
     assert losses.fog(replace(SAMPLES, in_box=torch.ones(2, 2)), TARGET).item() == pytest.approx(0.2 / 2)
     assert losses.fog(SAMPLES, TARGET).item() == 0
+    left_out = replace(TARGET, weight=torch.tensor([1.0, 0.0]))
+    assert losses.fog(replace(SAMPLES, in_box=torch.ones(2, 2)), left_out).item() == 0
 
 
 def test_blend():

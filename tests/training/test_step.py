@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from hnerf.body.canonical import PoseCorrection
-from hnerf.config import LossSettings, TrainingSettings
+from hnerf.config import LossSettings, PaperFieldSettings, TrainingSettings
 from hnerf.fields.conditions import Draws
 from hnerf.fields.rays import PosedScene
 from hnerf.training import losses
@@ -107,7 +107,7 @@ def test_fog_is_asked_about_the_box() -> None:
     field.sample = lambda *inputs: (dataclasses.replace(SAMPLES, in_box=torch.ones(2, 2)), None)
     none, scene = torch.zeros(2, 3), PosedScene(None, None, None)
     rays = PixelRays(none, none, none, TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)
-    settings = TrainingSettings(losses=LossSettings(fog=31))
+    settings = TrainingSettings(field=PaperFieldSettings(), losses=LossSettings(fog=31))
     terms = Objective(field, PoseCorrection(2, 0, 2), settings)(scene, rays, Draws(none, none, none))
     assert terms["fog"].item() == pytest.approx(31 * 0.1)
 
