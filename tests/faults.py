@@ -139,8 +139,8 @@ FAULTS = (
     # the losses
     Fault("reconstruction-weight", LOSSES, "(target.weight * (target.colour", "((target.colour", BY_LOSSES),
     Fault("mask-swapped", LOSSES, "target.person * error", "(1 - target.person) * error", BY_LOSSES),
-    Fault("mask-box", LOSSES, "pixel_colour(samples.in_box * samples.alpha, samples)",
-          "pixel_colour(samples.alpha, samples)", BY_LOSSES),
+    Fault("mask-box", LOSSES, "target.colour - pixel_colour(samples.in_box * samples.alpha, samples)",
+          "target.colour - pixel_colour(samples.alpha, samples)", BY_LOSSES),
     Fault("blend-eta", LOSSES, "eta * (1 - target.person)", "(1 - target.person)", BY_LOSSES),
     Fault("blend-outside", LOSSES, " + (1 - samples.in_box) * samples.alpha", "", BY_LOSSES),
     Fault("paper-box-samples", PAPER, "stratified(entry, leave, ", "stratified(near, far, ", BY_PAPER),

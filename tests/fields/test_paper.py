@@ -212,7 +212,8 @@ def test_distances_are_in_scene_units_and_their_gradient_in_metres(
 def test_each_loss_of_a_ray() -> None:
     """The ray is on the person, who is white; F paints B white and all else black. Before B half of the light is lost
     1.2 times, in it 1.7 times: 2^-1.2 - 2^-2.9 of C, 1 - 2^-1.7 of C~ is white. d_hat is .045, -.005 and -.005: of C^,
-    2^-1.2 comes through to alpha_dot sigmoid(-9), sigmoid(1), sigmoid(1). Weights are the paper's."""
+    2^-1.2 comes through to alpha_dot sigmoid(-9), sigmoid(1), sigmoid(1). Weights are the
+    paper's, and there is no fog beside the person."""
     field, (standing, conditions) = field_of(), bodies()
     field.radiance = Fog(lambda point: (point[:, 3:] != 1).float().expand(-1, 3))
     correction = standing.correction()
@@ -230,6 +231,7 @@ def test_each_loss_of_a_ray() -> None:
     expected = {
         "reconstruction": 3 * (1 - (2**-1.2 - 2**-2.9)),
         "mask": 3 * 2**-1.7,
+        "fog": 0.0,
         "blend": 0.1 * 3 * (1 - 2**-1.2 * (1 - sigmoid(9) * sigmoid(-1) ** 2)),
         "geometry": 0.02 * sum(crossed),
         "segmentation": 0.02 * -math.log(sigmoid(200 * 0.005)),

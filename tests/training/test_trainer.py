@@ -99,7 +99,7 @@ def test_overfits_the_column(tmp_path: Path):
     assert drawn.depth_m[mask].mean().item() == pytest.approx(3.6, abs=0.4)
 
 
-def test_the_paper_learns_by_all_nine_losses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_paper_learns_by_its_nine_losses_and_fog(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """With the preset's weights, on the same batch repeatedly, so that random batches do not hide what is learned."""
     losses = load_settings("paper").training.losses
     settings = tiny(field={"kind": "paper", "samples": 16}, losses=losses, steps=15, novel_pose_steps=0)
@@ -113,7 +113,7 @@ def test_the_paper_learns_by_all_nine_losses(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(trainer_module, "WARM_UP_STEPS", 1)
     trainer.run()
     first, last = (trainer.history[k]["losses"] for k in (0, -1))
-    colour, shape = {"reconstruction", "mask", "blend"}, {"geometry", "segmentation", "eikonal"}
+    colour, shape = {"reconstruction", "mask", "fog", "blend"}, {"geometry", "segmentation", "eikonal"}
     assert first.keys() == last.keys() == colour | shape | {"residual", "fit", "increment"}
     assert all(math.isfinite(value) and value > 0 for value in last.values())
     assert sum(last.values()) < 0.95 * sum(first.values())
