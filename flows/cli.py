@@ -14,6 +14,7 @@ from hnerf.config import load_settings
 from hnerf.errors import InputError, InvalidAsset
 from tasks.launcher import RankFailedError
 from tasks.limits import StalledError
+from tasks.source import place
 
 FAILED, BAD_INPUT = 1, 2
 NO_ROOM = (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # None: our own, of libraries that do not say why
@@ -68,15 +69,15 @@ def _existing(options: argparse.Namespace) -> list[Path]:
     """Return the folders that a command reads; InputError for what is wrong without the imports that take seconds."""
     if "preset" in options:
         load_settings(options.preset, getattr(options, "overrides", ()))
-    given = {what: place for name, what in FOLDERS.items() if isinstance(place := getattr(options, name, None), Path)}
-    for what, folder in given.items():
+    folders = {what: given for name, what in FOLDERS.items() if isinstance(given := getattr(options, name, None), Path)}
+    for what, folder in folders.items():
         if not (folder.is_dir() or (what == FOLDERS["capture"] and folder.is_file())):
             raise InputError(f"{folder}: no such folder; give {what}")
     motions = getattr(options, "motion", None) or []
     for motion in motions if isinstance(motions, list) else [motions]:
         if not motion.exists():
             raise InputError(f"{motion}: no such file; give {MOTIONS}")
-    return list(given.values())
+    return list(folders.values())
 
 
 def _name(command: Command) -> str:
@@ -101,7 +102,7 @@ def _parser() -> argparse.ArgumentParser:
         return added
 
     run = add(commands.run, store, preset)
-    run.add_argument("capture", type=_place, help="the recording's folder or URL, or one video")
+    run.add_argument("capture", type=place, help="the recording's folder or URL, or one video")
     _add_overrides(run, "override a setting of `hnerf settings`")
     add(commands.check_cameras, capture, preset)
     add(commands.settings, preset)
@@ -126,11 +127,6 @@ def _parser() -> argparse.ArgumentParser:
     add(commands.models)
     add(commands.demo)
     return parser
-
-
-def _place(text: str) -> Path | str:
-    """Return a path, or a URL as it is."""
-    return text if "://" in text else Path(text)
 
 
 def _add_overrides(command: argparse.ArgumentParser, what: str) -> None:

@@ -20,8 +20,8 @@ from flows.restart import DEPLOYMENT, restart_crashed, unfinished_runs
 from hnerf.errors import InputError
 from tasks import quarantine
 from tasks.ledger import Ledger
-from tasks.remote import is_remote, local, remote_captures
-from tasks.source import entries, read_capture
+from tasks.remote import remote_captures
+from tasks.source import entries, place, read_capture
 
 DISK_EVENT = "hnerf.disk.nearly-full"  # flows/automations.py tells the operator
 
@@ -56,8 +56,8 @@ def ingest_captures(
         min_free_gib: Nothing more is started while the store's disk has less free space than this, in GiB.
     """
     ledger = Ledger.of(store)
-    if not is_remote(folder):
-        folder = local(folder)
+    folder = place(folder)
+    if isinstance(folder, Path):
         folder.mkdir(parents=True, exist_ok=True)
         quarantine.clear_removed(folder)
     if not _has_room(store, min_free_gib):

@@ -26,9 +26,9 @@ from tasks.launcher import RankFailedError
 from tasks.ledger import forget, was_started
 from tasks.limits import StalledError, set_limits
 from tasks.quarantine import clear, note
-from tasks.remote import NothingThereError, fetched, is_remote, local, remote_capture
+from tasks.remote import NothingThereError, fetched, remote_capture
 from tasks.segmentation import converged, needs_body, segment
-from tasks.source import read_capture
+from tasks.source import place, read_capture
 from tasks.store import Artifact, Store
 from tasks.training import train
 
@@ -77,6 +77,7 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     settings = load_settings(preset, overrides)
     set_limits(settings.limits)
     artifact_store = Store(store.resolve())
+    capture = place(capture)
     source, truth = read_capture(local_folder(artifact_store, capture), store)
     if settings.evaluation.holdout:
         cameras = recorded_cameras(source.root)
@@ -84,7 +85,7 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
 
     recorded = ingest(artifact_store, source, settings.capture)
     subject = Capture.load(recorded.root).name
-    artifact_store.claim(subject, source.digest, capture if is_remote(capture) else source.root)
+    artifact_store.claim(subject, source.digest, capture if isinstance(capture, str) else source.root)
     artifact_store.link_latest(subject, recorded)
     recording = artifact_store.link_latest(subject, with_detections(artifact_store, recorded, settings))
     calibration = artifact_store.link_latest(subject, calibrate(artifact_store, recording, settings.calibration))
@@ -120,11 +121,9 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
 @train_subject.on_failure
 def note_failure(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
     """Say why in the folder that is watched, if the capture was started from there."""
-    if is_remote(flow_run.parameters["capture"]):
-        return
-    capture, store = local(flow_run.parameters["capture"]), Path(flow_run.parameters.get("store", "store"))
+    capture, store = place(flow_run.parameters["capture"]), Path(flow_run.parameters.get("store", "store"))
     error = state.result(raise_on_failure=False)
-    if isinstance(error, Exception) and was_started(store, capture):
+    if isinstance(error, Exception) and isinstance(capture, Path) and was_started(store, capture):
         kind = "refused" if isinstance(error, InputError) else "failed"
         why = str(error) if isinstance(error, NOTED) else f"{type(error).__name__}: {one_line(error)}"
         with suppress(OSError):  # a folder that may only be read, or is gone
@@ -134,23 +133,23 @@ def note_failure(flow: object, flow_run: FlowRun, state: State[Trained]) -> None
 @train_subject.on_completion
 def clear_note(flow: object, flow_run: FlowRun, state: State[Trained]) -> None:
     """Take back what an earlier run noted."""
-    if not is_remote(flow_run.parameters["capture"]):
+    capture = place(flow_run.parameters["capture"])
+    if isinstance(capture, Path):
         with suppress(OSError):
-            clear(local(flow_run.parameters["capture"]))
+            clear(capture)
 
 
 def local_folder(store: Store, capture: Path | str) -> Path:
     """Return a capture's folder or video; what is in a bucket is fetched. One that cannot be found may be started again
     from wherever it lies now."""
-    if not is_remote(capture):
-        folder = local(capture)
-        if not folder.exists():
-            forget(store.root, folder)
-        return folder
+    if isinstance(capture, Path):
+        if not capture.exists():
+            forget(store.root, capture)
+        return capture
     try:
-        found = remote_capture(str(capture))
+        found = remote_capture(capture)
     except (NothingThereError, BucketError):
-        forget(store.root, str(capture))
+        forget(store.root, capture)
         raise
     return fetched(store, found)
 

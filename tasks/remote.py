@@ -39,16 +39,6 @@ class RemoteCapture:
         return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
-def is_remote(place: Path | str) -> bool:
-    """Return whether a place is in a bucket; file:// names one on a disk."""
-    return isinstance(place, str) and "://" in place.removeprefix("file://")
-
-
-def local(place: Path | str) -> Path:
-    """Return the path of a place on a disk."""
-    return Path(place.removeprefix("file://")) if isinstance(place, str) else place
-
-
 def remote_captures(folder: str) -> Iterator[RemoteCapture]:
     """Yield the captures in the subfolders of a folder, sorted."""
     bucket = Bucket.at(folder)

@@ -14,6 +14,12 @@ from tasks.store import sha256_of
 GROUND_TRUTH = "ground_truth"
 
 
+def place(given: Path | str) -> Path | str:
+    """Return a path, or the URL of what is in a bucket; file:// names a path."""
+    text = str(given).removeprefix("file://")
+    return text if isinstance(given, str) and "://" in text else Path(text)
+
+
 class Source(BaseModel):
     """Part of the capture folder `root`. name: the folder's own; digest: SHA-256 of the part's file names and bytes,
     wherever the folder lies."""

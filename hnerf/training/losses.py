@@ -33,21 +33,25 @@ def pixel_colour(alpha: Float[Tensor, "R K"], samples: RaySamples) -> Float[Tens
     return composite(weights, samples.colour) + (1 - weights.sum(1, keepdim=True)) * samples.background
 
 
+def box_colour(samples: RaySamples) -> Float[Tensor, "R 3"]:
+    """Return C~: the colour composited with b alpha."""
+    return pixel_colour(samples.in_box * samples.alpha, samples)
+
+
 def reconstruction(samples: RaySamples, target: Target) -> Float[Tensor, ""]:
     """Return rec: |C_gt - C|_1."""
     return (target.weight * (target.colour - pixel_colour(samples.alpha, samples)).abs().sum(1)).mean()
 
 
 def mask(samples: RaySamples, target: Target) -> Float[Tensor, ""]:
-    """Return mask: |M (C_gt - C~)|_1, C~ composited with b alpha."""
-    error = (target.colour - pixel_colour(samples.in_box * samples.alpha, samples)).abs().sum(1)
+    """Return mask: |M (C_gt - C~)|_1."""
+    error = (target.colour - box_colour(samples)).abs().sum(1)
     return (target.weight * target.person * error).mean()
 
 
 def fog(samples: RaySamples, target: Target) -> Float[Tensor, ""]:
     """Return fog: |(1 - M) C~|_1, for fields that model the background, since rec takes fog in the box for it."""
-    shown = pixel_colour(samples.in_box * samples.alpha, samples).sum(1)
-    return (target.weight * (1 - target.person) * shown).mean()
+    return (target.weight * (1 - target.person) * box_colour(samples).sum(1)).mean()
 
 
 def blend(samples: RaySamples, target: Target, eta: float) -> Float[Tensor, ""]:

@@ -191,7 +191,7 @@ def test_a_folder_renamed_while_its_run_waits_is_trained_under_its_new_name(
     look(watched)
     (watched / "ada").rename(watched / "eve")
     assert look(watched) == []  # whether that run has begun is not known yet
-    with pytest.raises(InputError, match="captures/ada"):
+    with pytest.raises(InputError, match="ada: no such folder"):
         train_subject.fn(Path(runs[0]["capture"]), "demo", watched.parent / "store")
     assert look(watched) == ["eve"]
     assert runs[-1]["capture"] == str(watched / "eve") and look(watched) == []
@@ -252,10 +252,9 @@ def test_captures_in_a_bucket_are_started_by_their_url(bucket: str, tmp_path: Pa
     assert ingest_captures.fn(bucket, "demo", store, 60.0) == []
     (waiting, _) = (store / "ingested").glob("new-*")
     os.utime(waiting, (time.time() - 61,) * 2)
-    assert len(ingest_captures.fn(bucket, "demo", store, 60.0)) == 1
-    assert ingest_captures.fn(bucket, "demo", store, 0.0) == [
-        {"ada": "bob", "bob": "ada"}[Path(runs[0]["capture"]).name]
-    ]
+    (one,) = ingest_captures.fn(bucket, "demo", store, 60.0)
+    (other,) = ingest_captures.fn(bucket, "demo", store, 0.0)
+    assert {one, other} == {"ada", "bob"}
     assert {run["capture"] for run in runs} == {f"{bucket}/ada", f"{bucket}/bob"}
     assert not list((store / "ingested").glob("new-*"))
     fs.copy(f"{bucket}/ada/a.mp4", f"{bucket}/copy of ada/a.mp4")

@@ -7,7 +7,7 @@ from fsspec import filesystem
 from hnerf.errors import InputError
 from tasks import remote
 from tasks.bucket import Bucket
-from tasks.remote import NothingThereError, fetched, is_remote, local, remote_capture, remote_captures
+from tasks.remote import NothingThereError, fetched, remote_capture, remote_captures
 from tasks.store import Store
 
 
@@ -95,11 +95,6 @@ def test_a_file_system_without_etags_is_refused(tmp_path: Path) -> None:
     filesystem("memory").pipe("/bare/ada/a.mp4", b"1")
     with pytest.raises(InputError, match="has no ETag; put captures into a bucket of S3"):
         list(remote_captures("memory://bare"))
-
-
-def test_what_is_on_a_disk_is_a_path() -> None:
-    assert [is_remote(place) for place in ("s3://b/ada", "file:///ada", "ada", Path("ada"))] == [True, *[False] * 3]
-    assert [local(place) for place in ("file:///ada", "ada", Path("ada"))] == [Path("/ada"), Path("ada"), Path("ada")]
 
 
 def test_a_long_download_reports_how_far_it_is(captures: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

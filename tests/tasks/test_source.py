@@ -5,7 +5,7 @@ import pytest
 
 from hnerf.errors import InputError
 from tasks import source as module
-from tasks.source import read_capture
+from tasks.source import place, read_capture
 
 
 @pytest.fixture
@@ -116,3 +116,8 @@ def test_a_store_in_the_capture_is_bad_input(folder: Path) -> None:
 def test_missing_folder_is_bad_input(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
         read_capture(tmp_path / "absent")
+
+
+def test_what_is_on_a_disk_is_a_path() -> None:
+    given = ("s3://b/ada", "file:///ada", "ada", Path("ada"))
+    assert [place(one) for one in given] == ["s3://b/ada", Path("/ada"), Path("ada"), Path("ada")]
