@@ -5,8 +5,7 @@ import pytest
 from fsspec import filesystem
 
 from hnerf.errors import InputError
-from tasks import remote
-from tasks.bucket import Bucket
+from tasks.bucket import VARIABLE, Bucket
 from tasks.remote import NothingThereError, fetched, remote_capture, remote_captures
 from tasks.store import Store
 
@@ -40,6 +39,15 @@ def test_captures_are_the_folders_and_their_files_are_fetched_once(captures: str
     assert found == {"intri.yml": "ada/intri.yml", "images/01/0.jpg": "ada/images/01/0.jpg"}
     inode = folder.stat().st_ino
     assert fetched(store, remote_capture(f"{captures}/ada/")).stat().st_ino == inode
+
+
+def test_what_is_in_a_bucket_already_is_not_put_into_the_shared_one(
+    captures: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "shared").mkdir()
+    monkeypatch.setenv(VARIABLE, f"file://{tmp_path}/shared")
+    fetched(Store(tmp_path / "store"), remote_capture(f"{captures}/ada"))
+    assert not list((tmp_path / "shared").iterdir())
 
 
 def test_what_changes_is_another_capture_even_at_the_same_size(captures: str, tmp_path: Path) -> None:
@@ -100,5 +108,5 @@ def test_a_file_system_without_etags_is_refused(tmp_path: Path) -> None:
 def test_a_long_download_reports_how_far_it_is(captures: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[tuple[str, float, float]] = []
     monkeypatch.setattr("tasks.bucket.report", lambda *given: seen.append(given))
-    remote.fetched(Store(tmp_path / "store"), remote_capture(f"{captures}/bob"))
+    fetched(Store(tmp_path / "store"), remote_capture(f"{captures}/bob"))
     assert seen[-1] == ("a.mp4", 9, 9)
