@@ -22,6 +22,7 @@ from hnerf.evaluation.pictures import camera_of_box
 from hnerf.evaluation.views import NOVEL_VIEW, TRAINING_VIEW, View, all_views, sample_views
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.progress import tracked
+from hnerf.side_by_side import side_by_side
 
 IMAGES = 6  # few: a field on two cores renders one in about a second
 LONGEST_PX = 300  # of the person's box, for the same reason; larger boxes are scaled down
@@ -50,12 +51,15 @@ def compare_with_field(capture: Capture, masks: Masks, avatar: Avatar, staged: S
     with_mask = [view for view in tested if _mask(capture, masks, view) is not None]
     chosen = with_mask or sample_views(trained, IMAGES)
     surfaces = _skinned_surfaces(staged, [view.frame for view in chosen])
-    compared = []
-    for view in tracked(chosen, "asset against field", len(chosen)):
+
+    def compare(view: View) -> Compared | None:
         mask = _mask(capture, masks, view)
-        if mask is not None and mask.any():
-            compared.append(_compared(capture, view, mask, avatar, staged, surfaces[view.frame]))
-    return compared
+        if mask is None or not mask.any():
+            return None
+        return _compared(capture, view, mask, avatar, staged, surfaces[view.frame])
+
+    compared = side_by_side(compare, chosen, avatar.body.theta.device)
+    return [one for one in tracked(compared, "asset against field", len(chosen)) if one]
 
 
 def comparison_figures(compared: list[Compared]) -> dict[str, Any]:
