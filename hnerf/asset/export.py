@@ -22,6 +22,7 @@ from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
 from hnerf.asset.extreme_poses import extreme_poses
 from hnerf.asset.figures import (
     beyond_skinning_mm,
+    level_figures,
     light_figures,
     mesh_figures,
     motion_figures,
@@ -169,6 +170,7 @@ def _staged(
         added,
         albedo,
         normals,
+        settings.level_faces,
     )
 
 
@@ -182,6 +184,7 @@ def _figures(
         "mesh": mesh_figures(settings.topology, surface.mesh, staged),
         "to_surface_mm": surface.distances_mm,
         "findings": findings(surface.distances_mm[settings.topology]) if registered else [],
+        "levels": level_figures(staged),
         "texture_px": settings.texture_px,
         "normal_map_px": settings.normal_map_px,
         "light": light_figures(staged.albedo.light) if staged.albedo else None,

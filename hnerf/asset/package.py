@@ -25,7 +25,6 @@ from hnerf.asset.usd import (
     LIGHT_NAME,
     NORMAL_MAP_NAME,
     ROOT,
-    SURFACE,
     TEXTURE_NAME,
     author_albedo_look,
     author_cameras,
@@ -35,6 +34,7 @@ from hnerf.asset.usd import (
     author_rig,
     define_mesh,
     extent,
+    surface_paths,
     vec3f,
 )
 from hnerf.body.descriptor import normals_of
@@ -101,8 +101,8 @@ def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps
     with tempfile.TemporaryDirectory() as folder:
         stage = _new_stage(Path(folder) / "avatar_cache.usdc", avatar, avatar.frames, fps, info)
         author_cameras(stage, cameras, avatar.stage_from_world)
-        mesh = define_mesh(stage, ROOT.AppendChild("Surface"), avatar)
-        author_captured_look(stage, mesh.GetPath(), avatar)
+        mesh = define_mesh(stage, ROOT.AppendChild("Surface"), avatar, level=0)
+        author_captured_look(stage, [mesh.GetPath()], avatar)
         points, extents, normals = mesh.CreatePointsAttr(), mesh.CreateExtentAttr(), mesh.CreateNormalsAttr()
         for frame, posed in zip(avatar.frames, avatar.points_m, strict=True):
             points.Set(vec3f(posed), float(frame))
@@ -115,11 +115,19 @@ def _parts(avatar: StagedAvatar, cameras: list[Camera], fps: float) -> list[Part
     """Return the parts of the package."""
     view = partial(author_cameras, cameras=cameras, stage_from_world=avatar.stage_from_world)
     return [
-        Part("geometry", partial(author_geometry, avatar=avatar), fps),
+        *(
+            Part(
+                f"geometry_lod{level}",
+                partial(author_geometry, avatar=avatar, level=level),
+                fps,
+                ("lod", f"lod{level}"),
+            )
+            for level in range(len(avatar.levels))
+        ),
         *_looks(avatar, fps),
         Part("cameras", view, fps),
         *(
-            Part(f"rig_{name}", partial(author_rig, name=name, rig=rig), fps, ("rig", name))
+            Part(f"rig_{name}", partial(author_rig, name=name, rig=rig, levels=avatar.levels), fps, ("rig", name))
             for name, rig in avatar.rigs.items()
         ),
         *(
@@ -131,11 +139,11 @@ def _parts(avatar: StagedAvatar, cameras: list[Camera], fps: float) -> list[Part
 
 def _looks(avatar: StagedAvatar, fps: float) -> list[Part]:
     """Return the look as captured, and, if there is one, that of the albedo with the light."""
-    author = partial(author_captured_look, mesh=SURFACE, avatar=avatar)
+    author = partial(author_captured_look, meshes=surface_paths(avatar), avatar=avatar)
     looks = [Part("look_captured", author, fps, ("look", "captured"))]
     if avatar.albedo is not None:
         _, intensity = dome(avatar.albedo.light)
-        author = partial(author_albedo_look, mesh=SURFACE, avatar=avatar, intensity=intensity)
+        author = partial(author_albedo_look, meshes=surface_paths(avatar), avatar=avatar, intensity=intensity)
         looks.append(Part("look_albedo", author, fps, ("look", "albedo")))
     return looks
 
@@ -155,6 +163,7 @@ def _in_variant(stage: Usd.Stage, part: Part) -> Iterator[None]:
 
 def _select(stage: Usd.Stage, motion: str) -> None:
     sets = stage.GetDefaultPrim().GetVariantSets()
+    sets.SetSelection("lod", "lod0")
     sets.SetSelection("look", "captured")
     sets.SetSelection("rig", FULL)
     sets.SetSelection("motion", motion)

@@ -17,6 +17,7 @@ from hnerf.evaluation.galleries import GalleryPicture
 from hnerf.evaluation.pictures import clay, data_uri
 from hnerf.evaluation.report import report_environment
 from hnerf.evenly_spaced import evenly_spaced
+from hnerf.geometry.camera import Camera
 from hnerf.geometry.mesh_queries import Surface
 
 TEMPLATES = Path(__file__).parent / "page"
@@ -57,6 +58,7 @@ def write_report(
                 _picture("Clay, back", clay(surface, back)),
                 _picture("Wireframe, front", wireframe(surface, front)),
                 _picture("Wireframe, back", wireframe(surface, back)),
+                *_less_detail(avatar, points_m, front),
             ],
             texture=[
                 _picture("Texture", texture_picture(avatar.texture, SQUARE_PX)),
@@ -79,6 +81,12 @@ def _beside_field(view: Compared) -> list[GalleryPicture]:
         _picture(f"Field, {psnr['field']}", view.field[..., :3]),
         _picture(f"Asset, {psnr['asset']}", view.asset[..., :3]),
     ]
+
+
+def _less_detail(avatar: StagedAvatar, points_m: np.ndarray, camera: Camera) -> list[GalleryPicture]:
+    """Return the wireframe of each lower level of detail."""
+    meshes = [trimesh.Trimesh(points_m[lv.vertices], lv.faces, process=False) for lv in avatar.levels[1:]]
+    return [_picture(f"lod{k}, {len(m.faces)} faces", wireframe(Surface(m), camera)) for k, m in enumerate(meshes, 1)]
 
 
 def _without_light(avatar: StagedAvatar) -> list[GalleryPicture]:

@@ -5,16 +5,28 @@ import trimesh
 
 
 def simplify(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
-    """Return the surface repaired and decimated to at most `faces` triangles (quadrics, Garland and Heckbert 1997)."""
+    """Return the surface repaired and decimated to at most `faces` triangles."""
     meshes = pymeshlab.MeshSet()
     meshes.add_mesh(pymeshlab.Mesh(surface.vertices, surface.faces))
     _repair(meshes)
     if meshes.current_mesh().face_number() > faces:
-        meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=faces, preservetopology=True, preservenormal=True)
+        collapse_edges(meshes, faces, onto_ends=False)
         _repair(meshes)
     meshes.meshing_remove_unreferenced_vertices()
     mesh = meshes.current_mesh()
     return trimesh.Trimesh(mesh.vertex_matrix(), mesh.face_matrix(), process=False)
+
+
+def collapse_edges(meshes: pymeshlab.MeshSet, faces: int, onto_ends: bool) -> None:
+    """Collapse edges of the current mesh until it has at most `faces` triangles, to the best point, or to one of their
+    ends (quadrics, Garland and Heckbert 1997); onto_ends also keeps the outlines of an open mesh, edge by edge."""
+    meshes.meshing_decimation_quadric_edge_collapse(  # what is not given is as in the last call
+        targetfacenum=faces,
+        preservetopology=True,
+        preservenormal=True,
+        preserveboundary=onto_ends,
+        optimalplacement=not onto_ends,
+    )
 
 
 def _repair(meshes: pymeshlab.MeshSet) -> None:

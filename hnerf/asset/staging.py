@@ -1,12 +1,13 @@
 """The clothed avatar in the axes of asset formats: right-handed, Y up, metres; shared by all writers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hnerf.asset.albedo import Albedo
 from hnerf.asset.correctives import Correctives
+from hnerf.asset.levels import Level, levels_of
 from hnerf.asset.motions import Motion, motion_of, resampled
 from hnerf.asset.rigs import FULL, RestSurface, StagedRig, stage_rigs
 from hnerf.asset.skeleton import Bones
@@ -23,18 +24,16 @@ REST_POSE = "A"  # of every body model here: arms slanting down
 class StagedAvatar:
     """The arrays of an avatar ready to be written; numpy, float64 and int64 unless said otherwise.
 
-    rest_points_m (V, 3), the soles at height 0; faces (F, 3), uvs (U, 2) v up, face_uvs (F, 3): the mesh. shapes_m (K,
-    V, 3) float32: corrective blend shapes, applied before the skin. rigs: "full", with all joints of the body model,
-    and "game", with few joints and influences. frames (n,): of the capture; points_m (n, V, 3) float32: the surface of
-    each. extents_m: the box (2, 3) at each time code of each motion, (n, 2, 3). texture (H, W, 3) uint8 sRGB.
-    stage_from_world (3, 3): a rotation. albedo, with its light in the stage, and normal_map (S, S, 3) uint8, in tangent
-    space, if there are any.
+    rest_points_m (V, 3), the soles at height 0. levels: the mesh in all detail, then with fewer and fewer faces.
+    shapes_m (K, V, 3) float32: corrective blend shapes, applied before the skin. rigs: "full", with all joints of the
+    body model, and "game", with few joints and influences. frames (n,): of the capture; points_m (n, V, 3) float32: the
+    surface of each. extents_m: the box (2, 3) at each time code of each motion, (n, 2, 3). texture (H, W, 3) uint8
+    sRGB. stage_from_world (3, 3): a rotation. albedo, with its light in the stage, and normal_map (S, S, 3) uint8, in
+    tangent space, if there are any.
     """
 
     rest_points_m: np.ndarray
-    faces: np.ndarray
-    uvs: np.ndarray
-    face_uvs: np.ndarray
+    levels: Sequence[Level]
     shapes_m: np.ndarray
     rigs: dict[str, StagedRig]
     frames: np.ndarray
@@ -44,6 +43,21 @@ class StagedAvatar:
     stage_from_world: np.ndarray
     albedo: Albedo | None = None
     normal_map: np.ndarray | None = None
+
+    @property
+    def faces(self) -> np.ndarray:
+        """Return the faces (F, 3) in all detail."""
+        return self.levels[0].faces
+
+    @property
+    def uvs(self) -> np.ndarray:
+        """Return the texture coordinates (U, 2), v up, in all detail."""
+        return self.levels[0].layout.uvs.astype(np.float64)
+
+    @property
+    def face_uvs(self) -> np.ndarray:
+        """Return the rows (F, 3) of `uvs` of the faces' corners."""
+        return self.levels[0].layout.face_uvs
 
     @property
     def rest(self) -> RestSurface:
@@ -73,10 +87,12 @@ def stage_avatar(
     further: Mapping[str, tuple[BodyFit, float]] | None = None,
     albedo: Albedo | None = None,
     normal_map: np.ndarray | None = None,
+    level_faces: Sequence[int] = (),
 ) -> StagedAvatar:
     """Turn a clothed body (see `clothed_rig`) and its motion to Y up, with both rigs. surfaces_m (n, V, 3): its surface
     in each frame; `up`: the vertical axis of the world, "y" or "z"; fps: of the frames; further: motions of the same
-    joints in the same world with their frames a second, by name; albedo: with its light in the world."""
+    joints in the same world with their frames a second, by name; albedo: with its light in the world; level_faces: of
+    lower levels of detail."""
     world, rig, body = stage_from_world(up), clothed.rig, Y_UP_FROM_Z_UP
     rest_m, joints_m = rig.vertices_m.double().numpy() @ body.T, rig.joints_m.double().numpy() @ body.T
     stands_m = np.array([joints_m[0, 0], rest_m[:, 1].min(), joints_m[0, 2]])
@@ -87,9 +103,7 @@ def stage_avatar(
     rigs = stage_rigs(rig, joints_m - stands_m, rest, motions, floor_m, bones)
     return StagedAvatar(
         rest_points_m=rest.points_m,
-        faces=rig.faces.numpy(),
-        uvs=layout.uvs.astype(np.float64),
-        face_uvs=layout.face_uvs,
+        levels=levels_of(rest.points_m, rig.faces.numpy(), layout, level_faces),
         shapes_m=rest.shapes_m,
         rigs=rigs,
         frames=np.array(clothed.frames),

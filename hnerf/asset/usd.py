@@ -3,11 +3,12 @@
 Y up, metres. Matrices are transposed on the way in (USD has row vectors).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
+from hnerf.asset.levels import Level
 from hnerf.asset.quads import polygon_corners
 from hnerf.asset.rigs import StagedRig
 from hnerf.asset.skeleton import Skeleton
@@ -19,7 +20,7 @@ from hnerf.geometry.camera import Camera
 
 ROOT = Sdf.Path("/Avatar")
 BODY = ROOT.AppendChild("Body")
-SURFACE, SKELETON, MOTION = (BODY.AppendChild(name) for name in ("Surface", "Skeleton", "Motion"))
+SKELETON, MOTION = (BODY.AppendChild(name) for name in ("Skeleton", "Motion"))
 APERTURE = 0.36  # film gate width in tenths of a scene unit, read as 36 mm where a unit is a metre
 TEXTURE_NAME, ALBEDO_NAME, LIGHT_NAME, NORMAL_MAP_NAME = "texture.png", "albedo.png", "light.png", "normal_map.png"
 REST_NOTE = (
@@ -28,17 +29,28 @@ REST_NOTE = (
 )
 
 
-def author_geometry(stage: Usd.Stage, avatar: StagedAvatar) -> None:
-    """Define the skinned mesh at rest, with its blend shapes; rigs bind it."""
+def surface_path(level: int) -> Sdf.Path:
+    """Return where the mesh is at a level of detail. Each has a prim of its own, since rigs have weights for each."""
+    return BODY.AppendChild(f"Surface_lod{level}" if level else "Surface")
+
+
+def surface_paths(avatar: StagedAvatar) -> list[Sdf.Path]:
+    """Return where the mesh is at all levels of detail."""
+    return [surface_path(level) for level in range(len(avatar.levels))]
+
+
+def author_geometry(stage: Usd.Stage, avatar: StagedAvatar, level: int) -> None:
+    """Define the skinned mesh at rest at a level of detail, with its blend shapes; rigs bind it."""
     UsdSkel.Root.Define(stage, BODY)
-    mesh = define_mesh(stage, SURFACE, avatar)
-    mesh.CreatePointsAttr(vec3f(avatar.rest_points_m))
-    mesh.CreateExtentAttr(extent(avatar.rest_points_m))
-    mesh.CreateNormalsAttr(vec3f(normals_of(avatar.rest_points_m, avatar.faces)))
+    path, kept = surface_path(level), avatar.levels[level].vertices
+    mesh = define_mesh(stage, path, avatar, level)
+    mesh.CreatePointsAttr(vec3f(avatar.rest_points_m[kept]))
+    mesh.CreateExtentAttr(extent(avatar.rest_points_m[kept]))
+    mesh.CreateNormalsAttr(vec3f(normals_of(avatar.rest_points_m, avatar.faces)[kept]))
     names, targets = shape_names(avatar), []
     for name, offsets_m in zip(names, avatar.shapes_m, strict=True):
-        shape = UsdSkel.BlendShape.Define(stage, SURFACE.AppendChild(name))
-        shape.CreateOffsetsAttr(vec3f(offsets_m))
+        shape = UsdSkel.BlendShape.Define(stage, path.AppendChild(name))
+        shape.CreateOffsetsAttr(vec3f(offsets_m[kept]))
         targets.append(shape.GetPath())
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1))
@@ -46,22 +58,22 @@ def author_geometry(stage: Usd.Stage, avatar: StagedAvatar) -> None:
     binding.CreateBlendShapeTargetsRel().SetTargets(targets)
 
 
-def author_captured_look(stage: Usd.Stage, mesh: Sdf.Path, avatar: StagedAvatar) -> None:
-    """Bind the mesh to the texture in the recording's light."""
-    _define_material(stage, "Captured", TEXTURE_NAME, mesh, avatar)
+def author_captured_look(stage: Usd.Stage, meshes: Iterable[Sdf.Path], avatar: StagedAvatar) -> None:
+    """Bind meshes to the texture in the recording's light."""
+    _define_material(stage, "Captured", TEXTURE_NAME, meshes, avatar)
 
 
-def author_albedo_look(stage: Usd.Stage, mesh: Sdf.Path, avatar: StagedAvatar, intensity: float) -> None:
-    """Bind the mesh to the albedo, and define the recording's light: intensity times the picture LIGHT_NAME."""
-    _define_material(stage, "Albedo", ALBEDO_NAME, mesh, avatar)
+def author_albedo_look(stage: Usd.Stage, meshes: Iterable[Sdf.Path], avatar: StagedAvatar, intensity: float) -> None:
+    """Bind meshes to the albedo, and define the recording's light: intensity times the picture LIGHT_NAME."""
+    _define_material(stage, "Albedo", ALBEDO_NAME, meshes, avatar)
     light = UsdLux.DomeLight.Define(stage, ROOT.AppendChild("Light"))
     light.CreateIntensityAttr(intensity)
     light.CreateTextureFileAttr(f"./{LIGHT_NAME}")
     light.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
 
 
-def _define_material(stage: Usd.Stage, name: str, file: str, mesh: Sdf.Path, avatar: StagedAvatar) -> None:
-    """Define a matte preview surface with a texture file and the normal map, and bind the mesh to it."""
+def _define_material(stage: Usd.Stage, name: str, file: str, meshes: Iterable[Sdf.Path], avatar: StagedAvatar) -> None:
+    """Define a matte preview surface with a texture file and the normal map, and bind meshes to it."""
     material = UsdShade.Material.Define(stage, ROOT.AppendPath(f"Materials/{name}"))
     UsdGeom.Scope.Define(stage, material.GetPath().GetParentPath())
     reader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("TextureCoordinates"))
@@ -84,7 +96,8 @@ def _define_material(stage: Usd.Stage, name: str, file: str, mesh: Sdf.Path, ava
         normal = normals.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
         surface.CreateInput("normal", Sdf.ValueTypeNames.Normal3f).ConnectToSource(normal)
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
-    UsdShade.MaterialBindingAPI.Apply(stage.OverridePrim(mesh)).Bind(material)
+    for mesh in meshes:
+        UsdShade.MaterialBindingAPI.Apply(stage.OverridePrim(mesh)).Bind(material)
 
 
 def _define_texture(
@@ -100,8 +113,9 @@ def _define_texture(
     return texture
 
 
-def author_rig(stage: Usd.Stage, name: str, rig: StagedRig) -> None:
-    """Define a rig: its skeleton, the mesh's skin weights, and which motions are its own."""
+def author_rig(stage: Usd.Stage, name: str, rig: StagedRig, levels: Sequence[Level]) -> None:
+    """Define a rig: its skeleton, the skin weights of the mesh at all levels of detail, and which motions are its
+    own."""
     skeleton = UsdSkel.Skeleton.Define(stage, SKELETON)
     skeleton.CreateJointsAttr(joint_paths(rig.skeleton))
     skeleton.CreateJointNamesAttr(rig.skeleton.names)
@@ -110,14 +124,14 @@ def author_rig(stage: Usd.Stage, name: str, rig: StagedRig) -> None:
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([MOTION.AppendChild(name)])
     skeleton.GetPrim().SetDocumentation(REST_NOTE)
     skeleton.GetPrim().SetCustomData({"restPose": REST_POSE, "jointNamesIn": _names_elsewhere(rig.skeleton)})
-
-    binding = UsdSkel.BindingAPI.Apply(stage.OverridePrim(SURFACE))
-    binding.CreateSkeletonRel().SetTargets([SKELETON])
     influences = rig.skin.joints.shape[1]
-    indices = binding.CreateJointIndicesPrimvar(False, influences)
-    indices.Set(Vt.IntArray.FromNumpy(rig.skin.joints.astype(np.int32).ravel()))
-    weights = binding.CreateJointWeightsPrimvar(False, influences)
-    weights.Set(Vt.FloatArray.FromNumpy(rig.skin.weights.astype(np.float32).ravel()))
+    for number, level in enumerate(levels):
+        binding = UsdSkel.BindingAPI.Apply(stage.OverridePrim(surface_path(number)))
+        binding.CreateSkeletonRel().SetTargets([SKELETON])
+        indices = binding.CreateJointIndicesPrimvar(False, influences)
+        indices.Set(Vt.IntArray.FromNumpy(rig.skin.joints[level.vertices].astype(np.int32).ravel()))
+        weights = binding.CreateJointWeightsPrimvar(False, influences)
+        weights.Set(Vt.FloatArray.FromNumpy(rig.skin.weights[level.vertices].astype(np.float32).ravel()))
 
 
 def author_motion(stage: Usd.Stage, name: str, avatar: StagedAvatar) -> None:
@@ -198,18 +212,19 @@ def _identifier(name: str) -> str:
     return Tf.MakeValidIdentifier(f"_{name}" if name[:1].isdigit() else name)
 
 
-def define_mesh(stage: Usd.Stage, path: Sdf.Path, avatar: StagedAvatar) -> UsdGeom.Mesh:
+def define_mesh(stage: Usd.Stage, path: Sdf.Path, avatar: StagedAvatar, level: int) -> UsdGeom.Mesh:
     """Define topology, texture coordinates and display colours; the caller sets points, normals and extents."""
-    mesh = UsdGeom.Mesh.Define(stage, path)
-    corners = polygon_corners(avatar.faces)
+    mesh, shown = UsdGeom.Mesh.Define(stage, path), avatar.levels[level]
+    corners = polygon_corners(shown.faces)
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(corners), corners.shape[1], np.int32)))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(avatar.faces.ravel()[corners].astype(np.int32).ravel()))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(shown.faces.ravel()[corners].astype(np.int32).ravel()))
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
-    st.Set(Vt.Vec2fArray.FromNumpy(avatar.uvs.astype(np.float32)))
-    st.SetIndices(Vt.IntArray.FromNumpy(avatar.face_uvs.ravel()[corners].astype(np.int32).ravel()))
-    mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(vec3f(to_linear(avatar.vertex_colours / 255)))
+    st.Set(Vt.Vec2fArray.FromNumpy(shown.layout.uvs.astype(np.float32)))
+    st.SetIndices(Vt.IntArray.FromNumpy(shown.layout.face_uvs.ravel()[corners].astype(np.int32).ravel()))
+    colours = to_linear(avatar.vertex_colours[shown.vertices] / 255)
+    mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(vec3f(colours))
     return mesh
 
 

@@ -14,7 +14,9 @@ from hnerf.render.motion import Motion, select_poses
 from tests.asset.figure import bending_body, capture
 from tests.asset.stand_in import CLOTHING_M, StandInAvatar
 
-SMALL = AssetSettings(grid_cells=96, faces=2000, texture_px=128, photograph_frames=0, normal_map_px=64, correctives=2)
+SMALL = AssetSettings(
+    grid_cells=96, faces=2000, level_faces=(500,), texture_px=128, photograph_frames=0, normal_map_px=64, correctives=2
+)
 
 
 def test_surface_is_the_grown_body() -> None:
@@ -27,7 +29,8 @@ def test_surface_is_the_grown_body() -> None:
 
 FILES = {"avatar.usda", "avatar_24.usda", "avatar_30.usda", "avatar.usdz", "avatar_cache.usdz", "avatar.glb"}
 FILES |= {"avatar_game.glb", "avatar.bvh", "avatar/texture.png", "avatar/normal_map.png"}
-FILES |= {f"avatar/{name}.usdc" for name in ("geometry", "look_captured", "cameras", "rig_full", "rig_game")}
+FILES |= {f"avatar/{name}.usdc" for name in ("look_captured", "cameras", "rig_full", "rig_game")}
+FILES |= {"avatar/geometry_lod0.usdc", "avatar/geometry_lod1.usdc"}
 FILES |= {f"avatar/motion_{name}.usdc" for name in ("captured", "captured_24", "captured_30", "nod")}
 
 
@@ -43,16 +46,17 @@ def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monke
     assert report["viewer"].startswith("no viewer.html: three.js is not installed")
     page = (tmp_path / "report.html").read_text()
     assert report["viewer"] in page and 'href="viewer.html"' not in page
-    assert page.count("<img") == 2 + 4 + 2  # turntable, surface, texture
+    assert page.count("<img") == 2 + 5 + 2  # turntable, surface, texture
     assert report["mesh"]["watertight"] and report["mesh"]["faces"] <= 2000
     assert report["mesh"]["height_m"] == pytest.approx(1.62, abs=0.005)
+    assert [report["levels"][lod]["faces"] for lod in ("lod0", "lod1")] == [report["mesh"]["faces"], 500]
     assert report["light"] is None  # without photographs
     assert (report["frames"], report["joints"], report["cameras"]) == (4, 3, 1)
     assert report["rigs"]["game"]["influences"] == 2 and report["rigs"]["game"]["moved_max_mm"] < 0.01
     assert report["motions"]["nod"] == {"fps": 25.0, "poses": 2}
     assert report["motions"]["captured_30"] == {"fps": 30, "poses": 16}
     for name in ("avatar.usdz", "avatar.usda"):
-        assert (report["validation"][name]["variants"], report["validation"][name]["warnings"]) == (8, [])
+        assert (report["validation"][name]["variants"], report["validation"][name]["warnings"]) == (16, [])
     assert report["against_field"]["images"] == 0 and report["crossing_share"] == {}
     assert "Extreme poses" not in page and "Asset and field" not in page
     stage = Usd.Stage.Open(str(tmp_path / "avatar.usda"))

@@ -1,4 +1,5 @@
 import dataclasses
+import itertools
 import time
 from pathlib import Path
 from zipfile import ZipFile
@@ -10,17 +11,21 @@ from pxr import Ar, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
 from hnerf.asset.dome import dome
 from hnerf.asset.package import AssetInfo, write_cache, write_package, write_usdz
+from hnerf.asset.quads import polygon_corners
+from hnerf.asset.srgb import to_linear
 from hnerf.asset.staging import StagedAvatar
 from hnerf.asset.validation import each_variant
+from hnerf.body.descriptor import normals_of
 from tests.asset.figure import FRAMES, side_camera
 
 INFO = AssetInfo("column", "7", "CC0-1.0", "0123abcd")
 
 
 def skinned_points(stage: Usd.Stage, code: float) -> np.ndarray:
-    """Return the points of the mesh at a time code as OpenUSD evaluates them: blend shapes, then UsdSkel's skin."""
+    """Return the points of the only mesh at a time code as OpenUSD evaluates them: blend shapes, then UsdSkel's
+    skin."""
     root = UsdSkel.Root(stage.GetPrimAtPath("/Avatar/Body"))
-    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/Avatar/Body/Surface"))
+    (mesh,) = (UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
     cache = UsdSkel.Cache()
     cache.Populate(root, Usd.PrimDefaultPredicate)
     skeleton = cache.GetSkelQuery(UsdSkel.Skeleton(stage.GetPrimAtPath("/Avatar/Body/Skeleton")))
@@ -57,16 +62,39 @@ def test_usd_skins_as_we_do_in_every_variant(name: str, package: Path, staged: S
     stage = Usd.Stage.Open(str(package / name))
     root, seen = stage.GetDefaultPrim(), set()
     for _ in each_variant(stage):
-        rig, motion = (root.GetVariantSet(variants).GetVariantSelection() for variants in ("rig", "motion"))
-        seen.add((rig, motion))
-        moving = staged.rigs[rig].motions[motion]
+        rig, motion, lod = (root.GetVariantSet(name).GetVariantSelection() for name in ("rig", "motion", "lod"))
+        seen.add((rig, motion, lod))
+        moving, shown = staged.rigs[rig].motions[motion], staged.levels[int(lod[-1])].vertices
         expected = list(staged.rigs[rig].surfaces_m(motion, staged.rest))
         for k in (0, len(moving.codes) - 1):
             code = moving.codes[k] * 10 / moving.fps
-            np.testing.assert_allclose(skinned_points(stage, code), expected[k], atol=1e-5)
+            np.testing.assert_allclose(skinned_points(stage, code), expected[k][shown], atol=1e-5)
             box = UsdSkel.Root(stage.GetPrimAtPath("/Avatar/Body")).GetExtentAttr().Get(code)
             np.testing.assert_allclose(box, [expected[k].min(0), expected[k].max(0)], atol=1e-5)
-    assert seen == {(rig, motion) for rig in ("full", "game") for motion in ("captured", "captured_24", "captured_30")}
+    motions = ("captured", "captured_24", "captured_30")
+    assert seen == set(itertools.product(("full", "game"), motions, ("lod0", "lod1")))
+
+
+@pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_24.usda"])
+def test_all_detail_is_shown_unless_less_is_chosen(name: str, package: Path, staged: StagedAvatar) -> None:
+    stage = Usd.Stage.Open(str(package / name))
+    stage.SetEditTarget(stage.GetSessionLayer())
+    detail = stage.GetDefaultPrim().GetVariantSet("lod")
+    assert (detail.GetVariantNames(), detail.GetVariantSelection()) == (["lod0", "lod1"], "lod0")
+    for choice, path in (("lod0", "/Avatar/Body/Surface"), ("lod1", "/Avatar/Body/Surface_lod1")):
+        detail.SetVariantSelection(choice)
+        (mesh,) = (UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
+        assert mesh.GetPath() == path
+        assert bound_surface(stage).GetPath() == "/Avatar/Materials/Captured/Surface"
+        level = staged.levels[int(choice[-1])]
+        corners = polygon_corners(level.faces)
+        np.testing.assert_array_equal(mesh.GetFaceVertexIndicesAttr().Get(), level.faces.ravel()[corners].ravel())
+        st = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened()
+        np.testing.assert_allclose(st, level.layout.uvs[level.layout.face_uvs.ravel()[corners].ravel()], atol=1e-7)
+        normals = normals_of(staged.rest_points_m, staged.faces)[level.vertices]
+        np.testing.assert_allclose(mesh.GetNormalsAttr().Get(), normals, atol=1e-6)
+        colours = to_linear(staged.vertex_colours[level.vertices] / 255)
+        np.testing.assert_allclose(mesh.GetDisplayColorAttr().Get(), colours, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz"])
@@ -106,7 +134,8 @@ def test_the_same_avatar_is_the_same_bytes_at_any_time(package: Path, staged: St
     time.sleep(max(0.0, (package / "avatar_cache.usdz").stat().st_mtime + 2.0 - time.time()))
     write_all(tmp_path, staged)
     written = [path for path in sorted(tmp_path.rglob("*")) if path.is_file()]
-    assert len(written) == 3 + 4 + 2 + 2 + 2 + 3 + 2  # interfaces, pictures, common parts, looks, rigs, motions, .usdz
+    # Interfaces, pictures, levels of detail, cameras, looks, rigs, motions, .usdz.
+    assert len(written) == 3 + 4 + 2 + 1 + 2 + 2 + 3 + 2
     for path in written:
         assert path.read_bytes() == (package / path.relative_to(tmp_path)).read_bytes(), path.name
     with ZipFile(tmp_path / "avatar.usdz") as archive:

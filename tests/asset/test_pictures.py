@@ -5,7 +5,9 @@ import pytest
 import trimesh
 
 from hnerf.asset import pictures
+from hnerf.asset.levels import Level
 from hnerf.asset.staging import StagedAvatar
+from hnerf.asset.texture import UvLayout
 from hnerf.geometry.mesh_queries import Surface
 
 RED, GREEN, BLUE = [255, 0, 0], [0, 255, 0], [0, 0, 255]
@@ -19,9 +21,8 @@ def card(staged: StagedAvatar) -> StagedAvatar:
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     texture = np.array([[RED, GREEN], [BLUE, [255, 255, 0]]], np.uint8).repeat(32, 0).repeat(32, 1)
     uvs = corners_m[:, :2] + (0.5, 0)
-    return dataclasses.replace(
-        staged, faces=faces, uvs=uvs, face_uvs=faces, texture=texture, points_m=corners_m[None].astype(np.float32)
-    )
+    levels = [Level(np.arange(4), faces, UvLayout(uvs, faces))]
+    return dataclasses.replace(staged, levels=levels, texture=texture, points_m=corners_m[None].astype(np.float32))
 
 
 def surface_of(card: StagedAvatar) -> Surface:
@@ -55,7 +56,8 @@ def test_edges_are_lines_and_faces_are_not(card: StagedAvatar) -> None:
 
 
 def test_the_layout_shows_where_faces_lie_in_the_texture(card: StagedAvatar) -> None:
-    lower = dataclasses.replace(card, uvs=card.uvs * (1, 0.5))
+    level = Level(np.arange(4), card.faces, UvLayout(card.uvs * (1, 0.5), card.face_uvs))
+    lower = dataclasses.replace(card, levels=[level])
     layout = pictures.uv_picture(lower, 64)
     assert layout[10, 32].tolist() == [255, 255, 255]
     assert layout[60, 40].tolist() == pictures.PAPER.tolist()

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from hnerf.asset.correctives import correctives_of
+from hnerf.asset.levels import Level
 from hnerf.asset.staging import StagedAvatar, stage_avatar, stage_from_world
 from hnerf.asset.texture import UvLayout
 from hnerf.body.fit_result import BodyFit
@@ -75,12 +76,11 @@ def test_other_rates_are_the_same_motion_at_whole_frames(staged: StagedAvatar) -
 def test_a_vertex_has_the_colour_of_its_texel(staged: StagedAvatar) -> None:
     """One triangle on a texture of 4 x 4 whose red is the column and green the row from the top."""
     texture = np.stack([*np.meshgrid(range(4), range(4)), np.zeros((4, 4))], -1).astype(np.uint8)
+    uvs = np.array([[0.1, 0.9], [0.9, 0.9], [1.0, 0.0]])
     triangle = dataclasses.replace(
         staged,
         rest_points_m=np.zeros((3, 3)),
-        faces=np.array([[2, 0, 1]]),
-        uvs=np.array([[0.1, 0.9], [0.9, 0.9], [1.0, 0.0]]),
-        face_uvs=np.array([[0, 1, 2]]),
+        levels=[Level(np.arange(3), np.array([[2, 0, 1]]), UvLayout(uvs, np.array([[0, 1, 2]])))],
         texture=texture,
     )
     np.testing.assert_array_equal(triangle.vertex_colours, [[3, 0, 0], [3, 3, 0], [0, 0, 0]])

@@ -1,0 +1,58 @@
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+import trimesh
+
+from hnerf.asset.figures import level_figures
+from hnerf.asset.levels import Level, levels_of
+from hnerf.asset.staging import StagedAvatar
+from hnerf.asset.texture import UvLayout, unwrap
+from tests.asset.figure import upright_column
+
+
+def test_a_cube_needs_its_corners_alone() -> None:
+    """A cube of 2 m, each of whose twelve halves of sides is cut into four, in one chart without an outline."""
+    cube = trimesh.creation.box((2, 2, 2)).subdivide()
+    unused = np.zeros((1, 2), np.float32)
+    layout = UvLayout(np.concatenate([unused, cube.vertices[:, :2].astype(np.float32)]), 1 + np.array(cube.faces))
+    levels = levels_of(cube.vertices, cube.faces, layout, [12, 48, 16])
+    assert [len(level.faces) for level in levels] == [48, 16, 12]
+    np.testing.assert_array_equal(levels[0].vertices, range(26))
+    corners = levels[2]
+    kept_m = cube.vertices[corners.vertices]
+    assert sorted(map(tuple, kept_m.tolist())) == sorted(itertools.product((-1, 1), repeat=3))
+    assert trimesh.Trimesh(kept_m, corners.faces, process=False).volume == pytest.approx(8)
+    np.testing.assert_array_equal(corners.layout.uvs[corners.layout.face_uvs], kept_m[corners.faces][..., :2])
+
+
+def places(level: Level) -> set[tuple[float, ...]]:
+    """Return the vertex and the texture coordinates of each corner of a face."""
+    uvs = level.layout.uvs[level.layout.face_uvs].reshape(-1, 2)
+    return {tuple(row) for row in np.column_stack([level.vertices[level.faces].ravel(), uvs]).tolist()}
+
+
+def test_charts_keep_their_outlines() -> None:
+    """A closed column whose charts have outlines of 224 edges in all: no level has less than 336 faces."""
+    column = upright_column(0.18, -0.05, 1.65)
+    layout = unwrap(column.vertices, column.faces, 64)
+    whole, coarse = levels_of(column.vertices, column.faces, layout, [5000, 400, 335])
+    assert (len(whole.faces), len(coarse.faces)) == (816, 400)
+    mesh = trimesh.Trimesh(column.vertices[coarse.vertices], coarse.faces, process=False)
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(column.volume)
+    assert places(coarse) < places(whole)
+
+
+def test_the_distance_of_a_level_is_that_of_its_points_from_the_whole(staged: StagedAvatar) -> None:
+    """A roof of two slopes of 45 degrees and its floor: above x, the nearest slope is x / sqrt 2 away, up to x = 1."""
+    points_m = np.array([[0.0, 0, 0], [0, 9, 0], [1, 0, 1], [1, 9, 1], [2, 0, 0], [2, 9, 0]])
+    roof, floor = np.array([[0, 2, 3], [0, 3, 1], [2, 4, 5], [2, 5, 3]]), np.array([[0, 2, 3], [0, 3, 1]])
+    layout = UvLayout(np.zeros((6, 2), np.float32), roof)
+    levels = [Level(np.arange(6), roof, layout), Level(np.array([0, 1, 4, 5]), floor, layout)]
+    figures = level_figures(dataclasses.replace(staged, rest_points_m=points_m, levels=levels))
+    assert (figures["lod1"]["vertices"], figures["lod1"]["faces"]) == (4, 2)
+    assert figures["lod1"]["to_lod0_mean_mm"] == pytest.approx(500 / np.sqrt(2), rel=0.02)
+    assert figures["lod1"]["to_lod0_p99_mm"] == pytest.approx(990 / np.sqrt(2), rel=0.02)
+    assert figures["lod0"]["to_lod0_p99_mm"] == pytest.approx(0, abs=0.01)
