@@ -28,6 +28,7 @@ PYTEST = (sys.executable, "-m", "pytest", "-o", "addopts=", "-x", "-q", "-p", "n
 PAPER, FAST = "hnerf/fields/paper.py", "hnerf/fields/fast.py"
 LOSSES, STEP = "hnerf/training/losses.py", "hnerf/training/step.py"
 CONDITIONS, TRAINER = "hnerf/fields/conditions.py", "hnerf/training/trainer.py"
+TUNED_POSES = "hnerf/training/tuned_poses.py"
 COMPOSITING, CANONICAL = "hnerf/fields/compositing.py", "hnerf/fields/grids.py"
 ENCODING, MLP = "hnerf/fields/encoding.py", "hnerf/fields/mlp.py"
 BODIES, PIXELS = "hnerf/body/canonical.py", "hnerf/training/pixels.py"
@@ -213,9 +214,9 @@ FAULTS = (
     Fault("trainer-poses-go-on", TRAINER, "pose.grad[self.train_rows] = 0.0", "pass", BY_TRAINER),
     Fault("trainer-decay", TRAINER, "FINAL_LEARNING_RATE ** self._progress() * ", "", BY_TRAINER),
     Fault("ground-unknown", TRAINER, "settings, ground_axis)", "settings)", BY_TRAINER),
-    Fault("one-camera-drifts", TRAINER, "            self._keep_distance()\n", "", BY_TRAINER),
-    Fault("one-camera-farthest", TRAINER, "tuned.norm(dim=-1).mean()", "tuned.norm(dim=-1).max()", BY_TRAINER),
-    Fault("one-camera-all", TRAINER, "root[rows, :3, 3] = self", "root[-1] = root[0]; root[rows, :3, 3] = self",
+    Fault("one-camera-drifts", TRAINER, "if self.only_centre_m is not None:", "if False:", BY_TRAINER),
+    Fault("one-camera-farthest", TUNED_POSES, "tuned.norm(dim=-1).mean()", "tuned.norm(dim=-1).max()", BY_TRAINER),
+    Fault("one-camera-all", TUNED_POSES, "root[rows, :3, 3] = centre", "root[-1] = root[0]; root[rows, :3, 3] = centre",
           BY_TRAINER),
     Fault("trainer-tighten", TRAINER, "if self.step <= self.field_steps:", "if False:", BY_TRAINER),
     Fault("checkpoint-optimizer", TRAINER, 'self.optimizer.load_state_dict(state["optimizer"])', "pass",

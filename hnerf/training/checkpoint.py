@@ -1,17 +1,37 @@
 """Checkpoints: written to a temporary file and renamed, read without unpickling anything but tensors."""
 
+import hashlib
 import logging
 import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
+from hnerf.body.fit_result import BodyFit
+from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks
+from hnerf.config import TrainingSettings
 from hnerf.errors import one_line, printable
 
 log = logging.getLogger("hnerf.training")
 
 NAME = "checkpoint.pt"
+
+
+def training_key(capture: Capture, masks: Masks, body: BodyFit, settings: TrainingSettings) -> str:
+    """Return a digest of what a training is made from, by which its checkpoint is known; of images, only which there
+    are, because the body was fitted to them."""
+    digest = hashlib.sha256(f"{settings.model_dump_json()} {capture.name} {capture.train_frames}".encode())
+    for camera in capture.cameras.values():
+        digest.update(f"{camera.name} {camera.width_px} {camera.height_px}".encode())
+        for numbers in (camera.K, camera.R, camera.t_m):
+            digest.update(np.ascontiguousarray(numbers, dtype=np.float64).tobytes())
+        digest.update(bytes((camera.name, frame) in masks for frame in capture.frames))
+    for tensor in (body.theta, body.root, body.rig.vertices_m):
+        digest.update(tensor.cpu().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:

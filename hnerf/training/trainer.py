@@ -2,10 +2,8 @@
 against the finished field."""
 
 import dataclasses
-import hashlib
 import json
 import logging
-import math
 import resource
 import time
 from pathlib import Path
@@ -19,34 +17,29 @@ from torch.nn.parallel import DistributedDataParallel
 from hnerf.avatar.model_file import write_field
 from hnerf.avatar.trained import build_field
 from hnerf.body.canonical import PosedBodies
-from hnerf.body.common_rest import with_common_rest
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.config import TrainingSettings
-from hnerf.fields.conditions import Conditions, Draws, concatenate, shard
-from hnerf.fields.samples import RaySamples
+from hnerf.fields.conditions import Conditions, Draws
 from hnerf.progress import report
 from hnerf.results import TrainingReport, write_result
 from hnerf.training.auto_settings import SceneStatistics, decide
-from hnerf.training.checkpoint import load_checkpoint, save_checkpoint
+from hnerf.training.checkpoint import load_checkpoint, save_checkpoint, training_key
 from hnerf.training.distributed import Distributed
 from hnerf.training.exposure import camera_gains
+from hnerf.training.fixed_rays import FixedRays
 from hnerf.training.gather import gather_pixels
-from hnerf.training.losses import pixel_colour
 from hnerf.training.parts import decide_parts
-from hnerf.training.pixels import EDGE_SHARE, PixelRays
+from hnerf.training.pixels import EDGE_SHARE
 from hnerf.training.step import Objective, TrainingError, not_finite
+from hnerf.training.tuned_poses import keep_distance, share_rest
 
 logger = logging.getLogger("hnerf.training")
 
 WARM_UP_STEPS = 20
 FINAL_LEARNING_RATE = 0.1  # at the end, relative to the first
 SKIPS_ALLOWED = 2  # consecutive; one more non-finite step stops the run
-HELD_OUT_RAYS = 2048  # for the held-out PSNR and the check of the surface
-MIN_PERSON_COVERAGE = 0.1  # of the person's pixels; below it the surface has collapsed
-MAX_BACKGROUND_COVERAGE = 0.8  # of the background pixels; above it the surface fills the box
-MIN_SAMPLES_PER_RAY = 64  # through a whole scene: valid-wave's body covers 38 % with 16, 59 % with 64, 64 % with 256
 LOG_STEPS = 25
 TRIAL_FRAMES = 8  # at most, to measure the memory of rays
 POSE_STRIDE = 6  # between the training poses for which the shell is tightened
@@ -65,7 +58,7 @@ class Trainer:
         processes: Distributed,
     ):
         started_at = time.monotonic()
-        self.key = _key(capture, masks, body, settings)
+        self.key = training_key(capture, masks, body, settings)
         self.settings, self.decisions = decide(SceneStatistics.of(capture, masks, body), settings)
         settings, self.out, self.processes = self.settings, out, processes
         device = processes.device
@@ -97,6 +90,7 @@ class Trainer:
         self._set_poses(bodies)
         rays = settings.frames_per_step * settings.rays_per_frame
         self.parts, self.decisions["parts"] = decide_parts(rays, settings.memory_gib, self._trial_loss, processes)
+        self.fixed_rays = FixedRays(self.field, self.pixels, settings.seed, self.parts.most_rays)
         self._resume()
         self.setup_seconds = time.monotonic() - started_at
 
@@ -162,38 +156,23 @@ class Trainer:
                 save_checkpoint(self.out, self._state())
         if self.processes.is_main:
             (self.out / "history.jsonl").write_text("".join(json.dumps(row) + "\n" for row in self.history))
-        self._require_surface()
+        self.fixed_rays.require_surface(self.scene, self.train_rows)
         return self._finish() if self.processes.is_main else None
 
     def _absorb(self) -> None:
         self.scene.bodies.absorb(self.objective.correction, self.train_rows if self.settings.one_posture else None)
         if self.step <= self.field_steps:
-            self._keep_distance()
+            if self.only_centre_m is not None:
+                keep_distance(self.scene.bodies, self.body, self.train_rows, self.only_centre_m)
             self._average_over_frames()
             self.field.tighten(self.scene.bodies.rig, self.scene.conditions.pose[self.train_rows[::POSE_STRIDE]])
         self._set_poses(self.scene.bodies)
 
-    def _keep_distance(self) -> None:
-        """Scale the training frames' roots about the only camera, so that their mean distance from it stays the fit's:
-        that camera sees a larger person who is farther away alike, and training would drift."""
-        if self.only_centre_m is None:
-            return
-        rows, bodies = self.train_rows, self.scene.bodies
-        fitted, tuned = (r[rows, :3, 3] - self.only_centre_m for r in (self.body.root, bodies.root))
-        root = bodies.root.clone()
-        root[rows, :3, 3] = self.only_centre_m + tuned * (fitted.norm(dim=-1).mean() / tuned.norm(dim=-1).mean())
-        bodies.set_poses(bodies.rig, bodies.theta, root)
-
     def _average_over_frames(self) -> None:
         """Apply what the training frames have in common to all poses; with one posture this is the posture itself."""
-        rows, bodies = self.train_rows, self.scene.bodies
-        self.field.average_over_frames(rows)
-        if not self.field.common_rest or self.settings.one_posture or len(rows) < 2:
-            return
-        theta, root = bodies.theta.clone(), bodies.root.clone()
-        fitted, tuned = ((t[rows], r[rows]) for t, r in ((self.body.theta, self.body.root), (theta, root)))
-        rig, theta[rows], root[rows] = with_common_rest(bodies.rig, fitted, tuned)
-        bodies.set_poses(rig, theta, root)
+        self.field.average_over_frames(self.train_rows)
+        if self.field.common_rest and not self.settings.one_posture and len(self.train_rows) > 1:
+            share_rest(self.scene.bodies, self.body, self.train_rows)
 
     def _freeze_field(self) -> None:
         """Freeze the field; the parameters of novel frames are fitted to it, so that it never learns from their
@@ -267,43 +246,8 @@ class Trainer:
         row: dict[str, Any] = {"step": self.step, "seconds": round(self.seconds, 2)}
         row["losses"] = {name: value.item() for name, value in terms.items()}
         if len(self.novel_rows) and self.step <= self.field_steps:
-            row["held_out"] = {"psnr": self._held_out_psnr()}
+            row["held_out"] = {"psnr": self.fixed_rays.psnr(self.scene, self.novel_rows)}
         self.history.append(row)
-
-    @torch.no_grad()
-    def _held_out_psnr(self) -> float:
-        """Return the PSNR on person pixels of novel-pose frames in training cameras, on which the field is not
-        trained."""
-        rays, samples = self._sample_fixed_rays(self.novel_rows, self.field.samples)
-        mixed = rays.edge & (not self.field.models_background)  # with a background that only such a field models
-        error = (pixel_colour(samples.in_box * samples.alpha, samples) - rays.colour)[rays.person & ~mixed]
-        return float(-10 * torch.log10((error**2).mean()))
-
-    @torch.no_grad()
-    def _sample_fixed_rays(self, rows: Tensor, count: int) -> tuple[PixelRays, RaySamples]:
-        """Return rays at some frames, the same ones on each call, and their samples as for rendering, with `count`
-        random numbers per ray."""
-        generator = torch.Generator(self.processes.device).manual_seed(self.settings.seed)
-        rays = self.pixels.draw(rows, HELD_OUT_RAYS // len(rows) + 1, generator)
-        parts, found = math.ceil(len(rays) / self.parts.most_rays), []
-        for part in (shard(rays, k, parts) for k in range(parts)):
-            draws = Draws.deterministic(len(part), count, self.processes.device)
-            found.append(self.field.sample(self.scene, part, draws)[0])
-        return rays, concatenate(found)
-
-    def _require_surface(self) -> None:
-        """Raise TrainingError if the surface is empty or fills the box. Of the background, rays through the box are
-        evaluated, away from outlines unless pixels are so large that there are no others."""
-        count = max(self.field.samples, MIN_SAMPLES_PER_RAY) if self.field.models_background else self.field.samples
-        rays, samples = self._sample_fixed_rays(self.train_rows, count)
-        coverage = self.field.coverage(samples)
-        beside = ~rays.person & (samples.in_box > 0).any(1)
-        clear = beside & ~rays.edge
-        person, around = coverage[rays.person].mean(), coverage[clear if clear.any() else beside].mean()
-        if not person >= MIN_PERSON_COVERAGE:  # also true for NaN
-            raise TrainingError(f"the surface is empty (covers {person:.0%} of the person): check masks and body fit")
-        if around > MAX_BACKGROUND_COVERAGE:
-            raise TrainingError(f"the surface fills the box (covers {around:.0%} of the surroundings): check the masks")
 
     def _state(self) -> dict[str, Any]:
         bodies = self.scene.bodies
@@ -395,20 +339,6 @@ def train(
     caller calls `remove_checkpoint`. Raises TrainingError if the surface collapses or the losses stay non-finite.
     """
     return Trainer(capture, masks, body, settings, out, processes or Distributed.join()).run()
-
-
-def _key(capture: Capture, masks: Masks, body: BodyFit, settings: TrainingSettings) -> str:
-    """Return a digest of what a training is made from, by which its checkpoint is known; of images, only which there
-    are, because the body was fitted to them."""
-    digest = hashlib.sha256(f"{settings.model_dump_json()} {capture.name} {capture.train_frames}".encode())
-    for camera in capture.cameras.values():
-        digest.update(f"{camera.name} {camera.width_px} {camera.height_px}".encode())
-        for numbers in (camera.K, camera.R, camera.t_m):
-            digest.update(np.ascontiguousarray(numbers, dtype=np.float64).tobytes())
-        digest.update(bytes((camera.name, frame) in masks for frame in capture.frames))
-    for tensor in (body.theta, body.root, body.rig.vertices_m):
-        digest.update(tensor.cpu().numpy().tobytes())
-    return digest.hexdigest()
 
 
 def _progress_message(row: dict[str, Any]) -> str:

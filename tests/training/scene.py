@@ -15,7 +15,7 @@ from hnerf.fields import fast
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.silhouette import silhouette
 from hnerf.render import trajectory
-from hnerf.training import trainer
+from hnerf.training import fixed_rays
 from tests.body.boxes import box_rig
 
 SIZE_PX = 32
@@ -51,8 +51,8 @@ TINY = TrainingSettings.model_validate(
 # For trainings of a dozen steps. They leave no surface worth judging, so few rays are rendered for the check and the
 # held-out PSNR; and the shell is tightened in coarse steps.
 SHRUNK_CONSTANTS: tuple[tuple[ModuleType, str, float], ...] = (
-    (trainer, "MIN_PERSON_COVERAGE", 0.0),
-    (trainer, "HELD_OUT_RAYS", 64),
+    (fixed_rays, "MIN_PERSON_COVERAGE", 0.0),
+    (fixed_rays, "RAYS", 64),
     (fast, "TIGHTEN_STEP_M", 0.02),
 )
 

@@ -9,10 +9,10 @@ from torch import nn
 from hnerf.fields.base import Field
 from hnerf.fields.fast import FastField
 from hnerf.fields.paper import PaperField
-from hnerf.training import trainer as trainer_module
+from hnerf.training import fixed_rays
 from hnerf.training.distributed import Distributed
 from hnerf.training.step import TrainingError
-from hnerf.training.trainer import MIN_PERSON_COVERAGE, Trainer
+from hnerf.training.trainer import Trainer
 from tests.training.scene import record, tiny
 
 FAR = 10.0  # units of the residual's last layer: metres away in either field
@@ -21,7 +21,7 @@ FAR = 10.0  # units of the residual's last layer: metres away in either field
 @pytest.fixture(autouse=True)
 def few_looks(monkeypatch: pytest.MonkeyPatch) -> None:
     """An eighth of the rays tells empty from full."""
-    monkeypatch.setattr(trainer_module, "HELD_OUT_RAYS", 256)
+    monkeypatch.setattr(fixed_rays, "RAYS", 256)
 
 
 def trainer_of(folder: Path, kind: str) -> Trainer:
@@ -47,9 +47,9 @@ def test_a_surface_between_the_samples_of_a_training_is_no_collapse(tmp_path: Pa
     """Two samples per ray, across 5 m, hardly ever fall into the column."""
     trainer = trainer_of(tmp_path, "paper")
     trainer.field.samples = 2
-    rays, samples = trainer._sample_fixed_rays(trainer.train_rows, 2)
-    assert trainer.field.coverage(samples)[rays.person].mean() < MIN_PERSON_COVERAGE
-    trainer._require_surface()
+    rays, samples = trainer.fixed_rays.sample(trainer.scene, trainer.train_rows, 2)
+    assert trainer.field.coverage(samples)[rays.person].mean() < fixed_rays.MIN_PERSON_COVERAGE
+    trainer.fixed_rays.require_surface(trainer.scene, trainer.train_rows)
 
 
 @pytest.mark.parametrize("kind", ["fast", "paper"])
@@ -71,4 +71,4 @@ def test_a_distance_that_is_not_a_number_is_no_surface(tmp_path: Path):
     trainer = trainer_of(tmp_path, "fast")
     move_surface(trainer.field, float("nan"))
     with pytest.raises(TrainingError, match="surface is empty"):
-        trainer._require_surface()
+        trainer.fixed_rays.require_surface(trainer.scene, trainer.train_rows)

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from hnerf.fields.conditions import Draws
+from hnerf.training import fixed_rays
 from hnerf.training import parts as parts_module
-from hnerf.training import trainer as trainer_module
 from hnerf.training.distributed import Distributed
 from hnerf.training.parts import GIB, PEAK_FACTOR, USABLE_SHARE, Parts, decide_parts
 from hnerf.training.pixels import PixelRays
@@ -92,14 +92,15 @@ def test_memory_changes_the_number_of_parts_and_not_the_gradients(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     """128 rays of 1 MB each in 50 MB: 43, 43 and 42. Evaluation during training is split likewise."""
-    monkeypatch.setattr(trainer_module, "HELD_OUT_RAYS", 300)
+    monkeypatch.setattr(fixed_rays, "RAYS", 300)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
     monkeypatch.setattr(parts_module, "_peak_bytes", lambda trial_loss, about, device: (about, 1e6 * about))
     found = []
     for memory_gib, count in ((None, 1), (50e6 / GIB, 3)):
         trainer = untrained(tmp_path, kind, ALONE, memory_gib=memory_gib)
         assert trainer.parts.count == count
-        found.append(gradients(trainer, trainer.objective) | {"psnr": torch.tensor(trainer._held_out_psnr())})
+        psnr = trainer.fixed_rays.psnr(trainer.scene, trainer.novel_rows)
+        found.append(gradients(trainer, trainer.objective) | {"psnr": torch.tensor(psnr)})
     assert found[0].keys() == found[1].keys()
     for name, gradient in found[0].items():
         torch.testing.assert_close(found[1][name], gradient, atol=1e-6, rtol=1e-4, msg=lambda m, n=name: f"{n}: {m}")

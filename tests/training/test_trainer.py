@@ -17,7 +17,7 @@ from hnerf.avatar.trained import load_avatar
 from hnerf.config import TrainingSettings, load_settings
 from hnerf.errors import InputError
 from hnerf.training import trainer as trainer_module
-from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint
+from hnerf.training.checkpoint import NAME, load_checkpoint, save_checkpoint, training_key
 from hnerf.training.distributed import Distributed
 from hnerf.training.pixels import PixelRays, Pixels
 from hnerf.training.step import TrainingError
@@ -323,8 +323,8 @@ def test_other_settings_and_poses_are_another_training(tmp_path: Path) -> None:
     capture, masks, body = record(tmp_path / "capture")
     moved = replace(body, root=body.root + 1e-3)
     scenes = [(body, TINY), (body, TINY.model_copy(update={"seed": 1})), (moved, TINY)]
-    keys = {trainer_module._key(capture, masks, used, settings) for used, settings in scenes}
-    assert len(keys) == 3 and trainer_module._key(capture, masks, body, TINY) in keys
+    keys = {training_key(capture, masks, used, settings) for used, settings in scenes}
+    assert len(keys) == 3 and training_key(capture, masks, body, TINY) in keys
 
 
 def test_a_full_disk_is_an_os_error(tmp_path: Path):

@@ -1,0 +1,65 @@
+"""What a field shows on rays that stay the same: its PSNR on unseen frames, and whether it has a surface."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hnerf.fields.base import Field
+from hnerf.fields.conditions import Draws, concatenate, shard
+from hnerf.fields.rays import PosedScene
+from hnerf.fields.samples import RaySamples
+from hnerf.training.losses import pixel_colour
+from hnerf.training.pixels import PixelRays, Pixels
+from hnerf.training.step import TrainingError
+
+RAYS = 2048
+MIN_PERSON_COVERAGE = 0.1  # of the person's pixels; below it the surface has collapsed
+MAX_BACKGROUND_COVERAGE = 0.8  # of the background pixels; above it the surface fills the box
+MIN_SAMPLES_PER_RAY = 64  # through a whole scene: valid-wave's body covers 38 % with 16, 59 % with 64, 64 % with 256
+
+
+@dataclass(frozen=True)
+class FixedRays:
+    """Rays through pixels, chosen by a seed; most_rays: how many fit into memory at once."""
+
+    field: Field
+    pixels: Pixels
+    seed: int
+    most_rays: float
+
+    @torch.no_grad()
+    def psnr(self, scene: PosedScene[Any], rows: Tensor) -> float:
+        """Return the PSNR on the person's pixels of the frames in rows."""
+        rays, samples = self.sample(scene, rows, self.field.samples)
+        mixed = rays.edge & (not self.field.models_background)  # with a background that only such a field models
+        error = (pixel_colour(samples.in_box * samples.alpha, samples) - rays.colour)[rays.person & ~mixed]
+        return float(-10 * torch.log10((error**2).mean()))
+
+    @torch.no_grad()
+    def require_surface(self, scene: PosedScene[Any], rows: Tensor) -> None:
+        """Raise TrainingError if the surface is empty or fills the box. Of the background, rays through the box are
+        evaluated, away from outlines unless pixels are so large that there are no others."""
+        count = max(self.field.samples, MIN_SAMPLES_PER_RAY) if self.field.models_background else self.field.samples
+        rays, samples = self.sample(scene, rows, count)
+        coverage = self.field.coverage(samples)
+        beside = ~rays.person & (samples.in_box > 0).any(1)
+        clear = beside & ~rays.edge
+        person, around = coverage[rays.person].mean(), coverage[clear if clear.any() else beside].mean()
+        if not person >= MIN_PERSON_COVERAGE:  # also true for NaN
+            raise TrainingError(f"the surface is empty (covers {person:.0%} of the person): check masks and body fit")
+        if around > MAX_BACKGROUND_COVERAGE:
+            raise TrainingError(f"the surface fills the box (covers {around:.0%} of the surroundings): check the masks")
+
+    def sample(self, scene: PosedScene[Any], rows: Tensor, count: int) -> tuple[PixelRays, RaySamples]:
+        """Return the rays at the frames in rows, and their samples as for rendering, with `count` random numbers per
+        ray."""
+        generator = torch.Generator(rows.device).manual_seed(self.seed)
+        rays = self.pixels.draw(rows, RAYS // len(rows) + 1, generator)
+        parts, found = math.ceil(len(rays) / self.most_rays), []
+        for part in (shard(rays, k, parts) for k in range(parts)):
+            draws = Draws.deterministic(len(part), count, rows.device)
+            found.append(self.field.sample(scene, part, draws)[0])
+        return rays, concatenate(found)
