@@ -16,6 +16,8 @@ from hnerf.config import AssetSettings
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.render.motion import select_poses
 
+LIGHT_INSIDE = 0.3  # factor of sRGB values
+
 
 def baked_textures(
     capture: Capture,
@@ -24,17 +26,20 @@ def baked_textures(
     surfaces_m: np.ndarray,
     layout: UvLayout,
     settings: AssetSettings,
+    cavities: np.ndarray | None = None,
 ) -> tuple[np.ndarray, Albedo | None]:
     """Return the texture of the clothed body, (H, W, 3) uint8 sRGB, and its albedo, unless it is the field's alone.
-    surfaces_m (n, V, 3): its surface in the world in each frame."""
-    texels = rasterise(layout, settings.texture_px)
+    surfaces_m (n, V, 3): its surface in the world in each frame; cavities (V,) bool: vertices deep inside mouth
+    and nose, which are as dark as places that little light gets to."""
+    texels, faces = rasterise(layout, settings.texture_px), clothed.rig.faces.numpy()
+    outer = np.ones(len(clothed.rig.vertices_m)) if cavities is None else ~cavities
+    lit = texels.interpolate(np.where(outer, 1.0, LIGHT_INSIDE)[:, None], faces)
     posed = select_poses(clothed, tuple(evenly_spaced(capture.train_frames, settings.texture_poses)))
-    field = field_colours(avatar, posed, texels)
+    field = field_colours(avatar, posed, texels, cavities)
     if not settings.photograph_frames:
-        return texture_image(texels, field, settings.texture_px), None
+        return texture_image(texels, field * lit, settings.texture_px), None
     frames = evenly_spaced(capture.train_frames, settings.photograph_frames)
     photographed = {frame: surfaces_m[clothed.index(frame)] for frame in frames}
-    faces = clothed.rig.faces.numpy()
     light = fit_light(photographed_shading(capture, avatar.gains, photographed, faces))
     seen_by_field = [surfaces_m[clothed.index(frame)] for frame in posed.frames]
     captured = CapturedBlend(field)
@@ -42,5 +47,5 @@ def baked_textures(
     for seen in photographed_texels(capture, avatar.gains, photographed, faces, texels):
         captured.add(seen)
         albedo.add(seen)
-    texture, delit = (texture_image(texels, blend.colours(), settings.texture_px) for blend in (captured, albedo))
+    texture, delit = (texture_image(texels, blend.colours() * lit, settings.texture_px) for blend in (captured, albedo))
     return texture, Albedo(delit, light)

@@ -88,7 +88,9 @@ def export_asset(
     timeless = avatar.without_frames()  # one texture serves all frames
     layout = surface.mesh.layout(settings.texture_px)
     with _timed("texture", seconds):
-        texture, albedo = baked_textures(capture, timeless, surface.body, surface.surfaces_m, layout, settings)
+        cavities = surface.mesh.base.cavities if surface.mesh.base else None
+        body, surfaces_m = surface.body, surface.surfaces_m
+        texture, albedo = baked_textures(capture, timeless, body, surfaces_m, layout, settings, cavities)
     with _timed("normal map", seconds):
         px = settings.normal_map_px
         normals = normal_map(timeless, surface.mesh, layout, px) if px else None
@@ -171,6 +173,7 @@ def _staged(
         albedo,
         normals,
         settings.level_faces,
+        surface.mesh.base.face_units_m if surface.mesh.base else {},
     )
 
 
@@ -188,6 +191,7 @@ def _figures(
         "texture_px": settings.texture_px,
         "normal_map_px": settings.normal_map_px,
         "light": light_figures(staged.albedo.light) if staged.albedo else None,
+        "expressions": list(staged.expressions_m),
         "joints": len(staged.rigs[FULL].skeleton.names),
         "rigs": {name: rig_figures(staged, name) for name in staged.rigs},
         "motions": motion_figures(staged),

@@ -1,4 +1,4 @@
-"""Poses that show how an asset bends: arms up, a deep squat, a fist, a turned head."""
+"""Poses and expressions that show how an asset bends: arms up, a deep squat, a fist, a turned head, an open jaw."""
 
 import math
 from collections.abc import Mapping
@@ -28,6 +28,12 @@ TURNED_HEAD = {"neck01": (0, 20, 0), "neck02": (0, 15, 0), "neck03": (0, 15, 0),
 FIST_DEG = (20.0, 35.0, 45.0, *4 * (80.0, 95.0, 60.0))  # flexion of segments from straight: the thumb's, then fingers'
 HAND = ("wrist.L", "metacarpal", "finger")  # beginnings of the names of joints
 HEAD = ("head", "neck", "eye")
+EXPRESSIONS = {
+    "Jaw open": ("jawOpen",),
+    "Smile": ("mouthSmileLeft", "mouthSmileRight"),
+    "Eyes closed": ("eyeBlinkLeft", "eyeBlinkRight"),
+    "Brows up": ("browInnerUp", "browOuterUpLeft", "browOuterUpRight"),
+}
 
 
 @dataclass(frozen=True)
@@ -42,8 +48,8 @@ class ExtremePose:
 
 
 def extreme_poses(staged: StagedAvatar, rig: Rig, skin_faces: int) -> list[ExtremePose]:
-    """Return the poses that a body has joints for. rig: the asset's, in body axes; skin_faces: how many of its first
-    faces are closed skin."""
+    """Return the poses that a body has joints for, and the expressions that it has. rig: the asset's, in body axes;
+    skin_faces: how many of its first faces are closed skin."""
     everything = np.ones(len(rig.vertices_m), bool)
     poses = {
         "Arms up": (turned(rig, ARMS_UP), everything),
@@ -51,13 +57,23 @@ def extreme_poses(staged: StagedAvatar, rig: Rig, skin_faces: int) -> list[Extre
         "Fist": (fist(rig), moved_by(rig, HAND) & (rig.vertices_m[:, 0] > 0).numpy()),
         "Turned head": (turned(rig, TURNED_HEAD), moved_by(rig, HEAD)),
     }
-    found = []
-    for name, (theta, shown) in poses.items():
-        if theta is not None:
-            points_m = posed_m(staged, rig, theta)
-            share = float(crossing_faces(points_m, staged.faces[:skin_faces]).mean())
-            found.append(ExtremePose(name, points_m, shown, share))
-    return found
+    surfaces = {n: (posed_m(staged, rig, theta), shown) for n, (theta, shown) in poses.items() if theta is not None}
+    surfaces |= with_expressions(staged)
+    return [
+        ExtremePose(name, points_m, shown, float(crossing_faces(points_m, staged.faces[:skin_faces]).mean()))
+        for name, (points_m, shown) in surfaces.items()
+    ]
+
+
+def with_expressions(staged: StagedAvatar) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return the surface at rest (V, 3) with each of `EXPRESSIONS`, and the points (V,) bool of the face, by name;
+    nothing if the asset has no expressions."""
+    units = staged.expressions_m
+    if not units:
+        return {}
+    face = np.any([moved_m.any(1) for moved_m in units.values()], 0)
+    moved_m = {name: np.sum([units[unit] for unit in parts], 0) for name, parts in EXPRESSIONS.items()}
+    return {name: (staged.rest_points_m + m, face) for name, m in moved_m.items()}
 
 
 def turned(rig: Rig, turns_deg: Mapping[str, tuple[float, float, float]]) -> Tensor | None:

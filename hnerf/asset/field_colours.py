@@ -24,18 +24,20 @@ log = logging.getLogger("hnerf.asset")
 
 
 @torch.no_grad()
-def field_colours(avatar: Avatar, clothed: BodyFit, texels: Texels) -> np.ndarray:
+def field_colours(avatar: Avatar, clothed: BodyFit, texels: Texels, cavities: np.ndarray | None = None) -> np.ndarray:
     """Return the field's colour at each texel, (N, 3): its radiance along the inward normal, the median over the poses
     of `clothed`.
 
     Poses of the capture keep the field's conditioning within what it was trained on; the median rejects a pose in which
     that spot touches another limb. A texel that lies off the field's surface in all poses takes the colour of the mesh
-    around it.
+    around it, and so do vertices that line cavities, (V,) bool, of which the field has no surface.
     """
-    seen = []
+    seen, outer = [], torch.ones(len(clothed.rig.vertices_m), dtype=torch.bool)
+    if cavities is not None:
+        outer = ~torch.from_numpy(cavities)
     for frame, theta, root in zip(clothed.frames, clothed.theta, clothed.root, strict=True):
         log.info("texture: %d texels in the pose of frame %d", len(texels.face), frame)
-        seen.append(_colours_in_pose(avatar, clothed.rig, texels, theta, root).numpy())
+        seen.append(_colours_in_pose(avatar, clothed.rig, texels, theta, root, outer).numpy())
     return filled(median_of_seen(np.stack(seen)), texels, clothed.rig)
 
 
@@ -69,14 +71,14 @@ def filled(colours: np.ndarray, texels: Texels, rig: Rig) -> np.ndarray:
     return result
 
 
-def _colours_in_pose(avatar: Avatar, rig: Rig, texels: Texels, theta: Tensor, root: Tensor) -> Tensor:
+def _colours_in_pose(avatar: Avatar, rig: Rig, texels: Texels, theta: Tensor, root: Tensor, outer: Tensor) -> Tensor:
     """Return the radiance at each texel of the surface posed by theta (J, 3) and root (4, 4), (N, 3) on the CPU; NaN
-    off the field's surface."""
+    off the field's surface, and except on outer vertices (V,)."""
     device = avatar.body.rig.vertices_m.device
     vertices_m, faces = pose_vertices(rig, theta, root).to(device), rig.faces.to(device)
     theta, root = theta.to(device), root.to(device)
     surface_m, normals = move_onto_surface(avatar, vertices_m, faces, theta, root)  # skinning only approximates it
-    on_surface = avatar.signed_distance(surface_m, theta, root).abs() <= OFF_SURFACE_M
+    on_surface = outer.to(device) & (avatar.signed_distance(surface_m, theta, root).abs() <= OFF_SURFACE_M)
     shown = torch.nonzero(on_surface[faces].all(1)[texels.face.to(device)])[:, 0]
     corners, weights = faces[texels.face.to(device)[shown]], texels.barycentric.to(device)[shown, :, None]
     points_m = (surface_m[corners] * weights).sum(1)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from hnerf.asset.rigs import JointMotion, StagedRig
 from hnerf.asset.skeleton import Skeleton
 from hnerf.asset.skinning import Skin
-from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar
+from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar, moved_points, shape_names
 from hnerf.asset.tangents import uv_tangents
 from hnerf.asset.texture import UvLayout
 from hnerf.body.descriptor import normals_of
@@ -54,6 +54,29 @@ class GlbWriter:
         )
         return len(self.document.accessors) - 1
 
+    def sparse_accessor(self, values: np.ndarray, at: np.ndarray, count: int) -> int:
+        """Append an array of `count` elements that are zero but for float32 values (n, C) at n of them, in rising
+        order; return the index of the accessor."""
+        sparse = gltf.Sparse(
+            count=len(at),
+            indices=gltf.AccessorSparseIndices(
+                bufferView=self.view(at.astype(np.uint32).tobytes()), componentType=gltf.UNSIGNED_INT
+            ),
+            values=gltf.AccessorSparseValues(bufferView=self.view(np.ascontiguousarray(values).tobytes())),
+        )
+        self.document.accessors.append(
+            gltf.Accessor(
+                byteOffset=None,
+                componentType=gltf.FLOAT,
+                count=count,
+                type=SHAPES[values.shape[1:]],
+                min=np.minimum(values.min(0), 0).tolist(),
+                max=np.maximum(values.max(0), 0).tolist(),
+                sparse=sparse,
+            )
+        )
+        return len(self.document.accessors) - 1
+
     def save(self, path: Path) -> None:
         """Write the document to a file."""
         self.document.buffers[0].byteLength = len(self._chunk)
@@ -67,10 +90,12 @@ def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig) -> None:
     writer = GlbWriter()
     document = writer.document
     _add_joints(document, rig.skeleton)
-    no_weights = [0.0] * len(avatar.shapes_m)
+    names = [*shape_names(avatar), *avatar.expressions_m]
     primitive = _primitive(writer, avatar, rig.skin)
     _add_materials(writer, avatar, primitive)
-    document.meshes.append(gltf.Mesh(primitives=[primitive], weights=no_weights or None))
+    document.meshes.append(
+        gltf.Mesh(primitives=[primitive], weights=[0.0] * len(names) or None, extras={"targetNames": names})
+    )
     inverse_bind = np.linalg.inv(rig.skeleton.bind).swapaxes(1, 2).astype(np.float32)  # stored by columns
     joints = list(range(len(rig.skeleton.names)))
     document.skins.append(gltf.Skin(inverseBindMatrices=writer.accessor(inverse_bind), joints=joints, skeleton=0))
@@ -78,7 +103,7 @@ def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig) -> None:
     document.scenes[0].nodes = [0, len(joints)]
     for name, motion in rig.motions.items():
         if name not in RESAMPLED:
-            document.animations.append(_animation(writer, name, motion, rig.skeleton))
+            document.animations.append(_animation(writer, name, motion, rig.skeleton, len(names)))
     writer.save(path)
 
 
@@ -92,8 +117,8 @@ def _add_joints(document: gltf.GLTF2, skeleton: Skeleton) -> None:
 
 
 def _primitive(writer: GlbWriter, avatar: StagedAvatar, skin: Skin) -> gltf.Primitive:
-    """Add the mesh and its correctives, with vertices split at the texture's seams; skin influences beyond four go into
-    a second set."""
+    """Add the mesh, its correctives and its expressions, with vertices split at the texture's seams; skin influences
+    beyond four go into a second set."""
     vertex = np.zeros(len(avatar.uvs), np.int64)
     vertex[avatar.face_uvs] = avatar.faces
     normals = normals_of(avatar.rest_points_m, avatar.faces)
@@ -113,6 +138,9 @@ def _primitive(writer: GlbWriter, avatar: StagedAvatar, skin: Skin) -> gltf.Prim
         setattr(attributes, f"WEIGHTS_{start // 4}", _vertex_data(writer, weights[:, start : start + 4], np.float32))
     indices = writer.accessor(avatar.face_uvs.astype(np.uint32).ravel(), gltf.ELEMENT_ARRAY_BUFFER)
     targets = [gltf.Attributes(POSITION=_vertex_data(writer, shape[vertex], np.float32)) for shape in avatar.shapes_m]
+    for moved_m in (offsets_m[vertex] for offsets_m in avatar.expressions_m.values()):
+        at = moved_points(moved_m)
+        targets.append(gltf.Attributes(POSITION=writer.sparse_accessor(moved_m[at], at, len(vertex))))
     return gltf.Primitive(attributes=attributes, indices=indices, material=0, targets=targets or None)
 
 
@@ -148,9 +176,9 @@ def _add_texture(writer: GlbWriter, image: np.ndarray) -> int:
     return len(writer.document.textures) - 1
 
 
-def _animation(writer: GlbWriter, name: str, motion: JointMotion, skeleton: Skeleton) -> gltf.Animation:
+def _animation(writer: GlbWriter, name: str, motion: JointMotion, skeleton: Skeleton, shapes: int) -> gltf.Animation:
     """Add what moves: translations and rotations of joints that leave their place at rest, and the weights of the
-    correctives."""
+    correctives; those of expressions, which follow them up to a number of shapes, are 0."""
     animation = gltf.Animation(name=name, channels=[], samplers=[])
     times = writer.accessor(((motion.codes - motion.codes[0]) / motion.fps).astype(np.float32))
 
@@ -168,5 +196,6 @@ def _animation(writer: GlbWriter, name: str, motion: JointMotion, skeleton: Skel
         if (1 - np.abs(motion.quaternions[:, joint] @ turned[joint])).max() > STILL**2 / 8:
             animate(joint, "rotation", motion.quaternions[:, joint])
     if motion.shape_weights.size:
-        animate(len(skeleton.names), "weights", motion.shape_weights.ravel())
+        weights = np.pad(motion.shape_weights, ((0, 0), (0, shapes - motion.shape_weights.shape[1])))
+        animate(len(skeleton.names), "weights", weights.ravel())
     return animation

@@ -50,9 +50,12 @@ def _shape_defects(prim: Usd.Prim, vertices: int) -> list[str]:
     if len(names) != len(targets):
         return [f"{prim.GetPath()}: {len(names)} blend shapes but {len(targets)} targets"]
     for target in targets:
-        offsets = np.array(UsdSkel.BlendShape(prim.GetStage().GetPrimAtPath(target)).GetOffsetsAttr().Get() or [])
-        if offsets.shape != (vertices, 3) or not np.isfinite(offsets).all():
+        shape = UsdSkel.BlendShape(prim.GetStage().GetPrimAtPath(target))
+        offsets, points = np.array(shape.GetOffsetsAttr().Get() or []), shape.GetPointIndicesAttr().Get()
+        if offsets.shape != (len(points) if points else vertices, 3) or not np.isfinite(offsets).all():
             return [f"{target}: offsets are not finite or not one a point"]
+        if points and not 0 <= min(points) <= max(points) < vertices:
+            return [f"{target}: point index out of range"]
     return []
 
 

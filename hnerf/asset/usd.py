@@ -13,7 +13,7 @@ from hnerf.asset.quads import polygon_corners
 from hnerf.asset.rigs import StagedRig
 from hnerf.asset.skeleton import Skeleton
 from hnerf.asset.srgb import to_linear
-from hnerf.asset.staging import REST_POSE, StagedAvatar
+from hnerf.asset.staging import REST_POSE, StagedAvatar, moved_points, shape_names
 from hnerf.body.descriptor import normals_of
 from hnerf.body.skeletons import EQUIVALENTS, SKELETONS
 from hnerf.geometry.camera import Camera
@@ -47,15 +47,19 @@ def author_geometry(stage: Usd.Stage, avatar: StagedAvatar, level: int) -> None:
     mesh.CreatePointsAttr(vec3f(avatar.rest_points_m[kept]))
     mesh.CreateExtentAttr(extent(avatar.rest_points_m[kept]))
     mesh.CreateNormalsAttr(vec3f(normals_of(avatar.rest_points_m, avatar.faces)[kept]))
-    names, targets = shape_names(avatar), []
-    for name, offsets_m in zip(names, avatar.shapes_m, strict=True):
-        shape = UsdSkel.BlendShape.Define(stage, path.AppendChild(name))
-        shape.CreateOffsetsAttr(vec3f(offsets_m[kept]))
-        targets.append(shape.GetPath())
+    shapes = []
+    for name, offsets_m in zip(shape_names(avatar), avatar.shapes_m, strict=True):
+        shapes.append(UsdSkel.BlendShape.Define(stage, path.AppendChild(name)))
+        shapes[-1].CreateOffsetsAttr(vec3f(offsets_m[kept]))
+    for name, offsets_m in avatar.expressions_m.items():
+        if len(moved := moved_points(offsets_m[kept])):  # no points would mean all points
+            shapes.append(UsdSkel.BlendShape.Define(stage, path.AppendChild(name)))
+            shapes[-1].CreateOffsetsAttr(vec3f(offsets_m[kept][moved]))
+            shapes[-1].CreatePointIndicesAttr(Vt.IntArray.FromNumpy(moved.astype(np.int32)))
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1))
-    binding.CreateBlendShapesAttr(names)
-    binding.CreateBlendShapeTargetsRel().SetTargets(targets)
+    binding.CreateBlendShapesAttr([shape.GetPrim().GetName() for shape in shapes])
+    binding.CreateBlendShapeTargetsRel().SetTargets([shape.GetPath() for shape in shapes])
 
 
 def author_captured_look(stage: Usd.Stage, meshes: Iterable[Sdf.Path], avatar: StagedAvatar) -> None:
@@ -226,11 +230,6 @@ def define_mesh(stage: Usd.Stage, path: Sdf.Path, avatar: StagedAvatar, level: i
     colours = to_linear(avatar.vertex_colours[shown.vertices] / 255)
     mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(vec3f(colours))
     return mesh
-
-
-def shape_names(avatar: StagedAvatar) -> list[str]:
-    """Return the names of the corrective blend shapes."""
-    return [f"corrective_{k + 1:02d}" for k in range(len(avatar.shapes_m))]
 
 
 def vec3f(values: np.ndarray) -> Vt.Vec3fArray:

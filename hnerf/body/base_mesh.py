@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from hnerf.body.anny import BETA_NAMES, anny_model
+from hnerf.body.face_units import face_units_m
 from hnerf.body.rig import Rig
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 
@@ -27,7 +28,7 @@ class BaseMesh:
 
     hidden (V,) bool: inside the mouth, nose and eye sockets, or on an eyeball, where no outer surface is to be found;
     skin_faces: how many of the first faces are the body's own skin. uvs (U, 2) v up, face_uvs (F, 3): the model's own
-    texture coordinates; None if it has none.
+    texture coordinates; None if it has none. face_units_m (V, 3) float32, by name: how expressions move the vertices.
     """
 
     rig: Rig
@@ -35,12 +36,23 @@ class BaseMesh:
     skin_faces: int
     uvs: np.ndarray | None
     face_uvs: np.ndarray | None
+    face_units_m: dict[str, np.ndarray]
+
+    @property
+    def cavities(self) -> np.ndarray:
+        """Return which vertices of the skin are hidden, with two edges at least to any that is not, (V,) bool."""
+        faces, deep = self.rig.faces[: self.skin_faces].numpy(), np.zeros_like(self.hidden)
+        deep[faces[self.hidden[faces].all(1)]] = True
+        for _ in range(2):
+            deep[faces[~deep[faces].all(1)]] = False
+        return deep
 
 
 def base_mesh(rig: Rig) -> BaseMesh:
-    """Return the mesh of a rig at its shape. Only anny's has eyeballs, cavities and texture coordinates."""
+    """Return the mesh of a rig at its shape. Only anny's has eyeballs, cavities, texture coordinates and expressions,
+    which leave the eyeballs to their joints."""
     if rig.beta_names != BETA_NAMES:
-        return BaseMesh(rig, np.zeros(len(rig.vertices_m), bool), len(rig.faces), None, None)
+        return BaseMesh(rig, np.zeros(len(rig.vertices_m), bool), len(rig.faces), None, None, {})
     model, eyes, sides = anny_model(), _eyes(), ("eye.L", "eye.R")
     placed_m = [_in_socket(rig, eye_m) for eye_m in eyes.vertices_m]
     joints = torch.tensor([rig.joint_names.index(name) for name in sides]).repeat_interleave(len(placed_m[0]))
@@ -55,7 +67,8 @@ def base_mesh(rig: Rig) -> BaseMesh:
     hidden = np.concatenate([_cavities(), np.ones(len(joints), bool)])
     uvs = np.concatenate([model.texture_coordinates.numpy(), eyes.uvs])
     face_uvs = np.concatenate([model.face_texture_coordinate_indices.numpy(), eyes.face_uvs + len(uvs) - len(eyes.uvs)])
-    return BaseMesh(shown, hidden, len(rig.faces), uvs.astype(np.float32), face_uvs)
+    units_m = {name: np.pad(moved, ((0, len(joints)), (0, 0))) for name, moved in face_units_m(rig).items()}
+    return BaseMesh(shown, hidden, len(rig.faces), uvs.astype(np.float32), face_uvs, units_m)
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from tests.asset.figure import bending_body, posed_with_displacements, upright_c
 
 @pytest.fixture(scope="session")
 def staged() -> StagedAvatar:
-    """Return clothes around the bending column, of 816 and of 400 faces, with two shapes of noise, textures and a
-    normal map of noise, and light from above."""
+    """Return clothes around the bending column, of 816 and of 400 faces, with two shapes of noise, a frown of
+    its top, textures and a normal map of noise, and light from above."""
     body = bending_body()
     clothes = upright_column(0.18, -0.05, 1.65)
     layout = unwrap(clothes.vertices, clothes.faces, 64)
@@ -28,6 +28,18 @@ def staged() -> StagedAvatar:
     normals = rng.integers(100, 156, (32, 32, 3), np.uint8)
     shapes = correctives_of(moved_m, 2)
     albedo = Albedo(rng.integers(0, 255, (64, 64, 3), np.uint8), Light(np.array([0.7, 0, 0.26, 0, 0, 0, 0, 0, 0]), 9.0))
+    top = clothes.vertices[:, 2] > 1.6
+    frown_m = np.where(top[:, None], (0.01, 0.02, 0.03), 0).astype(np.float32)  # left, back, up
     return stage_avatar(
-        clothed, surfaces_m, shapes, layout, texture, "z", 10.0, albedo=albedo, normal_map=normals, level_faces=[400]
+        clothed,
+        surfaces_m,
+        shapes,
+        layout,
+        texture,
+        "z",
+        10.0,
+        albedo=albedo,
+        normal_map=normals,
+        level_faces=[400],
+        expressions_m={"frown": frown_m},
     )

@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from hnerf.asset.baking import baked_textures
+from hnerf.asset.baking import LIGHT_INSIDE, baked_textures
 from hnerf.asset.light import Light
 from hnerf.asset.srgb import to_linear, to_srgb
-from hnerf.asset.texture import unwrap
+from hnerf.asset.texture import rasterise, unwrap
 from hnerf.body.descriptor import normals_of
 from hnerf.body.rig import pose_vertices
 from hnerf.capture.capture import Capture
@@ -80,3 +80,23 @@ def test_there_is_no_albedo_without_photographs() -> None:
     settings = SETTINGS.model_copy(update={"photograph_frames": 0})
     texture, albedo = baked_textures(figure.capture(), Grey(body), body, np.zeros(0), layout, settings)
     assert albedo is None and texture.shape == (64, 64, 3)
+
+
+def test_cavities_are_dark(pictures: dict[int, np.ndarray]) -> None:
+    """The upper half of the column is declared a cavity."""
+    body = figure.bending_body()
+    vertices_m, faces = body.rig.vertices_m.numpy(), body.rig.faces.numpy()
+    still_m = np.zeros((len(body.frames), *vertices_m.shape), np.float32)
+    surfaces_m = figure.posed_with_displacements(body, still_m).astype(float)
+    layout = unwrap(vertices_m, faces, 64)
+    capture = Pictured(**vars(figure.capture()), pictures=pictures)
+    texels = rasterise(layout, 64)
+    z_m = vertices_m[faces[texels.face.numpy()]][..., 2]
+    for photographs in (0, 3):
+        settings, shown = SETTINGS.model_copy(update={"photograph_frames": photographs}), []
+        for cavities in (None, vertices_m[:, 2] > 0.85):
+            texture, _ = baked_textures(capture, Grey(body), body, surfaces_m, layout, settings, cavities)
+            shown.append(texture[texels.row, texels.column, 0].astype(float))
+        ratio = shown[1] / shown[0]
+        assert np.median(ratio[z_m.min(1) > 0.85]) == pytest.approx(LIGHT_INSIDE, abs=0.05)
+        np.testing.assert_allclose(ratio[z_m.max(1) < 0.6], 1, atol=0.02)

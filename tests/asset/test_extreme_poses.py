@@ -5,7 +5,18 @@ import numpy as np
 import pytest
 import torch
 
-from hnerf.asset.extreme_poses import ARMS_UP, DEEP_SQUAT, TURNED_HEAD, extreme_poses, fist, moved_by, posed_m, turned
+from hnerf.asset.extreme_poses import (
+    ARMS_UP,
+    DEEP_SQUAT,
+    EXPRESSIONS,
+    TURNED_HEAD,
+    extreme_poses,
+    fist,
+    moved_by,
+    posed_m,
+    turned,
+    with_expressions,
+)
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.staging import StagedAvatar
 from hnerf.body.anny import anny_rig
@@ -42,7 +53,21 @@ def test_the_column_bows_to_the_front(staged: StagedAvatar) -> None:
 
 
 def test_a_body_without_these_joints_has_no_such_poses(staged: StagedAvatar) -> None:
-    assert extreme_poses(staged, clothed_rig(column_rig(), upright_column(0.18, -0.05, 1.65)), 0) == []
+    faceless = dataclasses.replace(staged, expressions_m={})
+    assert extreme_poses(faceless, clothed_rig(column_rig(), upright_column(0.18, -0.05, 1.65)), 0) == []
+
+
+def test_an_expression_is_the_sum_of_its_units(staged: StagedAvatar) -> None:
+    units = {name: np.zeros((len(staged.rest_points_m), 3)) for parts in EXPRESSIONS.values() for name in parts}
+    units["mouthSmileLeft"][0], units["mouthSmileRight"][1], units["jawOpen"][1] = (0.01, 0, 0), (0.02, 0, 0), (0, 1, 0)
+    shown = with_expressions(dataclasses.replace(staged, expressions_m=units))
+    assert list(shown) == list(EXPRESSIONS)
+    smile_m, face = shown["Smile"]
+    np.testing.assert_allclose(
+        (smile_m - staged.rest_points_m)[:3], [[0.01, 0, 0], [0.02, 0, 0], [0, 0, 0]], atol=1e-12
+    )
+    np.testing.assert_array_equal(np.flatnonzero(face), [0, 1])
+    assert with_expressions(dataclasses.replace(staged, expressions_m={})) == {}
 
 
 def test_poses_are_what_their_names_say(body: Rig) -> None:

@@ -67,6 +67,24 @@ def test_texels_off_the_fields_surface_take_the_colour_around() -> None:
     assert colours[z_m > 1.7].min() > 0.7
 
 
+def test_cavities_take_the_colour_around() -> None:
+    """The upper half of a column is declared a cavity: the lower half is red, and so all of it is."""
+
+    class Halves(StandInAvatar):
+        def colour(self, points_m: Tensor, directions: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+            return torch.where(points_m[:, 2:] < 0.85, torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0]))
+
+    body = BodyFit(column_rig(), (0,), torch.zeros(1, 2, 3), torch.eye(4)[None])
+    clothes = upright_column(0.16, 0.0, 1.6)
+    texels = rasterise(unwrap(clothes.vertices, clothes.faces, 64), 64)
+    posed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
+    z_m = clothes.triangles_center[texels.face.numpy(), 2]
+    for cavities, above in ((None, [0, 1, 0]), (clothes.vertices[:, 2] > 0.75, [1, 0, 0])):
+        colours = field_colours(Halves(body), posed, texels, cavities)
+        np.testing.assert_allclose(np.median(colours[z_m > 0.9], 0), above, atol=1e-3)
+        np.testing.assert_allclose(np.median(colours[z_m < 0.7], 0), [1, 0, 0], atol=1e-3)
+
+
 def test_median_of_what_is_seen() -> None:
     nan = np.nan
     poses = np.array([[3.0, nan, nan, nan], [1.0, 4.0, 7.0, nan], [2.0, 1.0, nan, nan]])[..., None] * np.ones(3)

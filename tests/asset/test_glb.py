@@ -44,9 +44,19 @@ def glb(rig: str, staged: StagedAvatar, tmp_path_factory: pytest.TempPathFactory
 def accessor(document: pygltflib.GLTF2, index: int) -> np.ndarray:
     """Return the numbers of an accessor."""
     item = document.accessors[index]
-    view = document.bufferViews[item.bufferView]
+    if item.sparse:
+        at = numbers(document, item.sparse.indices.bufferView, item.sparse.indices.componentType)
+        values = np.zeros((item.count, 3), np.float32)
+        values[at] = numbers(document, item.sparse.values.bufferView, item.componentType).reshape(-1, 3)
+        return values
+    return numbers(document, item.bufferView, item.componentType).reshape(item.count, -1)
+
+
+def numbers(document: pygltflib.GLTF2, buffer_view: int, component_type: int) -> np.ndarray:
+    """Return what a buffer view holds."""
+    view = document.bufferViews[buffer_view]
     data = document.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
-    return np.frombuffer(data, TYPES[item.componentType]).reshape(item.count, -1)
+    return np.frombuffer(data, TYPES[component_type])
 
 
 def played(document: pygltflib.GLTF2, key: int) -> np.ndarray:
@@ -174,11 +184,25 @@ def test_correctives_are_morph_targets_with_a_weight_a_frame(glb: Path, staged: 
     (primitive,) = document.meshes[0].primitives
     vertex = np.zeros(len(staged.uvs), int)
     vertex[staged.face_uvs] = staged.faces
-    for target, shape_m in zip(primitive.targets, staged.shapes_m, strict=True):
+    for target, shape_m in zip(primitive.targets[:-1], staged.shapes_m, strict=True):
         np.testing.assert_allclose(accessor(document, target["POSITION"]), shape_m[vertex], atol=1e-7)
-    weights = accessor(document, document.animations[0].samplers[-1].output)
+    weights = accessor(document, document.animations[0].samplers[-1].output).reshape(len(FRAMES), -1)
     expected = staged.rigs["full"].motions["captured"].shape_weights
-    np.testing.assert_allclose(weights.reshape(len(FRAMES), -1), expected)
+    np.testing.assert_allclose(weights[:, :-1], expected)
+    assert (weights[:, -1] == 0).all()  # of the expression
+
+
+def test_expressions_are_morph_targets_after_the_correctives(glb: Path, staged: StagedAvatar) -> None:
+    document = pygltflib.GLTF2.load(str(glb))
+    (mesh,) = document.meshes
+    assert mesh.extras["targetNames"] == ["corrective_01", "corrective_02", "corrective_03", "frown"]
+    assert len(mesh.primitives[0].targets) == len(mesh.weights) == 4
+    vertex = np.zeros(len(staged.uvs), int)
+    vertex[staged.face_uvs] = staged.faces
+    item = document.accessors[mesh.primitives[0].targets[-1]["POSITION"]]
+    frown_m = accessor(document, mesh.primitives[0].targets[-1]["POSITION"])
+    np.testing.assert_allclose(frown_m, staged.expressions_m["frown"][vertex], atol=1e-7)
+    np.testing.assert_allclose((item.min, item.max), ([0, 0, -0.02], [0.01, 0.03, 0]), atol=1e-7)
 
 
 def test_the_khronos_validator_finds_nothing(glb: Path) -> None:

@@ -34,7 +34,8 @@ def skinned_points(stage: Usd.Stage, code: float) -> np.ndarray:
     binding, points = UsdSkel.BindingAPI(mesh.GetPrim()), np.array(mesh.GetPointsAttr().Get())
     targets = binding.GetBlendShapeTargetsRel().GetTargets()
     for name, path in zip(binding.GetBlendShapesAttr().Get(), targets, strict=True):
-        points += weights[name] * np.array(UsdSkel.BlendShape(stage.GetPrimAtPath(path)).GetOffsetsAttr().Get())
+        if name in weights:
+            points += weights[name] * np.array(UsdSkel.BlendShape(stage.GetPrimAtPath(path)).GetOffsetsAttr().Get())
     moved = Vt.Vec3fArray.FromNumpy(points)
     skinning = cache.GetSkinningQuery(mesh.GetPrim())
     assert skinning.ComputeSkinnedPoints(skeleton.ComputeSkinningTransforms(code), moved, code)
@@ -105,6 +106,40 @@ def test_the_captured_frames_are_the_time_codes(name: str, package: Path, staged
     assert motion.GetRotationsAttr().GetTimeSamples() == list(FRAMES)
     for frame, expected in zip(FRAMES, staged.points_m, strict=True):
         np.testing.assert_allclose(skinned_points(stage, frame), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("lod", ["lod0", "lod1"])
+def test_expressions_are_shapes_of_some_points_that_no_motion_uses(
+    lod: str, package: Path, staged: StagedAvatar
+) -> None:
+    stage = Usd.Stage.Open(str(package / "avatar.usda"))
+    stage.SetEditTarget(stage.GetSessionLayer())
+    stage.GetDefaultPrim().GetVariantSet("lod").SetVariantSelection(lod)
+    (mesh,) = (prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
+    used = UsdSkel.Animation(stage.GetPrimAtPath("/Avatar/Body/Motion/full")).GetBlendShapesAttr().Get()
+    assert list(UsdSkel.BindingAPI(mesh).GetBlendShapesAttr().Get()) == [
+        *used,
+        "frown",
+    ]  # of "nothing", nothing is left
+    frown = UsdSkel.BlendShape(stage.GetPrimAtPath(mesh.GetPath().AppendChild("frown")))
+    moved_m = np.zeros((len(UsdGeom.Mesh(mesh).GetPointsAttr().Get()), 3))
+    moved_m[np.array(frown.GetPointIndicesAttr().Get())] = frown.GetOffsetsAttr().Get()
+    np.testing.assert_allclose(moved_m, staged.expressions_m["frown"][staged.levels[int(lod[-1])].vertices], atol=1e-7)
+    assert 0 < len(frown.GetOffsetsAttr().Get()) < len(moved_m) / 2
+
+
+def test_a_level_without_the_points_of_an_expression_does_without_it(staged: StagedAvatar, tmp_path: Path) -> None:
+    gone = np.setdiff1d(staged.levels[0].vertices, staged.levels[1].vertices)[0]
+    wink_m = np.zeros((len(staged.rest_points_m), 3), np.float32)
+    wink_m[gone] = 0.01
+    write_usdz(tmp_path / "wink.usdz", dataclasses.replace(staged, expressions_m={"wink": wink_m}), [], 10.0, INFO)
+    stage = Usd.Stage.Open(str(tmp_path / "wink.usdz"))
+    found = {}
+    for level in ("lod0", "lod1"):
+        stage.GetDefaultPrim().GetVariantSet("lod").SetVariantSelection(level)
+        (mesh,) = (prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
+        found[level] = "wink" in UsdSkel.BindingAPI(mesh).GetBlendShapesAttr().Get()
+    assert found == {"lod0": True, "lod1": False}
 
 
 @pytest.mark.parametrize("rate", [24, 30])

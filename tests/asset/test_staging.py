@@ -6,7 +6,7 @@ import torch
 
 from hnerf.asset.correctives import correctives_of
 from hnerf.asset.levels import Level
-from hnerf.asset.staging import StagedAvatar, stage_avatar, stage_from_world
+from hnerf.asset.staging import StagedAvatar, moved_points, stage_avatar, stage_from_world
 from hnerf.asset.texture import UvLayout
 from hnerf.body.fit_result import BodyFit
 from tests.asset.figure import FRAMES, bending_body, column_rig
@@ -84,6 +84,14 @@ def test_a_vertex_has_the_colour_of_its_texel(staged: StagedAvatar) -> None:
         texture=texture,
     )
     np.testing.assert_array_equal(triangle.vertex_colours, [[3, 0, 0], [3, 3, 0], [0, 0, 0]])
+
+
+def test_expressions_turn_to_the_stages_axes(staged: StagedAvatar) -> None:
+    moved_m = staged.expressions_m["frown"]
+    top = moved_points(moved_m)
+    np.testing.assert_array_equal(top, np.flatnonzero(staged.rest_points_m[:, 1] > 1.65))  # 5 cm were below the ground
+    np.testing.assert_allclose(moved_m[top], np.tile([0.01, 0.03, -0.02], (len(top), 1)), atol=1e-7)
+    assert len(moved_points(np.full((4, 3), 1e-6))) == 0
 
 
 @pytest.mark.parametrize("up", ["y", "z"])

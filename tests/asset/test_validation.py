@@ -135,6 +135,16 @@ def short_shape(stage: Usd.Stage) -> None:
     shape.GetOffsetsAttr().Set([Gf.Vec3f(0)] * 5)
 
 
+def shape_of_no_point(stage: Usd.Stage) -> None:
+    frown = UsdSkel.BlendShape(stage.GetPrimAtPath(f"{BODY}/Surface/frown"))
+    change(frown.GetPointIndicesAttr(), 0, len(mesh(stage).GetPointsAttr().Get()))
+
+
+def short_expression(stage: Usd.Stage) -> None:
+    frown = UsdSkel.BlendShape(stage.GetPrimAtPath(f"{BODY}/Surface/frown"))
+    frown.GetOffsetsAttr().Set(frown.GetOffsetsAttr().Get()[:-1])
+
+
 def shape_without_target(stage: Usd.Stage) -> None:
     UsdSkel.BindingAPI(mesh(stage)).GetBlendShapesAttr().Set(["smile"])
 
@@ -201,7 +211,9 @@ def no_default_prim(stage: Usd.Stage) -> None:
         (floating, "its lowest point at rest is at height 0.3 m"),
         (one_eye, "skin follows one eye and not the other"),
         (short_shape, "corrective_01: offsets are not finite or not one a point"),
-        (shape_without_target, "1 blend shapes but 3 targets"),
+        (shape_without_target, "1 blend shapes but 4 targets"),
+        (shape_of_no_point, "frown: point index out of range"),
+        (short_expression, "frown: offsets are not finite or not one a point"),
         (negative_weight, "blend shape weights are not one a shape from 0 to 1 at time 5"),
         (no_colours, "1 display colours for its points"),
         (no_material, "/Avatar/Body/Surface: no material is bound"),

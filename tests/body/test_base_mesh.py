@@ -44,6 +44,16 @@ def test_eyeballs_lie_about_their_joints_and_turn_with_them(shown: BaseMesh) -> 
     assert not shown.hidden[shown.rig.vertices_m[:, 2].argmax()]
 
 
+def test_cavities_are_deeper_than_what_is_hidden(shown: BaseMesh) -> None:
+    faces = shown.rig.faces[: shown.skin_faces].numpy()
+    mesh = trimesh.Trimesh(shown.rig.vertices_m.numpy(), faces, process=False)
+    assert shown.cavities.sum() > 500 and not (shown.cavities & ~shown.hidden).any()
+    for vertex in np.flatnonzero(shown.cavities)[::50]:
+        around = {n for near in mesh.vertex_neighbors[vertex] for n in (near, *mesh.vertex_neighbors[near])}
+        assert shown.hidden[list(around)].all()
+    assert not shown.cavities[-144:].any()  # eyeballs
+
+
 def test_texture_coordinates_neither_overlap_nor_mirror_and_favour_the_head(shown: BaseMesh) -> None:
     assert shown.uvs is not None and shown.face_uvs is not None
     assert shown.face_uvs.shape == shown.rig.faces.shape

@@ -1,0 +1,54 @@
+import numpy as np
+import pytest
+import torch
+
+from hnerf.body.anny import ADULT, anny_rig
+from hnerf.body.base_mesh import base_mesh
+from hnerf.body.face_units import face_units_m
+from hnerf.body.rig import Rig
+from tests.asset.figure import column_rig
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """Return an average adult, Z up, facing -Y, the left at +X."""
+    return anny_rig()
+
+
+def test_units_have_the_names_of_arkit_and_all_move_something(rig: Rig) -> None:
+    units = face_units_m(rig)
+    assert len(units) == 51 and "tongueOut" not in units
+    assert {"jawOpen", "eyeBlinkLeft", "mouthSmileRight", "browInnerUp", "noseSneerLeft", "cheekPuff"} <= set(units)
+    assert all(unit.shape == (len(rig.vertices_m), 3) and unit.any() for unit in units.values())
+
+
+def test_units_do_what_their_names_say(rig: Rig) -> None:
+    units = face_units_m(rig)
+    jaw = units["jawOpen"][np.linalg.norm(units["jawOpen"], axis=1).argmax()]
+    assert jaw[2] < -0.02 and abs(jaw[0]) < 0.005  # down
+    for side, sign in (("Left", 1), ("Right", -1)):
+        blink, smile = (units[f"{name}{side}"] for name in ("eyeBlink", "mouthSmile"))
+        lid = np.linalg.norm(blink, axis=1).argmax()
+        assert sign * rig.vertices_m[lid, 0] > 0.02 and blink[lid, 2] < -0.005
+        corner = np.linalg.norm(smile, axis=1).argmax()
+        assert sign * rig.vertices_m[corner, 0] > 0.01 and smile[corner, 2] > 0 and sign * smile[corner, 0] > 0
+    assert units["jawForward"][:, 1].min() < -0.005 < 0.001 > units["jawForward"][:, 1].max()
+
+
+def test_a_smaller_face_moves_less(rig: Rig) -> None:
+    beta = torch.tensor(ADULT)
+    beta[1] = 0.4
+    child = anny_rig(beta)
+    face = np.any([moved.any(1) for moved in face_units_m(rig).values()], 0)
+    widths_m = [float(np.ptp(body.vertices_m[face, 0].numpy())) for body in (rig, child)]
+    (adults, childs) = (face_units_m(body)["jawOpen"] for body in (rig, child))
+    scale = childs[adults[:, 2].argmin(), 2] / adults[:, 2].min()
+    assert scale == pytest.approx(widths_m[1] / widths_m[0], rel=0.1) and scale < 0.95
+    np.testing.assert_allclose(childs, scale * adults, atol=1e-7)
+
+
+def test_eyeballs_do_not_move_and_other_bodies_have_no_units(rig: Rig) -> None:
+    base = base_mesh(rig)
+    assert base.face_units_m["jawOpen"].shape == (len(base.rig.vertices_m), 3)
+    assert not base.face_units_m["eyeLookDownLeft"][len(rig.vertices_m) :].any()
+    assert face_units_m(column_rig()) == {} == base_mesh(column_rig()).face_units_m
