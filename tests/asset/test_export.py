@@ -1,17 +1,20 @@
+import dataclasses
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from pxr import Usd
 
 from hnerf.asset.export import export_asset
 from hnerf.avatar.surface import surface_in_pose
+from hnerf.body.base_mesh import base_mesh
 from hnerf.capture.masks import Masks
 from hnerf.config import AssetSettings
 from hnerf.errors import InvalidAsset
 from hnerf.render.motion import Motion, select_poses
-from tests.asset.figure import bending_body, capture
+from tests.asset.figure import bending_body, capture, column_rig
 from tests.asset.stand_in import CLOTHING_M, StandInAvatar
 
 SMALL = AssetSettings(
@@ -37,6 +40,10 @@ FILES |= {f"avatar/motion_{name}.usdc" for name in ("captured", "captured_24", "
 def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))  # the capture has no pixels for a viewer
     monkeypatch.setattr("hnerf.asset.report.TURNS", 2)
+    frown_m = np.full((len(column_rig().vertices_m), 3), 0.01, np.float32)
+    frowning = dataclasses.replace(base_mesh(column_rig()), face_units_m={"frown": frown_m})
+    monkeypatch.setattr("hnerf.asset.topologies.base_mesh", lambda rig: frowning)
+    monkeypatch.setattr("hnerf.asset.extreme_poses.EXPRESSIONS", {"Frown": ("frown",)})
     nod = Motion(select_poses(bending_body(), (4, 5)), 25.0, "z")
     report = export_asset(
         capture(), Masks({}, {}), StandInAvatar(bending_body()), SMALL, tmp_path, "0123", {"nod": nod}
@@ -46,7 +53,8 @@ def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monke
     assert report["viewer"].startswith("no viewer.html: three.js is not installed")
     page = (tmp_path / "report.html").read_text()
     assert report["viewer"] in page and 'href="viewer.html"' not in page
-    assert page.count("<img") == 2 + 5 + 2  # turntable, surface, texture
+    assert page.count("<img") == 2 + 5 + 2 + 2  # turntable, surface, an expression, texture
+    assert report["expressions"] == ["frown"]
     assert report["mesh"]["watertight"] and report["mesh"]["faces"] <= 2000
     assert report["mesh"]["height_m"] == pytest.approx(1.62, abs=0.005)
     assert [report["levels"][lod]["faces"] for lod in ("lod0", "lod1")] == [report["mesh"]["faces"], 500]
@@ -57,8 +65,8 @@ def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monke
     assert report["motions"]["captured_30"] == {"fps": 30, "poses": 16}
     for name in ("avatar.usdz", "avatar.usda"):
         assert (report["validation"][name]["variants"], report["validation"][name]["warnings"]) == (16, [])
-    assert report["against_field"]["images"] == 0 and report["crossing_share"] == {}
-    assert "Extreme poses" not in page and "Asset and field" not in page
+    assert report["against_field"]["images"] == 0 and list(report["crossing_share"]) == ["Frown"]
+    assert "Extreme poses" in page and "Asset and field" not in page
     stage = Usd.Stage.Open(str(tmp_path / "avatar.usda"))
     assert stage.GetDefaultPrim().GetAssetInfoByKey("captureDigest") == "0123"
 

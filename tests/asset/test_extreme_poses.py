@@ -70,6 +70,13 @@ def test_an_expression_is_the_sum_of_its_units(staged: StagedAvatar) -> None:
     assert with_expressions(dataclasses.replace(staged, expressions_m={})) == {}
 
 
+def test_expressions_are_shown_with_the_poses(staged: StagedAvatar) -> None:
+    units = {name: np.full((len(staged.rest_points_m), 3), 0.01) for parts in EXPRESSIONS.values() for name in parts}
+    rig = clothed_rig(column_rig(), upright_column(0.18, -0.05, 1.65))
+    shown = extreme_poses(dataclasses.replace(staged, expressions_m=units), rig, len(staged.faces))
+    assert [pose.name for pose in shown] == list(EXPRESSIONS)
+
+
 def test_poses_are_what_their_names_say(body: Rig) -> None:
     """In body axes: Z up, to the front -Y, to the left +X."""
     up = joints_m(body, turned(body, ARMS_UP))
