@@ -16,7 +16,7 @@ from hnerf.config import AssetSettings
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.render.motion import select_poses
 
-LIGHT_INSIDE = 0.3  # factor of sRGB values
+CAVITY_BRIGHTNESS = 0.3  # factor of sRGB values
 
 
 def baked_textures(
@@ -33,7 +33,7 @@ def baked_textures(
     and nose, which are as dark as places that little light gets to."""
     texels, faces = rasterise(layout, settings.texture_px), clothed.rig.faces.numpy()
     outer = np.ones(len(clothed.rig.vertices_m)) if cavities is None else ~cavities
-    lit = texels.interpolate(np.where(outer, 1.0, LIGHT_INSIDE)[:, None], faces)
+    lit = texels.interpolate(np.where(outer, 1.0, CAVITY_BRIGHTNESS)[:, None], faces)
     posed = select_poses(clothed, tuple(evenly_spaced(capture.train_frames, settings.texture_poses)))
     field = field_colours(avatar, posed, texels, cavities)
     if not settings.photograph_frames:

@@ -73,7 +73,7 @@ def filled(colours: np.ndarray, texels: Texels, rig: Rig) -> np.ndarray:
 
 def _colours_in_pose(avatar: Avatar, rig: Rig, texels: Texels, theta: Tensor, root: Tensor, outer: Tensor) -> Tensor:
     """Return the radiance at each texel of the surface posed by theta (J, 3) and root (4, 4), (N, 3) on the CPU; NaN
-    off the field's surface, and except on outer vertices (V,)."""
+    off the field's surface, and on faces that touch a vertex that is not outer (V,)."""
     device = avatar.body.rig.vertices_m.device
     vertices_m, faces = pose_vertices(rig, theta, root).to(device), rig.faces.to(device)
     theta, root = theta.to(device), root.to(device)

@@ -70,8 +70,8 @@ class GlbWriter:
                 componentType=gltf.FLOAT,
                 count=count,
                 type=SHAPES[values.shape[1:]],
-                min=np.minimum(values.min(0), 0).tolist(),
-                max=np.maximum(values.max(0), 0).tolist(),
+                min=(values.min(0) if len(at) == count else np.minimum(values.min(0), 0)).tolist(),
+                max=(values.max(0) if len(at) == count else np.maximum(values.max(0), 0)).tolist(),
                 sparse=sparse,
             )
         )

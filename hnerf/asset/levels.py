@@ -1,5 +1,6 @@
 """Levels of detail: the asset's mesh with fewer faces, on the same texture and with the same skin."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,7 +11,9 @@ import trimesh
 from hnerf.asset.simplify import collapse_edges
 from hnerf.asset.texture import UvLayout
 
-FACES_A_SEAM_EDGE = 1.5  # at least: charts whose outlines are kept get broken with fewer
+FACES_PER_SEAM_EDGE = 1.5  # at least: with fewer, charts whose seams are kept get broken
+
+log = logging.getLogger("hnerf.asset")
 
 
 @dataclass(frozen=True)
@@ -24,18 +27,29 @@ class Level:
 
 
 def levels_of(points_m: np.ndarray, faces: np.ndarray, layout: UvLayout, face_counts: Sequence[int]) -> list[Level]:
-    """Return a mesh (V, 3), (F, 3) and its decimations to each count of faces, largest first. Left out are counts that
-    the mesh does not exceed, and those so small that nothing but the charts' outlines would be left."""
-    edges = np.sort(trimesh.geometry.faces_to_edges(layout.face_uvs), axis=1)
-    fewest = FACES_A_SEAM_EDGE * len(trimesh.grouping.group_rows(edges, require_count=1))
-    counts = sorted({count for count in face_counts if fewest <= count < len(faces)}, reverse=True)
-    whole = Level(np.arange(len(points_m)), faces, layout)
-    return [whole, *(_decimated(points_m, whole, count) for count in counts)]
+    """Return a mesh (V, 3), (F, 3) and its decimations to each count of triangles, largest first. Left out are counts
+    that the mesh does not exceed, and, with a warning, those so small that the seams of the charts would hardly leave
+    anything between them."""
+    whole, seams = Level(np.arange(len(points_m)), faces, layout), len(seam_edges(layout.face_uvs))
+    found = [whole]
+    for count in sorted({count for count in face_counts if count < len(faces)}, reverse=True):
+        if count < FACES_PER_SEAM_EDGE * seams:
+            log.warning("no level of detail of %d triangles: the texture's seams have %d edges", count, seams)
+        else:
+            found.append(_decimated(points_m, whole, count))
+    return found
+
+
+def seam_edges(face_uvs: np.ndarray) -> np.ndarray:
+    """Return the edges (n, 2) of faces (F, 3), as rows of texture coordinates, at which charts end."""
+    edges = np.sort(trimesh.geometry.faces_to_edges(face_uvs), axis=1)
+    once: np.ndarray = edges[trimesh.grouping.group_rows(edges, require_count=1)]
+    return once
 
 
 def _decimated(points_m: np.ndarray, whole: Level, face_count: int) -> Level:
-    """Return the mesh after collapses of edges to one of their ends. It is cut open for that at the charts' outlines,
-    which stay as they are, so that the level has no cracks."""
+    """Return the mesh after collapses of edges to one of their ends. The seams of the charts are
+    kept as they are: the mesh is cut open there, and its parts fit together again."""
     uvs, face_uvs = np.unique(whole.layout.face_uvs, return_inverse=True)
     face_uvs = face_uvs.reshape(-1, 3)
     vertex_of_uv = np.zeros(len(uvs), np.int64)

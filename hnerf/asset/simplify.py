@@ -18,14 +18,15 @@ def simplify(surface: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
 
 
 def collapse_edges(meshes: pymeshlab.MeshSet, faces: int, onto_ends: bool) -> None:
-    """Collapse edges of the current mesh until it has at most `faces` triangles, to the best point, or to one of their
-    ends (quadrics, Garland and Heckbert 1997); onto_ends also keeps the outlines of an open mesh, edge by edge."""
+    """Collapse edges of the current mesh until it has at most `faces` triangles, to the best point, or, onto_ends, to
+    one of their ends (quadrics, Garland and Heckbert 1997). The latter keeps every edge of an open mesh's boundary."""
     meshes.meshing_decimation_quadric_edge_collapse(  # what is not given is as in the last call
         targetfacenum=faces,
         preservetopology=True,
         preservenormal=True,
         preserveboundary=onto_ends,
         optimalplacement=not onto_ends,
+        autoclean=not onto_ends,  # it merges vertices at the same place, as on both sides of a cut
     )
 
 

@@ -127,8 +127,10 @@ def shape_names(avatar: StagedAvatar) -> list[str]:
 
 
 def moved_points(offsets_m: np.ndarray) -> np.ndarray:
-    """Return which points a blend shape (V, 3) moves, (n,)."""
-    return np.flatnonzero(np.abs(offsets_m).max(1) > STILL_M)
+    """Return which points a blend shape (V, 3) moves, (n,); the first one if it moves none, since formats take no
+    points for all points."""
+    moved = np.flatnonzero(np.abs(offsets_m).max(1) > STILL_M)
+    return moved if len(moved) else np.zeros(1, np.int64)
 
 
 def stage_from_world(up: str) -> np.ndarray:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from hnerf.body.anny import BETA_NAMES, anny_model
 from hnerf.body.face_units import face_units_m
@@ -40,11 +41,15 @@ class BaseMesh:
 
     @property
     def cavities(self) -> np.ndarray:
-        """Return which vertices of the skin are hidden, with two edges at least to any that is not, (V,) bool."""
-        faces, deep = self.rig.faces[: self.skin_faces].numpy(), np.zeros_like(self.hidden)
-        deep[faces[self.hidden[faces].all(1)]] = True
+        """Return which vertices line mouth and nose, three edges or more inside, (V,) bool. Eye sockets are left out:
+        their lining shows beside the eyeballs."""
+        faces, deep = self.rig.faces[: self.skin_faces].numpy(), self.hidden.copy()
+        deep[self.rig.faces[self.skin_faces :].numpy()] = False
         for _ in range(2):
             deep[faces[~deep[faces].all(1)]] = False
+        if self.skin_faces < len(self.rig.faces):
+            eyeballs = cKDTree(self.rig.vertices_m[self.rig.faces[self.skin_faces :].unique()].numpy())
+            deep &= eyeballs.query(self.rig.vertices_m.numpy())[0] > EYE_RADIUS_M
         return deep
 
 

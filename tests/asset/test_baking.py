@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hnerf.asset.baking import LIGHT_INSIDE, baked_textures
+from hnerf.asset.baking import CAVITY_BRIGHTNESS, baked_textures
 from hnerf.asset.light import Light
 from hnerf.asset.srgb import to_linear, to_srgb
 from hnerf.asset.texture import rasterise, unwrap
@@ -98,5 +98,5 @@ def test_cavities_are_dark(pictures: dict[int, np.ndarray]) -> None:
             texture, _ = baked_textures(capture, Grey(body), body, surfaces_m, layout, settings, cavities)
             shown.append(texture[texels.row, texels.column, 0].astype(float))
         ratio = shown[1] / shown[0]
-        assert np.median(ratio[z_m.min(1) > 0.85]) == pytest.approx(LIGHT_INSIDE, abs=0.05)
+        assert np.median(ratio[z_m.min(1) > 0.85]) == pytest.approx(CAVITY_BRIGHTNESS, abs=0.05)
         np.testing.assert_allclose(ratio[z_m.max(1) < 0.6], 1, atol=0.02)

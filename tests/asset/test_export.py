@@ -57,14 +57,14 @@ def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monke
     assert report["expressions"] == ["frown"]
     assert report["mesh"]["watertight"] and report["mesh"]["faces"] <= 2000
     assert report["mesh"]["height_m"] == pytest.approx(1.62, abs=0.005)
-    assert [report["levels"][lod]["faces"] for lod in ("lod0", "lod1")] == [report["mesh"]["faces"], 500]
+    assert [report["levels"][lod]["triangles"] for lod in ("lod0", "lod1")] == [report["mesh"]["faces"], 500]
     assert report["light"] is None  # without photographs
     assert (report["frames"], report["joints"], report["cameras"]) == (4, 3, 1)
     assert report["rigs"]["game"]["influences"] == 2 and report["rigs"]["game"]["moved_max_mm"] < 0.01
     assert report["motions"]["nod"] == {"fps": 25.0, "poses": 2}
     assert report["motions"]["captured_30"] == {"fps": 30, "poses": 16}
     for name in ("avatar.usdz", "avatar.usda"):
-        assert (report["validation"][name]["variants"], report["validation"][name]["warnings"]) == (16, [])
+        assert (report["validation"][name]["variants"], report["validation"][name]["warnings"]) == (10, [])
     assert report["against_field"]["images"] == 0 and list(report["crossing_share"]) == ["Frown"]
     assert "Extreme poses" in page and "Asset and field" not in page
     stage = Usd.Stage.Open(str(tmp_path / "avatar.usda"))

@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 from hnerf.asset.figures import level_figures
-from hnerf.asset.levels import Level, levels_of
+from hnerf.asset.levels import Level, levels_of, seam_edges
 from hnerf.asset.staging import StagedAvatar
 from hnerf.asset.texture import UvLayout, unwrap
 from tests.asset.figure import upright_column
@@ -27,14 +27,20 @@ def test_a_cube_needs_its_corners_alone() -> None:
     np.testing.assert_array_equal(corners.layout.uvs[corners.layout.face_uvs], kept_m[corners.faces][..., :2])
 
 
+def signed_area(level: Level) -> float:
+    """Return the area of the faces in the texture; mirrored ones count as negative."""
+    a, b, c = level.layout.uvs[level.layout.face_uvs].swapaxes(0, 1)
+    return float((((b - a)[:, 0] * (c - a)[:, 1]) - ((b - a)[:, 1] * (c - a)[:, 0])).sum() / 2)
+
+
 def places(level: Level) -> set[tuple[float, ...]]:
     """Return the vertex and the texture coordinates of each corner of a face."""
     uvs = level.layout.uvs[level.layout.face_uvs].reshape(-1, 2)
     return {tuple(row) for row in np.column_stack([level.vertices[level.faces].ravel(), uvs]).tolist()}
 
 
-def test_charts_keep_their_outlines() -> None:
-    """A closed column whose charts have outlines of 224 edges in all: no level has less than 336 faces."""
+def test_charts_keep_their_seams(caplog: pytest.LogCaptureFixture) -> None:
+    """A closed column whose charts have seams of 224 edges in all: no level has less than 336 faces."""
     column = upright_column(0.18, -0.05, 1.65)
     layout = unwrap(column.vertices, column.faces, 64)
     whole, coarse = levels_of(column.vertices, column.faces, layout, [5000, 400, 335])
@@ -43,16 +49,22 @@ def test_charts_keep_their_outlines() -> None:
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(column.volume)
     assert places(coarse) < places(whole)
+    seams = [level.layout.uvs[seam_edges(level.layout.face_uvs)] for level in (whole, coarse)]
+    before, after = ({frozenset(map(tuple, edge)) for edge in edges.tolist()} for edges in seams)
+    assert before == after and len(before) == 224
+    assert signed_area(coarse) == pytest.approx(signed_area(whole))
+    assert "no level of detail of 335 triangles: the texture's seams have 224 edges" in caplog.text
 
 
-def test_the_distance_of_a_level_is_that_of_its_points_from_the_whole(staged: StagedAvatar) -> None:
-    """A roof of two slopes of 45 degrees and its floor: above x, the nearest slope is x / sqrt 2 away, up to x = 1."""
+def test_the_distance_of_a_level_is_that_of_points_on_either(staged: StagedAvatar) -> None:
+    """A roof of two slopes of 45 degrees, its ridge at x = 1, and the floor below it. Above x on the floor, the nearest
+    slope is x / sqrt 2 away; from x on a slope, the floor is x away: (1 / sqrt 2 + 1) / 4 on average over both."""
     points_m = np.array([[0.0, 0, 0], [0, 9, 0], [1, 0, 1], [1, 9, 1], [2, 0, 0], [2, 9, 0]])
     roof, floor = np.array([[0, 2, 3], [0, 3, 1], [2, 4, 5], [2, 5, 3]]), np.array([[0, 2, 3], [0, 3, 1]])
     layout = UvLayout(np.zeros((6, 2), np.float32), roof)
     levels = [Level(np.arange(6), roof, layout), Level(np.array([0, 1, 4, 5]), floor, layout)]
     figures = level_figures(dataclasses.replace(staged, rest_points_m=points_m, levels=levels))
-    assert (figures["lod1"]["vertices"], figures["lod1"]["faces"]) == (4, 2)
-    assert figures["lod1"]["to_lod0_mean_mm"] == pytest.approx(500 / np.sqrt(2), rel=0.02)
-    assert figures["lod1"]["to_lod0_p99_mm"] == pytest.approx(990 / np.sqrt(2), rel=0.02)
-    assert figures["lod0"]["to_lod0_p99_mm"] == pytest.approx(0, abs=0.01)
+    assert figures["lod0"] == {"vertices": 6, "triangles": 4}
+    assert (figures["lod1"]["vertices"], figures["lod1"]["triangles"]) == (4, 2)
+    assert figures["lod1"]["to_lod0_mean_mm"] == pytest.approx(250 / np.sqrt(2) + 250, rel=0.02)
+    assert figures["lod1"]["to_lod0_p99_mm"] == pytest.approx(980, rel=0.01)  # 2 % of the slopes are above 0.98 m

@@ -116,16 +116,18 @@ export class Avatar {
 }
 
 // Returns the blend shapes: one for each name, which several meshes may share, with the largest weight that a motion
-// gives it.
+// gives it, and whether any gives it one: others are expressions.
 function shapesOf(meshes, motions) {
   const shapes = new Map();
   for (const mesh of meshes) {
     for (const [key, index] of Object.entries(mesh.morphTargetDictionary ?? {})) {
       const name = /^\d+$/.test(key) ? `Shape ${Number(key) + 1}` : key;
-      if (!shapes.has(name)) shapes.set(name, { name, targets: [], added: 0, largest: 1 });
+      if (!shapes.has(name)) shapes.set(name, { name, targets: [], added: 0, largest: 1, moves: false });
       const shape = shapes.get(name);
       shape.targets.push({ mesh, index });
-      shape.largest = Math.max(shape.largest, largestWeight(mesh, index, motions));
+      const weight = largestWeight(mesh, index, motions);
+      shape.largest = Math.max(shape.largest, weight);
+      shape.moves ||= weight > 0;
     }
   }
   return [...shapes.values()];
