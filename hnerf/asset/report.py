@@ -86,7 +86,10 @@ def _beside_field(view: Compared) -> list[GalleryPicture]:
 def _less_detail(avatar: StagedAvatar, points_m: np.ndarray, camera: Camera) -> list[GalleryPicture]:
     """Return the wireframe of each lower level of detail."""
     meshes = [trimesh.Trimesh(points_m[lv.vertices], lv.faces, process=False) for lv in avatar.levels[1:]]
-    return [_picture(f"lod{k}, {len(m.faces)} faces", wireframe(Surface(m), camera)) for k, m in enumerate(meshes, 1)]
+    return [
+        _picture(f"lod{level}, {len(mesh.faces)} triangles", wireframe(Surface(mesh), camera))
+        for level, mesh in enumerate(meshes, 1)
+    ]
 
 
 def _without_light(avatar: StagedAvatar) -> list[GalleryPicture]:
