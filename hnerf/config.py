@@ -278,7 +278,7 @@ class AssetSettings(Section):
     grid_cells: int = Field(default=256, ge=16)  # of marching cubes, on the longest side
     topology: Literal["registered", "captured"] = "registered"  # the body model's mesh, or that of marching cubes
     faces: int = Field(default=20_000, ge=100)  # of the captured mesh; the registered one has the body model's
-    level_faces: tuple[PositiveInt, ...] = (10_000, 5_000)  # of the lower levels of detail
+    level_faces: tuple[PositiveInt, ...] = (10_000, 5_000)  # triangles, at most, of each lower level of detail
     texture_px: int = Field(default=1024, ge=16)
     texture_poses: int = Field(default=3, ge=1)  # of the capture, whose median is the field's colour of a texel
     photograph_frames: int = Field(default=16, ge=0)  # whose training photographs make the texture; 0: the field alone

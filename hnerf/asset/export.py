@@ -88,9 +88,9 @@ def export_asset(
     timeless = avatar.without_frames()  # one texture serves all frames
     layout = surface.mesh.layout(settings.texture_px)
     with _timed("texture", seconds):
-        cavities = surface.mesh.base.cavities if surface.mesh.base else None
-        body, surfaces_m = surface.body, surface.surfaces_m
-        texture, albedo = baked_textures(capture, timeless, body, surfaces_m, layout, settings, cavities)
+        texture, albedo = baked_textures(
+            capture, timeless, surface.body, surface.surfaces_m, layout, settings, surface.mesh.cavities
+        )
     with _timed("normal map", seconds):
         px = settings.normal_map_px
         normals = normal_map(timeless, surface.mesh, layout, px) if px else None
@@ -173,7 +173,7 @@ def _staged(
         albedo,
         normals,
         settings.level_faces,
-        surface.mesh.base.face_units_m if surface.mesh.base else {},
+        surface.mesh.face_units_m,
     )
 
 

@@ -14,7 +14,6 @@ from hnerf.asset.skinning import Skin
 from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar, moved_points, shape_names
 from hnerf.asset.tangents import uv_tangents
 from hnerf.asset.texture import UvLayout
-from hnerf.body.descriptor import normals_of
 
 COMPONENT_TYPES = {"float32": gltf.FLOAT, "uint16": gltf.UNSIGNED_SHORT, "uint32": gltf.UNSIGNED_INT}
 RESAMPLED = [f"{CAPTURED}_{rate}" for rate in RATES]  # glTF counts in seconds and does not need them
@@ -121,15 +120,14 @@ def _primitive(writer: GlbWriter, avatar: StagedAvatar, skin: Skin) -> gltf.Prim
     beyond four go into a second set."""
     vertex = np.zeros(len(avatar.uvs), np.int64)
     vertex[avatar.face_uvs] = avatar.faces
-    normals = normals_of(avatar.rest_points_m, avatar.faces)
     attributes = gltf.Attributes(
         POSITION=_vertex_data(writer, avatar.rest_points_m[vertex], np.float32),
-        NORMAL=_vertex_data(writer, normals[vertex], np.float32),
+        NORMAL=_vertex_data(writer, avatar.normals[vertex], np.float32),
         TEXCOORD_0=_vertex_data(writer, avatar.uvs * (1, -1) + (0, 1), np.float32),  # v runs down in glTF
     )
     if avatar.normal_map is not None:
         layout = UvLayout(avatar.uvs, avatar.face_uvs)
-        tangents = uv_tangents(avatar.rest_points_m, normals, avatar.faces, layout)
+        tangents = uv_tangents(avatar.rest_points_m, avatar.normals, avatar.faces, layout)
         attributes.TANGENT = _vertex_data(writer, tangents, np.float32)
     missing = -skin.joints.shape[1] % 4
     joints, weights = (np.pad(a, ((0, 0), (0, missing)))[vertex] for a in (skin.joints, skin.weights))

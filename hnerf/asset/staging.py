@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from hnerf.asset.motions import Motion, motion_of, resampled
 from hnerf.asset.rigs import FULL, RestSurface, StagedRig, stage_rigs
 from hnerf.asset.skeleton import Bones
 from hnerf.asset.texture import UvLayout
+from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 
@@ -25,7 +27,7 @@ REST_POSE = "A"  # of every body model here: arms slanting down
 class StagedAvatar:
     """The arrays of an avatar ready to be written; numpy, float64 and int64 unless said otherwise.
 
-    rest_points_m (V, 3), the soles at height 0. levels: the mesh in all detail, then with fewer and fewer faces.
+    rest_points_m (V, 3), the soles at height 0. levels: the mesh at full detail, then with fewer and fewer faces.
     shapes_m (K, V, 3) float32: corrective blend shapes, applied before the skin; expressions_m (V, 3) float32, by name:
     those of the face, which no motion uses. rigs: "full", with all joints of the body model, and "game", with few
     joints and influences. frames (n,): of the capture; points_m (n, V, 3) float32: the
@@ -49,18 +51,29 @@ class StagedAvatar:
 
     @property
     def faces(self) -> np.ndarray:
-        """Return the faces (F, 3) in all detail."""
+        """Return the faces (F, 3) at full detail."""
         return self.levels[0].faces
 
     @property
     def uvs(self) -> np.ndarray:
-        """Return the texture coordinates (U, 2), v up, in all detail."""
+        """Return the texture coordinates (U, 2), v up, at full detail."""
         return self.levels[0].layout.uvs.astype(np.float64)
 
     @property
     def face_uvs(self) -> np.ndarray:
         """Return the rows (F, 3) of `uvs` of the faces' corners."""
         return self.levels[0].layout.face_uvs
+
+    @cached_property
+    def normals(self) -> np.ndarray:
+        """Return the unit normals (V, 3) of the surface at rest."""
+        return normals_of(self.rest_points_m, self.faces)
+
+    @cached_property
+    def expression_normals(self) -> dict[str, np.ndarray]:
+        """Return how expressions change the normals, (V, 3), by name."""
+        shapes_m = self.expressions_m.items()
+        return {name: normals_of(self.rest_points_m + m, self.faces) - self.normals for name, m in shapes_m}
 
     @property
     def rest(self) -> RestSurface:

@@ -33,6 +33,16 @@ class AssetMesh:
         """Return all of the mesh."""
         return trimesh.Trimesh(self.rig.vertices_m.numpy(), self.rig.faces.numpy(), process=False)
 
+    @property
+    def cavities(self) -> np.ndarray:
+        """Return which vertices line mouth and nose, (V,) bool."""
+        return np.zeros(len(self.rig.vertices_m), bool) if self.base is None else self.base.cavities
+
+    @property
+    def face_units_m(self) -> dict[str, np.ndarray]:
+        """Return how expressions move the vertices, (V, 3), by name."""
+        return {} if self.base is None else self.base.face_units_m
+
     def layout(self, texture_px: int) -> UvLayout:
         """Return the texture coordinates: the body model's where it has some, else charts of the body at its shape,
         else of this mesh."""

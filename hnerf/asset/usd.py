@@ -14,7 +14,6 @@ from hnerf.asset.rigs import StagedRig
 from hnerf.asset.skeleton import Skeleton
 from hnerf.asset.srgb import to_linear
 from hnerf.asset.staging import REST_POSE, StagedAvatar, moved_points, shape_names
-from hnerf.body.descriptor import normals_of
 from hnerf.body.skeletons import EQUIVALENTS, SKELETONS
 from hnerf.geometry.camera import Camera
 
@@ -46,18 +45,16 @@ def author_geometry(stage: Usd.Stage, avatar: StagedAvatar, level: int) -> None:
     mesh = define_mesh(stage, path, avatar, level)
     mesh.CreatePointsAttr(vec3f(avatar.rest_points_m[kept]))
     mesh.CreateExtentAttr(extent(avatar.rest_points_m[kept]))
-    normals = normals_of(avatar.rest_points_m, avatar.faces)
-    mesh.CreateNormalsAttr(vec3f(normals[kept]))
+    mesh.CreateNormalsAttr(vec3f(avatar.normals[kept]))
     shapes = []
     for name, offsets_m in zip(shape_names(avatar), avatar.shapes_m, strict=True):
         shapes.append(UsdSkel.BlendShape.Define(stage, path.AppendChild(name)))
         shapes[-1].CreateOffsetsAttr(vec3f(offsets_m[kept]))
     for name, offsets_m in avatar.expressions_m.items():
         moved = moved_points(offsets_m[kept])
-        turned = normals_of(avatar.rest_points_m + offsets_m, avatar.faces) - normals
         shapes.append(UsdSkel.BlendShape.Define(stage, path.AppendChild(name)))
         shapes[-1].CreateOffsetsAttr(vec3f(offsets_m[kept][moved]))
-        shapes[-1].CreateNormalOffsetsAttr(vec3f(turned[kept][moved]))
+        shapes[-1].CreateNormalOffsetsAttr(vec3f(avatar.expression_normals[name][kept][moved]))
         shapes[-1].CreatePointIndicesAttr(Vt.IntArray.FromNumpy(moved.astype(np.int32)))
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1))
