@@ -174,6 +174,7 @@ def _staged(
         normals,
         settings.level_faces,
         surface.mesh.face_units_m,
+        surface.mesh.physiques_m,
     )
 
 
@@ -192,6 +193,7 @@ def _figures(
         "normal_map_px": settings.normal_map_px,
         "light": light_figures(staged.albedo.light) if staged.albedo else None,
         "expressions": list(staged.expressions_m),
+        "physiques": list(staged.physiques_m),
         "joints": len(staged.rigs[FULL].skeleton.names),
         "rigs": {name: rig_figures(staged, name) for name in staged.rigs},
         "motions": motion_figures(staged),

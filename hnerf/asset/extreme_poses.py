@@ -1,4 +1,4 @@
-"""Poses and expressions that show how an asset bends: arms up, a deep squat, a fist, a turned head, an open jaw."""
+"""What shows how an asset bends: extreme poses, expressions, and other physiques."""
 
 import math
 from collections.abc import Mapping
@@ -38,8 +38,8 @@ EXPRESSIONS = {
 
 @dataclass(frozen=True)
 class ExtremePose:
-    """A pose of the asset. points_m (V, 3), Y up, facing +Z; shown (V,) bool: the points that a picture frames;
-    crossing: the share of the skin's faces that cross others."""
+    """A pose of the asset, or its rest pose in another shape. points_m (V, 3), Y up, facing +Z; shown (V,) bool: the
+    points that a picture frames; crossing: the share of the skin's faces that cross others."""
 
     name: str
     points_m: np.ndarray
@@ -48,8 +48,8 @@ class ExtremePose:
 
 
 def extreme_poses(staged: StagedAvatar, rig: Rig, skin_faces: int) -> list[ExtremePose]:
-    """Return the poses that a body has joints for, and the expressions that it has. rig: the asset's, in body axes;
-    skin_faces: how many of its first faces are closed skin."""
+    """Return the poses that a body has joints for, and the expressions and physiques that it has. rig: the asset's, in
+    body axes; skin_faces: how many of its first faces are closed skin."""
     everything = np.ones(len(rig.vertices_m), bool)
     poses = {
         "Arms up": (turned(rig, ARMS_UP), everything),
@@ -59,6 +59,8 @@ def extreme_poses(staged: StagedAvatar, rig: Rig, skin_faces: int) -> list[Extre
     }
     surfaces = {n: (posed_m(staged, rig, theta), shown) for n, (theta, shown) in poses.items() if theta is not None}
     surfaces |= with_expressions(staged)
+    bodies_m = {name: staged.rest_points_m + moved_m for name, moved_m in staged.physiques_m.items()}
+    surfaces |= {name.capitalize(): (points_m, everything) for name, points_m in bodies_m.items()}
     return [
         ExtremePose(name, points_m, shown, float(crossing_faces(points_m, staged.faces[:skin_faces]).mean()))
         for name, (points_m, shown) in surfaces.items()

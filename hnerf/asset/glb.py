@@ -89,7 +89,7 @@ def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig) -> None:
     writer = GlbWriter()
     document = writer.document
     _add_joints(document, rig.skeleton)
-    names = [*shape_names(avatar), *avatar.expressions_m]
+    names = [*shape_names(avatar), *avatar.expressions_m, *avatar.physiques_m]
     primitive = _primitive(writer, avatar, rig.skin)
     _add_materials(writer, avatar, primitive)
     document.meshes.append(
@@ -116,8 +116,8 @@ def _add_joints(document: gltf.GLTF2, skeleton: Skeleton) -> None:
 
 
 def _primitive(writer: GlbWriter, avatar: StagedAvatar, skin: Skin) -> gltf.Primitive:
-    """Add the mesh, its correctives and its expressions, with vertices split at the texture's seams; skin influences
-    beyond four go into a second set."""
+    """Add the mesh with its correctives, expressions and physiques, its vertices split at the texture's seams; skin
+    influences beyond four go into a second set."""
     vertex = np.zeros(len(avatar.uvs), np.int64)
     vertex[avatar.face_uvs] = avatar.faces
     attributes = gltf.Attributes(
@@ -136,7 +136,7 @@ def _primitive(writer: GlbWriter, avatar: StagedAvatar, skin: Skin) -> gltf.Prim
         setattr(attributes, f"WEIGHTS_{start // 4}", _vertex_data(writer, weights[:, start : start + 4], np.float32))
     indices = writer.accessor(avatar.face_uvs.astype(np.uint32).ravel(), gltf.ELEMENT_ARRAY_BUFFER)
     targets = [gltf.Attributes(POSITION=_vertex_data(writer, shape[vertex], np.float32)) for shape in avatar.shapes_m]
-    for moved_m in (offsets_m[vertex] for offsets_m in avatar.expressions_m.values()):
+    for moved_m in (offsets_m[vertex] for offsets_m in (avatar.expressions_m | avatar.physiques_m).values()):
         at = moved_points(moved_m)
         targets.append(gltf.Attributes(POSITION=writer.sparse_accessor(moved_m[at], at, len(vertex))))
     return gltf.Primitive(attributes=attributes, indices=indices, material=0, targets=targets or None)

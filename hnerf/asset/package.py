@@ -32,8 +32,10 @@ from hnerf.asset.usd import (
     author_geometry,
     author_motion,
     author_rig,
+    author_shape,
     define_mesh,
     extent,
+    physique_box,
     surface_paths,
     vec3f,
 )
@@ -112,9 +114,14 @@ def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps
 
 
 def _parts(avatar: StagedAvatar, cameras: list[Camera], fps: float) -> list[Part]:
-    """Return the parts of the package."""
+    """Return the parts of the package. What one part says is stronger than what later ones say: shapes replace the
+    extents of motions."""
     view = partial(author_cameras, cameras=cameras, stage_from_world=avatar.stage_from_world)
     return [
+        *(
+            Part(f"shape_{name}", partial(author_shape, avatar=avatar, physique=physique), fps, ("shape", name))
+            for name, physique in {CAPTURED: None, **{name: name for name in avatar.physiques_m}}.items()
+        ),
         *(
             Part(
                 f"geometry_lod{level}",
@@ -163,6 +170,7 @@ def _in_variant(stage: Usd.Stage, part: Part) -> Iterator[None]:
 
 def _select(stage: Usd.Stage, motion: str) -> None:
     sets = stage.GetDefaultPrim().GetVariantSets()
+    sets.SetSelection("shape", CAPTURED)
     sets.SetSelection("lod", "lod0")
     sets.SetSelection("look", "captured")
     sets.SetSelection("rig", FULL)
@@ -214,8 +222,9 @@ def _set_rate(stage: Usd.Stage, fps: float) -> None:
 
 
 def _everywhere(avatar: StagedAvatar) -> object:
-    """Return the box around the surface at rest, in all motions and in the cache."""
+    """Return the box around the surface at rest, in all motions and physiques, and in the cache."""
     corners = [avatar.rest_points_m, *(boxes.reshape(-1, 3) for boxes in avatar.extents_m.values())]
+    corners += [physique_box(avatar, name) for name in avatar.physiques_m]
     return extent(np.concatenate([*corners, avatar.points_m.reshape(-1, 3)]))
 
 

@@ -8,8 +8,8 @@ from hnerf.asset.staging import CAPTURED, RATES
 from hnerf.body.skeletons import PELVIS, ROOT
 
 SAME = 1e-4  # metres, or parts of 1, by which what must agree may differ
-ON_GROUND_M = 1e-3  # by which the lowest point may be off the ground, and with less detail:
-ON_GROUND_DECIMATED_M = 1e-2
+ON_GROUND_M = 1e-3  # by which the captured body's lowest point may be off the ground
+ON_GROUND_CHANGED_M = 1e-2  # the same with less detail or in another shape
 
 
 def skin_defects(prim: Usd.Prim) -> list[str]:
@@ -34,8 +34,9 @@ def skin_defects(prim: Usd.Prim) -> list[str]:
     used = {tokens[j].rpartition("/")[2] for j in np.unique(joints[weights > 0]).tolist()}
     if len(used & {"eye_L", "eye_R"}) == 1:
         defects.append(f"{name}: skin follows one eye and not the other")
-    whole = _selected(prim.GetStage(), "lod") in ("", "lod0")
-    if not abs(points[:, 1].min()) < (ON_GROUND_M if whole else ON_GROUND_DECIMATED_M):
+    stage = prim.GetStage()
+    as_captured = _selected(stage, "lod") in ("", "lod0") and _selected(stage, "shape") in ("", CAPTURED)
+    if not abs(points[:, 1].min()) < (ON_GROUND_M if as_captured else ON_GROUND_CHANGED_M):
         defects.append(f"{name}: its lowest point at rest is at height {points[:, 1].min():.3g} m, not on the ground")
     if _selected(prim.GetStage(), "rig") == GAME and influences > GAME_INFLUENCES:
         defects.append(f"{name}: {influences} influences; the game rig has at most {GAME_INFLUENCES}")

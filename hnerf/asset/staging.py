@@ -29,17 +29,18 @@ class StagedAvatar:
 
     rest_points_m (V, 3), the soles at height 0. levels: the mesh at full detail, then with fewer and fewer faces.
     shapes_m (K, V, 3) float32: corrective blend shapes, applied before the skin; expressions_m (V, 3) float32, by name:
-    those of the face, which no motion uses. rigs: "full", with all joints of the body model, and "game", with few
-    joints and influences. frames (n,): of the capture; points_m (n, V, 3) float32: the
-    surface of each. extents_m: the box (2, 3) at each time code of each motion, (n, 2, 3). texture (H, W, 3) uint8
-    sRGB. stage_from_world (3, 3): a rotation. albedo, with its light in the stage, and normal_map (S, S, 3) uint8, in
-    tangent space, if there are any.
+    those of the face, which no motion uses; physiques_m, likewise: of other physiques around the same bones. rigs:
+    "full", with all joints of the body model, and "game", with few joints and influences. frames (n,): of the capture;
+    points_m (n, V, 3) float32: the surface of each. extents_m: the box (2, 3) at each time code of each motion, (n, 2,
+    3). texture (H, W, 3) uint8 sRGB. stage_from_world (3, 3): a rotation. albedo, with its light in the stage, and
+    normal_map (S, S, 3) uint8, in tangent space, if there are any.
     """
 
     rest_points_m: np.ndarray
     levels: Sequence[Level]
     shapes_m: np.ndarray
     expressions_m: dict[str, np.ndarray]
+    physiques_m: dict[str, np.ndarray]
     rigs: dict[str, StagedRig]
     frames: np.ndarray
     points_m: np.ndarray
@@ -105,11 +106,12 @@ def stage_avatar(
     normal_map: np.ndarray | None = None,
     level_faces: Sequence[int] = (),
     expressions_m: Mapping[str, np.ndarray] | None = None,
+    physiques_m: Mapping[str, np.ndarray] | None = None,
 ) -> StagedAvatar:
     """Turn a clothed body (see `clothed_rig`) and its motion to Y up, with both rigs. surfaces_m (n, V, 3): its surface
     in each frame; `up`: the vertical axis of the world, "y" or "z"; fps: of the frames; further: motions of the same
     joints in the same world with their frames a second, by name; albedo: with its light in the world; level_faces: of
-    lower levels of detail; expressions_m (V, 3): of the face, in the body's axes."""
+    lower levels of detail; expressions_m, physiques_m (V, 3): of the face and of other bodies, in the body's axes."""
     world, rig, body = stage_from_world(up), clothed.rig, Y_UP_FROM_Z_UP
     rest_m, joints_m = rig.vertices_m.double().numpy() @ body.T, rig.joints_m.double().numpy() @ body.T
     stands_m = np.array([joints_m[0, 0], rest_m[:, 1].min(), joints_m[0, 2]])
@@ -122,7 +124,8 @@ def stage_avatar(
         rest_points_m=rest.points_m,
         levels=levels_of(rest.points_m, rig.faces.numpy(), layout, level_faces),
         shapes_m=rest.shapes_m,
-        expressions_m={name: moved @ body.T.astype(np.float32) for name, moved in (expressions_m or {}).items()},
+        expressions_m=_turned(expressions_m, body),
+        physiques_m=_turned(physiques_m, body),
         rigs=rigs,
         frames=np.array(clothed.frames),
         points_m=points_m,
@@ -137,6 +140,11 @@ def stage_avatar(
 def shape_names(avatar: StagedAvatar) -> list[str]:
     """Return the names of the corrective blend shapes."""
     return [f"corrective_{k + 1:02d}" for k in range(len(avatar.shapes_m))]
+
+
+def _turned(shapes_m: Mapping[str, np.ndarray] | None, rotation: np.ndarray) -> dict[str, np.ndarray]:
+    """Turn blend shapes (V, 3), by name, if there are any."""
+    return {name: moved_m @ rotation.T.astype(np.float32) for name, moved_m in (shapes_m or {}).items()}
 
 
 def moved_points(offsets_m: np.ndarray) -> np.ndarray:

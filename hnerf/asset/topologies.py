@@ -43,6 +43,11 @@ class AssetMesh:
         """Return how expressions move the vertices, (V, 3), by name."""
         return {} if self.base is None else self.base.face_units_m
 
+    @property
+    def physiques_m(self) -> dict[str, np.ndarray]:
+        """Return how other physiques move the vertices, (V, 3), by name."""
+        return {} if self.base is None else self.base.physiques_m
+
     def layout(self, texture_px: int) -> UvLayout:
         """Return the texture coordinates: the body model's where it has some, else charts of the body at its shape,
         else of this mesh."""

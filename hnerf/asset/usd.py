@@ -14,6 +14,7 @@ from hnerf.asset.rigs import StagedRig
 from hnerf.asset.skeleton import Skeleton
 from hnerf.asset.srgb import to_linear
 from hnerf.asset.staging import REST_POSE, StagedAvatar, moved_points, shape_names
+from hnerf.body.descriptor import normals_of
 from hnerf.body.skeletons import EQUIVALENTS, SKELETONS
 from hnerf.geometry.camera import Camera
 
@@ -39,13 +40,11 @@ def surface_paths(avatar: StagedAvatar) -> list[Sdf.Path]:
 
 
 def author_geometry(stage: Usd.Stage, avatar: StagedAvatar, level: int) -> None:
-    """Define the skinned mesh at rest at a level of detail, with its blend shapes; rigs bind it."""
+    """Define the skinned mesh at a level of detail, with its blend shapes; `author_shape` places its points, and rigs
+    bind it."""
     UsdSkel.Root.Define(stage, BODY)
     path, kept = surface_path(level), avatar.levels[level].vertices
     mesh = define_mesh(stage, path, avatar, level)
-    mesh.CreatePointsAttr(vec3f(avatar.rest_points_m[kept]))
-    mesh.CreateExtentAttr(extent(avatar.rest_points_m[kept]))
-    mesh.CreateNormalsAttr(vec3f(avatar.normals[kept]))
     shapes = []
     for name, offsets_m in zip(shape_names(avatar), avatar.shapes_m, strict=True):
         shapes.append(UsdSkel.BlendShape.Define(stage, path.AppendChild(name)))
@@ -60,6 +59,28 @@ def author_geometry(stage: Usd.Stage, avatar: StagedAvatar, level: int) -> None:
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1))
     binding.CreateBlendShapesAttr([shape.GetPrim().GetName() for shape in shapes])
     binding.CreateBlendShapeTargetsRel().SetTargets([shape.GetPath() for shape in shapes])
+
+
+def author_shape(stage: Usd.Stage, avatar: StagedAvatar, physique: str | None) -> None:
+    """Place the mesh at rest at all levels of detail, as captured or in another physique. The body's extent is then a
+    box around it in any motion."""
+    points_m = avatar.rest_points_m if physique is None else avatar.rest_points_m + avatar.physiques_m[physique]
+    normals = normals_of(points_m, avatar.faces)
+    for number, level in enumerate(avatar.levels):
+        mesh = UsdGeom.Mesh(stage.OverridePrim(surface_path(number)))
+        mesh.CreatePointsAttr(vec3f(points_m[level.vertices]))
+        mesh.CreateExtentAttr(extent(points_m[level.vertices]))
+        mesh.CreateNormalsAttr(vec3f(normals[level.vertices]))
+    if physique is not None:
+        UsdGeom.Boundable(stage.OverridePrim(BODY)).CreateExtentAttr(vec3f(physique_box(avatar, physique)))
+
+
+def physique_box(avatar: StagedAvatar, name: str) -> np.ndarray:
+    """Return a box (2, 3) that holds a physique in all motions: that of the captured body, grown by how far the skin
+    moves at most. (Skinned points are no farther apart than at rest: their weights are not negative and sum to 1.)"""
+    boxes, moved_m = np.concatenate(list(avatar.extents_m.values())), avatar.physiques_m[name]
+    grown_m = np.linalg.norm(moved_m, axis=1).max()
+    return np.stack([boxes[:, 0].min(0) - grown_m, boxes[:, 1].max(0) + grown_m])
 
 
 def author_captured_look(stage: Usd.Stage, meshes: Iterable[Sdf.Path], avatar: StagedAvatar) -> None:

@@ -39,16 +39,16 @@ def validate_package(path: Path) -> dict[str, Any]:
 
 
 def each_variant(stage: Usd.Stage) -> Iterator[str]:
-    """Select every combination of the root prim's variants in turn, in the session layer, and yield what a message says
-    of it: nothing without variants, else like "rig=full motion=captured: ". Lower levels of detail are combined with
-    the first motion alone."""
+    """Select combinations of the root prim's variants in turn, in the session layer, and yield what a message says of
+    each: nothing without variants, else like "rig=full motion=captured: ". They are all those that have at least two of
+    the first motion, the first shape and the first level of detail."""
     root = stage.GetDefaultPrim()
     sets = {} if not root else {name: root.GetVariantSet(name) for name in root.GetVariantSets().GetNames()}
     stage.SetEditTarget(stage.GetSessionLayer())
     names = {name: variants.GetVariantNames() for name, variants in sets.items()}
     for chosen in itertools.product(*names.values()):
-        further = [name for name, value in zip(names, chosen, strict=True) if value != names[name][0]]
-        if "lod" in further and "motion" in further:
+        further = {name for name, value in zip(names, chosen, strict=True) if value != names[name][0]}
+        if len(further & {"lod", "motion", "shape"}) > 1:
             continue
         for variants, name in zip(sets.values(), chosen, strict=True):
             variants.SetVariantSelection(name)

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from hnerf.body.anny import BETA_NAMES, anny_model
 from hnerf.body.face_units import face_units_m
+from hnerf.body.physiques import physiques_m
 from hnerf.body.rig import Rig
 from hnerf.geometry.axes import Y_UP_FROM_Z_UP
 
@@ -29,7 +30,8 @@ class BaseMesh:
 
     hidden (V,) bool: inside the mouth, nose and eye sockets, or on an eyeball, where no outer surface is to be found;
     skin_faces: how many of the first faces are the body's own skin. uvs (U, 2) v up, face_uvs (F, 3): the model's own
-    texture coordinates; None if it has none. face_units_m (V, 3) float32, by name: how expressions move the vertices.
+    texture coordinates; None if it has none. face_units_m, physiques_m (V, 3) float32, by name: how expressions and
+    other physiques move the vertices.
     """
 
     rig: Rig
@@ -38,6 +40,7 @@ class BaseMesh:
     uvs: np.ndarray | None
     face_uvs: np.ndarray | None
     face_units_m: dict[str, np.ndarray]
+    physiques_m: dict[str, np.ndarray]
 
     @property
     def cavities(self) -> np.ndarray:
@@ -54,10 +57,10 @@ class BaseMesh:
 
 
 def base_mesh(rig: Rig) -> BaseMesh:
-    """Return the mesh of a rig at its shape. Only anny's has eyeballs, cavities, texture coordinates and expressions,
-    which leave the eyeballs to their joints."""
+    """Return the mesh of a rig at its shape. Only anny's has eyeballs, cavities, texture coordinates, expressions and
+    physiques, which leave the eyeballs to their joints."""
     if rig.beta_names != BETA_NAMES:
-        return BaseMesh(rig, np.zeros(len(rig.vertices_m), bool), len(rig.faces), None, None, {})
+        return BaseMesh(rig, np.zeros(len(rig.vertices_m), bool), len(rig.faces), None, None, {}, {})
     model, eyes, sides = anny_model(), _eyes(), ("eye.L", "eye.R")
     placed_m = [_in_socket(rig, eye_m) for eye_m in eyes.vertices_m]
     joints = torch.tensor([rig.joint_names.index(name) for name in sides]).repeat_interleave(len(placed_m[0]))
@@ -72,8 +75,11 @@ def base_mesh(rig: Rig) -> BaseMesh:
     hidden = np.concatenate([_cavities(), np.ones(len(joints), bool)])
     uvs = np.concatenate([model.texture_coordinates.numpy(), eyes.uvs])
     face_uvs = np.concatenate([model.face_texture_coordinate_indices.numpy(), eyes.face_uvs + len(uvs) - len(eyes.uvs)])
-    units_m = {name: np.pad(moved, ((0, len(joints)), (0, 0))) for name, moved in face_units_m(rig).items()}
-    return BaseMesh(shown, hidden, len(rig.faces), uvs.astype(np.float32), face_uvs, units_m)
+    units_m, bodies_m = (
+        {name: np.pad(moved, ((0, len(joints)), (0, 0))) for name, moved in shapes_m.items()}
+        for shapes_m in (face_units_m(rig), physiques_m(rig))
+    )
+    return BaseMesh(shown, hidden, len(rig.faces), uvs.astype(np.float32), face_uvs, units_m, bodies_m)
 
 
 @dataclass(frozen=True)

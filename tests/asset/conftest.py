@@ -15,7 +15,7 @@ from tests.asset.figure import bending_body, posed_with_displacements, upright_c
 @pytest.fixture(scope="session")
 def staged() -> StagedAvatar:
     """Return clothes around the bending column, of 816 and of 400 faces, with two shapes of noise, a frown of
-    its top, textures and a normal map of noise, and light from above."""
+    its top, a stout physique, textures and a normal map of noise, and light from above."""
     body = bending_body()
     clothes = upright_column(0.18, -0.05, 1.65)
     layout = unwrap(clothes.vertices, clothes.faces, 64)
@@ -42,4 +42,5 @@ def staged() -> StagedAvatar:
         normal_map=normals,
         level_faces=[400],
         expressions_m={"frown": frown_m},
+        physiques_m={"stout": (0.3 * clothes.vertices * (1, 1, 0)).astype(np.float32)},
     )

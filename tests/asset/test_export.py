@@ -33,7 +33,8 @@ def test_surface_is_the_grown_body() -> None:
 FILES = {"avatar.usda", "avatar_24.usda", "avatar_30.usda", "avatar.usdz", "avatar_cache.usdz", "avatar.glb"}
 FILES |= {"avatar_game.glb", "avatar.bvh", "avatar/texture.png", "avatar/normal_map.png"}
 FILES |= {f"avatar/{name}.usdc" for name in ("look_captured", "cameras", "rig_full", "rig_game")}
-FILES |= {"avatar/geometry_lod0.usdc", "avatar/geometry_lod1.usdc"}
+FILES |= {"avatar/geometry_lod0.usdc", "avatar/geometry_lod1.usdc", "avatar/shape_stout.usdc"}
+FILES |= {"avatar/shape_captured.usdc"}
 FILES |= {f"avatar/motion_{name}.usdc" for name in ("captured", "captured_24", "captured_30", "nod")}
 
 
@@ -41,7 +42,10 @@ def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monke
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))  # the capture has no pixels for a viewer
     monkeypatch.setattr("hnerf.asset.report.TURNS", 2)
     frown_m = np.full((len(column_rig().vertices_m), 3), 0.01, np.float32)
-    frowning = dataclasses.replace(base_mesh(column_rig()), face_units_m={"frown": frown_m})
+    stout_m = frown_m * np.float32([1, 1, 0])  # its soles stay on the ground
+    frowning = dataclasses.replace(
+        base_mesh(column_rig()), face_units_m={"frown": frown_m}, physiques_m={"stout": stout_m}
+    )
     monkeypatch.setattr("hnerf.asset.topologies.base_mesh", lambda rig: frowning)
     monkeypatch.setattr("hnerf.asset.extreme_poses.EXPRESSIONS", {"Frown": ("frown",)})
     nod = Motion(select_poses(bending_body(), (4, 5)), 25.0, "z")
@@ -53,8 +57,8 @@ def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monke
     assert report["viewer"].startswith("no viewer.html: three.js is not installed")
     page = (tmp_path / "report.html").read_text()
     assert report["viewer"] in page and 'href="viewer.html"' not in page
-    assert page.count("<img") == 2 + 5 + 2 + 2  # turntable, surface, an expression, texture
-    assert report["expressions"] == ["frown"]
+    assert page.count("<img") == 2 + 5 + 2 + 2 + 2  # turntable, surface, an expression, a physique, texture
+    assert report["expressions"] == ["frown"] and report["physiques"] == ["stout"]
     assert report["mesh"]["watertight"] and report["mesh"]["faces"] <= 2000
     assert report["mesh"]["height_m"] == pytest.approx(1.62, abs=0.005)
     assert [report["levels"][lod]["triangles"] for lod in ("lod0", "lod1")] == [report["mesh"]["faces"], 500]
@@ -64,8 +68,8 @@ def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monke
     assert report["motions"]["nod"] == {"fps": 25.0, "poses": 2}
     assert report["motions"]["captured_30"] == {"fps": 30, "poses": 16}
     for name in ("avatar.usdz", "avatar.usda"):
-        assert (report["validation"][name]["variants"], report["validation"][name]["warnings"]) == (10, [])
-    assert report["against_field"]["images"] == 0 and list(report["crossing_share"]) == ["Frown"]
+        assert (report["validation"][name]["variants"], report["validation"][name]["warnings"]) == (12, [])
+    assert report["against_field"]["images"] == 0 and list(report["crossing_share"]) == ["Frown", "Stout"]
     assert "Extreme poses" in page and "Asset and field" not in page
     stage = Usd.Stage.Open(str(tmp_path / "avatar.usda"))
     assert stage.GetDefaultPrim().GetAssetInfoByKey("captureDigest") == "0123"

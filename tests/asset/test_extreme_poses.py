@@ -53,7 +53,7 @@ def test_the_column_bows_to_the_front(staged: StagedAvatar) -> None:
 
 
 def test_a_body_without_these_joints_has_no_such_poses(staged: StagedAvatar) -> None:
-    faceless = dataclasses.replace(staged, expressions_m={})
+    faceless = dataclasses.replace(staged, expressions_m={}, physiques_m={})
     assert extreme_poses(faceless, clothed_rig(column_rig(), upright_column(0.18, -0.05, 1.65)), 0) == []
 
 
@@ -70,11 +70,13 @@ def test_an_expression_is_the_sum_of_its_units(staged: StagedAvatar) -> None:
     assert with_expressions(dataclasses.replace(staged, expressions_m={})) == {}
 
 
-def test_expressions_are_shown_with_the_poses(staged: StagedAvatar) -> None:
+def test_expressions_and_physiques_are_shown_with_the_poses(staged: StagedAvatar) -> None:
     units = {name: np.full((len(staged.rest_points_m), 3), 0.01) for parts in EXPRESSIONS.values() for name in parts}
     rig = clothed_rig(column_rig(), upright_column(0.18, -0.05, 1.65))
     shown = extreme_poses(dataclasses.replace(staged, expressions_m=units), rig, len(staged.faces))
-    assert [pose.name for pose in shown] == list(EXPRESSIONS)
+    assert [pose.name for pose in shown] == [*EXPRESSIONS, "Stout"]
+    np.testing.assert_array_equal(shown[-1].points_m, staged.rest_points_m + staged.physiques_m["stout"])
+    assert shown[-1].shown.all()
 
 
 def test_poses_are_what_their_names_say(body: Rig) -> None:

@@ -184,24 +184,25 @@ def test_correctives_are_morph_targets_with_a_weight_a_frame(glb: Path, staged: 
     (primitive,) = document.meshes[0].primitives
     vertex = np.zeros(len(staged.uvs), int)
     vertex[staged.face_uvs] = staged.faces
-    for target, shape_m in zip(primitive.targets[:-1], staged.shapes_m, strict=True):
+    for target, shape_m in zip(primitive.targets[:-2], staged.shapes_m, strict=True):
         np.testing.assert_allclose(accessor(document, target["POSITION"]), shape_m[vertex], atol=1e-7)
     weights = accessor(document, document.animations[0].samplers[-1].output).reshape(len(FRAMES), -1)
     expected = staged.rigs["full"].motions["captured"].shape_weights
-    np.testing.assert_allclose(weights[:, :-1], expected)
-    assert (weights[:, -1] == 0).all()  # of the expression
+    np.testing.assert_allclose(weights[:, :-2], expected)
+    assert (weights[:, -2:] == 0).all()  # of the expression and the physique
 
 
-def test_expressions_are_morph_targets_after_the_correctives(glb: Path, staged: StagedAvatar) -> None:
+def test_expressions_and_physiques_are_morph_targets_after_the_correctives(glb: Path, staged: StagedAvatar) -> None:
     document = pygltflib.GLTF2.load(str(glb))
     (mesh,) = document.meshes
-    assert mesh.extras["targetNames"] == ["corrective_01", "corrective_02", "corrective_03", "frown"]
-    assert len(mesh.primitives[0].targets) == len(mesh.weights) == 4
+    assert mesh.extras["targetNames"] == ["corrective_01", "corrective_02", "corrective_03", "frown", "stout"]
+    assert len(mesh.primitives[0].targets) == len(mesh.weights) == 5
     vertex = np.zeros(len(staged.uvs), int)
     vertex[staged.face_uvs] = staged.faces
-    item = document.accessors[mesh.primitives[0].targets[-1]["POSITION"]]
-    frown_m = accessor(document, mesh.primitives[0].targets[-1]["POSITION"])
+    item = document.accessors[mesh.primitives[0].targets[-2]["POSITION"]]
+    frown_m, stout_m = (accessor(document, target["POSITION"]) for target in mesh.primitives[0].targets[-2:])
     np.testing.assert_allclose(frown_m, staged.expressions_m["frown"][vertex], atol=1e-7)
+    np.testing.assert_allclose(stout_m, staged.physiques_m["stout"][vertex], atol=1e-5)
     np.testing.assert_allclose((item.min, item.max), ([0, 0, -0.02], [0.01, 0.03, 0]), atol=1e-7)
 
 

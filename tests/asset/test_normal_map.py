@@ -34,7 +34,7 @@ def square(hidden: bool = False) -> AssetMesh:
     """Return the square on the ground, one corner at the origin."""
     vertices_m = torch.from_numpy(np.pad(SIDE_M * CORNERS, ((0, 0), (0, 1)))).float()
     rig = dataclasses.replace(column_rig(), vertices_m=vertices_m, faces=torch.from_numpy(HALVES))
-    return AssetMesh(rig, as_they_are, 2, BaseMesh(rig, np.full(4, hidden), 2, None, None, {}))
+    return AssetMesh(rig, as_they_are, 2, BaseMesh(rig, np.full(4, hidden), 2, None, None, {}, {}))
 
 
 def map_of(

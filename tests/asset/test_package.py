@@ -63,18 +63,57 @@ def test_usd_skins_as_we_do_in_every_variant(name: str, package: Path, staged: S
     stage = Usd.Stage.Open(str(package / name))
     root, seen = stage.GetDefaultPrim(), set()
     for _ in each_variant(stage):
-        rig, motion, lod = (root.GetVariantSet(name).GetVariantSelection() for name in ("rig", "motion", "lod"))
-        seen.add((rig, motion, lod))
+        sets = ("rig", "motion", "lod", "shape")
+        rig, motion, lod, shape = (root.GetVariantSet(name).GetVariantSelection() for name in sets)
+        seen.add((rig, motion, lod, shape))
         moving, shown = staged.rigs[rig].motions[motion], staged.levels[int(lod[-1])].vertices
-        expected = list(staged.rigs[rig].surfaces_m(motion, staged.rest))
+        moved_m = staged.physiques_m.get(shape, np.zeros((1, 3)))
+        rest = dataclasses.replace(staged.rest, points_m=staged.rest_points_m + moved_m)
+        expected = list(staged.rigs[rig].surfaces_m(motion, rest))
         for k in (0, len(moving.codes) - 1):
             code = moving.codes[k] * 10 / moving.fps
             np.testing.assert_allclose(skinned_points(stage, code), expected[k][shown], atol=1e-5)
             box = UsdSkel.Root(stage.GetPrimAtPath("/Avatar/Body")).GetExtentAttr().Get(code)
-            np.testing.assert_allclose(box, [expected[k].min(0), expected[k].max(0)], atol=1e-5)
+            tight = np.stack([expected[k].min(0), expected[k].max(0)])
+            if shape == "captured":
+                np.testing.assert_allclose(box, tight, atol=1e-5)
+            else:
+                assert (box[0] <= tight[0] + 1e-6).all() and (box[1] >= tight[1] - 1e-6).all()
     motions = ("captured", "captured_24", "captured_30")
     rigs = ("full", "game")
-    assert seen == {*itertools.product(rigs, motions, ["lod0"]), *itertools.product(rigs, motions[:1], ["lod1"])}
+    assert seen == {
+        *itertools.product(rigs, motions, ["lod0"], ["captured"]),
+        *itertools.product(rigs, motions[:1], ["lod1"], ["captured"]),
+        *itertools.product(rigs, motions[:1], ["lod0"], ["stout"]),
+    }
+
+
+@pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_30.usda"])
+@pytest.mark.parametrize("lod", ["lod0", "lod1"])
+def test_another_shape_moves_the_skin_at_every_level(name: str, lod: str, package: Path, staged: StagedAvatar) -> None:
+    stage = Usd.Stage.Open(str(package / name))
+    stage.SetEditTarget(stage.GetSessionLayer())
+    root, kept = stage.GetDefaultPrim(), staged.levels[int(lod[-1])].vertices
+    root.GetVariantSet("lod").SetVariantSelection(lod)
+    shape = root.GetVariantSet("shape")
+    assert (shape.GetVariantNames(), shape.GetVariantSelection()) == (["captured", "stout"], "captured")
+    for choice, moved_m in (("captured", 0), ("stout", staged.physiques_m["stout"])):
+        shape.SetVariantSelection(choice)
+        (mesh,) = (UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
+        points_m = staged.rest_points_m + moved_m
+        np.testing.assert_allclose(mesh.GetPointsAttr().Get(), points_m[kept], atol=1e-6)
+        np.testing.assert_allclose(mesh.GetNormalsAttr().Get(), normals_of(points_m, staged.faces)[kept], atol=1e-6)
+        box = [points_m[kept].min(0), points_m[kept].max(0)]
+        np.testing.assert_allclose(mesh.GetExtentAttr().Get(), box, atol=1e-6)
+    hint = np.array(UsdGeom.ModelAPI(root).GetExtentsHintAttr().Get())
+    body = np.array(UsdSkel.Root(stage.GetPrimAtPath("/Avatar/Body")).GetExtentAttr().Get())
+    assert (hint[0] <= body[0]).all() and (hint[1] >= body[1]).all()
+
+
+def test_without_physiques_the_captured_shape_is_the_only_one(staged: StagedAvatar, tmp_path: Path) -> None:
+    write_usdz(tmp_path / "plain.usdz", dataclasses.replace(staged, physiques_m={}), [], 10.0, INFO)
+    stage = Usd.Stage.Open(str(tmp_path / "plain.usdz"))
+    assert stage.GetDefaultPrim().GetVariantSet("shape").GetVariantNames() == ["captured"]
 
 
 @pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_24.usda"])
@@ -170,8 +209,8 @@ def test_the_same_avatar_is_the_same_bytes_at_any_time(package: Path, staged: St
     time.sleep(max(0.0, (package / "avatar_cache.usdz").stat().st_mtime + 2.0 - time.time()))
     write_all(tmp_path, staged)
     written = [path for path in sorted(tmp_path.rglob("*")) if path.is_file()]
-    # Interfaces, pictures, levels of detail, cameras, looks, rigs, motions, .usdz.
-    assert len(written) == 3 + 4 + 2 + 1 + 2 + 2 + 3 + 2
+    # Interfaces, pictures, shapes, levels of detail, cameras, looks, rigs, motions, .usdz.
+    assert len(written) == 3 + 4 + 2 + 2 + 1 + 2 + 2 + 3 + 2
     for path in written:
         assert path.read_bytes() == (package / path.relative_to(tmp_path)).read_bytes(), path.name
     with ZipFile(tmp_path / "avatar.usdz") as archive:

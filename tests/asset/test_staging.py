@@ -86,7 +86,9 @@ def test_a_vertex_has_the_colour_of_its_texel(staged: StagedAvatar) -> None:
     np.testing.assert_array_equal(triangle.vertex_colours, [[3, 0, 0], [3, 3, 0], [0, 0, 0]])
 
 
-def test_expressions_turn_to_the_stages_axes(staged: StagedAvatar) -> None:
+def test_expressions_and_physiques_turn_to_the_stages_axes(staged: StagedAvatar) -> None:
+    stout_m = 0.3 * staged.rest_points_m * (1, 0, 1)  # the column stands on the axis
+    np.testing.assert_allclose(staged.physiques_m["stout"], stout_m, atol=1e-6)
     moved_m = staged.expressions_m["frown"]
     top = moved_points(moved_m)
     np.testing.assert_array_equal(top, np.flatnonzero(staged.rest_points_m[:, 1] > 1.65))  # 5 cm were below the ground

@@ -116,7 +116,7 @@ export class Avatar {
 }
 
 // Returns the blend shapes: one for each name, which several meshes may share, with the largest weight that a motion
-// gives it, and whether any gives it one: others are expressions.
+// gives it, and whether any gives it one: others are expressions and physiques.
 function shapesOf(meshes, motions) {
   const shapes = new Map();
   for (const mesh of meshes) {
