@@ -138,10 +138,12 @@ def _captures(folder: Path) -> Iterator[Path]:
 def _listing(capture: Path) -> tuple[str, float]:
     """Return a digest of the names, sizes and times of a folder's files, which tells whether it was seen before without
     reading them, and when one was last written, moved or made (0 if there is none): modification times alone may be
-    those of the original."""
-    listing, touched_s = hashlib.sha256(), 0.0
-    for entry in sorted(entries(capture), key=lambda entry: entry.path):
+    those of the original. A hidden file, such as a copy under way, only counts for when."""
+    listing, touched_s, files = hashlib.sha256(), 0.0, 0
+    for entry in sorted(entries(capture, hidden=True), key=lambda entry: entry.path):
         stat = entry.stat(follow_symlinks=False)
-        listing.update(os.fsencode(f"{entry.path} {stat.st_size} {stat.st_mtime_ns}\n"))
         touched_s = max(touched_s, stat.st_ctime)
-    return f"seen-{listing.hexdigest()}", touched_s
+        if not any(part.startswith(".") for part in Path(entry.path).relative_to(capture).parts):
+            listing.update(os.fsencode(f"{entry.path} {stat.st_size} {stat.st_mtime_ns}\n"))
+            files += 1
+    return f"seen-{listing.hexdigest()}", touched_s if files else 0.0

@@ -41,10 +41,11 @@ def made_folder(folder: Path) -> Iterator[None]:
 
 def replace_text(path: Path, text: str) -> None:
     """Replace a text file atomically: write a temporary file beside it, then rename."""
+    encoded = text.encode()
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     beside.unlink(missing_ok=True)
-    with beside.open("x") as file:  # never through a link that lies there
-        file.write(text)
+    with beside.open("xb") as file:  # never through a link that lies there
+        file.write(encoded)
     os.replace(beside, path)
 
 

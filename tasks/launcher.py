@@ -100,9 +100,11 @@ def end_with_parent(last: signal.Signals) -> None:
 def _environment(processes: int) -> dict[str, str]:
     """Return the ranks' environment: the cores divided evenly among them, and threads that sleep while they wait,
     unless the user has set otherwise. Spinning threads make a step many times slower when anything else runs on the
-    machine. Modules are not imported from the current folder, whatever its files are called."""
+    machine. Modules are not imported from the current folder, whatever its files are called. Lines are not held back:
+    torchrun does not flush what it passes on, and a training whose progress is not seen counts as stalled."""
     threads = max(1, len(os.sched_getaffinity(0)) // processes)
-    return {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "PASSIVE", **os.environ, "PYTHONSAFEPATH": "1"}
+    own = {"PYTHONSAFEPATH": "1", "PYTHONUNBUFFERED": "1"}
+    return {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "PASSIVE", **os.environ, **own}
 
 
 def _follow(agent: "subprocess.Popen[str]", log: logging.Logger) -> None:

@@ -4,6 +4,7 @@ import os
 import time
 from pathlib import Path
 
+from hnerf.errors import printable
 from hnerf.files import replace_text
 
 FOLDER = ".refused"
@@ -14,7 +15,7 @@ def note(capture: Path, why: str) -> None:
     """Say why a capture gave no result."""
     path = _path(capture)
     path.parent.mkdir(exist_ok=True)
-    text = f"{capture.name}: {why}\n\n{REMEDY}\n"
+    text = f"{printable(capture.name)}: {printable(why)}\n\n{REMEDY}\n"
     if path.is_symlink() or not path.is_file() or path.read_text(errors="replace").partition("\n\nSeen ")[0] != text:
         replace_text(path, f"{text}\n\nSeen {time.strftime('%Y-%m-%d %H:%M:%S %z')}\n")
 

@@ -61,17 +61,18 @@ def capture_files(folder: Path) -> list[Path]:
     return sorted(Path(entry.path) for entry in entries(folder))
 
 
-def entries(folder: Path | str) -> Iterator["os.DirEntry[str]"]:
-    """Yield the entries of these files, in no order, which know whether they are links without asking again."""
-    try:
-        with os.scandir(folder) as found:
-            visible = [entry for entry in found if not entry.name.startswith(".")]
-            folders = [entry.path for entry in visible if entry.is_dir(follow_symlinks=False)]
-    except OSError as error:
-        _refuse(error)
-    yield from (entry for entry in visible if entry.is_symlink() or entry.is_file(follow_symlinks=False))
-    for path in folders:
-        yield from entries(path)
+def entries(folder: Path | str, hidden: bool = False) -> Iterator["os.DirEntry[str]"]:
+    """Yield the entries of these files, in no order, which know whether they are links without asking again; hidden:
+    yield hidden ones, too."""
+    waiting = [os.fspath(folder)]
+    while waiting:
+        try:
+            with os.scandir(waiting.pop()) as found:
+                shown = [entry for entry in found if hidden or not entry.name.startswith(".")]
+                waiting += [entry.path for entry in shown if entry.is_dir(follow_symlinks=False)]
+        except OSError as error:
+            _refuse(error)
+        yield from (entry for entry in shown if entry.is_symlink() or entry.is_file(follow_symlinks=False))
 
 
 def _digest(folder: Path, files: Iterable[Path]) -> str:

@@ -99,6 +99,35 @@ def test_folders_still_being_written_hidden_and_empty_ones_wait(watched: Path, r
     assert look(watched) == ["ada", "bob"]
 
 
+def test_a_copy_under_way_with_a_hidden_name_waits(watched: Path, runs: list[dict[str, Any]]) -> None:
+    """rsync writes beside the file's own name."""
+    for path in [*watched.rglob("*")]:
+        os.utime(path, (0, 0))
+    (watched / "bob" / "images" / ".1.jpg.Xa81fQ").write_text("half")
+    while time.time() - (watched / "ada" / "images" / "0.jpg").stat().st_ctime < 0.6:
+        time.sleep(0.1)
+    (watched / "bob" / "images" / ".1.jpg.Xa81fQ").write_text("nearly all")
+    assert look(watched, settle_s=0.5) == ["ada"]
+    (watched / "bob" / "images" / ".1.jpg.Xa81fQ").unlink()
+    assert look(watched, settle_s=0.5) == ["bob"]
+
+
+def test_a_name_that_is_not_utf_8_and_a_deep_folder_are_noted_and_the_others_go_on(
+    watched: Path, runs: list[dict[str, Any]]
+) -> None:
+    shutil.copytree(watched / "ada", watched / os.fsdecode(b"a\xff"))
+    at = os.open(watched, os.O_RDONLY)
+    for _ in range(1100):
+        os.mkdir("d", dir_fd=at)
+        at, above = os.open("d", os.O_RDONLY, dir_fd=at), at
+        os.close(above)
+    os.close(at)
+    assert look(watched) == ["ada", "bob"]
+    note = (watched / ".refused" / os.fsdecode(b"a\xff.txt")).read_text()
+    assert note.startswith("a\\udcff: refused: ") and "is not UTF-8; rename it" in note
+    assert sorted(path.name for path in (watched / ".refused").iterdir()) == [os.fsdecode(b"a\xff.txt")]
+
+
 def test_a_capture_that_cannot_be_read_is_said_and_the_others_go_on(
     watched: Path, runs: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

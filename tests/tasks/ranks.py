@@ -20,6 +20,11 @@ def main(mode: str, folder: Path) -> None:
         raise ValueError("boom in rank one")
     if rank == 1 and mode == "killed":
         os.kill(os.getpid(), signal.SIGKILL)
+    if mode == "slow":
+        for line in range(3):
+            print(f"line {line} at {time.time():.3f}")
+            time.sleep(0.5)
+        return
     if mode == "ok":
         print(f"rank {rank} of {os.environ['WORLD_SIZE']}")
         relay()

@@ -61,6 +61,17 @@ def test_ranks_log_lines_report_progress_and_import_nothing_from_where_the_user_
     assert sorted(progress) == [("training", 0, 8), ("training", 1, 8)]
 
 
+def test_lines_are_logged_as_they_come(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)
+    with caplog.at_level(logging.INFO, logger=RANKS):
+        run_ranks(RANKS, ["slow", str(tmp_path)], processes=1)
+    lines = [record for record in caplog.records if record.name == RANKS]
+    delays_s = [record.created - float(record.message.split()[-1]) for record in lines]
+    assert len(delays_s) == 3 and max(delays_s) - min(delays_s) < 0.4  # they are written 0.5 s apart
+
+
 @pytest.mark.parametrize(
     ("mode", "error", "message"),
     [
