@@ -196,7 +196,7 @@ class NerfiesSettings(FieldSettings):
     width: int = Field(default=64, ge=2)  # of the template network
     deformation_width: int = Field(default=64, ge=2)
     code_width: int = Field(default=8, ge=1)  # of each frame's latent code
-    anneal_steps: int = Field(default=500, ge=1)  # until the deformation uses all octaves of its encoding
+    anneal_share: float = Field(default=1 / 3, gt=0, le=1)  # of training, until the deformation uses all octaves
     learning_rate: float = Field(default=5e-3, gt=0)
 
 

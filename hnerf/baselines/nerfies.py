@@ -62,14 +62,14 @@ class NerfiesField(DynamicField):
     NerfField.
     """
 
-    steps_taken: Tensor
+    progress: Tensor
 
     def __init__(self, body: BodyFit, settings: NerfiesSettings):
         super().__init__(body, settings.samples, settings.learning_rate, settings.code_width)
         self.settings = settings
         self.deformation = Deformation(settings.code_width, settings.deformation_width)
         self.template = NerfNetwork(settings.width)
-        self.register_buffer("steps_taken", torch.zeros((), dtype=torch.long))
+        self.register_buffer("progress", torch.zeros(()))
 
     def sample(self, scene: PosedScene[Boxes], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:
         """Evaluate rays as Field.sample does, at coarse and fine samples together (K = 2 x samples). With draws.probe,
@@ -97,12 +97,12 @@ class NerfiesField(DynamicField):
         change = jacobian(lambda x: self._deform(x, code), self.scaled(points))
         return dataclasses.replace(samples, elastic=weights.sum(1) * elastic_energy(change)), depths
 
-    def on_step_end(self) -> None:
-        """Count steps for annealing."""
-        self.steps_taken += 1
+    def on_step_end(self, progress: float) -> None:
+        """Note how far training has come, for annealing; a later phase begins with all octaves."""
+        self.progress.clamp_(min=progress)
 
     def _deform(self, points: Tensor, code: Tensor) -> Tensor:
-        octaves = OCTAVES * self.steps_taken / self.settings.anneal_steps
+        octaves = OCTAVES * self.progress / self.settings.anneal_share
         return self.deformation(points, code, octaves)
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:

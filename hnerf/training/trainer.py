@@ -194,7 +194,7 @@ class Trainer:
         self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
         terms = self.parts.backward(module, scene, rays, draws, self.processes)
-        self.field.on_step_end()
+        self.field.on_step_end(self._progress())
         if self.step >= self.field_steps:  # the loss that pulls all frames to the fit must not move finished frames
             for pose in (self.objective.correction.turn, self.objective.correction.move_m):
                 if pose.grad is not None:
