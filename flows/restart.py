@@ -2,10 +2,13 @@
 
 import logging
 from datetime import UTC, datetime, timedelta
+from typing import Any
 
 from prefect import get_client
+from prefect.client.orchestration import SyncPrefectClient
 from prefect.client.schemas import filters
 from prefect.client.schemas.objects import FlowRun, State, StateType
+from prefect.client.schemas.sorting import FlowRunSort
 from prefect.states import Scheduled
 
 FLOW, NAME = "train-subject", "local"
@@ -16,13 +19,15 @@ AGAIN = "crashed; begun again"
 # A worker with a limit ends when it is offered a run that it has not let go of, and until then it imports the flow once
 # more, for its hooks: a minute on a busy machine.
 RELEASE = timedelta(minutes=2)
+PAGE = 100  # runs; the server gives at most 200 at once
 
 log = logging.getLogger("hnerf.restart")
 
 
 def unfinished_runs() -> int:
     """Return how many runs of the deployment have not ended."""
-    return len(_runs(*UNFINISHED))
+    with get_client(sync_client=True) as client:
+        return client.count_flow_runs(**_filters(*UNFINISHED))
 
 
 def restart_crashed(max_restarts: int) -> int:
@@ -31,7 +36,7 @@ def restart_crashed(max_restarts: int) -> int:
     even before the server counts it as running. It begins after RELEASE."""
     restarted = 0
     with get_client(sync_client=True) as client:
-        for run in _runs(StateType.CRASHED):
+        for run in _all_runs(client, StateType.CRASHED):
             before = [state.message == AGAIN for state in client.read_flow_run_states(run.id)].count(True)
             if before < max_restarts:
                 again: State[None] = Scheduled(scheduled_time=datetime.now(UTC) + RELEASE, message=AGAIN)
@@ -41,12 +46,21 @@ def restart_crashed(max_restarts: int) -> int:
     return restarted
 
 
-def _runs(*states: StateType) -> list[FlowRun]:
-    with get_client(sync_client=True) as client:
-        return client.read_flow_runs(
-            flow_filter=filters.FlowFilter(name=filters.FlowFilterName(any_=[FLOW])),
-            deployment_filter=filters.DeploymentFilter(name=filters.DeploymentFilterName(any_=[NAME])),
-            flow_run_filter=filters.FlowRunFilter(
-                state=filters.FlowRunFilterState(type=filters.FlowRunFilterStateType(any_=list(states)))
-            ),
-        )
+def _all_runs(client: SyncPrefectClient, *states: StateType) -> list[FlowRun]:
+    """Return all runs of the deployment in these states, oldest first; the server answers with some at a time."""
+    found: list[FlowRun] = []
+    while some := client.read_flow_runs(
+        **_filters(*states), sort=FlowRunSort.EXPECTED_START_TIME_ASC, limit=PAGE, offset=len(found)
+    ):
+        found += some
+    return found
+
+
+def _filters(*states: StateType) -> dict[str, Any]:
+    return {
+        "flow_filter": filters.FlowFilter(name=filters.FlowFilterName(any_=[FLOW])),
+        "deployment_filter": filters.DeploymentFilter(name=filters.DeploymentFilterName(any_=[NAME])),
+        "flow_run_filter": filters.FlowRunFilter(
+            state=filters.FlowRunFilterState(type=filters.FlowRunFilterStateType(any_=list(states)))
+        ),
+    }

@@ -32,7 +32,7 @@ GROUND_M, SUNK_M = 0.03, 0.05  # of the lowest points of bodies from height 0, i
 ONE_POSTURE_RAD = 0.002  # std_rad below which the fit found one posture in all frames
 POSE_WIDTH = 8
 NODES = 128  # about 12 cm apart; finer detail, such as a collar, is left to the canonical surface
-DRAWS_PER_PIXEL = 1.5  # how often a pixel of the person is drawn on average
+RAYS_PER_PIXEL = 1.5  # of the person; about half of all rays meet the person
 MIN_STEPS, MAX_STEPS = 600, 4000
 STEPS_PER_FRAME = 540  # with its rays, until its body's depth converges with one camera; half as many lose 0.7 dB
 
@@ -171,7 +171,7 @@ def _ground(scene: SceneStatistics) -> Decision:
 
 def _steps(scene: SceneStatistics, settings: TrainingSettings) -> Decision:
     rays = settings.frames_per_step * settings.rays_per_frame
-    wanted = DRAWS_PER_PIXEL * scene.person_px / rays
+    wanted = RAYS_PER_PIXEL * scene.person_px / rays
     reason = f"{scene.person_px} pixels of the person at {rays} rays a step ask for {wanted:.0f}"
     if scene.cameras == 1 and scene.frames > 1 and settings.pose_learning_rate:
         depths = STEPS_PER_FRAME * scene.frames / settings.frames_per_step

@@ -9,11 +9,12 @@ import pytest
 from prefect import get_client
 from prefect.client.schemas.actions import WorkPoolCreate
 from prefect.client.schemas.filters import DeploymentFilter, DeploymentFilterName, FlowFilter, FlowFilterName
-from prefect.client.schemas.objects import FlowRun
+from prefect.client.schemas.objects import FlowRun, StateType
 from prefect.deployments import run_deployment
 from prefect.exceptions import PrefectHTTPStatusError
 from prefect.states import Crashed
 
+from flows import restart
 from flows.restart import RELEASE, restart_crashed, unfinished_runs
 
 ROOT = Path(__file__).parent.parent.parent
@@ -98,6 +99,20 @@ def test_a_crashed_run_is_begun_again_a_few_times(deployed: str) -> None:
                 assert begins and begins > datetime.now(UTC) + RELEASE / 2
         assert counts == [1, 1, 0, 0]
         assert client.read_flow_run(run.id).state_name == "Crashed"  # type: ignore[union-attr]
+
+
+def test_more_runs_than_the_server_gives_at_once_are_all_counted(
+    deployed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = unfinished_runs()
+    monkeypatch.setattr(restart, "PAGE", 2)
+    begun = [run_deployment("train-subject/local", parameters={"capture": f"/{n}"}, timeout=0) for n in range(5)]
+    assert unfinished_runs() == before + 5
+    with get_client(sync_client=True) as client:
+        for run in begun:
+            client.set_flow_run_state(run.id, Crashed(), force=True)  # type: ignore[union-attr]
+        crashed = [run.id for run in restart._all_runs(client, StateType.CRASHED)]
+    assert {run.id for run in begun} <= set(crashed) and len(crashed) == len(set(crashed))  # type: ignore[union-attr]
 
 
 def test_parameters_are_checked_before_there_is_a_run(deployed: str) -> None:
