@@ -88,6 +88,7 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
     artifact_store.claim(subject, source.digest, capture if isinstance(capture, str) else source.root)
     artifact_store.link_latest(subject, recorded)
     recording = artifact_store.link_latest(subject, with_detections(artifact_store, recorded, settings))
+    artifact_store.unlink_latest(subject, {"detection", "hands"} - {recording.stage})
     calibration = artifact_store.link_latest(subject, calibrate(artifact_store, recording, settings.calibration))
     left_out = calibrated_held_out_cameras(recording, calibration, settings)
     segmentation = artifact_store.link_latest(
@@ -157,8 +158,8 @@ def local_folder(store: Store, capture: Path | str) -> Path:
 def with_detections(store: Store, recorded: Artifact, settings: Settings) -> Artifact:
     """Return the recording with people detected by a network if it needs that, and with points of the subject's hands
     if they are wanted and the network is installed."""
-    wanted = needs_detection(recorded, settings.detection)
-    recording = detect(store, recorded, settings.detection) if wanted else recorded
+    wanted, network = needs_detection(recorded, settings.detection), settings.detection
+    recording = detect(store, recorded, network.source, network.size) if wanted else recorded
     return find_hands(store, recording) if needs_hands(recording, settings.detection) else recording
 
 

@@ -94,9 +94,12 @@ class Bucket:
                 return None
 
     def folders(self) -> list[str]:
-        """Return the names of the folders at the top, sorted, without hidden ones."""
+        """Return the names of the folders at the top, sorted, without hidden ones; none before the first file."""
         with self._answering(""):
-            entries = self.fs.ls(self.root, detail=True)
+            try:
+                entries = self.fs.ls(self.root, detail=True)
+            except FileNotFoundError:
+                return []
         names = {one["name"].rstrip("/").removeprefix(f"{self.root}/") for one in entries if one["type"] == "directory"}
         return sorted(name for name in names if _is_visible(name))
 

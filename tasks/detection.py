@@ -12,10 +12,11 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("detection", version="3", resumable=True)
-def detect(out: Path, recording: Artifact, settings: DetectionSettings) -> dict[str, float]:
+@stage("detection", version="4", resumable=True)
+def detect(out: Path, recording: Artifact, source: str | None, size: str) -> dict[str, float]:
     """Write the recording with keypoints of its training cameras; resume after the cameras that an interrupted run
-    finished."""
+    finished. source, size: of DetectionSettings, whose other fields would not change the result."""
+    settings = DetectionSettings.model_validate({"source": source, "size": size})
     try:
         report = detect_people(Capture.load(recording.root), settings, out)
     except BrokenProcessPool as error:

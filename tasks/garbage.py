@@ -54,7 +54,7 @@ def collect(store: Store, garbage: Garbage) -> bool:
     """Remove it; return False, with all in place, if a process works on the key or has used it meanwhile."""
     try:
         with store.locked(garbage.stage, garbage.key, wait=False):
-            removed = _remove_left(garbage) if garbage.left else _remove_artifact(store, garbage)
+            removed = _remove_left(store, garbage) if garbage.left else _remove_artifact(store, garbage)
             if removed and not store.path(garbage.stage, garbage.key, ".json").exists():
                 store.path(garbage.stage, garbage.key, ".lock").unlink()
             return removed
@@ -76,8 +76,10 @@ def _remove_artifact(store: Store, garbage: Garbage) -> bool:
     return True
 
 
-def _remove_left(garbage: Garbage) -> bool:
-    if _written_s(garbage.left) > garbage.used_s:  # resumed, and interrupted again
+def _remove_left(store: Store, garbage: Garbage) -> bool:
+    folder, record = (store.path(garbage.stage, garbage.key, end) for end in ("", ".json"))
+    finished = folder in garbage.left and record.exists()  # it was about to be recorded
+    if finished or _written_s(garbage.left) > garbage.used_s:  # resumed, and interrupted again
         return False
     for path in garbage.left:
         if path.is_dir() and not path.is_symlink():

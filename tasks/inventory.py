@@ -14,7 +14,6 @@ from tasks.store import RECORDING, STAGES, Artifact, Store
 KEY = re.compile(r"[0-9a-f]{32}")
 STAGE = re.compile(r"[a-z][a-z-]*")
 NO_STAGES = ("subjects", "ingested")
-RESULTS = STAGES[-2:]  # where runs end
 NOBODY = "-"
 
 
@@ -94,9 +93,11 @@ class Inventory:
         roots = pinned(self.store.root)
         for subject, links in self.latest.items():
             roots |= set(links.values())
-            newest = [one.artifact.name for one in self.of_subject(subject)[::-1]]
-            for stage in RESULTS if keep > 1 else ():
-                roots |= set([name for name in newest if name.startswith(f"{stage}/")][:keep])
+            newest = [one.artifact for one in self.of_subject(subject)[::-1]] if keep > 1 else []
+            assets = [one for one in newest if one.stage == "asset"][:keep]  # with which runs end, and nothing else
+            trained = {name for one in assets for name in one.inputs if name.startswith("training/")}
+            scores = [one for one in newest if one.stage == "evaluation" and trained & set(one.inputs)]
+            roots |= {one.name for one in assets + scores}
         return self.with_inputs(roots)
 
 

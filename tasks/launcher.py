@@ -1,6 +1,5 @@
 """Launcher of a module in several processes under torchrun, none of which outlives the caller."""
 
-import ctypes
 import fcntl
 import json
 import logging
@@ -18,6 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
 
 from hnerf.errors import InputError
+from hnerf.processes import end_with_parent
 from hnerf.progress import report_relayed
 
 GRACE_S = 40  # torchrun gives its ranks 30 s to end before it kills them
@@ -27,8 +27,6 @@ LOGS, LOCK, YOUNG_S = "hnerf-ranks-", "lock", 60.0
 FAILURE = "failure.json"  # tasks/agent.py: the first failing rank and its exit code
 # Sent from outside; other signals are raised by the process itself and would recur.
 KILLED = (signal.SIGKILL, signal.SIGTERM)
-PR_SET_PDEATHSIG = 1  # linux/prctl.h
-_libc = ctypes.CDLL(None)
 
 
 class LostWorkerError(RuntimeError):
@@ -89,12 +87,6 @@ def _remove_left_behind() -> None:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if time.time() - (folder / LOCK).stat().st_mtime > YOUNG_S:
                 shutil.rmtree(folder)
-
-
-def end_with_parent(last: signal.Signals) -> None:
-    """Have the kernel (Linux) send this process a signal when its parent dies."""
-    if hasattr(_libc, "prctl"):
-        _libc.prctl(PR_SET_PDEATHSIG, last)
 
 
 def _environment(processes: int) -> dict[str, str]:

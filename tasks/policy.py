@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import json
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from prefect.settings import PREFECT_RESULTS_LOCAL_STORAGE_PATH
 from prefect.tasks import Task
 
 from hnerf.config import Section
+from tasks.bucket import VARIABLE
 from tasks.launcher import LostWorkerError
 from tasks.limits import StalledError
 from tasks.source import Source
@@ -64,14 +66,17 @@ class StorePolicy(CachePolicy):
     """Prefect's cache policy, as a view of the artifact store.
 
     A task run counts as cached if Prefect's record of it agrees with the store. The record of an artifact that was
-    damaged, deleted or made anew is dropped here, so that the task runs again.
+    damaged, deleted or made anew is dropped here, so that the task runs again. With a bucket, Prefect keeps no records:
+    the task looks whether its artifact is there, too.
     """
 
     def compute_key(
         self, task_ctx: TaskRunContext, inputs: dict[str, Any], flow_parameters: dict[str, Any], **kwargs: Any
-    ) -> str:
+    ) -> str | None:
         """Return the name of Prefect's record: the stage's key and a digest of the store's path, so that two stores do
-        not share records."""
+        not share records. None with a bucket."""
+        if os.environ.get(VARIABLE):
+            return None
         store: Store = inputs["store"]
         task = task_ctx.task
         key = stage_key(task.name, str(task.version), inputs["inputs"])

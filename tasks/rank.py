@@ -4,7 +4,7 @@ import runpy
 import signal
 import sys
 
-from tasks.launcher import end_with_parent
+from hnerf.processes import end_with_parent
 
 if __name__ == "__main__":
     end_with_parent(signal.SIGKILL)  # before the module's imports, which take seconds

@@ -169,6 +169,11 @@ class Store:
         os.replace(beside, link)
         return artifact
 
+    def unlink_latest(self, subject: str, stages: Iterable[str]) -> None:
+        """Remove a subject's links to artifacts of these stages, which the latest run did without."""
+        for stage in stages:
+            (self.subject_folder(subject) / stage).unlink(missing_ok=True)
+
     def claim(self, subject: str, digest: str, folder: Path | str) -> None:
         """Note which recording the results under a subject's name are of; warn if until now they were of another, in
         another folder: two recordings of one name replace each other's results."""

@@ -14,6 +14,7 @@ FOUNDATION = (
     "evenly_spaced",
     "tables",
     "files",
+    "processes",
     "progress",
     "side_by_side",
     "models",

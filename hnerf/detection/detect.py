@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import os
 import shutil
+import signal
 import time
 from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
@@ -25,6 +26,7 @@ from hnerf.detection.person_detector import PersonDetector
 from hnerf.detection.tracker import track
 from hnerf.errors import InputError
 from hnerf.models import POSE_DETECTOR, model_file
+from hnerf.processes import end_with_parent
 from hnerf.progress import report as report_progress
 
 KEYPOINTS: KeypointSetName = "blazepose_33"
@@ -93,7 +95,8 @@ def _find_people(capture: Capture, size: str, out: Path) -> None:
             find_in_camera(capture, name, size, out)
         return
     processes = min(len(waiting), len(os.sched_getaffinity(0)))
-    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, spawn, initializer=end_with_parent, initargs=(signal.SIGKILL,)) as pool:
         jobs = {pool.submit(find_in_camera, capture, name, size, out): name for name in waiting}
         running = set(jobs)
         while running:

@@ -1,6 +1,10 @@
 """A capture without keypoints becomes one with; on the shared capture where the networks are there."""
 
+import os
 import shutil
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -111,3 +115,18 @@ def test_joints_are_where_the_truth_has_them(tmp_path: Path) -> None:
         assert found is not None
         true_px, _ = capture.cameras[camera].project(joints_m)
         assert np.median(np.linalg.norm(found[0, 0, LIMBS, :2] - true_px, axis=-1)) < 8
+
+
+def test_no_process_outlives_the_stage_that_was_killed(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tests.detection.orphans", str(tmp_path)]
+    stage = subprocess.Popen(command, cwd=Path(__file__).parents[2], stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while len(list(tmp_path.iterdir())) < min(2, len(os.sched_getaffinity(0))):
+        assert time.monotonic() < deadline and stage.poll() is None
+        time.sleep(0.05)
+    workers = [int(path.name) for path in tmp_path.iterdir()]
+    stage.kill()
+    stage.wait()
+    while any(Path(f"/proc/{worker}/exe").exists() for worker in workers):
+        assert time.monotonic() < deadline, f"{workers} are still running"
+        time.sleep(0.05)

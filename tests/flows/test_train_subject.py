@@ -77,6 +77,17 @@ def test_what_was_detected_takes_the_recordings_place(folder: Path, tmp_path: Pa
     assert given(subject, "asset") == ["detection", "calibration", "segmentation", "training"]
 
 
+def test_what_a_run_did_without_is_not_shown(folder: Path, tmp_path: Path) -> None:
+    """The recording's own files do not change."""
+    for name in ("undetected", "handed"):
+        (folder / name).touch()
+    assert (train_subject.fn(folder, "demo", tmp_path / "store", []).subject / "hands").exists()
+    (folder / "handed").rename(folder / "bared")
+    (folder / "undetected").rename(folder / "detected")
+    subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject
+    assert not {"detection", "hands"} & {path.name for path in subject.iterdir()}
+
+
 def test_hands_lie_between_the_recording_and_all_else(folder: Path, tmp_path: Path) -> None:
     (folder / "handed").touch()
     subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject

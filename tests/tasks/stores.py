@@ -1,4 +1,5 @@
-"""A small store of two people for tests: capture -> fit -> evaluation of each, and what was before."""
+"""A small store of two people for tests, capture -> fit -> training -> evaluation and asset of each, and what was
+before."""
 
 import json
 import os
@@ -31,7 +32,9 @@ def run_of(store: Store, subject: str, first: int) -> list[Artifact]:
     capture = store.link_latest(subject, add(store, "capture", first, name=subject))
     rough = add(store, "fit", first + 1, capture)
     fit = store.link_latest(subject, add(store, "fit", first + 2, capture, rough))
-    return [capture, rough, fit, store.link_latest(subject, add(store, "evaluation", first + 3, fit))]
+    training = store.link_latest(subject, add(store, "training", first + 3, fit))
+    ends = [store.link_latest(subject, add(store, stage, first + 4, training)) for stage in ("evaluation", "asset")]
+    return [capture, rough, fit, training, *ends]
 
 
 def names(artifacts: list[Artifact]) -> set[str]:

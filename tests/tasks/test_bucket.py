@@ -65,6 +65,11 @@ def test_a_bucket_that_is_away_says_so_in_one_line(s3: str, monkeypatch: pytest.
         away.size_bytes("x")
 
 
+def test_a_place_where_nothing_was_put_yet_has_no_folders(s3: str) -> None:
+    bucket = Bucket.at(f"{s3}/nothing-yet")
+    assert bucket.folders() == [] and list(bucket.files("ada")) == []
+
+
 def test_a_bucket_that_is_not_there_is_not_made(s3: str) -> None:
     with pytest.raises(InputError, match="s3://none/x: none is not there; make it"):
         Bucket.at("s3://none/x")

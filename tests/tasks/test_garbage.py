@@ -52,6 +52,14 @@ def test_more_results_of_each_subject_can_be_kept(store: Store) -> None:
     assert garbage(store, keep=2) == names(first) and garbage(store, keep=1) == names(first + second)
 
 
+def test_rows_of_an_ablation_are_no_results(store: Store) -> None:
+    """They end with an evaluation, and nobody links to them."""
+    first, second = run_of(store, "ada", 10), run_of(store, "ada", 20)
+    rows = [add(store, "training", 30 + n, second[2]) for n in range(3)]
+    rows += [add(store, "evaluation", 40 + n, row) for n, row in enumerate(rows)]
+    assert garbage(store, keep=2) == names(rows) and garbage(store, keep=1) == names(first + rows)
+
+
 def test_what_was_used_lately_stays(store: Store) -> None:
     before, _ = run_of(store, "ada", 10), run_of(store, "ada", 20)
     store.find("fit", before[1].root.name)
@@ -63,7 +71,7 @@ def test_a_use_between_look_and_removal_saves_it(store: Store) -> None:
     found = find_garbage(Inventory.of(store), 1, 0)
     used = store.find("fit", before[2].root.name)
     assert used == before[2]
-    assert sorted(collect(store, one) for one in found) == [False, True, True, True]
+    assert sorted(collect(store, one) for one in found) == [False, *5 * [True]]
     assert store.find("fit", before[2].root.name) == used
 
 
@@ -80,7 +88,7 @@ def test_what_a_running_process_uses_stays_until_it_is_killed(store: Store) -> N
     process.start()
     assert used.wait(PATIENCE_S)
     assert pinned(store.root) == {before[2].name}
-    assert garbage(store) == {before[3].name}  # the fit was computed from the others
+    assert garbage(store) == names(before[3:])  # the fit was computed from the others
     assert process.pid
     os.kill(process.pid, signal.SIGKILL)
     process.join(PATIENCE_S)
@@ -136,6 +144,16 @@ def test_work_that_was_resumed_meanwhile_stays(store: Store) -> None:
     (one,) = find_garbage(Inventory.of(store), 1, 0)
     (partial / "checkpoint").touch()
     assert not collect(store, one) and partial.exists()
+
+
+def test_what_was_about_to_be_recorded_stays(store: Store) -> None:
+    """A folder gets its name, and then its record."""
+    made = add(store, "fit", 90)
+    record = store.path("fit", f"{90:032x}", ".json")
+    record.rename(record.with_suffix(".away"))
+    (one,) = find_garbage(Inventory.of(store), 1, 0)
+    record.with_suffix(".away").rename(record)
+    assert not collect(store, one) and store.find("fit", f"{90:032x}") == made
 
 
 def test_a_lock_that_was_removed_under_a_waiting_process_holds_nobody_apart(store: Store) -> None:

@@ -98,6 +98,17 @@ def test_second_flow_run_is_cached_until_an_artifact_is_damaged(
     assert calls(tmp_path) == ["copied", "doubled", "copied"]
 
 
+def test_a_flow_run_puts_what_the_bucket_lacks_there(
+    prefect_api: str, tmp_path: Path, source: Source, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chain(tmp_path, source)
+    (tmp_path / "bucket").mkdir()
+    monkeypatch.setenv("HNERF_BUCKET", f"file://{tmp_path}/bucket")
+    chain(tmp_path, source)
+    assert len(list((tmp_path / "bucket").rglob("*.tar"))) == 2
+    assert calls(tmp_path) == ["copied", "doubled"]
+
+
 def test_artifact_made_anew_outside_prefect_replaces_its_record(
     prefect_api: str, tmp_path: Path, source: Source
 ) -> None:

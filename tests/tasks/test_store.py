@@ -228,6 +228,14 @@ def test_view_never_mixes_what_was_made_from_other_things(tmp_path: Path) -> Non
     assert [path.name for path in (tmp_path / "subjects" / "ada").iterdir()] == ["fit"]
 
 
+def test_view_forgets_stages_that_a_run_did_without(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    for stage in ("capture", "hands", "fit"):
+        store.link_latest("ada", store.get_or_compute(stage, "k", write_abc))
+    store.unlink_latest("ada", {"detection", "hands"})
+    assert sorted(path.name for path in (tmp_path / "subjects" / "ada").iterdir()) == ["capture", "fit"]
+
+
 @pytest.mark.parametrize("name", ["", "..", "../../home", "a/b"])
 def test_view_stays_within_the_store(tmp_path: Path, name: str) -> None:
     store = Store(tmp_path)

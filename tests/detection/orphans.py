@@ -1,0 +1,22 @@
+"""A detection whose networks never answer, for tests: python -m tests.detection.orphans FOLDER."""
+
+import os
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from hnerf.detection import detect
+
+
+def never(capture: Any, camera: str, size: str, out: Path) -> None:
+    """Leave a file named after the process's id, and sleep."""
+    (out / str(os.getpid())).touch()
+    time.sleep(100)
+
+
+if __name__ == "__main__":
+    detect.find_in_camera = never
+    cameras: Any = SimpleNamespace(train_cameras=("01", "02"), frames=(0,))
+    detect._find_people(cameras, "lite", Path(sys.argv[1]))
