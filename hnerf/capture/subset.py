@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from hnerf.capture.board_footage import BOARDS_FILE
-from hnerf.capture.capture import HANDS, KEYPOINTS, PERSON, Capture
+from hnerf.capture.capture import HANDS, KEYPOINTS, LANDMARKS, PERSON, Capture
 from hnerf.errors import InputError, NotApplicableError
 
 T = TypeVar("T")
@@ -53,12 +53,16 @@ def subset(
 
 
 def write_arrays(capture: Capture, kept: Capture) -> None:
-    """Write keypoints, hands and given poses of the frames and cameras that are kept."""
+    """Write keypoints, hands, landmarks and given poses of the frames and cameras that are kept."""
     rows = np.searchsorted(capture.frames, kept.frames)
-    found = read_keypoints(capture)
-    write_keypoints(kept.root, {name: found[name][rows] for name in kept.cameras if name in found})
-    hands = {name: points for name in kept.cameras if (points := capture.hands(name)) is not None}
-    write_points(kept.root / HANDS, {name: points[rows] for name, points in hands.items()})
+    for file, read in ((KEYPOINTS, capture.keypoints), (HANDS, capture.hands)):
+        found = {name: points for name in kept.cameras if (points := read(name)) is not None}
+        write_points(kept.root / file, {name: points[rows] for name, points in found.items()})
+    for name in kept.cameras:
+        landmarks = capture.landmarks(name)
+        if landmarks is not None:
+            points_px, points_m = (points[rows] for points in landmarks)
+            write_points(kept.root / LANDMARKS / f"{name}.npz", {"points_px": points_px, "points_m": points_m})
     poses = capture.given_poses()
     if poses:
         dataclasses.replace(poses, theta=poses.theta[rows], root=poses.root[rows]).save(kept.root / "poses.npz")
@@ -76,7 +80,7 @@ def write_keypoints(root: Path, keypoints: dict[str, np.ndarray]) -> None:
 
 
 def write_points(path: Path, points: dict[str, np.ndarray]) -> None:
-    """Write points by camera, and no file where there are none."""
+    """Write arrays of points by name, and no file where there are none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if points:
         np.savez_compressed(path, **points)  # type: ignore[arg-type]

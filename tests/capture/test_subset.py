@@ -5,7 +5,7 @@ import pytest
 from hnerf.capture.capture import Capture
 from hnerf.capture.subset import subset
 from hnerf.errors import InputError
-from tests.study.recording import write_recording
+from tests.study.recording import write_landmarks, write_recording
 
 
 def test_a_subset_has_the_rows_and_files_that_were_chosen(tmp_path: Path) -> None:
@@ -21,6 +21,17 @@ def test_a_subset_has_the_rows_and_files_that_were_chosen(tmp_path: Path) -> Non
     names = [f"{camera}/{frame:06d}.png" for camera in ("02", "03") for frame in (2, 6, 10)]
     pictures = [f"{folder}/{name}" for folder in ("images", "masks") for name in names]
     assert stored == ["background/02.png", "background/03.png", *pictures]
+
+
+def test_landmarks_stay_with_their_frames(tmp_path: Path) -> None:
+    capture = write_recording(tmp_path / "all")
+    write_landmarks(capture, "02")
+    subset(capture, tmp_path / "few", ("02",), (6, 2), (10,))
+    few = Capture.load(tmp_path / "few")
+    landmarks = few.landmarks("02")
+    assert landmarks is not None
+    assert [points[:, 0, 0, 0].tolist() for points in landmarks] == [[2, 6, 10], [0.2, 0.6, 1.0]]
+    assert few.landmarks("03") is None  # no network looked
 
 
 def test_none_keeps_everything(tmp_path: Path) -> None:

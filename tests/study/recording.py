@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import LANDMARKS, Capture
 from hnerf.geometry.camera import Camera
 
 SIZE_PX = 16
@@ -38,6 +38,15 @@ def write_recording(folder: Path) -> Capture:
     np.savez_compressed(folder / "keypoints.npz", **dict.fromkeys(ROTATIONS, people))  # type: ignore[arg-type]
     capture.save()
     return capture
+
+
+def write_landmarks(capture: Capture, camera: str) -> None:
+    """Write the landmarks of one person: all at x = frame, y = 5 px with confidence 1, and frame / 10 metres off in x,
+    y and z."""
+    frame = np.array(capture.frames)[:, None, None]
+    points = np.stack(np.broadcast_arrays(frame, 5, 1), -1) * np.ones((1, 1, 33, 1))
+    (capture.root / LANDMARKS).mkdir(exist_ok=True)
+    np.savez(capture.root / LANDMARKS / f"{camera}.npz", points_px=points, points_m=points[..., :1] / 10 * np.ones(3))
 
 
 def write(path: Path, pixels: np.ndarray) -> None:
