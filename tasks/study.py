@@ -24,14 +24,14 @@ from tasks.training import load_trained_avatar
 EXTREME_POSES = 3  # checked for each strength and seed
 
 
-@stage("study-capture", version="3")
+@stage("study-capture", version="4")
 def degrade_capture(out: Path, recording: Artifact, degradation: Degradation) -> dict[str, float]:
     """Write a degraded capture, in the form that `ingest` writes."""
     catalogue.degrade_capture(Capture.load(recording.root), degradation, out)
     return {}
 
 
-@stage("study-worn", version="2")
+@stage("study-worn", version="3")
 def degrade_clothing(
     out: Path, truth: Source, recording: Artifact, calibration: Artifact, body: Artifact, degradation: Degradation
 ) -> dict[str, float]:

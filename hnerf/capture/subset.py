@@ -2,7 +2,7 @@
 
 import dataclasses
 import shutil
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -13,6 +13,7 @@ from hnerf.capture.capture import HANDS, KEYPOINTS, LANDMARKS, PERSON, Capture
 from hnerf.errors import InputError, NotApplicableError
 
 T = TypeVar("T")
+PointChange = Callable[[str, np.ndarray], np.ndarray]
 
 
 def require_several_cameras(capture: Capture) -> None:
@@ -52,20 +53,30 @@ def subset(
     kept.save()
 
 
-def write_arrays(capture: Capture, kept: Capture) -> None:
-    """Write keypoints, hands, landmarks and given poses of the frames and cameras that are kept."""
-    rows = np.searchsorted(capture.frames, kept.frames)
+def write_arrays(
+    capture: Capture,
+    kept: Capture,
+    change: PointChange = lambda _, points: points,
+    shown: Mapping[str, tuple[int, ...]] | None = None,
+) -> None:
+    """Write keypoints, hands, landmarks and given poses of the frames and cameras that are kept, all points in images
+    (frames, ..., 3) changed by `change(camera, points)`. shown: as in `copy_pixels`, by camera."""
+    frames = dict.fromkeys(kept.cameras, kept.frames) | dict(shown or {})
+    rows = {name: np.searchsorted(capture.frames, frames[name]) for name in kept.cameras}
     for file, read in ((KEYPOINTS, capture.keypoints), (HANDS, capture.hands)):
         found = {name: points for name in kept.cameras if (points := read(name)) is not None}
-        write_points(kept.root / file, {name: points[rows] for name, points in found.items()})
+        write_points(kept.root / file, {name: change(name, points[rows[name]]) for name, points in found.items()})
     for name in kept.cameras:
         landmarks = capture.landmarks(name)
         if landmarks is not None:
-            points_px, points_m = (points[rows] for points in landmarks)
-            write_points(kept.root / LANDMARKS / f"{name}.npz", {"points_px": points_px, "points_m": points_m})
+            points_px, points_m = (points[rows[name]] for points in landmarks)
+            write_points(
+                kept.root / LANDMARKS / f"{name}.npz", {"points_px": change(name, points_px), "points_m": points_m}
+            )
     poses = capture.given_poses()
     if poses:
-        dataclasses.replace(poses, theta=poses.theta[rows], root=poses.root[rows]).save(kept.root / "poses.npz")
+        own = np.searchsorted(capture.frames, kept.frames)
+        dataclasses.replace(poses, theta=poses.theta[own], root=poses.root[own]).save(kept.root / "poses.npz")
 
 
 def read_keypoints(capture: Capture) -> dict[str, np.ndarray]:
@@ -86,10 +97,17 @@ def write_points(path: Path, points: dict[str, np.ndarray]) -> None:
         np.savez_compressed(path, **points)  # type: ignore[arg-type]
 
 
-def copy_pixels(capture: Capture, kept: Capture, camera: str) -> None:
-    """Copy one camera's images, clean plate, given masks and detected person masks, file by file, unchanged."""
+def copy_pixels(capture: Capture, kept: Capture, camera: str, shown: tuple[int, ...] | None = None) -> None:
+    """Copy one camera's images, clean plate, given masks and detected person masks, file by file, unchanged. shown: the
+    capture's frame that each of the kept frames shows; None for the same."""
     for folder in ("images", "masks", PERSON):
-        copy_files(capture.root / folder / camera, kept.root / folder / camera, {f"{f:06d}" for f in kept.frames})
+        stored = {path.stem: path for path in (capture.root / folder / camera).glob("*")}
+        for frame, source in zip(kept.frames, shown or kept.frames, strict=True):
+            path = stored.get(f"{source:06d}")
+            if path:
+                target = kept.root / folder / camera / f"{frame:06d}{path.suffix}"
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path, target)
     copy_files(capture.root / "background", kept.root / "background", {camera})
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hnerf.capture.capture import LANDMARKS, Capture
+from hnerf.capture.capture import HANDS, LANDMARKS, PERSON, Capture
 from hnerf.geometry.camera import Camera
 
 SIZE_PX = 16
@@ -38,6 +38,22 @@ def write_recording(folder: Path) -> Capture:
     np.savez_compressed(folder / "keypoints.npz", **dict.fromkeys(ROTATIONS, people))  # type: ignore[arg-type]
     capture.save()
     return capture
+
+
+def write_detected(capture: Capture) -> None:
+    """Write what networks detect in the training cameras: in every frame a person mask of 200 in the middle 8 x 8 px
+    and frame elsewhere, landmarks, and two hands whose points are all at (frame, 5), but the first of the left one at
+    (7.5, 7.5)."""
+    likely = {frame: np.full((SIZE_PX, SIZE_PX), frame) for frame in capture.frames}
+    hands = np.ones((len(capture.frames), 2, 21, 3))
+    hands[..., 0], hands[..., 1] = np.array(capture.frames)[:, None, None], 5
+    hands[:, 0, 0, :2] = 7.5
+    np.savez(capture.root / HANDS, **dict.fromkeys(capture.train_cameras, hands))  # type: ignore[arg-type]
+    for name in capture.train_cameras:
+        write_landmarks(capture, name)
+        for frame, mask in likely.items():
+            mask[4:12, 4:12] = 200
+            write(capture.root / PERSON / name / f"{frame:06d}.png", mask)
 
 
 def write_landmarks(capture: Capture, camera: str) -> None:

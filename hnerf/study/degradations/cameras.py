@@ -1,7 +1,6 @@
 """Degradations of the camera rig: fewer cameras or frames, one camera rotated, or one camera delayed."""
 
 import dataclasses
-import shutil
 from pathlib import Path
 from typing import TypeVar
 
@@ -9,14 +8,7 @@ import cv2
 import numpy as np
 
 from hnerf.capture.capture import Capture
-from hnerf.capture.subset import (
-    copy_pixels,
-    read_keypoints,
-    require_several_cameras,
-    subset,
-    write_arrays,
-    write_keypoints,
-)
+from hnerf.capture.subset import copy_pixels, require_several_cameras, subset, write_arrays
 from hnerf.errors import NotApplicableError
 
 T = TypeVar("T")
@@ -44,25 +36,17 @@ def rotate_camera(capture: Capture, angle_deg: float, rng: np.random.Generator, 
 
 def delay_camera(capture: Capture, frames: float, rng: np.random.Generator, out: Path) -> None:
     """Delay one random training camera: at each frame it shows its image of that many frames before, and until then its
-    first image."""
+    first image; masks and what was detected are those of the image."""
     if not 1 <= round(frames) < len(capture.frames):
         raise NotApplicableError(f"{capture.name}: has {len(capture.frames)} frames; none can be delayed by {frames:g}")
     require_several_cameras(capture)
     late = str(rng.choice(capture.train_cameras))
-    kept = dataclasses.replace(capture, root=out)
-    write_arrays(capture, kept)
-    for name in capture.cameras:
-        copy_pixels(capture, kept, name)
     rows = np.maximum(np.arange(len(capture.frames)) - round(frames), 0)
-    keypoints = read_keypoints(capture)
-    if late in keypoints:
-        write_keypoints(out, keypoints | {late: keypoints[late][rows]})
-    for folder in ("images", "masks"):
-        for frame, row in zip(capture.frames, rows, strict=True):
-            for own in (out / folder / late).glob(f"{frame:06d}.*"):
-                own.unlink()  # the earlier frame may have no mask
-            for source in (capture.root / folder / late).glob(f"{capture.frames[row]:06d}.*"):
-                shutil.copyfile(source, out / folder / late / f"{frame:06d}{source.suffix}")
+    shown = {late: tuple(capture.frames[row] for row in rows)}
+    kept = dataclasses.replace(capture, root=out)
+    write_arrays(capture, kept, shown=shown)
+    for name in capture.cameras:
+        copy_pixels(capture, kept, name, shown.get(name))
     kept.save()
 
 

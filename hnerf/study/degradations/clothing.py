@@ -14,7 +14,7 @@ import numpy as np
 
 from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
-from hnerf.capture.capture import Capture, write_image
+from hnerf.capture.capture import PERSON, Capture, write_image
 from hnerf.capture.subset import copy_files, write_arrays
 from hnerf.evaluation.ground_truth import ON_BLACK, GroundTruth
 from hnerf.geometry.rays import RayHits
@@ -137,7 +137,7 @@ GARMENTS: dict[str, Callable[[np.ndarray, np.ndarray, float, Rng], Garment]] = {
 def add_clothing(
     kind: str, strength: float, rng: Rng, capture: Capture, body: BodyFit, truth: GroundTruth, out: Path
 ) -> None:
-    """Write the capture into `out` with a garment of GARMENTS drawn into every image and given mask, and under
+    """Write the capture into `out` with a garment of GARMENTS drawn into every image and mask, and under
     `ground_truth/` into the truth. Keypoints stay: detectors guess what cloth hides. Board footage is omitted."""
     bodies_m, faces = body.vertices_m().double().numpy(), body.rig.faces.numpy()
     rows = [body.index(frame) for frame in capture.frames]
@@ -167,7 +167,7 @@ def add_clothing(
 
 
 def _draw(lit_garment: LitGarment, capture: Capture, truth: GroundTruth, camera: str, frame: int, out: Path) -> None:
-    """Write one image, its given mask, and its truth if there is one."""
+    """Write one image, its given and its detected mask, and its truth if there is one."""
     rgb, coverage, mask = render_person(lit_garment, capture.cameras[camera])
 
     def over(pixels: np.ndarray) -> np.ndarray:
@@ -181,6 +181,9 @@ def _draw(lit_garment: LitGarment, capture: Capture, truth: GroundTruth, camera:
     given = capture.given_mask(camera, frame)
     if given is not None:
         write_image(out / "masks" / file, joined(given))
+    likely = capture.person_probability(camera, frame)
+    if likely is not None:
+        write_image(out / PERSON / file, np.where(mask, 255, 255 * likely).round().astype(np.uint8))
     if truth.has_mask(camera, frame):
         write_image(out / "ground_truth" / "masks" / file, joined(truth.mask(camera, frame)))
         write_image(out / ON_BLACK / file.with_suffix(".jpg"), over(truth.on_black(camera, frame)[0]))

@@ -1,6 +1,7 @@
 """Degradations of the training cameras' images. Test cameras stay as they are, so that scores can be compared.
 
-Clean plates are degraded likewise, since the same camera took them; keypoints stay, unless pixels move.
+Clean plates are degraded likewise, since the same camera took them. What was detected in the images (keypoints, hands,
+landmarks, person masks) stays, unless pixels move or are hidden.
 """
 
 import dataclasses
@@ -10,8 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hnerf.capture.capture import Capture, write_image
-from hnerf.capture.subset import copy_pixels, read_keypoints, require_several_cameras, write_arrays, write_keypoints
+from hnerf.capture.capture import PERSON, Capture, write_image
+from hnerf.capture.subset import PointChange, copy_pixels, require_several_cameras, write_arrays
 from hnerf.geometry.camera import Camera
 
 PixelChange = Callable[[str, np.ndarray], np.ndarray]
@@ -37,38 +38,47 @@ def vary_exposure(capture: Capture, stops: float, rng: np.random.Generator, out:
 
 
 def resize(capture: Capture, scale: float, rng: np.random.Generator, out: Path) -> None:
-    """Resize training cameras' images, keypoints and given masks by a factor. Board footage is omitted."""
-    cameras = {name: capture.cameras[name] for name in capture.train_cameras}
-    small = {name: c.resized(*(max(1, round(scale * px)) for px in (c.width_px, c.height_px)))
-             for name, c in cameras.items()}  # fmt: skip
+    """Resize training cameras' images and masks by a factor, and what was detected in them. Board footage is
+    omitted."""
+    cameras = capture.cameras | {
+        name: camera.resized(*(max(1, round(scale * px)) for px in (camera.width_px, camera.height_px)))
+        for name, camera in capture.cameras.items()
+        if name in capture.train_cameras
+    }
 
     def resized(camera: str, pixels: np.ndarray) -> np.ndarray:
-        return _resized(pixels, small[camera])
+        return _resized(pixels, cameras[camera])
 
-    rewrite_images(capture.with_cameras(capture.cameras | small), out, resized, resized)
-    keypoints = read_keypoints(capture)
-    for name in set(keypoints) & set(small):
-        keypoints[name] = _scaled_keypoints(keypoints[name], cameras[name], small[name])
-    write_keypoints(out, keypoints)
+    def scaled(camera: str, points: np.ndarray) -> np.ndarray:
+        return _scaled_points(points, capture.cameras[camera], cameras[camera])
+
+    rewrite_images(capture.with_cameras(cameras), out, resized, resized, scaled)
 
 
 def rewrite_images(
-    capture: Capture, out: Path, change: PixelChange, change_mask: PixelChange = lambda _, mask: mask
+    capture: Capture,
+    out: Path,
+    change: PixelChange,
+    change_mask: PixelChange = lambda _, mask: mask,
+    change_points: PointChange = lambda _, points: points,
 ) -> None:
     """Copy a capture, changing every image and clean plate of its training cameras by `change(camera, (H, W, 3)
-    uint8)`, and every given mask by `change_mask(camera, (H, W) uint8 of 0 and 255)`. Images are JPEG, as written by
+    uint8)`, every given mask and detected person mask by `change_mask(camera, (H, W) uint8 from 0 to 255)`, and the
+    points detected in any camera by `change_points(camera, (frames, ..., 3))`. Images are JPEG, as written by
     ingest."""
     kept = dataclasses.replace(capture, root=out)
-    write_arrays(capture, kept)
+    write_arrays(capture, kept, change_points)
     for name in capture.test_cameras:
         copy_pixels(capture, kept, name)
     for name in capture.train_cameras:
         for frame in capture.frames:
             write_image(out / "images" / name / f"{frame:06d}.jpg", change(name, capture.image(name, frame)))
-            mask = capture.given_mask(name, frame)
+            mask, likely = capture.given_mask(name, frame), capture.person_probability(name, frame)
             if mask is not None:
                 grey = change_mask(name, np.where(mask, 255, 0).astype(np.uint8))
                 write_image(out / "masks" / name / f"{frame:06d}.png", np.where(grey > 127, 255, 0).astype(np.uint8))
+            if likely is not None:
+                write_image(out / PERSON / name / f"{frame:06d}.png", change_mask(name, _to_8_bit(255 * likely)))
         plate = capture.background(name)
         if plate is not None:
             write_image(out / "background" / f"{name}.jpg", change(name, plate))
@@ -81,12 +91,12 @@ def _resized(pixels: np.ndarray, camera: Camera) -> np.ndarray:
     return cv2.resize(pixels, size_px, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
 
 
-def _scaled_keypoints(keypoints: np.ndarray, old: Camera, new: Camera) -> np.ndarray:
-    """Scale keypoints (..., 3) to another image size, pixel centres at integers; those of zero confidence stay zero."""
+def _scaled_points(points: np.ndarray, old: Camera, new: Camera) -> np.ndarray:
+    """Scale points (..., 3) to another image size, pixel centres at integers; those of zero confidence stay zero."""
     scale = np.array([new.width_px / old.width_px, new.height_px / old.height_px])
-    xy = keypoints[..., :2] * scale + (scale - 1) / 2
-    return np.concatenate([xy, keypoints[..., 2:]], -1) * (keypoints[..., 2:] > 0)
+    xy = points[..., :2] * scale + (scale - 1) / 2
+    return np.concatenate([xy, points[..., 2:]], -1) * (points[..., 2:] > 0)
 
 
-def _to_8_bit(rgb: np.ndarray) -> np.ndarray:
-    return rgb.round().clip(0, 255).astype(np.uint8)
+def _to_8_bit(pixels: np.ndarray) -> np.ndarray:
+    return pixels.round().clip(0, 255).astype(np.uint8)

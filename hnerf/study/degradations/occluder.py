@@ -7,7 +7,6 @@ import numpy as np
 
 from hnerf.capture.capture import Capture
 from hnerf.capture.subject import subject_keypoints
-from hnerf.capture.subset import read_keypoints, write_keypoints
 from hnerf.errors import NotApplicableError
 from hnerf.geometry.camera import Camera
 from hnerf.study.degradations.images import rewrite_images
@@ -19,8 +18,8 @@ GREY = np.array([96, 96, 96], np.uint8)
 
 def add_pillar(capture: Capture, width_m: float, rng: np.random.Generator, out: Path) -> None:
     """Put a grey square pillar between the person and a random training camera. It hides what lies behind it in every
-    training camera that it stands in front of the person for, in the clean plates as well; keypoints behind it are not
-    detected.
+    training camera that it stands in front of the person for, in the clean plates as well; points and person masks
+    behind it are not detected.
 
     Cameras that would see it behind or beside the person do not show it. Raises NotApplicableError if the person's
     position is unknown.
@@ -34,9 +33,8 @@ def add_pillar(capture: Capture, width_m: float, rng: np.random.Generator, out: 
         out,
         lambda camera, rgb: np.where(hidden[camera][..., None], GREY, rgb),
         lambda camera, mask: mask * ~hidden[camera],
+        lambda camera, points: _without(points, hidden[camera]) if camera in hidden else points,
     )
-    keypoints = read_keypoints(capture)
-    write_keypoints(out, {n: _without(k, hidden[n]) if n in hidden else k for n, k in keypoints.items()})
 
 
 def person_middle(capture: Capture) -> np.ndarray:
@@ -74,8 +72,8 @@ def _hidden(camera: Camera, corners_m: np.ndarray, person_m: np.ndarray) -> np.n
     return hidden.astype(bool)
 
 
-def _without(keypoints: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """Return keypoints (..., 3), set to zero on hidden pixels (H, W)."""
+def _without(points: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+    """Return points (..., 3), set to zero on hidden pixels (H, W)."""
     height_px, width_px = hidden.shape
-    x, y = (keypoints[..., k].round().astype(int).clip(0, size - 1) for k, size in enumerate((width_px, height_px)))
-    return keypoints * ~hidden[y, x][..., None]
+    x, y = (points[..., k].round().astype(int).clip(0, size - 1) for k, size in enumerate((width_px, height_px)))
+    return points * ~hidden[y, x][..., None]

@@ -7,12 +7,13 @@ import pytest
 from hnerf.capture.capture import Capture
 from hnerf.errors import InputError, NotApplicableError
 from hnerf.study.degradations.catalogue import KINDS, Degradation, check_strengths, degrade_capture
-from tests.study.recording import FRAMES, write_recording
+from tests.study.recording import FRAMES, write_detected, write_recording
 
 
 def degraded(tmp_path: Path, kind: str, strength: float, seed: int = 0) -> Capture:
     """Degrade the recording of tests/study/recording.py and load it."""
     capture = write_recording(tmp_path / "good")
+    write_detected(capture)
     degrade_capture(capture, Degradation(kind=kind, strength=strength, seed=seed), tmp_path / "bad")
     return Capture.load(tmp_path / "bad")
 
@@ -62,6 +63,14 @@ def test_a_late_camera_shows_what_it_saw_before(tmp_path: Path) -> None:
     keypoints = {name: bad.keypoints(name)[:, 0, 1, 0].tolist() for name in bad.cameras}  # type: ignore[index]
     assert keypoints.pop(late[0]) == [2, 2, 2, 4, 6]
     assert list(keypoints.values()) == [[2, 4, 6, 8, 10]] * 2
+    for name in bad.train_cameras:
+        expected = [2, 2, 2, 4, 6] if name == late[0] else [2, 4, 6, 8, 10]
+        assert bad.hands(name)[:, 1, 0, 0].tolist() == expected  # type: ignore[index]
+        points_px, points_m = bad.landmarks(name)  # type: ignore[misc]
+        assert points_px[:, 0, 0, 0].tolist() == expected
+        assert (10 * points_m[:, 0, 0, 0]).tolist() == pytest.approx(expected)
+        likely = [bad.person_probability(name, frame) for frame in FRAMES]
+        assert [round(255 * float(mask[0, 0])) for mask in likely] == expected  # type: ignore[index]
 
 
 def test_a_late_camera_has_no_mask_where_it_had_none_before(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.study.degradations import clothing
 from hnerf.study.degradations.clothing import Garment, add_clothing, long_hair, skirt
 from tests.body.boxes import box_rig
-from tests.study.recording import FRAMES, SIZE_PX, write_recording
+from tests.study.recording import FRAMES, SIZE_PX, write_detected, write_recording
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -87,6 +87,7 @@ def dressed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Capture, G
     frame 2."""
     monkeypatch.setitem(clothing.GARMENTS, "column", column)
     good = write_recording(tmp_path / "good")
+    write_detected(good)
     folder = good.root / "ground_truth"
     mask = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
     mask[7:9, 7:9] = 255
@@ -111,6 +112,10 @@ def test_what_is_worn_is_seen_where_the_body_does_not_hide_it(tmp_path: Path, mo
         assert changed[name][6:10, 7:9].all()
         assert changed[name].sum() == 8
     assert bad.given_mask("02", 2).sum() == 64  # type: ignore[union-attr]  # the middle 8 x 8 px, as before
+    likely = bad.person_probability("02", 2)
+    assert likely is not None
+    assert (likely[6:10, 7:9] == 1).all()
+    assert (255 * likely).round().sum() == 8 * 255 + 56 * 200 + 192 * 2
     assert bad.keypoints("02")[0, 0, 1].tolist() == [2, 5, 1]  # type: ignore[index]
     assert bad.background("02").mean() == pytest.approx(50, abs=1)  # type: ignore[union-attr]
 

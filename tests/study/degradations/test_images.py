@@ -21,6 +21,17 @@ def test_noise_has_its_spread_in_training_cameras_alone(tmp_path: Path) -> None:
     assert bad.given_mask("01", 2).sum() == 64  # type: ignore[union-attr]
 
 
+def test_noise_leaves_what_was_detected(tmp_path: Path) -> None:
+    bad = degraded(tmp_path, "image_noise", 10)
+    assert bad.has_person_masks
+    good = Capture.load(tmp_path / "good")
+    for name in bad.train_cameras:
+        for read in (Capture.hands, Capture.landmarks):
+            assert np.array_equal(read(bad, name), read(good, name))  # type: ignore[arg-type, operator]
+        both = (one.person_probability(name, 10) for one in (bad, good))
+        assert np.array_equal(*both)  # type: ignore[arg-type]
+
+
 def test_blur_spreads_by_a_share_of_the_width(tmp_path: Path) -> None:
     good = write_recording(tmp_path / "good")
     dot = np.zeros((SIZE_PX, SIZE_PX, 3))
@@ -52,6 +63,13 @@ def test_half_size(tmp_path: Path) -> None:
     assert np.argwhere(mask).min(0).tolist() == [2, 2]
     assert mask.sum() == 16
     assert bad.background("01").shape == (8, 8, 3)  # type: ignore[union-attr]
+    assert bad.hands("01")[0, 1, 0].tolist() == [0.75, 2.25, 1]  # type: ignore[index]
+    points_px, points_m = bad.landmarks("01")  # type: ignore[misc]
+    assert points_px[0, 0, 0].tolist() == [0.75, 2.25, 1]
+    assert points_m[0, 0, 0].tolist() == [0.2, 0.2, 0.2]
+    likely = bad.person_probability("01", 2)
+    assert likely is not None
+    assert (255 * likely).round().sum() == 16 * 200 + 48 * 2
 
 
 def test_the_person_stands_where_rays_meet(tmp_path: Path) -> None:
@@ -66,7 +84,7 @@ def test_the_pillar_stands_on_the_way_to_the_camera(tmp_path: Path) -> None:
     assert corners_m.max(0) == pytest.approx([-1.35, 0.25, 2.2])
 
 
-def test_a_pillar_hides_pixels_masks_and_keypoints_of_the_camera_behind_it(tmp_path: Path) -> None:
+def test_a_pillar_hides_pixels_masks_and_points_of_the_camera_behind_it(tmp_path: Path) -> None:
     """At 2.15 m from a camera of 16 px focal length, where it is nearest, 0.5 m are 3.7 px; the other camera sees it
     1.35 m to the left of the person and not in front of them."""
     bad = degraded(tmp_path, "occluder", 0.5)
@@ -81,3 +99,9 @@ def test_a_pillar_hides_pixels_masks_and_keypoints_of_the_camera_behind_it(tmp_p
     assert mask.sum() == 64 - 4 * 8
     assert not keypoints[0, 0, 0].any()  # 7.5 px
     assert keypoints[0, 0, 1].tolist() == [2, 5, 1]
+    hands, likely = bad.hands(behind[0]), bad.person_probability(behind[0], 2)
+    assert hands is not None
+    assert likely is not None
+    assert not hands[0, 0, 0].any()  # 7.5 px
+    assert hands[0, 0, 1].tolist() == [2, 5, 1]
+    assert np.flatnonzero(~likely.any(0)).tolist() == [6, 7, 8, 9]
