@@ -17,7 +17,8 @@ from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
 from hnerf.errors import InputError, NotApplicableError, one_line
 from hnerf.evaluation.columns import reason_without_novel_poses
-from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, TRACKED
+from hnerf.evaluation.evaluate import reason_without_surface
+from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, PRIMARY_SPLITS, TRACKED
 from hnerf.files import embed_images, replace_text
 from hnerf.study.degradations.catalogue import KINDS, Degradation, degrade_settings
 from hnerf.study.stability.charts import curve_chart, matrix_chart
@@ -252,10 +253,11 @@ class Attempt:
         novel = Capture.load(self.recording.root).novel_pose_frames and not no_poses
         split = ANIMATED if novel else NOVEL_VIEW
         surfaces = (metrics[split]["geometry"] or {"per_surface": []})["per_surface"]
+        unmeshed = [why for primary in PRIMARY_SPLITS if (why := reason_without_surface(metrics[primary]))]
         return {
             "images": _images(metrics, split),
             "surfaces": {surface["frame"]: surface["chamfer_mm"] for surface in surfaces},
-            "faults": _faults(check_meshes(self.store, evaluation, good_body)),
+            "faults": unmeshed + _faults(check_meshes(self.store, evaluation, good_body)),
             "protocol": metrics["protocol"],
             "seconds": json.loads((training.root / "report.json").read_text())["seconds"],
         }

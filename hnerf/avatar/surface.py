@@ -20,6 +20,7 @@ COARSEST_STRIDE = 9  # nodes; divided by three per level, so that a coarse node 
 POSED_CELLS = 256  # on the longest side of the box
 MAX_STEP_M = 0.03  # skinning error stays below this; a longer distance belongs to another limb
 POSED_MARGIN_M = 0.2  # around the naked body: hair, shoes, loose clothes
+NO_SURFACE = "signed distance field: "  # begins every reason why a field has no surface
 
 
 def posed_surface(avatar: Avatar, frame: int) -> trimesh.Trimesh:
@@ -66,14 +67,14 @@ def extract_surface(
     nodes = [math.ceil(float(side_m) / step_m - 1e-4) + 1 for side_m in upper_m - lower_m]
     values = _sample_near_surface(signed_distance, lower_m, step_m, nodes).cpu().numpy()
     if not np.isfinite(values).all():
-        raise InputError("signed distance field: not finite; training diverged, lower its learning rate")
+        raise InputError(f"{NO_SURFACE}not finite; training diverged, lower its learning rate")
     if not values.min() < 0 < values.max():
         found = "everything is inside" if values.max() <= 0 else "everything is outside"
-        raise InputError(f"signed distance field: no surface in its box ({found}); train longer or check masks")
+        raise InputError(f"{NO_SURFACE}no surface in its box ({found}); train longer or check masks")
     vertices, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")  # in steps from `lower_m`
     mesh = _largest_component(trimesh.Trimesh(vertices, faces, process=False))
     if mesh.vertices.min() <= 0 or (mesh.vertices >= np.array(nodes) - 1).any():
-        raise InputError("signed distance field: the surface fills its box; train longer or check masks and body fit")
+        raise InputError(f"{NO_SURFACE}the surface fills its box; train longer or check masks and body fit")
     return trimesh.Trimesh(mesh.vertices * step_m + lower_m.cpu().numpy(), mesh.faces, process=False)
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import logging
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,9 @@ import numpy as np
 import trimesh
 
 from hnerf.avatar.avatar import Avatar
-from hnerf.avatar.surface import POSED_CELLS, posed_surface
+from hnerf.avatar.surface import NO_SURFACE, POSED_CELLS, posed_surface
 from hnerf.config import EvaluationSettings
+from hnerf.errors import InputError
 from hnerf.evaluation import geometry
 from hnerf.evaluation.columns import avatar_for_split, reason_unavailable
 from hnerf.evaluation.ground_truth import GroundTruth
@@ -102,7 +104,7 @@ def score_meshes(
     avatar: Avatar, frames: list[int], true_meshes: dict[int, trimesh.Trimesh], out: Path
 ) -> dict[str, Any]:
     """Write `meshes/<frame>.ply` of the frames, posed as the avatar's body is; return their mean geometry scores, or
-    null with a reason."""
+    null with a reason, which is why there is no surface if any frame has none."""
     (out / "meshes").mkdir(exist_ok=True)
 
     def measure(frame: int) -> tuple[int, dict[str, Any] | None]:
@@ -115,10 +117,19 @@ def score_meshes(
 
     scores = []
     measured = side_by_side(measure, frames, avatar.body.theta.device)
-    for frame, (faces, score) in zip(frames, tracked(measured, "meshes", len(frames)), strict=True):
-        log.info("meshed frame %d: %d faces", frame, faces)
-        scores += [score] if score else []
+    try:
+        for frame, (faces, score) in zip(frames, tracked(measured, "meshes", len(frames)), strict=True):
+            log.info("meshed frame %d: %d faces", frame, faces)
+            scores += [score] if score else []
+    except InputError as error:  # young or failed models may have no surface, which is a result
+        return {"geometry": None, "geometry_reason": str(error)}
     if not scores:
         return {"geometry": None, "geometry_reason": "the capture has no ground-truth surface in these frames"}
     means = {name: float(np.mean([score[name] for score in scores])) for name in scores[0] if name != "frame"}
     return {"geometry": means | {"n": len(scores), "per_surface": scores}}
+
+
+def reason_without_surface(scores: Mapping[str, Any]) -> str | None:
+    """Return why the field that a split's scores are of has no surface; None if it has one or none was extracted."""
+    reason = scores.get("geometry_reason", "")
+    return reason if reason.startswith(NO_SURFACE) else None

@@ -12,11 +12,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from hnerf.config import EvaluationSettings
 from hnerf.evaluation import evaluate as module
-from hnerf.evaluation.evaluate import evaluate, mesh_frames
+from hnerf.evaluation.evaluate import evaluate, mesh_frames, reason_without_surface
 from hnerf.evaluation.geometry import score_geometry
 from hnerf.evaluation.images import render
 from hnerf.evaluation.metrics import mask_box
@@ -235,6 +236,33 @@ def evaluated(base: Path, test_cameras: tuple[str, ...], truth: bool, kind: str)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "write_report", lambda *_: None)
         return out, evaluate(inputs, EvaluationSettings(max_meshes=1, report_rows=1), out)
+
+
+class Mist(BallAvatar):
+    """A ball whose field has no surface."""
+
+    def signed_distance(self, points_m: torch.Tensor, theta: torch.Tensor, root: torch.Tensor) -> torch.Tensor:
+        return torch.full((len(points_m),), 0.05)
+
+
+def test_a_field_without_a_surface_has_images_and_a_reason(tmp_path: Path) -> None:
+    capture = write_ball_capture(tmp_path / "capture", "ball", ("c",))
+    write_ball_truth(capture, RADIUS_M)
+    inputs = ball_inputs(capture, tmp_path / "stages")
+    out = tmp_path / "evaluation"
+    out.mkdir()
+    inputs = dataclasses.replace(inputs, avatar=Mist(inputs.fitted))
+    evaluate(inputs, EvaluationSettings(max_meshes=1, report_rows=1), out)
+    found = json.loads((out / "metrics.json").read_text())
+    reason = "no surface in its box (everything is outside)"
+    for split in ("novel_view", "novel_pose"):
+        assert found[split]["n"] > 0 and found[split]["geometry"] is None
+        assert reason in found[split]["geometry_reason"] and reason in (reason_without_surface(found[split]) or "")
+    assert reason in (out / "report.html").read_text()
+
+
+def test_a_surface_without_truth_is_a_surface(unscored: Scored) -> None:
+    assert reason_without_surface(unscored[1]["novel_pose"]) is None
 
 
 def test_a_method_that_tunes_nothing_has_one_column(tmp_path: Path) -> None:

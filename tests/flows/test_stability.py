@@ -144,6 +144,25 @@ def test_every_run_has_a_verdict(stages: list[dict[str, Any]], tmp_path: Path) -
     assert charts == {"ada-mine-matrix.png", "ada-mine-psnr.png", "ada-mine-chamfer_mm.png"}
 
 
+def test_a_field_without_a_surface_failed(
+    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evaluate = module.evaluate
+
+    def evaluate_mist(*inputs: Any) -> Any:
+        report = evaluate(*inputs)
+        path = report.root / "metrics.json"
+        metrics = json.loads(path.read_text())
+        why = "signed distance field: not finite; training diverged"
+        metrics["novel_pose"] |= {"geometry": None, "geometry_reason": why}
+        path.write_text(json.dumps(metrics))
+        return report
+
+    monkeypatch.setattr(module, "evaluate", evaluate_mist)
+    run = study(tmp_path, only=["pose_noise"])["runs"][0]
+    assert (run["verdict"], run["reason"]) == ("failed", "signed distance field: not finite; training diverged")
+
+
 def test_runs_are_compared_by_the_images_and_surfaces_that_both_have(
     stages: list[dict[str, Any]], tmp_path: Path
 ) -> None:

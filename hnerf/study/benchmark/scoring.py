@@ -14,7 +14,6 @@ from hnerf.avatar.avatar import Avatar
 from hnerf.avatar.trained import load_avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture, read_rgb, write_image
-from hnerf.errors import InputError
 from hnerf.evaluation.columns import avatar_for_split, reason_unavailable
 from hnerf.evaluation.evaluate import PROTOCOL, mesh_frames, score_meshes
 from hnerf.evaluation.ground_truth import GroundTruth
@@ -130,10 +129,7 @@ def score_views(
         return found | {"geometry": None, "geometry_reason": "the study requests no surface here"}
     true_meshes = scene.truth.meshes() if scene.truth else {}
     frames = [f for f in mesh_frames(split_frames(scene.capture, split), true_meshes, meshes) if f in true_meshes]
-    try:
-        return found | score_meshes(avatar, frames, true_meshes, out)
-    except InputError as error:  # young or failed models may have no surface, which is a result
-        return found | {"geometry": None, "geometry_reason": str(error)}
+    return found | score_meshes(avatar, frames, true_meshes, out)
 
 
 def write_pictures(scene: ScoringScene, split: str, per_image: list[ImageScores], out: Path) -> list[Picture]:
