@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from hnerf.evaluation.evaluate import reason_without_surface
 from hnerf.study.benchmark.curves import bin_edges, bin_means
 from hnerf.study.benchmark.results import BINS, scatter_points, scored_methods, sweep_curves
 from hnerf.tables import pick
@@ -98,8 +99,12 @@ def others_have_no_surface(result: Result) -> Iterator[Finding]:
     """Check that no method but the first has a surface that covers the person's volume."""
     for title, variant in result["variants"].items():
         for name, scores in itertools.islice(scored_methods(variant).items(), 1, None):
-            iou = pick(scores[scores["split"]], "geometry.iou") or 0.0
-            yield iou < NO_SURFACE, f"{title}: {name} IoU {iou:.2f}"
+            split = scores[scores["split"]]
+            iou = pick(split, "geometry.iou")
+            if iou is not None:
+                yield iou < NO_SURFACE, f"{title}: {name} IoU {iou:.2f}"
+            elif reason_without_surface(split):
+                yield True, f"{title}: {name} no surface"
 
 
 CHECKS: dict[str, Callable[[Result], Iterator[Finding]]] = {

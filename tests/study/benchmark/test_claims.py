@@ -92,5 +92,19 @@ def test_others_have_no_surface() -> None:
     assert verdict(synthetic_result("others_have_no_surface", nerf={2: (20.0, 0.9, 0.3)})).startswith("no: ")
 
 
+@pytest.mark.parametrize(
+    ("reason", "seen"),
+    [
+        ("signed distance field: not finite; training diverged", "yes: 4 cameras: nerf no surface; "),
+        ("the capture has no ground-truth surface in these frames", "yes: 2 cameras: nerf IoU 0.05."),
+    ],
+)
+def test_a_surface_that_was_not_compared_with_a_truth_is_no_figure(reason: str, seen: str) -> None:
+    result = synthetic_result("others_have_no_surface")
+    unknown = {"geometry": None, "geometry_reason": reason}
+    result["variants"]["4 cameras"]["methods"]["nerf"]["novel_view"] |= unknown
+    assert verdict(result).startswith(seen)
+
+
 def test_without_figures_nothing_is_said() -> None:
     assert verdict(synthetic_result("ahead") | {"variants": {"8 cameras": {"left_out": "too few"}}}) == "no figures."
