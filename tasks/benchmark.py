@@ -10,7 +10,7 @@ from hnerf.models import LPIPS_ALEXNET
 from hnerf.study.benchmark.plan import ScoringSettings
 from hnerf.study.benchmark.scoring import ScoringScene, score, score_end
 from tasks.calibration import calibrated_capture
-from tasks.source import GROUND_TRUTH, Source
+from tasks.source import GROUND_TRUTH, Source, require_unchanged
 from tasks.stage import stage
 from tasks.store import Artifact
 
@@ -27,6 +27,7 @@ def score_training(
 ) -> dict[str, float]:
     """Score a training's snapshots and its end on held-out data, and time the rendering of a frame."""
     found = score(scoring_scene(truth, recording, calibration, body), training.root, settings, out)
+    require_unchanged(truth)
     psnr = found[found["split"]]["psnr"]
     return {} if psnr is None else {"psnr": psnr}
 
@@ -43,6 +44,7 @@ def score_end_of_training(
 ) -> dict[str, float]:
     """Score only the last point of a training's curve."""
     found = score_end(scoring_scene(truth, recording, calibration, body), training.root, settings, out)
+    require_unchanged(truth)
     return {"steps": found["training"]["steps"], "seconds": found["training"]["field_seconds"]}
 
 

@@ -13,7 +13,7 @@ from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.views import SPLITS
 from hnerf.models import LPIPS_ALEXNET
 from tasks.calibration import calibrated_capture
-from tasks.source import Source
+from tasks.source import Source, require_unchanged
 from tasks.stage import stage
 from tasks.store import Artifact
 from tasks.training import load_trained_avatar
@@ -47,6 +47,7 @@ def evaluate(
         held_out_folders=tuple(scores.root for scores in held_out),
     )
     found = evaluate_avatar(inputs, settings, out)
+    require_unchanged(truth)
     held_out_mean = _headline((found["holdout"] or {"mean": {}})["mean"])
     return _headline(found) | {f"holdout {name}": value for name, value in held_out_mean.items()}
 

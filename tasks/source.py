@@ -53,6 +53,15 @@ def read_capture(folder: Path, store: Path | None = None) -> tuple[Source, Sourc
     return recorded, known
 
 
+def require_unchanged(truth: Source) -> None:
+    """Raise InputError unless the files of a ground truth are still those of its digest: what was read of others must
+    not be found under that key again."""
+    folder = truth.root / GROUND_TRUTH
+    files = [f for f in capture_files(truth.root) if f.is_relative_to(folder)] if truth.root.exists() else []
+    if _digest(truth.root, files) != truth.digest:
+        raise InputError(f"{folder}: changed or moved since the command started; run the same command again")
+
+
 def capture_files(folder: Path) -> list[Path]:
     """Return the files and symbolic links in a capture folder, sorted, without hidden ones and devices; a video alone
     is its own file. Raises InputError if a folder cannot be read."""

@@ -16,7 +16,7 @@ from hnerf.study.degradations.catalogue import Degradation
 from hnerf.study.degradations.fit import extreme_poses
 from hnerf.study.surface import SurfaceCheck, check_pose, check_surface
 from tasks.calibration import calibrated_capture
-from tasks.source import Source
+from tasks.source import Source, require_unchanged
 from tasks.stage import stage
 from tasks.store import Artifact
 from tasks.training import load_trained_avatar
@@ -38,6 +38,7 @@ def degrade_clothing(
     """Write a capture whose person wears added clothes or hair, and its ground truth likewise under `ground_truth/`."""
     capture = calibrated_capture(recording, calibration)
     catalogue.degrade_clothing(capture, BodyFit.load(body.root), GroundTruth(truth.root, capture), degradation, out)
+    require_unchanged(truth)
     return {}
 
 

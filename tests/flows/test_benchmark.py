@@ -19,7 +19,7 @@ from hnerf.study.benchmark import publish as publish_module
 from hnerf.study.benchmark.plan import ScoringSettings
 from tasks import benchmark as tasks_module
 from tasks.launcher import LostWorkerError
-from tasks.source import Source
+from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
 from tests.study.benchmark.test_results import scores
 
@@ -261,8 +261,12 @@ def test_scores_are_found_again_until_what_is_scored_or_how_changes(
         return scores(30.0, 1.0, "")
 
     monkeypatch.setattr(tasks_module, "score", score)
+    monkeypatch.setattr(tasks_module, "score_end", lambda *_: {"training": {"steps": 1, "field_seconds": 1.0}})
     monkeypatch.setattr(tasks_module, "scoring_scene", lambda *_: None)
-    truth = Source(root=tmp_path, name="ada", digest="1")
+    mesh = tmp_path / "ada" / "ground_truth" / "mesh.ply"
+    mesh.parent.mkdir(parents=True)
+    mesh.write_text("true")
+    truth = read_capture(tmp_path / "ada")[1]
     recording, calibration, body, model = (Artifact(stage=s, root=tmp_path / s, files={}) for s in "abdc")
     store = Store(tmp_path / "store")
 
@@ -274,5 +278,9 @@ def test_scores_are_found_again_until_what_is_scored_or_how_changes(
     assert first.metrics == {"psnr": 30.0}
     assert counted == [tmp_path / "c"]
     run(truth, ScoringSettings(images=3))
-    run(truth.model_copy(update={"digest": "2"}), ScoringSettings())
-    assert len(counted) == 3
+    mesh.write_text("truer")
+    for stage in (tasks_module.score_training, tasks_module.score_end_of_training):
+        with pytest.raises(InputError, match="ada/ground_truth: changed"):  # nothing is kept under the old key
+            stage(store, truth, recording, calibration, body, model, ScoringSettings(images=4))
+    run(read_capture(tmp_path / "ada")[1], ScoringSettings())
+    assert len(counted) == 4

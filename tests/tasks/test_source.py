@@ -5,7 +5,7 @@ import pytest
 
 from hnerf.errors import InputError
 from tasks import source as module
-from tasks.source import place, read_capture
+from tasks.source import place, read_capture, require_unchanged
 
 
 @pytest.fixture
@@ -55,6 +55,30 @@ def test_recording_and_ground_truth_have_digests_of_their_own(folder: Path) -> N
     assert recorded_now == recorded
     assert truth_now.digest != truth.digest
     assert truth.root == folder
+
+
+@pytest.mark.parametrize("change", ["edited", "added", "gone", "moved"])
+def test_a_ground_truth_that_changed_meanwhile_is_refused(folder: Path, change: str) -> None:
+    _, truth = read_capture(folder)
+    (folder / "intri.yml").write_text("the recording is not read again")
+    require_unchanged(truth)
+    mesh = folder / "ground_truth" / "mesh.ply"
+    match change:
+        case "edited":
+            mesh.write_text("other")
+        case "added":
+            (folder / "ground_truth" / "more.ply").touch()
+        case "gone":
+            mesh.unlink()
+        case "moved":
+            folder.rename(folder.with_name("elsewhere"))
+    with pytest.raises(InputError, match="ada/ground_truth: changed or moved since the command started; run the same"):
+        require_unchanged(truth)
+
+
+def test_no_ground_truth_stays_none(tmp_path: Path) -> None:
+    (tmp_path / "clip.mp4").write_bytes(b"pixels")
+    require_unchanged(read_capture(tmp_path / "clip.mp4")[1])
 
 
 @pytest.mark.parametrize("change", ["bytes", "name", "new", "gone", "link"])

@@ -9,8 +9,11 @@ import trimesh
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
+from hnerf.errors import InputError
 from hnerf.study.degradations.catalogue import Degradation
+from tasks import study as module
 from tasks.capture import subset_capture
+from tasks.source import read_capture
 from tasks.store import Artifact, Store
 from tasks.study import check_meshes, degrade_capture, degrade_fit
 from tests.body.boxes import box_rig
@@ -55,6 +58,21 @@ def test_strength_and_seed_are_part_of_a_degradations_key(store: Store) -> None:
     assert made[0].root == made[1].root
     assert len({artifact.root for artifact in made}) == 3
     assert Capture.load(made[0].root).train_cameras == ("01", "02")
+
+
+def test_what_is_worn_is_kept_only_with_the_ground_truth_of_its_key(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "calibrated_capture", lambda recording, _: Capture.load(recording.root))
+    monkeypatch.setattr(module.catalogue, "degrade_clothing", lambda *_: None)
+    worn, good = Degradation(kind="skirt", strength=0.1, seed=0), recording(store)
+    mesh = tmp_path / "ada" / "ground_truth" / "meshes.npz"
+    mesh.parent.mkdir(parents=True)
+    truth = read_capture(tmp_path / "ada")[1]
+    mesh.write_text("new")
+    with pytest.raises(InputError, match="ada/ground_truth: changed"):
+        module.degrade_clothing(store, truth, good, good, body(store), worn)
+    module.degrade_clothing(store, read_capture(tmp_path / "ada")[1], good, good, body(store), worn)
 
 
 def test_a_degraded_fit_is_a_fit_with_the_good_ones_report(store: Store) -> None:
