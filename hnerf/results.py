@@ -48,8 +48,8 @@ class ChosenSetting(TypedDict):
 
 @CLOSED
 class TrainingReport(TypedDict):
-    """report.json of training. seconds: of both phases, field_seconds: of the field's own; the mean changes are those
-    of all poses since the fit."""
+    """report.json of training. seconds: of the steps of both phases, field_seconds: of the field's own; setup_seconds:
+    of what comes before them, and in neither; the mean changes are those of all poses since the fit."""
 
     device: str
     processes: int

@@ -34,9 +34,10 @@ PICTURES = 2  # of each training
 REPEATS = 3  # of a timed rendering, of which the median counts
 SLOW_S = 10.0  # an image that takes this long is timed once
 SCORING_PROTOCOL = (
-    "Training seconds: the trainer's own clock, without reading the capture. Curves: fewer images and surfaces than in "
-    "tables, the same ones at every point and for all methods, new poses animated; the last point is the finished "
-    "field. "
+    "Training seconds: the trainer's own clock from its first step on, without reading the capture and without setup "
+    "(scene statistics, gathering of pixels, building of field and shell: setup_seconds in scores.json). Curves: fewer "
+    "images and surfaces than in tables, the same ones at every point and for all methods, new poses animated; the "
+    "last point is the finished field. "
     f"Time of a frame: median of {REPEATS} renderings of a whole image, of one if it takes over {SLOW_S:.0f} s. "
     "Peak memory: on a CPU that of the training process, including all libraries; on a GPU that of tensors."
 )
