@@ -21,8 +21,9 @@ class BoxField(Field):
     and 1. Densities are per unit of these coordinates.
 
     The methods were published for a bounded object, a person cut out of the image, or a whole scene; here the
-    background comes from the clean plate, so rays are sampled in the person's box only, those of all pixels that see
-    it. Outside the box the networks were never trained, so the surface ends there.
+    background comes from the clean plate, so rays are sampled in the person's box only. Training draws them from all
+    pixels that see it, a third of them at outlines of the person, as for H-NeRF's preset `fast`. Outside the box the
+    networks were never trained, so the surface ends there.
     """
 
     centre_m: Tensor
