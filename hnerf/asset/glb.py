@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from hnerf.asset.rigs import JointMotion, StagedRig
 from hnerf.asset.skeleton import Skeleton
 from hnerf.asset.skinning import Skin
-from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar, moved_points, shape_names
+from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar, moved_points
 from hnerf.asset.tangents import uv_tangents
 from hnerf.asset.texture import UvLayout
 
@@ -89,7 +89,7 @@ def write_glb(path: Path, avatar: StagedAvatar, rig: StagedRig) -> None:
     writer = GlbWriter()
     document = writer.document
     _add_joints(document, rig.skeleton)
-    names = [*shape_names(avatar), *avatar.expressions_m, *avatar.physiques_m]
+    names = [*avatar.blend_shapes_m, *avatar.physiques_m]
     primitive = _primitive(writer, avatar, rig.skin)
     _add_materials(writer, avatar, primitive)
     document.meshes.append(
@@ -135,10 +135,14 @@ def _primitive(writer: GlbWriter, avatar: StagedAvatar, skin: Skin) -> gltf.Prim
         setattr(attributes, f"JOINTS_{start // 4}", _vertex_data(writer, joints[:, start : start + 4], np.uint16))
         setattr(attributes, f"WEIGHTS_{start // 4}", _vertex_data(writer, weights[:, start : start + 4], np.float32))
     indices = writer.accessor(avatar.face_uvs.astype(np.uint32).ravel(), gltf.ELEMENT_ARRAY_BUFFER)
-    targets = [gltf.Attributes(POSITION=_vertex_data(writer, shape[vertex], np.float32)) for shape in avatar.shapes_m]
-    for moved_m in (offsets_m[vertex] for offsets_m in (avatar.expressions_m | avatar.physiques_m).values()):
-        at = moved_points(moved_m)
-        targets.append(gltf.Attributes(POSITION=writer.sparse_accessor(moved_m[at], at, len(vertex))))
+    targets = []
+    for name, offsets_m in (avatar.blend_shapes_m | avatar.physiques_m).items():
+        at = moved_points(offsets_m[vertex])
+        place, turn = (
+            writer.sparse_accessor(changed[vertex][at], at, len(vertex))
+            for changed in (offsets_m, avatar.normal_changes[name])
+        )
+        targets.append(gltf.Attributes(POSITION=place, NORMAL=turn))
     return gltf.Primitive(attributes=attributes, indices=indices, material=0, targets=targets or None)
 
 

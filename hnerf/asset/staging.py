@@ -70,11 +70,17 @@ class StagedAvatar:
         """Return the unit normals (V, 3) of the surface at rest."""
         return normals_of(self.rest_points_m, self.faces)
 
+    @property
+    def blend_shapes_m(self) -> dict[str, np.ndarray]:
+        """Return the correctives and the expressions, (V, 3), by name."""
+        return dict(zip(shape_names(self), self.shapes_m, strict=True)) | self.expressions_m
+
     @cached_property
-    def expression_normals(self) -> dict[str, np.ndarray]:
-        """Return how expressions change the normals, (V, 3), by name."""
-        shapes_m = self.expressions_m.items()
-        return {name: normals_of(self.rest_points_m + m, self.faces) - self.normals for name, m in shapes_m}
+    def normal_changes(self) -> dict[str, np.ndarray]:
+        """Return how correctives, expressions and physiques change the normals, (V, 3) float32, by name."""
+        shapes_m = (self.blend_shapes_m | self.physiques_m).items()
+        changed = {name: normals_of(self.rest_points_m + m, self.faces) - self.normals for name, m in shapes_m}
+        return {name: change.astype(np.float32) for name, change in changed.items()}
 
     @property
     def rest(self) -> RestSurface:

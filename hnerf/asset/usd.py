@@ -46,14 +46,11 @@ def author_geometry(stage: Usd.Stage, avatar: StagedAvatar, level: int) -> None:
     path, kept = surface_path(level), avatar.levels[level].vertices
     mesh = define_mesh(stage, path, avatar, level)
     shapes = []
-    for name, offsets_m in zip(shape_names(avatar), avatar.shapes_m, strict=True):
-        shapes.append(UsdSkel.BlendShape.Define(stage, path.AppendChild(name)))
-        shapes[-1].CreateOffsetsAttr(vec3f(offsets_m[kept]))
-    for name, offsets_m in avatar.expressions_m.items():
+    for name, offsets_m in avatar.blend_shapes_m.items():
         moved = moved_points(offsets_m[kept])
         shapes.append(UsdSkel.BlendShape.Define(stage, path.AppendChild(name)))
         shapes[-1].CreateOffsetsAttr(vec3f(offsets_m[kept][moved]))
-        shapes[-1].CreateNormalOffsetsAttr(vec3f(avatar.expression_normals[name][kept][moved]))
+        shapes[-1].CreateNormalOffsetsAttr(vec3f(avatar.normal_changes[name][kept][moved]))
         shapes[-1].CreatePointIndicesAttr(Vt.IntArray.FromNumpy(moved.astype(np.int32)))
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
     binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1))

@@ -13,7 +13,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from hnerf.asset.glb import VARIANTS, write_glb
-from hnerf.asset.staging import StagedAvatar
+from hnerf.asset.staging import StagedAvatar, moved_points
 from hnerf.asset.tangents import uv_tangents
 from hnerf.asset.texture import UvLayout
 from hnerf.body.descriptor import normals_of
@@ -202,6 +202,12 @@ def test_expressions_and_physiques_are_morph_targets_after_the_correctives(glb: 
     item = document.accessors[mesh.primitives[0].targets[-2]["POSITION"]]
     frown_m, stout_m = (accessor(document, target["POSITION"]) for target in mesh.primitives[0].targets[-2:])
     np.testing.assert_allclose(frown_m, staged.expressions_m["frown"][vertex], atol=1e-7)
+    for target, shape_m in zip(
+        mesh.primitives[0].targets, (*staged.shapes_m, staged.expressions_m["frown"]), strict=False
+    ):
+        bent = normals_of(staged.rest_points_m + shape_m, staged.faces) - staged.normals
+        at = moved_points(shape_m[vertex])
+        np.testing.assert_allclose(accessor(document, target["NORMAL"])[at], bent[vertex][at], atol=1e-6)
     np.testing.assert_allclose(stout_m, staged.physiques_m["stout"][vertex], atol=1e-5)
     np.testing.assert_allclose((item.min, item.max), ([0, 0, -0.02], [0.01, 0.03, 0]), atol=1e-7)
 

@@ -170,6 +170,15 @@ def test_expressions_are_shapes_of_some_points_that_no_motion_uses(
     assert np.abs(expected - rest)[kept].max() > 0.01
 
 
+def test_correctives_change_the_normals(package: Path, staged: StagedAvatar) -> None:
+    stage = Usd.Stage.Open(str(package / "avatar.usda"))
+    shape = UsdSkel.BlendShape(stage.GetPrimAtPath("/Avatar/Body/Surface/corrective_01"))
+    bent, rest = (normals_of(staged.rest_points_m + m, staged.faces) for m in (staged.shapes_m[0], 0))
+    moved = np.array(shape.GetPointIndicesAttr().Get())
+    np.testing.assert_allclose(shape.GetNormalOffsetsAttr().Get(), (bent - rest)[moved], atol=1e-6)
+    assert np.abs((bent - rest)[moved]).max() > 0.01
+
+
 def test_a_level_without_the_points_of_an_expression_has_it_all_the_same(staged: StagedAvatar, tmp_path: Path) -> None:
     gone = np.setdiff1d(staged.levels[0].vertices, staged.levels[1].vertices)[0]
     wink_m = np.zeros((len(staged.rest_points_m), 3), np.float32)
