@@ -105,11 +105,14 @@ def in_step(
 ) -> dict[str, ImageFolder | Video | InStep]:
     """Return the footage of all cameras at common instants: the frames of the slowest camera that all recorded.
 
-    It is the same footage where there are no clocks and all frames come at an even rate. fps: of images without a rate
-    of their own. Raises InputError where a clock is missing, or the recordings do not overlap.
+    It is the same footage where there are no clocks and no video says that its frames come at an uneven rate. fps: of
+    images without a rate of their own. Raises InputError where a clock is missing, or the recordings do not overlap.
     """
     times_s = {name: frame_times_s(one, fps) for name, one in footage.items()}
-    if not clocks and (len(footage) == 1 or all(_regular(times) for times in times_s.values())):
+    uneven = any(
+        isinstance(one, Video) and one.times_s and not _regular(times_s[name]) for name, one in footage.items()
+    )
+    if not clocks and (len(footage) == 1 or not uneven):
         return dict(footage)
     clocks = clocks or dict.fromkeys(footage, Clock())
     if missing := sorted(set(footage).difference(clocks)):
@@ -148,7 +151,10 @@ def _regular(times_s: np.ndarray) -> bool:
 
 
 def _frames_at(frames: np.ndarray, times_s: np.ndarray, wanted_s: np.ndarray) -> np.ndarray:
-    """Return the frame numbers with fractions at times; NaN beyond half a frame from either end."""
-    reach_s = _step_s(times_s) / 2
-    found = np.interp(wanted_s, times_s, frames)
-    return np.where((wanted_s >= times_s[0] - reach_s) & (wanted_s <= times_s[-1] + reach_s), found, np.nan)
+    """Return the frame numbers with fractions at times; NaN beyond half a frame from the nearest one: before the first,
+    after the last, and where frames are missing."""
+    step_s, position = _step_s(times_s), np.interp(wanted_s, times_s, np.arange(len(times_s)))
+    before_s, after_s = (times_s[rounded(position).astype(int)] for rounded in (np.floor, np.ceil))
+    off_s = np.minimum(np.abs(wanted_s - before_s), np.abs(wanted_s - after_s))
+    neighbours = (after_s > before_s) & (after_s - before_s <= (1 + IRREGULAR) * step_s)
+    return np.where(neighbours | (off_s <= step_s / 2), np.interp(wanted_s, times_s, frames), np.nan)

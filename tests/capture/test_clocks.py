@@ -13,6 +13,7 @@ from hnerf.capture.uncalibrated import Uncalibrated
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from tests.capture.mp4 import hold_frames, rotate, write_video
+from tests.capture.recordings import write_easymocap
 
 
 def images(name: str, count: int, fps: float) -> ImageFolder:
@@ -38,6 +39,25 @@ def test_a_drift_moves_later_frames_by_hand() -> None:
 def test_nothing_changes_without_clocks_at_even_rates() -> None:
     footage = {"a": images("a", 10, 10), "b": images("b", 10, 10)}
     assert in_step(footage, {}, 30) == footage
+
+
+def test_images_that_are_missing_are_not_replaced_by_others(tmp_path: Path) -> None:
+    whole, gap = images("a", 20, 10), images("b", 20, 10)
+    for frame in (5, 6, 7):
+        del gap.files[frame]
+    found = in_step({"a": whole, "b": gap}, {"a": Clock(), "b": Clock(0.04)}, 30)
+    assert found["a"].frames == (*range(5), *range(8, 20))  # at instant 7, b's nearest image is 0.06 s away
+    folder = write_easymocap(tmp_path / "film")
+    (folder / "images" / "02" / "000002.png").unlink()
+    with pytest.raises(InputError, match="02: 4 frames, but camera 01 has 5"):
+        ingest(folder, CaptureSettings(), tmp_path / "out")
+
+
+def test_frames_that_come_unevenly_are_all_taken_and_none_for_another() -> None:
+    video = Video(Path("b"), (0, 1, 2, 3, 4, 5), None, (0.0, 0.1, 0.21, 0.3, 0.6, 0.7))  # two dropped after 0.3 s
+    found = in_step({"a": images("a", 7, 10), "b": video}, {"a": Clock(), "b": Clock(0.04)}, 30)
+    assert isinstance(found["b"], InStep)  # a's instants 4 and 5 are 0.44 and 0.54 s: 0.14 and 0.06 s from a frame
+    assert found["b"].own == pytest.approx({0: 0.4, 1: 1 + 4 / 11, 2: 2 + 3 / 9, 3: 3 + 4 / 30, 6: 4.4})
 
 
 def test_recordings_that_do_not_overlap_and_missing_clocks_are_refused() -> None:
