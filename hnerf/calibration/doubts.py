@@ -15,7 +15,8 @@ MIN_UPRIGHT_COSINE = 0.5  # mean cosine between trunk and up; below it the perso
 EXCHANGED_COSINE = -0.3  # median cosine between left as labelled, and left as face and feet show it
 LOOKED_AT = 5  # frames of each camera, evenly spaced, whose keypoints are compared with the person's pixels
 PLATE_DIFFERENCE = 30  # grey levels between image and clean plate that show the person
-MIRRORED_GAIN = 0.3  # share of keypoints that mirroring brings onto the person
+GAIN = 0.25  # share of keypoints that undoing a mistake brings onto the person
+LOW_SHARE = 0.4  # of the other cameras' share; of a person who is hidden by half, more than that stays in the mask
 # BODY_25
 NOSE, NECK, MID_HIP, EARS = 0, 1, 8, (17, 18)
 LEFT, RIGHT = (5, 12), (2, 9)  # shoulder, hip
@@ -38,7 +39,7 @@ def check_spread(capture: Capture, keypoints: np.ndarray) -> None:
 def doubts(capture: Capture, keypoints: np.ndarray, points_m: np.ndarray | None) -> tuple[str, ...]:
     """Return in words, and log, what contradicts the recording. keypoints (C, frames, 25, 3) of the training cameras;
     points_m (frames, 25, 3), None with one camera."""
-    found = mirrored(capture, keypoints)
+    found = of_other_pictures(capture, keypoints)
     if points_m is not None:
         found = [*_not_upright(points_m, capture.up), *exchanged_sides(points_m), *found]
     for line in found:
@@ -90,32 +91,69 @@ def _direction(start_m: np.ndarray, end_m: np.ndarray) -> np.ndarray:
     return (end_m - start_m) / np.linalg.norm(end_m - start_m, axis=-1, keepdims=True).clip(1e-9)
 
 
-def mirrored(capture: Capture, keypoints: np.ndarray) -> list[str]:
-    """Return a doubt if keypoints (C, frames, 25, 3) lie on the person only when they are mirrored left to right.
+def of_other_pictures(capture: Capture, keypoints: np.ndarray) -> list[str]:
+    """Return doubts if keypoints (C, frames, 25, 3) lie on the person only when they are mirrored left to right, or if
+    a camera's were detected in other pictures than it has.
 
     A ring of cameras cannot tell: mirrored in all of them, a person stands turned about the ring's axis. The person's
     pixels are those of masks that came with the recording or from a network, else what differs from a clean plate.
     """
-    on, on_mirrored = [], []
-    for name, found in zip(capture.train_cameras, keypoints, strict=True):
-        rows = range(len(capture.frames))
-        for row in evenly_spaced(tuple(rows), LOOKED_AT):
-            person = _person(capture, name, capture.frames[row])
-            points = found[row][found[row, :, 2] > 0, :2]
-            if person is None or not len(points):
-                continue
-            x, y = points.round().astype(int).T
-            width_px = person.shape[1]
-            inside = (x >= 0) & (x < width_px) & (y >= 0) & (y < len(person))
-            x, y = x[inside], y[inside]
-            on += person[y, x].tolist()
-            on_mirrored += person[y, width_px - 1 - x].tolist()
-    if not on or np.mean(on_mirrored) < np.mean(on) + MIRRORED_GAIN:
+    rows = list(evenly_spaced(tuple(range(len(capture.frames))), LOOKED_AT))
+    detected = dict(zip(capture.train_cameras, keypoints[:, rows], strict=True))
+    people = {name: [_person(capture, name, capture.frames[row]) for row in rows] for name in detected}
+    on = {name: _on(people[name], detected[name]) for name in detected}
+    on = {name: hits for name, hits in on.items() if np.isfinite(hits).any()}
+    mirrored = {name: _on(people[name], detected[name], mirrored=True) for name in on}
+    share, share_mirrored = _share(*on.values()), _share(*mirrored.values())
+    if share_mirrored > share + GAIN:
+        return [
+            f"{share:.0%} of the keypoints lie on the person, mirrored left to right {share_mirrored:.0%}: "
+            "they belong to mirrored pictures; detect them again in these"
+        ]
+    shares, lines = {name: _share(hits) for name, hits in on.items()}, []
+    for name in shares:
+        others = {f"those of camera {other}": np.nan_to_num(_on(people[name], detected[other])) for other in shares}
+        del others[f"those of camera {name}"]
+        undone = others | {"mirrored": mirrored[name], "in reverse order": _on(people[name][::-1], detected[name])}
+        lines += _worse(name, shares, {what: _share(hits) for what, hits in undone.items()})
+    return lines
+
+
+def _worse(camera: str, shares: dict[str, float], undone: dict[str, float]) -> list[str]:
+    """Return a doubt if far fewer keypoints of a camera lie on the person than in other cameras, or once a mistake is
+    undone. shares: by camera; undone: by mistake."""
+    share, usual = shares[camera], float(np.median([shares[name] for name in shares if name != camera] or [0.0]))
+    mistake = max(undone, key=lambda what: undone[what])
+    if undone[mistake] > share + GAIN:
+        compared = f"{mistake} {undone[mistake]:.0%}"
+    elif share < LOW_SHARE * usual:
+        compared = f"in other cameras {usual:.0%}"
+    else:
         return []
     return [
-        f"{np.mean(on):.0%} of the keypoints lie on the person, mirrored left to right {np.mean(on_mirrored):.0%}: "
-        "they belong to mirrored pictures; detect them again in these"
+        f"camera {camera}: {share:.0%} of the keypoints lie on the person, {compared}: they were detected in other "
+        "pictures than it has; put its pictures right, or detect again in these"
     ]
+
+
+def _on(people: list[np.ndarray | None], keypoints: np.ndarray, mirrored: bool = False) -> np.ndarray:
+    """Return for each keypoint that is detected of (n, 25, 3) whether it lies on the person in as many pictures, (m,);
+    NaN outside the picture."""
+    hits = [np.zeros(0)]
+    for person, points in zip(people, keypoints, strict=True):
+        if person is not None:
+            last = np.array(person.shape[::-1]) - 1
+            at = points[points[:, 2] > 0, :2].round().astype(int)
+            x, y = at.clip(0, last).T
+            hits.append(np.where((at == np.stack([x, y], 1)).all(1), person[y, last[0] - x if mirrored else x], np.nan))
+    return np.concatenate(hits)
+
+
+def _share(*hits: np.ndarray) -> float:
+    """Return the mean of what is known; 0 if nothing is."""
+    known = np.concatenate([np.zeros(0), *hits])
+    known = known[np.isfinite(known)]
+    return float(known.mean()) if len(known) else 0.0
 
 
 def _person(capture: Capture, camera: str, frame: int) -> np.ndarray | None:

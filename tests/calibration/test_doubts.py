@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hnerf.calibration.doubts import exchanged_sides, mirrored
+from hnerf.calibration.doubts import exchanged_sides, of_other_pictures
 from hnerf.capture.capture import Capture, write_image
 from tests.calibration.synthetic import SIZE_PX, detections, ring, walk_m, write_capture
 
@@ -53,13 +53,39 @@ def with_masks(root: Path) -> tuple[Capture, np.ndarray]:
 
 def test_keypoints_of_mirrored_pictures_are_told_by_masks(tmp_path: Path) -> None:
     capture, keypoints = with_masks(tmp_path)
-    assert mirrored(capture, keypoints) == []
+    assert of_other_pictures(capture, keypoints) == []
     wrong = keypoints.copy()
     wrong[..., 0] = SIZE_PX - 1 - wrong[..., 0]
-    (doubt,) = mirrored(capture, wrong)
+    (doubt,) = of_other_pictures(capture, wrong)
     assert "mirrored left to right 100%" in doubt
+
+
+def test_pictures_of_one_camera_that_are_not_its_own_are_told_by_masks(tmp_path: Path) -> None:
+    capture, keypoints = with_masks(tmp_path)
+    first, mirrored = capture.train_cameras[0], keypoints.copy()
+    mirrored[0, ..., 0] = SIZE_PX - 1 - mirrored[0, ..., 0]
+    (doubt,) = of_other_pictures(capture, mirrored)
+    assert doubt.startswith(f"camera {first}: ") and "mirrored 100%" in doubt
+    first_line, _ = of_other_pictures(capture, keypoints[[1, 0, 2]])
+    assert f"those of camera {capture.train_cameras[1]} 100%" in first_line
+    (doubt,) = of_other_pictures(capture, np.concatenate([keypoints[:1, ::-1], keypoints[1:]]))
+    assert doubt.startswith(f"camera {first}: ") and "in reverse order" in doubt
+    elsewhere = keypoints.copy()
+    elsewhere[0, ..., :2] = 3
+    (doubt,) = of_other_pictures(capture, elsewhere)
+    assert doubt.startswith(f"camera {first}: 0% ") and "in other cameras 100%" in doubt
+
+
+def test_masks_that_are_loose_or_hold_half_the_person_are_no_doubt(tmp_path: Path) -> None:
+    capture, keypoints = with_masks(tmp_path)
+    for frame, people in enumerate(keypoints[0]):
+        middle_px = int(people[8, 1])
+        mask = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
+        mask[:middle_px] = 255
+        write_image(tmp_path / "masks" / capture.train_cameras[0] / f"{frame:06d}.png", mask)
+    assert of_other_pictures(capture, keypoints) == []
 
 
 def test_without_masks_or_plates_there_is_no_doubt(tmp_path: Path) -> None:
     capture = write_capture(tmp_path, ring(3), detections(ring(3), 1))
-    assert mirrored(capture, np.stack([people[:, 0] for people in detections(ring(3), 1).values()])) == []
+    assert of_other_pictures(capture, np.stack([people[:, 0] for people in detections(ring(3), 1).values()])) == []
