@@ -7,11 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hnerf.capture.capture import write_image
+from hnerf.capture.capture import read_rgb, write_image
 from hnerf.capture.lens import Lens
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
+MAX_ROUNDING = 1.0  # grey levels, by which two decoders differ on average
 MAX_LABELS = 64  # levels of a mask of labels; a mask of more has soft edges
 
 # OpenCV's default of 5 iterations is off by pixels.
@@ -76,11 +77,12 @@ class Normaliser:
     def write_image(self, rgb: np.ndarray, source: Path, verbatim: Path | None, target: Path) -> None:
         """Write an image to `target` plus a suffix.
 
-        The file itself is copied where it already holds exactly these pixels. Otherwise a JPEG of quality 95 without
-        chroma subsampling is written: its error is far below that of the resampling, at a fifth of a PNG's size.
+        The file itself is copied where `read_rgb` finds these pixels in it, too, whatever it makes of the EXIF.
+        Otherwise a JPEG of quality 95 without chroma subsampling is written: its error is far below that of the
+        resampling, at a fifth of a PNG's size.
         """
         self._check_size(rgb, source)
-        if verbatim and not self.changes_pixels:
+        if verbatim and not self.changes_pixels and _reads_as(verbatim, rgb):
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(verbatim, target.with_name(target.name + verbatim.suffix.lower()))
         else:
@@ -105,3 +107,9 @@ class Normaliser:
                 f"{source}: is {width_px} x {height_px} px, but camera {self.lens.name} records "
                 f"{self.recorded_size_px[0]} x {self.recorded_size_px[1]}; give all its pictures one size"
             )
+
+
+def _reads_as(path: Path, rgb: np.ndarray) -> bool:
+    """Return whether `read_rgb` finds the same picture in a file, but for the rounding of another decoder."""
+    read = read_rgb(path)
+    return read.shape == rgb.shape and cv2.norm(read, rgb, cv2.NORM_L1) < MAX_ROUNDING * rgb.size

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image
 
 from hnerf.errors import InputError
 
@@ -31,6 +31,11 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 VIDEO_SUFFIXES = (".mp4", ".mov")
 JSON_SUFFIXES = (".json",)
 _IMAGE_MODES = ("1", "L", "LA", "P", "RGB", "RGBA")  # 8 bits a channel: others would be clipped
+_EXIF_ORIENTATION = 0x112
+_UPRIGHT = dict(enumerate(  # by EXIF orientation, 2 to 8: what turns the picture upright
+    (Image.Transpose.FLIP_LEFT_RIGHT, Image.Transpose.ROTATE_180, Image.Transpose.FLIP_TOP_BOTTOM,
+     Image.Transpose.TRANSPOSE, Image.Transpose.ROTATE_270, Image.Transpose.TRANSVERSE, Image.Transpose.ROTATE_90), 2
+))  # fmt: skip
 _CAMERA_NAME = re.compile(r"\w([\w ()-]{0,62}[\w()-])?")  # is used as a folder name, and in a glob without wildcards
 _KEY_PART = r"""(?:(?<![\w-])[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"{_KEY_PART}(?:[ \t]*\.[ \t]*{_KEY_PART}){{{MAX_KEY_PARTS}}}")
@@ -189,14 +194,26 @@ def check_image_size(path: Path, width_px: float, height_px: float) -> tuple[int
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Read an image, upright, as (H, W, 3) uint8 RGB. Raises InputError if it is not a whole 8-bit JPEG or PNG of a
-    sane size."""
+    """Read an image, upright by its EXIF, as (H, W, 3) uint8 RGB. Raises InputError if it is not a whole 8-bit JPEG or
+    PNG of a sane size."""
     try:
         with Image.open(path, formats=["JPEG", "PNG"]) as image:
             check_image_size(path, *image.size)
             if image.mode not in _IMAGE_MODES:
                 raise InputError(f"{path}: pixels are {image.mode}; export it again with 8 bits a channel")
-            return np.array(ImageOps.exif_transpose(image).convert("RGB"))
+            rgb = image.convert("RGB")
+            turn = _UPRIGHT.get(_orientation(image))
+            return np.array(rgb if turn is None else rgb.transpose(turn))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
         raise InputError(f"{path}: not a readable image ({reason}); export it again as JPEG or PNG") from None
+
+
+def _orientation(image: Image.Image) -> int:
+    """Return the EXIF orientation of an image; 0 where none can be read."""
+    exif = Image.Exif()
+    try:
+        exif.load(image.info.get("exif", b""))
+        return int(exif.get(_EXIF_ORIENTATION, 0))
+    except Exception:  # damaged EXIF can raise nearly anything
+        return 0

@@ -1,0 +1,71 @@
+"""Images of strangers: upright whatever their metadata say, and of bounded size."""
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hnerf.capture.capture import Capture
+from hnerf.capture.ingest import ingest
+from hnerf.capture.safe_io import read_image
+from hnerf.config import CaptureSettings
+from tests.capture import recordings as rec
+
+SHORT, LONG = 3, 4  # types of EXIF
+ORIENTATION, DESCRIPTION = 0x112, 0x10E
+XMP = (
+    b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+    b'<rdf:Description xmlns:tiff="http://ns.adobe.com/tiff/1.0/" tiff:Orientation="6"/></rdf:RDF></x:xmpmeta>'
+)
+STORED = rec.picture("01", 0)
+# By EXIF's orientation: where its row 0 and column 0 are seen.
+UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    1: lambda a: a,  # top, left
+    2: lambda a: a[:, ::-1],  # top, right
+    3: lambda a: a[::-1, ::-1],  # bottom, right
+    4: lambda a: a[::-1],  # bottom, left
+    5: lambda a: a.swapaxes(0, 1),  # left, top
+    6: lambda a: a.swapaxes(0, 1)[:, ::-1],  # right, top
+    7: lambda a: a.swapaxes(0, 1)[::-1, ::-1],  # right, bottom
+    8: lambda a: a.swapaxes(0, 1)[::-1],  # left, bottom
+}
+
+
+def exif(*entries: tuple[int, int, int]) -> bytes:
+    """Return EXIF, most significant byte first, of entries (tag, type, number)."""
+    values = {SHORT: ">HHIH2x", LONG: ">HHII"}
+    packed = b"".join(struct.pack(values[kind], tag, kind, 1, number) for tag, kind, number in entries)
+    return b"Exif\0\0MM\0*\0\0\0\x08" + struct.pack(">H", len(entries)) + packed + bytes(4)
+
+
+@pytest.mark.parametrize("orientation", UPRIGHT)
+def test_images_are_read_upright(orientation: int, tmp_path: Path) -> None:
+    Image.fromarray(STORED).save(tmp_path / "a.png", exif=exif((ORIENTATION, SHORT, orientation)))
+    assert np.array_equal(read_image(tmp_path / "a.png"), UPRIGHT[orientation](STORED))
+
+
+def test_damaged_metadata_do_not_matter_and_xmp_neither(tmp_path: Path) -> None:
+    """A number in place of a description, which cannot be written again, leaves the orientation; nonsense is none."""
+    odd, nonsense = exif((DESCRIPTION, SHORT, 7), (ORIENTATION, SHORT, 6)), exif((ORIENTATION, LONG, 1 << 31))
+    for metadata, expected in ((odd, UPRIGHT[6](STORED)), (nonsense, STORED), (b"Exif\0\0MM", STORED)):
+        Image.fromarray(STORED).save(tmp_path / "a.png", exif=metadata)
+        assert np.array_equal(read_image(tmp_path / "a.png"), expected)
+    Image.fromarray(STORED).save(tmp_path / "a.jpg", xmp=XMP)
+    assert read_image(tmp_path / "a.jpg").shape == STORED.shape
+
+
+@pytest.mark.parametrize("orientation", [(ORIENTATION, SHORT, 6), (ORIENTATION, SHORT, 2), (ORIENTATION, LONG, 6)])
+def test_what_is_ingested_is_what_was_read(orientation: tuple[int, int, int], tmp_path: Path) -> None:
+    """OpenCV, which reads what is kept, applies EXIF itself, and does not know an orientation of another type."""
+    folder = rec.write_easymocap(tmp_path / "person")
+    sizes = [line for line in (folder / "intri.yml").read_text().splitlines() if not line.startswith(("W_", "H_"))]
+    (folder / "intri.yml").write_text("\n".join(sizes))
+    for path in (folder / "images").rglob("*.png"):
+        Image.open(path).save(path, exif=exif(orientation))
+    ingest(folder, CaptureSettings(), tmp_path / "out")
+    kept = Capture.load(tmp_path / "out").image("01", 0)
+    read = read_image(folder / "images/01/000000.png")
+    assert kept.shape == read.shape and np.abs(kept.astype(int) - read).mean() < 8  # a JPEG of noise
