@@ -16,6 +16,8 @@ from hnerf.progress import report
 
 # Our own message, one line, replaces what OpenCV and FFmpeg would print about a bad video.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+# MP4 and QuickTime, whatever the file is called: others, such as playlists, make FFmpeg read further files.
+os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = "format_whitelist;mov"
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
 

@@ -211,6 +211,13 @@ POSE2SIM = {
     "fisheye": (lambda f: _edit(f / "calibration/Calib.toml", "fisheye = false", "fisheye = true"), "fisheye"),
     "video missing": (lambda f: (f / "videos/cam02.mp4").unlink(), "videos/cam02.mp4"),
     "video is none": (lambda f: (f / "videos/cam02.mp4").write_bytes(b"0" * 100), "videos/cam02.mp4"),
+    "video is a list of other files": (
+        lambda f: [
+            (f / "videos/cam02.mp4").rename(f / "videos/cam02"),
+            (f / "videos/cam02.mp4").write_text("ffconcat version 1.0\nfile cam02\nduration 0.4\n"),
+        ],
+        "videos/cam02.mp4: not a readable video",
+    ),
     "video cut short": (lambda f: _cut_video(f / "videos/cam02.mp4"), "videos/cam02.mp4"),
     "unequal frame counts": (lambda f: rec.write_video(f / "videos/cam02.mp4", 9), "videos/cam02.mp4: 9 frames"),
     "video of another rate": (
