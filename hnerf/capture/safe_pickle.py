@@ -9,9 +9,9 @@ import io
 import math
 import pickle
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse
@@ -95,9 +95,9 @@ class _Dtype(_StandIn):
     """A numpy.dtype(code, align, copy) with state (version, byte order, ...): numbers, text, or Python objects."""
 
     def plain(self, done: dict[int, Any]) -> Any:
-        code, order = str(self.arguments[0]), str(self.state[1]) if self.state else "|"
-        if not _DTYPES.fullmatch(code) or order not in "<>|=":
-            raise pickle.UnpicklingError(f"an array of type {code}")
+        code, order = self.arguments[0], self.state[1] if self.state else "|"
+        if not isinstance(code, str) or not _DTYPES.fullmatch(code) or order not in ("<", ">", "|", "="):
+            raise pickle.UnpicklingError("an array of an unknown type")
         return np.dtype(code).newbyteorder(order)  # type: ignore[arg-type]
 
 
@@ -169,6 +169,27 @@ def _encoded(text: str, encoding: str) -> bytes:
     return text.encode("latin1")
 
 
+def _unhashed(items: Any) -> Any:
+    """Return the items of a set as they are: nobody looks into it, and tuples of shared parts hash without end."""
+    return items
+
+
+def _with_keys(code: bytes, keys: slice) -> Callable[[Any], None]:
+    """Return what loads the items of a dictionary, but no tuples for keys. keys: where they are on the stack."""
+
+    def load(unpickler: Any) -> None:
+        if any(isinstance(key, tuple) for key in unpickler.stack[keys]):
+            raise pickle.UnpicklingError("a tuple for a key")
+        pickle._Unpickler.dispatch[code[0]](unpickler)
+
+    return load
+
+
+def _refused(unpickler: Any) -> None:
+    """Refuse what allocates as much as a pickle says, or hashes what it holds."""
+    raise pickle.UnpicklingError("it holds a set or a bytearray")
+
+
 _ALLOWED: dict[tuple[str, str], Any] = {
     ("numpy", "dtype"): _Dtype,
     ("numpy", "ndarray"): _Array,
@@ -177,8 +198,8 @@ _ALLOWED: dict[tuple[str, str], Any] = {
     ("copyreg", "_reconstructor"): _reconstructed,
     ("__builtin__", "object"): object,
     ("builtins", "object"): object,
-    ("__builtin__", "set"): set,
-    ("builtins", "set"): set,
+    ("__builtin__", "set"): _unhashed,
+    ("builtins", "set"): _unhashed,
     ("chumpy.ch", "Ch"): _Chumpy,
     **{(module, "_reconstruct"): _reconstructed for module in ("numpy.core.multiarray", "numpy._core.multiarray")},
     **{(module, "scalar"): _Scalar for module in ("numpy.core.multiarray", "numpy._core.multiarray")},
@@ -187,6 +208,14 @@ _ALLOWED: dict[tuple[str, str], Any] = {
 
 
 class _Unpickler(pickle._Unpickler):  # in Python: the one in C allocates as much as a pickle's memo index says
+    dispatch: ClassVar = {
+        **pickle._Unpickler.dispatch,
+        **{code[0]: _refused for code in (pickle.BYTEARRAY8, pickle.EMPTY_SET, pickle.ADDITEMS, pickle.FROZENSET)},
+        pickle.SETITEM[0]: _with_keys(pickle.SETITEM, slice(-2, -1)),
+        pickle.SETITEMS[0]: _with_keys(pickle.SETITEMS, slice(0, None, 2)),
+        pickle.DICT[0]: _with_keys(pickle.DICT, slice(0, None, 2)),
+    }
+
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _ALLOWED:
             raise pickle.UnpicklingError(f"it names {module}.{name}")

@@ -90,11 +90,19 @@ def _of_a_terabyte() -> bytes:
     return stored.replace(b"I2\n", b"I1000000000000\n")
 
 
+SHARED = b"2\x86" * 60  # makes what is on the stack a tuple of itself and itself, as often as that
+
 BAD = {
     "a call": pickle.dumps({"cams": Bomb()}),
     "a call in an array": pickle.dumps(np.array([Bomb()], object)),
     "an allowed function's own attribute": b"cnumpy\nfromfile\n(S'/etc/passwd'\ntR.",
     "a call by a stand-in": b"cnumpy.core.multiarray\n_reconstruct\n(c__builtin__\nset\n(I0\ntS'b'\ntR.",
+    "a set": pickle.dumps({1, 2}, 4),
+    "a frozen set": pickle.dumps(frozenset({1, 2}), 4),
+    "a tuple for a key": b"\x80\x02})" + SHARED + b"K\x01s.",
+    "tuples for keys": b"\x80\x02}()" + SHARED + b"K\x01K\x02K\x03u.",
+    "keys of a dictionary at once": b"()" + SHARED + b"K\x01d.",
+    "a tuple for a type": b"\x80\x02cnumpy\ndtype\n)" + SHARED + b"\x85R.",
     "more than it holds": _of_a_terabyte(),
     "cut short": pickle.dumps(DATA)[:300],
     "nested deeply": b"(" * 5000 + b"l" * 5000 + b".",
@@ -110,6 +118,19 @@ def test_what_is_no_plain_data_is_refused(case: str, tmp_path: Path, monkeypatch
     with pytest.raises(InputError, match=r"a\.pkl: not a pickle of plain data"):
         read_pickle(tmp_path / "a.pkl")
     assert not (tmp_path / "pickle-was-loaded").exists()
+
+
+def test_bytes_of_a_declared_length_are_not_allocated(tmp_path: Path) -> None:
+    (tmp_path / "a.pkl").write_bytes(b"\x80\x05\x96" + (10**12).to_bytes(8, "little") + b".")
+    with pytest.raises(InputError, match="holds a set or a bytearray"):
+        read_pickle(tmp_path / "a.pkl")
+
+
+def test_a_set_of_old_is_read_without_hashing(tmp_path: Path) -> None:
+    (tmp_path / "a.pkl").write_bytes(b"\x80\x02}U\x01ac__builtin__\nset\n](" + b")" + SHARED + b"e\x85RsU\x01bK\x02s.")
+    with pytest.raises(InputError, match="more than 10000000 items"):
+        read_pickle(tmp_path / "a.pkl")
+    assert read_pickle(dumped(tmp_path / "b.pkl", {"a": {5}, "b": 2}, 2)) == {"a": [5], "b": 2}
 
 
 def nested_twice(levels: int) -> list[Any]:
