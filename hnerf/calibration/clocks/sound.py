@@ -28,12 +28,15 @@ class SoundOffset(NamedTuple):
 
 
 def sound_offset(a: np.ndarray, b: np.ndarray) -> SoundOffset | None:
-    """Return the offset of two sound tracks (n,), (m,) at RATE_HZ; None where no peak stands out.
+    """Return the offset of two sound tracks (n,), (m,) at RATE_HZ; None where no peak stands out, one is silent, or
+    one is shorter than the echoes of a sound.
 
     Generalised cross-correlation with the phase transform (Knapp and Carter 1976): every frequency counts alike, so
     that the direct sound makes a sharp peak and echoes, which differ between microphones, make lower ones. Sound needs
     3 ms a metre: microphones at different distances hear it that much apart.
     """
+    if min(len(a), len(b)) < 2 * RIVAL_S * RATE_HZ or not np.ptp(a) or not np.ptp(b):
+        return None
     size = 1 << (len(a) + len(b) - 1).bit_length()
     spectra = [np.fft.rfft(track - track.mean(), size) for track in (a, b)]
     cross = np.conj(spectra[0]) * spectra[1]
@@ -84,4 +87,4 @@ def _read_wave(path: Path) -> np.ndarray:
     sound = np.frombuffer(samples[: len(samples) - len(samples) % (2 * channels)], "<i2").reshape(-1, channels).mean(1)
     if rate_hz == RATE_HZ:
         return np.asarray(sound)
-    return np.asarray(resample(sound, round(len(sound) * RATE_HZ / rate_hz)))
+    return np.asarray(resample(sound, max(1, round(len(sound) * RATE_HZ / rate_hz))))

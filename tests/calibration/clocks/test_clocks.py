@@ -133,6 +133,17 @@ def test_unrelated_sound_tells_nothing() -> None:
     assert sound_offset(rng.normal(size=50_000), rng.normal(size=60_000)) is None
 
 
+def test_silence_and_a_click_tell_nothing(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).normal(size=50_000)
+    assert sound_offset(noise, np.zeros(50_000)) is None and sound_offset(np.zeros(50_000), np.zeros(50_000)) is None
+    assert sound_offset(noise, noise[:300]) is None and sound_offset(noise[:300], noise[:300]) is None
+    with wave.open(str(tmp_path / "a.wav"), "wb") as file:
+        file.setparams((1, 2, 48_000, 0, "NONE", "none"))
+        file.writeframes(b"\1\0")
+    sound = read_sound(tmp_path / "a.mp4")
+    assert sound is not None and len(sound) == 1
+
+
 def test_a_wave_file_beside_a_video_is_read_at_any_rate(tmp_path: Path) -> None:
     tone = (1000 * np.sin(2 * np.pi * 440 * np.arange(48_000) / 48_000)).astype("<i2")
     with wave.open(str(tmp_path / "a.wav"), "wb") as file:
