@@ -17,7 +17,8 @@ from PIL import Image
 
 from hnerf.errors import InputError
 
-MAX_IMAGE_PIXELS = 64_000_000
+MAX_IMAGE_PIXELS = 36_000_000  # a frame of 8K video has 33 million
+MAX_SIDE_PX = 32_766  # of images that OpenCV can undistort
 MAX_TEXT_BYTES = 16_000_000
 MAX_TOML_BYTES = 500_000
 MAX_KEY_PARTS = 16  # of a dotted key in TOML; tomllib needs memory and time by their square
@@ -187,23 +188,29 @@ def read_arrays(path: Path, wanted: Container[str], max_bytes: int) -> dict[str,
 
 def check_image_size(path: Path, width_px: float, height_px: float) -> tuple[int, int]:
     """Return the declared (width, height) if sane, before anything is allocated for it. Raises InputError otherwise."""
-    if not (width_px >= 1 and height_px >= 1 and width_px * height_px <= MAX_IMAGE_PIXELS):
-        limit = MAX_IMAGE_PIXELS // 1_000_000
-        raise InputError(f"{path}: declares {width_px:g} x {height_px:g} px; give 1 to {limit} million pixels")
+    short_px, long_px = sorted((width_px, height_px))
+    if not (short_px >= 1 and long_px <= MAX_SIDE_PX and short_px * long_px <= MAX_IMAGE_PIXELS):
+        raise InputError(
+            f"{path}: declares {width_px:g} x {height_px:g} px; give 1 to {MAX_IMAGE_PIXELS // 1_000_000} million "
+            f"pixels, no side over {MAX_SIDE_PX}"
+        )
     return int(width_px), int(height_px)
 
 
 def read_image(path: Path) -> np.ndarray:
     """Read an image, upright by its EXIF, as (H, W, 3) uint8 RGB. Raises InputError if it is not a whole 8-bit JPEG or
     PNG of a sane size."""
+    image: Image.Image  # one at a time: each conversion is another copy
     try:
         with Image.open(path, formats=["JPEG", "PNG"]) as image:
             check_image_size(path, *image.size)
             if image.mode not in _IMAGE_MODES:
                 raise InputError(f"{path}: pixels are {image.mode}; export it again with 8 bits a channel")
-            rgb = image.convert("RGB")
-            turn = _UPRIGHT.get(_orientation(image))
-            return np.array(rgb if turn is None else rgb.transpose(turn))
+            image.load()
+        turn = _UPRIGHT.get(_orientation(image))
+        image = image if image.mode == "RGB" else image.convert("RGB")
+        image = image if turn is None else image.transpose(turn)
+        return np.array(image)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
         raise InputError(f"{path}: not a readable image ({reason}); export it again as JPEG or PNG") from None

@@ -1,6 +1,8 @@
 """Images of strangers: upright whatever their metadata say, and of bounded size."""
 
 import struct
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,8 +12,9 @@ from PIL import Image
 
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
-from hnerf.capture.safe_io import read_image
+from hnerf.capture.safe_io import check_image_size, read_image
 from hnerf.config import CaptureSettings
+from hnerf.errors import InputError
 from tests.capture import recordings as rec
 
 SHORT, LONG = 3, 4  # types of EXIF
@@ -69,3 +72,26 @@ def test_what_is_ingested_is_what_was_read(orientation: tuple[int, int, int], tm
     kept = Capture.load(tmp_path / "out").image("01", 0)
     read = read_image(folder / "images/01/000000.png")
     assert kept.shape == read.shape and np.abs(kept.astype(int) - read).mean() < 8  # a JPEG of noise
+
+
+@pytest.mark.parametrize("size_px", [(6001, 6000), (32_767, 1), (1, 32_767), (0, 5), (float("nan"), 5)])
+def test_sizes_that_no_camera_records_or_opencv_cannot_undistort_are_refused(size_px: tuple[float, float]) -> None:
+    with pytest.raises(InputError, match=r"a\.png: declares .*; give 1 to 36 million pixels, no side over 32766"):
+        check_image_size(Path("a.png"), *size_px)
+
+
+def test_8k_video_and_narrow_strips_are_not_too_large() -> None:
+    assert check_image_size(Path("a.mp4"), 7680.0, 4320.0) == (7680, 4320)
+    assert check_image_size(Path("a.png"), 32_766, 1) == (32_766, 1)
+
+
+def test_the_largest_image_takes_less_than_500_mb(tmp_path: Path) -> None:
+    """In a process of its own, whose peak tells."""
+    Image.new("RGBA", (6000, 6000)).save(tmp_path / "a.png", exif=exif((ORIENTATION, SHORT, 6)), compress_level=1)
+    program = (
+        "import pathlib, re, sys; from hnerf.capture.safe_io import read_image\n"
+        "def peak_kb(): return int(re.search(r'VmHWM:\\s*(\\d+)', pathlib.Path('/proc/self/status').read_text())[1])\n"
+        "before = peak_kb(); read_image(pathlib.Path(sys.argv[1])); print(peak_kb() - before)"
+    )
+    done = subprocess.run([sys.executable, "-c", program, tmp_path / "a.png"], capture_output=True, check=True)
+    assert 1024 * int(done.stdout) < 500_000_000
