@@ -42,9 +42,9 @@ class Board(BaseModel):
 
     columns: int = Field(ge=3, le=64)
     rows: int = Field(ge=3, le=64)
-    square_m: float = Field(gt=0, le=2)
+    square_m: float = Field(ge=1e-4, le=2)
     dictionary: str | None = Field(default=None, pattern=r"^DICT_[A-Z0-9_]{1,32}$")
-    marker_share: float = Field(default=0.75, gt=0, lt=1)
+    marker_share: float = Field(default=0.75, ge=0.1, le=0.99)
     inverted: bool = False
 
     @property
@@ -260,7 +260,7 @@ def _from_caliscope(path: Path) -> dict[str, Any]:
             "marker_share": table["aruco_scale"],
             "inverted": table["inverted"],
         }
-    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+    except (KeyError, OverflowError, TypeError, ValueError, ZeroDivisionError) as error:
         raise InputError(f"{path}: board: {error} is missing or not a number; write it again with Caliscope") from None
 
 

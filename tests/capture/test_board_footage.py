@@ -77,12 +77,22 @@ def test_capture_toml_describes_a_board_too(tmp_path: Path) -> None:
         ('columns = 20\nrows = 20\nsquare_m = 0.1\ndictionary = "DICT_4X4_50"', "only 50 markers"),
         ("columns = 4\nrows = 5\nsquare_m = nan", "board: square_m"),
         ("columns = 4\nrows = 5\nsquare_m = 0.1\nsides = 2", "board: sides"),
+        ("columns = 4\nrows = 5\nsquare_m = 1e-300", "board: square_m"),
+        ("columns = 4\nrows = 5\nsquare_m = 0.1\nmarker_share = 1e-300", "board: marker_share"),
+        ("columns = 4\nrows = 5\nsquare_m = 0.1\nmarker_share = 0.9999999999", "board: marker_share"),
     ],
 )
 def test_bad_descriptions_are_refused(table: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "capture.toml").write_text(f"[board]\n{table}\n")
     with pytest.raises(InputError, match="capture.toml.*" + message):
         read_board(tmp_path)
+
+
+def test_endless_numbers_of_caliscope_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "charuco.toml").write_text(CHARUCO.replace("= 5.4", "= " + "1" * 400))
+    with pytest.raises(InputError, match=r"charuco\.toml: board: .* is missing or not a number") as refusal:
+        read_board(tmp_path)
+    assert len(str(refusal.value)) < 300
 
 
 @pytest.mark.parametrize("inverted", [False, True])
