@@ -48,7 +48,7 @@ class Pose2Sim(Layout):
 
 def _natural_order(path: Path) -> list[str | int]:
     """Return a key that sorts walk_9 before walk_10."""
-    return [int(part) if part.isdecimal() else part for part in re.split("([0-9]+)", path.stem)]
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split("([0-9]+)", path.stem))]
 
 
 def lens_from_table(source: Path, key: str, table: Any) -> Lens:

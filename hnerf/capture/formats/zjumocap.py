@@ -1,5 +1,6 @@
 """ZJU-MoCap, and Human3.6M as NeuralBody prepares it: annots.npy, mask_cihp/ or mask/, new_params/ or params/."""
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -44,7 +45,9 @@ class ZjuMocap(Layout):
             frames = [_frame(row[0]) for row in rows]
             columns = list(zip(*rows, strict=True))
         except (IndexError, KeyError, TypeError, ValueError):
-            raise InputError(f"{self.source}: 'ims' does not list images, as many a frame; prepare it again") from None
+            raise InputError(
+                f"{self.source}: 'ims' does not list images by frame number, as many a frame; prepare it again"
+            ) from None
         if len(set(names)) < len(names) or len(set(frames)) < len(frames):
             raise InputError(f"{self.source}: lists two images of one camera and frame; prepare it again")
         return {name: dict(zip(frames, paths, strict=True)) for name, paths in zip(names, columns, strict=True)}
@@ -110,8 +113,11 @@ class ZjuMocap(Layout):
 
 def _frame(path: PurePosixPath) -> int:
     """Return the frame number of an image: 000012.jpg is frame 12, and so is
-    CoreView_313_Camera_(1)_0012_2019-08-23_16-08-50.592.jpg."""
-    return int(path.stem if path.stem.isdigit() else path.stem.split("_")[4])
+    CoreView_313_Camera_(1)_0012_2019-08-23_16-08-50.592.jpg. Raises IndexError or ValueError on other names."""
+    number = path.stem if path.stem.isdigit() else path.stem.split("_")[4]
+    if not re.fullmatch("[0-9]{1,9}", number):
+        raise ValueError(number)
+    return int(number)
 
 
 def _parameters(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,9 +1,12 @@
 """The real capture in the Pose2Sim layout."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from hnerf.capture.capture import Capture
+from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.ingest import ingest
 from hnerf.capture.keypoint_sets import is_body_25, to_body_25
 from hnerf.config import CaptureSettings
@@ -45,3 +48,13 @@ def test_both_narrow_videos_are_matched_by_their_bars(balance: Capture) -> None:
         assert (area.left, area.width) == (0, 1080)
         assert area.top == pytest.approx(7, abs=0.1)
         assert area.height == pytest.approx(1920 * 1080 / 1088, abs=0.1)
+
+
+def test_keypoint_files_follow_the_numbers_in_their_names(tmp_path: Path) -> None:
+    """Digits of other scripts are letters."""
+    folder = tmp_path / "pose" / "a_json"
+    folder.mkdir(parents=True)
+    for name in ("walk_10", "walk_9", "walk_\u0663", "\u0663"):
+        (folder / f"{name}.json").touch()
+    files = Pose2Sim(tmp_path).keypoint_files("a")
+    assert [Path(str(file)).stem for file in files.values()] == ["walk_9", "walk_10", "walk_\u0663", "\u0663"]

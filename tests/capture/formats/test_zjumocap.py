@@ -106,3 +106,10 @@ def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
     refused("leaves the capture folder")
     np.save(folder / "annots.npy", {"cams": {}, "ims": []}, allow_pickle=True)  # type: ignore[arg-type]
     refused(r"annots\.npy: 'ims' does not list images")
+
+
+@pytest.mark.parametrize("name", ["1566547850592{}.jpg", "a_b_c_d_-{}_x.jpg", "²{}.jpg"])
+def test_frames_that_are_no_numbers_of_up_to_nine_digits_are_refused(name: str, tmp_path: Path) -> None:
+    (tmp_path / "zju").mkdir()
+    with pytest.raises(InputError, match=r"annots\.npy: 'ims' does not list images by frame number"):
+        ingest(write_zju(tmp_path / "zju", frame=name), CaptureSettings(), tmp_path / "out")
