@@ -116,6 +116,8 @@ def read_smpl(path: Path) -> Smpl:
         free=torch.tensor([name in JOINTS and name not in LOCKED for name in names]),
         keypoint_weights=keypoint_weights,
     )
+    if not all(part.isfinite().all() for part in (rig.vertices_m, rig.skin_weights, rig.keypoint_weights)):
+        raise InputError(f"{path}: a bone, a row of weights or of J_regressor is zero; convert the model again")
     return Smpl(rig, rotations)
 
 
@@ -166,9 +168,9 @@ def _checked(path: Path, data: dict[str, Any]) -> dict[str, Tensor]:
     numbers finite."""
     try:
         arrays = {key: torch.from_numpy(np.array(data[key], dtype=np.float64)) for key in KEYS}
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         raise InputError(f"{path}: holds other data than arrays of numbers; convert the model again") from None
-    vertices, joints = len(arrays["v_template"]), len(arrays["J_regressor"])
+    vertices, joints = (arrays[key].shape[0] if arrays[key].ndim else 0 for key in ("v_template", "J_regressor"))
     if vertices not in MESHES or joints not in FURTHER_JOINTS:
         raise InputError(f"{path}: {vertices} vertices and {joints} joints are not those of SMPL, SMPL-H or SMPL-X")
     shapes: dict[str, tuple[int, ...]] = {
@@ -179,15 +181,21 @@ def _checked(path: Path, data: dict[str, Any]) -> dict[str, Tensor]:
         "kintree_table": (2, joints),
     }
     wrong = [key for key, shape in shapes.items() if arrays[key].shape != shape]
-    wrong += [] if arrays["shapedirs"].shape[:2] == (vertices, 3) and arrays["shapedirs"].ndim == 3 else ["shapedirs"]
-    wrong += [key for key in KEYS if not arrays[key].isfinite().all()]
-    above = arrays["kintree_table"][0, 1:]
-    wrong += [] if ((above >= 0) & (above < torch.arange(1, joints))).all() else ["kintree_table"]
-    faces = arrays["f"]
-    wrong += [] if faces.shape[1:] == (3,) and faces.min() >= 0 and faces.max() < vertices else ["f"]
-    if wrong or arrays["shapedirs"].shape[2] < BETAS:
-        raise InputError(f"{path}: {(wrong or ['shapedirs'])[0]} is not that of an SMPL model; convert it again")
+    *ends, betas = arrays["shapedirs"].shape or (0,)
+    wrong += [] if ends == [vertices, 3] and betas >= BETAS else ["shapedirs"]
+    wrong += [] if len(arrays["f"].shape) == 2 and arrays["f"].shape[1] == 3 and len(arrays["f"]) else ["f"]
+    if wrong := wrong or _wrong_numbers(arrays):
+        raise InputError(f"{path}: {wrong[0]} is not that of an SMPL model; convert it again")
     return arrays
+
+
+def _wrong_numbers(arrays: dict[str, Tensor]) -> list[str]:
+    """Return which arrays, of a model's shapes, hold NaN, parents below their children or vertices that are not
+    there."""
+    wrong = [key for key in KEYS if not arrays[key].isfinite().all()]
+    above, faces = arrays["kintree_table"][0, 1:], arrays["f"]
+    wrong += [] if ((above >= 0) & (above < torch.arange(1, len(above) + 1))).all() else ["kintree_table"]
+    return wrong + ([] if faces.min() >= 0 and faces.max() < len(arrays["v_template"]) else ["f"])
 
 
 def _bones(names: tuple[str, ...], joints_m: Tensor) -> dict[str, Tensor]:

@@ -1,5 +1,6 @@
 """SMPL's file format as a rig, tested on a made-up person of tubes; vertices worked out by SMPL's own equations."""
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -145,6 +146,14 @@ BAD = {
     "a face too far": (lambda f: _rewrite(f, f=np.array([[0, 1, 6890]])), "f is not that of an SMPL model"),
     "a child before its parent": (lambda f: _rewrite(f, kintree_table=np.full((2, 24), 23)), "kintree_table is not"),
     "NaN": (lambda f: _rewrite(f, shapedirs=np.full((6890, 3, 10), np.nan)), "shapedirs is not"),
+    "one number for a template": (lambda f: _rewrite(f, v_template=np.array(3.0)), "0 vertices and 24 joints"),
+    "a number for shapes": (lambda f: _rewrite(f, shapedirs=np.array(3.0)), "shapedirs is not"),
+    "too few shapes": (lambda f: _rewrite(f, shapedirs=np.zeros((6890, 3, 9))), "shapedirs is not"),
+    "a list of parents": (lambda f: _rewrite(f, kintree_table=np.arange(24)), "kintree_table is not"),
+    "no faces": (lambda f: _rewrite(f, f=np.zeros((0, 3), int)), "f is not"),
+    "faces in a row": (lambda f: _rewrite(f, f=np.arange(9)), "f is not"),
+    "joints nowhere": (lambda f: _rewrite(f, J_regressor=np.zeros((24, 6890))), "J_regressor is zero"),
+    "skin of no bone": (lambda f: _rewrite(f, weights=np.zeros((6890, 24))), "row of weights"),
     "pickled arrays": (lambda f: _rewrite(f, f=np.array([{}], object)), "not a .npz of plain arrays"),
     "no shapes": (lambda f: _rewrite(f, shapedirs=None), "no shapedirs; give an SMPL"),
 }
@@ -153,6 +162,12 @@ BAD = {
 def _rewrite(path: Path, **changed: np.ndarray | None) -> None:
     data = made_up_smpl() | changed
     np.savez(path, **{key: value for key, value in data.items() if value is not None})
+
+
+def test_endless_numbers_of_a_pickle_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "m.pkl").write_bytes(pickle.dumps(made_up_smpl() | {"f": [[10**600, 1, 2]]}, 2))
+    with pytest.raises(InputError, match=r"m\.pkl: holds other data"):
+        read_smpl(tmp_path / "m.pkl")
 
 
 @pytest.mark.parametrize("case", BAD)
