@@ -54,7 +54,7 @@ def correctives_of(displacements_m: np.ndarray, count: int) -> Correctives:
     and their weights, which are from 0 to 1, since Blender and others clamp them to that.
 
     Components are the leading terms of the singular value decomposition (Eckart and Young 1936). It is not centred, so
-    that a surface without animation is the one that was meshed.
+    that frames without displacements have no weights.
     """
     frames = displacements_m.reshape(len(displacements_m), -1)
     count = min(count, len(frames))

@@ -56,8 +56,9 @@ log = logging.getLogger("hnerf.asset")
 @dataclass(frozen=True)
 class ClothedSurface:
     """The surface of the asset: the field's in the rest pose, `dense`; the meshes made of it by topology, and how far
-    they are from it; of the chosen `mesh`, the body in every frame, its surface in the world, (n, V, 3), what
-    displacements (n, V, 3) take skinning there, and the blend shapes that come close to them."""
+    they are from it as registered or decimated; the chosen `mesh`, moved by the mean displacement of the training
+    frames, the body in every frame, its surface in the world, (n, V, 3), what displacements (n, V, 3) take skinning
+    there, and the blend shapes that come close to them."""
 
     dense: trimesh.Trimesh
     distances_mm: dict[str, Any]
@@ -139,8 +140,11 @@ def _clothed_surface(
     with _timed("correctives", seconds):
         body = dataclasses.replace(select_poses(timeless.body, capture.frames).to("cpu"), rig=mesh.rig)
         surfaces_m, displacements_m = frame_surfaces(avatar, body, mesh.settle)
+        centred = mesh.moved(displacements_m[[body.index(frame) for frame in capture.train_frames]].mean(0))
+        displacements_m -= (centred.rig.vertices_m - mesh.rig.vertices_m).numpy()
         correctives = correctives_of(displacements_m, settings.correctives)
-    return ClothedSurface(dense, distances_mm, mesh, body, surfaces_m, displacements_m, correctives)
+    body = dataclasses.replace(body, rig=centred.rig)
+    return ClothedSurface(dense, distances_mm, centred, body, surfaces_m, displacements_m, correctives)
 
 
 def _staged(

@@ -1,5 +1,6 @@
 """The two meshes that an asset can have: the body model's own, registered, and the field's own, captured."""
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,12 +10,14 @@ import torch
 import trimesh
 
 from hnerf.asset.correctives import as_they_are
-from hnerf.asset.registration import SMOOTHING_M, register
+from hnerf.asset.registration import SMOOTHING_M, crossing_faces, register
 from hnerf.asset.rig_transfer import clothed_rig, strongest, with_surface
 from hnerf.asset.simplify import simplify
 from hnerf.asset.texture import UvLayout, unwrap
 from hnerf.body.base_mesh import BaseMesh, base_mesh
 from hnerf.body.rig import Rig
+
+HALVINGS = 10
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,16 @@ class AssetMesh:
     def physiques_m(self) -> dict[str, np.ndarray]:
         """Return how other physiques move the vertices, (V, 3), by name."""
         return {} if self.base is None else self.base.physiques_m
+
+    def moved(self, offsets_m: np.ndarray) -> "AssetMesh":
+        """Return the mesh with its vertices moved by offsets_m (V, 3); by half of that, a quarter and so on where faces
+        of its skin would cross others."""
+        rest_m, skin = self.rig.vertices_m.numpy(), self.rig.faces.numpy()[: self.skin_faces]
+        share = np.ones((len(rest_m), 1), np.float32)
+        for _ in range(HALVINGS):
+            share[np.unique(skin[crossing_faces(rest_m + share * offsets_m, skin)])] /= 2
+        vertices_m = torch.from_numpy(rest_m + share * offsets_m)
+        return dataclasses.replace(self, rig=dataclasses.replace(self.rig, vertices_m=vertices_m))
 
     def layout(self, texture_px: int) -> UvLayout:
         """Return the texture coordinates: the body model's where it has some, else charts of the body at its shape,

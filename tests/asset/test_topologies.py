@@ -1,0 +1,29 @@
+import dataclasses
+
+import numpy as np
+import torch
+import trimesh
+
+from hnerf.asset.correctives import as_they_are
+from hnerf.asset.registration import crossing_faces
+from hnerf.asset.topologies import AssetMesh
+from tests.asset.figure import column_rig, twice
+
+
+def test_a_moved_mesh_does_not_cross_itself() -> None:
+    """Two boxes with 3 mm of air between them, of which one would be moved by 3.5 mm towards the other: what
+    would cross moves half of that."""
+    boxes = twice(trimesh.creation.box(extents=(0.02, 0.02, 0.02)), (0.023, 0.001, 0.001))
+    rig = dataclasses.replace(
+        column_rig(),
+        vertices_m=torch.from_numpy(np.asarray(boxes.vertices)).float(),
+        faces=torch.from_numpy(np.asarray(boxes.faces)).long(),
+    )
+    mesh = AssetMesh(rig, as_they_are, len(rig.faces), None)
+    offsets_m = np.zeros((16, 3), np.float32)
+    offsets_m[8:, 0] = -0.0035
+    moved = mesh.moved(offsets_m).trimesh
+    assert not crossing_faces(moved.vertices, moved.faces).any()
+    np.testing.assert_allclose((moved.vertices - boxes.vertices)[:, 0].min(), -0.0035, atol=1e-6)
+    facing = moved.vertices[8:, 0] < 0.02
+    np.testing.assert_allclose(moved.vertices[8:, 0][facing], 0.013 - 0.00175, atol=1e-6)
