@@ -9,6 +9,7 @@ from hnerf.body.skeletons import PELVIS, ROOT
 
 SAME = 1e-4  # metres, or parts of 1, by which what must agree may differ
 ON_GROUND_M = 1e-3  # by which the captured body's lowest point may be off the ground
+EYE_OFF = 0.3  # of its radius, by which an eye's joint may be off the middle of its ball
 ON_GROUND_CHANGED_M = 1e-2  # the same with less detail or in another shape
 
 
@@ -34,6 +35,8 @@ def skin_defects(prim: Usd.Prim) -> list[str]:
     used = {tokens[j].rpartition("/")[2] for j in np.unique(joints[weights > 0]).tolist()}
     if len(used & {"eye_L", "eye_R"}) == 1:
         defects.append(f"{name}: skin follows one eye and not the other")
+    off = _eyes_off(points, joints.reshape(vertices, -1), weights.reshape(vertices, -1), skeleton)
+    defects += [f"{name}: {eye} does not turn about the middle of its ball" for eye in off]
     stage = prim.GetStage()
     as_captured = _selected(stage, "lod") in ("", "lod0") and _selected(stage, "shape") in ("", CAPTURED)
     if not abs(points[:, 1].min()) < (ON_GROUND_M if as_captured else ON_GROUND_CHANGED_M):
@@ -41,6 +44,21 @@ def skin_defects(prim: Usd.Prim) -> list[str]:
     if _selected(prim.GetStage(), "rig") == GAME and influences > GAME_INFLUENCES:
         defects.append(f"{name}: {influences} influences; the game rig has at most {GAME_INFLUENCES}")
     return defects
+
+
+def _eyes_off(points: np.ndarray, joints: np.ndarray, weights: np.ndarray, skeleton: UsdSkel.Skeleton) -> list[str]:
+    """Return the names of the eyes whose joints are off the middle of the points (V, 3) that follow them. joints,
+    weights (V, K)."""
+    off = []
+    for j, (token, bind) in enumerate(
+        zip(skeleton.GetJointsAttr().Get(), skeleton.GetBindTransformsAttr().Get(), strict=True)
+    ):
+        name, ball = token.rpartition("/")[2], points[((joints == j) & (weights > 0)).any(1)]
+        if name.startswith("eye_") and len(ball):
+            low, high = ball.min(0), ball.max(0)
+            if np.linalg.norm(bind.ExtractTranslation() - (low + high) / 2) > EYE_OFF * (high - low).min() / 2:
+                off.append(name)
+    return off
 
 
 def _shape_defects(prim: Usd.Prim, vertices: int) -> list[str]:

@@ -6,6 +6,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from hnerf.asset.rigs import EYEBALL_WEIGHT
 from hnerf.body.descriptor import BodyMeshes
 from hnerf.body.rig import Rig
 
@@ -19,6 +20,17 @@ def clothed_rig(rig: Rig, surface: trimesh.Trimesh) -> Rig:
     vertices_m = torch.from_numpy(surface.vertices).float()
     faces = torch.from_numpy(surface.faces).long()
     return with_surface(rig, vertices_m, faces, *transfer_skin_weights(rig, vertices_m, faces))
+
+
+def with_vertices(rig: Rig, vertices_m: Tensor) -> Rig:
+    """Return the rig with its vertices at vertices_m (V, 3), and the joint of each eye moved as its ball is on average,
+    so that the ball goes on turning about its middle."""
+    joints_m = rig.joints_m.clone()
+    for j in (j for j, name in enumerate(rig.joint_names) if name.startswith("eye.")):
+        ball = rig.dense_weights[:, j] > EYEBALL_WEIGHT
+        if ball.any():
+            joints_m[j] += (vertices_m - rig.vertices_m)[ball].mean(0)
+    return dataclasses.replace(rig, vertices_m=vertices_m, joints_m=joints_m)
 
 
 def with_surface(rig: Rig, vertices_m: Tensor, faces: Tensor, skin_joints: Tensor, skin_weights: Tensor) -> Rig:

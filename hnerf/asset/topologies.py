@@ -11,7 +11,7 @@ import trimesh
 
 from hnerf.asset.correctives import as_they_are
 from hnerf.asset.registration import SMOOTHING_M, crossing_faces, register
-from hnerf.asset.rig_transfer import clothed_rig, strongest, with_surface
+from hnerf.asset.rig_transfer import clothed_rig, strongest, with_surface, with_vertices
 from hnerf.asset.simplify import simplify
 from hnerf.asset.texture import UvLayout, unwrap
 from hnerf.body.base_mesh import BaseMesh, base_mesh
@@ -59,7 +59,7 @@ class AssetMesh:
         for _ in range(HALVINGS):
             share[np.unique(skin[crossing_faces(rest_m + share * offsets_m, skin)])] /= 2
         vertices_m = torch.from_numpy(rest_m + share * offsets_m)
-        return dataclasses.replace(self, rig=dataclasses.replace(self.rig, vertices_m=vertices_m))
+        return dataclasses.replace(self, rig=with_vertices(self.rig, vertices_m))
 
     def layout(self, texture_px: int) -> UvLayout:
         """Return the texture coordinates: the body model's where it has some, else charts of the body at its shape,
@@ -78,12 +78,12 @@ def asset_meshes(rig: Rig, dense: trimesh.Trimesh, faces: int) -> dict[str, Asse
 
 
 def registered_mesh(rig: Rig, dense: trimesh.Trimesh) -> AssetMesh:
-    """Return the body model's mesh moved onto the surface, with the body model's strongest joint weights."""
+    """Return the body model's mesh moved onto the surface, with the body model's strongest joint weights. Joints stay
+    where they are, but for those of eyes."""
     base = base_mesh(rig)
     found = register(base, dense)
-    shown = with_surface(
-        base.rig, torch.from_numpy(found.vertices_m).float(), base.rig.faces, *strongest(base.rig.dense_weights)
-    )
+    moved = with_vertices(base.rig, torch.from_numpy(found.vertices_m).float())
+    shown = with_surface(moved, moved.vertices_m, moved.faces, *strongest(moved.dense_weights))
     return AssetMesh(shown, found.plate.solver(found.trust, SMOOTHING_M[-1]), base.skin_faces, base)
 
 

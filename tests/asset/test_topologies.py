@@ -6,8 +6,8 @@ import trimesh
 
 from hnerf.asset.correctives import as_they_are
 from hnerf.asset.registration import crossing_faces
-from hnerf.asset.topologies import AssetMesh
-from tests.asset.figure import column_rig, twice
+from hnerf.asset.topologies import AssetMesh, registered_mesh
+from tests.asset.figure import column_rig, twice, upper_weight, upright_column
 
 
 def test_a_moved_mesh_does_not_cross_itself() -> None:
@@ -27,3 +27,14 @@ def test_a_moved_mesh_does_not_cross_itself() -> None:
     np.testing.assert_allclose((moved.vertices - boxes.vertices)[:, 0].min(), -0.0035, atol=1e-6)
     facing = moved.vertices[8:, 0] < 0.02
     np.testing.assert_allclose(moved.vertices[8:, 0][facing], 0.013 - 0.00175, atol=1e-6)
+
+
+def test_eyes_go_with_the_registered_mesh() -> None:
+    """The field stands 2 cm to the left of the body: what follows the upper joint, as a ball its eye, goes there."""
+    rig = dataclasses.replace(column_rig(), joint_names=("root", "eye.L"))
+    field = upright_column(0.15, 0.0, 1.6)
+    field.vertices += (0.02, 0, 0)
+    shown = registered_mesh(rig, field).rig
+    moved_m = (shown.vertices_m - rig.vertices_m)[upper_weight(rig.vertices_m[:, 2]) > 0.999].mean(0)
+    assert 0.005 < float(moved_m[0]) < 0.02
+    torch.testing.assert_close(shown.joints_m, torch.stack([torch.zeros(3), moved_m + torch.tensor([0, 0, 0.8])]))

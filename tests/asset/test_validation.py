@@ -210,6 +210,7 @@ def no_default_prim(stage: Usd.Stage) -> None:
         (nameless_rest_pose, "does not name its rest pose"),
         (floating, "its lowest point at rest is at height 0.3 m"),
         (one_eye, "skin follows one eye and not the other"),
+        (one_eye, "eye_L does not turn about the middle of its ball"),
         (short_shape, "corrective_01: offsets are not finite or not one a point"),
         (shape_without_target, "1 blend shapes but 4 targets"),
         (shape_of_no_point, "frown: point index out of range"),
@@ -232,6 +233,20 @@ def test_each_defect_is_named(stage: Usd.Stage, damage: Callable[[Usd.Stage], No
     stage.SetEditTarget(stage.GetRootLayer() if damage in of_root_layer else stage.GetSessionLayer())
     damage(stage)
     assert message in "; ".join(data_defects(stage))
+
+
+def test_eyes_turn_about_the_middle_of_their_balls(stage: Usd.Stage) -> None:
+    """What follows the upper joint is 36 cm wide: its joint may be 30 % of 18 cm off the middle."""
+    stage.SetEditTarget(stage.GetSessionLayer())
+    binding = UsdSkel.BindingAPI(mesh(stage))
+    joints, weights = (np.array(a.Get()) for a in (binding.GetJointIndicesPrimvar(), binding.GetJointWeightsPrimvar()))
+    on_eye = ((joints == 2) & (weights > 0)).reshape(len(mesh(stage).GetPointsAttr().Get()), -1).any(1)
+    ball = np.array(mesh(stage).GetPointsAttr().Get())[on_eye]
+    one_eye(stage)
+    for off_m, wrong in ((0.05, False), (0.06, True)):
+        middle = (ball.min(0) + ball.max(0)) / 2 + (off_m, 0, 0)
+        change(skeleton(stage).GetBindTransformsAttr(), 2, Gf.Matrix4d().SetTranslate(Gf.Vec3d(*middle.tolist())))
+        assert ("does not turn about" in "; ".join(data_defects(stage))) is wrong
 
 
 def test_an_albedo_needs_its_light(stage: Usd.Stage) -> None:
