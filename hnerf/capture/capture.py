@@ -133,7 +133,8 @@ class Capture:
             found = stored.get(camera)
         if found is None or not self.stored_frames:
             return found
-        return resample(found, self.stored_frames, np.array(self.frames) + self.frame_offsets.get(camera, 0.0))
+        instants = np.array(self.frames) + self.frame_offsets.get(camera, 0.0)
+        return resample(found, self.stored_frames, instants, in_order=file == HANDS)
 
     @property
     def has_keypoints(self) -> bool:

@@ -21,8 +21,10 @@ def median_step(frames: Sequence[int]) -> int:
     return int(np.median(np.diff(frames))) if len(frames) > 1 else 1
 
 
-def resample(keypoints: np.ndarray, frames: Sequence[int], instants: np.ndarray) -> np.ndarray:
-    """Resample keypoints (n, people, K, 3) of recorded frames (n,) at other instants (m,): (m, people, K, 3).
+def resample(keypoints: np.ndarray, frames: Sequence[int], instants: np.ndarray, in_order: bool = False) -> np.ndarray:
+    """Resample keypoints (n, people, K, 3) of recorded frames (n,) at other instants (m,): (m, people, K, 3). People
+    are found again by where they are, however frames list them; in_order: as all frames list them, like left and right
+    hands.
 
     Interpolates linearly between neighbours one median step apart; elsewhere (where a recording ends or jumps) takes
     the frame within half a frame, or nobody without one. A keypoint that only the nearer neighbour shows is taken from
@@ -36,8 +38,9 @@ def resample(keypoints: np.ndarray, frames: Sequence[int], instants: np.ndarray)
     nearer, farther = np.where(share < 0.5, (before, after), (after, before))
     between = (share > 0) & (share < 1) & (gap <= median_step(frames))
     resampled = keypoints[nearer].copy()
+    mix = _mixed if in_order else _between
     for i in np.flatnonzero(between):
-        resampled[i] = _between(keypoints[nearer[i]], keypoints[farther[i]], max(share[i], 1 - share[i]))
+        resampled[i] = mix(keypoints[nearer[i]], keypoints[farther[i]], max(share[i], 1 - share[i]))
     resampled[(np.abs(instants - recorded[nearer]) > 0.5) & ~between] = 0
     return resampled
 
@@ -48,10 +51,16 @@ def _between(near: np.ndarray, far: np.ndarray, weight: float) -> np.ndarray:
     mixed = near.copy()
     distances = np.stack([[_distance(a, b) for b in far] for a in near])
     for a, b in zip(*linear_sum_assignment(distances), strict=True):
-        both = (near[a, :, 2:] > 0) & (far[b, :, 2:] > 0)
         if distances[a, b] < MAX_STEP_OF_PERSON:
-            mixed[a] = np.where(both, weight * near[a] + (1 - weight) * far[b], near[a])
+            mixed[a] = _mixed(near[a], far[b], weight)
     return mixed
+
+
+def _mixed(near: np.ndarray, far: np.ndarray, weight: float) -> np.ndarray:
+    """Return keypoints (..., K, 3) between two frames, with `weight` for the near one, which alone counts for those
+    that the far one does not show."""
+    both = (near[..., 2:] > 0) & (far[..., 2:] > 0)
+    return np.where(both, weight * near + (1 - weight) * far, near)
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> float:

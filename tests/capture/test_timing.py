@@ -47,6 +47,14 @@ def test_people_are_followed_whatever_their_order() -> None:
     assert resample(swapped, (0, 1), np.array([0.4]))[0, :, 0, 0].tolist() == [4, 504]
 
 
+def test_hands_keep_their_order_however_far_they_move() -> None:
+    """Crossed hands, a point of which the second frame does not show."""
+    crossing = np.stack([people_at(0, 100), people_at(100, 0)])
+    crossing[1, 1, 1] = 0
+    found = resample(crossing, (0, 1), np.array([0.25]), in_order=True)
+    assert found[0].tolist() == [[[25, 0, 0.8], [25, 100, 0.8]], [[75, 0, 0.8], [100, 100, 0.8]]]
+
+
 def test_a_capture_in_step_reads_the_nearest_frame(tmp_path: Path) -> None:
     camera = Camera("a", np.eye(3), np.eye(3), np.zeros(3), 4, 4)
     for frame in range(6):
@@ -54,6 +62,7 @@ def test_a_capture_in_step_reads_the_nearest_frame(tmp_path: Path) -> None:
             (tmp_path / folder / "a").mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(tmp_path / folder / "a" / f"{frame:06d}.png"), np.full((4, 4), value, np.uint8))
     np.savez(tmp_path / "keypoints.npz", a=np.stack([people_at(10 * frame) for frame in range(6)]))
+    np.savez(tmp_path / "hands.npz", a=np.stack([people_at(0, 90 * frame) for frame in range(6)]))
     size = {"a": (4, 4)}
     capture = Capture("x", tmp_path, {"a": camera}, ("a",), (), (0, 1, 2, 3), (4, 5), 30.0, "z", size, size)
 
@@ -64,6 +73,10 @@ def test_a_capture_in_step_reads_the_nearest_frame(tmp_path: Path) -> None:
     found = in_step.keypoints("a")
     assert found is not None
     np.testing.assert_allclose(found[:, 0, 0, 0], [17.5, 27.5, 37.5, 47.5])
+
+    hands = in_step.hands("a")  # the right one passes the left in strides of nearly its own length
+    assert hands is not None
+    np.testing.assert_allclose(hands[:, :, 0, 0], [[0, x] for x in (157.5, 247.5, 337.5, 427.5)])
 
     in_step.save()
     assert json.loads((tmp_path / "capture.json").read_text())["frame_offsets"] == {"a": 1.75}
