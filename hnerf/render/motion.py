@@ -28,6 +28,7 @@ AMASS_WIDTHS = (72, 156, 165)  # pose parameters of SMPL, SMPL-H and SMPL-X, whi
 AMASS_RATES = ("mocap_framerate", "mocap_frame_rate")
 BODY_JOINTS = 22
 DEFAULT_FPS = 30.0  # of AMASS files without a rate
+BELOW_FLOOR = 0.05  # share of a motion's frames with a foot below its floor, by errors
 MAX_MOTION_BYTES = 256_000_000  # unpacked; half an hour of SMPL-H at 100 poses a second
 
 
@@ -88,10 +89,10 @@ def select_poses(body: BodyFit, frames: tuple[int, ...]) -> BodyFit:
 def retarget(own: BodyFit, motion: Motion, up: str) -> BodyFit:
     """Return the motion's poses on the rig of `own`, with the rotations of joints matched by name.
 
-    The motion is moved so that its mean pelvis position coincides with that of `own`, and its floor, the lowest point
-    of all its frames, with the lowest point of `own`. In each frame the lowest point keeps the height above the floor
-    that it had on the motion's own body. `up`: the vertical axis of the world of `own`. Raises InputError if the motion
-    lacks a joint.
+    The motion is moved so that its mean pelvis position coincides with that of `own`, and its floor, which 5 % of its
+    frames reach below, with that of `own`, the median of its lowest points, on which the asset stands. In each frame
+    the lowest point keeps the height above the floor that it had on the motion's own body. `up`: the vertical axis of
+    the world of `own`. Raises InputError if the motion lacks a joint.
     """
     other, names = motion.body, motion.body.rig.joint_names
     theta = torch.zeros(len(other.frames), len(own.rig.joint_names), 3)
@@ -106,9 +107,8 @@ def retarget(own: BodyFit, motion: Motion, up: str) -> BodyFit:
     placed = BodyFit(own.rig, other.frames, theta, turn @ other.root)
     apart_m = _pelvis_m(own).mean(0) - _pelvis_m(placed).mean(0)
     lowest_m = lowest_points_m(other, motion.up)
-    return set_lowest_points(
-        _translated(placed, apart_m), lowest_m - lowest_m.min() + lowest_points_m(own, up).min(), up
-    )
+    above_floor_m = lowest_m - lowest_m.quantile(BELOW_FLOOR)  # of a motion that may be in the air half of the time
+    return set_lowest_points(_translated(placed, apart_m), above_floor_m + lowest_points_m(own, up).quantile(0.5), up)
 
 
 def interpolate_poses(body: BodyFit, first: int, last: int, count: int) -> BodyFit:

@@ -57,10 +57,22 @@ def test_another_motion_stands_where_this_body_stood(up: str) -> None:
     found = retarget(own, motion, "z")
     torch.testing.assert_close(found.theta[:, 1], torch.tensor([[0.1, 0, 0], [0.2, 0, 0]]))
     assert found.theta[:, 0].count_nonzero() == 0
-    torch.testing.assert_close(lowest_points_m(found, "z"), torch.tensor([0.5, 0.8]))
+    torch.testing.assert_close(lowest_points_m(found, "z"), torch.tensor([0.485, 0.785]))  # floor: 5 % of 30 cm up
     torch.testing.assert_close(found.root[:, :2, 3], torch.tensor([[0.0, 2], [1, 2]]))
     torch.testing.assert_close(found.root[:, :3, :3], torch.eye(3).repeat(2, 1, 1))
     assert found.rig is own.rig
+
+
+def test_single_frames_below_the_floor_do_not_lift_a_motion() -> None:
+    """One of four frames of the body has its foot 20 cm below the floor, and one of 21 frames of the motion, 10 cm."""
+    own, other = bending_body(), giant()
+    own.root[2, 2, 3] -= 0.2
+    root = other.root[:1].repeat(21, 1, 1)
+    root[7, 2, 3] -= 0.1
+    other = BodyFit(other.rig, tuple(range(21)), other.theta[:1].repeat(21, 1, 1), root)
+    expected = torch.full((21,), 0.5)
+    expected[7] = 0.4
+    torch.testing.assert_close(lowest_points_m(retarget(own, Motion(other, 10.0, "z"), "z"), "z"), expected)
 
 
 def test_a_motion_without_a_joint_that_turns_is_refused() -> None:
