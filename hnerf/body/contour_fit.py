@@ -35,6 +35,7 @@ MIN_NORMAL_COSINE = 0.5  # between the outlines' normals above which points may 
 GROUND_STD_M = 0.01  # of the lowest vertex of a frame above the ground
 GROUND_OUTLIER_M = 0.15  # distance of a body that does not stand on the ground
 MAX_SOLE_M = 0.05  # between the skin and the ground
+BORDER_PX = 2.0  # of the picture, at which a mask ends whatever is there
 UNDERSIDE_M = 0.015  # of vertices above the lowest one that may touch the ground
 HUBER = 1.345  # standard deviations beyond which residuals push no harder; 95 % efficient on Gaussian noise
 DAMPING = 1e-4  # more would hold back depth and scale, which one camera's outlines hardly determine
@@ -179,7 +180,8 @@ def refine_with_outlines(
             ]
             if only is not None:
                 found.append(_ground_contact(vertices_m, up, sole_m))
-                soles_m += [_sole_m(only, e, float(problem.scale_m[0, t]), vertices_m, up) for e in row if e]
+                found_m = [_sole_m(only, e, float(problem.scale_m[0, t]), vertices_m, up) for e in row if e]
+                soles_m += [sole_m for sole_m in found_m if sole_m is not None]
             for rows in found:
                 add_residuals(equations, articulation, joints, t, rows)
                 residuals.append(rows.residual_m)
@@ -204,12 +206,16 @@ def _ground_contact(vertices_m: np.ndarray, up: int, sole_m: float) -> ContourRe
     return ContourResiduals(np.array([lowest]), np.eye(3)[[up]], np.array([height_m]), np.array([weight]))
 
 
-def _sole_m(camera: Camera, edge: Outline, scale_m: float, vertices_m: np.ndarray, up: int) -> float:
+def _sole_m(camera: Camera, edge: Outline, scale_m: float, vertices_m: np.ndarray, up: int) -> float | None:
     """Return how far the mask reaches out below the foot, at the vertex that is lowest in the image of those that may
-    touch the ground: shoes stand between it and the skin."""
+    touch the ground: shoes stand between it and the skin. None where the picture ends before the foot does."""
     height_m = vertices_m[:, up]
     pixels = camera.project(vertices_m[height_m < height_m.min() + UNDERSIDE_M])[0]
     lowest = pixels[(pixels @ -camera.R[:2, up]).argmax()]
+    if not (
+        (lowest > BORDER_PX) & (lowest < (camera.width_px - 1 - BORDER_PX, camera.height_px - 1 - BORDER_PX))
+    ).all():
+        return None
     inside_px = -map_coordinates(edge.distance_px, lowest[::-1, None], order=1, mode="nearest")[0]
     return float(np.clip(inside_px * scale_m, 0, MAX_SOLE_M))
 

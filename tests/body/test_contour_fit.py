@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 
 from hnerf.body.contour_fit import _ground_contact, _sole_m, match, outline
@@ -93,13 +95,22 @@ def test_a_sole_is_as_thick_as_the_mask_reaches_below_the_foot() -> None:
     camera, scale_m = ring_camera("a", 0.3), 3 / 281.6
     foot = np.array([[0, 0, 0.7], [0, 0, 0.8], [1.0, 0.3, 0.716]])
 
-    def sole_to(rows: int) -> float:
+    def sole_to(rows: int) -> float | None:
         mask = np.zeros((256, 256), bool)
         mask[20:rows, 20:236] = True
         return _sole_m(camera, outline(mask, 1.0), scale_m, foot, 2)
 
     np.testing.assert_allclose(sole_to(160), 3.34 * scale_m, atol=1e-6)
     np.testing.assert_allclose([sole_to(150), sole_to(200)], [0, 0.05], rtol=1e-6)
+
+
+def test_a_foot_beyond_the_picture_has_no_sole() -> None:
+    """As above, the foot is in row 156.16: 0.84, 1.84 and 2.84 px above the last row of three pictures."""
+    foot, mask = np.array([[0, 0, 0.7]]), np.ones((256, 256), bool)
+    for height_px, seen in ((158, False), (159, False), (160, True)):
+        camera = dataclasses.replace(ring_camera("a", 0.3), height_px=height_px)
+        found = _sole_m(camera, outline(mask[:height_px], 1.0), 3 / 281.6, foot, 2)
+        assert (found is not None) is seen
 
 
 def test_a_sole_stands_on_the_ground() -> None:
