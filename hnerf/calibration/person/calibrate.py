@@ -20,6 +20,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.lens import Lens
 from hnerf.capture.subject import subject_keypoints
+from hnerf.capture.timing import median_step
 from hnerf.config import CalibrationSettings
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
@@ -124,7 +125,8 @@ def calibrate_from_person(
         _check_determined(fit.cameras, found, straight, unknown_focal)
         height = height_m or MEAN_STATURE_M
         scaled, points_m = scale_to(fit.cameras, found.points_m, height)
-        cameras, _, up_sd_deg = stand_on_ground(scaled, points_m)
+        frame_s = median_step(capture.frames) / capture.fps
+        cameras, _, up_sd_deg = stand_on_ground(scaled, points_m, frame_s)
         uncertainty = _uncertainty(cameras, keypoints, unknown_focal, fit)
         _check_uncertainty(cameras, uncertainty)
     except InputError as error:

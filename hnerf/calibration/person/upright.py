@@ -17,7 +17,7 @@ FEET = ((11, 22, 23, 24), (14, 19, 20, 21))  # ankle, toes and heel of the right
 LEAN_SD = np.tan(np.deg2rad(6.0))  # of the mean direction from ankles to neck: people lean as they walk and reach
 ROLL_SD = np.deg2rad(3.0)  # of a camera about its line of sight: people hold and mount cameras level
 CONTACT_SD_M = 0.02  # of a standing foot's lowest keypoint above the ground
-FRAMES_A_STEP = 10  # a third of a second: frames of one step say the same about the ground
+STEP_S = 1 / 3  # of a walk: frames of one step say the same about the ground
 ROUNDS = 30  # of iteratively re-weighted least squares
 FIRST_SCALE = 4.0  # times the standard deviations, from which the Cauchy scale shrinks to 1
 
@@ -32,13 +32,15 @@ def scale_to(cameras: Sequence[Camera], points: np.ndarray, height_m: float) -> 
     return [dataclasses.replace(camera, t_m=scale * camera.t_m) for camera in cameras], scale * points
 
 
-def stand_on_ground(cameras: Sequence[Camera], points_m: np.ndarray) -> tuple[list[Camera], np.ndarray, float]:
+def stand_on_ground(
+    cameras: Sequence[Camera], points_m: np.ndarray, frame_s: float
+) -> tuple[list[Camera], np.ndarray, float]:
     """Return the rig and its points (frames, 25, 3) in a world with Z up, the ground at 0 below the middle of the
     person's path, and the first camera towards -Y; and the standard error of up in degrees.
 
-    Raises InputError where ankles and neck are never seen.
+    frame_s: seconds from one of the frames to the next. Raises InputError where ankles and neck are never seen.
     """
-    world, up_sd = _upright(cameras, points_m)
+    world, up_sd = _upright(cameras, points_m, frame_s)
     turned_m = points_m @ world.T
     feet_m = _lowest_of_feet(turned_m)
     ground_m = float(np.median(feet_m[:, 2])) if len(feet_m) else float(np.nanmin(turned_m[..., 2]))
@@ -53,7 +55,7 @@ def stand_on_ground(cameras: Sequence[Camera], points_m: np.ndarray) -> tuple[li
     return turned, points_m @ world.T - origin_m, float(np.rad2deg(up_sd))
 
 
-def _upright(cameras: Sequence[Camera], points_m: np.ndarray) -> tuple[np.ndarray, float]:
+def _upright(cameras: Sequence[Camera], points_m: np.ndarray, frame_s: float) -> tuple[np.ndarray, float]:
     """Return the rotation (3, 3) to a world with Z up, and the standard error of up in radians.
 
     Up is the normal (-a, -b, 1) of the ground z = a x + b y + c on which the lower keypoints of standing feet lie, as
@@ -75,7 +77,7 @@ def _upright(cameras: Sequence[Camera], points_m: np.ndarray) -> tuple[np.ndarra
             np.array([[-1, 0, 0, body[0] / body[2]], [0, -1, 0, body[1] / body[2]]]) / LEAN_SD,
             np.column_stack([sideways[:, :2], np.zeros(len(sideways)), sideways[:, 2]]) / ROLL_SD,
         ]
-        counts = [1 / (2 * FRAMES_A_STEP), 1.0, 1.0]
+        counts = [0.5 * min(1.0, frame_s / STEP_S), 1.0, 1.0]  # of each foot, a step counts as one frame
         A = np.concatenate([np.sqrt(count) * part for part, count in zip(rows, counts, strict=True)])
         off = np.concatenate([part[:, 3] for part in rows])
         off[len(feet_m) : len(feet_m) + 2] = np.linalg.norm(off[len(feet_m) : len(feet_m) + 2])

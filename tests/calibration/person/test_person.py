@@ -85,7 +85,7 @@ def test_the_ground_lies_below_the_feet_whatever_the_world_was() -> None:
     cameras = [
         dataclasses.replace(c, R=c.R @ tumble.T, t_m=c.t_m - c.R @ tumble.T @ np.array([1.0, 2, 3])) for c in ring(4)
     ]
-    stood, points_m, _ = stand_on_ground(cameras, walk_m() @ tumble.T + [1, 2, 3])
+    stood, points_m, _ = stand_on_ground(cameras, walk_m() @ tumble.T + [1, 2, 3], 1 / 30)
     assert np.allclose(points_m[..., 2], walk_m()[..., 2] - 0.02, atol=0.01)  # the toes are 2 cm above the floor
     assert stood[0].centre_m[0] == pytest.approx(0, abs=1e-9) and stood[0].centre_m[1] < 0
     assert stood[0].centre_m[2] == pytest.approx(ring(4)[0].centre_m[2] - 0.02, abs=0.02)
@@ -94,9 +94,21 @@ def test_the_ground_lies_below_the_feet_whatever_the_world_was() -> None:
 def test_a_person_who_leans_does_not_tilt_cameras_that_are_level() -> None:
     lean = cv2.Rodrigues(np.array([0, np.deg2rad(20), 0]))[0]
     still = np.repeat((STANDING_M @ lean.T)[None], 12, axis=0)
-    stood, _, up_sd_deg = stand_on_ground(ring(4), still)
+    stood, _, up_sd_deg = stand_on_ground(ring(4), still, 1 / 30)
     assert max(abs(np.rad2deg(camera.R[0, 2])) for camera in stood) < 3
     assert up_sd_deg > 2  # what contradicts itself is not certain
+
+
+def test_frames_of_one_step_count_as_one_at_any_rate() -> None:
+    """Every frame twice in half the time says the same; and frames half a second apart, no more than a second apart."""
+    rolled = [dataclasses.replace(c, R=cv2.Rodrigues(np.array([0, 0, 0.1]))[0] @ c.R) for c in ring(4)]
+    walk = walk_m() + np.random.default_rng(0).normal(0, 0.01, (12, 25, 3))
+    once, twice, slow, slower = (
+        stand_on_ground(rolled, points_m, frame_s)
+        for points_m, frame_s in ((walk, 0.1), (walk.repeat(2, 0), 0.05), (walk, 0.5), (walk, 1.0))
+    )
+    assert twice[2] == pytest.approx(once[2]) and slower[2] == slow[2] < once[2]
+    assert np.allclose(twice[0][0].R, once[0][0].R) and not np.allclose(slow[0][0].R, once[0][0].R)
 
 
 def test_a_recording_gets_cameras_in_metres_with_an_uncertainty(tmp_path: Path) -> None:
@@ -112,6 +124,21 @@ def test_a_recording_gets_cameras_in_metres_with_an_uncertainty(tmp_path: Path) 
     found.save(tmp_path / "out")
     read = EasyMocap(tmp_path / "out").lenses()
     assert np.allclose(read["c1"].R, found.cameras[1].R)
+
+
+def test_the_rate_and_the_stride_of_a_recording_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every third frame at 60 a second: 50 ms apart."""
+    truth, asked = ring(3), []
+    capture = write_capture(tmp_path, [lost(camera) for camera in truth], detections(truth, 1.0))
+    capture = dataclasses.replace(capture, fps=60.0, train_frames=tuple(range(0, 36, 3)))
+
+    def stood(cameras: list[Camera], points_m: np.ndarray, frame_s: float) -> tuple[list[Camera], np.ndarray, float]:
+        asked.append(frame_s)
+        return stand_on_ground(cameras, points_m, frame_s)
+
+    monkeypatch.setattr("hnerf.calibration.person.calibrate.stand_on_ground", stood)
+    calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), STATURE_M)
+    assert asked == [pytest.approx(0.05)]
 
 
 def test_without_a_height_the_mean_is_taken_and_said(tmp_path: Path) -> None:
