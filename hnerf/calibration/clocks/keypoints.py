@@ -20,7 +20,6 @@ MAX_STEP_S = 0.1  # that the offset changes by in a round
 CLEAR = 0.8  # of the next best offset's residual, which the best may have at most
 OTHER_S = 0.5  # from which another offset is another one
 DRIFT_SIGMAS, MAX_DRIFT_ERROR = 4.0, 1e-4  # standard errors by which a drift must show, and how well it must be known
-TRACK_RUN = 7  # frames: neighbouring detections of a joint are off together, and are smoothed together
 REACH_S, MIN_REACH = 0.1, 2  # seconds, and frames, on each side, through which a parabola is laid
 JUDGED = (
     0.95  # quantile of residuals by which offsets are compared: a wave of one hand tells steps of an even walk apart
@@ -62,6 +61,11 @@ class _Path(NamedTuple):
         """Return the median time between frames."""
         return float(np.median(np.diff(self.times_s)))
 
+    @property
+    def window_s(self) -> float:
+        """Return the time of the frames that are smoothed together, and whose detections are off together."""
+        return (2 * _reach(self.step_s) + 1) * self.step_s
+
     def at(self, instants_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return places (m, 25, 2) and velocities (m, 25, 2) at instants on this clock, by Taylor's series from the
         nearest frame, and which are known (m, 25)."""
@@ -94,7 +98,7 @@ def smoothed(track: Track) -> _Path:
     if len(track.times_s) < 3 or not seen.any():
         raise InputError("the person is seen in fewer than three frames")
     mean, spread = xy[seen].mean(0), float(xy[seen].std(0).mean())
-    reach = max(MIN_REACH, round(REACH_S / float(np.median(np.diff(track.times_s)))))
+    reach = _reach(float(np.median(np.diff(track.times_s))))
     rows = np.arange(len(xy))[:, None] + np.arange(-reach, reach + 1)
     inside = (rows >= 0) & (rows < len(xy))
     rows = rows.clip(0, len(xy) - 1)
@@ -109,6 +113,11 @@ def smoothed(track: Track) -> _Path:
     solved[known] = np.linalg.solve(normal[known], sums[known])
     to_unit = np.array([[1 / spread, 0, -mean[0] / spread], [0, 1 / spread, -mean[1] / spread], [0, 0, 1]])
     return _Path(track.times_s, np.moveaxis(solved, 2, 0), known, to_unit)
+
+
+def _reach(step_s: float) -> int:
+    """Return through how many frames on each side a parabola is laid."""
+    return max(MIN_REACH, round(REACH_S / step_s))
 
 
 def pair_clock(a: _Path, b: _Path, fundamental: np.ndarray | None = None, near_s: float | None = None) -> PairClock:
@@ -226,8 +235,14 @@ def _refined(a: _Path, b: _Path, offset_s: float, fixed: np.ndarray | None, drif
         clock[: 1 + drifts] += step[: 1 + drifts].clip(-MAX_STEP_S, MAX_STEP_S)
         if fixed is None:
             f = (f + step[1 + drifts :]) / np.linalg.norm(f + step[1 + drifts :])
-    variance = float((weights * residuals**2).sum() / weights.sum()) * TRACK_RUN
+    together = _off_together(a, b, len(times_s))
+    variance = float((weights * residuals**2).sum() / weights.sum()) * together
     covariance = np.zeros((2, 2))
     covariance[: 1 + drifts, : 1 + drifts] = variance * np.linalg.pinv(normal)[: 1 + drifts, : 1 + drifts]
     residual = float(np.quantile(np.abs(residuals), JUDGED))
     return _Fit(float(clock[0] - clock[1] * middle_s), float(1 + clock[1]), residual, covariance)
+
+
+def _off_together(a: _Path, b: _Path, frames: int) -> float:
+    """Return how many of a's frames, of which so many are used, evenly spaced, one smoothed detection is in."""
+    return max(1.0, max(a.window_s, b.window_s) / (a.step_s * len(a.times_s) / frames))

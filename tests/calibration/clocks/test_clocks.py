@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.clocks.estimate import estimate_clocks
-from hnerf.calibration.clocks.keypoints import Track, pair_clock, smoothed
+from hnerf.calibration.clocks.keypoints import Track, _off_together, pair_clock, smoothed
 from hnerf.calibration.clocks.sound import read_sound, sound_offset
 from hnerf.calibration.matches import fundamental
 from hnerf.errors import InputError
@@ -90,6 +90,22 @@ def test_smoothing_is_a_parabola_by_hand() -> None:
     x = (place[0, 0, 0] - path.to_unit[0, 2]) / path.to_unit[0, 0]
     assert known.all() and x == pytest.approx(10 + 3 * 0.42 + 2 * 0.42**2)
     assert velocity[0, 0, 0] / path.to_unit[0, 0] == pytest.approx(3 + 4 * 0.42)
+
+
+def test_detections_that_are_smoothed_together_count_as_one() -> None:
+    """A tenth of a second on each side: 7 frames at 30 a second, 25 at 120, and at 10 two on each side, 5 frames, whose
+    half second is 15 frames at 30. Of 600 frames every second one is used, then every tenth."""
+    at_30, at_120, at_10 = (smoothed(filmed(0, 20.0, 0.0, fps=fps)) for fps in (30.0, 120.0, 10.0))
+    pairs = (at_30, at_30, 600), (at_120, at_120, 2400), (at_30, at_10, 600), (at_30, at_30, 300), (at_30, at_30, 60)
+    assert [_off_together(*pair) for pair in pairs] == pytest.approx([7, 25, 15, 3.5, 1])
+
+
+def test_a_clock_is_the_less_sure_the_more_detections_are_smoothed_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four times the 7 that are: twice the error."""
+    a, b = smoothed(filmed(0, 6.0, 0.0)), smoothed(filmed(1, 6.0, 0.4))
+    error_s = pair_clock(a, b).error_s
+    monkeypatch.setattr("hnerf.calibration.clocks.keypoints._off_together", lambda *_: 28.0)
+    assert pair_clock(a, b).error_s == pytest.approx(2 * error_s)
 
 
 def test_one_camera_and_a_person_who_is_still_are_refused() -> None:
