@@ -9,8 +9,8 @@ from hnerf.body.skeletons import PELVIS, ROOT
 
 SAME = 1e-4  # metres, or parts of 1, by which what must agree may differ
 ON_GROUND_M = 1e-3  # by which the captured body's lowest point may be off the ground
-EYE_OFF = 0.3  # of its radius, by which an eye's joint may be off the middle of its ball
 ON_GROUND_CHANGED_M = 1e-2  # the same with less detail or in another shape
+EYE_OFF = 0.1  # of its radius, by which an eye's joint may be off the middle of its ball
 
 
 def skin_defects(prim: Usd.Prim) -> list[str]:
@@ -35,10 +35,11 @@ def skin_defects(prim: Usd.Prim) -> list[str]:
     used = {tokens[j].rpartition("/")[2] for j in np.unique(joints[weights > 0]).tolist()}
     if len(used & {"eye_L", "eye_R"}) == 1:
         defects.append(f"{name}: skin follows one eye and not the other")
-    off = _eyes_off(points, joints.reshape(vertices, -1), weights.reshape(vertices, -1), skeleton)
-    defects += [f"{name}: {eye} does not turn about the middle of its ball" for eye in off]
     stage = prim.GetStage()
     as_captured = _selected(stage, "lod") in ("", "lod0") and _selected(stage, "shape") in ("", CAPTURED)
+    if as_captured:
+        off = _eyes_off(points, joints.reshape(vertices, -1), weights.reshape(vertices, -1), skeleton)
+        defects += [f"{name}: {eye} does not turn about the middle of its ball" for eye in off]
     if not abs(points[:, 1].min()) < (ON_GROUND_M if as_captured else ON_GROUND_CHANGED_M):
         defects.append(f"{name}: its lowest point at rest is at height {points[:, 1].min():.3g} m, not on the ground")
     if _selected(prim.GetStage(), "rig") == GAME and influences > GAME_INFLUENCES:

@@ -23,13 +23,12 @@ def clothed_rig(rig: Rig, surface: trimesh.Trimesh) -> Rig:
 
 
 def with_vertices(rig: Rig, vertices_m: Tensor) -> Rig:
-    """Return the rig with its vertices at vertices_m (V, 3), and the joint of each eye moved as its ball is on average,
-    so that the ball goes on turning about its middle."""
+    """Return the rig with its vertices at vertices_m (V, 3), and the joint of each eye in the middle of its ball."""
     joints_m = rig.joints_m.clone()
     for j in (j for j, name in enumerate(rig.joint_names) if name.startswith("eye.")):
         ball = rig.dense_weights[:, j] > EYEBALL_WEIGHT
         if ball.any():
-            joints_m[j] += (vertices_m - rig.vertices_m)[ball].mean(0)
+            joints_m[j] = (vertices_m[ball].amin(0) + vertices_m[ball].amax(0)) / 2
     return dataclasses.replace(rig, vertices_m=vertices_m, joints_m=joints_m)
 
 
