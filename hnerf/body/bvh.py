@@ -1,7 +1,9 @@
 """BVH files (Biovision hierarchy): a skeleton whose joints are not turned at rest, and its poses at a constant rate."""
 
 import io
+import re
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from hnerf.errors import InputError
 
 MAX_BYTES = 128_000_000
 MAX_JOINTS = 1000
+MAX_HEAD_LINES = 20 * MAX_JOINTS  # of the hierarchy; a joint has 4 to 8
 MAX_NUMBERS = 20_000_000  # of all frames
 MAX_VALUE = 1e6  # of an offset or a channel
 FRAME_S = (1e-4, 10.0)  # that a frame may last
@@ -58,7 +61,7 @@ class _Joint:
 
 def read_bvh(path: Path) -> Bvh:
     """Read a BVH file. Raises InputError, naming file and line, where it is none, or too large to be one."""
-    lines = read_text(path, MAX_BYTES).splitlines()
+    lines = read_text(path, MAX_BYTES).split("\n", MAX_HEAD_LINES)
     joints, at = _hierarchy(path, lines)
     frames, frame_s, at = _motion_head(path, lines, at)
     width = sum(len(joint.channels) for joint in joints)
@@ -66,11 +69,11 @@ def read_bvh(path: Path) -> Bvh:
         raise InputError(f"{path}: no joint has channels; export it again")
     if frames * max(width, 3 * len(joints)) > MAX_NUMBERS:  # joints without channels need as much memory
         raise InputError(f"{path}: {frames} frames of {len(joints)} joints are too many; cut the motion")
-    rows = [line for line in lines[at:] if line.strip()]
+    rows = [row[0] for row in islice(re.finditer(r"\S[^\n]*", "\n".join(lines[at:])), frames)]
     if len(rows) < frames:
         raise InputError(f"{path}: says {frames} frames and has {len(rows)}; export it again")
     try:
-        values = np.loadtxt(io.StringIO("\n".join(rows[:frames])), ndmin=2, comments=None)
+        values = np.loadtxt(io.StringIO("\n".join(rows)), ndmin=2, comments=None)
     except ValueError as error:
         raise InputError(f"{path}: frames are not numbers ({error}); export it again") from None
     if values.shape != (frames, width) or not (np.abs(values) <= MAX_VALUE).all():  # also true for NaN
@@ -99,7 +102,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
     def wrong(number: int, what: str) -> InputError:
         return InputError(f"{path}: line {number + 1}: {what}; export it again as BVH")
 
-    for number, line in enumerate(lines):
+    for number, line in enumerate(lines[:MAX_HEAD_LINES]):
         words = line.split()
         match words:
             case [] | ["HIERARCHY"]:

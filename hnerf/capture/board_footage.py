@@ -26,6 +26,7 @@ from hnerf.config import validated
 from hnerf.errors import InputError
 
 MAX_FRAMES = 200  # of each camera in which the board is searched, evenly strided
+MAX_TABLE_BYTES = 2_000_000  # of timestamps.csv: a hundred thousand rows
 BOARDS_FILE = "boards.npz"
 METRES = {"inch": 0.0254, "cm": 0.01}
 
@@ -318,7 +319,7 @@ def _sync_indices(path: Path) -> dict[str, tuple[int, ...]]:
 def _csv_rows(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the rows of a table. Raises InputError if it is none."""
     try:
-        yield from csv.DictReader(safe_io.read_text(path).splitlines())
+        yield from csv.DictReader(safe_io.read_text(path, MAX_TABLE_BYTES).splitlines())
     except csv.Error as error:  # such as a field longer than 128 KiB
         raise InputError(f"{path}: not a table ({error}); export it again or remove it") from None
 

@@ -31,13 +31,18 @@ def read_results(path: Path, frames: Iterable[int]) -> list[np.ndarray]:
     image_id: the frame's number, or an image name that ends in it. Frames that are not listed show nobody. Raises
     InputError if it is no such file, or is of other frames.
     """
+    frames = tuple(frames)
     try:
         people: dict[int, list[Any]] = {}
-        for result in read_json(path):
+        results = read_json(path)
+        if len(results) > MAX_PEOPLE * len(frames):
+            raise InputError(
+                f"{path}: {len(results)} people in {len(frames)} images; keep at most {MAX_PEOPLE} in each"
+            )
+        for result in results:
             people.setdefault(_frame(result["image_id"]), []).append(result["keypoints"])
     except (KeyError, TypeError, ValueError):
         raise InputError(f"{path}: no list of image_id and keypoints; write COCO results again") from None
-    frames = tuple(frames)
     if strange := sorted(set(people).difference(frames)):
         raise InputError(
             f"{path}: image_id {strange[0]} is none of the recording's frames {frames[0]} to {frames[-1]}; "

@@ -15,6 +15,7 @@ USUALLY = 0.5  # share of a camera's images in which the others support it, from
 CANDIDATES = 8  # combinations of people kept in each frame
 JUMP_COST = 4.0  # in best scores of one camera, for moving by the person's own height between frames
 FREE_JUMPS = 2.0  # in median movements between frames: jumps up to this cost nothing
+MAX_PAIRED = 12  # people of an image, the most prominent, who are compared with those of other cameras
 MAX_PEOPLE = 4  # followed: the subject, and those whom the report says were left
 SAME_SHARE = 0.1  # of a person's height: mean distance of the keypoints of one person, found twice
 MOST_MOVING, STILL_SHARE = (
@@ -56,7 +57,8 @@ def follow_people(cameras: list[Camera], people: list[np.ndarray]) -> list[Perso
     detection from each camera on which the cameras agree: two-view triangulation predicts where each camera must see
     the person.
     """
-    left, tracks = [found.copy() for found in people], list[PersonTrack]()
+    left = [_most_prominent(camera, found) for camera, found in zip(cameras, people, strict=True)]
+    tracks: list[PersonTrack] = []
     frames = len(left[0])
     while len(tracks) < MAX_PEOPLE and any((found[..., 2] > 0).any() for found in left):
         candidates = [_frame_candidates(cameras, [found[i] for found in left]) for i in range(frames)]
@@ -70,6 +72,12 @@ def follow_people(cameras: list[Camera], people: list[np.ndarray]) -> list[Perso
         for found, own in zip(left, picked, strict=True):
             found *= ~_same_place(own[:, None], found)[..., None, None]
     return tracks
+
+
+def _most_prominent(camera: Camera, people: np.ndarray) -> np.ndarray:
+    """Return a copy of people (frames, P, 25, 3) with the MAX_PAIRED most prominent of each frame, in their order."""
+    best = np.argsort(-_prominence(camera, people), axis=1, kind="stable")[:, :MAX_PAIRED]
+    return np.take_along_axis(people, np.sort(best, axis=1)[..., None, None], 1)
 
 
 def _usually(supported: np.ndarray, seen: np.ndarray) -> np.ndarray:

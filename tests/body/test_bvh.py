@@ -1,3 +1,4 @@
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -102,3 +103,18 @@ def test_endless_hierarchies_are_refused(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(bvh, "MAX_JOINTS", 1)
     with pytest.raises(InputError, match="more than 1 joints"):
         read_bvh(written(tmp_path, ELBOW))
+
+
+def test_lines_after_the_frames_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bvh, "MAX_BYTES", 4_000_000)  # so much is set aside at first
+    path = written(tmp_path, ELBOW + "12\n" * 1_000_000)
+    tracemalloc.start()
+    motion = read_bvh(path)
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(motion.positions) == 2 and peak_bytes < 30_000_000  # ten copies of the file; as many strings have 60 MB
+
+
+def test_blank_lines_lie_anywhere(tmp_path: Path) -> None:
+    spaced = read_bvh(written(tmp_path, ELBOW.replace("\n", "\r\n \r\n")))
+    assert np.array_equal(spaced.positions, read_bvh(written(tmp_path, ELBOW)).positions)

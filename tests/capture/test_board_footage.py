@@ -144,6 +144,14 @@ def test_a_table_with_an_endless_field_is_refused(tmp_path: Path) -> None:
         read_board_footage(tmp_path, "extrinsic")
 
 
+def test_a_table_of_more_than_2_mb_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "charuco.toml").write_text(CHARUCO)
+    rec.write_png(tmp_path / "calibration" / "extrinsic" / "cam_0" / "0.png", np.zeros((8, 8, 3), np.uint8))
+    (tmp_path / "calibration" / "extrinsic" / "timestamps.csv").write_text("sync_index,cam_id\n" + "1,1\n" * 500_000)
+    with pytest.raises(InputError, match=r"timestamps\.csv: 2000018 bytes are too many"):
+        read_board_footage(tmp_path, "extrinsic")
+
+
 def test_footage_with_a_suffix_in_upper_case_is_not_left_out(tmp_path: Path) -> None:
     (tmp_path / "charuco.toml").write_text(CHARUCO)
     for name in ("cam_0.mp4", "cam_1.MP4"):

@@ -105,6 +105,9 @@ def test_lists_of_results_are_read_by_frame(tmp_path: Path) -> None:
     assert four.shape == (2, 17, 3) and (four[1, :, 2] == 1).all()
     with pytest.raises(InputError, match=r"01\.json: image_id 4 is none of the recording's frames 1 to 3"):
         read_results(tmp_path / "01.json", (1, 2, 3))
+    (tmp_path / "01.json").write_text(json.dumps([{}] * 129))
+    with pytest.raises(InputError, match=r"01\.json: 129 people in 2 images; keep at most 64 in each"):
+        read_results(tmp_path / "01.json", (0, 1))
     (tmp_path / "01.json").write_text(json.dumps([{"image_id": "cover", "keypoints": []}]))
     with pytest.raises(InputError, match=r"01\.json: no list of image_id"):
         read_results(tmp_path / "01.json", (0,))

@@ -6,12 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hnerf.capture import people
 from hnerf.capture.capture import Capture, SubjectPoint
 from hnerf.capture.subject import ranked_people, subject_keypoints
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import STANDING_M, ring, walk_m, write_capture
 
+_AGREED = people._agreements
 FRAMES, CONFIDENCE, NOISE_PX = 30, 0.8, 1.0
 
 
@@ -118,6 +120,23 @@ def test_cameras_without_places_choose_each_for_itself(tmp_path: Path) -> None:
     capture, (subject, *_) = recorded(tmp_path, cameras, walk_m(FRAMES), *far)
     nowhere = {c.name: dataclasses.replace(c, R=np.eye(3), t_m=np.zeros(3)) for c in cameras}
     assert share_right(subject_keypoints(dataclasses.replace(capture, cameras=nowhere)), subject) > 0.9
+
+
+def test_in_a_crowd_the_most_prominent_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    """64 people in either image, of whom the last one is twice as tall as the others."""
+    counts = []
+    monkeypatch.setattr(
+        people, "_agreements", lambda cameras, found: counts.append([*map(len, found)]) or _AGREED(cameras, found)
+    )
+    cameras = ring(2)
+    images = []
+    for camera in cameras:
+        seen = seen_by(camera, STANDING_M[None], np.random.default_rng(0))
+        small = seen * (0.5, 0.5, 1)
+        images.append(np.stack([*[small] * 63, seen], 1))
+    best = people.follow_people(cameras, images)[0]
+    assert counts[0] == [12, 12]
+    assert all(np.array_equal(found, image[:, 63]) for found, image in zip(best.keypoints, images, strict=True))
 
 
 def test_two_who_have_the_same_claim_are_one_line(tmp_path: Path) -> None:
