@@ -32,6 +32,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import h5py
 import numpy as np
+from PIL import ExifTags, Image
 
 from hnerf.body.bvh import Bvh, read_bvh, write_bvh
 from hnerf.capture.formats.export import write_cameras
@@ -66,6 +67,15 @@ def _ingest(folder: Path, out: Path) -> object:
     return ingest(folder, CaptureSettings(), out)
 
 
+def _photograph(path: Path, rgb: np.ndarray) -> None:
+    """Write a JPEG as a phone held upright does, whose EXIF says how to turn it."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation], exif[ExifTags.Base.Make] = 6, "phone"
+    exif[ExifTags.Base.XResolution], exif[ExifTags.IFD.Exif] = 72.0, {ExifTags.Base.FocalLengthIn35mmFilm: 26}
+    path.parent.mkdir(exist_ok=True)
+    Image.fromarray(np.rot90(rgb)).save(path, exif=exif)
+
+
 def _easymocap(folder: Path) -> None:
     """Write what an EasyMocap folder can hold: masks, a plate, keypoints of both kinds, capture.toml."""
     folder.mkdir()
@@ -75,7 +85,7 @@ def _easymocap(folder: Path) -> None:
             stem = f"{frame:06d}"
             rec.write_png(folder / "images" / camera / f"{stem}.png", rec.picture(camera, frame))
             rec.write_png(folder / "masks" / camera / f"{stem}.png", np.full((rec.HEIGHT, rec.WIDTH, 3), 255, np.uint8))
-        rec.write_png(folder / "background" / f"{camera}.png", rec.picture(camera, 9))
+        _photograph(folder / "background" / f"{camera}.jpg", rec.picture(camera, 9))
     person = np.tile([4.0, 5.0, 0.5], (25, 1))
     for frame in range(FRAMES):
         rec.write_keypoints(folder / "openpose" / "01" / f"{frame:06d}_keypoints.json", [person])
