@@ -96,7 +96,7 @@ def fist(rig: Rig) -> Tensor | None:
     if not {"wrist.L", "wrist.R", *finger_joints()} <= set(rig.joint_names):
         return None
     prior = FingerPrior.of(rig)
-    straight = prior.low - math.radians(LIMITS_DEG[0])
+    straight = prior.low[:, 0] - math.radians(LIMITS_DEG[0])
     flexion = straight + torch.deg2rad(torch.tensor(FIST_DEG * 2))
     theta = torch.zeros(len(rig.joint_names), 3)
     theta[[rig.joint_names.index(name) for name in finger_joints()]] = (flexion[:, None] * prior.axes[:, 0]).float()

@@ -16,12 +16,14 @@ from hnerf.body.reprojection import Views, reprojection_term
 from hnerf.body.rig import Rig
 
 # By segment, from the palm: flexion of a relaxed hand, and standard deviations of flexion, twist and spread, all in
-# degrees and chosen wide; fingers bend between the limits, from straight. Twist is that of a thumb's first joint.
+# degrees and chosen wide; fingers bend between the limits, from straight, and spread up to theirs, to either side, from
+# rest. Twist is that of a thumb's first joint.
 RELAXED_DEG = (20.0, 25.0, 15.0)
 STD_DEG = ((25.0, 2.0, 12.0), (25.0, 2.0, 2.0), (15.0, 2.0, 2.0))
 THUMB_RELAXED_DEG = (5.0, 10.0, 10.0)
 THUMB_STD_DEG = ((15.0, 10.0, 15.0), (15.0, 2.0, 5.0), (20.0, 2.0, 2.0))
 LIMITS_DEG = (-10.0, 100.0)
+SPREAD_LIMITS_DEG, THUMB_SPREAD_LIMITS_DEG = (20.0, 5.0, 5.0), (35.0, 5.0, 5.0)
 RATE_DEG_S = 200.0  # standard deviation of a finger joint's speed: a fist closes in a third of a second
 # Steps, with what counts as an outlier: a fist is a decimetre from a relaxed hand. Then as for the palm.
 STEPS_M, DAMPING = (0.2, 0.2, 0.2, 0.2, *6 * (OUTLIER_M,)), 1e-4
@@ -29,8 +31,8 @@ STEPS_M, DAMPING = (0.2, 0.2, 0.2, 0.2, *6 * (OUTLIER_M,)), 1e-4
 
 @dataclass(frozen=True)
 class FingerPrior:
-    """Priors on the 30 finger joints. axes (30, 3, 3): rows flexion, twist and spread; mean, low and high (30,): of the
-    flexion from rest; std (30, 3); all in radians."""
+    """Priors on the 30 finger joints. axes (30, 3, 3): rows flexion, twist and spread; mean (30,): of the flexion from
+    rest; low, high and std (30, 3); all in radians."""
 
     axes: Tensor
     mean: Tensor
@@ -59,7 +61,11 @@ class FingerPrior:
         relaxed = torch.tensor([*THUMB_RELAXED_DEG, *4 * RELAXED_DEG] * 2, dtype=rig.joints_m.dtype)
         std = torch.tensor([*THUMB_STD_DEG, *4 * STD_DEG] * 2, dtype=relaxed.dtype)
         bend = torch.stack(bends).asin()
-        low, high = (math.radians(limit) - bend for limit in LIMITS_DEG)
+        spread = torch.deg2rad(torch.tensor([*THUMB_SPREAD_LIMITS_DEG, *4 * SPREAD_LIMITS_DEG] * 2, dtype=std.dtype))
+        low, high = (
+            torch.stack([math.radians(limit) - bend, torch.full_like(bend, sign * math.inf), sign * spread], 1)
+            for limit, sign in zip(LIMITS_DEG, (-1, 1), strict=True)
+        )
         return FingerPrior(torch.stack(axes), torch.deg2rad(relaxed) - bend, low, high, torch.deg2rad(std))
 
     def relaxed(self) -> Tensor:

@@ -34,7 +34,7 @@ HINGES = ("lowerleg01", "lowerarm01")  # joints that bend from straight to folde
 FOLDED_DEG = 150.0  # of a hinge, from straight
 FLEXION_DEG = {"upperarm01": (-170, 45), "upperleg01": (-130, 40)}  # limits forwards and backwards, from rest
 MEAN_FLEXION_DEG = {"upperarm01": -10.0}  # arms are carried in front of the body
-LIMIT_STD_DEG = 2.0  # of a flexion beyond its limits
+LIMIT_STD_DEG = 2.0  # of a turn beyond its limits
 
 DIFFERENCE = (1.0, -2.0, 1.0)
 OUTLIER_SIGMAS = 3.0  # of an acceleration: a sudden movement or a cut
@@ -55,8 +55,10 @@ class PosePrior:
         bend = torch.stack([_angle(bones[int(articulation.parents[m + 1])], bones[m + 1]) for m in range(len(names))])
         hinge = torch.tensor([name in HINGES for name in names])
         span = torch.deg2rad(torch.tensor([FLEXION_DEG.get(name, (-180, 180)) for name in names], dtype=bones.dtype))
-        self.low = torch.where(hinge, -bend, span[:, 0])
-        self.high = torch.where(hinge, math.radians(FOLDED_DEG) - bend, span[:, 1])
+        low = torch.where(hinge, -bend, span[:, 0])
+        high = torch.where(hinge, math.radians(FOLDED_DEG) - bend, span[:, 1])
+        pad = torch.nn.functional.pad
+        self.low, self.high = (pad(x[:, None], (0, 2), value=end) for x, end in ((low, -math.inf), (high, math.inf)))
         self.mean = torch.zeros_like(self.sigma)
         self.mean[:, 0] = torch.deg2rad(torch.tensor([MEAN_FLEXION_DEG.get(name, 0.0) for name in names]))
 
@@ -74,15 +76,13 @@ def add_turn_prior(
     equations: NormalEquations, first: int, axes: Tensor, turns: Tensor, mean: Tensor, std: Tensor, low: Tensor,
     high: Tensor,
 ) -> float:  # fmt: skip
-    """Add a Gaussian on turns (n, M, 3), the unknowns from `first` on, and one-sided limits on their flexion to the
-    normal equations; return the cost. axes (M, 3, 3): rows flexion, twist, sideways; mean, std (M, 3) about these, and
-    low, high (M,) of the flexion, in radians."""
+    """Add a Gaussian on turns (n, M, 3), the unknowns from `first` on, and one-sided limits to the normal equations;
+    return the cost. axes (M, 3, 3): rows flexion, twist, sideways; mean, std, low, high (M, 3) about these, in
+    radians."""
     local = torch.einsum("mac,nmc->nma", axes, turns)
-    weight = (std**-2).expand_as(local).clone()
-    off, excess = local - mean, local[..., 0] - local[..., 0].clamp(low, high)
-    pull, limit = weight * off, math.radians(LIMIT_STD_DEG) ** -2
-    pull[..., 0] += limit * excess
-    weight[..., 0] += limit * (excess != 0)
+    off, excess, limit = local - mean, local - local.clamp(low, high), math.radians(LIMIT_STD_DEG) ** -2
+    pull = std**-2 * off + limit * excess
+    weight = std**-2 + limit * (excess != 0)
     blocks = torch.einsum("mac,nma,mad->nmcd", axes, weight, axes)
     gradient = torch.einsum("mac,nma->nmc", axes, pull)
     for m in range(len(axes)):

@@ -57,10 +57,20 @@ def test_a_finger_one_standard_deviation_off_costs_a_half() -> None:
     assert prior.add(equations, turns) < 1e-20
     turns[0, 4] += math.radians(25) * prior.axes[4, 0]
     np.testing.assert_allclose(prior.add(equations, turns), 0.5)
-    beyond = prior.high[4] + math.radians(4)
+    beyond = prior.high[4, 0] + math.radians(4)
     turns[0, 4] = beyond * prior.axes[4, 0]
     expected = 0.5 * float((beyond - prior.mean[4]) / math.radians(25)) ** 2 + 2
     np.testing.assert_allclose(prior.add(equations, turns), expected)
+
+
+def test_fingers_do_not_spread_beyond_their_limits() -> None:
+    """24 degrees at the knuckle of the left index finger: two standard deviations of 12, and two of 2 beyond 20. 39 at
+    the thumb's base: 2.6 of 15, and two beyond 35. 9 at the index finger's end: 4.5 of 2, and two beyond 5."""
+    prior = FingerPrior.of(RIG)
+    for joint, sign, angle_deg, std in ((3, 1, 24, 2.0), (3, -1, 24, 2.0), (0, 1, 39, 2.6), (5, -1, 9, 4.5)):
+        turns = prior.relaxed()[None].clone()
+        turns[0, joint] += sign * math.radians(angle_deg) * prior.axes[joint, 2]
+        np.testing.assert_allclose(prior.add(NormalEquations(1, 90, 0), turns), 0.5 * std**2 + 2)
 
 
 def test_a_change_of_one_standard_deviation_costs_a_half() -> None:
