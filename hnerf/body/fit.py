@@ -232,8 +232,7 @@ def _report(
     residual_m = residual_px * metres_per_pixel(observations.cameras, pose).mean(0).numpy()
     iou = None if masks is None else _silhouette_iou(capture, masks, fit)
     poor = residual_m > POOR_KEYPOINT_M
-    if iou is not None:
-        poor |= np.array([value is None or value < POOR_IOU for value in iou])
+    poor |= np.isnan(residual_m) if iou is None else [value is None or value < POOR_IOU for value in iou]
     flagged = [frame for frame, bad in zip(fit.frames, poor, strict=True) if bad]
     if flagged:
         log.warning("the fit is poor in %d of %d frames: %s", len(flagged), len(poor), flagged)

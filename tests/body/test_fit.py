@@ -8,7 +8,7 @@ import torch
 from hnerf.body import contour_fit
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.body_model import body_model
-from hnerf.body.fit import fit_body, make_problem, resolve_depth_flips
+from hnerf.body.fit import _report, fit_body, make_problem, resolve_depth_flips
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel
 from hnerf.body.observations import observe, runs
@@ -40,6 +40,20 @@ def test_four_cameras_recover_pose_and_shape(tmp_path: Path) -> None:
     assert max(report["keypoint_residual_px"]) < 2
     assert abs(report["stature_m"] - float(np.ptp(truth.rig.vertices_m[:, 2].numpy()))) < 0.02
     assert fit.frames == (0, 1, 2) and not fit.theta[:, ~fit.rig.free].any()
+
+
+def test_a_frame_that_nothing_was_fitted_to_is_poor(tmp_path: Path) -> None:
+    """Frame 1 has no keypoints, and there are no masks; with masks, it is what these say."""
+    truth = moving_body((0, 1, 2))
+    capture = record(tmp_path, truth, RING, ("0", "1"))
+    seen = observe(capture)
+    seen.confidence[:, 1] = 0
+    nothing = torch.zeros(25, 3, dtype=torch.float64)
+    pose = Pose(truth.rig.to(dtype=torch.float64), truth.theta.double(), truth.root.double(), nothing)
+    masks = Silhouettes(capture, truth)
+    reports = [_report(capture, m, seen, pose, truth, {}) for m in (None, masks)]  # type: ignore[arg-type]
+    assert [report["keypoint_residual_px"][1] for report in reports] == [None, None]
+    assert [report["poor_frames"] for report in reports] == [[1], []]
 
 
 def test_one_camera_finds_the_depth(tmp_path: Path) -> None:
