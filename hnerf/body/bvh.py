@@ -19,7 +19,9 @@ MAX_NUMBERS = 20_000_000  # of all frames
 MAX_VALUE = 1e6  # of an offset or a channel
 FRAME_S = (1e-4, 10.0)  # that a frame may last
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
-WRITTEN_ORDER = "ZXY"  # of rotations
+# Of rotations: the middle angle must stay within 90 degrees, beyond which all three flip. Roots turn about Y without
+# end, limbs bend about X and rise about Z.
+ROOT_ORDER, JOINT_ORDER = "YZX", "XYZ"
 
 
 @dataclass(frozen=True)
@@ -85,10 +87,11 @@ def write_bvh(path: Path, motion: Bvh) -> None:
     """Write a motion; only the root's positions are kept, others are their offsets. Bones end as long as they began."""
     lines = ["HIERARCHY", *_hierarchy_lines(motion, 0, ""), "MOTION", f"Frames: {len(motion.positions)}"]
     lines.append(f"Frame Time: {motion.frame_s:.9g}")
-    turns = Rotation.from_matrix(motion.rotations.reshape(-1, 3, 3)).as_euler(WRITTEN_ORDER, degrees=True)
-    order = _depth_first(motion.parents)
-    angles = turns.reshape(len(motion.positions), -1, 3)[:, order].reshape(len(motion.positions), -1)
-    for row in np.concatenate([motion.positions[:, 0], angles], 1):
+    turns = [
+        Rotation.from_matrix(motion.rotations[:, joint]).as_euler(_written_order(joint), degrees=True)
+        for joint in _depth_first(motion.parents)
+    ]
+    for row in np.concatenate([motion.positions[:, 0], np.unwrap(np.hstack(turns), axis=0, period=360)], 1):
         lines.append(" ".join(f"{value:.6f}" for value in row))
     path.write_text("\n".join(lines) + "\n")
 
@@ -185,6 +188,11 @@ def _poses(joints: list[_Joint], values: np.ndarray, frame_s: float) -> Bvh:
     return Bvh(tuple(joint.name for joint in joints), parents, offsets, frame_s, positions, rotations)
 
 
+def _written_order(joint: int) -> str:
+    """Return the order of a joint's rotations in the file."""
+    return JOINT_ORDER if joint else ROOT_ORDER
+
+
 def _depth_first(parents: np.ndarray) -> list[int]:
     """Return the joints in the order in which the file lists them."""
     order, waiting = [], [0]
@@ -200,7 +208,7 @@ def _hierarchy_lines(motion: Bvh, joint: int, indent: str) -> list[str]:
     def offset(values: np.ndarray) -> str:
         return "OFFSET " + " ".join(f"{value:.6f}" for value in values)
 
-    turning = " ".join(f"{axis}rotation" for axis in WRITTEN_ORDER)
+    turning = " ".join(f"{axis}rotation" for axis in _written_order(joint))
     kind, channels = ("JOINT", f"3 {turning}") if joint else ("ROOT", f"6 Xposition Yposition Zposition {turning}")
     inside = f"{indent}\t"
     lines = [f"{indent}{kind} {motion.names[joint]}", f"{indent}{{", f"{inside}{offset(motion.offsets[joint])}"]

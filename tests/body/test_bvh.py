@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from hnerf.body import bvh
 from hnerf.body.bvh import Bvh, read_bvh, write_bvh
@@ -58,6 +59,18 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     order = [0, 1, 3, 2]
     for found, true in zip(again.world(), fork.world(), strict=True):
         np.testing.assert_allclose(found, true[:, order], atol=1e-6)
+
+
+def test_angles_do_not_jump_where_somebody_turns_and_a_knee_bends(tmp_path: Path) -> None:
+    """A root turns from 170 to 190 degrees, leaning by 2 and 3, a joint bends from 80 to 100, twisted by 4 and 5."""
+    root = Rotation.from_euler("YZX", [[170, 2, 3], [190, 2, 3]], degrees=True).as_matrix()
+    knee = Rotation.from_euler("XYZ", [[80, 4, 5], [100, 4, 5]], degrees=True).as_matrix()
+    offsets = np.array([[0.0, 9, 0], [0, -1, 0]])
+    leg = Bvh(("hip", "knee"), np.array([-1, 0]), offsets, 0.1, np.tile(offsets, (2, 1, 1)), np.stack([root, knee], 1))
+    write_bvh(tmp_path / "b.bvh", leg)
+    rows = np.loadtxt((tmp_path / "b.bvh").read_text().splitlines()[-2:])
+    np.testing.assert_allclose(rows, [[0, 9, 0, 170, 2, 3, 80, 4, 5], [0, 9, 0, 190, 2, 3, 100, 4, 5]], atol=1e-5)
+    np.testing.assert_allclose(read_bvh(tmp_path / "b.bvh").rotations, leg.rotations, atol=1e-6)
 
 
 @pytest.mark.parametrize(
