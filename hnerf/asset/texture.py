@@ -10,6 +10,8 @@ import xatlas
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
+from hnerf.geometry.rays import cast, mesh_on_cpu
+
 CHART_PADDING_PX = 4
 SUBPIXEL_BITS = 8
 ALL = slice(None)
@@ -59,18 +61,22 @@ def unwrap(vertices_m: np.ndarray, faces: np.ndarray, texture_px: int) -> UvLayo
 
 
 def rasterise(layout: UvLayout, texture_px: int) -> Texels:
-    """Return the texels that a layout's faces touch; a texel on the border of two faces belongs to the later face."""
-    corners_px = (layout.uvs * (1, -1) + (0, 1))[layout.face_uvs] * texture_px - 0.5  # centres at integers
+    """Return the texels that a layout's faces touch. A texel belongs to the face that contains its centre; to the last
+    that touches it, if none does."""
+    at_px = (layout.uvs * (1, -1) + (0, 1)) * texture_px - 0.5  # centres at integers
+    corners_px = at_px[layout.face_uvs]
     face_image = np.full((texture_px, texture_px), -1, np.int32)
     for index, triangle in enumerate(np.round(corners_px * (1 << SUBPIXEL_BITS)).astype(np.int32)):
         cv2.fillConvexPoly(face_image, triangle, index, shift=SUBPIXEL_BITS)
     row, column = np.nonzero(face_image >= 0)
-    face = face_image[row, column]
-    a, b, c = corners_px[face].swapaxes(0, 1)
     p = np.stack([column, row], 1)
+    flat = mesh_on_cpu(np.column_stack([at_px, np.zeros(len(at_px))]), layout.face_uvs)
+    around = cast(flat, np.column_stack([p, np.ones(len(p))]), np.tile([0.0, 0, -1], (len(p), 1))).face
+    face = np.where(around >= 0, around, face_image[row, column])
+    a, b, c = corners_px[face].swapaxes(0, 1)
     weights = np.stack([_cross(b - p, c - p), _cross(c - p, a - p), _cross(a - p, b - p)], 1)
     area = weights.sum(1, keepdims=True)
-    # The centre of a texel that a face touches may lie outside it.
+    # The centre of a texel that faces only touch lies outside them.
     inside = np.clip(weights / np.where(area == 0, 1, area), 0, None) + 1e-9
     barycentric = torch.from_numpy(inside / inside.sum(1, keepdims=True)).float()
     return Texels(torch.from_numpy(row), torch.from_numpy(column), torch.from_numpy(face).long(), barycentric)

@@ -16,6 +16,21 @@ def test_texels_of_one_triangle() -> None:
     torch.testing.assert_close(at[3, 2], torch.tensor([0.25, 0.625, 0.125]))
 
 
+def test_a_texel_belongs_to_the_face_around_its_centre() -> None:
+    """Two rectangles of two faces each meet at u = 0.4, 1.6 texels from the left, and end at u = 0.8, at 3.2: the
+    centres of columns 0 and 1 lie in the first, that of column 2 in the second, which touches columns 1 and 3 too."""
+    corners = [[u, v] for u in (0, 0.4, 0.8) for v in (0, 1)]
+    layout = UvLayout(np.array(corners), np.array([[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]]))
+    texels = rasterise(layout, 4)
+    image = np.full((4, 4), -1)
+    image[texels.row, texels.column] = texels.face // 2
+    assert image.tolist() == [[0, 0, 1, 1]] * 4
+    corner_u = torch.from_numpy(layout.uvs[layout.face_uvs][texels.face, :, 0])
+    inside = texels.column < 3
+    at_u = (texels.barycentric * corner_u).sum(1)[inside]
+    torch.testing.assert_close(at_u, (texels.column[inside] + 0.5) / 4, atol=1e-5, rtol=0, check_dtype=False)
+
+
 def test_values_of_vertices_at_texels() -> None:
     faces, values = np.array([[0, 1, 2], [2, 1, 3]]), np.array([[0.0, 1], [4, 1], [8, 1], [100, 1]])
     nowhere = torch.zeros(2, dtype=torch.long)
