@@ -97,9 +97,9 @@ class NerfiesField(DynamicField):
         change = jacobian(lambda x: self._deform(x, code), self.scaled(points))
         return dataclasses.replace(samples, elastic=weights.sum(1) * elastic_energy(change)), depths
 
-    def on_step_end(self, progress: float) -> None:
-        """Note how far training has come, for annealing; a later phase begins with all octaves."""
-        self.progress.clamp_(min=progress)
+    def on_progress(self, progress: float) -> None:
+        """Note how far training has come, for annealing."""
+        self.progress.fill_(progress)
 
     def _deform(self, points: Tensor, code: Tensor) -> Tensor:
         octaves = OCTAVES * self.progress / self.settings.anneal_share

@@ -77,9 +77,9 @@ class Field(nn.Module, ABC):
         """Return the random numbers needed per ray at a training progress from 0 to 1."""
         return self.samples
 
-    def on_step_end(self, progress: float) -> None:
-        """Update state after a training step; called once per step, whatever the number of its parts. progress: of the
-        phase, from 0 to 1."""
+    def on_progress(self, progress: float) -> None:
+        """Note how far the field's training has come, from 0 to 1; called after each of its steps but the last,
+        whatever the number of their parts."""
 
     def samples_needed(self, region: Any, rays: Rays) -> Tensor:
         """Return the number of samples that rendering takes along R rays: (R,) long, 0 where nothing is visible."""

@@ -128,6 +128,8 @@ class Trainer:
                 self.optimizer.state.clear()  # its momentum would keep moving the training poses
             terms = self._optimise(module)
             self.step += 1
+            if self.step < self.field_steps:
+                self.field.on_progress(self._progress())
             self.seconds = self.processes.all_max(time.monotonic() - started)  # one clock: learning rates follow it
             if self.step < self.field_steps and self.settings.seconds and self.seconds >= self.settings.seconds:
                 self.field_steps = self.step
@@ -194,7 +196,6 @@ class Trainer:
         self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
         terms = self.parts.backward(module, scene, rays, draws, self.processes)
-        self.field.on_step_end(self._progress())
         if self.step >= self.field_steps:  # the loss that pulls all frames to the fit must not move finished frames
             for pose in (self.objective.correction.turn, self.objective.correction.move_m):
                 if pose.grad is not None:

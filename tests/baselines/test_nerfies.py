@@ -27,7 +27,7 @@ SMALL = [
     "training.rays_per_frame=96",
     "training.field.samples=12",
     "training.field.width=32",
-    "training.field.anneal_share=0.25",
+    "training.field.anneal_share=0.3333",
     "training.field.learning_rate=0.01",
 ]
 
@@ -127,10 +127,8 @@ def test_training_anneals_and_looking_does_not(field: NerfiesField) -> None:
     assert evaluate(field, training=False).elastic is None
     assert evaluate(field, training=True).elastic is not None
     assert field.progress == 0
-    field.on_step_end(0.2)
+    field.on_progress(0.2)
     assert field.state_dict()["progress"] == pytest.approx(0.2)
-    field.on_step_end(0.1)  # of the phase that novel frames learn in
-    assert field.progress == pytest.approx(0.2)
 
 
 def test_what_stands_still_or_turns_as_a_whole_costs_nothing_and_what_swells_does(field: NerfiesField) -> None:
@@ -147,15 +145,15 @@ def test_what_stands_still_or_turns_as_a_whole_costs_nothing_and_what_swells_doe
 
 def test_the_deformation_begins_smooth_and_ends_with_all_octaves(field: NerfiesField) -> None:
     """A screw that reads only the highest octave is zero at first and complete after its share of training."""
-    assert field.settings.anneal_share == 0.25
+    assert field.settings.anneal_share == 0.3333
     torch.nn.init.normal_(field.deformation.screw.weight)
     points = torch.rand(20, 3)
     code = torch.zeros(20, field.settings.code_width)
     plain = field.deformation(points, code, torch.tensor(float(OCTAVES)))
-    for share in (0.0, 0.2):
+    for share in (0.0, 0.3):
         field.progress.fill_(share)
         assert not torch.allclose(field._deform(points, code), plain, atol=1e-3)
-    field.progress.fill_(0.25)
+    field.progress.fill_(0.3333)
     torch.testing.assert_close(field._deform(points, code), plain)
 
 
@@ -166,7 +164,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Learned:
 
 
 def test_overfits_two_frames(learned: Learned) -> None:
-    """28 dB in both, with progress noted from 0 to the last step's."""
+    """28 dB in both, with progress noted up to the last step."""
     assert learned.avatar.field.progress == pytest.approx(89 / 90)
     assert min(learned.psnr(frame) for frame in (0, 1)) > 28
 

@@ -22,25 +22,25 @@ def test_what_is_there_and_whose(store: Store, capsys: pytest.CaptureFixture[str
     store.claim("ada", "a" * 64, Path("/recordings/\x1bada"))
     assert main(["store", "list"]) == 0
     _, ada, total = capsys.readouterr().out.splitlines()
-    assert ada.split()[:4] == ["ada", "78", "B", "8"] and ada.endswith("/recordings/\\x1bada")
-    assert total.startswith("all: 78 B; not needed: 39 B; free")  # "abc 10", three more, and a name of 15 bytes; twice
+    assert ada.split()[:4] == ["ada", "102", "B", "12"] and ada.endswith("/recordings/\\x1bada")
+    assert total.startswith("all: 102 B; not needed: 51 B; free")  # "abc 10", five more, and a name of 15 bytes; twice
     assert main(["store", "show", "ada"]) == 0
     lines = capsys.readouterr().out.splitlines()[2:]
     assert [line.split()[-1] for line in lines if "yes" in line] == [
-        f"capture/{20:032x}", f"fit/{22:032x}", f"evaluation/{23:032x}"
+        f"capture/{20:032x}", f"fit/{22:032x}", f"training/{23:032x}", f"asset/{24:032x}", f"evaluation/{24:032x}"
     ]  # fmt: skip
     assert main(["store", "show", "eve"]) == 2
 
 
 def test_nothing_is_removed_without_yes(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["store", "gc", "--older", "1d"]) == 0
-    assert capsys.readouterr().out.endswith("not needed: 4, 39 B; nothing was removed: give --yes to remove\n")
+    assert capsys.readouterr().out.endswith("not needed: 6, 51 B; nothing was removed: give --yes to remove\n")
     assert main(["store", "gc", "--keep", "2", "--yes"]) == 0
     assert main(["store", "gc", "--older", "999999d", "--yes"]) == 0
     assert main(["store", "verify"]) == 0
-    assert "checked: 8 artifacts, 10 files, 78 B" in capsys.readouterr().out
+    assert "checked: 12 artifacts, 14 files, 102 B" in capsys.readouterr().out
     assert main(["store", "gc", "--yes"]) == 0
-    assert capsys.readouterr().out.endswith("removed: 4 of 4, 39 B\n")
+    assert capsys.readouterr().out.endswith("removed: 6 of 6, 51 B\n")
     assert main(["store", "verify"]) == 0
 
 

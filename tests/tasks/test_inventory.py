@@ -21,9 +21,9 @@ def test_an_artifact_is_known_by_size_and_times(store: Store) -> None:
 
 
 def test_inputs_of_inputs_are_found_once(store: Store) -> None:
-    capture, rough, fit, evaluation = run_of(store, "ada", 10)
+    capture, rough, fit, training, evaluation, _ = run_of(store, "ada", 10)
     found = Inventory.of(store)
-    assert found.with_inputs([evaluation.name]) == names([capture, rough, fit, evaluation])
+    assert found.with_inputs([evaluation.name]) == names([capture, rough, fit, training, evaluation])
     assert found.with_inputs([rough.name, "fit/gone"]) == names([capture, rough])
 
 

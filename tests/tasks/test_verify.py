@@ -20,16 +20,16 @@ def store(tmp_path: Path) -> Store:
 def test_a_sound_store_has_no_faults(store: Store) -> None:
     everything, of_ada = faults(store), faults(store, ["ada"])
     assert everything.lines == of_ada.lines == []
-    assert (everything.artifacts, of_ada.artifacts) == (8, 4)
-    assert everything.files == 8 + 2  # letters of each, and a capture.json of each person
-    assert of_ada.size_bytes == 4 * len("abc 10") + len('{"name": "ada"}')
+    assert (everything.artifacts, of_ada.artifacts) == (12, 6)
+    assert everything.files == 12 + 2  # letters of each, and a capture.json of each person
+    assert of_ada.size_bytes == 6 * len("abc 10") + len('{"name": "ada"}')
 
 
 def test_what_is_damaged_missing_or_not_of_it_is_named(store: Store) -> None:
     letters = sorted(store.root.glob("fit/*/deep/letters"))
     letters[0].write_text("abd")
     (letters[1].parent / "more").touch()
-    (store.subject_folder("bob") / "asset").symlink_to(f"../../asset/{99:032x}")
+    (store.subject_folder("bob") / "hands").symlink_to(f"../../hands/{99:032x}")
     store.path("fit", f"{98:032x}", ".json").write_text("[]")
     found = faults(store)
     assert [line.rpartition(": ")[2] for line in found.lines] == [
