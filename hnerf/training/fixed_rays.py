@@ -41,13 +41,12 @@ class FixedRays:
     @torch.no_grad()
     def require_surface(self, scene: PosedScene[Any], rows: Tensor) -> None:
         """Raise TrainingError if the surface is empty or fills the box. Of the background, rays through the box are
-        evaluated, away from outlines unless pixels are so large that there are no others."""
+        evaluated, those at outlines, too: a tight shell meets hardly any others."""
         count = max(self.field.samples, MIN_SAMPLES_PER_RAY) if self.field.models_background else self.field.samples
         rays, samples = self.sample(scene, rows, count)
         coverage = self.field.coverage(samples)
         beside = ~rays.person & (samples.in_box > 0).any(1)
-        clear = beside & ~rays.edge
-        person, around = coverage[rays.person].mean(), coverage[clear if clear.any() else beside].mean()
+        person, around = coverage[rays.person].mean(), coverage[beside].mean()
         if not person >= MIN_PERSON_COVERAGE:  # also true for NaN
             raise TrainingError(f"the surface is empty (covers {person:.0%} of the person): check masks and body fit")
         if around > MAX_BACKGROUND_COVERAGE:

@@ -1,6 +1,8 @@
 """Collapse: a surface that is empty or fills the box ends training with an error, at the thresholds that users have."""
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -65,6 +67,22 @@ def test_a_collapsed_surface_is_an_error(tmp_path: Path, kind: str, outwards: fl
     move_surface(trainer.field, outwards)
     with pytest.raises(TrainingError, match=message):
         trainer.run()
+
+
+def test_a_single_pixel_away_from_outlines_does_not_tell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Its mask may lack what the field shows; here it is labelled as beside the person, and all others as outline."""
+    trainer = trainer_of(tmp_path, "fast")
+    sample = trainer.fixed_rays.sample
+
+    def with_one_clear(*given: Any) -> Any:
+        rays, samples = sample(*given)
+        (shown,) = torch.nonzero(rays.person)[:1, 0]
+        edge, person = torch.ones_like(rays.edge), rays.person.clone()
+        edge[shown], person[shown] = False, False
+        return dataclasses.replace(rays, edge=edge, person=person), samples
+
+    monkeypatch.setattr(fixed_rays.FixedRays, "sample", lambda _, *given: with_one_clear(*given))
+    trainer.fixed_rays.require_surface(trainer.scene, trainer.train_rows)
 
 
 def test_a_distance_that_is_not_a_number_is_no_surface(tmp_path: Path):
