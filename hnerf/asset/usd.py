@@ -14,7 +14,6 @@ from hnerf.asset.rigs import StagedRig
 from hnerf.asset.skeleton import Skeleton
 from hnerf.asset.srgb import to_linear
 from hnerf.asset.staging import REST_POSE, StagedAvatar, moved_points, shape_names
-from hnerf.body.descriptor import normals_of
 from hnerf.body.skeletons import EQUIVALENTS, SKELETONS
 from hnerf.geometry.camera import Camera
 
@@ -61,8 +60,10 @@ def author_geometry(stage: Usd.Stage, avatar: StagedAvatar, level: int) -> None:
 def author_shape(stage: Usd.Stage, avatar: StagedAvatar, physique: str | None) -> None:
     """Place the mesh at rest at all levels of detail, as captured or in another physique. The body's extent is then a
     box around it in any motion."""
-    points_m = avatar.rest_points_m if physique is None else avatar.rest_points_m + avatar.physiques_m[physique]
-    normals = normals_of(points_m, avatar.faces)
+    points_m, normals = avatar.rest_points_m, avatar.normals
+    if physique is not None:
+        points_m = points_m + avatar.physiques_m[physique]
+        normals = normals + avatar.normal_changes[physique]
     for number, level in enumerate(avatar.levels):
         mesh = UsdGeom.Mesh(stage.OverridePrim(surface_path(number)))
         mesh.CreatePointsAttr(vec3f(points_m[level.vertices]))
