@@ -19,6 +19,7 @@ from pydantic import Field
 from flows.restart import DEPLOYMENT, restart_crashed, unfinished_runs
 from hnerf.errors import InputError
 from tasks import quarantine
+from tasks.bucket import is_visible
 from tasks.ledger import Ledger
 from tasks.remote import remote_captures
 from tasks.source import entries, place, read_capture
@@ -143,7 +144,7 @@ def _listing(capture: Path) -> tuple[str, float]:
     for entry in sorted(entries(capture, hidden=True), key=lambda entry: entry.path):
         stat = entry.stat(follow_symlinks=False)
         touched_s = max(touched_s, stat.st_ctime)
-        if not any(part.startswith(".") for part in Path(entry.path).relative_to(capture).parts):
+        if is_visible(entry.path.removeprefix(f"{capture}/")):
             listing.update(os.fsencode(f"{entry.path} {stat.st_size} {stat.st_mtime_ns}\n"))
             files += 1
     return f"seen-{listing.hexdigest()}", touched_s if files else 0.0

@@ -101,7 +101,7 @@ class Bucket:
             except FileNotFoundError:
                 return []
         names = {one["name"].rstrip("/").removeprefix(f"{self.root}/") for one in entries if one["type"] == "directory"}
-        return sorted(name for name in names if _is_visible(name))
+        return sorted(name for name in names if is_visible(name))
 
     def files(self, folder: str) -> Iterator[RemoteFile]:
         """Yield the files below a folder of an object store, sorted, without hidden ones and markers of folders; none
@@ -111,7 +111,7 @@ class Bucket:
             found = self.fs.find(root, detail=True)
         for path, entry in sorted(found.items()):
             name = path.removeprefix(f"{root}/")
-            if path.startswith(f"{root}/") and _is_visible(name):
+            if path.startswith(f"{root}/") and is_visible(name):
                 if "ETag" not in entry:
                     raise InputError(f"{self.where(name)}: has no ETag; put captures into a bucket of S3")
                 yield RemoteFile(name, int(entry["size"]), entry["ETag"])
@@ -184,5 +184,6 @@ class Bucket:
             raise BucketError(f"{self.where(name)}: {one_line(error)}; can the bucket be reached?") from error
 
 
-def _is_visible(name: str) -> bool:
+def is_visible(name: str) -> bool:
+    """Return whether neither a file nor a folder around it is hidden."""
     return all(part and not part.startswith(".") for part in name.split("/"))
