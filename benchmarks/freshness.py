@@ -105,10 +105,12 @@ def shown_seconds(record: dict[str, Any]) -> str:
 
 def _files(base: Path, module: str) -> Iterator[Path]:
     """Yield the module's file and its packages', as far as they exist in the folder."""
-    names = module.split(".")
-    for count in range(1, len(names) + 1):
-        path = base.joinpath(*names[:count])
+    path = base
+    for name in module.split("."):
+        path /= name
         yield from (file for file in (path.with_suffix(".py"), path / "__init__.py") if file.is_file())
+        if not path.is_dir():
+            return
 
 
 @cache
@@ -119,7 +121,7 @@ def _code(text: str) -> tuple[str, tuple[str, ...]]:
     for node in ast.walk(tree):
         if isinstance(node, DOCUMENTED) and ast.get_docstring(node) is not None:
             node.body = node.body[1:] or [ast.Pass()]
-    return ast.unparse(tree), tuple(_named(ast.walk(tree)))
+    return ast.unparse(tree), tuple(dict.fromkeys(_named(ast.walk(tree))))
 
 
 def _named(nodes: Iterable[ast.AST]) -> Iterator[str]:

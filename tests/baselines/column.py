@@ -5,17 +5,12 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-import numpy as np
 import torch
-import trimesh
 
-from hnerf.avatar.surface import surface_in_pose
 from hnerf.avatar.trained import TrainedAvatar, load_avatar
 from hnerf.body.fit_result import BodyFit
-from hnerf.body.rig import pose_vertices
 from hnerf.capture.capture import Capture
 from hnerf.config import TrainingSettings
-from hnerf.evaluation.geometry import score_geometry
 from hnerf.training.distributed import Distributed
 from hnerf.training.trainer import train
 from tests.body.boxes import box_rig
@@ -43,14 +38,6 @@ class Learned:
             shown = drawn.rgb + (1 - drawn.alpha[..., None]) * torch.from_numpy(plate / 255).float()
             errors.append((shown - torch.from_numpy(self.capture.image(name, frame) / 255).float()).square().mean())
         return float(-10 * torch.log10(torch.stack(errors).mean()))
-
-    def overlap(self, frame: int) -> float:
-        """Return the intersection over union of the surface's volume and the column's in a frame."""
-        theta, root = self.body.theta[frame], self.body.root[frame]
-        vertices_m = pose_vertices(self.body.rig, theta, root).numpy()
-        column = trimesh.Trimesh(vertices_m, self.body.rig.faces.numpy(), process=False)
-        found = surface_in_pose(self.avatar, theta, root, CELLS)
-        return score_geometry(found, column, np.random.default_rng(0), samples=1000, nodes=64).iou
 
 
 def learn(folder: Path, settings: TrainingSettings, bends_rad: tuple[float, float, float]) -> Learned:
