@@ -283,7 +283,7 @@ class AssetSettings(Section):
     texture_poses: int = Field(default=3, ge=1)  # of the capture, whose median is the field's colour of a texel
     photograph_frames: int = Field(default=16, ge=0)  # whose training photographs make the texture; 0: the field alone
     normal_map_px: int = Field(default=0, ge=0)  # side of the normal map; 0: none, since it shows the grids' cells
-    correctives: int = Field(default=8, ge=0, le=64)  # components of what frames have beyond skinning
+    correctives: int = Field(default=16, ge=0, le=64)  # components of what frames have beyond skinning
     bones: Literal["along", "identity"] = "along"  # joints' axes at rest: Y along the bone, or those of the stage
     allow_poor: bool = False  # hand over an asset that is more than 4 dB below its field, too
     version: str = "1"  # of the asset, as its assetInfo says

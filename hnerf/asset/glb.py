@@ -18,6 +18,7 @@ from hnerf.asset.texture import UvLayout
 COMPONENT_TYPES = {"float32": gltf.FLOAT, "uint16": gltf.UNSIGNED_SHORT, "uint32": gltf.UNSIGNED_INT}
 RESAMPLED = [f"{CAPTURED}_{rate}" for rate in RATES]  # glTF counts in seconds and does not need them
 VARIANTS = "KHR_materials_variants"
+DENSE_SHARE = 0.75  # of the vertices; if a blend shape moves more, indices of 4 bytes cost more than zeros of 12
 STILL = 1e-6  # metres or radians by which a joint without a channel may be off
 SHAPES = {(): gltf.SCALAR, (2,): gltf.VEC2, (3,): gltf.VEC3, (4,): gltf.VEC4, (4, 4): gltf.MAT4}
 
@@ -53,14 +54,12 @@ class GlbWriter:
         )
         return len(self.document.accessors) - 1
 
-    def sparse_accessor(self, values: np.ndarray, at: np.ndarray, count: int) -> int:
-        """Append an array of `count` elements that are zero but for float32 values (n, C) at n of them, in rising
-        order; return the index of the accessor."""
+    def sparse_accessor(self, values: np.ndarray, at: int, count: int) -> int:
+        """Append an array of `count` elements that are zero but for float32 values (n, C) at n < count of them; return
+        the index of the accessor. at: the view of their indices, uint32 in rising order."""
         sparse = gltf.Sparse(
-            count=len(at),
-            indices=gltf.AccessorSparseIndices(
-                bufferView=self.view(at.astype(np.uint32).tobytes()), componentType=gltf.UNSIGNED_INT
-            ),
+            count=len(values),
+            indices=gltf.AccessorSparseIndices(bufferView=at, componentType=gltf.UNSIGNED_INT),
             values=gltf.AccessorSparseValues(bufferView=self.view(np.ascontiguousarray(values).tobytes())),
         )
         self.document.accessors.append(
@@ -69,8 +68,8 @@ class GlbWriter:
                 componentType=gltf.FLOAT,
                 count=count,
                 type=SHAPES[values.shape[1:]],
-                min=(values.min(0) if len(at) == count else np.minimum(values.min(0), 0)).tolist(),
-                max=(values.max(0) if len(at) == count else np.maximum(values.max(0), 0)).tolist(),
+                min=np.minimum(values.min(0), 0).tolist(),
+                max=np.maximum(values.max(0), 0).tolist(),
                 sparse=sparse,
             )
         )
@@ -135,15 +134,21 @@ def _primitive(writer: GlbWriter, avatar: StagedAvatar, skin: Skin) -> gltf.Prim
         setattr(attributes, f"JOINTS_{start // 4}", _vertex_data(writer, joints[:, start : start + 4], np.uint16))
         setattr(attributes, f"WEIGHTS_{start // 4}", _vertex_data(writer, weights[:, start : start + 4], np.float32))
     indices = writer.accessor(avatar.face_uvs.astype(np.uint32).ravel(), gltf.ELEMENT_ARRAY_BUFFER)
-    targets = []
-    for name, offsets_m in (avatar.blend_shapes_m | avatar.physiques_m).items():
-        at = moved_points(offsets_m[vertex])
-        place, turn = (
-            writer.sparse_accessor(changed[vertex][at], at, len(vertex))
-            for changed in (offsets_m, avatar.normal_changes[name])
-        )
-        targets.append(gltf.Attributes(POSITION=place, NORMAL=turn))
+    shapes = avatar.blend_shapes_m | avatar.physiques_m
+    targets = [_target(writer, shapes[name][vertex], avatar.normal_changes[name][vertex]) for name in shapes]
     return gltf.Primitive(attributes=attributes, indices=indices, material=0, targets=targets or None)
+
+
+def _target(writer: GlbWriter, offsets_m: np.ndarray, normal_changes: np.ndarray) -> gltf.Attributes:
+    """Add what a blend shape changes at the vertices, two (V, 3)."""
+    changes = offsets_m.astype(np.float32), normal_changes.astype(np.float32)
+    moved = moved_points(offsets_m)
+    if len(moved) > DENSE_SHARE * len(offsets_m):
+        place, turn = (writer.accessor(values, gltf.ARRAY_BUFFER) for values in changes)
+    else:
+        at = writer.view(moved.astype(np.uint32).tobytes())
+        place, turn = (writer.sparse_accessor(values[moved], at, len(offsets_m)) for values in changes)
+    return gltf.Attributes(POSITION=place, NORMAL=turn)
 
 
 def _vertex_data(writer: GlbWriter, values: np.ndarray, dtype: type) -> int:

@@ -209,6 +209,8 @@ def test_expressions_and_physiques_are_morph_targets_after_the_correctives(glb: 
         at = moved_points(shape_m[vertex])
         np.testing.assert_allclose(accessor(document, target["NORMAL"])[at], bent[vertex][at], atol=1e-6)
     np.testing.assert_allclose(stout_m, staged.physiques_m["stout"][vertex], atol=1e-5)
+    assert item.sparse
+    assert not document.accessors[mesh.primitives[0].targets[0]["POSITION"]].sparse  # a corrective moves nearly all
     np.testing.assert_allclose((item.min, item.max), ([0, 0, -0.02], [0.01, 0.03, 0]), atol=1e-7)
 
 
