@@ -97,7 +97,7 @@ REGISTRY = (
     study("stability", "quick", "fast"),
     study("stability", "brief", "fast"),
     study("stability", "seeds", "fast"),
-    study("stability", "methods", "fast", "neural-body"),
+    study("stability", "published", "fast", "neural-body"),
     ablations("fast"),
     ablations(
         "paper-small", "training.steps=200", "capture.max_side_px=128", "evaluation.max_images=4", rows=PAPERS_ROWS

@@ -71,10 +71,12 @@ def _shape_defects(prim: Usd.Prim, vertices: int) -> list[str]:
         return [f"{prim.GetPath()}: {len(names)} blend shapes but {len(targets)} targets"]
     for target in targets:
         shape = UsdSkel.BlendShape(prim.GetStage().GetPrimAtPath(target))
-        offsets, points = np.array(shape.GetOffsetsAttr().Get() or []), shape.GetPointIndicesAttr().Get()
-        if offsets.shape != (len(points) if points else vertices, 3) or not np.isfinite(offsets).all():
+        offsets, points = (
+            np.array(attribute.Get() or []) for attribute in (shape.GetOffsetsAttr(), shape.GetPointIndicesAttr())
+        )
+        if offsets.shape != (len(points) or vertices, 3) or not np.isfinite(offsets).all():
             return [f"{target}: offsets are not finite or not one a point"]
-        if points and not 0 <= min(points) <= max(points) < vertices:
+        if len(points) and not 0 <= points.min() <= points.max() < vertices:
             return [f"{target}: point index out of range"]
     return []
 
