@@ -2,9 +2,8 @@
 
 Two implementations find the closest point: `BodyMeshes.closest_points` (warp's bounding-volume hierarchy; CPU and CUDA)
 and `closest_points_reference` (every triangle, plain torch), which tests compare it to. The reference takes the sign
-from the winding number. The fast one does so if asked to be exact, else only where the surface normal leaves doubt:
-four times faster, and wrong only inside a body that intersects itself, near the part of its surface that is buried
-there.
+from the winding number. The fast one does so only where the surface normal leaves doubt, and, if asked to be exact,
+next to faces that are buried where the body intersects itself.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -14,12 +13,12 @@ from threading import Lock
 import numpy as np
 import torch
 import warp as wp
-from torch import Tensor
+from torch import Tensor, nn
 
 wp.config.log_level = wp.LOG_ERROR
 
 SURE_COSINE = 0.35  # of the angle between offset and normal; below it the winding number decides the sign
-NEVER_SURE = 2.0
+BESIDE_M = 1e-4  # in front of the surface, where the winding number tells whether it is buried
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ def _closest_kernel(
     points: wp.array(dtype=wp.vec3),
     normals: wp.array2d(dtype=wp.vec3),
     reach_m: float,
-    sure_cosine: float,
+    doubtful: wp.array2d(dtype=wp.bool),
     face: wp.array(dtype=wp.int32),
     barycentric: wp.array(dtype=wp.vec3),
     sign: wp.array(dtype=float),
@@ -60,10 +59,20 @@ def _closest_kernel(
         normal = query.u * normals[m, a] + query.v * normals[m, b] + w * normals[m, c]
         offset = points[i] - wp.mesh_eval_position(meshes[m], query.face, query.u, query.v)
         along = wp.dot(offset, normal)
-        if wp.abs(along) > sure_cosine * wp.length(offset) * wp.length(normal):
+        sure = wp.abs(along) > SURE_COSINE * wp.length(offset) * wp.length(normal)
+        if doubtful:
+            sure = sure and not doubtful[m, query.face]
+        if sure:
             sign[i] = wp.sign(along)
         else:
             sign[i] = wp.mesh_query_point_sign_winding_number(meshes[m], points[i], reach_m).sign
+
+
+@wp.kernel
+def _inside_kernel(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), inside: wp.array(dtype=wp.bool)) -> None:
+    """Find out which points, close to the surface of a mesh, are inside."""
+    i = wp.tid()
+    inside[i] = wp.mesh_query_point_sign_winding_number(mesh, points[i], 2.0 * BESIDE_M).sign < 0.0
 
 
 class BodyMeshes:
@@ -81,6 +90,7 @@ class BodyMeshes:
         ]
         self._ids = wp.array([m.id for m in self._meshes], dtype=wp.uint64, device=self._device)
         self._coming: Tensor | None = None
+        self._doubtful: Tensor | None = None
         self._refitting = Lock()
 
     def refit(self, vertices_m: Tensor) -> None:
@@ -93,7 +103,31 @@ class BodyMeshes:
             if self._coming is not None:
                 for mesh, points in zip(self._meshes, self._to_warp(self._coming), strict=True):
                     mesh.points = points
-                self._coming = None
+                self._coming = self._doubtful = None
+
+    def _doubtful_faces(self, points: int) -> Tensor:
+        """Return which faces of each copy are buried where the body intersects itself, or touch one that is, (n, F)
+        bool; all, without looking, for so few points that it would take longer. A face is buried if the inside lies in
+        front of its middle, or in front of a corner."""
+        if points < len(self._faces):
+            return torch.ones(len(self._meshes), len(self._faces), dtype=torch.bool, device=self._faces.device)
+        with self._refitting:
+            if self._doubtful is None:
+                self._doubtful = torch.stack([self._touch_buried(k) for k in range(len(self._meshes))])
+            return self._doubtful
+
+    def _touch_buried(self, copy: int) -> Tensor:
+        mesh, faces, normals = self._meshes[copy], self._faces, self._normals[copy]
+        vertices_m = wp.to_torch(mesh.points)
+        outwards = nn.functional.normalize(torch.cat([normals, normals[faces].sum(1)]), dim=1)
+        front_m = torch.cat([vertices_m, vertices_m[faces].mean(1)]) + BESIDE_M * outwards
+        inside = torch.zeros(len(front_m), dtype=torch.bool, device=front_m.device)
+        arguments = [mesh.id, wp.from_torch(front_m, dtype=wp.vec3), wp.from_torch(inside)]
+        wp.launch(_inside_kernel, len(inside), arguments, device=self._device)
+        buried_vertices, buried_middles = inside.split([len(vertices_m), len(faces)])
+        touched = torch.zeros(len(vertices_m), dtype=torch.bool, device=inside.device)
+        touched[faces[buried_middles | buried_vertices[faces].any(1)]] = True
+        return touched[faces].any(1)
 
     def _to_warp(self, vertices_m: Tensor) -> list[wp.array]:
         """Return each copy's vertices for warp, which does not copy them, and compute their normals for the sign."""
@@ -108,6 +142,7 @@ class BodyMeshes:
         `reach_m`."""
         self._refit()
         n, device = len(points_m), points_m.device
+        doubtful = wp.from_torch(self._doubtful_faces(n)) if exact_sign else None
         mesh_index, points_m = mesh_index.to(torch.int32).contiguous(), points_m.detach().float().contiguous()
         face = torch.empty(n, dtype=torch.int32, device=device)
         barycentric = torch.zeros(n, 3, device=device)
@@ -123,7 +158,7 @@ class BodyMeshes:
                     wp.from_torch(points_m[part], dtype=wp.vec3),
                     wp.from_torch(self._normals, dtype=wp.vec3),
                     reach_m,
-                    NEVER_SURE if exact_sign else SURE_COSINE,
+                    doubtful,
                 ],
                 outputs=[
                     wp.from_torch(face[part]),

@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+import trimesh
 from torch import Tensor
 
 from hnerf.body.anny import anny_rig
@@ -84,6 +85,21 @@ def test_exact_sign_inside_a_body_that_intersects_itself():
     meshes = BodyMeshes(vertices[None], faces)
     assert meshes.closest_points(point, row, 5.0, exact_sign=True).sign.tolist() == [-1.0]
     assert closest_points_reference(point, vertices, faces, 5.0).sign.tolist() == [-1.0]
+
+
+def test_exact_sign_around_and_inside_of_surfaces_that_cross():
+    """Two coarse balls of radius 1 move until their middles are 1.7 apart: many faces are buried in part."""
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    sphere, faces = torch.from_numpy(ball.vertices).float(), torch.from_numpy(ball.faces)
+    faces = torch.cat([faces, faces + len(sphere)])
+    points = torch.rand(8000, 3, generator=torch.Generator().manual_seed(0)) * 3 - torch.tensor([0.5, 1.5, 1.5])
+    apart, crossing = (torch.cat([sphere, sphere + torch.tensor([x, 0.1, 0.2])]) for x in (2.5, 1.7))
+    meshes, row = BodyMeshes(apart[None], faces), torch.zeros(len(points), dtype=torch.int32)
+    for vertices in (apart, crossing):
+        meshes.refit(vertices[None])
+        wanted = closest_points_reference(points, vertices, faces, 9.0).sign
+        assert torch.equal(meshes.closest_points(points, row, 9.0, exact_sign=True).sign, wanted)
+    assert not torch.equal(meshes.closest_points(points, row, 9.0).sign, wanted)
 
 
 def test_canonical_position_undoes_the_pose():
