@@ -43,7 +43,7 @@ export async function main(bytes, recording) {
 // Draws whenever something changed; plays in real time.
 function run(viewer) {
   const { avatar, stage } = viewer;
-  let last = performance.now();
+  let last;
   viewer.changed = true;
   stage.orbit.addEventListener("change", () => (viewer.changed = true));
   const draw = (now) => {
@@ -58,7 +58,7 @@ function run(viewer) {
     }
     requestAnimationFrame(draw);
   };
-  requestAnimationFrame(draw);
+  requestAnimationFrame((first) => draw((last = first))); // the clock of frames lags behind performance.now()
 }
 
 function connectMotion(viewer) {
