@@ -4,9 +4,12 @@ import logging
 
 import numpy as np
 
+from hnerf.calibration.diagnosis import GROSS_SHARE
 from hnerf.capture.capture import Capture
+from hnerf.capture.people import person_heights_px
 from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
+from hnerf.geometry.camera import Camera
 
 log = logging.getLogger("hnerf.calibration")
 
@@ -17,6 +20,7 @@ LOOKED_AT = 5  # frames of each camera, evenly spaced, whose keypoints are compa
 PLATE_DIFFERENCE = 30  # grey levels between image and clean plate that show the person
 GAIN = 0.25  # share of keypoints that undoing a mistake brings onto the person
 LOW_SHARE = 0.4  # of the other cameras' share; of a person who is hidden by half, more than that stays in the mask
+MIN_IN_SIGHT = 0.05  # share of the person's keypoints in the pictures of a test camera
 # BODY_25
 NOSE, NECK, MID_HIP, EARS = 0, 1, 8, (17, 18)
 LEFT, RIGHT = (5, 12), (2, 9)  # shoulder, hip
@@ -42,6 +46,7 @@ def doubts(capture: Capture, keypoints: np.ndarray, points_m: np.ndarray | None)
     found = of_other_pictures(capture, keypoints)
     if points_m is not None:
         found = [*_not_upright(points_m, capture.up), *exchanged_sides(points_m), *found]
+        found += of_test_cameras(capture, points_m)
     for line in found:
         log.warning("%s: %s", capture.name, line)
     return tuple(found)
@@ -89,6 +94,50 @@ def exchanged_sides(points_m: np.ndarray) -> list[str]:
 def _direction(start_m: np.ndarray, end_m: np.ndarray) -> np.ndarray:
     """Return unit vectors (frames, 3), NaN where an end is not known."""
     return (end_m - start_m) / np.linalg.norm(end_m - start_m, axis=-1, keepdims=True).clip(1e-9)
+
+
+def of_test_cameras(capture: Capture, points_m: np.ndarray) -> list[str]:
+    """Return doubts about cameras for testing that do not see the person where the training cameras do, points_m
+    (frames, 25, 3): all scores would be wrong. Where a test camera has no keypoints, its picture must show some of
+    these points."""
+    lines = []
+    for name in capture.test_cameras:
+        camera, people = capture.cameras[name], capture.keypoints(name)
+        off = np.nan if people is None else _off_share(camera, points_m, people)
+        if off > GROSS_SHARE:
+            why = f"its keypoints lie {off:.0%} of the person's height from where the training cameras see them"
+        elif np.isnan(off) and not _in_sight(camera, points_m):
+            why = "the person, where the training cameras see it, is not in its picture, or a dot"
+        else:
+            continue
+        lines.append(
+            f"camera {name}, for testing: {why}, so scores from it mean nothing; correct its calibration or its "
+            "pictures, or leave it out"
+        )
+    return lines
+
+
+def _off_share(camera: Camera, points_m: np.ndarray, people: np.ndarray) -> float:
+    """Return the median distance in the image, as a share of the person's height, between points (frames, 25, 3) and
+    the nearest of the people (frames, P, 25, 3); NaN if nobody is seen. Points behind the camera are a height off."""
+    uv, depth_m = camera.project(points_m)
+    heights_px = person_heights_px(people)[..., None].clip(1)
+    shares = np.linalg.norm(uv[:, None] - people[..., :2], axis=-1) / heights_px
+    shares = np.where(depth_m[:, None] <= 0, 1.0, shares)
+    known = (people[..., 2] > 0) & np.isfinite(points_m).all(-1)[:, None]
+    off = np.ma.median(np.ma.masked_array(shares, ~known), axis=-1).filled(np.inf).min(1)
+    off = off[np.isfinite(off)]
+    return float(np.median(off)) if len(off) else np.nan
+
+
+def _in_sight(camera: Camera, points_m: np.ndarray) -> bool:
+    """Return whether some of the points (..., 3) that are known lie in the picture, and not all on one spot."""
+    known_m = points_m[np.isfinite(points_m).all(-1)]
+    uv, depth_m = camera.project(known_m)
+    inside = (depth_m > 0) & (uv >= 0).all(-1) & (uv < (camera.width_px, camera.height_px)).all(-1)
+    if inside.sum() <= MIN_IN_SIGHT * len(known_m):
+        return len(known_m) == 0
+    return float(np.ptp(uv[inside], axis=0).max()) >= MIN_PERSON_PX
 
 
 def of_other_pictures(capture: Capture, keypoints: np.ndarray) -> list[str]:

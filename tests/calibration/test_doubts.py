@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hnerf.calibration.doubts import exchanged_sides, of_other_pictures
+from hnerf.calibration.doubts import doubts, exchanged_sides, of_other_pictures, of_test_cameras
 from hnerf.capture.capture import Capture, write_image
-from tests.calibration.synthetic import SIZE_PX, detections, ring, walk_m, write_capture
+from hnerf.geometry.camera import Camera
+from tests.calibration.synthetic import FRAMES, SIZE_PX, detections, ring, walk_m, write_capture
 
 # BODY_25: each right keypoint and its left one
 PAIRS = ((2, 5), (3, 6), (4, 7), (9, 12), (10, 13), (11, 14), (15, 16), (17, 18), (22, 19), (23, 20), (24, 21))
@@ -89,3 +90,42 @@ def test_masks_that_are_loose_or_hold_half_the_person_are_no_doubt(tmp_path: Pat
 def test_without_masks_or_plates_there_is_no_doubt(tmp_path: Path) -> None:
     capture = write_capture(tmp_path, ring(3), detections(ring(3), 1))
     assert of_other_pictures(capture, np.stack([people[:, 0] for people in detections(ring(3), 1).values()])) == []
+
+
+def with_a_test_camera(root: Path, wrong: Camera, detected: bool) -> Capture:
+    """Write a capture of three cameras, and one for testing that is calibrated as `wrong`."""
+    *others, test = ring(4)
+    seen = detections([*others, test] if detected else others, 1)
+    capture = write_capture(root, [*others, dataclasses.replace(wrong, name=test.name)], seen)
+    return dataclasses.replace(capture, train_cameras=capture.train_cameras[:3], test_cameras=(test.name,))
+
+
+def test_a_test_camera_that_is_calibrated_wrongly_is_doubted(tmp_path: Path) -> None:
+    """Without keypoints of its own, it is doubted if it cannot see the person."""
+    first, *_, test = ring(4)
+    millimetres = dataclasses.replace(test, t_m=1000 * test.t_m)
+    behind = dataclasses.replace(test, t_m=test.t_m - [0, 0, 100])
+    expected = {
+        ("right", True): 0, ("right", False): 0, ("another", True): 1, ("another", False): 0, ("mm", True): 1,
+        ("mm", False): 1, ("behind", True): 1, ("behind", False): 1,
+    }  # fmt: skip
+    cameras = {"right": test, "another": first, "mm": millimetres, "behind": behind}
+    for (what, detected), count in expected.items():
+        capture = with_a_test_camera(tmp_path / f"{what}{detected}", cameras[what], detected)
+        lines = doubts(capture, np.zeros((3, FRAMES, 25, 3)), walk_m())
+        assert len(lines) == count, (what, detected, lines)
+        assert all(line.startswith("camera c3, for testing: ") for line in lines)
+
+
+def test_a_test_camera_may_see_somebody_else_as_well_or_nobody(tmp_path: Path) -> None:
+    capture = with_a_test_camera(tmp_path, ring(4)[3], detected=True)
+    points_m = walk_m()
+    points_m[0] = points_m[:, 3] = np.nan
+    with np.load(tmp_path / "keypoints.npz") as stored:
+        found = dict(stored)
+    found["c3"] = np.concatenate([found["c3"] + [300, 0, 0], found["c3"]], 1)
+    found["c3"][1] = 0
+    np.savez(tmp_path / "keypoints.npz", **found)
+    assert of_test_cameras(capture, points_m) == []
+    np.savez(tmp_path / "keypoints.npz", **(found | {"c3": 0 * found["c3"]}))
+    assert of_test_cameras(capture, points_m) == []
