@@ -30,7 +30,7 @@ from hnerf.capture.manifest import (
     chosen_frames,
     read_manifest,
 )
-from hnerf.capture.normalise import Normaliser
+from hnerf.capture.normalise import Normaliser, kept_share
 from hnerf.capture.safe_io import JSON_SUFFIXES, VIDEO_SUFFIXES, file_named, read_image
 from hnerf.capture.timing import median_step
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
@@ -43,6 +43,7 @@ DEFAULT_FPS = 30.0  # of images, whose files state none
 # Encoders pad and crop by a few pixels; the calibration stage judges what that does to the cameras.
 SIZE_TOLERANCE = 0.02
 RATE_TOLERANCE = 0.01  # between frame rates, as a share
+MIN_KEPT_SHARE = 0.5  # of an undistorted picture: a lens takes less than a fifth of it
 MAX_OUTSIDE_SHARE = 0.5  # of keypoints outside their images: detectors guess some that are cut off
 LAYOUTS: tuple[type[Layout], ...] = (
     ZjuMocap,
@@ -219,6 +220,7 @@ def _write_pixels(
         source = picture.file or footage.path
         if normaliser is None:
             height_px, width_px = picture.rgb.shape[:2]
+            _check_distortion(footage.path, lens, (width_px, height_px))
             normaliser = Normaliser.create(lens, (width_px, height_px), settings.max_side_px)
         brightest = max(brightest, int(picture.rgb.max()))
         stem = f"{picture.frame:06d}"
@@ -235,6 +237,15 @@ def _write_pixels(
     if plate:
         normaliser.write_image(read_image(plate), plate, plate, out / "background" / lens.name)
     return normaliser
+
+
+def _check_distortion(footage: Path, lens: Lens, size_px: tuple[int, int]) -> None:
+    """Raise InputError if undistortion would leave nothing of most of a picture of (width, height) pixels."""
+    if np.any(lens.distortion) and (kept := kept_share(lens, size_px)) < MIN_KEPT_SHARE:
+        raise InputError(
+            f"{footage}: by the distortion of camera {lens.name}, {1 - kept:.0%} of the picture was never recorded; "
+            "calibrate it again"
+        )
 
 
 def _mask_paths(

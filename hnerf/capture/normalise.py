@@ -14,6 +14,7 @@ from hnerf.geometry.camera import Camera
 
 MAX_ROUNDING = 1.0  # grey levels, by which two decoders differ on average
 MAX_LABELS = 64  # levels of a mask of labels; a mask of more has soft edges
+GRID = 32  # samples along each side of a picture, to see what a distortion does
 
 # OpenCV's default of 5 iterations is off by pixels.
 UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-3)
@@ -107,6 +108,16 @@ class Normaliser:
                 f"{source}: is {width_px} x {height_px} px, but camera {self.lens.name} records "
                 f"{self.recorded_size_px[0]} x {self.recorded_size_px[1]}; give all its pictures one size"
             )
+
+
+def kept_share(lens: Lens, size_px: tuple[int, int]) -> float:
+    """Return the share of an undistorted picture of (width, height) pixels that the recorded one shows, by GRID x GRID
+    samples."""
+    corner = np.array(size_px) - 1.0
+    at_px = np.stack(np.meshgrid(*np.linspace(0, corner, GRID).T), -1).reshape(-1, 2)
+    rays = np.concatenate([at_px, np.ones((len(at_px), 1))], 1) @ np.linalg.inv(lens.K).T
+    recorded_px = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), lens.K, lens.distortion)[0][:, 0]
+    return float(((recorded_px >= -0.5) & (recorded_px <= corner + 0.5)).all(1).mean())
 
 
 def _reads_as(path: Path, rgb: np.ndarray) -> bool:

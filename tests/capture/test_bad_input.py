@@ -91,6 +91,10 @@ EASYMOCAP = {
     ),
     "camera named twice": (lambda f: _edit(f / "intri.yml", '"02"', '"01"'), "two cameras are called 01"),
     "T of 1e30": (lambda f: _edit(f / "extri.yml", "data: [ 0., 1., 3. ]", "data: [ 1e30, 1., 3. ]"), "T holds 1e+30"),
+    "distortion beyond any lens": (
+        lambda f: rec.write_calibration(f, (1e8, 0, 0, 0, 0)),
+        "images/01: by the distortion of camera 01",
+    ),
     "camera not in extri": (lambda f: _edit(f / "extri.yml", "T_02", "T_03"), "extri.yml: T_02"),
     "matrix of a billion rows": (lambda f: _edit(f / "intri.yml", "rows: 3", "rows: 1000000000"), "intri.yml: K_01"),
     "matrix shorter than declared": (lambda f: _edit(f / "intri.yml", "cols: 3", "cols: 5"), "intri.yml: K_01"),
