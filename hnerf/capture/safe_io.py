@@ -81,8 +81,12 @@ def path_in_capture(root: Path, *parts: str) -> Path:
 
 def files_in(root: Path, *parts: str, suffixes: tuple[str, ...] = ()) -> list[Path]:
     """Return the files of a folder inside the capture, sorted by name; an empty list if there is no such folder.
-    suffixes: those to keep, in lower case, in whichever case files have them; none keeps all."""
+    suffixes: those to keep, in lower case, in whichever case files have them; none keeps all. Raises InputError where a
+    file takes the folder's place."""
     folder = path_in_capture(root, *parts)
+    for place in (root.joinpath(*parts[:depth]) for depth in range(1, len(parts) + 1)):
+        if place.is_file():
+            raise InputError(f"{place}: is a file where a folder belongs; rename or remove it")
     if not folder.is_dir():
         return []
     paths = (

@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -59,6 +60,11 @@ def _huge_png(folder: Path) -> None:
 def _pipe(path: Path) -> None:
     path.unlink(missing_ok=True)
     os.mkfifo(path)
+
+
+def _file_in_place_of(folder: Path) -> None:
+    shutil.rmtree(folder)
+    folder.write_text("not a folder")
 
 
 def _toml(text: str) -> Callable[[Path], object]:
@@ -159,6 +165,14 @@ EASYMOCAP = {
     "a thousand people": (
         lambda f: (f / "openpose/01/000001_keypoints.json").write_text(json.dumps({"people": [{}] * 1000})),
         "1000 people",
+    ),
+    "file in place of the keypoints' folder": (
+        lambda f: _file_in_place_of(f / "openpose"),
+        "openpose: is a file where a folder belongs",
+    ),
+    "file in place of one camera's keypoints": (
+        lambda f: _file_in_place_of(f / "openpose/02"),
+        "openpose/02: is a file where a folder belongs",
     ),
     "linked image folder": (lambda f: _link(f, "images/01"), "images/01: is a symbolic link"),
     "linked image": (lambda f: _link(f, "images/01/000001.png"), "000001.png: is a symbolic link"),
