@@ -47,6 +47,9 @@ class FrameSplit(_Table):
     novel_pose: list[FrameNumber] = []
 
 
+TABLES: dict[str, type[_Table]] = {"cameras": CameraSplit, "frames": FrameSplit}
+
+
 class CaptureManifest(_Table):
     """The content of `capture.toml`. Descriptive keys (licence, ...) are free; those below have a meaning. `subject` is
     descriptive, too, unless it begins with "nearest"."""
@@ -105,6 +108,9 @@ def read_manifest(folder: Path) -> CaptureManifest:
     for key in sorted(set(tree).difference(known)):
         if meant := difflib.get_close_matches(key.lower(), known, 1, MIN_KEY_SIMILARITY):
             raise InputError(f"{path}: {key[:80]} has no meaning; did you mean {meant[0]}? If not, rename it")
+        tables = [f"[{name}]" for name, table in TABLES.items() if key in table.model_fields]
+        if tables and isinstance(tree[key], list):
+            raise InputError(f"{path}: {key} is in no table; put it under {' or '.join(tables)}, or rename it")
     return validated(CaptureManifest, tree, path)
 
 

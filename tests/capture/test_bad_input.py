@@ -188,6 +188,11 @@ EASYMOCAP = {
     "toml with next to no units": (_toml("units = 1e-300"), "capture.toml: units"),
     "toml is not TOML": (_toml("name = "), "capture.toml"),
     "toml with an unknown key": (_toml('[cameras]\ntrain = ["01"]\nvalidation = ["02"]\n'), "cameras.validation"),
+    "toml with cameras outside their table": (
+        _toml('train = ["01"]\ntest = ["02"]\n'),
+        "capture.toml: test is in no table; put it under [cameras]",
+    ),
+    "toml with frames outside their table": (_toml("novel_pose = [3]\n"), "novel_pose is in no table; put it under [f"),
     "toml with unknown units": (_toml('units = "inch"\n'), "units"),
     "toml with a mistyped table": (_toml('[Camera]\ntrain = ["01"]\n'), "Camera has no meaning; did you mean cameras?"),
     "toml with a mistyped key": (_toml('unit = "mm"\n'), "unit has no meaning; did you mean units?"),
