@@ -143,12 +143,15 @@ def _check_convention(capture: Capture, cameras: Sequence[Camera], keypoints: np
 
 
 def _check_height(capture: Capture, found: Measure) -> None:
-    """Raise InputError if the person's height is impossible, naming the unit in which it would be plausible."""
+    """Raise InputError if the person's height is impossible, naming the unit in which it would be plausible, else
+    unusual intrinsics, which may be the cause."""
     low, high = BODY_HEIGHT_M
     if low <= found.body_height_m <= high or np.isnan(found.body_height_m):
         return
     unit = likely_unit(found.body_height_m)
-    cause = f"the translations look like {unit}; " if unit else ""
+    cameras = [capture.cameras[name] for name in capture.train_cameras]
+    odd = [f"camera {camera.name}: {reason}" for camera in cameras for reason in intrinsics_reasons(camera)]
+    cause = f"the translations look like {unit}; " if unit else f"{odd[0]}; calibrate it again, or else " if odd else ""
     factor = UNITS_M[unit] if unit else USUAL_HEIGHT_M / found.body_height_m
     raise InputError(
         f"{capture.name}: the person would be {found.body_height_m:.4g} m tall; {cause}{_unit_advice(factor)}"

@@ -225,6 +225,16 @@ def test_metres_declared_as_millimetres_are_not_taken_for_one_place(tmp_path: Pa
         check_calibration(tiny, SETTINGS)
 
 
+def test_a_principal_point_far_outside_the_picture_is_named_beside_the_height(tmp_path: Path) -> None:
+    """It distorts the world, which no unit explains."""
+    shift = np.array([[0, 0, 20_000.0], [0, 0, 0], [0, 0, 0]])
+    capture = recorded_with(tmp_path, lambda c: dataclasses.replace(c, K=c.K + shift))
+    with pytest.raises(
+        InputError, match=r"m tall; camera c0: principal point at 2050 % of the width .* multiply units"
+    ):
+        check_calibration(capture, SETTINGS)
+
+
 def test_a_person_of_unusual_height_is_told_not_refused(tmp_path: Path) -> None:
     small = recorded_with(tmp_path, lambda c: dataclasses.replace(c, t_m=0.6 * c.t_m), noise_px=0)
     (note,) = check_calibration(small, SETTINGS).notes
