@@ -87,7 +87,10 @@ def read_clocks(folder: Path) -> dict[str, Clock]:
     path = path_in_capture(folder, FILE)
     if not path.exists():
         return {}
-    tables = {name: validated(_ClockTable, table, path) for name, table in read_toml(path).items()}
+    tree = read_toml(path)
+    if strays := [key for key, table in tree.items() if not isinstance(table, dict)]:
+        raise InputError(f"{path}: {strays[0][:80]} is no table; write it under the name of a camera, as [camera]")
+    tables = {name: validated(_ClockTable, table, path) for name, table in tree.items()}
     return {name: Clock(table.offset_s, 1 + 1e-6 * table.drift_ppm) for name, table in tables.items()}
 
 

@@ -68,6 +68,12 @@ def test_recordings_that_do_not_overlap_and_missing_clocks_are_refused() -> None
         in_step(footage, {"a": Clock()}, 30)
 
 
+def test_a_clock_outside_the_table_of_a_camera_is_named(tmp_path: Path) -> None:
+    (tmp_path / "clocks.toml").write_text("offset_s = 1.0\n")
+    with pytest.raises(InputError, match=r"clocks\.toml: offset_s is no table"):
+        read_clocks(tmp_path)
+
+
 def test_clocks_are_read_as_written(tmp_path: Path) -> None:
     clocks = {"left": Clock(), "cam 2": Clock(-1.25, 1.0002)}
     write_clocks(tmp_path / "clocks.toml", clocks)
