@@ -9,6 +9,7 @@ import torch
 
 from hnerf.asset.export import export_asset
 from hnerf.asset.staging import CAPTURED
+from hnerf.avatar.finished import readable
 from hnerf.avatar.trained import load_avatar
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
@@ -34,9 +35,14 @@ def export_subject(
             if not (subject / file).is_file():
                 raise InputError(f"{subject / file}: missing; give <store>/subjects/<name> of a finished `hnerf run`")
         further = _named(motions)
-        capture = load_cameras(subject / "calibration", Capture.load(subject / "capture"))
-        avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
-        masks = Masks.load(subject / "segmentation")
+        with readable(subject / "capture" / "capture.json"):
+            recorded = Capture.load(subject / "capture")
+        with readable(subject / "calibration"):
+            capture = load_cameras(subject / "calibration", recorded)
+        with readable(subject / "training"):
+            avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
+        with readable(subject / "segmentation"):
+            masks = Masks.load(subject / "segmentation")
         return export_asset(capture, masks, avatar, settings, partial, digest, further)
 
 

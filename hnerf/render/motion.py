@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from hnerf.avatar.finished import readable
 from hnerf.body.body_model import body_model
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.given_start import initial_pose_from_given
@@ -159,7 +160,10 @@ def _subject_motion(folder: Path, frames: str) -> Motion:
     found = [folder / stage for stage in ("training", "fit") if (folder / stage / "body.npz").is_file()]
     if not found or not (folder / "capture" / "capture.json").is_file():
         raise InputError(f"{folder}: holds no fitted body; give <store>/subjects/<name>, a .bvh or an AMASS .npz")
-    body, capture = BodyFit.load(found[0]), Capture.load(folder / "capture")
+    with readable(found[0]):
+        body = BodyFit.load(found[0])
+    with readable(folder / "capture" / "capture.json"):
+        capture = Capture.load(folder / "capture")
     return Motion(select_poses(body, select_frames(body.frames, frames, folder)), capture.fps, capture.up)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from hnerf.avatar.finished import readable
 from hnerf.avatar.trained import load_avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import pose_vertices
@@ -62,7 +63,8 @@ def render_subject(subject: Path, options: RenderOptions, out: Path) -> int:
         motion = _motion(subject, options, capture)
         cameras = _cameras(options, capture, motion.body)
         shots: list[Shot] = list(zip(cameras, itertools.cycle(motion.body.frames), strict=False))
-        avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
+        with readable(subject / "training"):
+            avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
         write_pictures(avatar.with_body(motion.body), shots, options.what, motion.fps, partial)
     return len(shots)
 
@@ -80,12 +82,16 @@ def _checked_capture(subject: Path, options: RenderOptions) -> Capture:
         raise InputError("--radius and --height are for an orbit; omit them, or omit --camera and --path")
     if options.pictures is not None and options.pictures < 1:
         raise InputError(f"{options.pictures} pictures: give 1 or more")
-    return load_cameras(subject / "calibration", Capture.load(subject / "capture"))
+    with readable(subject / "capture" / "capture.json"):
+        capture = Capture.load(subject / "capture")
+    with readable(subject / "calibration"):
+        return load_cameras(subject / "calibration", capture)
 
 
 def _motion(subject: Path, options: RenderOptions, capture: Capture) -> Motion:
     """Return the poses to show, on the body shape to show."""
-    own = BodyFit.load(subject / "training")
+    with readable(subject / "training"):
+        own = BodyFit.load(subject / "training")
     if options.motion is None:
         motion = Motion(select_poses(own, select_frames(own.frames, options.frames, subject)), capture.fps, capture.up)
     else:

@@ -48,3 +48,12 @@ def test_an_unfinished_subject_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"model\.safetensors: missing; give <store>/subjects/<name>"):
         export_subject(tmp_path / "ada", AssetSettings(), [], tmp_path / "out", "")
     assert not (tmp_path / "out").exists()
+
+
+def test_masks_that_are_cut_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exported.Capture, "load", lambda folder: folder)
+    monkeypatch.setattr(exported, "load_cameras", lambda folder, capture: "capture")
+    monkeypatch.setattr(exported, "load_avatar", lambda folder, device: "avatar")
+    with pytest.raises(InputError, match=r"ada/segmentation: damaged, or written by another version \("):
+        export_subject(made(tmp_path / "ada"), AssetSettings(), [], tmp_path / "out", "")
+    assert not (tmp_path / "out").exists()

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -180,3 +181,38 @@ def test_what_is_there_is_not_written_over(subject: Path, tmp_path: Path, capsys
 def test_a_folder_that_is_no_subject_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["render", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert "capture.json: missing; give <store>/subjects/<name>" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("file", "named"),
+    [
+        ("capture/capture.json", "capture/capture.json"),
+        ("calibration/intri.yml", "calibration"),
+        ("calibration/report.json", "calibration"),
+        ("training/body.npz", "training"),
+        ("training/rig.npz", "training"),
+        ("training/settings.json", "training"),
+        ("training/model.safetensors", "training"),
+    ],
+)
+def test_a_copy_with_a_file_that_is_cut_is_one_line(
+    file: str, named: str, subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = shutil.copytree(subject, tmp_path / "copy")
+    (copy / file).write_bytes((copy / file).read_bytes()[: (copy / file).stat().st_size // 2])
+    view = ["--camera", "0", "--frames", "0"]
+    assert main(["render", str(copy), "--out", str(tmp_path / "out"), *view]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"hnerf: {copy / named}: damaged, or written by another version (")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_motion_of_another_version_is_one_line(
+    subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = shutil.copytree(subject, tmp_path / "copy")
+    stored = json.loads((copy / "capture/capture.json").read_text())
+    (copy / "capture/capture.json").write_text(json.dumps(stored | {"lens": 1}))
+    assert main(["render", str(subject), "--out", str(tmp_path / "out"), "--motion", str(copy)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"hnerf: {copy / 'capture/capture.json'}: damaged, or written by another version (")
