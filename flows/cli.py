@@ -3,6 +3,8 @@
 import argparse
 import errno
 import logging
+import os
+import select
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -34,7 +36,7 @@ log = logging.getLogger("hnerf")
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; one line on stderr and 2 for input and paths that cannot be used, 1 for a training that cannot
-    go on or an asset that must not be handed over."""
+    go on, an asset that must not be handed over, or output that nobody reads."""
     options = _parser().parse_args(argv)
     try:
         with display():
@@ -42,11 +44,14 @@ def main(argv: list[str] | None = None) -> int:
             if options.command.__module__ == commands.__name__ and options.command is not commands.settings:
                 log.info("%s", " ".join([_name(options.command), *map(str, folders)]))
             options.command(options)
+        sys.stdout.flush()
     except InputError as error:
         return _fail(error, BAD_INPUT)
     except (RankFailedError, StalledError, InvalidAsset) as error:
         return _fail(error, FAILED)
     except OSError as error:
+        if isinstance(error, BrokenPipeError) and _reader_has_left():
+            return FAILED
         from tasks.bucket import BucketError
         from tasks.policy import is_permanent  # imports Prefect
 
@@ -63,6 +68,16 @@ def main(argv: list[str] | None = None) -> int:
 def _fail(why: object, status: int) -> int:
     print("hnerf:", " ".join(str(why).splitlines()), file=sys.stderr)
     return status
+
+
+def _reader_has_left() -> bool:
+    """Return whether nobody reads standard output any more, as after `| head -1`; what is left to print is dropped."""
+    poll = select.poll()
+    poll.register(sys.stdout, 0)
+    if not any(events & select.POLLERR for _, events in poll.poll(0)):
+        return False
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at the end
+    return True
 
 
 def _existing(options: argparse.Namespace) -> list[Path]:

@@ -1,5 +1,6 @@
 import errno
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -197,6 +198,15 @@ def test_the_first_line_comes_before_what_takes_seconds(
     assert main(["run", str(tmp_path)]) == 0
     first, *_ = capsys.readouterr().out.splitlines()
     assert first.endswith(f" hnerf: run {tmp_path}")
+
+
+def test_output_that_nobody_reads_ends_a_command_quietly() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    code = "import sys; from flows.cli import main; sys.exit(main(['settings']))"
+    ended = subprocess.run([sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE, check=False)
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (1, b"")
 
 
 def test_choices_are_those_of_the_library() -> None:
