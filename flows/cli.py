@@ -92,6 +92,10 @@ def _existing(options: argparse.Namespace) -> list[Path]:
     for motion in motions if isinstance(motions, list) else [motions]:
         if not motion.exists():
             raise InputError(f"{motion}: no such file; give {MOTIONS}")
+    for option in ("path", "lens"):
+        file = getattr(options, option, None)
+        if file and not file.exists():
+            raise InputError(f"{file}: no such file; give --{option} another")
     return list(folders.values())
 
 

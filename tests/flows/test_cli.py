@@ -27,6 +27,7 @@ from tests.shared_data import shared_capture
         (["stability", "absent"], "absent: no such folder"),
         (["render", "absent"], "absent: no such folder; give <store>/subjects/<name> of a finished `hnerf run`"),
         (["calibrate", "absent"], "absent: no such folder"),
+        (["calibrate", ".", "--lens", "absent.yml"], "absent.yml: no such file; give --lens another"),
         (["export", "absent"], "absent: no such folder; give <store>/subjects/<name> of a finished `hnerf run`"),
         (["export", ".", "--motion", "a.bvh"], "a.bvh: no such file; give a BVH file, an AMASS .npz, or another"),
         (["render", ".", "--motion", "a.npz"], "a.npz: no such file; give a BVH file, an AMASS .npz, or another"),

@@ -158,7 +158,7 @@ def test_a_taller_body_reaches_higher_in_the_picture(subject: Path, tmp_path: Pa
         (["--frames", "7"], "no frames 7; it has 0 to 2"),
         (["--between", "0", "7"], "no frames 7; it has 0 to 2"),
         (["--motion", "absent.npz"], "absent.npz: no such file"),
-        (["--path", "absent.json"], "absent.json: cannot be read"),
+        (["--path", "absent.json"], "absent.json: no such file; give --path another"),
         (["--shape", "height"], "shape height: give a name and what to add"),
         (["--volume", "-100"], "volume -100 %: cannot be reached with this body"),
         (["--radius", "-1"], "radius"),
