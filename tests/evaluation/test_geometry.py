@@ -42,6 +42,36 @@ def test_distances_go_to_the_surface_not_to_samples() -> None:
     assert score.watertight
 
 
+def test_both_directions_count_alike() -> None:
+    """From a plane all of the nearer of two others is 10 cm away; of these, half is 10 cm away and half 30 cm: 20 cm in
+    the mean and 0.05 m^2 squared."""
+    both = joined(plane(0.1), plane(0.3))
+    for pair in ((plane(), both), (both, plane())):
+        score = score_geometry(*pair, np.random.default_rng(0), samples=4000, nodes=16)
+        assert score.chamfer_mm == pytest.approx((100 + 200) / 2, rel=0.03)
+        assert score.chamfer_l2_e3 == pytest.approx((10 + 50) / 2, rel=0.05)
+
+
+def test_normals_are_compared_in_both_directions() -> None:
+    """All of a plane is next to one that is parallel; of that and a plane turned by 60 degrees far above, half."""
+    both = joined(plane(0.1), plane(1.0, tilt_deg=60))
+    for pair in ((plane(), both), (both, plane())):
+        score = score_geometry(*pair, np.random.default_rng(0), samples=4000, nodes=16)
+        assert score.normal_consistency == pytest.approx((1 + (1 + 0.5) / 2) / 2, abs=0.01)
+
+
+@pytest.mark.parametrize("x_m", [-0.5, 0.5])
+def test_volumes_count_wherever_either_of_them_is(x_m: float) -> None:
+    score = score_geometry(cube(x_m), cube(), np.random.default_rng(0), samples=500, nodes=64)
+    assert score.iou == pytest.approx(0.5 / 1.5, abs=0.02)
+
+
+def test_the_prediction_is_what_must_be_closed() -> None:
+    for predicted, truth, closed in ((cube(), plane(), True), (plane(), cube(), False)):
+        score = score_geometry(predicted, truth, np.random.default_rng(0), samples=100, nodes=8)
+        assert score.watertight is closed
+
+
 def test_overlap_of_offset_cubes() -> None:
     surfaces = Surface(cube()), Surface(cube(0.5))
     # Nodes in the middle of cells of 1/64 m that no side of a cube cuts: counted volumes are exact.

@@ -17,6 +17,20 @@ def test_ssim_of_flat_images_is_its_luminance_term() -> None:
     assert ssim(a, a) == pytest.approx(1.0)
 
 
+def test_ssim_of_one_window_by_hand() -> None:
+    """Take images as large as the window, 11 px: one number for each channel, from means, variances and the covariance
+    under a Gaussian of 1.5 px that sums to 1, with C1 = 0.01^2 and C2 = 0.03^2."""
+    a, b = np.random.default_rng(0).uniform(size=(2, 11, 11, 3))
+    b = (a + b) / 2
+    along = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
+    window = np.outer(along, along)[..., None] / along.sum() ** 2
+    mean_a, mean_b = ((window * image).sum((0, 1)) for image in (a, b))
+    var_a, var_b = (window * (a - mean_a) ** 2).sum((0, 1)), (window * (b - mean_b) ** 2).sum((0, 1))
+    cov = (window * (a - mean_a) * (b - mean_b)).sum((0, 1))
+    luminance = (2 * mean_a * mean_b + 1e-4) / (mean_a**2 + mean_b**2 + 1e-4)
+    assert ssim(a, b) == pytest.approx((luminance * (2 * cov + 9e-4) / (var_a + var_b + 9e-4)).mean(), abs=1e-9)
+
+
 def test_mask_box_is_padded_and_cut_to_the_image() -> None:
     mask = np.zeros((100, 80), bool)
     mask[30:41, 5:9] = True

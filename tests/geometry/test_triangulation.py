@@ -44,6 +44,19 @@ def test_a_near_camera_counts_by_its_pixels_wherever_the_world_begins() -> None:
     np.testing.assert_allclose(solve_points(projections, keypoints, np.ones((3, 1))), [[0.001, 0, 10]], atol=2e-4)
 
 
+def test_a_pair_of_surer_views_wins_over_one_in_larger_images() -> None:
+    """Two views with a focal length of 100 px see a point 4 m ahead; two of 200 px, a tenth as sure, one 0.1 m beside.
+    The first pair is 5 px off in the others, 2 x 0.1 x 5 = 1; the second 2.5 px in the first, 2 x 1 x 2.5 = 5."""
+    projections = np.stack([
+        np.diag([focal, focal, 1]) @ np.c_[np.eye(3), [-x_m, 0, 0]]
+        for x_m, focal in ((-1, 100.0), (1, 100.0), (-2, 200.0), (2, 200.0))
+    ])  # fmt: skip
+    keypoints = np.array([[[25, 0, 1]], [[-25, 0, 1]], [[100, 5, 0.1]], [[-100, 5, 0.1]]])
+    points_m, _, inliers = triangulate(projections, keypoints, inlier_px=3.0)
+    np.testing.assert_allclose(points_m, [[0, 0, 4]], atol=1e-6)
+    assert inliers[:, 0].tolist() == [True, True, False, False]
+
+
 def test_an_outlier_view_is_left_out_and_its_residual_told() -> None:
     cameras = ring(4)
     keypoints = np.stack([seen.reshape(-1, 3) for seen in detections(cameras, noise_px=0).values()])
