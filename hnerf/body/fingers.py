@@ -47,7 +47,7 @@ class FingerPrior:
         for side in SIDES:
             at = {name: rig.joints_m[rig.joint_names.index(f"{name}.{side}")] for name in ["wrist", *_names()]}
             normal = torch.linalg.cross(at["finger2-1"] - at["wrist"], at["finger5-1"] - at["wrist"])
-            back = normal if side == "R" else -normal  # of the hand
+            back = normal if side == "R" else -normal  # to the palm, whither fingers bend
             for finger in range(1, 6):
                 chain = [at[f"finger{finger}-{segment}"] for segment in (1, 2, 3)]
                 bones = [chain[0] - at["wrist"], chain[1] - chain[0], chain[2] - chain[1]]

@@ -2,8 +2,10 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
+from hnerf.body import fingers
 from hnerf.body.anny import anny_rig
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.fingers import FingerPrior, add_persistence, fit_fingers
@@ -48,6 +50,25 @@ def test_fingers_bend_towards_the_wrist_alike_on_both_sides() -> None:
     torch.testing.assert_close(bent[0], bent[1], atol=1e-3, rtol=0)
 
 
+def test_angles_count_from_straight_fingers() -> None:
+    """The left index finger is straight at rest but for its second joint, bent by 30 degrees to the palm: relaxed, it
+    is at 25, so 5 back from rest; it bends from -10 to 100, so by 40 back and 70 on."""
+    wrist, first, second, third, little = (
+        RIG.joint_names.index(f"{name}.L") for name in ("wrist", "finger2-1", "finger2-2", "finger2-3", "finger5-1")
+    )
+    joints_m = RIG.joints_m.clone()
+    ahead = joints_m[first] - joints_m[wrist]
+    palm = torch.linalg.cross(joints_m[little] - joints_m[wrist], ahead)  # below an arm held out to the left
+    ahead, palm = ahead / ahead.norm(), palm / palm.norm()
+    joints_m[second] = joints_m[first] + 0.04 * ahead
+    joints_m[third] = joints_m[second] + 0.03 * (math.sqrt(0.75) * ahead + 0.5 * palm)
+    prior = FingerPrior.of(replace(RIG, joints_m=joints_m))
+    index = slice(3, 6)  # after the thumb
+    found_deg = torch.stack([prior.mean[index], prior.low[index, 0], prior.high[index, 0]]).rad2deg()
+    expected_deg = torch.tensor([[20.0, -5, 15], [-10, -40, -10], [100, 70, 100]], dtype=torch.float64)
+    torch.testing.assert_close(found_deg, expected_deg)
+
+
 def test_a_finger_one_standard_deviation_off_costs_a_half() -> None:
     """The second joint of an index finger has 25 degrees; the relaxed hand costs nothing. 4 degrees beyond a limit, two
     standard deviations, cost 2 more."""
@@ -78,6 +99,41 @@ def test_a_change_of_one_standard_deviation_costs_a_half() -> None:
     turns[1:, 7, 1] = 0.2
     assert math.isclose(add_persistence(NormalEquations(3, 90, 0), turns, np.array([0, 1]), 0.2), 0.5)
     assert add_persistence(NormalEquations(3, 90, 0), turns, np.array([1]), 0.2) == 0  # a gap between the first two
+
+
+def test_changes_couple_frames_to_the_next() -> None:
+    """The cost is a quadratic form, so its gradient is the matrix times the turns: a frame's own block, and those that
+    couple it to the frames before and after. All of the diagonal is coupling."""
+    turns = torch.randn(3, 2, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    equations, x = NormalEquations(3, 6, 0), turns.flatten(1).numpy()
+    cost = add_persistence(equations, turns, np.array([0, 1]), 0.1)
+    own, coupled = equations.frame[:2]
+    by_matrix = np.einsum("tij,tj->ti", own, x)
+    by_matrix[:-1] += np.einsum("tij,tj->ti", coupled, x[1:])
+    by_matrix[1:] += np.einsum("tji,tj->ti", coupled, x[:-1])
+    np.testing.assert_allclose(equations.frame_gradient, by_matrix, rtol=1e-12)
+    np.testing.assert_allclose((x * by_matrix).sum() / 2, cost)
+    np.testing.assert_allclose(equations.coupling_diagonal, np.einsum("tii->ti", own))
+
+
+def test_fingers_persist_within_a_run_at_their_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames 0 and 1, then 5 to 7, a tenth of a second apart: 200 degrees a second are 20 from frame to frame."""
+    asked = []
+    monkeypatch.setattr(fingers, "STEPS_M", (0.2,))
+    monkeypatch.setattr(fingers, "add_persistence", lambda _, __, *given: asked.append(given))
+    pose = posed(FingerPrior.of(RIG).relaxed(), 5)
+    fit_fingers(pose, views_of(seen_points(pose)), torch.full((2, 5), 0.009), [(0, 1), (5, 6, 7)], 0.1)
+    ((following, std),) = asked
+    assert following.tolist() == [0, 2, 3] and math.isclose(std, math.radians(20))
+
+
+def test_fingers_begin_relaxed_unless_they_are_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fingers, "STEPS_M", ())
+    relaxed = FingerPrior.of(RIG).relaxed()
+    for given, begun in ((0 * relaxed, relaxed), (2 * relaxed, 2 * relaxed)):
+        pose = posed(given, 1)
+        found = fit_fingers(pose, views_of(seen_points(pose)), torch.full((2, 1), 0.009), [(0,)], 0.1)
+        torch.testing.assert_close(found.theta[0, FINGERS], begun)
 
 
 def test_gradients_are_those_of_the_costs() -> None:

@@ -1,11 +1,13 @@
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import torch
 
 from hnerf.body.anny import anny_rig
 from hnerf.body.articulation import Articulation, Pose
-from hnerf.body.hand_points import PalmTerm, hand_points, has_fingers, moved_onto_palm, seen_twice
+from hnerf.body.hand_points import PalmTerm, hand_points, has_fingers, moved_onto_palm, observe_hands, seen_twice
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.reprojection import Views, project
 from tests.body.recorded_body import ring_camera
@@ -61,6 +63,35 @@ def test_a_hand_that_one_camera_sees_is_not_fitted() -> None:
     """Of three cameras two see the left hand and one the right; in the next frame three and two."""
     confidence = torch.tensor([[[0.9, 0.9], [0.9, 0.6]], [[0.6, 0.4], [0.7, 0.8]], [[0.1, 0.0], [0.6, 0.5]]])
     assert seen_twice(confidence).tolist() == [[True, False], [True, True]]
+
+
+def test_hands_are_sure_where_two_cameras_see_them() -> None:
+    """The left hand is in both cameras, the right one surely in the first only. Either is as sure as in the surest
+    camera."""
+    found = {"0": np.full((1, 2, 21, 3), 0.9), "1": np.full((1, 2, 21, 3), 0.6)}
+    found["1"][0, 1, :, 2] = 0.4
+    capture: Any = SimpleNamespace(
+        train_cameras=("0", "1"), cameras=dict(zip("01", CAMERAS, strict=True)), hands=found.get
+    )
+    views = observe_hands(capture)
+    assert views is not None and views.cameras == CAMERAS
+    assert views.confidence[:, 0, [0, 20, 21, 41]].tolist() == [[0.9, 0.9, 0, 0], [0.6, 0.6, 0, 0]]
+    assert PalmTerm(views).seen().tolist() == [[0.9, 0]]
+    for names in (("0",), ("0", "2")):  # a single camera, and one in which none were looked for
+        capture.train_cameras = names
+        assert observe_hands(capture) is None
+
+
+def test_surer_points_count_more_when_a_palm_is_moved() -> None:
+    """Three of six points of the left palm are 9 px beside, half as sure as the others: (3 / 4 x 9) / (3 + 3 / 4)."""
+    pose = body()
+    articulation = Articulation(pose.rig)
+    x = articulation.jacobian(hand_points(articulation), articulation.pose(pose))[0]
+    seen = views_of(x)
+    seen.pixels[0, :, [0, 1, 5], 0] -= 9
+    seen.confidence[0, :, [0, 1, 5]] = 0.5
+    moved = moved_onto_palm(seen, x).pixels - seen.pixels
+    torch.testing.assert_close(moved[0, :, :21, 0], torch.full((2, 21), 1.8, dtype=torch.float64))
 
 
 def test_hand_points_move_onto_the_palm_of_the_body() -> None:
