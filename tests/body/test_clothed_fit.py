@@ -1,5 +1,6 @@
 """Cloth offsets worked out by hand: on one triangle, on a ball's outline, and on a body that they pull aside."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 
 from hnerf.body.articulation import Pose
 from hnerf.body.body_model import body_model
-from hnerf.body.clothed_fit import match_clothed, refine_with_clothing, solve_cloth_offset
+from hnerf.body.clothed_fit import _with_more_cloth, match_clothed, refine_with_clothing, solve_cloth_offset
 from hnerf.body.contour_fit import ContourResiduals, Outline, outline
 from hnerf.body.descriptor import normals_of
 from hnerf.body.fit import make_problem
@@ -32,6 +33,23 @@ def test_neighbours_wear_nearly_the_same() -> None:
     rows = ContourResiduals(np.array([0]), np.zeros((1, 3)), np.array([-0.01]), np.ones(1))
     a = 0.01 / (5.02 - 4 / 1.01)
     np.testing.assert_allclose(solve_cloth_offset(np.zeros(3), [rows], np.array([[0, 1, 2]])), [a, a / 1.01, a / 1.01])
+
+
+def test_an_edge_of_two_faces_ties_its_ends_once() -> None:
+    """Two triangles on either side of the edge 1-2; vertex 1 is 1 cm too small. At 1, (1.02 + 6) a - 4 c - 2 b = 0.01;
+    at 2, 6.02 b - 2 a - 4 c = 0; at 0 and 3, 4.02 c - 2 a - 2 b = 0."""
+    rows = ContourResiduals(np.array([1]), np.zeros((1, 3)), np.array([-0.01]), np.ones(1))
+    found = solve_cloth_offset(np.zeros(4), [rows], np.array([[0, 1, 2], [2, 1, 3]]))
+    a, b, c = np.linalg.solve([[7.02, -2, -4], [-2, 6.02, -4], [-2, -2, 4.02]], [0.01, 0, 0])
+    np.testing.assert_allclose(found, [c, a, b, c])
+
+
+def test_more_cloth_fills_what_was_too_small() -> None:
+    """A body 1 cm too small in 3 cm more cloth is 2 cm too large: 1 / (1 + 1)^2; at another vertex nothing changes."""
+    rows = ContourResiduals(np.array([2, 0]), np.zeros((2, 3)), np.array([-0.01, 0.0]), np.full(2, 9.0))
+    found = _with_more_cloth(rows, np.array([0, 0.5, 0.03]))
+    np.testing.assert_allclose(found.residual_m, [0.02, 0])
+    np.testing.assert_allclose(found.weight, [0.25, 1])
 
 
 def test_what_is_seen_often_is_worn_as_seen() -> None:
@@ -65,6 +83,14 @@ def test_what_is_too_far_off_matches_nothing() -> None:
     assert len(rows.vertices) == 0
 
 
+def test_outlines_that_face_the_other_way_match_nothing() -> None:
+    vertices, faces = ball(0.2, 1.0)
+    edge = outline(disc(SEEN_PX), 1.0)
+    edge = replace(edge, normals=-edge.normals)
+    rows = match_clothed(ring_camera("a", 0.3), edge, SCALE_M, vertices, normals_of(vertices, faces), faces)
+    assert len(rows.vertices) == 0
+
+
 def clothed_scene(folder: Path, frames: int, cameras: int) -> tuple[Problem, Pose, list[list[Outline | None]]]:
     """Return a problem with true keypoints, the true pose, and outlines of a body with 2 cm of cloth on its front."""
     truth, settings = moving_body(tuple(range(frames))), FitSettings()
@@ -91,7 +117,7 @@ def test_clothes_that_all_frames_wear_hardly_pull_a_body_aside(tmp_path: Path) -
     problem, pose, edges = clothed_scene(tmp_path, 8, 4)
     found = refine_with_clothing(problem, pose, edges)
     places = [joint_transforms(p.rig, p.theta, p.root)[:, p.rig.free, :3, 3] for p in (found, pose)]
-    assert (places[0] - places[1]).norm(dim=-1).mean() < 0.012
+    assert 0.005 < (places[0] - places[1]).norm(dim=-1).mean() < 0.012
 
 
 @pytest.mark.parametrize(("frames", "cameras"), [(8, 1), (7, 2)])

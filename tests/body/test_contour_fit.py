@@ -1,11 +1,27 @@
 import dataclasses
 
 import numpy as np
+import torch
 
-from hnerf.body.contour_fit import _ground_contact, _sole_m, match, outline
+from hnerf.body.articulation import Articulation
+from hnerf.body.contour_fit import (
+    ContourResiduals,
+    Outline,
+    _contain,
+    _cover,
+    _ground_contact,
+    _rim,
+    _sole_m,
+    add_residuals,
+    match,
+    outline,
+)
 from hnerf.body.descriptor import normals_of
+from hnerf.body.normal_equations import NormalEquations
 from hnerf.config import FitSettings
 from tests.body.recorded_body import ring_camera
+from tests.body.test_articulation import random_pose
+from tests.body.two_bone import two_bone_rig
 
 SETTINGS = FitSettings(inside_m=0.01, outside_m=0.02, clothing_m=0.1, spacing_m=0.01)
 
@@ -86,6 +102,74 @@ def test_a_part_that_a_mask_lacks_pushes_no_harder_than_one_that_sticks_out_a_li
     out = rows.residual_m > 0.01345
     assert rows.residual_m[out].min() < 0.04 and rows.residual_m[out].max() > 0.18
     np.testing.assert_allclose((rows.weight * rows.residual_m)[out], 134.5)
+
+
+def test_a_hand_before_the_trunk_has_no_outline() -> None:
+    """A small ball half a metre before a large one, as seen from the camera, has its rim in the middle of the large
+    one's silhouette."""
+    camera, (trunk_m, faces), (hand_m, _) = ring_camera("a", 0.3), ball(0.2, 1.0), ball(0.05, 1.0)
+    hand_m = hand_m + 0.5 * np.array([np.cos(0.3), np.sin(0.3), 0])
+    both_m, both = np.concatenate([trunk_m, hand_m]), np.concatenate([faces, faces + len(trunk_m)])
+    rim = _rim(camera, both_m, normals_of(both_m, both), both)
+    assert len(rim) > 20 and rim.max() < len(trunk_m)
+    assert len(_rim(camera, hand_m, normals_of(hand_m, faces), faces)) > 20
+
+
+def test_the_outline_goes_on_where_the_picture_ends() -> None:
+    """Of a ball in the middle, a picture of half the width shows the left half."""
+    camera, (vertices, faces) = ring_camera("a", 0.3), ball(0.2, 1.0)
+    half, normals = dataclasses.replace(camera, width_px=128), normals_of(vertices, faces)
+    rim, seen = (_rim(c, vertices, normals, faces) for c in (camera, half))
+    column = camera.project(vertices)[0][:, 0]
+    for side in (column[rim] < 124, column[rim] > 132):
+        assert side.sum() > 10 and np.isin(rim[side], seen).all()
+
+
+def test_a_contour_pulls_what_is_inside_it_and_faces_its_way() -> None:
+    """An edge whose outside is up has a rim 3 px inside, one 3 px outside, and one 3 px inside that faces right."""
+    edge = Outline(np.array([[10.0, 0], [20, 0], [30, 0]]), np.tile([0.0, -1], (3, 1)), np.zeros((1, 1)))
+    rim_px = np.array([[10.0, 3], [20, -3], [30, 3]])
+    ids, direction, signed_px = _cover(edge, rim_px, np.array([[0.0, -1], [0, -1], [1, 0]]))
+    assert (ids.tolist(), direction.tolist(), signed_px.tolist()) == ([0], [[0, -1]], [-3])
+
+
+def test_one_vertex_of_a_cell_is_pushed_back_to_the_mask() -> None:
+    """A disc of 20 px in the middle of 256 x 200 pixels: to its right are two rim vertices in one cell of 2 px, below
+    it another one, in a cell whose row and column add up to the same; one lies within, one beyond the picture."""
+    edge = outline(disc(20)[:200], 1.0)
+    rim_px = np.array([[200.0, 128], [200.4, 128.3], [128, 190], [138, 190], [130, 130], [300, 128]])
+    ids, direction, distance_px = _contain(edge, rim_px, 2.0)
+    assert sorted(ids.tolist()) == [0, 2, 3]
+    right, below = ids.tolist().index(0), ids.tolist().index(2)
+    np.testing.assert_allclose(direction[[right, below]], [[1, 0], [0, 1]], atol=0.05)
+    np.testing.assert_allclose(distance_px[[right, below]], [52, 42], atol=1)
+
+
+def test_residuals_enter_the_normal_equations_twice_if_added_twice() -> None:
+    """Along any direction through pose and shape, gradient and curvature are those of the sums of w (r + g . dx)^2."""
+    rig, frame, step = two_bone_rig(), 1, 1e-6
+    articulation, pose = Articulation(rig), random_pose(rig, 2)
+    random = np.random.default_rng(0)
+    rows = ContourResiduals(np.array([1, 3]), random.normal(size=(2, 3)), np.array([0.1, -0.2]), np.array([4.0, 9]))
+    equations = NormalEquations(2, articulation.unknowns, 3)
+    for _ in range(2):
+        add_residuals(equations, articulation, articulation.pose(pose), frame, rows)
+    by_pose, by_shape = random.normal(size=articulation.unknowns), 0.7
+    ends_m = []
+    for sign in (1, -1):
+        steps = np.zeros((2, articulation.unknowns))
+        steps[frame] = sign * step * by_pose
+        moved = articulation.apply_step(pose, torch.from_numpy(steps))
+        moved = dataclasses.replace(moved, rig=rig.reshaped(rig.beta + sign * step * by_shape))
+        ends_m.append(Articulation(moved.rig).surface(Articulation(moved.rig).pose(moved), frame).numpy())
+    along = (rows.gradient * (ends_m[0] - ends_m[1])[rows.vertices] / (2 * step)).sum(1)
+    shared = np.array([by_shape, 0, 0])
+    slope = equations.frame_gradient[frame] @ by_pose + equations.shared_gradient @ shared
+    np.testing.assert_allclose(slope, 2 * (rows.weight * rows.residual_m * along).sum(), rtol=1e-5)
+    curvature = by_pose @ equations.frame[0][frame] @ by_pose + shared @ equations.shared @ shared
+    curvature += 2 * by_pose @ equations.border[frame] @ shared
+    np.testing.assert_allclose(curvature, 2 * (rows.weight * along**2).sum(), rtol=1e-5)
+    assert not equations.frame_gradient[0].any() and not equations.border[0].any()
 
 
 def test_a_sole_is_as_thick_as_the_mask_reaches_below_the_foot() -> None:

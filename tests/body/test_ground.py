@@ -5,7 +5,7 @@ import numpy as np
 import torch
 
 from hnerf.body.anny import anny_rig
-from hnerf.body.articulation import Articulation, Pose
+from hnerf.body.articulation import Articulation, Pose, with_offsets
 from hnerf.body.ground import FEET, Ground
 from hnerf.body.normal_equations import NormalEquations
 from tests.body.test_articulation import random_pose
@@ -13,7 +13,9 @@ from tests.body.test_articulation import random_pose
 
 def cost_and_equations(pose: Pose) -> tuple[float, NormalEquations]:
     articulation = Articulation(pose.rig)
-    x, by_frame, by_shape = articulation.jacobian(articulation.keypoints(), articulation.pose(pose))
+    x, by_frame, by_shape = articulation.jacobian(
+        with_offsets(articulation.keypoints(), pose.offsets_m), articulation.pose(pose)
+    )
     equations = NormalEquations(len(x), articulation.unknowns, by_shape.shape[-1])
     return Ground(2).add(equations, pose, x, by_frame, by_shape), equations
 
@@ -35,6 +37,13 @@ def test_who_stands_costs_nothing_and_two_centimetres_a_half() -> None:
     raised = standing(0.0)
     raised.theta[0, raised.rig.joint_names.index("lowerleg01.R"), 0] = 1.0
     assert cost_and_equations(raised)[0] < 1e-9 and len(FEET) == 6
+
+
+def test_a_keypoint_that_is_seen_higher_up_stands_no_higher() -> None:
+    """A detector that sees toes and heels 4 cm above the model's does not lift the body."""
+    pose = standing(0.0)
+    pose.offsets_m[FEET, 2] = 0.04
+    assert cost_and_equations(pose)[0] < 1e-9
 
 
 def test_the_gradient_of_the_ground_is_that_of_its_cost() -> None:

@@ -69,6 +69,24 @@ def test_the_gradient_is_that_of_the_cost() -> None:
     assert equations.frame_gradient[2, 6] > 0.1 and not equations.frame_gradient[:, :6].any()
 
 
+def test_a_median_is_pulled_the_other_way_in_its_own_group() -> None:
+    """Two groups of three frames turn alike; in each, one frame bends off its median, by 0.4 and by 0.1. What pulls a
+    frame back pulls its group's median on; frames and medians are tied by the frames' weights."""
+    pose = turned([0.0, 2.0, 4.0] * 2, [0.5, 0.5, 0.9, 0.2, 0.2, 0.1])
+    articulation = Articulation(pose.rig)
+    posture_prior = PosturePrior.of_single_view([[0, 1, 2], [3, 4, 5]], pose, CAMERA)
+    equations = NormalEquations(6, articulation.unknowns, 1 + posture_prior.unknowns(articulation))  # one other before
+    posture_prior.add(equations, articulation, pose)
+    pulls = equations.frame_gradient[:, 6]
+    assert pulls[2] > 0 > pulls[5] and not pulls[[0, 1, 3, 4]].any()
+    np.testing.assert_allclose(equations.shared_gradient, [0, -pulls[2], 0, 0, -pulls[5], 0, 0])
+    weights = equations.frame[0][:, 6, 6]
+    tied = np.zeros((6, 7))
+    tied[:3, 1], tied[3:, 4] = -weights[:3], -weights[3:]
+    np.testing.assert_allclose(equations.border[:, 6], tied)
+    np.testing.assert_allclose(equations.shared[[1, 4], [1, 4]], [weights[:3].sum(), weights[3:].sum()], rtol=1e-6)
+
+
 def test_frames_move_together_with_their_median() -> None:
     """Pulls of 1 / rad^2 ask the elbow of three frames to bend by 0.3: in one step all do, as if there were no prior.
     If the median stood still they would go 0.3 / (1 + w), w = 1 / (7 degrees)^2 = 67."""
