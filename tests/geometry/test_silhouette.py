@@ -1,4 +1,7 @@
+import dataclasses
+
 import numpy as np
+import pytest
 
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.silhouette import silhouette
@@ -29,3 +32,13 @@ def test_what_reaches_behind_the_camera_is_left_out() -> None:
 
 def test_triangles_larger_than_the_image_cover_it() -> None:
     assert silhouette(CAMERA, TRIANGLE_M * [1e4, 1e4, 1] - [1e4, 1e4, 0], np.array([[0, 1, 2]])).all()
+
+
+@pytest.mark.parametrize(("width_px", "height_px"), [(9, 5), (5, 9)])
+def test_an_image_is_covered_up_to_its_own_edges(width_px: int, height_px: int) -> None:
+    """A triangle beyond the last column and row of an image that is wider than high, or higher than wide."""
+    camera = dataclasses.replace(CAMERA, width_px=width_px, height_px=height_px)
+    covered = silhouette(camera, TRIANGLE_M * [10, 10, 1], np.array([[0, 1, 2]]))
+    expected = np.zeros((height_px, width_px), bool)
+    expected[4:, 4:] = True
+    np.testing.assert_array_equal(covered, expected)

@@ -1,5 +1,6 @@
 """Which pixels a step draws, and where a recording's edges are."""
 
+import dataclasses
 import functools
 from pathlib import Path
 
@@ -142,6 +143,19 @@ def test_an_arm_towards_the_camera_reaches_as_far_as_it_is_large():
     arm, body = np.tile([[20 / 50, 20 / 50, 1.0]], (3, 1)), np.tile([[50 / 25, 20 / 25, 2.0]], (20, 1))
     visible_pixels = within_reach(AHEAD, np.vstack([arm, body]), 0.2)
     assert np.flatnonzero(visible_pixels[20]).tolist() == [*range(10, 31), *range(40, 60)]
+
+
+def test_pixels_that_are_longer_than_wide_are_reached_by_the_larger_focal_length():
+    """20 cm at 2 m are 5 px of 50 px across, and 2.5 px of 25 px along: all within a disc of 5 px."""
+    camera = dataclasses.replace(AHEAD, K=np.diag([50.0, 25.0, 1.0]))
+    visible_pixels = within_reach(camera, np.array([[20 / 25, 20 / 12.5, 2.0]]), 0.2)
+    assert np.flatnonzero(visible_pixels[20]).tolist() == [*range(15, 26)]
+
+
+def test_what_is_behind_the_camera_covers_nothing():
+    """Of two vertices, the one behind lies on the line through pixel (10, 10)."""
+    visible_pixels = within_reach(AHEAD, np.array([[0.8, 0.8, 2.0], [-0.2, -0.2, -1]]), 0.2)
+    assert visible_pixels[20, 20] and not visible_pixels[10, 10]
 
 
 def test_a_box_is_met_within_the_outline_of_its_corners():
