@@ -143,14 +143,15 @@ def visible_texels(
     facing = ((normals * towards).sum(1) > 0)[faces].any(1)
     index = np.flatnonzero(facing[texels.face.numpy()])
     points_m, normal = (texels.interpolate(values, faces, index) for values in (vertices_m, normals))
-    pixels_px, _ = camera.project(points_m)
+    pixels_px, depth_m = camera.project(points_m)
     view_m = camera.centre_m - points_m
     distance_m = np.linalg.norm(view_m, axis=1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-9)
     cosine = (view_m * normal).sum(1) / distance_m
     seen_m, outline = _depth(camera, vertices_m, faces)
     column, row = np.round(pixels_px).astype(int).T
-    inside = (column >= 0) & (row >= 0) & (column < camera.width_px) & (row < camera.height_px) & (cosine > 0)
+    inside = (column >= 0) & (row >= 0) & (column < camera.width_px) & (row < camera.height_px)
+    inside &= (cosine > 0) & (depth_m > 0)  # what is behind the camera would be seen mirrored
     column, row = (np.where(inside, at, 0) for at in (column, row))
     visible = inside & ~outline[row, column] & (distance_m < seen_m[row, column] + DEPTH_TOLERANCE_M / cosine.clip(0.1))
     return index[visible], cosine[visible], normal[visible], pixels_px[visible]

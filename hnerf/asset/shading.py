@@ -41,9 +41,9 @@ def visible_vertices(
     view_m = camera.centre_m - vertices_m
     distance_m = np.linalg.norm(view_m, axis=1)
     cosine = (view_m * normals).sum(1) / distance_m
-    pixels_px, _ = camera.project(vertices_m)
+    pixels_px, ahead_m = camera.project(vertices_m)
     inside = ((pixels_px >= 0) & (pixels_px <= [camera.width_px - 1, camera.height_px - 1])).all(1)
-    vertex = np.flatnonzero(inside & (cosine > 0))
+    vertex = np.flatnonzero(inside & (cosine > 0) & (ahead_m > 0))  # what is behind would be seen mirrored
     mesh = mesh_on_cpu(vertices_m, faces)
 
     def depth_m(aside_px: tuple[int, int]) -> np.ndarray:

@@ -77,12 +77,30 @@ def test_a_texel_is_seen_where_it_projects() -> None:
     np.testing.assert_allclose(normals, [[0, 0, -1]], atol=1e-6)
 
 
+def test_normals_between_corners_are_unit_vectors() -> None:
+    """A fold's edge is turned by 22.5 degrees to +X, the corner left of it faces the camera; half-way, at (-0.1, 0, 0),
+    the normal is turned by 11.25 degrees."""
+    bend = np.pi / 4
+    folded_m = np.array([[-0.2, 0, 0], [0, -0.2, 0], [0, 0.2, 0], [0.2 * np.cos(bend), 0, 0.2 * np.sin(bend)]])
+    _, cosine, normals, _ = visible_texels(
+        camera(), folded_m, np.array([[0, 2, 1], [1, 2, 3]]), texels_at([0], [[0.5, 0.25, 0.25]])
+    )
+    np.testing.assert_allclose(normals, [[np.sin(bend / 4), 0, -np.cos(bend / 4)]], atol=1e-6)
+    np.testing.assert_allclose(cosine, np.cos(bend / 4 - np.arctan(0.1 / 2)), atol=1e-6)
+
+
 def test_a_square_behind_another_is_hidden_and_one_from_behind_too() -> None:
     vertices_m = np.concatenate([square(0.4, 0.0), square(0.4, -0.3)])
     both = np.concatenate([FACES, FACES + 4])
     index, _, _, _ = visible_texels(camera(), vertices_m, both, texels_at([0, 2], [MIDDLE, MIDDLE]))
     assert index.tolist() == [1]
     index, _, _, _ = visible_texels(camera(), square(0.4, 0.0), FACES[:, ::-1].copy(), texels_at([0], [MIDDLE]))
+    assert len(index) == 0
+
+
+def test_a_square_behind_the_camera_is_not_seen() -> None:
+    """It faces the camera, from 2 m behind it, and is mirrored in the middle of the picture."""
+    index, _, _, _ = visible_texels(camera(), square(0.4, -4.0), FACES[:, ::-1].copy(), texels_at([0], [MIDDLE]))
     assert len(index) == 0
 
 

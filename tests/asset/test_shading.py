@@ -52,3 +52,4 @@ def test_averted_and_cut_off_vertices_are_not_seen() -> None:
     assert seen(camera(), grid(0.2, 0.0), FACES) == [MIDDLE]
     assert seen(camera(), grid(0.2, 0.0), FACES[:, ::-1].copy()) == []
     assert seen(camera(), grid(0.2, 0.0, 1.1), FACES) == []  # the picture ends 1 m aside
+    assert seen(camera(), grid(0.2, -4.0), FACES[:, ::-1].copy()) == []  # it faces the camera from behind
