@@ -134,11 +134,12 @@ def _consistent_keypoints(capture: Capture, body: BodyFit | None) -> dict[str, n
 
     They are triangulated and projected where several cameras see the person, which removes a detector's outliers; gaps
     in time are interpolated; what no two cameras ever see together is left as each has it. Where the recording has no
-    keypoints, they are the body's own.
+    keypoints, they are the body's own. What is behind a camera is NaN.
     """
     if body is not None and not capture.has_keypoints:
         points_m = (body.rig.keypoint_weights @ body.vertices_m()).numpy()
-        return {name: capture.cameras[name].project(points_m)[0] for name in capture.train_cameras}
+        own = np.full((*points_m.shape[:-1], 2), np.nan)
+        return {name: _in_image(capture.cameras[name], points_m, own) for name in capture.train_cameras}
     found = subject_keypoints(capture)
     seen = {name: _interpolated(np.where(k[..., 2:] > 0, k[..., :2], np.nan)) for name, k in found.items()}
     cameras = [capture.cameras[name] for name in capture.train_cameras]
@@ -147,8 +148,14 @@ def _consistent_keypoints(capture: Capture, body: BodyFit | None) -> dict[str, n
     flat = np.stack([found[camera.name].reshape(-1, 3) for camera in cameras])
     points_m, _, _ = triangulate(np.stack([camera.projection for camera in cameras]), flat)
     poses_m = _interpolated(points_m.reshape(-1, 25, 3))
-    together = {camera.name: camera.project(poses_m)[0] for camera in cameras}
-    return {name: np.where(np.isfinite(pose_px), pose_px, seen[name]) for name, pose_px in together.items()}
+    return {camera.name: _in_image(camera, poses_m, seen[camera.name]) for camera in cameras}
+
+
+def _in_image(camera: Camera, points_m: np.ndarray, own_px: np.ndarray) -> np.ndarray:
+    """Return the pixels (..., 2) of points (..., 3), those in own_px (..., 2) where a point is not known, and NaN where
+    it is behind the camera."""
+    pixels_px, depth_m = camera.project(points_m)
+    return np.where(depth_m[..., None] <= 0, np.nan, np.where(np.isfinite(pixels_px), pixels_px, own_px))
 
 
 def _interpolated(tracks: np.ndarray) -> np.ndarray:

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from hnerf.config import SegmentationSettings
-from hnerf.segmentation.prior import _completed_pose, _interpolated, keypoint_priors, network_priors
+from hnerf.segmentation.prior import (
+    _completed_pose,
+    _consistent_keypoints,
+    _interpolated,
+    _stick_figure,
+    keypoint_priors,
+    network_priors,
+)
+from tests.calibration.synthetic import detections, ring, turned, write_capture
 from tests.segmentation.scene import write_likely, write_scene
 
 HEAD, LEGS, FEET = [0, 15, 16, 17, 18], [10, 11, 13, 14, *range(19, 25)], list(range(19, 25))
@@ -56,6 +64,18 @@ def test_a_detection_far_outside_the_image_is_drawn_no_farther_than_that(tmp_pat
     prior = dict(keypoint_priors(capture, SegmentationSettings()))["c0"][0]
     assert 5 * 400 < prior.height_px < 6 * 400  # from 5 heights above the image to the feet in it
     assert prior.reach[truth["c0", 0]].all()
+
+
+def test_nobody_is_where_a_camera_looks_away(tmp_path: Path) -> None:
+    """Two of three cameras see the person, who stands behind the third, and is not drawn mirrored there."""
+    cameras = ring(3)
+    seen = detections(cameras, 0.5)
+    seen["c2"][..., 2] = 0
+    away = turned(cameras[2], 180)
+    found = _consistent_keypoints(write_capture(tmp_path, [*cameras[:2], away], seen), None)
+    assert np.isfinite(found["c0"]).all() and np.isnan(found["c2"]).all()
+    figure = _stick_figure(away, found["c2"][0])
+    assert not figure.completed.any() and figure.height_px == 0
 
 
 def test_head_and_legs_in_line_with_the_trunk_by_hand() -> None:
