@@ -41,6 +41,17 @@ def test_box_interval_by_hand():
     assert near[1] == far[1]
 
 
+def test_a_ray_begins_at_its_camera():
+    """Inside [1, 2] along x: from 0 to the side half a metre ahead, or to y = 0.74, 0.24 / 0.6 away; of a box behind
+    there is nothing."""
+    origins = torch.tensor([[1.5, 0.5, 0.5], [1.5, 0.5, 0.5], [4.0, 0.5, 0.5]])
+    directions = torch.tensor([[1.0, 0, 0], [0.8, 0.6, 0], [1, 0, 0]])
+    lower, upper = torch.tensor([[1.0, 0.0, 0.0]]).expand(3, 3), torch.tensor([[2.0, 0.74, 1.0]]).expand(3, 3)
+    near, far = box_interval(Rays(origins, directions, torch.zeros(3).long()), lower, upper)
+    torch.testing.assert_close(near, torch.zeros(3))
+    torch.testing.assert_close(far, torch.tensor([0.5, 0.4, 0.0]))
+
+
 def test_states_around_a_sphere():
     grid = even_shell(sphere(0.3), outer_m=0.05, inner_m=0.04, cell_m=0.02)
     assert along_x(grid, [0.0, 0.27, 0.33, 0.42, 5.0]) == [SOLID, SHELL, SHELL, EMPTY, EMPTY]

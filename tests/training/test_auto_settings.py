@@ -76,6 +76,23 @@ def test_what_is_given_stands():
     }
 
 
+def test_samples_follow_a_shell_that_is_given():
+    """2.4 x (20 + 5) cm / 6 mm = 100."""
+    assert decided(SCENE, field={"kind": "fast", "outer_m": 0.2, "inner_m": 0.05})[0].field.samples == 100
+
+
+def test_a_shell_is_no_thicker_than_fifteen_centimetres():
+    """A skirt reaches 30 cm out of the body: 2.4 x (15 + 3) cm / 6 mm = 72."""
+    fast = decided(SCENE.__class__(**{**vars(SCENE), "outside_m": 0.3}))[0].field
+    assert (fast.outer_m, fast.inner_m, fast.samples) == (0.15, 0.03, 72)
+
+
+def test_a_person_far_away_has_one_level():
+    """Pixels of 10 cm: 19 cells on 1.92 m, fewer than the 24 of a coarsest level, and 13 of geometry, than 16."""
+    fast = decided(SCENE.__class__(**{**vars(SCENE), "footprint_m": 0.1}))[0].field
+    assert (fast.colour_cells, fast.geometry_cells) == ((19,), (13,))
+
+
 @pytest.mark.parametrize(
     ("kind", "std_rad", "one"), [("fast", 0.001, True), ("fast", 0.003, False), ("paper", 0.001, False)]
 )

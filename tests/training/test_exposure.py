@@ -13,8 +13,9 @@ import trimesh
 from hnerf.avatar.trained import TrainedAvatar, build_field
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.geometry.reach import everywhere
+from hnerf.training import exposure
 from hnerf.training.distributed import Distributed
-from hnerf.training.exposure import _visible_vertices, camera_gains, solve_gains
+from hnerf.training.exposure import _vertex_colours, _visible_vertices, camera_gains, solve_gains
 from hnerf.training.gather import gather_pixels
 from tests.training.scene import TINY, KnownMasks, look_at, record
 
@@ -64,6 +65,32 @@ def test_the_larger_number_of_places_counts_more() -> None:
     assert logs[2, 0] - logs[0, 0] == pytest.approx(0.3 * (1 / 150) / (1 / 150 + 1 / 100))
 
 
+def test_a_few_places_that_differ_do_not_count() -> None:
+    """Two of five ratios are of another limb: the median of 0.1, 0.2, 0.3, 5 and 9 is 0.3."""
+    found = np.repeat([[0.1], [9], [0.3], [5], [0.2]], 3, axis=1)
+    np.testing.assert_allclose(solve_gains(2, {(0, 1): found})[:, 0], [-0.15, 0.15])
+
+
+def test_cameras_that_share_too_little_are_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exposure, "MIN_SHARED_VERTICES", len(BALL.vertices))
+    assert measured({"a": (0.5, 0.5, 0.5), "b": (1, 1, 1)})[1].reason == "no two cameras to compare"
+
+
+def test_levels_of_a_body_point_are_those_of_its_pixel_if_they_are_usable() -> None:
+    """Above row 48 one channel is 15, at and below row 80 one is 245; left of column 64 nobody is in the mask."""
+    picture, mask = np.full((128, 128, 3), 100, np.uint8), np.ones((128, 128), bool)
+    picture[:48, :, 0], picture[80:, :, 2] = 15, 245
+    mask[:, :64] = False
+    capture: Any = SimpleNamespace(cameras=RING, image=lambda name, frame: picture)
+    surface, masks = Surface(BALL), KnownMasks({("a", 3): mask})
+    levels = _vertex_colours(capture, masks, surface, "a", 3)
+    seen, xy = _visible_vertices(RING["a"], surface)
+    x, y = xy.T
+    usable = np.zeros(len(seen), bool)
+    usable[np.flatnonzero(seen)[(y >= 48) & (y < 80) & (x >= 64)]] = True
+    assert usable.sum() > 100 and (levels[usable] == 100).all() and np.isnan(levels[~usable]).all()
+
+
 def test_gains_of_cameras_that_see_the_same_ball() -> None:
     true = {"a": (0.8, 0.8, 0.9), "b": (1.2, 1.1, 1.0), "c": (1.0, 1.0, 1.0), "d": (1.1, 1.2, 1.0)}
     found, decision = measured(true)
@@ -101,6 +128,8 @@ def test_what_is_hidden_is_not_in_sight() -> None:
     assert len(places) > 100
     assert (np.hypot(places[:, 1], places[:, 2]) / (4 - places[:, 0]) > 0.12).all()  # beside the small one's cone
     assert seen[len(BALL.vertices) :].any()
+    towards = (RING["a"].centre_m - places) / np.linalg.norm(RING["a"].centre_m - places, axis=1, keepdims=True)
+    assert 0.4 < (towards * places).sum(1).min() < 0.42  # what is seen at a flatter angle does not tell its colour
     turned = np.diag([-1.0, 1, -1])
     away = dataclasses.replace(RING["a"], R=turned @ RING["a"].R, t_m=turned @ RING["a"].t_m)
     assert not _visible_vertices(away, Surface(BALL))[0].any()  # it is behind the camera
