@@ -55,3 +55,13 @@ def test_irradiance_is_the_mean_over_surfaces() -> None:
     texels = Texels(place, place, place, torch.tensor([[0.2, 0.3, 0.5]]))
     found = mean_irradiance(ABOVE, [corners_m, corners_m * (1, -1, 1)], np.array([[0, 1, 2]]), texels)
     np.testing.assert_allclose(found, [(1 + 0.2) / 2], atol=1e-6)
+
+
+def test_irradiance_between_two_normals_is_that_of_a_unit_vector() -> None:
+    """A roof's edge has a normal half-way between up and +X; half-way from there to a corner that faces up, it is at
+    22.5 degrees, where E = 0.6 + 0.4 cos."""
+    corners_m = np.array([[-1.0, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1]])
+    place = torch.zeros(1, dtype=torch.long)
+    texels = Texels(place, place, place, torch.tensor([[0.5, 0.25, 0.25]]))
+    found = mean_irradiance(ABOVE, [corners_m], np.array([[0, 1, 2], [1, 3, 2]]), texels)
+    np.testing.assert_allclose(found, 0.6 + 0.4 * np.cos(np.pi / 8), atol=1e-6)

@@ -1,7 +1,11 @@
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
-from hnerf.asset.motions import Motion, ground_transforms, resampled
+from hnerf.asset.motions import Motion, ground_transforms, motion_of, resampled
+from hnerf.body.fit_result import BodyFit
+from hnerf.geometry.axes import Y_UP_FROM_Z_UP
+from tests.asset.figure import bending_body
 
 
 def turning(fps: float, codes: list[float], degrees: list[float]) -> Motion:
@@ -40,6 +44,18 @@ def test_the_root_follows_way_and_heading_and_not_the_tilt() -> None:
     found = ground_transforms(pelvis, 0.1)[0]
     np.testing.assert_allclose(found[:3, 3], [1, 0.1, -2])
     np.testing.assert_allclose(found[:3, :3], heading.as_matrix(), atol=1e-12)
+
+
+def test_the_first_joint_turns_with_the_world_and_then_by_itself() -> None:
+    """In a world with Y up the body is tipped by a quarter turn about x, and before that its first joint turns by one
+    about z: the body's left, +X, goes to the world's Z; its front, -Y, to X."""
+    body = bending_body()
+    theta, root = torch.zeros(1, 2, 3), torch.eye(4)[None].clone()
+    theta[0, 0, 2] = np.pi / 2
+    root[0, :3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # y to z, z to -y
+    found = motion_of(BodyFit(body.rig, (3,), theta, root), 10.0, np.zeros((1, 0)), np.eye(3)).turns[0, 0]
+    left, front = (Y_UP_FROM_Z_UP @ axis for axis in ([1.0, 0, 0], [0, -1.0, 0]))
+    np.testing.assert_allclose([found @ left, found @ front], [[0, 0, 1], [1, 0, 0]], atol=1e-6)
 
 
 def test_joints_below_move_with_those_above() -> None:

@@ -104,14 +104,24 @@ def test_a_square_behind_the_camera_is_not_seen() -> None:
     assert len(index) == 0
 
 
+def test_a_slope_does_not_hide_itself() -> None:
+    """Seen at 60 degrees from 2 m away, a texel half a pixel, 1 cm, beside its pixel's ray is up to 1.7 cm farther away
+    than what the ray meets: less than 1 cm / cos 60."""
+    share = np.linspace(0.38, 0.5, 50)  # of corner 0, at x from 0.1 m to 0
+    texels = texels_at([0] * 50, [[s, 0.5, 0.5 - s] for s in share.tolist()])
+    index, cosine, _, _ = visible_texels(camera("side", np.pi / 3), square(0.4, 0.0), FACES, texels)
+    assert index.tolist() == list(range(50))
+    assert cosine[-1] == pytest.approx(0.5)
+
+
 def test_texels_near_an_outline_are_left_out() -> None:
-    """The square ends at 30 px; the third pixel from there is the first whose neighbourhood has no jump."""
-    at_px = np.array([31.0, 34.0])
+    """The square ends at 30 and at 70 px; the third pixel from there is the first whose neighbourhood has no jump."""
+    at_px = np.array([31.0, 34.0, 66.0, 69.0])
     share = (at_px - 30) / 40  # along the diagonal from corner 0 to corner 2
-    texels = texels_at([0, 0], [[1 - s, s, 0] for s in share.tolist()])
+    texels = texels_at([0] * 4, [[1 - s, s, 0] for s in share.tolist()])
     index, _, _, pixels_px = visible_texels(camera(), square(0.4, 0.0), FACES, texels)
-    assert index.tolist() == [1]
-    np.testing.assert_allclose(pixels_px, [[34, 34]], atol=1e-4)
+    assert index.tolist() == [1, 2]
+    np.testing.assert_allclose(pixels_px, [[34, 34], [66, 66]], atol=1e-4)
 
 
 def test_colours_are_means_by_the_fourth_power_of_the_cosine(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,8 @@
+import numpy as np
 import pytest
 
 from hnerf.asset.correctives import as_they_are
-from hnerf.asset.regions import LIMIT_MM, findings, region_of, surface_distances_mm
+from hnerf.asset.regions import LIMIT_MM, _summary, findings, region_of, surface_distances_mm
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.topologies import AssetMesh
 from tests.asset.figure import column_rig, upright_column
@@ -34,3 +35,7 @@ def test_distances_from_the_fields_surface_to_each_mesh() -> None:
 
 def test_a_region_at_the_limit_is_no_finding() -> None:
     assert findings({"all": {"mean": 50, "p95": 99}, "legs": {"mean": 1.0, "p95": LIMIT_MM}}) == []
+
+
+def test_mean_and_95th_percentile() -> None:
+    assert _summary(np.append(np.arange(100.0), 1050)) == {"mean": pytest.approx(6000 / 101), "p95": 95}

@@ -3,7 +3,7 @@ import dataclasses
 import torch
 import trimesh
 
-from hnerf.asset.rig_transfer import transfer_skin_weights, with_vertices
+from hnerf.asset.rig_transfer import strongest, transfer_skin_weights, with_vertices
 from tests.asset.figure import column_rig, upper_weight
 
 
@@ -34,6 +34,12 @@ def test_at_most_eight_influences_largest_first() -> None:
     joints, weights = transfer_skin_weights(ten, rig.vertices_m, rig.faces)
     assert joints[0].tolist() == [9, 8, 7, 6, 5, 4, 3, 2]
     torch.testing.assert_close(weights[0], torch.arange(10.0, 2.0, -1) / 52)  # 10 + 9 + ... + 3 = 52
+
+
+def test_what_has_no_weight_is_the_first_joint() -> None:
+    joints, weights = strongest(torch.tensor([[0.1, 0.0, 0.4, 0.0]]))
+    assert joints.tolist() == [[2, 0, 0, 0]]
+    torch.testing.assert_close(weights, torch.tensor([[0.8, 0.2, 0, 0]]))
 
 
 def test_an_eyes_joint_is_in_the_middle_of_its_ball() -> None:

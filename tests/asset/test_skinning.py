@@ -51,6 +51,15 @@ def test_a_joint_that_moves_as_another_is_given_up_without_loss() -> None:
     np.testing.assert_allclose(found.weights, [[0.75, 0.25]], atol=1e-6)
 
 
+def test_a_joint_without_weight_gets_none() -> None:
+    """Joint 0, which only fills the row, moves exactly as the blend of the three others does."""
+    skin = Skin(np.array([[1, 2, 3, 0]]), np.array([[1 / 3, 1 / 3, 1 / 3, 0]]))
+    poses = [(moves((1 / 3, 1 / 3, 1 / 3), (1, 0, 0), (0, 1, 0), (0, 0, 1)), np.zeros((1, 3)))]
+    found = with_few_influences(skin, iter(poses), 2)
+    assert found.joints.min() > 0
+    np.testing.assert_allclose(found.weights, [[0.5, 0.5]], atol=1e-6)
+
+
 RANDOM = [np.random.default_rng(seed).normal(size=(3, 4, 3)) for seed in range(4)]
 # One pose in which the line through the last two joints passes nearest, but outside of them.
 OUTSIDE = np.array([[[3.0, -2, -1], [-2, -3, -3], [-3, 2, 2], [-2, 1, 1]]])

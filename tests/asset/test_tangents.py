@@ -44,6 +44,15 @@ def test_faces_count_by_their_angles() -> None:
     np.testing.assert_allclose(found[0, :2], expected / np.linalg.norm(expected), atol=1e-12)
 
 
+def test_a_coordinate_is_mirrored_as_the_greater_angle_is() -> None:
+    points_m = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [-1, 1, 0]])
+    shared = UvLayout(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [1, 0]]), np.array([[0, 1, 2], [0, 3, 4]]))
+    # As above, but the second face, of 90 degrees, is mirrored: there u rises along y - x.
+    found = uv_tangents(points_m, UP, HALVES, shared)
+    expected = np.array([1, 0]) + 2 * np.array([-1, 1]) / 2**0.5
+    np.testing.assert_allclose(found[0], [*expected / np.linalg.norm(expected), 0, -1], atol=1e-12)
+
+
 def test_coordinates_without_area_have_some_tangent() -> None:
     found = uv_tangents(SQUARE_M, UP, HALVES, layout((0, 0), (0, 0), (0, 0), (0, 0)))
     np.testing.assert_allclose(np.linalg.norm(found[:, :3], axis=1), 1)

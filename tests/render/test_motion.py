@@ -14,6 +14,8 @@ from hnerf.body.rig import joint_transforms
 from hnerf.errors import InputError
 from hnerf.render.motion import (
     Motion,
+    _read_amass,
+    _rotation_between_up_axes,
     interpolate_poses,
     lowest_points_m,
     read_motion,
@@ -61,6 +63,13 @@ def test_another_motion_stands_where_this_body_stood(up: str) -> None:
     torch.testing.assert_close(found.root[:, :2, 3], torch.tensor([[0.0, 2], [1, 2]]))
     torch.testing.assert_close(found.root[:, :3, :3], torch.eye(3).repeat(2, 1, 1))
     assert found.rig is own.rig
+
+
+def test_up_becomes_up() -> None:
+    y, z = torch.eye(3)[1:]
+    assert torch.equal(_rotation_between_up_axes("y", "z") @ y, z)
+    assert torch.equal(_rotation_between_up_axes("z", "y") @ z, y)
+    assert torch.equal(_rotation_between_up_axes("y", "y"), torch.eye(3))
 
 
 def test_single_frames_below_the_floor_do_not_lift_a_motion() -> None:
@@ -152,6 +161,14 @@ def test_amass_poses_turn_the_likes_of_smpls_joints(tmp_path: Path) -> None:
     # The mean SMPL body turns about its pelvis at (0, -0.23, 0.03), and is then moved; its hips are 9 cm below.
     hip = torch.tensor([1 - 0.23, 1.2 + 0.03 - 0.09])
     torch.testing.assert_close(at["upperleg01.L"][0, 1:], hip, atol=0.03, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("rate", "fps"), [({"mocap_framerate": 120.0}, 120.0), ({"mocap_frame_rate": 60.0}, 60.0), ({}, 30.0)]
+)
+def test_the_rate_of_amass_has_two_names_and_a_default(rate: dict[str, float], fps: float, tmp_path: Path) -> None:
+    np.savez(tmp_path / "walk.npz", poses=np.zeros((1, 165)), trans=np.zeros((1, 3)), **rate)  # type: ignore[arg-type]
+    assert _read_amass(tmp_path / "walk.npz")[1] == fps
 
 
 @pytest.mark.parametrize(
