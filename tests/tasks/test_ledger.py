@@ -1,3 +1,5 @@
+import os
+import time
 from pathlib import Path
 
 from tasks.ledger import Ledger, forget
@@ -23,3 +25,28 @@ def test_a_capture_that_was_lost_is_free_again_under_another_key(tmp_path: Path)
 def test_a_store_without_a_ledger_has_nothing_to_forget(tmp_path: Path) -> None:
     forget(tmp_path, tmp_path / "ada")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_listing_stands_since_it_was_asked_about_first(tmp_path: Path) -> None:
+    """A hundred seconds ago; asking again does not begin anew, but what was started does."""
+    ledger, began_s = Ledger.of(tmp_path), time.time() - 100
+    assert ledger.stood_s("seen-ada") < 50
+    os.utime(tmp_path / "ingested" / "new-seen-ada", (began_s, began_s))
+    assert 100 <= ledger.stood_s("seen-ada") < 150 and 100 <= ledger.stood_s("seen-ada") < 150
+    ledger.note_seen("seen-ada", DIGEST)
+    assert ledger.stood_s("seen-ada") < 50
+
+
+def test_an_empty_note_is_of_no_capture(tmp_path: Path) -> None:
+    ledger = Ledger.of(tmp_path)
+    ledger.note_seen("seen-ada", "")
+    assert not ledger.seen("seen-ada")
+
+
+def test_a_capture_that_was_started_again_is_not_lost(tmp_path: Path) -> None:
+    ledger = Ledger.of(tmp_path)
+    ledger.note_started(DIGEST, tmp_path / "ada", "first run")
+    first = ledger.start_key(DIGEST)
+    forget(tmp_path, tmp_path / "ada")
+    ledger.note_started(DIGEST, tmp_path / "ada", "second run")
+    assert ledger.start_key(DIGEST) == first
