@@ -8,7 +8,7 @@ import torch
 from hnerf.avatar.avatar import Rendering
 from hnerf.capture.capture import read_rgb, read_rgba, write_image
 from hnerf.errors import InputError
-from hnerf.evaluation.images import rgba
+from hnerf.evaluation.images import mean_of, rgba
 
 
 def test_renderings_are_colour_over_black_and_coverage(tmp_path: Path) -> None:
@@ -21,6 +21,12 @@ def test_renderings_are_colour_over_black_and_coverage(tmp_path: Path) -> None:
     assert np.array_equal(read_rgb(tmp_path / "a.png"), picture[..., :3])
     stored = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
     assert stored is not None and stored[0, 0].tolist() == [0, 0, 128, 128]  # BGRA
+
+
+def test_a_mean_is_of_what_is_known_zeros_included() -> None:
+    """A rendering that misses the person altogether has a mask_iou of 0."""
+    assert mean_of([0.0, None, 0.5, 1.0]) == 0.5
+    assert mean_of([None]) is None
 
 
 def test_a_picture_without_coverage_is_no_rendering(tmp_path: Path) -> None:

@@ -57,5 +57,11 @@ def test_where_there_are_samples_every_node_is_kept() -> None:
     assert (sparse(torch.tensor([[0.5, 0.5, 1.45]]))[0, CHANNELS:] == 0).all()
 
 
+def test_a_flat_box_is_one_cell_thick() -> None:
+    """Of 8 cells along 2 m, 4 lie along 1 m, and less than a half along 0.1 m; a cell has two nodes."""
+    grids = SparseGrids(LOWER_M, torch.tensor([1.0, 2.0, 0.1]), (8,), CHANNELS, everywhere)
+    assert grids.sizes.tolist() == [[5, 9, 2]]
+
+
 def test_no_points_have_no_features() -> None:
     assert both()[0](POINTS[:0]).shape == (0, len(CELLS) * CHANNELS)
