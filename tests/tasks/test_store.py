@@ -1,6 +1,7 @@
 import errno
 import multiprocessing
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -68,6 +69,22 @@ def test_resumable_stage_goes_on_where_it_was(tmp_path: Path) -> None:
     )
     assert artifact.metrics == {"resumed": 1.0}
     assert list(artifact.files) == ["deep/letters"]
+
+
+def test_bad_input_leaves_nothing_to_be_resumed(tmp_path: Path) -> None:
+    def refused(out: Path) -> dict[str, float]:
+        write_abc(out)
+        raise InputError("a.jpg: bad")
+
+    with pytest.raises(InputError, match=r"a\.jpg: bad"):
+        Store(tmp_path).get_or_compute("training", "k", refused, resumable=True)
+    assert not (tmp_path / "training" / "k.partial").exists()
+
+
+def test_a_record_of_another_stage_is_none(tmp_path: Path) -> None:
+    made = Store(tmp_path).get_or_compute("training", "k", write_abc)
+    shutil.copytree(tmp_path / "training", tmp_path / "fit")
+    assert Store(tmp_path).find("training", "k") == made and Store(tmp_path).find("fit", "k") is None
 
 
 @pytest.mark.parametrize("victim", ["k/deep/letters", "k.json"])
