@@ -52,6 +52,8 @@ LIGHT, SHADING = "hnerf/asset/light.py", "hnerf/asset/shading.py"
 ALBEDO, DOME = "hnerf/asset/albedo.py", "hnerf/asset/dome.py"
 METRICS, REPORT = "hnerf/evaluation/metrics.py", "hnerf/evaluation/report.py"
 EXPOSURE, ARTICULATION = "hnerf/training/exposure.py", "hnerf/body/articulation.py"
+REACH, SCORES = "hnerf/geometry/reach.py", "hnerf/evaluation/geometry.py"
+FINGERS, CONTOUR = "hnerf/body/fingers.py", "hnerf/body/contour_fit.py"
 POLICY, STORE = "tasks/policy.py", "tasks/store.py"
 INVENTORY, PACKED, LIMITS = "tasks/inventory.py", "tasks/packed.py", "tasks/limits.py"
 BUCKET, LEASE, SHARED = "tasks/bucket.py", "tasks/lease.py", "tasks/shared.py"
@@ -71,6 +73,8 @@ BY_PACKAGE, BY_MOTIONS = "tests/asset/test_package.py", "tests/asset/test_motion
 BY_SKINNING = "tests/asset/test_skinning.py"
 BY_BVH, BY_BVH_MOTION = "tests/body/test_bvh.py", "tests/render/test_bvh_motion.py"
 BY_METRICS, BY_POLICY = "tests/evaluation/test_metrics.py", "tests/tasks/test_policy.py"
+BY_SCORES, BY_FINGERS = "tests/evaluation/test_geometry.py", "tests/body/test_fingers.py"
+BY_CONTOUR = "tests/body/test_contour_fit.py"
 BY_INGEST, BY_STORE = "tests/capture/test_ingest.py", "tests/tasks/test_store.py"
 BY_BAD_INPUT = "tests/capture/test_bad_input.py"
 BY_ANTIALIASING, BY_CORRECTIVES = "tests/avatar/test_antialiasing.py", "tests/asset/test_correctives.py"
@@ -162,7 +166,7 @@ FAULTS = (
     Fault("floor-outside", LOSSES, "relu(-d_hat)", "relu(d_hat)", BY_LOSSES),
     Fault("floor-sideways", STEP, "[..., self.ground_axis])", "[..., 0])", BY_STEP),
     Fault("increment-forgets", BODIES, "self.move_m + self.absorbed_move_m", "self.move_m", BY_LOSSES),
-    Fault("sole-ignored", "hnerf/body/contour_fit.py", "(vertices_m, up, sole_m))", "(vertices_m, up, 0.0))",
+    Fault("sole-ignored", CONTOUR, "(vertices_m, up, sole_m))", "(vertices_m, up, 0.0))",
           "tests/body/test_fit.py"),
     Fault("fit-clothed", STEP, "segmentation(samples.d, target", "segmentation(samples.d_hat, target", BY_STEP),
     Fault("segmentation-naked", STEP, "segmentation(samples.d_hat, target", "segmentation(samples.d, target", BY_STEP),
@@ -221,6 +225,8 @@ FAULTS = (
     Fault("trainer-tighten", TRAINER, "if self.step <= self.field_steps:", "if False:", BY_TRAINER),
     Fault("checkpoint-optimizer", TRAINER, 'self.optimizer.load_state_dict(state["optimizer"])', "pass",
           "tests/training/test_trainer.py"),
+    Fault("exposure-mean", EXPOSURE, "weight * np.median(found, 0)", "weight * np.mean(found, 0)", BY_EXPOSURE),
+    Fault("exposure-clipped", EXPOSURE, " & (levels[seen] < MAX_LEVEL).all(1)", "", BY_EXPOSURE),
     Fault("exposure-pair", EXPOSURE, "= (-weight, weight)", "= (weight, weight)", BY_EXPOSURE),
     # cameras, triangulation, meshes
     Fault("camera-half-pixel", CAMERA, "[0, sy, (sy - 1) / 2]", "[0, sy, 0]", BY_CAMERA),
@@ -239,6 +245,28 @@ FAULTS = (
           "tests/calibration/test_bundle.py"),
     Fault("turning-jacobian", ARTICULATION, "+ first * cross + second", "- first * cross + second",
           "tests/body/test_articulation.py"),
+    Fault("silhouette-wide", SILHOUETTE, "floor(high[0])), image.shape[1]", "floor(high[0])), image.shape[0]",
+          "tests/geometry/test_silhouette.py"),
+    Fault("triangulation-surest-pair", TRIANGULATION, "confidence * np.nan_to_num(dist",
+          "np.nan_to_num(dist", BY_TRIANGULATION),
+    Fault("reach-behind", REACH, "xy, depth_m = xy[depth_m > 0], depth_m[depth_m > 0]",
+          "depth_m = depth_m[depth_m > 0]", "tests/training/test_pixels.py"),
+    # the fit of the body
+    Fault("ground-offsets", "hnerf/body/ground.py", " + pose.offsets_m[FEET, 2]", "", "tests/body/test_ground.py"),
+    Fault("limbs-of-nobody", "hnerf/body/limb_depths.py", "np.where(known, np.nanmedian", "np.where(True, np.nanmedian",
+          "tests/body/test_limb_depths.py"),
+    Fault("fingers-bent-at-rest", FINGERS, "deg2rad(relaxed) - bend", "deg2rad(relaxed) + bend", BY_FINGERS),
+    Fault("fingers-across-gaps", FINGERS, "np.arange(ends[-1]), ends - 1)", "np.arange(ends[-1]), ends[-1:] - 1)",
+          BY_FINGERS),
+    Fault("hands-seen-once", "hnerf/body/hand_points.py", "seen_twice(hands[..., 0, 2])[..., None]", "1",
+          "tests/body/test_hand_points.py"),
+    Fault("postures-by-group", "hnerf/body/posture_prior.py", "first + group * len(at) + ", "first + ",
+          "tests/body/test_posture_prior.py"),
+    Fault("contour-cells", CONTOUR, "np.unique(row * width + column", "np.unique(row + column", BY_CONTOUR),
+    Fault("contour-shape", CONTOUR, "border[frame, :, shape] += weighted_j", "border[frame, :, shape] += j",
+          BY_CONTOUR),
+    Fault("cloth-aligned", "hnerf/body/clothed_fit.py", "keep = aligned & (", "keep = (",
+          "tests/body/test_clothed_fit.py"),
     # what comes in
     Fault("colmap-pixel-centre", COLMAP, "cx - PIXEL_CENTRE", "cx", BY_FILES),
     Fault("colmap-distortion", COLMAP, "distortion=values[4:9]", "distortion=values[5:9]", BY_FILES),
@@ -258,6 +286,8 @@ FAULTS = (
           "tests/capture/formats/test_zjumocap.py"),
     Fault("sides-exchanged", "hnerf/calibration/doubts.py", "np.cross(up, forward)", "np.cross(forward, up)",
           "tests/calibration/test_doubts.py"),
+    Fault("prior-mirrored", "hnerf/segmentation/prior.py", "where(depth_m[..., None] <= 0,", "where(False,",
+          "tests/segmentation/test_prior.py"),
     Fault("calibration-digits", "hnerf/calibration/report.py", "round(tree, DECIMALS)", "round(tree, 15)",
           "tests/calibration/test_check.py"),
     Fault("nearest-frame", TIMING, "offset_frames / step + 0.5", "offset_frames / step", BY_TIMING),
@@ -307,6 +337,9 @@ FAULTS = (
     Fault("look-light-in-world", "hnerf/asset/staging.py", "albedo.light.turned(world)", "albedo.light", BY_PACKAGE),
     Fault("glb-looks", GLB, '{"material": k, "variants": [k]}', '{"material": 0, "variants": [k]}', BY_GLB),
     Fault("photographs-outline", PHOTOGRAPHS, "inside & ~outline[row, column]", "inside", BY_PHOTOGRAPHS),
+    Fault("photographs-behind", PHOTOGRAPHS, " & (depth_m > 0)", "", BY_PHOTOGRAPHS),
+    Fault("shading-behind", SHADING, " & (ahead_m > 0)", "", BY_SHADING),
+    Fault("photographs-slope", PHOTOGRAPHS, "TOLERANCE_M / cosine.clip(0.1)", "TOLERANCE_M", BY_PHOTOGRAPHS),
     Fault("photographs-gain", PHOTOGRAPHS, "pixels_px) / gain", "pixels_px) * gain", BY_PHOTOGRAPHS),
     Fault("correctives-turn", CORRECTIVES, "solve(turn, surface_m", "solve(turn.mT, surface_m", BY_CORRECTIVES),
     Fault("plate-gaps", PLATE, "self.bending + self.gaps", "self.bending", BY_PLATE),
@@ -329,6 +362,10 @@ FAULTS = (
     Fault("usd-quaternion", USD, "Gf.Quatf(w, x, y, z)", "Gf.Quatf(x, y, z, w)", BY_PACKAGE),
     Fault("usd-camera-axis", USD, "np.diag([1, -1, -1])", "np.diag([1, 1, -1])", BY_USD),
     Fault("report-unescaped", REPORT, "autoescape=True", "autoescape=False", "tests/evaluation/test_evaluate.py"),
+    Fault("surface-one-way", SCORES, "distance_p.mean() + distance_t.mean()", "distance_p.mean() + distance_p.mean()",
+          BY_SCORES),
+    Fault("surface-closed-truth", SCORES, "bool(predicted.is_watertight)", "bool(truth.is_watertight)", BY_SCORES),
+    Fault("ssim-sample-covariance", METRICS, "use_sample_covariance=False", "use_sample_covariance=True", BY_METRICS),
     Fault("psnr-amplitude", METRICS, "-10 * np.log10(", "-20 * np.log10(", BY_METRICS),
     # what is done again, and what is not
     Fault("retry-lost-worker", POLICY, "OSError | LostWorkerError)", "OSError)", BY_POLICY),
@@ -338,6 +375,8 @@ FAULTS = (
     Fault("store-planted-links", STORE, "for path in partial.rglob(\"*\"):", "for path in list[Path]():", BY_STORE),
     Fault("ledger-key", "tasks/ledger.py", "lost.read_text() if lost.exists() else ''", "''",
           "tests/tasks/test_ledger.py"),
+    Fault("ledger-empty-note", "tasks/ledger.py", 'or "none")', 'or "")', "tests/tasks/test_ledger.py"),
+    Fault("store-bad-input", STORE, "if not resumable or isinstance(error, InputError)", "if not resumable", BY_STORE),
     Fault("checkpoint-key", "hnerf/training/checkpoint.py", 'or state.get("key") != key', "",
           "tests/training/test_trainer.py"),
     Fault("store-damage", STORE, " or sha256_of(path) != file.sha256", "", BY_STORE),

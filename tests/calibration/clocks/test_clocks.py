@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hnerf.calibration.clocks.estimate import estimate_clocks
+from hnerf.calibration.clocks.estimate import _solve, estimate_clocks
 from hnerf.calibration.clocks.keypoints import Track, _off_together, pair_clock, smoothed
 from hnerf.calibration.clocks.sound import read_sound, sound_offset
 from hnerf.calibration.matches import fundamental
@@ -53,6 +53,22 @@ def test_offsets_of_any_size_and_fractions_of_a_frame_at_other_rates() -> None:
     for name, offset in true_s.items():
         assert found.clocks[name].offset_s == pytest.approx(offset, abs=0.1 / FPS)
         assert found.clocks[name].rate == 1.0
+
+
+def test_clocks_of_pairs_in_a_chain_by_hand() -> None:
+    """b = a + 1 +- 0.1 and c = 1.5 b + 2 +- 0.2: 3.5, and an error of sqrt((1.5 x 0.1)^2 + 0.2^2) = 0.25."""
+    pairs = [("a", "b"), ("b", "c")]
+    differences, errors = dict(zip(pairs, (1.0, 2.0), strict=True)), dict(zip(pairs, (0.1, 0.2), strict=True))
+    x, error = _solve(["a", "b", "c"], differences, errors, {("b", "c"): 1.5})
+    np.testing.assert_allclose(x, [0, 1, 3.5])
+    np.testing.assert_allclose(error, [0, 0.1, 0.25])
+
+
+def test_a_pair_that_contradicts_two_others_hardly_counts() -> None:
+    """d is 3 after a by way of b and of c, and 4 directly, a hundred standard errors off."""
+    differences = {("a", "b"): 1.0, ("a", "c"): 2.0, ("a", "d"): 4.0, ("b", "c"): 1.0, ("b", "d"): 2.0, ("c", "d"): 1.0}
+    x, _ = _solve(list("abcd"), differences, dict.fromkeys(differences, 0.01), {})
+    np.testing.assert_allclose(x, [0, 1, 2, 3], atol=0.01)
 
 
 def test_a_drift_of_200_ppm_in_ten_minutes() -> None:
