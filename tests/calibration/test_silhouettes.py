@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hnerf.calibration.silhouettes import MaskOutline, Outlines
+from hnerf.calibration.silhouettes import BEHIND_CAMERA_PX, MaskOutline, Outlines, _outside_px
 from hnerf.capture.capture import Capture
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import SIZE_PX, look_at, ring, turned
@@ -47,6 +47,16 @@ def test_no_outline_where_the_image_ends() -> None:
     found = MaskOutline.around(cut_off)
     assert found is not None and found.points_px[:, 1].max() < 18
     assert MaskOutline.around(np.ones((20, 30), bool)) is None  # the camera stands too near to see any edge
+
+
+def test_a_point_behind_a_camera_is_outside_its_mask() -> None:
+    """The middle of the box, and as far behind the camera, where it would be seen in the same pixel."""
+    camera = ring(1)[0]
+    outline, middle_m = MaskOutline.around(mask(camera)), CORNERS_M.mean(0)
+    assert outline is not None
+    both_m = np.stack([middle_m, 2 * camera.centre_m - middle_m])
+    found_px = _outside_px([(camera, outline)], both_m[None])[0]
+    assert found_px[0] < -10 and found_px[1] == BEHIND_CAMERA_PX
 
 
 def test_a_true_rig_costs_nothing() -> None:
