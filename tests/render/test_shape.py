@@ -11,6 +11,7 @@ from hnerf.errors import InputError
 from hnerf.render.motion import lowest_points_m
 from hnerf.render.shape import offsets_from_bones_m, transfer_poses, volume_m3, with_shape_values, with_volume
 from tests.asset.figure import bending_body, column_rig
+from tests.body.two_bone import two_bone_rig
 
 
 def changeable_rig() -> Rig:
@@ -96,3 +97,10 @@ def test_another_shape_stands_on_the_same_floor() -> None:
     longer = transfer_poses(with_shape_values(body.rig, {"length": 0.5}), body, "z")
     torch.testing.assert_close(lowest_points_m(longer, "z"), torch.full((4,), 0.5))
     torch.testing.assert_close(longer.root[:, :2], body.root[:, :2])
+
+
+def test_what_is_beyond_the_end_of_its_bone_is_away_from_that_end() -> None:
+    """The forearm reaches from 1 m to 2 m; a vertex of it at 2.3 m is 30 cm beyond its end and 10 cm aside."""
+    rig = two_bone_rig()
+    rig.vertices_m[2] = torch.tensor([0.1, 0, 2.3])
+    torch.testing.assert_close(offsets_from_bones_m(rig)[2], torch.tensor([0.1, 0, 0.3], dtype=torch.float64))
