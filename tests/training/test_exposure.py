@@ -82,7 +82,8 @@ def test_levels_of_a_body_point_are_those_of_its_pixel_if_they_are_usable() -> N
     picture[:48, :, 0], picture[80:, :, 2] = 15, 245
     mask[:, :64] = False
     capture: Any = SimpleNamespace(cameras=RING, image=lambda name, frame: picture)
-    surface, masks = Surface(BALL), KnownMasks({("a", 3): mask})
+    masks: Any = KnownMasks({("a", 3): mask})
+    surface = Surface(BALL)
     levels = _vertex_colours(capture, masks, surface, "a", 3)
     seen, xy = _visible_vertices(RING["a"], surface)
     x, y = xy.T
