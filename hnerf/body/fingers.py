@@ -47,13 +47,13 @@ class FingerPrior:
         for side in SIDES:
             at = {name: rig.joints_m[rig.joint_names.index(f"{name}.{side}")] for name in ["wrist", *_names()]}
             normal = torch.linalg.cross(at["finger2-1"] - at["wrist"], at["finger5-1"] - at["wrist"])
-            back = normal if side == "R" else -normal  # to the palm, whither fingers bend
+            palmwards = normal if side == "R" else -normal  # where fingers bend to
             for finger in range(1, 6):
                 chain = [at[f"finger{finger}-{segment}"] for segment in (1, 2, 3)]
                 bones = [chain[0] - at["wrist"], chain[1] - chain[0], chain[2] - chain[1]]
                 bones = [bone / bone.norm() for bone in [*bones, bones[-1]]]
                 for above, bone in itertools.pairwise(bones):
-                    axis = normal if finger == 1 else torch.linalg.cross(bone, back)
+                    axis = normal if finger == 1 else torch.linalg.cross(bone, palmwards)
                     axis = axis - (axis @ bone) * bone
                     axis = axis / axis.norm()
                     axes.append(torch.stack([axis, bone, torch.linalg.cross(axis, bone)]))
