@@ -18,7 +18,7 @@ from tasks.launcher import RankFailedError
 from tasks.limits import StalledError
 from tasks.source import place
 
-FAILED, BAD_INPUT = 1, 2
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # the last as shells have it
 NO_ROOM = (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # None: our own, of libraries that do not say why
 CAMERA_FORMATS = ("easymocap", "caliscope", "aniposelib", "colmap")  # of hnerf.capture.formats.export, which is slow
 PICTURES = ("colour", "depth", "normals", "mask", "mesh")  # of hnerf.render.subject, which imports torch
@@ -36,7 +36,8 @@ log = logging.getLogger("hnerf")
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; one line on stderr and 2 for input and paths that cannot be used, 1 for a training that cannot
-    go on, an asset that must not be handed over, or output that nobody reads."""
+    go on, an asset that must not be handed over, or output that nobody reads; 130 if it is interrupted from the
+    keyboard."""
     options = _parser().parse_args(argv)
     try:
         with display():
@@ -45,6 +46,8 @@ def main(argv: list[str] | None = None) -> int:
                 log.info("%s", " ".join([_name(options.command), *map(str, folders)]))
             options.command(options)
         sys.stdout.flush()
+    except KeyboardInterrupt:
+        return _fail("interrupted", INTERRUPTED)
     except InputError as error:
         return _fail(error, BAD_INPUT)
     except (RankFailedError, StalledError, InvalidAsset) as error:
@@ -218,7 +221,10 @@ def _add_stability(stability: argparse.ArgumentParser) -> None:
 
 
 def _names(text: str) -> list[str]:
-    return [stripped for name in text.split(",") if (stripped := name.strip())]
+    names = [stripped for name in text.split(",") if (stripped := name.strip())]
+    if not names:
+        raise argparse.ArgumentTypeError("give one name or more")
+    return names
 
 
 def _not_negative(text: str) -> int:

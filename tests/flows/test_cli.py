@@ -166,15 +166,23 @@ def test_synth_takes_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert written == [SyntheticSettings(train_cameras=32, train_frames=1), SyntheticSettings()]
 
 
-def test_synth_writes_whole_or_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_synth_writes_whole_or_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def interrupted(out: Path, settings: object) -> None:
         (out / "half").touch()
         raise KeyboardInterrupt
 
     monkeypatch.setattr(synthetic, "write_synthetic_capture", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        main(["synth", str(tmp_path / "ada")])
+    assert main(["synth", str(tmp_path / "ada")]) == 130
+    assert capsys.readouterr().err == "hnerf: interrupted\n"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_list_without_names_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["benchmark", ".", "--methods", ","])
+    assert "give one name or more" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["run", "absent"], ["run"], ["settings"]])
