@@ -5,14 +5,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from hnerf.asset.export import export_asset
 from hnerf.asset.staging import CAPTURED
-from hnerf.avatar.finished import readable
-from hnerf.avatar.trained import load_avatar
-from hnerf.calibration.report import load_cameras
-from hnerf.capture.capture import Capture
+from hnerf.avatar.finished import avatar_of, readable, recording_of, require_files
 from hnerf.capture.masks import Masks
 from hnerf.config import AssetSettings
 from hnerf.errors import InputError
@@ -31,16 +26,9 @@ def export_subject(
     InputError where a file is missing, or a motion cannot be read or has another's name.
     """
     with atomic_folder(out) as partial:
-        for file in NEEDED:
-            if not (subject / file).is_file():
-                raise InputError(f"{subject / file}: missing; give <store>/subjects/<name> of a finished `hnerf run`")
+        require_files(subject, NEEDED)
         further = _named(motions)
-        with readable(subject / "capture" / "capture.json"):
-            recorded = Capture.load(subject / "capture")
-        with readable(subject / "calibration"):
-            capture = load_cameras(subject / "calibration", recorded)
-        with readable(subject / "training"):
-            avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
+        capture, avatar = recording_of(subject), avatar_of(subject)
         with readable(subject / "segmentation"):
             masks = Masks.load(subject / "segmentation")
         return export_asset(capture, masks, avatar, settings, partial, digest, further)

@@ -1,12 +1,16 @@
 """Files of a finished run that nobody has compared with their digests, as in a copy of a subject's folder."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
+import torch
 from safetensors import SafetensorError
 
+from hnerf.avatar.trained import TrainedAvatar, load_avatar
+from hnerf.calibration.report import load_cameras
+from hnerf.capture.capture import Capture
 from hnerf.capture.safe_io import ARRAY_FILE_ERRORS
 from hnerf.errors import InputError, one_line
 
@@ -23,3 +27,24 @@ def readable(part: Path) -> Iterator[None]:
     except DAMAGED as error:
         why = f"damaged, or written by another version ({one_line(error)})"
         raise InputError(f"{part}: {why}; copy the subject again, or repeat its `hnerf run`") from None
+
+
+def require_files(subject: Path, files: Iterable[str]) -> None:
+    """Raise InputError if a subject (<store>/subjects/<name>) lacks one of these files."""
+    for file in files:
+        if not (subject / file).is_file():
+            raise InputError(f"{subject / file}: missing; give <store>/subjects/<name> of a finished `hnerf run`")
+
+
+def recording_of(subject: Path) -> Capture:
+    """Load a subject's recording, with its calibrated cameras."""
+    with readable(subject / "capture" / "capture.json"):
+        capture = Capture.load(subject / "capture")
+    with readable(subject / "calibration"):
+        return load_cameras(subject / "calibration", capture)
+
+
+def avatar_of(subject: Path) -> TrainedAvatar:
+    """Load a subject's trained avatar, onto the GPU if there is one."""
+    with readable(subject / "training"):
+        return load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")

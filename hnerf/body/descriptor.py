@@ -117,6 +117,7 @@ class BodyMeshes:
             return self._doubtful
 
     def _touch_buried(self, copy: int) -> Tensor:
+        """Return these faces of one copy, (F,) bool."""
         mesh, faces, normals = self._meshes[copy], self._faces, self._normals[copy]
         vertices_m = wp.to_torch(mesh.points)
         outwards = nn.functional.normalize(torch.cat([normals, normals[faces].sum(1)]), dim=1)

@@ -8,11 +8,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hnerf.avatar.finished import readable
-from hnerf.avatar.trained import load_avatar
+from hnerf.avatar.finished import avatar_of, readable, recording_of, require_files
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import pose_vertices
-from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.capture.timing import median_step
 from hnerf.errors import InputError
@@ -63,18 +61,14 @@ def render_subject(subject: Path, options: RenderOptions, out: Path) -> int:
         motion = _motion(subject, options, capture)
         cameras = _cameras(options, capture, motion.body)
         shots: list[Shot] = list(zip(cameras, itertools.cycle(motion.body.frames), strict=False))
-        with readable(subject / "training"):
-            avatar = load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
-        write_pictures(avatar.with_body(motion.body), shots, options.what, motion.fps, partial)
+        write_pictures(avatar_of(subject).with_body(motion.body), shots, options.what, motion.fps, partial)
     return len(shots)
 
 
 def _checked_capture(subject: Path, options: RenderOptions) -> Capture:
     """Return the subject's capture with its calibrated cameras; raise InputError if files are missing or options are
     invalid."""
-    for file in ("capture/capture.json", "calibration/intri.yml", "training/model.safetensors"):
-        if not (subject / file).is_file():
-            raise InputError(f"{subject / file}: missing; give <store>/subjects/<name> of a finished `hnerf run`")
+    require_files(subject, ("capture/capture.json", "calibration/intri.yml", "training/model.safetensors"))
     unknown = [kind for kind in options.what if kind not in OUTPUT_KINDS]
     if unknown or not options.what:
         raise InputError(f"what {','.join(unknown)}: choose from {', '.join(OUTPUT_KINDS)}")
@@ -82,10 +76,7 @@ def _checked_capture(subject: Path, options: RenderOptions) -> Capture:
         raise InputError("--radius and --height are for an orbit; omit them, or omit --camera and --path")
     if options.pictures is not None and options.pictures < 1:
         raise InputError(f"{options.pictures} pictures: give 1 or more")
-    with readable(subject / "capture" / "capture.json"):
-        capture = Capture.load(subject / "capture")
-    with readable(subject / "calibration"):
-        return load_cameras(subject / "calibration", capture)
+    return recording_of(subject)
 
 
 def _motion(subject: Path, options: RenderOptions, capture: Capture) -> Motion:

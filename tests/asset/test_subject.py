@@ -23,10 +23,9 @@ def test_motions_are_named_after_their_files(tmp_path: Path, monkeypatch: pytest
     read = Motion(bending_body(), 25.0, "z")
     given: list[Any] = []
     monkeypatch.setattr(exported, "read_motion", lambda path: read)
-    monkeypatch.setattr(exported.Capture, "load", lambda folder: folder)
-    monkeypatch.setattr(exported, "load_cameras", lambda folder, capture: "capture")
+    monkeypatch.setattr(exported, "recording_of", lambda subject: "capture")
     monkeypatch.setattr(exported.Masks, "load", lambda folder: "masks")
-    monkeypatch.setattr(exported, "load_avatar", lambda folder, device: "avatar")
+    monkeypatch.setattr(exported, "avatar_of", lambda subject: "avatar")
     monkeypatch.setattr(exported, "export_asset", lambda *arguments: given.extend(arguments) or {"frames": 4})
     motions = [tmp_path / "01 slow-walk.bvh", tmp_path / "ben"]
     assert export_subject(made(tmp_path / "ada"), AssetSettings(), motions, tmp_path / "out", "01ab") == {"frames": 4}
@@ -51,9 +50,8 @@ def test_an_unfinished_subject_is_refused(tmp_path: Path) -> None:
 
 
 def test_masks_that_are_cut_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(exported.Capture, "load", lambda folder: folder)
-    monkeypatch.setattr(exported, "load_cameras", lambda folder, capture: "capture")
-    monkeypatch.setattr(exported, "load_avatar", lambda folder, device: "avatar")
+    monkeypatch.setattr(exported, "recording_of", lambda subject: "capture")
+    monkeypatch.setattr(exported, "avatar_of", lambda subject: "avatar")
     with pytest.raises(InputError, match=r"ada/segmentation: damaged, or written by another version \("):
         export_subject(made(tmp_path / "ada"), AssetSettings(), [], tmp_path / "out", "")
     assert not (tmp_path / "out").exists()

@@ -16,8 +16,6 @@ from hnerf.training.trainer import train
 from tests.body.boxes import box_rig
 from tests.training.scene import record
 
-CELLS = 48  # of the box in which a surface is looked for, on its longest side
-
 
 @dataclass(frozen=True, eq=False)
 class Learned:
