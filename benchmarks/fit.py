@@ -24,7 +24,7 @@ from hnerf.geometry.silhouette import silhouette
 from tasks.calibration import calibrated_capture
 from tasks.capture import ingest
 from tasks.source import read_capture
-from tasks.store import Store
+from tasks.store import Artifact, Store
 
 CAPTURES = ("valid-turn-mono", "valid-walk", "valid-wave")
 COLUMNS = {
@@ -63,9 +63,7 @@ def measure(folder: Path, store: Store) -> dict[str, Any]:
     recording = with_detections(store, ingest(store, source, settings.capture), settings)
     recording, calibration, _, made = prepare_training(store, recording, settings)
     capture, fit = calibrated_capture(recording, calibration), BodyFit.load(made.root)
-    with tempfile.TemporaryDirectory() as subject:
-        (Path(subject) / "fit").symlink_to(made.root)
-        joints = runpy.run_path(str(SHARED / "accept" / "score_run.py"))["joints"](Path(subject), folder)
+    joints = joint_errors(made, folder)
     ious, outside = [], []
     for frame, vertices_m in zip(fit.frames, fit.vertices_m().numpy(), strict=True):
         for name in capture.train_cameras:
@@ -81,6 +79,14 @@ def measure(folder: Path, store: Store) -> dict[str, Any]:
         "outside_share_worst": float(np.max(outside)),
         "seconds_per_frame": sum(made.metrics.values()) / len(fit.frames),
     }
+
+
+def joint_errors(made: Artifact, folder: Path) -> dict[str, Any]:
+    """Return the errors of a fit's limb joints by the independent program."""
+    with tempfile.TemporaryDirectory() as subject:
+        (Path(subject) / "fit").symlink_to(made.root)
+        found: dict[str, Any] = runpy.run_path(str(SHARED / "accept" / "score_run.py"))["joints"](Path(subject), folder)
+    return found
 
 
 if __name__ == "__main__":

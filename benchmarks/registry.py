@@ -86,6 +86,7 @@ REGISTRY = (
     measured("detection", "detection.py", captures=("pose2sim-balance", *CALIBRATED), threads=2),
     measured("segmentation", "segmentation.py", captures=RENDERED),
     measured("fit", "fit.py", "{store}", captures=RENDERED, configs=("fast",)),
+    measured("limits", "limits.py", "{store}", "valid-wave", captures=("valid-wave",), configs=("fast",)),
     shared("shared-fast-wave", "valid-wave"),
     shared("shared-fast-walk", "valid-walk"),
     *(shared(f"shared-video-{name}", f"valid-{name}", without=("openpose", "background")) for name in ("wave", "walk")),
