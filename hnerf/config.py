@@ -3,7 +3,8 @@
 A preset is a YAML file under `configs/`; `load_settings("fast", ["training.seconds=60"])` reads one and overrides it.
 """
 
-from collections.abc import Sequence
+import difflib
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, TypeVar
@@ -16,6 +17,7 @@ from hnerf.strict_yaml import parse_yaml
 S = TypeVar("S", bound=BaseModel)
 
 CONFIGS = Path(__file__).parent.parent / "configs"
+CLOSE = 0.7  # of difflib: keys that are taken for misspelled ones
 
 
 class Section(BaseModel):
@@ -398,4 +400,14 @@ def validated(kind: type[S], tree: Any, source: Path | str) -> S:
                 node = node[part]
                 key.append(str(part))
         key += [str(part) for part in first["loc"][-1:] if first["type"] == "missing"]
-        raise InputError(f"{source}: {'.'.join(key)}: {first['msg']}; correct it") from None
+        wrong, advice = first["msg"], "correct it"
+        if first["type"] == "extra_forbidden":
+            close = difflib.get_close_matches(key[-1], _keys(kind.model_json_schema()), 1, CLOSE)
+            wrong, advice = "no such key", f"did you mean {close[0]}?" if close else "remove it, or correct its name"
+        raise InputError(f"{source}: {'.'.join(key)}: {wrong}; {advice}") from None
+
+
+def _keys(schema: Mapping[str, Any]) -> set[str]:
+    """Return all keys of a model and of those within it, by its JSON schema."""
+    models = (schema, *schema.get("$defs", {}).values())
+    return {key for model in models for key in model.get("properties", {})}

@@ -45,8 +45,8 @@ def test_methods_of_ready_studies_have_valid_settings() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("title: t\nmethods: [a]\nvariants: {all: {}}\nspeed: 3", "speed: Extra inputs"),
-        ("title: t\nmethods: [a]\nvariants: {all: {views: 3}}", "variants.all.views: Extra inputs"),
+        ("title: t\nmethods: [a]\nvariants: {all: {}}\nspeed: 3", "speed: no such key; remove it"),
+        ("title: t\nmethods: [a]\nvariants: {all: {views: 3}}", "variants.all.views: no such key"),
         ("title: t\nmethods: [a]\nvariants: {all: {methods: [b]}}", "variants.all: no method b; there"),
         ("title: t\nmethods: [a]\nvariants: {a: {}}\nuntil_flat: true\nsnapshots: 0", "until_flat: requires"),
         ("title: t\nmethods: [a]\nvariants: {a: {}}\nuntil_flat: true\nseconds: 60", "until_flat: requires"),

@@ -69,7 +69,7 @@ def test_the_quick_study_tries_the_two_milder_strengths_and_says_what_it_left_ou
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("methods: [fast]\nseeds: [0]\ndegradations: {mask_holes: [5]}\nspeed: 3", "speed: Extra inputs"),
+        ("methods: [fast]\nseeds: [0]\ndegradations: {mask_holes: [5]}\nspeed: 3", "speed: no such key"),
         ("methods: []\nseeds: [0]\ndegradations: {}", "methods: "),
         ("methods: [fast]\nseeds: [0]\ndegradations: {hats: [5]}", "degradation hats: no such degradation"),
         ("methods: [fast]\nseeds: [0]\ndegradations: {mask_holes: [5, 2, 3]}", "the mildest first"),
