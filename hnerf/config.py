@@ -199,7 +199,7 @@ class NerfiesSettings(FieldSettings):
     deformation_width: int = Field(default=64, ge=2)
     code_width: int = Field(default=8, ge=1)  # of each frame's latent code
     anneal_share: float = Field(default=1 / 3, gt=0, le=1)  # of training, until the deformation uses all octaves
-    learning_rate: float = Field(default=5e-3, gt=0)
+    learning_rate: float = Field(default=1e-3, gt=0)  # as published; with 5e-3, it comes apart after minutes
 
 
 GeometryRoles = Literal["surface_leads", "print"]
