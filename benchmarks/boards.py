@@ -37,7 +37,7 @@ def main() -> None:
     seconds = time.perf_counter() - started
     lenses = Caliscope(folder).lenses()
     fitted = calibration.fit.cameras
-    shipped = [Camera(c.name, c.K, lenses[c.name].R, lenses[c.name].t_m, c.width_px, c.height_px) for c in fitted]
+    shipped = [Camera(c.name, c.K, lenses[c.name].R, lenses[c.name].t_m, *c.size_px) for c in fitted]
     pairs, report = compare_pairs(shipped, fitted), calibration.report()
     visible = sum(camera["board_visible"] for camera in report["cameras"].values())
     found = sum(camera["of_these_found"] for camera in report["cameras"].values())

@@ -101,9 +101,9 @@ def _score(capture: Capture, reference: list[Camera], known: bool) -> dict[str, 
     """Calibrate, and return the worst camera's errors and the seconds of one thread."""
     keypoints = np.stack(list(subject_keypoints(capture).values()))
     of_reference = measure(reference, keypoints)
-    lost = {c.name: Camera(c.name, c.K, np.eye(3), np.zeros(3), c.width_px, c.height_px) for c in reference}
+    lost = {c.name: Camera(c.name, c.K, np.eye(3), np.zeros(3), *c.size_px) for c in reference}
     if not known:
-        lost = {name: with_focal(c, USUAL_FOCAL * max(c.width_px, c.height_px)) for name, c in lost.items()}
+        lost = {name: with_focal(c, USUAL_FOCAL * max(c.size_px)) for name, c in lost.items()}
     unknown = [] if known else list(lost)
     started = time.process_time()
     found = calibrate_from_person(

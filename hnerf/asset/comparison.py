@@ -123,15 +123,14 @@ def _compared(
 ) -> Compared:
     box = mask_box(mask)
     camera = camera_of_box(capture.cameras[view.camera], box)
-    scale = min(1.0, LONGEST_PX / max(camera.width_px, camera.height_px))
-    size = round(scale * camera.width_px), round(scale * camera.height_px)
+    small = camera.scaled(min(1.0, LONGEST_PX / max(camera.size_px)))
     photograph = capture.image(view.camera, view.frame)[box] * mask[box][..., None]
-    photograph = cv2.resize(photograph, size, interpolation=cv2.INTER_AREA)
-    shown = cv2.resize(255 * mask[box].astype(np.uint8), size, interpolation=cv2.INTER_AREA) > 127
+    photograph = cv2.resize(photograph, small.size_px, interpolation=cv2.INTER_AREA)
+    shown = cv2.resize(255 * mask[box].astype(np.uint8), small.size_px, interpolation=cv2.INTER_AREA) > 127
     k = avatar.body.index(view.frame)
     with torch.no_grad():
-        field = rgba(avatar.render(camera.resized(*size), avatar.body.theta[k], avatar.body.root[k]))
-    asset = on_black(surface, staged, camera, size, avatar.gains.get(view.camera, (1.0, 1.0, 1.0)))
+        field = rgba(avatar.render(small, avatar.body.theta[k], avatar.body.root[k]))
+    asset = on_black(surface, staged, camera, small.size_px, avatar.gains.get(view.camera, (1.0, 1.0, 1.0)))
     scores = {"asset": _scores(asset, photograph, shown), "field": _scores(field, photograph, shown)}
     return Compared(view, photograph, field, asset, scores)
 

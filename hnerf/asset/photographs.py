@@ -161,7 +161,7 @@ def _depth(camera: Camera, vertices_m: np.ndarray, faces: np.ndarray) -> tuple[n
     """Return the distance (H, W) at which each pixel's ray meets a surface, and where it jumps (H, W) bool."""
     at_px = camera.project(vertices_m)[0]
     box_px = np.stack([np.floor(at_px.min(0)) - EDGE_PX, np.ceil(at_px.max(0)) + EDGE_PX + 1])
-    lower, upper = box_px.clip(0, [camera.width_px, camera.height_px]).astype(int)
+    lower, upper = box_px.clip(0, camera.size_px).astype(int)
     depth_m = np.full((camera.height_px, camera.width_px), FAR_M, np.float32)
     x, y = np.meshgrid(np.arange(lower[0], upper[0]), np.arange(lower[1], upper[1]))
     hits = cast(mesh_on_cpu(vertices_m, faces), *camera.rays(np.stack([x.ravel(), y.ravel()], 1).astype(float)))

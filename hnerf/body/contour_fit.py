@@ -212,9 +212,7 @@ def _sole_m(camera: Camera, edge: Outline, scale_m: float, vertices_m: np.ndarra
     height_m = vertices_m[:, up]
     pixels = camera.project(vertices_m[height_m < height_m.min() + UNDERSIDE_M])[0]
     lowest = pixels[(pixels @ -camera.R[:2, up]).argmax()]
-    if not (
-        (lowest > BORDER_PX) & (lowest < (camera.width_px - 1 - BORDER_PX, camera.height_px - 1 - BORDER_PX))
-    ).all():
+    if not ((lowest > BORDER_PX) & (lowest < np.array(camera.size_px) - 1 - BORDER_PX)).all():
         return None
     inside_px = -map_coordinates(edge.distance_px, lowest[::-1, None], order=1, mode="nearest")[0]
     return float(np.clip(inside_px * scale_m, 0, MAX_SOLE_M))

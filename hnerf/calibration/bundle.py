@@ -146,7 +146,7 @@ def _solve_shared_lens(
     focal_px = float(np.median([camera.K[0, 0] for camera in cameras]))
     model = "SIMPLE_RADIAL" if distorted else "SIMPLE_PINHOLE"
     params = [focal_px, 0, 0, k1] if distorted else [focal_px, 0, 0]
-    side = max(max(camera.width_px, camera.height_px) for camera in cameras)
+    side = max(max(camera.size_px) for camera in cameras)
     number = len(cameras) + 1
     common = pycolmap.Camera(camera_id=number, model=model, params=params, width=side, height=side)
     scene.add_camera_with_trivial_rig(common)

@@ -68,9 +68,7 @@ def measure(cameras: Sequence[Camera], keypoints: np.ndarray) -> Measure:
     flat = keypoints.reshape(len(cameras), -1, 3)
     points_m, residuals_px, _ = triangulate(np.stack([camera.projection for camera in cameras]), flat)
     points_m = points_m.reshape(*keypoints.shape[1:3], 3)
-    off_px = max(
-        float(np.hypot(camera.width_px, camera.height_px)) for camera in cameras
-    )  # where no point is in front of the camera
+    off_px = max(float(np.hypot(*camera.size_px)) for camera in cameras)  # where no point is in front of the camera
     found = {camera.name: row[np.isfinite(row)] for camera, row in zip(cameras, residuals_px, strict=True)}
     return Measure(
         median_px={name: float(np.median(row)) if len(row) else off_px for name, row in found.items()},
@@ -92,7 +90,7 @@ def trimmed_cost_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> float:
     projections = np.stack([camera.projection for camera in cameras])
     seen = keypoints[..., 2] > 0
     points_m, _, _ = triangulate(projections, keypoints, inlier_px=np.inf)
-    diagonal_px = np.array([[np.hypot(c.width_px, c.height_px)] for c in cameras])
+    diagonal_px = np.array([[np.hypot(*c.size_px)] for c in cameras])
     residuals = np.fmin(reprojection_px(projections, points_m, keypoints), diagonal_px)
     used = seen & (seen.sum(0) >= 2)
     costs = [trimmed_mean(row[use], TRIM) for row, use in zip(residuals, used, strict=True) if use.any()]

@@ -20,7 +20,7 @@ NOSE_SHARE = 0.92  # of an adult's stature (Winter 2009, figure 4.1: eyes at 0.9
 def intrinsics_reasons(camera: Camera) -> list[str]:
     """Return, in words, what is unusual about a camera's intrinsics."""
     focal_px = np.array([camera.K[0, 0], camera.K[1, 1]])
-    size_px = np.array([camera.width_px, camera.height_px])
+    size_px = np.array(camera.size_px)
     centre = (camera.K[:2, 2] + 0.5) / size_px
     field_deg = float(np.rad2deg(2 * np.arctan(size_px / focal_px / 2)).max())
     reasons = []

@@ -188,7 +188,7 @@ class Capture:
         """Write `capture.json` into `root`."""
         plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in ("root", "cameras")}
         plain["cameras"] = {
-            c.name: {"K": c.K.tolist(), "R": c.R.tolist(), "t_m": c.t_m.tolist(), "size_px": [c.width_px, c.height_px]}
+            c.name: {"K": c.K.tolist(), "R": c.R.tolist(), "t_m": c.t_m.tolist(), "size_px": c.size_px}
             for c in self.cameras.values()
         }
         plain["units"] = "m"

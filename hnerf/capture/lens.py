@@ -33,8 +33,7 @@ class Lens:
 
 def pinhole(camera: Camera) -> Lens:
     """Return a camera of undistorted images as a lens without distortion."""
-    size_px = (camera.width_px, camera.height_px)
-    return Lens(camera.name, camera.K, np.zeros(5), camera.R, camera.t_m, size_px)
+    return Lens(camera.name, camera.K, np.zeros(5), camera.R, camera.t_m, camera.size_px)
 
 
 def known_size(lens: Lens) -> tuple[int, int]:

@@ -37,11 +37,10 @@ class Normaliser:
     @staticmethod
     def create(lens: Lens, recorded_size_px: tuple[int, int], max_side_px: int) -> "Normaliser":
         """Return the conversion of images of (width, height) pixels, shrunk so that no side exceeds `max_side_px`."""
-        width_px, height_px = recorded_size_px
-        camera = Camera(lens.name, lens.K, lens.R, lens.t_m, width_px, height_px)
+        camera = Camera(lens.name, lens.K, lens.R, lens.t_m, *recorded_size_px)
         scale = max_side_px / max(recorded_size_px)
         if scale < 1:
-            camera = camera.resized(max(1, round(scale * width_px)), max(1, round(scale * height_px)))
+            camera = camera.scaled(scale)
         maps = None
         if np.any(lens.distortion):
             maps = cv2.initUndistortRectifyMap(lens.K, lens.distortion, None, lens.K, recorded_size_px, cv2.CV_16SC2)
@@ -50,19 +49,14 @@ class Normaliser:
     @property
     def changes_pixels(self) -> bool:
         """Return whether there is anything to undistort or to shrink."""
-        return self.maps is not None or self.size_px != self.recorded_size_px
-
-    @property
-    def size_px(self) -> tuple[int, int]:
-        """Return the (width, height) of what is written."""
-        return self.camera.width_px, self.camera.height_px
+        return self.maps is not None or self.camera.size_px != self.recorded_size_px
 
     def pixels(self, recorded: np.ndarray) -> np.ndarray:
         """Return recorded pixels (H, W) or (H, W, 3) uint8 undistorted and shrunk."""
         if self.maps is not None:
             recorded = cv2.remap(recorded, *self.maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        if self.size_px != self.recorded_size_px:
-            recorded = cv2.resize(recorded, self.size_px, interpolation=cv2.INTER_AREA)
+        if self.camera.size_px != self.recorded_size_px:
+            recorded = cv2.resize(recorded, self.camera.size_px, interpolation=cv2.INTER_AREA)
         return recorded
 
     def keypoints(self, recorded: np.ndarray) -> np.ndarray:
@@ -71,7 +65,7 @@ class Normaliser:
         xy = recorded[..., :2].reshape(-1, 1, 2)
         if self.maps is not None:
             xy = cv2.undistortPoints(xy, self.lens.K, self.lens.distortion, P=self.lens.K, criteria=UNDISTORTED)
-        scale = np.array(self.size_px) / self.recorded_size_px
+        scale = np.array(self.camera.size_px) / self.recorded_size_px
         xy = xy.reshape(*recorded.shape[:-1], 2) * scale + (scale - 1) / 2  # pixel centres at integers
         return np.concatenate([xy, recorded[..., 2:]], -1) * (recorded[..., 2:] > 0)
 

@@ -185,7 +185,7 @@ def person_heights_px(people: np.ndarray) -> np.ndarray:
 
 def _prominence(camera: Camera, people: np.ndarray) -> np.ndarray:
     """Return size x confidence x centrality of each person, (P,), from 0 to 1."""
-    size_px = np.array([camera.width_px, camera.height_px])
+    size_px = np.array(camera.size_px)
     weight = people[..., 2:]
     centre = (people[..., :2] * weight).sum(-2) / weight.sum(-2).clip(1e-9)
     off_centre = np.linalg.norm((centre - size_px / 2) / size_px, axis=-1)

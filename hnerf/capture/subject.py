@@ -112,7 +112,7 @@ def _place(capture: Capture, *people: PersonTrack) -> str:
         return "in different images"
     c, frame = np.argwhere(shown)[0]
     camera, places = capture.cameras[capture.train_cameras[c]], []
-    scale = np.array(capture.recorded_sizes_px[camera.name]) / (camera.width_px, camera.height_px)
+    scale = np.array(capture.recorded_sizes_px[camera.name]) / camera.size_px
     for person in people:
         keypoints = person.keypoints[c, frame]
         x, y = scale * np.median(keypoints[keypoints[:, 2] > 0, :2], axis=0)

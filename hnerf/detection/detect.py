@@ -149,7 +149,7 @@ def _by_frame(
 
 def _soft_mask(people: list[Person], capture: Capture, camera: str) -> np.ndarray:
     """Return 255 times the probability that a pixel shows a person, (H, W) uint8."""
-    size_px = capture.cameras[camera].width_px, capture.cameras[camera].height_px
+    size_px = capture.cameras[camera].size_px
     likely = np.zeros(size_px[::-1], np.float32)
     for person in people:
         likely = np.maximum(likely, person.region.paste(person.mask, size_px))
@@ -167,7 +167,7 @@ def _load(out: Path, camera: str) -> dict[str, np.ndarray]:
 
 def _inside(points: np.ndarray, capture: Capture, camera: str) -> np.ndarray:
     """Set keypoints that the network guessed outside the image to 0."""
-    size_px = np.array([capture.cameras[camera].width_px, capture.cameras[camera].height_px])
+    size_px = np.array(capture.cameras[camera].size_px)
     inside = ((points[..., :2] >= -0.5) & (points[..., :2] <= size_px - 0.5)).all(-1, keepdims=True)
     return points * inside
 

@@ -46,7 +46,7 @@ def keep_subject(
     subject (frames, 25, 3); people (frames, P, 25, 3): all whom the network found, in the order of `masks` and
     `regions` in `found`. A pixel that is likelier another's is not the subject's.
     """
-    size_px = capture.cameras[camera].width_px, capture.cameras[camera].height_px
+    size_px = capture.cameras[camera].size_px
     for i, frame in enumerate(capture.frames):
         shown = np.flatnonzero((people[i, ..., 2] > 0).any(-1))
         own = nearest_person(subject[i], people[i])

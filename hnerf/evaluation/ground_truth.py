@@ -96,7 +96,7 @@ class GroundTruth:
 
     def _as_rendered(self, image: np.ndarray, camera: str) -> np.ndarray:
         """Undistort and downscale an image as recorded, as ingest does with photographs."""
-        size = (self.capture.cameras[camera].width_px, self.capture.cameras[camera].height_px)
+        size = self.capture.cameras[camera].size_px
         recorded_px = self.capture.recorded_sizes_px.get(camera)
         if camera in self.capture.recorded_lenses and image.shape[1::-1] == recorded_px:
             K, distortion = map(np.array, self.capture.recorded_lenses[camera])

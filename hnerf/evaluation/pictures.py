@@ -68,7 +68,7 @@ def crop(picture: np.ndarray, box: tuple[slice, slice]) -> np.ndarray:
 def cropped_camera(camera: Camera, box: tuple[slice, slice]) -> Camera:
     """Return the camera whose whole image is `crop` of this one's."""
     part = camera_of_box(camera, box)
-    return part.resized(*_report_size(part.width_px, part.height_px))
+    return part.resized(*_report_size(*part.size_px))
 
 
 def camera_of_box(camera: Camera, box: tuple[slice, slice]) -> Camera:
@@ -168,15 +168,14 @@ def _headlight(mesh: trimesh.Trimesh, hits: RayHits, camera: Camera) -> np.ndarr
 
 def supersampled(camera: Camera) -> Camera:
     """Return the camera with SUPERSAMPLING times the pixels along each side, for `downsampled`."""
-    return camera.resized(camera.width_px * SUPERSAMPLING, camera.height_px * SUPERSAMPLING)
+    return camera.scaled(SUPERSAMPLING)
 
 
 def downsampled(colours: np.ndarray, hits: RayHits, camera: Camera) -> np.ndarray:
     """Average the colours of supersampled rays (N, 3), 0 to 255, over a white background, to the camera's own size."""
     fine = np.where(hits.face[:, None] >= 0, colours, BACKGROUND).astype(np.float32)
     fine = fine.reshape(camera.height_px * SUPERSAMPLING, camera.width_px * SUPERSAMPLING, 3)
-    size = (camera.width_px, camera.height_px)
-    return cv2.resize(fine, size, interpolation=cv2.INTER_AREA).clip(0, 255).astype(np.uint8)
+    return cv2.resize(fine, camera.size_px, interpolation=cv2.INTER_AREA).clip(0, 255).astype(np.uint8)
 
 
 def _colour_map(values: np.ndarray) -> np.ndarray:

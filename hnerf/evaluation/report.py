@@ -140,7 +140,7 @@ def stage_reports(inputs: EvaluationInputs) -> dict[str, dict[str, Any]]:
 
 def image_sizes(inputs: EvaluationInputs) -> str:
     """Return the distinct image sizes, like "256 × 256"."""
-    sizes = {(camera.width_px, camera.height_px) for camera in inputs.capture.cameras.values()}
+    sizes = {camera.size_px for camera in inputs.capture.cameras.values()}
     return ", ".join(f"{width} × {height}" for width, height in sorted(sizes))
 
 

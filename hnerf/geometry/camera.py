@@ -56,6 +56,11 @@ class Camera:
         return np.broadcast_to(self.centre_m, directions.shape), directions
 
     @property
+    def size_px(self) -> tuple[int, int]:
+        """Return the image's (width, height)."""
+        return self.width_px, self.height_px
+
+    @property
     def pixels_px(self) -> Float[np.ndarray, "H W 2"]:
         """Return the (x, y) of every pixel of the image."""
         return np.stack(np.meshgrid(np.arange(self.width_px), np.arange(self.height_px)), -1).astype(np.float64)
@@ -65,6 +70,10 @@ class Camera:
         sx, sy = width_px / self.width_px, height_px / self.height_px
         K = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]]) @ self.K
         return Camera(self.name, K, self.R, self.t_m, width_px, height_px)
+
+    def scaled(self, share: float) -> "Camera":
+        """Return this camera with a share of the pixels along each side, at least one."""
+        return self.resized(max(1, round(share * self.width_px)), max(1, round(share * self.height_px)))
 
 
 def look_at(like: Camera, centre_m: np.ndarray, target_m: np.ndarray, up: np.ndarray) -> Camera:

@@ -38,7 +38,7 @@ def within_reach(camera: Camera, vertices_m: Float[np.ndarray, "V 3"], reach_m: 
     Each vertex in front of the camera, in the image or beside it, covers a disc of the radius that the nearest vertices
     need.
     """
-    size_px = np.array([camera.width_px, camera.height_px])
+    size_px = np.array(camera.size_px)
     xy, depth_m = camera.project(vertices_m)
     xy, depth_m = xy[depth_m > 0], depth_m[depth_m > 0]
     if not len(depth_m):

@@ -116,8 +116,9 @@ def _cameras(options: RenderOptions, capture: Capture, body: BodyFit) -> list[Ca
         found = orbit(recorded, _middle_m(body), count, capture.up, options.radius_m, options.height_m)
     if options.camera is None:  # derived from recorded cameras, but without their exposure
         found = [dataclasses.replace(camera, name="") for camera in found]
-    found = found if options.size_px is None else [_resized(camera, options.size_px) for camera in found]
-    width_px, height_px = found[0].width_px, found[0].height_px  # the same for all cameras
+    if options.size_px is not None:
+        found = [camera.scaled(options.size_px / max(camera.size_px)) for camera in found]
+    width_px, height_px = found[0].size_px  # the same for all cameras
     if min(width_px, height_px) < MIN_SIZE_PX or max(width_px, height_px) > MAX_SIZE_PX:
         raise InputError(f"pictures of {width_px} x {height_px} px: each side must have {MIN_SIZE_PX} to {MAX_SIZE_PX}")
     return found
@@ -128,9 +129,3 @@ def _middle_m(body: BodyFit) -> np.ndarray:
     poses = (pose_vertices(body.rig, *pose) for pose in zip(body.theta, body.root, strict=True))
     corners_m = torch.stack([torch.stack([vertices_m.amin(0), vertices_m.amax(0)]) for vertices_m in poses])
     return (corners_m[:, 0].amin(0) + corners_m[:, 1].amax(0)).double().numpy() / 2
-
-
-def _resized(camera: Camera, size_px: int) -> Camera:
-    """Return the same view with `size_px` on its longest side."""
-    scale = size_px / max(camera.width_px, camera.height_px)
-    return camera.resized(max(1, round(scale * camera.width_px)), max(1, round(scale * camera.height_px)))

@@ -79,7 +79,7 @@ def read_camera_path(path: Path, size_px: tuple[int, int]) -> list[Camera]:
     cameras = [
         Camera(lens.name, lens.K, lens.R, metres_per_unit * lens.t_m, *(lens.size_px or size_px)) for lens in lenses
     ]
-    sizes = {(camera.width_px, camera.height_px) for camera in cameras}
+    sizes = {camera.size_px for camera in cameras}
     if len(sizes) != 1:
         raise InputError(
             f"{path}: has cameras of {len(sizes)} image sizes; a path needs one or more cameras, all of one size"

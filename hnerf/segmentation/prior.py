@@ -220,7 +220,7 @@ def _stick_figures(capture: Capture, body: BodyFit | None = None) -> Iterator[tu
 def _stick_figure(camera: Camera, pose_px: np.ndarray) -> _StickFigure:
     """Draw the stick figure of pose_px (25, 2), NaN where nothing is known; clipped far outside the image, as drawing
     takes small integers."""
-    far_px = FAR * max(camera.width_px, camera.height_px)
+    far_px = FAR * max(camera.size_px)
     pose_px = pose_px.clip(-far_px, far_px)
     whole_px = _completed_pose(pose_px)
     known = np.isfinite(whole_px).all(-1, keepdims=True)

@@ -113,8 +113,8 @@ def render_person(person: Renderable, camera: Camera) -> tuple[np.ndarray, np.nd
     rgb = np.zeros((camera.height_px, camera.width_px, 3))
     coverage, mask = np.zeros(rgb.shape[:2]), np.zeros(rgb.shape[:2], bool)
     seen_px, _ = camera.project(person.vertices_m)
-    low = np.floor(seen_px.min(0) - 1).astype(int).clip(0, (camera.width_px, camera.height_px))
-    high = np.ceil(seen_px.max(0) + 2).astype(int).clip(0, (camera.width_px, camera.height_px))
+    low = np.floor(seen_px.min(0) - 1).astype(int).clip(0, camera.size_px)
+    high = np.ceil(seen_px.max(0) + 2).astype(int).clip(0, camera.size_px)
     window = np.s_[low[1] : high[1], low[0] : high[0]]
     pixels = np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), -1)
     for offset in subpixel_offsets_px():
@@ -151,7 +151,7 @@ class RoomView:
     @staticmethod
     def of(camera: Camera) -> "RoomView":
         """Render the room with the same supersampling as the person."""
-        pixels = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), -1).reshape(-1, 2)
+        pixels = camera.pixels_px.reshape(-1, 2)
         plate = np.zeros((len(pixels), 3))
         for offset in subpixel_offsets_px():
             colour, hit = room_colour(*camera.rays(pixels + offset))

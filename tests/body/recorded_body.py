@@ -66,6 +66,6 @@ def record(root: Path, body: BodyFit, cameras: dict[str, Camera], train: tuple[s
         pixels = camera.project(keypoints_m)[0] if name in train else np.full((*keypoints_m.shape[:2], 2), 1e5)
         stored[name] = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], -1)[:, None]
     np.savez(root / "keypoints.npz", **stored)  # type: ignore[arg-type]
-    sizes = {name: (camera.width_px, camera.height_px) for name, camera in cameras.items()}
+    sizes = {name: camera.size_px for name, camera in cameras.items()}
     test = tuple(name for name in cameras if name not in train)
     return Capture("body", root, cameras, train, test, body.frames, (), 25.0, "z", sizes, sizes)

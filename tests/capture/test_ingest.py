@@ -129,7 +129,7 @@ def test_shrinking_takes_camera_keypoints_and_masks_along(folder: Path, tmp_path
             rec.write_png(folder / "masks" / camera / f"{frame:06d}.png", np.repeat(mask[..., None], 3, -1))
     capture = ingest(folder, CaptureSettings(max_side_px=16), tmp_path / "out")  # 24 x 16 -> 16 x 11
     camera, keypoints, shrunk = capture.cameras["01"], capture.keypoints("01"), capture.given_mask("01", 0)
-    assert (camera.width_px, camera.height_px) == (16, 11) and capture.image("01", 0).shape == (11, 16, 3)
+    assert camera.size_px == (16, 11) and capture.image("01", 0).shape == (11, 16, 3)
     assert capture.recorded_sizes_px["01"] == (24, 16)
     sx, sy = 16 / 24, 11 / 16
     assert camera.K[0].tolist() == pytest.approx([20 * sx, 0, (11.5 + 0.5) * sx - 0.5])
@@ -198,7 +198,7 @@ def test_padding_within_two_percent_is_let_through_and_reported(folder: Path, tm
         rec.write_png(folder / "images" / "01" / f"{frame:06d}.png", np.full((1600, 2352, 3), 9, np.uint8))
     capture = ingest(folder, CaptureSettings(max_side_px=1176), tmp_path / "out")
     assert capture.calibrated_sizes_px["01"] == (2400, 1600) and capture.recorded_sizes_px["01"] == (2352, 1600)
-    assert (capture.cameras["01"].width_px, capture.cameras["01"].height_px) == (1176, 800)
+    assert capture.cameras["01"].size_px == (1176, 800)
     assert capture.cameras["01"].K[0, 0] == pytest.approx(10.0)  # the calibrated 20, halved with the image
 
 

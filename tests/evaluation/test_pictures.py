@@ -11,7 +11,7 @@ def test_crops_and_their_camera_agree() -> None:
     camera = ball_camera("a", 30.0)
     box = (slice(10, 50), slice(20, 50))  # 40 x 30 px become 400 x 300
     cropped = pictures.cropped_camera(camera, box)
-    assert (cropped.width_px, cropped.height_px) == pictures.PICTURE_PX
+    assert cropped.size_px == pictures.PICTURE_PX
     point_m = np.array([0.02, -0.03, 1.05])
     (x, y), (u, v) = camera.project(point_m)[0], cropped.project(point_m)[0]
     assert (u, v) == pytest.approx(((x - 20 + 0.5) * 10 - 0.5, (y - 10 + 0.5) * 10 - 0.5))  # pixel centres at integers

@@ -32,7 +32,7 @@ def subject(tmp_path_factory: pytest.TempPathFactory) -> Path:
     capture, _, body = record(folder / "capture")
     capture.save()
     cameras = capture.cameras.values()
-    lenses = [Lens(c.name, c.K, np.zeros(5), c.R, c.t_m, (c.width_px, c.height_px)) for c in cameras]
+    lenses = [Lens(c.name, c.K, np.zeros(5), c.R, c.t_m, c.size_px) for c in cameras]
     write_cameras(folder / "calibration", lenses, "easymocap")
     in_step = {name: {"frame_offset": 0} for name in capture.cameras}
     (folder / "calibration" / "report.json").write_text(json.dumps({"cameras": in_step}))
@@ -107,7 +107,7 @@ def test_a_path_without_sizes_has_that_of_the_recording(subject: Path, tmp_path:
     write_cameras(tmp_path / "path", [lens], "easymocap")
     shrunk = dataclasses.replace(capture, recorded_sizes_px=dict.fromkeys(capture.cameras, (500, 300)))
     (found,) = _cameras(RenderOptions(path=tmp_path / "path", pictures=1), shrunk, BodyFit.load(subject / "training"))
-    assert (found.width_px, found.height_px) == (500, 300)
+    assert found.size_px == (500, 300)
 
 
 def test_cameras_that_did_not_record_have_no_exposure_of_their_own(subject: Path) -> None:

@@ -60,8 +60,7 @@ def _track(folder: Path, name: str, footage: Footage, fps: float, scratch: Path)
     settings = CaptureSettings(max_frames=MAX_FRAMES)
     capture = with_keypoints(ingest(folder, settings, scratch / "capture", alone), scratch / "detected")
     keypoints = subject_keypoints(capture)[name]
-    camera, (width_px, height_px) = capture.cameras[name], capture.recorded_sizes_px[name]
-    scale = np.array([width_px / camera.width_px, height_px / camera.height_px])
+    scale = np.array(capture.recorded_sizes_px[name]) / capture.cameras[name].size_px
     keypoints[..., :2] = keypoints[..., :2] * scale + (scale - 1) / 2
     rows = np.searchsorted(footage.frames, capture.frames)
     return Track(frame_times_s(footage, fps)[rows], keypoints)

@@ -162,8 +162,7 @@ def add_training_distances(capture: Capture, avatar: Avatar, split: str, found: 
 
 def frame_seconds(avatar: Avatar, camera: Camera, frame: int, side_px: int) -> float:
     """Return the median seconds of rendering a fitted pose to an image with this longest side."""
-    scale = side_px / max(camera.width_px, camera.height_px)
-    resized = camera.resized(round(camera.width_px * scale), round(camera.height_px * scale))
+    resized = camera.scaled(side_px / max(camera.size_px))
     k = avatar.body.index(frame)
     seconds: list[float] = []
     while not seconds or (len(seconds) < REPEATS and seconds[0] < SLOW_S):

@@ -41,9 +41,7 @@ def resize(capture: Capture, scale: float, rng: np.random.Generator, out: Path) 
     """Resize training cameras' images and masks by a factor, and what was detected in them. Board footage is
     omitted."""
     cameras = capture.cameras | {
-        name: camera.resized(*(max(1, round(scale * px)) for px in (camera.width_px, camera.height_px)))
-        for name, camera in capture.cameras.items()
-        if name in capture.train_cameras
+        name: camera.scaled(scale) for name, camera in capture.cameras.items() if name in capture.train_cameras
     }
 
     def resized(camera: str, pixels: np.ndarray) -> np.ndarray:
@@ -86,14 +84,13 @@ def rewrite_images(
 
 
 def _resized(pixels: np.ndarray, camera: Camera) -> np.ndarray:
-    size_px = camera.width_px, camera.height_px
-    shrinks = size_px[0] < pixels.shape[1]
-    return cv2.resize(pixels, size_px, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+    shrinks = camera.width_px < pixels.shape[1]
+    return cv2.resize(pixels, camera.size_px, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
 
 
 def _scaled_points(points: np.ndarray, old: Camera, new: Camera) -> np.ndarray:
     """Scale points (..., 3) to another image size, pixel centres at integers; those of zero confidence stay zero."""
-    scale = np.array([new.width_px / old.width_px, new.height_px / old.height_px])
+    scale = np.array(new.size_px) / old.size_px
     xy = points[..., :2] * scale + (scale - 1) / 2
     return np.concatenate([xy, points[..., 2:]], -1) * (points[..., 2:] > 0)
 

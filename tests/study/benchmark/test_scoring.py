@@ -51,7 +51,7 @@ class SizedBall(BallAvatar):
     sizes: list[tuple[int, int]] = field(default_factory=list)
 
     def render(self, camera: Any, theta: torch.Tensor, root: torch.Tensor) -> Rendering:
-        self.sizes.append((camera.width_px, camera.height_px))
+        self.sizes.append(camera.size_px)
         return super().render(camera, theta, root)
 
 
