@@ -149,10 +149,9 @@ def visible_texels(
     normal /= np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-9)
     cosine = (view_m * normal).sum(1) / distance_m
     seen_m, outline = _depth(camera, vertices_m, faces)
-    column, row = np.round(pixels_px).astype(int).T
-    inside = (column >= 0) & (row >= 0) & (column < camera.width_px) & (row < camera.height_px)
-    inside &= (cosine > 0) & (depth_m > 0)  # what is behind the camera would be seen mirrored
-    column, row = (np.where(inside, at, 0) for at in (column, row))
+    at_px = np.round(pixels_px)
+    inside = camera.holds(at_px) & (cosine > 0) & (depth_m > 0)  # what is behind the camera would be seen mirrored
+    column, row = np.where(inside[:, None], at_px, 0).astype(int).T
     visible = inside & ~outline[row, column] & (distance_m < seen_m[row, column] + DEPTH_TOLERANCE_M / cosine.clip(0.1))
     return index[visible], cosine[visible], normal[visible], pixels_px[visible]
 

@@ -134,7 +134,7 @@ def _in_sight(camera: Camera, points_m: np.ndarray) -> bool:
     """Return whether some of the points (..., 3) that are known lie in the picture, and not all on one spot."""
     known_m = points_m[np.isfinite(points_m).all(-1)]
     uv, depth_m = camera.project(known_m)
-    inside = (depth_m > 0) & (uv >= 0).all(-1) & (uv < (camera.width_px, camera.height_px)).all(-1)
+    inside = camera.holds(uv) & (depth_m > 0)
     if inside.sum() <= MIN_IN_SIGHT * len(known_m):
         return len(known_m) == 0
     return float(np.ptp(uv[inside], axis=0).max()) >= MIN_PERSON_PX

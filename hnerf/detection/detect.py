@@ -51,7 +51,8 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
             "feet, upright, and be no smaller than a tenth of the image"
         )
     people = to_body_25({name: people["points_px"] for name, people in found.items()}, KEYPOINTS)
-    people = {name: _inside(points, capture, name) for name, points in people.items()}
+    for name, points in people.items():  # what the network guesses outside the image counts as not seen
+        points *= capture.cameras[name].holds(points[..., :2])[..., None]
     shutil.copytree(capture.root, out, ignore=shutil.ignore_patterns("keypoints.npz"), dirs_exist_ok=True)
     alone = settings.source == "network" or not capture.has_keypoints
     write_keypoints(out, people if alone else _with_own(capture, people))
@@ -163,13 +164,6 @@ def _eight_bit(likely: np.ndarray) -> np.ndarray:
 def _load(out: Path, camera: str) -> dict[str, np.ndarray]:
     with np.load(out / LANDMARKS / f"{camera}.npz", allow_pickle=False) as stored:
         return dict(stored)
-
-
-def _inside(points: np.ndarray, capture: Capture, camera: str) -> np.ndarray:
-    """Set keypoints that the network guessed outside the image to 0."""
-    size_px = np.array(capture.cameras[camera].size_px)
-    inside = ((points[..., :2] >= -0.5) & (points[..., :2] <= size_px - 0.5)).all(-1, keepdims=True)
-    return points * inside
 
 
 def _summary(people: dict[str, np.ndarray]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,11 @@ class Camera:
         uv = x @ self.K.T
         with np.errstate(divide="ignore", invalid="ignore"):
             return uv[..., :2] / uv[..., 2:], depth_m
+
+    def holds(self, pixels_px: Float[np.ndarray, "*S 2"]) -> Bool[np.ndarray, "*S"]:
+        """Return whether points (x, y) lie in the image, which reaches half a pixel beyond the outer pixels' centres;
+        False for NaN."""
+        return np.all((pixels_px >= -0.5) & (pixels_px <= np.array(self.size_px) - 0.5), axis=-1)
 
     def rays(self, pixels_px: Float[np.ndarray, "*S 2"]) -> tuple[Float[np.ndarray, "*S 3"], Float[np.ndarray, "*S 3"]]:
         """Return the rays through pixels, given as (x, y): origins and unit directions in the world."""

@@ -91,7 +91,7 @@ def _visible_vertices(camera: Camera, surface: Surface) -> tuple[np.ndarray, np.
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     xy, depth_m = camera.project(mesh.vertices)
     xy = np.round(xy)
-    inside = ((xy >= 0) & (xy < (camera.width_px, camera.height_px))).all(1) & (depth_m > 0)
+    inside = camera.holds(xy) & (depth_m > 0)
     seen = inside & ((away * mesh.vertex_normals).sum(1) > MIN_FACING_COSINE)
     hits = surface.cast(camera.centre_m, -away[seen])
     met = (mesh.faces[hits.face] == np.flatnonzero(seen)[:, None]).any(1)

@@ -19,6 +19,12 @@ def test_a_point_and_its_ray_by_hand() -> None:
     np.testing.assert_allclose(direction, (point_m - origin_m) / np.sqrt(26))
 
 
+def test_an_image_reaches_half_a_pixel_beyond_its_outer_centres() -> None:
+    """Of 8 x 6 pixels, whose centres are at 0 to 7 and 0 to 5."""
+    inside, outside = [[-0.5, -0.5], [7.5, 5.5], [3, 2]], [[-0.6, 2], [7.6, 2], [3, -0.6], [3, 5.6], [np.nan, 2]]
+    assert CAMERA.holds(np.array(inside)).all() and not CAMERA.holds(np.array(outside)).any()
+
+
 def test_a_resized_camera_sees_the_same_in_the_same_part_of_the_image() -> None:
     """Pixel centres are at integers: of 8 x 6 pixels, at half the width and twice the height, x + 1/2 is halved and
     y + 1/2 doubled."""

@@ -131,7 +131,7 @@ def visible_and_found(fit: BoardFit, corners_m: np.ndarray) -> tuple[np.ndarray,
     visible = np.zeros_like(found)
     for i, camera in enumerate(fit.cameras):
         uv, depth_m = camera.project(corners)
-        inside = ((uv > -0.5) & (uv < [camera.width_px - 0.5, camera.height_px - 0.5])).all(-1) & (depth_m > 0)
+        inside = camera.holds(uv) & (depth_m > 0)
         towards = corners.mean(1) - camera.centre_m
         cosine = (fit.boards.R[..., 2] * towards).sum(-1) / np.linalg.norm(towards, axis=-1)
         by_others = np.delete(found, i, axis=0).any(0)
