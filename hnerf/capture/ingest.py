@@ -20,7 +20,7 @@ from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.formats.videos import Videos
 from hnerf.capture.formats.zjumocap import ZjuMocap
 from hnerf.capture.keypoint_files import read_openpose, read_results
-from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
+from hnerf.capture.keypoint_sets import to_body_25
 from hnerf.capture.lens import Lens
 from hnerf.capture.manifest import (
     CameraSplit,
@@ -32,6 +32,7 @@ from hnerf.capture.manifest import (
 )
 from hnerf.capture.normalise import Normaliser, kept_share
 from hnerf.capture.safe_io import JSON_SUFFIXES, VIDEO_SUFFIXES, file_named, read_image
+from hnerf.capture.subset import write_keypoints
 from hnerf.capture.timing import median_step
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
 from hnerf.config import CaptureSettings
@@ -87,7 +88,8 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     out.mkdir(parents=True, exist_ok=True)
     normalisers, areas = _write_cameras(layout, lenses, footage, wanted, settings, out)
     rows = np.searchsorted(recorded, wanted)
-    _write_keypoints({name: found[rows] for name, found in people.items()}, manifest.keypoints, normalisers, out)
+    chosen = to_body_25({name: found[rows] for name, found in people.items()}, manifest.keypoints)
+    write_keypoints(out, {name: normalisers[name].keypoints(points) for name, points in chosen.items()})
     _write_given_poses(folder, layout, wanted, out)
     if boards := read_board_footage(folder, "extrinsic"):
         normalised_corners(boards, normalisers).save(out)
@@ -187,16 +189,6 @@ def _write_cameras(
         areas |= {name: area} if area else {}
         normalisers[name] = _write_pixels(layout, lens, recording, frames, settings, out)
     return normalisers, areas
-
-
-def _write_keypoints(
-    people: dict[str, np.ndarray], named: KeypointSetName | None, normalisers: dict[str, Normaliser], out: Path
-) -> None:
-    """Write the keypoints of people by camera, detected as (frames, people, K, 3); no file where there are none."""
-    if people:
-        found = to_body_25(people, named)
-        keypoints = {name: normalisers[name].keypoints(points) for name, points in found.items()}
-        np.savez_compressed(out / "keypoints.npz", **keypoints)  # type: ignore[arg-type]
 
 
 def _write_given_poses(folder: Path, layout: Layout, frames: tuple[int, ...], out: Path) -> None:

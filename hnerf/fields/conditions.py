@@ -61,10 +61,6 @@ class Draws:
         view = view_sigma * torch.randn(rays, 3, generator=generator, device=device)
         return Draws(jitter, background, fine, probe, view)
 
-    def with_background(self, background: Tensor) -> "Draws":
-        """Return the same numbers with another colour behind the rays."""
-        return dataclasses.replace(self, background=background)
-
     @staticmethod
     def deterministic(rays: int, samples: int, device: torch.device) -> "Draws":
         """Return the numbers for rendering: every sample in the middle of its stratum, over black."""

@@ -68,7 +68,7 @@ def make_target(rays: PixelRays, draws: Draws, models_background: bool) -> tuple
         return losses.Target(rays.colour, person, everywhere), draws
     if rays.plate is not None:
         colour = torch.where((rays.person | rays.edge)[:, None], rays.colour, rays.plate)
-        return losses.Target(colour, person, everywhere), draws.with_background(rays.plate)
+        return losses.Target(colour, person, everywhere), dataclasses.replace(draws, background=rays.plate)
     colour = torch.where(rays.person[:, None], rays.colour, draws.background)
     return losses.Target(colour, person, (~rays.edge).float()), draws
 

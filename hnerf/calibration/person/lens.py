@@ -33,7 +33,7 @@ def fit_lenses(
     a wrong focal length moves a camera along its line of sight. keypoints (C, frames, 25, 3).
     """
     if not unknown:
-        return LensFit(_posed(cameras, keypoints), 0.0, ""), {}
+        return LensFit(adjust(cameras, keypoints, [camera.name for camera in cameras]), 0.0, ""), {}
     fits: dict[str, Callable[[list[Camera], np.ndarray], LensFit]] = {
         "one focal length": lambda rig, seen: _shared(rig, seen, unknown, False),
         "one focal length, one distortion": lambda rig, seen: _shared(rig, seen, unknown, True),
@@ -47,10 +47,6 @@ def fit_lenses(
         if costs_px[what] < (1 - min_improvement) * costs_px[chosen]:
             chosen = what
     return fits[chosen](cameras, keypoints)._replace(what=chosen), costs_px
-
-
-def _posed(cameras: list[Camera], keypoints: np.ndarray) -> list[Camera]:
-    return adjust(cameras, keypoints, [camera.name for camera in cameras])
 
 
 def _shared(cameras: list[Camera], keypoints: np.ndarray, unknown: Sequence[str], distorted: bool) -> LensFit:

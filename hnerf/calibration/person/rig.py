@@ -122,7 +122,8 @@ def _add_cameras(
     rig = dict(zip(first, pair.cameras, strict=True))
     while True:
         known = sorted(rig)
-        rig = dict(zip(known, _adjusted([rig[i] for i in known], keypoints[known]), strict=True))
+        adjusted = adjust([rig[i] for i in known], keypoints[known], [rig[i].name for i in known])
+        rig = dict(zip(known, adjusted, strict=True))
         if len(rig) == len(cameras):
             return [rig[i] for i in known]
         projections = np.stack([rig[i].projection for i in known])
@@ -139,10 +140,6 @@ def _add_cameras(
                 "of one moment and show the same person, or leave it out"
             )
         rig[best] = tried[best][0]
-
-
-def _adjusted(cameras: list[Camera], keypoints: np.ndarray) -> list[Camera]:
-    return adjust(cameras, keypoints, [camera.name for camera in cameras])
 
 
 def _resection(camera: Camera, points_m: np.ndarray, keypoints: np.ndarray, inlier_px: float) -> tuple[Camera, int]:

@@ -68,11 +68,12 @@ def psnr_curves(variant: Mapping[str, Any]) -> dict[str, list[Point]]:
 
 def frame_points(variant: Mapping[str, Any]) -> dict[str, Point]:
     """Return, by method, seconds a frame at the smallest size that was timed, and PSNR of the finished model."""
-    methods = scored_methods(variant).items()
-    points = {
-        name: (_smallest(scores["frame_seconds"])[1], scores[scores["split"]]["psnr"]) for name, scores in methods
-    }
-    return {name: (seconds, psnr) for name, (seconds, psnr) in points.items() if psnr is not None}
+    points = {}
+    for name, scores in scored_methods(variant).items():
+        seconds, psnr = scores["frame_seconds"], scores[scores["split"]]["psnr"]
+        if psnr is not None:
+            points[name] = (seconds[min(seconds, key=int)], psnr)
+    return points
 
 
 def trivial_psnr(variant: Mapping[str, Any]) -> dict[str, float]:
@@ -233,7 +234,3 @@ def missing_figures(scores: Mapping[str, Any]) -> Iterator[str]:
 
 def _sizes(variant: Mapping[str, Any]) -> list[str]:
     return sorted({size for scores in scored_methods(variant).values() for size in scores["frame_seconds"]}, key=int)
-
-
-def _smallest(frame_seconds: Mapping[str, float]) -> tuple[str, float]:
-    return min(frame_seconds.items(), key=lambda item: int(item[0]))
