@@ -13,6 +13,7 @@ import pytest
 from jaxtyping import install_import_hook
 
 if TYPE_CHECKING:
+    from hnerf.body.rig import Rig
     from hnerf.capture.capture import Capture
 
 SHAPED = ["geometry.camera", "geometry.reach", "geometry.triangulation", "fields.compositing", "fields.encoding"]
@@ -39,6 +40,14 @@ def wave(tmp_path_factory: pytest.TempPathFactory) -> "Capture":
     from tests.shared_data import shared_capture
 
     return ingest(shared_capture("valid-wave"), CaptureSettings(), tmp_path_factory.mktemp("wave"))
+
+
+@pytest.fixture(scope="session")
+def rig() -> "Rig":
+    """Anny's average body, Z up, facing -Y, the left at +X."""
+    from hnerf.body.anny import anny_rig
+
+    return anny_rig()
 
 
 @pytest.fixture(scope="session")

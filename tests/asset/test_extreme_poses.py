@@ -19,14 +19,8 @@ from hnerf.asset.extreme_poses import (
 )
 from hnerf.asset.rig_transfer import clothed_rig
 from hnerf.asset.staging import StagedAvatar
-from hnerf.body.anny import anny_rig
 from hnerf.body.rig import Rig, joint_transforms
 from tests.asset.figure import column_rig, upright_column
-
-
-@pytest.fixture(scope="module")
-def body() -> Rig:
-    return anny_rig()
 
 
 def joints_m(rig: Rig, theta: torch.Tensor | None) -> dict[str, np.ndarray]:
@@ -79,24 +73,24 @@ def test_expressions_and_physiques_are_shown_with_the_poses(staged: StagedAvatar
     assert shown[-1].shown.all()
 
 
-def test_poses_are_what_their_names_say(body: Rig) -> None:
+def test_poses_are_what_their_names_say(rig: Rig) -> None:
     """In body axes: Z up, to the front -Y, to the left +X."""
-    up = joints_m(body, turned(body, ARMS_UP))
-    squat = joints_m(body, turned(body, DEEP_SQUAT))
+    up = joints_m(rig, turned(rig, ARMS_UP))
+    squat = joints_m(rig, turned(rig, DEEP_SQUAT))
     for side, sign in (("L", 1), ("R", -1)):
         assert up[f"wrist.{side}"][2] > up["head"][2] + 0.2 and sign * up[f"wrist.{side}"][0] > 0
         hip, knee, ankle = (squat[f"{name}.{side}"] for name in ("upperleg01", "lowerleg01", "foot"))
         assert knee[1] < hip[1] - 0.2 and abs(knee[2] - hip[2]) < 0.25
         assert ankle[2] < knee[2] - 0.25 and sign * knee[0] > sign * hip[0] + 0.05
-    head = turned(body, TURNED_HEAD)
+    head = turned(rig, TURNED_HEAD)
     assert head is not None
-    turn = joint_transforms(body, head, torch.eye(4))[body.joint_names.index("head"), :3, :3].numpy()
+    turn = joint_transforms(rig, head, torch.eye(4))[rig.joint_names.index("head"), :3, :3].numpy()
     forward = turn @ [0, -1, 0]
     assert math.degrees(math.atan2(forward[0], -forward[1])) == pytest.approx(70, abs=0.1)  # to the left
 
 
-def test_a_fist_brings_finger_ends_to_the_palm(body: Rig) -> None:
-    open_hand, closed = joints_m(body, torch.zeros(len(body.joint_names), 3)), joints_m(body, fist(body))
+def test_a_fist_brings_finger_ends_to_the_palm(rig: Rig) -> None:
+    open_hand, closed = joints_m(rig, torch.zeros(len(rig.joint_names), 3)), joints_m(rig, fist(rig))
     for side in ("L", "R"):
         for finger in range(2, 6):
             before, after = (
@@ -106,6 +100,6 @@ def test_a_fist_brings_finger_ends_to_the_palm(body: Rig) -> None:
     assert fist(column_rig()) is None
 
 
-def test_vertices_by_the_joint_that_they_follow_most(body: Rig) -> None:
-    hands = body.vertices_m[moved_by(body, ("wrist.L", "metacarpal", "finger")).nonzero()[0]]
+def test_vertices_by_the_joint_that_they_follow_most(rig: Rig) -> None:
+    hands = rig.vertices_m[moved_by(rig, ("wrist.L", "metacarpal", "finger")).nonzero()[0]]
     assert hands[:, 0].abs().min() > 0.3 and len(hands) > 200

