@@ -58,26 +58,26 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_training_that_cannot_go_on_is_one_line_and_exit_code_1(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (RankFailedError("the surface is empty: check masks"), "hnerf: the surface is empty: check masks\n"),
+        (
+            InvalidAsset("avatar.usdz: there is no mesh;\nno skeleton"),
+            "hnerf: avatar.usdz: there is no mesh; no skeleton\n",
+        ),
+        (BucketError("s3://x/fit/k.tar: no answer"), "hnerf: s3://x/fit/k.tar: no answer\n"),
+    ],
+)
+def test_a_run_that_cannot_go_on_is_one_line_and_exit_code_1(
+    error: Exception, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def train(*_: object) -> None:
-        raise RankFailedError("the surface is empty: check masks and body fit")
+        raise error
 
     monkeypatch.setattr(train_subject, "fn", train)
     assert main(["run", str(tmp_path)]) == 1
-    assert capsys.readouterr().err == "hnerf: the surface is empty: check masks and body fit\n"
-
-
-def test_an_asset_that_is_not_valid_is_one_line_and_exit_code_1(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def train(*_: object) -> None:
-        raise InvalidAsset("avatar.usdz: there is no mesh;\nno skeleton")
-
-    monkeypatch.setattr(train_subject, "fn", train)
-    assert main(["run", str(tmp_path)]) == 1
-    assert capsys.readouterr().err == "hnerf: avatar.usdz: there is no mesh; no skeleton\n"
+    assert capsys.readouterr().err == line
 
 
 def test_a_store_that_cannot_be_made_is_one_line_and_exit_code_2(
@@ -112,17 +112,6 @@ def test_a_full_disk_is_one_line_and_exit_code_1(
         assert main(["run", str(tmp_path)]) == 1
         (line,) = capsys.readouterr().err.splitlines()
         assert line == f"hnerf: {error}; make room and give the same command again"
-
-
-def test_a_bucket_that_is_away_is_one_line_and_exit_code_1(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def train(*_: object) -> None:
-        raise BucketError("s3://x/fit/k.tar: no answer; can the bucket be reached?")
-
-    monkeypatch.setattr(train_subject, "fn", train)
-    assert main(["run", str(tmp_path)]) == 1
-    assert capsys.readouterr().err == "hnerf: s3://x/fit/k.tar: no answer; can the bucket be reached?\n"
 
 
 def test_cameras_are_not_written_over_the_recordings_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
