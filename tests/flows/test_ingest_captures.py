@@ -17,6 +17,8 @@ from tasks import quarantine
 from tasks.bucket import Bucket
 from tasks.source import read_capture
 
+pytestmark = pytest.mark.usefixtures("runs")
+
 
 @pytest.fixture
 def watched(tmp_path: Path) -> Path:
@@ -57,7 +59,7 @@ def test_each_capture_is_started_once(watched: Path, runs: list[dict[str, Any]])
     assert [Path(run["capture"]).name for run in runs] == ["ada", "bob"]
 
 
-def test_a_copy_or_a_new_name_is_the_same_capture(watched: Path, runs: list[dict[str, Any]]) -> None:
+def test_a_copy_or_a_new_name_is_the_same_capture(watched: Path) -> None:
     look(watched)
     shutil.copytree(watched / "ada", watched / "copy of ada")
     (watched / "bob").rename(watched / "robert")
@@ -74,8 +76,6 @@ def test_a_store_that_was_deleted_trains_again(watched: Path, monkeypatch: pytes
         return SimpleNamespace(id=f"run-{len(keys)}")
 
     monkeypatch.setattr(module, "run_deployment", run_deployment)
-    monkeypatch.setattr(module, "unfinished_runs", lambda: 0)
-    monkeypatch.setattr(module, "restart_crashed", lambda _: 0)
     look(watched)
     for record in (watched.parent / "store" / "ingested").iterdir():
         if record.name != "id":  # as if the machine had gone down before they were written
@@ -87,20 +87,20 @@ def test_a_store_that_was_deleted_trains_again(watched: Path, monkeypatch: pytes
     assert len(set(keys)) == 4
 
 
-def test_changed_content_is_a_new_capture(watched: Path, runs: list[dict[str, Any]]) -> None:
+def test_changed_content_is_a_new_capture(watched: Path) -> None:
     look(watched)
     (watched / "ada" / "images" / "0.jpg").write_text("other pixels")
     assert look(watched) == ["ada"]
 
 
-def test_folders_still_being_written_hidden_and_empty_ones_wait(watched: Path, runs: list[dict[str, Any]]) -> None:
+def test_folders_still_being_written_hidden_and_empty_ones_wait(watched: Path) -> None:
     shutil.copytree(watched / "ada", watched / ".incoming")
     (watched / "empty").mkdir()
     assert look(watched, settle_s=1000.0) == []
     assert look(watched) == ["ada", "bob"]
 
 
-def test_a_copy_under_way_with_a_hidden_name_waits(watched: Path, runs: list[dict[str, Any]]) -> None:
+def test_a_copy_under_way_with_a_hidden_name_waits(watched: Path) -> None:
     """rsync writes beside the file's own name."""
     for path in [*watched.rglob("*")]:
         os.utime(path, (0, 0))
@@ -113,9 +113,7 @@ def test_a_copy_under_way_with_a_hidden_name_waits(watched: Path, runs: list[dic
     assert look(watched, settle_s=0.5) == ["bob"]
 
 
-def test_a_name_that_is_not_utf_8_and_a_deep_folder_are_noted_and_the_others_go_on(
-    watched: Path, runs: list[dict[str, Any]]
-) -> None:
+def test_a_name_that_is_not_utf_8_and_a_deep_folder_are_noted_and_the_others_go_on(watched: Path) -> None:
     shutil.copytree(watched / "ada", watched / os.fsdecode(b"a\xff"))
     (watched / "deep").mkdir()
     at = os.open(watched / "deep", os.O_RDONLY)
@@ -133,7 +131,7 @@ def test_a_name_that_is_not_utf_8_and_a_deep_folder_are_noted_and_the_others_go_
 
 
 def test_a_capture_that_cannot_be_read_is_said_and_the_others_go_on(
-    watched: Path, runs: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    watched: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def unreadable(capture: Path) -> Any:
         if capture.name == "ada":
@@ -148,7 +146,7 @@ def test_a_capture_that_cannot_be_read_is_said_and_the_others_go_on(
 
 
 def test_a_refused_capture_is_noted_until_it_is_changed_or_removed(
-    watched: Path, runs: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+    watched: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The captures themselves stay where they are."""
     for name in ("ada", "bob"):
@@ -185,9 +183,7 @@ def test_notes_are_not_written_through_links(watched: Path, tmp_path: Path) -> N
     assert list((tmp_path / "elsewhere").iterdir()) == []
 
 
-def test_a_run_that_fails_is_noted_where_it_was_started_from(
-    watched: Path, runs: list[dict[str, Any]], prefect_api: str
-) -> None:
+def test_a_run_that_fails_is_noted_where_it_was_started_from(watched: Path, prefect_api: str) -> None:
     store = watched.parent / "store"
     for expected in ([], ["ada.txt"]):  # before and after it is started from the folder
         with pytest.raises(InputError):
@@ -205,7 +201,7 @@ def test_nothing_is_started_where_the_disk_is_nearly_full(
     assert full == runs == [] and "nothing is started" in caplog.text
 
 
-def test_a_look_at_many_known_folders_is_quick(watched: Path, runs: list[dict[str, Any]]) -> None:
+def test_a_look_at_many_known_folders_is_quick(watched: Path) -> None:
     """A hundred folders; a thousand take ten times as long (docs/reliability.md)."""
     for i in range(98):
         (watched / f"c{i}").mkdir()
@@ -243,23 +239,19 @@ def test_no_more_is_started_than_may_wait(
     assert look(watched, max_unfinished=3) == ["new1", "new2"]
 
 
-def test_links_out_of_the_folder_are_not_followed(
-    watched: Path, runs: list[dict[str, Any]], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_links_out_of_the_folder_are_not_followed(watched: Path, caplog: pytest.LogCaptureFixture) -> None:
     (watched / "ada").rename(watched.parent / "elsewhere")
     (watched / "ada").symlink_to(watched.parent / "elsewhere")
     assert look(watched) == ["bob"]
     assert "ada: is a symbolic link and not followed" in caplog.text
 
 
-def test_names_that_are_not_utf_8_are_captures_too(watched: Path, runs: list[dict[str, Any]]) -> None:
+def test_names_that_are_not_utf_8_are_captures_too(watched: Path) -> None:
     (watched / "ada" / os.fsdecode(b"caf\xe9.txt")).touch()
     assert look(watched) == ["ada", "bob"]
 
 
-def test_what_could_not_be_started_is_tried_at_the_next_look(
-    watched: Path, runs: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_could_not_be_started_is_tried_at_the_next_look(watched: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: Any, **__: Any) -> None:
         raise ConnectionError("no server")
 
@@ -296,9 +288,7 @@ def test_captures_in_a_bucket_are_started_by_their_url(bucket: str, tmp_path: Pa
     assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["ada"]
 
 
-def test_a_capture_that_left_the_bucket_is_started_from_where_it_lies(
-    bucket: str, tmp_path: Path, runs: list[dict[str, Any]]
-) -> None:
+def test_a_capture_that_left_the_bucket_is_started_from_where_it_lies(bucket: str, tmp_path: Path) -> None:
     store = tmp_path / "store"
     assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["ada", "bob"]
     filesystem("s3").mv(f"{bucket}/ada/a.mp4", f"{bucket}/adele/a.mp4")
@@ -308,7 +298,7 @@ def test_a_capture_that_left_the_bucket_is_started_from_where_it_lies(
 
 
 def test_a_worker_that_is_not_let_in_does_not_start_a_capture_again(
-    bucket: str, tmp_path: Path, runs: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+    bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = tmp_path / "store"
     assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["ada", "bob"]

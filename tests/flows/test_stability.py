@@ -15,6 +15,8 @@ from flows.stability import stability
 from hnerf.errors import InputError, NotApplicableError
 from tasks.launcher import LostWorkerError
 
+pytestmark = pytest.mark.usefixtures("stages")
+
 STUDY = """
 methods: [fast]
 seeds: [0, 1]
@@ -124,7 +126,7 @@ def study(tmp_path: Path, **options: Any) -> dict[str, Any]:
     return dict(json.loads(table.with_suffix(".json").read_text()))
 
 
-def test_every_run_has_a_verdict(stages: list[dict[str, Any]], tmp_path: Path) -> None:
+def test_every_run_has_a_verdict(tmp_path: Path) -> None:
     found = study(tmp_path)
     seen = [(r["kind"], r["strength"], r["verdict"], r["reason"]) for r in found["runs"] if r["seed"] == 1]
     assert seen == [
@@ -144,9 +146,7 @@ def test_every_run_has_a_verdict(stages: list[dict[str, Any]], tmp_path: Path) -
     assert charts == {"ada-mine-matrix.png", "ada-mine-psnr.png", "ada-mine-chamfer_mm.png"}
 
 
-def test_a_field_without_a_surface_failed(
-    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_field_without_a_surface_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     evaluate = module.evaluate
 
     def evaluate_mist(*inputs: Any) -> Any:
@@ -163,9 +163,7 @@ def test_a_field_without_a_surface_failed(
     assert (run["verdict"], run["reason"]) == ("failed", "signed distance field: not finite; training diverged")
 
 
-def test_runs_are_compared_by_the_images_and_surfaces_that_both_have(
-    stages: list[dict[str, Any]], tmp_path: Path
-) -> None:
+def test_runs_are_compared_by_the_images_and_surfaces_that_both_have(tmp_path: Path) -> None:
     """Compare the noisy run in frame 1 only, where both have 32 dB and 6 mm; the good run's mean of both frames is
     30."""
     good, noisy = study(tmp_path, only=["image_noise"])["runs"][:2]
@@ -177,9 +175,7 @@ def test_runs_are_compared_by_the_images_and_surfaces_that_both_have(
     assert "| ok | 32.00 (+0.00) | 32.50 (+0.00) | 33.00 (+0.00) | 0.900 (+0.000) | 6.00 (+0.00) |" in table
 
 
-def test_the_flow_runs_page_shows_the_charts_themselves(
-    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_flow_runs_page_shows_the_charts_themselves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[str] = []
     monkeypatch.setattr(run_page.FlowRunContext, "get", lambda: True)
     monkeypatch.setattr(run_page, "create_markdown_artifact", lambda text, **_: shown.append(text))
@@ -191,7 +187,7 @@ def test_the_flow_runs_page_shows_the_charts_themselves(
 
 
 def test_what_a_capture_does_not_allow_is_left_out_and_no_verdict(
-    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def degrade_masks(*_: Any) -> Any:
         raise NotApplicableError("ada: has no keypoints")
@@ -202,9 +198,7 @@ def test_what_a_capture_does_not_allow_is_left_out_and_no_verdict(
     assert found["left_out"].count("masks eroded, % of image width, 1: ada: has no keypoints") == 1
 
 
-def test_without_test_cameras_images_are_not_compared(
-    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_test_cameras_images_are_not_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = SimpleNamespace(name="ada", test_cameras=(), novel_pose_frames=(1, 3))
     monkeypatch.setattr(module.Capture, "load", lambda _: capture)
     runs = study(tmp_path, only=["pose_noise"])["runs"]
@@ -230,7 +224,7 @@ def test_each_degradation_is_put_in_at_its_place(stages: list[dict[str, Any]], t
 
 
 def test_a_method_that_cannot_take_the_capture_at_all_is_tried_once_a_seed(
-    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def train(*_: Any) -> Any:
         raise InputError("NeRF models one moment; choose one frame")
@@ -242,7 +236,7 @@ def test_a_method_that_cannot_take_the_capture_at_all_is_tried_once_a_seed(
 
 
 def test_further_seeds_try_what_is_near_a_border_and_nothing_else(
-    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = STUDY.replace("seeds: [0, 1]", "seeds: [0]\nborder_seeds: [3, 4]")
     (tmp_path / "mine.yaml").write_text(text)
@@ -277,9 +271,7 @@ def test_a_part_stands_for_the_capture(
     assert "the capture outside this part: frames 1, novel_poses False" in found["left_out"]
 
 
-def test_bad_input_in_evaluation_is_failure(
-    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bad_input_in_evaluation_is_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def evaluate(*_: Any) -> Any:
         raise InputError("signed distance field: no surface in its box")
 
@@ -289,7 +281,7 @@ def test_bad_input_in_evaluation_is_failure(
 
 @pytest.mark.parametrize("error", [LostWorkerError("rank 0 was killed"), OSError(28, "No space left on device")])
 def test_what_the_machine_did_ends_the_command_and_finished_runs_stand(
-    error: Exception, stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def degrade_fit(*_: Any) -> Any:
         raise error
@@ -304,7 +296,7 @@ def test_what_the_machine_did_ends_the_command_and_finished_runs_stand(
 
 
 def test_what_ends_the_first_run_leaves_an_earlier_study_as_it_was(
-    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def train(*_: Any) -> Any:
         raise KeyboardInterrupt
@@ -318,9 +310,7 @@ def test_what_ends_the_first_run_leaves_an_earlier_study_as_it_was(
     assert "degraded at 2" in (folder / "ada-mine-part.md").read_text()
 
 
-def test_a_chart_that_cannot_be_drawn_hides_nothing(
-    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_chart_that_cannot_be_drawn_hides_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def degrade_fit(*_: Any) -> Any:
         raise LostWorkerError("rank 0 was killed")
 
@@ -333,16 +323,14 @@ def test_a_chart_that_cannot_be_drawn_hides_nothing(
         study(tmp_path, only=["pose_noise"])
 
 
-def test_a_study_of_few_degradations_leaves_the_whole_one_as_it_was(
-    stages: list[dict[str, Any]], tmp_path: Path
-) -> None:
+def test_a_study_of_few_degradations_leaves_the_whole_one_as_it_was(tmp_path: Path) -> None:
     study(tmp_path)
     files = {path: path.read_bytes() for path in (tmp_path / "store" / "stability").iterdir()}
     study(tmp_path, only=["pose_noise"])
     assert {path: path.read_bytes() for path in files} == files
 
 
-def test_charts_of_an_earlier_call_go(stages: list[dict[str, Any]], tmp_path: Path) -> None:
+def test_charts_of_an_earlier_call_go(tmp_path: Path) -> None:
     """Run poses that are judged by surfaces alone, which have no curves."""
     study(tmp_path, only=["pose_noise"])
     study(tmp_path, only=["extreme_poses"])
@@ -358,7 +346,7 @@ def torn_surface(root: Path) -> SimpleNamespace:
 
 
 def test_a_run_to_compare_with_that_fails_is_kept_and_ends_its_seed(
-    stages: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     torn = torn_surface(tmp_path / "torn")
     monkeypatch.setattr(module, "check_meshes", lambda *_: torn)
@@ -369,7 +357,7 @@ def test_a_run_to_compare_with_that_fails_is_kept_and_ends_its_seed(
     assert "| pose noise, ° a joint | failed at 2 |" in text
 
 
-def test_what_has_no_new_poses_is_judged_on_new_views(stages: list[dict[str, Any]], tmp_path: Path) -> None:
+def test_what_has_no_new_poses_is_judged_on_new_views(tmp_path: Path) -> None:
     """Nerfies has no novel poses at all; the paper's method has none with one frame, and then nothing in common with
     the others."""
     (tmp_path / "mine.yaml").write_text(
@@ -389,9 +377,7 @@ def test_what_has_no_new_poses_is_judged_on_new_views(stages: list[dict[str, Any
     assert any("Nerfies has no pose to set" in reason for reason in found["left_out"])
 
 
-def test_the_command_prints_the_table(
-    stages: list[dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_prints_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--study", str(tmp_path / "mine.yaml"), "--store", str(tmp_path / "store"), "--only", "pose_noise"]
     assert main(["stability", str(tmp_path), "--methods", "fast, paper", *options]) == 0
     shown = capsys.readouterr().out
