@@ -34,7 +34,7 @@ def quality_chart(history: list[dict[str, Any]], path: Path) -> bool:
     for axes, colour, (name, points) in zip(panels, COLOURS, series.items(), strict=False):
         _line(axes, points, colour, None)
         _finish(axes, "seconds of training", f"held-out {name}")
-    _save(figure, path)
+    figure.savefig(path, facecolor="white")
     return True
 
 
@@ -64,7 +64,7 @@ def _chart(path: Path, series: dict[str, Points], x_label: str, y_label: str, sc
     axes.set_yscale(scale)
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=9, labelcolor=INK)
     _finish(axes, x_label, y_label)
-    _save(figure, path)
+    figure.savefig(path, facecolor="white")
     return True
 
 
@@ -92,7 +92,3 @@ def style(axes: Axes, x_label: str, y_label: str) -> None:
     for side, spine in axes.spines.items():
         spine.set_visible(side in ("left", "bottom"))
         spine.set_color(FAINT)
-
-
-def _save(figure: Figure, path: Path) -> None:
-    figure.savefig(path, facecolor="white")
