@@ -1,6 +1,5 @@
 """Chromium without a window, driven through a pipe by its DevTools protocol, so that no package drives it."""
 
-import base64
 import json
 import os
 import shutil
@@ -100,10 +99,6 @@ class Page:
         x, y = self.evaluate(f"(({{x, y, width, height}}) => [x + width / 2, y + height / 2])({box})")
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-
-    def screenshot(self) -> bytes:
-        """Return the window as a PNG file."""
-        return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
 
     def complaints(self) -> list[dict[str, Any]]:
         """Return the warnings and errors that the console shows."""

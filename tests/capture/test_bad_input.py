@@ -14,13 +14,7 @@ from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from tests.capture import recordings as rec
-
-
-class Bomb:
-    """An object whose pickle leaves a trace if anyone loads it."""
-
-    def __reduce__(self) -> tuple:
-        return os.system, ("touch pickle-was-loaded",)
+from tests.capture.test_safe_pickle import Bomb
 
 
 def _edit(path: Path, old: str, new: str) -> None:
