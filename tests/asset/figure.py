@@ -12,6 +12,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import Rig, pose_vertices
 from hnerf.capture.capture import Capture
 from hnerf.geometry.camera import Camera
+from tests.body.boxes import hinged
 
 FRAMES = (3, 4, 5, 8)  # with a gap
 
@@ -21,22 +22,8 @@ def column_rig() -> Rig:
     = 0.7 to 0.9."""
     column = upright_column(0.15, 0.0, 1.6)
     vertices_m = torch.from_numpy(column.vertices).float()
-    upper = upper_weight(vertices_m[:, 2])
-    return Rig(
-        vertices_m=vertices_m,
-        faces=torch.from_numpy(column.faces).long(),
-        joints_m=torch.tensor([[0.0, 0, 0], [0, 0, 0.8]]),
-        joint_names=("root", "upper.L"),
-        parents=torch.tensor([-1, 0]),
-        beta=torch.zeros(1),
-        beta_names=("height",),
-        shape_basis=torch.zeros(1, len(vertices_m), 3),
-        joint_basis=torch.zeros(1, 2, 3),
-        skin_joints=torch.tensor([[0, 1]]).repeat(len(vertices_m), 1),
-        skin_weights=torch.stack([1 - upper, upper], 1),
-        free=torch.tensor([False, True]),
-        keypoint_weights=torch.zeros(25, len(vertices_m)),
-    )
+    faces, joints_m = torch.from_numpy(column.faces).long(), torch.tensor([[0.0, 0, 0], [0, 0, 0.8]])
+    return hinged(vertices_m, faces, joints_m, ("root", "upper.L"), upper_weight(vertices_m[:, 2]))
 
 
 def upright_column(radius_m: float, bottom_m: float, top_m: float) -> trimesh.Trimesh:

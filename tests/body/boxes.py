@@ -1,5 +1,7 @@
 """A body small enough to work out by hand: a unit box, and a two-joint column of stacked boxes."""
 
+import dataclasses
+
 import torch
 import trimesh
 from torch import Tensor
@@ -36,18 +38,24 @@ def box_rig(bend_segments: int = 0, splits: int = 0) -> Rig:
     upper = ((vertices[:, 2] - 0.66) / 0.68).clamp(0, 1) if bend_segments else torch.zeros(len(vertices))
     basis = torch.zeros(1, len(vertices), 3)
     basis[0, vertices[:, 2] == height_m, 2] = 1.0
+    rig = hinged(vertices, faces, torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 1.0]]), ("lower", "upper"), upper)
+    return dataclasses.replace(rig, shape_basis=basis)
+
+
+def hinged(vertices_m: Tensor, faces: Tensor, joints_m: Tensor, names: tuple[str, ...], upper: Tensor) -> Rig:
+    """Return a rig of two bones, of which the upper one has these weights (V,); its one shape moves nothing."""
     return Rig(
-        vertices_m=vertices,
+        vertices_m=vertices_m,
         faces=faces,
-        joints_m=torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 1.0]]),
-        joint_names=("lower", "upper"),
+        joints_m=joints_m,
+        joint_names=names,
         parents=torch.tensor([-1, 0]),
         beta=torch.zeros(1),
         beta_names=("height",),
-        shape_basis=basis,
+        shape_basis=torch.zeros(1, len(vertices_m), 3),
         joint_basis=torch.zeros(1, 2, 3),
-        skin_joints=torch.tensor([[0, 1]]).repeat(len(vertices), 1),
+        skin_joints=torch.tensor([[0, 1]]).repeat(len(vertices_m), 1),
         skin_weights=torch.stack([1 - upper, upper], 1),
         free=torch.tensor([False, True]),
-        keypoint_weights=torch.zeros(25, len(vertices)),
+        keypoint_weights=torch.zeros(25, len(vertices_m)),
     )
