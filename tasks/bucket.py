@@ -5,7 +5,7 @@ Objects must appear whole or not at all, as in object stores; on a local or moun
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -87,11 +87,9 @@ class Bucket:
 
     def size_bytes(self, name: str) -> int | None:
         """Return the size of an object, None if there is no such object."""
-        with self._answering(name):
-            try:
-                return int(self.fs.info(self._path(name))["size"])
-            except FileNotFoundError:
-                return None
+        with self._answering(name), suppress(FileNotFoundError):
+            return int(self.fs.info(self._path(name))["size"])
+        return None
 
     def folders(self) -> list[str]:
         """Return the names of the folders at the top, sorted, without hidden ones; none before the first file."""
@@ -149,20 +147,14 @@ class Bucket:
 
     def read_note(self, name: str) -> bytes | None:
         """Return the beginning of a small object, None if there is no such object."""
-        with self._answering(name):
-            try:
-                with self.fs.open(self._path(name), "rb") as file:
-                    return bytes(file.read(MAX_NOTE_BYTES))
-            except FileNotFoundError:
-                return None
+        with self._answering(name), suppress(FileNotFoundError), self.fs.open(self._path(name), "rb") as file:
+            return bytes(file.read(MAX_NOTE_BYTES))
+        return None
 
     def remove(self, name: str) -> None:
         """Remove an object if it is there."""
-        with self._answering(name):
-            try:
-                self.fs.rm_file(self._path(name))
-            except FileNotFoundError:
-                return
+        with self._answering(name), suppress(FileNotFoundError):
+            self.fs.rm_file(self._path(name))
 
     def _path(self, name: str) -> str:
         return f"{self.root}/{name}"
