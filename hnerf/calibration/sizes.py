@@ -24,13 +24,15 @@ def _crop_or_pad(share: float) -> SizeChange:
 
 def _stretch(camera: Camera, calibrated_px: tuple[int, int], recorded_px: tuple[int, int]) -> Camera:
     sx, sy = (r / c for r, c in zip(recorded_px, calibrated_px, strict=True))
-    return dataclasses.replace(camera, K=np.diag([sx, sy, 1]) @ camera.K)
+    stretched = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])  # about the picture's corner
+    return dataclasses.replace(camera, K=stretched @ camera.K)
 
 
 def _scale_and_pad(camera: Camera, calibrated_px: tuple[int, int], recorded_px: tuple[int, int]) -> Camera:
     scale = min(r / c for r, c in zip(recorded_px, calibrated_px, strict=True))
     per_recorded = camera.width_px / recorded_px[0]
-    dx, dy = (per_recorded * (r - scale * c) / 2 for r, c in zip(recorded_px, calibrated_px, strict=True))
+    padding_px = (per_recorded * (r - scale * c) / 2 for r, c in zip(recorded_px, calibrated_px, strict=True))
+    dx, dy = ((scale - 1) / 2 + px for px in padding_px)
     return dataclasses.replace(camera, K=np.array([[scale, 0, dx], [0, scale, dy], [0, 0, 1]]) @ camera.K)
 
 

@@ -29,8 +29,10 @@ def test_each_change_by_hand() -> None:
     changed = {what: change(camera, (1080, 1000), (1000, 1000)).K for what, change in SIZE_CHANGES.items()}
     assert changed["cropped or padded evenly"][0].tolist() == [1000, 0, 459.5]
     assert changed["cropped or padded on the left or at the top"][0].tolist() == [1000, 0, 419.5]
-    assert changed["stretched"][:2, :2].round(1).tolist() == [[925.9, 0], [0, 1000]]
-    assert changed["scaled and padded evenly"][:2].round(1).tolist() == [[925.9, 0, 462.5], [0, 925.9, 499.5]]
+    # The middle of the picture stays its middle: half of 1000 is 500, half a pixel from the centre at 499.5; 540 of the
+    # calibrated 1080 become 500, so what was at 500 comes to lie at 500 * 1000 / 1080 = 462.963.
+    assert changed["stretched"][:2].round(3).tolist() == [[925.926, 0, 462.463], [0, 1000, 499.5]]
+    assert changed["scaled and padded evenly"][:2].round(3).tolist() == [[925.926, 0, 462.463], [0, 925.926, 499.5]]
 
 
 def test_bars_explain_a_size(narrow: Capture) -> None:
@@ -50,7 +52,7 @@ def test_residuals_choose_only_where_bars_do_not_explain_and_only_with_proof(nar
     cameras = ring(4)
     keypoints = np.stack([seen[:, 0] for seen in detections(cameras, 1).values()])
     # The picture was stretched: the intrinsics of the wider one are 1.08 times too long across.
-    K = np.diag([1.08, 1, 1]) @ cameras[1].K
+    K = np.array([[1.08, 0, 0.04], [0, 1, 0], [0, 0, 1]]) @ cameras[1].K
     as_calibrated = [dataclasses.replace(c, K=K) if c.name == "c1" else c for c in cameras]
     costs: dict[str, float] = {}
     matched, notes = _refine_for_size(narrow, as_calibrated, keypoints, ("c1",), 3.0, costs)
