@@ -3,13 +3,16 @@
 `avatar.usda` is the interface: variant sets, asset information, and payloads that lie in `avatar/`. `avatar_24.usda`
 and `avatar_30.usda` show it at these rates, for importers that ignore a file's own. `avatar.usdz` has the same prims
 and variants in one layer, as ARKit asks. `avatar_cache.usdz` has the surface as points at every frame.
+
+With a second avatar, of the captured mesh, there is a variant set `topology`. All other variant sets are inside its
+variants, and the names of payloads and pictures begin with the variant's.
 """
 
 import struct
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from zipfile import ZipFile
@@ -46,6 +49,9 @@ from hnerf.geometry.camera import Camera
 FIRST_TIME = bytes([0, 0, 0x21, 0])  # midnight, 1 January 1980, in ZIP's time and date
 INTERFACE, PAYLOADS = "avatar.usda", "avatar"
 
+Variant = tuple[str, str]  # its set and its name there
+Avatars = dict[str, StagedAvatar]  # by topology; by "", without that variant set, if there is only one
+
 
 @dataclass(frozen=True)
 class AssetInfo:
@@ -61,20 +67,30 @@ class AssetInfo:
 @dataclass(frozen=True)
 class Part:
     """A part of the package. name: of its payload; author: defines its prims; fps: the rate of its layer's time codes;
-    variant: its set and its name there, if it is one."""
+    variant: its set and its name there, if it is one; topology: likewise, which that is inside of."""
 
     name: str
     author: Callable[[Usd.Stage], None]
     fps: float
-    variant: tuple[str, str] | None = None
+    variant: Variant | None = None
+    topology: Variant | None = None
 
 
-def write_package(out: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
-    """Write `avatar.usda`, `avatar_24.usda`, `avatar_30.usda` and the folder `avatar/` into `out`."""
+def write_package(
+    out: Path,
+    avatar: StagedAvatar,
+    cameras: Iterable[Camera],
+    fps: float,
+    info: AssetInfo,
+    captured: StagedAvatar | None = None,
+) -> None:
+    """Write `avatar.usda`, `avatar_24.usda`, `avatar_30.usda` and the folder `avatar/` into `out`; captured: the same
+    avatar with the captured mesh, if both are wanted."""
+    avatars = _by_topology(avatar, captured)
     folder = out / PAYLOADS
     folder.mkdir()
-    _write_images(folder, avatar)
-    parts = _parts(avatar, list(cameras), fps)
+    _write_images(folder, avatars)
+    parts = _parts(avatars, list(cameras), fps)
     for part in parts:
         layer = Usd.Stage.CreateNew(str(folder / f"{part.name}.usdc"))
         _set_axes(layer)
@@ -82,26 +98,34 @@ def write_package(out: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fp
         layer.SetDefaultPrim(layer.OverridePrim(ROOT))
         part.author(layer)
         layer.GetRootLayer().Save()
-    _write_interface(out / INTERFACE, parts, avatar, fps, info, CAPTURED)
+    _write_interface(out / INTERFACE, parts, avatars, fps, info, CAPTURED)
     for rate in RATES:
-        _write_interface(out / f"avatar_{rate}.usda", parts, avatar, rate, info, f"{CAPTURED}_{rate}")
+        _write_interface(out / f"avatar_{rate}.usda", parts, avatars, rate, info, f"{CAPTURED}_{rate}")
 
 
-def write_usdz(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
+def write_usdz(
+    path: Path,
+    avatar: StagedAvatar,
+    cameras: Iterable[Camera],
+    fps: float,
+    info: AssetInfo,
+    captured: StagedAvatar | None = None,
+) -> None:
     """Write `avatar.usdz`: the same prims and variants as the package in a single layer, and the texture."""
+    avatars = _by_topology(avatar, captured)
     with tempfile.TemporaryDirectory() as folder:
-        stage = _new_stage(Path(folder) / "avatar.usdc", avatar, avatar.frames, fps, info)
-        for part in _parts(avatar, list(cameras), fps):
-            with _in_variant(stage, part):
+        stage = _new_stage(Path(folder) / "avatar.usdc", avatars, avatar.frames, fps, info)
+        for part in _parts(avatars, list(cameras), fps):
+            with _in_variant(stage, part.topology), _in_variant(stage, part.variant):
                 part.author(stage)
-        _select(stage, CAPTURED)
-        _package(stage, avatar, path)
+        _select(stage, avatars, CAPTURED)
+        _package(stage, avatars, path)
 
 
 def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
     """Write `avatar_cache.usdz`: the surface as world-space points at every frame, for programs without skinning."""
     with tempfile.TemporaryDirectory() as folder:
-        stage = _new_stage(Path(folder) / "avatar_cache.usdc", avatar, avatar.frames, fps, info)
+        stage = _new_stage(Path(folder) / "avatar_cache.usdc", {"": avatar}, avatar.frames, fps, info)
         author_cameras(stage, cameras, avatar.stage_from_world)
         mesh = define_mesh(stage, ROOT.AppendChild("Surface"), avatar, level=0)
         author_captured_look(stage, [mesh.GetPath()], avatar)
@@ -110,12 +134,34 @@ def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps
             points.Set(vec3f(posed), float(frame))
             extents.Set(extent(posed), float(frame))
             normals.Set(vec3f(normals_of(posed, avatar.faces)), float(frame))
-        _package(stage, avatar, path)
+        _package(stage, {"": avatar}, path)
 
 
-def _parts(avatar: StagedAvatar, cameras: list[Camera], fps: float) -> list[Part]:
-    """Return the parts of the package. What one part says is stronger than what later ones say: shapes replace the
-    extents of motions."""
+def _by_topology(avatar: StagedAvatar, captured: StagedAvatar | None) -> Avatars:
+    return {"": avatar} if captured is None else {"registered": avatar, "captured": captured}
+
+
+def _prefix(topology: str) -> str:
+    """Return what names of payloads and pictures begin with."""
+    return f"{topology}_" if topology else ""
+
+
+def _parts(avatars: Avatars, cameras: list[Camera], fps: float) -> list[Part]:
+    """Return the parts of the package, inside the variants of `topology` if there are several."""
+    return [
+        replace(part, name=_prefix(topology) + part.name, topology=_variant(topology))
+        for topology, avatar in avatars.items()
+        for part in _parts_of(avatar, cameras, fps, _prefix(topology))
+    ]
+
+
+def _variant(topology: str) -> Variant | None:
+    return ("topology", topology) if topology else None
+
+
+def _parts_of(avatar: StagedAvatar, cameras: list[Camera], fps: float, prefix: str) -> list[Part]:
+    """Return the parts of one topology; prefix: of its pictures. What one part says is stronger than what later ones
+    say: shapes replace the extents of motions."""
     view = partial(author_cameras, cameras=cameras, stage_from_world=avatar.stage_from_world)
     return [
         *(
@@ -131,7 +177,7 @@ def _parts(avatar: StagedAvatar, cameras: list[Camera], fps: float) -> list[Part
             )
             for level in range(len(avatar.levels))
         ),
-        *_looks(avatar, fps),
+        *_looks(avatar, fps, prefix),
         Part("cameras", view, fps),
         *(
             Part(f"rig_{name}", partial(author_rig, name=name, rig=rig, levels=avatar.levels), fps, ("rig", name))
@@ -144,54 +190,57 @@ def _parts(avatar: StagedAvatar, cameras: list[Camera], fps: float) -> list[Part
     ]
 
 
-def _looks(avatar: StagedAvatar, fps: float) -> list[Part]:
+def _looks(avatar: StagedAvatar, fps: float, prefix: str) -> list[Part]:
     """Return the look as captured, and, if there is one, that of the albedo with the light."""
-    author = partial(author_captured_look, meshes=surface_paths(avatar), avatar=avatar)
+    meshes = surface_paths(avatar)
+    author = partial(author_captured_look, meshes=meshes, avatar=avatar, prefix=prefix)
     looks = [Part("look_captured", author, fps, ("look", "captured"))]
     if avatar.albedo is not None:
         _, intensity = dome(avatar.albedo.light)
-        author = partial(author_albedo_look, meshes=surface_paths(avatar), avatar=avatar, intensity=intensity)
+        author = partial(author_albedo_look, meshes=meshes, avatar=avatar, intensity=intensity, prefix=prefix)
         looks.append(Part("look_albedo", author, fps, ("look", "albedo")))
     return looks
 
 
 @contextmanager
-def _in_variant(stage: Usd.Stage, part: Part) -> Iterator[None]:
-    """Author what follows inside the part's variant of the root prim, if it is one."""
-    if part.variant is None:
+def _in_variant(stage: Usd.Stage, variant: Variant | None) -> Iterator[None]:
+    """Author what follows inside a variant of the root prim, if there is one."""
+    if variant is None:
         yield
         return
-    variants = stage.GetDefaultPrim().GetVariantSets().AddVariantSet(part.variant[0])
-    variants.AddVariant(part.variant[1])
-    variants.SetVariantSelection(part.variant[1])
+    variants = stage.GetDefaultPrim().GetVariantSets().AddVariantSet(variant[0])
+    variants.AddVariant(variant[1])
+    variants.SetVariantSelection(variant[1])
     with variants.GetVariantEditContext():
         yield
 
 
-def _select(stage: Usd.Stage, motion: str) -> None:
+def _select(stage: Usd.Stage, avatars: Avatars, motion: str) -> None:
+    """Select what is shown at first: the first topology, and in each one the captured motion of the whole mesh."""
     sets = stage.GetDefaultPrim().GetVariantSets()
-    sets.SetSelection("shape", CAPTURED)
-    sets.SetSelection("lod", "lod0")
-    sets.SetSelection("look", "captured")
-    sets.SetSelection("rig", FULL)
-    sets.SetSelection("motion", motion)
+    for topology in reversed(avatars):
+        with _in_variant(stage, _variant(topology)):
+            sets.SetSelection("shape", CAPTURED)
+            sets.SetSelection("lod", "lod0")
+            sets.SetSelection("look", "captured")
+            sets.SetSelection("rig", FULL)
+            sets.SetSelection("motion", motion)
 
 
-def _write_interface(
-    file: Path, parts: list[Part], avatar: StagedAvatar, fps: float, info: AssetInfo, motion: str
-) -> None:
+def _write_interface(file: Path, parts: list[Part], avatars: Avatars, fps: float, info: AssetInfo, motion: str) -> None:
     """Write an interface layer whose time codes have a rate, with that motion selected. It has payloads of its own:
     time codes that are scaled twice are not whole, and importers that hold samples would be a frame late."""
-    stage = _new_stage(file, avatar, avatar.rigs[FULL].motions[motion].codes, fps, info)
+    codes = next(iter(avatars.values())).rigs[FULL].motions[motion].codes
+    stage = _new_stage(file, avatars, codes, fps, info)
     for part in parts:
         path = f"./{PAYLOADS}/{part.name}.usdc"
-        with _in_variant(stage, part):
+        with _in_variant(stage, part.topology), _in_variant(stage, part.variant):
             stage.GetDefaultPrim().GetPayloads().AddPayload(path)
-    _select(stage, motion)
+    _select(stage, avatars, motion)
     stage.GetRootLayer().Save()
 
 
-def _new_stage(file: Path, avatar: StagedAvatar, codes: np.ndarray, fps: float, info: AssetInfo) -> Usd.Stage:
+def _new_stage(file: Path, avatars: Avatars, codes: np.ndarray, fps: float, info: AssetInfo) -> Usd.Stage:
     """Return a stage from the first to the last of time codes, with the root prim and what it says of itself."""
     stage = Usd.Stage.CreateNew(str(file))
     _set_axes(stage)
@@ -207,7 +256,7 @@ def _new_stage(file: Path, avatar: StagedAvatar, codes: np.ndarray, fps: float, 
     model.SetAssetVersion(info.version)
     for key, value in (("captureDigest", info.capture), ("licence", info.licence)):
         root.SetAssetInfoByKey(key, value)
-    UsdGeom.ModelAPI.Apply(root).SetExtentsHint(_everywhere(avatar))
+    UsdGeom.ModelAPI.Apply(root).SetExtentsHint(extent(np.concatenate([*map(_everywhere, avatars.values())])))
     return stage
 
 
@@ -221,29 +270,31 @@ def _set_rate(stage: Usd.Stage, fps: float) -> None:
     stage.SetFramesPerSecond(fps)
 
 
-def _everywhere(avatar: StagedAvatar) -> object:
-    """Return the box around the surface at rest, in all motions and physiques, and in the cache."""
+def _everywhere(avatar: StagedAvatar) -> np.ndarray:
+    """Return points (n, 3) whose box is around the surface at rest, in all motions and physiques, and in the cache."""
     corners = [avatar.rest_points_m, *(boxes.reshape(-1, 3) for boxes in avatar.extents_m.values())]
     corners += [physique_box(avatar, name) for name in avatar.physiques_m]
-    return extent(np.concatenate([*corners, avatar.points_m.reshape(-1, 3)]))
+    return np.concatenate([*corners, avatar.points_m.reshape(-1, 3)])
 
 
-def _package(stage: Usd.Stage, avatar: StagedAvatar, path: Path) -> None:
+def _package(stage: Usd.Stage, avatars: Avatars, path: Path) -> None:
     layer = Path(stage.GetRootLayer().realPath)
     stage.GetRootLayer().Save()
-    _write_images(layer.parent, avatar)
+    _write_images(layer.parent, avatars)
     if not UsdUtils.CreateNewARKitUsdzPackage(str(layer), str(path)):
         raise OSError(f"{path}: USD could not write the package; is the disk full?")
     _forget_times(path)
 
 
-def _write_images(folder: Path, avatar: StagedAvatar) -> None:
-    write_image(folder / TEXTURE_NAME, avatar.texture)
-    if avatar.albedo is not None:
-        write_image(folder / ALBEDO_NAME, avatar.albedo.texture)
-        write_image(folder / LIGHT_NAME, dome(avatar.albedo.light)[0])
-    if avatar.normal_map is not None:
-        write_image(folder / NORMAL_MAP_NAME, avatar.normal_map)
+def _write_images(folder: Path, avatars: Avatars) -> None:
+    for topology, avatar in avatars.items():
+        prefix = _prefix(topology)
+        write_image(folder / f"{prefix}{TEXTURE_NAME}", avatar.texture)
+        if avatar.albedo is not None:
+            write_image(folder / f"{prefix}{ALBEDO_NAME}", avatar.albedo.texture)
+            write_image(folder / f"{prefix}{LIGHT_NAME}", dome(avatar.albedo.light)[0])
+        if avatar.normal_map is not None:
+            write_image(folder / f"{prefix}{NORMAL_MAP_NAME}", avatar.normal_map)
 
 
 def _forget_times(path: Path) -> None:

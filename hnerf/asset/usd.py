@@ -81,21 +81,26 @@ def physique_box(avatar: StagedAvatar, name: str) -> np.ndarray:
     return np.stack([boxes[:, 0].min(0) - grown_m, boxes[:, 1].max(0) + grown_m])
 
 
-def author_captured_look(stage: Usd.Stage, meshes: Iterable[Sdf.Path], avatar: StagedAvatar) -> None:
-    """Bind meshes to the texture in the recording's light."""
-    _define_material(stage, "Captured", TEXTURE_NAME, meshes, avatar)
+def author_captured_look(stage: Usd.Stage, meshes: Iterable[Sdf.Path], avatar: StagedAvatar, prefix: str = "") -> None:
+    """Bind meshes to the texture in the recording's light; prefix: of the names of its pictures."""
+    _define_material(stage, "Captured", TEXTURE_NAME, meshes, avatar, prefix)
 
 
-def author_albedo_look(stage: Usd.Stage, meshes: Iterable[Sdf.Path], avatar: StagedAvatar, intensity: float) -> None:
-    """Bind meshes to the albedo, and define the recording's light: intensity times the picture LIGHT_NAME."""
-    _define_material(stage, "Albedo", ALBEDO_NAME, meshes, avatar)
+def author_albedo_look(
+    stage: Usd.Stage, meshes: Iterable[Sdf.Path], avatar: StagedAvatar, intensity: float, prefix: str = ""
+) -> None:
+    """Bind meshes to the albedo, and define the recording's light: intensity times the picture LIGHT_NAME; prefix: of
+    the names of its pictures."""
+    _define_material(stage, "Albedo", ALBEDO_NAME, meshes, avatar, prefix)
     light = UsdLux.DomeLight.Define(stage, ROOT.AppendChild("Light"))
     light.CreateIntensityAttr(intensity)
-    light.CreateTextureFileAttr(f"./{LIGHT_NAME}")
+    light.CreateTextureFileAttr(f"./{prefix}{LIGHT_NAME}")
     light.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
 
 
-def _define_material(stage: Usd.Stage, name: str, file: str, meshes: Iterable[Sdf.Path], avatar: StagedAvatar) -> None:
+def _define_material(
+    stage: Usd.Stage, name: str, file: str, meshes: Iterable[Sdf.Path], avatar: StagedAvatar, prefix: str
+) -> None:
     """Define a matte preview surface with a texture file and the normal map, and bind meshes to it."""
     material = UsdShade.Material.Define(stage, ROOT.AppendPath(f"Materials/{name}"))
     UsdGeom.Scope.Define(stage, material.GetPath().GetParentPath())
@@ -103,7 +108,7 @@ def _define_material(stage: Usd.Stage, name: str, file: str, meshes: Iterable[Sd
     reader.CreateIdAttr("UsdPrimvarReader_float2")
     reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
     coordinates = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
-    texture = _define_texture(stage, material.GetPath().AppendChild("Texture"), file, "sRGB", coordinates)
+    texture = _define_texture(stage, material.GetPath().AppendChild("Texture"), prefix + file, "sRGB", coordinates)
     surface = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Surface"))
     surface.CreateIdAttr("UsdPreviewSurface")
     surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
@@ -113,7 +118,7 @@ def _define_material(stage: Usd.Stage, name: str, file: str, meshes: Iterable[Sd
     surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(colour)
     if avatar.normal_map is not None:
         path = material.GetPath().AppendChild("NormalMap")
-        normals = _define_texture(stage, path, NORMAL_MAP_NAME, "raw", coordinates)
+        normals = _define_texture(stage, path, prefix + NORMAL_MAP_NAME, "raw", coordinates)
         normals.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
         normals.CreateInput("bias", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(-1, -1, -1, 0))
         normal = normals.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)

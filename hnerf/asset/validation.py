@@ -41,11 +41,20 @@ def validate_package(path: Path) -> dict[str, Any]:
 def each_variant(stage: Usd.Stage) -> Iterator[str]:
     """Select combinations of the root prim's variants in turn, in the session layer, and yield what a message says of
     each: nothing without variants, else like "rig=full motion=captured: ". They are all those that have at least two of
-    the first motion, the first shape and the first level of detail."""
-    root = stage.GetDefaultPrim()
-    sets = {} if not root else {name: root.GetVariantSet(name) for name in root.GetVariantSets().GetNames()}
+    the first motion, the first shape and the first level of detail, in each topology."""
     stage.SetEditTarget(stage.GetSessionLayer())
-    names = {name: variants.GetVariantNames() for name, variants in sets.items()}
+    root = stage.GetDefaultPrim()
+    topologies = root.GetVariantSet("topology").GetVariantNames() if root else []
+    for topology in topologies or [""]:
+        yield from _each_inside(root, topology)
+
+
+def _each_inside(root: Usd.Prim, topology: str) -> Iterator[str]:
+    """Select what `each_variant` says inside a topology, if there is one: it has other variants than the next."""
+    if topology:
+        root.GetVariantSet("topology").SetVariantSelection(topology)
+    sets = {} if not root else {name: root.GetVariantSet(name) for name in root.GetVariantSets().GetNames()}
+    names = {name: [topology] if name == "topology" else v.GetVariantNames() for name, v in sets.items()}
     for chosen in itertools.product(*names.values()):
         further = {name for name, value in zip(names, chosen, strict=True) if value != names[name][0]}
         if len(further & {"lod", "motion", "shape"}) > 1:

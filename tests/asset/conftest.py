@@ -44,3 +44,21 @@ def staged() -> StagedAvatar:
         expressions_m={"frown": frown_m},
         physiques_m={"stout": (0.3 * clothes.vertices * (1, 1, 0)).astype(np.float32)},
     )
+
+
+@pytest.fixture(scope="session")
+def captured(staged: StagedAvatar) -> StagedAvatar:
+    """Return these clothes a fifth wider, in boxes twice as large, in other colours and another light, at full detail
+    alone, without frown and physique."""
+    assert staged.albedo is not None and staged.normal_map is not None
+    return dataclasses.replace(
+        staged,
+        rest_points_m=staged.rest_points_m * (1.2, 1, 1.2),
+        extents_m={name: 2 * boxes for name, boxes in staged.extents_m.items()},
+        levels=staged.levels[:1],
+        expressions_m={},
+        physiques_m={},
+        texture=255 - staged.texture,
+        normal_map=255 - staged.normal_map,
+        albedo=Albedo(255 - staged.albedo.texture, Light(np.array([0.7, 0, 0.1, 0, 0, 0, 0, 0, 0]), 9.0)),
+    )

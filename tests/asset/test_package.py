@@ -50,6 +50,33 @@ def write_all(out: Path, staged: StagedAvatar) -> None:
     write_cache(out / "avatar_cache.usdz", staged, cameras, 10.0, INFO)
 
 
+def selected(stage: Usd.Stage, *sets: str) -> list[str]:
+    """Return what is selected in variant sets."""
+    return [stage.GetDefaultPrim().GetVariantSet(name).GetVariantSelection() for name in sets]
+
+
+def expect_our_skin(stage: Usd.Stage, staged: StagedAvatar) -> list[np.ndarray]:
+    """Compare the first and the last pose of the selected motion with our own skinning; return all poses of ours."""
+    rig, motion, lod, shape = selected(stage, "rig", "motion", "lod", "shape")
+    moving, shown = staged.rigs[rig].motions[motion], staged.levels[int(lod[-1])].vertices
+    moved_m = staged.physiques_m.get(shape, np.zeros((1, 3)))
+    rest = dataclasses.replace(staged.rest, points_m=staged.rest_points_m + moved_m)
+    expected = list(staged.rigs[rig].surfaces_m(motion, rest))
+    for k in (0, len(moving.codes) - 1):
+        points_m = skinned_points(stage, moving.codes[k] * 10 / moving.fps)
+        np.testing.assert_allclose(points_m, expected[k][shown], atol=1e-5)
+    return expected
+
+
+@pytest.fixture(scope="module")
+def both(staged: StagedAvatar, captured: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the package and `avatar.usdz` of two topologies."""
+    out = tmp_path_factory.mktemp("both")
+    write_package(out, staged, [side_camera()], 10.0, INFO, captured)
+    write_usdz(out / "avatar.usdz", staged, [side_camera()], 10.0, INFO, captured)
+    return out
+
+
 @pytest.fixture(scope="module")
 def package(staged: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with these files."""
@@ -61,18 +88,14 @@ def package(staged: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> P
 @pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz"])
 def test_usd_skins_as_we_do_in_every_variant(name: str, package: Path, staged: StagedAvatar) -> None:
     stage = Usd.Stage.Open(str(package / name))
-    root, seen = stage.GetDefaultPrim(), set()
+    seen = set()
     for _ in each_variant(stage):
-        sets = ("rig", "motion", "lod", "shape")
-        rig, motion, lod, shape = (root.GetVariantSet(name).GetVariantSelection() for name in sets)
+        rig, motion, lod, shape = selected(stage, "rig", "motion", "lod", "shape")
         seen.add((rig, motion, lod, shape))
-        moving, shown = staged.rigs[rig].motions[motion], staged.levels[int(lod[-1])].vertices
-        moved_m = staged.physiques_m.get(shape, np.zeros((1, 3)))
-        rest = dataclasses.replace(staged.rest, points_m=staged.rest_points_m + moved_m)
-        expected = list(staged.rigs[rig].surfaces_m(motion, rest))
+        expected = expect_our_skin(stage, staged)
+        moving = staged.rigs[rig].motions[motion]
         for k in (0, len(moving.codes) - 1):
             code = moving.codes[k] * 10 / moving.fps
-            np.testing.assert_allclose(skinned_points(stage, code), expected[k][shown], atol=1e-5)
             box = UsdSkel.Root(stage.GetPrimAtPath("/Avatar/Body")).GetExtentAttr().Get(code)
             tight = np.stack([expected[k].min(0), expected[k].max(0)])
             if shape == "captured":
@@ -85,6 +108,33 @@ def test_usd_skins_as_we_do_in_every_variant(name: str, package: Path, staged: S
         *itertools.product(rigs, motions, ["lod0"], ["captured"]),
         *itertools.product(rigs, motions[:1], ["lod1"], ["captured"]),
         *itertools.product(rigs, motions[:1], ["lod0"], ["stout"]),
+    }
+
+
+@pytest.mark.parametrize(("name", "motion"), [("avatar.usda", "captured"), ("avatar_30.usda", "captured_30")])
+def test_each_topology_shows_the_whole_mesh_in_the_motion_of_the_file(name: str, motion: str, both: Path) -> None:
+    stage = Usd.Stage.Open(str(both / name))
+    for topology in ("registered", "captured"):
+        stage.GetDefaultPrim().GetVariantSet("topology").SetVariantSelection(topology)
+        sets = ("shape", "lod", "look", "rig", "motion")
+        assert selected(stage, *sets) == ["captured", "lod0", "captured", "full", motion]
+
+
+@pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz"])
+def test_either_topology_is_skinned_in_all_its_variants(
+    name: str, both: Path, staged: StagedAvatar, captured: StagedAvatar
+) -> None:
+    stage = Usd.Stage.Open(str(both / name))
+    seen = set()
+    for _ in each_variant(stage):
+        topology, *others = selected(stage, "topology", "rig", "motion", "lod", "shape")
+        seen.add((topology, *others))
+        expect_our_skin(stage, {"registered": staged, "captured": captured}[topology])
+    rigs, motions = ("full", "game"), ("captured", "captured_24", "captured_30")
+    assert seen == {
+        *itertools.product(["registered", "captured"], rigs, motions, ["lod0"], ["captured"]),
+        *itertools.product(["registered"], rigs, motions[:1], ["lod1"], ["captured"]),
+        *itertools.product(["registered"], rigs, motions[:1], ["lod0"], ["stout"]),
     }
 
 
@@ -311,6 +361,26 @@ def test_the_surface_has_a_texture_and_a_normal_map(name: str, package: Path, st
         np.testing.assert_array_equal(pixels(texture.GetInput("file").Get()), expected)
     # Of values from 0 to 1, so that they become components from -1 to 1.
     assert texture.GetInput("scale").Get() == (2, 2, 2, 1) and texture.GetInput("bias").Get() == (-1, -1, -1, 0)
+
+
+@pytest.mark.parametrize("name", ["avatar.usda", "avatar.usdz", "avatar_24.usda"])
+def test_each_topology_has_its_own_pictures(
+    name: str, both: Path, staged: StagedAvatar, captured: StagedAvatar
+) -> None:
+    stage = Usd.Stage.Open(str(both / name))
+    topology = stage.GetDefaultPrim().GetVariantSet("topology")
+    assert (topology.GetVariantNames(), topology.GetVariantSelection()) == (["captured", "registered"], "registered")
+    for choice, shown in (("captured", captured), ("registered", staged)):
+        assert shown.albedo is not None
+        topology.SetVariantSelection(choice)
+        assert len(stage.GetPrimAtPath("/Avatar/Cameras").GetChildren()) == 1
+        for look, expected in (("captured", shown.texture), ("albedo", shown.albedo.texture)):
+            stage.GetDefaultPrim().GetVariantSet("look").SetVariantSelection(look)
+            for given, picture in (("diffuseColor", expected), ("normal", shown.normal_map)):
+                file = texture_of(bound_surface(stage), given).GetInput("file").Get()
+                np.testing.assert_array_equal(pixels(file), picture)
+        light = UsdLux.DomeLight(stage.GetPrimAtPath("/Avatar/Light")).GetTextureFileAttr().Get()
+        np.testing.assert_array_equal(pixels(light), dome(shown.albedo.light)[0])
 
 
 def test_a_normal_map_and_an_albedo_can_be_left_out(staged: StagedAvatar, tmp_path: Path) -> None:

@@ -302,6 +302,24 @@ def test_what_we_write_passes_every_validator(package: Path) -> None:
         assert report["validators"] >= 30
 
 
+def test_both_topologies_pass_every_validator_and_a_defect_of_one_says_of_which(
+    staged: StagedAvatar, captured: StagedAvatar, tmp_path: Path
+) -> None:
+    write_package(tmp_path, staged, [side_camera()], 10.0, INFO, captured)
+    write_usdz(tmp_path / "avatar.usdz", staged, [side_camera()], 10.0, INFO, captured)
+    for name in ("avatar.usdz", "avatar.usda", "avatar_24.usda"):
+        report = validate_package(tmp_path / name)
+        assert (report["variants"], report["warnings"]) == (20 + 12, [])
+    shape = Usd.Stage.Open(str(tmp_path / "avatar/captured_shape_captured.usdc"))
+    change(UsdGeom.Mesh(shape.GetPrimAtPath(f"{BODY}/Surface")).GetPointsAttr(), 0, Gf.Vec3f(np.nan))
+    shape.GetRootLayer().Save()
+    with pytest.raises(
+        InvalidAsset, match=r"avatar\.usda: topology=captured shape=captured lod=lod0 .* not finite"
+    ) as e:
+        validate_package(tmp_path / "avatar.usda")
+    assert "topology=registered" not in str(e.value)
+
+
 def test_a_defect_in_one_variant_says_in_which(package: Path, tmp_path: Path) -> None:
     shutil.copytree(package, tmp_path / "copy")
     motion = Usd.Stage.Open(str(tmp_path / "copy/avatar/motion_captured_30.usdc"))
