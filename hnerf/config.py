@@ -278,7 +278,7 @@ class AssetSettings(Section):
     """Settings of the exported assets."""
 
     grid_cells: int = Field(default=256, ge=16)  # of marching cubes, on the longest side
-    topology: Literal["registered", "captured"] = "registered"  # the body model's mesh, or that of marching cubes
+    topology: Literal["registered", "captured", "both"] = "registered"  # the body's mesh; marching cubes'; in USD, both
     faces: int = Field(default=20_000, ge=100)  # of the captured mesh; the registered one has the body model's
     level_faces: tuple[PositiveInt, ...] = (10_000, 5_000)  # triangles, at most, of each lower level of detail
     texture_px: int = Field(default=1024, ge=16)

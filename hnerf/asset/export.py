@@ -17,7 +17,7 @@ import trimesh
 from hnerf.asset.albedo import Albedo
 from hnerf.asset.baking import baked_textures
 from hnerf.asset.bvh_file import write_avatar_bvh
-from hnerf.asset.comparison import compare_with_field, comparison_figures, require_close
+from hnerf.asset.comparison import Compared, compare_with_field, comparison_figures, require_close
 from hnerf.asset.correctives import Correctives, correctives_of, frame_surfaces
 from hnerf.asset.extreme_poses import extreme_poses
 from hnerf.asset.figures import (
@@ -54,19 +54,36 @@ log = logging.getLogger("hnerf.asset")
 
 
 @dataclass(frozen=True)
-class ClothedSurface:
-    """The surface of the asset: the field's in the rest pose, `dense`; the meshes made of it by topology, and how far
-    they are from it as registered or decimated; the chosen `mesh`, moved by the mean displacement of the training
-    frames, the body in every frame, its surface in the world, (n, V, 3), what displacements (n, V, 3) take skinning
-    there, and the blend shapes that come close to them."""
+class RestMeshes:
+    """The field's surface in the rest pose, `dense`; the meshes made of it by topology, and how far they are from it as
+    registered or decimated."""
 
     dense: trimesh.Trimesh
+    by_topology: dict[str, AssetMesh]
     distances_mm: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ClothedSurface:
+    """The surface of the asset: the mesh, moved by the mean displacement of the training frames, the body in every
+    frame, its surface in the world, (n, V, 3), what displacements (n, V, 3) take skinning there, and the blend shapes
+    that come close to them."""
+
     mesh: AssetMesh
     body: BodyFit
     surfaces_m: np.ndarray
     displacements_m: np.ndarray
     correctives: Correctives
+
+
+@dataclass(frozen=True)
+class MeshAsset:
+    """All that is written of one mesh, its views beside the field's, and the seconds of each step."""
+
+    surface: ClothedSurface
+    staged: StagedAvatar
+    compared: list[Compared]
+    seconds: dict[str, float]
 
 
 def export_asset(
@@ -85,8 +102,65 @@ def export_asset(
     validation, or the asset is far below its field (`require_close`).
     """
     seconds: dict[str, float] = {}
-    surface = _clothed_surface(capture, avatar, settings, seconds)
+    meshes = _rest_meshes(avatar, settings, seconds)
+    names = list(meshes.by_topology) if settings.topology == "both" else [settings.topology]
+    asset, *others = [
+        _mesh_asset(capture, masks, avatar, meshes.by_topology[n], settings, further or {}) for n in names
+    ]
+    captured = others[0] if others else None
+    surface, staged = asset.surface, asset.staged
+    seconds |= asset.seconds
+    with _timed("poses", seconds):
+        poses = extreme_poses(staged, surface.mesh.rig, surface.mesh.skin_faces)
+    with _timed("files", seconds):
+        info = AssetInfo(capture.name, settings.version, settings.licence, digest)
+        write_files(out, staged, capture, info, captured.staged if captured else None)
+    with _timed("viewer", seconds):
+        viewer = write_viewer(out / "viewer.html", out / "avatar.glb", capture, staged.stage_from_world)
+    with _timed("validation", seconds):
+        validation = {name: validate_package(out / name) for name in PACKAGES}
+    report = _figures(capture, meshes, asset, names[0], settings) | {
+        "against_field": comparison_figures(asset.compared),
+        "crossing_share": {pose.name: pose.crossing for pose in poses},
+        "viewer": viewer,
+        "bytes": {str(p.relative_to(out)): p.stat().st_size for p in sorted(out.rglob("*")) if p.is_file()},
+        "seconds": seconds,
+        "validation": validation,
+    }
+    if captured:
+        report["captured"] = _captured_figures(captured)
+    (out / "report.json").write_text(json.dumps(report, indent=1))
+    shown = capture.train_frames[0]
+    root = surface.body.root[surface.body.index(shown)].numpy()
+    write_report(out / "report.html", capture.name, staged, shown, root, asset.compared, poses, report)
+    return report
+
+
+def _rest_meshes(avatar: Avatar, settings: AssetSettings, seconds: dict[str, float]) -> RestMeshes:
+    """Mesh the avatar in the rest pose; seconds: where steps' times go."""
+    timeless = avatar.without_frames()  # one mesh serves all frames
+    with _timed("surface", seconds):
+        rest = avatar.body.theta.new_zeros(len(avatar.body.rig.joints_m), 3), torch.eye(4).to(avatar.body.theta)
+        dense = surface_in_pose(timeless, *rest, settings.grid_cells)
+    with _timed("mesh", seconds):
+        meshes = asset_meshes(timeless.body.rig.to("cpu"), dense, settings.faces)
+    with _timed("distances", seconds):
+        return RestMeshes(dense, meshes, surface_distances_mm(dense, meshes))
+
+
+def _mesh_asset(
+    capture: Capture,
+    masks: Masks,
+    avatar: Avatar,
+    mesh: AssetMesh,
+    settings: AssetSettings,
+    further: Mapping[str, Motion],
+) -> MeshAsset:
+    """Texture, rig and move a mesh, and compare it with its field. Raises InvalidAsset if it is far below."""
+    seconds: dict[str, float] = {}
     timeless = avatar.without_frames()  # one texture serves all frames
+    with _timed("correctives", seconds):
+        surface = _clothed_surface(capture, avatar, mesh, settings)
     layout = surface.mesh.layout(settings.texture_px)
     with _timed("texture", seconds):
         texture, albedo = baked_textures(
@@ -96,55 +170,23 @@ def export_asset(
         px = settings.normal_map_px
         normals = normal_map(timeless, surface.mesh, layout, px) if px else None
     with _timed("staging", seconds):
-        staged = _staged(capture, timeless.body, surface, layout, texture, albedo, normals, settings, further or {})
+        staged = _staged(capture, timeless.body, surface, layout, texture, albedo, normals, settings, further)
     with _timed("comparison", seconds):
         compared = compare_with_field(capture, masks, avatar, staged)
-        against_field = comparison_figures(compared)
-    require_close(capture.name, against_field, settings.allow_poor)
-    with _timed("poses", seconds):
-        poses = extreme_poses(staged, surface.mesh.rig, surface.mesh.skin_faces)
-    with _timed("files", seconds):
-        write_files(out, staged, capture, AssetInfo(capture.name, settings.version, settings.licence, digest))
-    with _timed("viewer", seconds):
-        viewer = write_viewer(out / "viewer.html", out / "avatar.glb", capture, staged.stage_from_world)
-    with _timed("validation", seconds):
-        validation = {name: validate_package(out / name) for name in PACKAGES}
-    report = _figures(capture, surface, staged, settings) | {
-        "against_field": against_field,
-        "crossing_share": {pose.name: pose.crossing for pose in poses},
-        "viewer": viewer,
-        "bytes": {str(p.relative_to(out)): p.stat().st_size for p in sorted(out.rglob("*")) if p.is_file()},
-        "seconds": seconds,
-        "validation": validation,
-    }
-    (out / "report.json").write_text(json.dumps(report, indent=1))
-    shown = capture.train_frames[0]
-    root = surface.body.root[surface.body.index(shown)].numpy()
-    write_report(out / "report.html", capture.name, staged, shown, root, compared, poses, report)
-    return report
+    require_close(capture.name, comparison_figures(compared), settings.allow_poor)
+    return MeshAsset(surface, staged, compared, seconds)
 
 
-def _clothed_surface(
-    capture: Capture, avatar: Avatar, settings: AssetSettings, seconds: dict[str, float]
-) -> ClothedSurface:
-    """Mesh the avatar in the rest pose and follow the mesh through the frames; seconds: where steps' times go."""
-    timeless = avatar.without_frames()  # one mesh serves all frames
-    with _timed("surface", seconds):
-        rest = avatar.body.theta.new_zeros(len(avatar.body.rig.joints_m), 3), torch.eye(4).to(avatar.body.theta)
-        dense = surface_in_pose(timeless, *rest, settings.grid_cells)
-    with _timed("mesh", seconds):
-        meshes = asset_meshes(timeless.body.rig.to("cpu"), dense, settings.faces)
-        mesh = meshes[settings.topology]
-    with _timed("distances", seconds):
-        distances_mm = surface_distances_mm(dense, meshes)
-    with _timed("correctives", seconds):
-        body = dataclasses.replace(select_poses(timeless.body, capture.frames).to("cpu"), rig=mesh.rig)
-        surfaces_m, displacements_m = frame_surfaces(avatar, body, mesh.settle)
-        centred = mesh.moved(displacements_m[[body.index(frame) for frame in capture.train_frames]].mean(0))
-        displacements_m -= (centred.rig.vertices_m - mesh.rig.vertices_m).numpy()
-        correctives = correctives_of(displacements_m, settings.correctives)
+def _clothed_surface(capture: Capture, avatar: Avatar, mesh: AssetMesh, settings: AssetSettings) -> ClothedSurface:
+    """Follow a mesh in the rest pose through the frames."""
+    poses = select_poses(avatar.without_frames().body, capture.frames).to("cpu")
+    body = dataclasses.replace(poses, rig=mesh.rig)
+    surfaces_m, displacements_m = frame_surfaces(avatar, body, mesh.settle)
+    centred = mesh.moved(displacements_m[[body.index(frame) for frame in capture.train_frames]].mean(0))
+    displacements_m -= (centred.rig.vertices_m - mesh.rig.vertices_m).numpy()
+    correctives = correctives_of(displacements_m, settings.correctives)
     body = dataclasses.replace(body, rig=centred.rig)
-    return ClothedSurface(dense, distances_mm, centred, body, surfaces_m, displacements_m, correctives)
+    return ClothedSurface(centred, body, surfaces_m, displacements_m, correctives)
 
 
 def _staged(
@@ -183,15 +225,15 @@ def _staged(
 
 
 def _figures(
-    capture: Capture, surface: ClothedSurface, staged: StagedAvatar, settings: AssetSettings
+    capture: Capture, meshes: RestMeshes, asset: MeshAsset, topology: str, settings: AssetSettings
 ) -> dict[str, Any]:
     """Return the figures of the surface, the rigs and the motions."""
-    registered = settings.topology == "registered"
+    surface, staged = asset.surface, asset.staged
     return {
-        "surface": surface_figures(surface.dense),
-        "mesh": mesh_figures(settings.topology, surface.mesh, staged),
-        "to_surface_mm": surface.distances_mm,
-        "findings": findings(surface.distances_mm[settings.topology]) if registered else [],
+        "surface": surface_figures(meshes.dense),
+        "mesh": mesh_figures(topology, surface.mesh, staged),
+        "to_surface_mm": meshes.distances_mm,
+        "findings": findings(meshes.distances_mm[topology]) if topology == "registered" else [],
         "levels": level_figures(staged),
         "texture_px": settings.texture_px,
         "normal_map_px": settings.normal_map_px,
@@ -207,11 +249,25 @@ def _figures(
     }
 
 
-def write_files(out: Path, staged: StagedAvatar, capture: Capture, info: AssetInfo) -> None:
-    """Write a staged avatar in all formats into the folder `out`."""
+def _captured_figures(asset: MeshAsset) -> dict[str, Any]:
+    """Return the figures of the captured mesh beside the registered one."""
+    return {
+        "mesh": mesh_figures("captured", asset.surface.mesh, asset.staged),
+        "levels": level_figures(asset.staged),
+        "beyond_skinning_mm": beyond_skinning_mm(asset.surface.displacements_m, asset.surface.correctives),
+        "against_field": comparison_figures(asset.compared),
+        "seconds": asset.seconds,
+    }
+
+
+def write_files(
+    out: Path, staged: StagedAvatar, capture: Capture, info: AssetInfo, captured: StagedAvatar | None = None
+) -> None:
+    """Write a staged avatar in all formats into the folder `out`; captured: the same with the captured mesh, which USD
+    has as well."""
     cameras = list(capture.cameras.values())
-    write_package(out, staged, cameras, capture.fps, info)
-    write_usdz(out / "avatar.usdz", staged, cameras, capture.fps, info)
+    write_package(out, staged, cameras, capture.fps, info, captured)
+    write_usdz(out / "avatar.usdz", staged, cameras, capture.fps, info, captured)
     write_cache(out / "avatar_cache.usdz", staged, cameras, capture.fps, info)
     write_glb(out / "avatar.glb", staged, staged.rigs[FULL])
     write_glb(out / "avatar_game.glb", staged, staged.rigs[GAME])

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pxr import Usd
+from pxr import Usd, UsdGeom
 from torch import Tensor
 
-from hnerf.asset.export import _clothed_surface, export_asset
+from hnerf.asset.export import _clothed_surface, _rest_meshes, export_asset
 from hnerf.avatar.surface import surface_in_pose
 from hnerf.body.base_mesh import base_mesh
 from hnerf.body.rig import pose_vertices
 from hnerf.capture.masks import Masks
-from hnerf.config import AssetSettings
+from hnerf.config import AssetSettings, overridden
 from hnerf.errors import InvalidAsset
 from hnerf.render.motion import Motion, select_poses
 from tests.asset.figure import bending_body, capture, column_rig
@@ -45,9 +45,9 @@ class Swelling(StandInAvatar):
 
 def test_the_mesh_has_the_mean_displacement_of_training_frames() -> None:
     """4 mm on average over frames 3 to 5, which leaves -2, 0, 2 and, in the novel pose of frame 8, 8 mm."""
-    captured = SMALL.model_copy(update={"topology": "captured"})
-    found = _clothed_surface(capture(), Swelling(bending_body()), captured, {})
-    still = _clothed_surface(capture(), StandInAvatar(bending_body()), captured, {})
+    mesh = _rest_meshes(StandInAvatar(bending_body()), SMALL, {}).by_topology["captured"]
+    found = _clothed_surface(capture(), Swelling(bending_body()), mesh, SMALL)
+    still = _clothed_surface(capture(), StandInAvatar(bending_body()), mesh, SMALL)
     rest_m, still_m = found.mesh.rig.vertices_m.numpy(), still.mesh.rig.vertices_m.numpy()
     sides = (np.abs(rest_m[:, 2] - 0.8) > 0.35) & (rest_m[:, 2] > 0.1) & (rest_m[:, 2] < 1.5)
     radius_m = np.linalg.norm(rest_m[sides, :2], axis=1)
@@ -103,6 +103,31 @@ def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monke
     assert "Extreme poses" in page and "Asset and field" not in page
     stage = Usd.Stage.Open(str(tmp_path / "avatar.usda"))
     assert stage.GetDefaultPrim().GetAssetInfoByKey("captureDigest") == "0123"
+
+
+def test_usd_has_both_meshes_if_both_are_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))
+    monkeypatch.setattr("hnerf.asset.report.TURNS", 2)
+    for topology in ("registered", "both"):
+        (tmp_path / topology).mkdir()
+        settings = overridden(SMALL, [f"topology={topology}"])
+        export_asset(capture(), Masks({}, {}), StandInAvatar(bending_body()), settings, tmp_path / topology)
+    one, two = (json.loads((tmp_path / name / "report.json").read_text()) for name in ("registered", "both"))
+    assert two["mesh"] == one["mesh"] and "captured" not in one
+    faces = two["captured"]["mesh"]["faces"]
+    assert two["captured"]["mesh"]["topology"] == "captured" and faces != one["mesh"]["faces"]
+    assert {"texture", "comparison"} < set(two["captured"]["seconds"])
+    assert two["captured"]["against_field"]["images"] == 0
+    for path in ("avatar.glb", "avatar_game.glb", "avatar.bvh", "avatar_cache.usdz"):
+        assert (tmp_path / "both" / path).read_bytes() == (tmp_path / "registered" / path).read_bytes(), path
+    for name in ("avatar.usda", "avatar_24.usda", "avatar_30.usda", "avatar.usdz"):
+        stage = Usd.Stage.Open(str(tmp_path / "both" / name))
+        triangles = []
+        for topology in ("captured", "registered"):
+            stage.GetDefaultPrim().GetVariantSet("topology").SetVariantSelection(topology)
+            corners = UsdGeom.Mesh(stage.GetPrimAtPath("/Avatar/Body/Surface")).GetFaceVertexCountsAttr().Get()
+            triangles.append(int(np.sum(np.array(corners) - 2)))
+        assert triangles == [faces, one["mesh"]["faces"]], name
 
 
 def test_nothing_is_written_of_an_asset_far_below_its_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
