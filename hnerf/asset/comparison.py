@@ -81,19 +81,20 @@ def comparison_figures(compared: list[Compared]) -> dict[str, Any]:
     }
 
 
-def require_close(name: str, figures: dict[str, Any], allow_poor: bool) -> None:
-    """Raise InvalidAsset if the asset of a capture called `name` is more than POOR_DB below its field; figures: see
-    `comparison_figures`."""
+def require_close(name: str, topology: str, figures: dict[str, Any], allow_poor: bool) -> None:
+    """Raise InvalidAsset if the asset of a capture called `name`, with the mesh of that topology, is more than POOR_DB
+    below its field; figures: see `comparison_figures`."""
     below_db = figures["below_field"]["psnr"] if figures["images"] else 0.0
     if below_db <= POOR_DB:
         return
     found = (
-        f"{name}: the asset is {below_db:.1f} dB below its field ({figures['asset']['psnr']:.1f} against "
-        f"{figures['field']['psnr']:.1f} dB, mean of {figures['images']} images from {figures['cameras']} cameras)"
+        f"{name}: the asset with the {topology} mesh is {below_db:.1f} dB below its field "
+        f"({figures['asset']['psnr']:.1f} against {figures['field']['psnr']:.1f} dB, "
+        f"mean of {figures['images']} images from {figures['cameras']} cameras)"
     )
     if not allow_poor:
         raise InvalidAsset(
-            f"{found}; at most {POOR_DB:.0f} dB are allowed. Try asset.topology=captured or a larger asset.texture_px, "
+            f"{found}; at most {POOR_DB:.0f} dB are allowed. Try another asset.topology or a larger asset.texture_px, "
             "or take it as it is: asset.allow_poor=true (`hnerf export --allow-poor`)"
         )
     log.warning("%s", found)

@@ -104,9 +104,7 @@ def export_asset(
     seconds: dict[str, float] = {}
     meshes = _rest_meshes(avatar, settings, seconds)
     names = list(meshes.by_topology) if settings.topology == "both" else [settings.topology]
-    asset, *others = [
-        _mesh_asset(capture, masks, avatar, meshes.by_topology[n], settings, further or {}) for n in names
-    ]
+    asset, *others = [_mesh_asset(capture, masks, avatar, meshes, name, settings, further or {}) for name in names]
     captured = others[0] if others else None
     surface, staged = asset.surface, asset.staged
     seconds |= asset.seconds
@@ -152,15 +150,16 @@ def _mesh_asset(
     capture: Capture,
     masks: Masks,
     avatar: Avatar,
-    mesh: AssetMesh,
+    meshes: RestMeshes,
+    topology: str,
     settings: AssetSettings,
     further: Mapping[str, Motion],
 ) -> MeshAsset:
-    """Texture, rig and move a mesh, and compare it with its field. Raises InvalidAsset if it is far below."""
+    """Texture, rig and move one of the meshes, and compare it with the field; InvalidAsset if it is far below."""
     seconds: dict[str, float] = {}
     timeless = avatar.without_frames()  # one texture serves all frames
     with _timed("correctives", seconds):
-        surface = _clothed_surface(capture, avatar, mesh, settings)
+        surface = _clothed_surface(capture, avatar, meshes.by_topology[topology], settings)
     layout = surface.mesh.layout(settings.texture_px)
     with _timed("texture", seconds):
         texture, albedo = baked_textures(
@@ -173,7 +172,7 @@ def _mesh_asset(
         staged = _staged(capture, timeless.body, surface, layout, texture, albedo, normals, settings, further)
     with _timed("comparison", seconds):
         compared = compare_with_field(capture, masks, avatar, staged)
-    require_close(capture.name, comparison_figures(compared), settings.allow_poor)
+    require_close(capture.name, topology, comparison_figures(compared), settings.allow_poor)
     return MeshAsset(surface, staged, compared, seconds)
 
 

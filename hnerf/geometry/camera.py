@@ -76,7 +76,7 @@ class Camera:
         K = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]]) @ self.K
         return Camera(self.name, K, self.R, self.t_m, width_px, height_px)
 
-    def scaled(self, share: float) -> "Camera":
+    def scaled(self, share: float | int) -> "Camera":
         """Return this camera with a share of the pixels along each side, at least one."""
         return self.resized(max(1, round(share * self.width_px)), max(1, round(share * self.height_px)))
 

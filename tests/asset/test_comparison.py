@@ -108,7 +108,7 @@ def test_without_a_mask_there_is_a_reason_and_no_refusal(recorded: Capture, stag
     for masks in (nobody, Masks({}, {})):
         figures = comparison_figures(compare_with_field(recorded, masks, GreyField(bending_body()), staged))
         assert figures == {"images": 0, "reason": "no image has a mask of the person"}
-        require_close("ada", figures, allow_poor=False)
+        require_close("ada", "registered", figures, allow_poor=False)
 
 
 def test_figures_are_means_and_what_the_asset_lacks(recorded: Capture, staged: StagedAvatar) -> None:
@@ -131,12 +131,14 @@ def test_an_asset_far_below_its_field_is_refused_in_one_line(caplog: pytest.LogC
         scores = {"asset": {"psnr": 29.5 - below_db}, "field": {"psnr": 29.5}, "below_field": {"psnr": below_db}}
         return {"images": 6, "cameras": "training", **scores}
 
-    require_close("ada", figures(4.0), allow_poor=False)
+    require_close("ada", "registered", figures(4.0), allow_poor=False)
     with pytest.raises(InvalidAsset) as refused:
-        require_close("ada", figures(4.1), allow_poor=False)
+        require_close("ada", "registered", figures(4.1), allow_poor=False)
     line = str(refused.value)
-    assert line.startswith("ada: the asset is 4.1 dB below its field (25.4 against 29.5 dB, mean of 6 images from tr")
+    assert line.startswith(
+        "ada: the asset with the registered mesh is 4.1 dB below its field (25.4 against 29.5 dB, mean of 6 images"
+    )
     assert "asset.allow_poor=true (`hnerf export --allow-poor`)" in line and "\n" not in line
     assert not caplog.records
-    require_close("ada", figures(4.1), allow_poor=True)
-    assert "ada: the asset is 4.1 dB below its field" in caplog.text
+    require_close("ada", "registered", figures(4.1), allow_poor=True)
+    assert "ada: the asset with the registered mesh is 4.1 dB below its field" in caplog.text

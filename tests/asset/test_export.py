@@ -135,6 +135,6 @@ def test_nothing_is_written_of_an_asset_far_below_its_field(tmp_path: Path, monk
     poor = {"images": 2, "cameras": "training", **scores}
     monkeypatch.setattr("hnerf.asset.export.comparison_figures", lambda compared: poor)
     tiny = SMALL.model_copy(update={"grid_cells": 32, "texture_px": 32, "faces": 500, "correctives": 0})
-    with pytest.raises(InvalidAsset, match=r"column: the asset is 10\.0 dB below its field"):
+    with pytest.raises(InvalidAsset, match=r"column: the asset with the registered mesh is 10\.0 dB below its field"):
         export_asset(capture(), Masks({}, {}), StandInAvatar(bending_body()), tiny, tmp_path)
     assert list(tmp_path.iterdir()) == []
