@@ -14,6 +14,7 @@ import argparse
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -95,7 +96,6 @@ def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: 
     (scratch / "preset.yaml").write_text(PRESET)
     listen = ("--host", "127.0.0.1", "--port", str(server_port), "--no-ui")
     done: dict[str, list[str]] = {}
-    generations: dict[str, set[str]] = {}
     kills: Counter[str] = Counter()
     restarts = 0
     with (
@@ -109,7 +109,6 @@ def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: 
         while len(done) < len(names) and time.monotonic() - started_s < options.limit:
             time.sleep(POLL_S)
             note_finished(machines, names, done)
-            note_generations(generations)
             restarted = [machine.restarted() for machine in machines]
             restarts += sum(now is not before for now, before in zip(restarted, machines, strict=True))
             machines, at = restarted, random.randrange(MACHINES)
@@ -129,13 +128,13 @@ def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: 
         for machine in machines:
             machine.stop()
         time.sleep(5)
-        note_generations(generations)
+        puts = shared_artifacts(scratch)
         faults = [f"{name}: no results" for name in names if name not in done]
-        faults += [f"{name}: not in the bucket" for made in done.values() for name in made if name not in generations]
-        faults += [f"{name}: made {len(made)} times" for name, made in generations.items() if len(made) > 1]
+        faults += [f"{name}: not in the bucket" for made in done.values() for name in made if name not in puts]
+        faults += [f"{name}: put into the bucket {count} times" for name, count in puts.items() if count > 1]
         for machine in machines:
             faults += verify(machine.disk)
-        faults += verify(fetched(scratch / "third", list(generations)))
+        faults += verify(fetched(scratch / "third", list(puts)))
     faults += [f"process {pid} is left: {command(pid)}" for pid in marked(f"{MARK}={mark}")]
     logs = "".join(path.read_text(errors="replace") for path in scratch.glob("worker*.log"))
     return {
@@ -146,8 +145,8 @@ def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: 
         "kills": dict(kills),
         "workers_that_ended_by_themselves": restarts,
         "runs": states,
-        "artifacts": len(generations),
-        "made_twice": sum(len(made) > 1 for made in generations.values()),
+        "artifacts": len(puts),
+        "made_twice": sum(count > 1 for count in puts.values()),
         "fetched_by_another_machine": logs.count("hnerf.shared - fetching "),
         "server_mib": [kib // 1024 for kib in memory_kib],
         "faults": faults,
@@ -216,15 +215,10 @@ def note_finished(machines: list[Machine], names: list[str], done: dict[str, lis
                 done[name] = [f"{stage}/{Path(os.readlink(links / stage)).name}" for stage in RESULTS]
 
 
-def note_generations(generations: dict[str, set[str]]) -> None:
-    """Note each artifact of the bucket: one that was put there again has another date."""
-    from tasks.bucket import Bucket
-
-    bucket = Bucket.at(os.environ["HNERF_BUCKET"])
-    for path, one in bucket.fs.find(bucket.root, detail=True).items():
-        if path.endswith(".tar"):
-            name = path.removeprefix(f"{bucket.root}/").removesuffix(".tar")
-            generations.setdefault(name, set()).add(f"{one['ETag']} {one['LastModified']}")
+def shared_artifacts(scratch: Path) -> Counter[str]:
+    """Return how often each artifact was put into the bucket, by the log of its server."""
+    log = (scratch / "s3.log").read_text(errors="replace")
+    return Counter(re.findall(rf'"PUT /{BUCKET}/shared/(\S+)\.tar HTTP/[0-9.]+" 200', log))
 
 
 def wait_until_idle(patience_s: float = 180.0) -> None:
