@@ -20,6 +20,7 @@ from provenance import SHARED, provenance, provenance_line, table, write_result
 
 from flows.train_subject import prepare_training, with_detections
 from hnerf.capture.capture import Capture
+from hnerf.capture.keypoint_files import write_openpose
 from hnerf.config import load_settings
 from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW
 from hnerf.study.benchmark.plan import ScoringSettings
@@ -83,9 +84,7 @@ def copy_with_truth(folder: Path, capture: Capture, parts: tuple[str, ...], copy
         for name in capture.train_cameras:
             for path in sorted((copy / "openpose" / name).glob("*.json")):
                 exact_px, _ = capture.cameras[name].project(exact_m[int(path.name.split("_")[0])])
-                points = np.concatenate([exact_px, np.ones((BODY_25, 1))], 1)
-                people = [{"person_id": [-1], "pose_keypoints_2d": points.ravel().tolist()}]
-                path.write_text(json.dumps({"version": 1.3, "people": people}))
+                write_openpose(path, np.concatenate([exact_px, np.ones((BODY_25, 1))], 1))
 
 
 def as_markdown(result: dict[str, Any]) -> str:

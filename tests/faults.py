@@ -228,7 +228,7 @@ FAULTS = (
     Fault("exposure-clipped", EXPOSURE, " & (levels[seen] < MAX_LEVEL).all(1)", "", BY_EXPOSURE),
     Fault("exposure-pair", EXPOSURE, "= (-weight, weight)", "= (weight, weight)", BY_EXPOSURE),
     # cameras, triangulation, meshes
-    Fault("camera-half-pixel", CAMERA, "[0, sy, (sy - 1) / 2]", "[0, sy, 0]", BY_CAMERA),
+    Fault("camera-half-pixel", CAMERA, "[0, sy, top_px + (sy - 1) / 2]", "[0, sy, top_px]", BY_CAMERA),
     Fault("camera-rays-transposed", CAMERA, "np.linalg.inv(self.K).T @ self.R", "np.linalg.inv(self.K).T @ self.R.T",
           BY_CAMERA),
     Fault("triangulation-depth", TRIANGULATION, "@ points_m.T + projections[:, 2, 3:])",

@@ -78,11 +78,13 @@ class ClothedSurface:
 
 @dataclass(frozen=True)
 class MeshAsset:
-    """All that is written of one mesh, its views beside the field's, and the seconds of each step."""
+    """All that is written of one mesh, its views beside the field's with their figures, and the seconds of each
+    step."""
 
     surface: ClothedSurface
     staged: StagedAvatar
     compared: list[Compared]
+    against_field: dict[str, Any]
     seconds: dict[str, float]
 
 
@@ -118,7 +120,7 @@ def export_asset(
     with _timed("validation", seconds):
         validation = {name: validate_package(out / name) for name in PACKAGES}
     report = _figures(capture, meshes, asset, names[0], settings) | {
-        "against_field": comparison_figures(asset.compared),
+        "against_field": asset.against_field,
         "crossing_share": {pose.name: pose.crossing for pose in poses},
         "viewer": viewer,
         "bytes": {str(p.relative_to(out)): p.stat().st_size for p in sorted(out.rglob("*")) if p.is_file()},
@@ -172,8 +174,9 @@ def _mesh_asset(
         staged = _staged(capture, timeless.body, surface, layout, texture, albedo, normals, settings, further)
     with _timed("comparison", seconds):
         compared = compare_with_field(capture, masks, avatar, staged)
-    require_close(capture.name, topology, comparison_figures(compared), settings.allow_poor)
-    return MeshAsset(surface, staged, compared, seconds)
+        against_field = comparison_figures(compared)
+    require_close(capture.name, topology, against_field, settings.allow_poor)
+    return MeshAsset(surface, staged, compared, against_field, seconds)
 
 
 def _clothed_surface(capture: Capture, avatar: Avatar, mesh: AssetMesh, settings: AssetSettings) -> ClothedSurface:
@@ -254,7 +257,7 @@ def _captured_figures(asset: MeshAsset) -> dict[str, Any]:
         "mesh": mesh_figures("captured", asset.surface.mesh, asset.staged),
         "levels": level_figures(asset.staged),
         "beyond_skinning_mm": beyond_skinning_mm(asset.surface.displacements_m, asset.surface.correctives),
-        "against_field": comparison_figures(asset.compared),
+        "against_field": asset.against_field,
         "seconds": asset.seconds,
     }
 

@@ -3,10 +3,8 @@
 import dataclasses
 from collections.abc import Callable
 
-import numpy as np
-
 from hnerf.capture.capture import Capture
-from hnerf.geometry.camera import Camera
+from hnerf.geometry.camera import Camera, resampling
 
 SizeChange = Callable[[Camera, tuple[int, int], tuple[int, int]], Camera]
 
@@ -17,23 +15,21 @@ def _crop_or_pad(share: float) -> SizeChange:
     def change(camera: Camera, calibrated_px: tuple[int, int], recorded_px: tuple[int, int]) -> Camera:
         per_recorded = camera.width_px / recorded_px[0]
         dx, dy = (share * per_recorded * (r - c) for r, c in zip(recorded_px, calibrated_px, strict=True))
-        return dataclasses.replace(camera, K=np.array([[1, 0, dx], [0, 1, dy], [0, 0, 1]]) @ camera.K)
+        return dataclasses.replace(camera, K=resampling(1.0, 1.0, dx, dy) @ camera.K)
 
     return change
 
 
 def _stretch(camera: Camera, calibrated_px: tuple[int, int], recorded_px: tuple[int, int]) -> Camera:
     sx, sy = (r / c for r, c in zip(recorded_px, calibrated_px, strict=True))
-    stretched = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])  # about the picture's corner
-    return dataclasses.replace(camera, K=stretched @ camera.K)
+    return dataclasses.replace(camera, K=resampling(sx, sy) @ camera.K)
 
 
 def _scale_and_pad(camera: Camera, calibrated_px: tuple[int, int], recorded_px: tuple[int, int]) -> Camera:
     scale = min(r / c for r, c in zip(recorded_px, calibrated_px, strict=True))
     per_recorded = camera.width_px / recorded_px[0]
-    padding_px = (per_recorded * (r - scale * c) / 2 for r, c in zip(recorded_px, calibrated_px, strict=True))
-    dx, dy = ((scale - 1) / 2 + px for px in padding_px)
-    return dataclasses.replace(camera, K=np.array([[scale, 0, dx], [0, scale, dy], [0, 0, 1]]) @ camera.K)
+    dx, dy = (per_recorded * (r - scale * c) / 2 for r, c in zip(recorded_px, calibrated_px, strict=True))
+    return dataclasses.replace(camera, K=resampling(scale, scale, dx, dy) @ camera.K)
 
 
 SIZE_CHANGES: dict[

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hnerf.capture.lens import Lens
+from hnerf.geometry.camera import resampling
 
 DARK = 16.0  # grey level: nine tenths of each row of a bar are below it
 LIT = 40.0  # grey level: the median of the picture beside a bar must be above it, so that the edge shows
@@ -48,8 +49,7 @@ def lens_for_area(lens: Lens, area: Area, recorded_px: tuple[int, int]) -> Lens 
     sx, sy = area.width / lens.size_px[0], area.height / lens.size_px[1]
     if area == Area(0, 0, *recorded_px) or abs(area.height - sx * lens.size_px[1]) > ASPECT_PX:
         return None
-    to_recorded = np.array([[sx, 0, area.left + (sx - 1) / 2], [0, sy, area.top + (sy - 1) / 2], [0, 0, 1]])
-    return dataclasses.replace(lens, K=to_recorded @ lens.K)
+    return dataclasses.replace(lens, K=resampling(sx, sy, area.left, area.top) @ lens.K)
 
 
 def _bar_px(grey: np.ndarray) -> float:

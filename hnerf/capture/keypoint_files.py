@@ -1,5 +1,6 @@
 """Files that keypoint detectors write: OpenPose's, one a frame; and lists of COCO results, one a camera."""
 
+import json
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -22,6 +23,13 @@ def read_openpose(path: Path) -> np.ndarray:
         return _people(path, [person["pose_keypoints_2d"] for person in people])
     except (KeyError, TypeError):
         raise InputError(f"{path}: no list of people with pose_keypoints_2d; detect them again") from None
+
+
+def write_openpose(path: Path, keypoints: np.ndarray) -> None:
+    """Write one person's keypoints (K, 3) x_px, y_px, confidence as OpenPose does."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    person = {"person_id": [-1], "pose_keypoints_2d": keypoints.ravel().tolist()}
+    path.write_text(json.dumps({"version": 1.3, "people": [person]}))
 
 
 def read_results(path: Path, frames: Iterable[int]) -> list[np.ndarray]:

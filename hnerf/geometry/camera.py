@@ -73,12 +73,17 @@ class Camera:
     def resized(self, width_px: int, height_px: int) -> "Camera":
         """Return this camera with its image resampled to another size (pixel centres at integers)."""
         sx, sy = width_px / self.width_px, height_px / self.height_px
-        K = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]]) @ self.K
-        return Camera(self.name, K, self.R, self.t_m, width_px, height_px)
+        return Camera(self.name, resampling(sx, sy) @ self.K, self.R, self.t_m, width_px, height_px)
 
     def scaled(self, share: float | int) -> "Camera":
         """Return this camera with a share of the pixels along each side, at least one."""
         return self.resized(max(1, round(share * self.width_px)), max(1, round(share * self.height_px)))
+
+
+def resampling(sx: float, sy: float, left_px: float | int = 0.0, top_px: float | int = 0.0) -> Float[np.ndarray, "3 3"]:
+    """Return the matrix that takes pixels of an image to those of the image scaled by sx and sy, whose corner is then
+    put left_px and top_px into another; pixel centres are at integers, so the corner is at -0.5."""
+    return np.array([[sx, 0, left_px + (sx - 1) / 2], [0, sy, top_px + (sy - 1) / 2], [0, 0, 1]])
 
 
 def look_at(like: Camera, centre_m: np.ndarray, target_m: np.ndarray, up: np.ndarray) -> Camera:

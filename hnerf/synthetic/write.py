@@ -13,6 +13,7 @@ from hnerf.body.descriptor import normals_of
 from hnerf.body.rig import Rig, joint_transforms, pose_vertices
 from hnerf.capture.capture import write_image
 from hnerf.capture.formats.easymocap import write_easymocap
+from hnerf.capture.keypoint_files import write_openpose
 from hnerf.capture.lens import pinhole
 from hnerf.config import SyntheticSettings
 from hnerf.geometry.camera import Camera, look_at
@@ -160,10 +161,7 @@ def _write_view(
     if scored:
         write_image(out / "ground_truth" / "on_black" / camera.name / f"{frame:06d}.jpg", _eight_bit(on_black))
     detected = detect(truth.keypoints_m, camera, truth.person.caster, rng)
-    path = out / "openpose" / camera.name / f"{frame:06d}_keypoints.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    person = {"person_id": [-1], "pose_keypoints_2d": detected.round(3).ravel().tolist()}
-    path.write_text(json.dumps({"version": 1.3, "people": [person]}))
+    write_openpose(out / "openpose" / camera.name / f"{frame:06d}_keypoints.json", detected.round(3))
 
 
 def _write_toml(out: Path, settings: SyntheticSettings) -> None:
