@@ -79,7 +79,8 @@ def write_synthetic_capture(out: Path, settings: SyntheticSettings) -> None:
     write_easymocap(out, [pinhole(view.camera) for view in views.values()])
     _write_toml(out, settings)
 
-    truths = []
+    joints_m, surfaces_m = [], []  # no more than is written: a long capture's truth does not fit into memory
+    known = [rig.joint_names.index(name) for name in MIXAMO]
     count = settings.train_frames + settings.novel_pose_frames
     for frame in tracked(range(count), "frames", count):
         truth = _frame_truth(dressed, _pose(rig, frame, settings))
@@ -91,8 +92,10 @@ def write_synthetic_capture(out: Path, settings: SyntheticSettings) -> None:
             ]
         for job in jobs:
             job.result()
-        truths.append(truth)
-    _write_truth(out, rig, dressed, truths)
+        joints_m.append(np.concatenate([truth.keypoints_m, truth.joints_m[known]]))
+        if frame % MESH_EVERY == 0:
+            surfaces_m.append(truth.person.vertices_m.astype(np.float32))
+    _write_truth(out, dressed.faces, surfaces_m, joints_m)
 
 
 def camera_names(settings: SyntheticSettings) -> tuple[list[str], list[str]]:
@@ -186,20 +189,18 @@ novel_pose = {frames[settings.train_frames :]}
     (out / "capture.toml").write_text(text)
 
 
-def _write_truth(out: Path, rig: Rig, dressed: DressedBody, truths: list[FrameTruth]) -> None:
-    """Write the true meshes and joints."""
-    frames = np.arange(0, len(truths), MESH_EVERY)
+def _write_truth(out: Path, faces: np.ndarray, surfaces_m: list[np.ndarray], joints_m: list[np.ndarray]) -> None:
+    """Write the true surface of each MESH_EVERY-th frame, and the joints of all."""
     np.savez_compressed(
         out / "ground_truth" / "meshes.npz",
-        faces=dressed.faces.astype(np.int32),
-        vertices=np.stack([truths[f].person.vertices_m for f in frames]).astype(np.float32),
-        frames=frames,
+        faces=faces.astype(np.int32),
+        vertices=np.stack(surfaces_m),
+        frames=np.arange(len(surfaces_m)) * MESH_EVERY,
     )
-    known = [rig.joint_names.index(name) for name in MIXAMO]
     np.savez_compressed(
         out / "ground_truth" / "joints.npz",
         names=np.array([*BODY_25_NAMES, *(f"rig:{name}" for name in MIXAMO.values())]),
-        positions=np.stack([np.concatenate([i.keypoints_m, i.joints_m[known]]) for i in truths]).astype(np.float32),
+        positions=np.stack(joints_m).astype(np.float32),
     )
 
 
