@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from peak_memory import peak_mib
 from provenance import SHARED, provenance, provenance_line, table, write_result
 
 from hnerf.capture.capture import PERSON, Capture, read_rgb
@@ -92,13 +93,7 @@ def cost_of_a_frame(capture: Capture, size: str, out: Path) -> dict[str, float]:
         find_in_camera(looked_at, camera, size, out / str(len(looked_at.frames)))
         times.append(time.process_time() - started)
     ms = 1e3 * (times[1] - times[0]) / (len(capture.frames) - 1)
-    return {"ms": round(ms, 1), "mib": _peak_mib()}
-
-
-def _peak_mib() -> int:
-    """Return the most memory that this process has held; getrusage would count what its parent held, too."""
-    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-    return round(int(status["VmHWM"].split()[0]) / 1024)
+    return {"ms": round(ms, 1), "mib": peak_mib()}
 
 
 def limb_keypoints(capture: Capture) -> np.ndarray:

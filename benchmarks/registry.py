@@ -9,6 +9,10 @@ FEW = ("evaluation.max_images=12", "evaluation.max_meshes=3")  # per split, sinc
 PAPERS_ROWS = ("mask", "blend", "geometry", "segmentation", "eikonal", "residual", "opt", "root", "noise")
 SMALL = "size_px=128"  # for many images of NeRF, each of which takes 18 s at 256 px
 MOMENT = (SMALL, "train_frames=1", "novel_pose_frames=0")
+LARGE = tuple(
+    f"--synth={setting}"
+    for setting in ("size_px=1024", "train_cameras=8", "test_cameras=1", "train_frames=200", "novel_pose_frames=8")
+)
 LONG_WALK = ("train_frames=40", "novel_pose_frames=24")
 
 
@@ -86,14 +90,15 @@ REGISTRY = (
     measured("detection", "detection.py", captures=("pose2sim-balance", *CALIBRATED), threads=2),
     measured("segmentation", "segmentation.py", captures=RENDERED),
     measured("fit", "fit.py", "{store}", captures=RENDERED, configs=("fast",)),
-    measured("limits", "limits.py", "{store}", "valid-wave", captures=("valid-wave",), configs=("fast",)),
+    measured("limits", "limits.py", "{store}", captures=CALIBRATED, configs=("fast",)),
     shared("shared-fast-wave", "valid-wave"),
     shared("shared-fast-walk", "valid-walk"),
     *(shared(f"shared-video-{name}", f"valid-{name}", without=("openpose", "background")) for name in ("wave", "walk")),
     shared("shared-fast-one-camera", "valid-turn-mono"),
     shared("shared-fast-real", "pose2sim-balance"),
     shared("shared-paper-small-wave", "valid-wave", "paper-small", *FEW),
-    measured("scaling", "scaling.py", captures=("valid-wave",), configs=("fast",)),
+    measured("scaling", "scaling.py", "scaling", "valid-wave", captures=("valid-wave",), configs=("fast",)),
+    measured("scaling-large", "scaling.py", "scaling-large", "performer", *LARGE, configs=("fast",)),
     measured("pixels-memory", "pixels_memory.py"),
     study("stability", "quick", "fast"),
     study("stability", "brief", "fast"),

@@ -1,10 +1,11 @@
 """Measure how the cost of every stage grows with frames, cameras and pixels.
 
-usage: python benchmarks/scaling.py [CAPTURE]
+usage: python benchmarks/scaling.py NAME CAPTURE [--synth a=b ...]
 
-Runs the stages of preset `fast`, training limited to a number of steps, on parts of a shared capture (default
-valid-wave) and on images of other sizes, each varied in turn, in a new store. Writes `benchmarks/results/scaling.json`,
-`.md` and `.png`; the straight lines of the chart mark proportional cost.
+CAPTURE is the name of a shared capture, a folder, or `performer`, a synthetic capture with the settings `--synth`. Runs
+the stages of preset `fast`, training limited to a number of steps, on the whole capture, and on a quarter and a half of
+its frames, cameras and pixels in turn, in a new store. Writes `benchmarks/results/NAME.json`, `.md` and `.png`; the
+straight lines of the chart mark proportional cost.
 """
 
 import argparse
@@ -15,7 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from provenance import RESULTS, SHARED, provenance, provenance_line, table, write_result
+from peak_memory import peak_mib, reset_peak
+from provenance import RESULTS, provenance, provenance_line, table, write_result
+from studies import capture_folder
 
 from flows.train_subject import segment_subject
 from hnerf.capture.capture import Capture
@@ -31,85 +34,94 @@ from tasks.study import degrade_capture
 from tasks.training import load_trained_avatar, train
 
 STEPS = 60
-AXES = {"frames": (6, 12, 24), "cameras": (1, 2, 4), "pixels": (0.25, 1.0, 4.0)}  # pixels: relative to the recording
+SHARES = (0.25, 0.5)
 MARKERS = "os^Dv"
+Cost = tuple[float, float]  # seconds, GiB
 
 
 def main() -> None:
-    """Time all parts, print, draw and write."""
+    """Measure all parts, print, draw and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("capture", nargs="?", default="valid-wave")
+    parser.add_argument("name")
+    parser.add_argument("capture")
+    parser.add_argument("--synth", action="append", default=[], metavar="a=b", help="of the performer")
     options = parser.parse_args()
     where = provenance()
-    source, _ = read_capture(SHARED / "data" / options.capture)
     with tempfile.TemporaryDirectory(prefix="hnerf-scaling-") as name:
-        folder = Path(name)
-        store = Store(folder / "captures")
-        recording = ingest(store, source, load_settings("fast").capture)
-        seconds = {
-            axis: {str(n): measure(Store(folder / f"{axis}-{n}"), part(store, recording, axis, n)) for n in amounts}
-            for axis, amounts in AXES.items()
-        }
-    result = where | {"capture": options.capture, "steps": STEPS, "seconds": seconds}
+        costs = measure_parts(capture_folder(options.capture, options.synth, Path(name)), Path(name))
+    result = where | {"capture": options.capture, "synth": options.synth, "steps": STEPS, "costs": costs}
     lines = [f"# Cost against frames, cameras and pixels: {options.capture}", "", provenance_line(result), ""]
-    lines += [f"Seconds of a stage; training is {STEPS} steps, with setup and saving.", ""]
-    for axis, rows in seconds.items():
+    lines += [f"Seconds of a stage, and the most GiB that its process held; training: {STEPS} steps, setup and saving."]
+    for axis, rows in costs.items():
         stages = list(next(iter(rows.values())))
-        lines += table([[axis, *stages], *([n, *(f"{row[s]:.1f}" for s in stages)] for n, row in rows.items())])
-        lines.append("")
-    write_result("scaling", result, "\n".join([*lines, "![seconds against size](scaling.png)", ""]))
-    draw(seconds, RESULTS / "scaling.png")
+        cells = [[str(n), *("{:.1f} s, {:.1f}".format(*row[stage]) for stage in stages)] for n, row in rows.items()]
+        lines += ["", *table([[axis, *stages], *cells])]
+    write_result(options.name, result, "\n".join([*lines, "", f"![seconds against size]({options.name}.png)", ""]))
+    draw(costs, RESULTS / f"{options.name}.png")
     print("\n".join(lines))
 
 
-def part(store: Store, recording: Artifact, axis: str, amount: float) -> Artifact:
-    """Return the recording with so many training frames or cameras, or so many times the pixels."""
-    capture = Capture.load(recording.root)
-    if axis == "frames":
-        return subset_capture(store, recording, None, tuple(evenly_spaced(capture.train_frames, int(amount))), ())
-    if axis == "cameras":
-        return subset_capture(store, recording, capture.train_cameras[: int(amount)], None, ())
-    if amount == 1:
-        return subset_capture(store, recording, None, None, ())
-    kind = "small_images" if amount < 1 else "large_images"
-    resized = degrade_capture(store, recording, Degradation(kind=kind, strength=amount**0.5, seed=0))
-    return subset_capture(store, resized, None, None, ())
+def measure_parts(capture: Path, scratch: Path) -> dict[str, dict[int, dict[str, Cost]]]:
+    """Return the costs by axis, amount and stage; the largest amount of each axis is the whole capture."""
+    store = Store(scratch / "captures")
+    recording = ingest(store, read_capture(capture)[0], load_settings("fast").capture)
+    recorded = Capture.load(recording.root)
+    frames, cameras = recorded.train_frames, recorded.train_cameras
+    pixels = recorded.cameras[cameras[0]].width_px * recorded.cameras[cameras[0]].height_px
+    costs: dict[str, dict[int, dict[str, Cost]]] = {"frames": {}, "cameras": {}, "pixels": {}}
+    for share in SHARES:
+        fewer_frames = tuple(evenly_spaced(frames, round(share * len(frames))))
+        fewer_cameras = tuple(evenly_spaced(cameras, round(share * len(cameras))))
+        smaller = degrade_capture(store, recording, Degradation(kind="small_images", strength=share**0.5, seed=0))
+        parts = {
+            ("frames", len(fewer_frames)): subset_capture(store, recording, None, fewer_frames, ()),
+            ("cameras", len(fewer_cameras)): subset_capture(store, recording, fewer_cameras, None, ()),
+            ("pixels", round(share * pixels)): subset_capture(store, smaller, None, None, ()),
+        }
+        for (axis, amount), part in parts.items():
+            costs[axis][amount] = measure(Store(scratch / f"{axis}-{amount}"), part)
+    whole = measure(Store(scratch / "whole"), subset_capture(store, recording, None, None, ()))
+    for axis, amount in {"frames": len(frames), "cameras": len(cameras), "pixels": pixels}.items():
+        costs[axis][amount] = whole
+    return costs
 
 
-def measure(store: Store, recording: Artifact) -> dict[str, float]:
-    """Return the seconds of each stage and of one image."""
+def measure(store: Store, recording: Artifact) -> dict[str, Cost]:
+    """Return the cost of each stage and of one image."""
     settings = load_settings("fast", [f"training.steps={STEPS}"])
-    seconds: dict[str, float] = {}
+    costs: dict[str, Cost] = {}
 
     def timed(name: str, work: Callable[[], Any]) -> Any:
+        reset_peak()
         started = time.perf_counter()
         found = work()
-        seconds[name] = time.perf_counter() - started
+        costs[name] = time.perf_counter() - started, peak_mib() / 1024
         return found
 
     calibration = timed("calibration", lambda: calibrate(store, recording, settings.calibration))
     segmentation = timed("segmentation", lambda: segment_subject(store, recording, calibration, settings))
     body = timed("fit", lambda: fit(store, recording, calibration, segmentation, settings.fit))
     training = timed("training", lambda: train(store, recording, calibration, segmentation, body, settings.training))
+    costs["training"] = costs["training"][0], training.metrics["peak_memory_gib"]  # of its own process
     avatar, capture = load_trained_avatar(training), calibrated_capture(recording, calibration)
     camera = capture.cameras[capture.train_cameras[0]]
     avatar.render(camera, avatar.body.theta[0], avatar.body.root[0])
     timed("one image", lambda: avatar.render(camera, avatar.body.theta[0], avatar.body.root[0]))
-    return seconds
+    return costs
 
 
-def draw(seconds: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
+def draw(costs: dict[str, dict[int, dict[str, Cost]]], path: Path) -> None:
     """Draw a panel for each axis, both scales logarithmic; grey lines have the slope of proportional cost."""
     figure = Figure(figsize=(11, 3.8), layout="constrained")
     for axes, (axis, rows) in zip(
-        figure.subplots(1, len(seconds), sharey=True, squeeze=False)[0], seconds.items(), strict=True
+        figure.subplots(1, len(costs), sharey=True, squeeze=False)[0], costs.items(), strict=True
     ):
-        amounts = [float(n) for n in rows]
+        amounts = list(rows)
         for marker, stage in zip(MARKERS, next(iter(rows.values())), strict=True):
-            spent = [row[stage] for row in rows.values()]
+            spent = [row[stage][0] for row in rows.values()]
             axes.loglog(amounts, spent, marker=marker, color="black", linewidth=1, markersize=5, label=stage)
             axes.loglog(amounts, [spent[0] * n / amounts[0] for n in amounts], color="0.75", linewidth=1, zorder=0)
-        axes.set_xlabel("pixels, as a multiple of the recorded" if axis == "pixels" else f"training {axis}")
+        axes.set_xlabel("pixels of an image" if axis == "pixels" else f"training {axis}")
         axes.set_xticks(amounts, [f"{n:g}" for n in amounts])
         axes.minorticks_off()
     figure.axes[0].set_ylabel("seconds")
