@@ -50,7 +50,7 @@ def exposure_corrected(plate: np.ndarray, image: np.ndarray, free: np.ndarray) -
     """
     if not free.any():
         return plate
-    gains = np.median((image[free][::PIXEL_STRIDE] + LOG_OFFSET) / (plate[free][::PIXEL_STRIDE] + LOG_OFFSET), 0)
+    gains = np.median((_some(image, free) + LOG_OFFSET) / (_some(plate, free) + LOG_OFFSET), 0)
     if np.abs(gains - 1).max() < MIN_GAIN:
         return plate
     return ((plate + LOG_OFFSET) * gains - LOG_OFFSET).round().clip(0, 255).astype(np.uint8)
@@ -62,8 +62,13 @@ def noise_level(image: np.ndarray, plate: np.ndarray, free: np.ndarray) -> float
     All of the image is used if most of it is free: then what shadows change counts as noise, and not as the person.
     """
     free = np.ones_like(free) if free.mean() > MOSTLY_FREE else free
-    contrast = image[free][::PIXEL_STRIDE].astype(np.float32) - plate[free][::PIXEL_STRIDE]
+    contrast = _some(image, free).astype(np.float32) - _some(plate, free)
     return (1.4826 * float(np.median(np.abs(contrast))) if len(contrast) else 0.0) + ROUNDING
+
+
+def _some(image: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """Return every PIXEL_STRIDE-th of the pixels `where` (H, W) bool of an image (H, W, 3), (N, 3)."""
+    return image.reshape(-1, 3)[np.flatnonzero(where)[::PIXEL_STRIDE]]
 
 
 def difference(

@@ -2,9 +2,11 @@
 
 import dataclasses
 import logging
+from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
@@ -12,10 +14,11 @@ from hnerf.capture.masks import Masks, encode
 from hnerf.config import SegmentationSettings
 from hnerf.errors import InputError
 from hnerf.progress import tracked
-from hnerf.segmentation.backends import choose_backend
+from hnerf.segmentation.backends import Backend, choose_backend
 from hnerf.segmentation.learned import Network
 from hnerf.segmentation.prior import Prior, body_priors, keypoint_priors, network_priors
 from hnerf.segmentation.verdicts import MaskVerdict, area_jumps, judge_mask
+from hnerf.side_by_side import side_by_side
 
 log = logging.getLogger("hnerf.segmentation")
 
@@ -39,14 +42,18 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
         backend = choose_backend(capture, name, own, body is not None, network, settings)
         log.info("camera %s: %d masks, %s", name, len(capture.frames), backend.name)
         verdicts = []
-        for frame, prior in zip(capture.frames, own, strict=True):
-            mask = backend.mask(frame, prior)
+        masks = side_by_side(partial(_mask, backend), zip(capture.frames, own, strict=True), torch.device("cpu"))
+        for frame, prior, mask in zip(capture.frames, own, masks, strict=True):
             verdicts.append(judge_mask(mask, prior))
             encoded[name, frame] = encode(mask)
         cameras[name] = {"backend": backend.name} | _findings(capture, name, verdicts, own)
         for row in cameras[name]["dropped"]:
             del encoded[name, row["frame"]]
     return Masks(encoded, {"cameras": cameras})
+
+
+def _mask(backend: Backend, frame_and_prior: tuple[int, Prior]) -> np.ndarray:
+    return backend.mask(*frame_and_prior)
 
 
 def _findings(capture: Capture, camera: str, verdicts: list[MaskVerdict], priors: list[Prior]) -> dict[str, Any]:

@@ -137,6 +137,15 @@ def test_clean_plate_with_a_soft_shadow(tmp_path: Path) -> None:
     np.testing.assert_array_equal(loaded.get("c0", 3), masks.get("c0", 3))
 
 
+def test_masks_made_side_by_side_are_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    capture, _ = write_scene(tmp_path)
+    encoded = {}
+    for threads in (1, 3):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        encoded[threads] = segment(capture, None, SETTINGS).encoded
+    assert encoded[1] == encoded[3]
+
+
 def test_given_masks_come_first_and_lose_other_people(tmp_path: Path) -> None:
     capture, truth = write_scene(tmp_path)
     given = {view: mask.copy() for view, mask in truth.items()}
