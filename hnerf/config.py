@@ -287,6 +287,7 @@ class AssetSettings(Section):
     normal_map_px: int = Field(default=0, ge=0)  # side of the normal map; 0: none, since it shows the grids' cells
     correctives: int = Field(default=16, ge=0, le=64)  # components of what frames have beyond skinning
     bones: Literal["along", "identity"] = "along"  # joints' axes at rest: Y along the bone, or those of the stage
+    splats: int = Field(default=0, ge=0, le=1_000_000)  # Gaussian splats on the surface, in files of their own; 0: none
     allow_poor: bool = False  # hand over an asset that is more than 4 dB below its field, too
     version: str = "1"  # of the asset, as its assetInfo says
     licence: str = ""  # of the asset, as its assetInfo says

@@ -43,6 +43,7 @@ NORMALISE, MANIFEST = "hnerf/capture/normalise.py", "hnerf/capture/manifest.py"
 PLATE, REGISTRATION = "hnerf/asset/plate.py", "hnerf/asset/registration.py"
 FIELD_COLOURS = "hnerf/asset/field_colours.py"
 GLB, USD, PACKAGE = "hnerf/asset/glb.py", "hnerf/asset/usd.py", "hnerf/asset/package.py"
+SPLATS, SPLAT_RENDERING = "hnerf/asset/splats.py", "hnerf/asset/splat_rendering.py"
 SKELETON, MOTIONS, SKINNING = "hnerf/asset/skeleton.py", "hnerf/asset/motions.py", "hnerf/asset/skinning.py"
 RIGS, BVH, BVH_MOTION = "hnerf/asset/rigs.py", "hnerf/body/bvh.py", "hnerf/render/bvh_motion.py"
 ANTIALIASING, CORRECTIVES = "hnerf/avatar/antialiasing.py", "hnerf/asset/correctives.py"
@@ -70,6 +71,7 @@ BY_CAMERA, BY_TRIANGULATION = "tests/geometry/test_camera.py", "tests/geometry/t
 BY_FILES, BY_USD = "tests/capture/formats/test_camera_files.py", "tests/asset/test_usd.py"
 BY_PACKAGE, BY_MOTIONS = "tests/asset/test_package.py", "tests/asset/test_motions.py"
 BY_SKINNING = "tests/asset/test_skinning.py"
+BY_SPLATS, BY_SPLAT_RENDERING = "tests/asset/test_splats.py", "tests/asset/test_splat_rendering.py"
 BY_BVH, BY_BVH_MOTION = "tests/body/test_bvh.py", "tests/render/test_bvh_motion.py"
 BY_METRICS, BY_POLICY = "tests/evaluation/test_metrics.py", "tests/tasks/test_policy.py"
 BY_SCORES, BY_FINGERS = "tests/evaluation/test_geometry.py", "tests/body/test_fingers.py"
@@ -357,6 +359,13 @@ FAULTS = (
     Fault("colours-median", FIELD_COLOURS, "for k in (seen - 1, seen)", "for k in (seen, seen)", BY_FIELD_COLOURS),
     Fault("surface-step", SURFACE, "vertices_m - step_to_surface(", "vertices_m + step_to_surface(", BY_CORRECTIVES),
     Fault("usd-shape-weights", USD, "array(motion.shape_weights[k]", "array(1 - motion.shape_weights[k]", BY_PACKAGE),
+    Fault("splats-triangle", SPLATS, "root = np.sqrt(", "root = (", BY_SPLATS),
+    Fault("splats-spread", SPLATS, "SPREAD = 1.4", "SPREAD = 1.3", BY_SPLATS),
+    Fault("splats-logit", "hnerf/asset/splat_ply.py", "np.log(OPACITY / (1 - OPACITY))", "OPACITY", BY_SPLATS),
+    Fault("splats-quaternion", "hnerf/asset/splat_prim.py", "[:, [1, 2, 3, 0]]", "[:, [0, 1, 2, 3]]", BY_SPLATS),
+    Fault("splats-order", SPLAT_RENDERING, "np.argsort(depth_m,", "np.argsort(-depth_m,", BY_SPLAT_RENDERING),
+    Fault("splats-hidden", SPLAT_RENDERING, "through[pixel] * np.exp(before)", "np.exp(before)", BY_SPLAT_RENDERING),
+    Fault("splats-slope", SPLAT_RENDERING, "K[:2] - pixels_px[:, :, None] *", "K[:2] - 0 *", BY_SPLAT_RENDERING),
     Fault("glb-time", GLB, "(motion.codes - motion.codes[0]) / motion.fps", "motion.codes / motion.fps", BY_GLB),
     Fault("usd-quaternion", USD, "Gf.Quatf(w, x, y, z)", "Gf.Quatf(x, y, z, w)", BY_PACKAGE),
     Fault("usd-camera-axis", USD, "np.diag([1, -1, -1])", "np.diag([1, 1, -1])", BY_USD),

@@ -45,6 +45,7 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("asset: {faces: -1}", "asset.faces"),
         ("asset: {texture_px: -1}", "asset.texture_px"),
         ("asset: {texture_poses: 0}", "asset.texture_poses"),
+        ("asset: {splats: -1}", "asset.splats"),
         ("training: {field: {kind: nerf}}", "training: Value error, nerf does not tune poses"),
         ("training: {losses: {fog: 0.1}}", "training: Value error, fast does not model the background"),
     ],

@@ -1,4 +1,5 @@
-"""The asset against the field it was made from: both in the same views, scored by the photograph under its mask."""
+"""The asset, and its splats, against the field it was made from: all in the same views, scored by the photograph under
+its mask."""
 
 import logging
 from dataclasses import dataclass
@@ -9,8 +10,9 @@ import numpy as np
 import torch
 import trimesh
 
-from hnerf.asset.pictures import on_black
+from hnerf.asset.pictures import on_black, splats_on_black
 from hnerf.asset.rigs import FULL
+from hnerf.asset.splats import Splats
 from hnerf.asset.staging import CAPTURED, StagedAvatar
 from hnerf.avatar.avatar import Avatar
 from hnerf.capture.capture import Capture
@@ -33,17 +35,20 @@ log = logging.getLogger("hnerf.asset")
 
 @dataclass(frozen=True)
 class Compared:
-    """One view, in the person's box: photograph (H, W, 3) over black; field and asset (H, W, 4), over black and their
-    coverage; uint8. scores: of "asset" and "field", by name."""
+    """One view, in the person's box: photograph (H, W, 3) over black; field, asset and splats, if there are any, (H, W,
+    4), over black and their coverage; uint8. scores: of "asset", "field" and "splats", by name."""
 
     view: View
     photograph: np.ndarray
     field: np.ndarray
     asset: np.ndarray
     scores: dict[str, dict[str, float]]
+    splats: np.ndarray | None = None
 
 
-def compare_with_field(capture: Capture, masks: Masks, avatar: Avatar, staged: StagedAvatar) -> list[Compared]:
+def compare_with_field(
+    capture: Capture, masks: Masks, avatar: Avatar, staged: StagedAvatar, splats: Splats | None = None
+) -> list[Compared]:
     """Return at most IMAGES views of training frames, from test cameras if the recording has masks of these, else from
     training cameras. None if no view has a mask."""
     tested = sample_views(all_views(capture, NOVEL_VIEW), IMAGES)
@@ -56,19 +61,19 @@ def compare_with_field(capture: Capture, masks: Masks, avatar: Avatar, staged: S
         mask = _mask(capture, masks, view)
         if mask is None or not mask.any():
             return None
-        return _compared(capture, view, mask, avatar, staged, surfaces[view.frame])
+        return _compared(capture, view, mask, avatar, staged, surfaces[view.frame], splats)
 
     compared = side_by_side(compare, chosen, avatar.body.theta.device)
     return [one for one in tracked(compared, "asset against field", len(chosen)) if one]
 
 
 def comparison_figures(compared: list[Compared]) -> dict[str, Any]:
-    """Return the mean scores of asset and field, by how much the asset is below, and those of each image."""
+    """Return the mean scores of asset, field and splats, by how much the asset is below, and those of each image."""
     if not compared:
         return {"images": 0, "reason": "no image has a mask of the person"}
     means = {
         shown: {name: float(np.mean([c.scores[shown][name] for c in compared])) for name in compared[0].scores[shown]}
-        for shown in ("asset", "field")
+        for shown in compared[0].scores
     }
     cameras = "test" if compared[0].view.split == NOVEL_VIEW else "training"
     below = {name: means["field"][name] - means["asset"][name] for name in means["field"]}
@@ -120,7 +125,13 @@ def _skinned_surfaces(staged: StagedAvatar, frames: list[int]) -> dict[int, Surf
 
 
 def _compared(
-    capture: Capture, view: View, mask: np.ndarray, avatar: Avatar, staged: StagedAvatar, surface: Surface
+    capture: Capture,
+    view: View,
+    mask: np.ndarray,
+    avatar: Avatar,
+    staged: StagedAvatar,
+    surface: Surface,
+    splats: Splats | None,
 ) -> Compared:
     box = mask_box(mask)
     camera = camera_of_box(capture.cameras[view.camera], box)
@@ -131,9 +142,15 @@ def _compared(
     k = avatar.body.index(view.frame)
     with torch.no_grad():
         field = rgba(avatar.render(small, avatar.body.theta[k], avatar.body.root[k]))
-    asset = on_black(surface, staged, camera, small.size_px, avatar.gains.get(view.camera, (1.0, 1.0, 1.0)))
+    gain = avatar.gains.get(view.camera, (1.0, 1.0, 1.0))
+    asset = on_black(surface, staged, camera, small.size_px, gain)
     scores = {"asset": _scores(asset, photograph, shown), "field": _scores(field, photograph, shown)}
-    return Compared(view, photograph, field, asset, scores)
+    if splats is None:
+        return Compared(view, photograph, field, asset, scores)
+    drawn = splats_on_black(splats, np.asarray(surface.mesh.vertices), camera, small.size_px, gain)
+    to_field = psnr(drawn[..., :3].astype(np.float32) / 255, field[..., :3].astype(np.float32) / 255)
+    scores["splats"] = _scores(drawn, photograph, shown) | {"psnr_to_field": to_field}
+    return Compared(view, photograph, field, asset, scores, drawn)
 
 
 def _scores(rendered: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> dict[str, float]:

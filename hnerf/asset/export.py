@@ -27,14 +27,17 @@ from hnerf.asset.figures import (
     mesh_figures,
     motion_figures,
     rig_figures,
+    splat_figures,
     surface_figures,
 )
 from hnerf.asset.glb import write_glb
 from hnerf.asset.normal_map import normal_map
-from hnerf.asset.package import AssetInfo, write_cache, write_package, write_usdz
+from hnerf.asset.package import AssetInfo, write_cache, write_package, write_splats, write_usdz
 from hnerf.asset.regions import findings, surface_distances_mm
 from hnerf.asset.report import write_report
 from hnerf.asset.rigs import FULL, GAME
+from hnerf.asset.splat_ply import write_splat_ply
+from hnerf.asset.splats import Splats, surface_splats
 from hnerf.asset.staging import StagedAvatar, stage_avatar
 from hnerf.asset.texture import UvLayout
 from hnerf.asset.topologies import AssetMesh, asset_meshes
@@ -49,6 +52,7 @@ from hnerf.config import AssetSettings
 from hnerf.render.motion import Motion, retarget, select_poses
 
 PACKAGES = ("avatar.usdz", "avatar.usda", "avatar_24.usda", "avatar_30.usda", "avatar_cache.usdz")
+SPLATS = "avatar_splats.usdc"
 
 log = logging.getLogger("hnerf.asset")
 
@@ -83,6 +87,7 @@ class MeshAsset:
 
     surface: ClothedSurface
     staged: StagedAvatar
+    splats: Splats | None
     compared: list[Compared]
     against_field: dict[str, Any]
     seconds: dict[str, float]
@@ -106,19 +111,21 @@ def export_asset(
     seconds: dict[str, float] = {}
     meshes = _rest_meshes(avatar, settings, seconds)
     names = list(meshes.by_topology) if settings.topology == "both" else [settings.topology]
-    asset, *others = [_mesh_asset(capture, masks, avatar, meshes, name, settings, further or {}) for name in names]
+    asset = _mesh_asset(capture, masks, avatar, meshes, names[0], settings, further or {})
+    bare = settings.model_copy(update={"splats": 0})  # the first mesh alone has splats
+    others = [_mesh_asset(capture, masks, avatar, meshes, name, bare, further or {}) for name in names[1:]]
     captured = others[0] if others else None
-    surface, staged = asset.surface, asset.staged
+    surface, staged, splats = asset.surface, asset.staged, asset.splats
     seconds |= asset.seconds
     with _timed("poses", seconds):
         poses = extreme_poses(staged, surface.mesh.rig, surface.mesh.skin_faces)
     with _timed("files", seconds):
         info = AssetInfo(capture.name, settings.version, settings.licence, digest)
-        write_files(out, staged, capture, info, captured.staged if captured else None)
+        write_files(out, staged, capture, info, captured.staged if captured else None, splats)
     with _timed("viewer", seconds):
         viewer = write_viewer(out / "viewer.html", out / "avatar.glb", capture, staged.stage_from_world)
     with _timed("validation", seconds):
-        validation = {name: validate_package(out / name) for name in PACKAGES}
+        validation = {name: validate_package(out / name) for name in (*PACKAGES, *([SPLATS] if splats else []))}
     report = _figures(capture, meshes, asset, names[0], settings) | {
         "against_field": asset.against_field,
         "crossing_share": {pose.name: pose.crossing for pose in poses},
@@ -129,6 +136,8 @@ def export_asset(
     }
     if captured:
         report["captured"] = _captured_figures(captured)
+    if splats:
+        report["splats"] = splat_figures(staged, splats)
     (out / "report.json").write_text(json.dumps(report, indent=1))
     shown = capture.train_frames[0]
     root = surface.body.root[surface.body.index(shown)].numpy()
@@ -172,11 +181,12 @@ def _mesh_asset(
         normals = normal_map(timeless, surface.mesh, layout, px) if px else None
     with _timed("staging", seconds):
         staged = _staged(capture, timeless.body, surface, layout, texture, albedo, normals, settings, further)
+    splats = surface_splats(staged, settings.splats) if settings.splats else None
     with _timed("comparison", seconds):
-        compared = compare_with_field(capture, masks, avatar, staged)
+        compared = compare_with_field(capture, masks, avatar, staged, splats)
         against_field = comparison_figures(compared)
     require_close(capture.name, topology, against_field, settings.allow_poor)
-    return MeshAsset(surface, staged, compared, against_field, seconds)
+    return MeshAsset(surface, staged, splats, compared, against_field, seconds)
 
 
 def _clothed_surface(capture: Capture, avatar: Avatar, mesh: AssetMesh, settings: AssetSettings) -> ClothedSurface:
@@ -263,10 +273,15 @@ def _captured_figures(asset: MeshAsset) -> dict[str, Any]:
 
 
 def write_files(
-    out: Path, staged: StagedAvatar, capture: Capture, info: AssetInfo, captured: StagedAvatar | None = None
+    out: Path,
+    staged: StagedAvatar,
+    capture: Capture,
+    info: AssetInfo,
+    captured: StagedAvatar | None = None,
+    splats: Splats | None = None,
 ) -> None:
     """Write a staged avatar in all formats into the folder `out`; captured: the same with the captured mesh, which USD
-    has as well."""
+    has as well; splats: on its surface, for files of their own."""
     cameras = list(capture.cameras.values())
     write_package(out, staged, cameras, capture.fps, info, captured)
     write_usdz(out / "avatar.usdz", staged, cameras, capture.fps, info, captured)
@@ -274,6 +289,9 @@ def write_files(
     write_glb(out / "avatar.glb", staged, staged.rigs[FULL])
     write_glb(out / "avatar_game.glb", staged, staged.rigs[GAME])
     write_avatar_bvh(out / "avatar.bvh", staged)
+    if splats:
+        write_splats(out / SPLATS, staged, splats, capture.fps, info)
+        write_splat_ply(out / "avatar_splats.ply", staged, splats)
 
 
 @contextmanager

@@ -8,7 +8,9 @@ import trimesh
 from hnerf.asset.correctives import Correctives
 from hnerf.asset.light import Light
 from hnerf.asset.registration import crossing_faces
-from hnerf.asset.rigs import FULL
+from hnerf.asset.rigs import FULL, GAME, posed_frames
+from hnerf.asset.skinning import skinned
+from hnerf.asset.splats import Splats
 from hnerf.asset.staging import CAPTURED, StagedAvatar
 from hnerf.asset.topologies import AssetMesh
 from hnerf.geometry.mesh_queries import Surface
@@ -63,6 +65,24 @@ def rig_figures(staged: StagedAvatar, name: str) -> dict[str, float]:
     return {
         "joints": len(rig.skeleton.names),
         "influences": rig.skin.influences,
+        "moved_p99_mm": float(1e3 * np.percentile(worst_m, 99)),
+        "moved_max_mm": float(1e3 * worst_m.max()),
+    }
+
+
+def splat_figures(staged: StagedAvatar, splats: Splats) -> dict[str, float]:
+    """Return how many splats there are, their sigma along the surface, and how far their own skin moves them from the
+    captured surfaces, as `rig_figures` does."""
+    game, full = staged.rigs[GAME], staged.rigs[FULL]
+    skin, weights = splats.skin(game), game.motions[CAPTURED].shape_weights
+    poses = posed_frames(game.skeleton, game.stage[CAPTURED], staged.rest, weights)
+    worst_m = np.zeros(len(splats.face))
+    for (transforms, points_m), surface_m in zip(poses, full.surfaces_m(CAPTURED, staged.rest), strict=True):
+        off_m = skinned(transforms, skin, splats.at(points_m)) - splats.at(surface_m)
+        worst_m = np.maximum(worst_m, np.linalg.norm(off_m, axis=1))
+    return {
+        "count": len(splats.face),
+        "sigma_mm": 1e3 * splats.sigma_m,
         "moved_p99_mm": float(1e3 * np.percentile(worst_m, 99)),
         "moved_max_mm": float(1e3 * worst_m.max()),
     }

@@ -2,7 +2,8 @@
 
 `avatar.usda` is the interface: variant sets, asset information, and payloads that lie in `avatar/`. `avatar_24.usda`
 and `avatar_30.usda` show it at these rates, for importers that ignore a file's own. `avatar.usdz` has the same prims
-and variants in one layer, as ARKit asks. `avatar_cache.usdz` has the surface as points at every frame.
+and variants in one layer, as ARKit asks. `avatar_cache.usdz` has the surface as points at every frame, and
+`avatar_splats.usdc`, if splats are wanted, has these.
 
 With a second avatar, of the captured mesh, there is a variant set `topology`. All other variant sets are inside its
 variants, and the names of payloads and pictures begin with the variant's.
@@ -22,6 +23,8 @@ from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
 
 from hnerf.asset.dome import dome
 from hnerf.asset.rigs import FULL
+from hnerf.asset.splat_prim import author_splats
+from hnerf.asset.splats import Splats
 from hnerf.asset.staging import CAPTURED, RATES, StagedAvatar
 from hnerf.asset.usd import (
     ALBEDO_NAME,
@@ -135,6 +138,13 @@ def write_cache(path: Path, avatar: StagedAvatar, cameras: Iterable[Camera], fps
             extents.Set(extent(posed), float(frame))
             normals.Set(vec3f(normals_of(posed, avatar.faces)), float(frame))
         _package(stage, {"": avatar}, path)
+
+
+def write_splats(path: Path, avatar: StagedAvatar, splats: Splats, fps: float, info: AssetInfo) -> None:
+    """Write `avatar_splats.usdc`: Gaussian splats on the surface at every frame."""
+    stage = _new_stage(path, {"": avatar}, avatar.frames, fps, info)
+    author_splats(stage, avatar, splats)
+    stage.GetRootLayer().Save()
 
 
 def _by_topology(avatar: StagedAvatar, captured: StagedAvatar | None) -> Avatars:

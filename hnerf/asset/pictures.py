@@ -4,6 +4,8 @@ RGB."""
 import cv2
 import numpy as np
 
+from hnerf.asset.splat_rendering import render_splats
+from hnerf.asset.splats import OPACITY, Splats
 from hnerf.asset.staging import StagedAvatar
 from hnerf.evaluation.pictures import cast_pixels, downsampled, portrait_camera, studio_light, supersampled
 from hnerf.geometry.camera import Camera
@@ -43,6 +45,17 @@ def on_black(
     exposed = np.minimum(colours * np.array(gain, np.float32), 255)
     pixels = np.concatenate([exposed, np.full((len(exposed), 1), 255, np.float32)], 1) * (hits.face[:, None] >= 0)
     averaged = cv2.resize(pixels.reshape(fine.height_px, fine.width_px, 4), size_px, interpolation=cv2.INTER_AREA)
+    return averaged.round().astype(np.uint8)
+
+
+def splats_on_black(
+    splats: Splats, points_m: np.ndarray, camera: Camera, size_px: tuple[int, int], gain: tuple[float, float, float]
+) -> np.ndarray:
+    """Render splats on a mesh with vertices (V, 3) likewise."""
+    middles_m, _, quaternions = splats.on(points_m)
+    exposed = np.minimum(splats.colours * np.array(gain), 1)
+    fine = render_splats(middles_m, quaternions, splats.scales_m, OPACITY, exposed, supersampled(camera))
+    averaged = cv2.resize(255 * fine, size_px, interpolation=cv2.INTER_AREA)
     return averaged.round().astype(np.uint8)
 
 

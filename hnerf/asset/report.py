@@ -74,12 +74,13 @@ def write_report(
 
 
 def _beside_field(view: Compared) -> list[GalleryPicture]:
-    """Return the photograph of a view, and renderings of field and asset with their PSNR."""
+    """Return the photograph of a view, and renderings of field, asset and splats, if there are any, with their PSNR."""
     psnr = {shown: f"{scores['psnr']:.1f} dB" for shown, scores in view.scores.items()}
     return [
         _picture(f"Photograph, camera {view.view.camera}, frame {view.view.frame}", view.photograph),
         _picture(f"Field, {psnr['field']}", view.field[..., :3]),
         _picture(f"Asset, {psnr['asset']}", view.asset[..., :3]),
+        *([] if view.splats is None else [_picture(f"Splats, {psnr['splats']}", view.splats[..., :3])]),
     ]
 
 

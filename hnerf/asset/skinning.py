@@ -22,7 +22,7 @@ class Skin:
         same = (joints[:, :, None] == joints[:, None, :]) & (self.weights[:, None, :] > 0)
         first = same.argmax(2) == np.arange(joints.shape[1])
         summed = np.where(first & (self.weights > 0), (same * self.weights[:, None, :]).sum(2), 0)
-        return _largest_first(joints, summed)
+        return largest_first(joints, summed)
 
     @property
     def influences(self) -> int:
@@ -45,7 +45,7 @@ def with_few_influences(skin: Skin, poses: Iterator[tuple[np.ndarray, np.ndarray
     """
     many = np.nonzero((skin.weights > 0).sum(1) > influences)[0]
     if not len(many):
-        return _largest_first(skin.joints, skin.weights, influences)
+        return largest_first(skin.joints, skin.weights, influences)
     joints, before = skin.joints[many], skin.weights[many].astype(np.float64)
     form = np.zeros((len(many), before.shape[1], before.shape[1]))
     frames = 0
@@ -57,7 +57,7 @@ def with_few_influences(skin: Skin, poses: Iterator[tuple[np.ndarray, np.ndarray
     form = form / max(frames, 1) + WEIGHT_COST_M**2 * np.eye(before.shape[1])
     weights = skin.weights.copy()
     weights[many] = _best_subsets(form, before, influences)
-    return _largest_first(skin.joints, weights, influences)
+    return largest_first(skin.joints, weights, influences)
 
 
 def _best_subsets(form: np.ndarray, before: np.ndarray, influences: int) -> np.ndarray:
@@ -81,7 +81,8 @@ def _best_subsets(form: np.ndarray, before: np.ndarray, influences: int) -> np.n
     return best
 
 
-def _largest_first(joints: np.ndarray, weights: np.ndarray, influences: int | None = None) -> Skin:
+def largest_first(joints: np.ndarray, weights: np.ndarray, influences: int | None = None) -> Skin:
+    """Return the skin of joints and weights (V, K) with the `influences` largest weights of each point, or all."""
     order = np.argsort(-weights, axis=1, kind="stable")[:, :influences]
     weights = np.take_along_axis(weights, order, 1)
     joints = np.where(weights > 0, np.take_along_axis(joints, order, 1), 0)

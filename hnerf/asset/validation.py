@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdSkel, UsdValidation
+from pxr import Usd, UsdGeom, UsdSkel, UsdValidation, UsdVol
 
 from hnerf.asset.package_checks import package_defects
 from hnerf.asset.rig_checks import animation_defects, samples, skeleton_defects, skin_defects
+from hnerf.asset.splat_checks import splat_defects
 from hnerf.errors import InvalidAsset
 
 PLAUSIBLE_SIZE_M = (0.5, 3.0)  # longest side of the box around a person, from lying down to raised arms
@@ -66,7 +67,8 @@ def _each_inside(root: Usd.Prim, topology: str) -> Iterator[str]:
 
 
 def data_defects(stage: Usd.Stage) -> list[str]:
-    """Return one line for each defect in units, structure, meshes, skinning and skeletons, as variants are selected."""
+    """Return one line for each defect in units, structure, meshes, skinning, skeletons and splats, as variants are
+    selected."""
     defects = []
     if UsdGeom.GetStageMetersPerUnit(stage) != 1.0:
         defects.append(f"metersPerUnit is {UsdGeom.GetStageMetersPerUnit(stage)}, not 1")
@@ -80,11 +82,14 @@ def data_defects(stage: Usd.Stage) -> list[str]:
             defects += _mesh_defects(UsdGeom.Mesh(prim))
             if prim.HasAPI(UsdSkel.BindingAPI):
                 defects += skin_defects(prim)
+        elif prim.IsA(UsdVol.ParticleField3DGaussianSplat):
+            found += 1
+            defects += splat_defects(prim)
         elif prim.IsA(UsdSkel.Skeleton):
             defects += skeleton_defects(UsdSkel.Skeleton(prim))
         elif prim.IsA(UsdSkel.Animation):
             defects += animation_defects(UsdSkel.Animation(prim))
-    return defects if found else [*defects, "has no mesh"]
+    return defects if found else [*defects, "has no mesh and no splats"]
 
 
 def _mesh_defects(mesh: UsdGeom.Mesh) -> list[str]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from hnerf.asset import comparison
 from hnerf.asset.comparison import compare_with_field, comparison_figures, require_close
+from hnerf.asset.splats import surface_splats
 from hnerf.asset.staging import StagedAvatar
 from hnerf.avatar.avatar import Rendering
 from hnerf.capture.capture import Capture, write_image
@@ -78,6 +79,22 @@ def test_the_asset_is_seen_by_the_camera_in_the_frame_as_that_camera_exposes_it(
     np.testing.assert_allclose(covered.max(0), seen_px.max(0) - (230, 100), atol=3)
     column, row = covered.mean(0).astype(int)
     assert found.asset[row, column].tolist() == [50, 100, 255, 255]
+
+
+def test_splats_are_seen_as_the_asset_is_and_scored_by_photograph_and_field(
+    recorded: Capture, staged: StagedAvatar
+) -> None:
+    avatar, shown = GreyField(bending_body(), gains={"01": (0.5, 1.0, 3.0)}), grey(staged, 100)
+    (found,) = compare_with_field(recorded, masks_of((4,)), avatar, shown, surface_splats(shown, 20_000))
+    assert found.splats is not None
+    inside = found.asset[..., 3] == 255
+    assert np.abs(found.splats[inside].astype(int) - (50, 100, 255, 255)).mean() < 3
+    assert found.scores["splats"]["psnr"] == pytest.approx(found.scores["asset"]["psnr"], abs=0.5)
+    off = (found.splats[..., :3].astype(float) - 90) / 255  # the field is grey all over
+    assert found.scores["splats"]["psnr_to_field"] == pytest.approx(-10 * np.log10((off**2).mean()), abs=1e-3)
+    figures = comparison_figures([found])
+    assert figures["splats"] == found.scores["splats"] and list(figures["below_field"]) == ["psnr", "ssim", "mask_iou"]
+    assert figures["per_image"][0]["splats_psnr_to_field"] == found.scores["splats"]["psnr_to_field"]
 
 
 def test_large_boxes_are_scaled_down(recorded: Capture, staged: StagedAvatar, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -108,9 +108,9 @@ def test_export_writes_every_file_and_says_what_is_in_them(tmp_path: Path, monke
 def test_usd_has_both_meshes_if_both_are_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "nothing"))
     monkeypatch.setattr("hnerf.asset.report.TURNS", 2)
-    for topology in ("registered", "both"):
+    for topology, splats in (("registered", 0), ("both", 300)):
         (tmp_path / topology).mkdir()
-        settings = overridden(SMALL, [f"topology={topology}"])
+        settings = overridden(SMALL, [f"topology={topology}", f"splats={splats}"])
         export_asset(capture(), Masks({}, {}), StandInAvatar(bending_body()), settings, tmp_path / topology)
     one, two = (json.loads((tmp_path / name / "report.json").read_text()) for name in ("registered", "both"))
     assert two["mesh"] == one["mesh"] and "captured" not in one
@@ -118,6 +118,10 @@ def test_usd_has_both_meshes_if_both_are_wanted(tmp_path: Path, monkeypatch: pyt
     assert two["captured"]["mesh"]["topology"] == "captured" and faces != one["mesh"]["faces"]
     assert {"texture", "comparison"} < set(two["captured"]["seconds"])
     assert two["captured"]["against_field"]["images"] == 0
+    assert two["splats"]["count"] == 300 and "splats" not in one | two["captured"]
+    added = {"avatar_splats.usdc", "avatar_splats.ply"}
+    assert added < set(two["bytes"]) and not added & set(one["bytes"])
+    assert two["validation"]["avatar_splats.usdc"]["warnings"] == [] and "avatar_splats.usdc" not in one["validation"]
     for path in ("avatar.glb", "avatar_game.glb", "avatar.bvh", "avatar_cache.usdz"):
         assert (tmp_path / "both" / path).read_bytes() == (tmp_path / "registered" / path).read_bytes(), path
     for name in ("avatar.usda", "avatar_24.usda", "avatar_30.usda", "avatar.usdz"):
