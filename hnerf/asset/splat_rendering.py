@@ -9,7 +9,7 @@ from hnerf.geometry.camera import Camera
 NEAREST_M = 0.05  # what is nearer to the camera is left out
 FAINTEST = 1 / 255  # of an opacity that is drawn
 SMOOTHING_PX2 = 0.3  # variance that a pixel adds, as in the published program
-MOST_AT_ONCE = 2_000_000  # pairs of a splat and a pixel
+MOST_AT_ONCE = 1_000_000  # pairs of a splat and a pixel
 
 
 def render_splats(

@@ -64,6 +64,18 @@ def test_what_is_behind_the_camera_or_beside_the_picture_is_not_drawn() -> None:
     assert not found.any()
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_turned_splat_leans_from_the_first_axis_to_the_second(axis: int) -> None:
+    """30 degrees about x turn y to z, about y turn z to x, about z turn x to y."""
+    variances, (first, second) = np.array([9.0, 4.0, 1.0]), ((axis + 1) % 3, (axis + 2) % 3)
+    quaternion = np.array([[np.cos(np.pi / 12), 0, 0, 0]])
+    quaternion[0, 1 + axis] = np.sin(np.pi / 12)
+    found = covariances(quaternion, np.sqrt(variances))[0]
+    assert found[axis, axis] == pytest.approx(variances[axis])
+    assert found[first, first] == pytest.approx(0.75 * variances[first] + 0.25 * variances[second])
+    assert found[first, second] == pytest.approx(0.75**0.5 / 2 * (variances[first] - variances[second]))
+
+
 def test_a_turned_disc_is_seen_from_its_side() -> None:
     """2 cm by 4 cm by 1 mm, turned by 90 degrees about the line of sight, and seen by a camera that looks along -x."""
     scales_m = np.array([0.02, 0.04, 0.001])

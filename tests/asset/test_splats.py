@@ -11,7 +11,7 @@ from hnerf.asset.figures import splat_figures
 from hnerf.asset.package import AssetInfo, write_splats
 from hnerf.asset.pictures import on_black, splats_on_black
 from hnerf.asset.rigs import FULL, GAME
-from hnerf.asset.skinning import skinned
+from hnerf.asset.skinning import Skin, skinned
 from hnerf.asset.splat_ply import write_splat_ply
 from hnerf.asset.splats import OPACITY, SPREAD, Splats, evenly_on_faces, surface_splats, turned_to
 from hnerf.asset.staging import CAPTURED, StagedAvatar
@@ -147,6 +147,20 @@ def test_the_plys_skin_moves_splats_as_the_game_rig_moves_the_surface(
     figures = splat_figures(staged, splats)
     assert figures["count"] == COUNT and figures["sigma_mm"] == pytest.approx(1e3 * splats.sigma_m)
     assert 5 < figures["moved_p99_mm"] < figures["moved_max_mm"] < 12  # bent by 0.8, with noise of 1 cm on points
+
+
+def test_the_plys_skin_has_the_four_strongest_joints_of_the_game_rig(
+    staged: StagedAvatar, splats: Splats, tmp_path: Path
+) -> None:
+    """All points follow five joints of six; the weakest, with a tenth, is left out."""
+    rig, points = staged.rigs[GAME], len(staged.rest_points_m)
+    skin = Skin(np.tile([5, 1, 0, 4, 2], (points, 1)), np.tile([0.1, 0.3, 0.2, 0.25, 0.15], (points, 1)))
+    six = dataclasses.replace(rig, skeleton=dataclasses.replace(rig.skeleton, names=tuple("abcdef")), skin=skin)
+    write_splat_ply(tmp_path / "a.ply", dataclasses.replace(staged, rigs=staged.rigs | {GAME: six}), splats)
+    found = read_ply(tmp_path / "a.ply")
+    assert [found[f"joint_{k}"].tolist() for k in range(4)] == [[joint] * COUNT for joint in (1, 4, 0, 2)]
+    for k, weight in enumerate((0.3, 0.25, 0.2, 0.15)):
+        np.testing.assert_allclose(found[f"weight_{k}"], weight / 0.9, rtol=1e-6)
 
 
 def test_usd_has_the_splats_on_the_skinned_surface_in_each_frame(
