@@ -20,15 +20,15 @@ def ball(sigma_m: float) -> np.ndarray:
 
 
 def test_a_splat_is_brightest_at_its_middle_and_falls_off_by_its_sigma_in_pixels() -> None:
-    """5 cm at 2 m and 10 cm to the right is 5 px by 10 px at column 50; each gets 0.3 px² of a pixel."""
+    """5 cm at 2 m and 10 cm to the right is 5 px by 10 px at column 50."""
     found = render_splats(np.array([[0.1, 0, 2.0]]), STRAIGHT, ball(0.05), 0.8, np.array([[1.0, 0.5, 0]]), camera())
     assert np.unravel_index(found[..., 3].argmax(), (61, 81)) == (30, 50)
     np.testing.assert_allclose(found[30, 50], [0.8, 0.4, 0, 0.8], rtol=1e-9)
     # Off the axis of the view, depth counts as well: its slope is 10 px in 2 m, 5 px a metre.
-    across_px2 = 5**2 + (5 * 0.05) ** 2 + 0.3
+    across_px2 = 5**2 + (5 * 0.05) ** 2
     assert found[30, 57, 3] == pytest.approx(0.8 * np.exp(-(7**2) / 2 / across_px2))
-    assert found[38, 50, 3] == pytest.approx(0.8 * np.exp(-(8**2) / 2 / (10**2 + 0.3)))
-    assert found[30, 70, 3] == 0  # exp(-400 / 50.7) is less than a step of 8 bits
+    assert found[38, 50, 3] == pytest.approx(0.8 * np.exp(-(8**2) / 2 / 10**2))
+    assert found[30, 70, 3] == 0  # exp(-400 / 50) is less than a step of 8 bits
 
 
 def test_splats_hide_those_behind_whatever_their_order() -> None:
@@ -82,7 +82,7 @@ def test_a_turned_disc_is_seen_from_its_side() -> None:
     np.testing.assert_allclose(covariances(QUARTER, scales_m)[0], np.diag([0.04, 0.02, 0.001]) ** 2, atol=1e-12)
     middle_m = np.array([[0, 0, 2.0]])
     seen_px2 = projected(middle_m, covariances(QUARTER, scales_m), camera())[0]
-    np.testing.assert_allclose(seen_px2, np.diag([4**2 + 0.3, 4**2 + 0.3]), atol=1e-9)
+    np.testing.assert_allclose(seen_px2, np.diag([4**2, 4**2]), atol=1e-9)
     aside = Camera("c", camera().K, np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.array([-2.0, 0, 2.0]), 81, 61)
     seen_px2 = projected(middle_m, covariances(QUARTER, scales_m), aside)[0]
-    np.testing.assert_allclose(seen_px2, np.diag([0.1**2 + 0.3, 4**2 + 0.3]), atol=1e-9)
+    np.testing.assert_allclose(seen_px2, np.diag([0.1**2, 4**2]), atol=1e-9)
