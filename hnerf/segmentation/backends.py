@@ -115,7 +115,7 @@ class BackgroundSubtraction:
 
 
 def choose_backend(
-    capture: Capture, camera: str, priors: list[Prior], fitted: bool, network: Network | None,
+    capture: Capture, camera: str, priors: Sequence[Prior], fitted: bool, network: Network | None,
     settings: SegmentationSettings,
 ) -> Backend:  # fmt: skip
     """Return the first possible source of masks: given masks, the user's network, a clean plate, then the background

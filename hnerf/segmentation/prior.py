@@ -1,7 +1,8 @@
 """Priors on where in an image the subject is, from keypoints or from a fitted body."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -67,44 +68,69 @@ class Prior:
         return Prior(self.core[window], self.body[window], self.near[window], self.reach[window], self.height_px)
 
 
-def keypoint_priors(capture: Capture, settings: SegmentationSettings) -> Iterator[tuple[str, list[Prior]]]:
-    """Yield each training camera with the priors of its stick figures, in the order of `capture.frames`."""
-    for name, figures in _stick_figures(capture):
-        rest = settings.reach, _is_upright(capture, name)
-        yield name, [Prior.around(s.core, s.body, s.completed, s.height_px, *rest) for s in figures]
+class Priors(Sequence[Prior]):
+    """The priors of one camera in the order of `capture.frames`, each made whenever it is asked for: those of a long
+    recording do not fit into memory together."""
+
+    def __init__(self, make: Callable[[int], Prior], frames: int) -> None:
+        self._make, self._numbers = make, range(frames)
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def __getitem__(self, number: int) -> Prior:  # type: ignore[override]
+        return self._make(self._numbers[number])
 
 
-def body_priors(capture: Capture, body: BodyFit, settings: SegmentationSettings) -> Iterator[tuple[str, list[Prior]]]:
+def keypoint_priors(capture: Capture, settings: SegmentationSettings) -> Iterator[tuple[str, Priors]]:
+    """Yield each training camera with the priors of its stick figures."""
+    for name, poses_px in _consistent_keypoints(capture, None).items():
+        yield name, Priors(partial(_keypoint_prior, capture, name, poses_px, settings.reach), len(poses_px))
+
+
+def _keypoint_prior(capture: Capture, camera: str, poses_px: np.ndarray, reach: float, number: int) -> Prior:
+    stick = _stick_figure(capture.cameras[camera], poses_px[number])
+    upright = _is_upright(capture, camera)
+    return Prior.around(stick.core, stick.body, stick.completed, stick.height_px, reach, upright)
+
+
+def body_priors(capture: Capture, body: BodyFit, settings: SegmentationSettings) -> Iterator[tuple[str, Priors]]:
     """Yield each training camera with the priors of the fitted body together with the stick figure, which a poor fit
     may miss."""
-    vertices_m, faces = body.vertices_m().numpy(), body.rig.faces.numpy()
-    for name, figures in _stick_figures(capture, body):
-        priors, upright = [], _is_upright(capture, name)
-        for frame, figure in zip(capture.frames, figures, strict=True):
-            covered = silhouette(capture.cameras[name], vertices_m[body.index(frame)], faces)
-            core = cv2.erode(covered.astype(np.uint8), disc(CORE_SHARE * figure.height_px)).astype(bool)
-            covered |= figure.body
-            priors.append(Prior.around(core, covered, covered, figure.height_px, settings.reach / 2, upright))
-        yield name, priors
+    vertices_m, faces = body.vertices_m().numpy()[[body.index(f) for f in capture.frames]], body.rig.faces.numpy()
+    for name, poses_px in _consistent_keypoints(capture, body).items():
+        make = partial(_body_prior, capture, name, poses_px, vertices_m, faces, settings.reach)
+        yield name, Priors(make, len(poses_px))
 
 
-def network_priors(capture: Capture, settings: SegmentationSettings) -> Iterator[tuple[str, list[Prior]]]:
+def _body_prior(
+    capture: Capture, camera: str, poses_px: np.ndarray, vertices_m: np.ndarray, faces: np.ndarray, reach: float,
+    number: int,
+) -> Prior:  # fmt: skip
+    stick = _stick_figure(capture.cameras[camera], poses_px[number])
+    covered = silhouette(capture.cameras[camera], vertices_m[number], faces)
+    core = cv2.erode(covered.astype(np.uint8), disc(CORE_SHARE * stick.height_px)).astype(bool)
+    covered |= stick.body
+    return Prior.around(core, covered, covered, stick.height_px, reach / 2, _is_upright(capture, camera))
+
+
+def network_priors(capture: Capture, settings: SegmentationSettings) -> Iterator[tuple[str, Priors]]:
     """Yield each training camera with the priors of what a network took for a person, as far as it is the subject,
     together with the stick figure."""
-    for name, figures in _stick_figures(capture):
-        priors, upright = [], _is_upright(capture, name)
-        for frame, stick in zip(capture.frames, figures, strict=True):
-            likely = capture.person_probability(name, frame)
-            assert likely is not None  # a network looks at every image of a training camera
-            figure = Prior.around(stick.core, stick.body, stick.completed, stick.height_px, settings.reach, upright)
-            covered = (likely > LIKELY) & figure.reach
-            if not covered.any():  # missed in this image
-                priors.append(figure)
-                continue
-            core = cv2.erode((likely > SURE).astype(np.uint8), disc(CORE_SHARE * stick.height_px)).astype(bool)
-            body = covered | stick.core
-            priors.append(Prior.around(core & covered, body, body, stick.height_px, settings.reach / 2, upright))
-        yield name, priors
+    for name, poses_px in _consistent_keypoints(capture, None).items():
+        yield name, Priors(partial(_network_prior, capture, name, poses_px, settings.reach), len(poses_px))
+
+
+def _network_prior(capture: Capture, camera: str, poses_px: np.ndarray, reach: float, number: int) -> Prior:
+    likely = capture.person_probability(camera, capture.frames[number])
+    assert likely is not None  # a network looks at every image of a training camera
+    figure = _keypoint_prior(capture, camera, poses_px, reach, number)
+    covered = (likely > LIKELY) & figure.reach
+    if not covered.any():  # missed in this image
+        return figure
+    core = cv2.erode((likely > SURE).astype(np.uint8), disc(CORE_SHARE * figure.height_px)).astype(bool)
+    body = covered | figure.core
+    return Prior.around(core & covered, body, body, figure.height_px, reach / 2, _is_upright(capture, camera))
 
 
 def _is_upright(capture: Capture, camera: str) -> bool:
@@ -209,12 +235,6 @@ class _StickFigure:
     body: np.ndarray
     completed: np.ndarray
     height_px: float
-
-
-def _stick_figures(capture: Capture, body: BodyFit | None = None) -> Iterator[tuple[str, list[_StickFigure]]]:
-    """Yield each training camera with the stick figures of `capture.frames`."""
-    for name, poses_px in _consistent_keypoints(capture, body).items():
-        yield name, [_stick_figure(capture.cameras[name], pose_px) for pose_px in poses_px]
 
 
 def _stick_figure(camera: Camera, pose_px: np.ndarray) -> _StickFigure:

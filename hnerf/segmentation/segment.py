@@ -3,7 +3,7 @@
 import dataclasses
 import logging
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from hnerf.errors import InputError
 from hnerf.progress import tracked
 from hnerf.segmentation.backends import Backend, choose_backend
 from hnerf.segmentation.learned import Network
-from hnerf.segmentation.prior import Prior, body_priors, keypoint_priors, network_priors
+from hnerf.segmentation.prior import Priors, body_priors, keypoint_priors, network_priors
 from hnerf.segmentation.verdicts import MaskVerdict, area_jumps, judge_mask
 from hnerf.side_by_side import side_by_side
 
@@ -41,24 +41,35 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
     for name, own in tracked(priors, "segmentation", len(capture.train_cameras)):
         backend = choose_backend(capture, name, own, body is not None, network, settings)
         log.info("camera %s: %d masks, %s", name, len(capture.frames), backend.name)
-        verdicts = []
-        masks = side_by_side(partial(_mask, backend), zip(capture.frames, own, strict=True), torch.device("cpu"))
-        for frame, prior, mask in zip(capture.frames, own, masks, strict=True):
-            verdicts.append(judge_mask(mask, prior))
-            encoded[name, frame] = encode(mask)
-        cameras[name] = {"backend": backend.name} | _findings(capture, name, verdicts, own)
+        verdicts, bodies_px = [], []
+        looks = side_by_side(partial(_look, capture, backend, own), range(len(own)), torch.device("cpu"))
+        for frame, look in zip(capture.frames, looks, strict=True):
+            verdicts.append(look.verdict)
+            bodies_px.append(look.body_px)
+            encoded[name, frame] = look.encoded
+        cameras[name] = {"backend": backend.name} | _findings(capture, name, verdicts, bodies_px)
         for row in cameras[name]["dropped"]:
             del encoded[name, row["frame"]]
     return Masks(encoded, {"cameras": cameras})
 
 
-def _mask(backend: Backend, frame_and_prior: tuple[int, Prior]) -> np.ndarray:
-    return backend.mask(*frame_and_prior)
+class _Look(NamedTuple):
+    """What one image gives: the encoded mask, its verdict, and the pixels of the prior's body."""
+
+    encoded: bytes
+    verdict: MaskVerdict
+    body_px: int
 
 
-def _findings(capture: Capture, camera: str, verdicts: list[MaskVerdict], priors: list[Prior]) -> dict[str, Any]:
+def _look(capture: Capture, backend: Backend, priors: Priors, number: int) -> _Look:
+    prior = priors[number]
+    mask = backend.mask(capture.frames[number], prior)
+    return _Look(encode(mask), judge_mask(mask, prior), int(prior.body.sum()))
+
+
+def _findings(capture: Capture, camera: str, verdicts: list[MaskVerdict], bodies_px: list[int]) -> dict[str, Any]:
     """Return plain values: the median area, and the frames dropped or noted, each with its reason."""
-    sudden = area_jumps(capture.frames, verdicts, [int(prior.body.sum()) for prior in priors])
+    sudden = area_jumps(capture.frames, verdicts, bodies_px)
     judged = {
         frame: dataclasses.replace(verdict, fault=verdict.fault or sudden.get(frame))
         for frame, verdict in zip(capture.frames, verdicts, strict=True)
