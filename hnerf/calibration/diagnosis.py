@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from hnerf.capture.people import person_heights_px
-from hnerf.geometry.camera import Camera
+from hnerf.geometry.camera import Camera, resampling
 from hnerf.geometry.triangulation import reprojection_px, triangulate
 
 TRIM = 0.8  # share of the residuals that count; the rest are taken for detector errors
@@ -176,14 +176,11 @@ def size_ratio(cameras: Sequence[Camera], keypoints: np.ndarray) -> float | None
     flat, limit_px = keypoints.reshape(len(cameras), -1, 3), gross_limit_px(keypoints)
     if len(cameras) < 3 or min(cost_without_each_px(cameras, flat).values()) <= limit_px:
         return None
-    costs_px = [trimmed_cost_px([_scale_intrinsics(c, ratio) for c in cameras], flat) for ratio in SIZE_RATIOS]
+    scaled = ([dataclasses.replace(c, K=resampling(ratio, ratio) @ c.K) for c in cameras] for ratio in SIZE_RATIOS)
+    costs_px = [trimmed_cost_px(resized, flat) for resized in scaled]
     best = int(np.argmin(costs_px))
     ratio = float(SIZE_RATIOS[best])
     return ratio if costs_px[best] <= limit_px and max(ratio, 1 / ratio) > OTHER_SIZE else None
-
-
-def _scale_intrinsics(camera: Camera, ratio: float) -> Camera:
-    return dataclasses.replace(camera, K=np.diag([ratio, ratio, 1]) @ camera.K)
 
 
 def undo_mistake(cameras: list[Camera], keypoints: np.ndarray) -> tuple[list[Camera], dict[str, str]]:

@@ -6,6 +6,7 @@ import numpy as np
 from hnerf.capture.capture import Capture, SubjectPoint
 from hnerf.capture.people import PersonTrack, follow_in_each_camera, follow_people, moves
 from hnerf.errors import InputError
+from hnerf.geometry.camera import resampling
 from hnerf.geometry.triangulation import triangulate
 
 EQUAL_CLAIM = 0.9  # share of the best claim from which another person may as well be meant
@@ -112,9 +113,9 @@ def _place(capture: Capture, *people: PersonTrack) -> str:
         return "in different images"
     c, frame = np.argwhere(shown)[0]
     camera, places = capture.cameras[capture.train_cameras[c]], []
-    scale = np.array(capture.recorded_sizes_px[camera.name]) / camera.size_px
+    to_recorded = resampling(*(np.array(capture.recorded_sizes_px[camera.name]) / camera.size_px))
     for person in people:
         keypoints = person.keypoints[c, frame]
-        x, y = scale * np.median(keypoints[keypoints[:, 2] > 0, :2], axis=0)
+        x, y, _ = to_recorded @ [*np.median(keypoints[keypoints[:, 2] > 0, :2], axis=0), 1]
         places.append(f"({x:.0f}, {y:.0f})")
     return f"at {' and '.join(places)} in camera {camera.name}, frame {capture.frames[frame]}"

@@ -206,6 +206,14 @@ def test_a_camera_that_is_far_off_is_not_one_of_another_picture_size(count: int)
     assert size_ratio(cameras, seen) is None
 
 
+def test_the_corner_of_a_small_picture_stays_its_corner_at_another_size() -> None:
+    """A person 31 px tall, where keypoints may be off by 1.6 px: scaled about the centre of the first pixel, pictures of
+    5 times the size would be off by (5 - 1) / 2 = 2 px."""
+    cameras = [camera.resized(14, 14) for camera in ring(3)]
+    seen = detections([camera.resized(70, 70) for camera in cameras], 0)
+    assert size_ratio(cameras, np.stack([points[:2, 0] for points in seen.values()])) == pytest.approx(5)
+
+
 def test_a_wrong_convention_in_one_camera_is_named(tmp_path: Path) -> None:
     report = check_calibration(recorded_with(tmp_path, MISTAKES["R is transposed"], only=3), SETTINGS)
     assert "R is transposed: undone" in report.verdicts["c3"].reasons

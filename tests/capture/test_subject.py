@@ -145,6 +145,17 @@ def test_two_who_have_the_same_claim_are_one_line(tmp_path: Path) -> None:
         subject_keypoints(capture)
 
 
+def test_two_who_have_the_same_claim_are_placed_in_recorded_pixels(tmp_path: Path) -> None:
+    """The recorded picture is 8 times as large: pixel 400 covers its pixels 3200 to 3207, of which 3203.5 is the
+    middle."""
+    x, y, seen = np.linspace(-20, 20, 25), np.linspace(-50, 50, 25), np.full(25, CONFIDENCE)
+    moving = [np.stack([x + middle, y + 500 + 2 * f, seen], -1) for f in range(FRAMES) for middle in (400, 600)]
+    capture = write_capture(tmp_path, ring(1), {"c0": np.reshape(moving, (FRAMES, 2, 25, 3))})
+    capture = dataclasses.replace(capture, recorded_sizes_px={"c0": (8000, 8000)})
+    with pytest.raises(InputError, match=r"at \(4804, 4004\) and \(3204, 4004\) in camera c0, frame 0"):
+        subject_keypoints(capture)
+
+
 @pytest.mark.parametrize("chosen", [0, 1])
 def test_who_is_named_is_taken(chosen: int, tmp_path: Path) -> None:
     """By the ground, and by a point in an image."""
