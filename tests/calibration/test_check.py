@@ -207,8 +207,8 @@ def test_a_camera_that_is_far_off_is_not_one_of_another_picture_size(count: int)
 
 
 def test_the_corner_of_a_small_picture_stays_its_corner_at_another_size() -> None:
-    """A person 31 px tall, where keypoints may be off by 1.6 px: scaled about the centre of the first pixel, pictures of
-    5 times the size would be off by (5 - 1) / 2 = 2 px."""
+    """A person 31 px tall, where keypoints may be off by 1.6 px: scaled about the centre of the first pixel, pictures
+    of 5 times the size would be off by (5 - 1) / 2 = 2 px."""
     cameras = [camera.resized(14, 14) for camera in ring(3)]
     seen = detections([camera.resized(70, 70) for camera in cameras], 0)
     assert size_ratio(cameras, np.stack([points[:2, 0] for points in seen.values()])) == pytest.approx(5)
