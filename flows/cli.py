@@ -11,6 +11,7 @@ from pathlib import Path
 
 from flows import commands
 from flows.display import display
+from flows.ending import Terminated, open_closed_streams, unwound_by_sigterm
 from flows.store_commands import add_store_commands
 from hnerf.config import load_settings
 from hnerf.errors import InputError, InvalidAsset
@@ -18,7 +19,7 @@ from tasks.launcher import RankFailedError
 from tasks.limits import StalledError
 from tasks.source import place
 
-FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # the last as shells have it
+FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143  # the last two as shells have them
 NO_ROOM = (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # None: our own, of libraries that do not say why
 CAMERA_FORMATS = ("easymocap", "caliscope", "aniposelib", "colmap")  # of hnerf.capture.formats.export, which is slow
 PICTURES = ("colour", "depth", "normals", "mask", "mesh")  # of hnerf.render.subject, which imports torch
@@ -37,15 +38,18 @@ log = logging.getLogger("hnerf")
 def main(argv: list[str] | None = None) -> int:
     """Run one command; one line on stderr and 2 for input and paths that cannot be used, 1 for a training that cannot
     go on, an asset that must not be handed over, or output that nobody reads; 130 if it is interrupted from the
-    keyboard."""
+    keyboard, 143 by SIGTERM."""
+    open_closed_streams()
     options = _parser().parse_args(argv)
     try:
-        with display():
+        with unwound_by_sigterm(), display():
             folders = _existing(options)
             if options.command.__module__ == commands.__name__ and options.command is not commands.settings:
                 log.info("%s", " ".join([_name(options.command), *map(str, folders)]))
             options.command(options)
         sys.stdout.flush()
+    except Terminated:
+        return _fail("ended by SIGTERM", TERMINATED)
     except KeyboardInterrupt:
         return _fail("interrupted", INTERRUPTED)
     except InputError as error:

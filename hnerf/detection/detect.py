@@ -100,14 +100,17 @@ def _find_people(capture: Capture, size: str, out: Path) -> None:
     with ProcessPoolExecutor(processes, spawn, initializer=end_with_parent, initargs=(signal.SIGKILL,)) as pool:
         jobs = {pool.submit(find_in_camera, capture, name, size, out): name for name in waiting}
         running = set(jobs)
-        while running:
-            done, running = wait(running, PROGRESS_S, FIRST_EXCEPTION)
-            for job in done:
-                if job.exception():
-                    pool.shutdown(wait=False, cancel_futures=True)
-                job.result()
-            images = sum(len(list((out / PERSON / name).glob("*.png"))) for name in jobs.values())
-            report_progress("detection", images, len(jobs) * len(capture.frames))
+        try:
+            while running:
+                done, running = wait(running, PROGRESS_S, FIRST_EXCEPTION)
+                for job in done:
+                    job.result()
+                images = sum(len(list((out / PERSON / name).glob("*.png"))) for name in jobs.values())
+                report_progress("detection", images, len(jobs) * len(capture.frames))
+        except BaseException:  # SIGTERM and Ctrl-C as well: the pool would wait for all cameras
+            for worker in multiprocessing.active_children():
+                worker.terminate()
+            raise
 
 
 def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -117,7 +118,9 @@ def test_joints_are_where_the_truth_has_them(tmp_path: Path) -> None:
         assert np.median(np.linalg.norm(found[0, 0, LIMBS, :2] - true_px, axis=-1)) < 8
 
 
-def test_no_process_outlives_the_stage_that_was_killed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_no_process_outlives_the_stage_that_was_ended(how: signal.Signals, tmp_path: Path) -> None:
+    """Nor does the stage wait for what its workers are at."""
     command = [sys.executable, "-m", "tests.detection.orphans", str(tmp_path)]
     stage = subprocess.Popen(command, cwd=Path(__file__).parents[2], stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
@@ -125,8 +128,8 @@ def test_no_process_outlives_the_stage_that_was_killed(tmp_path: Path) -> None:
         assert time.monotonic() < deadline and stage.poll() is None
         time.sleep(0.05)
     workers = [int(path.name) for path in tmp_path.iterdir()]
-    stage.kill()
-    stage.wait()
+    stage.send_signal(how)
+    stage.wait(60)
     while any(Path(f"/proc/{worker}/exe").exists() for worker in workers):
         assert time.monotonic() < deadline, f"{workers} are still running"
         time.sleep(0.05)

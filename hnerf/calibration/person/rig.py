@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-import pycolmap
 
 from hnerf.calibration.bundle import adjust
 from hnerf.calibration.diagnosis import median_height_px, trimmed_cost_px
@@ -20,6 +19,10 @@ from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import triangulate
+from hnerf.processes import sigterm_kept
+
+with sigterm_kept():
+    import pycolmap
 
 INLIER_SHARE = 0.02  # of the person's height in pixels: about twice a detector's noise
 MIN_SHARED = 100  # keypoints that two cameras see at once: four whole people

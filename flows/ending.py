@@ -1,0 +1,38 @@
+"""How a command ends that is told to, and what it does with streams that were closed before it began."""
+
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, which unwinds a command as Ctrl-C does."""
+
+
+@contextmanager
+def unwound_by_sigterm() -> Iterator[None]:
+    """Raise Terminated in the code inside on the first SIGTERM; ignore others, which timeout(1) sends while files are
+    removed. The processes that a command starts have the default again."""
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    signal.signal(number, signal.SIG_IGN)
+    raise Terminated
+
+
+def open_closed_streams() -> None:
+    """Let standard output and error that are closed (`>&-`) go nowhere: Python has None in their place, and the next
+    file that is opened would have their number, into which libraries write."""
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        if getattr(sys, name) is None:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+            os.set_inheritable(number, True)
+            setattr(sys, name, os.fdopen(number, "w"))

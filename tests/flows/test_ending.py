@@ -1,0 +1,83 @@
+"""Commands that are told to end, and commands whose streams are closed."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from flows.cli import main
+from flows.ending import Terminated, unwound_by_sigterm
+from hnerf import synthetic
+
+RUN = "import sys; from flows.cli import main; sys.exit(main(sys.argv[1:]))"
+ENDED_MIDWAY = """
+import os, signal, sys, time
+from flows.cli import main
+from hnerf import synthetic
+
+def write(out, settings):
+    import hnerf.calibration.person.rig, hnerf.capture.formats.colmap
+    (out / "half").touch()
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(60)
+
+synthetic.write_synthetic_capture = write
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_sigterm_is_one_line_and_leaves_nothing_half_written(tmp_path: Path) -> None:
+    """Also once pycolmap is loaded, which takes the signal for a crash."""
+    command = [sys.executable, "-c", ENDED_MIDWAY, "synth", str(tmp_path / "ada")]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (143, "hnerf: ended by SIGTERM\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_second_sigterm_does_not_end_what_cleans_up(tmp_path: Path) -> None:
+    cleaned = []
+    with pytest.raises(Terminated), unwound_by_sigterm():
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        finally:
+            signal.raise_signal(signal.SIGTERM)
+            cleaned.append(tmp_path)
+    assert cleaned == [tmp_path]
+
+
+def test_what_sigterm_did_before_it_does_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    during = []
+    monkeypatch.setattr(
+        synthetic, "write_synthetic_capture", lambda *_: during.append(signal.getsignal(signal.SIGTERM))
+    )
+    before = signal.getsignal(signal.SIGTERM)
+    assert main(["synth", str(tmp_path / "ada")]) == 0
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert during != [before]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "lines", "status"),
+    [
+        ("settings >&-", 0, 0),
+        ("settings >&- 2>&-", 0, 0),
+        ("settings --preset best >&-", 1, 2),
+        ("settings --preset best 2>&-", 0, 2),
+        ("store list --store . >&-", 1, 2),
+    ],
+)
+def test_closed_streams_change_neither_what_is_done_nor_the_exit_code(
+    arguments: str, lines: int, status: int, tmp_path: Path
+) -> None:
+    command = ["sh", "-c", f'exec "$0" -c "$1" {arguments}', sys.executable, RUN]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert (len(ended.stderr.splitlines()), ended.stdout, ended.returncode) == (lines, "", status)
+
+
+def test_no_file_takes_the_number_of_a_closed_stream(tmp_path: Path) -> None:
+    """Libraries write to standard output and error by these numbers."""
+    code = "import sys; from flows import ending; ending.open_closed_streams(); sys.exit(open(sys.executable).fileno())"
+    ended = subprocess.run(["sh", "-c", 'exec "$0" -c "$1" >&- 2>&-', sys.executable, code], check=False)
+    assert ended.returncode > 2
