@@ -7,7 +7,9 @@ import os
 import select
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from flows import commands
 from flows.display import display
@@ -23,6 +25,9 @@ FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143  # the last two as s
 NO_ROOM = (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # None: our own, of libraries that do not say why
 CAMERA_FORMATS = ("easymocap", "caliscope", "aniposelib", "colmap")  # of hnerf.capture.formats.export, which is slow
 PICTURES = ("colour", "depth", "normals", "mask", "mesh")  # of hnerf.render.subject, which imports torch
+SIZES_PX = (2, 8000)  # of a picture's side, of the same module
+STATURE_M = (0.5, 2.3)  # of hnerf.calibration.diagnosis, which imports numpy
+MAX_COUNT, MAX_M = 999_999, 1000  # pictures have names of six digits
 FOLDERS = {
     "capture": "the capture's folder, or one video",
     "folder": "the folder of a capture",
@@ -169,16 +174,13 @@ def _add_calibrate(command: argparse.ArgumentParser) -> None:
     command.add_argument("--format", choices=CAMERA_FORMATS, action="append", default=[], help="write these files, too")
     boards = command.add_argument_group("from boards")
     boards.add_argument(
-        "--ground-frame",
-        type=_not_negative,
-        metavar="N",
-        help="the frame whose board lies on the floor, at the origin",
+        "--ground-frame", **_number(int, 0, MAX_COUNT, "N", "the frame whose board lies on the floor, at the origin")
     )
     person = command.add_argument_group("from the person")
-    person.add_argument("--height", type=_positive, metavar="M", help="height of the person (default: the mean)")
+    person.add_argument("--height", **_number(float, *STATURE_M, "M", "height of the person (default: the mean)"))
     person.add_argument("--lens", type=Path, metavar="FILE", help="intrinsics: intri.yml, or a TOML of cameras")
     person.add_argument(
-        "--fov", type=_angle, metavar="DEG", help="field of view across the longer side (default: metadata, or found)"
+        "--fov", **_number(float, 1, 170, "DEG", "field of view across the longer side (default: metadata, or found)")
     )
 
 
@@ -209,7 +211,7 @@ def _add_benchmark(benchmark: argparse.ArgumentParser) -> None:
     what = "methods to compare, of the study or any presets, like fast,nerf (default: the study's)"
     benchmark.add_argument("--methods", type=_names, metavar="LIST", help=what)
     benchmark.add_argument(
-        "--seconds", type=_positive, metavar="S", help="limit of every training (default: the study's)"
+        "--seconds", **_number(float, 0.1, 1_000_000, "S", "limit of every training (default: the study's)")
     )
 
 
@@ -231,25 +233,16 @@ def _names(text: str) -> list[str]:
     return names
 
 
-def _not_negative(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError("give 0 or more")
-    return value
+def _number(kind: type[float], low: float, high: float, unit: str, what: str) -> dict[str, Any]:
+    """Return how `add_argument` adds a number, int or float; one outside the range is refused, NaN included."""
 
+    def read(text: str) -> float:
+        with suppress(ValueError):
+            if low <= (value := kind(text)) <= high:
+                return value
+        raise argparse.ArgumentTypeError(f"give {'a whole number' if kind is int else 'a number'} from {low} to {high}")
 
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError("give a number above 0")
-    return value
-
-
-def _angle(text: str) -> float:
-    value = float(text)
-    if not 1 <= value <= 170:
-        raise argparse.ArgumentTypeError("give degrees from 1 to 170")
-    return value
+    return {"type": read, "metavar": unit, "help": what}
 
 
 def _add_render(render: argparse.ArgumentParser) -> None:
@@ -259,12 +252,18 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     view = render.add_mutually_exclusive_group()
     view.add_argument("--camera", help="a recorded camera's name (default: an orbit)")
     view.add_argument("--path", type=Path, help="a JSON list of cameras, or a folder of them, to fly along")
-    render.add_argument("--radius", type=float, metavar="M", help="radius of the orbit (default: the cameras')")
-    render.add_argument("--height", type=float, metavar="M", help="height of the orbit above the person's middle")
+    render.add_argument("--radius", **_number(float, 0.1, MAX_M, "M", "radius of the orbit (default: the cameras')"))
+    render.add_argument(
+        "--height", **_number(float, -MAX_M, MAX_M, "M", "height of the orbit above the person's middle")
+    )
     render.add_argument("--motion", type=Path, metavar="FILE", help=f"show {MOTIONS} (default: the recording's)")
     render.add_argument("--frames", default=":", metavar="A:B:STEP", help="poses to show, or one number (default: all)")
-    render.add_argument("--between", type=int, nargs=2, metavar="FRAME", help="interpolate between two frames' poses")
+    render.add_argument(
+        "--between", nargs=2, **_number(int, 0, MAX_COUNT, "FRAME", "interpolate between two frames' poses")
+    )
     render.add_argument("--shape", action="append", default=[], metavar="NAME=+X", help="add to a shape value")
-    render.add_argument("--volume", type=float, metavar="PERCENT", help="change of the body's volume, like -40 or 80")
-    render.add_argument("--size", type=int, metavar="PX", help="longest side of a picture (default: as recorded)")
-    render.add_argument("--pictures", type=int, metavar="N", help="number of pictures (default: one a pose)")
+    render.add_argument(
+        "--volume", **_number(float, -100, 1000, "PERCENT", "change of the body's volume, like -40 or 80")
+    )
+    render.add_argument("--size", **_number(int, *SIZES_PX, "PX", "longest side of a picture (default: as recorded)"))
+    render.add_argument("--pictures", **_number(int, 1, MAX_COUNT, "N", "number of pictures (default: one a pose)"))

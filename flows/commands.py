@@ -6,7 +6,9 @@ Each imports what it needs itself, so that the others, and help, need not wait f
 import argparse
 import dataclasses
 import json
+import math
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -232,7 +234,7 @@ def export(options: argparse.Namespace) -> None:
 
 def _shape_change(text: str) -> tuple[str, float]:
     name, _, amount = text.partition("=")
-    try:
-        return name, float(amount)
-    except ValueError:
-        raise InputError(f"shape {text}: give a name and what to add, like weight=+0.4") from None
+    with suppress(ValueError):
+        if math.isfinite(change := float(amount)):
+            return name, change
+    raise InputError(f"--shape {text}: give a name and what to add, like weight=+0.4")

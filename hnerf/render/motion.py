@@ -71,8 +71,8 @@ def select_frames(frames: tuple[int, ...], wanted: str, source: Path) -> tuple[i
 
     Raises InputError, naming `source`, if the selection is malformed or empty.
     """
-    if not re.fullmatch(r"\d+|\d*:\d*(:[1-9]\d*)?", wanted):
-        raise InputError(f"frames {wanted}: give a number like 12, or FIRST:END:STEP like 0:24:2")
+    if not re.fullmatch(r"\d{1,9}|\d{0,9}:\d{0,9}(:[1-9]\d{0,8})?", wanted):
+        raise InputError(f"--frames {wanted[:80]}: give a number like 12, or FIRST:END:STEP like 0:24:2")
     parts = [int(part) if part else None for part in wanted.split(":")]
     numbers = range(*slice(*parts).indices(max(frames) + 1)) if ":" in wanted else range(int(wanted), int(wanted) + 1)
     chosen = tuple(frame for frame in frames if frame in numbers)

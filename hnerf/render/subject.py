@@ -120,7 +120,8 @@ def _cameras(options: RenderOptions, capture: Capture, body: BodyFit) -> list[Ca
         found = [camera.scaled(options.size_px / max(camera.size_px)) for camera in found]
     width_px, height_px = found[0].size_px  # the same for all cameras
     if min(width_px, height_px) < MIN_SIZE_PX or max(width_px, height_px) > MAX_SIZE_PX:
-        raise InputError(f"pictures of {width_px} x {height_px} px: each side must have {MIN_SIZE_PX} to {MAX_SIZE_PX}")
+        sides = f"each side must have {MIN_SIZE_PX} to {MAX_SIZE_PX}"
+        raise InputError(f"pictures of {width_px} x {height_px} px: {sides}; give another --size")
     return found
 
 

@@ -7,13 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from flows.cli import CAMERA_FORMATS, PICTURES, main
+from flows.cli import CAMERA_FORMATS, PICTURES, SIZES_PX, STATURE_M, main
 from flows.train_subject import Trained, train_subject
 from hnerf import synthetic
+from hnerf.calibration.diagnosis import BODY_HEIGHT_M
 from hnerf.capture.formats.export import WRITERS
 from hnerf.config import AssetSettings, SyntheticSettings
 from hnerf.errors import InvalidAsset
-from hnerf.render.subject import OUTPUT_KINDS
+from hnerf.render.subject import MAX_SIZE_PX, MIN_SIZE_PX, OUTPUT_KINDS
 from tasks.bucket import BucketError
 from tasks.launcher import RankFailedError
 from tests.shared_data import shared_capture
@@ -207,9 +208,39 @@ def test_output_that_nobody_reads_ends_a_command_quietly() -> None:
     assert (ended.returncode, ended.stderr) == (1, b"")
 
 
-def test_choices_are_those_of_the_library() -> None:
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("render . --size 0", "--size: give a whole number from 2 to 8000"),
+        ("render . --size 8001", "--size: give a whole number from 2 to 8000"),
+        ("render . --size nan", "--size: give a whole number from 2 to 8000"),
+        ("render . --pictures 0", "--pictures: give a whole number from 1 to 999999"),
+        ("render . --pictures 10000000000", "--pictures: give a whole number from 1 to 999999"),
+        ("render . --radius nan", "--radius: give a number from 0.1 to 1000"),
+        ("render . --radius -1", "--radius: give a number from 0.1 to 1000"),
+        ("render . --height inf", "--height: give a number from -1000 to 1000"),
+        ("render . --volume -101", "--volume: give a number from -100 to 1000"),
+        ("render . --between 0 -1", "--between: give a whole number from 0 to 999999"),
+        ("calibrate . --fov 0", "--fov: give a number from 1 to 170"),
+        ("calibrate . --height 1e9", "--height: give a number from 0.5 to 2.3"),
+        ("calibrate . --ground-frame x", "--ground-frame: give a whole number from 0 to 999999"),
+        ("benchmark . --seconds -3", "--seconds: give a number from 0.1 to 1000000"),
+        ("store gc --keep 0", "--keep: give 1 or more"),
+    ],
+)
+def test_a_number_out_of_its_range_is_answered_with_the_range(
+    arguments: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(arguments.split())
+    assert capsys.readouterr().err.endswith(f"error: argument {message}\n")
+
+
+def test_choices_and_ranges_are_those_of_the_library() -> None:
     assert tuple(WRITERS) == CAMERA_FORMATS
     assert OUTPUT_KINDS == PICTURES
+    assert (MIN_SIZE_PX, MAX_SIZE_PX) == SIZES_PX
+    assert BODY_HEIGHT_M == STATURE_M
 
 
 @pytest.mark.parametrize(("flags", "allowed"), [([], False), (["--allow-poor"], True)])

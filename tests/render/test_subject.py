@@ -152,16 +152,15 @@ def test_a_taller_body_reaches_higher_in_the_picture(subject: Path, tmp_path: Pa
     [
         (["--camera", "9"], "camera 9: the recording has 0, 1, 2, 3"),
         (["--what", "colour,xray"], "what xray: choose from colour, depth, normals, mask, mesh"),
-        (["--size", "0"], "pictures of 1 x 1 px: each side must have 2 to 8000"),
         (["--camera", "0", "--height", "1"], "--radius and --height are for an orbit"),
-        (["--pictures", "0"], "0 pictures"),
         (["--frames", "7"], "no frames 7; it has 0 to 2"),
         (["--between", "0", "7"], "no frames 7; it has 0 to 2"),
         (["--motion", "absent.npz"], "absent.npz: no such file"),
         (["--path", "absent.json"], "absent.json: no such file; give --path another"),
-        (["--shape", "height"], "shape height: give a name and what to add"),
+        (["--frames", "9" * 5000], "give a number like 12, or FIRST:END:STEP like 0:24:2"),
+        (["--shape", "height"], "--shape height: give a name and what to add"),
+        (["--shape", "height=nan"], "--shape height=nan: give a name and what to add"),
         (["--volume", "-100"], "volume -100 %: cannot be reached with this body"),
-        (["--radius", "-1"], "radius"),
     ],
 )
 def test_a_wish_that_cannot_be_met_is_one_line(
