@@ -152,6 +152,8 @@ def synchronise(options: argparse.Namespace) -> None:
 
 def export_cameras(options: argparse.Namespace) -> None:
     """Write a recording's cameras as other tools read them."""
+    if options.folder.resolve() in options.out.resolve().parents:
+        raise InputError(f"{options.out}: lies in the recording, whose results would be computed again; give another")
     with atomic_folder(options.out) as partial:
         from hnerf.capture.formats.export import write_cameras
         from hnerf.capture.ingest import recognise

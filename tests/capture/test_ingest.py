@@ -12,6 +12,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
+from hnerf.errors import InputError
 from tests.capture import recordings as rec
 from tests.shared_data import shared_capture
 
@@ -189,6 +190,16 @@ def test_clean_plates_come_along(folder: Path, tmp_path: Path) -> None:
     plate = capture.background("01")
     assert plate is not None and np.array_equal(plate, rec.picture("01", 99))
     assert capture.background("02") is None
+
+
+@pytest.mark.parametrize("line", ["W_01: 24\n", "H_01: 16\n"])
+def test_one_side_of_a_calibrated_picture_is_one_line(line: str, folder: Path, tmp_path: Path) -> None:
+    """Without the other it would be dropped, whatever size the pictures have."""
+    text = (folder / "intri.yml").read_text()
+    assert line in text
+    (folder / "intri.yml").write_text(text.replace(line, ""))
+    with pytest.raises(InputError, match=r"intri\.yml: has one of W_01 and H_01; add the other"):
+        ingest(folder, SETTINGS, tmp_path / "out")
 
 
 def test_padding_within_two_percent_is_let_through_and_reported(folder: Path, tmp_path: Path) -> None:

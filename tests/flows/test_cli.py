@@ -17,6 +17,7 @@ from hnerf.errors import InvalidAsset
 from hnerf.render.subject import MAX_SIZE_PX, MIN_SIZE_PX, OUTPUT_KINDS
 from tasks.bucket import BucketError
 from tasks.launcher import RankFailedError
+from tests.capture.recordings import write_easymocap
 from tests.shared_data import shared_capture
 
 
@@ -125,6 +126,19 @@ def test_cameras_are_not_written_over_the_recordings_own(tmp_path: Path, capsys:
         assert "exists; give the name of a new folder" in capsys.readouterr().err
     assert main(["export-cameras", str(tmp_path / "ada"), "--format", "colmap", "--out", str(tmp_path / "new")]) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["ada"]
+
+
+def test_cameras_are_not_exported_into_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its digest, and with it the key of every result, would be another."""
+    folder = write_easymocap(tmp_path / "ada")
+    before = sorted(folder.iterdir())
+    monkeypatch.chdir(folder)
+    assert main(["export-cameras", str(folder), "--format", "colmap", "--out", "cameras"]) == 2
+    assert "cameras: lies in the recording" in capsys.readouterr().err
+    assert sorted(folder.iterdir()) == before
+    assert main(["export-cameras", str(folder), "--format", "colmap", "--out", "../ada-cameras"]) == 0
 
 
 def test_unreadable_capture_leaves_nothing_half_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -152,7 +152,9 @@ class _CalibrationFile:
 def _lens(name: str, intri: _CalibrationFile, extri: _CalibrationFile | None) -> Lens:
     """Return the lens of one camera; at the origin without a file of extrinsics."""
     distortion = intri.matrix(f"dist_{name}", f"D_{name}")
-    width_px, height_px = intri.number(f"W_{name}"), intri.number(f"H_{name}")
+    width_px, height_px = sides = intri.number(f"W_{name}"), intri.number(f"H_{name}")
+    if sides.count(None) == 1:
+        raise InputError(f"{intri.path}: has one of W_{name} and H_{name}; add the other, or remove this one")
     return checked_lens(
         sources=(intri.path, extri.path if extri else intri.path),
         name=name,
