@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
 
 from hnerf.errors import InputError
-from hnerf.strict_yaml import parse_yaml
+from hnerf.strict_yaml import MAX_DEPTH, parse_yaml
 
 S = TypeVar("S", bound=BaseModel)
 
@@ -339,7 +339,10 @@ def overridden(settings: S, overrides: Sequence[str]) -> S:
         if not equals:
             raise InputError(f"--set {override}: write it as section.name=value")
         change = parse_yaml(value, f"--set {override}")
-        for part in reversed(key.split(".")):
+        parts = key.split(".")
+        if len(parts) > MAX_DEPTH:
+            raise InputError(f"--set {key}: no such key; `hnerf settings` lists them")
+        for part in reversed(parts):
             change = {part: change}
         tree = _merged(tree, change)
     message = " ".join(f"--set {override}" for override in overrides)

@@ -54,10 +54,7 @@ def collect(store: Store, garbage: Garbage) -> bool:
     """Remove it; return False, with all in place, if a process works on the key or has used it meanwhile."""
     try:
         with store.locked(garbage.stage, garbage.key, wait=False):
-            removed = _remove_left(store, garbage) if garbage.left else _remove_artifact(store, garbage)
-            if removed and not store.path(garbage.stage, garbage.key, ".json").exists():
-                store.path(garbage.stage, garbage.key, ".lock").unlink()
-            return removed
+            return _remove_left(store, garbage) if garbage.left else _remove_artifact(store, garbage)
     except BlockingIOError:
         return False
 
@@ -84,7 +81,7 @@ def _remove_left(store: Store, garbage: Garbage) -> bool:
     for path in garbage.left:
         if path.is_dir() and not path.is_symlink():
             remove(path)
-        elif path.suffix != ".lock":  # that one is held, and goes last
+        elif path.suffix != ".lock":  # that one is held, and goes last (Store.locked)
             path.unlink(missing_ok=True)
     return True
 

@@ -22,19 +22,22 @@ import logging
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 from pydantic import BaseModel
 
 from hnerf.errors import InputError
-from hnerf.files import replace_text
+from hnerf.files import made_folder, replace_text
 from tasks.pins import pin, unless_read_only
 
 log = logging.getLogger("hnerf.store")
 
 RECORDING = ".recording"  # under subjects/<name>: digest and folder of the recording
+SUFFIXES = ("", ".json", ".json.partial", ".partial", ".moving")  # of what a key may have beside its lock
+ATTEMPTS = 100  # to lock a key in a folder that others make and remove
 # In order: each stage is computed from those before it.
 STAGES = ("capture", "detection", "hands", "calibration", "segmentation", "fit", "training", "evaluation", "asset")
 
@@ -198,11 +201,18 @@ class Store:
 
     @contextmanager
     def locked(self, stage: str, key: str, wait: bool = True) -> Iterator[None]:
-        """Hold the lock of a key; raise BlockingIOError instead of waiting for it unless `wait`."""
+        """Hold the lock of a key; raise BlockingIOError instead of waiting for it unless `wait`. Where the key has
+        nothing in the end, no lock is left either, nor folders that were made for it."""
         path = self.path(stage, key, ".lock")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        while True:
-            with open(path, "w", opener=_without_following) as lock:
+        for attempt in count(1):
+            with ExitStack() as held:
+                try:
+                    held.enter_context(made_folder(path.parent))
+                    lock = held.enter_context(open(path, "w", opener=_without_following))
+                except (FileNotFoundError, FileExistsError):  # another removes the folder, which it made, as empty
+                    if attempt == ATTEMPTS:
+                        raise
+                    continue
                 try:
                     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
@@ -212,7 +222,11 @@ class Store:
                     fcntl.flock(lock, fcntl.LOCK_EX)
                 if not _is_at(path, lock.fileno()):
                     continue  # whoever held it has removed it
-                yield
+                try:
+                    yield
+                finally:
+                    if not any(os.path.lexists(self.path(stage, key, suffix)) for suffix in SUFFIXES):
+                        path.unlink(missing_ok=True)
                 return
 
     def commit(self, artifact: Artifact) -> Artifact:

@@ -89,6 +89,12 @@ def test_an_override_that_is_no_yaml_is_one_line() -> None:
         load_settings("fast", ["training.steps=[100"])
 
 
+def test_an_override_of_endless_depth_is_one_line() -> None:
+    key = ".".join(["x"] * 3000)
+    with pytest.raises(InputError, match=r"^--set x\.x.*no such key; `hnerf settings` lists them"):
+        load_settings("fast", [f"{key}=1", f"{key}=2"])
+
+
 def test_a_preset_builds_on_another(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("based_on: nerf\ntraining: {field: {width: 5}}")

@@ -3,7 +3,9 @@ import multiprocessing
 import os
 import shutil
 import signal
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -53,7 +55,26 @@ def test_half_written_artifact_is_not_seen(tmp_path: Path, error: BaseException)
     with pytest.raises(type(error)):
         Store(tmp_path).get_or_compute("fit", "k", half)
     assert Store(tmp_path).find("fit", "k") is None
-    assert [path.name for path in (tmp_path / "fit").iterdir()] == ["k.lock"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_failures_at_once_keep_apart_and_leave_no_lock(tmp_path: Path) -> None:
+    """Each removes the lock that others wait for, and the folder in which they are about to make theirs."""
+    alone = threading.Lock()
+
+    def fail(out: Path) -> dict[str, float]:
+        assert alone.acquire(blocking=False), "two at once"
+        time.sleep(1e-3)
+        alone.release()
+        raise InputError("a.jpg: bad")
+
+    def attempt(number: int) -> None:
+        with pytest.raises(InputError, match=r"a\.jpg: bad"):
+            Store(tmp_path / "store").get_or_compute("fit", "k", fail)
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(attempt, range(300)))
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
 def test_resumable_stage_goes_on_where_it_was(tmp_path: Path) -> None:
