@@ -57,14 +57,14 @@ class Bucket:
     def at(url: str) -> "Bucket":
         """Return the bucket of a URL like s3://bucket/folder or file:///mnt/share. Raises InputError where it is not
         there, or nothing opens it."""
-        if urlsplit(url).password or "::" in url:
-            raise InputError("a URL with a password or `::` is refused; give keys by the environment")
         try:
+            if urlsplit(url).password or "::" in url:
+                raise InputError("a URL with a password or `::` is refused; give keys by the environment")
             # Others write here, too: no listing may be remembered.
             fs, root = url_to_fs(url, use_listings_cache=False)
         except ImportError:
             raise InputError(f"what opens {url} is not installed; for S3, install '.[s3]'") from None
-        except ValueError as error:
+        except (TypeError, ValueError) as error:  # TypeError: a kind of place that needs more than a URL
             raise InputError(f"{url}: {one_line(error)}; give a URL like s3://bucket/folder") from None
         bucket = Bucket(fs, root.rstrip("/"))
         # What begins with a bucket's name is an object store, where folders need not exist.

@@ -19,6 +19,8 @@ def test_only_what_is_set_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     ("url", "why"),
     [
         ("nothing://x", "HNERF_BUCKET: .*nothing.*; give a URL like"),
+        ("s3://[", "HNERF_BUCKET: .*Invalid IPv6 URL; give a URL like"),
+        ("github://ada", "HNERF_BUCKET: .*missing.*'org'.*; give a URL like"),
         ("file:///no/such/folder", "HNERF_BUCKET: .*/no/such/folder is not there; make it"),
         ("memory://unmade", "is not there; make it"),
     ],
