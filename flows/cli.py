@@ -267,3 +267,7 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     )
     render.add_argument("--size", **_number(int, *SIZES_PX, "PX", "longest side of a picture (default: as recorded)"))
     render.add_argument("--pictures", **_number(int, 1, MAX_COUNT, "N", "number of pictures (default: one a pose)"))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -250,6 +250,12 @@ def test_a_number_out_of_its_range_is_answered_with_the_range(
     assert capsys.readouterr().err.endswith(f"error: argument {message}\n")
 
 
+def test_the_module_is_the_command() -> None:
+    command = [sys.executable, "-m", "flows.cli", "settings", "--preset", "nope"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2 and "nope: no such preset" in ended.stderr
+
+
 def test_choices_and_ranges_are_those_of_the_library() -> None:
     assert tuple(WRITERS) == CAMERA_FORMATS
     assert OUTPUT_KINDS == PICTURES
