@@ -43,12 +43,21 @@ DAMPING = 1e-4  # more would hold back depth and scale, which one camera's outli
 
 @dataclass(frozen=True)
 class Outline:
-    """The edge of a mask: points (N, 2) px, outward normals (N, 2), and the mask's signed distance (H, W) px, negative
-    inside."""
+    """The edge of a mask: points (N, 2) px, outward normals (N, 2); size_px of the mask; its signed distance, negative
+    inside, at each stride-th row and column."""
 
     points_px: np.ndarray
     normals: np.ndarray
+    size_px: tuple[int, int]
     distance_px: np.ndarray
+    stride: int = 1
+
+    def distance_at(self, points_px: np.ndarray) -> np.ndarray:
+        """Return the signed distance (N,) px of points (N, 2); beyond the picture, that of its nearest pixel."""
+        distance_px: np.ndarray = map_coordinates(
+            self.distance_px, points_px.T[::-1] / self.stride, order=1, mode="nearest"
+        )
+        return distance_px
 
 
 @dataclass(frozen=True)
@@ -61,16 +70,16 @@ class ContourResiduals:
     weight: np.ndarray
 
 
-def outline(mask: np.ndarray, spacing_px: float) -> Outline:
-    """Return the edge of a mask (H, W) bool, sampled about every spacing_px."""
+def outline(mask: np.ndarray, spacing_px: float, stride: int = 1) -> Outline:
+    """Return the edge of a mask (H, W) bool, sampled about every spacing_px, and distances at every stride-th pixel."""
     soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), MASK_BLUR_PX)
     lines = [_resampled(line, spacing_px) for line in find_contours(soft, 0.5)]  # (row, column)
     points = np.concatenate(lines) if lines else np.zeros((0, 2))
     slope = np.stack([map_coordinates(g, points.T, order=1) for g in np.gradient(soft)], -1)
     normals = -slope / np.linalg.norm(slope, axis=1, keepdims=True).clip(1e-9)
     inside, outside = (cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, 5) for m in (mask, ~mask))
-    distance = np.where(mask, 0.5 - inside, outside - 0.5)
-    return Outline(points[:, ::-1], normals[:, ::-1], distance)
+    distance_px = np.where(mask, 0.5 - inside, outside - 0.5)[::stride, ::stride].copy()
+    return Outline(points[:, ::-1], normals[:, ::-1], mask.shape[::-1], distance_px, stride)
 
 
 def _resampled(line: np.ndarray, spacing_px: float) -> np.ndarray:
@@ -134,20 +143,13 @@ def _cover(edge: Outline, rim_px: np.ndarray, rim_normals: np.ndarray) -> tuple[
 def _contain(edge: Outline, rim_px: np.ndarray, spacing_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Match rim vertices outside the mask, at most one in a cell, to its edge: index, direction (N, 2), distance px
     (positive)."""
-    height, width = edge.distance_px.shape
+    width, height = edge.size_px
     seen = np.flatnonzero(((rim_px >= 0) & (rim_px <= (width - 1, height - 1))).all(1))
     column, row = np.floor(rim_px[seen] / spacing_px).astype(np.int64).T
     first = seen[np.unique(row * width + column, return_index=True)[1]]
-    at = rim_px[first].T[::-1]
-    distance = map_coordinates(edge.distance_px, at, order=1)
-    ahead, behind = (
-        [
-            map_coordinates(edge.distance_px, at + step, order=1, mode="nearest")
-            for step in sign * np.eye(2)[::-1, :, None]
-        ]
-        for sign in (1, -1)
-    )
-    slope = np.stack(ahead, -1) - np.stack(behind, -1)
+    at_px = rim_px[first]
+    distance = edge.distance_at(at_px)
+    slope = np.stack([edge.distance_at(at_px + step) - edge.distance_at(at_px - step) for step in np.eye(2)], -1)
     slope /= np.linalg.norm(slope, axis=1, keepdims=True).clip(1e-9)
     out = distance > 0
     return first[out], slope[out], distance[out]
@@ -214,7 +216,7 @@ def _sole_m(camera: Camera, edge: Outline, scale_m: float, vertices_m: np.ndarra
     lowest = pixels[(pixels @ -camera.R[:2, up]).argmax()]
     if not ((lowest > BORDER_PX) & (lowest < np.array(camera.size_px) - 1 - BORDER_PX)).all():
         return None
-    inside_px = -map_coordinates(edge.distance_px, lowest[::-1, None], order=1, mode="nearest")[0]
+    inside_px = -edge.distance_at(lowest[None])[0]
     return float(np.clip(inside_px * scale_m, 0, MAX_SOLE_M))
 
 

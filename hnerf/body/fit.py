@@ -1,6 +1,7 @@
 """Fit the body to a capture: keypoints in space, keypoints in the images, then outlines; one shape, a pose a frame."""
 
 import logging
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -49,6 +50,7 @@ KEYPOINT_STEPS = 30  # Levenberg-Marquardt steps at most; it usually converges b
 TIGHT_STD = 0.1
 # Ratio to the cost of a pose a frame: 1.1 to 1.3 by keypoint noise alone, 1.4 if joints sway by a degree, 2.0 by two.
 MAX_SINGLE_POSTURE_COST = 1.5
+DISTANCE_BYTES = 2**30
 POOR_IOU, POOR_KEYPOINT_M = 0.75, 0.06  # a frame that is worse than either is flagged
 
 
@@ -209,13 +211,16 @@ def _by_split(capture: Capture) -> list[list[int]]:
 
 
 def _outlines(capture: Capture, masks: Masks, scale_m: Tensor, spacing_m: float) -> list[list[Outline | None]]:
-    """Return the masks' outlines by frame and training camera; None where a mask was dropped or is empty."""
+    """Return the masks' outlines by frame and training camera; None where a mask was dropped or is empty. Their
+    distances are at every pixel, or at as many as fit into DISTANCE_BYTES."""
+    pixels = len(capture.frames) * sum(math.prod(capture.cameras[name].size_px) for name in capture.train_cameras)
+    stride = max(1, math.ceil(math.sqrt(pixels * np.float32().itemsize / DISTANCE_BYTES)))
     edges: list[list[Outline | None]] = []
     for t, frame in enumerate(capture.frames):
         found = [masks.get(name, frame) if (name, frame) in masks else None for name in capture.train_cameras]
         spacings_px = spacing_m / scale_m[:, t].numpy()
         pairs = zip(found, spacings_px, strict=True)
-        edges.append([outline(m, px) if m is not None and m.any() else None for m, px in pairs])
+        edges.append([outline(m, px, stride) if m is not None and m.any() else None for m, px in pairs])
     return edges
 
 

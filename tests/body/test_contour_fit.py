@@ -56,6 +56,19 @@ def test_an_outline_runs_between_the_pixels_and_points_outwards() -> None:
     assert edge.distance_px[20, 10] == -0.5 and edge.distance_px[20, 9] == 0.5 and edge.distance_px[20, 5] == 4.5
 
 
+def test_distances_at_every_third_pixel_are_those_of_all_pixels_between_them() -> None:
+    """To the right of a disc of 20 px around (128, 128), in a picture whose last column is not kept."""
+    full, sparse = (outline(disc(20), 1.0, stride) for stride in (1, 3))
+    assert (full.distance_px.shape, sparse.distance_px.shape) == ((256, 256), (86, 86))
+    along_px = np.stack([np.linspace(140, 254, 50), np.full(50, 128.0)], 1)
+    np.testing.assert_allclose(full.distance_at(along_px), along_px[:, 0] - 148, atol=0.6)
+    np.testing.assert_allclose(sparse.distance_at(along_px), full.distance_at(along_px), atol=0.1)
+    assert sparse.distance_at(np.array([[300.0, 128]])) == sparse.distance_at(np.array([[255.0, 128]]))
+    for edge in (full, sparse):
+        [_], [direction], [distance_px] = _contain(edge, np.array([[200.0, 128]]), 2.0)
+        np.testing.assert_allclose([*direction, distance_px], [1, 0, 52], atol=0.6)
+
+
 def test_normals_point_out_of_a_ball() -> None:
     vertices, faces = ball(1.0, 0.0)
     equator = np.abs(vertices[:, 2]) < 0.5
@@ -127,7 +140,7 @@ def test_the_outline_goes_on_where_the_picture_ends() -> None:
 
 def test_a_contour_pulls_what_is_inside_it_and_faces_its_way() -> None:
     """An edge whose outside is up has a rim 3 px inside, one 3 px outside, and one 3 px inside that faces right."""
-    edge = Outline(np.array([[10.0, 0], [20, 0], [30, 0]]), np.tile([0.0, -1], (3, 1)), np.zeros((1, 1)))
+    edge = Outline(np.array([[10.0, 0], [20, 0], [30, 0]]), np.tile([0.0, -1], (3, 1)), (1, 1), np.zeros((1, 1)))
     rim_px = np.array([[10.0, 3], [20, -3], [30, 3]])
     ids, direction, signed_px = _cover(edge, rim_px, np.array([[0.0, -1], [0, -1], [1, 0]]))
     assert (ids.tolist(), direction.tolist(), signed_px.tolist()) == ([0], [[0, -1]], [-3])

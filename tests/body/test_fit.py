@@ -8,7 +8,7 @@ import torch
 from hnerf.body import contour_fit
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.body_model import body_model
-from hnerf.body.fit import _report, fit_body, make_problem, resolve_depth_flips
+from hnerf.body.fit import _outlines, _report, fit_body, make_problem, resolve_depth_flips
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel
 from hnerf.body.observations import observe, runs
@@ -40,6 +40,17 @@ def test_four_cameras_recover_pose_and_shape(tmp_path: Path) -> None:
     assert max(report["keypoint_residual_px"]) < 2
     assert abs(report["stature_m"] - float(np.ptp(truth.rig.vertices_m[:, 2].numpy()))) < 0.02
     assert fit.frames == (0, 1, 2) and not fit.theta[:, ~fit.rig.free].any()
+
+
+def test_the_distances_of_all_outlines_stay_within_their_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    truth = moving_body((0, 1))
+    capture = record(tmp_path, truth, RING, ("0", "1", "2", "3"))
+    width_px, height_px = capture.cameras["0"].size_px
+    whole = 2 * 4 * width_px * height_px * 4  # frames, cameras, pixels, bytes
+    for given, stride in ((whole, 1), (whole - 1, 2), (whole // 4, 2), (whole // 4 - 1, 3)):
+        monkeypatch.setattr("hnerf.body.fit.DISTANCE_BYTES", given)
+        edges = _outlines(capture, Silhouettes(capture, truth), torch.full((4, 2), 0.01), 0.05)  # type: ignore[arg-type]
+        assert [[edge.stride for edge in row if edge] for row in edges] == [[stride] * 4] * 2
 
 
 def test_a_frame_that_nothing_was_fitted_to_is_poor(tmp_path: Path) -> None:
