@@ -3,10 +3,12 @@ the forearm ends."""
 
 import math
 import shutil
+import threading
 from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 from hnerf.capture.capture import HANDS, Capture
 from hnerf.capture.people import person_heights_px
@@ -16,6 +18,7 @@ from hnerf.detection.network import Network
 from hnerf.detection.region import Region
 from hnerf.models import HAND_LANDMARKS
 from hnerf.progress import tracked
+from hnerf.side_by_side import side_by_side
 
 SIZE, POINTS = 224, 21
 SIDES = ((6, 7), (3, 4))  # elbow and wrist of the left and of the right arm in BODY_25
@@ -37,12 +40,14 @@ def detect_hands(capture: Capture, out: Path) -> dict[str, float]:
     Test cameras are never read. Raises InputError if the network is missing, or nobody is the subject.
     """
     cv2.setNumThreads(1)
-    network, people = HandNetwork(), subject_keypoints(capture)
-    images = [(name, frame) for name in capture.train_cameras for frame in capture.frames]
-    found = [
-        find_hands(capture.image(name, frame), people[name][capture.frames.index(frame)], network)
-        for name, frame in tracked(images, "hands", len(images))
-    ]
+    of_thread, people = _NetworkOfThread(), subject_keypoints(capture)
+    images = [(name, number) for name in capture.train_cameras for number in range(len(capture.frames))]
+
+    def find(image: tuple[str, int]) -> np.ndarray:
+        name, number = image
+        return find_hands(capture.image(name, capture.frames[number]), people[name][number], of_thread.network)
+
+    found = list(tracked(side_by_side(find, images, torch.device("cpu")), "hands", len(images)))
     by_camera = np.stack(found).reshape(len(capture.train_cameras), len(capture.frames), 2, POINTS, 3)
     shutil.copytree(capture.root, out, dirs_exist_ok=True)
     write_points(out / HANDS, dict(zip(capture.train_cameras, by_camera, strict=True)))
@@ -66,6 +71,13 @@ class HandNetwork:
         from_crop = region.from_crop(SIZE)
         places = raw.reshape(-1, 3)[:, :2].astype(np.float64) @ from_crop[:, :2].T + from_crop[:, 2]
         return np.column_stack([places, np.full(POINTS, float(presence[0]))])
+
+
+class _NetworkOfThread(threading.local):
+    """The hand network of each thread that asks for it: it is not safe to share."""
+
+    def __init__(self) -> None:
+        self.network = HandNetwork()
 
 
 def find_hands(image: np.ndarray, keypoints: np.ndarray, network: HandNetwork) -> np.ndarray:

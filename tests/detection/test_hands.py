@@ -1,10 +1,12 @@
 """Where hands are looked for, and which points are kept; numbers by hand."""
 
 import math
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
@@ -94,3 +96,30 @@ def test_hands_lie_with_the_capture(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert points is not None and points.shape == (len(capture.frames), 2, 21, 3) and own is not None
     np.testing.assert_array_equal(own, capture.keypoints(name))
     assert capture.hands(name) is None
+
+
+def test_each_thread_has_a_network_of_its_own_and_hands_stay_in_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture")
+    capture = Capture.load(tmp_path / "capture")
+    numbers = np.arange(len(capture.train_cameras) * len(capture.frames)).reshape(len(capture.train_cameras), -1)
+    people = {
+        name: np.tile(row[:, None, None], (1, 25, 3)) for name, row in zip(capture.train_cameras, numbers, strict=True)
+    }
+    used: dict[object, set[int]] = {}
+
+    def find(image: np.ndarray, keypoints: np.ndarray, network: object) -> np.ndarray:
+        used.setdefault(network, set()).add(threading.get_ident())
+        return np.full((2, 21, 3), keypoints[0, 0])
+
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
+    monkeypatch.setattr(hands, "subject_keypoints", lambda recording: people)
+    monkeypatch.setattr(hands, "HandNetwork", object)
+    monkeypatch.setattr(hands, "find_hands", find)
+    detect_hands(capture, tmp_path / "out")
+    assert max(map(len, used.values())) == 1
+    written = Capture.load(tmp_path / "out")
+    for name, row in zip(capture.train_cameras, numbers, strict=True):
+        points = written.hands(name)
+        assert points is not None and points[:, 0, 0, 0].tolist() == row.tolist()
