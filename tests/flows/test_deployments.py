@@ -119,3 +119,24 @@ def test_parameters_are_checked_before_there_is_a_run(deployed: str) -> None:
     with pytest.raises(PrefectHTTPStatusError, match=r"409|422") as refused:
         run_deployment("train-subject/local", parameters={"capture": "/a", "overrides": 3}, timeout=0)
     assert "overrides" in refused.value.response.text
+
+
+@pytest.mark.parametrize("pool", ["docker", "kubernetes"])
+def test_one_word_moves_all_but_the_watch_into_a_pool_of_containers(deployed: str, pool: str, tmp_path: Path) -> None:
+    text = (ROOT / "prefect.yaml").read_text()
+    moved = tmp_path / "prefect.yaml"
+    moved.write_text(text.replace("&pool local", f"&pool {pool}"))
+    base = f"configs/work_pools/{pool}.json"
+    prefect(deployed, "work-pool", "create", pool, "--type", pool, "--base-job-template", base)
+    prefect(deployed, "deploy", "--all", "--prefect-file", str(moved))
+    try:
+        with get_client(sync_client=True) as client:
+            pools = {str(one.entrypoint): one.work_pool_name for one in client.read_deployments()}
+        assert pools.pop("flows/ingest_captures.py:ingest_captures") == "local"
+        assert set(pools.values()) == {pool} and len(pools) == 4
+        with pytest.raises(PrefectHTTPStatusError, match=r"409|422"):
+            run_deployment(
+                "train-subject/local", parameters={"capture": "/a"}, job_variables={"time_limit_s": 0}, timeout=0
+            )
+    finally:
+        prefect(deployed, "deploy", "--all")
