@@ -28,7 +28,7 @@ LEFT_OUT = {
     r"systemctl|loginctl|journalctl|~/.config/systemd": "services: tests/flows/test_systemd_units.py",
     r"sudo|pg_dump|dropdb|DATABASE|database upgrade": "PostgreSQL: tests/flows/test_postgresql.py",
     r"ln -s": "a mount: tests/soak.py",
-    r"docker|(?i:kubernetes)|kubectl|containers\]|mkdir -p store captures": "containers: tests/flows/test_work_pools.py",
+    r"docker|(?i:kubernetes)|kubectl|containers\]|mkdir -p store c": "containers: tests/flows/test_work_pools.py",
 }
 LATER = r"prefect (server|worker) start"  # they run until the end
 SMALL = """training: {field: {kind: fast, colour_cells: [24, 64], samples: 12}, steps: 12, novel_pose_steps: 2}
