@@ -1,6 +1,7 @@
 """A detection whose networks never answer, for tests: python -m tests.detection.orphans FOLDER."""
 
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -17,6 +18,7 @@ def never(capture: Any, camera: str, size: str, out: Path) -> None:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # shells let what they start in the background ignore it
     detect.find_in_camera = never
     cameras: Any = SimpleNamespace(train_cameras=("01", "02"), frames=(0,))
     detect._find_people(cameras, "lite", Path(sys.argv[1]))
