@@ -100,7 +100,8 @@ def require_close(name: str, topology: str, figures: dict[str, Any], allow_poor:
     if not allow_poor:
         raise InvalidAsset(
             f"{found}; at most {POOR_DB:.0f} dB are allowed. Try another asset.topology or a larger asset.texture_px, "
-            "or take it as it is: asset.allow_poor=true (`hnerf export --allow-poor`)"
+            "or take it as it is, as for somebody who turns in light from one side, which one texture cannot show: "
+            "asset.allow_poor=true (`hnerf export --allow-poor`)"
         )
     log.warning("%s", found)
 

@@ -50,7 +50,7 @@ KEYPOINT_STEPS = 30  # Levenberg-Marquardt steps at most; it usually converges b
 TIGHT_STD = 0.1
 # Ratio to the cost of a pose a frame: 1.1 to 1.3 by keypoint noise alone, 1.4 if joints sway by a degree, 2.0 by two.
 MAX_SINGLE_POSTURE_COST = 1.5
-DISTANCE_BYTES = 2**30
+DISTANCE_BYTES = 2**31
 POOR_IOU, POOR_KEYPOINT_M = 0.75, 0.06  # a frame that is worse than either is flagged
 
 
