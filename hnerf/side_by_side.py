@@ -11,9 +11,10 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 MOST_AT_ONCE = 4  # each takes up to a GiB
+CPU = torch.device("cpu")
 
 
-def side_by_side(work: Callable[[T], R], items: Iterable[T], device: torch.device) -> Iterator[R]:
+def side_by_side(work: Callable[[T], R], items: Iterable[T], device: torch.device = CPU) -> Iterator[R]:
     """Yield work(item) of each item in order: one after another on a GPU, in several threads on a CPU, which divide
     those of torch among them. What is ready and not yet taken is at most one more than there are threads."""
     threads = torch.get_num_threads()

@@ -15,6 +15,7 @@ FOUNDATION = (
     "tables",
     "files",
     "processes",
+    "pycolmap_import",
     "progress",
     "side_by_side",
     "models",
@@ -50,3 +51,8 @@ def test_a_package_imports_none_above_it(floor: str) -> None:
             parts = name.split(".")
             assert parts[0] not in ("tasks", "flows", "prefect"), f"{path} imports {name}"
             assert parts[0] != "hnerf" or parts[1] in below, f"{path} imports {name}, which lies above"
+
+
+def test_pycolmap_is_imported_in_one_place() -> None:
+    """Elsewhere it would take SIGTERM for a crash."""
+    assert [path.name for path in ROOT.rglob("*.py") if "pycolmap" in imported(path)] == ["pycolmap_import.py"]

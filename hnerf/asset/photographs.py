@@ -6,7 +6,6 @@ from itertools import product
 
 import cv2
 import numpy as np
-import torch
 from scipy.ndimage import map_coordinates
 
 from hnerf.asset.texture import Texels
@@ -129,7 +128,7 @@ def photographed_texels(
         return SeenTexels(pixels, cosine, normals, sampled(image, pixels_px) / gain)
 
     views = list(product(surfaces_m, capture.train_cameras))
-    yield from tracked(side_by_side(seen_in, views, torch.device("cpu")), "photographs", len(views))
+    yield from tracked(side_by_side(seen_in, views), "photographs", len(views))
 
 
 def visible_texels(

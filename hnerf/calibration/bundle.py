@@ -5,12 +5,12 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-import pycolmap
 from scipy.spatial.transform import Rotation
 
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import reprojection_px, triangulate
+from hnerf.pycolmap_import import pycolmap
 
 ROUNDS = 3  # of triangulation and adjustment, each with the cameras of the one before
 LOSS_SCALE_PX = 2.0  # about the noise of a keypoint detector

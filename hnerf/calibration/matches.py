@@ -7,10 +7,10 @@ from itertools import combinations
 
 import cv2
 import numpy as np
-import pycolmap
 
 from hnerf.capture.capture import Capture
 from hnerf.geometry.camera import Camera
+from hnerf.pycolmap_import import pycolmap
 
 INLIER_PX = 3.0  # of the fundamental matrix that verifies matches
 MIN_MATCHES = 15  # and a share: a fundamental matrix fits some wrong matches by chance

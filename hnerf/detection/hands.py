@@ -8,7 +8,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 
 from hnerf.capture.capture import HANDS, Capture
 from hnerf.capture.people import person_heights_px
@@ -47,7 +46,7 @@ def detect_hands(capture: Capture, out: Path) -> dict[str, float]:
         name, number = image
         return find_hands(capture.image(name, capture.frames[number]), people[name][number], of_thread.network)
 
-    found = list(tracked(side_by_side(find, images, torch.device("cpu")), "hands", len(images)))
+    found = list(tracked(side_by_side(find, images), "hands", len(images)))
     by_camera = np.stack(found).reshape(len(capture.train_cameras), len(capture.frames), 2, POINTS, 3)
     shutil.copytree(capture.root, out, dirs_exist_ok=True)
     write_points(out / HANDS, dict(zip(capture.train_cameras, by_camera, strict=True)))

@@ -6,7 +6,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
@@ -42,7 +41,7 @@ def segment(capture: Capture, body: BodyFit | None, settings: SegmentationSettin
         backend = choose_backend(capture, name, own, body is not None, network, settings)
         log.info("camera %s: %d masks, %s", name, len(capture.frames), backend.name)
         verdicts, bodies_px = [], []
-        looks = side_by_side(partial(_look, capture, backend, own), range(len(own)), torch.device("cpu"))
+        looks = side_by_side(partial(_look, capture, backend, own), range(len(own)))
         for frame, look in zip(capture.frames, looks, strict=True):
             verdicts.append(look.verdict)
             bodies_px.append(look.body_px)

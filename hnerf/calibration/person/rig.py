@@ -19,10 +19,7 @@ from hnerf.errors import InputError
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.triangulation import triangulate
-from hnerf.processes import sigterm_kept
-
-with sigterm_kept():
-    import pycolmap
+from hnerf.pycolmap_import import pycolmap
 
 INLIER_SHARE = 0.02  # of the person's height in pixels: about twice a detector's noise
 MIN_SHARED = 100  # keypoints that two cameras see at once: four whole people

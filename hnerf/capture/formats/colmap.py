@@ -17,10 +17,7 @@ from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.lens import Lens, checked_lens, known_size
 from hnerf.capture.safe_io import check_camera_name, path_in_capture, read_bytes, read_text
 from hnerf.errors import InputError
-from hnerf.processes import sigterm_kept
-
-with sigterm_kept():
-    import pycolmap
+from hnerf.pycolmap_import import pycolmap
 
 PIXEL_CENTRE = 0.5  # in COLMAP; here pixel centres have integer coordinates
 MAX_BYTES = 256_000_000
