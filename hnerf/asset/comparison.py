@@ -1,5 +1,5 @@
-"""The asset, and its splats, against the field it was made from: all in the same views, scored by the photograph under
-its mask."""
+"""The asset's looks, and its splats, against the field they were made from: all in the same views, scored by the
+photograph under its mask."""
 
 import logging
 from dataclasses import dataclass
@@ -29,21 +29,21 @@ from hnerf.side_by_side import side_by_side
 IMAGES = 6  # few: a field on two cores renders one in about a second
 LONGEST_PX = 300  # of the person's box, for the same reason; larger boxes are scaled down
 POOR_DB = 4.0  # below its field, an asset lost what the field knew
+LOOKS = {"captured look": "asset", "albedo in its own light": "albedo"}  # what renders show them
 
 log = logging.getLogger("hnerf.asset")
 
 
 @dataclass(frozen=True)
 class Compared:
-    """One view, in the person's box: photograph (H, W, 3) over black; field, asset and splats, if there are any, (H, W,
-    4), over black and their coverage; uint8. scores: of "asset", "field" and "splats", by name."""
+    """One view, in the person's box: photograph (H, W, 3) over black; renders (H, W, 4), over black with their
+    coverage; uint8. Renders and their scores are of "field", "asset" (the captured look), and, if there are any,
+    "albedo" (in the light that was estimated with it) and "splats"."""
 
     view: View
     photograph: np.ndarray
-    field: np.ndarray
-    asset: np.ndarray
+    renders: dict[str, np.ndarray]
     scores: dict[str, dict[str, float]]
-    splats: np.ndarray | None = None
 
 
 def compare_with_field(
@@ -68,7 +68,8 @@ def compare_with_field(
 
 
 def comparison_figures(compared: list[Compared]) -> dict[str, Any]:
-    """Return the mean scores of asset, field and splats, by how much the asset is below, and those of each image."""
+    """Return the mean scores of field, looks and splats, by how much the captured look is below, and those of each
+    image."""
     if not compared:
         return {"images": 0, "reason": "no image has a mask of the person"}
     means = {
@@ -87,23 +88,31 @@ def comparison_figures(compared: list[Compared]) -> dict[str, Any]:
 
 
 def require_close(name: str, topology: str, figures: dict[str, Any], allow_poor: bool) -> None:
-    """Raise InvalidAsset if the asset of a capture called `name`, with the mesh of that topology, is more than POOR_DB
-    below its field; figures: see `comparison_figures`."""
-    below_db = figures["below_field"]["psnr"] if figures["images"] else 0.0
-    if below_db <= POOR_DB:
+    """Raise InvalidAsset if no look of the asset of a capture called `name`, with the mesh of that topology, is within
+    POOR_DB of its field. Warn if one is not, or with `allow_poor`. figures: see `comparison_figures`."""
+    if not figures["images"]:
         return
+    below_db = {
+        look: figures["field"]["psnr"] - figures[shown]["psnr"] for look, shown in LOOKS.items() if shown in figures
+    }
+    poor = {look: below for look, below in below_db.items() if below > POOR_DB}
+    if not poor:
+        return
+    looks = " and ".join(f"{look} {below:.1f} dB" for look, below in below_db.items())
     found = (
-        f"{name}: the asset with the {topology} mesh is {below_db:.1f} dB below its field "
-        f"({figures['asset']['psnr']:.1f} against {figures['field']['psnr']:.1f} dB, "
-        f"mean of {figures['images']} images from {figures['cameras']} cameras)"
+        f"{name}: the asset with the {topology} mesh is below its field: {looks} (field {figures['field']['psnr']:.1f} "
+        f"dB, mean of {figures['images']} images from {figures['cameras']} cameras)"
     )
-    if not allow_poor:
+    if len(poor) < len(below_db):
+        (good,) = below_db.keys() - poor.keys()
+        log.warning("%s; use the %s", found, good)
+    elif allow_poor:
+        log.warning("%s", found)
+    else:
         raise InvalidAsset(
             f"{found}; at most {POOR_DB:.0f} dB are allowed. Try another asset.topology or a larger asset.texture_px, "
-            "or take it as it is, as for somebody who turns in light from one side, which one texture cannot show: "
-            "asset.allow_poor=true (`hnerf export --allow-poor`)"
+            "or take it as it is: asset.allow_poor=true (`hnerf export --allow-poor`)"
         )
-    log.warning("%s", found)
 
 
 def _mask(capture: Capture, masks: Masks, view: View) -> np.ndarray | None:
@@ -144,14 +153,17 @@ def _compared(
     with torch.no_grad():
         field = rgba(avatar.render(small, avatar.body.theta[k], avatar.body.root[k]))
     gain = avatar.gains.get(view.camera, (1.0, 1.0, 1.0))
-    asset = on_black(surface, staged, camera, small.size_px, gain)
-    scores = {"asset": _scores(asset, photograph, shown), "field": _scores(field, photograph, shown)}
-    if splats is None:
-        return Compared(view, photograph, field, asset, scores)
-    drawn = splats_on_black(splats, np.asarray(surface.mesh.vertices), camera, small.size_px, gain)
-    to_field = psnr(drawn[..., :3].astype(np.float32) / 255, field[..., :3].astype(np.float32) / 255)
-    scores["splats"] = _scores(drawn, photograph, shown) | {"psnr_to_field": to_field}
-    return Compared(view, photograph, field, asset, scores, drawn)
+    renders = {"field": field, "asset": on_black(surface, staged, camera, small.size_px, gain)}
+    if staged.albedo:
+        renders["albedo"] = on_black(surface, staged, camera, small.size_px, gain, staged.albedo)
+    if splats:
+        points_m = np.asarray(surface.mesh.vertices)
+        renders["splats"] = splats_on_black(splats, points_m, camera, small.size_px, gain)
+    scores = {name: _scores(render, photograph, shown) for name, render in renders.items()}
+    if splats:
+        drawn, by_field = (renders[name][..., :3].astype(np.float32) / 255 for name in ("splats", "field"))
+        scores["splats"]["psnr_to_field"] = psnr(drawn, by_field)
+    return Compared(view, photograph, renders, scores)
 
 
 def _scores(rendered: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> dict[str, float]:

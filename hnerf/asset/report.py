@@ -74,13 +74,14 @@ def write_report(
 
 
 def _beside_field(view: Compared) -> list[GalleryPicture]:
-    """Return the photograph of a view, and renderings of field, asset and splats, if there are any, with their PSNR."""
-    psnr = {shown: f"{scores['psnr']:.1f} dB" for shown, scores in view.scores.items()}
+    """Return the photograph of a view, and all renders of it with their PSNR."""
+    captions = {"field": "Field", "asset": "Captured look", "albedo": "Albedo in its light", "splats": "Splats"}
     return [
         _picture(f"Photograph, camera {view.view.camera}, frame {view.view.frame}", view.photograph),
-        _picture(f"Field, {psnr['field']}", view.field[..., :3]),
-        _picture(f"Asset, {psnr['asset']}", view.asset[..., :3]),
-        *([] if view.splats is None else [_picture(f"Splats, {psnr['splats']}", view.splats[..., :3])]),
+        *(
+            _picture(f"{captions[name]}, {view.scores[name]['psnr']:.1f} dB", render[..., :3])
+            for name, render in view.renders.items()
+        ),
     ]
 
 

@@ -145,7 +145,7 @@ def cast_pixels(surface: Surface, camera: Camera) -> RayHits:
     return surface.cast(*camera.rays(camera.pixels_px.reshape(-1, 2)))
 
 
-def _normals(mesh: trimesh.Trimesh, hits: RayHits) -> np.ndarray:
+def normals_at(mesh: trimesh.Trimesh, hits: RayHits) -> np.ndarray:
     """Return smooth unit normals (N, 3) at hits, 0 where a ray hits nothing."""
     normals = np.zeros((len(hits.face), 3))
     smooth = hits.interpolate(mesh.vertex_normals, mesh.faces)
@@ -155,14 +155,14 @@ def _normals(mesh: trimesh.Trimesh, hits: RayHits) -> np.ndarray:
 
 def studio_light(mesh: trimesh.Trimesh, hits: RayHits, camera: Camera) -> np.ndarray:
     """Return the brightness (N, 1) under a key light, a light at the camera, and ambient light."""
-    normals = _normals(mesh, hits) @ camera.R.T
+    normals = normals_at(mesh, hits) @ camera.R.T
     light = 0.30 + 0.62 * (normals @ KEY_LIGHT).clip(0, 1) + 0.16 * (-normals[:, 2]).clip(0, 1)
     return light[:, None]
 
 
 def _headlight(mesh: trimesh.Trimesh, hits: RayHits, camera: Camera) -> np.ndarray:
     """Return the brightness (H, W) under a light at the camera."""
-    facing = -(_normals(mesh, hits) @ camera.R.T)[:, 2]
+    facing = -(normals_at(mesh, hits) @ camera.R.T)[:, 2]
     return (0.35 + 0.65 * facing.clip(0, 1)).reshape(camera.height_px, camera.width_px)
 
 

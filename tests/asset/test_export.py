@@ -135,10 +135,9 @@ def test_usd_has_both_meshes_if_both_are_wanted(tmp_path: Path, monkeypatch: pyt
 
 
 def test_nothing_is_written_of_an_asset_far_below_its_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scores = {"asset": {"psnr": 20.0}, "field": {"psnr": 30.0}, "below_field": {"psnr": 10.0}}
-    poor = {"images": 2, "cameras": "training", **scores}
+    poor = {"images": 2, "cameras": "training", "asset": {"psnr": 20.0}, "field": {"psnr": 30.0}}
     monkeypatch.setattr("hnerf.asset.export.comparison_figures", lambda compared: poor)
     tiny = SMALL.model_copy(update={"grid_cells": 32, "texture_px": 32, "faces": 500, "correctives": 0})
-    with pytest.raises(InvalidAsset, match=r"column: the asset with the registered mesh is 10\.0 dB below its field"):
+    with pytest.raises(InvalidAsset, match=r"registered mesh is below its field: .* 10\.0 dB"):
         export_asset(capture(), Masks({}, {}), StandInAvatar(bending_body()), tiny, tmp_path)
     assert list(tmp_path.iterdir()) == []
