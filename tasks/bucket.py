@@ -147,8 +147,8 @@ class Bucket:
 
     def read_note(self, name: str) -> bytes | None:
         """Return the beginning of a small object, None if there is no such object."""
-        with self._answering(name), suppress(FileNotFoundError), self.fs.open(self._path(name), "rb") as file:
-            return bytes(file.read(MAX_NOTE_BYTES))
+        with self._answering(name), suppress(FileNotFoundError):  # in one request: it may be rewritten meanwhile
+            return bytes(self.fs.cat_file(self._path(name), end=MAX_NOTE_BYTES))
         return None
 
     def remove(self, name: str) -> None:

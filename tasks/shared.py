@@ -8,13 +8,14 @@ results are; nothing in it is run, and nothing leads out of the store.
 
 import logging
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from hnerf.errors import InputError
 from tasks.bucket import Bucket
 from tasks.lease import leased
 from tasks.packed import Contents, NoRoomError, archived, pack, place, read_contents, require_room, unpack
+from tasks.shared_checkpoint import shared_checkpoint
 from tasks.store import Artifact, Store, remove
 
 log = logging.getLogger("hnerf.shared")
@@ -22,11 +23,14 @@ log = logging.getLogger("hnerf.shared")
 PACKED = "packed"
 
 
-def get_or_compute(bucket: Bucket, store: Store, stage: str, key: str, compute: Callable[[], Artifact]) -> Artifact:
+def get_or_compute(
+    bucket: Bucket, store: Store, stage: str, key: str, compute: Callable[[], Artifact], checkpoint: str = ""
+) -> Artifact:
     """Return an artifact of the store; if it is not there, that of the bucket, or else what `compute` puts into the
     store. It is then in both.
 
-    If several machines want the same, one computes it and the others wait. Raises BucketError if the bucket is away.
+    If several machines want the same, one computes it and the others wait; if that one is lost, another goes on from
+    its checkpoint, a file of this name in the folder of unfinished work. Raises BucketError if the bucket is away.
     """
     name = f"{stage}/{key}"
     if here := store.find(stage, key):
@@ -36,9 +40,12 @@ def get_or_compute(bucket: Bucket, store: Store, stage: str, key: str, compute: 
     while (found := _fetch(bucket, store, stage, key)) is None:
         with leased(bucket, name) as mine:
             if mine:
-                found = _fetch(bucket, store, stage, key)  # another may have finished just before
-                made = found or compute()
-                if found is None or bucket.size_bytes(_object(name)) is None:
+                if found := _fetch(bucket, store, stage, key):  # another may have finished just before
+                    if bucket.size_bytes(_object(name)) is None:
+                        _put(bucket, store, found)
+                    return found
+                with shared_checkpoint(bucket, store, stage, key, checkpoint) if checkpoint else nullcontext():
+                    made = compute()
                     _put(bucket, store, made)
                 return made
     return found

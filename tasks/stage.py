@@ -43,9 +43,10 @@ class Stage(Generic[P]):
         resumable: bool,
         networks: tuple[str, ...] = (),
         shared: bool = True,
+        checkpoint: str = "",
     ):
         self.write, self.name, self.version, self.resumable = write, name, version, resumable
-        self.networks, self.shared = networks, shared
+        self.networks, self.shared, self.checkpoint = networks, shared, checkpoint
         self.task: Task[..., Artifact] = Task(
             fn=self._run,
             name=name,
@@ -83,7 +84,7 @@ class Stage(Generic[P]):
             )
 
         bucket = Bucket.configured() if self.shared else None
-        return get_or_compute(bucket, store, self.name, key, compute) if bucket else compute()
+        return get_or_compute(bucket, store, self.name, key, compute, self.checkpoint) if bucket else compute()
 
     def _write_in_time(self, out: Path, inputs: dict[str, Input]) -> dict[str, float]:
         with limited(self.name, image_count(inputs.values()), self.resumable):
@@ -100,12 +101,17 @@ def image_count(inputs: Iterable[Input]) -> int:
 
 
 def stage(
-    name: str, version: str, resumable: bool = False, networks: tuple[str, ...] = (), shared: bool = True
+    name: str,
+    version: str,
+    resumable: bool = False,
+    networks: tuple[str, ...] = (),
+    shared: bool = True,
+    checkpoint: str = "",
 ) -> Callable[[Write[P]], Stage[P]]:
     """Make a function into a Stage (decorator). Artifacts lie under `<store>/<name>/`; raise `version` when the same
     inputs give another result.
 
     networks: files of hnerf.models that the stage uses if they are installed; the key depends on which ones are.
-    shared: through the bucket, if there is one.
+    shared: through the bucket, if there is one; checkpoint: the file of unfinished work that is shared there, too.
     """
-    return lambda write: Stage(write, name, version, resumable, networks, shared)
+    return lambda write: Stage(write, name, version, resumable, networks, shared, checkpoint)

@@ -8,13 +8,13 @@ import torch
 from hnerf.avatar.avatar import Avatar
 from hnerf.avatar.trained import load_avatar
 from hnerf.config import TrainingSettings
-from hnerf.training.checkpoint import remove_checkpoint
+from hnerf.training.checkpoint import NAME, remove_checkpoint
 from tasks.launcher import run_ranks
 from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("training", version="32", resumable=True)
+@stage("training", version="32", resumable=True, checkpoint=NAME)
 def train(
     out: Path,
     recording: Artifact,

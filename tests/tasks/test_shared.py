@@ -1,6 +1,7 @@
 import multiprocessing
 import os
 import random
+import shutil
 import signal
 import time
 from collections.abc import Callable
@@ -10,7 +11,7 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from hnerf.errors import InputError
-from tasks import lease, packed
+from tasks import lease, packed, shared_checkpoint
 from tasks.bucket import Bucket, BucketError
 from tasks.garbage import find_garbage
 from tasks.inventory import Inventory
@@ -21,6 +22,7 @@ from tasks.verify import faults
 SPAWN = multiprocessing.get_context("spawn")
 KEY = f"{7:032x}"
 OBJECT = f"fit/{KEY}.tar"
+CHECKPOINT = f"training/{KEY}.checkpoint"
 
 
 @pytest.fixture(params=["file", "memory", "s3"])
@@ -145,6 +147,151 @@ def test_a_result_that_could_not_be_shared_is_not_lost(tmp_path: Path, monkeypat
             made(bucket, store)
     made(bucket, store, never)
     made(bucket, Store(tmp_path / "there"), never)
+
+
+def resumed(
+    bucket: Bucket, store: Store, work: Callable[[Path], dict[str, float]], stage: str = "training"
+) -> Artifact:
+    """Return the artifact of a stage that resumes from `checkpoint`."""
+
+    def compute() -> Artifact:
+        return store.get_or_compute(stage, KEY, work, resumable=True)
+
+    return get_or_compute(bucket, store, stage, KEY, compute, "checkpoint")
+
+
+def finish(out: Path) -> dict[str, float]:
+    (out / "checkpoint").unlink()
+    return write(out)
+
+
+def kept(bucket: Bucket) -> bytes | None:
+    return bucket.read_note(CHECKPOINT)
+
+
+def soon(reached: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + 20
+    while not reached():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+
+
+def test_another_machine_goes_on_from_the_checkpoint_of_failed_work(bucket: Bucket, tmp_path: Path) -> None:
+    def fail(out: Path) -> dict[str, float]:
+        (out / "checkpoint").write_text("step 100")
+        raise RuntimeError("crash")
+
+    def go_on(out: Path) -> dict[str, float]:
+        assert [path.name for path in out.iterdir()] == ["checkpoint"]
+        assert (out / "checkpoint").read_text() == "step 100"
+        return finish(out)
+
+    here, there = Store(tmp_path / "here"), Store(tmp_path / "there")
+    with pytest.raises(RuntimeError):
+        resumed(bucket, here, fail)
+    assert kept(bucket) == b"step 100"
+    here.path("training", KEY, ".partial").joinpath("checkpoint").write_text("step 50")  # before it went elsewhere
+    assert resumed(bucket, there, go_on).files.keys() == {"again", "deep/letters"}
+    assert kept(bucket) is None and clean(there)
+    resumed(bucket, here, never)
+
+
+def test_the_bucket_has_each_new_checkpoint_once_while_work_goes_on(
+    bucket: Bucket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uploads, upload = [], Bucket.upload
+
+    def counted(self: Bucket, path: Path, name: str) -> None:
+        uploads.append(name)
+        upload(self, path, name)
+
+    def work(out: Path) -> dict[str, float]:
+        for text in ("step 100", "step 200"):
+            (out / "beside").write_text(text)
+            os.replace(out / "beside", out / "checkpoint")
+            soon(lambda text=text: kept(bucket) == text.encode())  # type: ignore[misc]
+            time.sleep(0.05)
+        return finish(out)
+
+    monkeypatch.setattr(shared_checkpoint, "LOOK_S", 0.01)
+    monkeypatch.setattr(Bucket, "upload", counted)
+    resumed(bucket, Store(tmp_path / "here"), work)
+    assert kept(bucket) is None and uploads == [CHECKPOINT, CHECKPOINT, f"training/{KEY}.tar"]
+
+
+def test_a_checkpoint_that_is_replaced_during_its_upload_arrives_whole(
+    bucket: Bucket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoint, upload = tmp_path / "checkpoint", Bucket.upload
+    checkpoint.write_text("old and long")
+
+    def replaced(self: Bucket, path: Path, name: str) -> None:
+        (tmp_path / "beside").write_text("new")
+        os.replace(tmp_path / "beside", checkpoint)
+        upload(self, path, name)
+
+    monkeypatch.setattr(Bucket, "upload", replaced)
+    shared_checkpoint._put(bucket, CHECKPOINT, checkpoint)
+    assert kept(bucket) == b"old and long" and checkpoint.read_text() == "new"
+
+
+def test_refused_work_leaves_no_checkpoint(tmp_path: Path) -> None:
+    bucket, store = disk_bucket(tmp_path), Store(tmp_path / "here")
+    bucket.upload(write_file(tmp_path / "elsewhere", "step 100"), CHECKPOINT)
+
+    def refuse(out: Path) -> dict[str, float]:
+        raise InputError("nobody is in the pictures")
+
+    with pytest.raises(InputError, match="nobody"):
+        resumed(bucket, store, refuse)
+    assert kept(bucket) is None and not store.path("training", KEY, ".partial").exists()
+
+
+def test_work_goes_on_where_the_bucket_takes_no_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(shared_checkpoint, "LOOK_S", 0.01)
+    bucket, upload = disk_bucket(tmp_path), Bucket.upload
+
+    def slow(self: Bucket, path: Path, name: str) -> None:
+        if name == CHECKPOINT:
+            raise BucketError("too slow")
+        upload(self, path, name)
+
+    def work(out: Path) -> dict[str, float]:
+        (out / "checkpoint").write_text("step 100")
+        soon(lambda: "too slow" in caplog.text)
+        return finish(out)
+
+    monkeypatch.setattr(Bucket, "upload", slow)
+    resumed(bucket, Store(tmp_path / "here"), work)
+    resumed(bucket, Store(tmp_path / "there"), never)
+
+
+def test_a_fetched_checkpoint_does_not_follow_links(tmp_path: Path) -> None:
+    bucket, store = disk_bucket(tmp_path), Store(tmp_path / "here")
+    bucket.upload(write_file(tmp_path / "elsewhere", "step 100"), CHECKPOINT)
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    partial = store.path("training", KEY, ".partial")
+    partial.parent.mkdir(parents=True)
+    partial.symlink_to(outside)
+    resumed(bucket, store, finish)
+    assert list(outside.iterdir()) == []
+    key = store.path("training", KEY)
+    for made in (key, key.with_name(f"{KEY}.json")):
+        shutil.rmtree(made) if made.is_dir() else made.unlink()
+    bucket.remove(f"training/{KEY}.tar")
+    bucket.upload(tmp_path / "elsewhere", CHECKPOINT)
+    partial.mkdir()
+    (partial / "checkpoint.tmp").symlink_to(outside / "planted")
+    resumed(bucket, store, finish)
+    assert list(outside.iterdir()) == []
+
+
+def write_file(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
 
 
 def work_in(root: Path, store: str, expiry_s: float) -> None:

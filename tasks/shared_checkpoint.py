@@ -1,0 +1,98 @@
+"""The checkpoint of unfinished work, shared through a bucket, so that another machine goes on where a lost one was.
+
+    <bucket>/<stage>/<key>.checkpoint    the latest one, until the work is done
+
+Whoever takes the work over checks what is in it, as it does with one of its own.
+"""
+
+import logging
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Event, Thread
+
+from hnerf.errors import InputError
+from tasks.bucket import Bucket, BucketError
+from tasks.packed import require_room
+from tasks.store import Store, remove
+
+log = logging.getLogger("hnerf.shared")
+
+LOOK_S = 60.0  # between looks for a new one
+
+Version = tuple[int, int] | None
+
+
+@contextmanager
+def shared_checkpoint(bucket: Bucket, store: Store, stage: str, key: str, file: str) -> Iterator[None]:
+    """Begin with the bucket's checkpoint, which replaces an own one, since the bucket has each soon after it is
+    written; while the work inside goes on, put new ones there. In the end, keep the last there if it is still needed
+    here. file: its name in the folder of unfinished work."""
+    name, path = f"{stage}/{key}.checkpoint", store.path(stage, key, ".partial") / file
+    with store.locked(stage, key):
+        _fetch(bucket, name, path)
+    ended = Event()
+    thread = Thread(target=_share, args=(bucket, name, path, _version(path), ended), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        if not path.exists():
+            _attempt(lambda: bucket.remove(name))
+
+
+def _fetch(bucket: Bucket, name: str, path: Path) -> None:
+    """Take the bucket's checkpoint, if there is one."""
+    if (size_bytes := bucket.size_bytes(name)) is None:
+        return
+    log.info("going on from %s (%.1f MB)", bucket.where(name), size_bytes / 1e6)
+    if path.parent.is_symlink():
+        remove(path.parent)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    require_room(size_bytes, path.parent, bucket.where(name))
+    beside = path.with_name(f"{path.name}.tmp")
+    beside.unlink(missing_ok=True)
+    bucket.download(name, beside)
+    os.replace(beside, path)
+
+
+def _share(bucket: Bucket, name: str, path: Path, shared: Version, ended: Event) -> None:
+    """Put each new checkpoint into the bucket, until the work has ended, and then the last one. shared: which one is
+    there already."""
+    last = False
+    while not last:
+        last = ended.wait(LOOK_S)
+        found = _version(path)
+        if found not in (None, shared) and _attempt(lambda: _put(bucket, name, path)):
+            shared = found
+
+
+def _put(bucket: Bucket, name: str, path: Path) -> None:
+    """Put the file that lies there now into the bucket, whatever replaces it meanwhile."""
+    try:
+        with path.open("rb") as file:
+            bucket.upload(Path(f"/dev/fd/{file.fileno()}"), name)
+    except FileNotFoundError:  # done: there is none any more
+        return
+
+
+def _version(path: Path) -> Version:
+    """Return what changes with each new file at a path; None if there is none."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return None
+    return found.st_ino, found.st_mtime_ns
+
+
+def _attempt(act: Callable[[], None]) -> bool:
+    """Return whether the bucket let it be done; warn if not: the work goes on without."""
+    try:
+        act()
+    except (BucketError, InputError) as error:
+        log.warning("%s", error)
+        return False
+    return True
