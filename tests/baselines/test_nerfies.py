@@ -23,7 +23,7 @@ from tests.baselines.column import Learned, learn, three_poses
 
 SMALL = [
     "training.steps=90",
-    "training.rays_per_frame=96",
+    "training.rays_per_frame=64",
     "training.field.samples=12",
     "training.field.width=32",
     "training.field.anneal_share=0.3333",

@@ -21,6 +21,7 @@ from tasks.source import Source, read_capture
 from tasks.stage import Stage, image_count
 from tasks.store import Store
 from tests.tasks.stores import add
+from tests.tasks.test_launcher import wait_until_running
 
 ROOT = Path(__file__).parents[2]
 
@@ -123,8 +124,7 @@ def test_ranks_that_stand_still_are_ended(tmp_path: Path, monkeypatch: pytest.Mo
 
     with pytest.raises(StalledError):
         within(1.5, wait_for_ranks)
-    for path in tmp_path.iterdir():
-        assert not Path(f"/proc/{path.name}").exists()
+    wait_until_running(tmp_path, 0)
 
 
 def test_code_that_never_comes_back_ends_its_process() -> None:
