@@ -2,7 +2,6 @@
 
 import itertools
 import json
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from hnerf.capture.lens import pinhole
 from hnerf.config import SyntheticSettings
 from hnerf.geometry.camera import Camera, look_at
 from hnerf.progress import tracked
+from hnerf.side_by_side import side_by_side
 from hnerf.synthetic.appearance import FACE
 from hnerf.synthetic.detect import detect
 from hnerf.synthetic.dressed import DressedBody, midpoints
@@ -79,22 +79,22 @@ def write_synthetic_capture(out: Path, settings: SyntheticSettings) -> None:
     write_easymocap(out, [pinhole(view.camera) for view in views.values()])
     _write_toml(out, settings)
 
-    joints_m, surfaces_m = [], []  # no more than is written: a long capture's truth does not fit into memory
     known = [rig.joint_names.index(name) for name in MIXAMO]
-    count = settings.train_frames + settings.novel_pose_frames
-    for frame in tracked(range(count), "frames", count):
+
+    def write_frame(frame: int) -> tuple[np.ndarray, np.ndarray]:
         truth = _frame_truth(dressed, _pose(rig, frame, settings))
-        with ThreadPoolExecutor() as pool:
-            seeds = ((settings.seed, frame, number) for number in range(len(views)))
-            jobs = [
-                pool.submit(_write_view, out, frame, view, truth, name in test_cameras, np.random.default_rng(seed))
-                for (name, view), seed in zip(views.items(), seeds, strict=True)
-            ]
-        for job in jobs:
-            job.result()
-        joints_m.append(np.concatenate([truth.keypoints_m, truth.joints_m[known]]))
+        for number, (name, view) in enumerate(views.items()):
+            rng = np.random.default_rng((settings.seed, frame, number))
+            _write_view(out, frame, view, truth, name in test_cameras, rng)
+        joints_m = np.concatenate([truth.keypoints_m, truth.joints_m[known]])
+        return joints_m, truth.person.vertices_m.astype(np.float32)
+
+    joints_m, surfaces_m = [], []
+    count = settings.train_frames + settings.novel_pose_frames
+    for frame, (joints, surface) in enumerate(tracked(side_by_side(write_frame, range(count)), "frames", count)):
+        joints_m.append(joints)
         if frame % MESH_EVERY == 0:
-            surfaces_m.append(truth.person.vertices_m.astype(np.float32))
+            surfaces_m.append(surface)
     _write_truth(out, dressed.faces, surfaces_m, joints_m)
 
 
