@@ -1,16 +1,38 @@
 """torchrun, with a report of the first failed rank in a file: python -m tasks.agent FILE TORCHRUN'S ARGUMENTS."""
 
 import json
+import os
 import sys
+import traceback
+from contextlib import suppress
 from pathlib import Path
 
 from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
 from torch.distributed.run import parse_args, run
 
-if __name__ == "__main__":
+
+def main(failure: Path, arguments: list[str]) -> None:
+    """Run torchrun, and end this process at once when it is done: where it was interrupted while it ended its ranks,
+    threads of it go on, and the interpreter would wait for them."""
+    code = 1
     try:
-        run(parse_args(sys.argv[2:]))
+        run(parse_args(arguments))
+        code = 0
     except ChildFailedError as error:
-        _, failure = error.get_first_failure()
-        Path(sys.argv[1]).write_text(json.dumps([failure.local_rank, failure.exitcode]))
-        raise
+        _, first = error.get_first_failure()
+        failure.write_text(json.dumps([first.local_rank, first.exitcode]))
+        _complain()
+    except BaseException:
+        _complain()
+    finally:
+        os._exit(code)
+
+
+def _complain() -> None:
+    with suppress(OSError):  # the caller may be gone
+        traceback.print_exc()
+        sys.stderr.flush()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2:])

@@ -125,6 +125,24 @@ def test_ranks_end_with_the_caller(tmp_path: Path, fatal: signal.Signals) -> Non
     wait_until_running(tmp_path, 0)
 
 
+def test_torchrun_ends_whatever_thread_of_it_goes_on(tmp_path: Path) -> None:
+    code = f"""
+import threading
+from pathlib import Path
+from tasks import agent
+
+def interrupted(arguments):
+    threading.Thread(target=threading.Event().wait).start()
+    raise KeyboardInterrupt("while it ended its ranks")
+
+agent.run = interrupted
+agent.main(Path({str(tmp_path / "failure")!r}), ["-m", "nothing"])
+"""
+    command = [sys.executable, "-c", code]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert ended.returncode == 1 and "while it ended its ranks" in ended.stderr
+
+
 def test_ranks_end_with_torchrun_which_is_worth_another_try(tmp_path: Path) -> None:
     with ThreadPoolExecutor() as pool:
         launched = pool.submit(run_ranks, RANKS, ["sleep", str(tmp_path)], 2)
