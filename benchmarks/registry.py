@@ -109,7 +109,7 @@ REGISTRY = (
         "paper-small", "training.steps=200", "capture.max_side_px=128", "evaluation.max_images=4", rows=PAPERS_ROWS
     ),
     study("benchmark", "static", "fast", "paper-small", "nerf", "idr", seconds=900),
-    study("benchmark", "dynamic", "fast", "neural-body", "nerfies", seconds=900),
+    study("benchmark", "dynamic", "fast", "neural-body", "nerfies", seconds=3600),
     study("benchmark", "frames", "fast", "neural-body", seconds=120),
     study("benchmark", "monocular", "fast"),
     study("benchmark", "nerfies", "fast", "nerfies", seconds=240),
