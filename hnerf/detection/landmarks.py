@@ -7,7 +7,7 @@ import numpy as np
 from hnerf.detection.network import Network, sigmoid
 from hnerf.detection.region import Region, region_around
 
-SIZE, POINTS, AUXILIARY = 256, 33, 2  # the auxiliary points, which follow, say where the next region is
+SIZE, POINTS = 256, 33  # two auxiliary points, which follow, say where the next region is
 HEAT_WINDOW, MIN_HEAT = 3, 0.5  # cells on each side of a point, and the heat that one of them must have
 MIN_PRESENCE = 0.5  # probability that a region shows a person; below it, nobody is there
 
