@@ -47,9 +47,9 @@ def test_set_up_upgrade_backup_and_restore(cluster: dict[str, str], tmp_path: Pa
     assert "alembic" in shell("psql --tuples-only --command '\\dt' hnerf", environment, tmp_path)
     pool = "prefect --no-prompt work-pool create {} --type process"
     serve(environment, tmp_path, [pool.format("before")])
-    shell("pg_dump --format=custom --file=prefect.dump hnerf", environment, tmp_path)
+    shell("pg_dump --format=custom hnerf > prefect.dump", environment, tmp_path)
     serve(environment, tmp_path, [pool.format("after")])
-    restore = "dropdb hnerf && createdb hnerf --owner hnerf && pg_restore --dbname=hnerf prefect.dump"
+    restore = "dropdb hnerf && createdb hnerf --owner hnerf && pg_restore --dbname=hnerf < prefect.dump"
     shell(restore, environment, tmp_path)
     shell("prefect server database upgrade --yes", environment, tmp_path)
     names = serve(environment, tmp_path, ["prefect work-pool ls"])
