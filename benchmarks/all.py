@@ -130,7 +130,7 @@ class Job:
                 env=environment(root, result.threads),
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                preexec_fn=partial(end_with_parent, signal.SIGTERM),
+                preexec_fn=partial(end_with_parent, signal.SIGTERM, os.getpid()),
             )
 
     def running(self) -> bool:

@@ -11,6 +11,7 @@ a copy of each capture that lacks this folder.
 
 import argparse
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -73,7 +74,7 @@ def measure(capture: Path, preset: str, store: Path, overrides: list[str]) -> di
     command += ["--store", str(store), *(f"--set={override}" for override in overrides)]
     known, started = (store / "subjects" / capture.name).exists(), time.perf_counter()
     lines: list[str] = []
-    ends = partial(end_with_parent, signal.SIGTERM)
+    ends = partial(end_with_parent, signal.SIGTERM, os.getpid())
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, preexec_fn=ends) as run:
         assert run.stdout is not None
         for line in run.stdout:

@@ -16,7 +16,7 @@ from flows.run_page import publish_markdown
 from flows.train_subject import prepare_training, with_detections
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, Settings, load_settings, read_yaml, with_changes
-from hnerf.errors import InputError, one_line
+from hnerf.errors import InputError, PlaceError, one_line
 from hnerf.files import replace_text
 from hnerf.study.benchmark import results
 from hnerf.tables import head, line, pick
@@ -99,6 +99,8 @@ def measure(store: Store, source: Source, truth: Source, settings: Settings) -> 
     try:
         training = train(store, *prepared, settings.training)
         evaluation = evaluate(store, truth, *prepared, training, settings.evaluation)
+    except PlaceError:
+        raise
     except Exception as error:  # that a method breaks without a part is a result
         if is_retryable(error):
             raise  # a full disk, a lost share, a killed worker

@@ -12,7 +12,7 @@ from flows.run_page import publish_markdown
 from flows.train_subject import Prepared, prepare_training, with_detections
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
-from hnerf.errors import InputError, one_line
+from hnerf.errors import InputError, PlaceError, one_line
 from hnerf.files import embed_images
 from hnerf.study.benchmark.convergence import is_flat, training_limits_s
 from hnerf.study.benchmark.plan import BenchmarkStudy, Variant, load_study
@@ -101,6 +101,8 @@ def measure(
             settings, more = train_until_flat(store, truth, prepared, plan, method)
         training = train(store, *prepared, settings.training)
         scores = score_training(store, truth, recording, prepared.calibration, prepared.body, training, plan.scoring)
+    except PlaceError:
+        raise
     except Exception as error:  # one method's failure must not end the others
         if is_retryable(error):
             raise  # a full disk, a lost share, a killed worker
@@ -125,6 +127,8 @@ def train_until_flat(
         try:
             training = train(store, *prepared, settings.training)
             point = score_end_of_training(store, truth, recording, calibration, body, training, plan.scoring)
+        except PlaceError:
+            raise
         except Exception as error:
             if is_retryable(error):
                 raise

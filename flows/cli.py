@@ -17,7 +17,7 @@ from flows.ending import Terminated, open_closed_streams, unwound_by_sigterm
 from flows.store_commands import add_store_commands
 from hnerf.config import load_settings
 from hnerf.errors import InputError, InvalidAsset
-from tasks.launcher import RankFailedError
+from tasks.launcher import LostWorkerError, RankFailedError
 from tasks.limits import StalledError
 from tasks.source import place
 
@@ -59,7 +59,7 @@ def main(argv: list[str] | None = None) -> int:
         return _fail("interrupted", INTERRUPTED)
     except InputError as error:
         return _fail(error, BAD_INPUT)
-    except (RankFailedError, StalledError, InvalidAsset) as error:
+    except (RankFailedError, LostWorkerError, StalledError, InvalidAsset) as error:
         return _fail(error, FAILED)
     except OSError as error:
         if isinstance(error, BrokenPipeError) and _reader_has_left():

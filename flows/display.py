@@ -12,7 +12,7 @@ from hnerf.progress import Progress, log
 def display() -> Iterator[None]:
     """Show the log, in place of Prefect's console handler, which writes to standard error."""
     logger, level = logging.getLogger("hnerf"), log.level
-    handler = TerminalHandler() if sys.stdout.isatty() else logging.StreamHandler(sys.stdout)
+    handler = TerminalHandler() if sys.stdout.isatty() else LineHandler(sys.stdout)
     handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
@@ -26,6 +26,15 @@ def display() -> Iterator[None]:
         handler.close()
         logger.propagate = True
         log.setLevel(level)
+
+
+class LineHandler(logging.StreamHandler):
+    """Prints records, unless nobody reads them any more."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Say nothing of a closed pipe, which the command notices at its end."""
+        if not isinstance(sys.exc_info()[1], BrokenPipeError):
+            super().handleError(record)
 
 
 class TerminalHandler(logging.Handler):

@@ -15,7 +15,7 @@ from flows.run_page import publish_markdown
 from flows.train_subject import Prepared, prepare_training, with_detections
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
-from hnerf.errors import InputError, NotApplicableError, one_line
+from hnerf.errors import InputError, NotApplicableError, PlaceError, one_line
 from hnerf.evaluation.columns import reason_without_novel_poses
 from hnerf.evaluation.evaluate import reason_without_surface
 from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, PRIMARY_SPLITS, TRACKED
@@ -207,11 +207,13 @@ class Attempt:
             return self.measure(prepared, training)
         except NotApplicableError as error:
             return {"left_out": str(error)}
+        except PlaceError:
+            raise
         except InputError as error:
             return {"error": (at_bad_input, str(error))}
         except Exception as error:  # any failure is a result of the study
             if is_retryable(error):
-                raise  # a full disk, a lost share, a killed worker
+                raise  # a full disk, a killed worker
             log.warning("%s: %s", type(error).__name__, error)
             return {"error": ("failed", one_line(error))}
 

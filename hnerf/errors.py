@@ -15,6 +15,10 @@ class NotApplicableError(InputError):
     fault."""
 
 
+class PlaceError(InputError):
+    """A place of results that is away, closed or full: no fault of the recording, and no result of a study."""
+
+
 class InvalidAsset(Exception):
     """A package that must not be handed over. The message names the file and every defect."""
 

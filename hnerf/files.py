@@ -17,7 +17,7 @@ def atomic_folder(out: Path) -> Iterator[Path]:
 
     It lies beside `out`, in the same file system. Raises InputError where `out` exists.
     """
-    if out.exists():
+    if os.path.lexists(out):
         raise InputError(f"{out}: exists; give the name of a new folder")
     with made_folder(out.parent), tempfile.TemporaryDirectory(dir=out.parent, prefix=f"{out.name}.partial-") as beside:
         partial = Path(beside) / out.name  # unlike `beside`, it has the permissions of the umask

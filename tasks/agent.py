@@ -10,11 +10,14 @@ from pathlib import Path
 from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
 from torch.distributed.run import parse_args, run
 
+from tasks.rank import AGENT
+
 
 def main(failure: Path, arguments: list[str]) -> None:
     """Run torchrun, and end this process at once when it is done: where it was interrupted while it ended its ranks,
     threads of it go on, and the interpreter would wait for them."""
     code = 1
+    os.environ[AGENT] = str(os.getpid())
     try:
         run(parse_args(arguments))
         code = 0

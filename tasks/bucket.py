@@ -16,7 +16,7 @@ from fsspec.callbacks import Callback
 from fsspec.core import url_to_fs
 from fsspec.implementations.local import LocalFileSystem
 
-from hnerf.errors import InputError, one_line
+from hnerf.errors import InputError, PlaceError, one_line
 from hnerf.progress import report
 
 VARIABLE = "HNERF_BUCKET"
@@ -51,7 +51,7 @@ class Bucket:
         try:
             return Bucket.at(url) if url else None
         except InputError as error:
-            raise InputError(f"{VARIABLE}: {error}") from None
+            raise type(error)(f"{VARIABLE}: {error}") from None
 
     @staticmethod
     def at(url: str) -> "Bucket":
@@ -73,7 +73,7 @@ class Bucket:
             try:
                 fs.info(top)
             except FileNotFoundError:
-                raise InputError(f"{url}: {top} is not there; make it, or give another URL") from None
+                raise PlaceError(f"{url}: {top} is not there; make it, or give another URL") from None
         return bucket
 
     @property
@@ -122,7 +122,7 @@ class Bucket:
 
     def upload(self, path: Path, name: str) -> None:
         """Make or replace an object with a file's bytes."""
-        with self._answering(name):
+        with self._answering(name, written=True):
             self._make_folder(name)
             beside = f"{name}.{uuid4().hex}" if self.is_disk else name
             self.fs.put_file(str(path), self._path(beside))
@@ -131,7 +131,7 @@ class Bucket:
 
     def create_note(self, name: str, text: bytes) -> bool:
         """Make a small object; return False if it is there already, which the file system decides for all machines."""
-        with self._answering(name):
+        with self._answering(name, written=True):
             self._make_folder(name)
             try:
                 with self.fs.open(self._path(name), "xb") as file:
@@ -142,7 +142,7 @@ class Bucket:
 
     def write_note(self, name: str, text: bytes) -> None:
         """Make or replace a small object."""
-        with self._answering(name):
+        with self._answering(name, written=True):
             self.fs.pipe_file(self._path(name), text)
 
     def read_note(self, name: str) -> bytes | None:
@@ -164,14 +164,19 @@ class Bucket:
             self.fs.makedirs(self.fs._parent(self._path(name)), exist_ok=True)
 
     @contextmanager
-    def _answering(self, name: str) -> Iterator[None]:
-        """Turn what goes wrong inside into errors of one line; file systems raise those of many libraries."""
+    def _answering(self, name: str, written: bool = False) -> Iterator[None]:
+        """Turn what goes wrong inside into errors of one line; file systems raise those of many libraries. written:
+        what is not there is the bucket itself, not the object."""
         try:
             yield
-        except (FileNotFoundError, InputError):
+        except InputError:
             raise
+        except FileNotFoundError as error:
+            if not written:
+                raise
+            raise BucketError(f"{self.where(name)}: {one_line(error)}; can the bucket be reached?") from error
         except PermissionError as error:
-            raise InputError(f"{self.where(name)}: {one_line(error)}; allow this user to read and write it") from error
+            raise PlaceError(f"{self.where(name)}: {one_line(error)}; allow this user to read and write it") from error
         except Exception as error:
             raise BucketError(f"{self.where(name)}: {one_line(error)}; can the bucket be reached?") from error
 

@@ -68,7 +68,7 @@ def run_ranks(module: str, arguments: Sequence[str], processes: int) -> None:
             errors="replace",
             env=_environment(processes),
             start_new_session=True,
-            preexec_fn=partial(end_with_parent, signal.SIGTERM),
+            preexec_fn=partial(end_with_parent, signal.SIGTERM, os.getpid()),
         )
         try:
             _follow(agent, logging.getLogger(module))

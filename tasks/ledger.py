@@ -38,7 +38,7 @@ class Ledger:
     def seen(self, listing: str) -> bool:
         """Return whether a folder of this listing was read, and its capture started, before."""
         path = self.root / listing
-        return path.exists() and self.knows(path.read_text().strip() or "none")
+        return path.exists() and self.knows(path.read_text(errors="replace").strip() or "none")
 
     def stood_s(self, listing: str) -> float:
         """Return for how long a listing has been the same, by this machine's clock: 0 when it is asked about first."""
@@ -71,7 +71,7 @@ def forget(store: Path, capture: Path | str) -> None:
     from wherever it lies now."""
     missing = capture if isinstance(capture, str) else str(capture.absolute())
     for record in list(_records(store)):
-        folder, _, run = record.read_text().partition("\n")
+        folder, _, run = record.read_text(errors="replace").partition("\n")
         if folder == missing:
             replace_text(record.with_name(f"{record.name}{LOST}"), run.strip())
             record.unlink()
@@ -80,7 +80,7 @@ def forget(store: Path, capture: Path | str) -> None:
 def was_started(store: Path, capture: Path) -> bool:
     """Return whether this folder's run was started from the watched folder."""
     folder = str(capture.absolute())
-    return any(record.read_text().partition("\n")[0] == folder for record in _records(store))
+    return any(record.read_text(errors="replace").partition("\n")[0] == folder for record in _records(store))
 
 
 def _records(store: Path) -> Iterator[Path]:

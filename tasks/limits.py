@@ -56,6 +56,8 @@ def limited(stage: str, images: int, resumable: bool) -> Iterator[None]:
 
     def rearm(progress: Progress) -> None:
         nonlocal armed_s, last
+        if progress == last:  # said again, by who waits for others
+            return
         last = progress
         if time.monotonic() - armed_s > REARM_S:
             armed_s = time.monotonic()

@@ -18,21 +18,21 @@ from typing import IO, Annotated, TypeVar
 from pydantic import Field, model_validator
 
 from hnerf.config import Section, validated
-from hnerf.errors import InputError
+from hnerf.errors import InputError, PlaceError
 from tasks.store import Artifact, Store, remove
 
 MANIFEST = re.compile(r"[0-9a-f]{64}\.json")
 MAX_MANIFEST_BYTES = 64 << 20  # 200 bytes a file
 BLOCK = tarfile.BLOCKSIZE
 CHUNK_BYTES = 1 << 20
-MAX_PATH_BYTES = 1024
+MAX_PATH_BYTES, MAX_NAME_BYTES = 1024, 255  # the latter of a folder or file
 SPARE_BYTES = 1 << 30  # of the disk, which an archive must leave free
 
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z-]{0,30}/[0-9a-f]{32}$")]  # of an artifact
 
 
-class NoRoomError(InputError):
+class NoRoomError(PlaceError):
     """The files would fill the disk."""
 
 
@@ -59,7 +59,7 @@ class ArchivedArtifact(Section):
             plain = "/".join(parts) == path == encoded.decode() and "\0" not in path
             if not (parts and plain) or parts[0] == "/" or ".." in parts or above & self.files.keys():
                 raise ValueError(f"{path!r} is not a path inside a folder")
-            if len(encoded) > MAX_PATH_BYTES:
+            if len(encoded) > MAX_PATH_BYTES or max(len(part.encode()) for part in parts) > MAX_NAME_BYTES:
                 raise ValueError(f"{path[:80]!r}... is not a path inside a folder: too long")
         return self
 

@@ -29,7 +29,16 @@ def pinned(store: Path) -> set[str]:
     """Return the names of the artifacts that living processes use; remove what dead ones left."""
     names: set[str] = set()
     for path in (store / FOLDER).glob("[0-9a-f]*"):
-        with path.open() as file:
+        try:
+            file = path.open("r+")  # NFS locks only what may be written
+        except FileNotFoundError:  # another looked at the same time
+            continue
+        except OSError as error:
+            if error.errno not in READ_ONLY:
+                raise
+            names |= set(path.read_text().split())
+            continue
+        with file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:

@@ -26,7 +26,9 @@ def clear(capture: Path) -> None:
 
 
 def clear_removed(folder: Path) -> None:
-    """Take back what was said about captures that are no longer in the watched folder."""
+    """Take back what was said about captures that are no longer in the watched folder; links are not followed."""
+    if (folder / FOLDER).is_symlink():
+        return
     for path in (folder / FOLDER).glob("*.txt"):
         if not os.path.lexists(folder / path.name.removesuffix(".txt")):
             path.unlink(missing_ok=True)

@@ -8,14 +8,15 @@ Whoever takes the work over checks what is in it, as it does with one of its own
 import logging
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Event, Thread
 
 from hnerf.errors import InputError
+from hnerf.files import replace_text
 from tasks.bucket import Bucket, BucketError
 from tasks.packed import require_room
-from tasks.store import Store, remove
+from tasks.store import Store, remove, sha256_of
 
 log = logging.getLogger("hnerf.shared")
 
@@ -26,14 +27,15 @@ Version = tuple[int, int] | None
 
 @contextmanager
 def shared_checkpoint(bucket: Bucket, store: Store, stage: str, key: str, file: str) -> Iterator[None]:
-    """Begin with the bucket's checkpoint, which replaces an own one, since the bucket has each soon after it is
-    written; while the work inside goes on, put new ones there. In the end, keep the last there if it is still needed
-    here. file: its name in the folder of unfinished work."""
+    """Begin with the bucket's checkpoint if another machine put it there since this one last did, else with an own one;
+    while the work inside goes on, put new ones there. In the end, keep the last there if it is still needed here. file:
+    its name in the folder of unfinished work."""
     name, path = f"{stage}/{key}.checkpoint", store.path(stage, key, ".partial") / file
     with store.locked(stage, key):
-        _fetch(bucket, name, path)
+        fetched = _fetch(bucket, name, path)
     ended = Event()
-    thread = Thread(target=_share, args=(bucket, name, path, _version(path), ended), daemon=True)
+    shared = _version(path) if fetched else None
+    thread = Thread(target=_share, args=(bucket, name, path, shared, ended), daemon=True)
     thread.start()
     try:
         yield
@@ -44,19 +46,28 @@ def shared_checkpoint(bucket: Bucket, store: Store, stage: str, key: str, file: 
             _attempt(lambda: bucket.remove(name))
 
 
-def _fetch(bucket: Bucket, name: str, path: Path) -> None:
-    """Take the bucket's checkpoint, if there is one."""
+def _fetch(bucket: Bucket, name: str, path: Path) -> bool:
+    """Take the bucket's checkpoint, if there is one that this machine does not know; return whether it did."""
     if (size_bytes := bucket.size_bytes(name)) is None:
-        return
-    log.info("going on from %s (%.1f MB)", bucket.where(name), size_bytes / 1e6)
+        return False
     if path.parent.is_symlink():
         remove(path.parent)
     path.parent.mkdir(parents=True, exist_ok=True)
     require_room(size_bytes, path.parent, bucket.where(name))
     beside = path.with_name(f"{path.name}.tmp")
     beside.unlink(missing_ok=True)
-    bucket.download(name, beside)
+    try:
+        bucket.download(name, beside)
+    except FileNotFoundError:  # removed meanwhile
+        return False
+    digest = sha256_of(beside)
+    if path.is_file() and _note(path).is_file() and _note(path).read_text(errors="replace") == digest:
+        beside.unlink()
+        return False
+    log.info("going on from %s (%.1f MB)", bucket.where(name), size_bytes / 1e6)
+    replace_text(_note(path), digest)
     os.replace(beside, path)
+    return True
 
 
 def _share(bucket: Bucket, name: str, path: Path, shared: Version, ended: Event) -> None:
@@ -73,10 +84,19 @@ def _share(bucket: Bucket, name: str, path: Path, shared: Version, ended: Event)
 def _put(bucket: Bucket, name: str, path: Path) -> None:
     """Put the file that lies there now into the bucket, whatever replaces it meanwhile."""
     try:
-        with path.open("rb") as file:
-            bucket.upload(Path(f"/dev/fd/{file.fileno()}"), name)
+        file = path.open("rb")
     except FileNotFoundError:  # done: there is none any more
         return
+    with file:
+        opened = Path(f"/dev/fd/{file.fileno()}")
+        bucket.upload(opened, name)
+        with suppress(FileNotFoundError):  # done meanwhile
+            replace_text(_note(path), sha256_of(opened))
+
+
+def _note(path: Path) -> Path:
+    """Return the file that holds the digest of the checkpoint that this machine last put into the bucket, or took."""
+    return path.with_name(f"{path.name}.shared")
 
 
 def _version(path: Path) -> Version:

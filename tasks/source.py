@@ -12,6 +12,7 @@ from hnerf.errors import InputError
 from tasks.store import sha256_of
 
 GROUND_TRUTH = "ground_truth"
+MAX_FILE_BYTES = 1 << 38  # a sparse file takes no disk, and hours to read
 
 
 def place(given: Path | str) -> Path | str:
@@ -45,6 +46,8 @@ def read_capture(folder: Path, store: Path | None = None) -> tuple[Source, Sourc
     shown = os.fsencode(folder).decode(errors="replace")
     if shown != str(folder):
         raise InputError(f"{shown}: the folder's name is not UTF-8; rename it")
+    if "\n" in shown:
+        raise InputError(f"{shown}: the folder's name has a line break; rename it")
     truth = folder / GROUND_TRUTH
     files = capture_files(folder)
     parts = [f for f in files if not f.is_relative_to(truth)], [f for f in files if f.is_relative_to(truth)]
@@ -88,10 +91,15 @@ def _digest(folder: Path, files: Iterable[Path]) -> str:
     listing = hashlib.sha256()
     for path in files:
         try:
+            if path.lstat().st_size > MAX_FILE_BYTES:
+                raise InputError(f"{path}: has more than {MAX_FILE_BYTES >> 30} GiB; cut it")
             content = os.readlink(path) if path.is_symlink() else sha256_of(path)
         except OSError as error:
             _refuse(error, path)
-        listing.update(os.fsencode(f"{content} {path.relative_to(folder)}\n"))
+        line = f"{content} {path.relative_to(folder)}"
+        if "\n" in line:  # or two folders could have one digest
+            raise InputError(f"{path}: has a line break in its name, or in what it links to; rename it")
+        listing.update(os.fsencode(f"{line}\n"))
     return listing.hexdigest()
 
 

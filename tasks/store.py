@@ -94,6 +94,8 @@ class Store:
         record = self.path(stage, key, ".json")
         if not record.is_file():  # nor a pipe or a device, from which reading never ends
             return None
+        if record.is_symlink() or self.path(stage, key).is_symlink():
+            return None
         pin(self.root, f"{stage}/{key}")
         try:
             with unless_read_only():
@@ -182,7 +184,7 @@ class Store:
         another folder: two recordings of one name replace each other's results."""
         path, claimed = self.subject_folder(subject) / RECORDING, f"{digest}\n{folder}\n"
         path.parent.mkdir(parents=True, exist_ok=True)
-        before = path.read_text() if path.is_file() and not path.is_symlink() else claimed
+        before = path.read_text(errors="replace") if path.is_file() and not path.is_symlink() else claimed
         if before != claimed and before.splitlines()[1:] != [str(folder)] and not before.startswith(digest):
             log.warning(
                 "%s showed the results of %s and will show those of %s; give one of them another name in capture.toml",

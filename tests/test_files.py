@@ -31,6 +31,12 @@ def test_what_exists_is_left_alone(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["ada"]
 
 
+def test_a_link_to_nothing_is_found_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "out").symlink_to(tmp_path / "nothing")
+    with pytest.raises(InputError, match="out: exists"), atomic_folder(tmp_path / "out"):
+        raise AssertionError("too late")
+
+
 def test_folders_that_stay_empty_go_again_and_others_stay(tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     with made_folder(tmp_path / "there"), made_folder(tmp_path / "a" / "b"), made_folder(tmp_path / "c"):

@@ -97,7 +97,8 @@ def _find_people(capture: Capture, size: str, out: Path) -> None:
         return
     processes = min(len(waiting), len(os.sched_getaffinity(0)))
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, spawn, initializer=end_with_parent, initargs=(signal.SIGKILL,)) as pool:
+    ends = (signal.SIGKILL, os.getpid())
+    with ProcessPoolExecutor(processes, spawn, initializer=end_with_parent, initargs=ends) as pool:
         jobs = {pool.submit(find_in_camera, capture, name, size, out): name for name in waiting}
         running = set(jobs)
         try:

@@ -16,7 +16,7 @@ from hnerf.config import AssetSettings, SyntheticSettings
 from hnerf.errors import InvalidAsset
 from hnerf.render.subject import MAX_SIZE_PX, MIN_SIZE_PX, OUTPUT_KINDS
 from tasks.bucket import BucketError
-from tasks.launcher import RankFailedError
+from tasks.launcher import LostWorkerError, RankFailedError
 from tests.capture.recordings import write_easymocap
 from tests.shared_data import shared_capture
 
@@ -68,6 +68,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
             InvalidAsset("avatar.usdz: there is no mesh;\nno skeleton"),
             "hnerf: avatar.usdz: there is no mesh; no skeleton\n",
         ),
+        (LostWorkerError("hnerf.training.run: rank 0 was killed"), "hnerf: hnerf.training.run: rank 0 was killed\n"),
         (BucketError("s3://x/fit/k.tar: no answer"), "hnerf: s3://x/fit/k.tar: no answer\n"),
     ],
 )

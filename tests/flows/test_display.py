@@ -38,3 +38,15 @@ def test_elsewhere_there_are_lines_alone(monkeypatch: pytest.MonkeyPatch) -> Non
     work()
     (line,) = file.getvalue().splitlines()
     assert line.endswith(" hnerf.stage: training: [1/2]")
+
+
+def test_a_pipe_that_nobody_reads_is_no_trace_for_each_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Closed(io.StringIO):
+        def write(self, text: str) -> int:
+            raise BrokenPipeError
+
+    monkeypatch.setattr(sys, "stdout", Closed())
+    work()
+    assert capsys.readouterr().err == ""

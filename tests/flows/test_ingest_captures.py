@@ -173,6 +173,9 @@ def test_a_refused_capture_is_noted_until_it_is_changed_or_removed(
 def test_notes_are_not_written_through_links(watched: Path, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (watched / ".refused").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "thesis.txt").touch()
+    quarantine.clear_removed(watched)
+    (tmp_path / "elsewhere" / "thesis.txt").unlink()  # raises if it is gone
     with pytest.raises(OSError, match="is a symbolic link"):
         quarantine.note(watched / "ada", "refused: x")
     (watched / ".refused").unlink()

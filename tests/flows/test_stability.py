@@ -12,7 +12,7 @@ from flows import run_page, train_subject
 from flows import stability as module
 from flows.cli import main
 from flows.stability import stability
-from hnerf.errors import InputError, NotApplicableError
+from hnerf.errors import InputError, NotApplicableError, PlaceError
 from tasks.launcher import LostWorkerError
 
 pytestmark = pytest.mark.usefixtures("stages")
@@ -279,7 +279,10 @@ def test_bad_input_in_evaluation_is_failure(tmp_path: Path, monkeypatch: pytest.
     assert {r["verdict"] for r in study(tmp_path, only=["pose_noise"])["runs"]} == {"failed"}
 
 
-@pytest.mark.parametrize("error", [LostWorkerError("rank 0 was killed"), OSError(28, "No space left on device")])
+@pytest.mark.parametrize(
+    "error",
+    [LostWorkerError("rank 0 was killed"), OSError(28, "No space left on device"), PlaceError("s3://b: closed")],
+)
 def test_what_the_machine_did_ends_the_command_and_finished_runs_stand(
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 from fsspec import filesystem, get_filesystem_class
 
-from hnerf.errors import InputError
+from hnerf.errors import InputError, PlaceError
 from tasks.bucket import VARIABLE, Bucket, BucketError
 
 
@@ -73,5 +73,26 @@ def test_a_place_where_nothing_was_put_yet_has_no_folders(s3: str) -> None:
 
 
 def test_a_bucket_that_is_not_there_is_not_made(s3: str) -> None:
-    with pytest.raises(InputError, match="s3://none/x: none is not there; make it"):
+    with pytest.raises(PlaceError, match="s3://none/x: none is not there; make it"):
         Bucket.at("s3://none/x")
+
+
+def test_a_share_that_vanishes_may_come_back(tmp_path: Path) -> None:
+    """A heartbeat must survive it, and an upload be tried again."""
+    (tmp_path / "share").mkdir()
+    bucket = Bucket.at(f"file://{tmp_path}/share")
+    (tmp_path / "share").rmdir()
+    with pytest.raises(BucketError, match="can the bucket be reached"):
+        bucket.write_note("n", b"1")
+    assert bucket.read_note("n") is None
+
+
+def test_keys_that_expired_are_no_fault_of_the_recording(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    bucket = Bucket.at(f"file://{tmp_path}")
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError("The provided token has expired.")
+
+    monkeypatch.setattr(type(bucket.fs), "info", refuse)
+    with pytest.raises(PlaceError, match="token has expired"):
+        bucket.size_bytes("x")

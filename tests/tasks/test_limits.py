@@ -4,6 +4,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -39,9 +40,11 @@ def within(stage_s: float, work: Callable[[], Any], image_s: float = 0.0) -> Any
 def sleep_in(resumable: bool, with_progress_every_s: float | None = None, duration_s: float = 5.0) -> None:
     with limited("fit", 1, resumable):
         end_s = time.monotonic() + duration_s
-        while time.monotonic() < end_s:
+        for done in count():
             time.sleep(with_progress_every_s or duration_s)
-            report("outlines", 3, 10)
+            report("outlines", done % 10, 10)
+            if time.monotonic() > end_s:
+                return
 
 
 @pytest.mark.parametrize("resumable", [True, False])
@@ -55,6 +58,19 @@ def test_a_stage_without_progress_is_ended_and_its_cause_said(resumable: bool) -
 def test_progress_gives_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "REARM_S", 0.0)
     within(0.3, lambda: sleep_in(False, with_progress_every_s=0.1, duration_s=0.6))
+
+
+def test_the_same_progress_again_gives_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "REARM_S", 0.0)
+
+    def report_the_same() -> None:
+        with limited("detection", 1, resumable=True):
+            for _ in range(20):
+                report("detection", 3, 10)
+                time.sleep(0.1)
+
+    with pytest.raises(StalledError, match="after 3 of 10 detection"):
+        within(0.3, report_the_same)
 
 
 def test_the_last_progress_is_said() -> None:

@@ -2,6 +2,7 @@ import errno
 import fcntl
 import os
 from pathlib import Path
+from typing import IO, Any
 
 import pytest
 
@@ -40,3 +41,34 @@ def test_a_store_that_may_only_be_read_notes_nothing(tmp_path: Path, monkeypatch
 def test_a_full_disk_is_no_read_only_store() -> None:
     with pytest.raises(OSError, match="full"), unless_read_only():
         raise OSError(errno.ENOSPC, "full")
+
+
+def test_files_are_locked_as_nfs_asks_and_may_go_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """NFS locks a file alone only where it may be written. What another has removed is a link to nothing here."""
+    lock = fcntl.flock
+
+    def on_nfs(file: IO[str], how: int) -> None:
+        if not file.writable():
+            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+        lock(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", on_nfs)
+    (tmp_path / FOLDER).mkdir()
+    (tmp_path / FOLDER / "0123").write_text("fit/1\n")
+    (tmp_path / FOLDER / "4567").symlink_to("gone")
+    assert pinned(tmp_path) == set()
+
+
+def test_pins_of_a_store_that_may_only_be_read_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody can tell which of them are of the living."""
+    (tmp_path / FOLDER).mkdir()
+    (tmp_path / FOLDER / "0123").write_text("fit/1\n")
+    plain = Path.open
+
+    def read_only(self: Path, mode: str = "r", *rest: Any, **more: Any) -> Any:
+        if "+" in mode:
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+        return plain(self, mode, *rest, **more)
+
+    monkeypatch.setattr(Path, "open", read_only)
+    assert pinned(tmp_path) == {"fit/1"}

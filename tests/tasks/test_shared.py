@@ -161,7 +161,8 @@ def resumed(
 
 
 def finish(out: Path) -> dict[str, float]:
-    (out / "checkpoint").unlink()
+    for path in out.glob("checkpoint*"):
+        path.unlink()
     return write(out)
 
 
@@ -182,7 +183,7 @@ def test_another_machine_goes_on_from_the_checkpoint_of_failed_work(bucket: Buck
         raise RuntimeError("crash")
 
     def go_on(out: Path) -> dict[str, float]:
-        assert [path.name for path in out.iterdir()] == ["checkpoint"]
+        assert sorted(path.name for path in out.iterdir()) == ["checkpoint", "checkpoint.shared"]
         assert (out / "checkpoint").read_text() == "step 100"
         return finish(out)
 
@@ -190,10 +191,47 @@ def test_another_machine_goes_on_from_the_checkpoint_of_failed_work(bucket: Buck
     with pytest.raises(RuntimeError):
         resumed(bucket, here, fail)
     assert kept(bucket) == b"step 100"
-    here.path("training", KEY, ".partial").joinpath("checkpoint").write_text("step 50")  # before it went elsewhere
     assert resumed(bucket, there, go_on).files.keys() == {"again", "deep/letters"}
     assert kept(bucket) is None and clean(there)
     resumed(bucket, here, never)
+
+
+def test_the_checkpoint_is_that_of_the_machine_that_worked_last(bucket: Bucket, tmp_path: Path) -> None:
+    """A newer own one stays, which the bucket could not take, and is put there, too; another machine's replaces it."""
+    begun = []
+
+    def fail(out: Path) -> dict[str, float]:
+        begun.append((out / "checkpoint").read_text() if (out / "checkpoint").exists() else "")
+        if not begun[-1]:
+            (out / "checkpoint").write_text("step 100")
+        raise RuntimeError("crash")
+
+    def attempt(store: Store) -> None:
+        with pytest.raises(RuntimeError):
+            resumed(bucket, store, fail)
+
+    here, there = Store(tmp_path / "here"), Store(tmp_path / "there")
+    own = here.path("training", KEY, ".partial") / "checkpoint"
+    attempt(here)
+    own.write_text("step 900")
+    attempt(here)
+    assert begun == ["", "step 900"] and kept(bucket) == b"step 900"
+    attempt(there)
+    bucket.upload(write_file(tmp_path / "elsewhere", "step 2000"), CHECKPOINT)
+    attempt(here)
+    assert begun[2:] == ["step 900", "step 2000"] and own.read_text() == "step 2000"
+    bucket.remove(CHECKPOINT)
+    attempt(here)
+    assert kept(bucket) == b"step 2000"
+
+
+def test_a_checkpoint_that_is_removed_while_it_is_fetched_was_of_finished_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bucket, store = disk_bucket(tmp_path), Store(tmp_path / "here")
+    monkeypatch.setattr(Bucket, "size_bytes", lambda self, name: 8 if name == CHECKPOINT else None)
+    resumed(bucket, store, write)
+    assert clean(store)
 
 
 def test_the_bucket_has_each_new_checkpoint_once_while_work_goes_on(

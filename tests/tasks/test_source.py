@@ -118,6 +118,27 @@ def test_a_folder_whose_name_is_not_utf_8_is_bad_input(folder: Path) -> None:
         read_capture(folder.rename(folder.with_name(os.fsdecode(b"jos\xe9"))))
 
 
+def test_a_line_break_in_a_name_is_bad_input(folder: Path) -> None:
+    """Else one file could be listed as two others are."""
+    (folder / "a\nb").touch()
+    with pytest.raises(InputError, match="a b: has a line break in its name"):
+        digest(folder)
+    (folder / "a\nb").unlink()
+    (folder / "link").symlink_to("a\nb")
+    with pytest.raises(InputError, match="link: has a line break"):
+        digest(folder)
+    (folder / "link").unlink()
+    with pytest.raises(InputError, match="the folder's name has a line break"):
+        digest(folder.rename(folder.with_name("a\nb")))
+
+
+def test_a_file_that_takes_hours_to_read_is_bad_input(folder: Path) -> None:
+    with (folder / "sparse.mp4").open("wb") as file:
+        file.truncate(module.MAX_FILE_BYTES + 1)
+    with pytest.raises(InputError, match=r"sparse\.mp4: has more than 256 GiB"):
+        digest(folder)
+
+
 def test_what_cannot_be_read_is_bad_input(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_: object) -> str:
         raise PermissionError(13, "Permission denied", "images")
