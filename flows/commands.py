@@ -51,7 +51,7 @@ def _train(capture: Path | str, preset: str, store: Path, overrides: list[str]) 
 
     trained = train_subject.fn(capture, preset, store, overrides)
     print(f"report:  {trained.report}")
-    print(f"asset:   {trained.asset}")
+    print(f"asset:   {trained.asset or 'none'}")
     print(f"subject: {trained.subject}")
 
 

@@ -13,10 +13,10 @@ from prefect import flow
 
 from flows.run_page import publish_markdown
 from flows.train_subject import Prepared, prepare_training, with_detections
+from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
 from hnerf.errors import InputError, NotApplicableError, PlaceError, one_line
-from hnerf.evaluation.columns import reason_without_novel_poses
 from hnerf.evaluation.evaluate import reason_without_surface
 from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, PRIMARY_SPLITS, TRACKED
 from hnerf.files import embed_images, replace_text

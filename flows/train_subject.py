@@ -1,5 +1,6 @@
 """Main flow: from a capture folder to an avatar."""
 
+import logging
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -9,6 +10,7 @@ from prefect import flow
 from prefect.client.schemas.objects import FlowRun, State
 
 from flows.run_page import embedded, publish_link, publish_markdown, shown_progress
+from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import recorded_cameras
 from hnerf.config import Settings, load_settings
@@ -32,6 +34,8 @@ from tasks.source import place, read_capture
 from tasks.store import Artifact, Store
 from tasks.training import train
 
+log = logging.getLogger("hnerf.train")
+
 NOTED = (InputError, InvalidAsset, BucketError, RankFailedError, StalledError)  # whose message says all
 
 
@@ -46,11 +50,11 @@ class Prepared(NamedTuple):
 
 class Trained(NamedTuple):
     """What a run leaves. subject: the folder that links to the latest result of each stage, which may be another run's;
-    report, asset: this run's own files."""
+    report, asset: this run's own files, no asset where the field has no poses to set."""
 
     subject: Path
     report: Path
-    asset: Path
+    asset: Path | None
 
 
 @flow(name="train-subject", flow_run_name="{capture}")
@@ -106,12 +110,15 @@ def train_avatar(capture: Path | str, preset: str, store: Path, overrides: Seque
         artifact_store, truth, recording, calibration, segmentation, body, training, settings.evaluation, held_out
     )
     artifact_store.link_latest(subject, evaluation)
-    asset = export(artifact_store, recording, calibration, segmentation, training, settings.asset)
-    for artifact in (recorded, recording, calibration, segmentation, body, training, evaluation, asset):
+    results, asset = [recorded, recording, calibration, segmentation, body, training, evaluation], None
+    if reason := reason_without_novel_poses(training.root):
+        log.warning("no asset: %s", reason)
+    else:
+        results.append(export(artifact_store, recording, calibration, segmentation, training, settings.asset))
+        asset = results[-1].root / "avatar.usdz"
+    for artifact in results:
         artifact_store.link_latest(subject, artifact)  # again: another run of this name may have relinked them
-    trained = Trained(
-        artifact_store.subject_folder(subject), evaluation.root / "report.html", asset.root / "avatar.usdz"
-    )
+    trained = Trained(artifact_store.subject_folder(subject), evaluation.root / "report.html", asset)
     pictures = embedded(_key_pictures(calibration, evaluation))
     page = f"{_figures(subject, evaluation, training, trained)}\n\n{pictures}\n"
     publish_markdown(page, "result", f"Result for {subject}")
@@ -223,5 +230,5 @@ def _figures(subject: str, evaluation: Artifact, training: Artifact, trained: Tr
     lines = [f"# {subject}", "", "| figure | value |", "|---|---|"]
     lines += [f"| {name} | {value:.4g} |" for name, value in evaluation.metrics.items()]
     lines += [f"| training {name} | {value:.4g} |" for name, value in training.metrics.items()]
-    lines += ["", f"Report: `{trained.report}`", f"Asset: `{trained.asset}`"]
+    lines += ["", f"Report: `{trained.report}`", f"Asset: `{trained.asset or 'none'}`"]
     return "\n".join(lines)

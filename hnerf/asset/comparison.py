@@ -28,6 +28,7 @@ from hnerf.side_by_side import side_by_side
 
 IMAGES = 6  # few: a field on two cores renders one in about a second
 LONGEST_PX = 300  # of the person's box, for the same reason; larger boxes are scaled down
+SHORTEST_PX = 12  # SSIM needs 11; a person who is nearly out of the picture has less
 POOR_DB = 4.0  # below its field, an asset lost what the field knew
 LOOKS = {"captured look": "asset", "albedo in its own light": "albedo"}  # what renders show them
 
@@ -145,7 +146,7 @@ def _compared(
 ) -> Compared:
     box = mask_box(mask)
     camera = camera_of_box(capture.cameras[view.camera], box)
-    small = camera.scaled(min(1.0, LONGEST_PX / max(camera.size_px)))
+    small = camera.scaled(min(1.0, max(LONGEST_PX / max(camera.size_px), SHORTEST_PX / min(camera.size_px))))
     photograph = capture.image(view.camera, view.frame)[box] * mask[box][..., None]
     photograph = cv2.resize(photograph, small.size_px, interpolation=cv2.INTER_AREA)
     shown = cv2.resize(255 * mask[box].astype(np.uint8), small.size_px, interpolation=cv2.INTER_AREA) > 127

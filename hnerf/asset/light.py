@@ -71,6 +71,8 @@ def fit_light(shading: Shading) -> Light:
     their irradiances, and the light takes a Gauss-Newton step in which the albedos follow (variable projection, Golub
     and Pereyra 1973). A ridge keeps the light constant where the normals of points do not turn.
     """
+    if not len(shading.point):
+        return Light(np.eye(len(REFLECTED))[0], 0.0)
     sums = _Sums(shading.point)
     basis = REFLECTED * harmonics(shading.normals)
     coefficients = np.eye(len(REFLECTED))[0]

@@ -14,7 +14,7 @@ SAMPLES = 20_000
 REGIONS = {  # by how the names of joints begin; all other joints are the torso's
     "head": ("head", "neck", "eye", "jaw"),
     "arms": ("upperarm", "lowerarm"),
-    "hands": ("wrist", "metacarpal", "finger"),
+    "hands": ("wrist", "hand", "metacarpal", "finger"),
     "legs": ("upperleg", "lowerleg"),
     "feet": ("foot", "toe"),
 }

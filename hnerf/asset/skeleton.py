@@ -119,6 +119,8 @@ def _directions(names: tuple[str, ...], parents: np.ndarray, positions_m: np.nda
     for j, name in enumerate(names):
         if name.startswith("eye"):
             directions[j] = FRONT
+        elif name == "head":  # whatever is below it, such as a jaw
+            directions[j] = UP
         elif not directions[j].any():
-            directions[j] = UP if name == "head" or parents[j] < 0 else directions[parents[j]]
+            directions[j] = UP if parents[j] < 0 else directions[parents[j]]
     return directions

@@ -7,7 +7,7 @@ from typing import Any
 
 from hnerf.asset.export import export_asset
 from hnerf.asset.staging import CAPTURED
-from hnerf.avatar.finished import avatar_of, readable, recording_of, require_files
+from hnerf.avatar.finished import avatar_of, readable, recording_of, require_files, require_poses
 from hnerf.capture.masks import Masks
 from hnerf.config import AssetSettings
 from hnerf.errors import InputError
@@ -27,6 +27,7 @@ def export_subject(
     """
     with atomic_folder(out) as partial:
         require_files(subject, NEEDED)
+        require_poses(subject, "an asset")
         further = _named(motions)
         capture, avatar = recording_of(subject), avatar_of(subject)
         with readable(subject / "segmentation"):

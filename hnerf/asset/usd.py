@@ -243,7 +243,7 @@ def _identifier(name: str) -> str:
 def define_mesh(stage: Usd.Stage, path: Sdf.Path, avatar: StagedAvatar, level: int) -> UsdGeom.Mesh:
     """Define topology, texture coordinates and display colours; the caller sets points, normals and extents."""
     mesh, shown = UsdGeom.Mesh.Define(stage, path), avatar.levels[level]
-    corners = polygon_corners(shown.faces)
+    corners = polygon_corners(shown.layout.face_uvs)
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(corners), corners.shape[1], np.int32)))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(shown.faces.ravel()[corners].astype(np.int32).ravel()))
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)

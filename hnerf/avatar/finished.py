@@ -1,5 +1,6 @@
 """Files of a finished run that nobody has compared with their digests, as in a copy of a subject's folder."""
 
+import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,7 @@ from hnerf.avatar.trained import TrainedAvatar, load_avatar
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.capture.safe_io import ARRAY_FILE_ERRORS
+from hnerf.config import TrainingSettings
 from hnerf.errors import InputError, one_line
 
 # SystemError: OpenCV's, of YAML that is cut. A disk's own faults (OSError) stay what they are.
@@ -48,3 +50,21 @@ def avatar_of(subject: Path) -> TrainedAvatar:
     """Load a subject's trained avatar, onto the GPU if there is one."""
     with readable(subject / "training"):
         return load_avatar(subject / "training", "cuda" if torch.cuda.is_available() else "cpu")
+
+
+def reason_without_novel_poses(training: Path) -> str | None:
+    """Return why a trained model, by its folder, cannot show poses that it was not trained on; None if it can."""
+    stored = json.loads((training / "settings.json").read_text())
+    field = TrainingSettings.model_validate(stored["training"]).field
+    if field.kind == "paper" and stored["static"]:
+        return "H-NeRF's static network models one moment"
+    return field.no_new_poses or None
+
+
+def require_poses(subject: Path, what: str) -> None:
+    """Raise InputError if the model of a subject's folder cannot show poses that it was not trained on; what: is wanted
+    of it."""
+    with readable(subject / "training"):
+        reason = reason_without_novel_poses(subject / "training")
+    if reason:
+        raise InputError(f"{subject}: {reason}; {what} needs new poses: train with preset fast or paper")

@@ -17,7 +17,7 @@ _RENAMED = {
     "lowerleg02": "calf_twist", "spine05": "spine_01", "spine04": "spine_02", "spine03": "spine_03",
     "spine02": "spine_04", "spine01": "spine_05", "neck01": "neck_01", "neck02": "neck_02", "neck03": "neck_03",
     "shoulder01": "shoulder", "upperarm01": "upperarm", "upperarm02": "upperarm_twist", "lowerarm01": "forearm",
-    "lowerarm02": "forearm_twist", "wrist": "hand", "hand": "hand_end",
+    "lowerarm02": "forearm_twist", "wrist": "hand", "hand": "hand_end", "toes": "middle_toe_01",
 }  # fmt: skip
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 _TOES = ("big_toe", "second_toe", "middle_toe", "fourth_toe", "little_toe")

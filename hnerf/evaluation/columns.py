@@ -5,8 +5,8 @@ import json
 from pathlib import Path
 
 from hnerf.avatar.avatar import Avatar
+from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.body.fit_result import BodyFit
-from hnerf.config import TrainingSettings
 from hnerf.evaluation.views import ANIMATED, NOVEL_POSE_SPLITS, POSED, TRACKED
 
 
@@ -35,12 +35,3 @@ def reason_unavailable(split: str, training: Path) -> str | None:
     if split == TRACKED and not (steps and nodes):
         return "these frames have no deformation of their own"
     return None
-
-
-def reason_without_novel_poses(training: Path) -> str | None:
-    """Return why a trained model, by its folder, cannot show poses that it was not trained on; None if it can."""
-    stored = json.loads((training / "settings.json").read_text())
-    field = TrainingSettings.model_validate(stored["training"]).field
-    if field.kind == "paper" and stored["static"]:
-        return "H-NeRF's static network models one moment"
-    return field.no_new_poses or None

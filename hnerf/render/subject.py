@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hnerf.avatar.finished import avatar_of, readable, recording_of, require_files
+from hnerf.avatar.finished import avatar_of, readable, recording_of, require_files, require_poses
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import pose_vertices
 from hnerf.capture.capture import Capture
@@ -58,6 +58,8 @@ def render_subject(subject: Path, options: RenderOptions, out: Path) -> int:
     """
     with atomic_folder(out) as partial:
         capture = _checked_capture(subject, options)
+        if options.motion or options.between or options.shape or options.volume is not None:
+            require_poses(subject, "another motion or shape")
         motion = _motion(subject, options, capture)
         cameras = _cameras(options, capture, motion.body)
         shots: list[Shot] = list(zip(cameras, itertools.cycle(motion.body.frames), strict=False))

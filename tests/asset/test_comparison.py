@@ -129,6 +129,18 @@ def test_large_boxes_are_scaled_down(recorded: Capture, staged: StagedAvatar, mo
     assert (found.renders["asset"][..., 3] > 127).sum() == pytest.approx(18 * 68, rel=0.1)
 
 
+def test_a_sliver_of_a_person_is_scored(
+    recorded: Capture, staged: StagedAvatar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its box, 28 px wide and 470 high, would be 9 px wide at 150."""
+    monkeypatch.setattr(comparison, "LONGEST_PX", 150)
+    edge = np.zeros((480, 640), bool)
+    edge[:450, :8] = True
+    masks = Masks({("01", 4): encode(edge)}, {})
+    (found,) = compare_with_field(recorded, masks, GreyField(bending_body()), grey(staged, 100))
+    assert min(found.photograph.shape[:2]) >= 11 and np.isfinite(found.scores["asset"]["ssim"])
+
+
 def test_test_cameras_with_masks_come_first(recorded: Capture, staged: StagedAvatar) -> None:
     cameras = recorded.cameras | {"02": dataclasses.replace(side_camera(), name="02")}
     tested = dataclasses.replace(recorded, cameras=cameras, test_cameras=("02",))

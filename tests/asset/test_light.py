@@ -90,3 +90,10 @@ def test_a_light_in_other_axes() -> None:
     turned = light.turned(quarter)
     np.testing.assert_allclose(turned.irradiance(normals @ quarter.T), light.irradiance(normals), atol=1e-9)
     assert turned.turn_deg == 3.0
+
+
+def test_where_no_photograph_shows_anything_the_light_is_the_same_from_everywhere() -> None:
+    nothing = Shading(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    found = fit_light(nothing)
+    np.testing.assert_allclose(found.irradiance(directions(5)), 1)
+    assert found.turn_deg == 0

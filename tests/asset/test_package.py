@@ -178,7 +178,7 @@ def test_all_detail_is_shown_unless_less_is_chosen(name: str, package: Path, sta
         assert mesh.GetPath() == path
         assert bound_surface(stage).GetPath() == "/Avatar/Materials/Captured/Surface"
         level = staged.levels[int(choice[-1])]
-        corners = polygon_corners(level.faces)
+        corners = polygon_corners(level.layout.face_uvs)
         np.testing.assert_array_equal(mesh.GetFaceVertexIndicesAttr().Get(), level.faces.ravel()[corners].ravel())
         st = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened()
         np.testing.assert_allclose(st, level.layout.uvs[level.layout.face_uvs.ravel()[corners].ravel()], atol=1e-7)

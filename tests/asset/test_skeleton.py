@@ -10,10 +10,10 @@ def stage_joints(rig: Rig) -> np.ndarray:
 
 
 def test_axes_by_hand() -> None:
-    """An arm to the left, a finger at its end, a foot to the front, and a head."""
-    names = ("root", "upperarm_L", "hand_L", "foot_L", "toe_L", "head")
-    parents = np.array([-1, 0, 1, 0, 3, 0])
-    at = np.array([[0.0, 0, 0], [1, 1, 0], [2, 1, 0], [0.1, 0, 0], [0.1, 0, 0.2], [0, 1.5, 0]])
+    """An arm to the left, a finger at its end, a foot to the front, and a head with a jaw in front of it."""
+    names = ("root", "upperarm_L", "hand_L", "foot_L", "toe_L", "head", "jaw")
+    parents = np.array([-1, 0, 1, 0, 3, 0, 5])
+    at = np.array([[0.0, 0, 0], [1, 1, 0], [2, 1, 0], [0.1, 0, 0], [0.1, 0, 0.2], [0, 1.5, 0], [0, 1.5, 0.1]])
     found = along_bones(names, parents, at)
     np.testing.assert_allclose(found[1], np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]), atol=1e-12)  # y left, z front
     np.testing.assert_allclose(found[2], found[1])  # the last of a chain goes on

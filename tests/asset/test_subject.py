@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 from typing import Any
 
@@ -5,7 +6,7 @@ import pytest
 
 from hnerf.asset import subject as exported
 from hnerf.asset.subject import export_subject
-from hnerf.config import AssetSettings
+from hnerf.config import AssetSettings, load_settings
 from hnerf.errors import InputError
 from hnerf.render.motion import Motion
 from tests.asset.figure import bending_body
@@ -16,7 +17,13 @@ def made(folder: Path) -> Path:
     for name in exported.NEEDED:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).touch()
+    with_model(folder, "fast")
     return folder
+
+
+def with_model(folder: Path, preset: str) -> None:
+    stored = {"static": True, "training": load_settings(preset).training.model_dump()}
+    (folder / "training" / "settings.json").write_text(json.dumps(stored))
 
 
 def test_motions_are_named_after_their_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -47,6 +54,14 @@ def test_an_unfinished_subject_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"model\.safetensors: missing; give <store>/subjects/<name>"):
         export_subject(tmp_path / "ada", AssetSettings(), [], tmp_path / "out", "")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("preset", ["idr", "nerf", "nerfies", "paper"])
+def test_a_model_of_moments_has_no_asset(preset: str, tmp_path: Path) -> None:
+    """At rest, only what the body's box shares with the recorded moment would be left of it."""
+    with_model(made(tmp_path / "ada"), preset)
+    with pytest.raises(InputError, match="an asset needs new poses: train with preset fast or paper"):
+        export_subject(tmp_path / "ada", AssetSettings(), [], tmp_path / "out", "")
 
 
 def test_masks_that_are_cut_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

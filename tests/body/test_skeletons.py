@@ -14,6 +14,7 @@ def test_readable_names() -> None:
     assert exported_name("metacarpal1.L") == "index_metacarpal_L"
     assert exported_name("toe5-3.L") == "little_toe_03_L"
     assert exported_name("jaw") == "jaw"
+    assert exported_name("toes.L") == exported_name("toe3-1.L") and exported_name("toes.L") in EQUIVALENTS
 
 
 def test_every_joint_of_the_body_has_a_name_of_its_own() -> None:

@@ -12,6 +12,7 @@ from fsspec import filesystem
 from flows import train_subject as module
 from flows.train_subject import train_subject
 from hnerf.capture.capture import Capture
+from hnerf.config import load_settings
 from hnerf.geometry.camera import Camera
 from tasks import store
 from tasks.stage import Stage
@@ -24,7 +25,7 @@ STAGES = ("ingest", "detect", "find_hands", "calibrate", "segment", "fit", "trai
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Write a capture folder and replace every stage of the flow."""
     for name in STAGES:
-        monkeypatch.setattr(module, name, _noting(getattr(module, name)))
+        monkeypatch.setattr(module, name, _noting(getattr(module, name), tmp_path))
     monkeypatch.setattr(module, "needs_body", lambda *_: (tmp_path / "ada" / "bare").exists())
     monkeypatch.setattr(module, "needs_detection", lambda *_: (tmp_path / "ada" / "undetected").exists())
     monkeypatch.setattr(module, "needs_hands", lambda *_: (tmp_path / "ada" / "handed").exists())
@@ -32,10 +33,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "ada"
 
 
-def _noting(stage: Stage[Any]) -> Stage[Any]:
+def _noting(stage: Stage[Any], tmp_path: Path) -> Stage[Any]:
     """Return a stage of the same name and inputs that writes down which artifacts it was given."""
 
     def write(out: Path, **inputs: Any) -> dict[str, float]:
+        still = load_settings("idr" if (tmp_path / "ada" / "still").exists() else "fast").training
+        (out / "settings.json").write_text(json.dumps({"static": False, "training": still.model_dump()}))
         (out / "given.json").write_text(json.dumps([v.stage for v in inputs.values() if isinstance(v, Artifact)]))
         camera = Camera("1", np.eye(3), np.eye(3), np.zeros(3), 4, 4)
         Capture("ada", out, {"1": camera}, ("1",), (), (0,), (), 25.0, "z", {"1": (4, 4)}, {"1": (4, 4)}).save()
@@ -57,6 +60,15 @@ def test_every_stage_is_shown_and_given_what_went_before(folder: Path, tmp_path:
     assert given(subject, "training") == ["capture", "calibration", "segmentation", "fit"]
     assert given(subject, "evaluation") == ["capture", "calibration", "segmentation", "fit", "training"]
     assert given(subject, "asset") == ["capture", "calibration", "segmentation", "training"]
+
+
+def test_a_field_without_poses_to_set_has_no_asset(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (folder / "still").touch()
+    trained = train_subject.fn(folder, "demo", tmp_path / "store", [])
+    assert trained.asset is None and "no asset: IDR models one moment" in caplog.text
+    assert (trained.subject / "evaluation").exists() and not (trained.subject / "asset").exists()
 
 
 def test_a_capture_in_a_bucket_is_fetched(folder: Path, s3: str, tmp_path: Path) -> None:

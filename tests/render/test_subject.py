@@ -18,6 +18,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.footage import Video
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.lens import Lens
+from hnerf.config import load_settings
 from hnerf.render.motion import interpolate_poses
 from hnerf.render.subject import RenderOptions, _cameras
 from tests.training.scene import TINY, record
@@ -170,6 +171,17 @@ def test_a_wish_that_cannot_be_met_is_one_line(
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("options", [["--between", "0", "1"], ["--volume", "5"], ["--shape", "height=0.1"]])
+def test_a_model_of_moments_shows_no_other(
+    options: list[str], subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = shutil.copytree(subject, tmp_path / "column")
+    stored = {"static": True, "training": load_settings("nerfies").training.model_dump()}
+    (copy / "training" / "settings.json").write_text(json.dumps(stored))
+    assert main(["render", str(copy), "--out", str(tmp_path / "out"), *options]) == 2
+    assert "column: Nerfies has no pose to set" in capsys.readouterr().err
 
 
 def test_what_is_there_is_not_written_over(subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

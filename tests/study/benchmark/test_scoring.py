@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from hnerf.avatar.avatar import Rendering
+from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
-from hnerf.evaluation.columns import reason_without_novel_poses
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.images import render
 from hnerf.evaluation.metrics import mask_box
