@@ -28,6 +28,7 @@ LEFT_OUT = {
     r"systemctl|loginctl|journalctl|~/.config/systemd": "services: tests/flows/test_systemd_units.py",
     r"sudo|pg_dump|dropdb|DATABASE|database upgrade": "PostgreSQL: tests/flows/test_postgresql.py",
     r"ln -s": "a mount: tests/soak.py",
+    r"s3://BUCKET/captures": "captures in a bucket: tests/flows/test_train_subject.py, tests/soak.py",
     r"docker|(?i:kubernetes)|kubectl|containers\]|mkdir -p store c": "containers: tests/flows/test_work_pools.py",
 }
 LATER = r"prefect (server|worker) start"  # they run until the end

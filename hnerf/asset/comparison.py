@@ -147,6 +147,7 @@ def _compared(
     box = mask_box(mask)
     camera = camera_of_box(capture.cameras[view.camera], box)
     small = camera.scaled(min(1.0, max(LONGEST_PX / max(camera.size_px), SHORTEST_PX / min(camera.size_px))))
+    cast = camera.scaled(min(1.0, 2 * max(small.size_px) / max(camera.size_px)))  # a large box has millions of rays
     photograph = capture.image(view.camera, view.frame)[box] * mask[box][..., None]
     photograph = cv2.resize(photograph, small.size_px, interpolation=cv2.INTER_AREA)
     shown = cv2.resize(255 * mask[box].astype(np.uint8), small.size_px, interpolation=cv2.INTER_AREA) > 127
@@ -154,12 +155,12 @@ def _compared(
     with torch.no_grad():
         field = rgba(avatar.render(small, avatar.body.theta[k], avatar.body.root[k]))
     gain = avatar.gains.get(view.camera, (1.0, 1.0, 1.0))
-    renders = {"field": field, "asset": on_black(surface, staged, camera, small.size_px, gain)}
+    renders = {"field": field, "asset": on_black(surface, staged, cast, small.size_px, gain)}
     if staged.albedo:
-        renders["albedo"] = on_black(surface, staged, camera, small.size_px, gain, staged.albedo)
+        renders["albedo"] = on_black(surface, staged, cast, small.size_px, gain, staged.albedo)
     if splats:
         points_m = np.asarray(surface.mesh.vertices)
-        renders["splats"] = splats_on_black(splats, points_m, camera, small.size_px, gain)
+        renders["splats"] = splats_on_black(splats, points_m, cast, small.size_px, gain)
     scores = {name: _scores(render, photograph, shown) for name, render in renders.items()}
     if splats:
         drawn, by_field = (renders[name][..., :3].astype(np.float32) / 255 for name in ("splats", "field"))

@@ -11,7 +11,8 @@ from tests.asset.figure import column_rig, upright_column
 @pytest.mark.parametrize(
     ("joint", "region"),
     [("neck01", "head"), ("eye.L", "head"), ("clavicle.R", "torso"), ("spine03", "torso"), ("root", "torso"),
-     ("lowerarm02.L", "arms"), ("wrist.R", "hands"), ("hand.L", "hands"), ("finger2-3.L", "hands"), ("metacarpal1.L", "hands"),
+     ("lowerarm02.L", "arms"), ("wrist.R", "hands"), ("hand.L", "hands"), ("finger2-3.L", "hands"),
+     ("metacarpal1.L", "hands"),
      ("upperleg01.L", "legs"), ("foot.R", "feet"), ("toe5-3.R", "feet"), ("pelvis.L", "torso")],
 )  # fmt: skip
 def test_regions_by_joint(joint: str, region: str) -> None:
