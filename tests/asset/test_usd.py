@@ -1,9 +1,13 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom
 
-from hnerf.asset.staging import stage_from_world
-from hnerf.asset.usd import define_camera
+from hnerf.asset.levels import Level
+from hnerf.asset.staging import StagedAvatar, stage_from_world
+from hnerf.asset.texture import UvLayout
+from hnerf.asset.usd import define_camera, define_mesh
 from tests.asset.figure import side_camera
 
 
@@ -31,3 +35,18 @@ def test_camera_projects_where_ours_does() -> None:
     )
     pixel = np.array([(ndc[0] + 1) / 2 * 640 - 0.5, (1 - ndc[1]) / 2 * 480 - 0.5])
     np.testing.assert_allclose(pixel, ours.project(world)[0], atol=1e-4)
+
+
+def test_a_seam_on_a_diagonal_parts_the_halves_of_a_quad(staged: StagedAvatar) -> None:
+    """A polygon has one texture coordinate a corner: across the seam, it would show what lies between two charts."""
+    faces = np.array([[0, 1, 2], [2, 1, 3]])
+    uvs = np.random.default_rng(0).random((6, 2)).astype(np.float32)
+    for face_uvs, count in ((faces, 4), (np.arange(6).reshape(2, 3), 3)):
+        level = Level(np.arange(4), faces, UvLayout(uvs, face_uvs))
+        stage, avatar = Usd.Stage.CreateInMemory(), dataclasses.replace(staged, levels=[level])
+        mesh = define_mesh(stage, Sdf.Path("/Mesh"), avatar, level=0)
+        counts, corners = mesh.GetFaceVertexCountsAttr().Get(), mesh.GetFaceVertexIndicesAttr().Get()
+        assert set(counts) == {count} and len(counts) == (1 if count == 4 else 2)
+        st = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened())
+        own = {(v, *uvs[row]) for v, row in zip(faces.ravel(), face_uvs.ravel(), strict=True)}
+        assert {(v, *at) for v, at in zip(corners, st, strict=True)} == own
