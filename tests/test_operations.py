@@ -4,10 +4,12 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import httpx
@@ -127,7 +129,9 @@ def environment(folder: Path) -> dict[str, str]:
 
 def start(command: str, folder: Path, variables: dict[str, str]) -> "subprocess.Popen[bytes]":
     """Start what runs until the end; return once the server answers."""
-    started = subprocess.Popen(shlex.split(command), cwd=folder, env=variables)
+    # Prefect's worker ends by SIGINT, which a shell's background jobs ignore.
+    listens = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    started = subprocess.Popen(shlex.split(command), cwd=folder, env=variables, preexec_fn=listens)
     deadline_s = time.monotonic() + PATIENCE_S
     while True:
         try:
