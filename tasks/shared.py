@@ -34,16 +34,12 @@ def get_or_compute(
     """
     name = f"{stage}/{key}"
     if here := store.find(stage, key):
-        if bucket.size_bytes(_object(name)) is None:
-            _put(bucket, store, here)
-        return here
+        return _put_if_missing(bucket, store, here)
     while (found := _fetch(bucket, store, stage, key)) is None:
         with leased(bucket, name) as mine:
             if mine:
                 if found := _fetch(bucket, store, stage, key):  # another may have finished just before
-                    if bucket.size_bytes(_object(name)) is None:
-                        _put(bucket, store, found)
-                    return found
+                    return _put_if_missing(bucket, store, found)
                 with shared_checkpoint(bucket, store, stage, key, checkpoint) if checkpoint else nullcontext():
                     made = compute()
                     _put(bucket, store, made)
@@ -86,6 +82,13 @@ def _unpacked(scratch: Path, name: str, where: str) -> Contents:
         require_room(contents.unpacked_bytes(), scratch, where)
         unpack(archive, contents, scratch, where)
     return contents
+
+
+def _put_if_missing(bucket: Bucket, store: Store, artifact: Artifact) -> Artifact:
+    """Put an artifact of the store into the bucket unless that has it; return it."""
+    if bucket.size_bytes(_object(artifact.name)) is None:
+        _put(bucket, store, artifact)
+    return artifact
 
 
 def _put(bucket: Bucket, store: Store, artifact: Artifact) -> None:

@@ -401,7 +401,7 @@ FAULTS = (
     Fault("lease-renewed", LEASE, "if now != text:", "if False:", BY_LEASE),
     Fault("lease-given-up", LEASE, "if text != FREE and", "if", BY_LEASE),
     Fault("shared-another", SHARED, "if list(contents.artifacts) != [name]:", "if False:", BY_SHARED),
-    Fault("shared-later", SHARED, "if bucket.size_bytes(_object(name)) is None:", "if False:", BY_SHARED),
+    Fault("shared-later", SHARED, "if bucket.size_bytes(_object(artifact.name)) is None:", "if False:", BY_SHARED),
     Fault("limit-progress", LIMITS, "            arm()\n\n    def end", "            pass\n\n    def end", BY_LIMITS),
     Fault("limit-end", LIMITS, "exit=True", "exit=False", BY_LIMITS),
 )  # fmt: skip

@@ -14,6 +14,7 @@ from flows.train_subject import train_subject
 from hnerf.capture.capture import Capture
 from hnerf.capture.formats.easymocap import write_easymocap
 from hnerf.capture.lens import pinhole
+from hnerf.config import load_settings
 from tasks.calibration import calibrated_capture
 from tasks.stage import Stage
 from tasks.store import Artifact
@@ -45,6 +46,8 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any
                 (out / "report.json").write_text(json.dumps({"cameras": {n: {"frame_offset": 0.0} for n in cameras}}))
             else:
                 (out / "made").write_text(str(len(made)))
+            settings = {"static": False, "training": load_settings("fast").training.model_dump()}
+            (out / "settings.json").write_text(json.dumps(settings))
             return {}
 
         write.__signature__ = inspect.signature(stage.write)  # type: ignore[attr-defined]
