@@ -16,14 +16,14 @@ from flows.run_page import publish_markdown
 from flows.train_subject import prepare_training, with_detections
 from hnerf.capture.capture import Capture
 from hnerf.config import CONFIGS, Settings, load_settings, read_yaml, with_changes
-from hnerf.errors import InputError, PlaceError, one_line
+from hnerf.errors import InputError, one_line
 from hnerf.files import replace_text
 from hnerf.study.benchmark import results
 from hnerf.tables import head, line, pick
 from tasks.capture import ingest
 from tasks.evaluation import evaluate
 from tasks.limits import set_limits
-from tasks.policy import is_retryable
+from tasks.policy import is_of_the_machine
 from tasks.source import Source, read_capture
 from tasks.store import Store
 from tasks.training import train
@@ -99,11 +99,9 @@ def measure(store: Store, source: Source, truth: Source, settings: Settings) -> 
     try:
         training = train(store, *prepared, settings.training)
         evaluation = evaluate(store, truth, *prepared, training, settings.evaluation)
-    except PlaceError:
-        raise
     except Exception as error:  # that a method breaks without a part is a result
-        if is_retryable(error):
-            raise  # a full disk, a lost share, a killed worker
+        if is_of_the_machine(error):
+            raise
         log.warning("%s: %s", type(error).__name__, error)
         return {"error": one_line(error)}
     metrics = json.loads((evaluation.root / "metrics.json").read_text())

@@ -12,7 +12,7 @@ from flows.run_page import publish_markdown
 from flows.train_subject import Prepared, prepare_training, with_detections
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
-from hnerf.errors import InputError, PlaceError, one_line
+from hnerf.errors import InputError, one_line
 from hnerf.files import embed_images
 from hnerf.study.benchmark.convergence import is_flat, training_limits_s
 from hnerf.study.benchmark.plan import BenchmarkStudy, Variant, load_study
@@ -21,7 +21,7 @@ from tasks.benchmark import score_end_of_training, score_training
 from tasks.calibration import calibrated_capture
 from tasks.capture import ingest, subset_capture
 from tasks.limits import set_limits
-from tasks.policy import is_retryable
+from tasks.policy import is_of_the_machine
 from tasks.source import Source, read_capture
 from tasks.store import Store
 from tasks.training import train
@@ -101,11 +101,9 @@ def measure(
             settings, more = train_until_flat(store, truth, prepared, plan, method)
         training = train(store, *prepared, settings.training)
         scores = score_training(store, truth, recording, prepared.calibration, prepared.body, training, plan.scoring)
-    except PlaceError:
-        raise
     except Exception as error:  # one method's failure must not end the others
-        if is_retryable(error):
-            raise  # a full disk, a lost share, a killed worker
+        if is_of_the_machine(error):
+            raise
         log.warning("%s: %s", type(error).__name__, error)
         return {"error": one_line(error)}
     found: dict[str, Any] = json.loads((scores.root / "scores.json").read_text())
@@ -127,10 +125,8 @@ def train_until_flat(
         try:
             training = train(store, *prepared, settings.training)
             point = score_end_of_training(store, truth, recording, calibration, body, training, plan.scoring)
-        except PlaceError:
-            raise
         except Exception as error:
-            if is_retryable(error):
+            if is_of_the_machine(error):
                 raise
             log.warning("after %g s: %s", limit_s, one_line(error))
             continue

@@ -16,7 +16,7 @@ from flows.train_subject import Prepared, prepare_training, with_detections
 from hnerf.avatar.finished import reason_without_novel_poses
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings, load_settings
-from hnerf.errors import InputError, NotApplicableError, PlaceError, one_line
+from hnerf.errors import InputError, NotApplicableError, one_line
 from hnerf.evaluation.evaluate import reason_without_surface
 from hnerf.evaluation.views import ANIMATED, NOVEL_VIEW, POSED, PRIMARY_SPLITS, TRACKED
 from hnerf.files import embed_images, replace_text
@@ -29,7 +29,7 @@ from tasks.capture import ingest, subset_capture
 from tasks.evaluation import evaluate
 from tasks.fit import fit
 from tasks.limits import set_limits
-from tasks.policy import is_retryable
+from tasks.policy import is_of_the_machine
 from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
 from tasks.study import (
@@ -207,13 +207,11 @@ class Attempt:
             return self.measure(prepared, training)
         except NotApplicableError as error:
             return {"left_out": str(error)}
-        except PlaceError:
-            raise
-        except InputError as error:
-            return {"error": (at_bad_input, str(error))}
         except Exception as error:  # any failure is a result of the study
-            if is_retryable(error):
-                raise  # a full disk, a killed worker
+            if is_of_the_machine(error):
+                raise
+            if isinstance(error, InputError):
+                return {"error": (at_bad_input, str(error))}
             log.warning("%s: %s", type(error).__name__, error)
             return {"error": ("failed", one_line(error))}
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from tasks.inventory import KEY, Inventory, in_stages
 from tasks.store import Store, remove
 
-LEFT = re.compile(rf"({KEY.pattern})(\.partial|\.json\.partial|\.moving|\.lock|)")
+LEFT = re.compile(rf"({KEY.pattern})(\.partial|\.json\.partial|\.moving|\.shared|\.lock|)")
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from prefect.settings import PREFECT_RESULTS_LOCAL_STORAGE_PATH
 from prefect.tasks import Task
 
 from hnerf.config import Section
+from hnerf.errors import PlaceError
 from tasks.bucket import VARIABLE
 from tasks.launcher import LostWorkerError
 from tasks.limits import StalledError
@@ -99,6 +100,12 @@ def is_retryable(error: object) -> bool:
     if isinstance(error, StalledError):
         return error.retryable
     return isinstance(error, OSError | LostWorkerError) and not is_permanent(error)
+
+
+def is_of_the_machine(error: Exception) -> bool:
+    """Return whether an error is no result of a study: a full disk, a killed worker, a place of results that is
+    away."""
+    return isinstance(error, PlaceError) or is_retryable(error)
 
 
 def is_permanent(error: Exception) -> bool:

@@ -70,6 +70,7 @@ def _fetch(bucket: Bucket, store: Store, stage: str, key: str) -> Artifact | Non
             log.warning("%s (%s is computed again)", error, stage)
             return None
         place(store, name, contents.artifacts[name], scratch)
+        store.path(stage, key, ".shared").unlink(missing_ok=True)  # of work that another machine finished
     return store.find(stage, key)
 
 

@@ -8,7 +8,7 @@ Whoever takes the work over checks what is in it, as it does with one of its own
 import logging
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from threading import Event, Thread
 
@@ -31,11 +31,12 @@ def shared_checkpoint(bucket: Bucket, store: Store, stage: str, key: str, file: 
     while the work inside goes on, put new ones there. In the end, keep the last there if it is still needed here. file:
     its name in the folder of unfinished work."""
     name, path = f"{stage}/{key}.checkpoint", store.path(stage, key, ".partial") / file
+    known = store.path(stage, key, ".shared")
     with store.locked(stage, key):
-        fetched = _fetch(bucket, name, path)
+        fetched = _fetch(bucket, name, path, known)
     ended = Event()
     shared = _version(path) if fetched else None
-    thread = Thread(target=_share, args=(bucket, name, path, shared, ended), daemon=True)
+    thread = Thread(target=_share, args=(bucket, name, path, known, shared, ended), daemon=True)
     thread.start()
     try:
         yield
@@ -43,11 +44,13 @@ def shared_checkpoint(bucket: Bucket, store: Store, stage: str, key: str, file: 
         ended.set()
         thread.join()
         if not path.exists():
+            known.unlink(missing_ok=True)
             _attempt(lambda: bucket.remove(name))
 
 
-def _fetch(bucket: Bucket, name: str, path: Path) -> bool:
-    """Take the bucket's checkpoint, if there is one that this machine does not know; return whether it did."""
+def _fetch(bucket: Bucket, name: str, path: Path, known: Path) -> bool:
+    """Take the bucket's checkpoint, if there is one that this machine does not know; return whether it did. known: the
+    file with the digest of the one that this machine last put there, or took."""
     if (size_bytes := bucket.size_bytes(name)) is None:
         return False
     if path.parent.is_symlink():
@@ -61,27 +64,27 @@ def _fetch(bucket: Bucket, name: str, path: Path) -> bool:
     except FileNotFoundError:  # removed meanwhile
         return False
     digest = sha256_of(beside)
-    if path.is_file() and _note(path).is_file() and _note(path).read_text(errors="replace") == digest:
+    if path.is_file() and known.is_file() and known.read_text(errors="replace") == digest:
         beside.unlink()
         return False
     log.info("going on from %s (%.1f MB)", bucket.where(name), size_bytes / 1e6)
-    replace_text(_note(path), digest)
+    replace_text(known, digest)
     os.replace(beside, path)
     return True
 
 
-def _share(bucket: Bucket, name: str, path: Path, shared: Version, ended: Event) -> None:
+def _share(bucket: Bucket, name: str, path: Path, known: Path, shared: Version, ended: Event) -> None:
     """Put each new checkpoint into the bucket, until the work has ended, and then the last one. shared: which one is
     there already."""
     last = False
     while not last:
         last = ended.wait(LOOK_S)
         found = _version(path)
-        if found not in (None, shared) and _attempt(lambda: _put(bucket, name, path)):
+        if found not in (None, shared) and _attempt(lambda: _put(bucket, name, path, known)):
             shared = found
 
 
-def _put(bucket: Bucket, name: str, path: Path) -> None:
+def _put(bucket: Bucket, name: str, path: Path, known: Path) -> None:
     """Put the file that lies there now into the bucket, whatever replaces it meanwhile."""
     try:
         file = path.open("rb")
@@ -90,13 +93,7 @@ def _put(bucket: Bucket, name: str, path: Path) -> None:
     with file:
         opened = Path(f"/dev/fd/{file.fileno()}")
         bucket.upload(opened, name)
-        with suppress(FileNotFoundError):  # done meanwhile
-            replace_text(_note(path), sha256_of(opened))
-
-
-def _note(path: Path) -> Path:
-    """Return the file that holds the digest of the checkpoint that this machine last put into the bucket, or took."""
-    return path.with_name(f"{path.name}.shared")
+        replace_text(known, sha256_of(opened))
 
 
 def _version(path: Path) -> Version:

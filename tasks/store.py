@@ -4,6 +4,7 @@
     <store>/<stage>/<key>.json      the record: each file's SHA-256 and size, and a few metrics
     <store>/<stage>/<key>.partial/  work in progress
     <store>/<stage>/<key>.moving/   being fetched from a bucket, or put there (tasks/shared.py)
+    <store>/<stage>/<key>.shared    which checkpoint of it a bucket has (tasks/shared_checkpoint.py)
     <store>/<stage>/<key>.lock      locked (flock) while a process works on the key; the kernel releases it if that dies
     <store>/subjects/<name>/<stage> -> the latest artifact of a subject
     <store>/subjects/<name>/.recording  the digest and the folder of the recording that these are of
@@ -36,7 +37,7 @@ from tasks.pins import pin, unless_read_only
 log = logging.getLogger("hnerf.store")
 
 RECORDING = ".recording"  # under subjects/<name>: digest and folder of the recording
-SUFFIXES = ("", ".json", ".json.partial", ".partial", ".moving")  # of what a key may have beside its lock
+SUFFIXES = ("", ".json", ".json.partial", ".partial", ".moving", ".shared")  # of what a key may have beside its lock
 ATTEMPTS = 100  # to lock a key in a folder that others make and remove
 # In order: each stage is computed from those before it.
 STAGES = ("capture", "detection", "hands", "calibration", "segmentation", "fit", "training", "evaluation", "asset")

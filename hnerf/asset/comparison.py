@@ -10,7 +10,7 @@ import numpy as np
 import torch
 import trimesh
 
-from hnerf.asset.pictures import on_black, splats_on_black
+from hnerf.asset.pictures import looks_on_black, splats_on_black
 from hnerf.asset.rigs import FULL
 from hnerf.asset.splats import Splats
 from hnerf.asset.staging import CAPTURED, StagedAvatar
@@ -155,9 +155,7 @@ def _compared(
     with torch.no_grad():
         field = rgba(avatar.render(small, avatar.body.theta[k], avatar.body.root[k]))
     gain = avatar.gains.get(view.camera, (1.0, 1.0, 1.0))
-    renders = {"field": field, "asset": on_black(surface, staged, cast, small.size_px, gain)}
-    if staged.albedo:
-        renders["albedo"] = on_black(surface, staged, cast, small.size_px, gain, staged.albedo)
+    renders = {"field": field} | looks_on_black(surface, staged, cast, small.size_px, gain)
     if splats:
         points_m = np.asarray(surface.mesh.vertices)
         renders["splats"] = splats_on_black(splats, points_m, cast, small.size_px, gain)

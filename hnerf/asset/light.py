@@ -71,11 +71,11 @@ def fit_light(shading: Shading) -> Light:
     their irradiances, and the light takes a Gauss-Newton step in which the albedos follow (variable projection, Golub
     and Pereyra 1973). A ridge keeps the light constant where the normals of points do not turn.
     """
+    coefficients = np.eye(len(REFLECTED))[0]
     if not len(shading.point):
-        return Light(np.eye(len(REFLECTED))[0], 0.0)
+        return Light(coefficients, 0.0)
     sums = _Sums(shading.point)
     basis = REFLECTED * harmonics(shading.normals)
-    coefficients = np.eye(len(REFLECTED))[0]
     counts = shading.weights
     for _ in range(ITERATIONS):
         irradiance = (basis @ coefficients).clip(LEAST_IRRADIANCE)[:, None]

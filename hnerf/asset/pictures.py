@@ -4,7 +4,6 @@ RGB."""
 import cv2
 import numpy as np
 
-from hnerf.asset.albedo import Albedo
 from hnerf.asset.splat_rendering import render_splats
 from hnerf.asset.splats import OPACITY, Splats
 from hnerf.asset.srgb import to_linear, to_srgb
@@ -40,26 +39,32 @@ def turntable_cameras(points_m: np.ndarray, facing: np.ndarray, count: int) -> l
 
 def textured(surface: Surface, avatar: StagedAvatar, camera: Camera) -> np.ndarray:
     """Render a posed surface of the avatar with its texture, without light, on white."""
-    hits, colours = _textured_rays(surface, avatar, avatar.texture, supersampled(camera))
-    return downsampled(colours, hits, camera)
-
-
-def on_black(
-    surface: Surface,
-    avatar: StagedAvatar,
-    camera: Camera,
-    size_px: tuple[int, int],
-    gain: tuple[float, float, float],
-    albedo: Albedo | None = None,
-) -> np.ndarray:
-    """Render a posed surface of the avatar as a camera exposes it, over black and with its coverage, (H, W, 4) uint8,
-    averaged to the size (width, height): with the captured texture, or with an albedo in its light."""
     fine = supersampled(camera)
-    hits, colours = _textured_rays(surface, avatar, albedo.texture if albedo else avatar.texture, fine)
-    if albedo:
+    hits = cast_pixels(surface, fine)
+    return downsampled(_texture_colours(hits, avatar, avatar.texture, fine), hits, camera)
+
+
+def looks_on_black(
+    surface: Surface, avatar: StagedAvatar, camera: Camera, size_px: tuple[int, int], gain: tuple[float, float, float]
+) -> dict[str, np.ndarray]:
+    """Render a posed surface of the avatar as a camera exposes it, over black and with its coverage, (H, W, 4) uint8,
+    averaged to the size (width, height): "asset", with the captured texture, and "albedo", in its light, if there is
+    one."""
+    fine = supersampled(camera)
+    hits = cast_pixels(surface, fine)
+    colours = {"asset": _texture_colours(hits, avatar, avatar.texture, fine)}
+    if avatar.albedo:
         normals = normals_at(surface.mesh, hits) @ avatar.stage_from_world.T
-        lit = to_linear(colours / 255) * albedo.light.irradiance(normals)[:, None]
-        colours = (255 * to_srgb(lit)).astype(np.float32)
+        unlit = to_linear(_texture_colours(hits, avatar, avatar.albedo.texture, fine) / 255)
+        lit = to_srgb(unlit * avatar.albedo.light.irradiance(normals)[:, None])
+        colours["albedo"] = (255 * lit).astype(np.float32)
+    return {look: _exposed(found, hits, fine, size_px, gain) for look, found in colours.items()}
+
+
+def _exposed(
+    colours: np.ndarray, hits: RayHits, fine: Camera, size_px: tuple[int, int], gain: tuple[float, float, float]
+) -> np.ndarray:
+    """Return colours (N, 3) from 0 to 255 of a camera's rays as it exposes them, as `looks_on_black` does."""
     exposed = np.minimum(colours * np.array(gain, np.float32), 255)
     pixels = np.concatenate([exposed, np.full((len(exposed), 1), 255, np.float32)], 1) * (hits.face[:, None] >= 0)
     averaged = cv2.resize(pixels.reshape(fine.height_px, fine.width_px, 4), size_px, interpolation=cv2.INTER_AREA)
@@ -77,19 +82,16 @@ def splats_on_black(
     return averaged.round().astype(np.uint8)
 
 
-def _textured_rays(
-    surface: Surface, avatar: StagedAvatar, texture: np.ndarray, camera: Camera
-) -> tuple[RayHits, np.ndarray]:
-    """Return the hits of a camera's pixels (N,), row by row, and a texture's colours there, (N, 3) float32 from 0 to
-    255, of no meaning where a ray meets nothing."""
-    hits = cast_pixels(surface, camera)
+def _texture_colours(hits: RayHits, avatar: StagedAvatar, texture: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return a texture's colours at the hits of a camera's pixels, row by row, (N, 3) float32 from 0 to 255, of no
+    meaning where a ray meets nothing."""
     height_px, width_px = texture.shape[:2]
     texel_px = np.zeros((len(hits.face), 2), np.float32)  # centres at integers, rows from the top
     uv = hits.interpolate(avatar.uvs, avatar.face_uvs)
     texel_px[hits.face >= 0] = uv * (width_px, -height_px) + (-0.5, height_px - 0.5)
     columns, rows = texel_px.reshape(camera.height_px, camera.width_px, 2).transpose(2, 0, 1)
     colours = cv2.remap(texture, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return hits, colours.reshape(-1, 3).astype(np.float32)
+    return colours.reshape(-1, 3).astype(np.float32)
 
 
 def wireframe(surface: Surface, camera: Camera) -> np.ndarray:

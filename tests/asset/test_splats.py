@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from hnerf.asset.figures import splat_figures
 from hnerf.asset.package import AssetInfo, write_splats
-from hnerf.asset.pictures import on_black, splats_on_black
+from hnerf.asset.pictures import looks_on_black, splats_on_black
 from hnerf.asset.rigs import FULL, GAME
 from hnerf.asset.skinning import Skin, skinned
 from hnerf.asset.splat_ply import write_splat_ply
@@ -235,7 +235,7 @@ def test_a_picture_of_splats_is_that_of_the_mesh(staged: StagedAvatar) -> None:
     points_m = staged.points_m[1].astype(float) @ staged.stage_from_world
     drawn = splats_on_black(found, points_m, camera, camera.size_px, gain)
     surface = Surface(trimesh.Trimesh(points_m, staged.faces, process=False))
-    mesh = on_black(surface, grey, camera, camera.size_px, gain)
+    mesh = looks_on_black(surface, grey, camera, camera.size_px, gain)["asset"]
     inside = mesh[..., 3] == 255
     assert np.abs(drawn[inside].astype(int) - (60, 120, 255, 255)).max(1).mean() < 3
     assert np.mean((drawn[..., 3] > 127) != (mesh[..., 3] > 127)) < 0.02 * inside.mean() + 0.003

@@ -161,8 +161,7 @@ def resumed(
 
 
 def finish(out: Path) -> dict[str, float]:
-    for path in out.glob("checkpoint*"):
-        path.unlink()
+    (out / "checkpoint").unlink()
     return write(out)
 
 
@@ -183,7 +182,7 @@ def test_another_machine_goes_on_from_the_checkpoint_of_failed_work(bucket: Buck
         raise RuntimeError("crash")
 
     def go_on(out: Path) -> dict[str, float]:
-        assert sorted(path.name for path in out.iterdir()) == ["checkpoint", "checkpoint.shared"]
+        assert [path.name for path in out.iterdir()] == ["checkpoint"]
         assert (out / "checkpoint").read_text() == "step 100"
         return finish(out)
 
@@ -194,6 +193,8 @@ def test_another_machine_goes_on_from_the_checkpoint_of_failed_work(bucket: Buck
     assert resumed(bucket, there, go_on).files.keys() == {"again", "deep/letters"}
     assert kept(bucket) is None and clean(there)
     resumed(bucket, here, never)
+    for store in (here, there):
+        assert {path.name for path in (store.root / "training").iterdir()} == {KEY, f"{KEY}.json", f"{KEY}.lock"}
 
 
 def test_the_checkpoint_is_that_of_the_machine_that_worked_last(bucket: Bucket, tmp_path: Path) -> None:
@@ -269,7 +270,7 @@ def test_a_checkpoint_that_is_replaced_during_its_upload_arrives_whole(
         upload(self, path, name)
 
     monkeypatch.setattr(Bucket, "upload", replaced)
-    shared_checkpoint._put(bucket, CHECKPOINT, checkpoint)
+    shared_checkpoint._put(bucket, CHECKPOINT, checkpoint, tmp_path / "known")
     assert kept(bucket) == b"old and long" and checkpoint.read_text() == "new"
 
 
