@@ -2,7 +2,7 @@ import os
 import time
 from pathlib import Path
 
-from tasks.ledger import Ledger, forget
+from tasks.ledger import Ledger, forget, was_started
 
 DIGEST, OTHER = "a" * 64, "b" * 64
 
@@ -50,3 +50,12 @@ def test_a_capture_that_was_started_again_is_not_lost(tmp_path: Path) -> None:
     forget(tmp_path, tmp_path / "ada")
     ledger.note_started(DIGEST, tmp_path / "ada", "second run")
     assert ledger.start_key(DIGEST) == first
+
+
+def test_damaged_notes_are_of_no_capture(tmp_path: Path) -> None:
+    ledger = Ledger.of(tmp_path)
+    for name in (DIGEST, "seen-ada"):
+        (ledger.root / name).write_bytes(b"\xff\xfe")
+    assert not ledger.seen("seen-ada") and not was_started(tmp_path, tmp_path / "ada")
+    forget(tmp_path, tmp_path / "ada")
+    assert ledger.knows(DIGEST)

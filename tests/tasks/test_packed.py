@@ -1,9 +1,10 @@
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
 from hnerf.errors import InputError
-from tasks.packed import Contents, archived, manifest_name, pack, place, read_contents, unpack
+from tasks.packed import ArchivedArtifact, Contents, archived, manifest_name, pack, place, read_contents, unpack
 from tasks.store import Store
 from tests.tasks.stores import add
 
@@ -41,3 +42,10 @@ def test_a_manifest_with_another_digest_is_refused(packed: Path) -> None:
     packed.write_bytes(packed.read_bytes().replace(b'"size_bytes":5', b'"size_bytes":6'))
     with packed.open("rb") as archive, pytest.raises(InputError, match="packed: its manifest is damaged"):
         read_contents(Contents, archive, "packed")
+
+
+@pytest.mark.parametrize(("length", "fits"), [(255, True), (256, False)])
+def test_names_are_no_longer_than_file_systems_take_them(length: int, fits: bool) -> None:
+    stored = {"sha256": ABC, "size_bytes": 3}
+    with nullcontext() if fits else pytest.raises(ValueError, match="is not a path inside a folder: too long"):
+        ArchivedArtifact.model_validate({"files": {f"deep/{'a' * length}": stored}})

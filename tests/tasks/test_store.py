@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from hnerf.errors import InputError
-from tasks.store import Store, recording_digest, require_intact
+from tasks.store import RECORDING, Store, recording_digest, remove, require_intact
 
 # Not forked: a child would inherit Prefect's threads half-way.
 SPAWN = multiprocessing.get_context("spawn")
@@ -185,6 +185,28 @@ def test_two_recordings_of_one_name_are_said(tmp_path: Path, caplog: pytest.LogC
     assert caplog.text == ""
     store.claim("ada", "f" * 64, theirs)
     assert f"subjects/ada showed the results of {tmp_path}/moved/ada and will show those of {theirs}" in caplog.text
+
+
+def test_a_damaged_note_of_the_recording_is_written_again(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    note = store.subject_folder("ada") / RECORDING
+    note.parent.mkdir(parents=True)
+    note.write_bytes(b"\xff\xfe")
+    store.claim("ada", "d" * 64, tmp_path / "ada")
+    assert note.read_text() == f"{'d' * 64}\n{tmp_path / 'ada'}\n"
+
+
+def test_a_link_in_place_of_an_artifact_is_none(tmp_path: Path) -> None:
+    """Neither its folder nor its record may lie elsewhere."""
+    made = Store(tmp_path / "elsewhere").get_or_compute("fit", "k", write_abc)
+    fit, store = tmp_path / "store" / "fit", Store(tmp_path / "store")
+    for linked in ("k", "k.json"):
+        shutil.rmtree(fit, ignore_errors=True)
+        shutil.copytree(made.root.parent, fit)
+        assert store.find("fit", "k") is not None
+        remove(fit / linked) if linked == "k" else (fit / linked).unlink()
+        (fit / linked).symlink_to(made.root.parent / linked)
+        assert store.find("fit", "k") is None
 
 
 def test_directory_without_record_is_not_an_artifact(tmp_path: Path) -> None:
