@@ -1,14 +1,13 @@
 """A subject as one file: the artifacts of its latest results, packed (tasks/packed.py), and its links."""
 
 import os
-import tempfile
 from pathlib import Path
 from typing import Annotated
+from uuid import uuid4
 
 from pydantic import Field, model_validator
 
 from hnerf.errors import InputError
-from hnerf.files import made_folder
 from tasks.inventory import Inventory
 from tasks.packed import Contents, Name, archived, pack, place, read_contents, require_room, unpack
 from tasks.store import RECORDING, STAGES, Artifact, Store
@@ -65,20 +64,16 @@ def import_subject(store: Store, path: Path) -> Manifest:
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; give an archive of `hnerf store export`")
-    with (
-        made_folder(store.root),
-        path.open("rb") as archive,
-        tempfile.TemporaryDirectory(dir=store.root, prefix=".import-") as scratch,
-    ):
+    with path.open("rb") as archive, store.scratch(STAGES[0], uuid4().hex) as scratch:
         manifest = read_contents(Manifest, archive, str(path))
         require_room(manifest.unpacked_bytes(), store.root, str(path))
         _check_subject(manifest, store)
-        unpack(archive, manifest, Path(scratch), str(path))
+        unpack(archive, manifest, scratch, str(path))
         for name, one in manifest.artifacts.items():
             stage, key = name.split("/")
             with store.locked(stage, key):
                 if not store.find(stage, key):
-                    place(store, name, one, Path(scratch))
+                    place(store, name, one, scratch)
         if manifest.recording:
             digest, _, folder = manifest.recording.strip().partition("\n")
             store.claim(manifest.subject, digest, Path(folder))

@@ -7,8 +7,8 @@ results are; nothing in it is run, and nothing leads out of the store.
 """
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 from hnerf.errors import InputError
@@ -16,7 +16,7 @@ from tasks.bucket import Bucket
 from tasks.lease import leased
 from tasks.packed import Contents, NoRoomError, archived, pack, place, read_contents, require_room, unpack
 from tasks.shared_checkpoint import shared_checkpoint
-from tasks.store import Artifact, Store, remove
+from tasks.store import Artifact, Store
 
 log = logging.getLogger("hnerf.shared")
 
@@ -51,7 +51,7 @@ def _fetch(bucket: Bucket, store: Store, stage: str, key: str) -> Artifact | Non
     """Put the bucket's artifact into the store, unless that has it; return None if it is not there, or damaged."""
     name = f"{stage}/{key}"
     where = bucket.where(_object(name))
-    with _scratch(store, stage, key) as scratch:
+    with store.scratch(stage, key) as scratch:
         if found := store.find(stage, key):
             return found
         if (size_bytes := bucket.size_bytes(_object(name))) is None:
@@ -95,22 +95,9 @@ def _put_if_missing(bucket: Bucket, store: Store, artifact: Artifact) -> Artifac
 def _put(bucket: Bucket, store: Store, artifact: Artifact) -> None:
     """Put an artifact of the store into the bucket."""
     log.info("sharing %s", artifact.name)
-    with _scratch(store, artifact.stage, artifact.root.name) as scratch:
+    with store.scratch(artifact.stage, artifact.root.name) as scratch:
         pack(Contents(artifacts=archived([artifact])), store, scratch / PACKED)
         bucket.upload(scratch / PACKED, _object(artifact.name))
-
-
-@contextmanager
-def _scratch(store: Store, stage: str, key: str) -> Iterator[Path]:
-    """Make a folder beside the artifact, for as long as the lock of its key is held here."""
-    with store.locked(stage, key):
-        folder = store.path(stage, key, ".moving")
-        remove(folder)
-        folder.mkdir()
-        try:
-            yield folder
-        finally:
-            remove(folder)
 
 
 def _object(name: str) -> str:

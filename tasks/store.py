@@ -3,7 +3,7 @@
     <store>/<stage>/<key>/          the files, put there by one rename
     <store>/<stage>/<key>.json      the record: each file's SHA-256 and size, and a few metrics
     <store>/<stage>/<key>.partial/  work in progress
-    <store>/<stage>/<key>.moving/   being fetched from a bucket, or put there (tasks/shared.py)
+    <store>/<stage>/<key>.moving/   on its way into or out of a bucket (tasks/shared.py) or archive (tasks/archive.py)
     <store>/<stage>/<key>.shared    which checkpoint of it a bucket has (tasks/shared_checkpoint.py)
     <store>/<stage>/<key>.lock      locked (flock) while a process works on the key; the kernel releases it if that dies
     <store>/subjects/<name>/<stage> -> the latest artifact of a subject
@@ -231,6 +231,18 @@ class Store:
                     if not any(os.path.lexists(self.path(stage, key, suffix)) for suffix in SUFFIXES):
                         path.unlink(missing_ok=True)
                 return
+
+    @contextmanager
+    def scratch(self, stage: str, key: str) -> Iterator[Path]:
+        """Make a folder for files on their way in or out, and hold the lock of the key while it is there."""
+        with self.locked(stage, key):
+            folder = self.path(stage, key, ".moving")
+            remove(folder)
+            folder.mkdir()
+            try:
+                yield folder
+            finally:
+                remove(folder)
 
     def commit(self, artifact: Artifact) -> Artifact:
         """Record the files in the artifact's `.partial` folder, and put them in place; its lock must be held."""

@@ -1,5 +1,6 @@
 import io
 import json
+import os
 import shutil
 import tarfile
 from collections.abc import Callable
@@ -12,6 +13,7 @@ import pytest
 from hnerf.errors import InputError
 from tasks import packed as module
 from tasks.archive import export_subject, import_subject
+from tasks.garbage import collect, find_garbage
 from tasks.inventory import Inventory, recording_of
 from tasks.packed import manifest_name
 from tasks.store import Store
@@ -42,7 +44,7 @@ def test_a_subject_comes_out_and_in_with_all_it_was_computed_from(packed: Path, 
             assert one.artifact.inputs == there.stored[name].artifact.inputs
         assert recording_of(store, "ada") == "/recordings/ada"
         assert faults(store).lines == []
-    assert not list(store.root.glob(".import-*"))
+    assert not list(store.root.glob("*/*.moving"))
 
 
 def test_a_run_beside_it_that_has_some_keeps_them(packed: Path, tmp_path: Path) -> None:
@@ -194,3 +196,16 @@ def test_a_file_under_many_paths_counts_as_often(packed: Path, tmp_path: Path, m
     with pytest.raises(InputError, match="make room"):
         import_subject(Store(tmp_path / "to"), packed)
     assert nothing_came_of(tmp_path / "to")
+
+
+def test_what_a_killed_import_left_is_collected(packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = Store(tmp_path / "to")
+    run_of(store, "bob", 20)
+    monkeypatch.setattr("tasks.archive.unpack", lambda *_: os._exit(9))
+    if not (child := os.fork()):
+        import_subject(store, packed)
+        os._exit(0)
+    os.waitpid(child, 0)
+    (left,) = find_garbage(Inventory.of(store), keep=1, older_s=0)
+    assert collect(store, left) and not list(store.root.glob("*/*.moving"))
+    assert not find_garbage(Inventory.of(store), keep=1, older_s=0)
