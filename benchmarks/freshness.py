@@ -80,8 +80,7 @@ def result_files(root: Path, result: Result) -> list[Path]:
 def load_records(root: Path) -> Records:
     """Return the records by the results' names."""
     path = root / "benchmarks" / "results" / "provenance.json"
-    records: Records = json.loads(path.read_text()) if path.exists() else {}
-    return records
+    return json.loads(path.read_text()) if path.exists() else {}
 
 
 def save_record(root: Path, name: str, record: dict[str, Any]) -> None:

@@ -94,8 +94,7 @@ def score(subject: Path, capture: Path) -> dict[str, Any] | None:
     if not (capture / "ground_truth").is_dir():
         return None
     command = [sys.executable, str(SCORE_RUN), str(subject), str(capture)]
-    scored: dict[str, Any] = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
-    return scored
+    return json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
 
 
 def as_markdown(result: dict[str, Any]) -> str:

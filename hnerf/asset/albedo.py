@@ -52,5 +52,4 @@ class AlbedoBlend:
 def mean_irradiance(light: Light, surfaces_m: Iterable[np.ndarray], faces: np.ndarray, texels: Texels) -> np.ndarray:
     """Return the mean irradiance of texels (N,) over some surfaces (V, 3)."""
     normals = [unit(texels.interpolate(normals_of(surface_m, faces), faces)) for surface_m in surfaces_m]
-    mean: np.ndarray = np.mean([light.irradiance(of_texels) for of_texels in normals], 0)
-    return mean
+    return np.mean([light.irradiance(of_texels) for of_texels in normals], 0)

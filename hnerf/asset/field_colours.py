@@ -47,8 +47,7 @@ def median_of_seen(colours: np.ndarray) -> np.ndarray:
     seen = (~np.isnan(colours[..., 0])).sum(0)
     row = np.arange(len(seen))
     middle = [ordered[(k // 2).clip(0, len(colours) - 1), row] for k in (seen - 1, seen)]
-    median: np.ndarray = np.mean(middle, axis=0)
-    return median
+    return np.mean(middle, axis=0)
 
 
 def filled(colours: np.ndarray, texels: Texels, rig: Rig) -> np.ndarray:

@@ -43,8 +43,7 @@ def levels_of(points_m: np.ndarray, faces: np.ndarray, layout: UvLayout, face_co
 def seam_edges(face_uvs: np.ndarray) -> np.ndarray:
     """Return the edges (n, 2) of faces (F, 3), as rows of texture coordinates, at which charts end."""
     edges = np.sort(trimesh.geometry.faces_to_edges(face_uvs), axis=1)
-    once: np.ndarray = edges[trimesh.grouping.group_rows(edges, require_count=1)]
-    return once
+    return edges[trimesh.grouping.group_rows(edges, require_count=1)]
 
 
 def _decimated(points_m: np.ndarray, whole: Level, face_count: int) -> Level:

@@ -44,8 +44,7 @@ class Light:
 
     def irradiance(self, normals: np.ndarray) -> np.ndarray:
         """Return E (N,) of unit normals (N, 3), at least LEAST_IRRADIANCE."""
-        irradiance: np.ndarray = (harmonics(normals) @ (REFLECTED * self.coefficients)).clip(LEAST_IRRADIANCE)
-        return irradiance
+        return (harmonics(normals) @ (REFLECTED * self.coefficients)).clip(LEAST_IRRADIANCE)
 
     def turned(self, rotation: np.ndarray) -> "Light":
         """Return the same light in other axes; rotation (3, 3): to them from these."""
@@ -115,5 +114,4 @@ class _Sums:
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Return the sums (M, ...) of values (M, ...)."""
-        sums: np.ndarray = (self._of_point @ values)[self._point]
-        return sums
+        return (self._of_point @ values)[self._point]

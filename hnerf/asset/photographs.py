@@ -40,8 +40,7 @@ class TexelPixels:
         """Return by how much the pixel of each texel differs from the mean of its texels, which show (M, 3)."""
         count = np.bincount(self.pixel)[:, None]
         total = np.stack([np.bincount(self.pixel, channel) for channel in shown.T], 1)
-        difference: np.ndarray = (self.colours - total / count)[self.pixel]
-        return difference
+        return (self.colours - total / count)[self.pixel]
 
 
 class BackProjection:

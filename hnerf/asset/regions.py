@@ -59,11 +59,9 @@ def _summary(distance_mm: np.ndarray) -> dict[str, float]:
 def _vertex_regions(rig: Rig) -> np.ndarray:
     """Return the region of each vertex, (V,), by its strongest joint."""
     regions = np.array([region_of(name) for name in rig.joint_names])
-    found: np.ndarray = regions[rig.dense_weights.argmax(1).numpy()]
-    return found
+    return regions[rig.dense_weights.argmax(1).numpy()]
 
 
 def _nearest_vertices(surface: Surface, points_m: np.ndarray) -> np.ndarray:
     """Return a vertex of the face nearest to each point, (N,)."""
-    found: np.ndarray = surface.mesh.faces[surface.closest(points_m)[1]][:, 0]
-    return found
+    return surface.mesh.faces[surface.closest(points_m)[1]][:, 0]

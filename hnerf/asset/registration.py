@@ -59,8 +59,7 @@ def crossing_faces(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
     meshes = pymeshlab.MeshSet()
     meshes.add_mesh(pymeshlab.Mesh(vertices_m, faces))
     meshes.compute_selection_by_self_intersections_per_face()
-    crossing: np.ndarray = meshes.current_mesh().face_selection_array()
-    return crossing
+    return meshes.current_mesh().face_selection_array()
 
 
 def _match(

@@ -58,8 +58,7 @@ def covariances(quaternions: np.ndarray, scales_m: np.ndarray) -> np.ndarray:
         ]
     )
     axes_m = np.moveaxis(rotations, 2, 0) * scales_m
-    found: np.ndarray = axes_m @ axes_m.swapaxes(1, 2)
-    return found
+    return axes_m @ axes_m.swapaxes(1, 2)
 
 
 def projected(middles_m: np.ndarray, covariances_m2: np.ndarray, camera: Camera) -> np.ndarray:
@@ -67,8 +66,7 @@ def projected(middles_m: np.ndarray, covariances_m2: np.ndarray, camera: Camera)
     J is the Jacobian of the projection at the middles (eq. 5)."""
     pixels_px, depth_m = camera.project(middles_m)
     jacobians = (camera.K[:2] - pixels_px[:, :, None] * camera.K[2]) / depth_m[:, None, None] @ camera.R
-    found: np.ndarray = jacobians @ covariances_m2 @ jacobians.swapaxes(1, 2)
-    return found
+    return jacobians @ covariances_m2 @ jacobians.swapaxes(1, 2)
 
 
 def _touched(

@@ -43,8 +43,7 @@ class Splats:
         """Return values (V, C) of the vertices at the splats, (N, C)."""
         corners, share = self.faces[self.face].T, self.barycentric.T[..., None]
         a, b, c = (per_vertex[at] * by for at, by in zip(corners, share, strict=True))
-        values: np.ndarray = a + b + c
-        return values
+        return a + b + c
 
     def on(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the splats' middles, unit normals (N, 3) and orientations (N, 4), as w x y z, where the mesh has

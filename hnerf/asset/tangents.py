@@ -68,14 +68,12 @@ def frames_at(texels: Texels, normals: np.ndarray, faces: np.ndarray, layout: Uv
 def corner_angles(triangles: np.ndarray) -> np.ndarray:
     """Return the angles of triangles (F, 3, 3) at their corners, in radians (F, 3)."""
     onward, back = unit(np.roll(triangles, -1, 1) - triangles), unit(np.roll(triangles, 1, 1) - triangles)
-    angles: np.ndarray = np.arccos((onward * back).sum(-1).clip(-1, 1))
-    return angles
+    return np.arccos((onward * back).sum(-1).clip(-1, 1))
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
     """Return vectors (..., 3) at unit length, zero where they have none."""
-    scaled: np.ndarray = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True).clip(1e-20)
-    return scaled
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True).clip(1e-20)
 
 
 def _rising_u(triangles: np.ndarray, uvs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -95,5 +93,4 @@ def _at_right_angles(vectors: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the products (N, 1) of vectors (N, 3)."""
-    product: np.ndarray = (a * b).sum(1, keepdims=True)
-    return product
+    return (a * b).sum(1, keepdims=True)

@@ -40,8 +40,7 @@ class Texels:
         corners, share = faces[self.face.numpy()[index]].T, self.barycentric.numpy()[index].T[..., None]
         # A corner at a time takes half the time of all three at once.
         a, b, c = (per_vertex[at] * by for at, by in zip(corners, share, strict=True))
-        values: np.ndarray = a + b + c
-        return values
+        return a + b + c
 
 
 def unwrap(vertices_m: np.ndarray, faces: np.ndarray, texture_px: int) -> UvLayout:

@@ -221,8 +221,7 @@ def nearest_corner(corners: Tensor, barycentric: Tensor) -> Tensor:
 def weighted_sum(values: Tensor, corners: Tensor, barycentric: Tensor) -> Tensor:
     """Return weighted sums (N, D) of rows of values (V, D): corners (N, K) name the rows, barycentric (N, K) their
     weights. One pass; gradients flow to the values only."""
-    found: Tensor = _WeightedSum.apply(values, corners, barycentric.to(values))
-    return found
+    return _WeightedSum.apply(values, corners, barycentric.to(values))
 
 
 class _WeightedSum(torch.autograd.Function):

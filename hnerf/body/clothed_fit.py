@@ -98,8 +98,7 @@ def solve_cloth_offset(cloth_offset_m: np.ndarray, found: list[ContourResiduals]
     seen = np.bincount(ids, weight, len(cloth_offset_m))
     pulled = np.bincount(ids, weight * residual_m, len(cloth_offset_m))
     matrix = diags_array(seen + SKIN_WEIGHT) + SMOOTHNESS_WEIGHT * _vertex_laplacian(faces, len(cloth_offset_m))
-    solved: np.ndarray = spsolve(csc_array(matrix), seen * cloth_offset_m - pulled)
-    return solved
+    return spsolve(csc_array(matrix), seen * cloth_offset_m - pulled)
 
 
 def _with_more_cloth(rows: ContourResiduals, more_m: np.ndarray) -> ContourResiduals:
@@ -110,8 +109,7 @@ def _with_more_cloth(rows: ContourResiduals, more_m: np.ndarray) -> ContourResid
 
 def _geman_mcclure_weight(residual_m: np.ndarray) -> np.ndarray:
     """Return the weight of each residual."""
-    geman_mcclure: np.ndarray = 1 / (1 + (residual_m / OUTLIER_M) ** 2) ** 2
-    return geman_mcclure
+    return 1 / (1 + (residual_m / OUTLIER_M) ** 2) ** 2
 
 
 def _vertex_laplacian(faces: np.ndarray, vertices: int) -> csr_array:

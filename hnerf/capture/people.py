@@ -83,8 +83,7 @@ def _most_prominent(camera: Camera, people: np.ndarray) -> np.ndarray:
 def _usually(supported: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Return the share of the frames in which a camera sees the person that other cameras support it, (C,); both
     (frames, C) bool."""
-    share: np.ndarray = (supported & seen).sum(0) / seen.sum(0).clip(1)
-    return share
+    return (supported & seen).sum(0) / seen.sum(0).clip(1)
 
 
 def moves(keypoints: np.ndarray) -> bool:

@@ -59,8 +59,7 @@ class SparseGrids(nn.Module):
         """Interpolate features at positions (N, 3) in canonical metres: (N, levels * channels). Positions outside the
         box take the border's features."""
         unit = ((y_m - self.lower_m) / (self.upper_m - self.lower_m)).clamp(0, 1)
-        found: Tensor = _Interpolation.apply(unit, self.features, self.sizes, self.rows)
-        return found
+        return _Interpolation.apply(unit, self.features, self.sizes, self.rows)
 
     def dense_levels(self) -> list[Tensor]:
         """Return the features of all nodes of each level, (Z, Y, X, channels)."""

@@ -99,14 +99,12 @@ def degrade_clothing(capture: Capture, body: BodyFit, truth: GroundTruth, degrad
 
 def degrade_masks(masks: Masks, capture: Capture, degradation: Degradation) -> Masks:
     """Return degraded masks of the same views."""
-    changed: Masks = _change(degradation)(masks, capture, degradation.strength, degradation.rng)
-    return changed
+    return _change(degradation)(masks, capture, degradation.strength, degradation.rng)
 
 
 def degrade_fit(body: BodyFit, degradation: Degradation) -> BodyFit:
     """Return a body fit with degraded poses or shape."""
-    changed: BodyFit = _change(degradation)(body, degradation.strength, degradation.rng)
-    return changed
+    return _change(degradation)(body, degradation.strength, degradation.rng)
 
 
 def degrade_settings(settings: TrainingSettings, degradation: Degradation) -> TrainingSettings:
