@@ -18,9 +18,8 @@ from torch import Tensor
 
 from hnerf.body.anny import anny_rig
 from hnerf.body.canonical import PosedBodies
-from hnerf.body.descriptor import closest_points_reference, vertex_normals
+from hnerf.body.descriptor import vertex_normals
 
-REFERENCE_POINTS = 16  # few: the reference tests every triangle against every point
 OUTER_M, INNER_M = 0.07, 0.03  # extent of the shell outside and inside the body
 RUNS = 5
 
@@ -52,17 +51,12 @@ def measure(count: int, frames: int) -> dict[str, float]:
         found = bodies.describe(points_m, frame, reach_m, correction)
         (found.d.sum() + found.y.sum()).backward()
 
-    few = points_m[:REFERENCE_POINTS]
-    asked: dict[str, tuple[Callable[[], Any], int]] = {
-        "(d, s, y), sign by normal where unambiguous": (lambda: bodies.describe(points_m, frame, reach_m), count),
-        "(d, s, y), sign by winding number": (lambda: bodies.describe(points_m, frame, reach_m, None, True), count),
-        "(d, s, y) and gradients to pose and shape": (learning, count),
-        "plain reference (closest point alone)": (
-            lambda: closest_points_reference(few, rig.vertices_m, rig.faces, reach_m),
-            REFERENCE_POINTS,
-        ),
+    asked: dict[str, Callable[[], Any]] = {
+        "(d, s, y), sign by normal where unambiguous": lambda: bodies.describe(points_m, frame, reach_m),
+        "(d, s, y), sign by winding number": lambda: bodies.describe(points_m, frame, reach_m, None, True),
+        "(d, s, y) and gradients to pose and shape": learning,
     }
-    return {name: points / median_s(work) for name, (work, points) in asked.items()}
+    return {name: count / median_s(work) for name, work in asked.items()}
 
 
 def shell_points(vertices_m: Tensor, faces: Tensor, count: int) -> Tensor:

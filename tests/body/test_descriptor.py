@@ -9,9 +9,10 @@ from torch import Tensor
 
 from hnerf.body.anny import anny_rig
 from hnerf.body.canonical import PosedBodies, axis_angle_from_rotation, distinct_rows, weighted_sum
-from hnerf.body.descriptor import BodyMeshes, closest_points_reference, solid_angle
+from hnerf.body.descriptor import BodyMeshes
 from hnerf.body.rig import Rig, pose_vertices, rotation_from_axis_angle
 from tests.body.boxes import box_faces, box_rig, box_vertices
+from tests.body.reference import closest_points_reference, solid_angle
 
 
 def test_box_by_hand():
