@@ -1,5 +1,4 @@
-"""How far a correction of pose and shape carries points, and its gradient, in one pass over the points each, by warp;
-`displacement_reference` is the same in plain torch."""
+"""How far a correction of pose and shape carries points, and its gradient, in one pass over them each, by warp."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -47,24 +46,6 @@ class Displacement(torch.autograd.Function):
         found = tuple(gradient.new_zeros(shape) for shape in ctx.shapes)
         _launch(1, found, ctx.saved_tensors, gradient.contiguous())
         return *found, None, None, None, None, None, None
-
-
-def displacement_reference(
-    twists: Tensor,
-    bulge: Tensor,
-    carried: Tensor,
-    points: Tensor,
-    posed: Tensor,
-    share: Tensor,
-    linear: Tensor,
-    skin_joints: Tensor,
-    skin_weights: Tensor,
-) -> Tensor:
-    """Return what `Displacement` does. Memory grows with points x chains."""
-    frame, vertex = posed.long() // len(share), posed.long() % len(share)
-    turn, shift = (share[vertex, :, None, None] * twists[frame]).sum(1).unbind(1)
-    rigid = (skin_weights[vertex, :, None] * carried[frame[:, None], skin_joints.long()[vertex]]).sum(1)
-    return torch.linalg.cross(turn, points) + shift + (linear[posed.long()] @ bulge[vertex, :, None])[..., 0] + rigid
 
 
 def _launch(which: int, learned: tuple[Tensor, ...], fixed: tuple[Tensor, ...], moved: Tensor) -> None:

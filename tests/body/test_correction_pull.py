@@ -1,6 +1,25 @@
 import torch
+from torch import Tensor
 
-from hnerf.body.correction_pull import Displacement, displacement_reference
+from hnerf.body.correction_pull import Displacement
+
+
+def displacement_reference(
+    twists: Tensor,
+    bulge: Tensor,
+    carried: Tensor,
+    points: Tensor,
+    posed: Tensor,
+    share: Tensor,
+    linear: Tensor,
+    skin_joints: Tensor,
+    skin_weights: Tensor,
+) -> Tensor:
+    """Return what `Displacement` does. Memory grows with points x chains."""
+    frame, vertex = posed.long() // len(share), posed.long() % len(share)
+    turn, shift = (share[vertex, :, None, None] * twists[frame]).sum(1).unbind(1)
+    rigid = (skin_weights[vertex, :, None] * carried[frame[:, None], skin_joints.long()[vertex]]).sum(1)
+    return torch.linalg.cross(turn, points) + shift + (linear[posed.long()] @ bulge[vertex, :, None])[..., 0] + rigid
 
 
 def test_a_correction_carries_points_and_is_pulled_as_in_plain_torch() -> None:
