@@ -18,14 +18,14 @@ from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks
 from hnerf.config import NerfSettings, load_settings
-from hnerf.fields.encoding import FeatureGrids
+from hnerf.fields.sparse_grids import SparseGrids
 from hnerf.training import trainer
 
 
 class Voxels(nn.Module):
     def __init__(self):
         super().__init__()
-        self.grid = FeatureGrids(-ones(3), ones(3), cells=(64,), channels=4)
+        self.grid = SparseGrids(-ones(3), ones(3), (64,), 4, near=lambda points, _: ones(len(points), dtype=bool))
 
     def forward(self, point, view):
         density, *rgb = self.grid(point.reshape(-1, 3)).unflatten(0, point.shape[:-1]).unbind(-1)

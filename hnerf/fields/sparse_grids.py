@@ -1,5 +1,5 @@
-"""Feature grids that hold only the nodes near a surface: FeatureGrids (hnerf/fields/encoding.py, the plain reference)
-in a fifth of the memory, with all levels interpolated and differentiated in one pass each by warp."""
+"""Feature grids that hold only the nodes near a surface, about a fifth of all; their levels are interpolated and
+differentiated in one pass each by warp."""
 
 # mypy: disable-error-code="no-untyped-def"
 

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from hnerf.fields.encoding import FeatureGrids
 from hnerf.fields.sparse_grids import SparseGrids
+from tests.fields.plain_grids import FeatureGrids
 
 LOWER_M, UPPER_M, CELLS, CHANNELS = torch.zeros(3), torch.tensor([1.0, 2.0, 1.5]), (3, 8), 4
 ON_BORDERS = torch.tensor([[0.0, 0.0, 0.0], [1.0, 2.0, 1.5], [0.5, 7.0, 0.3], [-1.0, 0.2, 1.5]])
