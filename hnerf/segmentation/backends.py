@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 
@@ -18,17 +17,6 @@ from hnerf.segmentation.prior import Prior, bounding_window
 CLEAN_PLATE = "clean plate"
 AROUND_BODY, AROUND_DETECTED = "median around the fitted body", "median around the detected person"
 MEDIAN_FRAMES = 60  # at most, evenly spaced, for the background without a plate
-
-
-class Backend(Protocol):
-    """A source of masks for one camera of a capture. `name` is for the report."""
-
-    @property
-    def name(self) -> str: ...
-
-    def mask(self, frame: int, prior: Prior) -> np.ndarray:
-        """Return the mask of the person whom the prior describes, (H, W) bool."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -112,6 +100,9 @@ class BackgroundSubtraction:
         found = difference(image[window], plate[window], noise, self.settings, shadowed=is_median)
         mask[window] = cut(image[window], found, prior.cropped(window), self.known[window])
         return mask
+
+
+Backend = Given | Learned | BackgroundSubtraction  # a source of masks for one camera; its name is for the report
 
 
 def choose_backend(
