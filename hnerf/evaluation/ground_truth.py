@@ -1,8 +1,9 @@
-"""Ground truth of a capture folder: masks, the person on black, and surfaces, under `ground_truth/`."""
+"""What images and surfaces are scored against: the ground truth of a capture folder (masks, the person on black, and
+surfaces, under `ground_truth/`), or its own masks."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ import trimesh
 
 from hnerf.capture.capture import Capture
 from hnerf.capture.lens import Lens
+from hnerf.capture.masks import Masks
 from hnerf.capture.normalise import Normaliser
 from hnerf.capture.safe_io import ARRAY_FILE_ERRORS, path_in_capture, read_arrays, read_image
 from hnerf.errors import InputError
@@ -17,27 +19,6 @@ from hnerf.errors import InputError
 ON_BLACK = "ground_truth/on_black"
 MAX_MESHES_BYTES = 2_000_000_000  # unpacked; 60 frames of a million vertices have 1.4 GB
 MASKED_IMAGE = "image x ground-truth mask"
-
-
-class Truth(Protocol):
-    """Interface of what images are scored against."""
-
-    @property
-    def has_masks(self) -> bool:
-        """Return whether images can be scored at all."""
-        ...
-
-    def has_mask(self, camera: str, frame: int) -> bool:
-        """Return whether this image can be scored."""
-        ...
-
-    def mask(self, camera: str, frame: int) -> np.ndarray:
-        """Return the true mask, (H, W) bool, True on the person."""
-        ...
-
-    def on_black(self, camera: str, frame: int) -> tuple[np.ndarray, str]:
-        """Return the person alone over black, (H, W, 3) uint8, and the name of its source."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -103,3 +84,27 @@ class GroundTruth:
             lens = Lens(camera, K, distortion, np.eye(3), np.zeros(3), recorded_px)
             return Normaliser.create(lens, recorded_px, max(size)).pixels(image)
         return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+@dataclass(frozen=True)
+class OwnMasks:
+    """The Truth of captures that have none: the person under the masks from segmentation."""
+
+    capture: Capture
+    masks: Masks
+    has_masks: ClassVar[bool] = True
+
+    def has_mask(self, camera: str, frame: int) -> bool:
+        """Return whether this image has a mask that can be trusted."""
+        return (camera, frame) in self.masks
+
+    def mask(self, camera: str, frame: int) -> np.ndarray:
+        """Return the mask, (H, W) bool, True on the person."""
+        return self.masks.get(camera, frame)
+
+    def on_black(self, camera: str, frame: int) -> tuple[np.ndarray, str]:
+        """Return the photograph under its mask, (H, W, 3) uint8, and the name of that source."""
+        return self.capture.image(camera, frame) * self.mask(camera, frame)[..., None], "photograph x own mask"
+
+
+Truth = GroundTruth | OwnMasks  # what images are scored against

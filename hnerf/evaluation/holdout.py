@@ -3,11 +3,8 @@
 import dataclasses
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
-
-import numpy as np
+from typing import Any
 
 from hnerf.avatar.avatar import Avatar
 from hnerf.body.fit_result import BodyFit
@@ -16,6 +13,7 @@ from hnerf.capture.masks import Masks
 from hnerf.config import EvaluationSettings
 from hnerf.errors import InputError
 from hnerf.evaluation.columns import avatar_for_split, reason_unavailable
+from hnerf.evaluation.ground_truth import OwnMasks
 from hnerf.evaluation.images import mean_of, render, score_split, scored_views, unscored
 from hnerf.evaluation.views import PRIMARY_SPLITS
 from hnerf.results import HeldOutCamera, write_result
@@ -28,27 +26,6 @@ LABEL = "photographs under the capture's own masks, camera left out of fit and t
 NOT_REQUESTED = (
     "no field was trained without a camera; `hnerf run --set evaluation.holdout=each` trains one without each in turn"
 )
-
-
-@dataclass(frozen=True)
-class OwnMasks:
-    """The Truth of captures that have none: the person under the masks from segmentation."""
-
-    capture: Capture
-    masks: Masks
-    has_masks: ClassVar[bool] = True
-
-    def has_mask(self, camera: str, frame: int) -> bool:
-        """Return whether this image has a mask that can be trusted."""
-        return (camera, frame) in self.masks
-
-    def mask(self, camera: str, frame: int) -> np.ndarray:
-        """Return the mask, (H, W) bool, True on the person."""
-        return self.masks.get(camera, frame)
-
-    def on_black(self, camera: str, frame: int) -> tuple[np.ndarray, str]:
-        """Return the photograph under its mask, (H, W, 3) uint8, and the name of that source."""
-        return self.capture.image(camera, frame) * self.mask(camera, frame)[..., None], "photograph x own mask"
 
 
 def held_out_cameras(train: Sequence[str], test: Sequence[str], holdout: str | None) -> tuple[str, ...]:
