@@ -84,7 +84,9 @@ class ImageScores(TypedDict):
 
 @CLOSED
 class SurfaceScores(TypedDict):
-    """Scores of one surface against the true one. chamfer_l2_e3 in m^2 x 1e3."""
+    """Scores of one surface against the true one. chamfer_l2_e3: mean squared distance of both directions, m^2 x 1e3;
+    chamfer_mm: mean distance; normal_consistency: mean |cos| of the normals at nearest points; iou of the volumes;
+    watertight: whether the prediction is closed."""
 
     frame: int
     chamfer_l2_e3: float

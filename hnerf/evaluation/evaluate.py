@@ -1,6 +1,5 @@
 """Evaluation of a trained avatar by the protocol of docs/method.md: renderings, meshes, scores and a report."""
 
-import dataclasses
 import itertools
 import logging
 import time
@@ -113,7 +112,7 @@ def score_meshes(
         if frame not in true_meshes:
             return len(mesh.faces), None
         found = geometry.score_geometry(mesh, true_meshes[frame], np.random.default_rng(0))
-        return len(mesh.faces), {"frame": frame} | dataclasses.asdict(found)
+        return len(mesh.faces), {"frame": frame} | found
 
     scores = []
     measured = side_by_side(measure, frames, avatar.body.theta.device)

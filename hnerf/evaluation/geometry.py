@@ -4,7 +4,7 @@ The Chamfer distance is from samples to the surface (not to its samples). Only w
 clothes hide inner layers that no camera could observe.
 """
 
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -17,27 +17,15 @@ OCCUPANCY_NODES = 128  # along each side of the common box
 BOX_MARGIN_M = 0.02  # of the common box around both surfaces
 
 
-@dataclass(frozen=True)
-class GeometryScore:
-    """The scores of one mesh. chamfer_l2_e3: mean squared distance of both directions, m^2 x 1e3; chamfer_mm: mean
-    distance; normal_consistency: mean |cos| of the normals at nearest points; iou of the volumes; watertight: whether
-    the prediction is closed."""
-
-    chamfer_l2_e3: float
-    chamfer_mm: float
-    normal_consistency: float
-    iou: float
-    watertight: bool
-
-
 def score_geometry(
     predicted: trimesh.Trimesh,
     truth: trimesh.Trimesh,
     rng: np.random.Generator,
     samples: int = SAMPLES,
     nodes: int = OCCUPANCY_NODES,
-) -> GeometryScore:
-    """Score one mesh against another, both in world metres (docs/method.md, "Evaluation protocol")."""
+) -> dict[str, Any]:
+    """Score one mesh against another, both in world metres (docs/method.md, "Evaluation protocol"). The scores are
+    those of hnerf.results.SurfaceScores."""
     surfaces = Surface(predicted), Surface(truth)
     (points_p, normals_p), (points_t, normals_t) = (outer_samples(s, samples, rng) for s in surfaces)
     distance_p, face_t = surfaces[1].closest(points_p)
@@ -46,13 +34,13 @@ def score_geometry(
     agreement_t = np.abs((normals_t * predicted.face_normals[face_p]).sum(1))
     lower_m = np.minimum(points_p.min(0), points_t.min(0)) - BOX_MARGIN_M
     upper_m = np.maximum(points_p.max(0), points_t.max(0)) + BOX_MARGIN_M
-    return GeometryScore(
-        chamfer_l2_e3=1e3 * float((distance_p**2).mean() + (distance_t**2).mean()) / 2,
-        chamfer_mm=1e3 * float(distance_p.mean() + distance_t.mean()) / 2,
-        normal_consistency=float(agreement_p.mean() + agreement_t.mean()) / 2,
-        iou=volume_overlap(*surfaces, lower_m, upper_m, nodes),
-        watertight=bool(predicted.is_watertight),
-    )
+    return {
+        "chamfer_l2_e3": 1e3 * float((distance_p**2).mean() + (distance_t**2).mean()) / 2,
+        "chamfer_mm": 1e3 * float(distance_p.mean() + distance_t.mean()) / 2,
+        "normal_consistency": float(agreement_p.mean() + agreement_t.mean()) / 2,
+        "iou": volume_overlap(*surfaces, lower_m, upper_m, nodes),
+        "watertight": bool(predicted.is_watertight),
+    }
 
 
 def outer_samples(surface: Surface, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

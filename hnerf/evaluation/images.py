@@ -1,6 +1,5 @@
 """The images of a split: which there are, their renderings and their scores."""
 
-import dataclasses
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -82,7 +81,7 @@ def score_split(capture: Capture, split: str, views: list[View], truth: Truth | 
         reference, source = truth.on_black(view.camera, view.frame)
         score = metrics.score_image(read_rgba(view.path(out)), reference, mask)
         references.add(source)
-        row: Any = {"camera": view.camera, "frame": view.frame} | dataclasses.asdict(score)
+        row: Any = {"camera": view.camera, "frame": view.frame} | score
         rows.append(row | metrics.trivial_psnr(reference, mask))
     if not rows:
         return unscored(

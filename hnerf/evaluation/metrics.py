@@ -1,6 +1,6 @@
 """Image metrics of the evaluation protocol (docs/method.md): 8-bit images over black, in the person's padded box."""
 
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from skimage.metrics import structural_similarity
@@ -11,24 +11,14 @@ BOX_PADDING_PX = 20
 COVERED_LEVEL = 127  # of 255; a rendered pixel with more coverage counts as person, however dark it is
 
 
-@dataclass(frozen=True)
-class ImageScore:
-    """The scores of one image. psnr in dB; ssim in [-1, 1]; mask_iou: covered pixels against the mask, in [0, 1];
-    lpips: 0 for equal images, None if its weights are not installed."""
-
-    psnr: float
-    ssim: float
-    mask_iou: float
-    lpips: float | None
-
-
-def score_image(rendered: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> ImageScore:
+def score_image(rendered: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> dict[str, Any]:
     """Score a rendering (H, W, 4), over black and its coverage, against a reference (H, W, 3) over black, both uint8;
-    mask (H, W) bool, not empty."""
+    mask (H, W) bool, not empty. The scores are those of hnerf.results.ImageScores."""
     box = mask_box(mask)
     shown, true = rendered[box][..., :3], reference[box]
     a, b = shown.astype(np.float32) / 255, true.astype(np.float32) / 255
-    return ImageScore(psnr(a, b), ssim(a, b), mask_iou(rendered[..., 3], mask), lpips(shown, true))
+    colour = {"psnr": psnr(a, b), "ssim": ssim(a, b)}
+    return colour | {"mask_iou": mask_iou(rendered[..., 3], mask), "lpips": lpips(shown, true)}
 
 
 def trivial_psnr(reference: np.ndarray, mask: np.ndarray) -> dict[str, float]:

@@ -164,7 +164,7 @@ def test_figures_agree_with_the_independent_program(scored: Scored) -> None:
     ours = score_geometry(predicted, truth, np.random.default_rng(0), samples=5000, nodes=40)
     theirs = program["geometry"](predicted, truth, np.random.default_rng(0), n=5000, grid=40)
     for name in ("chamfer_l2_e3", "chamfer_mm", "normal_consistency", "iou", "watertight"):
-        assert getattr(ours, name) == pytest.approx(theirs[name], rel=1e-6), name
+        assert ours[name] == pytest.approx(theirs[name], rel=1e-6), name
 
 
 def test_a_rendering_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:

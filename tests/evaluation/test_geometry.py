@@ -24,22 +24,22 @@ def joined(a: trimesh.Trimesh, b: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def test_parallel_planes() -> None:
     score = score_geometry(plane(), plane(0.1), np.random.default_rng(0), samples=2000, nodes=16)
-    assert score.chamfer_mm == pytest.approx(100.0, rel=1e-5)
-    assert score.chamfer_l2_e3 == pytest.approx(10.0, rel=1e-5)  # 0.1^2 x 1e3
-    assert score.normal_consistency == pytest.approx(1.0)
-    assert not score.watertight
+    assert score["chamfer_mm"] == pytest.approx(100.0, rel=1e-5)
+    assert score["chamfer_l2_e3"] == pytest.approx(10.0, rel=1e-5)  # 0.1^2 x 1e3
+    assert score["normal_consistency"] == pytest.approx(1.0)
+    assert not score["watertight"]
 
 
 def test_normal_consistency_of_turned_planes() -> None:
     score = score_geometry(plane(), plane(tilt_deg=60), np.random.default_rng(0), samples=2000, nodes=16)
-    assert score.normal_consistency == pytest.approx(0.5, abs=1e-6)  # cos 60 degrees, wherever the nearest point is
+    assert score["normal_consistency"] == pytest.approx(0.5, abs=1e-6)  # cos 60 degrees, wherever the nearest point is
 
 
 def test_distances_go_to_the_surface_not_to_samples() -> None:
     score = score_geometry(cube(), cube(), np.random.default_rng(0), samples=500, nodes=16)
-    assert score.chamfer_mm < 1e-3
-    assert score.iou == 1.0
-    assert score.watertight
+    assert score["chamfer_mm"] < 1e-3
+    assert score["iou"] == 1.0
+    assert score["watertight"]
 
 
 def test_both_directions_count_alike() -> None:
@@ -48,8 +48,8 @@ def test_both_directions_count_alike() -> None:
     both = joined(plane(0.1), plane(0.3))
     for pair in ((plane(), both), (both, plane())):
         score = score_geometry(*pair, np.random.default_rng(0), samples=4000, nodes=16)
-        assert score.chamfer_mm == pytest.approx((100 + 200) / 2, rel=0.03)
-        assert score.chamfer_l2_e3 == pytest.approx((10 + 50) / 2, rel=0.05)
+        assert score["chamfer_mm"] == pytest.approx((100 + 200) / 2, rel=0.03)
+        assert score["chamfer_l2_e3"] == pytest.approx((10 + 50) / 2, rel=0.05)
 
 
 def test_normals_are_compared_in_both_directions() -> None:
@@ -57,19 +57,19 @@ def test_normals_are_compared_in_both_directions() -> None:
     both = joined(plane(0.1), plane(1.0, tilt_deg=60))
     for pair in ((plane(), both), (both, plane())):
         score = score_geometry(*pair, np.random.default_rng(0), samples=4000, nodes=16)
-        assert score.normal_consistency == pytest.approx((1 + (1 + 0.5) / 2) / 2, abs=0.01)
+        assert score["normal_consistency"] == pytest.approx((1 + (1 + 0.5) / 2) / 2, abs=0.01)
 
 
 @pytest.mark.parametrize("x_m", [-0.5, 0.5])
 def test_volumes_count_wherever_either_of_them_is(x_m: float) -> None:
     score = score_geometry(cube(x_m), cube(), np.random.default_rng(0), samples=500, nodes=64)
-    assert score.iou == pytest.approx(0.5 / 1.5, abs=0.02)
+    assert score["iou"] == pytest.approx(0.5 / 1.5, abs=0.02)
 
 
 def test_the_prediction_is_what_must_be_closed() -> None:
     for predicted, truth, closed in ((cube(), plane(), True), (plane(), cube(), False)):
         score = score_geometry(predicted, truth, np.random.default_rng(0), samples=100, nodes=8)
-        assert score.watertight is closed
+        assert score["watertight"] is closed
 
 
 def test_overlap_of_offset_cubes() -> None:

@@ -51,7 +51,7 @@ def test_without_weights_it_is_null_and_says_why(tmp_path: Path, monkeypatch: py
     assert lpips(WHITE, BLACK) is None
     assert lpips_availability() == NOT_INSTALLED
     rendered = np.concatenate([WHITE, WHITE[..., :1]], -1)
-    assert score_image(rendered, WHITE, np.ones((64, 64), bool)).lpips is None
+    assert score_image(rendered, WHITE, np.ones((64, 64), bool))["lpips"] is None
 
 
 def test_weights_that_come_are_used(by_hand: None) -> None:
@@ -59,7 +59,7 @@ def test_weights_that_come_are_used(by_hand: None) -> None:
     rendered = np.concatenate([WHITE, WHITE[..., :1]], -1)
     score = score_image(rendered, BLACK, np.ones((64, 64), bool))
     module._alexnet.cache_clear()
-    assert score.lpips == pytest.approx(2.727262, abs=1e-5)
+    assert score["lpips"] == pytest.approx(2.727262, abs=1e-5)
     assert lpips_availability() == MEASURED
 
 

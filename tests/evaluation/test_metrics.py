@@ -55,9 +55,9 @@ def test_black_hair_on_black_counts() -> None:
     reference = np.zeros((16, 16, 3), np.uint8)
     reference[3, 2:4] = 200
     rendered = np.dstack([reference, 255 * mask.astype(np.uint8)])
-    assert score_image(rendered, reference, mask).mask_iou == 1.0
+    assert score_image(rendered, reference, mask)["mask_iou"] == 1.0
     rendered[2, 2:4, 3] = 0  # no hair
-    assert score_image(rendered, reference, mask).mask_iou == pytest.approx(2 / 4)
+    assert score_image(rendered, reference, mask)["mask_iou"] == pytest.approx(2 / 4)
 
 
 def test_floors_of_a_person_of_two_greys() -> None:
@@ -78,4 +78,4 @@ def test_score_image_looks_into_the_box_only() -> None:
     rendered = np.zeros((100, 100, 4), np.uint8)
     rendered[0, 0] = 255  # outside the box of 41 x 41 px
     rendered[50, 50] = 51  # 0.2
-    assert score_image(rendered, reference, mask).psnr == pytest.approx(-10 * np.log10(0.2**2 / 41**2), abs=1e-4)
+    assert score_image(rendered, reference, mask)["psnr"] == pytest.approx(-10 * np.log10(0.2**2 / 41**2), abs=1e-4)
