@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,12 +50,6 @@ class Uncalibrated(Layout):
     lens_file: Path | None = None
     fov_deg: float | None = None
     only: str | None = None
-    calibrated: ClassVar[bool] = False
-
-    @staticmethod
-    def recognises(folder: Path) -> bool:
-        """Return whether the folder holds images or videos of cameras."""
-        return bool(cameras_without_calibration(folder))
 
     @cached_property
     def known_lenses(self) -> dict[str, KnownLens]:

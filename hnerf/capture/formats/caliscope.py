@@ -23,8 +23,8 @@ FILES = ("camera_array.toml", "calibration.toml")
 class Caliscope(EasyMocap):
     """A capture folder with camera_array.toml, in metres, or with calibration.toml, in the board's unit."""
 
-    @staticmethod
-    def recognises(folder: Path) -> bool:
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
         """Return whether the folder looks like this layout."""
         return not (folder / "intri.yml").exists() and any((folder / name).exists() for name in FILES)
 

@@ -57,8 +57,8 @@ class _Optics(NamedTuple):
 class Colmap(EasyMocap):
     """A capture folder with a COLMAP model in sparse/0 (or sparse/); its unit of length is arbitrary."""
 
-    @staticmethod
-    def recognises(folder: Path) -> bool:
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
         """Return whether the folder looks like this layout."""
         return (folder / "sparse").is_dir() and not (folder / "intri.yml").exists()
 

@@ -22,10 +22,7 @@ MAX_CALIBRATION_BYTES = 500_000
 class EasyMocap(Layout):
     """A capture folder as EasyMocap's own tools read it (its `read_camera`): world to camera, OpenCV axes."""
 
-    @staticmethod
-    def recognises(folder: Path) -> bool:
-        """Return whether the folder has the poses of cameras in this layout."""
-        return (folder / "extri.yml").exists()
+    mark = "extri.yml"
 
     def lenses(self) -> dict[str, Lens]:
         """Return every camera that intri.yml names."""

@@ -25,18 +25,18 @@ class StoredFrame(NamedTuple):
 class Layout(ABC):
     """A capture folder in one layout. Methods for what most layouts lack return nothing by default.
 
+    `mark`: a file or folder that only this layout has.
     `novel_pose_share`: share of the frames for novel poses, where no `capture.toml` splits them.
-    `calibrated`: whether the poses of the cameras are known.
     """
 
     folder: Path
+    mark: ClassVar[str] = ""
     novel_pose_share: ClassVar[float] = 0.0
-    calibrated: ClassVar[bool] = True
 
-    @staticmethod
-    @abstractmethod
-    def recognises(folder: Path) -> bool:
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
         """Return whether the folder looks like this layout."""
+        return (folder / cls.mark).exists()
 
     @abstractmethod
     def lenses(self) -> dict[str, Lens]:

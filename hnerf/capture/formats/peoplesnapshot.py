@@ -29,10 +29,7 @@ MAX_NUMBERS = 10_000_000  # in an array of keypoints or poses: more than an hour
 class PeopleSnapshot(Layout):
     """A subject's folder as its publication's tools read it; the world is rotated so that Z is up."""
 
-    @staticmethod
-    def recognises(folder: Path) -> bool:
-        """Return whether the folder looks like this layout."""
-        return (folder / "camera.pkl").exists()
+    mark = "camera.pkl"
 
     def lenses(self) -> dict[str, Lens]:
         """Return the one camera."""

@@ -18,12 +18,8 @@ from hnerf.errors import InputError
 class Pose2Sim(Layout):
     """A capture folder as Pose2Sim's own tools read it: world to camera, metres, Z up."""
 
+    mark = "calibration"
     novel_pose_share: ClassVar[float] = 0.2  # the last fifth, whose motion the training frames do not contain
-
-    @staticmethod
-    def recognises(folder: Path) -> bool:
-        """Return whether the folder looks like this layout."""
-        return (folder / "calibration").exists()
 
     def lenses(self) -> dict[str, Lens]:
         """Return every camera of the one calibration file."""

@@ -24,8 +24,8 @@ class Videos(Layout):
     """Videos of a person. One needs no calibration: the camera is held level, with the field of view that
     `capture.toml` states. Several need each other's places."""
 
-    @staticmethod
-    def recognises(folder: Path) -> bool:
+    @classmethod
+    def recognises(cls, folder: Path) -> bool:
         """Return whether there is a video: the file itself, in the folder, or in its videos/."""
         return bool(_videos(folder))
 

@@ -26,10 +26,7 @@ METRES_PER_UNIT = 1e-3  # of the cameras' translations
 class ZjuMocap(Layout):
     """A capture folder as NeuralBody's own tools read it: world to camera, OpenCV axes, Z up."""
 
-    @staticmethod
-    def recognises(folder: Path) -> bool:
-        """Return whether the folder looks like this layout."""
-        return (folder / "annots.npy").exists()
+    mark = "annots.npy"
 
     @property
     def source(self) -> Path:
