@@ -43,9 +43,9 @@ def synchronise_recording(folder: Path) -> tuple[Clocks, dict[str, str]]:
             sounds[name] = sound
     near_s = {}
     for a, b in combinations(names, 2):
-        found = sound_offset(sounds[a], sounds[b]) if a in sounds and b in sounds else None
-        if found:
-            near_s[a, b] = found.offset_s
+        found_s = sound_offset(sounds[a], sounds[b]) if a in sounds and b in sounds else None
+        if found_s is not None:
+            near_s[a, b] = found_s
     heard = {name for pair in near_s for name in pair}
     sources = {name: "keypoints and sound" if name in heard else "keypoints" for name in names}
     try:

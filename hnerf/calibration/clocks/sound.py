@@ -4,7 +4,6 @@ import shutil
 import subprocess
 import wave
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import resample
@@ -19,17 +18,9 @@ MIN_OVER_RIVAL = 1.3  # times the next peak
 MAX_SECONDS = 7_200.0
 
 
-class SoundOffset(NamedTuple):
-    """offset_s: by how much later b's recording shows a sound than a's does; peak: of the correlation, in its standard
-    deviations."""
-
-    offset_s: float
-    peak: float
-
-
-def sound_offset(a: np.ndarray, b: np.ndarray) -> SoundOffset | None:
-    """Return the offset of two sound tracks (n,), (m,) at RATE_HZ; None where no peak stands out, one is silent, or
-    one is shorter than the echoes of a sound.
+def sound_offset(a: np.ndarray, b: np.ndarray) -> float | None:
+    """Return by how many seconds later the second of two sound tracks (n,), (m,) at RATE_HZ shows a sound than the
+    first does; None where no peak stands out, one is silent, or one is shorter than the echoes of a sound.
 
     Generalised cross-correlation with the phase transform (Knapp and Carter 1976): every frequency counts alike, so
     that the direct sound makes a sharp peak and echoes, which differ between microphones, make lower ones. Sound needs
@@ -46,13 +37,12 @@ def sound_offset(a: np.ndarray, b: np.ndarray) -> SoundOffset | None:
     floor = 1e-3 * magnitude[band].mean() + 1e-30
     correlation = np.fft.irfft(np.where(band, cross / (magnitude + floor), 0), size)
     best = int(correlation.argmax())
-    spread = float(correlation.std())
     away = np.ones(size, bool)
     away[(best + np.arange(-round(RIVAL_S * RATE_HZ), round(RIVAL_S * RATE_HZ) + 1)) % size] = False
     peak = float(correlation[best])
-    if peak < MIN_PEAK * spread or peak < MIN_OVER_RIVAL * float(correlation[away].max()):
+    if peak < MIN_PEAK * float(correlation.std()) or peak < MIN_OVER_RIVAL * float(correlation[away].max()):
         return None
-    return SoundOffset((best if best < len(b) else best - size) / RATE_HZ, peak / spread)
+    return (best if best < len(b) else best - size) / RATE_HZ
 
 
 def read_sound(path: Path) -> np.ndarray | None:
