@@ -73,20 +73,12 @@ class Surface:
     def inside(self, points_m: np.ndarray) -> np.ndarray:
         """Return whether each point is inside the mesh, (N,) bool: its winding number is over one half (Jacobson et al.
         2013)."""
-        inside = wp.zeros(len(points_m), dtype=int)
-        wp.launch(_inside_kernel, len(points_m), [self._warp_mesh.id, to_vec3_array(points_m), inside])
-        return inside.numpy() > 0
+        return self._flags(_inside_kernel, points_m)
 
     def escapes(self, points_m: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return whether a ray along any of the directions (K, 3) leaves each point without meeting the surface, (N,)
         bool."""
-        escapes = wp.zeros(len(points_m), dtype=int)
-        wp.launch(
-            _escape_kernel,
-            len(points_m),
-            [self._warp_mesh.id, to_vec3_array(points_m), to_vec3_array(directions), escapes],
-        )
-        return escapes.numpy() > 0
+        return self._flags(_escape_kernel, points_m, to_vec3_array(directions))
 
     def cast(self, origins_m: np.ndarray, directions: np.ndarray) -> RayHits:
         """Return the first hits of rays; origins_m is (N, 3), or (3,) if all rays share one."""
@@ -94,9 +86,7 @@ class Surface:
 
     def near(self, points_m: np.ndarray, reach_m: float) -> np.ndarray:
         """Return whether the surface comes within `reach_m` of each point, (N,) bool."""
-        near = wp.zeros(len(points_m), dtype=int)
-        wp.launch(_near_kernel, len(points_m), [self._warp_mesh.id, to_vec3_array(points_m), reach_m, near])
-        return near.numpy() > 0
+        return self._flags(_near_kernel, points_m, reach_m)
 
     def occupancy(self, lower_m: np.ndarray, upper_m: np.ndarray, nodes: int) -> np.ndarray:
         """Return `inside` at the nodes^3 grid points of a box, bool. `nodes` is a multiple of the coarsest block.
@@ -115,6 +105,12 @@ class Surface:
             occupied[tuple(np.moveaxis(members, -1, 0))] = self.inside(middles_m[~to_split])[:, None]
             blocks = ((blocks[to_split] * 2)[:, None] + _cube(2)).reshape(-1, 3)
         return occupied
+
+    def _flags(self, kernel: wp.Kernel, points_m: np.ndarray, *more: wp.array | float) -> np.ndarray:
+        """Return what a kernel, given points and what it needs beside them, sets for each point, (N,) bool."""
+        flags = wp.zeros(len(points_m), dtype=int)
+        wp.launch(kernel, len(points_m), [self._warp_mesh.id, to_vec3_array(points_m), *more, flags])
+        return flags.numpy() > 0
 
 
 def _cube(side: int) -> np.ndarray:
