@@ -87,7 +87,9 @@ def gc(options: argparse.Namespace) -> None:
     removed = [one for one in garbage if options.yes and collect(store, one)]
     total, gone = _size(_sum(garbage)), _size(_sum(removed))
     if options.yes:
-        print(f"removed: {len(removed)} of {len(garbage)}, {gone}" + _in_use(len(garbage) - len(removed)))
+        left = len(garbage) - len(removed)
+        in_use = f"; {left} came into use meanwhile" if left else ""
+        print(f"removed: {len(removed)} of {len(garbage)}, {gone}{in_use}")
     else:
         print(f"not needed: {len(garbage)}, {total}; nothing was removed: give --yes to remove")
 
@@ -160,10 +162,6 @@ def _store(options: argparse.Namespace) -> "Store":
 
 def _sum(garbage: "Iterable[Garbage]") -> int:
     return sum(one.size_bytes for one in garbage)
-
-
-def _in_use(count: int) -> str:
-    return f"; {count} came into use meanwhile" if count else ""
 
 
 def _date(seconds: float) -> str:

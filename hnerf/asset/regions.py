@@ -6,7 +6,6 @@ import numpy as np
 import trimesh
 
 from hnerf.asset.topologies import AssetMesh
-from hnerf.body.rig import Rig
 from hnerf.evaluation.geometry import outer_samples
 from hnerf.geometry.mesh_queries import Surface
 
@@ -33,7 +32,9 @@ def surface_distances_mm(dense: trimesh.Trimesh, meshes: Mapping[str, AssetMesh]
     mesh, as a whole ("all") and by region of the registered mesh."""
     points_m, _ = outer_samples(Surface(dense), SAMPLES, np.random.default_rng(0))
     surfaces = {name: Surface(mesh.trimesh) for name, mesh in meshes.items()}
-    region = _vertex_regions(meshes["registered"].rig)[_nearest_vertices(surfaces["registered"], points_m)]
+    rig, (_, face) = meshes["registered"].rig, surfaces["registered"].closest(points_m)
+    vertex_region = np.array([region_of(name) for name in rig.joint_names])[rig.dense_weights.argmax(1).numpy()]
+    region = vertex_region[surfaces["registered"].mesh.faces[face][:, 0]]
     found: dict[str, Distances] = {}
     for name, surface in surfaces.items():
         distance_mm = 1e3 * surface.closest(points_m)[0]
@@ -54,14 +55,3 @@ def findings(distances_mm: Distances) -> list[str]:
 
 def _summary(distance_mm: np.ndarray) -> dict[str, float]:
     return {"mean": float(distance_mm.mean()), "p95": float(np.percentile(distance_mm, 95))}
-
-
-def _vertex_regions(rig: Rig) -> np.ndarray:
-    """Return the region of each vertex, (V,), by its strongest joint."""
-    regions = np.array([region_of(name) for name in rig.joint_names])
-    return regions[rig.dense_weights.argmax(1).numpy()]
-
-
-def _nearest_vertices(surface: Surface, points_m: np.ndarray) -> np.ndarray:
-    """Return a vertex of the face nearest to each point, (N,)."""
-    return surface.mesh.faces[surface.closest(points_m)[1]][:, 0]

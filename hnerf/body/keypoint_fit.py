@@ -110,20 +110,16 @@ class Problem:
         """Return the data term of triangulated keypoints; robust as in `image_term`."""
         known = self.observations.space_m.isfinite().all(-1)
         residual = torch.where(known[..., None], x - self.observations.space_m.nan_to_num(), 0.0)
-        weight, cost = self._robust(residual.square().sum(-1), known.to(x.dtype))
-        eye = torch.eye(3, dtype=x.dtype)
-        return weight[..., None, None] * eye, weight[..., None] * residual, cost
+        squared, trust, eye = residual.square().sum(-1), known.to(x.dtype), torch.eye(3, dtype=x.dtype)
+        weight, cost = geman_mcclure(squared, self.priors.keypoint_m, self.priors.keypoint_outlier_m)
+        weight = trust * weight
+        return weight[..., None, None] * eye, weight[..., None] * residual, float((trust * cost).sum())
 
     def image_term(self, x: Tensor) -> DataTerm:
         """Return the data term of reprojected keypoints, with pixel residuals converted to metres."""
         return reprojection_term(
             self.observations.views, self.scale_m, x, self.priors.keypoint_m, self.priors.keypoint_outlier_m
         )
-
-    def _robust(self, squared: Tensor, trust: Tensor) -> tuple[Tensor, float]:
-        """Return Geman-McClure weights of squared residuals, times their trust, and the cost."""
-        weight, cost = geman_mcclure(squared, self.priors.keypoint_m, self.priors.keypoint_outlier_m)
-        return trust * weight, float((trust * cost).sum())
 
     def apply_step(self, pose: Pose, equations: NormalEquations, damping: float) -> Pose:
         """Return the pose after a damped Gauss-Newton step, its rig linearised anew."""

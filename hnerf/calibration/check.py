@@ -52,7 +52,8 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
     given = [capture.cameras[name] for name in capture.train_cameras]
     if len(given) == 1:
         return _monocular(capture, keypoints[0])
-    settings = _scale_residual_limit(settings, median_height_px(keypoints))
+    limit_px = RESIDUAL_SHARE * median_height_px(keypoints)  # detectors' errors grow with the person's size in pixels
+    settings = settings.model_copy(update={"max_residual_px": max(settings.max_residual_px, limit_px)})
     before = measure(given, keypoints)
     _check_convention(capture, given, keypoints, before)
     cameras, mistakes = undo_mistake(given, keypoints)
@@ -109,12 +110,6 @@ def _keypoints(capture: Capture) -> np.ndarray:
                 f"{capture.name}: camera {name} never shows the person; check its keypoints or leave it out"
             )
     return np.stack([found[name] for name in capture.train_cameras])
-
-
-def _scale_residual_limit(settings: CalibrationSettings, height_px: float) -> CalibrationSettings:
-    """Return the settings with a residual limit for a person of this height: detector errors grow with the person's
-    size in pixels."""
-    return settings.model_copy(update={"max_residual_px": max(settings.max_residual_px, RESIDUAL_SHARE * height_px)})
 
 
 def _check_convention(capture: Capture, cameras: Sequence[Camera], keypoints: np.ndarray, found: Measure) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 
 from hnerf.capture.capture import PERSON, Capture, write_image
 from hnerf.capture.subset import PointChange, copy_pixels, require_several_cameras, write_arrays
-from hnerf.geometry.camera import Camera
 
 PixelChange = Callable[[str, np.ndarray], np.ndarray]
 
@@ -45,10 +44,14 @@ def resize(capture: Capture, scale: float, rng: np.random.Generator, out: Path) 
     }
 
     def resized(camera: str, pixels: np.ndarray) -> np.ndarray:
-        return _resized(pixels, cameras[camera])
+        shrinks = cameras[camera].width_px < pixels.shape[1]
+        interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
+        return cv2.resize(pixels, cameras[camera].size_px, interpolation=interpolation)
 
     def scaled(camera: str, points: np.ndarray) -> np.ndarray:
-        return _scaled_points(points, capture.cameras[camera], cameras[camera])
+        scale = np.array(cameras[camera].size_px) / capture.cameras[camera].size_px
+        xy = points[..., :2] * scale + (scale - 1) / 2  # pixel centres are at integers
+        return np.concatenate([xy, points[..., 2:]], -1) * (points[..., 2:] > 0)  # what is unseen stays zero
 
     rewrite_images(capture.with_cameras(cameras), out, resized, resized, scaled)
 
@@ -81,18 +84,6 @@ def rewrite_images(
         if plate is not None:
             write_image(out / "background" / f"{name}.jpg", change(name, plate))
     kept.save()
-
-
-def _resized(pixels: np.ndarray, camera: Camera) -> np.ndarray:
-    shrinks = camera.width_px < pixels.shape[1]
-    return cv2.resize(pixels, camera.size_px, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
-
-
-def _scaled_points(points: np.ndarray, old: Camera, new: Camera) -> np.ndarray:
-    """Scale points (..., 3) to another image size, pixel centres at integers; those of zero confidence stay zero."""
-    scale = np.array(new.size_px) / old.size_px
-    xy = points[..., :2] * scale + (scale - 1) / 2
-    return np.concatenate([xy, points[..., 2:]], -1) * (points[..., 2:] > 0)
 
 
 def _to_8_bit(pixels: np.ndarray) -> np.ndarray:
