@@ -203,10 +203,8 @@ class Trial:
         for name in used.train_cameras:
             off = used.frame_offsets.get(name, 0.0) + (self.delay_frames if name == self.name else 0)
             shown_m = self._keypoints_at(np.array(used.frames) + off)
-            uv, true_uv = (
-                used.cameras[name].project(shown_m)[0],
-                self.whole.cameras[name].project(self._keypoints_at(used.frames))[0],
-            )
+            uv = used.cameras[name].project(shown_m)[0]
+            true_uv = self.whole.cameras[name].project(self._keypoints_at(used.frames))[0]
             medians_px.append(float(np.median(np.linalg.norm(uv - true_uv, axis=-1))))
         return max(medians_px)
 

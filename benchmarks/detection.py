@@ -82,10 +82,8 @@ def measure(folder: Path, sizes: list[str], scratch: Path) -> dict[str, Any]:
 def cost_of_a_frame(capture: Capture, size: str, out: Path) -> dict[str, float]:
     """Return the milliseconds of one core a frame of the first camera takes after the first one, and the most memory
     that this process, which must be a new one, holds."""
-    camera, one = (
-        capture.train_cameras[0],
-        dataclasses.replace(capture, train_frames=capture.frames[:1], novel_pose_frames=()),
-    )
+    camera = capture.train_cameras[0]
+    one = dataclasses.replace(capture, train_frames=capture.frames[:1], novel_pose_frames=())
     find_in_camera(one, camera, size, out / "warm")
     times = []
     for looked_at in (one, capture):
@@ -132,10 +130,8 @@ def _ious(folder: Path, capture: Capture) -> list[float]:
     for camera in capture.train_cameras:
         for frame in capture.frames:
             name = Path(camera) / f"{frame:06d}.png"
-            mask, true = (
-                read_rgb(place / name)[..., 0] > 127
-                for place in (capture.root / PERSON, folder / "ground_truth" / "masks")
-            )
+            places = capture.root / PERSON, folder / "ground_truth" / "masks"
+            mask, true = (read_rgb(place / name)[..., 0] > 127 for place in places)
             ious.append(float(np.sum(mask & true) / np.sum(mask | true)))
     return ious
 

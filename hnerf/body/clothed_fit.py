@@ -54,10 +54,8 @@ def refine_with_clothing(problem: Problem, pose: Pose, edges: list[list[Outline 
             found += [
                 (t, match_clothed(c, e, float(s[t]), clothed_m, normals, faces)) for c, s, e in views if e is not None
             ]
-        before_m, cloth_offset_m = (
-            cloth_offset_m,
-            solve_cloth_offset(cloth_offset_m, [rows for _, rows in found], faces),
-        )
+        before_m = cloth_offset_m
+        cloth_offset_m = solve_cloth_offset(before_m, [rows for _, rows in found], faces)
         found = [(t, _with_more_cloth(rows, cloth_offset_m - before_m)) for t, rows in found]
         _, equations = problem.assemble(pose, problem.image_term)
         for t, rows in found:

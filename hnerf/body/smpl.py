@@ -93,9 +93,8 @@ def read_smpl(path: Path) -> Smpl:
     vertices_m[0] += _pose_blend_shape(data["posedirs"], rotations, parents)
     vertices_m, joints_m = _reposed(vertices_m, joints_m, weights, rotations, parents)
 
-    kept = torch.tensor([not name.startswith("eye") for name in names])[
-        weights.argmax(1)
-    ]  # eyeballs are separate parts
+    of_body = torch.tensor([not name.startswith("eye") for name in names])  # eyeballs are separate parts
+    kept = of_body[weights.argmax(1)]
     place = kept.cumsum(0) - 1
     faces = data["f"].long()
     faces = place[faces[kept[faces].all(1)]]

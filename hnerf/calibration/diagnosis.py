@@ -30,9 +30,8 @@ MISTAKES: dict[str, Callable[[Camera], Camera]] = {  # by the mistake: the funct
         c, R=np.diag([1, -1, -1]) @ c.R, t_m=np.diag([1, -1, -1]) @ c.t_m
     ),
 }
-SINGLE_CAMERA_MISTAKES: dict[
-    str, Callable[[Camera], Camera]
-] = {  # made in all cameras, they would only scale the world
+# Made in all cameras, they would only scale the world.
+SINGLE_CAMERA_MISTAKES: dict[str, Callable[[Camera], Camera]] = {
     f"T is in {unit}": lambda c, metres=metres: dataclasses.replace(c, t_m=metres * c.t_m)  # type: ignore[misc]
     for unit, metres in UNITS_M.items()
 }

@@ -7,9 +7,7 @@ import numpy as np
 from hnerf.geometry.camera import Camera
 
 FIELD_OF_VIEW_DEG = (10.0, 120.0)  # of the longer side; people are not filmed with lenses beyond this range
-PRINCIPAL_POINT_RANGE = (
-    1 / 3
-)  # of the image's sides: width of the central range in which an uncropped image has its principal point
+PRINCIPAL_POINT_RANGE = 1 / 3  # of the image's sides, about the middle: an uncropped image's principal point is in it
 MAX_ASPECT_ERROR = 0.1  # of the pixel aspect ratio from 1
 STANDING_M = (1.2, 2.1)
 UNMEASURED_M = 1e-6  # height of a camera whose height nobody has measured

@@ -32,9 +32,8 @@ def _scale_and_pad(camera: Camera, calibrated_px: tuple[int, int], recorded_px: 
     return dataclasses.replace(camera, K=resampling(scale, scale, dx, dy) @ camera.K)
 
 
-SIZE_CHANGES: dict[
-    str, SizeChange
-] = {  # none: cropped or padded on the right and at the bottom, which leaves K as it is
+# Cropping or padding on the right and at the bottom is not among them: it leaves K as it is.
+SIZE_CHANGES: dict[str, SizeChange] = {
     "cropped or padded evenly": _crop_or_pad(0.5),
     "cropped or padded on the left or at the top": _crop_or_pad(1.0),
     "stretched": _stretch,

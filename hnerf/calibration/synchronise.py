@@ -240,10 +240,8 @@ def _timing(view: _View) -> Timing:
         return Timing.unknown(f"fewer than {MIN_FRAMES} frames with neighbours {step} before and after")
     kept = [np.setdiff1d(every, left_out) for left_out in np.array_split(every, JACKKNIFE_BLOCKS)]
     error = _jackknife_error([parabola.vertex(k) for k in kept])
-    curvature_px2, curvature_error_px2 = (
-        parabola.curvature_px2(every),
-        _jackknife_error([parabola.curvature_px2(k) for k in kept]),
-    )
+    curvature_px2 = parabola.curvature_px2(every)
+    curvature_error_px2 = _jackknife_error([parabola.curvature_px2(k) for k in kept])
     reason = ""
     if curvature_px2 < MIN_CURVATURE_SIGMAS * curvature_error_px2 or error > MAX_ERROR_STEPS:
         reason = (

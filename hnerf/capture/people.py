@@ -18,11 +18,8 @@ FREE_JUMPS = 2.0  # in median movements between frames: jumps up to this cost no
 MAX_PAIRED = 12  # people of an image, the most prominent, who are compared with those of other cameras
 MAX_PEOPLE = 4  # followed: the subject, and those whom the report says were left
 SAME_SHARE = 0.1  # of a person's height: mean distance of the keypoints of one person, found twice
-MOST_MOVING, STILL_SHARE = (
-    90,
-    0.05,
-)  # percentile of keypoints, and the share of a height that a picture of a person does
-# not move by (noise of a detector: a hundredth)
+MOST_MOVING = 90  # percentile of keypoints
+STILL_SHARE = 0.05  # of a height, that a picture of a person does not move by (noise of a detector: a hundredth)
 
 
 class PersonTrack(NamedTuple):

@@ -58,10 +58,8 @@ def dome_lights() -> tuple[np.ndarray, np.ndarray]:
     They are scaled so that an unshadowed upward surface has irradiance BRIGHTNESS.
     """
     k = np.arange(LIGHTS) + 0.5
-    up, around = (
-        1 - 1.25 * k / LIGHTS,
-        np.pi * (1 + np.sqrt(5)) * k,
-    )  # a little light comes from below, reflected by the floor
+    up = 1 - 1.25 * k / LIGHTS  # a little light comes from below, reflected by the floor
+    around = np.pi * (1 + np.sqrt(5)) * k
     flat = np.sqrt(1 - up**2)
     directions = np.stack([flat * np.cos(around), flat * np.sin(around), up], -1)
     key = np.clip(directions @ KEY_DIRECTION / np.linalg.norm(KEY_DIRECTION), 0, 1)

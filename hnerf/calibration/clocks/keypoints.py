@@ -21,9 +21,8 @@ CLEAR = 0.8  # of the next best offset's residual, which the best may have at mo
 OTHER_S = 0.5  # from which another offset is another one
 DRIFT_SIGMAS, MAX_DRIFT_ERROR = 4.0, 1e-4  # standard errors by which a drift must show, and how well it must be known
 REACH_S, MIN_REACH = 0.1, 2  # seconds, and frames, on each side, through which a parabola is laid
-JUDGED = (
-    0.95  # quantile of residuals by which offsets are compared: a wave of one hand tells steps of an even walk apart
-)
+# Quantile of residuals by which offsets are compared: a wave of one hand tells steps of an even walk apart.
+JUDGED = 0.95
 MIN_KEYPOINTS = 100  # that both see
 MAX_REFINED = 2000  # frames, evenly spaced, to which a clock is refined
 CONVERGED = 1e-7  # seconds, and drift: a step that ends the refinement
