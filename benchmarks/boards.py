@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from provenance import SHARED, provenance, provenance_line, table, write_result
 
-from hnerf.calibration.boards.calibrate import calibrate_from_boards
+from hnerf.calibration.boards.calibrate import calibrate_from_boards, rms
 from hnerf.calibration.boards.rig import compare_pairs, solve_boards, solve_rig
 from hnerf.capture.formats.caliscope import Caliscope
 from hnerf.geometry.camera import Camera
@@ -50,9 +50,9 @@ def main() -> None:
         "turned_deg": max(pair["turned_deg"] for pair in pairs.values()),
         "moved_cm": max(pair["moved_cm"] for pair in pairs.values()),
         "rms_px": report["rms_px"],
-        "rms_with_corners_off_plane_px": _rms(np.linalg.norm(every[np.isfinite(every[..., 0])], axis=-1)),
-        "rms_held_out_px": _rms(solve_boards(from_first_half, corners_m, seen_px[:, half:]).error_px()),
-        "rms_shipped_px": _rms(solve_boards(shipped, corners_m, seen_px).error_px()),
+        "rms_with_corners_off_plane_px": rms(np.linalg.norm(every[np.isfinite(every[..., 0])], axis=-1)),
+        "rms_held_out_px": rms(solve_boards(from_first_half, corners_m, seen_px[:, half:]).error_px()),
+        "rms_shipped_px": rms(solve_boards(shipped, corners_m, seen_px).error_px()),
         "seconds": seconds,
     }
     result = where | {"footage": FOOTAGE, "protocol": PROTOCOL, "goals": GOALS, "figures": figures}
@@ -86,10 +86,6 @@ def as_markdown(result: dict[str, Any]) -> str:
     head = [f"# Cameras from board footage: `{result['footage']}`", "", provenance_line(result), ""]
     body = [*table(goals), "", *table(by_camera), "", *table(by_pair), "", "## Intrinsics", "", *intrinsics]
     return "\n".join([*head, *body, "", "## Protocol", "", result["protocol"], ""])
-
-
-def _rms(error_px: np.ndarray) -> float:
-    return float(np.sqrt((error_px**2).mean()))
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ class BoardCalibration:
             }
             for i, camera in enumerate(self.fit.cameras)
         }
-        return {"frames": found.shape[1], "rms_px": _rms(self.fit.error_px()), "cameras": cameras}
+        return {"frames": found.shape[1], "rms_px": rms(self.fit.error_px()), "cameras": cameras}
 
     def save(self, out: Path, layouts: Sequence[str] = ()) -> None:
         """Write `intri.yml`, `extri.yml`, `report.json` and `boards.png`, and the cameras in further layouts."""
@@ -109,7 +109,7 @@ def board_evidence(capture: Capture) -> dict[str, Any] | None:
     seen = stored.corners_m, corners_px, stored.frame_step
     own, given = (solve(cameras, *seen) for solve in (rig.solve_rig, rig.solve_boards))
     figures = {
-        camera.name: _figures(given, i) | {"footage_rms_px": _rms(own.error_px(i))} for i, camera in enumerate(cameras)
+        camera.name: _figures(given, i) | {"footage_rms_px": rms(own.error_px(i))} for i, camera in enumerate(cameras)
     }
     return {
         "frames": corners_px.shape[1],
@@ -206,11 +206,12 @@ def _figures(fit: BoardFit, camera: int) -> dict[str, Any]:
     return {
         "pictures": len(offsets),
         "corners": len(error_px),
-        "rms_px": _rms(error_px),
+        "rms_px": rms(error_px),
         "median_px": float(np.median(error_px)) if len(error_px) else None,
         "offset_frames_p5_p50_p95": at,
     }
 
 
-def _rms(error_px: np.ndarray) -> float | None:
+def rms(error_px: np.ndarray) -> float | None:
+    """Return the root of the mean square; None of nothing."""
     return float(np.sqrt((error_px**2).mean())) if len(error_px) else None
