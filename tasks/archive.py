@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from hnerf.errors import InputError
 from tasks.inventory import Inventory
 from tasks.packed import Contents, Name, archived, pack, place, read_contents, require_room, unpack
-from tasks.store import RECORDING, STAGES, Artifact, Store
+from tasks.store import STAGES, Artifact, Store
 
 
 class Manifest(Contents):
@@ -43,7 +43,7 @@ def export_subject(store: Store, subject: str, out: Path) -> Manifest:
     artifacts = [_intact(store, *name.split("/")) for name in sorted(inventory.with_inputs(latest.values()))]
     manifest = Manifest(
         subject=subject,
-        recording=(store.subject_folder(subject) / RECORDING).read_text() if _has_recording(store, subject) else "",
+        recording=store.recording(subject),
         latest=latest,
         artifacts=archived(artifacts),
     )
@@ -82,11 +82,6 @@ def import_subject(store: Store, path: Path) -> Manifest:
     return manifest
 
 
-def _has_recording(store: Store, subject: str) -> bool:
-    path = store.subject_folder(subject) / RECORDING
-    return path.is_file() and not path.is_symlink()
-
-
 def _intact(store: Store, stage: str, key: str) -> Artifact:
     found = store.find(stage, key)
     if found is None:
@@ -98,6 +93,6 @@ def _check_subject(manifest: Manifest, store: Store) -> None:
     """Raise InputError if the subject's name belongs to another recording."""
     here = store.subject_folder(manifest.subject)
     if here.is_dir() and any(here.iterdir()):
-        recording = (here / RECORDING).read_text() if _has_recording(store, manifest.subject) else ""
+        recording = store.recording(manifest.subject)
         if recording.partition("\n")[0] != manifest.recording.partition("\n")[0] or not recording:
             raise InputError(f"{here}: has the results of another recording; import into another store")

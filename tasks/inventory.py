@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 
 from tasks.pins import pinned
-from tasks.store import RECORDING, STAGES, Artifact, Store
+from tasks.store import STAGES, Artifact, Store
 
 KEY = re.compile(r"[0-9a-f]{32}")
 STAGE = re.compile(r"[a-z][a-z-]*")
@@ -110,10 +110,7 @@ def in_stages(store: Store, pattern: str) -> Iterator[Path]:
 
 def recording_of(store: Store, subject: str) -> str:
     """Return the folder of the recording that a subject's results are of, empty if it is not known."""
-    path = store.subject_folder(subject) / RECORDING
-    if not path.is_file() or path.is_symlink():
-        return ""
-    return " ".join(path.read_text(errors="replace").splitlines()[1:])
+    return " ".join(store.recording(subject).splitlines()[1:])
 
 
 def _latest(store: Store) -> dict[str, dict[str, str]]:

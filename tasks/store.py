@@ -198,6 +198,11 @@ class Store:
         """Return the folder with links to a subject's latest artifacts."""
         return self.root / "subjects" / subject
 
+    def recording(self, subject: str) -> str:
+        """Return the digest and the folder of a subject's recording, a line each; empty where they are not known."""
+        path = self.subject_folder(subject) / RECORDING
+        return path.read_text(errors="replace") if path.is_file() and not path.is_symlink() else ""
+
     def path(self, stage: str, key: str, suffix: str = "") -> Path:
         """Return where an artifact lies, or what belongs to it (.json, .partial, .lock)."""
         return self.root / stage / f"{key}{suffix}"
