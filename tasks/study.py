@@ -27,7 +27,7 @@ EXTREME_POSES = 3  # checked for each strength and seed
 @stage("study-capture", version="4")
 def degrade_capture(out: Path, recording: Artifact, degradation: Degradation) -> dict[str, float]:
     """Write a degraded capture, in the form that `ingest` writes."""
-    catalogue.degrade_capture(Capture.load(recording.root), degradation, out)
+    degradation.apply(Capture.load(recording.root), out=out)
     return {}
 
 
@@ -47,16 +47,14 @@ def degrade_masks(
     out: Path, recording: Artifact, calibration: Artifact, segmentation: Artifact, degradation: Degradation
 ) -> dict[str, float]:
     """Write degraded masks."""
-    catalogue.degrade_masks(
-        Masks.load(segmentation.root), calibrated_capture(recording, calibration), degradation
-    ).save(out)
+    degradation.apply(Masks.load(segmentation.root), calibrated_capture(recording, calibration)).save(out)
     return {}
 
 
 @stage("study-fit", version="1")
 def degrade_fit(out: Path, body: Artifact, degradation: Degradation) -> dict[str, float]:
     """Write a degraded body fit, with the report of the good one."""
-    catalogue.degrade_fit(BodyFit.load(body.root), degradation).save(out)
+    degradation.apply(BodyFit.load(body.root)).save(out)
     shutil.copyfile(body.root / "report.json", out / "report.json")
     return {}
 

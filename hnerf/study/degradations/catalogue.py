@@ -11,7 +11,6 @@ import numpy as np
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
-from hnerf.capture.masks import Masks
 from hnerf.config import Section, TrainingSettings
 from hnerf.errors import InputError
 from hnerf.evaluation.ground_truth import GroundTruth
@@ -37,6 +36,13 @@ class Degradation(Section):
     def rng(self) -> Rng:
         """Return a generator with the same random numbers for the same seed, whatever the strength."""
         return np.random.default_rng(self.seed)
+
+    def apply(self, *what: Any, **where: Any) -> Any:
+        """Write a degraded capture, normalised like the one given, into a folder `out`; or return degraded masks of the
+        same views, given masks and their capture, or a body fit with degraded poses or shape."""
+        change = KINDS[self.kind].change
+        assert change is not None  # degradations of capture, masks and fit have one
+        return change(*what, self.strength, self.rng, **where)
 
 
 @dataclass(frozen=True)
@@ -87,24 +93,9 @@ KINDS = {
 }
 
 
-def degrade_capture(capture: Capture, degradation: Degradation, out: Path) -> None:
-    """Write the degraded capture, normalised like the one given, into `out`."""
-    _change(degradation)(capture, degradation.strength, degradation.rng, out)
-
-
 def degrade_clothing(capture: Capture, body: BodyFit, truth: GroundTruth, degradation: Degradation, out: Path) -> None:
     """Write into `out` the capture and its ground truth with clothes or hair that no body model expresses."""
     degraded_clothing.add_clothing(degradation.kind, degradation.strength, degradation.rng, capture, body, truth, out)
-
-
-def degrade_masks(masks: Masks, capture: Capture, degradation: Degradation) -> Masks:
-    """Return degraded masks of the same views."""
-    return _change(degradation)(masks, capture, degradation.strength, degradation.rng)
-
-
-def degrade_fit(body: BodyFit, degradation: Degradation) -> BodyFit:
-    """Return a body fit with degraded poses or shape."""
-    return _change(degradation)(body, degradation.strength, degradation.rng)
 
 
 def degrade_settings(settings: TrainingSettings, degradation: Degradation) -> TrainingSettings:
@@ -128,9 +119,3 @@ def check_strengths(name: str, strengths: tuple[float, ...]) -> None:
     if not (strengths and onwards and valid):
         what = f"{'whole ' * kind.integer}numbers between {low:g} and {high:g} that {'rise' if way > 0 else 'fall'}"
         raise InputError(f"degradation {name}: give {what}, the mildest first")
-
-
-def _change(degradation: Degradation) -> Callable[..., Any]:
-    change = KINDS[degradation.kind].change
-    assert change is not None  # degradations of capture, masks and fit have one
-    return change

@@ -6,7 +6,7 @@ import pytest
 
 from hnerf.capture.capture import Capture
 from hnerf.errors import InputError, NotApplicableError
-from hnerf.study.degradations.catalogue import KINDS, Degradation, check_strengths, degrade_capture
+from hnerf.study.degradations.catalogue import KINDS, Degradation, check_strengths
 from tests.study.recording import FRAMES, write_detected, write_recording
 
 
@@ -14,7 +14,7 @@ def degraded(tmp_path: Path, kind: str, strength: float, seed: int = 0) -> Captu
     """Degrade the recording of tests/study/recording.py and load it."""
     capture = write_recording(tmp_path / "good")
     write_detected(capture)
-    degrade_capture(capture, Degradation(kind=kind, strength=strength, seed=seed), tmp_path / "bad")
+    Degradation(kind=kind, strength=strength, seed=seed).apply(capture, out=tmp_path / "bad")
     return Capture.load(tmp_path / "bad")
 
 
@@ -39,7 +39,7 @@ def test_one_camera_alone_differs_from_none(tmp_path: Path, kind: str) -> None:
     capture = write_recording(tmp_path / "good")
     alone = replace(capture, train_cameras=capture.train_cameras[:1])
     with pytest.raises(NotApplicableError, match="ada: has only one training camera; this needs several"):
-        degrade_capture(alone, Degradation(kind=kind, strength=1.0, seed=0), tmp_path / "bad")
+        Degradation(kind=kind, strength=1.0, seed=0).apply(alone, out=tmp_path / "bad")
 
 
 def test_one_training_camera_turns_about_its_centre(tmp_path: Path) -> None:
@@ -77,7 +77,7 @@ def test_a_late_camera_has_no_mask_where_it_had_none_before(tmp_path: Path) -> N
     capture = write_recording(tmp_path / "good")
     for name in capture.train_cameras:
         (capture.root / "masks" / name / "000004.png").unlink()
-    degrade_capture(capture, Degradation(kind="camera_out_of_step", strength=1.0, seed=0), tmp_path / "bad")
+    Degradation(kind="camera_out_of_step", strength=1.0, seed=0).apply(capture, out=tmp_path / "bad")
     masked = [[path.stem for path in sorted((tmp_path / "bad" / "masks" / name).iterdir())] for name in ("01", "02")]
     assert sorted(masked) == [["000002", "000004", "000008", "000010"], ["000002", "000006", "000008", "000010"]]
 

@@ -4,7 +4,7 @@ import torch
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.config import load_settings
-from hnerf.study.degradations.catalogue import Degradation, degrade_fit, degrade_settings
+from hnerf.study.degradations.catalogue import Degradation, degrade_settings
 from hnerf.study.degradations.fit import extreme_poses
 from tests.body.boxes import box_rig
 
@@ -19,7 +19,7 @@ def body() -> BodyFit:
 
 
 def test_pose_noise_is_root_mean_square_degrees_of_joints_that_move(body: BodyFit) -> None:
-    turned = degrade_fit(body, Degradation(kind="pose_noise", strength=5, seed=0)).theta
+    turned = Degradation(kind="pose_noise", strength=5, seed=0).apply(body).theta
     moves = body.rig.free & (body.rig.parents >= 0)
     angles_deg = torch.rad2deg(turned.norm(dim=-1))
     assert float(angles_deg[:, moves].square().mean().sqrt()) == pytest.approx(5, rel=0.05)
@@ -27,7 +27,7 @@ def test_pose_noise_is_root_mean_square_degrees_of_joints_that_move(body: BodyFi
 
 
 def test_a_wrong_shape_moves_vertices_by_as_much(body: BodyFit) -> None:
-    bad = degrade_fit(body, Degradation(kind="wrong_shape", strength=20, seed=3))
+    bad = Degradation(kind="wrong_shape", strength=20, seed=3).apply(body)
     moved_m = bad.rig.vertices_m - body.rig.vertices_m
     assert float(moved_m.square().sum(-1).mean().sqrt()) == pytest.approx(0.020, rel=1e-4)
     assert torch.equal(bad.theta, body.theta)

@@ -5,7 +5,7 @@ import pytest
 
 from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks, encode
-from hnerf.study.degradations.catalogue import Degradation, degrade_masks
+from hnerf.study.degradations.catalogue import Degradation
 from tests.study.recording import write_recording
 
 SIZE_PX = 100
@@ -22,7 +22,7 @@ def masks() -> Masks:
 def changed(tmp_path: Path, kind: str, strength: float) -> list[np.ndarray]:
     """Return the degraded masks."""
     capture = write_recording(tmp_path)
-    bad = degrade_masks(masks(), capture, Degradation(kind=kind, strength=strength, seed=0))
+    bad = Degradation(kind=kind, strength=strength, seed=0).apply(masks(), capture)
     assert list(bad.encoded) == [("01", 2), ("01", 4)]
     return [bad.get("01", frame) for frame in (2, 4)]
 
@@ -53,7 +53,7 @@ def test_a_limb_is_cut_off_around_its_bone(tmp_path: Path) -> None:
     people[:, 0, [3, 6, 10, 13]] = 40, 40, 1
     people[:, 0, [4, 7, 11, 14]] = 50, 40, 1
     np.savez_compressed(tmp_path / "keypoints.npz", **dict.fromkeys(capture.cameras, people))  # type: ignore[arg-type]
-    bad = degrade_masks(masks(), Capture.load(tmp_path), Degradation(kind="mask_limb", strength=100, seed=0))
+    bad = Degradation(kind="mask_limb", strength=100, seed=0).apply(masks(), Capture.load(tmp_path))
     cut = masks().get("01", 2) & ~bad.get("01", 2)
     assert cut[40, 38:58].all()
     rows, columns = np.nonzero(cut)
@@ -63,5 +63,5 @@ def test_a_limb_is_cut_off_around_its_bone(tmp_path: Path) -> None:
 
 def test_no_limb_is_missing_from_no_masks(tmp_path: Path) -> None:
     capture = write_recording(tmp_path)
-    spared = degrade_masks(masks(), capture, Degradation(kind="mask_limb", strength=1e-9, seed=0))
+    spared = Degradation(kind="mask_limb", strength=1e-9, seed=0).apply(masks(), capture)
     assert np.array_equal(spared.get("01", 2), masks().get("01", 2))
