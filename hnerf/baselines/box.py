@@ -10,6 +10,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.fields.base import Field
 from hnerf.fields.compositing import alpha_from_density
 from hnerf.fields.conditions import Conditions
+from hnerf.fields.samples import RaySamples
 from hnerf.fields.shell import Boxes
 
 SURFACE_DENSITY_PER_M = 20.0  # density of the surface: sigma_h of H-NeRF, 50 per scene unit of 2.5 m
@@ -69,3 +70,10 @@ class BoxField(Field):
         larger, within BAND_M. Only its sign and its zero set are meaningful, not its size."""
         threshold = SURFACE_DENSITY_PER_M * self.scale_m
         return BAND_M * (threshold - density) / (threshold + density)
+
+
+def box_samples(alpha: Tensor, colour: Tensor, d: Tensor, **given: Any) -> RaySamples:
+    """Return the samples of a field that knows no body: in the box, of one opacity, with no residual and no gradients,
+    unless these are given."""
+    known = {"alpha_dot": alpha, "in_box": torch.ones_like(d), "density": None, "residual": torch.zeros_like(d)}
+    return RaySamples(alpha=alpha, colour=colour, d=d, **(known | {"gradient_norm": d.new_zeros(0)} | given))

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from hnerf.baselines.box import BoxField
+from hnerf.baselines.box import BoxField, box_samples
 from hnerf.body.fit_result import BodyFit
 from hnerf.fields.conditions import Conditions
 from hnerf.fields.samples import RaySamples
@@ -27,15 +27,4 @@ class DynamicField(BoxField):
     def to_samples(self, density: Tensor, colour: Tensor, depths_m: Tensor, far_m: Tensor, **extra: Any) -> RaySamples:
         """Build samples from density (R, K) and colour (R, K, 3) at depths (R, K); the last sample extends to the end
         of the box."""
-        alpha, d = self.opacity(density, depths_m, far_m), self.pseudo_distance(density)
-        return RaySamples(
-            alpha=alpha,
-            alpha_dot=alpha,
-            in_box=torch.ones_like(d),
-            colour=colour,
-            density=None,
-            d=d,
-            residual=torch.zeros_like(d),
-            gradient_norm=d.new_zeros(0),
-            **extra,
-        )
+        return box_samples(self.opacity(density, depths_m, far_m), colour, self.pseudo_distance(density), **extra)

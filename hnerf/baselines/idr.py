@@ -8,6 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from hnerf.baselines.box import box_samples
 from hnerf.baselines.static import StaticField
 from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
@@ -106,10 +107,8 @@ class IdrField(StaticField):
             norms = self._evaluate(lower + (upper - lower) * draws.fine[:, :3])[1].norm(dim=-1)
         alpha = hit[:, None].to(d)
         colour = torch.zeros_like(rays.origins_m).index_copy(0, pick, seen)[:, None]
-        inside = torch.ones_like(d)
-        return RaySamples(
-            alpha, alpha, inside, colour, None, d, torch.zeros_like(d), norms, draws.background
-        ), surface_depths[:, None]
+        samples = box_samples(alpha, colour, d, gradient_norm=norms, background=draws.background)
+        return samples, surface_depths[:, None]
 
     def distance(self, points_m: Tensor) -> Tensor:
         """Return f (...) in metres at points (..., 3)."""

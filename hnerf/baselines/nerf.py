@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from hnerf.baselines.box import box_samples
 from hnerf.baselines.static import StaticField
 from hnerf.body.canonical import PosedBodies
 from hnerf.body.fit_result import BodyFit
@@ -68,16 +69,11 @@ class NerfField(StaticField):
         drawn = sample_pdf(first, near, far, weights_from_alpha(first_alpha.detach()), draws.fine)
         every = torch.cat([first, drawn], 1).sort(1).values
         alpha, density, colour = self._evaluate(self.fine, rays, every, far)
-        d = self.pseudo_distance(torch.cat([first_density, density], 1))
-        samples = RaySamples(
+        samples = box_samples(
             alpha=torch.cat([torch.zeros_like(first_alpha), alpha], 1),
             alpha_dot=torch.cat([first_alpha, torch.zeros_like(alpha)], 1),
-            in_box=torch.ones_like(d),
             colour=torch.cat([first_colour, colour], 1),
-            density=None,
-            d=d,
-            residual=torch.zeros_like(d),
-            gradient_norm=d.new_zeros(0),
+            d=self.pseudo_distance(torch.cat([first_density, density], 1)),
             background=draws.background,
         )
         return samples, torch.cat([first, every], 1)
