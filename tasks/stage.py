@@ -4,8 +4,9 @@ import inspect
 import json
 import logging
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Concatenate, Generic, ParamSpec
+from typing import Any, Concatenate, Generic, ParamSpec
 
 from prefect import Task
 from prefect.context import FlowRunContext
@@ -28,30 +29,31 @@ NETWORKS = "networks"  # beside a stage's own inputs, in its key
 Write = Callable[Concatenate[Path, P], dict[str, float]]
 
 
+@dataclass(eq=False)
 class Stage(Generic[P]):
     """A function `write(out, inputs...)` that fills a folder, made into a cached task.
 
     It is called as `stage(store, inputs...)`: within a flow run it is a Prefect task run; outside one it does the same
     work through the same store, without a server.
+
+    networks: files of hnerf.models that the stage uses if they are installed; the key depends on which ones are.
+    shared: through the bucket, if there is one; checkpoint: the file of unfinished work that is shared there, too.
     """
 
-    def __init__(
-        self,
-        write: Write[P],
-        name: str,
-        version: str,
-        resumable: bool,
-        networks: tuple[str, ...] = (),
-        shared: bool = True,
-        checkpoint: str = "",
-    ):
-        self.write, self.name, self.version, self.resumable = write, name, version, resumable
-        self.networks, self.shared, self.checkpoint = networks, shared, checkpoint
+    write: Write[P]
+    name: str
+    version: str
+    resumable: bool = False
+    networks: tuple[str, ...] = ()
+    shared: bool = True
+    checkpoint: str = ""
+
+    def __post_init__(self) -> None:
         self.task: Task[..., Artifact] = Task(
             fn=self._run,
-            name=name,
-            description=write.__doc__,
-            version=version,
+            name=self.name,
+            description=self.write.__doc__,
+            version=self.version,
             cache_policy=StorePolicy(),
             persist_result=True,
             result_serializer="json",
@@ -100,18 +102,7 @@ def image_count(inputs: Iterable[Input]) -> int:
     return max(counts, default=1)
 
 
-def stage(
-    name: str,
-    version: str,
-    resumable: bool = False,
-    networks: tuple[str, ...] = (),
-    shared: bool = True,
-    checkpoint: str = "",
-) -> Callable[[Write[P]], Stage[P]]:
-    """Make a function into a Stage (decorator). Artifacts lie under `<store>/<name>/`; raise `version` when the same
-    inputs give another result.
-
-    networks: files of hnerf.models that the stage uses if they are installed; the key depends on which ones are.
-    shared: through the bucket, if there is one; checkpoint: the file of unfinished work that is shared there, too.
-    """
-    return lambda write: Stage(write, name, version, resumable, networks, shared, checkpoint)
+def stage(name: str, version: str, **options: Any) -> Callable[[Write[P]], Stage[P]]:
+    """Make a function into a Stage with these options (decorator). Artifacts lie under `<store>/<name>/`; raise
+    `version` when the same inputs give another result."""
+    return lambda write: Stage(write, name, version, **options)
