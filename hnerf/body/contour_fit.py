@@ -156,17 +156,15 @@ def _contain(edge: Outline, rim_px: np.ndarray, spacing_px: float) -> tuple[np.n
 
 
 def refine_with_outlines(
-    problem: Problem, pose: Pose, edges: list[list[Outline | None]], settings: FitSettings, up: int
+    problem: Problem, pose: Pose, edges: list[list[Outline | None]], settings: FitSettings, ground: int | None
 ) -> Pose:
     """Refine a pose by Gauss-Newton steps on outlines and keypoints, with matches made anew before each step.
 
-    edges: by frame and camera, None without a mask; up: the world's vertical axis, used with one camera only.
+    edges: by frame and camera, None without a mask; ground: the world's vertical axis where a single camera sees a
+    person stand on height 0, else None.
     """
     faces = pose.rig.faces.numpy()
-    only = problem.observations.cameras[0] if len(problem.observations.cameras) == 1 else None
-    if only is not None and only.centre_m[up] <= GROUND_OUTLIER_M:
-        only = None  # height 0 is not the ground
-    sole_m = 0.0
+    only, sole_m = problem.observations.cameras[0], 0.0
     for step in tracked(range(settings.contour_steps), "outlines", settings.contour_steps):
         articulation = Articulation(pose.rig)
         joints = articulation.pose(pose)
@@ -180,9 +178,9 @@ def refine_with_outlines(
                 for camera, scale_m, edge in zip(problem.observations.cameras, problem.scale_m, row, strict=True)
                 if edge is not None
             ]
-            if only is not None:
-                found.append(_ground_contact(vertices_m, up, sole_m))
-                found_m = [_sole_m(only, e, float(problem.scale_m[0, t]), vertices_m, up) for e in row if e]
+            if ground is not None:
+                found.append(_ground_contact(vertices_m, ground, sole_m))
+                found_m = [_sole_m(only, e, float(problem.scale_m[0, t]), vertices_m, ground) for e in row if e]
                 soles_m += [sole_m for sole_m in found_m if sole_m is not None]
             for rows in found:
                 add_residuals(equations, articulation, joints, t, rows)
@@ -200,7 +198,7 @@ def _ground_contact(vertices_m: np.ndarray, up: int, sole_m: float) -> ContourRe
     """Return the residual of the lowest vertex against a sole on the ground at height 0, where calibrations usually put
     it: with one camera this determines the depth.
 
-    Geman-McClure weights let it go where the body is in the air or the world's origin lies elsewhere.
+    Geman-McClure weights let it go where the body is in the air.
     """
     lowest = int(vertices_m[:, up].argmin())
     height_m = vertices_m[lowest, up] - sole_m

@@ -22,7 +22,7 @@ from hnerf.body.contour_fit import Outline, outline, refine_with_outlines
 from hnerf.body.fingers import fit_fingers
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.given_start import given_poses_note, initial_pose_from_given, observations_of_pose
-from hnerf.body.ground import Ground
+from hnerf.body.ground import Ground, is_ground
 from hnerf.body.hand_points import PalmTerm, has_fingers, observe_hands
 from hnerf.body.initial_root import root_from_image, root_from_space
 from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel
@@ -72,7 +72,9 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
         up, single = "xyz".index(capture.up), len(observations.cameras) == 1
         hands, step_s = observe_hands(capture), median_step(capture.frames) / capture.fps
         terms: dict[str, Any] = {"limb_depths": observe_limb_depths(capture, observations)}
-        terms |= {"balance": Balance(up), "ground": Ground(up)} if single else {}
+        on_ground = single and is_ground(observations.cameras[0], observations.keypoints(0), capture.up)
+        terms |= {"balance": Balance(up)} if single else {}
+        terms |= {"ground": Ground(up)} if on_ground else {}
         with _timed(seconds, "start"):
             pose = given_pose or initial_pose(capture, observations, model)
         palm = PalmTerm(hands) if hands and has_fingers(pose.rig) else None
@@ -94,7 +96,7 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
                 problem = make_problem(model, pose, observations, smoothness, settings, offsets=1, proportions=1)
                 problem = replace(problem, palm=palm, posture_prior=posture_prior, **terms)
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
-                pose = refine_with_outlines(problem, pose, edges, settings, up)
+                pose = refine_with_outlines(problem, pose, edges, settings, up if on_ground else None)
             with _timed(seconds, "clothes"):
                 pose = refine_with_clothing(problem, pose, edges)
         if palm and masks is not None:
@@ -128,7 +130,7 @@ def initial_pose(capture: Capture, observations: Observations, model: BodyModel)
     camera.
 
     A frame where that fails takes the placement of the nearest frame where it does not. Raises InputError where it
-    fails in most frames.
+    fails in most of the frames in which anything of a person is seen.
     """
     rig = model.rig(None)
     articulation = Articulation(rig)
@@ -136,13 +138,13 @@ def initial_pose(capture: Capture, observations: Observations, model: BodyModel)
     if len(observations.cameras) > 1:
         roots = [root_from_space(rest_m, points_m) for points_m in observations.space_m.numpy()]
     else:
-        views = torch.cat([observations.pixels[0], observations.confidence[0, ..., None]], -1).numpy()
-        roots = [root_from_image(observations.cameras[0], rest_m, keypoints) for keypoints in views]
+        roots = [root_from_image(observations.cameras[0], rest_m, seen) for seen in observations.keypoints(0)]
     placed = {t: root for t, root in enumerate(roots) if root is not None}
-    if len(placed) < len(roots) / 2:
+    shown = int((observations.confidence > 0).any(-1).any(0).sum())  # the person may come late
+    if not placed or len(placed) < shown / 2:
         raise InputError(
             f"{capture.root / 'keypoints.npz'}: head and trunk are found by enough cameras in only {len(placed)} of "
-            f"{len(roots)} frames; check the keypoint files and the calibration, or leave those frames out"
+            f"{shown} frames with a person; check the keypoint files and the calibration, or leave those frames out"
         )
     nearest = [placed[min(placed, key=lambda known: abs(known - t))] for t in range(len(roots))]
     theta = torch.zeros(len(roots), len(rig.joints_m), 3, dtype=torch.float64)

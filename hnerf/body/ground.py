@@ -3,16 +3,29 @@
 With one camera, how far away somebody is follows from where he stands; from his stature alone it is off by decimetres.
 """
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from hnerf.body.articulation import Pose
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.robust import geman_mcclure
+from hnerf.capture.standing import STANDING_M, stature_on_ground_m
+from hnerf.geometry.camera import Camera
 
 FEET = list(range(19, 25))  # toes and heels in BODY_25
 GROUND_STD_M = 0.02  # of a keypoint of the lower foot above the ground, beyond its height on the rest body
-OUTLIER_M = 0.25  # of a body in the air, or of a world whose origin lies elsewhere
+OUTLIER_M = 0.25  # of a body in the air
+MIN_CAMERA_M = 0.15  # above the ground
+
+
+def is_ground(camera: Camera, keypoints: np.ndarray, up: str) -> bool:
+    """Return whether world height 0 can be the ground under a person whom a single camera sees as keypoints (n, 25, 3):
+    it lies below the camera, and who stands there is as tall as people are, if feet and nose are ever seen."""
+    stature_m = stature_on_ground_m(camera, keypoints, up)
+    low, high = STANDING_M
+    above = camera.centre_m["xyz".index(up)] > MIN_CAMERA_M
+    return bool(above and (np.isnan(stature_m) or low <= stature_m <= high))
 
 
 class Ground:

@@ -11,11 +11,10 @@ from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.observations import Observations
 from hnerf.body.robust import geman_mcclure
 from hnerf.capture.capture import Capture
-from hnerf.capture.people import person_heights_px
+from hnerf.detection.merge import nearest_person
 
 # Of a depth between two landmarks against the truth: 45 to 130 mm, bias included, on two rendered recordings.
 DEPTH_STD_M, OUTLIER_M = 0.1, 0.3
-SAME_PERSON = 0.15  # of the person's height: median distance of keypoints and landmarks of one person
 
 # BODY_25 keypoints that are one landmark of BlazePose: shoulders, elbows, wrists, hips, knees, ankles.
 LANDMARKS = {2: 12, 3: 14, 4: 16, 5: 11, 6: 13, 7: 15, 9: 24, 10: 26, 11: 28, 12: 23, 13: 25, 14: 27}
@@ -58,11 +57,11 @@ def observe_limb_depths(capture: Capture, observations: Observations) -> LimbDep
         return None
     own, places = list(LANDMARKS), list(LANDMARKS.values())
     pixels, metres = (points[:, :, places] for points in found)
-    keypoints = torch.cat([observations.pixels[0], observations.confidence[0, ..., None]], -1).numpy()[:, own]
+    keypoints = observations.keypoints(0)[:, own]
     depths_m, trust = np.zeros((2, len(keypoints), len(LIMBS)))
     ends = np.array([[own.index(end) for end in limb] for limb in LIMBS])
     for t, subject in enumerate(keypoints):
-        person = _same_person(subject, pixels[t])
+        person = nearest_person(subject, pixels[t])
         if person is not None:
             depth_m, seen = metres[t, person, :, 2], pixels[t, person, :, 2]
             depths_m[t] = depth_m[ends[:, 1]] - depth_m[ends[:, 0]]
@@ -73,15 +72,3 @@ def observe_limb_depths(capture: Capture, observations: Observations) -> LimbDep
     rays = np.column_stack([middle, np.ones(len(middle))]) @ np.linalg.inv(camera.K).T @ camera.R
     away = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     return LimbDepths(*(torch.from_numpy(part) for part in (depths_m, trust, away)))
-
-
-def _same_person(subject: np.ndarray, people: np.ndarray) -> int | None:
-    """Return which of people (P, K, 3) has the keypoints of the subject (K, 3); None if none is near enough."""
-    both = (subject[:, 2] > 0) & (people[..., 2] > 0)
-    distance = np.where(both, np.linalg.norm(people[..., :2] - subject[:, :2], axis=-1), np.nan)
-    known = np.any(both, axis=1)
-    if not known.any():
-        return None
-    median = np.where(known, np.nanmedian(np.where(known[..., None], distance, 0), axis=1), np.inf)
-    nearest = int(median.argmin())
-    return nearest if median[nearest] < SAME_PERSON * float(person_heights_px(subject[None])[0]) else None

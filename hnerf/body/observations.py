@@ -29,6 +29,10 @@ class Observations:
         """Return the keypoints as the cameras see them."""
         return Views(self.cameras, self.pixels, self.confidence)
 
+    def keypoints(self, camera: int) -> np.ndarray:
+        """Return what one camera sees, (n, 25, 3): x_px, y_px, confidence."""
+        return torch.cat([self.pixels[camera], self.confidence[camera, ..., None]], -1).numpy()
+
 
 def observe(capture: Capture) -> Observations:
     """Return the keypoints of every frame, from training cameras only. Raises InputError where the capture has none."""

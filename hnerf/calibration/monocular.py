@@ -4,15 +4,13 @@ import dataclasses
 
 import numpy as np
 
+from hnerf.capture.standing import STANDING_M, stature_on_ground_m
 from hnerf.geometry.camera import Camera
 
 FIELD_OF_VIEW_DEG = (10.0, 120.0)  # of the longer side; people are not filmed with lenses beyond this range
 PRINCIPAL_POINT_RANGE = 1 / 3  # of the image's sides, about the middle: an uncropped image's principal point is in it
 MAX_ASPECT_ERROR = 0.1  # of the pixel aspect ratio from 1
-STANDING_M = (1.2, 2.1)
 UNMEASURED_M = 1e-6  # height of a camera whose height nobody has measured
-NOSE, SOLES = 0, (19, 21, 22, 24)  # of BODY_25: big toes and heels
-NOSE_SHARE = 0.92  # of an adult's stature (Winter 2009, figure 4.1: eyes at 0.936)
 
 
 def intrinsics_reasons(camera: Camera) -> list[str]:
@@ -61,28 +59,3 @@ def raised_above_ground(camera: Camera, keypoints: np.ndarray, up: str, stature_
         return camera, ""
     words = f"its height is not known: {height_m:.2f} m if the camera is level and the person {stature_m:.2f} m tall"
     return dataclasses.replace(camera, t_m=camera.t_m - height_m * camera.R @ vertical), words
-
-
-def stature_on_ground_m(camera: Camera, keypoints: np.ndarray, up: str) -> float:
-    """Return the person's stature if they stand on height 0: the median over frames of the nose's height above the
-    standing foot, divided by NOSE_SHARE; NaN if never seen.
-
-    The standing foot is where a ray to a toe or heel meets height 0 closest to the camera: rays to a lifted foot meet
-    it farther away. keypoints (frames, 25, 3).
-    """
-    vertical = "xyz".index(up)
-    origin = camera.centre_m
-    _, soles = camera.rays(keypoints[:, SOLES, :2])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        far_m = -origin[vertical] / soles[..., vertical]
-    far_m = np.where((far_m > 0) & (keypoints[:, SOLES, 2] > 0), far_m, np.inf)
-    nearest = far_m.argmin(1)
-    frames = np.flatnonzero(np.isfinite(far_m.min(1)) & (keypoints[:, NOSE, 2] > 0))
-    if len(frames) == 0:
-        return float("nan")
-    foot_m = origin + far_m[frames, nearest[frames], None] * soles[frames, nearest[frames]]
-    _, noses = camera.rays(keypoints[frames, NOSE, :2])
-    level = [axis for axis in range(3) if axis != vertical]
-    away_m = foot_m - origin
-    along_m = (away_m[:, level] * noses[:, level]).sum(1) / (noses[:, level] ** 2).sum(1)
-    return float(np.median(origin[vertical] + along_m * noses[:, vertical])) / NOSE_SHARE

@@ -147,14 +147,15 @@ class Capture:
         return all((self.root / PERSON / camera).is_dir() for camera in self.train_cameras)
 
     def given_poses(self) -> GivenPoses | None:
-        """Return the poses of a body model that come with the recording, a row for each of `frames`; None where there
-        are none."""
+        """Return the poses of a body model that come with the recording, a row for each of `frames`; None where none of
+        these has one."""
         path = self.root / "poses.npz"
         if not path.exists():
             return None
         poses = GivenPoses.load(path)
         rows = np.searchsorted(self.stored_frames or self.frames, self.frames)
-        return dataclasses.replace(poses, theta=poses.theta[rows], root=poses.root[rows])
+        poses = dataclasses.replace(poses, theta=poses.theta[rows], root=poses.root[rows])
+        return poses if poses.known.any() else None
 
     def with_cameras(self, cameras: dict[str, Camera]) -> "Capture":
         """Return the same recording seen through other (refined) cameras."""

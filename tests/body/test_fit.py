@@ -8,7 +8,7 @@ import torch
 from hnerf.body import contour_fit
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.body_model import body_model
-from hnerf.body.fit import _outlines, _report, fit_body, make_problem, resolve_depth_flips
+from hnerf.body.fit import _outlines, _report, fit_body, initial_pose, make_problem, resolve_depth_flips
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel
 from hnerf.body.observations import observe, runs
@@ -73,6 +73,15 @@ def test_one_camera_finds_the_depth(tmp_path: Path) -> None:
     fit, _ = fit_body(capture, Silhouettes(capture, truth), FitSettings(contour_steps=6))  # type: ignore[arg-type]
     assert joint_error_m(fit, truth).mean() < 0.06
     assert fit.vertices_m()[..., 2].min(1).values.mean() < 0.01  # bare feet stand on the ground
+
+
+def test_one_camera_finds_the_stature_where_height_0_is_not_the_ground(tmp_path: Path) -> None:
+    """The world's origin is a board on a table, 0.7 m above the floor."""
+    truth = moving_body((0, 1))
+    capture = record(tmp_path, truth, RING, ("0",))
+    below = capture.with_cameras({n: replace(c, t_m=c.t_m + c.R @ [0, 0, 0.7]) for n, c in capture.cameras.items()})
+    _, report = fit_body(below, None, FitSettings())
+    assert 1.6 < report["stature_m"] < 2.0  # as the prior has it
 
 
 def test_before_one_camera_somebody_stands_on_his_soles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,6 +151,16 @@ def test_a_person_seen_by_too_few_cameras_is_bad_input(tmp_path: Path) -> None:
     (tmp_path / "keypoints.npz").unlink()
     with pytest.raises(InputError, match=r"no keypoints"):
         fit_body(capture, None, FitSettings())
+
+
+def test_frames_before_the_person_comes_do_not_count(tmp_path: Path) -> None:
+    capture = record(tmp_path, moving_body((0, 1, 2, 3, 4)), RING, ("0", "1"))
+    with np.load(tmp_path / "keypoints.npz") as stored:
+        keypoints = dict(stored)
+    for seen in keypoints.values():
+        seen[:3, ..., 2] = 0
+    np.savez(tmp_path / "keypoints.npz", **keypoints)
+    assert initial_pose(capture, observe(capture), body_model(FitSettings())).root.isfinite().all()
 
 
 def test_runs_break_at_gaps_and_between_splits(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from hnerf.capture.given_poses import GivenPoses
 from hnerf.config import CalibrationSettings, FitSettings, SegmentationSettings
 from hnerf.segmentation.segment import segment
 from tests.body.made_up_smpl import write_smpl
-from tests.body.recorded_body import Silhouettes, record, ring_camera
+from tests.body.recorded_body import Silhouettes, moving_body, record, ring_camera
 
 RING = {str(k): ring_camera(str(k), 0.3 + k * np.pi / 2) for k in range(4)}
 LIMBS = tuple(f"{bone}.{side}" for bone in ("upperarm01", "lowerarm01", "upperleg01", "lowerleg01") for side in "LR")
@@ -124,3 +124,9 @@ def test_anny_is_fitted_to_outlines_from_given_poses_alone(model_file: Path, tmp
     wrists = [joints_m(body)[:, body.rig.joint_names.index("wrist.L")] for body in (fit, truth)]
     assert float((wrists[0] - wrists[1]).norm(dim=-1).max()) < 0.08 and min(report["silhouette_iou"]) > 0.7
     assert report["given_poses"].startswith("are SMPL's: used as the start, by corresponding joints")
+
+
+def test_frames_of_which_none_has_a_pose_have_no_given_poses(tmp_path: Path) -> None:
+    capture = record(tmp_path, moving_body((0, 1)), {"0": ring_camera("0", 0.0)}, ("0",))
+    GivenPoses.unknown(2).save(tmp_path / "poses.npz")
+    assert capture.given_poses() is None

@@ -6,8 +6,9 @@ import torch
 
 from hnerf.body.anny import anny_rig
 from hnerf.body.articulation import Articulation, Pose, with_offsets
-from hnerf.body.ground import FEET, Ground
+from hnerf.body.ground import FEET, Ground, is_ground
 from hnerf.body.normal_equations import NormalEquations
+from tests.body.recorded_body import moving_body, ring_camera
 from tests.body.test_articulation import random_pose
 
 
@@ -55,3 +56,23 @@ def test_the_gradient_of_the_ground_is_that_of_its_cost() -> None:
     slope = (cost_and_equations(pose)[1].frame_gradient * direction.numpy()).sum()
     assert abs(slope) > 1e-2
     np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-6, rtol=1e-4)
+
+
+def test_height_0_is_the_ground_where_who_stands_there_is_as_tall_as_people_are() -> None:
+    """Seen from a metre above the floor. If height 0 is 0.7 m below the floor, the ray to a foot meets it 1.7 times as
+    far away, and the person is 1.7 times as tall; 0.7 m above it, 0.3 times. Without feet, nothing speaks against it,
+    save that the camera is below."""
+    body, camera = moving_body((0,)), ring_camera("0", 0.0)
+    keypoints_m = torch.einsum("kv,nvd->nkd", body.rig.keypoint_weights, body.vertices_m()).double().numpy()
+    keypoints = np.concatenate([camera.project(keypoints_m)[0], np.ones((1, 25, 1))], -1)
+    unseen = keypoints.copy()
+    unseen[:, FEET, 2] = 0
+    for raised_m, whole, without_feet in (
+        (0.0, True, True),
+        (0.7, False, True),
+        (-0.7, False, True),
+        (-1.0, False, False),
+    ):
+        shifted = replace(camera, t_m=camera.t_m - camera.R @ [0, 0, raised_m])
+        assert is_ground(shifted, keypoints, "z") == whole
+        assert is_ground(shifted, unseen, "z") == without_feet

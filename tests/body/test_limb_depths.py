@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from hnerf.body.articulation import Articulation, Pose
-from hnerf.body.limb_depths import LIMBS, LimbDepths, _same_person, observe_limb_depths
+from hnerf.body.limb_depths import LIMBS, LimbDepths, observe_limb_depths
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.observations import observe
 from hnerf.capture.capture import LANDMARKS
@@ -73,22 +73,6 @@ def test_landmarks_of_the_subject_give_depths(tmp_path: Path) -> None:
     assert float(depths.trust[0, LIMBS.index((12, 13))]) == pytest.approx(0.8) and not depths.trust[1].any()
     hips = body.vertices_m()[0].numpy().mean(0) - camera.centre_m
     assert float(depths.away[0] @ torch.from_numpy(hips / np.linalg.norm(hips)).double()) > 0.98
-
-
-def test_the_person_is_compared_where_both_are_seen() -> None:
-    """Of a subject 100 px tall, seen at three of five places, the second of three people is 10 px off at two, and far
-    off at places that either lacks; the first is 20 px off, the last not seen at all. 15 px off are another person."""
-    subject = np.array([[0, 0, 1], [0, 100, 1], [30, 50, 1], [0, 0, 0], [0, 0, 0.0]])
-    people = np.stack([subject + np.array([20, 0, 0]), subject + np.array([10, 0, 0]), 0 * subject])
-    people[1, 2] = 500, 500, 0
-    people[1, 3:] = 500, 500, 1
-    people[0, 3:, 2] = 1
-    assert _same_person(subject, people) == 1
-    people[1, :2, 0] = 14.9
-    assert _same_person(subject, people) == 1
-    people[1, :2, 0] = 15.1
-    assert _same_person(subject, people) is None
-    assert _same_person(subject, people[2:]) is None
 
 
 def test_the_direction_to_the_person_is_that_of_keypoints_that_are_seen(tmp_path: Path) -> None:

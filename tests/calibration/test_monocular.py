@@ -3,8 +3,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hnerf.calibration.monocular import ground_reasons, intrinsics_reasons, raised_above_ground, stature_on_ground_m
+from hnerf.calibration.monocular import ground_reasons, intrinsics_reasons, raised_above_ground
 from hnerf.capture.ingest import ingest
+from hnerf.capture.standing import stature_on_ground_m
 from hnerf.capture.subject import subject_keypoints
 from hnerf.config import CaptureSettings
 from tests.calibration.synthetic import STANDING_M, detections, ring
