@@ -28,15 +28,16 @@ class Given:
     name: str = "given"
 
     def mask(self, frame: int, prior: Prior) -> np.ndarray:
-        """Return the given mask, reduced to the subject where the prior finds it. Raises InputError where it is
-        missing."""
+        """Return the given mask, reduced to the subject where the prior finds it; empty if the subject is known to be
+        outside the image. Raises InputError where it is missing."""
         mask = self.capture.given_mask(self.camera, frame)
         if mask is None:
             raise InputError(
                 f"masks/{self.camera}/{frame:06d}.png: mask missing; give a mask for every frame or for none"
             )
         subject = components_within(mask, prior.reach)
-        return subject if subject.any() else mask
+        elsewhere = prior.height_px > 0 and not prior.reach.any()
+        return subject if subject.any() or elsewhere else mask
 
 
 @dataclass(frozen=True)

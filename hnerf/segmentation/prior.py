@@ -109,7 +109,7 @@ def _body_prior(
 ) -> Prior:  # fmt: skip
     stick = _stick_figure(capture.cameras[camera], poses_px[number])
     covered = silhouette(capture.cameras[camera], vertices_m[number], faces)
-    core = cv2.erode(covered.astype(np.uint8), disc(CORE_SHARE * stick.height_px)).astype(bool)
+    core = _core(covered, stick.height_px)
     covered |= stick.body
     return Prior.around(core, covered, covered, stick.height_px, reach / 2, _is_upright(capture, camera))
 
@@ -128,9 +128,15 @@ def _network_prior(capture: Capture, camera: str, poses_px: np.ndarray, reach: f
     covered = (likely > LIKELY) & figure.reach
     if not covered.any():  # missed in this image
         return figure
-    core = cv2.erode((likely > SURE).astype(np.uint8), disc(CORE_SHARE * figure.height_px)).astype(bool)
+    core = _core(likely > SURE, figure.height_px)
     body = covered | figure.core
     return Prior.around(core & covered, body, body, figure.height_px, reach / 2, _is_upright(capture, camera))
+
+
+def _core(covered: np.ndarray, height_px: float) -> np.ndarray:
+    """Return what lies deep enough inside (H, W) bool for a limb, in a time that does not grow with the person."""
+    depth_px = cv2.distanceTransform(covered.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    return np.asarray(depth_px > max(1, round(CORE_SHARE * height_px)))
 
 
 def _is_upright(capture: Capture, camera: str) -> bool:

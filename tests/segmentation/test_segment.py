@@ -12,6 +12,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.masks import Masks, encode, movement_px
 from hnerf.config import SegmentationSettings
 from hnerf.errors import InputError
+from hnerf.segmentation.backends import Given
 from hnerf.segmentation.cut import components_within
 from hnerf.segmentation.difference import difference, exposure_corrected, masked_median, noise_level, visible_background
 from hnerf.segmentation.edge import refine_edge
@@ -156,6 +157,16 @@ def test_given_masks_come_first_and_lose_other_people(tmp_path: Path) -> None:
     assert masks.report["cameras"]["c0"]["backend"] == "given"
     for view, mask in truth.items():
         np.testing.assert_array_equal(masks.get(*view), mask)
+
+
+def test_a_given_mask_of_somebody_else_is_no_mask_of_the_subject(tmp_path: Path) -> None:
+    """The subject is known to be outside the image; where nothing is known of the subject, the mask is believed."""
+    capture, truth = write_scene(tmp_path)
+    write_masks(capture, truth)
+    nowhere = np.zeros_like(truth["c0", 0])
+    for height_px, believed in ((400.0, False), (0.0, True)):
+        mask = Given(capture, "c0").mask(0, Prior(nowhere, nowhere, nowhere, nowhere, height_px))
+        assert mask.any() == believed
 
 
 @pytest.mark.parametrize(
