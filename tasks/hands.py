@@ -17,6 +17,7 @@ def find_hands(out: Path, recording: Artifact) -> dict[str, float]:
 
 
 def needs_hands(recording: Artifact, settings: DetectionSettings) -> bool:
-    """Return whether to look for hands: the settings allow it, the network is installed, and keypoints say where."""
-    wanted = settings.hands == "auto" and has_model(HAND_LANDMARKS)
-    return wanted and Capture.load(recording.root).has_keypoints
+    """Return whether to look for hands: the settings allow it, the network is installed, keypoints say where, and
+    several cameras see them, as a fit of fingers needs."""
+    wanted, capture = settings.hands == "auto" and has_model(HAND_LANDMARKS), Capture.load(recording.root)
+    return wanted and capture.has_keypoints and len(capture.train_cameras) > 1

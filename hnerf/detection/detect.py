@@ -28,6 +28,7 @@ from hnerf.errors import InputError
 from hnerf.models import POSE_DETECTOR, model_file
 from hnerf.processes import end_with_parent
 from hnerf.progress import report as report_progress
+from hnerf.progress import tracked
 
 KEYPOINTS: KeypointSetName = "blazepose_33"
 PROGRESS_S = 0.5  # between two counts of the images that are done
@@ -44,8 +45,9 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
     for name in (POSE_DETECTOR, f"pose_landmark_{settings.size}.tflite"):
         model_file(name)
     _find_people(capture, settings.size, out)
-    found = {name: _load(out, name) for name in capture.train_cameras}
-    if not any((people["points_px"][..., 2] > 0).any() for people in found.values()):
+    found = {name: _load(out, name, "points_px", "seconds") for name in capture.train_cameras}
+    alone = settings.source == "network" or not capture.has_keypoints
+    if alone and not any((people["points_px"][..., 2] > 0).any() for people in found.values()):
         raise InputError(
             f"{capture.name}: nobody found in any image of the training cameras; a person must be seen from head to "
             "feet, upright, and be no smaller than a tenth of the image"
@@ -54,14 +56,13 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
     for name, points in people.items():  # what the network guesses outside the image counts as not seen
         points *= capture.cameras[name].holds(points[..., :2])[..., None]
     shutil.copytree(capture.root, out, ignore=shutil.ignore_patterns("keypoints.npz"), dirs_exist_ok=True)
-    alone = settings.source == "network" or not capture.has_keypoints
     write_keypoints(out, people if alone else _with_own(capture, people))
     detected = Capture.load(out)
     ranked = ranked_people(detected)
     if alone:  # a recording's own keypoints may lack what is hidden
         check_subject(capture, ranked[0])
     for name, subject in zip(capture.train_cameras, ranked[0].keypoints, strict=True):
-        keep_subject(out, capture, name, subject, people[name], found[name])
+        keep_subject(out, capture, name, subject, people[name], _load(out, name, "masks", "regions"))
     draw_people(out / PICTURE, detected, ranked)
     cameras = {name: _summary(people) for name, people in found.items()}
     report = {"cameras": cameras, "people": people_rows(detected, ranked)}
@@ -122,11 +123,12 @@ def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> None:
     """
     cv2.setNumThreads(1)
     started = time.perf_counter()
-    images = (capture.image(camera, frame) for frame in capture.frames)
+    frames = tracked(capture.frames, "detection", len(capture.frames))
+    images = (capture.image(camera, frame) for frame in frames)
     everybody = []
     for frame, people in zip(capture.frames, track(images, PersonDetector(), LandmarkNetwork(size)), strict=True):
-        everybody.append(people)
         write_image(out / PERSON / camera / f"{frame:06d}.png", _soft_mask(people, capture, camera))
+        everybody.append([person._replace(mask=_eight_bit(person.mask)) for person in people])
     path = out / LANDMARKS / f"{camera}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_suffix(".partial")
@@ -135,7 +137,7 @@ def find_in_camera(capture: Capture, camera: str, size: str, out: Path) -> None:
             file,
             points_px=_by_frame(everybody, lambda person: person.points_px, (POINTS, 3)),
             points_m=_by_frame(everybody, lambda person: person.points_m, (POINTS, 3)),
-            masks=_by_frame(everybody, lambda person: _eight_bit(person.mask), (SIZE, SIZE), np.uint8),
+            masks=_by_frame(everybody, lambda person: person.mask, (SIZE, SIZE), np.uint8),
             regions=_by_frame(everybody, lambda person: np.array([*person.region.centre_px, *person.region[1:]]), (4,)),
             seconds=np.array(time.perf_counter() - started),
         )
@@ -165,9 +167,10 @@ def _eight_bit(likely: np.ndarray) -> np.ndarray:
     return (255 * likely).round().astype(np.uint8)
 
 
-def _load(out: Path, camera: str) -> dict[str, np.ndarray]:
+def _load(out: Path, camera: str, *names: str) -> dict[str, np.ndarray]:
+    """Return some of what `find_in_camera` stored; all masks would fill the memory."""
     with np.load(out / LANDMARKS / f"{camera}.npz", allow_pickle=False) as stored:
-        return dict(stored)
+        return {name: stored[name] for name in names}
 
 
 def _summary(people: dict[str, np.ndarray]) -> dict[str, Any]:

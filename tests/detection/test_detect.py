@@ -90,6 +90,15 @@ def test_nobody_is_one_line(recording: Capture, tmp_path: Path, monkeypatch: pyt
         detect(recording, NETWORK, tmp_path / "out")
 
 
+def test_a_network_that_finds_nobody_leaves_the_recordings_own_keypoints(
+    recording: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "LandmarkNetwork", lambda size: lambda image, region: None)
+    detect(recording, DetectionSettings(), tmp_path / "out")
+    kept, own = Capture.load(tmp_path / "out").keypoints("01"), recording.keypoints("01")
+    assert kept is not None and own is not None and np.array_equal(kept, own)
+
+
 def test_missing_networks_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "none"))
     capture = ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture")
