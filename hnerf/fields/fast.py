@@ -35,6 +35,7 @@ HALF_SAMPLES_UNTIL = 0.75  # of the training: as accurate on three captures, in 
 MAX_NEIGHBOUR_DISTANCE_M = 0.03  # canonical; neighbours on a ray that are farther apart lie on different limbs
 MIN_DESCENT_M = 1e-4  # of d_hat from one sample to the next; below it the surface position has no useful derivative
 MIN_COLOUR_WEIGHT = 1e-3  # samples of less weight are not coloured
+MIN_SHOWN_WEIGHT = 1e-2  # the same in rendering, where their neighbours stand in for them: - 0.002 dB on valid-wave
 
 
 class FastField(Field):
@@ -111,9 +112,9 @@ class FastField(Field):
         for depth_m in torch.arange(-s.inner_m, s.outer_m, TIGHTEN_STEP_M).tolist():
             old = torch.nonzero((-self.inner_m <= depth_m) & (depth_m <= self.outer_m))[:, 0]
             described = bodies.describe((bodies.vertices_m[0] + depth_m * normals)[old], only[old], self.reach_m)
-            seen = torch.zeros_like(described.near)
-            for one in pose.split(1):
-                d_hat = described.d + self._residual(described, one, only[old])
+            seen, pick = torch.zeros_like(described.near), self._trained(described)
+            for residual in self.field.residual_in_each(described.y[pick], described.d[pick], pose):
+                d_hat = described.d.index_add(0, pick, residual)
                 seen |= described.near & (d_hat.abs() < settled_m)
             for side, extent in extent_m.items():
                 extent.scatter_reduce_(0, described.vertex[seen], side * described.d[seen], "amax")
@@ -180,8 +181,8 @@ class FastField(Field):
         # an opaque core: nothing shines through if the surface lies deeper
         end = torch.where(core[hit, None], 1.0, alpha_dot[:, -1:])
         alpha = torch.cat([alpha_dot[:, :-1], end], 1)
-        visible = weights_from_alpha(alpha.detach()).flatten() > MIN_COLOUR_WEIGHT
-        colour = self._colour(scene.bodies, move_to_surface(described, d + residual), pose, row, visible)
+        on_surface, weights = move_to_surface(described, d + residual), weights_from_alpha(alpha.detach())
+        colour = self._ray_colours(scene, on_surface, weights, row)
         norms = d.new_zeros(0)
         if draws.probe is not None:
             norms = self._gradient_norms(described, skin, pose, row, draws.probe[hit], depths.shape[1])
@@ -194,7 +195,7 @@ class FastField(Field):
             return values.new_full((len(met), *values.shape[1:]), elsewhere).index_copy(0, hit, values)
 
         alpha, alpha_dot, residual = (everywhere(values, 0.0) for values in (alpha, alpha_dot, residual))
-        colour = everywhere(colour.view(len(hit), depths.shape[1], 3), 0.0)
+        colour = everywhere(colour, 0.0)
         seen = described.near.view_as(d).any(1, keepdim=True)
         d, in_box = everywhere(d, self.reach_m), everywhere(seen.expand_as(d).float(), 0.0)
         samples = RaySamples(alpha, alpha_dot, in_box, colour, None, d, residual, norms, background, elastic)
@@ -225,14 +226,27 @@ class FastField(Field):
         moved, normal_displacement = self.deformation(described, frame_row)
         return dataclasses.replace(described, y=described.y - moved, d=described.d - normal_displacement), moved
 
-    def _residual(self, described: Descriptor, pose: Tensor, row: Tensor) -> Tensor:
-        """Return dd (N,) in the shell; 0 outside it and deeper inside, where no ray samples and the body's d is
-        enough."""
+    def _trained(self, described: Descriptor) -> Tensor:
+        """Return which points (M,) are in the shell: neither outside it nor deeper inside, where no ray samples and the
+        body's d is enough."""
         s = self.settings
         trained = described.near & (described.d < self.reach_m) & (described.d > -s.inner_m - 2 * s.shell_cell_m)
-        pick = torch.nonzero(trained)[:, 0]
+        return torch.nonzero(trained)[:, 0]
+
+    def _residual(self, described: Descriptor, pose: Tensor, row: Tensor) -> Tensor:
+        """Return dd (N,) in the shell, 0 elsewhere."""
+        pick = self._trained(described)
         y, d, row = (t.index_select(0, pick) for t in (described.y, described.d, row))
         return torch.zeros_like(described.d).index_copy(0, pick, self.field.residual(y, d, pose, row))
+
+    def _ray_colours(self, scene: PosedScene[ShellGrid], described: Descriptor, weights: Tensor, row: Tensor) -> Tensor:
+        """Return the colours (R, K, 3) of samples (R K,) on rays with weights (R, K), zero where they hardly count. In
+        rendering, without gradients, fewer samples are coloured, which stand in for the others on their ray."""
+        rendering = not torch.is_grad_enabled()
+        visible = shown(weights) if rendering else weights > MIN_COLOUR_WEIGHT
+        colour = self._colour(scene.bodies, described, scene.conditions.pose, row, visible.flatten())
+        share = weights.sum(1) / (weights * visible).sum(1).clamp(min=1e-9) if rendering else weights.new_ones(())
+        return colour.view(*weights.shape, 3) * share.view(-1, 1, 1)
 
     def _colour(self, bodies: PosedBodies, described: Descriptor, pose: Tensor, row: Tensor, visible: Tensor) -> Tensor:
         """Return the colours (N, 3) of the visible samples, zero elsewhere. Light falls on the surface's own normal, so
@@ -278,6 +292,12 @@ class FastField(Field):
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
         described, _ = self._deformed(bodies.describe(points_m, row, FAR_M), conditions.frame_row[row])
         return self._colour(bodies, described, conditions.pose, row, torch.ones_like(described.near))
+
+
+def shown(weights: Tensor) -> Tensor:
+    """Return which samples of rays with weights (R, K) are coloured in rendering, bool: those of some weight, and those
+    of at least half the greatest on their ray."""
+    return weights > (weights.amax(1, keepdim=True) / 2).clamp(max=MIN_SHOWN_WEIGHT)
 
 
 def move_to_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:

@@ -1,6 +1,6 @@
 """The networks F and DH of the fast field: feature grids over the canonical shell and small MLPs (docs/method.md)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor, nn
@@ -44,17 +44,42 @@ class CanonicalField(nn.Module):
             nn.Linear(width, 3),
         )
 
-    def _inputs(self, features: Tensor, d: Tensor, pose: Tensor, row: Tensor) -> list[Tensor]:
-        return [features, d[:, None] / self.unit_m, self.pose_code(pose).index_select(0, row)]
-
     def residual(self, y_m: Tensor, d_m: Tensor, pose: Tensor, row: Tensor) -> Tensor:
         """Return dd (N,) in metres at y (N, 3) and d (N,), in the pose of `row` (N,) among poses (n, P); zero at the
         start of training."""
-        features = self.geometry_grids(y_m)
-        return self.unit_m * self.geometry(torch.cat(self._inputs(features, d_m, pose, row), -1))[:, 0]
+        return self._residual(self.geometry_grids(y_m), d_m, pose, row)
+
+    def residual_in_each(self, y_m: Tensor, d_m: Tensor, pose: Tensor) -> Iterator[Tensor]:
+        """Yield dd (N,) in metres in each of poses (n, P)."""
+        features, row = self.geometry_grids(y_m), torch.zeros(len(y_m), dtype=torch.long, device=y_m.device)
+        for one in pose.split(1):
+            yield self._residual(features, d_m, one, row)
 
     def colour(self, y_m: Tensor, d_m: Tensor, normal: Tensor, pose: Tensor, row: Tensor) -> Tensor:
         """Return c (N, 3) in [0, 1]."""
-        features = self.colour_grids(y_m)
-        inputs = self._inputs(features, d_m, pose, row)
-        return torch.sigmoid(self.radiance(torch.cat([*inputs, positional_encoding(normal, 1)], -1)))
+        first, *others = self.radiance
+        hidden = self._hidden(first, self.colour_grids(y_m), d_m, pose, row, positional_encoding(normal, 1))
+        for layer in others:
+            hidden = layer(hidden)
+        return torch.sigmoid(hidden)
+
+    def _residual(self, features: Tensor, d_m: Tensor, pose: Tensor, row: Tensor) -> Tensor:
+        first, activation, last = self.geometry
+        return self.unit_m * last(activation(self._hidden(first, features, d_m, pose, row)))[:, 0]
+
+    def _hidden(
+        self, first: nn.Module, features: Tensor, d_m: Tensor, pose: Tensor, row: Tensor, *more: Tensor
+    ) -> Tensor:
+        """Return what the first layer of a network makes of features, d, the code of the pose and whatever else it is
+        given. A single pose is part of its bias, in nine tenths of the time."""
+        code, inputs = self.pose_code(pose), [features, d_m[:, None] / self.unit_m]
+        if len(code) > 1:
+            hidden: Tensor = first(torch.cat([*inputs, code.index_select(0, row), *more], -1))
+            return hidden
+        assert isinstance(first, nn.Linear)
+        start = features.shape[1] + 1
+        before, of_code, after = first.weight.split(
+            [start, code.shape[1], first.in_features - start - code.shape[1]], 1
+        )
+        weight, bias = torch.cat([before, after], 1), first.bias + of_code @ code[0]
+        return nn.functional.linear(torch.cat([*inputs, *more], -1), weight, bias)

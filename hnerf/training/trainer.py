@@ -247,7 +247,8 @@ class Trainer:
         row: dict[str, Any] = {"step": self.step, "seconds": round(self.seconds, 2)}
         row["losses"] = {name: value.item() for name, value in terms.items()}
         if len(self.novel_rows) and self.step <= self.field_steps:
-            row["held_out"] = {"psnr": self.fixed_rays.psnr(self.scene, self.novel_rows)}
+            psnr = self.fixed_rays.psnr(self.scene, self.novel_rows)
+            row |= {"held_out": {"psnr": psnr}} if psnr is not None else {}
         self.history.append(row)
 
     def _state(self) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import torch
 
 from hnerf.body.canonical import Descriptor, PosedBodies
 from hnerf.config import FastFieldSettings
-from hnerf.fields.base import Field
+from hnerf.fields.base import Field, composited
 from hnerf.fields.conditions import Conditions, Draws
 from hnerf.fields.fast import (
     SAMPLE_COUNTS,
@@ -18,6 +18,7 @@ from hnerf.fields.fast import (
     TIGHTEN_STEP_M,
     FastField,
     move_to_surface,
+    shown,
 )
 from hnerf.fields.rays import PosedScene, Rays
 from hnerf.training.losses import pixel_colour
@@ -185,6 +186,26 @@ def test_rays_beside_others_see_what_they_would_see_alone():
         between = field.render_rays(scene, rays)
     torch.testing.assert_close(found, alone, atol=2e-3, rtol=0)
     assert found[..., 3].min() > 0.99 and (found[..., :3] - between[:, :3]).abs().max() > 0.02
+
+
+def test_samples_of_little_weight_take_the_colour_of_their_ray() -> None:
+    """Shown are samples of more than a hundredth, or than half the greatest on a ray that sees hardly anything."""
+    weights = torch.tensor([[0.02, 0.009, 0.9, 0.011], [0.004, 0.001, 0.003, 0.0]])
+    assert shown(weights).tolist() == [[True, False, True, True], [True, False, True, False]]
+
+
+def test_all_that_a_ray_sees_is_coloured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A surface so soft that many samples weigh little: they are white, as the others are, and not black."""
+    bodies, conditions = standing()
+    field = field_of(40.0)
+    monkeypatch.setattr(type(field.field), "colour", lambda _, y, *__: torch.ones_like(y))
+    rays = Rays(torch.tensor([[0.5, 0.4, 3.0]]), torch.tensor([[0.0, 0.0, -1.0]]), torch.zeros(1, dtype=torch.long))
+    with torch.no_grad():
+        scene, draws = field.scene(bodies, conditions), Draws.deterministic(1, 64, torch.device("cpu"))
+        samples, depths = field.sample(scene, rays, draws)
+    seen = composited(samples, depths)[0]
+    assert 3 < int((samples.colour[0, :, 0] > 0).sum()) < 64
+    torch.testing.assert_close(seen[:3], seen[3].expand(3))
 
 
 def test_the_shell_moves_with_the_surface_of_a_frame():

@@ -38,7 +38,8 @@ def known_field() -> CanonicalField:
         levels = zip(grids.dense_levels(), features, strict=True)
         grids.set_levels([torch.full_like(level, feature) for level, feature in levels])
     field.pose_code.weight.data = torch.tensor([[0.0, 0, 1], [0, -1, 0]])
-    field.geometry, field.radiance = First(1), First(3)
+    field.geometry = nn.Sequential(First(1), nn.Identity(), nn.Identity())
+    field.radiance = nn.Sequential(First(3))
     return field
 
 
@@ -46,7 +47,7 @@ def test_geometry_sees_features_distance_and_pose() -> None:
     """Input distance and output are in units of the outer shell thickness: half of 5 cm."""
     field = known_field()
     found = field.residual(Y, D, *POSE)
-    torch.testing.assert_close(field.geometry.asked, torch.tensor([[0.5, 0.25, -0.2, *CODE]]))
+    torch.testing.assert_close(field.geometry[0].asked, torch.tensor([[0.5, 0.25, -0.2, *CODE]]))
     torch.testing.assert_close(found.detach(), torch.tensor([0.025]))
 
 
@@ -55,8 +56,30 @@ def test_colour_sees_features_distance_pose_and_normal() -> None:
     field = known_field()
     found = field.colour(Y, D, NORMAL, *POSE)
     encoded = [1.0, 0, -0.5, 0, 0, -1, -1, 1, 0]
-    torch.testing.assert_close(field.radiance.asked, torch.tensor([[2.0, -0.2, *CODE, *encoded]]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(field.radiance[0].asked, torch.tensor([[2.0, -0.2, *CODE, *encoded]]), atol=1e-6, rtol=0)
     torch.testing.assert_close(found.detach(), torch.sigmoid(torch.tensor([[2.0, -0.2, 0.3]])))
+
+
+def random_field() -> CanonicalField:
+    torch.manual_seed(0)
+    field = CanonicalField(torch.zeros(3), torch.ones(3), SETTINGS, 3, everywhere)
+    for parameter in field.parameters():
+        nn.init.normal_(parameter)
+    return field
+
+
+def test_a_pose_alone_is_answered_as_among_others() -> None:
+    field, (poses, row) = random_field(), POSE
+    alone = poses[1:], torch.zeros(1, dtype=torch.long)
+    torch.testing.assert_close(field.residual(Y, D, *alone), field.residual(Y, D, poses, row))
+    torch.testing.assert_close(field.colour(Y, D, NORMAL, *alone), field.colour(Y, D, NORMAL, poses, row))
+
+
+def test_residuals_in_each_of_several_poses() -> None:
+    field, poses = random_field(), POSE[0]
+    each = [field.residual(Y, D, poses, torch.tensor([k])) for k in range(2)]
+    torch.testing.assert_close(list(field.residual_in_each(Y, D, poses)), each)
+    assert (each[0] - each[1]).abs() > 1e-3
 
 
 def test_no_network_answers_before_it_is_trained() -> None:

@@ -19,14 +19,18 @@ ROOM_M = 0.012
 STEP_M = 0.004  # at which it is looked for
 
 
-def tightened(
-    residual: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor], poses: list[float]
-) -> tuple[Tensor, Tensor]:
-    """Return the thickness outside and inside at the vertices within faces: at edges the closest point of a normal's
-    ray differs."""
+def field_of(residual: Callable[[Tensor, Tensor], Tensor]) -> FastField:
+    """Return a field with a given residual, by y (N, 3) and a pose (P,)."""
     field = FastField(RIG, SETTINGS, 1)
     field.log_sharpness.data.fill_(1000.0).log_()
-    field.field.residual = residual
+    field.field.residual_in_each = lambda y, d, pose: (residual(y, one).expand(len(y)) for one in pose)
+    return field
+
+
+def tightened(residual: Callable[[Tensor, Tensor], Tensor], poses: list[float]) -> tuple[Tensor, Tensor]:
+    """Return the thickness outside and inside at the vertices within faces: at edges the closest point of a normal's
+    ray differs."""
+    field = field_of(residual)
     field.tighten(RIG, torch.tensor(poses)[:, None].expand(-1, 3))
     within = ((RIG.vertices_m > 0.1) & (RIG.vertices_m < 0.9)).sum(1) == 2
     assert within.any()
@@ -46,16 +50,14 @@ def test_each_side_is_as_thick_as_its_own_surface_asks_for(
     surfaces_m: list[float], outer_m: float, inner_m: float
 ) -> None:
     """The surface lies at a given height above the skin in each of some poses."""
-    outer, inner = tightened(lambda y, d, pose, row: -pose[row, 0], surfaces_m)
+    outer, inner = tightened(lambda y, pose: -pose[0], surfaces_m)
     assert ((outer - outer_m).abs() <= STEP_M + 1e-6).all()
     assert ((inner - inner_m).abs() <= STEP_M + 1e-6).all()
 
 
 def test_vertices_are_tightened_each_by_what_is_seen_there() -> None:
     """The surface lies 4 cm outside the skin above the middle, at the skin below it."""
-    field = FastField(RIG, SETTINGS, 1)
-    field.log_sharpness.data.fill_(1000.0).log_()
-    field.field.residual = lambda y, d, pose, row: torch.where(y[:, 2] > 0.5, -0.04, 0.0)
+    field = field_of(lambda y, pose: torch.where(y[:, 2] > 0.5, -0.04, 0.0))
     field.tighten(RIG, torch.zeros(1, 3))
     x, y, z = RIG.vertices_m.T
     side = ((x - 0.5).abs() == 0.5) & (y > 0.1) & (y < 0.9)
