@@ -404,11 +404,13 @@ def validated(kind: type[S], tree: Any, source: Path | str) -> S:
                 node = node[part]
                 key.append(str(part))
         key += [str(part) for part in first["loc"][-1:] if first["type"] == "missing"]
-        wrong, advice = first["msg"], "correct it"
+        wrong, advice = first["msg"].removeprefix("Value error, "), "correct it"
         if first["type"] == "extra_forbidden":
             close = difflib.get_close_matches(key[-1], _keys(kind.model_json_schema()), 1, CLOSE)
             wrong, advice = "no such key", f"did you mean {close[0]}?" if close else "remove it, or correct its name"
-        raise InputError(f"{source}: {'.'.join(key)}: {wrong}; {advice}") from None
+        where = ": ".join([str(source), ".".join(key)] if key else [str(source)])
+        advised = wrong if "; " in wrong else f"{wrong}; {advice}"  # a model's own words may say what to do
+        raise InputError(f"{where}: {advised}") from None
 
 
 def _keys(schema: Mapping[str, Any]) -> set[str]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from hnerf.config import NerfSettings, load_settings, with_changes
+from hnerf.config import NerfSettings, SyntheticSettings, load_settings, validated, with_changes
 from hnerf.errors import InputError
 from hnerf.study.benchmark.plan import load_study
 from hnerf.study.stability.plan import load_stability
@@ -46,14 +46,21 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("asset: {texture_px: -1}", "asset.texture_px"),
         ("asset: {texture_poses: 0}", "asset.texture_poses"),
         ("asset: {splats: -1}", "asset.splats"),
-        ("training: {field: {kind: nerf}}", "training: Value error, nerf does not tune poses"),
-        ("training: {losses: {fog: 0.1}}", "training: Value error, fast does not model the background"),
+        ("training: {field: {kind: nerf}}", "training: nerf does not tune poses"),
+        ("training: {losses: {fog: 0.1}}", "training: fast does not model the background"),
     ],
 )
 def test_what_is_not_allowed_is_refused_by_file_and_key(tmp_path: Path, text: str, named: str) -> None:
     path = changes(tmp_path, text)
     with pytest.raises(InputError, match=f"{path}: {named}: "):
         with_changes(load_settings("fast"), path)
+
+
+def test_keys_that_contradict_each_other_are_one_line_with_one_advice() -> None:
+    with pytest.raises(
+        InputError, match=r"^a\.yaml: test_cameras: one at most between two training cameras; lower it$"
+    ):
+        validated(SyntheticSettings, {"train_cameras": 1, "test_cameras": 2}, "a.yaml")
 
 
 @pytest.mark.parametrize(
