@@ -15,10 +15,10 @@ from hnerf.training.losses import pixel_colour
 from hnerf.training.pixels import PixelRays, Pixels
 from hnerf.training.step import TrainingError
 
-SURFACE_RAYS, PSNR_RAYS = 2048, 512  # the latter are rendered every few steps
+RAYS = 2048
 MIN_PERSON_COVERAGE = 0.1  # of the person's pixels; below it the surface has collapsed
 MAX_BACKGROUND_COVERAGE = 0.8  # of the background pixels; above it the surface fills the box
-MIN_CLEAR_RAYS = 32  # of SURFACE_RAYS; a few tell nothing, since masks lack some of what is there
+MIN_CLEAR_RAYS = 32  # of RAYS; a few tell nothing, since masks lack some of what is there
 MIN_SAMPLES_PER_RAY = 64  # through a whole scene: valid-wave's body covers 38 % with 16, 59 % with 64, 64 % with 256
 
 
@@ -34,7 +34,7 @@ class FixedRays:
     @torch.no_grad()
     def psnr(self, scene: PosedScene[Any], rows: Tensor) -> float | None:
         """Return the PSNR on the person's pixels of the frames in rows; None if none is drawn."""
-        rays, samples = self.sample(scene, rows, self.field.samples, PSNR_RAYS)
+        rays, samples = self.sample(scene, rows, self.field.samples)
         mixed = rays.edge & (not self.field.models_background)  # with a background that only such a field models
         error = (pixel_colour(samples.in_box * samples.alpha, samples) - rays.colour)[rays.person & ~mixed]
         return float(-10 * torch.log10((error**2).mean())) if len(error) else None
@@ -45,7 +45,7 @@ class FixedRays:
         evaluated; away from outlines, which blurred surfaces cover, if enough of them are: a tight shell meets hardly
         any others."""
         count = max(self.field.samples, MIN_SAMPLES_PER_RAY) if self.field.models_background else self.field.samples
-        rays, samples = self.sample(scene, rows, count, SURFACE_RAYS)
+        rays, samples = self.sample(scene, rows, count)
         coverage = self.field.coverage(samples)
         beside = ~rays.person & (samples.in_box > 0).any(1)
         clear = beside & ~rays.edge
@@ -56,11 +56,11 @@ class FixedRays:
         if around > MAX_BACKGROUND_COVERAGE:
             raise TrainingError(f"the surface fills the box (covers {around:.0%} of the surroundings): check the masks")
 
-    def sample(self, scene: PosedScene[Any], rows: Tensor, count: int, about: int) -> tuple[PixelRays, RaySamples]:
-        """Return about so many rays at the frames in rows, and their samples as for rendering, with `count` random
-        numbers per ray."""
+    def sample(self, scene: PosedScene[Any], rows: Tensor, count: int) -> tuple[PixelRays, RaySamples]:
+        """Return the rays at the frames in rows, and their samples as for rendering, with `count` random numbers per
+        ray."""
         generator = torch.Generator(rows.device).manual_seed(self.seed)
-        rays = self.pixels.draw(rows, about // len(rows) + 1, generator)
+        rays = self.pixels.draw(rows, RAYS // len(rows) + 1, generator)
         parts, found = math.ceil(len(rays) / self.most_rays), []
         for part in (shard(rays, k, parts) for k in range(parts)):
             draws = Draws.deterministic(len(part), count, rows.device)

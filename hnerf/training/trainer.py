@@ -41,6 +41,7 @@ WARM_UP_STEPS = 20
 FINAL_LEARNING_RATE = 0.1  # at the end, relative to the first
 SKIPS_ALLOWED = 2  # consecutive; one more non-finite step stops the run
 LOG_STEPS = 25
+CURVE_STEPS = 100  # between the points of the curve on unseen frames, each of which takes as long as a step
 TRIAL_FRAMES = 8  # at most, to measure the memory of rays
 POSE_STRIDE = 6  # between the training poses for which the shell is tightened
 
@@ -246,7 +247,8 @@ class Trainer:
     def _record(self, terms: dict[str, Tensor]) -> None:
         row: dict[str, Any] = {"step": self.step, "seconds": round(self.seconds, 2)}
         row["losses"] = {name: value.item() for name, value in terms.items()}
-        if len(self.novel_rows) and self.step <= self.field_steps:
+        on_curve = self.step % CURVE_STEPS == 0 or self.step in (1, self.field_steps)
+        if len(self.novel_rows) and self.step <= self.field_steps and on_curve:
             psnr = self.fixed_rays.psnr(self.scene, self.novel_rows)
             row |= {"held_out": {"psnr": psnr}} if psnr is not None else {}
         self.history.append(row)

@@ -23,7 +23,7 @@ FAR = 10.0  # units of the residual's last layer: metres away in either field
 @pytest.fixture(autouse=True)
 def few_looks(monkeypatch: pytest.MonkeyPatch) -> None:
     """An eighth of the rays tells empty from full."""
-    monkeypatch.setattr(fixed_rays, "SURFACE_RAYS", 256)
+    monkeypatch.setattr(fixed_rays, "RAYS", 256)
 
 
 def trainer_of(folder: Path, kind: str) -> Trainer:
@@ -49,7 +49,7 @@ def test_a_surface_between_the_samples_of_a_training_is_no_collapse(tmp_path: Pa
     """Two samples per ray, across 5 m, hardly ever fall into the column."""
     trainer = trainer_of(tmp_path, "paper")
     trainer.field.samples = 2
-    rays, samples = trainer.fixed_rays.sample(trainer.scene, trainer.train_rows, 2, 256)
+    rays, samples = trainer.fixed_rays.sample(trainer.scene, trainer.train_rows, 2)
     assert trainer.field.coverage(samples)[rays.person].mean() < fixed_rays.MIN_PERSON_COVERAGE
     trainer.fixed_rays.require_surface(trainer.scene, trainer.train_rows)
 

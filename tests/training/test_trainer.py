@@ -285,6 +285,15 @@ def test_a_gradient_that_is_not_finite_skips_the_step(tmp_path: Path, monkeypatc
     assert all(torch.equal(before[name], p) for name, p in trainer.field.named_parameters())
 
 
+def test_frames_that_never_show_the_person_have_no_curve(tmp_path: Path):
+    trainer = Trainer(*record(tmp_path / "capture"), tiny(), tmp_path, ALONE)
+    trainer.step = trainer.field_steps
+    trainer._record({})
+    trainer.pixels.person[:] = False
+    trainer._record({})
+    assert ["held_out" in row for row in trainer.history] == [True, False]
+
+
 def test_progress_is_told_in_words():
     row = {"step": 25, "seconds": 7.0, "losses": {"reconstruction": 0.1234, "elastic": 0.0}}
     assert trainer_module._progress_message(row) == "reconstruction 0.12"
