@@ -270,6 +270,7 @@ def test_a_board_that_is_found_nowhere_is_hardly_that_board(tmp_path: Path, monk
         calibrate_from_boards(tmp_path)
 
 
+@pytest.mark.soak
 def test_real_footage_gives_the_shipped_cameras() -> None:
     folder = shared_capture("caliscope-charuco")
     calibration = calibrate_from_boards(folder)
