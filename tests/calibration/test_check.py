@@ -87,8 +87,8 @@ def test_runs_that_differ_in_the_last_digits_write_the_same_report(tmp_path: Pat
     found again, so that its camera files are the same, too."""
     written = []
     for name, nudge_px in (("one", 0.0), ("two", 1e-9)):
-        turned_camera = [turned(camera, 1.0) if i == 2 else camera for i, camera in enumerate(ring(4))]
-        seen = {c: points + np.array([nudge_px, -nudge_px, 0]) for c, points in detections(ring(4), 2).items()}
+        turned_camera = [turned(camera, 1.0) if i == 2 else camera for i, camera in enumerate(ring(3))]
+        seen = {c: points + np.array([nudge_px, -nudge_px, 0]) for c, points in detections(ring(3), 2).items()}
         capture = write_capture(tmp_path / name, turned_camera, seen)
         check_calibration(capture, SETTINGS).save(tmp_path / name / "out")
         files = ("report.json", "intri.yml", "extri.yml")
