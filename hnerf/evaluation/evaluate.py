@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 
 from hnerf.avatar.avatar import Avatar
-from hnerf.avatar.surface import NO_SURFACE, POSED_CELLS, posed_surface
+from hnerf.avatar.surface import NO_SURFACE, POSED_CELLS, POSED_MARGIN_M, posed_surface
 from hnerf.config import EvaluationSettings
 from hnerf.errors import InputError
 from hnerf.evaluation import geometry
@@ -48,9 +48,9 @@ PROTOCOL = (
     "novel_pose_posed, in poses tuned on the training cameras; novel_pose_tracked, with these frames' deformations, "
     "too. All methods get the same fitted poses. "
     f"holdout: {LABEL}; new poses animated. "
-    "Geometry, of novel_view and novel_pose: zero surface of the signed distance by marching cubes, "
-    f"{POSED_CELLS} cells on the longest side; {geometry.SAMPLES} samples a surface before those that cannot be seen "
-    "from outside are dropped, fixed seed; "
+    "Geometry, of novel_view and novel_pose: largest component of the zero surface of the signed distance, within "
+    f"{100 * POSED_MARGIN_M:.0f} cm of the body's box, by marching cubes, {POSED_CELLS} cells on the longest side; "
+    f"{geometry.SAMPLES} samples a surface before those that cannot be seen from outside are dropped, fixed seed; "
     "Chamfer: mean of both directions of the mean squared distance from sample to surface, m^2 x 1e3, and of the mean "
     "distance in mm; normal consistency: mean |cos| at nearest points; IoU by winding number on a "
     f"{geometry.OCCUPANCY_NODES}^3 grid."
