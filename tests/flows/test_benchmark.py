@@ -122,7 +122,7 @@ def test_trainings_get_longer_until_they_gain_nothing_or_time_or_steps_are_over(
     def score_end(*inputs: Any) -> Any:
         name, training = stages[-1][1].field.kind, stages[-1][1]
         seconds = min(training.seconds, 30.0) if name == "fast" else training.seconds
-        point = {"seconds": seconds, "psnr": 30.0 if name == "fast" else psnr[seconds]}
+        point = {"n": 1, "seconds": seconds, "psnr": 30.0 if name == "fast" else psnr[seconds]}
         (tmp_path / "scores.json").write_text(json.dumps({"training": {"field_seconds": seconds}, "curve": [point]}))
         return SimpleNamespace(root=tmp_path)
 

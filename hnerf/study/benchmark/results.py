@@ -154,7 +154,7 @@ def _variant_lines(variant: Mapping[str, Any]) -> list[str]:
     titles = ["method", *(t for t, _ in COLUMNS.values()), *(t for t, _ in COSTS.values())]
     titles += [f"frame at {size} px, s" for size in sizes] + [f"s to best - {NEAR_BEST_DB:g} dB"]
     near_best = near_best_seconds(variant)
-    lines = [f"{variant['cameras']} training cameras, {variant['frames']} training frames.", ""]
+    lines = [f"{variant['cameras']} training cameras, {variant['frames']} training frames.{_counts(variant)}", ""]
     lines += head(titles)
     missing: dict[str, list[str]] = {}
     for name, scores in variant["methods"].items():
@@ -177,6 +177,21 @@ def _variant_lines(variant: Mapping[str, Any]) -> list[str]:
     lines += _timeline(variant)
     message = [f"- {', '.join(names)}: {reason}" for reason, names in missing.items()]
     return [*lines, *(["", *message] if message else [])]
+
+
+def _counts(variant: Mapping[str, Any]) -> str:
+    """Return on how many images and surfaces a variant's scores rest, as a sentence with a space before it; nothing if
+    there are no scores. A method that lacks some has fewer."""
+    found = list(scored_methods(variant).values())
+    if not found:
+        return ""
+    images, surfaces = (
+        " / ".join(str(max(pick(scores[split], key) or 0 for scores in found)) for split in PRIMARY_SPLITS)
+        for key in ("n", "geometry.n")
+    )
+    of_curves = max((point["n"] for scores in found for point in scores["curve"]), default=0)
+    splits = " / ".join(SPLITS[split] for split in PRIMARY_SPLITS)
+    return f" Scored on {images} images and {surfaces} surfaces ({splits}), curves on {of_curves} images."
 
 
 def cell(scores: Mapping[str, Any], key: str, form: str) -> str:
