@@ -46,15 +46,32 @@ def test_every_check_that_a_study_may_name_is_there() -> None:
 
 def test_more_is_better() -> None:
     assert verdict(synthetic_result("more_is_better")) == (
-        "yes: fast 28.0 dB to 30.0 dB; nerf 20.0 dB to 26.0 dB; "
-        "fast Chamfer 0.20 to Chamfer 0.10; nerf Chamfer 0.90 to Chamfer 0.50."
+        "yes: fast 28.0, 30.0 dB; nerf 20.0, 26.0 dB; fast Chamfer 0.200, 0.100; nerf Chamfer 0.900, 0.500."
     )
     assert verdict(synthetic_result("more_is_better", nerf={4: (26.0, 1.0, 0.05)})).startswith("no: ")
 
 
+@pytest.mark.parametrize(
+    ("psnr", "chamfer", "seen"),
+    [
+        ((28.0, 30.0, 29.7), (0.9, 0.5, 0.54), "yes: fast 28.0, 30.0, 29.7 dB; fast Chamfer 0.900, 0.500, 0.540."),
+        ((28.0, 30.0, 29.5), (0.9, 0.5, 0.4), "no: fast 28.0, 30.0, 29.5 dB"),
+        ((28.0, 29.0, 30.0), (0.9, 1.0, 0.4), "no: fast 28.0, 29.0, 30.0 dB; fast Chamfer 0.900, 1.000, 0.400."),
+        ((28.0, 27.8, 28.0), (0.9, 0.5, 0.4), "no: "),
+    ],
+    ids=["falls as seeds do", "falls in the end", "falls on the way", "ends where it began"],
+)
+def test_more_is_better_at_every_step(psnr: tuple[float, ...], chamfer: tuple[float, ...], seen: str) -> None:
+    """Seeds alone move PSNR by 0.4 dB, and Chamfer by a tenth."""
+    result = synthetic_result("more_is_better")
+    figures = zip((2, 4, 8), psnr, chamfer, strict=True)
+    result["variants"] = {f"{n} cameras": {"methods": {"fast": of_method(db, c, 0.9, n, 0.1)}} for n, db, c in figures}
+    assert verdict(result).startswith(seen)
+
+
 def test_the_first_method_loses_least() -> None:
     assert verdict(synthetic_result("loses_least")) == (
-        "yes: fast loses 2.0 dB, nerf 6.0 dB; fast loses Chamfer 0.10, nerf Chamfer 0.40."
+        "yes: fast loses 2.0 dB, nerf 6.0 dB; fast loses Chamfer 0.100, nerf Chamfer 0.400."
     )
     assert verdict(synthetic_result("loses_least", fast={2: (23.0, 0.2, 0.9)})).startswith("no: fast loses 7.0 dB")
 
