@@ -71,7 +71,7 @@ def empty_result(plan: BenchmarkStudy, study: str, recorded: Capture) -> dict[st
     """Return a result without scores, in the form of hnerf/study/benchmark/results.py."""
     described = plan.model_dump(include={"title", "notes", "claims", "seconds", "until_flat", "sweep", "methods"})
     variants = {title: describe_variant(variant, recorded) for title, variant in plan.variants.items()}
-    return {"subject": recorded.name, "study": study} | described | {"variants": variants}
+    return {"subject": recorded.name, "study": study} | described | {"own": plan.own_methods(), "variants": variants}
 
 
 def describe_variant(variant: Variant, recorded: Capture) -> dict[str, Any]:

@@ -76,9 +76,9 @@ class ScoringSettings(Section):
 
 
 class BenchmarkStudy(Section):
-    """A benchmark. methods: presets, that of H-NeRF first; seconds: limit of every training, None for each preset's own
-    end; snapshots: how many are scored before it; until_flat: instead of them, longer and longer trainings up to
-    `seconds` (hnerf/study/benchmark/convergence.py)."""
+    """A benchmark. methods: presets, of which claims are about the first of H-NeRF; seconds: limit of every training,
+    None for each preset's own end; snapshots: how many are scored before it; until_flat: instead of them, longer and
+    longer trainings up to `seconds` (hnerf/study/benchmark/convergence.py)."""
 
     title: str
     notes: tuple[str, ...] = ()  # for the reader, such as what is left out
@@ -114,10 +114,15 @@ class BenchmarkStudy(Section):
             training["steps"] = UNLIMITED_STEPS
         return settings.model_copy(update={"training": settings.training.model_copy(update=training)})
 
+    def own_methods(self) -> list[str]:
+        """Return which methods are presets of H-NeRF."""
+        return [name for name in self.methods if load_settings(name).training.field.tunes_poses]
+
     def restricted_to(self, names: Sequence[str], seconds: float | None) -> "BenchmarkStudy":
-        """Return the study with these methods only and this time limit; a method that it does not have is run on every
-        variant. Without names it keeps its methods, and without a limit its own."""
-        methods = tuple(names) or self.methods
+        """Return the study with these methods only, in its own order, and this time limit; a method that it does not
+        have is run on every variant. Without names it keeps its methods, and without a limit its own."""
+        further = dict.fromkeys(name for name in names if name not in self.methods)
+        methods = (*(name for name in self.methods if name in names or not names), *further)
         variants = {}
         for title, variant in self.variants.items():
             there = variant.methods or self.methods

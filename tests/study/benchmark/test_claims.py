@@ -32,7 +32,7 @@ def synthetic_result(check: str, **changes: Any) -> dict[str, Any]:
         for n in (4, 2)
     }
     claims = [{"says": "It works.", "check": check}]
-    return {"sweep": "cameras", "methods": ["fast", "nerf"], "claims": claims, "variants": variants}
+    return {"sweep": "cameras", "own": ["fast"], "claims": claims, "variants": variants}
 
 
 def verdict(result: dict[str, Any]) -> str:
@@ -121,6 +121,23 @@ def test_a_surface_that_was_not_compared_with_a_truth_is_no_figure(reason: str, 
     unknown = {"geometry": None, "geometry_reason": reason}
     result["variants"]["4 cameras"]["methods"]["nerf"]["novel_view"] |= unknown
     assert verdict(result).startswith(seen)
+
+
+@pytest.mark.parametrize("check", ["loses_least", "ahead", "ahead_at_every_angle", "no_trend_with_pose"])
+def test_nothing_is_said_about_the_method_where_none_of_its_presets_ran(check: str) -> None:
+    assert verdict(synthetic_result(check) | {"own": []}) == "no figures."
+
+
+@pytest.mark.parametrize("check", ["loses_least", "ahead", "ahead_at_every_angle", "others_have_no_surface"])
+def test_further_presets_of_the_method_are_no_others(check: str) -> None:
+    assert verdict(synthetic_result(check) | {"own": ["fast", "nerf"]}) == "no figures."
+
+
+def test_all_others_are_looked_at_where_the_method_failed() -> None:
+    result = synthetic_result("others_have_no_surface", nerf={4: (26.0, 0.5, 0.3)})
+    for variant in result["variants"].values():
+        variant["methods"]["fast"] = {"error": "it came apart"}
+    assert verdict(result) == "no: 4 cameras: nerf IoU 0.30; 2 cameras: nerf IoU 0.05."
 
 
 def test_without_figures_nothing_is_said() -> None:

@@ -119,6 +119,14 @@ def test_narrowing_keeps_methods_where_they_were_and_tries_presets_everywhere() 
     assert narrowed.seconds == 5.0
 
 
+def test_methods_keep_the_order_of_the_study_and_own_presets_are_known() -> None:
+    study = load_study("cameras").restricted_to(["idr", "demo", "nerf", "fast", "idr"], None)
+    assert study.methods == ("fast", "nerf", "idr", "demo")
+    assert all(variant.methods == study.methods for variant in study.variants.values())
+    assert study.own_methods() == ["fast", "demo"]
+    assert load_study("cameras").restricted_to(["nerf"], None).own_methods() == []
+
+
 def test_only_the_clock_ends_a_compared_method() -> None:
     study = load_study("dynamic")
     steps = {name: study.settings(name).training.steps for name in ("fast", "paper", "neural-body", "nerfies")}

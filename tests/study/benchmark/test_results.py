@@ -90,6 +90,7 @@ def result(**changes: Any) -> dict[str, Any]:
         "until_flat": False,
         "sweep": "cameras",
         "methods": ["fast", "nerf", "idr"],
+        "own": ["fast"],
         "variants": {
             "4 cameras": {"cameras": 4, "frames": 1, "methods": methods},
             "2 cameras": {"cameras": 2, "frames": 1, "methods": few},
