@@ -15,7 +15,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("scoring", version="12", networks=(LPIPS_ALEXNET,))
+@stage("scoring", version="13", networks=(LPIPS_ALEXNET,))
 def score_training(
     out: Path,
     truth: Source,

@@ -74,7 +74,7 @@ def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: P
             continue
         column = avatar_for_split(name, avatar, scene.fitted)
         found[name] = score_views(scene, column, name, settings.images, settings.meshes, out)
-        add_training_distances(scene.capture, column, name, found[name])
+        add_training_distances(scene, name, found[name])
     found["pictures"] = write_pictures(scene, split, found[split]["per_image"], out)
     camera = next(iter(scene.capture.cameras.values()))
     found["frame_seconds"] = {
@@ -146,14 +146,16 @@ def write_pictures(scene: ScoringScene, split: str, per_image: list[ImageScores]
     return chosen
 
 
-def add_training_distances(capture: Capture, avatar: Avatar, split: str, found: SplitScores) -> None:
-    """Add to each image's and surface's scores the distance of its view and its pose from those of training."""
-    apart_deg = pose_distances_deg(avatar.body, split_frames(capture, split), capture.train_frames)
-    vertices_m = avatar.body.vertices_m().cpu().numpy()
+def add_training_distances(scene: ScoringScene, split: str, found: SplitScores) -> None:
+    """Add to each image's and surface's scores the distance of its view and its pose from those of training, by the
+    body as fitted: the same for all methods, whatever each has tuned."""
+    capture, body = scene.capture, scene.fitted
+    apart_deg = pose_distances_deg(body, split_frames(capture, split), capture.train_frames)
+    vertices_m = body.vertices_m().cpu().numpy()
     middles_m = (vertices_m.min(1) + vertices_m.max(1)) / 2
     trained = [capture.cameras[name] for name in capture.train_cameras]
     for row in found["per_image"]:
-        middle_m = middles_m[avatar.body.index(row["frame"])]
+        middle_m = middles_m[body.index(row["frame"])]
         row["view_angle_deg"] = view_angle_deg(capture.cameras[row["camera"]], trained, middle_m)
     geometry = found.get("geometry")
     for row in [*found["per_image"], *(geometry["per_surface"] if geometry else ())]:

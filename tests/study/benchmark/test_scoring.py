@@ -137,6 +137,8 @@ def test_curves_of_new_poses_are_animated_and_end_with_the_field(tmp_path: Path)
     assert found["novel_pose"]["mask_iou"] == 1.0
     for column in ("posed", "tracked"):  # one picture here, as no frame knows anything of itself
         assert found[f"novel_pose_{column}"]["mask_iou"] < 0.9
+        (row,), (animated,) = found[f"novel_pose_{column}"]["per_image"], found["novel_pose"]["per_image"]
+        assert row["view_angle_deg"] == animated["view_angle_deg"]  # of the body that all methods were given
         assert "geometry" not in found[f"novel_pose_{column}"]
 
 
