@@ -120,6 +120,7 @@ class Job:
         state = new / "seconds.json" if "{new}" in used else logs / f"{flat}.json"
         if "{store}" not in used and "{new}" not in used:
             state.unlink(missing_ok=True)  # there is nothing to resume from
+        self.store = new if "{new}" in used else store
         self.log, self.watch = logs / f"{flat}.log", Stopwatch(state, self.digest)
         program, *arguments = (argument.format(store=store, new=new) for argument in result.command)
         print(f"{result.name}: under way, {self.log}", flush=True)
@@ -161,11 +162,21 @@ class Job:
             "date": datetime.now(UTC).date().isoformat(),
             "machine": machine() | {"threads": self.result.threads},
             "load": sum(self.loads) / len(self.loads),
-            "seconds": self.watch.seconds if self.watch.is_complete else known["seconds"],
+            "seconds": known["seconds"] if self._reused() or not self.watch.is_complete else self.watch.seconds,
             "files": file_digests(self.root, self.result),
         }
         save_record(self.root, self.result.name, record)
         return None
+
+    def _reused(self) -> bool:
+        """Return whether a training was used that another result, or a command, had left in the store: its folder is
+        from before, and its record, which is touched at each use, is not."""
+        records = (self.store / "training").glob("*.json")
+        return any(
+            record.with_suffix("").stat().st_mtime < self.watch.began < record.stat().st_mtime
+            for record in records
+            if record.with_suffix("").exists()
+        )
 
     def _fault(self) -> str | None:
         if self.process.returncode:

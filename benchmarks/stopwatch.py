@@ -12,17 +12,18 @@ class Stopwatch:
     """A stopwatch that runs from its creation, and continues from the file of an interrupted run of the same code.
 
     is_complete: whether `seconds` cover all the work; they do not if, by the file, an earlier run of other code, or one
-    that ended, may have left trainings to reuse.
+    that ended, may have left something to reuse. began: when the first of the runs did, in seconds since the epoch.
     """
 
     def __init__(self, path: Path, digest: str) -> None:
-        found: dict[str, Any] = {"digest": digest, "seconds": 0.0, "whole": True, "done": False}
+        found: dict[str, Any] = {"digest": digest, "seconds": 0.0, "whole": True, "done": False, "began": time.time()}
         if path.exists():
             found = json.loads(path.read_text())
-        goes_on = found["digest"] == digest and not found["done"]
+        goes_on = found["digest"] == digest and not found["done"] and "began" in found
         self.path, self.digest = path, digest
         self.is_complete = goes_on and found["whole"]
         self.earlier_s = found["seconds"] if goes_on else 0.0
+        self.began: float = found["began"] if goes_on else time.time()
         self.started_s = self.saved_s = time.monotonic()
 
     @property
@@ -41,4 +42,4 @@ class Stopwatch:
         """Write the file."""
         self.saved_s = time.monotonic()
         state = {"digest": self.digest, "seconds": self.seconds, "whole": self.is_complete, "done": done}
-        self.path.write_text(json.dumps(state))
+        self.path.write_text(json.dumps(state | {"began": self.began}))

@@ -1,6 +1,7 @@
 """Results are made once, in order, despite interruptions and failures; programs and checkouts are fake."""
 
 import json
+import os
 import time
 from pathlib import Path
 
@@ -65,6 +66,19 @@ def test_changed_code_makes_a_result_anew_and_keeps_the_time_of_the_whole_work(c
     checkout.commit()
     assert make(checkout.root, [ONE], fresh_store, 1) == 0
     assert load_records(checkout.root)["one"]["seconds"] != first["seconds"]
+
+
+@pytest.mark.parametrize("used", [True, False])
+def test_the_time_is_of_the_whole_work_unless_the_store_held_a_training_of_it(checkout: Checkout, used: bool) -> None:
+    """Let the store have a training of an hour ago, which is looked up by touching its record."""
+    folder = checkout.store / "training" / "a"
+    folder.mkdir(parents=True)
+    folder.with_suffix(".json").touch()
+    for path in (folder, folder.with_suffix(".json")):
+        os.utime(path, (time.time() - 3600,) * 2)
+    before_writing(checkout, "(Path(store) / 'training' / 'a.json').touch()" if used else "")
+    assert make(checkout.root, [ONE], checkout.store, 1) == 0
+    assert (load_records(checkout.root)["one"]["seconds"] is None) == used
 
 
 def test_a_checkout_with_changes_is_refused(checkout: Checkout) -> None:

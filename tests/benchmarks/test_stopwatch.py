@@ -22,7 +22,7 @@ def test_an_interrupted_run_of_the_same_code_goes_on(tmp_path: Path, clock: list
     clock[0] = 500.0
     second = Stopwatch(tmp_path / "state.json", "a")
     clock[0] = 512.0
-    assert (second.seconds, second.is_complete) == (42.0, True)
+    assert (second.seconds, second.is_complete, second.began) == (42.0, True, first.began)
 
 
 def test_a_killed_run_has_lost_ten_seconds_at_most(tmp_path: Path, clock: list[float]) -> None:
