@@ -7,7 +7,8 @@ CAPTURE is the name of a shared capture, a folder, or `performer`, which stands 
 settings `--synth`, written to STORE.
 
 Runs `hnerf benchmark`, `hnerf stability` or `hnerf ablate` with STORE, where finished work is reused, and
-copies its tables and charts to `benchmarks/results/<kind>/`. Ablations are scored on a few images.
+copies its tables and charts to `benchmarks/results/<kind>/`, without the `-part` of a study with other methods or
+seconds. Ablations are scored on a few images.
 """
 
 import argparse
@@ -50,10 +51,11 @@ def main() -> None:
     clean_commit(ROOT)  # refuse if it changed during the study
     kept = RESULTS / options.kind
     kept.mkdir(parents=True, exist_ok=True)
+    name = table.stem if options.kind == "ablations" else table.stem.removesuffix("-part")
     for path in [*table.parent.glob(f"{table.stem}.*"), *table.parent.glob(f"{table.stem}-*.png")]:
-        shutil.copy(path, kept / path.name)
-    text = f"{table.read_text()}\nMade by `benchmarks/studies.py`: {where}\n"
-    (kept / table.name).write_text(text)
+        shutil.copy(path, kept / path.name.replace(table.stem, name))
+    text = f"{table.read_text().replace(table.stem, name)}\nMade by `benchmarks/studies.py`: {where}\n"
+    (kept / f"{name}.md").write_text(text)
     print(text)
 
 

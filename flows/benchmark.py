@@ -46,16 +46,18 @@ def benchmark(
     Args:
         capture: The recording's folder, or one video; relative to the repository.
         study: A name under configs/benchmark/, or a YAML file.
-        methods: Of the study, or presets, instead of all.
-        seconds: Limit of every training, instead of the study's.
+        methods: Of the study, or presets, instead of all; the table's name then ends in "-part".
+        seconds: Limit of every training, instead of the study's; likewise.
         store: Where results are kept.
     """
-    plan = load_study(study).restricted_to(methods or [], seconds)
+    whole = load_study(study)
+    plan = whole.restricted_to(methods or [], seconds)
     capture_settings = [plan.settings(name).capture for name in plan.methods]  # invalid presets are refused first
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
     recorded = Capture.load(ingest(artifact_store, source, capture_settings[0]).root)
-    result, table = empty_result(plan, Path(study).stem, recorded), None
+    name = Path(study).stem + ("" if plan == whole.restricted_to([], None) else "-part")
+    result, table = empty_result(plan, name, recorded), None
     for title, entry in result["variants"].items():
         variant = plan.variants[title]
         for name in () if "left_out" in entry else variant.methods or plan.methods:

@@ -67,16 +67,17 @@ def stability(
         capture: The recording's folder, or one video; relative to the repository.
         study: A name under configs/stability/, or a YAML file.
         store: Where results are kept.
-        methods: Presets in place of the study's.
-        only: Names of degradations; the table's name then ends in "-part".
+        methods: Presets in place of the study's; the table's name then ends in "-part".
+        only: Names of degradations; likewise.
     """
-    plan = load_stability(study).restricted_to(only)
+    whole = load_stability(study)
+    plan = whole.restricted_to(only)
     plan = plan.model_copy(update={"methods": tuple(methods)}) if methods else plan
     presets = {name: load_settings(name, plan.overrides) for name in plan.methods}
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
     subject = Capture.load(ingest_part(artifact_store, source, plan, next(iter(presets.values()))).root).name
-    table = artifact_store.root / "stability" / f"{subject}-{Path(study).stem}{'-part' if only else ''}.md"
+    table = artifact_store.root / "stability" / f"{subject}-{Path(study).stem}{'' if plan == whole else '-part'}.md"
     table.parent.mkdir(parents=True, exist_ok=True)
     result: Figures = {"subject": subject, "study": study, "plan": plan.model_dump(mode="json")}
     result |= {"left_out": plan.left_out(), "protocol": None, "runs": []}

@@ -211,14 +211,29 @@ def test_the_command_prints_table_and_chart(
     assert [settings.snapshots_s for _, settings in stages] == [(2.0, 4.0)] * 2
     shown = capsys.readouterr().out
     assert "| demo | 30.00 / - / - / - |" in shown
-    chart = tmp_path / "store" / "benchmark" / "ada-toys.png"
+    chart = tmp_path / "store" / "benchmark" / "ada-toys-part.png"
     assert f"chart: {chart}" in shown and chart.exists()
+
+
+@pytest.mark.usefixtures("stages", "undrawn")
+@pytest.mark.parametrize(
+    ("methods", "seconds", "name"),
+    [
+        (["fast"], None, "ada-toys-part.md"),
+        ([], 8.0, "ada-toys-part.md"),
+        (["demo", "paper", "fast"], 60.0, "ada-toys.md"),
+    ],
+)
+def test_a_part_of_a_study_does_not_replace_its_table(
+    study: str, tmp_path: Path, methods: list[str], seconds: float | None, name: str
+) -> None:
+    assert benchmark.fn(tmp_path, study, methods, seconds, tmp_path / "store").name == name
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_quick_is_a_study(stages: Stages, tmp_path: Path) -> None:
     assert main(["benchmark", str(tmp_path), "--quick", "--methods", "fast", "--store", str(tmp_path / "store")]) == 0
-    assert (tmp_path / "store" / "benchmark" / "ada-quick.md").exists()
+    assert (tmp_path / "store" / "benchmark" / "ada-quick-part.md").exists()
     with pytest.raises(SystemExit):
         main(["benchmark", str(tmp_path), "--quick", "--study", "static"])
 
@@ -241,7 +256,7 @@ def test_the_flow_runs_page_shows_the_charts_themselves(
     table = benchmark.fn(tmp_path, study, ["demo"], store=tmp_path / "store")
     chart = base64.b64encode(table.with_suffix(".png").read_bytes()).decode()
     (text,) = shown
-    assert f"![ada-toys.png](data:image/png;base64,{chart})" in text
+    assert f"![ada-toys-part.png](data:image/png;base64,{chart})" in text
 
 
 def test_charts_are_found_whatever_the_captures_name(tmp_path: Path) -> None:

@@ -121,7 +121,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[dict[str, An
 def study(tmp_path: Path, **options: Any) -> dict[str, Any]:
     """Run the study of this file; return its result."""
     table = stability.fn(tmp_path, str(tmp_path / "mine.yaml"), tmp_path / "store", **options)
-    part = "-part" if options.get("only") else ""
+    part = "-part" if options else ""
     assert table == tmp_path / "store" / "stability" / f"ada-mine{part}.md"
     return dict(json.loads(table.with_suffix(".json").read_text()))
 
@@ -326,10 +326,11 @@ def test_a_chart_that_cannot_be_drawn_hides_nothing(tmp_path: Path, monkeypatch:
         study(tmp_path, only=["pose_noise"])
 
 
-def test_a_study_of_few_degradations_leaves_the_whole_one_as_it_was(tmp_path: Path) -> None:
+@pytest.mark.parametrize("part", [{"only": ["pose_noise"]}, {"methods": ["demo"]}], ids=str)
+def test_a_part_of_a_study_leaves_the_whole_one_as_it_was(tmp_path: Path, part: dict[str, list[str]]) -> None:
     study(tmp_path)
     files = {path: path.read_bytes() for path in (tmp_path / "store" / "stability").iterdir()}
-    study(tmp_path, only=["pose_noise"])
+    study(tmp_path, **part)
     assert {path: path.read_bytes() for path in files} == files
 
 
