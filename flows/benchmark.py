@@ -13,6 +13,7 @@ from flows.train_subject import Prepared, prepare_training, with_detections
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
 from hnerf.errors import InputError, one_line
+from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.files import embed_images
 from hnerf.study.benchmark.convergence import is_flat, training_limits_s
 from hnerf.study.benchmark.plan import BenchmarkStudy, Variant, load_study
@@ -22,7 +23,7 @@ from tasks.calibration import calibrated_capture
 from tasks.capture import ingest, subset_capture
 from tasks.limits import set_limits
 from tasks.policy import is_of_the_machine
-from tasks.source import Source, read_capture
+from tasks.source import GROUND_TRUTH, Source, read_capture
 from tasks.store import Store
 from tasks.training import train
 
@@ -56,6 +57,11 @@ def benchmark(
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
     recorded = Capture.load(ingest(artifact_store, source, capture_settings[0]).root)
+    if plan.until_flat and not (recorded.test_cameras and GroundTruth(truth.root, recorded).has_masks):
+        raise InputError(
+            f"{recorded.name}: no image can be scored, so that no curve is ever flat; it takes test cameras and "
+            f"{GROUND_TRUTH}/masks. Mend it, or give another study"
+        )
     name = Path(study).stem + ("" if plan == whole.restricted_to([], None) else "-part")
     result, table = empty_result(plan, name, recorded), None
     for title, entry in result["variants"].items():

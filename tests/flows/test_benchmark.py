@@ -71,7 +71,8 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stages:
     monkeypatch.setattr(module, "ingest", lambda *_: SimpleNamespace(root=tmp_path, title="whole"))
     monkeypatch.setattr(module, "with_detections", lambda store, recording, settings: recording)
     monkeypatch.setattr(module, "subset_capture", lambda _, recording, *parts: SimpleNamespace(title=str(parts)))
-    monkeypatch.setattr(module, "read_capture", lambda *_: (None, None))
+    monkeypatch.setattr(module, "read_capture", lambda *_: (None, SimpleNamespace(root=tmp_path)))
+    (tmp_path / "ground_truth" / "masks").mkdir(parents=True)
     monkeypatch.setattr(module, "calibrated_capture", lambda *_: RECORDED)
     monkeypatch.setattr(module.Capture, "load", lambda _: RECORDED)
     monkeypatch.setattr(module, "train", train)
@@ -146,6 +147,19 @@ def test_trainings_get_longer_until_they_gain_nothing_or_time_or_steps_are_over(
     (tmp_path / "mine.yaml").write_text(f"{text}100")
     found = read(benchmark.fn(tmp_path, str(tmp_path / "mine.yaml"), store=tmp_path / "store"))
     assert found["variants"]["one"]["methods"]["nerf"]["ended"] == "limit"
+
+
+@pytest.mark.parametrize("lacks", ["test cameras", "masks"])
+def test_nothing_is_trained_until_flat_where_no_image_can_be_scored(
+    stages: Stages, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lacks: str
+) -> None:
+    if lacks == "masks":
+        (tmp_path / "ground_truth" / "masks").rmdir()
+    else:
+        monkeypatch.setattr(RECORDED, "test_cameras", ())
+    with pytest.raises(InputError, match="ada: no image can be scored, so that no curve is ever flat"):
+        benchmark.fn(tmp_path, "static-converged", store=tmp_path / "store")
+    assert stages == []
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -120,7 +120,10 @@ class BenchmarkStudy(Section):
 
     def restricted_to(self, names: Sequence[str], seconds: float | None) -> "BenchmarkStudy":
         """Return the study with these methods only, in its own order, and this time limit; a method that it does not
-        have is run on every variant. Without names it keeps its methods, and without a limit its own."""
+        have is run on every variant. Without names it keeps its methods, and without a limit its own. Raises InputError
+        for a limit below the first training of a study until curves are flat."""
+        if self.until_flat and seconds and seconds < FIRST_S:
+            raise InputError(f"--seconds {seconds:g}: the first training of this study takes {FIRST_S:g} s; give more")
         further = dict.fromkeys(name for name in names if name not in self.methods)
         methods = (*(name for name in self.methods if name in names or not names), *further)
         variants = {}

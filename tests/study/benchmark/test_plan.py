@@ -119,6 +119,13 @@ def test_narrowing_keeps_methods_where_they_were_and_tries_presets_everywhere() 
     assert narrowed.seconds == 5.0
 
 
+def test_less_time_than_the_first_training_until_flat_is_refused() -> None:
+    study = load_study("static-converged")
+    assert study.restricted_to([], 10.0).seconds == 10.0
+    with pytest.raises(InputError, match="--seconds 5: the first training of this study takes 10 s; give more"):
+        study.restricted_to([], 5.0)
+
+
 def test_methods_keep_the_order_of_the_study_and_own_presets_are_known() -> None:
     study = load_study("cameras").restricted_to(["idr", "demo", "nerf", "fast", "idr"], None)
     assert study.methods == ("fast", "nerf", "idr", "demo")
