@@ -18,6 +18,7 @@ from hnerf.errors import InputError
 
 ON_BLACK = "ground_truth/on_black"
 MAX_MESHES_BYTES = 2_000_000_000  # unpacked; 60 frames of a million vertices have 1.4 GB
+MAX_M = 10_000  # from the origin, of true surfaces
 MASKED_IMAGE = "image x ground-truth mask"
 
 
@@ -40,7 +41,8 @@ class GroundTruth:
 
     def mask(self, camera: str, frame: int) -> np.ndarray:
         """Return the true mask, (H, W) bool, True on the person."""
-        return self._as_rendered(read_image(self._mask_path(camera, frame))[..., 0], camera) > 127
+        path = self._mask_path(camera, frame)
+        return self._as_rendered(read_image(path)[..., 0], camera, path) > 127
 
     def on_black(self, camera: str, frame: int) -> tuple[np.ndarray, str]:
         """Return the person alone over black, (H, W, 3) uint8, and the name of its source.
@@ -50,7 +52,7 @@ class GroundTruth:
         """
         path = self._path("on_black", camera, f"{self.capture.recorded_frame(camera, frame):06d}.jpg")
         if path.exists():
-            return self._as_rendered(read_image(path), camera), ON_BLACK
+            return self._as_rendered(read_image(path), camera, path), ON_BLACK
         return self.capture.image(camera, frame) * self.mask(camera, frame)[..., None], MASKED_IMAGE
 
     def meshes(self) -> dict[int, trimesh.Trimesh]:
@@ -61,8 +63,11 @@ class GroundTruth:
         try:
             stored = read_arrays(path, ("faces", "vertices", "frames"), MAX_MESHES_BYTES)
             faces, vertices, frames = stored["faces"], stored["vertices"], stored["frames"]
-            if not (faces.min() >= 0 and faces.max() < vertices.shape[1] and np.isfinite(vertices).all()):
-                raise ValueError("a face index is out of range, or a vertex is not finite")
+            if vertices.shape[2:] != (3,) or faces.shape[1:] != (3,) or faces.dtype.kind not in "iu":
+                raise ValueError("vertices are not (frames, V, 3), or faces not integers (F, 3)")
+            near = vertices.min() >= -MAX_M and vertices.max() <= MAX_M  # which NaN is not
+            if not (near and faces.min() >= 0 and faces.max() < vertices.shape[1]):
+                raise ValueError(f"a face index is out of range, or a vertex is not within {MAX_M} m")
             return {int(f): trimesh.Trimesh(v, faces, process=False) for f, v in zip(frames, vertices, strict=True)}
         except (*ARRAY_FILE_ERRORS, IndexError) as error:
             raise InputError(
@@ -75,15 +80,24 @@ class GroundTruth:
     def _mask_path(self, camera: str, frame: int) -> Path:
         return self._path("masks", camera, f"{self.capture.recorded_frame(camera, frame):06d}.png")
 
-    def _as_rendered(self, image: np.ndarray, camera: str) -> np.ndarray:
-        """Undistort and downscale an image as recorded, as ingest does with photographs."""
+    def _as_rendered(self, image: np.ndarray, camera: str, path: Path) -> np.ndarray:
+        """Undistort and downscale an image as recorded, as ingest does with photographs; one of the camera's size stays
+        as it is. Raises InputError for another shape, or another size where there is a lens to undistort."""
         size = self.capture.cameras[camera].size_px
         recorded_px = self.capture.recorded_sizes_px.get(camera)
         if camera in self.capture.recorded_lenses and image.shape[1::-1] == recorded_px:
             K, distortion = map(np.array, self.capture.recorded_lenses[camera])
             lens = Lens(camera, K, distortion, np.eye(3), np.zeros(3), recorded_px)
             return Normaliser.create(lens, recorded_px, max(size)).pixels(image)
-        return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        width_px, height_px = given = image.shape[1::-1]
+        if given == size:
+            return image
+        stretched = abs(width_px * size[1] - height_px * size[0]) > max(given)  # by more than rounding
+        if camera in self.capture.recorded_lenses or (stretched and given != recorded_px):
+            raise InputError(
+                f"{path}: is {width_px} x {height_px} px, unlike camera {camera}; give it at the recording's size"
+            )
+        return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 @dataclass(frozen=True)

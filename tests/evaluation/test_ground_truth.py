@@ -43,6 +43,37 @@ def test_a_mask_of_the_recording_is_shrunk_by_area(truth: GroundTruth) -> None:
     assert truth.mask("c", 1)[0, :3].tolist() == [False, True, True]
 
 
+def bent(truth: GroundTruth) -> GroundTruth:
+    """Return truth of a camera whose lens distorts, recorded at twice its size."""
+    camera = truth.capture.cameras["c"]
+    size_px = (2 * camera.width_px, 2 * camera.height_px)
+    lenses = {"c": (camera.scaled(2).K.tolist(), [0.0, 0.0, 0.5, 0.5])}
+    return replace(truth, capture=replace(truth.capture, recorded_sizes_px={"c": size_px}, recorded_lenses=lenses))
+
+
+@pytest.mark.parametrize(("size_px", "lens"), [((100, 180), False), ((64, 128), False), ((256, 256), True)], ids=str)
+def test_truth_of_another_shape_or_that_cannot_be_undistorted_is_refused(
+    truth: GroundTruth, size_px: tuple[int, int], lens: bool
+) -> None:
+    mask = np.zeros(size_px[::-1], np.uint8)
+    path = truth.folder / "ground_truth" / "masks" / "c" / "000001.png"
+    cv2.imwrite(str(path), mask)
+    shown = f"{size_px[0]} x {size_px[1]} px"
+    with pytest.raises(InputError, match=rf"000001\.png: is {shown}, unlike camera c; give it at the recording's size"):
+        (bent(truth) if lens else truth).mask("c", 1)
+
+
+def test_truth_as_large_as_the_camera_or_the_recording_is_taken(truth: GroundTruth) -> None:
+    """Round 64 px of 85 x 64 to 85 x 64: a picture of 1024 x 768 has the same shape but for rounding."""
+    wide = replace(truth.capture.cameras["c"], width_px=85)
+    odd = replace(truth, capture=replace(truth.capture, cameras={**truth.capture.cameras, "c": wide}))
+    path = truth.folder / "ground_truth" / "masks" / "c" / "000001.png"
+    cv2.imwrite(str(path), np.full((768, 1024), 255, np.uint8))
+    assert odd.mask("c", 1).all() and odd.mask("c", 1).shape == (64, 85)
+    cv2.imwrite(str(path), np.full((128, 128), 255, np.uint8))
+    assert bent(truth).mask("c", 1).shape == (64, 64)
+
+
 def test_truth_is_of_the_instant_of_the_photograph(truth: GroundTruth) -> None:
     """Let camera c record the instant of frame 1 in its frame 2."""
     in_step = replace(truth, capture=truth.capture.synchronised({"c": 1.0}))
@@ -90,6 +121,24 @@ def test_faces_without_vertices_are_refused(truth: GroundTruth, faces: list[list
     path = truth.folder / "ground_truth" / "meshes.npz"
     np.savez(path, faces=np.array(faces), vertices=np.zeros((1, 3, 3)), frames=np.array([0]))
     with pytest.raises(InputError, match=r"meshes\.npz: true surfaces cannot be read \(a face index is out of range"):
+        truth.meshes()
+
+
+@pytest.mark.parametrize(
+    ("faces", "vertices"),
+    [
+        ([[0, 1, 2]], np.zeros((1, 3, 2))),
+        ([[0, 1, 2]], np.zeros((3, 3))),
+        ([[0, 1, 2, 2]], np.zeros((1, 3, 3))),
+        ([0, 1, 2], np.zeros((1, 3, 3))),
+        ([[0.0, 1.0, 2.0]], np.zeros((1, 3, 3))),
+        ([[0, 1, 2]], np.full((1, 3, 3), np.nan)),
+        ([[0, 1, 2]], np.full((1, 3, 3), 2e4)),
+    ],
+)
+def test_surfaces_that_cannot_be_compared_are_refused(truth: GroundTruth, faces: list, vertices: np.ndarray) -> None:
+    np.savez(truth.folder / "ground_truth" / "meshes.npz", faces=np.array(faces), vertices=vertices, frames=[0])
+    with pytest.raises(InputError, match=r"meshes\.npz: true surfaces cannot be read \("):
         truth.meshes()
 
 
