@@ -33,10 +33,10 @@ def held_out_cameras(train: Sequence[str], test: Sequence[str], holdout: str | N
 
     Raises InputError, one line, if there is no such camera or fewer than MIN_CAMERAS would be left.
     """
+    if holdout not in (None, EACH, *train):
+        raise InputError(f"evaluation.holdout={holdout}: no such training camera; there are {', '.join(train)}")
     if holdout is None or test:
         return ()
-    if holdout != EACH and holdout not in train:
-        raise InputError(f"evaluation.holdout={holdout}: no such training camera; there are {', '.join(train)}")
     if len(train) <= MIN_CAMERAS:
         raise InputError(
             f"evaluation.holdout={holdout}: fewer than {MIN_CAMERAS} of the {len(train)} training cameras would be "

@@ -127,8 +127,14 @@ def test_cameras_that_cannot_be_left_out_are_refused(train: tuple[str, ...], hol
         held_out_cameras(train, (), holdout)
 
 
+def test_a_name_that_no_camera_has_is_refused_although_test_cameras_score_the_capture() -> None:
+    with pytest.raises(InputError, match=r"evaluation\.holdout=d: no such training camera; there are a, b, c"):
+        held_out_cameras(CAMERAS, ("t",), "d")
+
+
 def test_cameras_are_left_out_one_by_one_or_in_turn() -> None:
     assert held_out_cameras(CAMERAS, (), None) == ()
     assert held_out_cameras(CAMERAS, (), "b") == ("b",)
     assert held_out_cameras(CAMERAS, (), "each") == CAMERAS
     assert held_out_cameras(("a", "b"), ("t",), "each") == ()  # test cameras score the capture
+    assert held_out_cameras(("a", "b"), ("t",), "a") == ()
