@@ -60,6 +60,10 @@ class Bucket:
         try:
             if urlsplit(url).password or "::" in url:
                 raise InputError("a URL with a password or `::` is refused; give keys by the environment")
+            if urlsplit(url).scheme in ("http", "https"):
+                raise InputError(
+                    f"{url}: is no bucket; download it and give the file, or a URL like s3://bucket/folder"
+                )
             # Others write here, too: no listing may be remembered.
             fs, root = url_to_fs(url, use_listings_cache=False)
         except ImportError:

@@ -23,6 +23,7 @@ def test_only_what_is_set_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         ("github://ada", "HNERF_BUCKET: .*missing.*'org'.*; give a URL like"),
         ("file:///no/such/folder", "HNERF_BUCKET: .*/no/such/folder is not there; make it"),
         ("memory://unmade", "is not there; make it"),
+        ("https://example.com/x", "HNERF_BUCKET: https://example.com/x: is no bucket; download it and give the file"),
     ],
 )
 def test_what_cannot_be_opened_is_refused_in_one_line(url: str, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
