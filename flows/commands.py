@@ -224,6 +224,9 @@ def export(options: argparse.Namespace) -> None:
     from hnerf.asset.subject import export_subject
     from tasks.store import recording_digest, require_intact
 
+    for override in options.overrides:
+        if override.partition("=")[0].split(".")[0] != "asset":
+            raise InputError(f"--set {override}: an export has settings of the section `asset` alone; remove it")
     for folder in (options.subject, *(motion for motion in options.motion if motion.is_dir())):
         require_intact(folder)
     allowed = ["asset.allow_poor=true"] if options.allow_poor else []

@@ -37,6 +37,14 @@ from tests.shared_data import shared_capture
             ["export", ".", "--set", "asset.bones=up"],
             "hnerf: --set asset.bones=up: asset.bones: Input should be 'along'",
         ),
+        (
+            ["export", ".", "--set", "training.steps=3"],
+            "hnerf: --set training.steps=3: an export has settings of the section `asset` alone; remove it",
+        ),
+        (
+            ["run", "http://example.com/x.mp4"],
+            "hnerf: http://example.com/x.mp4: is no bucket; download it and give the file",
+        ),
         (["run", "absent", "--preset", "best"], "best: no such preset or file; presets are "),
         (["run", "absent", "--set", "training.stepz=1"], "training.stepz: no such key; did you mean steps?"),
         (["run", "absent", "--set", "training.noise=.inf"], "training.noise: Input should be a finite number"),
