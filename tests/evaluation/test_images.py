@@ -8,7 +8,11 @@ import torch
 from hnerf.avatar.avatar import Rendering
 from hnerf.capture.capture import read_rgb, read_rgba, write_image
 from hnerf.errors import InputError
-from hnerf.evaluation.images import mean_of, rgba
+from hnerf.evaluation import images as module
+from hnerf.evaluation.ground_truth import GroundTruth
+from hnerf.evaluation.images import mean_of, render, rgba, score_split
+from hnerf.evaluation.views import View
+from tests.evaluation.ball import RADIUS_M, BallAvatar, ball_fit, write_ball_capture, write_ball_truth
 
 
 def test_renderings_are_colour_over_black_and_coverage(tmp_path: Path) -> None:
@@ -33,3 +37,25 @@ def test_a_picture_without_coverage_is_no_rendering(tmp_path: Path) -> None:
     write_image(tmp_path / "a.png", np.zeros((2, 2, 3), np.uint8))
     with pytest.raises(InputError, match=r"a\.png: no readable image with an alpha channel"):
         read_rgba(tmp_path / "a.png")
+
+
+def test_an_image_that_does_not_show_the_person_is_counted_and_not_scored(tmp_path: Path) -> None:
+    """Of two images, the person has left one."""
+    capture = write_ball_capture(tmp_path, "ball", ("c",))
+    write_ball_truth(capture, RADIUS_M)
+    write_image(tmp_path / "ground_truth" / "masks" / "c" / "000001.png", np.zeros((64, 64, 3), np.uint8))
+    views = [View("novel_view", "c", frame) for frame in (0, 1)]
+    render({"novel_view": BallAvatar(ball_fit())}, capture, views, tmp_path)
+    found = score_split(capture, "novel_view", views, GroundTruth(tmp_path, capture), tmp_path)
+    assert (found["n"], found["without_person"], found["without_mask"]) == (1, 1, 0)
+    assert [row["frame"] for row in found["per_image"]] == [0]
+
+
+def test_seconds_are_of_one_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two images take 12 s."""
+    capture = write_ball_capture(tmp_path, "ball", ("c",))
+    clock = iter((100.0, 112.0))
+    monkeypatch.setattr(module.time, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr(module, "tracked", lambda items, *_: items)  # which looks at the clock, too
+    views = [View("novel_view", "c", frame) for frame in (0, 1)]
+    assert render({"novel_view": BallAvatar(ball_fit())}, capture, views, tmp_path) == 6.0

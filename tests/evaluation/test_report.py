@@ -2,7 +2,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
+
+from hnerf.capture.capture import write_image
+from hnerf.config import EvaluationSettings
+from hnerf.evaluation import report
 from hnerf.evaluation.report import costs, is_table_rows, readable, reading_notes, stage_reports, summary
+from hnerf.evaluation.views import View
 from tests.evaluation.ball import ball_inputs, write_ball_capture
 
 
@@ -72,3 +79,18 @@ def test_notes_say_what_was_left_out_and_what_was_compared_to(tmp_path: Path) ->
         "New views: 3 images have no ground-truth mask and are not scored.",
         "New views: 2 images do not show the person and are not scored.",
     ]
+
+
+def test_the_worst_image_of_a_split_is_shown_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One row is of the split's first frame; the worst image is another's."""
+    capture = write_ball_capture(tmp_path, "ball", ("c",))
+    for frame in (0, 1, 2):
+        write_image(View("novel_view", "c", frame).path(tmp_path), np.zeros((64, 64, 4), np.uint8))
+    psnr = {0: 30.0, 1: 20.0, 2: 40.0}
+    found: Any = {"holdout": None, "novel_pose": {"per_image": []}}
+    found["novel_view"] = {"per_image": [{"camera": "c", "frame": f, "psnr": db} for f, db in psnr.items()]}
+    monkeypatch.setattr(report, "view_row", lambda view, *given: (view.frame, given[3]))
+    monkeypatch.setattr(report, "surface_gallery", lambda *_: None)
+    inputs = ball_inputs(capture, tmp_path / "stages")
+    shown, _ = report.galleries(inputs, EvaluationSettings(report_rows=1), None, {}, found, tmp_path)
+    assert shown.rows == [(0, ""), (1, "the worst of this split, 20.0 dB")]

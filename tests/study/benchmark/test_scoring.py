@@ -212,3 +212,10 @@ def test_a_frame_is_timed_at_its_longest_side() -> None:
     wide = replace(ball_camera("a", 0.0), width_px=64, height_px=32)
     assert frame_seconds(avatar, wide, 0, 16) > 0
     assert avatar.sizes == [(16, 8)] * 3
+
+
+def test_the_median_of_the_timed_renderings_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They take 1, 9 and 2 s."""
+    clock = iter((0.0, 1.0, 10.0, 19.0, 20.0, 22.0))
+    monkeypatch.setattr(scoring.time, "perf_counter", lambda: next(clock))
+    assert frame_seconds(BallAvatar(ball_fit()), ball_camera("a", 0.0), 0, 16) == 2.0
