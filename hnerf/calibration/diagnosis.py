@@ -8,7 +8,7 @@ import numpy as np
 
 from hnerf.capture.people import person_heights_px
 from hnerf.geometry.camera import Camera, resampling
-from hnerf.geometry.triangulation import reprojection_px, triangulate
+from hnerf.geometry.triangulation import confidence_of, reprojection_px, solve_points, triangulate
 
 TRIM = 0.8  # share of the residuals that count; the rest are taken for detector errors
 BODY_HEIGHT_M = (0.5, 2.3)
@@ -88,7 +88,7 @@ def trimmed_cost_px(cameras: Sequence[Camera], keypoints: np.ndarray) -> float:
     """
     projections = np.stack([camera.projection for camera in cameras])
     seen = keypoints[..., 2] > 0
-    points_m, _, _ = triangulate(projections, keypoints, inlier_px=np.inf)
+    points_m = solve_points(projections, keypoints, confidence_of(keypoints))
     diagonal_px = np.array([[np.hypot(*c.size_px)] for c in cameras])
     residuals = np.fmin(reprojection_px(projections, points_m, keypoints), diagonal_px)
     used = seen & (seen.sum(0) >= 2)

@@ -11,14 +11,14 @@ DAMPING = 1e-12  # of the normal equations' trace: keeps them solvable for paral
 
 
 def triangulate(
-    projections: Float[np.ndarray, "C 3 4"], keypoints: Float[np.ndarray, "C K 3"], inlier_px: float | None = None
+    projections: Float[np.ndarray, "C 3 4"], keypoints: Float[np.ndarray, "C K 3"]
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "C K"], Bool[np.ndarray, "C K"]]:
     """Triangulate points from several views, leaving outlier views out.
 
     keypoints: x_px, y_px, confidence (0: unseen). For each point, every pair of views
     is solved linearly; the solution nearest to all views (confidence-weighted L1) decides which views are inliers. The
-    inliers are then solved together by the iteratively re-weighted linear method (Hartley and Sturm 1997). `inlier_px`
-    defaults to 4 times the median distance of the views that took no part in a pair's solution: it grows with noise and
+    inliers are then solved together by the iteratively re-weighted linear method (Hartley and Sturm 1997). They are
+    nearer than 4 times the median distance of the views that took no part in a pair's solution: it grows with noise and
     calibration error.
 
     Returns points_m, NaN with fewer than two inlier views; residuals_px, NaN where unseen or without a point; inliers.
@@ -29,9 +29,8 @@ def triangulate(
     pair_points = np.concatenate([points for points, _ in best]) if best else np.zeros((0, 3))
     in_pair = np.concatenate([members for _, members in best], 1) if best else confidence > 0
     distances = reprojection_px(projections, pair_points, keypoints)
-    if inlier_px is None:
-        third_views_px = distances[(confidence > 0) & ~in_pair & np.isfinite(distances)]
-        inlier_px = max(MIN_INLIER_PX, 4 * float(np.median(third_views_px))) if third_views_px.size else np.inf
+    third_views_px = distances[(confidence > 0) & ~in_pair & np.isfinite(distances)]
+    inlier_px = max(MIN_INLIER_PX, 4 * float(np.median(third_views_px))) if third_views_px.size else np.inf
     inliers = (confidence > 0) & (distances < inlier_px)
     points_m = solve_points(projections, keypoints, confidence * inliers)
     residuals_px = reprojection_px(projections, points_m, keypoints)

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.check import check_calibration
-from hnerf.calibration.diagnosis import MISTAKES, body_height_m, cost_without_each_px, likely_unit, size_ratio
+from hnerf.calibration.diagnosis import (
+    MISTAKES,
+    body_height_m,
+    cost_without_each_px,
+    likely_unit,
+    size_ratio,
+    trimmed_cost_px,
+)
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
 from hnerf.config import CalibrationSettings
@@ -297,3 +304,12 @@ def test_a_rendered_capture_is_left_alone(wave: Capture) -> None:
     report = check_calibration(wave, SETTINGS)
     assert report.verdict == "ok"
     assert all(report.cameras[name] is camera for name, camera in wave.cameras.items())
+
+
+def test_the_trimmed_cost_uses_every_view() -> None:
+    """One camera looks backwards. Rejected, it would cost its image's diagonal, the others nothing: 354 px in all."""
+    cameras = ring(4)
+    keypoints = np.stack([found[:, 0] for found in detections(cameras, 0).values()]).reshape(4, -1, 3)
+    assert trimmed_cost_px(cameras, keypoints) == pytest.approx(0, abs=1e-6)
+    backwards = [turned(cameras[0], 180.0), *cameras[1:]]
+    assert trimmed_cost_px(backwards, keypoints) > 400

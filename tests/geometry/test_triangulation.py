@@ -7,7 +7,7 @@ import pytest
 from hnerf.capture.subject import subject_keypoints
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
-from hnerf.geometry.triangulation import solve_points, triangulate
+from hnerf.geometry.triangulation import _best_pair, solve_points, triangulate
 from tests.calibration.synthetic import detections, ring, walk_m, write_capture
 
 
@@ -52,9 +52,9 @@ def test_a_pair_of_surer_views_wins_over_one_in_larger_images() -> None:
         for x_m, focal in ((-1, 100.0), (1, 100.0), (-2, 200.0), (2, 200.0))
     ])  # fmt: skip
     keypoints = np.array([[[25, 0, 1]], [[-25, 0, 1]], [[100, 5, 0.1]], [[-100, 5, 0.1]]])
-    points_m, _, inliers = triangulate(projections, keypoints, inlier_px=3.0)
+    points_m, in_pair = _best_pair(projections, keypoints, keypoints[..., 2])
     np.testing.assert_allclose(points_m, [[0, 0, 4]], atol=1e-6)
-    assert inliers[:, 0].tolist() == [True, True, False, False]
+    assert in_pair[:, 0].tolist() == [True, True, False, False]
 
 
 def test_an_outlier_view_is_left_out_and_its_residual_told() -> None:
