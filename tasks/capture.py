@@ -18,7 +18,7 @@ def ingest(out: Path, source: Source, settings: CaptureSettings) -> dict[str, fl
     return {"cameras": len(capture.cameras), "frames": len(capture.frames)}
 
 
-@stage("subset", version="2")
+@stage("subset", version="3")
 def subset_capture(
     out: Path,
     recording: Artifact,

@@ -66,12 +66,12 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
 
     Images are undistorted, and shrunk to `settings.max_side_px`, with their keypoints and masks. Where `capture.toml`
     names no frames, those before the first and after the last detected person are left out. A recording that is
-    `uncalibrated` is read without the poses of its cameras, all of which are then for training. Raises InputError, one
-    line that names the file, on anything missing, unreadable, contradictory or unsafe.
+    `uncalibrated` is read without the poses of its cameras, all of which are then for training, and without footage of
+    a board. Raises InputError, one line that names the file, on anything missing, unreadable, contradictory or unsafe.
     """
     layout, manifest = uncalibrated or recognise(folder), read_manifest(folder)
     if uncalibrated:
-        manifest = manifest.model_copy(update={"cameras": None})
+        manifest = _without_places(manifest, uncalibrated.only)
     subject = capture_name(folder, manifest)
     lenses = layout.lenses()
     cameras = chosen_cameras(folder, manifest, list(lenses), layout.training_cameras())
@@ -91,7 +91,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     chosen = to_body_25({name: found[rows] for name, found in people.items()}, manifest.keypoints)
     write_keypoints(out, {name: normalisers[name].keypoints(points) for name, points in chosen.items()})
     _write_given_poses(folder, layout, wanted, out)
-    if boards := read_board_footage(folder, "extrinsic"):
+    if not uncalibrated and (boards := read_board_footage(folder, "extrinsic")):
         normalised_corners(boards, normalisers).save(out)
 
     metres = manifest.metres_per_unit
@@ -140,6 +140,15 @@ def recognise(folder: Path) -> Layout:
         "(sparse/), Caliscope (camera_array.toml), aniposelib (calibration.toml), ZJU-MoCap (annots.npy), "
         f"PeopleSnapshot (camera.pkl) and videos ({', '.join(VIDEO_SUFFIXES)}); see docs/formats.md"
     )
+
+
+def _without_places(manifest: CaptureManifest, only: str | None) -> CaptureManifest:
+    """Return what holds without calibration: neither a split of the cameras nor a subject named by the ground; and, of
+    one camera by itself, neither common frames nor a subject named in another."""
+    dropped = {"cameras"} | ({"frames"} if only else set())
+    if (point := manifest.subject_point) and (not point.camera or only not in (None, point.camera)):
+        dropped.add("subject")
+    return manifest.model_copy(update=dict.fromkeys(dropped))
 
 
 def _subject_point(

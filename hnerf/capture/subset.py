@@ -3,13 +3,16 @@
 import dataclasses
 import shutil
 from collections.abc import Callable, Collection, Mapping
+from itertools import product
+from operator import itemgetter
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
 from hnerf.capture.board_footage import BOARDS_FILE
-from hnerf.capture.capture import HANDS, KEYPOINTS, LANDMARKS, PERSON, Capture
+from hnerf.capture.capture import HANDS, KEYPOINTS, LANDMARKS, PERSON, Capture, SubjectPoint
+from hnerf.capture.subject import subject_keypoints
 from hnerf.errors import InputError, NotApplicableError
 
 T = TypeVar("T")
@@ -44,6 +47,7 @@ def subset(
         train_frames=select(capture, "training frame", train_frames, capture.train_frames),
         novel_pose_frames=select(capture, "novel-pose frame", novel_pose_frames, capture.novel_pose_frames),
     )
+    kept = dataclasses.replace(kept, subject_point=_subject_point(capture, kept))
     if not kept.train_cameras or not kept.train_frames:
         raise InputError(f"{capture.name}: no training camera or frame would be left; keep one of each")
     write_arrays(capture, kept)
@@ -51,6 +55,19 @@ def subset(
     for name in kept.cameras:
         copy_pixels(capture, kept, name)
     kept.save()
+
+
+def _subject_point(capture: Capture, kept: Capture) -> SubjectPoint | None:
+    """Return the point that names the subject; where its camera is left out, a keypoint of the person in another."""
+    point = capture.subject_point
+    if point is None or point.camera in ("", *kept.train_cameras) or capture.keypoints(point.camera) is None:
+        return point
+    found = subject_keypoints(capture)
+    for name, frame in product(kept.train_cameras, kept.frames):
+        x, y, confidence = max(found[name][capture.frames.index(frame)].tolist(), key=itemgetter(2))
+        if confidence:
+            return SubjectPoint((x, y), name, frame)
+    return point
 
 
 def write_arrays(

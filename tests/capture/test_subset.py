@@ -1,10 +1,14 @@
+import dataclasses
 from pathlib import Path
 
 import pytest
 
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, SubjectPoint
+from hnerf.capture.subject import subject_keypoints
 from hnerf.capture.subset import subset
 from hnerf.errors import InputError
+from tests.calibration.synthetic import ring
+from tests.capture.test_subject import recorded, share_right, staying
 from tests.study.recording import write_landmarks, write_recording
 
 
@@ -32,6 +36,17 @@ def test_landmarks_stay_with_their_frames(tmp_path: Path) -> None:
     assert landmarks is not None
     assert [points[:, 0, 0, 0].tolist() for points in landmarks] == [[2, 6, 10], [0.2, 0.6, 1.0]]
     assert few.landmarks("03") is None  # no network looked
+
+
+def test_who_is_named_in_a_camera_left_out_is_named_in_another(tmp_path: Path) -> None:
+    people_m = staying((0, -0.6)), staying((0, 0.6))
+    capture, each = recorded(tmp_path / "all", ring(3), *people_m)
+    x, y, _ = each[1]["c1"][7, 0]
+    capture = dataclasses.replace(capture, subject_point=SubjectPoint((x, y), "c1", 7))
+    subset(capture, tmp_path / "few", ("c0", "c2"), None, None)
+    few = Capture.load(tmp_path / "few")
+    assert few.subject_point is not None and few.subject_point.camera == "c0"
+    assert share_right(subject_keypoints(few), {name: each[1][name] for name in ("c0", "c2")}) == 1
 
 
 def test_none_keeps_everything(tmp_path: Path) -> None:

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from hnerf.capture.capture import SubjectPoint
 from hnerf.capture.ingest import ingest, recognise
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
 from hnerf.capture.video_metadata import KEY, focal_35mm
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
+from tests.capture.recordings import write_easymocap, write_png
 
 
 def write_images(folder: Path, camera: str, exif: Image.Exif | None = None) -> None:
@@ -103,3 +105,35 @@ def test_a_run_names_the_command_that_calibrates(tmp_path: Path) -> None:
     write_images(tmp_path, "a")
     with pytest.raises(InputError, match=r"no calibration.*hnerf calibrate .* --from person"):
         recognise(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("toml", "only", "point"),
+    [
+        ('subject = "nearest to (3, 5) in 01 at frame 0"', "02", None),
+        ('subject = "nearest to (3, 5) in 01 at frame 0"', "01", SubjectPoint((3.0, 5.0), "01", 0)),
+        ('subject = "nearest to (3, 5) in 01 at frame 0"', None, SubjectPoint((3.0, 5.0), "01", 0)),
+        ('subject = "nearest to (0.5, -1.2)"', None, None),
+        ("[frames]\ntrain = [0, 1, 2, 3, 4]", "02", None),
+    ],
+)
+def test_what_other_cameras_and_places_are_needed_for_is_not_asked(
+    tmp_path: Path, toml: str, only: str | None, point: SubjectPoint | None
+) -> None:
+    """Camera 02, read alone, is a frame shorter than `capture.toml` says; the ground is not known yet."""
+    folder = write_easymocap(tmp_path / "ada")
+    (folder / "capture.toml").write_text(f"{toml}\n")
+    if only == "02":
+        (folder / "images" / "02" / "000004.png").unlink()
+        (folder / "openpose" / "02" / "000004_keypoints.json").unlink()
+    capture = ingest(folder, CaptureSettings(), tmp_path / "out", Uncalibrated(folder, only=only))
+    assert capture.subject_point == point and len(capture.frames) == (4 if only == "02" else 5)
+
+
+def test_board_footage_is_not_read_without_calibration(tmp_path: Path) -> None:
+    """It shows one of the cameras only, and would be searched once for each."""
+    folder = write_easymocap(tmp_path / "ada")
+    write_png(folder / "calibration" / "extrinsic" / "01" / "0.png", np.zeros((16, 24, 3), np.uint8))
+    (folder / "capture.toml").write_text("[board]\ncolumns = 4\nrows = 5\nsquare_m = 0.05\n")
+    capture = ingest(folder, CaptureSettings(), tmp_path / "out", Uncalibrated(folder, only="02"))
+    assert not (capture.root / "boards.npz").exists()

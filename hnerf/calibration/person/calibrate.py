@@ -146,9 +146,12 @@ def calibrate_from_person(
 
 
 def _each_alone(capture: Capture) -> np.ndarray:
-    """Return the keypoints (C, frames, 25, 3) of the person whom each camera by itself takes for the subject."""
-    alone = [dataclasses.replace(capture, train_cameras=(name,)) for name in capture.train_cameras]
-    return np.stack([subject_keypoints(one)[one.train_cameras[0]] for one in alone])
+    """Return the keypoints (C, frames, 25, 3) of the person whom each camera by itself takes for the subject: who is
+    named there, else who has the best claim."""
+    found = subject_keypoints(dataclasses.replace(capture, subject_point=None))
+    if point := capture.subject_point:
+        found |= subject_keypoints(dataclasses.replace(capture, train_cameras=(point.camera,)))
+    return np.stack(list(found.values()))
 
 
 def _straight(keypoints: np.ndarray, fit: LensFit, unknown: Sequence[str]) -> np.ndarray:
@@ -166,7 +169,8 @@ def _check_determined(
     if found.median_px[worst] > MAX_RESIDUAL_SHARE * median_height_px(keypoints):
         raise InputError(
             f"camera {worst} does not see the same person at the same time as the others (keypoints off by "
-            f"{found.median_px[worst]:.0f} px); check that all recordings start together, or leave it out"
+            f"{found.median_px[worst]:.0f} px); check that all recordings start together, name the subject among "
+            "several people (docs/formats.md), or leave it out"
         )
     moved = _motion(found.points_m)
     if moved < MIN_MOTION:

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.bundle import align, undistort
-from hnerf.calibration.person.calibrate import calibrate_from_person
+from hnerf.calibration.person.calibrate import _each_alone, calibrate_from_person
 from hnerf.calibration.person.lens import fit_lenses, with_focal
 from hnerf.calibration.person.rig import first_poses
 from hnerf.calibration.person.upright import scale_to, stand_on_ground
+from hnerf.capture.capture import SubjectPoint
 from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
@@ -185,3 +186,16 @@ def test_recordings_of_different_moments_are_refused(tmp_path: Path) -> None:
     seen = detections(ring(4), 1.0)
     seen["c1"] = seen["c1"][[5, 2, 9, 0, 11, 7, 1, 10, 4, 8, 3, 6]]
     assert "camera c1" in refusal(tmp_path, ring(4), seen, [])
+
+
+def test_each_camera_takes_who_is_named_there_or_has_the_best_claim(tmp_path: Path) -> None:
+    """Two people walk beside each other, of whom the second is named in c0 and is a little larger in c1."""
+    seen = detections(ring(2), 0.0)
+    aside = np.array([200.0, 0, 0])
+    both = {name: np.concatenate([found - aside, found + aside], 1) for name, found in seen.items()}
+    middle = both["c1"][:, 1:, :, :2].mean(2, keepdims=True)
+    both["c1"][:, 1:, :, :2] = middle + 1.05 * (both["c1"][:, 1:, :, :2] - middle)
+    capture = write_capture(tmp_path, [lost(camera) for camera in ring(2)], both)
+    x, y, _ = both["c0"][3, 1, 0]
+    capture = dataclasses.replace(capture, subject_point=SubjectPoint((x, y), "c0", 3))
+    np.testing.assert_array_equal(_each_alone(capture), [both["c0"][:, 1], both["c1"][:, 1]])
