@@ -136,7 +136,7 @@ def recognise(folder: Path) -> Layout:
             f"`hnerf calibrate {folder} --from person` finds them from the person, --from boards from a board"
         )
     raise InputError(
-        f"{folder}: is none of EasyMocap (intri.yml, extri.yml, images/), Pose2Sim (calibration/, videos/), COLMAP "
+        f"{folder}: is none of EasyMocap (intri.yml, extri.yml, images/), Pose2Sim (calibration/Calib*.toml), COLMAP "
         "(sparse/), Caliscope (camera_array.toml), aniposelib (calibration.toml), ZJU-MoCap (annots.npy), "
         f"PeopleSnapshot (camera.pkl) and videos ({', '.join(VIDEO_SUFFIXES)}); see docs/formats.md"
     )

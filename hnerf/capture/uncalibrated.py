@@ -58,7 +58,7 @@ class Uncalibrated(Layout):
         names = [name for name in cameras_without_calibration(self.folder) if self.only in (None, name)]
         own = path_in_capture(self.folder, "intri.yml")
         file = self.lens_file or (own if own.exists() else None)
-        given = _read_lenses(file) if file else {}
+        given = read_lenses(file) if file else {}
         if self.lens_file and not set(given).intersection(names):
             raise InputError(f"{file}: has none of the cameras {', '.join(names)}; name them as the recordings are")
         known = {name: KnownLens(lens, f"from {file.name}") for name, lens in given.items() if file and name in names}
@@ -96,7 +96,7 @@ def lens_by_angle(name: str, footage: Footage, fov_deg: float | None) -> KnownLe
     return KnownLens(Lens(name, K, np.zeros(4), np.eye(3), np.zeros(3), (width_px, height_px)), source)
 
 
-def _read_lenses(path: Path) -> dict[str, Lens]:
+def read_lenses(path: Path) -> dict[str, Lens]:
     """Return the lenses of a file of intrinsics, whose poses, if it has any, are not read."""
     if path.suffix.lower() in (".yml", ".yaml"):
         return read_intrinsics(path)
@@ -104,7 +104,7 @@ def _read_lenses(path: Path) -> dict[str, Lens]:
     tables = tree.get("cameras", tree)
     nowhere = {"rotation": [0, 0, 0], "translation": [0, 0, 0]}
     lenses = [
-        lens_from_table(path, key, {"name": f"cam_{key}"} | table | nowhere)
+        lens_from_table(path, key, {"name": f"cam_{table.get('cam_id', table.get('port', key))}"} | table | nowhere)
         for key, table in (tables.items() if isinstance(tables, dict) else ())
         if isinstance(table, dict) and "matrix" in table
     ]

@@ -207,7 +207,7 @@ EASYMOCAP = {
 }
 
 POSE2SIM = {
-    "no calibration file": (lambda f: (f / "calibration/Calib.toml").unlink(), "calibration: 0 files"),
+    "no calibration file": (lambda f: (f / "calibration/Calib.toml").unlink(), "walker: 2 videos without calibration"),
     "calibration is a pickle": (
         lambda f: (f / "calibration/Calib.toml").write_bytes(pickle.dumps(Bomb())),
         "Calib.toml",

@@ -19,11 +19,14 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.ingest import recognise
 from hnerf.capture.lens import Lens
+from hnerf.capture.safe_io import path_in_capture
+from hnerf.capture.uncalibrated import read_lenses
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 MAX_TILT_DEG = 75.0  # a board tilted further is too slanted to be detected
-CALIBRATION_FILES = ("intri.yml", "camera_array.toml", "calibration.toml", "sparse", "calibration/Calib*.toml")
+INTRINSICS = ("intri.yml", "camera_array.toml", "calibration.toml")
+WHOLE_CALIBRATIONS = ("sparse", "calibration/Calib*.toml")
 
 log = logging.getLogger("hnerf.calibration")
 
@@ -154,7 +157,7 @@ def _check_board_found(footage: BoardFootage) -> None:
 def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], dict[str, str]]:
     """Return the lens of every camera in the extrinsic footage, and where it comes from, in words."""
     close = read_board_footage(folder, "intrinsic")
-    given = recognise(folder).lenses() if any(any(folder.glob(name)) for name in CALIBRATION_FILES) else {}
+    given = _given_lenses(folder)
     lenses, words = {}, {}
     for name, size_px in footage.sizes_px.items():
         source = close if close is not None and name in close.corners_px else footage
@@ -176,6 +179,15 @@ def _intrinsics(folder: Path, footage: BoardFootage) -> tuple[dict[str, Lens], d
             )
         lenses[name] = dataclasses.replace(lenses[name], size_px=size_px)
     return lenses, words
+
+
+def _given_lenses(folder: Path) -> dict[str, Lens]:
+    """Return the lenses of the calibration file in a folder, which need not know poses; none where there is none."""
+    for name in INTRINSICS:
+        path = path_in_capture(folder, name)
+        if path.exists():
+            return read_lenses(path)
+    return recognise(folder).lenses() if any(any(folder.glob(name)) for name in WHOLE_CALIBRATIONS) else {}
 
 
 def _compared(found: LensEstimate, given: Lens) -> str:

@@ -25,7 +25,7 @@ class StoredFrame(NamedTuple):
 class Layout(ABC):
     """A capture folder in one layout. Methods for what most layouts lack return nothing by default.
 
-    `mark`: a file or folder that only this layout has.
+    `mark`: a file that only this layout has; its name may have wildcards.
     `novel_pose_share`: share of the frames for novel poses, where no `capture.toml` splits them.
     """
 
@@ -36,7 +36,7 @@ class Layout(ABC):
     @classmethod
     def recognises(cls, folder: Path) -> bool:
         """Return whether the folder looks like this layout."""
-        return (folder / cls.mark).exists()
+        return any(folder.glob(cls.mark))
 
     @abstractmethod
     def lenses(self) -> dict[str, Lens]:

@@ -18,7 +18,7 @@ from hnerf.errors import InputError
 class Pose2Sim(Layout):
     """A capture folder as Pose2Sim's own tools read it: world to camera, metres, Z up."""
 
-    mark = "calibration"
+    mark = "calibration/Calib*.toml"
     novel_pose_share: ClassVar[float] = 0.2  # the last fifth, whose motion the training frames do not contain
 
     def lenses(self) -> dict[str, Lens]:

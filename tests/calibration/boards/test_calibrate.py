@@ -210,6 +210,22 @@ def test_given_intrinsics_without_a_size_have_that_of_the_footage(
     assert calibrate_from_boards(tmp_path).lenses["a"].size_px == (1280, 720)
 
 
+@pytest.mark.parametrize("kind", ["easymocap", "caliscope"])
+def test_intrinsics_need_no_poses_beside_them(tmp_path: Path, kind: str) -> None:
+    """There is board footage, too, in the folder calibration/ that Pose2Sim has."""
+    (tmp_path / "calibration" / "extrinsic").mkdir(parents=True)
+    given = Lens("cam_7", np.diag([900.0, 900, 1]), np.zeros(5), np.eye(3), np.zeros(3), (1000, 1000))
+    write_cameras(tmp_path, [given], kind)
+    (tmp_path / "extri.yml").unlink(missing_ok=True)
+    if kind == "caliscope":
+        path = tmp_path / "camera_array.toml"
+        lines = [line for line in path.read_text().splitlines() if not line.startswith(("rotation =", "translation"))]
+        path.write_text("\n".join(lines).replace("[cameras.7]", "[cameras.0]"))
+    footage = BoardFootage(tmp_path, BOARD, (0,), 1, {"cam_7": np.full((1, 20, 2), np.nan)}, {"cam_7": (1000, 1000)})
+    lenses, words = calibration_boards._intrinsics(tmp_path, footage)
+    assert lenses["cam_7"].K[0, 0] == 900 and words["cam_7"].startswith("given; not verified")
+
+
 def test_undistortion_keeps_what_is_absent_absent() -> None:
     lens = Lens("a", np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), np.array([0.1, 0, 0, 0]), np.eye(3),
                 np.zeros(3), None)  # fmt: skip
