@@ -69,9 +69,8 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     `uncalibrated` is read without the poses of its cameras, all of which are then for training, and without footage of
     a board. Raises InputError, one line that names the file, on anything missing, unreadable, contradictory or unsafe.
     """
-    layout, manifest = uncalibrated or recognise(folder), read_manifest(folder)
-    if uncalibrated:
-        manifest = _without_places(manifest, uncalibrated.only)
+    layout = uncalibrated or recognise(folder)
+    manifest = _manifest_for(layout, folder)
     subject = capture_name(folder, manifest)
     lenses = layout.lenses()
     cameras = chosen_cameras(folder, manifest, list(lenses), layout.training_cameras())
@@ -142,11 +141,20 @@ def recognise(folder: Path) -> Layout:
     )
 
 
-def _without_places(manifest: CaptureManifest, only: str | None) -> CaptureManifest:
-    """Return what holds without calibration: neither a split of the cameras nor a subject named by the ground; and, of
-    one camera by itself, neither common frames nor a subject named in another."""
-    dropped = {"cameras"} | ({"frames"} if only else set())
-    if (point := manifest.subject_point) and (not point.camera or only not in (None, point.camera)):
+def _manifest_for(layout: Layout, folder: Path) -> CaptureManifest:
+    """Read what `capture.toml` says of a recording in this layout.
+
+    Without calibration there is neither a split of the cameras nor a subject named by the ground; and, of one camera by
+    itself, neither common frames nor a subject named in another. Raises InputError where the world's vertical axis is
+    not that of the layout's own world.
+    """
+    manifest = read_manifest(folder)
+    if isinstance(layout, PeopleSnapshot | Videos) and manifest.up != "z":
+        raise InputError(f"{folder / 'capture.toml'}: up: z is up where one camera makes the world; remove the line")
+    if not isinstance(layout, Uncalibrated):
+        return manifest
+    dropped = {"cameras"} | ({"frames"} if layout.only else set())
+    if (point := manifest.subject_point) and (not point.camera or layout.only not in (None, point.camera)):
         dropped.add("subject")
     return manifest.model_copy(update=dict.fromkeys(dropped))
 

@@ -56,6 +56,13 @@ def refused(folder: Path, out: Path) -> str:
     return str(refusal.value)
 
 
+def test_the_world_of_one_camera_has_z_up(tmp_path: Path) -> None:
+    write_video(tmp_path / "ada" / "front.mp4", 3)
+    (tmp_path / "ada" / "capture.toml").write_text('up = "y"\n')
+    message = "capture.toml: up: z is up where one camera makes the world; remove the line"
+    assert message in refused(tmp_path / "ada", tmp_path / "out")
+
+
 def test_several_videos_need_cameras(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_video(tmp_path / "ada" / f"{name}.mp4", 3)
