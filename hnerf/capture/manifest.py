@@ -115,16 +115,19 @@ def read_manifest(folder: Path) -> CaptureManifest:
 
 
 def capture_name(folder: Path, manifest: CaptureManifest) -> str:
-    """Return the name of the subject. It becomes a folder name; raises InputError if it cannot be one."""
+    """Return the name of the subject: that of `capture.toml`, else of the folder or the video, without signs that a
+    folder of results cannot have. Raises InputError if there is nothing left to call it by, or too much."""
     place = folder.resolve()
-    given = (place.stem if place.is_file() else place.name) if manifest.name is None else manifest.name
+    source, given = folder / "capture.toml", manifest.name
+    if given is None:
+        source, given = folder, place.stem if place.is_file() else place.name
     name = unicodedata.normalize("NFC", given)  # macOS: NFD
+    if manifest.name is None:
+        name = re.sub(r"[^\w .()-]|^\W", "_", name)
     if not re.fullmatch(r"\w[\w .()-]{0,127}", name):
-        raise InputError(
-            f"{folder / 'capture.toml'}: name {shown(name)}: use letters, digits, '_', '-', '.' and spaces"
-        )
+        raise InputError(f"{source}: name {shown(name)}: rename it; use letters, digits, '_', '-', '.' and spaces")
     if len(name.encode()) > MAX_NAME_BYTES:
-        raise InputError(f"{folder / 'capture.toml'}: name of {len(name.encode())} bytes; keep to {MAX_NAME_BYTES}")
+        raise InputError(f"{source}: name of {len(name.encode())} bytes; keep to {MAX_NAME_BYTES}")
     return name
 
 

@@ -6,6 +6,7 @@ import re
 import stat
 import tokenize
 import tomllib
+import unicodedata
 import zipfile
 import zlib
 from collections.abc import Container
@@ -44,13 +45,21 @@ _ARGUMENTS = ("file", "allow_pickle")  # of np.savez, which is given keypoints w
 
 
 def check_camera_name(name: object, source: Path) -> str:
-    """Return `name` if it can be the name of a folder and of an array in a .npz. Raises InputError naming `source`
-    otherwise (separators, dots, wildcards)."""
-    if not isinstance(name, str) or not _CAMERA_NAME.fullmatch(name):
-        raise InputError(f"{source}: camera name {shown(name)}: use letters, digits, '_', '-', spaces and ()")
-    if name in _ARGUMENTS:
+    """Return `name`, its accents composed, if it can be the name of a folder and of an array in a .npz. Raises
+    InputError naming `source` otherwise (separators, dots, wildcards)."""
+    composed = _composed(name) if isinstance(name, str) else ""
+    if not _CAMERA_NAME.fullmatch(composed):
+        raise InputError(
+            f"{source}: camera name {shown(name)}: rename it; use letters, digits, '_', '-', spaces and ()"
+        )
+    if composed in _ARGUMENTS:
         raise InputError(f"{source}: a camera cannot be called {name!r}; rename it")
-    return name
+    return composed
+
+
+def _composed(text: str) -> str:
+    """Return a text with one character for a letter and its accent, of which macOS makes two in file names."""
+    return unicodedata.normalize("NFC", text)
 
 
 def shown(value: object) -> str:
@@ -59,11 +68,11 @@ def shown(value: object) -> str:
 
 
 def path_in_capture(root: Path, *parts: str) -> Path:
-    """Return root/parts, which need not exist. Raises InputError if it leaves the capture folder, passes through a
-    link, or is a pipe or a device, which could be waited for without end."""
+    """Return root/parts, which need not exist, its accents as the folder has them. Raises InputError if it leaves the
+    capture folder, passes through a link, or is a pipe or a device, which could be waited for without end."""
     path = root
     for part in parts:
-        path = path / part
+        path = path / _spelled(path, part)
         if part in ("", ".", "..") or Path(part).name != part:
             raise InputError(f"{path}: the name leaves the capture folder; rename it")
         try:
@@ -77,6 +86,13 @@ def path_in_capture(root: Path, *parts: str) -> Path:
         if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
             raise InputError(f"{path}: is a pipe or a device; put a file into the capture folder")
     return path
+
+
+def _spelled(folder: Path, name: str) -> str:
+    """Return the name of a file, whose accents may be composed or not, as the folder that holds it spells it."""
+    if name.isascii() or os.path.lexists(folder / name) or not folder.is_dir():
+        return name
+    return next((other for other in os.listdir(folder) if _composed(other) == _composed(name)), name)
 
 
 def files_in(root: Path, *parts: str, suffixes: tuple[str, ...] = ()) -> list[Path]:
@@ -100,7 +116,7 @@ def files_in(root: Path, *parts: str, suffixes: tuple[str, ...] = ()) -> list[Pa
 def file_named(root: Path, stem: str, *parts: str, suffixes: tuple[str, ...]) -> Path:
     """Return the file called `stem` with one of these suffixes, matched as in `files_in`, in a folder inside the
     capture; where there is none, the path that it would have with the first suffix."""
-    found = [path for path in files_in(root, *parts, suffixes=suffixes) if path.stem == stem]
+    found = [path for path in files_in(root, *parts, suffixes=suffixes) if _composed(path.stem) == stem]
     return found[0] if found else path_in_capture(root, *parts, stem + suffixes[0])
 
 
@@ -141,10 +157,10 @@ def _without_waiting(name: str, flags: int) -> int:
 
 
 def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """Read a small UTF-8 text file, with or without a byte order mark. Raises InputError if it is missing, empty, too
-    large, or not text (a pickle, an archive)."""
+    """Read a small UTF-8 text file, with or without a byte order mark; its accents are composed. Raises InputError if
+    it is missing, empty, too large, or not text (a pickle, an archive)."""
     try:
-        text = read_bytes(path, max_bytes).decode("utf-8-sig")
+        text = _composed(read_bytes(path, max_bytes).decode("utf-8-sig"))
     except UnicodeDecodeError:
         raise InputError(f"{path}: is not UTF-8 text (a pickle, or another encoding?); save it as UTF-8") from None
     if not text.strip():

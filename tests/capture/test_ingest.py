@@ -1,7 +1,9 @@
 """Ingestion: pixels, cameras and keypoints of a small recording, worked out by hand."""
 
 import logging
+import unicodedata
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -259,3 +261,21 @@ def test_shared_captures_come_through(tmp_path: Path) -> None:
     assert (len(capture.train_frames), len(capture.novel_pose_frames)) == (24, 12)
     image = cv2.imread(str(folder / "images" / "05" / "000035.jpg"))[..., ::-1]
     assert np.array_equal(capture.image("05", 35), image)
+
+
+@pytest.mark.parametrize("form", ["NFC", "NFD"])
+def test_accents_are_the_same_composed_or_not(tmp_path: Path, form: Literal["NFC", "NFD"]) -> None:
+    """macOS takes them apart in the names of files, editors compose them, or the other way round."""
+    folder = rec.write_easymocap(tmp_path / "ada")
+    other: Literal["NFC", "NFD"] = "NFD" if form == "NFC" else "NFC"
+    written, named = (unicodedata.normalize(one, "K\u00e4te") for one in (form, other))
+    for file in ("intri.yml", "extri.yml"):
+        text = (folder / file).read_text().replace('"01"', f'"{written}"').replace("_01:", f"_{written}:")
+        (folder / file).write_text(text)
+    (folder / "capture.toml").write_text(f'[cameras]\ntrain = ["{written}", "02"]\n')
+    for part in ("images", "openpose"):
+        (folder / part / "01").rename(folder / part / named)
+    rec.write_png(folder / "background" / f"{named}.png", rec.picture("01", 9))
+    capture = ingest(folder, CaptureSettings(), tmp_path / "out")
+    assert capture.train_cameras == ("K\u00e4te", "02") and capture.keypoints("K\u00e4te") is not None
+    assert capture.background("K\u00e4te") is not None

@@ -16,6 +16,8 @@ from hnerf.capture.uncalibrated import USUAL_FOCAL, lens_by_angle
 from hnerf.errors import InputError
 from hnerf.geometry.axes import CAMERA_FROM_Z_UP
 
+CAMERA = "camera"
+
 log = logging.getLogger("hnerf.capture")
 
 
@@ -37,7 +39,7 @@ class Videos(Layout):
                 f"{self.folder}: {len(videos)} videos without calibration; `hnerf calibrate {self.folder} --from "
                 "person` finds their cameras from the person, --from boards from footage of a board"
             )
-        name = check_camera_name(videos[0].stem, videos[0])
+        name = _camera_name(videos[0])
         stated = read_manifest(self.folder).field_of_view_deg
         known = lens_by_angle(name, Video(videos[0], (0,), None), stated)
         if not known.source:
@@ -50,8 +52,17 @@ class Videos(Layout):
         return {name: dataclasses.replace(known.lens, R=CAMERA_FROM_Z_UP)}
 
     def footage(self, camera: str) -> Footage:
-        """Return the camera's video."""
-        return Video.open(next(path for path in _videos(self.folder) if path.stem == camera))
+        """Return the one video."""
+        return Video.open(_videos(self.folder)[0])
+
+
+def _camera_name(video: Path) -> str:
+    """Return the name of a video's file, as phones and messengers make it, where a camera can have it, else one that
+    fits."""
+    try:
+        return check_camera_name(video.stem, video)
+    except InputError:
+        return CAMERA
 
 
 def _videos(folder: Path) -> list[Path]:

@@ -1,6 +1,7 @@
 """ZJU-MoCap, and Human3.6M as NeuralBody prepares it: annots.npy, mask_cihp/ or mask/, new_params/ or params/."""
 
 import re
+import unicodedata
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -38,7 +39,7 @@ class ZjuMocap(Layout):
         """Return the images' paths by camera, named after an image's own folder, and by frame."""
         try:
             rows = [[PurePosixPath(str(path)) for path in row["ims"]] for row in self._annotations["ims"]]
-            names = [path.parent.name for path in rows[0]]
+            names = [unicodedata.normalize("NFC", path.parent.name) for path in rows[0]]
             frames = [_frame(row[0]) for row in rows]
             columns = list(zip(*rows, strict=True))
         except (IndexError, KeyError, TypeError, ValueError):

@@ -36,6 +36,27 @@ def test_one_file_is_a_capture(clip: Path, tmp_path: Path, caplog: pytest.LogCap
     assert depth_m == 2
 
 
+@pytest.mark.parametrize(
+    ("file", "subject", "camera"),
+    [
+        ("PXL_20230101_120000.TS.mp4", "PXL_20230101_120000.TS", "camera"),
+        ("WhatsApp Video 2024-01-02 at 10.11.12.mp4", "WhatsApp Video 2024-01-02 at 10.11.12", "camera"),
+        ("it's me.mp4", "it_s me", "camera"),
+        ("-clip.mp4", "_clip", "camera"),
+        ("Zoe\u0308.mp4", "Zo\u00eb", "Zo\u00eb"),
+    ],
+)
+def test_a_file_may_be_called_as_phones_call_it(tmp_path: Path, file: str, subject: str, camera: str) -> None:
+    write_video(tmp_path / "x.mp4", 3)
+    found = ingest((tmp_path / "x.mp4").rename(tmp_path / file), SETTINGS, tmp_path / "out")
+    assert found.name == subject and found.train_cameras == (camera,)
+
+
+def test_a_name_that_is_too_long_is_the_files(clip: Path, tmp_path: Path) -> None:
+    long = clip.rename(clip.with_name("a" * 129 + ".mp4"))
+    assert "aaa.mp4: name 'aaaa" in refused(long, tmp_path / "out")
+
+
 @pytest.mark.parametrize("place", ["videos/front.MP4", "front.mov", "videos/front.mp4"])
 def test_a_folder_states_the_field_of_view(place: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """90 degrees: the focal length is half the longer side."""
