@@ -4,7 +4,6 @@ Each imports what it needs itself, so that the others, and help, need not wait f
 """
 
 import argparse
-import dataclasses
 import json
 import math
 from collections.abc import Iterator
@@ -156,13 +155,9 @@ def export_cameras(options: argparse.Namespace) -> None:
         raise InputError(f"{options.out}: lies in the recording, whose results would be computed again; give another")
     with atomic_folder(options.out) as partial:
         from hnerf.capture.formats.export import write_cameras
-        from hnerf.capture.ingest import recognise
-        from hnerf.capture.manifest import read_manifest
+        from hnerf.capture.ingest import exported_lenses
 
-        lenses = recognise(options.folder).lenses().values()
-        scale = read_manifest(options.folder).metres_per_unit
-        in_metres = [dataclasses.replace(lens, t_m=scale * lens.t_m) for lens in lenses]
-        write_cameras(partial, in_metres, options.format)
+        write_cameras(partial, exported_lenses(options.folder), options.format)
     print(f"cameras: {options.out}")
 
 

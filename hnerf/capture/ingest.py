@@ -1,6 +1,7 @@
 """Ingestion: a capture folder in any known layout becomes one normalised capture."""
 
 import logging
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -120,6 +121,25 @@ def recorded_cameras(folder: Path) -> CameraSplit:
     does."""
     layout = recognise(folder)
     return chosen_cameras(folder, read_manifest(folder), list(layout.lenses()), layout.training_cameras())
+
+
+def exported_lenses(folder: Path) -> list[Lens]:
+    """Return the cameras of a capture folder for other tools: in metres, and with the size of their first image where
+    the calibration states none, if there is one. Raises InputError as `ingest` does."""
+    layout, metres = recognise(folder), read_manifest(folder).metres_per_unit
+    return [
+        replace(lens, t_m=metres * lens.t_m, size_px=lens.size_px or _first_size(layout, name))
+        for name, lens in layout.lenses().items()
+    ]
+
+
+def _first_size(layout: Layout, camera: str) -> tuple[int, int] | None:
+    """Return the (width, height) of a camera's first image; None where there is none."""
+    with suppress(InputError):
+        footage = layout.footage(camera)
+        height_px, width_px = next(footage.read(footage.frames[:1])).rgb.shape[:2]
+        return width_px, height_px
+    return None
 
 
 def recognise(folder: Path) -> Layout:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hnerf.capture.ingest import ingest
+from hnerf.capture.ingest import exported_lenses, ingest
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from tests.capture import recordings as rec
@@ -113,3 +113,14 @@ def test_frames_that_are_no_numbers_of_up_to_nine_digits_are_refused(name: str, 
     (tmp_path / "zju").mkdir()
     with pytest.raises(InputError, match=r"annots\.npy: 'ims' does not list images by frame number"):
         ingest(write_zju(tmp_path / "zju", frame=name), CaptureSettings(), tmp_path / "out")
+
+
+def test_exported_cameras_have_the_size_of_their_images(folder: Path) -> None:
+    """annots.npy states none; translations are in metres already."""
+    lenses = exported_lenses(folder)
+    assert [(lens.size_px, lens.t_m.tolist()) for lens in lenses] == [((rec.WIDTH, rec.HEIGHT), [0, 1, 3])] * len(
+        lenses
+    )
+    for path in folder.rglob("*.jpg"):
+        path.unlink()
+    assert {lens.size_px for lens in exported_lenses(folder)} == {None}
