@@ -13,6 +13,7 @@ DARK = 16.0  # grey level: nine tenths of each row of a bar are below it
 LIT = 40.0  # grey level: the median of the picture beside a bar must be above it, so that the edge shows
 MAX_BAR_SHARE = 0.4  # of the picture's side, for each of its two bars
 RISE_PX = 3  # width of the step from a bar to the picture at most; an encoder blurs it over two
+BAND_ROWS = 256  # of the pictures, handled at once: floats of whole ones would take gigabytes
 ASPECT_PX = 1.0  # by which the picture's height may differ from what its width implies
 
 
@@ -31,7 +32,9 @@ def picture_area(pictures: Sequence[np.ndarray]) -> Area:
 
     A bar is dark in all frames and ends sharply; a picture that fades into the dark has none.
     """
-    grey = np.median([picture.mean(-1) for picture in pictures], axis=0)
+    starts = range(0, len(pictures[0]), BAND_ROWS)
+    bands = ([picture[row : row + BAND_ROWS].mean(-1, dtype=np.float32) for picture in pictures] for row in starts)
+    grey = np.concatenate([np.median(band, axis=0) for band in bands])
     top, bottom = _bar_px(grey), _bar_px(grey[::-1])
     left, right = _bar_px(grey.T), _bar_px(grey.T[::-1])
     height, width = grey.shape

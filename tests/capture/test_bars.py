@@ -1,5 +1,6 @@
 """Black bars with known edges."""
 
+import tracemalloc
 from pathlib import Path
 
 import cv2
@@ -50,6 +51,15 @@ def test_a_bar_is_dark_in_most_frames() -> None:
     pictures = frames()
     pictures[0][:7] = 0
     assert picture_area(pictures) == (0, 0, 200, 300)
+
+
+def test_large_pictures_take_little_more_memory_than_they_are() -> None:
+    """Five pictures have 15 bytes a pixel; as floats they would have 40, and their median as many again."""
+    pictures = [np.full((2048, 512, 3), 90 + i, np.uint8) for i in range(5)]
+    tracemalloc.start()
+    assert picture_area(pictures) == (0, 0, 512, 2048)
+    assert tracemalloc.get_traced_memory()[1] < 20 * 2048 * 512
+    tracemalloc.stop()
 
 
 def test_scale_and_offset_by_hand() -> None:
