@@ -63,7 +63,8 @@ class PeopleSnapshot(Layout):
         if not path.exists():
             return {}
         count = self._one_a_frame(path, "keypoints")
-        return {i: StoredFrame(path, partial(_keypoints, path, i)) for i in range(count)}
+        found = _array(path, "keypoints", (3 * COCO_POINTS,)).reshape(count, 1, COCO_POINTS, 3)
+        return {i: StoredFrame(path, points.copy) for i, points in enumerate(found)}
 
     def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
         """Return the frames of masks.hdf5: masks (N, H, W), 0 outside the person."""
@@ -121,11 +122,6 @@ def _count(path: Path, name: str) -> int:
     """Return the number of rows of a dataset."""
     with _opened(path) as file:
         return len(_dataset(path, file, name))
-
-
-def _keypoints(path: Path, row: int) -> np.ndarray:
-    """Read the keypoints of one frame, (1, 18, 3)."""
-    return _array(path, "keypoints", (3 * COCO_POINTS,))[row].reshape(1, COCO_POINTS, 3)
 
 
 def _mask(path: Path, row: int) -> np.ndarray:

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from hnerf.capture.capture import Capture
+from hnerf.capture.formats import peoplesnapshot
+from hnerf.capture.formats.layout import StoredFrame
 from hnerf.capture.formats.peoplesnapshot import PeopleSnapshot
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
@@ -52,6 +54,15 @@ def test_the_world_is_turned_upright(capture: Capture) -> None:
     pixel, depth_m = camera.project(np.array([0.1, 2.5, -0.2]))
     assert pixel == pytest.approx([31.5 + 50 * 0.1 / 2.5, 23.5 + 50 * 0.2 / 2.5]) and depth_m == pytest.approx(2.5)
     assert capture.up == "z" and capture.train_frames == (0, 1, 2, 3, 4, 5)
+
+
+def test_keypoints_are_read_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[str] = []
+    whole = peoplesnapshot._array
+    monkeypatch.setattr(peoplesnapshot, "_array", lambda *what: read.append(what[1]) or whole(*what))
+    frames = PeopleSnapshot(folder).keypoint_files("camera").values()
+    assert [frame.read().shape for frame in frames if isinstance(frame, StoredFrame)] == [(1, 18, 3)] * 6
+    assert read == ["keypoints"]
 
 
 def test_masks_and_keypoints(capture: Capture) -> None:
