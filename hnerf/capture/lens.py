@@ -12,6 +12,7 @@ from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 MIN_FOCAL_PX = 1.0  # a smaller focal length is an error of units
+MAX_SKEW_PX = 0.1  # of a camera with distortion, which OpenCV undistorts as if there were no skew
 MAX_NUMBER = 1e9  # of a calibration; beyond it, later arithmetic overflows
 
 
@@ -83,6 +84,8 @@ def checked_lens(
     K, R = K.reshape(3, 3), cv2.Rodrigues(R.ravel())[0] if R.size == 3 else R.reshape(3, 3)
     if K[0, 0] < MIN_FOCAL_PX or K[1, 1] < MIN_FOCAL_PX or K[1, 0] != 0 or K[2].tolist() != [0, 0, 1]:
         raise InputError(f"{intrinsics}: camera {camera}: K is not a matrix of intrinsics in pixels; calibrate again")
+    if abs(K[0, 1]) > MAX_SKEW_PX and np.any(distortion):
+        raise InputError(f"{intrinsics}: camera {camera}: skew beside distortion is not undistorted; calibrate without")
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise InputError(f"{extrinsics}: camera {camera}: R is not a rotation; calibrate again")
     size = check_image_size(intrinsics, *size_px) if size_px else None

@@ -1,13 +1,16 @@
 """Keypoints of distorted lenses, and names of captures."""
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
-from hnerf.capture.lens import Lens
+from hnerf.capture.lens import Lens, checked_lens
 from hnerf.capture.manifest import CaptureManifest, capture_name
 from hnerf.capture.normalise import Normaliser
+from hnerf.errors import InputError
 
 
 def test_keypoints_near_the_edge_are_undistorted_exactly() -> None:
@@ -21,6 +24,14 @@ def test_keypoints_near_the_edge_are_undistorted_exactly() -> None:
     expected_px = (rays @ K.T)[:, :2]
     found = Normaliser.create(lens, (1920, 1080), 1920).keypoints(recorded)
     np.testing.assert_allclose(found[0, :, :2], expected_px, atol=0.02)
+
+
+@pytest.mark.parametrize(("skew", "k1", "refused"), [(12.0, -0.1, True), (1e-9, -0.1, False), (12.0, 0.0, False)])
+def test_skew_is_read_without_distortion_only(skew: float, k1: float, refused: bool) -> None:
+    K, distortion = np.array([[800.0, skew, 499.5], [0, 800, 499.5], [0, 0, 1]]), np.array([k1, 0, 0, 0])
+    source = Path("intri.yml")
+    with pytest.raises(InputError, match=r"intri\.yml: camera a: skew") if refused else nullcontext():
+        checked_lens((source, source), "a", K, distortion, np.eye(3), np.zeros(3), None)
 
 
 def test_a_folder_named_on_a_mac_has_the_same_name() -> None:
