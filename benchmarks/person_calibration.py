@@ -7,6 +7,7 @@ minutes. Writes `benchmarks/results/person-calibration.json` and `.md`.
 """
 
 import argparse
+import dataclasses
 import logging
 import tempfile
 import time
@@ -26,7 +27,6 @@ from hnerf.calibration.clocks.keypoints import Track
 from hnerf.calibration.diagnosis import body_height_m, measure
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.person.calibrate import PersonCalibration, calibrate_from_person
-from hnerf.calibration.person.lens import with_focal
 from hnerf.calibration.refine import Refinement, refine
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
@@ -97,13 +97,20 @@ def _reference(capture: Capture) -> list[Camera]:
     return refinement.cameras
 
 
+def _guessed(camera: Camera) -> Camera:
+    """Return the camera with the usual focal length and its principal point in the middle of the image."""
+    focal_px = USUAL_FOCAL * max(camera.size_px)
+    K = np.array([[focal_px, 0, (camera.width_px - 1) / 2], [0, focal_px, (camera.height_px - 1) / 2], [0, 0, 1.0]])
+    return dataclasses.replace(camera, K=K)
+
+
 def _score(capture: Capture, reference: list[Camera], known: bool) -> dict[str, Any]:
     """Calibrate, and return the worst camera's errors and the seconds of one thread."""
     keypoints = np.stack(list(subject_keypoints(capture).values()))
     of_reference = measure(reference, keypoints)
     lost = {c.name: Camera(c.name, c.K, np.eye(3), np.zeros(3), *c.size_px) for c in reference}
     if not known:
-        lost = {name: with_focal(c, USUAL_FOCAL * max(c.size_px)) for name, c in lost.items()}
+        lost = {name: _guessed(camera) for name, camera in lost.items()}
     unknown = [] if known else list(lost)
     started = time.process_time()
     found = calibrate_from_person(

@@ -1,6 +1,5 @@
 """Focal length and one term of distortion from the person, as far as held-out keypoints determine them."""
 
-import dataclasses
 import logging
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -73,9 +72,3 @@ def _held_out_px(
         straight = undistort(judged.reshape(len(cameras), -1, 3), found.cameras, shared, found.k1)
         costs_px.append(trimmed_cost_px(found.cameras, straight))
     return float(np.mean(costs_px))
-
-
-def with_focal(camera: Camera, focal_px: float) -> Camera:
-    """Return the camera with another focal length and its principal point in the middle of the image."""
-    K = np.array([[focal_px, 0, (camera.width_px - 1) / 2], [0, focal_px, (camera.height_px - 1) / 2], [0, 0, 1.0]])
-    return dataclasses.replace(camera, K=K)

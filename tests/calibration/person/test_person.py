@@ -10,7 +10,7 @@ import pytest
 
 from hnerf.calibration.bundle import align, undistort
 from hnerf.calibration.person.calibrate import _each_alone, calibrate_from_person
-from hnerf.calibration.person.lens import fit_lenses, with_focal
+from hnerf.calibration.person.lens import fit_lenses
 from hnerf.calibration.person.rig import first_poses
 from hnerf.calibration.person.upright import scale_to, stand_on_ground
 from hnerf.capture.capture import SubjectPoint
@@ -49,7 +49,8 @@ def test_a_rig_is_found_without_poses() -> None:
 def test_a_common_focal_length_is_found_from_a_guess_that_is_far_off() -> None:
     truth = ring(4)
     keypoints = seen_by(truth, 0.5)
-    guess = [with_focal(lost(camera), 750.0) for camera in truth]
+    K = np.array([[750.0, 0, 499.5], [0, 750, 499.5], [0, 0, 1]])
+    guess = [dataclasses.replace(lost(camera), K=K) for camera in truth]
     fit, _ = fit_lenses(first_poses(guess, keypoints), keypoints, [c.name for c in truth], 0.02)
     assert fit.what == "one focal length"
     assert fit.cameras[0].K[0, 0] == pytest.approx(1000, rel=0.01)
