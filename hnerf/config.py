@@ -42,7 +42,7 @@ class SyntheticSettings(Section):
     test_cameras: int = Field(default=2, ge=0)  # each half-way between two of those, evenly spaced
     train_frames: int = Field(default=20, ge=1)
     novel_pose_frames: int = Field(default=6, ge=0)
-    fps: float = Field(default=10.0, gt=0)
+    fps: float = Field(default=10.0, ge=0.01, le=10_000)  # as capture.toml may state
 
     @model_validator(mode="after")
     def _one_test_camera_in_a_gap(self) -> Self:

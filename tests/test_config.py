@@ -4,7 +4,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import ValidationError
 
+from hnerf.capture.footage import MAX_FPS, MIN_FPS
 from hnerf.config import NerfSettings, SyntheticSettings, load_settings, validated, with_changes
 from hnerf.errors import InputError
 from hnerf.study.benchmark.plan import load_study
@@ -136,3 +138,11 @@ def test_another_kind_of_field_keeps_nothing_of_the_kind_before() -> None:
 def test_a_name_that_no_file_can_have_is_no_preset(name: str) -> None:
     with pytest.raises(InputError, match="no such preset or file"):
         load_settings(name)
+
+
+def test_a_synthetic_capture_has_a_rate_that_the_reader_accepts() -> None:
+    for fps in (MIN_FPS, MAX_FPS):
+        assert SyntheticSettings(fps=fps).fps == fps
+    for fps in (MIN_FPS / 2, 2 * MAX_FPS):
+        with pytest.raises(ValidationError, match="fps"):
+            SyntheticSettings(fps=fps)
