@@ -17,10 +17,11 @@ MAX_PEOPLE = 64  # in one image
 
 def read_openpose(path: Path) -> np.ndarray:
     """Read an OpenPose file: (people, K, 3) x_px, y_px, confidence in the file's order, K a known number of points, or
-    0 without people. Raises InputError if it is no such file."""
+    0 without people, among whom nobody counts who has no points. Raises InputError if it is no such file."""
     try:
         people = _check_count(path, read_json(path)["people"])
-        return _people(path, [person["pose_keypoints_2d"] for person in people])
+        found = [person["pose_keypoints_2d"] for person in people if person != {}]
+        return _people(path, [points for points in found if points != []])
     except (KeyError, TypeError):
         raise InputError(f"{path}: no list of people with pose_keypoints_2d; detect them again") from None
 

@@ -90,6 +90,13 @@ def test_an_unknown_number_of_points_names_the_known_sets(tmp_path: Path) -> Non
         read_openpose(tmp_path / "a.json")
 
 
+def test_people_without_points_are_nobody(tmp_path: Path) -> None:
+    people = [{}, {"pose_keypoints_2d": []}, {"pose_keypoints_2d": points(25).ravel().tolist()}]
+    for count, kept in ((3, (1, 25, 3)), (2, (0, 0, 3))):
+        (tmp_path / "a.json").write_text(json.dumps({"people": people[:count]}))
+        assert read_openpose(tmp_path / "a.json").shape == kept
+
+
 def test_lists_of_results_are_read_by_frame(tmp_path: Path) -> None:
     """Results are as AlphaPose (image names) and MMPose (numbers) write them; scores over 1 count as 1."""
     sure = points(17)
