@@ -1,7 +1,10 @@
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from hnerf.calibration.matches import Matches, _verified_matches, fundamental, sampson_px
+from hnerf.calibration.matches import Matches, _match_features, _verified_matches, fundamental, sampson_px
 from hnerf.capture.capture import Capture
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import look_at, turned
@@ -40,6 +43,14 @@ def test_verification_does_not_ask_the_calibration() -> None:
     assert 200 <= len(kept) < 210
     assert len(_verified_matches(wrong)) == 0
     assert len(_verified_matches(seen(10))) == 0
+
+
+def test_matches_have_pixel_centres_at_integers() -> None:
+    """COLMAP's corner of an image is at 0, so that its first pixel's centre is at one half."""
+    a, b = ([SimpleNamespace(x=x + 0.5, y=7.5) for x in places] for places in ((3, 9), (20, 21, 22)))
+    matcher: Any = SimpleNamespace(match=lambda *_: [(1, 2), (0, 0)])
+    found: Any = (a, None), (b, None)
+    assert _match_features(matcher, *found).tolist() == [[[9, 7], [22, 7]], [[3, 7], [20, 7]]]
 
 
 def test_views_a_right_angle_apart_share_no_matches(wave: Capture) -> None:

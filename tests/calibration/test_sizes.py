@@ -35,6 +35,14 @@ def test_each_change_by_hand() -> None:
     assert changed["scaled and padded evenly"][:2].round(3).tolist() == [[925.926, 0, 462.463], [0, 925.926, 499.5]]
 
 
+def test_changes_are_the_same_in_a_picture_that_was_shrunk() -> None:
+    """Calibrated and recorded twice as large, and read at half the size."""
+    camera = ring(1)[0]
+    for change in SIZE_CHANGES.values():
+        shrunk, whole = (change(camera, (times * 1080, times * 1000), (times * 1000,) * 2) for times in (2, 1))
+        np.testing.assert_allclose(shrunk.K, whole.K)
+
+
 def test_bars_explain_a_size(narrow: Capture) -> None:
     assert [name for name in narrow.cameras if size_unexplained(narrow, name)] == ["c1"]
     assert size_reasons(narrow, "c0") == []

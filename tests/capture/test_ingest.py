@@ -263,6 +263,15 @@ def test_shared_captures_come_through(tmp_path: Path) -> None:
     assert np.array_equal(capture.image("05", 35), image)
 
 
+def test_the_distance_of_recorded_frames_is_kept(folder: Path, tmp_path: Path) -> None:
+    """Frames 0 to 4 are called 0, 3, 6, 9 and 12; of these, capture.toml chooses the first and the last."""
+    for path in sorted([*folder.glob("images/*/*"), *folder.glob("openpose/*/*")], reverse=True):
+        path.rename(path.with_name(f"{3 * int(path.name[:6]):06d}{path.name[6:]}"))
+    (folder / "capture.toml").write_text("[frames]\ntrain = [0, 12]\n")
+    capture = ingest(folder, SETTINGS, tmp_path / "out")
+    assert capture.frames == (0, 12) and capture.frame_step == 3
+
+
 @pytest.mark.parametrize("form", ["NFC", "NFD"])
 def test_accents_are_the_same_composed_or_not(tmp_path: Path, form: Literal["NFC", "NFD"]) -> None:
     """macOS takes them apart in the names of files, editors compose them, or the other way round."""

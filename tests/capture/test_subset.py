@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 
 from hnerf.capture.capture import Capture, SubjectPoint
+from hnerf.capture.given_poses import GivenPoses
 from hnerf.capture.subject import subject_keypoints
 from hnerf.capture.subset import subset
 from hnerf.errors import InputError
@@ -36,6 +37,17 @@ def test_landmarks_stay_with_their_frames(tmp_path: Path) -> None:
     assert landmarks is not None
     assert [points[:, 0, 0, 0].tolist() for points in landmarks] == [[2, 6, 10], [0.2, 0.6, 1.0]]
     assert few.landmarks("03") is None  # no network looked
+
+
+def test_given_poses_stay_with_their_frames(tmp_path: Path) -> None:
+    capture = write_recording(tmp_path / "all")
+    poses = GivenPoses.unknown(5)
+    poses.theta[:, 0, 0] = poses.root[:, 0, 0] = capture.frames
+    poses.save(capture.root / "poses.npz")
+    subset(capture, tmp_path / "few", None, (6, 2), (10,))
+    few = Capture.load(tmp_path / "few").given_poses()
+    assert few is not None
+    assert few.theta[:, 0, 0].tolist() == few.root[:, 0, 0].tolist() == [2, 6, 10]
 
 
 def test_who_is_named_in_a_camera_left_out_is_named_in_another(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration.bundle import align, undistort
-from hnerf.calibration.person.calibrate import _each_alone, calibrate_from_person
+from hnerf.calibration.person.calibrate import _as_recorded, _each_alone, calibrate_from_person
 from hnerf.calibration.person.lens import fit_lenses
 from hnerf.calibration.person.rig import first_poses
 from hnerf.calibration.person.upright import scale_to, stand_on_ground
@@ -149,6 +149,15 @@ def test_without_a_height_the_mean_is_taken_and_said(tmp_path: Path) -> None:
     found = calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), None)
     assert found.scale_sd == pytest.approx(np.hypot(0.03, 0.09 / 1.65))
     assert found.notes()[0] == "scale: a person of 1.65 m, the mean of adults (give --height), +- 6 %"
+
+
+def test_a_lens_is_of_the_recorded_pictures(tmp_path: Path) -> None:
+    """Of 2000 px, shrunk to 1000 px: the focal length doubles, and the middle at 499.5 comes to 999.5."""
+    capture = write_capture(tmp_path, ring(1), detections(ring(1), 0.0))
+    capture = dataclasses.replace(capture, recorded_sizes_px={"c0": (2000, 2000)})
+    lens = _as_recorded(capture, capture.cameras["c0"], -0.1)
+    np.testing.assert_allclose(lens.K, [[2000, 0, 999.5], [0, 2000, 999.5], [0, 0, 1]])
+    assert lens.size_px == (2000, 2000) and lens.distortion.tolist() == [-0.1, 0, 0, 0]
 
 
 def refusal(tmp_path: Path, cameras: list[Camera], seen: dict[str, np.ndarray], unknown: list[str]) -> str:

@@ -9,9 +9,11 @@ from PIL import Image
 
 from flows.cli import main
 from hnerf.calibration.bundle import align
+from hnerf.calibration.clocks.recording import _track
 from hnerf.capture.clocks import read_clocks
 from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.capture.formats.pose2sim import Pose2Sim
+from hnerf.capture.uncalibrated import Uncalibrated
 from hnerf.geometry.camera import Camera
 from tests.calibration.clocks.test_clocks import filmed
 from tests.calibration.synthetic import detections, ring
@@ -19,13 +21,15 @@ from tests.calibration.synthetic import detections, ring
 FRAMES = 12
 
 
-def write_recording(folder: Path, keypoints: dict[str, np.ndarray], pose2sim: bool = False) -> Path:
-    """Write grey pictures, and keypoints (frames, 25, 3) in files of OpenPose, by camera."""
+def write_recording(
+    folder: Path, keypoints: dict[str, np.ndarray], pose2sim: bool = False, side_px: int = 1000
+) -> Path:
+    """Write grey square pictures, and keypoints (frames, 25, 3) in files of OpenPose, by camera."""
     for name, frames in keypoints.items():
         place = folder / (f"pose/{name}_json" if pose2sim else f"openpose/{name}")
         pictures = folder / "images" / name
         place.mkdir(parents=True), pictures.mkdir(parents=True)
-        grey = Image.new("RGB", (1000, 1000), (90, 90, 90))
+        grey = Image.new("RGB", (side_px, side_px), (90, 90, 90))
         for frame, points in enumerate(frames):
             grey.save(pictures / f"{frame:06d}.jpg", quality=20)
             person = {"pose_keypoints_2d": points.ravel().tolist()}
@@ -54,6 +58,15 @@ def test_a_folder_gets_its_clocks(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert read_clocks(folder)["c1"].offset_s == pytest.approx(0.5, abs=0.1 / 30)
     assert main(["synchronise", str(folder)]) == 2
     assert "remove it to synchronise again" in capsys.readouterr().err
+
+
+def test_tracks_are_in_pixels_of_the_recording(tmp_path: Path) -> None:
+    """Its pictures are shrunk to 1024 px."""
+    seen = filmed(0, 0.1, 0.0).keypoints * [2.048, 2.048, 1]
+    folder = write_recording(tmp_path / "film", {"c0": seen}, side_px=2048)
+    track = _track(folder, "c0", Uncalibrated(folder).footage("c0"), 30.0, tmp_path)
+    np.testing.assert_allclose(track.keypoints, seen, atol=1e-3)
+    np.testing.assert_allclose(track.times_s, [0, 1 / 30, 2 / 30])
 
 
 def test_a_folder_without_recordings_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
