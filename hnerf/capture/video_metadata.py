@@ -1,5 +1,6 @@
-"""Focal lengths in the metadata of images (EXIF) and of videos (QuickTime's keys)."""
+"""Metadata of images (EXIF) and of videos (boxes of MP4 and QuickTime): focal lengths, numbers of samples."""
 
+import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +25,12 @@ def focal_35mm(path: Path) -> float | None:
     except (Image.DecompressionBombError, OSError, OverflowError, SyntaxError, ValueError):  # whoever reads it says so
         return None
     return found if found and 1 <= found <= 2000 else None
+
+
+def declared_samples(path: Path) -> int:
+    """Return the largest number of samples of one size that a track of a video declares, wherever among its boxes."""
+    declared = re.findall(rb"stsz.{4}(?!\0{4}).{4}(.{4})", _top_box(path, b"moov"), re.DOTALL)
+    return max((int.from_bytes(count, "big") for count in declared), default=0)
 
 
 def _of_image(path: Path) -> float | None:
@@ -54,6 +61,8 @@ def _top_box(path: Path, wanted: bytes) -> bytes:
     with path.open("rb") as file:
         while len(head := file.read(8)) == 8:
             size, kind, start = int.from_bytes(head[:4], "big"), head[4:], 8
+            if size == 0:  # to the end
+                size = path.stat().st_size
             if size == 1:
                 size, start = int.from_bytes(file.read(8), "big"), 16
             if kind == wanted:

@@ -38,6 +38,13 @@ def hold_frames(path: Path, first: int, rest: int) -> None:
     path.write_bytes(path.read_bytes().replace(b"edts", b"free"))  # the edit list would cut it to its old length
 
 
+def declare_samples(path: Path, count: int) -> None:
+    """Let a video declare this many samples, each of one byte."""
+    _edit(path, b"stsz", lambda _: struct.pack(">III", 0, 1, count))
+    _edit(path, b"stsc", lambda _: struct.pack(">IIIII", 0, 1, 1, count, 1))
+    _edit(path, b"stts", lambda _: struct.pack(">IIII", 0, 1, count, 1))
+
+
 def _edit(path: Path, wanted: bytes, change: Callable[[bytes], bytes]) -> None:
     path.write_bytes(_edited(path.read_bytes(), wanted, change))
 

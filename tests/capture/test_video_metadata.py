@@ -3,7 +3,10 @@ from pathlib import Path
 
 import pytest
 
-from hnerf.capture.video_metadata import focal_35mm
+from hnerf.capture.footage import Video
+from hnerf.capture.video_metadata import declared_samples, focal_35mm
+from hnerf.errors import InputError
+from tests.capture.mp4 import declare_samples, write_video
 
 HOSTILE = {
     "no image": ("a.jpg", b"nothing"),
@@ -19,3 +22,18 @@ def test_what_cannot_be_read_states_nothing(case: str, tmp_path: Path) -> None:
     name, content = HOSTILE[case]
     (tmp_path / name).write_bytes(content)
     assert focal_35mm(tmp_path / name) is None
+
+
+@pytest.mark.parametrize("to_the_end", [False, True])
+def test_more_samples_declared_than_there_are_bytes(tmp_path: Path, to_the_end: bool) -> None:
+    """FFmpeg's table of ten million would take 240 MB. The last box may leave its size out."""
+    path = tmp_path / "a.mp4"
+    write_video(path, [90] * 3)
+    assert declared_samples(path) == 0 and len(Video.open(path).frames) == 3
+    declare_samples(path, 10_000_000)
+    if to_the_end:
+        content = path.read_bytes()
+        start = content.index(b"moov") - 4
+        path.write_bytes(content[:start] + bytes(4) + content[start + 4 :])
+    with pytest.raises(InputError, match=r"a\.mp4: declares 10000000 samples in \d+ bytes"):
+        Video.open(path)
