@@ -47,6 +47,8 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
     """
     if not capture.has_keypoints and capture.given_poses():
         return _unchecked(capture)
+    if empty := _never_showing(capture):
+        return _without(empty, capture, settings)
     keypoints = _keypoints(capture)
     check_spread(capture, keypoints)
     given = [capture.cameras[name] for name in capture.train_cameras]
@@ -101,15 +103,25 @@ def _rounded(camera: Camera) -> Camera:
 
 
 def _keypoints(capture: Capture) -> np.ndarray:
-    """Return the subject's keypoints in the training cameras, (C, frames, 25, 3). Raises InputError if a camera has
-    none."""
-    found = subject_keypoints(capture)
-    for name, seen in found.items():
-        if not (seen[..., 2] > 0).any():
-            raise InputError(
-                f"{capture.name}: camera {name} never shows the person; check its keypoints or leave it out"
-            )
-    return np.stack([found[name] for name in capture.train_cameras])
+    """Return the subject's keypoints in the training cameras, (C, frames, 25, 3)."""
+    return np.stack(list(subject_keypoints(capture).values()))
+
+
+def _never_showing(capture: Capture) -> list[str]:
+    """Return the training cameras without any keypoint of the subject."""
+    return [name for name, seen in subject_keypoints(capture).items() if not (seen[..., 2] > 0).any()]
+
+
+def _without(empty: list[str], capture: Capture, settings: CalibrationSettings) -> CalibrationReport:
+    """Return the report of the other cameras, with those that never show the person rejected. Two or more are left:
+    where one alone shows a person, the choice of the subject has raised InputError."""
+    others = tuple(name for name in capture.train_cameras if name not in empty)
+    report = check_calibration(dataclasses.replace(capture, train_cameras=others), settings)
+    why = "never shows the person; check its keypoints if it does"
+    verdict = CameraVerdict("rejected", None, None, None, None, 0.0, Timing.unknown("no keypoints"), (why,))
+    return dataclasses.replace(
+        report, verdicts={name: report.verdicts.get(name, verdict) for name in capture.train_cameras}
+    )
 
 
 def _check_convention(capture: Capture, cameras: Sequence[Camera], keypoints: np.ndarray, found: Measure) -> None:

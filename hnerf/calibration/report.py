@@ -87,7 +87,7 @@ class CalibrationReport:
         status = {name: self.verdicts[name].status if name in self.verdicts else "unjudged" for name in self.cameras}
         draw_cameras(out / "cameras.png", list(self.cameras.values()), status, self.up, self.before, self.after)
         if self.evidence and self.after:
-            used = [self.cameras[name] for name in self.verdicts]
+            used = [self.cameras[name] for name in self.evidence.capture.train_cameras]
             draw_evidence(out / "witnesses.png", self.evidence, used, self.after)
 
     def _to_dict(self) -> dict[str, Any]:
@@ -115,10 +115,10 @@ class CalibrationReport:
         """Return the evidence about the cameras as given and as used; empty with one camera."""
         if self.evidence is None or self.before is None or self.after is None:
             return {}
-        given = self.evidence.capture.cameras
+        given, judged = self.evidence.capture.cameras, self.evidence.capture.train_cameras
         return {
-            "as_given": self.evidence.summarise([given[name] for name in self.verdicts], self.before),
-            "as_used": self.evidence.summarise([self.cameras[name] for name in self.verdicts], self.after),
+            "as_given": self.evidence.summarise([given[name] for name in judged], self.before),
+            "as_used": self.evidence.summarise([self.cameras[name] for name in judged], self.after),
             "board_footage": self.evidence.boards or "none: the recording has no calibration/ footage of a board",
         }
 

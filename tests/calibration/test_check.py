@@ -275,12 +275,18 @@ def test_cameras_at_one_place_are_named(tmp_path: Path) -> None:
         check_calibration(recorded_with(tmp_path, moved, only=0), SETTINGS)
 
 
-def test_a_camera_that_never_shows_the_person_is_named(tmp_path: Path) -> None:
+def test_a_camera_that_never_shows_the_person_is_left_out_if_two_others_do(tmp_path: Path) -> None:
     cameras = ring(4)
     seen = detections(cameras, noise_px=1)
     seen["c2"] = 0 * seen["c2"]
-    with pytest.raises(InputError, match="camera c2 never shows the person"):
-        check_calibration(write_capture(tmp_path, cameras, seen), SETTINGS)
+    capture = write_capture(tmp_path / "in", cameras, seen)
+    report = check_calibration(capture, SETTINGS)
+    assert [verdict.status for verdict in report.verdicts.values()] == ["ok", "ok", "rejected", "ok"]
+    assert report.verdicts["c2"].reasons[0].startswith("never shows the person")
+    report.save(tmp_path / "out")
+    assert load_cameras(tmp_path / "out", capture).train_cameras == ("c0", "c1", "c3")
+    with pytest.raises(InputError, match="no person found by any camera but c1"):
+        check_calibration(dataclasses.replace(capture, train_cameras=("c1", "c2")), SETTINGS)
 
 
 def test_a_size_mismatch_is_named(tmp_path: Path) -> None:

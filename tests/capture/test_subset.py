@@ -42,6 +42,7 @@ def test_landmarks_stay_with_their_frames(tmp_path: Path) -> None:
 def test_given_poses_stay_with_their_frames(tmp_path: Path) -> None:
     capture = write_recording(tmp_path / "all")
     poses = GivenPoses.unknown(5)
+    poses.theta[:], poses.root[:] = 0, 0
     poses.theta[:, 0, 0] = poses.root[:, 0, 0] = capture.frames
     poses.save(capture.root / "poses.npz")
     subset(capture, tmp_path / "few", None, (6, 2), (10,))
