@@ -53,12 +53,14 @@ def rig() -> "Rig":
 @pytest.fixture(scope="session")
 def prefect_api() -> Iterator[str]:
     """URL of a Prefect server."""
+    from prefect.logging.handlers import APILogWorker
     from prefect.settings import PREFECT_API_URL, temporary_settings
 
     from tests.prefect_server import prefect_server
 
     with prefect_server() as url, temporary_settings({PREFECT_API_URL: url}):
         yield url
+        APILogWorker.drain_all(timeout=10)  # who has logs for a server that is gone tries for a minute to send them
 
 
 @pytest.fixture(scope="session")
