@@ -59,11 +59,11 @@ def benchmark(
     recorded = Capture.load(ingest(artifact_store, source, capture_settings[0]).root)
     if plan.until_flat and not (recorded.test_cameras and GroundTruth(truth.root, recorded).has_masks):
         raise InputError(
-            f"{recorded.name}: no image can be scored, so that no curve is ever flat; it takes test cameras and "
-            f"{GROUND_TRUTH}/masks. Mend it, or give another study"
+            f"{recorded.name}: no image can be scored, so no curve can become flat; add test cameras and "
+            f"{GROUND_TRUTH}/masks, or choose another study"
         )
-    name = Path(study).stem + ("" if plan == whole.restricted_to([], None) else "-part")
-    result, table = empty_result(plan, name, recorded), None
+    part = plan != whole.restricted_to([], None)
+    result, table = empty_result(plan, Path(study).stem, part, recorded), None
     for title, entry in result["variants"].items():
         variant = plan.variants[title]
         for name in () if "left_out" in entry else variant.methods or plan.methods:
@@ -75,11 +75,12 @@ def benchmark(
     return table
 
 
-def empty_result(plan: BenchmarkStudy, study: str, recorded: Capture) -> dict[str, Any]:
+def empty_result(plan: BenchmarkStudy, study: str, part: bool, recorded: Capture) -> dict[str, Any]:
     """Return a result without scores, in the form of hnerf/study/benchmark/results.py."""
     described = plan.model_dump(include={"title", "notes", "claims", "seconds", "until_flat", "sweep", "methods"})
     variants = {title: describe_variant(variant, recorded) for title, variant in plan.variants.items()}
-    return {"subject": recorded.name, "study": study} | described | {"own": plan.own_methods(), "variants": variants}
+    named = {"subject": recorded.name, "study": study, "part": part}
+    return named | described | {"own": plan.own_methods(), "variants": variants}
 
 
 def describe_variant(variant: Variant, recorded: Capture) -> dict[str, Any]:

@@ -221,7 +221,7 @@ def export(options: argparse.Namespace) -> None:
 
     for override in options.overrides:
         if override.partition("=")[0].split(".")[0] != "asset":
-            raise InputError(f"--set {override}: an export has settings of the section `asset` alone; remove it")
+            raise InputError(f"--set {override}: hnerf export takes settings of the section `asset` only; remove it")
     for folder in (options.subject, *(motion for motion in options.motion if motion.is_dir())):
         require_intact(folder)
     allowed = ["asset.allow_poor=true"] if options.allow_poor else []

@@ -19,5 +19,7 @@ def find_hands(out: Path, recording: Artifact) -> dict[str, float]:
 def needs_hands(recording: Artifact, settings: DetectionSettings) -> bool:
     """Return whether to look for hands: the settings allow it, the network is installed, keypoints say where, and
     several cameras see them, as a fit of fingers needs."""
-    wanted, capture = settings.hands == "auto" and has_model(HAND_LANDMARKS), Capture.load(recording.root)
-    return wanted and capture.has_keypoints and len(capture.train_cameras) > 1
+    if settings.hands != "auto" or not has_model(HAND_LANDMARKS):
+        return False
+    capture = Capture.load(recording.root)
+    return capture.has_keypoints and len(capture.train_cameras) > 1

@@ -47,9 +47,10 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
     """
     if not capture.has_keypoints and capture.given_poses():
         return _unchecked(capture)
-    if empty := _never_showing(capture):
-        return _without(empty, capture, settings)
     keypoints = _keypoints(capture)
+    empty = [name for name, seen in zip(capture.train_cameras, keypoints, strict=True) if not seen[..., 2].any()]
+    if empty:
+        return _without(empty, capture, settings)
     check_spread(capture, keypoints)
     given = [capture.cameras[name] for name in capture.train_cameras]
     if len(given) == 1:
@@ -107,15 +108,15 @@ def _keypoints(capture: Capture) -> np.ndarray:
     return np.stack(list(subject_keypoints(capture).values()))
 
 
-def _never_showing(capture: Capture) -> list[str]:
-    """Return the training cameras without any keypoint of the subject."""
-    return [name for name, seen in subject_keypoints(capture).items() if not (seen[..., 2] > 0).any()]
-
-
 def _without(empty: list[str], capture: Capture, settings: CalibrationSettings) -> CalibrationReport:
-    """Return the report of the other cameras, with those that never show the person rejected. Two or more are left:
-    where one alone shows a person, the choice of the subject has raised InputError."""
+    """Return the report of the other cameras, with those that never show the person rejected. Raises InputError if
+    fewer than two are left."""
     others = tuple(name for name in capture.train_cameras if name not in empty)
+    if len(others) < 2:
+        raise InputError(
+            f"{capture.name}: only camera {', '.join(others)} shows the person; correct the others' keypoints, or "
+            "train on it alone ([cameras] in capture.toml)"
+        )
     report = check_calibration(dataclasses.replace(capture, train_cameras=others), settings)
     why = "never shows the person; check its keypoints if it does"
     verdict = CameraVerdict("rejected", None, None, None, None, 0.0, Timing.unknown("no keypoints"), (why,))

@@ -20,7 +20,7 @@ from hnerf.config import SegmentationSettings
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
 from hnerf.segmentation.backends import BackgroundSubtraction
-from hnerf.segmentation.prior import keypoint_priors
+from hnerf.segmentation.prior import priors_of
 
 FRAMES = 8  # evenly spaced: neighbouring frames add nothing
 PLATE_FRAMES = 24  # from which the background is estimated if there is no clean plate
@@ -181,7 +181,7 @@ def _outside_px(seen: Sequence[tuple[Camera, MaskOutline]], points_m: np.ndarray
 def _outlines(capture: Capture, name: str, keypoints: np.ndarray, shown: Sequence[int]) -> list[MaskOutline | None]:
     """Return one camera's outlines at the frames of these indices; keypoints (frames, 25, 3) of the subject."""
     outlines = []
-    for i, mask in zip(shown, _masks(capture, name, shown), strict=True):
+    for i, mask in zip(shown, _masks(capture, name, keypoints, shown), strict=True):
         xy = keypoints[i, keypoints[i, :, 2] > 0, :2].round().astype(int)
         xy = xy[((xy >= 0) & (xy < mask.shape[::-1])).all(1)]
         covered = mask[xy[:, 1], xy[:, 0]].mean() if len(xy) else 0.0
@@ -189,13 +189,14 @@ def _outlines(capture: Capture, name: str, keypoints: np.ndarray, shown: Sequenc
     return outlines
 
 
-def _masks(capture: Capture, name: str, shown: Sequence[int]) -> list[np.ndarray]:
-    """Return the person's masks in one camera at the frames of these indices, (H, W) bool each."""
+def _masks(capture: Capture, name: str, keypoints: np.ndarray, shown: Sequence[int]) -> list[np.ndarray]:
+    """Return the masks (H, W) bool of the person with keypoints (frames, 25, 3) in one camera, at the frames of these
+    indices."""
     given = [capture.given_mask(name, capture.frames[i]) for i in shown]
     if all(mask is not None for mask in given):
         return [mask for mask in given if mask is not None]
     settings = SegmentationSettings()
-    ((_, priors),) = keypoint_priors(dataclasses.replace(capture, train_cameras=(name,)), settings)
+    priors = priors_of(capture, name, keypoints, settings)
     plate = capture.background(name)
     if plate is None:
         backend = BackgroundSubtraction.from_median(capture, name, priors, PLATE_FRAMES, settings)

@@ -71,9 +71,9 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     a board. Raises InputError, one line that names the file, on anything missing, unreadable, contradictory or unsafe.
     """
     layout = uncalibrated or recognise(folder)
+    lenses = layout.lenses()
     manifest = _manifest_for(layout, folder)
     subject = capture_name(folder, manifest)
-    lenses = layout.lenses()
     cameras = chosen_cameras(folder, manifest, list(lenses), layout.training_cameras())
     filmed = {name: layout.footage(name) for name in cameras.train + cameras.test}
     clocks = {} if len(filmed) == 1 else read_clocks(folder)

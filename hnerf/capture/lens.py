@@ -85,7 +85,10 @@ def checked_lens(
     if K[0, 0] < MIN_FOCAL_PX or K[1, 1] < MIN_FOCAL_PX or K[1, 0] != 0 or K[2].tolist() != [0, 0, 1]:
         raise InputError(f"{intrinsics}: camera {camera}: K is not a matrix of intrinsics in pixels; calibrate again")
     if abs(K[0, 1]) > MAX_SKEW_PX and np.any(distortion):
-        raise InputError(f"{intrinsics}: camera {camera}: skew beside distortion is not undistorted; calibrate without")
+        raise InputError(
+            f"{intrinsics}: camera {camera}: has both skew and lens distortion, which cannot be undistorted together; "
+            "calibrate again without skew"
+        )
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise InputError(f"{extrinsics}: camera {camera}: R is not a rotation; calibrate again")
     size = check_image_size(intrinsics, *size_px) if size_px else None

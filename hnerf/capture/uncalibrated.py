@@ -106,7 +106,7 @@ def read_lenses(path: Path) -> dict[str, Lens]:
     lenses = [
         lens_from_table(path, key, {"name": f"cam_{table.get('cam_id', table.get('port', key))}"} | table | nowhere)
         for key, table in (tables.items() if isinstance(tables, dict) else ())
-        if isinstance(table, dict) and "matrix" in table
+        if isinstance(table, dict) and "matrix" in table and not table.get("ignore", False)
     ]
     if not lenses:
         raise InputError(f"{path}: no tables of cameras with a matrix; give intri.yml or a TOML as in docs/formats.md")

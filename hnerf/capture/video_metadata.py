@@ -12,6 +12,7 @@ from hnerf.capture.safe_io import VIDEO_SUFFIXES
 EXIF_IFD, EXIF_FOCAL_35MM = 0x8769, 0xA405
 KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
 MAX_METADATA_BYTES = 16_000_000
+MAX_TABLES_BYTES = 1 << 28  # of boxes with tables of samples; days of video
 # Of QuickTime's well-known types 21 (signed), 22 (unsigned), 23 and 24 (floats), by their number of bytes.
 FORMATS = {(21, 1): ">b", (21, 2): ">h", (21, 4): ">i", (22, 1): ">B", (22, 2): ">H", (22, 4): ">I", (23, 4): ">f",
            (24, 8): ">d"}  # fmt: skip
@@ -29,7 +30,7 @@ def focal_35mm(path: Path) -> float | None:
 
 def declared_samples(path: Path) -> int:
     """Return the largest number of samples of one size that a track of a video declares, wherever among its boxes."""
-    declared = re.findall(rb"stsz.{4}(?!\0{4}).{4}(.{4})", _top_box(path, b"moov"), re.DOTALL)
+    declared = re.findall(rb"stsz.{4}(?!\0{4}).{4}(.{4})", _top_box(path, b"moov", MAX_TABLES_BYTES), re.DOTALL)
     return max((int.from_bytes(count, "big") for count in declared), default=0)
 
 
@@ -41,7 +42,7 @@ def _of_image(path: Path) -> float | None:
 
 def _of_video(path: Path) -> float | None:
     """Return the value of Apple's key in moov/meta (QuickTime File Format, "Metadata")."""
-    moov = _top_box(path, b"moov")
+    moov = _top_box(path, b"moov", MAX_METADATA_BYTES)
     meta = dict(_boxes(moov)).get(b"meta", b"")
     parts = dict(_boxes(meta)) or dict(_boxes(meta[4:]))  # a full box in MP4, a plain one in QuickTime
     keys = parts.get(b"keys", b"")
@@ -56,17 +57,17 @@ def _of_video(path: Path) -> float | None:
     return float(struct.unpack(form, value[8:])[0]) if form else None
 
 
-def _top_box(path: Path, wanted: bytes) -> bytes:
-    """Return the content of a file's first box of this kind; empty where there is none of a sane size."""
+def _top_box(path: Path, wanted: bytes, most_bytes: int) -> bytes:
+    """Return the content of a file's first box of this kind; empty where there is none, or a larger one."""
     with path.open("rb") as file:
         while len(head := file.read(8)) == 8:
             size, kind, start = int.from_bytes(head[:4], "big"), head[4:], 8
             if size == 0:  # to the end
-                size = path.stat().st_size
+                size = path.stat().st_size - file.tell() + len(head)
             if size == 1:
                 size, start = int.from_bytes(file.read(8), "big"), 16
             if kind == wanted:
-                return file.read(size - start) if start <= size <= MAX_METADATA_BYTES else b""
+                return file.read(size - start) if start <= size <= most_bytes else b""
             if size < start:
                 return b""
             file.seek(size - start, 1)

@@ -81,8 +81,9 @@ class GroundTruth:
         return self._path("masks", camera, f"{self.capture.recorded_frame(camera, frame):06d}.png")
 
     def _as_rendered(self, image: np.ndarray, camera: str, path: Path) -> np.ndarray:
-        """Undistort and downscale an image as recorded, as ingest does with photographs; one of the camera's size stays
-        as it is. Raises InputError for another shape, or another size where there is a lens to undistort."""
+        """Undistort and shrink an image of the recording's size, as ingest does with photographs; return one of the
+        camera's size as it is. Where no lens distorts, any other size of the same shape is resized. Raises InputError
+        otherwise."""
         size = self.capture.cameras[camera].size_px
         recorded_px = self.capture.recorded_sizes_px.get(camera)
         if camera in self.capture.recorded_lenses and image.shape[1::-1] == recorded_px:

@@ -35,7 +35,7 @@ HALF_SAMPLES_UNTIL = 0.75  # of the training: as accurate on three captures, in 
 MAX_NEIGHBOUR_DISTANCE_M = 0.03  # canonical; neighbours on a ray that are farther apart lie on different limbs
 MIN_DESCENT_M = 1e-4  # of d_hat from one sample to the next; below it the surface position has no useful derivative
 MIN_COLOUR_WEIGHT = 1e-3  # samples of less weight are not coloured
-MIN_SHOWN_WEIGHT = 1e-2  # the same in rendering, where their neighbours stand in for them: - 0.002 dB on valid-wave
+MIN_SHOWN_WEIGHT = 1e-2  # the same in rendering, where the coloured ones take their weight: - 0.002 dB on valid-wave
 
 
 class FastField(Field):
@@ -240,8 +240,9 @@ class FastField(Field):
         return torch.zeros_like(described.d).index_copy(0, pick, self.field.residual(y, d, pose, row))
 
     def _ray_colours(self, scene: PosedScene[ShellGrid], described: Descriptor, weights: Tensor, row: Tensor) -> Tensor:
-        """Return the colours (R, K, 3) of samples (R K,) on rays with weights (R, K), zero where they hardly count. In
-        rendering, without gradients, fewer samples are coloured, which stand in for the others on their ray."""
+        """Return the colours (R, K, 3) of samples (R K,) on rays with weights (R, K). Samples of little weight are not
+        coloured; in rendering, without gradients, there are more of them, and the coloured ones are scaled up to the
+        weight of the whole ray."""
         rendering = not torch.is_grad_enabled()
         visible = shown(weights) if rendering else weights > MIN_COLOUR_WEIGHT
         colour = self._colour(scene.bodies, described, scene.conditions.pose, row, visible.flatten())

@@ -88,6 +88,12 @@ def keypoint_priors(capture: Capture, settings: SegmentationSettings) -> Iterato
         yield name, Priors(partial(_keypoint_prior, capture, name, poses_px, settings.reach), len(poses_px))
 
 
+def priors_of(capture: Capture, camera: str, keypoints: np.ndarray, settings: SegmentationSettings) -> Priors:
+    """Return the priors of a person's stick figures in one camera, seen as keypoints (frames, 25, 3)."""
+    poses_px = _interpolated(np.where(keypoints[..., 2:] > 0, keypoints[..., :2], np.nan))
+    return Priors(partial(_keypoint_prior, capture, camera, poses_px, settings.reach), len(poses_px))
+
+
 def _keypoint_prior(capture: Capture, camera: str, poses_px: np.ndarray, reach: float, number: int) -> Prior:
     stick = _stick_figure(capture.cameras[camera], poses_px[number])
     upright = _is_upright(capture, camera)

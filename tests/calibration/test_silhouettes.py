@@ -2,15 +2,19 @@
 
 import dataclasses
 from itertools import product
+from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
+from hnerf.calibration import silhouettes
 from hnerf.calibration.silhouettes import BEHIND_CAMERA_PX, MaskOutline, Outlines, _outside_px
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, SubjectPoint
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import SIZE_PX, look_at, ring, turned
+from tests.capture.test_subject import recorded, staying
 
 CORNERS_M = np.array(list(product([-0.2, 0.2], [-0.3, 0.3], [0.1, 1.7])))
 
@@ -117,3 +121,17 @@ def test_wrong_cameras_do_not_change_the_masks(wave: Capture) -> None:
         for one, other in zip(a.by_camera[name], b.by_camera[name], strict=True):
             assert one is not None and other is not None
             np.testing.assert_allclose(one.distance_px, other.distance_px, atol=1e-4)  # OpenCV's last bits vary
+
+
+def test_outlines_are_of_whom_the_recording_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Named in one camera, the person is followed into the others."""
+    capture, each = recorded(tmp_path, ring(3), staying((0, -0.6)), staying((0, 0.6)))
+    x, y, _ = each[1]["c1"][7, 0]
+    backend = SimpleNamespace(mask=lambda frame, prior: prior.body)
+    monkeypatch.setattr(silhouettes.BackgroundSubtraction, "from_median", lambda *_: backend)
+    found = Outlines.of(dataclasses.replace(capture, subject_point=SubjectPoint((x, y), "c1", 7)))
+    assert found is not None and found.by_camera.keys() == {"c0", "c1", "c2"}
+    for name, (outline, *_) in found.by_camera.items():
+        hip_px, other_px = (one[name][found.instants[0], 8, :2].round().astype(int) for one in (each[1], each[0]))
+        assert outline is not None
+        assert outline.distance_px[hip_px[1], hip_px[0]] < 0 < outline.distance_px[other_px[1], other_px[0]]

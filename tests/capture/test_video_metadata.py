@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from hnerf.capture.footage import Video
-from hnerf.capture.video_metadata import declared_samples, focal_35mm
+from hnerf.capture.video_metadata import MAX_METADATA_BYTES, declared_samples, focal_35mm
 from hnerf.errors import InputError
 from tests.capture.mp4 import declare_samples, write_video
 
@@ -26,14 +26,16 @@ def test_what_cannot_be_read_states_nothing(case: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("to_the_end", [False, True])
 def test_more_samples_declared_than_there_are_bytes(tmp_path: Path, to_the_end: bool) -> None:
-    """FFmpeg's table of ten million would take 240 MB. The last box may leave its size out."""
+    """FFmpeg's table of a hundred million would take 2.4 GB. The last box may leave its size out, whatever comes
+    before."""
     path = tmp_path / "a.mp4"
     write_video(path, [90] * 3)
     assert declared_samples(path) == 0 and len(Video.open(path).frames) == 3
-    declare_samples(path, 10_000_000)
+    declare_samples(path, 100_000_000)
     if to_the_end:
         content = path.read_bytes()
         start = content.index(b"moov") - 4
-        path.write_bytes(content[:start] + bytes(4) + content[start + 4 :])
-    with pytest.raises(InputError, match=r"a\.mp4: declares 10000000 samples in \d+ bytes"):
+        free = struct.pack(">I4s", MAX_METADATA_BYTES, b"free") + bytes(MAX_METADATA_BYTES - 8)
+        path.write_bytes(free + content[:start] + bytes(4) + content[start + 4 :])
+    with pytest.raises(InputError, match=r"a\.mp4: declares 100000000 samples in \d+ bytes"):
         Video.open(path)

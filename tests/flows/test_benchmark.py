@@ -157,7 +157,7 @@ def test_nothing_is_trained_until_flat_where_no_image_can_be_scored(
         (tmp_path / "ground_truth" / "masks").rmdir()
     else:
         monkeypatch.setattr(RECORDED, "test_cameras", ())
-    with pytest.raises(InputError, match="ada: no image can be scored, so that no curve is ever flat"):
+    with pytest.raises(InputError, match="ada: no image can be scored, so no curve can become flat; add test cameras"):
         benchmark.fn(tmp_path, "static-converged", store=tmp_path / "store")
     assert stages == []
 
@@ -241,7 +241,9 @@ def test_the_command_prints_table_and_chart(
 def test_a_part_of_a_study_does_not_replace_its_table(
     study: str, tmp_path: Path, methods: list[str], seconds: float | None, name: str
 ) -> None:
-    assert benchmark.fn(tmp_path, study, methods, seconds, tmp_path / "store").name == name
+    table = benchmark.fn(tmp_path, study, methods, seconds, tmp_path / "store")
+    assert table.name == name
+    assert json.loads(table.with_suffix(".json").read_text())["study"] == "toys"  # in the caption
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -39,7 +39,7 @@ from tests.shared_data import shared_capture
         ),
         (
             ["export", ".", "--set", "training.steps=3"],
-            "hnerf: --set training.steps=3: an export has settings of the section `asset` alone; remove it",
+            "hnerf: --set training.steps=3: hnerf export takes settings of the section `asset` only; remove it",
         ),
         (
             ["run", "http://example.com/x.mp4"],

@@ -294,6 +294,15 @@ def test_frames_that_never_show_the_person_have_no_curve(tmp_path: Path):
     assert ["held_out" in row for row in trainer.history] == [True, False]
 
 
+def test_the_curve_has_a_point_every_hundred_steps(tmp_path: Path):
+    trainer = Trainer(*record(tmp_path / "capture"), tiny(), tmp_path, ALONE)
+    trainer.field_steps = 250
+    for step in (1, 25, 100, 125, 250, 275):
+        trainer.step = step
+        trainer._record({})
+    assert ["held_out" in row for row in trainer.history] == [True, False, True, False, True, False]
+
+
 def test_progress_is_told_in_words():
     row = {"step": 25, "seconds": 7.0, "losses": {"reconstruction": 0.1234, "elastic": 0.0}}
     assert trainer_module._progress_message(row) == "reconstruction 0.12"

@@ -22,8 +22,9 @@ SWEEP_FIGURES = {"psnr": PSNR, "geometry.chamfer_l2_e3": f"{CHAMFER}, 1e-3 m²"}
 
 
 def publish(result: dict[str, Any], store: Path) -> Path:
-    """Write `<store>/benchmark/<subject>-<study>.{md,csv,json}` and its PNGs anew; return the Markdown file's path."""
-    table = store / "benchmark" / f"{result['subject']}-{result['study']}.md"
+    """Write `<store>/benchmark/<subject>-<study>.{md,csv,json}`, its study ending in "-part" if it is one, and its PNGs
+    anew; return the Markdown file's path."""
+    table = store / "benchmark" / f"{result['subject']}-{result['study']}{'-part' if result['part'] else ''}.md"
     table.parent.mkdir(parents=True, exist_ok=True)
     drawn = draw_charts(result, store, table)
     replace_text(table.with_suffix(".json"), json.dumps(result, indent=1) + "\n")

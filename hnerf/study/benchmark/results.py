@@ -1,7 +1,8 @@
 """A benchmark's result as tables, Markdown for people and CSV for spreadsheets, and as the data of its charts.
 
 A result is a plain tree, as in the JSON file:
-    {subject, study, title, notes, claims, seconds, until_flat, sweep, methods: [name], own: [name of an H-NeRF preset],
+    {subject, study, part: whether methods or seconds are not the study's, title, notes, claims, seconds, until_flat,
+     sweep, methods: [name], own: [name of an H-NeRF preset],
      variants: {title: {cameras, frames,
       methods: {name: scores of scoring.py, and "ended", a key of END_REASONS, if the study trains until curves
        are flat; or {"error": one line}}} or {"left_out": why}}}

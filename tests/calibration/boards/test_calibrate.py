@@ -220,7 +220,9 @@ def test_intrinsics_need_no_poses_beside_them(tmp_path: Path, kind: str) -> None
     if kind == "caliscope":
         path = tmp_path / "camera_array.toml"
         lines = [line for line in path.read_text().splitlines() if not line.startswith(("rotation =", "translation"))]
-        path.write_text("\n".join(lines).replace("[cameras.7]", "[cameras.0]"))
+        text = "\n".join(lines).replace("[cameras.7]", "[cameras.0]")
+        other = text.replace("[cameras.0]", "[cameras.1]").replace("= false", "= true")
+        path.write_text(f"{text}\n{other.replace('cam_id = 7', 'cam_id = 8')}")
     footage = BoardFootage(tmp_path, BOARD, (0,), 1, {"cam_7": np.full((1, 20, 2), np.nan)}, {"cam_7": (1000, 1000)})
     lenses, words = calibration_boards._intrinsics(tmp_path, footage)
     assert lenses["cam_7"].K[0, 0] == 900 and words["cam_7"].startswith("given; not verified")

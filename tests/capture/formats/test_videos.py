@@ -87,6 +87,7 @@ def test_the_world_of_one_camera_has_z_up(tmp_path: Path) -> None:
 def test_several_videos_need_cameras(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_video(tmp_path / "ada" / f"{name}.mp4", 3)
+    (tmp_path / "ada" / "capture.toml").write_text('up = "y"\n')  # which holds once there are cameras
     assert "--from person` finds their cameras" in refused(tmp_path / "ada", tmp_path / "out")
 
 

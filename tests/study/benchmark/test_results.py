@@ -83,6 +83,7 @@ def result(**changes: Any) -> dict[str, Any]:
     return {
         "subject": "ada",
         "study": "toy",
+        "part": False,
         "title": "Toys",
         "notes": ["A note."],
         "claims": [],
