@@ -11,7 +11,7 @@ from PIL import Image
 from hnerf.capture.capture import SubjectPoint
 from hnerf.capture.ingest import ingest, recognise
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
-from hnerf.capture.video_metadata import KEY, focal_35mm
+from hnerf.capture.video_metadata import KEY, MAX_METADATA_BYTES, focal_35mm
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from tests.capture.recordings import write_easymocap, write_png
@@ -63,9 +63,13 @@ def test_a_videos_metadata_give_the_focal_length(tmp_path: Path) -> None:
     item = box(struct.pack(">I", 2), box(b"data", struct.pack(">IIh", 21, 0, 28)))
     video = tmp_path / "a.mp4"
     video.write_bytes(box(b"ftyp", b"qt  ") + box(b"moov", box(b"meta", keys + box(b"ilst", item))))
+    whole = video.read_bytes()
     assert focal_35mm(video) == 28
-    video.write_bytes(video.read_bytes()[:-1])
+    video.write_bytes(whole[:-1])
     assert focal_35mm(video) is None
+    start = whole.index(b"moov") - 4  # the last box may leave its size out, however much comes before
+    video.write_bytes(box(b"free", bytes(MAX_METADATA_BYTES)) + whole[:start] + bytes(4) + whole[start + 4 :])
+    assert focal_35mm(video) == 28
 
 
 @pytest.mark.parametrize("name", ["intri.yml", "lenses.toml"])
