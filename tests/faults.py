@@ -258,6 +258,7 @@ FAULTS = (
           "tests/detection/test_merge.py"),
     Fault("ground-anywhere", "hnerf/body/ground.py", "low <= stature_m <= high", "True", "tests/body/test_ground.py"),
     Fault("pose-alone", CANONICAL, "first.bias + of_code @ code[0]", "first.bias", BY_CANONICAL),
+    Fault("ghosts-of-limbs", FAST, "ahead / descent_m, 1.0), 0.0)", "ahead / descent_m, 0.0), 0.0)", BY_FAST),
     Fault("little-weight-black", FAST, "* share.view(-1, 1, 1)", "", BY_FAST),
     Fault("fingers-bent-at-rest", FINGERS, "deg2rad(relaxed) - bend", "deg2rad(relaxed) + bend", BY_FINGERS),
     Fault("fingers-across-gaps", FINGERS, "np.arange(ends[-1]), ends - 1)", "np.arange(ends[-1]), ends[-1:] - 1)",

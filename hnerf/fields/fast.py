@@ -304,18 +304,25 @@ def shown(weights: Tensor) -> Tensor:
 def move_to_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:
     """Move samples (R K,) along their rays to where d_hat (R, K), linear between samples, is zero or closest to it.
 
-    A sample's opacity is that of the path to the next one; its colour is that of the surface that makes it opaque. A
-    ray's last sample stays, as do samples whose successor is out of reach or on another limb. Gradients also flow
-    through the position of the zero (as in IDR, Yariv et al. 2020): a body that moves along a ray shows the same point
-    to it, and without that term it would be drawn towards or away from its camera.
+    A sample's opacity is that of the path to the next one; its colour is that of the surface that makes it opaque. If
+    the next one is nearer to another limb's surface, that is the one: the sample goes to its successor, else limbs have
+    ghosts of their outlines on the limbs behind them. A ray's last sample stays, as do samples whose successor is out
+    of reach. Gradients also flow through the position of the zero (as in IDR, Yariv et al. 2020): a body that moves
+    along a ray shows the same point to it, and without that term it would be drawn towards or away from its camera.
     """
     y, d, near = (t.unflatten(0, d_hat.shape) for t in (described.y, described.d, described.near))
     ahead, after = d_hat[:, :-1], d_hat[:, 1:]
-    joined = near[:, :-1] & near[:, 1:] & ((y[:, 1:] - y[:, :-1]).norm(dim=-1) < MAX_NEIGHBOUR_DISTANCE_M)
+    descends = near[:, :-1] & near[:, 1:] & (ahead > after)
+    same_limb = (y[:, 1:] - y[:, :-1]).norm(dim=-1) < MAX_NEIGHBOUR_DISTANCE_M
     descent_m = (ahead - after).clamp(min=MIN_DESCENT_M)
-    share = torch.where(joined & (ahead > after), ahead / descent_m, 0.0).clamp(0, 1)[..., None]
+    share = torch.where(descends, torch.where(same_limb, ahead / descent_m, 1.0), 0.0).clamp(0, 1)[..., None]
+    skips = nn.functional.pad(descends & ~same_limb, (0, 1)).flatten()
+    triangle = torch.arange(len(skips), device=skips.device) + skips
 
     def moved(values: Tensor) -> Tensor:
         return torch.cat([torch.lerp(values[:, :-1], values[:, 1:], share), values[:, -1:]], 1).flatten(0, 1)
 
-    return dataclasses.replace(described, y=moved(y), d=moved(d[..., None])[:, 0])
+    corners, barycentric = (t.index_select(0, triangle) for t in (described.corners, described.barycentric))
+    return dataclasses.replace(
+        described, y=moved(y), d=moved(d[..., None])[:, 0], corners=corners, barycentric=barycentric
+    )

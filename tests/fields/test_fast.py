@@ -255,12 +255,22 @@ def test_colours_are_those_of_the_surface_between_two_samples():
     assert torch.allclose(moved.y[:, 2], expected, atol=1e-7)
 
 
-def test_samples_stay_where_the_next_one_is_out_of_reach_or_on_another_limb():
-    described = on_a_ray([0.005, -0.005, 0.005, -0.005], [True, False, True, True])
+def test_samples_stay_where_the_next_one_is_out_of_reach_or_farther_from_another_limb():
+    described = on_a_ray([0.005, -0.005, 0.005, 0.006], [True, False, True, True])
     described.y[3, 0] = 0.1
     moved = move_to_surface(described, described.d[None])
-    assert torch.equal(moved.d, described.d)
-    assert torch.equal(moved.y, described.y)
+    for name in ("d", "y", "corners", "barycentric"):
+        assert torch.equal(getattr(moved, name), getattr(described, name))
+
+
+def test_a_sample_before_another_limb_shows_that_limb():
+    """5 mm from an arm, then 1 mm inside the trunk: the path between them is opaque by the trunk."""
+    described = on_a_ray([0.005, -0.001, -0.006], [True] * 3)
+    described.y[1:, 0] = 0.1
+    described.corners[1:], described.barycentric[1:] = 7, 0.5
+    moved = move_to_surface(described, described.d[None])
+    for name in ("d", "y", "corners", "barycentric"):
+        assert torch.equal(getattr(moved, name), getattr(described, name)[[1, 1, 2]])
 
 
 def test_a_surface_is_met_at_the_same_point_when_its_body_moves_along_the_ray():
