@@ -7,7 +7,6 @@ import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 import warp as wp
 from scipy import ndimage
@@ -46,17 +45,18 @@ class ShellGrid:
         margin_m = float(outer_m.max()) + 2 * cell_m
         lower = vertices_m.amin(1) - margin_m
         sizes = ((vertices_m.amax(1) + margin_m - lower) / cell_m).ceil().long()
-        cells = np.full((len(sizes), *sizes.amax(0).tolist()), EMPTY, np.uint8)
+        shape = len(sizes), *sizes.amax(0).tolist()
+        cells = torch.full(shape, EMPTY, dtype=torch.uint8, device=vertices_m.device)
 
-        def fill(row: int) -> None:
+        def fill(row_and_size: tuple[int, list[int]]) -> None:
+            row, size = row_and_size
             index = ((weighted_sum(vertices_m[row], corners, weights) - lower[row]) / cell_m).long()
             thickness = (side[row][corners].amax(-1) / cell_m for side in (outer_m, inner_m))
-            size, *surface = (t.cpu() for t in (sizes[row], index, *thickness))
-            cells[row][tuple(map(slice, size))] = _classify_cells(size.tolist(), *surface)
+            cells[row][tuple(map(slice, size))] = _classify_cells(size, index, *thickness)
 
         with ThreadPoolExecutor(torch.get_num_threads()) as threads:  # one frame per thread, which bounds memory
-            list(threads.map(fill, range(len(cells))))
-        return ShellGrid(torch.from_numpy(cells).to(vertices_m.device), lower, cell_m)
+            list(threads.map(fill, enumerate(sizes.tolist())))
+        return ShellGrid(cells, lower, cell_m)
 
     def cell_states(self, rays: Rays, depths_m: Tensor) -> Tensor:
         """Return the state of the cells at depths (R, K) along R rays: (R, K) uint8. Outside the grid it is that of the
@@ -118,26 +118,29 @@ def surface_points(vertices_m: Tensor, faces: Tensor, spacing_m: float) -> tuple
     return torch.cat(corners), torch.cat(weights)
 
 
-def _classify_cells(size: list[int], points: Tensor, outer: Tensor, inner: Tensor) -> np.ndarray:
+def _classify_cells(size: list[int], points: Tensor, outer: Tensor, inner: Tensor) -> Tensor:
     """Return the states of a frame's cells around surface points (V, 3) with thicknesses (V,), all in cells."""
-    beside = _within(size, points, torch.ones(len(points)))  # a cell thicker than the surface: the inside has no leaks
-    away, _ = ndimage.label(~beside)
-    inside = away != away[0, 0, 0]
-    cells = np.where(inside, np.uint8(SOLID), np.uint8(EMPTY))
-    cells[np.where(inside, _within(size, points, inner + SLACK), _within(size, points, outer + SLACK))] = SHELL
-    return cells
+    beside = _within(size, points, torch.ones_like(outer))  # a cell thicker than the surface: the inside has no leaks
+    away, _ = ndimage.label(~beside.cpu().numpy())
+    inside = torch.from_numpy(away != away[0, 0, 0]).to(points.device)
+    shell = torch.where(inside, _within(size, points, inner + SLACK), _within(size, points, outer + SLACK))
+    return torch.where(shell, SHELL, torch.where(inside, SOLID, EMPTY)).to(torch.uint8)
 
 
-def _within(size: list[int], points: Tensor, reach: Tensor) -> np.ndarray:
-    """Return the cells whose centres are at most as far from that of a point's cell as the point reaches, in an array
-    of this size; points (V, 3), reach (V,)."""
+def _within(size: list[int], points: Tensor, reach: Tensor) -> Tensor:
+    """Return the cells whose centres are at most as far from that of a point's cell as the point reaches, in a bool
+    tensor of this size; points (V, 3), reach (V,)."""
     index = (points[:, 0] * size[1] + points[:, 1]) * size[2] + points[:, 2]
-    farthest = torch.zeros(math.prod(size)).scatter_reduce_(0, index, reach.float(), "amax")
-    centres = torch.nonzero(farthest)[:, 0]
-    within = torch.zeros(size, dtype=torch.uint8)
-    at = wp.from_torch(torch.stack(torch.unravel_index(centres, size), 1).int(), dtype=wp.vec3i)
-    wp.launch(_fill_balls, len(centres), [at, *map(wp.from_torch, (farthest[centres], within))], device="cpu")
-    return within.bool().numpy()
+    farthest = torch.zeros(math.prod(size), device=points.device).scatter_reduce_(0, index, reach.float(), "amax")
+    centres = torch.nonzero(farthest.view(size))
+    within = torch.zeros(size, dtype=torch.uint8, device=points.device)
+    _launch(centres.int().contiguous(), farthest[farthest > 0], within)
+    return within.bool()
+
+
+def _launch(centres: Tensor, radii: Tensor, cells: Tensor) -> None:
+    inputs = [wp.from_torch(centres, dtype=wp.vec3i), wp.from_torch(radii), wp.from_torch(cells)]
+    wp.launch(_fill_balls, len(centres), inputs, device=wp.device_from_torch(cells.device))
 
 
 @wp.kernel(enable_backward=False)

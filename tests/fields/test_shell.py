@@ -73,7 +73,7 @@ def test_the_shell_is_all_that_any_surface_point_reaches():
     cells = torch.cartesian_prod(*map(torch.arange, (14, 15, 16)))
     apart = torch.cdist(cells.float(), points.float())
     reached = [(apart <= reach + SLACK).any(1).view(14, 15, 16) for reach in (outer, inner)]
-    found = torch.from_numpy(_classify_cells([14, 15, 16], points, outer, inner))
+    found = _classify_cells([14, 15, 16], points, outer, inner)
     assert (found == SHELL)[found != SOLID].equal(reached[0][found != SOLID])
     assert ((found == SHELL) >= (reached[0] & reached[1])).all() and (found == SHELL).sum() > 500
 

@@ -1,8 +1,9 @@
 """A simulated GPU: CPU tensors that claim to be on cuda:0, so that a machine without a GPU detects where tensors of two
 devices meet. Warp's kernels and `embedding_bag` run on the CPU."""
 
+import builtins
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 from hnerf.avatar import trained as model
 from hnerf.body import canonical, correction_pull
 from hnerf.body.descriptor import BodyMeshes, ClosestPoints
-from hnerf.fields import fast, sparse_grids
+from hnerf.fields import fast, shell, sparse_grids
 from hnerf.training import trainer
 
 CUDA = torch.device("cuda", 0)
@@ -140,8 +141,9 @@ def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     monkeypatch.setattr(torch.nn.functional, "embedding_bag", embedding_bag)
     for module in (canonical, fast):
         monkeypatch.setattr(module, "BodyMeshes", Meshes)
-    for module in (correction_pull, sparse_grids):
+    for module in (correction_pull, shell, sparse_grids):
         monkeypatch.setattr(module, "_launch", _on_one_device(module._launch))
+    monkeypatch.setattr(shell, "ThreadPoolExecutor", lambda threads: nullcontext(builtins))  # modes are a thread's own
     monkeypatch.setattr(model, "load_file", load_file)
     monkeypatch.setattr(trainer, "save_checkpoint", lambda folder, state: None)
     with Routed():
