@@ -1,0 +1,92 @@
+"""Train, evaluate and render a prepared subject on a GPU.
+
+usage: python benchmarks/gpu.py SUBJECT CAPTURE OUT [--preset NAME] [--set a.b=c]
+
+SUBJECT is a folder of a store's `subjects/`, whose recording, calibration, masks and body fit were made on any machine;
+CAPTURE the recording as it came, for its `ground_truth/`. Training and evaluation are those of the pipeline's stages,
+without Prefect. Writes `OUT/training/`, `OUT/evaluation/` and, under `benchmarks/results/`, `gpu-PRESET-SUBJECT.json`
+and `.md`.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+from provenance import provenance, provenance_line, table, write_result
+
+from hnerf.avatar.trained import load_avatar
+from hnerf.body.fit_result import BodyFit
+from hnerf.calibration.report import load_cameras
+from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks
+from hnerf.config import load_settings
+from hnerf.evaluation.evaluate import evaluate
+from hnerf.evaluation.inputs import EvaluationInputs
+from hnerf.study.benchmark.scoring import frame_seconds
+from hnerf.training.trainer import train
+
+SIDES_PX = (256, 512)
+
+
+def main() -> None:
+    """Train, evaluate, render and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name in ("subject", "capture", "out"):
+        parser.add_argument(name, type=Path)
+    parser.add_argument("--preset", default="fast")
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="a.b=c")
+    options = parser.parse_args()
+    result = provenance() | {"preset": options.preset, "overrides": options.overrides}
+    settings = load_settings(options.preset, options.overrides)
+    folders = {name: options.subject / name for name in ("calibration", "segmentation", "fit")}
+    capture = load_cameras(folders["calibration"], Capture.load(options.subject / "capture"))
+    masks, body = Masks.load(folders["segmentation"]), BodyFit.load(folders["fit"])
+    training, evaluation = options.out / "training", options.out / "evaluation"
+    for folder in (training, evaluation):
+        folder.mkdir(parents=True, exist_ok=True)
+    result["training"] = train(capture, masks, body, settings.training, training)
+    avatar = load_avatar(training, "cuda")
+    camera = capture.cameras[(*capture.test_cameras, *capture.train_cameras)[0]]
+    frame = capture.train_frames[0]
+    result["frame_seconds"] = {str(side): frame_seconds(avatar, camera, frame, side) for side in SIDES_PX}
+    result["peak_memory_gib"] = torch.cuda.max_memory_allocated() / 2**30
+    inputs = {f"{name}_folder": folder for name, folder in folders.items()} | {"training_folder": training}
+    result["metrics"] = evaluate(
+        EvaluationInputs(options.capture, capture, masks, body, avatar, **inputs), settings.evaluation, evaluation
+    )
+    name = f"gpu-{options.preset}-{options.subject.name}"
+    write_result(name, result, as_markdown(options.subject.name, result))
+
+
+def as_markdown(subject: str, result: dict) -> str:
+    """Format the scores of each split, and the cost."""
+    changes = f" with {', '.join(result['overrides'])}" if result["overrides"] else ""
+    columns = {"n": ("images", "d"), "psnr": ("PSNR", ".2f"), "ssim": ("SSIM", ".3f"), "mask_iou": ("mask IoU", ".3f")}
+    surface_columns = {
+        "chamfer_l2_e3": ("Chamfer x1e-3 m²", ".3f"),
+        "chamfer_mm": ("mean mm", ".1f"),
+        "normal_consistency": ("NC", ".3f"),
+        "iou": ("IoU", ".3f"),
+    }
+    rows = [["", *(title for title, _ in (*columns.values(), *surface_columns.values()))]]
+    for split, title in (("novel_view", "training poses, test cameras"), ("novel_pose", "new poses, animated")):
+        scores = result["metrics"][split]
+        surface = scores["geometry"]
+        row = [f"{scores[key]:{form}}" for key, (_, form) in columns.items()]
+        rows.append([title, *row, *(f"{surface[k]:{f}}" if surface else "" for k, (_, f) in surface_columns.items())])
+    training, seconds = result["training"], result["frame_seconds"]
+    cost = {
+        "setup, s": f"{training['setup_seconds']:.0f}",
+        "training, s": f"{training['seconds']:.0f}",
+        "of that the field, s": f"{training['field_seconds']:.0f}",
+        "steps": str(training["steps"]),
+        "GPU memory, GiB": f"{result['peak_memory_gib']:.1f}",
+    }
+    cost |= {f"a frame at {side} px, s": f"{seconds[str(side)]:.3f}" for side in SIDES_PX}
+    head = [f"# {subject} on a GPU, preset `{result['preset']}`{changes}", "", provenance_line(result), ""]
+    protocol = ["", "## Protocol", "", result["metrics"]["protocol"], ""]
+    return "\n".join([*head, *table(rows), "", *table([list(cost), list(cost.values())]), *protocol])
+
+
+if __name__ == "__main__":
+    main()
