@@ -2,18 +2,20 @@
 middle."""
 
 from collections.abc import Callable
-from contextlib import nullcontext
 
 import torch
 from torch import Tensor, nn
 
 from hnerf.fields.encoding import positional_encoding
 
+MULTIPLE = 8  # of a matrix's rows in bfloat16: tensor cores take other sizes at a fraction of their speed
+
 
 class SkipMLP(nn.Module):
     """MLP of `layers` linear layers of `width`, with Swish by default; the input is fed again into the middle layer.
 
-    bf16: compute and store activations in bfloat16, for half the memory and less time on processors that support it.
+    bf16: compute, store and return activations in bfloat16, for half the memory and less time on processors that
+    support it.
     """
 
     def __init__(
@@ -41,12 +43,24 @@ class SkipMLP(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (N, inputs) to (N, width)."""
-        h, kind = x, x.device.type
-        # no cache: threads share it, and a thread without gradients would leave its cast weights to the others
-        with torch.autocast(kind, torch.bfloat16, cache_enabled=False) if self.bf16 else nullcontext():
-            for k, layer in enumerate(self.layers):
-                h = self.activation(layer(torch.cat([h, x], -1) if k == self.middle else h))
-        return h.to(x.dtype)
+        if self.bf16:
+            x = pad_columns(x).bfloat16()
+        h = x
+        for k, layer in enumerate(self.layers):
+            h = self.activation(linear(layer, torch.cat([h, x], -1) if k == self.middle else h))
+        return h
+
+
+def linear(layer: nn.Module, x: Tensor) -> Tensor:
+    """Return a linear layer's output in the type of x; x (N, inputs) may have columns of zeros beyond the inputs."""
+    assert isinstance(layer, nn.Linear)
+    weight = nn.functional.pad(layer.weight, (0, x.shape[1] - layer.in_features))
+    return nn.functional.linear(x, weight.to(x.dtype), layer.bias.to(x.dtype))
+
+
+def pad_columns(x: Tensor) -> Tensor:
+    """Return x (N, inputs) with columns of zeros up to a multiple of MULTIPLE."""
+    return nn.functional.pad(x, (0, -x.shape[1] % MULTIPLE))
 
 
 class RadianceMLP(nn.Module):
@@ -71,9 +85,11 @@ class RadianceMLP(nn.Module):
         """Map point (N, D) in scene units, pose (N, P), root (N, Q) and view (N, 3) to density (N,) per scene unit and
         colour (N, 3)."""
         features = self.trunk(torch.cat([positional_encoding(point, self.OCTAVES), pose], -1))
-        density = nn.functional.softplus(self.density(features)[:, 0])
-        seen = positional_encoding(view, self.view_octaves)
-        return density, torch.sigmoid(self.colour(torch.cat([features, root, seen], -1)))
+        density = nn.functional.softplus(self.density(features.to(point.dtype))[:, 0])
+        seen = torch.cat([root, positional_encoding(view, self.view_octaves)], -1).to(features.dtype)
+        hidden, activation, last = self.colour
+        shaded = activation(linear(hidden, pad_columns(torch.cat([features, seen], -1))))
+        return density, torch.sigmoid(last(shaded.to(point.dtype)))
 
 
 class ResidualMLP(nn.Module):
@@ -90,4 +106,5 @@ class ResidualMLP(nn.Module):
 
     def forward(self, point: Tensor, pose: Tensor) -> Tensor:
         """Map point (N, D) and pose (N, P) to dd (N,) in scene units."""
-        return self.residual(self.trunk(torch.cat([positional_encoding(point, self.OCTAVES), pose], -1)))[:, 0]
+        features = self.trunk(torch.cat([positional_encoding(point, self.OCTAVES), pose], -1))
+        return self.residual(features.to(point.dtype))[:, 0]
