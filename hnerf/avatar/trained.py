@@ -32,6 +32,7 @@ from hnerf.geometry.camera import Camera
 RAYS_PER_BATCH = 16384
 SAMPLES_PER_BATCH = 1 << 20  # coarse ones, for fields with many per ray: a network keeps some KiB for each
 POINTS_PER_BATCH = 1 << 17
+GPU_BATCHES = 4  # times as many: a GPU waits for the launches of smaller ones
 FIELDS: dict[type[config.FieldSettings], type[Field]] = {
     config.FastFieldSettings: FastField,
     config.PaperFieldSettings: PaperField,
@@ -70,6 +71,7 @@ class TrainedAvatar:
         scene = self.field.scene(bodies, conditions)
         device = bodies.vertices_m.device
         at_once = max(1, min(RAYS_PER_BATCH, SAMPLES_PER_BATCH // self.field.samples))
+        at_once *= GPU_BATCHES if device.type == "cuda" else 1
 
         def rays_at(points_px: np.ndarray) -> Rays:
             o, d = (torch.from_numpy(row.astype(np.float32)).to(device) for row in camera.rays(points_px.astype(float)))

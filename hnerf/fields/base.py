@@ -64,6 +64,9 @@ class Field(nn.Module, ABC):
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Return parameter groups for Adam."""
 
+    def compile_networks(self) -> None:
+        """Have torch fuse the operations of networks whose time goes into moving activations, for training on a GPU."""
+
     def frame_parameters(self) -> list[nn.Parameter]:
         """Return the parameters of single frames, with frames as first axis; for novel frames they are fitted to the
         finished field, as poses are."""

@@ -57,6 +57,10 @@ class PaperField(Field):
         """Return parameter groups for Adam."""
         return [{"params": list(self.parameters()), "lr": self.settings.learning_rate}]
 
+    def compile_networks(self) -> None:
+        """Compile F, but not DH: torch does not compile the second derivatives that `eikonal` needs."""
+        self.radiance.compile(dynamic=True)
+
     def sample(self, scene: PosedScene[Boxes], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:
         """Evaluate rays as Field.sample does, at coarse and fine samples together (K = 2 x samples)."""
         half_m, inner = self.settings.scene_m, self.settings.box_samples

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import logging
 import resource
+import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -68,6 +69,8 @@ class Trainer:
         self.static = len(capture.train_frames) == 1
         self.body = body.to(device)
         self.field = build_field(settings.field, self.body, self.static).to(device)
+        if device.type == "cuda" and shutil.which("cc"):  # Triton needs a C compiler when it runs
+            self.field.compile_networks()
         bodies = PosedBodies(self.body.rig, self.body.theta, self.body.root, self.field.canonical_m)
         ground_axis = "xyz".index(capture.up) if settings.ground else None
         self.objective = Objective(self.field, bodies.correction(), settings, ground_axis)
