@@ -3,10 +3,11 @@
 usage: python benchmarks/all.py [NAME ...] [--store STORE] [--jobs 1|2] [--list]
 
 NAME is a result's name in benchmarks/registry.py or a pattern of names, such as "stability/*"; by default all results.
-Results that are fresh are skipped, and so are those whose capture is not in `../shared/data` beside this checkout. Ends
-with exit code 2 if the checkout has uncommitted changes. After an interruption, repeat the same command: finished
-results are fresh, and an unfinished one finds its finished trainings in STORE. A result that fails is reported at the
-end, with exit code 1, and does not stop the others. `--list` shows the state of each result and makes none.
+Results that are fresh are skipped, and so are those whose capture is not in `../shared/data` beside this checkout, or
+that need a GPU where there is none. Ends with exit code 2 if the checkout has uncommitted changes. After an
+interruption, repeat the same command: finished results are fresh, and an unfinished one finds its finished trainings in
+STORE. A result that fails is reported at the end, with exit code 1, and does not stop the others. `--list` shows the
+state of each result and makes none.
 """
 
 import argparse
@@ -21,6 +22,7 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
+import torch
 from freshness import code_digest, file_digests, load_records, result_files, save_record, shown_seconds, stale_reason
 from provenance import ROOT, clean_commit, table
 from registry import REGISTRY, Result
@@ -102,6 +104,8 @@ def reason_to_skip(root: Path, result: Result, jobs: int) -> str | None:
     absent = [name for name in result.captures if not (root.parent / "shared" / "data" / name).is_dir()]
     if absent:
         return f"left out: no ../shared/data/{absent[0]}"
+    if result.gpu and not torch.cuda.is_available():
+        return "left out: needs a GPU"
     return "left out: needs both cores; give --jobs 2" if result.threads > jobs else None
 
 

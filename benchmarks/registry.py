@@ -23,7 +23,7 @@ class Result:
     command: a program under benchmarks/ and its arguments, where {store} is the store of all results, and {new} a
     folder that no other result and no other version of the code uses, for programs that time all of their work; files:
     patterns under benchmarks/results/; captures: under ../shared/data; configs: patterns under configs/ without
-    ".yaml"; runs: modules that the program starts and does not import; threads: of the program.
+    ".yaml"; runs: modules that the program starts and does not import; threads: of the program; gpu: it needs one.
     """
 
     name: str
@@ -33,6 +33,7 @@ class Result:
     configs: tuple[str, ...] = ()
     runs: tuple[str, ...] = ()
     threads: int = 1
+    gpu: bool = False
 
 
 def measured(
@@ -50,6 +51,14 @@ def shared(
     command += tuple(f"--set={change}" for change in changes)
     command += ("--without", *without) if without else ()
     return Result(name, command, (f"{name}.*",), (capture,), (preset,), ("flows.train_subject",), threads)
+
+
+def on_gpu(capture: str, preset: str, *changes: str) -> Result:
+    """Return a result of training and evaluation on a GPU, of a subject that is in the store up to its body fit."""
+    name = f"gpu-{preset}-{capture}"
+    command = ("gpu.py", f"{{store}}/subjects/{capture}", f"../shared/data/{capture}", "{new}", "--preset", preset)
+    command += tuple(f"--set={change}" for change in changes)
+    return Result(name, command, (f"{name}.*",), (capture,), (preset,), gpu=True)
 
 
 def study(
@@ -122,6 +131,12 @@ REGISTRY = (
     ),
     study("benchmark", "pose-distance", "fast", "neural-body", seconds=120, synth=(SMALL, *LONG_WALK)),
     measured("budget", "budget.py", "{store}", captures=RENDERED, configs=("fast",)),
+    on_gpu("valid-wave", "fast", "evaluation.max_images=40"),
+    on_gpu("valid-walk", "fast-gpu", "evaluation.max_images=12", "evaluation.max_meshes=2"),
+    on_gpu(
+        *("valid-walk", "paper", "evaluation.max_images=6", "evaluation.max_meshes=2"),
+        *("training.novel_pose_steps=0", "training.seconds=640"),
+    ),
     shared("shared-fast-two-threads", "valid-wave", threads=2),
     measured("rendering", "rendering.py", "{store}", captures=RENDERED, configs=("fast",), threads=2),
     study("benchmark", "quick", "fast", "paper-small", "nerf", store="{new}", threads=2),

@@ -42,7 +42,7 @@ class SkipMLP(nn.Module):
             nn.init.zeros_(layer.bias)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map (N, inputs) to (N, width)."""
+        """Map (..., inputs) to (..., width)."""
         if self.bf16:
             x = pad_columns(x).bfloat16()
         h = x
@@ -52,15 +52,16 @@ class SkipMLP(nn.Module):
 
 
 def linear(layer: nn.Module, x: Tensor) -> Tensor:
-    """Return a linear layer's output in the type of x; x (N, inputs) may have columns of zeros beyond the inputs."""
+    """Return a linear layer's output in the type of x; x (..., inputs) may have columns of zeros beyond the inputs."""
     assert isinstance(layer, nn.Linear)
-    weight = nn.functional.pad(layer.weight, (0, x.shape[1] - layer.in_features))
+    beyond = x.shape[-1] - layer.in_features
+    weight = nn.functional.pad(layer.weight, (0, beyond)) if beyond else layer.weight
     return nn.functional.linear(x, weight.to(x.dtype), layer.bias.to(x.dtype))
 
 
 def pad_columns(x: Tensor) -> Tensor:
-    """Return x (N, inputs) with columns of zeros up to a multiple of MULTIPLE."""
-    return nn.functional.pad(x, (0, -x.shape[1] % MULTIPLE))
+    """Return x (..., inputs) with columns of zeros up to a multiple of MULTIPLE."""
+    return nn.functional.pad(x, (0, -x.shape[-1] % MULTIPLE))
 
 
 class RadianceMLP(nn.Module):
