@@ -58,7 +58,6 @@ def main() -> None:
     result = where | {"footage": FOOTAGE, "protocol": PROTOCOL, "goals": GOALS, "figures": figures}
     result |= {"pairs": pairs, "report": report}
     write_result("boards", result, as_markdown(result))
-    print(as_markdown(result))
 
 
 def as_markdown(result: dict[str, Any]) -> str:

@@ -41,7 +41,6 @@ def main() -> None:
     for name in options.captures:
         captures[name] = where | measure(SHARED / "data" / name, Store(options.store.resolve()))
         write_result("budget", {"captures": captures}, as_markdown(captures))
-    print(as_markdown(captures))
 
 
 def measure(folder: Path, store: Store) -> dict[str, Any]:

@@ -105,7 +105,6 @@ def main() -> None:
         result["captures"][name] = {"trials": _trials(name, options.trials, options.untouched)}
         result["captures"][name]["seconds"] = time.perf_counter() - started
     write_result("calibration-faults", result, as_markdown(result))
-    print(as_markdown(result))
 
 
 def _trials(name: str, trials: int, untouched: int) -> list[dict[str, Any]]:

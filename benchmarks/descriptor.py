@@ -35,7 +35,6 @@ def main() -> None:
     shown = [["query", "points a second"], *([name, f"{rate:,.0f}"] for name, rate in rows.items())]
     markdown = "\n".join(["# Body descriptor", "", provenance_line(result), "", *table(shown), ""])
     write_result("descriptor", result, markdown)
-    print(markdown)
 
 
 def measure(count: int, frames: int) -> dict[str, float]:

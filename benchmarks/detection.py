@@ -56,7 +56,6 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as scratch:
             result["captures"][name] = measure(SHARED / "data" / name, options.sizes, Path(scratch))
     write_result("detection", result, as_markdown(result))
-    print(as_markdown(result))
 
 
 def measure(folder: Path, sizes: list[str], scratch: Path) -> dict[str, Any]:

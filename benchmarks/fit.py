@@ -53,7 +53,6 @@ def main() -> None:
     ]
     markdown = "\n".join(["# Body fit", "", provenance_line(result), "", *table(rows), ""])
     write_result("fit", result, markdown)
-    print(markdown)
 
 
 def measure(folder: Path, store: Store) -> dict[str, Any]:

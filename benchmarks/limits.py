@@ -49,7 +49,6 @@ def main() -> None:
         for title, parts in REPLACED.items():
             rows[title] = measure(SHARED / "data" / name, parts, options.store.resolve())
             write_result("limits", result, as_markdown(result))
-    print(as_markdown(result))
 
 
 def measure(folder: Path, parts: tuple[str, ...], store_folder: Path) -> dict[str, Any]:

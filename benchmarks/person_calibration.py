@@ -68,7 +68,6 @@ def main() -> None:
             result["captures"][name] = measure_capture(SHARED / "data" / name, options.detected, Path(scratch))
     result["clocks"] = {"calibrated": clock_errors(True), "not calibrated": clock_errors(False)}
     write_result("person-calibration", result, as_markdown(result))
-    print(as_markdown(result))
 
 
 def measure_capture(folder: Path, detected: bool, scratch: Path) -> dict[str, Any]:

@@ -44,7 +44,6 @@ def main() -> None:
     message = f"{size}; the last column is the gathering process's own memory, without the files that it writes."
     markdown = "\n".join(["# Host memory of pixels", "", provenance_line(result), "", message, "", *table(shown), ""])
     write_result("pixels-memory", result, markdown)
-    print(markdown)
 
 
 def measure(processes: int, frames: int, cameras: int, size_px: int) -> dict[str, float]:

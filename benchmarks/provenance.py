@@ -32,7 +32,9 @@ def provenance_line(result: dict[str, Any]) -> str:
 
 
 def write_result(name: str, result: dict[str, Any], markdown: str) -> None:
-    """Write `benchmarks/results/NAME.json` and `.md`, unless the checkout has changed since the program began."""
+    """Print the Markdown and write `benchmarks/results/NAME.json` and `.md`, unless the checkout has changed since the
+    program began."""
+    print(markdown)
     clean_commit(ROOT)
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")

@@ -39,7 +39,6 @@ def main() -> None:
     rows += [[name, *(f"{s:.2f} s" for s in found.values())] for name, found in result["seconds"].items()]
     text = "\n".join(["# Rendering a frame", "", provenance_line(result), "", *table(rows), ""])
     write_result("rendering", result, text)
-    print(text)
 
 
 def measure(subject: Path, cores: list[int]) -> dict[str, float]:

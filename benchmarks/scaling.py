@@ -58,7 +58,6 @@ def main() -> None:
         lines += ["", *table([[axis, *stages], *cells])]
     write_result(options.name, result, "\n".join([*lines, "", f"![seconds against size]({options.name}.png)", ""]))
     draw(costs, RESULTS / f"{options.name}.png")
-    print("\n".join(lines))
 
 
 def measure_parts(capture: Path, scratch: Path) -> dict[str, dict[int, dict[str, Cost]]]:

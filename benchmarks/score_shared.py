@@ -53,7 +53,6 @@ def main() -> int:
         capture = lacking(SHARED / "data" / name, options.without, options.store)
         result["captures"][name] = measure(capture, options.preset, options.store, options.overrides)
         write_result(options.name or f"shared-{options.preset}", result, as_markdown(result))
-    print(as_markdown(result))
     return int(any("error" in figures for figures in result["captures"].values()))
 
 

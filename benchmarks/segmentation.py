@@ -57,7 +57,6 @@ def main() -> None:
     }
     result["mean_iou"] = {"over": GOAL_CAPTURES, **means}
     write_result("segmentation", result, as_markdown(result))
-    print(as_markdown(result))
 
 
 def measure(folder: Path, sheet: Path | None) -> dict[str, Any]:
