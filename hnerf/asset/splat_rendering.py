@@ -7,6 +7,7 @@ Here the caller takes finer pixels instead.
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hnerf.geometry.camera import Camera
 
@@ -49,15 +50,7 @@ def render_splats(
 
 def covariances(quaternions: np.ndarray, scales_m: np.ndarray) -> np.ndarray:
     """Return R S S^T R^T (N, 3, 3), of rotations by unit quaternions (N, 4), w x y z, and scales (3,) (eq. 6)."""
-    w, x, y, z = quaternions.T
-    rotations = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    axes_m = np.moveaxis(rotations, 2, 0) * scales_m
+    axes_m = Rotation.from_quat(quaternions, scalar_first=True).as_matrix() * scales_m
     return axes_m @ axes_m.swapaxes(1, 2)
 
 
