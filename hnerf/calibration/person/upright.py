@@ -101,12 +101,7 @@ def _body_direction(points_m: np.ndarray) -> np.ndarray:
 
 def _rotation(up: np.ndarray) -> np.ndarray:
     """Return the smallest rotation (3, 3) that takes a direction to +Z."""
-    up = up / np.linalg.norm(up)
-    axis = np.cross(up, [0, 0, 1.0])
-    sine = np.linalg.norm(axis)
-    if sine < 1e-12:
-        return np.diag([1.0, np.sign(up[2]), np.sign(up[2])])
-    return np.asarray(Rotation.from_rotvec(axis / sine * np.arctan2(sine, up[2])).as_matrix())
+    return np.asarray(Rotation.align_vectors([[0.0, 0, 1]], up[None])[0].as_matrix())
 
 
 def _lowest_of_feet(points_m: np.ndarray) -> np.ndarray:
