@@ -28,11 +28,6 @@ class Frames:
         z = _dot(directions - x * self.tangent, self.normal) / _dot(self.normal, self.normal)
         return unit(np.concatenate([x, y, z], 1))
 
-    def directions(self, components: np.ndarray) -> np.ndarray:
-        """Return the unit directions (N, 3) that have these components (N, 3)."""
-        x, y, z = components.T[..., None]
-        return unit(x * self.tangent + y * self.bitangent + z * self.normal)
-
 
 def uv_tangents(points_m: np.ndarray, normals: np.ndarray, faces: np.ndarray, layout: UvLayout) -> np.ndarray:
     """Return the tangent of each texture coordinate, (U, 4): the unit vector T and w. points_m, normals (V, 3); faces
