@@ -118,8 +118,7 @@ def _without(empty: list[str], capture: Capture, settings: CalibrationSettings) 
             "train on it alone ([cameras] in capture.toml)"
         )
     report = check_calibration(dataclasses.replace(capture, train_cameras=others), settings)
-    why = "never shows the person; check its keypoints if it does"
-    verdict = CameraVerdict("rejected", None, None, None, None, 0.0, Timing.unknown("no keypoints"), (why,))
+    verdict = CameraVerdict("rejected", reasons=("never shows the person; check its keypoints if it does",))
     return dataclasses.replace(
         report, verdicts={name: report.verdicts.get(name, verdict) for name in capture.train_cameras}
     )
@@ -256,12 +255,7 @@ def _unchecked(capture: Capture) -> CalibrationReport:
     """Return the report of a recording with given body poses and no keypoints: nothing was detected that could check
     the cameras."""
     notes = ("not checked: the recording has no keypoints; cameras are used as given, with the poses given for them",)
-    verdicts = {
-        name: CameraVerdict(
-            "ok", None, None, None, None, 0.0, Timing.unknown("no keypoints"), tuple(size_reasons(capture, name))
-        )
-        for name in capture.train_cameras
-    }
+    verdicts = {name: CameraVerdict("ok", reasons=tuple(size_reasons(capture, name))) for name in capture.train_cameras}
     return CalibrationReport(capture.cameras, verdicts, None, None, {}, {}, notes, capture.up, None)
 
 
@@ -278,8 +272,8 @@ def _monocular(capture: Capture, keypoints: np.ndarray) -> CalibrationReport:
         camera, raised = raised_above_ground(camera, keypoints, capture.up, USUAL_HEIGHT_M)
     reasons = size_reasons(capture, name) + intrinsics_reasons(camera)
     reasons += [raised] if raised else ground_reasons(camera, keypoints, capture.up)
-    status = "refined" if raised else "ok"
-    verdict = CameraVerdict(status, None, None, None, None, 0.0, Timing.unknown("one camera"), tuple(reasons))
+    timing = Timing.unknown("one camera")
+    verdict = CameraVerdict("refined" if raised else "ok", timing=timing, reasons=tuple(reasons))
     cameras = capture.cameras | {name: camera}
     found = doubts(capture, keypoints[None], None)
     return CalibrationReport(cameras, {name: verdict}, None, None, {}, {}, notes, capture.up, None, found)

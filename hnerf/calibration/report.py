@@ -21,23 +21,24 @@ from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
 
 DECIMALS = 4  # of pixels, metres, frames and shares: a tenth of a millimetre, far below what is measured
+NO_KEYPOINTS = Timing.unknown("no keypoints")
 SEVERITY = ("ok", "refined", "suspect", "rejected")
 
 
 @dataclass(frozen=True)
 class CameraVerdict:
-    """Verdict on one camera. status: one of SEVERITY; residuals in pixels, None with one camera; frame_offset: the
-    corrected offset, the frame of this camera at the others' frame 0; timing: the offset as measured; reasons: in
-    words."""
+    """Verdict on one camera. status: one of SEVERITY; residuals in pixels, None where none were measured, as with one
+    camera; frame_offset: the corrected offset, the frame of this camera at the others' frame 0; timing: the offset as
+    measured; reasons: in words."""
 
     status: str
-    median_px: float | None
-    p95_px: float | None
-    median_before_px: float | None
-    p95_before_px: float | None
-    frame_offset: float
-    timing: Timing
-    reasons: tuple[str, ...]
+    median_px: float | None = None
+    p95_px: float | None = None
+    median_before_px: float | None = None
+    p95_before_px: float | None = None
+    frame_offset: float = 0.0
+    timing: Timing = NO_KEYPOINTS
+    reasons: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict as plain types for JSON."""
