@@ -20,10 +20,9 @@ from tasks.asset import export
 from tasks.bucket import BucketError
 from tasks.calibration import calibrate, calibrated_capture
 from tasks.capture import ingest, subset_capture
-from tasks.detection import detect, needs_detection
+from tasks.detection import detect, find_hands, needs_detection, needs_hands
 from tasks.evaluation import evaluate, evaluate_held_out
 from tasks.fit import fit
-from tasks.hands import find_hands, needs_hands
 from tasks.launcher import RankFailedError
 from tasks.ledger import forget, was_started
 from tasks.limits import StalledError, set_limits

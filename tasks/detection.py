@@ -1,4 +1,4 @@
-"""The detection stage: people found by a network in recordings without keypoints."""
+"""The stages that look for people and for their hands by networks."""
 
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -6,7 +6,8 @@ from pathlib import Path
 from hnerf.capture.capture import Capture
 from hnerf.config import DetectionSettings
 from hnerf.detection.detect import detect as detect_people
-from hnerf.models import POSE_DETECTOR, has_model
+from hnerf.detection.hands import detect_hands
+from hnerf.models import HAND_LANDMARKS, POSE_DETECTOR, has_model
 from tasks.launcher import LostWorkerError
 from tasks.stage import stage
 from tasks.store import Artifact
@@ -32,3 +33,18 @@ def needs_detection(recording: Artifact, settings: DetectionSettings) -> bool:
     flat = len(capture.train_cameras) == 1 and not posed and has_model(POSE_DETECTOR)
     silent = not capture.has_keypoints and not posed
     return settings.source in ("network", "both") or (settings.source is None and (silent or flat))
+
+
+@stage("hands", version="1")
+def find_hands(out: Path, recording: Artifact) -> dict[str, float]:
+    """Write the recording with the points of hands. Return the least share of hands found in a camera."""
+    return {"least_found": min(detect_hands(Capture.load(recording.root), out).values())}
+
+
+def needs_hands(recording: Artifact, settings: DetectionSettings) -> bool:
+    """Return whether to look for hands: the settings allow it, the network is installed, keypoints say where, and
+    several cameras see them, as a fit of fingers needs."""
+    if settings.hands != "auto" or not has_model(HAND_LANDMARKS):
+        return False
+    capture = Capture.load(recording.root)
+    return capture.has_keypoints and len(capture.train_cameras) > 1

@@ -1,4 +1,4 @@
-"""Conditions under which a network detects people."""
+"""Conditions under which networks detect people and their hands."""
 
 import dataclasses
 from pathlib import Path
@@ -8,8 +8,8 @@ import pytest
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings, DetectionSettings, SegmentationSettings
-from hnerf.models import POSE_DETECTOR
-from tasks.detection import needs_detection
+from hnerf.models import HAND_LANDMARKS, POSE_DETECTOR
+from tasks.detection import needs_detection, needs_hands
 from tasks.segmentation import needs_body
 from tasks.store import Artifact
 from tests.capture.recordings import write_easymocap
@@ -51,3 +51,20 @@ def test_a_single_camera_wants_the_depth_of_limbs(tmp_path: Path, monkeypatch: p
     assert not needs_detection(recording, DetectionSettings(source="recording"))
     capture.save()
     assert not needs_detection(recording, DetectionSettings())
+
+
+def test_hands_need_a_network_keypoints_and_leave(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HNERF_MODELS", str(tmp_path / "models"))
+    ingest(write_easymocap(tmp_path / "folder"), CaptureSettings(), tmp_path / "capture")
+    recording = Artifact(stage="capture", root=tmp_path / "capture", files={})
+    assert not needs_hands(recording, DetectionSettings())
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / HAND_LANDMARKS).touch()
+    assert needs_hands(recording, DetectionSettings())
+    assert not needs_hands(recording, DetectionSettings(hands="none"))
+    capture = Capture.load(tmp_path / "capture")
+    dataclasses.replace(capture, train_cameras=capture.train_cameras[:1]).save()
+    assert not needs_hands(recording, DetectionSettings())
+    capture.save()
+    (tmp_path / "capture" / "keypoints.npz").unlink()
+    assert not needs_hands(recording, DetectionSettings())
