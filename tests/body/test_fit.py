@@ -118,8 +118,8 @@ def test_neighbours_outvote_an_arm_mirrored_in_depth(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("cameras", [("0",), ("0", "1", "2", "3")])
-def test_a_lone_frame_that_is_hardly_seen_stays_near_the_others(tmp_path: Path, cameras: tuple[str, ...]) -> None:
-    """Frame 9 has no neighbours in time; one camera of four sees it, or none at all."""
+def test_keypoints_alone_and_a_lone_frame_that_is_hardly_seen(tmp_path: Path, cameras: tuple[str, ...]) -> None:
+    """Frame 9 has no neighbours in time, and stays near the others; one camera of four sees it, or none at all."""
     truth = moving_body((0, 1, 9))
     capture = record(tmp_path, truth, RING, cameras)
     with np.load(tmp_path / "keypoints.npz") as stored:
@@ -127,16 +127,10 @@ def test_a_lone_frame_that_is_hardly_seen_stays_near_the_others(tmp_path: Path, 
     for name in cameras[:1] if len(cameras) == 1 else cameras[1:]:
         keypoints[name][2] = 0
     np.savez(tmp_path / "keypoints.npz", **keypoints)  # type: ignore[arg-type]
-    fit, _ = fit_body(capture, None, FitSettings())
+    fit, report = fit_body(capture, None, FitSettings())
     assert fit.frames == truth.frames and fit.root.isfinite().all()
     assert (fit.root[2, :3, 3] - fit.root[1, :3, 3]).norm() < 1.0
-
-
-def test_keypoints_alone_seed_a_segmentation(tmp_path: Path) -> None:
-    truth = moving_body((0, 1))
-    capture = record(tmp_path, truth, RING, ("0", "1", "2", "3"))
-    fit, report = fit_body(capture, None, FitSettings())
-    assert joint_error_m(fit, truth).mean() < 0.03
+    assert len(cameras) == 1 or joint_error_m(fit, truth)[:2].mean() < 0.03
     assert report["silhouette_iou"] is None and "outlines" not in report["seconds"]
 
 
