@@ -1,12 +1,11 @@
 """Calibrate the shared captures from the person, without their calibration, and synchronise the embedded performer.
 
-usage: python benchmarks/person_calibration.py [--detected]
+usage: python benchmarks/person_calibration.py
 
-Needs `../shared` beside this checkout; --detected also runs the network of `hnerf models` on the images, which takes
-minutes. Writes `benchmarks/results/person-calibration.json` and `.md`.
+Needs `../shared` beside this checkout and the networks of `hnerf models`, whose detections take minutes. Writes
+`benchmarks/results/person-calibration.json` and `.md`.
 """
 
-import argparse
 import dataclasses
 import logging
 import tempfile
@@ -58,26 +57,21 @@ PROTOCOL = (
 
 def main() -> None:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--detected", action="store_true")
-    options = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
     result: dict[str, Any] = provenance() | {"protocol": PROTOCOL, "captures": {}}
     for name in (REAL, *RENDERED):
         with tempfile.TemporaryDirectory() as scratch:
-            result["captures"][name] = measure_capture(SHARED / "data" / name, options.detected, Path(scratch))
+            result["captures"][name] = measure_capture(SHARED / "data" / name, Path(scratch))
     result["clocks"] = {"calibrated": clock_errors(True), "not calibrated": clock_errors(False)}
     write_result("person-calibration", result, as_markdown(result))
 
 
-def measure_capture(folder: Path, detected: bool, scratch: Path) -> dict[str, Any]:
+def measure_capture(folder: Path, scratch: Path) -> dict[str, Any]:
     """Return figures by keypoints and by what is known of the lenses."""
     capture = ingest(folder, CaptureSettings(), scratch / "capture")
     reference = _reference(capture)
-    sources = {"delivered": capture}
-    if detected:
-        detect(capture, DetectionSettings(source="network"), scratch / "detected")
-        sources["detected"] = Capture.load(scratch / "detected")
+    detect(capture, DetectionSettings(source="network"), scratch / "detected")
+    sources = {"delivered": capture, "detected": Capture.load(scratch / "detected")}
     found = {}
     for source, seen in sources.items():
         for lenses in ("known", "unknown"):

@@ -95,7 +95,7 @@ REGISTRY = (
     measured("descriptor", "descriptor.py"),
     measured("boards", "boards.py", captures=("caliscope-charuco",)),
     measured("calibration-faults", "calibration.py", captures=CALIBRATED),
-    measured("person-calibration", "person_calibration.py", "--detected", captures=("pose2sim-balance", *CALIBRATED)),
+    measured("person-calibration", "person_calibration.py", captures=("pose2sim-balance", *CALIBRATED)),
     measured("detection", "detection.py", captures=("pose2sim-balance", *CALIBRATED), threads=2),
     measured("segmentation", "segmentation.py", captures=RENDERED),
     measured("fit", "fit.py", "{store}", captures=RENDERED, configs=("fast",)),
