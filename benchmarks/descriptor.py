@@ -1,13 +1,12 @@
 """Measure how many points a second the body descriptor handles, by kind of query.
 
-usage: python benchmarks/descriptor.py [--points 100000] [--frames 8]
+usage: python benchmarks/descriptor.py
 
 Points lie within the shell of `fast` around the average body, one resting copy a frame, in random order (rays query
 points in order, which caches better). Writes `benchmarks/results/descriptor.json` and `.md`: medians of five runs after
 a warm-up run.
 """
 
-import argparse
 import time
 from collections.abc import Callable
 from typing import Any
@@ -20,30 +19,27 @@ from hnerf.body.anny import anny_rig
 from hnerf.body.canonical import PosedBodies
 from hnerf.body.descriptor import vertex_normals
 
+POINTS, FRAMES = 100_000, 8
 OUTER_M, INNER_M = 0.07, 0.03  # extent of the shell outside and inside the body
 RUNS = 5
 
 
 def main() -> None:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--points", type=int, default=100_000)
-    parser.add_argument("--frames", type=int, default=8)
-    options = parser.parse_args()
-    where, rows = provenance(), measure(options.points, options.frames)
-    result = where | {"points": options.points, "frames": options.frames, "points_per_s": rows}
+    where, rows = provenance(), measure()
+    result = where | {"points": POINTS, "frames": FRAMES, "points_per_s": rows}
     shown = [["query", "points a second"], *([name, f"{rate:,.0f}"] for name, rate in rows.items())]
     markdown = "\n".join(["# Body descriptor", "", provenance_line(result), "", *table(shown), ""])
     write_result("descriptor", result, markdown)
 
 
-def measure(count: int, frames: int) -> dict[str, float]:
+def measure() -> dict[str, float]:
     """Return points a second, by kind of query."""
     rig = anny_rig()
-    theta, root = torch.zeros(frames, len(rig.joints_m), 3), torch.eye(4).expand(frames, 4, 4)
+    theta, root = torch.zeros(FRAMES, len(rig.joints_m), 3), torch.eye(4).expand(FRAMES, 4, 4)
     bodies = PosedBodies(rig, theta, root, rig.vertices_m)
     correction = bodies.correction()
-    points_m, frame = shell_points(rig.vertices_m, rig.faces, count), torch.arange(count) % frames
+    points_m, frame = shell_points(rig.vertices_m, rig.faces), torch.arange(POINTS) % FRAMES
     reach_m = OUTER_M + 0.04
 
     def learning() -> None:
@@ -55,14 +51,14 @@ def measure(count: int, frames: int) -> dict[str, float]:
         "(d, s, y), sign by winding number": lambda: bodies.describe(points_m, frame, reach_m, None, True),
         "(d, s, y) and gradients to pose and shape": learning,
     }
-    return {name: count / median_s(work) for name, work in asked.items()}
+    return {name: POINTS / median_s(work) for name, work in asked.items()}
 
 
-def shell_points(vertices_m: Tensor, faces: Tensor, count: int) -> Tensor:
-    """Return random points (count, 3), uniform in depth over the shell."""
+def shell_points(vertices_m: Tensor, faces: Tensor) -> Tensor:
+    """Return random points (POINTS, 3), uniform in depth over the shell."""
     generator = torch.Generator().manual_seed(0)
-    pick = torch.randint(len(vertices_m), (count,), generator=generator)
-    depth_m = torch.rand(count, 1, generator=generator) * (OUTER_M + INNER_M) - INNER_M
+    pick = torch.randint(len(vertices_m), (POINTS,), generator=generator)
+    depth_m = torch.rand(POINTS, 1, generator=generator) * (OUTER_M + INNER_M) - INNER_M
     return vertices_m[pick] + depth_m * vertex_normals(vertices_m, faces)[pick]
 
 

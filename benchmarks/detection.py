@@ -1,12 +1,11 @@
 """Compare the networks' keypoints and masks with those of the shared captures and with the truth.
 
-usage: python benchmarks/detection.py [--sizes heavy,full,lite]
+usage: python benchmarks/detection.py
 
 Needs `../shared/data` beside this checkout, and the networks of `hnerf models`. Writes
 `benchmarks/results/detection.json` and `.md`.
 """
 
-import argparse
 import dataclasses
 import logging
 import multiprocessing
@@ -47,18 +46,15 @@ PROTOCOL = (
 
 def main() -> None:
     """Detect, measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", type=lambda text: text.split(","), default=list(SIZES), metavar="LIST")
-    options = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", datefmt="%H:%M:%S")
     result: dict[str, Any] = provenance() | {"protocol": PROTOCOL, "captures": {}}
     for name in (REAL, *RENDERED):
         with tempfile.TemporaryDirectory() as scratch:
-            result["captures"][name] = measure(SHARED / "data" / name, options.sizes, Path(scratch))
+            result["captures"][name] = measure(SHARED / "data" / name, Path(scratch))
     write_result("detection", result, as_markdown(result))
 
 
-def measure(folder: Path, sizes: list[str], scratch: Path) -> dict[str, Any]:
+def measure(folder: Path, scratch: Path) -> dict[str, Any]:
     """Score the keypoints that a capture came with, and those of each size of the network."""
     everything = ingest(folder, CaptureSettings(max_side_px=1920), scratch / "everything")
     frames = tuple(evenly_spaced(everything.frames, FRAMES))
@@ -69,7 +65,7 @@ def measure(folder: Path, sizes: list[str], scratch: Path) -> dict[str, Any]:
     capture = Capture.load(scratch / "capture")
     score = score_truth if (folder / "ground_truth").is_dir() else score_residuals
     figures = {DELIVERED: score(folder, capture)}
-    for size in sizes:
+    for size in SIZES:
         out = scratch / size
         detect(capture, DetectionSettings.model_validate({"source": "network", "size": size}), out)
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as alone:

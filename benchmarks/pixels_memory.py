@@ -1,13 +1,12 @@
 """Measure the host memory of a training's pixels, as `paper` keeps them, by number of processes.
 
-usage: python benchmarks/pixels_memory.py [--frames 60] [--cameras 8] [--size-px 1024]
+usage: python benchmarks/pixels_memory.py
 
 Images are noise, so that no part of them can be skipped; masks are discs. Each process reads all pixels once, so that
 all are in memory. The memory of all processes together is the sum of their proportional set sizes (Pss), which count a
 page that several processes map once. Writes `benchmarks/results/pixels-memory.json` and `.md`.
 """
 
-import argparse
 import json
 import os
 import socket
@@ -25,17 +24,14 @@ from hnerf.training.distributed import Distributed
 from hnerf.training.gather import gather_pixels
 
 PROCESSES = (1, 2, 4)
+FRAMES, CAMERAS, SIZE_PX = 60, 8, 1024
 GIB = 2**30
 
 
 def main() -> None:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name, default in (("frames", 60), ("cameras", 8), ("size-px", 1024)):
-        parser.add_argument(f"--{name}", type=int, default=default)
-    options = parser.parse_args()
-    rows = {str(n): measure(n, options.frames, options.cameras, options.size_px) for n in PROCESSES}
-    size = f"{options.frames} frames x {options.cameras} cameras x {options.size_px} px"
+    rows = {str(n): measure(n) for n in PROCESSES}
+    size = f"{FRAMES} frames x {CAMERAS} cameras x {SIZE_PX} px"
     shown = [["processes", "all processes, GiB", "before pixels", "pixels", "peak while gathering"]]
     for n, row in rows.items():
         sizes = (row["all_gib"], row["before_gib"], row["all_gib"] - row["before_gib"], row["gathering_gib"])
@@ -46,14 +42,14 @@ def main() -> None:
     write_result("pixels-memory", result, markdown)
 
 
-def measure(processes: int, frames: int, cameras: int, size_px: int) -> dict[str, float]:
+def measure(processes: int) -> dict[str, float]:
     """Return the GiB of all processes together before and after they have their pixels, and of the gathering one
     meanwhile."""
     with socket.socket() as free, TemporaryDirectory() as folder:
         free.bind(("127.0.0.1", 0))
         os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}
         free.close()
-        multiprocessing.spawn(run_process, (processes, frames, cameras, size_px, Path(folder)), processes)
+        multiprocessing.spawn(run_process, (processes, Path(folder)), processes)
         found = [json.loads((Path(folder) / f"{rank}.json").read_text()) for rank in range(processes)]
     return {
         "before_gib": sum(row["before"] for row in found) / GIB,
@@ -62,12 +58,12 @@ def measure(processes: int, frames: int, cameras: int, size_px: int) -> dict[str
     }
 
 
-def run_process(rank: int, processes: int, frames: int, cameras: int, size_px: int, folder: Path) -> None:
+def run_process(rank: int, processes: int, folder: Path) -> None:
     """Gather the pixels as process `rank`, and write its memory figures."""
     os.environ |= {"RANK": str(rank), "WORLD_SIZE": str(processes)}
     torch.set_num_threads(1)
     here, found = Distributed.join(), {}
-    capture, masks, body = synthetic_inputs(frames, cameras, size_px)
+    capture, masks, body = synthetic_inputs()
     here.barrier()
     found["before"] = process_bytes("Pss")
     here.barrier()
@@ -103,7 +99,7 @@ class Noise(SimpleNamespace):
         """Return None: there are no plates."""
 
 
-class Discs(SimpleNamespace):
+class Discs:
     """Fake masks of discs."""
 
     def __contains__(self, view: tuple[str, int]) -> bool:
@@ -112,17 +108,17 @@ class Discs(SimpleNamespace):
 
     def get(self, camera: str, frame: int) -> np.ndarray:
         """Return the mask, (H, W) bool."""
-        y, x = np.ogrid[: self.size_px, : self.size_px]
-        return (x - self.size_px // 2) ** 2 + (y - self.size_px // 2) ** 2 < (self.size_px // 4) ** 2
+        y, x = np.ogrid[:SIZE_PX, :SIZE_PX]
+        return (x - SIZE_PX // 2) ** 2 + (y - SIZE_PX // 2) ** 2 < (SIZE_PX // 4) ** 2
 
 
-def synthetic_inputs(frames: int, cameras: int, size_px: int) -> tuple[Any, Any, Any]:
+def synthetic_inputs() -> tuple[Any, Any, Any]:
     """Return a fake capture, masks and body fit with what gathering whole images uses."""
-    camera = SimpleNamespace(width_px=size_px, height_px=size_px, K=np.eye(3), R=np.eye(3), centre_m=np.zeros(3))
-    names = tuple(f"{k}" for k in range(cameras))
+    camera = SimpleNamespace(width_px=SIZE_PX, height_px=SIZE_PX, K=np.eye(3), R=np.eye(3), centre_m=np.zeros(3))
+    names = tuple(f"{k}" for k in range(CAMERAS))
     by_name = {name: SimpleNamespace(**vars(camera), name=name) for name in names}
-    body = SimpleNamespace(frames=tuple(range(frames)), vertices_m=lambda: torch.zeros(frames, 1, 3))
-    return Noise(train_cameras=names, cameras=by_name), Discs(size_px=size_px), body
+    body = SimpleNamespace(frames=tuple(range(FRAMES)), vertices_m=lambda: torch.zeros(FRAMES, 1, 3))
+    return Noise(train_cameras=names, cameras=by_name), Discs(), body
 
 
 if __name__ == "__main__":
