@@ -32,7 +32,7 @@ from hnerf.asset.figures import (
 )
 from hnerf.asset.glb import write_glb
 from hnerf.asset.normal_map import normal_map
-from hnerf.asset.package import AssetInfo, write_cache, write_package, write_splats, write_usdz
+from hnerf.asset.package import AssetInfo, Avatars, write_cache, write_package, write_splats, write_usdz
 from hnerf.asset.regions import findings, surface_distances_mm
 from hnerf.asset.report import write_report
 from hnerf.asset.rigs import FULL, GAME
@@ -121,7 +121,8 @@ def export_asset(
         poses = extreme_poses(staged, surface.mesh.rig, surface.mesh.skin_faces)
     with _timed("files", seconds):
         info = AssetInfo(capture.name, settings.version, settings.licence, digest)
-        write_files(out, staged, capture, info, captured.staged if captured else None, splats)
+        avatars = {"registered": staged, "captured": captured.staged} if captured else {"": staged}
+        write_files(out, avatars, capture, info, splats)
     with _timed("viewer", seconds):
         viewer = write_viewer(out / "viewer.html", out / "avatar.glb", capture, staged.stage_from_world)
     with _timed("validation", seconds):
@@ -272,19 +273,12 @@ def _captured_figures(asset: MeshAsset) -> dict[str, Any]:
     }
 
 
-def write_files(
-    out: Path,
-    staged: StagedAvatar,
-    capture: Capture,
-    info: AssetInfo,
-    captured: StagedAvatar | None = None,
-    splats: Splats | None = None,
-) -> None:
-    """Write a staged avatar in all formats into the folder `out`; captured: the same with the captured mesh, which USD
-    has as well; splats: on its surface, for files of their own."""
-    cameras = list(capture.cameras.values())
-    write_package(out, staged, cameras, capture.fps, info, captured)
-    write_usdz(out / "avatar.usdz", staged, cameras, capture.fps, info, captured)
+def write_files(out: Path, avatars: Avatars, capture: Capture, info: AssetInfo, splats: Splats | None) -> None:
+    """Write a staged avatar in all formats into the folder `out`, of which USD has the meshes of all topologies, others
+    the first; splats: on its surface, for files of their own."""
+    cameras, staged = list(capture.cameras.values()), next(iter(avatars.values()))
+    write_package(out, avatars, cameras, capture.fps, info)
+    write_usdz(out / "avatar.usdz", avatars, cameras, capture.fps, info)
     write_cache(out / "avatar_cache.usdz", staged, cameras, capture.fps, info)
     write_glb(out / "avatar.glb", staged, staged.rigs[FULL])
     write_glb(out / "avatar_game.glb", staged, staged.rigs[GAME])

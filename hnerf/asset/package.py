@@ -79,17 +79,8 @@ class Part:
     topology: Variant | None = None
 
 
-def write_package(
-    out: Path,
-    avatar: StagedAvatar,
-    cameras: Iterable[Camera],
-    fps: float,
-    info: AssetInfo,
-    captured: StagedAvatar | None = None,
-) -> None:
-    """Write `avatar.usda`, `avatar_24.usda`, `avatar_30.usda` and the folder `avatar/` into `out`; captured: the same
-    avatar with the captured mesh, if both are wanted."""
-    avatars = _by_topology(avatar, captured)
+def write_package(out: Path, avatars: Avatars, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
+    """Write `avatar.usda`, `avatar_24.usda`, `avatar_30.usda` and the folder `avatar/` into `out`."""
     folder = out / PAYLOADS
     folder.mkdir()
     _write_images(folder, avatars)
@@ -106,18 +97,10 @@ def write_package(
         _write_interface(out / f"avatar_{rate}.usda", parts, avatars, rate, info, f"{CAPTURED}_{rate}")
 
 
-def write_usdz(
-    path: Path,
-    avatar: StagedAvatar,
-    cameras: Iterable[Camera],
-    fps: float,
-    info: AssetInfo,
-    captured: StagedAvatar | None = None,
-) -> None:
+def write_usdz(path: Path, avatars: Avatars, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
     """Write `avatar.usdz`: the same prims and variants as the package in a single layer, and the texture."""
-    avatars = _by_topology(avatar, captured)
     with tempfile.TemporaryDirectory() as folder:
-        stage = _new_stage(Path(folder) / "avatar.usdc", avatars, avatar.frames, fps, info)
+        stage = _new_stage(Path(folder) / "avatar.usdc", avatars, next(iter(avatars.values())).frames, fps, info)
         for part in _parts(avatars, list(cameras), fps):
             with _in_variant(stage, part.topology), _in_variant(stage, part.variant):
                 part.author(stage)
@@ -145,10 +128,6 @@ def write_splats(path: Path, avatar: StagedAvatar, splats: Splats, fps: float, i
     stage = _new_stage(path, {"": avatar}, avatar.frames, fps, info)
     author_splats(stage, avatar, splats)
     stage.GetRootLayer().Save()
-
-
-def _by_topology(avatar: StagedAvatar, captured: StagedAvatar | None) -> Avatars:
-    return {"": avatar} if captured is None else {"registered": avatar, "captured": captured}
 
 
 def _prefix(topology: str) -> str:

@@ -45,8 +45,8 @@ def skinned_points(stage: Usd.Stage, code: float) -> np.ndarray:
 def write_all(out: Path, staged: StagedAvatar) -> None:
     """Write the package, `avatar.usdz` and `avatar_cache.usdz`, of the column at 10 frames a second."""
     cameras = [dataclasses.replace(side_camera(), name=name) for name in ("cam 1", "cam.1", "01")]
-    write_package(out, staged, cameras, 10.0, INFO)
-    write_usdz(out / "avatar.usdz", staged, cameras, 10.0, INFO)
+    write_package(out, {"": staged}, cameras, 10.0, INFO)
+    write_usdz(out / "avatar.usdz", {"": staged}, cameras, 10.0, INFO)
     write_cache(out / "avatar_cache.usdz", staged, cameras, 10.0, INFO)
 
 
@@ -72,8 +72,8 @@ def expect_our_skin(stage: Usd.Stage, staged: StagedAvatar) -> list[np.ndarray]:
 def both(staged: StagedAvatar, captured: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the package and `avatar.usdz` of two topologies."""
     out = tmp_path_factory.mktemp("both")
-    write_package(out, staged, [side_camera()], 10.0, INFO, captured)
-    write_usdz(out / "avatar.usdz", staged, [side_camera()], 10.0, INFO, captured)
+    write_package(out, {"registered": staged, "captured": captured}, [side_camera()], 10.0, INFO)
+    write_usdz(out / "avatar.usdz", {"registered": staged, "captured": captured}, [side_camera()], 10.0, INFO)
     return out
 
 
@@ -161,7 +161,7 @@ def test_another_shape_moves_the_skin_at_every_level(name: str, lod: str, packag
 
 
 def test_without_physiques_the_captured_shape_is_the_only_one(staged: StagedAvatar, tmp_path: Path) -> None:
-    write_usdz(tmp_path / "plain.usdz", dataclasses.replace(staged, physiques_m={}), [], 10.0, INFO)
+    write_usdz(tmp_path / "plain.usdz", {"": dataclasses.replace(staged, physiques_m={})}, [], 10.0, INFO)
     stage = Usd.Stage.Open(str(tmp_path / "plain.usdz"))
     assert stage.GetDefaultPrim().GetVariantSet("shape").GetVariantNames() == ["captured"]
 
@@ -233,7 +233,9 @@ def test_a_level_without_the_points_of_an_expression_has_it_all_the_same(staged:
     gone = np.setdiff1d(staged.levels[0].vertices, staged.levels[1].vertices)[0]
     wink_m = np.zeros((len(staged.rest_points_m), 3), np.float32)
     wink_m[gone] = 0.01
-    write_usdz(tmp_path / "wink.usdz", dataclasses.replace(staged, expressions_m={"wink": wink_m}), [], 10.0, INFO)
+    write_usdz(
+        tmp_path / "wink.usdz", {"": dataclasses.replace(staged, expressions_m={"wink": wink_m})}, [], 10.0, INFO
+    )
     stage = Usd.Stage.Open(str(tmp_path / "wink.usdz"))
     stage.GetDefaultPrim().GetVariantSet("lod").SetVariantSelection("lod1")
     wink = UsdSkel.BlendShape(stage.GetPrimAtPath("/Avatar/Body/Surface_lod1/wink"))
@@ -304,7 +306,7 @@ def test_nothing_but_the_interface_is_loaded_without_payloads(package: Path) -> 
 
 def test_the_hint_has_room_for_every_motion(staged: StagedAvatar, tmp_path: Path) -> None:
     far = dataclasses.replace(staged, extents_m={name: 100 * boxes for name, boxes in staged.extents_m.items()})
-    write_usdz(tmp_path / "far.usdz", far, [], 10.0, INFO)
+    write_usdz(tmp_path / "far.usdz", {"": far}, [], 10.0, INFO)
     stage = Usd.Stage.Open(str(tmp_path / "far.usdz"))
     hint = np.array(UsdGeom.ModelAPI(stage.GetDefaultPrim()).GetExtentsHintAttr().Get())
     corners = np.concatenate([boxes.reshape(-1, 3) for boxes in far.extents_m.values()])
@@ -385,7 +387,7 @@ def test_each_topology_has_its_own_pictures(
 
 def test_a_normal_map_and_an_albedo_can_be_left_out(staged: StagedAvatar, tmp_path: Path) -> None:
     bare = dataclasses.replace(staged, normal_map=None, albedo=None)
-    write_usdz(tmp_path / "smooth.usdz", bare, [], 10.0, INFO)
+    write_usdz(tmp_path / "smooth.usdz", {"": bare}, [], 10.0, INFO)
     stage = Usd.Stage.Open(str(tmp_path / "smooth.usdz"))
     assert stage.GetDefaultPrim().GetVariantSet("look").GetVariantNames() == ["captured"]
     surface = UsdShade.Shader(stage.GetPrimAtPath("/Avatar/Materials/Captured/Surface"))

@@ -20,8 +20,8 @@ BODY = "/Avatar/Body"
 def package(staged: StagedAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the package and `avatar.usdz`."""
     out = tmp_path_factory.mktemp("package")
-    write_package(out, staged, [side_camera()], 10.0, INFO)
-    write_usdz(out / "avatar.usdz", staged, [side_camera()], 10.0, INFO)
+    write_package(out, {"": staged}, [side_camera()], 10.0, INFO)
+    write_usdz(out / "avatar.usdz", {"": staged}, [side_camera()], 10.0, INFO)
     return out
 
 
@@ -305,8 +305,8 @@ def test_what_we_write_passes_every_validator(package: Path) -> None:
 def test_both_topologies_pass_every_validator_and_a_defect_of_one_says_of_which(
     staged: StagedAvatar, captured: StagedAvatar, tmp_path: Path
 ) -> None:
-    write_package(tmp_path, staged, [side_camera()], 10.0, INFO, captured)
-    write_usdz(tmp_path / "avatar.usdz", staged, [side_camera()], 10.0, INFO, captured)
+    write_package(tmp_path, {"registered": staged, "captured": captured}, [side_camera()], 10.0, INFO)
+    write_usdz(tmp_path / "avatar.usdz", {"registered": staged, "captured": captured}, [side_camera()], 10.0, INFO)
     for name in ("avatar.usdz", "avatar.usda", "avatar_24.usda"):
         report = validate_package(tmp_path / name)
         assert (report["variants"], report["warnings"]) == (20 + 12, [])
