@@ -55,41 +55,14 @@ class BoardFit:
         return found[np.isfinite(found)]
 
 
-def adjust(
-    cameras: Sequence[Camera],
-    corners_m: np.ndarray,
-    corners_px: np.ndarray,
-    boards: Poses,
-    moving: Sequence[bool],
-    frame_step: int,
-) -> BoardFit:
-    """Minimise a robust least-squares cost over board poses, time offsets, and the cameras that are `moving`.
+class Adjustment:
+    """A robust least-squares problem over board poses, time offsets, and the cameras that are `moving`. Unknowns in one
+    vector: 6 per camera, 6 per frame (rotation, then translation), 1 per image that shows the board.
 
     corners_m (N, 3) on the board; corners_px (C, F, N, 2) undistorted, NaN where not seen, of every `frame_step`-th
     frame of the footage; offsets are in frames of the footage. Rotations are updated on the left, R <- exp(w) R (Triggs
     et al. 2000, Bundle Adjustment, section 2.2).
     """
-    problem = _Problem(cameras, corners_m, corners_px, boards, np.asarray(moving), frame_step)
-    start = np.zeros(problem.size)
-    limits = np.full(problem.size, np.inf)
-    limits[problem.offsets] = MAX_OFFSET_FRAMES
-    solved = least_squares(
-        problem.residuals,
-        start,
-        bounds=(-limits, limits),
-        jac_sparsity=problem.sparsity(),
-        loss="soft_l1",
-        f_scale=LOSS_SCALE_PX,
-        x_scale="jac",
-        ftol=COST_TOLERANCE,
-        max_nfev=MAX_ITERATIONS,
-    )
-    return problem.fit(solved.x)
-
-
-class _Problem:
-    """Unknowns in one vector: 6 per camera, 6 per frame (rotation, then translation), 1 per image that shows the
-    board."""
 
     def __init__(
         self,
@@ -97,11 +70,11 @@ class _Problem:
         corners_m: np.ndarray,
         corners_px: np.ndarray,
         boards: Poses,
-        moving: np.ndarray,
+        moving: Sequence[bool],
         frame_step: int,
     ) -> None:
         self.cameras, self.corners_m, self.corners_px, self.boards = cameras, corners_m, corners_px, boards
-        self.moving, self.frame_step = moving, frame_step
+        self.moving, self.frame_step = np.asarray(moving), frame_step
         self.seen = np.isfinite(corners_px[..., 0])  # (C, F, N)
         self.camera, self.frame = np.nonzero(self.seen.any(-1))  # of each picture
         self.picture, self.corner = np.nonzero(self.seen[self.camera, self.frame])  # of each observation
@@ -111,6 +84,23 @@ class _Problem:
         self.before, self.after = _adjacent_frames(self.seen.any((0, 2)))
         self.offsets = slice(6 * (count + frames), 6 * (count + frames) + len(self.camera))
         self.size = self.offsets.stop
+
+    def solve(self) -> BoardFit:
+        """Minimise the cost."""
+        limits = np.full(self.size, np.inf)
+        limits[self.offsets] = MAX_OFFSET_FRAMES
+        solved = least_squares(
+            self.residuals,
+            np.zeros(self.size),
+            bounds=(-limits, limits),
+            jac_sparsity=self.sparsity(),
+            loss="soft_l1",
+            f_scale=LOSS_SCALE_PX,
+            x_scale="jac",
+            ftol=COST_TOLERANCE,
+            max_nfev=MAX_ITERATIONS,
+        )
+        return self.fit(solved.x)
 
     def residuals(self, x: np.ndarray) -> np.ndarray:
         """Return two residuals per corner in pixels, then one per image for its time offset."""

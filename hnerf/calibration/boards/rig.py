@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
-from hnerf.calibration.boards.bundle import BoardFit, Poses, adjust
+from hnerf.calibration.boards.bundle import Adjustment, BoardFit, Poses
 from hnerf.capture.lens import Lens
 from hnerf.capture.normalise import UNDISTORTED
 from hnerf.errors import InputError
@@ -73,7 +73,7 @@ def solve_rig(
     views = _view_poses(cameras, corners_m, corners_px)
     cameras = _chain_poses(cameras, views)
     boards = _board_poses(cameras, corners_m, corners_px, views)
-    return adjust(cameras, corners_m, corners_px, boards, [i > 0 for i in range(len(cameras))], frame_step)
+    return Adjustment(cameras, corners_m, corners_px, boards, [i > 0 for i in range(len(cameras))], frame_step).solve()
 
 
 def solve_boards(
@@ -81,7 +81,7 @@ def solve_boards(
 ) -> BoardFit:
     """Solve as `solve_rig` does, with fixed cameras."""
     boards = _board_poses(cameras, corners_m, corners_px, _view_poses(cameras, corners_m, corners_px))
-    return adjust(cameras, corners_m, corners_px, boards, [False] * len(cameras), frame_step)
+    return Adjustment(cameras, corners_m, corners_px, boards, [False] * len(cameras), frame_step).solve()
 
 
 def compare_pairs(cameras: Sequence[Camera], others: Sequence[Camera]) -> dict[str, dict[str, float]]:
