@@ -14,7 +14,6 @@ import numpy as np
 import torch
 import trimesh
 
-from hnerf.asset.albedo import Albedo
 from hnerf.asset.baking import baked_textures
 from hnerf.asset.bvh_file import write_avatar_bvh
 from hnerf.asset.comparison import Compared, compare_with_field, comparison_figures, require_close
@@ -39,7 +38,6 @@ from hnerf.asset.rigs import FULL, GAME
 from hnerf.asset.splat_ply import write_splat_ply
 from hnerf.asset.splats import Splats, surface_splats
 from hnerf.asset.staging import StagedAvatar, stage_avatar
-from hnerf.asset.texture import UvLayout
 from hnerf.asset.topologies import AssetMesh, asset_meshes
 from hnerf.asset.validation import validate_package
 from hnerf.asset.viewer import write_viewer
@@ -181,7 +179,27 @@ def _mesh_asset(
         px = settings.normal_map_px
         normals = normal_map(timeless, surface.mesh, layout, px) if px else None
     with _timed("staging", seconds):
-        staged = _staged(capture, timeless.body, surface, layout, texture, albedo, normals, settings, further)
+        own = timeless.body.to("cpu")  # the unclothed body, beside which further motions are put
+        added = {
+            name: (dataclasses.replace(retarget(own, motion, capture.up), rig=surface.mesh.rig), motion.fps)
+            for name, motion in further.items()
+        }
+        staged = stage_avatar(
+            surface.body,
+            surface.surfaces_m,
+            surface.correctives,
+            layout,
+            texture,
+            capture.up,
+            capture.fps,
+            settings.bones,
+            added,
+            albedo,
+            normals,
+            settings.level_faces,
+            surface.mesh.face_units_m,
+            surface.mesh.physiques_m,
+        )
     splats = surface_splats(staged, settings.splats) if settings.splats else None
     with _timed("comparison", seconds):
         compared = compare_with_field(capture, masks, avatar, staged, splats)
@@ -200,41 +218,6 @@ def _clothed_surface(capture: Capture, avatar: Avatar, mesh: AssetMesh, settings
     correctives = correctives_of(displacements_m, settings.correctives)
     body = dataclasses.replace(body, rig=centred.rig)
     return ClothedSurface(centred, body, surfaces_m, displacements_m, correctives)
-
-
-def _staged(
-    capture: Capture,
-    fitted: BodyFit,
-    surface: ClothedSurface,
-    layout: UvLayout,
-    texture: np.ndarray,
-    albedo: Albedo | None,
-    normals: np.ndarray | None,
-    settings: AssetSettings,
-    further: Mapping[str, Motion],
-) -> StagedAvatar:
-    """Return the avatar in stage axes, with further motions; fitted: the unclothed body, beside which they are put."""
-    own = fitted.to("cpu")
-    added = {
-        name: (dataclasses.replace(retarget(own, motion, capture.up), rig=surface.mesh.rig), motion.fps)
-        for name, motion in further.items()
-    }
-    return stage_avatar(
-        surface.body,
-        surface.surfaces_m,
-        surface.correctives,
-        layout,
-        texture,
-        capture.up,
-        capture.fps,
-        settings.bones,
-        added,
-        albedo,
-        normals,
-        settings.level_faces,
-        surface.mesh.face_units_m,
-        surface.mesh.physiques_m,
-    )
 
 
 def _figures(
