@@ -18,26 +18,14 @@ class Displacement(torch.autograd.Function):
     posed (N,) int32: row of frame and vertex among n V; twists (n, C, 2, 3): turn and shift of each chain of joints,
     and share (V, C) of the vertices in them; bulge (V, 3): change of the rest body, which linear (n V, 3, 3) turns;
     carried (n, J, 3): what joints carry rigidly, shared by skin_joints (V, K) int32 and skin_weights (V, K). Gradients
-    flow to twists, bulge and carried.
+    flow to twists, bulge and carried; fixed are points, posed, share, linear, skin_joints and skin_weights.
     """
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        twists: Tensor,
-        bulge: Tensor,
-        carried: Tensor,
-        points: Tensor,
-        posed: Tensor,
-        share: Tensor,
-        linear: Tensor,
-        skin_joints: Tensor,
-        skin_weights: Tensor,
-    ) -> Tensor:
-        fixed = (points, posed, share, linear, skin_joints, skin_weights)
+    def forward(ctx: Any, twists: Tensor, bulge: Tensor, carried: Tensor, *fixed: Tensor) -> Tensor:
         ctx.save_for_backward(*fixed)
         ctx.shapes = twists.shape, bulge.shape, carried.shape
-        moved = torch.empty_like(points)
+        moved = torch.empty_like(fixed[0])
         _launch(0, (twists.detach(), bulge.detach(), carried.detach()), fixed, moved)
         return moved
 
