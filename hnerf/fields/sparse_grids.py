@@ -80,29 +80,22 @@ class _Interpolation(torch.autograd.Function):
     def forward(ctx: Any, unit: Tensor, features: Tensor, sizes: Tensor, rows: Tensor) -> Tensor:
         ctx.save_for_backward(unit, features, sizes, rows)
         found = features.new_empty(len(unit), len(sizes), features.shape[1])
-        _launch(0, unit, features, sizes, rows, [found])
+        _launch(0, (unit, features, sizes, rows), [found])
         return found.flatten(1)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor, None, None]:
-        unit, features, sizes, rows = ctx.saved_tensors
+        unit, features, sizes, _ = ctx.saved_tensors
         of_features = torch.zeros_like(features)
         of_unit = torch.empty_like(unit) if ctx.needs_input_grad[0] else None
         gradient = gradient.unflatten(1, (len(sizes), -1)).contiguous()
-        _launch(1, unit, features, sizes, rows, [gradient, of_features], of_unit)
+        _launch(1, ctx.saved_tensors, [gradient, of_features], of_unit)
         return of_unit, of_features, None, None
 
 
-def _launch(
-    which: int,
-    unit: Tensor,
-    features: Tensor,
-    sizes: Tensor,
-    rows: Tensor,
-    nodes: list[Tensor],
-    of_unit: Tensor | None = None,
-) -> None:
+def _launch(which: int, common: tuple[Tensor, ...], nodes: list[Tensor], of_unit: Tensor | None = None) -> None:
     """Run a kernel of `_kernels` over N points; `nodes` and `of_unit` are its arguments beside the common ones."""
+    unit, features, sizes, rows = common
     if not len(unit):
         return
     node = wp.types.vector(length=features.shape[1], dtype=wp.float32)
