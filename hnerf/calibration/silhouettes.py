@@ -19,7 +19,7 @@ from hnerf.capture.subject import subject_keypoints
 from hnerf.config import SegmentationSettings
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
-from hnerf.segmentation.backends import BackgroundSubtraction
+from hnerf.segmentation.backends import AROUND_DETECTED, BackgroundSubtraction
 from hnerf.segmentation.prior import priors_of
 
 FRAMES = 8  # evenly spaced: neighbouring frames add nothing
@@ -197,9 +197,5 @@ def _masks(capture: Capture, name: str, keypoints: np.ndarray, shown: Sequence[i
         return [mask for mask in given if mask is not None]
     settings = SegmentationSettings()
     priors = priors_of(capture, name, keypoints, settings)
-    plate = capture.background(name)
-    if plate is None:
-        backend = BackgroundSubtraction.from_median(capture, name, priors, PLATE_FRAMES, settings)
-    else:
-        backend = BackgroundSubtraction.from_plate(capture, name, plate, settings)
+    backend = BackgroundSubtraction.of(capture, name, priors, PLATE_FRAMES, AROUND_DETECTED, settings)
     return [backend.mask(capture.frames[i], priors[i]) for i in shown]

@@ -67,27 +67,18 @@ class BackgroundSubtraction:
     name: str
 
     @staticmethod
-    def from_plate(
-        capture: Capture, camera: str, plate: np.ndarray, settings: SegmentationSettings
+    def of(
+        capture: Capture, camera: str, priors: Sequence[Prior], count: int, around: str, settings: SegmentationSettings
     ) -> "BackgroundSubtraction":
-        """Use a clean plate, which is known everywhere."""
-        return BackgroundSubtraction(capture, camera, plate, np.ones(plate.shape[:2], bool), settings, CLEAN_PLATE)
-
-    @staticmethod
-    def from_median(
-        capture: Capture,
-        camera: str,
-        priors: Sequence[Prior],
-        count: int,
-        settings: SegmentationSettings,
-        name: str = AROUND_BODY,
-    ) -> "BackgroundSubtraction":
-        """Use the median over at most `count` frames, each where its prior leaves the background free; priors are in
-        the order of the frames."""
+        """Use the clean plate, which is known everywhere, if there is one, else the median over at most `count` frames,
+        each where its prior leaves the background free; priors are in the order of the frames."""
+        plate = capture.background(camera)
+        if plate is not None:
+            return BackgroundSubtraction(capture, camera, plate, np.ones(plate.shape[:2], bool), settings, CLEAN_PLATE)
         chosen = evenly_spaced(range(len(priors)), count)
         images = [capture.image(camera, capture.frames[i]) for i in chosen]
         plate, known = masked_median(images, [priors[i].near for i in chosen])
-        return BackgroundSubtraction(capture, camera, plate, known, settings, name)
+        return BackgroundSubtraction(capture, camera, plate, known, settings, around)
 
     def mask(self, frame: int, prior: Prior) -> np.ndarray:
         """Return the mask cut out of the window within reach of the prior."""
@@ -119,12 +110,9 @@ def choose_backend(
         return Given(capture, camera)
     if network is not None:
         return Learned(capture, camera, network)
-    plate = capture.background(camera)
-    if plate is not None:
-        return BackgroundSubtraction.from_plate(capture, camera, plate, settings)
-    if not fitted and not capture.has_person_masks:
+    if not fitted and not capture.has_person_masks and capture.background(camera) is None:
         raise InputError(
             f"{capture.name}: camera {camera} has neither masks nor a plate (background/{camera}.jpg); fit a body first"
         )
     around = AROUND_BODY if fitted else AROUND_DETECTED
-    return BackgroundSubtraction.from_median(capture, camera, priors, MEDIAN_FRAMES, settings, around)
+    return BackgroundSubtraction.of(capture, camera, priors, MEDIAN_FRAMES, around, settings)

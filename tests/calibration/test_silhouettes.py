@@ -128,7 +128,7 @@ def test_outlines_are_of_whom_the_recording_names(tmp_path: Path, monkeypatch: p
     capture, each = recorded(tmp_path, ring(3), staying((0, -0.6)), staying((0, 0.6)))
     x, y, _ = each[1]["c1"][7, 0]
     backend = SimpleNamespace(mask=lambda frame, prior: prior.body)
-    monkeypatch.setattr(silhouettes.BackgroundSubtraction, "from_median", lambda *_: backend)
+    monkeypatch.setattr(silhouettes.BackgroundSubtraction, "of", lambda *_: backend)
     found = Outlines.of(dataclasses.replace(capture, subject_point=SubjectPoint((x, y), "c1", 7)))
     assert found is not None and found.by_camera.keys() == {"c0", "c1", "c2"}
     for name, (outline, *_) in found.by_camera.items():
