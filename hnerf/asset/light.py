@@ -10,6 +10,7 @@ Albedo and light are known but for a factor. Here E is 1 at the brightest normal
 keeps the colour that it was photographed with, and no albedo is above 1 but where photographs are overexposed.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,8 @@ LEAST_IRRADIANCE = 0.1  # of the greatest: darker, neither photographs nor the e
 OUTLIER = 0.5  # of the expected colour: what differs more is another surface
 RIDGE = 1e-5  # of the evidence: where the normals of points turn by less than a quarter of a degree, it decides
 ITERATIONS, SETTLED = 30, 1e-4
+
+Sums = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,7 @@ def fit_light(shading: Shading) -> Light:
     coefficients = np.eye(len(REFLECTED))[0]
     if not len(shading.point):
         return Light(coefficients, 0.0)
-    sums = _Sums(shading.point)
+    sums = _sums_over(shading.point)
     basis = REFLECTED * harmonics(shading.normals)
     counts = shading.weights
     for _ in range(ITERATIONS):
@@ -93,7 +96,7 @@ def fit_light(shading: Shading) -> Light:
 
 
 def _step(
-    sums: "_Sums", weight: np.ndarray, slope: np.ndarray, residual: np.ndarray, coefficients: np.ndarray
+    sums: Sums, weight: np.ndarray, slope: np.ndarray, residual: np.ndarray, coefficients: np.ndarray
 ) -> np.ndarray:
     """Return the change (9,) of coefficients that takes most of residuals (M,) of these weights (M,) and slopes (M, 9),
     where each point may be brighter or darker as a whole; the constant one stays."""
@@ -105,13 +108,7 @@ def _step(
     return np.concatenate([[0.0], change])
 
 
-class _Sums:
-    """Sums over all that was seen of a point, for each of what was seen of it."""
-
-    def __init__(self, point: np.ndarray) -> None:
-        self._point = point
-        self._of_point = csr_array((np.ones(len(point)), (point, np.arange(len(point)))))
-
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Return the sums (M, ...) of values (M, ...)."""
-        return (self._of_point @ values)[self._point]
+def _sums_over(point: np.ndarray) -> Sums:
+    """Return the function that takes values (M, ...) to the sums (M, ...) over all that was seen of the same point."""
+    of_point = csr_array((np.ones(len(point)), (point, np.arange(len(point)))))
+    return lambda values: (of_point @ values)[point]
