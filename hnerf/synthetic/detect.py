@@ -1,9 +1,10 @@
 """Simulated keypoint detections: noisy, unsure where the body hides them, and sometimes wrong."""
 
 import numpy as np
+import warp as wp
 
 from hnerf.geometry.camera import Camera
-from hnerf.synthetic.render import RayCaster
+from hnerf.geometry.rays import cast
 
 NOISE_OF_WIDTH = 1.5 / 256  # 1.5 px in an image of 256: a detector's error scales with the person
 HIDDEN_NOISE = 3.0  # times as much where the body itself hides a keypoint
@@ -11,12 +12,12 @@ HIDDEN_BEHIND_M = 0.20  # behind the surface; visible joints lie less deep under
 OUTLIERS, OUTLIER_OF_WIDTH = 0.02, 0.16
 
 
-def detect(keypoints_m: np.ndarray, camera: Camera, caster: RayCaster, rng: np.random.Generator) -> np.ndarray:
+def detect(keypoints_m: np.ndarray, camera: Camera, mesh: wp.Mesh, rng: np.random.Generator) -> np.ndarray:
     """Return detections (25, 3) x_px, y_px, confidence of world keypoints (25, 3); zero for those outside the image."""
     exact_px, _ = camera.project(keypoints_m)
     towards = keypoints_m - camera.centre_m
     distance_m = np.linalg.norm(towards, axis=1)
-    hits = caster.cast(camera.centre_m, towards / distance_m[:, None])
+    hits = cast(mesh, camera.centre_m, towards / distance_m[:, None])
     hidden = np.logical_and(hits.face >= 0, distance_m - hits.distance_m > HIDDEN_BEHIND_M)
 
     sigma_px = NOISE_OF_WIDTH * camera.width_px * np.where(hidden, HIDDEN_NOISE, 1.0)

@@ -10,7 +10,7 @@ import warp as wp
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from hnerf.geometry.camera import Camera
-from hnerf.geometry.rays import RayHits, cast, mesh_on_cpu, to_vec3_array
+from hnerf.geometry.rays import RayHits, cast, to_vec3_array
 from hnerf.synthetic.appearance import person_colour, room_colour
 
 wp.config.log_level = wp.LOG_ERROR
@@ -33,22 +33,12 @@ def _visibility_kernel(
         visible[i, k] = 1.0
 
 
-class RayCaster:
-    """Ray casting against a mesh on the CPU."""
-
-    def __init__(self, vertices_m: np.ndarray, faces: np.ndarray) -> None:
-        self.mesh = mesh_on_cpu(vertices_m, faces)
-
-    def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> RayHits:
-        """Return the first hits of rays from one origin (3,) along unit directions (N, 3)."""
-        return cast(self.mesh, origin_m, directions)
-
-    def visibility(self, points_m: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return 1 where a point (N, 3) sees infinity along a direction (K, 3), else 0: (N, K)."""
-        visible = wp.zeros((len(points_m), len(directions)), dtype=wp.float32, device="cpu")
-        inputs = [self.mesh.id, to_vec3_array(points_m, "cpu"), to_vec3_array(directions, "cpu"), visible]
-        wp.launch(_visibility_kernel, visible.shape, inputs, device="cpu")
-        return visible.numpy()
+def visibility(mesh: wp.Mesh, points_m: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return 1 where a point (N, 3) sees infinity along a direction (K, 3) past a mesh on the CPU, else 0: (N, K)."""
+    visible = wp.zeros((len(points_m), len(directions)), dtype=wp.float32, device="cpu")
+    inputs = [mesh.id, to_vec3_array(points_m, "cpu"), to_vec3_array(directions, "cpu"), visible]
+    wp.launch(_visibility_kernel, visible.shape, inputs, device="cpu")
+    return visible.numpy()
 
 
 def dome_lights() -> tuple[np.ndarray, np.ndarray]:
@@ -91,13 +81,13 @@ class ShadedPerson:
 
     vertices_m: np.ndarray
     faces: np.ndarray
-    caster: RayCaster
+    mesh: wp.Mesh
     vertex_attributes: np.ndarray
     face_m: np.ndarray
 
     def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> RayHits:
         """Return the first hits of rays from one origin (3,) along unit directions (N, 3)."""
-        return self.caster.cast(origin_m, directions)
+        return cast(self.mesh, origin_m, directions)
 
     def colours(self, hits: RayHits) -> np.ndarray:
         """Return lit colours in [0, 1] of those rays that hit, (M, 3)."""
@@ -126,13 +116,13 @@ def render_person(person: Renderable, camera: Camera) -> tuple[np.ndarray, np.nd
     return rgb, coverage, mask
 
 
-def floor_shadow(caster: RayCaster, centre_m: np.ndarray, lights: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+def floor_shadow(mesh: wp.Mesh, centre_m: np.ndarray, lights: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Return the share of the floor's light that arrives around a point, on a grid (cells, cells) over x and y."""
     line = np.linspace(-SHADOW_HALF_SIDE_M, SHADOW_HALF_SIDE_M, SHADOW_CELLS)
     x, y = np.meshgrid(line, line, indexing="ij")
     points = np.stack([x + centre_m[0], y + centre_m[1], np.full_like(x, 1e-3)], -1).reshape(-1, 3)
     above = lights[0][:, 2] > 0
-    visible = caster.visibility(points, lights[0][above])
+    visible = visibility(mesh, points, lights[0][above])
     weights = lights[0][above, 2] * lights[1][above]
     return gaussian_filter((visible @ (weights / weights.sum())).reshape(SHADOW_CELLS, SHADOW_CELLS), 1.5)
 

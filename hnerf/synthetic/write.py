@@ -16,19 +16,20 @@ from hnerf.capture.keypoint_files import write_openpose
 from hnerf.capture.lens import pinhole
 from hnerf.config import SyntheticSettings
 from hnerf.geometry.camera import Camera, look_at
+from hnerf.geometry.rays import mesh_on_cpu
 from hnerf.progress import tracked
 from hnerf.side_by_side import side_by_side
 from hnerf.synthetic.appearance import FACE
 from hnerf.synthetic.detect import detect
 from hnerf.synthetic.dressed import DressedBody, midpoints
 from hnerf.synthetic.render import (
-    RayCaster,
     RoomView,
     ShadedPerson,
     dome_lights,
     floor_shadow,
     irradiance,
     render_person,
+    visibility,
 )
 from hnerf.synthetic.walk import WalkPose, walk_pose
 
@@ -131,19 +132,19 @@ def _frame_truth(dressed: DressedBody, pose: WalkPose) -> FrameTruth:
     root = pose.root.clone()
     root[2, 3] -= float(dressed.posed_m(pose.theta, root, pose.gait_phase)[:, 2].min())
     vertices_m = dressed.posed_m(pose.theta, root, pose.gait_phase)
-    lights, caster = dome_lights(), RayCaster(vertices_m, dressed.faces)
+    lights, mesh = dome_lights(), mesh_on_cpu(vertices_m, dressed.faces)
     normals = normals_of(vertices_m, dressed.faces)
     # Shadows are soft: visibility at the body's own vertices is enough, without those that refinement added.
     body = slice(len(vertices_m) - len(dressed.edges))
-    visible = midpoints(caster.visibility(vertices_m[body] + 3e-3 * normals[body], lights[0]), dressed.edges)
+    visible = midpoints(visibility(mesh, vertices_m[body] + 3e-3 * normals[body], lights[0]), dressed.edges)
     vertex_attributes = np.hstack([dressed.rest_m, dressed.depths_m, irradiance(normals, visible, lights)[:, None]])
     rig = dressed.rig
     face_m = (rig.keypoint_weights[list(FACE)] @ rig.vertices_m).double().numpy()
     return FrameTruth(
         keypoints_m=(rig.keypoint_weights @ pose_vertices(rig, pose.theta, root)).double().numpy(),
         joints_m=joint_transforms(rig, pose.theta, root)[:, :3, 3].double().numpy(),
-        person=ShadedPerson(vertices_m, dressed.faces, caster, vertex_attributes, face_m),
-        shadow=floor_shadow(caster, root[:3, 3].numpy(), lights),
+        person=ShadedPerson(vertices_m, dressed.faces, mesh, vertex_attributes, face_m),
+        shadow=floor_shadow(mesh, root[:3, 3].numpy(), lights),
         ground_m=root[:3, 3].double().numpy(),
     )
 
@@ -163,7 +164,7 @@ def _write_view(
     )
     if scored:
         write_image(out / "ground_truth" / "on_black" / camera.name / f"{frame:06d}.jpg", _eight_bit(on_black))
-    detected = detect(truth.keypoints_m, camera, truth.person.caster, rng)
+    detected = detect(truth.keypoints_m, camera, truth.person.mesh, rng)
     write_openpose(out / "openpose" / camera.name / f"{frame:06d}_keypoints.json", detected.round(3))
 
 

@@ -15,9 +15,10 @@ from hnerf.body.anny import anny_rig
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings, SyntheticSettings
+from hnerf.geometry.rays import cast, mesh_on_cpu
 from hnerf.synthetic import write_synthetic_capture
 from hnerf.synthetic.dressed import DressedBody
-from hnerf.synthetic.render import RayCaster, dome_lights, floor_shadow, irradiance
+from hnerf.synthetic.render import dome_lights, floor_shadow, irradiance, visibility
 from hnerf.synthetic.write import camera_names, ring_of_cameras
 
 TINY = SyntheticSettings(size_px=64, train_frames=3, novel_pose_frames=1)
@@ -133,12 +134,12 @@ def test_clothes_are_beyond_the_body() -> None:
 def test_rays_meet_a_known_square() -> None:
     """The square z = 1, |x|, |y| <= 1 has two triangles."""
     vertices_m = np.array([[-1.0, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
-    caster = RayCaster(vertices_m, np.array([[0, 1, 2], [0, 2, 3]]))
-    hits = caster.cast(np.array([0.5, -0.25, 3.0]), np.array([[0.0, 0, -1], [0, 0, 1]]))
+    mesh = mesh_on_cpu(vertices_m, np.array([[0, 1, 2], [0, 2, 3]]))
+    hits = cast(mesh, np.array([0.5, -0.25, 3.0]), np.array([[0.0, 0, -1], [0, 0, 1]]))
     assert hits.face.tolist() == [0, -1] and hits.distance_m[0] == pytest.approx(2.0)
     met_m = hits.interpolate(vertices_m, np.array([[0, 1, 2], [0, 2, 3]]))
     assert met_m[0].tolist() == pytest.approx([0.5, -0.25, 1.0])
-    visible = caster.visibility(np.array([[0.0, 0, 0], [0, 0, 2]]), np.array([[0.0, 0, 1]]))
+    visible = visibility(mesh, np.array([[0.0, 0, 0], [0, 0, 2]]), np.array([[0.0, 0, 1]]))
     assert visible.tolist() == [[0.0], [1.0]]
 
 
@@ -147,9 +148,9 @@ def test_light_of_an_open_sky() -> None:
     up, down = np.array([[0.0, 0, 1], [0, 0, -1]])
     bright = irradiance(np.stack([up, down]), np.ones((2, len(lights[1]))), lights)
     assert bright[0] == pytest.approx(1.25) and 0 < bright[1] < 0.3
-    roof = RayCaster(np.array([[-9.0, -9, 1], [9, -9, 1], [0, 9, 1]]), np.array([[0, 1, 2]]))
+    roof = mesh_on_cpu(np.array([[-9.0, -9, 1], [9, -9, 1], [0, 9, 1]]), np.array([[0, 1, 2]]))
     assert floor_shadow(roof, np.zeros(3), lights).min() < 0.2
-    nothing = RayCaster(np.array([[0.0, 0, -5], [1, 0, -5], [0, 1, -5]]), np.array([[0, 1, 2]]))
+    nothing = mesh_on_cpu(np.array([[0.0, 0, -5], [1, 0, -5], [0, 1, -5]]), np.array([[0, 1, 2]]))
     assert floor_shadow(nothing, np.zeros(3), lights).min() == pytest.approx(1.0)
 
 

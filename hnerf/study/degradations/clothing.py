@@ -11,14 +11,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import warp as wp
 
 from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import PERSON, Capture, write_image
 from hnerf.capture.subset import copy_files, write_arrays
 from hnerf.evaluation.ground_truth import ON_BLACK, GroundTruth
-from hnerf.geometry.rays import RayHits
-from hnerf.synthetic.render import RayCaster, dome_lights, irradiance, render_person
+from hnerf.geometry.rays import RayHits, cast, mesh_on_cpu
+from hnerf.synthetic.render import dome_lights, irradiance, render_person, visibility
 
 Rng = np.random.Generator
 
@@ -75,25 +76,25 @@ class LitGarment:
     vertices_m: np.ndarray
     faces: np.ndarray
     colour: np.ndarray
-    both: RayCaster
+    both: wp.Mesh
 
     @staticmethod
     def over_body(garment: Garment, row: int, body_m: np.ndarray, body_faces: np.ndarray, up: str) -> "LitGarment":
         """Return the garment in frame `row`, lit, over the body's vertices body_m (V, 3) of the same frame."""
         vertices_m, faces = garment.vertices_m[row], garment.faces
-        both = RayCaster(np.concatenate([vertices_m, body_m]), np.concatenate([faces, body_faces + len(vertices_m)]))
+        both = mesh_on_cpu(np.concatenate([vertices_m, body_m]), np.concatenate([faces, body_faces + len(vertices_m)]))
         directions, strength = dome_lights()
         if up == "y":
             directions = directions[:, [0, 2, 1]] * [1, 1, -1]
         normals = normals_of(vertices_m, faces)
-        visible = both.visibility(vertices_m + 3e-3 * normals, directions)
+        visible = visibility(both, vertices_m + 3e-3 * normals, directions)
         light = irradiance(normals, visible, (directions, strength))
         return LitGarment(vertices_m, faces, (garment.colours * light[:, None]).clip(0, 1), both)
 
     def cast(self, origin_m: np.ndarray, directions: np.ndarray) -> RayHits:
         """Return the first hits of rays from one origin (3,) along unit directions (N, 3); none where the body comes
         first."""
-        hits = self.both.cast(origin_m, directions)
+        hits = cast(self.both, origin_m, directions)
         return dataclasses.replace(hits, face=np.where(hits.face < len(self.faces), hits.face, -1))
 
     def colours(self, hits: RayHits) -> np.ndarray:
