@@ -42,10 +42,7 @@ def export_subject(store: Store, subject: str, out: Path) -> Manifest:
         raise InputError(f"{store.subject_folder(subject)}: no results; `hnerf store list` names the subjects")
     artifacts = [_intact(store, *name.split("/")) for name in sorted(inventory.with_inputs(latest.values()))]
     manifest = Manifest(
-        subject=subject,
-        recording=store.recording(subject),
-        latest=latest,
-        artifacts=archived(artifacts),
+        subject=subject, recording=store.recording(subject), latest=latest, artifacts=archived(artifacts)
     )
     beside = out.with_name(f".{out.name}.{os.getpid()}")
     try:

@@ -8,14 +8,7 @@ from hnerf.asset.splat_rendering import render_splats
 from hnerf.asset.splats import OPACITY, Splats
 from hnerf.asset.srgb import to_linear, to_srgb
 from hnerf.asset.staging import StagedAvatar
-from hnerf.evaluation.pictures import (
-    cast_pixels,
-    downsampled,
-    normals_at,
-    portrait_camera,
-    studio_light,
-    supersampled,
-)
+from hnerf.evaluation.pictures import cast_pixels, downsampled, normals_at, portrait_camera, studio_light, supersampled
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.geometry.rays import RayHits
