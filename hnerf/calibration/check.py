@@ -75,8 +75,10 @@ def check_calibration(capture: Capture, settings: CalibrationSettings) -> Calibr
         reasons = size_reasons(capture, name) + intrinsics_reasons(old) + _fit_reasons(name, before, settings)
         reasons += [f"{mistakes[name]}: undone"] if name in mistakes else []
         reasons += [_timing_reason(offset, timing[name]), *_change_reasons(old, new), refinement.reasons[name]]
+        residuals_px = after.median_px[name], after.p95_px[name], before.median_px[name], before.p95_px[name]
         status = "refined" if new is not old or offset else "ok"
-        verdicts[name] = _verdict(name, status, before, after, offset, timing[name], reasons, settings)
+        verdict = CameraVerdict(status, *residuals_px, offset, timing[name], tuple(reasons))
+        verdicts[name] = _judged(verdict, after.median_px[name], after.misfit == name, settings.max_residual_px)
     if sum(v.status != "rejected" for v in verdicts.values()) < 2:
         raise InputError(f"{capture.name}: fewer than two cameras agree on the person; calibrate again")
     every = capture.cameras | {camera.name: camera for camera in used}
@@ -222,33 +224,14 @@ def _change_reasons(old: Camera, new: Camera) -> list[str]:
     return [f"turned by {turned_deg:.2f} degrees, moved by {moved_cm:.1f} cm{lens}"]
 
 
-def _verdict(
-    name: str,
-    status: str,
-    before: Measure,
-    after: Measure,
-    offset_frames: float,
-    timing: Timing,
-    reasons: list[str],
-    settings: CalibrationSettings,
-) -> CameraVerdict:
-    """Return one training camera's verdict; it is worse than `status` where the residuals are still too large."""
-    if after.median_px[name] > settings.max_residual_px:
-        status = "suspect"
-        reasons = [*reasons, f"as used, median residual is still {after.median_px[name]:.1f} px"]
-    if after.misfit == name and after.median_px[name] > REJECT_FACTOR * settings.max_residual_px:
-        status = "rejected"
-        reasons = [*reasons, "not used from here on"]
-    return CameraVerdict(
-        status=status,
-        median_px=after.median_px[name],
-        p95_px=after.p95_px[name],
-        median_before_px=before.median_px[name],
-        p95_before_px=before.p95_px[name],
-        frame_offset=offset_frames,
-        timing=timing,
-        reasons=tuple(reasons),
-    )
+def _judged(verdict: CameraVerdict, median_px: float, misfit: bool, limit_px: float) -> CameraVerdict:
+    """Return one training camera's verdict, which is worse where the residuals are still too large."""
+    if median_px > limit_px:
+        why = f"as used, median residual is still {median_px:.1f} px"
+        verdict = dataclasses.replace(verdict, status="suspect", reasons=(*verdict.reasons, why))
+    if misfit and median_px > REJECT_FACTOR * limit_px:
+        verdict = dataclasses.replace(verdict, status="rejected", reasons=(*verdict.reasons, "not used from here on"))
+    return verdict
 
 
 def _unchecked(capture: Capture) -> CalibrationReport:
