@@ -27,12 +27,11 @@ LOOSEN_SMOOTHING_M = 0.002
 @dataclass(frozen=True)
 class Registration:
     """A registered mesh: vertices_m (V, 3); trust (V,) in [0, 1] that a vertex was matched; plate: of the body it came
-    from; crossing: number of its skin's faces that cross others."""
+    from."""
 
     vertices_m: np.ndarray
     trust: np.ndarray
     plate: Plate
-    crossing: int
 
 
 def register(body: BaseMesh, target: trimesh.Trimesh) -> Registration:
@@ -50,8 +49,7 @@ def register(body: BaseMesh, target: trimesh.Trimesh) -> Registration:
         matched_m, trust = _match(moved_m, faces, surface, scale_m)
         trust[body.hidden] = 0
         moved_m = body_m + plate.solver(trust, smoothing_m)(matched_m - body_m)
-    moved_m, crossing = _loosened(moved_m, faces, body.skin_faces, plate)
-    return Registration(moved_m, trust, plate, crossing)
+    return Registration(_loosened(moved_m, faces, body.skin_faces, plate), trust, plate)
 
 
 def crossing_faces(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -81,15 +79,15 @@ def _thickness_m(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.where(hits.face >= 0, hits.distance_m, 0) + START_M
 
 
-def _loosened(vertices_m: np.ndarray, faces: np.ndarray, skin_faces: int, plate: Plate) -> tuple[np.ndarray, int]:
-    """Return the mesh with faces of its skin that cross each other drawn into the body, and how many still cross."""
+def _loosened(vertices_m: np.ndarray, faces: np.ndarray, skin_faces: int, plate: Plate) -> np.ndarray:
+    """Return the mesh with faces of its skin that cross each other drawn into the body."""
     keep = plate.solver(np.ones(len(vertices_m)), LOOSEN_SMOOTHING_M)
     for _ in range(LOOSEN_STEPS):
         crossing = crossing_faces(vertices_m, faces[:skin_faces])
         if not crossing.any():
-            return vertices_m, 0
+            break
         drawn_m = np.zeros_like(vertices_m)
         corners = np.unique(faces[:skin_faces][crossing])
         drawn_m[corners] = -LOOSEN_M * normals_of(vertices_m, faces)[corners]
         vertices_m = vertices_m + keep(drawn_m)
-    return vertices_m, int(crossing_faces(vertices_m, faces[:skin_faces]).sum())
+    return vertices_m
