@@ -16,6 +16,7 @@ FOUNDATION = (
     "files",
     "processes",
     "pycolmap_import",
+    "warp_import",
     "progress",
     "side_by_side",
     "models",
@@ -53,6 +54,7 @@ def test_a_package_imports_none_above_it(floor: str) -> None:
             assert parts[0] != "hnerf" or parts[1] in below, f"{path} imports {name}, which lies above"
 
 
-def test_pycolmap_is_imported_in_one_place() -> None:
-    """Elsewhere it would take SIGTERM for a crash."""
-    assert [path.name for path in ROOT.rglob("*.py") if "pycolmap" in imported(path)] == ["pycolmap_import.py"]
+@pytest.mark.parametrize("library", ["pycolmap", "warp"])
+def test_a_library_is_imported_in_one_place(library: str) -> None:
+    """Elsewhere pycolmap would take SIGTERM for a crash, and warp would print a banner."""
+    assert [path.name for path in ROOT.rglob("*.py") if library in imported(path)] == [f"{library}_import.py"]

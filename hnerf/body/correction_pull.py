@@ -6,10 +6,9 @@ from functools import cache
 from typing import Any
 
 import torch
-import warp as wp
 from torch import Tensor
 
-wp.config.log_level = wp.LOG_ERROR
+from hnerf.warp_import import wp
 
 
 class Displacement(torch.autograd.Function):

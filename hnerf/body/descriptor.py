@@ -11,10 +11,9 @@ from threading import Lock
 
 import numpy as np
 import torch
-import warp as wp
 from torch import Tensor, nn
 
-wp.config.log_level = wp.LOG_ERROR
+from hnerf.warp_import import wp
 
 SURE_COSINE = 0.35  # of the angle between offset and normal; below it the winding number decides the sign
 BESIDE_M = 1e-4  # in front of the surface, where the winding number tells whether it is buried

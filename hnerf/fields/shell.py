@@ -8,14 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import torch
-import warp as wp
 from scipy import ndimage
 from torch import Tensor
 
 from hnerf.body.canonical import weighted_sum
 from hnerf.fields.rays import Rays
-
-wp.config.log_level = wp.LOG_ERROR
+from hnerf.warp_import import wp
 
 EMPTY, SHELL, SOLID = 0, 1, 2
 SLACK = 0.5  # cells: most of a cell then lies in the shell; thicknesses have more room than its corners need

@@ -8,10 +8,9 @@ from functools import cache
 from typing import Any
 
 import torch
-import warp as wp
 from torch import Tensor, nn
 
-wp.config.log_level = wp.LOG_ERROR
+from hnerf.warp_import import wp
 
 
 class SparseGrids(nn.Module):

@@ -4,11 +4,9 @@
 
 import numpy as np
 import trimesh
-import warp as wp
 
 from hnerf.geometry.rays import RayHits, cast, to_vec3_array
-
-wp.config.log_level = wp.LOG_ERROR
+from hnerf.warp_import import wp
 
 REACH_M = 10.0  # beyond any distance that is asked for
 RAY_START_M = 2.0e-3  # escape rays start this far off the surface, so that they do not hit it at once

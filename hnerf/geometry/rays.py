@@ -5,9 +5,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-import warp as wp
 
-wp.config.log_level = wp.LOG_ERROR
+from hnerf.warp_import import wp
 
 REACH_M = 1.0e3  # beyond any surface that a ray can meet
 

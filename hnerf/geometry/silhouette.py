@@ -1,11 +1,10 @@
 """Rasterised silhouettes of triangle meshes."""
 
 import numpy as np
-import warp as wp
 
 from hnerf.geometry.camera import Camera
+from hnerf.warp_import import wp
 
-wp.config.log_level = wp.LOG_ERROR  # no banner, no warning about a missing GPU driver
 NEAR_M = 1e-3  # least depth of a vertex; triangles with a nearer one are not drawn
 
 

@@ -1,10 +1,10 @@
 """Simulated keypoint detections: noisy, unsure where the body hides them, and sometimes wrong."""
 
 import numpy as np
-import warp as wp
 
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.rays import cast
+from hnerf.warp_import import wp
 
 NOISE_OF_WIDTH = 1.5 / 256  # 1.5 px in an image of 256: a detector's error scales with the person
 HIDDEN_NOISE = 3.0  # times as much where the body itself hides a keypoint

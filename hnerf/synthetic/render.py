@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import warp as wp
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.rays import RayHits, cast, to_vec3_array
 from hnerf.synthetic.appearance import person_colour, room_colour
-
-wp.config.log_level = wp.LOG_ERROR
+from hnerf.warp_import import wp
 
 SUPERSAMPLES = 3  # per side; odd, so that one ray goes through the pixel's centre
 KEY_DIRECTION = np.array([0.5, -0.6, 0.75])  # to the brightest part of the dome

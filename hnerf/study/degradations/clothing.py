@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import warp as wp
 
 from hnerf.body.descriptor import normals_of
 from hnerf.body.fit_result import BodyFit
@@ -20,6 +19,7 @@ from hnerf.capture.subset import copy_files, write_arrays
 from hnerf.evaluation.ground_truth import ON_BLACK, GroundTruth
 from hnerf.geometry.rays import RayHits, cast, mesh_on_cpu
 from hnerf.synthetic.render import dome_lights, irradiance, render_person, visibility
+from hnerf.warp_import import wp
 
 Rng = np.random.Generator
 

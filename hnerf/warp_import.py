@@ -1,0 +1,7 @@
+"""warp, imported without its banner and its warnings. Every module takes it from here."""
+
+import warp as wp
+
+__all__ = ["wp"]
+
+wp.config.log_level = wp.LOG_ERROR
