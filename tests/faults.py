@@ -390,6 +390,8 @@ FAULTS = (
           "tests/tasks/test_ledger.py"),
     Fault("ledger-empty-note", "tasks/ledger.py", 'or "none")', 'or "")', "tests/tasks/test_ledger.py"),
     Fault("store-bad-input", STORE, "if not resumable or isinstance(error, InputError)", "if not resumable", BY_STORE),
+    Fault("checkpoint-damage", "hnerf/training/checkpoint.py", "archive.testzip()", "None",
+          "tests/training/test_trainer.py"),
     Fault("checkpoint-key", "hnerf/training/checkpoint.py", 'or state.get("key") != key', "",
           "tests/training/test_trainer.py"),
     Fault("store-damage", STORE, " or sha256_of(path) != file.sha256", "", BY_STORE),

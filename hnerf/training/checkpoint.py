@@ -5,6 +5,7 @@ import logging
 import os
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 import torch
@@ -58,6 +59,9 @@ def load_checkpoint(folder: Path, device: torch.device, key: str) -> dict[str, A
     read or is of another training. The next write replaces it."""
     path = folder / NAME
     try:
+        with ZipFile(path) as archive:  # torch reads tensors without a look at their checksums
+            if damaged := archive.testzip():
+                raise ValueError(f"{damaged} has changed")
         state = torch.load(path, map_location=device, weights_only=True)
     except FileNotFoundError:
         return None

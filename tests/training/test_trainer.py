@@ -331,6 +331,19 @@ def test_a_damaged_checkpoint_is_discarded_with_a_warning(
     assert "checkpoint.pt: cannot be read" in warning and "\n" not in warning
 
 
+def test_a_checkpoint_with_a_bit_of_a_weight_flipped_is_discarded_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As a disk or a bucket may return it; torch alone would read it."""
+    save_checkpoint(tmp_path, {"key": "mine", "x": torch.full((1000,), 1.25)})
+    written = bytearray((tmp_path / NAME).read_bytes())
+    written[written.index(torch.full((500,), 1.25).numpy().tobytes()) + 1003] ^= 0x40  # the exponent of one
+    (tmp_path / NAME).write_bytes(written)
+    assert load_checkpoint(tmp_path, torch.device("cpu"), "mine") is None
+    (warning,) = caplog.messages
+    assert "checkpoint.pt: cannot be read (archive/data/0 has changed)" in warning and "\n" not in warning
+
+
 def test_a_checkpoint_of_another_training_is_discarded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     save_checkpoint(tmp_path, {"key": "theirs", "step": 1})
     assert load_checkpoint(tmp_path, torch.device("cpu"), "mine") is None
