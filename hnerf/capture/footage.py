@@ -10,6 +10,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from hnerf.capture.edit_list import shown_frames
 from hnerf.capture.safe_io import check_image_size, read_image
 from hnerf.capture.video_metadata import declared_samples
 from hnerf.errors import InputError
@@ -55,8 +56,8 @@ class ImageFolder:
 
 @dataclass(frozen=True)
 class Video:
-    """A video file whose every frame can be decoded, numbered from 0; times_s: when each is shown, where the file
-    says."""
+    """A video file whose every frame can be decoded, numbered from 0; without those that its edit list does not show.
+    times_s: when each is shown, where the file says."""
 
     path: Path
     frames: tuple[int, ...]
@@ -76,10 +77,9 @@ class Video:
                 report(path.name, len(times_s), declared + 1)
         report(path.name, 1, 1)
         count = len(times_s)
-        if count == 0 or count != declared:
-            raise InputError(
-                f"{path}: {declared} frames declared, {count} could be read; export it again whole, as H.264"
-            )
+        shown = declared if count == declared else shown_frames(path, declared)
+        if count == 0 or count != shown:
+            raise InputError(f"{path}: {shown} frames declared, {count} could be read; export it again whole, as H.264")
         ascending = all(a < b for a, b in pairwise(times_s))
         declared_fps = stream.get(cv2.CAP_PROP_FPS)
         fps = declared_fps if MIN_FPS <= declared_fps <= MAX_FPS else None

@@ -30,7 +30,7 @@ def focal_35mm(path: Path) -> float | None:
 
 def declared_samples(path: Path) -> int:
     """Return the largest number of samples of one size that a track of a video declares, wherever among its boxes."""
-    declared = re.findall(rb"stsz.{4}(?!\0{4}).{4}(.{4})", _top_box(path, b"moov", MAX_TABLES_BYTES), re.DOTALL)
+    declared = re.findall(rb"stsz.{4}(?!\0{4}).{4}(.{4})", top_box(path, b"moov", MAX_TABLES_BYTES), re.DOTALL)
     return max((int.from_bytes(count, "big") for count in declared), default=0)
 
 
@@ -42,22 +42,22 @@ def _of_image(path: Path) -> float | None:
 
 def _of_video(path: Path) -> float | None:
     """Return the value of Apple's key in moov/meta (QuickTime File Format, "Metadata")."""
-    moov = _top_box(path, b"moov", MAX_METADATA_BYTES)
-    meta = dict(_boxes(moov)).get(b"meta", b"")
-    parts = dict(_boxes(meta)) or dict(_boxes(meta[4:]))  # a full box in MP4, a plain one in QuickTime
+    moov = top_box(path, b"moov", MAX_METADATA_BYTES)
+    meta = dict(boxes(moov)).get(b"meta", b"")
+    parts = dict(boxes(meta)) or dict(boxes(meta[4:]))  # a full box in MP4, a plain one in QuickTime
     keys = parts.get(b"keys", b"")
-    names = [content for _, content in _boxes(keys[8:])]
+    names = [content for _, content in boxes(keys[8:])]
     if KEY not in names:
         return None
     number = struct.pack(">I", names.index(KEY) + 1)
-    value = dict(_boxes(dict(_boxes(parts.get(b"ilst", b""))).get(number, b""))).get(b"data", b"")
+    value = dict(boxes(dict(boxes(parts.get(b"ilst", b""))).get(number, b""))).get(b"data", b"")
     if len(value) < 8:
         return None
     form = FORMATS.get((int.from_bytes(value[:4], "big"), len(value) - 8))
     return float(struct.unpack(form, value[8:])[0]) if form else None
 
 
-def _top_box(path: Path, wanted: bytes, most_bytes: int) -> bytes:
+def top_box(path: Path, wanted: bytes, most_bytes: int) -> bytes:
     """Return the content of a file's first box of this kind; empty where there is none, or a larger one."""
     with path.open("rb") as file:
         while len(head := file.read(8)) == 8:
@@ -74,7 +74,7 @@ def _top_box(path: Path, wanted: bytes, most_bytes: int) -> bytes:
     return b""
 
 
-def _boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:
+def boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:
     """Yield kind and content of the boxes that follow each other; nothing from where their sizes stop making sense."""
     at = 0
     while at + 8 <= len(content):

@@ -1,4 +1,4 @@
-"""Small videos with what phones write and OpenCV does not: a rotation, and frames at an uneven rate."""
+"""Small videos with what phones write and OpenCV does not: a rotation, frames at an uneven rate, edit lists."""
 
 import struct
 from collections.abc import Callable
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 QUARTER_TURN = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30)  # clockwise, of tkhd's matrix
-CONTAINERS = (b"moov", b"trak", b"mdia", b"minf", b"stbl")
+CONTAINERS = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"edts")
 
 
 def write_video(path: Path, levels: list[int], size_px: tuple[int, int] = (96, 64), fps: float = 25) -> None:
@@ -38,11 +38,30 @@ def hold_frames(path: Path, first: int, rest: int) -> None:
     path.write_bytes(path.read_bytes().replace(b"edts", b"free"))  # the edit list would cut it to its old length
 
 
+def trim(path: Path, *edits: tuple[int | None, int], wide: bool = False) -> None:
+    """Let a video show these frames alone, as those do that are trimmed without being encoded again. edits: the first
+    frame, None for nothing meanwhile, and the number of frames; wide: in numbers of 64 bits."""
+    content = path.read_bytes()
+    movie_rate, rate = (_number(content, kind, 12) for kind in (b"mvhd", b"mdhd"))
+    step, form = _number(content, b"stts", 12), ">QqI" if wide else ">IiI"
+    listed = [
+        struct.pack(form, count * step * movie_rate // rate, -1 if first is None else first * step, 1 << 16)
+        for first, count in edits
+    ]
+    _edit(path, b"elst", lambda _: struct.pack(">II", wide << 24, len(edits)) + b"".join(listed))
+
+
 def declare_samples(path: Path, count: int) -> None:
     """Let a video declare this many samples, each of one byte."""
     _edit(path, b"stsz", lambda _: struct.pack(">III", 0, 1, count))
     _edit(path, b"stsc", lambda _: struct.pack(">IIIII", 0, 1, 1, count, 1))
     _edit(path, b"stts", lambda _: struct.pack(">IIII", 0, 1, count, 1))
+
+
+def _number(content: bytes, kind: bytes, at: int) -> int:
+    """Return the number of 32 bits at a place of the first box of a kind."""
+    start = content.index(kind) + 4 + at
+    return int.from_bytes(content[start : start + 4], "big")
 
 
 def _edit(path: Path, wanted: bytes, change: Callable[[bytes], bytes]) -> None:

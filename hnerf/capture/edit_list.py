@@ -1,0 +1,77 @@
+"""Edit lists of MP4 and QuickTime: which frames players show of a video that was trimmed without being encoded again.
+
+Trimmed videos begin with the key frame before the cut; the edit list says from when to when they are shown.
+"""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from hnerf.capture.video_metadata import MAX_TABLES_BYTES, boxes, top_box
+
+MAX_EDITS = 1000
+NOTHING = -1  # in place of a time: an edit that shows nothing
+INSIDE = (b"mdia", b"minf", b"stbl", b"edts")
+
+
+def shown_frames(path: Path, samples: int) -> int:
+    """Return how many frames FFmpeg shows of a video's track of this many samples: those within its edit list; all
+    where it has none that can be read."""
+    movie = list(boxes(top_box(path, b"moov", MAX_TABLES_BYTES)))
+    tracks = [_leaves(content) for kind, content in movie if kind == b"trak"]
+    videos = [track for track in tracks if track.get(b"hdlr", b"")[8:12] == b"vide"]
+    try:
+        track = next(one for one in videos if _number(one[b"stsz"][8:12]) == samples)
+        return _within(_edits(dict(movie)[b"mvhd"], track), _shown_at(track, samples))
+    except (KeyError, StopIteration, ValueError, ZeroDivisionError, struct.error):
+        return samples
+
+
+def _leaves(content: bytes) -> dict[bytes, bytes]:
+    """Return the boxes of a track that matter here; of two of a kind the outer one."""
+    found = dict(boxes(content))
+    for kind in INSIDE:
+        found = dict(boxes(found.get(kind, b""))) | found
+    return found
+
+
+def _edits(mvhd: bytes, track: dict[bytes, bytes]) -> list[tuple[int, int]]:
+    """Return begin and end of each edit that shows something, in the units of the track. Raises ValueError if there are
+    too many."""
+    elst, rate, movie_rate = track[b"elst"], _time_scale(track[b"mdhd"]), _time_scale(mvhd)
+    count, entry = _number(elst[4:8]), struct.Struct(">QqI" if elst[0] else ">IiI")
+    if not 0 < count <= MAX_EDITS:
+        raise ValueError(f"{count} edits")
+    listed = [entry.unpack_from(elst, 8 + entry.size * i) for i in range(count)]
+    lengths = [(2 * length * rate + movie_rate) // (2 * movie_rate) for length, _, _ in listed]  # rounded
+    return [(begin, begin + n) for n, (_, begin, _) in zip(lengths, listed, strict=True) if begin != NOTHING]
+
+
+def _shown_at(track: dict[bytes, bytes], samples: int) -> np.ndarray:
+    """Return when each sample is shown, ascending, in the units of the track. Raises ValueError if it does not say."""
+    lasts = _expanded(track[b"stts"], ">u4", samples)
+    offsets = _expanded(track[b"ctts"], ">i4", samples) if b"ctts" in track else 0
+    return np.sort(np.cumsum(lasts) - lasts + offsets)
+
+
+def _expanded(table: bytes, number: str, samples: int) -> np.ndarray:
+    """Return the number of each sample from a table of runs. Raises ValueError if it is of another count of samples."""
+    runs = np.frombuffer(table[8:], np.dtype([("count", ">u4"), ("number", number)]), _number(table[4:8]))
+    if runs["count"].sum(dtype=np.int64) != samples:
+        raise ValueError("another number of samples")
+    return np.repeat(runs["number"].astype(np.int64), runs["count"])
+
+
+def _within(edits: list[tuple[int, int]], shown_at: np.ndarray) -> int:
+    return sum(int(np.subtract(*np.searchsorted(shown_at, (end, begin)))) for begin, end in edits)
+
+
+def _time_scale(header: bytes) -> int:
+    """Return the units a second of a header of a movie or a track."""
+    at = 20 if header[0] else 12
+    return _number(header[at : at + 4])
+
+
+def _number(content: bytes) -> int:
+    return int(struct.unpack(">I", content)[0])
