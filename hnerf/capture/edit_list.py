@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hnerf.capture.video_metadata import MAX_TABLES_BYTES, boxes, top_box
+from hnerf.capture.boxes import MAX_TABLES_BYTES, boxes, top_box
 
 MAX_EDITS = 1000
 NOTHING = -1  # in place of a time: an edit that shows nothing

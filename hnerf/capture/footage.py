@@ -10,9 +10,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from hnerf.capture.boxes import check_tables
 from hnerf.capture.edit_list import shown_frames
 from hnerf.capture.safe_io import check_image_size, read_image
-from hnerf.capture.video_metadata import declared_samples
 from hnerf.errors import InputError
 from hnerf.progress import report
 
@@ -104,8 +104,7 @@ Footage = ImageFolder | Video
 def _open_stream(path: Path) -> cv2.VideoCapture:
     if not path.is_file():
         raise InputError(f"{path}: video missing; every calibrated camera needs one")
-    if (samples := declared_samples(path)) > path.stat().st_size:  # FFmpeg would make a table of them all
-        raise InputError(f"{path}: declares {samples} samples in {path.stat().st_size} bytes; export it again as H.264")
+    check_tables(path)
     stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not stream.isOpened():
         raise InputError(f"{path}: not a readable video; export it again as H.264")

@@ -1,0 +1,90 @@
+"""Boxes of MP4 and QuickTime, of which videos are made (ISO/IEC 14496-12)."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from hnerf.errors import InputError
+
+MAX_TABLES_BYTES = 1 << 28  # of boxes with tables of samples; days of video
+MAX_REPEATS = 10  # of samples, by edits, as often as the file has bytes
+NO_TABLES = (b"mdat", b"free", b"skip", b"wide")
+COMPRESSED = re.compile(rb"cmov.{4}dcom", re.DOTALL)
+SAMPLES = re.compile(rb"stsz.{8}(.{4})", re.DOTALL)
+FRAGMENT_SAMPLES = re.compile(rb"trun.{4}(.{4})", re.DOTALL)
+EDITS = re.compile(rb"(.{4})elst", re.DOTALL)
+EDIT_BYTES = 12
+
+
+def top_box(path: Path, wanted: bytes, most_bytes: int) -> bytes:
+    """Return the content of a file's first box of this kind; empty where there is none, or a larger one."""
+    for kind, start, size_bytes in _top_boxes(path):
+        if kind == wanted:
+            return _content(path, start, size_bytes) if size_bytes <= most_bytes else b""
+    return b""
+
+
+def boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Yield kind and content of the boxes that follow each other; nothing from where their sizes stop making sense."""
+    at = 0
+    while at + 8 <= len(content):
+        size = int.from_bytes(content[at : at + 4], "big")
+        if not 8 <= size <= len(content) - at:
+            return
+        yield content[at + 4 : at + 8], content[at + 8 : at + size]
+        at += size
+
+
+def check_tables(path: Path) -> None:
+    """Raise InputError for a video of which FFmpeg would make tables that are much larger than its own: it declares
+    more samples than it has bytes, repeats them in many edits, or has a compressed header. Wherever that is among its
+    boxes, it counts."""
+    tables_bytes, samples, fragments, edits = 0, 0, 0, 0
+    for kind, start, size_bytes in _top_boxes(path):
+        if kind in NO_TABLES:
+            continue
+        tables_bytes += size_bytes
+        if tables_bytes > MAX_TABLES_BYTES:
+            raise InputError(
+                f"{path}: more than {MAX_TABLES_BYTES >> 20} MB of tables beside its frames; export it in shorter parts"
+            )
+        content = _content(path, start, size_bytes)
+        if COMPRESSED.search(content):
+            raise InputError(f"{path}: its header is compressed; export it again as H.264")
+        samples = max([samples, *_numbers(SAMPLES, content)])
+        fragments += sum(_numbers(FRAGMENT_SAMPLES, content))
+        edits += sum(_numbers(EDITS, content)) // EDIT_BYTES
+    samples, file_bytes = max(samples, fragments), path.stat().st_size
+    if samples > file_bytes:
+        raise InputError(f"{path}: declares {samples} samples in {file_bytes} bytes; export it again as H.264")
+    if samples * edits > MAX_REPEATS * file_bytes:
+        raise InputError(f"{path}: repeats its frames in {edits} edits; export it again as H.264")
+
+
+def _top_boxes(path: Path) -> Iterator[tuple[bytes, int, int]]:
+    """Yield kind, start and size of the content of a file's outer boxes; nothing from where sizes stop making sense."""
+    at, end = 0, path.stat().st_size
+    with path.open("rb") as file:
+        while len(head := file.read(8)) == 8:
+            size, kind, head_bytes = int.from_bytes(head[:4], "big"), head[4:], 8
+            if size == 0:  # to the end
+                size = end - at
+            elif size == 1:
+                size, head_bytes = int.from_bytes(file.read(8), "big"), 16
+            if size < head_bytes:
+                return
+            yield kind, at + head_bytes, min(size, end - at) - head_bytes
+            at += size
+            if at >= end:
+                return
+            file.seek(at)
+
+
+def _content(path: Path, start: int, size_bytes: int) -> bytes:
+    with path.open("rb") as file:
+        file.seek(start)
+        return file.read(size_bytes)
+
+
+def _numbers(pattern: re.Pattern[bytes], content: bytes) -> list[int]:
+    return [int.from_bytes(found, "big") for found in pattern.findall(content)]

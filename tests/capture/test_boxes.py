@@ -1,0 +1,77 @@
+import struct
+import zlib
+from pathlib import Path
+
+import pytest
+
+from hnerf.capture import boxes
+from hnerf.capture.footage import Video
+from hnerf.errors import InputError
+from tests.capture.mp4 import declare_samples, trim, write_video
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    """Return a video of three frames, which is read as it is."""
+    write_video(tmp_path / "a.mp4", [90] * 3)
+    assert len(Video.open(tmp_path / "a.mp4").frames) == 3
+    return tmp_path / "a.mp4"
+
+
+def box(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", 8 + len(content)) + kind + content
+
+
+def split(path: Path) -> tuple[bytes, bytes]:
+    """Return what comes before a video's last box, and that, which has its tables."""
+    content = path.read_bytes()
+    start = content.index(b"moov") - 4
+    return content[:start], content[start:]
+
+
+@pytest.mark.parametrize("to_the_end", [False, True])
+def test_more_samples_declared_than_there_are_bytes(video: Path, to_the_end: bool) -> None:
+    """FFmpeg's table of a hundred million would take 2.4 GB. The last box may leave its size out."""
+    declare_samples(video, 100_000_000)
+    if to_the_end:
+        frames, moov = split(video)
+        video.write_bytes(frames + bytes(4) + moov[4:])
+    with pytest.raises(InputError, match=r"a\.mp4: declares 100000000 samples in \d+ bytes"):
+        Video.open(video)
+
+
+def test_more_samples_declared_in_fragments_than_there_are_bytes(video: Path) -> None:
+    """Fragments count together. Frames may hold any bytes."""
+    run = box(b"moof", box(b"traf", box(b"trun", struct.pack(">III", 1, 600, 0))))
+    video.write_bytes(video.read_bytes() + box(b"mdat", run * 9) + run)
+    boxes.check_tables(video)
+    video.write_bytes(video.read_bytes() + run * 3)
+    with pytest.raises(InputError, match=r"a\.mp4: declares 2400 samples in \d+ bytes"):
+        boxes.check_tables(video)
+
+
+def test_frames_that_are_repeated_without_end(video: Path) -> None:
+    """As many edits as that make FFmpeg's table a thousand times the file's."""
+    write_video(video, [90] * 1000)
+    trim(video, *[(0, 1000)] * 300)
+    with pytest.raises(InputError, match=r"a\.mp4: repeats its frames in 301 edits; export it again"):
+        Video.open(video)
+
+
+def test_a_compressed_header(video: Path) -> None:
+    frames, moov = split(video)
+    packed = box(b"dcom", b"zlib") + box(b"cmvd", struct.pack(">I", len(moov)) + zlib.compress(moov))
+    video.write_bytes(frames + box(b"moov", box(b"cmov", packed)))
+    with pytest.raises(InputError, match=r"a\.mp4: its header is compressed; export it again"):
+        Video.open(video)
+
+
+def test_tables_are_read_up_to_a_limit(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames count for nothing, as do boxes to be skipped."""
+    frames, moov = split(video)
+    monkeypatch.setattr(boxes, "MAX_TABLES_BYTES", 1 << 20)
+    video.write_bytes(frames + box(b"free", bytes(2 << 20)) + moov)
+    assert len(Video.open(video).frames) == 3
+    video.write_bytes(frames + box(b"moov", moov[8:] + box(b"free", bytes(1 << 20))))
+    with pytest.raises(InputError, match=r"a\.mp4: more than 1 MB of tables beside its frames; export it in shorter"):
+        Video.open(video)
