@@ -3,7 +3,6 @@
 import argparse
 import errno
 import logging
-import os
 import select
 import sys
 from collections.abc import Callable
@@ -13,7 +12,7 @@ from typing import Any
 
 from flows import commands
 from flows.display import display
-from flows.ending import Terminated, open_closed_streams, unwound_by_sigterm
+from flows.ending import Terminated, drop_what_is_left, open_closed_streams, unwound_by_sigterm
 from flows.store_commands import add_store_commands
 from hnerf.config import load_settings
 from hnerf.errors import InputError, InvalidAsset
@@ -45,8 +44,16 @@ def main(argv: list[str] | None = None) -> int:
     go on, an asset that must not be handed over, or output that nobody reads; 130 if it is interrupted from the
     keyboard, 143 by SIGTERM."""
     open_closed_streams()
-    options = _parser().parse_args(argv)
     try:
+        return _run(argv)
+    finally:
+        drop_what_is_left()
+
+
+def _run(argv: list[str] | None) -> int:
+    """Run one command; return the exit code."""
+    try:
+        options = _options(argv)
         with unwound_by_sigterm(), display():
             folders = _existing(options)
             if options.command.__module__ == commands.__name__ and options.command is not commands.settings:
@@ -65,31 +72,37 @@ def main(argv: list[str] | None = None) -> int:
         if isinstance(error, BrokenPipeError) and _reader_has_left():
             return FAILED
         from tasks.bucket import BucketError
-        from tasks.policy import is_permanent  # imports Prefect
 
         if isinstance(error, BucketError):
             return _fail(error, FAILED)
         if error.errno in NO_ROOM:
             return _fail(f"{error}; make room and give the same command again", FAILED)
+        from tasks.policy import is_permanent  # imports Prefect
+
         if error.filename is None or not is_permanent(error):
             raise
         return _fail(f"{error.filename}: {error.strerror}; give another path, or mend this one", BAD_INPUT)
     return 0
 
 
+def _options(argv: list[str] | None) -> argparse.Namespace:
+    try:
+        return _parser().parse_args(argv)
+    finally:
+        sys.stdout.flush()  # the help, after which argparse ends the process
+
+
 def _fail(why: object, status: int) -> int:
-    print("hnerf:", " ".join(str(why).splitlines()), file=sys.stderr)
+    with suppress(OSError):  # nobody reads it, or there is no room
+        print("hnerf:", " ".join(str(why).splitlines()), file=sys.stderr)
     return status
 
 
 def _reader_has_left() -> bool:
-    """Return whether nobody reads standard output any more, as after `| head -1`; what is left to print is dropped."""
+    """Return whether nobody reads standard output any more, as after `| head -1`."""
     poll = select.poll()
     poll.register(sys.stdout, 0)
-    if not any(events & select.POLLERR for _, events in poll.poll(0)):
-        return False
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at the end
-    return True
+    return any(events & select.POLLERR for _, events in poll.poll(0))
 
 
 def _existing(options: argparse.Namespace) -> list[Path]:

@@ -29,11 +29,11 @@ def display() -> Iterator[None]:
 
 
 class LineHandler(logging.StreamHandler):
-    """Prints records, unless nobody reads them any more."""
+    """Prints records, unless nobody reads them any more, or they have no room."""
 
     def handleError(self, record: logging.LogRecord) -> None:
-        """Say nothing of a closed pipe, which the command notices at its end."""
-        if not isinstance(sys.exc_info()[1], BrokenPipeError):
+        """Say nothing of a closed pipe or a full disk, which the command notices at its end."""
+        if not isinstance(sys.exc_info()[1], OSError):
             super().handleError(record)
 
 

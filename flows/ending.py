@@ -1,5 +1,6 @@
 """How a command ends that is told to, and what it does with streams that were closed before it began."""
 
+import fcntl
 import os
 import signal
 import sys
@@ -29,10 +30,21 @@ def _terminate(number: int, frame: FrameType | None) -> None:
 
 
 def open_closed_streams() -> None:
-    """Let standard output and error that are closed (`>&-`) go nowhere: Python has None in their place, and the next
-    file that is opened would have their number, into which libraries write."""
+    """Let standard output and error that are closed (`>&-`), or open for reading alone, go nowhere: of closed ones,
+    Python has None in their place, and the next file that is opened would have their number, into which libraries
+    write."""
     for number, name in ((1, "stdout"), (2, "stderr")):
-        if getattr(sys, name) is None:
+        if getattr(sys, name) is None or fcntl.fcntl(number, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
             os.dup2(os.open(os.devnull, os.O_WRONLY), number)
             os.set_inheritable(number, True)
             setattr(sys, name, os.fdopen(number, "w"))
+
+
+def drop_what_is_left() -> None:
+    """Drop what standard output and error do not take, as their disk is full or nobody reads them: Python would print a
+    trace about it at its end, and change the exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

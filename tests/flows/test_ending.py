@@ -1,5 +1,6 @@
-"""Commands that are told to end, and commands whose streams are closed."""
+"""Commands that are told to end, and commands whose streams are closed or full."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -66,14 +67,35 @@ def test_what_sigterm_did_before_it_does_again(tmp_path: Path, monkeypatch: pyte
         ("settings --preset best >&-", 1, 2),
         ("settings --preset best 2>&-", 0, 2),
         ("store list --store . >&-", 1, 2),
+        ("settings 1</dev/null", 0, 0),
+        ("settings --preset best 2>/dev/full", 0, 2),
+        ("settings --presets best 2>/dev/full", 0, 2),
     ],
 )
 def test_closed_streams_change_neither_what_is_done_nor_the_exit_code(
     arguments: str, lines: int, status: int, tmp_path: Path
 ) -> None:
-    command = ["sh", "-c", f'exec "$0" -c "$1" {arguments}', sys.executable, RUN]
-    ended = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    ended = from_shell(arguments, tmp_path)
     assert (len(ended.stderr.splitlines()), ended.stdout, ended.returncode) == (lines, "", status)
+
+
+@pytest.mark.parametrize("arguments", ["--help", "settings", "models"])
+def test_standard_output_without_room_is_one_line_and_exit_code_1(arguments: str, tmp_path: Path) -> None:
+    ended = from_shell(f"{arguments} >/dev/full", tmp_path)
+    assert ended.stderr.startswith("hnerf: [Errno 28] No space left") and ended.stderr.count("\n") == 1
+    assert ended.returncode == 1
+
+
+def test_help_that_nobody_reads_is_exit_code_1(tmp_path: Path) -> None:
+    ended = from_shell("--help | true; exit ${PIPESTATUS[0]}", tmp_path)
+    assert (ended.stderr, ended.returncode) == ("", 1)
+
+
+def from_shell(arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run a command whose arguments and streams a shell reads; it buffers its output, as it does by default."""
+    command = ["bash", "-c", f'"$0" -c "$1" {arguments}', sys.executable, RUN]
+    buffered = {**os.environ, "PYTHONUNBUFFERED": ""}
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder, env=buffered)
 
 
 def test_no_file_takes_the_number_of_a_closed_stream(tmp_path: Path) -> None:
