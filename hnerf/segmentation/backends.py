@@ -36,8 +36,7 @@ class Given:
                 f"masks/{self.camera}/{frame:06d}.png: mask missing; give a mask for every frame or for none"
             )
         subject = components_within(mask, prior.reach)
-        elsewhere = prior.height_px > 0 and not prior.reach.any()
-        return subject if subject.any() or elsewhere else mask
+        return subject if subject.any() or prior.elsewhere else mask
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,8 @@ FOOT_SHARE = 0.1  # of the person's height: extent of an unseen foot around its 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of the person in one image before looking at it; height_px of the person.
+    """What is known of the person in one image before looking at it; height_px of the person, 0 where nothing is seen
+    or `behind`: the person is behind the camera.
 
     (H, W) bool, each within the next: `core`, surely the person; `body`, as fitted; `near`, what a slightly wrong body
     may cover; `reach`, the farthest extent of clothes and hair.
@@ -47,11 +48,18 @@ class Prior:
     near: np.ndarray
     reach: np.ndarray
     height_px: float
+    behind: bool = False
+
+    @property
+    def elsewhere(self) -> bool:
+        """Return whether the person is known to be outside the image."""
+        return (self.height_px > 0 or self.behind) and not self.reach.any()
 
     @staticmethod
     def around(
-        core: np.ndarray, body: np.ndarray, completed: np.ndarray, height_px: float, reach: float, upright: bool = False
-    ) -> "Prior":
+        core: np.ndarray, body: np.ndarray, completed: np.ndarray, height_px: float, reach: float,
+        upright: bool = False, behind: bool = False,
+    ) -> "Prior":  # fmt: skip
         """Return the prior grown around where the body is, seen or completed, (H, W) bool; reach in heights of the
         person.
 
@@ -61,11 +69,12 @@ class Prior:
         within = away_px <= reach * height_px
         if upright and completed.any():
             within[int(np.flatnonzero(completed.any(1))[-1] + SOLE_SHARE * height_px) + 1 :] = False
-        return Prior(core, body, within & (away_px <= NEAR_SHARE * height_px), within, height_px)
+        return Prior(core, body, within & (away_px <= NEAR_SHARE * height_px), within, height_px, behind)
 
     def cropped(self, window: tuple[slice, slice]) -> "Prior":
         """Return the same prior within a window of the image."""
-        return Prior(self.core[window], self.body[window], self.near[window], self.reach[window], self.height_px)
+        core, body, near, reach = (part[window] for part in (self.core, self.body, self.near, self.reach))
+        return Prior(core, body, near, reach, self.height_px, self.behind)
 
 
 class Priors(Sequence[Prior]):
@@ -97,7 +106,7 @@ def priors_of(capture: Capture, camera: str, keypoints: np.ndarray, settings: Se
 def _keypoint_prior(capture: Capture, camera: str, poses_px: np.ndarray, reach: float, number: int) -> Prior:
     stick = _stick_figure(capture.cameras[camera], poses_px[number])
     upright = _is_upright(capture, camera)
-    return Prior.around(stick.core, stick.body, stick.completed, stick.height_px, reach, upright)
+    return Prior.around(stick.core, stick.body, stick.completed, stick.height_px, reach, upright, stick.behind)
 
 
 def body_priors(capture: Capture, body: BodyFit, settings: SegmentationSettings) -> Iterator[tuple[str, Priors]]:
@@ -117,7 +126,8 @@ def _body_prior(
     covered = silhouette(capture.cameras[camera], vertices_m[number], faces)
     core = _core(covered, stick.height_px)
     covered |= stick.body
-    return Prior.around(core, covered, covered, stick.height_px, reach / 2, _is_upright(capture, camera))
+    upright = _is_upright(capture, camera)
+    return Prior.around(core, covered, covered, stick.height_px, reach / 2, upright, stick.behind)
 
 
 def network_priors(capture: Capture, settings: SegmentationSettings) -> Iterator[tuple[str, Priors]]:
@@ -172,7 +182,7 @@ def _consistent_keypoints(capture: Capture, body: BodyFit | None) -> dict[str, n
 
     They are triangulated and projected where several cameras see the person, which removes a detector's outliers; gaps
     in time are interpolated; what no two cameras ever see together is left as each has it. Where the recording has no
-    keypoints, they are the body's own. What is behind a camera is NaN.
+    keypoints, they are the body's own. What is behind a camera is infinite.
     """
     if body is not None and not capture.has_keypoints:
         points_m = (body.rig.keypoint_weights @ body.vertices_m()).numpy()
@@ -190,10 +200,10 @@ def _consistent_keypoints(capture: Capture, body: BodyFit | None) -> dict[str, n
 
 
 def _in_image(camera: Camera, points_m: np.ndarray, own_px: np.ndarray) -> np.ndarray:
-    """Return the pixels (..., 2) of points (..., 3), those in own_px (..., 2) where a point is not known, and NaN where
-    it is behind the camera."""
+    """Return the pixels (..., 2) of points (..., 3), those in own_px (..., 2) where a point is not known, and infinity
+    where it is behind the camera."""
     pixels_px, depth_m = camera.project(points_m)
-    return np.where(depth_m[..., None] <= 0, np.nan, np.where(np.isfinite(pixels_px), pixels_px, own_px))
+    return np.where(depth_m[..., None] <= 0, np.inf, np.where(np.isfinite(pixels_px), pixels_px, own_px))
 
 
 def _interpolated(tracks: np.ndarray) -> np.ndarray:
@@ -241,19 +251,21 @@ def _completed_pose(pose_px: np.ndarray) -> np.ndarray:
 @dataclass(frozen=True)
 class _StickFigure:
     """A drawn stick figure, (H, W) bool: core, without the feet, where shadows touch the person; body, with the feet;
-    completed, also with what no keypoint shows."""
+    completed, also with what no keypoint shows. behind: whether all that is known of it is behind the camera."""
 
     core: np.ndarray
     body: np.ndarray
     completed: np.ndarray
     height_px: float
+    behind: bool
 
 
 def _stick_figure(camera: Camera, pose_px: np.ndarray) -> _StickFigure:
-    """Draw the stick figure of pose_px (25, 2), NaN where nothing is known; clipped far outside the image, as drawing
-    takes small integers."""
+    """Draw the stick figure of pose_px (25, 2), NaN where nothing is known, infinite behind the camera; clipped far
+    outside the image, as drawing takes small integers."""
     far_px = FAR * max(camera.size_px)
-    pose_px = pose_px.clip(-far_px, far_px)
+    behind = np.isinf(pose_px)
+    pose_px = np.where(behind, np.nan, pose_px.clip(-far_px, far_px))
     whole_px = _completed_pose(pose_px)
     known = np.isfinite(whole_px).all(-1, keepdims=True)
     height_px = float(person_heights_px(np.concatenate([np.nan_to_num(whole_px), known], -1)))
@@ -262,7 +274,7 @@ def _stick_figure(camera: Camera, pose_px: np.ndarray) -> _StickFigure:
     for _, _, ankle, foot in LEGS:
         if known[ankle] and not np.isfinite(pose_px[list(foot)]).any():
             cv2.circle(completed, _pixel(whole_px[ankle]), round(FOOT_SHARE * height_px), 1, cv2.FILLED)
-    return _StickFigure(core, body, body | completed.astype(bool), height_px)
+    return _StickFigure(core, body, body | completed.astype(bool), height_px, bool(behind.any() and not known.any()))
 
 
 def _drawn(camera: Camera, pose_px: np.ndarray, height_px: float) -> tuple[np.ndarray, np.ndarray]:

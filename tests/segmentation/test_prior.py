@@ -1,9 +1,11 @@
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from hnerf.config import SegmentationSettings
+from hnerf.segmentation.backends import Given
 from hnerf.segmentation.prior import (
     _completed_pose,
     _consistent_keypoints,
@@ -12,7 +14,7 @@ from hnerf.segmentation.prior import (
     keypoint_priors,
     network_priors,
 )
-from tests.calibration.synthetic import detections, ring, turned, write_capture
+from tests.calibration.synthetic import SIZE_PX, detections, ring, turned, write_capture
 from tests.segmentation.scene import write_likely, write_scene
 
 HEAD, LEGS, FEET = [0, 15, 16, 17, 18], [10, 11, 13, 14, *range(19, 25)], list(range(19, 25))
@@ -67,15 +69,23 @@ def test_a_detection_far_outside_the_image_is_drawn_no_farther_than_that(tmp_pat
 
 
 def test_nobody_is_where_a_camera_looks_away(tmp_path: Path) -> None:
-    """Two of three cameras see the person, who stands behind the third, and is not drawn mirrored there."""
+    """Two of three cameras see the person, who stands behind the third, and is not drawn mirrored there. A mask that is
+    given there shows somebody else."""
     cameras = ring(3)
     seen = detections(cameras, 0.5)
     seen["c2"][..., 2] = 0
     away = turned(cameras[2], 180)
-    found = _consistent_keypoints(write_capture(tmp_path, [*cameras[:2], away], seen), None)
-    assert np.isfinite(found["c0"]).all() and np.isnan(found["c2"]).all()
+    capture = write_capture(tmp_path, [*cameras[:2], away], seen)
+    found = _consistent_keypoints(capture, None)
+    assert np.isfinite(found["c0"]).all() and np.isinf(found["c2"]).all()
     figure = _stick_figure(away, found["c2"][0])
-    assert not figure.completed.any() and figure.height_px == 0
+    assert not figure.completed.any() and figure.height_px == 0 and figure.behind
+    stranger = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
+    stranger[300:900, 400:600] = 255
+    (tmp_path / "masks" / "c2").mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / "masks" / "c2" / "000000.png"), stranger)
+    prior = dict(keypoint_priors(capture, SegmentationSettings()))["c2"][0]
+    assert prior.elsewhere and not Given(capture, "c2").mask(0, prior).any()
 
 
 def test_head_and_legs_in_line_with_the_trunk_by_hand() -> None:
