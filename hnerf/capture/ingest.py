@@ -32,7 +32,7 @@ from hnerf.capture.manifest import (
     read_manifest,
 )
 from hnerf.capture.normalise import Normaliser, kept_share
-from hnerf.capture.safe_io import JSON_SUFFIXES, VIDEO_SUFFIXES, file_named, read_image
+from hnerf.capture.safe_io import JSON_SUFFIXES, VIDEO_SUFFIXES, file_named, read_image, read_mask
 from hnerf.capture.subset import write_keypoints
 from hnerf.capture.timing import median_step
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
@@ -256,7 +256,7 @@ def _write_pixels(
         normaliser.write_image(picture.rgb, source, picture.file, out / "images" / lens.name / stem)
         if picture.frame in mask_paths:
             mask = mask_paths[picture.frame]
-            recorded = mask.read() if isinstance(mask, StoredFrame) else read_image(mask).max(-1)
+            recorded = mask.read() if isinstance(mask, StoredFrame) else read_mask(mask)
             path = mask.path if isinstance(mask, StoredFrame) else mask
             normaliser.write_mask(recorded, path, out / "masks" / lens.name / f"{stem}.png")
     if brightest <= BLACK:

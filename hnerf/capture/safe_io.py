@@ -9,7 +9,7 @@ import tomllib
 import unicodedata
 import zipfile
 import zlib
-from collections.abc import Container
+from collections.abc import Callable, Container
 from pathlib import Path
 from typing import Any
 
@@ -220,6 +220,28 @@ def check_image_size(path: Path, width_px: float, height_px: float) -> tuple[int
 def read_image(path: Path) -> np.ndarray:
     """Read an image, upright by its EXIF, as (H, W, 3) uint8 RGB. Raises InputError if it is not a whole 8-bit JPEG or
     PNG of a sane size."""
+    return _read_image(path, _colours)
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """Read a mask, (H, W) uint8: the opacity of a person who is cut out of the background, else the lightest of the
+    colours. Raises InputError as `read_image` does."""
+    mask = _read_image(path, lambda image: _holes(image) or _colours(image))
+    return mask if mask.ndim == 2 else mask.max(-1)
+
+
+def _colours(image: Image.Image) -> Image.Image:
+    return image if image.mode == "RGB" else image.convert("RGB")
+
+
+def _holes(image: Image.Image) -> Image.Image | None:
+    """Return the opacity of an image; None where it is the same everywhere."""
+    opacity = image.getchannel("A") if image.mode in ("LA", "RGBA") else None
+    return opacity if opacity and len(set(opacity.getextrema())) > 1 else None
+
+
+def _read_image(path: Path, wanted: Callable[[Image.Image], Image.Image]) -> np.ndarray:
+    """Read what is `wanted` of an image, upright by its EXIF. Raises InputError as `read_image` does."""
     image: Image.Image  # one at a time: each conversion is another copy
     try:
         with Image.open(path, formats=["JPEG", "PNG"]) as image:
@@ -228,7 +250,7 @@ def read_image(path: Path) -> np.ndarray:
                 raise InputError(f"{path}: pixels are {image.mode}; export it again with 8 bits a channel")
             image.load()
         turn = _UPRIGHT.get(_orientation(image))
-        image = image if image.mode == "RGB" else image.convert("RGB")
+        image = wanted(image)
         image = image if turn is None else image.transpose(turn)
         return np.array(image)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:

@@ -12,7 +12,7 @@ from PIL import Image
 
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
-from hnerf.capture.safe_io import check_image_size, read_image
+from hnerf.capture.safe_io import check_image_size, read_image, read_mask
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
 from tests.capture import recordings as rec
@@ -72,6 +72,20 @@ def test_what_is_ingested_is_what_was_read(orientation: tuple[int, int, int], tm
     kept = Capture.load(tmp_path / "out").image("01", 0)
     read = read_image(folder / "images/01/000000.png")
     assert kept.shape == read.shape and np.abs(kept.astype(int) - read).mean() < 8  # a JPEG of noise
+
+
+@pytest.mark.parametrize(
+    ("mode", "colour", "lightest"), [("L", 0, 0), ("L", 90, 90), ("RGB", (0, 0, 0), 0), ("RGB", (7, 90, 0), 90)]
+)
+def test_the_mask_of_a_cut_out_is_its_opacity(mode: str, colour: object, lightest: int, tmp_path: Path) -> None:
+    """Whatever colours the person has, and the background that does not show. What is opaque is read by its colours."""
+    opacity = np.zeros((8, 6), np.uint8)
+    opacity[2:6, 1:4] = 200
+    for alpha, expected in ((opacity, opacity), (np.full_like(opacity, 255), np.full_like(opacity, lightest))):
+        image = Image.new(mode, (6, 8), colour)  # type: ignore[arg-type]
+        image.putalpha(Image.fromarray(alpha))
+        image.save(tmp_path / "a.png")
+        assert np.array_equal(read_mask(tmp_path / "a.png"), expected)
 
 
 @pytest.mark.parametrize("size_px", [(6001, 6000), (32_767, 1), (1, 32_767), (0, 5), (float("nan"), 5)])
