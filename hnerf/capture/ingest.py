@@ -1,6 +1,7 @@
 """Ingestion: a capture folder in any known layout becomes one normalised capture."""
 
 import logging
+import unicodedata
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +33,16 @@ from hnerf.capture.manifest import (
     read_manifest,
 )
 from hnerf.capture.normalise import Normaliser, kept_share
-from hnerf.capture.safe_io import JSON_SUFFIXES, VIDEO_SUFFIXES, file_named, read_image, read_mask
+from hnerf.capture.safe_io import (
+    IMAGE_SUFFIXES,
+    JSON_SUFFIXES,
+    VIDEO_SUFFIXES,
+    file_named,
+    path_in_capture,
+    read_image,
+    read_mask,
+    shown,
+)
 from hnerf.capture.subset import write_keypoints
 from hnerf.capture.timing import median_step
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
@@ -57,6 +67,8 @@ LAYOUTS: tuple[type[Layout], ...] = (
     Videos,
 )  # the first that recognises a folder
 BLACK = 8  # grey level that noise and an encoder leave of black
+MAX_NAMED = 5  # in a warning
+BY_CAMERA = ("images", "videos", "openpose", "masks", "mask", "background")  # folders of EasyMocap
 BAR_FRAMES = 5  # evenly spaced, in which black bars are searched
 
 log = logging.getLogger("hnerf.capture")
@@ -72,6 +84,8 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     """
     layout = uncalibrated or recognise(folder)
     lenses = layout.lenses()
+    if isinstance(layout, EasyMocap):
+        _warn_of_unread(folder, set(lenses))
     manifest = _manifest_for(layout, folder)
     subject = capture_name(folder, manifest)
     cameras = chosen_cameras(folder, manifest, list(lenses), layout.training_cameras())
@@ -177,6 +191,19 @@ def _manifest_for(layout: Layout, folder: Path) -> CaptureManifest:
     if (point := manifest.subject_point) and (not point.camera or layout.only not in (None, point.camera)):
         dropped.add("subject")
     return manifest.model_copy(update=dict.fromkeys(dropped))
+
+
+def _warn_of_unread(folder: Path, cameras: set[str]) -> None:
+    """Warn of images, masks and others that are of none of the calibrated cameras."""
+    for place in BY_CAMERA:
+        found = path_in_capture(folder, place)
+        entries = sorted(found.iterdir()) if found.is_dir() else []
+        named = [path.name for path in entries if path.is_dir() and not path.name.startswith(".")]
+        named += [path.stem for path in entries if path.suffix.lower() in VIDEO_SUFFIXES + IMAGE_SUFFIXES]
+        unread = [shown(name) for name in named if unicodedata.normalize("NFC", name) not in cameras]
+        if unread:
+            some = ", ".join(unread[:MAX_NAMED]) + (", ..." if len(unread) > MAX_NAMED else "")
+            log.warning("%s: %s not in the calibration, and not read; rename or remove them", found, some)
 
 
 def _subject_point(

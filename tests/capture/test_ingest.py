@@ -82,6 +82,23 @@ def test_capture_toml_names_and_splits(folder: Path, tmp_path: Path) -> None:
     ]
 
 
+def test_what_is_of_no_calibrated_camera_is_told(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING, "hnerf.capture"):
+        ingest(folder, SETTINGS, tmp_path / "out")
+        assert not caplog.messages
+        for camera in ("1", "2", "\n", "5", "6", "7"):
+            rec.write_png(folder / "masks" / camera / "000000.png", rec.picture("01", 0))
+        for camera in ("1", "01"):
+            rec.write_png(folder / "background" / f"{camera}.png", rec.picture("01", 0))
+        ingest(folder, SETTINGS, tmp_path / "again")
+    assert caplog.messages == [
+        f"{folder}/{found} not in the calibration, and not read; rename or remove them"
+        for found in (r"masks: '\n', '1', '2', '5', '6', ...", "background: '1'")
+    ]
+
+
 def test_long_recordings_are_strided_evenly(folder: Path, tmp_path: Path) -> None:
     assert ingest(folder, CaptureSettings(max_frames=3), tmp_path / "out").train_frames == (0, 2, 4)
 
