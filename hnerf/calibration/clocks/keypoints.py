@@ -95,7 +95,7 @@ def smoothed(track: Track) -> _Path:
     """
     xy, seen = track.keypoints[..., :2], track.keypoints[..., 2] > 0
     if len(track.times_s) < 3 or not seen.any():
-        raise InputError("the person is seen in fewer than three frames")
+        raise InputError("the person is seen in fewer than three frames; film longer, or leave the camera out")
     mean, spread = xy[seen].mean(0), float(xy[seen].std(0).mean())
     reach = _reach(float(np.median(np.diff(track.times_s))))
     rows = np.arange(len(xy))[:, None] + np.arange(-reach, reach + 1)
@@ -163,7 +163,9 @@ def _best_offsets(a: _Path, b: _Path, f: np.ndarray | None) -> np.ndarray:
         if all(abs(lags[i] - lags[j]) * step_s >= SEPARATION_S for j in chosen):
             chosen.append(int(i))
     if not chosen:
-        raise InputError(f"the recordings do not show the person together for {MIN_OVERLAP_S:g} s")
+        raise InputError(
+            f"the recordings do not show the person together for {MIN_OVERLAP_S:g} s; film longer, or leave it out"
+        )
     return np.asarray(lags[chosen] * step_s + grids[1][0] - grids[0][0])
 
 

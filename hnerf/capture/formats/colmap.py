@@ -70,7 +70,9 @@ class Colmap(EasyMocap):
         lenses: dict[str, Lens] = {}
         for shot in shots:
             if shot.camera_id not in optics_of:
-                raise InputError(f"{images}: image {shot.name[:80]}: camera {shot.camera_id} is not in {cameras}")
+                raise InputError(
+                    f"{images}: image {shot.name[:80]}: camera {shot.camera_id} is not in {cameras}; export both again"
+                )
             lens = _lens((cameras, images), shot, optics_of[shot.camera_id])
             if lens.name in lenses:
                 raise InputError(f"{images}: several images of camera {lens.name}; keep the images of one moment")
