@@ -36,7 +36,8 @@ class Given:
                 f"masks/{self.camera}/{frame:06d}.png: mask missing; give a mask for every frame or for none"
             )
         subject = components_within(mask, prior.reach)
-        return subject if subject.any() or prior.elsewhere else mask
+        found = (subject & prior.core).any() if prior.core.any() else subject.any()  # not a gap in an inverted mask
+        return subject if found or prior.elsewhere else mask
 
 
 @dataclass(frozen=True)

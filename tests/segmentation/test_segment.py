@@ -169,8 +169,22 @@ def test_a_given_mask_of_somebody_else_is_no_mask_of_the_subject(tmp_path: Path)
         assert mask.any() == believed
 
 
+def inverted_around_a_gap(mask: np.ndarray) -> np.ndarray:
+    """Return a mask of the background, of which a few pixels lie between an arm and the trunk of the person."""
+    near, nearer = (cv2.dilate(mask.astype(np.uint8), np.ones((side, side))).astype(bool) for side in (11, 9))
+    beside = np.argwhere(nearer & ~mask)
+    inverted = ~near
+    inverted[tuple(beside[len(beside) // 2])] = True
+    return inverted
+
+
 @pytest.mark.parametrize(
-    ("spoil", "word"), [(np.zeros_like, "no person in the mask"), (np.logical_not, "the mask is inverted")]
+    ("spoil", "word"),
+    [
+        (np.zeros_like, "no person in the mask"),
+        (np.logical_not, "the mask is inverted"),
+        (inverted_around_a_gap, "the mask is inverted"),
+    ],
 )
 def test_a_bad_mask_is_dropped_and_named(tmp_path: Path, spoil, word: str) -> None:  # type: ignore[no-untyped-def]
     capture, truth = write_scene(tmp_path)
