@@ -58,7 +58,9 @@ class PaperField(Field):
         return [{"params": list(self.parameters()), "lr": self.settings.learning_rate}]
 
     def compile_networks(self) -> None:
-        """Compile F, but not DH: torch does not compile the second derivatives that `eikonal` needs."""
+        """Compile F, but not DH: torch does not compile the second derivatives that `eikonal` needs. Where compilation
+        fails, as without Python's headers, torch warns and runs F as it is."""
+        torch._dynamo.config.suppress_errors = True
         self.radiance.compile(dynamic=True)
 
     def sample(self, scene: PosedScene[Boxes], rays: Rays, draws: Draws) -> tuple[RaySamples, Tensor]:

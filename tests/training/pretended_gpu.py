@@ -17,6 +17,7 @@ from hnerf.avatar import trained as model
 from hnerf.body import canonical, correction_pull
 from hnerf.body.descriptor import BodyMeshes, ClosestPoints
 from hnerf.fields import fast, shell, sparse_grids
+from hnerf.fields.paper import PaperField
 from hnerf.training import trainer
 
 CUDA = torch.device("cuda", 0)
@@ -144,6 +145,7 @@ def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     for module in (correction_pull, shell, sparse_grids):
         monkeypatch.setattr(module, "_launch", _on_one_device(module._launch))
     monkeypatch.setattr(shell, "ThreadPoolExecutor", lambda threads: nullcontext(builtins))  # modes are a thread's own
+    monkeypatch.setattr(PaperField, "compile_networks", lambda field: None)  # there is nothing to compile for
     monkeypatch.setattr(model, "load_file", load_file)
     monkeypatch.setattr(trainer, "save_checkpoint", lambda folder, state: None)
     with Routed():
