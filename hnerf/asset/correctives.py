@@ -37,12 +37,14 @@ def frame_surfaces(
     settle: makes displacements (V, 3) in the rest pose agree with each other.
     """
     rig, device = clothed.rig, avatar.body.theta.device
+    learned_m = avatar.frame_displacements(rig.vertices_m.to(device), clothed.theta.to(device), clothed.root.to(device))
     surfaces_m, displacements_m = [], []
-    for theta, root in tracked(zip(clothed.theta, clothed.root, strict=True), "correctives", len(clothed.frames)):
-        skinned_m = pose_vertices(rig, theta, root)
+    poses = zip(clothed.theta, clothed.root, learned_m.cpu(), strict=True)
+    for theta, root, moved_m in tracked(poses, "correctives", len(clothed.frames)):
+        skinned_m, turn = pose_vertices(rig, theta, root), vertex_skinning(rig, theta, root)[..., :3]
         posed = theta.to(device), root.to(device)
-        surface_m = move_onto_surface(avatar, skinned_m.to(device), rig.faces.to(device), *posed)[0].cpu()
-        turn = vertex_skinning(rig, theta, root)[..., :3]
+        start_m = skinned_m + (turn @ moved_m[..., None])[..., 0]
+        surface_m = move_onto_surface(avatar, start_m.to(device), rig.faces.to(device), *posed)[0].cpu()
         displacement_m = settle(torch.linalg.solve(turn, surface_m - skinned_m).numpy()).astype(np.float32)
         surfaces_m.append((skinned_m + (turn @ torch.from_numpy(displacement_m)[..., None])[..., 0]).numpy())
         displacements_m.append(displacement_m)

@@ -42,6 +42,12 @@ class Avatar(Protocol):
         topology."""
         ...
 
+    def frame_displacements(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+        """Return how far what was learned for the frames of poses theta (n, J, 3), root (n, 4, 4) moves the surface
+        next to points (N, 3) around the body at rest, beside where it is in a pose of no frame: (n, N, 3), in the axes
+        of the body at rest."""
+        ...
+
     def render(self, camera: Camera, theta: Tensor, root: Tensor) -> Rendering:
         """Render colour, coverage and depth of the person alone, exposed as the training camera of this name."""
         ...

@@ -107,6 +107,14 @@ class TrainedAvatar:
         return dataclasses.replace(self, body=body.to(self.body.theta.device))
 
     @torch.no_grad()
+    def frame_displacements(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+        """Return how far what was learned for single frames moves the surface next to points (N, 3) around the body at
+        rest, (n, N, 3), for poses theta (n, J, 3), root (n, 4, 4)."""
+        bodies, _ = self._pose(torch.zeros_like(theta[0]), torch.eye(4).to(root))
+        rows = torch.cat([self._frame_row(*pose) for pose in zip(theta, root, strict=True)])
+        return self.field.frame_displacements(bodies, points_m, rows)
+
+    @torch.no_grad()
     def signed_distance(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
         """Return d_hat (N,) in metres at world points (N, 3)."""
         bodies, conditions = self._pose(theta, root)

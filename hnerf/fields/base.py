@@ -114,6 +114,11 @@ class Field(nn.Module, ABC):
         """Return how far the learned content covers each ray, (R,)."""
         return 1 - (1 - samples.in_box * samples.alpha).prod(1)
 
+    def frame_displacements(self, bodies: PosedBodies, points_m: Tensor, frame_row: Tensor) -> Tensor:
+        """Return how far rows `frame_row` (n,) move the surface next to points (N, 3) around the first body, the one at
+        rest, beside where it is in a pose of no frame, (n, N, 3)."""
+        return points_m.new_zeros(len(frame_row), *points_m.shape)
+
     @abstractmethod
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """Return d_hat (N,) in metres at points (N, 3) around the first body, negative inside."""

@@ -282,6 +282,16 @@ class FastField(Field):
         found = self.field.residual(y.flatten(0, 1), d.flatten(), pose, row.repeat(len(axes))).view_as(d)
         return outward + (found[1:] - found[0]).T / GRADIENT_STEP_M
 
+    def frame_displacements(self, bodies: PosedBodies, points_m: Tensor, frame_row: Tensor) -> Tensor:
+        """Return how far rows `frame_row` (n,) move the surface next to points (N, 3) around the body at rest, (n, N,
+        3)."""
+        if self.deformation is None:
+            return super().frame_displacements(bodies, points_m, frame_row)
+        described = bodies.describe(points_m, frame_row.new_zeros(len(points_m)), FAR_M)
+        rows = torch.cat([frame_row, frame_row.new_full((1,), -1)])
+        moved_m = torch.stack([self.deformation(described, row.expand(len(points_m)))[0] for row in rows])
+        return moved_m[:-1] - moved_m[-1]
+
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """Return d_hat (N,) at points (N, 3) around the first body; beyond the shell it is the body's own distance."""
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)

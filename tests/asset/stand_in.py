@@ -26,6 +26,9 @@ class StandInAvatar:
     def with_body(self, body: BodyFit) -> "StandInAvatar":
         return StandInAvatar(body)
 
+    def frame_displacements(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+        return points_m.new_zeros(len(theta), *points_m.shape)
+
     def signed_distance(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
         vertices_m = pose_vertices(self.body.rig, theta, root)
         found = self._closest(points_m, vertices_m)

@@ -36,6 +36,25 @@ def test_displacements_are_turned_by_the_skinning() -> None:
     np.testing.assert_allclose(posed_with_displacements(clothed, moved_m), surfaces_m, atol=1e-6)
 
 
+def test_surfaces_follow_what_a_frame_slides_along_them() -> None:
+    """In the last frame, bent, the field's column slides a centimetre up itself, along the surface."""
+
+    class Sliding(StandInAvatar):
+        def frame_displacements(self, points_m: torch.Tensor, theta: torch.Tensor, root: torch.Tensor) -> torch.Tensor:
+            moved_m = super().frame_displacements(points_m, theta, root)
+            moved_m[-1, :, 2] = 0.01
+            return moved_m
+
+    body, clothes = bending_body(), upright_column(0.16, -0.02, 1.62)
+    clothed = dataclasses.replace(body, rig=clothed_rig(body.rig, clothes))
+    surfaces_m, moved_m = frame_surfaces(Sliding(body), clothed)
+    height_m = clothes.vertices[:, 2]
+    sides = (np.abs(height_m - 0.8) > 0.35) & (height_m > 0.1) & (height_m < 1.5)
+    np.testing.assert_allclose(moved_m[-1, sides], np.broadcast_to([0, 0, 0.01], (sides.sum(), 3)), atol=0.0015)
+    np.testing.assert_allclose(moved_m[0, sides], 0, atol=0.0015)
+    np.testing.assert_allclose(posed_with_displacements(clothed, moved_m), surfaces_m, atol=1e-6)
+
+
 def rebuilt(found: Correctives) -> np.ndarray:
     """Return the displacements (n, V, 3) that shapes and weights stand for."""
     return np.einsum("nk,kvd->nvd", found.weights, found.offsets_m)

@@ -46,6 +46,9 @@ class BallAvatar:
         grey = (self.grey - self.frames_darken_by) / 255
         return Rendering(alpha[..., None].expand(-1, -1, 3) * grey, alpha, alpha)
 
+    def frame_displacements(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
+        raise NotImplementedError
+
     def signed_distance(self, points_m: Tensor, theta: Tensor, root: Tensor) -> Tensor:
         return (points_m - root[:3, 3]).norm(dim=1) - RADIUS_M
 

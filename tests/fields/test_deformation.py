@@ -109,3 +109,18 @@ def test_a_frame_moves_all_that_the_field_knows(moved_m: list[float]):
     torch.testing.assert_close(seen(points_m + torch.tensor(moved_m), 1), seen(points_m, 0), atol=1e-4, rtol=1e-3)
     torch.testing.assert_close(seen(points_m, -1), seen(points_m, 0))
     assert (seen(points_m, 1) - seen(points_m, 0)).abs().max() > 1e-3
+    moved = field.frame_displacements(bodies, points_m, torch.tensor([1, -1, 0]))
+    torch.testing.assert_close(moved, torch.tensor([moved_m, [0.0] * 3, [0.0] * 3])[:, None].expand(-1, 2, -1))
+
+
+def test_a_field_knows_how_a_frame_moves_it_beside_the_mean_of_frames():
+    """Moved by 2 and by 4 cm in frames 0 and 1, and by 3 cm in poses of no frame."""
+    settings = FastFieldSettings(outer_m=0.1, inner_m=0.1, geometry_cells=(16,), colour_cells=(16,), nodes=1)
+    rig = box_rig(splits=3)
+    field = FastField(rig, settings, frames=2)
+    assert field.deformation is not None
+    field.deformation.displacement.data[:2, 0, 0] = torch.tensor([0.02, 0.04])
+    field.average_over_frames(torch.tensor([0, 1]))
+    bodies = PosedBodies(rig, torch.zeros(1, 2, 3), torch.eye(4)[None], rig.vertices_m)
+    moved = field.frame_displacements(bodies, torch.tensor([[0.43, 0.51, 1.03]]), torch.tensor([0, 1, -1]))
+    torch.testing.assert_close(moved[:, 0], torch.tensor([[-0.01, 0, 0], [0.01, 0, 0], [0.0, 0, 0]]))
