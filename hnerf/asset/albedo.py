@@ -30,19 +30,19 @@ class AlbedoBlend:
     def __init__(self, field_colours: np.ndarray, field_irradiance: np.ndarray, light: Light) -> None:
         self._light = light
         seen = to_linear(field_colours)
-        self._field = seen / field_irradiance[:, None]
+        self._field = (seen / field_irradiance[:, None]).astype(np.float32)
         self._irradiance = FIELD_WEIGHT * field_irradiance[:, None]
         self._total = FIELD_WEIGHT * seen
         self._projection = BackProjection()
 
     def add(self, seen: SeenTexels) -> None:
         """Take in a photograph."""
-        irradiance = self._light.irradiance(seen.normals)[:, None]
-        counts = seen.weights(to_srgb(self._field[seen.index] * irradiance))
+        irradiance = self._light.irradiance(seen.normals).astype(np.float32)[:, None]
+        counts = seen.weights(to_srgb(self._field.take(seen.index, 0) * irradiance))
         self._irradiance[seen.index] += counts * irradiance
         self._total[seen.index] += counts * to_linear(seen.colours)
         pixels = dataclasses.replace(seen.pixels, colours=to_linear(seen.pixels.colours))
-        self._projection.add(pixels, counts, irradiance.astype(np.float32))
+        self._projection.add(pixels, counts, irradiance)
 
     def colours(self) -> np.ndarray:
         """Return the albedos (N, 3) as sRGB in [0, 1]."""

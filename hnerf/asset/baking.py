@@ -6,16 +6,18 @@ import numpy as np
 from hnerf.asset.albedo import Albedo, AlbedoBlend, mean_irradiance
 from hnerf.asset.field_colours import field_colours
 from hnerf.asset.light import fit_light
-from hnerf.asset.photographs import CapturedBlend, photographed_texels
+from hnerf.asset.photographs import CapturedBlend, photographed_texels, sampled
 from hnerf.asset.shading import photographed_shading
-from hnerf.asset.texture import UvLayout, rasterise, texture_image
+from hnerf.asset.texture import Texels, UvLayout, rasterise, texture_image
 from hnerf.avatar.avatar import Avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
 from hnerf.config import AssetSettings
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.render.motion import select_poses
+from hnerf.side_by_side import side_by_side
 
+FIELD_PX = 512  # side of the texture in which photographs find the field's colours; it shows nothing as fine as theirs
 CAVITY_BRIGHTNESS = 0.3  # factor of sRGB values
 
 
@@ -35,9 +37,10 @@ def baked_textures(
     outer = np.ones(len(clothed.rig.vertices_m)) if cavities is None else ~cavities
     lit = texels.interpolate(np.where(outer, 1.0, CAVITY_BRIGHTNESS)[:, None], faces)
     posed = select_poses(clothed, tuple(evenly_spaced(capture.train_frames, settings.texture_poses)))
-    field = field_colours(avatar, posed, texels, cavities)
     if not settings.photograph_frames:
+        field = field_colours(avatar, posed, texels, cavities)
         return texture_image(texels, field * lit, settings.texture_px), None
+    field = _coarse_field_colours(avatar, posed, layout, texels, settings.texture_px, cavities)
     frames = evenly_spaced(capture.train_frames, settings.photograph_frames)
     photographed = {frame: surfaces_m[clothed.index(frame)] for frame in frames}
     light = fit_light(photographed_shading(capture, avatar.gains, photographed, faces))
@@ -47,5 +50,21 @@ def baked_textures(
     for seen in photographed_texels(capture, avatar.gains, photographed, faces, texels):
         captured.add(seen)
         albedo.add(seen)
-    texture, delit = (texture_image(texels, blend.colours() * lit, settings.texture_px) for blend in (captured, albedo))
+
+    def finished(blend: CapturedBlend | AlbedoBlend) -> np.ndarray:
+        return texture_image(texels, blend.colours() * lit, settings.texture_px)
+
+    blends: list[CapturedBlend | AlbedoBlend] = [captured, albedo]
+    texture, delit = side_by_side(finished, blends)
     return texture, Albedo(delit, light)
+
+
+def _coarse_field_colours(
+    avatar: Avatar, posed: BodyFit, layout: UvLayout, texels: Texels, texture_px: int, cavities: np.ndarray | None
+) -> np.ndarray:
+    """Return the field's colours at texels of a texture, (N, 3), from those of a smaller one."""
+    side_px = min(texture_px, FIELD_PX)
+    coarse = rasterise(layout, side_px)
+    image = texture_image(coarse, field_colours(avatar, posed, coarse, cavities), side_px)
+    at = np.stack([texels.column.numpy(), texels.row.numpy()], 1)
+    return sampled(image, (at + 0.5) * side_px / texture_px - 0.5)

@@ -6,7 +6,6 @@ from itertools import product
 
 import cv2
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from hnerf.asset.texture import Texels
 from hnerf.avatar.avatar import Gains
@@ -40,7 +39,7 @@ class TexelPixels:
         """Return by how much the pixel of each texel differs from the mean of its texels, which show (M, 3)."""
         count = np.bincount(self.pixel)[:, None]
         total = np.stack([np.bincount(self.pixel, channel) for channel in shown.T], 1)
-        return (self.colours - total / count)[self.pixel]
+        return (self.colours - total / count).astype(np.float32).take(self.pixel, 0)
 
 
 class BackProjection:
@@ -56,12 +55,12 @@ class BackProjection:
 
     def sharpened(self, mean: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Return the mean (N, 3), of total weight (N, 1), sharpened, in [0, 1]."""
-        colours = np.clip(mean, 0, 1)
+        colours = np.clip(mean, 0, 1).astype(np.float32)
         for _ in range(BACK_PROJECTIONS):
             change = np.zeros_like(colours)
             for pixels, counts, light in self._views:
-                change[pixels.index] += counts * pixels.unexplained(colours[pixels.index] * light)
-            colours = np.clip(colours + change / weight, 0, 1)
+                change[pixels.index] += counts * pixels.unexplained(colours.take(pixels.index, 0) * light)
+            colours = np.clip(colours + change / weight, 0, 1).astype(np.float32)
         return colours
 
 
@@ -83,8 +82,8 @@ class SeenTexels:
     def weights(self, expected: np.ndarray) -> np.ndarray:
         """Return how much each texel counts, (M, 1): the fourth power of the cosine, and less the more its colour
         contradicts the expected one (M, 3) (Geman-McClure)."""
-        error = np.linalg.norm(self.colours - expected, axis=1) / OUTLIER
-        return (self.cosine**COSINE_POWER / (1 + error**2) ** 2)[:, None]
+        error = (self.colours - expected) / OUTLIER
+        return (self.cosine**COSINE_POWER / (1 + _dot(error, error)) ** 2)[:, None]
 
 
 class CapturedBlend:
@@ -92,14 +91,14 @@ class CapturedBlend:
     3), which count a little everywhere, so that they are what no photograph shows."""
 
     def __init__(self, field_colours: np.ndarray) -> None:
-        self._field = field_colours
+        self._field = field_colours.astype(np.float32)
         self._weight = np.full((len(field_colours), 1), FIELD_WEIGHT)
         self._total = FIELD_WEIGHT * field_colours
         self._projection = BackProjection()
 
     def add(self, seen: SeenTexels) -> None:
         """Take in a photograph."""
-        counts = seen.weights(self._field[seen.index])
+        counts = seen.weights(self._field.take(seen.index, 0))
         self._weight[seen.index] += counts
         self._total[seen.index] += counts * seen.colours
         self._projection.add(seen.pixels, counts)
@@ -117,11 +116,11 @@ def photographed_texels(
 
     def seen_in(view: tuple[int, str]) -> SeenTexels:
         frame, name = view
-        camera, gain = capture.cameras[name], gains.get(name, (1.0, 1.0, 1.0))
+        camera, gain = capture.cameras[name], np.array(gains.get(name, (1.0, 1.0, 1.0)), np.float32)
         image = capture.image(name, frame)
         index, cosine, normals, pixels_px = visible_texels(camera, surfaces_m[frame], faces, texels)
         x, y = np.round(pixels_px).astype(int).T
-        at, pixel = np.unique(y * camera.width_px + x, return_inverse=True)
+        at, pixel = _distinct(y * camera.width_px + x, camera.width_px * camera.height_px)
         colours = (image.reshape(-1, 3)[at] / 255 / gain).astype(np.float32)
         pixels = TexelPixels(index.astype(np.int32), pixel.astype(np.int32), colours)
         return SeenTexels(pixels, cosine, normals, sampled(image, pixels_px) / gain)
@@ -140,12 +139,12 @@ def visible_texels(
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     facing = ((normals * towards).sum(1) > 0)[faces].any(1)
     index = np.flatnonzero(facing[texels.face.numpy()])
-    points_m, normal = (texels.interpolate(values, faces, index) for values in (vertices_m, normals))
+    points_m, normal = np.hsplit(texels.interpolate(np.hstack([vertices_m, normals]), faces, index), 2)
     pixels_px, depth_m = camera.project(points_m)
-    view_m = camera.centre_m - points_m
-    distance_m = np.linalg.norm(view_m, axis=1)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-9)
-    cosine = (view_m * normal).sum(1) / distance_m
+    view_m = camera.centre_m.astype(points_m.dtype) - points_m
+    distance_m = np.sqrt(_dot(view_m, view_m))
+    normal = normal / np.sqrt(_dot(normal, normal)).clip(1e-9)[:, None]
+    cosine = _dot(view_m, normal) / distance_m
     seen_m, outline = _depth(camera, vertices_m, faces)
     at_px = np.round(pixels_px)
     inside = camera.holds(at_px) & (cosine > 0) & (depth_m > 0)  # what is behind the camera would be seen mirrored
@@ -170,6 +169,31 @@ def _depth(camera: Camera, vertices_m: np.ndarray, faces: np.ndarray) -> tuple[n
 
 
 def sampled(image: np.ndarray, pixels_px: np.ndarray) -> np.ndarray:
-    """Return the colours (M, 3) in [0, 1] at points (M, 2) of an image (H, W, 3) uint8, by bilinear interpolation."""
-    x, y = pixels_px.T
-    return np.stack([map_coordinates(image[..., k] / 255, [y, x], order=1, mode="nearest") for k in range(3)], 1)
+    """Return the colours (M, 3) float32 in [0, 1] at points (M, 2) of an image (H, W, 3) uint8, by bilinear
+    interpolation; beyond its border, those of the border."""
+    height_px, width_px = image.shape[:2]
+    x, y = pixels_px.T.clip(0, np.array([[width_px - 1], [height_px - 1]]))
+    left, top = x.astype(np.int64), y.astype(np.int64)
+    right, below = np.minimum(left + 1, width_px - 1), np.minimum(top + 1, height_px - 1)
+    across, down = ((at - whole).astype(np.float32)[:, None] for at, whole in ((x, left), (y, top)))
+    colours = (image.reshape(-1, 3) / 255).astype(np.float32)
+
+    def along(row: np.ndarray) -> np.ndarray:
+        a, b = (colours.take(row * width_px + column, 0) for column in (left, right))
+        return a + across * (b - a)
+
+    upper = along(top)
+    return upper + down * (along(below) - upper)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the products (M,) of the rows of two arrays (M, 3); a sum along so short an axis is slower."""
+    return np.einsum("mk,mk->m", a, b)
+
+
+def _distinct(values: np.ndarray, end: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distinct ones of whole numbers (M,) below an end, and which of them each is, as `np.unique` does, but
+    without sorting."""
+    present = np.zeros(end, bool)
+    present[values] = True
+    return np.flatnonzero(present), (np.cumsum(present, dtype=np.int32) - 1)[values]

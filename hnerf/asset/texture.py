@@ -37,9 +37,9 @@ class Texels:
 
     def interpolate(self, per_vertex: np.ndarray, faces: np.ndarray, index: np.ndarray | slice = ALL) -> np.ndarray:
         """Return values (V, C) of the vertices of faces (F, 3) at the texels of an index, (M, C)."""
-        corners, share = faces[self.face.numpy()[index]].T, self.barycentric.numpy()[index].T[..., None]
-        # A corner at a time takes half the time of all three at once.
-        a, b, c = (per_vertex[at] * by for at, by in zip(corners, share, strict=True))
+        corners, share = faces.take(self.face.numpy()[index], 0).T, self.barycentric.numpy()[index].T[..., None]
+        # A corner at a time takes half the time of all three at once, and `take` half that of an index.
+        a, b, c = (per_vertex.take(at, 0) * by for at, by in zip(corners, share, strict=True))
         return a + b + c
 
 

@@ -51,7 +51,8 @@ class Camera:
     def holds(self, pixels_px: Float[np.ndarray, "*S 2"]) -> Bool[np.ndarray, "*S"]:
         """Return whether points (x, y) lie in the image, which reaches half a pixel beyond the outer pixels' centres;
         False for NaN."""
-        return np.all((pixels_px >= -0.5) & (pixels_px <= np.array(self.size_px) - 0.5), axis=-1)
+        (x, y), (width_px, height_px) = np.moveaxis(pixels_px, -1, 0), self.size_px
+        return (x >= -0.5) & (x <= width_px - 0.5) & (y >= -0.5) & (y <= height_px - 0.5)
 
     def rays(self, pixels_px: Float[np.ndarray, "*S 2"]) -> tuple[Float[np.ndarray, "*S 3"], Float[np.ndarray, "*S 3"]]:
         """Return the rays through pixels, given as (x, y): origins and unit directions in the world."""

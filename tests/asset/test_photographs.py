@@ -15,6 +15,7 @@ from hnerf.asset.photographs import (
     CapturedBlend,
     TexelPixels,
     photographed_texels,
+    sampled,
     visible_texels,
 )
 from hnerf.asset.texture import Texels
@@ -204,3 +205,10 @@ def test_a_texel_lies_in_the_pixel_that_it_projects_to() -> None:
     (seen,) = photographed_texels(shaded, {"front": (0.8, 0.8, 0.8)}, {0: square(0.4, 0.0)}, FACES, texels)
     assert seen.pixels.index.tolist() == [0, 1] and seen.pixels.pixel.tolist() == [0, 0]
     np.testing.assert_allclose(seen.pixels.colours, [[200 / 255 / 0.8] * 3], rtol=1e-6)
+
+
+def test_colours_between_pixels_are_bilinear_and_beyond_the_border_its_own() -> None:
+    """Of rows 0, 100 and 50, 250, a quarter to the right and half way down: (25 + 100) / 2."""
+    image = np.repeat(np.array([[0, 100], [50, 250]], np.uint8)[..., None], 3, 2)
+    found = 255 * sampled(image, np.array([[0.25, 0.5], [-3.0, 0.5], [7.0, 9.0]]))
+    np.testing.assert_allclose(found, np.repeat([[62.5], [25], [250]], 3, 1), rtol=1e-6)
