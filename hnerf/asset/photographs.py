@@ -22,7 +22,7 @@ EDGE_PX = 5  # neighbourhood in which a jump of depth is an outline, whose pixel
 EDGE_SLOPE = 2.5  # of depth to width, from which a slope counts as a jump; seen so obliquely, it weighs nothing either
 DEPTH_TOLERANCE_M = 0.01
 FAR_M = 1e3  # depth where a ray meets nothing
-BACK_PROJECTIONS = 2  # more sharpen noise
+BACK_PROJECTIONS = 3  # more sharpen noise
 FIELD_WEIGHT = 0.05  # of the field's colour; a view along the normal weighs 1
 
 
