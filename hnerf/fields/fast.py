@@ -177,11 +177,12 @@ class FastField(Field):
         pose = scene.conditions.pose
         d = torch.where(described.near, described.d, self.reach_m).view(len(hit), depths.shape[1])
         residual = self._residual(described, pose, row).view_as(d)
-        alpha_dot = alpha_from_sdf(d + residual, self.log_sharpness.exp())
+        d_hat = d + residual
+        alpha_dot = alpha_from_sdf(least_around(described, d_hat), self.log_sharpness.exp())
         # an opaque core: nothing shines through if the surface lies deeper
         end = torch.where(core[hit, None], 1.0, alpha_dot[:, -1:])
         alpha = torch.cat([alpha_dot[:, :-1], end], 1)
-        on_surface, weights = move_to_surface(described, d + residual), weights_from_alpha(alpha.detach())
+        on_surface, weights = move_to_surface(described, d_hat), weights_from_alpha(alpha.detach())
         colour = self._ray_colours(scene, on_surface, weights, row)
         norms = d.new_zeros(0)
         if draws.probe is not None:
@@ -311,28 +312,48 @@ def shown(weights: Tensor) -> Tensor:
     return weights > (weights.amax(1, keepdim=True) / 2).clamp(max=MIN_SHOWN_WEIGHT)
 
 
+def on_same_limb(described: Descriptor, shape: torch.Size) -> Tensor:
+    """Return which samples of R rays, shape (R, K), are on the limb of the next one, both within reach: (R, K - 1)
+    bool."""
+    y, near = (t.unflatten(0, shape) for t in (described.y, described.near))
+    return near[:, :-1] & near[:, 1:] & ((y[:, 1:] - y[:, :-1]).norm(dim=-1) < MAX_NEIGHBOUR_DISTANCE_M)
+
+
+def least_around(described: Descriptor, d_hat: Tensor) -> Tensor:
+    """Replace d_hat (R, K) at samples that are closer to their limb than both neighbours by the least of the parabola
+    through the three: a ray that passes a finger is closest to it between two samples."""
+    same_limb = on_same_limb(described, d_hat.shape)
+    before, at, after = d_hat[:, :-2], d_hat[:, 1:-1], d_hat[:, 2:]
+    closest = same_limb[:, :-1] & same_limb[:, 1:] & (at <= before) & (at <= after)
+    deeper_m = (after - before).square() / (8 * (before + after - 2 * at)).clamp(min=MIN_DESCENT_M)
+    return d_hat - nn.functional.pad(torch.where(closest, deeper_m, 0.0), (1, 1))
+
+
 def move_to_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:
     """Move samples (R K,) along their rays to where d_hat (R, K), linear between samples, is zero or closest to it.
 
     A sample's opacity is that of the path to the next one; its colour is that of the surface that makes it opaque. If
-    the next one is nearer to another limb's surface, that is the one: the sample goes to its successor, else limbs have
-    ghosts of their outlines on the limbs behind them. A ray's last sample stays, as do samples whose successor is out
-    of reach. Gradients also flow through the position of the zero (as in IDR, Yariv et al. 2020): a body that moves
-    along a ray shows the same point to it, and without that term it would be drawn towards or away from its camera.
+    the next one is nearer to another limb's surface, or the first within reach, that is the one: the sample goes where
+    its successor does, else limbs have ghosts of their outlines on the limbs behind them. A limb's first sample also
+    moves back, by up to the distance to the second, if it is inside already. A ray's last sample stays, as do samples
+    whose successor is out of reach. Gradients also flow through the position of the zero (as in IDR, Yariv et al.
+    2020): a body that moves along a ray shows the same point to it, and without that term it would be drawn towards or
+    away from its camera.
     """
     y, d, near = (t.unflatten(0, d_hat.shape) for t in (described.y, described.d, described.near))
-    ahead, after = d_hat[:, :-1], d_hat[:, 1:]
-    descends = near[:, :-1] & near[:, 1:] & (ahead > after)
-    same_limb = (y[:, 1:] - y[:, :-1]).norm(dim=-1) < MAX_NEIGHBOUR_DISTANCE_M
+    same_limb, ahead, after = on_same_limb(described, d_hat.shape), d_hat[:, :-1], d_hat[:, 1:]
+    descends = near[:, 1:] & (ahead > after)
     descent_m = (ahead - after).clamp(min=MIN_DESCENT_M)
-    share = torch.where(descends, torch.where(same_limb, ahead / descent_m, 1.0), 0.0).clamp(0, 1)[..., None]
+    back = nn.functional.pad(-(~same_limb[:, :-1]).to(d_hat), (1, 0))  # how far a limb's first sample may go
+    share = torch.where(descends & same_limb, ahead / descent_m, 0.0).clamp(max=1).maximum(back)[..., None]
     skips = nn.functional.pad(descends & ~same_limb, (0, 1)).flatten()
-    triangle = torch.arange(len(skips), device=skips.device) + skips
+    source = torch.arange(len(skips), device=skips.device) + skips
 
     def moved(values: Tensor) -> Tensor:
-        return torch.cat([torch.lerp(values[:, :-1], values[:, 1:], share), values[:, -1:]], 1).flatten(0, 1)
+        values = torch.cat([torch.lerp(values[:, :-1], values[:, 1:], share), values[:, -1:]], 1)
+        return values.flatten(0, 1).index_select(0, source)
 
-    corners, barycentric = (t.index_select(0, triangle) for t in (described.corners, described.barycentric))
+    corners, barycentric = (t.index_select(0, source) for t in (described.corners, described.barycentric))
     return dataclasses.replace(
         described, y=moved(y), d=moved(d[..., None])[:, 0], corners=corners, barycentric=barycentric
     )

@@ -17,6 +17,7 @@ from hnerf.fields.fast import (
     SPACING_M,
     TIGHTEN_STEP_M,
     FastField,
+    least_around,
     move_to_surface,
     shown,
 )
@@ -263,14 +264,32 @@ def test_samples_stay_where_the_next_one_is_out_of_reach_or_farther_from_another
         assert torch.equal(getattr(moved, name), getattr(described, name))
 
 
-def test_a_sample_before_another_limb_shows_that_limb():
-    """5 mm from an arm, then 1 mm inside the trunk: the path between them is opaque by the trunk."""
-    described = on_a_ray([0.005, -0.001, -0.006], [True] * 3)
+@pytest.mark.parametrize("first_near", [True, False])
+def test_a_sample_before_another_limb_shows_that_limb(first_near):
+    """5 mm from an arm, or out of reach, then 1 and 6 mm inside the trunk: the path between the first two is opaque by
+    the trunk, whose surface is a fifth of a step before the second."""
+    described = on_a_ray([0.005, -0.001, -0.006], [first_near, True, True])
     described.y[1:, 0] = 0.1
     described.corners[1:], described.barycentric[1:] = 7, 0.5
     moved = move_to_surface(described, described.d[None])
-    for name in ("d", "y", "corners", "barycentric"):
+    on_trunk = torch.tensor([[0.1, 0, 0], [0.1, 0, 0], [0.1, 0, -0.006]])
+    torch.testing.assert_close(moved.y, on_trunk, atol=1e-7, rtol=0)
+    torch.testing.assert_close(moved.d, on_trunk[:, 2], atol=1e-7, rtol=0)
+    for name in ("corners", "barycentric"):
         assert torch.equal(getattr(moved, name), getattr(described, name)[[1, 1, 2]])
+
+
+def test_a_ray_comes_closest_to_a_limb_between_samples():
+    """(t^2 + 2) mm at t = -1.75, -0.75, 0.25, 1.25 steps: the least is 2 mm. Not so at the ends, where neighbours are
+    out of reach, or on another limb."""
+    d_hat = 1e-3 * (torch.tensor([[-1.75, -0.75, 0.25, 1.25]]).square() + 2)
+    described = on_a_ray(d_hat[0].tolist(), [True] * 4)
+    expected = d_hat.clone()
+    expected[0, 2] = 0.002
+    torch.testing.assert_close(least_around(described, d_hat), expected, atol=1e-7, rtol=0)
+    assert torch.equal(least_around(on_a_ray(d_hat[0].tolist(), [True, True, True, False]), d_hat), d_hat)
+    described.y[3, 0] = 0.1
+    assert torch.equal(least_around(described, d_hat), d_hat)
 
 
 def test_a_surface_is_met_at_the_same_point_when_its_body_moves_along_the_ray():
