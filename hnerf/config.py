@@ -409,7 +409,7 @@ def validated(kind: type[S], tree: Any, source: Path | str) -> S:
             close = difflib.get_close_matches(key[-1], _keys(kind.model_json_schema()), 1, CLOSE)
             wrong, advice = "no such key", f"did you mean {close[0]}?" if close else "remove it, or correct its name"
             if close == key[-1:]:
-                advice = "it belongs into another section"
+                advice = "it belongs in another section"
         where = ": ".join([str(source), ".".join(key)] if key else [str(source)])
         advised = wrong if "; " in wrong else f"{wrong}; {advice}"  # a model's own words may say what to do
         raise InputError(f"{where}: {advised}") from None

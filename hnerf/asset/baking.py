@@ -63,7 +63,7 @@ def _coarse_field_colours(
     avatar: Avatar, posed: BodyFit, layout: UvLayout, texels: Texels, texture_px: int, cavities: np.ndarray | None
 ) -> np.ndarray:
     """Return the field's colours at texels of a texture, (N, 3), from those of a smaller one."""
-    side_px = min(texture_px, FIELD_PX)
+    side_px = min(texture_px, max(FIELD_PX, texture_px // 2))  # no smaller: charts lie a few texels apart
     coarse = rasterise(layout, side_px)
     image = texture_image(coarse, field_colours(avatar, posed, coarse, cavities), side_px)
     at = np.stack([texels.column.numpy(), texels.row.numpy()], 1)

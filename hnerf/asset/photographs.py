@@ -176,10 +176,10 @@ def sampled(image: np.ndarray, pixels_px: np.ndarray) -> np.ndarray:
     left, top = x.astype(np.int64), y.astype(np.int64)
     right, below = np.minimum(left + 1, width_px - 1), np.minimum(top + 1, height_px - 1)
     across, down = ((at - whole).astype(np.float32)[:, None] for at, whole in ((x, left), (y, top)))
-    colours = (image.reshape(-1, 3) / 255).astype(np.float32)
+    colours = image.reshape(-1, 3)
 
     def along(row: np.ndarray) -> np.ndarray:
-        a, b = (colours.take(row * width_px + column, 0) for column in (left, right))
+        a, b = (colours.take(row * width_px + column, 0) / np.float32(255) for column in (left, right))
         return a + across * (b - a)
 
     upper = along(top)

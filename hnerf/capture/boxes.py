@@ -9,11 +9,11 @@ from hnerf.errors import InputError
 MAX_TABLES_BYTES = 1 << 28  # of boxes with tables of samples; days of video
 MAX_REPEATS = 10  # of samples, by edits, as often as the file has bytes
 NO_TABLES = (b"mdat", b"free", b"skip", b"wide")
+HEADERS = (b"mvhd", b"cmov")  # FFmpeg takes a box that begins with one of them for the header, whatever it is called
 COMPRESSED = re.compile(rb"cmov.{4}dcom", re.DOTALL)
-SAMPLES = re.compile(rb"stsz.{8}(.{4})", re.DOTALL)
-FRAGMENT_SAMPLES = re.compile(rb"trun.{4}(.{4})", re.DOTALL)
-EDITS = re.compile(rb"(.{4})elst", re.DOTALL)
-EDIT_BYTES = 12
+SAMPLES = re.compile(rb"stsz(?=.{8}(.{4}))", re.DOTALL)  # takes up the name alone: other bytes may hold the next one
+FRAGMENT_SAMPLES = re.compile(rb"trun(?=.{4}(.{4}))", re.DOTALL)
+EDITS = re.compile(rb"elst(?=.{4}(.{4}))", re.DOTALL)
 
 
 def top_box(path: Path, wanted: bytes, most_bytes: int) -> bytes:
@@ -41,7 +41,7 @@ def check_tables(path: Path) -> None:
     boxes, it counts."""
     tables_bytes, samples, fragments, edits = 0, 0, 0, 0
     for kind, start, size_bytes in _top_boxes(path):
-        if kind in NO_TABLES:
+        if kind in NO_TABLES and _content(path, start, 8)[4:] not in HEADERS:
             continue
         tables_bytes += size_bytes
         if tables_bytes > MAX_TABLES_BYTES:
@@ -51,9 +51,9 @@ def check_tables(path: Path) -> None:
         content = _content(path, start, size_bytes)
         if COMPRESSED.search(content):
             raise InputError(f"{path}: its header is compressed; export it again as H.264")
-        samples = max([samples, *_numbers(SAMPLES, content)])
+        samples += sum(_numbers(SAMPLES, content))
         fragments += sum(_numbers(FRAGMENT_SAMPLES, content))
-        edits += sum(_numbers(EDITS, content)) // EDIT_BYTES
+        edits += sum(_numbers(EDITS, content))
     samples, file_bytes = max(samples, fragments), path.stat().st_size
     if samples > file_bytes:
         raise InputError(f"{path}: declares {samples} samples in {file_bytes} bytes; export it again as H.264")

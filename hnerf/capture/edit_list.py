@@ -24,7 +24,7 @@ def shown_frames(path: Path, samples: int) -> int:
     try:
         track = next(one for one in videos if _number(one[b"stsz"][8:12]) == samples)
         return _within(_edits(dict(movie)[b"mvhd"], track), _shown_at(track, samples))
-    except (KeyError, StopIteration, ValueError, ZeroDivisionError, struct.error):
+    except (LookupError, StopIteration, ValueError, ZeroDivisionError, struct.error):
         return samples
 
 

@@ -197,8 +197,8 @@ def _warn_of_unread(folder: Path, cameras: set[str]) -> None:
     """Warn of images, masks and others that are of none of the calibrated cameras."""
     for place in BY_CAMERA:
         found = path_in_capture(folder, place)
-        entries = sorted(found.iterdir()) if found.is_dir() else []
-        named = [path.name for path in entries if path.is_dir() and not path.name.startswith(".")]
+        entries = [p for p in sorted(found.iterdir()) if not p.name.startswith(".")] if found.is_dir() else []
+        named = [path.name for path in entries if path.is_dir()]
         named += [path.stem for path in entries if path.suffix.lower() in VIDEO_SUFFIXES + IMAGE_SUFFIXES]
         unread = [shown(name) for name in named if unicodedata.normalize("NFC", name) not in cameras]
         if unread:

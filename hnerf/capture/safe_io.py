@@ -235,9 +235,11 @@ def _colours(image: Image.Image) -> Image.Image:
 
 
 def _holes(image: Image.Image) -> Image.Image | None:
-    """Return the opacity of an image; None where it is the same everywhere."""
-    opacity = image.getchannel("A") if image.mode in ("LA", "RGBA") else None
-    return opacity if opacity and len(set(opacity.getextrema())) > 1 else None
+    """Return the opacity of an image; None where it is opaque everywhere."""
+    if image.mode not in ("LA", "RGBA") and "transparency" not in image.info:
+        return None
+    opacity = image.convert("RGBA").getchannel("A")
+    return opacity if opacity.getextrema()[0] < 255 else None
 
 
 def _read_image(path: Path, wanted: Callable[[Image.Image], Image.Image]) -> np.ndarray:

@@ -322,6 +322,8 @@ def on_same_limb(described: Descriptor, shape: torch.Size) -> Tensor:
 def least_around(described: Descriptor, d_hat: Tensor) -> Tensor:
     """Replace d_hat (R, K) at samples that are closer to their limb than both neighbours by the least of the parabola
     through the three: a ray that passes a finger is closest to it between two samples."""
+    if d_hat.shape[1] < 3:
+        return d_hat
     same_limb = on_same_limb(described, d_hat.shape)
     before, at, after = d_hat[:, :-2], d_hat[:, 1:-1], d_hat[:, 2:]
     closest = same_limb[:, :-1] & same_limb[:, 1:] & (at <= before) & (at <= after)
@@ -333,12 +335,12 @@ def move_to_surface(described: Descriptor, d_hat: Tensor) -> Descriptor:
     """Move samples (R K,) along their rays to where d_hat (R, K), linear between samples, is zero or closest to it.
 
     A sample's opacity is that of the path to the next one; its colour is that of the surface that makes it opaque. If
-    the next one is nearer to another limb's surface, or the first within reach, that is the one: the sample goes where
-    its successor does, else limbs have ghosts of their outlines on the limbs behind them. A limb's first sample also
-    moves back, by up to the distance to the second, if it is inside already. A ray's last sample stays, as do samples
-    whose successor is out of reach. Gradients also flow through the position of the zero (as in IDR, Yariv et al.
-    2020): a body that moves along a ray shows the same point to it, and without that term it would be drawn towards or
-    away from its camera.
+    the next one is nearer to another limb's surface, or the first within reach, that is the one: the sample takes the
+    place to which its successor moves on that limb, else limbs have ghosts of their outlines on the limbs behind them.
+    A limb's first sample, unless it is the ray's, also moves back, by up to the distance to the second, if it is inside
+    already. A ray's last sample stays, as do samples whose successor is out of reach. Gradients also flow through the
+    position of the zero (as in IDR, Yariv et al. 2020): a body that moves along a ray shows the same point to it, and
+    without that term it would be drawn towards or away from its camera.
     """
     y, d, near = (t.unflatten(0, d_hat.shape) for t in (described.y, described.d, described.near))
     same_limb, ahead, after = on_same_limb(described, d_hat.shape), d_hat[:, :-1], d_hat[:, 1:]

@@ -122,7 +122,7 @@ def _classify_cells(size: list[int], points: Tensor, outer: Tensor, inner: Tenso
     away, _ = ndimage.label(~beside.cpu().numpy())
     inside = torch.from_numpy(away != away[0, 0, 0]).to(points.device)
     shell = torch.where(inside, _within(size, points, inner + SLACK), _within(size, points, outer + SLACK))
-    return torch.where(shell, SHELL, torch.where(inside, SOLID, EMPTY)).to(torch.uint8)
+    return (SOLID * inside.to(torch.uint8)).masked_fill_(shell, SHELL)  # EMPTY is 0
 
 
 def _within(size: list[int], points: Tensor, reach: Tensor) -> Tensor:

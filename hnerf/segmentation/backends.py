@@ -36,8 +36,8 @@ class Given:
                 f"masks/{self.camera}/{frame:06d}.png: mask missing; give a mask for every frame or for none"
             )
         subject = components_within(mask, prior.reach)
-        found = (subject & prior.core).any() if prior.core.any() else subject.any()  # not a gap in an inverted mask
-        return subject if found or prior.elsewhere else mask
+        inverted = prior.core.any() and not (subject & prior.core).any() and mask.mean() > 0.5  # and shows but a gap
+        return subject if (subject.any() and not inverted) or prior.elsewhere else mask
 
 
 @dataclass(frozen=True)

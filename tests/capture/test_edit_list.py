@@ -48,6 +48,18 @@ def test_a_trimmed_video_that_is_cut_short_is_refused(video: Path) -> None:
         Video.open(video)
 
 
+def test_an_empty_header_shows_everything(video: Path) -> None:
+    trim(video, (2, 4))
+    content = bytearray(video.read_bytes())
+    where = content.index(b"mvhd")
+    content[where : where + 4] = b"free"
+    content[where - 4 : where - 4] = struct.pack(">I", 8) + b"mvhd"
+    moov = content.index(b"moov")
+    content[moov - 4 : moov] = struct.pack(">I", struct.unpack(">I", content[moov - 4 : moov])[0] + 8)
+    video.write_bytes(content)
+    assert shown_frames(video, 8) == 8
+
+
 @pytest.mark.parametrize(
     ("kind", "at", "number"),
     [

@@ -88,6 +88,17 @@ def test_the_mask_of_a_cut_out_is_its_opacity(mode: str, colour: object, lightes
         assert np.array_equal(read_mask(tmp_path / "a.png"), expected)
 
 
+def test_cut_outs_of_nobody_and_of_palettes(tmp_path: Path) -> None:
+    """Where the person has left, hidden colours do not count. A palette or a grey value may be what is transparent."""
+    Image.new("RGBA", (6, 8), (9, 90, 9, 0)).save(tmp_path / "nobody.png")
+    assert not read_mask(tmp_path / "nobody.png").any()
+    shape = np.full((8, 6), 120, np.uint8)
+    shape[2:6, 1:4] = 30
+    for mode in ("L", "P"):
+        Image.fromarray(shape).convert(mode).save(tmp_path / "a.png", transparency=120)
+        assert np.array_equal(read_mask(tmp_path / "a.png") > 0, shape == 30)
+
+
 @pytest.mark.parametrize("size_px", [(6001, 6000), (32_767, 1), (1, 32_767), (0, 5), (float("nan"), 5)])
 def test_sizes_that_no_camera_records_or_opencv_cannot_undistort_are_refused(size_px: tuple[float, float]) -> None:
     with pytest.raises(InputError, match=r"a\.png: declares .*; give 1 to 36 million pixels, no side over 32766"):

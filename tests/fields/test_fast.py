@@ -290,6 +290,8 @@ def test_a_ray_comes_closest_to_a_limb_between_samples():
     assert torch.equal(least_around(on_a_ray(d_hat[0].tolist(), [True, True, True, False]), d_hat), d_hat)
     described.y[3, 0] = 0.1
     assert torch.equal(least_around(described, d_hat), d_hat)
+    for few in (1, 2):
+        assert torch.equal(least_around(on_a_ray([0.01] * few, [True] * few), d_hat[:, :few]), d_hat[:, :few])
 
 
 def test_a_surface_is_met_at_the_same_point_when_its_body_moves_along_the_ray():
