@@ -239,7 +239,7 @@ def _holes(image: Image.Image) -> Image.Image | None:
     if image.mode not in ("LA", "RGBA") and "transparency" not in image.info:
         return None
     opacity = image.convert("RGBA").getchannel("A")
-    return opacity if opacity.getextrema()[0] < 255 else None
+    return opacity if np.asarray(opacity).min() < 255 else None
 
 
 def _read_image(path: Path, wanted: Callable[[Image.Image], Image.Image]) -> np.ndarray:
