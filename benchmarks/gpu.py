@@ -13,6 +13,7 @@ from pathlib import Path
 
 import torch
 from provenance import provenance, provenance_line, table, write_result
+from score_shared import GEOMETRY_COLUMNS, IMAGE_COLUMNS, score_cells
 
 from hnerf.avatar.trained import load_avatar
 from hnerf.body.fit_result import BodyFit
@@ -61,19 +62,9 @@ def main() -> None:
 def as_markdown(subject: str, result: dict) -> str:
     """Format the scores of each split, and the cost."""
     changes = f" with {', '.join(result['overrides'])}" if result["overrides"] else ""
-    columns = {"n": ("images", "d"), "psnr": ("PSNR", ".2f"), "ssim": ("SSIM", ".3f"), "mask_iou": ("mask IoU", ".3f")}
-    surface_columns = {
-        "chamfer_l2_e3": ("Chamfer x1e-3 m²", ".3f"),
-        "chamfer_mm": ("mean mm", ".1f"),
-        "normal_consistency": ("NC", ".3f"),
-        "iou": ("IoU", ".3f"),
-    }
-    rows = [["", *(title for title, _ in (*columns.values(), *surface_columns.values()))]]
+    rows = [["", "images", *(title for title, _ in (IMAGE_COLUMNS | GEOMETRY_COLUMNS).values())]]
     for split, title in (("novel_view", "training poses, test cameras"), ("novel_pose", "new poses, animated")):
-        scores = result["metrics"][split]
-        surface = scores["geometry"]
-        row = [f"{scores[key]:{form}}" for key, (_, form) in columns.items()]
-        rows.append([title, *row, *(f"{surface[k]:{f}}" if surface else "" for k, (_, f) in surface_columns.items())])
+        rows.append([title, *score_cells(result["metrics"][split])])
     training, seconds = result["training"], result["frame_seconds"]
     cost = {
         "setup, s": f"{training['setup_seconds']:.0f}",

@@ -122,13 +122,16 @@ def _split_table(captures: dict[str, Any], split: str) -> list[str]:
         if not figures.get("score"):
             rows.append([name, figures.get("error", "no ground truth"), *[""] * len(columns)])
             continue
-        found = figures["score"][split]
-        values = [found[key] for key in IMAGE_COLUMNS] + [
-            (found["geometry"] or {}).get(key) for key in GEOMETRY_COLUMNS
-        ]
-        shown = ["" if v is None else form.format(v) for v, (_, form) in zip(values, columns.values(), strict=True)]
-        rows.append([name, str(found["n"]), *shown])
+        rows.append([name, *score_cells(figures["score"][split])])
     return table(rows)
+
+
+def score_cells(found: dict[str, Any]) -> list[str]:
+    """Format a split's number of images, and its scores in the order of IMAGE_COLUMNS and GEOMETRY_COLUMNS; empty where
+    there is none."""
+    columns, values = IMAGE_COLUMNS | GEOMETRY_COLUMNS, found | (found["geometry"] or {})
+    shown = (form.format(values[key]) if values.get(key) is not None else "" for key, (_, form) in columns.items())
+    return [str(found["n"]), *shown]
 
 
 def _columns_table(captures: dict[str, Any]) -> list[str]:

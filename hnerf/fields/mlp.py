@@ -89,8 +89,8 @@ class RadianceMLP(nn.Module):
         density = nn.functional.softplus(self.density(features.to(point.dtype))[:, 0])
         seen = torch.cat([root, positional_encoding(view, self.view_octaves)], -1).to(features.dtype)
         hidden, activation, last = self.colour
-        shown = torch.cat([features, seen], -1)
-        shaded = activation(linear(hidden, pad_columns(shown) if self.trunk.bf16 else shown))
+        inputs = torch.cat([features, seen], -1)
+        shaded = activation(linear(hidden, pad_columns(inputs) if self.trunk.bf16 else inputs))
         return density, torch.sigmoid(last(shaded.to(point.dtype)))
 
 

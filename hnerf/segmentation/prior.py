@@ -57,9 +57,14 @@ class Prior:
 
     @staticmethod
     def around(
-        core: np.ndarray, body: np.ndarray, completed: np.ndarray, height_px: float, reach: float,
-        upright: bool = False, behind: bool = False,
-    ) -> "Prior":  # fmt: skip
+        core: np.ndarray,
+        body: np.ndarray,
+        completed: np.ndarray,
+        height_px: float,
+        reach: float,
+        upright: bool = False,
+        behind: bool = False,
+    ) -> "Prior":
         """Return the prior grown around where the body is, seen or completed, (H, W) bool; reach in heights of the
         person.
 
