@@ -62,7 +62,7 @@ BODY_25 = (
 
 @functools.cache
 def anny_model() -> "anny.Anny":
-    """Load the body model; the first construction on a machine takes about a minute and is cached on disk by anny."""
+    """Load the body model; anny builds it in about a minute and keeps it on disk, as `make install` has it do."""
     import anny
     from anny.models.model_data import TopologyConfig
 
