@@ -169,6 +169,17 @@ def test_a_given_mask_of_somebody_else_is_no_mask_of_the_subject(tmp_path: Path)
         assert mask.any() == believed
 
 
+def test_of_a_mask_that_shows_but_the_subjects_feet_the_bystander_is_removed(tmp_path: Path) -> None:
+    capture, truth = write_scene(tmp_path)
+    core, reach = np.zeros((2, *truth["c0", 0].shape), bool)
+    core[4:20, 10:14], reach[2:28, 8:16] = True, True
+    feet, bystander = np.zeros_like(core), np.zeros_like(core)
+    feet[24:26, 11:13], bystander[4:26, 24:30] = True, True
+    write_masks(capture, truth | {("c0", 0): feet | bystander})
+    mask = Given(capture, "c0").mask(0, Prior(core, core, reach, reach, height_px=24.0))
+    np.testing.assert_array_equal(mask, feet)
+
+
 def inverted_around_a_gap(mask: np.ndarray) -> np.ndarray:
     """Return a mask of the background, of which a few pixels lie between an arm and the trunk of the person."""
     near, nearer = (cv2.dilate(mask.astype(np.uint8), np.ones((side, side))).astype(bool) for side in (11, 9))
