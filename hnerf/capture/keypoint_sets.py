@@ -64,8 +64,8 @@ def to_body_25(detections: dict[str, np.ndarray], named: KeypointSetName | None)
     25, 3).
 
     `named` is the set of all cameras; without it the set is known from the number of points, and for 25, which two sets
-    have, from where point 8 lies. K is 0 where nobody was detected. Raises InputError where `named` has another number
-    of points.
+    have, from which points are the face. K is 0 where nobody was detected. Raises InputError where `named` has another
+    number of points.
     """
     of_25 = [points.reshape(-1, 25, 3) for points in detections.values() if points.shape[-2] == 25]
     if of_25 and not named and not is_body_25(np.concatenate(of_25)):
@@ -104,13 +104,18 @@ def is_body_25(keypoints: np.ndarray) -> bool:
     """Return whether (..., 25, 3) detections are in BODY_25's order rather than BODY_25B's; True where they do not show
     it.
 
-    BODY_25's points 8, 9, 12 are mid-hip, right and left hip, so 8 lies midway; BODY_25B's are right elbow, left wrist,
-    right hip. Decided by the median over all detections, relative to the distance from point 0 (nose in both) to the
-    hips.
+    BODY_25's points 1 to 4 are neck and right arm, and 15 to 18 are eyes and ears; BODY_25B's points 1 to 4 are eyes
+    and ears, and among 15 to 18 are the ankles. A face is smaller than these from every side, and its points lie close
+    together whatever a detector's error. Most detections decide.
     """
-    seen = keypoints[(keypoints[..., [0, 8, 9, 12], 2] > 0).all(-1)][..., :2]
-    if len(seen) == 0:
-        return True
-    middle = (seen[:, 9] + seen[:, 12]) / 2
-    offset = np.linalg.norm(seen[:, 8] - middle, axis=-1) / (np.linalg.norm(seen[:, 0] - middle, axis=-1) + 1e-9)
-    return bool(np.median(offset) < 0.1)
+    people = keypoints.reshape(-1, 25, 3)
+    first_px, last_px = _extent_px(people[:, 1:5]), _extent_px(people[:, 15:19])
+    return int((first_px < last_px).sum()) <= int((last_px < first_px).sum())
+
+
+def _extent_px(points: np.ndarray) -> np.ndarray:
+    """Return the diagonal of the box around the points that are seen of (n, K, 3); NaN where fewer than two are."""
+    seen = points[..., 2:] > 0
+    low, high = (np.where(seen, points[..., :2], far) for far in (np.inf, -np.inf))
+    extent_px = np.linalg.norm(high.max(1) - low.min(1), axis=-1)
+    return np.where(seen.sum((1, 2)) >= 2, extent_px, np.nan)

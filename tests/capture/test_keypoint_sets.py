@@ -57,14 +57,31 @@ def test_the_number_of_points_tells_the_set(count: int) -> None:
     assert np.array_equal(converted(count), converted(count, name))
 
 
-def test_where_point_8_lies_tells_sets_of_25_apart() -> None:
-    """A person 10 px high: nose at y = 0, hips at 5 and 2 px apart; BODY_25's point 8 lies between them."""
-    body_25 = np.ones((25, 3))
-    body_25[[0, 8, 9, 12], :2] = [[5, 0], [5, 5], [4, 5], [6, 5]]
-    assert is_body_25(body_25) and not is_body_25(points(25))
+def person(face: slice, others: slice) -> np.ndarray:
+    """Return keypoints (25, 3) of a person whose face is 1 px wide, and whose `others` lie 3 px apart."""
+    keypoints = np.ones((25, 3))
+    keypoints[face, 0], keypoints[others, 0] = [5, 6, 5, 6], [0, 3, 6, 9]
+    return keypoints
+
+
+def test_where_the_face_is_tells_sets_of_25_apart() -> None:
+    body_25, body_25b = person(slice(15, 19), slice(1, 5)), person(slice(1, 5), slice(15, 19))
+    assert is_body_25(body_25) and not is_body_25(body_25b)
     assert is_body_25(np.zeros((25, 3)))  # nobody seen: the commoner of the two
-    seen_by_one = {"01": points(25)[None, None], "02": np.zeros((1, 1, 25, 3))}
-    assert to_body_25(seen_by_one, None)["01"][0, 0, 8].tolist() == pytest.approx([11.5, 1150, 0.511])
+    one_ear = np.zeros((25, 3))
+    one_ear[4] = body_25b[4]
+    assert is_body_25(one_ear)  # a single point has no extent
+    assert not is_body_25(np.stack([body_25b, body_25b, body_25]))
+    body_25b[[11, 12], :2] = [[4, 5], [6, 5]]
+    seen_by_one = {"01": body_25b[None, None], "02": np.zeros((1, 1, 25, 3))}
+    assert to_body_25(seen_by_one, None)["01"][0, 0, 8].tolist() == [5, 5, 1]
+
+
+def test_a_person_from_above_keeps_the_order() -> None:
+    """From above, hidden hips are guessed: the mid-hip lies off their middle by a third of the distance to the nose."""
+    body_25 = person(slice(15, 19), slice(1, 5))
+    body_25[[0, 8, 9, 12], :2] = [[5, 1], [5, 6], [3, 4], [7, 4]]
+    assert is_body_25(body_25)
 
 
 def test_a_mean_needs_both_points() -> None:
