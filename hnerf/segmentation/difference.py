@@ -12,6 +12,7 @@ LOG_OFFSET = 6.0  # grey levels added before the logarithm: below them sensors a
 RATIO_NOISE = 0.01  # of log ratios, beyond the pixel's own noise: JPEG, rounding of the plate
 SHADOW_TINT = 0.02  # log chroma per log brightness: gamma and stray light tint deep shadows a little
 SHADOW_SHARE = 0.1  # prior share of the background near a person
+GREY_SHADOW_SHARE = 0.3  # in grey pictures, where no chroma tells a shadow from the person
 EDGE_OF_SHADOW = 0.1  # log brightness over which the density of shadows darker than the darkest falls off
 PERSON_BRIGHTNESS, PERSON_CHROMA = 0.6, 0.25  # std of a person's log ratio to the background
 NOISE_FACTOR = 0.8  # the robust estimate of noise counts JPEG's blocks twice
@@ -77,7 +78,8 @@ def difference(
     """Compare images (H, W, 3) uint8 RGB. `shadowed`: the plate, a median over time, may contain shadows itself.
 
     The logarithm of their ratio splits into brightness and chroma. Unchanged background has neither; a shadow lowers
-    the brightness and hardly changes the chroma (Horprasert et al. 1999, in logarithms); a person may have any.
+    the brightness and hardly changes the chroma (Horprasert et al. 1999, in logarithms); a person may have any, but in
+    a grey picture has none either.
     """
     lit, unlit = image.astype(np.float32) + LOG_OFFSET, plate.astype(np.float32) + LOG_OFFSET
     ratio = np.log(lit / unlit)
@@ -88,8 +90,10 @@ def difference(
     tint = noise_variance + settings.shadow_chroma**2 + (SHADOW_TINT * np.minimum(brightness, 0)) ** 2
     darkest = float(np.log(settings.darkest_shadow))
     shadow = _log_uniform(brightness, darkest, -darkest if shadowed else 0.0) + _log_gaussian(chroma, tint, 2)
-    background = np.logaddexp(np.log(1 - SHADOW_SHARE) + unchanged, np.log(SHADOW_SHARE) + shadow)
-    person = _log_gaussian(3 * brightness**2, 3 * PERSON_BRIGHTNESS**2, 1) + _log_gaussian(chroma, PERSON_CHROMA**2, 2)
+    grey = (image == image[..., :1]).all()
+    share, tones = (GREY_SHADOW_SHARE, tint) if grey else (SHADOW_SHARE, PERSON_CHROMA**2)
+    background = np.logaddexp(np.log(1 - share) + unchanged, np.log(share) + shadow)
+    person = _log_gaussian(3 * brightness**2, 3 * PERSON_BRIGHTNESS**2, 1) + _log_gaussian(chroma, tones, 2)
     contrast = CONTRAST_GAIN * (image.astype(np.float32) - plate) / np.sqrt(plate + CONTRAST_FLOOR)
     picture = (128 + contrast).clip(0, 255).round().astype(np.uint8)
     return Difference((person - background).astype(np.float32), picture, plate)

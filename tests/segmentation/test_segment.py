@@ -41,6 +41,18 @@ def test_a_shadow_is_not_the_person_by_hand() -> None:
     assert (found.contrast[:8] == 128).all()
 
 
+def test_in_grey_pictures_a_dark_person_may_be_one_or_a_shadow() -> None:
+    """Left: the plate at 60 % brightness, by which a shadow is e^1 times likelier or less likely than a person; right:
+    darker than any shadow."""
+    plate = np.full((40, 80, 3), 150, np.uint8)
+    image = plate.copy()
+    image[10:30, 10:30], image[10:30, 50:70] = 90, 20
+    found = difference(image, plate, noise_level(image, plate, np.ones((40, 80), bool)), SETTINGS)
+    assert (np.abs(found.log_odds[12:28, 12:28]) < 1).all()
+    assert (found.log_odds[12:28, 52:68] > 4).all()
+    assert (found.log_odds[:8] < -4).all()
+
+
 def test_noise_and_exposure_are_those_of_the_background_by_hand() -> None:
     """Two thirds of the image are the person's. Beside him the plate is 20 % darker, but for a step of 2 levels up and
     down, once LOG_OFFSET is added to either: 150 + 6 against 124 + 6, give or take 2."""
