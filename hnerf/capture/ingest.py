@@ -345,10 +345,11 @@ def _per_frame(
     some = next(iter(files.values()))
     place = some.path if isinstance(some, StoredFrame) else some.parent
     if len(files) != len(recorded):
-        raise InputError(f"{place}: {len(files)} {what} for {len(recorded)} frames; give one for each")
+        nobody = " (an empty list of people where nobody is seen)" if what == "keypoints" else ""
+        raise InputError(f"{place}: {len(files)} {what} for {len(recorded)} frames; give one for each{nobody}")
     for frame in wanted:
         if frame not in files:
-            raise InputError(f"{place}: {what} of frame {frame} missing; give one for each frame")
+            raise InputError(f"{place}: {what} of frame {frame} missing; give one for each, numbered as its image is")
     return {frame: files[frame] for frame in wanted}
 
 

@@ -255,6 +255,8 @@ def _read_image(path: Path, wanted: Callable[[Image.Image], Image.Image]) -> np.
         image = wanted(image)
         image = image if turn is None else image.transpose(turn)
         return np.array(image)
+    except FileNotFoundError:
+        raise InputError(f"{path}: image missing; add it to the capture folder") from None
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
         raise InputError(f"{path}: not a readable image ({reason}); export it again as JPEG or PNG") from None

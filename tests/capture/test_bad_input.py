@@ -132,7 +132,10 @@ EASYMOCAP = {
         lambda f: (f / "openpose/01/000001_keypoints.json").write_text(""),
         "000001_keypoints.json: is empty",
     ),
-    "keypoint file missing": (lambda f: (f / "openpose/01/000001_keypoints.json").unlink(), "openpose/01: 4 keypoints"),
+    "keypoint file missing": (
+        lambda f: (f / "openpose/01/000001_keypoints.json").unlink(),
+        "openpose/01: 4 keypoints for 5 frames; give one for each (an empty list of people where nobody is seen)",
+    ),
     "keypoints are a pickle": (
         lambda f: (f / "openpose/01/000001_keypoints.json").write_bytes(pickle.dumps(Bomb())),
         "000001_keypoints.json",

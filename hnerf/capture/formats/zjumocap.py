@@ -81,13 +81,13 @@ class ZjuMocap(Layout):
         return ImageFolder(next(iter(files.values())).parent, files)
 
     def mask_files(self, camera: str) -> dict[int, Path | StoredFrame]:
-        """Return mask_cihp/<image>.png, or mask/, by frame: part labels, 0 outside the person."""
+        """Return mask_cihp/<image>.png, or mask/, by frame: part labels, 0 outside the person. A camera may have
+        none."""
+        images = {frame: path.with_suffix(".png").parts for frame, path in self.images[camera].items()}
         for name in ("mask_cihp", "mask"):
-            if path_in_capture(self.folder, name).is_dir():
-                paths = self.images[camera].items()
-                return {
-                    frame: path_in_capture(self.folder, name, *path.with_suffix(".png").parts) for frame, path in paths
-                }
+            masks = {frame: path_in_capture(self.folder, name, *parts) for frame, parts in images.items()}
+            if any(path.exists() for path in masks.values()):
+                return dict(masks)
         return {}
 
     def given_poses(self, frames: tuple[int, ...]) -> GivenPoses | None:

@@ -1,5 +1,6 @@
 """A ZJU-MoCap folder of two cameras and three frames, as NeuralBody prepares it."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,15 @@ def test_cameras_images_and_masks(folder: Path, tmp_path: Path) -> None:
     assert capture.keypoints("Camera_B1") is None and capture.given_poses() is None
 
 
+def test_cameras_may_lack_masks(folder: Path, tmp_path: Path) -> None:
+    """Camera_B1 has none, and those of Camera_B2 lie in mask/, beside an empty mask_cihp/."""
+    (folder / "mask_cihp").rename(folder / "mask")
+    (folder / "mask_cihp").mkdir()
+    shutil.rmtree(folder / "mask" / "Camera_B1")
+    capture = ingest(folder, CaptureSettings(), tmp_path / "out")
+    assert capture.given_mask("Camera_B1", 0) is None and capture.given_mask("Camera_B2", 0) is not None
+
+
 def test_given_poses(folder: Path, tmp_path: Path) -> None:
     """new_params override params; frame 1 has none; 69 turns leave out the pelvis."""
     turns = np.arange(72.0) * (np.arange(72) >= 3)
@@ -99,7 +109,7 @@ def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
     (folder / "params" / "1.npy").rename(folder / "params" / "9.npy")
     refused(r"none of the chosen frames has a given pose")
     (folder / "mask_cihp" / "Camera_B2" / "000001.png").unlink()
-    refused(r"mask_cihp/Camera_B2/000001\.png")
+    refused(r"mask_cihp/Camera_B2/000001\.png: image missing; add it")
     annotations = np.load(folder / "annots.npy", allow_pickle=True).item()
     annotations["ims"][0]["ims"][1] = "../secret/000000.jpg"
     np.save(folder / "annots.npy", annotations, allow_pickle=True)
