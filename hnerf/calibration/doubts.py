@@ -20,6 +20,7 @@ LOOKED_AT = 5  # frames of each camera, evenly spaced, whose keypoints are compa
 PLATE_DIFFERENCE = 30  # grey levels between image and clean plate that show the person
 GAIN = 0.25  # share of keypoints that undoing a mistake brings onto the person
 LOW_SHARE = 0.4  # of the other cameras' share; of a person who is hidden by half, more than that stays in the mask
+MAX_COVERED = 0.5  # of a picture, by a mask of the person; more is mostly an inverted one, which segmentation refuses
 MIN_IN_SIGHT = 0.05  # share of the person's keypoints in the pictures of a test camera
 # BODY_25
 NOSE, NECK, MID_HIP, EARS = 0, 1, 8, (17, 18)
@@ -209,7 +210,7 @@ def _person(capture: Capture, camera: str, frame: int) -> np.ndarray | None:
     """Return which pixels show the person, (H, W) bool; None where nothing tells."""
     mask = capture.given_mask(camera, frame)
     if mask is not None:
-        return mask
+        return mask if mask.mean() < MAX_COVERED else None
     likely = capture.person_probability(camera, frame)
     if likely is not None:
         return likely > 0.5

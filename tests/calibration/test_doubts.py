@@ -61,6 +61,17 @@ def test_keypoints_of_mirrored_pictures_are_told_by_masks(tmp_path: Path) -> Non
     assert "mirrored left to right 100%" in doubt
 
 
+def test_inverted_masks_are_no_mirrored_pictures(tmp_path: Path) -> None:
+    """Keypoints at the left of all pictures lie on no inverted mask there, and on all at the right."""
+    capture, keypoints = with_masks(tmp_path)
+    keypoints[..., 0] = SIZE_PX / 8
+    for path in (tmp_path / "masks").glob("*/*.png"):
+        inverted = np.full((SIZE_PX, SIZE_PX), 255, np.uint8)
+        inverted[:, : SIZE_PX // 4] = 0
+        write_image(path, inverted)
+    assert of_other_pictures(capture, keypoints) == []
+
+
 def test_pictures_of_one_camera_that_are_not_its_own_are_told_by_masks(tmp_path: Path) -> None:
     capture, keypoints = with_masks(tmp_path)
     first, mirrored = capture.train_cameras[0], keypoints.copy()
