@@ -85,7 +85,10 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     layout = uncalibrated or recognise(folder)
     lenses = layout.lenses()
     if isinstance(layout, EasyMocap):
-        _warn_of_unread(folder, set(lenses))
+        _warn_of_unread(folder, BY_CAMERA, set(lenses))
+    if isinstance(layout, Pose2Sim):
+        _warn_of_unread(folder, ("videos",), set(lenses))
+        _warn_of_unread(folder, ("pose",), {f"{name}_json" for name in lenses})
     manifest = _manifest_for(layout, folder)
     subject = capture_name(folder, manifest)
     cameras = chosen_cameras(folder, manifest, list(lenses), layout.training_cameras())
@@ -193,14 +196,14 @@ def _manifest_for(layout: Layout, folder: Path) -> CaptureManifest:
     return manifest.model_copy(update=dict.fromkeys(dropped))
 
 
-def _warn_of_unread(folder: Path, cameras: set[str]) -> None:
-    """Warn of images, masks and others that are of none of the calibrated cameras."""
-    for place in BY_CAMERA:
+def _warn_of_unread(folder: Path, places: tuple[str, ...], expected: set[str]) -> None:
+    """Warn of images, masks and others whose names, in these places, are those of none of the calibrated cameras."""
+    for place in places:
         found = path_in_capture(folder, place)
         entries = [p for p in sorted(found.iterdir()) if not p.name.startswith(".")] if found.is_dir() else []
         named = [path.name for path in entries if path.is_dir()]
         named += [path.stem for path in entries if path.suffix.lower() in VIDEO_SUFFIXES + IMAGE_SUFFIXES]
-        unread = [shown(name) for name in named if unicodedata.normalize("NFC", name) not in cameras]
+        unread = [shown(name) for name in named if unicodedata.normalize("NFC", name) not in expected]
         if unread:
             some = ", ".join(unread[:MAX_NAMED]) + (", ..." if len(unread) > MAX_NAMED else "")
             log.warning("%s: %s not in the calibration, and not read; rename or remove them", found, some)

@@ -1,5 +1,6 @@
 """The real capture in the Pose2Sim layout."""
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.ingest import ingest
 from hnerf.capture.keypoint_sets import is_body_25, to_body_25
 from hnerf.config import CaptureSettings
+from tests.capture import recordings as rec
 from tests.shared_data import shared_capture
 
 
@@ -48,6 +50,22 @@ def test_both_narrow_videos_are_matched_by_their_bars(balance: Capture) -> None:
         assert (area.left, area.width) == (0, 1080)
         assert area.top == pytest.approx(7, abs=0.1)
         assert area.height == pytest.approx(1920 * 1080 / 1088, abs=0.1)
+
+
+def test_keypoints_and_videos_of_no_calibrated_camera_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = rec.write_pose2sim(tmp_path / "film")
+    with caplog.at_level(logging.WARNING, "hnerf.capture"):
+        ingest(folder, CaptureSettings(), tmp_path / "out")
+        assert not caplog.messages
+        (folder / "pose" / "cam01_json").rename(folder / "pose" / "cam01")
+        rec.write_video(folder / "videos" / "cam09.mp4", 10)
+        ingest(folder, CaptureSettings(), tmp_path / "again")
+    assert caplog.messages == [
+        f"{folder}/{found} not in the calibration, and not read; rename or remove them"
+        for found in ("videos: 'cam09'", "pose: 'cam01'")
+    ]
 
 
 def test_keypoint_files_follow_the_numbers_in_their_names(tmp_path: Path) -> None:
