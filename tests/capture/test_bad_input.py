@@ -102,7 +102,10 @@ EASYMOCAP = {
     "camera name leaves the folder": (lambda f: _edit(f / "intri.yml", '"01"', '"../01"'), "intri.yml"),
     "camera called as np.savez's argument": (_call_a_camera_file, "intri.yml: a camera cannot be"),
     "camera without a folder": (lambda f: (f / "images/02").rename(f / "images/03"), "images/02"),
-    "camera without images": (lambda f: [p.unlink() for p in (f / "images/02").iterdir()], "images/02"),
+    "camera without images": (
+        lambda f: [p.unlink() for p in (f / "images/02").iterdir()],
+        "add them, or leave the camera out of [cameras] in capture.toml",
+    ),
     "unequal frame counts": (lambda f: (f / "images/02/000004.png").unlink(), "images/02: 4 frames"),
     "frame without a number": (lambda f: (f / "images/01/000001.png").rename(f / "images/01/a.png"), "images/01/a.png"),
     "unreadable image": (lambda f: (f / "images/01/000001.png").write_bytes(b"nothing"), "images/01/000001.png"),

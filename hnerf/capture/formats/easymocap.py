@@ -43,7 +43,7 @@ class EasyMocap(Layout):
         if not video.exists():
             raise InputError(
                 f"{self.folder / 'images' / camera}: no JPEG or PNG images, and no {video}; "
-                "add them or take the camera out of the calibration"
+                "add them, or leave the camera out of [cameras] in capture.toml"
             )
         return Video.open(video)
 
