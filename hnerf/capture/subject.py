@@ -67,7 +67,9 @@ def _detected(capture: Capture) -> list[np.ndarray]:
     for name in names:
         found = capture.keypoints(name)
         if found is None:
-            raise InputError(f"{capture.name}: camera {name}: no keypoints; leave detection.source out, or detect some")
+            raise InputError(
+                f"{capture.name}: camera {name}: no keypoints; set detection.source=network, or detect some"
+            )
         people.append(np.nan_to_num(found).astype(np.float64))
     seen = np.array([(p[..., 2] > 0).any((1, 2)) for p in people])  # (cameras, frames)
     if not (seen.sum(0) >= min(2, len(names))).any():

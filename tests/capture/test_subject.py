@@ -180,3 +180,14 @@ def test_one_of_several_cameras_is_one_line(tmp_path: Path) -> None:
     seen = {c.name: seen_by(c, walk_m(), rng)[:, None] * (c.name == "c1") for c in cameras}
     with pytest.raises(InputError, match="no person found by any camera but c1"):
         subject_keypoints(write_capture(tmp_path, cameras, seen))
+
+
+def test_a_camera_without_keypoints_is_told_how_to_get_them(tmp_path: Path) -> None:
+    """The network is not used by itself, since the other camera's keypoints came with the recording."""
+    capture, _ = recorded(tmp_path, ring(2), walk_m())
+    with np.load(tmp_path / "keypoints.npz") as stored:
+        kept = dict(stored)
+    del kept["c1"]
+    np.savez(tmp_path / "keypoints.npz", **kept)
+    with pytest.raises(InputError, match=r"camera c1: no keypoints; set detection\.source=network, or detect some"):
+        subject_keypoints(capture)
