@@ -54,6 +54,7 @@ METRICS, REPORT = "hnerf/evaluation/metrics.py", "hnerf/evaluation/report.py"
 EXPOSURE, ARTICULATION = "hnerf/training/exposure.py", "hnerf/body/articulation.py"
 REACH, SCORES = "hnerf/geometry/reach.py", "hnerf/evaluation/geometry.py"
 FINGERS, CONTOUR = "hnerf/body/fingers.py", "hnerf/body/contour_fit.py"
+POSTURES, BY_POSTURES = "hnerf/body/posture_prior.py", "tests/body/test_posture_prior.py"
 POLICY, STORE = "tasks/policy.py", "tasks/store.py"
 INVENTORY, PACKED, LIMITS = "tasks/inventory.py", "tasks/packed.py", "tasks/limits.py"
 BUCKET, LEASE, SHARED = "tasks/bucket.py", "tasks/lease.py", "tasks/shared.py"
@@ -269,8 +270,10 @@ FAULTS = (
           BY_FINGERS),
     Fault("hands-seen-once", "hnerf/body/hand_points.py", "seen_twice(hands[..., 0, 2])[..., None]", "1",
           "tests/body/test_hand_points.py"),
-    Fault("postures-by-group", "hnerf/body/posture_prior.py", "first + group * len(at) + ", "first + ",
-          "tests/body/test_posture_prior.py"),
+    Fault("fingers-usual", FINGERS, "hand[seen if seen.any() else ~seen]", "hand", BY_FINGERS),
+    Fault("forearms-twist", POSTURES, "axes[forearms, 1]", "axes[forearms, 0]", BY_POSTURES),
+    Fault("postures-by-group", POSTURES, "slice(first + group * size, first + (group + 1) * size)",
+          "slice(first, first + size)", BY_POSTURES),
     Fault("contour-cells", CONTOUR, "np.unique(row * width + column", "np.unique(row + column", BY_CONTOUR),
     Fault("contour-shape", CONTOUR, "border[frame, :, shape] += weighted_j", "border[frame, :, shape] += j",
           BY_CONTOUR),

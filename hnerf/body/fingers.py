@@ -1,4 +1,5 @@
-"""Fit of the fingers to hand points, with the body held: a relaxed hand where nothing is seen of them."""
+"""Fit of the fingers to hand points, with the body held: close to the person's usual hand, or a relaxed one if no frame
+shows it."""
 
 import itertools
 import math
@@ -9,11 +10,12 @@ import torch
 from torch import Tensor
 
 from hnerf.body.articulation import Articulation, Pose
-from hnerf.body.hand_points import OUTLIER_M, POINT_STD_M, SIDES, finger_joints, hand_points, moved_onto_palm
+from hnerf.body.hand_points import OUTLIER_M, POINT_STD_M, SEEN, SIDES, finger_joints, hand_points, moved_onto_palm
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.pose_prior import add_turn_prior
 from hnerf.body.reprojection import Views, reprojection_term
 from hnerf.body.rig import Rig
+from hnerf.body.robust import geman_mcclure
 
 # By segment, from the palm: flexion of a relaxed hand, and standard deviations of flexion, twist and spread, all in
 # degrees and chosen wide; fingers bend between the limits, from straight, and spread up to theirs, to either side, from
@@ -25,8 +27,11 @@ THUMB_STD_DEG = ((15.0, 10.0, 15.0), (15.0, 2.0, 5.0), (20.0, 2.0, 2.0))
 LIMITS_DEG = (-10.0, 100.0)
 SPREAD_LIMITS_DEG, THUMB_SPREAD_LIMITS_DEG = (20.0, 5.0, 5.0), (35.0, 5.0, 5.0)
 RATE_DEG_S = 200.0  # standard deviation of a finger joint's speed: a fist closes in a third of a second
-# Steps, with what counts as an outlier: a fist is a decimetre from a relaxed hand. Then as for the palm.
-STEPS_M, DAMPING = (0.2, 0.2, 0.2, 0.2, *6 * (OUTLIER_M,)), 1e-4
+# Steps, with what counts as an outlier: a fist is a decimetre from a relaxed hand. Then as for the palm. The last steps
+# also hold each joint close to its median over the frames that show the hand.
+STEPS_M, USUAL_STEPS, DAMPING = (0.2, 0.2, 0.2, 0.2, *12 * (OUTLIER_M,)), 6, 1e-4
+USUAL_STD_DEG, USUAL_OUTLIER_DEG = 5.0, 20.0  # std about the median, and deviation of another gesture
+MIN_USUAL_FRAMES = 3
 
 
 @dataclass(frozen=True)
@@ -92,6 +97,21 @@ def add_persistence(equations: NormalEquations, turns: Tensor, following: np.nda
     return 0.5 * weight * float((change**2).sum())
 
 
+def add_usual(equations: NormalEquations, turns: Tensor, shown: Tensor) -> float:
+    """Add a robust prior that keeps turns (n, 30, 3) close to their medians over the frames that show their hand, shown
+    (n, 2) bool, and return its cost: a network mistakes small fingers differently in each frame. A hand that few frames
+    show has none."""
+    known = (shown.sum(0) >= MIN_USUAL_FRAMES).repeat_interleave(15)
+    by_hand = zip(turns.split(15, 1), shown.T, strict=True)
+    median = torch.cat([hand[seen if seen.any() else ~seen].quantile(0.5, dim=0) for hand, seen in by_hand])
+    off = torch.where(known[:, None], turns - median, 0.0)
+    weight, cost = geman_mcclure(off.square().sum(-1), math.radians(USUAL_STD_DEG), math.radians(USUAL_OUTLIER_DEG))
+    equations.frame_gradient += (weight[..., None] * off).flatten(1).numpy()
+    at = np.arange(3 * len(known))
+    equations.frame[0][:, at, at] += (weight * known).repeat_interleave(3, 1).numpy()
+    return float(cost.sum())
+
+
 def fit_fingers(pose: Pose, views: Views, scale_m: Tensor, runs: list[tuple[int, ...]], seconds: float) -> Pose:
     """Return the pose with fingers fitted to hand points (C, n, 42) relative to their palm, everything else held.
 
@@ -112,13 +132,16 @@ def fit_fingers(pose: Pose, views: Views, scale_m: Tensor, runs: list[tuple[int,
     if not (theta[:, fingers] != 0).any():
         theta[:, fingers] = prior.relaxed()
     views = moved_onto_palm(views, articulation.jacobian(points, articulation.pose(pose))[0])
-    for outlier_m in STEPS_M:
+    shown = (views.confidence[..., [0, 21]] > SEEN).any(0)
+    for number, outlier_m in enumerate(STEPS_M):
         x, by_frame, _ = articulation.jacobian(points, articulation.pose(replace(pose, theta=theta)))
         matrix, pull, _ = reprojection_term(views, scale_m, x, POINT_STD_M, outlier_m)
         equations = NormalEquations(len(theta), len(unknowns), 0)
         equations.add_points(matrix, pull, by_frame[..., unknowns], x.new_zeros(*x.shape, 0))
         prior.add(equations, theta[:, fingers])
         add_persistence(equations, theta[:, fingers], following, math.radians(RATE_DEG_S) * seconds)
+        if number >= len(STEPS_M) - USUAL_STEPS:
+            add_usual(equations, theta[:, fingers], shown)
         step, _ = equations.step(DAMPING, np.zeros(0), np.zeros(0))
         theta[:, fingers] += torch.from_numpy(step).unflatten(-1, (-1, 3))
     return replace(pose, theta=theta)

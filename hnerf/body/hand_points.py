@@ -93,10 +93,6 @@ class PalmTerm:
         equations.add_points(matrix, pull, by_frame, by_shape)
         return cost
 
-    def seen(self) -> Tensor:
-        """Return how surely either hand is seen in each frame, (n, 2) in [0, 1]: as by the surest camera."""
-        return self.views.confidence[..., [0, 21]].amax(0)
-
 
 def moved_onto_palm(views: Views, x: Tensor) -> Views:
     """Return the views of hand points moved in each view so that the means of the palms are where those of x (n, 42, 3)

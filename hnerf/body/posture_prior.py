@@ -10,10 +10,13 @@ from torch import Tensor
 
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.normal_equations import NormalEquations
+from hnerf.body.pose_prior import PosePrior
 from hnerf.body.robust import geman_mcclure
 from hnerf.geometry.camera import Camera
 
-WRIST_STD_DEG, WRIST_OUTLIER_DEG = 5.0, 10.0  # std of a joint's turn, and deviation of another posture
+# Standard deviation of a joint's turn, and deviation of another posture.
+WRIST_STD_DEG, WRIST_OUTLIER_DEG = 5.0, 15.0
+TWIST_STD_DEG, TWIST_OUTLIER_DEG = 10.0, 40.0  # of forearms about their bones
 POSTURE_STD_DEG, POSTURE_OUTLIER_DEG = 7.0, 14.0
 MIN_STD_DEG = 2.0  # a first fit cannot show smaller ones
 SINGLE_POSTURE_STD_DEG = 0.1  # of joints that stand still
@@ -28,24 +31,29 @@ class PosturePrior:
     posture go.
 
     groups: the frames' rows, each in one of them; trust (n, M - 1) by frame and free joint: 0 is none, 1 is full; std
-    (n, M - 1) and outlier in radians.
+    (n, M - 1) and outlier (M - 1,) in radians; held (M - 1, 3, 3): projects a deviation onto the axes that are held.
     """
 
     groups: list[list[int]]
     trust: Tensor
     std: Tensor
-    outlier: float
+    outlier: Tensor
+    held: Tensor
 
     @staticmethod
-    def of_wrists(frames: int, articulation: Articulation, seen: Tensor | None = None) -> "PosturePrior":
-        """Return a prior on the wrists alone, over all frames: no keypoint of the body shows how they turn. seen (n,
-        2): how surely the points of the left and of the right hand do."""
-        names = [articulation.rig.joint_names[joint] for joint in articulation.joints[1:].tolist()]
-        trust = torch.zeros(frames, len(names), dtype=torch.float64)
-        for hand, side in enumerate("LR"):
-            wrists = [m for m, name in enumerate(names) if name == f"wrist.{side}"]
-            trust[:, wrists] = 1.0 if seen is None else 1 - seen[:, hand, None]
-        return PosturePrior.uniform([list(range(frames))], trust, WRIST_STD_DEG, WRIST_OUTLIER_DEG)
+    def of_hands(frames: int, articulation: Articulation) -> "PosturePrior":
+        """Return a prior on wrists and on the twist of forearms, over all frames: no keypoint of the body shows how
+        these turn, and in images of a few hundred pixels a network mistakes the turn of a hand in single frames."""
+        names = [articulation.rig.joint_names[joint].split(".")[0] for joint in articulation.joints[1:].tolist()]
+        wrists, forearms = (torch.tensor([part == name for name in names]) for part in ("wrist", "lowerarm01"))
+        prior = PosturePrior.uniform(
+            [list(range(frames))], (wrists | forearms).expand(frames, -1).double(), WRIST_STD_DEG, WRIST_OUTLIER_DEG
+        )
+        prior.std[:, forearms] = math.radians(TWIST_STD_DEG)
+        prior.outlier[forearms] = math.radians(TWIST_OUTLIER_DEG)
+        bones = PosePrior(articulation).axes[forearms, 1]
+        prior.held[forearms] = bones[:, :, None] * bones[:, None]
+        return prior
 
     @staticmethod
     def of_single_view(groups: list[list[int]], pose: Pose, camera: Camera) -> "PosturePrior":
@@ -63,7 +71,8 @@ class PosturePrior:
     @staticmethod
     def uniform(groups: list[list[int]], trust: Tensor, std_deg: float, outlier_deg: float) -> "PosturePrior":
         """Return a prior with the same standard deviation for all joints and frames."""
-        return PosturePrior(groups, trust, torch.full_like(trust, math.radians(std_deg)), math.radians(outlier_deg))
+        std, outlier = torch.full_like(trust, std_deg).deg2rad(), torch.full_like(trust[0], outlier_deg).deg2rad()
+        return PosturePrior(groups, trust, std, outlier, torch.eye(3, dtype=trust.dtype).repeat(len(outlier), 1, 1))
 
     def with_learned_std(self, pose: Pose) -> "PosturePrior":
         """Return the prior with each joint's standard deviation as found in a first fit, between 2 degrees and the
@@ -99,17 +108,20 @@ class PosturePrior:
         the frames to the medians from before it; after it the medians are computed anew.
         """
         off = self._deviations(pose.theta[:, articulation.joints[1:]])
+        off = (self.held @ off[..., None])[..., 0]
         weight, cost = geman_mcclure(off.square().sum(-1) * self.trust, self.std, self.outlier)
-        weights = (weight * self.trust).repeat_interleave(3, 1).numpy()  # (n, 3 (M - 1))
-        pull = weights * off.flatten(1).numpy()
+        weight *= self.trust
+        pull, size = (weight[..., None] * off).flatten(1).numpy(), 3 * len(self.held)
+        matrix, at = off.new_zeros(len(off), len(self.held), 3, len(self.held), 3), torch.arange(len(self.held))
+        matrix[:, at, :, at] = weight.T[..., None, None] * self.held[:, None]
+        weights = matrix.reshape(len(off), size, size).numpy()
         equations.frame_gradient[:, 6:] += pull
-        at = np.arange(6, articulation.unknowns)
-        equations.frame[0][:, at, at] += weights
+        equations.frame[0][:, 6:, 6:] += weights
         first = len(equations.shared) - self.unknowns(articulation)
         for group, rows in enumerate(self.groups):
-            own = first + group * len(at) + np.arange(len(at))
-            equations.border[np.array(rows)[:, None], at, own] -= weights[rows]
-            equations.shared[own, own] += weights[rows].sum(0) + REGULARISATION
+            own = slice(first + group * size, first + (group + 1) * size)
+            equations.border[rows, 6:, own] -= weights[rows]
+            equations.shared[own, own] += weights[rows].sum(0) + REGULARISATION * np.eye(size)
             equations.shared_gradient[own] -= pull[rows].sum(0)
         return float(cost.sum())
 

@@ -3,7 +3,7 @@
 from torch import Tensor
 
 
-def geman_mcclure(squared: Tensor, sigma: float | Tensor, outlier: float) -> tuple[Tensor, Tensor]:
+def geman_mcclure(squared: Tensor, sigma: float | Tensor, outlier: float | Tensor) -> tuple[Tensor, Tensor]:
     """Return Geman-McClure (1987) weights of re-weighted least squares for squared residuals, and the costs, each of
     their shape.
 

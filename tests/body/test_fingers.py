@@ -8,7 +8,7 @@ import torch
 from hnerf.body import fingers
 from hnerf.body.anny import anny_rig
 from hnerf.body.articulation import Articulation, Pose
-from hnerf.body.fingers import FingerPrior, add_persistence, fit_fingers
+from hnerf.body.fingers import FingerPrior, add_persistence, add_usual, fit_fingers
 from hnerf.body.hand_points import finger_joints, hand_points
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.rig import Rig, joint_transforms
@@ -122,7 +122,7 @@ def test_fingers_persist_within_a_run_at_their_rate(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(fingers, "STEPS_M", (0.2,))
     monkeypatch.setattr(fingers, "add_persistence", lambda _, __, *given: asked.append(given))
     pose = posed(FingerPrior.of(RIG).relaxed(), 5)
-    fit_fingers(pose, views_of(seen_points(pose)), torch.full((2, 5), 0.009), [(0, 1), (5, 6, 7)], 0.1)
+    fit_fingers(pose, views_of(seen_points(pose)), torch.full((2, 5), 0.0045), [(0, 1), (5, 6, 7)], 0.1)
     ((following, std),) = asked
     assert following.tolist() == [0, 2, 3] and math.isclose(std, math.radians(20))
 
@@ -134,6 +134,39 @@ def test_fingers_begin_relaxed_unless_they_are_given(monkeypatch: pytest.MonkeyP
         pose = posed(given, 1)
         found = fit_fingers(pose, views_of(seen_points(pose)), torch.full((2, 1), 0.009), [(0,)], 0.1)
         torch.testing.assert_close(found.theta[0, FINGERS], begun)
+
+
+SHOWN = torch.tensor([[True, False], [True, True], [True, True], [False, False]])
+
+
+def test_an_unusual_finger_costs_a_half_and_a_gesture_little_more() -> None:
+    """A joint of the left hand is 5 degrees off its median of the three frames that show the hand: 0.5 / (1 + (5 /
+    20)^2); 300 off, nearly (20 / 5)^2 / 2. Two frames show the right hand, which is too few for a median."""
+    for off_deg, cost in ((5.0, 0.5 / (1 + 1 / 16)), (300.0, 0.5 * 60**2 / (1 + 15**2))):
+        turns = torch.full((4, 30, 3), 0.1, dtype=torch.float64)
+        turns[2, 4, 0] += math.radians(off_deg)
+        turns[1, 20, 0] += 1.0
+        np.testing.assert_allclose(add_usual(NormalEquations(4, 90, 0), turns, SHOWN), cost)
+
+
+def test_the_usual_hand_is_that_of_the_frames_that_show_it() -> None:
+    """Half of the frames see nothing, and have another hand; these are pulled to the others', not half-way."""
+    turns = torch.zeros(6, 30, 3, dtype=torch.float64)
+    turns[3:, :, 0] = 0.2
+    equations = NormalEquations(6, 90, 0)
+    add_usual(equations, turns, torch.tensor([[True, True]] * 3 + [[False, False]] * 3))
+    assert not equations.frame_gradient[:3].any() and (equations.frame_gradient[3:, ::3] > 0).all()
+
+
+def test_the_gradient_towards_the_usual_hand_is_that_of_the_cost_while_medians_stand_still() -> None:
+    turns = torch.zeros(3, 30, 3, dtype=torch.float64)
+    turns[2] = torch.rand(30, 3, generator=torch.Generator().manual_seed(0)).double()
+    shown, step = torch.ones(3, 2, dtype=torch.bool), torch.zeros_like(turns)
+    step[2] = 1e-6
+    ends = [add_usual(NormalEquations(3, 90, 0), turns + sign * step, shown) for sign in (1, -1)]
+    equations = NormalEquations(3, 90, 0)
+    add_usual(equations, turns, shown)
+    np.testing.assert_allclose(equations.frame_gradient[2].sum(), (ends[0] - ends[1]) / 2e-6, rtol=1e-6)
 
 
 def test_gradients_are_those_of_the_costs() -> None:
@@ -164,3 +197,18 @@ def test_bent_fingers_are_found_and_unseen_ones_relax() -> None:
     torch.testing.assert_close(found.theta[:, FINGERS[15:]], prior.relaxed()[15:].expand(3, -1, -1))
     rest = [j for j in range(len(RIG.joint_names)) if j not in FINGERS]
     torch.testing.assert_close(found.theta[:, rest], true.theta[:, rest])
+
+
+def test_a_frame_that_hides_a_hand_shows_the_usual_one_and_a_gesture_stays() -> None:
+    """In frames far apart the left hand is bent by 30 degrees; one frame hides it, and in another it is bent by 65,
+    where the usual hand's points would be 3 cm off."""
+    prior = FingerPrior.of(RIG)
+    bend = torch.deg2rad(torch.tensor([30, 30, 30, 30, 65], dtype=torch.float64))[:, None, None]
+    true = posed(prior.relaxed() + bend * prior.axes[:, 0] * (torch.arange(30) % 15 >= 3)[:, None], 5)
+    views = views_of(seen_points(true))
+    views.confidence[:, 1] = 0
+    start = posed(torch.zeros(30, 3, dtype=torch.float64), 5)
+    found = fit_fingers(start, views, torch.full((2, 5), 0.009), [(t,) for t in range(0, 50, 10)], 0.1)
+    off_m = (seen_points(found) - seen_points(true))[:, :21].norm(dim=-1).mean(1)
+    usual_off_m = (seen_points(true)[0] - seen_points(true)[4])[:21].norm(dim=-1).mean()
+    assert off_m[1] < 0.004 and off_m[4] < 0.012 and usual_off_m > 0.03

