@@ -54,8 +54,8 @@ def _eyes_off(points: np.ndarray, joints: np.ndarray, weights: np.ndarray, skele
     for j, (token, bind) in enumerate(
         zip(skeleton.GetJointsAttr().Get(), skeleton.GetBindTransformsAttr().Get(), strict=True)
     ):
-        name, ball = token.rpartition("/")[2], points[((joints == j) & (weights > 0)).any(1)]
-        if name.startswith("eye_") and len(ball):
+        name = token.rpartition("/")[2]
+        if name.startswith("eye_") and len(ball := points[((joints == j) & (weights > 0)).any(1)]):
             low, high = ball.min(0), ball.max(0)
             if np.linalg.norm(bind.ExtractTranslation() - (low + high) / 2) > EYE_OFF * (high - low).min() / 2:
                 off.append(name)
