@@ -15,7 +15,7 @@ from hnerf.avatar.trained import load_avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.calibration.report import load_cameras
 from hnerf.capture.capture import Capture
-from hnerf.evaluation.pictures import clay, crop, cropped_camera, frame_person, overlay_surface
+from hnerf.evaluation.pictures import clay, crop, cropped_camera, frame_person, overlay_surface, shoot
 from hnerf.geometry.mesh_queries import Surface
 
 
@@ -40,7 +40,7 @@ def main() -> None:
         photograph,
         overlay_surface(photograph, Surface(body), close),
         crop(rendered, box),
-        clay(Surface(posed_surface(avatar, options.frame)), close),
+        clay(shoot(Surface(posed_surface(avatar, options.frame)), close)),
     ]
     cv2.imwrite(str(options.out), cv2.cvtColor(np.hstack(panels), cv2.COLOR_RGB2BGR))
 

@@ -3,12 +3,13 @@ RGB."""
 
 import cv2
 import numpy as np
+import trimesh
 
 from hnerf.asset.splat_rendering import render_splats
 from hnerf.asset.splats import OPACITY, Splats
 from hnerf.asset.srgb import to_linear, to_srgb
 from hnerf.asset.staging import StagedAvatar
-from hnerf.evaluation.pictures import cast_pixels, downsampled, normals_at, portrait_camera, studio_light, supersampled
+from hnerf.evaluation.pictures import Shot, normals_at, portrait_camera, shoot, studio_light, supersampled
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.geometry.rays import RayHits
@@ -30,11 +31,9 @@ def turntable_cameras(points_m: np.ndarray, facing: np.ndarray, count: int) -> l
     return cameras
 
 
-def textured(surface: Surface, avatar: StagedAvatar, camera: Camera) -> np.ndarray:
+def textured(shot: Shot, avatar: StagedAvatar) -> np.ndarray:
     """Render a posed surface of the avatar with its texture, without light, on white."""
-    fine = supersampled(camera)
-    hits = cast_pixels(surface, fine)
-    return downsampled(_texture_colours(hits, avatar, avatar.texture, fine), hits, camera)
+    return shot.averaged(_texture_colours(shot, avatar, avatar.texture))
 
 
 def looks_on_black(
@@ -43,21 +42,19 @@ def looks_on_black(
     """Render a posed surface of the avatar as a camera exposes it, over black and with its coverage, (H, W, 4) uint8,
     averaged to the size (width, height): "asset", with the captured texture, and "albedo", in its light, if there is
     one."""
-    fine = supersampled(camera)
-    hits = cast_pixels(surface, fine)
-    colours = {"asset": _texture_colours(hits, avatar, avatar.texture, fine)}
+    shot = shoot(surface, camera)
+    colours = {"asset": _texture_colours(shot, avatar, avatar.texture)}
     if avatar.albedo:
-        normals = normals_at(surface.mesh, hits) @ avatar.stage_from_world.T
-        unlit = to_linear(_texture_colours(hits, avatar, avatar.albedo.texture, fine) / 255)
+        normals = normals_at(shot.mesh, shot.hits) @ avatar.stage_from_world.T
+        unlit = to_linear(_texture_colours(shot, avatar, avatar.albedo.texture) / 255)
         lit = to_srgb(unlit * avatar.albedo.light.irradiance(normals)[:, None])
         colours["albedo"] = (255 * lit).astype(np.float32)
-    return {look: _exposed(found, hits, fine, size_px, gain) for look, found in colours.items()}
+    return {look: _exposed(found, shot, size_px, gain) for look, found in colours.items()}
 
 
-def _exposed(
-    colours: np.ndarray, hits: RayHits, fine: Camera, size_px: tuple[int, int], gain: tuple[float, float, float]
-) -> np.ndarray:
+def _exposed(colours: np.ndarray, shot: Shot, size_px: tuple[int, int], gain: tuple[float, float, float]) -> np.ndarray:
     """Return colours (N, 3) from 0 to 255 of a camera's rays as it exposes them, as `looks_on_black` does."""
+    fine, hits = shot.fine, shot.hits
     exposed = np.minimum(colours * np.array(gain, np.float32), 255)
     pixels = np.concatenate([exposed, np.full((len(exposed), 1), 255, np.float32)], 1) * (hits.face[:, None] >= 0)
     averaged = cv2.resize(pixels.reshape(fine.height_px, fine.width_px, 4), size_px, interpolation=cv2.INTER_AREA)
@@ -75,36 +72,36 @@ def splats_on_black(
     return averaged.round().astype(np.uint8)
 
 
-def _texture_colours(hits: RayHits, avatar: StagedAvatar, texture: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return a texture's colours at the hits of a camera's pixels, row by row, (N, 3) float32 from 0 to 255, of no
-    meaning where a ray meets nothing."""
+def _texture_colours(shot: Shot, avatar: StagedAvatar, texture: np.ndarray) -> np.ndarray:
+    """Return a texture's colours at the hits of rays, (N, 3) float32 from 0 to 255, of no meaning where a ray meets
+    nothing."""
+    fine, hits = shot.fine, shot.hits
     height_px, width_px = texture.shape[:2]
     texel_px = np.zeros((len(hits.face), 2), np.float32)  # centres at integers, rows from the top
     uv = hits.interpolate(avatar.uvs, avatar.face_uvs)
     texel_px[hits.face >= 0] = uv * (width_px, -height_px) + (-0.5, height_px - 0.5)
-    columns, rows = texel_px.reshape(camera.height_px, camera.width_px, 2).transpose(2, 0, 1)
+    columns, rows = texel_px.reshape(fine.height_px, fine.width_px, 2).transpose(2, 0, 1)
     colours = cv2.remap(texture, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return colours.reshape(-1, 3).astype(np.float32)
 
 
-def wireframe(surface: Surface, camera: Camera) -> np.ndarray:
+def wireframe(shot: Shot) -> np.ndarray:
     """Render the edges of the surface's faces that a camera sees, on white."""
-    fine = supersampled(camera)
-    hits = cast_pixels(surface, fine)
+    hits = shot.hits
     colours = np.zeros((len(hits.face), 3), np.float32)
-    pixel_m = hits.distance_m[hits.face >= 0] / fine.K[0, 0]
-    edge = _to_edge_m(surface, hits) < LINE_PX * pixel_m
+    pixel_m = hits.distance_m[hits.face >= 0] / shot.fine.K[0, 0]
+    edge = _to_edge_m(shot.mesh, hits) < LINE_PX * pixel_m
     colours[hits.face >= 0] = np.where(edge[:, None], LINE, PAPER)
-    return downsampled(colours * studio_light(surface.mesh, hits, fine), hits, camera)
+    return shot.averaged(colours * studio_light(shot))
 
 
-def _to_edge_m(surface: Surface, hits: RayHits) -> np.ndarray:
+def _to_edge_m(mesh: trimesh.Trimesh, hits: RayHits) -> np.ndarray:
     """Return the distance from each hit to the nearest edge of its face: the least barycentric coordinate times its
     height."""
     met = hits.face >= 0
-    corners_m = surface.mesh.vertices[surface.mesh.faces[hits.face[met]]]
+    corners_m = mesh.vertices[mesh.faces[hits.face[met]]]
     edges_m = np.linalg.norm(np.roll(corners_m, -1, 1) - np.roll(corners_m, -2, 1), axis=2)  # opposite to each corner
-    heights_m = 2 * surface.mesh.area_faces[hits.face[met]][:, None] / edges_m.clip(1e-9)
+    heights_m = 2 * mesh.area_faces[hits.face[met]][:, None] / edges_m.clip(1e-9)
     return (hits.barycentric[met] * heights_m).min(1)
 
 

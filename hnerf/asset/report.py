@@ -1,5 +1,7 @@
 """The report of the asset: one self-contained HTML file beside it, which links to the viewer."""
 
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +16,12 @@ from hnerf.asset.pictures import texture_picture, textured, turntable_cameras, u
 from hnerf.asset.skeleton import FRONT
 from hnerf.asset.staging import StagedAvatar
 from hnerf.evaluation.galleries import GalleryPicture
-from hnerf.evaluation.pictures import clay, data_uri
+from hnerf.evaluation.pictures import clay, data_uri, shoot
 from hnerf.evaluation.report import report_environment
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.mesh_queries import Surface
+from hnerf.side_by_side import side_by_side
 
 TEMPLATES = Path(__file__).parent / "page"
 TURNS = 8  # views of the turntable
@@ -41,24 +44,21 @@ def write_report(
     facing = avatar.stage_from_world @ -world_from_body[:3, 1]
     points_m = avatar.points_m[list(avatar.frames).index(frame)].astype(np.float64)
     surface = Surface(trimesh.Trimesh(points_m, avatar.faces, process=False))
-    cameras = turntable_cameras(points_m, facing, TURNS)
-    front, back = cameras[0], cameras[TURNS // 2]
+    shots = list(side_by_side(partial(shoot, surface), turntable_cameras(points_m, facing, TURNS)))
+    front, back = shots[0], shots[TURNS // 2]
     page = report_environment(TEMPLATES).get_template("asset.html")
     path.write_text(
         page.render(
             name=name,
             frame=frame,
             has_viewer=(path.parent / "viewer.html").exists(),
-            turntable=[
-                _picture(f"{round(360 * k / TURNS)}°", textured(surface, avatar, camera))
-                for k, camera in enumerate(cameras)
-            ],
+            turntable=[_picture(f"{round(360 * k / TURNS)}°", textured(shot, avatar)) for k, shot in enumerate(shots)],
             surface=[
-                _picture("Clay, front", clay(surface, front)),
-                _picture("Clay, back", clay(surface, back)),
-                _picture("Wireframe, front", wireframe(surface, front)),
-                _picture("Wireframe, back", wireframe(surface, back)),
-                *_less_detail(avatar, points_m, front),
+                _picture("Clay, front", clay(front)),
+                _picture("Clay, back", clay(back)),
+                _picture("Wireframe, front", wireframe(front)),
+                _picture("Wireframe, back", wireframe(back)),
+                *_less_detail(avatar, points_m, front.camera),
             ],
             texture=[
                 _picture("Texture", texture_picture(avatar.texture, SQUARE_PX)),
@@ -66,7 +66,7 @@ def write_report(
                 *_without_light(avatar),
             ],
             against_field=[_beside_field(view) for view in evenly_spaced(compared, COMPARED)],
-            poses=[picture for pose in poses for picture in _extreme(pose, avatar)],
+            poses=list(chain.from_iterable(side_by_side(partial(_extreme, avatar), poses))),
             figures=figures,
         ),
         encoding="utf-8",
@@ -89,7 +89,7 @@ def _less_detail(avatar: StagedAvatar, points_m: np.ndarray, camera: Camera) -> 
     """Return the wireframe of each lower level of detail."""
     meshes = [trimesh.Trimesh(points_m[lv.vertices], lv.faces, process=False) for lv in avatar.levels[1:]]
     return [
-        _picture(f"lod{level}, {len(mesh.faces)} triangles", wireframe(Surface(mesh), camera))
+        _picture(f"lod{level}, {len(mesh.faces)} triangles", wireframe(shoot(Surface(mesh), camera)))
         for level, mesh in enumerate(meshes, 1)
     ]
 
@@ -105,13 +105,13 @@ def _without_light(avatar: StagedAvatar) -> list[GalleryPicture]:
     ]
 
 
-def _extreme(pose: ExtremePose, avatar: StagedAvatar) -> list[GalleryPicture]:
+def _extreme(avatar: StagedAvatar, pose: ExtremePose) -> list[GalleryPicture]:
     """Return a pose in clay and textured."""
     surface = Surface(trimesh.Trimesh(pose.points_m, avatar.faces, process=False))
-    camera = turntable_cameras(pose.points_m[pose.shown], FRONT, 1)[0]
+    shot = shoot(surface, turntable_cameras(pose.points_m[pose.shown], FRONT, 1)[0])
     return [
-        _picture(f"{pose.name}: {100 * pose.crossing:.1f} % of faces cross", clay(surface, camera)),
-        _picture(pose.name, textured(surface, avatar, camera)),
+        _picture(f"{pose.name}: {100 * pose.crossing:.1f} % of faces cross", clay(shot)),
+        _picture(pose.name, textured(shot, avatar)),
     ]
 
 

@@ -95,11 +95,13 @@ def surface_row(frame: int, mesh: trimesh.Trimesh, truth: trimesh.Trimesh | None
     points_m = mesh.vertices if truth is None else np.concatenate([mesh.vertices, truth.vertices])
     cameras = {side: pictures.portrait_camera(points_m, root, side) for side in ("front", "back")}
     surface = Surface(mesh)
-    row = [(f"Surface, {side}", pictures.clay(surface, camera)) for side, camera in cameras.items()]
+    shots = {side: pictures.shoot(surface, camera) for side, camera in cameras.items()}
+    row = [(f"Surface, {side}", pictures.clay(shot)) for side, shot in shots.items()]
     if truth is not None:
         true_surface = Surface(truth)
-        row += [(f"Ground truth, {side}", pictures.clay(true_surface, camera)) for side, camera in cameras.items()]
-        row += [(f"Distance, {side}", pictures.distance_map(surface, true_surface, c)) for side, c in cameras.items()]
+        true_shots = {side: pictures.shoot(true_surface, camera) for side, camera in cameras.items()}
+        row += [(f"Ground truth, {side}", pictures.clay(shot)) for side, shot in true_shots.items()]
+        row += [(f"Distance, {side}", pictures.distance_map(shot, true_surface)) for side, shot in shots.items()]
     return Row(f"Frame {frame}", note, _captioned(row))
 
 

@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -103,23 +104,42 @@ def error_map(rendered: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return _colour_map(error / FULL_ERROR)
 
 
-def clay(surface: Surface, camera: Camera) -> np.ndarray:
+@dataclass(frozen=True)
+class Shot:
+    """A surface as a camera's picture shows it, in one look or another: the camera with SUPERSAMPLING times the pixels
+    along each side, and the hits of their rays, row by row."""
+
+    mesh: trimesh.Trimesh
+    camera: Camera
+    fine: Camera
+    hits: RayHits
+
+    def averaged(self, colours: np.ndarray) -> np.ndarray:
+        """Return the picture (H, W, 3) uint8 of the rays' colours (N, 3), 0 to 255, on white."""
+        fine = np.where(self.hits.face[:, None] >= 0, colours, BACKGROUND).astype(np.float32)
+        fine = fine.reshape(self.fine.height_px, self.fine.width_px, 3)
+        return cv2.resize(fine, self.camera.size_px, interpolation=cv2.INTER_AREA).clip(0, 255).astype(np.uint8)
+
+
+def shoot(surface: Surface, camera: Camera) -> Shot:
+    """Cast the rays of a camera's picture."""
+    fine = supersampled(camera)
+    return Shot(surface.mesh, camera, fine, cast_pixels(surface, fine))
+
+
+def clay(shot: Shot) -> np.ndarray:
     """Render the surface as a grey model on white."""
-    fine = supersampled(camera)
-    hits = cast_pixels(surface, fine)
-    return downsampled(DISTANCE_COLOURS[0] * studio_light(surface.mesh, hits, fine), hits, camera)
+    return shot.averaged(DISTANCE_COLOURS[0] * studio_light(shot))
 
 
-def distance_map(surface: Surface, truth: Surface, camera: Camera) -> np.ndarray:
+def distance_map(shot: Shot, truth: Surface) -> np.ndarray:
     """Render the surface coloured by its distance to the truth: grey is none, dark red FULL_DISTANCE_M or more."""
-    fine = supersampled(camera)
-    hits = cast_pixels(surface, fine)
-    met = hits.face >= 0
-    distance_m, _ = truth.closest(hits.interpolate(surface.mesh.vertices, surface.mesh.faces))
+    met = shot.hits.face >= 0
+    distance_m, _ = truth.closest(shot.hits.interpolate(shot.mesh.vertices, shot.mesh.faces))
     steps = np.linspace(0, FULL_DISTANCE_M, len(DISTANCE_COLOURS))
     colours = np.zeros((len(met), 3), np.float32)
     colours[met] = np.stack([np.interp(distance_m, steps, channel) for channel in DISTANCE_COLOURS.T], 1)
-    return downsampled(colours * studio_light(surface.mesh, hits, fine), hits, camera)
+    return shot.averaged(colours * studio_light(shot))
 
 
 def portrait_camera(points_m: np.ndarray, root: np.ndarray, side: str) -> Camera:
@@ -153,9 +173,9 @@ def normals_at(mesh: trimesh.Trimesh, hits: RayHits) -> np.ndarray:
     return normals
 
 
-def studio_light(mesh: trimesh.Trimesh, hits: RayHits, camera: Camera) -> np.ndarray:
-    """Return the brightness (N, 1) under a key light, a light at the camera, and ambient light."""
-    normals = normals_at(mesh, hits) @ camera.R.T
+def studio_light(shot: Shot) -> np.ndarray:
+    """Return the brightness (N, 1) of rays under a key light, a light at the camera, and ambient light."""
+    normals = normals_at(shot.mesh, shot.hits) @ shot.camera.R.T
     light = 0.30 + 0.62 * (normals @ KEY_LIGHT).clip(0, 1) + 0.16 * (-normals[:, 2]).clip(0, 1)
     return light[:, None]
 
@@ -167,15 +187,8 @@ def _headlight(mesh: trimesh.Trimesh, hits: RayHits, camera: Camera) -> np.ndarr
 
 
 def supersampled(camera: Camera) -> Camera:
-    """Return the camera with SUPERSAMPLING times the pixels along each side, for `downsampled`."""
+    """Return the camera with SUPERSAMPLING times the pixels along each side."""
     return camera.scaled(SUPERSAMPLING)
-
-
-def downsampled(colours: np.ndarray, hits: RayHits, camera: Camera) -> np.ndarray:
-    """Average the colours of supersampled rays (N, 3), 0 to 255, over a white background, to the camera's own size."""
-    fine = np.where(hits.face[:, None] >= 0, colours, BACKGROUND).astype(np.float32)
-    fine = fine.reshape(camera.height_px * SUPERSAMPLING, camera.width_px * SUPERSAMPLING, 3)
-    return cv2.resize(fine, camera.size_px, interpolation=cv2.INTER_AREA).clip(0, 255).astype(np.uint8)
 
 
 def _colour_map(values: np.ndarray) -> np.ndarray:

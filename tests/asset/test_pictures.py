@@ -8,6 +8,7 @@ from hnerf.asset import pictures
 from hnerf.asset.levels import Level
 from hnerf.asset.staging import StagedAvatar
 from hnerf.asset.texture import UvLayout
+from hnerf.evaluation.pictures import shoot
 from hnerf.geometry.mesh_queries import Surface
 
 RED, GREEN, BLUE = [255, 0, 0], [0, 255, 0], [0, 0, 255]
@@ -31,7 +32,7 @@ def surface_of(card: StagedAvatar) -> Surface:
 
 def test_the_texture_is_seen_upright_from_the_front(card: StagedAvatar) -> None:
     front = pictures.turntable_cameras(card.points_m[0], FRONT, 4)[0]
-    picture = pictures.textured(surface_of(card), card, front)
+    picture = pictures.textured(shoot(surface_of(card), front), card)
     # 300 x 400 px; the card is 282 px wide and as high, in the middle
     assert picture[100, 60].tolist() == RED
     assert picture[100, 240].tolist() == GREEN
@@ -48,7 +49,7 @@ def test_the_turntable_goes_around_the_person(card: StagedAvatar) -> None:
 
 def test_edges_are_lines_and_faces_are_not(card: StagedAvatar) -> None:
     front = pictures.turntable_cameras(card.points_m[0], FRONT, 4)[0]
-    picture = pictures.wireframe(surface_of(card), front).astype(int)
+    picture = pictures.wireframe(shoot(surface_of(card), front)).astype(int)
     diagonal, inside = picture[199, 150], picture[150, 100]
     assert inside.max() - inside.min() < 15  # grey
     assert diagonal[2] - diagonal[0] > 40  # blue
