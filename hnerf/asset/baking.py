@@ -6,7 +6,7 @@ import numpy as np
 from hnerf.asset.albedo import Albedo, AlbedoBlend, mean_irradiance
 from hnerf.asset.field_colours import field_colours
 from hnerf.asset.light import fit_light
-from hnerf.asset.photographs import CapturedBlend, photographed_texels, sampled
+from hnerf.asset.photographs import CapturedBlend, SeenSurface, photographed_texels, sampled
 from hnerf.asset.shading import photographed_shading
 from hnerf.asset.texture import Texels, UvLayout, rasterise, texture_image
 from hnerf.avatar.avatar import Avatar
@@ -42,12 +42,12 @@ def baked_textures(
         return texture_image(texels, field * lit, settings.texture_px), None
     field = _coarse_field_colours(avatar, posed, layout, texels, settings.texture_px, cavities)
     frames = evenly_spaced(capture.train_frames, settings.photograph_frames)
-    photographed = {frame: surfaces_m[clothed.index(frame)] for frame in frames}
-    light = fit_light(photographed_shading(capture, avatar.gains, photographed, faces))
+    photographed = {frame: SeenSurface.of(surfaces_m[clothed.index(frame)], faces) for frame in frames}
+    light = fit_light(photographed_shading(capture, avatar.gains, photographed))
     seen_by_field = [surfaces_m[clothed.index(frame)] for frame in posed.frames]
     captured = CapturedBlend(field)
     albedo = AlbedoBlend(field, mean_irradiance(light, seen_by_field, faces, texels), light)
-    for seen in photographed_texels(capture, avatar.gains, photographed, faces, texels):
+    for seen in photographed_texels(capture, avatar.gains, photographed, texels):
         captured.add(seen)
         albedo.add(seen)
 

@@ -15,6 +15,7 @@ from hnerf.geometry.camera import Camera
 from hnerf.geometry.rays import cast, mesh_on_cpu
 from hnerf.progress import tracked
 from hnerf.side_by_side import side_by_side
+from hnerf.warp_import import wp
 
 OUTLIER = 0.15  # of a colour in [0, 1]: what differs more from the field is another limb, or a passing shadow
 COSINE_POWER = 4  # of the weight of a view by its angle to the normal
@@ -24,6 +25,22 @@ DEPTH_TOLERANCE_M = 0.01
 FAR_M = 1e3  # depth where a ray meets nothing
 BACK_PROJECTIONS = 3  # more sharpen noise
 FIELD_WEIGHT = 0.05  # of the field's colour; a view along the normal weighs 1
+
+
+@dataclass(frozen=True)
+class SeenSurface:
+    """The surface of a frame, for several cameras to see: vertices_m (V, 3), faces (F, 3), unit normals (V, 3), and the
+    mesh for rays."""
+
+    vertices_m: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    mesh: wp.Mesh
+
+    @classmethod
+    def of(cls, vertices_m: np.ndarray, faces: np.ndarray) -> "SeenSurface":
+        """Prepare the mesh of vertices_m (V, 3) and faces (F, 3)."""
+        return cls(vertices_m, faces, normals_of(vertices_m, faces), mesh_on_cpu(vertices_m, faces))
 
 
 @dataclass(frozen=True)
@@ -109,32 +126,32 @@ class CapturedBlend:
 
 
 def photographed_texels(
-    capture: Capture, gains: Gains, surfaces_m: Mapping[int, np.ndarray], faces: np.ndarray, texels: Texels
+    capture: Capture, gains: Gains, surfaces: Mapping[int, SeenSurface], texels: Texels
 ) -> Iterator[SeenTexels]:
-    """Yield what the training photographs of some frames show of the texels, where the surface does not hide them, away
-    from outlines. surfaces_m: vertices (V, 3) in the world by frame."""
+    """Yield what the training photographs of some frames, whose surfaces are given, show of the texels, where the
+    surface does not hide them, away from outlines."""
 
     def seen_in(view: tuple[int, str]) -> SeenTexels:
         frame, name = view
         camera, gain = capture.cameras[name], np.array(gains.get(name, (1.0, 1.0, 1.0)), np.float32)
         image = capture.image(name, frame)
-        index, cosine, normals, pixels_px = visible_texels(camera, surfaces_m[frame], faces, texels)
+        index, cosine, normals, pixels_px = visible_texels(camera, surfaces[frame], texels)
         x, y = np.round(pixels_px).astype(int).T
         at, pixel = _distinct(y * camera.width_px + x, camera.width_px * camera.height_px)
         colours = (image.reshape(-1, 3)[at] / 255 / gain).astype(np.float32)
         pixels = TexelPixels(index.astype(np.int32), pixel.astype(np.int32), colours)
         return SeenTexels(pixels, cosine, normals, sampled(image, pixels_px) / gain)
 
-    views = list(product(surfaces_m, capture.train_cameras))
+    views = list(product(surfaces, capture.train_cameras))
     yield from tracked(side_by_side(seen_in, views), "photographs", len(views))
 
 
 def visible_texels(
-    camera: Camera, vertices_m: np.ndarray, faces: np.ndarray, texels: Texels
+    camera: Camera, surface: SeenSurface, texels: Texels
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return which texels (M,) a camera sees away from outlines, the cosines of its view to their normals (M,), these
     unit normals (M, 3), and their pixels (M, 2)."""
-    normals = normals_of(vertices_m, faces)
+    vertices_m, faces, normals = surface.vertices_m, surface.faces, surface.normals
     towards = camera.centre_m - vertices_m
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     facing = ((normals * towards).sum(1) > 0)[faces].any(1)
@@ -145,7 +162,7 @@ def visible_texels(
     distance_m = np.sqrt(_dot(view_m, view_m))
     normal = normal / np.sqrt(_dot(normal, normal)).clip(1e-9)[:, None]
     cosine = _dot(view_m, normal) / distance_m
-    seen_m, outline = _depth(camera, vertices_m, faces)
+    seen_m, outline = _depth(camera, surface)
     at_px = np.round(pixels_px)
     inside = camera.holds(at_px) & (cosine > 0) & (depth_m > 0)  # what is behind the camera would be seen mirrored
     column, row = np.where(inside[:, None], at_px, 0).astype(int).T
@@ -153,14 +170,14 @@ def visible_texels(
     return index[visible], cosine[visible], normal[visible], pixels_px[visible]
 
 
-def _depth(camera: Camera, vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _depth(camera: Camera, surface: SeenSurface) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance (H, W) at which each pixel's ray meets a surface, and where it jumps (H, W) bool."""
-    at_px = camera.project(vertices_m)[0]
+    at_px = camera.project(surface.vertices_m)[0]
     box_px = np.stack([np.floor(at_px.min(0)) - EDGE_PX, np.ceil(at_px.max(0)) + EDGE_PX + 1])
     lower, upper = box_px.clip(0, camera.size_px).astype(int)
     depth_m = np.full((camera.height_px, camera.width_px), FAR_M, np.float32)
     x, y = np.meshgrid(np.arange(lower[0], upper[0]), np.arange(lower[1], upper[1]))
-    hits = cast(mesh_on_cpu(vertices_m, faces), *camera.rays(np.stack([x.ravel(), y.ravel()], 1).astype(float)))
+    hits = cast(surface.mesh, *camera.rays(np.stack([x.ravel(), y.ravel()], 1).astype(float)))
     depth_m[y.ravel(), x.ravel()] = np.where(hits.face >= 0, hits.distance_m, FAR_M)
     window = np.ones((EDGE_PX, EDGE_PX), np.uint8)
     near_m = cv2.erode(depth_m, window)

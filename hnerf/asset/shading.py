@@ -6,48 +6,45 @@ from itertools import product
 import numpy as np
 
 from hnerf.asset.light import Shading
-from hnerf.asset.photographs import COSINE_POWER, EDGE_SLOPE, FAR_M, sampled
+from hnerf.asset.photographs import COSINE_POWER, EDGE_SLOPE, FAR_M, SeenSurface, sampled
 from hnerf.asset.srgb import to_linear
 from hnerf.avatar.avatar import Gains
-from hnerf.body.descriptor import normals_of
 from hnerf.capture.capture import Capture
 from hnerf.geometry.camera import Camera
-from hnerf.geometry.rays import cast, mesh_on_cpu
+from hnerf.geometry.rays import cast
+from hnerf.side_by_side import side_by_side
 
 HIDDEN_M = 0.01  # in front of a vertex, another surface hides it
 ASIDE_PX = 2  # a vertex beside which the surface ends or jumps is on an outline, whose pixels mix two surfaces
 
 
-def photographed_shading(
-    capture: Capture, gains: Gains, surfaces_m: Mapping[int, np.ndarray], faces: np.ndarray
-) -> Shading:
-    """Return the colours of all vertices in the training photographs of some frames, weighted by the fourth power of
-    the cosine to the normal. surfaces_m: vertices (V, 3) in the world by frame; gains of cameras are divided out."""
-    seen = []
-    for frame, name in product(surfaces_m, capture.train_cameras):
-        camera, gain = capture.cameras[name], gains.get(name, (1.0, 1.0, 1.0))
-        normals = normals_of(surfaces_m[frame], faces)
-        vertex, cosine, pixels_px = visible_vertices(camera, surfaces_m[frame], faces, normals)
+def photographed_shading(capture: Capture, gains: Gains, surfaces: Mapping[int, SeenSurface]) -> Shading:
+    """Return the colours of all vertices in the training photographs of some frames, whose surfaces are given, weighted
+    by the fourth power of the cosine to the normal. Gains of cameras are divided out."""
+
+    def seen_in(view: tuple[int, str]) -> tuple[np.ndarray, ...]:
+        frame, name = view
+        camera, surface, gain = capture.cameras[name], surfaces[frame], gains.get(name, (1.0, 1.0, 1.0))
+        vertex, cosine, pixels_px = visible_vertices(camera, surface)
         colours = to_linear(sampled(capture.image(name, frame), pixels_px) / gain)
-        seen.append((vertex, normals[vertex], colours, cosine**COSINE_POWER))
+        return vertex, surface.normals[vertex], colours, cosine**COSINE_POWER
+
+    seen = side_by_side(seen_in, product(surfaces, capture.train_cameras))
     return Shading(*(np.concatenate(parts) for parts in zip(*seen, strict=True)))
 
 
-def visible_vertices(
-    camera: Camera, vertices_m: np.ndarray, faces: np.ndarray, normals: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def visible_vertices(camera: Camera, surface: SeenSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return which vertices (M,) a camera sees away from outlines, the cosines of its view to their normals (M,), and
     their pixels (M, 2)."""
-    view_m = camera.centre_m - vertices_m
+    view_m = camera.centre_m - surface.vertices_m
     distance_m = np.linalg.norm(view_m, axis=1)
-    cosine = (view_m * normals).sum(1) / distance_m
-    pixels_px, ahead_m = camera.project(vertices_m)
+    cosine = (view_m * surface.normals).sum(1) / distance_m
+    pixels_px, ahead_m = camera.project(surface.vertices_m)
     inside = ((pixels_px >= 0) & (pixels_px <= [camera.width_px - 1, camera.height_px - 1])).all(1)
     vertex = np.flatnonzero(inside & (cosine > 0) & (ahead_m > 0))  # what is behind would be seen mirrored
-    mesh = mesh_on_cpu(vertices_m, faces)
 
     def depth_m(aside_px: tuple[int, int]) -> np.ndarray:
-        hits = cast(mesh, *camera.rays(pixels_px[vertex] + np.array(aside_px)))
+        hits = cast(surface.mesh, *camera.rays(pixels_px[vertex] + np.array(aside_px)))
         return np.where(hits.face >= 0, hits.distance_m, FAR_M)
 
     vertex = vertex[depth_m((0, 0)) > distance_m[vertex] - HIDDEN_M]

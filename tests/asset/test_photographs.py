@@ -13,6 +13,7 @@ from hnerf.asset.photographs import (
     OUTLIER,
     BackProjection,
     CapturedBlend,
+    SeenSurface,
     TexelPixels,
     photographed_texels,
     sampled,
@@ -62,15 +63,16 @@ def colours_from_photographs(
     capture: Any, gains: Gains, surfaces_m: dict[int, np.ndarray], faces: np.ndarray, texels: Texels, field: np.ndarray
 ) -> np.ndarray:
     """Return the blend of all that photographs show of texels."""
+    surfaces = {frame: SeenSurface.of(vertices_m, faces) for frame, vertices_m in surfaces_m.items()}
     blend = CapturedBlend(field)
-    for seen in photographed_texels(capture, gains, surfaces_m, faces, texels):
+    for seen in photographed_texels(capture, gains, surfaces, texels):
         blend.add(seen)
     return blend.colours()
 
 
 def test_a_texel_is_seen_where_it_projects() -> None:
     index, cosine, normals, pixels_px = visible_texels(
-        camera(), square(0.4, 0.0), FACES, texels_at([0], [[0.5, 0.25, 0.25]])
+        camera(), SeenSurface.of(square(0.4, 0.0), FACES), texels_at([0], [[0.5, 0.25, 0.25]])
     )
     assert index.tolist() == [0]
     np.testing.assert_allclose(pixels_px, [[50, 40]], atol=1e-4)  # (0, -0.2) m, 50 px a metre
@@ -83,9 +85,8 @@ def test_normals_between_corners_are_unit_vectors() -> None:
     the normal is turned by 11.25 degrees."""
     bend = np.pi / 4
     folded_m = np.array([[-0.2, 0, 0], [0, -0.2, 0], [0, 0.2, 0], [0.2 * np.cos(bend), 0, 0.2 * np.sin(bend)]])
-    _, cosine, normals, _ = visible_texels(
-        camera(), folded_m, np.array([[0, 2, 1], [1, 2, 3]]), texels_at([0], [[0.5, 0.25, 0.25]])
-    )
+    fold = SeenSurface.of(folded_m, np.array([[0, 2, 1], [1, 2, 3]]))
+    _, cosine, normals, _ = visible_texels(camera(), fold, texels_at([0], [[0.5, 0.25, 0.25]]))
     np.testing.assert_allclose(normals, [[np.sin(bend / 4), 0, -np.cos(bend / 4)]], atol=1e-6)
     np.testing.assert_allclose(cosine, np.cos(bend / 4 - np.arctan(0.1 / 2)), atol=1e-6)
 
@@ -93,15 +94,17 @@ def test_normals_between_corners_are_unit_vectors() -> None:
 def test_a_square_behind_another_is_hidden_and_one_from_behind_too() -> None:
     vertices_m = np.concatenate([square(0.4, 0.0), square(0.4, -0.3)])
     both = np.concatenate([FACES, FACES + 4])
-    index, _, _, _ = visible_texels(camera(), vertices_m, both, texels_at([0, 2], [MIDDLE, MIDDLE]))
+    index, _, _, _ = visible_texels(camera(), SeenSurface.of(vertices_m, both), texels_at([0, 2], [MIDDLE, MIDDLE]))
     assert index.tolist() == [1]
-    index, _, _, _ = visible_texels(camera(), square(0.4, 0.0), FACES[:, ::-1].copy(), texels_at([0], [MIDDLE]))
+    averted = SeenSurface.of(square(0.4, 0.0), FACES[:, ::-1].copy())
+    index, _, _, _ = visible_texels(camera(), averted, texels_at([0], [MIDDLE]))
     assert len(index) == 0
 
 
 def test_a_square_behind_the_camera_is_not_seen() -> None:
     """It faces the camera, from 2 m behind it, and is mirrored in the middle of the picture."""
-    index, _, _, _ = visible_texels(camera(), square(0.4, -4.0), FACES[:, ::-1].copy(), texels_at([0], [MIDDLE]))
+    behind = SeenSurface.of(square(0.4, -4.0), FACES[:, ::-1].copy())
+    index, _, _, _ = visible_texels(camera(), behind, texels_at([0], [MIDDLE]))
     assert len(index) == 0
 
 
@@ -110,7 +113,7 @@ def test_a_slope_does_not_hide_itself() -> None:
     than what the ray meets: less than 1 cm / cos 60."""
     share = np.linspace(0.38, 0.5, 50)  # of corner 0, at x from 0.1 m to 0
     texels = texels_at([0] * 50, [[s, 0.5, 0.5 - s] for s in share.tolist()])
-    index, cosine, _, _ = visible_texels(camera("side", np.pi / 3), square(0.4, 0.0), FACES, texels)
+    index, cosine, _, _ = visible_texels(camera("side", np.pi / 3), SeenSurface.of(square(0.4, 0.0), FACES), texels)
     assert index.tolist() == list(range(50))
     assert cosine[-1] == pytest.approx(0.5)
 
@@ -120,7 +123,7 @@ def test_texels_near_an_outline_are_left_out() -> None:
     at_px = np.array([31.0, 34.0, 66.0, 69.0])
     share = (at_px - 30) / 40  # along the diagonal from corner 0 to corner 2
     texels = texels_at([0] * 4, [[1 - s, s, 0] for s in share.tolist()])
-    index, _, _, pixels_px = visible_texels(camera(), square(0.4, 0.0), FACES, texels)
+    index, _, _, pixels_px = visible_texels(camera(), SeenSurface.of(square(0.4, 0.0), FACES), texels)
     assert index.tolist() == [1, 2]
     np.testing.assert_allclose(pixels_px, [[34, 34], [66, 66]], atol=1e-4)
 
@@ -202,7 +205,8 @@ def test_a_texel_lies_in_the_pixel_that_it_projects_to() -> None:
     shaded: Any = capture({"front": 0}, [camera()])
     shaded.image("front", 0)[40, 50] = 200
     texels = texels_at([0, 0], [[0.5, 0.25, 0.25], [0.495, 0.255, 0.25]])
-    (seen,) = photographed_texels(shaded, {"front": (0.8, 0.8, 0.8)}, {0: square(0.4, 0.0)}, FACES, texels)
+    surfaces = {0: SeenSurface.of(square(0.4, 0.0), FACES)}
+    (seen,) = photographed_texels(shaded, {"front": (0.8, 0.8, 0.8)}, surfaces, texels)
     assert seen.pixels.index.tolist() == [0, 1] and seen.pixels.pixel.tolist() == [0, 0]
     np.testing.assert_allclose(seen.pixels.colours, [[200 / 255 / 0.8] * 3], rtol=1e-6)
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from hnerf.asset.photographs import SeenSurface
 from hnerf.asset.shading import photographed_shading, visible_vertices
 from hnerf.asset.srgb import to_linear
-from hnerf.body.descriptor import normals_of
 from hnerf.geometry.camera import Camera
 from tests.asset.test_photographs import camera, capture
 
@@ -20,7 +20,7 @@ def grid(half_m: float, z_m: float, x_m: float = 0.0) -> np.ndarray:
 
 
 def seen(view: Camera, vertices_m: np.ndarray, faces: np.ndarray) -> list[int]:
-    return visible_vertices(view, vertices_m, faces, normals_of(vertices_m, faces))[0].tolist()
+    return visible_vertices(view, SeenSurface.of(vertices_m, faces))[0].tolist()
 
 
 def test_the_photographs_colour_in_linear_light() -> None:
@@ -29,8 +29,7 @@ def test_the_photographs_colour_in_linear_light() -> None:
     found = photographed_shading(
         capture({"front": 102}, [camera()]),
         {"front": (2.0, 2.0, 2.0)},
-        {0: grid(0.3, 0.0, 0.4), 1: grid(0.3, 0.0, 0.4)},
-        FACES,
+        dict.fromkeys((0, 1), SeenSurface.of(grid(0.3, 0.0, 0.4), FACES)),
     )
     assert found.point.tolist() == [MIDDLE, MIDDLE]
     np.testing.assert_allclose(found.normals, [[0, 0, -1]] * 2, atol=1e-6)
