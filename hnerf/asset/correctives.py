@@ -5,12 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from hnerf.avatar.avatar import Avatar
 from hnerf.avatar.surface import move_onto_surface
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import pose_vertices, vertex_skinning
 from hnerf.progress import tracked
+from hnerf.side_by_side import side_by_side
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,6 @@ def as_they_are(displacement_m: np.ndarray) -> np.ndarray:
     return displacement_m
 
 
-@torch.no_grad()
 def frame_surfaces(
     avatar: Avatar, clothed: BodyFit, settle: Callable[[np.ndarray], np.ndarray] = as_they_are
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -38,16 +39,20 @@ def frame_surfaces(
     """
     rig, device = clothed.rig, avatar.body.theta.device
     learned_m = avatar.frame_displacements(rig.vertices_m.to(device), clothed.theta.to(device), clothed.root.to(device))
-    surfaces_m, displacements_m = [], []
-    poses = zip(clothed.theta, clothed.root, learned_m.cpu(), strict=True)
-    for theta, root, moved_m in tracked(poses, "correctives", len(clothed.frames)):
+
+    @torch.no_grad()
+    def followed(pose: tuple[Tensor, Tensor, Tensor]) -> tuple[np.ndarray, np.ndarray]:
+        theta, root, moved_m = pose
         skinned_m, turn = pose_vertices(rig, theta, root), vertex_skinning(rig, theta, root)[..., :3]
         posed = theta.to(device), root.to(device)
         start_m = skinned_m + (turn @ moved_m[..., None])[..., 0]
         surface_m = move_onto_surface(avatar, start_m.to(device), rig.faces.to(device), *posed)[0].cpu()
         displacement_m = settle(torch.linalg.solve(turn, surface_m - skinned_m).numpy()).astype(np.float32)
-        surfaces_m.append((skinned_m + (turn @ torch.from_numpy(displacement_m)[..., None])[..., 0]).numpy())
-        displacements_m.append(displacement_m)
+        return (skinned_m + (turn @ torch.from_numpy(displacement_m)[..., None])[..., 0]).numpy(), displacement_m
+
+    poses = zip(clothed.theta, clothed.root, learned_m.cpu(), strict=True)
+    found = tracked(side_by_side(followed, poses, device), "correctives", len(clothed.frames))
+    surfaces_m, displacements_m = zip(*found, strict=True)
     return np.stack(surfaces_m), np.stack(displacements_m)
 
 
