@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 from prefect import flow
 
-from flows.cli import main
 from hnerf.config import LimitSettings
 from hnerf.progress import report
 from tasks import limits
@@ -71,16 +70,6 @@ def test_the_same_progress_again_gives_no_time(monkeypatch: pytest.MonkeyPatch) 
 
     with pytest.raises(StalledError, match="after 3 of 10 detection"):
         within(0.3, report_the_same)
-
-
-def test_the_last_progress_is_said() -> None:
-    def report_and_sleep() -> None:
-        with limited("fit", 1, resumable=False):
-            report("outlines", 3, 10)
-            time.sleep(5)
-
-    with pytest.raises(StalledError, match="after 3 of 10 outlines"):
-        within(0.1, report_and_sleep)
 
 
 def test_limits_grow_with_the_recording(tmp_path: Path) -> None:
@@ -158,14 +147,3 @@ with limits.limited("capture", 1, False):
     started = time.monotonic()
     ended = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert ended.returncode == 1 and "Timeout" in ended.stderr and time.monotonic() - started < 15
-
-
-def test_the_command_says_it_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def stalled(*_: Any) -> None:
-        raise StalledError("fit: ended, no progress for 9 s", retryable=False)
-
-    monkeypatch.setattr("flows.commands._train", stalled)
-    assert main(["run", str(tmp_path)]) == 1
-    assert capsys.readouterr().err == "hnerf: fit: ended, no progress for 9 s\n"
