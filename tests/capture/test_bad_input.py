@@ -241,7 +241,7 @@ POSE2SIM = {
         ],
         "videos/cam02.mp4: not a readable video",
     ),
-    "video cut short": (lambda f: _cut_video(f / "videos/cam02.mp4"), "videos/cam02.mp4"),
+    "video cut short": (lambda f: _cut_video(f / "videos/cam02.mp4"), "cam02.mp4: 10 frames declared"),
     "unequal frame counts": (lambda f: rec.write_video(f / "videos/cam02.mp4", 9), "videos/cam02.mp4: 9 frames"),
     "video of another rate": (
         lambda f: rec.write_video(f / "videos/cam02.mp4", 10, fps=24),
@@ -274,21 +274,23 @@ def _refused(folder: Path, tmp_path: Path, names: str) -> None:
     assert not (tmp_path / "out" / "capture.json").exists()
 
 
-@pytest.mark.parametrize("case", EASYMOCAP)
-def test_broken_easymocap_folder_is_refused(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("write", "damage", "names"),
+    [
+        pytest.param(write, *case, id=name)
+        for write, cases in ((rec.write_easymocap, EASYMOCAP), (rec.write_pose2sim, POSE2SIM))
+        for name, case in cases.items()
+    ],
+)
+def test_broken_folder_is_refused(
+    write: Callable[[Path], Path],
+    damage: Callable[[Path], object],
+    names: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.chdir(tmp_path)
-    folder = rec.write_easymocap(tmp_path / "person")
-    damage, names = EASYMOCAP[case]
-    damage(folder)
-    _refused(folder, tmp_path, names)
-    assert not (tmp_path / "pickle-was-loaded").exists()
-
-
-@pytest.mark.parametrize("case", POSE2SIM)
-def test_broken_pose2sim_folder_is_refused(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    folder = rec.write_pose2sim(tmp_path / "walker")
-    damage, names = POSE2SIM[case]
+    folder = write(tmp_path / "walker")
     damage(folder)
     _refused(folder, tmp_path, names)
     assert not (tmp_path / "pickle-was-loaded").exists()

@@ -136,19 +136,16 @@ def test_dropped_frames_are_placed_by_the_table(tmp_path: Path) -> None:
         read_board_footage(tmp_path, "extrinsic")
 
 
-def test_a_table_with_an_endless_field_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [(f"{'1' * 200_000},0\n", r"not a table \(field larger"), ("1,1\n" * 500_000, "2000018 bytes are too many")],
+    ids=["an endless field", "more than 2 MB"],
+)
+def test_a_table_without_end_is_refused(rows: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "charuco.toml").write_text(CHARUCO)
     rec.write_png(tmp_path / "calibration" / "extrinsic" / "cam_0" / "0.png", np.zeros((8, 8, 3), np.uint8))
-    (tmp_path / "calibration" / "extrinsic" / "timestamps.csv").write_text(f"sync_index,cam_id\n{'1' * 200_000},0\n")
-    with pytest.raises(InputError, match=r"timestamps\.csv: not a table \(field larger"):
-        read_board_footage(tmp_path, "extrinsic")
-
-
-def test_a_table_of_more_than_2_mb_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "charuco.toml").write_text(CHARUCO)
-    rec.write_png(tmp_path / "calibration" / "extrinsic" / "cam_0" / "0.png", np.zeros((8, 8, 3), np.uint8))
-    (tmp_path / "calibration" / "extrinsic" / "timestamps.csv").write_text("sync_index,cam_id\n" + "1,1\n" * 500_000)
-    with pytest.raises(InputError, match=r"timestamps\.csv: 2000018 bytes are too many"):
+    (tmp_path / "calibration" / "extrinsic" / "timestamps.csv").write_text(f"sync_index,cam_id\n{rows}")
+    with pytest.raises(InputError, match=rf"timestamps\.csv: {message}"):
         read_board_footage(tmp_path, "extrinsic")
 
 

@@ -107,14 +107,6 @@ def test_what_is_no_video(tmp_path: Path) -> None:
     assert "notes.txt: is none of" in refused(tmp_path / "notes.txt", tmp_path / "out")
 
 
-def test_more_frames_declared_than_there_are(clip: Path, tmp_path: Path) -> None:
-    data = clip.read_bytes()
-    start = data.index(b"mdat") + 4
-    length = int.from_bytes(data[start - 8 : start - 4], "big") - 8
-    clip.write_bytes(data[: start + length // 2] + bytes(length - length // 2) + data[start + length :])
-    assert "my clip.mp4: 6 frames declared" in refused(clip, tmp_path / "out")
-
-
 def test_the_subject_is_named_in_recorded_pixels(tmp_path: Path) -> None:
     """Images of 24 x 16 px are halved: (13, 5) becomes (13.5 / 2 - .5, 5.5 / 2 - .5); frame 9 is not there, 4 is."""
     folder = write_easymocap(tmp_path / "ada")
