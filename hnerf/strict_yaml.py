@@ -3,13 +3,13 @@
 from typing import Any
 
 import yaml
+from yaml.composer import Composer
 
 from hnerf.errors import InputError
 
 MAX_DEPTH = 32  # of nested lists and dictionaries
 # What PyYAML raises on tags without their value ("x: !!int", "x: !!timestamp"), beside its own.
 ERRORS = (yaml.YAMLError, AttributeError, ArithmeticError, LookupError, RecursionError, TypeError, ValueError)
-_EVENTS = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # written in C, ten times as fast, where it was built
 
 
 class _Strict:
@@ -36,6 +36,16 @@ class _SafeLoader(_Strict, yaml.SafeLoader):
     pass
 
 
+class _StringLoader(_Strict, getattr(yaml, "CBaseLoader", yaml.BaseLoader), Composer):  # type: ignore[misc]
+    """Parses in C, which is faster, where that was built; composes in Python, which is strict."""
+
+    get_single_node = Composer.get_single_node
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)  # type: ignore[call-arg]
+        Composer.__init__(self)
+
+
 def parse_yaml(text: str | bytes, source: object) -> Any:
     """Return what YAML text says, as numbers, text, lists and dictionaries. Raises InputError, one line that begins
     with `source`, where it is not YAML or not strict."""
@@ -47,37 +57,8 @@ def parse_yaml(text: str | bytes, source: object) -> Any:
 
 def parse_yaml_strings(text: str) -> Any:
     """Return what YAML text says, every scalar as a string, whatever its tag. Raises ValueError where it is not YAML or
-    not strict. Events are read one at a time, so that neither depth nor repetition costs more than the text does."""
-    root: list[Any] = []
-    open_nodes: list[tuple[Any, list[str]]] = [(root, [])]  # a container, and its key that waits for a value
-
-    def add(value: Any) -> None:
-        container, waiting = open_nodes[-1]
-        if isinstance(container, list):
-            container.append(value)
-        elif waiting:
-            container[waiting.pop()] = value
-        elif not isinstance(value, str) or value in container:
-            raise ValueError("a key is no text, or is there twice")
-        else:
-            waiting.append(value)
-
+    not strict."""
     try:
-        for event in yaml.parse(text, Loader=_EVENTS):
-            if isinstance(event, yaml.AliasEvent):
-                raise ValueError("aliases are not read")
-            if isinstance(event, yaml.ScalarEvent):
-                add(event.value)
-            elif isinstance(event, yaml.SequenceStartEvent | yaml.MappingStartEvent):
-                node: Any = [] if isinstance(event, yaml.SequenceStartEvent) else {}
-                add(node)
-                open_nodes.append((node, []))
-                if len(open_nodes) > MAX_DEPTH:
-                    raise ValueError(f"nested more than {MAX_DEPTH} deep")
-            elif isinstance(event, yaml.SequenceEndEvent | yaml.MappingEndEvent):
-                open_nodes.pop()
-    except (yaml.YAMLError, RecursionError) as error:
+        return yaml.load(text, Loader=_StringLoader)
+    except ERRORS as error:
         raise ValueError(str(error)) from None
-    if len(root) > 1:
-        raise ValueError("several documents")
-    return root[0] if root else None
