@@ -20,6 +20,7 @@ import torch
 import torch.multiprocessing as multiprocessing
 from provenance import provenance, provenance_line, table, write_result
 
+from hnerf.capture.masks import Masks, encode
 from hnerf.training.distributed import Distributed
 from hnerf.training.gather import gather_pixels
 
@@ -99,26 +100,16 @@ class Noise(SimpleNamespace):
         """Return None: there are no plates."""
 
 
-class Discs:
-    """Fake masks of discs."""
-
-    def __contains__(self, view: tuple[str, int]) -> bool:
-        """Return True: every view has a mask."""
-        return True
-
-    def get(self, camera: str, frame: int) -> np.ndarray:
-        """Return the mask, (H, W) bool."""
-        y, x = np.ogrid[:SIZE_PX, :SIZE_PX]
-        return (x - SIZE_PX // 2) ** 2 + (y - SIZE_PX // 2) ** 2 < (SIZE_PX // 4) ** 2
-
-
 def synthetic_inputs() -> tuple[Any, Any, Any]:
     """Return a fake capture, masks and body fit with what gathering whole images uses."""
     camera = SimpleNamespace(width_px=SIZE_PX, height_px=SIZE_PX, K=np.eye(3), R=np.eye(3), centre_m=np.zeros(3))
     names = tuple(f"{k}" for k in range(CAMERAS))
     by_name = {name: SimpleNamespace(**vars(camera), name=name) for name in names}
     body = SimpleNamespace(frames=tuple(range(FRAMES)), vertices_m=lambda: torch.zeros(FRAMES, 1, 3))
-    return Noise(train_cameras=names, cameras=by_name), Discs(), body
+    y, x = np.ogrid[:SIZE_PX, :SIZE_PX]
+    disc = encode((x - SIZE_PX // 2) ** 2 + (y - SIZE_PX // 2) ** 2 < (SIZE_PX // 4) ** 2)
+    masks = Masks({(name, frame): disc for name in names for frame in body.frames}, {})
+    return Noise(train_cameras=names, cameras=by_name), masks, body
 
 
 if __name__ == "__main__":

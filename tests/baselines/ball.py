@@ -11,12 +11,13 @@ import torch
 from hnerf.avatar.trained import TrainedAvatar, load_avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks, encode
 from hnerf.config import TrainingSettings
 from hnerf.geometry.camera import Camera
 from hnerf.training.distributed import Distributed
 from hnerf.training.trainer import train
 from tests.body.boxes import box_rig
-from tests.training.scene import SIZE_PX, KnownMasks, _write, look_at
+from tests.training.scene import SIZE_PX, _write, look_at
 
 MIDDLE_M, RADIUS_M = np.full(3, 0.5), 0.35
 ALONE = Distributed(0, 1, torch.device("cpu"))
@@ -41,7 +42,7 @@ def body() -> BodyFit:
     return BodyFit(box_rig(splits=4), (0,), torch.zeros(1, 2, 3), torch.eye(4)[None])
 
 
-def record(folder: Path) -> tuple[Capture, KnownMasks, BodyFit]:
+def record(folder: Path) -> tuple[Capture, Masks, BodyFit]:
     """Write the recording of one frame to `folder`; eight cameras, all of them for training."""
     cameras, masks = {}, {}
     for k, name in enumerate(RING):
@@ -50,10 +51,10 @@ def record(folder: Path) -> tuple[Capture, KnownMasks, BodyFit]:
         colour, mask = render(camera)
         _write(folder / "images" / name / "000000.png", np.where(mask[..., None], colour, 128))
         _write(folder / "background" / f"{name}.png", np.full_like(colour, 128))
-        cameras[name], masks[name, 0] = camera, mask
+        cameras[name], masks[name, 0] = camera, encode(mask)
     sizes = dict.fromkeys(cameras, (SIZE_PX, SIZE_PX))
     capture = Capture("ball", folder, cameras, RING, (), (0,), (), 10.0, "z", sizes, sizes)
-    return capture, KnownMasks(masks), body()
+    return capture, Masks(masks, {}), body()
 
 
 def trained(folder: Path, settings: TrainingSettings, cameras: tuple[str, ...]) -> TrainedAvatar:

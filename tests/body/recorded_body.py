@@ -1,6 +1,5 @@
 """A naked body of known shape and pose, recorded without error: keypoints and masks in a ring of cameras."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,24 +9,18 @@ from hnerf.body.anny import ADULT, BETA_NAMES, anny_rig
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import rotation_from_axis_angle
 from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks, encode
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.silhouette import silhouette
 
 
-@dataclass(frozen=True)
-class Silhouettes:
-    """Masks of the training cameras; requesting another camera's fails."""
-
-    capture: Capture
-    body: BodyFit
-
-    def __contains__(self, view: tuple[str, int]) -> bool:
-        return view[1] in self.body.frames
-
-    def get(self, camera: str, frame: int) -> np.ndarray:
-        assert camera in self.capture.train_cameras
-        vertices_m = self.body.vertices_m()[self.body.index(frame)].numpy()
-        return silhouette(self.capture.cameras[camera], vertices_m, self.body.rig.faces.numpy())
+def silhouettes(capture: Capture, body: BodyFit) -> Masks:
+    """Return masks of the training cameras; requesting another camera's fails."""
+    encoded, faces = {}, body.rig.faces.numpy()
+    for frame, vertices_m in zip(body.frames, body.vertices_m().numpy(), strict=True):
+        for name in capture.train_cameras:
+            encoded[name, frame] = encode(silhouette(capture.cameras[name], vertices_m, faces))
+    return Masks(encoded, {})
 
 
 def ring_camera(name: str, angle: float, size_px: int = 256) -> Camera:

@@ -16,7 +16,7 @@ from hnerf.body.pose_prior import Smoothness
 from hnerf.body.rig import Rig, joint_transforms
 from hnerf.config import FitSettings
 from hnerf.errors import InputError
-from tests.body.recorded_body import Silhouettes, moving_body, record, ring_camera
+from tests.body.recorded_body import moving_body, record, ring_camera, silhouettes
 from tests.body.test_articulation import random_pose
 from tests.body.two_bone import two_bone_rig
 
@@ -32,7 +32,7 @@ def joint_error_m(a: BodyFit, b: BodyFit) -> torch.Tensor:
 def test_four_cameras_recover_pose_and_shape(tmp_path: Path) -> None:
     truth = moving_body((0, 1, 2))
     capture = record(tmp_path, truth, RING, ("0", "1", "2", "3"))
-    fit, report = fit_body(capture, Silhouettes(capture, truth), FitSettings(contour_steps=6))  # type: ignore[arg-type]
+    fit, report = fit_body(capture, silhouettes(capture, truth), FitSettings(contour_steps=6))
     error_m = joint_error_m(fit, truth)
     assert error_m.mean() < 0.012 and error_m.max() < 0.04
     assert (fit.vertices_m() - truth.vertices_m()).norm(dim=-1).mean() < 0.012
@@ -49,7 +49,7 @@ def test_the_distances_of_all_outlines_stay_within_their_bytes(tmp_path: Path, m
     whole = 2 * 4 * width_px * height_px * 4  # frames, cameras, pixels, bytes
     for given, stride in ((whole, 1), (whole - 1, 2), (whole // 4, 2), (whole // 4 - 1, 3)):
         monkeypatch.setattr("hnerf.body.fit.DISTANCE_BYTES", given)
-        edges = _outlines(capture, Silhouettes(capture, truth), torch.full((4, 2), 0.01), 0.05)  # type: ignore[arg-type]
+        edges = _outlines(capture, silhouettes(capture, truth), torch.full((4, 2), 0.01), 0.05)
         assert [[edge.stride for edge in row if edge] for row in edges] == [[stride] * 4] * 2
 
 
@@ -61,7 +61,7 @@ def test_a_frame_that_nothing_was_fitted_to_is_poor(tmp_path: Path) -> None:
     seen.confidence[:, 1] = 0
     nothing = torch.zeros(25, 3, dtype=torch.float64)
     pose = Pose(truth.rig.to(dtype=torch.float64), truth.theta.double(), truth.root.double(), nothing)
-    masks = Silhouettes(capture, truth)
+    masks = silhouettes(capture, truth)
     reports = [_report(capture, m, seen, pose, truth, {}) for m in (None, masks)]  # type: ignore[arg-type]
     assert [report["keypoint_residual_px"][1] for report in reports] == [None, None]
     assert [report["poor_frames"] for report in reports] == [[1], []]
@@ -70,7 +70,7 @@ def test_a_frame_that_nothing_was_fitted_to_is_poor(tmp_path: Path) -> None:
 def test_one_camera_finds_the_depth(tmp_path: Path) -> None:
     truth = moving_body((0, 1, 2, 3))
     capture = record(tmp_path, truth, RING, ("0",))
-    fit, _ = fit_body(capture, Silhouettes(capture, truth), FitSettings(contour_steps=6))  # type: ignore[arg-type]
+    fit, _ = fit_body(capture, silhouettes(capture, truth), FitSettings(contour_steps=6))
     assert joint_error_m(fit, truth).mean() < 0.06
     assert fit.vertices_m()[..., 2].min(1).values.mean() < 0.01  # bare feet stand on the ground
 
@@ -89,7 +89,7 @@ def test_before_one_camera_somebody_stands_on_his_soles(tmp_path: Path, monkeypa
     truth = moving_body((0, 1, 2, 3))
     truth.root[:, 2, 3] += 0.03
     capture = record(tmp_path, truth, RING, ("0",))
-    fit, _ = fit_body(capture, Silhouettes(capture, truth), FitSettings(contour_steps=6))  # type: ignore[arg-type]
+    fit, _ = fit_body(capture, silhouettes(capture, truth), FitSettings(contour_steps=6))
     assert 0.015 < fit.vertices_m()[..., 2].min(1).values.mean() < 0.035
 
 

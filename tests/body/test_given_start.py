@@ -20,7 +20,7 @@ from hnerf.capture.given_poses import GivenPoses
 from hnerf.config import CalibrationSettings, FitSettings, SegmentationSettings
 from hnerf.segmentation.segment import segment
 from tests.body.made_up_smpl import write_smpl
-from tests.body.recorded_body import Silhouettes, moving_body, record, ring_camera
+from tests.body.recorded_body import moving_body, record, ring_camera, silhouettes
 
 RING = {str(k): ring_camera(str(k), 0.3 + k * np.pi / 2) for k in range(4)}
 LIMBS = tuple(f"{bone}.{side}" for bone in ("upperarm01", "lowerarm01", "upperleg01", "lowerleg01") for side in "LR")
@@ -75,7 +75,7 @@ def test_contours_correct_given_poses_where_there_are_no_keypoints(model_file: P
     capture, truth = recorded(model_file, tmp_path, wrong)
     settings = FitSettings(body_model=model_file)
     begin = initial_pose_from_given(wrong, body_model(settings))
-    fit, report = fit_body(capture, Silhouettes(capture, truth), settings)  # type: ignore[arg-type]
+    fit, report = fit_body(capture, silhouettes(capture, truth), settings)
     before, after = ((joints_m(body) - joints_m(truth))[:, truth.rig.free].norm(dim=-1) for body in (begin, fit))
     assert float(before.mean()) > 0.03 and float(after.mean()) < 0.008
     assert report["given_poses"] == "used as the start, and in place of keypoints, which are missing"
@@ -84,7 +84,7 @@ def test_contours_correct_given_poses_where_there_are_no_keypoints(model_file: P
 def test_the_stages_before_a_fit_do_without_keypoints(model_file: Path, tmp_path: Path) -> None:
     """Cameras are used as given and reported as unchecked; only the person is kept of the given masks."""
     capture, truth = recorded(model_file, tmp_path, parameters())
-    masks = Silhouettes(capture, truth)
+    masks = silhouettes(capture, truth)
     for name in capture.train_cameras:
         for frame in capture.frames:
             given = np.where(masks.get(name, frame), 255, 0).astype(np.uint8)
@@ -120,7 +120,7 @@ def test_anny_takes_the_pose_by_corresponding_joints(model_file: Path) -> None:
 
 def test_anny_is_fitted_to_outlines_from_given_poses_alone(model_file: Path, tmp_path: Path) -> None:
     capture, truth = recorded(model_file, tmp_path, parameters())
-    fit, report = fit_body(capture, Silhouettes(capture, truth), FitSettings(contour_steps=2))  # type: ignore[arg-type]
+    fit, report = fit_body(capture, silhouettes(capture, truth), FitSettings(contour_steps=2))
     wrists = [joints_m(body)[:, body.rig.joint_names.index("wrist.L")] for body in (fit, truth)]
     assert float((wrists[0] - wrists[1]).norm(dim=-1).max()) < 0.08 and min(report["silhouette_iou"]) > 0.7
     assert report["given_poses"].startswith("are SMPL's: used as the start, by corresponding joints")

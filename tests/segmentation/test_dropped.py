@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 from hnerf.body.fit import _outlines, _silhouette_iou
-from hnerf.capture.masks import Masks, encode
+from hnerf.capture.masks import Masks
 from hnerf.geometry.reach import everywhere
 from hnerf.training.distributed import Distributed
 from hnerf.training.gather import gather_pixels
@@ -15,10 +15,8 @@ ALONE = Distributed(0, 1, torch.device("cpu"))
 
 
 def test_fit_and_training_do_without(tmp_path: Path) -> None:
-    capture, known, body = record(tmp_path)
-    whole = {view: encode(mask) for view, mask in known.masks.items()}
-    kept = {view: png for view, png in whole.items() if view != ("1", 0) and view[1] != 1}
-    masks = Masks(kept, {})
+    capture, whole, body = record(tmp_path)
+    masks = Masks({view: png for view, png in whole.encoded.items() if view != ("1", 0) and view[1] != 1}, {})
 
     scale_m = torch.full((4, 3), 0.01, dtype=torch.float64)
     edges = _outlines(capture, masks, scale_m, 0.03)
@@ -28,8 +26,7 @@ def test_fit_and_training_do_without(tmp_path: Path) -> None:
     assert iou == [1.0, None, 1.0]
 
     pixels, all_pixels = (
-        gather_pixels(capture, m, body, capture.frames, everywhere, {}, tmp_path, ALONE)
-        for m in (masks, Masks(whole, {}))
+        gather_pixels(capture, m, body, capture.frames, everywhere, {}, tmp_path, ALONE) for m in (masks, whole)
     )
     count, all_count = pixels.starts.diff().tolist(), all_pixels.starts.diff().tolist()
     assert count[1] == 0 and count[2] == all_count[2]

@@ -10,6 +10,7 @@ import torch
 
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture
+from hnerf.capture.masks import Masks, encode
 from hnerf.config import TrainingSettings
 from hnerf.fields import fast
 from hnerf.geometry.camera import Camera
@@ -64,28 +65,13 @@ def tiny(kind: str = "fast", **changes: object) -> TrainingSettings:
     )
 
 
-class KnownMasks:
-    """Masks held in memory, by camera and frame."""
-
-    def __init__(self, masks: dict[tuple[str, int], np.ndarray]):
-        self.masks = masks
-
-    def __contains__(self, view: tuple[str, int]) -> bool:
-        """Return whether there is a mask; none was dropped but those that are missing here."""
-        return view in self.masks
-
-    def get(self, camera: str, frame: int) -> np.ndarray:
-        """Return the mask, (H, W) bool."""
-        return self.masks[camera, frame]
-
-
 def look_at(name: str, centre_m: np.ndarray, target_m: np.ndarray) -> Camera:
     """Return a camera at `centre_m` with `target_m` in the image centre, z up."""
     like = Camera(name, np.diag([1.2 * SIZE_PX, 1.2 * SIZE_PX, 1]), np.eye(3), np.zeros(3), SIZE_PX, SIZE_PX)
     return trajectory.look_at(like, centre_m, target_m, np.array([0, 0, 1]))
 
 
-def record(folder: Path, bends_rad: tuple[float, ...] = (0.0, 0.2, 0.4)) -> tuple[Capture, KnownMasks, BodyFit]:
+def record(folder: Path, bends_rad: tuple[float, ...] = (0.0, 0.2, 0.4)) -> tuple[Capture, Masks, BodyFit]:
     """Write the recording to `folder`, bent by the given angle in each frame; frame 2 is a novel pose."""
     rig = box_rig(bend_segments=6, splits=4)
     theta = torch.zeros(len(FRAMES), 2, 3)
@@ -99,12 +85,12 @@ def record(folder: Path, bends_rad: tuple[float, ...] = (0.0, 0.2, 0.4)) -> tupl
     for name, camera in cameras.items():
         for row, frame in enumerate(FRAMES):
             mask = silhouette(camera, body.vertices_m()[row].numpy(), rig.faces.numpy())
-            masks[name, frame] = mask
+            masks[name, frame] = encode(mask)
             _write(folder / "images" / name / f"{frame:06d}.png", np.where(mask[..., None], [200, 50, 50], plate))
         _write(folder / "background" / f"{name}.png", plate)
     sizes = dict.fromkeys(cameras, (SIZE_PX, SIZE_PX))
     capture = Capture("column", folder, cameras, tuple(cameras), (), FRAMES[:2], FRAMES[2:], 10.0, "z", sizes, sizes)
-    return capture, KnownMasks(masks), body
+    return capture, Masks(masks, {}), body
 
 
 def _write(path: Path, rgb: np.ndarray) -> None:

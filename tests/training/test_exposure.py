@@ -11,13 +11,14 @@ import torch
 import trimesh
 
 from hnerf.avatar.trained import TrainedAvatar, build_field
+from hnerf.capture.masks import Masks, encode
 from hnerf.geometry.mesh_queries import Surface
 from hnerf.geometry.reach import everywhere
 from hnerf.training import exposure
 from hnerf.training.distributed import Distributed
 from hnerf.training.exposure import _vertex_colours, _visible_vertices, camera_gains, solve_gains
 from hnerf.training.gather import gather_pixels
-from tests.training.scene import TINY, KnownMasks, look_at, record
+from tests.training.scene import TINY, look_at, record
 
 ALONE = Distributed(0, 1, torch.device("cpu"))
 BALL = trimesh.creation.icosphere(subdivisions=5)  # 10242 vertices 1 m around the origin
@@ -47,7 +48,7 @@ def measured(gains: dict[str, tuple[float, float, float]], unmasked: str = "") -
         rig=SimpleNamespace(faces=torch.from_numpy(BALL.faces.copy())),
         index=lambda frame: 0,
     )
-    masks: Any = KnownMasks({(name, 3): np.ones((128, 128), bool) for name in gains if name != unmasked})
+    masks = Masks({(name, 3): encode(np.ones((128, 128), bool)) for name in gains if name != unmasked}, {})
     return camera_gains(capture, masks, body)
 
 
@@ -82,9 +83,8 @@ def test_levels_of_a_body_point_are_those_of_its_pixel_if_they_are_usable() -> N
     picture[:48, :, 0], picture[80:, :, 2] = 15, 245
     mask[:, :64] = False
     capture: Any = SimpleNamespace(cameras=RING, image=lambda name, frame: picture)
-    masks: Any = KnownMasks({("a", 3): mask})
     surface = Surface(BALL)
-    levels = _vertex_colours(capture, masks, surface, "a", 3)
+    levels = _vertex_colours(capture, Masks({("a", 3): encode(mask)}, {}), surface, "a", 3)
     seen, xy = _visible_vertices(RING["a"], surface)
     x, y = xy.T
     usable = np.zeros(len(seen), bool)

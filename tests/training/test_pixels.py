@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from hnerf.capture.masks import encode
 from hnerf.geometry.camera import Camera
 from hnerf.geometry.reach import ReachablePixels, everywhere, within_box, within_reach
 from hnerf.training import gather
@@ -15,7 +16,7 @@ from hnerf.training.distributed import Distributed
 from hnerf.training.gather import gather_pixels
 from hnerf.training.pixels import Pixels
 from hnerf.training.plates import plates_of
-from tests.training.scene import record
+from tests.training.scene import SIZE_PX, record
 
 AHEAD = Camera("ahead", np.diag([50.0, 50.0, 1.0]), np.eye(3), np.zeros(3), 60, 40)
 ALONE = Distributed(0, 1, torch.device("cpu"))
@@ -117,7 +118,7 @@ def test_a_frame_without_edges_offers_all_its_pixels(tmp_path: Path):
     """The person fills every image of the first frame."""
     capture, masks, body = record(tmp_path)
     for camera in capture.train_cameras:
-        masks.masks[camera, 0][:] = True
+        masks.encoded[camera, 0] = encode(np.ones((SIZE_PX, SIZE_PX), bool))
     pixels = gather_pixels(capture, masks, body, body.frames, REACHED, {}, tmp_path, ALONE)
     assert torch.equal(pixels.edges[: pixels.edge_starts[1]], torch.arange(int(pixels.starts[1])))
 
