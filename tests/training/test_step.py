@@ -11,6 +11,7 @@ from hnerf.body.canonical import PoseCorrection
 from hnerf.config import LossSettings, PaperFieldSettings, TrainingSettings
 from hnerf.fields.conditions import Draws
 from hnerf.fields.rays import PosedScene
+from hnerf.fields.samples import RaySamples
 from hnerf.training import losses
 from hnerf.training.pixels import PixelRays
 from hnerf.training.step import Objective, make_target
@@ -54,20 +55,27 @@ def test_without_a_plate_surroundings_are_random_and_the_outline_is_left_out() -
     assert torch.equal(draws.background, BEYOND)
 
 
+def asked(
+    settings: TrainingSettings, samples: RaySamples = SAMPLES, depths_m: Tensor | None = None, axis: int | None = None
+) -> dict[str, Tensor]:
+    """Return the losses of the rays of test_losses, which come down from 1 m along z, through a field whose gamma is
+    80. depths_m: of the samples; axis: the ground's."""
+    field: Any = torch.nn.Module()
+    field.models_background, field.gamma = True, 80.0
+    field.sample = lambda *inputs: (samples, depths_m)
+    correction = PoseCorrection(frames=2, free_joints=0, shapes=2)
+    correction.absorbed_shape.copy_(torch.tensor([3.0, 4.0]))
+    origins_m, down = torch.tensor([[0.0, 0.0, 1.0]] * 2), torch.tensor([[0.0, 0.0, -1.0]] * 2)
+    rays = PixelRays(origins_m, down, down[:, 0], TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)
+    return Objective(field, correction, settings, axis)(PosedScene(None, None, None), rays, Draws(down, down, down))
+
+
 def test_each_loss_is_given_its_own_numbers() -> None:
-    """The rays of test_losses through a field whose gamma is 80 give each of its ten values, times its weight."""
+    """Each of the ten values of test_losses, times its weight."""
     s = LossSettings(
         **{"reconstruction": 2, "mask": 3, "blend": 5, "geometry": 7, "segmentation": 11, "eikonal": 13},
         **{"residual": 17, "fit": 19, "increment": 23, "elastic": 29, "eta": 0.25},
     )
-    field: Any = torch.nn.Module()
-    field.models_background, field.gamma = True, 80.0
-    field.sample = lambda *inputs: (SAMPLES, None)
-    correction = PoseCorrection(frames=2, free_joints=0, shapes=2)
-    correction.absorbed_shape.copy_(torch.tensor([3.0, 4.0]))
-    none, scene = torch.zeros(2, 3), PosedScene(None, None, None)
-    rays = PixelRays(none, none, none, TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)
-    terms = Objective(field, correction, TrainingSettings(losses=s))(scene, rays, Draws(none, none, none))
     expected = {
         "reconstruction": 2 * 0.475,
         "mask": 3 * 0.375,
@@ -80,45 +88,27 @@ def test_each_loss_is_given_its_own_numbers() -> None:
         "increment": 23 * 5,
         "elastic": 29 * 0.1,
     }
-    assert {name: term.item() for name, term in terms.items()} == pytest.approx(expected, rel=1e-5)
+    assert {name: term.item() for name, term in asked(TrainingSettings(losses=s)).items()} == pytest.approx(
+        expected, rel=1e-5
+    )
 
 
 def test_the_floor_is_asked_about_samples_below_the_ground() -> None:
-    """Rays come down from 1 m along z. The second sample of the first ray lies 10 cm below the ground, and its d_hat is
+    """The second sample of the first ray lies 10 cm below the ground, and its d_hat is
     -0.02: a mean of 0.01 over two rays, times 3. Where the ground is unknown there is no floor."""
-    field: Any = torch.nn.Module()
-    field.models_background, field.gamma = True, 80.0
-    field.sample = lambda *inputs: (SAMPLES, torch.tensor([[0.9, 1.1], [0.5, 0.8]]))
-    none, scene = torch.zeros(2, 3), PosedScene(None, None, None)
-    origins_m, down = torch.tensor([[0.0, 0.0, 1.0]] * 2), torch.tensor([[0.0, 0.0, -1.0]] * 2)
-    rays = PixelRays(origins_m, down, none[:, 0], TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)
-    settings = TrainingSettings(losses=LossSettings(floor=3))
-    known, unknown = (
-        Objective(field, PoseCorrection(2, 0, 2), settings, axis)(scene, rays, Draws(none, none, none))
-        for axis in (2, None)
-    )
+    settings, depths_m = TrainingSettings(losses=LossSettings(floor=3)), torch.tensor([[0.9, 1.1], [0.5, 0.8]])
+    known, unknown = (asked(settings, depths_m=depths_m, axis=axis) for axis in (2, None))
     assert known["floor"].item() == pytest.approx(0.03)
     assert "floor" not in unknown
 
 
 def test_fog_is_asked_about_the_box() -> None:
-    field: Any = torch.nn.Module()
-    field.models_background, field.gamma = True, 80.0
-    field.sample = lambda *inputs: (dataclasses.replace(SAMPLES, in_box=torch.ones(2, 2)), None)
-    none, scene = torch.zeros(2, 3), PosedScene(None, None, None)
-    rays = PixelRays(none, none, none, TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)
     settings = TrainingSettings(field=PaperFieldSettings(), losses=LossSettings(fog=31))
-    terms = Objective(field, PoseCorrection(2, 0, 2), settings)(scene, rays, Draws(none, none, none))
+    terms = asked(settings, dataclasses.replace(SAMPLES, in_box=torch.ones(2, 2)))
     assert terms["fog"].item() == pytest.approx(31 * 0.1)
 
 
 def test_a_loss_without_weight_is_not_asked() -> None:
     assert LossSettings().elastic == LossSettings().fog == 0
-    field: Any = torch.nn.Module()
-    field.models_background, field.gamma = True, 80.0
-    field.sample = lambda *inputs: (SAMPLES, None)
-    none, scene = torch.zeros(2, 3), PosedScene(None, None, None)
-    rays = PixelRays(none, none, none, TARGET.colour, TARGET.person > 0, TARGET.person > 0, None)
-    settings = TrainingSettings(losses=LossSettings(mask=0, geometry=0))
-    terms = Objective(field, PoseCorrection(2, 0, 2), settings)(scene, rays, Draws(none, none, none))
+    terms = asked(TrainingSettings(losses=LossSettings(mask=0, geometry=0)))
     assert not {"mask", "geometry", "elastic", "fog"} & terms.keys()
