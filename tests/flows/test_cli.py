@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -86,10 +87,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
 def test_a_run_that_cannot_go_on_is_one_line_and_exit_code_1(
     error: Exception, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def train(*_: object) -> None:
-        raise error
-
-    monkeypatch.setattr(train_subject, "fn", train)
+    monkeypatch.setattr(train_subject, "fn", Mock(side_effect=error))
     assert main(["run", str(tmp_path)]) == 1
     assert capsys.readouterr().err == line
 
@@ -106,10 +104,7 @@ def test_a_store_that_cannot_be_made_is_one_line_and_exit_code_2(
 
 
 def test_a_fault_that_may_pass_keeps_its_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def train(*_: object) -> None:
-        raise OSError(errno.EIO, "Input/output error", "a.jpg")
-
-    monkeypatch.setattr(train_subject, "fn", train)
+    monkeypatch.setattr(train_subject, "fn", Mock(side_effect=OSError(errno.EIO, "Input/output error", "a.jpg")))
     with pytest.raises(OSError, match="Input/output error"):
         main(["run", str(tmp_path)])
 
@@ -118,11 +113,7 @@ def test_a_full_disk_is_one_line_and_exit_code_1(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for error in (OSError("a.png: cannot be written; is the disk full?"), OSError(errno.ENOSPC, "No space left", "b")):
-
-        def train(*_: object, error: OSError = error) -> None:
-            raise error
-
-        monkeypatch.setattr(train_subject, "fn", train)
+        monkeypatch.setattr(train_subject, "fn", Mock(side_effect=error))
         assert main(["run", str(tmp_path)]) == 1
         (line,) = capsys.readouterr().err.splitlines()
         assert line == f"hnerf: {error}; make room and give the same command again"

@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from fsspec import filesystem
@@ -255,11 +256,8 @@ def test_names_that_are_not_utf_8_are_captures_too(watched: Path) -> None:
 
 
 def test_what_could_not_be_started_is_tried_at_the_next_look(watched: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: Any, **__: Any) -> None:
-        raise ConnectionError("no server")
-
     with monkeypatch.context() as broken:
-        broken.setattr(module, "run_deployment", refuse)
+        broken.setattr(module, "run_deployment", Mock(side_effect=ConnectionError("no server")))
         with pytest.raises(ConnectionError):
             look(watched)
     assert look(watched) == ["ada", "bob"]
@@ -306,10 +304,7 @@ def test_a_worker_that_is_not_let_in_does_not_start_a_capture_again(
     store = tmp_path / "store"
     assert ingest_captures.fn(bucket, "demo", store, 0.0) == ["ada", "bob"]
 
-    def refuse(*_: Any) -> None:
-        raise InputError("403")
-
     with monkeypatch.context() as patch, pytest.raises(InputError, match="403"):
-        patch.setattr(Bucket, "files", refuse)
+        patch.setattr(Bucket, "files", Mock(side_effect=InputError("403")))
         train_subject.fn(f"{bucket}/ada", "demo", store)
     assert ingest_captures.fn(bucket, "demo", store, 0.0) == []

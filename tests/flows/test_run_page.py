@@ -2,6 +2,7 @@ import base64
 import io
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from PIL import Image
@@ -42,10 +43,7 @@ def test_progress_and_links_are_on_the_page_of_the_run(
 
 
 def test_a_server_that_is_away_ends_no_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise ConnectionError("no server")
-
-    monkeypatch.setattr(run_page, "create_progress_artifact", refuse)
+    monkeypatch.setattr(run_page, "create_progress_artifact", Mock(side_effect=ConnectionError("no server")))
     page = run_page._ProgressPage()
     page.next_s["fit"] = 0.0
     page.show(run_page.Progress("fit", 1, 2))

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -189,10 +190,7 @@ def test_the_flow_runs_page_shows_the_charts_themselves(tmp_path: Path, monkeypa
 def test_what_a_capture_does_not_allow_is_left_out_and_no_verdict(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def degrade_masks(*_: Any) -> Any:
-        raise NotApplicableError("ada: has no keypoints")
-
-    monkeypatch.setattr(module, "degrade_masks", degrade_masks)
+    monkeypatch.setattr(module, "degrade_masks", Mock(side_effect=NotApplicableError("ada: has no keypoints")))
     found = study(tmp_path, only=["mask_eroded"])
     assert [run["kind"] for run in found["runs"]] == ["as recorded", "as recorded"]
     assert found["left_out"].count("masks eroded, % of image width, 1: ada: has no keypoints") == 1
@@ -226,10 +224,7 @@ def test_each_degradation_is_put_in_at_its_place(stages: list[dict[str, Any]], t
 def test_a_method_that_cannot_take_the_capture_at_all_is_tried_once_a_seed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def train(*_: Any) -> Any:
-        raise InputError("NeRF models one moment; choose one frame")
-
-    monkeypatch.setattr(module, "train", train)
+    monkeypatch.setattr(module, "train", Mock(side_effect=InputError("NeRF models one moment; choose one frame")))
     runs = study(tmp_path)["runs"]
     assert [(r["kind"], r["verdict"]) for r in runs] == [("as recorded", "refused")] * 2
     assert "NeRF models one moment" in runs[0]["reason"]
@@ -272,10 +267,7 @@ def test_a_part_stands_for_the_capture(
 
 
 def test_bad_input_in_evaluation_is_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def evaluate(*_: Any) -> Any:
-        raise InputError("signed distance field: no surface in its box")
-
-    monkeypatch.setattr(module, "evaluate", evaluate)
+    monkeypatch.setattr(module, "evaluate", Mock(side_effect=InputError("no surface in its box")))
     assert {r["verdict"] for r in study(tmp_path, only=["pose_noise"])["runs"]} == {"failed"}
 
 
@@ -286,10 +278,7 @@ def test_bad_input_in_evaluation_is_failure(tmp_path: Path, monkeypatch: pytest.
 def test_what_the_machine_did_ends_the_command_and_finished_runs_stand(
     error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def degrade_fit(*_: Any) -> Any:
-        raise error
-
-    monkeypatch.setattr(module, "degrade_fit", degrade_fit)
+    monkeypatch.setattr(module, "degrade_fit", Mock(side_effect=error))
     with pytest.raises(type(error)):
         study(tmp_path)
     table = tmp_path / "store" / "stability" / "ada-mine.md"
@@ -301,11 +290,8 @@ def test_what_the_machine_did_ends_the_command_and_finished_runs_stand(
 def test_what_ends_the_first_run_leaves_an_earlier_study_as_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def train(*_: Any) -> Any:
-        raise KeyboardInterrupt
-
     earlier = study(tmp_path, only=["pose_noise"])
-    monkeypatch.setattr(module, "train", train)
+    monkeypatch.setattr(module, "train", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         study(tmp_path, only=["pose_noise"])
     folder = tmp_path / "store" / "stability"
@@ -314,14 +300,8 @@ def test_what_ends_the_first_run_leaves_an_earlier_study_as_it_was(
 
 
 def test_a_chart_that_cannot_be_drawn_hides_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def degrade_fit(*_: Any) -> Any:
-        raise LostWorkerError("rank 0 was killed")
-
-    def matrix_chart(*_: Any) -> None:
-        raise ValueError("no ink")
-
-    monkeypatch.setattr(module, "degrade_fit", degrade_fit)
-    monkeypatch.setattr(module, "matrix_chart", matrix_chart)
+    monkeypatch.setattr(module, "degrade_fit", Mock(side_effect=LostWorkerError("rank 0 was killed")))
+    monkeypatch.setattr(module, "matrix_chart", Mock(side_effect=ValueError("no ink")))
     with pytest.raises(LostWorkerError):
         study(tmp_path, only=["pose_noise"])
 
@@ -342,18 +322,11 @@ def test_charts_of_an_earlier_call_go(tmp_path: Path) -> None:
     assert charts == {"ada-mine-part-matrix.png"}
 
 
-def torn_surface(root: Path) -> SimpleNamespace:
-    """Return what a check of meshes finds for a surface that is not closed."""
-    root.mkdir()
-    (root / "surface.json").write_text(json.dumps({"000001": {"fault": "surface is not watertight"}}))
-    return SimpleNamespace(root=root)
-
-
 def test_a_run_to_compare_with_that_fails_is_kept_and_ends_its_seed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    torn = torn_surface(tmp_path / "torn")
-    monkeypatch.setattr(module, "check_meshes", lambda *_: torn)
+    (tmp_path / "surface.json").write_text(json.dumps({"000001": {"fault": "surface is not watertight"}}))
+    monkeypatch.setattr(module, "check_meshes", lambda *_: SimpleNamespace(root=tmp_path))
     table = study(tmp_path, only=["pose_noise"])
     rows = [(r["kind"], r["seed"], r["verdict"], r["reason"]) for r in table["runs"]]
     assert rows == [("as recorded", seed, "failed", "surface is not watertight") for seed in (0, 1)]

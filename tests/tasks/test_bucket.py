@@ -1,5 +1,6 @@
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from fsspec import filesystem, get_filesystem_class
@@ -91,9 +92,6 @@ def test_a_share_that_vanishes_may_come_back(tmp_path: Path) -> None:
 def test_keys_that_expired_are_no_fault_of_the_recording(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     bucket = Bucket.at(f"file://{tmp_path}")
 
-    def refuse(*_: object, **__: object) -> None:
-        raise PermissionError("The provided token has expired.")
-
-    monkeypatch.setattr(type(bucket.fs), "info", refuse)
+    monkeypatch.setattr(type(bucket.fs), "info", Mock(side_effect=PermissionError("The provided token has expired.")))
     with pytest.raises(PlaceError, match="token has expired"):
         bucket.size_bytes("x")

@@ -8,6 +8,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.synchronize import Event
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -102,10 +103,7 @@ def test_a_store_that_may_only_be_read_is_looked_at(store: Store, monkeypatch: p
     (store.root / pins.FOLDER).mkdir(exist_ok=True)
     (store.root / pins.FOLDER / "0dead").write_text(f"{before[0].name}\n")
 
-    def refuse(*_: object, **__: object) -> None:
-        raise OSError(errno.EROFS, "Read-only file system")
-
-    monkeypatch.setattr(os, "unlink", refuse)
+    monkeypatch.setattr(os, "unlink", Mock(side_effect=OSError(errno.EROFS, "Read-only file system")))
     assert garbage(store) == names(before)
 
 

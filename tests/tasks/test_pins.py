@@ -3,6 +3,7 @@ import fcntl
 import os
 from pathlib import Path
 from typing import IO, Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -30,10 +31,7 @@ def test_what_a_dead_process_used_is_forgotten(tmp_path: Path) -> None:
 
 
 def test_a_store_that_may_only_be_read_notes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(*_: object) -> None:
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
-
-    monkeypatch.setattr(pins, "_begin", refused)
+    monkeypatch.setattr(pins, "_begin", Mock(side_effect=OSError(errno.EROFS, os.strerror(errno.EROFS))))
     pin(tmp_path, "fit/1")
     assert pinned(tmp_path) == set()
 

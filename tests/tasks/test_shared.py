@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
@@ -130,11 +131,8 @@ def test_nothing_is_fetched_that_would_fill_the_disk(tmp_path: Path, monkeypatch
 
 
 def test_failed_work_is_left_to_the_next(bucket: Bucket, tmp_path: Path) -> None:
-    def fail(out: Path) -> dict[str, float]:
-        raise RuntimeError("crash")
-
     with pytest.raises(RuntimeError):
-        made(bucket, Store(tmp_path / "here"), fail)
+        made(bucket, Store(tmp_path / "here"), Mock(side_effect=RuntimeError("crash")))
     made(bucket, Store(tmp_path / "there"))
     assert bucket.read_note(f"fit/{KEY}.lease.0") is bucket.read_note(f"fit/{KEY}.lease.1") is None
 
@@ -278,11 +276,8 @@ def test_refused_work_leaves_no_checkpoint(tmp_path: Path) -> None:
     bucket, store = disk_bucket(tmp_path), Store(tmp_path / "here")
     bucket.upload(write_file(tmp_path / "elsewhere", "step 100"), CHECKPOINT)
 
-    def refuse(out: Path) -> dict[str, float]:
-        raise InputError("nobody is in the pictures")
-
     with pytest.raises(InputError, match="nobody"):
-        resumed(bucket, store, refuse)
+        resumed(bucket, store, Mock(side_effect=InputError("nobody is in the pictures")))
     assert kept(bucket) is None and not store.path("training", KEY, ".partial").exists()
 
 

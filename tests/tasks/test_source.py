@@ -1,5 +1,6 @@
 import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -140,8 +141,7 @@ def test_a_file_that_takes_hours_to_read_is_bad_input(folder: Path) -> None:
 
 
 def test_what_cannot_be_read_is_bad_input(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(*_: object) -> str:
-        raise PermissionError(13, "Permission denied", "images")
+    refused = Mock(side_effect=PermissionError(13, "Permission denied", "images"))
 
     with monkeypatch.context() as locked, pytest.raises(InputError, match=r"0\.jpg: cannot be read \(Permission"):
         locked.setattr(module, "sha256_of", refused)

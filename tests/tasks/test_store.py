@@ -7,6 +7,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -167,11 +168,8 @@ def test_a_complete_store_may_be_read_only(tmp_path: Path, monkeypatch: pytest.M
     made = store.link_latest("ada", store.get_or_compute("fit", "k", write_abc))
     store.claim("ada", "d", tmp_path / "captures" / "ada")
 
-    def refuse(*_: object, **__: object) -> None:
-        raise OSError(errno.EROFS, "Read-only file system")
-
     for name in ("replace", "unlink", "symlink", "rename", "open"):
-        monkeypatch.setattr(os, name, refuse)
+        monkeypatch.setattr(os, name, Mock(side_effect=OSError(errno.EROFS, "Read-only file system")))
     assert store.get_or_compute("fit", "k", never) == made
     store.claim("ada", "d", tmp_path / "captures" / "ada")
     assert store.link_latest("ada", made) == made

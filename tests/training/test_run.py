@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -22,11 +23,8 @@ from hnerf.training.step import TrainingError
 def test_what_is_told_is_the_last_line_and_an_exit_code(
     error: Exception, code: int, told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def fails(*_: object) -> None:
-        raise error
-
     monkeypatch.setattr(sys, "argv", ["run", "capture", "cameras", "masks", "fit", "{}", "out"])
     monkeypatch.setattr(run.Distributed, "join", lambda: None)
-    monkeypatch.setattr(run.Capture, "load", fails)
+    monkeypatch.setattr(run.Capture, "load", Mock(side_effect=error))
     assert run.main() == code
     assert capsys.readouterr().err == f"{told}\n"
