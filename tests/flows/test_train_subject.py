@@ -80,13 +80,14 @@ def test_a_capture_in_a_bucket_is_fetched(folder: Path, s3: str, tmp_path: Path)
     assert (trained.subject / ".recording").read_text().splitlines()[1] == url
 
 
-def test_what_was_detected_takes_the_recordings_place(folder: Path, tmp_path: Path) -> None:
-    (folder / "undetected").touch()
+@pytest.mark.parametrize(("mark", "stage"), [("undetected", "detection"), ("handed", "hands")])
+def test_what_was_detected_takes_the_recordings_place(folder: Path, tmp_path: Path, mark: str, stage: str) -> None:
+    (folder / mark).touch()
     subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject
-    assert given(subject, "detection") == ["capture"]
-    assert given(subject, "calibration") == ["detection"]
-    assert given(subject, "training") == ["detection", "calibration", "segmentation", "fit"]
-    assert given(subject, "asset") == ["detection", "calibration", "segmentation", "training"]
+    assert given(subject, stage) == ["capture"]
+    assert given(subject, "calibration") == [stage]
+    assert given(subject, "training") == [stage, "calibration", "segmentation", "fit"]
+    assert given(subject, "asset") == [stage, "calibration", "segmentation", "training"]
 
 
 def test_what_a_run_did_without_is_not_shown(folder: Path, tmp_path: Path) -> None:
@@ -98,14 +99,6 @@ def test_what_a_run_did_without_is_not_shown(folder: Path, tmp_path: Path) -> No
     (folder / "undetected").rename(folder / "detected")
     subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject
     assert not {"detection", "hands"} & {path.name for path in subject.iterdir()}
-
-
-def test_hands_lie_between_the_recording_and_all_else(folder: Path, tmp_path: Path) -> None:
-    (folder / "handed").touch()
-    subject = train_subject.fn(folder, "demo", tmp_path / "store", []).subject
-    assert given(subject, "hands") == ["capture"]
-    assert given(subject, "calibration") == ["hands"]
-    assert given(subject, "training") == ["hands", "calibration", "segmentation", "fit"]
 
 
 def test_the_store_knows_every_stage_that_a_subject_links_to() -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from onnx import TensorProto, helper
+from onnx import NodeProto, TensorProto, helper
 
 from hnerf.config import SegmentationSettings
 from hnerf.errors import InputError
@@ -25,13 +25,15 @@ def write_network(path: Path, shape: list, gain: float = 50.0) -> Path:
         helper.make_node("Conv", [names[0], "weights", "bias"], ["planes"]),
         helper.make_node("Sigmoid", ["planes"], ["person"]),
     ]
-    graph = helper.make_graph(
-        nodes,
-        "blue",
-        [helper.make_tensor_value_info("image", TensorProto.FLOAT, shape)],
-        [helper.make_tensor_value_info("person", TensorProto.FLOAT, None)],
-        [weights, bias],
+    return save(path, shape, nodes, weights, bias)
+
+
+def save(path: Path, shape: list, nodes: list[NodeProto], *constants: TensorProto) -> Path:
+    """Write a network from `image`, of this shape, to `person`."""
+    image, seen = (
+        helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in (("image", shape), ("person", None))
     )
+    graph = helper.make_graph(nodes, path.stem, [image], [seen], constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
     path.write_bytes(model.SerializeToString())
     return path
@@ -73,25 +75,15 @@ def test_files_that_are_no_such_network(tmp_path: Path) -> None:
         Network(tmp_path / "text.onnx")
     weights = helper.make_tensor("weights", TensorProto.FLOAT, [1], [1.0])
     node = helper.make_node("Mul", ["image", "weights"], ["person"])
-    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 4])
-    graph = helper.make_graph(
-        [node], "flat", [image], [helper.make_tensor_value_info("person", TensorProto.FLOAT, None)], [weights]
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    (tmp_path / "flat.onnx").write_bytes(model.SerializeToString())
+    flat = save(tmp_path / "flat.onnx", [1, 4], [node], weights)
     with pytest.raises(InputError, match="needs one float input"):
-        Network(tmp_path / "flat.onnx")
+        Network(flat)
 
 
 def test_a_network_that_loads_but_does_not_run(tmp_path: Path) -> None:
     """The network accepts any height and width, but then needs 4 x 4 pixels."""
     size = helper.make_tensor("size", TensorProto.INT64, [4], [1, 3, 4, 4])
     node = helper.make_node("Reshape", ["image", "size"], ["person"])
-    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, "H", "W"])
-    graph = helper.make_graph(
-        [node], "fixed", [image], [helper.make_tensor_value_info("person", TensorProto.FLOAT, None)], [size]
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    (tmp_path / "fixed.onnx").write_bytes(model.SerializeToString())
+    fixed = Network(save(tmp_path / "fixed.onnx", [1, 3, "H", "W"], [node], size))
     with pytest.raises(InputError, match=r"fixed\.onnx: does not run on \(1, 3, 10, 20\): [^\n]*any size$"):
-        Network(tmp_path / "fixed.onnx").probability(np.zeros((10, 20, 3), np.uint8))
+        fixed.probability(np.zeros((10, 20, 3), np.uint8))
