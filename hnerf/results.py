@@ -14,10 +14,8 @@ from typing_extensions import TypedDict
 Split = Literal["novel_view", "novel_pose", "novel_pose_posed", "novel_pose_tracked"]
 Mean = Literal["psnr", "ssim", "mask_iou", "lpips", "empty_psnr", "one_colour_psnr"]
 Primary = Literal["novel_view", "novel_pose"]  # splits that are meshed, and that held-out cameras are scored on
-CLOSED = with_config(ConfigDict(extra="forbid"))
 
 
-@CLOSED
 class FitReport(TypedDict):
     """report.json of the body fit; lists over frames. seconds: of each part, and in no file.
 
@@ -37,7 +35,6 @@ class FitReport(TypedDict):
     given_poses: NotRequired[str]
 
 
-@CLOSED
 class ChosenSetting(TypedDict):
     """A setting that was chosen from the scene, and why."""
 
@@ -46,7 +43,6 @@ class ChosenSetting(TypedDict):
     reason: str
 
 
-@CLOSED
 class TrainingReport(TypedDict):
     """report.json of training. seconds: of the steps of both phases, field_seconds: of the field's own; setup_seconds:
     of what comes before them, and in neither; the mean changes are those of all poses since the fit."""
@@ -65,7 +61,6 @@ class TrainingReport(TypedDict):
     decisions: list[ChosenSetting]
 
 
-@CLOSED
 class ImageScores(TypedDict):
     """Scores of one image against the truth (docs/method.md, "Evaluation protocol"), in dB or from 0 to 1. lpips: null
     without its weights. The distances from training are in scores.json alone."""
@@ -82,7 +77,6 @@ class ImageScores(TypedDict):
     pose_distance_deg: NotRequired[float]
 
 
-@CLOSED
 class SurfaceScores(TypedDict):
     """Scores of one surface against the true one. chamfer_l2_e3: mean squared distance of both directions, m^2 x 1e3;
     chamfer_mm: mean distance; normal_consistency: mean |cos| of the normals at nearest points; iou of the volumes;
@@ -97,7 +91,6 @@ class SurfaceScores(TypedDict):
     pose_distance_deg: NotRequired[float]
 
 
-@CLOSED
 class GeometryScores(TypedDict):
     """Means over n surfaces. watertight: the share of closed ones."""
 
@@ -110,7 +103,6 @@ class GeometryScores(TypedDict):
     per_surface: list[SurfaceScores]
 
 
-@CLOSED
 class SplitMeans(TypedDict):
     """Means over the n images of a split, null where there are none, for a reason. reference: what was compared with;
     without_mask, without_person: images that were left out; geometry: of splits that are meshed."""
@@ -130,14 +122,12 @@ class SplitMeans(TypedDict):
     geometry_reason: NotRequired[str]
 
 
-@CLOSED
 class SplitScores(SplitMeans):
     """Scores of a split and of its images."""
 
     per_image: list[ImageScores]
 
 
-@CLOSED
 class HeldOutCamera(TypedDict):
     """Scores of a camera that was left out of fit and training; camera: only in holdout.json, which has it alone."""
 
@@ -147,7 +137,6 @@ class HeldOutCamera(TypedDict):
     novel_pose: SplitScores
 
 
-@CLOSED
 class HeldOut(TypedDict):
     """Scores by camera left out, and by split their means over cameras."""
 
@@ -156,7 +145,6 @@ class HeldOut(TypedDict):
     mean: dict[Primary, dict[Mean, float | None]]
 
 
-@CLOSED
 class Metrics(TypedDict):
     """metrics.json of evaluation. lpips: the network's weights, or why there are none; seconds: by part."""
 
@@ -172,7 +160,6 @@ class Metrics(TypedDict):
     seconds: dict[str, float]
 
 
-@CLOSED
 class Machine(TypedDict):
     """The machine that measurements were taken on. threads: that torch uses; gpu: null without one."""
 
@@ -184,14 +171,12 @@ class Machine(TypedDict):
     python: str
 
 
-@CLOSED
 class CurvePoint(SplitMeans):
     """Scores after some seconds of training."""
 
     seconds: float
 
 
-@CLOSED
 class Picture(TypedDict):
     """A scored image of which there is a picture."""
 
@@ -199,7 +184,6 @@ class Picture(TypedDict):
     frame: int
 
 
-@CLOSED
 class EndScores(TypedDict):
     """scores.json of a training of which only the end is scored. training: its report.json, which was
     checked when it was written."""
@@ -208,7 +192,6 @@ class EndScores(TypedDict):
     curve: list[CurvePoint]
 
 
-@CLOSED
 class Scores(EndScores):
     """scores.json of a benchmark's training. split: of the curve and the pictures; frame_seconds: of rendering, by the
     image's longest side in pixels."""
@@ -234,10 +217,15 @@ FILES: dict[str, Any] = {
 }
 
 
+def _closed(kind: Any) -> TypeAdapter[Any]:
+    """Return what checks a kind of result: neither it nor what is in it has other keys."""
+    return TypeAdapter(with_config(ConfigDict(extra="forbid"))(kind))
+
+
 def write_result(path: Path, kind: Any, result: Any) -> None:
     """Write a result as JSON. Raises ValidationError if it has another key than its kind, or a value of another
     type."""
-    TypeAdapter(kind).validate_python(result)
+    _closed(kind).validate_python(result)
     path.write_text(json.dumps(result, indent=1))
 
 
@@ -245,7 +233,7 @@ def write_schemas(folder: Path) -> None:
     """Write `<name>.json`, the JSON schema of each kind of result, into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, kind in FILES.items():
-        (folder / f"{name}.json").write_text(json.dumps(TypeAdapter(kind).json_schema(), indent=1) + "\n")
+        (folder / f"{name}.json").write_text(json.dumps(_closed(kind).json_schema(), indent=1) + "\n")
 
 
 if __name__ == "__main__":
