@@ -5,14 +5,12 @@ import re
 import shutil
 import time
 from argparse import ArgumentTypeError
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hnerf.errors import InputError, printable
 
 if TYPE_CHECKING:  # importing Prefect takes seconds, which help need not wait for
-    from tasks.garbage import Garbage
     from tasks.store import Store
 
 UNITS_S = {"d": 86400, "h": 3600, "m": 60, "s": 1}
@@ -85,13 +83,13 @@ def gc(options: argparse.Namespace) -> None:
         owners = ", ".join(sorted(inventory.owners.get(name, ()))) or "-"
         print(f"{_size(one.size_bytes):>9}  {one.what:<10}  {name}  {printable(owners)}")
     removed = [one for one in garbage if options.yes and collect(store, one)]
-    total, gone = _size(_sum(garbage)), _size(_sum(removed))
+    size = _size(sum(one.size_bytes for one in (removed if options.yes else garbage)))
     if options.yes:
         left = len(garbage) - len(removed)
         in_use = f"; {left} came into use meanwhile" if left else ""
-        print(f"removed: {len(removed)} of {len(garbage)}, {gone}{in_use}")
+        print(f"removed: {len(removed)} of {len(garbage)}, {size}{in_use}")
     else:
-        print(f"not needed: {len(garbage)}, {total}; nothing was removed: give --yes to remove")
+        print(f"not needed: {len(garbage)}, {size}; nothing was removed: give --yes to remove")
 
 
 def export(options: argparse.Namespace) -> None:
@@ -158,10 +156,6 @@ def _store(options: argparse.Namespace) -> "Store":
     if not store.exists():
         raise InputError(f"{options.store}: is no store; give --store the place of the results")
     return store
-
-
-def _sum(garbage: "Iterable[Garbage]") -> int:
-    return sum(one.size_bytes for one in garbage)
 
 
 def _date(seconds: float) -> str:
