@@ -10,7 +10,7 @@ import numpy as np
 
 from hnerf.capture.bars import Area, lens_for_area, picture_area
 from hnerf.capture.board_footage import normalised_corners, read_board_footage
-from hnerf.capture.capture import Capture, SubjectPoint
+from hnerf.capture.capture import KEYPOINTS, Capture, SubjectPoint
 from hnerf.capture.clocks import InStep, in_step, read_clocks
 from hnerf.capture.footage import Footage, VideoFrame
 from hnerf.capture.formats.caliscope import Caliscope
@@ -43,7 +43,7 @@ from hnerf.capture.safe_io import (
     read_mask,
     shown,
 )
-from hnerf.capture.subset import write_keypoints
+from hnerf.capture.subset import write_points
 from hnerf.capture.timing import median_step
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
 from hnerf.config import CaptureSettings
@@ -106,7 +106,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
     normalisers, areas = _write_cameras(layout, lenses, footage, wanted, settings, out)
     rows = np.searchsorted(recorded, wanted)
     chosen = to_body_25({name: found[rows] for name, found in people.items()}, manifest.keypoints)
-    write_keypoints(out, {name: normalisers[name].keypoints(points) for name, points in chosen.items()})
+    write_points(out / KEYPOINTS, {name: normalisers[name].keypoints(points) for name, points in chosen.items()})
     _write_given_poses(folder, layout, wanted, out)
     if not uncalibrated and (boards := read_board_footage(folder, "extrinsic")):
         normalised_corners(boards, normalisers).save(out)

@@ -102,11 +102,6 @@ def read_keypoints(capture: Capture) -> dict[str, np.ndarray]:
     return {name: people for name, people in found.items() if people is not None}
 
 
-def write_keypoints(root: Path, keypoints: dict[str, np.ndarray]) -> None:
-    """Write `keypoints.npz`, by camera; no file where nothing was detected."""
-    write_points(root / KEYPOINTS, keypoints)
-
-
 def write_points(path: Path, points: dict[str, np.ndarray]) -> None:
     """Write arrays of points by name, and no file where there are none."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -14,10 +14,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hnerf.capture.capture import LANDMARKS, PERSON, Capture, write_image
-from hnerf.capture.keypoint_sets import KeypointSetName, to_body_25
+from hnerf.capture.capture import KEYPOINTS, LANDMARKS, PERSON, Capture, write_image
+from hnerf.capture.keypoint_sets import to_body_25
 from hnerf.capture.subject import ranked_people
-from hnerf.capture.subset import read_keypoints, write_keypoints
+from hnerf.capture.subset import read_keypoints, write_points
 from hnerf.config import DetectionSettings
 from hnerf.detection.landmarks import POINTS, SIZE, LandmarkNetwork, Person
 from hnerf.detection.merge import fill_missing, pad_people
@@ -30,7 +30,6 @@ from hnerf.processes import end_with_parent
 from hnerf.progress import report as report_progress
 from hnerf.progress import tracked
 
-KEYPOINTS: KeypointSetName = "blazepose_33"
 PROGRESS_S = 0.5  # between two counts of the images that are done
 
 
@@ -52,11 +51,11 @@ def detect(capture: Capture, settings: DetectionSettings, out: Path) -> dict[str
             f"{capture.name}: nobody found in any image of the training cameras; a person must be seen from head to "
             "feet, upright, and be no smaller than a tenth of the image"
         )
-    people = to_body_25({name: people["points_px"] for name, people in found.items()}, KEYPOINTS)
+    people = to_body_25({name: people["points_px"] for name, people in found.items()}, "blazepose_33")
     for name, points in people.items():  # what the network guesses outside the image counts as not seen
         points *= capture.cameras[name].holds(points[..., :2])[..., None]
-    shutil.copytree(capture.root, out, ignore=shutil.ignore_patterns("keypoints.npz"), dirs_exist_ok=True)
-    write_keypoints(out, people if alone else _with_own(capture, people))
+    shutil.copytree(capture.root, out, ignore=shutil.ignore_patterns(KEYPOINTS), dirs_exist_ok=True)
+    write_points(out / KEYPOINTS, people if alone else _with_own(capture, people))
     detected = Capture.load(out)
     ranked = ranked_people(detected)
     if alone:  # a recording's own keypoints may lack what is hidden
