@@ -31,14 +31,15 @@ def prefect_server(
     silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     with subprocess.Popen(start, env=environment, cwd=folder, **silent) as server:
         try:
-            _wait_for(f"{url}/health", patience_s)
+            wait_for(f"{url}/health", patience_s)
             yield url
         finally:
             server.terminate()
             server.wait(timeout=60)
 
 
-def _wait_for(url: str, patience_s: float) -> None:
+def wait_for(url: str, patience_s: float) -> None:
+    """Wait until a server answers."""
     deadline = time.monotonic() + patience_s
     while time.monotonic() < deadline:
         try:
@@ -46,4 +47,4 @@ def _wait_for(url: str, patience_s: float) -> None:
             return
         except httpx.HTTPError:
             time.sleep(0.2)
-    pytest.fail(f"no Prefect server within {patience_s:.0f} s")
+    pytest.fail(f"{url} does not answer within {patience_s:.0f} s")

@@ -33,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.machines import MARK, ROOT, Machine, command, marked, process, resident_kib
 from tests.postgresql import BINARIES, cluster
-from tests.prefect_server import free_port
+from tests.prefect_server import free_port, wait_for
 
 SIZES = {"size_px": 96, "train_cameras": 4, "test_cameras": 1, "train_frames": 4, "novel_pose_frames": 1}
 PRESET = """based_on: demo
@@ -187,8 +187,8 @@ def set_up(scratch: Path) -> None:
     from prefect.client.schemas.actions import DeploymentScheduleCreate, DeploymentUpdate
     from prefect.client.schemas.schedules import IntervalSchedule
 
-    wait_for(f"{os.environ['PREFECT_API_URL']}/health")
-    wait_for(os.environ["AWS_ENDPOINT_URL"])
+    for url in (f"{os.environ['PREFECT_API_URL']}/health", os.environ["AWS_ENDPOINT_URL"]):
+        wait_for(url, 300)
     filesystem("s3").mkdir(BUCKET)
     filesystem("s3").put(str(scratch / "captures"), CAPTURES, recursive=True)
     run("prefect", "--no-prompt", "work-pool", "create", "local", "--type", "process")
@@ -265,21 +265,6 @@ def fetched(store: Path, names: list[str]) -> Path:
 def run(module: str, *arguments: str) -> None:
     """Run a command to its end."""
     subprocess.run([sys.executable, "-m", module, *arguments], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
-
-
-def wait_for(url: str, patience_s: float = 300.0) -> None:
-    """Wait until a server answers."""
-    import httpx
-
-    deadline_s = time.monotonic() + patience_s
-    while True:
-        try:
-            httpx.get(url, timeout=2.0).raise_for_status()
-            return
-        except httpx.HTTPError:
-            if time.monotonic() > deadline_s:
-                raise
-            time.sleep(POLL_S)
 
 
 if __name__ == "__main__":

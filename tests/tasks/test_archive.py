@@ -91,10 +91,6 @@ def member_of(manifest: dict[str, Any]) -> tuple[str, bytes]:
     return manifest_name(text), text
 
 
-def nothing_came_of(store: Path) -> bool:
-    return not store.exists()
-
-
 NAME = f"fit/{11:032x}"
 
 
@@ -108,7 +104,7 @@ def test_paths_that_lead_out_are_refused(packed: Path, tmp_path: Path, path: str
     repack(packed, [member_of(manifest), *files])
     with pytest.raises(InputError, match="is not a path inside a folder"):
         import_subject(Store(tmp_path / "to"), packed)
-    assert nothing_came_of(tmp_path / "to")
+    assert not (tmp_path / "to").exists()
 
 
 @pytest.mark.parametrize(
@@ -138,7 +134,7 @@ def test_a_manifest_that_is_none_is_refused(
     repack(packed, [member_of(manifest), *files])
     with pytest.raises(InputError):
         import_subject(Store(tmp_path / "to"), packed)
-    assert nothing_came_of(tmp_path / "to")
+    assert not (tmp_path / "to").exists()
 
 
 @pytest.mark.parametrize(
@@ -161,7 +157,7 @@ def test_members_other_than_named_files_are_refused(
     packed.write_bytes(whole + packed.read_bytes())
     with pytest.raises(InputError, match=why):
         import_subject(Store(tmp_path / "to"), packed)
-    assert nothing_came_of(tmp_path / "to")
+    assert not (tmp_path / "to").exists()
 
 
 def test_every_cut_and_other_bytes_are_refused(packed: Path, tmp_path: Path) -> None:
@@ -174,7 +170,7 @@ def test_every_cut_and_other_bytes_are_refused(packed: Path, tmp_path: Path) -> 
     packed.write_bytes(whole[: end - 1] + b"?" + whole[end:])
     with pytest.raises(InputError, match="damaged or cut short"):
         import_subject(Store(tmp_path / "to"), packed)
-    assert nothing_came_of(tmp_path / "to")
+    assert not (tmp_path / "to").exists()
 
 
 def test_what_would_fill_the_disk_is_refused(packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,7 +191,7 @@ def test_a_file_under_many_paths_counts_as_often(packed: Path, tmp_path: Path, m
     repack(packed, [member_of(manifest), *files])
     with pytest.raises(InputError, match="make room"):
         import_subject(Store(tmp_path / "to"), packed)
-    assert nothing_came_of(tmp_path / "to")
+    assert not (tmp_path / "to").exists()
 
 
 def test_what_a_killed_import_left_is_collected(packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
