@@ -10,14 +10,14 @@ import torch
 
 from hnerf.avatar.trained import TrainedAvatar, load_avatar
 from hnerf.body.fit_result import BodyFit
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.masks import Masks, encode
 from hnerf.config import TrainingSettings
 from hnerf.geometry.camera import Camera
 from hnerf.training.distributed import Distributed
 from hnerf.training.trainer import train
 from tests.body.boxes import box_rig
-from tests.training.scene import SIZE_PX, _write, look_at
+from tests.training.scene import SIZE_PX, look_at
 
 MIDDLE_M, RADIUS_M = np.full(3, 0.5), 0.35
 ALONE = Distributed(0, 1, torch.device("cpu"))
@@ -49,8 +49,8 @@ def record(folder: Path) -> tuple[Capture, Masks, BodyFit]:
         turn = k * np.pi / 4
         camera = look_at(name, MIDDLE_M + np.array([2 * np.cos(turn), 2 * np.sin(turn), 0.4]), MIDDLE_M)
         colour, mask = render(camera)
-        _write(folder / "images" / name / "000000.png", np.where(mask[..., None], colour, 128))
-        _write(folder / "background" / f"{name}.png", np.full_like(colour, 128))
+        write_image(folder / "images" / name / "000000.png", np.where(mask[..., None], colour, 128))
+        write_image(folder / "background" / f"{name}.png", np.full_like(colour, 128))
         cameras[name], masks[name, 0] = camera, encode(mask)
     sizes = dict.fromkeys(cameras, (SIZE_PX, SIZE_PX))
     capture = Capture("ball", folder, cameras, RING, (), (0,), (), 10.0, "z", sizes, sizes)

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -15,7 +14,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.body.given_start import initial_pose_from_given
 from hnerf.body.rig import joint_transforms
 from hnerf.calibration.check import check_calibration
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.given_poses import GivenPoses
 from hnerf.config import CalibrationSettings, FitSettings, SegmentationSettings
 from hnerf.segmentation.segment import segment
@@ -89,8 +88,7 @@ def test_the_stages_before_a_fit_do_without_keypoints(model_file: Path, tmp_path
         for frame in capture.frames:
             given = np.where(masks.get(name, frame), 255, 0).astype(np.uint8)
             given[:10, :10] = 255  # something else
-            (tmp_path / "masks" / name).mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(tmp_path / "masks" / name / f"{frame:06d}.png"), given)
+            write_image(tmp_path / "masks" / name / f"{frame:06d}.png", given)
     report = check_calibration(capture, CalibrationSettings())
     assert report.verdict == "ok" and report.cameras == capture.cameras
     assert report.notes[0].startswith("not checked: the recording has no keypoints")

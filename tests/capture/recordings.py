@@ -6,6 +6,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from hnerf.capture.capture import write_image
+
 WIDTH, HEIGHT = 24, 16
 CAMERAS = ("01", "02")
 FRAMES = (0, 1, 2, 3, 4)
@@ -18,11 +20,6 @@ TRANSLATIONS_M = {"01": [0.0, 1, 3], "02": [0.0, 1, 3]}
 def picture(camera: str, frame: int) -> np.ndarray:
     """Return an image (16, 24, 3) uint8 RGB of noise, so that no two are equal."""
     return np.random.default_rng([int(camera[-2:]), frame]).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
-
-
-def write_png(path: Path, rgb: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), rgb[..., ::-1])
 
 
 def write_keypoints(path: Path, people: list) -> None:
@@ -57,7 +54,7 @@ def write_easymocap(folder: Path) -> Path:
     write_calibration(folder)
     for camera in CAMERAS:
         for frame in FRAMES:
-            write_png(folder / "images" / camera / f"{frame:06d}.png", picture(camera, frame))
+            write_image(folder / "images" / camera / f"{frame:06d}.png", picture(camera, frame))
             person = np.tile([3.0 + frame, 5.0, 0.5], (25, 1))
             people = [person, person + np.array([1.0, 0, 0])] if (camera, frame) == ("02", 2) else [person]
             write_keypoints(folder / "openpose" / camera / f"{frame:06d}_keypoints.json", people)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hnerf.capture.capture import write_image
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
@@ -111,12 +112,12 @@ EASYMOCAP = {
     "unreadable image": (lambda f: (f / "images/01/000001.png").write_bytes(b"nothing"), "images/01/000001.png"),
     "image cut short": (lambda f: os.truncate(f / "images/01/000001.png", 700), "images/01/000001.png"),
     "pictures that are all black": (
-        lambda f: [rec.write_png(p, np.full((16, 24, 3), 5, np.uint8)) for p in (f / "images/02").iterdir()],
+        lambda f: [write_image(p, np.full((16, 24, 3), 5, np.uint8)) for p in (f / "images/02").iterdir()],
         "images/02: all pictures are black",
     ),
     "image of enormous size": (_huge_png, "images/02/000003.png"),
     "image of another size": (
-        lambda f: rec.write_png(f / "images/01/000002.png", np.zeros((8, 8, 3), np.uint8)),
+        lambda f: write_image(f / "images/01/000002.png", np.zeros((8, 8, 3), np.uint8)),
         "images/01/000002.png: is 8 x 8 px",
     ),
     "calibrated at another size": (
@@ -124,11 +125,11 @@ EASYMOCAP = {
         "24 x 16 px, but camera 02",
     ),
     "plate of another size": (
-        lambda f: rec.write_png(f / "background/01.png", np.zeros((8, 8, 3), np.uint8)),
+        lambda f: write_image(f / "background/01.png", np.zeros((8, 8, 3), np.uint8)),
         "background/01.png",
     ),
     "mask missing": (
-        lambda f: rec.write_png(f / "masks/01/000002.png", np.zeros((16, 24, 3), np.uint8)),
+        lambda f: write_image(f / "masks/01/000002.png", np.zeros((16, 24, 3), np.uint8)),
         "masks/01: 1 masks for 5 frames",
     ),
     "empty keypoint file": (

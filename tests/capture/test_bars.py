@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from hnerf.capture.bars import Area, lens_for_area, picture_area
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.ingest import ingest
 from hnerf.capture.lens import Lens
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
-from tests.capture.recordings import WIDTH, picture, write_easymocap, write_png
+from tests.capture.recordings import WIDTH, picture, write_easymocap
 
 LENS = Lens(
     "a", np.array([[200.0, 0, 99.5], [0, 200, 149.5], [0, 0, 1]]), np.zeros(5), np.eye(3), np.zeros(3), (200, 300)
@@ -80,7 +80,7 @@ def test_a_letterboxed_camera_is_matched_at_the_door(tmp_path: Path) -> None:
     folder = write_easymocap(tmp_path / "in")
     for path in sorted((folder / "images" / "01").iterdir()):
         tall = cv2.resize(picture("01", int(path.stem)) // 2 + 100, (48, 32), interpolation=cv2.INTER_NEAREST)
-        write_png(path, np.pad(tall, ((20, 20), (0, 0), (0, 0))))
+        write_image(path, np.pad(tall, ((20, 20), (0, 0), (0, 0))))
     ingest(folder, CaptureSettings(), tmp_path / "out")
     capture = Capture.load(tmp_path / "out")
     assert capture.picture_areas_px["01"] == pytest.approx((0, 20, 48, 32), abs=0.2)
@@ -92,6 +92,6 @@ def test_a_letterboxed_camera_is_matched_at_the_door(tmp_path: Path) -> None:
 def test_a_size_that_bars_do_not_explain_is_refused(tmp_path: Path) -> None:
     folder = write_easymocap(tmp_path / "in")
     for path in sorted((folder / "images" / "01").iterdir()):
-        write_png(path, np.pad(picture("01", int(path.stem)), ((20, 20), (0, 9), (0, 0)), mode="wrap"))
+        write_image(path, np.pad(picture("01", int(path.stem)), ((20, 20), (0, 9), (0, 0)), mode="wrap"))
     with pytest.raises(InputError, match=r"000000.png: is 33 x 56 px, but camera 01 was calibrated at 24 x 16"):
         ingest(folder, CaptureSettings(), tmp_path / "out")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from hnerf.capture.board_footage import Board, BoardDetector, load_board_corners, read_board, read_board_footage
+from hnerf.capture.capture import write_image
 from hnerf.capture.footage import Video
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
@@ -124,7 +125,7 @@ def test_dropped_frames_are_placed_by_the_table(tmp_path: Path) -> None:
     blank = np.full((240, 320, 3), 128, np.uint8)
     for camera, pictures in {"cam_0": [blank, charuco_picture(True)], "cam_1": [blank] * 3}.items():
         for i, picture in enumerate(pictures):
-            rec.write_png(root / camera / f"{i}.png", picture)
+            write_image(root / camera / f"{i}.png", picture)
     rows = ["sync_index,cam_id,frame_time", "10,0,1.0", "10,1,1.0", "11,1,1.1", "12,1,1.2", "12,0,1.2"]
     (root / "timestamps.csv").write_text("\n".join(rows))
     footage = read_board_footage(tmp_path, "extrinsic")
@@ -143,7 +144,7 @@ def test_dropped_frames_are_placed_by_the_table(tmp_path: Path) -> None:
 )
 def test_a_table_without_end_is_refused(rows: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "charuco.toml").write_text(CHARUCO)
-    rec.write_png(tmp_path / "calibration" / "extrinsic" / "cam_0" / "0.png", np.zeros((8, 8, 3), np.uint8))
+    write_image(tmp_path / "calibration" / "extrinsic" / "cam_0" / "0.png", np.zeros((8, 8, 3), np.uint8))
     (tmp_path / "calibration" / "extrinsic" / "timestamps.csv").write_text(f"sync_index,cam_id\n{rows}")
     with pytest.raises(InputError, match=rf"timestamps\.csv: {message}"):
         read_board_footage(tmp_path, "extrinsic")
@@ -204,8 +205,8 @@ def test_ingest_keeps_the_corners_in_the_pixels_it_writes(tmp_path: Path) -> Non
     intri = re.sub(r"(W_0\d): 24", r"\1: 320", (folder / "intri.yml").read_text())
     (folder / "intri.yml").write_text(re.sub(r"(H_0\d): 16", r"\1: 240", intri))
     for camera in rec.CAMERAS:
-        rec.write_png(folder / "images" / camera / "000000.png", charuco_picture(True))
-        rec.write_png(folder / "calibration" / "extrinsic" / camera / "000003.png", charuco_picture(True))
+        write_image(folder / "images" / camera / "000000.png", charuco_picture(True))
+        write_image(folder / "calibration" / "extrinsic" / camera / "000003.png", charuco_picture(True))
     (folder / "charuco.toml").write_text(CHARUCO)
     capture = ingest(folder, CaptureSettings(max_side_px=160), tmp_path / "out")
     stored = load_board_corners(capture.root)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.formats.pose2sim import Pose2Sim
 from hnerf.capture.ingest import ingest
 from hnerf.config import CaptureSettings
@@ -89,9 +89,9 @@ def test_what_is_of_no_calibrated_camera_is_told(
         ingest(folder, SETTINGS, tmp_path / "out")
         assert not caplog.messages
         for camera in ("1", "2", "\n", "5", "6", "7"):
-            rec.write_png(folder / "masks" / camera / "000000.png", rec.picture("01", 0))
+            write_image(folder / "masks" / camera / "000000.png", rec.picture("01", 0))
         for camera in ("1", "01"):
-            rec.write_png(folder / "background" / f"{camera}.png", rec.picture("01", 0))
+            write_image(folder / "background" / f"{camera}.png", rec.picture("01", 0))
         ingest(folder, SETTINGS, tmp_path / "again")
     assert caplog.messages == [
         f"{folder}/{found} not in the calibration, and not read; rename or remove them"
@@ -146,7 +146,7 @@ def test_shrinking_takes_camera_keypoints_and_masks_along(folder: Path, tmp_path
     mask[:8, :12] = 1  # not 255: anything but black is the person
     for camera in rec.CAMERAS:
         for frame in rec.FRAMES:
-            rec.write_png(folder / "masks" / camera / f"{frame:06d}.png", np.repeat(mask[..., None], 3, -1))
+            write_image(folder / "masks" / camera / f"{frame:06d}.png", np.repeat(mask[..., None], 3, -1))
     capture = ingest(folder, CaptureSettings(max_side_px=16), tmp_path / "out")  # 24 x 16 -> 16 x 11
     camera, keypoints, shrunk = capture.cameras["01"], capture.keypoints("01"), capture.given_mask("01", 0)
     assert camera.size_px == (16, 11) and capture.image("01", 0).shape == (11, 16, 3)
@@ -163,7 +163,7 @@ def test_masks_in_a_jpeg_do_not_grow(folder: Path, tmp_path: Path) -> None:
     mask[3:13, 5:19] = 255
     for camera in rec.CAMERAS:
         for frame in rec.FRAMES:
-            rec.write_png(folder / "masks" / camera / f"{frame:06d}.jpg", mask)
+            write_image(folder / "masks" / camera / f"{frame:06d}.jpg", mask)
     assert (cv2.imread(str(folder / "masks" / "01" / "000000.jpg"))[..., 0] > 0).sum() > 140
     found = ingest(folder, SETTINGS, tmp_path / "out").given_mask("01", 0)
     assert found is not None and np.array_equal(found, mask[..., 0] > 0)
@@ -177,7 +177,7 @@ def test_mattes_are_cut_in_the_middle_of_their_edges_and_labels_are_not(folder: 
     matte[13:] = np.linspace(0, 100, matte[13:, :, 0].size).reshape(matte.shape[0] - 13, -1)[..., None]
     for camera in rec.CAMERAS:
         for frame in rec.FRAMES:
-            rec.write_png(folder / "masks" / camera / f"{frame:06d}.png", matte if frame == rec.FRAMES[0] else labels)
+            write_image(folder / "masks" / camera / f"{frame:06d}.png", matte if frame == rec.FRAMES[0] else labels)
     capture = ingest(folder, SETTINGS, tmp_path / "out")
     soft, hard = (capture.given_mask("01", frame) for frame in rec.FRAMES[:2])
     assert soft is not None and np.array_equal(soft, matte[..., 0] > 127)
@@ -193,7 +193,7 @@ def test_distorted_recording_comes_out_linear(folder: Path, tmp_path: Path) -> N
         rec.write_keypoints(folder / "openpose" / "01" / f"{frame:06d}_keypoints.json", [points])
     ramp = np.repeat(np.arange(rec.WIDTH, dtype=np.uint8)[None, :, None] * 10, rec.HEIGHT, 0).repeat(3, -1)
     for frame in rec.FRAMES:
-        rec.write_png(folder / "images" / "01" / f"{frame:06d}.png", ramp)
+        write_image(folder / "images" / "01" / f"{frame:06d}.png", ramp)
     capture = ingest(folder, SETTINGS, tmp_path / "out")
     keypoints = capture.keypoints("01")
     assert keypoints is not None and keypoints[0, 0, 0] == pytest.approx([11.5 + 8.0, 7.5, 0.9], abs=1e-3)
@@ -204,7 +204,7 @@ def test_distorted_recording_comes_out_linear(folder: Path, tmp_path: Path) -> N
 
 
 def test_clean_plates_come_along(folder: Path, tmp_path: Path) -> None:
-    rec.write_png(folder / "background" / "01.png", rec.picture("01", 99))
+    write_image(folder / "background" / "01.png", rec.picture("01", 99))
     capture = ingest(folder, SETTINGS, tmp_path / "out")
     plate = capture.background("01")
     assert plate is not None and np.array_equal(plate, rec.picture("01", 99))
@@ -225,7 +225,7 @@ def test_padding_within_two_percent_is_let_through_and_reported(folder: Path, tm
     text = (folder / "intri.yml").read_text()
     (folder / "intri.yml").write_text(text.replace("W_01: 24", "W_01: 2400").replace("H_01: 16", "H_01: 1600"))
     for frame in rec.FRAMES:
-        rec.write_png(folder / "images" / "01" / f"{frame:06d}.png", np.full((1600, 2352, 3), 9, np.uint8))
+        write_image(folder / "images" / "01" / f"{frame:06d}.png", np.full((1600, 2352, 3), 9, np.uint8))
     capture = ingest(folder, CaptureSettings(max_side_px=1176), tmp_path / "out")
     assert capture.calibrated_sizes_px["01"] == (2400, 1600) and capture.recorded_sizes_px["01"] == (2352, 1600)
     assert capture.cameras["01"].size_px == (1176, 800)
@@ -301,7 +301,7 @@ def test_accents_are_the_same_composed_or_not(tmp_path: Path, form: Literal["NFC
     (folder / "capture.toml").write_text(f'[cameras]\ntrain = ["{written}", "02"]\n')
     for part in ("images", "openpose"):
         (folder / part / "01").rename(folder / part / named)
-    rec.write_png(folder / "background" / f"{named}.png", rec.picture("01", 9))
+    write_image(folder / "background" / f"{named}.png", rec.picture("01", 9))
     capture = ingest(folder, CaptureSettings(), tmp_path / "out")
     assert capture.train_cameras == ("K\u00e4te", "02") and capture.keypoints("K\u00e4te") is not None
     assert capture.background("K\u00e4te") is not None

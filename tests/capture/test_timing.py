@@ -1,10 +1,9 @@
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.timing import nearest_frame, resample
 from hnerf.geometry.camera import Camera
 
@@ -59,8 +58,7 @@ def test_a_capture_in_step_reads_the_nearest_frame(tmp_path: Path) -> None:
     camera = Camera("a", np.eye(3), np.eye(3), np.zeros(3), 4, 4)
     for frame in range(6):
         for folder, value in (("images", 40 * frame), ("masks", 255 * (frame == 4))):
-            (tmp_path / folder / "a").mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(tmp_path / folder / "a" / f"{frame:06d}.png"), np.full((4, 4), value, np.uint8))
+            write_image(tmp_path / folder / "a" / f"{frame:06d}.png", np.full((4, 4), value, np.uint8))
     np.savez(tmp_path / "keypoints.npz", a=np.stack([people_at(10 * frame) for frame in range(6)]))
     np.savez(tmp_path / "hands.npz", a=np.stack([people_at(0, 90 * frame) for frame in range(6)]))
     size = {"a": (4, 4)}

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hnerf.capture.capture import SubjectPoint
+from hnerf.capture.capture import SubjectPoint, write_image
 from hnerf.capture.ingest import ingest, recognise
 from hnerf.capture.uncalibrated import Uncalibrated, cameras_without_calibration
 from hnerf.capture.video_metadata import KEY, MAX_METADATA_BYTES, focal_35mm
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
-from tests.capture.recordings import write_easymocap, write_png
+from tests.capture.recordings import write_easymocap
 
 
 def write_images(folder: Path, camera: str, exif: Image.Exif | None = None) -> None:
@@ -137,7 +137,7 @@ def test_what_other_cameras_and_places_are_needed_for_is_not_asked(
 def test_board_footage_is_not_read_without_calibration(tmp_path: Path) -> None:
     """It shows one of the cameras only, and would be searched once for each."""
     folder = write_easymocap(tmp_path / "ada")
-    write_png(folder / "calibration" / "extrinsic" / "01" / "0.png", np.zeros((16, 24, 3), np.uint8))
+    write_image(folder / "calibration" / "extrinsic" / "01" / "0.png", np.zeros((16, 24, 3), np.uint8))
     (folder / "capture.toml").write_text("[board]\ncolumns = 4\nrows = 5\nsquare_m = 0.05\n")
     capture = ingest(folder, CaptureSettings(), tmp_path / "out", Uncalibrated(folder, only="02"))
     assert not (capture.root / "boards.npz").exists()

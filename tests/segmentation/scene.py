@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, write_image
 from tests.calibration.synthetic import STANDING_M, look_at, write_capture
 
 SIZE_PX = 400
@@ -43,11 +43,11 @@ def write_scene(
                 image[np.roll(person(camera.project(STANDING_M)[0]), -stranger_px, axis=1)] = STRANGER_RGB
             image[truth[camera.name, frame]] = PERSON_RGB
             noisy = (image + rng.normal(size=image.shape) * 2).clip(0, 255).astype(np.uint8)
-            _write(root / "images" / camera.name / f"{frame:06d}.png", noisy)
+            write_image(root / "images" / camera.name / f"{frame:06d}.png", noisy)
             poses_px.append(np.concatenate([pose_px, np.full((25, 1), 0.8)], 1))
         seen[camera.name] = np.stack(poses_px)[:, None]
         if plate:
-            _write(root / "background" / f"{camera.name}.png", room)
+            write_image(root / "background" / f"{camera.name}.png", room)
     return write_capture(root, views, seen), truth
 
 
@@ -56,7 +56,7 @@ def write_likely(capture: Capture, masks: dict) -> None:
     for (camera, frame), mask in masks.items():
         likely = cv2.GaussianBlur(np.where(mask, 255.0, 0.0), (0, 0), 2)
         likely[:40, :30] = 255
-        _write(capture.root / "person" / camera / f"{frame:06d}.png", likely.round().astype(np.uint8))
+        write_image(capture.root / "person" / camera / f"{frame:06d}.png", likely.round().astype(np.uint8))
 
 
 def person(pose_px: np.ndarray) -> np.ndarray:
@@ -83,7 +83,7 @@ def _mirrored(mask: np.ndarray) -> np.ndarray:
 def write_masks(capture: Capture, masks: dict) -> None:
     """Write given masks beside the images."""
     for (camera, frame), mask in masks.items():
-        _write(capture.root / "masks" / camera / f"{frame:06d}.png", np.where(mask, 255, 0).astype(np.uint8))
+        write_image(capture.root / "masks" / camera / f"{frame:06d}.png", np.where(mask, 255, 0).astype(np.uint8))
 
 
 def only_frames(capture: Capture, count: int) -> Capture:
@@ -91,8 +91,3 @@ def only_frames(capture: Capture, count: int) -> Capture:
     with np.load(capture.root / "keypoints.npz") as stored:
         np.savez(capture.root / "keypoints.npz", **{name: stored[name][:count] for name in stored.files})
     return dataclasses.replace(capture, train_frames=tuple(range(count)), novel_pose_frames=())
-
-
-def _write(path: Path, image: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image)

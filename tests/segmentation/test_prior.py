@@ -1,9 +1,9 @@
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
+from hnerf.capture.capture import write_image
 from hnerf.config import SegmentationSettings
 from hnerf.segmentation.backends import Given
 from hnerf.segmentation.prior import (
@@ -82,8 +82,7 @@ def test_nobody_is_where_a_camera_looks_away(tmp_path: Path) -> None:
     assert not figure.completed.any() and figure.height_px == 0 and figure.behind
     stranger = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
     stranger[300:900, 400:600] = 255
-    (tmp_path / "masks" / "c2").mkdir(parents=True)
-    cv2.imwrite(str(tmp_path / "masks" / "c2" / "000000.png"), stranger)
+    write_image(tmp_path / "masks" / "c2" / "000000.png", stranger)
     prior = dict(keypoint_priors(capture, SegmentationSettings()))["c2"][0]
     assert prior.elsewhere and not Given(capture, "c2").mask(0, prior).any()
 

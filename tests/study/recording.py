@@ -2,10 +2,9 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from hnerf.capture.capture import HANDS, LANDMARKS, PERSON, Capture
+from hnerf.capture.capture import HANDS, LANDMARKS, PERSON, Capture, write_image
 from hnerf.geometry.camera import Camera
 
 SIZE_PX = 16
@@ -25,13 +24,13 @@ def write_recording(folder: Path) -> Capture:
     sizes = dict.fromkeys(ROTATIONS, (SIZE_PX, SIZE_PX))
     cameras = {name: Camera(name, K, R, np.array([0.0, 1, 4]), SIZE_PX, SIZE_PX) for name, R in ROTATIONS.items()}
     capture = Capture("ada", folder, cameras, ("01", "02"), ("03",), FRAMES[:3], FRAMES[3:], 10.0, "z", sizes, sizes)
-    mask = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
+    dark, mask = np.ones((SIZE_PX, SIZE_PX, 3), np.uint8), np.zeros((SIZE_PX, SIZE_PX), np.uint8)
     mask[4:12, 4:12] = 255
     for name in ROTATIONS:
         for frame in FRAMES:
-            write(folder / "images" / name / f"{frame:06d}.png", np.full((SIZE_PX, SIZE_PX, 3), 100 + frame))
-            write(folder / "masks" / name / f"{frame:06d}.png", mask)
-        write(folder / "background" / f"{name}.png", np.full((SIZE_PX, SIZE_PX, 3), 50))
+            write_image(folder / "images" / name / f"{frame:06d}.png", (100 + frame) * dark)
+            write_image(folder / "masks" / name / f"{frame:06d}.png", mask)
+        write_image(folder / "background" / f"{name}.png", 50 * dark)
     people = np.full((len(FRAMES), 1, 25, 3), 7.5)
     people[..., 2] = 1
     people[:, 0, 1, 0], people[:, 0, 1, 1] = FRAMES, 5
@@ -44,7 +43,7 @@ def write_detected(capture: Capture) -> None:
     """Write what networks detect in the training cameras: in every frame a person mask of 200 in the middle 8 x 8 px
     and frame elsewhere, landmarks, and two hands whose points are all at (frame, 5), but the first of the left one at
     (7.5, 7.5)."""
-    likely = {frame: np.full((SIZE_PX, SIZE_PX), frame) for frame in capture.frames}
+    likely = {frame: np.full((SIZE_PX, SIZE_PX), frame, np.uint8) for frame in capture.frames}
     hands = np.ones((len(capture.frames), 2, 21, 3))
     hands[..., 0], hands[..., 1] = np.array(capture.frames)[:, None, None], 5
     hands[:, 0, 0, :2] = 7.5
@@ -53,7 +52,7 @@ def write_detected(capture: Capture) -> None:
         write_landmarks(capture, name)
         for frame, mask in likely.items():
             mask[4:12, 4:12] = 200
-            write(capture.root / PERSON / name / f"{frame:06d}.png", mask)
+            write_image(capture.root / PERSON / name / f"{frame:06d}.png", mask)
 
 
 def write_landmarks(capture: Capture, camera: str) -> None:
@@ -63,9 +62,3 @@ def write_landmarks(capture: Capture, camera: str) -> None:
     points = np.stack(np.broadcast_arrays(frame, 5, 1), -1) * np.ones((1, 1, 33, 1))
     (capture.root / LANDMARKS).mkdir(exist_ok=True)
     np.savez(capture.root / LANDMARKS / f"{camera}.npz", points_px=points, points_m=points[..., :1] / 10 * np.ones(3))
-
-
-def write(path: Path, pixels: np.ndarray) -> None:
-    """Write one PNG."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), pixels.astype(np.uint8))

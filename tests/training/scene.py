@@ -4,12 +4,11 @@ pixels."""
 from pathlib import Path
 from types import ModuleType
 
-import cv2
 import numpy as np
 import torch
 
 from hnerf.body.fit_result import BodyFit
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, write_image
 from hnerf.capture.masks import Masks, encode
 from hnerf.config import TrainingSettings
 from hnerf.fields import fast
@@ -81,18 +80,13 @@ def record(folder: Path, bends_rad: tuple[float, ...] = (0.0, 0.2, 0.4)) -> tupl
     directions = [(4, 0), (0, 4), (-4, 0), (0, -4)]
     cameras = {f"{k}": look_at(f"{k}", middle + np.array([x, y, 0.5]), middle) for k, (x, y) in enumerate(directions)}
     masks = {}
-    plate = np.full((SIZE_PX, SIZE_PX, 3), 128, np.uint8)
+    red, plate = np.array([200, 50, 50], np.uint8), np.full((SIZE_PX, SIZE_PX, 3), 128, np.uint8)
     for name, camera in cameras.items():
         for row, frame in enumerate(FRAMES):
             mask = silhouette(camera, body.vertices_m()[row].numpy(), rig.faces.numpy())
             masks[name, frame] = encode(mask)
-            _write(folder / "images" / name / f"{frame:06d}.png", np.where(mask[..., None], [200, 50, 50], plate))
-        _write(folder / "background" / f"{name}.png", plate)
+            write_image(folder / "images" / name / f"{frame:06d}.png", np.where(mask[..., None], red, plate))
+        write_image(folder / "background" / f"{name}.png", plate)
     sizes = dict.fromkeys(cameras, (SIZE_PX, SIZE_PX))
     capture = Capture("column", folder, cameras, tuple(cameras), (), FRAMES[:2], FRAMES[2:], 10.0, "z", sizes, sizes)
     return capture, Masks(masks, {}), body
-
-
-def _write(path: Path, rgb: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), rgb[..., ::-1].astype(np.uint8))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hnerf.capture.capture import write_image
 from hnerf.capture.ingest import exported_lenses, ingest
 from hnerf.config import CaptureSettings
 from hnerf.errors import InputError
@@ -21,10 +22,10 @@ def write_zju(folder: Path, names: tuple[str, ...] = CAMERAS, frame: str = "{:06
     rows = [[f"{name}/" + frame.format(f) for name in names] for f in range(3)]
     for row in rows:
         for path in row:
-            rec.write_png(folder / path, np.full((rec.HEIGHT, rec.WIDTH, 3), 90, np.uint8))
+            write_image(folder / path, np.full((rec.HEIGHT, rec.WIDTH, 3), 90, np.uint8))
             labels = np.zeros((rec.HEIGHT, rec.WIDTH, 3), np.uint8)
             labels[:, :12] = 3
-            rec.write_png((folder / "mask_cihp" / path).with_suffix(".png"), labels)
+            write_image((folder / "mask_cihp" / path).with_suffix(".png"), labels)
     turns = [rec.ROTATIONS[name] for name in rec.CAMERAS] * 12
     cams: dict[str, Any] = {
         "K": [np.array(rec.K)] * len(names),

@@ -7,10 +7,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
+from hnerf.capture.capture import write_image
 from hnerf.evaluation.images import unscored
 from hnerf.study.benchmark import charts
 from hnerf.study.benchmark.publish import picture_rows, publish
@@ -233,8 +233,7 @@ def write_pictures(store: Path) -> None:
     for name, grey in (("f", 200), ("n", 90)):
         for kind in ("render", "truth"):
             path = store / "scoring" / name / "pictures" / f"0-{kind}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(path), np.full((40, 30, 3), grey, np.uint8))
+            write_image(path, np.full((40, 30, 3), grey, np.uint8))
 
 
 def test_methods_that_were_scored_on_other_images_are_published(tmp_path: Path) -> None:

@@ -1,13 +1,12 @@
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
 import trimesh
 
 from hnerf.body.fit_result import BodyFit
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, write_image
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.study.degradations import clothing
 from hnerf.study.degradations.clothing import Garment, add_clothing, long_hair, skirt
@@ -91,8 +90,7 @@ def dressed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Capture, G
     folder = good.root / "ground_truth"
     mask = np.zeros((SIZE_PX, SIZE_PX), np.uint8)
     mask[7:9, 7:9] = 255
-    (folder / "masks" / "03").mkdir(parents=True)
-    assert cv2.imwrite(str(folder / "masks" / "03" / "000002.png"), mask)
+    write_image(folder / "masks" / "03" / "000002.png", mask)
     np.savez(folder / "meshes.npz", faces=[[0, 1, 2]], vertices=np.eye(3)[None], frames=[2])
     root = torch.eye(4).repeat(len(FRAMES), 1, 1)
     root[:, :3, 3] = torch.tensor([-2.0, -0.5, 0.5])

@@ -3,11 +3,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hnerf.capture.capture import Capture
+from hnerf.capture.capture import Capture, write_image
 from hnerf.study.degradations.images import blur
 from hnerf.study.degradations.occluder import person_middle, pillar
 from tests.study.degradations.test_cameras import degraded
-from tests.study.recording import SIZE_PX, write, write_recording
+from tests.study.recording import SIZE_PX, write_recording
 
 
 def test_noise_has_its_spread_in_training_cameras_alone(tmp_path: Path) -> None:
@@ -34,9 +34,9 @@ def test_noise_leaves_what_was_detected(tmp_path: Path) -> None:
 
 def test_blur_spreads_by_a_share_of_the_width(tmp_path: Path) -> None:
     good = write_recording(tmp_path / "good")
-    dot = np.zeros((SIZE_PX, SIZE_PX, 3))
+    dot = np.zeros((SIZE_PX, SIZE_PX, 3), np.uint8)
     dot[8, 8] = 255
-    write(good.root / "images" / "01" / "000002.png", dot)
+    write_image(good.root / "images" / "01" / "000002.png", dot)
     blur(good, 6.25, np.random.default_rng(0), tmp_path / "bad")  # 1 px
     shown = Capture.load(tmp_path / "bad").image("01", 2)[..., 0].astype(int)
     # 255 / (2 pi) = 40.6 in the middle, times exp(-1 / 2) beside it, exp(-2) two pixels away; JPEG errs by a few levels
