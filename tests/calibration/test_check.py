@@ -24,6 +24,7 @@ from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import STANDING_M, detections, ring, turned, walk_m, write_capture
 
 SETTINGS = CalibrationSettings()
+SHIFT_PX = np.array([[0, 0, 20_000.0], [0, 0, 0], [0, 0, 0]])
 Mistake = Callable[[Camera], Camera]
 
 
@@ -227,27 +228,22 @@ def test_a_wrong_convention_in_one_camera_is_named(tmp_path: Path) -> None:
     assert true_error_px(report.cameras["c3"], ring(4)[3]) < 1
 
 
-def test_millimetres_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"1793 m tall; .* millimetres; in capture.toml multiply units .* by 0.001$"):
-        check_calibration(
-            recorded_with(tmp_path, lambda c: dataclasses.replace(c, t_m=1000 * c.t_m), noise_px=0), SETTINGS
-        )
-
-
-def test_metres_declared_as_millimetres_are_not_taken_for_one_place(tmp_path: Path) -> None:
-    tiny = recorded_with(tmp_path, lambda c: dataclasses.replace(c, t_m=0.001 * c.t_m), noise_px=0)
-    with pytest.raises(InputError, match=r"metres declared as millimetres; .* by 1000$"):
-        check_calibration(tiny, SETTINGS)
-
-
-def test_a_principal_point_far_outside_the_picture_is_named_beside_the_height(tmp_path: Path) -> None:
-    """It distorts the world, which no unit explains."""
-    shift = np.array([[0, 0, 20_000.0], [0, 0, 0], [0, 0, 0]])
-    capture = recorded_with(tmp_path, lambda c: dataclasses.replace(c, K=c.K + shift))
-    with pytest.raises(
-        InputError, match=r"m tall; camera c0: principal point at 2050 % of the width .* multiply units"
-    ):
-        check_calibration(capture, SETTINGS)
+@pytest.mark.parametrize(
+    ("changed", "only", "message"),
+    [
+        (lambda c: {"t_m": 1000 * c.t_m}, None, r"1793 m tall; .* millimetres; in capture.toml multiply .* by 0.001$"),
+        (lambda c: {"t_m": 0.001 * c.t_m}, None, r"metres declared as millimetres; .* by 1000$"),
+        (lambda c: {"K": c.K + SHIFT_PX}, None, "camera c0: principal point at 2050 % of the width .* multiply units"),
+        (lambda c: {"R": ring(4)[1].R, "t_m": ring(4)[1].t_m}, 0, "c0 and c1 stand at one place"),
+    ],
+    ids=["millimetres", "metres for millimetres", "principal point, which no unit explains", "cameras at one place"],
+)
+def test_what_no_person_can_have_is_named(
+    tmp_path: Path, changed: Callable[[Camera], dict[str, np.ndarray]], only: int | None, message: str
+) -> None:
+    wrong = recorded_with(tmp_path, lambda c: dataclasses.replace(c, **changed(c)), only, noise_px=0)
+    with pytest.raises(InputError, match=message):
+        check_calibration(wrong, SETTINGS)
 
 
 def test_a_person_of_unusual_height_is_told_not_refused(tmp_path: Path) -> None:
@@ -265,14 +261,6 @@ def test_swapped_files_fit_no_convention(tmp_path: Path) -> None:
     ]  # fmt: skip
     with pytest.raises(InputError, match="no known mistake explains it"):
         check_calibration(write_capture(tmp_path, shuffled, detections(cameras, 1)), SETTINGS)
-
-
-def test_cameras_at_one_place_are_named(tmp_path: Path) -> None:
-    def moved(camera: Camera) -> Camera:
-        return dataclasses.replace(ring(4)[1], name=camera.name)
-
-    with pytest.raises(InputError, match="c0 and c1 stand at one place"):
-        check_calibration(recorded_with(tmp_path, moved, only=0), SETTINGS)
 
 
 def test_a_camera_that_never_shows_the_person_is_left_out_if_two_others_do(tmp_path: Path) -> None:
