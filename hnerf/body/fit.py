@@ -118,7 +118,7 @@ def _fit_in_images(capture: Capture, problem: Problem, pose: Pose, palm: PalmTer
         pose = levenberg_marquardt(problem, pose, problem.image_term, KEYPOINT_STEPS)
     cameras = problem.observations.cameras
     if len(cameras) > 1:
-        return pose, PosturePrior.of_hands(len(pose.root), Articulation(pose.rig))
+        return pose, PosturePrior.of_twists(len(pose.root), Articulation(pose.rig))
     posture_prior = PosturePrior.of_single_view(_by_split(capture), pose, cameras[0])
     pose = resolve_depth_flips(replace(problem, posture_prior=posture_prior), pose, runs(capture))
     return hold_single_posture(problem, pose, posture_prior)

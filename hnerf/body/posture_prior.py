@@ -16,7 +16,7 @@ from hnerf.geometry.camera import Camera
 
 # Standard deviation of a joint's turn, and deviation of another posture.
 WRIST_STD_DEG, WRIST_OUTLIER_DEG = 5.0, 15.0
-TWIST_STD_DEG, TWIST_OUTLIER_DEG = 10.0, 40.0  # of forearms about their bones
+TWISTED, TWIST_STD_DEG, TWIST_OUTLIER_DEG = ("upperarm01", "lowerarm01", "upperleg01"), 10.0, 40.0  # about their bones
 POSTURE_STD_DEG, POSTURE_OUTLIER_DEG = 7.0, 14.0
 MIN_STD_DEG = 2.0  # a first fit cannot show smaller ones
 SINGLE_POSTURE_STD_DEG = 0.1  # of joints that stand still
@@ -41,18 +41,19 @@ class PosturePrior:
     held: Tensor
 
     @staticmethod
-    def of_hands(frames: int, articulation: Articulation) -> "PosturePrior":
-        """Return a prior on wrists and on the twist of forearms, over all frames: no keypoint of the body shows how
-        these turn, and in images of a few hundred pixels a network mistakes the turn of a hand in single frames."""
+    def of_twists(frames: int, articulation: Articulation) -> "PosturePrior":
+        """Return a prior on wrists and on the twist of arms and thighs, over all frames: keypoints of the body show
+        hardly how a straight limb twists and not how a hand turns, and in images of a few hundred pixels a network
+        mistakes the turn of a hand in single frames."""
         names = [articulation.rig.joint_names[joint].split(".")[0] for joint in articulation.joints[1:].tolist()]
-        wrists, forearms = (torch.tensor([part == name for name in names]) for part in ("wrist", "lowerarm01"))
+        wrists, twisted = (torch.tensor([name in held for name in names]) for held in (("wrist",), TWISTED))
         prior = PosturePrior.uniform(
-            [list(range(frames))], (wrists | forearms).expand(frames, -1).double(), WRIST_STD_DEG, WRIST_OUTLIER_DEG
+            [list(range(frames))], (wrists | twisted).expand(frames, -1).double(), WRIST_STD_DEG, WRIST_OUTLIER_DEG
         )
-        prior.std[:, forearms] = math.radians(TWIST_STD_DEG)
-        prior.outlier[forearms] = math.radians(TWIST_OUTLIER_DEG)
-        bones = PosePrior(articulation).axes[forearms, 1]
-        prior.held[forearms] = bones[:, :, None] * bones[:, None]
+        prior.std[:, twisted] = math.radians(TWIST_STD_DEG)
+        prior.outlier[twisted] = math.radians(TWIST_OUTLIER_DEG)
+        bones = PosePrior(articulation).axes[twisted, 1]
+        prior.held[twisted] = bones[:, :, None] * bones[:, None]
         return prior
 
     @staticmethod

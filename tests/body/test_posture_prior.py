@@ -114,14 +114,15 @@ def test_who_stands_still_is_held_to_it() -> None:
     )
 
 
-def test_several_cameras_need_a_posture_prior_of_wrists_and_twisted_forearms_only() -> None:
+def test_several_cameras_need_a_posture_prior_of_wrists_and_twisted_limbs_only() -> None:
     """One frame of three is off the median. 5 degrees cost 0.5 / (1 + 1/9) at a wrist, 10 degrees about the bone 0.5 /
-    (1 + 1/16) at a forearm; an elbow that bends costs nothing, nor does an upper arm that twists."""
+    (1 + 1/16) at arms and thighs; an elbow that bends costs nothing, nor does a shin that twists."""
     articulation = Articulation(anny_rig().to(dtype=torch.float64))
-    posture_prior, names = PosturePrior.of_hands(3, articulation), articulation.rig.joint_names
+    posture_prior, names = PosturePrior.of_twists(3, articulation), articulation.rig.joint_names
     axes = dict(zip(articulation.joints[1:].tolist(), PosePrior(articulation).axes, strict=True))
-    rows = (("wrist.L", 2, 5, 0.45), ("lowerarm01.R", 1, 10, 0.5 / (1 + 1 / 16)), ("lowerarm01.R", 0, 60, 0.0))
-    for name, axis, angle_deg, cost in (*rows, ("upperarm01.R", 1, 10, 0.0)):
+    twisted = [(f"{bone}.R", 1, 10, 0.5 / (1 + 1 / 16)) for bone in ("upperarm01", "lowerarm01", "upperleg01")]
+    free = [("lowerarm01.R", 0, 60, 0.0), ("lowerleg01.R", 1, 10, 0.0)]
+    for name, axis, angle_deg, cost in [("wrist.L", 2, 5, 0.45), *twisted, *free]:
         joint, pose = names.index(name), random_pose(articulation.rig, 3)
         pose = replace(pose, theta=torch.zeros_like(pose.theta))
         pose.theta[1, joint] = math.radians(angle_deg) * axes[joint][axis]
@@ -134,7 +135,7 @@ def test_several_cameras_need_a_posture_prior_of_wrists_and_twisted_forearms_onl
 def test_a_twist_pulls_its_frame_and_its_median_about_the_bone_alone() -> None:
     """A step that only this prior asks for ends where all frames twist alike, and leaves the bend as it was."""
     articulation = Articulation(anny_rig().to(dtype=torch.float64))
-    posture_prior, joint = PosturePrior.of_hands(3, articulation), articulation.rig.joint_names.index("lowerarm01.L")
+    posture_prior, joint = PosturePrior.of_twists(3, articulation), articulation.rig.joint_names.index("lowerarm01.L")
     place = articulation.joints.tolist().index(joint) - 1
     axes = PosePrior(articulation).axes[place]
     pose = random_pose(articulation.rig, 3)
