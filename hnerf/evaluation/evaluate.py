@@ -16,7 +16,7 @@ from hnerf.config import EvaluationSettings
 from hnerf.errors import InputError
 from hnerf.evaluation import geometry
 from hnerf.evaluation.columns import avatar_for_split, reason_unavailable
-from hnerf.evaluation.ground_truth import GroundTruth
+from hnerf.evaluation.ground_truth import UNDER_GIVEN_MASKS, GivenMasks, GroundTruth, truth_of
 from hnerf.evaluation.holdout import LABEL, collect_held_out
 from hnerf.evaluation.images import render, score_split, scored_views, unscored
 from hnerf.evaluation.inputs import EvaluationInputs
@@ -64,7 +64,7 @@ def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) 
     """
     started = time.perf_counter()
     capture = inputs.capture
-    truth = GroundTruth(inputs.capture_folder, capture) if (inputs.capture_folder / "ground_truth").is_dir() else None
+    truth = truth_of(inputs.capture_folder, capture)
     unavailable = {split: why for split in SPLITS if (why := reason_unavailable(split, inputs.training_folder))}
     available = [split for split in (TRAINING_VIEW, *SPLITS) if split not in unavailable]
     avatars = {split: avatar_for_split(split, inputs.avatar, inputs.fitted) for split in available}
@@ -74,10 +74,10 @@ def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) 
     wanted = dict.fromkeys(itertools.chain(*shown, *(views[split] for split in views if split not in illustrative)))
     image_seconds = render(avatars, capture, list(wanted), out)
     rendered = time.perf_counter()
-    found: Any = {"protocol": PROTOCOL, "lpips": lpips_availability(), "seconds_per_image": image_seconds}
+    found: Any = {"protocol": protocol_of(truth), "lpips": lpips_availability(), "seconds_per_image": image_seconds}
     found |= {split: score_split(capture, split, views[split], truth, out) for split in views}
     found |= {split: unscored(why) for split, why in unavailable.items()}
-    true_meshes = {} if truth is None else truth.meshes()
+    true_meshes = truth.meshes()
     for split in PRIMARY_SPLITS:
         if split in unavailable:
             found[split] |= {"geometry": None, "geometry_reason": unavailable[split]}
@@ -91,6 +91,12 @@ def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) 
     write_result(out / "metrics.json", Metrics, found)
     log.info("evaluation took %.0f s, %.0f s of them rendering", found["seconds"]["all"], rendered - started)
     return found
+
+
+def protocol_of(truth: GroundTruth | None) -> str:
+    """Return the protocol, with what differs for captures without true masks."""
+    given = isinstance(truth, GivenMasks)
+    return f"{PROTOCOL} Here, images are compared to {UNDER_GIVEN_MASKS}." if given else PROTOCOL
 
 
 def mesh_frames(frames: tuple[int, ...], true_meshes: dict[int, trimesh.Trimesh], count: int) -> list[int]:

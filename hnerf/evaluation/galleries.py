@@ -9,7 +9,7 @@ import trimesh
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import pose_vertices
 from hnerf.evaluation import pictures
-from hnerf.evaluation.ground_truth import GroundTruth
+from hnerf.evaluation.ground_truth import GIVEN_MASKED_IMAGE, GroundTruth
 from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.metrics import COVERED_LEVEL
 from hnerf.evaluation.views import TRAINING_VIEW, View
@@ -82,7 +82,9 @@ def _mask_and_reference(
 ) -> tuple[np.ndarray | None, tuple[str, np.ndarray] | None]:
     """Return the mask (H, W) bool and the captioned picture to compare with, or None where there is none."""
     if view.split != TRAINING_VIEW and truth is not None and truth.has_mask(view.camera, view.frame):
-        return truth.mask(view.camera, view.frame), ("Ground truth", truth.on_black(view.camera, view.frame)[0])
+        picture, source = truth.on_black(view.camera, view.frame)
+        caption = "Input × mask" if source == GIVEN_MASKED_IMAGE else "Ground truth"
+        return truth.mask(view.camera, view.frame), (caption, picture)
     if (view.camera, view.frame) not in inputs.masks:
         return None, None
     mask = inputs.masks.get(view.camera, view.frame)

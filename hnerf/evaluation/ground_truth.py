@@ -20,6 +20,8 @@ ON_BLACK = "ground_truth/on_black"
 MAX_MESHES_BYTES = 2_000_000_000  # unpacked; 60 frames of a million vertices have 1.4 GB
 MAX_M = 10_000  # from the origin, of true surfaces
 MASKED_IMAGE = "image x ground-truth mask"
+GIVEN_MASKED_IMAGE = "photograph x given mask"
+UNDER_GIVEN_MASKS = "photographs under the masks that came with the recording, whose errors count as the field's"
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,35 @@ class GroundTruth:
                 f"{path}: is {width_px} x {height_px} px, unlike camera {camera}; give it at the recording's size"
             )
         return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+class GivenMasks(GroundTruth):
+    """The Truth of captures whose test cameras have no true masks but some that came with the recording: photographs
+    under these, with everybody whom they show. Surfaces are still those of `ground_truth/`."""
+
+    @property
+    def has_masks(self) -> bool:
+        """Return whether any test camera has masks."""
+        return any(self.has_mask(c, f) for c in self.capture.test_cameras for f in self.capture.frames)
+
+    def mask(self, camera: str, frame: int) -> np.ndarray:
+        """Return the given mask, (H, W) bool, True on the person."""
+        mask = self.capture.given_mask(camera, frame)
+        assert mask is not None  # by has_mask
+        return mask
+
+    def on_black(self, camera: str, frame: int) -> tuple[np.ndarray, str]:
+        """Return the photograph under its mask, (H, W, 3) uint8, and the name of that source."""
+        return self.capture.image(camera, frame) * self.mask(camera, frame)[..., None], GIVEN_MASKED_IMAGE
+
+    def _mask_path(self, camera: str, frame: int) -> Path:
+        return self.capture.root / "masks" / camera / f"{self.capture.recorded_frame(camera, frame):06d}.png"
+
+
+def truth_of(folder: Path, capture: Capture) -> GroundTruth:
+    """Return what a capture with an original folder is scored against: GivenMasks only if there are no true masks."""
+    truth, given = GroundTruth(folder, capture), GivenMasks(folder, capture)
+    return given if not truth.has_masks and given.has_masks else truth
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@ def score_split(capture: Capture, split: str, views: list[View], truth: Truth | 
     if not capture.test_cameras:
         return unscored(TUNED_ON)
     if truth is None or not truth.has_masks:
-        return unscored("the capture has no ground-truth masks")
+        return unscored("the test cameras have neither ground-truth masks nor masks that came with the recording")
     rows: list[ImageScores] = []
     references = set()
     known = views_with_mask(views, truth)

@@ -15,7 +15,7 @@ from hnerf.config import EvaluationSettings
 from hnerf.detection.people import PICTURE, REPORT
 from hnerf.evaluation import charts
 from hnerf.evaluation.galleries import Gallery, GalleryPicture, surface_row, view_row
-from hnerf.evaluation.ground_truth import MASKED_IMAGE, GroundTruth
+from hnerf.evaluation.ground_truth import GIVEN_MASKED_IMAGE, MASKED_IMAGE, UNDER_GIVEN_MASKS, GroundTruth
 from hnerf.evaluation.images import TUNED_ON
 from hnerf.evaluation.inputs import EvaluationInputs
 from hnerf.evaluation.views import (
@@ -89,7 +89,7 @@ def write_report(
             size_px=image_sizes(inputs),
             split_titles=SPLIT_TITLES,
             columns=COLUMNS,
-            reasons=missing_figures(found),
+            reasons=[*missing_figures(found), *under_given_masks(found)],
             held_out=held_out_rows(found),
             found=found,
             summary=summary(found),
@@ -275,7 +275,7 @@ def costs(stages: dict[str, dict[str, Any]], found: Metrics) -> list[tuple[str, 
 
 def reading_notes(inputs: EvaluationInputs, found: Metrics) -> list[str]:
     """Return what is missing from the scores, or must be kept in mind when they are read."""
-    lines = [f"LPIPS is {found['lpips']}.", *missing_figures(found)]
+    lines = [f"LPIPS is {found['lpips']}.", *missing_figures(found), *under_given_masks(found)]
     for split in PRIMARY_SPLITS:
         scores, title = found[split], SPLIT_TITLES[split]
         if "geometry_reason" in scores:
@@ -283,7 +283,7 @@ def reading_notes(inputs: EvaluationInputs, found: Metrics) -> list[str]:
         if MASKED_IMAGE in scores.get("reference", ""):
             lines.append(f"{title}: compared to photographs under the true mask, whose edge pixels contain background.")
         if scores.get("without_mask"):
-            lines.append(f"{title}: {scores['without_mask']} images have no ground-truth mask and are not scored.")
+            lines.append(f"{title}: {scores['without_mask']} images have no mask to score them by.")
         if scores.get("without_person"):
             lines.append(f"{title}: {scores['without_person']} images do not show the person and are not scored.")
     if not inputs.capture.test_cameras:
@@ -303,6 +303,12 @@ def missing_figures(found: Metrics) -> list[str]:
     if TUNED_ON in by_reason and found["holdout"] is None:
         lines.append(f"Cameras left out: no scores: {found['holdout_reason']}.")
     return lines
+
+
+def under_given_masks(found: Metrics) -> list[str]:
+    """Return one line that says which splits were compared to photographs under given masks, if any were."""
+    titles = [SPLIT_TITLES[split] for split in SPLITS if found[split].get("reference") == GIVEN_MASKED_IMAGE]
+    return [f"{'; '.join(titles)}: compared to {UNDER_GIVEN_MASKS}."] if titles else []
 
 
 def is_table_rows(value: Any) -> bool:

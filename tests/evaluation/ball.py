@@ -132,6 +132,14 @@ def write_ball_truth(capture: Capture, radius_m: float) -> None:
     np.savez(path, faces=ball.faces, vertices=vertices, frames=np.array([0]))
 
 
+def write_ball_masks(capture: Capture, camera: str) -> None:
+    """Write masks that came with a camera's recording, in which the left half of the ball is missing."""
+    for frame in FRAMES:
+        mask = seen(capture.cameras[camera], centre_m(frame)).astype(np.uint8) * 255
+        mask[:, : SIZE_PX // 2] = 0
+        _write(capture.root / "masks" / camera / f"{frame:06d}.png", mask)
+
+
 def tuned(fit: BodyFit) -> BodyFit:
     """Return the fit with the body of the novel frame raised."""
     root = fit.root.clone()

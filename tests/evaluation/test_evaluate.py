@@ -1,9 +1,11 @@
 """The whole evaluation on a synthetic subject with known scores, and against the independent scoring program."""
 
 import dataclasses
+import html
 import json
 import re
 import runpy
+import shutil
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -17,8 +19,9 @@ import trimesh
 
 from hnerf.config import EvaluationSettings
 from hnerf.evaluation import evaluate as module
-from hnerf.evaluation.evaluate import evaluate, mesh_frames, reason_without_surface
+from hnerf.evaluation.evaluate import PROTOCOL, evaluate, mesh_frames, protocol_of, reason_without_surface
 from hnerf.evaluation.geometry import score_geometry
+from hnerf.evaluation.ground_truth import GIVEN_MASKED_IMAGE, MASKED_IMAGE, UNDER_GIVEN_MASKS, truth_of
 from hnerf.evaluation.images import render
 from hnerf.evaluation.metrics import mask_box
 from hnerf.evaluation.views import View
@@ -35,6 +38,7 @@ from tests.evaluation.ball import (
     seen,
     tuned,
     write_ball_capture,
+    write_ball_masks,
     write_ball_truth,
     write_settings,
 )
@@ -271,7 +275,46 @@ def test_a_method_that_tunes_nothing_has_one_column(tmp_path: Path) -> None:
     assert found["novel_pose_tracked"]["reason"] == "these frames have no deformation of their own"
     assert sorted(p.name for p in (out / "renders").iterdir()) == ["novel_pose", "novel_view", "training_view"]
     for split in ("novel_view", "novel_pose"):  # test cameras without ground truth
-        assert "no ground-truth masks" in found[split]["reason"]
+        assert "neither ground-truth masks nor" in found[split]["reason"]
+
+
+def test_test_cameras_without_truth_are_scored_under_the_masks_of_the_recording(tmp_path: Path) -> None:
+    """Of two test cameras only c has masks, in which the ball lacks its left half; expect that and an even picture."""
+    capture = write_ball_capture(tmp_path / "capture", "ball", ("c", "d"))
+    write_ball_masks(capture, "c")
+    (tmp_path / "evaluation").mkdir()
+    settings = EvaluationSettings(max_meshes=1, report_rows=1)
+    found = evaluate(ball_inputs(capture, tmp_path / "stages"), settings, tmp_path / "evaluation")
+    whole = seen(TEST_CAMERA, centre_m(3))
+    half = whole & (np.arange(whole.shape[1]) >= whole.shape[1] // 2)
+    error = (whole * RENDERED / 255 - half * PHOTOGRAPHED / 255)[mask_box(half)]
+    assert found["novel_pose"]["psnr"] == pytest.approx(-10 * np.log10((error**2).mean()), abs=1e-4)
+    assert found["novel_pose"]["mask_iou"] == pytest.approx(half.sum() / whole.sum())
+    assert [row["camera"] for row in found["novel_view"]["per_image"]] == ["c"] * 3
+    assert found["novel_view"]["without_mask"] == 3
+    assert found["novel_view"]["reference"] == "photograph x given mask"
+    assert "no ground-truth surface" in found["novel_view"]["geometry_reason"]
+    assert found["protocol"] == f"{PROTOCOL} Here, images are compared to {UNDER_GIVEN_MASKS}."
+    text = html.unescape((tmp_path / "evaluation" / "report.html").read_text())
+    assert text.count(f"New poses, tracked: compared to {UNDER_GIVEN_MASKS}") == 2  # below the figures and in the notes
+    assert 'alt="Ground truth"' not in text and text.count('alt="Input × mask"') > 1  # not only the training view's
+
+
+def test_true_masks_come_before_those_of_the_recording(tmp_path: Path) -> None:
+    capture = write_ball_capture(tmp_path, "ball", ("c",))
+    write_ball_masks(capture, "c")
+    write_ball_truth(capture, RADIUS_M)
+    truth = truth_of(tmp_path, capture)
+    assert truth.on_black("c", 0)[1] == MASKED_IMAGE and protocol_of(truth) == PROTOCOL
+    shutil.rmtree(tmp_path / "ground_truth" / "masks")
+    truth = truth_of(tmp_path, capture)
+    assert truth.on_black("c", 0)[1] == GIVEN_MASKED_IMAGE and list(truth.meshes()) == [0]
+
+
+def test_masks_of_training_cameras_score_nothing(tmp_path: Path) -> None:
+    capture = write_ball_capture(tmp_path, "ball", ("c",))
+    write_ball_masks(capture, "a")
+    assert not truth_of(tmp_path, capture).has_masks
 
 
 def test_a_method_without_poses_shows_no_new_ones(tmp_path: Path) -> None:

@@ -76,7 +76,7 @@ def test_notes_say_what_was_left_out_and_what_was_compared_to(tmp_path: Path) ->
         "LPIPS is not available: no weights.",
         "New poses, animated; New poses, posed; New poses, tracked: no image scores: rain.",
         "New views: compared to photographs under the true mask, whose edge pixels contain background.",
-        "New views: 3 images have no ground-truth mask and are not scored.",
+        "New views: 3 images have no mask to score them by.",
         "New views: 2 images do not show the person and are not scored.",
     ]
 

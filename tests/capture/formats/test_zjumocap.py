@@ -91,6 +91,7 @@ def test_the_published_cameras_are_for_training(tmp_path: Path) -> None:
     capture = ingest(write_zju(tmp_path / "zju", names, frame), CaptureSettings(), tmp_path / "out")
     assert capture.train_cameras == ("Camera (1)", "Camera (7)", "Camera (13)", "Camera (19)")
     assert len(capture.test_cameras) == 17 and capture.train_frames == (0, 1, 2)
+    assert all(capture.given_mask(name, 2) is not None for name in capture.test_cameras)  # which score them
 
 
 def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
