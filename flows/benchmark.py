@@ -13,7 +13,7 @@ from flows.train_subject import Prepared, prepare_training, with_detections
 from hnerf.capture.capture import Capture
 from hnerf.config import Settings
 from hnerf.errors import InputError, one_line
-from hnerf.evaluation.ground_truth import GroundTruth
+from hnerf.evaluation.ground_truth import truth_of
 from hnerf.files import embed_images
 from hnerf.study.benchmark.convergence import is_flat, training_limits_s
 from hnerf.study.benchmark.plan import BenchmarkStudy, Variant, load_study
@@ -57,9 +57,9 @@ def benchmark(
     artifact_store = Store(store.resolve())
     source, truth = read_capture(capture, store)
     recorded = Capture.load(ingest(artifact_store, source, capture_settings[0]).root)
-    if plan.until_flat and not (recorded.test_cameras and GroundTruth(truth.root, recorded).has_masks):
+    if plan.until_flat and not (recorded.test_cameras and truth_of(truth.root, recorded).has_masks):
         raise InputError(
-            f"{recorded.name}: no image can be scored, so no curve can become flat; add test cameras and "
+            f"{recorded.name}: no image can be scored, so no curve can become flat; add test cameras with masks, or "
             f"{GROUND_TRUTH}/masks, or choose another study"
         )
     part = plan != whole.restricted_to([], None)

@@ -5,17 +5,17 @@ from pathlib import Path
 import torch
 
 from hnerf.body.fit_result import BodyFit
-from hnerf.evaluation.ground_truth import GroundTruth
+from hnerf.evaluation.ground_truth import truth_of
 from hnerf.models import LPIPS_ALEXNET
 from hnerf.study.benchmark.plan import ScoringSettings
 from hnerf.study.benchmark.scoring import ScoringScene, score, score_end
 from tasks.calibration import calibrated_capture
-from tasks.source import GROUND_TRUTH, Source, require_unchanged
+from tasks.source import Source, require_unchanged
 from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("scoring", version="13", networks=(LPIPS_ALEXNET,))
+@stage("scoring", version="14", networks=(LPIPS_ALEXNET,))
 def score_training(
     out: Path,
     truth: Source,
@@ -32,7 +32,7 @@ def score_training(
     return {} if psnr is None else {"psnr": psnr}
 
 
-@stage("scoring-end", version="3", networks=(LPIPS_ALEXNET,))
+@stage("scoring-end", version="4", networks=(LPIPS_ALEXNET,))
 def score_end_of_training(
     out: Path,
     truth: Source,
@@ -51,5 +51,5 @@ def score_end_of_training(
 def scoring_scene(truth: Source, recording: Artifact, calibration: Artifact, body: Artifact) -> ScoringScene:
     """Return what trainings on a recording are scored against, on the GPU if there is one."""
     capture = calibrated_capture(recording, calibration)
-    known = GroundTruth(truth.root, capture) if (truth.root / GROUND_TRUTH).is_dir() else None
-    return ScoringScene(capture, BodyFit.load(body.root), known, "cuda" if torch.cuda.is_available() else "cpu")
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    return ScoringScene(capture, BodyFit.load(body.root), truth_of(truth.root, capture), device)

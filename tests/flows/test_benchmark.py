@@ -23,7 +23,15 @@ from tasks.source import Source, read_capture
 from tasks.store import Artifact, Store
 from tests.study.benchmark.test_results import scores
 
-RECORDED = SimpleNamespace(name="ada", train_cameras=("1", "2", "3", "4"), train_frames=(0, 1, 2), test_cameras=("5",))
+RECORDED = SimpleNamespace(
+    name="ada",
+    train_cameras=("1", "2", "3", "4"),
+    test_cameras=("5",),
+    train_frames=(0, 1, 2),
+    frames=(0, 1, 2),
+    root=Path("nowhere"),
+    recorded_frame=lambda _, frame: frame,
+)
 STUDY = """
 title: Toys
 seconds: 60
@@ -144,6 +152,10 @@ def test_trainings_get_longer_until_they_gain_nothing_or_time_or_steps_are_over(
     assert (nerf["ended"], [row["seconds"] for row in nerf["curve"]]) == ("flat", list(psnr))
     assert [training.seconds for _, training in stages][-2:] == [640.0, 640.0]  # the second is in the store
     assert nerf["novel_view"]["psnr"] == 25.05
+    (tmp_path / "ground_truth" / "masks").rmdir()  # those of the recording will do
+    (tmp_path / "masks" / "5").mkdir(parents=True)
+    (tmp_path / "masks" / "5" / "000000.png").touch()
+    monkeypatch.setattr(RECORDED, "root", tmp_path)
     (tmp_path / "mine.yaml").write_text(f"{text}100")
     found = read(benchmark.fn(tmp_path, str(tmp_path / "mine.yaml"), store=tmp_path / "store"))
     assert found["variants"]["one"]["methods"]["nerf"]["ended"] == "limit"

@@ -15,7 +15,7 @@ from hnerf.avatar.trained import load_avatar
 from hnerf.body.fit_result import BodyFit
 from hnerf.capture.capture import Capture, read_rgb, write_image
 from hnerf.evaluation.columns import avatar_for_split, reason_unavailable
-from hnerf.evaluation.evaluate import PROTOCOL, mesh_frames, score_meshes
+from hnerf.evaluation.evaluate import mesh_frames, protocol_of, score_meshes
 from hnerf.evaluation.ground_truth import GroundTruth
 from hnerf.evaluation.images import render, score_split, unscored, views_with_mask
 from hnerf.evaluation.lpips import lpips_availability
@@ -61,7 +61,7 @@ def score(scene: ScoringScene, training: Path, settings: ScoringSettings, out: P
     """
     avatar, split = load_avatar(training, scene.device), settings.split
     unavailable = {name: why for name in SPLITS if (why := reason_unavailable(name, training))}
-    protocol = f"{PROTOCOL} {SCORING_PROTOCOL}"
+    protocol = f"{protocol_of(scene.truth)} {SCORING_PROTOCOL}"
     found: Any = {"machine": machine(), "protocol": protocol, "lpips": lpips_availability()}
     found["split"], found["training"] = split, json.loads((training / "report.json").read_text())
     scored = scene.capture.test_cameras and split not in unavailable
