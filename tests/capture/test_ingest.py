@@ -99,6 +99,12 @@ def test_what_is_of_no_calibrated_camera_is_told(
     ]
 
 
+def test_a_folder_of_plates_is_refused(folder: Path, tmp_path: Path) -> None:
+    write_image(folder / "background" / "01" / "000000.png", rec.picture("01", 0))
+    with pytest.raises(InputError, match=r"background/01: a folder; give one clean plate a camera, as 01\.png beside"):
+        ingest(folder, SETTINGS, tmp_path / "out")
+
+
 def test_long_recordings_are_strided_evenly(folder: Path, tmp_path: Path) -> None:
     assert ingest(folder, CaptureSettings(max_frames=3), tmp_path / "out").train_frames == (0, 2, 4)
 

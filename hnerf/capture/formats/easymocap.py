@@ -61,7 +61,9 @@ class EasyMocap(Layout):
         return {}
 
     def plate_file(self, camera: str) -> Path | None:
-        """Return background/<camera>.jpg or .png."""
+        """Return background/<camera>.jpg or .png; raise InputError if that is a folder."""
+        if (folder := safe_io.path_in_capture(self.folder, "background", camera)).is_dir():
+            raise InputError(f"{folder}: a folder; give one clean plate a camera, as {folder.name}.png beside it")
         plate = safe_io.file_named(self.folder, camera, "background", suffixes=safe_io.IMAGE_SUFFIXES)
         return plate if plate.exists() else None
 
