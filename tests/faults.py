@@ -223,7 +223,7 @@ FAULTS = (
     Fault("fingers-across-gaps", "body/fingers", "np.arange(ends[-1]), ends - 1)",
           "np.arange(ends[-1]), ends[-1:] - 1)"),
     Fault("hands-seen-once", "body/hand_points", "seen_twice(hands[..., 0, 2])[..., None]", "1"),
-    Fault("fingers-usual", "body/fingers", "hand[seen if seen.any() else ~seen]", "hand"),
+    Fault("fingers-median", "body/fingers", "turns[seen, joints].quantile", "turns[:, joints].quantile"),
     Fault("limbs-twist", "body/posture_prior", "axes[twisted, 1]", "axes[twisted, 0]"),
     Fault("postures-by-group", "body/posture_prior", "slice(first + group * size, first + (group + 1) * size)",
           "slice(first, first + size)"),

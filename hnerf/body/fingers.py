@@ -1,5 +1,5 @@
-"""Fit of the fingers to hand points, with the body held: close to the person's usual hand, or a relaxed one if no frame
-shows it."""
+"""Fit of the fingers to hand points, with the body held: close to their medians over the frames, or relaxed where few
+frames show the hand."""
 
 import itertools
 import math
@@ -29,9 +29,9 @@ SPREAD_LIMITS_DEG, THUMB_SPREAD_LIMITS_DEG = (20.0, 5.0, 5.0), (35.0, 5.0, 5.0)
 RATE_DEG_S = 200.0  # standard deviation of a finger joint's speed: a fist closes in a third of a second
 # Steps, with what counts as an outlier: a fist is a decimetre from a relaxed hand. Then as for the palm. The last steps
 # also hold each joint close to its median over the frames that show the hand.
-STEPS_M, USUAL_STEPS, DAMPING = (0.2, 0.2, 0.2, 0.2, *12 * (OUTLIER_M,)), 6, 1e-4
-USUAL_STD_DEG, USUAL_OUTLIER_DEG = 5.0, 20.0  # std about the median, and deviation of another gesture
-MIN_USUAL_FRAMES = 3
+STEPS_M, MEDIAN_STEPS, DAMPING = (0.2, 0.2, 0.2, 0.2, *12 * (OUTLIER_M,)), 6, 1e-4
+MEDIAN_STD_DEG, MEDIAN_OUTLIER_DEG = 5.0, 20.0  # std about the median, and deviation of another gesture
+MIN_MEDIAN_FRAMES = 3
 
 
 @dataclass(frozen=True)
@@ -97,19 +97,22 @@ def add_persistence(equations: NormalEquations, turns: Tensor, following: np.nda
     return 0.5 * weight * float((change**2).sum())
 
 
-def add_usual(equations: NormalEquations, turns: Tensor, shown: Tensor) -> float:
+def add_median_prior(equations: NormalEquations, turns: Tensor, shown: Tensor) -> float:
     """Add a robust prior that keeps turns (n, 30, 3) close to their medians over the frames that show their hand, shown
     (n, 2) bool, and return its cost: a network mistakes small fingers differently in each frame. A hand that few frames
     show has none."""
-    known = (shown.sum(0) >= MIN_USUAL_FRAMES).repeat_interleave(15)
-    by_hand = zip(turns.split(15, 1), shown.T, strict=True)
-    median = torch.cat([hand[seen if seen.any() else ~seen].quantile(0.5, dim=0) for hand, seen in by_hand])
-    off = torch.where(known[:, None], turns - median, 0.0)
-    weight, cost = geman_mcclure(off.square().sum(-1), math.radians(USUAL_STD_DEG), math.radians(USUAL_OUTLIER_DEG))
-    equations.frame_gradient += (weight[..., None] * off).flatten(1).numpy()
-    at = np.arange(3 * len(known))
-    equations.frame[0][:, at, at] += (weight * known).repeat_interleave(3, 1).numpy()
-    return float(cost.sum())
+    cost = 0.0
+    for hand, seen in enumerate(shown.T):
+        if seen.sum() < MIN_MEDIAN_FRAMES:
+            continue
+        joints, at = slice(15 * hand, 15 * hand + 15), np.arange(45 * hand, 45 * hand + 45)
+        off = turns[:, joints] - turns[seen, joints].quantile(0.5, dim=0)
+        std, outlier = math.radians(MEDIAN_STD_DEG), math.radians(MEDIAN_OUTLIER_DEG)
+        weight, costs = geman_mcclure(off.square().sum(-1), std, outlier)
+        equations.frame_gradient[:, at] += (weight[..., None] * off).flatten(1).numpy()
+        equations.frame[0][:, at, at] += weight.repeat_interleave(3, 1).numpy()
+        cost += float(costs.sum())
+    return cost
 
 
 def fit_fingers(pose: Pose, views: Views, scale_m: Tensor, runs: list[tuple[int, ...]], seconds: float) -> Pose:
@@ -140,8 +143,8 @@ def fit_fingers(pose: Pose, views: Views, scale_m: Tensor, runs: list[tuple[int,
         equations.add_points(matrix, pull, by_frame[..., unknowns], x.new_zeros(*x.shape, 0))
         prior.add(equations, theta[:, fingers])
         add_persistence(equations, theta[:, fingers], following, math.radians(RATE_DEG_S) * seconds)
-        if number >= len(STEPS_M) - USUAL_STEPS:
-            add_usual(equations, theta[:, fingers], shown)
+        if number >= len(STEPS_M) - MEDIAN_STEPS:
+            add_median_prior(equations, theta[:, fingers], shown)
         step, _ = equations.step(DAMPING, np.zeros(0), np.zeros(0))
         theta[:, fingers] += torch.from_numpy(step).unflatten(-1, (-1, 3))
     return replace(pose, theta=theta)

@@ -42,9 +42,11 @@ class PosturePrior:
 
     @staticmethod
     def of_twists(frames: int, articulation: Articulation) -> "PosturePrior":
-        """Return a prior on wrists and on the twist of arms and thighs, over all frames: keypoints of the body show
-        hardly how a straight limb twists and not how a hand turns, and in images of a few hundred pixels a network
-        mistakes the turn of a hand in single frames."""
+        """Return a prior on wrists and on the twist of arms and thighs, over all frames.
+
+        The body's keypoints hardly show how a straight limb twists, and not at all how a hand turns; in images of a few
+        hundred pixels, a network mistakes the turn of a hand in single frames.
+        """
         names = [articulation.rig.joint_names[joint].split(".")[0] for joint in articulation.joints[1:].tolist()]
         wrists, twisted = (torch.tensor([name in held for name in names]) for held in (("wrist",), TWISTED))
         prior = PosturePrior.uniform(

@@ -93,7 +93,7 @@ def evaluate(inputs: EvaluationInputs, settings: EvaluationSettings, out: Path) 
     return found
 
 
-def protocol_of(truth: GroundTruth | None) -> str:
+def protocol_of(truth: GroundTruth) -> str:
     """Return the protocol, with what differs for captures without true masks."""
     given = isinstance(truth, GivenMasks)
     return f"{PROTOCOL} Here, images are compared to {UNDER_GIVEN_MASKS}." if given else PROTOCOL

@@ -24,7 +24,7 @@ TUNED_ON = (
 )
 
 
-def scored_views(capture: Capture, split: str, truth: Truth | None, count: int | None) -> list[View]:
+def scored_views(capture: Capture, split: str, truth: Truth, count: int | None) -> list[View]:
     """Return all images of a split, or at most `count` of those with a true mask; of all if none has one."""
     views = all_views(capture, split)
     if count is None:
@@ -32,9 +32,9 @@ def scored_views(capture: Capture, split: str, truth: Truth | None, count: int |
     return sample_views(views_with_mask(views, truth) or views, count)
 
 
-def views_with_mask(views: list[View], truth: Truth | None) -> list[View]:
+def views_with_mask(views: list[View], truth: Truth) -> list[View]:
     """Return the views that have a true mask."""
-    return [view for view in views if truth and truth.has_mask(view.camera, view.frame)]
+    return [view for view in views if truth.has_mask(view.camera, view.frame)]
 
 
 def render(avatars: Mapping[str, Avatar], capture: Capture, views: list[View], out: Path) -> float:
@@ -61,7 +61,7 @@ def rgba(rendering: Rendering) -> np.ndarray:
     return (both.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
-def score_split(capture: Capture, split: str, views: list[View], truth: Truth | None, out: Path) -> SplitScores:
+def score_split(capture: Capture, split: str, views: list[View], truth: Truth, out: Path) -> SplitScores:
     """Return the mean image scores of a split's renderings, and those of each image; null with a reason if there are
     none."""
     if not views:
@@ -69,7 +69,7 @@ def score_split(capture: Capture, split: str, views: list[View], truth: Truth | 
         return unscored(f"the capture has no {missing}")
     if not capture.test_cameras:
         return unscored(TUNED_ON)
-    if truth is None or not truth.has_masks:
+    if not truth.has_masks:
         return unscored("the test cameras have neither ground-truth masks nor masks that came with the recording")
     rows: list[ImageScores] = []
     references = set()

@@ -74,7 +74,7 @@ LONG_LIST = 12  # values; longer lists are shown by their range
 def write_report(
     inputs: EvaluationInputs,
     settings: EvaluationSettings,
-    truth: GroundTruth | None,
+    truth: GroundTruth,
     true_meshes: dict[int, trimesh.Trimesh],
     found: Metrics,
     out: Path,
@@ -169,7 +169,7 @@ def held_out_rows(found: Metrics) -> list[list[str]]:
 def galleries(
     inputs: EvaluationInputs,
     settings: EvaluationSettings,
-    truth: GroundTruth | None,
+    truth: GroundTruth,
     true_meshes: dict[int, trimesh.Trimesh],
     found: Metrics,
     out: Path,

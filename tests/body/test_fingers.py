@@ -8,7 +8,7 @@ import torch
 from hnerf.body import fingers
 from hnerf.body.anny import anny_rig
 from hnerf.body.articulation import Articulation, Pose
-from hnerf.body.fingers import FingerPrior, add_persistence, add_usual, fit_fingers
+from hnerf.body.fingers import FingerPrior, add_median_prior, add_persistence, fit_fingers
 from hnerf.body.hand_points import finger_joints, hand_points
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.rig import Rig, joint_transforms
@@ -146,7 +146,7 @@ def test_an_unusual_finger_costs_a_half_and_a_gesture_little_more() -> None:
         turns = torch.full((4, 30, 3), 0.1, dtype=torch.float64)
         turns[2, 4, 0] += math.radians(off_deg)
         turns[1, 20, 0] += 1.0
-        np.testing.assert_allclose(add_usual(NormalEquations(4, 90, 0), turns, SHOWN), cost)
+        np.testing.assert_allclose(add_median_prior(NormalEquations(4, 90, 0), turns, SHOWN), cost)
 
 
 def test_the_usual_hand_is_that_of_the_frames_that_show_it() -> None:
@@ -154,7 +154,7 @@ def test_the_usual_hand_is_that_of_the_frames_that_show_it() -> None:
     turns = torch.zeros(6, 30, 3, dtype=torch.float64)
     turns[3:, :, 0] = 0.2
     equations = NormalEquations(6, 90, 0)
-    add_usual(equations, turns, torch.tensor([[True, True]] * 3 + [[False, False]] * 3))
+    add_median_prior(equations, turns, torch.tensor([[True, True]] * 3 + [[False, False]] * 3))
     assert not equations.frame_gradient[:3].any() and (equations.frame_gradient[3:, ::3] > 0).all()
 
 
@@ -163,9 +163,9 @@ def test_the_gradient_towards_the_usual_hand_is_that_of_the_cost_while_medians_s
     turns[2] = torch.rand(30, 3, generator=torch.Generator().manual_seed(0)).double()
     shown, step = torch.ones(3, 2, dtype=torch.bool), torch.zeros_like(turns)
     step[2] = 1e-6
-    ends = [add_usual(NormalEquations(3, 90, 0), turns + sign * step, shown) for sign in (1, -1)]
+    ends = [add_median_prior(NormalEquations(3, 90, 0), turns + sign * step, shown) for sign in (1, -1)]
     equations = NormalEquations(3, 90, 0)
-    add_usual(equations, turns, shown)
+    add_median_prior(equations, turns, shown)
     np.testing.assert_allclose(equations.frame_gradient[2].sum(), (ends[0] - ends[1]) / 2e-6, rtol=1e-6)
 
 

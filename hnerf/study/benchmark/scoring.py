@@ -46,11 +46,11 @@ SCORING_PROTOCOL = (
 @dataclass(frozen=True)
 class ScoringScene:
     """What trainings are scored against: the capture with calibrated cameras, the body as fitted before training, and
-    the truth, if any."""
+    the truth."""
 
     capture: Capture
     fitted: BodyFit
-    truth: GroundTruth | None
+    truth: GroundTruth
     device: str
 
 
@@ -128,7 +128,7 @@ def score_views(
         return found
     if not meshes:
         return found | {"geometry": None, "geometry_reason": "the study requests no surface here"}
-    true_meshes = scene.truth.meshes() if scene.truth else {}
+    true_meshes = scene.truth.meshes()
     frames = [f for f in mesh_frames(split_frames(scene.capture, split), true_meshes, meshes) if f in true_meshes]
     return found | score_meshes(avatar, frames, true_meshes, out)
 
@@ -138,7 +138,6 @@ def write_pictures(scene: ScoringScene, split: str, per_image: list[ImageScores]
     which."""
     chosen = [Picture(camera=row["camera"], frame=row["frame"]) for row in evenly_spaced(per_image, PICTURES)]
     for k, row in enumerate(chosen):
-        assert scene.truth is not None  # since images were scored
         box = frame_person(scene.truth.mask(**row))
         both = {"render": read_rgb(View(split, **row).path(out)), "truth": scene.truth.on_black(**row)[0]}
         for name, picture in both.items():
