@@ -5,7 +5,7 @@ skinning there, so y equals s + d n(s) where the skin moves rigidly, and stays c
 not.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -44,6 +44,14 @@ class Descriptor:
     def vertex(self) -> Tensor:
         """Return the corner of the closest triangle that is nearest to the closest point, (N,)."""
         return nearest_corner(self.corners, self.barycentric)
+
+    def pick(self, rows: Tensor) -> "Descriptor":
+        """Return the descriptors of `rows` (M,)."""
+        return Descriptor(*(getattr(self, field.name).index_select(0, rows) for field in fields(self)))
+
+    def followed_by(self, other: "Descriptor") -> "Descriptor":
+        """Return these descriptors and others after them."""
+        return Descriptor(*(torch.cat([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)))
 
 
 class PoseCorrection(nn.Module):
@@ -86,12 +94,18 @@ class PosedBodies:
         self._skin_joints = rig.skin_joints.int()
         self._pose(theta, root)
         self._meshes = BodyMeshes(self.vertices_m, rig.faces)
+        self._limbs = rig.limbs
+        self._close = self._limbs.close(self.vertices_m)
+        close = torch.nonzero(self._close.flatten(0, 1).any(0))[:, 0].tolist()
+        self._faces_of = {limb: torch.nonzero(self._limbs.face_limb == limb)[:, 0] for limb in close}
+        self._limb_meshes = {k: BodyMeshes(self.vertices_m, rig.faces[faces]) for k, faces in self._faces_of.items()}
 
     def set_poses(self, rig: Rig, theta: Tensor, root: Tensor) -> None:
-        """Replace the poses and the shape by similar ones."""
+        """Replace the poses and the shape by similar ones, in which the same limbs are close to each other."""
         self.rig = rig
         self._pose(theta, root)
-        self._meshes.refit(self.vertices_m)
+        for meshes in (self._meshes, *self._limb_meshes.values()):
+            meshes.refit(self.vertices_m)
 
     def _pose(self, theta: Tensor, root: Tensor) -> None:
         self.theta, self.root = theta.detach(), root.detach()
@@ -130,6 +144,56 @@ class PosedBodies:
         closest is looked for once.
         """
         found = self._meshes.closest_points(points_m, frame, reach_m, exact_sign)
+        return self._described(points_m, frame, found, correction, s_follows, beside_m)
+
+    def describe_by_limbs(
+        self,
+        points_m: Tensor,
+        frame: Tensor,
+        reach_m: float,
+        correction: PoseCorrection | None = None,
+        exact_sign: bool = False,
+        s_follows: bool = True,
+        beside_m: Tensor | None = None,
+    ) -> tuple[Descriptor, Tensor]:
+        """Return what `describe` does, followed by descriptors relative to limbs beside the closest, where the pose
+        brings them close to it; and of which of the points these M are, (M,)."""
+        closest = self.describe(points_m, frame, reach_m, correction, exact_sign, s_follows, beside_m)
+        if not self._limb_meshes:
+            return closest, torch.zeros(0, dtype=torch.long, device=frame.device)
+        close = self._close[frame.long(), closest.vertex[: len(frame)]] & closest.near[: len(frame), None]
+        more, found = self._closest_on_limbs(points_m, frame, reach_m, close)
+        beside_m = None if beside_m is None else beside_m[:, more]
+        other = self._described(points_m[more], frame[more], found, correction, s_follows, beside_m)
+        copies = torch.arange(len(closest.d) // len(points_m), device=more.device)
+        return closest.followed_by(other), (more + len(points_m) * copies[:, None]).flatten()
+
+    def _closest_on_limbs(
+        self, points_m: Tensor, frame: Tensor, reach_m: float, asked: Tensor
+    ) -> tuple[Tensor, ClosestPoints]:
+        """Return which points are within reach of a limb that they ask for, (M,), and what of it is closest to them.
+        asked (N, L) bool. Limbs end where they join: that end is no surface."""
+        found = []
+        for limb, meshes in self._limb_meshes.items():
+            points = torch.nonzero(asked[:, limb])[:, 0]
+            at = meshes.closest_points(points_m[points], frame[points], reach_m)
+            face = self._faces_of[limb][at.face.clamp(min=0)]
+            on_end = (self._limbs.on_cut[self.rig.faces[face]] | (at.barycentric < ON_EDGE)).all(1)
+            kept = torch.nonzero((at.face >= 0) & ~on_end)[:, 0]
+            found.append((points[kept], face[kept], at.barycentric[kept], at.sign[kept]))
+        more, *closest = (torch.cat(parts) for parts in zip(*found, strict=True))
+        return more, ClosestPoints(*closest)
+
+    def _described(
+        self,
+        points_m: Tensor,
+        frame: Tensor,
+        found: ClosestPoints,
+        correction: PoseCorrection | None,
+        s_follows: bool,
+        beside_m: Tensor | None,
+    ) -> Descriptor:
+        """Return the descriptors of points by their closest points; the arguments are those of `describe`."""
         moved = points_m - points_m.detach()  # zero, but carries the gradient
         if beside_m is not None:
             many = len(beside_m)

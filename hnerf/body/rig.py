@@ -18,6 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hnerf.body.limbs import Limbs
+
 
 @dataclass(frozen=True)
 class Rig:
@@ -51,6 +53,11 @@ class Rig:
             depth.append(depth[parent] + 1)
         depths = torch.tensor(depth, device=self.parents.device)
         return [torch.nonzero(depths == level)[:, 0] for level in range(max(depth) + 1)]
+
+    @cached_property
+    def limbs(self) -> Limbs:
+        """Return the trunk, arms and legs."""
+        return Limbs.of(self)
 
     @cached_property
     def dense_weights(self) -> Tensor:

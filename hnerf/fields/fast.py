@@ -166,17 +166,23 @@ class FastField(Field):
         row, background, beside_m = rays.frame[hit].repeat_interleave(depths.shape[1]), draws.background, None
         if directions is not None:
             beside_m = ((directions - rays.directions)[:, hit, None] * depths[hit, :, None]).flatten(1, 2)
-        skin = scene.bodies.describe(points_m, row, self.reach_m, scene.correction, s_follows=False, beside_m=beside_m)
+        bodies, pose = scene.bodies, scene.conditions.pose
+        skin, more = bodies.describe_by_limbs(
+            points_m, row, self.reach_m, scene.correction, s_follows=False, beside_m=beside_m
+        )
         if directions is not None:
             many = len(directions)
             hit = (hit + len(rays) * torch.arange(many, device=hit.device)[:, None]).flatten()
             depths, met, core, row, background = (torch.cat([t] * many) for t in (depths, met, core, row, background))
-        described, moved = self._deformed(skin, scene.conditions.frame_row[row])
+        rows = torch.cat([row, row[more]])
+        described, moved = self._deformed(skin, scene.conditions.frame_row[rows])
         near = described.near & (described.d <= self.outer_m[described.vertex])  # cells reach farther than the shell
         described = dataclasses.replace(described, near=near)
-        pose = scene.conditions.pose
-        d = torch.where(described.near, described.d, self.reach_m).view(len(hit), depths.shape[1])
-        residual = self._residual(described, pose, row).view_as(d)
+        d = torch.where(described.near, described.d, self.reach_m)
+        residual = self._residual(described, pose, rows)
+        chosen = least_of_limbs(d + residual, more)
+        skin, described = skin.pick(chosen), described.pick(chosen)
+        d, residual = (t.index_select(0, chosen).view(len(hit), depths.shape[1]) for t in (d, residual))
         d_hat = d + residual
         alpha_dot = alpha_from_sdf(least_around(described, d_hat), self.log_sharpness.exp())
         # an opaque core: nothing shines through if the surface lies deeper
@@ -189,7 +195,7 @@ class FastField(Field):
             norms = self._gradient_norms(described, skin, pose, row, draws.probe[hit], depths.shape[1])
         elastic = None
         if moved is not None:
-            energy = torch.where(described.near, (moved / ELASTIC_M).square().sum(-1), 0.0)
+            energy = torch.where(described.near, (moved.index_select(0, chosen) / ELASTIC_M).square().sum(-1), 0.0)
             elastic = energy.view_as(d).mean(1)
 
         def everywhere(values: Tensor, elsewhere: float) -> Tensor:
@@ -295,15 +301,36 @@ class FastField(Field):
 
     def signed_distance(self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions) -> Tensor:
         """Return d_hat (N,) at points (N, 3) around the first body; beyond the shell it is the body's own distance."""
-        row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
-        described, _ = self._deformed(bodies.describe(points_m, row, FAR_M, exact_sign=True), conditions.frame_row[row])
-        return described.d + self._residual(described, conditions.pose, row)
+        return self._at_points(bodies, points_m, conditions, exact_sign=True)[1]
 
     def colour(self, bodies: PosedBodies, points_m: Tensor, directions: Tensor, conditions: Conditions) -> Tensor:
         """Return c (N, 3) at points around the first body; this field does not depend on the viewing direction."""
+        described = self._at_points(bodies, points_m, conditions)[0]
         row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
-        described, _ = self._deformed(bodies.describe(points_m, row, FAR_M), conditions.frame_row[row])
         return self._colour(bodies, described, conditions.pose, row, torch.ones_like(described.near))
+
+    def _at_points(
+        self, bodies: PosedBodies, points_m: Tensor, conditions: Conditions, exact_sign: bool = False
+    ) -> tuple[Descriptor, Tensor]:
+        """Return descriptors of points (N, 3) around the first body, and d_hat (N,) there."""
+        row = torch.zeros(len(points_m), dtype=torch.long, device=points_m.device)
+        skin, more = bodies.describe_by_limbs(points_m, row, FAR_M, exact_sign=exact_sign)
+        rows = torch.cat([row, row[more]])
+        described, _ = self._deformed(skin, conditions.frame_row[rows])
+        d_hat = described.d + self._residual(described, conditions.pose, rows)
+        chosen = least_of_limbs(d_hat, more)
+        return described.pick(chosen), d_hat.index_select(0, chosen)
+
+
+def least_of_limbs(d_hat: Tensor, more: Tensor) -> Tensor:
+    """Return the row of d_hat (N + M,) that is the least at each of N points: its own, or one of the last M, at points
+    `more` (M,), by other limbs. The person is the union of the limbs."""
+    points = len(d_hat) - len(more)
+    chosen = torch.arange(points, device=d_hat.device)
+    own, other = d_hat.detach().split([points, len(more)])
+    least = own.scatter_reduce(0, more, other, "amin")
+    better = torch.nonzero((other < own[more]) & (other == least[more]))[:, 0]
+    return chosen.index_copy(0, more[better], points + better)
 
 
 def shown(weights: Tensor) -> Tensor:

@@ -18,12 +18,14 @@ from hnerf.fields.fast import (
     TIGHTEN_STEP_M,
     FastField,
     least_around,
+    least_of_limbs,
     move_to_surface,
     shown,
 )
 from hnerf.fields.rays import PosedScene, Rays
 from hnerf.training.losses import pixel_colour
 from tests.body.boxes import box_rig
+from tests.body.test_limbs import limbs_rig, swung
 
 RIG = box_rig(splits=3)
 SETTINGS = FastFieldSettings(
@@ -349,3 +351,25 @@ def test_a_ray_that_grazes_the_surface_has_finite_gradients():
 def test_samples_stay_where_the_surface_is_left():
     described = on_a_ray([0.001, 0.004, 0.004, 0.009], [True] * 4)
     assert torch.equal(move_to_surface(described, described.d[None]).d, described.d)
+
+
+def test_the_person_is_the_union_of_the_limbs() -> None:
+    """Point 0 is asked about two more limbs, of which the last is the least; 1 is deepest in its own; 2 in another."""
+    d_hat = torch.tensor([3.0, -4.0, 2.0, 2.5, 1.0, -3.0, -1.0])
+    assert least_of_limbs(d_hat, torch.tensor([0, 0, 1, 2])).tolist() == [4, 1, 6]
+
+
+def test_a_shirt_that_is_closer_to_the_arm_than_to_the_trunk_is_the_trunks() -> None:
+    """The arm is 4 cm from the trunk, 0.8 m below the shoulder, and a shirt reaches 3 cm out of the trunk. 2.5 cm from
+    the trunk, less than 1.5 from the arm, a point is 5 mm inside the shirt, and a ray through it ends there."""
+    rig, bodies = limbs_rig(), swung(0.2)
+    field = FastField(rig, SETTINGS, 1)
+    field.log_sharpness.data.fill_(2000.0).log_()
+    field.field.residual = lambda y, d, pose, row: torch.where(y[:, 0] < 1.1, -0.03, 0.0)
+    conditions = Conditions.of(rig, bodies.theta, bodies.root, torch.zeros(1).long(), 2.5)
+    point_m = torch.tensor([[1.025, 0.05, 0.2]])
+    assert bodies.describe(point_m, torch.zeros(1).long(), 1.0).y[0, 0] > 1.1
+    assert field.signed_distance(bodies, point_m, conditions).item() == pytest.approx(-0.005, abs=1e-5)
+    ray = Rays(point_m - torch.tensor([[0.0, 1.0, 0.0]]), torch.tensor([[0.0, 1.0, 0.0]]), torch.zeros(1).long())
+    scene, draws = field.scene(bodies, conditions), Draws.deterministic(1, 32, torch.device("cpu"))
+    assert field.coverage(field.sample(scene, ray, draws)[0]).item() > 0.99

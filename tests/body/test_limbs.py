@@ -1,0 +1,129 @@
+"""A trunk, a slab, and an arm, a rod beside it, which a turn about its top end lays against the trunk or into it:
+which of the two is asked beside the closest, worked out by hand and compared with trying every triangle of each."""
+
+import torch
+from torch import Tensor
+
+from hnerf.body.anny import anny_rig
+from hnerf.body.canonical import Descriptor, PosedBodies
+from hnerf.body.limbs import CLOSE_M
+from hnerf.body.rig import Rig
+from tests.body.boxes import box_faces, box_vertices, hinged
+from tests.body.reference import closest_points_reference
+
+LEVELS = 40
+SHOULDER_M = (1.2, 0.05, 1.0)
+REACH_M = 0.3
+ONE = torch.zeros(1, dtype=torch.long)
+
+
+def limbs_rig(gap_m: float = 0.2) -> Rig:
+    """Return the trunk, x from 0 to 1 m, and an arm, x from 1.2 to 1.3 m, or closer, below its joint at the top; both
+    are 0.1 m thick along y, and 1 m high."""
+    trunk, arm = (box_vertices(1.0, LEVELS) * torch.tensor([x, 0.1, 1.0]) for x in (1.0, 0.1))
+    vertices_m = torch.cat([trunk, arm + torch.tensor([1 + gap_m, 0.0, 0.0])])
+    faces = torch.cat([box_faces(LEVELS), box_faces(LEVELS) + len(trunk)])
+    on_arm = torch.cat([torch.zeros(len(trunk)), torch.ones(len(arm))])
+    joints_m = torch.tensor([[0.5, 0.05, 0.0], SHOULDER_M])
+    return hinged(vertices_m, faces, joints_m, ("root", "upperarm01.L"), on_arm)
+
+
+def swung(slope: float) -> PosedBodies:
+    """Return the bodies with the arm turned about y, so that it comes closer by `slope` metres for each below the
+    shoulder."""
+    rig, theta = limbs_rig(), torch.zeros(1, 2, 3)
+    theta[0, 1, 1] = torch.tensor(slope).atan()
+    return PosedBodies(rig, theta, torch.eye(4)[None], rig.vertices_m)
+
+
+def at(*points: tuple[float, float, float]) -> Tensor:
+    return torch.tensor(points)
+
+
+def by_other_limbs(bodies: PosedBodies, points_m: Tensor) -> tuple[Tensor, Descriptor]:
+    """Return which points other limbs than the closest describe, too, and how."""
+    described, more = bodies.describe_by_limbs(points_m, ONE.expand(len(points_m)), REACH_M)
+    return more, described.pick(torch.arange(len(points_m), len(described.d)))
+
+
+def test_limbs_begin_at_their_first_joints() -> None:
+    limbs = limbs_rig().limbs
+    assert torch.equal(limbs.vertex_limb, torch.tensor([0, 1]).repeat_interleave(4 * (LEVELS + 1)))
+    assert not limbs.on_cut.any()
+    facing = limbs.samples[(limbs_rig().vertices_m[limbs.samples, 0] - 1.2).abs() < 1e-6]
+    torch.testing.assert_close(limbs.rest_m[limbs.sample_of[facing], 0], torch.full((len(facing),), 0.2))
+
+
+def test_only_limbs_that_came_closer_than_at_rest_are_close() -> None:
+    """At rest the arm is 20 cm away, and closer than 6 where a slope of 0.2 has come 70 cm down: there the vertices of
+    the trunk that face it are close to the arm, and those of the arm to the trunk. An arm that is 4 cm away at rest is
+    not close."""
+    rig, bodies = limbs_rig(), swung(0.2)
+    limbs = rig.limbs
+    assert not limbs.close(rig.vertices_m[None]).any()
+    close = limbs.close(bodies.vertices_m)[0]
+    x, _, z = rig.vertices_m.T
+    facing = (x == 1) | ((x - 1.2).abs() < 1e-6)
+    lower, upper = facing & (z < 0.25), facing & (z > 0.4)
+    own = limbs.vertex_limb
+    assert close[lower, 1 - own[lower]].all() and not close[upper].any()
+    assert not close[torch.arange(len(own)), own].any() and not close[:, 2:].any()
+    rig = limbs_rig(0.04)
+    assert not rig.limbs.close(rig.vertices_m[None]).any()
+    assert CLOSE_M == 0.06
+
+
+def test_a_point_between_two_limbs_is_described_by_both() -> None:
+    """With a slope of 0.2, 0.8 m below the shoulder, the arm's face is 4 cm from the trunk. A point 1 cm from the trunk
+    is 3 cm from the arm, times the cosine of its slope; above, where they are apart, nothing else is asked."""
+    bodies = swung(0.2)
+    found, other = by_other_limbs(bodies, at((1.01, 0.05, 0.2), (1.01, 0.05, 0.9)))
+    assert found.tolist() == [0]
+    cosine = 1 / 1.04**0.5
+    torch.testing.assert_close(other.d, torch.tensor([0.03 * cosine]), atol=1e-4, rtol=0)
+    down_m = (0.8**2 + 0.19**2 - (0.03 * cosine) ** 2) ** 0.5  # along the arm, from its joint to the closest point
+    torch.testing.assert_close(other.y, at((1.2 - 0.03 * cosine, 0.05, 1 - down_m)), atol=1e-4, rtol=0)
+    assert (other.vertex >= 4 * (LEVELS + 1)).all()
+
+
+def test_other_limbs_are_closest_as_when_every_triangle_is_tried() -> None:
+    """The arm cuts into the trunk: all points around the two have, of the other limb, the distance and sign that it has
+    alone."""
+    bodies = swung(0.35)
+    rig, vertices_m = bodies.rig, bodies.vertices_m[0]
+    points_m = torch.rand(600, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([0.6, 0.3, 1.2])
+    points_m += torch.tensor([0.8, -0.1, -0.1])
+    found, other = by_other_limbs(bodies, points_m)
+    arms = rig.faces.amin(1) >= 4 * (LEVELS + 1)
+    expected = torch.stack(
+        [
+            closest_points_reference(points_m, vertices_m, rig.faces[of_limb], REACH_M).sign
+            * closest_distance(points_m, vertices_m, rig.faces[of_limb])
+            for of_limb in (~arms, arms)
+        ],
+        1,
+    )
+    of_arm = (other.vertex >= 4 * (LEVELS + 1)).long()
+    assert len(found) > 150 and 0 < of_arm.sum() < len(found)
+    torch.testing.assert_close(other.d, expected[found, of_arm], atol=1e-5, rtol=0)
+
+
+def closest_distance(points_m: Tensor, vertices_m: Tensor, faces: Tensor) -> Tensor:
+    found = closest_points_reference(points_m, vertices_m, faces, 9.0)
+    return ((vertices_m[faces[found.face]] * found.barycentric[..., None]).sum(1) - points_m).norm(dim=1)
+
+
+def test_no_point_is_described_by_where_a_limb_ends() -> None:
+    """An arm pressed into the trunk: the trunk's end at the shoulder, which is inside the body, is no surface."""
+    rig = anny_rig()
+    theta = torch.zeros(1, len(rig.joints_m), 3)
+    theta[0, rig.joint_names.index("upperarm01.L"), 1] = 0.9
+    bodies = PosedBodies(rig, theta, torch.eye(4)[None], rig.vertices_m)
+    limbs = rig.limbs
+    arm = limbs.vertex_limb == 1
+    points_m = bodies.vertices_m[0, arm]
+    found, other = by_other_limbs(bodies, points_m)
+    share_on_cut = (limbs.on_cut[other.corners] * other.barycentric).sum(1)
+    assert 50 < len(found) < len(points_m)
+    assert (share_on_cut < 0.9999).all()
+    assert limbs.on_cut.sum() < 300
