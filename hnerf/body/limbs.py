@@ -47,7 +47,8 @@ class Limbs:
         on_cut[rig.faces[corner_limbs.amin(1) < face_limb].flatten()] = True
         cell = torch.cat([(rig.vertices_m / SAMPLE_CELL_M).floor().long(), vertex_limb[:, None]], 1)
         cells, sample_of = torch.unique(cell, dim=0, return_inverse=True)
-        samples = sample_of.new_zeros(len(cells)).index_copy(0, sample_of, torch.arange(len(cell), device=cell.device))
+        vertices = torch.arange(len(cell), device=cell.device)
+        samples = torch.full_like(cells[:, 0], len(cell)).scatter_reduce(0, sample_of, vertices, "amin")
         rest_m = _distances_m(rig.vertices_m[samples], vertex_limb[samples])
         return Limbs(vertex_limb, face_limb, on_cut, samples, sample_of, rest_m)
 
