@@ -67,7 +67,7 @@ def _draw_outline(axes: Axes, cameras: Sequence[Camera], camera: Camera, evidenc
         return
     message = f"mean {residuals_px.mean():.2f} px, 95 % below {np.percentile(residuals_px, 95):.1f} px"
     axes.set_title(f"{camera.name}: outline, {message}", fontsize=10)
-    _scatter(axes, outline.points_px, outlines.at(middle).residuals_px(cameras)[camera.name], 14)
+    _scatter(axes, outline.points_px, outlines.some(slice(middle, middle + 1)).residuals_px(cameras)[camera.name], 14)
 
 
 def _draw_matches(axes: Axes, cameras: Sequence[Camera], camera: Camera, evidence: Evidence) -> None:

@@ -95,9 +95,9 @@ class Outlines:
         usable = {name: outlines for name, outlines in by_camera.items() if any(outlines)}
         return Outlines(usable, tuple(shown)) if len(usable) > 1 else None
 
-    def at(self, position: int) -> "Outlines":
-        """Return the outlines of one instant, by its position in `instants`."""
-        return Outlines({name: [row[position]] for name, row in self.by_camera.items()}, (self.instants[position],))
+    def some(self, positions: slice) -> "Outlines":
+        """Return the outlines of some instants, by their positions in `instants`."""
+        return Outlines({name: row[positions] for name, row in self.by_camera.items()}, self.instants[positions])
 
     def cost_px(self, cameras: Sequence[Camera]) -> float:
         """Return the mean of the lowest 98 % of all residuals under at least two cameras.

@@ -19,7 +19,9 @@ NO_MATCHES = Matches({}, 0)
 
 
 class OutlinesThat:
-    """Stand-in for the outlines: the same cost for any refined cameras."""
+    """Stand-in for the outlines of one instant: the same cost for any refined cameras."""
+
+    instants = (0,)
 
     def __init__(self, given: Sequence[Camera], given_px: float, refined_px: float) -> None:
         self.given, self.given_px, self.refined_px = given, given_px, refined_px

@@ -1,0 +1,76 @@
+"""Cameras fitted to the exact outlines of a box in several places."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hnerf.calibration.outline_adjustment import _turned, adjust_to_outlines
+from hnerf.calibration.silhouettes import MaskOutline, Outlines
+from hnerf.geometry.camera import Camera
+from tests.calibration.synthetic import ring, turned
+from tests.calibration.test_refine import keypoints_of, refined, with_c2
+from tests.calibration.test_silhouettes import CORNERS_M, mask
+
+MIDDLE_M = np.array([0.0, 0.0, 0.9])
+
+
+def places() -> list[np.ndarray]:
+    """Return the corners of the box, turned about the vertical and moved, at eight instants."""
+    turns = [np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]) for a in np.arange(8) * 0.7]
+    return [CORNERS_M @ turn.T + [0.1 * np.sin(i), 0.1 * np.cos(2 * i), 0] for i, turn in enumerate(turns)]
+
+
+def outlines() -> Outlines:
+    by_camera = {c.name: [MaskOutline.around(mask(c, corners_m)) for corners_m in places()] for c in ring(4)}
+    return Outlines(by_camera, tuple(range(8)))
+
+
+def off_px(cameras: list[Camera]) -> np.ndarray:
+    """Return the mean distance of the boxes' corners in each image from where they are seen, (C,)."""
+    corners_m = np.concatenate(places())
+    pairs = zip(cameras, ring(4), strict=True)
+    return np.array(
+        [np.linalg.norm(c.project(corners_m)[0] - t.project(corners_m)[0], axis=1).mean() for c, t in pairs]
+    )
+
+
+def test_a_camera_turns_about_the_person_and_moves_in_its_own_axes() -> None:
+    """A quarter turn about the line of sight leaves the pivot in its pixel; 1 cm to the right, 3.5 m away, is 1000 x
+    0.01 / 3.5 pixels."""
+    camera = ring(4)[1]
+    seen, depth_m = camera.project(MIDDLE_M)
+    quarter = _turned(camera, np.array([0, 0, np.pi / 2, 0, 0, 0]), MIDDLE_M)
+    np.testing.assert_allclose(quarter.project(MIDDLE_M)[0], seen, atol=1e-9)
+    np.testing.assert_allclose(quarter.R, np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ camera.R, atol=1e-12)
+    moved = _turned(camera, np.array([0, 0, 0, 0.01, 0, 0]), MIDDLE_M)
+    np.testing.assert_allclose(moved.project(MIDDLE_M)[0] - seen, [camera.K[0, 0] * 0.01 / depth_m, 0], atol=1e-9)
+
+
+def test_a_turned_camera_returns() -> None:
+    given = with_c2(lambda c: turned(c, 0.5))
+    found = adjust_to_outlines(outlines(), given, ["c2"], MIDDLE_M)
+    assert [new is old for new, old in zip(found, given, strict=True)] == [True, True, False, True]
+    assert off_px(given)[2] > 8 and off_px(found)[2] < 1
+
+
+def test_all_cameras_together_keep_the_world() -> None:
+    """The rig stays where it was given, and one camera of it is better."""
+    given = with_c2(lambda c: turned(c, 0.5))
+    found = adjust_to_outlines(outlines(), given, [c.name for c in given], MIDDLE_M)
+    assert off_px(found).max() < off_px(given).max() / 2
+    for new, old in zip(found, given, strict=True):
+        assert np.linalg.norm(new.centre_m - old.centre_m) < 0.1
+
+
+def test_outlines_mend_what_keypoints_get_wrong_alike_in_all_frames(tmp_path: Path) -> None:
+    """c2 is turned by a degree, and its detector sees everything 4 px to the right: keypoints alone leave it 4 px off.
+    Without any error of keypoints, they have the last word."""
+    given = with_c2(lambda c: turned(c, 1.0))
+    biased = keypoints_of()
+    biased[2, ..., 0] += 4
+    alone, both = (refined(tmp_path / name, given, biased, o) for name, o in (("a", None), ("b", outlines())))
+    assert off_px(alone.cameras)[2] == pytest.approx(4, abs=0.5) and off_px(both.cameras)[2] < 1
+    assert "then fitted to outlines: those of other frames go from" in both.reasons["c2"]
+    exact = refined(tmp_path / "c", given, keypoints_of(0), outlines())
+    assert "outlines" not in exact.reasons["c2"] and off_px(exact.cameras)[2] < 0.1
