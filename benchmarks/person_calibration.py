@@ -27,6 +27,7 @@ from hnerf.calibration.diagnosis import body_height_m, measure
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.person.calibrate import PersonCalibration, calibrate_from_person
 from hnerf.calibration.refine import Refinement, refine
+from hnerf.calibration.silhouettes import Outlines
 from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest
 from hnerf.capture.subject import subject_keypoints
@@ -43,10 +44,10 @@ NOISE = 0.01  # of the person's height in pixels, standard deviation
 SECONDS, FPS, WAVES_AT_S = 3.0, 30.0, 1.5
 OFFSETS_FRAMES, RATES = (0.0, 37.0, -11.37, 20.6), (30.0, 30.0, 30.0, 25.0)
 PROTOCOL = (
-    "Cameras: the training cameras of each capture, from keypoints alone; poses of the delivered calibration are not "
-    "read. Lenses known: its intrinsics are; unknown: one focal length is estimated from a guess of .85 of the longer "
-    "side. The height is the one that the reference gives the person. Turn and move: of the worst camera, after a "
-    "similarity alignment to the reference, which is the true calibration of the rendered captures, and for "
+    "Cameras: the training cameras of each capture, from keypoints and outlines; poses of the delivered calibration "
+    "are not read. Lenses known: its intrinsics are; unknown: one focal length is estimated from a guess of .85 of the "
+    "longer side. The height is the one that the reference gives the person. Turn and move: of the worst camera, after "
+    "a similarity alignment to the reference, which is the true calibration of the rendered captures, and for "
     "pose2sim-balance the delivered one as the calibration check refines it. Said: the largest standard error that is "
     "reported. Residual: the worst camera's median, and the reference's, in pixels of the capture's images. Up: angle "
     "to the reference's. Clocks: keypoints of the embedded performer, who walks and then waves, from a ring of four "
@@ -107,7 +108,11 @@ def _score(capture: Capture, reference: list[Camera], known: bool) -> dict[str, 
     unknown = [] if known else list(lost)
     started = time.process_time()
     found = calibrate_from_person(
-        capture.with_cameras(lost), unknown, dict.fromkeys(lost, "given"), body_height_m(of_reference.points_m)
+        capture.with_cameras(lost),
+        unknown,
+        dict.fromkeys(lost, "given"),
+        body_height_m(of_reference.points_m),
+        Outlines.of,
     )
     seconds = time.process_time() - started
     turns_deg, moves_m = errors(found.cameras, reference)

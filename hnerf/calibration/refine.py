@@ -1,6 +1,7 @@
 """Refinement of cameras, accepted only where held-out frames and joints prove it and the images do not contradict
 it."""
 
+import dataclasses
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ import numpy as np
 from hnerf.calibration.bundle import adjust
 from hnerf.calibration.diagnosis import held_out_parts, measure, trimmed_cost_px
 from hnerf.calibration.matches import Matches
-from hnerf.calibration.outline_adjustment import adjust_to_outlines
+from hnerf.calibration.outline_adjustment import follow_outlines
 from hnerf.calibration.silhouettes import Outlines
 from hnerf.calibration.sizes import SIZE_CHANGES, size_unexplained
 from hnerf.capture.capture import Capture
@@ -18,7 +19,6 @@ from hnerf.config import CalibrationSettings
 from hnerf.geometry.camera import Camera
 
 OUTLINE_NOISE, OUTLINE_NOISE_PX = 0.05, 0.05  # by which share, or how many pixels, outlines may fit worse by chance
-OUTLINE_GAIN_PX = 0.01  # at least; keypoints without bias leave 0.006 px on valid-wave
 MATCH_NOISE_PX = 0.5  # by which the matches of two cameras may fit worse by chance
 
 log = logging.getLogger("hnerf.calibration")
@@ -43,6 +43,11 @@ class _Candidate:
     cameras: list[Camera]
     changes: dict[str, str]
     cost_px: float
+
+    def also(self, change: str) -> "_Candidate":
+        """Return the candidate with one more change of all that was changed."""
+        changes = {name: f"{before}; then {change}" for name, before in self.changes.items()}
+        return dataclasses.replace(self, changes=changes)
 
 
 def refine(
@@ -77,13 +82,15 @@ def refine(
     )
     if refined is not chosen.cameras:
         refined = adjust(refined, keypoints, free)
-    refined, followed = _follow_outlines(outlines, refined, keypoints, free, matches, cost_factor)
+    person_m = np.nanmedian(measure(refined, keypoints).points_m.reshape(-1, 3), 0)
+    followed, gain = follow_outlines(outlines, refined, free, person_m, settings.min_improvement)
+    if gain and not _contradiction(matches, cameras, followed):
+        refined, chosen = followed, chosen.also(gain)
     gained = 1 - chosen.cost_px / held_out_px["as given"]
     outlines_px, refusal = judge_by_outlines(outlines, cameras, refined, gained)
     if refusal:
         return Refinement(cameras, held_out_px, outlines_px, kept, [refusal])
-    changes = {name: change + followed for name, change in chosen.changes.items()}
-    return Refinement(refined, held_out_px, outlines_px, kept | changes, notes)
+    return Refinement(refined, held_out_px, outlines_px, kept | chosen.changes, notes)
 
 
 def _refine_one_by_one(
@@ -126,29 +133,6 @@ def _refine_together(cameras: list[Camera], keypoints: np.ndarray, held_out_px: 
     cost_px = held_out_px["all poses refined"] = held_out_cost_px(cameras, keypoints, everyone)
     changes = f"refined with all others: held-out frames go {_from_to(held_out_px['as given'], cost_px)}"
     return _Candidate(adjust(cameras, keypoints, everyone), dict.fromkeys(everyone, changes), cost_px)
-
-
-def _follow_outlines(
-    outlines: Outlines | None,
-    cameras: list[Camera],
-    keypoints: np.ndarray,
-    free: Sequence[str],
-    matches: Matches,
-    cost_factor: float,
-) -> tuple[list[Camera], str]:
-    """Return the refined cameras, fitted to the person's outlines of every other instant if those of the others gain by
-    it and no matches contradict; and what to add to the reason."""
-    if outlines is None or len(outlines.instants) < 2:
-        return cameras, ""
-    log.info("trying: fitted to outlines")
-    fitted, judged = outlines.some(slice(0, None, 2)), outlines.some(slice(1, None, 2))
-    person_m = np.nanmedian(measure(cameras, keypoints).points_m.reshape(-1, 3), 0)
-    followed = adjust_to_outlines(fitted, cameras, free, person_m)
-    before_px, after_px = judged.cost_px(cameras), judged.cost_px(followed)
-    gains = after_px < min(cost_factor * before_px, before_px - OUTLINE_GAIN_PX)
-    if not gains or _contradiction(matches, cameras, followed):
-        return cameras, ""
-    return followed, f"; then fitted to outlines: those of other frames go {_from_to(before_px, after_px)}"
 
 
 def _contradiction(matches: Matches, given: list[Camera], refined: list[Camera]) -> str:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hnerf.calibration import outline_adjustment
 from hnerf.calibration.outline_adjustment import _turned, adjust_to_outlines
 from hnerf.calibration.silhouettes import MaskOutline, Outlines
 from hnerf.geometry.camera import Camera
@@ -15,15 +16,20 @@ from tests.calibration.test_silhouettes import CORNERS_M, mask
 MIDDLE_M = np.array([0.0, 0.0, 0.9])
 
 
+@pytest.fixture(autouse=True)
+def _short(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outline_adjustment, "EVALUATIONS", 6)
+
+
 def places() -> list[np.ndarray]:
-    """Return the corners of the box, turned about the vertical and moved, at eight instants."""
-    turns = [np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]) for a in np.arange(8) * 0.7]
+    """Return the corners of the box, turned about the vertical and moved, at four instants."""
+    turns = [np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]) for a in np.arange(4) * 0.7]
     return [CORNERS_M @ turn.T + [0.1 * np.sin(i), 0.1 * np.cos(2 * i), 0] for i, turn in enumerate(turns)]
 
 
 def outlines() -> Outlines:
     by_camera = {c.name: [MaskOutline.around(mask(c, corners_m)) for corners_m in places()] for c in ring(4)}
-    return Outlines(by_camera, tuple(range(8)))
+    return Outlines(by_camera, tuple(range(4)))
 
 
 def off_px(cameras: list[Camera]) -> np.ndarray:
@@ -51,16 +57,15 @@ def test_a_turned_camera_returns() -> None:
     given = with_c2(lambda c: turned(c, 0.5))
     found = adjust_to_outlines(outlines(), given, ["c2"], MIDDLE_M)
     assert [new is old for new, old in zip(found, given, strict=True)] == [True, True, False, True]
-    assert off_px(given)[2] > 8 and off_px(found)[2] < 1
+    assert off_px(given)[2] > 8 and off_px(found)[2] < 3
 
 
 def test_all_cameras_together_keep_the_world() -> None:
-    """The rig stays where it was given, and one camera of it is better."""
     given = with_c2(lambda c: turned(c, 0.5))
     found = adjust_to_outlines(outlines(), given, [c.name for c in given], MIDDLE_M)
-    assert off_px(found).max() < off_px(given).max() / 2
-    for new, old in zip(found, given, strict=True):
-        assert np.linalg.norm(new.centre_m - old.centre_m) < 0.1
+    assert outlines().cost_px(found) < outlines().cost_px(given) / 2
+    moved_m = np.mean([new.centre_m - old.centre_m for new, old in zip(found, given, strict=True)], axis=0)
+    np.testing.assert_allclose(moved_m, 0, atol=1e-9)
 
 
 def test_outlines_mend_what_keypoints_get_wrong_alike_in_all_frames(tmp_path: Path) -> None:
@@ -70,7 +75,7 @@ def test_outlines_mend_what_keypoints_get_wrong_alike_in_all_frames(tmp_path: Pa
     biased = keypoints_of()
     biased[2, ..., 0] += 4
     alone, both = (refined(tmp_path / name, given, biased, o) for name, o in (("a", None), ("b", outlines())))
-    assert off_px(alone.cameras)[2] == pytest.approx(4, abs=0.5) and off_px(both.cameras)[2] < 1
-    assert "then fitted to outlines: those of other frames go from" in both.reasons["c2"]
+    assert off_px(alone.cameras)[2] == pytest.approx(4, abs=0.5) and off_px(both.cameras)[2] < 2
+    assert "; then fitted to outlines: those of held-out frames go from" in both.reasons["c2"]
     exact = refined(tmp_path / "c", given, keypoints_of(0), outlines())
     assert "outlines" not in exact.reasons["c2"] and off_px(exact.cameras)[2] < 0.1

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from hnerf.calibration.bundle import adjust, adjust_shared_lens, align, undistort
 from hnerf.calibration.diagnosis import Measure, body_height_m, measure, median_height_px
+from hnerf.calibration.outline_adjustment import follow_outlines
 from hnerf.calibration.person.lens import LensFit, fit_lenses
 from hnerf.calibration.person.rig import first_poses
 from hnerf.calibration.person.upright import CHAIN_SD, MEAN_STATURE_M, STATURE_SD_M, scale_to, stand_on_ground
+from hnerf.calibration.silhouettes import Outlines
 from hnerf.capture.capture import Capture
 from hnerf.capture.formats.export import write_cameras
 from hnerf.capture.lens import Lens
@@ -102,13 +104,18 @@ class PersonCalibration:
 
 
 def calibrate_from_person(
-    capture: Capture, unknown_focal: Sequence[str], intrinsics: dict[str, str], height_m: float | None
+    capture: Capture,
+    unknown_focal: Sequence[str],
+    intrinsics: dict[str, str],
+    height_m: float | None,
+    outlines_of: Callable[[Capture], Outlines | None],
 ) -> PersonCalibration:
-    """Calibrate the training cameras of a capture from its keypoints alone; the poses of its cameras are not read.
+    """Calibrate the training cameras of a capture from its keypoints and outlines; the poses of its cameras are not
+    read.
 
     unknown_focal: cameras whose focal length is a guess, to be estimated; intrinsics: where each camera's come from, in
-    words; height_m: the person's, the mean stature if None. Raises InputError where the recording does not determine
-    the cameras.
+    words; height_m: the person's, the mean stature if None; outlines_of: how outlines are found. Lenses with distortion
+    are left as keypoints have them. Raises InputError where the recording does not determine the cameras.
     """
     if len(capture.train_cameras) < 2:
         raise InputError(f"{capture.name}: one camera cannot be calibrated from the person; film with two or more")
@@ -125,6 +132,11 @@ def calibrate_from_person(
         _check_determined(fit.cameras, found, straight, unknown_focal)
         height = height_m or MEAN_STATURE_M
         scaled, points_m = scale_to(fit.cameras, found.points_m, height)
+        if fit.k1 == 0:
+            outlines = outlines_of(capture.with_cameras(capture.cameras | {c.name: c for c in scaled}))
+            person_m = np.nanmedian(points_m.reshape(-1, 3), 0)
+            followed, _ = follow_outlines(outlines, scaled, capture.train_cameras, person_m, min_improvement)
+            scaled, points_m = scale_to(followed, measure(followed, straight).points_m, height)
         frame_s = median_step(capture.frames) / capture.fps
         cameras, _, up_sd_deg = stand_on_ground(scaled, points_m, frame_s)
         uncertainty = _uncertainty(cameras, keypoints, unknown_focal, fit)

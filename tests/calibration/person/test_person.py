@@ -13,11 +13,11 @@ from hnerf.calibration.person.calibrate import _as_recorded, _each_alone, calibr
 from hnerf.calibration.person.lens import fit_lenses
 from hnerf.calibration.person.rig import first_poses
 from hnerf.calibration.person.upright import scale_to, stand_on_ground
-from hnerf.capture.capture import SubjectPoint
+from hnerf.capture.capture import Capture, SubjectPoint
 from hnerf.capture.formats.easymocap import EasyMocap
 from hnerf.errors import InputError
 from hnerf.geometry.camera import Camera
-from tests.calibration.synthetic import STANDING_M, detections, look_at, ring, walk_m, write_capture
+from tests.calibration.synthetic import STANDING_M, detections, look_at, ring, turned, walk_m, write_capture
 
 STATURE_M = 1.56 / 0.87  # of the figure: its limb chain, over the chain's share of an adult's stature
 
@@ -25,6 +25,10 @@ STATURE_M = 1.56 / 0.87  # of the figure: its limb chain, over the chain's share
 def lost(camera: Camera) -> Camera:
     """Return the camera without its pose."""
     return dataclasses.replace(camera, R=np.eye(3), t_m=np.zeros(3))
+
+
+def no_outlines(capture: Capture) -> None:
+    """Stand in for what finds outlines, of captures without images."""
 
 
 def worst_errors(cameras: list[Camera], truth: list[Camera]) -> tuple[float, float]:
@@ -116,7 +120,7 @@ def test_frames_of_one_step_count_as_one_at_any_rate() -> None:
 def test_a_recording_gets_cameras_in_metres_with_an_uncertainty(tmp_path: Path) -> None:
     truth = ring(4)
     capture = write_capture(tmp_path, [lost(camera) for camera in truth], detections(truth, 1.0))
-    found = calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), STATURE_M)
+    found = calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), STATURE_M, no_outlines)
     turn_deg, move_m = worst_errors(found.cameras, truth)
     assert turn_deg < 0.3 and move_m < 0.02
     spread = [np.linalg.norm(a.centre_m - b.centre_m) for a, b in pairwise(found.cameras)]
@@ -126,6 +130,22 @@ def test_a_recording_gets_cameras_in_metres_with_an_uncertainty(tmp_path: Path) 
     found.save(tmp_path / "out")
     read = EasyMocap(tmp_path / "out").lenses()
     assert np.allclose(read["c1"].R, found.cameras[1].R)
+
+
+def test_outlines_have_the_last_word_on_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Outlines that turn c1 by half a degree: the rig that is scaled and stood on the ground has it turned so."""
+    truth = ring(4)
+    capture = write_capture(tmp_path, [lost(camera) for camera in truth], detections(truth, 0.0))
+
+    def follow(outlines: str, cameras: list[Camera], *_: object) -> tuple[list[Camera], str]:
+        assert outlines == "found"
+        return [turned(camera, 0.5) if camera.name == "c1" else camera for camera in cameras], "gained"
+
+    monkeypatch.setattr("hnerf.calibration.person.calibrate.follow_outlines", follow)
+    found = calibrate_from_person(
+        capture, [], dict.fromkeys(capture.cameras, "given"), STATURE_M, lambda capture: "found"
+    )  # type: ignore[arg-type, return-value]
+    assert worst_errors(found.cameras, [turned(c, 0.5) if c.name == "c1" else c for c in truth])[0] < 0.1
 
 
 def test_the_rate_and_the_stride_of_a_recording_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,14 +159,14 @@ def test_the_rate_and_the_stride_of_a_recording_count(tmp_path: Path, monkeypatc
         return stand_on_ground(cameras, points_m, frame_s)
 
     monkeypatch.setattr("hnerf.calibration.person.calibrate.stand_on_ground", stood)
-    calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), STATURE_M)
+    calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), STATURE_M, no_outlines)
     assert asked == [pytest.approx(0.05)]
 
 
 def test_without_a_height_the_mean_is_taken_and_said(tmp_path: Path) -> None:
     truth = ring(3)
     capture = write_capture(tmp_path, [lost(camera) for camera in truth], detections(truth, 1.0))
-    found = calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), None)
+    found = calibrate_from_person(capture, [], dict.fromkeys(capture.cameras, "given"), None, no_outlines)
     assert found.scale_sd == pytest.approx(np.hypot(0.03, 0.09 / 1.65))
     assert found.notes()[0] == "scale: a person of 1.65 m, the mean of adults (give --height), +- 6 %"
 
@@ -163,7 +183,7 @@ def test_a_lens_is_of_the_recorded_pictures(tmp_path: Path) -> None:
 def refusal(tmp_path: Path, cameras: list[Camera], seen: dict[str, np.ndarray], unknown: list[str]) -> str:
     capture = write_capture(tmp_path, [lost(camera) for camera in cameras], seen)
     with pytest.raises(InputError) as refused:
-        calibrate_from_person(capture, unknown, dict.fromkeys(capture.cameras, ""), 1.8)
+        calibrate_from_person(capture, unknown, dict.fromkeys(capture.cameras, ""), 1.8, no_outlines)
     return str(refused.value)
 
 
