@@ -8,7 +8,7 @@ from hnerf.body.anny import anny_rig
 from hnerf.body.canonical import Descriptor, PosedBodies
 from hnerf.body.limbs import CLOSE_M
 from hnerf.body.rig import Rig
-from tests.body.boxes import box_faces, box_vertices, hinged
+from tests.body.boxes import box_faces, box_rig, box_vertices, hinged
 from tests.body.reference import closest_points_reference
 
 LEVELS = 40
@@ -52,6 +52,12 @@ def test_limbs_begin_at_their_first_joints() -> None:
     assert not limbs.on_cut.any()
     facing = limbs.samples[(limbs_rig().vertices_m[limbs.samples, 0] - 1.2).abs() < 1e-6]
     torch.testing.assert_close(limbs.rest_m[limbs.sample_of[facing], 0], torch.full((len(facing),), 0.2))
+
+
+def test_a_body_without_limbs_is_all_trunk() -> None:
+    limbs = box_rig().limbs
+    assert not limbs.vertex_limb.any() and not len(limbs.samples)
+    assert not limbs.close(torch.zeros(2, len(limbs.vertex_limb), 3)).any()
 
 
 def test_only_limbs_that_came_closer_than_at_rest_are_close() -> None:
