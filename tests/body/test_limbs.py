@@ -97,7 +97,7 @@ def test_other_limbs_are_closest_as_when_every_triangle_is_tried() -> None:
     alone."""
     bodies = swung(0.35)
     rig, vertices_m = bodies.rig, bodies.vertices_m[0]
-    points_m = torch.rand(600, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([0.6, 0.3, 1.2])
+    points_m = torch.rand(300, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([0.6, 0.3, 1.2])
     points_m += torch.tensor([0.8, -0.1, -0.1])
     found, other = by_other_limbs(bodies, points_m)
     arms = rig.faces.amin(1) >= 4 * (LEVELS + 1)
@@ -110,7 +110,7 @@ def test_other_limbs_are_closest_as_when_every_triangle_is_tried() -> None:
         1,
     )
     of_arm = (other.vertex >= 4 * (LEVELS + 1)).long()
-    assert len(found) > 150 and 0 < of_arm.sum() < len(found)
+    assert len(found) > 75 and 0 < of_arm.sum() < len(found)
     torch.testing.assert_close(other.d, expected[found, of_arm], atol=1e-5, rtol=0)
 
 

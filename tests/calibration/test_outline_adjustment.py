@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hnerf.calibration import outline_adjustment
+from hnerf.calibration import outline_adjustment, silhouettes
 from hnerf.calibration.outline_adjustment import _turned, adjust_to_outlines
 from hnerf.calibration.silhouettes import MaskOutline, Outlines
 from hnerf.geometry.camera import Camera
@@ -19,6 +19,7 @@ MIDDLE_M = np.array([0.0, 0.0, 0.9])
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outline_adjustment, "EVALUATIONS", 6)
+    monkeypatch.setattr(silhouettes, "POINTS", 24)
 
 
 def places() -> list[np.ndarray]:
@@ -57,7 +58,7 @@ def test_a_turned_camera_returns() -> None:
     given = with_c2(lambda c: turned(c, 0.5))
     found = adjust_to_outlines(outlines(), given, ["c2"], MIDDLE_M)
     assert [new is old for new, old in zip(found, given, strict=True)] == [True, True, False, True]
-    assert off_px(given)[2] > 8 and off_px(found)[2] < 3
+    assert off_px(given)[2] > 8 and off_px(found)[2] < 4
 
 
 def test_all_cameras_together_keep_the_world() -> None:
@@ -75,7 +76,7 @@ def test_outlines_mend_what_keypoints_get_wrong_alike_in_all_frames(tmp_path: Pa
     biased = keypoints_of()
     biased[2, ..., 0] += 4
     alone, both = (refined(tmp_path / name, given, biased, o) for name, o in (("a", None), ("b", outlines())))
-    assert off_px(alone.cameras)[2] == pytest.approx(4, abs=0.5) and off_px(both.cameras)[2] < 2
+    assert off_px(alone.cameras)[2] == pytest.approx(4, abs=0.5) and off_px(both.cameras)[2] < 2.5
     assert "; then fitted to outlines: those of held-out frames go from" in both.reasons["c2"]
     exact = refined(tmp_path / "c", given, keypoints_of(0), outlines())
     assert "outlines" not in exact.reasons["c2"] and off_px(exact.cameras)[2] < 0.1
