@@ -153,18 +153,17 @@ class PosedBodies:
         reach_m: float,
         correction: PoseCorrection | None = None,
         exact_sign: bool = False,
-        s_follows: bool = True,
         beside_m: Tensor | None = None,
     ) -> tuple[Descriptor, Tensor]:
         """Return what `describe` does, followed by descriptors relative to limbs beside the closest, where the pose
-        brings them close to it; and of which of the points these M are, (M,)."""
-        closest = self.describe(points_m, frame, reach_m, correction, exact_sign, s_follows, beside_m)
+        brings them close to it; and of which of the points these M are, (M,). Their s does not follow the points."""
+        closest = self.describe(points_m, frame, reach_m, correction, exact_sign, False, beside_m)
         if not self._limb_meshes:
             return closest, torch.zeros(0, dtype=torch.long, device=frame.device)
         close = self._close[frame.long(), closest.vertex[: len(frame)]] & closest.near[: len(frame), None]
         more, found = self._closest_on_limbs(points_m, frame, reach_m, close)
         beside_m = None if beside_m is None else beside_m[:, more]
-        other = self._described(points_m[more], frame[more], found, correction, s_follows, beside_m)
+        other = self._described(points_m[more], frame[more], found, correction, False, beside_m)
         copies = torch.arange(len(closest.d) // len(points_m), device=more.device)
         return closest.followed_by(other), (more + len(points_m) * copies[:, None]).flatten()
 

@@ -29,14 +29,16 @@ def follow_outlines(
     outlines: Outlines | None,
     cameras: Sequence[Camera],
     free: Sequence[str],
-    person_m: np.ndarray,
+    points_m: np.ndarray,
     min_improvement: float,
 ) -> tuple[list[Camera], str]:
     """Return the cameras fitted to the outlines, if a fit to every other instant improves the rest by a share of
-    `min_improvement` or more; and by how much it does, in words, empty if the cameras are the given ones."""
+    `min_improvement` or more; and by how much it does, in words, empty if the cameras are the given ones. points_m
+    (frames, 25, 3): the person's joints, NaN where unknown."""
     if outlines is None or len(outlines.instants) < 2:
         return list(cameras), ""
     log.info("trying: fitted to outlines")
+    person_m = np.nanmedian(points_m.reshape(-1, 3), 0)
     fitted, judged = outlines.some(slice(0, None, 2)), outlines.some(slice(1, None, 2))
     followed = adjust_to_outlines(fitted, cameras, free, person_m)
     before_px, after_px = judged.cost_px(cameras), judged.cost_px(followed)

@@ -82,8 +82,8 @@ def refine(
     )
     if refined is not chosen.cameras:
         refined = adjust(refined, keypoints, free)
-    person_m = np.nanmedian(measure(refined, keypoints).points_m.reshape(-1, 3), 0)
-    followed, gain = follow_outlines(outlines, refined, free, person_m, settings.min_improvement)
+    points_m = measure(refined, keypoints).points_m
+    followed, gain = follow_outlines(outlines, refined, free, points_m, settings.min_improvement)
     if gain and not _contradiction(matches, cameras, followed):
         refined, chosen = followed, chosen.also(gain)
     gained = 1 - chosen.cost_px / held_out_px["as given"]

@@ -167,9 +167,7 @@ class FastField(Field):
         if directions is not None:
             beside_m = ((directions - rays.directions)[:, hit, None] * depths[hit, :, None]).flatten(1, 2)
         bodies, pose = scene.bodies, scene.conditions.pose
-        skin, more = bodies.describe_by_limbs(
-            points_m, row, self.reach_m, scene.correction, s_follows=False, beside_m=beside_m
-        )
+        skin, more = bodies.describe_by_limbs(points_m, row, self.reach_m, scene.correction, beside_m=beside_m)
         if directions is not None:
             many = len(directions)
             hit = (hit + len(rays) * torch.arange(many, device=hit.device)[:, None]).flatten()

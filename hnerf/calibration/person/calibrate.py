@@ -134,8 +134,7 @@ def calibrate_from_person(
         scaled, points_m = scale_to(fit.cameras, found.points_m, height)
         if fit.k1 == 0:
             outlines = outlines_of(capture.with_cameras(capture.cameras | {c.name: c for c in scaled}))
-            person_m = np.nanmedian(points_m.reshape(-1, 3), 0)
-            followed, _ = follow_outlines(outlines, scaled, capture.train_cameras, person_m, min_improvement)
+            followed, _ = follow_outlines(outlines, scaled, capture.train_cameras, points_m, min_improvement)
             scaled, points_m = scale_to(followed, measure(followed, straight).points_m, height)
         frame_s = median_step(capture.frames) / capture.fps
         cameras, _, up_sd_deg = stand_on_ground(scaled, points_m, frame_s)
