@@ -12,7 +12,7 @@ from hnerf.fields.rays import PosedScene, Rays
 from tests.baselines.column import learn, three_poses
 
 SMALL = [
-    "training.steps=120",
+    "training.steps=95",
     "training.rays_per_frame=96",
     "training.field.voxel_m=0.0613",  # no fraction of the column's edges, so that no vertex lies between voxels
     "training.field.samples=16",

@@ -101,10 +101,10 @@ def test_neighbours_outvote_an_arm_mirrored_in_depth(tmp_path: Path) -> None:
     nothing = torch.zeros(25, 3, dtype=torch.float64)
     pose = Pose(truth.rig.to(dtype=torch.float64), truth.theta.double(), truth.root.double(), nothing)
     problem = make_problem(body_model(settings), pose, seen, smoothness, settings, offsets=1, proportions=0.1)
-    pose = levenberg_marquardt(problem, pose, problem.image_term, 30)
+    pose = levenberg_marquardt(problem, pose, problem.image_term, 15)
     mirrored_theta = pose.theta.clone()
     mirrored_theta[1, truth.rig.joint_names.index("upperarm01.L")] += torch.tensor([0.0, 2.0, 0.0])
-    mirrored = levenberg_marquardt(problem, replace(pose, theta=mirrored_theta), problem.image_term, 30)
+    mirrored = levenberg_marquardt(problem, replace(pose, theta=mirrored_theta), problem.image_term, 15)
     wrist = truth.rig.joint_names.index("wrist.L")
 
     def off_m(found: Pose) -> float:

@@ -154,7 +154,7 @@ def test_unreadable_capture_leaves_nothing_half_written(tmp_path: Path, capsys: 
 
 def test_check_prints_every_camera_and_the_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capture, preset = shared_capture("valid-wave"), tmp_path / "no-hands.yaml"
-    preset.write_text("based_on: fast\ndetection: {hands: none}\n")
+    preset.write_text("based_on: fast\ndetection: {hands: none}\ncapture: {max_frames: 12}\n")
     assert main(["check-cameras", str(capture), "--store", str(tmp_path), "--preset", str(preset)]) == 0
     lines = capsys.readouterr().out.splitlines()
     table = lines[next(i for i, line in enumerate(lines) if line.startswith("camera ")) :]

@@ -89,7 +89,8 @@ def test_overfits_the_column(tmp_path: Path):
     fast = TINY.field.model_dump() | rates | {"samples": 32, "outer_m": 0.1}
     out = tmp_path / "out"
     out.mkdir()
-    train(capture, masks, body, tiny(field=fast, steps=180, rays_per_frame=256, absorb_steps=60), out, ALONE)
+    rare = {"absorb_steps": 60, "checkpoint_steps": 120}
+    train(capture, masks, body, tiny(field=fast, steps=120, rays_per_frame=256, **rare), out, ALONE)
     avatar = load_avatar(out)
     drawn = avatar.render(capture.cameras["0"], avatar.body.theta[0], avatar.body.root[0])
     mask = torch.from_numpy(masks.get("0", 0))

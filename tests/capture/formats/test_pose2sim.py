@@ -17,9 +17,9 @@ from tests.shared_data import shared_capture
 
 @pytest.fixture(scope="module")
 def balance(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    """One frame in four of its 60, of which the last fifth is for novel poses."""
+    """One frame in eight of its 60, of which the last fifth is for novel poses."""
     folder = shared_capture("pose2sim-balance")
-    return ingest(folder, CaptureSettings(max_side_px=256, max_frames=12), tmp_path_factory.mktemp("balance"))
+    return ingest(folder, CaptureSettings(max_side_px=256, max_frames=6), tmp_path_factory.mktemp("balance"))
 
 
 def test_real_detections_become_body_25(balance: Capture) -> None:
@@ -37,7 +37,7 @@ def test_files_that_hold_body_25_already_are_left_alone(balance: Capture) -> Non
 
 def test_defects_of_the_real_capture_are_recorded(balance: Capture) -> None:
     assert balance.recorded_sizes_px["cam01"] == (1080, 1920) and balance.calibrated_sizes_px["cam01"] == (1088, 1920)
-    assert balance.train_frames == tuple(range(0, 48, 4)) and balance.novel_pose_frames == tuple(range(48, 60, 4))
+    assert balance.train_frames == tuple(range(0, 48, 8)) and balance.novel_pose_frames == (48, 56)
     assert balance.fps == pytest.approx(60.0) and balance.up == "z"
     # Z is up: the cameras' own up directions cancel but for their common vertical part.
     upward = -np.mean([camera.R[1] for camera in balance.cameras.values()], axis=0)
