@@ -220,6 +220,7 @@ FAULTS = (
     Fault("limbs-begin-inside", "fields/fast", ".clamp(max=1).maximum(back)", ".clamp(0, 1)"),
     Fault("outlines-unheld", "calibration/outline_adjustment", "if after_px >= min(", "if after_px >= 1e9 + min("),
     Fault("outlines-own-centre", "calibration/outline_adjustment", " + (camera.R - R) @ pivot_m", ""),
+    Fault("outlines-still-rays", "calibration/silhouettes", "if camera.name == self.name:", "if False:"),
     Fault("limbs-not-united", "fields/fast", "(other < own[more])", "(other > own[more])"),
     Fault("limbs-close-at-rest", "body/limbs", " & (distances_m < CLOSER_THAN_AT_REST * self.rest_m)", ""),
     Fault("limbs-end-open", "body/canonical", "| (at.barycentric < ON_EDGE)).all(1)", ").all(1) & False", "body/limbs"),

@@ -59,8 +59,10 @@ def adjust_to_outlines(
         return np.concatenate([*outlines.residuals_px(moved).values(), values / np.tile(STD, len(free))])
 
     def slopes(values: np.ndarray) -> np.ndarray:
-        steps, at = np.tile(STEP, len(free)), residuals(values)
-        return np.stack([(residuals(values + step) - at) / step.max() for step in np.diag(steps)], 1)
+        moved, steps = _moved(cameras, free, values, person_m), np.tile(STEP, len(free))
+        stepped = [{c.name: c for c in _moved(cameras, free, values + step, person_m)} for step in np.diag(steps)]
+        changed_px = outlines.changes_px(moved, [of[free[i // len(STEP)]] for i, of in enumerate(stepped)])
+        return np.concatenate([(changed_px / steps[:, None]).T, np.diag(1 / np.tile(STD, len(free)))])
 
     solved = least_squares(
         residuals, np.zeros(6 * len(free)), slopes, loss="cauchy", f_scale=LOSS_SCALE_PX, max_nfev=EVALUATIONS

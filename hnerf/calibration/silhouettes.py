@@ -112,18 +112,89 @@ class Outlines:
 
         Cameras without outlines are left out, as are instants at which fewer than two cameras have one.
         """
+        found = {name: [near.residuals_px() for near in rows] for name, rows in self._near_hull(cameras).items()}
+        return {name: np.concatenate(rows) if rows else np.zeros(0) for name, rows in found.items()}
+
+    def changes_px(self, cameras: Sequence[Camera], replacements: Sequence[Camera]) -> np.ndarray:
+        """Return by how much all `residuals_px`, one camera's after another's, change if one camera is replaced by a
+        slightly different one of the same name, for each of the replacements: (replacements, n). Rays are searched only
+        where they pass the hull closest before."""
+        near_hull = [near for rows in self._near_hull(cameras).values() for near in rows]
+        before_px = np.concatenate([near.residuals_px() for near in near_hull])
+        after_px = [np.concatenate([near.replaced(c).residuals_px() for near in near_hull]) for c in replacements]
+        return np.stack(after_px) - before_px
+
+    def _near_hull(self, cameras: Sequence[Camera]) -> dict[str, list["_RaysNearHull"]]:
+        """Return where the rays of each camera's outlines pass the hull of the others, at instants with at least
+        two."""
         known = [camera for camera in cameras if camera.name in self.by_camera]
-        residuals: dict[str, list[np.ndarray]] = {camera.name: [] for camera in known}
+        found: dict[str, list[_RaysNearHull]] = {camera.name: [] for camera in known}
         for instant in range(len(self.instants)):
             at_once = [(camera, self.by_camera[camera.name][instant]) for camera in known]
-            seen = [(camera, outline) for camera, outline in at_once if outline is not None]
+            seen = {camera.name: (camera, outline) for camera, outline in at_once if outline is not None}
             if len(seen) < 2:
                 continue
-            centre_m, reach_m = _locate_person(seen)
-            for i, (camera, outline) in enumerate(seen):
-                others = seen[:i] + seen[i + 1 :]
-                residuals[camera.name].append(_hull_distances_px(camera, outline, others, centre_m, reach_m))
-        return {name: np.concatenate(rows) if rows else np.zeros(0) for name, rows in residuals.items()}
+            centre_m, reach_m = _locate_person(list(seen.values()))
+            for name in seen:
+                found[name].append(_RaysNearHull.of(name, seen, centre_m, reach_m))
+        return found
+
+
+@dataclasses.dataclass(frozen=True)
+class _RaysNearHull:
+    """Samples of the rays of one camera's outline, where they pass the hull of the other cameras closest.
+
+    name: of the camera; seen: cameras and outlines of that instant, by name; along_m (n, FINE): distances of the
+    samples from the camera; points_m (n, FINE, 3): the samples; outside_px: what `_outside_px` says of them, by the
+    name of the other camera.
+    """
+
+    name: str
+    seen: Mapping[str, tuple[Camera, MaskOutline]]
+    along_m: np.ndarray
+    points_m: np.ndarray
+    outside_px: Mapping[str, np.ndarray]
+
+    @staticmethod
+    def of(
+        name: str, seen: Mapping[str, tuple[Camera, MaskOutline]], centre_m: np.ndarray, reach_m: float
+    ) -> "_RaysNearHull":
+        """Search the rays of a camera within `reach_m` of their points closest to the centre."""
+        camera, outline = seen[name]
+        origins, directions = camera.rays(outline.points_px)
+        nearest_m = ((centre_m - origins) * directions).sum(-1, keepdims=True)
+        step_m = 2 * reach_m / (COARSE - 1)
+        along_m = (nearest_m + np.linspace(-reach_m, reach_m, COARSE)).clip(step_m)
+        coarse = _RaysNearHull._at(name, seen, along_m)
+        best_m = np.take_along_axis(along_m, coarse._outside_hull_px().argmin(1)[:, None], 1)
+        return _RaysNearHull._at(name, seen, best_m + np.linspace(-step_m, step_m, FINE))
+
+    @staticmethod
+    def _at(name: str, seen: Mapping[str, tuple[Camera, MaskOutline]], along_m: np.ndarray) -> "_RaysNearHull":
+        """Sample the rays of a camera at distances (n, S)."""
+        camera, outline = seen[name]
+        origins, directions = camera.rays(outline.points_px)
+        points_m = origins[:, None] + along_m[..., None] * directions[:, None]
+        outside_px = {other: _outside_px(*seen[other], points_m) for other in seen if other != name}
+        return _RaysNearHull(name, seen, along_m, points_m, outside_px)
+
+    def replaced(self, camera: Camera) -> "_RaysNearHull":
+        """Return the same samples with the camera of this name replaced by `camera`."""
+        if camera.name not in self.seen:
+            return self
+        seen = {**self.seen, camera.name: (camera, self.seen[camera.name][1])}
+        if camera.name == self.name:
+            return _RaysNearHull._at(self.name, seen, self.along_m)
+        outside_px = {**self.outside_px, camera.name: _outside_px(*seen[camera.name], self.points_m)}
+        return dataclasses.replace(self, seen=seen, outside_px=outside_px)
+
+    def residuals_px(self) -> np.ndarray:
+        """Return the least distance at which each ray passes the hull, (n,) pixels >= 0."""
+        return self._outside_hull_px().min(1).clip(0)
+
+    def _outside_hull_px(self) -> np.ndarray:
+        """Return how far the samples lie outside the mask that excludes them most, (n, S) pixels."""
+        return np.maximum.reduce(list(self.outside_px.values()))
 
 
 def _locate_person(seen: Sequence[tuple[Camera, MaskOutline]]) -> tuple[np.ndarray, float]:
@@ -139,43 +210,16 @@ def _locate_person(seen: Sequence[tuple[Camera, MaskOutline]]) -> tuple[np.ndarr
     return centre_m, SEARCH_RANGE * float(np.median(sizes_m))
 
 
-def _hull_distances_px(
-    camera: Camera,
-    outline: MaskOutline,
-    others: Sequence[tuple[Camera, MaskOutline]],
-    centre_m: np.ndarray,
-    reach_m: float,
-) -> np.ndarray:
-    """Return the least distance at which each outline point's ray passes the hull of the other cameras, (n,) pixels >=
-    0.
-
-    Each ray is searched within `reach_m` of its point closest to the centre.
-    """
-    origins, directions = camera.rays(outline.points_px)
-    nearest_m = ((centre_m - origins) * directions).sum(-1, keepdims=True)
-    step_m = 2 * reach_m / (COARSE - 1)
-    along_m = (nearest_m + np.linspace(-reach_m, reach_m, COARSE)).clip(step_m)
-    outside_px = _outside_px(others, origins[:, None] + along_m[..., None] * directions[:, None])
-    best_m = np.take_along_axis(along_m, outside_px.argmin(1)[:, None], 1)
-    closer_m = best_m + np.linspace(-step_m, step_m, FINE)
-    closer_px = _outside_px(others, origins[:, None] + closer_m[..., None] * directions[:, None])
-    return closer_px.min(1).clip(0)
-
-
-def _outside_px(seen: Sequence[tuple[Camera, MaskOutline]], points_m: np.ndarray) -> np.ndarray:
-    """Return how far points (n, S, 3) lie outside the mask that excludes them most, (n, S) pixels, negative inside the
-    hull.
+def _outside_px(camera: Camera, outline: MaskOutline, points_m: np.ndarray) -> np.ndarray:
+    """Return how far points (n, S, 3) lie outside a mask, (n, S) pixels, negative inside.
 
     Beyond the image border the nearest border pixel counts: where the border cuts the person off, the person may go on.
     """
-    worst = np.full(points_m.shape[:2], -np.inf)
-    for camera, outline in seen:
-        uv, depth_m = camera.project(points_m)
-        at = np.nan_to_num(uv).clip(-BEHIND_CAMERA_PX, BEHIND_CAMERA_PX).astype(np.float32)
-        x, y = cv2.split(at)
-        far_px = cv2.remap(outline.distance_px, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        worst = np.maximum(worst, np.where(depth_m > 0, far_px, BEHIND_CAMERA_PX))
-    return worst
+    uv, depth_m = camera.project(points_m)
+    at = np.nan_to_num(uv).clip(-BEHIND_CAMERA_PX, BEHIND_CAMERA_PX).astype(np.float32)
+    x, y = cv2.split(at)
+    far_px = cv2.remap(outline.distance_px, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.where(depth_m > 0, far_px, BEHIND_CAMERA_PX)
 
 
 def _outlines(capture: Capture, name: str, keypoints: np.ndarray, shown: Sequence[int]) -> list[MaskOutline | None]:

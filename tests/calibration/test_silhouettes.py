@@ -59,7 +59,7 @@ def test_a_point_behind_a_camera_is_outside_its_mask() -> None:
     outline, middle_m = MaskOutline.around(mask(camera)), CORNERS_M.mean(0)
     assert outline is not None
     both_m = np.stack([middle_m, 2 * camera.centre_m - middle_m])
-    found_px = _outside_px([(camera, outline)], both_m[None])[0]
+    found_px = _outside_px(camera, outline, both_m[None])[0]
     assert found_px[0] < -10 and found_px[1] == BEHIND_CAMERA_PX
 
 
@@ -99,6 +99,26 @@ def test_a_camera_without_mask_takes_no_part() -> None:
     residuals_px = partly.residuals_px([*cameras[:3], turned(cameras[3], 20)])
     assert len(residuals_px["c3"]) == 0 and len(residuals_px["c0"]) > 30
     assert max(row.max() for row in residuals_px.values() if len(row)) < 1.5
+
+
+def test_small_changes_are_those_that_a_search_anew_finds() -> None:
+    """Every camera is half a degree off, so that rays miss the hull, and each in turn is moved by 3 mm, 3.5 m away at a
+    focal length of 1000 px: the rays that change at all change by up to 0.86 px. A camera without outlines changes
+    nothing."""
+    seen = outlines(ring(4))
+    given = [turned(camera, 0.5, axis=i % 2) for i, camera in enumerate(ring(4))]
+    given.append(dataclasses.replace(given[0], name="without outlines"))
+    moved = [dataclasses.replace(camera, t_m=camera.t_m + np.array([0.003, 0, 0])) for camera in given]
+    found_px = seen.changes_px(given, moved)
+    before_px = np.concatenate([*seen.residuals_px(given).values()])
+    for i, changed_px in enumerate(found_px[:4]):
+        anew = seen.residuals_px([*given[:i], moved[i], *given[i + 1 :]])
+        off_px = np.abs(changed_px - (np.concatenate([*anew.values()]) - before_px))
+        assert off_px.max() < 0.5 and off_px.mean() < 0.05  # samples of rays are 1 cm apart, here and there
+        assert 0.5 < np.abs(changed_px).max() < 1.2
+        own = slice(i * len(anew["c0"]), (i + 1) * len(anew["c0"]))
+        assert np.abs(changed_px[own]).max() > 0.3
+    assert (found_px[4] == 0).all()
 
 
 def test_a_rendered_capture_tells_a_turned_camera(wave: Capture) -> None:
