@@ -25,7 +25,7 @@ from hnerf.segmentation.prior import priors_of
 FRAMES = 8  # evenly spaced: neighbouring frames add nothing
 PLATE_FRAMES = 24  # from which the background is estimated if there is no clean plate
 POINTS = 64  # on the outline in each image
-COARSE, FINE = 64, 17  # samples along a ray, and again between the neighbours of the best
+COARSE, FINE = 64, 17  # samples along a ray, and again between the neighbours of the best, twice
 SEARCH_RANGE = 1.5  # times the person's size: length of each ray that is searched, either way
 TRIM = 0.98  # share of the residuals that count; the rest are taken for mask errors
 MIN_KEYPOINTS_INSIDE = 0.6  # share of the person's keypoints; a mask that holds fewer is not the person's
@@ -164,10 +164,12 @@ class _RaysNearHull:
         origins, directions = camera.rays(outline.points_px)
         nearest_m = ((centre_m - origins) * directions).sum(-1, keepdims=True)
         step_m = 2 * reach_m / (COARSE - 1)
-        along_m = (nearest_m + np.linspace(-reach_m, reach_m, COARSE)).clip(step_m)
-        coarse = _RaysNearHull._at(name, seen, along_m)
-        best_m = np.take_along_axis(along_m, coarse._outside_hull_px().argmin(1)[:, None], 1)
-        return _RaysNearHull._at(name, seen, best_m + np.linspace(-step_m, step_m, FINE))
+        near = _RaysNearHull._at(name, seen, (nearest_m + np.linspace(-reach_m, reach_m, COARSE)).clip(step_m))
+        for _ in range(2):
+            best_m = np.take_along_axis(near.along_m, near._outside_hull_px().argmin(1)[:, None], 1)
+            near = _RaysNearHull._at(name, seen, best_m + np.linspace(-step_m, step_m, FINE))
+            step_m *= 2 / (FINE - 1)
+        return near
 
     @staticmethod
     def _at(name: str, seen: Mapping[str, tuple[Camera, MaskOutline]], along_m: np.ndarray) -> "_RaysNearHull":

@@ -18,7 +18,7 @@ MIDDLE_M = np.array([0.0, 0.0, 0.9])
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(outline_adjustment, "EVALUATIONS", 6)
+    monkeypatch.setattr(outline_adjustment, "EVALUATIONS", 12)
     monkeypatch.setattr(silhouettes, "POINTS", 24)
 
 
@@ -58,7 +58,7 @@ def test_a_turned_camera_returns() -> None:
     given = with_c2(lambda c: turned(c, 0.5))
     found = adjust_to_outlines(outlines(), given, ["c2"], MIDDLE_M)
     assert [new is old for new, old in zip(found, given, strict=True)] == [True, True, False, True]
-    assert off_px(given)[2] > 8 and off_px(found)[2] < 4
+    assert off_px(given)[2] > 8 and off_px(found)[2] < 1
 
 
 def test_all_cameras_together_keep_the_world() -> None:
@@ -76,7 +76,7 @@ def test_outlines_mend_what_keypoints_get_wrong_alike_in_all_frames(tmp_path: Pa
     biased = keypoints_of()
     biased[2, ..., 0] += 4
     alone, both = (refined(tmp_path / name, given, biased, o) for name, o in (("a", None), ("b", outlines())))
-    assert off_px(alone.cameras)[2] == pytest.approx(4, abs=0.5) and off_px(both.cameras)[2] < 2.5
+    assert off_px(alone.cameras)[2] == pytest.approx(4, abs=0.5) and off_px(both.cameras)[2] < 1
     assert "; then fitted to outlines: those of held-out frames go from" in both.reasons["c2"]
     exact = refined(tmp_path / "c", given, keypoints_of(0), outlines())
     assert "outlines" not in exact.reasons["c2"] and off_px(exact.cameras)[2] < 0.1

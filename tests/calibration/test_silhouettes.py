@@ -114,7 +114,7 @@ def test_small_changes_are_those_that_a_search_anew_finds() -> None:
     for i, changed_px in enumerate(found_px[:4]):
         anew = seen.residuals_px([*given[:i], moved[i], *given[i + 1 :]])
         off_px = np.abs(changed_px - (np.concatenate([*anew.values()]) - before_px))
-        assert off_px.max() < 0.5 and off_px.mean() < 0.05  # samples of rays are 1 cm apart, here and there
+        assert off_px.max() < 0.15
         assert 0.5 < np.abs(changed_px).max() < 1.2
         own = slice(i * len(anew["c0"]), (i + 1) * len(anew["c0"]))
         assert np.abs(changed_px[own]).max() > 0.3
