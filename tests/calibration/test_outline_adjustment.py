@@ -64,7 +64,9 @@ def test_a_turned_camera_returns() -> None:
 def test_all_cameras_together_keep_the_world() -> None:
     given = with_c2(lambda c: turned(c, 0.5))
     found = adjust_to_outlines(outlines(), given, [c.name for c in given], MIDDLE_M)
+    assert off_px(found).max() < off_px(given).max() / 2
     assert outlines().cost_px(found) < outlines().cost_px(given) / 2
+    assert max(np.linalg.norm(new.centre_m - old.centre_m) for new, old in zip(found, given, strict=True)) < 0.1
     moved_m = np.mean([new.centre_m - old.centre_m for new, old in zip(found, given, strict=True)], axis=0)
     np.testing.assert_allclose(moved_m, 0, atol=1e-9)
 
