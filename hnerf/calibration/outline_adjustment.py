@@ -1,4 +1,4 @@
-"""Adjustment of camera poses until the person's outlines in all cameras belong to one body.
+"""Adjustment of cameras until the person's outlines in all cameras belong to one body.
 
 A detector sees hips and shoulders elsewhere from the front than from behind, alike in all frames, so cameras that
 keypoints have refined may be off by pixels. Outlines have no such bias, but say little of cameras that are far off.
@@ -18,6 +18,7 @@ from hnerf.geometry.camera import Camera
 
 STD = np.array([0.05] * 3 + [0.1] * 3)  # of a pose from keypoints: a turn about the person, rad, and a move, m
 STEP = np.array([0.002] * 3 + [0.003] * 3)  # of finite differences: about a pixel
+FOCAL_STD, FOCAL_STEP = 0.2, 0.02  # of the logarithm of a focal length from keypoints
 LOSS_SCALE_PX = 1.0  # of Cauchy's loss: errors of masks are larger
 EVALUATIONS = 20
 MIN_GAIN_PX = 0.01  # of outlines at other instants; cameras from keypoints without bias leave 0.006 px on valid-wave
@@ -31,50 +32,69 @@ def follow_outlines(
     free: Sequence[str],
     points_m: np.ndarray,
     min_improvement: float,
+    unknown_focal: Sequence[str] = (),
 ) -> tuple[list[Camera], str]:
     """Return the cameras fitted to the outlines, if a fit to every other instant improves the rest by a share of
     `min_improvement` or more; and by how much it does, in words, empty if the cameras are the given ones. points_m
-    (frames, 25, 3): the person's joints, NaN where unknown."""
+    (frames, 25, 3): the person's joints, NaN where unknown; unknown_focal: as of `adjust_to_outlines`."""
     if outlines is None or len(outlines.instants) < 2:
         return list(cameras), ""
     log.info("trying: fitted to outlines")
     person_m = np.nanmedian(points_m.reshape(-1, 3), 0)
     fitted, judged = outlines.some(slice(0, None, 2)), outlines.some(slice(1, None, 2))
-    followed = adjust_to_outlines(fitted, cameras, free, person_m)
+    followed = adjust_to_outlines(fitted, cameras, free, person_m, unknown_focal)
     before_px, after_px = judged.cost_px(cameras), judged.cost_px(followed)
     if after_px >= min((1 - min_improvement) * before_px, before_px - MIN_GAIN_PX):
         return list(cameras), ""
-    followed = adjust_to_outlines(outlines, followed, free, person_m)
+    followed = adjust_to_outlines(outlines, followed, free, person_m, unknown_focal)
     return followed, f"fitted to outlines: those of held-out frames go from {before_px:.2f} to {after_px:.2f} px"
 
 
 def adjust_to_outlines(
-    outlines: Outlines, cameras: Sequence[Camera], free: Sequence[str], person_m: np.ndarray
+    outlines: Outlines,
+    cameras: Sequence[Camera],
+    free: Sequence[str],
+    person_m: np.ndarray,
+    unknown_focal: Sequence[str] = (),
 ) -> list[Camera]:
-    """Return the cameras with poses of those named in `free` fitted to the outlines; person_m (3,): where the person
-    is, about which they turn. If all are free, the rig is aligned to the given cameras."""
+    """Return the cameras with poses of those named in `free` fitted to the outlines, and with one zoom of all those
+    named in `unknown_focal`; person_m (3,): where the person is, about which they turn. If all are free, the rig is
+    aligned to the given cameras."""
+    zooms = 1 if unknown_focal else 0
+    stds = np.array([*np.tile(STD, len(free)), *[FOCAL_STD] * zooms])
+    steps = np.array([*np.tile(STEP, len(free)), *[FOCAL_STEP] * zooms])
+
+    def moved(values: np.ndarray) -> list[Camera]:
+        zoom = float(np.exp(values[6 * len(free) :].sum()))
+        zoomed = [_zoomed(c, zoom, person_m) if c.name in unknown_focal else c for c in cameras]
+        changes = dict(zip(free, values[: 6 * len(free)].reshape(-1, 6), strict=True))
+        return [_turned(c, changes[c.name], person_m) if c.name in changes else c for c in zoomed]
 
     def residuals(values: np.ndarray) -> np.ndarray:
-        moved = _moved(cameras, free, values, person_m)
-        return np.concatenate([*outlines.residuals_px(moved).values(), values / np.tile(STD, len(free))])
+        return np.concatenate([*outlines.residuals_px(moved(values)).values(), values / stds])
 
     def slopes(values: np.ndarray) -> np.ndarray:
-        moved, steps = _moved(cameras, free, values, person_m), np.tile(STEP, len(free))
-        stepped = [{c.name: c for c in _moved(cameras, free, values + step, person_m)} for step in np.diag(steps)]
-        changed_px = outlines.changes_px(moved, [of[free[i // len(STEP)]] for i, of in enumerate(stepped)])
-        return np.concatenate([(changed_px / steps[:, None]).T, np.diag(1 / np.tile(STD, len(free)))])
+        changing = [*([name] for name in free for _ in STEP), *[unknown_focal] * zooms]
+        stepped = [
+            [camera for camera in moved(values + step) if camera.name in names]
+            for step, names in zip(np.diag(steps), changing, strict=True)
+        ]
+        changed_px = outlines.changes_px(moved(values), stepped)
+        return np.concatenate([(changed_px / steps[:, None]).T, np.diag(1 / stds)])
 
     solved = least_squares(
-        residuals, np.zeros(6 * len(free)), slopes, loss="cauchy", f_scale=LOSS_SCALE_PX, max_nfev=EVALUATIONS
+        residuals, np.zeros(len(stds)), slopes, loss="cauchy", f_scale=LOSS_SCALE_PX, max_nfev=EVALUATIONS
     )
-    adjusted = _moved(cameras, free, solved.x, person_m)
+    adjusted = moved(solved.x)
     return align(adjusted, cameras) if len(free) == len(cameras) else adjusted
 
 
-def _moved(cameras: Sequence[Camera], free: Sequence[str], values: np.ndarray, person_m: np.ndarray) -> list[Camera]:
-    """Return the cameras, those named in `free` turned about a point of the world and moved: six values each."""
-    changes = dict(zip(free, values.reshape(-1, 6), strict=True))
-    return [c if c.name not in changes else _turned(c, changes[c.name], person_m) for c in cameras]
+def _zoomed(camera: Camera, zoom: float, pivot_m: np.ndarray) -> Camera:
+    """Return a camera with its focal length multiplied, moved along its axis so that a point of the world is seen at
+    the same pixel and of the same size."""
+    K = camera.K * np.array([[zoom, zoom, 1], [1, zoom, 1], [1, 1, 1]])
+    back_m = (zoom - 1) * (camera.R @ pivot_m + camera.t_m)[2]
+    return dataclasses.replace(camera, K=K, t_m=camera.t_m + np.array([0, 0, back_m]))
 
 
 def _turned(camera: Camera, values: np.ndarray, pivot_m: np.ndarray) -> Camera:

@@ -115,10 +115,10 @@ class Outlines:
         found = {name: [near.residuals_px() for near in rows] for name, rows in self._near_hull(cameras).items()}
         return {name: np.concatenate(rows) if rows else np.zeros(0) for name, rows in found.items()}
 
-    def changes_px(self, cameras: Sequence[Camera], replacements: Sequence[Camera]) -> np.ndarray:
-        """Return by how much all `residuals_px`, one camera's after another's, change if one camera is replaced by a
-        slightly different one of the same name, for each of the replacements: (replacements, n). Rays are searched only
-        where they pass the hull closest before."""
+    def changes_px(self, cameras: Sequence[Camera], replacements: Sequence[Sequence[Camera]]) -> np.ndarray:
+        """Return by how much all `residuals_px`, one camera's after another's, change if some cameras are replaced by
+        slightly different ones of the same names, for each of the replacements: (replacements, n). Rays are searched
+        only where they pass the hull closest before."""
         near_hull = [near for rows in self._near_hull(cameras).values() for near in rows]
         before_px = np.concatenate([near.residuals_px() for near in near_hull])
         after_px = [np.concatenate([near.replaced(c).residuals_px() for near in near_hull]) for c in replacements]
@@ -180,14 +180,16 @@ class _RaysNearHull:
         outside_px = {other: _outside_px(*seen[other], points_m) for other in seen if other != name}
         return _RaysNearHull(name, seen, along_m, points_m, outside_px)
 
-    def replaced(self, camera: Camera) -> "_RaysNearHull":
-        """Return the same samples with the camera of this name replaced by `camera`."""
-        if camera.name not in self.seen:
-            return self
-        seen = {**self.seen, camera.name: (camera, self.seen[camera.name][1])}
-        if camera.name == self.name:
-            return _RaysNearHull._at(self.name, seen, self.along_m)
-        outside_px = {**self.outside_px, camera.name: _outside_px(*seen[camera.name], self.points_m)}
+    def replaced(self, cameras: Sequence[Camera]) -> "_RaysNearHull":
+        """Return the samples with the cameras of these names replaced; if the rays change, their points closest to the
+        samples."""
+        changed = {c.name: (c, self.seen[c.name][1]) for c in cameras if c.name in self.seen}
+        seen = {**self.seen, **changed}
+        if self.name in changed:
+            origins, directions = changed[self.name][0].rays(changed[self.name][1].points_px)
+            along_m = ((self.points_m - origins[:, None]) * directions[:, None]).sum(-1)
+            return _RaysNearHull._at(self.name, seen, along_m)
+        outside_px = {**self.outside_px, **{name: _outside_px(*of, self.points_m) for name, of in changed.items()}}
         return dataclasses.replace(self, seen=seen, outside_px=outside_px)
 
     def residuals_px(self) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration import outline_adjustment, silhouettes
-from hnerf.calibration.outline_adjustment import _turned, adjust_to_outlines
+from hnerf.calibration.outline_adjustment import _turned, _zoomed, adjust_to_outlines
 from hnerf.calibration.silhouettes import MaskOutline, Outlines
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import ring, turned
@@ -22,14 +22,15 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(silhouettes, "POINTS", 24)
 
 
-def places() -> list[np.ndarray]:
+def places(range_m: float = 0.1) -> list[np.ndarray]:
     """Return the corners of the box, turned about the vertical and moved, at four instants."""
     turns = [np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]) for a in np.arange(4) * 0.7]
-    return [CORNERS_M @ turn.T + [0.1 * np.sin(i), 0.1 * np.cos(2 * i), 0] for i, turn in enumerate(turns)]
+    return [CORNERS_M @ turn.T + [range_m * np.sin(i), range_m * np.cos(2 * i), 0] for i, turn in enumerate(turns)]
 
 
-def outlines() -> Outlines:
-    by_camera = {c.name: [MaskOutline.around(mask(c, corners_m)) for corners_m in places()] for c in ring(4)}
+def outlines(range_m: float = 0.1) -> Outlines:
+    seen_m = places(range_m)
+    by_camera = {c.name: [MaskOutline.around(mask(c, corners_m)) for corners_m in seen_m] for c in ring(4)}
     return Outlines(by_camera, tuple(range(4)))
 
 
@@ -82,3 +83,26 @@ def test_outlines_mend_what_keypoints_get_wrong_alike_in_all_frames(tmp_path: Pa
     assert "; then fitted to outlines: those of held-out frames go from" in both.reasons["c2"]
     exact = refined(tmp_path / "c", given, keypoints_of(0), outlines())
     assert "outlines" not in exact.reasons["c2"] and off_px(exact.cameras)[2] < 0.1
+
+
+def test_a_zoomed_camera_sees_the_person_at_the_same_place_and_size() -> None:
+    """Twice the focal length from twice as far: 10 cm beside the pivot across the line of sight stay where they are
+    seen, and 10 cm before it come closer to it, by the ratio of depths."""
+    camera = ring(4)[1]
+    beside_m, before_m = MIDDLE_M + 0.1 * camera.R[0], MIDDLE_M + 0.1 * camera.R[0] - 0.1 * camera.R[2]
+    far = _zoomed(camera, 2.0, MIDDLE_M)
+    assert far.K[0, 0] == far.K[1, 1] == 2000 and far.K[0, 2] == camera.K[0, 2]
+    np.testing.assert_allclose(far.project(beside_m)[0], camera.project(beside_m)[0], atol=1e-9)
+    depth_m = camera.project(MIDDLE_M)[1]
+    seen_px = 1000 * 0.1 / depth_m * 2 * depth_m / (2 * depth_m - 0.1)
+    assert far.project(before_m)[0][0] - camera.project(MIDDLE_M)[0][0] == pytest.approx(seen_px)
+
+
+def test_an_unknown_focal_length_returns() -> None:
+    """A box that moves by a metre; three cameras a tenth too long, each that much too far away. The fourth's is
+    known."""
+    given = [camera if camera.name == "c3" else _zoomed(camera, 1.1, MIDDLE_M) for camera in ring(4)]
+    names = [camera.name for camera in given]
+    found = adjust_to_outlines(outlines(0.5), given, names, MIDDLE_M, names[:3])
+    assert [c.K[0, 0] for c in found[:3]] == pytest.approx([1000] * 3, rel=0.03)
+    assert found[3].K[0, 0] == 1000

@@ -109,7 +109,7 @@ def test_small_changes_are_those_that_a_search_anew_finds() -> None:
     given = [turned(camera, 0.5, axis=i % 2) for i, camera in enumerate(ring(4))]
     given.append(dataclasses.replace(given[0], name="without outlines"))
     moved = [dataclasses.replace(camera, t_m=camera.t_m + np.array([0.003, 0, 0])) for camera in given]
-    found_px = seen.changes_px(given, moved)
+    found_px = seen.changes_px(given, [[camera] for camera in moved])
     before_px = np.concatenate([*seen.residuals_px(given).values()])
     for i, changed_px in enumerate(found_px[:4]):
         anew = seen.residuals_px([*given[:i], moved[i], *given[i + 1 :]])

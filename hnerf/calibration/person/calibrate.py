@@ -134,7 +134,9 @@ def calibrate_from_person(
         scaled, points_m = scale_to(fit.cameras, found.points_m, height)
         if fit.k1 == 0:
             outlines = outlines_of(capture.with_cameras(capture.cameras | {c.name: c for c in scaled}))
-            followed, _ = follow_outlines(outlines, scaled, capture.train_cameras, points_m, min_improvement)
+            followed, _ = follow_outlines(
+                outlines, scaled, capture.train_cameras, points_m, min_improvement, unknown_focal
+            )
             scaled, points_m = scale_to(followed, measure(followed, straight).points_m, height)
         frame_s = median_step(capture.frames) / capture.fps
         cameras, _, up_sd_deg = stand_on_ground(scaled, points_m, frame_s)

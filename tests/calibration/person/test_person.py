@@ -133,17 +133,18 @@ def test_a_recording_gets_cameras_in_metres_with_an_uncertainty(tmp_path: Path) 
 
 
 def test_outlines_have_the_last_word_on_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Outlines that turn c1 by half a degree: the rig that is scaled and stood on the ground has it turned so."""
+    """Outlines that turn c1 by half a degree: the rig that is scaled and stood on the ground has it turned so. They are
+    told which focal lengths are unknown."""
     truth = ring(4)
     capture = write_capture(tmp_path, [lost(camera) for camera in truth], detections(truth, 0.0))
 
-    def follow(outlines: str, cameras: list[Camera], *_: object) -> tuple[list[Camera], str]:
-        assert outlines == "found"
+    def follow(outlines: str, cameras: list[Camera], *others: object) -> tuple[list[Camera], str]:
+        assert outlines == "found" and others[-1] == ["c0"]
         return [turned(camera, 0.5) if camera.name == "c1" else camera for camera in cameras], "gained"
 
     monkeypatch.setattr("hnerf.calibration.person.calibrate.follow_outlines", follow)
     found = calibrate_from_person(
-        capture, [], dict.fromkeys(capture.cameras, "given"), STATURE_M, lambda capture: "found"
+        capture, ["c0"], dict.fromkeys(capture.cameras, "given"), STATURE_M, lambda capture: "found"
     )  # type: ignore[arg-type, return-value]
     assert worst_errors(found.cameras, [turned(c, 0.5) if c.name == "c1" else c for c in truth])[0] < 0.1
 
