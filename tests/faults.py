@@ -221,6 +221,8 @@ FAULTS = (
     Fault("outlines-unheld", "calibration/outline_adjustment", "if after_px >= min(", "if after_px >= 1e9 + min("),
     Fault("outlines-own-centre", "calibration/outline_adjustment", " + (camera.R - R) @ pivot_m", ""),
     Fault("outlines-zoom-in-place", "calibration/outline_adjustment", "back_m = (zoom - 1) *", "back_m = 0 *"),
+    Fault("outlines-missed-alone", "calibration/silhouettes", "before_px > -SLIGHT_CHANGE_PX", "before_px > 0"),
+    Fault("outlines-one-way", "calibration/outline_adjustment", "in (steps, -steps)", "in (steps, steps)"),
     Fault("outlines-still-rays", "calibration/silhouettes", "if self.name in changed:", "if False:"),
     Fault("limbs-not-united", "fields/fast", "(other < own[more])", "(other > own[more])"),
     Fault("limbs-close-at-rest", "body/limbs", " & (distances_m < CLOSER_THAN_AT_REST * self.rest_m)", ""),

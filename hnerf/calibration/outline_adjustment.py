@@ -16,11 +16,12 @@ from hnerf.calibration.bundle import align
 from hnerf.calibration.silhouettes import Outlines
 from hnerf.geometry.camera import Camera
 
+FRAMES = 36  # evenly spaced: masks err by pixels, differently in each frame
 STD = np.array([0.05] * 3 + [0.1] * 3)  # of a pose from keypoints: a turn about the person, rad, and a move, m
 STEP = np.array([0.002] * 3 + [0.003] * 3)  # of finite differences: about a pixel
 FOCAL_STD, FOCAL_STEP = 0.2, 0.02  # of the logarithm of a focal length from keypoints
-LOSS_SCALE_PX = 1.0  # of Cauchy's loss: errors of masks are larger
-EVALUATIONS = 20
+LOSS_SCALE_PX = 0.5  # of Cauchy's loss: errors of masks are larger
+EVALUATIONS, MIN_GAIN = 20, 0.01  # of an adjustment, and the share of the cost by which the last must lower it
 MIN_GAIN_PX = 0.01  # of outlines at other instants; cameras from keypoints without bias leave 0.006 px on valid-wave
 
 log = logging.getLogger("hnerf.calibration")
@@ -75,15 +76,24 @@ def adjust_to_outlines(
 
     def slopes(values: np.ndarray) -> np.ndarray:
         changing = [*([name] for name in free for _ in STEP), *[unknown_focal] * zooms]
-        stepped = [
-            [camera for camera in moved(values + step) if camera.name in names]
-            for step, names in zip(np.diag(steps), changing, strict=True)
-        ]
-        changed_px = outlines.changes_px(moved(values), stepped)
-        return np.concatenate([(changed_px / steps[:, None]).T, np.diag(1 / stds)])
+        ahead, behind = (
+            [
+                [camera for camera in moved(values + step) if camera.name in names]
+                for step, names in zip(np.diag(signed), changing, strict=True)
+            ]
+            for signed in (steps, -steps)
+        )
+        up_px, down_px = np.split(outlines.changes_px(moved(values), [*ahead, *behind]), 2)
+        return np.concatenate([((up_px - down_px) / (2 * steps[:, None])).T, np.diag(1 / stds)])
 
     solved = least_squares(
-        residuals, np.zeros(len(stds)), slopes, loss="cauchy", f_scale=LOSS_SCALE_PX, max_nfev=EVALUATIONS
+        residuals,
+        np.zeros(len(stds)),
+        slopes,
+        loss="cauchy",
+        f_scale=LOSS_SCALE_PX,
+        ftol=MIN_GAIN,
+        max_nfev=EVALUATIONS,
     )
     adjusted = moved(solved.x)
     return align(adjusted, cameras) if len(free) == len(cameras) else adjusted

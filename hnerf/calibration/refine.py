@@ -11,7 +11,7 @@ import numpy as np
 from hnerf.calibration.bundle import adjust
 from hnerf.calibration.diagnosis import held_out_parts, measure, trimmed_cost_px
 from hnerf.calibration.matches import Matches
-from hnerf.calibration.outline_adjustment import follow_outlines
+from hnerf.calibration.outline_adjustment import FRAMES, follow_outlines
 from hnerf.calibration.silhouettes import Outlines
 from hnerf.calibration.sizes import SIZE_CHANGES, size_unexplained
 from hnerf.capture.capture import Capture
@@ -83,7 +83,8 @@ def refine(
     if refined is not chosen.cameras:
         refined = adjust(refined, keypoints, free)
     points_m = measure(refined, keypoints).points_m
-    followed, gain = follow_outlines(outlines, refined, free, points_m, settings.min_improvement)
+    more = Outlines.of(capture, FRAMES) if outlines else None
+    followed, gain = follow_outlines(more, refined, free, points_m, settings.min_improvement)
     if gain and not _contradiction(matches, cameras, followed):
         refined, chosen = followed, chosen.also(gain)
     gained = 1 - chosen.cost_px / held_out_px["as given"]

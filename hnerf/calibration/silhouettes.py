@@ -8,6 +8,7 @@ point of the ray lies outside, in pixels of the camera that excludes it. It does
 import dataclasses
 import logging
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -22,13 +23,14 @@ from hnerf.geometry.camera import Camera
 from hnerf.segmentation.backends import AROUND_DETECTED, BackgroundSubtraction
 from hnerf.segmentation.prior import priors_of
 
-FRAMES = 8  # evenly spaced: neighbouring frames add nothing
+FRAMES = 8  # enough to tell that a camera is wrong
 PLATE_FRAMES = 24  # from which the background is estimated if there is no clean plate
 POINTS = 64  # on the outline in each image
 COARSE, FINE = 64, 17  # samples along a ray, and again between the neighbours of the best, twice
 SEARCH_RANGE = 1.5  # times the person's size: length of each ray that is searched, either way
 TRIM = 0.98  # share of the residuals that count; the rest are taken for mask errors
 MIN_KEYPOINTS_INSIDE = 0.6  # share of the person's keypoints; a mask that holds fewer is not the person's
+SLIGHT_CHANGE_PX = 5.0  # at most, of the distance of a ray from the hull, as a camera is changed slightly
 BEHIND_CAMERA_PX = 1e4  # the residual of a point behind a camera that sees the person
 
 log = logging.getLogger("hnerf.calibration")
@@ -80,16 +82,16 @@ class Outlines:
     instants: tuple[int, ...]
 
     @staticmethod
-    def of(capture: Capture) -> "Outlines | None":
-        """Return the outlines of the training cameras at a few instants, from given masks, clean plates or a median of
-        the images.
+    def of(capture: Capture, frames: int = FRAMES) -> "Outlines | None":
+        """Return the outlines of the training cameras at as many frames, evenly spaced, from given masks, clean plates
+        or a median of the images.
 
         The masks use each camera's own keypoints only, so that a wrong calibration cannot spoil them. Returns None if
         fewer than two cameras have a usable mask.
         """
         found = subject_keypoints(capture)
         everyone = np.all([(seen[..., 2] > 0).any(1) for seen in found.values()], axis=0)
-        shown = evenly_spaced(np.flatnonzero(everyone).tolist(), FRAMES)
+        shown = evenly_spaced(np.flatnonzero(everyone).tolist(), frames)
         log.info("outlines of %d cameras at %d instants", len(found), len(shown))
         by_camera = {name: _outlines(capture, name, found[name], shown) for name in found}
         usable = {name: outlines for name, outlines in by_camera.items() if any(outlines)}
@@ -112,17 +114,23 @@ class Outlines:
 
         Cameras without outlines are left out, as are instants at which fewer than two cameras have one.
         """
-        found = {name: [near.residuals_px() for near in rows] for name, rows in self._near_hull(cameras).items()}
+        found = {name: [near.closest_px().clip(0) for near in rows] for name, rows in self._near_hull(cameras).items()}
         return {name: np.concatenate(rows) if rows else np.zeros(0) for name, rows in found.items()}
 
     def changes_px(self, cameras: Sequence[Camera], replacements: Sequence[Sequence[Camera]]) -> np.ndarray:
         """Return by how much all `residuals_px`, one camera's after another's, change if some cameras are replaced by
-        slightly different ones of the same names, for each of the replacements: (replacements, n). Rays are searched
-        only where they pass the hull closest before."""
+        slightly different ones of the same names, for each of the replacements: (replacements, n). Only rays that end
+        near an outline are searched, and only where they pass the hull closest before."""
         near_hull = [near for rows in self._near_hull(cameras).values() for near in rows]
-        before_px = np.concatenate([near.residuals_px() for near in near_hull])
-        after_px = [np.concatenate([near.replaced(c).residuals_px() for near in near_hull]) for c in replacements]
-        return np.stack(after_px) - before_px
+        before_px = np.concatenate([near.closest_px() for near in near_hull])
+        close = before_px > -SLIGHT_CHANGE_PX
+        starts = np.cumsum([0, *(len(near.along_m) for near in near_hull)])
+        searched = [near.only(close[start:end]) for near, (start, end) in zip(near_hull, pairwise(starts), strict=True)]
+        changed_px = np.zeros((len(replacements), len(close)))
+        for i, replaced in enumerate(replacements):
+            after_px = np.concatenate([near.replaced(replaced).closest_px() for near in searched])
+            changed_px[i, close] = after_px.clip(0) - before_px[close].clip(0)
+        return changed_px
 
     def _near_hull(self, cameras: Sequence[Camera]) -> dict[str, list["_RaysNearHull"]]:
         """Return where the rays of each camera's outlines pass the hull of the others, at instants with at least
@@ -161,21 +169,25 @@ class _RaysNearHull:
     ) -> "_RaysNearHull":
         """Search the rays of a camera within `reach_m` of their points closest to the centre."""
         camera, outline = seen[name]
-        origins, directions = camera.rays(outline.points_px)
+        rays = origins, directions = camera.rays(outline.points_px)
         nearest_m = ((centre_m - origins) * directions).sum(-1, keepdims=True)
         step_m = 2 * reach_m / (COARSE - 1)
-        near = _RaysNearHull._at(name, seen, (nearest_m + np.linspace(-reach_m, reach_m, COARSE)).clip(step_m))
+        near = _RaysNearHull._at(name, seen, rays, (nearest_m + np.linspace(-reach_m, reach_m, COARSE)).clip(step_m))
         for _ in range(2):
             best_m = np.take_along_axis(near.along_m, near._outside_hull_px().argmin(1)[:, None], 1)
-            near = _RaysNearHull._at(name, seen, best_m + np.linspace(-step_m, step_m, FINE))
+            near = _RaysNearHull._at(name, seen, rays, best_m + np.linspace(-step_m, step_m, FINE))
             step_m *= 2 / (FINE - 1)
         return near
 
     @staticmethod
-    def _at(name: str, seen: Mapping[str, tuple[Camera, MaskOutline]], along_m: np.ndarray) -> "_RaysNearHull":
-        """Sample the rays of a camera at distances (n, S)."""
-        camera, outline = seen[name]
-        origins, directions = camera.rays(outline.points_px)
+    def _at(
+        name: str,
+        seen: Mapping[str, tuple[Camera, MaskOutline]],
+        rays: tuple[np.ndarray, np.ndarray],
+        along_m: np.ndarray,
+    ) -> "_RaysNearHull":
+        """Sample the rays of a camera, origins and directions (n, 3), at distances (n, S)."""
+        origins, directions = rays
         points_m = origins[:, None] + along_m[..., None] * directions[:, None]
         outside_px = {other: _outside_px(*seen[other], points_m) for other in seen if other != name}
         return _RaysNearHull(name, seen, along_m, points_m, outside_px)
@@ -186,15 +198,23 @@ class _RaysNearHull:
         changed = {c.name: (c, self.seen[c.name][1]) for c in cameras if c.name in self.seen}
         seen = {**self.seen, **changed}
         if self.name in changed:
-            origins, directions = changed[self.name][0].rays(changed[self.name][1].points_px)
+            camera, outline = changed[self.name]
+            rays = origins, directions = camera.rays(outline.points_px)
             along_m = ((self.points_m - origins[:, None]) * directions[:, None]).sum(-1)
-            return _RaysNearHull._at(self.name, seen, along_m)
+            return _RaysNearHull._at(self.name, seen, rays, along_m)
         outside_px = {**self.outside_px, **{name: _outside_px(*of, self.points_m) for name, of in changed.items()}}
         return dataclasses.replace(self, seen=seen, outside_px=outside_px)
 
-    def residuals_px(self) -> np.ndarray:
-        """Return the least distance at which each ray passes the hull, (n,) pixels >= 0."""
-        return self._outside_hull_px().min(1).clip(0)
+    def only(self, rays: np.ndarray) -> "_RaysNearHull":
+        """Return the samples of some of the rays, (n,) bool."""
+        camera, outline = self.seen[self.name]
+        seen = {**self.seen, self.name: (camera, dataclasses.replace(outline, points_px=outline.points_px[rays]))}
+        outside_px = {name: px[rays] for name, px in self.outside_px.items()}
+        return _RaysNearHull(self.name, seen, self.along_m[rays], self.points_m[rays], outside_px)
+
+    def closest_px(self) -> np.ndarray:
+        """Return how far from the hull each ray passes at its closest, (n,) pixels, negative inside."""
+        return self._outside_hull_px().min(1)
 
     def _outside_hull_px(self) -> np.ndarray:
         """Return how far the samples lie outside the mask that excludes them most, (n, S) pixels."""
@@ -220,7 +240,7 @@ def _outside_px(camera: Camera, outline: MaskOutline, points_m: np.ndarray) -> n
     Beyond the image border the nearest border pixel counts: where the border cuts the person off, the person may go on.
     """
     uv, depth_m = camera.project(points_m)
-    at = np.nan_to_num(uv).clip(-BEHIND_CAMERA_PX, BEHIND_CAMERA_PX).astype(np.float32)
+    at = np.fmin(np.fmax(uv, -BEHIND_CAMERA_PX), BEHIND_CAMERA_PX).astype(np.float32)
     x, y = cv2.split(at)
     far_px = cv2.remap(outline.distance_px, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.where(depth_m > 0, far_px, BEHIND_CAMERA_PX)

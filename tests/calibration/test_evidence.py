@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from hnerf.calibration.check import check_calibration
 from hnerf.calibration.diagnosis import measure
@@ -20,7 +21,8 @@ from hnerf.config import CalibrationSettings
 from tests.calibration.synthetic import turned
 
 
-def test_a_turned_camera_before_and_after(wave: Capture, tmp_path: Path) -> None:
+def test_a_turned_camera_before_and_after(wave: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hnerf.calibration.refine.FRAMES", 4)
     off = wave.with_cameras(wave.cameras | {"02": turned(wave.cameras["02"], 2.0)})
     report = check_calibration(off, CalibrationSettings())
     report.save(tmp_path)

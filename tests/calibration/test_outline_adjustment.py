@@ -72,9 +72,12 @@ def test_all_cameras_together_keep_the_world() -> None:
     np.testing.assert_allclose(moved_m, 0, atol=1e-9)
 
 
-def test_outlines_mend_what_keypoints_get_wrong_alike_in_all_frames(tmp_path: Path) -> None:
+def test_outlines_mend_what_keypoints_get_wrong_alike_in_all_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """c2 is turned by a degree, and its detector sees everything 4 px to the right: keypoints alone leave it 4 px off.
     Without any error of keypoints, they have the last word."""
+    monkeypatch.setattr(Outlines, "of", lambda *_: outlines())
     given = with_c2(lambda c: turned(c, 1.0))
     biased = keypoints_of()
     biased[2, ..., 0] += 4
@@ -98,9 +101,10 @@ def test_a_zoomed_camera_sees_the_person_at_the_same_place_and_size() -> None:
     assert far.project(before_m)[0][0] - camera.project(MIDDLE_M)[0][0] == pytest.approx(seen_px)
 
 
-def test_an_unknown_focal_length_returns() -> None:
+def test_an_unknown_focal_length_returns(monkeypatch: pytest.MonkeyPatch) -> None:
     """A box that moves by a metre; three cameras a tenth too long, each that much too far away. The fourth's is
     known."""
+    monkeypatch.setattr(silhouettes, "POINTS", 48)
     given = [camera if camera.name == "c3" else _zoomed(camera, 1.1, MIDDLE_M) for camera in ring(4)]
     names = [camera.name for camera in given]
     found = adjust_to_outlines(outlines(0.5), given, names, MIDDLE_M, names[:3])

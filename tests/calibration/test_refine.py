@@ -10,6 +10,7 @@ from hnerf.calibration.check import check_calibration
 from hnerf.calibration.diagnosis import MISTAKES, SINGLE_CAMERA_MISTAKES, undo_mistake
 from hnerf.calibration.matches import Matches
 from hnerf.calibration.refine import Refinement, judge_by_outlines, refine
+from hnerf.calibration.silhouettes import Outlines
 from hnerf.config import CalibrationSettings
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import FRAMES, detections, ring, turned, walk_m, write_capture
@@ -28,6 +29,11 @@ class OutlinesThat:
 
     def cost_px(self, cameras: Sequence[Camera]) -> float:
         return self.given_px if cameras is self.given else self.refined_px
+
+
+@pytest.fixture(autouse=True)
+def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Outlines, "of", lambda *_: None)
 
 
 def keypoints_of(noise_px: float = 1) -> np.ndarray:

@@ -121,6 +121,16 @@ def test_small_changes_are_those_that_a_search_anew_finds() -> None:
     assert (found_px[4] == 0).all()
 
 
+def test_rays_that_come_out_of_the_hull_count() -> None:
+    """A camera of a true rig is moved from 1.5 mm left to 1.5 mm right: rays at one side come out."""
+    seen, rig = outlines(ring(4)), ring(4)
+    left, right = (dataclasses.replace(rig[0], t_m=rig[0].t_m + np.array([x, 0, 0])) for x in (-0.0015, 0.0015))
+    before_px, after_px = (np.concatenate([*seen.residuals_px([c, *rig[1:]]).values()]) for c in (left, right))
+    found_px = seen.changes_px([left, *rig[1:]], [[right]])[0]
+    np.testing.assert_allclose(found_px, after_px - before_px, atol=0.15)
+    assert found_px[before_px == 0].max() > 0.2
+
+
 def test_a_rendered_capture_tells_a_turned_camera(wave: Capture) -> None:
     seen = Outlines.of(wave)
     assert seen is not None

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from hnerf.calibration.bundle import adjust, adjust_shared_lens, align, undistort
 from hnerf.calibration.diagnosis import Measure, body_height_m, measure, median_height_px
-from hnerf.calibration.outline_adjustment import follow_outlines
+from hnerf.calibration.outline_adjustment import FRAMES, follow_outlines
 from hnerf.calibration.person.lens import LensFit, fit_lenses
 from hnerf.calibration.person.rig import first_poses
 from hnerf.calibration.person.upright import CHAIN_SD, MEAN_STATURE_M, STATURE_SD_M, scale_to, stand_on_ground
@@ -108,14 +108,15 @@ def calibrate_from_person(
     unknown_focal: Sequence[str],
     intrinsics: dict[str, str],
     height_m: float | None,
-    outlines_of: Callable[[Capture], Outlines | None],
+    outlines_of: Callable[[Capture, int], Outlines | None],
 ) -> PersonCalibration:
     """Calibrate the training cameras of a capture from its keypoints and outlines; the poses of its cameras are not
     read.
 
     unknown_focal: cameras whose focal length is a guess, to be estimated; intrinsics: where each camera's come from, in
-    words; height_m: the person's, the mean stature if None; outlines_of: how outlines are found. Lenses with distortion
-    are left as keypoints have them. Raises InputError where the recording does not determine the cameras.
+    words; height_m: the person's, the mean stature if None; outlines_of: how outlines of a number of frames are found.
+    Lenses with distortion are left as keypoints have them. Raises InputError where the recording does not determine the
+    cameras.
     """
     if len(capture.train_cameras) < 2:
         raise InputError(f"{capture.name}: one camera cannot be calibrated from the person; film with two or more")
@@ -133,7 +134,7 @@ def calibrate_from_person(
         height = height_m or MEAN_STATURE_M
         scaled, points_m = scale_to(fit.cameras, found.points_m, height)
         if fit.k1 == 0:
-            outlines = outlines_of(capture.with_cameras(capture.cameras | {c.name: c for c in scaled}))
+            outlines = outlines_of(capture.with_cameras(capture.cameras | {c.name: c for c in scaled}), FRAMES)
             followed, _ = follow_outlines(
                 outlines, scaled, capture.train_cameras, points_m, min_improvement, unknown_focal
             )

@@ -27,7 +27,7 @@ def lost(camera: Camera) -> Camera:
     return dataclasses.replace(camera, R=np.eye(3), t_m=np.zeros(3))
 
 
-def no_outlines(capture: Capture) -> None:
+def no_outlines(capture: Capture, frames: int) -> None:
     """Stand in for what finds outlines, of captures without images."""
 
 
@@ -144,7 +144,7 @@ def test_outlines_have_the_last_word_on_poses(tmp_path: Path, monkeypatch: pytes
 
     monkeypatch.setattr("hnerf.calibration.person.calibrate.follow_outlines", follow)
     found = calibrate_from_person(
-        capture, ["c0"], dict.fromkeys(capture.cameras, "given"), STATURE_M, lambda capture: "found"
+        capture, ["c0"], dict.fromkeys(capture.cameras, "given"), STATURE_M, lambda *_: "found"
     )  # type: ignore[arg-type, return-value]
     assert worst_errors(found.cameras, [turned(c, 0.5) if c.name == "c1" else c for c in truth])[0] < 0.1
 

@@ -38,7 +38,10 @@ def write_recording(
 
 
 @pytest.mark.parametrize("pose2sim", [False, True])
-def test_a_folder_gets_its_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str], pose2sim: bool) -> None:
+def test_a_folder_gets_its_cameras(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, pose2sim: bool
+) -> None:
+    monkeypatch.setattr("hnerf.calibration.person.calibrate.FRAMES", 2)
     truth = ring(3)
     seen = {name: found[:, 0] for name, found in detections(truth, 1.0).items()}
     folder, out = write_recording(tmp_path / "film", seen, pose2sim), tmp_path / "cameras"
