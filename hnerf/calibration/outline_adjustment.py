@@ -5,6 +5,7 @@ keypoints have refined may be off by pixels. Outlines have no such bias, but say
 """
 
 import dataclasses
+import itertools
 import logging
 from collections.abc import Sequence
 
@@ -15,6 +16,7 @@ from scipy.optimize import least_squares
 from hnerf.calibration.bundle import align
 from hnerf.calibration.silhouettes import Outlines
 from hnerf.geometry.camera import Camera
+from hnerf.progress import report
 
 FRAMES = 36  # evenly spaced: masks err by pixels, differently in each frame
 STD = np.array([0.05] * 3 + [0.1] * 3)  # of a pose from keypoints: a turn about the person, rad, and a move, m
@@ -65,6 +67,8 @@ def adjust_to_outlines(
     stds = np.array([*np.tile(STD, len(free)), *[FOCAL_STD] * zooms])
     steps = np.array([*np.tile(STEP, len(free)), *[FOCAL_STEP] * zooms])
 
+    evaluations = itertools.count()
+
     def moved(values: np.ndarray) -> list[Camera]:
         zoom = float(np.exp(values[6 * len(free) :].sum()))
         zoomed = [_zoomed(c, zoom, person_m) if c.name in unknown_focal else c for c in cameras]
@@ -72,6 +76,7 @@ def adjust_to_outlines(
         return [_turned(c, changes[c.name], person_m) if c.name in changes else c for c in zoomed]
 
     def residuals(values: np.ndarray) -> np.ndarray:
+        report("cameras to outlines", next(evaluations), EVALUATIONS)
         return np.concatenate([*outlines.residuals_px(moved(values)).values(), values / stds])
 
     def slopes(values: np.ndarray) -> np.ndarray:
@@ -95,6 +100,7 @@ def adjust_to_outlines(
         ftol=MIN_GAIN,
         max_nfev=EVALUATIONS,
     )
+    report("cameras to outlines", EVALUATIONS, EVALUATIONS)
     adjusted = moved(solved.x)
     return align(adjusted, cameras) if len(free) == len(cameras) else adjusted
 

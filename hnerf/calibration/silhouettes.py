@@ -20,8 +20,10 @@ from hnerf.capture.subject import subject_keypoints
 from hnerf.config import SegmentationSettings
 from hnerf.evenly_spaced import evenly_spaced
 from hnerf.geometry.camera import Camera
+from hnerf.progress import tracked
 from hnerf.segmentation.backends import AROUND_DETECTED, BackgroundSubtraction
 from hnerf.segmentation.prior import priors_of
+from hnerf.side_by_side import side_by_side
 
 FRAMES = 8  # enough to tell that a camera is wrong
 PLATE_FRAMES = 24  # from which the background is estimated if there is no clean plate
@@ -93,7 +95,8 @@ class Outlines:
         everyone = np.all([(seen[..., 2] > 0).any(1) for seen in found.values()], axis=0)
         shown = evenly_spaced(np.flatnonzero(everyone).tolist(), frames)
         log.info("outlines of %d cameras at %d instants", len(found), len(shown))
-        by_camera = {name: _outlines(capture, name, found[name], shown) for name in found}
+        each = side_by_side(lambda name: _outlines(capture, name, found[name], shown), found)
+        by_camera = dict(zip(found, tracked(each, "outlines", len(found)), strict=True))
         usable = {name: outlines for name, outlines in by_camera.items() if any(outlines)}
         return Outlines(usable, tuple(shown)) if len(usable) > 1 else None
 
