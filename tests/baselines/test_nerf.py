@@ -22,7 +22,7 @@ from tests.baselines.ball import RING, body, inner_psnr, psnr, record, trained
 
 SMALL = [
     "training.steps=250",
-    "training.rays_per_frame=128",
+    "training.rays_per_frame=256",
     "training.field.width=32",
     "training.field.samples=16",
     "training.field.learning_rate=0.01",
