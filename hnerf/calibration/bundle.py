@@ -182,8 +182,12 @@ def _add_image(scene: pycolmap.Reconstruction, number: int, camera: Camera, keyp
 
 def _as_solved(scene: pycolmap.Reconstruction, number: int, camera: Camera, zoom: float) -> Camera:
     pose = scene.image(number).cam_from_world()
-    K = camera.K * np.array([[zoom, zoom, 1], [1, zoom, 1], [1, 1, 1]])
-    return dataclasses.replace(camera, K=K, R=pose.rotation.matrix(), t_m=np.array(pose.translation))
+    return dataclasses.replace(zoomed(camera, zoom), R=pose.rotation.matrix(), t_m=np.array(pose.translation))
+
+
+def zoomed(camera: Camera, zoom: float) -> Camera:
+    """Return the camera with its focal length multiplied; its pose and principal point stay."""
+    return dataclasses.replace(camera, K=camera.K * np.array([[zoom, zoom, 1], [1, zoom, 1], [1, 1, 1]]))
 
 
 def align(cameras: Sequence[Camera], to: Sequence[Camera]) -> list[Camera]:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from hnerf.calibration.bundle import align
+from hnerf.calibration.bundle import align, zoomed
 from hnerf.calibration.silhouettes import Outlines
 from hnerf.geometry.camera import Camera
 from hnerf.progress import report
@@ -23,7 +23,8 @@ STD = np.array([0.05] * 3 + [0.1] * 3)  # of a pose from keypoints: a turn about
 STEP = np.array([0.002] * 3 + [0.003] * 3)  # of finite differences: about a pixel
 FOCAL_STD, FOCAL_STEP = 0.2, 0.02  # of the logarithm of a focal length from keypoints
 LOSS_SCALE_PX = 0.5  # of Cauchy's loss: errors of masks are larger
-EVALUATIONS, MIN_GAIN = 20, 0.01  # of an adjustment, and the share of the cost by which the last must lower it
+EVALUATIONS = 20
+MIN_COST_DECREASE = 0.01  # as a share: a smaller step is the last
 MIN_GAIN_PX = 0.01  # of outlines at other instants; cameras from keypoints without bias leave 0.006 px on valid-wave
 
 log = logging.getLogger("hnerf.calibration")
@@ -66,14 +67,13 @@ def adjust_to_outlines(
     zooms = 1 if unknown_focal else 0
     stds = np.array([*np.tile(STD, len(free)), *[FOCAL_STD] * zooms])
     steps = np.array([*np.tile(STEP, len(free)), *[FOCAL_STEP] * zooms])
-
     evaluations = itertools.count()
 
     def moved(values: np.ndarray) -> list[Camera]:
         zoom = float(np.exp(values[6 * len(free) :].sum()))
-        zoomed = [_zoomed(c, zoom, person_m) if c.name in unknown_focal else c for c in cameras]
+        at_zoom = [_zoomed_about(c, zoom, person_m) if c.name in unknown_focal else c for c in cameras]
         changes = dict(zip(free, values[: 6 * len(free)].reshape(-1, 6), strict=True))
-        return [_turned(c, changes[c.name], person_m) if c.name in changes else c for c in zoomed]
+        return [_turned(c, changes[c.name], person_m) if c.name in changes else c for c in at_zoom]
 
     def residuals(values: np.ndarray) -> np.ndarray:
         report("cameras to outlines", next(evaluations), EVALUATIONS)
@@ -97,7 +97,7 @@ def adjust_to_outlines(
         slopes,
         loss="cauchy",
         f_scale=LOSS_SCALE_PX,
-        ftol=MIN_GAIN,
+        ftol=MIN_COST_DECREASE,
         max_nfev=EVALUATIONS,
     )
     report("cameras to outlines", EVALUATIONS, EVALUATIONS)
@@ -105,12 +105,11 @@ def adjust_to_outlines(
     return align(adjusted, cameras) if len(free) == len(cameras) else adjusted
 
 
-def _zoomed(camera: Camera, zoom: float, pivot_m: np.ndarray) -> Camera:
+def _zoomed_about(camera: Camera, zoom: float, pivot_m: np.ndarray) -> Camera:
     """Return a camera with its focal length multiplied, moved along its axis so that a point of the world is seen at
     the same pixel and of the same size."""
-    K = camera.K * np.array([[zoom, zoom, 1], [1, zoom, 1], [1, 1, 1]])
     back_m = (zoom - 1) * (camera.R @ pivot_m + camera.t_m)[2]
-    return dataclasses.replace(camera, K=K, t_m=camera.t_m + np.array([0, 0, back_m]))
+    return dataclasses.replace(zoomed(camera, zoom), t_m=camera.t_m + np.array([0, 0, back_m]))
 
 
 def _turned(camera: Camera, values: np.ndarray, pivot_m: np.ndarray) -> Camera:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hnerf.calibration import outline_adjustment, silhouettes
-from hnerf.calibration.outline_adjustment import _turned, _zoomed, adjust_to_outlines
+from hnerf.calibration.outline_adjustment import _turned, _zoomed_about, adjust_to_outlines
 from hnerf.calibration.silhouettes import MaskOutline, Outlines
 from hnerf.geometry.camera import Camera
 from tests.calibration.synthetic import ring, turned
@@ -93,7 +93,7 @@ def test_a_zoomed_camera_sees_the_person_at_the_same_place_and_size() -> None:
     seen, and 10 cm before it come closer to it, by the ratio of depths."""
     camera = ring(4)[1]
     beside_m, before_m = MIDDLE_M + 0.1 * camera.R[0], MIDDLE_M + 0.1 * camera.R[0] - 0.1 * camera.R[2]
-    far = _zoomed(camera, 2.0, MIDDLE_M)
+    far = _zoomed_about(camera, 2.0, MIDDLE_M)
     assert far.K[0, 0] == far.K[1, 1] == 2000 and far.K[0, 2] == camera.K[0, 2]
     np.testing.assert_allclose(far.project(beside_m)[0], camera.project(beside_m)[0], atol=1e-9)
     depth_m = camera.project(MIDDLE_M)[1]
@@ -105,7 +105,7 @@ def test_an_unknown_focal_length_returns(monkeypatch: pytest.MonkeyPatch) -> Non
     """A box that moves by a metre; three cameras a tenth too long, each that much too far away. The fourth's is
     known."""
     monkeypatch.setattr(silhouettes, "POINTS", 48)
-    given = [camera if camera.name == "c3" else _zoomed(camera, 1.1, MIDDLE_M) for camera in ring(4)]
+    given = [camera if camera.name == "c3" else _zoomed_about(camera, 1.1, MIDDLE_M) for camera in ring(4)]
     names = [camera.name for camera in given]
     found = adjust_to_outlines(outlines(0.5), given, names, MIDDLE_M, names[:3])
     assert [c.K[0, 0] for c in found[:3]] == pytest.approx([1000] * 3, rel=0.03)
