@@ -56,6 +56,16 @@ def main() -> int:
     parser.add_argument("--limit", type=float, default=6 * 3600.0, metavar="S", help="give up after so long")
     parser.add_argument("--out", type=Path, help="also write the figures into this JSON file")
     options = parser.parse_args()
+    figures = under_fire(options.subjects, options.kill_every, options.limit)
+    text = json.dumps(figures, indent=1)
+    print(text)
+    if options.out:
+        options.out.write_text(text + "\n")
+    return 1 if figures["faults"] else 0
+
+
+def under_fire(subjects: int, kill_every_s: float, limit_s: float) -> dict[str, Any]:
+    """Train recordings under fire in a new folder, which is removed unless there were faults; return the figures."""
     scratch = Path(tempfile.mkdtemp(prefix="hnerf-soak-"))
     mark = uuid4().hex
     server_port, bucket_port = free_port(), free_port()
@@ -75,24 +85,24 @@ def main() -> int:
     try:
         with database():
             os.environ[MARK] = mark
-            figures = soak(scratch, server_port, bucket_port, mark, options)
+            figures = soak(scratch, (server_port, bucket_port), mark, subjects, kill_every_s, limit_s)
     finally:
         for pid in marked(f"{MARK}={mark}"):
             os.kill(pid, signal.SIGKILL)
-    text = json.dumps(figures, indent=1)
-    print(text)
-    if options.out:
-        options.out.write_text(text + "\n")
     if figures["faults"]:
         print(f"left for a look: {scratch}", file=sys.stderr)
-        return 1
-    shutil.rmtree(scratch)
-    return 0
+    else:
+        shutil.rmtree(scratch)
+    return figures
 
 
-def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: argparse.Namespace) -> dict[str, Any]:
-    """Train all recordings under fire; return the figures, among which are the faults."""
-    names = write_captures(scratch / "captures", options.subjects)
+def soak(
+    scratch: Path, ports: tuple[int, int], mark: str, subjects: int, kill_every_s: float, limit_s: float
+) -> dict[str, Any]:
+    """Train all recordings in a folder, with a server and a bucket at these ports; return the figures, among which are
+    the faults."""
+    server_port, bucket_port = ports
+    names = write_captures(scratch / "captures", subjects)
     (scratch / "preset.yaml").write_text(PRESET)
     listen = ("--host", "127.0.0.1", "--port", str(server_port), "--no-ui")
     done: dict[str, list[str]] = {}
@@ -105,8 +115,8 @@ def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: 
         set_up(scratch)
         machines = [Machine.started(scratch, number) for number in range(MACHINES)]
         started_s, memory_kib = time.monotonic(), [resident_kib(server.pid)]
-        kill_s = started_s + options.kill_every
-        while len(done) < len(names) and time.monotonic() - started_s < options.limit:
+        kill_s = started_s + kill_every_s
+        while len(done) < len(names) and time.monotonic() - started_s < limit_s:
             time.sleep(POLL_S)
             note_finished(machines, names, done)
             restarted = [machine.restarted() for machine in machines]
@@ -114,7 +124,7 @@ def soak(scratch: Path, server_port: int, bucket_port: int, mark: str, options: 
             machines, at = restarted, random.randrange(MACHINES)
             if time.monotonic() < kill_s:
                 continue
-            kill_s = time.monotonic() + options.kill_every * random.uniform(0.5, 1.5)
+            kill_s = time.monotonic() + kill_every_s * random.uniform(0.5, 1.5)
             if run := machines[at].run():  # a kill that finds none lapses: it would meet the last run as it begins
                 if kills.total() % 2:
                     machines[at] = machines[at].lose()
