@@ -211,7 +211,9 @@ FAULTS = (
     Fault("reach-behind", "geometry/reach", "xy, depth_m = xy[depth_m > 0], depth_m[depth_m > 0]",
           "depth_m = depth_m[depth_m > 0]", "training/pixels"),
     # the fit of the body
-    Fault("ground-offsets", "body/ground", " + pose.offsets_m[FEET, 2]", ""),
+    Fault("ground-offsets", "body/ground", " + pose.offsets_m[:, 2]", ""),
+    Fault("ground-one-foot", "body/ground", "for foot in (LEFT, RIGHT)", "for foot in (LEFT, LEFT)"),
+    Fault("ground-never-each-foot", "body/fit", "replace(problem.ground, each_foot=True)", "problem.ground"),
     Fault("person-of-any-distance", "detection/merge", "if distance <= nearest:", "if True:"),
     Fault("ground-anywhere", "body/ground", "low <= stature_m <= high", "True"),
     Fault("pose-alone", "fields/grids", "first.bias + of_code @ code[0]", "first.bias"),

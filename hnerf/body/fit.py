@@ -94,6 +94,7 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
         if masks is not None:
             with _timed(seconds, "outlines"):
                 problem = make_problem(model, pose, observations, smoothness, settings, offsets=1, proportions=1)
+                terms |= {"ground": Ground(up, each_foot=True)} if on_ground else {}
                 problem = replace(problem, palm=palm, posture_prior=posture_prior, **terms)
                 edges = _outlines(capture, masks, problem.scale_m, settings.spacing_m)
                 pose = refine_with_outlines(problem, pose, edges, settings, up if on_ground else None)
@@ -120,6 +121,7 @@ def _fit_in_images(capture: Capture, problem: Problem, pose: Pose, palm: PalmTer
     if len(cameras) > 1:
         return pose, PosturePrior.of_twists(len(pose.root), Articulation(pose.rig))
     posture_prior = PosturePrior.of_single_view(_by_split(capture), pose, cameras[0])
+    problem = replace(problem, ground=problem.ground and replace(problem.ground, each_foot=True))
     pose = resolve_depth_flips(replace(problem, posture_prior=posture_prior), pose, runs(capture))
     return hold_single_posture(problem, pose, posture_prior)
 

@@ -1,7 +1,10 @@
-"""A prior that the lower foot stands on the ground, at height 0, where calibrations usually put it.
+"""A prior that feet stand on the ground, at height 0, where calibrations usually put it.
 
 With one camera, how far away somebody is follows from where he stands; from his stature alone it is off by decimetres.
+How far each leg reaches towards the camera follows in the same way, while its foot is down.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,9 +16,11 @@ from hnerf.body.robust import geman_mcclure
 from hnerf.capture.standing import STANDING_M, stature_on_ground_m
 from hnerf.geometry.camera import Camera
 
-FEET = list(range(19, 25))  # toes and heels in BODY_25
+LEFT, RIGHT = [19, 20, 21], [22, 23, 24]  # toes and heel of a foot in BODY_25
+FEET = LEFT + RIGHT
 GROUND_STD_M = 0.02  # of a keypoint of the lower foot above the ground, beyond its height on the rest body
 OUTLIER_M = 0.25  # of a body in the air
+EACH_STD_M, EACH_OUTLIER_M = 0.04, 0.05  # the same of either foot, and of one that swings
 MIN_CAMERA_M = 0.15  # above the ground
 
 
@@ -28,27 +33,37 @@ def is_ground(camera: Camera, keypoints: np.ndarray, up: str) -> bool:
     return bool(above and (np.isnan(stature_m) or low <= stature_m <= high))
 
 
+@dataclass(frozen=True)
 class Ground:
-    """A Gaussian on the height of the lowest of toes and heels, frame by frame, with Geman-McClure weights."""
+    """A Gaussian on the height of the lowest of toes and heels, frame by frame, with Geman-McClure weights.
 
-    def __init__(self, up: int) -> None:
-        """Prepare the prior; `up` is the index of the world's vertical axis."""
-        self.up = torch.eye(3, dtype=torch.float64)[up]
+    up: index of the world's vertical axis; each_foot: adds a wider one on each foot, once the pose is known well enough
+    to tell a foot that swings.
+    """
+
+    up: int
+    each_foot: bool = False
 
     def add(
         self, equations: NormalEquations, pose: Pose, keypoints_m: Tensor, by_frame: Tensor, by_shared: Tensor
     ) -> float:
         """Add the prior to the normal equations and return its cost. keypoints_m (n, 25, 3), their derivatives by_frame
         (n, 25, 3, U) and by_shared (n, 25, 3, S)."""
-        rest_m = (pose.rig.keypoint_weights[FEET] @ pose.rig.vertices_m)[:, 2] + pose.offsets_m[FEET, 2]
-        height_m = keypoints_m[:, FEET] @ self.up - (rest_m - pose.rig.vertices_m[:, 2].min())
-        lowest, foot = height_m.min(1)
-        weight, cost = geman_mcclure(lowest.square(), GROUND_STD_M, OUTLIER_M)
-        rows, feet = torch.arange(len(foot)), torch.tensor(FEET)[foot]
-        equations.add_points(
-            weight[:, None, None, None] * torch.outer(self.up, self.up),
-            (weight * lowest)[:, None, None] * self.up,
-            by_frame[rows, feet, None],
-            by_shared[rows, feet, None],
-        )
-        return float(cost.sum())
+        rest_m = (pose.rig.keypoint_weights @ pose.rig.vertices_m)[:, 2] + pose.offsets_m[:, 2]
+        up = torch.eye(3, dtype=keypoints_m.dtype)[self.up]
+        height_m = keypoints_m @ up - (rest_m - pose.rig.vertices_m[:, 2].min())
+        rows, cost = torch.arange(len(height_m)), 0.0
+        parts = [(FEET, GROUND_STD_M, OUTLIER_M)]
+        parts += [(foot, EACH_STD_M, EACH_OUTLIER_M) for foot in (LEFT, RIGHT)] if self.each_foot else []
+        for points, std_m, outlier_m in parts:
+            lowest, at = height_m[:, points].min(1)
+            weight, costs = geman_mcclure(lowest.square(), std_m, outlier_m)
+            point = torch.tensor(points)[at]
+            equations.add_points(
+                weight[:, None, None, None] * torch.outer(up, up),
+                (weight * lowest)[:, None, None] * up,
+                by_frame[rows, point, None],
+                by_shared[rows, point, None],
+            )
+            cost += float(costs.sum())
+        return cost

@@ -10,6 +10,7 @@ from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.body_model import body_model
 from hnerf.body.fit import _outlines, _report, fit_body, initial_pose, make_problem, resolve_depth_flips
 from hnerf.body.fit_result import BodyFit
+from hnerf.body.ground import Ground
 from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel
 from hnerf.body.observations import observe, runs
 from hnerf.body.pose_prior import Smoothness
@@ -67,10 +68,13 @@ def test_a_frame_that_nothing_was_fitted_to_is_poor(tmp_path: Path) -> None:
     assert [report["poor_frames"] for report in reports] == [[1], []]
 
 
-def test_one_camera_finds_the_depth(tmp_path: Path) -> None:
-    truth = moving_body((0, 1, 2, 3))
+def test_one_camera_finds_the_depth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the lower foot first; once the pose is known, by both, before the outlines' six steps and in them."""
+    truth, stands, each_foot = moving_body((0, 1, 2, 3)), Ground.add, []
+    monkeypatch.setattr(Ground, "add", lambda self, *given: each_foot.append(self.each_foot) or stands(self, *given))
     capture = record(tmp_path, truth, RING, ("0",))
     fit, _ = fit_body(capture, silhouettes(capture, truth), FitSettings(contour_steps=6))
+    assert each_foot == sorted(each_foot) and not each_foot[0] and sum(each_foot) > 6
     assert joint_error_m(fit, truth).mean() < 0.06
     assert fit.vertices_m()[..., 2].min(1).values.mean() < 0.01  # bare feet stand on the ground
 

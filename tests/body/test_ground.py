@@ -11,14 +11,16 @@ from hnerf.body.normal_equations import NormalEquations
 from tests.body.recorded_body import moving_body, ring_camera
 from tests.body.test_articulation import random_pose
 
+LOWER, EACH = Ground(2), Ground(2, each_foot=True)
 
-def cost_and_equations(pose: Pose) -> tuple[float, NormalEquations]:
+
+def cost_and_equations(pose: Pose, ground: Ground = LOWER) -> tuple[float, NormalEquations]:
     articulation = Articulation(pose.rig)
     x, by_frame, by_shape = articulation.jacobian(
         with_offsets(articulation.keypoints(), pose.offsets_m), articulation.pose(pose)
     )
     equations = NormalEquations(len(x), articulation.unknowns, by_shape.shape[-1])
-    return Ground(2).add(equations, pose, x, by_frame, by_shape), equations
+    return ground.add(equations, pose, x, by_frame, by_shape), equations
 
 
 def standing(height_m: float) -> Pose:
@@ -40,6 +42,17 @@ def test_who_stands_costs_nothing_and_two_centimetres_a_half() -> None:
     assert cost_and_equations(raised)[0] < 1e-9 and len(FEET) == 6
 
 
+def test_each_foot_that_is_down_stands_on_the_ground_and_one_that_swings_is_let_go() -> None:
+    """Four centimetres up, each foot costs 0.5 / (1 + (4/5)^2) beside the lower one's; a shank that is lifted by a
+    right angle costs no more than (5/4)^2 / 2."""
+    lower = cost_and_equations(standing(0.04))[0]
+    assert math.isclose(cost_and_equations(standing(0.04), EACH)[0], lower + 2 * 0.5 / 1.64, rel_tol=1e-3)
+    for side in "LR":
+        raised = standing(0.0)
+        raised.theta[0, raised.rig.joint_names.index(f"lowerleg01.{side}"), 0] = math.pi / 2
+        assert 0.7 < cost_and_equations(raised, EACH)[0] < 25 / 32
+
+
 def test_a_keypoint_that_is_seen_higher_up_stands_no_higher() -> None:
     """A detector that sees toes and heels 4 cm above the model's does not lift the body."""
     pose = standing(0.0)
@@ -52,10 +65,13 @@ def test_the_gradient_of_the_ground_is_that_of_its_cost() -> None:
     pose = replace(pose, offsets_m=torch.zeros(25, 3, dtype=torch.float64))
     articulation = Articulation(pose.rig)
     direction = torch.randn(2, articulation.unknowns, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    ends = [cost_and_equations(articulation.apply_step(pose, sign * 1e-6 * direction))[0] for sign in (1, -1)]
-    slope = (cost_and_equations(pose)[1].frame_gradient * direction.numpy()).sum()
-    assert abs(slope) > 1e-2
-    np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-6, rtol=1e-4)
+    for ground in (LOWER, EACH):
+        ends = [
+            cost_and_equations(articulation.apply_step(pose, sign * 1e-6 * direction), ground)[0] for sign in (1, -1)
+        ]
+        slope = (cost_and_equations(pose, ground)[1].frame_gradient * direction.numpy()).sum()
+        assert abs(slope) > 1e-2
+        np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-6, rtol=1e-4)
 
 
 def test_height_0_is_the_ground_where_who_stands_there_is_as_tall_as_people_are() -> None:
