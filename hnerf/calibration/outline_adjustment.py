@@ -8,13 +8,14 @@ import dataclasses
 import itertools
 import logging
 from collections.abc import Sequence
+from functools import lru_cache
 
 import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
 from hnerf.calibration.bundle import align, zoomed
-from hnerf.calibration.silhouettes import Outlines
+from hnerf.calibration.silhouettes import NearHull, Outlines
 from hnerf.geometry.camera import Camera
 from hnerf.progress import report
 
@@ -75,9 +76,13 @@ def adjust_to_outlines(
         changes = dict(zip(free, values[: 6 * len(free)].reshape(-1, 6), strict=True))
         return [_turned(c, changes[c.name], person_m) if c.name in changes else c for c in at_zoom]
 
+    @lru_cache(maxsize=1)  # slopes are asked for where the last residuals were
+    def near_hull(*values: float) -> NearHull:
+        return outlines.near_hull(moved(np.array(values)))
+
     def residuals(values: np.ndarray) -> np.ndarray:
         report("cameras to outlines", next(evaluations), EVALUATIONS)
-        return np.concatenate([*outlines.residuals_px(moved(values)).values(), values / stds])
+        return np.concatenate([*near_hull(*values).residuals_px().values(), values / stds])
 
     def slopes(values: np.ndarray) -> np.ndarray:
         changing = [*([name] for name in free for _ in STEP), *[unknown_focal] * zooms]
@@ -88,7 +93,7 @@ def adjust_to_outlines(
             ]
             for signed in (steps, -steps)
         )
-        up_px, down_px = np.split(outlines.changes_px(moved(values), [*ahead, *behind]), 2)
+        up_px, down_px = np.split(near_hull(*values).changes_px([*ahead, *behind]), 2)
         return np.concatenate([((up_px - down_px) / (2 * steps[:, None])).T, np.diag(1 / stds)])
 
     solved = least_squares(

@@ -117,25 +117,9 @@ class Outlines:
 
         Cameras without outlines are left out, as are instants at which fewer than two cameras have one.
         """
-        found = {name: [near.closest_px().clip(0) for near in rows] for name, rows in self._near_hull(cameras).items()}
-        return {name: np.concatenate(rows) if rows else np.zeros(0) for name, rows in found.items()}
+        return self.near_hull(cameras).residuals_px()
 
-    def changes_px(self, cameras: Sequence[Camera], replacements: Sequence[Sequence[Camera]]) -> np.ndarray:
-        """Return by how much all `residuals_px`, one camera's after another's, change if some cameras are replaced by
-        slightly different ones of the same names, for each of the replacements: (replacements, n). Only rays that end
-        near an outline are searched, and only where they pass the hull closest before."""
-        near_hull = [near for rows in self._near_hull(cameras).values() for near in rows]
-        before_px = np.concatenate([near.closest_px() for near in near_hull])
-        close = before_px > -SLIGHT_CHANGE_PX
-        starts = np.cumsum([0, *(len(near.along_m) for near in near_hull)])
-        searched = [near.only(close[start:end]) for near, (start, end) in zip(near_hull, pairwise(starts), strict=True)]
-        changed_px = np.zeros((len(replacements), len(close)))
-        for i, replaced in enumerate(replacements):
-            after_px = np.concatenate([near.replaced(replaced).closest_px() for near in searched])
-            changed_px[i, close] = after_px.clip(0) - before_px[close].clip(0)
-        return changed_px
-
-    def _near_hull(self, cameras: Sequence[Camera]) -> dict[str, list["_RaysNearHull"]]:
+    def near_hull(self, cameras: Sequence[Camera]) -> "NearHull":
         """Return where the rays of each camera's outlines pass the hull of the others, at instants with at least
         two."""
         known = [camera for camera in cameras if camera.name in self.by_camera]
@@ -148,7 +132,34 @@ class Outlines:
             centre_m, reach_m = _locate_person(list(seen.values()))
             for name in seen:
                 found[name].append(_RaysNearHull.of(name, seen, centre_m, reach_m))
-        return found
+        return NearHull(found)
+
+
+@dataclasses.dataclass(frozen=True)
+class NearHull:
+    """Where the rays of outlines pass the hull, by camera, one entry per instant."""
+
+    by_camera: Mapping[str, Sequence["_RaysNearHull"]]
+
+    def residuals_px(self) -> dict[str, np.ndarray]:
+        """Return what `Outlines.residuals_px` does."""
+        found = {name: [near.closest_px().clip(0) for near in rows] for name, rows in self.by_camera.items()}
+        return {name: np.concatenate(rows) if rows else np.zeros(0) for name, rows in found.items()}
+
+    def changes_px(self, replacements: Sequence[Sequence[Camera]]) -> np.ndarray:
+        """Return by how much all `residuals_px`, one camera's after another's, change if some cameras are replaced by
+        slightly different ones of the same names, for each of the replacements: (replacements, n). Only rays that end
+        near an outline are searched, and only where they pass the hull closest before."""
+        near_hull = [near for rows in self.by_camera.values() for near in rows]
+        before_px = np.concatenate([near.closest_px() for near in near_hull])
+        close = before_px > -SLIGHT_CHANGE_PX
+        starts = np.cumsum([0, *(len(near.along_m) for near in near_hull)])
+        searched = [near.only(close[start:end]) for near, (start, end) in zip(near_hull, pairwise(starts), strict=True)]
+        changed_px = np.zeros((len(replacements), len(close)))
+        for i, replaced in enumerate(replacements):
+            after_px = np.concatenate([near.replaced(replaced).closest_px() for near in searched])
+            changed_px[i, close] = after_px.clip(0) - before_px[close].clip(0)
+        return changed_px
 
 
 @dataclasses.dataclass(frozen=True)

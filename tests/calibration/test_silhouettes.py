@@ -109,7 +109,7 @@ def test_small_changes_are_those_that_a_search_anew_finds() -> None:
     given = [turned(camera, 0.5, axis=i % 2) for i, camera in enumerate(ring(4))]
     given.append(dataclasses.replace(given[0], name="without outlines"))
     moved = [dataclasses.replace(camera, t_m=camera.t_m + np.array([0.003, 0, 0])) for camera in given]
-    found_px = seen.changes_px(given, [[camera] for camera in moved])
+    found_px = seen.near_hull(given).changes_px([[camera] for camera in moved])
     before_px = np.concatenate([*seen.residuals_px(given).values()])
     for i, changed_px in enumerate(found_px[:4]):
         anew = seen.residuals_px([*given[:i], moved[i], *given[i + 1 :]])
@@ -126,7 +126,7 @@ def test_rays_that_come_out_of_the_hull_count() -> None:
     seen, rig = outlines(ring(4)), ring(4)
     left, right = (dataclasses.replace(rig[0], t_m=rig[0].t_m + np.array([x, 0, 0])) for x in (-0.0015, 0.0015))
     before_px, after_px = (np.concatenate([*seen.residuals_px([c, *rig[1:]]).values()]) for c in (left, right))
-    found_px = seen.changes_px([left, *rig[1:]], [[right]])[0]
+    found_px = seen.near_hull([left, *rig[1:]]).changes_px([[right]])[0]
     np.testing.assert_allclose(found_px, after_px - before_px, atol=0.15)
     assert found_px[before_px == 0].max() > 0.2
 
