@@ -1,10 +1,11 @@
 """A lease of work among machines: who works on an artifact, as long as they show that they are alive.
 
-    <stage>/<key>.lease.<turn>    who works on the artifact, and a count that goes up; or FREE, once given up
+    <stage>/<key>.lease.<turn>    who works on the artifact and where, and a count that goes up; or FREE, once given up
 
 Turns are numbered from 0. A turn is taken by making its object, which the file system allows one worker only. The owner
 changes it every BEAT_S. The next turn may be taken once the last is FREE, or has not changed for EXPIRY_S by the clock
-of the one who waits: clocks of machines are not compared. What is finished needs no lease, and its turns are removed.
+of the one who waits: clocks of machines are not compared. If the owner ran where this one runs, it may be taken as soon
+as its process is gone. What is finished needs no lease, and its turns are removed.
 
 A turn is not taken back from an owner who was silent for too long and goes on: then two compute the same.
 """
@@ -15,6 +16,8 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
 from threading import Event, Thread
 
 from hnerf.errors import InputError, printable
@@ -72,10 +75,13 @@ def _last(bucket: Bucket, name: str) -> tuple[int, bytes]:
 
 
 def _expires(bucket: Bucket, name: str, turn: int, text: bytes) -> bool:
-    """Wait for the owner of a turn; return whether it fell silent."""
+    """Wait for the owner of a turn; return whether it fell silent, or is gone."""
     log.info("waiting for %s, which works on %s", printable(text.decode(errors="replace").partition(" ")[0]), name)
     seen_s = time.monotonic()
     while time.monotonic() - seen_s < EXPIRY_S:
+        if _is_gone(text):
+            log.warning("%s: the process that worked on it is gone; taking over", name)
+            return True
         time.sleep(LOOK_S)
         now = bucket.read_note(_note(name, turn))
         if now is None or now == FREE or bucket.read_note(_note(name, turn + 1)) is not None:
@@ -97,7 +103,22 @@ def _show_life(bucket: Bucket, note: str, ended: Event) -> None:
 
 
 def _text(count: int) -> bytes:
-    return f"{socket.gethostname()}:{os.getpid()} {count}".encode()
+    return f"{socket.gethostname()}:{os.getpid()} {_place()} {count}".encode()
+
+
+def _is_gone(text: bytes) -> bool:
+    """Return whether an owner by its text ran in this place, and does no more. A number that another process has got
+    meanwhile counts as alive."""
+    owner, _, rest = text.decode(errors="replace").partition(" ")
+    number = owner.rpartition(":")[2]
+    return rest.partition(" ")[0] == _place() and number.isdecimal() and not Path(f"/proc/{number}").exists()
+
+
+@cache
+def _place() -> str:
+    """Return what numbers of processes refer to: this start of this machine, and its name space."""
+    boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    return f"{boot}/{os.stat('/proc/self/ns/pid').st_ino}"
 
 
 def _note(name: str, turn: int) -> str:

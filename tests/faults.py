@@ -369,6 +369,8 @@ FAULTS = (
     Fault("archive-manifest", "tasks/packed", " or manifest_name(text) != name", "", "tasks/shared"),
     Fault("note-once", "tasks/bucket", '(name), "xb")', '(name), "wb")'),
     Fault("lease-renewed", "tasks/lease", "if now != text:", "if False:"),
+    Fault("lease-of-the-gone", "tasks/lease", "not Path(f\"/proc/{number}\").exists()", "False"),
+    Fault("lease-any-place", "tasks/lease", "rest.partition(\" \")[0] == _place() and", ""),
     Fault("lease-given-up", "tasks/lease", "if text != FREE and", "if"),
     Fault("shared-another", "tasks/shared", "if list(contents.artifacts) != [name]:", "if False:"),
     Fault("shared-later", "tasks/shared", "if bucket.size_bytes(_object(artifact.name)) is None:", "if False:"),

@@ -1,3 +1,4 @@
+import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -62,6 +63,19 @@ def test_of_many_one_takes_over_from_one_who_died(bucket: Bucket) -> None:
         assert sum(pool.map(take, range(8))) == 1
     assert 0.8 <= held[0] - began_s < 2.0
     assert notes(bucket) == []
+
+
+def test_a_process_that_is_gone_is_not_waited_for_where_it_ran(bucket: Bucket) -> None:
+    """Its number says nothing of another machine, another start of this one, or another container."""
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    host, place, _ = lease._text(0).decode().split()
+    owner = f"{host.rpartition(':')[0]}:{gone.pid}"
+    for where, least_s, most_s in ((place, 0.0, 0.4), (f"{place}0", 0.8, 2.0)):
+        bucket.create_note(f"{NAME}.lease.0", f"{owner} {where} 5".encode())
+        began_s = time.monotonic()
+        with leased(bucket, NAME) as mine:
+            assert mine and least_s <= time.monotonic() - began_s < most_s
 
 
 def test_given_up_work_can_be_taken_at_once(bucket: Bucket) -> None:
