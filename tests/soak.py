@@ -118,7 +118,7 @@ def soak(
         kill_s = started_s + kill_every_s
         while len(done) < len(names) and time.monotonic() - started_s < limit_s:
             time.sleep(POLL_S)
-            note_finished(machines, names, done)
+            note_finished(scratch, names, done)
             restarted = [machine.restarted() for machine in machines]
             restarts += sum(now is not before for now, before in zip(restarted, machines, strict=True))
             machines, at = restarted, random.randrange(MACHINES)
@@ -217,10 +217,11 @@ def set_up(scratch: Path) -> None:
         client.create_deployment_schedules(deployment.id, [(schedule.schedule, True)])
 
 
-def note_finished(machines: list[Machine], names: list[str], done: dict[str, list[str]]) -> None:
-    """Note the people who have an asset and a report on some machine, and the names of these artifacts."""
+def note_finished(scratch: Path, names: list[str], done: dict[str, list[str]]) -> None:
+    """Note the people who have an asset and a report on some machine, or had them on one when it was lost, and the names
+    of these artifacts."""
     for name in names:
-        for links in [machine.disk / "subjects" / name for machine in machines]:
+        for links in scratch.glob(f"*/subjects/{name}"):
             if name not in done and all((links / stage / file).exists() for stage, file in RESULTS.items()):
                 done[name] = [f"{stage}/{Path(os.readlink(links / stage)).name}" for stage in RESULTS]
 
