@@ -218,8 +218,8 @@ def set_up(scratch: Path) -> None:
 
 
 def note_finished(scratch: Path, names: list[str], done: dict[str, list[str]]) -> None:
-    """Note the people who have an asset and a report on some machine, or had them on one when it was lost, and the names
-    of these artifacts."""
+    """Note the people who have an asset and a report on some machine, or on the disk of a lost one, and the names of
+    these artifacts."""
     for name in names:
         for links in scratch.glob(f"*/subjects/{name}"):
             if name not in done and all((links / stage / file).exists() for stage, file in RESULTS.items()):
