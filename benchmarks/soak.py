@@ -15,8 +15,6 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.soak import under_fire
 
-LIMIT_S = 6 * 3600.0
-
 
 def main() -> None:
     """Train, kill, print and write."""
@@ -25,7 +23,7 @@ def main() -> None:
     parser.add_argument("--kill-every", type=float, default=180.0, metavar="S")
     options = parser.parse_args()
     result = provenance() | {"kill_every_s": options.kill_every}
-    result["figures"] = figures = under_fire(options.subjects, options.kill_every, LIMIT_S)
+    result["figures"] = figures = under_fire(options.subjects, options.kill_every)
     before_mib, after_mib = figures["server_mib"]
     kills = ", ".join(f"{count} x {what}" for what, count in figures["kills"].items()) or "none"
     states = ", ".join(f"{count} {state.lower()}" for state, count in figures["runs"].items())
