@@ -21,7 +21,7 @@ class FitReport(TypedDict):
 
     silhouette_iou: with the masks, null without any; beta: shape values by name; keypoint_offsets_m (25, 3): between
     where the detector and the body model place a keypoint; given_poses: how poses that came with the recording were
-    used.
+    used; on_ground: with one camera, whether world height 0 counted as the ground.
     """
 
     seconds: NotRequired[dict[str, float]]
@@ -33,6 +33,7 @@ class FitReport(TypedDict):
     beta: dict[str, float]
     keypoint_offsets_m: list[list[float]]
     given_poses: NotRequired[str]
+    on_ground: NotRequired[bool]
 
 
 class ChosenSetting(TypedDict):

@@ -11,7 +11,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("capture", version="13")
+@stage("capture", version="14")
 def ingest(out: Path, source: Source, settings: CaptureSettings) -> dict[str, float]:
     """Read a recording in any supported layout; undistort and normalise it."""
     capture = ingest_folder(source.root, settings, out)

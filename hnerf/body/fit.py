@@ -50,6 +50,8 @@ KEYPOINT_STEPS = 30  # Levenberg-Marquardt steps at most; it usually converges b
 TIGHT_STD = 0.1
 # Ratio to the cost of a pose a frame: 1.1 to 1.3 by keypoint noise alone, 1.4 if joints sway by a degree, 2.0 by two.
 MAX_SINGLE_POSTURE_COST = 1.5
+KNOWN_STATURE_STD_M = 0.02  # of one that `capture.toml` states: shoes, and how it was measured
+MAX_STATURE_SIGMAS = 1.5  # off what is usual, or stated, beyond which a stature that one camera tells is in doubt
 DISTANCE_BYTES = 2**31
 POOR_IOU, POOR_KEYPOINT_M = 0.75, 0.06  # a frame that is worse than either is flagged
 
@@ -61,6 +63,9 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
     """
     with threadpool_limits(1):  # tensors are so small that threads cost more time than they save
         seconds: dict[str, float] = {}
+        if capture.stature_m:
+            known = {"stature_m": capture.stature_m, "stature_std_m": KNOWN_STATURE_STD_M}
+            settings = settings.model_copy(update=known)
         model, given = body_model(settings), capture.given_poses()
         given_pose = initial_pose_from_given(given, model) if given else None
         observations = (
@@ -72,7 +77,8 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
         up, single = "xyz".index(capture.up), len(observations.cameras) == 1
         hands, step_s = observe_hands(capture), median_step(capture.frames) / capture.fps
         terms: dict[str, Any] = {"limb_depths": observe_limb_depths(capture, observations)}
-        on_ground = single and is_ground(observations.cameras[0], observations.keypoints(0), capture.up)
+        seen = observations.cameras[0], observations.keypoints(0)
+        on_ground = single and is_ground(*seen, capture.up, capture.stature_m)
         terms |= {"balance": Balance(up)} if single else {}
         terms |= {"ground": Ground(up)} if on_ground else {}
         with _timed(seconds, "start"):
@@ -105,6 +111,9 @@ def fit_body(capture: Capture, masks: Masks | None, settings: FitSettings) -> tu
                 pose = fit_fingers(pose, palm.views, problem.scale_m, runs(capture), step_s)
         fit = BodyFit(pose.rig.to(dtype=torch.float32), capture.frames, pose.theta.float(), pose.root.float())
         report = _report(capture, masks, observations, pose, fit, seconds)
+        if single:
+            report["on_ground"] = on_ground
+            _warn_of_stature(report["stature_m"], settings)
         if given_pose:
             report["given_poses"] = given_poses_note(model, capture)
         return fit, report
@@ -255,6 +264,19 @@ def _report(
         "beta": dict(zip(pose.rig.beta_names, pose.rig.beta.tolist(), strict=True)),
         "keypoint_offsets_m": pose.offsets_m.tolist(),
     }
+
+
+def _warn_of_stature(stature_m: float, settings: FitSettings) -> None:
+    """Warn where a single camera makes the person taller or smaller than expected: then it may be that they do not
+    stand on height 0."""
+    off_m = stature_m - settings.stature_m
+    if abs(off_m) > MAX_STATURE_SIGMAS * settings.stature_std_m:
+        log.warning(
+            "the person comes out %.2f m tall, %.2f m expected: do they stand on world height 0, and is the camera's "
+            "height right? State their height as stature_m in capture.toml",
+            stature_m,
+            settings.stature_m,
+        )
 
 
 def _keypoint_residuals_px(observations: Observations, fit: BodyFit) -> np.ndarray:

@@ -13,7 +13,7 @@ from torch import Tensor
 from hnerf.body.articulation import Pose
 from hnerf.body.normal_equations import NormalEquations
 from hnerf.body.robust import geman_mcclure
-from hnerf.capture.standing import STANDING_M, stature_on_ground_m
+from hnerf.capture.standing import is_standing, stature_on_ground_m
 from hnerf.geometry.camera import Camera
 
 LEFT, RIGHT = [19, 20, 21], [22, 23, 24]  # toes and heel of a foot in BODY_25
@@ -24,13 +24,12 @@ EACH_STD_M, EACH_OUTLIER_M = 0.04, 0.05  # the same of either foot, and of one t
 MIN_CAMERA_M = 0.15  # above the ground
 
 
-def is_ground(camera: Camera, keypoints: np.ndarray, up: str) -> bool:
+def is_ground(camera: Camera, keypoints: np.ndarray, up: str, stature_m: float | None) -> bool:
     """Return whether world height 0 can be the ground under a person whom a single camera sees as keypoints (n, 25, 3):
-    it lies below the camera, and who stands there is as tall as people are, if feet and nose are ever seen."""
-    stature_m = stature_on_ground_m(camera, keypoints, up)
-    low, high = STANDING_M
+    it lies below the camera, and who stands there is as tall as the person, or as people are if the stature is not
+    known. Without feet or nose nothing tells."""
     above = camera.centre_m["xyz".index(up)] > MIN_CAMERA_M
-    return bool(above and (np.isnan(stature_m) or low <= stature_m <= high))
+    return bool(above) and is_standing(stature_on_ground_m(camera, keypoints, up), stature_m)
 
 
 @dataclass(frozen=True)

@@ -252,9 +252,9 @@ def _monocular(capture: Capture, keypoints: np.ndarray) -> CalibrationReport:
     )
     camera, raised = capture.cameras[name], ""
     if capture.given_poses() is None:  # which are of the given camera
-        camera, raised = raised_above_ground(camera, keypoints, capture.up, USUAL_HEIGHT_M)
+        camera, raised = raised_above_ground(camera, keypoints, capture.up, capture.stature_m or USUAL_HEIGHT_M)
     reasons = size_reasons(capture, name) + intrinsics_reasons(camera)
-    reasons += [raised] if raised else ground_reasons(camera, keypoints, capture.up)
+    reasons += [raised] if raised else ground_reasons(camera, keypoints, capture.up, capture.stature_m)
     timing = Timing.unknown("one camera")
     verdict = CameraVerdict("refined" if raised else "ok", timing=timing, reasons=tuple(reasons))
     cameras = capture.cameras | {name: camera}

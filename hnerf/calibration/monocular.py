@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from hnerf.capture.standing import STANDING_M, stature_on_ground_m
+from hnerf.capture.standing import is_standing, stature_on_ground_m
 from hnerf.geometry.camera import Camera
 
 FIELD_OF_VIEW_DEG = (10.0, 120.0)  # of the longer side; people are not filmed with lenses beyond this range
@@ -32,16 +32,17 @@ def intrinsics_reasons(camera: Camera) -> list[str]:
     return reasons
 
 
-def ground_reasons(camera: Camera, keypoints: np.ndarray, up: str) -> list[str]:
-    """Return, in words, whether world height 0 can be the ground under a person seen as keypoints (frames, 25, 3)."""
-    stature_m = stature_on_ground_m(camera, keypoints, up)
-    if np.isnan(stature_m):
+def ground_reasons(camera: Camera, keypoints: np.ndarray, up: str, stature_m: float | None) -> list[str]:
+    """Return, in words, whether world height 0 can be the ground under a person of this stature, None if not known,
+    seen as keypoints (frames, 25, 3)."""
+    measured_m = stature_on_ground_m(camera, keypoints, up)
+    if np.isnan(measured_m):
         return ["world height 0 is not the ground: the camera never sees the person's feet and nose above it"]
-    low, high = STANDING_M
-    if low <= stature_m <= high:
-        return [f"standing on world height 0 the person is {stature_m:.2f} m tall: ground and scale can be true"]
+    if is_standing(measured_m, stature_m):
+        return [f"standing on world height 0 the person is {measured_m:.2f} m tall: ground and scale can be true"]
+    known = "" if stature_m is None else f", not {stature_m:.2f} m"
     return [
-        f"standing on world height 0 the person would be {stature_m:.2f} m tall: height 0 is not the ground, "
+        f"standing on world height 0 the person would be {measured_m:.2f} m tall{known}: height 0 is not the ground, "
         "or the translation is not in metres"
     ]
 
@@ -57,5 +58,7 @@ def raised_above_ground(camera: Camera, keypoints: np.ndarray, up: str, stature_
     height_m = stature_m / stature_on_ground_m(by_a_metre, keypoints, up)
     if not np.isfinite(height_m):
         return camera, ""
-    words = f"its height is not known: {height_m:.2f} m if the camera is level and the person {stature_m:.2f} m tall"
+    words = (
+        f"its height is not known: {height_m:.2f} m if the camera is level and the person stands {stature_m:.2f} m tall"
+    )
     return dataclasses.replace(camera, t_m=camera.t_m - height_m * camera.R @ vertical), words

@@ -46,6 +46,7 @@ class Capture:
     of cameras that are not synchronised (hnerf.capture.timing); `stored_frames`: the frames in the files, where some
     were dropped since; `frame_step`: the distance of frame numbers in the recording. `recorded_lenses`: K and
     distortion of the recorded files, of cameras that were undistorted. `subject_point`: None where nobody is named.
+    `stature_m`: the person's, where `capture.toml` states it.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Capture:
     frame_step: int = 1
     recorded_lenses: dict[str, tuple[list[list[float]], list[float]]] = dataclasses.field(default_factory=dict)
     subject_point: SubjectPoint | None = None
+    stature_m: float | None = None
 
     @property
     def frames(self) -> tuple[int, ...]:

@@ -127,6 +127,7 @@ def ingest(folder: Path, settings: CaptureSettings, out: Path, uncalibrated: Unc
         picture_areas_px=areas,
         frame_step=median_step(recorded),
         subject_point=_subject_point(folder, manifest, {name: normalisers[name] for name in cameras.train}, wanted),
+        stature_m=manifest.stature_m,
         recorded_lenses={c: (n.lens.K.tolist(), n.lens.distortion.tolist()) for c, n in normalisers.items() if n.maps},
     )
     capture.save()

@@ -62,6 +62,7 @@ class CaptureManifest(_Table):
     units: Literal["m", "mm"] | Annotated[float, Field(ge=1e-6, le=1e6)] = "m"
     keypoints: KeypointSetName | None = None
     field_of_view_deg: float | None = Field(default=None, ge=10, le=150)
+    stature_m: float | None = Field(default=None, ge=0.5, le=2.5)
     cameras: CameraSplit | None = None
     frames: FrameSplit | None = None
     subject: Any = None

@@ -5,23 +5,33 @@ import numpy as np
 from hnerf.geometry.camera import Camera
 
 STANDING_M = (1.2, 2.1)
-NOSE, SOLES = 0, (19, 21, 22, 24)  # of BODY_25: big toes and heels
-NOSE_SHARE = 0.92  # of an adult's stature (Winter 2009, figure 4.1: eyes at 0.936)
+NEAR_STATURE = (0.85, 1.2)  # the same, relative to a stature that is known
+NOSE, SOLES, ANKLES = 0, (19, 21, 22, 24), (11, 14)  # of BODY_25; soles: big toes and heels
+NOSE_SHARE, ANKLE_SHARE = 0.92, 0.039  # of an adult's stature (Winter 2009, figure 4.1: eyes at 0.936)
+
+
+def is_standing(measured_m: float, stature_m: float | None) -> bool:
+    """Return whether a stature that was measured on height 0 is that of the person, or of any if theirs is not known;
+    False if it is NaN."""
+    low, high = STANDING_M if stature_m is None else (share * stature_m for share in NEAR_STATURE)
+    return low <= measured_m <= high
 
 
 def stature_on_ground_m(camera: Camera, keypoints: np.ndarray, up: str) -> float:
-    """Return the person's stature if they stand on height 0: the median over frames of the nose's height above the
-    standing foot, divided by NOSE_SHARE; NaN if never seen.
+    """Return the person's stature H if they stand on height 0: the median over frames; NaN if never seen.
 
     The standing foot is where a ray to a toe or heel meets height 0 closest to the camera: rays to a lifted foot meet
-    it farther away. keypoints (frames, 25, 3).
+    it farther away. Where no toe or heel is ever seen, ankles stand for them, ANKLE_SHARE of H higher. If the ray to
+    the nose falls r times as steeply as the one to the foot, a camera at height c sees the nose at c - r (c -
+    ANKLE_SHARE H), which is NOSE_SHARE H. keypoints (frames, 25, 3).
     """
     vertical = "xyz".index(up)
     origin = camera.centre_m
-    _, soles = camera.rays(keypoints[:, SOLES, :2])
+    feet, share = (SOLES, 0.0) if (keypoints[:, SOLES, 2] > 0).any() else (ANKLES, ANKLE_SHARE)
+    _, soles = camera.rays(keypoints[:, feet, :2])
     with np.errstate(divide="ignore", invalid="ignore"):
         far_m = -origin[vertical] / soles[..., vertical]
-    far_m = np.where((far_m > 0) & (keypoints[:, SOLES, 2] > 0), far_m, np.inf)
+    far_m = np.where((far_m > 0) & (keypoints[:, feet, 2] > 0), far_m, np.inf)
     nearest = far_m.argmin(1)
     frames = np.flatnonzero(np.isfinite(far_m.min(1)) & (keypoints[:, NOSE, 2] > 0))
     if len(frames) == 0:
@@ -31,4 +41,5 @@ def stature_on_ground_m(camera: Camera, keypoints: np.ndarray, up: str) -> float
     level = [axis for axis in range(3) if axis != vertical]
     away_m = foot_m - origin
     along_m = (away_m[:, level] * noses[:, level]).sum(1) / (noses[:, level] ** 2).sum(1)
-    return float(np.median(origin[vertical] + along_m * noses[:, vertical])) / NOSE_SHARE
+    fall = -along_m * noses[:, vertical] / origin[vertical]
+    return float(np.median(origin[vertical] * (1 - fall) / (NOSE_SHARE - share * fall)))

@@ -26,12 +26,12 @@ def test_the_centre_of_mass_is_above_the_feet_of_who_stands_upright() -> None:
 def test_five_centimetres_off_balance_cost_a_half_less_what_fades() -> None:
     """A trunk moved forwards so that the centre of mass moves by 5 cm costs 0.5 / (1 + 1/9). Upwards costs nothing; far
     off costs nearly 0.5 x 9."""
-    balance, x = Balance(up=2), torch.zeros(1, 25, 3, dtype=torch.float64)
-    jacobian = torch.zeros(1, 25, 3, 9, dtype=torch.float64)
-    for axis, far, cost in ((0, 0.05, 0.45), (1, 0.05, 0.45), (2, 0.05, 0.0), (0, 5.0, 4.5 / (1 + 9e-4))):
-        moved = x.clone()
-        moved[0, [1, 8], axis] = far / 0.578
-        assert math.isclose(balance.add(NormalEquations(1, 9, 0), moved, jacobian), cost, abs_tol=1e-9)
+    x, jacobian = (torch.zeros(1, 25, 3, *more, dtype=torch.float64) for more in ((), (9,)))
+    for up, level in ((2, 1), (1, 2)):
+        for axis, far, cost in ((0, 0.05, 0.45), (level, 0.05, 0.45), (up, 0.05, 0.0), (0, 5.0, 4.5 / (1 + 9e-4))):
+            moved = x.clone()
+            moved[0, [1, 8], axis] = far / 0.578
+            assert math.isclose(Balance(up).add(NormalEquations(1, 9, 0), moved, jacobian), cost, abs_tol=1e-9)
 
 
 def test_the_gradient_of_balance_is_that_of_its_cost() -> None:

@@ -201,6 +201,20 @@ def test_a_sole_is_as_thick_as_the_mask_reaches_below_the_foot() -> None:
     np.testing.assert_allclose([sole_to(150), sole_to(200)], [0, 0.05], rtol=1e-6)
 
 
+def test_a_sole_is_below_the_vertex_that_is_lowest_in_the_picture() -> None:
+    """Of two vertices on the ground, 3 m and 2.8 m away, the nearer is lower: row 127.5 + 281.6 / 2.8 = 228.07, in
+    either order. The mask ends at row 234.5."""
+    camera, mask = ring_camera("a", 0.0), np.zeros((256, 256), bool)
+    mask[20:235, 20:236] = True
+    foot = np.array([[0, 0, 0.0], [0.2, 0, 0.005]])
+    for order in (foot, foot[::-1]):
+        rows = camera.project(order)[0][:, 1]
+        np.testing.assert_allclose(
+            _sole_m(camera, outline(mask, 1.0), 0.005, order, 2), (234.5 - rows.max()) * 0.005, rtol=1e-3
+        )
+        assert abs(rows.max() - rows.min()) > 5
+
+
 def test_a_foot_beyond_the_picture_has_no_sole() -> None:
     """As above, the foot is in row 156.16: 0.84, 1.84 and 2.84 px above the last row of three pictures."""
     foot, mask = np.array([[0, 0, 0.7]]), np.ones((256, 256), bool)

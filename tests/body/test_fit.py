@@ -8,7 +8,15 @@ import torch
 from hnerf.body import contour_fit
 from hnerf.body.articulation import Articulation, Pose
 from hnerf.body.body_model import body_model
-from hnerf.body.fit import _outlines, _report, fit_body, initial_pose, make_problem, resolve_depth_flips
+from hnerf.body.fit import (
+    _outlines,
+    _report,
+    _warn_of_stature,
+    fit_body,
+    initial_pose,
+    make_problem,
+    resolve_depth_flips,
+)
 from hnerf.body.fit_result import BodyFit
 from hnerf.body.ground import Ground
 from hnerf.body.keypoint_fit import FitPriors, Problem, levenberg_marquardt, metres_per_pixel
@@ -86,6 +94,25 @@ def test_one_camera_finds_the_stature_where_height_0_is_not_the_ground(tmp_path:
     below = capture.with_cameras({n: replace(c, t_m=c.t_m + c.R @ [0, 0, 0.7]) for n, c in capture.cameras.items()})
     _, report = fit_body(below, None, FitSettings())
     assert 1.6 < report["stature_m"] < 2.0  # as the prior has it
+
+
+def test_a_stature_that_is_stated_wins_over_the_usual_one(tmp_path: Path) -> None:
+    """Somebody of 1.83 m is taken for a child of 1.4 m, nearer to the camera, if `capture.toml` says so: on height 0 he
+    would be 1.3 times as tall."""
+    capture = replace(record(tmp_path, moving_body((0, 1)), RING, ("0",)), stature_m=1.4)
+    _, report = fit_body(capture, None, FitSettings())
+    assert not report["on_ground"] and abs(report["stature_m"] - 1.4) < 0.05
+
+
+def test_a_stature_that_one_camera_tells_is_doubted_beyond_one_and_a_half_standard_deviations(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """1.72 m + 1.5 x 8 cm are 1.84 m."""
+    settings = FitSettings(stature_m=1.72, stature_std_m=0.08)
+    for stature_m, words in ((1.83, ""), (1.61, ""), (1.85, "1.85 m tall, 1.72 m expected")):
+        caplog.clear()
+        _warn_of_stature(stature_m, settings)
+        assert words in caplog.text and bool(words) == bool(caplog.text)
 
 
 def test_before_one_camera_somebody_stands_on_his_soles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

