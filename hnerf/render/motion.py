@@ -28,6 +28,7 @@ from hnerf.render.bvh_motion import bvh_motion
 AMASS_WIDTHS = (72, 156, 165)  # pose parameters of SMPL, SMPL-H and SMPL-X, which share their first 22 joints
 AMASS_RATES = ("mocap_framerate", "mocap_frame_rate")
 BODY_JOINTS = 22
+HIPS = ("upperleg01.L", "upperleg01.R")
 DEFAULT_FPS = 30.0  # of AMASS files without a rate
 BELOW_FLOOR = 0.05  # share of a motion's frames with a foot below its floor, by errors
 MAX_MOTION_BYTES = 256_000_000  # unpacked; half an hour of SMPL-H at 100 poses a second
@@ -90,10 +91,11 @@ def select_poses(body: BodyFit, frames: tuple[int, ...]) -> BodyFit:
 def retarget(own: BodyFit, motion: Motion, up: str) -> BodyFit:
     """Return the motion's poses on the rig of `own`, with the rotations of joints matched by name.
 
-    The motion is moved so that its mean pelvis position coincides with that of `own`, and its floor, which 5 % of its
-    frames reach below, with that of `own`, the median of its lowest points, on which the asset stands. In each frame
-    the lowest point keeps the height above the floor that it had on the motion's own body. `up`: the vertical axis of
-    the world of `own`. Raises InputError if the motion lacks a joint.
+    The middle of the hips goes the way that it goes on the motion's own body, unscaled, so that legs which stand keep
+    standing while the trunk bends. It is moved so that its mean position coincides with that of `own`, and the motion's
+    floor, which 5 % of its frames reach below, with that of `own`, the median of its lowest points, on which the asset
+    stands. In each frame the lowest point keeps the height above the floor that it had on the motion's own body. `up`:
+    the vertical axis of the world of `own`. Raises InputError if the motion lacks a joint.
     """
     other, names = motion.body, motion.body.rig.joint_names
     theta = torch.zeros(len(other.frames), len(own.rig.joint_names), 3)
@@ -106,10 +108,12 @@ def retarget(own: BodyFit, motion: Motion, up: str) -> BodyFit:
     turn = torch.eye(4)
     turn[:3, :3] = _rotation_between_up_axes(motion.up, up)
     placed = BodyFit(own.rig, other.frames, theta, turn @ other.root)
-    apart_m = _pelvis_m(own).mean(0) - _pelvis_m(placed).mean(0)
+    hips_m = _hips_m(other) @ turn[:3, :3].T  # rigs have them at other places in the body frame, which pitches
+    hips_m += _hips_m(own).mean(0) - hips_m.mean(0)
+    placed = _translated(placed, hips_m - _hips_m(placed))
     lowest_m = lowest_points_m(other, motion.up)
     above_floor_m = lowest_m - lowest_m.quantile(BELOW_FLOOR)  # of a motion that may be in the air half of the time
-    return set_lowest_points(_translated(placed, apart_m), above_floor_m + lowest_points_m(own, up).quantile(0.5), up)
+    return set_lowest_points(placed, above_floor_m + lowest_points_m(own, up).quantile(0.5), up)
 
 
 def interpolate_poses(body: BodyFit, first: int, last: int, count: int) -> BodyFit:
@@ -145,8 +149,10 @@ def _translated(body: BodyFit, move_m: Tensor) -> BodyFit:
     return dataclasses.replace(body, root=root)
 
 
-def _pelvis_m(body: BodyFit) -> Tensor:
-    return joint_transforms(body.rig, body.theta, body.root)[:, 0, :3, 3]
+def _hips_m(body: BodyFit) -> Tensor:
+    """Return the middle of the hip joints, (n, 3), in the world; the root joint of a rig without legs."""
+    hips = [j for j, name in enumerate(body.rig.joint_names) if name in HIPS] or [0]
+    return joint_transforms(body.rig, body.theta, body.root)[:, hips, :3, 3].mean(1)
 
 
 def _rotation_between_up_axes(from_up: str, to_up: str) -> Tensor:

@@ -13,6 +13,7 @@ from hnerf.body.fit_result import BodyFit
 from hnerf.body.rig import joint_transforms
 from hnerf.errors import InputError
 from hnerf.render.motion import (
+    HIPS,
     Motion,
     _read_amass,
     _rotation_between_up_axes,
@@ -63,6 +64,29 @@ def test_another_motion_stands_where_this_body_stood(up: str) -> None:
     torch.testing.assert_close(found.root[:, :2, 3], torch.tensor([[0.0, 2], [1, 2]]))
     torch.testing.assert_close(found.root[:, :3, :3], torch.eye(3).repeat(2, 1, 1))
     assert found.rig is own.rig
+
+
+@pytest.mark.parametrize("up", ["z", "y"])
+def test_a_trunk_that_pitches_leaves_the_hips_where_they_are(up: str) -> None:
+    """The hip is 1.6 m above the origin of the other's body frame, and 0.8 m above that of `own`. As the other lies
+    down by a quarter turn about x, from (0, 0, 1.6) to (0, -1.6, 0), its frame goes by (0, 1.6, 1.6), so that the hip
+    stays."""
+    own, other = (
+        dataclasses.replace(body, rig=dataclasses.replace(body.rig, joint_names=(*body.rig.joint_names[:-1], HIPS[0])))
+        for body in (bending_body(), giant())
+    )
+    other.root[1, :3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    other.root[:, :3, 3] = torch.tensor([[10.0, 0, 5], [10, 1.6, 6.6]])
+    found = retarget(own, Motion(other if up == "z" else in_y_up(other), 10.0, up), "z")
+    hip_m = joint_transforms(found.rig, found.theta, found.root)[:, 1, :3, 3]
+    torch.testing.assert_close(hip_m[:, :2], torch.tensor([[0.5, 2], [0.5, 2]]))
+
+
+def test_the_motion_of_the_same_body_is_as_it_was() -> None:
+    """Its lowest points are all at 0.5 m, so that floor and median are one."""
+    own = bending_body()
+    own.rig.joints_m[0, 2] = 0.3
+    torch.testing.assert_close(retarget(own, Motion(own, 10.0, "z"), "z").root, own.root)
 
 
 def test_up_becomes_up() -> None:
