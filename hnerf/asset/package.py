@@ -100,7 +100,7 @@ def write_package(out: Path, avatars: Avatars, cameras: Iterable[Camera], fps: f
 def write_usdz(path: Path, avatars: Avatars, cameras: Iterable[Camera], fps: float, info: AssetInfo) -> None:
     """Write `avatar.usdz`: the same prims and variants as the package in a single layer, and the texture."""
     with tempfile.TemporaryDirectory() as folder:
-        stage = _new_stage(Path(folder) / "avatar.usdc", avatars, next(iter(avatars.values())).frames, fps, info)
+        stage = _new_stage(Path(folder) / "avatar.usdc", avatars, _time_range(avatars, CAPTURED, fps), fps, info)
         for part in _parts(avatars, list(cameras), fps):
             with _in_variant(stage, part.topology), _in_variant(stage, part.variant):
                 part.author(stage)
@@ -219,14 +219,22 @@ def _select(stage: Usd.Stage, avatars: Avatars, motion: str) -> None:
 def _write_interface(file: Path, parts: list[Part], avatars: Avatars, fps: float, info: AssetInfo, motion: str) -> None:
     """Write an interface layer whose time codes have a rate, with that motion selected. It has payloads of its own:
     time codes that are scaled twice are not whole, and importers that hold samples would be a frame late."""
-    codes = next(iter(avatars.values())).rigs[FULL].motions[motion].codes
-    stage = _new_stage(file, avatars, codes, fps, info)
+    stage = _new_stage(file, avatars, _time_range(avatars, motion, fps), fps, info)
     for part in parts:
         path = f"./{PAYLOADS}/{part.name}.usdc"
         with _in_variant(stage, part.topology), _in_variant(stage, part.variant):
             stage.GetDefaultPrim().GetPayloads().AddPayload(path)
     _select(stage, avatars, motion)
     stage.GetRootLayer().Save()
+
+
+def _time_range(avatars: Avatars, selected: str, fps: float) -> np.ndarray:
+    """Return the first and the last time code of a captured motion, (2,); the last of further motions where these last
+    longer, since a stage has one range for all of its variants."""
+    motions = next(iter(avatars.values())).rigs[FULL].motions
+    ends = [m.codes[-1] / m.fps * fps for name, m in motions.items() if not name.startswith(CAPTURED)]
+    first, last = motions[selected].codes[[0, -1]]
+    return np.array([first, max([last, *(np.ceil(end - 1e-6) for end in ends)])])
 
 
 def _new_stage(file: Path, avatars: Avatars, codes: np.ndarray, fps: float, info: AssetInfo) -> Usd.Stage:

@@ -1,7 +1,7 @@
 """The clothed avatar in the axes of asset formats: right-handed, Y up, metres; shared by all writers."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -168,11 +168,13 @@ def stage_from_world(up: str) -> np.ndarray:
 def _motions(
     clothed: BodyFit, fps: float, weights: np.ndarray, further: Mapping[str, tuple[BodyFit, float]], world: np.ndarray
 ) -> dict[str, Motion]:
-    """Return the captured motion, first, that motion at other rates, and further ones without blend shapes."""
+    """Return the captured motion, first, that motion at other rates, and further ones without blend shapes, which begin
+    at its first instant."""
     captured = motion_of(clothed, fps, weights, world)
     motions = {CAPTURED: captured, **{f"{CAPTURED}_{rate}": resampled(captured, rate) for rate in RATES}}
     for name, (body, rate) in further.items():
-        motions[name] = motion_of(body, rate, np.zeros((len(body.frames), weights.shape[1]), np.float32), world)
+        motion = motion_of(body, rate, np.zeros((len(body.frames), weights.shape[1]), np.float32), world)
+        motions[name] = replace(motion, codes=motion.codes - motion.codes[0] + captured.seconds[0] * rate)
     return motions
 
 

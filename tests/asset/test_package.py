@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 from pxr import Ar, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
+from hnerf.asset.correctives import correctives_of
 from hnerf.asset.dome import dome
 from hnerf.asset.package import AssetInfo, write_cache, write_package, write_usdz
 from hnerf.asset.quads import polygon_corners
 from hnerf.asset.srgb import to_linear
-from hnerf.asset.staging import StagedAvatar
+from hnerf.asset.staging import StagedAvatar, stage_avatar
+from hnerf.asset.texture import unwrap
 from hnerf.asset.validation import each_variant
 from hnerf.body.descriptor import normals_of
-from tests.asset.figure import FRAMES, side_camera
+from hnerf.body.fit_result import BodyFit
+from tests.asset.figure import FRAMES, bending_body, side_camera
 
 INFO = AssetInfo("column", "7", "CC0-1.0", "0123abcd")
 
@@ -254,6 +257,27 @@ def test_an_interface_at_another_rate_has_whole_time_codes(rate: int, package: P
     assert motion.GetRotationsAttr().GetTimeSamples() == codes.tolist()
     # 0.5 s, the capture's frame 5, is in the middle of both.
     np.testing.assert_allclose(skinned_points(stage, rate / 2), staged.points_m[2], atol=1e-5)
+
+
+def test_further_motions_begin_with_the_captured_one_and_none_is_cut_off(tmp_path: Path) -> None:
+    """Captured are 0.3 to 0.8 s. 31 poses at 20 a second, whatever their numbers, take 1.5 s: from 0.3 to 1.8 s, which
+    are codes 3 to 18 at 10 a second, and 7.2 to 43.2 at 24."""
+    body = bending_body()
+    rows = [0] * 31
+    dance = BodyFit(body.rig, tuple(range(7, 38)), body.theta[rows], body.root[rows])
+    none = correctives_of(np.zeros((4, len(body.rig.vertices_m), 3), np.float32), 0)
+    layout = unwrap(body.rig.vertices_m.numpy(), body.rig.faces.numpy(), 64)
+    texture, further = np.zeros((64, 64, 3), np.uint8), {"dance": (dance, 20.0)}
+    staged = stage_avatar(body, body.vertices_m().numpy(), none, layout, texture, "z", 10.0, further=further)
+    write_all(tmp_path, staged)
+    ranges = {"avatar.usda": (3, 18), "avatar.usdz": (3, 18), "avatar_24.usda": (8, 44), "avatar_cache.usdz": (3, 8)}
+    for name, expected in ranges.items():
+        stage = Usd.Stage.Open(str(tmp_path / name))
+        assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == expected, name
+    stage = Usd.Stage.Open(str(tmp_path / "avatar.usda"))
+    stage.GetDefaultPrim().GetVariantSet("motion").SetVariantSelection("dance")
+    motion = UsdSkel.Animation(stage.GetPrimAtPath("/Avatar/Body/Motion/full"))
+    np.testing.assert_allclose(motion.GetRotationsAttr().GetTimeSamples(), np.arange(3, 18.1, 0.5), atol=1e-9)
 
 
 def test_packaging_finds_every_file_and_is_silent(
