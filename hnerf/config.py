@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
 
 from hnerf.errors import InputError
-from hnerf.strict_yaml import MAX_DEPTH, parse_yaml
+from hnerf.strict_yaml import MAX_DEPTH, parse_yaml, parse_yaml_strings
 
 S = TypeVar("S", bound=BaseModel)
 
@@ -342,11 +342,22 @@ def overridden(settings: S, overrides: Sequence[str]) -> S:
         parts = key.split(".")
         if len(parts) > MAX_DEPTH:
             raise InputError(f"--set {key}: no such key; `hnerf settings` lists them")
+        if change is not None and _is_text(settings, parts):
+            change = parse_yaml_strings(value)  # "1.10" is a version, and "03" a camera
         for part in reversed(parts):
             change = {part: change}
         tree = _merged(tree, change)
     message = " ".join(f"--set {override}" for override in overrides)
     return validated(type(settings), tree, message) if overrides else settings
+
+
+def _is_text(settings: BaseModel, key: Sequence[str]) -> bool:
+    """Return whether the setting with this key, section by section, takes any text."""
+    section: object = settings
+    for part in key[:-1]:
+        section = dict(section).get(part) if isinstance(section, BaseModel) else None
+    field = type(section).model_fields.get(key[-1]) if isinstance(section, BaseModel) else None
+    return field is not None and field.annotation in (str, str | None)
 
 
 def with_changes(settings: Settings, path: Path) -> Settings:

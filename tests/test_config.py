@@ -98,6 +98,15 @@ def test_an_override_that_is_no_yaml_is_one_line() -> None:
         load_settings("fast", ["training.steps=[100"])
 
 
+@pytest.mark.parametrize(
+    ("value", "text"), [("2", "2"), ("1.10", "1.10"), ("2025-01-02", "2025-01-02"), ("'1'", "1"), ("two b", "two b")]
+)
+def test_text_that_reads_like_a_number_or_a_day_is_text(value: str, text: str) -> None:
+    settings = load_settings("fast", [f"asset.version={value}", f"evaluation.holdout={value}"])
+    assert (settings.asset.version, settings.evaluation.holdout) == (text, text)
+    assert load_settings("fast", ["evaluation.holdout=null"]).evaluation.holdout is None
+
+
 def test_an_override_of_endless_depth_is_one_line() -> None:
     key = ".".join(["x"] * 3000)
     with pytest.raises(InputError, match=r"^--set x\.x.*no such key; `hnerf settings` lists them"):
