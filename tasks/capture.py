@@ -6,7 +6,7 @@ from hnerf.capture.capture import Capture
 from hnerf.capture.ingest import ingest as ingest_folder
 from hnerf.capture.subset import subset
 from hnerf.config import CaptureSettings
-from tasks.source import Source
+from tasks.source import Source, require_unchanged
 from tasks.stage import stage
 from tasks.store import Artifact
 
@@ -15,6 +15,7 @@ from tasks.store import Artifact
 def ingest(out: Path, source: Source, settings: CaptureSettings) -> dict[str, float]:
     """Read a recording in any supported layout; undistort and normalise it."""
     capture = ingest_folder(source.root, settings, out)
+    require_unchanged(source)
     return {"cameras": len(capture.cameras), "frames": len(capture.frames)}
 
 

@@ -22,12 +22,13 @@ def place(given: Path | str) -> Path | str:
 
 
 class Source(BaseModel):
-    """Part of the capture folder `root`. name: the folder's own; digest: SHA-256 of the part's file names and bytes,
-    wherever the folder lies."""
+    """Part of the capture folder `root`: the recording, or its ground truth. name: the folder's own; digest: SHA-256 of
+    the part's file names and bytes, wherever the folder lies."""
 
     root: Path
     name: str
     digest: str
+    is_truth: bool = False
 
 
 def read_capture(folder: Path, store: Path | None = None) -> tuple[Source, Source]:
@@ -48,20 +49,19 @@ def read_capture(folder: Path, store: Path | None = None) -> tuple[Source, Sourc
         raise InputError(f"{shown}: the folder's name is not UTF-8; rename it")
     if "\n" in shown:
         raise InputError(f"{shown}: the folder's name has a line break; rename it")
-    truth = folder / GROUND_TRUTH
-    files = capture_files(folder)
-    parts = [f for f in files if not f.is_relative_to(truth)], [f for f in files if f.is_relative_to(truth)]
-    beside = folder.parent if folder.is_file() else folder
-    recorded, known = (Source(root=folder, name=folder.name, digest=_digest(beside, part)) for part in parts)
-    return recorded, known
+    recording, truth = _parts(folder)
+    return (
+        Source(root=folder, name=folder.name, digest=_digest(folder, recording)),
+        Source(root=folder, name=folder.name, digest=_digest(folder, truth), is_truth=True),
+    )
 
 
-def require_unchanged(truth: Source) -> None:
-    """Raise InputError unless the files of a ground truth are still those of its digest: what was read of others must
-    not be found under that key again."""
-    folder = truth.root / GROUND_TRUTH
-    files = [f for f in capture_files(truth.root) if f.is_relative_to(folder)] if truth.root.exists() else []
-    if _digest(truth.root, files) != truth.digest:
+def require_unchanged(source: Source) -> None:
+    """Raise InputError unless the files of a recording or a ground truth are still those of its digest: what was read
+    of others must not be found under that key again."""
+    files = _parts(source.root)[source.is_truth] if source.root.exists() else []
+    if _digest(source.root, files) != source.digest:
+        folder = source.root / GROUND_TRUTH if source.is_truth else source.root
         raise InputError(f"{folder}: changed or moved since the command started; run the same command again")
 
 
@@ -87,8 +87,15 @@ def entries(folder: Path | str, hidden: bool = False) -> Iterator["os.DirEntry[s
         yield from (entry for entry in shown if entry.is_symlink() or entry.is_file(follow_symlinks=False))
 
 
+def _parts(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Return the files of the recording in a capture folder, and those of its ground truth."""
+    files, truth = capture_files(folder), folder / GROUND_TRUTH
+    return [f for f in files if not f.is_relative_to(truth)], [f for f in files if f.is_relative_to(truth)]
+
+
 def _digest(folder: Path, files: Iterable[Path]) -> str:
     listing = hashlib.sha256()
+    beside = folder.parent if folder.is_file() else folder
     for path in files:
         try:
             if path.lstat().st_size > MAX_FILE_BYTES:
@@ -96,7 +103,7 @@ def _digest(folder: Path, files: Iterable[Path]) -> str:
             content = os.readlink(path) if path.is_symlink() else sha256_of(path)
         except OSError as error:
             _refuse(error, path)
-        line = f"{content} {path.relative_to(folder)}"
+        line = f"{content} {path.relative_to(beside)}"
         if "\n" in line:  # or two folders could have one digest
             raise InputError(f"{path}: has a line break in its name, or in what it links to; rename it")
         listing.update(os.fsencode(f"{line}\n"))

@@ -77,9 +77,19 @@ def test_a_ground_truth_that_changed_meanwhile_is_refused(folder: Path, change: 
         require_unchanged(truth)
 
 
-def test_no_ground_truth_stays_none(tmp_path: Path) -> None:
+def test_a_recording_that_changed_meanwhile_is_refused(folder: Path) -> None:
+    recorded, _ = read_capture(folder)
+    (folder / "ground_truth" / "mesh.ply").write_text("not part of it")
+    require_unchanged(recorded)
+    (folder / "images" / "0.jpg").write_bytes(b"others")
+    with pytest.raises(InputError, match="ada: changed or moved since the command started; run the same"):
+        require_unchanged(recorded)
+
+
+def test_one_video_and_no_ground_truth_stay_so(tmp_path: Path) -> None:
     (tmp_path / "clip.mp4").write_bytes(b"pixels")
-    require_unchanged(read_capture(tmp_path / "clip.mp4")[1])
+    for part in read_capture(tmp_path / "clip.mp4"):
+        require_unchanged(part)
 
 
 @pytest.mark.parametrize("change", ["bytes", "name", "new", "gone", "link"])
