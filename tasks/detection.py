@@ -13,7 +13,7 @@ from tasks.stage import stage
 from tasks.store import Artifact
 
 
-@stage("detection", version="4", resumable=True)
+@stage("detection", version="5", resumable=True)
 def detect(out: Path, recording: Artifact, source: str | None, size: str) -> dict[str, float]:
     """Write the recording with keypoints of its training cameras; resume after the cameras that an interrupted run
     finished. source, size: of DetectionSettings, whose other fields would not change the result."""
@@ -22,7 +22,7 @@ def detect(out: Path, recording: Artifact, source: str | None, size: str) -> dic
         report = detect_people(Capture.load(recording.root), settings, out)
     except BrokenProcessPool as error:
         raise LostWorkerError(f"a detection process ended: {error}") from error
-    return {"slowest_ms": max(camera["ms"] for camera in report["cameras"].values())}
+    return {"slowest_ms": max(report["ms"].values())} if report["ms"] else {}
 
 
 def needs_detection(recording: Artifact, settings: DetectionSettings) -> bool:

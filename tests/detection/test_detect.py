@@ -84,6 +84,16 @@ def test_cameras_that_are_done_are_not_looked_at_again(recording: Capture, tmp_p
     assert MadeUp.seen == 5
 
 
+def test_people_found_again_are_the_same_files_however_long_it_took(recording: Capture, tmp_path: Path) -> None:
+    first, second = (detect(recording, NETWORK, tmp_path / name) for name in "ab")
+    assert first["ms"].keys() == {"01"} and first["ms"] != second["ms"]
+    one, other = (
+        {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+        for root in (tmp_path / "a", tmp_path / "b")
+    )
+    assert "detection.json" in one and "landmarks/01.npz" in one and one == other
+
+
 def test_nobody_is_one_line(recording: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "LandmarkNetwork", lambda size: lambda image, region: None)
     with pytest.raises(InputError, match="folder: nobody found in any image of the training cameras; "):
