@@ -37,7 +37,8 @@ class Stage(Generic[P]):
     work through the same store, without a server.
 
     networks: files of hnerf.models that the stage uses if they are installed; the key depends on which ones are.
-    shared: through the bucket, if there is one; checkpoint: the file of unfinished work that is shared there, too.
+    shared: through the bucket, if there is one; checkpoint: the file of unfinished work that is shared there, too, and
+    is no part of the artifact.
     """
 
     write: Write[P]
@@ -82,7 +83,7 @@ class Stage(Generic[P]):
 
         def compute() -> Artifact:
             return store.get_or_compute(
-                self.name, key, lambda out: self._write_in_time(out, given), self.resumable, names
+                self.name, key, lambda out: self._write_in_time(out, given), self.resumable, names, self.checkpoint
             )
 
         bucket = Bucket.configured() if self.shared else None

@@ -127,12 +127,15 @@ class Store:
         write: Callable[[Path], dict[str, float]],
         resumable: bool = False,
         inputs: Iterable[str] = (),
+        checkpoint: str = "",
     ) -> Artifact:
         """Return the stored artifact, or compute it by `write(folder)`, which returns its metrics.
 
         If several callers want the same artifact, one computes it and the others wait. The folder of a resumable stage
         survives a crash, and the next call resumes in it; any other starts empty. Links that lie in the way are not
-        followed. A store that has the artifact may be read-only. inputs: names of the artifacts that `write` reads.
+        followed. A store that has the artifact may be read-only. inputs: names of the artifacts that `write` reads;
+        checkpoint: what begins with this name in the folder is no part of the artifact, and stays until that is
+        recorded.
         """
         if found := self.find(stage, key):
             return found
@@ -154,8 +157,9 @@ class Store:
                     shutil.rmtree(partial)
                 raise
             pin(self.root, f"{stage}/{key}")
-            return self.commit(Artifact(stage=stage, root=self.path(stage, key), files={}, metrics=metrics,
-                                        inputs=tuple(sorted(set(inputs)))))  # fmt: skip
+            made = Artifact(stage=stage, root=self.path(stage, key), files={}, metrics=metrics,
+                            inputs=tuple(sorted(set(inputs))))  # fmt: skip
+            return self.commit(made, checkpoint)
 
     def link_latest(self, subject: str, artifact: Artifact) -> Artifact:
         """Point `<store>/subjects/<subject>/<stage>` at the artifact; return it."""
@@ -249,28 +253,31 @@ class Store:
             finally:
                 remove(folder)
 
-    def commit(self, artifact: Artifact) -> Artifact:
-        """Record the files in the artifact's `.partial` folder, and put them in place; its lock must be held."""
+    def commit(self, artifact: Artifact, checkpoint: str = "") -> Artifact:
+        """Record the files in the artifact's `.partial` folder, and put them in place; its lock must be held. What
+        begins with the name `checkpoint` is deleted last."""
         stage, key = artifact.stage, artifact.root.name
         partial, folder, record = (self.path(stage, key, suffix) for suffix in (".partial", "", ".json"))
-        paths = sorted(partial.rglob("*"))
+        kept = set(partial.glob(f"{checkpoint}*")) if checkpoint else set()
+        paths = sorted(set(partial.rglob("*")) - kept)
         sizes_bytes = {path: _flush(path) for path in [partial, *paths]}
         files = {
             str(path.relative_to(partial)): StoredFile(sha256=sha256_of(path), size_bytes=sizes_bytes[path])
             for path in paths
             if path.is_file()
         }
-        record.unlink(missing_ok=True)
-        remove(folder)
-        os.replace(partial, folder)
-        _flush(folder.parent)
         artifact = artifact.model_copy(update={"files": files})
         beside = self.path(stage, key, ".json.partial")
         beside.unlink(missing_ok=True)
         with beside.open("x") as file:
             file.write(artifact.model_dump_json(indent=1, exclude={"root"}))
         _flush(beside)
+        remove(folder)
+        # The record comes first: a process that is killed before the folder is in place leaves work that resumes.
         os.replace(beside, record)
+        os.replace(partial, folder)
+        for path in kept:
+            (folder / path.name).unlink()
         _flush(folder.parent)
         return artifact
 

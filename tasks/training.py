@@ -8,7 +8,7 @@ import torch
 from hnerf.avatar.avatar import Avatar
 from hnerf.avatar.trained import load_avatar
 from hnerf.config import TrainingSettings
-from hnerf.training.checkpoint import NAME, remove_checkpoint
+from hnerf.training.checkpoint import NAME
 from tasks.launcher import run_ranks
 from tasks.stage import stage
 from tasks.store import Artifact
@@ -28,7 +28,6 @@ def train(
     processes = settings.processes or max(1, torch.cuda.device_count())
     run_ranks("hnerf.training.run", [*inputs, settings.model_dump_json(), str(out)], processes)
     report = json.loads((out / "report.json").read_text())
-    remove_checkpoint(out)
     return {name: report[name] for name in ("steps", "seconds", "peak_memory_gib", "model_mib")}
 
 

@@ -48,12 +48,6 @@ def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
     os.replace(beside, folder / NAME)
 
 
-def remove_checkpoint(folder: Path) -> None:
-    """Delete the checkpoint, and what an interrupted write left, once the final files have been written."""
-    for path in folder.glob(f"{NAME}*"):
-        path.unlink()
-
-
 def load_checkpoint(folder: Path, device: torch.device, key: str) -> dict[str, Any] | None:
     """Load the last checkpoint of the training with this key; None, with a warning where there is one, if it cannot be
     read or is of another training. The next write replaces it."""

@@ -343,7 +343,7 @@ def train(
     writes none.
 
     The last checkpoint is kept, so that a training stopped while writing its files need only write them again; the
-    caller calls `remove_checkpoint`. Raises TrainingError if the surface collapses or the losses stay non-finite.
+    caller deletes it. Raises TrainingError if the surface collapses or the losses stay non-finite.
     """
     return Trainer(capture, masks, body, settings, out, processes or Distributed.join()).run()
 

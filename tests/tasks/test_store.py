@@ -12,7 +12,7 @@ from unittest.mock import Mock
 import pytest
 
 from hnerf.errors import InputError
-from tasks.store import RECORDING, Store, recording_digest, remove, require_intact
+from tasks.store import RECORDING, Artifact, Store, recording_digest, remove, require_intact
 
 # Not forked: a child would inherit Prefect's threads half-way.
 SPAWN = multiprocessing.get_context("spawn")
@@ -91,6 +91,32 @@ def test_resumable_stage_goes_on_where_it_was(tmp_path: Path) -> None:
     )
     assert artifact.metrics == {"resumed": 1.0}
     assert list(artifact.files) == ["deep/letters"]
+
+
+@pytest.mark.parametrize("done", [0, 1, 2])
+def test_finished_work_that_could_not_be_recorded_resumes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: int
+) -> None:
+    """Let the disk be full, or the process killed, before the use is noted, before the record and before the folder
+    get their names."""
+
+    def work(out: Path) -> dict[str, float]:
+        resumed = (out / "checkpoint.pt").exists()
+        for name in ("checkpoint.pt", "checkpoint.pt.tmp", "model"):
+            (out / name).write_text("abc")
+        return {"resumed": float(resumed)}
+
+    def compute() -> Artifact:
+        return Store(tmp_path).get_or_compute("training", "k", work, resumable=True, checkpoint="checkpoint.pt")
+
+    renames = [*done * [Path.rename], Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))]
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
+        patch.setattr(os, "replace", lambda *ends: renames.pop(0)(*ends))
+        compute()
+    assert renames == []
+    made = compute()
+    assert made.metrics == {"resumed": 1.0} and list(made.files) == ["model"]
+    assert [path.name for path in made.root.iterdir()] == ["model"]
 
 
 def test_bad_input_leaves_nothing_to_be_resumed(tmp_path: Path) -> None:
@@ -208,7 +234,7 @@ def test_a_link_in_place_of_an_artifact_is_none(tmp_path: Path) -> None:
 
 
 def test_directory_without_record_is_not_an_artifact(tmp_path: Path) -> None:
-    """Leave what a crash between the rename and the record leaves."""
+    """Leave what a removal leaves that was killed half-way."""
     (tmp_path / "fit" / "k").mkdir(parents=True)
     (tmp_path / "fit" / "k" / "stale").write_text("x")
     assert list(Store(tmp_path).get_or_compute("fit", "k", write_abc).files) == ["deep/letters"]
