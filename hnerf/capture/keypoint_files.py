@@ -13,6 +13,7 @@ from hnerf.capture.safe_io import read_json
 from hnerf.errors import InputError
 
 MAX_PEOPLE = 64  # in one image
+MAX_PX = 1e6  # of a coordinate; far larger ones overflow in later arithmetic
 
 
 def read_openpose(path: Path) -> np.ndarray:
@@ -89,4 +90,12 @@ def _people(path: Path, triples: list[Any]) -> np.ndarray:
     if not np.isfinite(points).all():
         raise InputError(f"{path}: a keypoint is NaN or infinite; detect them again")
     points[..., 2] = points[..., 2].clip(0, 1)  # some detectors exceed 1, and COCO's own annotations reach 2
-    return points
+    return within_reach(path, points)
+
+
+def within_reach(path: Path, points: np.ndarray) -> np.ndarray:
+    """Return keypoints (..., 3), those beyond MAX_PX zero. Raises InputError if one of them was seen."""
+    far = (np.abs(points[..., :2]) > MAX_PX).any(-1)
+    if (points[far][:, 2] > 0).any():
+        raise InputError(f"{path}: a keypoint is beyond {MAX_PX:g} px; detect them again")
+    return np.where(far[..., None], 0.0, points)

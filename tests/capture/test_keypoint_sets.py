@@ -114,6 +114,19 @@ def test_people_without_points_are_nobody(tmp_path: Path) -> None:
         assert read_openpose(tmp_path / "a.json").shape == kept
 
 
+def test_points_that_were_not_seen_may_lie_anywhere(tmp_path: Path) -> None:
+    """The mean of two shoulders at 1e308, one of them without confidence, would be infinite."""
+    found = points(17)
+    found[5:7, :2], found[5, 2] = 1e308, 0
+    (tmp_path / "a.json").write_text(json.dumps({"people": [{"pose_keypoints_2d": found.ravel().tolist()}]}))
+    with pytest.raises(InputError, match=r"a\.json: a keypoint is beyond 1e\+06 px; detect them again"):
+        read_openpose(tmp_path / "a.json")
+    found[6, 2] = 0
+    (tmp_path / "a.json").write_text(json.dumps({"people": [{"pose_keypoints_2d": found.ravel().tolist()}]}))
+    found[5:7] = 0
+    assert np.array_equal(read_openpose(tmp_path / "a.json")[0], found)
+
+
 def test_lists_of_results_are_read_by_frame(tmp_path: Path) -> None:
     """Results are as AlphaPose (image names) and MMPose (numbers) write them; scores over 1 count as 1."""
     sure = points(17)

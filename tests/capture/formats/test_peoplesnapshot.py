@@ -131,5 +131,7 @@ def test_damage_is_named(folder: Path, tmp_path: Path) -> None:
     refused(r"masks\.hdf5: not a readable HDF5 file")
     write_hdf5(folder / "keypoints.hdf5", keypoints=np.full((6, 54), np.nan))
     refused(r"keypoints\.hdf5: keypoints is not \(N, 54\) finite numbers")
+    write_hdf5(folder / "keypoints.hdf5", keypoints=np.tile([1e308, 5.0, 0.5], (6, 18)))
+    refused(r"keypoints\.hdf5: a keypoint is beyond 1e\+06 px")
     (folder / "camera.pkl").write_bytes(pickle.dumps({"camera_f": [1]}))
     refused(r"camera\.pkl: camera_f, _c, .* is missing")
