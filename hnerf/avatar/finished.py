@@ -17,7 +17,9 @@ from hnerf.config import TrainingSettings
 from hnerf.errors import InputError, one_line
 
 # SystemError: OpenCV's, of YAML that is cut. A disk's own faults (OSError) stay what they are.
-DAMAGED = (*(kind for kind in ARRAY_FILE_ERRORS if kind is not OSError), SafetensorError, SystemError, cv2.error)
+DAMAGED = (
+    *(kind for kind in ARRAY_FILE_ERRORS if kind is not OSError), IndexError, SafetensorError, SystemError, cv2.error,
+)  # fmt: skip
 
 
 @contextmanager

@@ -24,10 +24,11 @@ MAX_TEXT_BYTES = 16_000_000
 MAX_TOML_BYTES = 500_000
 MAX_KEY_PARTS = 16  # of a dotted key in TOML; tomllib needs memory and time by their square
 # Exceptions on reading arrays from a file that is not a complete .npz of plain arrays; RuntimeError: an encrypted one,
-# or an unknown compression; tokenize.TokenError: a header with an open bracket.
+# or an unknown compression; OverflowError: a shape beyond all integers; tokenize.TokenError: a header with an open
+# bracket.
 ARRAY_FILE_ERRORS = (
-    AttributeError, EOFError, KeyError, MemoryError, OSError, RuntimeError, SyntaxError, TypeError, ValueError,
-    tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+    AttributeError, EOFError, KeyError, MemoryError, OSError, OverflowError, RuntimeError, SyntaxError, TypeError,
+    ValueError, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 VIDEO_SUFFIXES = (".mp4", ".mov")

@@ -142,6 +142,13 @@ def test_surfaces_that_cannot_be_compared_are_refused(truth: GroundTruth, faces:
         truth.meshes()
 
 
+def test_surfaces_of_no_frame_are_refused(truth: GroundTruth) -> None:
+    path, vertices = truth.folder / "ground_truth" / "meshes.npz", np.zeros((2, 3, 3))
+    np.savez(path, faces=np.array([[0, 1, 2]]), vertices=vertices, frames=np.array([np.inf, 1]))
+    with pytest.raises(InputError, match=r"meshes\.npz: true surfaces cannot be read \(cannot convert float infinity"):
+        truth.meshes()
+
+
 def test_more_than_fits_in_memory_is_refused(truth: GroundTruth, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object, **__: object) -> np.ndarray:
         raise MemoryError("Unable to allocate 1.07 PiB")

@@ -213,6 +213,14 @@ def test_what_is_no_motion_is_refused(arrays: dict[str, np.ndarray], message: st
         read_motion(tmp_path / "walk.npz")
 
 
+def test_a_shape_beyond_all_integers_is_no_motion(tmp_path: Path) -> None:
+    """It is declared by the header of an intact archive."""
+    with zipfile.ZipFile(tmp_path / "walk.npz", "w") as archive, archive.open("poses.npy", "w") as file:
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (10**30, 156)})
+    with pytest.raises(InputError, match=r"walk\.npz: not an \.npz of plain arrays"):
+        read_motion(tmp_path / "walk.npz")
+
+
 def test_half_a_file_is_no_motion(tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "walk.npz", poses=np.zeros((2, 156)), trans=np.zeros((2, 3)))
     whole = (tmp_path / "walk.npz").read_bytes()

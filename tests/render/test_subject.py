@@ -218,6 +218,17 @@ def test_a_copy_with_a_file_that_is_cut_is_one_line(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_copy_with_faces_that_are_none_is_one_line(
+    subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = shutil.copytree(subject, tmp_path / "copy")
+    with np.load(copy / "training/rig.npz") as stored:
+        np.savez(copy / "training/rig.npz", **{**stored, "faces": np.zeros(3, int)})
+    assert main(["render", str(copy), "--out", str(tmp_path / "out")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"hnerf: {copy / 'training'}: damaged, or written by another version (")
+
+
 def test_a_motion_of_another_version_is_one_line(
     subject: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
