@@ -1,6 +1,5 @@
 """What is in a store: its artifacts, whose they are, and what they were computed from."""
 
-import json
 import os
 import re
 from collections.abc import Iterable, Iterator
@@ -8,6 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from hnerf.capture.safe_io import read_json
+from hnerf.errors import InputError
 from tasks.pins import pinned
 from tasks.store import STAGES, Artifact, Store
 
@@ -130,7 +131,8 @@ def _recorded_name(artifact: Artifact) -> str:
     """Return the name of the person in a recording, empty for the artifacts of other stages."""
     if artifact.stage != STAGES[0]:
         return ""
+    described = artifact.root / "capture.json"
     try:
-        return str(json.loads((artifact.root / "capture.json").read_bytes())["name"])
-    except (OSError, LookupError, TypeError, ValueError):  # damaged
+        return "" if described.is_symlink() else str(read_json(described)["name"])
+    except (InputError, LookupError, TypeError):  # damaged, or no file
         return ""

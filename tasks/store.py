@@ -95,8 +95,6 @@ class Store:
         record = self.path(stage, key, ".json")
         if not record.is_file():  # nor a pipe or a device, from which reading never ends
             return None
-        if record.is_symlink() or self.path(stage, key).is_symlink():
-            return None
         pin(self.root, f"{stage}/{key}")
         try:
             with unless_read_only():
@@ -112,10 +110,12 @@ class Store:
 
     def recorded(self, stage: str, key: str) -> Artifact | None:
         """Return the artifact as its record describes it, whose files were not looked at; None if the record cannot be
-        read as one. Raises FileNotFoundError if there is none."""
+        read as one, or is a link. Raises FileNotFoundError if there is none."""
+        record, root = self.path(stage, key, ".json"), self.path(stage, key)
+        if record.is_symlink() or root.is_symlink():
+            return None
         try:
-            described = json.loads(self.path(stage, key, ".json").read_bytes())
-            artifact = Artifact.model_validate({"root": self.path(stage, key), **described})
+            artifact = Artifact.model_validate({"root": root, **json.loads(record.read_bytes())})
         except (RecursionError, TypeError, ValueError):  # TypeError: JSON, but no object
             return None
         return artifact if artifact.stage == stage else None

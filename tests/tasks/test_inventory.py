@@ -1,3 +1,5 @@
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -43,6 +45,25 @@ def test_a_record_that_is_damaged_is_named(store: Store) -> None:
     record.write_text("[")
     found = Inventory.of(store)
     assert (found.stored, found.unreadable) == ({}, (record,))
+
+
+@pytest.mark.parametrize("suffix", [".json", ""])
+def test_a_link_in_place_of_an_artifact_is_unreadable(store: Store, suffix: str, tmp_path: Path) -> None:
+    key = add(store, "fit", 7).root.name
+    store.path("fit", key, suffix).rename(tmp_path / "elsewhere")
+    store.path("fit", key, suffix).symlink_to(tmp_path / "elsewhere")
+    found = Inventory.of(store)
+    assert (found.stored, found.unreadable) == ({}, (store.path("fit", key, ".json"),))
+
+
+@pytest.mark.parametrize("replace", [os.mkfifo, lambda path: path.symlink_to("named.json")])
+def test_a_recording_s_name_is_read_from_a_file_alone(store: Store, replace: Callable[[Path], None]) -> None:
+    """A pipe would be waited for without end, and a link may lead to a device."""
+    capture = add(store, "capture", 7, name="ada")
+    assert Inventory.of(store).owners[capture.name] == {"ada"}
+    (capture.root / "capture.json").rename(capture.root / "named.json")
+    replace(capture.root / "capture.json")
+    assert Inventory.of(store).owners[capture.name] == set()
 
 
 def test_the_recording_of_a_subject_is_where_it_was_read(store: Store) -> None:
