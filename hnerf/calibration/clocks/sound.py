@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import resample
 
+from hnerf.capture.safe_io import path_in_capture
 from hnerf.errors import InputError
 
 RATE_HZ = 16_000  # to which sound is brought: a sample is 2 cm of its way
@@ -48,8 +49,8 @@ def sound_offset(a: np.ndarray, b: np.ndarray) -> float | None:
 def read_sound(path: Path) -> np.ndarray | None:
     """Return the sound (n,) at RATE_HZ of a video, from the .wav of the same name beside it, else, where the program
     ffmpeg is installed, from the video itself; None where there is none. Raises InputError on a .wav that cannot be
-    read."""
-    beside = path.with_suffix(".wav")
+    read, or is a link."""
+    beside = path_in_capture(path.parent, path.with_suffix(".wav").name)
     if beside.is_file():
         return _read_wave(beside)
     program = shutil.which("ffmpeg")
@@ -68,7 +69,7 @@ def _read_wave(path: Path) -> np.ndarray:
         with wave.open(str(path)) as file:
             channels, width, rate_hz = file.getnchannels(), file.getsampwidth(), file.getframerate()
             samples = file.readframes(min(file.getnframes(), int(MAX_SECONDS * rate_hz)))
-    except (EOFError, OSError, wave.Error):
+    except (EOFError, OSError, RuntimeError, wave.Error):  # RuntimeError: a part longer than the file
         raise InputError(f"{path}: not a readable .wav; export it again as 16-bit PCM") from None
     if width != 2 or rate_hz < 2 * BAND_HZ[0]:
         raise InputError(f"{path}: {8 * width} bits at {rate_hz} Hz; export it again as 16-bit PCM at 16 kHz or more")

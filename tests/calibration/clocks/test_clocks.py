@@ -189,3 +189,19 @@ def test_a_wave_file_beside_a_video_is_read_at_any_rate(tmp_path: Path) -> None:
     (tmp_path / "a.wav").write_bytes(b"RIFF")
     with pytest.raises(InputError, match=r"a\.wav: not a readable"):
         read_sound(tmp_path / "a.mp4")
+
+
+def test_a_wave_file_of_parts_that_do_not_fit_or_a_link_is_refused(tmp_path: Path) -> None:
+    """Bytes 16 to 19 are the size of the description of the format."""
+    with wave.open(str(tmp_path / "a.wav"), "wb") as file:
+        file.setparams((1, 2, 16_000, 0, "NONE", "none"))
+        file.writeframes(bytes(20))
+    with (tmp_path / "a.wav").open("r+b") as raw:
+        raw.seek(16)
+        raw.write((500).to_bytes(4, "little"))
+    with pytest.raises(InputError, match=r"a\.wav: not a readable \.wav"):
+        read_sound(tmp_path / "a.mp4")
+    (tmp_path / "a.wav").rename(tmp_path / "b.wav")
+    (tmp_path / "a.wav").symlink_to("b.wav")
+    with pytest.raises(InputError, match=r"a\.wav: is a symbolic link"):
+        read_sound(tmp_path / "a.mp4")
