@@ -133,7 +133,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
                     joints[open_joints[-1]].offset = offset
             case ["CHANNELS", count, *names] if open_joints and open_joints[-1] >= 0:
                 unknown = set(names) - set(CHANNELS) or len(set(names)) < len(names)
-                if not count.isdecimal() or int(count) != len(names) or unknown:
+                if count != str(len(names)) or unknown:
                     raise wrong(number, "CHANNELS does not list what it counts")
                 joints[open_joints[-1]].channels = tuple(names)
             case ["MOTION"] if joints and not open_joints and all(joint.offset for joint in joints):

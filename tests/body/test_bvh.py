@@ -82,6 +82,7 @@ def test_angles_do_not_jump_where_somebody_turns_and_a_knee_bends(tmp_path: Path
         ("OFFSET 1 2 3", "OFFSET 1 2 nan", "line 4: OFFSET is not three numbers"),
         ("OFFSET 1 2 3", "", "is not expected here"),
         ("CHANNELS 6", "CHANNELS 60", "line 5: CHANNELS does not list what it counts"),
+        ("CHANNELS 6", "CHANNELS " + "9" * 5000, "line 5: CHANNELS does not list what it counts"),
         ("2 Yrotation Zrotation", "2 Yrotation Yrotation", "CHANNELS does not list"),
         ("Yrotation Zrotation", "Yrotation Wrotation", "CHANNELS does not list"),
         ("JOINT Fore", "ROOT Fore", "line 6: ROOT in the wrong place"),
