@@ -7,7 +7,7 @@ import difflib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
 
@@ -17,6 +17,7 @@ from hnerf.strict_yaml import MAX_DEPTH, parse_yaml, parse_yaml_strings
 S = TypeVar("S", bound=BaseModel)
 
 CONFIGS = Path(__file__).parent.parent / "configs"
+Seed = Annotated[int, Field(ge=0, lt=2**63)]  # of any generator
 CLOSE = 0.7  # of difflib: keys that are taken for misspelled ones
 
 
@@ -36,7 +37,7 @@ class CaptureSettings(Section):
 class SyntheticSettings(Section):
     """Settings of the synthetic capture that `hnerf synth` writes; no stage of a run reads them."""
 
-    seed: int = Field(default=0, ge=0)
+    seed: Seed = 0
     size_px: int = Field(default=256, ge=16, le=4096)
     train_cameras: int = Field(default=4, ge=1)  # on a ring, at equal angles
     test_cameras: int = Field(default=2, ge=0)  # each half-way between two of those, evenly spaced
@@ -250,7 +251,7 @@ class TrainingSettings(Section):
     snapshots_s: tuple[PositiveFloat, ...] = ()  # times at which the subject is also saved, below `snapshots/`
     processes: int = Field(default=0, ge=0)  # 0: one for each GPU, or one without any
     memory_gib: float | None = Field(default=None, gt=0)  # per process, for the rays of a step; None: what is free
-    seed: int = Field(default=0, ge=0)
+    seed: Seed = 0
 
     @model_validator(mode="after")
     def _compared_methods_tune_no_poses(self) -> Self:

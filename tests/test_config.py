@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from pydantic import ValidationError
 
 from hnerf.capture.footage import MAX_FPS, MIN_FPS
@@ -141,6 +142,12 @@ def test_errors_in_unions_name_the_key_as_it_is_set(override: str, message: str)
 def test_another_kind_of_field_keeps_nothing_of_the_kind_before() -> None:
     changed = load_settings("demo", ["training.pose_learning_rate=0", "training.field.kind=nerf"]).training
     assert changed.field == NerfSettings()
+
+
+def test_a_seed_is_one_that_torch_takes() -> None:
+    torch.manual_seed(load_settings("fast", [f"training.seed={2**63 - 1}"]).training.seed)
+    with pytest.raises(InputError, match=rf"^--set training\.seed={2**63}: training\.seed: Input should be less than"):
+        load_settings("fast", [f"training.seed={2**63}"])
 
 
 @pytest.mark.parametrize("name", ["a" * 5000, "a\0b", "fa/" * 2000])

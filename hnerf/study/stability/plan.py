@@ -3,9 +3,9 @@
 from collections.abc import Collection
 from typing import Annotated
 
-from pydantic import Field, NonNegativeInt
+from pydantic import Field
 
-from hnerf.config import CONFIGS, Section, named_file, read_yaml, validated
+from hnerf.config import CONFIGS, Section, Seed, named_file, read_yaml, validated
 from hnerf.errors import InputError
 from hnerf.study.benchmark.plan import CapturePart
 from hnerf.study.degradations.catalogue import KINDS, check_strengths
@@ -20,8 +20,8 @@ class StabilityStudy(Section):
     border with the seeds before; part: the part of the capture that is used."""
 
     methods: Annotated[tuple[str, ...], Field(min_length=1)]
-    seeds: Annotated[tuple[NonNegativeInt, ...], Field(min_length=1)]
-    border_seeds: tuple[NonNegativeInt, ...] = ()
+    seeds: Annotated[tuple[Seed, ...], Field(min_length=1)]
+    border_seeds: tuple[Seed, ...] = ()
     part: CapturePart = CapturePart()
     overrides: tuple[str, ...] = ()
     degradations: Annotated[dict[str, tuple[float, ...]], Field(min_length=1)]
