@@ -18,6 +18,7 @@ S = TypeVar("S", bound=BaseModel)
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 Seed = Annotated[int, Field(ge=0, lt=2**63)]  # of any generator
+MAX_BYTES = 65_536  # of a file of settings
 CLOSE = 0.7  # of difflib: keys that are taken for misspelled ones
 
 
@@ -395,8 +396,12 @@ def named_file(name: str, folder: Path, one: str, many: str) -> Path:
 
 def read_yaml(path: Path) -> dict[str, Any]:
     """Return the keys and values of a YAML file, an empty dictionary for an empty file. Raises InputError, one line,
-    where it holds anything else."""
-    tree = parse_yaml(path.read_bytes(), path)
+    where it holds anything else, or more than settings need."""
+    with path.open("rb") as file:
+        text = file.read(MAX_BYTES + 1)
+    if len(text) > MAX_BYTES:
+        raise InputError(f"{path}: more than {MAX_BYTES} bytes; give a YAML file of settings")
+    tree = parse_yaml(text, path)
     if not isinstance(tree, dict | None):
         raise InputError(f"{path}: does not hold keys and values; write lines like `name: value`")
     return tree or {}

@@ -8,7 +8,7 @@ import torch
 from pydantic import ValidationError
 
 from hnerf.capture.footage import MAX_FPS, MIN_FPS
-from hnerf.config import NerfSettings, SyntheticSettings, load_settings, validated, with_changes
+from hnerf.config import NerfSettings, Settings, SyntheticSettings, load_settings, validated, with_changes
 from hnerf.errors import InputError
 from hnerf.study.benchmark.plan import load_study
 from hnerf.study.stability.plan import load_stability
@@ -123,6 +123,18 @@ def test_a_preset_builds_on_another(tmp_path: Path) -> None:
     path.write_text("based_on: absent")
     with pytest.raises(InputError, match=r"^absent: no such preset or file"):
         load_settings(str(path))
+
+
+def test_a_video_in_place_of_a_preset_is_not_read(tmp_path: Path) -> None:
+    """Neither as a preset nor as what one is based on."""
+    path = tmp_path / "large.yaml"
+    path.write_bytes(b"#" * 65_537)
+    (tmp_path / "mine.yaml").write_text(f"based_on: {path}")
+    for name in (path, tmp_path / "mine.yaml"):
+        with pytest.raises(InputError, match=rf"^{path}: more than 65536 bytes; give a YAML file of settings$"):
+            load_settings(str(name))
+    path.write_bytes(b"#" * 65_536)
+    assert load_settings(str(path)) == Settings()
 
 
 @pytest.mark.parametrize(
